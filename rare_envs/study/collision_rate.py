@@ -121,7 +121,8 @@ def describe_left_out(study: Study, estimate: samplers.Estimate) -> tuple[str, .
         mean = "ensemble: p is the mean over the refits, which stands for the error of the base distribution"
         found.append(f"{mean}; no interval of that error is given, and that of the rate leaves it out")
     if estimate.p == 0:
-        found.append("nothing failed: the upper end is that of the simulations, without the error of the distribution")
+        why = "no failure counts in p" if estimate.failures.total else "nothing failed"
+        found.append(f"{why}: the upper end is that of the simulations, without the error of the distribution")
     elif base is None:
         if not found:  # the mixture of the refits has none of its own
             found.append("the error of the base distribution is not known (no refits), and left out of the rate")

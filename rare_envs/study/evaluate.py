@@ -227,8 +227,8 @@ def resume(
         >>> resume(Path("runs/nowhere"))
         Traceback (most recent call last):
             ...
-        rare_envs.study.errors.BadInput: There is no unfinished run in 'runs/nowhere': it has no journal.bin.
-    """
+        rare_envs.study.errors.BadInput: There is no unfinished run in 'runs/nowhere': it has no journal.bin. Of one that was stopped before its first simulations, give the command again.
+    """  # noqa: E501 (the example shows a whole message)
     journal, question = continue_journal(folder, mend)
     with closing(journal):
         question = replace(open_question(asdict(question), folder, trust), core=question.core)

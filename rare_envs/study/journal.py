@@ -15,12 +15,15 @@ from agents.loading import strip_prefixes
 from agents.sb3.hub import HUB_PREFIX, find_cached_model
 from rare_envs.study.errors import BadInput
 from rare_envs.study.question import Question, read_question
+from rare_envs.study.storage.names import RESULT
 from rare_envs.version import __version__
 from samplers.execution.journal import JournalFile
-from samplers.execution.record_file import JournalError
+from samplers.execution.record_file import JournalError, NothingRecorded
 
 JOURNAL = "journal.bin"
 """Name of the file in the folder of a run."""
+BEGIN_AGAIN = "give the command again."
+"""Advice where there is nothing to continue."""
 
 
 def begin_journal(folder: Path, question: Question, force: bool = False) -> JournalFile:
@@ -63,7 +66,9 @@ def continue_journal(folder: Path, mend: bool = False) -> tuple[JournalFile, Que
     try:
         journal = JournalFile.open(path, mend)
     except FileNotFoundError as error:
-        raise BadInput(f"There is no unfinished run in {str(folder)!r}: it has no {JOURNAL}.") from error
+        raise BadInput(f"There is no unfinished run in {str(folder)!r}: {_explain_no_journal(folder)}") from error
+    except NothingRecorded as error:
+        raise BadInput(f"The run in {str(folder)!r} was stopped before its first simulations: {BEGIN_AGAIN}") from error
     except OSError as error:
         raise BadInput(f"Cannot take up {str(path)!r}: {error.strerror}.") from error
     except JournalError as error:
@@ -74,6 +79,13 @@ def continue_journal(folder: Path, mend: bool = False) -> tuple[JournalFile, Que
     except BadInput as error:
         journal.close()
         raise BadInput(f"Cannot take up {str(path)!r}: {error}") from error
+
+
+def _explain_no_journal(folder: Path) -> str:
+    """Return why a folder has no journal, and what to do."""
+    if (folder / RESULT).is_file():
+        return f"it has a finished one ({RESULT})."
+    return f"it has no {JOURNAL}. Of one that was stopped before its first simulations, {BEGIN_AGAIN}"
 
 
 def _read_question(journal: JournalFile) -> Question:

@@ -76,7 +76,7 @@ def _replay_likeliest_failure(report: Report) -> Drive | str:
     failures = report.estimate.failures
     driven = np.flatnonzero(~np.isnan(failures.f))  # not those on which the ego failed
     if not len(driven):
-        return explain_no_failure(report) if report.estimate.p == 0 else "no failure found that can be shown"
+        return "no failure found that can be shown" if failures.total else explain_no_failure(report)
     try:
         return drive_again(report.study.problem, failures.x[driven[0]])
     except (Exception, SystemExit, EgoGone) as error:  # the ego is the user's, and need not do again what it did before
@@ -129,7 +129,7 @@ def draw_convergence(axes: Axes, report: Report) -> None:
             axes.fill_between(spent, values / spread, values * spread, color=LINE_COLOUR, alpha=0.15, linewidth=0)
     low, high = estimate.interval
     axes.axhspan(max(low, 1e-300), high, color=HIT_COLOUR, alpha=0.12, linewidth=0)
-    if estimate.p == 0:
+    if estimate.p == 0 and not estimate.failures.total:
         spent = np.geomspace(1.0, max(estimate.n_sim, 2), 100)
         bound = np.minimum(high * estimate.n_sim / spent, 1.0)
         axes.plot(spent, bound, color=HIT_COLOUR, linewidth=1, label="upper end without a failure: as 1 / simulations")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import IO, Any, NamedTuple
 
@@ -43,8 +44,10 @@ class RecordedFailure(NamedTuple):
     """Scenario parameters, shape (d,)."""
     f: float
     log_p0: float
-    n_failures: int
-    """Number of failures of the run."""
+    n_listed: int
+    """Number of failures that the run lists, the most likely ones."""
+    n_found: int
+    """Number of failures that it found."""
 
 
 def find_failure(folder: Path, number: int, trust: bool = False) -> RecordedFailure:
@@ -78,7 +81,24 @@ def find_failure(folder: Path, number: int, trust: bool = False) -> RecordedFail
             f"Expected a failure from 0 to {count - 1}, got {number}." if count else "The run has no failure."
         )
     x = join_parameters(table, problem, number)
-    return RecordedFailure(problem, x, float(table["f"][number]), float(table["log_p0"][number]), count)
+    return RecordedFailure(
+        problem, x, float(table["f"][number]), float(table["log_p0"][number]), count, count_found(recorded, count)
+    )
+
+
+def count_found(recorded: Mapping[str, Any], n_listed: int) -> int:
+    """Return the number of failures that a run found.
+
+    Args:
+        recorded: Its result.json.
+        n_listed: Failures in its table, which are fewer where it found many.
+
+    Example:
+        >>> count_found({"n_failures": 1649}, 1000), count_found({}, 12)
+        (1649, 12)
+    """
+    found = recorded.get("n_failures")
+    return found if isinstance(found, int) and found > n_listed else n_listed
 
 
 def join_parameters(table: dict[str, NDArray[Any]], problem: DrivingProblem, number: int) -> NDArray[np.float64]:
@@ -150,8 +170,9 @@ def describe_drive(recorded: RecordedFailure, drive: Drive, number: int, ego: st
         ego: Another ego, if one drove in the place of the run's.
     """
     space, labels = recorded.problem.space, recorded.problem.world.scenario.labels
+    listed = f" ({recorded.n_listed:,} of them listed)" if recorded.n_listed < recorded.n_found else ""
     lines = [
-        f"Failure {number} of {recorded.n_failures} in {recorded.problem.env_id}: "
+        f"Failure {number} of {recorded.n_found:,} found{listed} in {recorded.problem.env_id}: "
         f"f = {drive.f:.4g}, log p0 = {recorded.log_p0:.2f}"
     ]
     for name, values in space.named(recorded.x).items():

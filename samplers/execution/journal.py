@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from samplers.execution.record_file import JournalError, RecordFile
+from samplers.execution.record_file import JournalError, NothingRecorded, RecordFile
 from samplers.problem import FloatArray
 from samplers.system import sync_folder
 
@@ -124,17 +124,23 @@ class JournalFile:
             mend: Of a damaged journal, keep what stands before the damage.
 
         Raises:
+            NothingRecorded: It was cut before its first record.
             JournalError: It is damaged, or another process has it open.
             OSError: It cannot be read.
         """
         records = RecordFile(path)
         try:
             dropped = records.mend(drop=mend)
-            head = json.loads(records.read() or b"")
+            first = records.read()
+            if first is None:
+                raise NothingRecorded(f"{str(path)!r} was cut before its first record; nothing is recorded in it.")
+            head = json.loads(first)
             if not isinstance(head, dict):
                 raise ValueError("its head is no object")
         except (ValueError, RecursionError) as error:
             records.close()
+            if isinstance(error, NothingRecorded):
+                raise
             words = str(error) if isinstance(error, JournalError) else f"{str(path)!r} is no journal: {error}."
             raise JournalError(words) from error
         except BaseException:
@@ -215,6 +221,8 @@ def _has_simulations(records: RecordFile) -> bool:
     """Return whether a file has batches, or is damaged or of another kind, so that somebody may want to keep it."""
     try:
         records.mend()
+    except NothingRecorded:
+        return False
     except JournalError:
         return True
     return records.read() is not None and records.read() is not None

@@ -15,7 +15,7 @@ from samplers.execution.executors.base import Work, WorkerPool
 from samplers.execution.executors.chunks import Chunk, Packed
 from samplers.execution.executors.dispatch import Dispatcher
 from samplers.execution.journal import JournalFile, JournalRecord
-from samplers.execution.record_file import JournalError
+from samplers.execution.record_file import JournalError, NothingRecorded
 from samplers.problem import FloatArray, Inputs
 
 N_CHECKED = 8
@@ -173,9 +173,11 @@ def open_journal(path: str | PathLike[str] | None, problem: Inputs, seed: int | 
         yield None
         return
     file = Path(path)
-    new = not file.exists() or file.stat().st_size == 0
     begun = {"dim": int(problem.dim), "seed": choose_seed(seed)}
-    journal = JournalFile.create(file, begun) if new else JournalFile.open(file)
+    try:
+        journal = JournalFile.open(file)
+    except (FileNotFoundError, NothingRecorded):
+        journal = JournalFile.create(file, begun)
     with contextlib.closing(journal):
         for name, wanted in (("dim", begun["dim"]), ("seed", seed)):
             had = journal.head.get(name)

@@ -29,6 +29,10 @@ class JournalError(ValueError):
     """Simulating again would not help."""
 
 
+class NothingRecorded(JournalError):
+    """A journal was cut before its first record was written, so that nothing is lost by beginning it anew."""
+
+
 class RecordFile:
     """Records of bytes, read and written in their order.
 
@@ -129,11 +133,15 @@ class RecordFile:
             Number of bytes dropped.
 
         Raises:
+            NothingRecorded: The file was cut in its first bytes.
             JournalError: A record is damaged otherwise, or the file is of another kind.
         """
         self._file.seek(0)
-        if self._file.read(len(MAGIC)) != MAGIC:
-            raise JournalError(f"{str(self.path)!r} is of another kind or version, or was cut at its beginning.")
+        begun = self._file.read(len(MAGIC))
+        if begun != MAGIC and MAGIC.startswith(begun):
+            raise NothingRecorded(f"{str(self.path)!r} was cut at its beginning; nothing is recorded in it.")
+        if begun != MAGIC:
+            raise JournalError(f"{str(self.path)!r} is of another kind or version.")
         self.rewind()
         n = 0
         while self.read() is not None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,8 @@ MAX_TEXT = 2**16
 """Letters of a name or formula in a question."""
 _CHANGEABLE = ("trust", "on_error", "core")
 """Fields that a resumed run may change, or that follow from what is installed."""
+_ADDRESS = "ego"
+"""Changes too where the ego is in another program."""
 
 
 def open_question(recorded: object, folder: Path, trust: bool) -> Question:
@@ -45,6 +48,24 @@ def open_question(recorded: object, folder: Path, trust: bool) -> Question:
 def note_question(question: Question) -> None:
     """Note that a question was asked here, so that its folder needs no trust."""
     note_own_run(_record(question), list_code(question))
+
+
+def is_same_question(recorded: object, question: Question) -> bool:
+    """Return whether a recorded question is this one, but for what a run that is resumed may change.
+
+    Args:
+        recorded: Of a file.
+        question: The question.
+
+    Example:
+        >>> asked = Question(env_id="rare_envs/CutIn-v0", seed=1)
+        >>> is_same_question(asdict(replace(asked, on_error="bound")), asked), is_same_question({"seed": 2}, asked)
+        (True, False)
+    """
+    asked = _record(question)
+    if find_ego_kind(question.ego) == "remote":
+        del asked[_ADDRESS]
+    return isinstance(recorded, Mapping) and all(recorded.get(name) == value for name, value in asked.items())
 
 
 def list_code(question: Question) -> list[str]:

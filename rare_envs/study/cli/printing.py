@@ -168,9 +168,9 @@ def _print_kinds(console: Console, report: Report) -> None:
         console.print(f"  {'severity' if number == 0 else '':<15} {line}")
 
 
-def _summarise_crash(crash: dict[str, Any]) -> str:
-    """Return who ran into whom, how fast, and the risk of injury, in words."""
-    who = ["the edge of the road" if one < 0 else f"vehicle {one}" if one else "the ego" for one in crash["vehicles"]]
+def _summarise_crash(crash: dict[str, Any], labels: tuple[str, ...]) -> str:
+    """Return who ran into whom, how fast, and the risk of injury, in words; `labels` are those of the vehicles."""
+    who = ["the edge of the road" if one < 0 else labels[one] for one in crash["vehicles"]]
     speeds = f"{crash['impact_speed']:.1f} m/s at contact, delta-v {max(crash['delta_v']):.1f} m/s"
     return f"{who[0]} runs into {who[1]}: {speeds}, serious injury {100 * max(crash['injury_risk']):.2g} %"
 
@@ -201,7 +201,7 @@ def _print_failure(console: Console, report: Report) -> None:
         "in brackets the central 90 % of ordinary scenarios):"
     )
     if report.crashes[0] is not None:
-        console.print(f"    {_summarise_crash(report.crashes[0])}")
+        console.print(f"    {_summarise_crash(report.crashes[0], report.study.problem.world.scenario.labels)}")
     normal = space.columns(space.to_standard_normal(np.vstack((failures.x[:1], ordinary))))
     likeliest, usual = space.columns(failures.x[:1]), space.columns(ordinary)
     for j, name in enumerate(space.names):

@@ -20,7 +20,7 @@ from rare_envs.study.corpus.storage import join_x, read_recorded, read_run
 from rare_envs.study.corpus.stored_failure import StoredFailure
 from rare_envs.study.errors import BadInput, as_bad_input
 from rare_envs.study.question import Question, build_problem, prepare
-from rare_envs.study.video import REPLAY_TOLERANCE, RecordedFailure
+from rare_envs.study.video import REPLAY_TOLERANCE, RecordedFailure, count_found
 
 NO_FAILURE = "The run has no failure."
 TrialOutcome = Literal["passed", "failed", "error"]
@@ -154,7 +154,9 @@ def find_for_ego(folder: Path, number: int, ego: str, trust: bool = False) -> Re
         raise BadInput(f"Expected a failure from 0 to {len(failures) - 1}, got {number}." if failures else NO_FAILURE)
     failure = failures[number]
     problem, x = load_world(failure, EgoChoice(ego=ego), folder, trust)
-    return RecordedFailure(problem, x, failure.f, failure.log_p0, len(failures))
+    return RecordedFailure(
+        problem, x, failure.f, failure.log_p0, len(failures), count_found(read_recorded(folder), len(failures))
+    )
 
 
 def load_world(

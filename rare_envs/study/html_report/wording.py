@@ -84,11 +84,33 @@ def summarise_answer(result: Result, base: str) -> str:
     if p > 0:
         return f"{format_odds(p).capitalize()} scenarios {describe_event(result)}. {where}"
     percent, rare = f"{100 * float(result['confidence']):g} %", 1 / float(result["interval"][1])
-    n = int(result.get("n_sim", 0))
-    seen = (
-        f"None of {n:,} simulations {describe_event(result)}; with {percent} confidence fewer than 1 in {rare:,.0f} do."
+    n, found, event = int(result.get("n_sim", 0)), int(result.get("n_failures") or 0), describe_event(result)
+    seen = f"None of {n:,} simulations {event}"
+    if found:
+        seen = f"Of {n:,} simulations {found:,} found what {event}, but none of those counts in p (as in a search)"
+    return f"{seen}; with {percent} confidence fewer than 1 in {rare:,.0f} do. {where}"
+
+
+def describe_validity(result: Result) -> str:
+    """Return what the answer rests on, in the words of `samplers.Estimate.proviso`.
+
+    Example:
+        >>> describe_validity({"p": 0.0, "n_failures": 3, "base_draws": 600, "unseen": 0.005, "confidence": 0.95})
+        'valid unless a failure region with probability above 0.5 % was missed (600 draws of ordinary traffic found no other)'
+    """  # noqa: E501 (the example shows a whole sentence)
+    draws = int(result.get("base_draws") or 0)
+    if draws == 0:
+        return "valid unless a failure region was missed (no draws of ordinary traffic bound its probability)"
+    unseen, confidence = format_probability(result.get("unseen")), float(result["confidence"])
+    if float(result["p"]) == 0 and not result.get("n_failures"):
+        return (
+            f"{draws:,} draws of ordinary traffic without a failure put p below {unseen} (one-sided "
+            f"{100 * confidence:g} %; the interval's end is that of {50 + 50 * confidence:g} % or more)"
+        )
+    return (
+        f"valid unless a failure region with probability above {unseen} was missed ({draws:,} draws of ordinary "
+        "traffic found no other)"
     )
-    return f"{seen} {where}"
 
 
 def describe_intervals(result: Result) -> list[tuple[str, str, str]]:

@@ -17,6 +17,7 @@ from agents.loading import find_ego_kind, strip_prefixes
 from rare_envs.distributions.fitted import FittedDistribution
 from rare_envs.files import replace_text
 from rare_envs.json_text import format_json, parse_json_object
+from rare_envs.study.analysis.recorded_question import is_same_question
 from rare_envs.study.journal import digest_files, find_named_files
 from rare_envs.study.question import Question, Study
 from rare_envs.study.storage.names import STUDY, STUDY_FORMAT
@@ -84,17 +85,10 @@ def finish_study_file(folder: Path, study: Study, seconds: float) -> None:
         begun = parse_json_object((folder / STUDY).read_text(encoding="utf-8"), STUDY)
     except (OSError, ValueError):  # of an earlier version, or somebody has removed it
         begun = {"question": None}
-    if "question" in begun and not _is_same_question(begun["question"], study.question):
+    if "question" in begun and not is_same_question(begun["question"], study.question):
         begun = describe_study(study)
     ended = {"finished": _now(), "seconds": seconds, "results": digest_results(folder)}
     replace_text(folder / STUDY, format_json({**begun, **ended}) + "\n")
-
-
-def _is_same_question(recorded: object, question: Question) -> bool:
-    """Return whether a recorded question is this one, but for what a run that is resumed may change."""
-    changeable = {"trust", "on_error", "core"} | ({"ego"} if find_ego_kind(question.ego) == "remote" else set())
-    asked = {name: value for name, value in asdict(question).items() if name not in changeable}
-    return isinstance(recorded, Mapping) and all(recorded.get(name) == value for name, value in asked.items())
 
 
 def find_versions() -> dict[str, str]:

@@ -20,10 +20,10 @@ import rare_envs
 from rare_envs.problem import DrivingProblem
 from rare_envs.study import evaluate, run_directory
 from rare_envs.study.errors import BadInput
-from rare_envs.study.journal import JOURNAL, continue_journal, digest_files
+from rare_envs.study.journal import JOURNAL, begin_journal, continue_journal, digest_files
 from rare_envs.study.question import Question, prepare
 from samplers.execution.record_file import RecordFile
-from tests.rare_envs.study.refusals import assert_refused
+from tests.rare_envs.study.refusals import FOLLOWING, assert_refused
 
 Cli = Callable[..., Result]
 FILES = ("result.json", "failures.csv")
@@ -240,6 +240,22 @@ def test_values_of_f_that_were_zeroed_are_refused_and_those_before_them_can_be_k
     done = cli("resume", "run", "--mend", "--json")
     assert done.exit_code in (0, 3), done.stderr
     assert answer(frail / "run") == answer(frail / "whole")
+
+
+@pytest.mark.parametrize("length", [None, 0, 5, 40])
+def test_a_run_that_was_stopped_before_its_first_simulation_says_what_to_do(
+    length: int | None, cli: Cli, frail: Path
+) -> None:
+    words = ("estimate", FOLLOWING, "--method", "mc", "--max-sim", 20, "--horizon", 1, "--out", "run")
+    Path("run").mkdir()
+    if length is not None:
+        begin_journal(Path("run"), Question(env_id=FOLLOWING)).close()
+        whole = Path("run", JOURNAL).read_bytes()
+        Path("run", JOURNAL).write_bytes(whole[:length])
+    refused = cli("resume", "run")
+    assert_refused(refused, "stopped before its first simulations", "ive the command again.")
+    assert cli(*words).exit_code in (0, 3)
+    assert_refused(cli("resume", "run"), "no unfinished run in 'run': it has a finished one (result.json)")
 
 
 def test_an_ego_that_has_changed_is_noticed(frail: Path, risky: str) -> None:

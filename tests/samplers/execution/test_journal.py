@@ -17,7 +17,7 @@ import pytest
 import samplers
 from samplers.execution import journal as journals
 from samplers.execution.journal import JournalFile, JournalRecord, digest_points
-from samplers.execution.record_file import JournalError, RecordFile
+from samplers.execution.record_file import MAGIC, JournalError, NothingRecorded, RecordFile
 from samplers.problem import FloatArray
 
 F = Callable[[FloatArray], FloatArray]
@@ -112,6 +112,21 @@ def test_no_journal_is_taken_for_one(tmp_path: Path) -> None:
         with pytest.raises(JournalError, match="no journal of this version"):
             run(tmp_path / "m")
         (tmp_path / "m").unlink()
+
+
+def test_a_journal_that_was_cut_before_its_first_record_is_begun_anew(tmp_path: Path) -> None:
+    whole = run(tmp_path / "whole", method="mc")
+    JournalFile.create(tmp_path / "head", {"dim": 4, "seed": whole.seed}).close()
+    content = (tmp_path / "head").read_bytes()
+    for length in (0, 1, len(MAGIC) - 1, len(MAGIC), len(MAGIC) + 5, len(content) - 1):
+        path = tmp_path / "cut"
+        path.write_bytes(content[:length])
+        with pytest.raises(NothingRecorded, match="nothing is recorded in it"):
+            JournalFile.open(path)
+        path.write_bytes(content[:length])
+        assert run(path, method="mc") == whole
+        path.write_bytes(content[:length])
+        JournalFile.create(path, {}).remove()
 
 
 def test_creating_replaces_an_empty_journal_alone(tmp_path: Path) -> None:

@@ -98,7 +98,9 @@ def replay_all(run: Path, ego: str | None, trust: bool, as_json: bool) -> None:
     if as_json:
         print_json(_describe_trials(trials, seconds) | {"same": len(trials) - len(different)})
     else:
-        print(f"{len(trials) - len(different):,} of {len(trials):,} failures come to the f that the run recorded.")
+        print(
+            f"{len(trials) - len(different):,} of {len(trials):,} failures that the run lists come to the f recorded."
+        )
         _print_trials(different)
     raise typer.Exit(3 if different else 0)
 

@@ -42,6 +42,6 @@ def export_command(
             raise BadInput(f"Cannot write {str(out)!r}: {error.strerror or error}.") from error
     names = [str(path) for path in files]
     if as_json:
-        print_json({"failure": failure, "failures": recorded.n_failures, "format": format, "files": names})
+        print_json({"failure": failure, "failures": recorded.n_listed, "format": format, "files": names})
     else:
         print(f"Wrote {' and '.join(names)}.")

@@ -50,7 +50,8 @@ def replay_command(
     same = abs(drive.f - recorded.f) <= REPLAY_TOLERANCE
     answer = {
         "failure": failure,
-        "failures": recorded.n_failures,
+        "failures": recorded.n_listed,
+        "n_failures": recorded.n_found,
         "f": drive.f,
         "f_recorded": recorded.f,
         "same": same,

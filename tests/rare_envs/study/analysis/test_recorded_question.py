@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Callable
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from rare_envs.study import Question, prepare, run_into
-from rare_envs.study.analysis.recorded_question import list_code, open_question
+from rare_envs.study.analysis.recorded_question import is_same_question, list_code, open_question
 from rare_envs.study.errors import BadInput
 from rare_envs.study.evaluate import resume
 from rare_envs.study.journal import begin_journal
@@ -49,6 +49,15 @@ CODE = {
     "measure": {"measure": "evil:gap"},
     "environment": {"env_id": f"evil:{FOLLOWING}"},
 }
+
+
+def test_the_address_of_an_ego_elsewhere_may_change_and_other_egos_may_not() -> None:
+    for ego, other, same in (("tcp://a:1", "tcp://b:2", True), ("idm", "human", False)):
+        asked = Question(env_id=FOLLOWING, ego=ego)
+        assert is_same_question(asdict(replace(asked, ego=other)), asked) is same
+    assert is_same_question(asdict(replace(asked, core="numba", trust=True, on_error="failure")), asked)
+    assert not is_same_question(asdict(replace(asked, seed=1)), asked)
+    assert not is_same_question(None, asked)
 
 
 @pytest.fixture(scope="module")
@@ -95,9 +104,9 @@ def test_a_received_run_is_not_resumed_without_trust(name: str, received: Path, 
 
 def test_trust_is_asked_for_once(received: Path) -> None:
     change_question(received, ego="evil:make")
-    assert find_failure(received, 0, trust=True).n_failures > 0
+    assert find_failure(received, 0, trust=True).n_found > 0
     assert Path("was_here").exists()
-    assert find_failure(received, 0).n_failures > 0
+    assert find_failure(received, 0).n_found > 0
     with Path("evil.py").open("a") as file:
         file.write("\nmore = 1\n")
     with pytest.raises(BadInput, match="add --trust"):
@@ -109,7 +118,7 @@ def test_a_run_of_ones_own_needs_no_trust(received: Path, tmp_path: Path) -> Non
     run_into(tmp_path / "mine", prepare(question))
     with Path("evil.py").open("a") as file:
         file.write("\nmended = True\n")
-    assert find_failure(tmp_path / "mine", 0).n_failures > 0
+    assert find_failure(tmp_path / "mine", 0).n_found > 0
 
 
 QUESTIONS: dict[str, Any] = {

@@ -32,6 +32,7 @@ def test_the_answer_is_readable(cli: Cli, risky: str) -> None:
     assert result.exit_code == 0
     for word in ("P[f <= 0] = ", "95 % interval", "c.o.v.", "2,000", "plain Monte Carlo", "idm"):
         assert word in result.stdout
+    assert "the ego runs into the lead: " in result.stdout
     for name, unit in (("ego_speed", "m/s"), ("lead_speed", "m/s"), ("gap", "m")):
         assert any(line.split()[:1] == [name] and unit in line.split() for line in result.stdout.splitlines())
 

@@ -4,7 +4,13 @@ from typing import Any
 
 import pytest
 
-from rare_envs.study.html_report.wording import describe_intervals, describe_rate, format_odds, summarise_answer
+from rare_envs.study.html_report.wording import (
+    describe_intervals,
+    describe_rate,
+    describe_validity,
+    format_odds,
+    summarise_answer,
+)
 
 RESULT: dict[str, Any] = {
     "p": 0.0012,
@@ -32,6 +38,17 @@ def test_an_interval_that_the_events_do_not_determine_is_said_to_be_so() -> None
 def test_no_failure_is_said_with_what_it_leaves_possible() -> None:
     words = summarise_answer({**RESULT, "p": 0.0, "interval": [0.0, 0.001]}, "us101")
     assert words.startswith("None of 4,000 simulations ends in a collision; with 95 % confidence fewer than 1 in 1,000")
+
+
+def test_failures_of_a_search_that_count_for_nothing_are_not_denied() -> None:
+    result = {**RESULT, "p": 0.0, "interval": [0.0, 0.001], "n_failures": 3, "base_draws": 600, "unseen": 0.005}
+    words = summarise_answer(result, "us101")
+    assert words.startswith("Of 4,000 simulations 3 found what ends in a collision, but none of those counts in p")
+    assert "valid unless a failure region with probability above 0.5 % was missed" in describe_validity(result)
+    nothing = describe_validity({**result, "n_failures": 0})
+    assert nothing.startswith("600 draws of ordinary traffic without a failure put p below 0.5 % (one-sided 95 %; ")
+    assert "valid unless a failure region" in describe_validity({**result, "p": 0.0012, "n_failures": 0})
+    assert "no draws of ordinary traffic bound its" in describe_validity(RESULT)
 
 
 @pytest.mark.parametrize(

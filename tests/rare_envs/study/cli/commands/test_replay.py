@@ -38,8 +38,25 @@ def test_a_failure_of_a_run_is_shown(cli: Cli, run: Path, tmp_path: Path) -> Non
             length += film.info["duration"]
     assert length == pytest.approx(1000 * answer["seconds"] + 100 * LAST_FRAME_TICKS, abs=1)  # equal frames are one
     words = cli("replay", run, "--out", tmp_path / "worst.png").stdout
-    for said in ("Failure 0 of", "ego_speed", "the ego into the lead (rear_end", f"Wrote {tmp_path / 'worst.png'}"):
+    n_found = json.loads((run / "result.json").read_text())["n_failures"]
+    for said in (
+        f"Failure 0 of {n_found} found in ",
+        "ego_speed",
+        "the ego into the lead (rear_end",
+        f"Wrote {tmp_path / 'worst.png'}",
+    ):
         assert said in words
+
+
+@pytest.mark.parametrize("more", [(), ("--ego", "idm")])
+def test_the_number_of_failures_is_that_of_the_answer(more: tuple[str, ...], cli: Cli, run: Path) -> None:
+    result = json.loads((run / "result.json").read_text())
+    n_listed = result["n_failures"]
+    (run / "result.json").write_text(json.dumps({**result, "n_failures": 1649}))  # of which the table has the likeliest
+    said = cli("replay", run, *more).stdout
+    assert f"Failure 0 of 1,649 found ({n_listed} of them listed) in {FOLLOWING}" in said
+    answer = json.loads(cli("replay", run, "--json", *more).stdout)
+    assert (answer["failures"], answer["n_failures"]) == (n_listed, 1649)
 
 
 def test_bad_input_is_one_line(cli: Cli, run: Path) -> None:
