@@ -123,8 +123,8 @@ class DrivingProblem:
                 by batch, so another number gives other bits; another number of workers does not.
             core: What simulates: "torch", the reference, for everything; "numba", compiled rollouts, for the scripted
                 scenarios with the IDM or a policy of dense layers as ego and the measure `ttc`, and for the highway
-                with learned drivers, the IDM or one of them as ego, and `ttc` or `lidar_ttc`; "auto" for the compiled
-                ones where they can be had. They differ by rounding; an estimate says which it used
+                with learned drivers, the IDM or one of them as ego, and `ttc`, `lidar_ttc` or `clearance`; "auto" for
+                the compiled ones where they can be had. They differ by rounding; an estimate says which it used
                 (`DrivingProblem.core`).
             **make_kwargs: Further keyword arguments of `gym.make` for this id. Without an `observation` the ego's
                 `observation_space` decides: a `Dict` names the kinds, the space of the lidar stands for "lidar", and

@@ -12,22 +12,24 @@ import torch
 from numpy.typing import NDArray
 
 from rare_envs.control.idm import IDM
-from rare_envs.measures.registry import CLEARANCE, MEASURES
-from rare_envs.measures.terms import find_order
 from rare_envs.scenarios import highway
 from rare_envs.simulation.compiled.failures import NotCompiled, compiler_failures
 from rare_envs.simulation.compiled.highway.dense_driver import DenseDriver, OffersDenseDriver, read_dense_driver
+from rare_envs.simulation.compiled.highway.measure_kinds import (
+    NO_TERMS,
+    ORDERS,
+    count_terms,
+    find_cut,
+    find_measure_kind,
+    find_term_kind,
+)
 
 if TYPE_CHECKING:
-    from rare_envs.simulation.compiled.highway.traffic_rollouts import Found, TrafficRows
+    from rare_envs.simulation.compiled.highway.traffic_slots import Found, Rules, TrafficRows
     from rare_envs.simulation.world import World
 
-DRIVERS_AT_ONCE, EGOS_AT_ONCE = 128, 32
-"""Drivers and egos that are computed side by side: those of 25 highways."""
-NO_TERMS, DISTANCES, BEAM_TIMES, LEAD_TIMES = range(4)
-"""Terms that compiled rollouts can tell apart."""
-ORDERS: dict[int, Any] = {DISTANCES: CLEARANCE, BEAM_TIMES: MEASURES["lidar_ttc"], LEAD_TIMES: MEASURES["ttc"]}
-"""The measures whose terms they are."""
+DRIVERS_AT_ONCE = 128
+"""Drivers around the egos that are computed side by side: those of 25 highways."""
 
 
 class RolloutTerms(NamedTuple):
@@ -78,40 +80,46 @@ class HighwayRollout:
 
     def terms(self, x: NDArray[np.float64], gamma: float) -> RolloutTerms:
         """Return f and terms of scenarios x (B, d) for a threshold of f; raises what a call raises."""
-        measurement = self.world.measurement
-        order, _ = find_order(measurement.episode_measure, measurement.collisions, gamma)
-        return self._drive(x, next(kind for kind, each in ORDERS.items() if each is order))
+        return self._drive(x, find_term_kind(self.world.measurement, gamma))
 
     def _drive(self, x: NDArray[np.float64], kind: int) -> RolloutTerms:
-        drivers, idm = self.drivers(), self.ego if isinstance(self.ego, IDM) else None
-        ego = drivers if isinstance(self.ego, IDM) else self.ego()
+        drivers, ego = self.drivers(), self.ego if isinstance(self.ego, IDM) else self.ego()
         with compiler_failures():
-            from rare_envs.simulation.compiled.compilation import single
-            from rare_envs.simulation.compiled.equations import IDMNumbers
             from rare_envs.simulation.compiled.highway.curved_road import CurvedRoadNumbers
             from rare_envs.simulation.compiled.highway.driver_lanes import DriverBuffers, DriverNumbers
-            from rare_envs.simulation.compiled.highway.traffic_rollouts import Rules, drive_among_learned
+            from rare_envs.simulation.compiled.highway.ego_lanes import EGOS_AT_ONCE, EgoNumbers
+            from rare_envs.simulation.compiled.highway.traffic_rollouts import drive_among_learned
+            from rare_envs.simulation.compiled.highway.traffic_slots import Sight, Slots
 
-            world, clock = self.world, self.world.clock
-            (tick,) = single(clock.dt)
-            by_lidar = world.measurement.episode_measure is MEASURES["lidar_ttc"]
+            vehicles = self.world.scenario.vehicles
             found = self._found(len(x), kind)
             drive_among_learned(
                 self._begin(x),
+                Slots.of(min(DRIVERS_AT_ONCE // (vehicles - 1), EGOS_AT_ONCE), vehicles),
+                Sight.of(vehicles),
                 DriverNumbers.of(drivers),
                 DriverBuffers.of(drivers, DRIVERS_AT_ONCE),
-                DriverNumbers.of(ego),
-                DriverBuffers.of(ego, EGOS_AT_ONCE),
-                IDMNumbers.of(idm or IDM()),
-                CurvedRoadNumbers.of(world.scenario.road),
-                Rules(idm is None, by_lidar, kind, self._cut(kind) * clock.ticks, tick, clock.ticks),
+                EgoNumbers.of(ego, drivers),
+                CurvedRoadNumbers.of(self.world.scenario.road),
+                self._rules(kind),
                 found,
             )
         return RolloutTerms(*found)
 
+    def _rules(self, kind: int) -> Rules:
+        """Return what is simulated and measured, with one of the kinds of terms."""
+        from rare_envs.simulation.compiled.compilation import single
+        from rare_envs.simulation.compiled.highway.traffic_slots import Rules
+
+        clock, measurement = self.world.clock, self.world.measurement
+        measure = find_measure_kind(measurement)
+        assert measure is not None
+        (tick,) = single(clock.dt)
+        return Rules(measure, measurement.collisions == "any", kind, find_cut(kind) * clock.ticks, tick, clock.ticks)
+
     def _begin(self, x: NDArray[np.float64]) -> TrafficRows:
         """Return the traffic of scenarios at time 0."""
-        from rare_envs.simulation.compiled.highway.traffic_rollouts import TrafficRows
+        from rare_envs.simulation.compiled.highway.traffic_slots import TrafficRows
 
         state, background = self.world.start_traffic(torch.from_numpy(np.ascontiguousarray(x)).float())
         assert background is not None
@@ -120,20 +128,14 @@ class HighwayRollout:
 
     def _found(self, rows: int, kind: int) -> Found:
         """Return arrays for what is found."""
-        from rare_envs.simulation.compiled.highway.traffic_rollouts import Found
+        from rare_envs.simulation.compiled.highway.traffic_slots import Found
 
-        others = self.world.scenario.vehicles - 1
-        count = {NO_TERMS: 0, DISTANCES: others, BEAM_TIMES: 2 * others, LEAD_TIMES: others + 1}[kind]
-        parts = 1 if self._cut(kind) == np.inf else 2
+        count = count_terms(kind, self.world.scenario.vehicles)
+        parts = 1 if find_cut(kind) == np.inf else 2
         values = np.full((rows, parts * count), np.inf, dtype=np.float32)
         if parts > 1:
             values[:, count:] = ORDERS[kind].terms.unattained
         return Found(np.empty(rows, dtype=np.float32), values, np.zeros(values.shape, dtype=np.int64))
-
-    def _cut(self, kind: int) -> float:
-        """Return the share of the horizon beyond which a term counts as a late one; infinite without such."""
-        cuts = () if kind == NO_TERMS else ORDERS[kind].terms.cuts
-        return float(cuts[0]) if cuts else np.inf
 
 
 def find_highway_rollout(world: World, ego: Any) -> HighwayRollout:
@@ -171,11 +173,8 @@ def _find_obstacle(world: World) -> str:
     obstacles = {
         f"the scenario {scenario.name!r} with drivers is not compiled": scenario.driven is not highway.driven
         or scenario.road != highway.HIGHWAY.road,
-        f"the measure {measurement.measure!r} is not compiled": all(
-            measurement.episode_measure is not MEASURES[name] for name in ("ttc", "lidar_ttc")
-        ),
+        f"the measure {measurement.measure!r} is not compiled": find_measure_kind(measurement) is None,
         "statistics of episodes are not compiled": measurement.statistics,
-        "collisions of other vehicles are not compiled": measurement.collisions != "ego",
         "parameters of the weather are not compiled": bool(world.columns.weather or world.columns.camera_noise),
     }
     return next((words for words, found in obstacles.items() if found), "")

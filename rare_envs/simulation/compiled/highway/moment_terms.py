@@ -61,22 +61,29 @@ def _nearest_corner(along: float, across: float, cos: float, sin: float) -> floa
 
 @compiled
 def clearances(x: SingleArray, y: SingleArray, heading: SingleArray, enough: SingleArray, found: SingleArray) -> None:
-    """Write the distance of the ego to each other vehicle [m]: `rare_envs.measures.two_dimensional.clearance_terms`.
+    """Write distances [m] of the ego to the others: `rare_envs.measures.two_dimensional.clearance_terms`.
+
+    With more places than others it goes on with the distances of the others: `pair_clearance_terms`.
 
     Args:
         x: In the flat world, shape (N,); likewise the next two.
         y: See x.
         heading: See x.
-        enough: Distances above these need not be exact, shape (N - 1,).
-        found: Shape (N - 1,), written to.
+        enough: Distances above these need not be exact, shape (N - 1,), or (N (N - 1) / 2,) for all pairs.
+        found: Of the same shape, written to.
     """
-    for other in range(1, len(x)):
-        dx, dy = x[other] - x[0], y[other] - y[0]
-        apart = np.sqrt(dx * dx + dy * dy) - _DIAGONAL
-        if apart > enough[other - 1]:
-            found[other - 1] = apart
-        else:
-            found[other - 1] = clearance_between(dx, dy, heading[0], heading[other])
+    pair = 0
+    for one in range(len(x)):
+        for other in range(one + 1, len(x)):
+            if pair == len(found):
+                return
+            dx, dy = x[other] - x[one], y[other] - y[one]
+            apart = np.sqrt(dx * dx + dy * dy) - _DIAGONAL
+            if apart > enough[pair]:
+                found[pair] = apart
+            else:
+                found[pair] = clearance_between(dx, dy, heading[one], heading[other])
+            pair += 1
 
 
 @compiled

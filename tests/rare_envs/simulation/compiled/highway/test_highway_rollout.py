@@ -18,11 +18,17 @@ from rare_envs.simulation.compiled.highway import find_highway_rollout
 HIGHWAY = "rare_envs/Highway-v0"
 
 
+@pytest.mark.parametrize("collisions", ["ego", "any"])
+@pytest.mark.parametrize("measure", ["ttc", "lidar_ttc", "clearance"])
+def test_measures_and_collisions_that_are_compiled(measure, collisions):
+    problem = rare_envs.DrivingProblem(HIGHWAY, measure=measure, collisions=collisions)
+    assert problem.core == "numba" and problem.terms_with_f
+
+
 @pytest.mark.parametrize(
     ("arguments", "reason"),
     [
         ({"measure": "thw"}, "the measure 'thw' is not compiled"),
-        ({"collisions": "any"}, "collisions of other vehicles are not compiled"),
         ({"drivers": "idm"}, "the drivers, a .*, are not compiled"),
         ({"observation": "camera", "weather": True}, "parameters of the weather are not compiled"),
         ({"ego": "noisy:idm"}, "is not compiled"),
@@ -47,12 +53,14 @@ def test_a_policy_among_learned_drivers_is_not_compiled():
         find_highway_rollout(world, lambda: SimpleNamespace(layers=()))
 
 
-def test_a_problem_is_sent_to_other_processes_with_its_core():
-    problem = rare_envs.DrivingProblem(HIGHWAY, noise="fixed", horizon=2.0)
+@pytest.mark.parametrize("measure", ["ttc", "lidar_ttc", "clearance"])
+def test_a_problem_is_sent_to_other_processes_with_its_core_and_measure(measure):
+    problem = rare_envs.DrivingProblem(HIGHWAY, measure=measure, noise="fixed", horizon=2.0)
     x = problem.base.sample(3, np.random.default_rng(0))
+    expected = problem.terms(x)
     sent = pickle.loads(pickle.dumps(problem))
     assert sent.core == "numba"
-    assert np.array_equal(sent.evaluate(x), problem.evaluate(x))
+    assert np.array_equal(sent.evaluate(x), expected.f) and np.array_equal(sent.terms(x).values, expected.values)
 
 
 def test_a_driver_that_is_changed_later_is_simulated_by_torch():

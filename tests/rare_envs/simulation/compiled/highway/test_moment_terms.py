@@ -5,7 +5,7 @@ import torch
 
 from rare_envs.measures import Moment
 from rare_envs.measures.time_to_collision import lidar_ttc, lidar_ttc_terms, ttc_terms
-from rare_envs.measures.two_dimensional import clearance_terms
+from rare_envs.measures.two_dimensional import clearance_terms, pair_clearance_terms
 from rare_envs.sensors.perception import find_vehicles_met, perceive_traffic
 from rare_envs.simulation.compiled.highway import moment_terms
 from rare_envs.simulation.compiled.highway.curved_road import CurvedRoadNumbers, lane_middle
@@ -35,6 +35,15 @@ def test_distances_to_the_other_vehicles():
         moment_terms.clearances(*(field[row] for field in place), np.full(5, np.inf, np.float32), found[row])
     assert np.allclose(found, expected, atol=5e-5)
     assert (expected == np.float32(0.01)).any() and (expected > 5.0).any()
+
+
+def test_distances_of_all_pairs():
+    given = moment()
+    place = [field.numpy() for field in ROAD.to_world(*given.state[:3])]
+    expected, found = pair_clearance_terms(given).numpy(), np.zeros((N, 15), np.float32)
+    for row in range(N):
+        moment_terms.clearances(*(field[row] for field in place), np.full(15, np.inf, np.float32), found[row])
+    assert np.allclose(found, expected, atol=5e-5)
 
 
 def test_distances_that_need_not_be_exact_are_still_too_great():

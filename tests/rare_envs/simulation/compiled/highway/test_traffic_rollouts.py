@@ -17,6 +17,9 @@ CASES = {
     "learned ego": {"measure": "lidar_ttc", "ego": "imitation", "horizon": 4.0},
     "other drivers": {"drivers": "bc", "horizon": 4.0},
     "collisions": {"ego": FAST, "drivers": "bc", "horizon": 8.0},
+    "clearance": {"measure": "clearance", "ego": FAST, "drivers": "bc", "horizon": 8.0},
+    "clearance, learned ego": {"measure": "clearance", "ego": "imitation", "horizon": 4.0},
+    "any collisions": {"measure": "clearance", "collisions": "any", "drivers": "bc", "horizon": 6.0},
 }
 
 
@@ -43,12 +46,22 @@ def test_f_is_that_of_the_torch_simulation(case):
     assert np.array_equal(f == -1.0, expected == -1.0)
     assert (np.abs(f - expected) > 1e-4).mean() <= 0.005  # a beam along a corner may meet it or not
     assert np.median(np.abs(f - expected)) < 1e-5
-    if case == "collisions":
+    if case in ("collisions", "clearance"):
         assert 0.02 < (expected == -1.0).mean() < 0.5
 
 
 @pytest.mark.parametrize(
-    ("case", "gamma"), [("ttc, no noise", 0.0), ("lidar", 0.0), ("collisions", 0.0), ("collisions", 1.5)]
+    ("case", "gamma"),
+    [
+        ("ttc, no noise", 0.0),
+        ("lidar", 0.0),
+        ("collisions", 0.0),
+        ("collisions", 1.5),
+        ("clearance", 0.0),
+        ("clearance, learned ego", 1.5),
+        ("any collisions", 0.0),
+        ("any collisions", 1.5),
+    ],
 )
 def test_terms_are_those_of_the_torch_simulation(case, gamma):
     compiled, reference = problems(case)
@@ -62,7 +75,7 @@ def test_terms_are_those_of_the_torch_simulation(case, gamma):
     assert compiled.terms_with_f
 
 
-@pytest.mark.parametrize("case", ["ttc", "learned ego"])
+@pytest.mark.parametrize("case", ["ttc", "learned ego", "any collisions"])
 def test_a_row_is_the_same_bits_in_any_batch(case):
     problem, _ = problems(case)
     x = points(problem, 60)
@@ -72,8 +85,19 @@ def test_a_row_is_the_same_bits_in_any_batch(case):
     assert np.array_equal(problem.terms(x[7:]).values, whole.values[7:])
 
 
+@pytest.mark.parametrize("case", ["clearance", "clearance, learned ego", "any collisions"])
+def test_distances_and_their_ticks_are_those_of_the_torch_simulation(case):
+    compiled, reference = problems(case)
+    x = points(compiled)
+    found, expected = compiled.terms(x), reference.terms(x)
+    assert np.abs(found.f - expected.f).max() < 5e-5 and np.median(np.abs(found.f - expected.f)) < 1e-6
+    assert np.abs(found.values - expected.values).max() < 2e-4  # at 500 m a single has steps of 3e-5
+    assert np.array_equal(found.ticks, expected.ticks) and np.array_equal(found.least, expected.least)
+    assert 0.02 < (found.f == -1.0).mean() < 0.7
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("case", ["ttc", "collisions", "lidar", "learned ego"])
+@pytest.mark.parametrize("case", ["ttc", "collisions", "lidar", "learned ego", "clearance", "any collisions"])
 def test_f_is_that_of_the_torch_simulation_in_20_000_rollouts(case):
     compiled, reference = problems(case)
     x = points(compiled, 20_000)
