@@ -1,6 +1,7 @@
 """World and scenario space from the keyword arguments of `gym.make`."""
 
 import inspect
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -24,6 +25,16 @@ from rare_envs.simulation.sensing import Sensing
 from rare_envs.simulation.world import World
 
 NO_NEEDS = EgoNeeds()
+CONFIGURATION_ARGUMENTS = {
+    "duration": "horizon",
+    "simulation_frequency": "dt",
+    "policy_frequency": "action",
+    "observation": "observation",
+    "type": "observation or action",
+    "action": "action",
+    "other_vehicles_type": "drivers",
+}
+"""The keyword argument of gym.make that sets what a key of HighwayEnv's configuration tells."""
 
 
 def set_up(
@@ -88,6 +99,8 @@ def set_up(
     scenario = find_scenario(scenario) if isinstance(scenario, str) else scenario
     for name in unknown:
         known = [word for word in inspect.signature(set_up).parameters if word not in ("scenario", "needs", "unknown")]
+        if name == "config":
+            raise TypeError(_describe_configuration(unknown[name]))
         of_reset = name in (parameter.name for parameter in scenario.parameters)
         hint = " (reset takes it as an option)" if of_reset else did_you_mean(name, known)
         env_id = next((each for each, registered in SCENARIOS.items() if registered is scenario), scenario.name)
@@ -161,6 +174,23 @@ def build_space(world: World, base: Distribution, ego_noise: int = 0) -> Scenari
             "have; rename them."
         )
     return ScenarioSpace.of(parameters, join_independent(*distributions))
+
+
+def _describe_configuration(config: Any) -> str:
+    """Return what to write in place of HighwayEnv's argument `config`."""
+    advice = []
+    for name, value in config.items() if isinstance(config, Mapping) else ():
+        argument = CONFIGURATION_ARGUMENTS.get(name)
+        if name == "duration":
+            advice.append(f"horizon={value!r} in place of 'duration'")
+        elif argument:
+            advice.append(f"the argument {argument} in place of {name!r}")
+        else:
+            advice.append(f"nothing in place of {name!r}, which belongs to the scenario or its picture")
+    what_to_do = "; ".join(advice) or "horizon, dt, observation, action or drivers"
+    return (
+        f"Expected keyword arguments of their own, not HighwayEnv's config, got config={config!r}; write {what_to_do}."
+    )
 
 
 def _check_one_of(what: str, value: object, valid: tuple[str, ...]) -> None:

@@ -2,6 +2,7 @@
 
 from typing import Any, NoReturn
 
+from rare_envs.make import CONFIGURATION_ARGUMENTS
 from rare_envs.plugins import did_you_mean
 
 PICTURE_KEYS = frozenset(
@@ -18,17 +19,6 @@ PICTURE_KEYS = frozenset(
     }
 )
 """Keys of HighwayEnv's configuration that change neither traffic nor spaces; they are kept, and the picture is ours."""
-
-_ARGUMENTS = {
-    "duration": "horizon",
-    "simulation_frequency": "dt",
-    "policy_frequency": "action",
-    "observation": "observation",
-    "type": "observation or action",
-    "action": "action",
-    "other_vehicles_type": "drivers",
-}
-"""The keyword argument of gym.make that sets what a key of HighwayEnv tells."""
 
 
 class FixedConfiguration(dict[str, Any]):
@@ -66,7 +56,7 @@ gym.make the argument horizon.
         elif name not in self:
             raise ValueError(f"Unknown key {name!r}{did_you_mean(name, self)} of config; it has {', '.join(self)}.")
         elif self[name] != value:
-            argument = _ARGUMENTS.get(name)
+            argument = CONFIGURATION_ARGUMENTS.get(name)
             advice = f"give gym.make the argument {argument}" if argument else "it belongs to the scenario"
             raise ValueError(
                 f"Expected config[{name!r}] to stay {self[name]!r}, got {value!r}; "

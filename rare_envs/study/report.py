@@ -109,7 +109,20 @@ class Report:
         """Doubts about p: of the method, about the base distribution, the ego's statistics, and f as a function."""
         base = self.estimate.base_uncertainty
         doubts = () if base is None else tuple(f"base distribution: {text}" for text in base.warnings)
-        return (*self.estimate.warnings, *doubts, *self.doubts_of_f)
+        return (*(() if self.is_exact_bound else self.estimate.warnings), *doubts, *self.doubts_of_f)
+
+    @property
+    def is_exact_bound(self) -> bool:
+        """Whether the answer is the upper end: no simulation failed, and all are draws from the base distribution.
+
+        The end is then exact, so that the warning that nothing failed is a remark.
+        """
+        return self.estimate.status is samplers.Status.NO_HITS and self.estimate.base_draws == self.estimate.n_sim
+
+    @property
+    def remarks(self) -> tuple[str, ...]:
+        """Facts about how the run went that cast no doubt on the numbers."""
+        return (*(self.estimate.warnings if self.is_exact_bound else ()), *self.estimate.remarks)
 
     @property
     def doubts_of_f(self) -> tuple[str, ...]:

@@ -128,10 +128,12 @@ class ImportanceSampling(Method):
         to_target = replace(goal, target_cov=target)
         final = yield from draw_after_search(inputs, to_target, search, sampler, base_share, limit, self.batch, rng)
         status = Status.CONVERGED if final.cov <= target else Status.BUDGET
-        warnings = _tilt_warnings(search, goal.gamma, missed)
-        if not final.stopped:
-            warnings += _stop_warnings(status, final.cov, target)
-        return final.outcome(goal, status, warnings)
+        outcome = final.outcome(goal, status, _tilt_warnings(search, goal.gamma, missed))
+        if (
+            final.stopped or status is not Status.BUDGET or goal.target_cov is not None
+        ):  # a goal's target: `Run` says it
+            return outcome
+        return outcome.remark_first(f"All draws were used at a c.o.v. of {final.cov:.3g}, above {target:.3g}.")
 
     def _search(
         self, inputs: Inputs, goal: Goal, rng: np.random.Generator
@@ -186,10 +188,3 @@ def _tilt_warnings(search: Search, gamma: float, missed: float) -> list[str]:
         where = f"{100 * missed:.0f} % of the failing points found lie outside the tilted distribution"
         return [f"{where}: draws from the base distribution replace it."]
     return search_warnings(search, gamma)
-
-
-def _stop_warnings(status: Status, cov: float, target: float) -> list[str]:
-    """Return the warning about draws that were used up before the target was met."""
-    if status is not Status.BUDGET:
-        return []
-    return [f"All draws were used at a c.o.v. of {cov:.3g}, above the target {target:.3g}."]

@@ -75,15 +75,27 @@ def common_options(
 
 
 @app.command("list")
-def list_command(as_json: JsonOption = False) -> None:
-    """Show environments with their parameters, methods, egos, measures and base distributions."""
+def list_command(
+    what: Annotated[
+        str | None,
+        typer.Argument(
+            metavar="[WHAT]", help="environments, methods, egos, drivers, measures, weather, all, or an environment."
+        ),
+    ] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Show the names of environments, methods, egos, drivers and measures; with one of these words, what they mean."""
     from rare_envs.study.cli.catalogue import list_names
-    from rare_envs.study.cli.printing import print_catalogue
+    from rare_envs.study.cli.catalogue_table import check_kind, print_details, print_overview
 
+    entries = list_names()
+    chosen = None if what is None else check_kind(entries, what)
     if as_json:
-        print_json(list_names())
+        print_json(entries)
+    elif chosen is None:
+        print_overview(entries)
     else:
-        print_catalogue(list_names())
+        print_details(entries, chosen)
 
 
 app.command("estimate")(estimate_command)

@@ -83,5 +83,5 @@ def list_names() -> dict[str, Any]:
 
 def _first_line(documented: object) -> str:
     """Return the first line of a docstring, as a noun: "Return the gap ..." becomes "Gap ..."."""
-    line = (documented.__doc__ or "").strip().partition("\n")[0].removeprefix("Return the ")
+    line = (documented.__doc__ or "").strip().partition("\n")[0].removeprefix("Return ").removeprefix("the ")
     return line[:1].upper() + line[1:]

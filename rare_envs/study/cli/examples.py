@@ -6,7 +6,7 @@ import typer
 
 EXAMPLES: dict[str, tuple[str, ...]] = {
     "": ("rare-envs list", "rare-envs estimate rare_envs/CutIn-v0 --ego idm --max-sim 3000"),
-    "list": ("rare-envs list", "rare-envs list --json"),
+    "list": ("rare-envs list", "rare-envs list egos", "rare-envs list CutIn-v0"),
     "estimate": (
         "rare-envs estimate rare_envs/CutIn-v0 --ego ppo.zip --out runs/cutin",
         "rare-envs estimate rare_envs/CarFollowing-v0 --method mc --max-sim 1e5",

@@ -164,7 +164,7 @@ class QuestionOptions(WorldOptions):
     """Options of a question: method, measure, threshold."""
 
     method: Annotated[
-        str, typer.Option(help="Estimation method; see rare-envs list.", autocompletion=complete_method)
+        str, typer.Option(help="Estimation method; see rare-envs list methods.", autocompletion=complete_method)
     ] = "auto"
     measure: Annotated[
         str, typer.Option(help="Safety measure f, small is dangerous: a name, module:function or stl:FORMULA.")
@@ -181,7 +181,8 @@ class EstimateOptions(QuestionOptions):
     """Options of `estimate` alone."""
 
     ego: Annotated[
-        str, typer.Option(help="A name, a .zip or .onnx, module:function, tcp://..., noisy:EGO; see rare-envs list.")
+        str,
+        typer.Option(help="A name, a .zip or .onnx, module:function, tcp://..., noisy:EGO; see rare-envs list egos."),
     ] = "idm"
     algo: AlgoOption = None
     stats: StatsOption = None
@@ -238,7 +239,7 @@ class RiskOptions:
     base: Annotated[
         list[str] | None, typer.Option(help="SCENARIO=NAME or FILE, in place of the site's base; may be repeated.")
     ] = None
-    method: Annotated[str, typer.Option(help="Estimation method; see rare-envs list.")] = "auto"
+    method: Annotated[str, typer.Option(help="Estimation method; see rare-envs list methods.")] = "auto"
     max_sim: Annotated[
         int | None,
         typer.Option(

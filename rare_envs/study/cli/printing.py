@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 from rich.console import Console
-from rich.table import Table
 
 import samplers
 from rare_envs.exposure import describe_human_contacts
@@ -21,45 +20,6 @@ from samplers.problem import FloatArray
 
 ENOUGH, MANY = 3.0, 300_000
 """Simulations over p that show with 95 % a region of failure as probable as all that was found; what they may cost."""
-
-
-def print_catalogue(entries: dict[str, Any]) -> None:
-    """Print what `list_names` returns as tables."""
-    console = Console(highlight=False)
-    for env_id, environment in entries["environments"].items():
-        console.print(_make_parameter_table(env_id, environment["parameters"]))
-        console.print(f"  vehicles, each of which can be an agent: {', '.join(environment['vehicles'])}")
-        console.print(f"  base distributions: {', '.join(environment['bases'])}, or your own JSON file")
-        around = environment["drivers"] or "a script, unless told otherwise"
-        console.print(f"  drivers around the ego: {around}")
-        added = ", ".join(f"{each['name']} ({each['size']:,} values)" for each in environment["of_learned_drivers"])
-        console.print(f"  learned drivers add: {added}")
-        console.print(f"  with HighwayEnv's observations and actions: {environment['kinematics_id']}\n")
-    console.print(
-        "HighwayEnv's own, for estimate, and with its settings for rare_envs.highway_env_problem in Python: "
-        f"{', '.join(entries['highway_env'])}\n"
-    )
-    console.print(_make_parameter_table("Weather, which --weather adds for egos with a camera", entries["weather"]))
-    titles = {
-        "methods": "Methods",
-        "egos": "Egos",
-        "drivers": "Drivers around the ego (their weights and noise become parameters)",
-        "measures": "Safety measures",
-    }
-    for kind, title in titles.items():
-        table = Table("name", "what it is", title=title, title_justify="left", title_style="bold")
-        for name, text in entries[kind].items():
-            table.add_row(name, text)
-        console.print(table)
-
-
-def _make_parameter_table(title: str, parameters: list[dict[str, Any]]) -> Table:
-    """Return a table of names, units, ranges and meanings."""
-    table = Table("parameter", "unit", "range", "meaning", title=title, title_justify="left", title_style="bold")
-    for each in parameters:
-        name = each["name"] if each["size"] == 1 else f"{each['name']} ({each['size']} values)"
-        table.add_row(name, each["unit"], f"{each['low']:g} to {each['high']:g}", each["meaning"])
-    return table
 
 
 def print_report(report: Report, out: Path | None = None) -> None:
@@ -109,9 +69,9 @@ def print_report(report: Report, out: Path | None = None) -> None:
     if isinstance(report.sensitivity, samplers.Sensitivity):
         for line in indent_lines(report.sensitivity):
             console.print(line)
-    for warning in (*estimate.warnings, *report.doubts_of_f):
+    for warning in (*(() if report.is_exact_bound else estimate.warnings), *report.doubts_of_f):
         console.print(f"warning: {warning}", style="yellow")
-    for remark in estimate.remarks:
+    for remark in report.remarks:
         console.print(f"remark: {remark}")
     for note in report.notes:
         console.print(f"note: {note}")

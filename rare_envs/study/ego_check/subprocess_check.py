@@ -112,9 +112,11 @@ def check_ego(request: EgoCheckRequest) -> list[Finding]:
         if reasons and not request.trust:
             return [report_failure("origin", "; ".join(reasons), TRUST_ADVICE)]
         place = f" ({'; '.join(reasons)})" if reasons else ""
-        harmless = "opened here is only what is known to be harmless"
-        advice = f"you said --trust: {TRUST_CONSEQUENCE}" if request.trust else harmless
-        findings.append(report_warning("origin", f"a Stable-Baselines3 .zip can hold code{place}", advice, False))
+        held = f"a Stable-Baselines3 .zip can hold code{place}"
+        if request.trust:
+            findings.append(report_warning("origin", held, f"you said --trust: {TRUST_CONSEQUENCE}", False))
+        else:
+            findings.append(report_pass("origin", f"{held}; opened here is only what is known to be harmless"))
     return findings + list(_check_in_subprocess(request))
 
 

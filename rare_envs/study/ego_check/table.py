@@ -36,6 +36,7 @@ def print_findings(findings: list[Finding], title: str, everything: bool = False
         table.add_row(Text(each.check), status, Text(each.found), Text(each.advice))
     passed = [each.check for each in findings if each not in shown]
     if passed:
-        table.add_row(Text(f"{len(passed)} others"), Text("pass", style=STYLES["pass"]), Text(", ".join(passed)), "")
+        count = f"{len(passed)} other{'s' if len(passed) > 1 else ''}"
+        table.add_row(Text(count), Text("pass", style=STYLES["pass"]), Text(", ".join(passed)), "")
     console.print(table)
     console.print(VERDICTS[exit_code(findings)], markup=False)

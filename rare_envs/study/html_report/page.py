@@ -141,7 +141,8 @@ def _describe_changes(study: LoadedStudy) -> list[str]:
 
 def list_doubts(result: Mapping[str, Any]) -> list[str]:
     """Return all warnings of a run: of the method, of its base distribution, of the ego's statistics, and of f."""
-    doubts = [str(text) for text in result.get("warnings") or []]
+    exact_bound = result.get("status") == "no_hits" and result.get("doubtful") is False  # none of the base draws failed
+    doubts = [] if exact_bound else [str(text) for text in result.get("warnings") or []]
     base = result.get("base_uncertainty")
     if isinstance(base, dict):
         doubts += [f"base distribution: {text}" for text in base.get("warnings") or []]

@@ -57,7 +57,14 @@ def test_stops_at_the_relative_half_width():
 def test_says_where_the_draws_did_not_suffice():
     result = samplers.estimate(half_space().problem, IS(half_width=0.01), seed=1, max_sim=4000)
     assert (result.n_sim, result.status) == (4000, "budget")
-    assert any("All draws were used" in text for text in result.warnings)
+    assert any("All draws were used" in text for text in result.remarks) and not result.warnings
+
+
+def test_an_unmet_target_is_said_once_and_as_of_all_methods():
+    result = samplers.estimate(half_space().problem, IS(), seed=1, max_sim=4000, target_cov=0.01)
+    assert result.status == "budget"
+    assert [text for text in result.remarks if "c.o.v." in text] == list(result.remarks[-1:])
+    assert result.remarks[-1].startswith("The target c.o.v. 0.01 was not met: 0.0") and not result.warnings
 
 
 @pytest.mark.parametrize("reference", [four_branches(3.0)], ids=lambda r: r.name)

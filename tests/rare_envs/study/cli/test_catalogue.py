@@ -23,7 +23,7 @@ Cli = Callable[..., Result]
 
 @pytest.mark.filterwarnings("ignore:.*is out of date")  # HighwayEnv keeps its old versions
 def test_list_shows_what_there_is(cli: Cli) -> None:
-    shown = cli("list").stdout
+    shown = cli("list", "all").stdout
     entries = json.loads(cli("list", "--json").stdout)
     assert list(entries["environments"]) == list(SCENARIOS)
     assert list(entries["methods"]) == list(samplers.METHODS)
@@ -60,4 +60,4 @@ def test_list_shows_what_there_is(cli: Cli) -> None:
 def test_the_list_has_the_weather(cli: Cli) -> None:
     listed = json.loads(cli("list", "--json").stdout)["weather"]
     assert [each["name"] for each in listed] == ["fog", "sun_elevation", "sun_azimuth", "sensor_noise"]
-    assert "sun_elevation" in cli("list").stdout
+    assert "sun_elevation" in cli("list", "weather").stdout

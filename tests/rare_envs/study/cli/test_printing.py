@@ -15,6 +15,7 @@ from typer.testing import Result
 
 from rare_envs import study
 from rare_envs.study.cli.printing import print_report
+from rare_envs.study.html_report.page import list_doubts
 
 Cli = Callable[..., Result]
 
@@ -37,14 +38,26 @@ def test_the_answer_is_readable(cli: Cli, risky: str) -> None:
         assert any(line.split()[:1] == [name] and unit in line.split() for line in result.stdout.splitlines())
 
 
-def test_a_doubtful_number_says_so_and_exits_with_3(cli: Cli, safe: str, tmp_path: Path) -> None:
-    result = cli(*SMALL, "--base", safe, "--out", tmp_path / "run")
+def test_a_doubtful_number_says_so_and_exits_with_3(cli: Cli, safe: str) -> None:
+    words = ("estimate", FOLLOWING, "--method", "adss", "--max-sim", 2000, "--base", safe)
+    result = cli(*words)
     assert result.exit_code == 3
     assert "warning: " in result.stdout
     assert "no failure found" in result.stdout
-    assert json.loads((tmp_path / "run" / "result.json").read_text())["doubtful"] is True
+    answer = cli(*words, "--json")
+    assert answer.exit_code == 3 and json.loads(answer.stdout)["doubtful"] is True
+
+
+def test_an_upper_bound_by_plain_monte_carlo_is_an_answer(cli: Cli, safe: str, tmp_path: Path) -> None:
+    result = cli(*SMALL, "--base", safe, "--out", tmp_path / "run")
+    assert result.exit_code == 0
+    assert "warning: " not in result.stdout
+    assert "remark: None of 2,000 simulations failed: p = 0 with a one-sided interval." in result.stdout
+    assert "2,000 base draws without a failure put p below 1.5e-03" in result.stdout
+    written = json.loads((tmp_path / "run" / "result.json").read_text())
+    assert written["doubtful"] is False and list_doubts(written) == []
+    assert written["interval"][1] == pytest.approx(1 - 0.025 ** (1 / 2000))
     assert (tmp_path / "run" / "plot.png").stat().st_size > 10_000
-    assert cli(*SMALL, "--base", safe, "--json").exit_code == 3
 
 
 def test_what_to_check_is_said_where_something_may_be_missed(cli: Cli, here: Path, risky: str, safe: str) -> None:

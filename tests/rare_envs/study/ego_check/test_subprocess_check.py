@@ -14,7 +14,7 @@ from typer.testing import Result
 import agents
 from agents.sb3.file_trust import find_origin_risks
 from rare_envs.study.ego_check.findings import Finding, exit_code
-from rare_envs.study.ego_check.subprocess_check import EgoCheckRequest, run_checks
+from rare_envs.study.ego_check.subprocess_check import EgoCheckRequest, check_ego, run_checks
 
 Cli = Callable[..., Result]
 ENV = "rare_envs/CarFollowing-v0"
@@ -284,6 +284,14 @@ def test_a_zip_that_others_can_write_to_is_refused_by_every_command(what: str, s
         ValueError, match=r"is writable by everybody.*copy it to a folder of your own.*code is in it runs"
     ):
         agents.load_ego(saved)
+
+
+def test_a_zip_of_ones_own_is_no_warning(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("rare_envs.study.ego_check.subprocess_check._check_in_subprocess", lambda _: iter(()))
+    (origin,) = check_ego(EgoCheckRequest("ego.zip", ENV))
+    assert (origin.check, origin.status) == ("origin", "pass")
+    (trusted,) = check_ego(EgoCheckRequest("ego.zip", ENV, trust=True))
+    assert trusted.status == "warn" and "whatever code is in it runs" in trusted.advice
 
 
 def test_trust_opens_it_all_the_same(saved: Path, cli: Cli) -> None:
