@@ -48,8 +48,12 @@ class ScriptedStep:
         (29.5, 0.92)
     """
 
-    def __init__(self, world: World) -> None:
+    def __init__(self, world: World, required: bool = False) -> None:
         """Take the numbers of a world.
+
+        Args:
+            world: The world.
+            required: Whether states in double precision are refused, not left to torch.
 
         Raises:
             NotCompiled: Its steps are not compiled, or numba is missing.
@@ -70,7 +74,7 @@ class ScriptedStep:
             }
             road, dt = world.scenario.road, world.clock.dt
             self._numbers = (IDMNumbers.of(CUTTER_IDM), RoadNumbers.of(road), single(dt)[0])
-            self._number, self._dt = scripts[script], dt
+            self._number, self._dt, self._required = scripts[script], dt, required
             self._try(world)
 
     def _try(self, world: World) -> None:
@@ -88,8 +92,11 @@ class ScriptedStep:
             action: Of the ego, in [-1, 1], shape (B, 2), or numbers of discrete actions, shape (B,).
 
         Returns:
-            The episodes a tick later, and the reward; None for an action that has to be refused, and for episodes in
-            which vehicles were commanded.
+            The episodes a tick later, and the reward; None for an action that has to be refused, for episodes in
+            which vehicles were commanded, and for states in double precision.
+
+        Raises:
+            ValueError: The state is in double precision, and compiled steps are required.
         """
         from rare_envs.simulation.compiled.tick_kernel import tick_scripted  # not kept: a step is copied and sent
 
@@ -100,6 +107,11 @@ class ScriptedStep:
         traffic = np.stack([field.numpy() for field in old[:4]])
         theta, f, collided = old.theta.numpy(), episode.measure_state.numpy(), episode.collided.numpy()
         if traffic.dtype != np.float32 or f.dtype != np.float32:
+            if self._required:
+                raise ValueError(
+                    "core='numba' steps states in single precision, got one in "
+                    f"{max(traffic.dtype, f.dtype)}; make the environment with core='torch'."
+                )
             return None
         contiguous = np.ascontiguousarray
         theta = contiguous(theta) if theta.shape[1] else traffic[0]
@@ -133,7 +145,7 @@ def find_scripted_step(world: World, core: str = "auto") -> ScriptedStep | None:
     if core == "torch":
         return None
     try:
-        return ScriptedStep(world)
+        return ScriptedStep(world, required=core == "numba")
     except NotCompiled as reason:
         if core == "numba":
             raise ValueError(f"core='numba' cannot simulate this: {reason}.") from reason

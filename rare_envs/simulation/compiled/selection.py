@@ -98,6 +98,10 @@ def find_compiled_rollout(world: World, ego: CompiledEgo) -> CompiledRollout | H
         rare_envs.simulation.compiled.failures.NotCompiled: the script of the scenario 'highway' is not compiled
     """
     if world.background is not None:
+        policy = None if isinstance(ego, IDM) else ego()
+        obstacle = _find_policy_obstacle(world, policy) if isinstance(policy, DensePolicy) else ""
+        if obstacle:
+            raise NotCompiled(obstacle)
         found = find_highway_rollout(world, ego)
         _import_compiler()
         return found

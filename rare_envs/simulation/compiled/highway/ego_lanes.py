@@ -1,38 +1,79 @@
-"""Egos among learned drivers, side by side, compiled by numba: the IDM or a learned driver."""
+"""Egos among learned drivers, side by side, compiled by numba: the IDM, a learned driver or a policy."""
 
 from typing import NamedTuple
 
 import numpy as np
 
 from rare_envs.control.idm import IDM
-from rare_envs.simulation.compiled.compilation import compiled
+from rare_envs.simulation.compiled.compilation import compiled, single
+from rare_envs.simulation.compiled.dense_policy import DensePolicy
 from rare_envs.simulation.compiled.equations import IDMNumbers, idm_acceleration, steer_to_line, steering_for
 from rare_envs.simulation.compiled.highway.curved_road import CurvedRoadNumbers, lane_middle
 from rare_envs.simulation.compiled.highway.dense_driver import DenseDriver
 from rare_envs.simulation.compiled.highway.driver_lanes import DriverBuffers, DriverNumbers, decide_action
-from rare_envs.simulation.compiled.highway.traffic_slots import Slots, TrafficRows
+from rare_envs.simulation.compiled.highway.traffic_slots import NO_ROW, Slots, TrafficRows
+from rare_envs.simulation.compiled.networks import LANES, NetworkNumbers, apply_network
+from rare_envs.simulation.compiled.policy_rollouts import PolicyNumbers, decode_row, observe_row
+from rare_envs.simulation.compiled.rollouts import SingleArray
 
 EGOS_AT_ONCE = 32
 """Egos that are computed side by side."""
+BY_RULE, BY_DRIVER, BY_POLICY = range(3)
+"""Kinds of egos: the IDM, a `DenseDriver`, a `DensePolicy`."""
+(_ZERO,) = single(0.0)
+_NO_POLICY = DensePolicy(((np.zeros((4, 4)), np.zeros(4)), (np.zeros((2, 4)), np.zeros(2))), "tanh")
 
 
 class EgoNumbers(NamedTuple):
-    """An ego, with arrays for those of all slots."""
+    """An ego, with arrays for those of all slots; what is not of its kind is of no meaning."""
 
-    learned: bool
-    """Whether it is a learned driver, else the IDM."""
+    kind: int
     idm: IDMNumbers
     driver: DriverNumbers
-    """The learned driver; with the IDM any."""
+    """The learned driver."""
     buffers: DriverBuffers
+    """Of the learned driver."""
+    policy: PolicyNumbers
+    network: NetworkNumbers
+    """Of the policy."""
+    values: SingleArray
+    """Of the network, shape (widest layer, `LANES`)."""
+    spare: SingleArray
+    actions: SingleArray
+    """Of the policy: acceleration [m/s^2] and steering angle [rad], NaN if unknown, shape (slots, 2)."""
 
     @classmethod
-    def of(cls, ego: IDM | DenseDriver, any_driver: DenseDriver) -> "EgoNumbers":
+    def of(cls, ego: IDM | DenseDriver | DensePolicy, any_driver: DenseDriver) -> "EgoNumbers":
         """Return the numbers of an ego."""
-        driver = any_driver if isinstance(ego, IDM) else ego
-        idm = ego if isinstance(ego, IDM) else IDM()
-        buffers = DriverBuffers.of(driver, EGOS_AT_ONCE)
-        return cls(not isinstance(ego, IDM), IDMNumbers.of(idm), DriverNumbers.of(driver), buffers)
+        driver = ego if isinstance(ego, DenseDriver) else any_driver
+        policy = ego if isinstance(ego, DensePolicy) else _NO_POLICY
+        network = NetworkNumbers.of(policy)
+        values, spare = np.zeros((2, network.widths.max(), LANES), dtype=np.float32)
+        return cls(
+            BY_RULE if isinstance(ego, IDM) else BY_DRIVER if isinstance(ego, DenseDriver) else BY_POLICY,
+            IDMNumbers.of(ego if isinstance(ego, IDM) else IDM()),
+            DriverNumbers.of(driver),
+            DriverBuffers.of(driver, EGOS_AT_ONCE),
+            PolicyNumbers.of(policy),
+            network,
+            values,
+            spare,
+            np.zeros((EGOS_AT_ONCE, 2), dtype=np.float32),
+        )
+
+
+@compiled
+def apply_policies(rows: TrafficRows, slots: Slots, ego: EgoNumbers) -> None:
+    """Write the actions of the policies of all slots, by the observation `features`."""
+    observed = 4 * rows.x.shape[1] - 1
+    ego.values[observed : ego.network.widths[0]] = _ZERO  # the last layers have written there
+    for slot in range(len(slots.row)):
+        row = slots.row[slot]
+        if row != NO_ROW:
+            observe_row(rows.x[row], rows.y[row], rows.heading[row], rows.speed[row], ego.policy, ego.values, slot)
+    outputs = apply_network(ego.network, ego.values, ego.spare)
+    for slot in range(len(slots.row)):
+        ego.actions[slot, 0], ego.actions[slot, 1] = decode_row(outputs[:, slot], ego.policy)
 
 
 @compiled
@@ -42,7 +83,9 @@ def decide_ego(
     """Return acceleration [m/s^2] and steering angle [rad] of the ego of a slot, whose network has been applied."""
     row = slots.row[slot]
     y, heading, speed = rows.y[row, 0], rows.heading[row, 0], rows.speed[row, 0]
-    if ego.learned:
+    if ego.kind == BY_POLICY:
+        return ego.actions[slot, 0], ego.actions[slot, 1]
+    if ego.kind == BY_DRIVER:
         return steer_as_learned(ego, slot, speed, slots.poses.curvature[slot, 0])
     acceleration = idm_acceleration(ego.idm, speed, slots.gap[slot], slots.closing[slot], ego.idm.desired_speed)
     return acceleration, steer_to_line(y - lane_middle(y, road), heading, speed)

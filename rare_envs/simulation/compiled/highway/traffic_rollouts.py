@@ -7,7 +7,7 @@ Drivers side by side do not depend on each other, so f of a row is the same bits
 
 import numpy as np
 
-from rare_envs.simulation.compiled.compilation import compiled
+from rare_envs.simulation.compiled.compilation import compiled, single
 from rare_envs.simulation.compiled.highway.curved_road import (
     CurvedRoadNumbers,
     bicycle_on_curve,
@@ -23,7 +23,13 @@ from rare_envs.simulation.compiled.highway.driver_lanes import (
     write_beam_features,
     write_own_features,
 )
-from rare_envs.simulation.compiled.highway.ego_lanes import EgoNumbers, decide_ego
+from rare_envs.simulation.compiled.highway.ego_lanes import (
+    BY_DRIVER,
+    BY_POLICY,
+    EgoNumbers,
+    apply_policies,
+    decide_ego,
+)
 from rare_envs.simulation.compiled.highway.lidar_lanes import measure_beams
 from rare_envs.simulation.compiled.highway.measure_kinds import BY_LIDAR
 from rare_envs.simulation.compiled.highway.row_measures import has_collided, measure_rows, record_collision
@@ -43,6 +49,7 @@ from rare_envs.simulation.compiled.rollouts import SingleArray
 
 FIRST_DRAW = 2
 """Draws before those of the ticks."""
+(_UNKNOWN,) = single(np.nan)
 
 
 @compiled
@@ -70,7 +77,7 @@ def drive_among_learned(
         rules: What is simulated and measured.
         found: Written to.
     """
-    ego_looks, next_row = ego.learned or rules.measure == BY_LIDAR, 0
+    ego_looks, next_row = ego.kind == BY_DRIVER or rules.measure == BY_LIDAR, 0
     while True:
         next_row = fill_slots(rows, next_row, slots, buffers, road, found)
         if are_free(slots):
@@ -84,7 +91,9 @@ def drive_among_learned(
         measure_beams(sight.seen, sight.beams)
         observe_drivers(rows, slots, sight.beams, 1, driver, buffers, road)
         apply_drivers(driver, buffers)
-        if ego.learned:
+        if ego.kind == BY_POLICY:
+            apply_policies(rows, slots, ego)
+        elif ego.kind == BY_DRIVER:
             observe_drivers(rows, slots, sight.ego_beams, 0, ego.driver, ego.buffers, road)
             apply_drivers(ego.driver, ego.buffers)
         move_rows(rows, slots, driver, buffers, ego, road, rules, found)
@@ -133,12 +142,19 @@ def move_rows(
     rules: Rules,
     found: Found,
 ) -> None:
-    """Move all rows by a tick, and free the slots of those with a collision; arguments as of `drive_among_learned`."""
+    """Move all rows by a tick, and free the slots of those with a collision; arguments as of `drive_among_learned`.
+
+    f is NaN where the actions of a policy are not finite.
+    """
     for slot in range(len(slots.row)):
         row = slots.row[slot]
         if row == NO_ROW:
             continue
-        moved = move_ego(rows, slots, slot, ego, road, rules.dt)
+        acceleration, steering = decide_ego(rows, slots, slot, ego, road)
+        if acceleration != acceleration:
+            found.f[row], slots.row[slot] = _UNKNOWN, NO_ROW
+            continue
+        moved = move_ego(rows, slots, slot, acceleration, steering, rules.dt)
         move_drivers(rows, slots, slot, driver, buffers, rules.dt)
         rows.x[row, 0], rows.y[row, 0], rows.heading[row, 0], rows.speed[row, 0] = moved
         place_row(rows, row, slot, slots.poses, road)
@@ -150,11 +166,10 @@ def move_rows(
 
 @compiled
 def move_ego(
-    rows: TrafficRows, slots: Slots, slot: int, ego: EgoNumbers, road: CurvedRoadNumbers, dt: float
+    rows: TrafficRows, slots: Slots, slot: int, acceleration: float, steering: float, dt: float
 ) -> tuple[float, float, float, float]:
     """Return x, y, heading and speed of the ego of a slot after a tick."""
     row = slots.row[slot]
-    acceleration, steering = decide_ego(rows, slots, slot, ego, road)
     return bicycle_on_curve(
         rows.x[row, 0],
         rows.y[row, 0],

@@ -5,6 +5,7 @@ import importlib.util
 import gymnasium as gym
 import numpy as np
 import pytest
+import torch
 from gymnasium.vector import AutoresetMode
 
 import rare_envs  # noqa: F401  (registers its ids)
@@ -80,6 +81,20 @@ def test_batches_are_those_of_torch(mode):
         assert_same(info, expected_info, 1e-4)
         ended += int(found[2].sum())
     assert ended > 3
+
+
+@pytest.mark.parametrize("core", ["auto", "numba"])
+def test_states_in_double_precision_are_left_to_torch_or_refused(core):
+    env = gym.make("rare_envs/CutIn-v0", core=core).unwrapped
+    env.reset(seed=0)
+    with torch.inference_mode():
+        env._episode = env.world.start(torch.from_numpy(env._x[None]))
+    if core == "numba":
+        with pytest.raises(ValueError, match=r"single precision, got one in float64; make .* with core='torch'\.$"):
+            env.step(np.zeros(2, np.float32))
+    else:
+        env.step(np.zeros(2, np.float32))
+        assert env._episode.state.x.dtype == torch.float64
 
 
 def test_actions_are_refused_as_by_torch():

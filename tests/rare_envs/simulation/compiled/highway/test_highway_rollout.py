@@ -2,7 +2,6 @@
 
 import pickle
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -45,12 +44,6 @@ def test_another_motion_of_the_drivers_is_not_compiled():
     scenario = replace(highway.HIGHWAY, driven=lambda state, action, dt: highway.driven(state, action, dt))
     with pytest.raises(NotCompiled, match="the scenario 'highway' with drivers is not compiled"):
         find_highway_rollout(World(scenario, background=agents.load_driver("mgail")), IDM())
-
-
-def test_a_policy_among_learned_drivers_is_not_compiled():
-    world = World(highway.HIGHWAY, background=agents.load_driver("mgail"))
-    with pytest.raises(NotCompiled, match="a policy among learned drivers is not compiled"):
-        find_highway_rollout(world, lambda: SimpleNamespace(layers=()))
 
 
 @pytest.mark.parametrize("measure", ["ttc", "lidar_ttc", "clearance"])

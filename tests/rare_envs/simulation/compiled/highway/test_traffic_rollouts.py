@@ -2,8 +2,11 @@
 
 from functools import cache
 
+import gymnasium as gym
 import numpy as np
 import pytest
+import torch
+from stable_baselines3 import PPO
 
 import rare_envs
 from rare_envs.control import IDM
@@ -21,6 +24,47 @@ CASES = {
     "clearance, learned ego": {"measure": "clearance", "ego": "imitation", "horizon": 4.0},
     "any collisions": {"measure": "clearance", "collisions": "any", "drivers": "bc", "horizon": 6.0},
 }
+
+
+@cache
+def policy(choices=False, steady=0.05):
+    """An untrained policy with actions as large as those of a trained one, which leaves the road now and then."""
+    env = gym.make("rare_envs/Highway-v0", noise=False, action="discrete" if choices else "continuous")
+    made = PPO("MlpPolicy", env, device="cpu", seed=0)
+    with torch.no_grad():
+        made.policy.action_net.weight.mul_(30.0)
+        if not choices:
+            made.policy.action_net.weight[1].mul_(steady)
+    return made
+
+
+@pytest.mark.parametrize("choices", [False, True])
+def test_policies_drive_as_in_the_torch_simulation(choices):
+    compiled, reference = (
+        rare_envs.DrivingProblem(
+            "rare_envs/Highway-v0", ego=policy(choices), action="discrete" if choices else None, horizon=4.0, core=core
+        )
+        for core in ("numba", "torch")
+    )
+    x = points(compiled, 60)
+    found, expected = compiled.terms(x), reference.terms(x)
+    assert np.array_equal(found.f, compiled.evaluate(x)) and np.array_equal(found.f[:3], compiled.evaluate(x[:3]))
+    assert np.array_equal(found.f == -1.0, expected.f == -1.0) and 0.02 < (found.f == -1.0).mean() < 0.9
+    assert np.median(np.abs(found.f - expected.f)) < 1e-5 and (np.abs(found.f - expected.f) > 1e-3).mean() <= 0.05
+    assert (np.abs(found.values - expected.values) > 1e-2).mean() <= 0.02
+
+
+def test_what_a_policy_cannot_say_is_told_by_torch():
+    ego = policy(steady=0.049)
+    with torch.no_grad():
+        ego.policy.action_net.bias[0] = torch.nan
+    problem = rare_envs.DrivingProblem("rare_envs/Highway-v0", ego=ego, horizon=1.0, core="numba")
+    x = problem.base.sample(2, np.random.default_rng(0))
+    terms, reasons = problem.attempt_terms(x)
+    assert np.isnan(terms.f).all() and np.isnan(terms.values).all()
+    assert set(reasons) == {0, 1} and "nan" in reasons[0]
+    with pytest.raises(ValueError, match="nan"):
+        problem.terms(x)
 
 
 @cache
