@@ -17,7 +17,7 @@ RUN pip install --no-cache-dir --index-url "$TORCH_INDEX" "$(grep '^torch==' /tm
     && rm -r /wheels /tmp/constraints.txt
 ARG USER_ID=1000
 RUN useradd --uid "$USER_ID" --create-home user && mkdir -p /data/runs && chown -R user /data
-USER user
+USER $USER_ID
 WORKDIR /data
 ENTRYPOINT ["rare-envs"]
 CMD ["--help"]

@@ -55,7 +55,8 @@ def demo(steps: int, out: Path) -> None:
     """
     torch.set_num_threads(1)  # batches this small are slower on more
     print(f"1. Training a PPO ego in {ENV_ID} for {steps:,} steps.", flush=True)
-    ego = train_ego(ENV_ID, algo="ppo", steps=steps, seed=0, out=out / "ego.zip")
+    # torch's steps, so that the ego is the same with and without numba
+    ego = train_ego(ENV_ID, algo="ppo", steps=steps, seed=0, out=out / "ego.zip", core="torch")
 
     print("2. Estimating how often it collides: find failures, then estimate from draws made for them.", flush=True)
     study = prepare(Question(env_id=ENV_ID, ego=str(ego), seed=0, trust=True))  # it has just been written

@@ -10,7 +10,7 @@ LINES = (Path(__file__).parents[1] / "Dockerfile").read_text(encoding="utf-8").s
 
 def test_the_folder_of_runs_belongs_to_the_user() -> None:
     instructions = [line for line in LINES if not line.startswith("#")]
-    as_root = "\n".join(instructions[: instructions.index("USER user")])
+    as_root = "\n".join(instructions[: instructions.index("USER $USER_ID")])
     assert re.search(r"mkdir -p /data/runs && chown -R user /data$", as_root, re.MULTILINE)
     assert "WORKDIR /data" in instructions
 

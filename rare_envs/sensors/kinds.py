@@ -5,6 +5,11 @@ from typing import Any
 
 OBSERVATIONS = ("features", "lidar", "kinematics", "camera", "speed")
 """Kinds of observation by name."""
+ELSEWHERE = (
+    "; HighwayEnv's own (GrayscaleObservation, OccupancyGrid, Kinematics of other sizes) are in "
+    "rare_envs.highway_env_problem and HighwayEnv's ids, such as highway-fast-v0"
+)
+"""Where to go with the observations that HighwayEnv has and this package has not."""
 
 
 def read_kinds(observation: Any) -> str:
@@ -24,7 +29,7 @@ def read_kinds(observation: Any) -> str:
     if not isinstance(names, list | tuple) or not names or not all(name in OBSERVATIONS for name in names):
         raise ValueError(
             f"Unknown observation {observation!r}; expected one of {', '.join(map(repr, OBSERVATIONS))}, or several, "
-            'such as "camera+lidar".'
+            f'such as "camera+lidar"{ELSEWHERE}.'
         )
     if len(set(names)) < len(names):
         raise ValueError(f"Expected different observations, got {observation!r}.")

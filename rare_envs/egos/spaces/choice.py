@@ -9,15 +9,10 @@ from gymnasium import spaces
 
 from rare_envs.control.actions import DISCRETE_ACTIONS
 from rare_envs.egos.wrappers import find_frame_stacking
-from rare_envs.sensors.kinds import OBSERVATIONS, read_kinds
+from rare_envs.sensors.kinds import ELSEWHERE, OBSERVATIONS, read_kinds
 from rare_envs.simulation.ego_interface import EgoNeeds
 from rare_envs.simulation.observation import observation_space
 
-ELSEWHERE = (
-    "; HighwayEnv's own (GrayscaleObservation, OccupancyGrid, Kinematics of other sizes) are in "
-    "rare_envs.highway_env_problem and HighwayEnv's ids, such as highway-fast-v0"
-)
-"""Where to go with the observations that HighwayEnv has and this package has not."""
 _COLOUR_CHANNELS = (3, 6, 9, 12)
 """Channels of one to four coloured frames side by side."""
 

@@ -22,6 +22,12 @@ def test_other_observations_are_refused(observation: object) -> None:
         read_kinds(observation)
 
 
+@pytest.mark.parametrize("observation", ["OccupancyGrid", "GrayscaleObservation", {"type": "Kinematics"}])
+def test_those_of_highway_env_have_another_place(observation: object) -> None:
+    with pytest.raises(ValueError, match=r"expected one of .*highway_env_problem and HighwayEnv's ids"):
+        read_kinds(observation)
+
+
 def test_functions_go_to_one_or_to_each() -> None:
     one = np.arange(3.0)
     several = {"a": one, "b": np.ones((3, 2))}
