@@ -89,11 +89,18 @@ class CombinedRounds:
         f, x = (np.concatenate(parts) for parts in zip(*((one.terms.f, one.x) for one in self.rounds), strict=True))
         return Draws.from_outcomes(f, np.concatenate(scaled), x, self.gamma)
 
-    def interval(self, confidence: float, base_share: float, cov: float) -> tuple[float, float]:
-        """Return the log-normal interval; with t quantiles and Bernstein's bound where few draws carry p."""
+    def interval(self, confidence: float, base_share: float, cov: float, ceiling: float) -> tuple[float, float]:
+        """Return the log-normal interval; with t quantiles and Bernstein's bound where few draws carry p.
+
+        Args:
+            confidence: Nominal coverage.
+            base_share: Share of base draws in every round.
+            cov: C.o.v. of p.
+            ceiling: Upper end of p by base draws; it stands in for Bernstein's bound where that is larger.
+        """
         factors = self.shares / np.array([len(one.log_weights) for one in self.rounds])
         largest = float(factors.max() * sum(len(one.log_weights) for one in self.rounds)) / base_share
-        return weighted_interval(self.draws, confidence, largest, cov)
+        return weighted_interval(self.draws, confidence, largest, cov, ceiling)
 
     def share_of_others(self, pursued: list[int]) -> float:
         """Return the share of p in failures whose least term was not pursued, and in points without an outcome."""

@@ -5,13 +5,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from samplers.methods.two_stage.mixture.subspace_em import GroupedPoints, fit_subspace_mixture
+from samplers.methods.two_stage.mixture.subspace_em import GroupedPoints, SubspaceMixture, fit_subspace_mixture
 from samplers.methods.two_stage.terms.history import TermHistory
 from samplers.methods.two_stage.terms.law import ComponentGroup, TermLaw
 from samplers.methods.two_stage.terms.settings import LawSettings, RoundSettings
 from samplers.methods.two_stage.terms.walks import Directions
 from samplers.problem import FloatArray
-from samplers.proposals.components import SubspaceGaussian
+from samplers.proposals.components import SubspaceGaussian, log_ratios
+from samplers.proposals.em import posterior
 from samplers.statistics.weights import effective_sample_size, normalise_weights
 
 POWER_STEPS = 20
@@ -72,13 +73,30 @@ def fit_law(
     settings: LawSettings,
     rng: np.random.Generator,
 ) -> TermLaw:
-    """Return the proposal fitted to weighted points u (n, d), with guards around the heaviest of them too."""
-    weights = temper_weights(log_weights, settings.fit_ess)
+    """Return the proposal fitted to weighted points u (n, d), with guards around the heaviest of them too.
+
+    The covariances are those of many points, whose weights are tempered for it; the means and the shares follow fewer
+    and heavier points.
+    """
+    z = u @ axes
     heaviest = np.argsort(-log_weights, kind="stable")[: settings.max_heavy]
-    points = GroupedPoints(u @ axes, weights, 1 / float(weights @ weights), np.arange(len(u)))
-    fit = fit_subspace_mixture(points, settings.max_bumps, rng)
     around = np.concatenate([u[heaviest], ends])[: settings.max_ends]
-    return build_law(axes, fit.components, fit.weights, around @ axes, guards @ axes, settings)
+    many = temper_weights(log_weights, settings.shape_ess)
+    points = GroupedPoints(z, many, 1 / float(many @ many), np.arange(len(z)))
+    mixture = fit_subspace_mixture(points, settings.max_bumps, rng)
+    bumps, shares = _move(mixture, z, temper_weights(log_weights, settings.mean_ess))
+    return build_law(axes, bumps, shares, around @ axes, guards @ axes, settings)
+
+
+def _move(mixture: SubspaceMixture, z: FloatArray, weights: FloatArray) -> tuple[list[SubspaceGaussian], FloatArray]:
+    """Return the components with the means that weighted points z (n, r) have in each, and their shares of them."""
+    shares = posterior(log_ratios(mixture.components, z) + np.log(mixture.weights)[:, None]) * weights
+    mass = shares.sum(axis=1)
+    moved = [
+        SubspaceGaussian(one.axes, one.axes.T @ (share @ z / m), one.variance) if m > 0 else one
+        for one, share, m in zip(mixture.components, shares, mass, strict=True)
+    ]
+    return moved, mass / mass.sum()
 
 
 def build_law(

@@ -32,7 +32,7 @@ from samplers.methods.two_stage.terms.settings import DEFAULT_TERM_SETTINGS, Ter
 from samplers.methods.two_stage.terms.space import TermSimulator
 from samplers.methods.two_stage.terms.walks import choose_starts, choose_terms, count_walks, walk_downhill
 from samplers.problem import Inputs
-from samplers.statistics.intervals import binomial_cov
+from samplers.statistics.intervals import binomial_cov, clopper_pearson
 from samplers.statistics.weights import effective_sample_size
 from samplers.trace import Level, Status
 
@@ -71,10 +71,15 @@ class SearchState:
     trace: tuple[Level, ...] = ()
     finals: tuple[FinalRound, ...] = ()
     base_draws: int = 0
-    base_rate: float = 0.0
-    """Share of the base draws that fail."""
+    base_failures: int = 0
+    """Base draws that fail."""
     last_rate: float = 0.0
     """Effective failures for each draw of the last round."""
+
+    @property
+    def base_rate(self) -> float:
+        """Share of the base draws that fail."""
+        return self.base_failures / max(self.base_draws, 1)
 
 
 def search_terms(
@@ -118,8 +123,9 @@ def _draw_base(search: TermSearch) -> SimulationSteps[SearchState]:
     n = min(max(int(rounds.base * search.budget), rounds.min_base), rounds.max_base)
     u = search.rng.standard_normal((n, search.simulator.inputs.dim))
     terms = yield from search.simulator.terms(u)
-    share = float((terms.f <= search.goal.gamma).mean())
-    state = SearchState(TermHistory.of_base_draws(u, terms), base_draws=n, base_rate=share)
+    failures = int((terms.f <= search.goal.gamma).sum())
+    share = failures / n
+    state = SearchState(TermHistory.of_base_draws(u, terms), base_draws=n, base_failures=failures)
     return _record(search, state, share, share, n, binomial_cov(share, n))
 
 
@@ -169,6 +175,7 @@ def _draw_round(
         state,
         history=state.history.add(u, terms, proposal),
         base_draws=state.base_draws + int((strata == 0).sum()),
+        base_failures=state.base_failures + int(fails[strata == 0].sum()),
         last_rate=ess / n,
     )
     p = float(drawn.y(gamma).mean())
@@ -239,7 +246,7 @@ def _conclude(search: TermSearch, state: SearchState, stopped: bool) -> Outcome:
     status = Status.CONVERGED if len(draws.f) else Status.NO_HITS
     return Outcome(
         p=combined.p,
-        interval=combined.interval(goal.confidence, settings.rounds.base_share, cov),
+        interval=combined.interval(goal.confidence, settings.rounds.base_share, cov, _ceiling(search, state)),
         cov=cov,
         status=Status.STOPPED if stopped else status,
         warnings=tuple(doubt(combined, [one.number for one in state.pursued], settings.doubts)),
@@ -250,6 +257,11 @@ def _conclude(search: TermSearch, state: SearchState, stopped: bool) -> Outcome:
     )
 
 
+def _ceiling(search: TermSearch, state: SearchState) -> float:
+    """Return the upper end of p by the base draws of all rounds alone, which no proposal has chosen."""
+    return clopper_pearson(state.base_failures, state.base_draws, search.goal.confidence)[1]
+
+
 def _estimate_early(search: TermSearch, state: SearchState) -> Outcome:
     """Return what all draws from known proposals say, for a run that ends before its estimate."""
     state, history = _close_trace(search, state), state.history
@@ -258,7 +270,9 @@ def _estimate_early(search: TermSearch, state: SearchState) -> Outcome:
     draws = Draws.from_outcomes(history.terms.f, history.log_weights + np.log(n), x, search.goal.gamma)
     return Outcome(
         p=draws.p,
-        interval=weighted_interval(draws, search.goal.confidence, n / history.n_base, draws.cov),
+        interval=weighted_interval(
+            draws, search.goal.confidence, n / history.n_base, draws.cov, _ceiling(search, state)
+        ),
         cov=draws.cov,
         status=Status.STOPPED,
         warnings=tuple(weight_warnings(draws)),

@@ -74,12 +74,16 @@ class TransformSlopes:
             return gradients
         if self._groups is None:
             self._find_pattern(u[:PATTERN_POINTS])
-        return np.array([self._pull_back(point, g) for point, g in zip(u, gradients, strict=True)])
+        assert self._groups is not None
+        result = gradients.copy()  # noise, where dx / du = I
+        slopes = self._differences(u, [self._moved[group] for group in self._groups])
+        for group, slope in zip(self._groups, slopes, strict=True):
+            result[:, self._moved[group]] = (slope * gradients) @ self._pattern[group].T
+        return result
 
     def _find_pattern(self, u: FloatArray) -> None:
         """Find which coordinates of x each moved coordinate of u changes, and groups of them that do not meet."""
-        changed = [self._differences(point, list(self._moved[:, None])) != 0 for point in u]
-        self._pattern = np.logical_or.reduce(changed)
+        self._pattern = (self._differences(u, list(self._moved[:, None])) != 0).any(axis=1)
         groups, taken = list[list[int]](), list[NDArray[np.bool_]]()
         for number, row in enumerate(self._pattern):
             k = next((k for k, seen in enumerate(taken) if not (seen & row).any()), len(groups))
@@ -91,18 +95,10 @@ class TransformSlopes:
         self._groups = [np.array(group) for group in groups]
 
     def _differences(self, u: FloatArray, groups: list[NDArray[np.int64]]) -> FloatArray:
-        """Return central differences of T at u (d,), with the coordinates of each group moved together, (k, d)."""
-        steps = np.zeros((len(groups), len(u)))
+        """Return central differences of T at u (n, d), with the coordinates of each group moved together, (k, n, d)."""
+        steps = np.zeros((len(groups), 1, u.shape[1]))
         for row, group in zip(steps, groups, strict=True):
-            row[group] = DIFFERENCE
-        x = self._base.from_standard_normal(np.concatenate([u + steps, u - steps]))
-        return np.asarray((x[: len(groups)] - x[len(groups) :]) / (2 * DIFFERENCE))
-
-    def _pull_back(self, u: FloatArray, gradient: FloatArray) -> FloatArray:
-        """Return J' g at one point, with J = dx / du."""
-        assert self._groups is not None
-        result = gradient.copy()  # noise, where J = I
-        slopes = self._differences(u, [self._moved[group] for group in self._groups])
-        for group, slope in zip(self._groups, slopes, strict=True):
-            result[self._moved[group]] = (self._pattern[group] * slope) @ gradient
-        return result
+            row[0, group] = DIFFERENCE
+        x = self._base.from_standard_normal(np.concatenate([u + steps, u - steps]).reshape(-1, u.shape[1]))
+        ahead, behind = x.reshape(2, len(groups), *u.shape)
+        return np.asarray((ahead - behind) / (2 * DIFFERENCE))

@@ -46,8 +46,16 @@ def test_rounds_that_differ_raise_the_variance():
 def test_without_a_failure_the_interval_is_one_sided():
     combined = CombinedRounds((final_round(np.zeros(100)),), 0.0)
     assert (combined.p, combined.cov(1.5)) == (0.0, np.inf)
-    low, high = combined.interval(0.95, 0.04, np.inf)
+    low, high = combined.interval(0.95, 0.04, np.inf, 1.0)
     assert low == 0.0 < high
+
+
+def test_base_draws_bound_p_where_few_draws_carry_it():
+    """Of 100 draws 3 fail: Bernstein's bound is 7 / 3 x 25 x log(80) / 99 = 2.6 and more, base draws without a failure
+    say 0.004."""
+    combined = CombinedRounds((final_round(np.repeat([1e-4, 0.0], [3, 97])),), 0.0)
+    assert combined.interval(0.95, 0.04, 0.6, 1.0)[1] == 1.0
+    assert combined.interval(0.95, 0.04, 0.6, 0.004)[1] == 0.004
 
 
 def test_failures_of_terms_that_nobody_pursued_are_told():
