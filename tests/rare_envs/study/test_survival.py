@@ -36,6 +36,8 @@ WORDS = ["--method", "mc", "--max-sim", "6000", "--gamma", "1", "--horizon", "2"
 TABLES = ("episodes.parquet", "failures.csv", "result.json", "study.json")
 PAUSE = 0.03
 """Seconds after a chunk: 21 kills within 0.05 s of a chunk, or 0.3 s of the start, leave most of the 120 chunks."""
+EXECUTORS = ("local", "futures", "ray")
+CHUNK = ("--chunk", str(TILE))
 KILLS = (1, 2, 3, 4, 5, 6, 8, 10, 12)
 """Changes of files in the final writes before which a run is killed."""
 
@@ -87,6 +89,14 @@ def whole(tmp_path_factory: pytest.TempPathFactory, base: str) -> Path:
     """The folder of an undisturbed run."""
     folder = tmp_path_factory.mktemp("whole")
     finish(folder, "estimate", FOLLOWING, "--base", base, *WORDS, "--out", "run")
+    return folder / "run"
+
+
+@pytest.fixture(scope="module")
+def whole_in_chunks(tmp_path_factory: pytest.TempPathFactory, base: str) -> Path:
+    """The same of a run in the chunks of workers, made without them."""
+    folder = tmp_path_factory.mktemp("whole")
+    finish(folder, "estimate", FOLLOWING, "--base", base, *WORDS, *CHUNK, "--out", "run")
     return folder / "run"
 
 
@@ -147,19 +157,23 @@ def test_killed_at_random_times_it_gives_the_same_files(kills: int, tmp_path: Pa
     assert_same_files(tmp_path / "run", whole, *TABLES)
 
 
-@pytest.mark.parametrize("name", [case(name) for name in ("local", "futures", "ray")])
-def test_killed_under_every_executor_it_gives_the_same_files(name: str, tmp_path: Path, base: str) -> None:
-    """The driver is killed 21 times, in turn here and under an executor, then five times in the final writes."""
-    chunk = ("--chunk", str(TILE))
-    finish(tmp_path, "estimate", FOLLOWING, "--base", base, *WORDS, *chunk, "--out", "whole")
-    kill_and_resume(tmp_path, base, np.random.default_rng(22), 21, chunk, lambda number: name if number % 3 else None)
-    assert_same_files(tmp_path / "run", tmp_path / "whole", *TABLES)
-    for kill_at in KILLS[::2]:
-        shutil.rmtree(tmp_path / "run")
-        words = ("estimate", FOLLOWING, "--base", base, *WORDS, *chunk, "--out", "run")
-        assert kill_in_final_writes(tmp_path, kill_at, *words, executor=name)
-        finish(tmp_path, "resume", "run", executor=name)
-        assert_same_files(tmp_path / "run", tmp_path / "whole", *TABLES)
+@pytest.mark.parametrize("name", [case(name) for name in EXECUTORS])
+def test_killed_under_every_executor_it_gives_the_same_files(
+    name: str, tmp_path: Path, base: str, whole_in_chunks: Path
+) -> None:
+    """The driver is killed 21 times, in turn here and under an executor."""
+    kill_and_resume(tmp_path, base, np.random.default_rng(22), 21, CHUNK, lambda number: name if number % 3 else None)
+    assert_same_files(tmp_path / "run", whole_in_chunks, *TABLES)
+
+
+@pytest.mark.parametrize(("name", "kill_at"), [case(name, kill_at) for name in EXECUTORS for kill_at in KILLS[::2]])
+def test_killed_under_every_executor_in_the_final_writes_it_gives_the_same_files(
+    name: str, kill_at: int, tmp_path: Path, base: str, whole_in_chunks: Path
+) -> None:
+    words = ("estimate", FOLLOWING, "--base", base, *WORDS, *CHUNK, "--out", "run")
+    assert kill_in_final_writes(tmp_path, kill_at, *words, executor=name)
+    finish(tmp_path, "resume", "run", executor=name)
+    assert_same_files(tmp_path / "run", whole_in_chunks, *TABLES)
 
 
 @pytest.mark.parametrize("kill_at", [pytest.param(k, marks=[] if k == 3 else pytest.mark.slow) for k in KILLS])
