@@ -248,7 +248,7 @@ def _run(folder: Path, study: Study, journal: JournalFile, progress: bool, execu
     except UnwrittenResults as error:
         raise UnwrittenResults(f"{error}{_resume_hint(journal, folder)}", error.report) from error
     except BadInput as error:
-        if not journal.n:
+        if not journal.has_simulations:
             journal.remove()
             (target / STUDY).unlink(missing_ok=True)
         raise BadInput(f"{error}{_resume_hint(journal, folder)}") from error
@@ -273,6 +273,7 @@ def _write(folder: Path, report: Report) -> None:
 
 def _resume_hint(journal: JournalFile, folder: Path) -> str:
     """Return the number of simulations kept and the command that continues the run."""
-    if not journal.n or not journal.kept:
+    if not journal.has_simulations or not journal.kept:
         return ""
-    return f" {journal.n:,} simulations are kept; go on with: rare-envs resume {folder}"
+    kept = f"{journal.n:,} simulations are" if journal.n else "What was simulated is"
+    return f" {kept} kept; go on with: rare-envs resume {folder}"

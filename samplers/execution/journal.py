@@ -89,6 +89,11 @@ class JournalFile:
         """Whether all simulations so far are in a file that is still there."""
         return not self._waiting and self._records.exists
 
+    @property
+    def has_simulations(self) -> bool:
+        """Whether there are finished simulations, read, written or still to be read."""
+        return self.n > 0 or self._records.has_more
+
     @classmethod
     def create(cls, path: Path, head: dict[str, Any], replace: bool = False) -> JournalFile:
         """Begin a journal.

@@ -85,6 +85,11 @@ class RecordFile:
         except OSError:
             return False
 
+    @property
+    def has_more(self) -> bool:
+        """Whether something stands behind the last record that was read or written; not of a closed file."""
+        return not self._file.closed and self.size > self._end
+
     def clear(self) -> None:
         """Remove all records."""
         self._file.truncate(0)

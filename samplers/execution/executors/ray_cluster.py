@@ -63,7 +63,7 @@ class RayCluster:
 
         Raises:
             ValueError: Ray is not installed, or the work cannot be sent.
-            ConnectionError: There is no cluster at the address.
+            ExecutorError: There is no cluster at the address, or none can be started.
         """
         try:
             import ray
@@ -72,10 +72,7 @@ class RayCluster:
         packed = pack_work(SeededWork(work, seed))
         started = not ray.is_initialized()
         if started:
-            words: dict[str, Any] = {"include_dashboard": False} if self.address is None else {}
-            if self.address is None and self.workers is not None:
-                words["num_cpus"] = self.workers
-            ray.init(address=self.address or "local", log_to_driver=False, logging_level="error", **words)
+            self._start(ray)
         pool = _RayPool(ray, self, packed)
         try:
             yield pool
@@ -83,6 +80,22 @@ class RayCluster:
             pool.close()
             if started:
                 ray.shutdown()
+
+    def _start(self, ray: Any) -> None:
+        """Connect to the cluster at the address, or start one here.
+
+        Raises:
+            ExecutorError: That fails, for whatever reason.
+        """
+        words: dict[str, Any] = {"include_dashboard": False} if self.address is None else {}
+        if self.address is None and self.workers is not None:
+            words["num_cpus"] = self.workers
+        try:
+            ray.init(address=self.address or "local", log_to_driver=False, logging_level="error", **words)
+        except Exception as error:  # a busy machine, a wrong address, another version of Ray: each has its own
+            ray.shutdown()
+            what = "Ray does not start" if self.address is None else f"No Ray cluster answers at {self.address!r}"
+            raise ExecutorError(f"{what} ({' '.join(describe(error).split())}).") from error
 
 
 class _RayPool:

@@ -22,6 +22,7 @@ from rare_envs.study import evaluate, run_directory
 from rare_envs.study.errors import BadInput
 from rare_envs.study.journal import JOURNAL, begin_journal, continue_journal, digest_files
 from rare_envs.study.question import Question, prepare
+from samplers.execution.executors import ExecutorError
 from samplers.execution.record_file import RecordFile
 from tests.rare_envs.study.refusals import FOLLOWING, assert_refused
 
@@ -240,6 +241,30 @@ def test_values_of_f_that_were_zeroed_are_refused_and_those_before_them_can_be_k
     done = cli("resume", "run", "--mend", "--json")
     assert done.exit_code in (0, 3), done.stderr
     assert answer(frail / "run") == answer(frail / "whole")
+
+
+class Unstarted:
+    """An executor that cannot work."""
+
+    def open(self, work: Any, seed: int) -> Any:
+        raise ExecutorError("No workers come.")
+
+
+def test_an_executor_that_does_not_start_costs_a_resumed_run_nothing(frail: Path, risky: str) -> None:
+    asked = question(risky, "mc")
+    evaluate.run_into(frail / "whole", prepare(asked))
+    (frail / "left").write_text("150")
+    with pytest.raises(BadInput, match="are kept"):
+        evaluate.run_into(frail / "run", prepare(asked))
+    kept = (frail / "run" / JOURNAL).read_bytes()
+    with pytest.raises(BadInput, match=r"No workers come\. What was simulated is kept; go on with: rare-envs resume"):
+        evaluate.resume(frail / "run", executor=Unstarted())
+    assert (frail / "run" / JOURNAL).read_bytes() == kept
+    evaluate.resume(frail / "run")
+    assert answer(frail / "run") == answer(frail / "whole")
+    with pytest.raises(BadInput, match=r"No workers come\.$"):
+        evaluate.run_into(frail / "new", prepare(asked), executor=Unstarted())
+    assert not list((frail / "new").iterdir())
 
 
 @pytest.mark.parametrize("length", [None, 0, 5, 40])

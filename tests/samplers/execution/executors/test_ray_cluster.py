@@ -32,6 +32,27 @@ def test_without_ray_there_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
         estimate(problem(), "ray", 10)
 
 
+@pytest.mark.parametrize(
+    ("address", "said"), [(None, "Ray does not start"), ("a:1", "No Ray cluster answers at 'a:1'")]
+)
+def test_a_cluster_that_does_not_start_is_one_line(
+    address: str | None, said: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import sys
+
+    ended: list[bool] = []
+
+    def init(**words: Any) -> None:
+        raise OSError("The current node timed out during startup.\n  See the logs.")
+
+    fake = SimpleNamespace(init=init, is_initialized=lambda: False, shutdown=lambda: ended.append(True))
+    monkeypatch.setitem(sys.modules, "ray", fake)
+    with pytest.raises(samplers.ExecutorError) as refused:
+        estimate(problem(), samplers.RayCluster(address), 10)
+    assert str(refused.value) == f"{said} (OSError: The current node timed out during startup. See the logs.)."
+    assert ended == [True]
+
+
 class FakeRay:
     """What the pool uses of Ray, with a thread for every task; a task that is cancelled is lost."""
 
