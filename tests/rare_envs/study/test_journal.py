@@ -264,7 +264,7 @@ def test_an_executor_that_does_not_start_costs_a_resumed_run_nothing(frail: Path
     assert answer(frail / "run") == answer(frail / "whole")
     with pytest.raises(BadInput, match=r"No workers come\.$"):
         evaluate.run_into(frail / "new", prepare(asked), executor=Unstarted())
-    assert not list((frail / "new").iterdir())
+    assert not (frail / "new").exists()
 
 
 @pytest.mark.parametrize("length", [None, 0, 5, 40])
