@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Mapping, Sequence
-from functools import cache
-from importlib import resources
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -19,25 +16,8 @@ from rare_envs.study.reproduction.page import render_reproduction
 from samplers.benchmark.runs import about
 from samplers.serialization import to_json_value
 
-SIMULATING_PACKAGES = ("rare_envs", "samplers", "agents")
 REPRODUCTION_FILE, REPRODUCTION_PAGE = "reproduction.json", "reproduction.html"
 _LIBRARIES = ("torch", "numba", "gymnasium")
-
-
-@cache
-def digest_code() -> str:
-    """Return a digest of the code and weights that runs come from: other ones may give other numbers at the same seed.
-
-    Example:
-        >>> len(digest_code())
-        16
-    """
-    digest = hashlib.blake2b(digest_size=8)
-    for package in SIMULATING_PACKAGES:
-        folder = Path(str(resources.files(package)))
-        for path in sorted(path for end in ("*.py", "*.safetensors") for path in folder.rglob(end)):
-            digest.update(path.read_bytes())
-    return digest.hexdigest()
 
 
 def make_record(

@@ -46,7 +46,7 @@ def format_leaderboard(result: Mapping[str, Any], most: int | None = None) -> st
         "",
         f"{plan['runs']} runs of each method on {len(plan['problems'])} problems, budgets of "
         f"{_join(f'{each:,}' for each in plan['budgets'])} simulations, seeds from {plan['seed']}. "
-        f"rare_envs {about['rare_envs']}, NumPy {about['numpy']}, SciPy {about['scipy']}, "
+        f"rare_envs {about['rare_envs']} (code {about['code']}), NumPy {about['numpy']}, SciPy {about['scipy']}, "
         f"{''.join(f'{name} {version}, ' for name, version in about['libraries'].items())}Python {about['python']}, "
         f"{about['processor']}.",
         "",

@@ -11,6 +11,7 @@ from typing import Any
 import rare_envs
 from rare_envs.files import replace_text
 from rare_envs.json_text import format_json
+from rare_envs.study.execution.code_digest import digest_code
 from rare_envs.study.execution.run_lines import RunLines
 from rare_envs.study.sampler_benchmark.leaderboard import format_leaderboard
 from rare_envs.study.sampler_benchmark.problems import ALL_PROBLEMS, GROUPS
@@ -98,7 +99,7 @@ def run_study(
         What `benchmark.json` has: machine and versions, cells, faults, power of the warnings, runs.
 
     Raises:
-        BadInput: The folder has runs of another version of the package, or damaged ones.
+        BadInput: The folder has runs of other code, or damaged ones.
     """
     out.mkdir(parents=True, exist_ok=True)
     lines = _open_runs(out / RUNS_FILE)
@@ -115,7 +116,10 @@ def summarise_study(plan: BenchmarkPlan, runs: Sequence[MethodRun]) -> dict[str,
     return to_json_value(  # type: ignore[no-any-return]  # a dict in, a dict out
         {
             "about": about(
-                rare_envs=rare_envs.__version__, libraries=find_library_versions(plan.methods), plan=asdict(plan)
+                rare_envs=rare_envs.__version__,
+                code=digest_code(),
+                libraries=find_library_versions(plan.methods),
+                plan=asdict(plan),
             ),
             "problems": {name: _describe_problem(name) for name in plan.problems},
             "cells": [
@@ -138,14 +142,14 @@ def read_runs(file: Path) -> list[MethodRun]:
     """Return the runs of a file, none if there is no such file.
 
     Raises:
-        BadInput: It is damaged, or of another version of the package.
+        BadInput: It is damaged, or of other code.
     """
     return _open_runs(file).read()
 
 
 def _open_runs(file: Path) -> RunLines[Job, MethodRun]:
     """Return the runs of a file, and how they are read and written."""
-    return RunLines(file, {"rare_envs": rare_envs.__version__}, _parse_run, asdict, _key, _key)
+    return RunLines(file, {"rare_envs": rare_envs.__version__, "code": digest_code()}, _parse_run, asdict, _key, _key)
 
 
 def _parse_run(content: dict[str, Any]) -> MethodRun:

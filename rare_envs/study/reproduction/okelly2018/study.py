@@ -10,6 +10,7 @@ import numpy as np
 
 import rare_envs
 import samplers
+from rare_envs.study.execution.code_digest import digest_code
 from rare_envs.study.execution.run_lines import RunLines, drop_torn_line
 from rare_envs.study.reproduction.okelly2018.rollouts import (
     ChunkJob,
@@ -33,7 +34,6 @@ from rare_envs.study.reproduction.okelly2018.search import (
     make_base,
     take_step,
 )
-from rare_envs.study.reproduction.record import digest_code
 from samplers.methods.cross_entropy import Product
 
 HIGHWAY_ENV_ID = "rare_envs/Highway-v0"

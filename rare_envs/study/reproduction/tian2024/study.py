@@ -9,9 +9,10 @@ from pathlib import Path
 from typing import Any
 
 import rare_envs
+from rare_envs.study.execution.code_digest import digest_code
 from rare_envs.study.execution.run_lines import RunLines
 from rare_envs.study.reproduction.folder import check_reproduction_folder
-from rare_envs.study.reproduction.record import digest_code, make_record, write_record
+from rare_envs.study.reproduction.record import make_record, write_record
 from rare_envs.study.reproduction.tian2024.catalogue import (
     ADSS_SIMULATIONS,
     EPISODE_SECONDS,

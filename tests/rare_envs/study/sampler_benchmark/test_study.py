@@ -93,7 +93,7 @@ def test_what_is_named_twice_is_run_once() -> None:
 
 @pytest.mark.parametrize(
     ("text", "said"),
-    [("{}\n", "line 1 is no run"), ('{"rare_envs": "0.0"}\nx\n', "line 2 is no run"), ("[]\n", "line 1 is no run")],
+    [("{}\n", "line 1 is no run"), ('{"rare_envs": "0.0", "code": "0"}\nx\n', "line 2 is no run"), ("[]\n", "line 1 is no run")],
 )
 def test_damaged_files_are_refused_in_one_line(tmp_path: Path, text: str, said: str) -> None:
     (tmp_path / "runs.jsonl").write_text(text)
@@ -102,11 +102,14 @@ def test_damaged_files_are_refused_in_one_line(tmp_path: Path, text: str, said: 
     assert "\n" not in str(caught.value)
 
 
-def test_runs_of_another_version_are_refused(tmp_path: Path) -> None:
-    run_study(PLAN, tmp_path)
+@pytest.mark.parametrize(("name", "other"), [("rare_envs", "0.0.0"), ("code", "0123456789abcdef")])
+def test_runs_of_another_version_or_other_code_are_refused(tmp_path: Path, name: str, other: str) -> None:
+    result = run_study(PLAN, tmp_path)
     file = tmp_path / "runs.jsonl"
-    file.write_text(file.read_text().replace(file.read_text().splitlines()[0], '{"rare_envs": "0.0.0"}', 1))
-    with pytest.raises(BadInput, match=r"runs of rare_envs 0\.0\.0"):
+    head, *runs = file.read_text().splitlines()
+    assert json.loads(head) == {"rare_envs": result["about"]["rare_envs"], "code": result["about"]["code"]}
+    file.write_text("\n".join([json.dumps({**json.loads(head), name: other}), *runs]) + "\n")
+    with pytest.raises(BadInput, match=f"runs of {name} {other}"):
         run_study(PLAN, tmp_path)
 
 

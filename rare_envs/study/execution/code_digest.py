@@ -1,0 +1,26 @@
+"""Digest of the code and weights that runs come from, by which runs of other code are told apart."""
+
+from __future__ import annotations
+
+import hashlib
+from functools import cache
+from importlib import resources
+from pathlib import Path
+
+SIMULATING_PACKAGES = ("rare_envs", "samplers", "agents")
+
+
+@cache
+def digest_code() -> str:
+    """Return a digest of the code and weights that runs come from: other ones may give other numbers at the same seed.
+
+    Example:
+        >>> len(digest_code())
+        16
+    """
+    digest = hashlib.blake2b(digest_size=8)
+    for package in SIMULATING_PACKAGES:
+        folder = Path(str(resources.files(package)))
+        for path in sorted(path for end in ("*.py", "*.safetensors") for path in folder.rglob(end)):
+            digest.update(path.read_bytes())
+    return digest.hexdigest()

@@ -1,0 +1,25 @@
+"""The digest tells apart code and weights."""
+
+from __future__ import annotations
+
+from importlib import resources
+from pathlib import Path
+
+import pytest
+
+from rare_envs.study.execution.code_digest import digest_code
+
+
+def test_another_source_or_weight_is_other_code(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    def digest(**files: str) -> str:
+        for name, text in files.items():
+            (tmp_path / name.replace("_", ".")).write_text(text)
+        digest_code.cache_clear()
+        return digest_code()
+
+    shipped = digest()
+    monkeypatch.setattr(resources, "files", lambda package: tmp_path)
+    found = [digest(a_py="1"), digest(a_py="2"), digest(b_safetensors="w"), digest(notes_txt="t")]
+    digest_code.cache_clear()
+    assert len({shipped, *found[:3]}) == 4
+    assert found[3] == found[2]
