@@ -25,6 +25,10 @@ class ComparedValue:
     ours: float | None = None
     interval: tuple[float, float] | None = None
     """95 % interval of ours."""
+    paper_all_in: float | None = None
+    """The paper's number with every simulation counted, the search among them; None where that is not known."""
+    ours_all_in: float | None = None
+    """Ours likewise."""
     released: str = ""
     """What the released code does or gives, in words."""
     reasons: tuple[str, ...] = ()
@@ -32,8 +36,10 @@ class ComparedValue:
 
     @property
     def difference(self) -> float | None:
-        """Ours over the paper's, less 1; None where one of them is not known."""
-        return None if self.ours is None or not self.paper else self.ours / self.paper - 1.0
+        """Ours over the paper's, less 1; None where one of them is not known, or negative."""
+        if self.ours is None or not self.paper or min(self.ours, self.paper) < 0.0:
+            return None
+        return self.ours / self.paper - 1.0
 
     def to_dict(self) -> dict[str, Any]:
         """Return the value and the difference as a record has them."""
@@ -64,6 +70,8 @@ class ComparisonTable:
     measured: tuple[MeasuredRow, ...] = ()
     """Further rows of ours, shown below."""
     measured_title: str = ""
+    all_in_title: str = "all simulations"
+    """Of the columns with every simulation counted."""
 
     def __post_init__(self) -> None:
         for labels in (*(value.labels for value in self.values), *(row.labels for row in self.measured)):
@@ -82,6 +90,7 @@ class ComparisonTable:
             "keys": list(self.keys),
             "values": [value.to_dict() for value in self.values],
             "explanations": dict(self.explanations),
+            "all_in_title": self.all_in_title,
             "measured_title": self.measured_title,
             "measured": [{"labels": row.labels, "values": dict(row.values)} for row in self.measured],
         }
@@ -110,31 +119,3 @@ class TestedClaim:
     def to_dict(self) -> dict[str, Any]:
         """Return the finding as a record has it."""
         return asdict(self)
-
-
-def format_compared(value: float | None) -> str:
-    """Return a number of a table, whatever its size; an en dash for None.
-
-    Example:
-        >>> [format_compared(value) for value in (2.392e-4, 0.0862, 406_400.0, 20, None)]
-        ['2.39e-04', '0.0862', '406,400', '20', '–']
-    """
-    if value is None:
-        return "–"
-    if abs(value) >= 1000:
-        return f"{value:,.0f}"
-    return f"{value:.2e}" if 0 < abs(value) < 1e-3 else f"{value:.3g}"
-
-
-def format_difference(value: float | None) -> str:
-    """Return a relative difference in percent, or as a factor where it is large.
-
-    Example:
-        >>> [format_difference(value) for value in (0.05, -0.2, 20.4, -0.99, None)]
-        ['+5 %', '-20 %', '× 21.4', '× 0.01', '–']
-    """
-    if value is None:
-        return "–"
-    if value > 2.0 or value < -0.9:
-        return f"× {format_compared(1.0 + value)}"
-    return f"{100 * value:+.0f} %"

@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from rare_envs.study.reproduction.comparison import format_compared, format_difference
-from rare_envs.study.reproduction.page import group_rows
+from rare_envs.study.reproduction.columns import format_compared, format_ends, group_rows, list_columns
 
 
 def format_reproduction(record: Mapping[str, Any]) -> str:
@@ -42,21 +41,13 @@ def format_reproduction(record: Mapping[str, Any]) -> str:
 
 
 def _format_table(table: Mapping[str, Any]) -> list[str]:
-    heads = [
-        *table["keys"],
-        "quantity",
-        "paper",
-        "ours",
-        "95 % interval",
-        "difference",
-        "released code",
-        "why they differ",
-    ]
+    columns = list_columns(table)
+    heads = [*table["keys"], *(column.head for column in columns)]
     lines = [_format_row(heads), "|---" * len(heads) + "|"]
     for labels, values in group_rows(table):
         for first, value in enumerate(values):
             shown = labels if first == 0 else [""] * len(labels)
-            lines.append(_format_row([*shown, *_describe_value(value)]))
+            lines.append(_format_row([*shown, *(column.show(value) for column in columns)]))
     return lines
 
 
@@ -66,30 +57,14 @@ def _format_measured(table: Mapping[str, Any]) -> list[str]:
     return [_format_row(heads), "|---" * len(heads) + "|", *map(_format_row, rows)]
 
 
-def _describe_value(value: Mapping[str, Any]) -> list[str]:
-    return [
-        value["quantity"],
-        format_compared(value["paper"]),
-        format_compared(value["ours"]),
-        _format_interval(value["interval"]),
-        format_difference(value["difference"]),
-        value["released"] or "–",
-        ", ".join(value["reasons"]) or "–",
-    ]
-
-
 def _describe_finding(row: Mapping[str, Any]) -> list[str]:
     return [
         row["claim"],
         row["statistic"],
         format_compared(row["value"]),
-        _format_interval(row["interval"]),
+        format_ends(row["interval"]),
         row["verdict"],
     ]
-
-
-def _format_interval(interval: list[float] | None) -> str:
-    return "–" if interval is None else f"{format_compared(interval[0])} to {format_compared(interval[1])}"
 
 
 def _format_row(cells: list[str]) -> str:

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from itertools import groupby
 from typing import Any
 
 from rare_envs.study.html_report.svg import FigureOfPage
 from rare_envs.study.html_report.templating import render_template
-from rare_envs.study.reproduction.comparison import format_compared, format_difference
+from rare_envs.study.reproduction.columns import NOTHING, format_compared, format_ends, group_rows, list_columns
 
 
 def render_reproduction(record: Mapping[str, Any], figures: Sequence[FigureOfPage]) -> str:
@@ -24,19 +23,9 @@ def render_reproduction(record: Mapping[str, Any], figures: Sequence[FigureOfPag
         "reproduction.html.j2",
         record=record,
         about=about,
-        tables=[(table, group_rows(table)) for table in record["tables"]],
+        tables=[(table, list_columns(table), group_rows(table)) for table in record["tables"]],
         svgs=svgs,
         number=format_compared,
-        percent=format_difference,
+        ends=format_ends,
+        nothing=NOTHING,
     )
-
-
-def group_rows(table: Mapping[str, Any]) -> list[tuple[list[str], list[dict[str, Any]]]]:
-    """Return the rows of a table: labels, and the values that follow each other with these labels.
-
-    Example:
-        >>> values = [{"labels": ["IS"], "quantity": "p"}, {"labels": ["IS"], "quantity": "runs"}]
-        >>> [(labels, len(rows)) for labels, rows in group_rows({"values": values})]
-        [(['IS'], 2)]
-    """
-    return [(labels, list(rows)) for labels, rows in groupby(table["values"], key=lambda value: value["labels"])]

@@ -40,13 +40,12 @@ def format_leaderboard(result: Mapping[str, Any], most: int | None = None) -> st
         most: Problems in a table, the worst; None for all.
     """
     about = result["about"]
-    plan = about["plan"]
+    methods = sorted({cell["method"] for cell in result["cells"]})
     lines = [
         "# Samplers on problems with known probabilities",
         "",
-        f"{plan['runs']} runs of each method on {len(plan['problems'])} problems, budgets of "
-        f"{_join(f'{each:,}' for each in plan['budgets'])} simulations, seeds from {plan['seed']}. "
-        f"rare_envs {about['rare_envs']} (code {about['code']}), NumPy {about['numpy']}, SciPy {about['scipy']}, "
+        " ".join(map(_describe_plan, list_plans(result)))
+        + f" rare_envs {about['rare_envs']} (code {about['code']}), NumPy {about['numpy']}, SciPy {about['scipy']}, "
         f"{''.join(f'{name} {version}, ' for name, version in about['libraries'].items())}Python {about['python']}, "
         f"{about['processor']}.",
         "",
@@ -57,12 +56,32 @@ def format_leaderboard(result: Mapping[str, Any], most: int | None = None) -> st
         "",
         *_format_overview(result),
     ]
-    for method in sorted(plan["methods"]):
+    for method in methods:
         lines += [f"## {method}", "", _describe_warnings(result["warnings"][method]), ""]
-        for budget in plan["budgets"]:
-            cells = [cell for cell in result["cells"] if (cell["method"], cell["max_sim"]) == (method, budget)]
+        for budget, cells in _cells_by_budget(result, method).items():
             lines += [f"### {budget:,} simulations", "", *_format_table(cells, most), ""]
     return "\n".join([*lines, *_format_problems(result["problems"])]) + "\n"
+
+
+def list_plans(result: Mapping[str, Any]) -> list[Mapping[str, Any]]:
+    """Return what was run: the plan of a benchmark, or those of several whose cells were put together."""
+    about = result["about"]
+    plans: list[Mapping[str, Any]] = about["plans"] if "plans" in about else [about["plan"]]
+    return plans
+
+
+def _describe_plan(plan: Mapping[str, Any]) -> str:
+    return (
+        f"{plan['runs']} runs of each of {len(plan['methods'])} methods on {len(plan['problems'])} problems, budgets "
+        f"of {_join(f'{each:,}' for each in plan['budgets'])} simulations, seeds from {plan['seed']}."
+    )
+
+
+def _cells_by_budget(result: Mapping[str, Any], method: str) -> dict[int, list[Mapping[str, Any]]]:
+    """Return the cells of a method, the least budget first."""
+    own = [cell for cell in result["cells"] if cell["method"] == method]
+    budgets = sorted({cell["max_sim"] for cell in own})
+    return {budget: [cell for cell in own if cell["max_sim"] == budget] for budget in budgets}
 
 
 def sort_worst_first(cells: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
@@ -85,14 +104,12 @@ def _format_overview(result: Mapping[str, Any]) -> list[str]:
     for group in dict.fromkeys(problem["group"] for problem in result["problems"].values()):
         names = {name for name, problem in result["problems"].items() if problem["group"] == group}
         lines += [f"### Set {group}", "", *_format_head(OVERVIEW_COLUMNS)]
-        for method in sorted(result["about"]["plan"]["methods"]):
-            for budget in result["about"]["plan"]["budgets"]:
+        for method in sorted({cell["method"] for cell in result["cells"]}):
+            for budget, of_method in _cells_by_budget(result, method).items():
                 cells = [
                     cell
-                    for cell in result["cells"]
-                    if (cell["method"], cell["max_sim"]) == (method, budget)
-                    and cell["problem"] in names
-                    and result["problems"][cell["problem"]]["knowable"]
+                    for cell in of_method
+                    if cell["problem"] in names and result["problems"][cell["problem"]]["knowable"]
                 ]
                 lines += [_format_pooled(method, budget, cells)] if cells else []
         lines.append("")

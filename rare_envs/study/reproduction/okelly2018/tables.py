@@ -13,7 +13,10 @@ Z_95 = 1.96
 MISSED_ERRORS = 3.0
 """Standard errors below the naive p from which failures are said to have been missed."""
 KEYS = ("sample", "gamma, theirs / ours [s]")
+SEARCH_COUNTED = "search counted"
 _ERROR = "standard error"
+_VARIANCE_RATIO = "variance, naive / sampler, equal draws"
+_DISTANCE_RATIO = "mean square distance from the naive p instead of the variance"
 
 
 def make_tables(ego: str, gammas: tuple[float, ...], found: Mapping[str, Any]) -> tuple[ComparisonTable, ...]:
@@ -36,6 +39,7 @@ def make_tables(ego: str, gammas: tuple[float, ...], found: Mapping[str, Any]) -
             keys=KEYS,
             values=tuple(estimates),
             explanations=reasons,
+            all_in_title=SEARCH_COUNTED,
         ),
         ComparisonTable(
             name=f"{printed.name.lower().replace(' ', '')}_ratios",
@@ -43,6 +47,7 @@ def make_tables(ego: str, gammas: tuple[float, ...], found: Mapping[str, Any]) -
             keys=KEYS,
             values=tuple(ratios),
             explanations=reasons,
+            all_in_title=SEARCH_COUNTED,
         ),
     )
 
@@ -52,7 +57,7 @@ def explain_differences(ego: str, found: Mapping[str, Any]) -> dict[str, str]:
     printed = found["searches"][PRINTED_SEARCH]
     texts = {
         "thresholds": WHY_OTHER_THRESHOLDS[ego],
-        "scale": "One run, with fewer rollouts than theirs unless the scale is full; the rows say how many.",
+        "scale": _explain_scale(PRINTED_TABLES[ego], found["naive"]),
         "search": "Their tables leave out the rollouts of the search; here they are counted.",
         "not run": "These rollouts were not made.",
         "no event": "Too rare for as many rollouts: nothing to compare with.",
@@ -77,6 +82,13 @@ def explain_differences(ego: str, found: Mapping[str, Any]) -> dict[str, str]:
     return texts
 
 
+def _explain_scale(printed: PrintedTable, naive: list[dict[str, Any]]) -> str:
+    """Return what the numbers of rollouts make of a difference."""
+    if naive and naive[0]["n"] >= printed.draws["naive"]:
+        return "One run of each row with one seed, of as many rollouts as theirs: the rest is chance."
+    return "One run, with fewer rollouts than theirs; the rows say how many."
+
+
 def _list_estimates(printed: PrintedTable, heads: list[str], found: Mapping[str, Any]) -> list[ComparedValue]:
     searches = found["searches"]
     rows: list[tuple[str, str | None, list[dict[str, Any]], tuple[str, ...]]] = [
@@ -97,6 +109,7 @@ def _list_estimates(printed: PrintedTable, heads: list[str], found: Mapping[str,
         if row not in printed.rows and not estimates:
             values.append(_not_run(label))
             continue
+        values.append(_count_rollouts(label, row, printed, estimates, searches.get(label.partition(", ")[2])))
         for j, head in enumerate(heads):
             paper = printed.rows[row][j] if row in printed.rows else (None, None)
             values += _pair(label, head, paper, estimates[j] if estimates else None, reasons)
@@ -104,12 +117,38 @@ def _list_estimates(printed: PrintedTable, heads: list[str], found: Mapping[str,
         head = next(each for each in heads if each.endswith(f" {own['gamma']}"))
         labels = (f"our default method, {own['n_sim']:,} simulations all in", head)
         values += [
+            ComparedValue(labels=labels, quantity="rollouts", ours_all_in=own["n_sim"], reasons=("extra",)),
             ComparedValue(
                 labels=labels, quantity="p", ours=own["p"], interval=(own["low"], own["high"]), reasons=("extra",)
             ),
             ComparedValue(labels=labels, quantity=_ERROR, ours=own["p"] * own["cov"], reasons=("extra",)),
         ]
     return values
+
+
+def _count_rollouts(
+    label: str,
+    row: str | None,
+    printed: PrintedTable,
+    estimates: list[dict[str, Any]],
+    search: Mapping[str, Any] | None,
+) -> ComparedValue:
+    """Return the rollouts of a row, and with those of its search."""
+    theirs = printed.draws.get(row or "")
+    ours = estimates[0]["n"] if estimates else None
+    return ComparedValue(
+        labels=(_label_rollouts(label, ours), "all"),
+        quantity="rollouts",
+        paper=theirs,
+        ours=ours,
+        paper_all_in=None if theirs is None else theirs + (printed.search if search else 0),
+        ours_all_in=None if ours is None else ours + (search["search"] if search else 0),
+        reasons=("not run",) if ours is None else ("search", "scale") if search else ("scale",),
+    )
+
+
+def _label_rollouts(label: str, n: int | None) -> str:
+    return f"{label}: not run" if n is None else f"{label}, {n:,} rollouts"
 
 
 def _not_run(label: str) -> ComparedValue:
@@ -126,21 +165,22 @@ def _pair(
 ) -> list[ComparedValue]:
     """Return an estimate and its standard error."""
     if ours is None:
-        labels = (f"{label}: not run", head)
+        labels = (_label_rollouts(label, None), head)
         return [
             ComparedValue(labels=labels, quantity=quantity, paper=value, reasons=("not run",))
             for quantity, value in zip(("p", _ERROR), paper, strict=True)
         ]
     p, error = ours["p"], ours["standard_error"]
-    interval = ours["interval"] or (max(0.0, p - Z_95 * error), p + Z_95 * error)
-    labels = (f"{label}, {ours['n']:,} rollouts", head)
+    around = (max(0.0, p - Z_95 * error), p + Z_95 * error) if error > 0.0 else None
+    interval = ours["interval"] or around
+    labels = (_label_rollouts(label, ours["n"]), head)
     return [
         ComparedValue(
             labels=labels,
             quantity=f"p ({ours['events']:,} events)",
             paper=paper[0],
             ours=p,
-            interval=tuple(interval),
+            interval=None if interval is None else tuple(interval),
             reasons=reasons,
         ),
         ComparedValue(labels=labels, quantity=_ERROR, paper=paper[1], ours=error, reasons=reasons),
@@ -166,8 +206,8 @@ def _list_ratios(printed: PrintedTable, heads: list[str], found: Mapping[str, An
         values.append(
             ComparedValue(
                 labels=(f"our default method, {own['n_sim']:,} simulations all in", head),
-                quantity="variance, naive / method, search counted",
-                ours=own["gain"],
+                quantity=_VARIANCE_RATIO,
+                ours_all_in=own["gain"],
                 reasons=("extra",) if own["gain"] is not None else ("no event",),
             )
         )
@@ -195,20 +235,21 @@ def _ratios_of(
     why = (*why, "missed") if low and not search["weights_move"] else why
     ratio, all_in, off = theirs
     rows = (
-        ("rare events, sampler / naive, equal draws", None, known["events_ratio"], known["events_interval"], why),
-        ("variance, naive / sampler, equal draws", ratio, known["variance_ratio"], None, why),
-        ("the same, search counted", all_in, known["all_in"], None, ("search", *why)),
-        ("by distance from the naive p instead, search counted", None, known["error_ratio"], None, ("search", *why)),
-        ("p less the naive p, in joint standard errors", off, known["errors_off"], None, why),
+        ("rare events, sampler / naive, equal draws", (None, None), (known["events_ratio"], None), why),
+        (_VARIANCE_RATIO, (ratio, all_in), (known["variance_ratio"], known["all_in"]), ("search", *why)),
+        (_DISTANCE_RATIO, (None, None), (None, known["error_ratio"]), ("search", *why)),
+        ("p less the naive p, in joint standard errors", (off, None), (known["errors_off"], None), why),
     )
     return [
         ComparedValue(
             labels=labels,
             quantity=quantity,
-            paper=paper,
-            ours=ours,
-            interval=interval,
-            reasons=reasons if ours is not None else missing,
+            paper=paper[0],
+            paper_all_in=paper[1],
+            ours=ours[0],
+            ours_all_in=ours[1],
+            interval=known["events_interval"] if quantity.startswith("rare events") else None,
+            reasons=reasons if any(value is not None for value in ours) else missing,
         )
-        for quantity, paper, ours, interval, reasons in rows
+        for quantity, paper, ours, reasons in rows
     ]

@@ -78,6 +78,7 @@ def _compare(key: tuple[str, str, str], paper: str, ours: ReplicationSummary, le
         reasons: tuple[str, ...],
         interval: Ends | None = None,
         released: str = "",
+        all_in: float | None = None,
     ) -> ComparedValue:
         known = _finite(mine)
         return ComparedValue(
@@ -86,6 +87,7 @@ def _compare(key: tuple[str, str, str], paper: str, ours: ReplicationSummary, le
             paper=theirs,
             ours=known,
             interval=interval if known is not None and interval is not None else None,
+            ours_all_in=all_in,
             released=released,
             reasons=(*reasons, *(only_text if theirs is not None else ())),
         )
@@ -106,10 +108,9 @@ def _compare(key: tuple[str, str, str], paper: str, ours: ReplicationSummary, le
         ours.squared_cov_interval,
     )  # fmt: skip
     yield value(
-        "simulations, as the paper counts", printed.n_sim, ours.simulations, cost,
-        released=_released_cost(paper, printed.p, ours, levels),
+        "simulations, as the paper counts", printed.n_sim, ours.simulations, (*cost, "counting"),
+        released=_released_cost(paper, printed.p, ours, levels), all_in=ours.all_simulations,
     )  # fmt: skip
-    yield value("all simulations", None, ours.all_simulations, ("counting",))
     yield value("gain over plain Monte Carlo", printed.gain, ours.gain, (*cost, "counting"), ours.gain_interval)
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 
-from rare_envs.study.reproduction.page import group_rows, render_reproduction
+from rare_envs.study.reproduction.page import render_reproduction
 from tests.rare_envs.study.reproduction.records import record_by_hand
 
 
@@ -21,12 +21,20 @@ def test_paper_ours_and_difference_stand_side_by_side() -> None:
         "ours",
         "95 % interval",
         "difference",
+        "ours, all simulations",
         "released code",
         "why they differ",
     ]
-    assert rows[1] == ["SS", "IDM", "mean of p", "8.00e-04", "6.00e-04", "–", "-25 %", "–", "traffic"]
-    assert rows[2] == ["simulations", "–", "4,980", "4,900 to 5,100", "–", "–", "–"]
+    assert rows[1] == ["SS", "IDM", "mean of p", "8.00e-04", "6.00e-04", "–", "-25 %", "–", "–", "traffic"]
+    assert rows[2] == ["simulations", "–", "4,980", "4,900 to 5,100", "–", "5,500", "–", "–"]
     assert rows[3][-2] == "does &lt;not&gt; run"
+
+
+def test_on_narrow_screens_every_number_has_its_head_and_empty_cells_are_left_out() -> None:
+    page = render_reproduction(record_by_hand(), [])
+    assert '<td class="n" data-head="ours, all simulations">5,500</td>' in page
+    assert '<td class=" none" data-head="why they differ">–</td>' in page
+    assert "td[data-head]:not(.name)::before" in page
 
 
 def test_the_page_needs_nothing_else_and_has_all_sections() -> None:
@@ -34,12 +42,3 @@ def test_the_page_needs_nothing_else_and_has_all_sections() -> None:
     assert not re.search(r"(src|href)=", page)
     assert [f'id="{name}"' in page for name in ("notes", "table9", "findings", "figure9", "made")] == [True] * 5
     assert "rare-envs reproduce paper" in page
-
-
-def test_equal_labels_apart_are_two_groups() -> None:
-    values = [{"labels": [name]} for name in ("a", "a", "b", "a")]
-    assert [(labels, len(rows)) for labels, rows in group_rows({"values": values})] == [
-        (["a"], 2),
-        (["b"], 1),
-        (["a"], 1),
-    ]

@@ -93,7 +93,11 @@ def test_what_is_named_twice_is_run_once() -> None:
 
 @pytest.mark.parametrize(
     ("text", "said"),
-    [("{}\n", "line 1 is no run"), ('{"rare_envs": "0.0", "code": "0"}\nx\n', "line 2 is no run"), ("[]\n", "line 1 is no run")],
+    [
+        ("{}\n", "line 1 is no run"),
+        ('{"rare_envs": "0.0", "code": "0"}\nx\n', "line 2 is no run"),
+        ("[]\n", "line 1 is no run"),
+    ],
 )
 def test_damaged_files_are_refused_in_one_line(tmp_path: Path, text: str, said: str) -> None:
     (tmp_path / "runs.jsonl").write_text(text)

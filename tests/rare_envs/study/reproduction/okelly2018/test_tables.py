@@ -23,6 +23,7 @@ COMPARISON = {
 RUN = {
     **NOT_RUN,
     "iterations": 20,
+    "search": 20_000,
     "sampler": {"shift": 5.0},
     "mean_ratio": 1e-9,
     "estimates": [ESTIMATE] * 4,
@@ -36,21 +37,25 @@ def found_of(search: dict[str, Any], own: tuple[dict[str, Any], ...] = ()) -> di
 
 def test_ours_stand_beside_theirs() -> None:
     values = make_tables("lidar", GAMMAS, found_of(RUN))[0].to_dict()["values"]
-    first = next(value for value in values if value["labels"][0].startswith("naive, 1,000 rollouts"))
+    rollouts, first, *_ = (value for value in values if value["labels"][0].startswith("naive, 1,000 rollouts"))
+    assert (rollouts["quantity"], rollouts["paper"], rollouts["ours"]) == ("rollouts", 1_300_000, 1000)
     assert (first["paper"], first["ours"], first["quantity"]) == (12.4e-6, 0.01, "p (10 events)")
     assert first["labels"][1] == f"0.14 / {GAMMAS[0]}"
     assert first["interval"] == pytest.approx((0.00412, 0.01588))
     searched = [value["paper"] for value in values if PRINTED_SEARCH in value["labels"][0]]
-    assert searched[:2] == [19.8e-6, 8.88e-6]
+    assert searched[:3] == [100_000, 19.8e-6, 8.88e-6]
 
 
 def test_the_search_counts_for_the_paper_too() -> None:
     values = make_tables("lidar", GAMMAS, found_of(RUN))[1].values
-    ratio, all_in = (value for value in values[:3] if value.paper is not None)
-    assert ratio.paper == pytest.approx(1.57, abs=0.01)
-    assert all_in.paper == pytest.approx(1.57 / 6, abs=0.01)
-    assert (ratio.ours, all_in.ours) == (7.2, 1.2)
-    assert values[3].reasons == ("underflow",)
+    (ratio,) = (value for value in values[:3] if value.paper is not None)
+    assert (ratio.paper, ratio.paper_all_in) == (pytest.approx(1.57, abs=0.01), pytest.approx(1.57 / 6, abs=0.01))
+    assert (ratio.ours, ratio.ours_all_in) == (7.2, 1.2)
+    assert (values[2].ours, values[2].ours_all_in, values[2].reasons) == (None, None, ("underflow",))
+    estimates = make_tables("lidar", GAMMAS, found_of(RUN))[0].values
+    (rollouts,) = (each for each in estimates if each.quantity == "rollouts" and PRINTED_SEARCH in each.labels[0])
+    assert (rollouts.paper, rollouts.paper_all_in) == (100_000, 600_000)
+    assert (rollouts.ours, rollouts.ours_all_in) == (1000, 21_000)
 
 
 def test_what_was_not_run_has_no_number() -> None:
@@ -67,7 +72,8 @@ def test_our_own_method_stands_at_its_threshold() -> None:
     estimates, ratios = make_tables("lidar", GAMMAS, found_of(RUN, (own,)))
     assert estimates.values[-2].labels[1] == f"0.19 / {GAMMAS[2]}"
     assert estimates.values[-1].ours == pytest.approx(1e-4)
-    assert ratios.values[-1].ours == 30.0
+    assert ratios.values[-1].ours_all_in == 30.0
+    assert [value.ours_all_in for value in estimates.values[-3:]] == [3000, None, None]
 
 
 @pytest.mark.parametrize("ego", ["lidar", "vision"])
@@ -79,14 +85,26 @@ def test_every_reason_is_explained(ego: str) -> None:
 def test_a_standard_error_that_underflows_is_no_gain() -> None:
     run = {**RUN, "comparisons": [{**COMPARISON, "variance_ratio": None, "all_in": None}] * 4}
     values = make_tables("lidar", GAMMAS, found_of(run))[1].values
-    assert [value.reasons for value in values[1:3]] == [("underflow",)] * 2
+    assert values[1].reasons == ("underflow",)
+
+
+def test_a_standard_error_of_zero_gives_no_interval() -> None:
+    run = {**RUN, "estimates": [{**ESTIMATE, "p": 1e-300, "standard_error": 0.0}] * 4}
+    values = make_tables("lidar", GAMMAS, found_of(run))[0].values
+    assert [each.interval for each in values if each.quantity == "p (10 events)"][4:] == [None] * 4
+
+
+def test_rows_with_as_many_rollouts_as_the_paper_differ_by_chance() -> None:
+    few, full = ({**found_of(RUN), "naive": [{**ESTIMATE, "n": n}] * 4} for n in (80_000, 1_300_000))
+    assert "with fewer rollouts than theirs" in explain_differences("lidar", few)["scale"]
+    assert "of as many rollouts as theirs" in explain_differences("lidar", full)["scale"]
 
 
 def test_missed_failures_are_said_to_be_missed() -> None:
     alone = {**RUN, "weights_move": False}
     values = make_tables("lidar", GAMMAS, found_of(alone))[1].values
-    assert all("missed" in value.reasons for value in values[:3])
-    assert (values[4].ours, values[4].paper) == (-5.0, pytest.approx(0.79, abs=0.01))  # (19.8 - 12.4) / 9.4
+    assert all("missed" in value.reasons for value in values[:2])
+    assert (values[3].ours, values[3].paper) == (-5.0, pytest.approx(0.79, abs=0.01))  # (19.8 - 12.4) / 9.4
 
 
 def test_what_the_paper_has_not_and_was_not_run_is_one_line() -> None:
