@@ -2,8 +2,8 @@
 
     python -m benchmarks.papers.page
 
-writes `docs/papers.md`. The records are `tian2024`, `okelly2018` and `okelly2018_vision` in `benchmarks/results`: the
-`reproduction.json` of a run, under the name of its paper.
+writes `docs/papers.md`. The records are `tian2024`, `okelly2018` (small scale), `okelly2018_full` and
+`okelly2018_vision` in `benchmarks/results`: the `reproduction.json` of a run, under the name of its paper.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from benchmarks import RESULTS
 from rare_envs.study.reproduction.markdown import format_reproduction
 
 PAPERS_PAGE = Path(__file__).parents[2] / "docs" / "papers.md"
-PAPERS = ("tian2024", "okelly2018", "okelly2018_vision")
+PAPERS = ("tian2024", "okelly2018", "okelly2018_full", "okelly2018_vision")
 READING = """\
 import json
 from pathlib import Path

@@ -117,6 +117,8 @@ def compare_means(
     """
     failing, ordinary = failing[~np.isnan(failing)], ordinary[~np.isnan(ordinary)]
     sizes = f"{len(failing):,} and {len(ordinary):,} runs"
+    if min(len(failing), len(ordinary)) > 1 and not ordinary.any():
+        return _compare_shares(claim, f"{quantity}, {groups}", failing, ordinary)
     if len(failing) < 2 or len(ordinary) < 2 or ordinary.mean() == 0.0:
         known = [f"{values.mean():.3g}" if len(values) else "none" for values in (failing, ordinary)]
         return TestedClaim(
@@ -141,6 +143,45 @@ def compare_means(
         interval=interval,
         verdict=claim.judge(interval),
     )
+
+
+def _compare_shares(claim: PaperClaim, quantity: str, failing: FloatArray, ordinary: FloatArray) -> TestedClaim:
+    """Test a claim by the shares of runs that have any of it, where no ordinary run has: there is no ratio of means."""
+    counts = [(int(np.count_nonzero(values)), len(values)) for values in (failing, ordinary)]
+    low, high = difference_interval(*counts)
+    found = stats.fisher_exact([[k, n - k] for k, n in counts])
+    shares = " and ".join(f"{k:,} of {n:,}" for k, n in counts)
+    seen = "holds" if (low > 0.0) == claim.above else "the opposite here"
+    return TestedClaim(
+        claim=claim.text,
+        statistic=f"{quantity}: difference of the shares of runs with any, {shares}; "
+        f"Fisher's exact test, p = {float(found.pvalue):.1g}",
+        value=counts[0][0] / counts[0][1] - counts[1][0] / counts[1][1],
+        interval=(low, high),
+        verdict="not seen here" if low <= 0.0 <= high else seen,
+    )
+
+
+def difference_interval(first: tuple[int, int], second: tuple[int, int]) -> Interval:
+    """Return the 95 % interval of a difference of two shares (Newcombe 1998, method 10).
+
+    Args:
+        first: Events, and runs.
+        second: Those that are taken off.
+
+    Example:
+        >>> low, high = difference_interval((56, 70), (48, 80))  # the example of the paper
+        >>> round(low, 4), round(high, 4)
+        (0.0524, 0.3339)
+    """
+    (p, low, high), (q, least, most) = (_wilson_interval(k, n) for k, n in (first, second))
+    return p - q - math.hypot(p - low, most - q), p - q + math.hypot(high - p, q - least)
+
+
+def _wilson_interval(k: int, n: int) -> tuple[float, float, float]:
+    """Return a share and the ends of its 95 % interval."""
+    ends = stats.binomtest(k, n).proportion_ci(0.95, method="wilson")
+    return k / n, float(ends.low), float(ends.high)
 
 
 def bootstrap_ratio(failing: FloatArray, ordinary: FloatArray) -> Interval:

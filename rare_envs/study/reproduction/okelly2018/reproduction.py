@@ -89,14 +89,20 @@ def write_notes(study: HighwayStudy, found: Mapping[str, Any]) -> list[str]:
         notes.append(
             f"The naive p rests on {events} events at the four thresholds; ratios to it are no surer than that."
         )
-    full, speed = STUDY_SCALES[study.ego, "full"], found["rollouts_per_second"]
-    if study.scale == "full" or speed is None:
+    speed, made = found["rollouts_per_second"], found["rollouts"] + sum(own["n_sim"] for own in found["own"])
+    if speed is None or (study.scale == "full" and made >= ours.rollouts):
         return notes
-    hours, search = (count / speed / 3600.0 for count in (full.rollouts, full.per_search))
+    full = STUDY_SCALES[study.ego, "full"]
+    rest, whole, search = (n / speed / 3600.0 for n in (full.rollouts - made, full.rollouts, full.per_search))
+    if study.scale == "full":
+        return [*notes, f"{_say_speed(speed)} the rest takes {rest:,.1f} hours of a core; the same command goes on."]
     return [
         *notes,
-        f"The full scale was not run: {full.naive:,} naive rollouts and four searches of {full.per_search:,}, "
-        f"{full.rollouts:,} with our own method. At the {speed:.3g} rollouts a second of the fastest chunk of this "
-        f"run (wall time) that is {hours:,.1f} hours of a core, {search:,.1f} for each search; `--scale full` goes on "
-        "where it was stopped.",
+        f"The full scale has {full.naive:,} naive rollouts and four searches of {full.per_search:,}, "
+        f"{full.rollouts:,} with our own method. {_say_speed(speed)} that is {whole:,.1f} hours of a core, "
+        f"{search:,.1f} for each search; `--scale full` goes on where it was stopped.",
     ]
+
+
+def _say_speed(speed: float) -> str:
+    return f"At the {speed:.3g} rollouts a second of the fastest chunk of this run (wall time)"

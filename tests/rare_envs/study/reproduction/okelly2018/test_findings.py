@@ -8,6 +8,7 @@ from rare_envs.study.reproduction.okelly2018.findings import (
     bootstrap_ratio,
     compare_means,
     compare_starts,
+    difference_interval,
     distance_beside,
     is_boxed_in,
     speed_behind,
@@ -86,8 +87,20 @@ def test_the_interval_of_a_ratio_holds_the_ratio_as_often_as_it_says() -> None:
     assert sum(low <= 1.2 <= high for low, high in intervals) >= 25  # 28.5 expected
 
 
-def test_zeros_cannot_be_told() -> None:
+def test_where_no_ordinary_run_has_any_the_shares_of_runs_are_compared() -> None:
     claim = PaperClaim("more lane changes", above=True)
-    found = compare_means(claim, "lane changes", np.zeros(10), np.zeros(20))
-    assert (found.value, found.verdict) == (None, "cannot be told")
-    assert "0 and 0, 10 and 20 runs" in found.statistic
+    none = compare_means(claim, "lane changes", np.zeros(512), np.zeros(512))
+    assert (none.value, none.verdict) == (0.0, "not seen here")
+    assert none.interval == pytest.approx((-0.00745, 0.00745), abs=1e-5)
+    assert "0 of 512 and 0 of 512; Fisher's exact test, p = 1" in none.statistic
+    some = compare_means(claim, "lane changes", np.repeat([0.2, 0.0], [9, 91]), np.zeros(100))
+    assert (some.value, some.verdict) == (0.09, "holds")
+    assert compare_means(PaperClaim("fewer", above=False), "", np.ones(50), np.zeros(50)).verdict == "the opposite here"
+    assert compare_means(claim, "lane changes", np.zeros(1), np.zeros(20)).verdict == "cannot be told"
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "ends"), [((9, 10), (3, 10), (0.1705, 0.8090)), ((5, 56), (0, 29), (-0.0381, 0.1926))]
+)
+def test_intervals_of_differences_are_those_of_newcombe(first, second, ends) -> None:
+    assert difference_interval(first, second) == pytest.approx(ends, abs=5e-5)
