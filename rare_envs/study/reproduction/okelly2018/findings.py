@@ -149,7 +149,7 @@ def _compare_shares(claim: PaperClaim, quantity: str, failing: FloatArray, ordin
     """Test a claim by the shares of runs that have any of it, where no ordinary run has: there is no ratio of means."""
     counts = [(int(np.count_nonzero(values)), len(values)) for values in (failing, ordinary)]
     low, high = difference_interval(*counts)
-    found = stats.fisher_exact([[k, n - k] for k, n in counts])
+    found = stats.fisher_exact(np.array([[k, n - k] for k, n in counts]))
     shares = " and ".join(f"{k:,} of {n:,}" for k, n in counts)
     seen = "holds" if (low > 0.0) == claim.above else "the opposite here"
     return TestedClaim(
