@@ -16,7 +16,7 @@ class TableColumn(NamedTuple):
     is_number: bool = True
 
 
-def list_columns(table: Mapping[str, Any]) -> list[TableColumn]:
+def list_compared_columns(table: Mapping[str, Any]) -> list[TableColumn]:
     """Return the columns of a table of a record; what no value has is no column.
 
     Args:
@@ -24,7 +24,7 @@ def list_columns(table: Mapping[str, Any]) -> list[TableColumn]:
 
     Example:
         >>> value = {"quantity": "p", "paper": 1e-3, "ours": 2e-3, "difference": 1.0, "ours_all_in": None}
-        >>> [(column.head, column.show(value)) for column in list_columns({"values": [value]})]
+        >>> [(column.head, column.show(value)) for column in list_compared_columns({"values": [value]})]
         [('quantity', 'p'), ('paper', '0.001'), ('ours', '0.002'), ('difference', '+100 %')]
     """
     title = table.get("all_in_title", "")
@@ -32,7 +32,7 @@ def list_columns(table: Mapping[str, Any]) -> list[TableColumn]:
         TableColumn("quantity", lambda value: str(value["quantity"]), is_number=False),
         TableColumn("paper", lambda value: format_compared(value["paper"])),
         TableColumn("ours", lambda value: format_compared(value["ours"])),
-        TableColumn("95 % interval", lambda value: format_ends(value.get("interval"))),
+        TableColumn("95 % interval", lambda value: format_compared_ends(value.get("interval"))),
         TableColumn("difference", lambda value: format_difference(value["difference"])),
         TableColumn(f"paper, {title}", lambda value: format_compared(value.get("paper_all_in"))),
         TableColumn(f"ours, {title}", lambda value: format_compared(value.get("ours_all_in"))),
@@ -85,11 +85,11 @@ def format_difference(value: float | None) -> str:
     return f"{100 * value:+.0f} %"
 
 
-def format_ends(interval: Sequence[float] | None) -> str:
+def format_compared_ends(interval: Sequence[float] | None) -> str:
     """Return the ends of an interval as text.
 
     Example:
-        >>> format_ends((0.1, 0.25)), format_ends(None)
+        >>> format_compared_ends((0.1, 0.25)), format_compared_ends(None)
         ('0.1 to 0.25', '–')
     """
     return NOTHING if interval is None else f"{format_compared(interval[0])} to {format_compared(interval[1])}"

@@ -5,7 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from rare_envs.study.reproduction.columns import format_compared, format_ends, group_rows, list_columns
+from rare_envs.study.reproduction.columns import (
+    format_compared,
+    format_compared_ends,
+    group_rows,
+    list_compared_columns,
+)
 
 
 def format_reproduction(record: Mapping[str, Any]) -> str:
@@ -41,7 +46,7 @@ def format_reproduction(record: Mapping[str, Any]) -> str:
 
 
 def _format_table(table: Mapping[str, Any]) -> list[str]:
-    columns = list_columns(table)
+    columns = list_compared_columns(table)
     heads = [*table["keys"], *(column.head for column in columns)]
     lines = [_format_row(heads), "|---" * len(heads) + "|"]
     for labels, values in group_rows(table):
@@ -62,7 +67,7 @@ def _describe_finding(row: Mapping[str, Any]) -> list[str]:
         row["claim"],
         row["statistic"],
         format_compared(row["value"]),
-        format_ends(row["interval"]),
+        format_compared_ends(row["interval"]),
         row["verdict"],
     ]
 

@@ -7,7 +7,13 @@ from typing import Any
 
 from rare_envs.study.html_report.svg import FigureOfPage
 from rare_envs.study.html_report.templating import render_template
-from rare_envs.study.reproduction.columns import NOTHING, format_compared, format_ends, group_rows, list_columns
+from rare_envs.study.reproduction.columns import (
+    NOTHING,
+    format_compared,
+    format_compared_ends,
+    group_rows,
+    list_compared_columns,
+)
 
 
 def render_reproduction(record: Mapping[str, Any], figures: Sequence[FigureOfPage]) -> str:
@@ -23,9 +29,9 @@ def render_reproduction(record: Mapping[str, Any], figures: Sequence[FigureOfPag
         "reproduction.html.j2",
         record=record,
         about=about,
-        tables=[(table, list_columns(table), group_rows(table)) for table in record["tables"]],
+        tables=[(table, list_compared_columns(table), group_rows(table)) for table in record["tables"]],
         svgs=svgs,
         number=format_compared,
-        ends=format_ends,
+        ends=format_compared_ends,
         nothing=NOTHING,
     )
