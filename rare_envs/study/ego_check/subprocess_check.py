@@ -163,7 +163,7 @@ def run_checks(request: EgoCheckRequest) -> Iterator[Finding | str]:
     import agents
     from agents.loading import find_ego_kind
     from rare_envs.egos.errors import EgoGone, reason_of
-    from rare_envs.problem import TAKEN_AS_ACCELERATIONS
+    from rare_envs.problem import AMBIGUOUS, TAKEN_AS_ACCELERATIONS
     from rare_envs.study.ego_check.behaviour import EGO_CHECKS, check_driving
     from rare_envs.study.ego_check.probe import Probe
     from rare_envs.study.ego_check.protocol import check_protocol
@@ -181,8 +181,8 @@ def run_checks(request: EgoCheckRequest) -> Iterator[Finding | str]:
         yield report_pass("loading", f"{type(ego).__name__}" if not isinstance(ego, str) else ego)
         problem = build_problem(request.question, ego)
         for note in problem.notes:
-            usual = note == TAKEN_AS_ACCELERATIONS
-            yield report_warning("action space", note, "say which by --action", not usual)
+            if note in (AMBIGUOUS, TAKEN_AS_ACCELERATIONS):  # of other bounds than ours a check of its own tells
+                yield report_warning("action space", note, "say which by --action", note == AMBIGUOUS)
         probe = Probe.of(ego, problem)
     except (Exception, SystemExit, EgoGone) as error:  # the ego is the user's: anything may happen in it
         yield report_failure("loading", reason_of(error), "see docs/egos.md for what an ego is")

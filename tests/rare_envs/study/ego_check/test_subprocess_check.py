@@ -286,6 +286,13 @@ def test_a_zip_that_others_can_write_to_is_refused_by_every_command(what: str, s
         agents.load_ego(saved)
 
 
+@pytest.mark.filterwarnings("ignore:.*are mapped to")
+def test_actions_of_other_bounds_are_told_once(broken: str) -> None:
+    every = run_checks(EgoCheckRequest(f"{broken}:another_unit", ENV))
+    (told,) = (each for each in every if isinstance(each, Finding) and each.check == "action space")
+    assert told.status == "warn" and "--action" not in told.advice
+
+
 def test_a_zip_of_ones_own_is_no_warning(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("rare_envs.study.ego_check.subprocess_check._check_in_subprocess", lambda _: iter(()))
     (origin,) = check_ego(EgoCheckRequest("ego.zip", ENV))
