@@ -94,8 +94,10 @@ class VisionCorrectionConfig:
 
     def __post_init__(self) -> None:
         for name, value in asdict(self).items():
-            least = 0 if name == "seed" else 1
-            if name not in ("rate", "seconds") and value < least:
+            least = {"seed": 0, "seconds": VisionEgo.dt}.get(name, 1)
+            if name == "rate" and not 0.0 < value < math.inf:
+                raise ValueError(f"Expected a positive rate, got {value}.")
+            if name != "rate" and not least <= value < math.inf:
                 raise ValueError(f"Expected {name} of at least {least}, got {value}.")
 
     @property
@@ -246,6 +248,7 @@ def main(
     replace_text(out / ROUNDS_FILE, json.dumps(records, indent=1) + "\n")
     metrics = judge_all_cases(VisionEgo(network), judged, JUDGE_SEED) if judged else {}
     command = f"python -m training.egos.vision_corrections FILE --out OUT --seed {seed} --rounds {rounds}"
+    command += f" --judged {judged}" if judged else ""
     provenance = Provenance(
         kind=f"{origin.kind}, corrected",
         command=f"{origin.command}, then {command}",

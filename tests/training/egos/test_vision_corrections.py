@@ -40,6 +40,14 @@ def make_pictures(n: int) -> LabelledPictures:
     return LabelledPictures(picture, luma(picture), torch.full((n,), 10.0), torch.zeros(n, 2), torch.zeros(n, 5))
 
 
+@pytest.mark.parametrize(
+    "wrong", [{"rate": 0.0}, {"rate": float("nan")}, {"seconds": 0.0}, {"seconds": float("inf")}, {"batch": 0}]
+)
+def test_settings_without_a_meaning_are_refused(wrong: dict[str, float]) -> None:
+    with pytest.raises(ValueError, match=f"Expected .*{next(iter(wrong))}"):
+        VisionCorrectionConfig(**wrong)  # type: ignore[arg-type]
+
+
 def test_the_network_learns_its_labels(network: PilotNet) -> None:
     data = make_pictures(4)
     given = network(data.picture, data.earlier, data.speed)
