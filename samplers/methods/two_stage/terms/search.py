@@ -73,6 +73,9 @@ class SearchState:
     base_draws: int = 0
     base_failures: int = 0
     """Base draws that fail."""
+    ceiling: float = 1.0
+    """Upper end of p by the base draws of the planned rounds, which no proposal has chosen. Batches that go on until a
+    target is met are left out: they stop by what they found."""
     last_rate: float = 0.0
     """Effective failures for each draw of the last round."""
 
@@ -125,7 +128,8 @@ def _draw_base(search: TermSearch) -> SimulationSteps[SearchState]:
     terms = yield from search.simulator.terms(u)
     failures = int((terms.f <= search.goal.gamma).sum())
     share = failures / n
-    state = SearchState(TermHistory.of_base_draws(u, terms), base_draws=n, base_failures=failures)
+    ceiling = clopper_pearson(failures, n, search.goal.confidence)[1]
+    state = SearchState(TermHistory.of_base_draws(u, terms), base_draws=n, base_failures=failures, ceiling=ceiling)
     return _record(search, state, share, share, n, binomial_cov(share, n))
 
 
@@ -171,11 +175,14 @@ def _draw_round(
     drawn = FinalRound(x, terms, -proposal.log_ratio(u), strata, factor=1.0)
     fails = terms.f <= gamma
     ess = effective_sample_size(drawn.log_weights[fails])
+    draws = state.base_draws + int((strata == 0).sum())
+    failures = state.base_failures + int(fails[strata == 0].sum())
     state = replace(
         state,
         history=state.history.add(u, terms, proposal),
-        base_draws=state.base_draws + int((strata == 0).sum()),
-        base_failures=state.base_failures + int(fails[strata == 0].sum()),
+        base_draws=draws,
+        base_failures=failures,
+        ceiling=clopper_pearson(failures, draws, search.goal.confidence)[1],
         last_rate=ess / n,
     )
     p = float(drawn.y(gamma).mean())
@@ -211,6 +218,7 @@ def _estimate(search: TermSearch, state: SearchState) -> Steps:
     rounds, goal = search.settings.rounds, search.goal
     room, stopped = search.left - int((len(rounds.final_sizes) - 1) * rounds.refit_share * search.budget), False
     plan = [(int(share * room), factor) for share, factor in zip(rounds.final_sizes, rounds.final_weights, strict=True)]
+    ceiling = state.ceiling
     while not stopped:
         number = len(state.finals)
         if number and goal.target_cov is not None and _combine(search, state).cov(_between(search)) <= goal.target_cov:
@@ -224,7 +232,8 @@ def _estimate(search: TermSearch, state: SearchState) -> Steps:
                 state = yield from _refit(search, state, sum(n for n, _ in plan[number:]))
             size = search.left if last else min(size, search.end - search.simulator.n_sim)
             state, drawn = yield from _draw_round(search, state, size, final=True)
-            state = replace(state, finals=(*state.finals, replace(drawn, factor=factor)))
+            ceiling = state.ceiling if number < len(plan) else ceiling
+            state = replace(state, finals=(*state.finals, replace(drawn, factor=factor)), ceiling=ceiling)
         except Interrupted:
             stopped = True
     return _conclude(search, state, stopped) if state.finals else _estimate_early(search, state)
@@ -246,7 +255,7 @@ def _conclude(search: TermSearch, state: SearchState, stopped: bool) -> Outcome:
     status = Status.CONVERGED if len(draws.f) else Status.NO_HITS
     return Outcome(
         p=combined.p,
-        interval=combined.interval(goal.confidence, settings.rounds.base_share, cov, _ceiling(search, state)),
+        interval=combined.interval(goal.confidence, settings.rounds.base_share, cov, state.ceiling),
         cov=cov,
         status=Status.STOPPED if stopped else status,
         warnings=tuple(doubt(combined, [one.number for one in state.pursued], settings.doubts)),
@@ -257,11 +266,6 @@ def _conclude(search: TermSearch, state: SearchState, stopped: bool) -> Outcome:
     )
 
 
-def _ceiling(search: TermSearch, state: SearchState) -> float:
-    """Return the upper end of p by the base draws of all rounds alone, which no proposal has chosen."""
-    return clopper_pearson(state.base_failures, state.base_draws, search.goal.confidence)[1]
-
-
 def _estimate_early(search: TermSearch, state: SearchState) -> Outcome:
     """Return what all draws from known proposals say, for a run that ends before its estimate."""
     state, history = _close_trace(search, state), state.history
@@ -270,9 +274,7 @@ def _estimate_early(search: TermSearch, state: SearchState) -> Outcome:
     draws = Draws.from_outcomes(history.terms.f, history.log_weights + np.log(n), x, search.goal.gamma)
     return Outcome(
         p=draws.p,
-        interval=weighted_interval(
-            draws, search.goal.confidence, n / history.n_base, draws.cov, _ceiling(search, state)
-        ),
+        interval=weighted_interval(draws, search.goal.confidence, n / history.n_base, draws.cov, state.ceiling),
         cov=draws.cov,
         status=Status.STOPPED,
         warnings=tuple(weight_warnings(draws)),

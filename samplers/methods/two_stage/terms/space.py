@@ -10,6 +10,8 @@ from samplers.problem import FloatArray, Inputs, StandardNormal, Terms
 
 DIFFERENCE = 1e-4
 """Standard deviations of a central difference: its error is 1e-8, that of rounding 1e-12."""
+POINTS_AT_ONCE = 4
+"""Points at which T is differentiated at once: 4 with 386 groups of 1,448 coordinates take 70 MB."""
 PATTERN_POINTS = 3
 """Points at which it is seen which coordinates of u a coordinate of x depends on."""
 
@@ -74,12 +76,18 @@ class TransformSlopes:
             return gradients
         if self._groups is None:
             self._find_pattern(u[:PATTERN_POINTS])
-        assert self._groups is not None
         result = gradients.copy()  # noise, where dx / du = I
+        for first in range(0, len(u), POINTS_AT_ONCE):
+            self._pull_back(u[first : first + POINTS_AT_ONCE], result[first : first + POINTS_AT_ONCE])
+        return result
+
+    def _pull_back(self, u: FloatArray, gradients: FloatArray) -> None:
+        """Replace the gradients at some points by J' g, with J = dx / du."""
+        assert self._groups is not None
+        given = gradients.copy()
         slopes = self._differences(u, [self._moved[group] for group in self._groups])
         for group, slope in zip(self._groups, slopes, strict=True):
-            result[:, self._moved[group]] = (slope * gradients) @ self._pattern[group].T
-        return result
+            gradients[:, self._moved[group]] = (slope * given) @ self._pattern[group].T
 
     def _find_pattern(self, u: FloatArray) -> None:
         """Find which coordinates of x each moved coordinate of u changes, and groups of them that do not meet."""
