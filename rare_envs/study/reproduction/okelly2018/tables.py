@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 from rare_envs.study.reproduction.comparison import ComparedValue, ComparisonTable
@@ -12,6 +12,8 @@ from rare_envs.study.reproduction.okelly2018.scales import PRINTED_SEARCH, WHY_O
 Z_95 = 1.96
 MISSED_ERRORS = 3.0
 """Standard errors below the naive p from which failures are said to have been missed."""
+FEW_DRAWS = 0.02
+"""Effective sample size over rare draws below which a few draws are said to make up an estimate."""
 KEYS = ("sample", "gamma, theirs / ours [s]")
 SEARCH_COUNTED = "search counted"
 _ERROR = "standard error"
@@ -38,7 +40,7 @@ def make_tables(ego: str, gammas: tuple[float, ...], found: Mapping[str, Any]) -
             title=f"{printed.name}: probabilities with the {ego} ego",
             keys=KEYS,
             values=tuple(estimates),
-            explanations=reasons,
+            explanations=_keep_used(reasons, estimates),
             all_in_title=SEARCH_COUNTED,
         ),
         ComparisonTable(
@@ -46,10 +48,17 @@ def make_tables(ego: str, gammas: tuple[float, ...], found: Mapping[str, Any]) -
             title=f"What cross-entropy gains over naive Monte Carlo with the {ego} ego",
             keys=KEYS,
             values=tuple(ratios),
-            explanations=reasons,
+            explanations=_keep_used(reasons, ratios),
             all_in_title=SEARCH_COUNTED,
         ),
     )
+
+
+def _keep_used(reasons: Mapping[str, str], values: Iterable[ComparedValue]) -> dict[str, str]:
+    """Return the explanations that some value refers to; `underflow` refers to `weights`."""
+    used = {reason for value in values for reason in value.reasons}
+    used |= {"weights"} if "underflow" in used else set()
+    return {name: text for name, text in reasons.items() if name in used}
 
 
 def explain_differences(ego: str, found: Mapping[str, Any]) -> dict[str, str]:
@@ -65,6 +74,10 @@ def explain_differences(ego: str, found: Mapping[str, Any]) -> dict[str, str]:
             "The search follows some of the failures and leaves the others out: p is then too small by more than its "
             "standard error can say, and the ratio of variances, which has no other source, says nothing. In the "
             "paper's Table 2 all four means of cross-entropy are below those of naive Monte Carlo as well."
+        ),
+        "few draws": (
+            f"The effective sample size of the rare draws is below {FEW_DRAWS:.0%} of their number: a few large "
+            "likelihood ratios make up the estimate, so that its standard error is itself uncertain."
         ),
         "underflow": "The standard error is below the smallest number of the machine, for the reason `weights`.",
         "extra": "Not in the paper.",
@@ -85,7 +98,7 @@ def explain_differences(ego: str, found: Mapping[str, Any]) -> dict[str, str]:
 def _explain_scale(printed: PrintedTable, naive: list[dict[str, Any]]) -> str:
     """Return what the numbers of rollouts make of a difference."""
     if naive and naive[0]["n"] >= printed.draws["naive"]:
-        return "One run of each row with one seed, of as many rollouts as theirs: the rest is chance."
+        return "One run of each row with one seed, of as many rollouts as theirs: beside other reasons there is chance."
     return "One run, with fewer rollouts than theirs; the rows say how many."
 
 
@@ -200,7 +213,8 @@ def _list_ratios(printed: PrintedTable, heads: list[str], found: Mapping[str, An
             all_in = None if ratio is None else ratio * draws / (draws + printed.search)
             theirs = (ratio, all_in, printed.errors_off(j) if of_paper else None)
             known = each["comparisons"][j] if each["comparisons"] else None
-            values += _ratios_of(f"cross-entropy, {name}", head, theirs, known, each)
+            few = bool(each["estimates"]) and _rests_on_few(each["estimates"][j])
+            values += _ratios_of(f"cross-entropy, {name}", head, theirs, known, each, few)
     for own in found["own"]:
         head = next(each for each in heads if each.endswith(f" {own['gamma']}"))
         values.append(
@@ -214,14 +228,21 @@ def _list_ratios(printed: PrintedTable, heads: list[str], found: Mapping[str, An
     return values
 
 
+def _rests_on_few(estimate: Mapping[str, Any]) -> bool:
+    """Return whether a few draws make up an estimate."""
+    ess = estimate.get("ess")
+    return ess is not None and ess < FEW_DRAWS * estimate["events"]
+
+
 def _ratios_of(
     label: str,
     head: str,
     theirs: tuple[float | None, float | None, float | None],
     known: Mapping[str, Any] | None,
     search: Mapping[str, Any],
+    few: bool,
 ) -> list[ComparedValue]:
-    """Return the ratios of one search at one threshold."""
+    """Return the ratios of one search at one threshold; `few` says whether its estimate rests on few draws."""
     if known is None:
         labels, missing = (f"{label}: {search['iterations']} of {search['of']} iterations run", head), ("not run",)
         known = {
@@ -233,12 +254,13 @@ def _ratios_of(
     why = ("thresholds", "weights", "scale") if search["weights_move"] and "sampler" in search else ("thresholds",)
     low = known["errors_off"] is not None and known["errors_off"] < -MISSED_ERRORS
     why = (*why, "missed") if low and not search["weights_move"] else why
+    of_weights = (*why, "few draws") if few and not search["weights_move"] else why
     ratio, all_in, off = theirs
     rows = (
         ("rare events, sampler / naive, equal draws", (None, None), (known["events_ratio"], None), why),
-        (_VARIANCE_RATIO, (ratio, all_in), (known["variance_ratio"], known["all_in"]), ("search", *why)),
-        (_DISTANCE_RATIO, (None, None), (None, known["error_ratio"]), ("search", *why)),
-        ("p less the naive p, in joint standard errors", (off, None), (known["errors_off"], None), why),
+        (_VARIANCE_RATIO, (ratio, all_in), (known["variance_ratio"], known["all_in"]), ("search", *of_weights)),
+        (_DISTANCE_RATIO, (None, None), (None, known["error_ratio"]), ("search", *of_weights)),
+        ("p less the naive p, in joint standard errors", (off, None), (known["errors_off"], None), of_weights),
     )
     return [
         ComparedValue(

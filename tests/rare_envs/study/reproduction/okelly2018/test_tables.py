@@ -107,6 +107,21 @@ def test_missed_failures_are_said_to_be_missed() -> None:
     assert (values[3].ours, values[3].paper) == (-5.0, pytest.approx(0.79, abs=0.01))  # (19.8 - 12.4) / 9.4
 
 
+def test_estimates_that_rest_on_few_draws_are_said_to() -> None:
+    events = {**ESTIMATE, "n": 100_000, "events": 48_605}
+    estimates = [{**events, "ess": ess} for ess in (2764.0, 82.0, None, 973.0)]
+    alone = {**RUN, "weights_move": False, "estimates": estimates}
+    values = make_tables("lidar", GAMMAS, found_of(alone))[1].values
+    gains = [value for value in values if value.quantity == "variance, naive / sampler, equal draws"]
+    assert ["few draws" in value.reasons for value in gains] == [False, True, False, False]
+
+
+def test_only_reasons_in_use_are_explained() -> None:
+    estimates, ratios = make_tables("lidar", GAMMAS, found_of(RUN))
+    assert list(estimates.explanations) == ["thresholds", "scale", "search", "not run", "weights"]
+    assert list(ratios.explanations) == ["thresholds", "scale", "search", "underflow", "weights"]
+
+
 def test_what_the_paper_has_not_and_was_not_run_is_one_line() -> None:
     name = "starts alone, rho 0.1"
     found = found_of(RUN) | {"searches": {PRINTED_SEARCH: RUN, name: {**NOT_RUN, "weights_move": False}}}
