@@ -72,13 +72,21 @@ def continue_journal(folder: Path, mend: bool = False) -> tuple[JournalFile, Que
     except OSError as error:
         raise BadInput(f"Cannot take up {str(path)!r}: {error.strerror}.") from error
     except JournalError as error:
-        hint = f" What stands before the damage is kept by rare-envs resume {folder} --mend."
-        raise BadInput(f"{error}{hint if 'damaged' in str(error) else ''}") from error
+        raise BadInput(f"{error}{_advise_on_damage(str(error), folder)}") from error
     try:
         return journal, _read_question(journal)
     except BadInput as error:
         journal.close()
         raise BadInput(f"Cannot take up {str(path)!r}: {error}") from error
+
+
+def _advise_on_damage(error: str, folder: Path) -> str:
+    """Return what to do about a damaged journal, behind a space; empty where the error is another one."""
+    if "damaged from its first record on" in error:
+        return " Nothing can be taken from it: it is left as it is, and the command with --force replaces it."
+    if "damaged" in error:
+        return f" What stands before the damage is kept by rare-envs resume {folder} --mend."
+    return ""
 
 
 def _explain_no_journal(folder: Path) -> str:

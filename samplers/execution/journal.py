@@ -126,11 +126,12 @@ class JournalFile:
 
         Args:
             path: Of the file.
-            mend: Of a damaged journal, keep what stands before the damage.
+            mend: Of a damaged journal, keep what stands before the damage; one whose first record is damaged is left
+                as it is.
 
         Raises:
             NothingRecorded: It was cut before its first record.
-            JournalError: It is damaged, or another process has it open.
+            JournalError: It is damaged, with `mend` in its first record, or another process has it open.
             OSError: It cannot be read.
         """
         records = RecordFile(path)

@@ -132,14 +132,15 @@ class RecordFile:
         A power cut leaves a record that ends too early, one whose last parts are missing, or zeros.
 
         Args:
-            drop: Drop all records from the first damaged one on, whatever the damage.
+            drop: Drop all records from the first damaged one on, whatever the damage; not from the first of all on,
+                before which nothing stands that could be kept.
 
         Returns:
             Number of bytes dropped.
 
         Raises:
             NothingRecorded: The file was cut in its first bytes.
-            JournalError: A record is damaged otherwise, or the file is of another kind.
+            JournalError: A record is damaged otherwise, or the file is of another kind; the file is left as it is.
         """
         self._file.seek(0)
         begun = self._file.read(len(MAGIC))
@@ -152,8 +153,9 @@ class RecordFile:
         while self.read() is not None:
             n += 1
         dropped = self.size - self._end
-        if dropped and not (drop or self._is_cut()):
-            raise JournalError(f"{str(self.path)!r} is damaged: record {n + 1} does not match its checksum.")
+        if dropped and not ((drop and n) or self._is_cut()):
+            where = f": record {n + 1} does" if n else " from its first record on, which does"
+            raise JournalError(f"{str(self.path)!r} is damaged{where} not match its checksum.")
         self._file.truncate(self._end)
         self.rewind()
         return dropped

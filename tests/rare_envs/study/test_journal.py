@@ -235,6 +235,10 @@ def test_values_of_f_that_were_zeroed_are_refused_and_those_before_them_can_be_k
     journal = frail / "run" / JOURNAL
     content = journal.read_bytes()
     second = content.index(b"points", content.index(b"points") + 1)
+    journal.write_bytes(content[:40] + b"\0" + content[41:])
+    for words in (("resume", "run"), ("resume", "run", "--mend")):
+        assert_refused(cli(*words), "damaged from its first record on", "with --force replaces it")
+        assert journal.read_bytes()[41:] == content[41:]
     journal.write_bytes(content[: second + 100] + bytes(1200) + content[second + 1300 :])
     refused = cli("resume", "run")
     assert_refused(refused, "damaged: record 3 does not match its checksum", "--mend")

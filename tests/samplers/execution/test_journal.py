@@ -233,3 +233,17 @@ def test_killed_at_random_times_it_comes_to_the_same_result(kills: int, tmp_path
     method = "mc" if kills == 2 else "two-stage"
     found = kill_at_random_times(tmp_path / "j", method, kills, np.random.default_rng(kills))
     assert found == run(None, method=method).to_json() + "\n"
+
+
+@pytest.mark.parametrize("mend", [False, True])
+def test_a_journal_whose_head_is_damaged_is_left_as_it_is(tmp_path: Path, mend: bool) -> None:
+    journal = JournalFile.create(tmp_path / "j", {"dim": 4, "seed": 4})
+    journal.append(JournalRecord("of x", np.ones(1000), {}))
+    journal.close()
+    content = bytearray((tmp_path / "j").read_bytes())
+    content[len(MAGIC) + 15] ^= 1
+    (tmp_path / "j").write_bytes(content)
+    with pytest.raises(JournalError, match="damaged from its first record on") as caught:
+        JournalFile.open(tmp_path / "j", mend)
+    assert not isinstance(caught.value, NothingRecorded)
+    assert (tmp_path / "j").read_bytes() == content

@@ -103,6 +103,17 @@ def test_records_before_a_damage_can_be_kept(path: Path) -> None:
     assert read_all(path) == PAYLOADS[:1]
 
 
+@pytest.mark.parametrize("drop", [False, True])
+@pytest.mark.parametrize("position", [len(MAGIC) + at for at in (0, 9, HEADER + 2)])
+def test_nothing_is_deleted_where_the_first_record_is_damaged(path: Path, position: int, drop: bool) -> None:
+    content = bytearray(path.read_bytes())
+    content[position] ^= 4
+    path.write_bytes(content)
+    with pytest.raises(JournalError, match="damaged from its first record on"):
+        read_all(path, drop)
+    assert path.read_bytes() == content
+
+
 def test_every_flipped_bit_is_noticed(path: Path) -> None:
     content = path.read_bytes()
     for position in range(len(content)):
