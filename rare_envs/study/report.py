@@ -31,6 +31,19 @@ ENSEMBLE_REASON = (
 """Why there are no derivatives of the mean over refits."""
 
 
+def has_exact_bound(estimate: samplers.Estimate) -> bool:
+    """Return whether the answer is the upper end: no simulation failed, and all are draws from the base distribution.
+
+    The end is then exact, so that the warning that nothing failed is a remark.
+
+    Example:
+        >>> never = samplers.FunctionProblem(lambda x: 9.0 - x[:, 0], dim=1)
+        >>> [has_exact_bound(samplers.estimate(never, method, seed=0, max_sim=600)) for method in ("mc", "ss")]
+        [True, False]
+    """
+    return estimate.status is samplers.Status.NO_HITS and estimate.base_draws == estimate.n_sim
+
+
 class BaseAnswer(NamedTuple):
     """p under another base distribution, or why the simulations of this run do not give it."""
 
@@ -113,11 +126,8 @@ class Report:
 
     @property
     def is_exact_bound(self) -> bool:
-        """Whether the answer is the upper end: no simulation failed, and all are draws from the base distribution.
-
-        The end is then exact, so that the warning that nothing failed is a remark.
-        """
-        return self.estimate.status is samplers.Status.NO_HITS and self.estimate.base_draws == self.estimate.n_sim
+        """Whether the answer is the upper end, see `has_exact_bound`."""
+        return has_exact_bound(self.estimate)
 
     @property
     def remarks(self) -> tuple[str, ...]:

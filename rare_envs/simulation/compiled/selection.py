@@ -11,13 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rare_envs.control.idm import IDM
-from rare_envs.measures.registry import MEASURES
 from rare_envs.plugins import one_line
 from rare_envs.scenarios import car_following, cut_in, hard_brake
 from rare_envs.simulation.compiled.dense_policy import DensePolicy
 from rare_envs.simulation.compiled.failures import CompilerFails, NotCompiled, compiler_failures
 from rare_envs.simulation.compiled.highway.dense_driver import DenseDriver
 from rare_envs.simulation.compiled.highway.highway_rollout import HighwayRollout, find_highway_rollout
+from rare_envs.simulation.compiled.highway.measure_kinds import BY_TTC, find_measure_kind
 from rare_envs.simulation.observation import EGO_FEATURES, OTHER_FEATURES
 
 if TYPE_CHECKING:
@@ -151,7 +151,7 @@ def _find_obstacle(world: World) -> str:
         f"the script of the scenario {scenario.name!r} is not compiled": not _find_script(scenario),
         "curved roads and lanes of different widths are not compiled": scenario.road.reference_line is not None
         or not scenario.road.equal,
-        f"the measure {measurement.measure!r} is not compiled": measurement.episode_measure is not MEASURES["ttc"],
+        f"the measure {measurement.measure!r} is not compiled": find_measure_kind(measurement) != BY_TTC,
         "statistics of episodes are not compiled": measurement.statistics,
         "collisions of other vehicles are not compiled": measurement.collisions != "ego",
         "parameters of the weather are not compiled": sum(world.columns) != scenario.size,

@@ -86,12 +86,12 @@ def list_command(
 ) -> None:
     """Show the names of environments, methods, egos, drivers and measures; with one of these words, what they mean."""
     from rare_envs.study.cli.catalogue import list_names
-    from rare_envs.study.cli.catalogue_table import check_kind, print_details, print_overview
+    from rare_envs.study.cli.catalogue_table import check_kind, choose_entries, print_details, print_overview
 
     entries = list_names()
     chosen = None if what is None else check_kind(entries, what)
     if as_json:
-        print_json(entries)
+        print_json(entries if chosen is None else choose_entries(entries, chosen))
     elif chosen is None:
         print_overview(entries)
     else:

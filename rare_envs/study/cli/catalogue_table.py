@@ -74,6 +74,25 @@ def print_details(entries: dict[str, Any], what: str) -> None:
             console.print(_make_meaning_table(title, entries[kind]))
 
 
+def choose_entries(entries: dict[str, Any], what: str) -> dict[str, Any]:
+    """Return the part of the names that `print_details` prints, under the keys that it has in the whole.
+
+    Args:
+        entries: What `list_names` returns.
+        what: One of `KINDS`, or the id of an environment.
+
+    Example:
+        >>> choose_entries({"egos": {"idm": "by rule"}, "drivers": {}}, "egos")
+        {'egos': {'idm': 'by rule'}}
+    """
+    if what == EVERYTHING:
+        return entries
+    if what not in KINDS:
+        return {"environments": {what: entries["environments"][what]}}
+    kinds = ("environments", "highway_env") if what == "environments" else (what,)
+    return {kind: entries[kind] for kind in kinds}
+
+
 def check_kind(entries: dict[str, Any], what: str) -> str:
     """Return what to show in detail: a kind, or the id that an id or its part behind the slash means.
 

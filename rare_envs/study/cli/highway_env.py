@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -35,7 +36,8 @@ def estimate_highway_env(
         executor: Where to simulate; None for this process.
 
     Returns:
-        The answer, JSON-ready, with the text of the estimate as "text".
+        The answer, JSON-ready, with the text of the estimate as "text", and whether a warning casts doubt on the number
+        as "doubtful".
 
     Raises:
         BadInput: An option does not go with such an environment, the ego does not fit, or the folder cannot be used.
@@ -82,13 +84,18 @@ def _read_arguments(question: Question) -> dict[str, Any]:
 
 def _describe(question: Question, problem: Any, result: Estimate) -> dict[str, Any]:
     """Return the answer, JSON-ready."""
-    lines = [f"{question.env_id}, ego {question.ego}", str(result), f"  given {HELD}"]
+    from rare_envs.study.report import has_exact_bound
+
+    shown = result
+    if has_exact_bound(result):  # the warning that nothing failed casts no doubt on the upper end
+        shown = replace(result, warnings=(), remarks=(*result.warnings, *result.remarks))
+    lines = [f"{question.env_id}, ego {question.ego}", str(shown), f"  given {HELD}"]
     likeliest = {}
     if len(result.failures):
         likeliest = {name: _as_plain(value) for name, value in problem.space.named(result.failures.x[0]).items()}
         lines.append(f"  most likely failure: {', '.join(f'{name} {value}' for name, value in likeliest.items())}")
     about = {"env_id": question.env_id, "ego": question.ego, "given": HELD, "most_likely": likeliest}
-    return {**result.to_dict(), **about, "text": "\n".join(lines)}
+    return {**result.to_dict(), **about, "doubtful": bool(shown.warnings), "text": "\n".join(lines)}
 
 
 def _as_plain(value: Any) -> Any:

@@ -1,4 +1,4 @@
-"""Digest of the code and weights that runs come from, by which runs of other code are told apart."""
+"""Digest of the code, weights and base distributions of runs, by which runs of other code are told apart."""
 
 from __future__ import annotations
 
@@ -7,12 +7,14 @@ from functools import cache
 from importlib import resources
 from pathlib import Path
 
+SIMULATING_FILES = ("*.py", "*.safetensors", "*.json")
+"""Patterns of the files that simulations come from: code, weights, base distributions."""
 SIMULATING_PACKAGES = ("rare_envs", "samplers", "agents")
 
 
 @cache
 def digest_code() -> str:
-    """Return a digest of the code and weights that runs come from: other ones may give other numbers at the same seed.
+    """Return a digest of the code and data that runs come from: other ones may give other numbers at the same seed.
 
     Example:
         >>> len(digest_code())
@@ -21,6 +23,6 @@ def digest_code() -> str:
     digest = hashlib.blake2b(digest_size=8)
     for package in SIMULATING_PACKAGES:
         folder = Path(str(resources.files(package)))
-        for path in sorted(path for end in ("*.py", "*.safetensors") for path in folder.rglob(end)):
+        for path in sorted(path for end in SIMULATING_FILES for path in folder.rglob(end)):
             digest.update(path.read_bytes())
     return digest.hexdigest()

@@ -108,7 +108,7 @@ def render_page(study: LoadedStudy, figures: Mapping[str, FigureOfPage], atlas: 
         folder=str(study.folder),
         summary=summarise_answer(result, str((study.about.get("base") or {}).get("name") or "its default base")),
         doubts=[*_describe_changes(study), *list_doubts(result)],
-        remarks=[*(result.get("remarks") or []), *(result.get("notes") or [])],
+        remarks=_list_notes(result),
         intervals=describe_intervals(result),
         validity=describe_validity(result),
         rate=describe_rate(result),
@@ -141,8 +141,7 @@ def _describe_changes(study: LoadedStudy) -> list[str]:
 
 def list_doubts(result: Mapping[str, Any]) -> list[str]:
     """Return all warnings of a run: of the method, of its base distribution, of the ego's statistics, and of f."""
-    exact_bound = result.get("status") == "no_hits" and result.get("doubtful") is False  # none of the base draws failed
-    doubts = [] if exact_bound else [str(text) for text in result.get("warnings") or []]
+    doubts = [] if _has_exact_bound(result) else [str(text) for text in result.get("warnings") or []]
     base = result.get("base_uncertainty")
     if isinstance(base, dict):
         doubts += [f"base distribution: {text}" for text in base.get("warnings") or []]
@@ -155,6 +154,17 @@ def list_doubts(result: Mapping[str, Any]) -> list[str]:
     if result.get("doubtful") and not doubts:
         doubts.append("the run had warnings that its result.json does not hold: see what the command printed")
     return doubts
+
+
+def _list_notes(result: Mapping[str, Any]) -> list[str]:
+    """Return what casts no doubt on the answer; where that is an exact bound, the warnings of the method too."""
+    warnings = (result.get("warnings") or []) if _has_exact_bound(result) else []
+    return [str(text) for text in (*warnings, *(result.get("remarks") or []), *(result.get("notes") or []))]
+
+
+def _has_exact_bound(result: Mapping[str, Any]) -> bool:
+    """Return whether none of the draws from the base distribution failed, which casts no doubt on the bound."""
+    return result.get("status") == "no_hits" and result.get("doubtful") is False
 
 
 def _make_figures(study: LoadedStudy, source: AtlasSource) -> dict[str, FigureOfPage]:

@@ -85,7 +85,7 @@ def _estimate_highway_env(
         print_json(answer)
     else:
         print(text if out is None else f"{text}\nWrote {out}.")
-    raise typer.Exit(DOUBTFUL if answer["warnings"] else 0)
+    raise typer.Exit(DOUBTFUL if answer["doubtful"] else 0)
 
 
 def _refuse_options_of_a_limit(typed: set[str]) -> None:

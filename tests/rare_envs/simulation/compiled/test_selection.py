@@ -109,6 +109,13 @@ def test_a_problem_is_sent_to_other_processes_with_its_core():
     assert problem.evaluate(np.array([[20.0, 15.0, 30.0]])) == pytest.approx(6.0)
 
 
+def test_worlds_and_drivers_that_were_sent_stay_compiled():
+    sent = pickle.loads(pickle.dumps(rare_envs.DrivingProblem(CAR_FOLLOWING)))
+    fresh = rare_envs.DrivingProblem(CAR_FOLLOWING, core="numba")
+    fresh.world, fresh.driver = sent.world, sent.driver
+    assert (fresh.core, fresh.evaluate(X)) == ("numba", pytest.approx(6.0))
+
+
 def test_a_process_without_numba_says_what_it_lacks(monkeypatch):
     problem = rare_envs.DrivingProblem(CAR_FOLLOWING, core="numba")
     monkeypatch.delattr(sys.modules[selection.__package__], "rollouts")

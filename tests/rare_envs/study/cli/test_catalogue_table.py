@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 
 import pytest
@@ -41,6 +42,16 @@ def test_all_names_fit_a_screen(capsys: pytest.CaptureFixture[str], monkeypatch:
 def test_one_kind_is_explained(cli: Cli, what: str, there: str, absent: str) -> None:
     shown = cli("list", what).stdout
     assert there in shown and absent not in shown
+
+
+def test_one_kind_alone_is_listed_as_json(cli: Cli) -> None:
+    whole = json.loads(cli("list", "--json").stdout)
+    assert json.loads(cli("list", "egos", "--json").stdout) == {"egos": whole["egos"]}
+    env_id = "rare_envs/CutIn-v0"
+    alone = json.loads(cli("list", "CutIn-v0", "--json").stdout)
+    assert alone == {"environments": {env_id: whole["environments"][env_id]}}
+    assert list(json.loads(cli("list", "environments", "--json").stdout)) == ["environments", "highway_env"]
+    assert json.loads(cli("list", "all", "--json").stdout) == whole
 
 
 def test_an_unknown_kind_is_one_line(cli: Cli) -> None:

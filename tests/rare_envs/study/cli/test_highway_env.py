@@ -38,6 +38,15 @@ def test_a_policy_from_there_is_estimated_there(cli: Cli, saved: Path, tmp_path:
     assert text.startswith(f"highway-fast-v0, ego {saved}\nP[f <= 0] = ") and "what it holds fixed is held" in text
 
 
+def test_an_upper_bound_by_plain_monte_carlo_is_an_answer(cli: Cli) -> None:
+    words = ("estimate", "highway-fast-v0", "--method", "mc", "--max-sim", 4, "--horizon", 1, "--gamma", -99)
+    found, text = cli(*words, "--json"), cli(*words)
+    answer = json.loads(found.stdout)
+    assert (answer["status"], answer["doubtful"], len(answer["warnings"])) == ("no_hits", False, 1)
+    assert (found.exit_code, text.exit_code) == (0, 0)
+    assert "warning" not in text.stdout and answer["warnings"][0] in text.stdout
+
+
 @pytest.mark.parametrize(
     ("options", "said"),
     [

@@ -1,4 +1,4 @@
-"""The digest tells apart code and weights."""
+"""The digest tells apart code, weights and base distributions."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import pytest
 from rare_envs.study.execution.code_digest import digest_code
 
 
-def test_another_source_or_weight_is_other_code(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_another_source_weight_or_base_is_other_code(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     def digest(**files: str) -> str:
         for name, text in files.items():
             (tmp_path / name.replace("_", ".")).write_text(text)
@@ -19,7 +19,7 @@ def test_another_source_or_weight_is_other_code(monkeypatch: pytest.MonkeyPatch,
 
     shipped = digest()
     monkeypatch.setattr(resources, "files", lambda package: tmp_path)
-    found = [digest(a_py="1"), digest(a_py="2"), digest(b_safetensors="w"), digest(notes_txt="t")]
+    found = [digest(a_py="1"), digest(a_py="2"), digest(b_safetensors="w"), digest(c_json="{}"), digest(notes_txt="t")]
     digest_code.cache_clear()
-    assert len({shipped, *found[:3]}) == 4
-    assert found[3] == found[2]
+    assert len({shipped, *found[:4]}) == 5
+    assert found[4] == found[3]

@@ -159,6 +159,18 @@ def test_doubts_are_those_of_method_base_and_f() -> None:
     assert list_doubts({"doubtful": False}) == [] and len(list_doubts({"doubtful": True})) == 1
 
 
+def test_a_warning_beside_an_exact_bound_is_a_note(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(FigureOfPage, "to_svg", lambda _: "")
+    run = Path(shutil.copytree(folder, tmp_path / "run"))
+    bound = {"status": "no_hits", "doubtful": False, "warnings": ["None of 9 failed."], "remarks": ["Cut short."]}
+    (run / "result.json").write_text(json.dumps(json.loads((run / "result.json").read_text()) | bound))
+    write_html_report(run, out=tmp_path / "page.html")
+    text = (tmp_path / "page.html").read_text()
+    assert "<dt>note</dt><dd>None of 9 failed.</dd><dt>note</dt><dd>Cut short.</dd>" in text
+
+
 def test_recorded_events_and_figures_as_files(folder: Path, tmp_path: Path, cli: Callable[..., Result]) -> None:
     events = tmp_path / "events.csv"
     events.write_text("gap,ego_speed,lead_speed,site\n20,21,10,a\n60,20,20,b\n,1,2,c\n")
