@@ -28,7 +28,7 @@ def print_overview(entries: dict[str, Any]) -> None:
 
     Example:
         >>> from rare_envs.study.cli.catalogue import list_names
-        >>> print_overview(list_names())  # doctest: +ELLIPSIS
+        >>> print_overview(list_names())  # doctest: +ELLIPSIS, +NORMALIZE_WHITESPACE
         environments              parameters
           rare_envs/CarFollowing-v0 ego_speed, lead_speed, gap
         ...
