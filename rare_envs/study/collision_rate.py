@@ -10,6 +10,8 @@ from rare_envs.distributions.fitted import FittedDistribution
 from rare_envs.distributions.frequency import EventFrequency
 from rare_envs.exposure.base_record import explain_no_frequency, read_source
 from rare_envs.exposure.rate import CollisionProbability, CollisionRate
+from rare_envs.measures.base import Measure
+from rare_envs.measures.registry import MEASURES
 from rare_envs.scenarios.registry import find_scenario
 from rare_envs.study.analysis.severity import Severity
 from rare_envs.study.question import Question, Study
@@ -18,7 +20,7 @@ from samplers.statistics.intervals import Interval
 from samplers.statistics.refit_families import refit_quantile
 
 COLLISION_MEASURE = "ttc"
-"""Measure that is -1 after a collision and above 0 without one."""
+"""Measure that is -1 after a collision and above 0 without one; others have the same event at gamma = 0 alone."""
 
 
 def find_frequency(study: Study) -> EventFrequency:
@@ -135,9 +137,11 @@ def describe_left_out(study: Study, estimate: samplers.Estimate) -> tuple[str, .
 
 def _explain_no_collisions(question: Question) -> str:
     """Return why p is no probability of a collision of the ego; empty if it is one."""
-    if question.measure != COLLISION_MEASURE:
+    measure = MEASURES.get(question.measure)
+    if not (isinstance(measure, Measure) and measure.collisions_only):
         return f"--measure {question.measure} counts other events than collisions (--measure {COLLISION_MEASURE} does)"
-    if not -1 <= question.gamma <= 0:
+    lowest = -1.0 if question.measure == COLLISION_MEASURE else 0.0
+    if not lowest <= question.gamma <= 0:
         return f"--gamma {question.gamma:g} counts other events than collisions (--gamma 0 does)"
     if question.collisions != "ego":
         return f"--collisions {question.collisions} counts those between other vehicles too"

@@ -6,6 +6,7 @@ import math
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 from scipy import stats
 
@@ -89,6 +90,7 @@ def test_nothing_failed(tmp_path: Path) -> None:
 REFUSED = {
     "another measure": ({"measure": "drac"}, "--measure drac"),
     "another threshold": ({"gamma": 1.0}, "--gamma 1"),
+    "a distance behind the collision": ({"measure": "clearance", "gamma": -0.5}, "--gamma -0.5"),
     "crashes of others": ({"collisions": "any"}, "--collisions any"),
 }
 
@@ -99,6 +101,17 @@ def test_what_counts_no_collisions_has_no_rate(fitted: str, changes: dict[str, o
     study = replace(study, question=replace(study.question, **changes))
     with pytest.raises(ValueError, match=said):
         find_frequency(study)
+
+
+@pytest.mark.parametrize("measure", ["ttc", "ttc_2d", "mttc", "thw", "clearance", "margin"])
+def test_measures_that_are_positive_until_contact_have_the_rate_of_collisions(fitted: str, measure: str) -> None:
+    study = prepare(question(fitted, gamma=0.0))
+    other = prepare(question(fitted, gamma=0.0, measure=measure))
+    assert find_frequency(other) == find_frequency(study)
+    x = study.problem.base.sample(500, np.random.default_rng(0))
+    collided = study.problem.evaluate(x) <= 0
+    assert 0 < collided.sum() < 500
+    np.testing.assert_array_equal(other.problem.evaluate(x) <= 0, collided)
 
 
 @pytest.mark.parametrize("env", ["rare_envs/Highway-v0", "rare_envs/CutIn-v0"])
