@@ -25,6 +25,7 @@ from rare_envs.measures.moment import Moment
 from rare_envs.measures.rss import MARGIN_MAX, rss_lateral, rss_longitudinal, rss_margin
 from rare_envs.measures.temporal_logic import stl
 from rare_envs.measures.time_to_collision import (
+    AT_START,
     TTC_MAX,
     lidar_ttc,
     lidar_ttc_terms,
@@ -110,7 +111,7 @@ MEASURES: MappingProxyType[str, EpisodeMeasure] = MappingProxyType(
             lidar_ttc,
             sees=True,
             collision=None,
-            terms=MeasureTerms(lidar_ttc_terms, names=name_lidar_terms, unattained=TTC_MAX),
+            terms=MeasureTerms(lidar_ttc_terms, names=name_lidar_terms, cuts=(AT_START,), unattained=TTC_MAX),
         ),
         "ttc_2d": Measure(ttc_2d, terms=_to_vehicles_and_edge(contact_time_terms), collisions_only=True),
         "mttc": Measure(mttc, collisions_only=True),

@@ -10,6 +10,9 @@ from rare_envs.traffic.lead import lead_index
 
 TTC_MAX = 10.0
 """Cap of the time to collision [s]; what is further away, or not closing, counts as this."""
+AT_START = 0.05
+"""Share of the horizon up to which a short time to collision belongs to the start: cars that begin side by side fail in
+other directions than those that come to it, 20 to 40 ticks later on the highway."""
 _SQUARE = 1e-6
 """Cosines of angles of beams are taken as 0 within this, which is rounding."""
 

@@ -137,7 +137,8 @@ def test_the_command_line_knows_it(installed):
     assert "'broken' of lattice-methods" in run.stderr
     answer = json.loads(run.stdout)
     assert (answer["method"]["name"], answer["n_sim"]) == ("lattice", 2000)
-    assert "Plain draws under another name." in command_line("list").stdout
+    assert "Plain draws under another name." in command_line("list", "methods").stdout
+    assert "lattice" in command_line("list").stdout
     refused = command_line("estimate", env, "--method", "lattic")
     assert refused.exit_code == 2
     assert "Did you mean 'lattice'?" in refused.stderr

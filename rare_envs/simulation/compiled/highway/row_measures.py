@@ -66,7 +66,7 @@ def measure_row(
         times = np.empty(2 * others, dtype=np.float32)
         value = lidar_times(ego_beams, slot, times)
         if rules.terms == BEAM_TIMES:
-            lower_terms(found, row, tick, 0, times)
+            lower_terms(found, row, tick, 2 * others if tick > rules.cut else 0, times)
     else:
         value = ttc(slots.gap[slot], slots.closing[slot], y[0], heading[0], speed[0], road)
     if rules.terms == LEAD_TIMES:

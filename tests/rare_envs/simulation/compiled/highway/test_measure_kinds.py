@@ -29,4 +29,4 @@ def test_numbers_of_measures():
 
 def test_numbers_and_cuts_of_terms():
     assert [measure_kinds.count_terms(kind, 6) for kind in range(5)] == [0, 5, 10, 6, 15]
-    assert [measure_kinds.find_cut(kind) for kind in range(5)] == [np.inf, 0.45, np.inf, np.inf, 0.45]
+    assert [measure_kinds.find_cut(kind) for kind in range(5)] == [np.inf, 0.45, 0.05, np.inf, 0.45]
