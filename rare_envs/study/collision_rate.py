@@ -20,7 +20,7 @@ from samplers.statistics.intervals import Interval
 from samplers.statistics.refit_families import refit_quantile
 
 COLLISION_MEASURE = "ttc"
-"""Measure that is -1 after a collision and above 0 without one; others have the same event at gamma = 0 alone."""
+"""The measure to advise: -1 after a collision and above 0 without one."""
 
 
 def find_frequency(study: Study) -> EventFrequency:
@@ -140,7 +140,7 @@ def _explain_no_collisions(question: Question) -> str:
     measure = MEASURES.get(question.measure)
     if not (isinstance(measure, Measure) and measure.collisions_only):
         return f"--measure {question.measure} counts other events than collisions (--measure {COLLISION_MEASURE} does)"
-    lowest = -1.0 if question.measure == COLLISION_MEASURE else 0.0
+    lowest = measure.collision if isinstance(measure.collision, float) else 0.0  # no number: f is graded by the crash
     if not lowest <= question.gamma <= 0:
         return f"--gamma {question.gamma:g} counts other events than collisions (--gamma 0 does)"
     if question.collisions != "ego":

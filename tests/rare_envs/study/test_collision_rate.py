@@ -90,7 +90,8 @@ def test_nothing_failed(tmp_path: Path) -> None:
 REFUSED = {
     "another measure": ({"measure": "drac"}, "--measure drac"),
     "another threshold": ({"gamma": 1.0}, "--gamma 1"),
-    "a distance behind the collision": ({"measure": "clearance", "gamma": -0.5}, "--gamma -0.5"),
+    "crashes of some severity alone": ({"measure": "margin", "gamma": -0.5}, "--gamma -0.5"),
+    "a value lower than that of a collision": ({"measure": "clearance", "gamma": -2.0}, "--gamma -2"),
     "crashes of others": ({"collisions": "any"}, "--collisions any"),
 }
 
@@ -108,6 +109,8 @@ def test_measures_that_are_positive_until_contact_have_the_rate_of_collisions(fi
     study = prepare(question(fitted, gamma=0.0))
     other = prepare(question(fitted, gamma=0.0, measure=measure))
     assert find_frequency(other) == find_frequency(study)
+    if measure != "margin":  # which is graded by the speed at contact
+        assert find_frequency(replace(other, question=replace(other.question, gamma=-0.5))) == find_frequency(study)
     x = study.problem.base.sample(500, np.random.default_rng(0))
     collided = study.problem.evaluate(x) <= 0
     assert 0 < collided.sum() < 500

@@ -45,11 +45,11 @@ def test_the_rule_is_terms_gradients_dimension_and_budget(half_spaces):
 
 @pytest.mark.parametrize(("dim", "p"), [(400, 1e-3), (400, 1e-8), (1448, 1e-5)])
 def test_series_systems_of_half_spaces(half_spaces, dim, p):
-    """Shares 0.8, 0.15 and 0.05. C.o.v. of 0.02 to 0.04 were measured."""
+    """Shares 0.8, 0.15 and 0.05. C.o.v. of 0.017 to 0.037 were measured."""
     problem, exact, _ = half_spaces(dim, p)
     results = runs(problem, range(10))
     check(results, exact)
-    assert all(r.cov < 0.05 and r.n_sim <= 6000 and r.status is Status.CONVERGED for r in results)
+    assert all(r.cov < 0.04 and r.n_sim <= 6000 and r.status is Status.CONVERGED for r in results)
     assert all(sum(level.n_sim for level in r.trace) == r.n_sim for r in results)
     assert not any(r.warnings for r in results)
 
