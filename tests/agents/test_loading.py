@@ -170,6 +170,7 @@ def test_a_missing_package_is_named(ppo_zip: Path, monkeypatch: pytest.MonkeyPat
 def trained_statistics(model: Any, steps: int = 50) -> VecNormalize:
     """Statistics that have seen some observations."""
     statistics = VecNormalize(DummyVecEnv([Still]), clip_obs=2.0)
+    statistics.seed(0)
     statistics.reset()
     for _ in range(steps):
         statistics.step(np.zeros((1, 2), np.float32))

@@ -45,6 +45,7 @@ def vec_env(action_space: spaces.Space[Any] | None = None) -> DummyVecEnv:
 
 
 def seen(env: VecNormalize) -> VecNormalize:
+    env.seed(0)
     env.reset()
     for _ in range(30):
         env.step(np.zeros((1, 2), np.float32))
