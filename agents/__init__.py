@@ -1,5 +1,9 @@
 """Egos and drivers: the policies whose safety is estimated, and those that surround them."""
 
+from rare_envs.installation import require_libraries
+
+require_libraries()  # before anything that needs them
+
 from agents.learned.checkpoints import Provenance, load_driver, read_driver, read_provenance, save_driver
 from agents.learned.driver import LearnedDriver, LearnedEgo
 from agents.learned.weight_distribution import WeightDistribution

@@ -2,6 +2,10 @@
 
 from typing import TYPE_CHECKING, Any
 
+from rare_envs.installation import require_libraries
+
+require_libraries()  # before anything that needs them
+
 from rare_envs.plugins import make_lazy_getattr, warn_of_namesakes
 from rare_envs.registration import (
     env,

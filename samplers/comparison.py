@@ -3,6 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
+from importlib import import_module
 from os import PathLike
 from typing import TYPE_CHECKING, Any
 
@@ -29,6 +30,7 @@ from samplers.serialization import to_json_value
 from samplers.statistics.cluster_sums import has_independent_points, interval_of_sum
 from samplers.statistics.intervals import Interval, degrees_of_freedom, zero_hit_bound
 from samplers.statistics.weights import effective_number
+from samplers.system.optional_libraries import needs_library
 from samplers.validation import check_whole
 
 if TYPE_CHECKING:
@@ -130,6 +132,8 @@ class Comparison:
 
     def to_pandas(self, names: Sequence[str] = ()) -> "pandas.DataFrame":
         """Return `to_arrow` as a pandas table; needs pandas."""
+        with needs_library("pandas", "A pandas table"):
+            import_module("pandas")  # PyArrow imports it later, and its error names no command
         return self.to_arrow(names).to_pandas()
 
     def save(self, path: str | PathLike[str]) -> None:

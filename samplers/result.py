@@ -4,6 +4,7 @@ import json
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, fields, is_dataclass, replace
 from functools import cached_property
+from importlib import import_module
 from os import PathLike
 from typing import TYPE_CHECKING, Any, cast
 
@@ -26,6 +27,7 @@ from samplers.problem import Distribution, FloatArray
 from samplers.sample import DrawWeights, Failures, Layer, Sample, SimulatedPoints, SimulationIndex
 from samplers.serialization import to_json_value
 from samplers.statistics.intervals import zero_hit_bound
+from samplers.system.optional_libraries import needs_library
 from samplers.trace import Level, Status
 
 if TYPE_CHECKING:
@@ -321,6 +323,8 @@ class Estimate(EstimateDisplay):
 
     def to_pandas(self, names: Sequence[str] = ()) -> "pandas.DataFrame":
         """Return `to_arrow` as a pandas table; needs pandas."""
+        with needs_library("pandas", "A pandas table"):
+            import_module("pandas")  # PyArrow imports it later, and its error names no command
         return self.to_arrow(names).to_pandas()
 
     def save(self, path: str | PathLike[str]) -> None:

@@ -18,14 +18,26 @@ ROOT = Path(__file__).parents[1]
 PACKAGES = ("agents", "rare_envs", "samplers", "training")
 
 
-def run(*words: str | Path, cwd: Path) -> str:
+NO_CARS = """
+from importlib.util import find_spec
+import samplers
+assert [name for name in ("torch", "gymnasium", "stable_baselines3", "cvxpy") if find_spec(name)] == []
+problem = samplers.FunctionProblem(lambda u: 3.5 - u.sum(axis=1) / 10**0.5, dim=10)
+for method in samplers.METHODS:
+    workers = 2 if method == "mc" else None
+    print(method, samplers.estimate(problem, method, seed=0, max_sim=3000, workers=workers).p)
+"""
+"""An estimate by every method, one of them by two processes, where a plain installation is all there is."""
+
+
+def run(*words: str | Path, cwd: Path, codes: tuple[int, ...] = (0, 3)) -> str:
     """Return what a command prints, run in a folder without this checkout on its path."""
     environment = {name: value for name, value in os.environ.items() if name not in ("PYTHONPATH", "VIRTUAL_ENV")}
     done = subprocess.run(
         [str(word) for word in words], cwd=cwd, env=environment, capture_output=True, text=True, check=False
     )
-    assert done.returncode in (0, 3), f"{words} ended with {done.returncode}:\n{done.stdout}\n{done.stderr}"
-    return done.stdout
+    assert done.returncode in codes, f"{words} ended with {done.returncode}:\n{done.stdout}\n{done.stderr}"
+    return done.stdout or done.stderr
 
 
 def shipped_files() -> set[str]:
@@ -69,6 +81,12 @@ def test_an_estimate_from_the_wheel_outside_the_checkout(tmp_path: Path) -> None
     scripts = tmp_path / "venv" / ("Scripts" if os.name == "nt" else "bin")
     pinned = ("-c", ROOT / "constraints.txt")
     run(scripts / "python", "-m", "pip", "install", "--quiet", *pinned, wheel, cwd=tmp_path)
+    found = dict(line.split() for line in run(scripts / "python", "-c", NO_CARS, cwd=tmp_path).splitlines())
+    assert set(found) >= {"mc", "ss", "ce", "two-stage", "surrogate"}
+    assert 1.5e-4 < float(found["two-stage"]) < 3.5e-4  # Phi(-3.5) = 2.33e-4
+    told = run(scripts / "rare-envs", "list", cwd=tmp_path, codes=(2,))
+    assert re.fullmatch(r"rare_envs, agents and training need .*torch.*: pip install 'rare-envs\[driving\]'\.\n", told)
+    run(scripts / "python", "-m", "pip", "install", "--quiet", *pinned, f"{wheel}[driving]", cwd=tmp_path)
     where = run(scripts / "python", "-c", "import rare_envs; print(rare_envs.__file__)", cwd=tmp_path)
     assert Path(where.strip()).is_relative_to(tmp_path / "venv")
     words = ("estimate", "rare_envs/CutIn-v0", "--ego", "idm", "--seed", "0", "--max-sim", "3000", "--json")

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from importlib import import_module
 from os import PathLike
 from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
 from samplers.presentation.notebook_html import html_table
 from samplers.presentation.object_file import read_object, write_object
 from samplers.problem import FloatArray
+from samplers.system.optional_libraries import needs_library
 
 if TYPE_CHECKING:
     import pandas
@@ -42,12 +44,15 @@ class CurveDisplay:
 
     def to_arrow(self) -> pyarrow.Table:
         """Return the curve as an Arrow table, a row for each threshold."""
-        import pyarrow as pa
+        with needs_library("pyarrow", "A table"):
+            import pyarrow as pa
 
         return pa.table(self._columns())
 
     def to_pandas(self) -> pandas.DataFrame:
         """Return `to_arrow` as a pandas table; needs pandas."""
+        with needs_library("pandas", "A pandas table"):
+            import_module("pandas")  # PyArrow imports it later, and its error names no command
         return self.to_arrow().to_pandas()
 
     def save(self, path: str | PathLike[str]) -> None:

@@ -7,6 +7,8 @@ from contextlib import contextmanager
 from os import PathLike
 from typing import TYPE_CHECKING
 
+from samplers.system.optional_libraries import needs_library
+
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
@@ -33,11 +35,13 @@ def drawing_axes(ax: Axes | str | PathLike[str] | None) -> Iterator[Axes]:
         TypeError: Expected axes of matplotlib or the path of an image, such as "p.png", got float.
     """
     if ax is None:
-        from matplotlib import pyplot
+        with needs_library("matplotlib", "A drawing"):
+            from matplotlib import pyplot
 
         yield pyplot.gca()
     elif isinstance(ax, str | PathLike):
-        from matplotlib.figure import Figure
+        with needs_library("matplotlib", "A drawing"):
+            from matplotlib.figure import Figure
 
         figure = Figure(layout="constrained")
         yield figure.add_subplot()

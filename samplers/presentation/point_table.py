@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from samplers.problem import FloatArray
 from samplers.sample import Sample, SimulatedPoints, SimulationIndex
+from samplers.system.optional_libraries import needs_library
 
 if TYPE_CHECKING:
     import pyarrow
@@ -54,7 +55,8 @@ def arrow_table(points: PointColumns, names: Sequence[str]) -> pyarrow.Table:
         >>> arrow_table(points, ["gap"]).to_pylist()
         [{'f': 0.0, 'gap': 1.0}]
     """
-    import pyarrow as pa
+    with needs_library("pyarrow", "A table"):
+        import pyarrow as pa
 
     dim = points.x.shape[1]
     chosen = list(names) or [f"x{i + 1}" for i in range(dim)]

@@ -17,6 +17,7 @@ from samplers.analysis.sensitivity.column_importance import ColumnImportance, co
 from samplers.analysis.sensitivity.parameter_scores import ParametricBase, parameter_scores
 from samplers.analysis.sensitivity.spread_shares import JOINT_GROUP, share_spread, sum_by_owner
 from samplers.serialization import to_json_value
+from samplers.system.optional_libraries import needs_library
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -147,14 +148,16 @@ class Sensitivity:
             axes: Two axes to draw in, or the path of an image to write; None makes a figure of pyplot.
         """
         if isinstance(axes, str | PathLike):
-            from matplotlib.figure import Figure
+            with needs_library("matplotlib", "A drawing"):
+                from matplotlib.figure import Figure
 
             figure = Figure(figsize=(12, 4.5), layout="constrained")
             drawn = self._draw(*figure.subplots(1, 2))
             figure.savefig(axes)
             return drawn
         if axes is None:
-            from matplotlib import pyplot
+            with needs_library("matplotlib", "A drawing"):
+                from matplotlib import pyplot
 
             return self._draw(*pyplot.subplots(1, 2, figsize=(12, 4.5), layout="constrained")[1])
         return self._draw(*axes)

@@ -19,6 +19,7 @@ from scipy.linalg import solve_triangular
 from scipy.special import betaln, digamma, polygamma
 
 from samplers.problem import FloatArray
+from samplers.system.optional_libraries import needs_library
 
 NEWTON_STEPS = 100
 """Far more than a concave function of two variables takes (about 10)."""
@@ -123,7 +124,8 @@ def _box_least_squares(cholesky: FloatArray, target: FloatArray) -> FloatArray:
 
     The objective is scaled so that the solver's absolute tolerances do not depend on units.
     """
-    cp: Any = import_module("cvxpy")  # over a second to import; its functions are not typed
+    with needs_library("cvxpy", "A bounded step of a mean whose coordinates are correlated"):
+        cp: Any = import_module("cvxpy")  # over a second to import; its functions are not typed
     inverse = solve_triangular(cholesky, np.eye(len(target)), lower=True)
     inverse /= np.abs(inverse).max()
     z = cp.Variable(len(target))
