@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import math
+
 import pytest
 
 from benchmarks.papers.page import PAPERS_PAGE, format_papers_page, read_records
-from rare_envs.study.reproduction.tian2024.replications import ReplicationJob, run_replication
-from rare_envs.study.reproduction.tian2024.summary import ReplicationSummary
+from rare_envs.study.reproduction.tian2024.replications import ReplicationJob, ReplicationRun, run_replication
+from rare_envs.study.reproduction.tian2024.tables import make_method_tables
 from rare_envs.threads import use_one_thread
+from samplers.serialization import to_json_value
 
 
 @pytest.fixture(scope="module")
@@ -40,23 +43,47 @@ def test_a_cheap_run_made_again_gives_the_committed_value(tian, scenario: str, m
     assert (again.n_sim, again.simulated) == (runs["n_sim"][place], runs["simulated"][place])
 
 
-def test_committed_tables_are_those_of_the_committed_runs(tian) -> None:
+def test_committed_tables_follow_from_the_committed_runs(tian) -> None:
     counts = {runs["method"]: len(runs["p"]) for runs in tian["runs"]}
     assert counts.pop("MC") == tian["about"]["replications_of_monte_carlo"]
     assert {counts.pop(method) for method in ("IS", "SS", "ADSS")} == {tian["about"]["replications"]}
     assert set(counts.values()) == {tian["about"]["replications_of_further_methods"]}
     assert tian["about"]["replications"] >= 20
-    for table, scenario in zip(tian["tables"], ("car-following", "cut-in"), strict=True):
-        runs = runs_of(tian, scenario, "stack", "ADSS")
-        summary = ReplicationSummary.of_estimates(runs["p"], 1.0)
-        shown = {
-            value["quantity"]: value["ours"]
-            for value in table["values"]
-            if value["labels"][0] == "ADSS" and value["labels"][1].startswith("stack")
-        }
-        assert shown["c.o.v. of p"] == pytest.approx(summary.cov)
-        assert shown['square of the c.o.v. (printed as "COV")'] == pytest.approx(summary.cov**2)
-        assert shown["mean of p"] == pytest.approx(summary.mean)
+    assert tables_of([run for runs in tian["runs"] for run in replications_of(runs)]) == tian["tables"]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("scenario", "method"), [("car-following", "ADSS"), ("cut-in", "two-stage")])
+def test_a_row_of_the_committed_tables_made_again_is_the_committed_one(tian, scenario: str, method: str) -> None:
+    runs = [run for each in tian["runs"] for run in replications_of(each)]
+    with use_one_thread():
+        for place, run in enumerate(runs):
+            if (run.scenario, run.system, run.method) == (scenario, "IDM", method):
+                runs[place] = run_replication(ReplicationJob(*run.key))
+    for again, shown in zip(tables_of(runs), tian["tables"], strict=True):
+        for one, other in zip(again["values"], shown["values"], strict=True):
+            assert one["ours"] == pytest.approx(other["ours"], rel=1e-6)
+            assert {**one, "ours": 0, "interval": 0, "difference": 0} == {
+                **other, "ours": 0, "interval": 0, "difference": 0
+            }  # fmt: skip
+        for one, other in zip(again["measured"], shown["measured"], strict=True):
+            assert one["labels"] == other["labels"]
+            assert one["values"] == pytest.approx(other["values"], rel=1e-6)
+
+
+def replications_of(runs) -> list[ReplicationRun]:
+    """Return the replications of a method on a system, as far as the record has them."""
+    numbers = ("seed", "p", "low", "high", "cov", "n_sim", "simulated", "final", "levels")
+    known = {name: [math.nan if value is None else value for value in runs[name]] for name in numbers}
+    names = {name: runs[name] for name in ("scenario", "system", "method")}
+    return [
+        ReplicationRun(**names, **dict(zip(numbers, values, strict=True)), warnings=(), trace=())
+        for values in zip(*known.values(), strict=True)
+    ]
+
+
+def tables_of(runs: list[ReplicationRun]):
+    return to_json_value([table.to_dict() for table in make_method_tables(runs)])
 
 
 def test_no_method_hides_simulations_by_its_own_count(tian) -> None:

@@ -85,6 +85,9 @@ def reproduce_okelly2018_command(
         return
     for note in record["notes"]:
         print(note)
+    speed = record["runs"][0]["rollouts_per_second"]
+    if speed is not None:
+        print(f"Fastest chunk of this run: {speed:,.3g} rollouts a second, wall time.")
     for found in record["findings"]:
         print(f"{found['claim']}: {found['verdict']}. {found['statistic']}.")
     print(f"Wrote {out / 'reproduction.html'}.")

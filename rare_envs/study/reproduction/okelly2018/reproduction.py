@@ -11,7 +11,7 @@ import samplers
 from rare_envs.study.reproduction.folder import check_reproduction_folder
 from rare_envs.study.reproduction.okelly2018.figures import describe_figures, make_figures
 from rare_envs.study.reproduction.okelly2018.printed import describe_printed
-from rare_envs.study.reproduction.okelly2018.scales import EGO_NAMES, STUDY_SCALES
+from rare_envs.study.reproduction.okelly2018.scales import CORE_SPEEDS, EGO_NAMES, STUDY_SCALES
 from rare_envs.study.reproduction.okelly2018.study import HighwayStudy, measure_highway
 from rare_envs.study.reproduction.okelly2018.summary import summarise_highway
 from rare_envs.study.reproduction.okelly2018.tables import make_tables
@@ -89,20 +89,23 @@ def write_notes(study: HighwayStudy, found: Mapping[str, Any]) -> list[str]:
         notes.append(
             f"The naive p rests on {events} events at the four thresholds; ratios to it are no surer than that."
         )
-    speed, made = found["rollouts_per_second"], found["rollouts"] + sum(own["n_sim"] for own in found["own"])
-    if speed is None or (study.scale == "full" and made >= ours.rollouts):
+    made = found["rollouts"] + sum(own["n_sim"] for own in found["own"])
+    if study.scale == "full" and made >= ours.rollouts:
         return notes
-    full = STUDY_SCALES[study.ego, "full"]
-    rest, whole, search = (n / speed / 3600.0 for n in (full.rollouts - made, full.rollouts, full.per_search))
+    speed, full = CORE_SPEEDS[study.ego], STUDY_SCALES[study.ego, "full"]
+    numbers = (full.rollouts - made, full.rollouts, full.per_search, ours.rollouts)
+    rest, whole, search, this = (n / speed / 3600.0 for n in numbers)
     if study.scale == "full":
-        return [*notes, f"{_say_speed(speed)} the rest takes {rest:,.1f} hours of a core; the same command goes on."]
+        return [*notes, f"{_say_speed(speed)} the rest takes {rest:,.1f} hours; the same command goes on."]
     return [
         *notes,
         f"The full scale has {full.naive:,} naive rollouts and four searches of {full.per_search:,}, "
-        f"{full.rollouts:,} with our own method. {_say_speed(speed)} that is {whole:,.1f} hours of a core, "
-        f"{search:,.1f} for each search; `--scale full` goes on where it was stopped.",
+        f"{full.rollouts:,} with our own method. {_say_speed(speed)} that is {whole:,.1f} hours, "
+        f"{search:,.1f} for each search, and {this:,.1f} for the small scale; "
+        "`--scale full` goes on where it was stopped.",
     ]
 
 
 def _say_speed(speed: float) -> str:
-    return f"At the {speed:.3g} rollouts a second of the fastest chunk of this run (wall time)"
+    """Return the beginning of a sentence: not the speed of this run, so that equal seeds give equal notes."""
+    return f"At {speed:,.0f} rollouts a second, about what a core of an AMD EPYC makes by its processor time,"
