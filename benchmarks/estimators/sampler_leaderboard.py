@@ -42,8 +42,8 @@ for cell in cells:
 """
 LEFT_OUT = """\
 Not run, for want of time: `surrogate`, which takes seconds a run (`auto` chooses it up to 500 simulations, so that it
-has no row at 300), `openturns-nais`, the set `public`, and what the commands leave out of 6,000 simulations: other sets
-than `analytic`, `openturns-ce`, which goes on to 50 times its budget, `openturns-form`, whose cost is not the budget's,
+has no row at 300), `openturns-nais`, and what the commands leave out of 6,000 simulations: the sets `highdim` and
+`driving`, `openturns-ce`, which goes on to 50 times its budget, `openturns-form`, whose cost is not the budget's,
 and `auto`, which is `two-stage` there."""
 HEAD = """\
 # Leaderboard of samplers

@@ -30,8 +30,8 @@ def test_the_page_is_what_the_result_gives() -> None:
 
 def test_every_method_has_every_problem_of_the_sets(committed) -> None:
     plans = list_plans(committed)
-    (main,) = (plan for plan in plans if plan["budgets"] == [1500] and len(plan["problems"]) >= 41)
-    assert set(choose_problems(["analytic", "highdim", "driving"])) <= set(main["problems"])
+    (main,) = (plan for plan in plans if plan["budgets"] == [1500] and len(plan["problems"]) >= 67)
+    assert set(choose_problems(["analytic", "public", "highdim", "driving"])) <= set(main["problems"])
     assert {"openturns-ss", "openturns-ce", "openturns-form", "uqpy-ss", "auto", "mc"} <= set(main["methods"])
     wanted = {
         (method, problem, budget): plan["runs"]
@@ -43,12 +43,19 @@ def test_every_method_has_every_problem_of_the_sets(committed) -> None:
     found = {(cell["method"], cell["problem"], cell["max_sim"]): cell["runs"] for cell in committed["cells"]}
     assert found == wanted
     assert len(found) == len(committed["cells"])
-    assert {budget for _, _, budget in found} == {300, 1500, 6000}
+    for group in ("analytic", "public"):
+        assert {budget for _, name, budget in found if name in choose_problems([group])} == {300, 1500, 6000}
 
 
 @pytest.mark.parametrize(
     ("method", "problem", "budget"),
-    [("mc", "common_d4", 6000), ("adss", "lin_d2", 1500), ("ce", "cut_in_d6", 1500), ("ss", "cut_in_us101_d6", 300)],
+    [
+        ("mc", "common_d4", 6000),
+        ("ss", "rp111_d2", 1500),
+        ("adss", "lin_d2", 1500),
+        ("ce", "cut_in_d6", 1500),
+        ("ss", "cut_in_us101_d6", 300),
+    ],
 )
 def test_a_cheap_cell_made_again_is_the_committed_one(
     committed, tmp_path: Path, method: str, problem: str, budget: int
