@@ -1,7 +1,7 @@
 """World and scenario space from the keyword arguments of `gym.make`."""
 
 import inspect
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -97,14 +97,7 @@ def set_up(
         ValueError: If an argument is not one of those; the message says what is.
     """
     scenario = find_scenario(scenario) if isinstance(scenario, str) else scenario
-    for name in unknown:
-        known = [word for word in inspect.signature(set_up).parameters if word not in ("scenario", "needs", "unknown")]
-        if name == "config":
-            raise TypeError(_describe_configuration(unknown[name]))
-        of_reset = name in (parameter.name for parameter in scenario.parameters)
-        hint = " (reset takes it as an option)" if of_reset else did_you_mean(name, known)
-        env_id = next((each for each, registered in SCENARIOS.items() if registered is scenario), scenario.name)
-        raise TypeError(f"{env_id} takes no keyword argument {name!r}{hint}; it takes {', '.join(known)}.")
+    refuse_unknown(scenario, unknown)
     kinds = read_kinds(observation)
     _check_one_of("action", action, ACTIONS)
     if not isinstance(weather, bool):
@@ -122,6 +115,28 @@ def set_up(
     if not isinstance(world.measurement.measure, str):
         _try_measure(world, space)
     return world, space
+
+
+def refuse_unknown(scenario: Scenario, arguments: Mapping[str, Any], more: Sequence[str] = ()) -> None:
+    """Raise a TypeError if a keyword argument is neither one of `set_up` nor one of `more`; the message lists both.
+
+    Args:
+        scenario: Of the environment.
+        arguments: By name.
+        more: Further arguments that whoever asks takes.
+
+    Raises:
+        TypeError: There is such an argument.
+    """
+    own = [word for word in inspect.signature(set_up).parameters if word not in ("scenario", "needs", "unknown")]
+    known = [*more, *own]
+    for name in (name for name in arguments if name not in known):
+        if name == "config":
+            raise TypeError(_describe_configuration(arguments[name]))
+        of_reset = name in (parameter.name for parameter in scenario.parameters)
+        hint = " (reset takes it as an option)" if of_reset else did_you_mean(name, known)
+        env_id = next((each for each, registered in SCENARIOS.items() if registered is scenario), scenario.name)
+        raise TypeError(f"{env_id} takes no keyword argument {name!r}{hint}; it takes {', '.join(known)}.")
 
 
 @torch.inference_mode()

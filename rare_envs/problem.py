@@ -20,7 +20,7 @@ from rare_envs.egos.needs import resolve
 from rare_envs.egos.policy import PolicyDriver, as_driver
 from rare_envs.egos.spaces.choice import choose_action, choose_observation, takes_indices
 from rare_envs.egos.wrappers import find_action_bounds
-from rare_envs.make import set_up
+from rare_envs.make import refuse_unknown, set_up
 from rare_envs.scenarios.registry import find_scenario, split_layout
 from rare_envs.sensors.kinds import read_kinds
 from rare_envs.simulation.compiled import CompiledRollout
@@ -144,6 +144,7 @@ class DrivingProblem:
         self.world: World
         self.space: ScenarioSpace
         scenario = find_scenario(env_id)
+        refuse_unknown(scenario, make_kwargs, more=("ego", "core", "chunk_size"))
         with _ego_errors_as_value_errors(ego):
             self.needs = resolve(ego, scenario.vehicles)
         make_kwargs["observation"] = make_kwargs.get("observation") or choose_observation(self.needs, scenario.vehicles)

@@ -150,9 +150,9 @@ def make_batch(env_id: str, num_envs: int, **kwargs: Any) -> VectorEnv[Any, Any,
     Raises:
         ValueError: If the id or an argument is unknown.
     """
-    from rare_envs.scenarios.registry import find_scenario
+    from rare_envs.scenarios.registry import complete_id, find_scenario
 
     find_scenario(split_layout(env_id)[0])
     if not isinstance(num_envs, int) or num_envs < 1:
         raise ValueError(f"Expected num_envs of at least 1, got {num_envs!r}.")
-    return gym.make_vec(env_id, num_envs=num_envs, vectorization_mode="vector_entry_point", **kwargs)
+    return gym.make_vec(complete_id(env_id), num_envs=num_envs, vectorization_mode="vector_entry_point", **kwargs)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import Enum
 
@@ -19,7 +20,8 @@ class Status(str, Enum):
     """
 
     CONVERGED = "converged"
-    """The method came to its own end (and met target_cov, if one was given)."""
+    """The method came to its own end (and met target_cov, if one was given); whether p can be trusted then is told by
+    the warnings."""
     NO_HITS = "no_hits"
     """It came to its end without seeing a failure: p = 0, one-sided interval."""
     BUDGET = "budget"
@@ -31,6 +33,20 @@ class Status(str, Enum):
 
     def __str__(self) -> str:
         return str(self.value)
+
+
+def describe_outcome(status: Status | str, warnings: Sequence[str]) -> str:
+    """Return how a run ended, in words: "converged" stands alone only where there is no warning.
+
+    Example:
+        >>> describe_outcome(Status.CONVERGED, ()), describe_outcome(Status.BUDGET, ("One draw carries 40 % of p.",))
+        ('converged', 'budget')
+        >>> describe_outcome("converged", ("One draw carries 40 % of p.",))
+        'came to its end with 1 warning'
+    """
+    if status != Status.CONVERGED or not warnings:
+        return str(status)
+    return f"came to its end with {len(warnings)} warning{'s' * (len(warnings) != 1)}"
 
 
 @dataclass(frozen=True, kw_only=True)

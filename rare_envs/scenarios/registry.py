@@ -85,6 +85,7 @@ def env_id_of(name: str) -> str:
         ...
         ValueError: Unknown scenario 'cutin' (did you mean 'cut_in'?); there are car_following, cut_in, highway, hard_brake.
     """  # noqa: E501 (the example shows a whole message)
+    name = complete_id(name)
     if name in SCENARIOS:
         return name
     ids = _newest_ids()
@@ -120,8 +121,8 @@ def find_scenario(env_id: str) -> Scenario:
     """Return the scenario of an environment id.
 
     Args:
-        env_id: For example "rare_envs/CutIn-v0"; "module:my_namespace/Overtaking-v0", as for `gym.make`, imports first
-            the module that registers it.
+        env_id: For example "rare_envs/CutIn-v0", or "CutIn-v0"; "module:my_namespace/Overtaking-v0", as for `gym.make`,
+            imports first the module that registers it.
 
     Raises:
         ValueError: If there is none; the message suggests the nearest id and lists all.
@@ -133,6 +134,7 @@ def find_scenario(env_id: str) -> Scenario:
     module, _, name = env_id.rpartition(":") if isinstance(env_id, str) else ("", "", env_id)
     if module:
         import_module(module, f"the environment {env_id!r}")
+    name = complete_id(name)
     if isinstance(name, str) and name in SCENARIOS:
         return SCENARIOS[name]
     layouts = {kinematics_id(each): each for each in SCENARIOS}
@@ -160,6 +162,18 @@ def is_highway_env_id(env_id: object) -> bool:
     return re.match(r"(highway(-fast)?|merge|intersection|roundabout)-v\d", str(env_id)) is not None
 
 
+def complete_id(env_id: str) -> str:
+    """Return an id with its namespace: of "CutIn-v0", or "CutIn-kinematics-v0", the one that ends so; else as it is.
+
+    Example:
+        >>> complete_id("CutIn-v0"), complete_id("rare_envs/CutIn-v0"), complete_id("Cut-v0")
+        ('rare_envs/CutIn-v0', 'rare_envs/CutIn-v0', 'Cut-v0')
+    """
+    known = (each for name in SCENARIOS for each in (name, kinematics_id(name)))
+    found = [each for each in known if each.rpartition("/")[2] == env_id]
+    return found[0] if len(found) == 1 else env_id
+
+
 HIGHWAY_ENV_LAYOUT = {"observation": "kinematics", "action": "meta"}
 """Keyword arguments that give an environment the interface of HighwayEnv's."""
 
@@ -180,12 +194,14 @@ def kinematics_id(env_id: str) -> str:
 def split_layout(env_id: str) -> tuple[str, dict[str, str]]:
     """Return the id of the scenario itself for an id with HighwayEnv's layout, and the keyword arguments it stands for.
 
+    The id may lack its namespace, see `complete_id`.
+
     Example:
         >>> split_layout("rare_envs/CutIn-kinematics-v0")
         ('rare_envs/CutIn-v0', {'observation': 'kinematics', 'action': 'meta'})
         >>> split_layout("rare_envs/CutIn-v0")
         ('rare_envs/CutIn-v0', {})
     """
-    layouts = {kinematics_id(each): each for each in SCENARIOS}
+    layouts, env_id = {kinematics_id(each): each for each in SCENARIOS}, complete_id(env_id)
     known = isinstance(env_id, str) and env_id in layouts  # what is no id is refused where the scenario is looked for
     return (layouts[env_id], dict(HIGHWAY_ENV_LAYOUT)) if known else (env_id, {})

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 from typing import Any
 
@@ -14,6 +14,7 @@ from rare_envs.egos.errors import EgoGone
 from rare_envs.problem import DrivingProblem
 from rare_envs.study.analysis.failure_replay import replay_failures, replay_further_failures
 from rare_envs.study.analysis.severity import Severity, compute_severity
+from rare_envs.study.analysis.unlisted import list_every_mode
 from rare_envs.study.storage.episode_file import digest_scenario
 from rare_envs.traffic.crash import CRASH_KINDS, Crash, describe_crash
 from samplers.analysis import NO_OUTCOME_LABEL, sum_by_label
@@ -65,6 +66,31 @@ def classify_failures(problem: DrivingProblem, estimate: samplers.Estimate) -> C
     row = np.cumsum(known) - 1
     listed = (describe_crash(crashes, int(at)) if one else None for at, one in zip(row, known, strict=True))
     return CrashKinds(shares, tuple(listed), by_scenario=by_scenario, severity=severity)
+
+
+def list_all_kinds(
+    problem: DrivingProblem, estimate: samplers.Estimate, kinds: CrashKinds
+) -> tuple[samplers.Estimate, CrashKinds]:
+    """Return both with one failure at least of each kind of crash and each mode in the list of failures.
+
+    Args:
+        problem: Of the run.
+        estimate: The run; its list has the most likely failures.
+        kinds: From `classify_failures`.
+    """
+    if not kinds.by_scenario:
+        return estimate, kinds
+    longer, added = list_every_mode(problem.space, estimate, kinds.by_scenario)
+    if not len(added):
+        return estimate, kinds
+    try:
+        crashes = problem.crashes(longer.failures.x[added])
+    except (Exception, SystemExit, EgoGone):  # the ego is the user's, and need not do again what it did before
+        return estimate, kinds
+    listed = list(kinds.listed)
+    for at, row in enumerate(added.tolist()):
+        listed.insert(row, describe_crash(crashes, at))
+    return longer, replace(kinds, listed=tuple(listed))
 
 
 def _weigh_crashes(

@@ -13,7 +13,7 @@ from agents.loading import find_ego_kind
 from rare_envs.egos.errors import EgoGone
 from rare_envs.study.analysis.recorded_question import note_question, open_question
 from rare_envs.study.analysis.repeatability import Repeatability, RowKeeper, check_repeatability
-from rare_envs.study.crash_kinds import CrashKinds, classify_failures
+from rare_envs.study.crash_kinds import CrashKinds, classify_failures, list_all_kinds
 from rare_envs.study.errors import BadInput, output_folder
 from rare_envs.study.execution.simulated_problem import SimulatedProblem, open_problem
 from rare_envs.study.journal import JOURNAL, begin_journal, check_same_files, continue_journal
@@ -22,7 +22,7 @@ from rare_envs.study.report import Report
 from rare_envs.study.run_directory import check_no_results, remove_drafts, remove_results, write_run
 from rare_envs.study.storage.episode_recorder import EpisodeRecorder
 from rare_envs.study.storage.names import STUDY
-from rare_envs.study.storage.study_file import begin_study_file, finish_study_file
+from rare_envs.study.storage.study_file import begin_study_file, finish_study_file, note_resumption
 from samplers.execution.executors import Executor, ExecutorError
 from samplers.execution.journal import JournalFile
 from samplers.execution.progress import Pace, open_listener
@@ -102,6 +102,7 @@ def run(
     else:
         seconds = time.perf_counter() - start
         kinds = classify_failures(study.problem, estimate)
+        estimate, kinds = list_all_kinds(study.problem, estimate, kinds)
         if recorder is not None:
             recorder.write(estimate, kinds.by_scenario)
     finally:
@@ -229,6 +230,7 @@ def resume(
             ...
         rare_envs.study.errors.BadInput: There is no unfinished run in 'runs/nowhere': it has no journal.bin. Of one that was stopped before its first simulations, give the command again.
     """  # noqa: E501 (the example shows a whole message)
+    stopped = _find_time(folder / JOURNAL)
     journal, question = continue_journal(folder, mend)
     with closing(journal):
         question = replace(open_question(asdict(question), folder, trust), core=question.core)
@@ -237,13 +239,31 @@ def resume(
         question = replace(question, ego=ego or question.ego, on_error=on_error or question.on_error)
         check_same_files(journal, question)
         remove_drafts(folder)
-        return _run(folder, prepare(question), journal, progress, executor)
+        study = prepare(question)
+        earlier = note_resumption(folder, stopped)
+        return _run(folder, study, journal, progress, executor, earlier)
 
 
-def _run(folder: Path, study: Study, journal: JournalFile, progress: bool, executor: Executor | None = None) -> Report:
+def _find_time(path: Path) -> float:
+    """Return when a file was changed last [s since 1970]; 0 where there is none."""
+    try:
+        return path.stat().st_mtime
+    except OSError:
+        return 0.0
+
+
+def _run(
+    folder: Path,
+    study: Study,
+    journal: JournalFile,
+    progress: bool,
+    executor: Executor | None = None,
+    earlier: float = 0.0,
+) -> Report:
     target = folder.absolute()  # an ego may change the working directory
     try:
         report = run(study, progress, journal, executor, target)
+        report = replace(report, seconds=report.seconds + earlier, earlier_seconds=earlier)
         _write(target, report)
     except UnwrittenResults as error:
         raise UnwrittenResults(f"{error}{_resume_hint(journal, folder)}", error.report) from error

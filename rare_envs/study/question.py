@@ -112,8 +112,8 @@ class Question:
     def __post_init__(self) -> None:
         """Take an id with HighwayEnv's layout as that of the scenario, with the observation and actions it means."""
         env_id, layout = split_layout(self.env_id)
+        object.__setattr__(self, "env_id", env_id)
         if layout:
-            object.__setattr__(self, "env_id", env_id)
             object.__setattr__(self, "observation", self.observation or layout["observation"])
             object.__setattr__(self, "action", self.action or layout["action"])
 
@@ -145,7 +145,7 @@ class Question:
             raise ValueError(f"Expected max_p above 0 and below 1, got {self.max_p!r}.")
         if not 0.5 < self.gate_confidence < 1.0:
             raise ValueError(f"Expected a one-sided confidence above 0.5 and below 1, got {self.gate_confidence!r}.")
-        return 2.0 * self.gate_confidence - 1.0
+        return round(2.0 * self.gate_confidence - 1.0, 12)  # 0.9, where floating point has 0.8999999999999999
 
     def check(self) -> samplers.Stepping:
         """Return the method, after a check of all that is known before the ego is loaded, which takes seconds.

@@ -64,12 +64,13 @@ class Report:
     Attributes:
         study: The question and what it names.
         estimate: The estimate of the method.
-        seconds: Wall time of the estimation [s].
+        seconds: Wall time of the estimation [s], that before interruptions included.
         faults: Scenarios on which the ego failed twice.
         n_retried: Simulations that were repeated to find them; not in n_sim.
         kinds: Crashes in which the failures ended.
         repeatability: Simulations done again at the end, not in n_sim; None if that was not done.
         lost: What of the folder could not be written, though the run went on; "" if nothing.
+        earlier_seconds: Wall time before the run was resumed the last time [s]; 0 if it never was.
 
     Example:
         >>> from rare_envs.study import Question, prepare, run
@@ -90,6 +91,7 @@ class Report:
     n_retried: int = 0
     repeatability: Repeatability | None = None
     lost: str = ""
+    earlier_seconds: float = 0.0
 
     @cached_property
     def sensitivity(self) -> samplers.Sensitivity | str | None:
@@ -248,6 +250,7 @@ class Report:
             "vec_normalize": self.vec_normalize,
             "missing_statistics": self._missing_statistics[0] if self._missing_statistics else "",
             "seconds": self.seconds,
+            "earlier_seconds": self.earlier_seconds,
             "n_failures": failures.total,
             "kinds": {kind: share.to_dict() for kind, share in self.kinds.shares.items()},
             "modes": [mode.to_dict() for mode in self.modes],

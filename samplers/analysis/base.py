@@ -77,6 +77,10 @@ class WeightedEstimate(Protocol):
         """Threshold of failure."""
 
     @property
+    def interval(self) -> tuple[float, float]:
+        """Interval of p."""
+
+    @property
     def confidence(self) -> float:
         """Nominal coverage of the interval."""
 

@@ -98,6 +98,8 @@ def sum_by_label(estimate: WeightedEstimate, rows: NDArray[np.int64], labels: ND
         mine = labels == kind
         sums = sum_points(sample, chosen[mine], estimate.gamma)
         shares[kind] = make_share(estimate, sums, float(everything.p[0]), grow, int(mine.sum()))
+    if len(shares) == 1 and estimate.p > 0:  # all of p: its interval is that of p
+        shares = {kind: replace(share, interval=estimate.interval, cov=estimate.cov) for kind, share in shares.items()}
     return dict(sorted(shares.items(), key=lambda each: -each[1].p))
 
 

@@ -120,7 +120,7 @@ def judge_estimate(estimate: HasLimits, max_p: float, given_base: bool = False) 
     if not (isinstance(max_p, int | float) and 0.0 < max_p < 1.0):
         raise ValueError(f"Expected max_p above 0 and below 1, got {max_p!r}.")
     base = None if given_base else estimate.base_uncertainty
-    confidence = 0.5 + estimate.confidence / 2
+    confidence = round(0.5 + estimate.confidence / 2, 12)
     none_failed = estimate.status is Status.NO_HITS
     own = (0.0, zero_hit_bound(estimate.base_draws, confidence)) if none_failed else estimate.interval
     (low, high), reason = (own, "") if base is None else _limits_of_base(base)

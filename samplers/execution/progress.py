@@ -44,6 +44,9 @@ class Progress:
 NARROW_TERMINAL = 72
 """Columns of a terminal below which a bar keeps itself, the count and the time only."""
 
+WIDE_TERMINAL = 110
+"""Columns of a terminal below which the bar is short where there are workers, so that all of the line is seen."""
+
 Listener = Callable[[Progress], None]
 
 
@@ -134,7 +137,7 @@ def describe_workers(progress: Progress) -> str:
     """
     if not progress.workers:
         return ""
-    words = f", {progress.workers} workers, {progress.n_retries} retries"
+    words = f", {progress.workers} workers{f', {progress.n_retries} retries' if progress.n_retries else ''}"
     if progress.seconds_left is None:
         return words
     for unit, seconds in (("d", 86400.0), ("h", 3600.0), ("min", 60.0)):
@@ -159,26 +162,29 @@ def open_listener(progress: bool | Listener, max_sim: int | None) -> Iterator[Li
 def _rich_bar(max_sim: int | None) -> Iterator[Listener]:
     """Show a bar on standard error while the run lasts; one that fails leaves nothing of it."""
     from rich.console import Console  # optional, and slow to import
-    from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
+    from rich.progress import BarColumn, ProgressColumn, TextColumn, TimeElapsedColumn
     from rich.progress import Progress as Bar
 
-    console = Console(stderr=True)
-    columns = (
+    console, length = Console(stderr=True), BarColumn(bar_width=20)
+    columns: tuple[ProgressColumn, ...] = (
         TextColumn("[bold]{task.description}"),
-        BarColumn(bar_width=20),
-        TextColumn("{task.completed:,.0f} simulations"),
+        length,
+        TextColumn("{task.completed:,.0f} {task.fields[unit]}"),
         TextColumn("{task.fields[state]}", markup=False),
         TimeElapsedColumn(),
     )
     narrow = (BarColumn(bar_width=10), TextColumn("{task.completed:,.0f} done"), TimeElapsedColumn())
     bar = Bar(*(columns if console.width >= NARROW_TERMINAL else narrow), console=console)
-    task = bar.add_task("estimate", total=max_sim, state="")
+    task = bar.add_task("estimate", total=max_sim, state="", unit="simulations")
 
     def show(progress: Progress) -> None:
         state = f"run {progress.run + 1} " if progress.run else ""
         if not math.isnan(progress.p):
             state += f"P[f <= {progress.level:.3g}] = {progress.p:.2e}"
         state += describe_workers(progress)
+        if progress.workers and console.width < WIDE_TERMINAL:  # the rest of the line needs the room
+            length.bar_width = 10
+            bar.update(task, description="", unit="done")
         bar.update(task, completed=progress.n_sim, state=state)
 
     bar.start()

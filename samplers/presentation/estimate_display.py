@@ -12,6 +12,7 @@ from samplers.analysis.base import RatioStore, require_sample
 from samplers.analysis.curve import Curve, lowest_known_threshold
 from samplers.presentation.drawing import drawing_axes
 from samplers.presentation.notebook_html import html_table
+from samplers.trace import describe_outcome
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -116,7 +117,7 @@ class EstimateDisplay:
             ("simulations", f"{self.n_sim:,}"),
             *([] if math.isnan(self.gain) else [("gain over Monte Carlo", f"{self.gain:.3g}")]),
             ("failing points", f"{self.failures.total:,}"),
-            ("method", f"{self.method.name}, seed {self.seed}, {self.status}"),
+            ("method", f"{self.method.name}, seed {self.seed}, {describe_outcome(self.status, self.warnings)}"),
             ("valid", self.proviso),
         ]
         notes = [*(f"remark: {text}" for text in self.remarks), *(f"warning: {text}" for text in self.warnings)]
@@ -132,7 +133,7 @@ class EstimateDisplay:
             f"  {100 * self.confidence:g} % interval [{low:.3e}, {high:.3e}], c.o.v. {cov}",
             *indent_lines(self.base_uncertainty),
             f"  {self.n_sim:,} simulations{gain}; {self.method.name}, seed {self.seed}, "
-            f"{self.status}; {self.failures.total:,} failing points",
+            f"{describe_outcome(self.status, self.warnings)}; {self.failures.total:,} failing points",
             *([f"  chosen {self.choice}"] if self.chose_another else []),
             f"  valid {self.proviso}",
         ]

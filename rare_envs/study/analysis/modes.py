@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -69,8 +69,42 @@ def find_modes(
         estimate: The run.
         crashes: Kinds of crash of its failures, by `digest_scenario`.
     """
-    if estimate.sample is None or not (estimate.sample.f <= estimate.gamma).any() or estimate.p <= 0:
+    found = assign_modes(space, estimate, crashes)
+    if found is None:
         return ()
+    sample, labels = require_sample(estimate), found.labels
+    shares = sum_by_label(estimate, found.rows, labels)
+    x, weights = sample.x[found.rows], sample.weights[np.flatnonzero(sample.f <= estimate.gamma)[found.rows]]
+    return tuple(
+        FailureMode(
+            crash=str(found.kinds[np.argmax(labels == label)]),
+            share=share,
+            failure=int(np.argmax(found.listed == label)) if (found.listed == label).any() else None,
+            center=_mean_parameters(space, x[labels == label], weights[labels == label]),
+        )
+        for label, share in shares.items()
+    )
+
+
+class LabelledFailures(NamedTuple):
+    """Failing points of a run with their modes."""
+
+    rows: NDArray[np.int64]
+    """Rows of `Sample.x`, shape (k,)."""
+    kinds: NDArray[np.object_]
+    """Their kinds of crash, shape (k,)."""
+    labels: NDArray[np.object_]
+    """Their modes, shape (k,)."""
+    listed: NDArray[np.object_]
+    """Mode of each failure of the run's list; "" where none of its kind was labelled."""
+
+
+def assign_modes(
+    space: ScenarioSpace, estimate: samplers.Estimate, crashes: Mapping[str, str]
+) -> LabelledFailures | None:
+    """Return `MAX_CLUSTERED` failing points with their modes, or None; arguments as of `find_modes`."""
+    if estimate.sample is None or not (estimate.sample.f <= estimate.gamma).any() or estimate.p <= 0:
+        return None
     sample = require_sample(estimate)
     rows = choose_failures(sample, estimate.gamma, MAX_REPLAYED)
     rows = rows[:: math.ceil(len(rows) / MAX_CLUSTERED)]
@@ -79,18 +113,7 @@ def find_modes(
     kinds = np.array([crashes.get(digest_scenario(each), "") for each in x], dtype=object)
     kinds[np.isneginf(sample.f[failing])] = NO_OUTCOME_LABEL
     labels = label_modes(_shown_normal(space, x), kinds)
-    shares = sum_by_label(estimate, rows, labels)
-    listed = _label_listed(space, estimate, crashes, x, kinds, labels)
-    weights = sample.weights[failing]
-    return tuple(
-        FailureMode(
-            crash=str(kinds[np.argmax(labels == label)]),
-            share=share,
-            failure=int(np.argmax(listed == label)) if (listed == label).any() else None,
-            center=_mean_parameters(space, x[labels == label], weights[labels == label]),
-        )
-        for label, share in shares.items()
-    )
+    return LabelledFailures(rows, kinds, labels, _label_listed(space, estimate, crashes, x, kinds, labels))
 
 
 def label_modes(u: FloatArray, kinds: NDArray[np.object_]) -> NDArray[np.object_]:

@@ -113,7 +113,8 @@ class Severity:
             f"> {self.curve.thresholds[i]:g} m/s {format_ends(float(base.low[i]), float(base.high[i]))}" for i in shown
         ]
         behind = f"({base.fitted_to}, {base.n_refits} refits)"
-        return [f"  base distribution {100 * base.confidence:g} %  {', '.join(parts)} {behind}"]
+        held = f"{100 * base.confidence:g} % of all thresholds together"
+        return [f"  base distribution {held}  {', '.join(parts)} {behind}"]
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain lists and numbers for JSON."""

@@ -37,6 +37,7 @@ DRIVERS = {
     "gail": "the same with policy gradients",
     "bc": "the same by behaviour cloning",
     "idm": "rule-based driver, Intelligent Driver Model and lane keeping by what it sees",
+    "idm+mobil": "the same, which changes lanes too, by MOBIL",
     "FILE.safetensors": "driver that you trained, see rare-envs train-drivers",
 }
 

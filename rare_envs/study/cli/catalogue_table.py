@@ -37,7 +37,9 @@ def print_overview(entries: dict[str, Any]) -> None:
     environments = Table.grid(padding=(0, 1))
     environments.add_row(Text("environments", style="bold"), Text("parameters", style="bold"))
     for env_id, environment in entries["environments"].items():
-        environments.add_row(f"  {env_id}", ", ".join(each["name"] for each in environment["parameters"]))
+        own = [each["name"] for each in environment["parameters"]]
+        added = [each["name"] for each in environment["of_learned_drivers"]] if environment["drivers"] else []
+        environments.add_row(f"  {env_id}", ", ".join(own + added))
     console.print(environments)
     kinds = {"of HighwayEnv": entries["highway_env"], **{kind: entries[kind] for kind in TITLES}}
     names = Table.grid(padding=(0, 1))
@@ -119,7 +121,7 @@ def _print_environment(console: Console, env_id: str, environment: dict[str, Any
     around = environment["drivers"] or "a script, unless told otherwise"
     console.print(f"  drivers around the ego: {around}")
     added = ", ".join(f"{each['name']} ({each['size']:,} values)" for each in environment["of_learned_drivers"])
-    console.print(f"  learned drivers add: {added}")
+    console.print(f"  learned drivers add{', those above too' if environment['drivers'] else ''}: {added}")
     console.print(f"  with HighwayEnv's observations and actions: {environment['kinematics_id']}\n")
 
 

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from enum import Enum
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -46,6 +47,30 @@ class ExecutorOptions:
     memory_limit: Annotated[
         float | None, typer.Option(help="GiB that the simulations of a worker process may take (Linux).")
     ] = None
+
+    def fill(self, others: Mapping[str, Any], typed: set[str]) -> ExecutorOptions:
+        """Return these options with those of a file in place of what was not typed.
+
+        Args:
+            others: Options of the file, by name.
+            typed: Names of the options that were typed.
+
+        Raises:
+            ValueError: If the file names an executor that there is not.
+
+        Example:
+            >>> ExecutorOptions(workers=2).fill({"workers": 8, "executor": "local"}, {"workers"})
+            ExecutorOptions(workers=2, executor=<ExecutorKind.LOCAL: 'local'>, address=None, time_limit=None, memory_limit=None)
+        """  # noqa: E501 (the example shows a whole object)
+        values = {name: value for name, value in others.items() if name not in typed and value is not None}
+        kinds = [kind.value for kind in ExecutorKind]
+        if values.get("executor", kinds[0]) not in kinds:
+            raise ValueError(
+                f"In the file of --config: expected executor to be {' or '.join(kinds)}, got {values['executor']!r}."
+            )
+        if "executor" in values:
+            values["executor"] = ExecutorKind(values["executor"])
+        return replace(self, **values)
 
     def make(self) -> Executor | None:
         """Return the executor; None for this process.

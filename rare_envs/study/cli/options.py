@@ -67,15 +67,16 @@ LEADER_SCENARIOS = {"cut-in": "cut_in", "car-following": "car_following"}
 
 
 def complete_environment(incomplete: str) -> list[str]:
-    """Return the ids that begin so, for completion in a shell.
+    """Return the ids, with and without their namespace, that begin so, for completion in a shell.
 
     Example:
-        >>> complete_environment("rare_envs/Car")
-        ['rare_envs/CarFollowing-v0']
+        >>> complete_environment("rare_envs/Car"), complete_environment("Car")
+        (['rare_envs/CarFollowing-v0'], ['CarFollowing-v0'])
     """
     from rare_envs.scenarios.registry import SCENARIOS
 
-    return [env_id for env_id in SCENARIOS if env_id.startswith(incomplete)]
+    short = [env_id.rpartition("/")[2] for env_id in SCENARIOS]
+    return [each for names in (SCENARIOS, short) for each in names if each.startswith(incomplete)]
 
 
 def complete_method(incomplete: str) -> list[str]:
@@ -90,9 +91,26 @@ def complete_method(incomplete: str) -> list[str]:
     return sorted(name for name in samplers.METHODS if name.startswith(incomplete))
 
 
+def read_environment(text: str | None) -> str | None:
+    """Return the id of an environment with its namespace, where it was typed without.
+
+    Example:
+        >>> read_environment("CutIn-v0"), read_environment("mine:Overtaking-v0"), read_environment(None)
+        ('rare_envs/CutIn-v0', 'mine:Overtaking-v0', None)
+    """
+    from rare_envs.scenarios.registry import complete_id
+
+    return None if text is None else complete_id(text)
+
+
 EnvArgument = Annotated[
     str,
-    typer.Argument(metavar="ENV", help="Environment, such as rare_envs/CutIn-v0.", autocompletion=complete_environment),
+    typer.Argument(
+        metavar="ENV",
+        help="Environment, such as rare_envs/CutIn-v0.",
+        autocompletion=complete_environment,
+        callback=read_environment,
+    ),
 ]
 EgoArgument = Annotated[str, typer.Argument(metavar="EGO", help="An ego, as for estimate --ego.")]
 ForceOption = Annotated[bool, typer.Option("--force", help="Replace what the folder of --out has of an earlier run.")]

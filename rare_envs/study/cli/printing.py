@@ -13,10 +13,12 @@ import samplers
 from rare_envs.exposure import describe_human_contacts
 from rare_envs.study.columns import MAX_SHOWN, draw_ordinary, find_ordinary_range, format_value
 from rare_envs.study.crash_kinds import KIND_DESCRIPTIONS
+from rare_envs.study.html_report.wording import explain_no_gain
 from rare_envs.study.rates.text import describe_injuries, describe_parts, format_interval, format_rate, name_events
 from rare_envs.study.report import Report
 from samplers.presentation.estimate_display import indent_lines
 from samplers.problem import FloatArray
+from samplers.trace import describe_outcome
 
 ENOUGH, MANY = 3.0, 300_000
 """Simulations over p that show with 95 % a region of failure as probable as all that was found; what they may cost."""
@@ -41,8 +43,10 @@ def print_report(report: Report, out: Path | None = None) -> None:
         f"{question.env_id}, ego {question.ego}{report.average and f', {report.average}'}",
         style="bold",
     )
-    console.print(f"  {f'{100 * estimate.confidence:g} % interval':<15} {low:.3e} to {high:.3e}")
-    if report.verdict is not None:
+    limited = report.verdict is not None
+    ends = f" (each end is one-sided at {50 + 50 * estimate.confidence:g} %, for --max-p)" if limited else ""
+    console.print(f"  {f'{100 * estimate.confidence:g} % interval':<15} {low:.3e} to {high:.3e}{ends}")
+    if limited:
         console.print(f"  {'limit':<15} {report.verdict}", style="bold")
     for line in indent_lines(estimate.base_uncertainty):
         console.print(line)
@@ -50,10 +54,13 @@ def print_report(report: Report, out: Path | None = None) -> None:
     _print_rate(console, report)
     rows = (
         ("c.o.v.", "not known" if math.isinf(estimate.cov) else f"{estimate.cov:.3f}"),
-        ("simulations", f"{estimate.n_sim:,} in {report.seconds:.1f} s by {question.core}"),
+        ("simulations", f"{estimate.n_sim:,} in {_format_time(report)} by {question.core}"),
         ("valid", estimate.proviso),
         ("gain", _format_gain(estimate)),
-        ("method", f"{estimate.method.name}, seed {estimate.seed}, {estimate.status}"),
+        (
+            "method",
+            f"{estimate.method.name}, seed {estimate.seed}, {describe_outcome(estimate.status, report.warnings)}",
+        ),
         *([("chosen", estimate.choice)] if estimate.chose_another else []),
     )
     for name, value in rows:
@@ -81,6 +88,12 @@ def print_report(report: Report, out: Path | None = None) -> None:
     if out is not None:
         names = ", ".join(path.name for path in sorted(out.iterdir()) if path.is_file())
         console.print(f"written to {out}: {names}")
+
+
+def _format_time(report: Report) -> str:
+    """Return the wall time, and how much of it was before an interruption."""
+    text = f"{report.seconds:.1f} s"
+    return f"{text} ({report.earlier_seconds:.0f} s before it was resumed)" if report.earlier_seconds else text
 
 
 def _print_other_bases(console: Console, report: Report) -> None:
@@ -143,7 +156,7 @@ def _format_odds(p: float) -> str:
 def _format_gain(estimate: samplers.Estimate) -> str:
     """Return the gain over plain Monte Carlo, and the simulations that it stands for."""
     if math.isnan(estimate.gain):
-        return "not known"
+        return explain_no_gain(estimate.p)
     needed = estimate.gain * estimate.n_sim
     gain = f"{estimate.gain:,.0f}" if estimate.gain >= 100 else f"{estimate.gain:.3g}"
     return f"{gain} (plain Monte Carlo: about {needed:,.0f} simulations for the same c.o.v.)"

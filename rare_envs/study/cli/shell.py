@@ -6,11 +6,12 @@ import contextlib
 import ctypes
 import json
 import os
+import re
 import signal
 import sys
 import threading
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from types import FrameType
 from typing import Any, NoReturn
 
@@ -57,6 +58,14 @@ class OneLineErrors(SummarisedCommands):
     SIGTERM and SIGHUP end a command as Ctrl-C does; the exit code is 128 and the number of the signal.
     """
 
+    def invoke(self, ctx: Any) -> Any:
+        """Run a command; where an error names an argument of Python, name the option that stands for it."""
+        try:
+            return super().invoke(ctx)
+        except BadInput as error:
+            error.args = (name_options(str(error), find_options(self.get_command(ctx, ctx.invoked_subcommand))),)
+            raise
+
     def main(self, *args: Any, **extra: Any) -> NoReturn:
         """Run a command and exit."""
         received: list[int] = []
@@ -78,6 +87,39 @@ class OneLineErrors(SummarisedCommands):
             _print_stderr(f"rare-envs: stopped by {number.name}")
             code = 128 + number
         sys.exit(code if isinstance(code, int) else 0)
+
+
+def find_options(command: Any) -> dict[str, str]:
+    """Return the options of a command, and of the commands below it, by the names that they have in Python."""
+    found: dict[str, str] = {}
+    for each in (command, *getattr(command, "commands", {}).values()):  # of a group
+        for parameter in getattr(each, "params", ()):
+            option = next((word for word in getattr(parameter, "opts", ()) if word.startswith("--")), None)
+            if option is not None:
+                found[parameter.name] = found[option[2:].replace("-", "_")] = option
+    return found
+
+
+def name_options(message: str, options: Mapping[str, str]) -> str:
+    """Return a message with options in place of the names that they have in Python.
+
+    A name of one word is an ordinary word too: it is replaced behind "Expected" at the beginning alone. What is said
+    of a file of --config stays as it is: its keys are these names.
+
+    Example:
+        >>> options = {"max_sim": "--max-sim", "seed": "--seed"}
+        >>> name_options("Expected max_sim of at least 1, got -5.", options)
+        'Expected --max-sim of at least 1, got -5.'
+        >>> name_options("Expected seed of at least 0, got -1 (the seed).", options)
+        'Expected --seed of at least 0, got -1 (the seed).'
+    """
+    if message.startswith("'"):
+        return message
+    for name, option in options.items():
+        before = r"(?<![-\w'\"/.])" if "_" in name else "^Expected "
+        after = r"(?![-\w'\"/(=]|\.\w)"
+        message = re.sub(f"{before}{name}{after}", option if "_" in name else f"Expected {option}", message)
+    return message
 
 
 def is_typed(context: typer.Context, name: str) -> bool:

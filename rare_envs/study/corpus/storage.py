@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -82,8 +82,13 @@ def _no_run(folder: Path) -> str:
     return f"No run in {str(folder)!r}: expected {RESULT} and {FAILURES}, as rare-envs estimate --out writes."
 
 
-def choose_likely(failures: Sequence[StoredFailure], most: int) -> list[StoredFailure]:
-    """Return the `most` most likely failures, one of each kind of crash among them as far as there is room.
+def choose_likely(failures: Sequence[StoredFailure], most: int, modes: Sequence[int] = ()) -> list[StoredFailure]:
+    """Return the `most` most likely failures, one of each kind of crash and mode among them as far as there is room.
+
+    Args:
+        failures: The most likely first.
+        most: Their number.
+        modes: Numbers of the failures that stand for a mode each.
 
     Example:
         >>> kinds = ["rear_end"] * 3 + ["side"]
@@ -94,7 +99,7 @@ def choose_likely(failures: Sequence[StoredFailure], most: int) -> list[StoredFa
     first: dict[str, int] = {}
     for number, failure in enumerate(failures):
         first.setdefault(failure.crash, number)
-    order = [*first.values(), *(number for number in range(len(failures)) if number not in first.values())]
+    order = list(dict.fromkeys([*first.values(), *modes, *range(len(failures))]))
     return [failures[number] for number in sorted(order[:most])]
 
 
@@ -104,7 +109,7 @@ def add_run(run: Path, corpus: Path, most: int = 20, trust: bool = False) -> tup
     Args:
         run: Folder of `rare-envs estimate --out`.
         corpus: Folder of the corpus; is made, if need be.
-        most: Number of failures, the most likely ones and one of each kind of crash.
+        most: Number of failures, the most likely ones and one of each kind of crash and each mode.
         trust: Trust the code that a run from elsewhere names.
 
     Returns:
@@ -127,7 +132,8 @@ def add_run(run: Path, corpus: Path, most: int = 20, trust: bool = False) -> tup
     """
     if most < 1:
         raise BadInput(f"Expected at least one failure to add, got {most}.")
-    chosen = choose_likely(read_run(run, trust), most)
+    failures = read_run(run, trust)
+    chosen = choose_likely(failures, most, _find_modes(read_recorded(run), len(failures)))
     if not chosen:
         raise BadInput(f"The run in {str(run)!r} has no failure.")
     new = 0
@@ -139,6 +145,13 @@ def add_run(run: Path, corpus: Path, most: int = 20, trust: bool = False) -> tup
                 new += 1
             note_question(read_question(failure.question_values()))
     return chosen, new
+
+
+def _find_modes(recorded: Mapping[str, Any], n: int) -> list[int]:
+    """Return the numbers of the failures, below n, that stand for a mode each; what is no number is left out."""
+    modes = recorded.get("modes")
+    numbers = [mode.get("failure") for mode in modes if isinstance(mode, dict)] if isinstance(modes, list) else []
+    return [number for number in numbers if type(number) is int and 0 <= number < n]
 
 
 def read_corpus(folder: Path) -> list[StoredFailure]:

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rare_envs.json_text import parse_json_object
+from rare_envs.scenarios.registry import find_scenario
 from rare_envs.study.question import Question
 from rare_envs.version import __version__
 
@@ -110,8 +111,16 @@ def make_stored(
     """
     values = {name: np.atleast_1d(part).astype(np.float64).tolist() for name, part in x.items()}
     world = {name: getattr(question, name) for name in WORLD_FIELDS}
-    versions = describe_versions()
-    return StoredFailure(question.env_id, world, values, f, log_p0, question.ego, crash, question.base, versions)
+    base, versions = _name_base(question), describe_versions()
+    return StoredFailure(question.env_id, world, values, f, log_p0, question.ego, crash, base, versions)
+
+
+def _name_base(question: Question) -> str | None:
+    """Return the name of the base distribution, the scenario's default where the question names none."""
+    try:
+        return question.base or find_scenario(question.env_id).default_base
+    except ValueError:  # a scenario of the user's that is not there any longer
+        return None
 
 
 def parse_stored(text: str, source: str) -> StoredFailure:

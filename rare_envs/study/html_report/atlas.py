@@ -116,7 +116,8 @@ def _describe_crash(drive: Drive) -> list[tuple[str, str]]:
         return [("end", f"no crash; the worst moment is at {drive.time[drive.worst]:.1f} s")]
     who, whom = ("the edge of the road" if j < 0 else drive.names[j] for j in crash["vehicles"])
     return [
-        ("crash", f"{who} into {whom} after {drive.time[-1]:.1f} s, closing at {crash['closing_speed']:.1f} m/s"),
+        ("crash", f"{who} into {whom} after {drive.time[-1]:.1f} s, at {crash['impact_speed']:.1f} m/s"),
+        ("closing speed", f"{crash['closing_speed']:.1f} m/s of it, at right angles to what touches"),
         ("delta-v", f"{max(crash['delta_v']):.2g} m/s"),
         ("serious injury (MAIS 3+)", f"{100 * max(crash['injury_risk']):.2g} %"),
     ]

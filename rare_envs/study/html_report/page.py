@@ -27,6 +27,7 @@ from rare_envs.study.html_report.wording import (
     describe_method,
     describe_rate,
     describe_validity,
+    explain_no_gain,
     format_probability,
     name_measure,
     summarise_answer,
@@ -37,6 +38,7 @@ from rare_envs.study.storage.loaded_study import LoadedStudy, load_study
 from rare_envs.study.storage.names import EPISODES, REPORT, RESULT, STUDY
 from rare_envs.traffic.palette import CRASH_COLOUR, ROLE_COLOURS
 from samplers.problem import FloatArray
+from samplers.trace import describe_outcome
 
 SECTIONS = ("warnings", "answer", "convergence", "levels", "weights", "curve", "parameters", "kinds", "atlas", "made")
 """Ids of the sections of the page, in their order."""
@@ -111,6 +113,8 @@ def render_page(study: LoadedStudy, figures: Mapping[str, FigureOfPage], atlas: 
         remarks=_list_notes(result),
         intervals=describe_intervals(result),
         validity=describe_validity(result),
+        end=describe_outcome(str(result.get("status")), list_doubts(result)),
+        no_gain=explain_no_gain(float(result["p"])),
         rate=describe_rate(result),
         method=describe_method(result),
         figures={name: figure.to_svg() for name, figure in figures.items()},

@@ -54,6 +54,18 @@ def format_odds(p: float) -> str:
     return f"about 1 in {float(f'{n:.2g}'):,.0f}"
 
 
+def explain_no_gain(p: float) -> str:
+    """Return why there is no gain over Monte Carlo.
+
+    Example:
+        >>> explain_no_gain(0.0), explain_no_gain(1e-5)
+        ('not known, as nothing that failed counts in p', 'not known, as the c.o.v. is 1 or more')
+    """
+    if p <= 0:
+        return "not known, as nothing that failed counts in p"
+    return "none, as every scenario fails" if p >= 1 else "not known, as the c.o.v. is 1 or more"
+
+
 def describe_event(result: Result) -> str:
     """Return what is counted, in words.
 
@@ -113,6 +125,13 @@ def describe_validity(result: Result) -> str:
     )
 
 
+def _describe_ends(result: Result) -> str:
+    """Return why the interval has another confidence than usual; empty where it has not."""
+    if not isinstance(result.get("gate"), dict):
+        return ""
+    return f"; each end is one-sided at {50 + 50 * float(result['confidence']):g} %, for the limit of --max-p"
+
+
 def describe_intervals(result: Result) -> list[tuple[str, str, str]]:
     """Return the intervals of p: name, ends, and what each holds."""
     percent, p = f"{100 * float(result['confidence']):g} %", float(result["p"])
@@ -121,7 +140,7 @@ def describe_intervals(result: Result) -> list[tuple[str, str, str]]:
         (
             f"{percent}, sampling",
             f"{format_probability(low, p)} to {format_probability(high, p)}",
-            "error of a finite number of simulations; the model of traffic taken as true",
+            "error of a finite number of simulations; the model of traffic taken as true" + _describe_ends(result),
         )
     ]
     base = result.get("base_uncertainty")

@@ -18,6 +18,16 @@ from rare_envs.study.question import Question, read_question
 MAX_QUESTION_BYTES = 2**20
 ENV_KEY = "env"
 """Key of the environment; the others are the options of `rare-envs estimate`, with - or _ between words."""
+OPTION_KEYS = {ENV_KEY: "env_id", "confidence": "gate_confidence"}
+"""Keys that are no names of fields of `Question`: they are called as the options are."""
+EXECUTOR_KEYS: dict[str, tuple[type, ...]] = {
+    "workers": (int,),
+    "executor": (str,),
+    "address": (str,),
+    "time_limit": (int, float),
+    "memory_limit": (int, float),
+}
+"""Options that say where simulations are made, which is no part of the question, with their types."""
 NOT_IN_FILES = ("trust",)
 """Whoever asks decides whether code runs, not a file."""
 
@@ -55,7 +65,7 @@ QuestionLoader.add_implicit_resolver(
 
 
 def read_question_file(path: Path) -> dict[str, Any]:
-    r"""Return the fields of `Question` that a file gives.
+    r"""Return the fields of `Question` that a file gives, and the options of `EXECUTOR_KEYS`.
 
     Args:
         path: Of a YAML file, which may be JSON.
@@ -72,14 +82,15 @@ def read_question_file(path: Path) -> dict[str, Any]:
         {'env_id': 'rare_envs/CutIn-v0', 'max_sim': 3000, 'noise': False}
     """
     given = _load_mapping(path)
-    named = {"env_id" if key == ENV_KEY else key.replace("-", "_"): value for key, value in given.items()}
-    known = [field.name for field in fields(Question) if field.name not in NOT_IN_FILES]
+    named = {_find_field(key): value for key, value in given.items()}
+    known = [*(field.name for field in fields(Question) if field.name not in NOT_IN_FILES), *EXECUTOR_KEYS]
     for key in given:
-        name = "env_id" if key == ENV_KEY else key.replace("-", "_")
+        name = _find_field(key)
         if name in NOT_IN_FILES:
             raise BadInput(f"{str(path)!r} cannot say {key}: give --{key} on the command line.")
         if name not in known:
-            names = [ENV_KEY if each == "env_id" else each for each in known]
+            options = {name: option for option, name in OPTION_KEYS.items()}
+            names = [options.get(each, each) for each in known]
             hint = did_you_mean(key.replace("-", "_"), names)
             raise BadInput(f"{str(path)!r} has an unknown key {key!r}{hint}. It may have: {', '.join(names)}.")
     if len(named) < len(given):
@@ -87,8 +98,20 @@ def read_question_file(path: Path) -> dict[str, Any]:
     try:
         read_question({"env_id": "", **named})
     except BadInput as error:
-        raise BadInput(f"{str(path)!r}: {str(error).replace(' of the recorded question', '')}") from error
+        text = str(error).replace(" of the recorded question", "").replace("gate_confidence", "confidence")
+        raise BadInput(f"{str(path)!r}: {text}") from error
+    for name, types in EXECUTOR_KEYS.items():
+        value = named.get(name)
+        if value is not None and (not isinstance(value, types) or isinstance(value, bool)):
+            expected = " or ".join(kind.__name__ for kind in types)
+            raise BadInput(f"{str(path)!r}: Expected {name} to be {expected}, got {reprlib.repr(value)}.")
     return named
+
+
+def _find_field(key: str) -> str:
+    """Return the name of the field or option that a key stands for."""
+    name = key.replace("-", "_")
+    return OPTION_KEYS.get(name, name)
 
 
 def join_question(given: Mapping[str, Any], env: str | None, options: Mapping[str, Any], typed: set[str]) -> Question:

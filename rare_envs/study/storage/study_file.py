@@ -7,6 +7,7 @@ import platform
 import shlex
 import sys
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import asdict
 from datetime import datetime, timezone
 from importlib import metadata
@@ -25,7 +26,18 @@ from rare_envs.study.storage.result_digests import digest_results
 from rare_envs.version import __version__
 from samplers.result import method_settings
 
-LIBRARIES = ("gymnasium", "numpy", "onnxruntime", "scipy", "stable-baselines3", "torch")
+LIBRARIES = (
+    "cvxpy",
+    "gymnasium",
+    "highway-env",
+    "numba",
+    "numpy",
+    "onnxruntime",
+    "scikit-learn",
+    "scipy",
+    "stable-baselines3",
+    "torch",
+)
 """Distributions whose versions may change a number."""
 
 
@@ -68,6 +80,27 @@ def begin_study_file(folder: Path, study: Study) -> None:
     replace_text(folder / STUDY, format_json(describe_study(study)) + "\n")
 
 
+def note_resumption(folder: Path, stopped: float) -> float:
+    """Note in study.json that an interrupted run goes on.
+
+    Args:
+        folder: Of the run.
+        stopped: When its last simulations were recorded [s since 1970].
+
+    Returns:
+        Wall time of the run before it was interrupted, to the second [s]; 0 where study.json does not tell.
+    """
+    try:
+        about = parse_json_object((folder / STUDY).read_text(encoding="utf-8"), STUDY)
+        begun = datetime.fromisoformat(str(about.get("resumed") or about["begun"])).timestamp()
+        earlier = float(about.get("earlier_seconds") or 0.0) + max(stopped - begun, 0.0)
+    except (OSError, ValueError, KeyError, TypeError):  # of an earlier version, or somebody has changed it
+        return 0.0
+    with suppress(OSError):  # a full disk is found when results are written
+        replace_text(folder / STUDY, format_json({**about, "resumed": _now(), "earlier_seconds": earlier}) + "\n")
+    return earlier
+
+
 def finish_study_file(folder: Path, study: Study, seconds: float) -> None:
     """Note in study.json that the run is done, and the digests of its files; what it held of the beginning stays.
 
@@ -76,7 +109,7 @@ def finish_study_file(folder: Path, study: Study, seconds: float) -> None:
     Args:
         folder: Of the run.
         study: What was asked.
-        seconds: Wall time [s].
+        seconds: Wall time, that before interruptions included [s].
 
     Raises:
         OSError: It cannot be written.

@@ -6,16 +6,20 @@ from pathlib import Path
 
 import pytest
 
+import rare_envs
 from rare_envs.scenarios.registry import (
     HIGHWAY_ENV_LAYOUT,
     SCENARIOS,
     Registry,
+    complete_id,
+    env_id_of,
     find_scenario,
     is_highway_env_id,
     kinematics_id,
     scenario_named,
     split_layout,
 )
+from rare_envs.study import Question
 from tests.rare_envs.scenarios.standing import STANDING
 
 PLACE = "place_of_this_registry_test"
@@ -157,3 +161,24 @@ def test_an_id_with_highway_envs_layout_stands_for_its_arguments() -> None:
     assert split_layout("rare_envs/HardBrake-kinematics-v0") == ("rare_envs/HardBrake-v0", HIGHWAY_ENV_LAYOUT)
     for other in ("rare_envs/CutIn-v0", "highway-fast-v0", 3, ["rare_envs/CutIn-v0"]):
         assert split_layout(other) == (other, {})  # type: ignore[arg-type]
+
+
+def test_an_id_may_lack_its_namespace_unless_two_end_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert find_scenario("CutIn-v0") is find_scenario("rare_envs/CutIn-v0")
+    assert env_id_of("CutIn-v0") == "rare_envs/CutIn-v0" and env_id_of("cut_in") == "rare_envs/CutIn-v1"
+    assert split_layout("CutIn-kinematics-v0") == split_layout("rare_envs/CutIn-kinematics-v0")
+    assert complete_id("a:CutIn-v0") == "a:CutIn-v0"
+    monkeypatch.setitem(SCENARIOS._entries, "mine/CutIn-v0", STANDING)
+    assert complete_id("CutIn-v0") == "CutIn-v0"
+    with pytest.raises(ValueError, match=r"^Unknown environment 'CutIn-v0' \(did you mean '\w+/CutIn-v0'"):
+        find_scenario("CutIn-v0")
+
+
+def test_every_front_door_takes_an_id_without_its_namespace() -> None:
+    problem = rare_envs.DrivingProblem("CutIn-v0")
+    assert problem.env_id == "rare_envs/CutIn-v0"
+    assert rare_envs.parallel_env("CutIn-v0").possible_agents == ["ego", "cutter", "lead"]
+    assert rare_envs.make_batch("CutIn-v0", 2).num_envs == 2
+    assert Question(env_id="CutIn-v0").env_id == "rare_envs/CutIn-v0"
+    layout = Question(env_id="CutIn-kinematics-v0")
+    assert (layout.env_id, layout.observation, layout.action) == ("rare_envs/CutIn-v0", "kinematics", "meta")

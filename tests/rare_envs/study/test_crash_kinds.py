@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,7 @@ import pytest
 import rare_envs
 import samplers
 from rare_envs.control.idm import IDM
-from rare_envs.study.crash_kinds import classify_failures
+from rare_envs.study.crash_kinds import classify_failures, list_all_kinds
 from rare_envs.study.question import Question, Study
 from rare_envs.study.report import Report
 from rare_envs.study.run_directory import write_run
@@ -87,3 +88,17 @@ def test_no_failures_no_kinds() -> None:
     problem = rare_envs.DrivingProblem(CUT_IN)
     kinds = classify_failures(problem, samplers.estimate(problem, "mc", max_sim=50, seed=0))
     assert (kinds.shares, kinds.listed, kinds.unknown) == ({}, (), "")
+
+
+def test_a_kind_that_the_list_lacks_is_added_with_its_crash(report: Report) -> None:
+    problem, failures = report.study.problem, report.estimate.failures
+    kinds = [crash["kind"] if crash else "none" for crash in report.crashes]
+    others = np.array([kind != "rear_end" for kind in kinds])
+    short = replace(failures, x=failures.x[others], f=failures.f[others], log_p0=failures.log_p0[others])
+    listed = tuple(crash for crash, kept in zip(report.crashes, others, strict=True) if kept)
+    estimate, found = list_all_kinds(
+        problem, replace(report.estimate, failures=short), replace(report.kinds, listed=listed)
+    )
+    (added,) = [k for k, crash in enumerate(found.listed) if crash is not None and crash["kind"] == "rear_end"]
+    assert len(found.listed) == len(estimate.failures) == len(short) + 1
+    assert (estimate.failures.x[added] == failures.x[kinds.index("rear_end")]).all()

@@ -34,6 +34,7 @@ def test_shares_add_up_to_p(method):
     whole = result.shares(lambda x: ["any"] * len(x))["any"]
     assert whole.p == pytest.approx(result.p, rel=1e-12)
     assert whole.points == int((result.sample.f <= 0).sum())
+    assert (whole.interval, whole.cov) == (result.interval, result.cov)
 
 
 def test_shares_are_the_probabilities_of_the_kinds():

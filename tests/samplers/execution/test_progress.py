@@ -4,6 +4,7 @@ import re
 import pytest
 
 import samplers
+from samplers.execution.progress import Progress, open_listener
 from samplers.limit_states import half_space
 
 
@@ -44,6 +45,16 @@ def test_a_narrow_terminal_keeps_bar_count_and_time(capsys, monkeypatch):
         assert len(last) <= columns
         assert "\u2501" in last and re.search(r"\d:\d\d:\d\d", last) and f"{result.n_sim:,}" in last
         assert ("P[f <= 0]" in last) == words
+
+
+def test_workers_and_both_times_fit_eighty_columns(capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "80")
+    with open_listener(True, 10_000) as show:
+        show(Progress(n_sim=9_000, max_sim=10_000, level=0.0, p=1.2e-5, run=0, workers=12, seconds_left=70.0))
+    last = capsys.readouterr().err.strip("\n").splitlines()[-1]
+    assert len(last) <= 80 and re.search(r"\d:\d\d:\d\d$", last.strip())
+    assert "9,000 done P[f <= 0] = 1.20e-05, 12 workers, 70 s left" in last  # all of it
+    assert "retries" not in last
 
 
 def failing_in_mid_run(x):

@@ -52,12 +52,15 @@ def estimate_command(
     """Estimate how often an ego fails, with an interval, and show its most likely failure."""
     from rare_envs.study.evaluate import run, run_into
     from rare_envs.study.question import prepare
-    from rare_envs.study.storage.question_file import join_question, read_question_file
+    from rare_envs.study.storage.question_file import EXECUTOR_KEYS, join_question, read_question_file
 
     typed = {name for name in context.params if is_typed(context, name)}
-    question = join_question({} if config is None else read_question_file(config), env, options.arguments(), typed)
+    given = {} if config is None else read_question_file(config)
+    with as_bad_input(ValueError):
+        places = places.fill({name: given.pop(name) for name in EXECUTOR_KEYS if name in given}, typed)
+    question = join_question(given, env, options.arguments(), typed)
     if question.max_p is None:
-        _refuse_options_of_a_limit(typed)
+        _refuse_options_of_a_limit(typed | set(given))
     if is_highway_env_id(question.env_id):
         _estimate_highway_env(question, typed, out, force, as_json, places)
     with show_what_is_known(lambda known: show_report(known, None, as_json)), keep_stdout_for_the_answer():

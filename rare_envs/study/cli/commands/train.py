@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from rare_envs.study.cli.options import JsonOption, NoiseChoice, SeedOption, TrustOption, WorldOptions
+from rare_envs.study.cli.options import JsonOption, NoiseChoice, SeedOption, TrustOption, WorldOptions, read_environment
 from rare_envs.study.cli.shell import keep_stdout_for_the_answer, print_json
 from rare_envs.study.errors import BadInput, as_bad_input
 from rare_envs.threads import use_one_thread
@@ -24,7 +24,11 @@ def train_ego_command(
     options: WorldOptions,
     env: Annotated[
         str | None,
-        typer.Argument(metavar="[ENV]", help="Environment, such as rare_envs/CutIn-v0; --from-failures tells it."),
+        typer.Argument(
+            metavar="[ENV]",
+            help="Environment, such as rare_envs/CutIn-v0; --from-failures tells it.",
+            callback=read_environment,
+        ),
     ] = None,
     algo: Annotated[
         str | None, typer.Option(help="Stable-Baselines3 algorithm; --from-failures tells it.", show_default="ppo")

@@ -114,7 +114,8 @@ class CombinedRounds:
 
 def doubt(combined: CombinedRounds, pursued: list[int], settings: DoubtSettings) -> list[str]:
     """Return the warnings about an estimate."""
-    warnings = list(weight_warnings(combined.draws))
+    every = "failing draws of all rounds" if len(combined.rounds) > 1 else "failing draws"
+    warnings = [text.replace("failing draws", every) for text in weight_warnings(combined.draws)]
     last = combined.rounds[-1].y(combined.gamma)
     ess = effective_number(last)
     if 0 < ess < settings.min_ess:

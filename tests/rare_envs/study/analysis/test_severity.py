@@ -196,10 +196,8 @@ def test_curve_and_injuries_have_the_intervals_of_a_fitted_base() -> None:
     assert (alone.low[0], alone.high[0]) == pytest.approx(whole.interval, rel=0.02)
     assert band.low[0] < alone.low[0] < alone.high[0] < band.high[0]
     text = str(severity)
-    assert (
-        f"base distribution 95 %  > 1 m/s {band.low[1]:.1e} to {band.high[1]:.1e} (40 events of 12 scenes, 20 refits)"
-        in text
-    )
+    ends = f"> 1 m/s {band.low[1]:.1e} to {band.high[1]:.1e} (40 events of 12 scenes, 20 refits)"
+    assert f"base distribution 95 % of all thresholds together  {ends}" in text
     assert text.count("base distribution 95 %") == 2
     saved = json.loads(json.dumps(severity.to_dict(), allow_nan=False))
     assert saved["injuries_base"]["spread"] == wide.spread

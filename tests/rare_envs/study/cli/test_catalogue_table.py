@@ -27,6 +27,9 @@ def test_all_names_fit_a_screen(capsys: pytest.CaptureFixture[str], monkeypatch:
     assert {word for name in names for word in name.replace(",", " ").split()} <= words
     for environment in entries["environments"].values():
         assert {each["name"] for each in environment["parameters"]} <= words
+    (highway,) = (line for line in shown.splitlines() if "Highway-v0" in line)
+    assert "weights, noise" in highway and "idm+mobil" in words
+    assert all("weights" not in line for line in shown.splitlines() if "CutIn" in line)
 
 
 @pytest.mark.parametrize(

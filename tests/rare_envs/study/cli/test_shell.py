@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -12,7 +13,13 @@ from pathlib import Path
 
 import pytest
 
-from rare_envs.study.cli.shell import Terminated, keep_stdout_for_the_answer, one_line_warnings, signals_as_exceptions
+from rare_envs.study.cli.shell import (
+    Terminated,
+    keep_stdout_for_the_answer,
+    name_options,
+    one_line_warnings,
+    signals_as_exceptions,
+)
 from tests.rare_envs.study.refusals import FOLLOWING, SMALL, Cli, assert_refused
 
 
@@ -92,3 +99,26 @@ def test_a_signal_that_the_user_has_ignored_stays_so() -> None:
         assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
     finally:
         signal.signal(signal.SIGHUP, before)
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (("--max-sim", -5), "Expected --max-sim "),
+        (("--seed", -1), "Expected --seed "),
+        (("--target-cov", 0), "--target-cov"),
+        (("--replicates", 0), "Expected --replicates "),
+        (("--on-error", "stop"), "--on-error"),
+        (("--chunk", 0), "Expected --chunk "),
+    ],
+)
+def test_an_error_names_the_option_that_was_typed(cli: Cli, words: tuple[object, ...], message: str) -> None:
+    refused = cli("estimate", FOLLOWING, *words)
+    assert_refused(refused, message)
+    assert not re.search(r"[a-z]_[a-z]", refused.stderr)
+
+
+def test_what_is_said_of_a_file_keeps_its_keys() -> None:
+    options = {"max_sim": "--max-sim"}
+    assert name_options("'study.yaml' has an unknown key 'max_sims' (max_sim?)", options).endswith("(max_sim?)")
+    assert name_options("f(max_sim=3) and a/max_sim", options) == "f(max_sim=3) and a/max_sim"

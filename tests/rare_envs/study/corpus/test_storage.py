@@ -37,6 +37,7 @@ def test_each_kind_of_crash_is_among_the_chosen() -> None:
     failures = [StoredFailure("", {}, {}, -1.0, -float(k), crash=kind) for k, kind in enumerate(kinds)]
     assert [each.log_p0 for each in choose_likely(failures, 3)] == [0.0, -2.0, -4.0]
     assert [each.log_p0 for each in choose_likely(failures, 4)] == [0.0, -1.0, -2.0, -4.0]
+    assert [each.log_p0 for each in choose_likely(failures, 4, modes=[3, 0])] == [0.0, -2.0, -3.0, -4.0]
     assert len(choose_likely(failures, 100)) == 5
 
 

@@ -96,3 +96,9 @@ def test_a_stored_failure_is_a_question() -> None:
     assert isinstance(STORED, StoredFailure)
     values = STORED.question_values()
     assert values["ego"] == "idm" and Question(**values).horizon == 4.0
+
+
+def test_the_default_base_is_named() -> None:
+    assert STORED.base == "us101" and json.loads(STORED.to_json())["base"] == "us101"
+    assert make_stored(replace(QUESTION, base="i80"), X, f=-1.0, log_p0=-9.25, crash="").base == "i80"
+    assert make_stored(replace(QUESTION, env_id="gone/Road-v0"), X, f=-1.0, log_p0=-9.25, crash="").base is None

@@ -25,7 +25,8 @@ def test_an_entry_says_what_happened_and_how_to_see_it_again(source: AtlasSource
     (entry,) = build_atlas(source, [MODE])
     facts = dict(entry.facts)
     assert entry.title == "Mode 1: the ego runs into a vehicle ahead" and entry.share.startswith("75 % of p: 1 %")
-    assert facts["crash"].startswith("the ego into the lead after 0.8 s") and facts["f"] == "-1"
+    assert facts["crash"].startswith("the ego into the lead after 0.8 s, at ") and facts["f"] == "-1"
+    assert facts["closing speed"].endswith("m/s of it, at right angles to what touches")
     assert facts["replay"].startswith("rare-envs replay runs/one --failure 0")
     assert "standard deviations per parameter" in facts["nearest recorded"]
     assert [row[:2] for row in entry.parameters] == [

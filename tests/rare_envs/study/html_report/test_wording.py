@@ -8,6 +8,7 @@ from rare_envs.study.html_report.wording import (
     describe_intervals,
     describe_rate,
     describe_validity,
+    explain_no_gain,
     format_odds,
     summarise_answer,
 )
@@ -63,3 +64,15 @@ def test_a_rate_or_why_there_is_none() -> None:
     rate = {"per_million_km": 320.0, "interval_per_million_km": [29.0, 3500.0], "per_hour": 0.011}
     lines = describe_rate({"rate": {**rate, "interval_per_hour": [0.001, 0.12]}})
     assert lines[0].startswith("320 collisions per million km (29 to 3,500), 0.011 per hour")
+
+
+def test_the_limit_of_a_gate_explains_the_confidence() -> None:
+    (sampling,) = describe_intervals({**RESULT, "confidence": 0.9, "gate": {"decision": "passes"}})
+    assert sampling[0] == "90 %, sampling" and sampling[2].endswith(
+        "each end is one-sided at 95 %, for the limit of --max-p"
+    )
+    assert "--max-p" not in describe_intervals({**RESULT, "gate": None})[0][2]
+
+
+def test_no_gain_has_a_reason() -> None:
+    assert len({explain_no_gain(p) for p in (0.0, 0.5, 1.0)}) == 3

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from datetime import datetime, timedelta, timezone
 from pathlib import Path
 
 import numpy as np
@@ -72,11 +73,16 @@ def test_a_resumed_run_has_the_same_table_but_for_times(
     assert sorted(path.name for path in (tmp_path / "cut").iterdir()) == ["journal.bin", "study.json"]
     begun = json.loads((tmp_path / "cut" / "study.json").read_text())
     assert begun["finished"] is None and begun["seed"] == 0
-    resume(tmp_path / "cut")
+    hour_ago = (datetime.now(timezone.utc) - timedelta(hours=1)).isoformat()
+    (tmp_path / "cut" / "study.json").write_text(json.dumps({**begun, "begun": hour_ago}))
+    report = resume(tmp_path / "cut")
+    assert 3500 < report.earlier_seconds < 3700 and report.seconds > report.earlier_seconds
     whole, cut = (rare_envs.load_study(tmp_path / name) for name in ("whole", "cut"))
     assert cut.episodes().drop(["seconds"]).equals(whole.episodes().drop(["seconds"]))
     assert (cut.episodes()["seconds"].to_numpy() > 0).all()
-    assert cut.about["begun"] == begun["begun"] and cut.about["finished"] is not None
+    assert (
+        cut.about["begun"] == hour_ago and cut.about["seconds"] == report.seconds and cut.about["finished"] is not None
+    )
 
 
 def test_large_blocks_are_lists_in_single_precision(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

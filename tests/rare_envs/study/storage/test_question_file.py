@@ -9,8 +9,9 @@ import pytest
 from typer.testing import Result
 
 from rare_envs.study import BadInput, Question
+from rare_envs.study.cli.executor_options import ExecutorKind, ExecutorOptions
 from rare_envs.study.cli.options import EstimateOptions
-from rare_envs.study.storage.question_file import NOT_IN_FILES, read_question_file
+from rare_envs.study.storage.question_file import EXECUTOR_KEYS, NOT_IN_FILES, read_question_file
 
 Cli = Callable[..., Result]
 
@@ -30,6 +31,28 @@ def test_numbers_are_those_of_the_command_line(tmp_path: Path) -> None:
     file.write_text("env: a\nmax-p: 1e-4\ngamma: -1.5E+1\nhorizon: 3\nseed: 010\nmax-sim: 6000\nnoise: off\n")
     numbers = {"max_p": 1e-4, "gamma": -15.0, "horizon": 3, "seed": 10, "max_sim": 6000, "noise": False}
     assert read_question_file(file) == {"env_id": "a", **numbers}
+
+
+def test_the_keys_are_called_as_the_options(cli: Cli, tmp_path: Path) -> None:
+    file = tmp_path / "study.yaml"
+    file.write_text("env: a\nconfidence: 0.9\nmax-p: 0.5\nworkers: 3\nexecutor: local\ntime-limit: 60\n")
+    read = read_question_file(file)
+    assert read == {
+        "env_id": "a", "gate_confidence": 0.9, "max_p": 0.5, "workers": 3, "executor": "local", "time_limit": 60
+    }  # fmt: skip
+    of_executor = {name: read[name] for name in EXECUTOR_KEYS if name in read}
+    places = ExecutorOptions(time_limit=5.0).fill(of_executor, {"time_limit"})
+    assert places == ExecutorOptions(workers=3, executor=ExecutorKind.LOCAL, time_limit=5.0)
+    for text, message in (
+        ("env: rare_envs/CutIn-v0\nworkers: 0\n", "workers"),
+        ("env: rare_envs/CutIn-v0\nworkers: many\n", "Expected workers to be int, got 'many'"),
+        ("env: rare_envs/CutIn-v0\nexecutor: cloud\n", "expected executor to be local or ray, got 'cloud'"),
+        ("env: rare_envs/CutIn-v0\nconfidence: 0.9\n", "Expected --confidence together with --max-p"),
+        ("env: rare_envs/CutIn-v0\nconfidense: 0.9\n", "did you mean 'confidence'"),
+    ):
+        file.write_text(text)
+        result = cli("estimate", "--config", file)
+        assert result.exit_code == 2 and message in result.stderr and result.stderr.count("\n") == 1
 
 
 def test_what_is_typed_comes_before_the_file(cli: Cli, risky: str, tmp_path: Path) -> None:

@@ -1,8 +1,12 @@
 from __future__ import annotations
 
 import json
+import time
 from dataclasses import replace
+from datetime import datetime, timedelta, timezone
 from pathlib import Path
+
+import pytest
 
 from rare_envs.study import Question, prepare
 from rare_envs.study.storage.result_digests import find_changed_results
@@ -10,7 +14,9 @@ from rare_envs.study.storage.study_file import (
     _describe_command,
     begin_study_file,
     describe_study,
+    find_versions,
     finish_study_file,
+    note_resumption,
 )
 
 
@@ -62,3 +68,20 @@ def test_the_file_of_another_run_is_written_anew(tmp_path: Path) -> None:
     (tmp_path / "study.json").write_text(json.dumps({**before, "command": "rare-envs estimate --seed 7"}))
     finish_study_file(tmp_path, prepare(replace(asked, on_error="bound")), 2.5)  # which may change
     assert json.loads((tmp_path / "study.json").read_text())["command"] == "rare-envs estimate --seed 7"
+
+
+def test_the_time_before_interruptions_adds_up(tmp_path: Path) -> None:
+    assert note_resumption(tmp_path, time.time()) == 0.0  # no study.json
+    begun = datetime.now(timezone.utc) - timedelta(hours=1)
+    about = {"begun": begun.isoformat(timespec="seconds"), "finished": None}
+    (tmp_path / "study.json").write_text(json.dumps(about))
+    assert note_resumption(tmp_path, begun.timestamp() + 600.0) == pytest.approx(600.0, abs=1.0)
+    now = time.time()
+    assert note_resumption(tmp_path, now + 30.0) == pytest.approx(630.0, abs=3.0)
+    assert note_resumption(tmp_path, now - 30.0) == pytest.approx(630.0, abs=3.0)  # it recorded nothing since
+    (tmp_path / "study.json").write_text('{"begun": 5}')
+    assert note_resumption(tmp_path, now) == 0.0
+
+
+def test_the_versions_of_what_computes_are_noted() -> None:
+    assert {"numba", "numpy", "scikit-learn", "torch"} <= set(find_versions())
