@@ -8,7 +8,11 @@ it states, which is its 95 % confidence length.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+import signal
+import threading
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -20,6 +24,8 @@ BLOCK = 100
 """Points that OpenTURNS hands over at once: that many chains in subset sampling, 10 % of the points of a level."""
 LEVELS_OF_A_BUDGET = 5
 """Levels, or iterations, that a budget is divided into: subset sampling takes 4 to 5 to a p of 1e-4."""
+STOPPING_SIGNALS = (signal.SIGINT, signal.SIGTERM)
+"""Signals that end a benchmark, which then goes on with the run that they interrupt."""
 EstimateNumbers = tuple[float, float, float, float]
 """p, low and high end, c.o.v."""
 
@@ -46,6 +52,7 @@ def run_algorithm(
     stops: list[BaseException] = []
 
     def evaluate(u: FloatArray) -> FloatArray:
+        set_handlers()
         try:
             return f(u)
         except BaseException as error:
@@ -53,10 +60,11 @@ def run_algorithm(
             raise
 
     try:
-        algorithm = make(_make_event(evaluate, dim))
-        algorithm.setMaximumOuterSampling(max(points // BLOCK, 1))
-        algorithm.setBlockSize(min(points, BLOCK))
-        algorithm.run()
+        with _remember_interruptions(stops) as set_handlers:
+            algorithm = make(_make_event(evaluate, dim))
+            algorithm.setMaximumOuterSampling(max(points // BLOCK, 1))
+            algorithm.setBlockSize(min(points, BLOCK))
+            algorithm.run()
     except Exception as error:  # an error of f arrives with the traceback as its text, an interruption too
         if stops:
             raise stops[0] from None
@@ -65,6 +73,40 @@ def run_algorithm(
     p, half = result.getProbabilityEstimate(), float(ndtri(0.975)) * result.getStandardDeviation()
     cov = result.getCoefficientOfVariation()
     return p, p - half, p + half, cov if p > 0 and cov >= 0 else math.inf
+
+
+@contextmanager
+def _remember_interruptions(stops: list[BaseException]) -> Iterator[Callable[[], None]]:
+    """Append what handlers of signals raise, which OpenTURNS makes an error of its own wherever they interrupt it.
+
+    Yields:
+        What sets these handlers: to be called in f, because a run of OpenTURNS replaces that of SIGINT by one that
+        leaves Python code without unwinding it, after which the process crashes.
+    """
+
+    def remember(handler: Callable[..., Any]) -> Callable[..., None]:
+        def handle(number: int, frame: Any) -> None:
+            try:
+                handler(number, frame)
+            except BaseException as error:
+                stops.append(error)
+                raise
+
+        return handle
+
+    in_main_thread = threading.current_thread() is threading.main_thread()
+    found = {number: signal.getsignal(number) for number in STOPPING_SIGNALS} if in_main_thread else {}
+    before = {number: handler for number, handler in found.items() if callable(handler)}
+    remembering = {number: remember(handler) for number, handler in before.items()}
+    try:
+        yield partial(_set_handlers, remembering)
+    finally:
+        _set_handlers(before)
+
+
+def _set_handlers(handlers: Mapping[signal.Signals, Callable[..., Any]]) -> None:
+    for number, handler in handlers.items():
+        signal.signal(number, handler)
 
 
 def _make_event(f: Callable[[FloatArray], FloatArray], dim: int) -> Any:

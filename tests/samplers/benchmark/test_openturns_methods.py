@@ -1,11 +1,14 @@
 """OpenTURNS as rows of the benchmark."""
 
+import signal
+
+import numpy as np
 import pytest
 
 pytest.importorskip("openturns")
 
 from samplers.benchmark import Job, run_once
-from samplers.benchmark.openturns_methods import OPENTURNS
+from samplers.benchmark.openturns_methods import ALGORITHMS, OPENTURNS, run_algorithm
 
 
 @pytest.mark.parametrize("name", OPENTURNS)
@@ -26,6 +29,27 @@ def test_an_interruption_stops_the_benchmark_and_is_no_error_of_the_method(stop)
 
     with pytest.raises(stop):
         OPENTURNS["openturns-ss"](FunctionProblem(f, 2), seed=0, max_sim=1000)
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_between_calls_of_f_stops_the_benchmark_too(number) -> None:
+    """It arrives when f has returned, in the code that hands its values over."""
+
+    class Late(np.ndarray):
+        def __getitem__(self, key):
+            signal.raise_signal(number)
+            return super().__getitem__(key)
+
+    def end(*_):
+        raise KeyboardInterrupt
+
+    before = signal.signal(number, end)
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            run_algorithm(ALGORITHMS["openturns-ss"], lambda u: (3 - u[:, 0]).view(Late), dim=2, seed=0, points=200)
+        assert signal.getsignal(number) is end
+    finally:
+        signal.signal(number, before)
 
 
 def test_an_error_of_f_is_one_line() -> None:
