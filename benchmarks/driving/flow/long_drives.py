@@ -12,6 +12,7 @@ of I-80 by Coifman and Li. Prints a table and writes `benchmarks/results/long_dr
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
@@ -118,8 +119,20 @@ def close_ring(traffic: Traffic, length: float) -> Traffic:
     return traffic._replace(x=torch.cat((x, moved))[None], there=there, driven=driven, **parts)
 
 
-def drive_long(start: Traffic, decide: Decide, length: float | None, seconds: float = SECONDS) -> Moments:
-    """Return what is counted while one driver drives all vehicles.
+class RingTick(NamedTuple):
+    """A tick of a drive of n vehicles, before it is made."""
+
+    traffic: Traffic
+    """The vehicles, one scene."""
+    action: Tensor
+    """Their acceleration [m/s^2] and yaw rate [rad/s], shape (1, n, 2)."""
+    touching: Tensor
+    """Whether the bodies of each two overlap, shape (1, n, n)."""
+
+
+@torch.inference_mode()
+def drive_ticks(start: Traffic, decide: Decide, length: float | None, seconds: float = SECONDS) -> Iterator[RingTick]:
+    """Yield the ticks of a drive in which one driver drives all vehicles.
 
     Args:
         start: The vehicles, one scene.
@@ -127,27 +140,33 @@ def drive_long(start: Traffic, decide: Decide, length: float | None, seconds: fl
         length: Of the ring [m]; None for an open road.
         seconds: Length of the drive [s].
     """
-    traffic, memory, rows, own = start, None, [], start.x.shape[1]
-    overlapping, lane = torch.zeros(0), lane_of(start.y, start.edges)
-    with torch.inference_mode():
-        for tick in range(round(seconds / DT)):
-            seen = traffic if length is None else close_ring(traffic, length)
-            action, memory = decide(seen, memory)
-            touching = find_overlaps(seen, own)
-            touching = torch.zeros(1, own, own).index_add(2, seen.vehicle[0], touching.float()) > 0.0
-            overlapping = touching if tick == 0 else overlapping
-            now, (low, high) = lane_of(traffic.y, traffic.edges), (traffic.edges[0, 0], traffic.edges[0, -1])
-            counted = (
-                traffic.speed < STOPPED,
-                (touching & ~overlapping).any(dim=2),
-                (traffic.y < low) | (traffic.y > high),
-                action[..., 0] <= HARD_BRAKE_ACCELERATION,
-            )
-            shares = (each.float().mean() for each in counted)
-            rows.append([traffic.speed.mean(), traffic.speed.min(), *shares, (now != lane).sum()])
-            lane, traffic = now, step_replay(None, traffic, action)
-            if length is not None:
-                traffic = traffic._replace(x=torch.remainder(traffic.x, length))
+    traffic, memory, own = start, None, start.x.shape[1]
+    for _ in range(round(seconds / DT)):
+        seen = traffic if length is None else close_ring(traffic, length)
+        action, memory = decide(seen, memory)
+        touching = find_overlaps(seen, own)
+        yield RingTick(traffic, action, torch.zeros(1, own, own).index_add(2, seen.vehicle[0], touching.float()) > 0.0)
+        traffic = step_replay(None, traffic, action)
+        if length is not None:
+            traffic = traffic._replace(x=torch.remainder(traffic.x, length))
+
+
+@torch.inference_mode()
+def drive_long(start: Traffic, decide: Decide, length: float | None, seconds: float = SECONDS) -> Moments:
+    """Return what is counted while one driver drives all vehicles; arguments as of `drive_ticks`."""
+    rows, overlapping, lane = [], None, lane_of(start.y, start.edges)
+    for traffic, action, touching in drive_ticks(start, decide, length, seconds):
+        overlapping = touching if overlapping is None else overlapping
+        now, (low, high) = lane_of(traffic.y, traffic.edges), (traffic.edges[0, 0], traffic.edges[0, -1])
+        counted = (
+            traffic.speed < STOPPED,
+            (touching & ~overlapping).any(dim=2),
+            (traffic.y < low) | (traffic.y > high),
+            action[..., 0] <= HARD_BRAKE_ACCELERATION,
+        )
+        shares = (each.float().mean() for each in counted)
+        rows.append([traffic.speed.mean(), traffic.speed.min(), *shares, (now != lane).sum()])
+        lane = now
     return Moments(*np.array(rows, dtype=float).T)
 
 
