@@ -5,7 +5,9 @@
 trains a PPO and a DQN ego in each scenario as the demo does, unless they are there already, asks `TwoStage` and
 `AdaptiveSubsetSimulation` about every ego in every scenario, and writes docs/shipped_egos.md with its pictures and
 benchmarks/results/egos.json. What that file has is not simulated again, but for the egos that are named: `--only
-vision,ppo`.
+vision,ppo`. The rows of `vision`, whose pictures take time, come by
+
+    python -m benchmarks.driving.egos --only vision --methods two-stage --env HardBrake-v0 --at-most 600
 """
 
 import json
@@ -49,8 +51,8 @@ intervals are those of sampling; the events behind a base distribution leave p o
 for car-following: under its default, `us101`, `idm` has 7.4e-11 and in 6,000 simulations of `imitation` nothing fails;
 `us101-gap` is a test distribution under which egos and methods can be compared.
 
-`vision` has {most:,} simulations at most, which take a quarter of an hour of a core, by the first method only since
-its correction ([camera](camera.md#the-ego-vision)). {missing}
+`vision` has {most:,} simulations at most, which take about five minutes of a core, by the first method only since
+its corrections ([camera](camera.md#the-ego-vision)). {missing}
 Rows of 100,000 steps are of short trainings and do not compare with those of 400,000: `ppo` in `HardBrake-v0` still
 crashes in a fifth of the brakings, where one of 400,000 steps crashed in 8e-05 under an earlier base of that scenario.
 Wall times are from a busy machine of two cores, shared with more or less other work. In the older pictures crashed
@@ -59,23 +61,23 @@ accelerations and cannot steer: on the I-80's curves it leaves its lane, or the 
 `Highway-v0` no intermediate value of f predicts a collision, so all methods can do is count: intervals are wide
 there, and warnings say so.
 
-A row of it in Python, with a quarter of the simulations:
+A row of it in Python, with half of the simulations:
 
 ```python
 import rare_envs
 import samplers
 
 problem = rare_envs.DrivingProblem("rare_envs/CutIn-v0", ego="idm", base="us101-15-offsets")
-print(samplers.estimate(problem, seed=0, max_sim=1500))
+print(samplers.estimate(problem, seed=0, max_sim=3000))
 ```
 
 ```text
-P[f <= 0] = 7.66e-04
-  95 % interval [6.52e-04, 9.55e-04], c.o.v. 0.080
-  base distribution 95 %  1.4e-05 to 4.3e-02 (38 + 15 events of 17 scenes, 30 refits); predictive mean 5e-03
+P[f <= 0] = 7.99e-04
+  95 % interval [7.23e-04, 9.14e-04], c.o.v. 0.051
+  base distribution 95 %  1.9e-05 to 3.3e-02 (38 + 15 events of 17 scenes, 30 refits); predictive mean 4e-03
     assumes that the fitted family is correct (1 component, log gaps); errors of the family are not included
-  1,500 simulations, gain over Monte Carlo 137; two-stage, seed 0, converged; 491 failing points
-  valid unless a failure region with probability above 1.8e-02 was missed (162 base draws found no other)
+  3,000 simulations, gain over Monte Carlo 158; two-stage, seed 0, converged; 1,012 failing points
+  valid unless a failure region with probability above 9.0e-03 was missed (332 base draws found no other)
 ```
 """
 
@@ -113,7 +115,9 @@ def train_cached(algo: str, env_id: str, steps: int, folder: Path) -> Path:
     return path if path.exists() else train_ego(env_id, algo, steps, seed=0, out=path, base=PAGE_BASES.get(env_id))
 
 
-def evaluate_ego(env_id: str, ego: str, method: str, steps: int, runs: Path, images: Path) -> EgoResult:
+def evaluate_ego(
+    env_id: str, ego: str, method: str, steps: int, runs: Path, images: Path, at_most: int | None = None
+) -> EgoResult:
     """Estimate, and draw the likeliest failure that the first of `PAGE_METHODS` has found.
 
     Args:
@@ -123,6 +127,7 @@ def evaluate_ego(env_id: str, ego: str, method: str, steps: int, runs: Path, ima
         steps: Of the training, for an ego that is trained here.
         runs: Folder of the trained egos.
         images: Folder of the pictures.
+        at_most: Simulations at most; None for those of `MOST`.
 
     Returns:
         What came out.
@@ -130,7 +135,8 @@ def evaluate_ego(env_id: str, ego: str, method: str, steps: int, runs: Path, ima
     trained = ego in TRAINED
     spec = str(train_cached(ego, env_id, steps, runs)) if trained else ego
     base = PAGE_BASES.get(env_id)
-    question = Question(env_id=env_id, ego=spec, method=method, max_sim=MOST.get(ego), base=base, ensemble_run=False)
+    most = at_most or MOST.get(ego)
+    question = Question(env_id=env_id, ego=spec, method=method, max_sim=most, base=base, ensemble_run=False)
     report = run(prepare(question), progress=True)
     estimate = report.estimate
     file = images / f"ego_{version_of(env_id)}_{ego.replace(':', '_')}.png"
@@ -228,14 +234,16 @@ def main(
     only: Annotated[str, typer.Option(help="Egos to measure anew, with commas between; all that are not yet.")] = "",
     env: Annotated[str, typer.Option(help="Only environments whose id contains this.")] = "",
     steps: Annotated[int, typer.Option(help="Of the training of an ego.")] = STEPS,
+    methods: Annotated[str, typer.Option(help="With commas between.")] = ",".join(PAGE_METHODS),
+    at_most: Annotated[int | None, typer.Option(min=1, help="Simulations of a run; usually what MOST has.")] = None,
 ) -> None:
     """Measure what is not measured yet and write the page."""
     chosen = only.split(",") if only else []
     measured = {key for key, cell in read_results().items() if cell.ego not in chosen or env not in cell.env_id}
-    for key in [(env_id, ego, method) for env_id in SCENARIOS for ego in PAGE_EGOS for method in PAGE_METHODS]:
+    for key in [(env_id, ego, method) for env_id in SCENARIOS for ego in PAGE_EGOS for method in methods.split(",")]:
         if key in measured or env not in key[0] or (chosen and key[1] not in chosen):
             continue
-        cell = evaluate_ego(*key, steps=steps, runs=runs, images=docs / "images")
+        cell = evaluate_ego(*key, steps=steps, runs=runs, images=docs / "images", at_most=at_most)
         print(format_row(cell), flush=True)
         write_results({**read_results(), key: cell})  # read anew: another process may measure other egos
     order = {ego: place for place, ego in enumerate(PAGE_EGOS)}

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
 from torch import Tensor
 
@@ -13,8 +15,10 @@ from rare_envs.control.idm import IDM
 from rare_envs.simulation.episode import Episode
 from rare_envs.traffic.state import VEHICLE_LENGTH
 
-_IDM = IDM(jam_distance=2.0)
+VISION_EXPERT = IDM(jam_distance=2.0)
 """Treiber, Hennecke and Helbing's (2000) distance at standstill: 1 m, the suite's, leaves nothing to an imitator."""
+EXPERT_BRAKES = VISION_EXPERT.max_deceleration
+"""Hardest braking of the expert [m/s^2]: the vehicle's."""
 MAX_HEADING = 0.3
 """Sine of the largest heading towards the middle of the lane."""
 AUXILIARY_SIZE = 5
@@ -23,7 +27,7 @@ OFFSET_UNIT, HEADING_UNIT, CURVATURE_UNIT, NEAR_GAP, CLOSING_UNIT = 0.5, 0.05, 0
 """Units of the targets, their usual sizes: offset [m], heading [rad], curvature [1/m], gap [m], closing speed [m/s]."""
 
 
-def expert_outputs(episode: Episode) -> Tensor:
+def expert_outputs(episode: Episode, brakes: float = EXPERT_BRAKES) -> Tensor:
     """Return the outputs that the network should give.
 
     Acceleration is IDM's behind the lead. The yaw rate is that of `rare_envs.control.steering` with the road's
@@ -32,6 +36,8 @@ def expert_outputs(episode: Episode) -> Tensor:
 
     Args:
         episode: B scenarios.
+        brakes: Hardest braking that is asked for [m/s^2]. The vehicle brakes by at most `EXPERT_BRAKES`; a network that
+            learns to ask for more keeps a margin where full braking is right.
 
     Returns:
         Acceleration and yaw rate in units of `ACCELERATION_UNIT` and `TURN_UNIT`, shape (B, 2).
@@ -43,7 +49,7 @@ def expert_outputs(episode: Episode) -> Tensor:
     turn = (wanted - heading) / HEADING_TIME + speed * road.curvature(state.x[:, 0])
     slip = torch.atan(0.5 * torch.tan(torch.tensor(MAX_STEERING)))  # of the bicycle model at full steering
     limit = speed * torch.sin(slip) / (0.5 * VEHICLE_LENGTH)
-    acceleration = _IDM.acceleration(state.speed[:, 0], episode.lead)
+    acceleration = replace(VISION_EXPERT, max_deceleration=brakes).acceleration(state.speed[:, 0], episode.lead)
     turn = torch.maximum(torch.minimum(turn, limit), -limit)
     return torch.stack((acceleration / ACCELERATION_UNIT, turn / TURN_UNIT), dim=1)
 

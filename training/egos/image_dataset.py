@@ -18,7 +18,7 @@ from rare_envs.simulation.episode import Episode
 from rare_envs.simulation.world import World
 from rare_envs.traffic.state import State
 from training.egos.curriculum import make_situations, start_situation
-from training.egos.expert_driver import auxiliary_targets, expert_outputs
+from training.egos.expert_driver import EXPERT_BRAKES, auxiliary_targets, expert_outputs
 
 SWING_CORRELATION, SWING_SCALE = 0.8, 0.6
 """Of the noise from tick to tick, with variance 1: it lasts for 0.1 s / -log(0.8), about half a second."""
@@ -61,6 +61,7 @@ def collect(
     recorded_share: float,
     noise: float,
     rng: np.random.Generator,
+    brakes: float = EXPERT_BRAKES,
 ) -> Iterator[LabelledPictures]:
     """Drive, and yield pictures with the outputs of the expert.
 
@@ -74,6 +75,7 @@ def collect(
         noise: Factor of the noise of the actions, `SWING_STD`, which lasts for half a second, so that places off the
             expert's path are seen.
         rng: Source of everything that is random.
+        brakes: Hardest braking that the labels ask for [m/s^2], see `training.egos.expert_driver.expert_outputs`.
 
     Yields:
         The moments of each situation.
@@ -81,7 +83,7 @@ def collect(
     situations = make_situations()
     for number in range(drives):
         world, episode = start_situation(situations[number % len(situations)], rows, ticks * VisionEgo.dt, rng)
-        moments = drive_and_label(world, episode, network, network_share, ticks, recorded_share, noise, rng)
+        moments = drive_and_label(world, episode, network, network_share, ticks, recorded_share, noise, rng, brakes)
         yield concatenate(list(moments))
 
 
@@ -94,12 +96,14 @@ def drive_and_label(
     recorded_share: float,
     noise: float,
     rng: np.random.Generator,
+    brakes: float = EXPERT_BRAKES,
+    first_ticks: int = 0,
 ) -> Iterator[LabelledPictures]:
-    """Yield the recorded moments of one situation; arguments as in `collect`."""
+    """Yield the recorded moments of one situation, all of the first ticks; the other arguments as in `collect`."""
     state, swing, before = None, np.zeros((len(episode.collided), 2)), deque([episode], LAG)
-    for _ in range(ticks):
-        speed, expert = episode.state.speed[:, 0], expert_outputs(episode)
-        recorded = ~episode.collided & bool(rng.random() < recorded_share)
+    for tick in range(ticks):
+        speed, expert = episode.state.speed[:, 0], expert_outputs(episode, brakes)
+        recorded = ~episode.collided & (bool(rng.random() < recorded_share) | (tick < first_ticks))
         swing = SWING_CORRELATION * swing + SWING_SCALE * rng.standard_normal(swing.shape)
         output = expert + noise * torch.from_numpy(swing * SWING_STD).float()
         if network is None:  # the expert needs no pictures: only recorded ones are taken

@@ -4,7 +4,8 @@ import numpy as np
 import torch
 
 from agents.vision.pilotnet import PilotNet
-from training.egos.image_dataset import collect, concatenate, mirror
+from training.egos.curriculum import make_situations, start_situation
+from training.egos.image_dataset import collect, concatenate, drive_and_label, mirror
 
 
 def test_pictures_are_noted_with_what_the_expert_would_do() -> None:
@@ -26,6 +27,14 @@ def test_pictures_for_the_expert_and_for_a_network_are_the_same() -> None:
     assert torch.equal(alone.picture[:4], mixed.picture[:4])
     assert torch.equal(alone.earlier, mixed.earlier)
     torch.testing.assert_close(alone.expert, mixed.expert)
+
+
+def test_the_first_ticks_are_recorded_whatever_the_share() -> None:
+    rng = np.random.default_rng(5)
+    world, episode = start_situation(make_situations()[1], 2, 0.4, rng)
+    parts = list(drive_and_label(world, episode, None, 0.0, 4, 0.0, 0.0, rng, first_ticks=3))
+    assert [len(part.speed) for part in parts] == [2, 2, 2]
+    assert torch.equal(parts[0].speed, episode.state.speed[:, 0])
 
 
 def test_mirrored_pictures_ask_for_mirrored_turns() -> None:

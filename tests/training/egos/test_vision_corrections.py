@@ -101,6 +101,7 @@ def test_failures_are_counted_and_half_of_them_held_out(network: PilotNet, monke
 
 def test_of_no_scenarios_none_fails(network: PilotNet) -> None:
     assert count_failing(network, HARD_BRAKE, np.empty((0, 3))) == 0
+    assert not list(drive_scenarios(network, HARD_BRAKE, np.empty((0, 3)), 1.0, SMALL, np.random.default_rng(0)))
 
 
 def test_a_file_that_is_none_is_refused_in_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
