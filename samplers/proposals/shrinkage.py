@@ -1,14 +1,18 @@
 """Shrinkage of a covariance that is estimated from few weighted points.
 
 Two targets: N(0, I) with one special direction, for points of one failure region, and the present Gaussian of a
-search, for a step of it.
+search, for a step of it. Without a target: the eigenvalues alone, by factors (Stein).
 
 References:
+    Stein, "Lectures on the theory of estimation of many parameters", Journal of Soviet Mathematics 34, 1986
+    (eigenvalues; put into order again as by Lin and Perlman, "A Monte Carlo comparison of four estimators of a
+    covariance matrix", 1985).
     Ledoit and Wolf, "A well-conditioned estimator for large-dimensional covariance matrices",
     Journal of Multivariate Analysis 88, 2004 (the share of the target).
 """
 
 import numpy as np
+from scipy.optimize import isotonic_regression
 
 from samplers.problem import FloatArray
 from samplers.proposals.gaussian import Gaussian, Moments, weighted_moments
@@ -40,6 +44,29 @@ def shrink_covariance(
     distance = float(((covariance - target) ** 2).sum())
     share = max(noise / distance if distance > noise else 1.0, (dim + 1) / (2 * (dim + 1 + n)))
     return (1 - share) * covariance + share * target, share
+
+
+def correct_eigenvalues(values: FloatArray, n: float) -> FloatArray:
+    """Return the eigenvalues of a covariance without their bias, by Stein's estimator.
+
+    Of few points the small eigenvalues are too small and the large ones too large. Each is divided by
+    1 - (d - 1) / n + (2 / n) sum_j l_i / (l_i - l_j): small ones change by a factor, where a target of variance 1 would
+    add to them. Failures between two planes have a variance of 0.05 across, which a tenth of I triples.
+
+    Args:
+        values: l, in increasing order, positive, shape (d,).
+        n: Independent points that they are estimated from, more than d.
+
+    Example:
+        >>> import numpy as np
+        >>> correct_eigenvalues(np.array([0.05, 1.0, 2.0]), n=20.0).round(3)
+        array([0.056, 1.105, 1.663])
+    """
+    gaps = values[:, None] - values
+    gaps[gaps == 0] = np.inf  # its own, and equal ones
+    factors = 1 - (len(values) - 1) / n + (2 / n) * (values[:, None] / gaps).sum(axis=1)
+    logs = np.log(values) - np.log(np.where(factors > 0, factors, 1.0))
+    return np.asarray(np.exp(isotonic_regression(logs).x))
 
 
 def fit_shrunk_gaussian(u: FloatArray, weights: FloatArray) -> Gaussian:

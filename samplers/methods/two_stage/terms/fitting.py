@@ -5,7 +5,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from samplers.methods.two_stage.mixture.subspace_em import GroupedPoints, SubspaceMixture, fit_subspace_mixture
+from samplers.methods.two_stage.mixture.subspace_em import (
+    LEAST_VARIANCE_OF_COMPONENT,
+    GroupedPoints,
+    SubspaceMixture,
+    fit_subspace_mixture,
+    inflate_variances,
+)
 from samplers.methods.two_stage.terms.history import TermHistory
 from samplers.methods.two_stage.terms.law import ComponentGroup, TermLaw
 from samplers.methods.two_stage.terms.settings import LawSettings, RoundSettings
@@ -13,7 +19,8 @@ from samplers.methods.two_stage.terms.walks import Directions
 from samplers.problem import FloatArray
 from samplers.proposals.components import SubspaceGaussian, log_ratios
 from samplers.proposals.em import posterior
-from samplers.statistics.weights import effective_sample_size, normalise_weights
+from samplers.proposals.shrinkage import correct_eigenvalues
+from samplers.statistics.weights import effective_number, effective_sample_size, normalise_weights
 
 POWER_STEPS = 20
 """Bisections for the power of the weights: to one millionth."""
@@ -84,19 +91,34 @@ def fit_law(
     many = temper_weights(log_weights, settings.shape_ess)
     points = GroupedPoints(z, many, 1 / float(many @ many), np.arange(len(z)))
     mixture = fit_subspace_mixture(points, settings.max_bumps, rng)
-    bumps, shares = _move(mixture, z, temper_weights(log_weights, settings.mean_ess))
+    bumps, shares = _finish(mixture, z, many, temper_weights(log_weights, settings.mean_ess), settings)
     return build_law(axes, bumps, shares, around @ axes, guards @ axes, settings)
 
 
-def _move(mixture: SubspaceMixture, z: FloatArray, weights: FloatArray) -> tuple[list[SubspaceGaussian], FloatArray]:
-    """Return the components with the means that weighted points z (n, r) have in each, and their shares of them."""
-    shares = posterior(log_ratios(mixture.components, z) + np.log(mixture.weights)[:, None]) * weights
-    mass = shares.sum(axis=1)
+def _finish(
+    mixture: SubspaceMixture, z: FloatArray, many: FloatArray, few: FloatArray, settings: LawSettings
+) -> tuple[list[SubspaceGaussian], FloatArray]:
+    """Return the components with the covariances of many points z (n, r) and the means of few, and their shares."""
+    shares = posterior(log_ratios(mixture.components, z) + np.log(mixture.weights)[:, None])
+    bumps = [_shape(one, z, share * many, settings) for one, share in zip(mixture.components, shares, strict=True)]
+    mass = shares @ few
     moved = [
-        SubspaceGaussian(one.axes, one.axes.T @ (share @ z / m), one.variance) if m > 0 else one
-        for one, share, m in zip(mixture.components, shares, mass, strict=True)
+        SubspaceGaussian(one.axes, one.axes.T @ ((share * few) @ z / m), one.variance) if m > 0 else one
+        for one, share, m in zip(bumps, shares, mass, strict=True)
     ]
     return moved, mass / mass.sum()
+
+
+def _shape(component: SubspaceGaussian, z: FloatArray, weights: FloatArray, settings: LawSettings) -> SubspaceGaussian:
+    """Return a component with Stein's estimate of the covariance of weighted points z (n, r), if they are enough."""
+    mass = weights.sum()
+    ess = effective_number(weights)
+    if ess < settings.shape_points * z.shape[1]:
+        return component
+    centred = (z - weights @ z / mass) * np.sqrt(weights / mass)[:, None]
+    values, axes = np.linalg.eigh(centred.T @ centred)
+    corrected = correct_eigenvalues(np.maximum(values, LEAST_VARIANCE_OF_COMPONENT), ess)
+    return SubspaceGaussian(axes, axes.T @ component.centre, inflate_variances(corrected, ess))
 
 
 def build_law(
@@ -108,9 +130,9 @@ def build_law(
     settings: LawSettings,
 ) -> TermLaw:
     """Return bumps, the same tempered, and Gaussians around ends and design points z (m, r), as one proposal."""
-    factor, plus = settings.tempered_variance
     tempered = tuple(
-        SubspaceGaussian(b.axes, settings.tempered_mean * b.mean, factor * b.variance + plus) for b in bumps
+        SubspaceGaussian(b.axes, settings.tempered_mean * b.mean, settings.tempered_variance * b.variance)
+        for b in bumps
     )
     groups = [
         ComponentGroup(settings.bump_share * float(w / weights.sum()), (bump,), np.ones(1))
@@ -118,8 +140,10 @@ def build_law(
     ]
     groups.append(ComponentGroup(settings.tempered_share, tempered, weights / weights.sum()))
     if len(ends):
-        identity, variance = np.eye(ends.shape[1]), np.full(ends.shape[1], settings.end_variance)
-        around = tuple(SubspaceGaussian(identity, settings.end_mean * end, variance) for end in ends)
+        nearest = np.argmax(log_ratios(bumps, ends) + np.log(weights)[:, None], axis=0)
+        around = tuple(
+            _around(bumps[k], settings.end_mean * end, settings) for k, end in zip(nearest, ends, strict=True)
+        )
         groups.append(ComponentGroup(settings.end_share, around, np.full(len(ends), 1 / len(ends))))
     if len(guards):
         identity = np.eye(guards.shape[1])
@@ -127,6 +151,11 @@ def build_law(
         groups.append(ComponentGroup(settings.guard_share, half_spaces, np.full(len(guards), 1 / len(guards))))
     total = sum(group.share for group in groups)
     return TermLaw(axes, tuple(ComponentGroup(g.share / total, g.components, g.weights) for g in groups))
+
+
+def _around(bump: SubspaceGaussian, centre: FloatArray, settings: LawSettings) -> SubspaceGaussian:
+    """Return a Gaussian around a point z (r,), in the shape of a bump but wider."""
+    return SubspaceGaussian(bump.axes, bump.axes.T @ centre, np.minimum(settings.end_variance * bump.variance, 1.0))
 
 
 def temper_weights(log_weights: FloatArray, wanted: float) -> FloatArray:

@@ -2,7 +2,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.stats import norm
 
 from samplers.methods.two_stage.terms.fitting import (
     choose_guards,
@@ -108,12 +107,27 @@ def test_the_heaviest_points_and_ends_are_guarded(rng):
     log_weights = np.zeros(61)
     log_weights[7] = np.log(50.0)
     law = fit_law(np.eye(5), u, log_weights, ends, u[:0], SETTINGS, rng)
-    means = np.array([component.mean for component in law.groups[-1].components])
-    np.testing.assert_allclose(means[0], SETTINGS.end_mean * u[7])
-    np.testing.assert_allclose(means[SETTINGS.max_heavy :], SETTINGS.end_mean * ends[0] * np.ones((12, 5)))
-    assert len(means) == SETTINGS.max_ends
-    own = SETTINGS.end_share / SETTINGS.max_ends * norm.pdf(0.1 * u[7], scale=SETTINGS.end_variance**0.5).prod()
-    assert law.log_ratio(u[7:8])[0] >= np.log(own / norm.pdf(u[7]).prod())
+    centres = np.array([component.centre for component in law.groups[-1].components])
+    np.testing.assert_allclose(centres[0], SETTINGS.end_mean * u[7])
+    np.testing.assert_allclose(centres[SETTINGS.max_heavy :], SETTINGS.end_mean * ends[0] * np.ones((12, 5)))
+    assert len(centres) == SETTINGS.max_ends
+    own = law.groups[-1].components[0].log_ratio(u[7:8])[0] + np.log(SETTINGS.end_share / SETTINGS.max_ends)
+    assert law.log_ratio(u[7:8])[0] >= own
+
+
+def test_a_slab_keeps_its_width(rng):
+    """Failures beyond 4 within 0.2 of a plane: a tenth of I in their covariance would make a variance of 0.04 0.14."""
+    u = rng.standard_normal((80, 20))
+    u[:, 0] = 4.0 + 0.25 * abs(u[:, 0])
+    u[:, 1] *= 0.2
+    law = fit_law(np.eye(20)[:, :8], u, np.zeros(80), u[:2], u[:0], SETTINGS, rng)
+    across = np.eye(8)[1]
+    bump, tempered, around = (group.components[0] for group in law.groups)
+    width = [float((one.axes.T @ across) ** 2 @ one.variance) for one in (bump, tempered, around)]
+    # raised by two standard errors of a variance of 80 points, and up to four of chance
+    assert 0.04 <= width[0] <= 0.04 * (1 + 6 * np.sqrt(2 / 80))
+    factors = np.array([SETTINGS.tempered_variance, SETTINGS.end_variance])
+    np.testing.assert_allclose(width[1:], factors * width[0], rtol=0.05)  # other variances end at 1
 
 
 def test_half_spaces_apart_from_each_other_are_guarded(rng):

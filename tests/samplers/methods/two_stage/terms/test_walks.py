@@ -100,7 +100,7 @@ def test_walks_without_a_gradient_stay(half_spaces, simulator_of, answer):
 
 @pytest.mark.parametrize(
     ("budget", "step", "expected"),
-    [(6000, 7.5, (12, 8)), (2000, 7.5, (6, 4)), (1000, 7.5, (4, 0)), (1000, 4.0, (6, 3))],
+    [(6000, 7.5, (18, 8)), (2000, 7.5, (6, 4)), (1000, 7.5, (4, 0)), (1000, 4.0, (6, 3))],
 )
 def test_walks_are_as_many_as_can_make_two_steps(budget, step, expected):
     """With 4 main terms and 8 others; a quarter of the budget is for walks: at 1,000 and 7.5 a step 250 / 15 = 16."""
