@@ -130,10 +130,10 @@ def test_a_journal_of_other_terms_is_refused(tmp_path):
 
 
 def test_a_journal_counts_simulations_not_numbers(tmp_path):
-    """Base draws are 200 simulations, of which the journal has 1 + 2 * 2 numbers each; 16 gradients of 2.5 are 40."""
+    """Base draws are 200 simulations, of which the journal has 1 + 2 * 2 numbers each; 24 gradients of 2.5 are 60."""
     with pytest.raises(KeyboardInterrupt):
         samplers.estimate(Series(2), seed=1, max_sim=2000, journal=tmp_path / "journal")
     journal = JournalFile.open(tmp_path / "journal")
-    assert [record.n_sim for record in iter(journal.read_next, None)] == [200, 40]
-    assert journal.n == 240
+    assert [record.n_sim for record in iter(journal.read_next, None)] == [200, 60]
+    assert journal.n == 260
     journal.close()

@@ -54,7 +54,7 @@ def test_an_upper_bound_by_plain_monte_carlo_is_an_answer(cli: Cli) -> None:
         (("--method", "addss"), "'adss'"),
         (("--measure", "braking"), "'braking'"),
         (("--ego", "nowhere.zip"), "nowhere.zip"),
-        (("--max-sim", 0), "max_sim"),
+        (("--max-sim", 0), "--max-sim"),
     ],
 )
 def test_what_does_not_go_there_is_one_line(cli: Cli, options: tuple[Any, ...], said: str) -> None:

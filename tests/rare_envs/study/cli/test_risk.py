@@ -72,7 +72,7 @@ BAD = {
     "a damaged base": (["idm", "--base", "cut_in=broken.json"], ["broken.json", "JSON"]),
     "a base without frequency": (["idm", "--base", "cut_in=highway"], ["'highway'", "nobody counted"]),
     "a misspelt method": (["idm", "--method", "addss"], ["adss"]),
-    "no budget": (["idm", "--max-sim", "0"], ["max_sim"]),
+    "no budget": (["idm", "--max-sim", "0"], ["--max-sim"]),
 }
 
 

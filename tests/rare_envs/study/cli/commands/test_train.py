@@ -13,7 +13,7 @@ BAD_TRAININGS = {
     "unknown environment": (["rare_envs/CutIn-v7"], ["rare_envs/CutIn-v"]),
     "misspelt algorithm": ([FOLLOWING, "--algo", "poo"], ["'ppo'"]),
     "no steps": ([FOLLOWING, "--steps", "0"], ["steps", "0"]),
-    "no environments": ([FOLLOWING, "--num-envs", "0"], ["num_envs", "0"]),
+    "no environments": ([FOLLOWING, "--num-envs", "0"], ["--num-envs", "0"]),
     "no environment": ([], ["--from-failures"]),
     "no run": (["--from-failures", "nowhere"], ["No run in 'nowhere'"]),
     "the run tells the world": (["--from-failures", "nowhere", "--base", "us101"], ["leave --base"]),
