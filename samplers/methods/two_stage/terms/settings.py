@@ -3,7 +3,8 @@
 "Prototype" are runs of another program on Highway-v0 (428 and 1,448 dimensions, 6,000 simulations, 7 to 20 replications
 of five cases), not repeated with this one: `python -m benchmarks.estimators.highway.gains` does that. "Stored runs" are
 6 to 10 runs of each of those cases with this program: proposals were fitted again to the draws of one run, and E[w^2]
-was taken over the failures that the others found. The fits are not repeated by a command either.
+was taken over the failures that the others found. "Chains" are Metropolis chains of failures, started from those of the
+stored runs. Neither the fits nor the chains are repeated by a command.
 """
 
 from dataclasses import dataclass
