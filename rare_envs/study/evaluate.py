@@ -230,7 +230,6 @@ def resume(
             ...
         rare_envs.study.errors.BadInput: There is no unfinished run in 'runs/nowhere': it has no journal.bin. Of one that was stopped before its first simulations, give the command again.
     """  # noqa: E501 (the example shows a whole message)
-    stopped = _find_time(folder / JOURNAL)
     journal, question = continue_journal(folder, mend)
     with closing(journal):
         question = replace(open_question(asdict(question), folder, trust), core=question.core)
@@ -240,27 +239,12 @@ def resume(
         check_same_files(journal, question)
         remove_drafts(folder)
         study = prepare(question)
-        earlier = note_resumption(folder, stopped)
-        return _run(folder, study, journal, progress, executor, earlier)
+        note_resumption(folder, journal.earlier_seconds)
+        return _run(folder, study, journal, progress, executor)
 
 
-def _find_time(path: Path) -> float:
-    """Return when a file was changed last [s since 1970]; 0 where there is none."""
-    try:
-        return path.stat().st_mtime
-    except OSError:
-        return 0.0
-
-
-def _run(
-    folder: Path,
-    study: Study,
-    journal: JournalFile,
-    progress: bool,
-    executor: Executor | None = None,
-    earlier: float = 0.0,
-) -> Report:
-    target = folder.absolute()  # an ego may change the working directory
+def _run(folder: Path, study: Study, journal: JournalFile, progress: bool, executor: Executor | None = None) -> Report:
+    target, earlier = folder.absolute(), journal.earlier_seconds  # an ego may change the working directory
     try:
         report = run(study, progress, journal, executor, target)
         report = replace(report, seconds=report.seconds + earlier, earlier_seconds=earlier)

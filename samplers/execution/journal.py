@@ -4,14 +4,15 @@ Methods draw by their seed alone. A continued run therefore asks for the same po
 outcomes from the journal for as long as it has any, and comes to the result of an undisturbed run.
 
 The file is a `RecordFile`. Its first record is a JSON object that says what the run is. Each other one is a batch: a
-line of JSON, then f as float64. What was written is on the disk after `SYNC_SECONDS`, or after the batch if that takes
-longer.
+line of JSON, with the wall time of the run so far, then f as float64. What was written is on the disk after
+`SYNC_SECONDS`, or after the batch if that takes longer.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
+import math
 import time
 import warnings
 from pathlib import Path
@@ -62,6 +63,7 @@ class JournalFile:
         head: What the run is, JSON-ready.
         n: Simulations that have been read or written so far.
         n_dropped: Bytes at the end of the file that were dropped: a record that was cut while it was written.
+        earlier_seconds: Wall time of the run before this journal was opened, up to its last record [s].
 
     Example:
         >>> from tempfile import TemporaryDirectory
@@ -76,12 +78,15 @@ class JournalFile:
         {'seed': 1} [ 2. -1.] None
     """
 
-    def __init__(self, records: RecordFile, head: dict[str, Any], n_dropped: int = 0) -> None:
+    def __init__(
+        self, records: RecordFile, head: dict[str, Any], n_dropped: int = 0, earlier_seconds: float = 0.0
+    ) -> None:
         """Use an open file that stands behind its head; see `create` and `open`."""
         self.path, self.head, self.n, self.n_dropped = records.path, head, 0, n_dropped
+        self.earlier_seconds = earlier_seconds
         self._records = records
         self._waiting: list[bytes] = []  # records that could not be written
-        self._synced = time.monotonic()
+        self._opened = self._synced = time.monotonic()
         self._warned = False
 
     @property
@@ -152,7 +157,8 @@ class JournalFile:
         except BaseException:
             records.close()
             raise
-        return cls(records, head, dropped)
+        earlier, records.last = _read_elapsed(records.last), None
+        return cls(records, head, dropped, earlier)
 
     def read_next(self) -> JournalRecord | None:
         """Return the next batch; None at the end of the journal.
@@ -180,7 +186,7 @@ class JournalFile:
         Warns:
             UserWarning: They cannot be written; once.
         """
-        line = {"points": record.points, "notes": record.notes}
+        line = {"points": record.points, "notes": record.notes, "elapsed": round(self._elapsed(), 3)}
         self._waiting.append(_encode(line) + np.asarray(record.f, dtype="<f8").tobytes())
         self.n += record.n_sim
         try:
@@ -207,6 +213,10 @@ class JournalFile:
         self._waiting.clear()
         self._records.remove()
 
+    def _elapsed(self) -> float:
+        """Return the wall time of the run so far, without that between an interruption and its resumption [s]."""
+        return self.earlier_seconds + time.monotonic() - self._opened
+
     def _write_waiting(self) -> None:
         while self._waiting:
             self._records.write(self._waiting[0])
@@ -232,6 +242,15 @@ def _has_simulations(records: RecordFile) -> bool:
     except JournalError:
         return True
     return records.read() is not None and records.read() is not None
+
+
+def _read_elapsed(payload: bytes | None) -> float:
+    """Return the wall time [s] that a record has; 0 where it has none, as the head."""
+    try:
+        elapsed = float(json.loads((payload or b"").split(b"\n", 1)[0])["elapsed"])
+    except (ValueError, KeyError, TypeError, RecursionError, OverflowError):
+        return 0.0
+    return elapsed if 0.0 <= elapsed < math.inf else 0.0
 
 
 def _encode(fields: dict[str, Any]) -> bytes:

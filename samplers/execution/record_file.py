@@ -38,6 +38,7 @@ class RecordFile:
 
     Attributes:
         path: Of the file.
+        last: Payload of the last record that `mend` has verified; None before, and where there is none.
 
     Example:
         >>> from tempfile import TemporaryDirectory
@@ -68,6 +69,7 @@ class RecordFile:
         # unbuffered, so that nothing is left behind of a write that failed
         self._file: IO[bytes] = open(os.open(path, flags, 0o666), "r+b", buffering=0)
         self._digest, self._end = b"", len(MAGIC)  # of the records that have been read or written
+        self.last: bytes | None = None
         if not lock_file(self._file) or not self.exists:
             self._file.close()
             raise JournalError(f"Another process is writing {str(path)!r}.")
@@ -149,9 +151,9 @@ class RecordFile:
         if begun != MAGIC:
             raise JournalError(f"{str(self.path)!r} is of another kind or version.")
         self.rewind()
-        n = 0
-        while self.read() is not None:
-            n += 1
+        n, self.last = 0, None
+        while (payload := self.read()) is not None:
+            n, self.last = n + 1, payload
         dropped = self.size - self._end
         if dropped and not ((drop and n) or self._is_cut()):
             where = f": record {n + 1} does" if n else " from its first record on, which does"

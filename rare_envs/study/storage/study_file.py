@@ -80,25 +80,17 @@ def begin_study_file(folder: Path, study: Study) -> None:
     replace_text(folder / STUDY, format_json(describe_study(study)) + "\n")
 
 
-def note_resumption(folder: Path, stopped: float) -> float:
-    """Note in study.json that an interrupted run goes on.
+def note_resumption(folder: Path, earlier_seconds: float) -> None:
+    """Note in study.json that an interrupted run goes on; one that cannot be read or written is left as it is.
 
     Args:
         folder: Of the run.
-        stopped: When its last simulations were recorded [s since 1970].
-
-    Returns:
-        Wall time of the run before it was interrupted, to the second [s]; 0 where study.json does not tell.
+        earlier_seconds: Wall time of the run before it was interrupted [s].
     """
-    try:
+    with suppress(OSError, ValueError):  # a full disk is found when results are written
         about = parse_json_object((folder / STUDY).read_text(encoding="utf-8"), STUDY)
-        begun = datetime.fromisoformat(str(about.get("resumed") or about["begun"])).timestamp()
-        earlier = float(about.get("earlier_seconds") or 0.0) + max(stopped - begun, 0.0)
-    except (OSError, ValueError, KeyError, TypeError):  # of an earlier version, or somebody has changed it
-        return 0.0
-    with suppress(OSError):  # a full disk is found when results are written
-        replace_text(folder / STUDY, format_json({**about, "resumed": _now(), "earlier_seconds": earlier}) + "\n")
-    return earlier
+        about |= {"resumed": _now(), "earlier_seconds": earlier_seconds}
+        replace_text(folder / STUDY, format_json(about) + "\n")
 
 
 def finish_study_file(folder: Path, study: Study, seconds: float) -> None:

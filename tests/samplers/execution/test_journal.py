@@ -51,7 +51,10 @@ class Counted:
 
 @pytest.mark.parametrize("method", ["two-stage", "adss", "mc", "ce"])
 @pytest.mark.parametrize("f", [half_space, raising])
-def test_cut_anywhere_it_comes_to_the_same_result(method: str, f: F, tmp_path: Path) -> None:
+def test_cut_anywhere_it_comes_to_the_same_result(
+    method: str, f: F, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(JournalFile, "_elapsed", lambda self: 0.0)
     path = tmp_path / "journal.bin"
     whole = run(None, f, method)
     assert run(path, f, method) == whole
@@ -191,6 +194,44 @@ def test_what_was_written_is_on_the_disk_within_the_interval(tmp_path: Path, mon
     journal.close()
     assert len(synced) == 6
     assert journals.SYNC_SECONDS == 1.0
+
+
+def test_the_wall_time_of_all_parts_adds_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Records 25 and 60 s after the begin; a part without any; after another boot one 20 s after the resumption."""
+    clock = [0.0]
+    monkeypatch.setattr(time, "monotonic", lambda: clock[0])
+    path, record = tmp_path / "j", JournalRecord("points", np.ones(1), {})
+
+    def go_on(journal: JournalFile, *times: float) -> float:
+        earlier = journal.earlier_seconds
+        while journal.read_next() is not None:
+            pass
+        for seconds in times:
+            clock[0] += seconds
+            journal.append(record)
+        clock[0] += 40.0
+        journal.close()
+        return earlier
+
+    assert go_on(JournalFile.create(path, {}), 25.0, 35.0) == 0.0
+    clock[0] += 30.0
+    assert go_on(JournalFile.open(path)) == 60.0
+    clock[0] = 5.0  # another boot
+    assert go_on(JournalFile.open(path), 20.0) == 60.0
+    assert go_on(JournalFile.open(path)) == 80.0
+
+
+@pytest.mark.parametrize("line", [b"", b"{}", b"[]", b"[" * 100_000, b'{"elapsed": null}', b'{"elapsed": NaN}'])
+def test_a_record_without_a_time_is_one_of_none(line: bytes, tmp_path: Path) -> None:
+    JournalFile.create(tmp_path / "j", {}).close()
+    records = RecordFile(tmp_path / "j")
+    records.mend()
+    records.read()
+    records.write(line + b"\n")
+    records.close()
+    journal = JournalFile.open(tmp_path / "j")
+    assert journal.earlier_seconds == 0.0
+    journal.close()
 
 
 def test_points_are_known_by_value_and_shape() -> None:
