@@ -207,7 +207,8 @@ def test_wrong_arguments_are_refused(kwargs, message):
     [
         (
             "measur",
-            r"Highway-v0 takes no .* 'measur' \(did you mean 'measure'\?\); it takes (ego, core, chunk_size, )?observation,",
+            r"Highway-v0 takes no .* 'measur' \(did you mean 'measure'\?\); "
+            r"it takes (ego, core, chunk_size, )?observation,",
         ),
         ("speed", r"'speed' \(reset takes it as an option\)"),
         ("wheels", r"'wheels'; it takes"),
