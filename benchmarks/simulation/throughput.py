@@ -38,7 +38,8 @@ FLOORS = {
     "car_following_ppo": 300.0,
     "car_following_ppo_compiled": 700.0,
     "env_step": 20.0,
-    "vec_step": 400.0,
+    "vec_step": 1000.0,
+    "vec_step_cut_in": 1000.0,
     "adss_latency": 10.0,
     "highway_1": 1.0,
     "highway_64": 30.0,
@@ -154,9 +155,9 @@ def _drive_by_policy(model: Any, x: np.ndarray[Any, Any]) -> None:
         road.step(0.1)
 
 
-def batch_step_ratio(steps: int, num_envs: int = 256) -> dict[str, float]:
+def batch_step_ratio(env_id: str, steps: int, num_envs: int = 256) -> dict[str, float]:
     """Compare steps of `gym.make_vec`, with random actions and the episodes that these end, with HighwayEnv's."""
-    batch, theirs = gym.make_vec(CAR_FOLLOWING, num_envs), highway_env_pair()
+    batch, theirs = gym.make_vec(env_id, num_envs), highway_env_pair()
     actions = np.random.default_rng(0).uniform(-0.3, 0.3, (steps, num_envs, 2)).astype(np.float32)
 
     def drive_batch() -> None:
@@ -331,7 +332,8 @@ def main(
         results["car_following_ppo"] = policy_ratio("torch", rounds)
         results["car_following_ppo_compiled"] = policy_ratio("numba", rounds)
         results["env_step"] = step_ratio(500)
-        results["vec_step"] = batch_step_ratio(200)
+        results["vec_step"] = batch_step_ratio(CAR_FOLLOWING, 200)
+        results["vec_step_cut_in"] = batch_step_ratio(CUT_IN, 200)
         results["adss_latency"] = latency_ratio()
         if with_memory:
             results["memory"] = memory()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from html import escape
@@ -222,7 +222,13 @@ class ScenarioSpace:
             self._check_range(j, points[:, self._slices[j]])
         return points
 
-    def scenario_x(self, options: Mapping[str, Any] | None, n: int, rng: np.random.Generator) -> FloatArray:
+    def scenario_x(
+        self,
+        options: Mapping[str, Any] | None,
+        n: int,
+        rng: np.random.Generator,
+        draw: Callable[[int, np.random.Generator], FloatArray] | None = None,
+    ) -> FloatArray:
         """Return scenarios with some parameters given and the others drawn from the base distribution.
 
         The given values replace drawn ones: the rest is not conditioned on them.
@@ -232,6 +238,7 @@ class ScenarioSpace:
                 {"x": (d,) or (n, d)} for all of them; None draws everything.
             n: Number of scenarios.
             rng: Source of randomness.
+            draw: Draws in place of `base.sample`, the same rows in a way of its own.
 
         Returns:
             Scenarios, shape (n, d).
@@ -245,7 +252,7 @@ class ScenarioSpace:
         if "x" in options:
             return self._given_x(options, n)
         columns = {self._index(name): self._column(name, value, n) for name, value in options.items()}
-        points = np.array(self.base.sample(n, rng), dtype=np.float64)
+        points = np.array((draw or self.base.sample)(n, rng), dtype=np.float64)
         for j, column in columns.items():
             points[:, self._slices[j]] = column
         return self.validate(points)

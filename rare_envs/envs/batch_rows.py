@@ -1,4 +1,4 @@
-"""Rows of a batch: replaced, picked, and in Gymnasium's vector form with their mask."""
+"""Rows of a batch: drawn ahead, replaced, picked, and in Gymnasium's vector form with their mask."""
 
 from __future__ import annotations
 
@@ -9,11 +9,64 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
+from rare_envs.arrays import FloatArray
+from rare_envs.distributions.beta import BetaDistribution
+from rare_envs.distributions.coordinate_mixture import CoordinateMixture
+from rare_envs.distributions.fitted import FittedDistribution
+from rare_envs.distributions.space import Distribution
+from rare_envs.distributions.truncated_mixture import TruncatedGaussianMixture
 from rare_envs.measures.base import RowsReplaceable
 from rare_envs.sensors.kinds import map_kinds
 from rare_envs.traffic.tensor_trees import map_leaves, map_tensors
 
 _T = TypeVar("_T")
+ROWS_AHEAD = 256
+"""Scenarios that are drawn at once: a few cost as much as these."""
+DRAWS_IN_A_ROW = (CoordinateMixture, TruncatedGaussianMixture, BetaDistribution)
+"""Distributions whose draws of m rows and then of n are those of m + n rows."""
+
+
+class DrawsAhead:
+    """Draws from a distribution, the same as by its `sample`, but many rows at once, which are kept for later calls.
+
+    Of a distribution that is not known to draw row by row, just the wanted rows are drawn.
+
+    Example:
+        >>> base = BetaDistribution([2.0], [2.0], [0.0], [1.0])
+        >>> ahead, rng = DrawsAhead(base), np.random.default_rng(0)
+        >>> drawn = [ahead.sample(2, rng), ahead.sample(1, rng)]
+        >>> np.array_equal(np.vstack(drawn), base.sample(3, np.random.default_rng(0)))
+        True
+    """
+
+    def __init__(self, base: Distribution) -> None:
+        """Draw from a distribution."""
+        self._base = base
+        plain = base.distribution if type(base) is FittedDistribution else base
+        self._in_a_row = type(plain) in DRAWS_IN_A_ROW
+        self._rng: np.random.Generator | None = None
+        self._state: Any = None
+        self._rows = np.empty((0, 0))
+        self._given = 0
+
+    def sample(self, n: int, rng: np.random.Generator) -> FloatArray:
+        """Return the next n rows, shape (n, d); the generator may be ahead of them until `settle`."""
+        if not self._in_a_row:
+            return self._base.sample(n, rng)
+        if rng is not self._rng or self._given + n > len(self._rows):
+            if rng is self._rng:
+                self.settle()
+            self._rng, self._state, self._given = rng, rng.bit_generator.state, 0
+            self._rows = self._base.sample(max(n, ROWS_AHEAD), rng)
+        self._given += n
+        return self._rows[self._given - n : self._given].copy()
+
+    def settle(self) -> None:
+        """Put the generator where it is after the rows that were given, and forget the others."""
+        if self._rng is not None:
+            self._rng.bit_generator.state = self._state
+            self._base.sample(self._given, self._rng)
+            self._rng, self._rows = None, self._rows[:0]
 
 
 def merge_rows(old: _T, rows: Tensor, new: _T) -> _T:

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from rare_envs.control.actions import read_actions
 from rare_envs.envs.batch_rows import (
+    DrawsAhead,
     list_tensors,
     merge_rows,
     put_masked,
@@ -91,6 +92,7 @@ class DrivingVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[Any]
         self.single_action_space = self.world.action_space
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
+        self._ahead = DrawsAhead(self.space.base)
         self._x = np.full((num_envs, self.space.dim), np.nan)
         self._tick = np.zeros(num_envs, dtype=np.int64)
         self._ended = np.zeros(num_envs, dtype=bool)
@@ -98,6 +100,16 @@ class DrivingVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[Any]
         self._episode: Episode | None = None
         self._renderer: Renderer | None = None
         self._compiled = find_scripted_step(self.world, core)
+
+    @property
+    def np_random(self) -> np.random.Generator:
+        """The generator of the batch, at the scenarios drawn so far."""
+        self._ahead.settle()
+        return super().np_random
+
+    @np_random.setter
+    def np_random(self, value: np.random.Generator) -> None:
+        self._np_random, self._np_random_seed = value, -1
 
     def reset(
         self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
@@ -233,7 +245,8 @@ class DrivingVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[Any]
     def _replace(self, rows: NDArray[np.intp], options: dict[str, Any] | None = None) -> Episode:
         """Start the episodes of some rows anew, and return them, a batch of R."""
         assert self._episode is not None
-        x = self.space.scenario_x(options, len(rows), self.np_random)
+        rng = self.np_random if self._np_random is None else self._np_random  # without the property, which settles
+        x = self.space.scenario_x(options, len(rows), rng, self._ahead.sample)
         self._x = self._x.copy()
         self._x[rows] = x
         self._tick[rows] = 0

@@ -21,9 +21,9 @@ NONE, REAR_END, REAR_ENDED, SIDE, ROAD_EDGE, OTHERS = range(len(CRASH_KINDS))
 RESTITUTION = 0.0
 """Share of the closing speed with which bodies part again: 0, a plastic impact, as usual above 10 m/s; near 0.3 at
 walking pace."""
-_MPH = 2.2369362920544
+MPH = 2.2369362920544
 """Miles per hour in a metre per second."""
-_MAIS3 = {"all": (-6.9540, 0.1637), "frontal": (-6.9774, 0.1620), "rear": (-8.0329, 0.1793)}
+MAIS3 = {"all": (-6.9540, 0.1637), "frontal": (-6.9774, 0.1620), "rear": (-8.0329, 0.1793)}
 """Intercept and slope per mph of delta-v, by crash mode; see `injury_risk`."""
 
 
@@ -98,8 +98,8 @@ def injury_risk(delta_v: Tensor, mode: str = "all") -> Tensor:
         >>> round(injury_risk(torch.tensor(19.0)).item(), 3)  # 42.5 mph
         0.501
     """
-    intercept, slope = _MAIS3[mode]
-    return torch.sigmoid(intercept + slope * _MPH * delta_v)
+    intercept, slope = MAIS3[mode]
+    return torch.sigmoid(intercept + slope * MPH * delta_v)
 
 
 def crash_of(state: State, road: Road, before: State | None = None, dt: float = 0.1) -> Crash:

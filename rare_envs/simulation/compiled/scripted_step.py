@@ -10,12 +10,13 @@ import torch
 from numpy.typing import NDArray
 
 from rare_envs.control.actions import DISCRETE_ACTIONS, MAX_ACCELERATION, MAX_STEERING
-from rare_envs.measures import Moment
 from rare_envs.scenarios.cut_in import CUTTER_IDM
 from rare_envs.simulation.compiled.failures import CompilerFails, NotCompiled, check_core, compiler_failures
 from rare_envs.simulation.compiled.selection import find_compiled_script
 from rare_envs.simulation.episode import Episode
+from rare_envs.simulation.episode_statistics import EpisodeStatistics
 from rare_envs.simulation.reward import RewardTerms
+from rare_envs.traffic.crash import Crash
 from rare_envs.traffic.lead import Lead
 from rare_envs.traffic.state import State
 
@@ -72,9 +73,9 @@ class ScriptedStep:
                 "cut_in": tick_kernel.CUT_IN_SCRIPT,
                 "hard_brake": tick_kernel.HARD_BRAKE_SCRIPT,
             }
-            road, dt = world.scenario.road, world.clock.dt
-            self._numbers = (IDMNumbers.of(CUTTER_IDM), RoadNumbers.of(road), single(dt)[0])
-            self._number, self._dt, self._required = scripts[script], dt, required
+            (dt,) = single(world.clock.dt)
+            self._numbers = (IDMNumbers.of(CUTTER_IDM), RoadNumbers.of(world.scenario.road), dt)
+            self._number, self._required = scripts[script], required
             self._try(world)
 
     def _try(self, world: World) -> None:
@@ -82,7 +83,10 @@ class ScriptedStep:
         low = [parameter.low for parameter in world.scenario.column_parameters]
         with torch.inference_mode():
             episode = world.with_statistics().start(torch.tensor([low]))
-        self.advance(episode, np.zeros((1, 2), dtype=np.float32))
+        moved = self.advance(episode, np.zeros((1, 2), dtype=np.float32))
+        assert moved is not None and moved.episode.statistics is not None
+        traffic, over = stack_traffic(episode.state), episode.collided.numpy()
+        self._record_crashes(moved.episode.statistics, traffic, traffic, over, over)
 
     def advance(self, episode: Episode, action: NDArray[Any]) -> CompiledStep | None:
         """Carry out a decision.
@@ -104,7 +108,7 @@ class ScriptedStep:
         physical = scale_actions(action, len(old.x))
         if physical is None or episode.overridden is not None or statistics is None:
             return None
-        traffic = np.stack([field.numpy() for field in old[:4]])
+        traffic = stack_traffic(old)
         theta, f, collided = old.theta.numpy(), episode.measure_state.numpy(), episode.collided.numpy()
         if traffic.dtype != np.float32 or f.dtype != np.float32:
             if self._required:
@@ -122,13 +126,28 @@ class ScriptedStep:
         x, y, heading, speed = map(tensor, ticked.traffic)
         state, lead = State(x, y, heading, speed, old.theta), Lead(*map(tensor, ticked.lead))
         least, now = tensor(ticked.f), tensor(ticked.collided)
+        statistics = statistics._replace(least_ttc=least)
         if ticked.eventful:
-            moment = Moment(state, lead, episode.road, None, old, self._dt)
-            statistics = statistics.update(moment, episode.collided, now, least)
-        else:
-            statistics = statistics._replace(least_ttc=least)
+            statistics = self._record_crashes(statistics, traffic, ticked.traffic, before, ticked.collided)
         episode = episode._replace(state=state, lead=lead, measure_state=least, collided=now, statistics=statistics)
         return CompiledStep(episode, RewardTerms(*map(tensor, ticked.terms)), ticked.features)
+
+    def _record_crashes(
+        self,
+        statistics: EpisodeStatistics,
+        before: NDArray[np.float32],
+        after: NDArray[np.float32],
+        was_over: NDArray[np.bool_],
+        is_over: NDArray[np.bool_],
+    ) -> EpisodeStatistics:
+        """Return statistics with the crashes of a tick; traffic as of `stack_traffic`, and who had collided by then."""
+        from rare_envs.simulation.compiled.crash_kernel import CrashRows, record_crashes
+
+        own, others = (CrashRows(*(field.numpy().copy() for field in each)) for each in statistics[1:])
+        _, road, dt = self._numbers
+        record_crashes(before, after, was_over, is_over, road, dt, own, others)
+        crashes = (Crash(*map(torch.from_numpy, each)) for each in (own, others))
+        return EpisodeStatistics(statistics.least_ttc, *crashes)
 
 
 def find_scripted_step(world: World, core: str = "auto") -> ScriptedStep | None:
@@ -152,6 +171,11 @@ def find_scripted_step(world: World, core: str = "auto") -> ScriptedStep | None:
         if isinstance(reason, CompilerFails):
             warnings.warn(f"{reason}; torch simulates, which is slower.", stacklevel=3)
     return None
+
+
+def stack_traffic(state: State) -> NDArray[Any]:
+    """Return x, y, heading and speed, shape (4, B, N)."""
+    return np.stack([field.numpy() for field in state[:4]])
 
 
 def scale_actions(action: NDArray[Any], batch: int) -> NDArray[np.float32] | None:

@@ -8,6 +8,7 @@ import pytest
 from numpy.typing import NDArray
 
 import rare_envs
+from rare_envs.envs.batch_rows import DRAWS_IN_A_ROW
 from rare_envs.envs.vector import DrivingVectorEnv, read_autoreset_mode
 from rare_envs.scenarios.registry import SCENARIOS
 
@@ -83,6 +84,29 @@ def test_same_seed_same_episodes(env_id: str) -> None:
             rows.append(batch.step(batch.action_space.sample())[0])
         runs.append(np.array(rows))
     np.testing.assert_array_equal(*runs)
+
+
+@ids
+def test_scenarios_are_those_of_one_draw_after_the_other(env_id: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    runs = []
+    for in_a_row in (DRAWS_IN_A_ROW, ()):
+        monkeypatch.setattr("rare_envs.envs.batch_rows.DRAWS_IN_A_ROW", in_a_row)
+        batch = rare_envs.make_batch(env_id, 4, horizon=0.5)
+        _, infos = batch.reset(seed=6)
+        rows = [infos["x"]]
+        for tick in range(12):
+            if tick == 8:  # the generator goes on, and part of the drawn scenarios are given
+                given = batch.space.low[: batch.space.sizes[0]]
+                rows.append(batch.reset(options={batch.space.names[0]: given})[1]["x"])
+            if tick == 9:
+                kept = batch.export_state()
+                batch = rare_envs.make_batch(env_id, 4, horizon=0.5)
+                batch.reset(seed=1)
+                batch.restore_state(kept)
+            rows.append(batch.step(np.zeros((4, 2), np.float32))[-1]["x"])
+        runs.append((np.array(rows), batch.np_random.bit_generator.state))
+    np.testing.assert_array_equal(runs[0][0], runs[1][0])
+    assert runs[0][1] == runs[1][1]
 
 
 @ids
