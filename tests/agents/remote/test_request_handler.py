@@ -93,7 +93,8 @@ def test_arrays_that_do_not_add_up_get_an_error(name: str, value: Any) -> None:
     assert protocol.unpack(server.handle(b"me", protocol.pack(act)))["code"] == "malformed"
 
 
-def test_random_bytes_get_an_error_and_are_never_run(tmp_path: Path) -> None:
+@pytest.mark.parametrize("n", [1500, pytest.param(20_000, marks=pytest.mark.slow)])
+def test_random_bytes_get_an_error_and_are_never_run(n: int, tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     server = RequestHandler(Braking())
     whole = [protocol.pack(message) for message in good_messages()]
@@ -104,7 +105,7 @@ def test_random_bytes_get_an_error_and_are_never_run(tmp_path: Path) -> None:
 
     inputs = [pickle.dumps(Run()), b"", b"\x81" * 5000, b"\xdd\xff\xff\xff\xff", b"\xc6\xff\xff\xff\xff"]
     inputs += [message[: int(cut)] for message in whole for cut in range(len(message))]
-    for _ in range(1500):
+    for _ in range(n):
         content = bytearray(whole[rng.integers(len(whole))])
         for _ in range(rng.integers(1, 5)):
             content[rng.integers(len(content))] = rng.integers(256)

@@ -1,0 +1,153 @@
+"""Every kind of file that a command reads, damaged: an answer or one line each, no traceback, and nothing is run.
+
+With `-m slow` 150 of each kind, more than 2,000 in all.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import stable_baselines3 as sb3
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+
+import rare_envs
+from rare_envs.study import Question, corpus, evaluate, prepare, run_directory
+from rare_envs.study.html_report import atlas
+from rare_envs.study.html_report.svg import FigureOfPage
+from rare_envs.study.journal import JOURNAL, begin_journal
+from samplers.execution.journal import JournalRecord
+from tests.rare_envs.study.conftest import write_base
+from tests.rare_envs.study.test_damaged_files import (
+    FOLLOWING,
+    assert_one_line,
+    cli,
+    damage_bytes,
+    damage_json,
+    damage_table,
+)
+
+QUICK, MANY = 4, 150
+Damage = Callable[[bytes, np.random.Generator], bytes]
+SMALL = ("estimate", FOLLOWING, "--method", "mc", "--max-sim", "20", "--horizon", "0.5")
+YAML = "env: rare_envs/CarFollowing-v0\nmethod: mc\nmax-sim: 20\nhorizon: 0.5\nseed: 1\ntarget-cov: 0.1\n"
+NGSIM = "Vehicle_ID,Frame_ID,Global_Time,Local_X,Local_Y,v_Length,v_Width,v_Class,v_Vel,Lane_ID\n"
+MARK = "ran"
+"""File that code in a damaged file would write."""
+
+
+class Kind(NamedTuple):
+    """A file and a command that reads it."""
+
+    path: str
+    words: tuple[str, ...]
+    damage: Damage = damage_bytes
+    library: str = "samplers"
+    """What the command needs beside the extra driving."""
+
+
+def damage_yaml(content: bytes, rng: np.random.Generator) -> bytes:
+    """Replace the value of a key by an odd one."""
+    odd = ("[[[[", "&a [*a, *a]", "!!python/object/apply:os.system ['touch ran']", "1e999", "null", "{}", "[]", "\x00")
+    lines = content.decode().splitlines()
+    at = int(rng.integers(len(lines)))
+    lines[at] = f"{lines[at].split(':')[0]}: {odd[rng.integers(len(odd))]}"
+    return "\n".join(lines).encode()
+
+
+KINDS = {
+    "result read by replay": Kind("run/result.json", ("replay", "run"), damage_json),
+    "result read by plan": Kind("run/result.json", ("plan", "run", "--cov", "0.05"), damage_json),
+    "result read by report": Kind("run/result.json", ("report", "run"), damage_json),
+    "study": Kind("run/study.json", ("report", "run"), damage_json),
+    "episodes": Kind("run/episodes.parquet", ("report", "run")),
+    "failures read by corpus add": Kind("run/failures.csv", ("corpus", "add", "run"), damage_table),
+    "failures read by export": Kind(
+        "run/failures.csv", ("export", "run", "--out", "crash.xml", "--format", "commonroad"), damage_table
+    ),
+    "events": Kind("events.csv", ("report", "run", "--events", "events.csv"), damage_table),
+    "journal": Kind(f"begun/{JOURNAL}", ("resume", "begun")),
+    "stored failure": Kind("corpus/stored.json", ("corpus", "run", "--ego", "idm"), damage_json),
+    "question": Kind("study.yaml", ("estimate", "--config", "study.yaml"), damage_yaml),
+    "base": Kind("base.json", (*SMALL, "--base", "base.json"), damage_json),
+    "policy": Kind("ego.zip", (*SMALL, "--ego", "ego.zip")),
+    "statistics": Kind("mine.pkl", (*SMALL, "--ego", "ego.zip", "--stats", "mine.pkl")),
+    "network": Kind("ego.onnx", (*SMALL, "--ego", "ego.onnx"), library="onnxruntime"),
+    "drivers": Kind("drivers.safetensors", (*SMALL, "--drivers", "drivers.safetensors")),
+    "recording": Kind("tracks.csv", ("fit", "--ngsim", "tracks.csv", "--out", "bases"), damage_table),
+}
+
+
+@pytest.fixture(scope="module")
+def good(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a file of every kind."""
+    folder = tmp_path_factory.mktemp("good")
+    base = str(write_base(folder / "base.json", gap=30.0))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(run_directory, "save_plot", lambda path, report: None)
+        asked = Question(env_id=FOLLOWING, base="us101-gap", gamma=3.0, horizon=2.0, method="mc", max_sim=600)
+        evaluate.run_into(folder / "run", prepare(asked))
+    corpus.add_run(folder / "run", folder / "corpus", most=1)
+    next(folder.glob("corpus/*.json")).rename(folder / "corpus" / "stored.json")
+    write_journal(folder / "begun", base)
+    (folder / "study.yaml").write_text(YAML)
+    (folder / "events.csv").write_text("gap,ego_speed,lead_speed,site\n20,21,10,a\n60,20,20,b\n40,19,20,b\n")
+    tracks = (f"{v},{k},{100 * k},6,{5 * k + 40 * v},15,6,2,50,1\n" for v in (1, 2) for k in range(60))
+    (folder / "tracks.csv").write_text(NGSIM + "".join(tracks))
+    shutil.copy(Path(rare_envs.__file__).parents[1] / "agents/data/mgail.safetensors", folder / "drivers.safetensors")
+    write_policy(folder)
+    return folder
+
+
+def write_journal(folder: Path, base: str) -> None:
+    folder.mkdir()
+    journal = begin_journal(folder, Question(env_id=FOLLOWING, base=base, horizon=1.0, method="mc", max_sim=60))
+    for _ in range(3):
+        journal.append(JournalRecord("of other points", np.ones(20), {"reasons": [], "n_retried": 0}))
+    journal.close()
+
+
+def write_policy(folder: Path) -> None:
+    """A policy behind VecNormalize, and the same as ONNX."""
+    env = VecNormalize(DummyVecEnv([lambda: gym.make(FOLLOWING, horizon=1.0)]))
+    sb3.PPO("MlpPolicy", env, n_steps=8, batch_size=8, seed=0, device="cpu").save(folder / "ego.zip")
+    env.save(str(folder / "mine.pkl"))
+    if importlib.util.find_spec("onnxruntime"):
+        words = ("export-ego", folder / "ego.zip", folder / "ego.onnx", "--stats", folder / "mine.pkl")
+        assert cli(*map(str, words)).exit_code == 0
+
+
+@pytest.fixture
+def here(good: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A copy of it to damage, in the working directory; no pictures are drawn."""
+    monkeypatch.setattr(FigureOfPage, "to_svg", lambda _: "")
+    monkeypatch.setattr(atlas, "encode_clip", lambda drive: "")
+    monkeypatch.setattr(run_directory, "save_plot", lambda path, report: None)
+    shutil.copytree(good, tmp_path, dirs_exist_ok=True)
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("n", [QUICK, pytest.param(MANY, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("name", KINDS)
+def test_a_damaged_file_is_read_or_refused_in_one_line(name: str, n: int, here: Path) -> None:
+    kind = KINDS[name]
+    if not importlib.util.find_spec(kind.library):
+        pytest.skip(f"{kind.library} is not installed")
+    rng, content = np.random.default_rng(n), (here / kind.path).read_bytes()
+    n_refused = 0
+    for number in range(n):
+        damaged: Any = damage_bytes(content, rng) if number % 3 == 0 else kind.damage(content, rng)
+        (here / kind.path).write_bytes(damaged)
+        result = cli(*kind.words)
+        assert_one_line(result, 0, 3, 4)
+        n_refused += result.exit_code == 2
+    assert n_refused >= n // 10
+    assert not (here / MARK).exists()
