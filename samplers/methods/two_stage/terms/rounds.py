@@ -15,6 +15,7 @@ from samplers.methods.two_stage.terms.fitting import (
     first_law,
     fit_law,
     near_points,
+    temper_weights,
 )
 from samplers.methods.two_stage.terms.history import TermHistory
 from samplers.methods.two_stage.terms.law import TermProposal
@@ -68,13 +69,14 @@ def mix_terms(
     """Return the mixture over the terms.
 
     With all of them at the threshold pi_j is proportional to sqrt(sum_j W^2), the sum over failures that the term is
-    the least of, at least `min_term_share`; until then those that are not come first. In the `final` rounds a term
-    that has not been reached waits no longer.
+    the least of, with tempered weights, and at least `min_term_share`; until then those that are not come first. In
+    the `final` rounds a term that has not been reached waits no longer.
     """
     k = len(pursued)
     if final or all(one.ready for one in pursued):
-        w = np.where(history.failing(gamma), np.exp(history.log_weights), 0.0)
-        size = np.array([np.sqrt((w[history.terms.least == one.number] ** 2).sum()) for one in pursued])
+        failing = history.failing(gamma)
+        w, least = temper_weights(history.log_weights[failing], s.share_ess), history.terms.least[failing]
+        size = np.array([np.sqrt((w[least == one.number] ** 2).sum()) for one in pursued])
         shares = size / size.sum() if size.sum() > 0 else np.full(k, 1 / k)
         shares = np.maximum(shares, min(s.min_term_share, 0.7 / k))
     else:
