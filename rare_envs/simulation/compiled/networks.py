@@ -10,14 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rare_envs.simulation.compiled.compilation import compiled, compiled_fused, single
+from rare_envs.simulation.compiled.dense_layer import UNITS_AT_ONCE, apply_layer
 from rare_envs.simulation.compiled.dense_policy import DensePolicy
 from rare_envs.simulation.compiled.rollouts import SingleArray
 
 LANES = 64
-"""Rows side by side, a number that the compiler knows: four of the widest registers, whose additions overlap in time.
-Half as many cost half as much again by row."""
-UNITS_AT_ONCE = 4
-"""Units are padded with zeros to multiples of this: so many inputs and outputs are taken at once."""
+"""Rows side by side, a number that the compiler knows, a multiple of `dense_layer.STRIP`."""
 _ZERO, _LIMIT = single(0.0, 7.905311)
 """Beyond 7.9 the hyperbolic tangent is 1 in single precision."""
 _P1, _P3, _P5, _P7, _P9, _P11, _P13 = single(
@@ -81,36 +79,6 @@ def relu(values: SingleArray) -> None:
     """Write the larger of 0 and the value over values (n,); NaN stays."""
     for i in range(len(values)):
         values[i] = _ZERO if values[i] < _ZERO else values[i]
-
-
-@compiled_fused
-def apply_layer(weight: SingleArray, bias: SingleArray, before: SingleArray, after: SingleArray) -> None:
-    """Write a layer's outputs.
-
-    Args:
-        weight: Shape (outputs, inputs), multiples of `UNITS_AT_ONCE`.
-        bias: Shape (outputs,).
-        before: Inputs, shape (at least inputs, lanes); many lanes, multiples of 16, are fast.
-        after: Outputs, shape (at least outputs, lanes), written to.
-    """
-    outputs, inputs = weight.shape
-    lanes = before.shape[1]
-    for j in range(0, outputs, 4):
-        after0, after1, after2, after3 = after[j], after[j + 1], after[j + 2], after[j + 3]
-        for lane in range(lanes):
-            after0[lane], after1[lane], after2[lane], after3[lane] = bias[j], bias[j + 1], bias[j + 2], bias[j + 3]
-        for k in range(0, inputs, 4):
-            a0, a1, a2, a3 = weight[j, k], weight[j, k + 1], weight[j, k + 2], weight[j, k + 3]
-            b0, b1, b2, b3 = weight[j + 1, k], weight[j + 1, k + 1], weight[j + 1, k + 2], weight[j + 1, k + 3]
-            c0, c1, c2, c3 = weight[j + 2, k], weight[j + 2, k + 1], weight[j + 2, k + 2], weight[j + 2, k + 3]
-            d0, d1, d2, d3 = weight[j + 3, k], weight[j + 3, k + 1], weight[j + 3, k + 2], weight[j + 3, k + 3]
-            before0, before1, before2, before3 = before[k], before[k + 1], before[k + 2], before[k + 3]
-            for lane in range(lanes):
-                x0, x1, x2, x3 = before0[lane], before1[lane], before2[lane], before3[lane]
-                after0[lane] = after0[lane] + a0 * x0 + a1 * x1 + a2 * x2 + a3 * x3
-                after1[lane] = after1[lane] + b0 * x0 + b1 * x1 + b2 * x2 + b3 * x3
-                after2[lane] = after2[lane] + c0 * x0 + c1 * x1 + c2 * x2 + c3 * x3
-                after3[lane] = after3[lane] + d0 * x0 + d1 * x1 + d2 * x2 + d3 * x3
 
 
 @compiled

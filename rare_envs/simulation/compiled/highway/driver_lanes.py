@@ -8,10 +8,11 @@ import numpy as np
 from rare_envs.sensors.lidar import BEAMS
 from rare_envs.sensors.perception import FEATURES
 from rare_envs.simulation.compiled.compilation import compiled, compiled_fused, single
+from rare_envs.simulation.compiled.dense_layer import apply_layer
 from rare_envs.simulation.compiled.equations import ONE, clip
 from rare_envs.simulation.compiled.highway.dense_driver import DenseDriver
 from rare_envs.simulation.compiled.highway.lidar_lanes import LOOKING
-from rare_envs.simulation.compiled.networks import apply_layer, pad_units, tanh
+from rare_envs.simulation.compiled.networks import pad_units, tanh
 from rare_envs.simulation.compiled.rollouts import SingleArray
 from rare_envs.traffic.state import VEHICLE_LENGTH, VEHICLE_WIDTH
 
