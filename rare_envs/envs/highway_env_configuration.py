@@ -1,5 +1,6 @@
 """The configuration of an environment under HighwayEnv's names; what the environment was made with stays."""
 
+import warnings
 from typing import Any, NoReturn
 
 from rare_envs.make import CONFIGURATION_ARGUMENTS
@@ -20,10 +21,14 @@ PICTURE_KEYS = frozenset(
 )
 """Keys of HighwayEnv's configuration that change neither traffic nor spaces; they are kept, and the picture is ours."""
 
+FRAME_RATE = "simulation_frequency"
+"""The key that HighwayEnv's scripts set before they record a video, for more frames."""
+
 
 class FixedConfiguration(dict[str, Any]):
     """A configuration that is read like a dictionary, and refuses to set what is fixed when the environment is made.
 
+    The frame rate stays too, but with a warning: HighwayEnv's scripts set it after the training, for a smoother video.
     A copy, a deep copy and a pickled one are plain dictionaries.
 
     Args:
@@ -49,12 +54,18 @@ gym.make the argument horizon.
         """Set a key of the picture, or another one to the value that it has.
 
         Raises:
-            ValueError: If the value would change.
+            ValueError: If the value would change, of another key than the frame rate.
         """
         if name in PICTURE_KEYS:
             super().__setitem__(name, value)
         elif name not in self:
             raise ValueError(f"Unknown key {name!r}{did_you_mean(name, self)} of config; it has {', '.join(self)}.")
+        elif self[name] != value and name == FRAME_RATE:
+            warnings.warn(
+                f"config[{name!r}] stays {self[name]!r}, not {value!r}: the time between frames is fixed when the "
+                "environment is made, by gym.make's argument dt.",
+                stacklevel=2,
+            )
         elif self[name] != value:
             argument = CONFIGURATION_ARGUMENTS.get(name)
             advice = f"give gym.make the argument {argument}" if argument else "it belongs to the scenario"

@@ -24,7 +24,7 @@ def config() -> FixedConfiguration:
     ("change", "message"),
     [
         (lambda config: config.update(duration=40), r"stay 10.0, got 40; .* gym.make the argument horizon"),
-        (lambda config: config.__setitem__("simulation_frequency", 15), "the argument dt"),
+        (lambda config: config.__setitem__("policy_frequency", 15), "the argument"),
         (lambda config: config["observation"].__setitem__("type", "OccupancyGrid"), "the argument observation"),
         (lambda config: config.__setitem__("lanes_count", 4), "it belongs to the scenario"),
         (lambda config: config.__ior__({"lanes_count": 4}), "it belongs to the scenario"),
@@ -50,6 +50,12 @@ def test_the_picture_and_equal_values_are_taken(config: FixedConfiguration) -> N
     config |= {"screen_width": 900}
     assert config.setdefault("screen_height", 150) == 150
     assert (config["scaling"], config["screen_width"], config["duration"]) == (7.0, 900, 10.0)
+
+
+def test_a_frame_rate_for_the_video_is_left_out_with_a_warning(config: FixedConfiguration) -> None:
+    with pytest.warns(UserWarning, match=r"stays 10, not 15: .* gym.make's argument dt"):
+        config["simulation_frequency"] = 15
+    assert config["simulation_frequency"] == 10
 
 
 @pytest.mark.parametrize("make_copy", [copy.copy, copy.deepcopy, dict, lambda c: pickle.loads(pickle.dumps(c))])

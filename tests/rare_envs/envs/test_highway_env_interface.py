@@ -111,8 +111,10 @@ def test_the_script_for_dqn_runs_with_another_id(tmp_path: Path) -> None:
     model = DQN.load(tmp_path / "model", env=env)
     video = RecordVideo(env, video_folder=str(tmp_path / "videos"), episode_trigger=lambda _: True)
     video.unwrapped.set_record_video_wrapper(video)
-    with pytest.warns(UserWarning, match="leaves simulation_frequency as they are"):
+    with pytest.warns(UserWarning, match="leaves simulation_frequency as they are"):  # as it did before
         video.unwrapped.configure({"simulation_frequency": 15})
+    with pytest.warns(UserWarning, match=r"simulation_frequency'\] stays 10"):  # and as it stands today
+        video.unwrapped.config["simulation_frequency"] = 15
     done = truncated = False
     observation, _ = video.reset()
     while not (done or truncated):
