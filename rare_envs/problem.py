@@ -19,7 +19,7 @@ from rare_envs.egos.loading import load_named_ego
 from rare_envs.egos.needs import resolve
 from rare_envs.egos.policy import PolicyDriver, as_driver
 from rare_envs.egos.spaces.choice import choose_action, choose_observation, takes_indices
-from rare_envs.egos.wrappers import find_action_bounds
+from rare_envs.egos.wrappers import describe_missing_normalisation, find_action_bounds
 from rare_envs.make import refuse_unknown, set_up
 from rare_envs.scenarios.registry import find_scenario, split_layout
 from rare_envs.sensors.kinds import read_kinds
@@ -66,6 +66,10 @@ RESCALED = (
 
 class AmbiguousActions(UserWarning):
     """An ego's actions can be taken in two ways."""
+
+
+class MissingStatistics(UserWarning):
+    """An ego seems to have been trained on normalised observations, and the statistics are not there."""
 
 
 class DrivingProblem:
@@ -159,6 +163,12 @@ class DrivingProblem:
         for note in self.notes:
             if note != TAKEN_AS_ACCELERATIONS:
                 warnings.warn(note, AmbiguousActions, stacklevel=2)
+        missing = describe_missing_normalisation(ego, self.world.observation_space)
+        if missing:
+            advice = "name their file, load_ego(path, stats=FILE), or hand in an ego that normalises before it predicts"
+            warnings.warn(
+                f"the ego has no VecNormalize statistics, but {missing}; {advice}", MissingStatistics, stacklevel=2
+            )
 
     def __setattr__(self, name: str, value: Any) -> None:
         """Set an attribute; another world or driver has another compiled rollout, or none, and other gradients."""
@@ -203,7 +213,7 @@ class DrivingProblem:
             found.append(AMBIGUOUS if "kinematics" in self.world.sensing.kinds else TAKEN_AS_ACCELERATIONS)
         bounds = find_action_bounds(self.needs.action_space) if continuous else None
         if bounds is not None:
-            found.append(RESCALED.format(low=bounds[0].tolist(), high=bounds[1].tolist()))
+            found.append(RESCALED.format(low=_round(bounds[0]), high=_round(bounds[1])))
         return tuple(found)
 
     @property
@@ -421,6 +431,11 @@ class DrivingProblem:
     def _nan_error(self, x_row: NDArray[np.float64], row: int | np.signedinteger[Any]) -> ValueError:
         named = {name: value for name, value in self.space.named(x_row).items() if np.size(value) == 1}
         return ValueError(f"The measure {self.world.measurement.measure!r} gave NaN, first at row {row}: {named}.")
+
+
+def _round(bounds: NDArray[Any]) -> list[float]:
+    """Return bounds as people write them: float32 makes 0.10000000149011612 of 0.1."""
+    return [float(f"{value:.4g}") for value in bounds]
 
 
 @contextmanager

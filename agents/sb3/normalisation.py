@@ -15,7 +15,7 @@ from gymnasium import spaces
 from agents.sb3.file_trust import TRUST
 from agents.sb3.pickle_values import ForbiddenObject
 from agents.sb3.safe_pickle import open_pickle
-from rare_envs.egos.wrappers import find_stacking
+from rare_envs.egos.wrappers import UNBOUNDED, find_stacking
 from rare_envs.plugins import one_line
 
 MAX_STATISTICS = 64 * 2**20
@@ -145,7 +145,7 @@ def describe_missing_statistics(header: Mapping[str, Any], last: Any, own: Any, 
     if not isinstance(expected, spaces.Box) or expected.dtype != np.float32 or len(expected.shape) != 1:
         return ""
     if isinstance(own, spaces.Box) and np.isinf(own.high).all() and not np.isinf(expected.high).any():
-        return "it declares observations without bounds, as behind Gymnasium's NormalizeObservation"
+        return UNBOUNDED
     if not isinstance(last, np.ndarray) or last.dtype.kind != "f" or last.ndim != 2 or not last.size:
         return ""
     furthest = float(last.flat[np.abs(last).argmax()])

@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 from rare_envs.sensors.kinds import batch_size, map_kinds
 
 Shape = tuple[int, ...]
+UNBOUNDED = "it declares observations without bounds, as behind Gymnasium's NormalizeObservation"
+"""Why statistics seem to be missing: what the wrapper does to the space of observations."""
 
 
 @dataclass(frozen=True)
@@ -180,3 +182,26 @@ def wrap_policy(policy: Any, given: spaces.Space[Any]) -> Any:
     if normalise is not None and not whole:
         policy = NormalisedPolicy(policy, normalise)
     return policy if bounds is None else RescaledPolicy(policy, *bounds)
+
+
+def describe_missing_normalisation(policy: Any, given: spaces.Space[Any]) -> str:
+    """Return why the statistics of a policy's observations seem to be missing; "" if nothing says so.
+
+    Args:
+        policy: A saved ego says it by `find_missing_statistics`. A Stable-Baselines3 model in memory brings those
+            of `VecNormalize`; those of Gymnasium's `NormalizeObservation` stay in its training environments, and the
+            bounds of its observations tell. Of any other object nothing is said.
+        given: Space of the environment's observations.
+
+    Example:
+        >>> describe_missing_normalisation(object(), spaces.Box(-1.0, 1.0, (2,)))
+        ''
+    """
+    if hasattr(policy, "find_missing_statistics"):
+        return str(policy.find_missing_statistics(given))
+    if getattr(policy, "get_vec_normalize_env", lambda: policy)() is not None:
+        return ""
+    own = policy.observation_space
+    if isinstance(own, spaces.Box) and isinstance(given, spaces.Box) and np.isfinite(given.high).all():
+        return UNBOUNDED if np.isinf(own.high).all() else ""
+    return ""

@@ -18,7 +18,7 @@ import samplers
 from rare_envs.distributions.fitted import FittedDistribution
 from rare_envs.distributions.space import Distribution
 from rare_envs.egos.errors import EgoGone
-from rare_envs.problem import AmbiguousActions, DrivingProblem
+from rare_envs.problem import AmbiguousActions, DrivingProblem, MissingStatistics
 from rare_envs.scenarios.base_distributions import load_base
 from rare_envs.scenarios.registry import find_scenario, split_layout
 from rare_envs.simulation.rollout import drive
@@ -286,6 +286,7 @@ def build_problem(question: Question, ego: Any) -> DrivingProblem:
     """
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", AmbiguousActions)
+        warnings.simplefilter("ignore", MissingStatistics)  # the report says it
         return DrivingProblem(
             question.env_id,
             ego=ego,

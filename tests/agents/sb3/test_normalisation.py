@@ -18,6 +18,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 import rare_envs
 from agents import SavedEgo, load_ego
 from agents.sb3.normalisation import describe_missing_statistics, find_statistics
+from rare_envs.problem import MissingStatistics
 
 ENV = "rare_envs/CarFollowing-v0"
 SETTINGS: dict[str, Any] = {"n_steps": 8, "batch_size": 8, "seed": 0, "device": "cpu"}
@@ -176,6 +177,15 @@ def test_what_are_no_statistics_is_refused_in_one_line(
     assert "\n" not in str(caught.value)
 
 
+def test_a_model_in_memory_says_that_its_statistics_stayed_in_the_training(tmp_path: Path) -> None:
+    model = sb3.PPO("MlpPolicy", NormalizeObservation(gym.make(ENV, horizon=1.0)), **SETTINGS)
+    with pytest.warns(MissingStatistics, match="as behind Gymnasium's NormalizeObservation; name"):
+        rare_envs.DrivingProblem(ENV, ego=model)
+    model.save(tmp_path / "ego.zip")
+    with pytest.warns(MissingStatistics, match="NormalizeObservation"):
+        rare_envs.DrivingProblem(ENV, ego=str(tmp_path / "ego.zip"))
+
+
 class Rescaled:
     """A policy that was trained behind `RescaleAction(env, -2, 2)`."""
 
@@ -195,7 +205,8 @@ def test_actions_are_rescaled_from_their_bounds() -> None:
     x = rare_envs.DrivingProblem(ENV).base.sample(64, np.random.default_rng(0))
     expected = rare_envs.DrivingProblem(ENV, ego=Rescaled(-1.0, 1.0)).evaluate(x)
     for low, high in ((-2.0, 2.0), (0.0, 1.0), (-0.1, 0.3)):
-        with pytest.warns(rare_envs.problem.AmbiguousActions, match=r"are mapped to \[-1, 1\] as RescaleAction does"):
+        told = rf"between \[{low}, {low}\] and \[{high}, {high}\], are mapped to \[-1, 1\] as RescaleAction does"
+        with pytest.warns(rare_envs.problem.AmbiguousActions, match=told):
             problem = rare_envs.DrivingProblem(ENV, ego=Rescaled(low, high))
         np.testing.assert_allclose(problem.evaluate(x), expected, rtol=1e-5)
     assert len(np.unique(expected)) > 4

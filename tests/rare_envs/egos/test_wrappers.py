@@ -5,7 +5,13 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 
-from rare_envs.egos.wrappers import FrameStackedPolicy, NormalisedPolicy, find_frame_stacking, find_stacking
+from rare_envs.egos.wrappers import (
+    FrameStackedPolicy,
+    NormalisedPolicy,
+    describe_missing_normalisation,
+    find_frame_stacking,
+    find_stacking,
+)
 
 SMALL = (36, 60)
 
@@ -62,3 +68,19 @@ def test_frames_side_by_side_begin_with_zeros_and_along_an_axis_with_copies() ->
 def test_a_normalised_policy_is_shown_normalised_observations() -> None:
     shown, _ = NormalisedPolicy(Echo(), lambda seen: (seen - 1.0) / 2.0).predict(np.array([[3.0]]))
     assert shown == 1.0
+
+
+class Model:
+    """What a Stable-Baselines3 model in memory tells of its training."""
+
+    def __init__(self, high: float, statistics: Any = None) -> None:
+        self.observation_space = spaces.Box(-high, high, (3,))
+        self.get_vec_normalize_env = lambda: statistics
+
+
+def test_bounds_tell_of_normalised_observations_unless_the_statistics_are_there() -> None:
+    given = spaces.Box(-5.0, 5.0, (3,))
+    assert "NormalizeObservation" in describe_missing_normalisation(Model(np.inf), given)
+    assert describe_missing_normalisation(Model(5.0), given) == ""
+    assert describe_missing_normalisation(Model(np.inf, statistics=object()), given) == ""
+    assert describe_missing_normalisation(Model(np.inf), spaces.Box(-np.inf, np.inf, (3,))) == ""
