@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import os
+import re
 import shutil
 import time
 from collections.abc import Callable, Iterator
@@ -19,6 +20,10 @@ Function = TypeVar("Function", bound=Callable[..., object])
 PACKAGE = Path(__file__).parents[2]
 UNUSED = 7 * 24 * 3600.0
 """Machine code of older sources that no process has loaded for so long [s] is removed."""
+_IMPORT = re.compile(
+    rf"^[ \t]*(?:from ({PACKAGE.name}[\w.]*) import (\([^)]*\)|[^\n]*)|import ({PACKAGE.name}[\w.]*))", re.MULTILINE
+)
+"""A statement, which unlike those of examples in docstrings begins its line."""
 _CONFIG: Any = numba.config
 
 
@@ -26,7 +31,8 @@ def compiled(function: Function) -> Function:
     """Compile a function when it is first called; division by zero gives inf, as in torch.
 
     numba looks at a function's own file alone to tell whether its kept code is out of date, not at those of the
-    functions and constants that it uses. So the folder is named after the sources of the whole package.
+    functions and constants that it uses. So the folder is named after all sources that the file imports, and that these
+    import.
 
     Raises:
         ImportError: numba is switched off, and would leave the function to Python.
@@ -43,7 +49,7 @@ def _compile(function: Function, **options: Any) -> Function:
     if _CONFIG.DISABLE_JIT:
         raise ImportError("NUMBA_DISABLE_JIT is set")
     dispatcher = numba.njit(error_model="numpy", **options)(function)
-    with _kept_in(find_cache_folder()) as can_be_kept:
+    with _kept_in(find_cache_folder(Path(function.__code__.co_filename))) as can_be_kept:
         if can_be_kept:
             dispatcher.enable_caching()
     return cast(Function, dispatcher)
@@ -55,8 +61,8 @@ def single(*values: float) -> tuple[float, ...]:
 
 
 @cache
-def find_cache_folder() -> Path | None:
-    """Return the folder of the machine code of these sources, made if need be; None where none can be written.
+def find_cache_folder(file: Path) -> Path | None:
+    """Return the folder of the machine code of a source file, made if need be; None where none can be written.
 
     It is below numba's `NUMBA_CACHE_DIR` if that is set, else beside this file, else in the home folder.
     """
@@ -65,7 +71,7 @@ def find_cache_folder() -> Path | None:
         [Path(asked)] if asked else [Path(__file__).parent / "__pycache__", Path("~/.cache/rare-envs").expanduser()]
     )
     for place in places:
-        folder = place / f"compiled-{digest_sources()}"
+        folder = place / f"compiled-{digest_sources(file)}"
         try:
             folder.mkdir(parents=True, exist_ok=True)
         except OSError:
@@ -91,13 +97,41 @@ def remove_old_code(place: Path, kept: Path) -> None:
                 shutil.rmtree(folder)
 
 
-@cache
-def digest_sources() -> str:
-    """Return a digest of the sources of the package."""
+def digest_sources(file: Path) -> str:
+    """Return a digest of the sources that a source file depends on."""
     digest = hashlib.blake2b(digest_size=8)
-    for path in sorted(PACKAGE.rglob("*.py")):
+    for path in find_sources(file):
         digest.update(path.read_bytes())
     return digest.hexdigest()
+
+
+def find_sources(file: Path) -> list[Path]:
+    """Return a source file and those of this package that it imports, and that these import, in a fixed order.
+
+    A package's `__init__` is among them if something is imported from it, and not for the modules within it.
+    """
+    found, to_read = {file}, [file]
+    while to_read:
+        new = _find_imports(to_read.pop()) - found
+        found |= new
+        to_read += new
+    return sorted(found)
+
+
+@cache
+def _find_imports(file: Path) -> frozenset[Path]:
+    """Return the sources of this package that a source file imports, also within its functions."""
+    found = set()
+    for module, names, whole in _IMPORT.findall(file.read_text(encoding="utf-8")):
+        members = [_find_module(f"{module}.{name}") or _find_module(module) for name in re.findall(r"\w+", names)]
+        found.update(members or [_find_module(module or whole)])
+    return frozenset(path for path in found if path is not None)
+
+
+def _find_module(name: str) -> Path | None:
+    """Return the source of a module of this package; None where there is none of this name."""
+    place = PACKAGE.parent.joinpath(*name.split("."))
+    return next((path for path in (place.with_suffix(".py"), place / "__init__.py") if path.is_file()), None)
 
 
 @contextmanager

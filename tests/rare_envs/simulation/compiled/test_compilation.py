@@ -2,11 +2,12 @@
 
 import os
 import time
+from pathlib import Path
 
 import numba
 import pytest
 
-from rare_envs.simulation.compiled import compilation
+from rare_envs.simulation.compiled import compilation, tick_kernel
 
 
 @pytest.fixture
@@ -25,22 +26,71 @@ def double(value):
 def test_code_is_kept_below_the_folder_that_was_asked_for(folder):
     before = numba.config.CACHE_DIR
     assert compilation.compiled(double)(2.0) == 4.0
-    kept = list(folder.glob(f"compiled-{compilation.digest_sources()}/**/*double*.nbc"))
+    kept = list(folder.glob(f"compiled-{compilation.digest_sources(Path(__file__))}/**/*double*.nbc"))
     assert len(kept) == 1
     assert before == numba.config.CACHE_DIR
 
 
-def test_another_source_has_another_folder(folder, tmp_path, monkeypatch):
-    (tmp_path / "one.py").write_text("LENGTH = 5.0\n")
-    monkeypatch.setattr(compilation, "PACKAGE", tmp_path)
-    first = compilation.digest_sources.__wrapped__()
-    (tmp_path / "one.py").write_text("LENGTH = 4.0\n")
-    assert compilation.digest_sources.__wrapped__() != first
+@pytest.fixture
+def package(tmp_path, monkeypatch):
+    """A package whose module `kernel` depends on all but `apart` and the folder's own `__init__`."""
+    sources = {
+        "__init__": "from rare_envs.apart import APART\n",
+        "kernel": "from rare_envs.one import (\n    LENGTH,  # [m]\n)\n\n\ndef f():\n    import rare_envs.late\n",
+        "one": "from rare_envs import two\nfrom rare_envs.parts import WIDTH\nLENGTH = 5.0\n",
+        "two": "from rare_envs import kernel\n",  # a circle ends
+        "parts/__init__": "from rare_envs.parts.deep import WIDTH\n",
+        "parts/deep": "WIDTH = 2.0\n",
+        "late": "",
+        "apart": "",
+    }
+    folder = tmp_path / "rare_envs"
+    (folder / "parts").mkdir(parents=True)
+    for name, text in sources.items():
+        (folder / f"{name}.py").write_text(text)
+    monkeypatch.setattr(compilation, "PACKAGE", folder)
+    return folder
+
+
+def digest(folder):
+    compilation._find_imports.cache_clear()
+    return compilation.digest_sources(folder / "kernel.py")
+
+
+@pytest.mark.parametrize("changed", ["kernel", "one", "two", "parts/__init__", "parts/deep", "late"])
+def test_another_source_has_another_folder(package, changed):
+    first, path = digest(package), package / f"{changed}.py"
+    assert digest(package) == first
+    path.write_text(path.read_text() + "HEIGHT = 1.0\n")
+    assert digest(package) != first
+
+
+@pytest.mark.parametrize("changed", ["__init__", "apart"])
+def test_a_source_that_does_not_matter_leaves_the_folder(package, changed):
+    first = digest(package)
+    (package / f"{changed}.py").write_text("HEIGHT = 1.0\n")
+    assert digest(package) == first
+
+
+def test_a_kernel_depends_on_the_equations_and_constants_that_it_uses():
+    root = compilation.PACKAGE
+    found = {path.relative_to(root).as_posix() for path in compilation.find_sources(Path(tick_kernel.__file__))}
+    assert found >= {
+        "simulation/compiled/tick_kernel.py",
+        "simulation/compiled/equations.py",
+        "simulation/compiled/compilation.py",
+        "simulation/reward.py",
+        "simulation/observation.py",
+        "control/actions.py",
+        "measures/base.py",
+        "traffic/state.py",
+    }
+    assert not found & {"__init__.py", "envs/vector.py", "problem.py"}
 
 
 def test_where_nothing_can_be_written_code_is_compiled_and_not_kept(folder, monkeypatch):
     monkeypatch.setattr(os, "access", lambda *_: False)
-    assert compilation.find_cache_folder() is None
+    assert compilation.find_cache_folder(Path(__file__)) is None
     assert compilation.compiled(double)(3.0) == 6.0
 
 
