@@ -214,9 +214,16 @@ def find_ego_kind(spec: str) -> EgoKind:
     return "function" if ":" in spec and "/" not in spec else "unknown"
 
 
+EGO_SUFFIXES = (".zip", ".onnx", ".safetensors")
+"""How the files of egos end."""
+
+
 def _suggest_ego(text: str) -> str:
     """Return a hint at the ego that a misspelt name may mean: a known name or a `.zip` saved nearby."""
     saved = Path(f"{text}.zip")
     if saved.is_file():
         return f" (did you mean {str(saved)!r}?)"
+    if Path(text).is_dir():
+        files = sorted(path.name for path in Path(text).iterdir() if path.suffix in EGO_SUFFIXES)
+        return f" (a folder; name a file in it: {', '.join(files[:5])})" if files else " (a folder without egos)"
     return did_you_mean(text.lower(), [RULE_BASED, HUMAN, *SHIPPED_EGOS, VISION, *SHIPPED_DRIVERS])

@@ -401,3 +401,11 @@ def test_an_unknown_spec_is_refused(spec: str, message: str) -> None:
 def test_a_forgotten_suffix_is_pointed_out(ppo_zip: Path) -> None:
     with pytest.raises(ValueError, match=r"did you mean '.*ego\.zip'"):
         load_ego(ppo_zip.with_suffix(""))
+
+
+def test_a_folder_in_place_of_a_file_is_told(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=r"Unknown ego .* \(a folder without egos\)"):
+        load_ego(tmp_path)
+    (tmp_path / "best.zip").touch()
+    with pytest.raises(ValueError, match=r"\(a folder; name a file in it: best\.zip\)"):
+        load_ego(tmp_path)
