@@ -3,7 +3,7 @@
     python -m training.imitation.noise_damping DATA [--driver mgail] [--damping 0.6 ...] [--test] [--out FILE]
 
 The noise of a learned driver is a damped oscillator. With less damping and the same natural frequency the
-accelerations and jerks keep their variances, but swing to and fro for longer, so that they add up to less: the noise
+accelerations and jerks keep their variances, but swing for longer, so that they add up to less: the noise
 has less power at low frequencies, which is what moves a vehicle away from where it would be. Prints how the driver
 does in the scenes that it has learned from, or with `--test` in the others; with `--out` it writes the driver with the
 last of the dampings, measured in the test scenes.
