@@ -64,9 +64,9 @@ def find_touching_pairs(moments: Iterator[DrivingStep]) -> list[TouchingPair]:
         for row, one, other in (touching & ~known).nonzero().tolist():
             key = row, min(one, other), max(one, other)
             if key not in found:
-                apart = [float((field[row, one] - field[row, other]).abs()) for field in (traffic.x, traffic.y)]
-                replayed = not bool(traffic.driven[row, other])
-                found[key] = TouchingPair(int(traffic.scene[row]), int(start[row]), replayed, tick, *apart)
+                along, across = ((field[row, one] - field[row, other]).abs() for field in (traffic.x, traffic.y))
+                replayed, scene = not bool(traffic.driven[row, other]), int(traffic.scene[row])
+                found[key] = TouchingPair(scene, int(start[row]), replayed, tick, float(along), float(across))
             found[key].steps += 1
     return sorted(found.values(), key=lambda pair: -pair.steps)
 
