@@ -1,6 +1,6 @@
-"""Which vehicles collide in the test scenes when one driver drives all of them?
+"""Touching pairs: vehicles that collide in the test scenes when one driver drives all of them.
 
-    python -m training.imitation.evaluation.contacts DATA [--driver mgail] [--seconds 20] [--seed 0]
+    python -m training.imitation.touching_pairs DATA [--driver mgail] [--seconds 20] [--seed 0]
 
 Starts are those of the realism figures, every 2 s of every scene. Prints the pairs that touch and did not at the start,
 longest first: their scene and start, when they touch first and for how many vehicle-steps of driven ones.
@@ -79,7 +79,7 @@ def main(
     seed: Annotated[int, typer.Option(help="Of the driver's noise.")] = 0,
 ) -> None:
     """Print which vehicles collide in the test scenes."""
-    with report_errors("contacts"):
+    with report_errors("touching_pairs"):
         chosen = load_driver(driver)
         if not isinstance(chosen, LearnedDriver):
             raise ValueError(f"Expected a learned driver, got the rule {driver!r}.")

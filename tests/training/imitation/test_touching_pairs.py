@@ -5,9 +5,9 @@ import typer
 from typer.testing import CliRunner
 
 from tests.training.imitation.synthetic_scenes import scenes
-from training.imitation.evaluation import contacts as module
+from training.imitation import touching_pairs as module
 from training.imitation.evaluation.behaviour import drive_traffic
-from training.imitation.evaluation.contacts import find_touching_pairs
+from training.imitation.touching_pairs import find_touching_pairs
 from training.imitation.traffic.recording import stack_scenes
 from training.imitation.traffic.replayed_traffic import start_replay
 
