@@ -18,7 +18,6 @@ import rare_envs
 from benchmarks import RESULTS
 from benchmarks.estimators.highway.cases import CASES, COUNTED_WORLDS, EARLIER_COUNTS
 from rare_envs.files import replace_text
-from rare_envs.simulation.rollout import rollout
 from rare_envs.threads import use_one_thread
 
 HIGHWAY_TRUTH = RESULTS / "highway_truth.json"
@@ -27,21 +26,12 @@ CHUNK = 2048
 
 
 def count_failures(world: str, seed: int, chunk: int) -> dict[str, int]:
-    """Count the failures of all cases of a world in one chunk of rollouts, by case.
-
-    Collisions are read off the rollouts themselves, where f of every measure is as it is without one.
-    """
-    problem = COUNTED_WORLDS[world].problem("lidar_ttc")
-    x = torch.from_numpy(problem.base.sample(CHUNK, np.random.default_rng((seed, chunk)))).float()
-    with torch.inference_mode():
-        ends = [rollout(problem.world, problem.driver, rows) for rows in torch.split(x, problem.tile)]
-    collided, f = (torch.cat([getattr(end, name) for end in ends]) for name in ("collided", "f"))
-    failed = {
-        name: collided if case.measure == "clearance" else f <= case.gamma
-        for name, case in CASES.items()
-        if case.world == world
-    }
-    return {name: int(each.sum()) for name, each in failed.items()}
+    """Count the failures of all cases of a world in one chunk of rollouts, by case."""
+    cases = {name: case for name, case in CASES.items() if case.world == world}
+    problems = {case.measure: COUNTED_WORLDS[world].problem(case.measure) for case in cases.values()}
+    x = next(iter(problems.values())).base.sample(CHUNK, np.random.default_rng((seed, chunk)))
+    f = {measure: problem.evaluate(x) for measure, problem in problems.items()}
+    return {name: int((f[case.measure] <= case.gamma).sum()) for name, case in cases.items()}
 
 
 def add_chunk(record: dict[str, Any], seed: int) -> None:
