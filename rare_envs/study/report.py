@@ -16,6 +16,7 @@ from agents.sb3.saved_ego import SavedEgo
 from rare_envs.distributions.fitted import FittedDistribution
 from rare_envs.distributions.space import Distribution
 from rare_envs.egos.faults import Fault
+from rare_envs.egos.wrappers import describe_missing_normalisation
 from rare_envs.exposure import HUMAN_BENCHMARKS, CollisionRate
 from rare_envs.study.analysis.modes import FailureMode, find_modes
 from rare_envs.study.analysis.repeatability import Repeatability
@@ -146,8 +147,9 @@ class Report:
     def _missing_statistics(self) -> tuple[str, ...]:
         ego = self.study.problem.ego
         problem = self.study.problem
-        missing = ego.find_missing_statistics(problem.world.observation_space) if isinstance(ego, SavedEgo) else ""
-        return (f"the ego has no VecNormalize statistics (--stats), but {missing}",) if missing else ()
+        missing = describe_missing_normalisation(ego, problem.world.observation_space)
+        option = " (--stats)" if isinstance(ego, SavedEgo) else ""
+        return (f"the ego has no VecNormalize statistics{option}, but {missing}",) if missing else ()
 
     @property
     def crashes(self) -> tuple[dict[str, Any] | None, ...]:

@@ -19,7 +19,7 @@ import numpy as np
 Function = TypeVar("Function", bound=Callable[..., object])
 PACKAGE = Path(__file__).parents[2]
 UNUSED = 7 * 24 * 3600.0
-"""Machine code of older sources that no process has loaded for so long [s] is removed."""
+"""Machine code that no process has loaded for so long [s] is removed."""
 _IMPORT = re.compile(
     rf"^[ \t]*(?:from ({PACKAGE.name}[\w.]*) import (\([^)]*\)|[^\n]*)|import ({PACKAGE.name}[\w.]*))", re.MULTILINE
 )
@@ -83,7 +83,7 @@ def find_cache_folder(file: Path) -> Path | None:
 
 
 def remove_old_code(place: Path, kept: Path) -> None:
-    """Remove the folders of older sources, but those that were used within a week: another process may use them.
+    """Remove the other folders, but those that were used within a week: another process may use them.
 
     Args:
         place: Where the folders are.
