@@ -9,8 +9,7 @@ from typing import Any
 
 import numpy as np
 from llvmlite import ir
-from numba.core import cgutils, types
-from numba.core.codegen import get_host_cpu_features
+from numba.core import cgutils, codegen, types
 from numba.extending import intrinsic
 from numba.np import arrayobj
 from numpy.typing import NDArray
@@ -19,7 +18,8 @@ from rare_envs.simulation.compiled.compilation import compiled_fused
 
 UNITS_AT_ONCE = 4
 """Outputs that are computed at once."""
-STRIP = 32 if "+avx512f" in get_host_cpu_features() else 16
+_CODE: Any = codegen
+STRIP = 32 if "+avx512f" in _CODE.get_host_cpu_features() else 16
 """Rows that are computed at once: with so many outputs, eight of the widest registers, whose additions overlap. With
 twice as many AVX2 has no register left, and takes half as long again."""
 _BUILD: Any = cgutils
