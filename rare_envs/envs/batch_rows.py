@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 from collections.abc import Iterator
 from typing import Any, TypeVar
 
@@ -46,6 +47,7 @@ class DrawsAhead:
         self._in_a_row = type(plain) in DRAWS_IN_A_ROW
         self._rng: np.random.Generator | None = None
         self._state: Any = None
+        self._state_ahead = b""
         self._rows = np.empty((0, 0))
         self._given = 0
 
@@ -58,15 +60,25 @@ class DrawsAhead:
                 self.settle()
             self._rng, self._state, self._given = rng, rng.bit_generator.state, 0
             self._rows = self._base.sample(max(n, ROWS_AHEAD), rng)
+            self._state_ahead = _freeze_state(rng)
         self._given += n
         return self._rows[self._given - n : self._given].copy()
 
     def settle(self) -> None:
-        """Put the generator where it is after the rows that were given, and forget the others."""
+        """Put the generator where it is after the rows that were given, and forget the others.
+
+        One that somebody else has drawn from since stays where it is: his draws would come again.
+        """
         if self._rng is not None:
-            self._rng.bit_generator.state = self._state
-            self._base.sample(self._given, self._rng)
+            if _freeze_state(self._rng) == self._state_ahead:
+                self._rng.bit_generator.state = self._state
+                self._base.sample(self._given, self._rng)
             self._rng, self._rows = None, self._rows[:0]
+
+
+def _freeze_state(rng: np.random.Generator) -> bytes:
+    """Return the state of a generator as bytes, for some have arrays in it."""
+    return pickle.dumps(rng.bit_generator.state)
 
 
 def merge_rows(old: _T, rows: Tensor, new: _T) -> _T:

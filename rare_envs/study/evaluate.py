@@ -228,7 +228,7 @@ def resume(
         >>> resume(Path("runs/nowhere"))
         Traceback (most recent call last):
             ...
-        rare_envs.study.errors.BadInput: There is no unfinished run in 'runs/nowhere': it has no journal.bin. Of one that was stopped before its first simulations, give the command again.
+        rare_envs.study.errors.BadInput: There is no unfinished run in 'runs/nowhere': the folder does not exist. Of a run that was stopped before its first simulations, give the command again.
     """  # noqa: E501 (the example shows a whole message)
     journal, question = continue_journal(folder, mend)
     with closing(journal):

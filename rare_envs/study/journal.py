@@ -93,6 +93,8 @@ def _explain_no_journal(folder: Path) -> str:
     """Return why a folder has no journal, and what to do."""
     if (folder / RESULT).is_file():
         return f"it has a finished one ({RESULT})."
+    if not folder.is_dir():
+        return f"the folder does not exist. Of a run that was stopped before its first simulations, {BEGIN_AGAIN}"
     return f"it has no {JOURNAL}. Of one that was stopped before its first simulations, {BEGIN_AGAIN}"
 
 

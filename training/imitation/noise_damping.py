@@ -59,7 +59,7 @@ def damp_acceleration(noise: AutoregressiveNoise, damping: float) -> Autoregress
     Example:
         >>> noise = AutoregressiveNoise.from_oscillators(frequency=(1.70, 1.57), damping=(0.845, 0.40))
         >>> [round(value, 4) for value in damp_acceleration(noise, 0.4).first]
-        [1.8877, 1.8979]
+        [1.8886, 1.8979]
     """
     (first, kept_first), (second, kept_second) = noise.first, noise.second
     radius = math.sqrt(max(-second, 0.0))

@@ -131,7 +131,9 @@ def check_export(path: Path | str, format: str, ego: str | None) -> bool:
         )
     path = Path(path)
     if path.suffix.lower() != _ENDINGS[format]:
-        raise ValueError(f"Expected a file that ends in {_ENDINGS[format]} for {format}, got {str(path)!r}.")
+        others = [name for name, ending in _ENDINGS.items() if ending == path.suffix.lower()]
+        hint = f"; --format {others[0]} writes such a file" if others else ""
+        raise ValueError(f"Expected a file that ends in {_ENDINGS[format]} for {format}, got {str(path)!r}{hint}.")
     if not path.parent.is_dir():
         raise ValueError(f"There is no folder {str(path.parent)!r}.")
     if ego not in ("recorded", "free", None):

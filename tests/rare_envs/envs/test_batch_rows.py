@@ -27,6 +27,16 @@ def test_rows_drawn_ahead_are_those_drawn_one_call_after_the_other(base: Distrib
         np.testing.assert_array_equal(ahead.sample(n, other), base.sample(n, same))
 
 
+@pytest.mark.parametrize("kind", [np.random.PCG64, np.random.MT19937])
+def test_a_generator_that_others_draw_from_too_is_not_put_back(kind: type[np.random.BitGenerator]) -> None:
+    """Their draws would come again."""
+    ahead, rng = DrawsAhead(BETA), np.random.Generator(kind(3))
+    ahead.sample(1, rng)
+    others = rng.random(5)
+    ahead.settle()
+    assert not np.isin(rng.random(10 * ROWS_AHEAD), others).any()
+
+
 def test_rows_drawn_ahead_are_the_callers_own() -> None:
     ahead, rng = DrawsAhead(BETA), np.random.default_rng(0)
     ahead.sample(1, rng)[:] = np.nan

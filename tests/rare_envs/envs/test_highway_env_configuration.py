@@ -24,7 +24,7 @@ def config() -> FixedConfiguration:
     ("change", "message"),
     [
         (lambda config: config.update(duration=40), r"stay 10.0, got 40; .* gym.make the argument horizon"),
-        (lambda config: config.__setitem__("policy_frequency", 15), "the argument"),
+        (lambda config: config.__setitem__("policy_frequency", 15), "gym.make the argument action"),
         (lambda config: config["observation"].__setitem__("type", "OccupancyGrid"), "the argument observation"),
         (lambda config: config.__setitem__("lanes_count", 4), "it belongs to the scenario"),
         (lambda config: config.__ior__({"lanes_count": 4}), "it belongs to the scenario"),

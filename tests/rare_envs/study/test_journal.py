@@ -285,6 +285,7 @@ def test_a_run_that_was_stopped_before_its_first_simulation_says_what_to_do(
     assert_refused(refused, "stopped before its first simulations", "ive the command again.")
     assert cli(*words).exit_code in (0, 3)
     assert_refused(cli("resume", "run"), "no unfinished run in 'run': it has a finished one (result.json)")
+    assert_refused(cli("resume", "nowhere"), "no unfinished run in 'nowhere': the folder does not exist")
 
 
 def test_an_ego_that_has_changed_is_noticed(frail: Path, risky: str) -> None:

@@ -24,7 +24,7 @@ def problem() -> DrivingProblem:
     ("name", "format", "ego", "message"),
     [
         ("a.xosc", "opensenario", None, "did you mean 'openscenario'"),
-        ("a.xml", "openscenario", None, r"ends in \.xosc"),
+        ("a.xml", "openscenario", None, r"ends in \.xosc for openscenario, got .*; --format commonroad writes"),
         ("a.xosc", "commonroad", None, r"ends in \.xml"),
         ("nowhere/a.xml", "commonroad", None, "There is no folder"),
         ("a.xosc", "carla", "recorded", "the ego is free"),

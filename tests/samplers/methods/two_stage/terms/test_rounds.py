@@ -61,6 +61,21 @@ def test_shares_of_ready_terms_follow_their_weights(half_spaces, rng, answer, si
     np.testing.assert_allclose(final, shares)  # nobody waits for a term that was not reached
 
 
+def test_one_heavy_failure_does_not_give_its_term_the_next_round(half_spaces, rng):
+    """Of two terms with 300 failures each, one failure of the first weighs as much as all others together."""
+    problem, _, normals = half_spaces(20, 0.3, shares=(0.5, 0.5))
+    history = base_history(problem, rng, 2000)
+    mine = np.flatnonzero(history.failing(0.0) & (history.terms.least == 0))[0]
+    log_density = history.log_density.copy()
+    log_density[mine] -= np.log(history.failing(0.0).sum())
+    heavy = TermHistory(history.u, history.terms, log_density, (), history.n_base)
+    pursued = pursue_walked(walked(normals, [1.0, 1.0]), heavy, SETTINGS)
+    shares = mix_terms(pursued, heavy, 0.0, RoundSettings(), final=True).shares
+    assert shares[0] < 0.75
+    plain = mix_terms(pursued, heavy, 0.0, RoundSettings(share_ess=1.0), final=True).shares
+    assert plain[0] > 0.8
+
+
 def test_a_fit_makes_gradients_within_its_limit_and_takes_up_new_terms(half_spaces, rng, answer, simulator_of):
     """The second term fails among the draws and nobody pursued it: it joins with gradients of its own."""
     problem, _, normals = half_spaces(20, 0.2, shares=(0.5, 0.5))
