@@ -139,8 +139,9 @@ def find_contact(old: SingleArray, new: SingleArray, one: int, other: int, dt: f
     dvy = (new[1, other] - old[1, other]) / dt - (new[1, one] - old[1, one]) / dt
     turn = new[2, other] - new[2, one]
     turn_cos, turn_sin = abs(math.cos(turn)), abs(math.sin(turn))
-    since, axis, least, shallow = -_NEVER, 0, -_NEVER, 0
-    offset_there, rate_there = np.empty(4, dtype=np.float32), np.empty(4, dtype=np.float32)
+    since, least, ahead = -_NEVER, -_NEVER, ZERO
+    axis, closing = 0, ZERO  # of the last to overlap
+    shallow, shallow_closing = 0, ZERO  # of the one along which they overlap least
     for number in range(4):
         course = new[2, one] if number < 2 else new[2, other]
         cos, sin = math.cos(course), math.sin(course)
@@ -152,17 +153,16 @@ def find_contact(old: SingleArray, new: SingleArray, one: int, other: int, dt: f
             reach = _HALF_WIDTH + _HALF_LENGTH * turn_sin + _HALF_WIDTH * turn_cos
         gap = abs(offset) - reach
         enter = -offset / rate - reach / abs(rate) if rate != ZERO else (-_NEVER if gap < ZERO else _NEVER)
-        if enter > since:
-            since, axis = enter, number
-        if gap > least:
-            least, shallow = gap, number
-        offset_there[number], rate_there[number] = offset, rate
-    if math.isinf(since):  # nothing moves: the axis along which they overlap least
-        since, axis = _ALWAYS, shallow
-    closing = -rate_there[axis] * np.sign(offset_there[axis])
-    return Contact(
-        since, axis, closing if closing > ZERO else ZERO, np.sqrt(dvx * dvx + dvy * dvy), offset_there[0], turn
-    )
+        approach = -rate * np.sign(offset)
+        if number == 0:
+            ahead = offset
+        if number == 0 or enter > since:
+            since, axis, closing = enter, number, approach
+        if number == 0 or gap > least:
+            least, shallow, shallow_closing = gap, number, approach
+    if math.isinf(since):  # nothing moves
+        since, axis, closing = _ALWAYS, shallow, shallow_closing
+    return Contact(since, axis, closing if closing > ZERO else ZERO, np.sqrt(dvx * dvx + dvy * dvy), ahead, turn)
 
 
 @compiled

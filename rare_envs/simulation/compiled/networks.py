@@ -82,13 +82,13 @@ def relu(values: SingleArray) -> None:
 
 
 @compiled
-def apply_network(network: NetworkNumbers, values: SingleArray, spare: SingleArray) -> SingleArray:
-    """Return the array that the outputs of a block were written to, `values` or `spare`.
+def apply_network(network: NetworkNumbers, values: SingleArray, spare: SingleArray) -> None:
+    """Write the outputs of a block over its observations.
 
     Args:
         network: The network.
-        values: Observations in the first rows, zeros in those that pad them, shape (widest layer, `LANES`); written
-            over.
+        values: Observations in the first rows, zeros in those that pad them, shape (widest layer, `LANES`); the
+            outputs are written to the first rows, and the others written over.
         spare: Of the same shape; written over.
     """
     before, after, last = values, spare, len(network.widths) - 2
@@ -103,4 +103,7 @@ def apply_network(network: NetworkNumbers, values: SingleArray, spare: SingleArr
         elif layer < last:
             relu(after[:outputs].reshape(outputs * LANES))
         before, after = after, before
-    return before
+    if last % 2 == 0:  # an odd number of layers ends in the spare array
+        for output in range(network.widths[-1]):
+            for lane in range(LANES):
+                values[output, lane] = spare[output, lane]

@@ -94,6 +94,24 @@ class VehicleRows(NamedTuple):
     the lead [m/s^2]."""
 
 
+class EgoLanes(NamedTuple):
+    """Arrays for `LANES` egos side by side, written over."""
+
+    values: SingleArray
+    """Of the network, shape (widest layer, `LANES`), zeros at first; likewise the next."""
+    spare: SingleArray
+    rows: NDArray[np.int64]
+    """Row in each lane, shape (`LANES`,)."""
+    done: NDArray[np.int64]
+    """Its ticks so far, likewise."""
+
+    @classmethod
+    def of(cls, network: NetworkNumbers) -> "EgoLanes":
+        """Return arrays for a network."""
+        values, spare = np.zeros((2, network.widths.max(), LANES), dtype=np.float32)
+        return cls(values, spare, *np.zeros((2, LANES), dtype=np.int64))
+
+
 def drive_by_policy(
     script: str, x: NDArray[np.float64], policy: DensePolicy, road: Road, dt: float, ticks: int
 ) -> SingleArray:
@@ -109,8 +127,10 @@ def drive_by_policy(
     """
     traffic = place_vehicles(script, np.ascontiguousarray(x.T, dtype=np.float32))
     numbers, network, (tick,) = PolicyNumbers.of(policy), NetworkNumbers.of(policy), single(dt)
-    cutter = IDMNumbers.of(CUTTER_IDM)
-    return drive_by_network(traffic, script == "cut_in", numbers, network, cutter, RoadNumbers.of(road), tick, ticks)
+    cutter, lanes = IDMNumbers.of(CUTTER_IDM), EgoLanes.of(network)
+    f = np.empty(len(x), dtype=np.float32)
+    drive_by_network(traffic, script == "cut_in", numbers, network, cutter, RoadNumbers.of(road), tick, ticks, lanes, f)
+    return f
 
 
 def place_vehicles(script: str, columns: SingleArray) -> VehicleRows:
@@ -207,8 +227,10 @@ def drive_by_network(
     road: RoadNumbers,
     dt: float,
     ticks: int,
-) -> SingleArray:
-    """Return f of each row, shape (B,).
+    lanes: EgoLanes,
+    f: SingleArray,
+) -> None:
+    """Write f of each row.
 
     Args:
         traffic: At time 0; moved on.
@@ -219,11 +241,10 @@ def drive_by_network(
         road: The road.
         dt: Tick [s].
         ticks: Length of an episode.
+        lanes: Of egos side by side.
+        f: Shape (B,), written to.
     """
-    f: SingleArray = np.empty(len(traffic.x), dtype=np.float32)
-    values = np.zeros((network.widths.max(), LANES), dtype=np.float32)
-    spare = np.zeros_like(values)
-    rows, done = np.zeros(LANES, dtype=np.int64), np.zeros(LANES, dtype=np.int64)  # of the lanes: row, ticks so far
+    values, spare, rows, done = lanes.values, lanes.spare, lanes.rows, lanes.done
     observed, running, next_row = 4 * traffic.x.shape[1] - 1, 0, 0
     while True:
         while running < LANES and next_row < len(f):
@@ -238,17 +259,17 @@ def drive_by_network(
             rows[running], done[running] = next_row, 0
             running, next_row = running + 1, next_row + 1
         if running == 0:
-            return f
+            return
         values[observed : network.widths[0]] = ZERO  # the last layers have written there
         for lane in range(running):
             row = rows[lane]
             observe_row(traffic.x[row], traffic.y[row], traffic.heading[row], traffic.speed[row], policy, values, lane)
-        outputs = apply_network(network, values, spare)
+        apply_network(network, values, spare)
         left = 0
         for lane in range(running):
             row = rows[lane]
             x, y, heading, speed = traffic.x[row], traffic.y[row], traffic.heading[row], traffic.speed[row]
-            acceleration, steering = decode_row(outputs[:, lane], policy)
+            acceleration, steering = decode_row(values[:, lane], policy)
             if acceleration != acceleration:
                 f[row] = _UNKNOWN
                 continue

@@ -53,13 +53,18 @@ def drive(script: str, x: NDArray[np.float64], ego: IDM, road: Road, dt: float, 
     """
     columns = np.ascontiguousarray(x.T, dtype=np.float32)
     idm, numbers, (tick,) = IDMNumbers.of(ego), RoadNumbers.of(road), single(dt)
+    moment = np.empty((4, 3 if script == "cut_in" else 2), dtype=np.float32)
+    f: SingleArray = np.empty(len(x), dtype=np.float32)
     if script == "cut_in":
-        return drive_cut_in(columns, idm, IDMNumbers.of(CUTTER_IDM), numbers, tick, ticks)
-    if script == "car_following":
+        drive_cut_in(columns, idm, IDMNumbers.of(CUTTER_IDM), numbers, tick, ticks, moment, f)
+    elif script == "car_following":
         ego_speed, lead_speed, gap = columns
-        return drive_behind_lead(ego_speed, lead_speed, gap, np.zeros_like(gap), idm, numbers, tick, ticks)
-    speed, gap, deceleration = columns
-    return drive_behind_lead(speed, speed, gap, -deceleration, idm, numbers, tick, ticks)
+        still = np.zeros_like(gap)
+        drive_behind_lead(ego_speed, lead_speed, gap, still, idm, numbers, tick, ticks, moment, f)
+    else:
+        speed, gap, deceleration = columns
+        drive_behind_lead(speed, speed, gap, -deceleration, idm, numbers, tick, ticks, moment, f)
+    return f
 
 
 @compiled
@@ -136,8 +141,10 @@ def drive_behind_lead(
     road: RoadNumbers,
     dt: float,
     ticks: int,
-) -> SingleArray:
-    """Return f of each scenario of an ego and a lead in one lane, shape (B,).
+    moment: SingleArray,
+    f: SingleArray,
+) -> None:
+    """Write f of each scenario of an ego and a lead in one lane.
 
     Args:
         ego_speed: [m/s], shape (B,), single precision as all.
@@ -148,10 +155,12 @@ def drive_behind_lead(
         road: The road.
         dt: Tick [s].
         ticks: Length of an episode.
+        moment: Shape (4, 2), written over: x, y, heading and speed of ego and lead.
+        f: Shape (B,), written to.
     """
-    f = np.empty_like(ego_speed)
+    x, y, heading, speed = moment[0], moment[1], moment[2], moment[3]
     for row in range(len(f)):
-        x, y, heading, speed = np.zeros((4, 2), dtype=np.float32)
+        moment[:] = ZERO
         x[1], speed[0], speed[1] = lead_gap[row] + BODY_LENGTH, ego_speed[row], lead_speed[row]
         gap, closing = lead_of(x, y, heading, speed, road)
         least = ttc(gap, closing, y[0], heading[0], speed[0], road)
@@ -165,14 +174,20 @@ def drive_behind_lead(
             gap, closing = lead_of(x, y, heading, speed, road)
             least = at_most(ttc(gap, closing, y[0], heading[0], speed[0], road), least)
         f[row] = least
-    return f
 
 
 @compiled
 def drive_cut_in(
-    columns: SingleArray, idm: IDMNumbers, cutter_idm: IDMNumbers, road: RoadNumbers, dt: float, ticks: int
-) -> SingleArray:
-    """Return f of each cut-in, shape (B,).
+    columns: SingleArray,
+    idm: IDMNumbers,
+    cutter_idm: IDMNumbers,
+    road: RoadNumbers,
+    dt: float,
+    ticks: int,
+    moment: SingleArray,
+    f: SingleArray,
+) -> None:
+    """Write f of each cut-in.
 
     Args:
         columns: Of x of `CutIn-v0` or `CutIn-v1`, shape (6, B) or (7, B), single precision.
@@ -181,11 +196,13 @@ def drive_cut_in(
         road: The road.
         dt: Tick [s].
         ticks: Length of an episode.
+        moment: Shape (4, 3), written over: x, y, heading and speed of ego, cutter and lead.
+        f: Shape (B,), written to.
     """
-    f: SingleArray = np.empty_like(columns[0])
+    x, y, heading, speed = moment[0], moment[1], moment[2], moment[3]
     for row in range(len(f)):
-        x, y, heading, speed = np.zeros((4, 3), dtype=np.float32)
-        speed[:] = columns[:3, row]
+        moment[:] = ZERO
+        speed[0], speed[1], speed[2] = columns[0, row], columns[1, row], columns[2, row]
         offset = columns[5, row]
         duration = columns[6, row] if len(columns) > 6 else _DURATION
         start = columns[3, row] + BODY_LENGTH
@@ -205,4 +222,3 @@ def drive_cut_in(
             gap, closing = lead_of(x, y, heading, speed, road)
             least = at_most(ttc(gap, closing, y[0], heading[0], speed[0], road), least)
         f[row] = least
-    return f

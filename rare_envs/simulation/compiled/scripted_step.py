@@ -102,7 +102,7 @@ class ScriptedStep:
         Raises:
             ValueError: The state is in double precision, and compiled steps are required.
         """
-        from rare_envs.simulation.compiled.tick_kernel import tick_scripted  # not kept: a step is copied and sent
+        from rare_envs.simulation.compiled import tick_kernel  # not kept: a step is copied and sent
 
         old, statistics = episode.state, episode.statistics
         physical = scale_actions(action, len(old.x))
@@ -121,13 +121,14 @@ class ScriptedStep:
         theta = contiguous(theta) if theta.shape[1] else traffic[0]
         cutter, road, dt = self._numbers
         before = contiguous(collided)
-        ticked = tick_scripted(self._number, traffic, theta, physical, contiguous(f), before, cutter, road, dt)
+        ticked = tick_kernel.Ticked.of(traffic, contiguous(f), before)
+        eventful = tick_kernel.tick_scripted(self._number, theta, physical, cutter, road, dt, ticked)
         tensor = torch.from_numpy
         x, y, heading, speed = map(tensor, ticked.traffic)
         state, lead = State(x, y, heading, speed, old.theta), Lead(*map(tensor, ticked.lead))
         least, now = tensor(ticked.f), tensor(ticked.collided)
         statistics = statistics._replace(least_ttc=least)
-        if ticked.eventful:
+        if eventful:
             statistics = self._record_crashes(statistics, traffic, ticked.traffic, before, ticked.collided)
         episode = episode._replace(state=state, lead=lead, measure_state=least, collided=now, statistics=statistics)
         return CompiledStep(episode, RewardTerms(*map(tensor, ticked.terms)), ticked.features)

@@ -42,7 +42,7 @@ _STANDING_GAP, _TIME_GAP, _COST, _LEAST_CLOSING = single(
 
 
 class Ticked(NamedTuple):
-    """B episodes one tick later."""
+    """Arrays for B episodes one tick later."""
 
     traffic: SingleArray
     """x, y, heading and speed, shape (4, B, N)."""
@@ -56,41 +56,43 @@ class Ticked(NamedTuple):
     """Of the reward, in the order of `RewardTerms`, shape (6, B)."""
     features: SingleArray
     """The observation `features`, shape (B, 3 + 4 (N - 1))."""
-    eventful: bool
-    """Whether an ego has collided in this tick, or two other vehicles touch."""
+
+    @classmethod
+    def of(cls, traffic: SingleArray, f: SingleArray, collided: NDArray[np.bool_]) -> "Ticked":
+        """Return arrays for episodes that are so far as the arguments of `tick_scripted` say."""
+        batch, vehicles = traffic.shape[1:]
+        lead, terms = np.empty((2, batch), dtype=np.float32), np.empty((6, batch), dtype=np.float32)
+        features = np.empty((batch, 4 * vehicles - 1), dtype=np.float32)
+        return cls(traffic.copy(), lead, f.copy(), collided.copy(), terms, features)
 
 
 @compiled
 def tick_scripted(
     script: int,
-    traffic: SingleArray,
     theta: SingleArray,
     action: SingleArray,
-    f: SingleArray,
-    collided: NDArray[np.bool_],
     cutter_idm: IDMNumbers,
     road: RoadNumbers,
     dt: float,
-) -> Ticked:
+    ticked: Ticked,
+) -> bool:
     """Move all vehicles of B episodes by a tick: `rare_envs.simulation.decision.advance` of continuous actions.
 
     Args:
         script: `CAR_FOLLOWING_SCRIPT`, `CUT_IN_SCRIPT` or `HARD_BRAKE_SCRIPT`.
-        traffic: x, y, heading and speed, shape (4, B, N), single precision.
-        theta: Of the state, shape (B, P).
+        theta: Of the state, shape (B, P), single precision.
         action: Acceleration [m/s^2] and steering angle [rad], shape (B, 2).
-        f: So far, shape (B,).
-        collided: So far, shape (B,).
         cutter_idm: Of the cutter, behind the lead.
         road: A straight road with equal lanes.
         dt: Tick [s].
+        ticked: The episodes, by `Ticked.of`; written to.
+
+    Returns:
+        Whether an ego has collided in this tick, or two other vehicles touch.
     """
-    batch, vehicles = traffic.shape[1:]
-    moved, lead, after = traffic.copy(), np.empty((2, batch), dtype=np.float32), np.empty_like(f)
-    over, eventful = collided.copy(), False
-    terms = np.empty((6, batch), dtype=np.float32)
-    features = np.empty((batch, 4 * vehicles - 1), dtype=np.float32)
-    for row in range(batch):
+    moved, lead, f, over, terms, features = ticked
+    eventful = False
+    for row in range(len(f)):
         x, y, heading, speed = moved[0, row], moved[1, row], moved[2, row], moved[3, row]
         acceleration, steering = action[row, 0], action[row, 1]
         ego = bicycle(x[0], y[0], heading[0], speed[0], acceleration, steering, dt)
@@ -103,15 +105,15 @@ def tick_scripted(
             x[1], speed[1] = keep_straight(x[1], speed[1], -theta[row, 0] if script == HARD_BRAKE_SCRIPT else ZERO, dt)
         x[0], y[0], heading[0], speed[0] = ego
         hit = has_hit(x, y, heading, road)
-        eventful |= (hit and not collided[row]) or others_touch(x, y, heading)
+        eventful |= (hit and not over[row]) or others_touch(x, y, heading)
         over[row] |= hit
         gap, closing = lead_of(x, y, heading, speed, road)
         lead[0, row], lead[1, row] = gap, closing
         value = at_most(ttc(gap, closing, y[0], heading[0], speed[0], road), f[row])
-        after[row] = _HIT if over[row] else value
+        f[row] = _HIT if over[row] else value
         write_reward(terms[:, row], y[0], heading[0], speed[0], acceleration, steering, gap, closing, over[row], road)
         write_features(features[row], x, y, heading, speed)
-    return Ticked(moved, lead, after, over, terms, features, eventful)
+    return eventful
 
 
 @compiled

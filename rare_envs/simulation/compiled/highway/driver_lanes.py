@@ -18,6 +18,8 @@ from rare_envs.traffic.state import VEHICLE_LENGTH, VEHICLE_WIDTH
 
 _OUTPUTS = 4  # two means and two log deviations
 _LENGTH, _WIDTH, _HALF, _NOTHING = single(VEHICLE_LENGTH, VEHICLE_WIDTH, 0.5, 0.0)
+NO_NOISE = (_NOTHING, _NOTHING)
+"""Of the two actions."""
 _OWN = FEATURES.index("range_-162")
 """Features before those of the beams."""
 
@@ -155,7 +157,9 @@ def apply_own_weights(weights: SingleArray, buffers: DriverBuffers, output: int,
 
 
 @compiled
-def decide_action(outputs: SingleArray, lane: int, noise: SingleArray, driver: DriverNumbers) -> tuple[float, float]:
+def decide_action(
+    outputs: SingleArray, lane: int, noise: tuple[float, float], driver: DriverNumbers
+) -> tuple[float, float]:
     """Return acceleration [m/s^2] and yaw rate [rad/s]: `agents.learned.driver.LearnedDriver.act`.
 
     Args:
@@ -181,17 +185,16 @@ def _limited_action(mean: float, log_deviation: float, noise: float, action: int
 
 
 @compiled
-def next_noise(memory: SingleArray, draws: SingleArray, driver: DriverNumbers, noise: SingleArray) -> None:
-    """Write the noise of a vehicle, and the memory after it: `agents.learned.coloured_noise.AutoregressiveNoise.step`.
+def next_noise(memory: SingleArray, draws: SingleArray, driver: DriverNumbers) -> tuple[float, float]:
+    """Return the noise of a vehicle's two actions: `agents.learned.coloured_noise.AutoregressiveNoise.step`.
 
     Args:
         memory: Of the two actions the values one and two ticks ago, shape (2, 2), written over.
         draws: Standard normal, shape (2,).
         driver: The driver.
-        noise: Shape (2,), written to.
     """
     for action in range(2):
         last = memory[action, 0]
         mean = last * driver.lag_1[action] + memory[action, 1] * driver.lag_2[action]
-        noise[action] = mean + driver.fresh[action] * draws[action]
-        memory[action, 0], memory[action, 1] = noise[action], last
+        memory[action, 0], memory[action, 1] = mean + driver.fresh[action] * draws[action], last
+    return memory[0, 0], memory[1, 0]

@@ -10,7 +10,7 @@ from rare_envs.simulation.compiled.dense_policy import DensePolicy
 from rare_envs.simulation.compiled.equations import IDMNumbers, idm_acceleration, steer_to_line, steering_for
 from rare_envs.simulation.compiled.highway.curved_road import CurvedRoadNumbers, lane_middle
 from rare_envs.simulation.compiled.highway.dense_driver import DenseDriver
-from rare_envs.simulation.compiled.highway.driver_lanes import DriverBuffers, DriverNumbers, decide_action
+from rare_envs.simulation.compiled.highway.driver_lanes import NO_NOISE, DriverBuffers, DriverNumbers, decide_action
 from rare_envs.simulation.compiled.highway.traffic_slots import NO_ROW, Slots, TrafficRows
 from rare_envs.simulation.compiled.networks import LANES, NetworkNumbers, apply_network
 from rare_envs.simulation.compiled.policy_rollouts import PolicyNumbers, decode_row, observe_row
@@ -71,9 +71,9 @@ def apply_policies(rows: TrafficRows, slots: Slots, ego: EgoNumbers) -> None:
         row = slots.row[slot]
         if row != NO_ROW:
             observe_row(rows.x[row], rows.y[row], rows.heading[row], rows.speed[row], ego.policy, ego.values, slot)
-    outputs = apply_network(ego.network, ego.values, ego.spare)
+    apply_network(ego.network, ego.values, ego.spare)
     for slot in range(len(slots.row)):
-        ego.actions[slot, 0], ego.actions[slot, 1] = decode_row(outputs[:, slot], ego.policy)
+        ego.actions[slot, 0], ego.actions[slot, 1] = decode_row(ego.values[:, slot], ego.policy)
 
 
 @compiled
@@ -94,6 +94,5 @@ def decide_ego(
 @compiled
 def steer_as_learned(ego: EgoNumbers, slot: int, speed: float, curvature: float) -> tuple[float, float]:
     """Return acceleration [m/s^2] and steering angle [rad]: `agents.learned.driver.LearnedEgo.act`."""
-    still = np.zeros(2, dtype=np.float32)
-    acceleration, yaw_rate = decide_action(ego.buffers.outputs, slot, still, ego.driver)
+    acceleration, yaw_rate = decide_action(ego.buffers.outputs, slot, NO_NOISE, ego.driver)
     return acceleration, steering_for(yaw_rate + speed * curvature, speed)

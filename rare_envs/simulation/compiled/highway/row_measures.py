@@ -52,36 +52,45 @@ def measure_row(
     """Measure a moment of a row without a collision."""
     row, tick, others = slots.row[slot], slots.tick[slot], rows.x.shape[1] - 1
     x, y, heading, speed = rows.x[row], rows.y[row], rows.heading[row], rows.speed[row]
-    far = np.empty(0, dtype=np.float32)
     if rules.terms == DISTANCES or rules.terms == PAIR_DISTANCES:
         count = others if rules.terms == DISTANCES else others * (others + 1) // 2
         late = count if tick > rules.cut else 0
-        far = measure_distances(slots.poses, slot, found.values[row, late : late + count])
-        lower_terms(found, row, tick, late, far)
+        measure_distances(slots, slot, found.values[row, late : late + count])
+        lower_terms(found, row, tick, late, slots.latest[:count])
     elif rules.measure == BY_CLEARANCE:
-        far = measure_distances(slots.poses, slot, np.full(others, found.f[row], dtype=np.float32))
+        slots.enough[:others] = found.f[row]
+        measure_distances(slots, slot, slots.enough[:others])
     if rules.measure == BY_CLEARANCE:
-        value = far[:others].min()
+        value = slots.latest[find_least(slots.latest[:others])]
     elif rules.measure == BY_LIDAR:
-        times = np.empty(2 * others, dtype=np.float32)
+        times = slots.latest[: 2 * others]
         value = lidar_times(ego_beams, slot, times)
         if rules.terms == BEAM_TIMES:
             lower_terms(found, row, tick, 2 * others if tick > rules.cut else 0, times)
     else:
         value = ttc(slots.gap[slot], slots.closing[slot], y[0], heading[0], speed[0], road)
     if rules.terms == LEAD_TIMES:
-        latest = np.empty(others + 1, dtype=np.float32)
+        latest = slots.latest[: others + 1]
         time_terms(x, y, heading, speed, lane_middle(y[0], road), road, latest)
         lower_terms(found, row, tick, 0, latest)
     found.f[row] = at_most(value, found.f[row])
 
 
 @compiled
-def measure_distances(poses: Poses, slot: int, enough: SingleArray) -> SingleArray:
-    """Return `clearances` of a slot."""
-    found: SingleArray = np.empty(len(enough), dtype=np.float32)
-    clearances(poses.x[slot], poses.y[slot], poses.heading[slot], enough, found)
-    return found
+def measure_distances(slots: Slots, slot: int, enough: SingleArray) -> None:
+    """Write `clearances` of a slot, as many as `enough` has, to the first of `slots.latest`."""
+    poses = slots.poses
+    clearances(poses.x[slot], poses.y[slot], poses.heading[slot], enough, slots.latest[: len(enough)])
+
+
+@compiled
+def find_least(values: SingleArray) -> int:
+    """Return the number of the first of the least values, shape (n,)."""
+    least = 0
+    for number in range(1, len(values)):
+        if values[number] < values[least]:
+            least = number
+    return least
 
 
 @compiled
@@ -126,10 +135,11 @@ def record_collision(
         return
     others, pairs = rows.x.shape[1] - 1, rules.terms == PAIR_DISTANCES
     count = others * (others + 1) // 2 if pairs else others
-    distances = measure_distances(slots.poses, slot, np.full(count, _FAR, dtype=np.float32))
-    term = np.argmin(distances)
+    slots.enough[:count] = _FAR
+    measure_distances(slots, slot, slots.enough[:count])
+    term = find_least(slots.latest[:count])
     if pairs and not touch(slots.poses, slot, others + 1):
-        term = np.argmin(distances[:others])
+        term = find_least(slots.latest[:others])
     elif rules.terms == LEAD_TIMES and off_road(rows.y[row, 0], road) and not touch(slots.poses, slot, 1):
         term = others
     term += count if tick > rules.cut else 0

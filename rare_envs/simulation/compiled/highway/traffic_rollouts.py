@@ -15,6 +15,7 @@ from rare_envs.simulation.compiled.highway.curved_road import (
     point_on_curve,
 )
 from rare_envs.simulation.compiled.highway.driver_lanes import (
+    NO_NOISE,
     DriverBuffers,
     DriverNumbers,
     apply_drivers,
@@ -187,11 +188,11 @@ def move_drivers(
     rows: TrafficRows, slots: Slots, slot: int, driver: DriverNumbers, buffers: DriverBuffers, dt: float
 ) -> None:
     """Move vehicles 1 to N - 1 of a slot by a tick."""
-    row, noise, others = slots.row[slot], np.zeros(2, dtype=np.float32), rows.x.shape[1] - 1
+    row, noise, others = slots.row[slot], NO_NOISE, rows.x.shape[1] - 1
     for other in range(1, others + 1):
         if rows.draws.shape[1]:
             draws = rows.draws[row, FIRST_DRAW + slots.tick[slot], other - 1]
-            next_noise(rows.memory[row, other - 1], draws, driver, noise)
+            noise = next_noise(rows.memory[row, other - 1], draws, driver)
         acceleration, yaw_rate = decide_action(buffers.outputs, others * slot + other - 1, noise, driver)
         moved = point_on_curve(
             rows.x[row, other],

@@ -83,13 +83,18 @@ class Slots(NamedTuple):
     closing: SingleArray
     """Speed at which it shrinks [m/s]."""
     poses: Poses
+    latest: SingleArray
+    """Terms of a moment of one slot, shape (more than a measure has,), likewise the next."""
+    enough: SingleArray
+    """Distances above which they need not be exact."""
 
     @classmethod
     def of(cls, slots: int, vehicles: int) -> "Slots":
         """Return free slots for rows of N vehicles."""
         poses = Poses(*np.zeros((len(Poses._fields), slots, vehicles), dtype=np.float32))
         gap, closing = np.zeros((2, slots), dtype=np.float32)
-        return cls(np.full(slots, NO_ROW), np.zeros(slots, dtype=np.int64), gap, closing, poses)
+        latest, enough = np.zeros((2, vehicles * (vehicles + 3) // 2), dtype=np.float32)
+        return cls(np.full(slots, NO_ROW), np.zeros(slots, dtype=np.int64), gap, closing, poses, latest, enough)
 
 
 class Sight(NamedTuple):

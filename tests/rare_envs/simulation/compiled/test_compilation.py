@@ -5,6 +5,7 @@ import time
 from pathlib import Path
 
 import numba
+import numpy as np
 import pytest
 
 from rare_envs.simulation.compiled import compilation, tick_kernel
@@ -23,12 +24,21 @@ def double(value):
     return value + value
 
 
+def double_all(values):
+    return (values + values)[0]
+
+
 def test_code_is_kept_below_the_folder_that_was_asked_for(folder):
     before = numba.config.CACHE_DIR
     assert compilation.compiled(double)(2.0) == 4.0
     kept = list(folder.glob(f"compiled-{compilation.digest_sources(Path(__file__))}/**/*double*.nbc"))
     assert len(kept) == 1
     assert before == numba.config.CACHE_DIR
+
+
+def test_a_compiled_function_makes_no_arrays(folder):
+    with pytest.raises(numba.core.errors.NumbaError, match="NRT required"):
+        compilation.compiled(double_all)(np.ones(2))
 
 
 @pytest.fixture

@@ -25,7 +25,7 @@ def layer(outputs: int, inputs: int, lanes: int) -> list[np.ndarray]:
 
 @pytest.mark.parametrize(
     ("outputs", "inputs", "lanes"),
-    [(UNITS_AT_ONCE, 1, STRIP), (12, 7, 2 * STRIP), (100, 200, 4 * STRIP), (8, 0, STRIP)],
+    [(UNITS_AT_ONCE, 1, STRIP), (24, 7, 2 * STRIP), (104, 200, 4 * STRIP), (8, 0, STRIP)],
 )
 def test_outputs(outputs, inputs, lanes):
     weight, bias, before = layer(outputs, inputs, lanes)

@@ -48,9 +48,9 @@ def test_actions_with_own_weights_and_coloured_noise():
     buffers = filled_buffers(features)
     buffers.head[:] = weights.T.numpy()
     driver_lanes.apply_drivers(NUMBERS, buffers)
-    kept, noise, found = memory[:, 0].numpy().copy(), np.zeros(2, np.float32), []
+    kept, found = memory[:, 0].numpy().copy(), []
     for lane in range(DRIVERS):
-        driver_lanes.next_noise(kept[lane], draws[lane, 0].numpy(), NUMBERS, noise)
+        noise = driver_lanes.next_noise(kept[lane], draws[lane, 0].numpy(), NUMBERS)
         found.append(driver_lanes.decide_action(buffers.outputs, lane, noise, NUMBERS))
     assert np.allclose(found, action[:, 0].numpy(), atol=2e-5)
     assert np.allclose(kept, after[:, 0].numpy(), atol=1e-6)
@@ -64,8 +64,8 @@ def test_mean_actions_of_the_own_weights():
         action, _ = DRIVER.act(features[:, None])
     buffers = filled_buffers(features)
     driver_lanes.apply_drivers(NUMBERS, buffers)
-    still = np.zeros(2, np.float32)
-    found = [driver_lanes.decide_action(buffers.outputs, lane, still, NUMBERS) for lane in range(DRIVERS)]
+    noise = driver_lanes.NO_NOISE
+    found = [driver_lanes.decide_action(buffers.outputs, lane, noise, NUMBERS) for lane in range(DRIVERS)]
     assert np.allclose(found, action[:, 0].numpy(), atol=2e-5)
 
 
