@@ -129,6 +129,10 @@ class WeightDistribution:
         """Return mean + L u of the rows of u (n, d)."""
         return np.asarray(self.mean + self._rows(u) @ self.cholesky.T)
 
+    def pull_back(self, u: FloatArray, gradients: FloatArray, /) -> FloatArray:
+        """Return gradients L' g with respect to u of gradients g with respect to the weights, (n, d)."""
+        return np.asarray(self._rows(gradients) @ self.cholesky)
+
     def _rows(self, x: FloatArray) -> FloatArray:
         x = np.asarray(x, dtype=np.float64)
         if x.ndim != 2 or x.shape[1] != self.dim:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from scipy import special
 
 from rare_envs.arrays import FloatArray
@@ -130,11 +130,27 @@ class BetaDistribution:
         anew = u != u[:1]
         anew[0] = True
         rows, columns = np.nonzero(anew)
-        chosen, alpha, beta = u[rows, columns], self.alpha[columns], self.beta[columns]
-        left = chosen < 0.0
-        shapes = np.where(left, alpha, beta), np.where(left, beta, alpha)
-        part = (self.high - self.low)[columns] * special.betaincinv(*shapes, special.ndtr(-np.abs(chosen)))
-        values = np.where(left, self.low[columns] + part, self.high[columns] - part)
+        chosen = u[rows, columns]
+        part = (self.high - self.low)[columns] * self._share(chosen, columns)[0]
+        values = np.where(chosen < 0.0, self.low[columns] + part, self.high[columns] - part)
         x = np.tile(values[: self.dim], (len(u), 1))
         x[rows, columns] = values
         return x
+
+    def pull_back(self, u: FloatArray, gradients: FloatArray) -> FloatArray:
+        """Return gradients with respect to u of gradients with respect to x, (n, d): dx / du = phi(u) / p(x)."""
+        share, first, second = self._share(np.asarray(u), np.arange(self.dim))
+        density = special.xlogy(first - 1, share) + special.xlog1py(second - 1, -share) - special.betaln(first, second)
+        slope = np.exp(-0.5 * (np.square(u) + np.log(2.0 * np.pi)) - density)
+        return np.asarray((self.high - self.low) * slope * gradients)
+
+    def _share(self, u: FloatArray, columns: NDArray[np.intp]) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return the distance from the nearer tail's end as a share of the range, and the shape parameters from there.
+
+        Args:
+            u: Points in standard normal space, of any shape.
+            columns: Number of the variable of each, of a shape that broadcasts with it.
+        """
+        left, alpha, beta = u < 0.0, self.alpha[columns], self.beta[columns]
+        first, second = np.where(left, alpha, beta), np.where(left, beta, alpha)
+        return np.asarray(special.betaincinv(first, second, special.ndtr(-np.abs(u)))), first, second

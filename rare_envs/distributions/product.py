@@ -52,6 +52,10 @@ class NoiseDistribution:
         """Return the same points."""
         return u
 
+    def pull_back(self, u: FloatArray, gradients: FloatArray) -> FloatArray:
+        """Return the same gradients."""
+        return gradients
+
     def project(self, x: FloatArray, weights: FloatArray, alpha: float) -> "NoiseDistribution":
         """Return the same distribution: a block of cross-entropy that does not move."""
         return self

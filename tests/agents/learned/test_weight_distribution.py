@@ -134,3 +134,10 @@ def test_arrays_that_are_no_upper_triangle_are_refused(small):
         WeightDistribution.from_arrays({**arrays, "columns": arrays["columns"] + 1})
     with pytest.raises(ValueError, match="one length"):
         WeightDistribution.from_arrays({**arrays, "precision": arrays["precision"][1:]})
+
+
+def test_gradients_are_pulled_back_by_the_map(small, rng):
+    """g(u) = a.x(u) is linear: its gradient is its value at the unit vectors less that at 0."""
+    a = rng.standard_normal(3)
+    expected = small.from_standard_normal(np.eye(3)) @ a - MEAN @ a
+    np.testing.assert_allclose(small.pull_back(rng.standard_normal((2, 3)), np.tile(a, (2, 1))), [expected] * 2)

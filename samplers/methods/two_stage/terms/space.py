@@ -6,7 +6,15 @@ from numpy.typing import NDArray
 from samplers.method import TermsOffer, request_gradients, request_terms, whole_simulations
 from samplers.methods.two_stage.noise_coordinates import noise_mask
 from samplers.methods.two_stage.simulator import SimulationSteps
-from samplers.problem import FloatArray, Inputs, StandardNormal, Terms
+from samplers.problem import (
+    DifferentiableDistribution,
+    Distribution,
+    FloatArray,
+    HasBlocks,
+    Inputs,
+    StandardNormal,
+    Terms,
+)
 
 DIFFERENCE = 1e-4
 """Standard deviations of a central difference: its error is 1e-8, that of rounding 1e-12."""
@@ -56,24 +64,48 @@ class TermSimulator:
 
 
 class TransformSlopes:
-    """Derivatives of x = T(u), the map from standard normal space, by finite differences of it: no simulation.
+    """Derivatives of x = T(u), the map from standard normal space, block by block: no simulation.
+
+    A block that is a `DifferentiableDistribution` has its own; others are differentiated by `DifferencedMap`.
+    """
+
+    def __init__(self, inputs: Inputs) -> None:
+        base, noise = inputs.base, noise_mask(inputs)
+        self._identity = isinstance(base, StandardNormal)
+        blocks = tuple(base.blocks) if isinstance(base, HasBlocks) else ()
+        dims = [block.dim for block in blocks]
+        if sum(dims) != inputs.dim or not all(isinstance(block, Distribution) for block in blocks):
+            blocks, dims = (base,), [inputs.dim]
+        self._ends = np.cumsum(dims)[:-1]
+        self._maps = [
+            block if isinstance(block, DifferentiableDistribution) else DifferencedMap(block, own)
+            for block, own in zip(blocks, np.split(noise, self._ends), strict=True)
+        ]
+
+    def pull_back(self, u: FloatArray, gradients: FloatArray) -> FloatArray:
+        """Return the gradients (n, d) with respect to x at T(u), u (n, d), as gradients with respect to u."""
+        if self._identity:
+            return gradients
+        parts = (np.split(points, self._ends, axis=1) for points in (u, gradients))
+        return np.hstack([each.pull_back(*part) for each, *part in zip(self._maps, *parts, strict=True)])
+
+
+class DifferencedMap:
+    """Derivatives of x = T(u) by finite differences of it.
 
     Coordinates of noise are themselves. Others that no coordinate of x depends on together are moved at the same time,
     as Curtis, Powell and Reid ("On the estimation of sparse Jacobian matrices", 1974) do: where each x depends on its
     own u alone, one difference gives all of them.
     """
 
-    def __init__(self, inputs: Inputs) -> None:
-        self._base = inputs.base
-        self._identity = isinstance(inputs.base, StandardNormal)
-        self._moved = np.flatnonzero(~noise_mask(inputs))
+    def __init__(self, base: Distribution, noise: NDArray[np.bool_]) -> None:
+        self._base = base
+        self._moved = np.flatnonzero(~noise)
         self._groups: list[NDArray[np.int64]] | None = None
-        self._pattern = np.zeros((0, inputs.dim), dtype=bool)
+        self._pattern = np.zeros((0, len(noise)), dtype=bool)
 
     def pull_back(self, u: FloatArray, gradients: FloatArray) -> FloatArray:
         """Return the gradients (n, d) with respect to x at T(u), u (n, d), as gradients with respect to u."""
-        if self._identity:
-            return gradients
         if self._groups is None:
             self._find_pattern(u[:PATTERN_POINTS])
         result = gradients.copy()  # noise, where dx / du = I

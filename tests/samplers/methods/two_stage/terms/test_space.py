@@ -26,6 +26,11 @@ class Chained:
         x[:, 2] = stats.gamma.ppf(stats.norm.cdf(u[:, 2]), 3.0)
         return x
 
+    def to_standard_normal(self, x):
+        raise AssertionError("not needed")
+
+    log_prob = to_standard_normal
+
     @property
     def base(self):
         return self
@@ -55,6 +60,46 @@ def test_coordinates_that_do_not_meet_are_moved_together(rng):
     slopes.pull_back(u, np.ones((10, 8)))
     found = 3 * 2 * 5  # at three points, every moved coordinate up and down
     assert inputs.calls == found + 10 * 2 * 2
+
+
+class Doubled:
+    """x = 2 u, with its derivatives."""
+
+    dim = 2
+
+    def from_standard_normal(self, u):
+        return 2.0 * u
+
+    def sample(self, n, rng):
+        return self.from_standard_normal(rng.standard_normal((n, 2)))
+
+    def to_standard_normal(self, x):
+        return x / 2.0
+
+    def log_prob(self, x):
+        return np.zeros(len(x))
+
+    def pull_back(self, u, gradients):
+        return 2.0 * gradients
+
+
+class Beside(Chained):
+    """Blocks: 2 u, and those of `Chained`."""
+
+    dim = 10
+
+    def __init__(self):
+        super().__init__()
+        self.noise = np.concatenate([[False, False], self.noise])
+        self.blocks = (Doubled(), Chained())
+
+
+def test_blocks_are_differentiated_each_for_itself(rng):
+    inputs, u, gradients = Beside(), rng.standard_normal((4, 10)), rng.standard_normal((4, 10))
+    found = TransformSlopes(inputs).pull_back(u, gradients)
+    np.testing.assert_array_equal(found[:, :2], 2.0 * gradients[:, :2])
+    np.testing.assert_allclose(found[:, 2:], TransformSlopes(Chained()).pull_back(u[:, 2:], gradients[:, 2:]))
+    assert inputs.calls == 0
 
 
 def test_standard_normal_space_needs_no_transform():
