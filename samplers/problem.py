@@ -411,6 +411,8 @@ class FunctionProblem:
         try:
             return one_per_row(f, len(x))
         except EvaluationError as error:
+            if str(error).endswith(f"got {(len(x), 1)}."):  # as functions of OpenTURNS return
+                hint = "Return its only column, f(x)[:, 0]."
             raise EvaluationError(f"{error} {hint}") from error
 
 

@@ -127,6 +127,15 @@ def test_an_f_of_one_point_gets_a_hint(f):
     )
 
 
+def test_an_f_that_returns_a_column_is_told_to_take_it():
+    column = samplers.FunctionProblem(lambda x: 3.0 - x[:, :1], dim=2)
+    with pytest.raises(samplers.EvaluationError, match=r"got \(100, 1\)\. Return its only column, f\(x\)\[:, 0\]\."):
+        column.evaluate(np.zeros((100, 2)))
+    ragged = samplers.FunctionProblem(lambda x: [[1.0], [2.0, 3.0]], dim=2)
+    with pytest.raises(samplers.EvaluationError, match="pass vectorized=False"):
+        ragged.evaluate(np.zeros((2, 2)))
+
+
 def test_an_f_of_batches_that_raises_gets_none():
     def f(x):
         if (x[..., 0] > 1.0).any():

@@ -74,7 +74,9 @@ class OneLineErrors(SummarisedCommands):
                 code = super().main(*args, **{**extra, "standalone_mode": False})
         except _UsageError as error:
             words = getattr(error, "format_message")()  # noqa: B009  (its class differs by version)
-            _fail(f"{words.rstrip('.')}{'' if words.endswith('?') else '.'} See rare-envs --help.")
+            path = getattr(getattr(error, "ctx", None), "command_path", "rare-envs")
+            help_command = " ".join(["rare-envs", *path.split()[1:]])
+            _fail(f"{words.rstrip('.')}{'' if words.endswith('?') else '.'} See {help_command} --help.")
         except (BadInput, EgoGone) as error:
             _fail(str(error))
         except BrokenPipeError:  # whoever read the answer has enough of it

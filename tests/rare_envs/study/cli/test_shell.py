@@ -32,6 +32,19 @@ def test_a_wrong_command_is_one_line(cli: Cli, words: list[str]) -> None:
     assert_refused(cli(*words), words[-1])
 
 
+@pytest.mark.parametrize(
+    ("words", "command"),
+    [
+        (["estimat"], "rare-envs"),
+        (["list", "--loud"], "rare-envs list"),
+        (["corpus", "run"], "rare-envs corpus run"),
+        (["estimate", "--max-sim", "ten"], "rare-envs estimate"),
+    ],
+)
+def test_a_wrong_command_names_the_help_page_of_that_command(cli: Cli, words: list[str], command: str) -> None:
+    assert cli(*words).stderr.endswith(f" See {command} --help.\n")
+
+
 def test_json_is_one_object_and_nothing_else(cli: Cli, risky: str) -> None:
     result = cli(*SMALL, "--base", risky, "--json")
     assert result.exit_code == 0
