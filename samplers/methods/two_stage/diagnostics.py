@@ -75,7 +75,8 @@ def check_discovery(
     share = discovery.unseen_share(confidence)
     if share <= settings.max_unseen_share:
         return []
+    searches = f"{discovery.lineages:.0f}"
     return [
-        f"Only {discovery.lineages:.0f} independent searches reached failure: further failure regions with probability "
-        f"up to {p * share / (1 - share):.1e} ({share:.0%} of p) cannot be excluded."
+        f"Only {searches} independent search{'' if searches == '1' else 'es'} reached failure: further failure regions "
+        f"with probability up to {p * share / (1 - share):.1e} ({share:.0%} of p) cannot be excluded."
     ]

@@ -93,10 +93,13 @@ def test_regions_that_the_draws_hardly_reach(share, warns):
     assert check_regions(final(failing=0, expected=[1.0])) == []
 
 
-@pytest.mark.parametrize(("lineages", "warns"), [(2, True), (3, True), (4, False), (50, False)])
+@pytest.mark.parametrize(("lineages", "warns"), [(1, True), (2, True), (3, True), (4, False), (50, False)])
 def test_few_lineages(lineages, warns):
     """The 97.5 % points of Beta(1/10, nu) are 0.46, 0.31 and 0.24 for nu = 2, 3 and 4."""
     found = check_discovery(1e-3, Discovery(lineages), 0.95)
     assert bool(found) == warns
     if lineages == 2:
         assert "up to 8.4e-04 (46% of p)" in found[0]
+        assert found[0].startswith("Only 2 independent searches reached")
+    if lineages == 1:
+        assert found[0].startswith("Only 1 independent search reached")
