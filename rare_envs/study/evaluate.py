@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 import time
 from collections.abc import Callable
 from contextlib import closing
@@ -250,15 +251,15 @@ def _run(folder: Path, study: Study, journal: JournalFile, progress: bool, execu
         report = replace(report, seconds=report.seconds + earlier, earlier_seconds=earlier)
         _write(target, report)
     except UnwrittenResults as error:
-        raise UnwrittenResults(f"{error}{_resume_hint(journal, folder)}", error.report) from error
+        raise UnwrittenResults(f"{error}{_resume_hint(journal, folder, study.question.trust)}", error.report) from error
     except BadInput as error:
         if not journal.has_simulations:
             journal.remove()
             (target / STUDY).unlink(missing_ok=True)
-        raise BadInput(f"{error}{_resume_hint(journal, folder)}") from error
+        raise BadInput(f"{error}{_resume_hint(journal, folder, study.question.trust)}") from error
     except KeyboardInterrupt as error:
         report_so_far = error.report if isinstance(error, RunInterrupted) else None
-        raise RunInterrupted(f"Stopped.{_resume_hint(journal, folder)}", report_so_far) from None
+        raise RunInterrupted(f"Stopped.{_resume_hint(journal, folder, study.question.trust)}", report_so_far) from None
     journal.remove()
     return report
 
@@ -275,9 +276,9 @@ def _write(folder: Path, report: Report) -> None:
         ) from error
 
 
-def _resume_hint(journal: JournalFile, folder: Path) -> str:
+def _resume_hint(journal: JournalFile, folder: Path, trust: bool) -> str:
     """Return the number of simulations kept and the command that continues the run."""
     if not journal.has_simulations or not journal.kept:
         return ""
     kept = f"{journal.n:,} simulations are" if journal.n else "What was simulated is"
-    return f" {kept} kept; go on with: rare-envs resume {folder}"
+    return f" {kept} kept; go on with: rare-envs resume {shlex.quote(str(folder))}{' --trust' if trust else ''}"

@@ -8,11 +8,14 @@ from __future__ import annotations
 
 import hashlib
 import importlib.util
+import shlex
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 
-from agents.loading import strip_prefixes
+from agents.loading import find_ego_kind, strip_prefixes
 from agents.sb3.hub import HUB_PREFIX, find_cached_model
+from agents.sb3.normalisation import find_statistics
 from rare_envs.study.errors import BadInput
 from rare_envs.study.question import Question, read_question
 from rare_envs.study.storage.names import RESULT
@@ -45,11 +48,19 @@ def begin_journal(folder: Path, question: Question, force: bool = False) -> Jour
         if "already" not in str(error):
             raise BadInput(error) from error
         raise BadInput(
-            f"There is an unfinished run in {str(folder)!r}: continue it with rare-envs resume {folder}, or replace it "
+            f"There is an unfinished run in {str(folder)!r}: continue it with rare-envs resume {shlex.quote(str(folder))}, or replace it "
             "by --force."
         ) from error
     except OSError as error:
         raise BadInput(f"Cannot write to the folder {str(folder)!r}: {error.strerror}.") from error
+
+
+def refuse_unfinished(folder: Path) -> None:
+    """Raise a BadInput if a folder has a run that is not finished."""
+    if (folder / JOURNAL).exists():
+        raise BadInput(
+            f"The run in {str(folder)!r} is not finished: rare-envs resume {shlex.quote(str(folder))} comes first."
+        )
 
 
 def continue_journal(folder: Path, mend: bool = False) -> tuple[JournalFile, Question]:
@@ -85,7 +96,7 @@ def _advise_on_damage(error: str, folder: Path) -> str:
     if "damaged from its first record on" in error:
         return " Nothing can be taken from it: it is left as it is, and the command with --force replaces it."
     if "damaged" in error:
-        return f" What stands before the damage is kept by rare-envs resume {folder} --mend."
+        return f" What stands before the damage is kept by rare-envs resume {shlex.quote(str(folder))} --mend."
     return ""
 
 
@@ -106,9 +117,8 @@ def _read_question(journal: JournalFile) -> Question:
 
 
 def check_same_files(journal: JournalFile, question: Question) -> None:
-    """Raise a BadInput if a file that the question names has changed since the run was begun."""
-    before, now = journal.head.get("files") or {}, digest_files(question)
-    changed = sorted(name for name in before if name in now and now[name] != before[name])
+    """Raise a BadInput if a file that the question names has changed since the run was begun, wherever it lies now."""
+    changed = find_changed_files(journal.head.get("files") or {}, digest_files(question))
     if changed:
         raise BadInput(
             f"{', '.join(changed)} has changed since the run in {str(journal.path.parent)!r} was begun, and its "
@@ -116,17 +126,50 @@ def check_same_files(journal: JournalFile, question: Question) -> None:
         )
 
 
+def find_changed_files(before: Mapping[str, str], now: Mapping[str, str]) -> list[str]:
+    """Return the files of other content, those that are gone and those that are new; where a file lies does not matter.
+
+    Args:
+        before: Digests by path, of when a run was begun.
+        now: The same of this moment.
+
+    Example:
+        >>> find_changed_files({"a.zip": "1"}, {"moved/a.zip": "1"}), find_changed_files({"a.zip": "1"}, {"a.zip": "2"})
+        ([], ['a.zip'])
+    """
+    gone = {name for name, digest in before.items() if digest not in now.values()}
+    new = {name for name, digest in now.items() if digest not in before.values()}
+    return sorted(gone | new)
+
+
 def digest_files(question: Question) -> dict[str, str]:
-    """Return the BLAKE2b digests of the files that a question names, by path; modules are found, not imported.
+    """Return the BLAKE2b digests of the files of a question, by path; modules are found, not imported.
+
+    They are those that it names, and the `VecNormalize` statistics that are read with its ego.
 
     Example:
         >>> digest_files(Question(env_id="rare_envs/CutIn-v0"))
         {}
     """
     bases = [name.strip() for name in (question.also_under or "").split(",")]
-    names = [strip_prefixes(question.ego), question.base, question.drivers, question.measure, *bases]
+    names = [question.base, question.drivers, question.measure, *bases]
     paths = {path for name in names if name for path in find_named_files(name)}
-    return {str(path): hashlib.blake2b(path.read_bytes(), digest_size=16).hexdigest() for path in sorted(paths)}
+    return digest_contents(sorted(paths | set(find_ego_files(question))))
+
+
+def digest_contents(paths: Sequence[Path]) -> dict[str, str]:
+    """Return the BLAKE2b digests of files, by path."""
+    return {str(path): hashlib.blake2b(path.read_bytes(), digest_size=16).hexdigest() for path in paths}
+
+
+def find_ego_files(question: Question) -> list[Path]:
+    """Return the files of the ego of a question, the `VecNormalize` statistics that it is loaded with included."""
+    spec = strip_prefixes(question.ego)
+    files = find_named_files(spec)
+    if find_ego_kind(spec) not in ("zip", "hub"):
+        return files
+    found = [Path(question.stats)] if question.stats else [find_statistics(path) for path in files]
+    return [*files, *(path for path in found if path is not None and path.is_file())]
 
 
 def find_named_files(name: str) -> list[Path]:

@@ -16,10 +16,11 @@ from rare_envs.envs.rendering import AGENT, FRAME_WIDTH, Colour, Renderer
 from rare_envs.files import replace_file
 from rare_envs.json_text import parse_json_object
 from rare_envs.problem import DrivingProblem
+from rare_envs.study.analysis.moved_files import warn_of_changed_files
 from rare_envs.study.analysis.recorded_question import open_question
 from rare_envs.study.columns import MAX_SHOWN, format_value
 from rare_envs.study.errors import BadInput, as_bad_input
-from rare_envs.study.journal import JOURNAL
+from rare_envs.study.journal import refuse_unfinished
 from rare_envs.study.question import prepare
 from rare_envs.study.replay import Drive
 from rare_envs.study.storage.failure_table import read_failures
@@ -61,8 +62,7 @@ def find_failure(folder: Path, number: int, trust: bool = False) -> RecordedFail
     Raises:
         BadInput: There is no such run or failure, or what it was about cannot be loaded any longer.
     """
-    if (folder / JOURNAL).exists():
-        raise BadInput(f"The run in {str(folder)!r} is not finished: rare-envs resume {folder} comes first.")
+    refuse_unfinished(folder)
     try:
         recorded = parse_json_object((folder / RESULT).read_text(encoding="utf-8"), repr(str(folder / RESULT)))
         table = read_failures(folder)
@@ -73,6 +73,7 @@ def find_failure(folder: Path, number: int, trust: bool = False) -> RecordedFail
     except ValueError as error:
         raise BadInput(error) from error
     question = open_question(recorded.get("question"), folder, trust)
+    warn_of_changed_files(question, folder)
     with as_bad_input(TypeError, OverflowError, RecursionError, MemoryError):
         problem = prepare(question).problem
     count = len(table["f"])

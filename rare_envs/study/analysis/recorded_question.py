@@ -9,6 +9,7 @@ from typing import Any
 
 from agents.loading import find_ego_kind, strip_prefixes
 from rare_envs.code_trust import check_code_trust, note_own_run
+from rare_envs.study.analysis.moved_files import find_moved_files
 from rare_envs.study.errors import BadInput, as_bad_input
 from rare_envs.study.question import Question, read_question
 
@@ -23,7 +24,7 @@ _ADDRESS = "ego"
 def open_question(recorded: object, folder: Path, trust: bool) -> Question:
     """Return the question of a folder, if its values are of the right types and what code it names may run.
 
-    What simulates it (`core`) is chosen anew.
+    What simulates it (`core`) is chosen anew, and files that have moved with the folder are found.
 
     Args:
         recorded: Of the file.
@@ -42,7 +43,7 @@ def open_question(recorded: object, folder: Path, trust: bool) -> Question:
         raise BadInput(f"The question of the run in {str(folder)!r} has a name of more than {MAX_TEXT} letters.")
     with as_bad_input(ValueError):
         check_code_trust(_record(question), list_code(question), folder, trust)
-    return question
+    return find_moved_files(question, folder)
 
 
 def note_question(question: Question) -> None:

@@ -14,7 +14,7 @@ from rare_envs.json_text import parse_json_object
 from rare_envs.study.analysis.recorded_question import note_question, open_question
 from rare_envs.study.corpus.stored_failure import StoredFailure, make_stored, read_stored
 from rare_envs.study.errors import BadInput, as_bad_input, output_folder
-from rare_envs.study.journal import JOURNAL
+from rare_envs.study.journal import refuse_unfinished
 from rare_envs.study.question import read_question
 from rare_envs.study.storage.failure_table import CRASH, read_failures
 from rare_envs.study.storage.names import FAILURES, RESULT
@@ -68,8 +68,7 @@ def read_recorded(folder: Path) -> dict[str, Any]:
     Raises:
         BadInput: There is no such run, or it is not finished.
     """
-    if (folder / JOURNAL).exists():
-        raise BadInput(f"The run in {str(folder)!r} is not finished: rare-envs resume {folder} comes first.")
+    refuse_unfinished(folder)
     try:
         return parse_json_object((folder / RESULT).read_text(encoding="utf-8"), repr(str(folder / RESULT)))
     except OSError as error:

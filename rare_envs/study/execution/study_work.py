@@ -11,7 +11,7 @@ import agents
 from rare_envs.egos.errors import EgoFault
 from rare_envs.egos.faults import FaultTolerant, format_x
 from rare_envs.study.errors import BadInput
-from rare_envs.study.journal import digest_files
+from rare_envs.study.journal import digest_files, find_changed_files
 from rare_envs.study.question import Study, build_problem
 from samplers.execution.executors.chunks import Chunk, Packed
 from samplers.execution.executors.packing import pack_gradients, pack_terms
@@ -99,8 +99,7 @@ class StudyWork:
         question = self._question
         if question is None:
             return
-        found = digest_files(question)
-        changed = sorted(name for name, digest in self._files.items() if found.get(name) != digest)
+        changed = find_changed_files(self._files, digest_files(question))
         if changed:
             raise BadInput(f"{', '.join(changed)} is not here, or not the file with which the run was begun")
         ego = agents.load_ego(question.ego, algo=question.algo, trust=question.trust, stats=question.stats)

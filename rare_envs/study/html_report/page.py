@@ -12,6 +12,7 @@ import numpy as np
 
 from rare_envs.files import replace_text
 from rare_envs.plugins import one_line
+from rare_envs.study.analysis.moved_files import warn_of_changed_files
 from rare_envs.study.analysis.recorded_question import open_question
 from rare_envs.study.analysis.repeatability import Repeatability
 from rare_envs.study.columns import draw_ordinary, list_columns
@@ -32,7 +33,7 @@ from rare_envs.study.html_report.wording import (
     name_measure,
     summarise_answer,
 )
-from rare_envs.study.journal import JOURNAL
+from rare_envs.study.journal import refuse_unfinished
 from rare_envs.study.question import prepare
 from rare_envs.study.storage.loaded_study import LoadedStudy, load_study
 from rare_envs.study.storage.names import EPISODES, REPORT, RESULT, STUDY
@@ -73,8 +74,7 @@ def write_html_report(
     """
     if figures is not None and figures not in FORMATS:
         raise BadInput(f"Expected --figures {', '.join(FORMATS)}, got {figures!r}.")
-    if (folder / JOURNAL).exists():
-        raise BadInput(f"The run in {str(folder)!r} is not finished: rare-envs resume {folder} comes first.")
+    refuse_unfinished(folder)
     study, page = load_study(folder), out or folder / REPORT
     with output_file(page):
         return _write(study, page, trust, events, figures)
@@ -85,7 +85,9 @@ def _write(study: LoadedStudy, page: Path, trust: bool, events: Path | None, kin
     folder = study.folder
     with as_bad_input(ValueError):
         failures = study.failures
-    problem = prepare(open_question(study.question, folder, trust)).problem
+    question = open_question(study.question, folder, trust)
+    warn_of_changed_files(question, folder)
+    problem = prepare(question).problem
     columns = [column for column in list_columns(problem.space) if column.shown]
     known = None if events is None else read_recorded_events(events, [column.name for column in columns])
     ordinary = draw_ordinary(problem.space)

@@ -18,8 +18,9 @@ from agents.loading import find_ego_kind, strip_prefixes
 from rare_envs.distributions.fitted import FittedDistribution
 from rare_envs.files import replace_text
 from rare_envs.json_text import format_json, parse_json_object
+from rare_envs.study.analysis.moved_files import describe_places
 from rare_envs.study.analysis.recorded_question import is_same_question
-from rare_envs.study.journal import digest_files, find_named_files
+from rare_envs.study.journal import digest_contents, digest_files, find_ego_files
 from rare_envs.study.question import Question, Study
 from rare_envs.study.storage.names import STUDY, STUDY_FORMAT
 from rare_envs.study.storage.result_digests import digest_results
@@ -41,8 +42,8 @@ LIBRARIES = (
 """Distributions whose versions may change a number."""
 
 
-def describe_study(study: Study) -> dict[str, Any]:
-    """Return what study.json holds at the beginning of a run.
+def describe_study(study: Study, folder: Path = Path()) -> dict[str, Any]:
+    """Return what study.json holds at the beginning of a run, whose folder is given.
 
     Example:
         >>> from rare_envs.study import prepare
@@ -51,6 +52,7 @@ def describe_study(study: Study) -> dict[str, Any]:
         (5, 'rule', 'us101', {'name': 'gap', 'unit': 'm', 'size': 1})
     """
     question, space = study.question, study.problem.space
+    files = digest_files(question)
     rows = zip(space.names, space.units, space.sizes, strict=True)
     return {
         "format": STUDY_FORMAT,
@@ -65,7 +67,8 @@ def describe_study(study: Study) -> dict[str, Any]:
         "method": {"name": study.method.name, "settings": method_settings(study.method)},
         "parameters": [{"name": name, "unit": unit, "size": int(size)} for name, unit, size in rows],
         "question": asdict(question),
-        "files": digest_files(question),
+        "files": files,
+        "file_places": describe_places(files, folder),
         "versions": find_versions(),
         "platform": platform.platform(),
     }
@@ -77,7 +80,7 @@ def begin_study_file(folder: Path, study: Study) -> None:
     Raises:
         OSError: It cannot be written.
     """
-    replace_text(folder / STUDY, format_json(describe_study(study)) + "\n")
+    replace_text(folder / STUDY, format_json(describe_study(study, folder)) + "\n")
 
 
 def note_resumption(folder: Path, earlier_seconds: float) -> None:
@@ -111,7 +114,7 @@ def finish_study_file(folder: Path, study: Study, seconds: float) -> None:
     except (OSError, ValueError):  # of an earlier version, or somebody has removed it
         begun = {"question": None}
     if "question" in begun and not is_same_question(begun["question"], study.question):
-        begun = describe_study(study)
+        begun = describe_study(study, folder)
     ended = {"finished": _now(), "seconds": seconds, "results": digest_results(folder)}
     replace_text(folder / STUDY, format_json({**begun, **ended}) + "\n")
 
@@ -129,8 +132,7 @@ def find_versions() -> dict[str, str]:
 
 def _describe_ego(question: Question) -> dict[str, Any]:
     """Return name, kind and fingerprint of the ego: of its files, or of this version where it comes with it."""
-    paths = find_named_files(strip_prefixes(question.ego))
-    files = {str(path): hashlib.blake2b(path.read_bytes(), digest_size=16).hexdigest() for path in paths}
+    files = digest_contents(find_ego_files(question))
     rests_on = "".join(sorted(files.values())) or f"{question.ego} of rare-envs {__version__}"
     return {
         "name": question.ego,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -88,7 +89,8 @@ def train_ego_command(
     if HYPERPARAMETERS[algo].discrete and options.action is None:
         world["action"] = "discrete"  # which is what the algorithm made of it
     seed_words = "" if next_seed is None else f" --seed {next_seed}"
-    print(f"Saved {path}. Next: rare-envs estimate {env} --ego {path}{_estimate_options(world, noise)}{seed_words}")
+    words = f"rare-envs estimate {env} --ego {shlex.quote(str(path))}{_estimate_options(world, noise)}{seed_words}"
+    print(f"Saved {path}. Next: {words}")
 
 
 def _read_plan(
@@ -120,7 +122,9 @@ def _estimate_options(world: dict[str, Any], noise: NoiseChoice) -> str:
     """Return the options with which `estimate` makes the world that an ego was trained in."""
     usual = {"noise": NoiseChoice.ON.value, "observation": "features", "action": "continuous", "collisions": "ego"}
     values = {**world, "noise": noise.value, "weather": None}
-    words = [f" --{name} {value}" for name, value in values.items() if value not in (None, usual.get(name))]
+    words = [
+        f" --{name} {shlex.quote(str(value))}" for name, value in values.items() if value not in (None, usual.get(name))
+    ]
     return "".join(words) + (" --weather" if world["weather"] else "")
 
 

@@ -1,0 +1,114 @@
+"""Files that a run names, found again where its folder has moved together with them."""
+
+from __future__ import annotations
+
+import os
+import re
+import warnings
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from rare_envs.json_text import parse_json_object
+from rare_envs.study.errors import BadInput, as_bad_input
+from rare_envs.study.journal import digest_contents, digest_files, find_changed_files
+from rare_envs.study.question import Question
+from rare_envs.study.storage.names import STUDY
+
+_FIELDS = ("ego", "stats", "base", "drivers", "measure", "also_under")
+"""Fields of a question that can name files."""
+
+
+def describe_places(files: Iterable[str], folder: Path) -> dict[str, str]:
+    """Return where files lie as seen from the folder of a run, by their paths.
+
+    Example:
+        >>> describe_places(["egos/a.zip"], Path("runs/a"))
+        {'egos/a.zip': '../../egos/a.zip'}
+    """
+    places = {}
+    for name in files:
+        try:
+            places[name] = Path(os.path.relpath(name, folder)).as_posix()
+        except ValueError:  # another drive of Windows
+            continue
+    return places
+
+
+def find_moved_files(question: Question, folder: Path) -> Question:
+    """Return the question of a run with files that are not where they were in the places that they have now.
+
+    A file is looked for where it lay as seen from the folder of the run; its content must be what it was.
+
+    Args:
+        question: As the run recorded it.
+        folder: Of the run.
+
+    Raises:
+        BadInput: A file has moved with the folder, and has changed.
+    """
+    about = _read_about(folder)
+    before, places = (_texts(about.get(name)) for name in ("files", "file_places"))
+    with as_bad_input(OSError, ValueError):  # names of somebody else's making
+        moved = dict(_list_moved(before, places, folder))
+    return replace(question, **{name: _rename(getattr(question, name), moved) for name in _FIELDS})
+
+
+def warn_of_changed_files(question: Question, folder: Path) -> None:
+    """Warn where a file of a run, or the statistics beside its ego, are not what they were when it was begun.
+
+    Args:
+        question: With the places that files have now.
+        folder: Of the run; one of an earlier version has no digests and is not compared.
+    """
+    about = _read_about(folder)
+    changed = find_changed_files(_texts(about["files"]), digest_files(question)) if "files" in about else []
+    if changed:
+        warnings.warn(
+            f"{', '.join(changed)} changed since the run in {str(folder)!r} was begun, whose numbers are of what it "
+            "was before.",
+            stacklevel=2,
+        )
+
+
+def _list_moved(before: Mapping[str, str], places: Mapping[str, str], folder: Path) -> Iterator[tuple[str, str]]:
+    """Yield the files that have moved, each with its new path."""
+    for name in sorted(before.keys() & places.keys()):
+        path = folder / places[name]
+        if _digest(Path(name)) == before[name] or not path.is_file():
+            continue
+        if _digest(path) == before[name]:
+            yield name, str(path)
+        elif not Path(name).is_file():
+            raise BadInput(
+                f"{str(path)!r} has changed since the run in {str(folder)!r} was begun, which names it as {name!r}: "
+                "put the earlier file there, or begin anew."
+            )
+
+
+def _digest(path: Path) -> str | None:
+    """Return the digest of a file; None where there is none."""
+    return digest_contents([path])[str(path)] if path.is_file() else None
+
+
+def _rename(value: str | None, moved: Mapping[str, str]) -> str | None:
+    """Return what a field names, such as noisy:a.zip?delay=1, with the new paths of files."""
+    for name, now in moved.items() if value is not None else ():
+        whole = rf"(?:^|(?<=[:,\s])){re.escape(name)}(?=$|[?:,\s])"
+        value = re.sub(whole, lambda _, now=now: now, str(value))
+    return value
+
+
+def _read_about(folder: Path) -> dict[str, Any]:
+    """Return what study.json holds; nothing where it cannot be read, which others tell."""
+    try:
+        return parse_json_object((folder / STUDY).read_text(encoding="utf-8"), STUDY)
+    except (OSError, ValueError):
+        return {}
+
+
+def _texts(value: object) -> dict[str, str]:
+    """Return the entries of an object that are texts."""
+    found = value.items() if isinstance(value, dict) else ()
+    return {str(name): text for name, text in found if isinstance(text, str)}
