@@ -48,8 +48,8 @@ def begin_journal(folder: Path, question: Question, force: bool = False) -> Jour
         if "already" not in str(error):
             raise BadInput(error) from error
         raise BadInput(
-            f"There is an unfinished run in {str(folder)!r}: continue it with rare-envs resume {shlex.quote(str(folder))}, or replace it "
-            "by --force."
+            f"There is an unfinished run in {str(folder)!r}: continue it with rare-envs resume "
+            f"{shlex.quote(str(folder))}, or replace it by --force."
         ) from error
     except OSError as error:
         raise BadInput(f"Cannot write to the folder {str(folder)!r}: {error.strerror}.") from error

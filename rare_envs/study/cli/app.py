@@ -41,6 +41,7 @@ from rare_envs.study.cli.shell import (
     DOUBTFUL,
     OneLineErrors,
     SummarisedCommands,
+    ignore_signals,
     keep_stdout_for_the_answer,
     print_json,
     show_what_is_known,
@@ -206,7 +207,10 @@ app.info.epilog = format_examples("")
 
 def main() -> None:
     """Run the command line; alone, it shows its help."""
-    app(sys.argv[1:] or ["--help"], prog_name="rare-envs")
+    try:
+        app(sys.argv[1:] or ["--help"], prog_name="rare-envs")
+    finally:
+        ignore_signals()
 
 
 if __name__ == "__main__":

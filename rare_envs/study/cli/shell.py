@@ -69,9 +69,12 @@ class OneLineErrors(SummarisedCommands):
     def main(self, *args: Any, **extra: Any) -> NoReturn:
         """Run a command and exit."""
         received: list[int] = []
+        code: Any = None
+        ended = False
         try:
             with signals_as_exceptions(received), one_line_warnings():
                 code = super().main(*args, **{**extra, "standalone_mode": False})
+                ended = code != 128 + signal.SIGINT
         except _UsageError as error:
             words = getattr(error, "format_message")()  # noqa: B009  (its class differs by version)
             path = getattr(getattr(error, "ctx", None), "command_path", "rare-envs")
@@ -83,8 +86,8 @@ class OneLineErrors(SummarisedCommands):
             os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # nothing more to say when Python flushes
             sys.exit(128 + _SIGPIPE)
         except (KeyboardInterrupt, typer.Abort):
-            code = 128 + signal.SIGINT
-        if received or code == 128 + signal.SIGINT:
+            pass
+        if not ended:
             number = signal.Signals(received[0] if received else signal.SIGINT)
             _print_stderr(f"rare-envs: stopped by {number.name}")
             code = 128 + number
@@ -148,6 +151,13 @@ def signals_as_exceptions(received: list[int]) -> Iterator[None]:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
+
+
+def ignore_signals() -> None:
+    """Ignore signals to end, for a process that has given its answer and is about to end by itself."""
+    for name in ("SIGINT", "SIGTERM", "SIGHUP"):
+        if hasattr(signal, name):
+            signal.signal(getattr(signal, name), signal.SIG_IGN)
 
 
 @contextlib.contextmanager

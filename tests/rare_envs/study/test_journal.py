@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shlex
 import subprocess
 import sys
 import threading
@@ -114,6 +115,18 @@ def test_the_answer_is_that_of_an_undisturbed_run(method: str, after: int, again
     for name in ("failures.csv", "faults.csv"):
         assert (frail / "run" / name).read_bytes() == (frail / "whole" / name).read_bytes()
     assert not (frail / "run" / JOURNAL).exists()
+
+
+def test_the_command_that_goes_on_can_be_typed(frail: Path, risky: str) -> None:
+    folder = frail / "my run"
+    (frail / "left").write_text("150")
+    with pytest.raises(BadInput, match="go on with") as stopped:
+        evaluate.run_into(folder, prepare(replace(question(risky, "mc"), trust=True)))
+    words = shlex.split(str(stopped.value).partition("go on with: ")[2])
+    assert words == ["rare-envs", "resume", str(folder), "--trust"]
+    with pytest.raises(BadInput, match="unfinished run") as begun:
+        evaluate.run_into(folder, prepare(question(risky, "mc")))
+    assert shlex.quote(str(folder)) in str(begun.value)
 
 
 def test_a_search_by_terms_is_continued_like_any_other(frail: Path) -> None:

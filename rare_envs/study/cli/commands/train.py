@@ -122,10 +122,11 @@ def _estimate_options(world: dict[str, Any], noise: NoiseChoice) -> str:
     """Return the options with which `estimate` makes the world that an ego was trained in."""
     usual = {"noise": NoiseChoice.ON.value, "observation": "features", "action": "continuous", "collisions": "ego"}
     values = {**world, "noise": noise.value, "weather": None}
-    words = [
-        f" --{name} {shlex.quote(str(value))}" for name, value in values.items() if value not in (None, usual.get(name))
-    ]
-    return "".join(words) + (" --weather" if world["weather"] else "")
+    told = {name: str(value) for name, value in values.items() if value not in (None, usual.get(name))}
+    words = "".join(f" --{name} {shlex.quote(value)}" for name, value in told.items())
+    return words + (" --weather" if world["weather"] else "")
+        " --weather" if world["weather"] else ""
+    )
 
 
 @spread_options

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import re
@@ -12,14 +13,18 @@ import warnings
 from pathlib import Path
 
 import pytest
+import typer
+from typer.testing import CliRunner
 
 from rare_envs.study.cli.shell import (
+    OneLineErrors,
     Terminated,
     keep_stdout_for_the_answer,
     name_options,
     one_line_warnings,
     signals_as_exceptions,
 )
+from rare_envs.study.errors import BadInput
 from tests.rare_envs.study.refusals import FOLLOWING, SMALL, Cli, assert_refused
 
 
@@ -112,6 +117,43 @@ def test_a_signal_that_the_user_has_ignored_stays_so() -> None:
         assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
     finally:
         signal.signal(signal.SIGHUP, before)
+
+
+@pytest.mark.parametrize(("code", "said"), [(0, ""), (2, "rare-envs: no room\n"), (3, "")])
+def test_a_signal_hides_neither_an_answer_nor_an_error(code: int, said: str) -> None:
+    app = typer.Typer(cls=OneLineErrors)
+
+    @app.command("other")
+    def other() -> None:
+        """A second one, so that there is a group."""
+
+    @app.command("answer")
+    def answer() -> None:
+        """A command in which the signal is caught, as by an ego that catches everything."""
+        with contextlib.suppress(KeyboardInterrupt):
+            os.kill(os.getpid(), signal.SIGTERM)
+        if code == 2:
+            raise BadInput("no room")
+        print("the answer")
+        raise typer.Exit(code)
+
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
+    result = CliRunner().invoke(app, ["answer"])
+    assert (result.exit_code, result.stderr) == (code, said)
+    assert {number: signal.getsignal(number) for number in before} == before
+
+
+@pytest.mark.parametrize("name", ["SIGINT", "SIGTERM", "SIGHUP"])
+def test_a_signal_after_the_answer_changes_nothing(name: str) -> None:
+    program = (
+        "import atexit, os, signal, sys\n"
+        "from rare_envs.study.cli.app import main\n"
+        f"atexit.register(lambda: os.kill(os.getpid(), signal.{name}))\n"
+        "sys.argv = ['rare-envs', '--version']\n"
+        "main()\n"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (0, "") and done.stdout.startswith("rare-envs ")
 
 
 @pytest.mark.parametrize(
