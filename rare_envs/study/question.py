@@ -18,6 +18,7 @@ import samplers
 from rare_envs.distributions.fitted import FittedDistribution
 from rare_envs.distributions.space import Distribution
 from rare_envs.egos.errors import EgoGone
+from rare_envs.measures.registry import MEASURES
 from rare_envs.problem import AmbiguousActions, DrivingProblem, MissingStatistics
 from rare_envs.scenarios.base_distributions import load_base
 from rare_envs.scenarios.registry import find_scenario, split_layout
@@ -261,6 +262,7 @@ def prepare(question: Question, ego: Any = None) -> Study:
         if ego is None:
             ego = agents.load_ego(question.ego, algo=question.algo, trust=question.trust, stats=question.stats)
         problem = build_problem(question, ego)
+        _check_threshold(question)
         observation, action = problem.world.sensing.observation, problem.world.clock.action
         study = Study(replace(question, observation=observation, action=action, core=problem.core), problem, method)
         names = [name.strip() for name in (question.also_under or "").split(",") if name.strip()]
@@ -271,6 +273,29 @@ def prepare(question: Question, ego: Any = None) -> Study:
         others = {name: study.under(name).problem.base for name in names}
     problem.varies = problem.varies or _answers_vary(problem)
     return replace(study, other_bases=others, ego_was_given=given)
+
+
+def _check_threshold(question: Question) -> None:
+    """Refuse a threshold below every value that a measure of this package takes; warn of one at which crashes count.
+
+    Raises:
+        ValueError: f <= gamma cannot happen.
+    """
+    measure = MEASURES.get(question.measure)
+    least = getattr(measure, "collision", None)
+    if not isinstance(least, float) or question.gamma >= 0.0:
+        return
+    if question.gamma < least:
+        raise ValueError(
+            f"Expected gamma of at least {least:g}, which is f of a collision and the least value of "
+            f"{question.measure}, got {question.gamma:g}: f <= gamma cannot happen. Take --gamma 0 for collisions."
+        )
+    if getattr(measure, "collisions_only", False):
+        warnings.warn(
+            f"{question.measure} is below 0 in collisions alone, where it is {least:g}: --gamma {question.gamma:g} "
+            "counts collisions, as --gamma 0 does; --measure margin grades them by speed.",
+            stacklevel=3,
+        )
 
 
 def build_problem(question: Question, ego: Any) -> DrivingProblem:

@@ -149,5 +149,5 @@ def test_a_damaged_file_is_read_or_refused_in_one_line(name: str, n: int, here: 
         result = cli(*kind.words)
         assert_one_line(result, 0, 3, 4)
         n_refused += result.exit_code == 2
-    assert n_refused >= n // 10
+    assert n_refused >= max(1, n // 10)
     assert not (here / MARK).exists()

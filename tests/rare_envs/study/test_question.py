@@ -114,3 +114,19 @@ def test_what_is_known_before_the_ego_is_loaded_is_checked_first(wrong: dict[str
         question.check()
     with pytest.raises(BadInput, match=message):
         prepare(question)
+
+
+@pytest.mark.parametrize(("measure", "gamma"), [("ttc", -1.5), ("clearance", -2.0), ("drac", -1e6)])
+def test_a_threshold_that_nothing_reaches_is_refused(measure: str, gamma: float) -> None:
+    with pytest.raises(BadInput, match="cannot happen"):
+        prepare(Question(env_id="rare_envs/CarFollowing-v0", measure=measure, gamma=gamma))
+
+
+def test_a_threshold_that_only_collisions_reach_is_told() -> None:
+    with pytest.warns(UserWarning, match="counts collisions, as --gamma 0 does"):
+        prepare(Question(env_id="rare_envs/CarFollowing-v0", gamma=-1.0))
+
+
+@pytest.mark.parametrize(("measure", "gamma"), [("margin", -5.0), ("rss_margin", -3.0), ("ttb", -1.0), ("ttc", 0.0)])
+def test_a_threshold_within_the_values_of_a_measure_is_taken(measure: str, gamma: float) -> None:
+    assert prepare(Question(env_id="rare_envs/CarFollowing-v0", measure=measure, gamma=gamma)).question.gamma == gamma

@@ -125,8 +125,6 @@ def _estimate_options(world: dict[str, Any], noise: NoiseChoice) -> str:
     told = {name: str(value) for name, value in values.items() if value not in (None, usual.get(name))}
     words = "".join(f" --{name} {shlex.quote(value)}" for name, value in told.items())
     return words + (" --weather" if world["weather"] else "")
-        " --weather" if world["weather"] else ""
-    )
 
 
 @spread_options
