@@ -48,7 +48,7 @@ def print_report(report: Report, out: Path | None = None) -> None:
     console.print(f"  {f'{100 * estimate.confidence:g} % interval':<15} {low:.3e} to {high:.3e}{ends}")
     if limited:
         console.print(f"  {'limit':<15} {report.verdict}", style="bold")
-    for line in indent_lines(estimate.base_uncertainty):
+    for line in indent_lines(estimate.base_uncertainty or _describe_fixed_base(report)):
         console.print(line)
     _print_other_bases(console, report)
     _print_rate(console, report)
@@ -88,6 +88,12 @@ def print_report(report: Report, out: Path | None = None) -> None:
     if out is not None:
         names = ", ".join(path.name for path in sorted(out.iterdir()) if path.is_file())
         console.print(f"written to {out}: {names}")
+
+
+def _describe_fixed_base(report: Report) -> str:
+    """Return that nothing is known of the error of the base distribution."""
+    name = report.study.base_name
+    return f"base distribution  no interval: {name!r} has no refits to events, so p takes it as the truth"
 
 
 def _format_time(report: Report) -> str:

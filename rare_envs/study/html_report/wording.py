@@ -12,6 +12,8 @@ from rare_envs.study.crash_kinds import KIND_DESCRIPTIONS
 from rare_envs.study.rates.text import format_interval, format_rate
 
 Result = Mapping[str, Any]
+WIDE = 10.0
+"""Ratio of the ends of the interval of the base distribution from which on the report warns of it."""
 SIZED_BY_BUDGET = ("mc", "is", "two-stage", "surrogate")
 """Methods whose setting n is their budget where max_sim does not say; the n of others is that of a level."""
 
@@ -160,6 +162,32 @@ def describe_intervals(result: Result) -> list[tuple[str, str, str]]:
             )
         )
     return rows
+
+
+def describe_wide_base(result: Result) -> str:
+    """Return how far the events behind the base distribution leave p open; empty where that is less than `WIDE`.
+
+    Example:
+        >>> base = {"interval": [1e-5, 2e-3], "fitted_to": "38 events"}
+        >>> describe_wide_base({"p": 1e-4, "base_uncertainty": base})
+        'the recorded events leave p open by a factor of 200, from 1.0 × 10⁻⁵ to 2.0 × 10⁻³ (38 events)'
+        >>> describe_wide_base({"p": 1e-4, "base_uncertainty": {**base, "interval": [1e-3, 2e-3]}})
+        ''
+    """
+    base = result.get("base_uncertainty")
+    if not isinstance(base, dict) or not result["p"]:
+        return ""
+    behind, ends = f" ({base.get('fitted_to', '')})", base.get("interval")
+    if ends is None:
+        return f"the recorded events do not bound p{behind}: {base.get('reason') or 'its spread is too large'}"
+    low, high = (float(end) for end in ends)
+    if high < WIDE * low or high <= 0.0:
+        return ""
+    factor = f"by a factor of {float(f'{high / low:.2g}'):,.0f}, " if low > 0.0 else ""
+    return (
+        f"the recorded events leave p open {factor}from {format_probability(low, low)} to "
+        f"{format_probability(high, low)}{behind}"
+    )
 
 
 def describe_rate(result: Result) -> list[str]:

@@ -159,6 +159,18 @@ def test_doubts_are_those_of_method_base_and_f() -> None:
     assert list_doubts({"doubtful": False}) == [] and len(list_doubts({"doubtful": True})) == 1
 
 
+@pytest.mark.parametrize(
+    ("interval", "said"),
+    [([1e-5, 1e-2], "by a factor of 1,000"), (None, "do not bound p"), ([1e-3, 3e-3], "No warnings")],
+)
+def test_a_wide_interval_of_the_base_is_a_warning(interval: list[float] | None, said: str, folder: Path) -> None:
+    study = load_study(folder)
+    base = {"interval": interval, "fitted_to": "38 events", "confidence": 0.95, "expected": None}
+    result = {**study.result, "warnings": [], "doubtful": False, "base_uncertainty": base}
+    text = render_page(replace(study, result=result), {}, [])
+    assert said in text and ("The run has no doubts" in text) == (said == "No warnings")
+
+
 def test_a_warning_beside_an_exact_bound_is_a_note(
     folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
