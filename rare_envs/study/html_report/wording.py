@@ -12,7 +12,7 @@ from rare_envs.study.crash_kinds import KIND_DESCRIPTIONS
 from rare_envs.study.rates.text import format_interval, format_rate
 
 Result = Mapping[str, Any]
-WIDE = 10.0
+WIDE_BASE = 10.0
 """Ratio of the ends of the interval of the base distribution from which on the report warns of it."""
 SIZED_BY_BUDGET = ("mc", "is", "two-stage", "surrogate")
 """Methods whose setting n is their budget where max_sim does not say; the n of others is that of a level."""
@@ -165,7 +165,7 @@ def describe_intervals(result: Result) -> list[tuple[str, str, str]]:
 
 
 def describe_wide_base(result: Result) -> str:
-    """Return how far the events behind the base distribution leave p open; empty where that is less than `WIDE`.
+    """Return how far the events behind the base distribution leave p open; empty where that is less than `WIDE_BASE`.
 
     Example:
         >>> base = {"interval": [1e-5, 2e-3], "fitted_to": "38 events"}
@@ -181,7 +181,7 @@ def describe_wide_base(result: Result) -> str:
     if ends is None:
         return f"the recorded events do not bound p{behind}: {base.get('reason') or 'its spread is too large'}"
     low, high = (float(end) for end in ends)
-    if high < WIDE * low or high <= 0.0:
+    if high < WIDE_BASE * low or high <= 0.0:
         return ""
     factor = f"by a factor of {float(f'{high / low:.2g}'):,.0f}, " if low > 0.0 else ""
     return (

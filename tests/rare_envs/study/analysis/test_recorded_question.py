@@ -102,6 +102,7 @@ def test_a_received_run_is_not_resumed_without_trust(name: str, received: Path, 
     assert not Path("was_here").exists()
 
 
+@pytest.mark.filterwarnings("ignore:.*changed since the run")  # the folder is that of another ego
 def test_trust_is_asked_for_once(received: Path) -> None:
     change_question(received, ego="evil:make")
     assert find_failure(received, 0, trust=True).n_found > 0
@@ -118,7 +119,8 @@ def test_a_run_of_ones_own_needs_no_trust(received: Path, tmp_path: Path) -> Non
     run_into(tmp_path / "mine", prepare(question))
     with Path("evil.py").open("a") as file:
         file.write("\nmended = True\n")
-    assert find_failure(tmp_path / "mine", 0).n_found > 0
+    with pytest.warns(UserWarning, match=r"evil\.py changed since the run in .*mine' was begun"):
+        assert find_failure(tmp_path / "mine", 0).n_found > 0
 
 
 QUESTIONS: dict[str, Any] = {
