@@ -317,6 +317,7 @@ def test_an_ego_that_has_changed_is_noticed(frail: Path, risky: str) -> None:
     with pytest.raises(BadInput, match=r"f is .* at a point where .*: it has changed"):
         evaluate.resume(frail / "run")
     (frail / "frail.py").write_text(before)
+    change_head(frail / "run" / JOURNAL, files=digest_files(question(risky, "mc")))
     sys.modules.pop("frail")
     assert evaluate.resume(frail / "run").estimate.n_sim == 1200
 
