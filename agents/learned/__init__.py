@@ -1,6 +1,7 @@
 """Learned drivers: networks, coloured noise, checkpoints and the distribution of their weights."""
 
 from agents.learned.checkpoints import Provenance, load_driver, read_driver, read_provenance, save_driver
+from agents.learned.collision_avoidance import CollisionAvoidance
 from agents.learned.coloured_noise import AutoregressiveNoise
 from agents.learned.driver import LearnedDriver, LearnedEgo, replace_head
 from agents.learned.networks import Policy, Scaling, head_weights
@@ -9,6 +10,7 @@ from agents.learned.weight_distribution import WeightDistribution
 
 __all__ = [
     "AutoregressiveNoise",
+    "CollisionAvoidance",
     "LearnedDriver",
     "LearnedEgo",
     "Policy",

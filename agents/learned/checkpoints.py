@@ -2,7 +2,8 @@
 
 The tensors are those of the network, with its scaling and the cap of its log standard deviation. If the last layer's
 weights have a distribution, its mean and the non-zero entries of its precision follow. The rest is JSON in the header:
-features, noise colour, limits of the actions, and where the driver comes from. Reading a file runs no code in it.
+features, noise colour, limits of the actions, the rule of collision avoidance if it has one, and where the driver comes
+from. Reading a file runs no code in it.
 """
 
 import difflib
@@ -20,6 +21,7 @@ import torch
 from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
+from agents.learned.collision_avoidance import CollisionAvoidance
 from agents.learned.coloured_noise import AutoregressiveNoise
 from agents.learned.driver import LearnedDriver
 from agents.learned.networks import ACTION_SIZE, FEATURE_CLIP, FEATURE_SIZE, HEAD_SIZE, Policy, Scaling
@@ -67,8 +69,9 @@ def load_driver(name: str | PathLike[str]) -> LearnedDriver | RuleDriver | LaneC
     """Load a driver by its name or from its file.
 
     Args:
-        name: "mgail", "gail" or "bc", which are shipped, and "imitation", which was trained to be an ego; "idm", the
-            rule-based driver, and "idm+mobil", which changes lanes too; or the path of a file that `save_driver` wrote.
+        name: "mgail2", "mgail", "gail" or "bc", which are shipped, and "imitation", which was trained to be an ego;
+            "idm", the rule-based driver, and "idm+mobil", which changes lanes too; or the path of a file that
+            `save_driver` wrote.
 
     Returns:
         A `LearnedDriver`, or a `RuleDriver` or `LaneChangingDriver` with its default parameters.
@@ -136,6 +139,7 @@ def save_driver(driver: LearnedDriver, provenance: Provenance, path: str | PathL
         "colour": asdict(driver.colour),
         "acceleration": driver.acceleration,
         "yaw_rate": driver.yaw_rate,
+        "avoidance": None if driver.avoidance is None else asdict(driver.avoidance),
         "radius": None if driver.weights is None else driver.weights.radius,
         **asdict(provenance),
     }
@@ -160,6 +164,7 @@ def read_driver(path: str | PathLike[str]) -> LearnedDriver:
     _check_header(header, path)
     check_finite(tensors, path)
     policy = _policy(tensors, path)
+    rule = header.get("avoidance")  # earlier files have none
     try:
         return LearnedDriver(
             policy,
@@ -167,6 +172,7 @@ def read_driver(path: str | PathLike[str]) -> LearnedDriver:
             acceleration=header["acceleration"],
             yaw_rate=header["yaw_rate"],
             weights=_weights(tensors, header["radius"], path),
+            avoidance=None if rule is None else CollisionAvoidance(**rule),
             name=header["name"],
         )
     except (AttributeError, TypeError, ValueError) as error:

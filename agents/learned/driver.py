@@ -9,6 +9,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from agents.learned.collision_avoidance import CollisionAvoidance
 from agents.learned.coloured_noise import WHITE_NOISE, AutoregressiveNoise
 from agents.learned.networks import (
     ACTION_SIZE,
@@ -69,6 +70,8 @@ class LearnedDriver:
     """Distribution of the 404 weights of the last layer; None if no ensemble was fitted."""
     name: str = "learned"
     """Names the driver in results, such as "mgail"."""
+    avoidance: CollisionAvoidance | None = None
+    """Rule that bounds the actions; None for the network's own."""
     noisy: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
@@ -120,11 +123,12 @@ class LearnedDriver:
         scaling = policy.scaling
         action = scaling.action_mean + scaling.action_std * normal
         low, high = action.new_tensor(tuple(zip(self.acceleration, self.yaw_rate, strict=True)))
-        return action.clamp(low, high).to(features.dtype), memory
+        action = action.clamp(low, high).to(features.dtype)
+        return action if self.avoidance is None else self.avoidance.limit(features, action), memory
 
     def dense_driver(self) -> DenseDriver | None:
-        """Return its present numbers for compiled rollouts; None if its class or its network was changed."""
-        if type(self) is not LearnedDriver or type(self.colour) is not AutoregressiveNoise:
+        """Return its numbers for compiled rollouts; None with a rule, or if its class or its network was changed."""
+        if type(self) is not LearnedDriver or type(self.colour) is not AutoregressiveNoise or self.avoidance:
             return None
         layers = read_layers(self.policy)
         if layers is None:
