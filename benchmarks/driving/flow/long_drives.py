@@ -245,9 +245,12 @@ def main(
     result: Annotated[Path, typer.Option("--json", help="File for the result.")] = RESULTS / "long_drives.json",
 ) -> None:
     """Drive, print the table and write the result."""
-    learned: Any = load_driver("mgail")
+    learned: dict[str, Any] = {name: load_driver(name) for name in ("mgail", "mgail2")}
     drivers = {
-        "mgail": by_features(sampling_driver(learned, torch.Generator().manual_seed(seed))),
+        **{
+            name: by_features(sampling_driver(driver, torch.Generator().manual_seed(seed)))
+            for name, driver in learned.items()
+        },
         "idm": by_features(rule_driver),
         "idm+mobil": by_lanes(LaneChangingDriver()),
     }
