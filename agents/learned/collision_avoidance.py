@@ -1,10 +1,10 @@
 """Collision avoidance: limits of a driver's actions, from what its lidar features tell.
 
 References:
-    Krauss, "Microscopic modeling of traffic flow", 1998, equation (3.3), after Gipps, "A behavioural car-following
+    Krauss, "Microscopic modeling of traffic flow", 1998, after Gipps, "A behavioural car-following
     model for computer simulation", 1981: the safe speed.
     Treiber and Kesting, "Traffic Flow Dynamics", 2013, chapter 11: the kinematic deceleration and usual values.
-    AASHTO, "A Policy on Geometric Design of Highways and Streets", 2011, section 2.1: turning radius of a car.
+    AASHTO, "A Policy on Geometric Design of Highways and Streets", 2011, table 2-2: turning radius of a car.
 """
 
 from __future__ import annotations
