@@ -52,7 +52,8 @@ def find_moved_files(question: Question, folder: Path) -> Question:
     before, places = (_texts(about.get(name)) for name in ("files", "file_places"))
     with as_bad_input(OSError, ValueError):  # names of somebody else's making
         moved = dict(_list_moved(before, places, folder))
-    return replace(question, **{name: _rename(getattr(question, name), moved) for name in _FIELDS})
+    renamed: dict[str, Any] = {name: _rename(getattr(question, name), moved) for name in _FIELDS}  # fields by name
+    return replace(question, **renamed)
 
 
 def warn_of_changed_files(question: Question, folder: Path) -> None:
@@ -96,7 +97,7 @@ def _rename(value: str | None, moved: Mapping[str, str]) -> str | None:
     """Return what a field names, such as noisy:a.zip?delay=1, with the new paths of files."""
     for name, now in moved.items() if value is not None else ():
         whole = rf"(?:^|(?<=[:,\s])){re.escape(name)}(?=$|[?:,\s])"
-        value = re.sub(whole, lambda _, now=now: now, str(value))
+        value = now.join(re.split(whole, str(value)))
     return value
 
 
