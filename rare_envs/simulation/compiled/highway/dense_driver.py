@@ -79,5 +79,5 @@ def read_dense_driver(offer: OffersDenseDriver) -> DenseDriver:
     """
     driver = offer.dense_driver()
     if driver is None:
-        raise NotCompiled(f"a {type(offer).__name__} whose network or methods were changed is not compiled")
+        raise NotCompiled(f"a {type(offer).__name__} with a rule, or whose network or methods were changed, is not compiled")
     return driver

@@ -1,6 +1,6 @@
 """The drivers at a second site: windows of I-80 (Coifman and Li), of which none has seen anything.
 
-    python -m benchmarks.driving.second_site DATA [--noises 3] [--json FILE]
+    python -m benchmarks.driving.flow.second_site DATA [--noises 3] [--json FILE]
 
 DATA is the folder with the table of I-80. The recording is cut into windows of 20 s, all vehicles but the first of each
 lane are driven from every 2 s of each window for 10 and 20 s, and compared with the people. It has no positions across
@@ -105,7 +105,9 @@ def main(
         driver: Any = load_driver(name)
         drivers[name] = noisy_drivers(driver, noises)
     rows = measure_site(read_windows(data), drivers)
-    about_run = about(torch=torch.__version__, command="python -m benchmarks.driving.second_site DATA", noises=noises)
+    about_run = about(
+        torch=torch.__version__, command="python -m benchmarks.driving.flow.second_site DATA", noises=noises
+    )
     text = json.dumps(round_numbers({"rows": rows, "about": about_run}), indent=1)
     result.write_text(text + "\n", encoding="utf-8")
     print(format_site(rows))

@@ -4,8 +4,8 @@ import pyarrow.parquet
 import torch
 
 from benchmarks.driving.flow.recorded_flow import COIFMAN_FILE
+from benchmarks.driving.flow.second_site import LANE_WIDTH, format_site, measure_site, read_windows
 from benchmarks.driving.realism import rule_driver
-from benchmarks.driving.second_site import LANE_WIDTH, format_site, measure_site, read_windows
 
 
 def write_table(folder, frames=100):
