@@ -63,7 +63,7 @@ class OffersDenseDriver(Protocol):
     """
 
     def dense_driver(self) -> DenseDriver | None:
-        """Return its present numbers; None if it was changed, so that its methods alone know what it does."""
+        """Return its present numbers; None if it has a rule or was changed, so that its methods alone know what it does."""
 
 
 def read_dense_driver(offer: OffersDenseDriver) -> DenseDriver:
@@ -79,5 +79,6 @@ def read_dense_driver(offer: OffersDenseDriver) -> DenseDriver:
     """
     driver = offer.dense_driver()
     if driver is None:
-        raise NotCompiled(f"a {type(offer).__name__} with a rule, or whose network or methods were changed, is not compiled")
+        kind = type(offer).__name__
+        raise NotCompiled(f"a {kind} with a rule, or whose network or methods were changed, is not compiled")
     return driver
