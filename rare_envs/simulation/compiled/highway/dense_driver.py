@@ -63,7 +63,7 @@ class OffersDenseDriver(Protocol):
     """
 
     def dense_driver(self) -> DenseDriver | None:
-        """Return its present numbers; None if it has a rule or was changed, so that its methods alone know what it does."""
+        """Return its present numbers; None with a rule or changes, so that its methods alone know what it does."""
 
 
 def read_dense_driver(offer: OffersDenseDriver) -> DenseDriver:
