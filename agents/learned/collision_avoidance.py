@@ -10,13 +10,14 @@ References:
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import asdict, dataclass, fields
 
 import torch
 from torch import Tensor
 
 from rare_envs.sensors.lidar import MAX_RANGE, beam_angles
 from rare_envs.sensors.perception import FEATURES, RANGE_COLUMNS, RATE_COLUMNS, SPEED_COLUMN
+from rare_envs.simulation.compiled.highway import AvoidanceSettings
 
 _LENGTH, _WIDTH = FEATURES.index("length"), FEATURES.index("width")
 _FORWARD, _SIDEWAYS, _ACROSS = 0.5, 0.3, 0.75
@@ -89,6 +90,17 @@ class CollisionAvoidance:
             value = getattr(self, each.name)  # a field by its name
             if isinstance(value, bool) or not isinstance(value, int | float) or not 0.0 < value < math.inf:
                 raise ValueError(f"Expected {each.name} of the collision avoidance above 0, got {value!r}.")
+
+    def settings(self) -> AvoidanceSettings:
+        """Return the numbers for compiled rollouts."""
+        return AvoidanceSettings(
+            **asdict(self),
+            forward=_FORWARD,
+            sideways=_SIDEWAYS,
+            across=_ACROSS,
+            gap_divisor=_LEAST_GAP,
+            speed_divisor=_LEAST_SPEED,
+        )
 
     def limit(self, features: Tensor, action: Tensor) -> Tensor:
         """Return actions within the bounds, differentiable in both arguments.

@@ -127,8 +127,10 @@ class LearnedDriver:
         return action if self.avoidance is None else self.avoidance.limit(features, action), memory
 
     def dense_driver(self) -> DenseDriver | None:
-        """Return its numbers for compiled rollouts; None with a rule, or if its class or its network was changed."""
-        if type(self) is not LearnedDriver or type(self.colour) is not AutoregressiveNoise or self.avoidance:
+        """Return its present numbers for compiled rollouts; None if its class, network or rule was changed."""
+        if type(self) is not LearnedDriver or type(self.colour) is not AutoregressiveNoise:
+            return None
+        if self.avoidance is not None and type(self.avoidance) is not CollisionAvoidance:
             return None
         layers = read_layers(self.policy)
         if layers is None:
@@ -149,6 +151,7 @@ class LearnedDriver:
             lag_1=colour.first,
             lag_2=colour.second,
             fresh=colour.scale,
+            avoidance=None if self.avoidance is None else self.avoidance.settings(),
         )
 
     def begin(self, draws: Tensor) -> Tensor:

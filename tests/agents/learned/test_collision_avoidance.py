@@ -114,9 +114,13 @@ def test_the_rule_is_read_from_the_file(tmp_path):
     assert read_driver(path).avoidance == rule
 
 
-def test_compiled_rollouts_refuse_the_rule():
-    assert load_driver("mgail2").dense_driver() is None
-    assert replace(load_driver("mgail2"), avoidance=None).dense_driver() is not None
+def test_compiled_rollouts_take_the_rule_unless_it_was_changed():
+    class Other(CollisionAvoidance):
+        """Bounds of its own."""
+
+    dense = load_driver("mgail2").dense_driver()
+    assert dense is not None and dense.avoidance is not None and dense.avoidance.deceleration == 2.0
+    assert replace(load_driver("mgail2"), avoidance=Other()).dense_driver() is None
 
 
 @pytest.mark.parametrize("value", [0.0, -1.0, math.nan, math.inf, True, "2"])

@@ -4,10 +4,16 @@
 numba, and are imported when it is called.
 """
 
-from rare_envs.simulation.compiled.highway.dense_driver import DenseDriver, OffersDenseDriver, read_dense_driver
+from rare_envs.simulation.compiled.highway.dense_driver import (
+    AvoidanceSettings,
+    DenseDriver,
+    OffersDenseDriver,
+    read_dense_driver,
+)
 from rare_envs.simulation.compiled.highway.highway_rollout import HighwayRollout, RolloutTerms, find_highway_rollout
 
 __all__ = [
+    "AvoidanceSettings",
     "DenseDriver",
     "HighwayRollout",
     "OffersDenseDriver",

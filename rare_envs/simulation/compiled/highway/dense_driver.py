@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +11,39 @@ from numpy.typing import NDArray
 from rare_envs.simulation.compiled.failures import NotCompiled
 
 Pair = tuple[float, float]
+
+
+class AvoidanceSettings(NamedTuple):
+    """Numbers of a rule that bounds actions by the beams; `agents.learned.CollisionAvoidance` says what they mean.
+
+    Example:
+        >>> from agents.learned import CollisionAvoidance
+        >>> CollisionAvoidance().settings().deceleration  # [m/s^2]
+        2.0
+    """
+
+    deceleration: float
+    reaction_time: float
+    relaxation_time: float
+    standstill_gap: float
+    least_gap: float
+    hardest: float
+    path_margin: float
+    clearance: float
+    reach: float
+    lateral_time: float
+    heading_time: float
+    turning_radius: float
+    forward: float
+    """Least cosine of beams that look ahead."""
+    sideways: float
+    """Least sine of those that look aside."""
+    across: float
+    """Least sine of those whose range rate is taken for lateral motion."""
+    gap_divisor: float
+    """Least gap to divide by [m]."""
+    speed_divisor: float
+    """Least speed to divide by [m/s]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,6 +81,8 @@ class DenseDriver:
     lag_2: Pair = (0.0, 0.0)
     fresh: Pair = (1.0, 1.0)
     """Standard deviation of the fresh part of the noise."""
+    avoidance: AvoidanceSettings | None = None
+    """Bounds the actions; None for none."""
 
 
 @runtime_checkable
@@ -63,7 +98,7 @@ class OffersDenseDriver(Protocol):
     """
 
     def dense_driver(self) -> DenseDriver | None:
-        """Return its present numbers; None with a rule or changes, so that its methods alone know what it does."""
+        """Return its present numbers; None if it was changed, so that its methods alone know what it does."""
 
 
 def read_dense_driver(offer: OffersDenseDriver) -> DenseDriver:
@@ -79,6 +114,5 @@ def read_dense_driver(offer: OffersDenseDriver) -> DenseDriver:
     """
     driver = offer.dense_driver()
     if driver is None:
-        kind = type(offer).__name__
-        raise NotCompiled(f"a {kind} with a rule, or whose network or methods were changed, is not compiled")
+        raise NotCompiled(f"a {type(offer).__name__} whose network or methods were changed is not compiled")
     return driver

@@ -10,6 +10,7 @@ from rare_envs.sensors.perception import FEATURES
 from rare_envs.simulation.compiled.compilation import compiled, compiled_fused, single
 from rare_envs.simulation.compiled.dense_layer import apply_layer
 from rare_envs.simulation.compiled.equations import ONE, clip
+from rare_envs.simulation.compiled.highway.avoidance_lanes import AvoidanceNumbers
 from rare_envs.simulation.compiled.highway.dense_driver import DenseDriver
 from rare_envs.simulation.compiled.highway.lidar_lanes import LOOKING
 from rare_envs.simulation.compiled.networks import pad_units, tanh
@@ -37,6 +38,7 @@ class DriverNumbers(NamedTuple):
     second: SingleArray
     second_bias: SingleArray
     cap: float
+    avoidance: AvoidanceNumbers
     action_mean: SingleArray
     """Shape (2,), likewise below."""
     action_deviation: SingleArray
@@ -61,6 +63,7 @@ class DriverNumbers(NamedTuple):
             second,
             second_bias,
             cap,
+            AvoidanceNumbers.of(driver.avoidance),
             *(np.array(getattr(driver, name), dtype=np.float32) for name in pairs),
         )
 

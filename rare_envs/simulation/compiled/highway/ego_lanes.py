@@ -8,6 +8,7 @@ from rare_envs.control.idm import IDM
 from rare_envs.simulation.compiled.compilation import compiled, single
 from rare_envs.simulation.compiled.dense_policy import DensePolicy
 from rare_envs.simulation.compiled.equations import IDMNumbers, idm_acceleration, steer_to_line, steering_for
+from rare_envs.simulation.compiled.highway.avoidance_lanes import limit_action
 from rare_envs.simulation.compiled.highway.curved_road import CurvedRoadNumbers, lane_middle
 from rare_envs.simulation.compiled.highway.dense_driver import DenseDriver
 from rare_envs.simulation.compiled.highway.driver_lanes import NO_NOISE, DriverBuffers, DriverNumbers, decide_action
@@ -78,21 +79,33 @@ def apply_policies(rows: TrafficRows, slots: Slots, ego: EgoNumbers) -> None:
 
 @compiled
 def decide_ego(
-    rows: TrafficRows, slots: Slots, slot: int, ego: EgoNumbers, road: CurvedRoadNumbers
+    rows: TrafficRows, slots: Slots, slot: int, beams: SingleArray, ego: EgoNumbers, road: CurvedRoadNumbers
 ) -> tuple[float, float]:
-    """Return acceleration [m/s^2] and steering angle [rad] of the ego of a slot, whose network has been applied."""
+    """Return acceleration [m/s^2] and steering angle [rad] of the ego of a slot, whose network has been applied.
+
+    Args:
+        rows: The traffic.
+        slots: In which it is driven.
+        slot: The ego's.
+        beams: Of the egos of all slots, if they are learned drivers.
+        ego: The ego.
+        road: The road.
+    """
     row = slots.row[slot]
     y, heading, speed = rows.y[row, 0], rows.heading[row, 0], rows.speed[row, 0]
     if ego.kind == BY_POLICY:
         return ego.actions[slot, 0], ego.actions[slot, 1]
     if ego.kind == BY_DRIVER:
-        return steer_as_learned(ego, slot, speed, slots.poses.curvature[slot, 0])
+        return steer_as_learned(ego, slot, beams, speed, slots.poses.curvature[slot, 0])
     acceleration = idm_acceleration(ego.idm, speed, slots.gap[slot], slots.closing[slot], ego.idm.desired_speed)
     return acceleration, steer_to_line(y - lane_middle(y, road), heading, speed)
 
 
 @compiled
-def steer_as_learned(ego: EgoNumbers, slot: int, speed: float, curvature: float) -> tuple[float, float]:
+def steer_as_learned(
+    ego: EgoNumbers, slot: int, beams: SingleArray, speed: float, curvature: float
+) -> tuple[float, float]:
     """Return acceleration [m/s^2] and steering angle [rad]: `agents.learned.driver.LearnedEgo.act`."""
     acceleration, yaw_rate = decide_action(ego.buffers.outputs, slot, NO_NOISE, ego.driver)
+    acceleration, yaw_rate = limit_action(acceleration, yaw_rate, speed, beams, slot, ego.driver.avoidance)
     return acceleration, steering_for(yaw_rate + speed * curvature, speed)

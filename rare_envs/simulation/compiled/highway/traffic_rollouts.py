@@ -8,6 +8,7 @@ Drivers side by side do not depend on each other, so f of a row is the same bits
 import numpy as np
 
 from rare_envs.simulation.compiled.compilation import compiled, single
+from rare_envs.simulation.compiled.highway.avoidance_lanes import limit_action
 from rare_envs.simulation.compiled.highway.curved_road import (
     CurvedRoadNumbers,
     bicycle_on_curve,
@@ -97,7 +98,7 @@ def drive_among_learned(
         elif ego.kind == BY_DRIVER:
             observe_drivers(rows, slots, sight.ego_beams, 0, ego.driver, ego.buffers, road)
             apply_drivers(ego.driver, ego.buffers)
-        move_rows(rows, slots, driver, buffers, ego, road, rules, found)
+        move_rows(rows, slots, sight, driver, buffers, ego, road, rules, found)
 
 
 @compiled
@@ -136,6 +137,7 @@ def observe_drivers(
 def move_rows(
     rows: TrafficRows,
     slots: Slots,
+    sight: Sight,
     driver: DriverNumbers,
     buffers: DriverBuffers,
     ego: EgoNumbers,
@@ -151,12 +153,12 @@ def move_rows(
         row = slots.row[slot]
         if row == NO_ROW:
             continue
-        acceleration, steering = decide_ego(rows, slots, slot, ego, road)
+        acceleration, steering = decide_ego(rows, slots, slot, sight.ego_beams, ego, road)
         if acceleration != acceleration:
             found.f[row], slots.row[slot] = _UNKNOWN, NO_ROW
             continue
         moved = move_ego(rows, slots, slot, acceleration, steering, rules.dt)
-        move_drivers(rows, slots, slot, driver, buffers, rules.dt)
+        move_drivers(rows, slots, slot, sight.beams, driver, buffers, rules.dt)
         rows.x[row, 0], rows.y[row, 0], rows.heading[row, 0], rows.speed[row, 0] = moved
         place_row(rows, row, slot, slots.poses, road)
         slots.tick[slot] += 1
@@ -185,7 +187,13 @@ def move_ego(
 
 @compiled
 def move_drivers(
-    rows: TrafficRows, slots: Slots, slot: int, driver: DriverNumbers, buffers: DriverBuffers, dt: float
+    rows: TrafficRows,
+    slots: Slots,
+    slot: int,
+    beams: SingleArray,
+    driver: DriverNumbers,
+    buffers: DriverBuffers,
+    dt: float,
 ) -> None:
     """Move vehicles 1 to N - 1 of a slot by a tick."""
     row, noise, others = slots.row[slot], NO_NOISE, rows.x.shape[1] - 1
@@ -193,12 +201,14 @@ def move_drivers(
         if rows.draws.shape[1]:
             draws = rows.draws[row, FIRST_DRAW + slots.tick[slot], other - 1]
             noise = next_noise(rows.memory[row, other - 1], draws, driver)
-        acceleration, yaw_rate = decide_action(buffers.outputs, others * slot + other - 1, noise, driver)
+        lane, speed = others * slot + other - 1, rows.speed[row, other]
+        acceleration, yaw_rate = decide_action(buffers.outputs, lane, noise, driver)
+        acceleration, yaw_rate = limit_action(acceleration, yaw_rate, speed, beams, lane, driver.avoidance)
         moved = point_on_curve(
             rows.x[row, other],
             rows.y[row, other],
             rows.heading[row, other],
-            rows.speed[row, other],
+            speed,
             acceleration,
             yaw_rate,
             dt,

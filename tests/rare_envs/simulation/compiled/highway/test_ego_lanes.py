@@ -32,7 +32,8 @@ def test_the_idm_decides_as_in_torch():
     measure_rows(
         rows, slots, np.zeros((20, 384), np.float32), ROAD, Rules(0, False, 0, np.inf, np.float32(0.1), 9), found
     )
-    decided = [ego_lanes.decide_ego(rows, slots, slot, ego, ROAD) for slot in range(10)]
+    beams = np.zeros((20, 384), np.float32)
+    decided = [ego_lanes.decide_ego(rows, slots, slot, beams, ego, ROAD) for slot in range(10)]
     assert ego.kind == ego_lanes.BY_RULE and np.allclose(decided, expected, atol=1e-5)
 
 
@@ -40,7 +41,10 @@ def test_a_learned_ego_adds_the_curvature_of_the_road():
     dense = read_dense_driver(agents.load_ego("imitation"))
     ego = ego_lanes.EgoNumbers.of(dense, dense)
     ego.buffers.outputs[:] = 0.0
-    straight, turning = (ego_lanes.steer_as_learned(ego, 0, np.float32(20.0), np.float32(k)) for k in (0.0, 1e-3))
+    beams = np.zeros((20, 384), np.float32)
+    straight, turning = (
+        ego_lanes.steer_as_learned(ego, 0, beams, np.float32(20.0), np.float32(k)) for k in (0.0, 1e-3)
+    )
     assert ego.kind == ego_lanes.BY_DRIVER and straight[0] == turning[0]
     assert np.isclose(straight[0], np.clip(dense.action_mean[0], dense.low[0], dense.high[0]))
     slip = [np.arctan(np.tan(steering) / 2.0) for _, steering in (straight, turning)]

@@ -19,6 +19,8 @@ CASES = {
     "lidar": {"measure": "lidar_ttc", "noise": "fixed", "horizon": 4.0},
     "learned ego": {"measure": "lidar_ttc", "ego": "imitation", "horizon": 4.0},
     "other drivers": {"drivers": "bc", "horizon": 4.0},
+    "drivers with a rule": {"measure": "clearance", "drivers": "mgail2", "ego": FAST, "horizon": 8.0},
+    "ego with a rule": {"measure": "lidar_ttc", "ego": "mgail2", "drivers": "bc", "horizon": 4.0},
     "collisions": {"ego": FAST, "drivers": "bc", "horizon": 8.0},
     "clearance": {"measure": "clearance", "ego": FAST, "drivers": "bc", "horizon": 8.0},
     "clearance, learned ego": {"measure": "clearance", "ego": "imitation", "horizon": 4.0},
