@@ -22,12 +22,14 @@ from rare_envs.simulation.compiled.equations import (
     TWO,
     ZERO,
     IDMNumbers,
+    PerVehicle,
     RoadNumbers,
     at_least,
     at_most,
     bicycle,
     boxes_overlap,
     centre_of,
+    cosine,
     idm_acceleration,
     lane_keeping,
     lead_of,
@@ -53,17 +55,16 @@ def drive(script: str, x: NDArray[np.float64], ego: IDM, road: Road, dt: float, 
     """
     columns = np.ascontiguousarray(x.T, dtype=np.float32)
     idm, numbers, (tick,) = IDMNumbers.of(ego), RoadNumbers.of(road), single(dt)
-    moment = np.empty((4, 3 if script == "cut_in" else 2), dtype=np.float32)
     f: SingleArray = np.empty(len(x), dtype=np.float32)
     if script == "cut_in":
-        drive_cut_in(columns, idm, IDMNumbers.of(CUTTER_IDM), numbers, tick, ticks, moment, f)
+        drive_cut_in(columns, idm, IDMNumbers.of(CUTTER_IDM), numbers, tick, ticks, f)
     elif script == "car_following":
         ego_speed, lead_speed, gap = columns
         still = np.zeros_like(gap)
-        drive_behind_lead(ego_speed, lead_speed, gap, still, idm, numbers, tick, ticks, moment, f)
+        drive_behind_lead(ego_speed, lead_speed, gap, still, idm, numbers, tick, ticks, f)
     else:
         speed, gap, deceleration = columns
-        drive_behind_lead(speed, speed, gap, -deceleration, idm, numbers, tick, ticks, moment, f)
+        drive_behind_lead(speed, speed, gap, -deceleration, idm, numbers, tick, ticks, f)
     return f
 
 
@@ -82,10 +83,10 @@ def bezier(progress: float, length: float, offset: float) -> tuple[float, float]
 
 @compiled
 def move_ego(
-    x: SingleArray,
-    y: SingleArray,
-    heading: SingleArray,
-    speed: SingleArray,
+    x: PerVehicle,
+    y: PerVehicle,
+    heading: PerVehicle,
+    speed: PerVehicle,
     idm: IDMNumbers,
     road: RoadNumbers,
     gap: float,
@@ -102,7 +103,7 @@ def move_ego(
 
 
 @compiled
-def has_hit(x: SingleArray, y: SingleArray, heading: SingleArray, road: RoadNumbers) -> bool:
+def has_hit(x: PerVehicle, y: PerVehicle, heading: PerVehicle, road: RoadNumbers) -> bool:
     """Return whether the ego touches another vehicle or is off the road; arguments (N,)."""
     for other in range(1, len(x)):
         if boxes_overlap(x[other] - x[0], y[other] - y[0], heading[0], heading[other]):
@@ -112,9 +113,9 @@ def has_hit(x: SingleArray, y: SingleArray, heading: SingleArray, road: RoadNumb
 
 @compiled
 def move_cutter(
-    x: SingleArray,
-    heading: SingleArray,
-    speed: SingleArray,
+    x: PerVehicle,
+    heading: PerVehicle,
+    speed: PerVehicle,
     start: float,
     length: float,
     offset: float,
@@ -123,12 +124,12 @@ def move_cutter(
     dt: float,
 ) -> tuple[float, float, float, float]:
     """Return x, y, heading and speed of vehicle 1 after a tick: `rare_envs.scenarios.cut_in.others`; arrays (3,)."""
-    straight = math.cos(heading[1])
+    straight = cosine(heading[1])
     gap, closing_speed = x[2] - x[1] - BODY_LENGTH, speed[1] - speed[2] * straight
     acceleration = idm_acceleration(idm, speed[1], gap, closing_speed, desired_speed)
     after = x[1] + speed[1] * straight * dt
     y, slope = bezier(after - start, length, offset)
-    return after, y, math.atan(slope), at_least(speed[1] + acceleration * dt, ZERO)
+    return after, y, slope if slope == ZERO else math.atan(slope), at_least(speed[1] + acceleration * dt, ZERO)
 
 
 @compiled
@@ -141,7 +142,6 @@ def drive_behind_lead(
     road: RoadNumbers,
     dt: float,
     ticks: int,
-    moment: SingleArray,
     f: SingleArray,
 ) -> None:
     """Write f of each scenario of an ego and a lead in one lane.
@@ -155,19 +155,17 @@ def drive_behind_lead(
         road: The road.
         dt: Tick [s].
         ticks: Length of an episode.
-        moment: Shape (4, 2), written over: x, y, heading and speed of ego and lead.
         f: Shape (B,), written to.
     """
-    x, y, heading, speed = moment[0], moment[1], moment[2], moment[3]
     for row in range(len(f)):
-        moment[:] = ZERO
-        x[1], speed[0], speed[1] = lead_gap[row] + BODY_LENGTH, ego_speed[row], lead_speed[row]
+        x, y, heading = (ZERO, lead_gap[row] + BODY_LENGTH), (ZERO, ZERO), (ZERO, ZERO)
+        speed = (ego_speed[row], lead_speed[row])
         gap, closing = lead_of(x, y, heading, speed, road)
         least = ttc(gap, closing, y[0], heading[0], speed[0], road)
         for _ in range(ticks):
             ego = move_ego(x, y, heading, speed, idm, road, gap, closing, dt)
-            x[1], speed[1] = keep_straight(x[1], speed[1], lead_acceleration[row], dt)
-            x[0], y[0], heading[0], speed[0] = ego
+            ahead, lead = keep_straight(x[1], speed[1], lead_acceleration[row], dt)
+            x, y, heading, speed = (ego[0], ahead), (ego[1], ZERO), (ego[2], ZERO), (ego[3], lead)
             if has_hit(x, y, heading, road):
                 least = _HIT
                 break
@@ -184,7 +182,6 @@ def drive_cut_in(
     road: RoadNumbers,
     dt: float,
     ticks: int,
-    moment: SingleArray,
     f: SingleArray,
 ) -> None:
     """Write f of each cut-in.
@@ -196,26 +193,23 @@ def drive_cut_in(
         road: The road.
         dt: Tick [s].
         ticks: Length of an episode.
-        moment: Shape (4, 3), written over: x, y, heading and speed of ego, cutter and lead.
         f: Shape (B,), written to.
     """
-    x, y, heading, speed = moment[0], moment[1], moment[2], moment[3]
     for row in range(len(f)):
-        moment[:] = ZERO
-        speed[0], speed[1], speed[2] = columns[0, row], columns[1, row], columns[2, row]
+        speed = (columns[0, row], columns[1, row], columns[2, row])
         offset = columns[5, row]
         duration = columns[6, row] if len(columns) > 6 else _DURATION
         start = columns[3, row] + BODY_LENGTH
-        x[1], x[2], y[1] = start, start + columns[4, row] + BODY_LENGTH, offset
+        x, y = (ZERO, start, start + columns[4, row] + BODY_LENGTH), (ZERO, offset, ZERO)
+        heading = (ZERO, ZERO, ZERO)
         length, desired_speed = max(speed[1] * duration, _LEAST_LENGTH), max(speed[1], ONE)
         gap, closing = lead_of(x, y, heading, speed, road)
         least = ttc(gap, closing, y[0], heading[0], speed[0], road)
         for _ in range(ticks):
             ego = move_ego(x, y, heading, speed, idm, road, gap, closing, dt)
             cutter = move_cutter(x, heading, speed, start, length, offset, cutter_idm, desired_speed, dt)
-            x[2] += speed[2] * dt
-            x[1], y[1], heading[1], speed[1] = cutter
-            x[0], y[0], heading[0], speed[0] = ego
+            x, y = (ego[0], cutter[0], x[2] + speed[2] * dt), (ego[1], cutter[1], ZERO)
+            heading, speed = (ego[2], cutter[2], ZERO), (ego[3], cutter[3], speed[2])
             if has_hit(x, y, heading, road):
                 least = _HIT
                 break
