@@ -32,7 +32,7 @@ def compiled(function: Function) -> Function:
     """Compile a function when it is first called; division by zero gives inf, as in torch.
 
     It can make no arrays and return none: it writes into those that it is given. So numba need not count references to
-    arrays, which it does by atomic operations at every slice; they were two thirds of the time of rollouts with a policy.
+    arrays, which it does by atomic operations at every slice: two thirds of the time of rollouts with a policy.
 
     numba looks at a function's own file alone to tell whether its kept code is out of date, not at those of the
     functions and constants that it uses. So the folder is named after all sources that the file imports, and that these
