@@ -34,7 +34,7 @@ EGOS = {
 }
 DRIVERS = {
     "mgail": "learned from recorded traffic by imitation, with gradients through the simulation",
-    "mgail2": "mgail with a rule of collision avoidance and less damped noise; by torch only",
+    "mgail2": "mgail with a rule of collision avoidance and less damped noise",
     "gail": "the same with policy gradients",
     "bc": "the same by behaviour cloning",
     "idm": "rule-based driver, Intelligent Driver Model and lane keeping by what it sees",
