@@ -1,7 +1,7 @@
 """Problem: the probability P[f(X) <= gamma] of a function f and a base distribution of X; small f is dangerous."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from html import escape
 from typing import Any, Protocol, TypeGuard, runtime_checkable
@@ -55,28 +55,6 @@ class Distribution(Protocol):
 
     def from_standard_normal(self, u: FloatArray) -> FloatArray:
         """Map u ~ N(0, I), shape (n, d), to x from this distribution, shape (n, d)."""
-
-
-@runtime_checkable
-class DifferentiableDistribution(Distribution, Protocol):
-    """A distribution that knows the derivatives of its map from standard normal space."""
-
-    def pull_back(self, u: FloatArray, gradients: FloatArray) -> FloatArray:
-        """Return gradients J' g with respect to u of gradients g with respect to x, both (n, d).
-
-        Args:
-            u: Points, shape (n, d), at which J = dx / du.
-            gradients: At x = T(u), shape (n, d).
-        """
-
-
-@runtime_checkable
-class HasBlocks(Protocol):
-    """A base distribution of independent blocks side by side."""
-
-    @property
-    def blocks(self) -> Sequence[Any]:
-        """Distributions with `dim`, in the order of the columns of x."""
 
 
 class Inputs(Protocol):

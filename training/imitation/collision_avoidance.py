@@ -8,23 +8,18 @@ the scenes that mgail learned from and on rings.
 
 from __future__ import annotations
 
-from contextlib import nullcontext
 from dataclasses import replace
-from importlib import resources
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from agents import LearnedDriver, load_driver, read_provenance, save_driver
-from agents.learned.checkpoints import SUFFIX
+from agents import LearnedDriver, load_driver
 from agents.learned.collision_avoidance import CollisionAvoidance
-from agents.names import SHIPPED_DRIVERS
 from rare_envs.threads import use_one_thread
 from training.command_line import report_errors, run_command
 from training.imitation.datasets import Source, load_scenes
-from training.imitation.evaluation.realism import header_metrics
-from training.imitation.noise_damping import damp_acceleration
+from training.imitation.noise_damping import damp_acceleration, write_derived
 from training.imitation.traffic.recording import Recording, stack_scenes
 
 
@@ -50,17 +45,7 @@ def write_driver(of: str, damping: float, test: Recording, out: Path) -> Path:
     if not isinstance(first, LearnedDriver):
         raise ValueError(f"Expected a learned driver, got the rule {of!r}.")
     made = add_avoidance(first, damping, out.stem)
-    shipped = resources.files("agents") / "data" / f"{of}{SUFFIX}"
-    with resources.as_file(shipped) if of in SHIPPED_DRIVERS else nullcontext(Path(of)) as path:
-        before = read_provenance(path)
-    command = f"python -m training.imitation.collision_avoidance data --driver {of} --damping {damping:g} --out OUT"
-    provenance = replace(
-        before,
-        kind=f"{before.kind}, rule of collision avoidance",
-        command=f"{before.command}, then {command}",
-        metrics=header_metrics(test, made),
-    )
-    return save_driver(made, provenance, out)
+    return write_derived(made, of, damping, "rule of collision avoidance", "collision_avoidance", test, out)
 
 
 @use_one_thread()

@@ -141,17 +141,37 @@ def write_damped(driver: LearnedDriver, of: str, damping: float, test: Recording
     Returns:
         The file.
     """
+    return write_derived(replace(driver, name=out.stem), of, damping, "less damped noise", "noise_damping", test, out)
+
+
+def write_derived(
+    driver: LearnedDriver, of: str, damping: float, difference: str, module: str, test: Recording, out: Path
+) -> Path:
+    """Write a driver that was made of another without training, measured in the test scenes.
+
+    Args:
+        driver: The driver.
+        of: Name or file of the other.
+        damping: Of its acceleration's noise [1/s].
+        difference: In words.
+        module: Of this package, whose command makes it.
+        test: Scenes that it has not learned from.
+        out: File to write, .safetensors.
+
+    Returns:
+        The file.
+    """
     shipped = resources.files("agents") / "data" / f"{of}{SUFFIX}"
     with resources.as_file(shipped) if of in SHIPPED_DRIVERS else nullcontext(Path(of)) as path:
         before = read_provenance(path)
-    command = f"python -m training.imitation.noise_damping data --driver {of} --damping {damping:g} --out OUT"
+    command = f"python -m training.imitation.{module} data --driver {of} --damping {damping:g} --out OUT"
     provenance = replace(
         before,
-        kind=f"{before.kind}, less damped noise",
+        kind=f"{before.kind}, {difference}",
         command=f"{before.command}, then {command}",
         metrics=header_metrics(test, driver),
     )
-    return save_driver(replace(driver, name=out.stem), provenance, out)
+    return save_driver(driver, provenance, out)
 
 
 if __name__ == "__main__":

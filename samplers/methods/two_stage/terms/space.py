@@ -1,5 +1,8 @@
 """Terms and their gradients in standard normal space, and the count of what they cost."""
 
+from collections.abc import Sequence
+from typing import Any, Protocol, runtime_checkable
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -7,10 +10,8 @@ from samplers.method import TermsOffer, request_gradients, request_terms, whole_
 from samplers.methods.two_stage.noise_coordinates import noise_mask
 from samplers.methods.two_stage.simulator import SimulationSteps
 from samplers.problem import (
-    DifferentiableDistribution,
     Distribution,
     FloatArray,
-    HasBlocks,
     Inputs,
     StandardNormal,
     Terms,
@@ -61,6 +62,28 @@ class TermSimulator:
         if self._slopes is None:
             self._slopes = TransformSlopes(self.inputs)
         return self._slopes.pull_back(u, answer.values)
+
+
+@runtime_checkable
+class DifferentiableDistribution(Distribution, Protocol):
+    """A distribution that knows the derivatives of its map from standard normal space."""
+
+    def pull_back(self, u: FloatArray, gradients: FloatArray) -> FloatArray:
+        """Return gradients J' g with respect to u of gradients g with respect to x, both (n, d).
+
+        Args:
+            u: Points, shape (n, d), at which J = dx / du.
+            gradients: At x = T(u), shape (n, d).
+        """
+
+
+@runtime_checkable
+class HasBlocks(Protocol):
+    """A base distribution of independent blocks side by side."""
+
+    @property
+    def blocks(self) -> Sequence[Any]:
+        """Distributions with `dim`, in the order of the columns of x."""
 
 
 class TransformSlopes:
