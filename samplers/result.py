@@ -277,16 +277,16 @@ class Estimate(EstimateDisplay):
         """Conditions under which p and its interval are valid, in words that follow "valid"."""
         fixed = f"given that {self.given}, " if self.given else ""
         if self.base_draws == 0:
-            return f"{fixed}unless a failure region was missed (no base draws bound its probability)"
+            return f"{fixed}if no failure region was missed (there are no base draws that would limit its probability)"
         if self.p == 0 and self.failures.total == 0:  # the interval itself is about what was missed
             return (
-                f"{fixed}whatever was missed: {self.base_draws:,} base draws without a failure put p below "
-                f"{self.unseen:.1e} (one-sided {100 * self.confidence:g} %; the interval's end is that of "
+                f"{fixed}without further assumptions: none of {self.base_draws:,} base draws failed, so p is below "
+                f"{self.unseen:.1e} with {100 * self.confidence:g} % confidence (the upper end of the interval has "
                 f"{50 * (1 + self.confidence):g} % or more)"
             )
         return (
-            f"{fixed}unless a failure region with probability above {self.unseen:.1e} was missed "
-            f"({self.base_draws:,} base draws found no other)"
+            f"{fixed}if no failure region was missed; {self.base_draws:,} base draws would have met one with "
+            f"probability above {self.unseen:.1e} ({100 * self.confidence:g} % confidence)"
         )
 
     def to_arrow(self, names: Sequence[str] = ()) -> "pyarrow.Table":

@@ -42,8 +42,8 @@ def test_says_how_large_a_region_may_have_been_missed():
     assert estimate.base_draws == 1000
     assert (1 - estimate.unseen) ** 1000 == pytest.approx(0.05)
     assert (
-        "valid unless a failure region with probability above 3.0e-03 was missed (1,000 base draws found no other)"
-        in str(estimate)
+        "valid if no failure region was missed; 1,000 base draws would have met one with probability above 3.0e-03 "
+        "(95 % confidence)" in str(estimate)
     )
     assert (1 - result(confidence=0.9).unseen) ** 1000 == pytest.approx(0.1)
     assert estimate.to_dict()["unseen"] == estimate.unseen
@@ -57,10 +57,10 @@ def test_without_a_failure_it_says_which_bound_has_which_level():
     estimate = samplers.estimate(never, "mc", seed=1, max_sim=1000)
     assert (1 - estimate.interval[1]) ** 1000 == pytest.approx(0.025)
     assert estimate.proviso == (
-        "whatever was missed: 1,000 base draws without a failure put p below 3.0e-03 "
-        "(one-sided 95 %; the interval's end is that of 97.5 % or more)"
+        "without further assumptions: none of 1,000 base draws failed, so p is below 3.0e-03 with 95 % confidence "
+        "(the upper end of the interval has 97.5 % or more)"
     )
-    assert "one-sided 90 %; the interval's end is that of 95 %" in replace(estimate, confidence=0.9).proviso
+    assert "with 90 % confidence (the upper end of the interval has 95 %" in replace(estimate, confidence=0.9).proviso
 
 
 def test_says_what_the_problem_holds_fixed():
@@ -70,8 +70,11 @@ def test_says_what_the_problem_holds_fixed():
     problem = SimpleNamespace(dim=2, base=problem.base, evaluate=problem.evaluate, given="one die is fixed")
     fixed = samplers.estimate(problem, "mc", seed=1, max_sim=500)
     assert fixed.to_dict()["given"] == "one die is fixed"
-    assert "valid given that one die is fixed, unless a failure region with probability above" in str(fixed)
-    assert "one die is fixed, unless a failure region was missed" in replace(fixed, base_draws=0).proviso
+    assert "valid given that one die is fixed, if no failure region was missed; " in str(fixed)
+    assert (
+        "one die is fixed, if no failure region was missed (there are no base draws"
+        in replace(fixed, base_draws=0).proviso
+    )
     run = samplers.MonteCarlo(n=500).start(problem, seed=1)
     while not run.done:
         run.tell(problem.evaluate(run.ask()))

@@ -110,20 +110,20 @@ def describe_validity(result: Result) -> str:
 
     Example:
         >>> describe_validity({"p": 0.0, "n_failures": 3, "base_draws": 600, "unseen": 0.005, "confidence": 0.95})
-        'valid unless a failure region with probability above 0.5 % was missed (600 draws of ordinary traffic found no other)'
+        'valid if no failure region was missed; 600 draws of ordinary traffic would have met one with probability above 0.5 % (95 % confidence)'
     """  # noqa: E501 (the example shows a whole sentence)
     draws = int(result.get("base_draws") or 0)
     if draws == 0:
-        return "valid unless a failure region was missed (no draws of ordinary traffic bound its probability)"
+        return "valid if no failure region was missed (there are no draws of ordinary traffic that would limit its probability)"
     unseen, confidence = format_probability(result.get("unseen")), float(result["confidence"])
     if float(result["p"]) == 0 and not result.get("n_failures"):
         return (
-            f"{draws:,} draws of ordinary traffic without a failure put p below {unseen} (one-sided "
-            f"{100 * confidence:g} %; the interval's end is that of {50 + 50 * confidence:g} % or more)"
+            f"none of {draws:,} draws of ordinary traffic failed, so p is below {unseen} with {100 * confidence:g} % "
+            f"confidence (the upper end of the interval has {50 + 50 * confidence:g} % or more)"
         )
     return (
-        f"valid unless a failure region with probability above {unseen} was missed ({draws:,} draws of ordinary "
-        "traffic found no other)"
+        f"valid if no failure region was missed; {draws:,} draws of ordinary traffic would have met one with "
+        f"probability above {unseen} ({100 * confidence:g} % confidence)"
     )
 
 

@@ -45,11 +45,14 @@ def test_failures_of_a_search_that_count_for_nothing_are_not_denied() -> None:
     result = {**RESULT, "p": 0.0, "interval": [0.0, 0.001], "n_failures": 3, "base_draws": 600, "unseen": 0.005}
     words = summarise_answer(result, "us101")
     assert words.startswith("Of 4,000 simulations 3 found what ends in a collision, but none of those counts in p")
-    assert "valid unless a failure region with probability above 0.5 % was missed" in describe_validity(result)
+    assert (
+        "600 draws of ordinary traffic would have met one with probability above 0.5 % (95 % confidence)"
+        in describe_validity(result)
+    )
     nothing = describe_validity({**result, "n_failures": 0})
-    assert nothing.startswith("600 draws of ordinary traffic without a failure put p below 0.5 % (one-sided 95 %; ")
-    assert "valid unless a failure region" in describe_validity({**result, "p": 0.0012, "n_failures": 0})
-    assert "no draws of ordinary traffic bound its" in describe_validity(RESULT)
+    assert nothing.startswith("none of 600 draws of ordinary traffic failed, so p is below 0.5 % with 95 % confidence")
+    assert "valid if no failure region was missed; " in describe_validity({**result, "p": 0.0012, "n_failures": 0})
+    assert "no draws of ordinary traffic that would limit its" in describe_validity(RESULT)
 
 
 @pytest.mark.parametrize(
