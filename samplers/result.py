@@ -277,7 +277,7 @@ class Estimate(EstimateDisplay):
         """Conditions under which p and its interval are valid, in words that follow "valid"."""
         fixed = f"given that {self.given}, " if self.given else ""
         if self.base_draws == 0:
-            return f"{fixed}if no failure region was missed (there are no base draws that would limit its probability)"
+            return f"{fixed}if no failure region was missed (no base draws limit its probability)"
         if self.p == 0 and self.failures.total == 0:  # the interval itself is about what was missed
             return (
                 f"{fixed}without further assumptions: none of {self.base_draws:,} base draws failed, so p is below "

@@ -77,7 +77,8 @@ P[f <= 0] = 7.99e-04
   base distribution 95 %  1.9e-05 to 3.3e-02 (38 + 15 events of 17 scenes, 30 refits); predictive mean 4e-03
     assumes that the fitted family is correct (1 component, log gaps); errors of the family are not included
   3,000 simulations, gain over Monte Carlo 158; two-stage, seed 0, converged; 1,012 failing points
-  valid if no failure region was missed; 332 base draws would have met one with probability above 9.0e-03 (95 % confidence)
+  valid if no failure region was missed; 332 base draws would have met one with probability above 9.0e-03 (95 %
+  confidence)
 ```
 """
 

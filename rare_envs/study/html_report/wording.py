@@ -114,7 +114,7 @@ def describe_validity(result: Result) -> str:
     """  # noqa: E501 (the example shows a whole sentence)
     draws = int(result.get("base_draws") or 0)
     if draws == 0:
-        return "valid if no failure region was missed (there are no draws of ordinary traffic that would limit its probability)"
+        return "valid if no failure region was missed (no draws of ordinary traffic limit its probability)"
     unseen, confidence = format_probability(result.get("unseen")), float(result["confidence"])
     if float(result["p"]) == 0 and not result.get("n_failures"):
         return (
