@@ -72,8 +72,7 @@ def test_says_what_the_problem_holds_fixed():
     assert fixed.to_dict()["given"] == "one die is fixed"
     assert "valid given that one die is fixed, if no failure region was missed; " in str(fixed)
     assert (
-        "one die is fixed, if no failure region was missed (no base draws limit"
-        in replace(fixed, base_draws=0).proviso
+        "one die is fixed, if no failure region was missed (no base draws limit" in replace(fixed, base_draws=0).proviso
     )
     run = samplers.MonteCarlo(n=500).start(problem, seed=1)
     while not run.done:
