@@ -13,7 +13,12 @@ from rare_envs.egos.policy import PolicyDriver
 from rare_envs.egos.sb3.dense_networks import read_dense_policy
 from rare_envs.simulation.compiled.failures import CompilerFails, NotCompiled, check_core
 from rare_envs.simulation.compiled.highway import HighwayRollout, OffersDenseDriver, RolloutTerms, read_dense_driver
-from rare_envs.simulation.compiled.selection import CompiledEgo, CompiledRollout, find_compiled_rollout
+from rare_envs.simulation.compiled.selection import (
+    CompiledEgo,
+    CompiledRollout,
+    find_compiled_rollout,
+    select_rollout,
+)
 from rare_envs.simulation.rollout import Driver
 from rare_envs.simulation.world import World
 
@@ -102,3 +107,17 @@ def compiled_ego(driver: Driver) -> CompiledEgo:
     if type(driver) is not IDM:
         raise NotCompiled(f"the ego, a {type(driver).__name__}, is not compiled")
     return driver
+
+
+def is_compiled_script(world: World, driver: Driver) -> bool:
+    """Return whether a world is a script that compiled rollouts know with this ego, with numba or without it.
+
+    Example:
+        >>> from rare_envs.scenarios.car_following import CAR_FOLLOWING
+        >>> is_compiled_script(World(CAR_FOLLOWING), IDM())
+        True
+    """
+    try:
+        return isinstance(select_rollout(world, compiled_ego(driver)), CompiledRollout)
+    except NotCompiled:
+        return False

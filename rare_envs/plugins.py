@@ -7,6 +7,7 @@ import difflib
 import importlib
 import importlib.util
 import os
+import re
 import sys
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -14,6 +15,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+_COLOUR = re.compile(r"\x1b\[[0-9;]*m")
 _MAX_WORDS = 200
 """Characters of an exception's message that `one_line` keeps: a line of a terminal or two."""
 SIBLINGS = {"agents": "agents.loading", "samplers": "samplers.estimation", "training": "training.ego_training"}
@@ -125,11 +127,13 @@ def did_you_mean(name: str, valid: Iterable[str]) -> str:
 def one_line(error: BaseException) -> str:
     """Return an exception as one line without a full stop: its class, and up to 200 characters of its message.
 
+    Colours of a terminal, which numba's messages have where colorama is installed, are left out.
+
     Example:
         >>> one_line(RuntimeError("no   weights."))
         'RuntimeError: no weights'
     """
-    words = " ".join(str(error).split()).rstrip(".")
+    words = " ".join(_COLOUR.sub("", str(error)).split()).rstrip(".")
     kind = type(error).__name__
     return f"{kind}: {words[:_MAX_WORDS]}" if words else kind
 

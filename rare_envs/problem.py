@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from rare_envs.core_choice import CoreChoice
+from rare_envs.core_choice import CoreChoice, is_compiled_script
 from rare_envs.distributions.space import Distribution, ScenarioSpace
 from rare_envs.egos.errors import reason_of
 from rare_envs.egos.loading import load_named_ego
@@ -23,7 +23,6 @@ from rare_envs.egos.wrappers import describe_missing_normalisation, find_action_
 from rare_envs.make import refuse_unknown, set_up
 from rare_envs.scenarios.registry import find_scenario, split_layout
 from rare_envs.sensors.kinds import read_kinds
-from rare_envs.simulation.compiled import CompiledRollout
 from rare_envs.simulation.episode import Episode
 from rare_envs.simulation.measurement import Measurement
 from rare_envs.simulation.rollout import StochasticDriver, rollout
@@ -196,8 +195,12 @@ class DrivingProblem:
 
     @property
     def terms_with_f(self) -> bool:
-        """Whether terms come with the rollout that gives f: compiled scripts have none, torch does."""
-        return not isinstance(self._core.rollout, CompiledRollout)
+        """Whether methods may ask for terms wherever they ask for f.
+
+        Not in scripts that have compiled rollouts: these have no terms. Nor do methods ask torch for them there, so
+        that both cores are asked the same questions, and give the same answers but for rounding.
+        """
+        return not is_compiled_script(self.world, self.driver)
 
     @property
     def dim(self) -> int:

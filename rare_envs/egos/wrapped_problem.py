@@ -56,7 +56,7 @@ class WrappedProblem:
 
     @property
     def terms_with_f(self) -> bool:
-        """Whether terms come with the rollout that gives f."""
+        """Whether methods may ask for terms wherever they ask for f."""
         return bool(getattr(self.problem, "terms_with_f", True))  # anybody's problem
 
     @property

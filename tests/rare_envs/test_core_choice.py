@@ -7,12 +7,16 @@ import warnings
 import numpy as np
 import pytest
 
+import rare_envs
+import samplers
 from rare_envs import core_choice
 from rare_envs.control.idm import IDM
-from rare_envs.core_choice import CoreChoice
+from rare_envs.core_choice import CoreChoice, is_compiled_script
 from rare_envs.scenarios.car_following import CAR_FOLLOWING
 from rare_envs.scenarios.highway import HIGHWAY
+from rare_envs.simulation.compiled import selection
 from rare_envs.simulation.compiled.failures import CompilerFails, NotCompiled
+from rare_envs.simulation.measurement import Measurement
 from rare_envs.simulation.world import World
 
 WORLD, X = World(CAR_FOLLOWING), np.array([[20.0, 15.0, 30.0]])
@@ -67,3 +71,23 @@ def test_compiled_rollouts_give_f() -> None:
     assert found is not None
     assert found.tolist() == [6.0]
     assert found.dtype == np.float64
+
+
+@pytest.mark.parametrize("env_id", ["rare_envs/CarFollowing-v0", "rare_envs/CutIn-v0"])
+def test_both_cores_are_asked_the_same_and_give_the_same_estimate(env_id: str) -> None:
+    """Rounding of f moves weights by a millionth; another sequence of points would move p by tenths."""
+    pytest.importorskip("numba", reason="compiled rollouts need numba, which the extra [fast] installs")
+    compiled, reference = (
+        samplers.estimate(rare_envs.DrivingProblem(env_id, core=core), samplers.TwoStage(), seed=0, max_sim=1000)
+        for core in ("numba", "torch")
+    )
+    assert compiled.p > 0
+    assert compiled.p == pytest.approx(reference.p, rel=1e-5)
+    assert compiled.failures.total == reference.failures.total
+
+
+def test_scripts_are_compiled_ones_with_numba_or_without(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(selection, "_import_compiler", lambda: 1 / 0)
+    assert is_compiled_script(WORLD, IDM())
+    assert not is_compiled_script(World(HIGHWAY), IDM())
+    assert not is_compiled_script(World(CAR_FOLLOWING, measurement=Measurement("clearance")), IDM())

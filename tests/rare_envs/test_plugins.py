@@ -68,6 +68,7 @@ def test_names_are_suggested_without_their_namespace() -> None:
 def test_an_exception_is_cut_to_one_line() -> None:
     assert one_line(KeyError()) == "KeyError"
     assert one_line(ValueError(" a\n\tb. ")) == "ValueError: a b"
+    assert one_line(ValueError("\x1b[1mNo\x1b[0m\x1b[31;1m type\x1b[0m.")) == "ValueError: No type"
     assert one_line(ValueError("x" * 1000)) == "ValueError: " + "x" * 200
 
 

@@ -97,14 +97,23 @@ def find_compiled_rollout(world: World, ego: CompiledEgo) -> CompiledRollout | H
             ...
         rare_envs.simulation.compiled.failures.NotCompiled: the script of the scenario 'highway' is not compiled
     """
+    found = select_rollout(world, ego)
+    _import_compiler()
+    return found
+
+
+def select_rollout(world: World, ego: CompiledEgo) -> CompiledRollout | HighwayRollout:
+    """Return `find_compiled_rollout`, whether numba can be used here or not.
+
+    Raises:
+        NotCompiled: There is none.
+    """
     if world.background is not None:
         policy = None if isinstance(ego, IDM) else ego()
         obstacle = _find_policy_obstacle(world, policy) if isinstance(policy, DensePolicy) else ""
         if obstacle:
             raise NotCompiled(obstacle)
-        found = find_highway_rollout(world, ego)
-        _import_compiler()
-        return found
+        return find_highway_rollout(world, ego)
     obstacle = _find_obstacle(world)
     if obstacle:
         raise NotCompiled(obstacle)
@@ -113,7 +122,6 @@ def find_compiled_rollout(world: World, ego: CompiledEgo) -> CompiledRollout | H
         obstacle = _find_policy_obstacle(world, ego())
         if obstacle:
             raise NotCompiled(obstacle)
-    _import_compiler()
     return CompiledRollout(_find_script(scenario), ego, scenario.road, clock.dt, clock.ticks)
 
 

@@ -36,11 +36,12 @@ def test_a_measure_without_moments_has_terms_and_no_gradient() -> None:
     assert wrapped.terms is not None and wrapped.gradient is None
 
 
-def test_compiled_rollouts_have_no_terms_of_their_own() -> None:
-    torch_problem = rare_envs.DrivingProblem("rare_envs/CarFollowing-v0", core="torch")
-    assert torch_problem.terms_with_f and WrappedProblem(torch_problem).terms_with_f
-    problem = rare_envs.DrivingProblem("rare_envs/CarFollowing-v0")
-    assert WrappedProblem(problem).terms_with_f == problem.terms_with_f == (problem.core == "torch")
+def test_scripts_with_compiled_rollouts_have_no_terms_beside_f_whichever_core_simulates() -> None:
+    for core in ("torch", "auto"):
+        problem = rare_envs.DrivingProblem("rare_envs/CarFollowing-v0", core=core)
+        assert not problem.terms_with_f and not WrappedProblem(problem).terms_with_f
+    problem = rare_envs.DrivingProblem("rare_envs/CarFollowing-v0", measure="clearance", core="torch")
+    assert problem.terms_with_f and WrappedProblem(problem).terms_with_f
 
 
 class Policy:
