@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import math
-
 import pytest
 
 from benchmarks.papers.page import PAPERS_PAGE, format_papers_page, read_records
+from benchmarks.papers.renew import read_replications
 from rare_envs.study.reproduction.tian2024.replications import ReplicationJob, ReplicationRun, run_replication
 from rare_envs.study.reproduction.tian2024.tables import make_method_tables
 from rare_envs.threads import use_one_thread
@@ -49,13 +48,13 @@ def test_committed_tables_follow_from_the_committed_runs(tian) -> None:
     assert {counts.pop(method) for method in ("IS", "SS", "ADSS")} == {tian["about"]["replications"]}
     assert set(counts.values()) == {tian["about"]["replications_of_further_methods"]}
     assert tian["about"]["replications"] >= 20
-    assert tables_of([run for runs in tian["runs"] for run in replications_of(runs)]) == tian["tables"]
+    assert tables_of(read_replications(tian)) == tian["tables"]
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("scenario", "method"), [("car-following", "ADSS"), ("cut-in", "two-stage")])
 def test_a_row_of_the_committed_tables_made_again_is_the_committed_one(tian, scenario: str, method: str) -> None:
-    runs = [run for each in tian["runs"] for run in replications_of(each)]
+    runs = read_replications(tian)
     with use_one_thread():
         for place, run in enumerate(runs):
             if (run.scenario, run.system, run.method) == (scenario, "IDM", method):
@@ -69,17 +68,6 @@ def test_a_row_of_the_committed_tables_made_again_is_the_committed_one(tian, sce
         for one, other in zip(again["measured"], shown["measured"], strict=True):
             assert one["labels"] == other["labels"]
             assert one["values"] == pytest.approx(other["values"], rel=1e-6)
-
-
-def replications_of(runs) -> list[ReplicationRun]:
-    """Return the replications of a method on a system, as far as the record has them."""
-    numbers = ("seed", "p", "low", "high", "cov", "n_sim", "simulated", "final", "levels")
-    known = {name: [math.nan if value is None else value for value in runs[name]] for name in numbers}
-    names = {name: runs[name] for name in ("scenario", "system", "method")}
-    return [
-        ReplicationRun(**names, **dict(zip(numbers, values, strict=True)), warnings=(), trace=())
-        for values in zip(*known.values(), strict=True)
-    ]
 
 
 def tables_of(runs: list[ReplicationRun]):

@@ -48,7 +48,7 @@ def describe_figures(ego: str, found: Mapping[str, Any]) -> dict[str, dict[str, 
             "title": f"{printed.figure}{letter}: {title}",
             "caption": "A curve for each search; without the rollouts of the search, as in the paper."
             + ("" if curves else " Not run yet."),
-            "paper": f"{range_} times.",
+            "paper": f"{range_}.",
             "axis": title,
             "curves": {
                 name: {"gamma": [p["gamma"] for p in curve], "ratio": [p[key] for p in curve]}

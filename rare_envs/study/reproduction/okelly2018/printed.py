@@ -72,8 +72,8 @@ PRINTED_TABLES = {
             "naive, equal draws": ((20e-6, 14.1e-6), (100e-6, 31.6e-6), (132e-5, 11.5e-5), (185e-5, 13.6e-5)),
         },
         search=500_000,
-        events="3 to 10",
-        variance="2 to 16",
+        events="3 to 10 times",
+        variance="2 to 16 times",
     ),
     "vision": PrintedTable(
         name="Table 2",
@@ -85,7 +85,7 @@ PRINTED_TABLES = {
             "cross-entropy": ((5.87e-5, 1.82e-5), (13.0e-5, 2.94e-5), (19.0e-5, 3.14e-5), (4.52e-4, 1.35e-4)),
         },
         search=20_000,
-        events="up to 18",
+        events="up to 18 times",
         variance="lower, no number is printed",
     ),
 }

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -183,13 +184,34 @@ def _run_own(
     rollouts: RolloutFolder, study: HighwayStudy, out: Path, problem: Any, progress: bool
 ) -> list[dict[str, Any]]:
     """Estimate every threshold by the package's default method, as far as simulations may be made."""
-    budget = study.settings.own
-    if budget == 0:
+    if study.settings.own == 0:
         return []
+    lines = _open_own(study, out)
+    drop_torn_line(lines.file)
+    known = {run["gamma"] for run in lines.read()}
+    wanted = [gamma for gamma in study.gammas if gamma in known or rollouts.spend(study.settings.own)]
+    return estimate_own(study, out, problem, wanted, progress and not known.issuperset(wanted))
 
-    def make(gammas: list[float]) -> Any:
-        for gamma in gammas:
-            found = samplers.estimate(problem, gamma=gamma, seed=study.seed, max_sim=budget)
+
+def estimate_own(
+    study: HighwayStudy, out: Path, problem: Any, gammas: Sequence[float], progress: bool = False
+) -> list[dict[str, Any]]:
+    """Estimate thresholds by the package's default method, but those that the folder has.
+
+    Args:
+        study: Budget and seed.
+        out: Folder of the file.
+        problem: What simulates.
+        gammas: Thresholds [s].
+        progress: Whether to show a bar.
+
+    Raises:
+        BadInput: The folder has estimates of something else or of other code, or damaged ones.
+    """
+
+    def make(missing: list[float]) -> Iterator[dict[str, Any]]:
+        for gamma in missing:
+            found = samplers.estimate(problem, gamma=gamma, seed=study.seed, max_sim=study.settings.own)
             low, high = found.interval
             yield {
                 "gamma": gamma,
@@ -202,10 +224,11 @@ def _run_own(
                 "warnings": list(found.warnings),
             }
 
-    lines = RunLines[float, dict[str, Any]](
+    return _open_own(study, out).complete(list(gammas), make, progress, "our default method")
+
+
+def _open_own(study: HighwayStudy, out: Path) -> RunLines[float, dict[str, Any]]:
+    """Return the estimates of our default method in a folder."""
+    return RunLines(
         out / "own.jsonl", study.header, dict, dict, key_of_job=lambda gamma: gamma, key_of_run=lambda run: run["gamma"]
     )
-    drop_torn_line(lines.file)
-    known = {run["gamma"] for run in lines.read()}
-    wanted = [gamma for gamma in study.gammas if gamma in known or rollouts.spend(budget)]
-    return lines.complete(wanted, make, progress and not known.issuperset(wanted), "our default method")

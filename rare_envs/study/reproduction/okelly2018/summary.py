@@ -59,7 +59,7 @@ def summarise_highway(study: HighwayStudy, problem: Any, measured: MeasuredHighw
         "naive": [asdict(each) for each in references],
         "naive_equal": [asdict(each) for each in equal],
         "searches": searches,
-        "own": [_compare_own(each, references) for each in measured.own],
+        "own": [compare_own(each, references) for each in measured.own],
         "findings": _find(study, problem, measured, f) if len(f) else [],
         "rollouts": len(f) + sum(each["search"] + each["final"] for each in searches.values()),
         "first": f[:FIRST].tolist(),
@@ -118,8 +118,19 @@ def _trace_curve(
     ]
 
 
-def _compare_own(own: dict[str, Any], references: Sequence[ThresholdEstimate]) -> dict[str, Any]:
-    """Add the gain over naive Monte Carlo at as many simulations, by the method's own c.o.v."""
+def compare_own(own: dict[str, Any], references: Sequence[ThresholdEstimate]) -> dict[str, Any]:
+    """Add the gain over naive Monte Carlo at as many simulations, by the method's own c.o.v.
+
+    Args:
+        own: An estimate, as `rare_envs.study.reproduction.okelly2018.study.estimate_own` returns it.
+        references: Of naive Monte Carlo, one of them at the same threshold.
+
+    Example:
+        >>> own = {"gamma": 0.5, "p": 1e-3, "cov": 0.1, "n_sim": 1000}
+        >>> naive = ThresholdEstimate(0.5, n=10_000, events=10, p=1e-3, standard_error=3.2e-4)
+        >>> round(compare_own(own, [naive])["gain"], 1)
+        99.9
+    """
     p = next((each.p for each in references if each.gamma == own["gamma"]), 0.0)
     error = own["p"] * own["cov"]
     gain = p * (1.0 - p) / own["n_sim"] / error**2 if p > 0.0 and 0.0 < error < float("inf") else None

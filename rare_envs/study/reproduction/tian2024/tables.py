@@ -97,7 +97,7 @@ def _compare(key: tuple[str, str, str], paper: str, ours: ReplicationSummary, le
     spread = {"IS": ("squared", "weights"), "MCS": ("squared", "chance")}.get(
         paper, ("squared", "settings", "limit state", *stacked)
     )
-    cost = {"IS": ("weights",), "MCS": ("stop rule", "traffic")}.get(paper, ("settings",))
+    cost = {"IS": ("weights",), "MCS": ("stop rule", "traffic")}.get(paper, ("traffic", "settings"))
     yield value("mean of p", printed.p, ours.mean, ("traffic", *stacked), ours.mean_interval, RELEASED[paper])
     if paper != "MCS":
         reasons = ("chance", *stacked) if level_methods else ("weights", "chance")
@@ -119,8 +119,10 @@ def _released_cost(paper: str, p: float | None, ours: ReplicationSummary, levels
     if paper == "MCS":
         rule = [f"{MOST_HALF_WIDTH_DRAWS * (1 - each) / each:,.0f}" for each in (p, ours.mean) if each]
         return f"the rule gives {rule[0]} for the printed p, {rule[-1]} for ours" if p else f"the rule gives {rule[-1]}"
-    if paper in ("SS", "ADSS"):
-        return f"seeds again: {POINTS_OF_A_LEVEL * levels:,.0f} for the same levels"
+    if paper == "SS":
+        return f"N in every level: {POINTS_OF_A_LEVEL * levels:,.0f} for the same levels"
+    if paper == "ADSS":
+        return f"N in every level and once more at the end: {POINTS_OF_A_LEVEL * (levels + 1):,.0f} for the same levels"
     return ""
 
 

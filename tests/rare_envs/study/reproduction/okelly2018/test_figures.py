@@ -21,6 +21,12 @@ def test_both_ratios_stand_against_the_threshold() -> None:
     assert figures["figure2b"]["curves"]["a"] == {"gamma": [0.4, 0.5, 0.6], "ratio": [None, 1e40, 2.0]}
 
 
+def test_what_the_paper_shows_is_a_sentence() -> None:
+    found = {"searches": {}}
+    said = [figure["paper"] for ego in ("lidar", "vision") for figure in describe_figures(ego, found).values()]
+    assert said == ["3 to 10 times.", "2 to 16 times.", "up to 18 times.", "lower, no number is printed."]
+
+
 def test_the_axes_are_the_papers() -> None:
     data = describe_figures("vision", {"searches": {"a": {"curve": CURVE}}})["figure3b"]
     figure = Figure()

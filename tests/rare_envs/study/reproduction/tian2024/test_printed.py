@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from rare_envs.study.reproduction.tian2024.printed import PRINTED, PrintedRow
+from rare_envs.study.reproduction.tian2024.printed import EXPLANATIONS, PRINTED, PrintedRow
 
 
 @pytest.mark.parametrize("system", ["stack", "IDM"])
@@ -17,6 +17,14 @@ def test_the_printed_column_is_the_square_of_plain_monte_carlo(system: str, meth
     assert row.squared_cov == pytest.approx(square, rel=0.25)
     assert row.cov is not None
     assert not row.cov == pytest.approx(square, rel=0.5)
+
+
+def test_the_explanation_has_the_numbers_of_plain_monte_carlo() -> None:
+    """They are near what is printed, and not equal to the digits shown."""
+    for system, method in (("stack", "MCS"), ("IDM", "MCS"), ("stack", "IS"), ("IDM", "IS")):
+        row = PRINTED["car-following", system, method]
+        assert f"{(1 - row.p) / (row.p * row.n_sim):.4f}" in EXPLANATIONS["squared"]
+        assert f"{row.squared_cov:.3f}" in EXPLANATIONS["squared"]
 
 
 def test_root_error_and_gain() -> None:

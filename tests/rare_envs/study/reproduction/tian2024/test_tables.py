@@ -51,9 +51,12 @@ def test_the_paper_counts_no_search_and_we_count_all() -> None:
 
 
 def test_the_released_code_is_said_in_words() -> None:
-    table2, _ = tables_of("MC", "SS", "IS")
+    table2, _ = tables_of("MC", "SS", "ADSS", "IS")
     assert "does not run as released" in find(table2, "IS", "IDM", "mean of p").released
-    assert find(table2, "SS", "IDM", "simulations").released == "seeds again: 2,000 for the same levels"
+    assert find(table2, "SS", "IDM", "simulations").released == "N in every level: 2,000 for the same levels"
+    assert find(table2, "ADSS", "IDM", "simulations").released.endswith(
+        "once more at the end: 2,500 for the same levels"
+    )
     assert "114,784" in find(table2, "Monte Carlo", "IDM", "simulations").released
 
 

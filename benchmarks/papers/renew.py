@@ -1,0 +1,128 @@
+"""Rows of our own methods in the committed records of both papers, made anew; the paper's methods stay as they are.
+
+    python -m benchmarks.papers.renew FOLDER
+    python -m benchmarks.papers.renew FOLDER --paper tian2024 --method two-stage
+
+makes these rows, writes their runs to FOLDER and goes on with those that are there; then it puts the rows into
+`benchmarks/results` and writes `docs/papers.md`. That is what `rare-envs reproduce` gives at the same seeds, without
+the hours of the other rows. With `--method ""` no row is made: tables and texts follow from the committed runs alone.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from benchmarks import RESULTS
+from benchmarks.papers.page import PAPERS, read_records
+from benchmarks.papers.page import main as write_page
+from rare_envs.json_text import format_json
+from rare_envs.study.reproduction.okelly2018.estimates import ThresholdEstimate
+from rare_envs.study.reproduction.okelly2018.reproduction import make_okelly_record
+from rare_envs.study.reproduction.okelly2018.study import HighwayStudy, estimate_own
+from rare_envs.study.reproduction.okelly2018.summary import compare_own
+from rare_envs.study.reproduction.tian2024.catalogue import METHOD_ROWS
+from rare_envs.study.reproduction.tian2024.figures import collect_figures
+from rare_envs.study.reproduction.tian2024.replications import (
+    ReplicationRun,
+    run_replication,
+)
+from rare_envs.study.reproduction.tian2024.study import TianPlan, open_replications, record_replications
+from rare_envs.threads import use_one_thread
+from samplers.benchmark.runs import map_jobs
+from samplers.serialization import to_json_value
+
+FURTHER = tuple(name for name, row in METHOD_ROWS.items() if not row.paper)
+"""Methods of Tian et al.'s tables that their paper does not have."""
+OWN_METHOD = "two-stage"
+"""The default method, whose rows O'Kelly et al.'s tables have."""
+_NUMBERS = ("seed", "p", "low", "high", "cov", "n_sim", "simulated", "final", "levels")
+
+
+def read_replications(record: dict[str, Any]) -> list[ReplicationRun]:
+    """Return the replications of a record of Tian et al., as far as it has them: no traces, no texts of warnings."""
+    runs = []
+    for group in record["runs"]:
+        names = {name: group[name] for name in ("scenario", "system", "method")}
+        for place, count in enumerate(group["warnings"]):
+            values = {name: math.nan if group[name][place] is None else group[name][place] for name in _NUMBERS}
+            runs.append(ReplicationRun(**names, **values, warnings=("",) * count, trace=()))
+    return runs
+
+
+def renew_tian(record: dict[str, Any], folder: Path, methods: Sequence[str] = ()) -> dict[str, Any]:
+    """Return a record with rows of further methods made anew.
+
+    Args:
+        record: As committed.
+        folder: Of the new replications.
+        methods: Some of `FURTHER`; none makes no row.
+
+    Raises:
+        ValueError: A method is none of them: its traces are in the figures, which only a whole run draws.
+    """
+    for name in methods:
+        if name not in FURTHER:
+            raise ValueError(f"Expected methods of {', '.join(FURTHER)}, got {name!r}: run the whole reproduction.")
+    about = record["about"]
+    plan = TianPlan(about["replications"], int(about["seeds"].partition(" ")[0]))
+    runs = read_replications(record)
+    if methods:
+        folder.mkdir(parents=True, exist_ok=True)
+        jobs = [job for job in plan.jobs() if job.method in methods]
+        lines = open_replications(folder, plan)
+        made = lines.complete(jobs, lambda missing: map_jobs(run_replication, missing), True, "replications")
+        new = {run.key: run for run in made}
+        runs = [new.get(run.key, run) for run in runs]
+    anew = record_replications(plan, runs, record["command"])
+    figures = {**record["figures"]}
+    figures["figure8"] = {**figures["figure8"], "ends": to_json_value(collect_figures(runs))["figure8"]["ends"]}
+    # what rests on the traces of the paper's methods stays
+    return {**anew, "about": about, "figures": figures, "findings": record["findings"]}
+
+
+def renew_okelly(record: dict[str, Any], folder: Path, own: bool = True) -> dict[str, Any]:
+    """Return a record with the rows of our default method made anew.
+
+    Args:
+        record: As committed.
+        folder: Of the new estimates.
+        own: Whether to make them.
+    """
+    about, (details,) = record["about"], record["runs"]
+    study = HighwayStudy(about["ego"], about["scale"], about["seed"])
+    found = {**details, "findings": []}
+    if own and details["own"]:
+        folder.mkdir(parents=True, exist_ok=True)
+        naive = [ThresholdEstimate(**each) for each in details["naive"]]
+        made = estimate_own(study, folder, study.make_problem(), [each["gamma"] for each in details["own"]], True)
+        found["own"] = [compare_own(each, naive) for each in made]
+    anew = make_okelly_record(study, record["command"], found)
+    return {**anew, "about": about, "findings": record["findings"]}
+
+
+def main() -> None:
+    """Read the command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("folder", type=Path, help="of the new runs")
+    parser.add_argument("--paper", choices=PAPERS, help="one record; all if none is named")
+    parser.add_argument("--method", default=OWN_METHOD, help="methods with commas")
+    arguments = parser.parse_args()
+    methods = [name for name in arguments.method.split(",") if name]
+    for paper, record in read_records().items():
+        if arguments.paper not in (None, paper):
+            continue
+        with use_one_thread():
+            if paper == "tian2024":
+                anew = renew_tian(record, arguments.folder / paper, methods)
+            else:
+                anew = renew_okelly(record, arguments.folder / paper, OWN_METHOD in methods)
+        (RESULTS / f"{paper}.json").write_text(format_json(anew) + "\n", encoding="utf-8")
+    write_page()
+
+
+if __name__ == "__main__":
+    main()
