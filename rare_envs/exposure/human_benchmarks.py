@@ -136,3 +136,14 @@ def describe_human_contacts() -> str:
         f"{REAR_END_CONTACTS_100CAR.per_million_km:.2g} into a vehicle ahead (100-Car), "
         f"{CONTACTS_SHRP2.per_million_km:.2g} {CONTACTS_SHRP2.kind} (SHRP 2)"
     )
+
+
+def summarise_human_contacts() -> str:
+    """Return the range of those figures in a few words, per million km.
+
+    Example:
+        >>> summarise_human_contacts()
+        'people 15 to 21'
+    """
+    low, high = sorted((CONTACTS_SHRP2.per_million_km, CONTACTS_100CAR.per_million_km))
+    return f"people {low:.2g} to {high:.2g}"

@@ -54,12 +54,15 @@ class Severity:
         ...     high=np.array([4e-3, 2.5e-3]), cov=np.array([0.2, 0.3]), ess=np.array([25.0, 11.0]), confidence=0.95)
         >>> injuries = FailureExpectation(
         ...     value=3e-5, interval=(2e-5, 5e-5), confidence=0.95, cov=0.2, per_failure=0.015)
-        >>> print(Severity(
+        >>> severity = Severity(
         ...     curve=curve, largest_delta_v=2.6, injuries=injuries, injuries_base=None,
-        ...     n_replayed=500, n_failures=1200, unknown=0.0))
+        ...     n_replayed=500, n_failures=1200, unknown=0.0)
+        >>> print(severity)
         collisions with delta-v > 1 m/s 2.0e-03 [1.0e-03, 4.0e-03], > 2 m/s 1.0e-03 [4.0e-04, 2.5e-03], at most 2.6 m/s
         serious injuries (MAIS 3+) 3.0e-05 per scenario [2.0e-05, 5.0e-05], 0.015 per failure
         from 500 of 1,200 failing scenarios, simulated again
+        >>> print(severity.summarise())
+        delta-v > 1 m/s 2.0e-03, > 2 m/s 1.0e-03, at most 2.6 m/s; serious injuries (MAIS 3+) 3.0e-05 per scenario
     """
 
     curve: Exceedance
@@ -97,6 +100,12 @@ class Severity:
         if self.unknown:
             lines[-1] += f"; {100 * self.unknown:.2g} % of p have no outcome and are left out"
         return "\n".join(lines)
+
+    def summarise(self) -> str:
+        """Return a short line for people, without intervals."""
+        parts = [f"> {self.curve.thresholds[i]:g} m/s {self.curve.p[i]:.1e}" for i in self._shown_thresholds]
+        speeds = ", ".join([*parts, f"at most {self.largest_delta_v:.2g} m/s"])
+        return f"delta-v {speeds}; serious injuries (MAIS 3+) {self.injuries.value:.1e} per scenario"
 
     @property
     def _shown_thresholds(self) -> list[int]:

@@ -118,6 +118,10 @@ AlgoOption = Annotated[str | None, typer.Option(help="Algorithm of the .zip, if 
 StatsOption = Annotated[
     str | None, typer.Option(help="File of the .zip's VecNormalize statistics; by default one is looked for beside it.")
 ]
+DetailsOption = Annotated[
+    bool,
+    typer.Option("--details", help="Print all intervals, and all parameters of the most likely failure."),
+]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object and nothing else.")]
 SeedOption = Annotated[int, typer.Option(help="Seed; the same seed gives the same answer.")]
 TrustOption = Annotated[

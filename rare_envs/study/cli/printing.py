@@ -2,30 +2,41 @@
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from rich.console import Console
 
 import samplers
 from rare_envs.exposure import describe_human_contacts
+from rare_envs.study.cli.summary import (
+    Row,
+    describe_failure,
+    describe_run,
+    describe_time,
+    format_cov,
+    format_gain,
+    list_rows,
+    summarise_crash,
+)
 from rare_envs.study.columns import MAX_SHOWN, draw_ordinary, find_ordinary_range, format_value
 from rare_envs.study.crash_kinds import KIND_DESCRIPTIONS
-from rare_envs.study.html_report.wording import explain_no_gain
 from rare_envs.study.rates.text import describe_injuries, describe_parts, format_interval, format_rate, name_events
 from rare_envs.study.report import Report
 from samplers.presentation.estimate_display import indent_lines
 from samplers.problem import FloatArray
-from samplers.trace import describe_outcome
 
 ENOUGH, MANY = 3.0, 300_000
 """Simulations over p that show with 95 % a region of failure as probable as all that was found; what they may cost."""
 
 
-def print_report(report: Report, out: Path | None = None) -> None:
+def print_report(report: Report, out: Path | None = None, details: bool = False) -> None:
     """Print the number, what it rests on, the most likely failure, and where the files are.
+
+    Args:
+        report: What to print.
+        out: Folder of the run.
+        details: Print everything: rates, kinds and severity with intervals, all parameters of the most likely failure.
 
     Example:
         >>> from rare_envs.study import Question, prepare, run
@@ -51,28 +62,16 @@ def print_report(report: Report, out: Path | None = None) -> None:
     for line in indent_lines(estimate.base_uncertainty or _describe_fixed_base(report)):
         console.print(line)
     _print_other_bases(console, report)
-    _print_rate(console, report)
-    rows = (
-        ("c.o.v.", "not known" if math.isinf(estimate.cov) else f"{estimate.cov:.3f}"),
-        ("simulations", f"{estimate.n_sim:,} in {_format_time(report)} by {question.core}"),
-        ("valid", estimate.proviso),
-        ("gain", _format_gain(estimate)),
-        (
-            "method",
-            f"{estimate.method.name}, seed {estimate.seed}, {describe_outcome(estimate.status, report.warnings)}",
-        ),
-        *([("chosen", estimate.choice)] if estimate.chose_another else []),
-    )
-    for name, value in rows:
-        console.print(f"  {name:<15} {value}")
-    _print_kinds(console, report)
-    if report.vec_normalize is not None:
-        console.print(f"  {'observations':<15} normalised by {report.vec_normalize}")
-    if report.faults:
-        first = report.faults[0].reason
-        console.print(f"  {'faults':<15} the ego failed twice on {len(report.faults)} scenarios; the first: {first}")
-        console.print(f"  {'':<15} {report.n_retried:,} more simulations were made to find them")
-    _print_failure(console, report)
+    if details:
+        _print_details(console, report)
+    else:
+        _print_rows(console, list_rows(report))
+    _print_rows(console, _list_faults(report))
+    if details:
+        _print_failure(console, report)
+    else:
+        for line in describe_failure(report):
+            console.print(f"  {line}")
     if isinstance(report.sensitivity, samplers.Sensitivity):
         for line in indent_lines(report.sensitivity):
             console.print(line)
@@ -90,16 +89,45 @@ def print_report(report: Report, out: Path | None = None) -> None:
         console.print(f"written to {out}: {names}")
 
 
+def _print_rows(console: Console, rows: list[Row]) -> None:
+    for name, text in rows:
+        console.print(f"  {name:<15} {text}")
+
+
+def _print_details(console: Console, report: Report) -> None:
+    """Print rates, effort and kinds of crash with their intervals."""
+    estimate = report.estimate
+    _print_rate(console, report)
+    _print_rows(
+        console,
+        [
+            Row("c.o.v.", format_cov(estimate)),
+            Row("simulations", f"{estimate.n_sim:,} in {describe_time(report)}"),
+            Row("valid", estimate.proviso),
+            Row("gain", format_gain(estimate)),
+            Row("method", describe_run(report)),
+            *([Row("chosen", estimate.choice)] if estimate.chose_another else []),
+        ],
+    )
+    _print_kinds(console, report)
+
+
+def _list_faults(report: Report) -> list[Row]:
+    """Return the statistics that normalise observations, and the scenarios on which the ego failed."""
+    rows = []
+    if report.vec_normalize is not None:
+        rows.append(Row("observations", f"normalised by {report.vec_normalize}"))
+    if report.faults:
+        first = report.faults[0].reason
+        rows.append(Row("faults", f"the ego failed twice on {len(report.faults)} scenarios; the first: {first}"))
+        rows.append(Row("", f"{report.n_retried:,} more simulations were made to find them"))
+    return rows
+
+
 def _describe_fixed_base(report: Report) -> str:
     """Return that nothing is known of the error of the base distribution."""
     name = report.study.base_name
     return f"base distribution  no interval: {name!r} has no refits to events, so p takes it as the truth"
-
-
-def _format_time(report: Report) -> str:
-    """Return the wall time, and how much of it was before an interruption."""
-    text = f"{report.seconds:.1f} s"
-    return f"{text} ({report.earlier_seconds:.0f} s before it was resumed)" if report.earlier_seconds else text
 
 
 def _print_other_bases(console: Console, report: Report) -> None:
@@ -147,25 +175,9 @@ def _print_kinds(console: Console, report: Report) -> None:
         console.print(f"  {'severity' if number == 0 else '':<15} {line}")
 
 
-def _summarise_crash(crash: dict[str, Any], labels: tuple[str, ...]) -> str:
-    """Return who ran into whom, how fast, and the risk of injury, in words; `labels` are those of the vehicles."""
-    who = ["the edge of the road" if one < 0 else labels[one] for one in crash["vehicles"]]
-    speeds = f"{crash['impact_speed']:.1f} m/s at contact, delta-v {max(crash['delta_v']):.1f} m/s"
-    return f"{who[0]} runs into {who[1]}: {speeds}, serious injury {100 * max(crash['injury_risk']):.2g} %"
-
-
 def _format_odds(p: float) -> str:
     """Return a small probability in words."""
     return f" (1 in {1 / p:,.0f} scenarios)" if 0 < p < 0.1 else ""
-
-
-def _format_gain(estimate: samplers.Estimate) -> str:
-    """Return the gain over plain Monte Carlo, and the simulations that it stands for."""
-    if math.isnan(estimate.gain):
-        return explain_no_gain(estimate.p)
-    needed = estimate.gain * estimate.n_sim
-    gain = f"{estimate.gain:,.0f}" if estimate.gain >= 100 else f"{estimate.gain:.3g}"
-    return f"{gain} (plain Monte Carlo: about {needed:,.0f} simulations for the same c.o.v.)"
 
 
 def _print_failure(console: Console, report: Report) -> None:
@@ -180,7 +192,7 @@ def _print_failure(console: Console, report: Report) -> None:
         "in brackets the central 90 % of ordinary scenarios):"
     )
     if report.crashes[0] is not None:
-        console.print(f"    {_summarise_crash(report.crashes[0], report.study.problem.world.scenario.labels)}")
+        console.print(f"    {summarise_crash(report.crashes[0], report.study.problem.world.scenario.labels)}")
     normal = space.columns(space.to_standard_normal(np.vstack((failures.x[:1], ordinary))))
     likeliest, usual = space.columns(failures.x[:1]), space.columns(ordinary)
     for j, name in enumerate(space.names):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
@@ -9,7 +10,14 @@ import typer
 
 from rare_envs.scenarios.registry import is_highway_env_id
 from rare_envs.study.cli.executor_options import ExecutorOptions
-from rare_envs.study.cli.options import EstimateOptions, ForceOption, JsonOption, TrustOption, complete_environment
+from rare_envs.study.cli.options import (
+    DetailsOption,
+    EstimateOptions,
+    ForceOption,
+    JsonOption,
+    TrustOption,
+    complete_environment,
+)
 from rare_envs.study.cli.shell import (
     DOUBTFUL,
     is_typed,
@@ -48,6 +56,7 @@ def estimate_command(
     out: Annotated[Path | None, typer.Option(help="Folder of the run: result.json, episodes.parquet and more.")] = None,
     force: ForceOption = False,
     as_json: JsonOption = False,
+    details: DetailsOption = False,
 ) -> None:
     """Estimate how often an ego fails, with an interval, and show its most likely failure."""
     from rare_envs.study.evaluate import run, run_into
@@ -63,7 +72,7 @@ def estimate_command(
         _refuse_options_of_a_limit(typed | set(given))
     if is_highway_env_id(question.env_id):
         _estimate_highway_env(question, typed, out, force, as_json, places)
-    with show_what_is_known(lambda known: show_report(known, None, as_json)), keep_stdout_for_the_answer():
+    with show_what_is_known(lambda known: show_report(known, None, as_json, details)), keep_stdout_for_the_answer():
         with as_bad_input(ValueError):
             executor = places.make()
         study = prepare(question)
@@ -72,7 +81,7 @@ def estimate_command(
             if out is None
             else run_into(out, study, progress=True, force=force, executor=executor)
         )
-    _answer(report, out, as_json)
+    _answer(report, out, as_json, details)
 
 
 def _estimate_highway_env(
@@ -102,22 +111,25 @@ def _refuse_options_of_a_limit(typed: set[str]) -> None:
             raise BadInput(f"Expected {option} together with --max-p, the limit of p.")
 
 
-def _answer(report: Any, out: Path | None, as_json: bool) -> NoReturn:
+def _answer(report: Any, out: Path | None, as_json: bool, details: bool) -> NoReturn:
     """Print a report and exit."""
-    show_report(report, out, as_json)
+    show_report(report, out, as_json, details)
     if report.verdict is not None:
         raise typer.Exit(GATE_CODES[report.verdict.decision])
     raise typer.Exit(DOUBTFUL if report.doubtful else 0)
 
 
-def show_report(report: Any, out: Path | None, as_json: bool) -> None:
+def show_report(report: Any, out: Path | None, as_json: bool, details: bool = False) -> None:
     """Print a report."""
     from rare_envs.study.cli.printing import print_report
 
     if as_json:
         print_json(report.to_dict())
     else:
-        print_report(report, out)
+        print_report(report, out, details)
+        if not details:
+            where = "--details" if out is None else f"rare-envs report {shlex.quote(str(out))}"
+            print(f"all intervals and parameters: {where}")
 
 
 @spread_options
@@ -134,12 +146,13 @@ def resume_command(
         bool, typer.Option("--mend", help="Of a damaged journal, keep the simulations before the damage.")
     ] = False,
     as_json: JsonOption = False,
+    details: DetailsOption = False,
 ) -> None:
     """Continue an interrupted run; the result is the same as without the interruption."""
     from rare_envs.study.evaluate import resume
 
-    with show_what_is_known(lambda known: show_report(known, None, as_json)), keep_stdout_for_the_answer():
+    with show_what_is_known(lambda known: show_report(known, None, as_json, details)), keep_stdout_for_the_answer():
         with as_bad_input(ValueError):
             executor = places.make()
         report = resume(run, ego, on_error, trust, progress=True, mend=mend, executor=executor)
-    _answer(report, run, as_json)
+    _answer(report, run, as_json, details)

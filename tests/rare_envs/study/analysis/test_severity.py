@@ -126,10 +126,12 @@ def test_the_replay_is_shared_with_the_kinds_and_goes_to_print_and_json(
     saved = json.loads(json.dumps(report.to_dict()["severity"], allow_nan=False))
     assert saved["injuries"]["value"] == severity.injuries.value
     assert saved["curve"]["delta_v"][:3] == [0.0, 0.1, 0.2]  # fine steps up to 2.5 m/s
-    print_report(report)
+    print_report(report, details=True)
     printed = capsys.readouterr().out
     for line in str(severity).splitlines():
         assert line in printed
+    print_report(report)
+    assert f"  severity        {severity.summarise()}\n" in capsys.readouterr().out
 
 
 def test_most_limits_what_is_driven_again(problem: rare_envs.DrivingProblem, plain: samplers.Estimate) -> None:

@@ -22,7 +22,7 @@ HIGHWAY = ("estimate", "rare_envs/Highway-v0", "--measure", "lidar_ttc", "--gamm
 
 def test_the_highway_end_to_end(cli: Cli, tmp_path: Path) -> None:
     """Blocks of x in every place where parameters are told, and drivers and horizon in the record."""
-    words = ("--ego", "bc", "--drivers", "gail", "--noise", "fixed", "--method", "mc", "--max-sim", 256)
+    words = ("--ego", "bc", "--drivers", "gail", "--noise", "fixed", "--method", "mc", "--max-sim", 256, "--details")
     result = cli(*HIGHWAY, *words, "--out", tmp_path)
     assert result.exit_code in (0, 3), result.output
     assert "the drivers' noise is one fixed sequence" in result.stdout

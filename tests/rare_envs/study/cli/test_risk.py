@@ -88,7 +88,9 @@ def test_out_in_a_file_is_refused(cli: Cli, here: Path, bases: list[str]) -> Non
 
 def test_estimate_prints_the_rate_beside_people(cli: Cli, here: Path) -> None:
     base = write_fitted(here / "fitted.json", "hard_brake")
-    text = " ".join(cli(*BRAKE, "--base", base).stdout.split())
+    short = " ".join(cli(*BRAKE, "--base", base).stdout.split())
+    assert "per million km (" in short and "; people 15 to 21 " in short
+    text = " ".join(cli(*BRAKE, "--base", base, "--details").stdout.split())
     assert "per million km (" in text
     assert (
         "people: 21 contacts of all kinds, 4.3 into a vehicle ahead (100-Car), 15 crashes without tyre strikes (SHRP 2)"
