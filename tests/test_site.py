@@ -57,5 +57,27 @@ def test_nothing_of_the_site_comes_from_elsewhere() -> None:
     assert CONFIG["validation"]["links"] == dict.fromkeys(CONFIG["validation"]["links"], "warn")
 
 
+def test_only_pages_and_pictures_are_copied() -> None:
+    assert {"*.py", "__pycache__"} <= set(CONFIG["exclude_docs"].split())  # of docs/site_hooks.py
+
+
+def readme_lines() -> list[str]:
+    return (ROOT / "README.md").read_text(encoding="utf-8").splitlines()
+
+
+def test_the_first_screen_of_the_readme() -> None:
+    """The question, two commands, what they print and the picture; set-up comes before the first table."""
+    lines = readme_lines()
+    first = "\n".join(lines[:60])
+    for part in ("**How often would this driving policy crash", "$ make demo", "$ make test", "P[f <= 0] = ", "demo.png)"):
+        assert part in first
+    tables = [number for number, line in enumerate(lines) if line.startswith("|")]
+    assert lines.index("## Set-up") < min(tables, default=len(lines))
+
+
+def test_the_readme_is_short() -> None:
+    assert len("\n".join(readme_lines())) < 13_000
+
+
 def test_pages_of_a_navigation() -> None:
     assert pages_in([{"A": ["a.md", {"B": "b.md"}]}, "c.md"]) == ["a.md", "b.md", "c.md"]
