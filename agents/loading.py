@@ -121,6 +121,7 @@ def load_ego(
     if kind == "noisy":
         from agents.imperfect_stack import NoisyEgo, Stack
 
+        _require_inner_ego(text)
         inner, mark, settings = text.removeprefix("noisy:").rpartition("?")
         stack = Stack.read(settings if mark else "")
         return cast(Ego, NoisyEgo(load_ego(inner if mark else settings, algo, trust, stats), stack))
@@ -167,6 +168,7 @@ def _load_elsewhere(kind: EgoKind, text: str, algo: str | None, trust: bool, sta
         raise ValueError(f"{text!r} needs pyzmq and msgpack: pip install 'rare-envs[remote]'.") from error
     try:
         if kind == "process":
+            _require_inner_ego(text)
             from agents.remote.subprocess_link import isolate
 
             return isolate(text.removeprefix("process:"), algo, trust, stats)
@@ -214,6 +216,13 @@ def find_ego_kind(spec: str) -> EgoKind:
     return "function" if ":" in spec and "/" not in spec else "unknown"
 
 
+def _require_inner_ego(text: str) -> None:
+    """Raise a ValueError if "noisy:" or "process:" stands alone."""
+    kind, _, inner = text.partition(":")
+    if not inner.partition("?")[0]:
+        raise ValueError(f"Expected an ego behind {kind + ':'!r}, such as {kind}:model.zip, got {text!r}.")
+
+
 EGO_SUFFIXES = (".zip", ".onnx", ".safetensors")
 """How the files of egos end."""
 
@@ -223,7 +232,8 @@ def _suggest_ego(text: str) -> str:
     saved = Path(f"{text}.zip")
     if saved.is_file():
         return f" (did you mean {str(saved)!r}?)"
-    if Path(text).is_dir():
+    if text and Path(text).is_dir():
         files = sorted(path.name for path in Path(text).iterdir() if path.suffix in EGO_SUFFIXES)
         return f" (a folder; name a file in it: {', '.join(files[:5])})" if files else " (a folder without egos)"
-    return did_you_mean(text.lower(), [RULE_BASED, HUMAN, *SHIPPED_EGOS, VISION, *SHIPPED_DRIVERS])
+    hint = did_you_mean(text, [RULE_BASED, HUMAN, *SHIPPED_EGOS, VISION, *SHIPPED_DRIVERS])
+    return hint or (" (there is no such file)" if Path(text).suffix or "/" in text else "")

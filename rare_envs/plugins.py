@@ -112,15 +112,15 @@ def make_lazy_getattr(package: str, modules: Mapping[str, str]) -> Callable[[str
 
 
 def did_you_mean(name: str, valid: Iterable[str]) -> str:
-    """Return `" (did you mean 'x'?)"` for the nearest valid name, or "" if none is near.
+    """Return `" (did you mean 'x'?)"` for the nearest valid name, or "" if none is near; capitals make no difference.
 
     Example:
         >>> did_you_mean("CutIm-v0", ["rare_envs/CutIn-v0", "rare_envs/Highway-v0"])
         " (did you mean 'rare_envs/CutIn-v0'?)"
     """
-    names = {v: v for v in valid}
-    names |= {v.split("/")[-1]: v for v in names}  # an id without its namespace
-    near = difflib.get_close_matches(name, list(names), n=1)
+    names = {v.lower(): v for v in valid}
+    names |= {short.split("/")[-1]: v for short, v in names.items()}  # an id without its namespace
+    near = difflib.get_close_matches(name.lower(), list(names), n=1)
     return f" (did you mean {names[near[0]]!r}?)" if near else ""
 
 

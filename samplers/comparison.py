@@ -339,7 +339,9 @@ def compare(
 def _check_same_base(a: Problem, b: Problem) -> None:
     """Raise a ValueError if the densities of X in the two problems differ at some draws of A's."""
     if int(a.dim) != int(b.dim):
-        raise ValueError(f"Expected two problems with the same x, got {a.dim} and {b.dim} dimensions.")
+        raise ValueError(
+            f"Expected two problems with the same x, got {a.dim} and {b.dim} dimensions: estimate each by itself."
+        )
     x = a.base.sample(BASE_CHECK_DRAWS, np.random.default_rng(0))
     if not np.allclose(a.base.log_prob(x), b.base.log_prob(x), rtol=1e-9, atol=1e-9):
         raise ValueError("Expected two problems with the same base distribution; their densities differ.")

@@ -43,12 +43,18 @@ def one_per_row(outcomes: ArrayLike, n: int) -> NDArray[np.float64]:
     Raises:
         EvaluationError: If they are not n real numbers.
     """
+    if outcomes is None:
+        raise EvaluationError(
+            f"Expected f to return shape ({n},), one value per row of x, got None: f has no `return`."
+        )
     try:
         if np.iscomplexobj(outcomes):
             raise TypeError("complex numbers have no order")
         f = np.asarray(outcomes, dtype=np.float64)
     except (TypeError, ValueError) as error:
-        raise EvaluationError(f"Expected f to return shape ({n},), one number per row of x: {error}") from error
+        raise EvaluationError(
+            f"Expected f to return shape ({n},), one number per row of x: {str(error).rstrip('.')}."
+        ) from error
     if f.shape != (n,):
         raise EvaluationError(f"Expected f to return shape ({n},), one value per row of x, got {f.shape}.")
     return f

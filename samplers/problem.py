@@ -391,7 +391,7 @@ class FunctionProblem:
         except EvaluationError as error:
             if str(error).endswith(f"got {(len(x), 1)}."):  # as functions of OpenTURNS return
                 hint = "Return its only column, f(x)[:, 0]."
-            raise EvaluationError(f"{error} {hint}") from error
+            raise EvaluationError(str(error) if f is None else f"{error} {hint}") from error
 
 
 def _takes_one_point(f: Callable[[FloatArray], Any], x: FloatArray) -> bool:

@@ -69,7 +69,13 @@ def test_the_first_screen_of_the_readme() -> None:
     """The question, two commands, what they print and the picture; set-up comes before the first table."""
     lines = readme_lines()
     first = "\n".join(lines[:60])
-    for part in ("**How often would this driving policy crash", "$ make demo", "$ make test", "P[f <= 0] = ", "demo.png)"):
+    for part in (
+        "**How often would this driving policy crash",
+        "$ make demo",
+        "$ make test",
+        "P[f <= 0] = ",
+        "demo.png)",
+    ):
         assert part in first
     tables = [number for number, line in enumerate(lines) if line.startswith("|")]
     assert lines.index("## Set-up") < min(tables, default=len(lines))

@@ -56,6 +56,9 @@ class ZmqLink:
         if self._secret is not None:
             secure_client(self._socket, self._secret)
         self._monitor = self._socket.get_monitor_socket(_BROKEN)
+        port = self._address.rpartition(":")[2]
+        if self._address.startswith("tcp://") and port.isdigit() and not 0 < int(port) < 65536:
+            raise ValueError(f"Cannot connect to {self._address!r}: expected a port from 1 to 65535.")
         try:
             self._socket.connect(self._address)
         except zmq.ZMQError as error:

@@ -13,7 +13,7 @@ from rare_envs.egos.errors import EgoGone
 from rare_envs.files import replace_text
 from rare_envs.json_text import format_json
 from rare_envs.study.analysis.repeatability import RowKeeper
-from rare_envs.study.errors import as_bad_input, output_folder
+from rare_envs.study.errors import BadInput, as_bad_input, output_folder
 from rare_envs.study.evaluate import recheck
 from rare_envs.study.question import Question, Study, prepare
 from rare_envs.study.run_directory import check_no_results, write_failures
@@ -74,6 +74,11 @@ def compare_egos(
     if out is not None and not force:
         check_no_results(out, COMPARISON)
     a, b = prepare(question), prepare(replace(question, ego=ego_b, algo=algo_b, stats=stats_b))
+    if a.problem.dim != b.problem.dim:  # of the egos that are shipped, human and noisy:EGO
+        raise BadInput(
+            f"Expected two egos with the same x, got {a.problem.dim} and {b.problem.dim} dimensions, as an ego that is "
+            "random has its own in x: estimate each by itself."
+        )
     kept = {name: RowKeeper(study.problem, question.gamma) for name, study in (("A", a), ("B", b))}
     with contextlib.nullcontext() if out is None else output_folder(out):
         with as_bad_input(ValueError, EgoGone):

@@ -6,6 +6,7 @@ nothing of it: the objects come from the user and bring their methods.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -21,6 +22,14 @@ From 8 on, where 1 - P[U > u] is nearly 1 in double precision, the quantile of a
 that of a Gumbel copula is not a number."""
 TRIED_U = np.array([9.0, 12.0, 20.0, 30.0])
 """|u| at which it is tried whether points have a place farther out."""
+CHECKED_POINTS = 12
+"""Points at which the transformation is compared with the density."""
+CHECKED_DIMS = 50
+"""Dimensions up to which it is compared: the comparison takes 24 points for each."""
+CHECK_STEP = 1e-3
+"""Step in u of the finite differences of the comparison."""
+LARGEST_ERROR = 0.02
+"""Error of the density by the transformation, as a difference of logarithms, at half of the points."""
 
 
 def is_openturns_distribution(value: object) -> bool:
@@ -37,7 +46,8 @@ class OpenTurnsDistribution:
 
     Raises:
         ValueError: If it is not continuous, or its iso-probabilistic transformation does not lead to N(0, I), as
-            that of a multivariate Student distribution.
+            that of a multivariate Student distribution, or does not have its density, as that of a Dirichlet
+            distribution in OpenTURNS 1.27.
 
     Example:
         >>> import numpy as np, openturns
@@ -58,6 +68,25 @@ class OpenTurnsDistribution:
                 f"The iso-probabilistic transformation of this {name} leads to {self._standard}, not to N(0, I): "
                 "use another copula, such as openturns.NormalCopula."
             )
+        error = self._density_error()
+        if error > LARGEST_ERROR:
+            raise ValueError(
+                f"OpenTURNS' iso-probabilistic transformation of this {name} does not have its density (off by "
+                f"{100 * math.expm1(error):.0f} %), so that p would be wrong: give an object with sample, log_prob, "
+                "to_standard_normal and from_standard_normal instead."
+            )
+
+    def _density_error(self) -> float:
+        """Return the median of |log p(x) - log phi(u) + log |det dx/du|| over some points; 0 in many dimensions."""
+        if self.dim > CHECKED_DIMS:
+            return 0.0
+        u = np.random.default_rng(0).standard_normal((CHECKED_POINTS, self.dim))
+        steps = CHECK_STEP * np.eye(self.dim)
+        ahead, behind = (self.from_standard_normal((u[:, None] + s * steps).reshape(-1, self.dim)) for s in (1, -1))
+        slopes = ((ahead - behind) / (2 * CHECK_STEP)).reshape(CHECKED_POINTS, self.dim, self.dim)
+        volume = np.linalg.slogdet(slopes).logabsdet
+        log_phi = -0.5 * (u**2).sum(axis=1) - 0.5 * self.dim * math.log(2 * math.pi)
+        return float(np.median(np.abs(self.log_prob(self.from_standard_normal(u)) - log_phi + volume)))
 
     @cached_property
     def _standard(self) -> str:

@@ -62,6 +62,12 @@ def test_what_cannot_be_imported_is_one_line(own_module: str, spec: str, message
 def test_names_are_suggested_without_their_namespace() -> None:
     ids = ["rare_envs/CutIn-v0", "rare_envs/Highway-v0"]
     assert did_you_mean("Highway-v1", ids) == " (did you mean 'rare_envs/Highway-v0'?)"
+    assert (
+        did_you_mean("cutin-V0", ids)
+        == did_you_mean("RARE_ENVS/CUTIN-V0", ids)
+        == " (did you mean 'rare_envs/CutIn-v0'?)"
+    )
+    assert did_you_mean("TTC", ["ttc", "pet"]) == " (did you mean 'ttc'?)"
     assert did_you_mean("zzz", ids) == ""
 
 

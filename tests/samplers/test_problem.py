@@ -149,6 +149,16 @@ def test_an_f_of_batches_that_raises_gets_none():
     assert samplers.estimate(problem, "mc", seed=0, max_sim=100, on_error="failure").p > 0.1
 
 
+def test_what_is_no_number_is_named_in_whole_sentences():
+    def f(x):
+        x.sum(axis=1)  # and no return
+
+    with pytest.raises(samplers.EvaluationError, match=r"got None: f has no `return`\.$"):
+        samplers.estimate(samplers.FunctionProblem(f, dim=2), "mc", seed=0, max_sim=100)
+    with pytest.raises(samplers.EvaluationError, match=r"could not convert string to float: 'a'\. f gets a batch"):
+        samplers.estimate(samplers.FunctionProblem(lambda x: "a", dim=2), "mc", seed=0, max_sim=100)
+
+
 def test_repr_is_one_line():
     assert repr(samplers.FunctionProblem(np.sin, dim=1)) == "<FunctionProblem of sin, 1 dimension>"
     assert "<p>FunctionProblem of &lt;lambda&gt;" in samplers.FunctionProblem(lambda x: x, dim=2)._repr_html_()

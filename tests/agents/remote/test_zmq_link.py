@@ -110,6 +110,9 @@ def test_a_broken_connection_and_silence_are_told_apart(serve: Any) -> None:
 def test_a_wrong_address_is_refused() -> None:
     with pytest.raises(ValueError, match="expected tcp://host:port"):
         ZmqLink("tcp://no port").open()
+    for port in (0, 99999):  # which ZeroMQ would try for as long as it may
+        with pytest.raises(ValueError, match=rf"Cannot connect to 'tcp://localhost:{port}': expected a port from 1"):
+            ZmqLink(f"tcp://localhost:{port}").open()
 
 
 @pytest.mark.parametrize("where", ["tcp", pytest.param("process", marks=pytest.mark.slow)])

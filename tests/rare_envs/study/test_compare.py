@@ -5,6 +5,7 @@ import json
 import pytest
 
 from rare_envs.study.storage.failure_table import read_failures
+from tests.rare_envs.study.refusals import assert_refused
 
 FOLLOWING = "rare_envs/CarFollowing-v0"
 RANDOM_LATER = """
@@ -66,6 +67,11 @@ def test_a_missing_ego_is_named(cli):
     assert result.exit_code == 2
     assert "nowhere.zip" in result.stderr
     assert result.stdout == ""
+
+
+def test_an_ego_with_noise_in_x_is_refused_beside_one_without(cli):
+    result = cli("compare", "idm", "human", FOLLOWING, "--max-sim", 100)
+    assert_refused(result, "the same x, got 3 and", "an ego that is random has its own in x: estimate each by itself")
 
 
 def test_an_ego_that_answers_at_random_is_named(cli, risky, here):

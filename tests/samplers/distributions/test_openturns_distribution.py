@@ -105,6 +105,23 @@ def test_what_has_no_map_is_refused():
         OpenTurnsDistribution(openturns.Student(4.0, [0.0, 0.0], [1.0, 1.0], correlated()))
 
 
+def test_a_map_that_has_not_the_density_is_refused():
+    """OpenTURNS 1.27 maps this distribution wrongly: x1 + x2 is Beta(3, 3), and p would be 1.7e-3 where it is 1e-3."""
+    with pytest.raises(
+        ValueError, match=r"transformation of this Dirichlet does not have its density \(off by \d+ %\)"
+    ):
+        OpenTurnsDistribution(openturns.Dirichlet([1.0, 2.0, 3.0]))
+
+
+def test_draws_have_the_law_that_openturns_draws_from(base):
+    """Where OpenTURNS draws without the map, it is another witness of each coordinate."""
+    openturns.RandomGenerator.SetSeed(0)
+    theirs = np.asarray(base.distribution.getSample(4000))
+    ours = base.sample(4000, np.random.default_rng(0))
+    for column in range(base.dim):
+        assert stats.ks_2samp(ours[:, column], theirs[:, column]).pvalue > 1e-4
+
+
 def test_p_with_correlated_normals_is_exact():
     """X ~ N(0, R), correlation 0.5: P[x1 + x2 >= 6] = Phi(-6 / sqrt(3)) = 2.7e-4."""
     base = openturns.JointDistribution([openturns.Normal(), openturns.Normal()], openturns.NormalCopula(correlated()))

@@ -25,7 +25,9 @@ def plan_command(
         str, typer.Argument(metavar="ENV|RUN", help="Environment, of which pilots are run; or the folder of a run.")
     ],
     options: QuestionOptions,
-    cov: Annotated[float, typer.Option(help="Coefficient of variation that is wished for.")] = 0.1,
+    cov: Annotated[
+        float, typer.Option("--cov", "--target-cov", help="Coefficient of variation that is wished for.")
+    ] = 0.1,
     ego: Annotated[str, typer.Option(help="An ego, as for estimate --ego.")] = "idm",
     pilot: Annotated[
         int | None, typer.Option(help="Simulations of each pilot.", show_default="the method's own budget")

@@ -15,6 +15,7 @@ def test_a_plan_from_pilots_and_one_from_a_folder(cli: Cli, risky: str, safe: st
     assert planned["method"] == "mc" and planned["n_sim"] > 2000 and planned["seconds"] > 0.0
     assert cli(*SMALL, "--base", risky, "--horizon", 4, "--out", tmp_path / "run").exit_code == 0
     text = cli("plan", tmp_path / "run", "--cov", 0.05).stdout
+    assert cli("plan", tmp_path / "run", "--target-cov", 0.05).stdout == text  # as `estimate` names it
     assert f"{planned['n_sim']:,} simulations" in text and "--target-cov 0.05" in text  # the same seed, the same pilot
     none = cli("plan", FOLLOWING, "--base", safe, "--method", "mc", "--pilot", 200)
     assert none.exit_code == 2 and none.stdout == ""
