@@ -13,6 +13,7 @@ from torch import Tensor
 from rare_envs.control.actions import DISCRETE_ACTIONS, IDLE, META_ACTIONS
 from rare_envs.egos.inference import PolicyQuery, query_policy
 from rare_envs.egos.needs import RULE_BASED_EGOS, WorldEgo, find_rule_based, resolve
+from rare_envs.egos.sb3.dense_inference import find_inference
 from rare_envs.egos.validation import refuse_ego
 from rare_envs.egos.wrappers import find_frame_stacking, wrap_policy
 from rare_envs.sensors.kinds import map_kinds
@@ -51,9 +52,9 @@ class PolicyDriver:
         """
         state, over = episode.state, episode.collided
         batch = len(over)
-        hidden, tick = (None, 0) if memory is None else memory
+        hidden, tick, policy = (None, 0, find_inference(self.policy)) if memory is None else memory
         if tick % self.stride:
-            return torch.full((batch,), IDLE, device=state.x.device), (hidden, tick + 1)
+            return torch.full((batch,), IDLE, device=state.x.device), (hidden, tick + 1, policy)
         if self.failed_rows:
             over = over.clone()
             over[list(self.failed_rows)] = True
@@ -61,13 +62,15 @@ class PolicyDriver:
         observation = map_kinds(lambda part: _replace_rows(part, over).numpy(force=True), seen)
         start = np.full(batch, memory is None)
         actions, hidden = query_policy(
-            self.policy, self.action, PolicyQuery(observation, hidden, start, over), self.failed_rows
+            policy, self.action, PolicyQuery(observation, hidden, start, over), self.failed_rows
         )
-        return actions.to(state.x) if actions.is_floating_point() else actions, (hidden, tick + 1)
+        return actions.to(state.x) if actions.is_floating_point() else actions, (hidden, tick + 1, policy)
 
 
 def _replace_rows(observation: Tensor, rows: Tensor) -> Tensor:
     """Return an observation in which some rows are replaced by the first other row, or by zeros if there is none."""
+    if not bool(rows.any()):
+        return observation
     wide = rows.view(-1, *[1] * (observation.ndim - 1))
     if bool(rows.all()):
         return observation.masked_fill(wide, 0)

@@ -1,6 +1,7 @@
 """Observations of an ego: `features`, its own state and the others' relative to it, `lidar`, `camera` and others."""
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -133,10 +134,12 @@ def observe_features(state: State) -> Tensor:
             state.y[:, j] - state.y[:, 0],
             state.speed[:, j] * torch.sin(state.heading[:, j]),
         ]
-    return (torch.stack(values, dim=1) / _scales(state)).clamp(-CLIP, CLIP).float()
+    return (torch.stack(values, dim=1) / _scales(state.x.shape[1], state.x.dtype, state.x.device)).clamp(-CLIP, CLIP).float()
 
 
-def _scales(state: State) -> Tensor:
+@lru_cache(maxsize=32)
+def _scales(vehicles: int, dtype: torch.dtype, device: torch.device) -> Tensor:
     """Return the scales of the entries of `features`, shape (3 + 4 (N - 1),)."""
-    features = EGO_FEATURES + OTHER_FEATURES * (state.x.shape[1] - 1)
-    return torch.tensor([feature.scale for feature in features], dtype=state.x.dtype, device=state.x.device)
+    features = EGO_FEATURES + OTHER_FEATURES * (vehicles - 1)
+    with torch.inference_mode(False):  # made under it they could not be used for gradients later
+        return torch.tensor([feature.scale for feature in features], dtype=dtype, device=device)

@@ -1,0 +1,83 @@
+"""Dense networks of Stable-Baselines3 queried layer by layer: the bits of `predict` without its way to the network.
+
+`predict` sets the mode of every module, copies the observations and makes a distribution whose mean it takes. With 25
+observations that takes six times as long as the layers.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+from torch.nn.functional import linear
+
+from rare_envs.egos.sb3.dense_networks import read_dense_policy
+from rare_envs.egos.wrappers import NormalisedPolicy, RescaledPolicy
+from rare_envs.simulation.compiled.failures import NotCompiled
+
+_ACTIVATIONS = {"tanh": torch.tanh, "relu": torch.relu}
+
+
+@dataclass(frozen=True, eq=False)
+class DenseInference:
+    """A policy with continuous actions that is dense layers, with the weights that it had when it was read."""
+
+    policy: Any
+    """Whose `predict` this one stands for."""
+    layers: tuple[tuple[Tensor, Tensor], ...]
+    """Weights, shape (outputs, inputs), and biases, shape (outputs,), of each layer, first to last."""
+    activation: str
+    """Between the layers, "tanh" or "relu"."""
+    low: Tensor
+    """Bounds of the actions, shape (2,)."""
+    high: Tensor
+
+    def predict(
+        self,
+        observation: NDArray[Any],
+        state: Any = None,
+        episode_start: NDArray[Any] | None = None,
+        deterministic: bool = True,
+    ) -> tuple[NDArray[Any], Any]:
+        """Return mean actions for observations (B, F), clipped; where they are not finite, what `policy` does then."""
+        between = _ACTIVATIONS[self.activation]
+        with torch.no_grad():
+            values = torch.from_numpy(observation).float()
+            for weights, biases in self.layers[:-1]:
+                values = between(linear(values, weights, biases))
+            actions = linear(values, *self.layers[-1])
+        if not bool(actions.isfinite().all()):
+            answer: tuple[NDArray[Any], Any] = self.policy.predict(
+                observation, state=state, episode_start=episode_start, deterministic=deterministic
+            )
+            return answer
+        return actions.clamp(self.low, self.high).numpy(), state
+
+
+def find_inference(policy: Any) -> Any:
+    """Return what gives a policy's actions soonest: its layers alone, or the policy itself where it is anything else.
+
+    Args:
+        policy: Has Stable-Baselines3's `predict`; it may stand behind wrappers.
+
+    Example:
+        >>> import gymnasium, rare_envs
+        >>> from stable_baselines3 import PPO
+        >>> model = PPO("MlpPolicy", gymnasium.make("rare_envs/CarFollowing-v0"), device="cpu")
+        >>> type(find_inference(model)).__name__, find_inference("anything else")
+        ('DenseInference', 'anything else')
+    """
+    if type(policy) in (RescaledPolicy, NormalisedPolicy):
+        return replace(policy, policy=find_inference(policy.policy))
+    try:
+        dense = read_dense_policy(policy)
+    except NotCompiled:
+        return policy
+    on_cpu = str(getattr(getattr(policy, "same_as", policy), "device", "cpu")) == "cpu"  # of SB3 all have one
+    if dense.clip is None or dense.rescale or dense.normalisation or not on_cpu:  # discrete actions, or wrapped twice
+        return policy
+    layers = tuple((torch.from_numpy(weights), torch.from_numpy(biases)) for weights, biases in dense.layers)
+    return DenseInference(policy, layers, dense.activation, *map(torch.from_numpy, dense.clip))

@@ -1,0 +1,73 @@
+"""Layers of SB3's policies queried alone give the bits of `predict`, and everything else is left to it."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+from stable_baselines3 import A2C, DQN, PPO
+from stable_baselines3.common.vec_env import VecNormalize
+
+import rare_envs
+import training
+from rare_envs.egos.sb3.dense_inference import DenseInference, find_inference
+from rare_envs.egos.wrappers import NormalisedPolicy, RescaledPolicy, wrap_policy
+
+CUT_IN = "rare_envs/CutIn-v0"
+
+
+def make(algorithm=PPO, **policy_kwargs):
+    return algorithm("MlpPolicy", gym.make(CUT_IN), device="cpu", seed=0, policy_kwargs=policy_kwargs or None)
+
+
+@pytest.mark.parametrize("size", [1, 7, 25, 1000, 4096])
+@pytest.mark.parametrize(
+    "make_model", [make, lambda: make(A2C, activation_fn=torch.nn.ReLU), lambda: make(net_arch=[256, 128, 32])]
+)
+def test_actions_are_those_of_predict_to_the_last_bit(make_model, size):
+    model = make_model()
+    seen = np.random.default_rng(1).uniform(-5, 5, (size, 11)).astype(np.float32)
+    found = find_inference(model)
+    assert isinstance(found, DenseInference)
+    np.testing.assert_array_equal(found.predict(seen)[0], model.predict(seen, deterministic=True)[0])
+
+
+def test_wrappers_stay_around_the_layers():
+    statistics = VecNormalize(training.sb3_vec_env(CUT_IN, num_envs=2))
+    statistics.obs_rms.mean[:] = np.random.default_rng(1).normal(size=11)
+    model = PPO("MlpPolicy", statistics, device="cpu", seed=0)
+    wrapped = RescaledPolicy(wrap_policy(model, gym.make(CUT_IN).observation_space), np.full(2, -2.0), np.ones(2))
+    found = find_inference(wrapped)
+    assert type(found) is RescaledPolicy and type(found.policy) is NormalisedPolicy
+    assert isinstance(found.policy.policy, DenseInference)
+    seen = np.random.default_rng(1).uniform(-5, 5, (25, 11)).astype(np.float32)
+    np.testing.assert_array_equal(found.predict(seen)[0], wrapped.predict(seen, deterministic=True)[0])
+
+
+def test_other_policies_are_asked_by_predict():
+    class Own(PPO):
+        """A PPO that may predict in another way."""
+
+    chooses = DQN("MlpPolicy", gym.make(CUT_IN, action="discrete"), device="cpu", buffer_size=10)
+    for policy in (chooses, make(Own), make(activation_fn=torch.nn.ELU), object()):
+        assert find_inference(policy) is policy
+
+
+def test_a_network_without_finite_outputs_fails_as_predict_does():
+    model = make()
+    with torch.no_grad():
+        model.policy.action_net.bias[0] = torch.nan
+    with pytest.raises(ValueError, match="invalid values"):
+        find_inference(model).predict(np.random.default_rng(1).normal(size=(3, 11)).astype(np.float32))
+
+
+def test_rollouts_are_those_of_predict_and_weights_are_read_for_each(monkeypatch):
+    model = make()
+    problem = rare_envs.DrivingProblem(CUT_IN, ego=model, core="torch", horizon=3.0)
+    x = problem.base.sample(40, np.random.default_rng(0))
+    first = problem.evaluate(x)
+    with torch.no_grad():
+        model.policy.action_net.bias[0] = 2.0
+    learned = problem.evaluate(x)
+    assert (first != learned).any()
+    monkeypatch.setattr("rare_envs.egos.policy.find_inference", lambda policy: policy)
+    np.testing.assert_array_equal(learned, problem.evaluate(x))
