@@ -46,13 +46,14 @@ FLOORS = {
     "highway_256": 100.0,
     "highway_512": 100.0,
     "highway_1024": 100.0,
+    "highway_1_compiled": 10.0,
     "highway_25_compiled": 300.0,
     "highway_1024_compiled": 300.0,
 }
 """Least ratios to HighwayEnv."""
 BATCHES = (1, 64, 256, 512, 1024)
 """Batch sizes of the highway."""
-COMPILED_BATCHES = (25, 1024)
+COMPILED_BATCHES = (1, 25, 1024)
 """Likewise with compiled rollouts."""
 CEILINGS = {
     "camera_64": 40.0,

@@ -134,7 +134,8 @@ def observe_features(state: State) -> Tensor:
             state.y[:, j] - state.y[:, 0],
             state.speed[:, j] * torch.sin(state.heading[:, j]),
         ]
-    return (torch.stack(values, dim=1) / _scales(state.x.shape[1], state.x.dtype, state.x.device)).clamp(-CLIP, CLIP).float()
+    scales = _scales(state.x.shape[1], state.x.dtype, state.x.device)
+    return (torch.stack(values, dim=1) / scales).clamp(-CLIP, CLIP).float()
 
 
 @lru_cache(maxsize=32)

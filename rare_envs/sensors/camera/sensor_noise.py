@@ -13,7 +13,7 @@ _STEP = -1640531535
 """2^32 over the golden ratio, as int32: Weyl's sequence spreads consecutive numbers."""
 _FACTORS = (0x7FEB352D, 0x846CA68B - 2**32)
 """Of a mixing function with low bias: Wellons, "Prospecting for hash functions", 2018 (lowbias32)."""
-_EVEN = 0x00FF00FF
+_EVEN, _BOTH = 0x00FF00FF, 0x00010001
 _MEAN, _DEVIATION = 4 * 127.5, (4 * (256**2 - 1) / 12) ** 0.5
 
 
@@ -23,10 +23,13 @@ def draw_pixel_noise(context: CameraContext, values: int) -> Tensor:
     for number in (context.tick, torch.full_like(context.tick, context.viewer)):
         key = _mix(key + (number.to(torch.int32) + 1) * _STEP)
     place = torch.arange(values, dtype=torch.int32, device=key.device) * _STEP
-    bits = _mix(place[None, :] + key[:, None])
-    pairs = (bits >> 8).bitwise_and_(_EVEN).add_(bits.bitwise_and_(_EVEN))  # bytes 0 + 1 and 2 + 3
-    total = (pairs >> 16).add_(pairs.bitwise_and_(0xFFFF))
-    return total.float().sub_(_MEAN).div_(_DEVIATION)
+    noise = torch.empty(len(key), values, device=key.device)
+    for mixed, row in zip(key.unbind(), noise.unbind(), strict=True):  # one picture stays in the cache
+        bits = _mix(place + mixed)
+        pairs = (bits >> 8).bitwise_and_(_EVEN).add_(bits.bitwise_and_(_EVEN))  # bytes 0 + 1 and 2 + 3
+        total = pairs.mul_(_BOTH) >> 16
+        torch.sub(total, _MEAN, out=row).div_(_DEVIATION)
+    return noise
 
 
 def _mix(bits: Tensor) -> Tensor:
