@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from markupsafe import Markup, escape
+
 from rare_envs.study.html_report.svg import FigureOfPage
 from rare_envs.study.html_report.templating import render_template
 from rare_envs.study.reproduction.columns import (
@@ -34,4 +36,17 @@ def render_reproduction(record: Mapping[str, Any], figures: Sequence[FigureOfPag
         number=format_compared,
         ends=format_compared_ends,
         nothing=NOTHING,
+        code=mark_code,
     )
+
+
+def mark_code(text: str) -> Markup:
+    """Return a text as HTML in which what stands between backticks is code.
+
+    Example:
+        >>> mark_code("`noisy:idm` < a stack")
+        Markup('<code>noisy:idm</code> &lt; a stack')
+    """
+    parts = text.split("`")
+    marked = [Markup("<code>{}</code>").format(part) if place % 2 else escape(part) for place, part in enumerate(parts)]
+    return Markup("").join(marked)

@@ -33,7 +33,7 @@ def test_paper_ours_and_difference_stand_side_by_side() -> None:
 def test_on_narrow_screens_every_number_has_its_head_and_empty_cells_are_left_out() -> None:
     page = render_reproduction(record_by_hand(), [])
     assert '<td class="n" data-head="ours, all simulations">5,500</td>' in page
-    assert '<td class=" none" data-head="why they differ">–</td>' in page
+    assert '<td class="words none" data-head="why they differ">–</td>' in page
     assert "td[data-head]:not(.name)::before" in page
 
 
@@ -42,3 +42,14 @@ def test_the_page_needs_nothing_else_and_has_all_sections() -> None:
     assert not re.search(r"(src|href)=", page)
     assert [f'id="{name}"' in page for name in ("notes", "table9", "findings", "figure9", "made")] == [True] * 5
     assert "rare-envs reproduce paper" in page
+
+
+def test_code_in_notes_is_shown_as_code_and_escaped() -> None:
+    record = {**record_by_hand(), "notes": ["the ego `a<b>` & others"]}
+    assert "<li>the ego <code>a&lt;b&gt;</code> &amp; others</li>" in render_reproduction(record, [])
+
+
+def test_a_figure_that_is_not_drawn_says_why() -> None:
+    record = record_by_hand()
+    record["figures"]["figure9"]["caption"] = "Not run yet."
+    assert "<p>Not run yet.</p>" in render_reproduction(record, [])
