@@ -82,7 +82,7 @@ def test_the_first_screen_of_the_readme() -> None:
 
 
 def test_the_readme_is_short() -> None:
-    assert len("\n".join(readme_lines())) < 13_000
+    assert len("\n".join(readme_lines())) < 10_000
 
 
 def test_pages_of_a_navigation() -> None:

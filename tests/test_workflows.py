@@ -46,6 +46,53 @@ def test_make_targets_exist() -> None:
                     assert set(words) <= targets
 
 
+ACTIONS = {
+    "actions/checkout",
+    "actions/download-artifact",
+    "actions/setup-python",
+    "actions/upload-artifact",
+    "pypa/gh-action-pypi-publish",
+}
+"""Actions that the workflows may use; a new one is looked at before it is named here."""
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_actions_have_a_version_and_inputs_that_steps_need(name: str) -> None:
+    for job in read_workflow(name)["jobs"].values():
+        for step in job.get("steps", ()):
+            assert ("uses" in step) != ("run" in step)
+            if "uses" in step:
+                action, _, version = step["uses"].partition("@")
+                assert action in ACTIONS
+                assert re.fullmatch(r"v\d+|release/v\d+", version)
+            for word in re.findall(r"\$\{\{ matrix\.(\w+) \}\}", str(step)):
+                assert word in job["strategy"]["matrix"]
+        if str(job.get("runs-on")).startswith("${{"):
+            assert job["defaults"]["run"]["shell"] == "bash"  # Windows would take another one
+
+
+def test_an_artifact_that_is_taken_was_left() -> None:
+    left, taken = set(), set()
+    for name in NAMES:
+        for job in read_workflow(name)["jobs"].values():
+            for step in job.get("steps", ()):
+                if step.get("uses", "").startswith("actions/upload-artifact"):
+                    left.add(step["with"]["name"])
+                if step.get("uses", "").startswith("actions/download-artifact"):
+                    taken.add(step["with"]["name"])
+    assert taken == {"packages"}
+    assert taken <= left
+
+
+def test_paths_in_commands_exist() -> None:
+    for name in NAMES:
+        for job in read_workflow(name)["jobs"].values():
+            for step in job.get("steps", ()):
+                for path in re.findall(r"(?<![\w./-])(?:tests|rare_envs|samplers)/[\w./]+", step.get("run", "")):
+                    if path not in ("rare_envs/CutIn-v0", "rare_envs/CutIn"):
+                        assert (ROOT / path).exists(), path
+
+
 def test_the_wheel_is_installed_on_all_systems_and_versions() -> None:
     matrix = read_workflow("build")["jobs"]["install"]["strategy"]["matrix"]
     assert {system.partition("-")[0] for system in matrix["os"]} == {"ubuntu", "macos", "windows"}

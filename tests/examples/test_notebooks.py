@@ -72,6 +72,19 @@ def test_a_notebook_runs(
 
 
 @pytest.mark.parametrize("name", sorted(SMALL))
+def test_a_notebook_needs_nothing_of_this_machine(name: str) -> None:
+    """A hosted service has the file of the notebook alone: no path outside its working directory, no data beside it."""
+    text = "\n".join(code_of(cell) for cell in cells_of(name))
+    assert re.findall(r"""["'](?:/|~|\.\./|[A-Za-z]:\\\\)""", text) == []
+    assert len((FOLDER / f"{name}.ipynb").read_bytes()) < 20_000  # no data, no pictures
+    install = next(code_of(cell) for cell in cells_of(name) if cell["cell_type"] == "code")
+    source = re.search(r'^SOURCE = "(.*)"$', install, re.MULTILINE)
+    needed = {"samplers_without_cars": "rare-envs"}.get(name, "rare-envs[driving]")
+    assert source is not None and source[1] == needed
+    assert '"pip", "install"' in install
+
+
+@pytest.mark.parametrize("name", sorted(SMALL))
 def test_a_notebook_is_well_formed(name: str) -> None:
     cells = cells_of(name)
     code = [code_of(cell) for cell in cells if cell["cell_type"] == "code"]
