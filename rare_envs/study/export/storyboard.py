@@ -160,7 +160,9 @@ def _make_carla_controller(xosc: Any, vehicle: str) -> Any:
 
 
 def _make_act(xosc: Any, trajectories: WorldTrajectories, options: StoryOptions) -> Any:
-    act = xosc.Act("drive", _after(xosc, 0.0, "start", "start"))
+    # what begins after time 0 leaves its trajectory for a tick; 1.0 has no other rule
+    begin = xosc.Rule.greaterThan if options.carla else xosc.Rule.greaterOrEqual
+    act = xosc.Act("drive", _at(xosc, 0.0, "start", "start", begin))
     priority = xosc.Priority.overwrite if options.carla else xosc.Priority.override  # its name since 1.1
     for j, vehicle in enumerate(trajectories.names):
         if vehicle == "ego" and options.free_ego:
@@ -171,7 +173,7 @@ def _make_act(xosc: Any, trajectories: WorldTrajectories, options: StoryOptions)
         line.add_shape(xosc.Polyline(trajectories.time.tolist(), places))
         follow = xosc.FollowTrajectoryAction(line, xosc.FollowingMode.position, xosc.ReferenceContext.absolute, 1, 0)
         event = xosc.Event(f"{vehicle}_follows", priority)
-        event.add_trigger(_after(xosc, 0.0, f"{vehicle}_starts", "start"))
+        event.add_trigger(_at(xosc, 0.0, f"{vehicle}_starts", "start", begin))
         event.add_action(f"{vehicle}_follows_trajectory", follow)
         maneuver = xosc.Maneuver(f"{vehicle}_maneuver")
         maneuver.add_event(event)
@@ -182,14 +184,14 @@ def _make_act(xosc: Any, trajectories: WorldTrajectories, options: StoryOptions)
     return act
 
 
-def _after(xosc: Any, time: float, name: str, point: str) -> Any:
-    """Return a trigger that is true once the simulation time is beyond `time` [s], or from its start at 0."""
-    condition = xosc.SimulationTimeCondition(time, xosc.Rule.greaterThan)
+def _at(xosc: Any, time: float, name: str, point: str, rule: Any) -> Any:
+    """Return a trigger by a comparison of the simulation time with `time` [s]."""
+    condition = xosc.SimulationTimeCondition(time, rule)
     return xosc.ValueTrigger(name, 0, xosc.ConditionEdge.none, condition, point)
 
 
 def _make_stop(xosc: Any, trajectories: WorldTrajectories, options: StoryOptions) -> Any:
-    end = _after(xosc, float(trajectories.time[-1]), "end", "stop")
+    end = _at(xosc, float(trajectories.time[-1]), "end", "stop", xosc.Rule.greaterThan)
     if not options.carla:
         return end
     # scenario_runner takes a condition of this name for a criterion, and reports whether the ego collided

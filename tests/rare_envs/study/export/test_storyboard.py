@@ -109,6 +109,13 @@ def test_a_crash_is_a_crash_in_the_file(cut_in: Drive, tmp_path: Path) -> None:
     assert touch == [False] * (len(touch) - 1) + [True]
 
 
+def test_vehicles_follow_their_trajectories_from_the_start(cut_in: Drive, tmp_path: Path) -> None:
+    """One that begins after time 0 goes straight on for a tick: 8 cm beside its trajectory in esmini."""
+    story = ET.parse(export(cut_in, tmp_path, "openscenario"))
+    rules = [one.attrib["rule"] for one in story.iterfind(".//StartTrigger//SimulationTimeCondition")]
+    assert rules == ["greaterOrEqual"] * 4  # the act, and the events of three vehicles
+
+
 def test_the_reference_point_is_the_rear_axle(cut_in: Drive, tmp_path: Path) -> None:
     start = read_start(export(cut_in, tmp_path, "openscenario"))
     x, y, heading, speed = start["cutter"]
