@@ -81,9 +81,9 @@ def format_scales(records: Mapping[str, Mapping[str, Any]]) -> str:
     text = (
         "All is there but rollouts with the vision ego: its small scale is not complete, and its full scale was not "
         "begun. In each rollout a camera draws a picture for each of 100 steps and a network looks at it: about "
-        f"{vision:.0f} rollouts a second of a core's processor time (an AMD EPYC; 3.4 where eight programs shared two "
-        f"cores), where the lidar ego makes {lidar:,.0f}. That is {hours[0]:.1f} core hours for the small scale and "
-        f"{hours[1]:.0f} for the full one. `rare-envs reproduce okelly2018 --ego vision --out vision` makes the small "
+        f"{vision:g} rollouts a second of a core's processor time (an AMD EPYC), where the lidar ego makes "
+        f"{lidar:,.0f}. That is {hours[0]:.1f} core hours for the small scale and {hours[1]:.0f} for the full one. "
+        "`rare-envs reproduce okelly2018 --ego vision --out vision` makes the small "
         "scale, in half the time with `--workers 2`, and goes on where it was stopped; `--scale full --executor ray` "
         "is for a cluster. Until then nothing here says whether cross-entropy gains with this ego what the paper's "
         "Table 2 and Figure 3 show."

@@ -108,4 +108,4 @@ def write_notes(study: HighwayStudy, found: Mapping[str, Any]) -> list[str]:
 
 def _say_speed(speed: float) -> str:
     """Return the beginning of a sentence: not the speed of this run, so that equal seeds give equal notes."""
-    return f"At {speed:,.0f} rollouts a second, about what a core of an AMD EPYC makes by its processor time,"
+    return f"At {speed:,.4g} rollouts a second, about what a core of an AMD EPYC makes by its processor time,"

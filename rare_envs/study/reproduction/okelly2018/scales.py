@@ -82,7 +82,7 @@ WHY_OTHER_THRESHOLDS = {
     "probabilities with that ego.",
 }
 """Explanations by ego."""
-CORE_SPEEDS = {"lidar": 1000.0, "vision": 6.0}
+CORE_SPEEDS = {"lidar": 1000.0, "vision": 3.5}
 """Rollouts a second of processor time with each ego, about: chunks of the small scale on one core of an AMD EPYC."""
 EGO_NAMES = {"lidar": "imitation", "vision": "vision"}
 """The egos by their names in `agents.load_ego`."""
