@@ -3,7 +3,7 @@
 OMP_NUM_THREADS=1 python -m benchmarks.simulation.core_rates
 """
 
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import typer
@@ -51,8 +51,17 @@ def measure_answers(env_id: str, core: str, seeds: int = 4) -> str:
 
 
 @use_one_thread()
-def main() -> None:
+def main(only_answers: Annotated[bool, typer.Option(help="Estimates alone.")] = False) -> None:
     """Measure and print."""
+    if not only_answers:
+        print_rates()
+    for env_id in (CUT_IN, CAR_FOLLOWING):
+        for core in ("auto", "torch"):
+            print(f"{env_id}, estimates, core {core}: {measure_answers(env_id, core)}", flush=True)
+
+
+def print_rates() -> None:
+    """Measure and print rollouts a second."""
     for rows in (25, 6000, 100_000):
         for env_id in (CAR_FOLLOWING, CUT_IN, HARD_BRAKE):
             print(f"{env_id}, {rows:,} rows: {measure_rates(env_id, rows)}")
@@ -65,9 +74,6 @@ def main() -> None:
         print(f"{HIGHWAY}, ttc with terms, {rows:,} rows: {measure_rates(HIGHWAY, rows, terms=True)}")
         found = measure_rates(HIGHWAY, rows, measure="lidar_ttc", ego=learned)
         print(f"{HIGHWAY}, lidar_ttc, learned ego, {rows:,} rows: {found}")
-    for env_id in (CUT_IN, CAR_FOLLOWING):
-        for core in ("auto", "torch"):
-            print(f"{env_id}, estimates, core {core}: {measure_answers(env_id, core)}")
 
 
 if __name__ == "__main__":

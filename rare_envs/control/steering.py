@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from rare_envs.traffic.road import Road
-from rare_envs.traffic.vehicle_models import NEAR_ZERO, steering_for
+from rare_envs.traffic.vehicle_models import NEAR_ZERO, are_zero, steering_for
 
 TAU_LATERAL = 0.6
 """Time constant of the way back to the line [s], HighwayEnv's `TAU_LATERAL`."""
@@ -42,7 +42,8 @@ def lane_keeping(y: Tensor, heading: Tensor, speed: Tensor, road: Road) -> Tenso
         >>> round(lane_keeping(zero + 0.5, zero, zero + 20.0, straight(1)).item(), 4)  # to the left, back to the lane
         -0.0521
     """
-    return steering_control(y - road.centre_of(y), heading, speed)
+    offset = y - road.centre_of(y)
+    return torch.zeros_like(y) if are_zero(offset, heading) else steering_control(offset, heading, speed)
 
 
 def steering_control(offset: Tensor, heading: Tensor, speed: Tensor) -> Tensor:

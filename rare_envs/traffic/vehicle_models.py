@@ -59,18 +59,25 @@ def bicycle(
         >>> round(x.item(), 2), round(speed.item(), 2)
         (2.0, 20.1)
     """
+    distance, after = speed * dt, (speed + acceleration * dt).clamp(min=0.0)
+    if curvature is None and are_zero(steering, heading):
+        return x + distance, y, heading, after
     slip = torch.atan(torch.tan(steering) * 0.5)
     course = heading + slip
-    distance = speed * dt
     ahead, turn = distance * torch.cos(course), distance * torch.sin(slip) / (VEHICLE_LENGTH / 2)
     if curvature is not None:
         ahead, turn = _along_curve(ahead, turn, y, curvature)
-    return (
-        x + ahead,
-        y + distance * torch.sin(course),
-        heading + turn,
-        (speed + acceleration * dt).clamp(min=0.0),
-    )
+    return x + ahead, y + distance * torch.sin(course), heading + turn, after
+
+
+def are_zero(*values: Tensor) -> bool:
+    """Return whether all of these are 0, where that is soon known and nothing is differentiated with respect to them.
+
+    Cars that go straight on in the middle of a lane then need no trigonometry; the result is the same.
+    """
+    if torch.is_grad_enabled() or values[0].device.type != "cpu":  # elsewhere to look at a value is to wait for it
+        return False
+    return not any(bool(value.any()) for value in values)
 
 
 def steering_for(yaw_rate: Tensor, speed: Tensor) -> Tensor:

@@ -42,3 +42,12 @@ def test_steering_by_hand() -> None:
     # the heading that the offset asks for needs no steering
     held = steering_control(tensor(3.0), tensor(-math.asin(0.25)), tensor(20.0))
     assert held.item() == pytest.approx(0.0, abs=1e-15)
+
+
+def test_steering_on_the_line_is_the_same_beside_a_car_that_is_off_it_and_alone() -> None:
+    y, speed = torch.tensor([0.0, 4.0, 1.0]), torch.tensor([20.0, 0.0, 20.0])
+    with torch.no_grad():
+        together = lane_keeping(y, 0 * y, speed, straight(2))
+        alone = lane_keeping(y[:2], 0 * y[:2], speed[:2], straight(2))
+    assert together.tolist()[:2] == alone.tolist() == [0.0, 0.0]
+    assert together[2] < 0.0

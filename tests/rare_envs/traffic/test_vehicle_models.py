@@ -8,7 +8,7 @@ import torch
 from highway_env.utils import not_zero
 from torch import Tensor
 
-from rare_envs.traffic.vehicle_models import NEAR_ZERO, STEERING_LIMIT, bicycle, point_mass, steering_for
+from rare_envs.traffic.vehicle_models import NEAR_ZERO, STEERING_LIMIT, are_zero, bicycle, point_mass, steering_for
 from tests.rare_envs.traffic_states import F64, tensor
 
 
@@ -36,6 +36,27 @@ def test_bicycle_turns_on_the_kinematic_circle() -> None:
 def test_vehicles_stop_and_do_not_reverse() -> None:
     *_, speed = bicycle(tensor(0.0), tensor(0.0), tensor(0.0), tensor(0.3), tensor(-5.0), tensor(0.0), 0.1)
     assert speed.item() == 0.0
+
+
+def test_straight_on_is_the_same_bits_beside_vehicles_that_turn_and_alone() -> None:
+    generator = torch.Generator().manual_seed(0)
+    x, y, speed, acceleration = torch.randn(4, 100, generator=generator) * 10
+    zero, turning = torch.zeros(100), torch.zeros(100)
+    turning[-1] = 0.1
+    with torch.no_grad():
+        alone = bicycle(x, y, zero, speed.abs(), acceleration, zero, 0.1)
+        beside = bicycle(x, y, zero, speed.abs(), acceleration, turning, 0.1)
+    for one, other in zip(alone, beside, strict=True):
+        assert torch.equal(one[:-1], other[:-1])
+    assert alone[2][-1] != beside[2][-1]
+
+
+def test_zeros_are_looked_for_only_where_nothing_is_differentiated() -> None:
+    zero = torch.zeros(3)
+    assert not are_zero(zero)
+    with torch.no_grad():
+        assert are_zero(zero, -zero)
+        assert not are_zero(zero, torch.tensor([0.0, torch.nan]))
 
 
 def test_bicycle_gradient() -> None:
