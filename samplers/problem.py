@@ -348,6 +348,10 @@ class FunctionProblem:
     def _set_base(self) -> None:
         """Set the base distribution and the dimension, each of which may follow from the other."""
         if self.base is None:
+            if self.dim == 0:  # as it is where it was not given
+                raise ValueError(
+                    "Expected dim to be a whole number of at least 1, or base, the distribution of x; got neither."
+                )
             check_whole("dim", self.dim, 1)
             object.__setattr__(self, "base", StandardNormal(self.dim))
             return

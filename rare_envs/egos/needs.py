@@ -10,7 +10,7 @@ from rare_envs.control.idm import IDM
 from rare_envs.egos.human import HumanEgo
 from rare_envs.egos.plain_callables import wrap_callable
 from rare_envs.egos.spaces.choice import find_fitting_kinds
-from rare_envs.egos.validation import is_policy
+from rare_envs.egos.validation import check_predict, is_policy
 from rare_envs.simulation.ego_interface import EgoNeeds
 from rare_envs.simulation.rollout import Driver
 from rare_envs.simulation.world import World
@@ -99,6 +99,8 @@ def resolve(ego: Any, vehicles: int = 1) -> EgoNeeds:
         )
     if isinstance(ego, WorldEgo):
         return EgoNeeds(noise=ego)
+    if is_policy(ego):
+        check_predict(ego)
     # The ego may be anybody's object, such as a Stable-Baselines3 model: it may declare these or not.
     lidar = isinstance(ego, PerceivingDriver) and ego.needs_lidar
     observed = getattr(ego, "observation_space", None)

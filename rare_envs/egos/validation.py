@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Sequence
-from typing import NoReturn
+from typing import Any, NoReturn
 
 
 def is_policy(ego: object) -> bool:
@@ -17,6 +18,35 @@ def is_policy(ego: object) -> bool:
     """
     # not isinstance of a Protocol, which takes a predict that is no function, and misses one that is passed on
     return not isinstance(ego, type) and callable(getattr(ego, "predict", None))
+
+
+def check_predict(ego: Any) -> None:
+    """Refuse a policy whose `predict` does not take the arguments that Stable-Baselines3's takes.
+
+    Args:
+        ego: An object with `predict`.
+
+    Raises:
+        ValueError: If it takes fewer, as a `predict(observation)` does.
+
+    Example:
+        >>> class Short:
+        ...     def predict(self, observation): ...
+        >>> check_predict(Short())
+        Traceback (most recent call last):
+        ValueError: Expected predict(observation, state, episode_start, deterministic), as Stable-Baselines3 has it, got predict(observation) of Short.
+    """  # noqa: E501 (the example shows a whole message)
+    try:
+        signature = inspect.signature(ego.predict)
+    except (TypeError, ValueError):  # of a built-in function it is not known
+        return
+    try:
+        signature.bind(None, state=None, episode_start=None, deterministic=True)
+    except TypeError as error:
+        raise ValueError(
+            "Expected predict(observation, state, episode_start, deterministic), as Stable-Baselines3 has it, got "
+            f"predict{signature} of {type(ego).__name__}."
+        ) from error
 
 
 def refuse_ego(ego: object, origin: str = "", known: Sequence[str] = ("idm",)) -> NoReturn:

@@ -66,11 +66,15 @@ def write_object(path: str | PathLike[str], value: object) -> None:
             ...
         TypeError: A value of class object cannot be written to a file.
     """
+    from safetensors import SafetensorError
     from safetensors.numpy import save_file
 
     arrays: dict[str, NDArray[Any]] = {}
     text = json.dumps(_encode(value, arrays), allow_nan=False)
-    save_file(arrays, str(path), metadata={"format": FILE_FORMAT, _KEY: text})
+    try:
+        save_file(arrays, str(path), metadata={"format": FILE_FORMAT, _KEY: text})
+    except SafetensorError as error:
+        raise OSError(f"Cannot write {str(path)!r}: {error}") from error
 
 
 def read_object(path: str | PathLike[str], cls: type[_Stored]) -> _Stored:

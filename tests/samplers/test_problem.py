@@ -162,3 +162,10 @@ def test_what_is_no_number_is_named_in_whole_sentences():
 def test_repr_is_one_line():
     assert repr(samplers.FunctionProblem(np.sin, dim=1)) == "<FunctionProblem of sin, 1 dimension>"
     assert "<p>FunctionProblem of &lt;lambda&gt;" in samplers.FunctionProblem(lambda x: x, dim=2)._repr_html_()
+
+
+def test_a_problem_without_dimension_and_base_asks_for_one():
+    with pytest.raises(
+        ValueError, match="or base, the distribution of x; got neither"
+    ):
+        samplers.FunctionProblem(lambda x: x[:, 0])

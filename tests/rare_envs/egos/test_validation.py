@@ -6,7 +6,8 @@ from typing import Any
 
 import pytest
 
-from rare_envs.egos.validation import is_policy, refuse_ego
+import rare_envs
+from rare_envs.egos.validation import check_predict, is_policy, refuse_ego
 
 
 class Still:
@@ -32,6 +33,22 @@ class Prophet:
 def test_who_has_predict_is_a_policy_also_by_delegation() -> None:
     assert is_policy(Still())
     assert is_policy(Proxy())
+
+
+class Short:
+    """As many write it; Stable-Baselines3 hands over more."""
+
+    def predict(self, observation: Any) -> Any:
+        return observation, None
+
+
+def test_a_predict_of_the_observation_alone_is_refused_before_anything_is_simulated() -> None:
+    for taken in (Still(), Proxy()):
+        check_predict(taken)
+    with pytest.raises(
+        ValueError, match=r"state, episode_start, deterministic\), as .*, got predict\(observation.* of Short"
+    ):
+        rare_envs.DrivingProblem("rare_envs/CutIn-v0", ego=Short())
 
 
 @pytest.mark.parametrize("ego", [Still, Prophet(), "idm", None])

@@ -113,3 +113,8 @@ def test_a_file_of_something_else_is_refused(tmp_path):
         read_object(tmp_path / "thing", samplers.Level)
     with pytest.raises(FileNotFoundError, match="no file"):
         read_object(tmp_path / "nothing", Thing)
+
+
+def test_a_folder_in_place_of_the_file_is_named(tmp_path):
+    with pytest.raises(OSError, match=r"Cannot write '.*': "):
+        write_object(tmp_path, Thing(1))
