@@ -41,11 +41,11 @@ NARROW = 400
 """Width of the pictures [pixels]."""
 HEAD = """# The shipped egos, everywhere
 
-Every ego that comes with this project, and two that `rare-envs train-ego ENV --algo ppo --steps STEPS` trained in the
-scenario at hand (`dqn` likewise; the steps stand in the row), in every scenario with its default drivers and the base
-distribution named with it: the probability of a collision within {horizon:g} s with its 95 % interval, by
-[two methods](estimates.md), simulations, wall time, number of warnings, and the likeliest failure that `two-stage`
-found (`python -m benchmarks.driving.egos`). The
+How often every ego that comes with this project collides within {horizon:g} s, in every scenario with its default
+drivers and the base distribution named with it. Two more egos were trained in the scenario at hand by
+`rare-envs train-ego ENV --algo ppo --steps STEPS` (`dqn` likewise; the steps stand in the row). A row has
+the probability with its 95 % interval, by [two methods](estimates.md), simulations, wall time, number of warnings, and
+the likeliest failure that `two-stage` found (`python -m benchmarks.driving.egos`). The
 intervals are those of sampling; the events behind a base distribution leave p open by far more
 ([the events behind it](base_uncertainty.md#the-events-behind-the-base-distribution)). The bases are the defaults but
 for car-following: under its default, `us101`, `idm` has 7.4e-11 and in 6,000 simulations of `imitation` nothing fails;

@@ -165,7 +165,5 @@ def test_repr_is_one_line():
 
 
 def test_a_problem_without_dimension_and_base_asks_for_one():
-    with pytest.raises(
-        ValueError, match="or base, the distribution of x; got neither"
-    ):
+    with pytest.raises(ValueError, match="or base, the distribution of x; got neither"):
         samplers.FunctionProblem(lambda x: x[:, 0])
