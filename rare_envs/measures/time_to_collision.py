@@ -7,6 +7,7 @@ from rare_envs.measures.moment import GAP_MIN, STILL, Moment, acceleration_of_le
 from rare_envs.sensors.lidar import beam_angles
 from rare_envs.sensors.perception import RANGE_COLUMNS, RATE_COLUMNS, find_vehicles_met
 from rare_envs.traffic.lead import lead_index
+from rare_envs.traffic.vehicle_models import are_zero
 
 TTC_MAX = 10.0
 """Cap of the time to collision [s]; what is further away, or not closing, counts as this."""
@@ -41,7 +42,10 @@ def ttc(moment: Moment) -> Tensor:
         >>> ttc(Moment.of_two(gap=25.0, speed=20.0, lead_speed=10.0)).item()
         2.5
     """
-    return torch.minimum(_time_to_lead(moment), time_to_edge(moment)).clamp(max=TTC_MAX)
+    to_lead = _time_to_lead(moment)
+    if are_zero(moment.state.heading[:, 0]):  # straight on there is no edge
+        return to_lead.clamp(max=TTC_MAX)
+    return torch.minimum(to_lead, time_to_edge(moment)).clamp(max=TTC_MAX)
 
 
 def ttc_terms(moment: Moment) -> Tensor:

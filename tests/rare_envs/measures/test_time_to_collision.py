@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 import pytest
+import torch
 
 from rare_envs.measures import TTC_MAX, Moment, mttc, ttc
 from rare_envs.traffic.lead import Lead
@@ -21,6 +22,15 @@ def test_ttc_of_two_cars() -> None:
     assert (
         0.0 < ttc(Moment(state, Lead(tensor(-2.0), tensor(10.0)), straight(1), None)).item() < 0.01
     )  # beside, not a collision
+
+
+@pytest.mark.parametrize("y", [0.0, 1.5, 7.0])  # in the middle, beside it, off the road
+def test_straight_on_ttc_without_the_edge_is_that_with_it(y: float) -> None:
+    moment = Moment.of_two(gap=25.0, speed=20.0, lead_speed=10.0)
+    moment = moment._replace(state=moment.state._replace(y=moment.state.y + y))
+    with torch.no_grad():
+        without = ttc(moment)
+    assert torch.equal(without, ttc(moment))  # where something may be differentiated, both are computed
 
 
 @pytest.mark.parametrize(
