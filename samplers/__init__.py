@@ -1,6 +1,6 @@
 """Estimating the probability of rare failures: P[f(X) <= gamma].
 
-Knows NumPy and probability, nothing about driving. `estimate` is the front door.
+It needs NumPy and SciPy, and nothing about driving. Begin with `estimate`.
 """
 
 from samplers.analysis.base_uncertainty import BaseUncertainty
