@@ -81,7 +81,7 @@ def print_report(report: Report, out: Path | None = None, details: bool = False)
         console.print(f"remark: {remark}")
     for note in report.notes:
         console.print(f"note: {note}")
-    if question.method != "mc" and question.ego != "idm" and estimate.p < estimate.unseen:
+    if question.method != "mc" and estimate.p < estimate.unseen:
         n = float(f"{ENOUGH / estimate.p:.1g}") if estimate.p > ENOUGH / MANY else MANY
         console.print(f"check: --method mc --max-sim {n:.0f} does not rely on a search")
     if out is not None:

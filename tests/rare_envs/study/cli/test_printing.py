@@ -55,7 +55,7 @@ def test_an_upper_bound_by_plain_monte_carlo_is_an_answer(cli: Cli, safe: str, t
     assert result.exit_code == 0
     assert "warning: " not in result.stdout
     assert "remark: None of 2,000 simulations failed: p = 0 with a one-sided interval." in result.stdout
-    assert "2,000 base draws without a failure put p below 1.5e-03" in result.stdout
+    assert "none of 2,000 base draws failed, so p is below 1.5e-03 with 95 % confidence" in result.stdout
     written = json.loads((tmp_path / "run" / "result.json").read_text())
     assert written["doubtful"] is False and list_doubts(written) == []
     assert written["interval"][1] == pytest.approx(1 - 0.025 ** (1 / 2000))
@@ -63,10 +63,9 @@ def test_an_upper_bound_by_plain_monte_carlo_is_an_answer(cli: Cli, safe: str, t
 
 
 def test_what_to_check_is_said_where_something_may_be_missed(cli: Cli, here: Path, risky: str, safe: str) -> None:
-    (here / "careful.py").write_text("def make():\n    return 'idm'\n")
     words = ("estimate", FOLLOWING, "--method", "adss", "--max-sim", 2000, "--base")
-    assert "check it" not in cli(*words, risky, "--ego", "egos_here:coasting").stdout  # base draws saw it often
-    assert "check: --method mc --max-sim 300000" in cli(*words, safe, "--ego", "careful:make").stdout
+    assert "check: " not in cli(*words, risky, "--ego", "egos_here:coasting").stdout  # base draws saw it often
+    assert "check: --method mc --max-sim 300000" in cli(*words, safe).stdout  # whoever drives
 
 
 class Fitted:
