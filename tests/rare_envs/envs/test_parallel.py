@@ -190,3 +190,15 @@ def test_bad_actions_and_options():
             env.step(actions)
     observations, *_ = env.step({"ego": np.zeros(2), "cutter": None})
     assert set(observations) == {"ego", "cutter"}
+
+
+@pytest.mark.parametrize("make", [rare_envs.parallel_env, rare_envs.env], ids=["parallel", "in turn"])
+def test_the_state_lies_in_the_state_space(make):
+    """As trainers with a central critic take it: every vehicle, also those that nobody commands."""
+    world = make("rare_envs/CutIn-v1")
+    world.reset(seed=1)
+    state = world.state()
+    assert world.state_space.contains(state)
+    assert state.shape == (3, 4)
+    world.reset(seed=2)
+    assert (world.state() != state).any()
