@@ -1,29 +1,43 @@
 """Leaderboard of samplers: the committed result of `rare-envs bench samplers`, and its page of the documentation.
 
-    python -m benchmarks.estimators.sampler_leaderboard FOLDER ...
+    python -m benchmarks.estimators.sampler_leaderboard
+    python -m benchmarks.estimators.sampler_leaderboard --renew FOLDER --method two-stage,auto
 
-reads `benchmark.json` in the folders of benchmarks of one code, of other budgets or sets each, writes
-`benchmarks/results/sampler_benchmark.json` (without the single runs) and `docs/sampler_leaderboard.md`. Without FOLDER
-it writes the page alone, from the committed result.
+The first writes `docs/sampler_leaderboard.md` from the committed result. The second makes the rows of some methods anew
+(without `--method` those of all), by the commands that the page shows; it writes their runs to FOLDER, goes on with
+those that are there, puts the rows in the place of the committed ones and writes the page.
 """
 
 from __future__ import annotations
 
+import argparse
 import contextlib
 import io
 import json
-import sys
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from benchmarks import RESULTS
-from rare_envs.study.sampler_benchmark.leaderboard import format_leaderboard, list_plans
+from rare_envs.study.sampler_benchmark.leaderboard import format_leaderboard, list_parts
 from rare_envs.study.sampler_benchmark.problems import ALL_PROBLEMS
+from rare_envs.study.sampler_benchmark.study import BenchmarkPlan, choose_problems, run_study
+from rare_envs.threads import use_one_thread
 
 LEADERBOARD_RESULT = RESULTS / "sampler_benchmark.json"
 LEADERBOARD_PAGE = Path(__file__).parents[2] / "docs" / "sampler_leaderboard.md"
+OWN = ("two-stage", "mc", "is", "ce", "ice", "ss", "adss")
+OTHERS = ("openturns-ss", "uqpy-ss", "openturns-ce", "openturns-form")
+ALL_SETS, LOW_SETS = ("analytic", "highdim", "driving", "public"), ("analytic", "public")
+PLANNED = {
+    300: ((*OWN, *OTHERS), ALL_SETS),
+    1500: (("auto", *OWN, *OTHERS), ALL_SETS),
+    6000: ((*OWN, "openturns-ss", "uqpy-ss"), LOW_SETS),
+}
+"""Methods and sets by budget."""
+RUNS = 6
+"""Of a method on a problem with a budget."""
 WORST = 4
 """Problems in a table of the page; the committed result has all."""
 DIGITS = 5
@@ -48,18 +62,22 @@ and `auto`, which is `two-stage` there."""
 HEAD = """\
 # Leaderboard of samplers
 
-`python -m benchmarks.estimators.sampler_leaderboard` makes this page from `benchmarks/results/sampler_benchmark.json`.
-That was measured by
+`python -m benchmarks.estimators.sampler_leaderboard` makes this page from `benchmarks/results/sampler_benchmark.json`;
+`--renew FOLDER --method two-stage,auto` makes the rows of these methods anew first, and goes on where it was stopped.
+The result was measured by
 
 COMMANDS
 
-while others computed on the machine, so that times are rough ones.
+while others computed on the machine, so that times are rough ones. Every problem is given as f alone: a method that
+uses terms or gradients of f does without them here.
 
 LEFT_OUT
 
 With so few runs of each cell most faults cannot be told from chance: only gross ones are named, and the tables of whole
 sets say more than single rows. Intervals of OpenTURNS' methods are p -+ 1.96 of the standard deviations that it states,
-UQpy's are lognormal with the c.o.v. that it states. FORM ends where f is flat.
+UQpy's are lognormal with the c.o.v. that it states; equal seeds gave other rows on another machine for 14 of its 185
+cells, and the same rows for every other method but `two-stage` (curved_d20, noisy_d6, rp54_d20; its code had changed).
+FORM ends where f is flat.
 
 [A benchmark for samplers](sampler_benchmark.md) says how to add a method. A row of the committed result is a method on
 a problem with a budget:
@@ -70,31 +88,84 @@ a problem with a budget:
 def condense_results(results: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Return what is committed of benchmarks: without their runs, each cell a row, numbers to a few digits.
 
+    Returns:
+        parts: What made each benchmark: machine, versions, digest of the code and plan.
+        problems: How each probability is known.
+        warnings: Runs with and without, by method and budget.
+        columns, cells: A row for each method, problem and budget.
+
     Raises:
-        ValueError: They are of different code, or have a cell in common.
+        ValueError: They have a cell in common.
     """
-    about = {name: value for name, value in results[0]["about"].items() if name not in ("plan", "libraries")}
-    for result in results:
-        if any(result["about"][name] != value for name, value in about.items()):
-            raise ValueError(f"Expected benchmarks of one code and machine, got {about} and {result['about']}.")
     cells = [cell for result in results for cell in result["cells"]]
     if len({(cell["method"], cell["problem"], cell["max_sim"]) for cell in cells}) < len(cells):
         raise ValueError("Expected benchmarks of other methods, problems or budgets each.")
-    columns = [name for name in cells[0] if name not in ("gain_se", "reference_error")]
-    warnings: dict[str, Counter[str]] = {}
+    columns = [name for name in cells[0] if name not in ("gain_se", "reference_error", "example")]
+    warnings: dict[str, dict[str, Counter[str]]] = {}
     for result in results:
-        for name, power in result["warnings"].items():
-            warnings.setdefault(name, Counter()).update({key: power[key] for key in power if key != "texts"})
-    libraries = {name: version for result in results for name, version in result["about"]["libraries"].items()}
+        for name, budgets in result["warnings"].items():
+            for budget, power in budgets.items():
+                counts = warnings.setdefault(name, {}).setdefault(budget, Counter())
+                counts.update({key: power[key] for key in power if key != "texts"})
     problems = {name: problem for result in results for name, problem in result["problems"].items()}
-    plans = [result["about"]["plan"] for result in results]
     return {
-        "about": {**about, "libraries": libraries, "plans": plans},
+        "parts": [part for result in results for part in list_parts(result)],
         "problems": {name: problems[name] for name in ALL_PROBLEMS if name in problems},
-        "warnings": {name: dict(counts) for name, counts in warnings.items()},
+        "warnings": {name: {key: dict(counts) for key, counts in each.items()} for name, each in warnings.items()},
         "columns": columns,
         "cells": [[_round_number(cell[name]) for name in columns] for cell in cells],
     }
+
+
+def leave_out(result: Mapping[str, Any], methods: Sequence[str]) -> dict[str, Any]:
+    """Return a result, its cells with their names, without the rows of some methods."""
+    parts = []
+    for part in list_parts(result):
+        kept = [name for name in part["plan"]["methods"] if name not in methods]
+        if kept:
+            libraries = {name: version for name, version in part["libraries"].items() if _uses(kept, name)}
+            parts.append({**part, "libraries": libraries, "plan": {**part["plan"], "methods": kept}})
+    return {
+        **result,
+        "parts": parts,
+        "warnings": {name: power for name, power in result["warnings"].items() if name not in methods},
+        "cells": [cell for cell in result["cells"] if cell["method"] not in methods],
+    }
+
+
+def _uses(methods: Sequence[str], library: str) -> bool:
+    return any(name.startswith(f"{library}-") for name in methods)
+
+
+def list_plans_of(methods: Sequence[str] = ()) -> list[BenchmarkPlan]:
+    """Return the benchmarks behind the rows of some methods, of all if none is named.
+
+    Raises:
+        ValueError: The leaderboard has no such method.
+    """
+    known = {name for names, _ in PLANNED.values() for name in names}
+    unknown = [name for name in methods if name not in known]
+    if unknown:
+        raise ValueError(f"Unknown method {unknown[0]!r} of the leaderboard; known: {', '.join(sorted(known))}.")
+    plans = []
+    for budget, (names, groups) in PLANNED.items():
+        chosen = tuple(name for name in names if name in methods or not methods)
+        if chosen:
+            plans.append(BenchmarkPlan(chosen, choose_problems(groups), (budget,), RUNS))
+    return plans
+
+
+def renew_rows(folder: Path, methods: Sequence[str] = ()) -> None:
+    """Make rows anew, or those of all methods, and write the committed result and the page.
+
+    Args:
+        folder: Of the runs; those that are there already are not made again.
+        methods: Whose rows; all if none is named.
+    """
+    with use_one_thread():
+        made = [run_study(plan, folder / str(plan.budgets[0]), progress=True) for plan in list_plans_of(methods)]
+    old = leave_out(read_leaderboard(), methods) if methods else None
+    write_leaderboard([old, *made] if old and old["cells"] else made)
 
 
 def read_leaderboard() -> dict[str, Any]:
@@ -108,7 +179,7 @@ def format_leaderboard_page() -> str:
     result = read_leaderboard()
     with contextlib.redirect_stdout(io.StringIO()) as printed:
         exec(compile(READING, "reading of the page", "exec"), {})
-    commands = "\n".join(f"    {_format_command(plan)}" for plan in list_plans(result))
+    commands = "\n".join(f"    {_format_command(part['plan'])}" for part in list_parts(result))
     head = HEAD.replace("COMMANDS", commands).replace("LEFT_OUT", LEFT_OUT)
     example = f"```python\n{READING}```\n\n```text\n{printed.getvalue()}```\n"
     _, _, page = format_leaderboard(result, WORST).partition("\n")  # the title
@@ -131,16 +202,26 @@ def _round_number(value: Any) -> Any:
     return float(f"{value:.{DIGITS}g}") if isinstance(value, float) else value
 
 
-def _write_result(results: Sequence[Mapping[str, Any]]) -> None:
-    """Write the committed result: a line for each cell."""
+def write_leaderboard(results: Sequence[Mapping[str, Any]]) -> None:
+    """Write the committed result, a line for each cell, and the page."""
     *first, (_, cells) = condense_results(results).items()
     lines = [f"{json.dumps(name)}: {json.dumps(value, allow_nan=False)}" for name, value in first]
     rows = ",\n".join(json.dumps(cell, allow_nan=False) for cell in cells)
     LEADERBOARD_RESULT.write_text("{" + ",\n".join([*lines, f'"cells": [\n{rows}\n]']) + "}\n", encoding="utf-8")
+    LEADERBOARD_PAGE.write_text(format_leaderboard_page(), encoding="utf-8")
+
+
+def main() -> None:
+    """Read the command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--renew", type=Path, metavar="FOLDER", help="make rows anew; folder of their runs")
+    parser.add_argument("--method", default="", help="methods with commas whose rows are made anew")
+    arguments = parser.parse_args()
+    if arguments.renew is None:
+        LEADERBOARD_PAGE.write_text(format_leaderboard_page(), encoding="utf-8")
+    else:
+        renew_rows(arguments.renew, [name for name in arguments.method.split(",") if name])
 
 
 if __name__ == "__main__":
-    if len(sys.argv) > 1:
-        files = [Path(folder) / "benchmark.json" for folder in sys.argv[1:]]
-        _write_result([json.loads(file.read_text(encoding="utf-8")) for file in files])
-    LEADERBOARD_PAGE.write_text(format_leaderboard_page(), encoding="utf-8")
+    main()

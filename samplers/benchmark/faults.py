@@ -18,6 +18,8 @@ NOTICED_BIAS = 0.02
 NOMINAL_COVERAGE = 0.95
 CHANCE = 1e-3
 """Probability that a method of nominal coverage is called one that covers too little."""
+READ_DIGITS = 1e-10
+"""Relative error that no draws reach in every run."""
 BUDGET_EXCESS = 0.01
 """Share of the budget by which it may be exceeded."""
 
@@ -39,17 +41,17 @@ def find_faults(cell: Cell, knowable: bool = True) -> tuple[str, ...]:
         >>> find_faults(cell)
         ('intervals hold p in 70 % of 20 runs (46 to 88 %)',)
     """
-    found = []
-    if cell.raised:
-        found.append(f"raised in {cell.raised} of {cell.runs} runs")
-    if cell.hidden:
-        found.append(f"states fewer simulations than it made in {100 * cell.hidden:.0f} % of the runs")
+    found = _find_broken_runs(cell)
     if cell.max_sim is not None and cell.n_sim > (1 + BUDGET_EXCESS) * cell.max_sim:
         found.append(f"makes {cell.n_sim / cell.max_sim:.2g} times the simulations of its budget")
-    if not knowable:
-        return tuple(found)
-    bias = cell.mean_over_p - 1.0
+    if cell.same_points:  # one run, so that nothing is known of its bias and coverage
+        return (*found, _describe_one_run(cell))
     ended = cell.runs - cell.raised
+    if not knowable or not ended:
+        return tuple(found)
+    if cell.p > 0 and cell.worst < READ_DIGITS:
+        found.append(f"p to {-math.log10(READ_DIGITS):.0f} digits in every run, as no draws give it")
+    bias = cell.mean_over_p - 1.0
     error = math.hypot(cell.mean_se, cell.reference_error)
     if ended >= LEAST_RUNS and abs(bias) > max(errors_allowed(ended) * error, NOTICED_BIAS) and not _is_bad_luck(cell):
         found.append(f"biased: mean / p {cell.mean_over_p:.3g} +- {error:.2g}")
@@ -58,6 +60,29 @@ def find_faults(cell: Cell, knowable: bool = True) -> tuple[str, ...]:
         held = f"intervals hold p in {100 * cell.coverage:.0f} % of {cell.runs} runs"
         found.append(f"{held} ({100 * low:.0f} to {100 * high:.0f} %)")
     return tuple(found)
+
+
+def _find_broken_runs(cell: Cell) -> list[str]:
+    """Return faults of single runs, which need no chance to be called so."""
+    found = []
+    if cell.raised:
+        found.append(f"raised in {cell.raised} of {cell.runs} runs ({cell.example})")
+    if cell.impossible:
+        example = "" if cell.raised else f" ({cell.example})"
+        found.append(f"answers that cannot be in {100 * cell.impossible:.0f} % of the runs{example}")
+    if cell.hidden:
+        found.append(f"states fewer simulations than it made in {100 * cell.hidden:.0f} % of the runs")
+    if cell.overstated:
+        found.append(f"states more simulations than it made in {100 * cell.overstated:.0f} % of the runs")
+    if cell.without_f:
+        found.append(f"answers without a simulation in {100 * cell.without_f:.0f} % of the runs")
+    return found
+
+
+def _describe_one_run(cell: Cell) -> str:
+    held = "holds" if cell.coverage > 0 else "does not hold"
+    ratio = f", p over the true one {cell.mean_over_p:.3g}" if cell.p > 0 else ""
+    return f"the same points at every seed: {cell.runs} runs are one, whose interval {held} p{ratio}"
 
 
 def errors_allowed(runs: int) -> float:

@@ -70,7 +70,8 @@ def run_algorithm(
             raise stops[0] from None
         raise RuntimeError(str(error).strip().splitlines()[-1]) from None
     result = algorithm.getResult()
-    p, half = result.getProbabilityEstimate(), float(ndtri(0.975)) * result.getStandardDeviation()
+    deviation = max(result.getStandardDeviation(), 0.0)  # -1 where its estimate of the variance is 0
+    p, half = result.getProbabilityEstimate(), float(ndtri(0.975)) * deviation
     cov = result.getCoefficientOfVariation()
     return p, p - half, p + half, cov if p > 0 and cov >= 0 else math.inf
 

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import hashlib
 import importlib
 import math
 import platform
 import time
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import Executor, ProcessPoolExecutor
+from concurrent.futures import BrokenExecutor, Executor, ProcessPoolExecutor
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
 from functools import cache
@@ -20,7 +21,7 @@ import scipy
 
 from samplers.benchmark.analytic_states import LimitState
 from samplers.benchmark.catalogue import BenchmarkProblem
-from samplers.benchmark.solvers import Solver, find_method
+from samplers.benchmark.solvers import Solver, digest_method, find_method
 from samplers.estimation import estimate
 from samplers.method import Stepping
 from samplers.problem import FloatArray, FunctionProblem
@@ -94,6 +95,10 @@ class MethodRun(SeededEstimate):
     """The budget; None for no limit."""
     stated: int | None = None
     """Simulations that the method states, None if it does not say; fewer than `n_sim` are hidden ones."""
+    points: str = ""
+    """Digest of the points at which f was evaluated, in their order: runs of other seeds have other ones."""
+    source: str = ""
+    """Digest of the code of a method of somebody else, version of another library; empty for our own."""
 
 
 class Meter:
@@ -107,6 +112,12 @@ class Meter:
     def __init__(self, f: Callable[[FloatArray], FloatArray], limit: int | None = None) -> None:
         self.calls, self.points, self.seconds = 0, 0, 0.0
         self._f, self._limit = f, limit
+        self._digest = hashlib.blake2b(digest_size=8)
+
+    @property
+    def digest(self) -> str:
+        """Digest of all points so far."""
+        return self._digest.hexdigest()
 
     def __call__(self, x: FloatArray) -> FloatArray:
         """Call f."""
@@ -115,6 +126,7 @@ class Meter:
         self.calls += 1
         self.points += len(x)
         start = time.process_time()
+        self._digest.update(np.ascontiguousarray(x).tobytes())
         values = self._f(x)
         self.seconds += time.process_time() - start
         return values
@@ -176,9 +188,10 @@ def run_once(job: Job, method: Stepping | Solver | None = None) -> MethodRun:
                 answer: Any = estimate(problem, method, seed=job.seed, max_sim=job.max_sim, replicates=job.replicates)
             else:
                 answer = method(problem, seed=job.seed, max_sim=job.max_sim)
-            return read_answer(job, meter, time.process_time() - start, answer)
-        except Exception as error:
-            return record_failure(job, meter, time.process_time() - start, error)
+            run = read_answer(job, meter, time.process_time() - start, answer)
+        except (Exception, SystemExit) as error:  # what a method does must not end a benchmark
+            run = record_failure(job, meter, time.process_time() - start, error)
+        return replace(run, source=digest_method(method))
 
 
 def read_answer(job: Job, meter: Meter, seconds: float, answer: Any) -> MethodRun:
@@ -205,7 +218,7 @@ def read_answer(job: Job, meter: Meter, seconds: float, answer: Any) -> MethodRu
     return replace(run, warnings=tuple(warnings), stated=stated)
 
 
-def record_failure(job: Job, meter: Meter, seconds: float, error: Exception) -> MethodRun:
+def record_failure(job: Job, meter: Meter, seconds: float, error: BaseException) -> MethodRun:
     """Return the record of a run that raised."""
     run = _record(job, meter, seconds, (math.nan,) * 4, "raised")
     return replace(run, error=f"{type(error).__name__}: {error}")
@@ -229,6 +242,7 @@ def _record(
         seconds=seconds - meter.seconds,
         status=status,
         max_sim=job.max_sim,
+        points=meter.digest,
     )
 
 
@@ -258,6 +272,9 @@ def map_jobs(
 ) -> Iterator[_Run]:
     """Return what a function gives for jobs of any kind, in order; see `run_all`.
 
+    Raises:
+        ChildProcessError: A worker process ended in the midst of a run.
+
     Example:
         >>> list(map_jobs(abs, [-1, 2]))
         [1, 2]
@@ -269,7 +286,13 @@ def map_jobs(
     else:
         # spawned, not forked: a progress bar runs in a thread of its own
         with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
-            yield from pool.map(once, jobs)
+            try:
+                yield from pool.map(once, jobs)
+            except BrokenExecutor:
+                raise ChildProcessError(
+                    "A worker process ended in the midst of a run. The same command goes on; with one worker the runs "
+                    "are made in this process."
+                ) from None
 
 
 def use_one_core() -> AbstractContextManager[object]:

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import hashlib
 import importlib
+import sys
 from collections.abc import Callable, Iterable
+from functools import cache
 from importlib.metadata import version
 from importlib.util import find_spec
+from pathlib import Path
 from typing import Any
 
 from samplers.benchmark.openturns_methods import OPENTURNS
@@ -69,6 +73,44 @@ def find_library_versions(methods: Iterable[str]) -> dict[str, str]:
     """
     libraries = {name.partition("-")[0] for name in methods if name in OTHER_SOLVERS}
     return {name: version(NEEDED_MODULES[name][0]) for name in sorted(libraries)}
+
+
+def digest_method(method: Stepping | Solver) -> str:
+    """Return what tells the code of a method of somebody else from another version of it.
+
+    Returns:
+        A digest of the Python files of the package that the method is of, or of its module where it stands alone; the
+        version of the library for solvers of other libraries; empty for our own methods, and where there is no file.
+
+    Example:
+        >>> digest_method(find_method("mc"))
+        ''
+    """
+    for name, solver in OTHER_SOLVERS.items():
+        if method is solver:
+            return " ".join(find_library_versions([name]).values())
+    named = method if hasattr(method, "__name__") else type(method)  # a function, else a method's class
+    package = str(getattr(named, "__module__", "")).partition(".")[0]
+    if package in (__name__.partition(".")[0], "builtins", "__main__", ""):
+        return ""
+    return _digest_package(package)
+
+
+@cache
+def _digest_package(package: str) -> str:
+    """Return a digest of the Python files of a top-level package or module; empty if it has none."""
+    module = sys.modules.get(package)
+    found = find_spec(package) if module is None else module.__spec__
+    if found is None:  # a module that was made by a program
+        return ""
+    if found.submodule_search_locations is not None:
+        paths = sorted(path for folder in found.submodule_search_locations for path in Path(folder).rglob("*.py"))
+    else:
+        paths = [Path(found.origin)] if found.has_location and found.origin else []
+    digest = hashlib.blake2b(digest_size=8)
+    for path in paths:
+        digest.update(path.read_bytes())
+    return digest.hexdigest() if paths else ""
 
 
 def _check_installed(name: str) -> None:

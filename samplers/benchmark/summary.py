@@ -12,6 +12,9 @@ from scipy import stats
 from samplers.benchmark.runs import OWN_CATALOGUE, MethodRun, limit_state
 from samplers.problem import FloatArray
 
+LONGEST_EXAMPLE = 100
+"""Letters of an error in a table."""
+
 
 @dataclass(frozen=True)
 class Cell:
@@ -59,6 +62,16 @@ class Cell:
     """Share of the runs that state fewer simulations than were made."""
     reference_error: float = 0.0
     """Standard error of p itself, over p."""
+    overstated: float = 0.0
+    """Share of the runs that state more simulations than the problem was asked for."""
+    without_f: float = 0.0
+    """Share of the runs that answer without a single simulation."""
+    impossible: float = 0.0
+    """Share of the runs with a p or c.o.v. that cannot be, or an interval around another p; none of them covers."""
+    example: str = ""
+    """What the first run raised or, if none did, the first impossible answer."""
+    same_points: bool = False
+    """Whether all runs simulated the same points, whatever their seed."""
 
     @property
     def coverage_interval(self) -> tuple[float, float]:
@@ -107,7 +120,7 @@ def cell_of(runs: Sequence[MethodRun], p: float, standard_error: float = 0.0) ->
         own_over_cov=own_cov / cov if cov > 0 else math.nan,
         gain=gain,
         gain_se=gain * _spread(error) / (_mean(error) * math.sqrt(len(ended))) if _mean(error) > 0 else math.nan,
-        coverage=sum(covers(run, p) for run in ended) / len(runs),
+        coverage=sum(covers(run, p) and is_possible(run) for run in ended) / len(runs),
         below=sum(run.high < p for run in ended) / len(runs),
         warned=_mean([bool(run.warnings) for run in ended]),
         worst=float(np.max(np.abs(ratio - 1.0))) if len(ended) else math.nan,
@@ -117,7 +130,33 @@ def cell_of(runs: Sequence[MethodRun], p: float, standard_error: float = 0.0) ->
         max_sim=runs[0].max_sim,
         hidden=sum(hides_simulations(run) for run in runs) / len(runs),
         reference_error=standard_error / p if p > 0 else 0.0,
+        overstated=sum(run.stated is not None and run.stated > run.n_sim for run in runs) / len(runs),
+        without_f=sum(run.n_sim == 0 for run in ended) / len(runs),
+        impossible=sum(not is_possible(run) for run in ended) / len(runs),
+        example=_find_example(runs),
+        same_points=_simulate_the_same(ended),
     )
+
+
+def is_possible(run: MethodRun) -> bool:
+    """Return whether p is a probability within its interval, and the c.o.v., if there is one, not negative."""
+    return 0.0 <= run.p <= 1.0 and run.low <= run.p <= run.high and not run.cov < 0.0
+
+
+def _find_example(runs: Sequence[MethodRun]) -> str:
+    """Return what the first run raised or, if none did, the first impossible answer, in a line."""
+    errors = [run.error for run in runs if run.error]
+    answers = [
+        f"p {run.p:.3g}, {run.low:.3g} to {run.high:.3g}, c.o.v. {run.cov:.3g}" for run in runs if not is_possible(run)
+    ]
+    text = " ".join([*errors, *answers, ""][0].split())
+    return text if len(text) <= LONGEST_EXAMPLE else f"{text[: LONGEST_EXAMPLE - 3]}..."
+
+
+def _simulate_the_same(runs: Sequence[MethodRun]) -> bool:
+    """Return whether runs of several seeds all simulated the same points."""
+    made = {run.points for run in runs}
+    return len({run.seed for run in runs}) > 1 and len(made) == 1 and "" not in made and runs[0].n_sim > 0
 
 
 def hides_simulations(run: MethodRun) -> bool:
@@ -199,4 +238,5 @@ def _mean(values: Sequence[float] | FloatArray) -> float:
 
 
 def _spread(values: FloatArray) -> float:
-    return float(np.std(values, ddof=1)) if len(values) > 1 else math.nan
+    with np.errstate(invalid="ignore"):  # an infinite answer has no spread
+        return float(np.std(values, ddof=1)) if len(values) > 1 else math.nan

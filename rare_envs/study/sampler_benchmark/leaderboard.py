@@ -12,11 +12,12 @@ from typing import Any
 from samplers.statistics import clopper_pearson
 
 PAGE_COLUMNS = (
-    "problem | p | mean / p | gain | coverage % (95 %) | below p % | above p % | own / real c.o.v. | warned % "
+    "problem | p | mean / p | c.o.v. | gain | coverage % (95 %) | below p % | above p % | own / real c.o.v. | warned % "
     "| simulations | own time [ms] | faults"
 )
 EXPLANATION = """\
 - *mean / p*: mean of the estimates over the known probability, with its standard error.
+- *c.o.v.*: spread of the estimates over their mean.
 - *gain*: variance of plain Monte Carlo at as many simulations, over the mean square error.
 - *coverage*: runs whose 95 % interval holds p, with the interval that so many runs allow (Clopper and Pearson).
 - *below p*, *above p*: runs whose interval is wholly below p, the unsafe side, and wholly above.
@@ -39,15 +40,11 @@ def format_leaderboard(result: Mapping[str, Any], most: int | None = None) -> st
         result: What `rare_envs.study.sampler_benchmark.study.summarise_study` returns.
         most: Problems in a table, the worst; None for all.
     """
-    about = result["about"]
     methods = sorted({cell["method"] for cell in result["cells"]})
     lines = [
         "# Samplers on problems with known probabilities",
         "",
-        " ".join(map(_describe_plan, list_plans(result)))
-        + f" rare_envs {about['rare_envs']} (code {about['code']}), NumPy {about['numpy']}, SciPy {about['scipy']}, "
-        f"{''.join(f'{name} {version}, ' for name, version in about['libraries'].items())}Python {about['python']}, "
-        f"{about['processor']}.",
+        *map(_describe_part, list_parts(result)),
         "",
         EXPLANATION,
         "## All problems of a set together",
@@ -57,23 +54,28 @@ def format_leaderboard(result: Mapping[str, Any], most: int | None = None) -> st
         *_format_overview(result),
     ]
     for method in methods:
-        lines += [f"## {method}", "", _describe_warnings(result["warnings"][method]), ""]
+        lines += [f"## {method}", ""]
         for budget, cells in _cells_by_budget(result, method).items():
-            lines += [f"### {budget:,} simulations", "", *_format_table(cells, most), ""]
+            warned = _describe_warnings(result["warnings"][method][str(budget)])
+            lines += [f"### {budget:,} simulations", "", warned, "", *_format_table(cells, most), ""]
     return "\n".join([*lines, *_format_problems(result["problems"])]) + "\n"
 
 
-def list_plans(result: Mapping[str, Any]) -> list[Mapping[str, Any]]:
-    """Return what was run: the plan of a benchmark, or those of several whose cells were put together."""
-    about = result["about"]
-    plans: list[Mapping[str, Any]] = about["plans"] if "plans" in about else [about["plan"]]
-    return plans
+def list_parts(result: Mapping[str, Any]) -> list[Mapping[str, Any]]:
+    """Return what made a benchmark, with its plan: of several whose cells were put together, of each."""
+    parts: list[Mapping[str, Any]] = result.get("parts") or [result["about"]]
+    return parts
 
 
-def _describe_plan(plan: Mapping[str, Any]) -> str:
+def _describe_part(about: Mapping[str, Any]) -> str:
+    """Return what was run, by what, in a line."""
+    plan = about["plan"]
+    libraries = "".join(f"{name} {version}, " for name, version in about["libraries"].items())
     return (
-        f"{plan['runs']} runs of each of {len(plan['methods'])} methods on {len(plan['problems'])} problems, budgets "
-        f"of {_join(f'{each:,}' for each in plan['budgets'])} simulations, seeds from {plan['seed']}."
+        f"- {plan['runs']} runs of each of {len(plan['methods'])} methods ({_join(plan['methods'])}) on "
+        f"{len(plan['problems'])} problems, budgets of {_join(f'{each:,}' for each in plan['budgets'])} simulations, "
+        f"seeds from {plan['seed']}: rare_envs {about['rare_envs']} (code {about['code']}), NumPy {about['numpy']}, "
+        f"SciPy {about['scipy']}, {libraries}Python {about['python']}, {about['processor']}."
     )
 
 
@@ -160,6 +162,7 @@ def _format_row(cell: Mapping[str, Any]) -> str:
         cell["problem"],
         f"{cell['p']:.3g}",
         f"{_number(cell['mean_over_p'], '.3f')} ± {_number(cell['mean_se'], '.3f')}",
+        _number(cell["cov"], ".3f"),
         _number(cell["gain"], ",.3g"),
         f"{100 * cell['coverage']:.0f} ({100 * low:.0f} to {100 * high:.0f})",
         f"{100 * cell['below']:.0f}",
@@ -168,15 +171,27 @@ def _format_row(cell: Mapping[str, Any]) -> str:
         _number(cell["warned"], ".0%").rstrip("%"),
         f"{cell['n_sim']:,.0f}",
         f"{1e3 * cell['seconds']:,.0f}",
-        "; ".join(cell["faults"]),
+        "; ".join(cell["faults"]).replace("|", "/"),
     ]
     return f"| {' | '.join(values)} |"
 
 
 def _describe_warnings(power: Mapping[str, Any]) -> str:
     """Return how often the warnings of a method come with the runs that are wrong, and with those that are right."""
-    wrong = f"{power['wrong_warned']} of {power['wrong']} runs that are off by more than 4 of their own standard errors"
-    return f"Warned: {wrong}; {power['right_warned']} of {power['right']} within 2."
+    hit = _format_share(power["wrong_warned"], power["wrong"])
+    false = _format_share(power["right_warned"], power["right"])
+    return (
+        f"Warnings: of runs that are off by more than 4 of their own standard errors {hit} have one; of runs within 2 "
+        f"{false} have one (false alarms)."
+    )
+
+
+def _format_share(number: int, of: int) -> str:
+    """Return a share with its 95 % interval in words."""
+    if of == 0:
+        return "none of 0"
+    low, high = clopper_pearson(number, of, 0.95)
+    return f"{number} of {of} ({100 * number / of:.0f} %; {100 * low:.0f} to {100 * high:.0f})"
 
 
 def _number(value: float | None, spec: str) -> str:

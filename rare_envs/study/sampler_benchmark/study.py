@@ -11,13 +11,14 @@ from typing import Any
 import rare_envs
 from rare_envs.files import replace_text
 from rare_envs.json_text import format_json
+from rare_envs.study.errors import BadInput
 from rare_envs.study.execution.code_digest import digest_code
-from rare_envs.study.execution.run_lines import RunLines
+from rare_envs.study.execution.run_lines import RunLines, drop_torn_line
 from rare_envs.study.sampler_benchmark.leaderboard import format_leaderboard
 from rare_envs.study.sampler_benchmark.problems import ALL_PROBLEMS, GROUPS
 from samplers.benchmark import Job, MethodRun, cells_of, find_faults, power_of, run_all, run_once
 from samplers.benchmark.runs import about
-from samplers.benchmark.solvers import find_library_versions, find_method
+from samplers.benchmark.solvers import digest_method, find_library_versions, find_method
 from samplers.serialization import to_json_value
 
 RUNS_FILE, RESULT_FILE, PAGE_FILE = "runs.jsonl", "benchmark.json", "leaderboard.md"
@@ -99,10 +100,11 @@ def run_study(
         What `benchmark.json` has: machine and versions, cells, faults, power of the warnings, runs.
 
     Raises:
-        BadInput: The folder has runs of other code, or damaged ones.
+        BadInput: The folder has runs of other code, of a method's too, or damaged ones.
     """
     out.mkdir(parents=True, exist_ok=True)
     lines = _open_runs(out / RUNS_FILE)
+    _refuse_other_sources(plan, lines)
     runs = lines.complete(plan.jobs(), lambda missing: run_all(missing, workers, run_once, executor), progress)
     result = summarise_study(plan, runs)
     replace_text(out / RESULT_FILE, format_json(result))
@@ -131,7 +133,13 @@ def summarise_study(plan: BenchmarkPlan, runs: Sequence[MethodRun]) -> dict[str,
                 for cell in cells
             ],
             "warnings": {
-                name: asdict(power_of([run for run in runs if run.method == name], CATALOGUE)) for name in plan.methods
+                name: {
+                    str(budget): asdict(
+                        power_of([run for run in runs if (run.method, run.max_sim) == (name, budget)], CATALOGUE)
+                    )
+                    for budget in plan.budgets
+                }
+                for name in plan.methods
             },
             "runs": [asdict(run) for run in runs],
         }
@@ -150,6 +158,15 @@ def read_runs(file: Path) -> list[MethodRun]:
 def _open_runs(file: Path) -> RunLines[Job, MethodRun]:
     """Return the runs of a file, and how they are read and written."""
     return RunLines(file, {"rare_envs": rare_envs.__version__, "code": digest_code()}, _parse_run, asdict, _key, _key)
+
+
+def _refuse_other_sources(plan: BenchmarkPlan, lines: RunLines[Job, MethodRun]) -> None:
+    """Raise BadInput if a file has runs of methods of the plan whose code is another by now."""
+    drop_torn_line(lines.file)
+    sources = {name: digest_method(find_method(name)) for name in plan.methods}
+    for run in lines.read():
+        if run.source != sources.get(run.method, run.source):
+            raise BadInput(f"{lines.file} has runs of other code of {run.method}: choose another --out.")
 
 
 def _parse_run(content: dict[str, Any]) -> MethodRun:

@@ -7,13 +7,18 @@ from pathlib import Path
 
 import pytest
 
+from benchmarks.estimators import sampler_leaderboard
 from benchmarks.estimators.sampler_leaderboard import (
     LEADERBOARD_PAGE,
+    PLANNED,
+    RUNS,
     condense_results,
     format_leaderboard_page,
+    leave_out,
     read_leaderboard,
+    renew_rows,
 )
-from rare_envs.study.sampler_benchmark.leaderboard import list_plans
+from rare_envs.study.sampler_benchmark.leaderboard import list_parts
 from rare_envs.study.sampler_benchmark.study import BenchmarkPlan, choose_problems, run_study
 from rare_envs.threads import use_one_thread
 
@@ -29,22 +34,24 @@ def test_the_page_is_what_the_result_gives() -> None:
 
 
 def test_every_method_has_every_problem_of_the_sets(committed) -> None:
-    plans = list_plans(committed)
-    (main,) = (plan for plan in plans if plan["budgets"] == [1500] and len(plan["problems"]) >= 67)
-    assert set(choose_problems(["analytic", "public", "highdim", "driving"])) <= set(main["problems"])
-    assert {"openturns-ss", "openturns-ce", "openturns-form", "uqpy-ss", "auto", "mc"} <= set(main["methods"])
+    assert set(PLANNED) == {300, 1500, 6000}
     wanted = {
-        (method, problem, budget): plan["runs"]
-        for plan in plans
-        for method in plan["methods"]
-        for problem in plan["problems"]
-        for budget in plan["budgets"]
+        (method, problem, budget): RUNS
+        for budget, (methods, groups) in PLANNED.items()
+        for problem in choose_problems(groups)
+        for method in methods
     }
     found = {(cell["method"], cell["problem"], cell["max_sim"]): cell["runs"] for cell in committed["cells"]}
     assert found == wanted
     assert len(found) == len(committed["cells"])
-    for group in ("analytic", "public"):
-        assert {budget for _, name, budget in found if name in choose_problems([group])} == {300, 1500, 6000}
+    said = {
+        (method, problem, budget): part["plan"]["runs"]
+        for part in list_parts(committed)
+        for method in part["plan"]["methods"]
+        for problem in part["plan"]["problems"]
+        for budget in part["plan"]["budgets"]
+    }
+    assert said == wanted
 
 
 @pytest.mark.parametrize(
@@ -65,7 +72,7 @@ def test_a_cheap_cell_made_again_is_the_committed_one(
         for each in committed["cells"]
         if (each["method"], each["problem"], each["max_sim"]) == (method, problem, budget)
     ]
-    seed = list_plans(committed)[0]["seed"]
+    seed = list_parts(committed)[0]["plan"]["seed"]
     with use_one_thread():
         result = run_study(BenchmarkPlan((method,), (problem,), (budget,), shown["runs"], seed), tmp_path)
     again = condense_results([result])
@@ -83,17 +90,43 @@ def test_what_is_committed_has_no_single_runs_and_few_digits(tmp_path: Path) -> 
     assert json.loads(json.dumps(result, allow_nan=False)) == result
 
 
-def test_benchmarks_of_one_code_are_put_together_and_others_refused(tmp_path: Path) -> None:
+def test_benchmarks_are_put_together_and_say_what_made_each(tmp_path: Path) -> None:
     first, second = (
         run_study(BenchmarkPlan(("mc",), (problem,), (budget,), 2), tmp_path)
         for problem, budget in (("never_d4", 100), ("common_d4", 200))
     )
+    second["about"]["code"] = "0"  # rows of other code stand beside them, and say so
     both = condense_results([first, second])
-    assert [plan["budgets"] for plan in list_plans(both)] == [[100], [200]]
+    assert [part["plan"]["budgets"] for part in list_parts(both)] == [[100], [200]]
+    assert [part["code"] for part in list_parts(both)] == [first["about"]["code"], "0"]
     assert list(both["problems"]) == ["common_d4", "never_d4"]
     assert len(both["cells"]) == 2
-    assert both["warnings"]["mc"]["right"] == first["warnings"]["mc"]["right"] + second["warnings"]["mc"]["right"]
+    assert both["warnings"]["mc"]["200"]["right"] == second["warnings"]["mc"]["200"]["right"]
     with pytest.raises(ValueError, match="other methods, problems or budgets"):
         condense_results([first, first])
-    with pytest.raises(ValueError, match="one code and machine"):
-        condense_results([first, {**second, "about": {**second["about"], "code": "0"}}])
+
+
+def test_rows_of_a_method_are_made_anew_and_the_others_stay(tmp_path: Path, monkeypatch) -> None:
+    """The runs that are there are not made again, and what was wrong in a row is put right."""
+    for name in ("LEADERBOARD_RESULT", "LEADERBOARD_PAGE"):
+        monkeypatch.setattr(sampler_leaderboard, name, tmp_path / name)
+    monkeypatch.setattr(sampler_leaderboard, "READING", "print('one row')\n")
+    monkeypatch.setattr(sampler_leaderboard, "PLANNED", {300: (("mc", "ss"), ("highdim",))})
+    monkeypatch.setattr(sampler_leaderboard, "RUNS", 2)
+    renew_rows(tmp_path / "runs")
+    made = read_leaderboard()
+    place = made["columns"].index("n_sim")
+    result = json.loads(sampler_leaderboard.LEADERBOARD_RESULT.read_text())
+    for row in result["cells"]:
+        row[place] += row[0] == "mc"
+    sampler_leaderboard.LEADERBOARD_RESULT.write_text(json.dumps(result))
+    runs = (tmp_path / "runs" / "300" / "runs.jsonl").read_text()
+    renew_rows(tmp_path / "runs", ["mc"])
+    assert (tmp_path / "runs" / "300" / "runs.jsonl").read_text() == runs
+    again = read_leaderboard()
+    assert [part["plan"]["methods"] for part in again["parts"]] == [["ss"], ["mc"]]
+    key = lambda cell: (cell["method"], cell["problem"])  # noqa: E731
+    assert sorted(again["cells"], key=key) == sorted(made["cells"], key=key)
+    with pytest.raises(ValueError, match="Unknown method 'nothing' of the leaderboard"):
+        renew_rows(tmp_path / "runs", ["nothing"])
+    assert {cell["method"] for cell in leave_out(again, ["mc"])["cells"]} == {"ss"}

@@ -1,5 +1,6 @@
 """Samplers that are wrong on purpose are found out, and right ones are not accused."""
 
+import re
 from dataclasses import replace
 
 import pytest
@@ -20,6 +21,10 @@ def test_a_bias_of_a_fifth_is_found() -> None:
     assert "biased: mean / p 1.2" in faults_of(f"{WRONG}:biased")
 
 
+def test_a_bias_of_a_fifth_downwards_is_found() -> None:
+    assert re.search(r"biased: mean / p 0\.(79|8)", faults_of(f"{WRONG}:low"))
+
+
 def test_intervals_of_half_the_width_are_found() -> None:
     """They hold p in 67 %: of 60 runs more than 50 do with a probability of 0.2 %, and 50 of 60 are accused."""
     assert "intervals hold p in" in faults_of(f"{WRONG}:narrow", "common_d4", runs=60)
@@ -27,6 +32,37 @@ def test_intervals_of_half_the_width_are_found() -> None:
 
 def test_hidden_simulations_are_found() -> None:
     assert "states fewer simulations than it made in 100 % of the runs" in faults_of(f"{WRONG}:hidden", runs=3)
+
+
+def test_simulations_that_nobody_saw_are_found() -> None:
+    """A method that states more than the problem was asked for has them from elsewhere, or has not made them."""
+    assert "states more simulations than it made in 100 % of the runs" in faults_of(f"{WRONG}:boastful", runs=3)
+    assert "answers without a simulation in 100 % of the runs" in faults_of(f"{WRONG}:idle", runs=3)
+
+
+def test_a_method_that_ignores_its_seed_is_found_and_its_runs_count_as_one() -> None:
+    """Nothing is known of the bias and the coverage of one run, so neither is a fault."""
+    found = faults_of(f"{WRONG}:stubborn", "common_d4", runs=20)
+    assert found.startswith("the same points at every seed: 20 runs are one, whose interval holds p")
+    assert "biased" not in found
+
+
+def test_a_probability_that_was_read_is_found() -> None:
+    assert faults_of(f"{WRONG}:informed", "common_d4", runs=3) == "p to 10 digits in every run, as no draws give it"
+
+
+def test_answers_that_cannot_be_are_found_and_cover_nothing() -> None:
+    jobs = [Job(f"{WRONG}:impossible", "common_d4", seed, 500) for seed in range(6)]
+    (cell,) = cells_of([run_once(job) for job in jobs])
+    assert cell.impossible == 1.0
+    assert cell.coverage == 0.0
+    assert find_faults(cell)[0] == "answers that cannot be in 100 % of the runs (p 1.7, 0 to 2, c.o.v. nan)"
+
+
+def test_what_a_method_raises_is_said_in_one_line_even_where_it_ends_the_program() -> None:
+    assert faults_of(f"{WRONG}:leaving", runs=2) == "raised in 2 of 2 runs (SystemExit: enough | of this)"
+    found = faults_of(f"{WRONG}:silent", runs=2, max_sim=100)
+    assert found == "raised in 2 of 2 runs (ValueError: expected p and an interval, got nan and 0 to 1)"
 
 
 def test_more_simulations_than_the_budget_are_found() -> None:

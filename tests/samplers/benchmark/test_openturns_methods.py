@@ -1,5 +1,6 @@
 """OpenTURNS as rows of the benchmark."""
 
+import math
 import signal
 
 import numpy as np
@@ -60,3 +61,9 @@ def test_an_error_of_f_is_one_line() -> None:
 
     with pytest.raises(RuntimeError, match="singular"):
         OPENTURNS["openturns-ss"](FunctionProblem(f, 2), seed=0, max_sim=1000)
+
+
+def test_without_a_failure_the_interval_is_the_point_that_openturns_states() -> None:
+    """Its standard deviation is -1 there, and its confidence length 0: the interval is no reversed one."""
+    run = run_once(Job("openturns-form", "never_d4", seed=0, max_sim=300))
+    assert (run.p, run.low, run.high, run.cov, run.error) == (0.0, 0.0, 0.0, math.inf, "")

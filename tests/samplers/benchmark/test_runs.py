@@ -1,6 +1,7 @@
 """One run, and what it records."""
 
 import math
+import os
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
@@ -57,6 +58,12 @@ def test_jobs_of_any_kind_are_made_in_order_one_at_a_time_or_by_an_executor():
 @pytest.mark.slow
 def test_jobs_are_made_in_several_processes():
     assert list(map_jobs(math.sqrt, [9.0, 1.0, 4.0], workers=2)) == [3.0, 1.0, 2.0]
+
+
+def test_a_worker_that_dies_is_told_of_in_one_line():
+    with pytest.raises(ChildProcessError, match="ended in the midst of a run") as caught:
+        list(map_jobs(os._exit, [3, 3], workers=2))
+    assert "\n" not in str(caught.value)
 
 
 def test_noise_differs_between_runs_and_comes_back_with_the_seed():

@@ -1,10 +1,12 @@
 """Samplers that are wrong on purpose, and one of a third party."""
 
+import sys
 from dataclasses import replace
 
 import numpy as np
 
 import samplers
+from samplers.benchmark.runs import limit_state
 
 
 def biased(problem, seed, max_sim):
@@ -47,3 +49,57 @@ def endless(problem, seed, max_sim):
 
 def wordy(problem, seed, max_sim):
     return 0.1, 0.2
+
+
+def low(problem, seed, max_sim):
+    """All numbers a fifth too low."""
+    found = samplers.estimate(problem, "two-stage", seed=seed, max_sim=max_sim)
+    low, high = found.interval
+    return replace(found, p=0.8 * found.p, interval=(0.8 * low, 0.8 * high))
+
+
+def boastful(problem, seed, max_sim):
+    """States twice what it made."""
+    found = samplers.estimate(problem, "mc", seed=seed, max_sim=max_sim)
+    return replace(found, n_sim=2 * found.n_sim)
+
+
+def stubborn(problem, seed, max_sim):
+    """The same draws at every seed."""
+    return plain(problem, 5, max_sim)
+
+
+def informed(problem, seed, max_sim):
+    """Reads p, and simulates for show."""
+    plain(problem, seed, max_sim)
+    p = limit_state("common_d4").p
+    return p, 0.9 * p, 1.1 * p
+
+
+def idle(problem, seed, max_sim):
+    """No simulation."""
+    return 0.04, 0.03, 0.05
+
+
+def impossible(problem, seed, max_sim):
+    """A p for every seed that is none, or is not in its interval."""
+    plain(problem, seed, max_sim)
+    return [
+        (1.7, 0.0, 2.0),
+        (-0.1, -1.0, 1.0),
+        (0.04, 0.05, 0.03),
+        (0.3, 0.03, 0.05),
+        (float("inf"), 0.0, float("inf")),
+        (0.04, 0.03, 0.05, -0.5),
+    ][seed % 6]
+
+
+def silent(problem, seed, max_sim):
+    """NaN."""
+    plain(problem, seed, max_sim)
+    return float("nan"), 0.0, 1.0
+
+
+def leaving(problem, seed, max_sim):
+    """Ends the program."""
+    sys.exit("enough | of\nthis")

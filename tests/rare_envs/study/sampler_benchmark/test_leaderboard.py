@@ -50,6 +50,28 @@ def test_all_problems_of_a_set_together_by_hand() -> None:
     assert "| mc | 500 | 1 of 2 | 70 (35 to 93) | 0 | 0 | 30 | 5 |" in format_leaderboard(result).splitlines()
 
 
+def test_rates_of_warnings_are_those_of_a_budget() -> None:
+    """With few simulations nearly every run has a warning, which says nothing of those with many."""
+    plan = BenchmarkPlan(("mc",), ("common_d4",), (20, 3000), runs=4)
+    result = summarise_study(plan, [run_once(job) for job in plan.jobs()])
+    few, many = result["warnings"]["mc"]["20"], result["warnings"]["mc"]["3000"]
+    assert few["right_warned"] == few["right"] > 0
+    assert many["right_warned"] < many["right"]
+    lines = format_leaderboard(result).splitlines()
+    shown = lines[lines.index("### 20 simulations") + 2]
+    assert f"of runs within 2 {few['right']} of {few['right']} (100 %; " in shown
+
+
+def test_bars_in_what_a_method_raised_do_not_break_the_table() -> None:
+    plan = BenchmarkPlan(("tests.samplers.benchmark.wrong_samplers:leaving",), ("common_d4",), (100,), runs=2)
+    page = format_leaderboard(summarise_study(plan, [run_once(job) for job in plan.jobs()]))
+    (row,) = [line for line in page.splitlines() if "SystemExit" in line]
+    assert "(SystemExit: enough / of this)" in row
+    head = next(line for line in page.splitlines() if line.startswith("| problem | p | mean"))
+    assert row.count("|") == head.count("|")
+    assert "| c.o.v. |" in head
+
+
 def test_only_the_worst_problems_are_shown_where_that_is_asked_for() -> None:
     plan = BenchmarkPlan(("mc",), ("common_d4", "lin_d2", "never_d4"), (500,), runs=2)
     page = format_leaderboard(summarise_study(plan, [run_once(job) for job in plan.jobs()]), most=1)

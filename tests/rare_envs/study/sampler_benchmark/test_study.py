@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import importlib
 import json
 import math
+import sys
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -11,6 +13,7 @@ import pytest
 
 from rare_envs.study.errors import BadInput
 from rare_envs.study.sampler_benchmark.study import BenchmarkPlan, choose_problems, read_runs, run_study
+from samplers.benchmark.solvers import _digest_package
 
 PLAN = BenchmarkPlan(("mc", "adss"), ("common_d4", "never_d4"), (500,), runs=2)
 
@@ -115,6 +118,27 @@ def test_runs_of_another_version_or_other_code_are_refused(tmp_path: Path, name:
     file.write_text("\n".join([json.dumps({**json.loads(head), name: other}), *runs]) + "\n")
     with pytest.raises(BadInput, match=f"runs of {name} {other}"):
         run_study(PLAN, tmp_path)
+
+
+def test_runs_of_a_method_whose_code_has_changed_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The folder would else show the figures of the method as it was."""
+    folder, text = tmp_path / "code", "def answer(problem, seed, max_sim):\n    return 0.1, 0.0, 1.0\n"
+    folder.mkdir()
+    monkeypatch.syspath_prepend(str(folder))
+    for content in (text, text.replace("0.1", "0.2")):
+        (folder / "changing_method.py").write_text(content)
+        sys.modules.pop("changing_method", None)
+        importlib.invalidate_caches()
+        _digest_package.cache_clear()
+        plan = BenchmarkPlan(("changing_method:answer", "mc"), ("lin_d2",), (100,), runs=2)
+        if content == text:
+            run_study(plan, tmp_path / "out")
+            assert len({run["source"] for run in run_study(plan, tmp_path / "out")["runs"]}) == 2
+        else:
+            with pytest.raises(BadInput, match="runs of other code of changing_method:answer"):
+                run_study(plan, tmp_path / "out")
+    others = BenchmarkPlan(("mc",), ("lin_d2",), (100,), runs=2)  # which are as they were
+    assert len(run_study(others, tmp_path / "out")["runs"]) == 2
 
 
 @pytest.mark.parametrize(
