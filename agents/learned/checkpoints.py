@@ -2,8 +2,8 @@
 
 The tensors are those of the network, with its scaling and the cap of its log standard deviation. If the last layer's
 weights have a distribution, its mean and the non-zero entries of its precision follow. The rest is JSON in the header:
-features, noise colour, limits of the actions, the rule of collision avoidance if it has one, and where the driver comes
-from. Reading a file runs no code in it.
+features, noise colour, limits of the actions, the rule of collision avoidance and the lane changes if it has them, and
+where the driver comes from. Reading a file runs no code in it.
 """
 
 import difflib
@@ -24,6 +24,7 @@ from torch import Tensor
 from agents.learned.collision_avoidance import CollisionAvoidance
 from agents.learned.coloured_noise import AutoregressiveNoise
 from agents.learned.driver import LearnedDriver
+from agents.learned.lane_changes import LaneChanges
 from agents.learned.networks import ACTION_SIZE, FEATURE_CLIP, FEATURE_SIZE, HEAD_SIZE, Policy, Scaling
 from agents.learned.rule_driver import RuleDriver
 from agents.learned.weight_distribution import WeightDistribution
@@ -69,8 +70,8 @@ def load_driver(name: str | PathLike[str]) -> LearnedDriver | RuleDriver | LaneC
     """Load a driver by its name or from its file.
 
     Args:
-        name: "mgail2", "mgail", "gail" or "bc", which are shipped, and "imitation", which was trained to be an ego;
-            "idm", the rule-based driver, and "idm+mobil", which changes lanes too; or the path of a file that
+        name: "mgail3", "mgail2", "mgail", "gail" or "bc", which are shipped, and "imitation", which was trained to be
+            an ego; "idm", the rule-based driver, and "idm+mobil", which changes lanes too; or the path of a file that
             `save_driver` wrote.
 
     Returns:
@@ -140,6 +141,8 @@ def save_driver(driver: LearnedDriver, provenance: Provenance, path: str | PathL
         "acceleration": driver.acceleration,
         "yaw_rate": driver.yaw_rate,
         "avoidance": None if driver.avoidance is None else asdict(driver.avoidance),
+        "hard_braking": driver.hard_braking,
+        "changes": None if driver.changes is None else asdict(driver.changes),
         "radius": None if driver.weights is None else driver.weights.radius,
         **asdict(provenance),
     }
@@ -164,15 +167,17 @@ def read_driver(path: str | PathLike[str]) -> LearnedDriver:
     _check_header(header, path)
     check_finite(tensors, path)
     policy = _policy(tensors, path)
-    rule = header.get("avoidance")  # earlier files have none
+    rule, changes = header.get("avoidance"), header.get("changes")  # earlier files have none
     try:
         return LearnedDriver(
             policy,
-            colour=AutoregressiveNoise(**{name: tuple(pair) for name, pair in header["colour"].items()}),
+            colour=_colour(header["colour"]),
             acceleration=header["acceleration"],
             yaw_rate=header["yaw_rate"],
             weights=_weights(tensors, header["radius"], path),
             avoidance=None if rule is None else CollisionAvoidance(**rule),
+            hard_braking=header.get("hard_braking", 1.0),
+            changes=None if changes is None else LaneChanges(**changes),
             name=header["name"],
         )
     except (AttributeError, TypeError, ValueError) as error:
@@ -286,6 +291,14 @@ def _policy(tensors: Mapping[str, Tensor], path: Path) -> Policy:
         check_tensor(_POLICY + name, value, tuple(expected[name].shape), torch.float32, path)
     policy.load_state_dict(state, assign=True)
     return policy.eval().requires_grad_(False)
+
+
+def _colour(header: Mapping[str, Any]) -> AutoregressiveNoise:
+    return AutoregressiveNoise(
+        tuple(header["first"]),
+        tuple(header["second"]),
+        header.get("balanced", False),  # earlier files have no third
+    )
 
 
 def _weights(tensors: Mapping[str, Tensor], radius: Any, path: Path) -> WeightDistribution | None:

@@ -125,13 +125,23 @@ class CollisionAvoidance:
         gap, across = ranges * torch.cos(angle) - 0.5 * length, ranges * torch.sin(angle)
         in_path = ahead & (ranges < MAX_RANGE) & (gap > 0.0) & (across.abs() < 0.5 * width + self.path_margin)
         closing = -features[..., RATE_COLUMNS] / torch.where(ahead, torch.cos(angle), 1.0)
+        bound = self.greatest_acceleration_behind(gap, closing, speed)
+        return torch.where(in_path, bound, torch.inf).amin(dim=-1)
+
+    def greatest_acceleration_behind(self, gap: Tensor, closing: Tensor, speed: Tensor) -> Tensor:
+        """Return the bound of the acceleration [m/s^2] behind a body, for tensors of one shape.
+
+        Args:
+            gap: To the body [m].
+            closing: Speed at which it closes [m/s].
+            speed: The own [m/s].
+        """
         b, lag = self.deceleration, self.deceleration * self.reaction_time
         room = 2.0 * b * (gap - self.standstill_gap).clamp(min=0.0) + (speed - closing).clamp(min=0.0).square()
         comfortable = ((lag * lag + room).sqrt() - lag - speed) / self.relaxation_time
         needed = closing.clamp(min=0.0).square() / (2.0 * (gap - self.least_gap).clamp(min=_LEAST_GAP))
         urgent = torch.where(needed > b, -needed.clamp(max=self.hardest), torch.inf)
-        bound = torch.minimum(comfortable.clamp(min=-b), urgent)
-        return torch.where(in_path, bound, torch.inf).amin(dim=-1)
+        return torch.minimum(comfortable.clamp(min=-b), urgent)
 
     def greatest_yaw_rates(self, features: Tensor) -> tuple[Tensor, Tensor]:
         """Return the bounds of the yaw rate to the left and to the right [rad/s], both 0 or more, shape (B, M)."""

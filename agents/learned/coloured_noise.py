@@ -33,8 +33,13 @@ class AutoregressiveNoise:
     """Coefficients of lag 1 of acceleration and of yaw rate; white noise has 0 here and below."""
     second: tuple[float, float] = (0.0, 0.0)
     """Coefficients of lag 2."""
+    balanced: bool = False
+    """Whether it begins so that what is expected of it adds up to 0: with nothing left of a swing that was under way
+    before, which would shift speed and heading for good."""
 
     def __post_init__(self) -> None:
+        if self.balanced and 0.0 in self.second:
+            raise ValueError(f"Expected coefficients of lag 2 of a noise that begins balanced, got {self.second}.")
         for a, b in zip(self.first, self.second, strict=True):
             if not (abs(b) < 1.0 and abs(a) < 1.0 - b):
                 raise ValueError(f"Expected the coefficients of a stationary noise, got {a} and {b}.")
@@ -64,14 +69,17 @@ class AutoregressiveNoise:
         return a, b
 
     def begin(self, fresh: Tensor) -> Tensor:
-        """Return two consecutive stationary values made of independent standard normal ones.
+        """Return two consecutive values made of independent standard normal ones: stationary, or balanced ones.
 
         Args:
-            fresh: Shape (..., 2, 2): action, then draw.
+            fresh: Shape (..., 2, 2): action, then draw; balanced noise does not use the second draw.
 
         Returns:
             Memory, shape (..., 2, 2): action, then the values one and two ticks ago.
         """
+        if self.balanced:  # E[sum of all that follow] = (earlier second + last (first + second)) / (1 - first - second)
+            last, (first, second) = fresh[..., 0], (fresh.new_tensor(pair) for pair in (self.first, self.second))
+            return torch.stack((last, -last * (first + second) / second), dim=-1)
         correlation = fresh.new_tensor([a / (1 - b) for a, b in zip(self.first, self.second, strict=True)])
         earlier = fresh[..., 1]
         return torch.stack((correlation * earlier + (1 - correlation.square()).sqrt() * fresh[..., 0], earlier), dim=-1)

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from agents.learned.collision_avoidance import CollisionAvoidance
 from agents.learned.coloured_noise import WHITE_NOISE, AutoregressiveNoise
+from agents.learned.lane_changes import STATE_SIZE, ChangeState, LaneChanges
 from agents.learned.networks import (
     ACTION_SIZE,
     FEATURE_CLIP,
@@ -33,6 +34,9 @@ if TYPE_CHECKING:
     from gymnasium import spaces
 
     from rare_envs.simulation.episode import Episode
+
+COMFORTABLE = 2.0
+"""Deceleration [m/s^2] that is comfortable, as in `CollisionAvoidance`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,6 +76,10 @@ class LearnedDriver:
     """Names the driver in results, such as "mgail"."""
     avoidance: CollisionAvoidance | None = None
     """Rule that bounds the actions; None for the network's own."""
+    hard_braking: float = 1.0
+    """Share of what the network brakes beyond `COMFORTABLE` that it is given; the rule brakes as it has to."""
+    changes: LaneChanges | None = None
+    """Lane changes, which need the rule; None for those of the network."""
     noisy: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
@@ -84,6 +92,10 @@ class LearnedDriver:
             low, high = getattr(self, name)  # a field by its name
             if not low < high:
                 raise ValueError(f"Expected limits of {name} in ascending order, got {(low, high)}.")
+        if not 0.0 < self.hard_braking <= 1.0:
+            raise ValueError(f"Expected a share of hard braking in (0, 1], got {self.hard_braking!r}.")
+        if self.changes is not None and self.avoidance is None:
+            raise ValueError("Expected a rule of collision avoidance beside the lane changes, got none.")
         if self.weights is not None and self.weights.dim != HEAD_SIZE:
             raise ValueError(f"Expected a distribution of {HEAD_SIZE} weights, got one of {self.weights.dim}.")
 
@@ -100,7 +112,8 @@ class LearnedDriver:
             features: What M vehicles in B scenarios perceive, shape (B, M, 51).
             weights: Last layers of the scenarios, shape (B, 404) as `head_weights` has them; None for the policy's own.
             innovations: Independent standard normal draws, shape (B, M, 2); None for the mean actions.
-            memory: Of the noise, shape (B, M, 2, 2), as the last call returned it; at the start that of `begin`.
+            memory: As the last call returned it; at the start that of `begin`. Shape (B, M, 2, 2), of the noise, and
+                with lane changes (B, M, 14).
 
         Returns:
             Accelerations [m/s^2] and yaw rates [rad/s], shape (B, M, 2), and the new memory.
@@ -109,7 +122,7 @@ class LearnedDriver:
             TypeError: If something is no tensor.
             ValueError: If a shape is wrong, or innovations come without a memory.
         """
-        batch, vehicles = _check_shapes(features, weights, innovations, memory)
+        batch, vehicles = _check_shapes(features, weights, innovations, memory, self._memory_shape)
         policy = self.policy
         hidden = policy.trunk(features.to(policy.head.weight.dtype).reshape(batch * vehicles, FEATURE_SIZE))
         if weights is None:
@@ -117,20 +130,62 @@ class LearnedDriver:
         else:
             output = apply_heads(hidden.view(batch, vehicles, HIDDEN_SIZES[-1]), weights.to(hidden.dtype).contiguous())
         normal, log_std = policy.split(output)
-        if innovations is not None and memory is not None:
-            noise, memory = self.colour.step(memory.to(hidden.dtype), innovations.to(hidden.dtype))
+        swings, state = self._split(memory)
+        if innovations is not None and swings is not None:
+            noise, swings = self.colour.step(swings.to(hidden.dtype), innovations.to(hidden.dtype))
             normal = normal + log_std.exp() * noise
         scaling = policy.scaling
         action = scaling.action_mean + scaling.action_std * normal
         low, high = action.new_tensor(tuple(zip(self.acceleration, self.yaw_rate, strict=True)))
-        action = action.clamp(low, high).to(features.dtype)
-        return action if self.avoidance is None else self.avoidance.limit(features, action), memory
+        action = self._ease_braking(action.clamp(low, high).to(features.dtype))
+        if state is None or swings is None:
+            return self._bound(features, action), memory if swings is None else swings
+        action, state = self._change_lanes(features, action, state, innovations)
+        return self._bound(features, action), torch.cat((swings.flatten(-2), state.pack().to(swings.dtype)), dim=-1)
+
+    @property
+    def _memory_shape(self) -> tuple[int, ...]:
+        """Shape of the memory of one vehicle."""
+        return (ACTION_SIZE, 2) if self.changes is None else (2 * ACTION_SIZE + STATE_SIZE,)
+
+    def _split(self, memory: Tensor | None) -> tuple[Tensor | None, ChangeState | None]:
+        """Return the memory of the noise, (B, M, 2, 2), and that of the lane changes."""
+        if memory is None or self.changes is None:
+            return memory, None
+        swings = memory[..., : 2 * ACTION_SIZE].unflatten(-1, (ACTION_SIZE, 2))
+        return swings, ChangeState.unpack(memory[..., 2 * ACTION_SIZE :])
+
+    def _ease_braking(self, action: Tensor) -> Tensor:
+        """Return actions with a share of the braking beyond `COMFORTABLE`."""
+        if self.hard_braking == 1.0:
+            return action
+        acceleration, yaw_rate = action.unbind(dim=-1)
+        eased = torch.maximum(acceleration, self.hard_braking * (acceleration + COMFORTABLE) - COMFORTABLE)
+        return torch.stack((eased, yaw_rate), dim=-1)
+
+    def _change_lanes(
+        self, features: Tensor, action: Tensor, state: ChangeState, innovations: Tensor | None
+    ) -> tuple[Tensor, ChangeState]:
+        """Return actions with the course of a lane change for the steering of those who are in one."""
+        assert self.changes is not None
+        assert self.avoidance is not None
+        change, state = self.changes.step(features, state, innovations)
+        bound = self.avoidance.greatest_acceleration_behind(change.gap, change.closing, features[..., SPEED_COLUMN])
+        acceleration = torch.where(change.follows, torch.minimum(action[..., 0], bound), action[..., 0])
+        yaw_rate = torch.where(change.changing, change.yaw_rate.clamp(*self.yaw_rate), action[..., 1])
+        return torch.stack((acceleration, yaw_rate), dim=-1), state
+
+    def _bound(self, features: Tensor, action: Tensor) -> Tensor:
+        """Return actions within the bounds of the rule, if there is one."""
+        return action if self.avoidance is None else self.avoidance.limit(features, action)
 
     def dense_driver(self) -> DenseDriver | None:
         """Return its present numbers for compiled rollouts; None if its class, network or rule was changed."""
         if type(self) is not LearnedDriver or type(self.colour) is not AutoregressiveNoise:
             return None
         if self.avoidance is not None and type(self.avoidance) is not CollisionAvoidance:
+            return None
+        if self.changes is not None or self.hard_braking != 1.0:
             return None
         layers = read_layers(self.policy)
         if layers is None:
@@ -155,14 +210,24 @@ class LearnedDriver:
         )
 
     def begin(self, draws: Tensor) -> Tensor:
-        """Return the memory of the noise at the start, from independent standard normal draws (B, M, 2, 2)."""
-        return self.colour.begin(draws)
+        """Return the memory at the start, from independent standard normal draws (B, M, 2, 2).
+
+        The patience for lane changes is made of the second draws, which balanced noise leaves.
+        """
+        swings = self.colour.begin(draws)
+        if self.changes is None:
+            return swings
+        return torch.cat((swings.flatten(-2), self.changes.begin(draws[..., 1]).pack()), dim=-1)
 
 
 def _check_shapes(
-    features: Tensor, weights: Tensor | None, innovations: Tensor | None, memory: Tensor | None
+    features: Tensor,
+    weights: Tensor | None,
+    innovations: Tensor | None,
+    memory: Tensor | None,
+    each: tuple[int, ...],
 ) -> tuple[int, int]:
-    """Return B and M."""
+    """Return B and M; `each` is the shape of the memory of one vehicle."""
     named = {"features": features, "weights": weights, "innovations": innovations, "memory": memory}
     for name, value in named.items():
         if not isinstance(value, Tensor) and (value is not None or name == "features"):
@@ -177,8 +242,8 @@ def _check_shapes(
         raise ValueError(f"Expected innovations of shape {expected}, got {tuple(innovations.shape)}.")
     if innovations is not None and memory is None:
         raise ValueError("Expected a memory beside the innovations; at the start it is driver.begin(draws).")
-    if memory is not None and memory.shape != (*expected, 2):
-        raise ValueError(f"Expected memory of shape {(*expected, 2)}, got {tuple(memory.shape)}.")
+    if memory is not None and memory.shape != (batch, vehicles, *each):
+        raise ValueError(f"Expected memory of shape {(batch, vehicles, *each)}, got {tuple(memory.shape)}.")
     return batch, vehicles
 
 

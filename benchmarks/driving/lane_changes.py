@@ -15,12 +15,11 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any
 
 import numpy as np
 import torch
 import typer
-from torch import Tensor
 
 from agents import LearnedDriver
 from benchmarks import RESULTS
@@ -32,6 +31,7 @@ from training.data.trajectories import DT
 from training.imitation.algorithms.expert_pairs import Pairs, collect_pairs
 from training.imitation.datasets import Source, load_scenes
 from training.imitation.evaluation.behaviour import Act, drive_traffic, sampling_driver
+from training.imitation.traffic.crossings import Crossings, find_crossings
 from training.imitation.traffic.recording import Recording, stack_scenes
 from training.imitation.traffic.replayed_traffic import lane_of, start_replay
 
@@ -39,8 +39,6 @@ BEFORE = (0.5, 1.0, 1.5, 2.0, 3.0)
 """Seconds before the crossing at which drivers take over."""
 AFTER = 2.0
 """Seconds beyond that in which they may still cross."""
-SETTLED = 10
-"""Ticks that a vehicle is in one lane on either side of a crossing, at least."""
 OFFSET = FEATURES.index("lane_offset")
 CLASSES = {
     "keeps its lane: less than 0.2 m/s across": (0.0, 0.2, -np.inf, np.inf),
@@ -49,33 +47,6 @@ CLASSES = {
     "comes in: 0.6 m/s or more, 0.5 m or more before the middle": (0.6, np.inf, -np.inf, -0.5),
 }
 """Moments by speed across [m/s] and offset from the middle [m], both towards where the vehicle moves."""
-
-
-class Crossings(NamedTuple):
-    """n lane changes of a recording, shape (n,) each."""
-
-    scene: Tensor
-    tick: Tensor
-    """The first in the new lane."""
-    vehicle: Tensor
-    side: Tensor
-    """1 to the right, -1 to the left."""
-
-
-def find_crossings(recording: Recording) -> Crossings:
-    """Return changes of lane with `SETTLED` ticks in one lane on either side."""
-    ticks = recording.x.shape[1]
-    lane = torch.stack([lane_of(recording.y[:, tick], recording.edges) for tick in range(ticks)], dim=1)
-    lane = torch.where(recording.present, lane, -1)
-    found = []
-    for tick in range(SETTLED, ticks - SETTLED + 1):
-        before, after = lane[:, tick - SETTLED : tick], lane[:, tick : tick + SETTLED]
-        settled = (before == before[:, -1:]).all(dim=1) & (after == after[:, :1]).all(dim=1)
-        crossed = settled & (before[:, -1] >= 0) & (after[:, 0] >= 0) & (before[:, -1] != after[:, 0])
-        scene, vehicle = crossed.nonzero(as_tuple=True)
-        side = (after[:, 0] - before[:, -1])[scene, vehicle].sign()
-        found.append(torch.stack((scene, torch.full_like(scene, tick), vehicle, side)))
-    return Crossings(*torch.cat(found, dim=1))
 
 
 def count_completed(recording: Recording, crossings: Crossings, act: Act, seconds: float) -> tuple[int, float]:

@@ -1,6 +1,6 @@
 """How likely do drivers make the recorded future? The realism score of the Waymo Open Sim Agents Challenge on US 101.
 
-    python -m benchmarks.driving.realism_score DATA [--seed 0] [--json FILE]
+    python -m benchmarks.driving.realism_score DATA [DRIVER ...] [--seed 0] [--json FILE]
 
 DATA is the folder with the tables of US 101. Every 2 s of the seven test scenes, where 4 s or more of the record are
 left, all vehicles but the first of each lane are driven for up to 8 s, 32 times, and the record is scored under these
@@ -59,7 +59,7 @@ LEAST_TICKS = 40
 """Ticks of record that a start needs."""
 BASELINE = "idm"
 """Row that the others are compared with, scene by scene."""
-LEARNED = ("bc", "gail", "mgail", "mgail2")
+LEARNED = ("bc", "gail", "mgail", "mgail2", "mgail3")
 SETTINGS = {"wosac_2024": WOSAC_2024, "wosac_2023": WOSAC_2023, "motorway": MOTORWAY}
 
 Decide = Callable[[Traffic, "Tensor | None"], tuple[Tensor, "Tensor | None"]]
@@ -246,6 +246,7 @@ def format_table(found: dict[str, dict[str, Any]]) -> str:
 @use_one_thread()
 def main(
     data: Annotated[Path, typer.Argument(help="Folder with the compact tables of US 101.")],
+    names: Annotated[list[str] | None, typer.Argument(help="Files or shipped names; all shipped ones if none.")] = None,
     seed: Annotated[int, typer.Option(help="Of the drivers' noise and of the resampling.")] = 0,
     rollouts: Annotated[int, typer.Option(help="Of each start.")] = SCENE_ROLLOUTS,
     result: Annotated[Path, typer.Option("--json", help="File for the result.")] = RESULTS / "realism_score.json",
@@ -253,7 +254,7 @@ def main(
     """Score drivers, print the table and write the result."""
     begun = time.process_time()
     train, test = (stack_scenes(scenes) for scenes in load_scenes(Source("data", data)))
-    drivers: dict[str, Any] = {name: load_driver(name) for name in LEARNED}
+    drivers: dict[str, Any] = {name: load_driver(name) for name in names or LEARNED}
     found = measure_scores(
         train,
         test,
@@ -263,7 +264,9 @@ def main(
         lambda name: print(f"{time.process_time() - begun:5.0f} s  {name}", flush=True),
     )
     settings = {"seed": seed, "rollouts": rollouts, "ticks": TICKS, "donors": DONORS}
-    command = f"python -m benchmarks.driving.realism_score DATA --seed {seed} --rollouts {rollouts}"
+    command = (
+        f"python -m benchmarks.driving.realism_score DATA {' '.join(names or ())} --seed {seed} --rollouts {rollouts}"
+    )
     bins = {name: {feature: list(each) for feature, each in setting.items()} for name, setting in SETTINGS.items()}
     about_run = about(torch=torch.__version__, command=command, **settings, seconds=round(time.process_time() - begun))
     text = json.dumps(round_numbers({"rows": found, "settings": bins, "about": about_run}), indent=1)

@@ -1,6 +1,6 @@
 """Long drives: two minutes of traffic that one driver drives alone, on a ring of 200 vehicles and on an open road.
 
-    python -m benchmarks.driving.flow.long_drives DATA [--seed 0] [--json FILE]
+    python -m benchmarks.driving.flow.long_drives DATA [DRIVER ...] [--seed 0] [--json FILE]
 
 Ring: 40 vehicles in each of five lanes of US 101, without entries and exits, at several densities; an open road: the
 same column of vehicles with nobody ahead of the first. Do speeds drift, do vehicles pile up, collide or leave the road,
@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from agents import load_driver
+from agents.names import RULE_BASED
 from benchmarks import RESULTS
 from benchmarks.driving.flow.recorded_flow import COIFMAN_FILE, coifman_points, scene_points, summarise_points
 from benchmarks.driving.realism import round_numbers, rule_driver
@@ -52,6 +53,7 @@ SECONDS, SETTLING = 120.0, 60.0
 """Length of a run, and the part of it that flow and speed are not averaged over [s]."""
 REACH = 150.0
 """Vehicles this near to the seam of the ring are seen beyond it too [m]; the lidar's range is 100 m."""
+NAMES = ("mgail", "mgail2", "mgail3", "idm", "idm+mobil")
 STOPPED = 1.0
 """Speed [m/s] below which a vehicle counts as stopped."""
 
@@ -190,6 +192,16 @@ def summarise_drive(moments: Moments, density: float | None) -> dict[str, Any]:
     }
 
 
+def choose(name: str, seed: int) -> Decide:
+    """Return the driver of a name or file, with one sequence of noise."""
+    if name == RULE_BASED:
+        return by_features(rule_driver)
+    driver: Any = load_driver(name)
+    if isinstance(driver, LaneChangingDriver):
+        return by_lanes(driver)
+    return by_features(sampling_driver(driver, torch.Generator().manual_seed(seed)))
+
+
 def measure_drives(drivers: dict[str, Decide], seed: int, seconds: float = SECONDS) -> dict[str, Any]:
     """Return the figures of every driver on the ring and on the open road."""
     out = {}
@@ -241,25 +253,18 @@ def format_drives(found: dict[str, Any]) -> str:
 @use_one_thread()
 def main(
     data: Annotated[Path, typer.Argument(help="Folder with the compact tables.")],
+    drivers: Annotated[list[str] | None, typer.Argument(help="Files or names; all rows if none.")] = None,
     seed: Annotated[int, typer.Option(help="Of starts and of the drivers' noise.")] = 0,
     result: Annotated[Path, typer.Option("--json", help="File for the result.")] = RESULTS / "long_drives.json",
 ) -> None:
     """Drive, print the table and write the result."""
-    learned: dict[str, Any] = {name: load_driver(name) for name in ("mgail", "mgail2")}
-    drivers = {
-        **{
-            name: by_features(sampling_driver(driver, torch.Generator().manual_seed(seed)))
-            for name, driver in learned.items()
-        },
-        "idm": by_features(rule_driver),
-        "idm+mobil": by_lanes(LaneChangingDriver()),
-    }
+    names = drivers or NAMES
     learn, test = load_scenes(Source("data", data))
     recorded = {"US 101": summarise_points(scene_points(stack_scenes([*learn, *test])))}
     if (data / COIFMAN_FILE).is_file():
         recorded["I-80"] = summarise_points(coifman_points(data))
-    found = {"drivers": measure_drives(drivers, seed), "recorded": recorded}
-    command = f"python -m benchmarks.driving.flow.long_drives DATA --seed {seed}"
+    found = {"drivers": measure_drives({name: choose(name, seed) for name in names}, seed), "recorded": recorded}
+    command = f"python -m benchmarks.driving.flow.long_drives DATA {' '.join(drivers or ())} --seed {seed}"
     about_run = about(torch=torch.__version__, command=command, seconds=SECONDS)
     result.write_text(json.dumps(round_numbers({**found, "about": about_run}), indent=1) + "\n", encoding="utf-8")
     print(format_drives(found))

@@ -22,7 +22,7 @@ EGOS = {
     "idm": "rule-based driver, Intelligent Driver Model (the default); with other parameters: idm?time_headway=2",
     "human": "attentive human driver by a published model with reaction time, errors and glances, docs/human_driver.md",
     "imitation": "shipped ego with lidar, learned from recorded traffic and from encounters",
-    "mgail, mgail2, gail, bc, FILE.safetensors": "learned driver with lidar, by its mean actions",
+    "mgail, mgail2, mgail3, gail, bc, FILE.safetensors": "learned driver with lidar, by its mean actions",
     "vision": "PilotNet on pictures of a front camera, which imitates a driver by rule; see docs/camera.md",
     "FILE.zip": "policy saved by Stable-Baselines3 or sb3-contrib, VecNormalize statistics beside it included",
     "hf:USER/REPOSITORY": "such a policy of the Hugging Face Hub, from its cache on this machine or downloaded",
@@ -35,6 +35,7 @@ EGOS = {
 DRIVERS = {
     "mgail": "learned from recorded traffic by imitation, with gradients through the simulation",
     "mgail2": "mgail with a rule of collision avoidance and less damped noise",
+    "mgail3": "mgail2 that changes lanes as often as people do, with noise that moves it less",
     "gail": "the same with policy gradients",
     "bc": "the same by behaviour cloning",
     "idm": "rule-based driver, Intelligent Driver Model and lane keeping by what it sees",

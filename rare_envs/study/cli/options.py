@@ -160,7 +160,7 @@ class ScenarioOptions:
     base: Annotated[str | None, typer.Option(help="Base distribution: a name or a JSON file.")] = None
     drivers: Annotated[
         str | None,
-        typer.Option(help="Of the vehicles around: mgail, mgail2, gail, bc, idm, idm+mobil or a file."),
+        typer.Option(help="Of the vehicles around: mgail, mgail2, mgail3, gail, bc, idm, idm+mobil or a file."),
     ] = None
     observation: ObservationOption = None
     action: ActionOption = None

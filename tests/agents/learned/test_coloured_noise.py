@@ -61,3 +61,20 @@ def test_the_expected_part_is_known_before_the_draw():
 def test_a_noise_that_grows_is_refused():
     with pytest.raises(ValueError, match="stationary"):
         AutoregressiveNoise((1.0, 0.5), (0.0, 0.0))
+
+
+def test_balanced_noise_adds_up_to_nothing_but_what_is_fresh():
+    noise = AutoregressiveNoise(OSCILLATING.first, OSCILLATING.second, balanced=True)
+    memory = noise.begin(torch.randn(5, 2, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(0)))
+    total = torch.zeros(5, 2, dtype=torch.float64)
+    for _ in range(400):
+        value, memory = noise.step(memory, torch.zeros(5, 2, dtype=torch.float64))
+        total += value
+    torch.testing.assert_close(total, torch.zeros_like(total), atol=1e-6, rtol=0)
+    values = sequence(noise, 150)
+    torch.testing.assert_close(values[-1].var(dim=0), torch.ones(2), atol=5 * 0.0045, rtol=0)
+
+
+def test_balanced_noise_needs_two_lags():
+    with pytest.raises(ValueError, match="Expected coefficients of lag 2 of a noise that begins balanced"):
+        AutoregressiveNoise((0.9, 0.9), (0.0, 0.0), balanced=True)

@@ -5,33 +5,16 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from benchmarks.driving.lane_changes import CLASSES, OFFSET, count_completed, find_crossings, measure_steering
+from benchmarks.driving.lane_changes import CLASSES, OFFSET, count_completed, measure_steering
 from rare_envs.sensors.perception import HEADING_COLUMN, SPEED_COLUMN
-from tests.training.imitation.synthetic_scenes import scenes
+from tests.training.imitation.synthetic_scenes import crossing_recording
 from training.imitation.algorithms.expert_pairs import Pairs
-from training.imitation.traffic.recording import stack_scenes
-
-CROSSING = 30
+from training.imitation.traffic.crossings import find_crossings
 
 
 @pytest.fixture
 def recording():
-    """In the second of two scenes the rear vehicle of the left lane moves to the right at 1 m/s from tick 12 on."""
-    made = stack_scenes(scenes(2))
-    y, heading = made.y.clone(), made.heading.clone()
-    tick = torch.arange(y.shape[1])
-    y[:, :, 0], heading[:, :, 0] = 1.8, 0.0
-    y[1, :, 0] = 3.601 + 0.1 * (tick.clamp(12, 48) - CROSSING)
-    heading[1, 12:48, 0] = 0.1 / (0.1 * made.speed[1, 12:48, 0])
-    return made._replace(y=y, heading=torch.asin(heading))
-
-
-def test_a_crossing_is_found_where_it_is(recording):
-    found = find_crossings(recording)
-    assert [column.tolist() for column in found] == [[1], [CROSSING], [0], [1]]
-    y = recording.y.clone()
-    y[1, CROSSING + 4 :, 0] = 1.8
-    assert len(find_crossings(recording._replace(y=y)).scene) == 0  # back again before it has settled
+    return crossing_recording()
 
 
 def test_who_goes_straight_on_completes_it_and_who_turns_back_does_not(recording):

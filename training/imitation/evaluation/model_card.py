@@ -88,6 +88,8 @@ def _drivers_table(drivers: Mapping[str, tuple[LearnedDriver, Provenance]]) -> s
             "noise, coefficients of lag 2": ", ".join(f"{value:.3g}" for value in driver.colour.second),
             "acceleration [m/s^2]": f"{driver.acceleration[0]:g} to {driver.acceleration[1]:g}",
             "yaw rate [rad/s]": f"{driver.yaw_rate[0]:g} to {driver.yaw_rate[1]:g}",
+            "rule of collision avoidance": "no" if driver.avoidance is None else "yes",
+            "lane changes at a hazard rate": "no" if driver.changes is None else "yes",
             "distribution of the weights": "no" if driver.weights is None else "yes",
         }
         for name, (driver, provenance) in drivers.items()

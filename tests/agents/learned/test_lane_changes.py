@@ -1,0 +1,249 @@
+import math
+from dataclasses import replace
+from itertools import pairwise
+
+import pytest
+import torch
+
+from agents import load_driver, read_driver, read_provenance, save_driver
+from agents.learned.adjacent_lanes import LEFT, RIGHT
+from agents.learned.driver import COMFORTABLE
+from agents.learned.lane_changes import STATE_SIZE, ChangeState, LaneChanges, patience_of
+from rare_envs.sensors.perception import HEADING_COLUMN, LANE_OFFSET_COLUMN, SPEED_COLUMN
+from tests.agents.learned.test_collision_avoidance import seen
+
+WIDTH = 3.6
+HAZARD = 0.5
+"""[1/s], to either side."""
+CHANGES = LaneChanges(coefficients=(math.log(HAZARD), 0.0, 0.0, 0.0, 0.0))
+OTHERS = {"range_36": 11.0, "range_m36": 11.0}
+"""Cars two lanes off on either side, so that there are lanes beside, and they are free."""
+
+
+def on_lane(offset=0.0, heading=0.0, speed=20.0, **beams):
+    """Return features of a car on a lane of 3.6 m."""
+    features = seen(speed=speed, **beams)
+    features[..., LANE_OFFSET_COLUMN], features[..., HEADING_COLUMN] = offset, heading
+    features[..., LEFT], features[..., RIGHT] = 0.5 * WIDTH + offset, 0.5 * WIDTH - offset
+    return features
+
+
+def begin(left=9.0, right=9.0, changes=CHANGES):
+    """Return a state with patiences of a left and a right change."""
+    state = changes.begin(torch.zeros(1, 1, 2, dtype=torch.float64))
+    return state._replace(patience=torch.tensor([[[left, right]]], dtype=torch.float64))
+
+
+def drive(state, seconds, changes=CHANGES, speed=20.0, y=0.0, heading=0.0, beams=OTHERS):
+    """Yield time, y from the middle of the first lane, heading and state of a car that steers by changes alone."""
+    for tick in range(round(seconds / 0.1)):
+        lane = round(y / WIDTH)
+        action, state = changes.step(on_lane(y - lane * WIDTH, heading, speed, **beams), state, None)
+        yield 0.1 * tick, y, heading, state
+        y += speed * math.sin(heading) * 0.1
+        heading += 0.1 * float(action.yaw_rate) * bool(action.changing)
+
+
+def test_patience_is_exponentially_distributed():
+    patience = patience_of(torch.randn(200_000, generator=torch.Generator().manual_seed(0)))
+    for q in (0.5, 1.0, 3.0):
+        assert float((patience > q).float().mean()) == pytest.approx(math.exp(-q), abs=5 * 0.5 / math.sqrt(200_000))
+
+
+@pytest.mark.parametrize("side", [-1, 1])
+def test_a_change_begins_when_the_hazard_has_used_up_the_patience(side):
+    state = begin(left=1.0, right=9.0) if side < 0 else begin(left=9.0, right=1.0)
+    started = next(time for time, _, _, state in drive(state, 5.0) if state.side != 0)
+    assert started == pytest.approx(1.0 / HAZARD, abs=0.15)
+    assert int(state.side) == 0
+
+
+def test_the_course_leads_to_the_middle_of_the_next_lane_in_its_time():
+    path = list(drive(begin(right=0.0), 5.0))
+    across = [y for _, y, _, _ in path]
+    changing = [time for time, _, _, state in path if state.side != 0]
+    assert changing[-1] - changing[0] == pytest.approx(CHANGES.duration, abs=0.15)
+    assert across[-1] == pytest.approx(WIDTH, abs=0.15)  # a tick late
+    assert max(across) < WIDTH + 0.05
+    assert path[-1][2] == pytest.approx(0.0, abs=0.003)
+    fast = sum(0.1 for before, after in pairwise(across) if after - before > 0.02)
+    assert fast == pytest.approx(3.4, abs=0.2)  # what people take on US 101, in the median
+
+
+def test_durations_differ_by_the_draw_of_the_moment():
+    """The draw of the other side decides, so that it does not depend on the next patience."""
+    paces = []
+    for draw in (-1.0, 0.0, 1.0):
+        draws = torch.tensor([[[draw, 3.0]]], dtype=torch.float64)
+        _, state = CHANGES.step(on_lane(**OTHERS), begin(right=0.0), draws)
+        paces.append(1.0 / float(state.pace))
+        assert float(state.patience[..., 1]) == pytest.approx(float(patience_of(draws)[..., 1]))
+    assert paces == pytest.approx([CHANGES.duration * math.exp(CHANGES.spread * draw) for draw in (-1, 0, 1)])
+
+
+@pytest.mark.parametrize(
+    ("why", "beams", "speed"),
+    [
+        ("nobody shows that there is a lane", {}, 20.0),
+        ("somebody is beside", OTHERS | {"range_90": 2.6, "range_m90": 2.6}, 20.0),
+        ("somebody ahead there closes fast", OTHERS | {"range_18": 10.0, "rate_18": -8.0, "range_m90": 2.6}, 20.0),
+        ("somebody behind there closes fast", OTHERS | {"range_162": 10.0, "rate_162": -8.0, "range_m90": 2.6}, 20.0),
+        ("it is too slow", OTHERS, 2.0),
+    ],
+)
+def test_no_change_begins_and_no_patience_is_used_if(why, beams, speed):
+    _, _, _, state = list(drive(begin(left=0.1, right=0.1), 3.0, speed=speed, beams=beams))[-1]
+    assert int(state.side) == 0, why
+    assert state.patience.flatten().tolist() == [0.1, 0.1], why
+
+
+def test_a_lane_is_remembered_for_a_while():
+    _, state = CHANGES.step(on_lane(**OTHERS), begin(left=99.0, right=99.0), None)
+    waited = [float(state.patience[..., 1]) for _, _, _, state in drive(state, 15.0, beams={})]
+    assert waited[-1] == pytest.approx(99.0 - HAZARD * CHANGES.remembered, abs=2 * HAZARD * 0.1)
+
+
+def test_a_change_is_given_up_before_the_line_and_not_behind_it():
+    for tick, goes_on in ((8, False), (25, True)):
+        *_, (_, y, heading, state) = list(drive(begin(right=0.0), 0.1 * tick))
+        assert bool(state.crossed) == goes_on
+        lane = round(y / WIDTH)
+        blocked = on_lane(y - lane * WIDTH, heading, range_90=2.6, **OTHERS)
+        _, state = CHANGES.step(blocked, state, None)
+        assert bool(state.side == 1) == goes_on
+
+
+def test_whoever_is_ahead_in_the_new_lane_is_kept_off_until_the_line():
+    ahead = {"range_18": 13.0, "rate_18": -1.0} | {"range_m36": 11.0}
+    action, state = CHANGES.step(on_lane(**ahead), begin(right=0.0), None)
+    assert bool(action.follows)
+    assert float(action.gap) == pytest.approx(13.0 * math.cos(math.radians(18)) - 2.5)
+    assert float(action.closing) == pytest.approx(1.0 / math.cos(math.radians(18)))
+    action, _ = CHANGES.step(on_lane(-1.7, **ahead), state._replace(offset=state.offset + 1.7), None)
+    assert not bool(action.follows)
+
+
+def test_a_change_under_way_at_the_first_moment_is_taken_up():
+    path = list(drive(begin(), 4.0, y=0.8, heading=0.8 / 20.0))
+    assert all(int(state.side) == 1 for _, _, _, state in path[:10])
+    assert path[-1][1] == pytest.approx(WIDTH, abs=0.15)
+    late = list(drive(begin(), 0.3, y=0.0, heading=0.0))[-1][3]
+    moving, _ = CHANGES.step(on_lane(0.8, 0.8 / 20.0, **OTHERS), late, None)
+    assert not bool(moving.changing)  # at the first moment only: later it may be the noise
+
+
+def test_nobody_is_taken_to_change_over_the_edge_of_the_road():
+    leftmost = {"range_36": 11.0}
+    _, state = CHANGES.step(on_lane(-0.8, -0.8 / 20.0, **leftmost), begin(), None)
+    assert int(state.side) == 0
+    _, state = CHANGES.step(on_lane(-0.8, -0.8 / 20.0, **OTHERS), begin(), None)
+    assert int(state.side) == -1
+
+
+def test_behind_a_line_the_lane_that_was_left_is_known_and_the_other_side_is_not():
+    _, state = CHANGES.step(on_lane(1.7, **OTHERS), begin(), None)
+    _, state = CHANGES.step(on_lane(-1.8), state, None)  # drifted over the line to the right
+    assert state.unseen.flatten().tolist() == [0.0, math.inf]
+
+
+def test_gradients_are_those_of_finite_differences():
+    driver = replace(load_driver("mgail3"), changes=CHANGES, policy=load_driver("mgail3").policy.double())
+    state = begin(right=0.0)
+    for tick in range(12):
+        y = 0.02 * tick
+        _, state = CHANGES.step(on_lane(y, 0.01, **OTHERS), state, None)
+    changing = torch.cat((torch.zeros(1, 1, 4, dtype=torch.float64), state.pack()), dim=-1)
+    fresh = torch.cat((torch.zeros(1, 1, 4, dtype=torch.float64), begin().pack()), dim=-1)
+    none = torch.zeros(1, 1, 2, dtype=torch.float64)
+    cases = (
+        (on_lane(0.25, 0.012, range_18=12.0, rate_18=-1.0, **OTHERS), changing),
+        (on_lane(0.8, 0.05, **OTHERS), fresh),
+        (on_lane(0.0, 0.0, **OTHERS), fresh),
+    )
+    for features, memory in cases:
+        act = lambda values, memory=memory: driver.act(values, None, none, memory)[0]  # noqa: E731
+        assert torch.autograd.gradcheck(act, features.requires_grad_(), atol=1e-4)
+
+
+def test_states_are_packed_and_unpacked():
+    memory = torch.randn(2, 3, STATE_SIZE)
+    assert torch.equal(ChangeState.unpack(memory).pack(), memory)
+
+
+@pytest.mark.parametrize("value", [0.0, -1.0, math.nan, math.inf, True, "2"])
+def test_settings_are_positive_numbers(value):
+    with pytest.raises(ValueError, match="Expected duration of the lane changes above 0"):
+        LaneChanges(duration=value)
+
+
+@pytest.mark.parametrize("coefficients", [(1.0, 2.0), (0.0, 0.0, 0.0, 0.0, math.nan)])
+def test_there_is_a_finite_coefficient_of_each_covariate(coefficients):
+    with pytest.raises(ValueError, match="Expected 5 finite coefficients of the hazard"):
+        LaneChanges(coefficients=coefficients)
+
+
+# --- the driver ----------------------------------------------------------------------------------
+
+
+def test_a_driver_with_lane_changes_keeps_them_in_its_memory():
+    driver = load_driver("mgail3")
+    generator = torch.Generator().manual_seed(0)
+    memory = driver.begin(torch.randn(2, 3, 2, 2, generator=generator))
+    assert memory.shape == (2, 3, 4 + STATE_SIZE)
+    features = on_lane(**OTHERS).float().expand(2, 3, -1)
+    one = driver.act(features, None, torch.zeros(2, 3, 2), memory)
+    again = driver.act(features, None, torch.zeros(2, 3, 2), memory)
+    assert torch.equal(one[0], again[0]) and torch.equal(one[1], again[1])
+    with pytest.raises(ValueError, match=r"Expected memory of shape \(2, 3, 14\)"):
+        driver.act(features, None, torch.zeros(2, 3, 2), memory[..., :4])
+
+
+def test_a_ripe_driver_steers_into_the_next_lane_and_keeps_off_whoever_is_ahead_there():
+    driver, draws = load_driver("mgail3"), torch.zeros(1, 1, 2, 2)
+    draws[..., 1, 1] = 8.0  # no patience for a change to the right
+    free, ahead = (
+        on_lane(**beams).float() for beams in (OTHERS, {"range_18": 10.0, "rate_18": -2.0, "range_m36": 11.0})
+    )
+    none = torch.zeros(1, 1, 2)
+    (action, memory), (behind, _) = (driver.act(each, None, none, driver.begin(draws)) for each in (free, ahead))
+    assert float(action[..., 1]) > 0.05
+    assert ChangeState.unpack(memory[..., 4:]).side.item() == 1.0
+    assert float(behind[..., 0]) == pytest.approx(-2.0)
+    assert float(action[..., 0]) > -1.0
+
+
+def test_hard_braking_is_eased_but_for_the_rule():
+    plain = replace(load_driver("mgail2"), avoidance=None)
+    features = on_lane(range_0=9.0, rate_0=-9.0).float()
+    own = float(plain.act(features)[0][..., 0])
+    assert own < -COMFORTABLE
+    eased = float(replace(plain, hard_braking=0.7).act(features)[0][..., 0])
+    assert eased == pytest.approx(-COMFORTABLE + 0.7 * (own + COMFORTABLE))
+    assert float(load_driver("mgail3").act(features)[0][..., 0]) == pytest.approx(-(9.0**2) / (2.0 * 6.0))
+    with pytest.raises(ValueError, match=r"Expected a share of hard braking in \(0, 1\], got 0"):
+        replace(plain, hard_braking=0.0)
+
+
+def test_lane_changes_need_the_rule_and_are_not_compiled():
+    driver = load_driver("mgail3")
+    assert driver.dense_driver() is None
+    assert replace(driver, changes=None).dense_driver() is None
+    assert replace(driver, changes=None, hard_braking=1.0).dense_driver() is not None
+    with pytest.raises(ValueError, match="Expected a rule of collision avoidance beside the lane changes"):
+        replace(driver, avoidance=None)
+
+
+def test_lane_changes_are_read_from_the_file(tmp_path):
+    driver = replace(load_driver("mgail3"), changes=CHANGES, hard_braking=0.9)
+    path = save_driver(driver, read_provenance("agents/data/mgail3.safetensors"), tmp_path / "mine.safetensors")
+    read = read_driver(path)
+    assert (read.changes, read.hard_braking, read.colour) == (CHANGES, 0.9, driver.colour)
+    assert read.colour.balanced
+
+
+def test_speed_and_heading_decide_who_is_slow():
+    """Below 5 m/s the course takes longer, as the car can go across only as fast as it goes along."""
+    _, slow = CHANGES.step(on_lane(speed=4.0, **OTHERS), begin(right=0.0), None)
+    _, fast = CHANGES.step(on_lane(speed=20.0, **OTHERS), begin(right=0.0), None)
+    assert float(slow.share) == pytest.approx(0.8 * float(fast.share))
+    assert on_lane(speed=4.0)[..., SPEED_COLUMN].item() == 4.0
