@@ -171,7 +171,7 @@ def read_driver(path: str | PathLike[str]) -> LearnedDriver:
     try:
         return LearnedDriver(
             policy,
-            colour=_colour(header["colour"]),
+            colour=AutoregressiveNoise.from_json(header["colour"]),
             acceleration=header["acceleration"],
             yaw_rate=header["yaw_rate"],
             weights=_weights(tensors, header["radius"], path),
@@ -291,14 +291,6 @@ def _policy(tensors: Mapping[str, Tensor], path: Path) -> Policy:
         check_tensor(_POLICY + name, value, tuple(expected[name].shape), torch.float32, path)
     policy.load_state_dict(state, assign=True)
     return policy.eval().requires_grad_(False)
-
-
-def _colour(header: Mapping[str, Any]) -> AutoregressiveNoise:
-    return AutoregressiveNoise(
-        tuple(header["first"]),
-        tuple(header["second"]),
-        header.get("balanced", False),  # earlier files have no third
-    )
 
 
 def _weights(tensors: Mapping[str, Tensor], radius: Any, path: Path) -> WeightDistribution | None:

@@ -6,7 +6,9 @@ first-order noise of the same smoothness makes a car wander off, because nothing
 """
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -59,6 +61,11 @@ class AutoregressiveNoise:
         first = tuple(2.0 * r * math.cos(w * dt) for r, w in zip(decay, frequency, strict=True))
         second = tuple(-r * r for r in decay)
         return cls((first[0], first[1]), (second[0], second[1]))
+
+    @classmethod
+    def from_json(cls, values: Mapping[str, Any]) -> "AutoregressiveNoise":
+        """Return the noise whose fields were written as JSON, which has lists for tuples."""
+        return cls(**{name: tuple(value) if isinstance(value, list) else value for name, value in values.items()})
 
     @property
     def scale(self) -> tuple[float, float]:

@@ -152,7 +152,7 @@ class LearnedDriver:
         """Return the memory of the noise, (B, M, 2, 2), and that of the lane changes."""
         if memory is None or self.changes is None:
             return memory, None
-        swings = memory[..., : 2 * ACTION_SIZE].unflatten(-1, (ACTION_SIZE, 2))
+        swings = memory[..., : 2 * ACTION_SIZE].reshape(*memory.shape[:-1], ACTION_SIZE, 2)
         return swings, ChangeState.unpack(memory[..., 2 * ACTION_SIZE :])
 
     def _ease_braking(self, action: Tensor) -> Tensor:

@@ -66,6 +66,7 @@ def measure_all(
     drivers: dict[str, LearnedDriver],
     effort: Effort,
     say: Callable[[str], None] = lambda text: None,
+    weights: bool = True,
 ) -> dict[str, Any]:
     """Return everything that is measured, ready for JSON.
 
@@ -75,6 +76,7 @@ def measure_all(
         drivers: Drivers by name.
         effort: Amount of simulation.
         say: Function that is called with the name of each measurement.
+        weights: Whether policies with drawn and moved weights are measured too.
     """
     judge = Judge(test, record_statistics(test), effort)
     features = collect_pairs(test).features
@@ -91,7 +93,7 @@ def measure_all(
         rows.append(judge.row(name, "driver", noisy_drivers(driver, effort.noises)))
         errors[name] = measure_errors(test, noisy_drivers(driver, 1)[0], effort)
         highways.append(measure_on_highway(name, noisy_drivers(driver, 1)[0], judge))
-        if driver.weights is not None:
+        if weights and driver.weights is not None:
             say(f"{name}, weights drawn and moved")
             rows += [measure_drawn(name, driver, judge), *measure_boxes(name, driver, features, judge)]
     return {
@@ -125,6 +127,7 @@ def main(
     noises: Annotated[int, typer.Option(help="Sequences of noise of each driver.")] = Effort.noises,
     draws: Annotated[int, typer.Option(help="Policies drawn from distributions and boxes.")] = Effort.draws,
     rollouts: Annotated[int, typer.Option(help="Of each segment among recorded others.")] = Effort.rollouts,
+    weights: Annotated[bool, typer.Option(help="Measure drawn and moved weights too.")] = True,
 ) -> None:
     """Measure how human drivers are, and draw it."""
     begun = time.perf_counter()
@@ -132,7 +135,12 @@ def main(
     train, test = (stack_scenes(scenes) for scenes in load_scenes(Source("data", data)))
     chosen = load_named(drivers or ["mgail", "gail", "bc"])
     found = measure_all(
-        train, test, chosen, effort, lambda text: print(f"{time.perf_counter() - begun:5.0f} s  {text}", flush=True)
+        train,
+        test,
+        chosen,
+        effort,
+        lambda text: print(f"{time.perf_counter() - begun:5.0f} s  {text}", flush=True),
+        weights,
     )
     found["about"] = about(torch=torch.__version__, **asdict(effort), seconds=round(time.perf_counter() - begun))
     out.mkdir(parents=True, exist_ok=True)

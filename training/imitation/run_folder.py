@@ -152,7 +152,7 @@ def read_training_settings(folder: Path) -> tuple[Source, Config]:
         raise ValueError(f"Expected a training in {str(folder)!r}, but there is no {SETTINGS_FILE}.")
     noted = json.loads(path.read_text(encoding="utf-8"))
     source, config = noted["source"], {name: _tuples(value) for name, value in noted["config"].items()}
-    config["colour"] = AutoregressiveNoise(**{name: tuple(value) for name, value in noted["config"]["colour"].items()})
+    config["colour"] = AutoregressiveNoise.from_json(noted["config"]["colour"])
     return replace(
         Source(source["kind"], Path(source["path"])),
         **{name: _tuples(source[name]) for name in ("location", "recordings", "seconds")},

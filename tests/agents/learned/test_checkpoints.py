@@ -82,7 +82,7 @@ def test_the_header_says_what_decides_how_it_drives(file):
     with safe_open(file, framework="pt") as opened:
         header = json.loads(opened.metadata()["driver"])
     assert len(header["features"]) == 51 and header["features"][0] == "lane_offset"
-    assert header["colour"] == {"first": [0.95, 0.9], "second": [0.0, 0.0]}
+    assert header["colour"] == {"first": [0.95, 0.9], "second": [0.0, 0.0], "balanced": False}
     assert header["log_std_cap"] == pytest.approx(-0.2)
     assert (header["acceleration"], header["yaw_rate"]) == ([-7.0, 3.5], [-0.25, 0.3])
     assert header["command"] == PROVENANCE.command and header["data_licence"] == "CC BY-SA 3.0"
