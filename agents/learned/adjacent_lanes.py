@@ -15,7 +15,9 @@ from torch import Tensor
 from rare_envs.sensors.lidar import MAX_RANGE, beam_angles
 from rare_envs.sensors.perception import FEATURES, HEADING_COLUMN, RANGE_COLUMNS, RATE_COLUMNS
 
-LENGTH, LEFT, RIGHT = (FEATURES.index(name) for name in ("length", "left_marker", "right_marker"))
+LENGTH_COLUMN, LEFT_MARKER_COLUMN, RIGHT_MARKER_COLUMN = (
+    FEATURES.index(name) for name in ("length", "left_marker", "right_marker")
+)
 _OVERLAP = 0.3
 """A point counts to the next lane if it is no further than this before its line [m]: bodies stand near the line too."""
 _BEYOND = 0.25
@@ -43,7 +45,8 @@ def look_aside(features: Tensor) -> AdjacentLanes:
 
     Example:
         >>> features = torch.zeros(51)
-        >>> features[RANGE_COLUMNS], features[LENGTH], features[LEFT], features[RIGHT] = MAX_RANGE, 5.0, 1.8, 1.8
+        >>> features[RANGE_COLUMNS], features[LENGTH_COLUMN] = MAX_RANGE, 5.0
+        >>> features[LEFT_MARKER_COLUMN] = features[RIGHT_MARKER_COLUMN] = 1.8
         >>> features[FEATURES.index("range_18")], features[FEATURES.index("rate_18")] = 10.0, -1.902
         >>> seen = look_aside(features)
         >>> [round(value, 2) for value in seen.lead_gap.tolist()], round(seen.lead_closing[1].item(), 2)
@@ -55,14 +58,14 @@ def look_aside(features: Tensor) -> AdjacentLanes:
     angle = beams + features[..., HEADING_COLUMN, None, None]
     side = features.new_tensor((-1.0, 1.0))[:, None]
     along, across = ranges * torch.cos(angle), side * ranges * torch.sin(angle)
-    line = torch.stack((features[..., LEFT], features[..., RIGHT]), dim=-1)[..., None]
-    width = (features[..., LEFT] + features[..., RIGHT])[..., None, None]
+    line = torch.stack((features[..., LEFT_MARKER_COLUMN], features[..., RIGHT_MARKER_COLUMN]), dim=-1)[..., None]
+    width = (features[..., LEFT_MARKER_COLUMN] + features[..., RIGHT_MARKER_COLUMN])[..., None, None]
     met = ranges < MAX_RANGE
     inside = met & (across > line - _OVERLAP) & (across < line + width)
     cos = torch.cos(beams)
     known = cos.abs() > _ALONG
     rate = torch.where(known, features[..., None, RATE_COLUMNS] / torch.where(known, cos, 1.0), 0.0).expand_as(across)
-    half = 0.5 * features[..., LENGTH, None, None]
+    half = 0.5 * features[..., LENGTH_COLUMN, None, None]
     lead = torch.where(inside & (along > 0.0), along - half, torch.inf).min(dim=-1)
     lag = torch.where(inside & (along <= 0.0), -along - half, torch.inf).min(dim=-1)
     lead_rate, lag_rate = (rate.gather(-1, each.indices[..., None])[..., 0] for each in (lead, lag))

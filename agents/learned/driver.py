@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 
     from rare_envs.simulation.episode import Episode
 
-COMFORTABLE = 2.0
+EASED_BEYOND = 2.0
 """Deceleration [m/s^2] that is comfortable, as in `CollisionAvoidance`."""
 
 
@@ -77,7 +77,7 @@ class LearnedDriver:
     avoidance: CollisionAvoidance | None = None
     """Rule that bounds the actions; None for the network's own."""
     hard_braking: float = 1.0
-    """Share of what the network brakes beyond `COMFORTABLE` that it is given; the rule brakes as it has to."""
+    """Share of what the network brakes beyond `EASED_BEYOND` that it is given; the rule brakes as it has to."""
     changes: LaneChanges | None = None
     """Lane changes, which need the rule; None for those of the network."""
     noisy: ClassVar[bool] = True
@@ -156,11 +156,11 @@ class LearnedDriver:
         return swings, ChangeState.unpack(memory[..., 2 * ACTION_SIZE :])
 
     def _ease_braking(self, action: Tensor) -> Tensor:
-        """Return actions with a share of the braking beyond `COMFORTABLE`."""
+        """Return actions with a share of the braking beyond `EASED_BEYOND`."""
         if self.hard_braking == 1.0:
             return action
         acceleration, yaw_rate = action.unbind(dim=-1)
-        eased = torch.maximum(acceleration, self.hard_braking * (acceleration + COMFORTABLE) - COMFORTABLE)
+        eased = torch.maximum(acceleration, self.hard_braking * (acceleration + EASED_BEYOND) - EASED_BEYOND)
         return torch.stack((eased, yaw_rate), dim=-1)
 
     def _change_lanes(

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from agents.learned.adjacent_lanes import LEFT, RIGHT, AdjacentLanes, look_aside
+from agents.learned.adjacent_lanes import LEFT_MARKER_COLUMN, RIGHT_MARKER_COLUMN, AdjacentLanes, look_aside
 from rare_envs.sensors.lidar import AHEAD_BEAM, MAX_RANGE
 from rare_envs.sensors.perception import (
     FEATURES,
@@ -219,7 +219,7 @@ class LaneChanges:
         """Return the state with what is known of the lanes beside, also where a line was crossed."""
         offset = features[..., LANE_OFFSET_COLUMN]
         moved = torch.where(state.share == _BEGUN, 0.0, state.offset - offset)  # about a lane's width across a line
-        crossed = moved.abs() > 0.5 * (features[..., LEFT] + features[..., RIGHT])
+        crossed = moved.abs() > 0.5 * (features[..., LEFT_MARKER_COLUMN] + features[..., RIGHT_MARKER_COLUMN])
         came_from = torch.stack((moved > 0.0, moved < 0.0), dim=-1)  # to the right of the lane that it left
         unseen = torch.where(crossed[..., None], torch.where(came_from, 0.0, torch.inf), state.unseen + LEARNED_TICK)
         return state._replace(
@@ -232,7 +232,7 @@ class LaneChanges:
         """Return the state with changes that were under way at the first moment."""
         first = state.share == _BEGUN
         across = features[..., SPEED_COLUMN] * torch.sin(features[..., HEADING_COLUMN])
-        side, width = across.sign(), features[..., LEFT] + features[..., RIGHT]
+        side, width = across.sign(), features[..., LEFT_MARKER_COLUMN] + features[..., RIGHT_MARKER_COLUMN]
         offset = side * features[..., LANE_OFFSET_COLUMN]
         crosses = offset + self.foresight * across.abs() > 0.5 * width
         on_line = offset + 0.5 * features[..., _WIDTH] > 0.5 * width + _OVER_LINE
@@ -309,7 +309,7 @@ def patience_of(draws: Tensor) -> Tensor:
 
 def _distance_left(features: Tensor, state: ChangeState) -> Tensor:
     """Return the distance across to the middle of the new lane [m], shape (B, M); lanes are taken as equally wide."""
-    width = features[..., LEFT] + features[..., RIGHT]
+    width = features[..., LEFT_MARKER_COLUMN] + features[..., RIGHT_MARKER_COLUMN]
     return width * (1.0 - state.crossed) - state.side * features[..., LANE_OFFSET_COLUMN]
 
 

@@ -36,7 +36,7 @@ from training.imitation.traffic.replayed_traffic import lane_of, replay_features
 BEFORE = 1.4
 """Median of the time from the beginning of a change to its crossing, in the scenes learned from [s]."""
 AROUND = (4.0, 3.0)
-"""Moments this long before or after a crossing are not among the others [s]."""
+"""ChangeMoments this long before or after a crossing are not among the others [s]."""
 EVERY = 5
 """Of the other moments every so many-th tick is used."""
 PENALTY = 1.0
@@ -47,8 +47,8 @@ HARD_BRAKING = 0.7
 """With .7 the rate of hard brakes is .0005 in the scenes learned from, people's .0006."""
 
 
-class Moments(NamedTuple):
-    """Moments of n vehicles and either side, from the scenes."""
+class ChangeMoments(NamedTuple):
+    """ChangeMoments of n vehicles and either side, from the scenes."""
 
     covariates: Tensor
     """Shape (n, 2, 5)."""
@@ -60,7 +60,7 @@ class Moments(NamedTuple):
     """Whether no crossing is near, shape (n,)."""
 
 
-def collect_moments(recording: Recording, changes: LaneChanges) -> Moments:
+def collect_moments(recording: Recording, changes: LaneChanges) -> ChangeMoments:
     """Return all moments in which a change begins, and some of the others."""
     scenes, ticks, vehicles = recording.x.shape
     begins = torch.zeros(scenes, ticks, vehicles, 2, dtype=torch.bool)
@@ -86,7 +86,7 @@ def collect_moments(recording: Recording, changes: LaneChanges) -> Moments:
         exists = torch.stack((lane > 0, lane < last), dim=-1)[chosen]
         may = changes.may_begin(features, lanes) & exists
         rows.append((changes.covariates(features, lanes), may, event[chosen], free[chosen]))
-    return Moments(*(torch.cat(column) for column in zip(*rows, strict=True)))
+    return ChangeMoments(*(torch.cat(column) for column in zip(*rows, strict=True)))
 
 
 def fit_logistic(inputs: Tensor, outcome: Tensor, penalty: float = PENALTY) -> Tensor:
@@ -113,7 +113,7 @@ def fit_logistic(inputs: Tensor, outcome: Tensor, penalty: float = PENALTY) -> T
     return out
 
 
-def fit_hazard(moments: Moments) -> tuple[float, ...]:
+def fit_hazard(moments: ChangeMoments) -> tuple[float, ...]:
     """Return the coefficients of the hazard [1/s], whose mean over the other moments is that of `RATES`."""
     (fast, seldom), (slow, often) = RATES
     fall = math.log(seldom / often) / (fast - slow)
@@ -137,7 +137,7 @@ def add_changes(
     return replace(driver, colour=colour, hard_braking=hard_braking, changes=changes, name=name)
 
 
-def write_driver(
+def write_changing_driver(
     of: str, coefficients: tuple[float, ...], damping: float, hard_braking: float, test: Recording, out: Path
 ) -> Path:
     """Write a driver with lane changes, measured in the test scenes.
@@ -175,7 +175,7 @@ def main(
         coefficients = fit_hazard(moments)
         fitted = ", ".join(f"{name} {value:g}" for name, value in zip(COVARIATES, coefficients, strict=True))
         print(f"Hazard from {int((moments.begins & moments.open).sum())} changes: {fitted}.")
-        print(f"Saved {write_driver(driver, coefficients, damping, hard_braking, test, out)}.")
+        print(f"Saved {write_changing_driver(driver, coefficients, damping, hard_braking, test, out)}.")
 
 
 if __name__ == "__main__":

@@ -3,7 +3,7 @@ import math
 import pytest
 import torch
 
-from agents.learned.adjacent_lanes import LEFT, RIGHT, look_aside
+from agents.learned.adjacent_lanes import LEFT_MARKER_COLUMN, RIGHT_MARKER_COLUMN, look_aside
 from rare_envs.sensors.lidar import Bodies
 from rare_envs.sensors.perception import HEADING_COLUMN, LANE_OFFSET_COLUMN, OnRoad, perceive
 from tests.agents.learned.test_collision_avoidance import seen
@@ -52,7 +52,11 @@ def test_beams_are_turned_with_the_vehicle():
 
 def test_gradients_are_those_of_finite_differences():
     features = seen(range_18=9.0, rate_18=-1.0, range_m144=7.0, rate_m144=-2.0, range_90=8.0)
-    features[..., LEFT], features[..., RIGHT], features[..., LANE_OFFSET_COLUMN] = 1.9, 1.7, 0.1
+    features[..., LEFT_MARKER_COLUMN], features[..., RIGHT_MARKER_COLUMN], features[..., LANE_OFFSET_COLUMN] = (
+        1.9,
+        1.7,
+        0.1,
+    )
     features[..., HEADING_COLUMN] = 0.02
 
     def finite(values):

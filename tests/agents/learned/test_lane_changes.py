@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from agents import load_driver, read_driver, read_provenance, save_driver
-from agents.learned.adjacent_lanes import LEFT, RIGHT
-from agents.learned.driver import COMFORTABLE
+from agents.learned.adjacent_lanes import LEFT_MARKER_COLUMN, RIGHT_MARKER_COLUMN
+from agents.learned.driver import EASED_BEYOND
 from agents.learned.lane_changes import STATE_SIZE, ChangeState, LaneChanges, patience_of
 from rare_envs.sensors.perception import HEADING_COLUMN, LANE_OFFSET_COLUMN
 from tests.agents.learned.test_collision_avoidance import seen
@@ -24,7 +24,7 @@ def on_lane(offset=0.0, heading=0.0, speed=20.0, **beams):
     """Return features of a car on a lane of 3.6 m."""
     features = seen(speed=speed, **beams)
     features[..., LANE_OFFSET_COLUMN], features[..., HEADING_COLUMN] = offset, heading
-    features[..., LEFT], features[..., RIGHT] = 0.5 * WIDTH + offset, 0.5 * WIDTH - offset
+    features[..., LEFT_MARKER_COLUMN], features[..., RIGHT_MARKER_COLUMN] = 0.5 * WIDTH + offset, 0.5 * WIDTH - offset
     return features
 
 
@@ -216,9 +216,9 @@ def test_hard_braking_is_eased_but_for_the_rule():
     plain = replace(load_driver("mgail2"), avoidance=None)
     features = on_lane(range_0=9.0, rate_0=-9.0).float()
     own = float(plain.act(features)[0][..., 0])
-    assert own < -COMFORTABLE
+    assert own < -EASED_BEYOND
     eased = float(replace(plain, hard_braking=0.7).act(features)[0][..., 0])
-    assert eased == pytest.approx(-COMFORTABLE + 0.7 * (own + COMFORTABLE))
+    assert eased == pytest.approx(-EASED_BEYOND + 0.7 * (own + EASED_BEYOND))
     assert float(load_driver("mgail3").act(features)[0][..., 0]) == pytest.approx(-(9.0**2) / (2.0 * 6.0))
     with pytest.raises(ValueError, match=r"Expected a share of hard braking in \(0, 1\], got 0"):
         replace(plain, hard_braking=0.0)

@@ -10,12 +10,12 @@ from tests.training.imitation.synthetic_scenes import CROSSING, crossing_recordi
 from training.imitation.lane_changes import (
     BEFORE,
     RATES,
-    Moments,
+    ChangeMoments,
     add_changes,
     collect_moments,
     fit_hazard,
     fit_logistic,
-    write_driver,
+    write_changing_driver,
 )
 
 
@@ -49,7 +49,7 @@ def test_the_mean_hazard_is_that_of_complete_recordings():
     covariates[..., 4] = speeds.repeat_interleave(2).repeat(n // 4)[:, None] - 10.0
     begins = torch.zeros(n, 2, dtype=torch.bool)
     begins[::40], begins[1::80] = True, True
-    moments = Moments(covariates, torch.ones(n, 2, dtype=torch.bool), begins, ~begins.any(dim=1))
+    moments = ChangeMoments(covariates, torch.ones(n, 2, dtype=torch.bool), begins, ~begins.any(dim=1))
     coefficients = torch.tensor(fit_hazard(moments))
     assert float(coefficients[2]) == pytest.approx(math.log(2.0), abs=0.15)
     hazard = (covariates @ coefficients).exp().sum(dim=1)[moments.other]
@@ -61,7 +61,7 @@ def test_the_mean_hazard_is_that_of_complete_recordings():
 def test_a_driver_gets_lane_changes_and_balanced_noise(tmp_path):
     recording = crossing_recording()
     coefficients = (-5.0, -1.0, 0.1, 0.0, -0.1)
-    out = write_driver("mgail2", coefficients, 0.2, 0.8, recording, tmp_path / "changing.safetensors")
+    out = write_changing_driver("mgail2", coefficients, 0.2, 0.8, recording, tmp_path / "changing.safetensors")
     made, plain = read_driver(out), load_driver("mgail2")
     assert made.name == "changing"
     assert made.changes == LaneChanges(coefficients=coefficients)
@@ -85,4 +85,4 @@ def test_the_shipped_driver_is_mgail2_with_lane_changes():
 
 def test_a_rule_alone_is_refused(tmp_path):
     with pytest.raises(ValueError, match="Expected a learned driver, got the rule 'idm'"):
-        write_driver("idm", (0.0,) * 5, 0.2, 0.7, None, tmp_path / "changing.safetensors")
+        write_changing_driver("idm", (0.0,) * 5, 0.2, 0.7, None, tmp_path / "changing.safetensors")

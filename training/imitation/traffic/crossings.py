@@ -8,7 +8,7 @@ from torch import Tensor
 from training.imitation.traffic.recording import Recording
 from training.imitation.traffic.replayed_traffic import lane_of
 
-SETTLED = 10
+SETTLED_TICKS = 10
 """Ticks that a vehicle is in one lane on either side of a crossing, at least."""
 
 
@@ -24,13 +24,13 @@ class Crossings(NamedTuple):
 
 
 def find_crossings(recording: Recording) -> Crossings:
-    """Return changes of lane with `SETTLED` ticks in one lane on either side."""
+    """Return changes of lane with `SETTLED_TICKS` ticks in one lane on either side."""
     ticks = recording.x.shape[1]
     lane = torch.stack([lane_of(recording.y[:, tick], recording.edges) for tick in range(ticks)], dim=1)
     lane = torch.where(recording.present, lane, -1)
     found = []
-    for tick in range(SETTLED, ticks - SETTLED + 1):
-        before, after = lane[:, tick - SETTLED : tick], lane[:, tick : tick + SETTLED]
+    for tick in range(SETTLED_TICKS, ticks - SETTLED_TICKS + 1):
+        before, after = lane[:, tick - SETTLED_TICKS : tick], lane[:, tick : tick + SETTLED_TICKS]
         settled = (before == before[:, -1:]).all(dim=1) & (after == after[:, :1]).all(dim=1)
         crossed = settled & (before[:, -1] >= 0) & (after[:, 0] >= 0) & (before[:, -1] != after[:, 0])
         scene, vehicle = crossed.nonzero(as_tuple=True)

@@ -1,6 +1,6 @@
 """How and where do drivers change lanes, beside the people of the same scenes?
 
-    python -m benchmarks.driving.changes_made DATA [DRIVER ...] [--test] [--json FILE]
+    python -m benchmarks.driving.flow.changes_made DATA [DRIVER ...] [--test] [--json FILE]
 
 DATA is the folder with the tables of US 101; drivers are files or the names of shipped ones. All vehicles are driven
 for 20 s from every 2 s of every scene, all scenes or with `--test` those that nobody learned from. A change counts if
@@ -209,7 +209,7 @@ def main(
         found[name]["under_way"] = share_completed(scenes, acts)
         print(name, json.dumps(round_numbers(found[name])), flush=True)
     about_run = about(
-        torch=torch.__version__, command="python -m benchmarks.driving.changes_made DATA" + " --test" * in_test
+        torch=torch.__version__, command="python -m benchmarks.driving.flow.changes_made DATA" + " --test" * in_test
     )
     result.write_text(json.dumps(round_numbers({**found, "about": about_run}), indent=1) + "\n", "utf-8")
 

@@ -3,7 +3,7 @@ import math
 import pytest
 import torch
 
-from benchmarks.driving.changes_made import (
+from benchmarks.driving.flow.changes_made import (
     QUANTITIES,
     describe_changes,
     drive_as_recording,
