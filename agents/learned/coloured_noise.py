@@ -65,7 +65,8 @@ class AutoregressiveNoise:
     @classmethod
     def from_json(cls, values: Mapping[str, Any]) -> "AutoregressiveNoise":
         """Return the noise whose fields were written as JSON, which has lists for tuples."""
-        return cls(**{name: tuple(value) if isinstance(value, list) else value for name, value in values.items()})
+        fields: dict[str, Any] = {name: tuple(v) if isinstance(v, list) else v for name, v in values.items()}
+        return cls(**fields)
 
     @property
     def scale(self) -> tuple[float, float]:
