@@ -58,7 +58,7 @@ def build_proposal(
     weights = start / start.sum()
     if not state.rounds or len(history.u) == 0:
         return MixtureProposal(candidates, weights)
-    floors = _set_floors(state, candidates, settings, radial=state.dim <= settings.radial_dim, final=final)
+    floors = _set_floors(state, history, candidates, settings, radial=state.dim <= settings.radial_dim, final=final)
     u, log_w = _smooth_indicators(history, state.gamma, settings) if state.noisy else (history.u, history.log_weights)
     log_r = log_ratios([candidate.component for candidate in candidates], u)
     weights = minimise_second_moment(log_r, log_w, weights, floors, mixture.weights)
@@ -175,20 +175,34 @@ def _fit_half_space_components(
     return [ProposalComponent(half_space, "half-space") for half_space in half_spaces]
 
 
+def _share_among_regions(state: RefinementState, history: MultipleImportanceSample) -> FloatArray:
+    """Return shares of the regions, shape (m,): as the roots of their weighted failures, by the densest Gaussian there.
+
+    The roots lie between equal shares, which many small regions would spend, and the failures' own.
+    """
+    regions = np.array([explored.region for explored in state.explored])
+    u, weights = _weighted_failures(state, history)
+    nearest = regions[log_ratios(state.gaussians, u).argmax(axis=0)]
+    roots = np.sqrt(np.bincount(nearest, weights=weights, minlength=len(state.regions)))
+    return np.asarray(roots / roots.sum())
+
+
 def _set_floors(
     state: RefinementState,
+    history: MultipleImportanceSample,
     candidates: list[ProposalComponent],
     settings: RefinementSettings,
     *,
     radial: bool,
     final: bool,
 ) -> list[Floor]:
-    """Return the least shares: of tempered Gaussians, spread and radial components, each region and base draws.
+    """Return the least shares: of each region and its tempered Gaussians, spread and radial components and base draws.
 
     They add up to 1 at most: base draws keep theirs, which bounds all weights, the others are lowered in proportion.
 
     Args:
         state: What is known of the regions.
+        history: All draws so far.
         candidates: All components.
         settings: The shares.
         radial: Whether there are few enough dimensions for radial components to reach a place off the regions.
@@ -196,11 +210,13 @@ def _set_floors(
     """
     kinds = np.array([candidate.kind for candidate in candidates])
     regions = np.array([candidate.region for candidate in candidates])
-    tempered = settings.tempered_share + settings.extra_tempered_share * (1 - state.hit_rate)
-    floors = [Floor(kinds == "tempered", settings.noisy_tempered_share if state.noisy else tempered)]
-    if state.rounds and state.rounds[-1].worth(state.gamma) < settings.good_rate:
+    spread = state.scattered and state.within is not None
+    extra = 0.0 if spread else settings.extra_tempered_share * (1 - state.hit_rate)
+    tempered = settings.noisy_tempered_share if state.noisy else settings.tempered_share + extra
+    n, shares = len(state.regions), _share_among_regions(state, history)
+    floors = [Floor((kinds == "tempered") & (regions == k), tempered * shares[k]) for k in range(n)]
+    if state.scattered or (state.rounds and state.rounds[-1].worth(state.gamma) < settings.good_rate):
         floors.append(Floor(kinds == "spread", settings.spread_share))
-    n = len(state.regions)
     if state.scattered or (radial and not state.noisy):
         floors.append(Floor(kinds == "radial", settings.radial_share))
     if n > 1 and not state.scattered:

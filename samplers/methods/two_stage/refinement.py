@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from samplers.methods.two_stage.mixture.least_of_planes import union_of_half_spaces
 from samplers.methods.two_stage.mixture.linear_model import half_space_proposals
 from samplers.methods.two_stage.mixture.proposal import NO_REGION, MixtureProposal, ProposalComponent
 from samplers.methods.two_stage.mixture.settings import DEFAULT_MIXTURE_SETTINGS, MixtureSettings, SubspaceSettings
@@ -66,7 +67,7 @@ class RefinementState:
     gaussians: list[SubspaceGaussian]
     """The same, moved to the weighted failures: one for each of `explored`."""
     linear: tuple[ProposalComponent, ...]
-    """Half-space proposals from linear regression of f around each region."""
+    """Half-space proposals from linear regression of f around each region, and of its pieces in the slopes' span."""
     rounds: tuple[NearDraws, ...] = ()
     hit_rate: float = 1.0
     """Share of the last round's draws from SHARP_KINDS that failed."""
@@ -119,7 +120,8 @@ def start_refinement(
     axes = exploration.slopes
     if axes is None or axes.shape[1] == 0:
         return state
-    return replace(state, within=_describe_regions(exploration.within(axes), gamma, settings, rng, mixture))
+    within = _describe_regions(exploration.within(axes), gamma, settings, rng, mixture)
+    return replace(state, within=_add_pieces(within, rng, mixture))
 
 
 def _describe_regions(
@@ -151,6 +153,7 @@ def refine_once(
     proposal: MixtureProposal,
     batch: ComponentDraws,
     settings: RefinementSettings,
+    rng: np.random.Generator,
     mixture: MixtureSettings = DEFAULT_MIXTURE_SETTINGS,
 ) -> RefinementState:
     """Return the state after a round of draws.
@@ -161,6 +164,7 @@ def refine_once(
         proposal: What the round drew from.
         batch: Its draws.
         settings: How many failures a fit needs.
+        rng: Source of randomness of the fits.
         mixture: Of the fits.
     """
     kinds = np.repeat([candidate.kind for candidate in proposal.candidates], batch.counts)
@@ -168,7 +172,7 @@ def refine_once(
     u = batch.u[near]
     draws = NearDraws(u, batch.f[near], proposal.log_weights(u))
     hit_rate = float((batch.f[sharp] <= state.gamma).mean()) if sharp.any() else 0.0
-    return _learn(state, history, draws, hit_rate, settings, mixture)
+    return _learn(state, history, draws, hit_rate, settings, rng, mixture)
 
 
 def _learn(
@@ -177,12 +181,14 @@ def _learn(
     draws: NearDraws,
     hit_rate: float,
     settings: RefinementSettings,
+    rng: np.random.Generator,
     mixture: MixtureSettings,
 ) -> RefinementState:
     """Return the state, and that in the coordinates of the slopes, moved to the failures of `history`."""
     axes, within = state.exploration.slopes, state.within
     if axes is not None and within is not None:
-        within = _learn(within, history.within(axes), draws.within(axes), hit_rate, settings, mixture)
+        within = _learn(within, history.within(axes), draws.within(axes), hit_rate, settings, rng, mixture)
+        within = _add_pieces(within, rng, mixture)
     state = replace(state, rounds=(*state.rounds, draws), hit_rate=hit_rate, within=within)
     if len(history.u) < settings.min_refit_failures:
         return state
@@ -191,6 +197,14 @@ def _learn(
         gaussians=refit_components(state.gaussians, history.u, history.log_weights, mixture.subspace),
         linear=_fit_linear(state, settings, mixture),
     )
+
+
+def _add_pieces(state: RefinementState, rng: np.random.Generator, mixture: MixtureSettings) -> RefinementState:
+    """Return the state with the half-spaces of a piecewise linear f, where f is one, beside its other proposals."""
+    known = [(region.u, region.f) for region in state.regions] + [(draws.u, draws.f) for draws in state.rounds]
+    u, f = np.concatenate([points for points, _ in known]), np.concatenate([outcomes for _, outcomes in known])
+    union = union_of_half_spaces(u, f, state.gamma, rng, mixture)
+    return state if union is None else replace(state, linear=(*state.linear, ProposalComponent(union, "linear")))
 
 
 def typical_weights(state: RefinementState, proposal: MixtureProposal) -> FloatArray:

@@ -179,18 +179,24 @@ def draw_round(
     first = context.simulator.n_sim
     state, batch = yield from _draw(context, state, proposal, n)
     gamma, settings = context.goal.gamma, context.settings
-    if len(state.rounds) >= settings.refinement.counted_from:
+    if len(state.rounds) >= _first_counted(state, gamma, settings):
         inputs = context.simulator.inputs
         empty = StratifiedSample.empty(len(proposal.weights), inputs.dim, np.empty(0), settings.min_stratum_draws)
         counted = CountedRound(empty.add(batch, proposal, inputs, gamma), first)
         state = replace(state, counted=(*state.counted, counted))
     draws = Draws.from_outcomes(batch.f, proposal.log_weights(batch.u), batch.u, gamma)
     history = state.history.add(batch, gamma)
-    refinement = refine_once(refinement, history, proposal, batch, settings.refinement, settings.mixture)
+    refinement = refine_once(refinement, history, proposal, batch, settings.refinement, context.rng, settings.mixture)
     ess = effective_sample_size(history.log_weights)
     state = replace(state, history=history, rounds=(*state.rounds, draws))
     p = float(np.exp(history.log_weights).sum())
     return _record_draws(context, state, batch, p, 1 / math.sqrt(ess) if ess else math.inf, ess), refinement
+
+
+def _first_counted(state: RunState, gamma: float, settings: TwoStageSettings) -> int:
+    """Return the number of rounds that do not count in p; base draws decide, which do not count either."""
+    common = np.count_nonzero(state.base_f <= gamma) >= settings.exploration.common_failures
+    return settings.refinement.counted_from - int(common)
 
 
 def refine(

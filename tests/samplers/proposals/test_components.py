@@ -9,6 +9,7 @@ from scipy import stats
 from samplers.limit_states import half_space
 from samplers.proposals.components import (
     HalfSpaceNormal,
+    HalfSpaceUnion,
     IsotropicNormal,
     LiftedComponent,
     RadialLaw,
@@ -52,6 +53,8 @@ COMPONENTS = {
     "half-space": (HalfSpaceNormal(rotation(3, 4)[:, 0], 2.0), 3),
     "half-space behind the origin": (HalfSpaceNormal(rotation(3, 4)[:, 0], -0.5), 3),
     "half-space with a gaussian across": (oblique_half_space(1.0), 3),
+    "half-spaces": (HalfSpaceUnion(rotation(2, 4), np.array([0.8, 1.5])), 2),
+    "half-spaces d=5": (HalfSpaceUnion(rotation(5, 4)[:3], np.array([2.0, 2.5, 3.0])), 5),
     "radial": (RadialLaw(3, 1.0, 1.5, 2.5), 3),
     "radial d=20": (RadialLaw(20, 12.0, 2.0, 4.0), 20),
     "radial in a plane of 10": (LiftedComponent(RadialLaw(2, 1.0, 1.5, 2.5), rotation(10, 6)[:, :2]), 10),
@@ -84,6 +87,8 @@ def test_weights_of_draws_average_to_the_base_s_probability_of_the_support(compo
         component, dim = component.within, component.axes.shape[1]  # N(0, I) across
     if isinstance(component, HalfSpaceNormal):
         supported = stats.norm.sf(component.start)
+    if isinstance(component, HalfSpaceUnion):  # of orthogonal planes
+        supported = 1 - stats.norm.cdf(component.starts).prod()
     if isinstance(component, RadialLaw):
         supported = stats.chi2.sf(component.start, dim)
     assert weights.mean() == pytest.approx(supported, rel=1e-12, abs=4 * weights.std() / math.sqrt(N))
@@ -93,7 +98,7 @@ def test_weights_of_draws_average_to_the_base_s_probability_of_the_support(compo
 def test_density_integrates_to_one(name):
     component, dim = COMPONENTS[name]
     u, mass = grid(dim)
-    edge = 1e-3 if isinstance(component, HalfSpaceNormal) else 0.0  # a cell that the edge of the half-space cuts
+    edge = 1e-3 if isinstance(component, HalfSpaceNormal | HalfSpaceUnion) else 0.0  # cells that an edge cuts
     assert (mass * np.exp(component.log_ratio(u))).sum() == pytest.approx(1.0, abs=1e-6 + edge)
 
 

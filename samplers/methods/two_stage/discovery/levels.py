@@ -33,6 +33,8 @@ class ExplorationPlanner:
     def plan_next(self, chains: Chains, depth: int, n_sim: int, rng: np.random.Generator) -> NextLevel | Status:
         """Return the next level, or how the descent ends: converged once `level_fraction` of the points fail."""
         points = chains.by_step()
+        if depth == 0 and np.count_nonzero(points.f <= self.gamma) >= self.settings.common_failures:
+            return Status.CONVERGED
         threshold = next_level(points.f, self.settings.level_fraction, self.gamma)
         if threshold == self.gamma:
             return Status.CONVERGED
@@ -56,6 +58,8 @@ def descend_levels(
     explore: ExplorationSettings,
 ) -> SimulationSteps[SubsetPoints]:
     """Run subset simulation from base draws u (n, d), f (n,), until a tenth of a level fails or the budget is used.
+
+    Where failures are common among the base draws, they are the last level.
 
     All candidates are kept, for the regressions around the regions; there is no estimate, so no level is recorded.
     """

@@ -39,7 +39,7 @@ def after_round(exact_region, rng, n=800, **kwargs):
     u, counts = proposal.draw(n, rng)
     batch = ComponentDraws(proposal.components, counts, u, problem.evaluate(u))
     history = history.add(batch, 0.0)
-    return refine_once(state, history, proposal, batch, SETTINGS), history, problem
+    return refine_once(state, history, proposal, batch, SETTINGS, rng), history, problem
 
 
 def share(proposal, *kinds):
@@ -90,7 +90,7 @@ def test_draws_of_a_round_move_the_components_in_the_span(exact_region, rng):
     u, counts = proposal.draw(2000, rng)
     batch = ComponentDraws(proposal.components, counts, u, problem.evaluate(u))
     history = history.add(batch, 0.0)
-    after = refine_once(state, history, proposal, batch, SETTINGS)
+    after = refine_once(state, history, proposal, batch, SETTINGS, rng)
     mean, variance = stats.truncnorm(BETA, np.inf).stats("mv")
     (gaussian,) = after.within.gaussians
     assert gaussian.centre[0] == pytest.approx(mean, abs=0.03)
@@ -186,6 +186,16 @@ def test_more_tempered_draws_where_the_others_miss(exact_region, rng):
     assert share(missing, "tempered") >= SETTINGS.tempered_share + SETTINGS.extra_tempered_share - 1e-9
 
 
+@pytest.mark.parametrize("final", [False, True])
+def test_every_region_keeps_tempered_draws(exact_region, rng, final):
+    """Both half-spaces fail alike, so that each has half of the tempered draws; 0.7 of that allows for chance."""
+    state, history, _ = after_round(exact_region, rng, regions=2)
+    proposal = build_proposal(state, history, SETTINGS, rng, final=final)
+    for k in range(2):
+        tempered = [c.kind == "tempered" and c.region == k for c in proposal.candidates]
+        assert proposal.weights[tempered].sum() >= 0.7 * SETTINGS.tempered_share / 2
+
+
 @pytest.mark.parametrize(("final", "least"), [(False, 0.25), (True, 0.1)])
 def test_no_region_is_lost(exact_region, rng, final, least):
     """The second region has no failure in the history: it keeps half of what is dealt out all the same."""
@@ -194,7 +204,7 @@ def test_no_region_is_lost(exact_region, rng, final, least):
     u, counts = proposal.draw(800, rng)
     batch = ComponentDraws(proposal.components, counts, u, BETA - u[:, 0])
     history = history.add(batch, 0.0)
-    state = refine_once(state, history, proposal, batch, SETTINGS)
+    state = refine_once(state, history, proposal, batch, SETTINGS, rng)
     shares = build_proposal(state, history, SETTINGS, rng, final=final)
     for k in range(2):
         own = [a for a, c in zip(shares.weights, shares.candidates, strict=True) if c.region == k]

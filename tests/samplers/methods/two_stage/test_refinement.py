@@ -43,7 +43,7 @@ def refined(exact_region, problem, regions, rng, n=600):
     proposal = build_proposal(before, MultipleImportanceSample.empty(problem.dim), SETTINGS, rng)
     batch = draws(proposal, n, problem, rng)
     history = MultipleImportanceSample.empty(problem.dim).add(batch, 0.0)
-    after = refine_once(before, history, proposal, batch, SETTINGS)
+    after = refine_once(before, history, proposal, batch, SETTINGS, rng)
     return before, after, history, batch
 
 
@@ -102,7 +102,7 @@ def test_hit_rate_is_that_of_the_sharp_components(exact_region, rng):
     f = np.concatenate([np.ones(100), np.where(np.arange(100) < 70, -1.0, 1.0)])
     batch = ComponentDraws(proposal.components, np.array([100, 100]), rng.standard_normal((200, 2)), f)
     history = MultipleImportanceSample.empty(2).add(batch, 0.0)
-    after = refine_once(state, history, proposal, batch, SETTINGS)
+    after = refine_once(state, history, proposal, batch, SETTINGS, rng)
     assert after.hit_rate == pytest.approx(0.7)
     np.testing.assert_array_equal(after.rounds[0].u, batch.u[100:])
     np.testing.assert_array_equal(after.rounds[0].log_weights, proposal.log_weights(batch.u[100:]))
@@ -115,7 +115,7 @@ def test_without_failures_a_round_changes_no_component(exact_region, rng):
     u = rng.standard_normal((100, 3))
     batch = ComponentDraws(proposal.components, np.array([100]), u, np.ones(100))
     history = MultipleImportanceSample.empty(3).add(batch, 0.0)
-    after = refine_once(state, history, proposal, batch, SETTINGS)
+    after = refine_once(state, history, proposal, batch, SETTINGS, rng)
     assert after.gaussians is state.gaussians
     assert after.linear is state.linear
     assert after.hit_rate == 0.0

@@ -131,6 +131,16 @@ def test_rounds_go_on_while_their_draws_are_worth_little(drive, rate, noisy, rou
     assert ends[4]
 
 
+@pytest.mark.parametrize(("fails", "rounds"), [(4, 0), (5, 1)])
+def test_the_second_round_counts_where_failures_are_common(drive, fails, rounds):
+    """Base draws decide, which do not count themselves: from 5 failures among them on."""
+    context, state, refinement, proposal, _ = explored(drive)
+    state = replace(state, base_f=np.where(np.arange(len(state.base_f)) < fails, -1.0, 1.0))
+    for _ in range(2):
+        state, refinement = drive(stages.draw_round(context, state, refinement, proposal, 100), PROBLEM).value
+    assert len(state.counted) == rounds
+
+
 def test_rounds_from_the_third_on_count_in_the_estimate(drive):
     context, state, refinement, proposal, _ = refined(drive)
     assert len(state.rounds) == 3

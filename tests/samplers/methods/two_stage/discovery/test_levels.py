@@ -85,3 +85,12 @@ def test_an_interrupted_descent_counts_what_it_simulated(rng):
     with pytest.raises(Interrupted):
         steps.throw(Interrupted())
     assert simulator.n_sim == rows > 0
+
+
+@pytest.mark.parametrize(("fails", "goes_on"), [(4, True), (5, False)])
+def test_common_failures_among_the_base_draws_end_the_descent(rng, fails, goes_on):
+    """Of 500 draws 5 fail: 1 %, from which on they are the last level. Further down as few are none."""
+    f = np.where(np.arange(500) < fails, -1.0, np.arange(500) + 1.0)
+    planned = plan(f, rng)
+    assert isinstance(planned, NextLevel) if goes_on else planned is Status.CONVERGED
+    assert isinstance(plan(f, rng, depth=1), NextLevel)
