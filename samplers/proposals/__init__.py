@@ -2,6 +2,7 @@
 
 from samplers.proposals.components import (
     HalfSpaceNormal,
+    HalfSpaceUnion,
     IsotropicNormal,
     MixtureComponent,
     RadialLaw,
@@ -15,6 +16,7 @@ __all__ = [
     "Gaussian",
     "GaussianMixture",
     "HalfSpaceNormal",
+    "HalfSpaceUnion",
     "IsotropicNormal",
     "Mixture",
     "MixtureComponent",
