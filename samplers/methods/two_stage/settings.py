@@ -239,8 +239,8 @@ class RefinementSettings:
     best weights for the failures met so far may leave a region hardly any: without this the variance of a draw was 1.2
     times as large on common3_d9 and banana_d8, and 2.1 times on loads_d7 (20 runs each)."""
     extra_tempered_share: float = 0.2
-    """How much more of them, times the share of the draws from sharp components that did not fail; not where the regions
-    are pieces of a shell, for the spread component is wider."""
+    """How much more of them, times the share of the draws from sharp components that did not fail; not where the
+    regions are pieces of a shell, for the spread component is wider."""
     noisy_tempered_share: float = 0.5
     """Least share of tempered Gaussians where f is noisy; q^(1/2) phi^(1/2) is then the best proposal."""
     region_share: float = 0.5
