@@ -30,6 +30,8 @@ CHECK_STEP = 1e-3
 """Step in u of the finite differences of the comparison."""
 LARGEST_ERROR = 0.02
 """Error of the density by the transformation, as a difference of logarithms, at half of the points."""
+LARGEST_RETURN_ERROR = 1e-3
+"""Distance in u between a point and what it comes back as, at half of the points."""
 
 
 def is_openturns_distribution(value: object) -> bool:
@@ -47,7 +49,8 @@ class OpenTurnsDistribution:
     Raises:
         ValueError: If it is not continuous, or its iso-probabilistic transformation does not lead to N(0, I), as
             that of a multivariate Student distribution, or does not have its density, as that of a Dirichlet
-            distribution in OpenTURNS 1.27.
+            distribution in OpenTURNS 1.27, or is not undone by its inverse, as that of a copula without marginals,
+            `NormalCopula`, in OpenTURNS 1.23.
 
     Example:
         >>> import numpy as np, openturns
@@ -75,6 +78,19 @@ class OpenTurnsDistribution:
                 f"{100 * math.expm1(error):.0f} %), so that p would be wrong: give an object with sample, log_prob, "
                 "to_standard_normal and from_standard_normal instead."
             )
+        distance = self._return_error()
+        if not distance <= LARGEST_RETURN_ERROR:
+            raise ValueError(
+                f"OpenTURNS' iso-probabilistic transformation of this {name} does not come back to where it began "
+                f"(off by {distance:.2g} in u), so that p would be wrong: install a newer OpenTURNS, or give an object "
+                "with sample, log_prob, to_standard_normal and from_standard_normal instead."
+            )
+
+    def _return_error(self) -> float:
+        """Return the median distance between points u and what they are after the inverse and the transformation."""
+        u = np.random.default_rng(0).standard_normal((CHECKED_POINTS, self.dim))
+        back = self.to_standard_normal(self.from_standard_normal(u))
+        return float(np.median(np.abs(back - u).max(axis=1)))
 
     def _density_error(self) -> float:
         """Return the median of |log p(x) - log phi(u) + log |det dx/du|| over some points; 0 in many dimensions."""

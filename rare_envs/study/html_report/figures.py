@@ -45,7 +45,7 @@ def draw_estimate_over_simulations(figure: Figure, result: Result) -> None:
 
 def draw_levels(figure: Figure, result: Result) -> None:
     """Draw the share of each level's points below its threshold, and the threshold, where that changes."""
-    panels = figure.subplots(1, 2 if _passes_levels(result) else 1, squeeze=False)[0]
+    panels = figure.subplots(1, 2 if passes_levels(result) else 1, squeeze=False)[0]
     shares = panels[0]
     trace = [level for level in result.get("trace") or [] if level["run"] == 0]
     numbers = range(len(trace))
@@ -153,7 +153,7 @@ def figures_of_result(result: Result, log_weights: FloatArray, measure: str) -> 
         measure: What f is, with its unit.
     """
     way, levels = "The estimate on the way, and the result", "Levels of the run: shares and thresholds"
-    room = TWO_PANELS_SIZE if _passes_levels(result) else PANEL_SIZE
+    room = TWO_PANELS_SIZE if passes_levels(result) else PANEL_SIZE
     made = [
         FigureOfPage("convergence", way, lambda f: draw_estimate_over_simulations(f, result), PANEL_SIZE),
         FigureOfPage("levels", levels, lambda f: draw_levels(f, result), room),
@@ -173,7 +173,7 @@ def figures_of_result(result: Result, log_weights: FloatArray, measure: str) -> 
     return {figure.name: figure for figure in made}
 
 
-def _passes_levels(result: Result) -> bool:
+def passes_levels(result: Result) -> bool:
     """Return whether the run has thresholds other than gamma."""
     return any(level["gamma"] != result["gamma"] for level in result.get("trace") or [])
 

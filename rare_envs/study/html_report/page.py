@@ -18,7 +18,7 @@ from rare_envs.study.analysis.repeatability import Repeatability
 from rare_envs.study.columns import draw_ordinary, list_columns
 from rare_envs.study.errors import BadInput, as_bad_input, output_file, output_folder
 from rare_envs.study.html_report.atlas import AtlasEntry, AtlasSource, build_atlas
-from rare_envs.study.html_report.figures import MAX_HISTOGRAMS, draw_parameters, figures_of_result
+from rare_envs.study.html_report.figures import MAX_HISTOGRAMS, draw_parameters, figures_of_result, passes_levels
 from rare_envs.study.html_report.recorded_events import read_recorded_events
 from rare_envs.study.html_report.svg import FORMATS, FigureOfPage
 from rare_envs.study.html_report.templating import render_template
@@ -122,6 +122,7 @@ def render_page(study: LoadedStudy, figures: Mapping[str, FigureOfPage], atlas: 
         method=describe_method(result),
         figures={name: figure.to_svg() for name, figure in figures.items()},
         captions={name: figure.caption for name, figure in figures.items()},
+        passes_levels=passes_levels(result),
         atlas=atlas,
         svgs={figure.name: figure.to_svg() for entry in atlas for figure in entry.figures},
         kinds=[(describe_kind(kind), share) for kind, share in (result.get("kinds") or {}).items()],

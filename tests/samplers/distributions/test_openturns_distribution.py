@@ -113,6 +113,18 @@ def test_a_map_that_has_not_the_density_is_refused():
         OpenTurnsDistribution(openturns.Dirichlet([1.0, 2.0, 3.0]))
 
 
+class ShiftedForward(openturns.Normal):
+    """A normal distribution whose transformation is not the inverse of its inverse, as a copula's in OpenTURNS 1.23."""
+
+    def getIsoProbabilisticTransformation(self):
+        return openturns.SymbolicFunction(["x1", "x2"], ["x1", "x2 + 0.15"])
+
+
+def test_a_map_that_does_not_come_back_is_refused():
+    with pytest.raises(ValueError, match=r"ShiftedForward does not come back to where it began \(off by 0\.15 in u\)"):
+        OpenTurnsDistribution(ShiftedForward(2))
+
+
 def test_draws_have_the_law_that_openturns_draws_from(base):
     """Where OpenTURNS draws without the map, it is another witness of each coordinate."""
     openturns.RandomGenerator.SetSeed(0)

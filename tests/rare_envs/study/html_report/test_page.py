@@ -79,7 +79,7 @@ def test_the_page_is_whole_and_needs_nothing_else(folder: Path) -> None:
 def test_the_page_says_what_the_files_say(folder: Path) -> None:
     text = (folder / "report.html").read_text(encoding="utf-8")
     result = json.loads((folder / "result.json").read_text())
-    assert f"p = {100 * result['p']:.2g} %" in text
+    assert f"p = {100 * result['p']:.2g}\xa0%" in text  # a number and its unit stay in one line
     assert "ends in a collision" in text and "the ego runs into a vehicle ahead" in text
     for name in ("ego_speed [m/s]", "lead_speed [m/s]", "gap [m]"):
         assert name in text
@@ -88,6 +88,17 @@ def test_the_page_says_what_the_files_say(folder: Path) -> None:
         assert label in text, label  # axes with units, as text
     figures = re.findall(r"<svg[^>]*aria-label=\"([^\"]+)\"", text)
     assert len(figures) >= 8
+
+
+@pytest.mark.parametrize("thresholds", [(0.0, 0.0), (4.0, 0.0)])
+def test_the_caption_of_the_levels_names_thresholds_only_where_they_are_drawn(
+    folder: Path, thresholds: tuple[float, float]
+) -> None:
+    study = load_study(folder)
+    trace = [{**study.result["trace"][0], "gamma": gamma} for gamma in thresholds]
+    figures = {"levels": FigureOfPage("levels", "Levels.", lambda figure: figure.subplots(), (3, 2))}
+    text = render_page(replace(study, result={**study.result, "gamma": 0.0, "trace": trace}), figures, [])
+    assert ("and the threshold on its way to gamma" in text) == (thresholds[0] > 0)
 
 
 def test_in_the_clip_every_vehicle_has_its_colour(folder: Path) -> None:
