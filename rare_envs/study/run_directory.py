@@ -151,4 +151,4 @@ def _write_table(
     if large:
         blocks = {name: part.astype(np.float32) for name, part in space.columns(x).items() if name in large}
         with replace_file(blocks_path) as draft:
-            np.savez_compressed(draft, allow_pickle=False, **blocks)
+            np.savez_compressed(draft, **blocks)  # NumPy 2.0 would write allow_pickle as a block
