@@ -151,4 +151,5 @@ def _write_table(
     if large:
         blocks = {name: part.astype(np.float32) for name, part in space.columns(x).items() if name in large}
         with replace_file(blocks_path) as draft:
-            np.savez_compressed(draft, **blocks)  # NumPy 2.0 would write allow_pickle as a block
+            # allow_pickle=False, as its types would like, is a block to NumPy 2.0
+            np.savez_compressed(draft, **blocks)  # type: ignore[arg-type]
