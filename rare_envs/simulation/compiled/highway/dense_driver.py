@@ -105,7 +105,7 @@ def read_dense_driver(offer: OffersDenseDriver) -> DenseDriver:
     """Return the present numbers of a driver.
 
     Raises:
-        NotCompiled: It was changed.
+        NotCompiled: It has a network or methods that compiled rollouts do not know.
 
     Example:
         >>> from agents import load_ego
@@ -114,5 +114,5 @@ def read_dense_driver(offer: OffersDenseDriver) -> DenseDriver:
     """
     driver = offer.dense_driver()
     if driver is None:
-        raise NotCompiled(f"a {type(offer).__name__} whose network or methods were changed is not compiled")
+        raise NotCompiled(f"a {type(offer).__name__} with a network or methods of its own is not compiled")
     return driver

@@ -60,5 +60,5 @@ class Other(LearnedDriver):
 )
 def test_a_driver_that_was_changed_is_not_compiled(driver):
     assert isinstance(driver, OffersDenseDriver)
-    with pytest.raises(NotCompiled, match="whose network or methods were changed is not compiled"):
+    with pytest.raises(NotCompiled, match="with a network or methods of its own is not compiled"):
         read_dense_driver(driver)

@@ -62,7 +62,7 @@ def test_a_driver_that_is_changed_later_is_simulated_by_torch():
     x = problem.base.sample(2, np.random.default_rng(0))
     expected = problem.evaluate(x)
     handle = driver.policy.register_forward_hook(lambda *_: None)
-    with pytest.warns(UserWarning, match="whose network or methods were changed is not compiled; torch simulates"):
+    with pytest.warns(UserWarning, match="with a network or methods of its own is not compiled; torch simulates"):
         f = problem.evaluate(x)
     handle.remove()
     assert np.allclose(f, expected, atol=1e-4) and problem.core == "torch"
