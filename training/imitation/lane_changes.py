@@ -36,11 +36,11 @@ from training.imitation.traffic.replayed_traffic import lane_of, replay_features
 BEFORE = 1.4
 """Median of the time from the beginning of a change to its crossing, in the scenes learned from [s]."""
 AROUND = (4.0, 3.0)
-"""ChangeMoments this long before or after a crossing are not among the others [s]."""
+"""Moments this long before or after a crossing are not among the others [s]."""
 EVERY = 5
 """Of the other moments every so many-th tick is used."""
 PENALTY = 1.0
-"""Half the precision of a normal prior of the slopes."""
+"""Precision of a normal prior of the slopes."""
 RATES = ((9.7, 0.025), (6.5, 0.039))
 """Mean speed [m/s], and lane changes per vehicle and 10 s, of the complete recordings of US 101 and of I-80."""
 HARD_BRAKING = 0.7
@@ -48,7 +48,7 @@ HARD_BRAKING = 0.7
 
 
 class ChangeMoments(NamedTuple):
-    """ChangeMoments of n vehicles and either side, from the scenes."""
+    """Moments of n vehicles and either side, from the scenes."""
 
     covariates: Tensor
     """Shape (n, 2, 5)."""

@@ -23,7 +23,7 @@ _ACTIVATIONS = {"tanh": torch.tanh, "relu": torch.relu}
 
 @dataclass(frozen=True, eq=False)
 class DenseInference:
-    """A policy with continuous actions that is dense layers, with the weights that it had when it was read."""
+    """A policy with continuous actions that is dense layers; it shares the policy's weights."""
 
     policy: Any
     """Whose `predict` this one stands for."""

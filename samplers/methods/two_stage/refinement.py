@@ -24,7 +24,7 @@ from samplers.methods.two_stage.regions import ExplorationResult, Region
 from samplers.methods.two_stage.settings import RefinementSettings
 from samplers.methods.two_stage.simulator import ComponentDraws
 from samplers.problem import FloatArray
-from samplers.proposals.components import SubspaceGaussian, log_ratios
+from samplers.proposals.components import HalfSpaceUnion, SubspaceGaussian, log_ratios
 from samplers.statistics.weights import effective_sample_size
 
 SHARP_KINDS = ("gaussian", "linear", "explored", "half-space", "radial")
@@ -204,7 +204,8 @@ def _add_pieces(state: RefinementState, rng: np.random.Generator, mixture: Mixtu
     known = [(region.u, region.f) for region in state.regions] + [(draws.u, draws.f) for draws in state.rounds]
     u, f = np.concatenate([points for points, _ in known]), np.concatenate([outcomes for _, outcomes in known])
     union = union_of_half_spaces(u, f, state.gamma, rng, mixture)
-    return state if union is None else replace(state, linear=(*state.linear, ProposalComponent(union, "linear")))
+    others = tuple(one for one in state.linear if not isinstance(one.component, HalfSpaceUnion))
+    return replace(state, linear=others if union is None else (*others, ProposalComponent(union, "linear")))
 
 
 def typical_weights(state: RefinementState, proposal: MixtureProposal) -> FloatArray:

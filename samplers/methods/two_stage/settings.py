@@ -256,7 +256,7 @@ class RefinementSettings:
     """Few dimensions. In 25 (series6, 60 runs) it took the coverage from 93 to 87 % and the gain from 48 to 5."""
     spread_share: float = 0.4
     """Share of the component that is as wide as the failures in the span of the slopes, where the regions are pieces of
-    a shell, and while draws are worth less than `good_rate`: there the failures form a ring, and Gaussians fitted to
+    a shell, or while draws are worth less than `good_rate`: there the failures form a ring, and Gaussians fitted to
     some of them leave gaps. Without it the second moment on oscillator_d100 was 800 to 2,000 times p^2, with it 40 to
     70, and 26 with the half-spaces of the pieces of f; with 0.15 of it these gave 150."""
     explored_share: float = 0.01

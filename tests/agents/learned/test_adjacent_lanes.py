@@ -24,9 +24,9 @@ def test_gaps_and_closing_speeds_in_the_next_lanes():
     # to the right one 12 m ahead that is 2 m/s slower, to the left one 9 m behind that is 3 m/s faster
     lanes = look_aside(perceived([0.0, 12.0, -9.0], [0.0, WIDTH, -WIDTH - 0.2], [20.0, 18.0, 23.0]))
     assert lanes.lead_gap[0] == lanes.lag_gap[1] == math.inf
-    assert float(lanes.lead_gap[1]) == pytest.approx(7.0, abs=1.6)  # where a beam meets the side, not the rear
+    assert float(lanes.lead_gap[1]) == pytest.approx(7.0, abs=1e-5)
     assert float(lanes.lead_closing[1]) == pytest.approx(2.0, abs=1e-6)
-    assert float(lanes.lag_gap[0]) == pytest.approx(4.0, abs=1.6)
+    assert float(lanes.lag_gap[0]) == pytest.approx(4.0, abs=1e-5)
     assert float(lanes.lag_closing[0]) == pytest.approx(3.0, abs=1e-6)
     assert lanes.beyond.tolist() == [True, True]
 

@@ -42,8 +42,8 @@ def union_of_half_spaces(
 ) -> HalfSpaceUnion | None:
     """Return the half-spaces in which the pieces of f fail, or None where pieces do not explain f.
 
-    Each begins before its plane by `crossing_errors` standard errors of a prediction and by `slack`; those around the
-    origin, nearer than `min_distance`, are left out.
+    Each begins before its plane by `PieceSettings.crossing_errors` standard deviations of its residuals and by `slack`;
+    those around the origin, nearer than `min_distance`, are left out.
 
     Args:
         u: Points, shape (n, d).
@@ -88,7 +88,7 @@ def union_of_half_spaces(
     error = np.sqrt(square / np.maximum(counts - dim - 1, 1))
     with np.errstate(divide="ignore", invalid="ignore"):
         starts = (pieces.intercepts - settings.pieces.crossing_errors * error) / steepness - edges.slack
-        kept = (counts > 0) & (starts > edges.min_distance)
+        kept = (counts > 0) & np.isfinite(starts) & (starts > edges.min_distance)  # a flat piece has no edge
         axes = -pieces.slopes / steepness[:, None]
     return HalfSpaceUnion(axes[kept], starts[kept]) if kept.any() else None
 

@@ -83,9 +83,9 @@ class PieceSettings:
     ridge: float = 1e-3
     """The same of the later ones, the smaller one of `LinearModelSettings.ridges`."""
     crossing_errors: float = 4.0
-    """Standard errors of a prediction by which a half-space begins before its plane. With 2 and 3 the intervals held p
-    in 90 and 88 % of 60 runs on oscillator_d100, for the slopes leave out some of the direction of a plane; with 4 in
-    all of them, at the same gain."""
+    """Standard deviations of its residuals by which a half-space begins before its plane. With 2 and 3 the intervals
+    held p in 90 and 88 % of 60 runs on oscillator_d100, for the slopes leave out some of the direction of a plane; with
+    4 in all of them, at the same gain."""
     min_r2: float = 0.8
     """R^2 under which f is no least of linear functions. It is 0.93 to 0.98 on oscillator_d100, 0.81 to 0.91 on
     duffing_d60, and negative on screen_d40, where f is the largest of three."""

@@ -1,5 +1,7 @@
 """Refinement of one or two regions whose failures are known: half-spaces in a few dimensions."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy import stats
@@ -18,7 +20,7 @@ from samplers.methods.two_stage.regions import ExplorationResult, Region
 from samplers.methods.two_stage.settings import RefinementSettings
 from samplers.methods.two_stage.simulator import ComponentDraws
 from samplers.problem import FunctionProblem
-from samplers.proposals.components import HalfSpaceNormal, IsotropicNormal, SubspaceGaussian
+from samplers.proposals.components import HalfSpaceNormal, HalfSpaceUnion, IsotropicNormal, SubspaceGaussian
 
 SETTINGS = RefinementSettings()
 BETA = 3.0
@@ -143,3 +145,21 @@ def test_typical_weight_of_a_region_is_that_of_later_states_without_the_heaviest
     proposal = MixtureProposal([ProposalComponent(far, "gaussian", 0)], np.ones(1))
     # phi / q = exp(9/2 - 3 u1): e^-4.5 at u1 = 3, e^4.5 at the origin
     np.testing.assert_allclose(typical_weights(state, proposal), np.exp(-4.5))
+
+
+@pytest.mark.parametrize("min_refit_failures", [SETTINGS.min_refit_failures, 10**6])
+def test_the_span_of_the_slopes_has_one_union_of_half_spaces(exact_region, rng, min_refit_failures):
+    """After the exploration and after every round, also where a round has too few failures to fit Gaussians again."""
+    dim, settings = 6, replace(SETTINGS, min_refit_failures=min_refit_failures)
+    problem = half_spaces(dim, 2)
+    state = start_refinement(explored(exact_region, problem, 2, slopes=np.eye(dim)[:, :3]), 0.0, settings, rng)
+    history = MultipleImportanceSample.empty(dim)
+    for _ in range(3):
+        (union,) = (one.component for one in state.within.linear if isinstance(one.component, HalfSpaceUnion))
+        for k in range(2):
+            assert (union.axes[:, k] > 0.98).any()
+        proposal = build_proposal(state, history, settings, rng)
+        assert [getattr(one.component, "within", None) for one in proposal.candidates].count(union) == 1
+        batch = draws(proposal, 400, problem, rng)
+        history = history.add(batch, 0.0)
+        state = refine_once(state, history, proposal, batch, settings, rng)
