@@ -213,8 +213,11 @@ def _set_floors(
     spread = state.scattered and state.within is not None
     extra = 0.0 if spread else settings.extra_tempered_share * (1 - state.hit_rate)
     tempered = settings.noisy_tempered_share if state.noisy else settings.tempered_share + extra
-    n, shares = len(state.regions), _share_among_regions(state, history)
-    floors = [Floor((kinds == "tempered") & (regions == k), tempered * shares[k]) for k in range(n)]
+    n = len(state.regions)
+    floors = [Floor(kinds == "tempered", tempered)]
+    if n > 1 and not state.scattered:
+        shares = _share_among_regions(state, history)
+        floors = [Floor((kinds == "tempered") & (regions == k), tempered * shares[k]) for k in range(n)]
     if state.scattered or (state.rounds and state.rounds[-1].worth(state.gamma) < settings.good_rate):
         floors.append(Floor(kinds == "spread", settings.spread_share))
     if state.scattered or (radial and not state.noisy):
