@@ -135,6 +135,13 @@ def test_names_of_egos_and_bases_are_escaped(folder: Path) -> None:
     assert "<script" not in text and text.count("&lt;script&gt;alert(1)") >= 6
 
 
+def test_commands_and_folders_are_those_to_paste(folder: Path, tmp_path: Path) -> None:
+    run = Path(shutil.copytree(folder, tmp_path / "5 % of it"))
+    study = load_study(run)
+    text = render_page(replace(study, about={**study.about, "command": "rare-envs resume '5 % of it'"}), {}, [])
+    assert "rare-envs resume &#39;5 % of it&#39;</code>" in text and "5\xa0% of it" not in text
+
+
 DAMAGED = {
     "result.json": [{"kinds": [1]}, {"modes": ["x"]}, {"method": "x"}, {"confidence": "x"}, {"n_sim": "x"}],
     "study.json": [{"versions": [1]}, {"base": [1]}],

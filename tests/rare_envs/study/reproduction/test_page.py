@@ -19,13 +19,13 @@ def test_paper_ours_and_difference_stand_side_by_side() -> None:
         "quantity",
         "paper",
         "ours",
-        "95 % interval",
+        "95\xa0% interval",  # a number and its unit stay in one line
         "difference",
         "ours, all simulations",
         "released code",
         "why they differ",
     ]
-    assert rows[1] == ["SS", "IDM", "mean of p", "8.00e-04", "6.00e-04", "–", "-25 %", "–", "–", "traffic"]
+    assert rows[1] == ["SS", "IDM", "mean of p", "8.00e-04", "6.00e-04", "–", "-25\xa0%", "–", "–", "traffic"]
     assert rows[2] == ["simulations", "–", "4,980", "4,900 to 5,100", "–", "5,500", "–", "–"]
     assert rows[3][-2] == "does &lt;not&gt; run"
 
@@ -42,6 +42,11 @@ def test_the_page_needs_nothing_else_and_has_all_sections() -> None:
     assert not re.search(r"(src|href)=", page)
     assert [f'id="{name}"' in page for name in ("notes", "table9", "findings", "figure9", "made")] == [True] * 5
     assert "rare-envs reproduce paper" in page
+
+
+def test_the_command_is_the_one_to_paste() -> None:
+    command = "rare-envs reproduce okelly2018 --out '5 % of it'"
+    assert "&#39;5 % of it&#39;</code>" in render_reproduction({**record_by_hand(), "command": command}, [])
 
 
 def test_code_in_notes_is_shown_as_code_and_escaped() -> None:
