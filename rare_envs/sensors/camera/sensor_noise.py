@@ -25,7 +25,7 @@ def draw_pixel_noise(context: CameraContext, values: int) -> Tensor:
     place = torch.arange(values, dtype=torch.int32, device=key.device) * _STEP
     noise = torch.empty(len(key), values, device=key.device)
     at_once = 1 if key.device.type == "cpu" else max(len(key), 1)  # one picture stays in the cache of a processor
-    for mixed, rows in zip(key.split(at_once), noise.split(at_once), strict=True):
+    for mixed, rows in zip(torch.split(key, at_once), torch.split(noise, at_once), strict=True):
         bits = _mix(place + mixed[:, None])
         pairs = (bits >> 8).bitwise_and_(_EVEN).add_(bits.bitwise_and_(_EVEN))  # bytes 0 + 1 and 2 + 3
         total = pairs.mul_(_BOTH) >> 16
