@@ -16,22 +16,28 @@ DRIVING = (
     "pyarrow",
     "stable_baselines3",
     "torch",
-    "typer",
     "yaml",
 )
 """Import names of what the extra `driving` installs (pyproject.toml)."""
 _COMMAND = "rare-envs"
-_BAD_INPUT = 2
-"""Exit code of the command line."""
 
 
-def require_libraries(modules: tuple[str, ...] = DRIVING) -> None:
+def find_missing_libraries(modules: tuple[str, ...] = DRIVING) -> tuple[str, ...]:
+    """Return those of some libraries that are not installed; nothing is imported.
+
+    Example:
+        >>> find_missing_libraries(("torch", "car"))
+        ('car',)
+    """
+    return tuple(name for name in modules if find_spec(name) is None)
+
+
+def require_libraries(modules: tuple[str, ...] = DRIVING, what: str = "rare_envs, agents and training need") -> None:
     """Raise an error of one line that says what to install if a library is missing.
-
-    The console script `rare-envs` prints that line and exits with code 2 instead.
 
     Args:
         modules: Import names of the libraries; nothing is imported.
+        what: Subject and verb of the line: what needs them.
 
     Raises:
         ImportError: If one is not installed.
@@ -43,11 +49,21 @@ def require_libraries(modules: tuple[str, ...] = DRIVING) -> None:
             ...
         ImportError: rare_envs, agents and training need car, not installed: pip install 'rare-envs[driving]'.
     """
-    missing = [name for name in modules if find_spec(name) is None]
-    if not missing:
-        return
-    line = f"rare_envs, agents and training need {', '.join(missing)}, not installed: pip install 'rare-envs[driving]'."
-    if sys.argv and Path(sys.argv[0]).stem == _COMMAND:
-        print(line, file=sys.stderr)
-        raise SystemExit(_BAD_INPUT)
-    raise ImportError(line)
+    missing = find_missing_libraries(modules)
+    if missing:
+        raise ImportError(f"{what} {', '.join(missing)}, not installed: pip install 'rare-envs[driving]'.")
+
+
+def is_command_line() -> bool:
+    """Return whether this process is the command `rare-envs`, `python -m rare_envs`, or a worker of one.
+
+    A worker that is started anew has the arguments of its parent.
+
+    Example:
+        >>> is_command_line()
+        False
+    """
+    program = Path(sys.argv[0]) if sys.argv else Path()
+    if program == Path("-m"):  # the module is being looked for
+        return "rare_envs" in sys.orig_argv[1:4]
+    return program.stem == _COMMAND or program.parts[-2:] == ("rare_envs", "__main__.py")

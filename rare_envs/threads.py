@@ -3,13 +3,15 @@
 import contextlib
 from collections.abc import Iterator
 
+from rare_envs.installation import find_missing_libraries
+
 
 @contextlib.contextmanager
 def use_one_thread() -> Iterator[None]:
     """Keep torch to one thread, and let it have as many as before afterwards; for a block or, as decorator, a function.
 
     Networks and batches this small lose more time to further threads than they gain, and on one thread sums round alike
-    on every machine.
+    on every machine. Without torch, there is nothing to keep.
 
     Example:
         >>> import torch
@@ -17,6 +19,9 @@ def use_one_thread() -> Iterator[None]:
         ...     torch.get_num_threads()
         1
     """
+    if find_missing_libraries(("torch",)):
+        yield
+        return
     import torch  # here, because the command line shows its help without it
 
     before = torch.get_num_threads()

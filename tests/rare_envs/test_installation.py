@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import ast
+import json
+import os
 import re
 import subprocess
 import sys
+from collections.abc import Callable
 from importlib.metadata import packages_distributions
 from pathlib import Path
 
 import pytest
 
-from rare_envs.installation import DRIVING, require_libraries
+from rare_envs.installation import DRIVING, is_command_line
+from rare_envs.version import __version__
 
 ROOT = Path(__file__).parents[2]
 PACKAGES = ("agents", "rare_envs", "samplers", "training")
@@ -62,19 +66,104 @@ def test_what_the_test_suite_needs_is_installed_by_its_extra() -> None:
     assert set(extras.split(",")) >= {"driving", "contrib", "export", "fast", "logs", "onnx", "remote", "stl"}
 
 
-@pytest.mark.parametrize("package", ["rare_envs", "agents", "training"])
+BARE = f"""
+import sys
+from importlib.machinery import PathFinder
+
+
+class Bare(PathFinder):
+    @classmethod
+    def find_spec(cls, name, path=None, target=None):
+        return None if name.partition(".")[0] in {DRIVING} else super().find_spec(name, path, target)
+
+
+sys.meta_path[sys.meta_path.index(PathFinder)] = Bare
+if __name__ == "__main__":
+    sys.argv[0] = "/somewhere/bin/rare-envs"
+    from rare_envs.study.cli import main
+
+    main()
+"""
+"""The command of an installation without the extra `driving`, in its worker processes too."""
+
+
+@pytest.fixture
+def bare(tmp_path: Path) -> Callable[..., subprocess.CompletedProcess[str]]:
+    """Runs the command where nothing of the extra `driving` can be found."""
+    script = tmp_path / "bare.py"
+    script.write_text(BARE, encoding="utf-8")
+
+    def run(*words: str) -> subprocess.CompletedProcess[str]:
+        command = [sys.executable, str(script), *words]
+        environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+        return subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, env=environment, check=False)
+
+    return run
+
+
+@pytest.mark.parametrize("package", ["rare_envs", "agents", "training.ego_training"])
 def test_importing_a_package_without_its_libraries_names_the_command(package: str) -> None:
-    code = f"import sys; sys.modules.update(torch=None, typer=None); import {package}"
+    code = f"import sys; sys.modules.update(torch=None, gymnasium=None); import {package}"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, check=False)
-    line = "rare_envs, agents and training need torch, typer, not installed: pip install 'rare-envs[driving]'."
+    line = "rare_envs, agents and training need gymnasium, torch, not installed: pip install 'rare-envs[driving]'."
     assert done.stderr.splitlines()[-1] == f"ImportError: {line}"
 
 
-def test_the_command_line_says_it_in_one_line(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+@pytest.mark.parametrize(
+    ("words", "shown"),
+    [
+        (["--version"], f"rare-envs {__version__}"),
+        (["--help"], "train-ego"),
+        (["estimate", "--help"], "--max-sim"),
+        (["bench", "samplers", "--help"], "--budget"),
+    ],
+)
+def test_version_and_help_need_no_library_of_the_extra(
+    bare: Callable[..., subprocess.CompletedProcess[str]], words: list[str], shown: str
 ) -> None:
-    monkeypatch.setattr(sys, "argv", ["/somewhere/bin/rare-envs", "list"])
-    with pytest.raises(SystemExit) as stopped:
-        require_libraries(("torch", "no_such_library"))
-    assert stopped.value.code == 2
-    assert capsys.readouterr().err.count("\n") == 1
+    done = bare(*words)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert shown in done.stdout
+
+
+def test_methods_are_measured_without_the_extra(bare: Callable[..., subprocess.CompletedProcess[str]]) -> None:
+    plan = ("--method", "mc", "--budget", "200", "--runs", "2", "--workers", "2")
+    done = bare("bench", "samplers", "--problems", "lin_d2", *plan, "--out", "bench", "--json")
+    assert done.returncode == 0, done.stderr
+    (cell,) = json.loads(done.stdout)["cells"]
+    assert (cell["method"], cell["runs"]) == ("mc", 2)
+
+
+@pytest.mark.parametrize(
+    ("words", "what"),
+    [
+        (["list"], "rare-envs list needs"),
+        (["estimate", "CutIn-v0", "--seed", "1"], "rare-envs estimate needs"),
+        (["corpus", "run", "--ego", "idm"], "rare-envs corpus run needs"),
+        (["bench", "samplers", "--set", "driving", "--method", "mc"], "Problems of the set driving need"),
+        (["bench", "samplers", "--method", "rare_envs:DrivingProblem"], "Cannot load the method"),
+    ],
+)
+def test_a_command_that_needs_the_extra_says_so_in_one_line(
+    bare: Callable[..., subprocess.CompletedProcess[str]], words: list[str], what: str
+) -> None:
+    done = bare(*words)
+    assert (done.returncode, done.stdout, done.stderr.count("\n")) == (2, "", 1), done.stderr
+    assert done.stderr.startswith(f"rare-envs: {what}")
+    assert done.stderr.endswith("torch, yaml, not installed: pip install 'rare-envs[driving]'.\n")
+
+
+def test_the_command_line_is_known_by_its_program(monkeypatch: pytest.MonkeyPatch) -> None:
+    for program, found in (
+        ("/somewhere/bin/rare-envs", True),
+        ("C:/venv/Scripts/rare-envs.exe", True),
+        (str(ROOT / "rare_envs/__main__.py"), True),
+        ("/somewhere/train.py", False),
+        ("/somewhere/__main__.py", False),
+    ):
+        monkeypatch.setattr(sys, "argv", [program, "list"])
+        assert is_command_line() == found, program
+    monkeypatch.setattr(sys, "argv", ["-m", "list"])
+    for module, found in (("rare_envs", True), ("pytest", False)):
+        monkeypatch.setattr(sys, "orig_argv", [sys.executable, "-m", module, "list"])
+        assert is_command_line() == found, module

@@ -44,6 +44,7 @@ from rare_envs.study.cli.shell import (
     ignore_signals,
     keep_stdout_for_the_answer,
     print_json,
+    require_driving,
     show_what_is_known,
 )
 from rare_envs.study.errors import as_bad_input
@@ -201,6 +202,7 @@ app.command("check-ego")(check_ego_command)
 app.command("serve-ego")(serve_ego_command)
 
 
+require_driving(app, but="bench")
 add_examples(app)
 app.info.epilog = format_examples("")
 

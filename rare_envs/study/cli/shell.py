@@ -16,10 +16,11 @@ from types import FrameType
 from typing import Any, NoReturn
 
 import typer
-from typer.core import TyperGroup
+from typer.core import TyperCommand, TyperGroup
 
 from rare_envs.egos.errors import EgoGone
-from rare_envs.study.errors import BadInput
+from rare_envs.installation import require_libraries
+from rare_envs.study.errors import BadInput, as_bad_input
 
 DOUBTFUL = 3
 """Exit code of a command that is done, with warnings that make its number doubtful."""
@@ -50,6 +51,30 @@ class SummarisedCommands(TyperGroup):
         rows = [(name, found.get_short_help_str(limit=WHOLE)) for name, found in commands if found is not None]
         with formatter.section("Commands"):
             formatter.write_dl(rows)
+
+
+class DrivingCommand(TyperCommand):
+    """A command that needs the libraries of the extra `driving`; its help does not."""
+
+    def invoke(self, ctx: Any) -> Any:
+        """Run the command, or say in one line what to install."""
+        with as_bad_input(ImportError):
+            require_libraries(what=f"{ctx.command_path} needs")
+        return super().invoke(ctx)
+
+
+def require_driving(app: typer.Typer, but: str) -> None:
+    """Let all commands of an app be `DrivingCommand`s, those of its groups too.
+
+    Args:
+        app: The app.
+        but: Name of the group whose commands need no such library.
+    """
+    for command in app.registered_commands:
+        command.cls = DrivingCommand
+    for group in app.registered_groups:
+        if group.name != but and group.typer_instance is not None:
+            require_driving(group.typer_instance, but)
 
 
 class OneLineErrors(SummarisedCommands):

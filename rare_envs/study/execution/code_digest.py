@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from functools import cache
-from importlib import resources
+from importlib.util import find_spec
 from pathlib import Path
 
 SIMULATING_FILES = ("*.py", "*.safetensors", "*.json")
@@ -22,7 +22,13 @@ def digest_code() -> str:
     """
     digest = hashlib.blake2b(digest_size=8)
     for package in SIMULATING_PACKAGES:
-        folder = Path(str(resources.files(package)))
-        for path in sorted(path for end in SIMULATING_FILES for path in folder.rglob(end)):
+        for path in sorted(path for end in SIMULATING_FILES for path in _find_folder(package).rglob(end)):
             digest.update(path.read_bytes())
     return digest.hexdigest()
+
+
+def _find_folder(package: str) -> Path:
+    """Return the folder of a package, which is not imported."""
+    found = find_spec(package)
+    assert found is not None and found.submodule_search_locations is not None
+    return Path(found.submodule_search_locations[0])

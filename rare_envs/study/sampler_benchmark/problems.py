@@ -5,7 +5,6 @@ from __future__ import annotations
 from functools import partial
 from typing import NamedTuple
 
-from rare_envs.problem import DrivingProblem
 from samplers.benchmark import PROBLEMS, BenchmarkProblem, LimitState
 
 
@@ -35,18 +34,22 @@ COUNTED_COLLISIONS = {
 
 def make_driving_state(counted: CountedCollisions) -> LimitState:
     """Return a scenario as a limit state in standard normal space."""
+    from rare_envs.problem import DrivingProblem  # here: the other problems need no torch
+
     problem = DrivingProblem(counted.env_id, base=counted.base)
     p = counted.collisions / counted.rollouts
     error = (p * (1 - p) / counted.rollouts) ** 0.5
     return LimitState(lambda u: problem.evaluate(problem.base.from_standard_normal(u)), problem.dim, p, error)
 
 
+DRIVING_GROUP = "driving"
+"""Name of the set that needs the extra `driving`."""
 ALL_PROBLEMS: dict[str, BenchmarkProblem] = {
     **PROBLEMS,
     **{
         name: BenchmarkProblem(
             partial(make_driving_state, counted),
-            "driving",
+            DRIVING_GROUP,
             "plain rollouts (python -m benchmarks.estimators.truth)",
             counted.rollouts,
             "20,000 rollouts of other draws",

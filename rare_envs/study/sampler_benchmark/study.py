@@ -8,14 +8,15 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-import rare_envs
 from rare_envs.files import replace_text
+from rare_envs.installation import require_libraries
 from rare_envs.json_text import format_json
 from rare_envs.study.errors import BadInput
 from rare_envs.study.execution.code_digest import digest_code
 from rare_envs.study.execution.run_lines import RunLines, drop_torn_line
 from rare_envs.study.sampler_benchmark.leaderboard import format_leaderboard
-from rare_envs.study.sampler_benchmark.problems import ALL_PROBLEMS, GROUPS
+from rare_envs.study.sampler_benchmark.problems import ALL_PROBLEMS, DRIVING_GROUP, GROUPS
+from rare_envs.version import __version__
 from samplers.benchmark import Job, MethodRun, cells_of, find_faults, power_of, run_all, run_once
 from samplers.benchmark.runs import about
 from samplers.benchmark.solvers import digest_method, find_library_versions, find_method
@@ -56,6 +57,8 @@ class BenchmarkPlan:
         unknown = [name for name in self.problems if name not in ALL_PROBLEMS]
         if unknown:
             raise ValueError(f"Unknown problem {unknown[0]!r}; known: {', '.join(ALL_PROBLEMS)}.")
+        if any(ALL_PROBLEMS[name].group == DRIVING_GROUP for name in self.problems):
+            require_libraries(what="Problems of the set driving need")
         for name in self.methods:
             find_method(name)
 
@@ -118,7 +121,7 @@ def summarise_study(plan: BenchmarkPlan, runs: Sequence[MethodRun]) -> dict[str,
     return to_json_value(  # type: ignore[no-any-return]  # a dict in, a dict out
         {
             "about": about(
-                rare_envs=rare_envs.__version__,
+                rare_envs=__version__,
                 code=digest_code(),
                 libraries=find_library_versions(plan.methods),
                 plan=asdict(plan),
@@ -157,7 +160,7 @@ def read_runs(file: Path) -> list[MethodRun]:
 
 def _open_runs(file: Path) -> RunLines[Job, MethodRun]:
     """Return the runs of a file, and how they are read and written."""
-    return RunLines(file, {"rare_envs": rare_envs.__version__, "code": digest_code()}, _parse_run, asdict, _key, _key)
+    return RunLines(file, {"rare_envs": __version__, "code": digest_code()}, _parse_run, asdict, _key, _key)
 
 
 def _refuse_other_sources(plan: BenchmarkPlan, lines: RunLines[Job, MethodRun]) -> None:

@@ -43,7 +43,11 @@ def bench_samplers_command(
     """Run methods many times on problems with known p; write bias, coverage, gain and faults of each."""
     from rare_envs.study.sampler_benchmark.study import BenchmarkPlan, choose_problems, run_study
 
-    with keep_stdout_for_the_answer(), as_bad_input(ValueError, ChildProcessError), working_directory_first():
+    with (
+        keep_stdout_for_the_answer(),
+        as_bad_input(ValueError, ChildProcessError, ImportError),
+        working_directory_first(),
+    ):
         plan = BenchmarkPlan(
             methods=_split(method),
             problems=choose_problems(_split(groups), _split(problems)),
