@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -15,6 +15,7 @@ from rare_envs.json_text import format_json
 from rare_envs.study.analysis.repeatability import RowKeeper
 from rare_envs.study.errors import BadInput, as_bad_input, output_folder
 from rare_envs.study.evaluate import recheck
+from rare_envs.study.execution.interruption import FIRST_BATCH, RunInterrupted, describe_stop
 from rare_envs.study.question import Question, Study, prepare
 from rare_envs.study.run_directory import check_no_results, write_failures
 from rare_envs.version import __version__
@@ -64,6 +65,7 @@ def compare_egos(
 
     Raises:
         BadInput: An argument cannot be used, or an ego failed on some x or is gone.
+        RunInterrupted: It was interrupted; the message says what they say.
 
     Example:
         >>> question = Question(env_id="rare_envs/CarFollowing-v0", gamma=3.0, horizon=3.0, method="mc", max_sim=1000)
@@ -81,7 +83,7 @@ def compare_egos(
         )
     kept = {name: RowKeeper(study.problem, question.gamma) for name, study in (("A", a), ("B", b))}
     with contextlib.nullcontext() if out is None else output_folder(out):
-        with as_bad_input(ValueError, EgoGone):
+        with as_bad_input(ValueError, EgoGone), _say_what_is_known():
             comparison = samplers.compare(
                 kept["A"],
                 kept["B"],
@@ -105,6 +107,17 @@ def compare_egos(
             replace_text(out / COMPARISON, format_json(answer) + "\n")
             write_failures(out, a.problem.space, comparison.either.failures)
     return EgoComparison(comparison, answer)
+
+
+@contextlib.contextmanager
+def _say_what_is_known() -> Iterator[None]:
+    """Let an interruption say the probability that one of both fails."""
+    try:
+        yield
+    except samplers.EstimationInterrupted as stopped:
+        raise RunInterrupted(describe_stop(stopped.estimate, "P[A or B fails]")) from None
+    except KeyboardInterrupt:
+        raise RunInterrupted(FIRST_BATCH) from None
 
 
 def _find_doubts(studies: Mapping[str, Study], kept: Mapping[str, RowKeeper]) -> list[str]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
 import time
 from collections.abc import Callable
 from contextlib import closing
@@ -16,6 +15,14 @@ from rare_envs.study.analysis.recorded_question import note_question, open_quest
 from rare_envs.study.analysis.repeatability import Repeatability, RowKeeper, check_repeatability
 from rare_envs.study.crash_kinds import CrashKinds, classify_failures, list_all_kinds
 from rare_envs.study.errors import BadInput, output_folder
+from rare_envs.study.execution.interruption import (
+    NOT_KEPT,
+    RunInterrupted,
+    describe_early_stop,
+    describe_kept,
+    describe_stop,
+    keep_answer,
+)
 from rare_envs.study.execution.simulated_problem import SimulatedProblem, open_problem
 from rare_envs.study.journal import JOURNAL, begin_journal, check_same_files, continue_journal
 from rare_envs.study.question import Study, prepare
@@ -27,15 +34,6 @@ from rare_envs.study.storage.study_file import begin_study_file, finish_study_fi
 from samplers.execution.executors import Executor, ExecutorError
 from samplers.execution.journal import JournalFile
 from samplers.execution.progress import Pace, open_listener
-
-
-class RunInterrupted(KeyboardInterrupt):
-    """A run was interrupted; the message says how to continue it."""
-
-    def __init__(self, message: str, report: Report | None = None) -> None:
-        super().__init__(message)
-        self.report = report
-        """The answer from the simulations made so far; None before the first ones."""
 
 
 class UnwrittenResults(BadInput):
@@ -83,35 +81,45 @@ def run(
         (0.021, 1000)
     """
     start, study = time.perf_counter(), settle_chunk(study, executor)
+    advice = "" if journal else NOT_KEPT
     recorder: EpisodeRecorder | None = None
+    problem: SimulatedProblem | None = None
     try:
         with open_problem(study, journal, executor) as problem:
             recorder = None if folder is None else EpisodeRecorder(problem, folder, study.problem.space)
             keeper = RowKeeper(recorder or problem, study.question.gamma)
             estimate = _estimate(study, keeper, problem, progress)
     except EgoGone as error:
-        raise BadInput(
-            f"{error}{'' if journal else ' With --out finished simulations would have been kept.'}"
-        ) from error
+        raise BadInput(f"{error}{advice}") from error
     except (ValueError, ExecutorError) as error:
         raise BadInput(error) from error
     except samplers.EstimationInterrupted as stopped:
-        kinds = CrashKinds(unknown="the run was interrupted")
-        seconds = time.perf_counter() - start
-        report = Report(study, stopped.estimate, seconds, tuple(problem.faults), kinds, problem.n_retried)
-        raise RunInterrupted("Stopped.", report) from None
+        assert problem is not None
+        report = _report_early(study, problem, stopped.estimate, time.perf_counter() - start)
+        raise RunInterrupted(f"{describe_stop(report.estimate)}{advice}", report) from None
+    except KeyboardInterrupt:
+        n_made, n_failed = (0, 0) if problem is None else (problem.n_made, problem.n_failed)
+        raise RunInterrupted(f"{describe_early_stop(n_made, n_failed)}{advice if n_made else ''}") from None
     else:
-        seconds = time.perf_counter() - start
-        kinds = classify_failures(study.problem, estimate)
-        estimate, kinds = list_all_kinds(study.problem, estimate, kinds)
-        if recorder is not None:
-            recorder.write(estimate, kinds.by_scenario)
+        report = _report_early(study, problem, estimate, time.perf_counter() - start)
+        with keep_answer(report):
+            kinds = classify_failures(study.problem, estimate)
+            estimate, kinds = list_all_kinds(study.problem, estimate, kinds)
+            report = replace(report, estimate=estimate, kinds=kinds)
+            if recorder is not None:
+                recorder.write(estimate, kinds.by_scenario)
     finally:
         if recorder is not None:
             recorder.close()
-    again = recheck(study, keeper)
-    lost = "" if recorder is None else recorder.lost
-    return Report(study, estimate, seconds, tuple(problem.faults), kinds, problem.n_retried, again, lost)
+    with keep_answer(report):
+        again = recheck(study, keeper)
+    return replace(report, repeatability=again, lost="" if recorder is None else recorder.lost)
+
+
+def _report_early(study: Study, problem: SimulatedProblem, estimate: samplers.Estimate, seconds: float) -> Report:
+    """Return the report of an estimate whose failures were not driven again."""
+    kinds = CrashKinds(unknown="the run was interrupted")
+    return Report(study, estimate, seconds, tuple(problem.faults), kinds, problem.n_retried)
 
 
 def settle_chunk(study: Study, executor: Executor | None) -> Study:
@@ -246,20 +254,25 @@ def resume(
 
 def _run(folder: Path, study: Study, journal: JournalFile, progress: bool, executor: Executor | None = None) -> Report:
     target, earlier = folder.absolute(), journal.earlier_seconds  # an ego may change the working directory
+
+    def kept(report: Report | None = None) -> str:
+        return describe_kept(journal, folder, study.question.trust, report)
+
     try:
         report = run(study, progress, journal, executor, target)
         report = replace(report, seconds=report.seconds + earlier, earlier_seconds=earlier)
-        _write(target, report)
+        with keep_answer(report):
+            _write(target, report)
     except UnwrittenResults as error:
-        raise UnwrittenResults(f"{error}{_resume_hint(journal, folder, study.question.trust)}", error.report) from error
+        raise UnwrittenResults(f"{error}{kept(error.report)}", error.report) from error
     except BadInput as error:
         if not journal.has_simulations:
             journal.remove()
             (target / STUDY).unlink(missing_ok=True)
-        raise BadInput(f"{error}{_resume_hint(journal, folder, study.question.trust)}") from error
+        raise BadInput(f"{error}{kept()}") from error
     except KeyboardInterrupt as error:
-        report_so_far = error.report if isinstance(error, RunInterrupted) else None
-        raise RunInterrupted(f"Stopped.{_resume_hint(journal, folder, study.question.trust)}", report_so_far) from None
+        known = error if isinstance(error, RunInterrupted) else RunInterrupted("Stopped.")
+        raise RunInterrupted(f"{known}{kept(known.report)}", known.report) from None
     journal.remove()
     return report
 
@@ -274,11 +287,3 @@ def _write(folder: Path, report: Report) -> None:
         raise UnwrittenResults(
             f"Cannot write the results to {str(folder)!r}: {error.strerror or error}.", report
         ) from error
-
-
-def _resume_hint(journal: JournalFile, folder: Path, trust: bool) -> str:
-    """Return the number of simulations kept and the command that continues the run."""
-    if not journal.has_simulations or not journal.kept:
-        return ""
-    kept = f"{journal.n:,} simulations are" if journal.n else "What was simulated is"
-    return f" {kept} kept; go on with: rare-envs resume {shlex.quote(str(folder))}{' --trust' if trust else ''}"

@@ -39,6 +39,7 @@ class JournaledEvaluation:
     Attributes:
         n_restored: Rows whose results were taken from the journal.
         on_chunk: Called with the number of rows of the request that are done, after every chunk.
+        on_result: Called with every chunk and its result, as soon as it is known.
     """
 
     def __init__(
@@ -50,6 +51,7 @@ class JournaledEvaluation:
         self._checked = False
         self.n_restored = 0
         self.on_chunk: Callable[[int], None] | None = None
+        self.on_result: Callable[[Chunk, Packed], None] | None = None
 
     @property
     def n_retries(self) -> int:
@@ -77,6 +79,7 @@ class JournaledEvaluation:
             if self._journal is not None:
                 digest = self._work.digest(chunks[number - first])
                 self._journal.append(JournalRecord(digest, packed[0], packed[1]))
+            self._tell(chunks[number - first], packed)
             changed()
 
         def changed() -> None:
@@ -122,7 +125,12 @@ class JournaledEvaluation:
             assert self._journal is not None
             check_same_f(self._journal, self._compute_f, chunk.x, record.f[: len(chunk)])
         self.n_restored += len(chunk)
+        self._tell(chunk, (record.f, record.notes))
         return record.f, record.notes
+
+    def _tell(self, chunk: Chunk, packed: Packed) -> None:
+        if self.on_result is not None:
+            self.on_result(chunk, packed)
 
     def _compute_f(self, x: FloatArray) -> FloatArray:
         """Return f of a few points, which are not kept."""

@@ -45,6 +45,7 @@ from rare_envs.study.cli.shell import (
     keep_stdout_for_the_answer,
     print_json,
     require_driving,
+    say_early_stop,
     show_what_is_known,
 )
 from rare_envs.study.errors import as_bad_input
@@ -105,6 +106,7 @@ app.command("estimate")(estimate_command)
 
 @app.command("risk")
 @spread_options
+@say_early_stop()
 @use_one_thread()
 def risk_command(
     ego: EgoArgument,
@@ -150,6 +152,7 @@ app.command("resume")(resume_command)
 
 @app.command("compare")
 @spread_options
+@say_early_stop()
 @use_one_thread()
 def compare_command(
     ego_a: Annotated[str, typer.Argument(metavar="EGO_A", help="An ego, as for estimate --ego.")],
@@ -175,7 +178,7 @@ def compare_command(
     from rare_envs.study.question import Question
 
     question = Question(env_id=env, ego=ego_a, max_sim=max_sim, algo=algo, stats=stats, **options.arguments())
-    with keep_stdout_for_the_answer():
+    with show_what_is_known(print), keep_stdout_for_the_answer():
         comparison = compare_egos(question, ego_b, progress=True, out=out, force=force, algo_b=algo_b, stats_b=stats_b)
     if as_json:
         print_json(comparison.answer)

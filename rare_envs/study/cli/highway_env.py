@@ -41,10 +41,12 @@ def estimate_highway_env(
 
     Raises:
         BadInput: An option does not go with such an environment, the ego does not fit, or the folder cannot be used.
+        RunInterrupted: It was interrupted; this has the answer of those made.
     """
     import agents
     import rare_envs
     import samplers
+    from rare_envs.study.execution.interruption import FIRST_BATCH, RunInterrupted, describe_stop
 
     refused = sorted(typed - OPTIONS)
     if refused:
@@ -62,14 +64,20 @@ def estimate_highway_env(
         problem = rare_envs.highway_env_problem(
             question.env_id, ego, measure=question.measure, noise=question.noise, fixed="highway_env", **settings
         )
-        with problem:
-            result = samplers.estimate(
-                problem,
-                question.method,
-                progress=True,
-                executor=executor,
-                **_read_arguments(question),
-            )
+        try:
+            with problem:
+                result = samplers.estimate(
+                    problem,
+                    question.method,
+                    progress=True,
+                    executor=executor,
+                    **_read_arguments(question),
+                )
+        except samplers.EstimationInterrupted as stopped:
+            known = _describe(question, problem, stopped.estimate)
+            raise RunInterrupted(describe_stop(stopped.estimate), known) from None
+        except KeyboardInterrupt:
+            raise RunInterrupted(FIRST_BATCH) from None
     if file is not None:
         with output_folder(file.parent):
             result.save(file)

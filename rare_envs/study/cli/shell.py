@@ -25,6 +25,9 @@ from rare_envs.study.errors import BadInput, as_bad_input
 DOUBTFUL = 3
 """Exit code of a command that is done, with warnings that make its number doubtful."""
 
+NOTHING_MADE = "Stopped: no estimate yet, no simulation made."
+"""What is known of a run that was interrupted before it has begun."""
+
 WHOLE = 1_000
 """Characters of a summary in a list of commands: more than any has."""
 
@@ -40,6 +43,13 @@ class Terminated(KeyboardInterrupt):
     def __init__(self, number: int) -> None:
         super().__init__(f"ended by {signal.Signals(number).name}")
         self.number = number
+
+
+class AnswerCut(KeyboardInterrupt):
+    """The printing of an answer was interrupted."""
+
+    report = None
+    """As of `RunInterrupted`: what could be said has been said."""
 
 
 class SummarisedCommands(TyperGroup):
@@ -213,10 +223,25 @@ def _fail(message: str) -> NoReturn:
 
 
 @contextlib.contextmanager
+def say_early_stop(words: str = NOTHING_MADE) -> Iterator[None]:
+    """Print in one line what is known of a run that is interrupted before it has begun; for a command.
+
+    Args:
+        words: The line.
+    """
+    try:
+        yield
+    except KeyboardInterrupt as error:
+        if not hasattr(error, "report"):  # unlike `RunInterrupted`
+            _print_stderr(words)
+        raise
+
+
+@contextlib.contextmanager
 def show_what_is_known(show: Callable[[Any], None]) -> Iterator[None]:
     """Print what a run knows that was interrupted, or whose results could not be written.
 
-    The message of a KeyboardInterrupt, which says how to continue the run, is printed too; Typer would drop it.
+    The message of the interruption, one line, comes first: whoever ended the process may not wait for the rest.
 
     Args:
         show: Prints a report.
@@ -225,11 +250,29 @@ def show_what_is_known(show: Callable[[Any], None]) -> Iterator[None]:
         yield
     except (KeyboardInterrupt, BadInput) as error:
         report = getattr(error, "report", None)  # of `RunInterrupted` and `UnwrittenResults`, slow to import
-        if report is not None:
-            show(report)
-        if isinstance(error, KeyboardInterrupt) and str(error):
+        if isinstance(error, KeyboardInterrupt) and hasattr(error, "report"):
             _print_stderr(str(error))
+        if report is not None:
+            print_whole(lambda: show(report))
         raise
+
+
+def print_whole(show: Callable[[], None]) -> None:
+    """Print an answer to its end: the first signal meanwhile changes nothing, as the command is about to end by itself.
+
+    Raises:
+        AnswerCut: There was a second signal.
+    """
+    from samplers.execution.interruption import defer_signals  # slow to import, and known by now
+
+    whole = False
+    try:
+        with defer_signals():
+            show()
+            whole = True
+    except KeyboardInterrupt:
+        if not whole:
+            raise AnswerCut from None
 
 
 @contextlib.contextmanager

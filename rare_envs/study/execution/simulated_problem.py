@@ -29,6 +29,8 @@ class SimulatedProblem(WrappedProblem):
         evaluation: Keeps and computes chunks.
         workers: Number of workers; 0 without an executor.
         row_seconds: Wall time of each simulation of the last batch [s], that of its chunk shared equally, shape (n,).
+        n_made: Simulations of which f is known, those of a batch that is not complete included.
+        n_failed: Those of them that failed, or have no outcome.
     """
 
     def __init__(self, study: Study, journal: JournalFile | None = None, pool: WorkerPool | None = None) -> None:
@@ -48,6 +50,8 @@ class SimulatedProblem(WrappedProblem):
         self.faults: list[Fault] = []
         self.n_retried = 0
         self.row_seconds = np.empty(0)
+        self.n_made = self.n_failed = 0
+        self.evaluation.on_result = self._count
 
     def evaluate(self, x: FloatArray) -> FloatArray:
         """Return f of scenarios x (n, d), shape (n,); NaN where the ego failed twice."""
@@ -88,6 +92,12 @@ class SimulatedProblem(WrappedProblem):
         parts = self.evaluation.evaluate(request)
         self.n_retried += sum(int(notes["n_retried"]) for _, (_, notes) in parts)
         return parts
+
+    def _count(self, chunk: Chunk, packed: Packed) -> None:
+        if chunk.kind != "gradient":
+            f = packed[0][: len(chunk)]
+            self.n_made += len(f)
+            self.n_failed += int((np.isnan(f) | (f <= self._work.gamma)).sum())
 
     def _record_faults(self, chunk: Chunk, f: FloatArray, reasons: list[str]) -> None:
         """Record the scenarios of a chunk without an outcome, with the reasons in their order."""

@@ -16,6 +16,7 @@ from rare_envs.scenarios.registry import env_id_of, scenario_named
 from rare_envs.study.collision_rate import find_frequency
 from rare_envs.study.errors import BadInput, as_bad_input
 from rare_envs.study.evaluate import run, run_into
+from rare_envs.study.execution.interruption import RunInterrupted, keep_answer
 from rare_envs.study.question import Question, Study, prepare
 from rare_envs.study.rates.result import Risk, ScenarioRisk
 from rare_envs.study.rates.sites import check_sites, choose_base, compare_sites
@@ -59,6 +60,7 @@ def risk(
 
     Raises:
         BadInput: An argument cannot be used; a scenario has no frequency of its events; or the ego failed.
+        RunInterrupted: It was interrupted; the message says what is known.
 
     Example:
         >>> risk("idm", scenarios=("cut_in", "car_following"))
@@ -81,10 +83,13 @@ def risk(
     if folder is not None and not force:
         for name in scenarios:  # all of them, before the first one is run
             check_no_results(folder / name)
-    found = Risk(
-        ego=ego if isinstance(ego, str) else type(ego).__name__,
-        scenarios=tuple(_evaluate(study, notes, sites[1:], folder, progress, force) for study, notes in prepared),
-    )
+    done: list[ScenarioRisk] = []
+    for study, notes in prepared:
+        try:
+            done.append(_evaluate(study, notes, sites[1:], folder, progress, force))
+        except RunInterrupted as error:
+            raise RunInterrupted(f"{error}{_describe_done(done)}", error.report) from None
+    found = Risk(ego=ego if isinstance(ego, str) else type(ego).__name__, scenarios=tuple(done))
     if folder is not None:
         write_risk(folder, found)
     return found
@@ -94,6 +99,11 @@ def write_risk(folder: Path, found: Risk) -> None:
     """Write risk.json and risk.png into an existing folder."""
     replace_text(folder / "risk.json", format_json(found.to_dict()) + "\n")
     found.save_plot(folder / "risk.png")
+
+
+def _describe_done(done: Sequence[ScenarioRisk]) -> str:
+    """Return what is known of scenarios whose runs are done, behind a space; empty if there are none."""
+    return f" Done before: {'; '.join(' '.join(one.describe().split()) for one in done)}." if done else ""
 
 
 def _check_scenarios(scenarios: Sequence[str], sites: Sequence[str], bases: Mapping[str, Any]) -> None:
@@ -134,7 +144,8 @@ def _evaluate(
     name = study.problem.world.scenario.name
     report = run(study, progress) if folder is None else run_into(folder / name, study, progress, force)
     assert report.rate is not None  # `risk` has looked for the frequency before
-    factors = compare_sites(report, other_sites, progress)
+    with keep_answer(report):
+        factors = compare_sites(report, other_sites, progress)
     logs = [0.0, *(float(np.log(factors[site])) for site in other_sites if factors.get(site, 0) > 0)]
     spread = float(np.std(logs, ddof=1)) if len(logs) > 1 else 0.0
     return ScenarioRisk(

@@ -23,6 +23,8 @@ from rare_envs.study.cli.shell import (
     is_typed,
     keep_stdout_for_the_answer,
     print_json,
+    print_whole,
+    say_early_stop,
     show_what_is_known,
 )
 from rare_envs.study.errors import BadInput, as_bad_input
@@ -37,6 +39,7 @@ GATE_CODES = {"passes": 0, "fails": 4, "undecided": 5}
 
 
 @spread_options
+@say_early_stop()
 @use_one_thread()
 def estimate_command(
     context: typer.Context,
@@ -90,13 +93,16 @@ def _estimate_highway_env(
     """Estimate in an environment of HighwayEnv, print the answer and exit."""
     from rare_envs.study.cli.highway_env import estimate_highway_env
 
-    with keep_stdout_for_the_answer(), as_bad_input(ValueError):
+    def show(answer: dict[str, Any], where: str = "") -> None:
+        text = answer.pop("text")
+        if as_json:
+            print_json(answer)
+        else:
+            print(f"{text}{where}")
+
+    with show_what_is_known(show), keep_stdout_for_the_answer(), as_bad_input(ValueError):
         answer = estimate_highway_env(question, typed, out, force, places.make())
-    text = answer.pop("text")
-    if as_json:
-        print_json(answer)
-    else:
-        print(text if out is None else f"{text}\nWrote {out}.")
+    print_whole(lambda: show(answer, "" if out is None else f"\nWrote {out}."))
     raise typer.Exit(DOUBTFUL if answer["doubtful"] else 0)
 
 
@@ -113,7 +119,7 @@ def _refuse_options_of_a_limit(typed: set[str]) -> None:
 
 def _answer(report: Any, out: Path | None, as_json: bool, details: bool) -> NoReturn:
     """Print a report and exit."""
-    show_report(report, out, as_json, details)
+    print_whole(lambda: show_report(report, out, as_json, details))
     if report.verdict is not None:
         raise typer.Exit(GATE_CODES[report.verdict.decision])
     raise typer.Exit(DOUBTFUL if report.doubtful else 0)
@@ -133,6 +139,7 @@ def show_report(report: Any, out: Path | None, as_json: bool, details: bool = Fa
 
 
 @spread_options
+@say_early_stop("Stopped before the run went on; what it had kept is still there.")
 @use_one_thread()
 def resume_command(
     run: Annotated[

@@ -17,11 +17,13 @@ import typer
 from typer.testing import CliRunner
 
 from rare_envs.study.cli.shell import (
+    AnswerCut,
     OneLineErrors,
     Terminated,
     keep_stdout_for_the_answer,
     name_options,
     one_line_warnings,
+    print_whole,
     signals_as_exceptions,
 )
 from rare_envs.study.errors import BadInput
@@ -141,6 +143,21 @@ def test_a_signal_hides_neither_an_answer_nor_an_error(code: int, said: str) -> 
     result = CliRunner().invoke(app, ["answer"])
     assert (result.exit_code, result.stderr) == (code, said)
     assert {number: signal.getsignal(number) for number in before} == before
+
+
+def test_an_answer_is_printed_to_its_end(capsys: pytest.CaptureFixture[str]) -> None:
+    def show(signals: int) -> None:
+        print("the beginning")
+        for _ in range(signals):
+            os.kill(os.getpid(), signal.SIGTERM)
+        print("the end")
+
+    with signals_as_exceptions([]):
+        print_whole(lambda: show(1))
+        assert capsys.readouterr().out == "the beginning\nthe end\n"
+        with pytest.raises(AnswerCut):
+            print_whole(lambda: show(2))
+    assert capsys.readouterr().out == "the beginning\n"
 
 
 @pytest.mark.parametrize("name", ["SIGINT", "SIGTERM", "SIGHUP"])
