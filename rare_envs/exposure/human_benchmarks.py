@@ -143,7 +143,7 @@ def summarise_human_contacts() -> str:
 
     Example:
         >>> summarise_human_contacts()
-        'people 15 to 21'
+        'people 15 to 21 (contacts at any speed)'
     """
     low, high = sorted((CONTACTS_SHRP2.per_million_km, CONTACTS_100CAR.per_million_km))
-    return f"people {low:.2g} to {high:.2g}"
+    return f"people {low:.2g} to {high:.2g} (contacts at any speed)"

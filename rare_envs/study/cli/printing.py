@@ -21,7 +21,7 @@ from rare_envs.study.cli.summary import (
 )
 from rare_envs.study.columns import MAX_SHOWN, draw_ordinary, find_ordinary_range, format_value
 from rare_envs.study.crash_kinds import KIND_DESCRIPTIONS
-from rare_envs.study.rates.text import describe_injuries, describe_parts, format_interval, format_rate, name_events
+from rare_envs.study.rates.text import describe_injuries, describe_parts, format_rate, format_with_interval, name_events
 from rare_envs.study.report import Report
 from samplers.presentation.estimate_display import indent_lines
 from samplers.problem import FloatArray
@@ -153,9 +153,9 @@ def _print_rate(console: Console, report: Report) -> None:
         console.print(f"  {'collisions':<15} {report.no_rate}")
         return
     console.print(
-        f"  {'collisions':<15} {format_rate(rate.per_million_km)} per million km "
-        f"({format_interval(rate.interval_per_million_km)}), {format_rate(rate.per_hour)} per hour "
-        f"({format_interval(rate.interval_per_hour)}); {describe_human_contacts()}"
+        f"  {'collisions':<15} "
+        f"{format_with_interval(rate.per_million_km, rate.interval_per_million_km, ' per million km')}, "
+        f"{format_with_interval(rate.per_hour, rate.interval_per_hour, ' per hour')}; {describe_human_contacts()}"
     )
     events = f"{format_rate(rate.frequency.per_km)} {name_events(rate.scenario)} per km"
     parts = describe_parts(rate)

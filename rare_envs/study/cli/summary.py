@@ -12,7 +12,7 @@ from rare_envs.exposure import CollisionRate, summarise_human_contacts
 from rare_envs.study.columns import MAX_SHOWN, draw_ordinary, find_ordinary_range, format_value, list_columns
 from rare_envs.study.crash_kinds import KIND_DESCRIPTIONS
 from rare_envs.study.html_report.wording import explain_no_gain
-from rare_envs.study.rates.text import format_interval, format_rate
+from rare_envs.study.rates.text import format_with_interval
 from rare_envs.study.report import Report
 from samplers.trace import describe_outcome
 
@@ -132,7 +132,7 @@ def _describe_rate(report: Report) -> list[Row]:
 
 
 def _describe_per_km(rate: CollisionRate) -> str:
-    return f"{format_rate(rate.per_million_km)} per million km ({format_interval(rate.interval_per_million_km)})"
+    return format_with_interval(rate.per_million_km, rate.interval_per_million_km, " per million km")
 
 
 def _describe_kinds(report: Report) -> list[Row]:

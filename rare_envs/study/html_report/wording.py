@@ -9,7 +9,7 @@ from typing import Any
 from rare_envs.exposure import describe_human_contacts
 from rare_envs.measures import MEASURES
 from rare_envs.study.crash_kinds import KIND_DESCRIPTIONS
-from rare_envs.study.rates.text import format_interval, format_rate
+from rare_envs.study.rates.text import format_with_interval
 
 Result = Mapping[str, Any]
 WIDE_BASE = 10.0
@@ -195,13 +195,11 @@ def describe_rate(result: Result) -> list[str]:
     rate = result.get("rate")
     if not isinstance(rate, dict):
         return [str(result.get("no_rate") or "no rate is known")]
-    lines = [
-        f"{format_rate(rate['per_million_km'])} collisions per million km "
-        f"({format_interval(tuple(rate['interval_per_million_km']))}), {format_rate(rate['per_hour'])} per hour "
-        f"({format_interval(tuple(rate['interval_per_hour']))})",
-        describe_human_contacts(),
-    ]
-    return lines
+    per_km, per_hour = (
+        format_with_interval(rate[per], tuple(rate[f"interval_{per}"]), f"{what} {per.replace('_', ' ')}")
+        for per, what in (("per_million_km", " collisions"), ("per_hour", ""))
+    )
+    return [f"{per_km}, {per_hour}", describe_human_contacts()]
 
 
 def describe_method(result: Result) -> str:

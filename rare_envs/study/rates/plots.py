@@ -13,7 +13,7 @@ from rare_envs.exposure.rate import RateInterval
 from rare_envs.exposure.total_rate import TotalRate
 from rare_envs.files import replace_file
 from rare_envs.study.plots import HIT_COLOUR, LINE_COLOUR, ORDINARY_COLOUR, STYLE
-from rare_envs.study.rates.text import format_interval, format_rate, format_share, name_scenario, name_source
+from rare_envs.study.rates.text import format_rate, format_share, format_with_interval, name_scenario, name_source
 
 FRACTION_BELOW = 0.1
 """Left end of the axis over the smallest number on it, where an interval reaches down to 0."""
@@ -32,8 +32,13 @@ def save_risk_plot(path: Path, ego: str, total: TotalRate) -> None:
         figure = Figure(figsize=(12, height), layout="constrained")
         left, right = figure.subplots(1, 2, width_ratios=(1.5, 1.0))
         figure.suptitle(
-            f"ego {ego}: {format_rate(total.per_million_km)} collisions per million km "
-            f"({100 * total.confidence:g} %: {format_interval(total.interval_per_million_km)})",
+            f"ego {ego}: "
+            + format_with_interval(
+                total.per_million_km,
+                total.interval_per_million_km,
+                " collisions per million km",
+                f"{100 * total.confidence:g} %: ",
+            ),
             fontsize=12,
             fontweight="bold",
         )

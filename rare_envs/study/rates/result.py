@@ -16,9 +16,9 @@ from rare_envs.study.rates.plots import save_risk_plot
 from rare_envs.study.rates.text import (
     describe_injuries,
     describe_uncertainty,
-    format_interval,
     format_rate,
     format_share,
+    format_with_interval,
     name_scenario,
 )
 from rare_envs.study.report import Report
@@ -68,7 +68,7 @@ class ScenarioRisk:
         sites = "".join(f", under {name} {factor:.2g} times as much" for name, factor in factors.items())
         return (
             f"{name_scenario(self.name):<13} {format_rate(rate.frequency.per_km)} per km x {rate.probability.p:.1e} = "
-            f"{format_rate(rate.per_million_km)}  ({format_interval(rate.interval_per_million_km)})   "
+            f"{format_with_interval(rate.per_million_km, rate.interval_per_million_km, ' ')}   "
             f"{behind} ({self.base_name} of {version}){sites}"
         )
 
@@ -135,13 +135,13 @@ class Risk:
     def __str__(self) -> str:
         """Return the table, for people."""
         total = self.total
-        per_km, per_hour = (format_interval(each) for each in (total.interval_per_million_km, total.interval_per_hour))
-        level = f"{100 * total.confidence:g} %"
+        level = f"{100 * total.confidence:g} %: "
+        per_km = format_with_interval(total.per_million_km, total.interval_per_million_km, " ", level)
+        per_hour = format_with_interval(total.per_hour, total.interval_per_hour, " ", level)
         lines = [
-            f"collisions per million km  {format_rate(total.per_million_km)}  ({level}: {per_km})   "
-            f"{describe_human_contacts()}",
+            f"collisions per million km  {per_km}   {describe_human_contacts()}",
             *(f"  {each.describe()}" for each in self.scenarios),
-            f"  per hour      {format_rate(total.per_hour)}  ({level}: {per_hour})",
+            f"  per hour      {per_hour}",
             *self._describe_kinds(),
             *([] if self.injuries is None else [f"  {describe_injuries(self.injuries)}"]),
         ]

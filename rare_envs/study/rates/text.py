@@ -11,8 +11,8 @@ EVENT_NOUNS = {"cut_in": "cut-ins", "hard_brake": "brakings", "car_following": "
 """Events of the scenarios, in the plural."""
 SOURCE_NOUNS = {"counts": "event counts", "sampling": "simulation"}
 PART_NOUNS = {"base": "base distribution", "site": "difference between sites", **SOURCE_NOUNS}
-LARGE, SMALL = 99.5, 0.01
-"""Rates from which whole numbers, and below which powers of ten are shown."""
+LARGE, SMALL, SMALL_BESIDE = 99.5, 0.01, 0.001
+"""Rates from which whole numbers are shown, and below which powers of ten: alone, and beside a rate above `SMALL`."""
 
 
 def format_rate(value: float) -> str:
@@ -22,22 +22,51 @@ def format_rate(value: float) -> str:
         >>> [format_rate(value) for value in (202.5, 5.14, 0.26, 0.0007, 0.0)]
         ['200', '5.1', '0.26', '7.0e-04', '0']
     """
-    if value == 0 or not math.isfinite(value):
+    return format_alike(value)[0]
+
+
+def format_alike(*values: float) -> list[str]:
+    """Return rates with two digits, all as decimals or all with powers of ten.
+
+    Example:
+        >>> format_alike(0.011, 0.001, 0.12), format_alike(0.011, 1e-4, 0.12), format_alike(11.0, 0.16, 820.0)
+        (['0.011', '0.0010', '0.12'], ['1.1e-02', '1.0e-04', '1.2e-01'], ['11', '0.16', '820'])
+    """
+    sizes = [value for value in values if value > 0 and math.isfinite(value)]
+    least = SMALL if max(sizes, default=SMALL) < SMALL else SMALL_BESIDE
+    decimal = all(value >= least for value in sizes)
+    return [_format_decimal(value) if decimal else _format_power(value) for value in values]
+
+
+def _format_power(value: float) -> str:
+    return f"{value:.1e}" if value > 0 and math.isfinite(value) else f"{value:g}"
+
+
+def _format_decimal(value: float) -> str:
+    if value <= 0 or not math.isfinite(value):
         return f"{value:g}"
     if value >= LARGE:
         return f"{round(value, 1 - math.floor(math.log10(value))):,.0f}"
-    return f"{value:#.2g}".rstrip(".") if value >= SMALL else f"{value:.1e}"
+    return f"{value:#.2g}".rstrip(".")
 
 
-def format_interval(interval: RateInterval) -> str:
-    """Return an interval of a rate, or what it is below.
+def format_with_interval(value: float, interval: RateInterval, unit: str = "", level: str = "") -> str:
+    """Return a rate with its interval, or what it is below, all numbers in one form.
+
+    Args:
+        value: The rate.
+        interval: Its interval.
+        unit: Behind the rate, with a space before it.
+        level: Before the interval, with a space after it.
 
     Example:
-        >>> format_interval((0.4, 62.0)), format_interval((0.0, 3.0))
-        ('0.40 to 62', 'below 3.0')
+        >>> format_with_interval(0.011, (0.001, 0.12), " per hour")
+        '0.011 per hour (0.0010 to 0.12)'
+        >>> format_with_interval(2e-7, (0.0, 1700.0), level="95 %: ")
+        '2.0e-07 (95 %: below 1.7e+03)'
     """
-    low, high = interval
-    return f"{format_rate(low)} to {format_rate(high)}" if low > 0 else f"below {format_rate(high)}"
+    middle, low, high = format_alike(value, *interval)
+    return f"{middle}{unit} ({level}{f'{low} to' if interval[0] > 0 else 'below'} {high})"
 
 
 def format_share(share: float) -> str:
@@ -68,9 +97,8 @@ def describe_parts(rate: CollisionRate) -> str:
 
 def describe_injuries(rate: CollisionRate | TotalRate) -> str:
     """Return a rate of serious injuries with its interval, in words."""
-    return (
-        f"serious injuries (MAIS 3+) {format_rate(rate.per_million_km)} per million km "
-        f"({100 * rate.confidence:g} %: {format_interval(rate.interval_per_million_km)})"
+    return "serious injuries (MAIS 3+) " + format_with_interval(
+        rate.per_million_km, rate.interval_per_million_km, " per million km", f"{100 * rate.confidence:g} %: "
     )
 
 

@@ -89,7 +89,7 @@ def test_out_in_a_file_is_refused(cli: Cli, here: Path, bases: list[str]) -> Non
 def test_estimate_prints_the_rate_beside_people(cli: Cli, here: Path) -> None:
     base = write_fitted(here / "fitted.json", "hard_brake")
     short = " ".join(cli(*BRAKE, "--base", base).stdout.split())
-    assert "per million km (" in short and "; people 15 to 21 " in short
+    assert "per million km (" in short and "; people 15 to 21 (contacts at any speed) " in short
     text = " ".join(cli(*BRAKE, "--base", base, "--details").stdout.split())
     assert "per million km (" in text
     assert (

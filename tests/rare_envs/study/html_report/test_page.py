@@ -223,6 +223,19 @@ def test_a_run_without_failures_has_a_page(tmp_path: Path, safe: str) -> None:
     assert "None of 50 simulations ends in a collision" in text and "No failure was found." in text
 
 
+def test_on_a_phone_every_number_of_a_table_has_its_heading(folder: Path) -> None:
+    text = (folder / "report.html").read_text(encoding="utf-8")
+    tables = re.findall(r"<table.*?</table>", text, re.DOTALL)
+    assert len(tables) >= 4 and all(table.startswith('<table class="cards') for table in tables)
+    for table in tables:
+        heads = re.findall(r"<th[^>]*>([^<]*)</th>", table)
+        for row in re.findall(r"<tr><td.*?</tr>", table):
+            cells = re.findall(r'<td(?: class="([^"]*)")?(?: data-head="([^"]*)")?>', row)
+            assert len(cells) == len(heads)
+            for head, (kind, named) in zip(heads, cells, strict=True):
+                assert named == head or (kind != "n" and not named)
+
+
 def find_chromium() -> str | None:
     """Return a browser to look with: RARE_ENVS_CHROMIUM, or one that is installed."""
     names = ("chromium", "chromium-browser", "google-chrome", "chrome")
@@ -245,6 +258,8 @@ def test_a_browser_shows_the_page_without_a_network_and_without_sideways_scrolli
         tab.on("request", lambda request: said.append(request.url) if request.url.startswith("http") else None)
         tab.goto(f"file://{folder / 'report.html'}")
         assert tab.evaluate("document.documentElement.scrollWidth") == width
+        wide = "[...document.querySelectorAll('table')].filter(e => e.scrollWidth > e.parentElement.clientWidth).length"
+        assert tab.evaluate(wide) == 0
         assert said == []
         assert len(tab.pdf(format="A4")) > 20_000
         browser.close()

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import pytest
 
 from rare_envs.exposure.total_rate import FurtherEvents, TotalRate, VarianceShare
@@ -9,8 +11,8 @@ from rare_envs.study.rates.text import (
     describe_further_events,
     describe_parts,
     describe_uncertainty,
-    format_interval,
     format_rate,
+    format_with_interval,
     name_events,
     name_scenario,
     name_source,
@@ -35,7 +37,24 @@ def test_two_digits(value: float, text: str) -> None:
 
 
 def test_an_interval_from_zero_is_a_bound() -> None:
-    assert format_interval((0.0, 0.0123)) == "below 0.012"
+    assert format_with_interval(0.0, (0.0, 0.0123)) == "0 (below 0.012)"
+
+
+@pytest.mark.parametrize(
+    ("value", "interval", "text"),
+    [
+        (0.011, (0.001, 0.12), "0.011 (0.0010 to 0.12)"),
+        (0.021, (0.0051, 0.15), "0.021 (0.0051 to 0.15)"),
+        (0.003, (0.001, 0.009), "3.0e-03 (1.0e-03 to 9.0e-03)"),
+        (0.003, (0.0004, 0.012), "3.0e-03 (4.0e-04 to 1.2e-02)"),
+        (11.0, (0.16, 820.0), "11 (0.16 to 820)"),
+        (2e-7, (0.0, 1700.0), "2.0e-07 (below 1.7e+03)"),
+        (1700.0, (30.0, math.inf), "1,700 (30 to inf)"),
+        (math.nan, (0.0, 5e-4), "nan (below 5.0e-04)"),
+    ],
+)
+def test_a_rate_and_its_interval_have_one_form(value: float, interval: tuple[float, float], text: str) -> None:
+    assert format_with_interval(value, interval) == text
 
 
 def test_words_of_scenarios_events_and_sources() -> None:
