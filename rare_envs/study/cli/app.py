@@ -25,6 +25,7 @@ from rare_envs.study.cli.commands.report import report_command
 from rare_envs.study.cli.commands.reproduce import reproduce_app
 from rare_envs.study.cli.commands.serve_ego import serve_ego_command
 from rare_envs.study.cli.commands.train import train_drivers_command, train_ego_command
+from rare_envs.study.cli.completion import EGO_WORDS, complete_kind, complete_scenario, complete_words
 from rare_envs.study.cli.examples import add_examples, format_examples
 from rare_envs.study.cli.options import (
     AlgoOption,
@@ -82,7 +83,9 @@ def list_command(
     what: Annotated[
         str | None,
         typer.Argument(
-            metavar="[WHAT]", help="environments, methods, egos, drivers, measures, weather, all, or an environment."
+            metavar="[WHAT]",
+            help="environments, methods, egos, drivers, measures, weather, all, or an environment.",
+            autocompletion=complete_kind,
         ),
     ] = None,
     as_json: JsonOption = False,
@@ -133,7 +136,12 @@ def risk_command(
 
 @app.command("bases")
 def bases_command(
-    scenario: Annotated[str, typer.Argument(metavar="SCENARIO", help="Environment, or its short name: cut_in.")],
+    scenario: Annotated[
+        str,
+        typer.Argument(
+            metavar="SCENARIO", help="Environment, or its short name: cut_in.", autocompletion=complete_scenario
+        ),
+    ],
     as_json: JsonOption = False,
 ) -> None:
     """List the base distributions of a scenario: events, site, family, fit, frequency and predictive checks."""
@@ -155,8 +163,15 @@ app.command("resume")(resume_command)
 @say_early_stop()
 @use_one_thread()
 def compare_command(
-    ego_a: Annotated[str, typer.Argument(metavar="EGO_A", help="An ego, as for estimate --ego.")],
-    ego_b: Annotated[str, typer.Argument(metavar="EGO_B", help="The other ego.")],
+    ego_a: Annotated[
+        str,
+        typer.Argument(
+            metavar="EGO_A", help="An ego, as for estimate --ego.", autocompletion=complete_words(*EGO_WORDS)
+        ),
+    ],
+    ego_b: Annotated[
+        str, typer.Argument(metavar="EGO_B", help="The other ego.", autocompletion=complete_words(*EGO_WORDS))
+    ],
     env: EnvArgument,
     options: QuestionOptions,
     max_sim: Annotated[

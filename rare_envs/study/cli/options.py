@@ -14,6 +14,18 @@ from typing import Annotated, Any
 
 import typer
 
+from rare_envs.study.cli.completion import (
+    ACTION_WORDS,
+    DRIVER_WORDS,
+    EGO_WORDS,
+    MEASURE_WORDS,
+    OBSERVATION_WORDS,
+    complete_base,
+    complete_environment,
+    complete_method,
+    complete_words,
+)
+
 
 class NoiseChoice(str, Enum):
     """Names for the `noise` argument of `DrivingProblem`: True, "fixed" and False.
@@ -66,31 +78,6 @@ LEADER_SCENARIOS = {"cut-in": "cut_in", "car-following": "car_following"}
 """Scenarios in which the ego gets a new leader; each is run beside the hard brake, and they count nothing twice."""
 
 
-def complete_environment(incomplete: str) -> list[str]:
-    """Return the ids, with and without their namespace, that begin so, for completion in a shell.
-
-    Example:
-        >>> complete_environment("rare_envs/Car"), complete_environment("Car")
-        (['rare_envs/CarFollowing-v0'], ['CarFollowing-v0'])
-    """
-    from rare_envs.scenarios.registry import SCENARIOS
-
-    short = [env_id.rpartition("/")[2] for env_id in SCENARIOS]
-    return [each for names in (SCENARIOS, short) for each in names if each.startswith(incomplete)]
-
-
-def complete_method(incomplete: str) -> list[str]:
-    """Return the estimation methods whose names begin so.
-
-    Example:
-        >>> complete_method("a")
-        ['adss', 'auto']
-    """
-    import samplers
-
-    return sorted(name for name in samplers.METHODS if name.startswith(incomplete))
-
-
 def read_environment(text: str | None) -> str | None:
     """Return the id of an environment with its namespace, where it was typed without.
 
@@ -112,7 +99,10 @@ EnvArgument = Annotated[
         callback=read_environment,
     ),
 ]
-EgoArgument = Annotated[str, typer.Argument(metavar="EGO", help="An ego, as for estimate --ego.")]
+EgoArgument = Annotated[
+    str,
+    typer.Argument(metavar="EGO", help="An ego, as for estimate --ego.", autocompletion=complete_words(*EGO_WORDS)),
+]
 ForceOption = Annotated[bool, typer.Option("--force", help="Replace what the folder of --out has of an earlier run.")]
 AlgoOption = Annotated[str | None, typer.Option(help="Algorithm of the .zip, if the file does not tell.")]
 StatsOption = Annotated[
@@ -135,13 +125,15 @@ ObservationOption = Annotated[
     typer.Option(
         help="Observation of the ego: features, lidar, kinematics, camera, speed, or camera+lidar; by default the "
         "one that the ego's space fits.",
+        autocompletion=complete_words(*OBSERVATION_WORDS),
     ),
 ]
 ActionOption = Annotated[
     str | None,
     typer.Option(
         help="Actions of the ego: continuous or discrete, each tick, or HighwayEnv's meta, each second; by default "
-        "those that its space fits."
+        "those that its space fits.",
+        autocompletion=complete_words(*ACTION_WORDS),
     ),
 ]
 EnsembleRunOption = Annotated[
@@ -157,10 +149,15 @@ EnsembleRunOption = Annotated[
 class ScenarioOptions:
     """Options of each command that drives an ego: the scenario, and the interface of the ego."""
 
-    base: Annotated[str | None, typer.Option(help="Base distribution: a name or a JSON file.")] = None
+    base: Annotated[
+        str | None, typer.Option(help="Base distribution: a name or a JSON file.", autocompletion=complete_base)
+    ] = None
     drivers: Annotated[
         str | None,
-        typer.Option(help="Of the vehicles around: mgail, mgail2, mgail3, gail, bc, idm, idm+mobil or a file."),
+        typer.Option(
+            help="Of the vehicles around: mgail, mgail2, mgail3, gail, bc, idm, idm+mobil or a file.",
+            autocompletion=complete_words(*DRIVER_WORDS),
+        ),
     ] = None
     observation: ObservationOption = None
     action: ActionOption = None
@@ -190,11 +187,18 @@ class QuestionOptions(WorldOptions):
         str, typer.Option(help="Estimation method; see rare-envs list methods.", autocompletion=complete_method)
     ] = "auto"
     measure: Annotated[
-        str, typer.Option(help="Safety measure f, small is dangerous: a name, module:function or stl:FORMULA.")
+        str,
+        typer.Option(
+            help="Safety measure f, small is dangerous: a name, module:function or stl:FORMULA.",
+            autocompletion=complete_words(*MEASURE_WORDS),
+        ),
     ] = "ttc"
     gamma: Annotated[float, typer.Option(help="Threshold: P[f <= gamma]; 0 counts collisions.")] = 0.0
     seed: SeedOption = 0
-    collisions: Annotated[str, typer.Option(help="Which count: ego, or any, between others too.")] = "ego"
+    collisions: Annotated[
+        str,
+        typer.Option(help="Which count: ego, or any, between others too.", autocompletion=complete_words("ego", "any")),
+    ] = "ego"
     ensemble_run: EnsembleRunOption = True
     trust: TrustOption = False
 
@@ -205,7 +209,10 @@ class EstimateOptions(QuestionOptions):
 
     ego: Annotated[
         str,
-        typer.Option(help="A name, a .zip or .onnx, module:function, tcp://..., noisy:EGO; see rare-envs list egos."),
+        typer.Option(
+            help="A name, a .zip or .onnx, module:function, tcp://..., noisy:EGO; see rare-envs list egos.",
+            autocompletion=complete_words(*EGO_WORDS),
+        ),
     ] = "idm"
     algo: AlgoOption = None
     stats: StatsOption = None
@@ -223,13 +230,23 @@ class EstimateOptions(QuestionOptions):
     ] = None
     target_cov: Annotated[float | None, typer.Option(help="Stop at this coefficient of variation.")] = None
     replicates: Annotated[int, typer.Option(help="Independent runs, combined by their mean.")] = 1
-    on_error: Annotated[str, typer.Option(help="Where the ego fails twice: raise, failure or bound.")] = "raise"
+    on_error: Annotated[
+        str,
+        typer.Option(
+            help="Where the ego fails twice: raise, failure or bound.",
+            autocompletion=complete_words("raise", "failure", "bound"),
+        ),
+    ] = "raise"
     chunk: Annotated[
         int | None,
         typer.Option(help="Simulations at once, few for a slow ego; with --workers 256, and 4,096 of rules."),
     ] = None
     core: Annotated[
-        str, typer.Option(help="What simulates: torch, numba (compiled; the IDM in scripted scenarios), or auto.")
+        str,
+        typer.Option(
+            help="What simulates: torch, numba (compiled; the IDM in scripted scenarios), or auto.",
+            autocompletion=complete_words("torch", "numba", "auto"),
+        ),
     ] = "auto"
     sensitivity: Annotated[
         bool,
@@ -253,7 +270,11 @@ class RiskOptions:
 
     leaders: Annotated[
         str,
-        typer.Option("--with", help="Scenario of new leaders beside hard brake: cut-in or car-following."),
+        typer.Option(
+            "--with",
+            help="Scenario of new leaders beside hard brake: cut-in or car-following.",
+            autocompletion=complete_words(*LEADER_SCENARIOS),
+        ),
     ] = "cut-in"
     sites: Annotated[
         str,
@@ -262,7 +283,9 @@ class RiskOptions:
     base: Annotated[
         list[str] | None, typer.Option(help="SCENARIO=NAME or FILE, in place of the site's base; may be repeated.")
     ] = None
-    method: Annotated[str, typer.Option(help="Estimation method; see rare-envs list methods.")] = "auto"
+    method: Annotated[
+        str, typer.Option(help="Estimation method; see rare-envs list methods.", autocompletion=complete_method)
+    ] = "auto"
     max_sim: Annotated[
         int | None,
         typer.Option(

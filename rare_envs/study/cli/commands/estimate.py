@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 import typer
 
 from rare_envs.scenarios.registry import is_highway_env_id
+from rare_envs.study.cli.completion import complete_environment
 from rare_envs.study.cli.executor_options import ExecutorOptions
 from rare_envs.study.cli.options import (
     DetailsOption,
@@ -16,7 +17,6 @@ from rare_envs.study.cli.options import (
     ForceOption,
     JsonOption,
     TrustOption,
-    complete_environment,
 )
 from rare_envs.study.cli.shell import (
     DOUBTFUL,

@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from rare_envs.study.cli.completion import complete_words
 from rare_envs.study.cli.options import JsonOption, TrustOption
 from rare_envs.study.cli.shell import keep_stdout_for_the_answer, print_json
 from rare_envs.study.errors import BadInput, as_bad_input
@@ -18,12 +19,19 @@ def export_command(
     run: Annotated[Path, typer.Argument(metavar="RUN", help="Folder that rare-envs estimate --out has written.")],
     out: Annotated[Path, typer.Option(help="The .xosc to write, its road beside it as .xodr; .xml for CommonRoad.")],
     failure: Annotated[int, typer.Option(help="Which failure; 0 is the most likely.")] = 0,
-    format: Annotated[str, typer.Option(help="openscenario, carla (for scenario_runner) or commonroad.")] = (
-        "openscenario"
-    ),
+    format: Annotated[
+        str,
+        typer.Option(
+            help="openscenario, carla (for scenario_runner) or commonroad.",
+            autocompletion=complete_words("openscenario", "carla", "commonroad"),
+        ),
+    ] = "openscenario",
     ego: Annotated[
         str | None,
-        typer.Option(help="recorded: it follows its trajectory; free: it only has a start. carla leaves it free."),
+        typer.Option(
+            help="recorded: it follows its trajectory; free: it only has a start. carla leaves it free.",
+            autocompletion=complete_words("recorded", "free"),
+        ),
     ] = None,
     trust: TrustOption = False,
     as_json: JsonOption = False,

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from rare_envs.study.cli.completion import EGO_WORDS, complete_environment, complete_words
 from rare_envs.study.cli.options import AlgoOption, JsonOption, QuestionOptions, StatsOption
 from rare_envs.study.cli.shell import is_typed, keep_stdout_for_the_answer, print_json
 from rare_envs.study.errors import BadInput
@@ -22,13 +23,20 @@ if TYPE_CHECKING:
 def plan_command(
     context: typer.Context,
     target: Annotated[
-        str, typer.Argument(metavar="ENV|RUN", help="Environment, of which pilots are run; or the folder of a run.")
+        str,
+        typer.Argument(
+            metavar="ENV|RUN",
+            help="Environment, of which pilots are run; or the folder of a run.",
+            autocompletion=complete_environment,
+        ),
     ],
     options: QuestionOptions,
     cov: Annotated[
         float, typer.Option("--cov", "--target-cov", help="Coefficient of variation that is wished for.")
     ] = 0.1,
-    ego: Annotated[str, typer.Option(help="An ego, as for estimate --ego.")] = "idm",
+    ego: Annotated[
+        str, typer.Option(help="An ego, as for estimate --ego.", autocompletion=complete_words(*EGO_WORDS))
+    ] = "idm",
     pilot: Annotated[
         int | None, typer.Option(help="Simulations of each pilot.", show_default="the method's own budget")
     ] = None,

@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from rare_envs.study.cli.commands.corpus import replay_all
+from rare_envs.study.cli.completion import EGO_WORDS, complete_words
 from rare_envs.study.cli.options import JsonOption, TrustOption
 from rare_envs.study.cli.shell import DOUBTFUL, is_typed, keep_stdout_for_the_answer, print_json
 from rare_envs.study.errors import BadInput
@@ -21,7 +22,11 @@ def replay_command(
     failure: Annotated[int, typer.Option(help="Which failure; 0 is the most likely.")] = 0,
     out: Annotated[Path | None, typer.Option(help="A .gif of the drive, or a .png of its worst moment.")] = None,
     ego: Annotated[
-        str | None, typer.Option(help="Another ego, as for estimate --ego, in the place of the run's.")
+        str | None,
+        typer.Option(
+            help="Another ego, as for estimate --ego, in the place of the run's.",
+            autocompletion=complete_words(*EGO_WORDS),
+        ),
     ] = None,
     replay_each: Annotated[
         bool, typer.Option("--all", help="Simulate all failures again and compare their f; without a film.")

@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from rare_envs.study.cli.completion import complete_words
 from rare_envs.study.cli.options import JsonOption, TrustOption
 from rare_envs.study.cli.shell import keep_stdout_for_the_answer, print_json
 from rare_envs.threads import use_one_thread
@@ -20,7 +21,13 @@ def report_command(
         Path | None,
         typer.Option(help="CSV of recorded events, with columns named as the parameters: how near they come."),
     ] = None,
-    figures: Annotated[str | None, typer.Option(help="Figures as files too, beside the page: svg, pdf or png.")] = None,
+    figures: Annotated[
+        str | None,
+        typer.Option(
+            help="Figures as files too, beside the page: svg, pdf or png.",
+            autocompletion=complete_words("svg", "pdf", "png"),
+        ),
+    ] = None,
     trust: TrustOption = False,
     as_json: JsonOption = False,
 ) -> None:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from rare_envs.study.cli.completion import complete_environment, complete_words
 from rare_envs.study.cli.options import JsonOption, NoiseChoice, SeedOption, TrustOption, WorldOptions, read_environment
 from rare_envs.study.cli.shell import keep_stdout_for_the_answer, print_json
 from rare_envs.study.errors import BadInput, as_bad_input
@@ -29,10 +30,16 @@ def train_ego_command(
             metavar="[ENV]",
             help="Environment, such as rare_envs/CutIn-v0; --from-failures tells it.",
             callback=read_environment,
+            autocompletion=complete_environment,
         ),
     ] = None,
     algo: Annotated[
-        str | None, typer.Option(help="Stable-Baselines3 algorithm; --from-failures tells it.", show_default="ppo")
+        str | None,
+        typer.Option(
+            help="Stable-Baselines3 algorithm; --from-failures tells it.",
+            show_default="ppo",
+            autocompletion=complete_words("ppo", "a2c", "sac", "td3", "dqn"),
+        ),
     ] = None,
     steps: Annotated[int, typer.Option(help="Environment steps to train for.")] = 200_000,
     out: Annotated[Path, typer.Option(help="File to save the ego in.")] = Path("ego.zip"),
