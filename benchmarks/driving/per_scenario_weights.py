@@ -16,7 +16,7 @@ from agents import LearnedDriver
 from agents.learned.coloured_noise import AutoregressiveNoise
 from agents.learned.driver import replace_head
 from agents.learned.networks import ACTION_SIZE, FEATURE_SIZE, HEAD_SIZE, Policy, Scaling, head_weights
-from benchmarks.simulation.throughput import seconds
+from benchmarks.simulation.timing import seconds
 from rare_envs.threads import use_one_thread
 
 FLOOR = 20.0

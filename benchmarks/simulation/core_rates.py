@@ -18,8 +18,8 @@ from benchmarks.simulation.throughput import (
     CUT_IN,
     HIGHWAY,
     ppo,
-    seconds,
 )
+from benchmarks.simulation.timing import seconds
 from rare_envs.threads import use_one_thread
 
 CORES = ("torch", "numba")

@@ -35,3 +35,13 @@ def test_floors_and_ceilings_are_kept_or_missed(capsys):
     assert not throughput.judge("answer_cut_in", {"slow_down": 8.1})
     assert throughput.judge("memory", {"peak_gib": 1.9})
     assert "8.1 times the time of one call of torch (ceiling 8)" in capsys.readouterr().out
+
+
+def test_a_rate_stands_beside_what_the_core_allows(capsys):
+    machine = {"simple": 1e10, "roots": 1e9, "curves": 1e8, "products": 1e10, "bytes": 1e10}
+    row = throughput.stand_by_bound({"per_second": 100.0, "ratio": 30.0}, machine, 1.0, throughput.CAR_FOLLOWING)
+    assert row["of_bound"] == 100.0 / row["bound_per_second"]
+    twice = throughput.stand_by_bound({"per_second": 100.0}, machine, 2.0, throughput.CAR_FOLLOWING)
+    assert twice["bound_per_second"] == 2 * row["bound_per_second"]
+    assert throughput.judge("env_step", {**row, "of_bound": 0.184})
+    assert "18 % of this core's bound" in capsys.readouterr().out
