@@ -75,12 +75,12 @@ def load_ego(
             ego with lidar; "vision", PilotNet on the front camera; "mgail", "gail" or "bc", drivers of the traffic,
             which as egos act by their mean actions; a path to a `.safetensors` with one of these kinds; a path to a
             `.zip` saved by Stable-Baselines3; "hf:USER/REPOSITORY", such a `.zip` of the Hugging Face Hub
-            (`agents.sb3.hub`); a path to an `.onnx` file (see
-            `agents.onnx.ego.OnnxEgo` for its form); `module:function`, a function without arguments that returns an ego
-            (modules in the working directory are found); `tcp://host:port` for an ego in another program
-            (docs/remote.md); or `process:EGO`, any of these files and functions in a process of its own, which is ended
-            and started anew where the ego hangs or dies; or `noisy:EGO`, any ego behind the imperfections of a full
-            stack (`agents.imperfect_stack.Stack`).
+            (`agents.sb3.hub`); a path to an `.onnx` file (see `agents.onnx.ego.OnnxEgo` for its form);
+            `module:function`, a function without arguments that returns an ego (modules in the working directory are
+            found); `tcp://host:port` for an ego in another program (docs/remote.md); or `process:EGO` or `noisy:EGO`.
+            `process:EGO` is any of these files and functions in a process of its own, which is ended and started anew
+            where the ego hangs or dies. `noisy:EGO` is any ego behind the imperfections of a full stack
+            (`agents.imperfect_stack.Stack`).
         algo: Algorithm of a `.zip`, such as "ppo"; recognised from the file when None. Only a `.zip` has one.
         trust: Open the pickles in a `.zip` as Stable-Baselines3 does, which runs whatever code is in them. Without it
             a file that needs code of its author's (a policy class of their own, say) is refused, and one to which
@@ -95,9 +95,9 @@ def load_ego(
 
     Raises:
         FileNotFoundError: The file does not exist.
-        ValueError: The spec is none of these, the file is not a model of Stable-Baselines3 or no driver or is
-            damaged or not trusted, the function is missing, fails or returns something without `predict`, or
-            algo or stats is given for something that is no `.zip`.
+        ValueError: The spec is none of these. Or the file is not a model of Stable-Baselines3, is no driver, is damaged
+            or is not trusted. Or the function is missing, fails or returns something without `predict`. Or algo or
+            stats is given for something that is no `.zip`.
 
     Example:
         >>> load_ego("idm")

@@ -288,11 +288,11 @@ def compare(
     """Estimate P[f_A(X) <= gamma] / P[f_B(X) <= gamma] for two functions of the same X.
 
     The method estimates P[A or B fails], f = min(f_A, f_B), and both are simulated at every draw. With weights w_i and
-    indicators a_i, b_i of the draws, p_A = sum w a and p_B = sum w b; the error of log(p_A / p_B) is that of
-    sum w (a / p_A - b / p_B), to which draws where both fail contribute next to nothing. The more alike the two are,
-    the smaller is the error of their ratio; the errors of two separate runs would add up. The interval is log-normal
-    with the t quantile of the effective number of draws where only one of them fails; without such draws it follows
-    from the Clopper-Pearson bound on their probability.
+    indicators a_i, b_i of the draws, p_A = sum w a and p_B = sum w b. The error of log(p_A / p_B) is that of sum w (a /
+    p_A - b / p_B), to which draws where both fail contribute next to nothing. The more alike the two are, the smaller
+    is the error of their ratio; the errors of two separate runs would add up. The interval is log-normal with the t
+    quantile of the effective number of draws where only one of them fails; without such draws it follows from the
+    Clopper-Pearson bound on their probability.
 
     Where the base distribution has refits (`FittedBase`), both probabilities are also known under each refit, and so
     is the uncertainty of the ratio that the events leave (`Comparison.base_uncertainty`): as a rule several times

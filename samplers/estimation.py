@@ -53,10 +53,10 @@ def estimate(
     """Estimate P[f(X) <= gamma], X ~ problem.base.
 
     Where the base distribution was fitted and has refits (`FittedBase`), the failing points of the run also give p
-    under each refit and so the uncertainty of p that the events leave (`Estimate.base_uncertainty`). If they do not
-    reach the refits (more than a tenth of these rest on under 10 effective failing points, which is known without
-    simulations), one further run is made under the mixture of the refits, `base.covering_ensemble()` where there is
-    one and else `base.ensemble()`. It has the same method (`TwoStage`, if that one cannot search under a mixture), seed
+    under each refit and so the uncertainty of p that the events leave (`Estimate.base_uncertainty`). They do not reach
+    the refits where more than a tenth of these rest on under 10 effective failing points, which is known without
+    simulations. Then one further run is made under the mixture of the refits: `base.covering_ensemble()` where there is
+    one, else `base.ensemble()`. It has the same method (`TwoStage`, if that one cannot search under a mixture), seed
     and rule for errors, no replicates and no target_cov. p and its interval remain those of the first run.
 
     Args:
@@ -65,13 +65,12 @@ def estimate(
         gamma: Threshold of failure.
         seed: Same seed, same answer. None draws one, which the result states.
         max_sim: Simulations that are never exceeded, over all replicates.
-        target_cov: Coefficient of variation to stop at. Methods that can go on drawing do so. If
-            the replicates together miss it, further independent runs are made and combined with
-            them (at least 5 in all, unless counts are pooled). They end when the target is met,
-            the rest of max_sim is too small for one more run (pooled runs use all of it), 200
-            runs are made, or as many runs as `replicates` have come to the limit of their method
-            (`n` of MonteCarlo without max_sim, 100 batches of CrossEntropy). If the target is
-            then not met the status is "budget".
+        target_cov: Coefficient of variation to stop at. Methods that can go on drawing do so. If the replicates
+            together miss it, further independent runs are made and combined with them (at least 5 in all, unless counts
+            are pooled). They end when the target is met, when 200 runs are made, or when the rest of max_sim is too
+            small for one more run (pooled runs use all of it). They also end when as many runs as `replicates` have
+            come to the limit of their method (`n` of MonteCarlo without max_sim, 100 batches of CrossEntropy). If the
+            target is then not met the status is "budget".
         confidence: Nominal coverage of the interval.
         replicates: Independent runs, side by side: f gets the points of all of them in one batch,
             and each has an equal share of max_sim. Runs of MonteCarlo are pooled: failing draws

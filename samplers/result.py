@@ -139,11 +139,10 @@ class Estimate(EstimateDisplay):
     def reweight(self, new_base: HasLogProb) -> Reweighted:
         """Return P[f(X) <= gamma] with X from another base distribution, from the same simulations.
 
-        Every failing point counts with the ratio of the densities. That works near the old base:
-        where the new one has its mass among points that were hardly drawn, the effective number of
-        units drops and the answer is refused. A region that fails and was never drawn from, because
-        the old base gives it little or no density, cannot be seen at all and no interval shows it;
-        where `new_base` can be sampled, draws from it tell whether it reaches beyond the old
+        Every failing point counts with the ratio of the densities. That works near the old base: where the new one has
+        its mass among points that were hardly drawn, the effective number of units drops and the answer is refused. A
+        failure region that was never drawn from, because the old base gives it little or no density, cannot be seen,
+        and no interval shows it. Where `new_base` can be sampled, draws from it tell whether it reaches beyond the old
         support.
 
         Args:

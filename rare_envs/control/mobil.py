@@ -47,9 +47,9 @@ class Mobil:
     """Parameters of MOBIL.
 
     Threshold and safe deceleration are those of Kesting et al. (2007). Where HighwayEnv's `IDMVehicle` differs
-    (`Mobil.highway_env`): politeness 0, a threshold of 0.2 m/s^2, at most 2 m/s^2 of braking imposed, no look at what
-    the changing vehicle itself would have to brake, and vehicles count in a lane up to 1 m beyond its edge, so that one
-    counts in two lanes. Of two lanes that are worth it HighwayEnv takes the right one, we the better one.
+    (`Mobil.highway_env`): politeness 0, a threshold of 0.2 m/s^2, at most 2 m/s^2 of braking imposed. It does not look
+    at what the changing vehicle itself would have to brake. Vehicles count in a lane up to 1 m beyond its edge, so that
+    one counts in two lanes. Of two lanes that are worth it HighwayEnv takes the right one, we the better one.
     Accelerations are not limited to what the brakes can do, in both and in the paper.
 
     Raises:

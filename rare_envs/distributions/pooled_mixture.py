@@ -38,8 +38,8 @@ def pool_mixtures(mixtures: Sequence[BoxMixture]) -> CoordinateMixture | PooledM
     """Return one distribution of all mixtures, each with equal weight.
 
     Those of the same coordinates become one mixture with the components of all, whose conditionals are cut to the box
-    as a whole, not each mixture's by itself: its density is the mean of their densities up to factors
-    1 / (1 - mass outside the box). Where the coordinates differ, the columns are taken in an order that serves all.
+    as a whole, not each mixture's by itself. Its density is the mean of their densities up to factors 1 / (1 - mass
+    outside the box). Where the coordinates differ, the columns are taken in an order that serves all.
 
     Args:
         mixtures: In the same box; coordinates and numbers of components may differ.

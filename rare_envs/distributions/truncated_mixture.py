@@ -37,11 +37,11 @@ class TruncatedGaussianMixture:
 
         p(x) = prod_j f(x_j | x_1, ..., x_{j-1}) / P_f(low_j <= X_j <= high_j | x_1, ..., x_{j-1})
 
-    inside the box and 0 outside: each conditional of the mixture, in the order of x, is cut to its
-    range and renormalised. The jointly truncated distribution, f(x) / P_f(box), divides by one constant
-    instead; the two agree up to factors 1 / (1 - mass outside the box), so they differ little when
-    that mass is small (the provenance of a fitted file states it), and are equal for d = 1. Cut
-    conditionals are one-dimensional, which is what makes the Rosenblatt map exact.
+    inside the box and 0 outside: each conditional of the mixture, in the order of x, is cut to its range and
+    renormalised. The jointly truncated distribution, f(x) / P_f(box), divides by one constant instead. The two agree up
+    to factors 1 / (1 - mass outside the box). So they differ little when that mass is small (the provenance of a fitted
+    file states it), and are equal for d = 1. Cut conditionals are one-dimensional, which is what makes the Rosenblatt
+    map exact.
 
     Args:
         weights: Component weights, shape (K,), positive, sum 1.

@@ -162,10 +162,9 @@ def wrap_policy(policy: Any, given: spaces.Space[Any]) -> Any:
     """Return the policy behind the wrappers that it was trained with, so that it takes the environment's observations.
 
     Args:
-        policy: Has `predict`; its `action_space`, if it has one, tells the bounds of its actions, its
-            `observation_space` how many frames it sees, and
-            `get_vec_normalize_env`, if it has one, SB3's `VecNormalize`, whose space tells whether observations are
-            normalised before or after they are stacked.
+        policy: Has `predict`. Its `action_space`, if it has one, tells the bounds of its actions, its
+            `observation_space` how many frames it sees. `get_vec_normalize_env`, if it has one, gives SB3's
+            `VecNormalize`, whose space tells whether observations are normalised before or after they are stacked.
         given: Space of the environment's observations.
     """
     # A Stable-Baselines3 model has both; anybody else's object need not.

@@ -21,8 +21,8 @@ def pet(trace: Trace) -> Tensor:
 
     The place is ground that the bodies of the ego and of another vehicle both cover in the course of the episode,
     either of them first. For every delay the ego's body is compared with where the other was (or will be) that much
-    earlier (or later), at all moments and on the straight ways between them; the least delay with an overlap is found
-    to a fraction of a tick from how far apart the bodies were one tick of delay sooner.
+    earlier (or later), at all moments and on the straight ways between them. The least delay with an overlap is found
+    to a fraction of a tick, from how far apart the bodies were one tick of delay sooner.
 
     Critical values: 1 to 1.5 s; under 1 s is a serious conflict.
 

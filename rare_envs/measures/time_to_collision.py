@@ -143,7 +143,7 @@ def mttc(moment: Moment) -> Tensor:
     """Return the modified time to collision (MTTC) with the lead: if both keep their accelerations.
 
     The least t > 0 with gap - dv t - da t^2 / 2 = 0, dv the closing speed, da the ego's acceleration less the lead's:
-    t = 2 gap / (dv + sqrt(dv^2 + 2 da gap)); there is none where the root is not real or the denominator not positive.
+    t = 2 gap / (dv + sqrt(dv^2 + 2 da gap)). There is none where the root is not real or the denominator not positive.
     Accelerations are those of the last tick, along the ego's heading. As published, nobody stops: speeds may pass 0.
 
     Critical values: as for the time to collision, often 1.5 to 4 s.

@@ -79,7 +79,7 @@ def others(state: State, dt: float) -> Others:
     """Move the lead at its speed and the cutter on its path, with IDM's acceleration behind the lead.
 
     The released code of Tian et al. also steers the cutter along a Bezier (30 m long, by pure pursuit, with the ego's
-    IDM); ours is exactly on the curve, whose length grows with the speed, and its desired speed is its initial one.
+    IDM). Ours is exactly on the curve, whose length grows with the speed, and its desired speed is its initial one.
     """
     desired_speed = state.theta[:, 3]
     speed, lead_speed = state.speed[:, 1], state.speed[:, 2]

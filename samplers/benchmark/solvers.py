@@ -79,8 +79,8 @@ def digest_method(method: Stepping | Solver) -> str:
     """Return what tells the code of a method of somebody else from another version of it.
 
     Returns:
-        A digest of the Python files of the package that the method is of, or of its module where it stands alone; the
-        version of the library for solvers of other libraries; empty for our own methods, and where there is no file.
+        A digest of the Python files of the package that the method is of, or of its module where it stands alone. For
+        solvers of other libraries, the version of the library. Empty for our own methods, and where there is no file.
 
     Example:
         >>> digest_method(find_method("mc"))

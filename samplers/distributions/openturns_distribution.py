@@ -47,10 +47,10 @@ class OpenTurnsDistribution:
         distribution: Such as `openturns.JointDistribution([openturns.Gumbel(), openturns.Normal()], copula)`.
 
     Raises:
-        ValueError: If it is not continuous, or its iso-probabilistic transformation does not lead to N(0, I), as
-            that of a multivariate Student distribution, or does not have its density, as that of a Dirichlet
-            distribution in OpenTURNS 1.27, or is not undone by its inverse, as that of a copula without marginals,
-            `NormalCopula`, in OpenTURNS 1.23.
+        ValueError: If it is not continuous, or its iso-probabilistic transformation is of no use here. The
+            transformation of a multivariate Student distribution does not lead to N(0, I). That of a Dirichlet
+            distribution in OpenTURNS 1.27 does not have its density. That of a copula without marginals,
+            `NormalCopula`, in OpenTURNS 1.23 is not undone by its inverse.
 
     Example:
         >>> import numpy as np, openturns

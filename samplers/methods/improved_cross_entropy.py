@@ -65,11 +65,10 @@ class ImprovedCrossEntropy(Method):
       the proposals): a region that the last round has thinned out or lost is still in the first ones.
     - *Wide draws* are ours: a Gaussian fitted to failures beyond a plane falls off sideways and outwards as
       fast as they do or faster, and the weights there would be heavy.
-    - *sigma* is sought by halving intervals of its logarithm, between 1e-15 and 10 times the median of
-      |f - gamma|; the code minimises |c.o.v. - target| over sigma itself, from a first width of 10 times
-      the mean of f (`sigma_t(1) = 10*mean(geval)` in iCE_SG, iCE_GM and iCE_vMFNM), which an outlier or a
-      negative mean spoils. f may be infinite: +inf has weight 0 at any finite width. Ties and a cap of f are
-      no difficulty, since no quantile is taken.
+    - *sigma* is sought by halving intervals of its logarithm, between 1e-15 and 10 times the median of |f - gamma|. The
+      code minimises |c.o.v. - target| over sigma itself, from a first width of 10 times the mean of f (`sigma_t(1) =
+      10*mean(geval)` in iCE_SG, iCE_GM and iCE_vMFNM). An outlier or a negative mean spoils that. f may be infinite:
+      +inf has weight 0 at any finite width. Ties and a cap of f are no difficulty, since no quantile is taken.
     - *Components.* The code starts with a given number and drops the small ones. Ours takes the number
       with the best Bayesian information criterion, up to `components`.
     - *Covariances* are shrunk towards I but for the direction of the mean (`fit_shrunk_gaussian`), which

@@ -13,11 +13,10 @@ MAX_TIED_SHARE = 0.5
 def next_level(f: FloatArray, fraction: float, gamma: float) -> float | None:
     """Return the next threshold for outcomes f (n,), or None if there is none to go to.
 
-    gamma as soon as the fraction is reached by f <= gamma: the answer is then known. Otherwise
-    the `fraction` quantile q, an outcome that occurred, so that the share of f <= q is its true
-    share. Where many outcomes tie at q (time to collision capped for most scenarios), the share
-    of f <= q may be far above `fraction`; then the largest distinct outcome below q is taken if
-    its share is nearer (in ratio) or if q would keep more than half of the points.
+    gamma as soon as the fraction is reached by f <= gamma: the answer is then known. Otherwise the `fraction` quantile
+    q, an outcome that occurred, so that the share of f <= q is its true share. Where many outcomes tie at q (time to
+    collision capped for most scenarios), the share of f <= q may be far above `fraction`. Then the largest distinct
+    outcome below q is taken if its share is nearer (in ratio) or if q would keep more than half of the points.
 
     Args:
         f: Outcomes; +inf is allowed.

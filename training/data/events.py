@@ -38,8 +38,9 @@ def car_following_events(trajectories: Trajectories) -> Events:
 
     Returns:
         The columns `CAR_FOLLOWING_COLUMNS`, each of shape (events,): speeds [m/s], accelerations [m/s^2], `gap` from
-        bumper to bumper [m], `n` frames the pair was seen for, `at_entry` whether the ego was seen first at that frame:
-        such a pair shows following under way, not its beginning. In the order of the table: by ego, then by time.
+        bumper to bumper [m], `n` frames the pair was seen for, and `at_entry`. The last says whether the ego was seen
+        first at that frame: such a pair shows following under way, not its beginning. In the order of the table: by
+        ego, then by time.
 
     Example:
         >>> from training.data import synthetic_traffic
@@ -154,9 +155,10 @@ def cut_in_events(trajectories: Trajectories) -> Events:
 
     Returns:
         The columns `CUT_IN_COLUMNS`, each of shape (2 changes,): ego is the nearest vehicle behind in the new lane,
-        lead the nearest ahead in it, -1 and NaN where there is none; gaps bumper to bumper (negative: side by side) and
-        the lateral offset from ego [m]; `lateral_speed` towards the new lane over 0.8 s around the crossing [m/s];
-        `duration` of the cubic course that moves across for as long [s], NaN where start or end was not recorded.
+        lead the nearest ahead in it, -1 and NaN where there is none. Gaps are bumper to bumper (negative: side by
+        side). Also the lateral offset from ego [m]; `lateral_speed` towards the new lane over 0.8 s around the crossing
+        [m/s]; `duration` of the cubic course that moves across for as long [s], NaN where start or end was not
+        recorded.
 
     Example:
         >>> from dataclasses import replace

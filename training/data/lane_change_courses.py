@@ -61,7 +61,7 @@ def time_around_peak(speed: FloatArray, time: FloatArray) -> float:
 def time_between_spans(start: FloatArray, end: FloatArray, dt: float) -> FloatArray:
     """Return the time above `LATERAL_SPEED` of changes that are found by their mean speed over `LATERAL_SPAN` frames.
 
-    The last slow span before a change ends at its start, the first slow one after it begins at its end; the speed falls
+    The last slow span before a change ends at its start, the first slow one after it begins at its end. The speed falls
     to that of a span in its middle, half a frame nearer to the change in the mean.
 
     Args:
