@@ -18,8 +18,14 @@ from rare_envs.egos.errors import reason_of
 from rare_envs.egos.loading import load_named_ego
 from rare_envs.egos.needs import resolve
 from rare_envs.egos.policy import PolicyDriver, as_driver
-from rare_envs.egos.spaces.choice import choose_action, choose_observation, takes_indices
-from rare_envs.egos.wrappers import describe_missing_normalisation, find_action_bounds
+from rare_envs.egos.spaces.ambiguities import (
+    TAKEN_AS_ACCELERATIONS,
+    AmbiguousActions,
+    MissingStatistics,
+    name_ambiguities,
+)
+from rare_envs.egos.spaces.choice import choose_action, choose_observation
+from rare_envs.egos.wrappers import describe_missing_normalisation
 from rare_envs.make import refuse_unknown, set_up
 from rare_envs.scenarios.registry import find_scenario, split_layout
 from rare_envs.sensors.kinds import read_kinds
@@ -44,31 +50,6 @@ RULE_CHUNK = 4096
 """Rollouts of a rule-based ego that a worker makes at once: enough for torch, and some for each of several workers."""
 POLICY_CHUNK = 256
 """Likewise with a policy, which is slower."""
-
-AMBIGUOUS = (
-    "the ego's actions 0 to 4 were taken as five accelerations; one that was trained in HighwayEnv needs "
-    "action='meta' (--action meta)"
-)
-"""HighwayEnv's meta-actions and our discrete ones are both numbers from 0 to 4, and their spaces are equal."""
-TAKEN_AS_ACCELERATIONS = (
-    "the ego's actions 0 to 4 were taken as five accelerations; --action discrete says so without this note, and one "
-    "that was trained with action='meta' needs --action meta"
-)
-"""Likewise for policies without HighwayEnv's observation, which rarely have its actions."""
-
-RESCALED = (
-    "the ego's actions, between {low} and {high}, are mapped to [-1, 1] as RescaleAction does; if they are in units of "
-    "their own, put a function of yours around it"
-)
-"""A policy's bounds do not say whether they are those of a wrapper or units."""
-
-
-class AmbiguousActions(UserWarning):
-    """An ego's actions can be taken in two ways."""
-
-
-class MissingStatistics(UserWarning):
-    """An ego seems to have been trained on normalised observations, and the statistics are not there."""
 
 
 class DrivingProblem:
@@ -210,14 +191,9 @@ class DrivingProblem:
     @property
     def notes(self) -> tuple[str, ...]:
         """Ambiguities that cannot be checked; the grave ones were also given as an `AmbiguousActions` warning."""
-        continuous = self.world.clock.action == "continuous" and self.needs.queries_policy
-        found = []
-        if continuous and takes_indices(self.needs.action_space):
-            found.append(AMBIGUOUS if "kinematics" in self.world.sensing.kinds else TAKEN_AS_ACCELERATIONS)
-        bounds = find_action_bounds(self.needs.action_space) if continuous else None
-        if bounds is not None:
-            found.append(RESCALED.format(low=_round(bounds[0]), high=_round(bounds[1])))
-        return tuple(found)
+        if self.world.clock.action != "continuous" or not self.needs.queries_policy:
+            return ()
+        return name_ambiguities(self.needs.action_space, self.world.sensing.kinds)
 
     @property
     def given(self) -> str:
@@ -434,11 +410,6 @@ class DrivingProblem:
     def _nan_error(self, x_row: NDArray[np.float64], row: int | np.signedinteger[Any]) -> ValueError:
         named = {name: value for name, value in self.space.named(x_row).items() if np.size(value) == 1}
         return ValueError(f"The measure {self.world.measurement.measure!r} gave NaN, first at row {row}: {named}.")
-
-
-def _round(bounds: NDArray[Any]) -> list[float]:
-    """Return bounds as people write them: float32 makes 0.10000000149011612 of 0.1."""
-    return [float(f"{value:.4g}") for value in bounds]
 
 
 @contextmanager

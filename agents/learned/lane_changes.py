@@ -45,8 +45,8 @@ _LEAST_SPEED = 1.0
 """Least speed to divide by [m/s]."""
 _LEAST_SHARE = 1e-3
 """Of the way across; the inverse of the course has no slope at 0."""
-_BEGUN = -1.0
-"""Share of a state that has not perceived anything."""
+_UNSTARTED = -1.0
+"""Share of a state that has not perceived anything yet."""
 STATE_SIZE = 10
 """Numbers that a vehicle keeps in mind."""
 
@@ -170,7 +170,7 @@ class LaneChanges:
         """Return the state before anything was perceived, from standard normal draws (B, M, 2)."""
         none = torch.zeros_like(draws[..., 0])
         return ChangeState(
-            patience_of(draws), torch.full_like(draws, torch.inf), none, none + _BEGUN, none, none, none, none
+            patience_of(draws), torch.full_like(draws, torch.inf), none, none + _UNSTARTED, none, none, none, none
         )
 
     def step(
@@ -218,7 +218,7 @@ class LaneChanges:
     def _remember(self, features: Tensor, lanes: AdjacentLanes, state: ChangeState) -> ChangeState:
         """Return the state with what is known of the lanes beside, also where a line was crossed."""
         offset = features[..., LANE_OFFSET_COLUMN]
-        moved = torch.where(state.share == _BEGUN, 0.0, state.offset - offset)  # about a lane's width across a line
+        moved = torch.where(state.share == _UNSTARTED, 0.0, state.offset - offset)  # about a lane's width across a line
         crossed = moved.abs() > 0.5 * (features[..., LEFT_MARKER_COLUMN] + features[..., RIGHT_MARKER_COLUMN])
         came_from = torch.stack((moved > 0.0, moved < 0.0), dim=-1)  # to the right of the lane that it left
         unseen = torch.where(crossed[..., None], torch.where(came_from, 0.0, torch.inf), state.unseen + LEARNED_TICK)
@@ -230,7 +230,7 @@ class LaneChanges:
 
     def _take_up(self, features: Tensor, lanes: AdjacentLanes, state: ChangeState) -> ChangeState:
         """Return the state with changes that were under way at the first moment."""
-        first = state.share == _BEGUN
+        first = state.share == _UNSTARTED
         across = features[..., SPEED_COLUMN] * torch.sin(features[..., HEADING_COLUMN])
         side, width = across.sign(), features[..., LEFT_MARKER_COLUMN] + features[..., RIGHT_MARKER_COLUMN]
         offset = side * features[..., LANE_OFFSET_COLUMN]

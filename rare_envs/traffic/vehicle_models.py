@@ -48,7 +48,8 @@ def bicycle(
         curvature: Of the road at x [1/m], positive to the right; None for a straight road.
 
     Returns:
-        x, y, heading and speed after the tick.
+        x, y, heading and speed after the tick. On a straight road, where nobody steers and all headings are 0, `y` and
+        `heading` are the tensors that were given: write into neither.
 
     References:
         Polack et al., "The kinematic bicycle model", 2017; HighwayEnv, `vehicle/kinematics.py`.

@@ -20,7 +20,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 import rare_envs
 from agents import Ego, LearnedEgo, Provenance, SavedEgo, load_driver, load_ego, save_driver
 from agents.sb3.zip_header import find_algorithm, read_header
-from rare_envs.problem import MissingStatistics
+from rare_envs.egos.spaces.ambiguities import MissingStatistics
 
 FEATURES = 5
 CONTINUOUS = spaces.Box(-1.0, 1.0, (2,), np.float32)

@@ -14,12 +14,12 @@ from typing import Annotated
 
 import typer
 
-from agents import LearnedDriver, load_driver
+from agents import LearnedDriver
 from agents.learned.collision_avoidance import CollisionAvoidance
 from rare_envs.threads import use_one_thread
 from training.command_line import report_errors, run_command
 from training.imitation.datasets import Source, load_scenes
-from training.imitation.noise_damping import damp_acceleration, write_derived
+from training.imitation.noise_damping import damp_acceleration, load_learned_driver, write_derived
 from training.imitation.traffic.recording import Recording, stack_scenes
 
 
@@ -41,10 +41,7 @@ def write_driver(of: str, damping: float, test: Recording, out: Path) -> Path:
     Raises:
         ValueError: The driver is a rule.
     """
-    first = load_driver(of)
-    if not isinstance(first, LearnedDriver):
-        raise ValueError(f"Expected a learned driver, got the rule {of!r}.")
-    made = add_avoidance(first, damping, out.stem)
+    made = add_avoidance(load_learned_driver(of), damping, out.stem)
     return write_derived(made, of, damping, "rule of collision avoidance", "collision_avoidance", test, out)
 
 

@@ -17,18 +17,19 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, NamedTuple
 
+import numpy as np
 import torch
 import typer
 from torch import Tensor
 
-from agents import LearnedDriver, load_driver
+from agents import LearnedDriver
 from agents.learned.adjacent_lanes import look_aside
 from agents.learned.lane_changes import COVARIATES, USUAL_SPEED, LaneChanges
 from rare_envs.threads import use_one_thread
 from training.command_line import report_errors, run_command
 from training.data.trajectories import DT
 from training.imitation.datasets import Source, load_scenes
-from training.imitation.noise_damping import damp_acceleration, write_derived
+from training.imitation.noise_damping import damp_acceleration, load_learned_driver, write_derived
 from training.imitation.traffic.crossings import find_crossings
 from training.imitation.traffic.recording import Recording, stack_scenes
 from training.imitation.traffic.replayed_traffic import lane_of, replay_features, start_replay
@@ -90,7 +91,7 @@ def collect_moments(recording: Recording, changes: LaneChanges) -> ChangeMoments
 
 
 def fit_logistic(inputs: Tensor, outcome: Tensor, penalty: float = PENALTY) -> Tensor:
-    """Return coefficients (k,) of a logistic regression by Newton's method; the first input is 1, and not penalised.
+    """Return coefficients (k,) of a logistic regression; the first input is 1, and not penalised.
 
     Args:
         inputs: Shape (n, k).
@@ -103,14 +104,12 @@ def fit_logistic(inputs: Tensor, outcome: Tensor, penalty: float = PENALTY) -> T
         >>> fit_logistic(inputs, outcome, penalty=0.0).exp()  # odds of 1 to 3, and 9 times as high
         tensor([0.3333, 9.0000], dtype=torch.float64)
     """
-    x, y = inputs.double(), outcome.double()
-    shrink = torch.diag(torch.tensor([0.0] + [penalty] * (x.shape[1] - 1), dtype=x.dtype))
-    out = torch.zeros(x.shape[1], dtype=x.dtype)
-    for _ in range(50):
-        chance = torch.sigmoid(x @ out)
-        slope = x.T @ (y - chance) - shrink @ out
-        out = out + torch.linalg.solve((x * (chance * (1.0 - chance))[:, None]).T @ x + shrink, slope)
-    return out
+    from sklearn.linear_model import LogisticRegression  # here, because importing it takes a second
+
+    strength = 1.0 / penalty if penalty else math.inf
+    model = LogisticRegression(C=strength, solver="newton-cholesky", tol=1e-10)
+    model.fit(inputs[:, 1:].double().numpy(), outcome.numpy())
+    return torch.from_numpy(np.concatenate((model.intercept_, model.coef_[0])))
 
 
 def fit_hazard(moments: ChangeMoments) -> tuple[float, ...]:
@@ -153,10 +152,7 @@ def write_changing_driver(
     Raises:
         ValueError: The driver is a rule.
     """
-    first = load_driver(of)
-    if not isinstance(first, LearnedDriver):
-        raise ValueError(f"Expected a learned driver, got the rule {of!r}.")
-    made = add_changes(first, coefficients, damping, hard_braking, out.stem)
+    made = add_changes(load_learned_driver(of), coefficients, damping, hard_braking, out.stem)
     return write_derived(made, of, damping, "lane changes", "lane_changes", test, out)
 
 

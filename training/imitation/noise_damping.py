@@ -46,6 +46,26 @@ DAMPINGS = (0.6, 0.4, 0.3)
 """Of the table, if none is named [1/s]."""
 
 
+def load_learned_driver(spec: str) -> LearnedDriver:
+    """Return a driver that has learned, by name or file.
+
+    Raises:
+        ValueError: There is none, or it is a rule.
+
+    Example:
+        >>> load_learned_driver("mgail").name
+        'mgail'
+        >>> load_learned_driver("idm")
+        Traceback (most recent call last):
+            ...
+        ValueError: Expected a learned driver, got the rule 'idm'.
+    """
+    driver = load_driver(spec)
+    if not isinstance(driver, LearnedDriver):
+        raise ValueError(f"Expected a learned driver, got the rule {spec!r}.")
+    return driver
+
+
 def damp_acceleration(noise: AutoregressiveNoise, damping: float) -> AutoregressiveNoise:
     """Return a noise whose acceleration has another damping and the same natural frequency.
 
@@ -112,9 +132,7 @@ def main(
 ) -> None:
     """Measure a driver with other dampings of its noise."""
     with report_errors("noise_damping"):
-        first = load_driver(driver)
-        if not isinstance(first, LearnedDriver):
-            raise ValueError(f"Expected a learned driver, got the rule {driver!r}.")
+        first = load_learned_driver(driver)
         learn, test = (stack_scenes(scenes) for scenes in load_scenes(Source("data", data)))
         made = [replace(first, colour=damp_acceleration(first.colour, each)) for each in damping]
     scenes = test if in_test else learn

@@ -16,7 +16,6 @@ from typing import Annotated
 import torch
 import typer
 
-from agents import LearnedDriver, load_driver
 from rare_envs.threads import use_one_thread
 from training.command_line import report_errors, run_command
 from training.data.trajectories import DT
@@ -28,6 +27,7 @@ from training.imitation.evaluation.behaviour import (
     regular_starts,
     sampling_driver,
 )
+from training.imitation.noise_damping import load_learned_driver
 from training.imitation.traffic.recording import stack_scenes
 from training.imitation.traffic.replayed_traffic import start_replay
 
@@ -80,9 +80,7 @@ def main(
 ) -> None:
     """Print which vehicles collide in the test scenes."""
     with report_errors("touching_pairs"):
-        chosen = load_driver(driver)
-        if not isinstance(chosen, LearnedDriver):
-            raise ValueError(f"Expected a learned driver, got the rule {driver!r}.")
+        chosen = load_learned_driver(driver)
         test = stack_scenes(load_scenes(Source("data", data))[1])
     traffic = start_replay(test, *regular_starts(test))
     ticks = round(seconds / DT)

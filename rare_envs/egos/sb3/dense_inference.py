@@ -9,6 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Any
 
+import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
@@ -45,7 +46,7 @@ class DenseInference:
         """Return mean actions for observations (B, F), clipped; where they are not finite, what `policy` does then."""
         between = _ACTIVATIONS[self.activation]
         with torch.no_grad():
-            values = torch.from_numpy(observation).float()
+            values = torch.from_numpy(np.ascontiguousarray(observation)).float()  # torch takes no negative strides
             for weights, biases in self.layers[:-1]:
                 values = between(linear(values, weights, biases))
             actions = linear(values, *self.layers[-1])

@@ -18,7 +18,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 import rare_envs
 from agents import SavedEgo, load_ego
 from agents.sb3.normalisation import describe_missing_statistics, find_statistics
-from rare_envs.problem import MissingStatistics
+from rare_envs.egos.spaces.ambiguities import AmbiguousActions, MissingStatistics
 
 ENV = "rare_envs/CarFollowing-v0"
 SETTINGS: dict[str, Any] = {"n_steps": 8, "batch_size": 8, "seed": 0, "device": "cpu"}
@@ -206,7 +206,7 @@ def test_actions_are_rescaled_from_their_bounds() -> None:
     expected = rare_envs.DrivingProblem(ENV, ego=Rescaled(-1.0, 1.0)).evaluate(x)
     for low, high in ((-2.0, 2.0), (0.0, 1.0), (-0.1, 0.3)):
         told = rf"between \[{low}, {low}\] and \[{high}, {high}\], are mapped to \[-1, 1\] as RescaleAction does"
-        with pytest.warns(rare_envs.problem.AmbiguousActions, match=told):
+        with pytest.warns(AmbiguousActions, match=told):
             problem = rare_envs.DrivingProblem(ENV, ego=Rescaled(low, high))
         np.testing.assert_allclose(problem.evaluate(x), expected, rtol=1e-5)
     assert len(np.unique(expected)) > 4

@@ -12,7 +12,7 @@ from typer.testing import Result
 
 import agents
 import rare_envs
-from rare_envs.problem import AmbiguousActions
+from rare_envs.egos.spaces.ambiguities import AmbiguousActions
 from rare_envs.study.ego_check.findings import Finding
 from rare_envs.study.ego_check.subprocess_check import EgoCheckRequest, run_checks
 from rare_envs.study.errors import BadInput

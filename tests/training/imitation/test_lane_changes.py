@@ -39,6 +39,17 @@ def test_logistic_regression_finds_the_coefficients_of_drawn_outcomes():
     assert slopes[1] < 0.5 * slopes[0]
 
 
+@pytest.mark.parametrize("penalty", [0.0, 1.0, 50.0])
+def test_the_penalised_likelihood_has_no_slope_at_the_coefficients(penalty):
+    generator = torch.Generator().manual_seed(1)
+    scales = torch.tensor([1.0, 1.0, 20.0, 0.1])
+    inputs = torch.cat((torch.ones(500, 1), torch.randn(500, 3, generator=generator)), dim=1).double() * scales
+    outcome = (torch.rand(500, generator=generator) < 0.1).double()
+    found = fit_logistic(inputs, outcome, penalty)
+    slope = inputs.T @ (outcome - torch.sigmoid(inputs @ found)) - penalty * found * torch.tensor([0.0, 1.0, 1.0, 1.0])
+    assert float(slope.abs().max()) < 1e-6
+
+
 def test_the_mean_hazard_is_that_of_complete_recordings():
     """Changes begin twice as often where the next lane is 1 m/s faster; half of the moments have either speed."""
     n = 4000

@@ -31,6 +31,14 @@ def test_actions_are_those_of_predict_to_the_last_bit(make_model, size):
     np.testing.assert_array_equal(found.predict(seen)[0], model.predict(seen, deterministic=True)[0])
 
 
+def test_observations_may_stand_in_memory_backwards_or_apart():
+    model = make()
+    seen = np.random.default_rng(1).uniform(-5, 5, (8, 22)).astype(np.float32)[::-1, ::-2]
+    assert min(seen.strides) < 0
+    found = find_inference(model).predict(seen)[0]
+    np.testing.assert_array_equal(found, model.predict(seen.copy(), deterministic=True)[0])
+
+
 def test_wrappers_stay_around_the_layers():
     statistics = VecNormalize(training.sb3_vec_env(CUT_IN, num_envs=2))
     statistics.obs_rms.mean[:] = np.random.default_rng(1).normal(size=11)
