@@ -28,11 +28,17 @@ EXECUTOR_KEYS: dict[str, tuple[type, ...]] = {
     "memory_limit": (int, float),
 }
 """Options that say where simulations are made, which is no part of the question, with their types."""
+COUNTS = ("workers", *(field.name for field in fields(Question) if field.type in ("int", "int | None")))
+"""Keys of whole numbers, which may be written as 1e6."""
 NOT_IN_FILES = ("trust",)
 """Whoever asks decides whether code runs, not a file."""
 
 
 INTEGER, FLOAT = "tag:yaml.org,2002:int", "tag:yaml.org,2002:float"
+
+
+def _is_whole(value: Any) -> bool:
+    return isinstance(value, float) and value.is_integer()
 
 
 class QuestionLoader(yaml.SafeLoader):  # type: ignore[misc]  # PyYAML has no types
@@ -95,6 +101,7 @@ def read_question_file(path: Path) -> dict[str, Any]:
             raise BadInput(f"{str(path)!r} has an unknown key {key!r}{hint}. It may have: {', '.join(names)}.")
     if len(named) < len(given):
         raise BadInput(f"{str(path)!r} gives the same option twice.")
+    named = {name: int(value) if name in COUNTS and _is_whole(value) else value for name, value in named.items()}
     try:
         read_question({"env_id": "", **named})
     except BadInput as error:

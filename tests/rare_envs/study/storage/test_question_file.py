@@ -33,6 +33,18 @@ def test_numbers_are_those_of_the_command_line(tmp_path: Path) -> None:
     assert read_question_file(file) == {"env_id": "a", **numbers}
 
 
+def test_whole_numbers_may_have_an_exponent(cli: Cli, tmp_path: Path) -> None:
+    file = tmp_path / "study.yaml"
+    file.write_text("env: rare_envs/CutIn-v0\nmax-sim: 1e6\nseed: 2e0\nchunk: 1.0\nworkers: 2e0\ngamma: 1e0\n")
+    read = read_question_file(file)
+    numbers = [read[name] for name in ("max_sim", "seed", "chunk", "workers", "gamma")]
+    assert numbers == [1_000_000, 2, 1, 2, 1.0] and [type(number) for number in numbers] == [*[int] * 4, float]
+    for text in ("max-sim: 1e-1", "max-sim: 100.5", "max-sim: 1e400", "seed: .nan"):
+        file.write_text(f"env: rare_envs/CutIn-v0\n{text}\n")
+        result = cli("estimate", "--config", file)
+        assert result.exit_code == 2 and "to be int" in result.stderr and result.stderr.count("\n") == 1
+
+
 def test_the_keys_are_called_as_the_options(cli: Cli, tmp_path: Path) -> None:
     file = tmp_path / "study.yaml"
     file.write_text("env: a\nconfidence: 0.9\nmax-p: 0.5\nworkers: 3\nexecutor: local\ntime-limit: 60\n")
