@@ -87,7 +87,8 @@ class Stack:
             if not (isinstance(value, int | float) and 0.0 <= value < math.inf):
                 raise ValueError(f"Expected {each.name} to be a number of at least 0, got {value!r}.")
         if not self.missed < 1.0 or not (self.jerk and self.steering_rate):
-            raise ValueError("Expected missed below 1, and jerk and steering_rate above 0.")
+            got = f"{self.missed:g}, {self.jerk:g} and {self.steering_rate:g}"
+            raise ValueError(f"Expected missed below 1, and jerk and steering_rate above 0, got {got}.")
 
     @classmethod
     def read(cls, query: str) -> Stack:
@@ -150,7 +151,10 @@ class NoisyEgo:
             raise ValueError(f'Expected action="continuous" for an ego behind a stack, got {world.clock.action!r}.')
         driver = as_driver(self.ego, world)
         if isinstance(driver, StochasticDriver) and driver.noise_columns:
-            raise ValueError("Expected an ego without noise of its own behind a stack, whose noise is all that x has.")
+            raise ValueError(
+                f"Expected an ego without noise of its own behind a stack, got {type(driver).__name__} with "
+                "some: give one that acts by its means, or leave noisy: out."
+            )
         return NoisyDriver(driver, self.stack, world)
 
 

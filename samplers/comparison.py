@@ -344,7 +344,10 @@ def _check_same_base(a: Problem, b: Problem) -> None:
         )
     x = a.base.sample(BASE_CHECK_DRAWS, np.random.default_rng(0))
     if not np.allclose(a.base.log_prob(x), b.base.log_prob(x), rtol=1e-9, atol=1e-9):
-        raise ValueError("Expected two problems with the same base distribution; their densities differ.")
+        raise ValueError(
+            "Expected two problems with the same base distribution, got two of other densities: estimate each "
+            "by itself."
+        )
 
 
 def _summarise(either: Estimate, problem: EitherFails) -> Comparison:

@@ -106,7 +106,9 @@ def restore_model(model: Any, state: Mapping[str, Any]) -> None:
         monitor.episode_lengths[:] = to_arrays(state["monitor"])["lengths"]
         _restore_generators(model, state["generators"])
     except (KeyError, RuntimeError, TypeError, AttributeError) as error:
-        raise ValueError(f"The checkpoint is of another model: {error}.") from error
+        raise ValueError(
+            f"The checkpoint is of another model ({error}): remove it, or train with its arguments."
+        ) from error
 
 
 def to_tensors(value: Any) -> Any:

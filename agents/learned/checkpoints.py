@@ -254,7 +254,7 @@ def require(present: Mapping[str, Any], names: Any, path: Path) -> None:
     """Refuse a file that lacks one of the names."""
     missing = [name for name in names if name not in present]
     if missing:
-        raise ValueError(f"{str(path)!r} lacks {', '.join(missing)}.")
+        raise ValueError(f"{str(path)!r} lacks {', '.join(missing)}; save the driver again with agents.save_driver.")
 
 
 def _check_header(header: Mapping[str, Any], path: Path) -> None:

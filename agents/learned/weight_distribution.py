@@ -61,7 +61,7 @@ class WeightDistribution:
         if not (np.isfinite(mean).all() and np.isfinite(precision).all()):
             raise ValueError("Expected a finite mean and precision, got inf or NaN.")
         if not np.allclose(precision, precision.T, rtol=SYMMETRY, atol=0.0):
-            raise ValueError("Expected a symmetric precision.")
+            raise ValueError("Expected a symmetric precision, got another one; (precision + precision.T) / 2 is one.")
         if not self.radius >= 0.0:
             raise ValueError(f"Expected radius >= 0, got {self.radius!r}.")
         for name, value in (("mean", mean), ("precision", 0.5 * (precision + precision.T))):
@@ -87,7 +87,10 @@ class WeightDistribution:
         try:
             reversed_factor = np.linalg.cholesky(self.precision[::-1, ::-1])
         except np.linalg.LinAlgError:
-            raise ValueError("Expected a positive definite precision.") from None
+            raise ValueError(
+                "Expected a positive definite precision, got one with an eigenvalue of "
+                f"{np.linalg.eigvalsh(self.precision)[0]:.3g}; add a small multiple of the unit matrix."
+            ) from None
         return np.ascontiguousarray(reversed_factor.T[::-1, ::-1])
 
     @cached_property

@@ -120,7 +120,10 @@ def compute_ratio_uncertainty(first: EnsembleEstimate, second: EnsembleEstimate)
     """
     bases = _require_same_refits(first, second)
     if first.confidence != second.confidence:
-        raise ValueError(f"Expected the same confidence, got {first.confidence:g} and {second.confidence:g}.")
+        raise ValueError(
+            f"Expected the same confidence, got {first.confidence:g} and {second.confidence:g}; give both estimates "
+            "one confidence=..."
+        )
     one, two = (reweight_runs_to_refits(each, base.refits) for each, base in zip((first, second), bases, strict=True))
     further = [each.ensemble_run for each in (first, second) if each.ensemble_run is not None]
     return summarise_ratio(

@@ -157,7 +157,10 @@ def log_density_ratios(estimate: WeightedEstimate, new_base: HasLogProb, x: Floa
 def require_base(estimate: WeightedEstimate) -> Distribution:
     """Return the base distribution of an estimate, or raise a ValueError that says it is not known."""
     if estimate.base is None:
-        raise ValueError("The estimate does not know its base distribution (`Estimate.base`).")
+        raise ValueError(
+            "The estimate does not know its base distribution (`Estimate.base` is None); estimate again, or set it by "
+            "dataclasses.replace(estimate, base=...)."
+        )
     return estimate.base
 
 

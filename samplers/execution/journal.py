@@ -115,7 +115,7 @@ class JournalFile:
         records = RecordFile(path, new=True)
         try:
             if not replace and records.size and _has_simulations(records):
-                raise JournalError(f"There is a journal already: {str(path)!r}.")
+                raise JournalError(f"There is a journal already, {str(path)!r}: remove it, or choose another file.")
             records.clear()
             records.write(_encode(head))
             records.sync()

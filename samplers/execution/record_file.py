@@ -72,7 +72,7 @@ class RecordFile:
         self.last: bytes | None = None
         if not lock_file(self._file) or not self.exists:
             self._file.close()
-            raise JournalError(f"Another process is writing {str(path)!r}.")
+            raise JournalError(f"Another process is writing {str(path)!r}: wait for it to end, or choose another file.")
 
     @property
     def size(self) -> int:
@@ -149,7 +149,7 @@ class RecordFile:
         if begun != MAGIC and MAGIC.startswith(begun):
             raise NothingRecorded(f"{str(self.path)!r} was cut at its beginning; nothing is recorded in it.")
         if begun != MAGIC:
-            raise JournalError(f"{str(self.path)!r} is of another kind or version.")
+            raise JournalError(f"{str(self.path)!r} is of another kind or version: remove it to begin anew.")
         self.rewind()
         n, self.last = 0, None
         while (payload := self.read()) is not None:

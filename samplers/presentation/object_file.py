@@ -137,7 +137,9 @@ def _encode(value: Any, arrays: dict[str, NDArray[Any]]) -> Any:
     if isinstance(value, Mapping):
         return {"dict": [[_encode(key, arrays), _encode(item, arrays)] for key, item in value.items()]}
     if not dataclasses.is_dataclass(value):
-        raise TypeError(f"A value of class {type(value).__name__} cannot be written to a file.")
+        raise TypeError(
+            f"A value of class {type(value).__name__} cannot be written to a file; to_dict() has plain values."
+        )
     fields = {f.name: getattr(value, f.name) for f in dataclasses.fields(value) if f.init}  # fields by name
     return {"object": [_name_of(value), {name: _encode(item, arrays) for name, item in fields.items()}]}
 
@@ -145,7 +147,9 @@ def _encode(value: Any, arrays: dict[str, NDArray[Any]]) -> Any:
 def _name_of(value: object) -> str:
     """Return the name of a value's class, which must be registered."""
     if not is_stored(value):
-        raise TypeError(f"An object of class {type(value).__name__} cannot be written to a file.")
+        raise TypeError(
+            f"An object of class {type(value).__name__} cannot be written to a file; to_dict() has plain values."
+        )
     return type(value).__name__
 
 

@@ -29,7 +29,7 @@ def concatenate_events(parts: Sequence[Events]) -> Events:
         ValueError: No table is given.
     """
     if not parts:
-        raise ValueError("There are no events to pool: no recording was given.")
+        raise ValueError("Expected events of at least one recording, got none.")
     return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
 
 

@@ -73,7 +73,7 @@ class Trajectories:
         if len(set(sizes.values())) != 1 or len(self.vehicle.shape) != 1:
             raise ValueError(f"Expected columns of one length, got {sizes}.")
         if not len(self):
-            raise ValueError("A table of trajectories needs at least one row.")
+            raise ValueError("Expected a table of trajectories with at least one row, got none.")
         same = (self.recording[1:] == self.recording[:-1]) & (self.vehicle[1:] == self.vehicle[:-1])
         later = (self.recording[1:] > self.recording[:-1]) | (
             (self.recording[1:] == self.recording[:-1]) & (self.vehicle[1:] > self.vehicle[:-1])
@@ -81,16 +81,16 @@ class Trajectories:
         wrong = np.flatnonzero(~(later | (same & (self.frame[1:] > self.frame[:-1]))))
         if wrong.size:
             raise ValueError(f"Rows {wrong[0]} and {wrong[0] + 1} are not in order of recording, vehicle and frame.")
-        for name, bad in (
-            ("x", ~np.isfinite(self.x)),
-            ("speed", ~(self.speed >= 0.0)),
-            ("length", self.length <= 0.0),
-            ("width", self.width <= 0.0),
-            ("lane", self.lane < 0),
+        for name, bad, wanted in (
+            ("x", ~np.isfinite(self.x), "a finite number"),
+            ("speed", ~(self.speed >= 0.0), "of at least 0"),
+            ("length", self.length <= 0.0, "above 0"),
+            ("width", self.width <= 0.0, "above 0"),
+            ("lane", self.lane < 0, "of at least 0"),
         ):
             if bad.any():
                 row = int(np.argmax(bad))
-                raise ValueError(f"Row {row}: {name} is {self.column(name)[row]:g}.")
+                raise ValueError(f"Row {row}: expected {name} {wanted}, got {self.column(name)[row]:g}.")
         for name, edges in self.edges.items():
             if not (np.diff(edges) > 0.0).all():
                 raise ValueError(f"Lane boundaries of {name} must increase to the right, got {edges}.")

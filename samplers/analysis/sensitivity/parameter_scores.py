@@ -94,7 +94,10 @@ def parameter_scores(base: ParametricBase, x: FloatArray) -> FloatArray:
             scores[:, i] = (above - below) / (2 * DIFFERENCE_STEP)
     if not np.isfinite(scores).all():
         worst = parameters[int(np.argmin(np.isfinite(scores).all(axis=0)))]
-        raise ValueError(f"The density has no finite derivative by the {worst.name} at a failing point.")
+        raise ValueError(
+            f"The density has no finite derivative by the {worst.name} at a failing point: it may "
+            "lie at the edge of the support; draw from a base distribution that ends smoothly."
+        )
     return scores
 
 

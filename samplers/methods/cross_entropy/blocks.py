@@ -196,7 +196,10 @@ def announced_blocks(inputs: Inputs) -> Product:
     product = Product(tuple(_as_block(entry) for entry in inputs.base.blocks))
     trial = product.sample(4, np.random.default_rng(0))
     if product.dim != inputs.dim or not np.allclose(product.log_prob(trial), inputs.base.log_prob(trial)):
-        raise ValueError(f"CrossEntropy: the blocks of {type(inputs.base).__name__} are not its distribution.")
+        raise ValueError(
+            f"CrossEntropy: the blocks of {type(inputs.base).__name__} are not its distribution: mend `blocks`, or "
+            'take family="gaussian", which works with any.'
+        )
     return product
 
 

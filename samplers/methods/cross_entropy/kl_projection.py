@@ -132,5 +132,8 @@ def _box_least_squares(cholesky: FloatArray, target: FloatArray) -> FloatArray:
     programme = cp.Problem(cp.Minimize(cp.sum_squares(inverse @ z - inverse @ target)), [z >= -1, z <= 1])
     programme.solve(solver=cp.OSQP, max_iter=100_000)
     if z.value is None:
-        raise RuntimeError(f"The projection on the box of the mean was not solved: {programme.status}.")
+        raise RuntimeError(
+            f"The projection on the box of the mean was not solved ({programme.status}): its covariance may be close "
+            "to singular; take a wider box."
+        )
     return np.clip(np.asarray(z.value, dtype=np.float64), -1.0, 1.0)

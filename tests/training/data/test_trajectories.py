@@ -38,9 +38,9 @@ def test_a_table_is_sorted_and_checked():
     assert tabulate(GOOD).find_rows(tabulate(GOOD).leader).tolist() == [2, -1, -1]
     for changes, message in (
         ({"frame": [1, 1, 1]}, "Rows 0 and 1 are not in order"),
-        ({"x": [0.0, np.nan, 9.0]}, "Row 1: x is nan"),
-        ({"speed": [1.0, 1.0, -1.0]}, "Row 2: speed is -1"),
-        ({"length": 0.0}, "Row 0: length is 0"),
+        ({"x": [0.0, np.nan, 9.0]}, "Row 1: expected x a finite number, got nan"),
+        ({"speed": [1.0, 1.0, -1.0]}, "Row 2: expected speed of at least 0, got -1"),
+        ({"length": 0.0}, "Row 0: expected length above 0, got 0"),
         ({name: [] for name in COLUMNS}, "at least one row"),
     ):
         with pytest.raises(ValueError, match=message):

@@ -57,7 +57,7 @@ def stack_scenes(scenes: Sequence[TrafficScene]) -> Recording:
         (2, 49, 9)
     """
     if not scenes:
-        raise ValueError("Expected at least one scene.")
+        raise ValueError("Expected at least one scene, got none.")
     ticks = max(scene.x.shape[0] for scene in scenes)
     vehicles = max(scene.x.shape[1] for scene in scenes)
     lanes = max(len(scene.edges) for scene in scenes)
