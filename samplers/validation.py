@@ -23,8 +23,9 @@ def is_whole(value: object, least: int) -> TypeGuard[int]:
 def check_number(name: str, value: object, low: float, high: float) -> None:
     """Raise a ValueError unless value is a number between low and high, both excluded."""
     if not is_number(value) or not low < value < high:
-        between = "a finite number" if low == -math.inf else f"a number between {low:g} and {high:g}"
-        raise ValueError(f"Expected {name} to be {between}, got {value!r}.")
+        between = f"a number above {low:g}" if high == math.inf else f"a number between {low:g} and {high:g}"
+        wanted = "a finite number" if low == -math.inf else between
+        raise ValueError(f"Expected {name} to be {wanted}, got {value!r}.")
 
 
 def check_whole(name: str, value: object, least: int) -> None:

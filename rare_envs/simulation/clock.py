@@ -45,7 +45,9 @@ class Clock:
             raise ValueError(f"Expected dt in (0, 1] s, got {self.dt!r}.")
         if self.horizon is None:
             return
-        in_range = _is_number(self.horizon) and self.dt <= self.horizon < LONGEST_HORIZON
+        if _is_number(self.horizon) and self.horizon >= LONGEST_HORIZON:
+            raise ValueError(f"Expected a horizon below {LONGEST_HORIZON:g} s, got {self.horizon!r}: it is in seconds.")
+        in_range = _is_number(self.horizon) and self.dt <= self.horizon
         if not in_range or abs(self.horizon / self.dt - self.ticks) > _ROUNDING:
             raise ValueError(f"Expected a horizon of one or more whole ticks of {self.dt} s, got {self.horizon!r}.")
         decisions = {"dt": (self.dt, 1.0 / self.dt), "horizon": (self.horizon, self.horizon / DECISION)}

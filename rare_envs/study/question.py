@@ -171,6 +171,8 @@ _JSON_TYPES: dict[str, tuple[type, ...]] = {
     "None": (type(None),),
 }
 """Names in the annotations of `Question` to types in JSON."""
+TYPE_WORDS = {"str": "a text", "int": "a whole number", "float": "a number", "bool": "true or false", "None": "null"}
+"""What the messages call them."""
 
 
 def read_question(values: Any) -> Question:
@@ -186,7 +188,7 @@ def read_question(values: Any) -> Question:
         >>> read_question({"env_id": "rare_envs/CutIn-v0", "gamma": "low"})
         Traceback (most recent call last):
             ...
-        rare_envs.study.errors.BadInput: Expected gamma of the recorded question to be float, got 'low'.
+        rare_envs.study.errors.BadInput: Expected gamma of the recorded question to be a number, got 'low'.
     """
     if not isinstance(values, dict) or "env_id" not in values:
         raise BadInput(f"Expected a recorded question, an object with env_id, got {reprlib.repr(values)}.")
@@ -195,7 +197,8 @@ def read_question(values: Any) -> Question:
         types = tuple(kind for word in annotation.split(" | ") for kind in _JSON_TYPES[word])
         value = values[name]
         if not isinstance(value, types) or (isinstance(value, bool) and bool not in types):
-            raise BadInput(f"Expected {name} of the recorded question to be {annotation}, got {reprlib.repr(value)}.")
+            wanted = " or ".join(TYPE_WORDS[word] for word in annotation.split(" | "))
+            raise BadInput(f"Expected {name} of the recorded question to be {wanted}, got {reprlib.repr(value)}.")
     return Question(**{name: values[name] for name in known})
 
 

@@ -35,6 +35,7 @@ def own_module(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
         "def make_nothing():\n    return None\n"
         "def make_trouble():\n    raise RuntimeError('no\\nweights')\n"
         "def make_exit():\n    sys.exit(7)\n"
+        "def make_function():\n    return lambda observation: np.full((len(observation), 2), 0.5)\n"
         "def make_array():\n    return np.zeros(2)\n"
     )
     monkeypatch.chdir(tmp_path)
@@ -46,6 +47,7 @@ def test_a_function_of_the_user_makes_the_ego(own_module: str) -> None:
     assert isinstance(ego, Ego)
     assert ego.predict(observations(2))[0] == [[0.0, 0.0]] * 2
     assert load_ego(f"{own_module}:make_rule_based") == "idm"
+    assert load_ego(f"{own_module}:make_function").predict(observations(2))[0].tolist() == [[0.5, 0.5]] * 2
 
 
 @pytest.mark.parametrize(

@@ -111,7 +111,7 @@ class OneLineErrors(SummarisedCommands):
                 code = super().main(*args, **{**extra, "standalone_mode": False})
                 ended = code != 128 + signal.SIGINT
         except _UsageError as error:
-            words = getattr(error, "format_message")()  # noqa: B009  (its class differs by version)
+            words = getattr(error, "format_message")().replace("Value error, ", "")  # noqa: B009  (differs by version)
             path = getattr(getattr(error, "ctx", None), "command_path", "rare-envs")
             help_command = " ".join(["rare-envs", *path.split()[1:]])
             _fail(f"{words.rstrip('.')}{'' if words.endswith('?') else '.'} See {help_command} --help.")

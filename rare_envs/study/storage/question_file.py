@@ -13,7 +13,7 @@ import yaml
 
 from rare_envs.plugins import did_you_mean
 from rare_envs.study.errors import BadInput
-from rare_envs.study.question import Question, read_question
+from rare_envs.study.question import TYPE_WORDS, Question, read_question
 
 MAX_QUESTION_BYTES = 2**20
 ENV_KEY = "env"
@@ -110,7 +110,7 @@ def read_question_file(path: Path) -> dict[str, Any]:
     for name, types in EXECUTOR_KEYS.items():
         value = named.get(name)
         if value is not None and (not isinstance(value, types) or isinstance(value, bool)):
-            expected = " or ".join(kind.__name__ for kind in types)
+            expected = " or ".join(TYPE_WORDS[kind.__name__] for kind in types)
             raise BadInput(f"{str(path)!r}: Expected {name} to be {expected}, got {reprlib.repr(value)}.")
     return named
 

@@ -220,10 +220,10 @@ def test_a_damaged_base_is_used_or_refused_in_one_line(n: int, tmp_path: Path, r
     [
         ([1], "an object with env_id"),
         ({}, "an object with env_id"),
-        ({"env_id": FOLLOWING, "seed": 1.5}, "seed of the recorded question to be int, got 1.5"),
-        ({"env_id": FOLLOWING, "seed": True}, "seed of the recorded question to be int, got True"),
-        ({"env_id": FOLLOWING, "ego": None}, "ego of the recorded question to be str"),
-        ({"env_id": [FOLLOWING]}, "env_id of the recorded question to be str"),
+        ({"env_id": FOLLOWING, "seed": 1.5}, "seed of the recorded question to be a whole number, got 1.5"),
+        ({"env_id": FOLLOWING, "seed": True}, "seed of the recorded question to be a whole number, got True"),
+        ({"env_id": FOLLOWING, "ego": None}, "ego of the recorded question to be a text"),
+        ({"env_id": [FOLLOWING]}, "env_id of the recorded question to be a text"),
     ],
 )
 def test_what_is_no_question_is_refused(values: Any, words: str) -> None:

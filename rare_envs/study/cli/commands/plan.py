@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -10,7 +11,7 @@ import typer
 from rare_envs.study.cli.completion import EGO_WORDS, complete_environment, complete_words
 from rare_envs.study.cli.options import AlgoOption, JsonOption, QuestionOptions, StatsOption
 from rare_envs.study.cli.shell import is_typed, keep_stdout_for_the_answer, print_json
-from rare_envs.study.errors import BadInput
+from rare_envs.study.errors import BadInput, as_bad_input
 from rare_envs.threads import use_one_thread
 from training.command_line import spread_options
 
@@ -48,7 +49,10 @@ def plan_command(
     from rare_envs.study.analysis.plan import plan_by_pilots, plan_from_result
     from rare_envs.study.corpus.storage import read_recorded
     from rare_envs.study.question import Question
+    from samplers.validation import check_number
 
+    with as_bad_input(ValueError):
+        check_number("--cov", cov, 0.0, math.inf)  # before the pilots
     with keep_stdout_for_the_answer():
         if Path(target).is_dir():
             _refuse_options_of_pilots(context)

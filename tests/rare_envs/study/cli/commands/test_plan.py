@@ -26,3 +26,8 @@ def test_a_plan_from_pilots_and_one_from_a_folder(cli: Cli, risky: str, safe: st
     assert_refused(cli("plan", FOLLOWING, "--base", risky, "--method", "mc,nope", "--pilot", 100), "'nope'")
     assert_refused(cli("plan", "rare_envs/Nowhere-v0"), "Nowhere")
     assert_refused(cli("plan", tmp_path / "nowhere"), "There is no folder", "nowhere' of a run. Unknown environment")
+
+
+def test_a_precision_that_cannot_be_is_refused_before_the_pilots(cli: Cli) -> None:
+    for cov in ("-1", "0", "nan"):
+        assert_refused(cli("plan", FOLLOWING, "--cov", cov), "Expected --cov to be a number above 0")
