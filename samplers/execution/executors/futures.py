@@ -5,6 +5,7 @@ from __future__ import annotations
 import faulthandler
 import itertools
 import os
+import reprlib
 import threading
 import time
 import weakref
@@ -122,18 +123,23 @@ class _ForeignPool:
         """Submit a chunk to the pool, to a new one if it is broken."""
         future: Future[Packed] = Future()
         limits = Limits(self._settings.time_limit, self._settings.memory_limit)
-        arguments = (self._key, self._packed, name_process(), limits, index, chunk, next(self._calls))
+        call = next(self._calls)
+        arguments = (self._key, self._packed, name_process(), limits, index, chunk, call)
         try:
             job = self._pool.submit(compute_in_worker, *arguments)
         except (BrokenExecutor, RuntimeError) as error:
             self._replace(error)
             job = self._pool.submit(compute_in_worker, *arguments)
+        if not callable(getattr(job, "result", None)):
+            raise ExecutorError(
+                f"Expected {type(self._pool).__name__}.submit to return a future, got {reprlib.repr(job)}."
+            )
         kept = weakref.ref(job)  # a job that is done is let go: some pools compute it again where its worker dies
         future.add_done_callback(lambda given_up: _cancel(kept()) if given_up.cancelled() else None)
         if hasattr(job, "add_done_callback"):
-            job.add_done_callback(lambda done: _pass_on(done, future))
+            job.add_done_callback(lambda done: _pass_on(done, future, call))
         else:
-            threading.Thread(target=_watch, args=(job, future), daemon=True).start()
+            threading.Thread(target=_watch, args=(job, future, call), daemon=True).start()
         return future
 
     def close(self) -> None:
@@ -177,7 +183,7 @@ def compute_in_worker(
         try:
             _loaded[key] = cloudpickle.loads(packed)
         except BaseException as error:
-            return Reply(None, ExecutorError(f"A worker cannot load the problem ({describe(error)})."))
+            return Reply(None, ExecutorError(f"A worker cannot load the problem ({describe(error)})."), call)
         while len(_loaded) > 2:
             _loaded.popitem(last=False)
         if not in_driver:
@@ -187,13 +193,13 @@ def compute_in_worker(
     if seconds is not None:
         faulthandler.dump_traceback_later(seconds, exit=True)
     try:
-        return Reply(_loaded[key](index, chunk))
+        return Reply(_loaded[key](index, chunk), call=call)
     except SystemExit as error:  # in a worker of somebody else's that is to live on
         if in_driver:
-            return Reply(None, WorkerLost(describe(error)))
+            return Reply(None, WorkerLost(describe(error)), call)
         os._exit(1)
     except BaseException as error:
-        return Reply(None, make_portable(error))
+        return Reply(None, make_portable(error), call)
     finally:
         if seconds is not None:
             faulthandler.cancel_dump_traceback_later()
@@ -219,26 +225,37 @@ _loaded: OrderedDict[str, Any] = OrderedDict()
 """Work of this process by its digest."""
 
 
-def _pass_on(done: Any, future: Future[Packed]) -> None:
-    """Let a future have what a job has come to; what the pool itself raises means that a worker was lost."""
+def _pass_on(done: Any, future: Future[Packed], call: int) -> None:
+    """Let a future have what a job has come to; what the pool itself raises means that a worker was lost.
+
+    Args:
+        done: The job.
+        future: Of the chunk.
+        call: Number of the call that the job is to answer.
+    """
     if not future.set_running_or_notify_cancel():  # nobody waits for it any more
         return
     try:
-        reply: Reply = done.result()
+        reply: Any = done.result()
     except (Exception, CancelledError) as error:
         future.set_exception(WorkerLost(describe(error).split("\n", 1)[0]))
         return
-    if reply.error is not None:
+    if not isinstance(reply, Reply):
+        words = f"Expected what the submitted function returns as result of a future, got {reprlib.repr(reply)}."
+        future.set_exception(ExecutorError(words))
+    elif reply.call != call:
+        future.set_exception(ExecutorError("A future of the executor has the result of another call."))
+    elif reply.error is not None:
         future.set_exception(reply.error)
     else:
         assert reply.result is not None
         future.set_result(reply.result)
 
 
-def _watch(job: Any, future: Future[Packed]) -> None:
+def _watch(job: Any, future: Future[Packed], call: int) -> None:
     while not job.done():
         time.sleep(POLL_SECONDS)
-    _pass_on(job, future)
+    _pass_on(job, future, call)
 
 
 def _cancel(job: Any) -> None:

@@ -26,6 +26,8 @@ class Reply(NamedTuple):
     """The result."""
     error: BaseException | None = None
     """What the work raised instead."""
+    call: int = 0
+    """Number of the call that it answers, where calls are numbered."""
 
 
 def main() -> None:
@@ -80,7 +82,7 @@ def make_portable(error: BaseException) -> BaseException:
 
 def describe(error: BaseException) -> str:
     """Return the type and the text of an error."""
-    return f"{type(error).__name__}: {error}"
+    return f"{type(error).__name__}: {error}".removesuffix(": ")
 
 
 def _take_streams() -> tuple[IO[bytes], IO[bytes]]:

@@ -69,6 +69,48 @@ def test_jobs_that_call_nobody_back() -> None:
     assert by(FuturesPool(Jobs(), workers=2)) == whole()
 
 
+class Wrong:
+    """A pool that answers something else than what it was asked to compute."""
+
+    def __init__(self, answer: Any) -> None:
+        self.answer = answer
+        self.replies: list[Any] = []
+
+    def submit(self, function: Any, *arguments: Any) -> Any:
+        self.replies.append(function(*arguments))
+        future: Future[Any] = Future()
+        return self.answer(self, future)
+
+
+def give(value: Any) -> Any:
+    """Return an answer that gives a value, or what a function of the replies so far returns."""
+
+    def answer(pool: Wrong, future: Future[Any]) -> Future[Any]:
+        future.set_result(value(pool.replies) if callable(value) else value)
+        return future
+
+    return answer
+
+
+@pytest.mark.parametrize(
+    ("answer", "message"),
+    [
+        (lambda pool, future: pool.replies[-1], "Expected Wrong.submit to return a future, got Reply"),
+        (lambda pool, future: None, "Expected Wrong.submit to return a future, got None"),
+        (give(3), "as result of a future, got 3"),
+        (give(None), "as result of a future, got None"),
+        (give((np.zeros(3), {})), "as result of a future, got "),
+        (give(lambda replies: replies[0]), "the result of another call"),
+        (give(lambda replies: replies[-2:][0]), "the result of another call"),
+    ],
+)
+def test_a_pool_that_answers_something_else_ends_the_run_in_one_line(answer: Any, message: str) -> None:
+    problem = samplers.FunctionProblem(matrix, 3)
+    with pytest.raises(samplers.ExecutorError, match=message) as refused:
+        samplers.estimate(problem, "mc", seed=3, max_sim=30_000, executor=FuturesPool(Wrong(answer), workers=2))
+    assert "\n" not in str(refused.value)
+
+
 def test_a_broken_pool_of_the_callers_ends_the_run_with_advice() -> None:
     with make_processes() as processes:
         with pytest.raises(samplers.ExecutorError, match="give a function that makes the pool"):
