@@ -7,7 +7,8 @@ next one to whichever is free first, as the executors do.
 
     python -m benchmarks.simulation.scheduler --out benchmarks/results/scheduler.json --figure docs/images/scheduler.svg
 
-With `--times FILE` the times of drives are those of an earlier record.
+With `--times FILE` the times of drives are those of an earlier record. Every run is printed and written as soon as it
+is done; the last one takes some minutes.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ import rare_envs
 import samplers
 
 WORKERS = (1, 10, 30, 100, 300, 1000)
-RUNS = ((1000, 1), (6000, 1), (20_000, 1), (60_000, 1), (60_000, 10))
+RUNS = ((1000, 1), (6000, 1), (20_000, 1), (60_000, 1), (60_000, 10), (600_000, 1))
 """Simulations, and replicates that share them."""
 N_TIMED = 40
 
@@ -122,28 +123,29 @@ def share_stages(
     return stages
 
 
-def measure(times: list[float], seed: int = 0) -> dict[str, Any]:
-    """Return the utilisation of each run by number of workers, and by stage and batch with 1,000 workers."""
-    rng = np.random.default_rng(seed)
-    found: dict[str, Any] = {"seconds_of_a_drive": times, "workers": WORKERS, "runs": []}
-    for budget, replicates in RUNS:
-        sizes, result = record_batches(budget, replicates)
-        drawn = [rng.choice(times, size).tolist() for size in sizes]  # a chunk is one drive
-        busy = sum(map(sum, drawn))
-        walls = [simulate_schedule(drawn, workers)[0] for workers in WORKERS]
-        found["runs"].append(
-            {
-                "name": f"{budget:,} simulations" + (f", {replicates} replicates" if replicates > 1 else ""),
-                "cov": result.cov,
-                "batches": sizes,
-                "utilisation": [busy / (wall * workers) for wall, workers in zip(walls, WORKERS, strict=True)],
-                "bound": [bound_utilisation(sizes, workers) for workers in WORKERS],
-                "stages": share_stages(result, sizes, drawn) if replicates == 1 else [],
-                "speedup": [walls[0] / wall for wall in walls],
-                "by_batch": simulate_schedule(drawn, WORKERS[-1])[1],
-            }
-        )
-    return found
+def measure_run(times: list[float], budget: int, replicates: int, seed: int = 0) -> dict[str, Any]:
+    """Return the utilisation of one run by number of workers, and by stage and batch with 1,000 workers."""
+    rng = np.random.default_rng([seed, budget, replicates])
+    sizes, result = record_batches(budget, replicates)
+    drawn = [rng.choice(times, size).tolist() for size in sizes]  # a chunk is one drive
+    busy = sum(map(sum, drawn))
+    walls = [simulate_schedule(drawn, workers)[0] for workers in WORKERS]
+    return {
+        "name": f"{budget:,} simulations" + (f", {replicates} replicates" if replicates > 1 else ""),
+        "cov": result.cov,
+        "batches": sizes,
+        "utilisation": [busy / (wall * workers) for wall, workers in zip(walls, WORKERS, strict=True)],
+        "bound": [bound_utilisation(sizes, workers) for workers in WORKERS],
+        "stages": share_stages(result, sizes, drawn) if replicates == 1 else [],
+        "speedup": [walls[0] / wall for wall in walls],
+        "by_batch": simulate_schedule(drawn, WORKERS[-1])[1],
+    }
+
+
+def print_run(run: dict[str, Any]) -> None:
+    """Print the utilisation of a run."""
+    shares = ", ".join(f"{n}: {share:.2f}" for n, share in zip(WORKERS, run["utilisation"], strict=True))
+    print(f"{run['name']} in {len(run['batches'])} batches, c.o.v. {run['cov']:.4f}; utilisation {shares}", flush=True)
 
 
 def draw_figure(found: dict[str, Any], path: Path) -> None:
@@ -175,17 +177,15 @@ def main() -> None:
     parser.add_argument("--times", type=Path)
     given = parser.parse_args()
     times = json.loads(given.times.read_text())["seconds_of_a_drive"] if given.times else measure_times()
-    found = measure(times)
     options = f"--out {given.out} --figure {given.figure}" + (f" --times {given.times}" if given.times else "")
+    found: dict[str, Any] = {"seconds_of_a_drive": times, "workers": WORKERS, "runs": []}
     found["command"] = f"python -m benchmarks.simulation.scheduler {options}"
-    given.out.write_text(json.dumps(found, indent=1) + "\n")
+    for budget, replicates in RUNS:
+        found["runs"].append(measure_run(times, budget, replicates))
+        print_run(found["runs"][-1])
+        given.out.write_text(json.dumps(found, indent=1) + "\n")
     if given.figure is not None:
         draw_figure(found, given.figure)
-    for result in found["runs"]:
-        shares = ", ".join(
-            f"{n}: {share:.2f}" for n, share in zip(found["workers"], result["utilisation"], strict=True)
-        )
-        print(f"{result['name']} in {len(result['batches'])} batches, c.o.v. {result['cov']:.3f}; utilisation {shares}")
 
 
 if __name__ == "__main__":

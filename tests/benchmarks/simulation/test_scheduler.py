@@ -1,5 +1,7 @@
 """Schedules of chunks on workers, against ones that are counted by hand."""
 
+import json
+import sys
 from types import SimpleNamespace
 
 import pytest
@@ -28,3 +30,22 @@ def test_stages_end_where_the_trace_has_as_many_simulations():
     assert [(stage["batches"], stage["n_sim"]) for stage in stages] == [(2, 30), (1, 5), (2, 2000)]
     assert [stage["share_of_time"] for stage in stages] == [0.4, 0.2, 0.4]
     assert [stage["utilisation"] for stage in stages] == pytest.approx([0.015, 0.005, 1.0])
+
+
+def test_every_run_is_written_when_it_is_done(tmp_path, monkeypatch):
+    """The second run is interrupted; the first one is in the file."""
+
+    def record(budget, replicates):
+        if budget == 2:
+            raise KeyboardInterrupt
+        return [3, 1], SimpleNamespace(cov=0.1, trace=[SimpleNamespace(n_sim=4)])
+
+    out = tmp_path / "found.json"
+    (tmp_path / "times.json").write_text('{"seconds_of_a_drive": [1.0]}')
+    monkeypatch.setattr(scheduler, "record_batches", record)
+    monkeypatch.setattr(scheduler, "RUNS", ((1, 1), (2, 1)))
+    monkeypatch.setattr(sys, "argv", ["scheduler", "--out", str(out), "--times", str(tmp_path / "times.json")])
+    with pytest.raises(KeyboardInterrupt):
+        scheduler.main()
+    (run,) = json.loads(out.read_text())["runs"]
+    assert run["utilisation"] == [1.0, *(4 / (2 * workers) for workers in scheduler.WORKERS[1:])]

@@ -89,11 +89,10 @@ def train_screen(
         settings: Penalties, and when a screen is worth it.
     """
     from sklearn.linear_model import LogisticRegression  # slow to import
-    from sklearn.svm import SVC
 
     if min(known.min_class, fresh.min_class) < settings.min_class_size:
         return None
-    classifier = SVC(C=settings.svm_penalty, random_state=0).fit(known.u, known.fails)
+    classifier = _fit_machine(known, settings)
     decision = classifier.decision_function(fresh.u)
     line = LogisticRegression(C=settings.calibration_penalty, random_state=0).fit(decision[:, None], fresh.fails)
     intercept, slope = float(line.intercept_[0]), float(line.coef_[0, 0])
@@ -103,9 +102,17 @@ def train_screen(
     best = _choose_screen(screens, fresh, log_weights, settings.max_variance_ratio)
     if best is None:
         return None
-    u, fails = (np.concatenate(parts) for parts in zip(known, fresh, strict=True))
-    both = SVC(C=settings.svm_penalty, random_state=0).fit(u, fails)
-    return FailureScreen(both, intercept, slope, best.min_acceptance)
+    both = LabelledPoints(*(np.concatenate(parts) for parts in zip(known, fresh, strict=True)))
+    return FailureScreen(_fit_machine(both, settings), intercept, slope, best.min_acceptance)
+
+
+def _fit_machine(points: LabelledPoints, settings: ScreeningSettings) -> Any:
+    """Return a support vector machine trained on points, or on some at equal distances where there are too many."""
+    from sklearn.svm import SVC  # slow to import
+
+    n = len(points.u)
+    chosen = np.linspace(0, n - 1, min(n, settings.svm_points)).astype(np.int64)
+    return SVC(C=settings.svm_penalty, random_state=0).fit(points.u[chosen], points.fails[chosen])
 
 
 def _choose_screen(

@@ -187,6 +187,8 @@ class ScreeningSettings:
     svm_penalty: float = 10.0
     """C of the support vector machine: points on the wrong side are few, for f has no noise where a screen is
     trained. Variance 1.02 +- 0.01 and 1.02 +- 0.02, with `calibration_penalty`."""
+    svm_points: int = 20_000
+    """Points that it is trained on at most: training and decisions grow with the square of their number."""
     calibration_penalty: float = 100.0
     """C of the logistic regression that calibrates it: two coefficients from dozens of points need hardly any
     penalty."""

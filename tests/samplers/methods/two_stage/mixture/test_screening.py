@@ -1,4 +1,5 @@
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -103,3 +104,15 @@ def test_no_screen_where_the_spread_is_that_of_the_weights(rng):
 
     log_weights = rng.normal(0, 1.5, 800)
     assert train_screen(labelled(rng, 800, nearly_all), labelled(rng, 800, nearly_all), log_weights) is None
+
+
+def test_a_machine_is_trained_on_so_many_points_at_most(rng):
+    """Of 3,000 points 500, at equal distances; with room for all of them nothing changes."""
+    known, fresh = labelled(rng, 3000, beyond), labelled(rng, 600, beyond)
+    few = train_screen(known, fresh, np.zeros(600), replace(SETTINGS, svm_points=500))
+    whole, roomy = (train_screen(known, fresh, np.zeros(600), replace(SETTINGS, svm_points=n)) for n in (3600, 10**6))
+    assert few.classifier.shape_fit_ == (500, 2)
+    assert whole.classifier.shape_fit_ == (3600, 2)
+    u = rng.normal(0, 1.5, (1000, 2))
+    np.testing.assert_array_equal(whole(u), roomy(u))
+    assert few(u)[u[:, 0] > 1.5].mean() > 0.9 and few(u)[u[:, 0] < 0.5].mean() < few.min_acceptance + 0.1
