@@ -350,7 +350,7 @@ class FunctionProblem:
         if self.base is None:
             if self.dim == 0:  # as it is where it was not given
                 raise ValueError(
-                    "Expected dim to be a whole number of at least 1, or base, the distribution of x; got neither."
+                    "Expected dim, a whole number of at least 1, or base, the distribution of x; got neither."
                 )
             check_whole("dim", self.dim, 1)
             object.__setattr__(self, "base", StandardNormal(self.dim))

@@ -16,7 +16,7 @@ from samplers.analysis.budget import Pilot
 from samplers.analysis.curve import Curve, compute_curve
 from samplers.analysis.failure_modes import Share, split_by_kind
 from samplers.analysis.gate import Verdict, judge_estimate
-from samplers.analysis.reweighting import HasLogProb, Reweighted, find_sibling, reweight_estimate
+from samplers.analysis.reweighting import Reweighted, find_sibling, reweight_estimate
 from samplers.analysis.sensitivity.parameter_sensitivity import Sensitivity, compute_sensitivity
 from samplers.method import Stepping
 from samplers.presentation.estimate_display import EstimateDisplay
@@ -136,7 +136,7 @@ class Estimate(EstimateDisplay):
         """
         return compute_curve(self, gammas)
 
-    def reweight(self, new_base: HasLogProb) -> Reweighted:
+    def reweight(self, new_base: Any) -> Reweighted:
         """Return P[f(X) <= gamma] with X from another base distribution, from the same simulations.
 
         Every failing point counts with the ratio of the densities. That works near the old base: where the new one has
@@ -146,7 +146,9 @@ class Estimate(EstimateDisplay):
         support.
 
         Args:
-            new_base: The other distribution of X: `log_prob` of points (n, d) in physical space gives (n,).
+            new_base: The other distribution of X: an object whose `log_prob` of points (n, d) in physical space gives
+                (n,); or a frozen distribution of `scipy.stats`, one of OpenTURNS, or a list of them, as for
+                `FunctionProblem(base=...)`.
 
         Raises:
             ValueError: If the effective number of units or points is too small, the new base has
@@ -158,16 +160,12 @@ class Estimate(EstimateDisplay):
             >>> from scipy import stats
             >>> problem = samplers.FunctionProblem(lambda x: 3.0 - x[:, 0], dim=2)
             >>> result = samplers.estimate(problem, seed=0, max_sim=4000)
-            >>> shifted = stats.multivariate_normal([0.5, 0.0])
-            >>> class Shifted:
-            ...     def log_prob(self, x):
-            ...         return shifted.logpdf(x)
-            >>> print(f"{result.reweight(Shifted()).p:.3f}")  # Phi(-2.5) = 0.0062
+            >>> print(f"{result.reweight(stats.multivariate_normal([0.5, 0.0])).p:.3f}")  # Phi(-2.5) = 0.0062
             0.006
         """
         return reweight_estimate(self, new_base)
 
-    def under(self, base: HasLogProb | str) -> Reweighted:
+    def under(self, base: Any) -> Reweighted:
         """Return P[f(X) <= gamma] with X from another base distribution, which may be one that the base knows by name.
 
         Args:

@@ -1,7 +1,7 @@
 """Drives of an ego in a HighwayEnv scenario: from x to f, here or in a worker process."""
 
 import warnings
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -16,7 +16,7 @@ from rare_envs.egos.wrappers import wrap_policy
 from rare_envs.interop.fast_observation import install_fast_observation
 from rare_envs.interop.parameters import restore_class_parameters, set_idm
 from rare_envs.interop.scenario import HighwayEnvScenario
-from rare_envs.plugins import did_you_mean
+from rare_envs.plugins import did_you_mean, one_line
 from rare_envs.threads import use_one_thread
 
 MAX_SECONDS = 100.0
@@ -46,7 +46,7 @@ class DriveTask:
         install_fast_observation(env.scene, blind=self.ego == "idm")
         if self.ego == "idm":
             return DriveRunner(env, None, self.seconds)
-        ego = self.ego if is_policy(self.ego) else self.ego()
+        ego = self.ego if is_policy(self.ego) else _call_maker(self.ego)
         if not is_policy(ego):
             refuse_ego(ego, f"from {self.ego!r}")
         check_ego_spaces(ego, env)
@@ -100,6 +100,17 @@ def make_highway_env(env_id: str, config: Mapping[str, Any] | None) -> gym.Env[A
         if word not in words:
             raise ValueError(f"{env_id} has no {word!r} to configure{did_you_mean(word, words)}; {', '.join(words)}.")
     return env
+
+
+def _call_maker(maker: Callable[[], Any]) -> Any:
+    """Return what a function of the user's makes, or raise a ValueError if it fails."""
+    try:
+        return maker()
+    except Exception as error:  # the function is the user's
+        raise ValueError(
+            f"Expected an ego with predict, or a function without arguments that makes one, got {maker!r}, which "
+            f"fails: {one_line(error)}."
+        ) from error
 
 
 def strip_ego(ego: Any) -> Any:

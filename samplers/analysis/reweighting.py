@@ -7,6 +7,7 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 
 from samplers.analysis.base import MIN_UNITS, WeightedEstimate, cov_inflation, require_sample
+from samplers.distributions.conversion import as_distribution, can_convert
 from samplers.problem import Distribution, FloatArray
 from samplers.serialization import to_json_value
 from samplers.statistics.cluster_sums import has_independent_points, interval_of_sum
@@ -94,7 +95,7 @@ class Reweighted:
         return {name: to_json_value(value) for name, value in asdict(self).items()}
 
 
-def reweight_estimate(estimate: WeightedEstimate, new_base: HasLogProb) -> Reweighted:
+def reweight_estimate(estimate: WeightedEstimate, new_base: Any) -> Reweighted:
     """Return p under another base; see `Estimate.reweight`.
 
     p1 = sum of w r over the failing points, r = p1(x) / p0(x). With T_c the sums over units, its
@@ -107,6 +108,8 @@ def reweight_estimate(estimate: WeightedEstimate, new_base: HasLogProb) -> Rewei
         ValueError: As described in `Estimate.reweight`.
     """
     sample = require_sample(estimate)
+    if can_convert(new_base) or isinstance(new_base, list | tuple):
+        new_base = as_distribution(new_base, sample.x.shape[1])
     failing = sample.f <= estimate.gamma
     f, old, owners = sample.f[failing], sample.weights[failing], sample.units[failing]
     log_ratios = log_density_ratios(estimate, new_base, sample.x)

@@ -171,13 +171,13 @@ def descent_cov(roots: NDArray[np.int64], n: int) -> float:
 
 def _end_warnings(depth: int, status: Status, hits: int, cov: float) -> list[str]:
     """Return what the end of the run at level `depth` and its failures leave doubtful."""
-    found = []
+    found, failing = [], f"{hits} failing point{'' if hits == 1 else 's'}"
     if status is Status.STALLED:
         found.append(f"No progress beyond level {depth}: f is constant there, or the limit on levels was reached.")
     if status is Status.BUDGET:
-        found.append(f"max_sim was used up at level {depth}; p rests on {hits} failing points.")
+        found.append(f"max_sim was used up at level {depth}; p rests on {failing}.")
     if status is Status.STOPPED:
-        found.append(f"Stopped at level {depth}; p rests on {hits} failing points.")
+        found.append(f"Stopped at level {depth}; p rests on {failing}.")
     if hits == 0:
         found.append("No failure was seen: p = 0 with a one-sided interval.")
     elif cov > LARGE_COV:

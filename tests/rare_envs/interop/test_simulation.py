@@ -55,3 +55,8 @@ def test_statistics_of_a_model_travel_without_its_environment() -> None:
     there = wrap_policy(pickle.loads(pickle.dumps(strip_ego(model))), vec_env.observation_space)
     assert there.normalise(seen)[0, 0, 0] == pytest.approx(vec_env.normalize_obs(seen)[0, 0, 0])  # type: ignore[call-overload]
     np.testing.assert_array_equal(there.predict(seen)[0], expected)
+
+
+def test_a_maker_that_fails_is_told_in_one_line() -> None:
+    with pytest.raises(ValueError, match=r"a function without arguments that makes one, got .* which fails: TypeError"):
+        fast(lambda observation: 1)

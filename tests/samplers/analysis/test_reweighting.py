@@ -5,6 +5,7 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
+import openturns
 import pytest
 from scipy import stats
 from scipy.special import ndtr
@@ -219,6 +220,24 @@ def test_densities_are_finite_numbers_one_for_each_point():
 
     with pytest.raises(ValueError, match="in 2 dimensions; 10000 draws"):
         run().reweight(WrongDraws(0.0))
+
+
+def test_distributions_of_scipy_and_openturns_are_taken_as_bases_are():
+    class Shifted:
+        def log_prob(self, x):
+            return stats.multivariate_normal([0.3, 0.1]).logpdf(x)
+
+    result = run()
+    expected = result.reweight(Shifted())
+    for new in (
+        stats.multivariate_normal([0.3, 0.1]),
+        [stats.norm(0.3), stats.norm(0.1)],
+        openturns.JointDistribution([openturns.Normal(0.3, 1.0), openturns.Normal(0.1, 1.0)]),
+    ):
+        assert result.reweight(new).p == pytest.approx(expected.p, rel=1e-9)
+        assert result.under(new).cov == pytest.approx(expected.cov, rel=1e-9)
+    with pytest.raises(ValueError, match="Expected a base distribution of 2 dimensions, got 3"):
+        result.reweight([stats.norm(0.3)] * 3)
 
 
 def test_densities_far_apart_do_not_overflow():

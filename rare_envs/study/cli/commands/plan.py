@@ -96,5 +96,5 @@ def _print_plan(found: tuple[PlannedRun, ...], cov: float) -> None:
 
     print(f"For a c.o.v. of {cov:g} (--target-cov {cov:g}):")
     for each in found:
-        time = "" if each.seconds is None else f", about {format_seconds(each.seconds)} as fast as the pilot"
+        time = "" if each.seconds is None else f", about {format_seconds(each.seconds)} at the pilot's speed"
         print(f"  {each.method:<12} {each.n_sim:>15,} simulations{time}")
