@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import reprlib
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -75,7 +76,10 @@ def _predict(policy: Any, query: PolicyQuery) -> tuple[Tensor, Any]:
         action, hidden = policy.predict(
             query.observation, state=query.hidden, episode_start=query.start, deterministic=True
         )
-    return torch.as_tensor(np.asarray(action)).to(query.over.device), hidden
+    actions = np.asarray(action)
+    if actions.dtype.kind not in "biuf":
+        raise ValueError(f"Expected actions as numbers, one or two for each observation, got {reprlib.repr(action)}.")
+    return torch.as_tensor(actions).to(query.over.device), hidden
 
 
 def _query_with_reasons(policy: Any, kind: str, query: PolicyQuery) -> tuple[Tensor, Any, dict[int, str]]:

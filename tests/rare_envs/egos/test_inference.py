@@ -95,3 +95,13 @@ def test_a_failed_row_idles_where_actions_are_meta() -> None:
     action, _ = query_policy(Meta(), "meta", query([3.0, -1.0, 4.0]), failed)
     assert action.tolist() == [3, IDLE, 4]
     assert list(failed) == [1]
+
+
+@pytest.mark.parametrize("answer", ["left", ["left", "left"], [None, None], [{"steering": 0.0}] * 2])
+def test_actions_that_are_no_numbers_are_refused(answer: Any) -> None:
+    class Wordy:
+        def predict(self, observation: Any, **_: Any) -> Any:
+            return answer, None
+
+    with pytest.raises(ValueError, match="Expected actions as numbers, one or two for each observation, got"):
+        query_policy(Wordy(), "continuous", query([0.1, 0.2]))
