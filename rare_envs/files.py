@@ -1,11 +1,18 @@
-"""Files that are replaced whole: whoever is killed while writing, or runs out of space, leaves the earlier file."""
+"""Files that are replaced whole: whoever is killed while writing, or runs out of space, leaves the earlier file.
+
+And files that somebody else may have written, which are read only where they are ordinary ones of a bounded size.
+"""
 
 from __future__ import annotations
 
 import contextlib
 import os
+import stat
 from collections.abc import Iterator
 from pathlib import Path
+
+MAX_TEXT_BYTES = 2**28
+"""Bytes of a text of a run: 1,000 failures with 10,000 numbers each have fewer."""
 
 
 @contextlib.contextmanager
@@ -54,6 +61,41 @@ def replace_text(path: str | Path, text: str) -> None:
     """
     with replace_file(path) as draft:
         draft.write_text(text, encoding="utf-8")
+
+
+def check_ordinary(path: str | Path, most: int | None = None) -> None:
+    """Refuse what is no ordinary file: a pipe would be waited for, and a device read without an end.
+
+    Args:
+        path: The file.
+        most: Bytes that it may have; None for any number.
+
+    Raises:
+        ValueError: It is none, or has more bytes.
+        OSError: There is none, or nobody may look at it.
+
+    Example:
+        >>> check_ordinary("/dev/null")
+        Traceback (most recent call last):
+            ...
+        ValueError: '/dev/null' is no ordinary file.
+    """
+    found = os.stat(path)
+    if not stat.S_ISREG(found.st_mode):
+        raise ValueError(f"{str(path)!r} is no ordinary file.")
+    if most is not None and found.st_size > most:
+        raise ValueError(f"{str(path)!r} has {found.st_size:,} bytes, more than {most:,}.")
+
+
+def read_text_file(path: str | Path) -> str:
+    """Return the text of an ordinary file in UTF-8 of at most `MAX_TEXT_BYTES`.
+
+    Raises:
+        ValueError: It is no such file, or no such text.
+        OSError: It cannot be read.
+    """
+    check_ordinary(path, MAX_TEXT_BYTES)
+    return Path(path).read_text(encoding="utf-8")
 
 
 def _sync(path: Path) -> None:

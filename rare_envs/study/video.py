@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
 from rare_envs.envs.rendering import AGENT, FRAME_WIDTH, Colour, Renderer
-from rare_envs.files import replace_file
+from rare_envs.files import read_text_file, replace_file
 from rare_envs.json_text import parse_json_object
 from rare_envs.problem import DrivingProblem
 from rare_envs.study.analysis.moved_files import warn_of_changed_files
@@ -64,7 +64,7 @@ def find_failure(folder: Path, number: int, trust: bool = False) -> RecordedFail
     """
     refuse_unfinished(folder)
     try:
-        recorded = parse_json_object((folder / RESULT).read_text(encoding="utf-8"), repr(str(folder / RESULT)))
+        recorded = parse_json_object(read_text_file(folder / RESULT), repr(str(folder / RESULT)))
         table = read_failures(folder)
     except OSError as error:
         raise BadInput(

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import os
+import stat
 import struct
 import zlib
 from pathlib import Path
@@ -61,7 +62,7 @@ class RecordFile:
             new: Make it where there is none; `clear` begins it.
 
         Raises:
-            JournalError: Another process has it open.
+            JournalError: Another process has it open, or it is no ordinary file.
             OSError: It cannot be opened.
         """
         self.path, self._absolute = path, path.absolute()  # the working directory may change
@@ -70,6 +71,9 @@ class RecordFile:
         self._file: IO[bytes] = open(os.open(path, flags, 0o666), "r+b", buffering=0)
         self._digest, self._end = b"", len(MAGIC)  # of the records that have been read or written
         self.last: bytes | None = None
+        if not stat.S_ISREG(os.fstat(self._file.fileno()).st_mode):  # a pipe would be waited for
+            self._file.close()
+            raise JournalError(f"{str(path)!r} is no ordinary file.")
         if not lock_file(self._file) or not self.exists:
             self._file.close()
             raise JournalError(f"Another process is writing {str(path)!r}: wait for it to end, or choose another file.")

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from rare_envs.files import replace_file, replace_text
+from rare_envs.files import MAX_TEXT_BYTES, read_text_file, replace_file, replace_text
 
 
 def names(folder: Path) -> list[str]:
@@ -120,3 +120,21 @@ def test_a_killed_writer_leaves_a_whole_file(tmp_path: Path) -> None:
         text = path.read_text()
         number = text[: len(text) // 200_000]
         assert text == number * 200_000
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="needs named pipes")
+def test_only_ordinary_files_of_a_bounded_size_are_read(tmp_path: Path) -> None:
+    pipe, large, text = tmp_path / "pipe", tmp_path / "large", tmp_path / "text"
+    os.mkfifo(pipe)
+    (tmp_path / "zero").symlink_to("/dev/zero")
+    text.write_text("été", encoding="utf-8")
+    large.touch()
+    os.truncate(large, MAX_TEXT_BYTES + 1)
+    assert read_text_file(text) == "été"
+    for path in (pipe, tmp_path / "zero", tmp_path):
+        with pytest.raises(ValueError, match="is no ordinary file"):
+            read_text_file(path)
+    with pytest.raises(ValueError, match="268,435,457 bytes, more than 268,435,456"):
+        read_text_file(large)
+    with pytest.raises(FileNotFoundError):
+        read_text_file(tmp_path / "nowhere")

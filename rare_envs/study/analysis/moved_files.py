@@ -10,6 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from rare_envs.files import read_text_file
 from rare_envs.json_text import parse_json_object
 from rare_envs.study.errors import BadInput, as_bad_input
 from rare_envs.study.journal import digest_contents, digest_files, find_changed_files
@@ -104,7 +105,7 @@ def _rename(value: str | None, moved: Mapping[str, str]) -> str | None:
 def _read_about(folder: Path) -> dict[str, Any]:
     """Return what study.json holds; nothing where it cannot be read, which others tell."""
     try:
-        return parse_json_object((folder / STUDY).read_text(encoding="utf-8"), STUDY)
+        return parse_json_object(read_text_file(folder / STUDY), STUDY)
     except (OSError, ValueError):
         return {}
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rare_envs.files import replace_text
+from rare_envs.files import read_text_file, replace_text
 from rare_envs.json_text import parse_json_object
 from rare_envs.study.analysis.recorded_question import note_question, open_question
 from rare_envs.study.corpus.stored_failure import StoredFailure, make_stored, read_stored
@@ -70,7 +70,7 @@ def read_recorded(folder: Path) -> dict[str, Any]:
     """
     refuse_unfinished(folder)
     try:
-        return parse_json_object((folder / RESULT).read_text(encoding="utf-8"), repr(str(folder / RESULT)))
+        return parse_json_object(read_text_file(folder / RESULT), repr(str(folder / RESULT)))
     except OSError as error:
         raise BadInput(_no_run(folder)) from error
     except ValueError as error:

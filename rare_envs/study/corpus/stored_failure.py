@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from rare_envs.files import check_ordinary
 from rare_envs.json_text import parse_json_object
 from rare_envs.scenarios.registry import find_scenario
 from rare_envs.study.question import Question
@@ -181,8 +182,6 @@ def read_stored(path: Path) -> StoredFailure:
         ValueError: It is no stored failure.
         OSError: It cannot be read.
     """
-    with path.open("rb") as file:
-        content = file.read(MAX_STORED + 1)
-    if len(content) > MAX_STORED:
-        raise ValueError(f"{str(path)!r} has more than {MAX_STORED:,} bytes.")
+    check_ordinary(path, MAX_STORED)
+    content = path.read_bytes()
     return parse_stored(content.decode("utf-8", "replace"), repr(str(path)))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import io
 import zipfile
 from pathlib import Path
 from typing import Any
@@ -10,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from rare_envs.files import check_ordinary, read_text_file
 from rare_envs.plugins import one_line
 from rare_envs.study.storage.names import BLOCKS, FAILURES
 
@@ -59,7 +61,7 @@ def read_failures(folder: Path) -> dict[str, NDArray[Any]]:
     try:
         failures = _read_table(folder / FAILURES)
     except (csv.Error, ValueError) as error:
-        raise ValueError(f"{str(folder / FAILURES)!r} is damaged: {error}.") from error
+        raise ValueError(f"{str(folder / FAILURES)!r} is damaged: {str(error).rstrip('.')}.") from error
     if (folder / BLOCKS).exists():
         failures |= _read_blocks(folder / BLOCKS)
     lengths = {name: len(values) for name, values in failures.items()}
@@ -74,8 +76,7 @@ def _read_table(path: Path) -> dict[str, NDArray[Any]]:
     Raises:
         ValueError: It is no table, or a cell is no number.
     """
-    with path.open(newline="", encoding="utf-8") as file:
-        header, *rows = csv.reader(file) or [[]]
+    header, *rows = csv.reader(io.StringIO(read_text_file(path))) or [[]]
     if any(len(row) != len(header) for row in rows):
         raise ValueError("a row has more or fewer cells than the header")
     columns: dict[str, list[NDArray[Any]]] = {}
@@ -94,6 +95,7 @@ def _read_blocks(path: Path) -> dict[str, NDArray[Any]]:
         ValueError: The file is damaged.
     """
     try:
+        check_ordinary(path)
         with zipfile.ZipFile(path) as archive:
             if sum(each.file_size for each in archive.infolist()) > MAX_BLOCK_BYTES:
                 raise ValueError(f"more than {MAX_BLOCK_BYTES:,} bytes unpacked")

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from numpy.typing import NDArray
 
+from rare_envs.files import read_text_file
 from rare_envs.json_text import parse_json_object
 from rare_envs.study.errors import BadInput
 from rare_envs.study.storage.failure_table import read_failures
@@ -193,7 +194,7 @@ def _read_object(path: Path) -> dict[str, Any]:
         BadInput: It holds none.
     """
     try:
-        return parse_json_object(path.read_text(encoding="utf-8"), repr(str(path)))
+        return parse_json_object(read_text_file(path), repr(str(path)))
     except (OSError, ValueError) as error:
         raise BadInput(error) from error
 

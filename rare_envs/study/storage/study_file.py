@@ -16,7 +16,7 @@ from typing import Any
 
 from agents.loading import find_ego_kind, strip_prefixes
 from rare_envs.distributions.fitted import FittedDistribution
-from rare_envs.files import replace_text
+from rare_envs.files import read_text_file, replace_text
 from rare_envs.json_text import format_json, parse_json_object
 from rare_envs.study.analysis.moved_files import describe_places
 from rare_envs.study.analysis.recorded_question import is_same_question
@@ -91,7 +91,7 @@ def note_resumption(folder: Path, earlier_seconds: float) -> None:
         earlier_seconds: Wall time of the run before it was interrupted [s].
     """
     with suppress(OSError, ValueError):  # a full disk is found when results are written
-        about = parse_json_object((folder / STUDY).read_text(encoding="utf-8"), STUDY)
+        about = parse_json_object(read_text_file(folder / STUDY), STUDY)
         about |= {"resumed": _now(), "earlier_seconds": earlier_seconds}
         replace_text(folder / STUDY, format_json(about) + "\n")
 
@@ -110,7 +110,7 @@ def finish_study_file(folder: Path, study: Study, seconds: float) -> None:
         OSError: It cannot be written.
     """
     try:
-        begun = parse_json_object((folder / STUDY).read_text(encoding="utf-8"), STUDY)
+        begun = parse_json_object(read_text_file(folder / STUDY), STUDY)
     except (OSError, ValueError):  # of an earlier version, or somebody has removed it
         begun = {"question": None}
     if "question" in begun and not is_same_question(begun["question"], study.question):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import os
 import shutil
 import zipfile
 from collections.abc import Callable, Iterator
@@ -254,3 +255,19 @@ def test_an_ego_that_sets_numpys_errors_sets_them_for_itself(here: Path, risky: 
     assert strict.exit_code in (0, 3), strict.stderr
     assert json.loads(strict.stdout)["p"] == json.loads(usual.stdout)["p"]
     assert np.geterr() == before
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="needs named pipes")
+@pytest.mark.parametrize("kind", ["pipe", "device"])
+@pytest.mark.parametrize("name", ["result.json", "study.json", "failures.csv", "failures.npz", JOURNAL])
+def test_a_pipe_or_a_device_in_the_place_of_a_file_is_neither_waited_for_nor_read_for_ever(
+    name: str, kind: str, run: Path
+) -> None:
+    (run / name).unlink(missing_ok=True)
+    if kind == "pipe":
+        os.mkfifo(run / name)
+    else:
+        (run / name).symlink_to("/dev/zero")
+    accepted = (0, 3) if name in ("study.json", "failures.npz") else ()  # others say what is missing, or none is needed
+    for words in (("replay",), ("report",), ("corpus", "add"), ("resume",)):
+        assert_one_line(cli(*words, "run"), *(accepted if words != ("resume",) else ()))
