@@ -164,7 +164,7 @@ def draw_figure(found: dict[str, Any], path: Path) -> None:
     right.set(
         xlabel="share of the simulations", ylabel=f"the same, batch by batch, {WORKERS[-1]:,} workers", ylim=(0, 1)
     )
-    left.legend(frameon=False)
+    left.legend(frameon=False, fontsize=8, loc="lower left")
     figure.savefig(path, metadata={"Date": None} if path.suffix == ".svg" else None)
     plt.close(figure)
 
