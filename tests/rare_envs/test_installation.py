@@ -126,6 +126,21 @@ def test_version_and_help_need_no_library_of_the_extra(
     assert shown in done.stdout
 
 
+def test_completion_needs_no_library_of_the_extra(
+    bare: Callable[..., subprocess.CompletedProcess[str]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("_RARE_ENVS_COMPLETE", "complete_bash")
+    for line, found in (
+        ("rare-envs estimate Car", ["CarFollowing-v0"]),
+        ("rare-envs estimate CutIn-v0 --base us", []),
+        ("rare-envs estimate CutIn-v0 --method ad", ["adss"]),
+    ):
+        monkeypatch.setenv("COMP_WORDS", line)
+        monkeypatch.setenv("COMP_CWORD", str(line.count(" ")))
+        done = bare()
+        assert (done.stdout.split(), done.stderr) == (found, "")
+
+
 def test_methods_are_measured_without_the_extra(bare: Callable[..., subprocess.CompletedProcess[str]]) -> None:
     plan = ("--method", "mc", "--budget", "200", "--runs", "2", "--workers", "2")
     done = bare("bench", "samplers", "--problems", "lin_d2", *plan, "--out", "bench", "--json")

@@ -9,6 +9,8 @@ from collections.abc import Callable
 
 import typer
 
+from rare_envs.installation import find_missing_libraries
+
 EGO_WORDS = ("idm", "human", "imitation", "mgail", "mgail2", "mgail3", "gail", "bc", "vision")
 DRIVER_WORDS = ("mgail", "mgail2", "mgail3", "gail", "bc", "idm", "idm+mobil")
 MEASURE_WORDS = (
@@ -96,6 +98,8 @@ def complete_scenario(incomplete: str) -> list[str]:
 
 def complete_base(context: typer.Context, incomplete: str) -> list[str]:
     """Return the base distributions, that begin so, of the environment which stands in the line already."""
+    if find_missing_libraries():  # bases need torch
+        return []
     from rare_envs.scenarios.registry import SCENARIOS, complete_id
 
     words = [context.params.get("env"), *context.args]  # among the latter while the line does not parse yet
