@@ -130,7 +130,8 @@ def fit_own_bases(
         except ValueError as error:
             too_few.append(f"{path}: {error}")
             if len(too_few) == len(chosen):
-                raise ValueError(too_few[0]) from None
+                every = "" if len(chosen) == 1 else f" No base of {', '.join(chosen)} is written: give more recordings."
+                raise ValueError(f"{too_few[-1]}{every}") from None
             typer.echo(f"{too_few[-1]} No base of {scenario} is written.", err=True)
             continue
         written.append(_write(out / f"{scenario}_{name}.json", format_base(scenario, base.to_dict())))

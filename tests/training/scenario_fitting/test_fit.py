@@ -124,6 +124,14 @@ def test_bases_are_fitted_to_a_file_of_i24_motion(simulated, quick, tmp_path):
     assert result.exit_code == 2 and "has no rows between the times" in result.stderr
 
 
+def test_where_no_base_can_be_fitted_the_error_names_all_of_them(simulated, quick, tmp_path):
+    path = write_i24(tmp_path / "morning.json", i24_documents(simulated))
+    result = run_cli("--i24", path, "--out", tmp_path, "--between", CLOCK, CLOCK + 2.0)
+    assert result.exit_code == 2
+    end = "No base of car_following, cut_in, hard_brake is written: give more recordings."
+    assert result.stderr.splitlines()[-1].endswith(end)
+
+
 def test_a_car_following_base_is_fitted_to_the_data_of_coifman_and_li(simulated, quick, tmp_path):
     path = write_coifman(tmp_path / "CoifmanAndLi2017.mat", coifman_matrix(simulated))
     result = run_cli("--coifman", path, "--out", tmp_path, "--scenario", "car_following")
