@@ -30,6 +30,8 @@ class HighwayEnvInterface:
 
     world: World
     render_mode: str | None
+    reset: Any
+    """Of the environment."""
     _episode: Episode | None
     _tick: int
     _scene: tuple[Episode, Any] | None = None
@@ -84,22 +86,27 @@ class HighwayEnvInterface:
 
     @property
     def road(self) -> Any:
-        """The road with all vehicles, the ego first, a `highway_env.road.road.Road`; None before the first reset."""
+        """The road with all vehicles, the ego first, a `highway_env.road.road.Road`.
+
+        Before the first reset, as with HighwayEnv, that of an episode which is begun for it.
+        """
         if self._episode is None:
-            return None
+            self.reset()
+        assert self._episode is not None
         if self._scene is None or self._scene[0] is not self._episode:
             self._scene = (self._episode, make_scene(self._episode))
         return self._scene[1]
 
     @property
     def controlled_vehicles(self) -> list[Any]:
-        """The ego, in a list; empty before the first reset."""
-        return [] if self.road is None else self.road.vehicles[:1]
+        """The ego, in a list."""
+        vehicles: list[Any] = self.road.vehicles
+        return vehicles[:1]
 
     @property
     def vehicle(self) -> Any:
-        """The ego, a `highway_env.vehicle.kinematics.Vehicle` at this moment; None before the first reset."""
-        return self.controlled_vehicles[0] if self.controlled_vehicles else None
+        """The ego, a `highway_env.vehicle.kinematics.Vehicle` at this moment."""
+        return self.controlled_vehicles[0]
 
     @property
     def action_type(self) -> Any:

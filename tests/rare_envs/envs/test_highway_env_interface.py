@@ -27,7 +27,6 @@ def make(env_id: str = CUT_IN, **kwargs: Any) -> Any:
 @pytest.mark.parametrize("env_id", rare_envs.ENV_IDS)
 def test_vehicle_and_road_follow_the_episode(env_id: str) -> None:
     env = make(env_id)
-    assert (env.road, env.vehicle, env.controlled_vehicles) == (None, None, [])
     _, info = env.reset(seed=1)
     assert env.vehicle is env.road.vehicles[0] is env.controlled_vehicles[0]
     assert (env.vehicle.speed, env.vehicle.crashed) == (info["speed"], info["crashed"])
@@ -71,6 +70,14 @@ def test_a_change_of_what_is_fixed_is_left_out_with_a_warning() -> None:
     with pytest.warns(UserWarning, match="leaves simulation_frequency, lanes_cuont as they are.*gym.make takes dt"):
         env.configure({"simulation_frequency": 15, "lanes_cuont": 3})
     assert env.config["simulation_frequency"] == 10 and "lanes_cuont" not in env.config
+
+
+def test_road_and_vehicle_are_there_before_the_first_reset_and_leave_a_seeded_one_as_it_is() -> None:
+    env, other = make(), make()
+    assert env.vehicle is env.road.vehicles[0] and env.vehicle.speed > 0 and not env.vehicle.crashed
+    for each in (env, other):
+        each.reset(seed=3)
+    assert env.vehicle.speed == other.vehicle.speed
 
 
 def test_time_goes_on_by_what_a_step_takes() -> None:
