@@ -64,7 +64,7 @@ def write_object(path: str | PathLike[str], value: object) -> None:
         >>> write_object("nowhere", object())
         Traceback (most recent call last):
             ...
-        TypeError: A value of class object cannot be written to a file.
+        TypeError: A value of class object cannot be written to a file; to_dict() has plain values.
     """
     from safetensors import SafetensorError
     from safetensors.numpy import save_file

@@ -50,8 +50,8 @@ FAILING = {
     "gives infinity": (lambda actions, short: np.where(short[:, None], np.inf, actions), "NaN or infinite actions"),
     "gives the wrong shape": (lambda actions, short: actions[:, :1], "Expected actions of shape"),
     "gives too few actions": (lambda actions, short: actions[~short], "Expected actions of shape"),
-    "gives words": (lambda actions, short: np.full(actions.shape, "left"), "TypeError"),
-    "gives nothing": (lambda actions, short: None, "TypeError"),
+    "gives words": (lambda actions, short: np.full(actions.shape, "left"), "Expected actions as numbers"),
+    "gives nothing": (lambda actions, short: None, "Expected actions as numbers"),
 }
 
 

@@ -27,7 +27,7 @@ def test_missing_values_are_empty_fields(tmp_path):
 def test_pooled_events_keep_their_order():
     pooled = concatenate_events([EVENTS, {name: values[:1] for name, values in EVENTS.items()}])
     assert pooled["ego"].tolist() == [-1, 4, -1]
-    with pytest.raises(ValueError, match="no recording was given"):
+    with pytest.raises(ValueError, match="at least one recording, got none"):
         concatenate_events([])
 
 

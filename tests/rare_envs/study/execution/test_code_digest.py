@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from importlib import resources
 from pathlib import Path
 
 import pytest
 
+from rare_envs.study.execution import code_digest
 from rare_envs.study.execution.code_digest import digest_code
 
 
@@ -18,7 +18,7 @@ def test_another_source_weight_or_base_is_other_code(monkeypatch: pytest.MonkeyP
         return digest_code()
 
     shipped = digest()
-    monkeypatch.setattr(resources, "files", lambda package: tmp_path)
+    monkeypatch.setattr(code_digest, "_find_folder", lambda package: tmp_path)
     found = [digest(a_py="1"), digest(a_py="2"), digest(b_safetensors="w"), digest(c_json="{}"), digest(notes_txt="t")]
     digest_code.cache_clear()
     assert len({shipped, *found[:4]}) == 5
