@@ -63,7 +63,7 @@ def read_records() -> dict[str, dict[str, Any]]:
 
 
 def format_scales(records: Mapping[str, Mapping[str, Any]]) -> str:
-    """Return a table of what each record has of its scale, and what the vision ego's rest would take."""
+    """Return a table of what each record has of its scale, and what the full one would take with the vision ego."""
     rows = []
     for paper, record in records.items():
         if paper == "tian2024":
@@ -79,14 +79,14 @@ def format_scales(records: Mapping[str, Mapping[str, Any]]) -> str:
     lidar, vision = (CORE_SPEEDS[ego] for ego in ("lidar", "vision"))
     hours = [STUDY_SCALES["vision", scale].rollouts / vision / 3600 for scale in ("small", "full")]
     text = (
-        "All is there but rollouts with the vision ego: its small scale is not complete, and its full scale was not "
-        "begun. In each rollout a camera draws a picture for each of 100 steps and a network looks at it: about "
+        "All is there but the full scale with the vision ego, which was not begun. In each rollout a camera draws a "
+        "picture for each of 100 steps and a network looks at it: about "
         f"{vision:g} rollouts a second of a core's processor time (an AMD EPYC), where the lidar ego makes "
-        f"{lidar:,.0f}. That is {hours[0]:.1f} core hours for the small scale and {hours[1]:.0f} for the full one. "
-        "`rare-envs reproduce okelly2018 --ego vision --out vision` makes the small "
-        "scale, in half the time with `--workers 2`, and goes on where it was stopped; `--scale full --executor ray` "
-        "is for a cluster. Until then nothing here says whether cross-entropy gains with this ego what the paper's "
-        "Table 2 and Figure 3 show."
+        f"{lidar:,.0f}. That is {hours[0]:.1f} core hours for the small scale and {hours[1]:.0f} for the full one; "
+        "`rare-envs reproduce okelly2018 --ego vision --scale full --executor ray` is for a cluster. With this ego "
+        "failures are so rare that the small scale's naive p rests on one event at most, so that it does not say "
+        "whether cross-entropy gains what the paper's Table 2 and Figure 3 show; its draws fail by the hundred, with "
+        "weights that add up to next to nothing, as with the lidar ego."
     )
     return SCALES_HEAD + "\n".join(rows) + f"\n\n{text}\n"
 
