@@ -11,7 +11,7 @@ from benchmarks.estimators import sampler_leaderboard
 from benchmarks.estimators.sampler_leaderboard import (
     LEADERBOARD_PAGE,
     PLANNED,
-    RUNS,
+    PlannedRuns,
     condense_results,
     format_leaderboard_page,
     leave_out,
@@ -34,12 +34,12 @@ def test_the_page_is_what_the_result_gives() -> None:
 
 
 def test_every_method_has_every_problem_of_the_sets(committed) -> None:
-    assert set(PLANNED) == {300, 1500, 6000}
+    assert {planned.budget for planned in PLANNED} == {300, 1500, 6000}
     wanted = {
-        (method, problem, budget): RUNS
-        for budget, (methods, groups) in PLANNED.items()
-        for problem in choose_problems(groups)
-        for method in methods
+        (method, problem, planned.budget): planned.runs
+        for planned in PLANNED
+        for problem in choose_problems(planned.groups)
+        for method in planned.methods
     }
     found = {(cell["method"], cell["problem"], cell["max_sim"]): cell["runs"] for cell in committed["cells"]}
     assert found == wanted
@@ -111,8 +111,7 @@ def test_rows_of_a_method_are_made_anew_and_the_others_stay(tmp_path: Path, monk
     for name in ("LEADERBOARD_RESULT", "LEADERBOARD_PAGE"):
         monkeypatch.setattr(sampler_leaderboard, name, tmp_path / name)
     monkeypatch.setattr(sampler_leaderboard, "READING", "print('one row')\n")
-    monkeypatch.setattr(sampler_leaderboard, "PLANNED", {300: (("mc", "ss"), ("highdim",))})
-    monkeypatch.setattr(sampler_leaderboard, "RUNS", 2)
+    monkeypatch.setattr(sampler_leaderboard, "PLANNED", (PlannedRuns(300, ("mc", "ss"), 2, ("highdim",)),))
     renew_rows(tmp_path / "runs")
     made = read_leaderboard()
     place = made["columns"].index("n_sim")
@@ -120,9 +119,9 @@ def test_rows_of_a_method_are_made_anew_and_the_others_stay(tmp_path: Path, monk
     for row in result["cells"]:
         row[place] += row[0] == "mc"
     sampler_leaderboard.LEADERBOARD_RESULT.write_text(json.dumps(result))
-    runs = (tmp_path / "runs" / "300" / "runs.jsonl").read_text()
+    runs = (tmp_path / "runs" / "300_mc" / "runs.jsonl").read_text()
     renew_rows(tmp_path / "runs", ["mc"])
-    assert (tmp_path / "runs" / "300" / "runs.jsonl").read_text() == runs
+    assert (tmp_path / "runs" / "300_mc" / "runs.jsonl").read_text() == runs
     again = read_leaderboard()
     assert [part["plan"]["methods"] for part in again["parts"]] == [["ss"], ["mc"]]
     key = lambda cell: (cell["method"], cell["problem"])  # noqa: E731
