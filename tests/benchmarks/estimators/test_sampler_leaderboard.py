@@ -129,3 +129,7 @@ def test_rows_of_a_method_are_made_anew_and_the_others_stay(tmp_path: Path, monk
     with pytest.raises(ValueError, match="Unknown method 'nothing' of the leaderboard"):
         renew_rows(tmp_path / "runs", ["nothing"])
     assert {cell["method"] for cell in leave_out(again, ["mc"])["cells"]} == {"ss"}
+    assert leave_out(again, budgets=[1500]) == again | {"parts": leave_out(again, budgets=[1500])["parts"]}
+    assert leave_out(again, budgets=[300])["cells"] == [] == leave_out(again, budgets=[300])["parts"]
+    with pytest.raises(ValueError, match=r"Expected budgets of 300, got \[7\]"):
+        renew_rows(tmp_path / "runs", ["mc"], [7])
