@@ -48,7 +48,7 @@ class Kind(NamedTuple):
     path: str
     words: tuple[str, ...]
     damage: Damage = damage_bytes
-    library: str = "samplers"
+    needs: str = "samplers"
     """What the command needs beside the extra driving."""
 
 
@@ -78,7 +78,7 @@ KINDS = {
     "base": Kind("base.json", (*SMALL, "--base", "base.json"), damage_json),
     "policy": Kind("ego.zip", (*SMALL, "--ego", "ego.zip")),
     "statistics": Kind("mine.pkl", (*SMALL, "--ego", "ego.zip", "--stats", "mine.pkl")),
-    "network": Kind("ego.onnx", (*SMALL, "--ego", "ego.onnx"), library="onnxruntime"),
+    "network": Kind("ego.onnx", (*SMALL, "--ego", "ego.onnx"), needs="onnxruntime"),
     "drivers": Kind("drivers.safetensors", (*SMALL, "--drivers", "drivers.safetensors")),
     "recording": Kind("tracks.csv", ("fit", "--ngsim", "tracks.csv", "--out", "bases"), damage_table),
 }
@@ -139,8 +139,7 @@ def here(good: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 @pytest.mark.parametrize("name", KINDS)
 def test_a_damaged_file_is_read_or_refused_in_one_line(name: str, n: int, here: Path) -> None:
     kind = KINDS[name]
-    if not importlib.util.find_spec(kind.library):
-        pytest.skip(f"{kind.library} is not installed")
+    pytest.importorskip(kind.needs)  # ONNX Runtime is optional
     rng, content = np.random.default_rng(n), (here / kind.path).read_bytes()
     n_refused = 0
     for number in range(n):
