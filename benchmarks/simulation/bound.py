@@ -75,22 +75,23 @@ class OperationCount(TorchDispatchMode):
         """
         out = func(*args, **(kwargs or {}))
         name = func.overloadpacket.__name__
-        kind = self._find_kind(name.removesuffix("_"), name)
+        kind = _find_kind(name)
         if kind == "products":
             self.operations[kind] += 2 * out.numel() * args[PRODUCTS[name]].shape[-1]
         elif kind is not None:
             self.operations[kind] += (args[0] if name in REDUCTIONS else out).numel()
         return out
 
-    def _find_kind(self, name: str, full_name: str) -> str | None:
-        if full_name in MOVES:
-            return None
-        for kind, names in (("simple", SIMPLE | REDUCTIONS), ("roots", ROOTS), ("curves", CURVES)):
-            if name in names or full_name in names:
-                return kind
-        if name in PRODUCTS:
-            return "products"
-        raise ValueError(f"Expected an operation of a known kind, got {full_name!r}: put it into a list of {__name__}.")
+
+def _find_kind(name: str) -> str | None:
+    """Return the kind of an operation, of one in place too; None of a move."""
+    if name in MOVES:
+        return None
+    kinds = {"simple": SIMPLE | REDUCTIONS, "roots": ROOTS, "curves": CURVES, "products": PRODUCTS.keys()}
+    for kind, names in kinds.items():
+        if name in names or name.removesuffix("_") in names:
+            return kind
+    raise ValueError(f"Expected an operation of a known kind, got {name!r}: put it into a list of {__name__}.")
 
 
 def count_operations(work: Callable[[], object]) -> Counter[str]:

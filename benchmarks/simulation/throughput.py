@@ -292,22 +292,22 @@ def memory(rollouts: int = 1_000_000) -> dict[str, float]:
     return {"rollouts": rollouts, "seconds": elapsed, "peak_gib": _peak_gib()}
 
 
-def stand_by_bound(
-    row: dict[str, float], machine: Mapping[str, float], unit: float, env_id: str, **settings: Any
-) -> dict[str, float]:
-    """Return a row with the rate that one core allows, and the share of it that was reached.
+def count_bound(machine: Mapping[str, float], env_id: str, **settings: Any) -> float:
+    """Return the rollouts a second that one core allows.
 
     Args:
-        row: With a rate.
         machine: Rates of `measure_machine`.
-        unit: Units of the rate's work in a rollout: 1 of rollouts, its ticks of steps, its seconds of traffic.
         env_id: Of the problem whose arithmetic is counted.
         **settings: Of this problem.
     """
     plain = rare_envs.DrivingProblem(env_id, core="torch", **settings)
     x = plain.base.sample(COUNTED, np.random.default_rng(0))
     plain.evaluate(x[:2])  # what is computed once is not counted
-    bound = unit * bound_rate(plain.evaluate, x, machine)
+    return bound_rate(plain.evaluate, x, machine)
+
+
+def stand_by_bound(row: dict[str, float], bound: float) -> dict[str, float]:
+    """Return a row with the rate that one core allows, in the unit of its own, and the share of it that was reached."""
     return {**row, "bound_per_second": bound, "of_bound": row["per_second"] / bound}
 
 
@@ -336,28 +336,29 @@ def main(
     if not only_camera:
         results = {"highway_memory": highway_memory()}  # first: a peak stays
         traffic = {"env_id": HIGHWAY, "measure": "lidar_ttc"}
-        unit = rare_envs.DrivingProblem(**traffic).world.clock.seconds
+        bound = rare_envs.DrivingProblem(**traffic).world.clock.seconds * count_bound(machine, **traffic)
         for core, ending, batches in (("torch", "", BATCHES), ("numba", "_compiled", COMPILED_BATCHES)):
             for batch in batches:
                 row = measure_highway(batch, rounds, core)
-                results[f"highway_{batch}{ending}"] = stand_by_bound(row, machine, unit, **traffic)
+                results[f"highway_{batch}{ending}"] = stand_by_bound(row, bound)
     results["camera_64"] = measure_camera(64, rounds)
     results["camera_64_weather"] = measure_camera(64, rounds, weather=True)
     if not (only_highway or only_camera):
+        scripts = {env_id: count_bound(machine, env_id, horizon=HORIZON) for env_id in (CAR_FOLLOWING, CUT_IN)}
         for name, env_id in (("car_following", CAR_FOLLOWING), ("cut_in", CUT_IN)):
             for core, ending in (("torch", ""), ("numba", "_compiled")):
                 row = rollout_ratio(env_id, core, rounds)
-                results[f"{name}_idm{ending}"] = stand_by_bound(row, machine, 1.0, env_id, horizon=HORIZON)
+                results[f"{name}_idm{ending}"] = stand_by_bound(row, scripts[env_id])
             results[f"answer_{name}"] = measure_answer(env_id, rounds)
+        bound = count_bound(machine, CAR_FOLLOWING, ego=ppo(CAR_FOLLOWING), horizon=HORIZON)
         for core, ending in (("torch", ""), ("numba", "_compiled")):
-            row, drive = policy_ratio(core, rounds), {"ego": ppo(CAR_FOLLOWING), "horizon": HORIZON}
-            results[f"car_following_ppo{ending}"] = stand_by_bound(row, machine, 1.0, CAR_FOLLOWING, **drive)
+            results[f"car_following_ppo{ending}"] = stand_by_bound(policy_ratio(core, rounds), bound)
         for name, row, env_id in (
             ("env_step", step_ratio(500), CAR_FOLLOWING),
             ("vec_step", batch_step_ratio(CAR_FOLLOWING, 200), CAR_FOLLOWING),
             ("vec_step_cut_in", batch_step_ratio(CUT_IN, 200), CUT_IN),
         ):
-            results[name] = stand_by_bound(row, machine, TICKS, env_id, horizon=HORIZON)
+            results[name] = stand_by_bound(row, TICKS * scripts[env_id])
         results["adss_latency"] = latency_ratio()
         if with_memory:
             results["memory"] = memory()
