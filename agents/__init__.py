@@ -1,6 +1,6 @@
 """Egos and drivers: the policies whose safety is estimated, and those that surround them."""
 
-from rare_envs.installation import require_libraries
+from rare_envs.startup import require_libraries
 
 require_libraries()  # before anything that needs them
 

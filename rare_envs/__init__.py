@@ -1,8 +1,11 @@
 """Driving environments whose scenarios are points x with a probability: how often does a policy crash?"""
 
+from rare_envs.startup import end_at_signals, find_missing_libraries, is_command_line, require_libraries
+
+end_at_signals()  # before what takes long to import
+
 from typing import TYPE_CHECKING, Any
 
-from rare_envs.installation import find_missing_libraries, is_command_line, require_libraries
 from rare_envs.plugins import make_lazy_getattr, warn_of_namesakes
 from rare_envs.scenarios.registry import SCENARIOS
 from rare_envs.version import __version__ as __version__

@@ -3,7 +3,7 @@
 import contextlib
 from collections.abc import Iterator
 
-from rare_envs.installation import find_missing_libraries
+from rare_envs.startup import find_missing_libraries
 
 
 @contextlib.contextmanager

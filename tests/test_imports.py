@@ -46,7 +46,7 @@ FLOORS = {
         comparison testing benchmark
     """,
     "rare_envs": """
-        version installation
+        version startup
         traffic plugins arrays threads json_text files code_trust
         distributions control sensors
         sensors.camera scenarios measures

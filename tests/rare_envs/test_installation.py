@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 
-from rare_envs.installation import DRIVING, is_command_line
+from rare_envs.startup import DRIVING
 from rare_envs.version import __version__
 
 ROOT = Path(__file__).parents[2]
@@ -166,19 +166,3 @@ def test_a_command_that_needs_the_extra_says_so_in_one_line(
     assert (done.returncode, done.stdout, done.stderr.count("\n")) == (2, "", 1), done.stderr
     assert done.stderr.startswith(f"rare-envs: {what}")
     assert done.stderr.endswith("torch, yaml, not installed: pip install 'rare-envs[driving]'.\n")
-
-
-def test_the_command_line_is_known_by_its_program(monkeypatch: pytest.MonkeyPatch) -> None:
-    for program, found in (
-        ("/somewhere/bin/rare-envs", True),
-        ("C:/venv/Scripts/rare-envs.exe", True),
-        (str(ROOT / "rare_envs/__main__.py"), True),
-        ("/somewhere/train.py", False),
-        ("/somewhere/__main__.py", False),
-    ):
-        monkeypatch.setattr(sys, "argv", [program, "list"])
-        assert is_command_line() == found, program
-    monkeypatch.setattr(sys, "argv", ["-m", "list"])
-    for module, found in (("rare_envs", True), ("pytest", False)):
-        monkeypatch.setattr(sys, "orig_argv", [sys.executable, "-m", module, "list"])
-        assert is_command_line() == found, module

@@ -9,7 +9,7 @@ from collections.abc import Callable
 
 import typer
 
-from rare_envs.installation import find_missing_libraries
+from rare_envs.startup import find_missing_libraries
 
 EGO_WORDS = ("idm", "human", "imitation", "mgail", "mgail2", "mgail3", "gail", "bc", "vision")
 DRIVER_WORDS = ("mgail", "mgail2", "mgail3", "gail", "bc", "idm", "idm+mobil")

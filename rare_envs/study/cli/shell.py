@@ -19,7 +19,7 @@ import typer
 from typer.core import TyperCommand, TyperGroup
 
 from rare_envs.egos.errors import EgoGone
-from rare_envs.installation import require_libraries
+from rare_envs.startup import require_libraries, restore_signals
 from rare_envs.study.errors import BadInput, as_bad_input
 
 DOUBTFUL = 3
@@ -107,6 +107,7 @@ class OneLineErrors(SummarisedCommands):
         code: Any = None
         ended = False
         try:
+            restore_signals()
             with signals_as_exceptions(received), one_line_warnings():
                 code = super().main(*args, **{**extra, "standalone_mode": False})
                 ended = code != 128 + signal.SIGINT

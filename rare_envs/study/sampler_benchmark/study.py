@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from rare_envs.files import replace_text
-from rare_envs.installation import require_libraries
 from rare_envs.json_text import format_json
+from rare_envs.startup import require_libraries
 from rare_envs.study.errors import BadInput
 from rare_envs.study.execution.code_digest import digest_code
 from rare_envs.study.execution.run_lines import RunLines, drop_torn_line

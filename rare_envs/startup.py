@@ -1,0 +1,111 @@
+"""Start: libraries that must be installed, and signals to the command line while modules are imported.
+
+Imported before everything else, so it imports nothing that is slow. The libraries are those of the extra `driving`,
+without which only `samplers` works.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+
+TYPE_CHECKING = False  # as of typing, which takes longer than all the rest here
+if TYPE_CHECKING:
+    from types import FrameType
+    from typing import Any, NoReturn
+
+DRIVING = (
+    "cvxpy",
+    "gymnasium",
+    "highway_env",
+    "jinja2",
+    "matplotlib",
+    "pettingzoo",
+    "pyarrow",
+    "stable_baselines3",
+    "torch",
+    "yaml",
+)
+"""Import names of what the extra `driving` installs (pyproject.toml)."""
+_COMMAND = "rare-envs"
+_handlers: dict[int, Any] = {}
+"""Handlers of signals in whose place `_end` stands."""
+
+
+def find_missing_libraries(modules: tuple[str, ...] = DRIVING) -> tuple[str, ...]:
+    """Return those of some libraries that are not installed; nothing is imported.
+
+    Example:
+        >>> find_missing_libraries(("torch", "car"))
+        ('car',)
+    """
+    from importlib.util import find_spec  # some milliseconds, in which no signal is caught yet
+
+    return tuple(name for name in modules if find_spec(name) is None)
+
+
+def require_libraries(modules: tuple[str, ...] = DRIVING, what: str = "rare_envs, agents and training need") -> None:
+    """Raise an error of one line that says what to install if a library is missing.
+
+    Args:
+        modules: Import names of the libraries; nothing is imported.
+        what: Subject and verb of the line: what needs them.
+
+    Raises:
+        ImportError: If one is not installed.
+
+    Example:
+        >>> require_libraries()
+        >>> require_libraries(("torch", "car"))
+        Traceback (most recent call last):
+            ...
+        ImportError: rare_envs, agents and training need car, not installed: pip install 'rare-envs[driving]'.
+    """
+    missing = find_missing_libraries(modules)
+    if missing:
+        raise ImportError(f"{what} {', '.join(missing)}, not installed: pip install 'rare-envs[driving]'.")
+
+
+def is_command_line() -> bool:
+    """Return whether this process is the command `rare-envs`, `python -m rare_envs`, or a worker of one.
+
+    A worker that is started anew has the arguments of its parent.
+
+    Example:
+        >>> is_command_line()
+        False
+    """
+    program = sys.argv[0] if sys.argv else ""
+    if program == "-m":  # the module is being looked for
+        return "rare_envs" in sys.orig_argv[1:4]
+    folder, name = os.path.split(program)
+    is_module = name == "__main__.py" and os.path.basename(folder) == "rare_envs"
+    return is_module or os.path.splitext(name)[0] == _COMMAND
+
+
+def end_at_signals() -> None:
+    """Let SIGINT, SIGTERM and SIGHUP end the process in one line until `restore_signals`; in a command line alone.
+
+    Python would print where in the imports it was. Nothing has begun yet, so nothing is to be tidied up. Signals that
+    are ignored (nohup) stay so, and so does a handler of the user's.
+    """
+    is_worker = "--multiprocessing-fork" in sys.orig_argv  # it imports the modules of its parent, and runs no command
+    if is_worker or not is_command_line():
+        return
+    for name in ("SIGINT", "SIGTERM", "SIGHUP"):
+        number = getattr(signal, name, None)  # Windows has no SIGHUP
+        if number is not None and signal.getsignal(number) in (signal.SIG_DFL, signal.default_int_handler):
+            _handlers[number] = signal.signal(number, _end)
+
+
+def restore_signals() -> None:
+    """Set the handlers again that `end_at_signals` has replaced."""
+    while _handlers:
+        signal.signal(*_handlers.popitem())
+
+
+def _end(number: int, frame: FrameType | None) -> NoReturn:
+    """End the process, with the line and the exit code of a command that is stopped."""
+    os.write(2, f"rare-envs: stopped by {signal.Signals(number).name}\n".encode())
+    os._exit(128 + number)

@@ -1,0 +1,93 @@
+"""Start of the command line: what a signal says that comes while modules are imported."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from rare_envs.startup import end_at_signals, is_command_line
+
+ROOT = Path(__file__).parents[2]
+SIGNALS = ("SIGINT", "SIGTERM", "SIGHUP")
+SCRIPT = "import sys\nfrom rare_envs.study.cli import main\nsys.exit(main())\n"
+"""What pip writes for the command `rare-envs`."""
+SIGNAL_AT_IMPORT = """
+import os, signal, sys
+
+{before}
+
+class SignalAtImport:
+    def find_spec(self, name, path=None, target=None):
+        if name == {module!r}:
+            sys.meta_path.remove(self)
+            os.kill(os.getpid(), signal.{signal})
+
+sys.meta_path.insert(0, SignalAtImport())
+"""
+
+
+def start(folder: Path, how: str, module: str, name: str, before: str = "pass") -> subprocess.CompletedProcess[str]:
+    """Run `rare-envs --version`; it gets a signal when it is about to import a module."""
+    (folder / "sitecustomize.py").write_text(SIGNAL_AT_IMPORT.format(module=module, signal=name, before=before))
+    (folder / "rare-envs").write_text(SCRIPT)
+    program = {"script": [str(folder / "rare-envs")], "module": ["-m", "rare_envs"]}[how]
+    return subprocess.run(
+        [sys.executable, *program, "--version"],
+        env={"PYTHONPATH": f"{folder}:{ROOT}"},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+
+
+@pytest.mark.parametrize("how", ["script", "module"])
+@pytest.mark.parametrize("module", ["rare_envs.plugins", "numpy", "gymnasium", "typer", "rare_envs.study.cli.app"])
+def test_ctrl_c_during_an_import_is_one_line(tmp_path: Path, how: str, module: str) -> None:
+    done = start(tmp_path, how, module, "SIGINT")
+    assert (done.returncode, done.stdout, done.stderr) == (130, "", "rare-envs: stopped by SIGINT\n")
+
+
+@pytest.mark.parametrize("name", SIGNALS)
+def test_every_signal_to_end_is_said(tmp_path: Path, name: str) -> None:
+    done = start(tmp_path, "module", "gymnasium", name)
+    number = getattr(signal, name)
+    assert (done.returncode, done.stderr) == (128 + number, f"rare-envs: stopped by {name}\n")
+
+
+def test_a_signal_that_nohup_ignores_stays_ignored(tmp_path: Path) -> None:
+    done = start(tmp_path, "module", "gymnasium", "SIGHUP", before="signal.signal(signal.SIGHUP, signal.SIG_IGN)")
+    assert (done.returncode, done.stderr) == (0, "") and done.stdout.startswith("rare-envs ")
+
+
+def test_other_programs_keep_their_handlers() -> None:
+    before = {name: signal.getsignal(getattr(signal, name)) for name in SIGNALS}
+    end_at_signals()  # of pytest, which is not the command line
+    assert {name: signal.getsignal(getattr(signal, name)) for name in SIGNALS} == before
+
+
+def test_a_process_that_is_started_anew_has_no_handler_of_its_parent(monkeypatch: pytest.MonkeyPatch) -> None:
+    before = signal.getsignal(signal.SIGINT)
+    monkeypatch.setattr(sys, "argv", ["/somewhere/bin/rare-envs", "estimate"])
+    monkeypatch.setattr(sys, "orig_argv", [sys.executable, "-c", "spawn_main()", "--multiprocessing-fork"])
+    end_at_signals()
+    assert signal.getsignal(signal.SIGINT) is before
+
+
+def test_the_command_line_is_known_by_its_program(monkeypatch: pytest.MonkeyPatch) -> None:
+    for program, found in (
+        ("/somewhere/bin/rare-envs", True),
+        ("C:/venv/Scripts/rare-envs.exe", True),
+        (str(ROOT / "rare_envs/__main__.py"), True),
+        ("/somewhere/train.py", False),
+        ("/somewhere/__main__.py", False),
+    ):
+        monkeypatch.setattr(sys, "argv", [program, "list"])
+        assert is_command_line() == found, program
+    monkeypatch.setattr(sys, "argv", ["-m", "list"])
+    for module, found in (("rare_envs", True), ("pytest", False)):
+        monkeypatch.setattr(sys, "orig_argv", [sys.executable, "-m", module, "list"])
+        assert is_command_line() == found, module
