@@ -189,6 +189,11 @@ class DrivingProblem:
         return self.space.dim
 
     @property
+    def column_names(self) -> tuple[str, ...]:
+        """Names of the columns of x, for the tables of results."""
+        return self.space.column_names
+
+    @property
     def notes(self) -> tuple[str, ...]:
         """Ambiguities that cannot be checked; the grave ones were also given as an `AmbiguousActions` warning."""
         if self.world.clock.action != "continuous" or not self.needs.queries_policy:

@@ -24,7 +24,7 @@ from samplers.presentation.drawing import drawing_axes
 from samplers.presentation.estimate_display import indent_lines
 from samplers.presentation.notebook_html import html_table
 from samplers.presentation.object_file import read_object, register_stored, write_object
-from samplers.problem import FloatArray, Problem, condition_of
+from samplers.problem import FloatArray, Problem, condition_of, names_of_columns
 from samplers.result import Estimate, without_base
 from samplers.serialization import to_json_value
 from samplers.statistics.cluster_sums import has_independent_points, interval_of_sum
@@ -123,7 +123,7 @@ class Comparison:
         f is the smaller outcome of the two.
 
         Args:
-            names: Names of the coordinates of x; x1, x2, ... by default.
+            names: Names of the coordinates of x; by default those of A's problem, or x1, x2, ...
 
         Raises:
             ValueError: If names do not fit.
@@ -248,6 +248,7 @@ class EitherFails:
     def __init__(self, a: Problem, b: Problem, gamma: float) -> None:
         self.dim, self.base = int(a.dim), a.base
         self.given = ", ".join(dict.fromkeys(given for problem in (a, b) if (given := condition_of(problem))))
+        self.column_names = names_of_columns(a)
         self.n_sim = 0
         self._problems, self._gamma = (a, b), gamma
         self._known: dict[bytes, tuple[bool, bool]] = {}

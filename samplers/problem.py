@@ -1,7 +1,7 @@
 """Problem: the probability P[f(X) <= gamma] of a function f and a base distribution of X; small f is dangerous."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from html import escape
 from typing import Any, Protocol, TypeGuard, runtime_checkable
@@ -112,6 +112,15 @@ class ConditionalProblem(Protocol):
     @property
     def given(self) -> str:
         """Condition, in words; empty without one."""
+
+
+@runtime_checkable
+class NamedProblem(Protocol):
+    """A problem whose columns of x have names, which tables of its results take."""
+
+    @property
+    def column_names(self) -> Sequence[str]:
+        """Names of the d columns of x; empty without names."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -229,6 +238,18 @@ def condition_of(problem: Inputs) -> str:
     return str(problem.given) if isinstance(problem, ConditionalProblem) else ""
 
 
+def names_of_columns(problem: Inputs) -> tuple[str, ...]:
+    """Return the names of the columns of x of a problem; empty where it has none.
+
+    Raises:
+        ValueError: If they are not as many different names as it has dimensions.
+    """
+    names = tuple(problem.column_names) if isinstance(problem, NamedProblem) else ()
+    if names and (len(set(names)) != int(problem.dim) or not all(isinstance(name, str) for name in names)):
+        raise ValueError(f"Expected column_names of a problem to be {int(problem.dim)} different names, got {names!r}.")
+    return names
+
+
 @dataclass(frozen=True)
 class StandardNormal:
     """N(0, I) in `dim` dimensions; its map to standard normal space is the identity.
@@ -285,6 +306,8 @@ class FunctionProblem:
             point.
         base: Distribution of X: N(0, I) by default, a `Distribution`, or what `as_distribution` takes: a frozen
             distribution of SciPy (of one coordinate: all `dim` have it), one of OpenTURNS, or a list of them.
+        column_names: Names of the columns of x, for tables; those of the description of an OpenTURNS distribution by
+            default.
 
     Raises:
         ValueError: If f, terms or gradient is not callable, f and terms are missing both, dim is not a positive
@@ -328,12 +351,16 @@ class FunctionProblem:
     vectorized: bool = True
     chunk_size: int | None = None
     base: Any = None
+    column_names: Sequence[str] = ()
 
     def __post_init__(self) -> None:
         """Check the arguments; the functions of terms and gradients become those of the protocols."""
         if not (callable(self.f) or (self.f is None and self.terms is not None)):
             raise ValueError(f"Expected f to be a function of an (n, d) array, got {self.f!r}.")
         self._set_base()
+        names = self.column_names or (self.base.column_names if isinstance(self.base, NamedProblem) else ())
+        object.__setattr__(self, "column_names", tuple(names))
+        names_of_columns(self)
         for name, wrap in (("terms", _FunctionTerms), ("gradient", _FunctionGradients)):
             function = getattr(self, name)  # terms, gradient
             if function is None or isinstance(function, wrap):

@@ -21,7 +21,7 @@ from samplers.analysis.sensitivity.parameter_sensitivity import Sensitivity, com
 from samplers.method import Stepping
 from samplers.presentation.estimate_display import EstimateDisplay
 from samplers.presentation.object_file import is_stored, read_object, register_stored, write_object
-from samplers.presentation.point_table import arrow_table, columns_of_sample, columns_of_simulations
+from samplers.presentation.point_table import arrow_table, columns_of_sample, columns_of_simulations, set_apart
 from samplers.presentation.stored_method import StoredMethod
 from samplers.problem import Distribution, FloatArray
 from samplers.sample import DrawWeights, Failures, Layer, Sample, SimulatedPoints, SimulationIndex
@@ -88,6 +88,8 @@ class Estimate(EstimateDisplay):
     """Simulations that were independent draws from the base distribution."""
     given: str = ""
     """Condition of p, which the problem holds fixed: its attribute `given`, if it has one."""
+    column_names: tuple[str, ...] = field(default=(), compare=False, repr=False)
+    """Names of the columns of x, the problem's attribute `column_names`; empty where it has none."""
     choice: str = field(default="", compare=False)
     """Method that `Auto` chose and why; empty where the method was named."""
     chose_another: bool = field(default=False, compare=False, repr=False)
@@ -259,15 +261,15 @@ class Estimate(EstimateDisplay):
         parameters to first order, which tells what recordings would narrow the interval most.
 
         Args:
-            names: Of the parameters of x, for the tables; x1, x2, ... by default.
+            names: Of the parameters of x, for the tables; by default those of the problem, or x1, x2, ...
             sizes: Columns of x that each takes; one by default.
             parameters: Whether derivatives by the parameters of the base are wanted too.
 
         Raises:
-            ValueError: If the method gave no weighted points, nothing failed, the base is not known, or names and
-                sizes do not fit.
+            ValueError: If the method gave no weighted points, fewer than two points failed, the base is not known, or
+                names and sizes do not fit.
         """
-        return compute_sensitivity(self, names, sizes, parameters)
+        return compute_sensitivity(self, names or (() if sizes else self.column_names), sizes, parameters)
 
     @property
     def proviso(self) -> str:
@@ -297,7 +299,8 @@ class Estimate(EstimateDisplay):
         (`rare_envs.load_study(folder).episodes()`); a journal keeps outcomes only.
 
         Args:
-            names: Names of the coordinates; x1, x2, ... by default.
+            names: Names of the coordinates; by default those of the problem (`x.f` for one named as another column),
+                or x1, x2, ...
 
         Raises:
             ValueError: If the method gave no weighted points, or names do not fit.
@@ -316,7 +319,7 @@ class Estimate(EstimateDisplay):
             columns = columns_of_sample(require_sample(self), self.gamma)
         else:
             columns = columns_of_simulations(self.points, self.simulations, self.gamma)
-        return arrow_table(columns, names)
+        return arrow_table(columns, names or set_apart(self.column_names, columns))
 
     def to_pandas(self, names: Sequence[str] = ()) -> "pandas.DataFrame":
         """Return `to_arrow` as a pandas table; needs pandas."""

@@ -130,6 +130,15 @@ class ScenarioSpace:
         """Number of columns of x, d."""
         return sum(self.sizes)
 
+    @property
+    def column_names(self) -> tuple[str, ...]:
+        """Names of the columns of x; those of a block have their number in it, such as "speed[0]"."""
+        return tuple(
+            name if size == 1 else f"{name}[{k}]"
+            for name, size in zip(self.names, self.sizes, strict=True)
+            for k in range(size)
+        )
+
     def sample(self, n: int, rng: np.random.Generator) -> FloatArray:
         """Draw independent scenarios from the base distribution, shape (n, d)."""
         return self.base.sample(n, rng)

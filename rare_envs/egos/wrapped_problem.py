@@ -50,6 +50,11 @@ class WrappedProblem:
         return self.problem.given if isinstance(self.problem, ConditionalProblem) else ""
 
     @property
+    def column_names(self) -> tuple[str, ...]:
+        """Names of the columns of x; empty where the problem has none."""
+        return tuple(getattr(self.problem, "column_names", ()))  # anybody's problem
+
+    @property
     def terms(self) -> Callable[..., Any] | None:
         """Terms as of `rare_envs.DrivingProblem.terms`; None where the problem has none."""
         return self._terms if callable(getattr(self.problem, "terms", None)) else None  # anybody's problem

@@ -78,6 +78,11 @@ class HighwayEnvProblem:
         return self.space.dim
 
     @property
+    def column_names(self) -> tuple[str, ...]:
+        """Names of the columns of x, for the tables of results."""
+        return self.space.column_names
+
+    @property
     def base(self) -> Distribution:
         """Distribution of x."""
         return self.space.base

@@ -32,11 +32,9 @@ class Column(NamedTuple):
 
 def list_columns(space: ScenarioSpace) -> list[Column]:
     """Return the columns in the order of x."""
-    return [
-        Column(name if size == 1 else f"{name}[{k}]", unit, size <= MAX_SHOWN)
-        for name, unit, size in zip(space.names, space.units, space.sizes, strict=True)
-        for k in range(size)
-    ]
+    blocks = zip(space.units, space.sizes, strict=True)
+    about = [(unit, size <= MAX_SHOWN) for unit, size in blocks for _ in range(size)]
+    return [Column(name, unit, shown) for name, (unit, shown) in zip(space.column_names, about, strict=True)]
 
 
 def draw_ordinary(space: ScenarioSpace) -> FloatArray:

@@ -120,6 +120,13 @@ class OpenTurnsDistribution:
         """Number of coordinates d."""
         return int(self.distribution.getDimension())
 
+    @property
+    def column_names(self) -> tuple[str, ...]:
+        """The description of the distribution; empty where it is OpenTURNS' own, X0, X1, ..., or has a name twice."""
+        names = tuple(self.distribution.getDescription())
+        given = any(name != f"X{i}" for i, name in enumerate(names))
+        return names if given and len(set(names)) == self.dim else ()
+
     def sample(self, n: int, rng: np.random.Generator) -> FloatArray:
         """Draw n independent points, shape (n, d), by `rng`, not by the generator of OpenTURNS."""
         return self.from_standard_normal(rng.standard_normal((n, self.dim)))

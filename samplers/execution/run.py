@@ -16,7 +16,7 @@ from samplers.execution.progress import Listener, Monitor, Progress
 from samplers.execution.replicate import Replicate, check_cost, count_simulations
 from samplers.execution.responder import hide_missing
 from samplers.method import Answer, Choice, Choosing, Goal, Outcome, Request, Stepping, TermsOffer
-from samplers.problem import FloatArray, Inputs, TermGradients, Terms, condition_of
+from samplers.problem import FloatArray, Inputs, TermGradients, Terms, condition_of, names_of_columns
 from samplers.result import Estimate
 from samplers.sample import SimulatedPoints, SimulationIndex
 from samplers.statistics.intervals import gain_over_monte_carlo
@@ -68,7 +68,7 @@ class Run:
     ) -> None:
         check_arguments(problem, method)
         self._inputs = InputsOnly(int(problem.dim), problem.base, offer)
-        self._given = condition_of(problem)
+        self._given, self._column_names = condition_of(problem), names_of_columns(problem)
         self._goal, self._on_error = arguments.goal, arguments.on_error
         self._seed = choose_seed(arguments.seed)
         self._n_wanted = int(arguments.replicates)
@@ -217,6 +217,7 @@ class Run:
             on_error=self._on_error,
             base_draws=whole.base_draws,
             given=self._given,
+            column_names=self._column_names,
             choice=self._choice.why,
             chose_another=self._choice.unusual,
             simulations=self._index_simulations(whole),

@@ -76,6 +76,17 @@ def arrow_table(points: PointColumns, names: Sequence[str]) -> pyarrow.Table:
     return pa.table(table)
 
 
+def set_apart(names: Sequence[str], points: PointColumns) -> list[str]:
+    """Return names of coordinates with "x." before those that are the name of another column.
+
+    Example:
+        >>> points = PointColumns(x=np.ones((1, 2)), rows=np.array([0]), columns={"f": np.zeros(1)}, missing={})
+        >>> set_apart(["gap", "f"], points)
+        ['gap', 'x.f']
+    """
+    return [f"x.{name}" if name in points.columns else name for name in names]
+
+
 def columns_of_sample(sample: Sample, gamma: float) -> PointColumns:
     """Return the weighted points behind an estimate: f, weight, unit, failed; x of the failing ones.
 

@@ -190,3 +190,12 @@ def test_repr_is_one_line_and_html_has_the_parameters() -> None:
     problem = rare_envs.DrivingProblem("rare_envs/CutIn-v0", ego=Constant([0.0, 0.0]))
     assert repr(problem) == "<DrivingProblem rare_envs/CutIn-v0, ego Constant, measure ttc, 6 dimensions>"
     assert problem.space._repr_html_() in problem._repr_html_()
+
+
+def test_tables_of_a_result_name_the_parameters() -> None:
+    problem = rare_envs.DrivingProblem("rare_envs/CutIn-v0")
+    result = samplers.estimate(rare_envs.FaultTolerant(problem), "mc", gamma=2.0, seed=0, max_sim=300)
+    assert tuple(result.to_pandas().columns[-6:]) == problem.space.names
+    highway = rare_envs.DrivingProblem("rare_envs/Highway-v0", noise=False)
+    assert len(highway.column_names) == highway.dim
+    assert highway.column_names[:2] == ("s[0]", "s[1]")

@@ -167,3 +167,9 @@ def test_repr_is_one_line():
 def test_a_problem_without_dimension_and_base_asks_for_one():
     with pytest.raises(ValueError, match="or base, the distribution of x; got neither"):
         samplers.FunctionProblem(lambda x: x[:, 0])
+
+
+@pytest.mark.parametrize("names", [["a"], ["a", "a"], ["a", 1]])
+def test_names_of_columns_that_do_not_fit_are_refused(names):
+    with pytest.raises(ValueError, match="2 different names, got"):
+        samplers.FunctionProblem(lambda x: x[:, 0], dim=2, column_names=names)

@@ -35,6 +35,9 @@ from samplers.problem import Distribution, FloatArray
 from samplers.serialization import to_json_value
 from samplers.statistics.weights import effective_number
 
+ROUNDING_VARIANCE = 1e-12
+"""Of u_j given failure: below it points are equal but for rounding."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class ColumnImportance:
@@ -67,7 +70,12 @@ def rank_columns(
             that come earlier in its order.
         names: Names of the parameters.
         sizes: Columns of each.
+
+    Raises:
+        ValueError: If a single point failed, which has no spread.
     """
+    if np.count_nonzero(failures.weights) < 2:
+        raise ValueError("A single point failed: what p is sensitive to needs more of them; give more simulations.")
     u = np.asarray(base.to_standard_normal(failures.x), dtype=np.float64)
     entropy, influence, mean = relative_entropies(failures, u)
     total = -math.log(float(failures.weights.sum()))
@@ -102,7 +110,7 @@ def relative_entropies(failures: WeightedFailures, u: FloatArray) -> tuple[Float
     share = failures.weights / failures.weights.sum()
     mean = share @ u
     square = share @ u**2
-    variance = np.maximum(square - mean**2, np.finfo(np.float64).tiny)
+    variance = np.maximum(square - mean**2, ROUNDING_VARIANCE)
     bias = 1 / count_effective_failures(failures)
     entropy = (square - 1 - np.log(variance)) / 2 - bias
     influence = (1 - 1 / variance) / 2 * (u**2 - square) + mean / variance * (u - mean)

@@ -149,3 +149,11 @@ def test_p_under_a_clayton_copula_is_its_lower_tail():
     result = samplers.estimate(problem, "two-stage", seed=0, max_sim=3000)
     exact = (2 * 1e-3**-2.0 - 1) ** -0.5
     assert abs(result.p / exact - 1) < 4 * result.cov < 0.5
+
+
+def test_a_description_names_the_columns():
+    pair = openturns.JointDistribution([openturns.Normal(), openturns.Gumbel()])
+    assert OpenTurnsDistribution(pair).column_names == ()
+    pair.setDescription(["strength", "load"])
+    problem = samplers.FunctionProblem(lambda x: x[:, 0], base=pair)
+    assert problem.column_names == ("strength", "load")

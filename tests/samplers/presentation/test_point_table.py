@@ -69,3 +69,23 @@ def test_names_that_do_not_fit_are_refused(names):
     result = samplers.estimate(PROBLEM, "mc", seed=0, max_sim=100)
     with pytest.raises(ValueError, match="Expected 2 different names"):
         result.to_arrow(names)
+
+
+def test_columns_are_named_by_the_problem():
+    named = samplers.FunctionProblem(PROBLEM.f, dim=2, column_names=["load", "f"])
+    for keep in (False, True):
+        result = samplers.estimate(named, "mc", seed=0, max_sim=6000, keep_points=keep)
+        assert result.to_arrow().column_names[-2:] == ["load", "x.f"]
+        assert result.to_arrow(["a", "b"]).column_names[-2:] == ["a", "b"]
+    assert [each.name for each in result.sensitivity().columns] == ["load", "f"]
+
+
+def test_a_comparison_has_the_names_of_its_problems():
+    a, b = (samplers.FunctionProblem(lambda x, at=at: at - x[:, 0], dim=1, column_names=["u"]) for at in (1.0, 1.2))
+    assert samplers.compare(a, b, "mc", seed=0, max_sim=500).to_arrow().column_names[-1] == "u"
+
+
+def test_names_outlive_a_file(tmp_path):
+    named = samplers.FunctionProblem(PROBLEM.f, dim=2, column_names=["load", "wind"])
+    samplers.estimate(named, "mc", seed=0, max_sim=500).save(tmp_path / "result")
+    assert samplers.Estimate.load(tmp_path / "result").column_names == ("load", "wind")

@@ -68,3 +68,11 @@ def test_irrelevant_noise_has_no_importance():
     importance = {each.name: each.importance for each in found.columns}
     assert importance["x"] > 0.6
     assert importance["noise"] < 0.05
+
+
+def test_a_single_failing_point_says_so():
+    problem = samplers.FunctionProblem(lambda x: 3.0 - x[:, 0], dim=2)
+    result = samplers.estimate(problem, "mc", seed=0, max_sim=1000)
+    assert result.failures.total == 1
+    with pytest.raises(ValueError, match="A single point failed"):
+        result.sensitivity()
