@@ -11,13 +11,15 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from rare_envs.study.html_report.svg import FigureOfPage
+from rare_envs.study.html_report.svg import Draw, FigureOfPage, Size
 from rare_envs.study.html_report.wording import Result
 from rare_envs.study.plots import HIT_COLOUR, LINE_COLOUR, ORDINARY_COLOUR
 from samplers.problem import FloatArray
 
 TWO_PANELS_SIZE, PANEL_SIZE = (7.2, 3.2), (5.4, 3.2)
 """Sizes of figures [inch]."""
+STACKED_SIZE = (4.2, 5.4)
+"""Size of two panels one below the other, for a narrow screen [inch]."""
 MAX_HISTOGRAMS = 12
 """Parameters that are shown, those that failures shift most."""
 
@@ -43,9 +45,15 @@ def draw_estimate_over_simulations(figure: Figure, result: Result) -> None:
     axes.legend(frameon=False, fontsize=8)
 
 
-def draw_levels(figure: Figure, result: Result) -> None:
-    """Draw the share of each level's points below its threshold, and the threshold, where that changes."""
-    panels = figure.subplots(1, 2 if passes_levels(result) else 1, squeeze=False)[0]
+def draw_levels(figure: Figure, result: Result, stacked: bool = False) -> None:
+    """Draw the share of each level's points below its threshold, and the threshold, where that changes.
+
+    Args:
+        figure: To draw into.
+        result: Of the run.
+        stacked: Whether the panels stand one below the other.
+    """
+    panels = _make_panels(figure, 2 if passes_levels(result) else 1, stacked)
     shares = panels[0]
     trace = [level for level in result.get("trace") or [] if level["run"] == 0]
     numbers = range(len(trace))
@@ -63,15 +71,16 @@ def draw_levels(figure: Figure, result: Result) -> None:
         axes.xaxis.set_major_locator(MaxNLocator(integer=True))
 
 
-def draw_weights(figure: Figure, log_weights: FloatArray, p: float) -> None:
+def draw_weights(figure: Figure, log_weights: FloatArray, p: float, stacked: bool = False) -> None:
     """Draw how much of p each failing simulation carries: a histogram, and p by the heaviest of them.
 
     Args:
         figure: To draw into.
         log_weights: Of the failing simulations, shape (k,).
         p: Their sum.
+        stacked: Whether the panels stand one below the other.
     """
-    histogram, share = figure.subplots(1, 2)
+    histogram, share = _make_panels(figure, 2, stacked)
     parts = np.sort(np.exp(log_weights) / p)[::-1]
     shown = np.log10(parts[parts > 0])
     histogram.hist(shown, bins=min(40, max(5, len(shown) // 5)) if np.ptp(shown) > 0 else 1, color=LINE_COLOUR)
@@ -101,7 +110,7 @@ def draw_curve(figure: Figure, curve: Mapping[str, Any], gamma: float, measure: 
 
 
 def draw_parameters(
-    figure: Figure, ordinary: FloatArray, failing: FloatArray, weights: FloatArray, labels: list[str]
+    figure: Figure, ordinary: FloatArray, failing: FloatArray, weights: FloatArray, labels: list[str], columns: int = 3
 ) -> None:
     """Draw each parameter in ordinary traffic and among failures.
 
@@ -111,9 +120,10 @@ def draw_parameters(
         failing: Failures, shape (m, k).
         weights: Of the failures, shape (m,).
         labels: Name and unit of each, length k.
+        columns: Panels side by side.
     """
-    rows = math.ceil(len(labels) / 3)
-    panels = np.atleast_1d(figure.subplots(rows, min(3, len(labels)), squeeze=False)).ravel()
+    rows = math.ceil(len(labels) / columns)
+    panels = np.atleast_1d(figure.subplots(rows, min(columns, len(labels)), squeeze=False)).ravel()
     for j, axes in enumerate(panels):
         if j >= len(labels):
             axes.set_axis_off()
@@ -128,7 +138,8 @@ def draw_parameters(
         axes.set_xlabel(labels[j])
         axes.set_yticks([])
         axes.set_ylabel("density")
-    panels[0].legend(frameon=False, fontsize=8)
+    lines, words = panels[0].get_legend_handles_labels()
+    figure.legend(lines, words, loc="outside upper right", ncols=2, frameon=False, fontsize=8)
 
 
 def draw_severity(figure: Figure, severity: Mapping[str, Any]) -> None:
@@ -153,15 +164,25 @@ def figures_of_result(result: Result, log_weights: FloatArray, measure: str) -> 
         measure: What f is, with its unit.
     """
     way, levels = "The estimate on the way, and the result", "Levels of the run: shares and thresholds"
-    room = TWO_PANELS_SIZE if passes_levels(result) else PANEL_SIZE
+    passes = passes_levels(result)
+    room = TWO_PANELS_SIZE if passes else PANEL_SIZE
+    narrow = (lambda f: draw_levels(f, result, stacked=True), STACKED_SIZE) if passes else None
     made = [
         FigureOfPage("convergence", way, lambda f: draw_estimate_over_simulations(f, result), PANEL_SIZE),
-        FigureOfPage("levels", levels, lambda f: draw_levels(f, result), room),
+        FigureOfPage("levels", levels, lambda f: draw_levels(f, result), room, narrow),
     ]
     if len(log_weights):
         p = float(np.exp(log_weights).sum())
         caption = "Weights of the failing simulations"
-        made.append(FigureOfPage("weights", caption, lambda f: draw_weights(f, log_weights, p), TWO_PANELS_SIZE))
+        made.append(
+            FigureOfPage(
+                "weights",
+                caption,
+                lambda f: draw_weights(f, log_weights, p),
+                TWO_PANELS_SIZE,
+                (lambda f: draw_weights(f, log_weights, p, stacked=True), STACKED_SIZE),
+            )
+        )
     curve, severity = result.get("curve"), result.get("severity")
     if isinstance(curve, dict):
         gamma = float(result["gamma"])
@@ -176,6 +197,24 @@ def figures_of_result(result: Result, log_weights: FloatArray, measure: str) -> 
 def passes_levels(result: Result) -> bool:
     """Return whether the run has thresholds other than gamma."""
     return any(level["gamma"] != result["gamma"] for level in result.get("trace") or [])
+
+
+def figure_of_parameters(
+    ordinary: FloatArray, failing: FloatArray, weights: FloatArray, labels: list[str]
+) -> FigureOfPage:
+    """Return the figure of `draw_parameters`: three panels side by side, two on a narrow screen."""
+
+    def make(columns: int, width: float) -> tuple[Draw, Size]:
+        height = 0.4 + 1.9 * math.ceil(len(labels) / columns)
+        return lambda f: draw_parameters(f, ordinary, failing, weights, labels, columns), (width, height)
+
+    caption = "Parameters in ordinary traffic and among failures, the most shifted first"
+    return FigureOfPage("parameters", caption, *make(3, 8.0), make(2, 4.6))
+
+
+def _make_panels(figure: Figure, n: int, stacked: bool) -> list[Axes]:
+    """Return n panels of a figure, side by side or one below the other."""
+    return list(figure.subplots(n if stacked else 1, 1 if stacked else n, squeeze=False).ravel())
 
 
 def _positive(value: float | None) -> float:

@@ -18,7 +18,7 @@ from rare_envs.study.analysis.repeatability import Repeatability
 from rare_envs.study.columns import draw_ordinary, list_columns
 from rare_envs.study.errors import BadInput, as_bad_input, output_file, output_folder
 from rare_envs.study.html_report.atlas import AtlasEntry, AtlasSource, build_atlas
-from rare_envs.study.html_report.figures import MAX_HISTOGRAMS, draw_parameters, figures_of_result, passes_levels
+from rare_envs.study.html_report.figures import MAX_HISTOGRAMS, figure_of_parameters, figures_of_result, passes_levels
 from rare_envs.study.html_report.recorded_events import read_recorded_events
 from rare_envs.study.html_report.svg import FORMATS, FigureOfPage
 from rare_envs.study.html_report.templating import render_template
@@ -189,13 +189,8 @@ def _make_figures(study: LoadedStudy, source: AtlasSource) -> dict[str, FigureOf
         weights = np.exp(log_weights[weighted]) if len(known) else np.ones(len(failing))
         order = _rank_shifts(ordinary, failing[weighted], weights)[:MAX_HISTOGRAMS]
         labels = [columns[j].label for j in order]
-        rows = -(-len(order) // 3)
-        figures["parameters"] = FigureOfPage(
-            "parameters",
-            "Parameters in ordinary traffic and among failures, the most shifted first",
-            lambda f: draw_parameters(f, ordinary[:, order], failing[weighted][:, order], weights, labels),
-            (8.0, 0.4 + 1.9 * rows),
-        )
+        chosen = failing[weighted][:, order]
+        figures["parameters"] = figure_of_parameters(ordinary[:, order], chosen, weights, labels)
     return figures
 
 

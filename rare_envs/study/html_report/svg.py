@@ -14,11 +14,13 @@ from rare_envs.files import replace_file
 from rare_envs.study.plots import STYLE
 
 WIDE_ON_PHONES = 420
-"""Width of a wide figure on a narrow screen [pixels]."""
+"""Width on a narrow screen of a wide figure that has no form of its own for it [pixels]."""
 FORMATS = ("svg", "pdf", "png")
 """Of figures as files."""
-Draw = Callable[[Figure], None]
+Draw = Callable[[Figure], object]
 """Draws into an empty figure."""
+Size = tuple[float, float]
+"""Width and height [inch]."""
 
 
 class FigureOfPage:
@@ -29,6 +31,8 @@ class FigureOfPage:
         caption: What it shows, in words.
         draw: Draws it.
         size: Width and height [inch].
+        narrow: As draw and size, for a narrow screen; None for the same figure, which has to be moved there where it is
+            wide.
 
     Example:
         >>> figure = FigureOfPage("line", "A line.", lambda figure: figure.subplots().plot([0, 1]), (3, 2))
@@ -37,11 +41,23 @@ class FigureOfPage:
         (True, False)
     """
 
-    def __init__(self, name: str, caption: str, draw: Callable[[Figure], object], size: tuple[float, float]) -> None:
+    def __init__(
+        self, name: str, caption: str, draw: Draw, size: Size, narrow: tuple[Draw, Size] | None = None
+    ) -> None:
         self.name, self.caption, self._draw, self._size = name, caption, draw, size
+        self._narrow = None if narrow is None else FigureOfPage(f"{name}-narrow", caption, *narrow)
 
     def to_svg(self) -> str:
-        """Return it as an element of a page: it has the width of its place, and its text is text."""
+        """Return it as an element of a page: it has the width of its place, and its text is text.
+
+        Two elements where there is a form for narrow screens, of which the page shows one.
+        """
+        if self._narrow is None:
+            return self._make_svg()
+        wide, narrow = self._make_svg(), self._narrow.to_svg()
+        return wide.replace("<svg", '<svg class="wide"', 1) + narrow.replace("<svg", '<svg class="narrow"', 1)
+
+    def _make_svg(self) -> str:
         buffer = io.StringIO()
         with matplotlib.rc_context({**STYLE, "svg.fonttype": "none", "svg.hashsalt": self.name}):
             self._make().savefig(buffer, format="svg", metadata={"Date": None})

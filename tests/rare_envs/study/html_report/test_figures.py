@@ -38,6 +38,14 @@ def test_the_heaviest_failures_add_up_to_all_of_p() -> None:
     np.testing.assert_allclose(np.asarray(line.get_ydata()), [60.0, 90.0, 100.0])
 
 
+def test_panels_stand_one_below_the_other_where_the_screen_is_narrow() -> None:
+    side_by_side, stacked = Figure(), Figure()
+    draw_weights(side_by_side, np.log([0.001, 0.006]), 0.007)
+    draw_weights(stacked, np.log([0.001, 0.006]), 0.007, stacked=True)
+    assert [axes.get_subplotspec().rowspan.start for axes in side_by_side.axes] == [0, 0]
+    assert [axes.get_subplotspec().rowspan.start for axes in stacked.axes] == [0, 1]
+
+
 def test_a_band_that_reaches_zero_stays_on_the_log_scale() -> None:
     figure = Figure()
     curve = {"gammas": [0.0, 1.0], "p": [0.01, 0.1], "low": [0.0, 0.05], "high": [0.02, 0.2], "confidence": 0.9}

@@ -258,8 +258,12 @@ def test_a_browser_shows_the_page_without_a_network_and_without_sideways_scrolli
         tab.on("request", lambda request: said.append(request.url) if request.url.startswith("http") else None)
         tab.goto(f"file://{folder / 'report.html'}")
         assert tab.evaluate("document.documentElement.scrollWidth") == width
-        wide = "[...document.querySelectorAll('table')].filter(e => e.scrollWidth > e.parentElement.clientWidth).length"
-        assert tab.evaluate(wide) == 0
+        for inner, outer in (("table", "e.parentElement"), ("figure", "e")):
+            wide = f"[...document.querySelectorAll('{inner}')].filter(e => e.scrollWidth > {outer}.clientWidth).length"
+            assert tab.evaluate(wide) == 0, inner
+        shown = "[...document.querySelectorAll('figure svg')].filter(e => e.clientWidth > 0).map(e => e.ariaLabel)"
+        captions = tab.evaluate(shown)
+        assert len(captions) == len(set(captions)) >= 5  # a figure with a form for narrow screens is shown in one form
         assert said == []
         assert len(tab.pdf(format="A4")) > 20_000
         browser.close()

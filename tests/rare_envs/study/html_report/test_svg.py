@@ -30,6 +30,14 @@ def test_it_has_the_width_of_its_place_and_text_as_text() -> None:
     assert "f &lt;= 0 &amp; more" in text
 
 
+def test_a_form_for_narrow_screens_stands_beside_the_wide_one() -> None:
+    text = FigureOfPage("line", "A line.", draw, (8, 3), narrow=(draw, (4, 6))).to_svg()
+    heads = re.findall(r'<svg class="(\w+)".*?viewBox="0 0 (\d+)', text)
+    assert heads == [("wide", "576"), ("narrow", "288")]
+    ids = re.findall(r'\bid="([^"]+)"', text)
+    assert len(ids) == len(set(ids))
+
+
 @pytest.mark.parametrize("kind", FORMATS)
 def test_files_are_of_the_kind_asked_for(tmp_path: Path, kind: str) -> None:
     path = FigureOfPage("line", "A line.", draw, (4, 3)).save(tmp_path, kind)
