@@ -87,16 +87,19 @@ def is_command_line() -> bool:
 def end_at_signals() -> None:
     """Let SIGINT, SIGTERM and SIGHUP end the process in one line until `restore_signals`; in a command line alone.
 
-    Python would print where in the imports it was. Nothing has begun yet, so nothing is to be tidied up. Signals that
-    are ignored (nohup) stay so, and so does a handler of the user's.
+    For imports: Python would print where in them it was, and an exception ends the C++ of torch with an abort. Nothing
+    has begun yet, so nothing is to be tidied up. Signals that are ignored (nohup) stay so.
     """
     is_worker = "--multiprocessing-fork" in sys.orig_argv  # it imports the modules of its parent, and runs no command
     if is_worker or not is_command_line():
         return
     for name in ("SIGINT", "SIGTERM", "SIGHUP"):
         number = getattr(signal, name, None)  # Windows has no SIGHUP
-        if number is not None and signal.getsignal(number) in (signal.SIG_DFL, signal.default_int_handler):
-            _handlers[number] = signal.signal(number, _end)
+        if number is not None and signal.getsignal(number) not in (signal.SIG_IGN, _end, None):
+            try:
+                _handlers[number] = signal.signal(number, _end)
+            except ValueError:  # not the main thread, which alone gets signals
+                return
 
 
 def restore_signals() -> None:

@@ -1,9 +1,10 @@
 """Threads of torch."""
 
 import contextlib
+import sys
 from collections.abc import Iterator
 
-from rare_envs.startup import find_missing_libraries
+from rare_envs.startup import end_at_signals, find_missing_libraries, restore_signals
 
 
 @contextlib.contextmanager
@@ -22,8 +23,11 @@ def use_one_thread() -> Iterator[None]:
     if find_missing_libraries(("torch",)):
         yield
         return
+    if "torch" not in sys.modules:
+        end_at_signals()
     import torch  # here, because the command line shows its help without it
 
+    restore_signals()
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     try:

@@ -30,13 +30,15 @@ sys.meta_path.insert(0, SignalAtImport())
 """
 
 
-def start(folder: Path, how: str, module: str, name: str, before: str = "pass") -> subprocess.CompletedProcess[str]:
-    """Run `rare-envs --version`; it gets a signal when it is about to import a module."""
+def start(
+    folder: Path, how: str, module: str, name: str, before: str = "pass", words: tuple[str, ...] = ("--version",)
+) -> subprocess.CompletedProcess[str]:
+    """Run `rare-envs`; it gets a signal when it is about to import a module."""
     (folder / "sitecustomize.py").write_text(SIGNAL_AT_IMPORT.format(module=module, signal=name, before=before))
     (folder / "rare-envs").write_text(SCRIPT)
     program = {"script": [str(folder / "rare-envs")], "module": ["-m", "rare_envs"]}[how]
     return subprocess.run(
-        [sys.executable, *program, "--version"],
+        [sys.executable, *program, *words],
         env={"PYTHONPATH": f"{folder}:{ROOT}"},
         capture_output=True,
         text=True,
@@ -56,6 +58,13 @@ def test_every_signal_to_end_is_said(tmp_path: Path, name: str) -> None:
     done = start(tmp_path, "module", "gymnasium", name)
     number = getattr(signal, name)
     assert (done.returncode, done.stderr) == (128 + number, f"rare-envs: stopped by {name}\n")
+
+
+@pytest.mark.parametrize("name", SIGNALS)
+def test_a_signal_while_a_command_imports_torch_is_one_line(tmp_path: Path, name: str) -> None:
+    done = start(tmp_path, "module", "torch._C", name, words=("estimate", "rare_envs/CarFollowing-v0"))
+    number = getattr(signal, name)
+    assert (done.returncode, done.stdout, done.stderr) == (128 + number, "", f"rare-envs: stopped by {name}\n")
 
 
 def test_a_signal_that_nohup_ignores_stays_ignored(tmp_path: Path) -> None:
