@@ -181,6 +181,13 @@ def _refuse_call(*_: Any) -> None:
     raise ForbiddenObject("it makes an array over memory that it names")
 
 
+def _find_member(cls: Any, name: Any) -> Any:
+    """Return a member of an enumeration: Python 3.11.0 to 3.11.3 pickles one as an attribute of its class."""
+    known = isinstance(cls, type) and issubclass(cls, Enum) and isinstance(name, str) and name in cls.__members__
+    _require(known, "an attribute of what is no enumeration")
+    return cls.__members__[name]
+
+
 RECONSTRUCTIONS: dict[str, Callable[..., Any]] = {
     "numpy.dtype": _make_dtype,
     "numpy.ndarray": _refuse_call,
@@ -199,6 +206,7 @@ RECONSTRUCTIONS: dict[str, Callable[..., Any]] = {
     "builtins.frozenset": _make_frozenset,
     "builtins.bytearray": _make_bytearray,
     "builtins.complex": complex,
+    "builtins.getattr": _find_member,
 }
 """Names in a pickle to the functions that they stand for."""
 

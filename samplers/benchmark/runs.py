@@ -111,6 +111,8 @@ class Meter:
 
     def __init__(self, f: Callable[[FloatArray], FloatArray], limit: int | None = None) -> None:
         self.calls, self.points, self.seconds = 0, 0, 0.0
+        self.reached: LimitReached | None = None
+        """What was raised at the limit; libraries in C++ pass on less of it."""
         self._f, self._limit = f, limit
         self._digest = hashlib.blake2b(digest_size=8)
 
@@ -122,7 +124,8 @@ class Meter:
     def __call__(self, x: FloatArray) -> FloatArray:
         """Call f."""
         if self._limit is not None and self.points + len(x) > self._limit:
-            raise LimitReached(f"more than {self._limit:,} evaluations")
+            self.reached = LimitReached(f"more than {self._limit:,} evaluations")
+            raise self.reached
         self.calls += 1
         self.points += len(x)
         start = time.process_time()
@@ -221,7 +224,8 @@ def read_answer(job: Job, meter: Meter, seconds: float, answer: Any) -> MethodRu
 def record_failure(job: Job, meter: Meter, seconds: float, error: BaseException) -> MethodRun:
     """Return the record of a run that raised."""
     run = _record(job, meter, seconds, (math.nan,) * 4, "raised")
-    return replace(run, error=f"{type(error).__name__}: {error}")
+    cause = meter.reached or error
+    return replace(run, error=f"{type(cause).__name__}: {cause}")
 
 
 def _record(

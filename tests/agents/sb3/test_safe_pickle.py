@@ -11,6 +11,7 @@ import pytest
 import torch
 from gymnasium import spaces
 from stable_baselines3.common.policies import ActorCriticPolicy
+from stable_baselines3.common.type_aliases import TrainFrequencyUnit
 
 from agents.sb3.safe_pickle import ForbiddenObject, open_pickle
 
@@ -59,6 +60,31 @@ def test_what_saved_models_hold_survives(value: Any) -> None:
         assert again.random() == value.random()
     else:
         assert again == value
+
+
+UNIT = b"cstable_baselines3.common.type_aliases\nTrainFrequencyUnit\n"
+
+
+def test_a_member_of_an_enumeration_is_opened_as_python_3_11_2_wrote_it() -> None:
+    assert open_pickle(b"cbuiltins\ngetattr\n(" + UNIT + b"S'EPISODE'\ntR.") is TrainFrequencyUnit.EPISODE
+    assert open_pickle(pickle.dumps(TrainFrequencyUnit.STEP)) is TrainFrequencyUnit.STEP
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        UNIT + b"S'mro'\n",
+        UNIT + b"S'__class__'\n",
+        UNIT,
+        UNIT + b"I1\n",
+        b"ctorch.nn\nModule\nS'forward'\n",
+        b"S'text'\nS'format'\n",
+        b"cbuiltins\ngetattr\nS'function'\n",
+    ],
+)
+def test_no_other_attribute_is(arguments: bytes) -> None:
+    with pytest.raises((ForbiddenObject, TypeError)):
+        open_pickle(b"cbuiltins\ngetattr\n(" + arguments + b"tR.")
 
 
 def test_classes_of_the_listed_families_are_opened() -> None:

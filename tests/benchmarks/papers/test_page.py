@@ -10,6 +10,7 @@ from rare_envs.study.reproduction.tian2024.replications import ReplicationJob, R
 from rare_envs.study.reproduction.tian2024.tables import make_method_tables
 from rare_envs.threads import use_one_thread
 from samplers.serialization import to_json_value
+from tests.benchmarks.papers.same_records import assert_same
 
 
 @pytest.fixture(scope="module")
@@ -57,7 +58,7 @@ def test_committed_tables_follow_from_the_committed_runs(tian) -> None:
     assert {counts.pop(method) for method in ("IS", "SS", "ADSS")} == {tian["about"]["replications"]}
     assert set(counts.values()) == {tian["about"]["replications_of_further_methods"]}
     assert tian["about"]["replications"] >= 20
-    assert tables_of(read_replications(tian)) == tian["tables"]
+    assert_same(tables_of(read_replications(tian)), tian["tables"])
 
 
 @pytest.mark.slow

@@ -10,12 +10,13 @@ from benchmarks.papers import renew
 from benchmarks.papers.page import read_records
 from benchmarks.papers.renew import renew_okelly, renew_tian
 from rare_envs.study.reproduction.tian2024.replications import ReplicationJob
+from tests.benchmarks.papers.same_records import assert_same
 
 
 def test_without_new_rows_a_record_follows_from_its_own_runs(tmp_path) -> None:
     for paper, record in read_records().items():
         anew = renew_tian(record, tmp_path) if paper == "tian2024" else renew_okelly(record, tmp_path, own=False)
-        assert anew == record, paper
+        assert_same(anew, record, paper)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -44,10 +45,9 @@ def test_a_row_of_tian_that_is_wrong_is_put_right_and_the_others_stay(tmp_path, 
     for one, other in zip(anew["tables"], record["tables"], strict=True):
         for row, shown in zip(one["measured"], other["measured"], strict=True):
             assert row["values"] == pytest.approx(shown["values"], rel=1e-6)
-        assert one["values"] == other["values"]
-    assert {name: anew[name] for name in ("figures", "findings", "notes")} == {
-        name: record[name] for name in ("figures", "findings", "notes")
-    }
+        assert_same(one["values"], other["values"])
+    for name in ("figures", "findings", "notes"):
+        assert_same(anew[name], record[name], name)
     renew_tian(wrong, tmp_path, ["cross-entropy"])
     assert len(made) == 4 * record["about"]["replications"]  # none is made twice
 
@@ -69,4 +69,4 @@ def test_our_rows_of_okelly_are_put_right(tmp_path, monkeypatch) -> None:
         return [{name: value for name, value in own.items() if name != "gain"} for own in shown]
 
     monkeypatch.setattr(renew, "estimate_own", estimate)
-    assert renew_okelly(wrong, tmp_path) == record
+    assert_same(renew_okelly(wrong, tmp_path), record)
