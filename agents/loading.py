@@ -115,7 +115,7 @@ def load_ego(
     if kind == "url":
         raise ValueError(f"Will not load an ego from {text!r}: download the file, look where it comes from, name it.")
     if kind == "unknown":
-        raise ValueError(f"Unknown ego {text!r}{_suggest_ego(text)}; expected {EXPECTED_EGO}.")
+        raise ValueError(f"Unknown ego {text!r}{suggest_ego(text)}; expected {EXPECTED_EGO}.")
     if kind in ("zip", "hub"):
         return load_saved_ego(find_hub_model(text) if kind == "hub" else Path(text), algo, trust, stats)
     if kind == "noisy":
@@ -227,7 +227,7 @@ EGO_SUFFIXES = (".zip", ".onnx", ".safetensors")
 """How the files of egos end."""
 
 
-def _suggest_ego(text: str) -> str:
+def suggest_ego(text: str) -> str:
     """Return a hint at the ego that a misspelt name may mean: a known name or a `.zip` saved nearby."""
     saved = Path(f"{text}.zip")
     if saved.is_file():

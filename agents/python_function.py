@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from typing import Any
 
 from agents.names import RULE_BASED
@@ -22,6 +23,12 @@ def call_factory(spec: str) -> Any:
     function = import_object(spec, f"the ego {spec!r}")
     if not callable(function):
         raise ValueError(f"Expected {spec!r} to be a function that returns an ego, got {type(function).__name__}.")
+    needed = _list_needed_arguments(function)
+    if needed:
+        raise ValueError(
+            f"Expected {spec!r} to be a function without arguments that returns the ego, got one that needs "
+            f"{', '.join(needed)}; for an ego that is a function, name another one that returns it."
+        )
     try:
         ego = wrap_callable(function())
     except (Exception, SystemExit) as error:  # the function is the user's: anything may happen in it
@@ -30,3 +37,13 @@ def call_factory(spec: str) -> Any:
     if not rule_based and not is_policy(ego):
         refuse_ego(ego, f"from {spec!r}")
     return ego
+
+
+def _list_needed_arguments(function: Any) -> list[str]:
+    """Return the arguments without which a function cannot be called; empty where that cannot be told."""
+    try:
+        parameters = inspect.signature(function).parameters.values()
+    except (TypeError, ValueError):  # of a function in C
+        return []
+    open_ended = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
+    return [p.name for p in parameters if p.default is p.empty and p.kind not in open_ended]

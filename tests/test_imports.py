@@ -64,7 +64,7 @@ FLOORS = {
         study.cli
     """,
     "agents": """
-        names settings
+        names settings missing_file
         python_function
         learned sb3 remote imperfect_stack
         vision onnx

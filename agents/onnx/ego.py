@@ -11,6 +11,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
+from agents.missing_file import report_missing_file
 from rare_envs.control.actions import DISCRETE_ACTIONS
 from rare_envs.plugins import one_line
 
@@ -58,7 +59,7 @@ class OnnxEgo:
             ValueError: It is no ONNX graph, or not of this form, or onnxruntime is not installed.
         """
         if not path.is_file():
-            raise FileNotFoundError(f"No ego at {str(path)!r}.")
+            raise report_missing_file(path)
         try:
             import onnxruntime
         except ImportError as error:

@@ -6,7 +6,6 @@ that needs classes of its author's own is opened as Stable-Baselines3 does, and 
 
 from __future__ import annotations
 
-import difflib
 import io
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -17,6 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from agents.missing_file import report_missing_file
 from agents.sb3.file_trust import TRUST, check_origin
 from agents.sb3.model_building import build_model
 from agents.sb3.normalisation import (
@@ -133,7 +133,7 @@ def load_saved_ego(path: Path, algo: str | None, trust: bool = False, stats: str
         FileNotFoundError: No ego at 'no/such/ego.zip': the folder 'no/such' does not exist.
     """
     if not path.exists():
-        raise FileNotFoundError(f"No ego at {str(path)!r}{_suggest_file(path)}.")
+        raise report_missing_file(path)
     if not path.is_file():
         raise ValueError(f"Expected a Stable-Baselines3 .zip, got the folder {str(path)!r}.")
     statistics_path = find_statistics(path) if stats is None else Path(stats)
@@ -147,17 +147,6 @@ def load_saved_ego(path: Path, algo: str | None, trust: bool = False, stats: str
     model = _load_model(algorithm, name, header, path, trust)
     statistics = None if statistics_path is None else load_statistics(statistics_path, model.observation_space, trust)
     return SavedEgo(model, name, path, statistics, statistics_path, header)
-
-
-def _suggest_file(path: Path) -> str:
-    """Return a hint at files in the same folder that a mistyped path may have meant."""
-    if not path.parent.is_dir():
-        return f": the folder {str(path.parent)!r} does not exist"
-    names = sorted(entry.name for entry in path.parent.glob("*.zip"))
-    near = difflib.get_close_matches(path.name, names, n=3, cutoff=0.5) or names[:3]
-    if not near:
-        return f": the folder {str(path.parent)!r} has no .zip"
-    return f"; in that folder: {', '.join(near)}"
 
 
 def _load_model(algorithm: Any, name: str, header: Mapping[str, Any], path: Path, trust: bool) -> Any:

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass
+from decimal import Decimal
 
 import numpy as np
 
@@ -10,6 +11,9 @@ from samplers.errors import ON_ERROR, OnError
 from samplers.method import Goal, Stepping, TermsOffer
 from samplers.problem import Distribution, Inputs
 from samplers.validation import check_name, check_number, check_whole
+
+MOST_SIMULATIONS = 10**12
+"""Largest `max_sim`: more is a slip of the keyboard."""
 
 
 @dataclass(frozen=True)
@@ -54,6 +58,10 @@ class RunArguments:
         check_whole("replicates", self.replicates, 1)
         if self.max_sim is not None:
             check_whole("max_sim", self.max_sim, self.replicates)
+            if self.max_sim > MOST_SIMULATIONS:
+                raise ValueError(
+                    f"Expected max_sim to be at most {MOST_SIMULATIONS:,}, got {Decimal(self.max_sim):.3g}."
+                )
         if self.seed is not None:
             check_whole("seed", self.seed, 0)
         check_name("on_error", self.on_error, list(ON_ERROR))

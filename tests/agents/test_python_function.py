@@ -37,6 +37,7 @@ def own_module(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
         "def make_exit():\n    sys.exit(7)\n"
         "def make_function():\n    return lambda observation: np.full((len(observation), 2), 0.5)\n"
         "def make_array():\n    return np.zeros(2)\n"
+        "def drive(observation, *rest, scale=1.0, **more):\n    return observation[:, :2]\n"
     )
     monkeypatch.chdir(tmp_path)
     return "own_egos_for_test"
@@ -59,6 +60,7 @@ def test_a_function_of_the_user_makes_the_ego(own_module: str) -> None:
         ("make_trouble", "failed to make an ego: RuntimeError: no weights"),
         ("make_exit", "failed to make an ego: SystemExit: 7"),
         ("make_array", "got ndarray from"),
+        ("drive", "without arguments that returns the ego, got one that needs observation; for an ego that is a"),
     ],
 )
 def test_a_function_that_does_not_serve_is_refused(function: str, message: str, own_module: str) -> None:

@@ -9,7 +9,7 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
     "list": ("rare-envs list", "rare-envs list egos", "rare-envs list CutIn-v0"),
     "estimate": (
         "rare-envs estimate rare_envs/CutIn-v0 --ego ppo.zip --out runs/cutin",
-        "rare-envs estimate rare_envs/CarFollowing-v0 --method mc --max-sim 1e5",
+        "rare-envs estimate rare_envs/CarFollowing-v0 --base us101-gap --method mc --max-sim 1e5",
         "rare-envs estimate highway-fast-v0 --ego dqn.zip --max-sim 300",
     ),
     "resume": ("rare-envs resume runs/cutin", "rare-envs resume runs/cutin --workers 4"),

@@ -113,7 +113,9 @@ DetailsOption = Annotated[
     typer.Option("--details", help="Print all intervals, and all parameters of the most likely failure."),
 ]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object and nothing else.")]
-SeedOption = Annotated[int, typer.Option(help="Seed; the same seed gives the same answer.")]
+SeedOption = Annotated[
+    int, typer.Option(help="Seed; the same seed gives the same answer.", parser=read_count, metavar="INTEGER")
+]
 TrustOption = Annotated[
     bool,
     typer.Option(

@@ -81,14 +81,15 @@ def check_ego(request: EgoCheckRequest) -> list[Finding]:
         The findings in order; the last one is a failure if the ego cannot be loaded, hangs or dies.
 
     Raises:
-        BadInput: The environment is unknown, or there is no such file.
+        BadInput: The environment or the ego is unknown, or there is no such file.
 
     Example:
         >>> for finding in check_ego(EgoCheckRequest("https://example.org/ego.zip", "rare_envs/CutIn-v0")):
         ...     print(finding.check, finding.status, finding.found)
         origin fail 'https://example.org/ego.zip' is a remote place
     """
-    from agents.loading import find_ego_kind, strip_prefixes
+    from agents.loading import EGO_SUFFIXES, EXPECTED_EGO, find_ego_kind, strip_prefixes, suggest_ego
+    from agents.missing_file import report_missing_file
     from agents.sb3.file_trust import TRUST_ADVICE, TRUST_CONSEQUENCE, find_origin_risks
     from agents.sb3.normalisation import find_statistics
     from rare_envs.scenarios.registry import find_scenario, split_layout
@@ -107,6 +108,10 @@ def check_ego(request: EgoCheckRequest) -> list[Finding]:
                 "origin", f"{name!r} is a remote place", "download the file, look where it comes from, name it"
             )
         ]
+    if kind == "unknown":
+        raise BadInput(f"Unknown ego {name!r}{suggest_ego(name)}; expected {EXPECTED_EGO}.")
+    if name.endswith(EGO_SUFFIXES) and not Path(name).exists():
+        raise BadInput(report_missing_file(Path(name)))
     if kind == "zip":
         reasons = find_origin_risks(Path(name), find_statistics(Path(name)))
         if reasons and not request.trust:

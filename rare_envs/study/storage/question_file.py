@@ -162,6 +162,8 @@ def _load_mapping(path: Path) -> dict[str, Any]:
         raise BadInput(f"Cannot read {str(path)!r}: {error.strerror}.") from error
     except (yaml.YAMLError, ValueError, RecursionError) as error:
         raise BadInput(f"{str(path)!r} is no YAML: {error}") from error
+    if given is None:
+        raise BadInput(f"{str(path)!r} has no keys: expected lines like gamma: 0.0.")
     if not isinstance(given, dict) or not all(isinstance(key, str) for key in given):
         raise BadInput(f"Expected {str(path)!r} to have lines like gamma: 0.0, got {reprlib.repr(given)}.")
     return given

@@ -35,6 +35,7 @@ def test_goal_without_limits():
         ({"gamma": np.nan}, "gamma to be a finite number, got nan"),
         ({"confidence": 1.0}, "confidence to be a number between 0 and 1, got 1.0"),
         ({"target_cov": 0}, "target_cov to be a number above 0, got 0"),
+        ({"max_sim": 10**99}, "max_sim to be at most 1,000,000,000,000, got 1.00e"),
         ({"replicates": 4, "max_sim": 3}, "max_sim to be a whole number of at least 4, got 3"),
         ({"seed": -1}, "seed to be a whole number of at least 0, got -1"),
         ({"on_error": "fail"}, "Unknown on_error 'fail'. Did you mean 'failure'"),

@@ -323,3 +323,22 @@ def test_where_everybody_may_add_files_ones_own_are_safe(saved: Path, monkeypatc
     assert "belongs to another user" in find_origin_risks(saved)[0]
     saved.parent.chmod(0o755)  # a colleague's: nobody else can have put it there
     assert find_origin_risks(saved) == []
+
+
+@pytest.mark.parametrize(
+    ("ego", "message"),
+    [
+        ("no_such.zip", "No ego at 'no_such.zip': the folder '.' has no .zip"),
+        ("process:no_such.onnx", "No ego at 'no_such.onnx'"),
+        ("imitatoin", "Unknown ego 'imitatoin' (did you mean 'imitation'?)"),
+    ],
+)
+def test_an_ego_that_is_not_there_is_one_line(
+    ego: str, message: str, cli: Cli, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    result = cli("check-ego", ego, ENV)
+    assert result.exit_code == 2
+    assert result.stdout == ""
+    assert message in result.stderr
+    assert result.stderr.count("\n") == 1

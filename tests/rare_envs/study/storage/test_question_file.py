@@ -86,7 +86,7 @@ def test_what_is_typed_comes_before_the_file(cli: Cli, risky: str, tmp_path: Pat
         ("env: rare_envs/CutIn-v0\nhorizon: 12:30\n", "Expected horizon to be a number or null, got '12:30'"),
         ("max-sim: 3\nmax_sim: 4\n", "same option twice"),
         ("- 1\n- 2\n", "lines like gamma"),
-        ("", "lines like gamma"),
+        ("", "has no keys: expected lines like gamma"),
         ("env: [unclosed\n", "is no YAML"),
         ("env: !!python/object/apply:os.system ['true']\n", "is no YAML"),
         ("1: 2\n", "lines like gamma"),
