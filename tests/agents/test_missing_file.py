@@ -9,7 +9,7 @@ from agents.missing_file import report_missing_file
     ("name", "hint"),
     [
         ("eg.zip", "; in that folder: ego.zip."),
-        ("weights.onnx", "; in that folder: a.onnx, b.onnx, c.onnx."),
+        ("policy_of_the_third_training.onnx", "; in that folder: a.onnx, b.onnx, c.onnx."),
         ("ego.safetensors", " has no .safetensors."),
         ("there/ego.zip", "there' does not exist."),
     ],
