@@ -54,7 +54,6 @@ ABLATIONS: dict[str, Mapping[str, Any]] = {
     "slopes": {"slopes.min_dim": 10**9},
     "components of the exploration": _without_kinds("explored"),
     "tempered Gaussians": _without_kinds("tempered"),
-    "screen": {"mixture.screening.min_class_size": 10**9},
     "further rounds": {"refinement.further_shares": ()},
     "lines of descent": {"lines.n": 1},
     "wide draws": {"exploration.wide": ((1.5, 2),), "exploration.deep_draws": 0},

@@ -12,8 +12,6 @@ PLANES = ("convex_d2", "corner_d5", "three_d6", "two_d60")
 MANY_DIMENSIONS = ("two_d30", "two_d60", "lin_d100", "four_d100")
 CURVED = ("convex_d2", "sphere_d20", "concave_d2", "corner_d5")
 """Not described by one hyperplane."""
-SCREENED = ("convex_d2", "sphere_d20", "corner_d5", "island_d3")
-"""One region in up to 40 dimensions."""
 
 
 @dataclass(frozen=True)
@@ -108,12 +106,6 @@ VARIATIONS = {
         MANY_DIMENSIONS, {"subspace.max_spread": (2.0, 8.0), "subspace.max_mean_excess": (0.25, 0.9)}
     ),
     "standard_errors": Variation(CURVED, {"subspace.standard_errors": (1.0, 4.0)}),
-    "min_acceptances": Variation(SCREENED, {"screening.min_acceptances": ((0.25, 0.125), (0.7, 0.5))}),
-    "max_variance_ratio": Variation(SCREENED, {"screening.max_variance_ratio": (0.45, 1.0)}),
-    "min_class_size": Variation(SCREENED, {"screening.min_class_size": (20, 80)}),
-    "penalties of the screen": Variation(
-        SCREENED, {"screening.svm_penalty": (5.0, 20.0), "screening.calibration_penalty": (50.0, 200.0)}
-    ),
     "updates": Variation(CURVED, {"weights.updates": (30, 120)}),
 }
 """By name."""

@@ -8,12 +8,10 @@ from scipy.special import log_ndtr
 from samplers.methods.two_stage.mixture.boundary import fit_half_spaces, fit_radial
 from samplers.methods.two_stage.mixture.mixture_weights import Floor, minimise_second_moment, raise_to_floors
 from samplers.methods.two_stage.mixture.proposal import MixtureProposal, ProposalComponent
-from samplers.methods.two_stage.mixture.screening import FailureScreen, LabelledPoints, train_screen
 from samplers.methods.two_stage.mixture.settings import (
     DEFAULT_MIXTURE_SETTINGS,
     EdgeSettings,
     MixtureSettings,
-    ScreeningSettings,
 )
 from samplers.methods.two_stage.mixture.subspace_em import truncate_weights
 from samplers.methods.two_stage.multiple_importance import MultipleImportanceSample
@@ -34,7 +32,6 @@ def build_proposal(
     state: RefinementState,
     history: MultipleImportanceSample,
     settings: RefinementSettings,
-    rng: np.random.Generator,
     mixture: MixtureSettings = DEFAULT_MIXTURE_SETTINGS,
     *,
     final: bool = False,
@@ -48,9 +45,8 @@ def build_proposal(
         state: What is known of the regions.
         history: All draws so far.
         settings: Shares and lower limits.
-        rng: Source of randomness: what a screen accepts is found by drawing.
-        mixture: Of edges, weights and screens.
-        final: For the estimate: what is no use is dropped, and a classifier may screen the draws.
+        mixture: Of edges and weights.
+        final: For the estimate: what is no use is dropped.
     """
     candidates = list_candidates(state, history, settings, mixture.edges)
     kinds = np.array([candidate.kind for candidate in candidates])
@@ -68,11 +64,7 @@ def build_proposal(
         weights = np.where(explored, np.maximum(weights, settings.explored_share), weights)
         keeps = keeps | explored
     weights = np.where((weights < settings.min_share) & ~keeps, 0.0, weights)
-    proposal = MixtureProposal(candidates, raise_to_floors(weights / weights.sum(), floors))
-    if not final or state.noisy or state.dim > mixture.subspace.high_dim:
-        return proposal
-    screen = _train_screen(state, mixture.screening)
-    return proposal if screen is None else proposal.with_screen(screen, rng, mixture.screening)
+    return MixtureProposal(candidates, raise_to_floors(weights / weights.sum(), floors))
 
 
 def list_candidates(
@@ -249,12 +241,3 @@ def _smooth_indicators(
     model = LogisticRegression(C=settings.logistic_penalty, max_iter=settings.logistic_iterations, random_state=0)
     odds = model.fit(x, f <= gamma).decision_function(x) / settings.probit_scale
     return u, log_w + log_ndtr(odds)
-
-
-def _train_screen(state: RefinementState, settings: ScreeningSettings) -> FailureScreen | None:
-    """Return a screen trained on the chains and the draws of all rounds, or None if none is worth it."""
-    *earlier, last = state.rounds
-    u = np.concatenate([region.u for region in state.regions] + [draws.u for draws in earlier])
-    f = np.concatenate([region.f for region in state.regions] + [draws.f for draws in earlier])
-    known, fresh = LabelledPoints(u, f <= state.gamma), LabelledPoints(last.u, last.f <= state.gamma)
-    return train_screen(known, fresh, last.log_weights, settings)

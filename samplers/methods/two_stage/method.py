@@ -29,18 +29,15 @@ class TwoStage(Method):
        a tenth of a failure. The weights minimise the estimated variance (`mixture_weights.py`), with lower limits for
        the base distribution, for tempered Gaussians (which bound weights where a Gaussian is a bad description) and
        for each region. After each round but the last, chains grow from failures that the next proposal would hardly
-       reach (`discovery/uncovered.py`). In up to 40 dimensions a classifier then screens the last mixture
-       (`screening.py`).
+       reach (`discovery/uncovered.py`).
     3. *Estimate* (`stratified.py`): fresh draws from the last mixture, stratified by component, together with those of
        the rounds from the third on, each weighted as a draw of its own mixture.
 
-    p-hat is unbiased, as the estimate from each mixture is given what came before it, with three exceptions. Whether
+    p-hat is unbiased, as the estimate from each mixture is given what came before it, with two exceptions. Whether
     another method takes over after the third round or later, and how many simulations chains then take before the next
-    one, depends on draws that count. Behind a screen, weights rest on its acceptance of each component. It is estimated
-    by draws that are not simulated, and its error, some tenths of a per cent, is common to all weights of a component;
-    the c.o.v. includes it. With a target c.o.v., the draws decide themselves when they end. (Weighting all draws as if
-    from one mixture, as adaptive multiple importance sampling does, would bias p by some per cent and make intervals
-    too short.)
+    one, depends on draws that count. With a target c.o.v., the draws decide themselves when they end. (Weighting all
+    draws as if from one mixture, as adaptive multiple importance sampling does, would bias p by some per cent and make
+    intervals too short.)
 
     All stages work in standard normal space, so that wide draws stay within the support of the parameters. A run
     yields 45 to 90 batches, half of them steps of the levels and the lines of descent. Regression of f, subset

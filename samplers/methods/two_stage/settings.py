@@ -3,7 +3,7 @@
 Users set `TwoStage.n` only. Where no other reason stands beside a number, it was chosen together with the others on the
 problems of `benchmarks/estimators/catalogue.py` at 6,000 simulations: some 30 configurations, up to 40 runs each, by
 which differences in gain of less than a factor of two cannot be told from chance. Numbers of the
-algorithms that fit and screen mixtures stand in `mixture/settings.py`.
+algorithms that fit mixtures stand in `mixture/settings.py`.
 """
 
 from dataclasses import dataclass, field

@@ -169,7 +169,7 @@ def begin_refinement(
     """Return what the exploration shows of its regions, at least one, and the proposal of the first round."""
     settings, mixture, rng = context.settings.refinement, context.settings.mixture, context.rng
     refinement = start_refinement(exploration, context.goal.gamma, settings, rng, mixture)
-    return refinement, build_proposal(refinement, state.history, settings, rng, mixture)
+    return refinement, build_proposal(refinement, state.history, settings, mixture)
 
 
 def draw_round(
@@ -219,7 +219,7 @@ def refine(
         state, refinement = yield from draw_round(context, state, refinement, proposal, n)
     enough = refinement.noisy or not state.rounds or state.rounds[-1].ess >= settings.good_rate * state.rounds[-1].n
     final = number == len(shares) or (enough and number >= len(settings.round_shares))
-    proposal = build_proposal(refinement, state.history, settings, context.rng, context.settings.mixture, final=final)
+    proposal = build_proposal(refinement, state.history, settings, context.settings.mixture, final=final)
     return state, refinement, proposal, final
 
 
@@ -244,7 +244,7 @@ def cover(
     covered = yield from cover_failures(context.simulator, refinement, points, within, rng, settings)
     if covered is refinement:
         return refinement, proposal
-    return covered, build_proposal(covered, state.history, settings.refinement, rng, settings.mixture)
+    return covered, build_proposal(covered, state.history, settings.refinement, settings.mixture)
 
 
 def gives_up(
@@ -381,7 +381,7 @@ def _draw(
     context: RunContext, state: RunState, proposal: MixtureProposal, n: int
 ) -> SimulationSteps[tuple[RunState, ComponentDraws]]:
     """Make n draws of a proposal; those from its first component, the base distribution, are counted."""
-    u, counts = proposal.draw(n, context.rng, context.settings.mixture.screening)
+    u, counts = proposal.draw(n, context.rng)
     f = yield from context.simulator.evaluate(u)
     batch = ComponentDraws(proposal.components, counts, u, f)
     return replace(state, base_draws=state.base_draws + int(counts[0])), batch

@@ -34,8 +34,6 @@ class StratifiedSample:
     """Of y in each component, shape (k,)."""
     squares: FloatArray
     """Of y^2 in each component, shape (k,)."""
-    acceptance_cov: float
-    """Error that all draws have in common: see `MixtureProposal.acceptance_cov`."""
     typical: FloatArray
     """Weight of a typical point of each region, whether or not a draw has met one, shape (m,)."""
     u_safe: FloatArray
@@ -49,7 +47,7 @@ class StratifiedSample:
     ) -> "StratifiedSample":
         """Return a sample without draws, of a proposal of k components in d dimensions."""
         zero, none = np.zeros(k), Draws(0, np.empty(0), np.empty(0))
-        return cls(none, zero, zero, zero, 0.0, typical, np.empty((0, dim)), min_stratum_draws)
+        return cls(none, zero, zero, zero, typical, np.empty((0, dim)), min_stratum_draws)
 
     def add(self, batch: ComponentDraws, proposal: MixtureProposal, inputs: Inputs, gamma: float) -> "StratifiedSample":
         """Return the sample with another batch from the same proposal."""
@@ -63,7 +61,6 @@ class StratifiedSample:
             self.counts + batch.counts,
             self.sums + np.bincount(owner, weights=y, minlength=k),
             self.squares + np.bincount(owner, weights=y * y, minlength=k),
-            proposal.acceptance_cov,
             self.typical,
             np.concatenate([self.u_safe, batch.u[~fails]]),
             self.min_stratum_draws,
@@ -81,13 +78,11 @@ class StratifiedSample:
         if earlier.draws.n == 0:
             return self
         draws = earlier.draws.join(self.draws)
-        common = math.hypot(*(each.acceptance_cov * each.draws.n * each.p for each in (earlier, self)))
         return StratifiedSample(
             draws,
             np.concatenate([earlier.counts, self.counts]),
             np.concatenate([earlier.sums, self.sums]),
             np.concatenate([earlier.squares, self.squares]),
-            common / (draws.n * draws.p) if draws.p > 0 else 0.0,
             self.typical,
             np.concatenate([earlier.u_safe, self.u_safe]),
             self.min_stratum_draws,
@@ -112,9 +107,7 @@ class StratifiedSample:
         within = float(((s2 - s1 * s1 / n) * n / (n - 1)).sum()) + float(self.squares[~many].sum())
         typical = min(float(self.typical.max(initial=0.0)), MAX_TYPICAL_SHARE * self.draws.n * self.p)
         largest = max(math.exp(float(self.draws.log_weights.max())), typical)
-        return math.hypot(
-            math.sqrt(max(within, 0.0) + largest * largest) / (self.draws.n * self.p), self.acceptance_cov
-        )
+        return math.sqrt(max(within, 0.0) + largest * largest) / (self.draws.n * self.p)
 
     def to_sample(
         self,

@@ -1,1 +1,1 @@
-"""The mixture proposal of two-stage: its components, their weights and the screening of its draws."""
+"""The mixture proposal of two-stage: its components and their weights."""

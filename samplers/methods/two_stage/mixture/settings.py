@@ -1,4 +1,4 @@
-"""Settings of the mixtures of two-stage: regression, expectation-maximisation, edges, screens, weights.
+"""Settings of the mixtures of two-stage: regression, expectation-maximisation, edges, weights.
 
 Below, "variance x and y" are the variances that runs state with a setting halved and doubled (or moved as far as makes
 sense), over those with the default one: geometric means over four problems of the catalogue where it acts, 10 seeds
@@ -173,37 +173,6 @@ class SubspaceSettings:
 
 
 @dataclass(frozen=True, kw_only=True)
-class ScreeningSettings:
-    """When a classifier screens the last proposal, and how (`screening.py`, `proposal.py`)."""
-
-    min_acceptances: tuple[float, ...] = (0.5, 0.25)
-    """Values of a_min to choose from: no weight grows by more than 4. Variance 1.06 +- 0.05 at (0.25, 0.125) and
-    1.03 +- 0.03 at (0.7, 0.5)."""
-    max_variance_ratio: float = 0.9
-    """A screen is used where it is estimated to give less than this share of the variance without it. Variance 1.11 at
-    0.45, 1.00 +- 0.03 at 1: the limit saves time where a screen hardly pays."""
-    min_class_size: int = 40
-    """Failing, and other, points that a classifier needs. Variance 1.12 and 0.92 +- 0.04."""
-    svm_penalty: float = 10.0
-    """C of the support vector machine: points on the wrong side are few, for f has no noise where a screen is
-    trained. Variance 1.02 +- 0.01 and 1.02 +- 0.02, with `calibration_penalty`."""
-    svm_points: int = 20_000
-    """Points that it is trained on at most: training and decisions grow with the square of their number."""
-    calibration_penalty: float = 100.0
-    """C of the logistic regression that calibrates it: two coefficients from dozens of points need hardly any
-    penalty."""
-    spare_factor: int = 2
-    """Draws per missing one in each pass of the rejection, as an acceptance of a half asks for."""
-    spare_draws: int = 20
-    """Draws more than that: a pass for the last missing one is seldom the last without them."""
-    acceptance_draws: int = 15_000
-    """Draws, shared among the components by weight, that find what a screen accepts; they are not simulated. The c.o.v.
-    of an acceptance of a half is then under 1 % of itself for a component of any weight that matters."""
-    min_acceptance_draws: int = 500
-    """Such draws of a component at least."""
-
-
-@dataclass(frozen=True, kw_only=True)
 class MixtureWeightSettings:
     """Search for the best weights of a mixture (`mixture_weights.py`)."""
 
@@ -222,7 +191,6 @@ class MixtureSettings:
     pieces: PieceSettings = PieceSettings()
     edges: EdgeSettings = EdgeSettings()
     subspace: SubspaceSettings = SubspaceSettings()
-    screening: ScreeningSettings = ScreeningSettings()
     weights: MixtureWeightSettings = MixtureWeightSettings()
 
 

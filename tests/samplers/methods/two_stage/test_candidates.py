@@ -35,7 +35,7 @@ def started(exact_region, rng, dim=3, regions=1, noisy=False, scattered=False):
 def after_round(exact_region, rng, n=800, **kwargs):
     """Return state and history after a round."""
     state, history, problem = started(exact_region, rng, **kwargs)
-    proposal = build_proposal(state, history, SETTINGS, rng)
+    proposal = build_proposal(state, history, SETTINGS)
     u, counts = proposal.draw(n, rng)
     batch = ComponentDraws(proposal.components, counts, u, problem.evaluate(u))
     history = history.add(batch, 0.0)
@@ -53,7 +53,7 @@ def kinds_of(candidates):
 def test_the_first_proposal_has_the_initial_shares(exact_region, rng):
     """Of the kinds that are there, in proportion; `explored` is the same as `gaussian` before the first round."""
     state, history, _ = started(exact_region, rng)
-    proposal = build_proposal(state, history, SETTINGS, rng)
+    proposal = build_proposal(state, history, SETTINGS)
     present = {kind: a for kind, a in SETTINGS.initial_shares.items() if kind in kinds_of(proposal.candidates)}
     assert set(SETTINGS.initial_shares) - set(present) == {"explored", "spread", "directional"}
     for kind, a in present.items():
@@ -86,7 +86,7 @@ def test_candidates_in_the_span_of_the_slopes_are_normal_across_it(exact_region,
 def test_draws_of_a_round_move_the_components_in_the_span(exact_region, rng):
     """As those in all coordinates: in the span a Gaussian is exact, in thirty dimensions it is shrunk."""
     state, history, problem = sloped(exact_region, rng, regions=1)
-    proposal = build_proposal(state, history, SETTINGS, rng)
+    proposal = build_proposal(state, history, SETTINGS)
     u, counts = proposal.draw(2000, rng)
     batch = ComponentDraws(proposal.components, counts, u, problem.evaluate(u))
     history = history.add(batch, 0.0)
@@ -107,10 +107,10 @@ def test_the_spread_has_a_share_while_draws_are_worth_little(exact_region, rng, 
     n = round(len(u) / worth)
     f = np.append(np.full(len(u), -1.0), np.ones(n - len(u)))
     draws = NearDraws(np.concatenate([u, np.zeros((n - len(u), 30))]), f, np.zeros(n))
-    drawn = build_proposal(state, history, SETTINGS, rng)
+    drawn = build_proposal(state, history, SETTINGS)
     v, counts = drawn.draw(1000, rng)
     history = history.add(ComponentDraws(drawn.components, counts, v, problem.evaluate(v)), 0.0)
-    after = build_proposal(replace(state, rounds=(draws,)), history, SETTINGS, rng)
+    after = build_proposal(replace(state, rounds=(draws,)), history, SETTINGS)
     assert draws.worth(0.0) == pytest.approx(worth)
     assert share(after, "spread") == pytest.approx(floor, abs=0.05)
 
@@ -118,12 +118,12 @@ def test_the_spread_has_a_share_while_draws_are_worth_little(exact_region, rng, 
 def test_base_draws_keep_their_share_where_all_floors_are_more_than_everything(exact_region, rng):
     """Half for two regions, 40 % for the spread, 10 % and more for tempered Gaussians, 5 % of base draws: over 1."""
     state, history, problem = sloped(exact_region, rng, regions=2)
-    drawn = build_proposal(state, history, SETTINGS, rng)
+    drawn = build_proposal(state, history, SETTINGS)
     u, counts = drawn.draw(1000, rng)
     history = history.add(ComponentDraws(drawn.components, counts, u, problem.evaluate(u)), 0.0)
     few = NearDraws(np.concatenate([state.points, np.zeros((20 * len(state.points), 30))]), np.empty(0), np.empty(0))
     few = few._replace(f=problem.evaluate(few.u), log_weights=np.zeros(len(few.u)))
-    after = build_proposal(replace(state, rounds=(few,), hit_rate=0.3), history, SETTINGS, rng)
+    after = build_proposal(replace(state, rounds=(few,), hit_rate=0.3), history, SETTINGS)
     assert few.worth(0.0) < SETTINGS.good_rate
     assert share(after, "base") == pytest.approx(SETTINGS.base_share)
     assert (after.weights >= 0).all()
@@ -161,16 +161,15 @@ def test_a_noisy_f_has_no_edges_and_more_tempered_gaussians(exact_region, rng):
     kinds = kinds_of(list_candidates(state, history, SETTINGS))
     assert not {"linear", "half-space"} & set(kinds)
     assert kinds["tempered"] == 2 * (kinds["gaussian"] + kinds["explored"])
-    proposal = build_proposal(state, history, SETTINGS, rng, final=True)
+    proposal = build_proposal(state, history, SETTINGS, final=True)
     assert share(proposal, "tempered") >= SETTINGS.noisy_tempered_share - 1e-9
     assert share(proposal, "base") >= SETTINGS.noisy_base_share - 1e-9
-    assert proposal.screen is None
 
 
 @pytest.mark.parametrize("final", [False, True])
 def test_lower_limits_of_one_region(exact_region, rng, final):
     state, history, _ = after_round(exact_region, rng)
-    proposal = build_proposal(state, history, SETTINGS, rng, final=final)
+    proposal = build_proposal(state, history, SETTINGS, final=final)
     assert proposal.weights.sum() == pytest.approx(1.0)
     assert share(proposal, "base") >= SETTINGS.base_share - 1e-9
     assert share(proposal, "tempered") >= SETTINGS.tempered_share - 1e-9
@@ -182,7 +181,7 @@ def test_lower_limits_of_one_region(exact_region, rng, final):
 
 def test_more_tempered_draws_where_the_others_miss(exact_region, rng):
     state, history, _ = after_round(exact_region, rng)
-    missing = build_proposal(replace(state, hit_rate=0.0), history, SETTINGS, rng)
+    missing = build_proposal(replace(state, hit_rate=0.0), history, SETTINGS)
     assert share(missing, "tempered") >= SETTINGS.tempered_share + SETTINGS.extra_tempered_share - 1e-9
 
 
@@ -190,7 +189,7 @@ def test_more_tempered_draws_where_the_others_miss(exact_region, rng):
 def test_every_region_keeps_tempered_draws(exact_region, rng, final):
     """Both half-spaces fail alike, so that each has half of the tempered draws; 0.7 of that allows for chance."""
     state, history, _ = after_round(exact_region, rng, regions=2)
-    proposal = build_proposal(state, history, SETTINGS, rng, final=final)
+    proposal = build_proposal(state, history, SETTINGS, final=final)
     for k in range(2):
         tempered = [c.kind == "tempered" and c.region == k for c in proposal.candidates]
         assert proposal.weights[tempered].sum() >= 0.7 * SETTINGS.tempered_share / 2
@@ -200,12 +199,12 @@ def test_every_region_keeps_tempered_draws(exact_region, rng, final):
 def test_no_region_is_lost(exact_region, rng, final, least):
     """The second region has no failure in the history: it keeps half of what is dealt out all the same."""
     state, history, _ = started(exact_region, rng, regions=2)
-    proposal = build_proposal(state, history, SETTINGS, rng)
+    proposal = build_proposal(state, history, SETTINGS)
     u, counts = proposal.draw(800, rng)
     batch = ComponentDraws(proposal.components, counts, u, BETA - u[:, 0])
     history = history.add(batch, 0.0)
     state = refine_once(state, history, proposal, batch, SETTINGS, rng)
-    shares = build_proposal(state, history, SETTINGS, rng, final=final)
+    shares = build_proposal(state, history, SETTINGS, final=final)
     for k in range(2):
         own = [a for a, c in zip(shares.weights, shares.candidates, strict=True) if c.region == k]
         assert sum(own) >= least - 1e-9
@@ -216,24 +215,24 @@ def test_no_region_is_lost(exact_region, rng, final, least):
 )
 def test_radial_draws_reach_failures_beside_the_regions_in_few_dimensions(exact_region, rng, dim, noisy, least):
     state, history, _ = after_round(exact_region, rng, dim=dim, noisy=noisy)
-    final = build_proposal(state, history, SETTINGS, rng, final=True)
+    final = build_proposal(state, history, SETTINGS, final=True)
     assert least - 1e-9 <= share(final, "radial") <= 1.1 * least
 
 
 def test_pieces_of_a_shell_share_one_limit(exact_region, rng):
     state, history, _ = after_round(exact_region, rng, regions=2, scattered=True)
-    proposal = build_proposal(state, history, SETTINGS, rng)
+    proposal = build_proposal(state, history, SETTINGS)
     assert share(proposal, "radial") >= SETTINGS.radial_share - 1e-9
 
 
 def test_the_last_proposal_is_nearly_the_best_for_a_half_space(exact_region, rng):
     """Weights under it vary as the floors for base and tempered draws let them: E[w^2] / E[w]^2 < 1.5 at failures."""
     state, history, problem = after_round(exact_region, rng, n=2000)
-    proposal = build_proposal(state, history, SETTINGS, rng, final=True)
+    proposal = build_proposal(state, history, SETTINGS, final=True)
     u, _ = proposal.draw(20_000, rng)
     w = np.where(problem.evaluate(u) <= 0, np.exp(proposal.log_weights(u)), 0.0)
     error = w.std() / np.sqrt(20_000)
-    assert w.mean() == pytest.approx(stats.norm.sf(BETA), abs=4 * error + 4 * proposal.acceptance_cov * w.mean())
+    assert w.mean() == pytest.approx(stats.norm.sf(BETA), abs=4 * error)
     assert (w**2).mean() / w.mean() ** 2 < 1.5
 
 

@@ -42,7 +42,7 @@ def draws(proposal, n, problem, rng):
 def refined(exact_region, problem, regions, rng, n=600):
     """Return the state before and after a round, and the draws."""
     before = start_refinement(explored(exact_region, problem, regions), 0.0, SETTINGS, rng)
-    proposal = build_proposal(before, MultipleImportanceSample.empty(problem.dim), SETTINGS, rng)
+    proposal = build_proposal(before, MultipleImportanceSample.empty(problem.dim), SETTINGS)
     batch = draws(proposal, n, problem, rng)
     history = MultipleImportanceSample.empty(problem.dim).add(batch, 0.0)
     after = refine_once(before, history, proposal, batch, SETTINGS, rng)
@@ -158,7 +158,7 @@ def test_the_span_of_the_slopes_has_one_union_of_half_spaces(exact_region, rng, 
         (union,) = (one.component for one in state.within.linear if isinstance(one.component, HalfSpaceUnion))
         for k in range(2):
             assert (union.axes[:, k] > 0.98).any()
-        proposal = build_proposal(state, history, settings, rng)
+        proposal = build_proposal(state, history, settings)
         assert [getattr(one.component, "within", None) for one in proposal.candidates].count(union) == 1
         batch = draws(proposal, 400, problem, rng)
         history = history.add(batch, 0.0)

@@ -21,7 +21,7 @@ REFINEMENT = DEFAULT_SETTINGS.refinement
 
 NOISE = np.random.default_rng(0)
 RUNS = {
-    "one region, screened": (parabola().problem, 6000, None),
+    "one region": (parabola().problem, 6000, None),
     "two regions": (samplers.FunctionProblem(lambda u: 3.0 - np.abs(u[:, 0]), 5), 2000, None),
     "many dimensions": (half_space(60).problem, 2000, None),
     "many faces": (samplers.FunctionProblem(lambda u: 4.2 - np.abs(u).max(axis=1), 10), 6000, None),

@@ -36,7 +36,7 @@ def explored(drive, **kwargs):
     state = drive(stages.draw_first(context, state), PROBLEM).value
     state, exploration = drive(stages.explore(context, state), PROBLEM).value
     refinement = start_refinement(exploration, 0.0, context.settings.refinement, context.rng)
-    proposal = build_proposal(refinement, state.history, context.settings.refinement, context.rng)
+    proposal = build_proposal(refinement, state.history, context.settings.refinement)
     return context, state, refinement, proposal, levels
 
 

@@ -1,5 +1,4 @@
 import math
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -19,7 +18,6 @@ from samplers.proposals.components import (
     draw_counts,
 )
 
-SCREENING = DEFAULT_SETTINGS.mixture.screening
 BETA = 2.0
 P = stats.norm.sf(BETA)
 PROBLEM = FunctionProblem(lambda u: BETA - u[:, 0], 1)
@@ -140,13 +138,6 @@ def test_draws_of_an_earlier_mixture_add_to_the_estimate_and_to_its_variance(rng
     assert alone.join(StratifiedSample.empty(4, 1, np.empty(0))) is alone
 
 
-def test_the_error_of_a_screen_counts_by_the_share_of_the_draws_behind_it(rng):
-    screened = replace(strata(batch([200, 300, 300, 200], rng)), acceptance_cov=0.04)
-    plain = strata(batch([200, 300, 300, 200], rng))
-    share = screened.p / (screened.p + plain.p)
-    assert screened.join(plain).acceptance_cov == pytest.approx(0.04 * share)
-
-
 def test_a_component_without_weight_changes_nothing():
     with_it = strata(batch([20, 30, 30, 20, 0], np.random.default_rng(1), UNUSED), proposal=UNUSED)
     without = strata(batch([20, 30, 30, 20], np.random.default_rng(1)))
@@ -187,43 +178,3 @@ def test_sample_without_base_draws(rng):
     sample = found.to_sample(PROPOSAL, np.empty(0), np.empty((0, 1)), 0.0)
     assert sample.n_units == len(sample.f) == 4000
     assert sample.weights.sum() == pytest.approx(1.0, abs=4 * np.sqrt((sample.weights**2).sum()))
-
-
-def screen(u):
-    """Lets most draws short of the threshold go, as a classifier would that is not quite right."""
-    return np.where(u[:, 0] > 2.1, 1.0, 0.3)
-
-
-def passed(distribution):
-    return distribution.sf(2.1) + 0.3 * distribution.cdf(2.1)
-
-
-def test_a_screen_thins_components_and_the_weights_account_for_it(rng):
-    """The shares that it lets through are estimated once, by drawing: their error is that of all runs together."""
-    proposal = PROPOSAL.with_screen(screen, rng)
-    for (_, distribution), acceptance, weight in zip(PARTS, proposal.acceptance, WEIGHTS, strict=True):
-        share, drawn = passed(distribution), max(SCREENING.acceptance_draws * weight, SCREENING.min_acceptance_draws)
-        assert acceptance == pytest.approx(share, abs=4 * math.sqrt(0.25 / drawn))
-    found = []
-    for _ in range(300):
-        u, counts = proposal.draw(100, rng)
-        found.append(strata(ComponentDraws(proposal.components, counts, u, PROBLEM.evaluate(u)), proposal=proposal))
-    p = np.array([one.p for one in found])
-    assert p.mean() == pytest.approx(P, abs=4 * math.hypot(p.std() / math.sqrt(300), proposal.acceptance_cov * P))
-    own = np.mean([variance_within(one) for one in found])
-    assert own == pytest.approx(p.var(), rel=4 * math.sqrt(2.5 / 300))
-    assert 0 < proposal.acceptance_cov < 0.02
-
-
-def test_base_and_wide_draws_pass_every_screen(rng):
-    candidates = [
-        ProposalComponent(IsotropicNormal(1), "base"),
-        ProposalComponent(IsotropicNormal(1, 1.5), "wide"),
-        ProposalComponent(PARTS[1][0], "gaussian"),
-    ]
-    proposal = MixtureProposal(candidates, np.array([0.2, 0.2, 0.6])).with_screen(screen, rng)
-    np.testing.assert_array_equal(proposal.acceptance[:2], 1.0)
-    u, counts = proposal.draw(10_000, rng)
-    assert stats.kstest(u[: counts[0], 0], "norm").pvalue > 1e-4
-    weights = np.exp(proposal.log_weights(np.linspace(-10, 10, 500)[:, None]))
-    assert weights.max() <= 1 / 0.2

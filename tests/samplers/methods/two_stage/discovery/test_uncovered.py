@@ -25,7 +25,7 @@ def known(exact_region, rng):
     exploration = ExplorationResult([exact_region(PROBLEM, 0, BETA)], noisy=False)
     state = start_refinement(exploration, 0.0, SETTINGS, rng)
     empty = MultipleImportanceSample.empty(4)
-    proposal = build_proposal(state, empty, SETTINGS, rng)
+    proposal = build_proposal(state, empty, SETTINGS)
     # no draw of N(0, 1.5^2 I), which would be seen to reach the second half-space
     weights = np.where([one.kind == "wide" for one in proposal.candidates], 0.0, proposal.weights)
     proposal = MixtureProposal(proposal.candidates, weights / weights.sum())
@@ -60,7 +60,7 @@ def test_chains_from_them_give_their_region_components(known, rng, drive):
     assert {one.region for one in (*covered.explored, *covered.linear)} == {0, 1}
     assert len(covered.gaussians) == len(covered.explored)
     before = typical_weights(covered, proposal)
-    after = typical_weights(covered, build_proposal(covered, history, SETTINGS, rng))
+    after = typical_weights(covered, build_proposal(covered, history, SETTINGS))
     assert before[1] > 10 * after[1]
     assert len(state.regions) == 1  # as it was
 
