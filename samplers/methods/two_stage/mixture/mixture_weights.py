@@ -82,17 +82,19 @@ def raise_to_floors(a: FloatArray, floors: Sequence[Floor]) -> FloatArray:
         >>> raise_to_floors(np.array([0.0, 0.0, 0.4, 0.6]), [floor]).round(2)
         array([0.1 , 0.1 , 0.32, 0.48])
     """
-    raised: list[Floor] = []
+    members = np.array([floor.members for floor in floors], dtype=np.float64).reshape(len(floors), len(a))
+    least, raised = np.array([floor.least for floor in floors]), np.zeros(len(floors), dtype=bool)
     while True:
-        low = [f for f in floors if f not in raised and float(a[f.members].sum()) < f.least - 1e-12]
-        if not low:
+        low = ~raised & (members @ a < least - 1e-12)
+        if not low.any():
             return a
-        raised += low
-        others = ~np.any([f.members for f in raised], axis=0)
-        rest, total = float(a[others].sum()), sum(f.least for f in raised)
+        raised |= low
+        others = ~members[raised].any(axis=0)
+        rest, total = float(a[others].sum()), float(least[raised].sum())
         room = max(1 - total, 0.0) if rest > 0 else 0.0
         a = np.where(others, a * (room / rest if rest > 0 else 0.0), a)
-        for f in raised:
-            own = float(a[f.members].sum())
-            inside = a[f.members] / own if own > 0 else np.full(f.members.sum(), 1 / f.members.sum())
-            a[f.members] = inside * (f.least if room > 0 else f.least / total)
+        for k in np.flatnonzero(raised):
+            inside = floors[k].members
+            own = float(a[inside].sum())
+            shares = a[inside] / own if own > 0 else np.full(inside.sum(), 1 / inside.sum())
+            a[inside] = shares * (least[k] if room > 0 else least[k] / total)
