@@ -112,14 +112,17 @@ def main(
     seeds: int = 40,
     first_seed: int = 0,
     env: Annotated[str, typer.Option(help="Only environments whose id contains this.")] = "",
+    method: Annotated[str, typer.Option(help="Only these methods, with commas; other rows of the result stay.")] = "",
     out: Annotated[Path, typer.Option(help="Where the result goes.")] = COMPARISON_RESULT,
 ) -> None:
     """Compare every method with the truth and write the result."""
-    cells = []
+    chosen = method.split(",") if method else list(samplers.METHODS)
+    kept = json.loads(out.read_text())["cells"] if method and out.exists() else []
+    cells = {(cell["env_id"], cell["base"], cell["method"]): cell for cell in kept}
     for row in json.loads(TRUTH_RESULT.read_text())["results"]:
-        for method in samplers.METHODS if env in row["env_id"] else ():
-            cells.append(compare_with_truth(row, method, range(first_seed, first_seed + seeds)))
-            cell = cells[-1]
+        for name in chosen if env in row["env_id"] else ():
+            cell = compare_with_truth(row, name, range(first_seed, first_seed + seeds))
+            cells[cell.env_id, cell.base, cell.method] = asdict(cell)
             print(
                 f"{cell.env_id:25s} {cell.base:8s} {cell.method:9s} mean/p {cell.mean / cell.truth:.3f} "
                 f"z {cell.z:+.2f} "
@@ -128,7 +131,7 @@ def main(
                 flush=True,
             )
     command = f"python -m benchmarks.estimators.against_truth --seeds {seeds} --first-seed {first_seed}"
-    out.write_text(json.dumps({"command": command, "cells": [asdict(cell) for cell in cells]}, indent=2) + "\n")
+    out.write_text(json.dumps({"command": command, "cells": list(cells.values())}, indent=2) + "\n")
 
 
 if __name__ == "__main__":
