@@ -93,8 +93,7 @@ def raise_to_floors(a: FloatArray, floors: Sequence[Floor]) -> FloatArray:
         rest, total = float(a[others].sum()), float(least[raised].sum())
         room = max(1 - total, 0.0) if rest > 0 else 0.0
         a = np.where(others, a * (room / rest if rest > 0 else 0.0), a)
-        for k in np.flatnonzero(raised):
-            inside = floors[k].members
-            own = float(a[inside].sum())
-            shares = a[inside] / own if own > 0 else np.full(inside.sum(), 1 / inside.sum())
-            a[inside] = shares * (least[k] if room > 0 else least[k] / total)
+        for floor in (floor for floor, is_raised in zip(floors, raised, strict=True) if is_raised):
+            own = float(a[floor.members].sum())
+            inside = a[floor.members] / own if own > 0 else np.full(floor.members.sum(), 1 / floor.members.sum())
+            a[floor.members] = inside * (floor.least if room > 0 else floor.least / total)
