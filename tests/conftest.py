@@ -1,7 +1,10 @@
 """Fixtures of all tests."""
 
 import os
+import signal
 import tempfile
 
 os.environ["XDG_STATE_HOME"] = tempfile.mkdtemp()  # notes of runs that tests make
 os.umask(0o022)  # a .zip to which everybody may write is refused
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # as a shell has it in the background; tests send it
+    signal.signal(signal.SIGINT, signal.default_int_handler)
