@@ -72,8 +72,7 @@ class LawSettings:
     tempered_variance: float = 1.5
     """... with mean and variance times these. What adds to the variance fills the slab. A mean times 0.85 has 1.1
     times the E[w^2] of the stored runs' collisions; 0.7 has 0.9 times it, but a heavy draw in one of ten series systems
-    of half-spaces. With a variance times 1.7, and `mean_ess` 40, E[w^2] of `lidar_ttc` is 1.07 times as large, and that
-    of collisions the same."""
+    of half-spaces."""
     end_share: float = 0.12
     """Share of Gaussians around the ends of the walks: a mode that no draw has met yet stays in reach ..."""
     end_mean: float = 0.9
@@ -128,9 +127,7 @@ class RoundSettings:
     points: one heavy draw would give its term most of the next round. E[w^2] of the IDM ego's collisions over chains
     of failures is 0.89 times that of untempered weights, of `lidar_ttc` and with `imitation` the same."""
     share_prior: float = 100.0
-    """Failures, as an effective number, with which the best shares for them and those by the terms count alike. Over
-    six stored runs of a case E[w^2] is 0.85 (`lidar_ttc`, IDM), 0.88 (`imitation`) and 1.06 (collisions) times that of
-    shares by the terms; with 30 it is 0.84, 0.88 and 1.19, with 300 0.89, 0.91 and 1.02."""
+    """Failures, as an effective number, with which the best shares for them and those by the terms count alike."""
     min_term_share: float = 0.14
     """Least share of a term, since one heavy draw of another would leave it next to nothing; less where there are more
     than five. With 0.17 two terms with 0.5 % of p took a third of the draws."""
