@@ -9,7 +9,7 @@ also where the subspaces of the terms differ.
 """
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -52,15 +52,6 @@ class TermLaw:
         weights = np.concatenate([group.share * group.weights for group in self.groups])
         return mixture_log_ratio(log_ratios(components, z), weights)
 
-    def group_log_ratios(self, u: FloatArray) -> FloatArray:
-        """Return log(q / phi) of each group alone at u (n, d), shape (len(groups), n)."""
-        z = u @ self.axes
-        return np.array([mixture_log_ratio(log_ratios(group.components, z), group.weights) for group in self.groups])
-
-    def with_shares(self, shares: FloatArray) -> "TermLaw":
-        """Return the proposal with other shares of its groups, shape (len(groups),), adding up to 1."""
-        return TermLaw(self.axes, tuple(replace(g, share=float(s)) for g, s in zip(self.groups, shares, strict=True)))
-
     def sample(self, group: int, n: int, rng: np.random.Generator) -> FloatArray:
         """Draw n points of one group, shape (n, d)."""
         xi = rng.standard_normal((n, len(self.axes)))
@@ -95,18 +86,6 @@ class TermProposal:
             for group in law.groups
         ]
         return np.array([self.base_share, *groups])
-
-    def stratum_log_ratios(self, u: FloatArray) -> FloatArray:
-        """Return log(q / phi) of the base and of every group alone at u (n, d), shape (k, n)."""
-        return np.concatenate([np.zeros((1, len(u))), *(law.group_log_ratios(u) for law in self.laws)])
-
-    def with_stratum_shares(self, shares: FloatArray) -> "TermProposal":
-        """Return the mixture with other shares of the base and of every group, shape (k,), positive, adding up to 1."""
-        ends = np.cumsum([1, *(len(law.groups) for law in self.laws)])[:-1]
-        base, *own = np.split(shares, ends)
-        totals = np.array([part.sum() for part in own])
-        laws = tuple(law.with_shares(part / part.sum()) for law, part in zip(self.laws, own, strict=True))
-        return TermProposal(self.dim, float(base[0]), laws, totals / totals.sum())
 
     def draw(self, n: int, rng: np.random.Generator) -> tuple[FloatArray, NDArray[np.int64]]:
         """Draw n points, a fixed number from each stratum; return them (n, d) and their strata (n,)."""

@@ -7,7 +7,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
-from samplers.methods.two_stage.mixture.mixture_weights import Floor, minimise_second_moment
 from samplers.methods.two_stage.simulator import SimulationSteps
 from samplers.methods.two_stage.terms.fitting import (
     PursuedTerm,
@@ -24,7 +23,7 @@ from samplers.methods.two_stage.terms.settings import LawSettings, RoundSettings
 from samplers.methods.two_stage.terms.space import TermSimulator
 from samplers.methods.two_stage.terms.walks import Directions, Walks, describe_half_spaces
 from samplers.problem import FloatArray
-from samplers.statistics.weights import effective_sample_size, normalise_weights
+from samplers.statistics.weights import normalise_weights
 
 
 def pursue_walked(walks: Walks, history: TermHistory, settings: TermSettings) -> list[PursuedTerm]:
@@ -70,12 +69,11 @@ def mix_terms(
     """Return the mixture over the terms.
 
     With all of them at the threshold pi_j is proportional to sqrt(sum_j W^2), the sum over failures that the term is
-    the least of, with tempered weights, and at least `min_term_share`; then all shares, also those within a term,
-    follow the failures (`_follow_failures`). Until then terms that are not at the threshold come first. In the `final`
-    rounds a term that has not been reached waits no longer.
+    the least of, with tempered weights, and at least `min_term_share`; until then those that are not come first. In
+    the `final` rounds a term that has not been reached waits no longer.
     """
-    k, at_threshold = len(pursued), final or all(one.ready for one in pursued)
-    if at_threshold:
+    k = len(pursued)
+    if final or all(one.ready for one in pursued):
         failing = history.failing(gamma)
         w, least = temper_weights(history.log_weights[failing], s.share_ess), history.terms.least[failing]
         size = np.array([np.sqrt((w[least == one.number] ** 2).sum()) for one in pursued])
@@ -83,26 +81,7 @@ def mix_terms(
         shares = np.maximum(shares, min(s.min_term_share, 0.7 / k))
     else:
         shares = np.array([s.waiting_share if one.ready else 1.0 for one in pursued])
-    laws = tuple(one.law for one in pursued)
-    proposal = TermProposal(history.u.shape[1], s.base_share, laws, shares / shares.sum())
-    return _follow_failures(proposal, history, gamma, s) if at_threshold else proposal
-
-
-def _follow_failures(proposal: TermProposal, history: TermHistory, gamma: float, s: RoundSettings) -> TermProposal:
-    """Return the mixture with shares between its own and those that minimise the second moment over all failures.
-
-    With failures worth n points the best shares for them count n / (n + `share_prior`).
-    """
-    failing = history.failing(gamma)
-    if not failing.any():
-        return proposal
-    own, log_weights = proposal.stratum_shares, history.log_weights[failing]
-    log_r, base = proposal.stratum_log_ratios(history.u[failing]), np.arange(len(own)) == 0
-    with np.errstate(divide="ignore"):
-        tempered = np.log(temper_weights(log_weights, s.share_ess))
-    best = minimise_second_moment(log_r, tempered, own, [Floor(base, s.base_share)])
-    known = effective_sample_size(log_weights) / (effective_sample_size(log_weights) + s.share_prior)
-    return proposal.with_stratum_shares(known * best + (1 - known) * own)
+    return TermProposal(history.u.shape[1], s.base_share, tuple(one.law for one in pursued), shares / shares.sum())
 
 
 def refit_terms(

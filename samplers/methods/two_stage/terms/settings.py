@@ -69,7 +69,7 @@ class LawSettings:
     """Share of them nearer to the origin and wider, which bounds weights where they are too narrow or, being fitted to
     draws of proposals that lie beyond the likely failures, too far out ..."""
     tempered_mean: float = 0.75
-    tempered_variance: float = 1.5
+    tempered_variance: float = 1.7
     """... with mean and variance times these. What adds to the variance fills the slab. A mean times 0.85 has 1.1
     times the E[w^2] of the stored runs' collisions; 0.7 has 0.9 times it, but a heavy draw in one of ten series systems
     of half-spaces."""
@@ -101,7 +101,7 @@ class LawSettings:
     """Gaussians of a term at most."""
     shape_ess: float = 160.0
     """Weights are raised to a power below 1 until they are worth this many points, for the covariances ..."""
-    mean_ess: float = 20.0
+    mean_ess: float = 40.0
     """... and this many for the means: a fit to fewer is noise. Collisions lie in a slab (not too far ahead nor
     behind): with 40 for both its width is shrunk to twice what it is, and E[w^2] 1.1 times as large."""
 
@@ -126,8 +126,6 @@ class RoundSettings:
     """Weights that the shares of the terms follow are raised to a power below 1 until failures are worth this many
     points: one heavy draw would give its term most of the next round. E[w^2] of the IDM ego's collisions over chains
     of failures is 0.89 times that of untempered weights, of `lidar_ttc` and with `imitation` the same."""
-    share_prior: float = 100.0
-    """Failures, as an effective number, with which the best shares for them and those by the terms count alike."""
     min_term_share: float = 0.14
     """Least share of a term, since one heavy draw of another would leave it next to nothing; less where there are more
     than five. With 0.17 two terms with 0.5 % of p took a third of the draws."""

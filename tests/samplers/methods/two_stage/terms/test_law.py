@@ -61,13 +61,3 @@ def test_draws_of_each_stratum_are_its_own(rng):
         assert abs(mine.mean() - mean) < 5 * mine.std() / np.sqrt(len(mine))
     along = u[strata == 3][:, [0, 3]].sum(axis=1) * np.sqrt(0.5)
     assert abs(along.mean() - 2.5) < 5 * np.sqrt(0.5 / len(along))
-
-
-def test_strata_mix_to_the_proposal_and_take_other_shares(rng):
-    proposal, u = make_proposal(), 2 * rng.standard_normal((50, 6))
-    log_r, shares = proposal.stratum_log_ratios(u), proposal.stratum_shares
-    np.testing.assert_allclose(logsumexp(log_r + np.log(shares)[:, None], axis=0), proposal.log_ratio(u), rtol=1e-9)
-    wanted = np.array([0.2, 0.1, 0.4, 0.3])
-    moved = proposal.with_stratum_shares(wanted)
-    np.testing.assert_allclose(moved.stratum_shares, wanted)
-    np.testing.assert_allclose(logsumexp(log_r + np.log(wanted)[:, None], axis=0), moved.log_ratio(u), rtol=1e-9)

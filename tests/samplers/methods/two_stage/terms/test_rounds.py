@@ -7,8 +7,6 @@ from samplers.methods.two_stage.terms.settings import DEFAULT_TERM_SETTINGS, Rou
 from samplers.methods.two_stage.terms.walks import Directions, Walks
 
 SETTINGS = DEFAULT_TERM_SETTINGS
-BY_TERMS = RoundSettings(share_prior=np.inf)
-"""Shares by the terms alone, however many failures are known."""
 
 
 def walked(normals, distances):
@@ -52,36 +50,15 @@ def test_shares_of_ready_terms_follow_their_weights(half_spaces, rng, answer, si
     pursued = pursue_walked(start, history, SETTINGS)
     first = mix_terms(pursued, history, 0.0, RoundSettings())
     np.testing.assert_allclose(first.shares, 1 / 3)  # none is ready: all alike
-    final = mix_terms(pursued, history, 0.0, BY_TERMS, final=True).shares
+    final = mix_terms(pursued, history, 0.0, RoundSettings(), final=True).shares
     pursued = answer(refit_terms(simulator_of(problem), history, pursued, 0.0, 10**6, rng, SETTINGS), problem)
     assert all(one.ready for one in pursued)
     failing = history.terms.f <= 0
     parts = np.sqrt([(failing & (history.terms.least == j)).sum() for j in range(3)])
-    shares = mix_terms(pursued, history, 0.0, BY_TERMS).shares
+    shares = mix_terms(pursued, history, 0.0, RoundSettings()).shares
     wanted = np.maximum(parts / parts.sum(), RoundSettings().min_term_share)
     np.testing.assert_allclose(shares, wanted / wanted.sum(), rtol=1e-9)
     np.testing.assert_allclose(final, shares)  # nobody waits for a term that was not reached
-
-
-def test_shares_follow_the_failures_as_far_as_these_are_known(half_spaces, rng, answer, simulator_of):
-    """The second moment over failures of other base draws falls; with a prior worth far more failures it stays."""
-    problem, _, normals = half_spaces(20, 0.05, shares=(0.6, 0.3, 0.1))
-    history = base_history(problem, rng, 20_000)
-    pursued = pursue_walked(walked(normals, [1.7, 1.9, 2.3]), history, SETTINGS)
-    pursued = answer(refit_terms(simulator_of(problem), history, pursued, 0.0, 10**6, rng, SETTINGS), problem)
-    own, moved, best = (
-        mix_terms(pursued, history, 0.0, RoundSettings(share_prior=n)) for n in (np.inf, RoundSettings.share_prior, 0.0)
-    )
-    u = rng.standard_normal((40_000, 20))
-    u = u[problem.terms(u).f <= 0]
-    second = [np.exp(-proposal.log_ratio(u)).mean() for proposal in (own, moved, best)]
-    assert second[0] > second[1] > second[2]
-    for proposal in (moved, best):
-        assert proposal.stratum_shares.sum() == pytest.approx(1.0)
-        assert proposal.base_share >= RoundSettings.base_share - 1e-9
-    middle = 0.5 * (own.stratum_shares + best.stratum_shares)
-    few = RoundSettings(share_prior=float(history.failing(0.0).sum()))  # base draws: each is worth one failure
-    np.testing.assert_allclose(mix_terms(pursued, history, 0.0, few).stratum_shares, middle)
 
 
 def test_one_heavy_failure_does_not_give_its_term_the_next_round(half_spaces, rng):
@@ -93,9 +70,9 @@ def test_one_heavy_failure_does_not_give_its_term_the_next_round(half_spaces, rn
     log_density[mine] -= np.log(history.failing(0.0).sum())
     heavy = TermHistory(history.u, history.terms, log_density, (), history.n_base)
     pursued = pursue_walked(walked(normals, [1.0, 1.0]), heavy, SETTINGS)
-    shares = mix_terms(pursued, heavy, 0.0, BY_TERMS, final=True).shares
+    shares = mix_terms(pursued, heavy, 0.0, RoundSettings(), final=True).shares
     assert shares[0] < 0.75
-    plain = mix_terms(pursued, heavy, 0.0, RoundSettings(share_ess=1.0, share_prior=np.inf), final=True).shares
+    plain = mix_terms(pursued, heavy, 0.0, RoundSettings(share_ess=1.0), final=True).shares
     assert plain[0] > 0.8
 
 
