@@ -40,7 +40,8 @@ def test_kinds_of_crash_are_never_in_one_mode() -> None:
 class Plane:
     """Two parameters in standard normal space: what `find_modes` needs of a space."""
 
-    names, sizes, units = ("a", "b"), (1, 1), ("m", "")
+    names = column_names = ("a", "b")
+    sizes, units = (1, 1), ("m", "")
 
     def to_standard_normal(self, x: FloatArray) -> FloatArray:
         return x

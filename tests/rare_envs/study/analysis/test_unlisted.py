@@ -17,7 +17,8 @@ from samplers.problem import FloatArray
 class Plane:
     """Two parameters in standard normal space: what is needed of a space."""
 
-    names, sizes, units = ("a", "b"), (1, 1), ("m", "")
+    names = column_names = ("a", "b")
+    sizes, units = (1, 1), ("m", "")
 
     def to_standard_normal(self, x: FloatArray) -> FloatArray:
         return x

@@ -293,7 +293,9 @@ def test_actions_of_other_bounds_are_told_once(broken: str) -> None:
     assert told.status == "warn" and "--action" not in told.advice
 
 
-def test_a_zip_of_ones_own_is_no_warning(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_zip_of_ones_own_is_no_warning(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("ego.zip").touch()
     monkeypatch.setattr("rare_envs.study.ego_check.subprocess_check._check_in_subprocess", lambda _: iter(()))
     (origin,) = check_ego(EgoCheckRequest("ego.zip", ENV))
     assert (origin.check, origin.status) == ("origin", "pass")

@@ -36,7 +36,6 @@ def final(failing=400, n=1000, p=1e-3, expected=0.0, cov=0.05):
         np.array([float(n)]),
         np.array([total]),
         np.array([squares]),
-        0.0,
         np.atleast_1d(np.asarray(expected, dtype=float)),
         np.empty((0, 1)),
     )
