@@ -1,6 +1,6 @@
 """How fast is it? Ratios within one run on one core against HighwayEnv's objects doing the same.
 
-    python -m benchmarks.simulation.throughput [--out result.json]
+    python -m benchmarks.simulation.throughput [--out build/throughput.json]
 
 Rates are work divided by process time, the two sides of a ratio in turn. Floors are ratios too, so that they hold on a
 slow machine as on a fast one; exits with 1 if one is missed.
@@ -8,6 +8,8 @@ slow machine as on a fast one; exits with 1 if one is missed.
 
 import json
 import resource
+import shutil
+import subprocess
 import time
 from collections.abc import Mapping
 from pathlib import Path
@@ -27,6 +29,8 @@ from rare_envs.simulation.rollout import rollout
 from rare_envs.threads import use_one_thread
 from samplers.benchmark.runs import about
 
+OUT = Path("build/throughput.json")
+"""Where the result goes by default."""
 CAR_FOLLOWING, CUT_IN, HIGHWAY = (f"rare_envs/{name}-v0" for name in ("CarFollowing", "CutIn", "Highway"))
 HORIZON = 20.0
 """Episodes of 200 ticks, as in the published baselines."""
@@ -325,7 +329,7 @@ def _compare_rates(ours: list[float], theirs: list[float]) -> dict[str, float]:
 @use_one_thread()
 def main(
     rounds: int = 5,
-    out: Annotated[Path | None, typer.Option(help="Write the result here as JSON.")] = None,
+    out: Annotated[Path, typer.Option(help="Write the result here as JSON.")] = OUT,
     with_memory: Annotated[bool, typer.Option(help="Also run a million rollouts.")] = True,
     only_highway: Annotated[bool, typer.Option(help="Leave the other scenarios out.")] = False,
     only_camera: Annotated[bool, typer.Option(help="The camera on the highway alone.")] = False,
@@ -363,11 +367,20 @@ def main(
         if with_memory:
             results["memory"] = memory()
     missed = [name for name, row in results.items() if not judge(name, row)]
-    if out is not None:
-        out.write_text(json.dumps({"machine": {**about(), "rates": machine}, "results": results}, indent=2) + "\n")
+    out.parent.mkdir(parents=True, exist_ok=True)
+    out.write_text(json.dumps({"machine": describe_run(machine), "results": results}, indent=2) + "\n")
+    print(f"Wrote {out}")
     if missed:
         print(f"Missed: {', '.join(missed)}")
         raise typer.Exit(1)
+
+
+def describe_run(rates: Mapping[str, float]) -> dict[str, Any]:
+    """Return the machine with its rates of arithmetic, the versions and the commit; an empty one outside a checkout."""
+    command = ["git", "-C", str(Path(__file__).parent), "describe", "--always", "--dirty", "--exclude", "*"]
+    has_git = shutil.which("git") is not None
+    commit = subprocess.run(command, capture_output=True, text=True, check=False).stdout.strip() if has_git else ""
+    return {**about(torch=torch.__version__, rare_envs=rare_envs.__version__, commit=commit), "rates": dict(rates)}
 
 
 def judge(name: str, row: dict[str, float]) -> bool:

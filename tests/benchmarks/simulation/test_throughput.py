@@ -44,3 +44,10 @@ def test_a_rate_stands_beside_what_the_core_allows(capsys):
     row = throughput.stand_by_bound({"per_second": 0.184 * bound, "ratio": 30.0}, bound)
     assert throughput.judge("env_step", row)
     assert "18 % of this core's bound" in capsys.readouterr().out
+
+
+def test_a_record_says_what_was_measured_where():
+    described = throughput.describe_run({"simple": 1e10})
+    assert described["rates"] == {"simple": 1e10}
+    assert {"processor", "python", "torch", "rare_envs"} <= {name for name, value in described.items() if value}
+    assert described["commit"] == "" or len(described["commit"].removesuffix("-dirty")) >= 7
