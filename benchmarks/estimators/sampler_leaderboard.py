@@ -72,8 +72,8 @@ LEFT_OUT = """\
 Not run, for want of time: `surrogate`, which takes seconds a run (`auto` chooses it up to 500 simulations, so that it
 has no row at 300), `openturns-nais` with 1,500 simulations, and what the commands leave out of 6,000: the sets
 `highdim` and `driving`, `openturns-ce` and `openturns-nais`, which go on to 50 times their budget, `openturns-form`,
-whose cost is not the budget's, and `auto`, which is `two-stage` there. Rows of `two-stage` with 1,500 and 6,000
-simulations are of the code before the pieces of f (the lines below name the code of each)."""
+whose cost is not the budget's, and `auto`, which is `two-stage` there. The lines below name the code of
+each row."""
 HEAD = """\
 # Leaderboard of samplers
 
