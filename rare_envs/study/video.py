@@ -19,7 +19,7 @@ from rare_envs.problem import DrivingProblem
 from rare_envs.study.analysis.moved_files import warn_of_changed_files
 from rare_envs.study.analysis.recorded_question import open_question
 from rare_envs.study.columns import MAX_SHOWN, format_value
-from rare_envs.study.errors import BadInput, as_bad_input
+from rare_envs.study.errors import BadInput, as_bad_input, output_file
 from rare_envs.study.journal import refuse_unfinished
 from rare_envs.study.question import prepare
 from rare_envs.study.replay import Drive
@@ -203,26 +203,24 @@ def check_film_path(path: Path | str) -> None:
     """Refuse a name whose pictures cannot be written.
 
     Raises:
-        BadInput: It ends neither in .gif nor in .png, or its folder does not exist.
+        BadInput: It ends neither in .gif nor in .png.
     """
     path = Path(path)
     if path.suffix.lower() not in (".gif", ".png"):
         raise BadInput(f"Expected a file that ends in .gif (the drive) or .png (its worst moment), got {str(path)!r}.")
-    if not path.parent.is_dir():
-        raise BadInput(f"There is no folder {str(path.parent)!r}.")
 
 
 def write_film(path: Path | str, drive: Drive, width: int = FRAME_WIDTH, every: int = 1) -> None:
     """Write a drive as a moving picture (.gif), or its worst moment (.png).
 
     Args:
-        path: The file.
+        path: The file; its folder is made if there is none.
         drive: What to show.
         width: Of the pictures [pixels].
         every: Show one tick out of so many.
 
     Raises:
-        BadInput: See `check_film_path`.
+        BadInput: See `check_film_path`, or the folder cannot be made or written to.
 
     Example:
         >>> from tempfile import TemporaryDirectory
@@ -238,12 +236,12 @@ def write_film(path: Path | str, drive: Drive, width: int = FRAME_WIDTH, every: 
     path = Path(path)
     shown = draw_frames(drive)
     shown = [each.resize((width, round(each.height * width / FRAME_WIDTH)), Image.Resampling.LANCZOS) for each in shown]
-    if path.suffix.lower() == ".png":
-        with replace_file(path) as draft:
+    with output_file(path), replace_file(path) as draft:
+        if path.suffix.lower() == ".png":
             shown[drive.worst].save(draft)
-        return
-    with replace_file(path) as draft, draft.open("wb") as file:
-        save_gif(file, shown, drive.problem.world.clock.dt, every)
+            return
+        with draft.open("wb") as file:
+            save_gif(file, shown, drive.problem.world.clock.dt, every)
 
 
 def _make_gif_palette() -> Image.Image:

@@ -80,7 +80,8 @@ def export_drive(
 
     Args:
         drive: The drive.
-        path: The file: `.xosc`, beside which the road is written as `.xodr`, or `.xml` for CommonRoad.
+        path: The file: `.xosc`, beside which the road is written as `.xodr`, or `.xml` for CommonRoad. Its folder is
+            made if there is none.
         format: One of `EXPORT_FORMATS`.
         ego: "recorded", the ego follows its trajectory as the others do; or "free", it is put to its place with its
             speed, and whoever simulates drives it. None for "free" with CARLA and "recorded" otherwise.
@@ -108,6 +109,7 @@ def export_drive(
     along = drive.position[..., 0]
     start, end = float(np.floor(along.min() - _MARGIN)), float(np.ceil(along.max() + _MARGIN))
     title = f"{drive.problem.env_id}, f = {drive.f:.4g}"
+    path.parent.mkdir(parents=True, exist_ok=True)
     if format == "commonroad":
         write_commonroad(path, trajectories, road, (start, end), title, free)
         return (path,)
@@ -123,7 +125,7 @@ def check_export(path: Path | str, format: str, ego: str | None) -> bool:
     """Return whether the ego is left free.
 
     Raises:
-        ValueError: There is no such format or folder, the name has another ending, or the ego cannot be so.
+        ValueError: There is no such format, the name has another ending, or the ego cannot be so.
     """
     if format not in EXPORT_FORMATS:
         raise ValueError(
@@ -134,8 +136,6 @@ def check_export(path: Path | str, format: str, ego: str | None) -> bool:
         others = [name for name, ending in _ENDINGS.items() if ending == path.suffix.lower()]
         hint = f"; --format {others[0]} writes such a file" if others else ""
         raise ValueError(f"Expected a file that ends in {_ENDINGS[format]} for {format}, got {str(path)!r}{hint}.")
-    if not path.parent.is_dir():
-        raise ValueError(f"There is no folder {str(path.parent)!r}.")
     if ego not in ("recorded", "free", None):
         raise ValueError(f"Expected an ego recorded or free, got {ego!r}.")
     if format == "carla" and ego == "recorded":

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -18,7 +19,7 @@ from rare_envs.study.cli.options import (
     TrustOption,
 )
 from rare_envs.study.cli.shell import keep_stdout_for_the_answer, print_json
-from rare_envs.study.errors import BadInput
+from rare_envs.study.errors import BadInput, output_file
 from rare_envs.threads import use_one_thread
 
 if TYPE_CHECKING:
@@ -70,10 +71,8 @@ def corpus_run_command(
     from rare_envs.study.corpus.storage import read_corpus
     from rare_envs.study.corpus.trial import EgoChoice, try_ego
 
-    if junit is not None and not junit.parent.is_dir():
-        raise BadInput(f"There is no folder {str(junit.parent)!r}.")
     choice = EgoChoice(ego=ego, algo=algo, stats=stats, observation=observation, action=action)
-    with keep_stdout_for_the_answer():
+    with keep_stdout_for_the_answer(), contextlib.nullcontext() if junit is None else output_file(junit):
         trials, seconds = try_ego(read_corpus(corpus), choice, corpus, trust)
         if junit is not None:
             try:

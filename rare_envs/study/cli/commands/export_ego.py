@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -10,7 +9,7 @@ import typer
 
 from rare_envs.study.cli.options import AlgoOption, JsonOption, StatsOption, TrustOption
 from rare_envs.study.cli.shell import keep_stdout_for_the_answer, print_json
-from rare_envs.study.errors import BadInput
+from rare_envs.study.errors import BadInput, as_bad_input, output_file
 
 
 def export_ego_command(
@@ -57,16 +56,12 @@ def export_ego(
         )
     if out.suffix != ".onnx":
         raise BadInput(f"Expected a file that ends in .onnx, got {str(out)!r}.")
-    if not out.parent.is_dir() or not os.access(out.parent, os.W_OK):
-        raise BadInput(f"Cannot write to the folder {str(out.parent)!r}.")
-    try:
+    with output_file(out), as_bad_input(ValueError, OSError):
         from agents.onnx.export import ACTION_TOLERANCE, export_onnx
         from agents.sb3.saved_ego import load_saved_ego
 
         ego = load_saved_ego(model, algo, trust, stats)
         exported = export_onnx(ego, out)
-    except (ValueError, OSError) as error:
-        raise BadInput(error) from error
     return {
         "model": str(model),
         "algorithm": ego.algorithm,

@@ -10,7 +10,7 @@ import typer
 from rare_envs.study.cli.completion import complete_words
 from rare_envs.study.cli.options import JsonOption, TrustOption
 from rare_envs.study.cli.shell import keep_stdout_for_the_answer, print_json
-from rare_envs.study.errors import BadInput, as_bad_input
+from rare_envs.study.errors import BadInput, as_bad_input, output_file
 from rare_envs.threads import use_one_thread
 
 
@@ -43,11 +43,12 @@ def export_command(
 
     with keep_stdout_for_the_answer(), as_bad_input(ValueError):
         check_export(out, format, ego)
-        recorded = find_failure(run, failure, trust)
-        try:
-            files = export_scenario(recorded.problem, recorded.x, out, format, ego)  # type: ignore[arg-type]  # checked
-        except OSError as error:
-            raise BadInput(f"Cannot write {str(out)!r}: {error.strerror or error}.") from error
+        with output_file(out):
+            recorded = find_failure(run, failure, trust)
+            try:
+                files = export_scenario(recorded.problem, recorded.x, out, format, ego)  # type: ignore[arg-type]
+            except OSError as error:
+                raise BadInput(f"Cannot write {str(out)!r}: {error.strerror or error}.") from error
     names = [str(path) for path in files]
     if as_json:
         print_json({"failure": failure, "failures": recorded.n_listed, "format": format, "files": names})

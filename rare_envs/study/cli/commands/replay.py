@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from pathlib import Path
 from typing import Annotated
 
@@ -11,7 +12,7 @@ from rare_envs.study.cli.commands.corpus import replay_all
 from rare_envs.study.cli.completion import EGO_WORDS, complete_words
 from rare_envs.study.cli.options import JsonOption, TrustOption
 from rare_envs.study.cli.shell import DOUBTFUL, is_typed, keep_stdout_for_the_answer, print_json
-from rare_envs.study.errors import BadInput
+from rare_envs.study.errors import BadInput, output_file
 from rare_envs.threads import use_one_thread
 
 
@@ -47,7 +48,7 @@ def replay_command(
         replay_all(run, ego, trust, as_json)
     if out is not None:
         check_film_path(out)
-    with keep_stdout_for_the_answer():
+    with keep_stdout_for_the_answer(), contextlib.nullcontext() if out is None else output_file(out):
         recorded = find_failure(run, failure, trust) if ego is None else find_for_ego(run, failure, ego, trust)
         drive = drive_again(recorded.problem, recorded.x)
         if out is not None:

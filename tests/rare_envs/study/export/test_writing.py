@@ -26,7 +26,6 @@ def problem() -> DrivingProblem:
         ("a.xosc", "opensenario", None, "did you mean 'openscenario'"),
         ("a.xml", "openscenario", None, r"ends in \.xosc for openscenario, got .*; --format commonroad writes"),
         ("a.xosc", "commonroad", None, r"ends in \.xml"),
-        ("nowhere/a.xml", "commonroad", None, "There is no folder"),
         ("a.xosc", "carla", "recorded", "the ego is free"),
         ("a.xosc", "openscenario", "away", "recorded or free"),
     ],
@@ -42,6 +41,13 @@ def test_x_is_checked(problem: DrivingProblem, tmp_path: Path) -> None:
     with pytest.raises(ValueError):
         export_scenario(problem, [20.0, np.nan, 10.0], tmp_path / "a.xml", "commonroad")
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_missing_folder_is_made(problem: DrivingProblem, tmp_path: Path) -> None:
+    (file,) = export_scenario(problem, X, tmp_path / "a" / "b" / "c.xml", "commonroad")
+    assert file.stat().st_size > 1000
+    with pytest.raises(OSError):
+        export_scenario(problem, X, file / "c.xml", "commonroad")
 
 
 def test_a_missing_library_is_named(problem: DrivingProblem, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

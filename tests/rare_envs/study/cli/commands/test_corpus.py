@@ -51,6 +51,6 @@ def test_refusals_are_one_line(cli: Cli, run: Path) -> None:
     assert_refused(cli("corpus", "run", "--ego", "idm"), "There is no corpus")
     cli("corpus", "add", "run")
     assert_refused(cli("corpus", "run", "--ego", "nowhere.zip"), "nowhere.zip")
-    assert_refused(cli("corpus", "run", "--ego", "idm", "--junit", "no/where.xml"), "no folder")
+    assert_refused(cli("corpus", "run", "--ego", "idm", "--junit", "run/result.json/a.xml"), "Cannot make the folder")
     Path("corpus", "stray.json").write_text("{}")
     assert_refused(cli("corpus", "run", "--ego", "idm"), "stray.json", "format")

@@ -72,7 +72,7 @@ def test_the_command_prints_the_report(cli: Cli, model: Path, tmp_path: Path) ->
         ("idm", "b.onnx", "Only policies saved by Stable-Baselines3, files that end in .zip, are exported; got 'idm'."),
         ("ego.onnx", "b.onnx", "files that end in .zip, are exported; got 'ego.onnx'."),
         ("ego.zip", "b.zip", "Expected a file that ends in .onnx, got 'b.zip'."),
-        ("ego.zip", "nowhere/b.onnx", "Cannot write to the folder 'nowhere'."),
+        ("ego.zip", "corrupt.zip/b.onnx", "Cannot make the folder 'corrupt.zip': there is a file of that name."),
         ("nowhere.zip", "b.onnx", "No ego at 'nowhere.zip'"),
         ("corrupt.zip", "b.onnx", "corrupt.zip"),
     ],

@@ -64,12 +64,20 @@ def test_bad_input_is_one_line(cli: Cli, run: Path) -> None:
         (["--failure", 100000], "Expected a failure from 0 to"),
         (["--failure", -1], "Expected a failure from 0 to"),
         (["--out", "clip.mp4"], "ends in .gif"),
-        (["--out", "no/such/clip.gif"], "no folder"),
+        (["--out", run / "result.json" / "clip.gif"], "there is a file of that name"),
     ):
         result = cli("replay", run, *words)
         assert result.exit_code == 2
         assert said in result.stderr
         assert len(result.stderr.strip().splitlines()) == 1
+
+
+def test_a_film_goes_into_a_new_folder(cli: Cli, run: Path, tmp_path: Path) -> None:
+    out = tmp_path / "films" / "new" / "worst.png"
+    assert cli("replay", run, "--failure", 100000, "--out", out).exit_code == 2
+    assert not (tmp_path / "films").exists()
+    assert cli("replay", run, "--out", out).exit_code == 0
+    assert out.stat().st_size > 1000
 
 
 def test_another_f_than_recorded_is_a_warning(cli: Cli, run: Path) -> None:
