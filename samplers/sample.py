@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -65,6 +65,12 @@ class DrawWeights:
     def of_equal_draws(cls, total: int, first: int, n: int) -> DrawWeights:
         """Return the weights of n of `total` plain draws."""
         return cls(first=first, log_weights=np.broadcast_to(-math.log(total), n))
+
+    def split(self, *parts: tuple[int, int]) -> tuple[DrawWeights, ...]:
+        """Return the weights in parts, each with what its run had spent before it, and its number of draws."""
+        ends = np.cumsum([n for _, n in parts])
+        pieces = np.split(self.log_weights, ends[:-1])
+        return tuple(replace(self, first=first, log_weights=w) for (first, _), w in zip(parts, pieces, strict=True))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -15,6 +15,7 @@ from samplers.importance.sampling import Space, simulate_until
 from samplers.method import Goal, Outcome, no_outcome_share
 from samplers.problem import FloatArray, Inputs
 from samplers.proposals.mixture import Mixture, ProposalDistribution, SupportsLogProb
+from samplers.sample import DrawWeights
 from samplers.statistics.intervals import binomial_cov
 from samplers.statistics.weights import effective_sample_size
 from samplers.trace import Level, Status
@@ -83,8 +84,9 @@ class FinalDraws(NamedTuple):
     """Draws from the base distribution among all simulations, see `Outcome.base_draws`."""
     stopped: bool
     """Whether the run was interrupted."""
-    from_search: bool
-    """Whether these are the draws of the search, as there are no others."""
+    n_first: int = 0
+    """Where there are none but those of the search: draws of its first round, which other rounds may follow before the
+    rest of these; otherwise 0."""
 
     @property
     def cov(self) -> float:
@@ -100,18 +102,30 @@ class FinalDraws(NamedTuple):
             warnings: About the search; those about the draws are added.
         """
         ended = status if len(self.draws.f) else Status.NO_HITS
+        from_search = self.n_first > 0
         early = ["Stopped before the final draws: the estimate rests on those of the search."]
         return Outcome(
             p=self.draws.p,
             interval=weighted_interval(self.draws, goal.confidence, self.largest_weight),
             cov=self.cov,
             status=Status.STOPPED if self.stopped else ended,
-            warnings=(*(early if self.from_search else warnings), *weight_warnings(self.draws)),
+            warnings=(*(early if from_search else warnings), *weight_warnings(self.draws)),
             trace=self.trace,
             no_outcome_share=no_outcome_share(self.draws.f, self.draws.log_weights),
             sample=self.draws.sample,
             base_draws=self.base_draws,
-            draw_weights=self.draws.weights_after(sum(level.n_sim for level in self.trace) - self.draws.n),
+            draw_weights=self._draw_weights,
+        )
+
+    @property
+    def _draw_weights(self) -> tuple[DrawWeights, ...]:
+        """Weight of every draw in p."""
+        spent = sum(level.n_sim for level in self.trace)
+        if not self.n_first:
+            return self.draws.weights_after(spent - self.draws.n)
+        rest = self.draws.n - self.n_first
+        return tuple(
+            part for each in self.draws.weights_after(0) for part in each.split((0, self.n_first), (spent - rest, rest))
         )
 
 
@@ -187,12 +201,13 @@ def draw_after_search(
     limit = 0 if search.status is Status.STOPPED else limit
     draws, trace, stopped = yield from simulate_until(inputs, sampler, goal, limit, batch, rng, space)
     largest, n_base = 1 / base_share, search.base_draws + int(base_share * draws.n)
-    from_search = draws.n == 0
-    if from_search:
+    n_first = 0
+    if draws.n == 0:
+        n_first = search.base_draws
         to_x = inputs.base.from_standard_normal if space is None else space.to_x
         draws, largest = pool_rounds(search.rounds, to_x, goal.gamma), search.largest_weight
     stopped = stopped or search.status is Status.STOPPED
-    return FinalDraws(draws, (*search.trace, *trace), largest, n_base, stopped, from_search)
+    return FinalDraws(draws, (*search.trace, *trace), largest, n_base, stopped, n_first)
 
 
 def search_warnings(search: Search, gamma: float) -> list[str]:

@@ -48,7 +48,7 @@ def of_simulations(method: str, replicates: int, gamma: float) -> tuple[samplers
 
 @pytest.mark.parametrize("gamma", [0.0, 1.5])
 @pytest.mark.parametrize("replicates", [1, 2])
-@pytest.mark.parametrize("method", ["mc", "is", "ce", "ice", "two-stage"])
+@pytest.mark.parametrize("method", ["mc", "is", "ce", "ice", "two-stage", "surrogate"])
 def test_weights_of_single_simulations_add_up_to_p(method: str, replicates: int, gamma: float) -> None:
     result, f = of_simulations(method, replicates, gamma)
     index = result.simulations
@@ -61,6 +61,21 @@ def test_weights_of_single_simulations_add_up_to_p(method: str, replicates: int,
     assert abs(weights.sum() - 1) <= 5 * weights.std() * len(weights) ** 0.5 + 1e-9
     counts = [np.sum((rows.run == level.run) & (rows.stage >= 0)) for level in result.trace]
     assert sum(level.n_sim for level in result.trace) == index.n and min(counts) > 0
+
+
+@pytest.mark.parametrize("after", [100, 700, 1500])
+@pytest.mark.parametrize("method", ["is", "ce", "ice", "two-stage", "surrogate"])
+def test_weights_of_a_run_that_is_stopped_add_up_to_p(method: str, after: int) -> None:
+    """p is that of the draws of the search then, of which cross-entropy keeps the first round and the last."""
+    problem = samplers.FunctionProblem(lambda x: 3.0 - np.abs(x[:, 0]), dim=4)
+    result = samplers.estimate(
+        problem, method, seed=1, max_sim=3000, keep_points=True, stop=lambda seen: seen.n_sim >= after
+    )
+    assert result.simulations is not None and result.points is not None
+    rows = result.simulations.describe(0, len(result.points.f))
+    known = ~np.isnan(rows.log_weight)
+    assert known.any()
+    assert np.exp(rows.log_weight[known & (result.points.f <= 0)]).sum() == pytest.approx(result.p, rel=1e-12)
 
 
 def test_stages_are_levels_and_parts_of_the_index_agree_with_the_whole() -> None:

@@ -76,7 +76,7 @@ class SurrogateRun:
         draws, trace, stopped = yield from simulate_until(self.inputs, base, self.goal, limit, batch, self.rng)
         if draws.n == 0:
             return self._estimate_early(Status.STOPPED if stopped else Status.BUDGET)
-        final = FinalDraws(draws, (*self.trace, *trace), 1.0, draws.n, stopped, from_search=False)
+        final = FinalDraws(draws, (*self.trace, *trace), 1.0, draws.n, stopped)
         return final.outcome(self.goal, Status.CONVERGED, ())
 
     def _simulate(self, u: FloatArray) -> Generator[FloatArray, FloatArray, None]:

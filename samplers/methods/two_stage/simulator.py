@@ -51,6 +51,8 @@ class ComponentDraws(NamedTuple):
     """Shape (n, d)."""
     f: FloatArray
     """Shape (n,)."""
+    first: int = 0
+    """Simulations that the run had spent before the first of them."""
 
 
 def extend_trace(

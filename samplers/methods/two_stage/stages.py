@@ -176,13 +176,12 @@ def draw_round(
     context: RunContext, state: RunState, refinement: RefinementState, proposal: MixtureProposal, n: int
 ) -> SimulationSteps[tuple[RunState, RefinementState]]:
     """Draw n points from a proposal and learn from them."""
-    first = context.simulator.n_sim
     state, batch = yield from _draw(context, state, proposal, n)
     gamma, settings = context.goal.gamma, context.settings
     if len(state.rounds) >= _first_counted(state, gamma, settings):
         inputs = context.simulator.inputs
         empty = StratifiedSample.empty(len(proposal.weights), inputs.dim, np.empty(0), settings.min_stratum_draws)
-        counted = CountedRound(empty.add(batch, proposal, inputs, gamma), first)
+        counted = CountedRound(empty.add(batch, proposal, inputs, gamma), batch.first)
         state = replace(state, counted=(*state.counted, counted))
     draws = Draws.from_outcomes(batch.f, proposal.log_weights(batch.u), batch.u, gamma)
     history = state.history.add(batch, gamma)
@@ -334,7 +333,9 @@ def estimate_early(context: RunContext, state: RunState) -> Outcome:
     largest_weight = draws.n / max(len(state.base_f), 1)
     interval = weighted_interval(draws, context.goal.confidence, largest_weight, draws.cov)
     outcome = _outcome(context, state, draws, draws.cov, interval)
-    return replace(outcome, sample=draws.sample, status=Status.STOPPED)
+    parts = [(batch.first, len(batch.f)) for batch in state.history.batches]
+    weights = tuple(part for each in draws.weights_after(0) for part in each.split(*parts))
+    return replace(outcome, sample=draws.sample, draw_weights=weights, status=Status.STOPPED)
 
 
 def run_monte_carlo(context: RunContext, state: RunState, *, counted: bool = True) -> Steps:
@@ -382,8 +383,9 @@ def _draw(
 ) -> SimulationSteps[tuple[RunState, ComponentDraws]]:
     """Make n draws of a proposal; those from its first component, the base distribution, are counted."""
     u, counts = proposal.draw(n, context.rng)
+    first = context.simulator.n_sim
     f = yield from context.simulator.evaluate(u)
-    batch = ComponentDraws(proposal.components, counts, u, f)
+    batch = ComponentDraws(proposal.components, counts, u, f, first)
     return replace(state, base_draws=state.base_draws + int(counts[0])), batch
 
 

@@ -93,7 +93,7 @@ def test_a_stopped_search_is_its_own_estimate(drive, rng):
     with pytest.raises(StopIteration) as ended:
         next(steps)
     final = ended.value.value
-    assert (final.from_search, final.stopped, final.largest_weight, final.base_draws) == (True, True, 2.0, 500)
+    assert (final.n_first, final.stopped, final.largest_weight, final.base_draws) == (500, True, 2.0, 500)
     outcome = final.outcome(Goal(gamma=0.0), Status.CONVERGED, ["not said"])
     assert outcome.status is Status.STOPPED
     assert outcome.warnings[0].startswith("Stopped before the final draws")

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from samplers.importance.draws import Draws, weight_warnings, weighted_interval
 from samplers.methods.two_stage.terms.settings import DoubtSettings
 from samplers.problem import FloatArray, Terms
+from samplers.sample import DrawWeights
 from samplers.statistics.weights import effective_number, largest_weight_share
 
 MIN_STRATUM_DRAWS = 5
@@ -29,6 +30,8 @@ class FinalRound:
     """Shape (n,)."""
     factor: float
     """Weight of one of its draws in p, relative to other rounds."""
+    first: int
+    """Simulations that the run had spent before its first draw."""
 
     def y(self, gamma: float) -> FloatArray:
         """Weight times indicator of failure, shape (n,)."""
@@ -88,6 +91,14 @@ class CombinedRounds:
         ]
         f, x = (np.concatenate(parts) for parts in zip(*((one.terms.f, one.x) for one in self.rounds), strict=True))
         return Draws.from_outcomes(f, np.concatenate(scaled), x, self.gamma)
+
+    @property
+    def draw_weights(self) -> tuple[DrawWeights, ...]:
+        """Weight of every draw in p."""
+        return tuple(
+            DrawWeights(first=one.first, log_weights=one.log_weights + math.log(c / len(one.log_weights)))
+            for one, c in zip(self.rounds, self.shares, strict=True)
+        )
 
     def interval(self, confidence: float, base_share: float, cov: float, ceiling: float) -> tuple[float, float]:
         """Return the log-normal interval; with t quantiles and Bernstein's bound where few draws carry p.

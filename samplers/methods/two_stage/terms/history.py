@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from samplers.execution.executors.packing import join_terms
 from samplers.methods.two_stage.terms.law import TermProposal
 from samplers.problem import FloatArray, Terms
+from samplers.sample import DrawWeights
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,6 +28,8 @@ class TermHistory:
     """Draws of each proposal, and the proposal."""
     n_base: int = 0
     """Base draws, the first of all."""
+    firsts: tuple[int, ...] = ()
+    """Simulations that the run had spent before each proposal's draws."""
 
     @classmethod
     def of_base_draws(cls, u: FloatArray, terms: Terms) -> "TermHistory":
@@ -38,8 +41,15 @@ class TermHistory:
         """log(phi / q) - log(n), shape (n,): exp of them over some points adds up to their probability."""
         return -self.log_density
 
-    def add(self, u: FloatArray, terms: Terms, proposal: TermProposal) -> "TermHistory":
-        """Return the history with draws u (m, d) of a proposal."""
+    @property
+    def draw_weights(self) -> tuple[DrawWeights, ...]:
+        """Weight of every draw in the p of all of them."""
+        sizes = (self.n_base, *(n for n, _ in self.proposals))
+        whole = DrawWeights(first=0, log_weights=self.log_weights)
+        return whole.split(*zip((0, *self.firsts), sizes, strict=True))
+
+    def add(self, u: FloatArray, terms: Terms, proposal: TermProposal, first: int) -> "TermHistory":
+        """Return the history with draws u (m, d) of a proposal, before which the run had spent `first` simulations."""
         count = np.log(len(u))
         old = np.logaddexp(self.log_density, count + proposal.log_ratio(self.u))
         new = np.full(len(u), np.log(self.n_base))
@@ -51,6 +61,7 @@ class TermHistory:
             np.concatenate([old, new]),
             (*self.proposals, (len(u), proposal)),
             self.n_base,
+            (*self.firsts, first),
         )
 
     def failing(self, gamma: float) -> NDArray[np.bool_]:

@@ -170,16 +170,17 @@ def _draw_round(
     gamma, rounds = search.goal.gamma, search.settings.rounds
     proposal = mix_terms(list(state.pursued), state.history, gamma, rounds, final)
     u, strata = proposal.draw(n, search.rng)
+    first = search.simulator.n_sim
     terms = yield from search.simulator.terms(u)
     x = search.simulator.inputs.base.from_standard_normal(u)
-    drawn = FinalRound(x, terms, -proposal.log_ratio(u), strata, factor=1.0)
+    drawn = FinalRound(x, terms, -proposal.log_ratio(u), strata, factor=1.0, first=first)
     fails = terms.f <= gamma
     ess = effective_sample_size(drawn.log_weights[fails])
     draws = state.base_draws + int((strata == 0).sum())
     failures = state.base_failures + int(fails[strata == 0].sum())
     state = replace(
         state,
-        history=state.history.add(u, terms, proposal),
+        history=state.history.add(u, terms, proposal, first),
         base_draws=draws,
         base_failures=failures,
         ceiling=clopper_pearson(failures, draws, search.goal.confidence)[1],
@@ -263,6 +264,7 @@ def _conclude(search: TermSearch, state: SearchState, stopped: bool) -> Outcome:
         no_outcome_share=no_outcome_share(draws.f, draws.log_weights),
         sample=draws.sample,
         base_draws=state.base_draws,
+        draw_weights=combined.draw_weights,
     )
 
 
@@ -282,6 +284,7 @@ def _estimate_early(search: TermSearch, state: SearchState) -> Outcome:
         no_outcome_share=no_outcome_share(draws.f, draws.log_weights),
         sample=draws.sample,
         base_draws=state.base_draws,
+        draw_weights=history.draw_weights,
     )
 
 
@@ -315,8 +318,15 @@ def _expected_levels(history: TermHistory, gamma: float) -> int:
 
 def _after(search: TermSearch, state: SearchState, outcome: Outcome) -> Outcome:
     """Return the outcome of another method that used the rest."""
-    trace = (*_close_trace(search, state).trace, *outcome.trace)
-    return replace(outcome, trace=trace, base_draws=state.base_draws + outcome.base_draws, counts=None)
+    earlier = _close_trace(search, state).trace
+    spent = sum(level.n_sim for level in earlier)
+    return replace(
+        outcome,
+        trace=(*earlier, *outcome.trace),
+        base_draws=state.base_draws + outcome.base_draws,
+        counts=None,
+        draw_weights=tuple(replace(weights, first=weights.first + spent) for weights in outcome.draw_weights),
+    )
 
 
 def _record(

@@ -6,7 +6,7 @@ from samplers.methods.two_stage.terms.settings import DoubtSettings
 from samplers.problem import Terms
 
 
-def final_round(y, factor=1.0, strata=None, least=None):
+def final_round(y, factor=1.0, strata=None, least=None, first=0):
     """Return a round of draws with these weights; those of 0 do not fail."""
     y = np.asarray(y, dtype=float)
     f = np.where(y > 0, -1.0, 1.0)
@@ -14,9 +14,8 @@ def final_round(y, factor=1.0, strata=None, least=None):
     values[np.arange(len(y)), np.zeros(len(y), int) if least is None else least] = np.where(f < 0, -1.0, 0.5)
     terms = Terms(f, values, np.zeros(values.shape, dtype=int), 0.0)
     log_weights = np.log(np.where(y > 0, y, 1.0))
-    return FinalRound(
-        np.zeros((len(y), 1)), terms, log_weights, np.zeros(len(y), int) if strata is None else strata, factor
-    )
+    strata = np.zeros(len(y), int) if strata is None else strata
+    return FinalRound(np.zeros((len(y), 1)), terms, log_weights, strata, factor, first)
 
 
 def test_rounds_are_combined_by_size_and_factor():
@@ -26,6 +25,14 @@ def test_rounds_are_combined_by_size_and_factor():
     assert combined.p == pytest.approx(0.3)
     assert combined.draws.p == pytest.approx(0.3)
     assert combined.draws.sample.weights[:3].sum() == pytest.approx(0.3)
+
+
+def test_every_draw_has_its_weight_in_p():
+    combined = CombinedRounds((final_round([1.0, 0.0], 0.5, first=7), final_round([0.5, 0.5, 0.0, 0.0], first=20)), 0.0)
+    first, last = combined.draw_weights
+    assert (first.first, last.first) == (7, 20)
+    np.testing.assert_allclose(np.exp(first.log_weights), [0.1, 0.1])  # 0.2 / 2, whether or not they fail
+    np.testing.assert_allclose(np.exp(last.log_weights), [0.1, 0.1, 0.2, 0.2])
 
 
 def test_the_variance_is_that_within_the_strata_and_of_one_more_heavy_draw():

@@ -288,3 +288,24 @@ def test_a_search_takes_its_numbers_from_the_settings_given(half_spaces, answer)
     assert first_level(SETTINGS) == 200
     assert first_level(replace(SETTINGS, rounds=replace(SETTINGS.rounds, base=0.2))) == 400
     assert first_level(replace(SETTINGS, min_budget=5000)) not in (200, 400)
+
+
+@pytest.mark.parametrize(
+    ("dim", "p", "options"),
+    [
+        (60, 1e-3, {}),  # the final rounds
+        (60, 1e-3, {"replicates": 2}),
+        (40, 0.3, {}),  # Monte Carlo after base draws that do not count
+        (60, 1e-3, {"stop": lambda seen: seen.n_sim >= 1500}),  # all draws so far
+        (60, 1e-3, {"stop": lambda seen: seen.n_sim >= 150}),  # base draws
+    ],
+)
+def test_p_is_the_sum_of_the_weights_of_single_simulations(half_spaces, dim, p, options):
+    """Gradients cost simulations and are none, so that there are fewer of them than `n_sim`."""
+    problem, _, _ = half_spaces(dim, p)
+    result = samplers.estimate(problem, seed=2, max_sim=3000, keep_points=True, **options)
+    rows = result.simulations.describe(0, len(result.points.f))
+    known = ~np.isnan(rows.log_weight)
+    weights = np.exp(rows.log_weight[known])
+    assert weights[result.points.f[known] <= 0].sum() == pytest.approx(result.p, rel=1e-12)
+    assert abs(weights.sum() - 1) <= 5 * weights.std() * len(weights) ** 0.5 + 1e-9  # as in any weighted sample
