@@ -19,6 +19,7 @@ from rare_envs.egos.loading import load_named_ego
 from rare_envs.egos.needs import resolve
 from rare_envs.egos.policy import PolicyDriver, as_driver
 from rare_envs.egos.spaces.ambiguities import (
+    DRIVES_ITSELF,
     TAKEN_AS_ACCELERATIONS,
     AmbiguousActions,
     MissingStatistics,
@@ -140,8 +141,9 @@ class DrivingProblem:
             self.driver = as_driver(ego, self.world, self.needs)
         self.varies = self.needs.varies
         self._core = CoreChoice(core, self.world, self.driver)
+        said_by_id = bool(layout) and not self.needs.queries_policy  # nobody named its actions
         for note in self.notes:
-            if note != TAKEN_AS_ACCELERATIONS:
+            if note != TAKEN_AS_ACCELERATIONS and not said_by_id:
                 warnings.warn(note, AmbiguousActions, stacklevel=2)
         missing = describe_missing_normalisation(ego, self.world.observation_space)
         if missing:
@@ -195,10 +197,11 @@ class DrivingProblem:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Ambiguities that cannot be checked; the grave ones were also given as an `AmbiguousActions` warning."""
-        if self.world.clock.action != "continuous" or not self.needs.queries_policy:
-            return ()
-        return name_ambiguities(self.needs.action_space, self.world.sensing.kinds)
+        """What cannot be checked or changes nothing; the grave ones were also given as an `AmbiguousActions` warning."""
+        action = self.world.clock.action
+        if not self.needs.queries_policy:
+            return () if action == "continuous" else (DRIVES_ITSELF.format(action=action),)
+        return name_ambiguities(self.needs.action_space, self.world.sensing.kinds) if action == "continuous" else ()
 
     @property
     def given(self) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import time
+import warnings
 import weakref
 from typing import Any, Protocol
 from urllib.parse import parse_qsl
@@ -24,7 +25,7 @@ MAX_NAME = 100
 _MAX_REASON = 500
 """Letters of an error's reason that are kept."""
 _HELLO_INTERVAL = 1.0
-"""Time [s] after which a hello without an answer is sent again."""
+"""Time [s] after which a hello without an answer is sent again, and after which the user is told of the wait."""
 _RETRY_PAUSE = 0.1
 """Time [s] between attempts to connect where they fail at once."""
 _PART_FACTOR, _MIN_PART_TIMEOUT = 10.0, 0.5
@@ -41,6 +42,10 @@ class NoReply(LinkError):
 
 class HandshakeError(LinkError):
     """A connection that the server will never accept: one side has a secret and the other none, say."""
+
+
+class WaitingForEgo(UserWarning):
+    """No server answers yet, and the client waits for one."""
 
 
 class RemoteError(RuntimeError):
@@ -316,7 +321,8 @@ class RemoteEgo:
 
     def _connect(self) -> Message:
         """Connect and exchange hello messages, retrying for `patience` seconds; return the server's."""
-        deadline, reason = time.monotonic() + self._patience, "no answer"
+        began, reason, told = time.monotonic(), "no answer", False
+        deadline = began + self._patience
         greeting = {"type": "hello", "protocol": protocol.PROTOCOL, "client": "rare-envs"}
         while True:
             self._link.open()
@@ -328,8 +334,17 @@ class RemoteEgo:
                 raise RemoteError(str(error)) from error
             except LinkError as error:
                 reason = str(error)
-            if time.monotonic() >= deadline:
-                raise EgoGone(f"No ego at {self._link.address} within {self._patience:g} s: {reason}.")
+            now, address = time.monotonic(), self._link.address
+            if now >= deadline:
+                raise EgoGone(f"No ego at {address} within {self._patience:g} s: {reason}.")
+            if now >= began + _HELLO_INTERVAL and not told:
+                told = True
+                warnings.warn(
+                    f"no ego at {address} yet: {reason}; waiting for one, {self._patience:g} s at most "
+                    "(?patience=SECONDS behind the address)",
+                    WaitingForEgo,
+                    stacklevel=3,
+                )
             time.sleep(_RETRY_PAUSE)
         if reply.get("protocol") != protocol.PROTOCOL:
             raise RemoteError(f"it speaks protocol {reply.get('protocol')!r}, expected {protocol.PROTOCOL}")

@@ -15,12 +15,13 @@ from agents.remote.curve import SECRET_VARIABLE, secure_client
 from agents.remote.protocol import MAX_BYTES, MalformedMessage
 
 _BROKEN = (
-    zmq.EVENT_DISCONNECTED
+    zmq.EVENT_CLOSED
+    | zmq.EVENT_DISCONNECTED
     | zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL
     | zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL
     | zmq.EVENT_HANDSHAKE_FAILED_AUTH
 )
-"""Events after which no answer will come."""
+"""Events after which no answer will come; `EVENT_CLOSED` is that of a connection that was refused."""
 
 
 class ZmqLink:
@@ -82,6 +83,8 @@ class ZmqLink:
     @staticmethod
     def _raise_broken(event: int) -> None:
         """Raise the error that an event of the connection means."""
+        if event == zmq.EVENT_CLOSED:
+            raise LinkError("nothing listens there")
         if event == zmq.EVENT_DISCONNECTED:
             raise LinkError("the connection broke")
         reason = f"the handshake failed; both sides need the same secret ({SECRET_VARIABLE}), or none"

@@ -25,10 +25,12 @@ RESCALED = (
     "their own, put a function of yours around it"
 )
 """A policy's bounds do not say whether they are those of a wrapper or units."""
+DRIVES_ITSELF = "the ego accelerates and steers by itself: action={action!r} (--action {action}) changes nothing for it"
+"""Scripts and learned drivers have no actions of another kind."""
 
 
 class AmbiguousActions(UserWarning):
-    """An ego's actions can be taken in two ways."""
+    """An ego's actions can be taken in two ways, or are not of the kind that was named."""
 
 
 class MissingStatistics(UserWarning):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import select
 import socket
 import threading
+import time
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ import pytest
 import rare_envs
 from agents import load_ego
 from agents.remote import protocol
-from agents.remote.client import LinkError, NoReply
+from agents.remote.client import LinkError, NoReply, WaitingForEgo
 from agents.remote.zmq_link import ZmqLink, connect
 from rare_envs.egos.errors import EgoGone
 from tests.agents.remote.egos import ENV, Braking
@@ -105,6 +106,29 @@ def test_a_broken_connection_and_silence_are_told_apart(serve: Any) -> None:
     with pytest.raises(LinkError, match="the connection broke"):
         link.request(b"", 10.0)
     link.close()
+
+
+def test_a_port_at_which_nothing_listens_is_said_in_a_second_and_waited_for(serve: Any) -> None:
+    """Its server may still be starting: what is found then is found without a fault."""
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        address = f"tcp://127.0.0.1:{listener.getsockname()[1]}"
+    link, began = ZmqLink(address), time.monotonic()
+    link.open()
+    with pytest.raises(LinkError, match="nothing listens there"):
+        link.request(b"", 20.0)
+    assert time.monotonic() - began < 10.0
+    link.close()
+    with pytest.raises(EgoGone, match=r"No ego at tcp://\S+ within 0\.2 s: nothing listens there\."):  # and no warning
+        connect(f"{address}?patience=0.2")
+    late = threading.Timer(2.0, serve, (Braking(), address))
+    late.start()
+    told = r"^no ego at tcp://\S+ yet: nothing listens there; waiting for one, 30 s at most \(\?patience=SECONDS"
+    with pytest.warns(WaitingForEgo, match=told) as warned:
+        there = connect(address)
+    assert len(warned) == 1
+    assert there.predict(OBSERVATION)[0].shape == (2, 2)
+    there.close()
+    late.join()
 
 
 def test_a_wrong_address_is_refused() -> None:

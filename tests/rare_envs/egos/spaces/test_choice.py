@@ -9,6 +9,7 @@ import pytest
 from gymnasium import spaces
 
 import rare_envs
+from rare_envs.egos.spaces.ambiguities import AmbiguousActions
 from rare_envs.egos.spaces.choice import choose_action, choose_observation, find_fitting_kinds, takes_indices
 from rare_envs.sensors.kinds import OBSERVATIONS
 from rare_envs.simulation.ego_interface import EgoNeeds
@@ -93,3 +94,17 @@ def test_other_policies_are_taken_to_accelerate() -> None:
     x = problem.base.sample(4, np.random.default_rng(0))
     said = rare_envs.DrivingProblem(CUT_IN, ego=problem.ego, action="discrete")
     np.testing.assert_array_equal(problem.evaluate(x), said.evaluate(x))
+
+
+@pytest.mark.parametrize("action", ["meta", "discrete"])
+def test_an_ego_that_drives_itself_says_that_named_actions_change_nothing(action: str) -> None:
+    told = f"the ego accelerates and steers by itself: action='{action}' (--action {action}) changes nothing for it"
+    plain = rare_envs.DrivingProblem(CUT_IN, ego="imitation")
+    assert plain.notes == ()
+    with pytest.warns(AmbiguousActions) as warned:
+        named = rare_envs.DrivingProblem(CUT_IN, ego="imitation", action=action)
+    assert [str(each.message) for each in warned] == [told]
+    assert named.notes == (told,)
+    x = plain.base.sample(4, np.random.default_rng(0))
+    np.testing.assert_array_equal(named.evaluate(x), plain.evaluate(x))
+    rare_envs.DrivingProblem(KINEMATICS, ego="idm")  # the id's own actions need no warning
