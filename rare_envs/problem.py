@@ -197,7 +197,7 @@ class DrivingProblem:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What cannot be checked or changes nothing; the grave ones were also given as an `AmbiguousActions` warning."""
+        """What cannot be checked or changes nothing; the grave ones also came as an `AmbiguousActions` warning."""
         action = self.world.clock.action
         if not self.needs.queries_policy:
             return () if action == "continuous" else (DRIVES_ITSELF.format(action=action),)
