@@ -248,6 +248,7 @@ class Report:
             "average": self.average,
             "gate": None if self.verdict is None else self.verdict.to_dict(),
             "doubtful": self.doubtful,
+            "doubts": self.warnings,
             "notes": self.notes,
             "vec_normalize": self.vec_normalize,
             "missing_statistics": self._missing_statistics[0] if self._missing_statistics else "",

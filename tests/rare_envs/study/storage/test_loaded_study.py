@@ -47,7 +47,7 @@ def test_polars_reads_the_table(folder: Path) -> None:
 def test_duckdb_reads_the_table(folder: Path) -> None:
     duckdb = pytest.importorskip("duckdb")
     study = rare_envs.load_study(folder)
-    found = duckdb.sql(f"SELECT sum(exp(log_weight)) FROM '{study.episodes_path}' WHERE failed").fetchone()
+    found = duckdb.sql(f"SELECT sum(exp(log_weight)) FROM '{study.episodes_path}' WHERE failed").fetchall()[0]
     assert found[0] == pytest.approx(study.p)
 
 
