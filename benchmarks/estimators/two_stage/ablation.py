@@ -45,10 +45,11 @@ def _without_kinds(*kinds: str) -> dict[str, Any]:
 
 
 ABLATIONS: dict[str, Mapping[str, Any]] = {
-    "all half-spaces": _without_kinds("linear", "half-space"),
+    "all half-spaces": _without_kinds("linear", "half-space", "corner"),
     "wide component": _without_kinds("wide"),
     "half-spaces through edges": _without_kinds("half-space"),
     "half-spaces of the regression": _without_kinds("linear"),
+    "corners of the regression": _without_kinds("corner"),
     "radial components": _without_kinds("radial"),
     "directional component": _without_kinds("directional"),
     "slopes": {"slopes.min_dim": 10**9},

@@ -60,7 +60,7 @@ def build_proposal(
     weights = minimise_second_moment(log_r, log_w, weights, floors, mixture.weights)
     keeps = kinds == "base"
     if not final:
-        explored = np.isin(kinds, ["explored", "linear", "spread"])
+        explored = np.isin(kinds, ["explored", "linear", "corner", "spread"])
         weights = np.where(explored, np.maximum(weights, settings.explored_share), weights)
         keeps = keeps | explored
     weights = np.where((weights < settings.min_share) & ~keeps, 0.0, weights)

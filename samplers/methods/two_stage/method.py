@@ -24,7 +24,8 @@ class TwoStage(Method):
        points that walk downhill each alone; chains inside the failure region from all of these. Two failing points are
        of one region if the point half way between them fails.
     2. *Refinement* (`refinement.py`, `candidates.py`): each region is described by Gaussians, by a hyperplane from
-       linear regression of f where f is linear, by half-spaces through the edge of its failures and by a radius.
+       linear regression of f where f is linear, by a corner of several where f is the greatest of linear functions, by
+       half-spaces through the edge of its failures and by a radius.
        Three rounds of draws follow, each from a mixture of these, and up to two more while a draw is worth less than
        a tenth of a failure. The weights minimise the estimated variance (`mixture_weights.py`), with lower limits for
        the base distribution, for tempered Gaussians (which bound weights where a Gaussian is a bad description) and

@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from samplers.methods.two_stage.mixture.greatest_of_planes import intersection_of_half_spaces
 from samplers.methods.two_stage.mixture.least_of_planes import union_of_half_spaces
 from samplers.methods.two_stage.mixture.linear_model import half_space_proposals
 from samplers.methods.two_stage.mixture.proposal import NO_REGION, MixtureProposal, ProposalComponent
@@ -27,7 +28,7 @@ from samplers.problem import FloatArray
 from samplers.proposals.components import HalfSpaceUnion, SubspaceGaussian, log_ratios
 from samplers.statistics.weights import effective_sample_size
 
-SHARP_KINDS = ("gaussian", "linear", "explored", "half-space", "radial")
+SHARP_KINDS = ("gaussian", "linear", "corner", "explored", "half-space", "radial")
 """Components that are meant to hold failures only."""
 TYPICAL_QUANTILE = 0.75
 """Of the mean weights of chains: that of the heaviest may be where hardly any failure is."""
@@ -67,7 +68,7 @@ class RefinementState:
     gaussians: list[SubspaceGaussian]
     """The same, moved to the weighted failures: one for each of `explored`."""
     linear: tuple[ProposalComponent, ...]
-    """Half-space proposals from linear regression of f around each region, and of its pieces in the slopes' span."""
+    """Half-spaces and corners from linear regression of f around each region, and of its pieces in the slopes' span."""
     rounds: tuple[NearDraws, ...] = ()
     hit_rate: float = 1.0
     """Share of the last round's draws from SHARP_KINDS that failed."""
@@ -139,9 +140,9 @@ def _describe_regions(
         for gaussian in _fit_chains(region, most, settings.points_per_chain, rng, mixture.subspace)
     )
     linear = tuple(
-        ProposalComponent(component, "linear", k)
+        proposal
         for k, region in enumerate(exploration.regions)
-        for component in half_space_proposals(region.points, region.u, region.f, gamma, mixture)
+        for proposal in _propose_edges(k, region.points, region.u, region.f, gamma, rng, mixture)
     )
     gaussians = [candidate.component for candidate in explored if isinstance(candidate.component, SubspaceGaussian)]
     return RefinementState(exploration=exploration, gamma=gamma, explored=explored, gaussians=gaussians, linear=linear)
@@ -195,7 +196,7 @@ def _learn(
     return replace(
         state,
         gaussians=refit_components(state.gaussians, history.u, history.log_weights, mixture.subspace),
-        linear=_fit_linear(state, settings, mixture),
+        linear=_fit_linear(state, settings, rng, mixture),
     )
 
 
@@ -238,7 +239,7 @@ def _fit_chains(
 
 
 def _fit_linear(
-    state: RefinementState, settings: RefinementSettings, mixture: MixtureSettings
+    state: RefinementState, settings: RefinementSettings, rng: np.random.Generator, mixture: MixtureSettings
 ) -> tuple[ProposalComponent, ...]:
     """Return half-space proposals from what was known of each region and the draws nearest to it."""
     u, f = np.concatenate([draws.u for draws in state.rounds]), np.concatenate([draws.f for draws in state.rounds])
@@ -251,6 +252,21 @@ def _fit_linear(
         own = owner == k
         failures = np.concatenate([region.points, u[own & fails]])
         around, outcomes = np.concatenate([region.u, u[own]]), np.concatenate([region.f, f[own]])
-        components = half_space_proposals(failures, around, outcomes, state.gamma, mixture)
-        proposals += [ProposalComponent(component, "linear", k) for component in components]
+        proposals += _propose_edges(k, failures, around, outcomes, state.gamma, rng, mixture)
     return tuple(proposals)
+
+
+def _propose_edges(
+    region: int,
+    failures: FloatArray,
+    u: FloatArray,
+    f: FloatArray,
+    gamma: float,
+    rng: np.random.Generator,
+    mixture: MixtureSettings,
+) -> list[ProposalComponent]:
+    """Return proposals from regression of f (n,) at u (n, d) around a region: a half-space, and a corner of several."""
+    half_spaces = half_space_proposals(failures, u, f, gamma, mixture)
+    corner = intersection_of_half_spaces(u, f, gamma, rng, mixture)
+    proposals = [ProposalComponent(component, "linear", region) for component in half_spaces]
+    return proposals if corner is None else [*proposals, ProposalComponent(corner, "corner", region)]

@@ -20,6 +20,7 @@ def _initial_shares() -> dict[Kind, float]:
         "radial": 0.1,
         "gaussian": 0.5,
         "linear": 0.5,
+        "corner": 0.3,
         "explored": 0.2,
         "tempered": 0.25,
         "half-space": 0.1,

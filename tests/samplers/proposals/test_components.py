@@ -8,6 +8,7 @@ from scipy import stats
 
 from samplers.limit_states import half_space
 from samplers.proposals.components import (
+    HalfSpaceIntersection,
     HalfSpaceNormal,
     HalfSpaceUnion,
     IsotropicNormal,
@@ -40,6 +41,13 @@ def oblique_half_space(start):
     )
 
 
+def oblique_corner(dim):
+    """Three planes at 60 degrees to each other."""
+    axes = rotation(dim, 4)[:3]
+    axes = axes + axes.sum(axis=0) / 3
+    return HalfSpaceIntersection(axes / np.linalg.norm(axes, axis=1)[:, None], np.array([1.5, 1.2, -0.3]))
+
+
 COMPONENTS = {
     "base": (IsotropicNormal(4), 4),
     "wide": (IsotropicNormal(2, 1.5), 2),
@@ -55,6 +63,8 @@ COMPONENTS = {
     "half-space with a gaussian across": (oblique_half_space(1.0), 3),
     "half-spaces": (HalfSpaceUnion(rotation(2, 4), np.array([0.8, 1.5])), 2),
     "half-spaces d=5": (HalfSpaceUnion(rotation(5, 4)[:3], np.array([2.0, 2.5, 3.0])), 5),
+    "corner": (HalfSpaceIntersection(rotation(2, 4), np.array([1.5, 0.8])), 2),
+    "oblique corner d=5": (oblique_corner(5), 5),
     "radial": (RadialLaw(3, 1.0, 1.5, 2.5), 3),
     "radial d=20": (RadialLaw(20, 12.0, 2.0, 4.0), 20),
     "radial in a plane of 10": (LiftedComponent(RadialLaw(2, 1.0, 1.5, 2.5), rotation(10, 6)[:, :2]), 10),
@@ -89,6 +99,9 @@ def test_weights_of_draws_average_to_the_base_s_probability_of_the_support(compo
         supported = stats.norm.sf(component.start)
     if isinstance(component, HalfSpaceUnion):  # of orthogonal planes
         supported = 1 - stats.norm.cdf(component.starts).prod()
+    if isinstance(component, HalfSpaceIntersection):
+        gram = component.axes @ component.axes.T
+        supported = stats.multivariate_normal(cov=gram, seed=0).cdf(-component.starts)
     if isinstance(component, RadialLaw):
         supported = stats.chi2.sf(component.start, dim)
     assert weights.mean() == pytest.approx(supported, rel=1e-12, abs=4 * weights.std() / math.sqrt(N))
@@ -98,8 +111,21 @@ def test_weights_of_draws_average_to_the_base_s_probability_of_the_support(compo
 def test_density_integrates_to_one(name):
     component, dim = COMPONENTS[name]
     u, mass = grid(dim)
-    edge = 1e-3 if isinstance(component, HalfSpaceNormal | HalfSpaceUnion) else 0.0  # cells that an edge cuts
+    planes = HalfSpaceNormal | HalfSpaceUnion | HalfSpaceIntersection
+    edge = 3e-3 if isinstance(component, planes) else 0.0  # cells that an edge cuts
     assert (mass * np.exp(component.log_ratio(u))).sum() == pytest.approx(1.0, abs=1e-6 + edge)
+
+
+def test_draws_of_a_corner_are_beyond_all_its_planes(rng):
+    corner = oblique_corner(5)
+    assert (corner.sample(1000, rng) @ corner.axes.T >= corner.starts - 1e-12).all()
+
+
+def test_a_corner_of_orthogonal_planes_is_the_normal_cut_to_it():
+    corner = HalfSpaceIntersection(np.eye(4)[:2], np.array([2.0, 1.5]))
+    u = np.array([[2.5, 1.6, -9.0, 3.0], [1.9, 1.6, 0.0, 0.0], [2.5, 1.4, 0.0, 0.0]])
+    expected = [-stats.norm.logsf(2.0) - stats.norm.logsf(1.5), -np.inf, -np.inf]
+    np.testing.assert_allclose(corner.log_ratio(u), expected, atol=1e-12)
 
 
 def test_ratio_is_that_of_the_densities():

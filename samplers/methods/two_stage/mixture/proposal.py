@@ -10,7 +10,17 @@ from samplers.problem import FloatArray
 from samplers.proposals.components import MixtureComponent, draw_components, draw_counts, log_ratios, mixture_log_ratio
 
 Kind = Literal[
-    "base", "wide", "radial", "gaussian", "linear", "explored", "tempered", "half-space", "spread", "directional"
+    "base",
+    "wide",
+    "radial",
+    "gaussian",
+    "linear",
+    "corner",
+    "explored",
+    "tempered",
+    "half-space",
+    "spread",
+    "directional",
 ]
 """Where a component of a proposal comes from:
 
@@ -20,6 +30,7 @@ Kind = Literal[
     radial      every direction alike, from the radius of the failures on
     gaussian    fitted to weighted failures
     linear      a half-space and its Gaussian, from linear regression of f
+    corner      N(0, I) beyond all of several planes, from regression of f as the greatest of linear functions
     explored    fitted to the chains of the exploration, never changed
     tempered    q^t phi^(1 - t) of a Gaussian q, which bounds weights where q is a bad description
     spread      as wide as the failures in the span of a few gradients of f, N(0, 1) across it

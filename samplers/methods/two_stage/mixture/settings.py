@@ -94,6 +94,23 @@ class PieceSettings:
 
 
 @dataclass(frozen=True, kw_only=True)
+class CornerSettings:
+    """f as the greatest of linear functions (`greatest_of_planes.py`)."""
+
+    n: int = 6
+    """Pieces to start with."""
+    starts: int = 3
+    """Fits from other points at most, until one explains f."""
+    most_points: int = 3000
+    """Points of a fit at most, drawn at random: with 6,000 simulations there are seldom as many, and with 600,000 a fit
+    would take seconds."""
+    min_start: float = -1.0
+    """Planes nearer than this hold 84 % of N(0, I) or more: the corner is hardly larger without them."""
+    min_turn: float = 0.1
+    """Sine of the least angle between a plane and the span of those before it: two at less are one."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class EdgeSettings:
     """Where proposals with an edge begin (`boundary.py`, and the half-spaces of `linear_model.py`)."""
 
@@ -189,6 +206,7 @@ class MixtureSettings:
 
     linear_model: LinearModelSettings = LinearModelSettings()
     pieces: PieceSettings = PieceSettings()
+    corner: CornerSettings = CornerSettings()
     edges: EdgeSettings = EdgeSettings()
     subspace: SubspaceSettings = SubspaceSettings()
     weights: MixtureWeightSettings = MixtureWeightSettings()

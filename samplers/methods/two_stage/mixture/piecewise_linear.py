@@ -1,0 +1,105 @@
+"""Regression of f by pieces: f as the least of several linear functions.
+
+Each point belongs to the piece that is the least there, and each piece is fitted anew to its points, until hardly a
+point changes its piece.
+
+References:
+    Magnani and Boyd, "Convex piecewise-linear fitting", Optimization and Engineering 10, 2009 (there the largest).
+"""
+
+import math
+from collections.abc import Iterable
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from samplers.methods.two_stage.mixture.linear_model import INLIER_ROUNDING, MAD_TO_SIGMA
+from samplers.methods.two_stage.mixture.settings import PieceSettings
+from samplers.problem import FloatArray
+
+class LinearPieces(NamedTuple):
+    """y(u) = min_k (intercept_k + slope_k . u)."""
+
+    intercepts: FloatArray
+    """Shape (k,)."""
+    slopes: FloatArray
+    """Shape (k, d)."""
+
+    def predict(self, u: FloatArray) -> FloatArray:
+        """Return each piece at u (n, d), shape (n, k)."""
+        return self.intercepts + u @ self.slopes.T
+
+    def take(self, kept: NDArray[np.int64]) -> "LinearPieces":
+        """Return some of the pieces."""
+        return LinearPieces(self.intercepts[kept], self.slopes[kept])
+
+
+def points_of_piece(dim: int, settings: PieceSettings) -> int:
+    """Return the points that a piece starts from."""
+    return settings.points_per_dim * dim + settings.least_points
+
+
+def start_pieces(
+    u: FloatArray, y: FloatArray, centres: NDArray[np.int64], settings: PieceSettings, n: int, rng: np.random.Generator
+) -> LinearPieces:
+    """Return the regressions of y (n,) on the points u (n, d) around at most n of the `centres`, rows of u."""
+    chosen = rng.choice(centres, min(n, len(centres)), replace=False)
+    distance = np.linalg.norm(u[chosen, None] - u, axis=2)
+    around = points_of_piece(u.shape[1], settings)
+    near = np.argpartition(distance, around - 1, axis=1)[:, :around]
+    return _regress(u, y, near, settings.first_ridge)
+
+
+def fit_pieces(
+    pieces: LinearPieces, u: FloatArray, y: FloatArray, settings: PieceSettings, inlier_sigmas: float = math.inf
+) -> LinearPieces | None:
+    """Return the pieces after regressions, each on the points at which it is the least one, until no point moves.
+
+    Args:
+        pieces: To start from.
+        u: Points, shape (n, d).
+        y: Their values, shape (n,).
+        settings: Most steps, ridge penalty and points of a piece; one with fewer is given up, and None is left of none.
+        inlier_sigmas: As in `assign_points`: points that do not agree are left out.
+    """
+    least, before = u.shape[1] + settings.least_points, np.empty(0, dtype=np.int64)
+    for _ in range(settings.iterations):
+        own, agrees = assign_points(pieces, u, y, inlier_sigmas)
+        own = np.where(agrees, own, -1)
+        if np.array_equal(own, before):
+            break
+        groups = [np.flatnonzero(own == k) for k in range(len(pieces.intercepts))]
+        groups = [group for group in groups if len(group) >= least]
+        if not groups:
+            return None
+        pieces, before = _regress(u, y, groups, settings.ridge), own
+    return pieces
+
+
+def assign_points(
+    pieces: LinearPieces, u: FloatArray, y: FloatArray, inlier_sigmas: float = math.inf
+) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+    """Return the least piece at each point u (n, d), and whether y (n,) agrees with it, shape (n,) each.
+
+    It does within so many standard deviations, these from the median absolute deviation of the piece's own points: of
+    all points, those of an exact piece would rule out those of another one.
+    """
+    predicted = pieces.predict(u)
+    own = predicted.argmin(axis=1)
+    if math.isinf(inlier_sigmas):
+        return own, np.ones(len(y), dtype=bool)
+    deviation, limit = np.abs(y - predicted.min(axis=1)), np.zeros(len(pieces.intercepts))
+    for k in np.unique(own):
+        limit[k] = inlier_sigmas * MAD_TO_SIGMA * np.median(deviation[own == k])
+    return own, deviation <= limit[own] + INLIER_ROUNDING * np.ptp(y)
+
+
+def _regress(u: FloatArray, y: FloatArray, groups: Iterable[NDArray[np.int64]], ridge: float) -> LinearPieces:
+    """Return the ridge regressions of y (n,) on u (n, d) at some groups of points, one piece each."""
+    design, dim = np.column_stack([u, np.ones(len(u))]), u.shape[1]
+    chosen = [(design[group], y[group]) for group in groups]
+    normal = np.array([x.T @ x for x, _ in chosen]) + ridge * np.diag(np.append(np.ones(dim), 0.0))
+    moments = np.array([x.T @ values for x, values in chosen])
+    coefficients = np.linalg.solve(normal, moments[:, :, None])[:, :, 0]
+    return LinearPieces(coefficients[:, dim], coefficients[:, :dim])
