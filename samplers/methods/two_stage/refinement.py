@@ -142,7 +142,7 @@ def _describe_regions(
     linear = tuple(
         proposal
         for k, region in enumerate(exploration.regions)
-        for proposal in _propose_edges(k, region.points, region.u, region.f, gamma, rng, mixture)
+        for proposal in _propose_edges(k, region.points, region.u, region.f, gamma, mixture)
     )
     gaussians = [candidate.component for candidate in explored if isinstance(candidate.component, SubspaceGaussian)]
     return RefinementState(exploration=exploration, gamma=gamma, explored=explored, gaussians=gaussians, linear=linear)
@@ -196,7 +196,7 @@ def _learn(
     return replace(
         state,
         gaussians=refit_components(state.gaussians, history.u, history.log_weights, mixture.subspace),
-        linear=_fit_linear(state, settings, rng, mixture),
+        linear=_fit_linear(state, settings, mixture),
     )
 
 
@@ -239,7 +239,7 @@ def _fit_chains(
 
 
 def _fit_linear(
-    state: RefinementState, settings: RefinementSettings, rng: np.random.Generator, mixture: MixtureSettings
+    state: RefinementState, settings: RefinementSettings, mixture: MixtureSettings
 ) -> tuple[ProposalComponent, ...]:
     """Return half-space proposals from what was known of each region and the draws nearest to it."""
     u, f = np.concatenate([draws.u for draws in state.rounds]), np.concatenate([draws.f for draws in state.rounds])
@@ -252,7 +252,7 @@ def _fit_linear(
         own = owner == k
         failures = np.concatenate([region.points, u[own & fails]])
         around, outcomes = np.concatenate([region.u, u[own]]), np.concatenate([region.f, f[own]])
-        proposals += _propose_edges(k, failures, around, outcomes, state.gamma, rng, mixture)
+        proposals += _propose_edges(k, failures, around, outcomes, state.gamma, mixture)
     return tuple(proposals)
 
 
@@ -262,11 +262,10 @@ def _propose_edges(
     u: FloatArray,
     f: FloatArray,
     gamma: float,
-    rng: np.random.Generator,
     mixture: MixtureSettings,
 ) -> list[ProposalComponent]:
     """Return proposals from regression of f (n,) at u (n, d) around a region: a half-space, and a corner of several."""
     half_spaces = half_space_proposals(failures, u, f, gamma, mixture)
-    corner = intersection_of_half_spaces(u, f, gamma, rng, mixture)
+    corner = intersection_of_half_spaces(u, f, gamma, mixture)
     proposals = [ProposalComponent(component, "linear", region) for component in half_spaces]
     return proposals if corner is None else [*proposals, ProposalComponent(corner, "corner", region)]

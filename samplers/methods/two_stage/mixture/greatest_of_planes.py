@@ -29,7 +29,7 @@ LEAST_SQUARE = 1e-20
 
 
 class PiecewiseFit(NamedTuple):
-    """Pieces whose least is gamma - f, and the points that they rest on."""
+    """Pieces whose least is gamma - f, in units of its spread, and the points that they rest on."""
 
     pieces: LinearPieces
     u: FloatArray
@@ -61,7 +61,6 @@ def intersection_of_half_spaces(
     u: FloatArray,
     f: FloatArray,
     gamma: float,
-    rng: np.random.Generator,
     settings: MixtureSettings = DEFAULT_MIXTURE_SETTINGS,
 ) -> HalfSpaceIntersection | None:
     """Return the corner in which all pieces of f fail, or None where no two or more pieces explain f.
@@ -75,15 +74,13 @@ def intersection_of_half_spaces(
         u: Points around one failure region, shape (n, d).
         f: Their outcomes, shape (n,); infinite ones are left out.
         gamma: Threshold of failure.
-        rng: Source of randomness: pieces start at points chosen at random.
         settings: Of the regression and of the edges.
 
     Example:
         f is the greatest of 2 - u1 and 1.5 - u2:
 
-        >>> rng = np.random.default_rng(0)
-        >>> u = rng.normal(1.5, 1.5, (400, 2))
-        >>> corner = intersection_of_half_spaces(u, (np.array([2, 1.5]) - u).max(axis=1), 0.0, rng)
+        >>> u = np.random.default_rng(0).normal(1.5, 1.5, (400, 2))
+        >>> corner = intersection_of_half_spaces(u, (np.array([2, 1.5]) - u).max(axis=1), 0.0)
         >>> corner.axes.round(2) + 0.0
         array([[1., 0.],
                [0., 1.]])
@@ -95,7 +92,7 @@ def intersection_of_half_spaces(
     u, f = u[finite], f[finite]
     fails, best = f <= gamma, None
     for used in (np.ones(len(f), dtype=bool), fails, ~fails):
-        fit = _fit_least(u[used], gamma - f[used], rng, settings)
+        fit = _fit_least(u[used], gamma - f[used], settings)
         if fit is not None and (best is None or fit.explained > best.explained):
             best = fit
         if best is not None and best.is_exact(linear):
@@ -108,33 +105,38 @@ def intersection_of_half_spaces(
     return _beyond_planes(axes, starts, settings)
 
 
-def _fit_least(
-    u: FloatArray, y: FloatArray, rng: np.random.Generator, settings: MixtureSettings
-) -> PiecewiseFit | None:
+def _fit_least(u: FloatArray, y: FloatArray, settings: MixtureSettings) -> PiecewiseFit | None:
     """Return the best of some fits of pieces to y (n,) at u (n, d); None where points are too few.
 
     Points that do not agree are left out at last only: before, they may be those of a piece that is still to come.
     """
-    unit = float(y.std()) if len(y) else 0.0
+    size = float(np.abs(y).max()) if len(y) else 0.0
+    unit = size * float((y / size).std()) if size > 0 else 0.0  # a square may overflow
     if unit == 0 or len(y) < points_of_piece(u.shape[1], settings.pieces):
         return None
-    if len(y) > settings.corner.most_points:
-        rows = rng.choice(len(y), settings.corner.most_points, replace=False)
-        u, y = u[rows], y[rows]
-    scaled, best, linear = y / unit, None, settings.linear_model
-    for _ in range(settings.corner.starts):
-        start = start_pieces(u, scaled, np.arange(len(y)), settings.pieces, settings.corner.n, rng)
-        pieces = fit_pieces(start, u, scaled, settings.pieces)
+    rows = _spread(len(y), settings.corner.most_points)
+    u, scaled, best, linear = u[rows], y[rows] / unit, None, settings.linear_model
+    order = np.argsort(scaled, kind="stable")
+    for k in range(settings.corner.starts):
+        centres = order[_spread(len(order), settings.corner.n, (k + 0.5) / settings.corner.starts)]
+        pieces = fit_pieces(start_pieces(u, scaled, centres, settings.pieces), u, scaled, settings.pieces)
         if pieces is not None:
             pieces = fit_pieces(_prune(pieces, u, scaled), u, scaled, settings.pieces, linear.inlier_sigmas)
         if pieces is None:
             continue
-        fit = _judge(LinearPieces(unit * pieces.intercepts, unit * pieces.slopes), u, y, linear.inlier_sigmas)
+        fit = _judge(pieces, u, scaled, linear.inlier_sigmas)
         if best is None or fit.explained > best.explained:
             best = fit
-        if best.is_exact(linear) or len(pieces.intercepts) == 1:
+        whole = best.is_exact(linear) and best.explained > linear.boundary_r2  # a piece fewer leaves its points out
+        if whole or len(pieces.intercepts) == 1:
             break
     return best
+
+
+def _spread(n: int, most: int, offset: float = 0.0) -> NDArray[np.int64]:
+    """Return at most so many of n rows, evenly spaced; the offset is a share of the space between two."""
+    k = min(n, most)
+    return ((np.arange(k) + offset) * n / k).astype(np.int64)
 
 
 def _judge(pieces: LinearPieces, u: FloatArray, y: FloatArray, inlier_sigmas: float) -> PiecewiseFit:

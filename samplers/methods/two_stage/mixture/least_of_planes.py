@@ -56,8 +56,8 @@ def union_of_half_spaces(
     if unit == 0 or len(fails) < linear.min_failures or len(f) < points_of_piece(dim, settings.pieces):
         return None
     y = (f - gamma) / unit
-    start = start_pieces(u, y, fails, settings.pieces, settings.pieces.n, rng)
-    pieces = fit_pieces(start, u, y, settings.pieces)
+    centres = rng.choice(fails, min(settings.pieces.n, len(fails)), replace=False)
+    pieces = fit_pieces(start_pieces(u, y, centres, settings.pieces), u, y, settings.pieces)
     if pieces is None:
         return None
     predicted = pieces.predict(u)

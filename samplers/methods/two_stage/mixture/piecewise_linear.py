@@ -18,6 +18,7 @@ from samplers.methods.two_stage.mixture.linear_model import INLIER_ROUNDING, MAD
 from samplers.methods.two_stage.mixture.settings import PieceSettings
 from samplers.problem import FloatArray
 
+
 class LinearPieces(NamedTuple):
     """y(u) = min_k (intercept_k + slope_k . u)."""
 
@@ -40,12 +41,9 @@ def points_of_piece(dim: int, settings: PieceSettings) -> int:
     return settings.points_per_dim * dim + settings.least_points
 
 
-def start_pieces(
-    u: FloatArray, y: FloatArray, centres: NDArray[np.int64], settings: PieceSettings, n: int, rng: np.random.Generator
-) -> LinearPieces:
-    """Return the regressions of y (n,) on the points u (n, d) around at most n of the `centres`, rows of u."""
-    chosen = rng.choice(centres, min(n, len(centres)), replace=False)
-    distance = np.linalg.norm(u[chosen, None] - u, axis=2)
+def start_pieces(u: FloatArray, y: FloatArray, centres: NDArray[np.int64], settings: PieceSettings) -> LinearPieces:
+    """Return the regressions of y (n,) on the points u (n, d) around each of the `centres`, rows of u."""
+    distance = np.linalg.norm(u[centres, None] - u, axis=2)
     around = points_of_piece(u.shape[1], settings)
     near = np.argpartition(distance, around - 1, axis=1)[:, :around]
     return _regress(u, y, near, settings.first_ridge)

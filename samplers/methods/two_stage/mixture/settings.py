@@ -102,7 +102,7 @@ class CornerSettings:
     starts: int = 3
     """Fits from other points at most, until one explains f."""
     most_points: int = 3000
-    """Points of a fit at most, drawn at random: with 6,000 simulations there are seldom as many, and with 600,000 a fit
+    """Points of a fit at most, evenly spaced: with 6,000 simulations there are seldom as many, and with 600,000 a fit
     would take seconds."""
     min_start: float = -1.0
     """Planes nearer than this hold 84 % of N(0, I) or more: the corner is hardly larger without them."""

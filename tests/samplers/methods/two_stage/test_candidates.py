@@ -55,7 +55,7 @@ def test_the_first_proposal_has_the_initial_shares(exact_region, rng):
     state, history, _ = started(exact_region, rng)
     proposal = build_proposal(state, history, SETTINGS)
     present = {kind: a for kind, a in SETTINGS.initial_shares.items() if kind in kinds_of(proposal.candidates)}
-    assert set(SETTINGS.initial_shares) - set(present) == {"explored", "spread", "directional"}
+    assert set(SETTINGS.initial_shares) - set(present) == {"corner", "explored", "spread", "directional"}
     for kind, a in present.items():
         assert share(proposal, kind) == pytest.approx(a / sum(present.values()))
 
@@ -136,7 +136,7 @@ def test_candidates_of_a_linear_region(exact_region, rng):
     candidates = list_candidates(state, history, SETTINGS)
     assert candidates[0].kind == "base"
     kinds = kinds_of(candidates)
-    assert set(kinds) == set(SETTINGS.initial_shares) - {"spread", "directional"}
+    assert set(kinds) == set(SETTINGS.initial_shares) - {"corner", "spread", "directional"}
     assert kinds["radial"] == 2
     gaussian = [c for c in candidates if isinstance(c.component, SubspaceGaussian) and c.kind != "tempered"]
     assert kinds["tempered"] == len(gaussian) * len(SETTINGS.tempering)

@@ -352,6 +352,21 @@ def test_stopped_in_the_estimate():
     assert result.trace[-1].n_sim == 300
 
 
+@pytest.mark.parametrize("collision", [False, True], ids=["f falls on", "f is -1 on failure"])
+def test_a_corner_takes_few_simulations(collision):
+    """Three conditions must all hold, p = 1.4e-4: plain Monte Carlo takes 7.7e6 simulations for a c.o.v. of 3 %."""
+    betas = np.array([2.0, 1.6, 1.2])
+    p = PHI(-betas).prod()
+
+    def f(u):
+        excess = (betas - u[:, :3]).max(axis=1)
+        return np.where(excess <= 0, -1.0, excess + 0.4) if collision else excess
+
+    result = samplers.estimate(samplers.FunctionProblem(f, 8), TS(), seed=0, max_sim=6000)
+    assert near(result, p)
+    assert result.cov < 0.03
+
+
 # where no proposal describes the failures
 
 

@@ -20,7 +20,13 @@ from samplers.methods.two_stage.regions import ExplorationResult, Region
 from samplers.methods.two_stage.settings import RefinementSettings
 from samplers.methods.two_stage.simulator import ComponentDraws
 from samplers.problem import FunctionProblem
-from samplers.proposals.components import HalfSpaceNormal, HalfSpaceUnion, IsotropicNormal, SubspaceGaussian
+from samplers.proposals.components import (
+    HalfSpaceIntersection,
+    HalfSpaceNormal,
+    HalfSpaceUnion,
+    IsotropicNormal,
+    SubspaceGaussian,
+)
 
 SETTINGS = RefinementSettings()
 BETA = 3.0
@@ -62,6 +68,15 @@ def test_the_exploration_gives_each_region_its_gaussians_and_its_half_space(exac
         assert half_space.start == pytest.approx(BETA, abs=0.1)
     assert (state.dim, state.rounds) == (4, ())
     assert state.points.shape == (100 * regions, 4)
+
+
+def test_a_region_that_two_conditions_bound_has_a_corner(exact_region, rng):
+    problem = FunctionProblem(lambda u: np.maximum(BETA - u[:, 0], 0.5 - u[:, 1]), 4)
+    state = start_refinement(explored(exact_region, problem, 1), 0.0, SETTINGS, rng)
+    (corner,) = (candidate.component for candidate in state.linear if candidate.kind == "corner")
+    assert isinstance(corner, HalfSpaceIntersection)
+    assert corner.axes[:, :2] == pytest.approx(np.eye(2), abs=0.05)
+    assert corner.starts == pytest.approx([BETA, 0.5], abs=0.1)
 
 
 def test_where_f_is_noisy_one_region_may_have_many_gaussians(rng):

@@ -29,13 +29,13 @@ def assert_is_the_corner(corner, tolerance=0.03):
 
 def test_the_planes_of_a_parallel_system_are_found(rng):
     u = points(rng)
-    assert_is_the_corner(intersection_of_half_spaces(u, parallel(u), 0.0, rng))
+    assert_is_the_corner(intersection_of_half_spaces(u, parallel(u), 0.0))
 
 
 def test_a_mean_of_draws_of_the_corner_is_p(rng):
     """Within four standard errors of the exact p, with hardly any variance."""
     u = points(rng)
-    corner = intersection_of_half_spaces(u, parallel(u), 0.0, rng)
+    corner = intersection_of_half_spaces(u, parallel(u), 0.0)
     draws = corner.sample(4000, rng)
     weights = np.exp(-corner.log_ratio(draws)) * (parallel(draws) <= 0)
     p = stats.norm.sf(BETAS).prod()
@@ -46,7 +46,7 @@ def test_a_mean_of_draws_of_the_corner_is_p(rng):
 
 def test_a_threshold_moves_the_planes(rng):
     u = points(rng)
-    corner = intersection_of_half_spaces(u, parallel(u), 0.2, rng)
+    corner = intersection_of_half_spaces(u, parallel(u), 0.2)
     order = np.argmax(corner.axes, axis=1)
     np.testing.assert_allclose(corner.starts, (BETAS - 0.2 / np.array([1.0, 0.5, 2.0]))[order] - MARGIN, atol=0.03)
 
@@ -55,14 +55,14 @@ def test_failures_of_another_region_do_not_bend_the_planes(rng):
     """One point in ten has a lesser f by another region."""
     u = points(rng)
     f = np.where(rng.random(len(u)) < 0.1, parallel(u) - 1.0, parallel(u))
-    assert_is_the_corner(intersection_of_half_spaces(u, f, 0.0, rng))
+    assert_is_the_corner(intersection_of_half_spaces(u, f, 0.0))
 
 
 def test_where_all_failures_have_the_same_f_the_corner_begins_before_them(rng):
     """As on a collision: f ends at 0.4 and jumps to -1, so that the planes themselves cross 0 too late."""
     u = points(rng)
     f = np.where(parallel(u) <= 0, -1.0, parallel(u) + 0.4)
-    corner = intersection_of_half_spaces(u, f, 0.0, rng)
+    corner = intersection_of_half_spaces(u, f, 0.0)
     np.testing.assert_allclose(corner.axes[:, :3], np.eye(3), atol=0.05)
     fails = u[f <= 0]
     assert np.isfinite(corner.log_ratio(fails)).mean() > 0.85
@@ -73,7 +73,7 @@ def test_a_convex_region_has_tangent_planes(rng):
     """Failure beyond a parabola, u1 >= 2 + 0.1 u2^2: nearly all failures lie within the corner."""
     u = np.concatenate([rng.normal(2.5, 0.5, (800, 1)), rng.normal(0, 1.5, (800, 1))], axis=1)
     f = 2 + 0.1 * u[:, 1] ** 2 - u[:, 0]
-    corner = intersection_of_half_spaces(u, f, 0.0, rng)
+    corner = intersection_of_half_spaces(u, f, 0.0)
     assert len(corner.starts) >= 2
     assert np.isfinite(corner.log_ratio(u[f <= 0])).mean() > 0.97
 
@@ -92,17 +92,17 @@ def test_a_convex_region_has_tangent_planes(rng):
 )
 def test_what_is_no_corner_has_none(rng, f):
     u = points(rng)
-    assert intersection_of_half_spaces(u, f(u, rng), 0.0, rng) is None
+    assert intersection_of_half_spaces(u, f(u, rng), 0.0) is None
 
 
 def test_a_handful_of_points_has_no_corner(rng):
     u = points(rng, n=10)
-    assert intersection_of_half_spaces(u, parallel(u), 0.0, rng) is None
+    assert intersection_of_half_spaces(u, parallel(u), 0.0) is None
 
 
 def test_planes_that_are_nearly_parallel_are_one(rng):
     """cos of the angle between the second and the third is 0.9995."""
     u = points(rng)
     f = np.max([2.0 - u[:, 0], 1.6 - u[:, 1], 1.55 - (u[:, 1] + 0.03 * u[:, 2])], axis=0)
-    corner = intersection_of_half_spaces(u, f, 0.0, rng)
+    corner = intersection_of_half_spaces(u, f, 0.0)
     assert len(corner.starts) == 2

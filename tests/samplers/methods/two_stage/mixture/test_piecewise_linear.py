@@ -66,7 +66,7 @@ def test_a_piece_with_too_few_points_is_given_up(rng):
 def test_pieces_start_as_regressions_around_points(rng, n):
     """Where all points are of one piece, every start is near it: the first ridge is 0.3."""
     u = rng.standard_normal((100, 3))
-    start = start_pieces(u, 2.0 - u[:, 1], np.arange(100), SETTINGS, n, rng)
+    start = start_pieces(u, 2.0 - u[:, 1], np.arange(n), SETTINGS)
     assert start.slopes.shape == (n, 3)
     np.testing.assert_allclose(start.slopes, np.tile([0.0, -1.0, 0.0], (n, 1)), atol=0.4)
     assert points_of_piece(3, SETTINGS) == 12
