@@ -165,10 +165,14 @@ def is_highway_env_id(env_id: object) -> bool:
 def complete_id(env_id: str) -> str:
     """Return an id with its namespace: of "CutIn-v0", or "CutIn-kinematics-v0", the one that ends so; else as it is.
 
+    The word "rare_envs:" before it, by which `gym.make` imports this package, is left out.
+
     Example:
-        >>> complete_id("CutIn-v0"), complete_id("rare_envs/CutIn-v0"), complete_id("Cut-v0")
+        >>> complete_id("CutIn-v0"), complete_id("rare_envs:rare_envs/CutIn-v0"), complete_id("Cut-v0")
         ('rare_envs/CutIn-v0', 'rare_envs/CutIn-v0', 'Cut-v0')
     """
+    if isinstance(env_id, str):  # what is no id is refused where the scenario is looked for
+        env_id = env_id.removeprefix("rare_envs:")
     known = (each for name in SCENARIOS for each in (name, kinematics_id(name)))
     found = [each for each in known if each.rpartition("/")[2] == env_id]
     return found[0] if len(found) == 1 else env_id
@@ -203,5 +207,5 @@ def split_layout(env_id: str) -> tuple[str, dict[str, str]]:
         ('rare_envs/CutIn-v0', {})
     """
     layouts, env_id = {kinematics_id(each): each for each in SCENARIOS}, complete_id(env_id)
-    known = isinstance(env_id, str) and env_id in layouts  # what is no id is refused where the scenario is looked for
+    known = isinstance(env_id, str) and env_id in layouts
     return (layouts[env_id], dict(HIGHWAY_ENV_LAYOUT)) if known else (env_id, {})

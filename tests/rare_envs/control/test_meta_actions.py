@@ -1,5 +1,7 @@
 """`observation="kinematics"` and `action="meta"` against HighwayEnv itself in float64, and through our environments."""
 
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -322,6 +324,13 @@ def test_an_id_with_highway_envs_layout() -> None:
     assert gym.make_vec("rare_envs/HardBrake-kinematics-v0", num_envs=2).reset()[0].shape == (2, 5, 5)
 
 
+def test_a_script_that_does_not_import_rare_envs_names_it_before_the_colon() -> None:
+    """As HighwayEnv's scripts, in which only the id is changed, do in their workers too."""
+    script = "import gymnasium, highway_env; print(gymnasium.make({!r}).reset(seed=3)[0].shape)"
+    words = [sys.executable, "-c", script.format("rare_envs:rare_envs/CutIn-kinematics-v0")]
+    assert subprocess.run(words, capture_output=True, text=True, check=True).stdout == "(5, 5)\n"
+
+
 def test_the_id_used_in_training_is_taken_everywhere() -> None:
     class Idle:
         def predict(
@@ -332,9 +341,11 @@ def test_the_id_used_in_training_is_taken_everywhere() -> None:
 
     x = rare_envs.DrivingProblem("rare_envs/CutIn-v0").base.sample(4, np.random.default_rng(0))
     short = rare_envs.DrivingProblem("rare_envs/CutIn-kinematics-v0", ego=Idle())
+    imported = rare_envs.DrivingProblem("rare_envs:rare_envs/CutIn-kinematics-v0", ego=Idle())
     whole = rare_envs.DrivingProblem("rare_envs/CutIn-v0", ego=Idle(), observation="kinematics", action="meta")
     np.testing.assert_array_equal(short.evaluate(x), whole.evaluate(x))
-    assert short.env_id == "rare_envs/CutIn-v0"
+    np.testing.assert_array_equal(imported.evaluate(x), whole.evaluate(x))
+    assert short.env_id == imported.env_id == "rare_envs/CutIn-v0"
     many = rare_envs.parallel_env("rare_envs/CutIn-kinematics-v0")
     assert many.action_space("ego") == gym.spaces.Discrete(5)
     assert rare_envs.make_batch("rare_envs/CutIn-kinematics-v0", num_envs=2).single_observation_space.shape == (5, 5)
