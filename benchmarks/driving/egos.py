@@ -72,12 +72,12 @@ print(samplers.estimate(problem, seed=0, max_sim=3000))
 ```
 
 ```text
-P[f <= 0] = 7.43e-04
-  95 % interval [6.70e-04, 8.58e-04], c.o.v. 0.053
-  base distribution 95 %  1.2e-05 to 4.5e-02 (38 + 15 events of 17 scenes, 30 refits); predictive mean 5e-03
+P[f <= 0] = 7.5e-04
+  95 % interval [7.0e-04, 8.3e-04], c.o.v. 0.036
+  base distribution 95 %  1.7e-05 to 3.3e-02 (38 + 15 events of 17 scenes, 30 refits); predictive mean 4e-03
     assumes that the fitted family is correct (1 component, log gaps); errors of the family are not included
-  3,000 simulations, gain over Monte Carlo 162; two-stage, seed 0, converged; 1,062 failing points
-  valid if no failure region was missed; 332 base draws would have met one with probability above 9.0e-03 (95 %
+  3,000 simulations, gain over Monte Carlo 349; two-stage, seed 0, converged; 1,082 failing points
+  valid if no failure region was missed; 330 base draws would have met one with probability above 9.0e-03 (95 %
   confidence)
 ```
 """
