@@ -103,6 +103,7 @@ class OneLineErrors(SummarisedCommands):
 
     def main(self, *args: Any, **extra: Any) -> NoReturn:
         """Run a command and exit."""
+        words = list((args[0] if args else extra.get("args")) or sys.argv[1:])
         received: list[int] = []
         code: Any = None
         ended = False
@@ -112,10 +113,10 @@ class OneLineErrors(SummarisedCommands):
                 code = super().main(*args, **{**extra, "standalone_mode": False})
                 ended = code != 128 + signal.SIGINT
         except _UsageError as error:
-            words = getattr(error, "format_message")().replace("Value error, ", "")  # noqa: B009  (differs by version)
-            path = getattr(getattr(error, "ctx", None), "command_path", "rare-envs")
+            said = getattr(error, "format_message")().replace("Value error, ", "")  # noqa: B009  (differs by version)
+            path = getattr(getattr(error, "ctx", None), "command_path", "") or self._find_path(words)
             help_command = " ".join(["rare-envs", *path.split()[1:]])
-            _fail(f"{words.rstrip('.')}{'' if words.endswith('?') else '.'} See {help_command} --help.")
+            _fail(f"{said.rstrip('.')}{'' if said.endswith('?') else '.'} See {help_command} --help.")
         except (BadInput, EgoGone) as error:
             _fail(str(error))
         except BrokenPipeError:  # whoever read the answer has enough of it
@@ -128,6 +129,17 @@ class OneLineErrors(SummarisedCommands):
             _print_stderr(f"rare-envs: stopped by {number.name}")
             code = 128 + number
         sys.exit(code if isinstance(code, int) else 0)
+
+    def _find_path(self, words: list[str]) -> str:
+        """Return the command that words begin with, for an error that does not know its command."""
+        path: list[str] = ["rare-envs"]
+        command: Any = self
+        for word in words:
+            command = getattr(command, "commands", {}).get(word)
+            if command is None:
+                break
+            path.append(word)
+        return " ".join(path)
 
 
 def find_options(command: Any) -> dict[str, str]:

@@ -2,6 +2,7 @@
 
 import json
 from importlib import resources
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -172,7 +173,8 @@ def test_a_hard_brake_base_is_fitted_to_brakings_to_a_standstill(quick, tmp_path
     ("arguments", "message"),
     [
         ((), "Expected one of --data, --ngsim, --highd, --tgsim, --i24 and --coifman, with a path"),
-        (("--highd", "none"), "has no files XX_tracks.csv"),
+        (("--highd", "none"), "There is no folder none; expected the data folder of highD"),
+        (("--highd", str(Path(__file__).parent)), "has no files XX_tracks.csv"),
         (("--ngsim", "none.csv"), "Cannot read none.csv"),
         (("--tgsim", "none"), "none has no CSV file with a column xloc_kf"),
         (("--i24", "none.json"), "Cannot read none.json"),

@@ -45,8 +45,10 @@ def highd_recordings(folder: Path | str) -> tuple[str, ...]:
     Example:
         >>> highd_recordings("no_such_folder")
         Traceback (most recent call last):
-        ValueError: no_such_folder has no files XX_tracks.csv; is it the data folder of highD?
+        ValueError: There is no folder no_such_folder; expected the data folder of highD, with files XX_tracks.csv.
     """
+    if not Path(folder).is_dir():
+        raise ValueError(f"There is no folder {folder}; expected the data folder of highD, with files XX_tracks.csv.")
     names = tuple(sorted(path.name.removesuffix("_tracks.csv") for path in Path(folder).glob("*_tracks.csv")))
     if not names:
         raise ValueError(f"{folder} has no files XX_tracks.csv; is it the data folder of highD?")

@@ -43,6 +43,8 @@ def test_a_wrong_command_is_one_line(cli: Cli, words: list[str]) -> None:
     ("words", "command"),
     [
         (["estimat"], "rare-envs"),
+        (["estimate", FOLLOWING, "--ego"], "rare-envs estimate"),
+        (["corpus", "run", "--ego"], "rare-envs corpus run"),
         (["list", "--loud"], "rare-envs list"),
         (["corpus", "run"], "rare-envs corpus run"),
         (["estimate", "--max-sim", "ten"], "rare-envs estimate"),
