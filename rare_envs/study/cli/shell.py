@@ -113,7 +113,7 @@ class OneLineErrors(SummarisedCommands):
                 code = super().main(*args, **{**extra, "standalone_mode": False})
                 ended = code != 128 + signal.SIGINT
         except _UsageError as error:
-            said = getattr(error, "format_message")().replace("Value error, ", "")  # noqa: B009  (differs by version)
+            said = _in_plain_words(getattr(error, "format_message")())  # noqa: B009  (differs by version)
             path = getattr(getattr(error, "ctx", None), "command_path", "") or self._find_path(words)
             help_command = " ".join(["rare-envs", *path.split()[1:]])
             _fail(f"{said.rstrip('.')}{'' if said.endswith('?') else '.'} See {help_command} --help.")
@@ -140,6 +140,15 @@ class OneLineErrors(SummarisedCommands):
                 break
             path.append(word)
         return " ".join(path)
+
+
+def _in_plain_words(message: str) -> str:
+    """Return what Typer says of a wrong value without the words of the library that it checks values with."""
+    message = message.replace("Value error, ", "")
+    message = message.replace("Input should be a valid number, unable to parse string as a number", "expected a number")
+    return re.sub(
+        r"Input should be a valid integer, unable to parse string as an \w+", "expected a whole number", message
+    )
 
 
 def find_options(command: Any) -> dict[str, str]:

@@ -39,6 +39,14 @@ def test_a_wrong_command_is_one_line(cli: Cli, words: list[str]) -> None:
     assert_refused(cli(*words), words[-1])
 
 
+@pytest.mark.parametrize("option", ["--gamma", "--horizon", "--target-cov", "--confidence"])
+def test_a_word_in_the_place_of_a_number_is_told_plainly(cli: Cli, option: str) -> None:
+    """In words that name the option; older versions of Typer say "not a valid float"."""
+    result = cli("estimate", FOLLOWING, option, "abc")
+    assert_refused(result, f"'{option}'")
+    assert re.search(r"expected a number\.|'abc' is not a valid float\.", result.stderr)
+
+
 @pytest.mark.parametrize(
     ("words", "command"),
     [
