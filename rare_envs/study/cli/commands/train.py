@@ -9,7 +9,15 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from rare_envs.study.cli.completion import complete_environment, complete_words
-from rare_envs.study.cli.options import JsonOption, NoiseChoice, SeedOption, TrustOption, WorldOptions, read_environment
+from rare_envs.study.cli.options import (
+    JsonOption,
+    NoiseChoice,
+    SeedOption,
+    TrustOption,
+    WorldOptions,
+    read_count,
+    read_environment,
+)
 from rare_envs.study.cli.shell import keep_stdout_for_the_answer, print_json
 from rare_envs.study.errors import BadInput, as_bad_input
 from rare_envs.threads import use_one_thread
@@ -41,7 +49,9 @@ def train_ego_command(
             autocompletion=complete_words("ppo", "a2c", "sac", "td3", "dqn"),
         ),
     ] = None,
-    steps: Annotated[int, typer.Option(help="Environment steps to train for.")] = 200_000,
+    steps: Annotated[
+        int, typer.Option(help="Environment steps to train for.", parser=read_count, metavar="INTEGER")
+    ] = 200_000,
     out: Annotated[Path, typer.Option(help="File to save the ego in.")] = Path("ego.zip"),
     seed: SeedOption = 0,
     num_envs: Annotated[int, typer.Option(help="Episodes that run side by side.")] = 256,
