@@ -70,5 +70,8 @@ def test_broken_highd_folders_are_refused(highd, tmp_path):
     ):
         with pytest.raises(ValueError, match=message):
             load_highd(spoiled(folder, rows, tmp_path, file, **texts), "01")
-    with pytest.raises(ValueError, match="is it the data folder of highD"):
+    with pytest.raises(ValueError, match=r"There is no folder .*none; expected the data folder of highD"):
         highd_recordings(tmp_path / "none")
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(ValueError, match="is it the data folder of highD"):
+        highd_recordings(tmp_path / "empty")
