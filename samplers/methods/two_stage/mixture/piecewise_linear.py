@@ -46,7 +46,7 @@ def start_pieces(u: FloatArray, y: FloatArray, centres: NDArray[np.int64], setti
     distance = np.linalg.norm(u[centres, None] - u, axis=2)
     around = points_of_piece(u.shape[1], settings)
     near = np.argpartition(distance, around - 1, axis=1)[:, :around]
-    return _regress(u, y, near, settings.first_ridge)
+    return _regress(_design(u), y, near, settings.first_ridge)
 
 
 def fit_pieces(
@@ -61,17 +61,19 @@ def fit_pieces(
         settings: Most steps, ridge penalty and points of a piece; one with fewer is given up, and None is left of none.
         inlier_sigmas: As in `assign_points`: points that do not agree are left out.
     """
-    least, before = u.shape[1] + settings.least_points, np.empty(0, dtype=np.int64)
+    least, before = u.shape[1] + settings.least_points, None
+    design = _design(u)
     for _ in range(settings.iterations):
         own, agrees = assign_points(pieces, u, y, inlier_sigmas)
-        own = np.where(agrees, own, -1)
-        if np.array_equal(own, before):
+        if not math.isinf(inlier_sigmas):
+            own = np.where(agrees, own, -1)
+        if before is not None and (own == before).all():
             break
         groups = [np.flatnonzero(own == k) for k in range(len(pieces.intercepts))]
         groups = [group for group in groups if len(group) >= least]
         if not groups:
             return None
-        pieces, before = _regress(u, y, groups, settings.ridge), own
+        pieces, before = _regress(design, y, groups, settings.ridge), own
     return pieces
 
 
@@ -93,11 +95,18 @@ def assign_points(
     return own, deviation <= limit[own] + INLIER_ROUNDING * np.ptp(y)
 
 
-def _regress(u: FloatArray, y: FloatArray, groups: Iterable[NDArray[np.int64]], ridge: float) -> LinearPieces:
-    """Return the ridge regressions of y (n,) on u (n, d) at some groups of points, one piece each."""
-    design, dim = np.column_stack([u, np.ones(len(u))]), u.shape[1]
+def _design(u: FloatArray) -> FloatArray:
+    """Return points u (n, d) with a column of ones, for the intercept, shape (n, d + 1)."""
+    return np.column_stack([u, np.ones(len(u))])
+
+
+def _regress(design: FloatArray, y: FloatArray, groups: Iterable[NDArray[np.int64]], ridge: float) -> LinearPieces:
+    """Return the ridge regressions of y (n,) at some groups of points, one piece each; `design` is (n, d + 1)."""
+    dim = design.shape[1] - 1
     chosen = [(design[group], y[group]) for group in groups]
-    normal = np.array([x.T @ x for x, _ in chosen]) + ridge * np.diag(np.append(np.ones(dim), 0.0))
+    normal = np.array([x.T @ x for x, _ in chosen])
+    slopes = np.arange(dim)
+    normal[:, slopes, slopes] += ridge  # the intercept has no penalty
     moments = np.array([x.T @ values for x, values in chosen])
     coefficients = np.linalg.solve(normal, moments[:, :, None])[:, :, 0]
     return LinearPieces(coefficients[:, dim], coefficients[:, :dim])
