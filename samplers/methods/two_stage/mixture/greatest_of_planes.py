@@ -17,6 +17,7 @@ from samplers.methods.two_stage.mixture.piecewise_linear import (
     LinearPieces,
     assign_points,
     fit_pieces,
+    piece_errors,
     points_of_piece,
     start_pieces,
 )
@@ -168,10 +169,8 @@ def _prune(pieces: LinearPieces, u: FloatArray, y: FloatArray) -> LinearPieces:
 
 def _find_planes(fit: PiecewiseFit, settings: MixtureSettings) -> tuple[FloatArray, FloatArray]:
     """Return the axes (k, d) of the pieces that have points and a direction, and where each begins to fail, (k,)."""
-    counts = np.bincount(fit.own, minlength=len(fit.pieces.intercepts))
     residual = fit.y - fit.pieces.predict(fit.u).min(axis=1)
-    square = np.bincount(fit.own, weights=residual**2, minlength=len(counts))
-    error = np.sqrt(square / np.maximum(counts - fit.u.shape[1] - 1, 1))
+    counts, error = piece_errors(fit.own, residual, len(fit.pieces.intercepts), fit.u.shape[1])
     kept = np.flatnonzero((counts > 0) & (np.linalg.norm(fit.pieces.slopes, axis=1) > 0))
     pieces, error = fit.pieces.take(kept), error[kept]
     steepness = np.linalg.norm(pieces.slopes, axis=1)

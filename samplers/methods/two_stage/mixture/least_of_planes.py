@@ -8,7 +8,7 @@ proposal: how well they fit decides how good it is, not whether the estimate is 
 import numpy as np
 
 from samplers.methods.two_stage.mixture.linear_model import LARGEST_OUTCOME
-from samplers.methods.two_stage.mixture.piecewise_linear import fit_pieces, points_of_piece, start_pieces
+from samplers.methods.two_stage.mixture.piecewise_linear import fit_pieces, piece_errors, points_of_piece, start_pieces
 from samplers.methods.two_stage.mixture.settings import DEFAULT_MIXTURE_SETTINGS, MixtureSettings
 from samplers.problem import FloatArray
 from samplers.proposals.components import HalfSpaceUnion
@@ -65,9 +65,7 @@ def union_of_half_spaces(
     if 1 - float(residual @ residual) / float(((y - y.mean()) ** 2).sum()) < settings.pieces.min_r2:
         return None
     steepness = np.linalg.norm(pieces.slopes, axis=1)
-    counts = np.bincount(own, minlength=len(steepness))
-    square = np.bincount(own, weights=residual**2, minlength=len(steepness))
-    error = np.sqrt(square / np.maximum(counts - dim - 1, 1))
+    counts, error = piece_errors(own, residual, len(steepness), dim)
     with np.errstate(divide="ignore", invalid="ignore"):
         starts = (pieces.intercepts - settings.pieces.crossing_errors * error) / steepness - edges.slack
         kept = (counts > 0) & np.isfinite(starts) & (starts > edges.min_distance)  # a flat piece has no edge

@@ -95,6 +95,15 @@ def assign_points(
     return own, deviation <= limit[own] + INLIER_ROUNDING * np.ptp(y)
 
 
+def piece_errors(
+    own: NDArray[np.int64], residual: FloatArray, n: int, dim: int
+) -> tuple[NDArray[np.int64], FloatArray]:
+    """Return the points of each of n pieces and the standard deviation of their residuals (m,), shape (n,) each."""
+    counts = np.bincount(own, minlength=n)
+    square = np.bincount(own, weights=residual**2, minlength=n)
+    return counts, np.sqrt(square / np.maximum(counts - dim - 1, 1))
+
+
 def _design(u: FloatArray) -> FloatArray:
     """Return points u (n, d) with a column of ones, for the intercept, shape (n, d + 1)."""
     return np.column_stack([u, np.ones(len(u))])
