@@ -85,14 +85,9 @@ class JournalFile:
         self.path, self.head, self.n, self.n_dropped = records.path, head, 0, n_dropped
         self.earlier_seconds = earlier_seconds
         self._records = records
-        self._waiting: list[bytes] = []  # records that could not be written
+        self._waiting: list[tuple[int, bytes]] = []  # records not yet written, with their numbers in the file
         self._opened = self._synced = time.monotonic()
         self._warned = False
-
-    @property
-    def kept(self) -> bool:
-        """Whether all simulations so far are in a file that is still there."""
-        return not self._waiting and self._records.exists
 
     @property
     def has_simulations(self) -> bool:
@@ -187,7 +182,8 @@ class JournalFile:
             UserWarning: They cannot be written; once.
         """
         line = {"points": record.points, "notes": record.notes, "elapsed": round(self._elapsed(), 3)}
-        self._waiting.append(_encode(line) + np.asarray(record.f, dtype="<f8").tobytes())
+        number = self._waiting[-1][0] + 1 if self._waiting else self._records.n
+        self._waiting.append((number, _encode(line) + np.asarray(record.f, dtype="<f8").tobytes()))
         self.n += record.n_sim
         try:
             self._write_waiting()
@@ -196,6 +192,14 @@ class JournalFile:
                 self._synced = time.monotonic()
         except OSError as error:
             self._warn(error)
+
+    def flush(self) -> bool:
+        """Write what is left, and return whether all simulations so far are in a file that is still there."""
+        try:
+            self._write_waiting()
+        except OSError as error:
+            self._warn(error)
+        return not self._waiting and self._records.exists
 
     def close(self) -> None:
         """Leave the journal for later."""
@@ -219,7 +223,9 @@ class JournalFile:
 
     def _write_waiting(self) -> None:
         while self._waiting:
-            self._records.write(self._waiting[0])
+            number, payload = self._waiting[0]
+            if number == self._records.n:  # else it was written before an interruption
+                self._records.write(payload)
             del self._waiting[0]
 
     def _warn(self, error: OSError) -> None:

@@ -13,7 +13,7 @@ import stat
 import struct
 import zlib
 from pathlib import Path
-from typing import IO
+from typing import IO, NamedTuple
 
 from samplers.system import lock_file
 
@@ -34,8 +34,21 @@ class NothingRecorded(JournalError):
     """A journal was cut before its first record was written, so that nothing is lost by beginning it anew."""
 
 
+class _Place(NamedTuple):
+    """Where the next record stands."""
+
+    n: int = 0
+    """Records before it."""
+    end: int = len(MAGIC)
+    """Byte at which it begins."""
+    digest: bytes = b""
+    """Of the record before."""
+
+
 class RecordFile:
     """Records of bytes, read and written in their order.
+
+    An interruption of a call leaves the file as it was before the call or as it is after it; `n` says which.
 
     Attributes:
         path: Of the file.
@@ -69,7 +82,7 @@ class RecordFile:
         flags = os.O_RDWR | (os.O_CREAT if new else 0) | getattr(os, "O_BINARY", 0)
         # unbuffered, so that nothing is left behind of a write that failed
         self._file: IO[bytes] = open(os.open(path, flags, 0o666), "r+b", buffering=0)
-        self._digest, self._end = b"", len(MAGIC)  # of the records that have been read or written
+        self._place = _Place()  # one value, so that no interruption comes between its parts
         self.last: bytes | None = None
         if not stat.S_ISREG(os.fstat(self._file.fileno()).st_mode):  # a pipe would be waited for
             self._file.close()
@@ -84,6 +97,11 @@ class RecordFile:
         return os.fstat(self._file.fileno()).st_size
 
     @property
+    def n(self) -> int:
+        """Number of records that have been read or written."""
+        return self._place.n
+
+    @property
     def exists(self) -> bool:
         """Whether the path still names this file."""
         try:
@@ -94,21 +112,21 @@ class RecordFile:
     @property
     def has_more(self) -> bool:
         """Whether something stands behind the last record that was read or written; not of a closed file."""
-        return not self._file.closed and self.size > self._end
+        return not self._file.closed and self.size > self._place.end
 
     def clear(self) -> None:
         """Remove all records."""
         self._file.truncate(0)
-        self._digest, self._end = b"", 0
-        self._write_at_end(MAGIC)
+        self._write_at(0, MAGIC)
+        self.rewind()
 
     def rewind(self) -> None:
         """Go back to the first record."""
-        self._digest, self._end = b"", len(MAGIC)
+        self._place = _Place()
 
     def read(self) -> bytes | None:
         """Return the next record and step over it; None where there is no whole one."""
-        self._file.seek(self._end)
+        self._file.seek(self._place.end)
         header = self._file.read(_HEADER.size)
         if len(header) < _HEADER.size:
             return None
@@ -118,8 +136,7 @@ class RecordFile:
         payload, digest = self._file.read(length), self._file.read(_DIGEST_SIZE)
         if len(payload) < length or digest != self._digest_of(payload):
             return None
-        self._end += _HEADER.size + length + _DIGEST_SIZE
-        self._digest = digest
+        self._step_over(length, digest)
         return payload
 
     def write(self, payload: bytes) -> None:
@@ -128,9 +145,9 @@ class RecordFile:
         Raises:
             OSError: It cannot be written.
         """
-        digest = self._digest_of(payload)
-        self._write_at_end(_HEADER.pack(len(payload), self._checksum(len(payload))) + payload + digest)
-        self._digest = digest
+        digest, header = self._digest_of(payload), _HEADER.pack(len(payload), self._checksum(len(payload)))
+        self._write_at(self._place.end, header + payload + digest)
+        self._step_over(len(payload), digest)
 
     def mend(self, drop: bool = False) -> int:
         """Verify all records, drop one at the end that was cut while it was written, and go back to the first one.
@@ -158,11 +175,11 @@ class RecordFile:
         n, self.last = 0, None
         while (payload := self.read()) is not None:
             n, self.last = n + 1, payload
-        dropped = self.size - self._end
+        dropped = self.size - self._place.end
         if dropped and not ((drop and n) or self._is_cut()):
             where = f": record {n + 1} does" if n else " from its first record on, which does"
             raise JournalError(f"{str(self.path)!r} is damaged{where} not match its checksum.")
-        self._file.truncate(self._end)
+        self._file.truncate(self._place.end)
         self.rewind()
         return dropped
 
@@ -180,26 +197,31 @@ class RecordFile:
             self._absolute.unlink()
         self._file.close()
 
-    def _write_at_end(self, content: bytes) -> None:
+    def _write_at(self, end: int, content: bytes) -> None:
         rest = memoryview(content)
         try:
-            self._file.seek(self._end)
+            self._file.seek(end)
             while rest:  # a full disk takes a part
                 rest = rest[self._file.write(rest) :]
         except OSError:
-            self._file.truncate(self._end)
+            self._file.truncate(end)
             raise
-        self._end += len(content)
+
+    def _step_over(self, length: int, digest: bytes) -> None:
+        """Go behind the next record, whose payload has a length."""
+        n, end, _ = self._place
+        self._place = _Place(n + 1, end + _HEADER.size + length + _DIGEST_SIZE, digest)
 
     def _is_cut(self) -> bool:
         """Return whether what stands behind the last whole record is one record, or zeros alone."""
-        self._file.seek(self._end)
+        end = self._place.end
+        self._file.seek(end)
         header = self._file.read(_HEADER.size)
         if len(header) < _HEADER.size:
             return True
         length, checksum = _HEADER.unpack(header)
         if checksum == self._checksum(length):
-            return bool(self._end + _HEADER.size + length + _DIGEST_SIZE >= self.size)
+            return bool(end + _HEADER.size + length + _DIGEST_SIZE >= self.size)
         if header.strip(b"\0"):
             return False
         while block := self._file.read(_BLOCK):
@@ -208,7 +230,7 @@ class RecordFile:
         return True
 
     def _checksum(self, length: int) -> int:
-        return zlib.crc32(self._digest + length.to_bytes(8, "little"))
+        return zlib.crc32(self._place.digest + length.to_bytes(8, "little"))
 
     def _digest_of(self, payload: bytes) -> bytes:
-        return hashlib.blake2b(self._digest + payload, digest_size=_DIGEST_SIZE).digest()
+        return hashlib.blake2b(self._place.digest + payload, digest_size=_DIGEST_SIZE).digest()

@@ -84,7 +84,7 @@ def describe_kept(journal: JournalFile, folder: Path, trust: bool, report: Repor
         trust: Whether the ego's file may run code.
         report: The answer, where there is one.
     """
-    if not journal.has_simulations or not journal.kept:
+    if not journal.has_simulations or not journal.flush():
         return ""
     kept = f"{_count_kept(journal, report)} are" if journal.n else "What was simulated is"
     return f" {kept} kept; go on with: rare-envs resume {shlex.quote(str(folder))}{' --trust' if trust else ''}"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 import signal
 import subprocess
@@ -10,6 +11,8 @@ import time
 import warnings
 from collections.abc import Callable
 from pathlib import Path
+from types import FrameType
+from typing import Any
 
 import numpy as np
 import pytest
@@ -179,6 +182,52 @@ def test_a_full_disk_ends_nothing_and_what_waits_is_written_later(
         again = samplers.estimate(samplers.FunctionProblem(f, 4), method, seed=1, max_sim=3000, journal=tmp_path / "j")
     assert again == result
     assert calls == [8]
+
+
+def interrupt_at(line: int, call: Callable[[], None]) -> bool:
+    """Call, with an interruption before the n-th line that it runs of journals; return whether there was one."""
+    left = [line]
+
+    def trace(frame: FrameType, event: str, _: Any) -> Any:
+        if Path(frame.f_code.co_filename).name not in ("journal.py", "record_file.py"):
+            return None
+        left[0] -= event == "line"
+        if event == "line" and left[0] == 0:
+            sys.settrace(None)
+            raise KeyboardInterrupt
+        return trace
+
+    before = sys.gettrace()
+    sys.settrace(trace)
+    try:
+        call()
+    except KeyboardInterrupt:
+        return True
+    finally:
+        sys.settrace(before)
+    return False
+
+
+def test_interrupted_anywhere_in_a_write_each_record_stands_there_once(tmp_path: Path) -> None:
+    """A signal that comes while a journal is written is the most likely one: a run writes after each chunk."""
+    path, records = tmp_path / "journal.bin", [JournalRecord(str(k), np.full(3, float(k)), {}) for k in range(4)]
+    for line in itertools.count(1):
+        journal = JournalFile.create(path, {}, replace=True)
+        journal.append(records[0])
+        interrupted = interrupt_at(line, lambda journal=journal: journal.append(records[1]))  # type: ignore[misc]
+        taken = journal.n == 6 or not interrupted
+        if taken:
+            assert journal.flush()
+        for record in records[2:]:
+            journal.append(record)
+        journal.close()
+        journal = JournalFile.open(path)
+        found = [record.points for record in iter(journal.read_next, None)]
+        journal.close()
+        assert found in (["0", "1", "2", "3"], *([] if taken else [["0", "2", "3"]])), line
+        if not interrupted:
+            break
+    assert line > 20
 
 
 def test_what_was_written_is_on_the_disk_within_the_interval(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
