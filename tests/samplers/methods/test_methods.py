@@ -11,10 +11,18 @@ import samplers
 from samplers.limit_states import four_branches, half_space, parabola, plateau, two_modes
 from samplers.problem import FunctionProblem
 from samplers.registry import METHODS
-from samplers.testing import METHOD_CHECKS
+from samplers.testing import METHOD_CHECKS, check_accuracy
+
+RUNS = {"two-stage": 14, "surrogate": 5, "ice": 20, "is": 30}
+"""Runs per problem of the methods whose own work takes long; the others make 60."""
+MAX_SIM = {"two-stage": 3000, "surrogate": 250}
+"""Simulations of each of these runs, where they are not the method's own number; with many seeds they are."""
 
 
-@pytest.fixture(params=sorted(set(METHODS) - {"auto"}))  # "auto" is another of them; those of other packages too
+ALL = sorted(set(METHODS) - {"auto"})  # "auto" is another of them; those of other packages too
+
+
+@pytest.fixture(params=ALL)
 def method(request):
     return samplers.get_method(request.param)
 
@@ -33,9 +41,17 @@ def test_our_own_are_frozen_documented_dataclasses_that_can_be_asked(name):
         assert f"{field.name}:" in type(method).__doc__
 
 
-@pytest.mark.parametrize("check", METHOD_CHECKS, ids=lambda check: check.__name__)
+@pytest.mark.parametrize("check", [check for check in METHOD_CHECKS if check is not check_accuracy])
 def test_does_what_every_method_must_do(method, check):
     check(method)
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=pytest.mark.slow if name == "surrogate" else ()) for name in ALL]
+)
+def test_accuracy_as_every_method_must_have_it(name):
+    """The surrogate, with 2,000 simulations, takes half a minute; `test_right_on_average_and_covered` has it too."""
+    check_accuracy(samplers.get_method(name))
 
 
 def test_failing_points_fail_and_are_all_counted(method, recorder):
@@ -71,7 +87,7 @@ def test_works_through_any_base(method):
 
     p = stats.gamma.sf(7.0, 2)
     runs = 8
-    results = [samplers.estimate(Sum(), method, seed=seed) for seed in range(runs)]
+    results = [samplers.estimate(Sum(), method, seed=seed, max_sim=MAX_SIM.get(method.name)) for seed in range(runs)]
     ratios = np.array([result.p for result in results]) / p
     assert ratios.mean() == pytest.approx(1.0, abs=4 * ratios.std(ddof=1) / np.sqrt(runs) + 0.04)
     assert (results[0].failures.x.sum(axis=1) >= 7.0).all()
@@ -130,12 +146,6 @@ REFERENCES = [half_space(2, 3.0), two_modes(), parabola(2.8), four_branches(3.0)
 BIAS = {"two-stage": 0.005, "surrogate": 0.0, "mc": 0.0, "is": 0.01, "ce": 0.01, "ice": 0.0, "ss": 0.05, "adss": 0.05}
 """Subset simulation carries a bias of order 1/N, some percent at N = 1000 (its docstring);
 cross-entropy misses a little of the tail beyond its proposal in most runs."""
-
-
-RUNS = {"two-stage": 14, "surrogate": 5, "ice": 20, "is": 30}
-"""Runs per problem of the methods whose own work takes long; the others make 60."""
-MAX_SIM = {"two-stage": 3000, "surrogate": 250}
-"""Simulations of each of these runs, where they are not the method's own number; with many seeds they are."""
 
 
 @functools.cache
