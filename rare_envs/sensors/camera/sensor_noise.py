@@ -4,6 +4,7 @@ A 32-bit hash of these gives four bytes; their sum, centred and scaled, has mean
 (the Irwin-Hall distribution of four terms, which ends at 3.5 standard deviations).
 """
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -23,14 +24,14 @@ def draw_pixel_noise(context: CameraContext, values: int) -> Tensor:
     for number in (context.tick, torch.full_like(context.tick, context.viewer)):
         key = _mix(key + (number.to(torch.int32) + 1) * _STEP)
     place = torch.arange(values, dtype=torch.int32, device=key.device) * _STEP
-    noise = torch.empty(len(key), values, device=key.device)
-    at_once = 1 if key.device.type == "cpu" else max(len(key), 1)  # one picture stays in the cache of a processor
-    for mixed, rows in zip(torch.split(key, at_once), torch.split(noise, at_once), strict=True):
-        bits = _mix(place + mixed[:, None])
-        pairs = (bits >> 8).bitwise_and_(_EVEN).add_(bits.bitwise_and_(_EVEN))  # bytes 0 + 1 and 2 + 3
-        total = pairs.mul_(_BOTH) >> 16
-        torch.sub(total, _MEAN, out=rows).div_(_DEVIATION)
-    return noise
+    return add_bytes_unsigned(key, place) if key.device.type == "cpu" else add_bytes(key, place)
+
+
+def add_bytes(key: Tensor, place: Tensor) -> Tensor:
+    """Return the scaled sums of bytes for keys (B,) and places (V,), int32 both, shape (B, V)."""
+    bits = _mix(place + key[:, None])
+    pairs = (bits >> 8).bitwise_and_(_EVEN).add_(bits.bitwise_and_(_EVEN))  # bytes 0 + 1 and 2 + 3
+    return (pairs.mul_(_BOTH) >> 16).sub(_MEAN).div_(_DEVIATION)
 
 
 def _mix(bits: Tensor) -> Tensor:
@@ -38,3 +39,27 @@ def _mix(bits: Tensor) -> Tensor:
     bits.bitwise_xor_((bits >> 16).bitwise_and_(0xFFFF)).mul_(_FACTORS[0])
     bits.bitwise_xor_((bits >> 15).bitwise_and_(0x1FFFF)).mul_(_FACTORS[1])
     return bits.bitwise_xor_((bits >> 16).bitwise_and_(0xFFFF))
+
+
+def add_bytes_unsigned(key: Tensor, place: Tensor) -> Tensor:
+    """Return the same as `add_bytes`, bit for bit, in half of its time on a processor.
+
+    torch has no shifts of unsigned integers, and a picture at a time stays in the cache.
+    """
+    noise = np.empty((len(key), len(place)), dtype=np.float32)
+    keys, places = (each.numpy().view(np.uint32) for each in (key, place))
+    bits, moved = np.empty_like(places), np.empty_like(places)
+    for mixed, row in zip(keys, noise, strict=True):
+        np.add(places, mixed, out=bits)
+        for shift, factor in zip((16, 15), _FACTORS, strict=True):
+            bits ^= np.right_shift(bits, shift, out=moved)
+            bits *= np.uint32(factor % 2**32)
+        bits ^= np.right_shift(bits, 16, out=moved)
+        np.bitwise_and(np.right_shift(bits, 8, out=moved), _EVEN, out=moved)
+        bits &= _EVEN
+        bits += moved  # bytes 0 + 1 and 2 + 3
+        bits *= np.uint32(_BOTH)
+        np.right_shift(bits, 16, out=bits)
+        np.subtract(bits.view(np.int32), np.float32(_MEAN), out=row, dtype=np.float32, casting="unsafe")
+        row /= np.float32(_DEVIATION)
+    return torch.from_numpy(noise)

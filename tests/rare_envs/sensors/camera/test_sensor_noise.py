@@ -8,7 +8,7 @@ import torch
 from scipy import stats
 
 from rare_envs.sensors.camera import Camera, CameraContext, Weather
-from rare_envs.sensors.camera.sensor_noise import draw_pixel_noise
+from rare_envs.sensors.camera.sensor_noise import add_bytes, add_bytes_unsigned, draw_pixel_noise
 
 N = 3 * 66 * 200
 """Values of a picture."""
@@ -85,3 +85,10 @@ def test_noise_is_white() -> None:
     pairs = torch.cat(pictures)
     across = torch.corrcoef(pairs) - torch.eye(len(pairs))
     assert across.abs().max() < 5 / math.sqrt(N)
+
+
+def test_signed_and_unsigned_integers_give_the_same_noise() -> None:
+    """The first are those of a graphics card, the second those of a processor."""
+    rng = torch.Generator().manual_seed(3)
+    key, place = (torch.randint(-(2**31), 2**31, (n,), generator=rng).to(torch.int32) for n in (50, 3000))
+    assert torch.equal(add_bytes(key, place), add_bytes_unsigned(key, place))
