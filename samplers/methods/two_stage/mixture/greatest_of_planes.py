@@ -17,6 +17,7 @@ from samplers.methods.two_stage.mixture.piecewise_linear import (
     LinearPieces,
     assign_points,
     fit_pieces,
+    fit_plane,
     piece_errors,
     points_of_piece,
     start_pieces,
@@ -53,9 +54,18 @@ class PiecewiseFit(NamedTuple):
         """Return whether f is what the pieces say at most of the points."""
         return self.r2 > settings.exact_r2 and self.share > settings.agreeing_share
 
-    def locates_edges(self, settings: LinearModelSettings) -> bool:
-        """Return whether the pieces also locate where failure begins."""
-        return self.r2 > settings.boundary_r2 and self.share > settings.agreeing_share
+    def is_whole(self, settings: LinearModelSettings) -> bool:
+        """Return whether it is so at nearly all of them: a fit with a piece fewer leaves the points of that one out."""
+        return self.is_exact(settings) and self.explained > settings.boundary_r2
+
+
+class PiecewiseSample(NamedTuple):
+    """Points that pieces are fitted to."""
+
+    u: FloatArray
+    """Shape (n, d)."""
+    y: FloatArray
+    """gamma - f there, in units of its spread, shape (n,)."""
 
 
 def intersection_of_half_spaces(
@@ -66,10 +76,9 @@ def intersection_of_half_spaces(
 ) -> HalfSpaceIntersection | None:
     """Return the corner in which all pieces of f fail, or None where no two or more pieces explain f.
 
-    The pieces are fitted to the failing points, to all and to those that do not fail: another region may be the lesser
-    one beside the failures, and f may be the same for all failures. The first fit that locates the edge counts, else
-    the best one. Each half-space begins before its plane by `LinearModelSettings.crossing_errors` standard deviations
-    of its residuals and by `slack`.
+    The pieces are fitted to all points, to the failing ones and to those that do not fail: another region may be the
+    lesser one beside the failures, and f may be the same for all failures. Each half-space begins before its plane by
+    `LinearModelSettings.crossing_errors` standard deviations of its residuals and by `slack`.
 
     Args:
         u: Points around one failure region, shape (n, d).
@@ -88,50 +97,76 @@ def intersection_of_half_spaces(
         >>> corner.starts.round(2)
         array([1.98, 1.48])
     """
-    linear = settings.linear_model
     finite = np.isfinite(f) & (np.abs(f) < LARGEST_OUTCOME)
     u, f = u[finite], f[finite]
-    fails, best = f <= gamma, None
-    for used in (np.ones(len(f), dtype=bool), fails, ~fails):
-        fit = _fit_least(u[used], gamma - f[used], settings)
-        if fit is not None and (best is None or fit.explained > best.explained):
-            best = fit
-        if best is not None and best.is_exact(linear):
-            break
-    if best is None or best.explained < settings.pieces.min_r2:
+    fails = f <= gamma
+    used = (np.ones(len(f), dtype=bool), fails, ~fails)
+    samples = [_scale_sample(u[rows], gamma - f[rows], settings) for rows in used]
+    fit = _find_fit([sample for sample in samples if sample is not None], settings)
+    if fit is None or fit.r2 < settings.corner.min_r2 or fit.share <= settings.linear_model.agreeing_share:
         return None
-    axes, starts = _find_planes(best, settings)
-    if (best.y < 0).all() or not best.locates_edges(linear):  # f may jump where failure begins
+    axes, starts = _find_planes(fit, settings)
+    if (fit.y < 0).all():  # f may jump where failure begins
         starts = np.minimum(starts, _edges_along(axes, u[fails], settings))
     return _beyond_planes(axes, starts, settings)
 
 
-def _fit_least(u: FloatArray, y: FloatArray, settings: MixtureSettings) -> PiecewiseFit | None:
-    """Return the best of some fits of pieces to y (n,) at u (n, d); None where points are too few.
-
-    Points that do not agree are left out at last only: before, they may be those of a piece that is still to come.
-    """
-    size = float(np.abs(y).max()) if len(y) else 0.0
+def _scale_sample(u: FloatArray, y: FloatArray, settings: MixtureSettings) -> PiecewiseSample | None:
+    """Return at most some of the points u (n, d), with y (n,) in units of its spread; None where they are too few."""
+    size, dim = float(np.abs(y).max()) if len(y) else 0.0, u.shape[1]
     unit = size * float((y / size).std()) if size > 0 else 0.0  # a square may overflow
-    if unit == 0 or len(y) < points_of_piece(u.shape[1], settings.pieces):
+    if unit == 0 or len(y) < points_of_piece(dim, settings.pieces):
         return None
-    rows = _spread(len(y), settings.corner.most_points)
-    u, scaled, best, linear = u[rows], y[rows] / unit, None, settings.linear_model
-    order = np.argsort(scaled, kind="stable")
-    for k in range(settings.corner.starts):
-        centres = order[_spread(len(order), settings.corner.n, (k + 0.5) / settings.corner.starts)]
-        pieces = fit_pieces(start_pieces(u, scaled, centres, settings.pieces), u, scaled, settings.pieces)
-        if pieces is not None:
-            pieces = fit_pieces(_prune(pieces, u, scaled), u, scaled, settings.pieces, linear.inlier_sigmas)
-        if pieces is None:
-            continue
-        fit = _judge(pieces, u, scaled, linear.inlier_sigmas)
-        if best is None or fit.explained > best.explained:
-            best = fit
-        whole = best.is_exact(linear) and best.explained > linear.boundary_r2  # a piece fewer leaves its points out
-        if whole or len(pieces.intercepts) == 1:
+    rows = _spread(len(y), settings.corner.points_per_dim * dim)
+    return PiecewiseSample(u[rows], y[rows] / unit)
+
+
+def _find_fit(samples: list[PiecewiseSample], settings: MixtureSettings) -> PiecewiseFit | None:
+    """Return the best of some fits of pieces, None without one.
+
+    One of each sample, until one is exact. Where the best of them has several pieces and is promising, its sample has
+    further ones, which start elsewhere.
+    """
+    corner, linear = settings.corner, settings.linear_model
+    best, chosen = None, None
+    for sample in samples:
+        fit = _fit_from(sample, 0, settings)
+        if fit is not None and (best is None or fit.explained > best.explained):
+            best, chosen = fit, sample
+        if best is not None and best.is_exact(linear):
             break
+    if best is None or chosen is None or len(best.pieces.intercepts) == 1 or best.r2 < corner.promising_r2:
+        return best
+    for start in range(1, corner.starts):
+        if best.is_whole(linear):
+            break
+        fit = _fit_from(chosen, start, settings)
+        if fit is not None and fit.explained > best.explained:
+            best = fit
     return best
+
+
+def _fit_from(sample: PiecewiseSample, start: int, settings: MixtureSettings) -> PiecewiseFit | None:
+    """Return the fit of pieces from the points of one of the starts; None where it explains too little of y.
+
+    Where one plane explains y, that is the fit. Points that do not agree are left out at last only: before, they may be
+    those of a piece that is still to come.
+    """
+    (u, y), corner, linear = sample, settings.corner, settings.linear_model
+    plane = _judge(fit_plane(u, y, settings.pieces), sample, linear.inlier_sigmas)
+    if plane.is_whole(linear):
+        return plane
+    order = np.argsort(y, kind="stable")
+    centres = order[_spread(len(order), corner.n, (start + 0.5) / corner.starts)]
+    first = start_pieces(u, y, centres, settings.pieces)
+    pieces = fit_pieces(first, u, y, settings.pieces, patience=corner.patience)
+    if pieces is None:
+        return None
+    pieces = _prune(pieces, u, y)
+    if _judge(pieces, sample, linear.inlier_sigmas).r2 < settings.pieces.min_r2:
+        return None
+    pieces = fit_pieces(pieces, u, y, settings.pieces, linear.inlier_sigmas, corner.patience)
+    return None if pieces is None else _judge(pieces, sample, linear.inlier_sigmas)
 
 
 def _spread(n: int, most: int, offset: float = 0.0) -> NDArray[np.int64]:
@@ -140,12 +175,13 @@ def _spread(n: int, most: int, offset: float = 0.0) -> NDArray[np.int64]:
     return ((np.arange(k) + offset) * n / k).astype(np.int64)
 
 
-def _judge(pieces: LinearPieces, u: FloatArray, y: FloatArray, inlier_sigmas: float) -> PiecewiseFit:
-    """Return pieces with the points u (n, d), y (n,) that agree with them."""
-    own, agrees = assign_points(pieces, u, y, inlier_sigmas)
+def _judge(pieces: LinearPieces, sample: PiecewiseSample, inlier_sigmas: float) -> PiecewiseFit:
+    """Return pieces with the points that agree with them."""
+    u, y = sample
+    own, agrees, deviation = assign_points(pieces, u, y, inlier_sigmas)
     u, y, own, share = u[agrees], y[agrees], own[agrees], float(agrees.mean())
     variance = float(y.var())
-    square = float(((y - pieces.predict(u).min(axis=1)) ** 2).mean())
+    square = float((deviation[agrees] ** 2).mean())
     return PiecewiseFit(pieces, u, y, own, 1 - square / variance if variance > 0 else 0.0, share)
 
 

@@ -18,6 +18,11 @@ from samplers.methods.two_stage.mixture.linear_model import INLIER_ROUNDING, MAD
 from samplers.methods.two_stage.mixture.settings import PieceSettings
 from samplers.problem import FloatArray
 
+LEAST_GAIN = 0.01
+"""Share of the mean square of the residuals."""
+NO_PIECE = -1
+"""In place of the number of a piece."""
+
 
 class LinearPieces(NamedTuple):
     """y(u) = min_k (intercept_k + slope_k . u)."""
@@ -49,8 +54,18 @@ def start_pieces(u: FloatArray, y: FloatArray, centres: NDArray[np.int64], setti
     return _regress(_design(u), y, near, settings.first_ridge)
 
 
+def fit_plane(u: FloatArray, y: FloatArray, settings: PieceSettings) -> LinearPieces:
+    """Return the regression of y (n,) on all points u (n, d) as the only piece."""
+    return _regress(_design(u), y, [np.arange(len(y))], settings.ridge)
+
+
 def fit_pieces(
-    pieces: LinearPieces, u: FloatArray, y: FloatArray, settings: PieceSettings, inlier_sigmas: float = math.inf
+    pieces: LinearPieces,
+    u: FloatArray,
+    y: FloatArray,
+    settings: PieceSettings,
+    inlier_sigmas: float = math.inf,
+    patience: int | None = None,
 ) -> LinearPieces | None:
     """Return the pieces after regressions, each on the points at which it is the least one, until no point moves.
 
@@ -60,14 +75,18 @@ def fit_pieces(
         y: Their values, shape (n,).
         settings: Most steps, ridge penalty and points of a piece; one with fewer is given up, and None is left of none.
         inlier_sigmas: As in `assign_points`: points that do not agree are left out.
+        patience: Steps without a gain, a mean square of residuals that is a `LEAST_GAIN` lower, that end the fit as
+            well: where pieces do not explain y, points move to and fro. None: no number of them does.
     """
-    least, before = u.shape[1] + settings.least_points, None
-    design = _design(u)
+    least, design = u.shape[1] + settings.least_points, _design(u)
+    before, lowest, idle = None, math.inf, 0
     for _ in range(settings.iterations):
-        own, agrees = assign_points(pieces, u, y, inlier_sigmas)
-        if not math.isinf(inlier_sigmas):
-            own = np.where(agrees, own, -1)
-        if before is not None and (own == before).all():
+        own, agrees, deviation = assign_points(pieces, u, y, inlier_sigmas)
+        square = float((deviation[agrees] ** 2).mean())
+        idle = 0 if square < (1 - LEAST_GAIN) * lowest else idle + 1
+        lowest = min(lowest, square)
+        own = np.where(agrees, own, NO_PIECE)
+        if idle == patience or (before is not None and (own == before).all()):
             break
         groups = [np.flatnonzero(own == k) for k in range(len(pieces.intercepts))]
         groups = [group for group in groups if len(group) >= least]
@@ -79,20 +98,22 @@ def fit_pieces(
 
 def assign_points(
     pieces: LinearPieces, u: FloatArray, y: FloatArray, inlier_sigmas: float = math.inf
-) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-    """Return the least piece at each point u (n, d), and whether y (n,) agrees with it, shape (n,) each.
+) -> tuple[NDArray[np.int64], NDArray[np.bool_], FloatArray]:
+    """Return the least piece at each point u (n, d), whether y (n,) agrees with it, and how far it is off, (n,) each.
 
     It does within so many standard deviations, these from the median absolute deviation of the piece's own points: of
     all points, those of an exact piece would rule out those of another one.
     """
     predicted = pieces.predict(u)
     own = predicted.argmin(axis=1)
+    deviation, limit = np.abs(y - predicted[np.arange(len(y)), own]), np.zeros(len(pieces.intercepts))
     if math.isinf(inlier_sigmas):
-        return own, np.ones(len(y), dtype=bool)
-    deviation, limit = np.abs(y - predicted.min(axis=1)), np.zeros(len(pieces.intercepts))
-    for k in np.unique(own):
-        limit[k] = inlier_sigmas * MAD_TO_SIGMA * np.median(deviation[own == k])
-    return own, deviation <= limit[own] + INLIER_ROUNDING * np.ptp(y)
+        return own, np.ones(len(y), dtype=bool), deviation
+    for k in range(len(limit)):
+        deviations = deviation[own == k]
+        if len(deviations):
+            limit[k] = inlier_sigmas * MAD_TO_SIGMA * _median(deviations)
+    return own, deviation <= limit[own] + INLIER_ROUNDING * np.ptp(y), deviation
 
 
 def piece_errors(
@@ -104,6 +125,13 @@ def piece_errors(
     return counts, np.sqrt(square / np.maximum(counts - dim - 1, 1))
 
 
+def _median(x: FloatArray) -> float:
+    """Return the median of x (n,), n > 0 and without NaN: for short arrays several times as fast as `np.median`."""
+    middle = len(x) // 2
+    ordered = np.partition(x, (middle - 1, middle) if len(x) % 2 == 0 else middle)
+    return float(ordered[middle] if len(x) % 2 else 0.5 * (ordered[middle - 1] + ordered[middle]))
+
+
 def _design(u: FloatArray) -> FloatArray:
     """Return points u (n, d) with a column of ones, for the intercept, shape (n, d + 1)."""
     return np.column_stack([u, np.ones(len(u))])
@@ -112,7 +140,7 @@ def _design(u: FloatArray) -> FloatArray:
 def _regress(design: FloatArray, y: FloatArray, groups: Iterable[NDArray[np.int64]], ridge: float) -> LinearPieces:
     """Return the ridge regressions of y (n,) at some groups of points, one piece each; `design` is (n, d + 1)."""
     dim = design.shape[1] - 1
-    chosen = [(design[group], y[group]) for group in groups]
+    chosen = [(design.take(group, axis=0), y[group]) for group in groups]
     normal = np.array([x.T @ x for x, _ in chosen])
     slopes = np.arange(dim)
     normal[:, slopes, slopes] += ridge  # the intercept has no penalty

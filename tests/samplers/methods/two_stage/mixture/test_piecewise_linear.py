@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from samplers.methods.two_stage.mixture import piecewise_linear
 from samplers.methods.two_stage.mixture.piecewise_linear import (
     LinearPieces,
     assign_points,
@@ -40,7 +41,7 @@ def test_points_of_something_else_are_left_out(rng):
     sigmas = DEFAULT_MIXTURE_SETTINGS.linear_model.inlier_sigmas
     found = fit_pieces(fit_pieces(TRUE, u, y, SETTINGS), u, y, SETTINGS, sigmas)
     np.testing.assert_allclose(found.slopes, TRUE.slopes, atol=1e-3)
-    _, agrees = assign_points(found, u, y, sigmas)
+    _, agrees, _ = assign_points(found, u, y, sigmas)
     assert 0.85 < agrees.mean() < 0.95
 
 
@@ -49,10 +50,35 @@ def test_an_exact_piece_does_not_rule_out_the_points_of_a_rough_one(rng):
     u, y = points(rng)
     own = TRUE.predict(u).argmin(axis=1)
     y = y + np.where(own == 1, rng.normal(0, 0.1, len(y)), 0.0)
-    piece, agrees = assign_points(TRUE, u, y, 3.0)
+    piece, agrees, _ = assign_points(TRUE, u, y, 3.0)
     np.testing.assert_array_equal(piece, own)
     assert agrees[own == 0].all()
     assert agrees[own == 1].mean() > 0.95
+
+
+def test_a_fit_that_gains_nothing_ends(rng, monkeypatch):
+    """Of noise pieces explain nothing, and points go to and fro until the steps are used up."""
+    u = rng.standard_normal((400, 3))
+    start = start_pieces(u, rng.standard_normal(400), np.arange(6), SETTINGS)
+    y = rng.standard_normal(400)
+    steps = []
+    assign = piecewise_linear.assign_points
+    monkeypatch.setattr(
+        piecewise_linear, "assign_points", lambda *arguments: steps.append(arguments) or assign(*arguments)
+    )
+    fit_pieces(start, u, y, SETTINGS)
+    all_steps = len(steps)
+    fit_pieces(start, u, y, SETTINGS, patience=2)
+    assert len(steps) - all_steps < all_steps
+    np.testing.assert_allclose(
+        fit_pieces(perturbed(rng), *points(rng), SETTINGS, patience=2).slopes, TRUE.slopes, atol=1e-4
+    )
+
+
+@pytest.mark.parametrize("n", [1, 2, 5, 300, 301])
+def test_the_median_is_that_of_numpy(rng, n):
+    x = rng.standard_normal(n)
+    assert piecewise_linear._median(x) == np.median(x)
 
 
 def test_a_piece_with_too_few_points_is_given_up(rng):
