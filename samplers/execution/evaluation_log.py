@@ -28,7 +28,6 @@ class EvaluationLog:
     Attributes:
         n_sim: Rows recorded, and what gradients cost.
         n_errors: Rows without an outcome.
-        failures: The most likely failing points.
     """
 
     def __init__(
@@ -36,7 +35,8 @@ class EvaluationLog:
     ) -> None:
         self.n_sim = 0
         self.n_errors = 0
-        self.failures = Failures.empty(dim)
+        self._failures = Failures.empty(dim)
+        self._new: list[tuple[FloatArray, FloatArray]] = []
         self._base = base
         self._gamma = gamma
         self._on_error = on_error
@@ -57,13 +57,26 @@ class EvaluationLog:
         self._keep_failures(x, f, missing | (f <= self._gamma))
         return np.where(missing, NO_OUTCOME, np.maximum(f, SMALLEST_F))
 
+    @property
+    def failures(self) -> Failures:
+        """The most likely failing points."""
+        self._merge_new()
+        return self._failures
+
     def add_cost(self, n: int) -> None:
         """Count n simulations that gave gradients and no outcomes."""
         self.n_sim += n
 
     def _keep_failures(self, x: FloatArray, f: FloatArray, failing: NDArray[np.bool_]) -> None:
-        """Merge the failing ones of the rows of x (n, d) into the failures kept."""
+        """Keep the failing ones of the rows of x (n, d)."""
         if failing.any():
-            failing_x = x[failing]
-            log_p0 = np.asarray(self._base.log_prob(failing_x), dtype=np.float64)
-            self.failures = self.failures.merge(failing_x, f[failing], log_p0, keep=self._keep)
+            self._new.append((x[failing], f[failing]))
+            if sum(len(rows) for _, rows in self._new) >= self._keep:
+                self._merge_new()
+
+    def _merge_new(self) -> None:
+        """Merge the new failing points into the most likely ones: the density of many costs little more than of one."""
+        if self._new:
+            x, f = (np.concatenate(parts) for parts in zip(*self._new, strict=True))
+            log_p0 = np.asarray(self._base.log_prob(x), dtype=np.float64)
+            self._failures, self._new = self._failures.merge(x, f, log_p0, keep=self._keep), []

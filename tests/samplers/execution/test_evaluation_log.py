@@ -55,3 +55,24 @@ def test_failures_are_ranked_by_density_and_bounded(rng):
     np.testing.assert_allclose(log_prob(log.failures.x), expected)
     np.testing.assert_array_equal(log.failures.f, log.failures.x[:, 0])
     assert log.failures.total == len(failing)
+
+
+def test_the_density_of_failures_is_asked_for_many_at_once(rng):
+    """A batch of a few rows costs a base fitted to data milliseconds: only `keep` new ones, or a reader, ask for it."""
+
+    class CountingNormal(StandardNormal):
+        asked = 0
+
+        def log_prob(self, x):
+            CountingNormal.asked += 1
+            return super().log_prob(x)
+
+    log = EvaluationLog(2, CountingNormal(2), 0.0, keep=10)
+    x = -np.abs(rng.standard_normal((24, 2)))
+    for part in np.split(x, 8):
+        log.record(part, part[:, 0])
+    assert CountingNormal.asked == 2  # after 12 and 24
+    assert log.failures.total == 24
+    assert log.failures is log.failures
+    log.record(x[:1], x[:1, 0])
+    assert (log.failures.total, CountingNormal.asked) == (25, 3)

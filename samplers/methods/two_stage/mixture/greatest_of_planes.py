@@ -58,6 +58,10 @@ class PiecewiseFit(NamedTuple):
         """Return whether it is so at nearly all of them: a fit with a piece fewer leaves the points of that one out."""
         return self.is_exact(settings) and self.explained > settings.boundary_r2
 
+    def locates_edges(self, settings: LinearModelSettings) -> bool:
+        """Return whether the pieces locate where failure begins."""
+        return self.r2 > settings.boundary_r2 and self.share > settings.agreeing_share
+
 
 class PiecewiseSample(NamedTuple):
     """Points that pieces are fitted to."""
@@ -103,7 +107,7 @@ def intersection_of_half_spaces(
     used = (np.ones(len(f), dtype=bool), fails, ~fails)
     samples = [_scale_sample(u[rows], gamma - f[rows], settings) for rows in used]
     fit = _find_fit([sample for sample in samples if sample is not None], settings)
-    if fit is None or fit.r2 < settings.corner.min_r2 or fit.share <= settings.linear_model.agreeing_share:
+    if fit is None or not fit.locates_edges(settings.linear_model):
         return None
     axes, starts = _find_planes(fit, settings)
     if (fit.y < 0).all():  # f may jump where failure begins

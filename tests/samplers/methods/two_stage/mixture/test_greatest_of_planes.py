@@ -97,10 +97,10 @@ def test_what_is_no_corner_has_none(rng, f):
 
 
 def test_planes_that_hold_only_roughly_are_no_corner(rng):
-    """Noise of a fifth of the spread leaves an R^2 of 0.96: such corners cost time and buy nothing."""
+    """Noise of two fifths of the spread leaves an R^2 of 0.86: such corners buy nothing."""
     u = points(rng)
     f = parallel(u)
-    assert intersection_of_half_spaces(u, f + 0.2 * f.std() * rng.standard_normal(len(u)), 0.0) is None
+    assert intersection_of_half_spaces(u, f + 0.4 * f.std() * rng.standard_normal(len(u)), 0.0) is None
     assert_is_the_corner(intersection_of_half_spaces(u, f + 0.02 * f.std() * rng.standard_normal(len(u)), 0.0), 0.1)
 
 
