@@ -47,7 +47,7 @@ FLOORS = {
     """,
     "rare_envs": """
         version startup
-        traffic plugins arrays threads json_text files code_trust
+        traffic plugins arrays threads json_text files code_trust compilation
         distributions control sensors
         sensors.camera scenarios measures
         simulation

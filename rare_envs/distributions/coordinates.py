@@ -140,6 +140,24 @@ class Coordinates:
             return behind - y * root
         return np.exp(y) if self.kinds[j] == "log" else y
 
+    def is_log(self, j: int) -> bool:
+        """Return whether the coordinate of column j is its logarithm; any other is linear in the column."""
+        return self.kinds[j] == "log"
+
+    def linear(self, j: int, mean: FloatArray, scale: FloatArray, x: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return mean and scale of column j, or of its logarithm, from those of its coordinate, (K, n) each.
+
+        Args:
+            j: The column.
+            mean: Of its coordinate, (K, n).
+            scale: Likewise, (K, n) or (K, 1).
+            x: Rows of which the earlier columns are set, (n, d).
+        """
+        if j in self._sources:
+            behind, root = self._behind_and_root(j, x)
+            return behind - mean * root, scale * root
+        return mean, np.broadcast_to(scale, mean.shape)
+
     def log_jacobian(self, x: FloatArray) -> FloatArray:
         """Return log |det dy/dx| at rows x in the box, (n, d) -> (n,): -log x of a logarithm, -log(gap) / 2 of a speed.
 

@@ -32,7 +32,9 @@ class ConditioningState(NamedTuple):
     """What the earlier coordinates of rows say about the next, of K components and n rows."""
 
     log_weights: FloatArray
-    """Logarithms of the weights of the components times their densities of the earlier coordinates, shape (K, n)."""
+    """Logarithms of the weights of the components times their densities of the earlier coordinates, shape (K, n).
+
+    (K, 1) before the first coordinate, where all rows are alike."""
     residuals: tuple[FloatArray, ...] = ()
     """Standardised residuals of the earlier coordinates, shape (K, n) each."""
 
@@ -143,14 +145,14 @@ class MixtureConditionals:
             )
         return points
 
-    def start(self, n: int) -> ConditioningState:
-        """Return the state of n rows before the first coordinate."""
-        return ConditioningState(np.repeat(np.log(self.weights)[:, None], n, axis=1))
+    def start(self) -> ConditioningState:
+        """Return the state of rows before the first coordinate, in which they are alike."""
+        return ConditioningState(np.log(self.weights)[:, None])
 
     def next_conditional(self, state: ConditioningState, bounds: tuple[Any, Any]) -> TruncatedConditional:
         """Return the distribution of the next coordinate given the earlier ones, within bounds."""
         i = len(state.residuals)
-        mean = np.repeat(self.means[:, i, None], state.log_weights.shape[1], axis=1)
+        mean = self.means[:, i, None]
         for k, residual in enumerate(state.residuals):
             mean = mean + self._factors[:, i, k, None] * residual
         return TruncatedConditional(state.log_weights, mean, self._factors[:, i, i, None], *bounds)
@@ -162,10 +164,10 @@ class MixtureConditionals:
         return ConditioningState(log_weights, (*state.residuals, residual))
 
     def _log_prob(self, x: FloatArray) -> FloatArray:
-        state, total = self.start(len(x)), np.zeros(len(x))
+        state, total = self.start(), np.zeros(len(x))
         for j in self.coordinates.columns:
             conditional = self.next_conditional(state, self.coordinates.bounds(j, x))
-            total = total - log_sum(state.log_weights + conditional.log_mass())
+            total = total - conditional.log_whole_mass()
             state = self.observe(conditional, state, self.coordinates.coordinate(j, x))
             density = log_sum(state.log_weights)
             total = total + density
@@ -174,7 +176,7 @@ class MixtureConditionals:
         return total[:, None]
 
     def _to_normal(self, x: FloatArray) -> FloatArray:
-        state, u = self.start(len(x)), np.empty_like(x)
+        state, u = self.start(), np.empty_like(x)
         for j in self.coordinates.columns:
             bounds = self.coordinates.bounds(j, x)
             conditional = self.next_conditional(state, bounds)
@@ -184,7 +186,7 @@ class MixtureConditionals:
         return u
 
     def _from_normal(self, u: FloatArray) -> FloatArray:
-        state, x = self.start(len(u)), np.empty_like(u)
+        state, x = self.start(), np.empty_like(u)
         for j in self.coordinates.columns:
             bounds = self.coordinates.bounds(j, x)
             conditional = self.next_conditional(state, bounds)
@@ -201,7 +203,7 @@ class MixtureConditionals:
         """
         n = len(uniforms)
         rows = np.arange(n)
-        log_weights = self.start(n).log_weights
+        log_weights = np.repeat(self.start().log_weights, n, axis=1)
         x, y = np.empty((n, self.dim)), np.empty((n, self.dim))
         for i, j in enumerate(self.coordinates.columns):
             bounds = self.coordinates.bounds(j, x)

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.special import log_ndtr, ndtri_exp
 
 from rare_envs.arrays import FloatArray
@@ -20,16 +20,11 @@ from rare_envs.distributions.mixture_conditionals import (
     MixtureConditionals,
     apply_by_chunks,
 )
+from rare_envs.distributions.quantiles.column_quantiles import find_quantiles
+from rare_envs.distributions.quantiles.mixture_quantile import MixtureColumn
+from rare_envs.distributions.quantiles.pool_by_logarithms import PoolTerm, find_quantiles_by_logarithms
 from rare_envs.distributions.truncated_mixture import TruncatedGaussianMixture
-from rare_envs.distributions.truncated_normal import (
-    MAX_ITERATIONS,
-    RootBracket,
-    TailSearch,
-    TruncatedConditional,
-    guess_quantile,
-    log_sum,
-    sum_components,
-)
+from rare_envs.distributions.truncated_normal import TruncatedConditional, log_sum
 
 BoxMixture = TruncatedGaussianMixture | CoordinateMixture
 
@@ -124,30 +119,20 @@ class _Part(NamedTuple):
     conditionals: MixtureConditionals
     state: ConditioningState
     log_weight: FloatArray
-    """Logarithm of its weight times its density of the earlier columns, shape (n,)."""
+    """Logarithm of its weight times its density of the earlier columns, shape (n,); (1,) where there are none."""
 
-    def next_conditional(self, j: int, x: FloatArray) -> TruncatedConditional:
-        """Return its distribution of the coordinate of column j."""
-        return self.conditionals.next_conditional(self.state, self.conditionals.coordinates.bounds(j, x))
-
-    def quantile_scale(self, j: int, x: FloatArray, conditional: TruncatedConditional) -> FloatArray:
-        """Return Phi^-1 of its distribution function of column j at x (n, d)."""
+    def term(self, j: int, x: FloatArray) -> PoolTerm:
+        """Return what it says of column j."""
         coordinates = self.conditionals.coordinates
-        y = move_inside(coordinates.coordinate(j, x), conditional.low, conditional.high)
-        return coordinates.sign(j) * conditional.to_normal(y)
-
-    def ends(self, j: int) -> tuple[float, float]:
-        """Return the range of column j."""
-        coordinates = self.conditionals.coordinates
-        return float(coordinates.low[j]), float(coordinates.high[j])
+        conditional = self.conditionals.next_conditional(self.state, coordinates.bounds(j, x))
+        return PoolTerm(coordinates, self.log_weight, conditional)
 
     def observe(self, j: int, x: FloatArray, conditional: TruncatedConditional) -> _Part:
         """Return the part after column j."""
         coordinates = self.conditionals.coordinates
         y = move_inside(coordinates.coordinate(j, x), conditional.low, conditional.high)
         state = self.conditionals.observe(conditional, self.state, y)
-        mass = log_sum(self.state.log_weights + conditional.log_mass())
-        density = log_sum(state.log_weights) - mass + coordinates.log_slope(j, x)
+        density = log_sum(state.log_weights) - conditional.log_whole_mass() + coordinates.log_slope(j, x)
         return self._replace(state=state, log_weight=self.log_weight + density)
 
 
@@ -229,142 +214,68 @@ class PooledMixture:
         """
         return apply_by_chunks(self._from_normal, self._conditionals[0].finite_rows(u), self.dim)
 
-    def _start(self, n: int) -> list[_Part]:
-        logs = np.log(self.weights)
-        pairs = zip(self._conditionals, logs, strict=True)
-        return [_Part(own, own.start(n), np.full(n, log_weight)) for own, log_weight in pairs]
+    def _start(self) -> list[_Part]:
+        pairs = zip(self._conditionals, np.log(self.weights), strict=True)
+        return [_Part(own, own.start(), np.array([log_weight])) for own, log_weight in pairs]
 
     def _to_normal(self, x: FloatArray) -> FloatArray:
-        parts, u = self._start(len(x)), np.empty_like(x)
+        parts, u = self._start(), np.empty_like(x)
         for j in self.parts[0].coordinates.columns:
-            conditionals = [part.next_conditional(j, x) for part in parts]
-            u[:, j] = _pooled_quantile_scale(j, x, parts, conditionals)
-            parts = [part.observe(j, x, each) for part, each in zip(parts, conditionals, strict=True)]
+            terms = [part.term(j, x) for part in parts]
+            u[:, j] = _pooled_quantile_scale(j, x, terms)
+            parts = [part.observe(j, x, term.conditional) for part, term in zip(parts, terms, strict=True)]
         return u
 
     def _from_normal(self, u: FloatArray) -> FloatArray:
-        parts, x = self._start(len(u)), np.empty_like(u)
+        parts, x = self._start(), np.empty_like(u)
         for j in self.parts[0].coordinates.columns:
-            conditionals = [part.next_conditional(j, x) for part in parts]
-            x[:, j] = _find_quantile(j, x, u[:, j], parts, conditionals)
-            parts = [part.observe(j, x, each) for part, each in zip(parts, conditionals, strict=True)]
+            terms = [part.term(j, x) for part in parts]
+            x[:, j] = _find_quantiles(j, x, u[:, j], terms)
+            parts = [part.observe(j, x, term.conditional) for part, term in zip(parts, terms, strict=True)]
         return x
 
 
-def _pooled_quantile_scale(
-    j: int, x: FloatArray, parts: Sequence[_Part], conditionals: Sequence[TruncatedConditional]
-) -> FloatArray:
+def _pooled_quantile_scale(j: int, x: FloatArray, terms: Sequence[PoolTerm]) -> FloatArray:
     """Return Phi^-1 of the pooled distribution function of column j at x (n, d), by the smaller tail."""
-    pairs = zip(parts, conditionals, strict=True)
-    scores = np.stack([part.quantile_scale(j, x, conditional) for part, conditional in pairs])
-    log_weights = np.stack([part.log_weight for part in parts])
+    scores = np.stack([_quantile_scale(j, x, term) for term in terms])
+    log_weights = np.stack([term.log_weight for term in terms])
     lower, upper = log_sum(log_weights + log_ndtr(scores)), log_sum(log_weights + log_ndtr(-scores))
     tail = np.minimum(lower, upper) - np.logaddexp(lower, upper)
     return np.asarray(np.where(lower <= upper, 1.0, -1.0) * ndtri_exp(tail))
 
 
-def _find_quantile(
-    j: int, x: FloatArray, u: FloatArray, parts: Sequence[_Part], conditionals: Sequence[TruncatedConditional]
-) -> FloatArray:
-    """Return the value of column j at which the pooled distribution function is Phi(u), (n,); each row stops by itself.
-
-    Positive u are solved in the mirror image, as those of one mixture are (`RootBracket`).
-    """
-    sign = np.where(u > 0, -1.0, 1.0)
-    pool = _PooledTail.of(j, x, u, parts, conditionals)
-    low, high = parts[0].ends(j)
-    left, right = np.where(u > 0, -high, low), np.where(u > 0, -low, high)
-    search = RootBracket(-np.abs(u), np.clip(sign * pool.guess(), left, right), left, right, right - left)
-    found, rows = sign * search.x, np.arange(len(u))
-    for _ in range(MAX_ITERATIONS):
-        search, done = search.advance(*pool.log_cdf_and_density(sign[rows] * search.x))
-        found[rows] = sign[rows] * search.x
-        keep = np.flatnonzero(~done)
-        if keep.size == 0:
-            break
-        if keep.size < len(rows):
-            rows, search, pool = rows[keep], search.take(keep), pool.take(keep)
-    return np.asarray(found)
+def _quantile_scale(j: int, x: FloatArray, term: PoolTerm) -> FloatArray:
+    """Return Phi^-1 of the distribution function that a part has of column j, at x (n, d)."""
+    conditional = term.conditional
+    y = move_inside(term.coordinates.coordinate(j, x), conditional.low, conditional.high)
+    return term.coordinates.sign(j) * conditional.to_normal(y)
 
 
-class _Tail(NamedTuple):
-    """The distribution function of column j of one part, read from the tail in which the root is; row by row."""
-
-    coordinates: Coordinates
-    log_weight: FloatArray
-    """Logarithm of the part's weight given the earlier columns, (n,)."""
-    mirrored: NDArray[np.bool_]
-    """Rows whose tail is the upper one of the coordinate, (n,)."""
-    low: FloatArray
-    high: FloatArray
-    """Range of the coordinate, (n,)."""
-    search: TailSearch
-
-    @classmethod
-    def of(cls, part: _Part, conditional: TruncatedConditional, j: int, u: FloatArray, log_total: FloatArray) -> _Tail:
-        """Return the tail of a part with a first guess; what does not depend on column j is computed once."""
-        coordinates = part.conditionals.coordinates
-        mirrored = coordinates.sign(j) * u > 0
-        mirror = conditional.mirror(mirrored)
-        score = mirror.log_weights + mirror.log_mass()
-        below = -np.abs(u)
-        search = TailSearch.start(mirror, log_sum(score), below, guess_quantile(mirror, below, score))
-        low, high = (np.broadcast_to(end, len(u)) for end in (conditional.low, conditional.high))
-        return cls(coordinates, part.log_weight - log_total, mirrored, low, high, search)
-
-    def guess(self, j: int, x: FloatArray) -> FloatArray:
-        """Return the part's own guess of column j for rows x (n, d), (n,)."""
-        y = np.where(self.mirrored, -self.search.x, self.search.x)
-        return self.coordinates.value(j, move_inside(y, self.low, self.high), x)
-
-    def log_cdf_and_density(self, j: int, x: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return logarithms at column j of x (n, d): the part's weight times its mass in the tail, and its density."""
-        y = move_inside(self.coordinates.coordinate(j, x), self.low, self.high)
-        log_cdf, log_density = self.search._replace(x=np.where(self.mirrored, -y, y)).log_cdf_and_density()
-        tail = np.minimum(log_cdf - self.search.mass, 0.0)
-        slope = self.coordinates.log_slope(j, x)
-        return self.log_weight + tail, self.log_weight + log_density - self.search.mass + slope
-
-    def take(self, rows: NDArray[np.intp]) -> _Tail:
-        """Return those of some rows."""
-        return _Tail(
-            self.coordinates,
-            self.log_weight[rows],
-            self.mirrored[rows],
-            self.low[rows],
-            self.high[rows],
-            self.search.take(rows),
-        )
+def _find_quantiles(j: int, x: FloatArray, u: FloatArray, terms: Sequence[PoolTerm]) -> FloatArray:
+    """Return the value of column j at which the pooled distribution function is Phi(u), for rows x (n, d), (n,)."""
+    column, is_log = _column_of(j, x, terms)
+    found, fits = find_quantiles(column, u)
+    if is_log:
+        found = np.exp(found)
+    if not fits.all():
+        rest = np.flatnonzero(~fits)
+        found[rest] = find_quantiles_by_logarithms(j, x[rest], u[rest], [term.take(rest) for term in terms])
+    coordinates = terms[0].coordinates
+    return move_inside(found, coordinates.low[j], coordinates.high[j])
 
 
-class _PooledTail(NamedTuple):
-    """The distribution function of column j of the pool, read from the tail in which the root is; row by row."""
-
-    j: int
-    x: FloatArray
-    """With the columns before j, shape (n, d); column j is written over."""
-    tails: list[_Tail]
-
-    @classmethod
-    def of(
-        cls, j: int, x: FloatArray, u: FloatArray, parts: Sequence[_Part], conditionals: Sequence[TruncatedConditional]
-    ) -> _PooledTail:
-        """Return the tails of all parts, for all rows."""
-        log_total = log_sum(np.stack([part.log_weight for part in parts]))
-        pairs = zip(parts, conditionals, strict=True)
-        return cls(j, x.copy(), [_Tail.of(part, conditional, j, u, log_total) for part, conditional in pairs])
-
-    def guess(self) -> FloatArray:
-        """Return the mean of the parts' guesses of the root by their weights, (n,)."""
-        return sum_components(np.stack([np.exp(each.log_weight) * each.guess(self.j, self.x) for each in self.tails]))
-
-    def log_cdf_and_density(self, values: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the logarithms of the mass in the tail up to values (n,), and of the density there."""
-        self.x[:, self.j] = values
-        pairs = [each.log_cdf_and_density(self.j, self.x) for each in self.tails]
-        log_cdf, log_density = (log_sum(np.stack(each)) for each in zip(*pairs, strict=True))
-        return np.minimum(log_cdf, 0.0), log_density
-
-    def take(self, rows: NDArray[np.intp]) -> _PooledTail:
-        """Return those of some rows."""
-        return _PooledTail(self.j, self.x[rows], [each.take(rows) for each in self.tails])
+def _column_of(j: int, x: FloatArray, terms: Sequence[PoolTerm]) -> tuple[MixtureColumn, bool]:
+    """Return column j of rows x (n, d) as mixtures of normals, and whether these are all of its logarithm."""
+    ordered = sorted(terms, key=lambda term: term.coordinates.is_log(j))
+    logs = [term.coordinates.is_log(j) for term in ordered]
+    pairs = [term.coordinates.linear(j, term.conditional.mean, term.conditional.scale, x) for term in ordered]
+    mean, scale = (np.concatenate(each) for each in zip(*pairs, strict=True))
+    log_weights = np.concatenate([term.conditional.log_weights for term in ordered])
+    sizes = [len(term.conditional.mean) for term in ordered]
+    edges = tuple(np.cumsum([0, *sizes]).tolist())
+    n_plain = edges[-1] if all(logs) else sum(size for size, log in zip(sizes, logs, strict=True) if not log)
+    low, high = (np.full(len(x), ends[j]) for ends in (terms[0].coordinates.low, terms[0].coordinates.high))
+    if all(logs):
+        low, high = np.log(low), np.log(high)
+    share = np.stack([term.log_weight for term in ordered])
+    return MixtureColumn(log_weights, mean, scale, low, high, edges, np.exp(share - log_sum(share)), n_plain), all(logs)

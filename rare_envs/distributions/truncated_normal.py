@@ -7,32 +7,38 @@ many columns there are.
 
 from __future__ import annotations
 
-from functools import reduce
 from typing import Any, NamedTuple, cast
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import log_ndtr, ndtri_exp
+from scipy.special import log_ndtr, ndtr, ndtri_exp
 
 from rare_envs.arrays import FloatArray
+from rare_envs.distributions.quantiles.column_quantiles import find_quantiles
+from rare_envs.distributions.quantiles.mixture_quantile import (
+    MIN_CONTRACTION,
+    MIN_MASS,
+    MixtureColumn,
+    sum_components,
+)
 
 LOG_SQRT_2PI = 0.5 * np.log(2.0 * np.pi)
 MAX_ITERATIONS = 200
 """Of the root search; bisection alone would need about 60."""
 ROOT_TOLERANCE = 1e-9
 """Of the root search, relative to 1 + |u|: three digits more than the 1e-6 to which samplers compare coordinates."""
-MIN_CONTRACTION = 0.75
-"""A step of Newton's method that does not shrink at least by this factor is left for a bisection, which halves."""
 NARROW = 1e-3
 """Intervals of less than this over (1 + |a|) are integrated by the midpoint rule: its error, (width a)^4, is then as
 small as the cancellation in a difference of distribution functions, 1e-12."""
+ALL = 8.3
+"""From here on Phi is 1 but for rounding."""
 
 
 class TruncatedConditional(NamedTuple):
     """One coordinate given the earlier ones: a one-dimensional mixture cut to [low, high].
 
-    Rows are columns here: log_weights and mean have shape (K, n), scale (K, 1); low and high are
-    scalars or (n,). log_weights need not be normalised.
+    Rows are columns here: log_weights and mean have shape (K, n), or (K, 1) if they are the same in
+    all rows, and scale (K, 1); low and high are scalars or (n,). log_weights need not be normalised.
     """
 
     log_weights: FloatArray
@@ -43,15 +49,29 @@ class TruncatedConditional(NamedTuple):
 
     def take(self, rows: NDArray[np.intp]) -> TruncatedConditional:
         """Return the distributions of some rows."""
-        n = self.mean.shape[1]
-        low, high = (np.broadcast_to(end, n)[rows] for end in (self.low, self.high))
-        return TruncatedConditional(self.log_weights[:, rows], self.mean[:, rows], self.scale, low, high)
+        return TruncatedConditional(*(_take_rows(array, rows) for array in self))
 
     def log_mass(self) -> FloatArray:
         """Return the log mass of each component in [low, high], (K, n)."""
         a = (self.low - self.mean) / self.scale
         width = np.broadcast_to((self.high - self.low) / self.scale, a.shape)
         return log_interval(a, a + width, width)
+
+    def log_whole_mass(self) -> FloatArray:
+        """Return the log mass of the mixture in [low, high], its weights as they are, (n,)."""
+        top = self.log_weights.max(axis=0)
+        top = np.where(np.isfinite(top), top, 0.0)
+        start, end = ((each - self.mean) / self.scale for each in (self.low, self.high))
+        mass, narrow = _plain_mass(start, end)
+        mass *= np.exp(self.log_weights - top)
+        total = sum_components(mass)
+        fits = (total >= MIN_MASS) & ~narrow.any(axis=0)
+        out = np.asarray(top + np.log(np.where(fits, total, 1.0)))
+        if not fits.all():
+            rest = np.flatnonzero(~fits)
+            conditional = self.take(rest)
+            out[rest] = log_sum(conditional.log_weights + conditional.log_mass())
+        return out
 
     def to_normal(self, x: FloatArray) -> FloatArray:
         """Return Phi^-1 of the distribution function at x (n,), by the smaller tail."""
@@ -64,7 +84,19 @@ class TruncatedConditional(NamedTuple):
         return cast(FloatArray, np.where(lower <= upper, 1.0, -1.0) * ndtri_exp(tail))
 
     def from_normal(self, u: FloatArray) -> FloatArray:
-        """Invert `to_normal`, (n,) -> (n,); positive u are solved in the mirror image."""
+        """Invert `to_normal`, (n,) -> (n,); rows that do not fit into plain numbers are solved in logarithms."""
+        n_components, n = len(self.mean), len(u)
+        low, high = (np.array(np.broadcast_to(end, n), dtype=np.float64) for end in (self.low, self.high))
+        edges, whole = (0, n_components), np.ones((1, 1))
+        column = MixtureColumn(self.log_weights, self.mean, self.scale, low, high, edges, whole, n_components)
+        found, fits = find_quantiles(column, u)
+        if not fits.all():
+            rest = np.flatnonzero(~fits)
+            found[rest] = self.take(rest).from_normal_by_logarithms(u[rest])
+        return found
+
+    def from_normal_by_logarithms(self, u: FloatArray) -> FloatArray:
+        """Invert `to_normal`, (n,) -> (n,), however far out; positive u are solved in the mirror image."""
         sign = np.where(u > 0, -1.0, 1.0)
         return sign * _solve_lower_tail(self.mirror(u > 0), sign * u)
 
@@ -72,6 +104,11 @@ class TruncatedConditional(NamedTuple):
         """Return the distributions of -x in some rows, boolean (n,), and of x in the others."""
         low, high = np.where(rows, -self.high, self.low), np.where(rows, -self.low, self.high)
         return TruncatedConditional(self.log_weights, np.where(rows, -1.0, 1.0) * self.mean, self.scale, low, high)
+
+
+def _take_rows(array: Any, rows: NDArray[np.intp]) -> Any:
+    """Return some rows of what may be the same in all of them."""
+    return array if np.shape(array)[-1:] in ((), (1,)) else np.take(array, rows, axis=-1)
 
 
 def _solve_lower_tail(conditional: TruncatedConditional, u: FloatArray) -> FloatArray:
@@ -211,6 +248,16 @@ class RootBracket(NamedTuple):
         return (target >= left) & (target <= right) & (np.abs(move) <= MIN_CONTRACTION * self.step)
 
 
+def _plain_mass(a: FloatArray, b: FloatArray) -> tuple[FloatArray, NDArray[np.bool_]]:
+    """Return Phi(b) - Phi(a) for a < b, and where the interval is so narrow that the difference cancels."""
+    below, turned = ndtr(-np.abs(a)), a > 0.0  # turned, so that both ends are read from the lower tail
+    narrow = (b - a) * (1.0 + np.abs(a)) < NARROW
+    if b.size and b.min() > ALL and not turned.any():
+        return 1.0 - below, narrow
+    mass = ndtr(np.where(turned, -b, b)) - below
+    return np.where(turned, -mass, mass), narrow
+
+
 def log_interval(a: FloatArray, b: FloatArray, width: FloatArray) -> FloatArray:
     """Return log(Phi(b) - Phi(a)) for a < b, accurate in both tails; `width` is b - a without rounding."""
     flip = a + b > 0  # mirrored, so that both ends are read from the lower tail
@@ -222,6 +269,7 @@ def log_difference(lower: FloatArray, upper: FloatArray, a: FloatArray, width: F
     """Return log(exp(upper) - exp(lower)), replaced by a series for narrow intervals at a."""
     with np.errstate(divide="ignore"):  # an empty interval has log mass -inf
         out = upper + np.log(-np.expm1(np.minimum(lower - upper, 0.0)))
+        a = np.broadcast_to(a, out.shape)
         narrow = width * (1.0 + np.abs(a)) < NARROW
         if narrow.any():  # cancellation: midpoint rule with its first correction, error w^4 a^4
             w = width[narrow]
@@ -259,11 +307,6 @@ def choose(score: FloatArray, v: FloatArray) -> NDArray[np.intp]:
         cumulative = cumulative + row
         pick += threshold >= cumulative
     return pick
-
-
-def sum_components(values: FloatArray) -> FloatArray:
-    """Sum over components, (K, n) -> (n,), in a fixed order: np.sum picks it by the shape."""
-    return reduce(np.add, values)
 
 
 def log_sum(values: FloatArray) -> FloatArray:

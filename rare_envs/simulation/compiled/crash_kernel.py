@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from rare_envs.simulation.compiled.compilation import compiled, single
+from rare_envs.compilation import compiled, single
 from rare_envs.simulation.compiled.equations import (
     ONE,
     TWO,

@@ -14,7 +14,7 @@ from numba.extending import intrinsic
 from numba.np import arrayobj
 from numpy.typing import NDArray
 
-from rare_envs.simulation.compiled.compilation import compiled_fused
+from rare_envs.compilation import compiled_fused
 
 _CODE: Any = codegen
 UNITS_AT_ONCE, STRIP = (8, 32) if "+avx512f" in _CODE.get_host_cpu_features() else (4, 16)

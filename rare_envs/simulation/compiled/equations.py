@@ -11,11 +11,11 @@ from typing import Any, NamedTuple, Protocol, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from rare_envs.compilation import compiled, single
 from rare_envs.control.idm import IDM, MIN_RATIO
 from rare_envs.control.steering import MAX_HEADING_COMMAND, TAU_HEADING, TAU_LATERAL
 from rare_envs.measures.moment import GAP_MIN, STILL
 from rare_envs.measures.time_to_collision import TTC_MAX
-from rare_envs.simulation.compiled.compilation import compiled, single
 from rare_envs.traffic import vehicle_models
 from rare_envs.traffic.oriented_boxes import DIAGONAL
 from rare_envs.traffic.road import Road

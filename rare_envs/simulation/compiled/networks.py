@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from rare_envs.simulation.compiled.compilation import compiled, compiled_fused, single
+from rare_envs.compilation import compiled, compiled_fused, single
 from rare_envs.simulation.compiled.dense_layer import UNITS_AT_ONCE, apply_layer
 from rare_envs.simulation.compiled.dense_policy import DensePolicy
 from rare_envs.simulation.compiled.rollouts import SingleArray

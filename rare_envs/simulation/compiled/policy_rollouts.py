@@ -11,10 +11,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from rare_envs.compilation import compiled, single
 from rare_envs.control.actions import DISCRETE_ACTIONS, MAX_ACCELERATION, MAX_STEERING
 from rare_envs.measures.base import COLLISION
 from rare_envs.scenarios.cut_in import CUT_IN_DURATION, CUT_IN_MIN_LENGTH, CUTTER_IDM
-from rare_envs.simulation.compiled.compilation import compiled, single
 from rare_envs.simulation.compiled.dense_policy import DensePolicy
 from rare_envs.simulation.compiled.equations import (
     BODY_LENGTH,

@@ -12,10 +12,10 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from rare_envs.compilation import compiled, single
 from rare_envs.control.idm import IDM
 from rare_envs.measures.base import COLLISION
 from rare_envs.scenarios.cut_in import CUT_IN_DURATION, CUT_IN_MIN_LENGTH, CUTTER_IDM
-from rare_envs.simulation.compiled.compilation import compiled, single
 from rare_envs.simulation.compiled.equations import (
     BODY_LENGTH,
     ONE,

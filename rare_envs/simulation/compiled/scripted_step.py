@@ -64,8 +64,8 @@ class ScriptedStep:
         if world.clock.action == "meta":
             raise NotCompiled("meta-actions are not compiled")
         with compiler_failures():
+            from rare_envs.compilation import single
             from rare_envs.simulation.compiled import tick_kernel
-            from rare_envs.simulation.compiled.compilation import single
             from rare_envs.simulation.compiled.equations import IDMNumbers, RoadNumbers
 
             scripts = {

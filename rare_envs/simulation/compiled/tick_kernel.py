@@ -6,10 +6,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from rare_envs.compilation import compiled, single
 from rare_envs.control.actions import MAX_ACCELERATION, MAX_STEERING
 from rare_envs.measures.base import COLLISION
 from rare_envs.simulation import reward
-from rare_envs.simulation.compiled.compilation import compiled, single
 from rare_envs.simulation.compiled.equations import (
     BODY_LENGTH,
     ONE,

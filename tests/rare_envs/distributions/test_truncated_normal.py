@@ -5,6 +5,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy import special, stats
 
+from rare_envs.distributions.quantiles.mixture_quantile import sum_components
 from rare_envs.distributions.truncated_normal import (
     NARROW,
     RootBracket,
@@ -13,7 +14,6 @@ from rare_envs.distributions.truncated_normal import (
     log_interval,
     log_sum,
     reweight,
-    sum_components,
     truncated_quantile,
 )
 

@@ -4,8 +4,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from rare_envs.compilation import compiled, single
 from rare_envs.sensors.lidar import MAX_RANGE
-from rare_envs.simulation.compiled.compilation import compiled, single
 from rare_envs.simulation.compiled.equations import TWO, ZERO, at_least, at_most
 from rare_envs.simulation.compiled.highway.dense_driver import AvoidanceSettings
 from rare_envs.simulation.compiled.highway.lidar_lanes import BEAM_COSINES, BEAM_SINES, LOOKING

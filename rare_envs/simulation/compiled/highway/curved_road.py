@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from rare_envs.simulation.compiled.compilation import compiled, single
+from rare_envs.compilation import compiled, single
 from rare_envs.simulation.compiled.equations import BODY_LENGTH, ONE, ZERO, at_least, slip_of
 from rare_envs.traffic.road import Road
 from rare_envs.traffic.state import VEHICLE_WIDTH

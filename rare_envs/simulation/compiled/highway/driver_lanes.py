@@ -5,9 +5,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from rare_envs.compilation import compiled, compiled_fused, single
 from rare_envs.sensors.lidar import BEAMS
 from rare_envs.sensors.perception import FEATURES
-from rare_envs.simulation.compiled.compilation import compiled, compiled_fused, single
 from rare_envs.simulation.compiled.dense_layer import apply_layer
 from rare_envs.simulation.compiled.equations import ONE, clip
 from rare_envs.simulation.compiled.highway.avoidance_lanes import AvoidanceNumbers

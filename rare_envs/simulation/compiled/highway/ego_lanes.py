@@ -4,8 +4,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from rare_envs.compilation import compiled, single
 from rare_envs.control.idm import IDM
-from rare_envs.simulation.compiled.compilation import compiled, single
 from rare_envs.simulation.compiled.dense_policy import DensePolicy
 from rare_envs.simulation.compiled.equations import IDMNumbers, idm_acceleration, steer_to_line, steering_for
 from rare_envs.simulation.compiled.highway.avoidance_lanes import limit_action

@@ -108,7 +108,7 @@ class HighwayRollout:
 
     def _rules(self, kind: int) -> Rules:
         """Return what is simulated and measured, with one of the kinds of terms."""
-        from rare_envs.simulation.compiled.compilation import single
+        from rare_envs.compilation import single
         from rare_envs.simulation.compiled.highway.traffic_slots import Rules
 
         clock, measurement = self.world.clock, self.world.measurement

@@ -10,8 +10,8 @@ import math
 
 import numpy as np
 
+from rare_envs.compilation import compiled, compiled_fused, single
 from rare_envs.sensors import lidar
-from rare_envs.simulation.compiled.compilation import compiled, compiled_fused, single
 from rare_envs.simulation.compiled.equations import ONE, ZERO
 from rare_envs.simulation.compiled.rollouts import SingleArray
 from rare_envs.traffic.state import VEHICLE_LENGTH, VEHICLE_WIDTH

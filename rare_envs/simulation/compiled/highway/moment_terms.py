@@ -7,10 +7,10 @@ import math
 
 import numpy as np
 
+from rare_envs.compilation import compiled, single
 from rare_envs.measures.moment import GAP_MIN, STILL
 from rare_envs.measures.time_to_collision import TTC_MAX
 from rare_envs.measures.two_dimensional import CLEARANCE_MAX
-from rare_envs.simulation.compiled.compilation import compiled, single
 from rare_envs.simulation.compiled.equations import BODY_LENGTH, ZERO, at_least, at_most, clip, lead_in_lane, ttc
 from rare_envs.simulation.compiled.highway.curved_road import CurvedRoadNumbers
 from rare_envs.simulation.compiled.highway.lidar_lanes import BEAM_COSINES, LOOKING

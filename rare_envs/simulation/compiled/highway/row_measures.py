@@ -2,8 +2,8 @@
 
 import numpy as np
 
+from rare_envs.compilation import compiled, single
 from rare_envs.measures.base import COLLISION
-from rare_envs.simulation.compiled.compilation import compiled, single
 from rare_envs.simulation.compiled.equations import at_most, boxes_overlap, lead_in_lane, off_road, ttc
 from rare_envs.simulation.compiled.highway.curved_road import CurvedRoadNumbers, lane_middle
 from rare_envs.simulation.compiled.highway.measure_kinds import (

@@ -7,7 +7,7 @@ Drivers side by side do not depend on each other, so f of a row is the same bits
 
 import numpy as np
 
-from rare_envs.simulation.compiled.compilation import compiled, single
+from rare_envs.compilation import compiled, single
 from rare_envs.simulation.compiled.highway.avoidance_lanes import limit_action
 from rare_envs.simulation.compiled.highway.curved_road import (
     CurvedRoadNumbers,

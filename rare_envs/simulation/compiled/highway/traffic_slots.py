@@ -5,8 +5,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from rare_envs.compilation import compiled, single
 from rare_envs.sensors.lidar import BEAMS
-from rare_envs.simulation.compiled.compilation import compiled, single
 from rare_envs.simulation.compiled.highway.curved_road import CurvedRoadNumbers, place_on_curve
 from rare_envs.simulation.compiled.highway.driver_lanes import DriverBuffers
 from rare_envs.simulation.compiled.highway.lidar_lanes import BEAM_FIELDS, BODY_FIELDS, LOOKING, place_body

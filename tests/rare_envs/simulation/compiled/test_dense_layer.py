@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from rare_envs.simulation.compiled.compilation import compiled_fused
+from rare_envs.compilation import compiled_fused
 from rare_envs.simulation.compiled.dense_layer import STRIP, UNITS_AT_ONCE, apply_layer
 
 

@@ -78,7 +78,7 @@ def test_where_numba_fails_torch_simulates_and_one_line_says_so(monkeypatch):
     for name in [name for name in sys.modules if name.startswith(selection.__package__ + ".r")]:
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.delattr(sys.modules[selection.__package__], "rollouts", raising=False)
-    monkeypatch.setattr("rare_envs.simulation.compiled.compilation.single", fail)
+    monkeypatch.setattr("rare_envs.compilation.single", fail)
     with pytest.warns(UserWarning, match=r"fails here: .*NumPy 2\.5 or less; torch simulates, which is slower\.$"):
         problem = rare_envs.DrivingProblem(CAR_FOLLOWING)
     assert problem.core == "torch"

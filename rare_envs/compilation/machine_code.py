@@ -17,7 +17,7 @@ import numba
 import numpy as np
 
 Function = TypeVar("Function", bound=Callable[..., object])
-PACKAGE = Path(__file__).parents[2]
+PACKAGE = Path(__file__).parents[1]
 UNUSED = 7 * 24 * 3600.0
 """Machine code that no process has loaded for so long [s] is removed."""
 _IMPORT = re.compile(

@@ -8,16 +8,17 @@ import numba
 import numpy as np
 import pytest
 
-from rare_envs.simulation.compiled import compilation, tick_kernel
+from rare_envs.compilation import machine_code
+from rare_envs.simulation.compiled import tick_kernel
 
 
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
     numba.config.reload_config()
-    compilation.find_cache_folder.cache_clear()
+    machine_code.find_cache_folder.cache_clear()
     yield tmp_path
-    compilation.find_cache_folder.cache_clear()
+    machine_code.find_cache_folder.cache_clear()
 
 
 def double(value):
@@ -30,15 +31,15 @@ def double_all(values):
 
 def test_code_is_kept_below_the_folder_that_was_asked_for(folder):
     before = numba.config.CACHE_DIR
-    assert compilation.compiled(double)(2.0) == 4.0
-    kept = list(folder.glob(f"compiled-{compilation.digest_sources(Path(__file__))}/**/*double*.nbc"))
+    assert machine_code.compiled(double)(2.0) == 4.0
+    kept = list(folder.glob(f"compiled-{machine_code.digest_sources(Path(__file__))}/**/*double*.nbc"))
     assert len(kept) == 1
     assert before == numba.config.CACHE_DIR
 
 
 def test_a_compiled_function_makes_no_arrays(folder):
     with pytest.raises(numba.core.errors.NumbaError, match="NRT required"):
-        compilation.compiled(double_all)(np.ones(2))
+        machine_code.compiled(double_all)(np.ones(2))
 
 
 @pytest.fixture
@@ -58,13 +59,13 @@ def package(tmp_path, monkeypatch):
     (folder / "parts").mkdir(parents=True)
     for name, text in sources.items():
         (folder / f"{name}.py").write_text(text)
-    monkeypatch.setattr(compilation, "PACKAGE", folder)
+    monkeypatch.setattr(machine_code, "PACKAGE", folder)
     return folder
 
 
 def digest(folder):
-    compilation._find_imports.cache_clear()
-    return compilation.digest_sources(folder / "kernel.py")
+    machine_code._find_imports.cache_clear()
+    return machine_code.digest_sources(folder / "kernel.py")
 
 
 @pytest.mark.parametrize("changed", ["kernel", "one", "two", "parts/__init__", "parts/deep", "late"])
@@ -83,12 +84,12 @@ def test_a_source_that_does_not_matter_leaves_the_folder(package, changed):
 
 
 def test_a_kernel_depends_on_the_equations_and_constants_that_it_uses():
-    root = compilation.PACKAGE
-    found = {path.relative_to(root).as_posix() for path in compilation.find_sources(Path(tick_kernel.__file__))}
+    root = machine_code.PACKAGE
+    found = {path.relative_to(root).as_posix() for path in machine_code.find_sources(Path(tick_kernel.__file__))}
     assert found >= {
         "simulation/compiled/tick_kernel.py",
         "simulation/compiled/equations.py",
-        "simulation/compiled/compilation.py",
+        "compilation/machine_code.py",
         "simulation/reward.py",
         "simulation/observation.py",
         "control/actions.py",
@@ -100,14 +101,14 @@ def test_a_kernel_depends_on_the_equations_and_constants_that_it_uses():
 
 def test_where_nothing_can_be_written_code_is_compiled_and_not_kept(folder, monkeypatch):
     monkeypatch.setattr(os, "access", lambda *_: False)
-    assert compilation.find_cache_folder(Path(__file__)) is None
-    assert compilation.compiled(double)(3.0) == 6.0
+    assert machine_code.find_cache_folder(Path(__file__)) is None
+    assert machine_code.compiled(double)(3.0) == 6.0
 
 
 def test_numba_that_is_switched_off_is_named(monkeypatch):
     monkeypatch.setattr(numba.config, "DISABLE_JIT", 1)
     with pytest.raises(ImportError, match="NUMBA_DISABLE_JIT is set"):
-        compilation.compiled(double)
+        machine_code.compiled(double)
 
 
 def test_code_of_older_sources_is_removed_unless_it_was_used_within_a_week(tmp_path):
@@ -117,6 +118,6 @@ def test_code_of_older_sources_is_removed_unless_it_was_used_within_a_week(tmp_p
         (tmp_path / name / "code.nbc").write_bytes(b"0")
     for name, days in (("compiled-old", 8), ("compiled-recent", 6), ("compiled-kept", 30), ("other", 30)):
         os.utime(tmp_path / name, (now - days * 86_400,) * 2)
-    compilation.remove_old_code(tmp_path, tmp_path / "compiled-kept")
+    machine_code.remove_old_code(tmp_path, tmp_path / "compiled-kept")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["compiled-kept", "compiled-recent", "other"]
     assert (tmp_path / "compiled-kept").stat().st_mtime > now - 60
