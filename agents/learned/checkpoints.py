@@ -70,9 +70,9 @@ def load_driver(name: str | PathLike[str]) -> LearnedDriver | RuleDriver | LaneC
     """Load a driver by its name or from its file.
 
     Args:
-        name: "mgail3", "mgail2", "mgail", "gail" or "bc", which are shipped, and "imitation", which was trained to be
-            an ego; "idm", the rule-based driver, and "idm+mobil", which changes lanes too; or the path of a file that
-            `save_driver` wrote.
+        name: "mgail4", "mgail3", "mgail2", "mgail", "gail" or "bc", which are shipped, and "imitation", which was
+            trained to be an ego; "idm", the rule-based driver, and "idm+mobil", which changes lanes too; or the path of
+            a file that `save_driver` wrote.
 
     Returns:
         A `LearnedDriver`, or a `RuleDriver` or `LaneChangingDriver` with its default parameters.
@@ -175,7 +175,7 @@ def read_driver(path: str | PathLike[str]) -> LearnedDriver:
             acceleration=header["acceleration"],
             yaw_rate=header["yaw_rate"],
             weights=_weights(tensors, header["radius"], path),
-            avoidance=None if rule is None else CollisionAvoidance(**rule),
+            avoidance=None if rule is None else CollisionAvoidance.from_json(rule),
             hard_braking=header.get("hard_braking", 1.0),
             changes=None if changes is None else LaneChanges(**changes),
             name=header["name"],

@@ -183,7 +183,8 @@ class LearnedDriver:
         """Return its present numbers for compiled rollouts; None if its class, network or rule was changed."""
         if type(self) is not LearnedDriver or type(self.colour) is not AutoregressiveNoise:
             return None
-        if self.avoidance is not None and type(self.avoidance) is not CollisionAvoidance:
+        rule = self.avoidance
+        if rule is not None and (type(rule) is not CollisionAvoidance or rule.close is not None):
             return None
         if self.changes is not None or self.hard_braking != 1.0:
             return None

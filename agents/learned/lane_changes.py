@@ -33,8 +33,6 @@ BOUND = 4.0
 """Greatest size of the third and the fourth [m/s]; of the last twice that."""
 USUAL_SPEED = 10.0
 """[m/s]."""
-_OVER_LINE = 0.4
-"""Who moves out and is over the line by so much [m] has a lane there; people at the edge of the road are not."""
 _SETTLED = 0.2
 """Speed across at which a change may end [m/s]."""
 _LATEST = 1.5
@@ -149,6 +147,8 @@ class LaneChanges:
     foresight: float = 2.1
     """[s]: about the ratio, 1.9, of the coefficients of speed across and offset in a logistic regression of who crosses
     within 3 s, and enough that seven in ten of those who are changing are taken for it."""
+    over_line: float = 0.4
+    """Who moves out and is over the line by so much [m] has a lane there; people at the edge of the road are not."""
     frequency: float = 1.5
     """Natural frequency of the correction [rad/s]."""
     slow: float = 10.0
@@ -215,6 +215,16 @@ class LaneChanges:
         enough = _gap_after(lanes, self.accepted_time) > self.accepted_gap
         return enough & (features[..., SPEED_COLUMN, None] > self.least_speed)
 
+    def recognise(self, features: Tensor, lanes: AdjacentLanes) -> Tensor:
+        """Return the side of a change that is under way, -1 to the left, 1 to the right, 0 for none, shape (B, M)."""
+        across = features[..., SPEED_COLUMN] * torch.sin(features[..., HEADING_COLUMN])
+        side, width = across.sign(), features[..., LEFT_MARKER_COLUMN] + features[..., RIGHT_MARKER_COLUMN]
+        offset = side * features[..., LANE_OFFSET_COLUMN]
+        crosses = offset + self.foresight * across.abs() > 0.5 * width
+        on_line = offset + 0.5 * features[..., _WIDTH] > 0.5 * width + self.over_line
+        free = _of_side(_gap_after(lanes, 0.5 * self.accepted_time), side) > self.least_gap
+        return torch.where(crosses & free & (_of_side(lanes.beyond, side) | on_line), side, 0.0)
+
     def _remember(self, features: Tensor, lanes: AdjacentLanes, state: ChangeState) -> ChangeState:
         """Return the state with what is known of the lanes beside, also where a line was crossed."""
         offset = features[..., LANE_OFFSET_COLUMN]
@@ -231,13 +241,9 @@ class LaneChanges:
     def _take_up(self, features: Tensor, lanes: AdjacentLanes, state: ChangeState) -> ChangeState:
         """Return the state with changes that were under way at the first moment."""
         first = state.share == _UNSTARTED
-        across = features[..., SPEED_COLUMN] * torch.sin(features[..., HEADING_COLUMN])
-        side, width = across.sign(), features[..., LEFT_MARKER_COLUMN] + features[..., RIGHT_MARKER_COLUMN]
-        offset = side * features[..., LANE_OFFSET_COLUMN]
-        crosses = offset + self.foresight * across.abs() > 0.5 * width
-        on_line = offset + 0.5 * features[..., _WIDTH] > 0.5 * width + _OVER_LINE
-        free = _of_side(_gap_after(lanes, 0.5 * self.accepted_time), side) > self.least_gap
-        begins = first & crosses & free & (_of_side(lanes.beyond, side) | on_line)
+        found = self.recognise(features, lanes)
+        side, width = found, features[..., LEFT_MARKER_COLUMN] + features[..., RIGHT_MARKER_COLUMN]
+        offset, begins = side * features[..., LANE_OFFSET_COLUMN], first & (found != 0.0)
         gone = (offset / width.clamp(min=1.0)).clamp(_LEAST_SHARE, 0.5)
         share = 0.5 - torch.sin(torch.asin(1.0 - 2.0 * gone) / 3.0)  # where the cubic course has gone so far
         return state._replace(

@@ -49,10 +49,13 @@ CLASSES = {
 """Moments by speed across [m/s] and offset from the middle [m], both towards where the vehicle moves."""
 
 
-def count_completed(recording: Recording, crossings: Crossings, act: Act, seconds: float) -> tuple[int, float]:
-    """Return the number of changes recorded that long before the crossing, and the share that the driver completes."""
+def find_completed(
+    recording: Recording, crossings: Crossings, act: Act, seconds: float
+) -> tuple[Crossings, torch.Tensor]:
+    """Return the changes recorded and driven that long before the crossing, and whether the driver completes them."""
     lead = round(seconds / DT)
-    scene, tick, vehicle, side = (column[crossings.tick >= lead] for column in crossings)
+    crossings = Crossings(*(column[crossings.tick >= lead] for column in crossings))
+    scene, tick, vehicle, side = crossings
     traffic = start_replay(recording, scene, tick - lead)
     chosen = traffic.driven & (traffic.vehicle == vehicle[:, None])
     rows = chosen.any(dim=1)  # the others have nobody ahead in their lane, and are replayed
@@ -64,7 +67,13 @@ def count_completed(recording: Recording, crossings: Crossings, act: Act, second
         for moment in drive_traffic(recording, traffic, act, lead + round(AFTER / DT)):
             now = lane_of(moment.traffic.y, moment.traffic.edges)[row, at]
             crossed |= (now - first) * side[rows] > 0
-    return len(row), float(crossed.float().mean())
+    return Crossings(*(column[rows] for column in crossings)), crossed
+
+
+def count_completed(recording: Recording, crossings: Crossings, act: Act, seconds: float) -> tuple[int, float]:
+    """Return the number of changes recorded that long before the crossing, and the share that the driver completes."""
+    _, crossed = find_completed(recording, crossings, act, seconds)
+    return len(crossed), float(crossed.float().mean())
 
 
 def measure_steering(pairs: Pairs, drivers: dict[str, LearnedDriver]) -> dict[str, dict[str, float]]:

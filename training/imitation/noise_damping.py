@@ -163,14 +163,14 @@ def write_damped(driver: LearnedDriver, of: str, damping: float, test: Recording
 
 
 def write_derived(
-    driver: LearnedDriver, of: str, damping: float, difference: str, module: str, test: Recording, out: Path
+    driver: LearnedDriver, of: str, damping: float | None, difference: str, module: str, test: Recording, out: Path
 ) -> Path:
     """Write a driver that was made of another without training, measured in the test scenes.
 
     Args:
         driver: The driver.
         of: Name or file of the other.
-        damping: Of its acceleration's noise [1/s].
+        damping: Of its acceleration's noise [1/s]; None where the command has no such option.
         difference: In words.
         module: Of this package, whose command makes it.
         test: Scenes that it has not learned from.
@@ -182,7 +182,8 @@ def write_derived(
     shipped = resources.files("agents") / "data" / f"{of}{SUFFIX}"
     with resources.as_file(shipped) if of in SHIPPED_DRIVERS else nullcontext(Path(of)) as path:
         before = read_provenance(path)
-    command = f"python -m training.imitation.{module} data --driver {of} --damping {damping:g} --out OUT"
+    option = "" if damping is None else f" --damping {damping:g}"
+    command = f"python -m training.imitation.{module} data --driver {of}{option} --out OUT"
     provenance = replace(
         before,
         kind=f"{before.kind}, {difference}",

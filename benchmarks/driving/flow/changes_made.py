@@ -24,7 +24,7 @@ from scipy.stats import ks_2samp
 from torch import Tensor
 
 from benchmarks import RESULTS
-from benchmarks.driving.lane_changes import count_completed
+from benchmarks.driving.lane_changes import find_completed
 from benchmarks.driving.realism import load_named, round_numbers
 from rare_envs.threads import use_one_thread
 from samplers.benchmark.runs import about
@@ -39,6 +39,8 @@ from training.imitation.traffic.replayed_traffic import lane_of, start_replay
 
 SECONDS = 20.0
 """Length of a drive."""
+DRAWS = 1000
+"""Of the bootstrap over changes."""
 QUANTITIES = ("duration", "speed", "gap ahead", "new gap ahead", "new gap behind", "speed of the new lane")
 """Of a change: its duration [s], and at its beginning the own speed [m/s], gaps to the nearest ahead in the old and in
 the new lane and to the nearest behind there [m], and how much faster [m/s] the nearest there drives."""
@@ -177,17 +179,32 @@ def under_way(recording: Recording) -> dict[float, Crossings]:
     return out
 
 
-def share_completed(recording: Recording, acts: list[Act]) -> dict[str, float]:
-    """Return how many of the moments at which a change is under way a driver takes to its end, and their number."""
-    moments = completed = 0.0
+def share_completed(recording: Recording, acts: list[Act]) -> dict[str, Any]:
+    """Return how many of the moments at which a change is under way a driver takes to its end.
+
+    Args:
+        recording: Scenes.
+        acts: One driver for each sequence of noise.
+
+    Returns:
+        The number of changes and of their moments, the share, and its 95 % interval by bootstrap over changes.
+    """
+    counts: dict[tuple[int, ...], list[int]] = {}  # of each change: moments, and those completed
     for seconds, crossings in under_way(recording).items():
         if not len(crossings.tick):
             continue
         for act in acts:
-            number, share = count_completed(recording, crossings, act, seconds)
-            if number:
-                moments, completed = moments + number, completed + number * share
-    return {"moments": moments / max(len(acts), 1), "completed": completed / max(moments, 1.0)}
+            changes, crossed = find_completed(recording, crossings, act, seconds)
+            for *which, done in zip(*(column.tolist() for column in (*changes, crossed)), strict=True):
+                count = counts.setdefault(tuple(which), [0, 0])
+                count[0], count[1] = count[0] + 1, count[1] + done
+    moments, completed = np.array(list(counts.values()), dtype=float).reshape(-1, 2).T
+    share = {"changes": len(moments), "moments": moments.sum() / max(len(acts), 1)}
+    if not len(moments):
+        return share | {"completed": 0.0}
+    times = np.random.default_rng(0).multinomial(len(moments), np.full(len(moments), 1.0 / len(moments)), DRAWS)
+    interval = np.quantile((times @ completed) / (times @ moments), [0.025, 0.975])
+    return share | {"completed": completed.sum() / moments.sum(), "interval": interval.tolist()}
 
 
 @use_one_thread()
@@ -202,7 +219,7 @@ def main(
     scenes = stack_scenes(test if in_test else [*learn, *test])
     people = describe_changes(scenes)
     found = {"people": summarise_changes(people, exposure(scenes), None)}
-    for name, driver in load_named(drivers or ["mgail", "mgail2", "mgail3"]).items():
+    for name, driver in load_named(drivers or ["mgail", "mgail2", "mgail3", "mgail4"]).items():
         made = drive_as_recording(scenes, sampling_driver(driver, torch.Generator().manual_seed(0)))
         found[name] = summarise_changes(describe_changes(made), exposure(made), people)
         acts = [sampling_driver(driver, torch.Generator().manual_seed(seed)) for seed in range(3)]

@@ -1,6 +1,6 @@
 """Long drives: two minutes of traffic that one driver drives alone, on a ring of 200 vehicles and on an open road.
 
-    python -m benchmarks.driving.flow.long_drives DATA [DRIVER ...] [--seed 0] [--json FILE]
+    python -m benchmarks.driving.flow.long_drives DATA [DRIVER ...] [--density 60 ...] [--seed 0] [--json FILE]
 
 Ring: 40 vehicles in each of five lanes of US 101, without entries and exits, at several densities; an open road: the
 same column of vehicles with nobody ahead of the first. Do speeds drift, do vehicles pile up, collide or leave the road,
@@ -12,7 +12,7 @@ of I-80 by Coifman and Li. Prints a table and writes `benchmarks/results/long_dr
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
@@ -53,7 +53,7 @@ SECONDS, SETTLING = 120.0, 60.0
 """Length of a run, and the part of it that flow and speed are not averaged over [s]."""
 REACH = 150.0
 """Vehicles this near to the seam of the ring are seen beyond it too [m]; the lidar's range is 100 m."""
-NAMES = ("mgail", "mgail2", "mgail3", "idm", "idm+mobil")
+NAMES = ("mgail", "mgail2", "mgail3", "mgail4", "idm", "idm+mobil")
 STOPPED = 1.0
 """Speed [m/s] below which a vehicle counts as stopped."""
 
@@ -202,7 +202,9 @@ def choose(name: str, seed: int) -> Decide:
     return by_features(sampling_driver(driver, torch.Generator().manual_seed(seed)))
 
 
-def measure_drives(drivers: dict[str, Decide], seed: int, seconds: float = SECONDS) -> dict[str, Any]:
+def measure_drives(
+    drivers: dict[str, Decide], seed: int, seconds: float = SECONDS, densities: Sequence[float] = DENSITIES
+) -> dict[str, Any]:
     """Return the figures of every driver on the ring and on the open road."""
     out = {}
     for name, decide in drivers.items():
@@ -216,7 +218,7 @@ def measure_drives(drivers: dict[str, Decide], seed: int, seconds: float = SECON
                 ),
                 density,
             )
-            for density in DENSITIES
+            for density in densities
         ]
         column = start_column(OPEN_DENSITY, np.random.default_rng(seed))
         out[name] = {"ring": ring, "open_road": summarise_drive(drive_long(column, decide, None, seconds), None)}
@@ -254,6 +256,7 @@ def format_drives(found: dict[str, Any]) -> str:
 def main(
     data: Annotated[Path, typer.Argument(help="Folder with the compact tables.")],
     drivers: Annotated[list[str] | None, typer.Argument(help="Files or names; all rows if none.")] = None,
+    density: Annotated[list[float] | None, typer.Option(help="On the ring [1/km and lane]; all if none.")] = None,
     seed: Annotated[int, typer.Option(help="Of starts and of the drivers' noise.")] = 0,
     result: Annotated[Path, typer.Option("--json", help="File for the result.")] = RESULTS / "long_drives.json",
 ) -> None:
@@ -263,8 +266,10 @@ def main(
     recorded = {"US 101": summarise_points(scene_points(stack_scenes([*learn, *test])))}
     if (data / COIFMAN_FILE).is_file():
         recorded["I-80"] = summarise_points(coifman_points(data))
-    found = {"drivers": measure_drives({name: choose(name, seed) for name in names}, seed), "recorded": recorded}
+    chosen = {name: choose(name, seed) for name in names}
+    found = {"drivers": measure_drives(chosen, seed, densities=density or DENSITIES), "recorded": recorded}
     command = f"python -m benchmarks.driving.flow.long_drives DATA {' '.join(drivers or ())} --seed {seed}"
+    command += "".join(f" --density {each:g}" for each in density or ())
     about_run = about(torch=torch.__version__, command=command, seconds=SECONDS)
     result.write_text(json.dumps(round_numbers({**found, "about": about_run}), indent=1) + "\n", encoding="utf-8")
     print(format_drives(found))

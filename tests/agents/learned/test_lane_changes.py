@@ -140,6 +140,19 @@ def test_nobody_is_taken_to_change_over_the_edge_of_the_road():
     assert int(state.side) == -1
 
 
+def test_who_is_over_the_line_far_enough_has_a_lane_there_that_nobody_shows():
+    moving = on_lane(1.1, 1.0 / 20.0)  # over the line by 0.3 m
+    for over_line, side in ((0.4, 0), (0.2, 1)):
+        _, state = replace(CHANGES, over_line=over_line).step(moving, begin(), None)
+        assert int(state.side) == side
+
+
+def test_who_looks_further_ahead_takes_slower_motion_for_a_change():
+    moving = on_lane(0.5, 0.58 / 20.0, **OTHERS)  # the middle reaches the line in 2.24 s
+    for foresight, side in ((2.1, 0), (2.4, 1)):
+        assert int(replace(CHANGES, foresight=foresight).step(moving, begin(), None)[1].side) == side
+
+
 def test_behind_a_line_the_lane_that_was_left_is_known_and_the_other_side_is_not():
     _, state = CHANGES.step(on_lane(1.7, **OTHERS), begin(), None)
     _, state = CHANGES.step(on_lane(-1.8), state, None)  # drifted over the line to the right

@@ -63,8 +63,35 @@ def test_moments_at_which_a_change_is_under_way_are_completed_by_who_goes_straig
     chosen = under_way(recording)
     times = [seconds for seconds, crossings in chosen.items() if len(crossings.tick)]
     assert times == pytest.approx([0.2, 0.6, 1.0, 1.4, 1.8])  # it moves for 1.8 s before the crossing
-    assert share_completed(recording, [straight]) == {"moments": 5.0, "completed": 1.0}
+    all_of_them = {"changes": 1, "moments": 5.0, "completed": 1.0, "interval": [1.0, 1.0]}
+    assert share_completed(recording, [straight]) == all_of_them
     assert share_completed(recording, [back])["completed"] < 0.5
+    assert share_completed(recording._replace(y=recording.y[:, :1].expand_as(recording.y)), [straight]) == {
+        "changes": 0,
+        "moments": 0.0,
+        "completed": 0.0,
+    }
+
+
+def test_the_interval_of_the_share_is_by_changes_and_not_by_moments(recording):
+    """Two changes, in either scene one, of five moments each; the driver goes on in the second scene alone."""
+    both = recording
+    for name in ("y", "heading"):
+        field = getattr(both, name).clone()  # a field by its name
+        field[0, :, 0] = field[1, :, 0]
+        both = both._replace(**{name: field})
+
+    def second_only(features, memory):
+        action = torch.zeros(*features.shape[:2], 2)
+        action[0, :, 1] = -features[0, :, HEADING_COLUMN] / 0.1 - 0.01
+        return action, None
+
+    found = share_completed(both, [second_only])
+    assert (found["changes"], found["moments"]) == (2, 10.0)
+    assert 0.5 <= found["completed"] < 1.0
+    low, high = found["interval"]
+    assert low == pytest.approx(2.0 * found["completed"] - 1.0)  # the first scene's change drawn twice
+    assert high == 1.0
 
 
 def test_drives_are_recorded(recording):
