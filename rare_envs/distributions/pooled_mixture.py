@@ -220,18 +220,20 @@ class PooledMixture:
 
     def _to_normal(self, x: FloatArray) -> FloatArray:
         parts, u = self._start(), np.empty_like(x)
-        for j in self.parts[0].coordinates.columns:
+        for place, j in enumerate(self.parts[0].coordinates.columns, start=1):
             terms = [part.term(j, x) for part in parts]
             u[:, j] = _pooled_quantile_scale(j, x, terms)
-            parts = [part.observe(j, x, term.conditional) for part, term in zip(parts, terms, strict=True)]
+            if place < self.dim:
+                parts = [part.observe(j, x, term.conditional) for part, term in zip(parts, terms, strict=True)]
         return u
 
     def _from_normal(self, u: FloatArray) -> FloatArray:
         parts, x = self._start(), np.empty_like(u)
-        for j in self.parts[0].coordinates.columns:
+        for place, j in enumerate(self.parts[0].coordinates.columns, start=1):
             terms = [part.term(j, x) for part in parts]
             x[:, j] = _find_quantiles(j, x, u[:, j], terms)
-            parts = [part.observe(j, x, term.conditional) for part, term in zip(parts, terms, strict=True)]
+            if place < self.dim:
+                parts = [part.observe(j, x, term.conditional) for part, term in zip(parts, terms, strict=True)]
         return x
 
 

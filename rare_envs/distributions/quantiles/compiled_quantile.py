@@ -21,6 +21,7 @@ from rare_envs.distributions.quantiles.mixture_quantile import (
     LAST_STEP,
     LOG2_E,
     MAX_BEND,
+    MAX_QUANTILE,
     MAX_STEPS,
     MIN_CONTRACTION,
     MIN_MASS,
@@ -28,12 +29,15 @@ from rare_envs.distributions.quantiles.mixture_quantile import (
     MIN_U,
     SERIES_WIDTH,
     SQRT_2PI,
+    TAIL_U,
     MixtureColumn,
 )
 
 MEAN, RATE, START, START_MASS, MASS, WEIGHT, DENSITY_WEIGHT = range(7)
 """Rows of the scratch array: fields of `_Tail` for one row of the column, and how many there are."""
 N_FIELDS = 7
+ALL_U = 8.3
+"""From here on Phi is 1 but for rounding, and need not be computed."""
 
 
 def _scipy_function(name: str, arguments: int) -> Any:
@@ -217,7 +221,7 @@ def _rise(tail: FloatArray, k: int, distance: float, b: float) -> float:
     """Return the mass of component k up to b, `distance` from the lower end: twin of `_Tail._rise`."""
     start = tail[START, k]
     width = distance * tail[RATE, k]
-    rise: float = _ndtr(b, 0) - tail[START_MASS, k]
+    rise: float = (1.0 if b > ALL_U else _ndtr(b, 0)) - tail[START_MASS, k]
     if not abs(width) < SERIES_WIDTH / (1.0 - start):
         return rise
     middle, half = start + 0.5 * width, 0.5 * width
@@ -233,25 +237,29 @@ def _guess(tail: FloatArray, n_plain: int, sign: float, ends: tuple[float, float
     """Return about where the distribution function is Phi(u): twin of `_Tail.guess`."""
     low, high, low_log, high_log = ends
     n, p = tail.shape[1], _ndtr(u, 0)
-    upper, lower, mean = np.inf, np.inf, 0.0
-    for k in range(n):
-        upper = min(upper, _component_quantile(tail, k, n_plain, sign, p / tail[WEIGHT, k]))
-        if n > 1:
-            lower = min(lower, _component_quantile(tail, k, n_plain, sign, p * tail[MASS, k]))
-            centre = _centre(tail, k, n_plain, sign, low_log, high_log)
-            mean += tail[WEIGHT, k] * tail[MASS, k] * centre
-    if n == 1:
-        return min(max(upper, low), high)
-    variance = 0.0
-    for k in range(n):
+    most = np.inf
+    if n == 1 or u < TAIL_U:
+        for k in range(n):
+            most = min(most, _component_quantile(tail, k, n_plain, sign, p / tail[WEIGHT, k]))
+    if n > 1:
+        most = min(_moment_quantile(tail, n_plain, sign, low_log, high_log, u), most)
+    return min(max(most, low), high)
+
+
+@compiled
+def _moment_quantile(tail: FloatArray, n_plain: int, sign: float, low_log: float, high_log: float, u: float) -> float:
+    """Return the quantile of a normal of equal moments: twin of `_Tail._moment_quantile`."""
+    mean, variance = 0.0, 0.0
+    for k in range(tail.shape[1]):
+        mean += tail[WEIGHT, k] * tail[MASS, k] * _centre(tail, k, n_plain, sign, low_log, high_log)
+    for k in range(tail.shape[1]):
         centre = _centre(tail, k, n_plain, sign, low_log, high_log)
         spread = 1.0 / abs(tail[RATE, k])
         if k >= n_plain:
             spread *= abs(centre)
         away = centre - mean
         variance += tail[WEIGHT, k] * tail[MASS, k] * (spread * spread + away * away)
-    guess = min(max(mean + math.sqrt(variance) * u, lower), upper)
-    return min(max(guess, low), high)
+    return mean + math.sqrt(variance) * u
 
 
 @compiled
@@ -351,6 +359,8 @@ def _find_step(
         bend = first + q * rise
         third = second + rise * (3.0 * q * bend + rise * (1.0 - q * q))
         step, reach = _fourth_order(error / rise, bend, third), min(distance, length)
+    if not q <= MAX_QUANTILE:
+        step = np.nan
     return step, reach, (error if math.isnan(step) else step) >= 0.0
 
 

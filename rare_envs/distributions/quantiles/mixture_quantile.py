@@ -25,11 +25,15 @@ MIN_U = -30.0
 """...least quantile scale, Phi(-30) = 5e-198, for which plain numbers do; logarithms are for the rest."""
 MIN_SHARE = 1e-20
 """Parts with a smaller share than this may be left out."""
+TAIL_U = -1.5
+"""Quantile scale below which the first guess also looks at single components."""
 SERIES_WIDTH = 0.1
 """Intervals of less than this over (1 + |a|) are integrated by a series with four terms, of relative error 1e-16."""
 LAST_STEP = 1e-4
 """A step of fourth order of less than this times the narrowest scale over (1 + |u|) is the last: what it leaves is this
 to the fourth power."""
+MAX_QUANTILE = 5.0
+"""On the quantile scale; beyond it Phi is so near to 1 that its rounding leads astray, and a bisection follows."""
 MAX_BEND = 0.25
 """Terms of second and third order, over that of the first, for which a step of fourth order is taken."""
 MIN_CONTRACTION = 0.75
@@ -159,15 +163,18 @@ class _Tail(NamedTuple):
     def guess(self, u: FloatArray) -> FloatArray:
         """Return about where the distribution functions are Phi(u), (n,) for u <= 0; exact for K = 1.
 
-        The quantile of a mixture is between the least quantile of its components at Phi(u) and, since each component
-        alone gives a part, the least one at Phi(u) over the weight. Within these, that of a normal of equal moments.
+        That of a normal of equal moments. In the tail at most the least quantile of the components at Phi(u) over their
+        weights: each component alone gives a part of the probability.
         """
-        p = ndtr(u)
         with np.errstate(divide="ignore", over="ignore"):  # a component without weight
-            upper = self._least_quantile(p / self.weight)
-        if len(self.mean) == 1:
-            return np.minimum(np.maximum(upper, self.low), self.high)
-        lower = self._least_quantile(p * self.mass)
+            most = self._least_quantile(ndtr(u) / self.weight)
+        if len(self.mean) > 1:
+            normal = self._moment_quantile(u)
+            most = np.where(u < TAIL_U, np.minimum(normal, most), normal)
+        return np.minimum(np.maximum(most, self.low), self.high)
+
+    def _moment_quantile(self, u: FloatArray) -> FloatArray:
+        """Return the quantile of a normal of equal moments, (n,)."""
         share = self.weight * self.mass
         centre, spread = self.mean, 1.0 / np.abs(self.rate)
         if self.n_plain < len(centre):
@@ -177,8 +184,7 @@ class _Tail(NamedTuple):
         mean = sum_components(share * centre)
         away = centre - mean
         scale = np.sqrt(sum_components(share * (spread * spread + away * away)))
-        guess = np.minimum(np.maximum(mean + scale * u, lower), upper)
-        return np.minimum(np.maximum(guess, self.low), self.high)
+        return np.asarray(mean + scale * u)
 
     def _least_quantile(self, mass: FloatArray) -> FloatArray:
         """Return the least end up to which some component has a mass (K, n), negative where turned round; (n,)."""
@@ -314,6 +320,7 @@ def _step(
             _fourth_order((ndtr(u) - cdf) / density, first, second),
             _fourth_order(error / rise, bend, third),
         )
+        step = np.where(q <= MAX_QUANTILE, step, np.nan)
     reach = np.where(close, length, np.minimum(distance, length))
     return step, reach, np.where(np.isnan(step), error, step) >= 0.0
 

@@ -91,3 +91,18 @@ def test_a_sum_over_components_is_in_their_order_however_many_columns_there_are(
     whole = sum_components(values)
     np.testing.assert_allclose(whole, values.sum(axis=0), atol=1e-12)
     assert all(sum_components(values[:, j : j + 1])[0] == whole[j] for j in range(300))
+
+
+def test_a_search_that_starts_at_an_end_that_cuts_the_bulk_goes_on() -> None:
+    """There the distribution function is 1 but for rounding, which says nothing of the way to the quantile."""
+    n = 300
+    column = draw_columns(np.random.default_rng(7), 5, 0, n)
+    column = column._replace(high=column.low + 9.0)
+    u = np.linspace(-6.0, -1e-3, n)
+    tail, fits = mixture_quantile._Tail.of(column, np.ones(n))
+    assert fits.all()
+    ends = tail.evaluate(column.high)[0]
+    assert np.count_nonzero((ends < 1.0) & (ends > 1.0 - 1e-14)) > 50
+    found = search_quantiles(column, u)[0]
+    for start in (column.high, np.nextafter(column.high, 0.0), column.low + 1e-6):
+        np.testing.assert_allclose(mixture_quantile._solve(tail, u, start), found, rtol=1e-12)
