@@ -36,8 +36,12 @@ class Simulator:
         """Return f at u (n, d), shape (n,); no batch is yielded where n = 0."""
         if len(u) == 0:
             return np.empty(0)
-        f = yield self.inputs.base.from_standard_normal(u)
-        self.n_sim += len(u)
+        return (yield from self.simulate(self.inputs.base.from_standard_normal(u)))
+
+    def simulate(self, x: FloatArray) -> SimulationSteps[FloatArray]:
+        """Return f at x (n, d), shape (n,), in physical space; n > 0."""
+        f = yield x
+        self.n_sim += len(x)
         return f
 
 
@@ -53,6 +57,8 @@ class ComponentDraws(NamedTuple):
     """Shape (n,)."""
     first: int = 0
     """Simulations that the run had spent before the first of them."""
+    x: FloatArray | None = None
+    """The points in physical space, shape (n, d), where they are kept: a fitted base takes long to map them again."""
 
 
 def extend_trace(

@@ -184,7 +184,7 @@ def draw_round(
         counted = CountedRound(empty.add(batch, proposal, inputs, gamma), batch.first)
         state = replace(state, counted=(*state.counted, counted))
     draws = Draws.from_outcomes(batch.f, proposal.log_weights(batch.u), batch.u, gamma)
-    history = state.history.add(batch, gamma)
+    history = state.history.add(batch._replace(x=None), gamma)
     refinement = refine_once(refinement, history, proposal, batch, settings.refinement, context.rng, settings.mixture)
     ess = effective_sample_size(history.log_weights)
     state = replace(state, history=history, rounds=(*state.rounds, draws))
@@ -381,11 +381,11 @@ def run_monte_carlo(context: RunContext, state: RunState, *, counted: bool = Tru
 def _draw(
     context: RunContext, state: RunState, proposal: MixtureProposal, n: int
 ) -> SimulationSteps[tuple[RunState, ComponentDraws]]:
-    """Make n draws of a proposal; those from its first component, the base distribution, are counted."""
+    """Make n > 0 draws of a proposal; those from its first component, the base distribution, are counted."""
     u, counts = proposal.draw(n, context.rng)
-    first = context.simulator.n_sim
-    f = yield from context.simulator.evaluate(u)
-    batch = ComponentDraws(proposal.components, counts, u, f, first)
+    x, first = context.simulator.inputs.base.from_standard_normal(u), context.simulator.n_sim
+    f = yield from context.simulator.simulate(x)
+    batch = ComponentDraws(proposal.components, counts, u, f, first, x)
     return replace(state, base_draws=state.base_draws + int(counts[0])), batch
 
 

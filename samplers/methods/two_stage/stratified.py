@@ -55,7 +55,7 @@ class StratifiedSample:
         log_weights = proposal.log_weights(batch.u)
         y = np.where(fails, np.exp(np.minimum(log_weights, MAX_LOG_WEIGHT)), 0.0)
         owner, k = np.repeat(np.arange(len(batch.counts)), batch.counts), len(batch.counts)
-        x = inputs.base.from_standard_normal(batch.u)
+        x = inputs.base.from_standard_normal(batch.u) if batch.x is None else batch.x
         return StratifiedSample(
             self.draws.join(Draws.from_outcomes(batch.f, log_weights, x, gamma)),
             self.counts + batch.counts,

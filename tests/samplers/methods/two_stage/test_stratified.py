@@ -178,3 +178,19 @@ def test_sample_without_base_draws(rng):
     sample = found.to_sample(PROPOSAL, np.empty(0), np.empty((0, 1)), 0.0)
     assert sample.n_units == len(sample.f) == 4000
     assert sample.weights.sum() == pytest.approx(1.0, abs=4 * np.sqrt((sample.weights**2).sum()))
+
+
+def test_points_that_are_known_in_physical_space_are_not_mapped_again(rng, monkeypatch):
+    """A base fitted to data takes as long to map the draws as they take to simulate."""
+    drawn = batch([50, 50, 50, 50], rng)
+    mapped = strata(drawn)
+
+    def fail(self, u):
+        raise AssertionError(f"expected no map; came {len(u)} points")
+
+    monkeypatch.setattr(type(PROBLEM.base), "from_standard_normal", fail)
+    with pytest.raises(AssertionError, match="came 200 points"):
+        strata(drawn)
+    known = strata(drawn._replace(x=drawn.u + 10.0))
+    np.testing.assert_array_equal(known.draws.x, mapped.draws.x + 10.0)
+    assert known.p == mapped.p
