@@ -18,10 +18,11 @@ from rare_envs.arrays import FloatArray
 from rare_envs.compilation import compiled
 from rare_envs.distributions.quantiles.mixture_quantile import (
     FLOAT_WIDTH,
+    HIGHEST,
     LAST_STEP,
     LOG2_E,
+    LOWEST,
     MAX_BEND,
-    MAX_QUANTILE,
     MAX_STEPS,
     MIN_CONTRACTION,
     MIN_MASS,
@@ -359,7 +360,7 @@ def _find_step(
         bend = first + q * rise
         third = second + rise * (3.0 * q * bend + rise * (1.0 - q * q))
         step, reach = _fourth_order(error / rise, bend, third), min(distance, length)
-    if not q <= MAX_QUANTILE:
+    if not (q >= LOWEST and q <= HIGHEST):
         step = np.nan
     return step, reach, (error if math.isnan(step) else step) >= 0.0
 

@@ -32,8 +32,9 @@ SERIES_WIDTH = 0.1
 LAST_STEP = 1e-4
 """A step of fourth order of less than this times the narrowest scale over (1 + |u|) is the last: what it leaves is this
 to the fourth power."""
-MAX_QUANTILE = 5.0
-"""On the quantile scale; beyond it Phi is so near to 1 that its rounding leads astray, and a bisection follows."""
+LOWEST, HIGHEST = -35.0, 7.0
+"""On the quantile scale; below, Phi nearly underflows, and above it is so near to 1 that its rounding leads astray: a
+bisection follows."""
 MAX_BEND = 0.25
 """Terms of second and third order, over that of the first, for which a step of fourth order is taken."""
 MIN_CONTRACTION = 0.75
@@ -320,7 +321,7 @@ def _step(
             _fourth_order((ndtr(u) - cdf) / density, first, second),
             _fourth_order(error / rise, bend, third),
         )
-        step = np.where(q <= MAX_QUANTILE, step, np.nan)
+        step = np.where((q >= LOWEST) & (q <= HIGHEST), step, np.nan)
     reach = np.where(close, length, np.minimum(distance, length))
     return step, reach, np.where(np.isnan(step), error, step) >= 0.0
 

@@ -3,6 +3,7 @@
 import mpmath
 import numpy as np
 import pytest
+from scipy import special
 
 from rare_envs.distributions.quantiles import mixture_quantile
 from rare_envs.distributions.quantiles.mixture_quantile import MixtureColumn, search_quantiles, sum_components
@@ -106,3 +107,35 @@ def test_a_search_that_starts_at_an_end_that_cuts_the_bulk_goes_on() -> None:
     found = search_quantiles(column, u)[0]
     for start in (column.high, np.nextafter(column.high, 0.0), column.low + 1e-6):
         np.testing.assert_allclose(mixture_quantile._solve(tail, u, start), found, rtol=1e-12)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_wild_mixtures_are_solved_wherever_the_first_guess_lies(seed: int) -> None:
+    """Scales from 1e-3 to 1e3, intervals anywhere: Phi(u) lies between the masses at three floats to either side."""
+    rng, n = np.random.default_rng(seed), 3000
+    n_plain, n_log = ((3, 0), (2, 2), (0, 3), (12, 0))[seed]
+    k = n_plain + n_log
+    mean, scale = rng.normal(5.0, 20.0, (k, n)), np.exp(rng.normal(0.0, 2.0, (k, n)))
+    mean[n_plain:], scale[n_plain:] = rng.normal(2.0, 1.5, (n_log, n)), np.exp(rng.normal(-1.0, 1.0, (n_log, n)))
+    low = 10.0 ** rng.uniform(-2.0, 1.5, n)
+    sizes = [size for size in (n_plain, n_log) if size]
+    share = np.full((len(sizes), 1), 1.0 / len(sizes))
+    high, edges = low + 10.0 ** rng.uniform(-2.0, 3.0, n), (0, *np.cumsum(sizes).tolist())
+    column = MixtureColumn(rng.normal(0.0, 4.0, (k, n)), mean, scale, low, high, edges, share, n_plain)
+    u = np.where(rng.random(n) < 0.5, rng.normal(0.0, 1.5, n), rng.uniform(-12.0, 12.0, n))
+    x, fits = search_quantiles(column, u)
+    tail, _ = mixture_quantile._Tail.of(column, np.where(u > 0.0, -1.0, 1.0))
+    y, floats, wanted = tail.sign * x, 3.0 * np.spacing(x), special.ndtr(-np.abs(u))
+    below, above = (tail.evaluate(np.clip(y + side, tail.low, tail.high))[0] for side in (-floats, floats))
+    right = (below * (1.0 - 1e-11) <= wanted) & (wanted <= above * (1.0 + 1e-11))
+    assert np.count_nonzero(fits) > 0.8 * n
+    assert right[fits].all()
+
+
+def test_a_search_that_starts_where_the_distribution_function_underflows_goes_on() -> None:
+    """Near -38 standard deviations Phi is a number of few digits, or 0."""
+    n = 41
+    start = np.linspace(-39.0, -35.0, n)
+    normal = np.zeros((1, 1)), np.zeros((1, 1)), np.ones((1, 1)), np.full(n, -400.0), np.full(n, 30.0)
+    tail, _ = mixture_quantile._Tail.of(MixtureColumn(*normal, (0, 1), np.ones((1, 1)), 1), np.ones(n))
+    np.testing.assert_allclose(mixture_quantile._solve(tail, np.full(n, -1.0), start), -1.0, rtol=1e-12)
