@@ -238,13 +238,16 @@ def _guess(tail: FloatArray, n_plain: int, sign: float, ends: tuple[float, float
     """Return about where the distribution function is Phi(u): twin of `_Tail.guess`."""
     low, high, low_log, high_log = ends
     n, p = tail.shape[1], _ndtr(u, 0)
-    most = np.inf
-    if n == 1 or u < TAIL_U:
+    if n == 1:
+        return min(max(_component_quantile(tail, 0, n_plain, sign, p / tail[WEIGHT, 0]), low), high)
+    guess = _moment_quantile(tail, n_plain, sign, low_log, high_log, u)
+    if u < TAIL_U:
+        least, most = np.inf, np.inf
         for k in range(n):
+            least = min(least, _component_quantile(tail, k, n_plain, sign, p * tail[MASS, k]))
             most = min(most, _component_quantile(tail, k, n_plain, sign, p / tail[WEIGHT, k]))
-    if n > 1:
-        most = min(_moment_quantile(tail, n_plain, sign, low_log, high_log, u), most)
-    return min(max(most, low), high)
+        guess = min(max(guess, least), most)
+    return min(max(guess, low), high)
 
 
 @compiled

@@ -164,15 +164,17 @@ class _Tail(NamedTuple):
     def guess(self, u: FloatArray) -> FloatArray:
         """Return about where the distribution functions are Phi(u), (n,) for u <= 0; exact for K = 1.
 
-        That of a normal of equal moments. In the tail at most the least quantile of the components at Phi(u) over their
-        weights: each component alone gives a part of the probability.
+        That of a normal of equal moments. In the tail between the least quantile of the components at Phi(u) and, since
+        each component alone gives a part of the probability, the least one at Phi(u) over their weights.
         """
+        p = ndtr(u)
         with np.errstate(divide="ignore", over="ignore"):  # a component without weight
-            most = self._least_quantile(ndtr(u) / self.weight)
+            guess = most = self._least_quantile(p / self.weight)
         if len(self.mean) > 1:
             normal = self._moment_quantile(u)
-            most = np.where(u < TAIL_U, np.minimum(normal, most), normal)
-        return np.minimum(np.maximum(most, self.low), self.high)
+            between = np.minimum(np.maximum(normal, self._least_quantile(p * self.mass)), most)
+            guess = np.where(u < TAIL_U, between, normal)
+        return np.minimum(np.maximum(guess, self.low), self.high)
 
     def _moment_quantile(self, u: FloatArray) -> FloatArray:
         """Return the quantile of a normal of equal moments, (n,)."""
