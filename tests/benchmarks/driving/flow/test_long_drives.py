@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 
+from benchmarks.driving.flow import long_drives as module
 from benchmarks.driving.flow.long_drives import (
     LANES,
     LEAST_HEADWAY,
@@ -11,9 +12,11 @@ from benchmarks.driving.flow.long_drives import (
     ROWS,
     STANDSTILL_GAP,
     Moments,
+    choose,
     close_ring,
     drive_long,
     format_drives,
+    measure_drives,
     start_column,
     start_speed,
     summarise_drive,
@@ -98,3 +101,12 @@ def test_denser_traffic_starts_slower():
     assert start_speed(15.0) == 20.0
     assert start_speed(60.0) == pytest.approx((1000 / 60 - 7.0) / 1.5)
     assert start_speed(200.0) == 0.0
+
+
+def test_drives_are_made_at_the_densities_that_are_asked_for(monkeypatch):
+    monkeypatch.setattr(module, "SETTLING", 2.0)
+    found = measure_drives({"idm": choose("idm", 0)}, seed=0, seconds=10.0, densities=(20.0, 50.0))
+    sparse, dense = found["idm"]["ring"]
+    assert (sparse["density"], dense["density"]) == (20.0, 50.0)
+    assert sparse["speed"] > dense["speed"] + 5.0
+    assert "density" not in found["idm"]["open_road"]
