@@ -40,12 +40,25 @@ def compiled(function: Function) -> Function:
 
     Raises:
         ImportError: numba is switched off, and would leave the function to Python.
+
+    Example:
+        >>> from rare_envs.simulation.compiled.equations import at_least  # @compiled
+        >>> at_least(1.0, 2.0), hasattr(at_least, "signatures")
+        (2.0, True)
     """
     return _compile(function)
 
 
 def compiled_fused(function: Function) -> Function:
-    """Compile as `compiled` does; products that are added are not rounded before, where the processor can do so."""
+    """Compile as `compiled` does; products that are added are not rounded before, where the processor can do so.
+
+    Example:
+        >>> from rare_envs.simulation.compiled.networks import tanh  # @compiled_fused
+        >>> values = np.array([0.0, 0.5], dtype=np.float32)
+        >>> tanh(values)
+        >>> values.round(4).tolist()
+        [0.0, 0.46209999918937683]
+    """
     return _compile(function, fastmath={"contract"})
 
 
@@ -60,7 +73,12 @@ def _compile(function: Function, **options: Any) -> Function:
 
 
 def single(*values: float) -> tuple[float, ...]:
-    """Return constants in single precision. To the type checker they are floats; numba infers types by itself."""
+    """Return constants in single precision. To the type checker they are floats; numba infers types by itself.
+
+    Example:
+        >>> [float(value) for value in single(0.5, 0.1)]
+        [0.5, 0.10000000149011612]
+    """
     return tuple(cast(float, np.float32(value)) for value in values)
 
 

@@ -51,7 +51,18 @@ class Distribution(Protocol):
 
 
 class Inputs(Protocol):
-    """The random input X of a problem; all that a method knows of it."""
+    """The random input X of a problem; all that a method knows of it.
+
+    Example:
+        A method asks for points of it; who has the simulator answers.
+
+        >>> import samplers
+        >>> class Places:
+        ...     dim, base = 2, samplers.StandardNormal(2)
+        >>> run = samplers.MonteCarlo(batch=100).start(Places(), seed=0, max_sim=300)
+        >>> run.ask().shape
+        (100, 2)
+    """
 
     @property
     def dim(self) -> int:
@@ -67,6 +78,13 @@ class HasNoise(Protocol):
     """A base distribution some of whose coordinates are the simulation's own randomness.
 
     They are independent standard normal. `TwoStage` does not search among them: it draws them as they come.
+
+    Example:
+        >>> import numpy as np, samplers
+        >>> class OneIsNoise(samplers.StandardNormal):
+        ...     noise = np.array([False, True])
+        >>> isinstance(OneIsNoise(2), HasNoise), isinstance(samplers.StandardNormal(2), HasNoise)
+        (True, False)
     """
 
     @property
@@ -100,7 +118,14 @@ class Problem(Inputs, Protocol):
 
 @runtime_checkable
 class ConditionalProblem(Protocol):
-    """A problem that holds something fixed, so that its p is conditional on it."""
+    """A problem that holds something fixed, so that its p is conditional on it.
+
+    Example:
+        >>> class Wet:
+        ...     given = "a wet road"
+        >>> isinstance(Wet(), ConditionalProblem)
+        True
+    """
 
     @property
     def given(self) -> str:
@@ -109,7 +134,14 @@ class ConditionalProblem(Protocol):
 
 @runtime_checkable
 class NamedProblem(Protocol):
-    """A problem whose columns of x have names, which tables of its results take."""
+    """A problem whose columns of x have names, which tables of its results take.
+
+    Example:
+        >>> import samplers
+        >>> braking = samplers.FunctionProblem(lambda x: x[:, 0], 2, column_names=("speed", "gap"))
+        >>> isinstance(braking, NamedProblem), braking.column_names
+        (True, ('speed', 'gap'))
+    """
 
     @property
     def column_names(self) -> Sequence[str]:
@@ -222,12 +254,26 @@ class HasTermGradients(HasTerms, Protocol):
 
 
 def offers_terms(problem: object) -> TypeGuard[HasTerms]:
-    """Return whether a problem has terms."""
+    """Return whether a problem has terms.
+
+    Example:
+        >>> import samplers
+        >>> offers_terms(samplers.FunctionProblem(lambda x: x[:, 0], 2))
+        False
+        >>> offers_terms(samplers.FunctionProblem(dim=2, terms=lambda x: x))
+        True
+    """
     return callable(getattr(problem, "terms", None))  # a user's object
 
 
 def condition_of(problem: Inputs) -> str:
-    """Return what a problem holds fixed, in words; empty for nothing."""
+    """Return what a problem holds fixed, in words; empty for nothing.
+
+    Example:
+        >>> import samplers
+        >>> condition_of(samplers.FunctionProblem(lambda x: x[:, 0], 2))
+        ''
+    """
     return str(problem.given) if isinstance(problem, ConditionalProblem) else ""
 
 
@@ -236,6 +282,11 @@ def names_of_columns(problem: Inputs) -> tuple[str, ...]:
 
     Raises:
         ValueError: If they are not as many different names as it has dimensions.
+
+    Example:
+        >>> import samplers
+        >>> names_of_columns(samplers.FunctionProblem(lambda x: x[:, 0], 2, column_names=["speed", "gap"]))
+        ('speed', 'gap')
     """
     names = tuple(problem.column_names) if isinstance(problem, NamedProblem) else ()
     if names and (len(set(names)) != int(problem.dim) or not all(isinstance(name, str) for name in names)):
