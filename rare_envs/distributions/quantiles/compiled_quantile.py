@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 from rare_envs.arrays import FloatArray
 from rare_envs.compilation import compiled
 from rare_envs.distributions.quantiles.mixture_quantile import (
-    FLOAT_WIDTH,
     HIGHEST,
     LAST_STEP,
     LOG2_E,
@@ -307,11 +306,12 @@ def _solve(
         left, right = (x, right) if rises else (left, x)
         target = x + step
         fits = target >= left and target <= right and abs(step) <= MIN_CONTRACTION * last
+        middle = left + 0.5 * (right - left)
         if not fits:
-            target = left + 0.5 * (right - left)
+            target = middle
         last = abs(target - x)
         done = fits and last <= LAST_STEP * reach
-        done = done or right - left <= FLOAT_WIDTH * abs(x) or target == x
+        done = done or middle == left or middle == right or target == x
         x = target
         if done:
             break

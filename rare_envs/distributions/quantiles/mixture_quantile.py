@@ -41,8 +41,6 @@ MIN_CONTRACTION = 0.75
 """A step that does not shrink at least by this factor is left for a bisection, which halves."""
 MAX_STEPS = 200
 """Bisection alone would need about 60."""
-FLOAT_WIDTH = 4.5e-16
-"""Width of a bracket, relative to its place, that has no float inside."""
 
 
 class MixtureColumn(NamedTuple):
@@ -288,10 +286,11 @@ def _solve(tail: _Tail, u: FloatArray, x: FloatArray) -> FloatArray:
         left, right = np.where(rises, x, left), np.where(rises, right, x)
         target = x + step
         fits = (target >= left) & (target <= right) & (np.abs(step) <= MIN_CONTRACTION * last)
-        target = np.where(fits, target, left + 0.5 * (right - left))
+        middle = left + 0.5 * (right - left)  # an end where the bracket has no float inside
+        target = np.where(fits, target, middle)
         last = np.abs(target - x)
         done = fits & (last <= LAST_STEP * reach)
-        done |= (right - left <= FLOAT_WIDTH * np.abs(x)) | (target == x)
+        done |= (middle == left) | (middle == right) | (target == x)
         found[rows] = x = target
         keep = np.flatnonzero(~done)
         if keep.size == 0:
