@@ -5,7 +5,6 @@ import pytest
 from numpy.typing import NDArray
 from scipy import special, stats
 
-from rare_envs.distributions.quantiles.mixture_quantile import sum_components
 from rare_envs.distributions.truncated_normal import (
     NARROW,
     RootBracket,
@@ -223,13 +222,6 @@ def test_a_component_of_weight_0_is_never_chosen() -> None:
 def test_log_of_a_sum_overflows_neither_up_nor_down() -> None:
     values = np.array([[1000.0, -1000.0, -np.inf, 0.0], [1000.0, -1000.0, -np.inf, np.log(3.0)]])
     np.testing.assert_allclose(log_sum(values), [1000 + np.log(2), -1000 + np.log(2), -np.inf, np.log(4)], rtol=1e-15)
-
-
-def test_a_sum_over_components_does_not_depend_on_how_many_columns_there_are() -> None:
-    values = np.random.default_rng(0).standard_normal((40, 300))
-    whole = sum_components(values)
-    np.testing.assert_allclose(whole, values.sum(axis=0), atol=1e-12)
-    assert all(sum_components(values[:, j : j + 1])[0] == whole[j] for j in range(300))
 
 
 def test_a_quantile_is_found_from_anywhere_in_its_bracket() -> None:
