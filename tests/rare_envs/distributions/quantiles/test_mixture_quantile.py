@@ -139,3 +139,18 @@ def test_a_search_that_starts_where_the_distribution_function_underflows_goes_on
     normal = np.zeros((1, 1)), np.zeros((1, 1)), np.ones((1, 1)), np.full(n, -400.0), np.full(n, 30.0)
     tail, _ = mixture_quantile._Tail.of(MixtureColumn(*normal, (0, 1), np.ones((1, 1)), 1), np.ones(n))
     np.testing.assert_allclose(mixture_quantile._solve(tail, np.full(n, -1.0), start), -1.0, rtol=1e-12)
+
+
+@pytest.mark.parametrize("seed", [411970636, 1058462086])
+def test_steps_from_where_the_distribution_function_nearly_underflows_are_not_trusted(seed: int) -> None:
+    """Of 300 mixtures each, one search is led past its quantile by such a step."""
+    rng, n = np.random.default_rng(seed), 300
+    column = draw_columns(rng, int(rng.integers(2, 7)), 0, n)
+    mean, scale = column.mean * float(rng.choice([1, 3, 10, 30])), column.scale * float(rng.choice([1, 0.3, 0.1]))
+    column, u = column._replace(mean=mean, scale=scale), rng.normal(0.0, 8.0, n)
+    x, fits = search_quantiles(column, u)
+    tail, _ = mixture_quantile._Tail.of(column, np.where(u > 0.0, -1.0, 1.0))
+    y, floats, wanted = tail.sign * x, 3.0 * np.spacing(np.abs(x)), special.ndtr(-np.abs(u))
+    below, above = (tail.evaluate(np.clip(y + side, tail.low, tail.high))[0] for side in (-floats, floats))
+    right = (below * (1.0 - 1e-11) <= wanted) & (wanted <= above * (1.0 + 1e-11))
+    assert right[fits].all()
