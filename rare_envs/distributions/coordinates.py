@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Any, Literal, TypeAlias
 
 import numpy as np
@@ -260,9 +260,19 @@ def as_finite(name: str, values: ArrayLike) -> FloatArray:
 
 def move_inside(values: FloatArray, low: Any, high: Any) -> FloatArray:
     """Return values in [low, high] with those at an end moved off it, by one float, from 0 by `LEAST_DISTANCE`."""
+    find = _inner_ends_of_box if isinstance(low, float) and isinstance(high, float) else _inner_ends
+    inner_low, inner_high = find(low, high)
+    return np.asarray(np.minimum(np.maximum(values, inner_low), inner_high))
+
+
+def _inner_ends(low: Any, high: Any) -> tuple[Any, Any]:
+    """Return the least and the largest value inside [low, high]."""
     inner_low = np.where(low == 0.0, LEAST_DISTANCE, np.nextafter(low, high))
-    inner_high = np.where(high == 0.0, -LEAST_DISTANCE, np.nextafter(high, low))
-    return np.clip(values, inner_low, inner_high)
+    return inner_low, np.where(high == 0.0, -LEAST_DISTANCE, np.nextafter(high, low))
+
+
+_inner_ends_of_box = lru_cache(maxsize=1024)(_inner_ends)
+"""The same for two numbers, the ends of a column's box, which are asked for with every batch."""
 
 
 def _check_ends(low: FloatArray, high: FloatArray, d: int) -> None:

@@ -182,7 +182,8 @@ class MixtureConditionals:
             conditional = self.next_conditional(state, bounds)
             inner = move_inside(self.coordinates.coordinate(j, x), *bounds)
             u[:, j] = self.coordinates.sign(j) * conditional.to_normal(inner)
-            state = self.observe(conditional, state, inner)
+            if j != self.coordinates.columns[-1]:
+                state = self.observe(conditional, state, inner)
         return u
 
     def _from_normal(self, u: FloatArray) -> FloatArray:
@@ -192,7 +193,8 @@ class MixtureConditionals:
             conditional = self.next_conditional(state, bounds)
             inner = move_inside(conditional.from_normal(self.coordinates.sign(j) * u[:, j]), *bounds)
             x[:, j] = self.coordinates.value(j, inner, x)
-            state = self.observe(conditional, state, inner)
+            if j != self.coordinates.columns[-1]:
+                state = self.observe(conditional, state, inner)
         return x
 
     def _ancestral(self, uniforms: FloatArray) -> FloatArray:

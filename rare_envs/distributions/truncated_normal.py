@@ -86,7 +86,7 @@ class TruncatedConditional(NamedTuple):
     def from_normal(self, u: FloatArray) -> FloatArray:
         """Invert `to_normal`, (n,) -> (n,); rows that do not fit into plain numbers are solved in logarithms."""
         n_components, n = len(self.mean), len(u)
-        low, high = (np.array(np.broadcast_to(end, n), dtype=np.float64) for end in (self.low, self.high))
+        low, high = np.full(n, self.low, dtype=np.float64), np.full(n, self.high, dtype=np.float64)
         edges, whole = (0, n_components), np.ones((1, 1))
         column = MixtureColumn(self.log_weights, self.mean, self.scale, low, high, edges, whole, n_components)
         found, fits = find_quantiles(column, u)

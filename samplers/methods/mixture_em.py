@@ -7,7 +7,8 @@ from typing import Protocol
 import numpy as np
 
 from samplers.problem import FloatArray
-from samplers.proposals.em import choose_centres, expectation_maximisation, one_hot
+from samplers.proposals.em import expectation_maximisation, one_hot
+from samplers.proposals.k_means import choose_centres
 from samplers.proposals.mixture import Mixture, ProposalDistribution
 
 

@@ -11,9 +11,13 @@ from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import gammaln, log_ndtr, logsumexp, ndtri_exp
+from scipy.special import gammaln, log_ndtr, ndtri_exp
 
 from samplers.problem import FloatArray
+from samplers.proposals.log_sums import log_sum_exp
+
+ROWS_FROM = 8
+"""With so many coordinates sums over them are taken point by point; fewer are added in the same order either way."""
 
 
 class MixtureComponent(Protocol):
@@ -84,9 +88,11 @@ class SubspaceGaussian:
 
     def log_ratio(self, u: FloatArray) -> FloatArray:
         """Return the log ratio; it depends on the coordinates along the axes only."""
-        t = u @ self.axes
-        terms = t * t - (t - self.mean) ** 2 / self.variance - np.log(self.variance)
-        return np.asarray(0.5 * terms.sum(axis=1))
+        t, mean, variance, axis = u @ self.axes, self.mean, self.variance, 1
+        if len(mean) < ROWS_FROM:  # the same sums, coordinate by coordinate
+            t, mean, variance, axis = np.ascontiguousarray(t.T), mean[:, None], variance[:, None], 0
+        terms = t * t - (t - mean) ** 2 / variance - np.log(variance)
+        return np.asarray(0.5 * terms.sum(axis=axis))
 
     def sample(self, n: int, rng: np.random.Generator) -> FloatArray:
         """Draw n points."""
@@ -192,12 +198,12 @@ class HalfSpaceUnion:
         """Return log k(u) less the logarithm of the sum of the half-spaces' probabilities."""
         beyond = np.count_nonzero(u @ self.axes.T >= self.starts, axis=1)
         with np.errstate(divide="ignore"):
-            return np.asarray(np.log(beyond) - logsumexp(log_ndtr(-self.starts)))
+            return np.asarray(np.log(beyond) - log_sum_exp(log_ndtr(-self.starts)))
 
     def sample(self, n: int, rng: np.random.Generator) -> FloatArray:
         """Draw n points."""
         log_p = log_ndtr(-self.starts)
-        chosen = rng.choice(len(self.starts), n, p=np.exp(log_p - logsumexp(log_p)))
+        chosen = rng.choice(len(self.starts), n, p=np.exp(log_p - log_sum_exp(log_p)))
         axes, xi = self.axes[chosen], rng.standard_normal((n, self.axes.shape[1]))
         t = -ndtri_exp(np.log1p(-rng.random(n)) + log_p[chosen])
         return np.asarray(xi + (t - (xi * axes).sum(axis=1))[:, None] * axes)
@@ -301,7 +307,7 @@ def log_ratios(components: Sequence[MixtureComponent], u: FloatArray) -> FloatAr
 
 def mixture_log_ratio(log_r: FloatArray, weights: FloatArray) -> FloatArray:
     """Return the log ratio of sum_k weights_k q_k from those of the q_k (k, n), shape (n,)."""
-    return np.asarray(logsumexp(log_r, axis=0, b=weights[:, None]))
+    return np.asarray(log_sum_exp(log_r, axis=0, weights=weights[:, None]))
 
 
 def draw_counts(weights: FloatArray, n: int, rng: np.random.Generator) -> NDArray[np.int64]:

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
-from scipy.special import logsumexp
 
 from samplers.problem import FloatArray
 from samplers.proposals.gaussian import Gaussian
+from samplers.proposals.log_sums import log_sum_exp
 
 
 class SupportsLogProb(Protocol):
@@ -63,7 +63,7 @@ class Mixture:
 
     def log_prob(self, u: FloatArray, /) -> FloatArray:
         """Return the log density at u (n, d), shape (n,)."""
-        return np.asarray(logsumexp(self.log_terms(u), axis=0))
+        return np.asarray(log_sum_exp(self.log_terms(u), axis=0))
 
     def log_terms(self, u: FloatArray) -> FloatArray:
         """Return log(weight_j q_j) of the components at u (n, d), shape (k, n)."""

@@ -1,9 +1,9 @@
 """Weights: normalisation and effective sample size of importance weights, given as logarithms."""
 
 import numpy as np
-from scipy.special import logsumexp
 
 from samplers.problem import FloatArray
+from samplers.proposals.log_sums import log_sum_exp
 
 
 def normalise_weights(log_weights: FloatArray) -> FloatArray:
@@ -13,7 +13,7 @@ def normalise_weights(log_weights: FloatArray) -> FloatArray:
         >>> normalise_weights(np.log([1.0, 3.0]))
         array([0.25, 0.75])
     """
-    return np.exp(log_weights - logsumexp(log_weights))
+    return np.asarray(np.exp(log_weights - log_sum_exp(log_weights)))
 
 
 def effective_sample_size(log_weights: FloatArray) -> float:
@@ -25,7 +25,7 @@ def effective_sample_size(log_weights: FloatArray) -> float:
     """
     if log_weights.size == 0:
         return 0.0
-    return float(np.exp(2 * logsumexp(log_weights) - logsumexp(2 * log_weights)))
+    return float(np.exp(2 * log_sum_exp(log_weights) - log_sum_exp(2 * log_weights)))
 
 
 def largest_weight_share(log_weights: FloatArray) -> float:

@@ -71,7 +71,8 @@ def search_by_rows(column: MixtureColumn, u: FloatArray) -> tuple[FloatArray, ND
 
 def _plain_array(array: FloatArray) -> FloatArray:
     """Return an array in C order that can be written."""
-    return np.require(array, np.float64, ["C", "W"])
+    flags = array.flags
+    return array if flags.c_contiguous and flags.writeable else np.array(array, np.float64, order="C")
 
 
 @compiled

@@ -10,13 +10,13 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import logsumexp
 
 from samplers.methods.mixture_em import fit_proposal_mixture
 from samplers.methods.surrogate.kriging import Kriging, Prediction
 from samplers.methods.surrogate.settings import PoolSettings, ProposalSettings
 from samplers.problem import FloatArray, StandardNormal
 from samplers.proposals.gaussian import Gaussian
+from samplers.proposals.log_sums import log_sum_exp
 from samplers.proposals.mixture import Mixture
 from samplers.proposals.shrinkage import fit_shrunk_gaussian
 from samplers.statistics.weights import effective_sample_size, normalise_weights
@@ -56,7 +56,7 @@ class Pool(NamedTuple):
 
         With b ~ w sqrt(P), n cov^2 = (sum w sqrt(P) / sum w P)^2 - 1.
         """
-        ratio = logsumexp(self.log_proposal) - logsumexp(self.log_weights + self.prediction.log_fail)
+        ratio = float(log_sum_exp(self.log_proposal)) - log_sum_exp(self.log_weights + self.prediction.log_fail)
         return float(np.sqrt(np.expm1(min(2 * ratio, 100.0)) / max(n, 1)))
 
 
@@ -114,7 +114,7 @@ class PoolProposal(NamedTuple):
     @property
     def largest_weight(self) -> float:
         """Upper bound of the weights."""
-        return float(np.exp(logsumexp(self.pool.log_weights))) / (len(self.pool.u) * float(self.shares[1]))
+        return float(np.exp(log_sum_exp(self.pool.log_weights))) / (len(self.pool.u) * float(self.shares[1]))
 
     @property
     def pool_variance(self) -> float:

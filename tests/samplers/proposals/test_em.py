@@ -1,4 +1,4 @@
-"""Expectation-maximisation with any family, and k-means."""
+"""Expectation-maximisation with any family."""
 
 from dataclasses import dataclass
 from itertools import pairwise
@@ -6,8 +6,9 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from samplers.proposals.em import choose_centres, expectation_maximisation, k_means, one_hot, posterior
+from samplers.proposals.em import expectation_maximisation, one_hot, posterior
 from samplers.proposals.gaussian import Gaussian
+from samplers.proposals.k_means import k_means
 from samplers.proposals.mixture import Mixture
 
 
@@ -89,39 +90,3 @@ def test_it_ends_when_the_gain_is_small(rng):
 def test_posterior_is_bayes_rule():
     terms = np.log([[0.2 * 0.5, 0.2 * 0.1], [0.8 * 0.1, 0.8 * 0.1]])
     np.testing.assert_allclose(posterior(terms), [[10 / 18, 0.2], [8 / 18, 0.8]])
-
-
-def test_centres_are_far_apart_and_distinct(rng):
-    """Ten tight groups: squared distances leave a second centre in one group a chance of 1e-3 at most."""
-    groups = 100.0 * np.eye(10)
-    x = np.repeat(groups, 20, axis=0) + 0.01 * rng.standard_normal((200, 10))
-    centres = choose_centres(x, np.full(200, 1 / 200), 10, rng)
-    assert sorted(np.argmax(centres, axis=1)) == list(range(10))
-    assert len(choose_centres(np.ones((5, 2)), np.ones(5), 3, rng)) == 1
-    only = choose_centres(np.arange(6.0)[:, None], np.array([0, 0, 1.0, 0, 0, 0]), 3, rng)
-    np.testing.assert_array_equal(only, [[2.0]])
-
-
-def test_k_means_finds_the_groups(rng):
-    x = np.repeat([[0.0, 0.0], [10.0, 0.0], [0.0, 10.0]], 30, axis=0) + rng.standard_normal((90, 2))
-    labels = k_means(x, np.ones(90), 3, rng)
-    assert len({tuple(labels[30 * j : 30 * j + 30]) for j in range(3)}) == 3
-    assert all(len(set(labels[30 * j : 30 * j + 30])) == 1 for j in range(3))
-
-
-def test_k_means_with_fewer_places_than_clusters(rng):
-    """Two places, with a rounding error in each: no warning, and no cluster has points of both."""
-    x = np.repeat([[1.0, 2.0], [-1.0, 0.5]], 20, axis=0) * (1 + 1e-16 * rng.integers(-3, 4, (40, 2)))
-    labels = k_means(x, np.full(40, 1 / 40), 5, rng)
-    assert labels.min() >= 0 and labels.max() < 5
-    assert not set(labels[:20]) & set(labels[20:])
-    np.testing.assert_array_equal(k_means(x, np.full(40, 1 / 40), 1, rng), np.zeros(40))
-
-
-def test_k_means_ends_where_each_point_is_nearest_to_the_mean_of_its_cluster(rng):
-    """Lloyd's fixed point with weights, on groups that four moves are enough for."""
-    x = np.repeat([[0.0, 0.0], [10.0, 0.0], [0.0, 10.0]], 30, axis=0) + rng.standard_normal((90, 2))
-    weights = rng.random(90)
-    labels = k_means(x, weights, 3, rng)
-    means = np.array([np.average(x[labels == j], axis=0, weights=weights[labels == j]) for j in range(3)])
-    np.testing.assert_array_equal(((x[:, None] - means) ** 2).sum(axis=2).argmin(axis=1), labels)

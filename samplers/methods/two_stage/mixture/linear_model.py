@@ -215,6 +215,18 @@ def weighted_quantile(x: FloatArray, weights: FloatArray, share: float) -> float
     return float(x[order][min(int(np.searchsorted(total, share * total[-1])), len(x) - 1)])
 
 
+def median(x: FloatArray) -> float:
+    """Return the median of x (n,), n > 0 and without NaN: for short arrays several times as fast as `np.median`.
+
+    Example:
+        >>> median(np.array([3.0, 1.0, 2.0, 9.0]))
+        2.5
+    """
+    middle = len(x) // 2
+    ordered = np.partition(x, (middle - 1, middle) if len(x) % 2 == 0 else middle)
+    return float(ordered[middle] if len(x) % 2 else 0.5 * (ordered[middle - 1] + ordered[middle]))
+
+
 def _fit_ridge(x: FloatArray, y: FloatArray, settings: LinearModelSettings) -> tuple[FloatArray, float]:
     """Return the slope (d,) of the ridge regression of y (n,) on x (n, d), and its leave-one-out R^2.
 
@@ -274,14 +286,14 @@ def _find_inliers(x: FloatArray, y: FloatArray, settings: LinearModelSettings) -
     n, dim = x.shape
     design = np.column_stack([x, np.ones(n)])
     penalty = np.diag(np.append(np.full(dim, settings.lad_ridge), 0.0))
-    w = np.ones(n)
+    w, weighted = np.ones(n), np.empty_like(design)
     for _ in range(settings.lad_iterations):
-        weighted = design * w[:, None]
+        np.multiply(design, w[:, None], out=weighted)
         inverse = np.linalg.inv(weighted.T @ design + penalty)
         leverage = np.einsum("ij,ij->i", weighted @ inverse, design)
         residual = np.abs(y - design @ (inverse @ (weighted.T @ y)))
         deviation = residual / np.maximum(1 - leverage, settings.min_left_out_lad)
-        typical = float(np.median(deviation))
+        typical = median(deviation)
         w = 1 / (deviation + settings.lad_smoothing * typical + LAD_MIN_DEVIATION)
         w *= n / w.sum()
     limit = settings.inlier_sigmas * MAD_TO_SIGMA * typical

@@ -7,6 +7,7 @@ References:
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +17,8 @@ from samplers.problem import FloatArray
 
 LEAST_DENSITY_RATIO = 1e-150
 """Least ratio of densities to divide by."""
+FLOOR_ROUNDING = 1e-12
+"""A group that is this little below its floor has reached it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,11 +65,11 @@ def minimise_second_moment(
     largest = log_r.max(axis=0)
     ratio = np.exp(log_r - largest)
     scaled = np.exp(log_weights - largest - (log_weights - largest).max())
-    a = start
+    a, limits = start, _FloorIndex.of(floors, len(start))
     for _ in range(settings.updates):
         q = np.maximum(a @ ratio, LEAST_DENSITY_RATIO)
         a = a * np.sqrt((ratio * (scaled / (q * q))).sum(axis=1))
-        a = raise_to_floors(a / a.sum(), floors)
+        a = limits.apply(a / a.sum())
     return a
 
 
@@ -82,18 +85,43 @@ def raise_to_floors(a: FloatArray, floors: Sequence[Floor]) -> FloatArray:
         >>> raise_to_floors(np.array([0.0, 0.0, 0.4, 0.6]), [floor]).round(2)
         array([0.1 , 0.1 , 0.32, 0.48])
     """
-    members = np.array([floor.members for floor in floors], dtype=np.float64).reshape(len(floors), len(a))
-    least, raised = np.array([floor.least for floor in floors]), np.zeros(len(floors), dtype=bool)
-    while True:
-        low = ~raised & (members @ a < least - 1e-12)
-        if not low.any():
-            return a
-        raised |= low
-        others = ~members[raised].any(axis=0)
-        rest, total = float(a[others].sum()), float(least[raised].sum())
-        room = max(1 - total, 0.0) if rest > 0 else 0.0
-        a = np.where(others, a * (room / rest if rest > 0 else 0.0), a)
-        for floor in (floor for floor, is_raised in zip(floors, raised, strict=True) if is_raised):
-            own = float(a[floor.members].sum())
-            inside = a[floor.members] / own if own > 0 else np.full(floor.members.sum(), 1 / floor.members.sum())
-            a[floor.members] = inside * (floor.least if room > 0 else floor.least / total)
+    return _FloorIndex.of(floors, len(a)).apply(a)
+
+
+class _FloorIndex(NamedTuple):
+    """Floors as they are read in every update of the weights."""
+
+    members: FloatArray
+    """Ones where a component (k) belongs to a floor (m), shape (m, k)."""
+    least: FloatArray
+    """Shape (m,)."""
+    rows: tuple[NDArray[np.intp], ...]
+    """The components of each floor."""
+
+    @classmethod
+    def of(cls, floors: Sequence[Floor], k: int) -> "_FloorIndex":
+        """Return the floors of k components."""
+        members = np.array([floor.members for floor in floors], dtype=np.float64).reshape(len(floors), k)
+        least = np.array([floor.least for floor in floors])
+        return cls(members, least, tuple(np.flatnonzero(floor.members) for floor in floors))
+
+    def apply(self, a: FloatArray) -> FloatArray:
+        """Return weights raised to the floors, see `raise_to_floors`."""
+        raised: NDArray[np.bool_] | None = None
+        while True:
+            low = self.members @ a < self.least - FLOOR_ROUNDING
+            if raised is not None:
+                low &= ~raised
+            if not low.any():
+                return a
+            raised = low if raised is None else raised | low
+            others = ~self.members[raised].any(axis=0)
+            rest, total = float(a[others].sum()), float(self.least[raised].sum())
+            room = max(1 - total, 0.0) if rest > 0 else 0.0
+            a = np.where(others, a * (room / rest if rest > 0 else 0.0), a)
+            for i in np.flatnonzero(raised):
+                rows = self.rows[i]
+                weights = a.take(rows)
+                own = float(np.add.reduce(weights))
+                inside = weights / own if own > 0 else np.full(len(rows), 1 / len(rows))
+                a[rows] = inside * (self.least[i] if room > 0 else self.least[i] / total)

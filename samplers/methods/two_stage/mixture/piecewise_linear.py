@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from samplers.methods.two_stage.mixture.linear_model import INLIER_ROUNDING, MAD_TO_SIGMA
+from samplers.methods.two_stage.mixture.linear_model import INLIER_ROUNDING, MAD_TO_SIGMA, median
 from samplers.methods.two_stage.mixture.settings import PieceSettings
 from samplers.problem import FloatArray
 
@@ -82,7 +82,8 @@ def fit_pieces(
     before, lowest, idle = None, math.inf, 0
     for _ in range(settings.iterations):
         own, agrees, deviation = assign_points(pieces, u, y, inlier_sigmas)
-        square = float((deviation[agrees] ** 2).mean())
+        agreeing = deviation[agrees]
+        square = float(np.add.reduce(agreeing * agreeing)) / len(agreeing)  # `mean` takes longer to begin
         idle = 0 if square < (1 - LEAST_GAIN) * lowest else idle + 1
         lowest = min(lowest, square)
         own = np.where(agrees, own, NO_PIECE)
@@ -112,7 +113,7 @@ def assign_points(
     for k in range(len(limit)):
         deviations = deviation[own == k]
         if len(deviations):
-            limit[k] = inlier_sigmas * MAD_TO_SIGMA * _median(deviations)
+            limit[k] = inlier_sigmas * MAD_TO_SIGMA * median(deviations)
     return own, deviation <= limit[own] + INLIER_ROUNDING * np.ptp(y), deviation
 
 
@@ -123,13 +124,6 @@ def piece_errors(
     counts = np.bincount(own, minlength=n)
     square = np.bincount(own, weights=residual**2, minlength=n)
     return counts, np.sqrt(square / np.maximum(counts - dim - 1, 1))
-
-
-def _median(x: FloatArray) -> float:
-    """Return the median of x (n,), n > 0 and without NaN: for short arrays several times as fast as `np.median`."""
-    middle = len(x) // 2
-    ordered = np.partition(x, (middle - 1, middle) if len(x) % 2 == 0 else middle)
-    return float(ordered[middle] if len(x) % 2 else 0.5 * (ordered[middle - 1] + ordered[middle]))
 
 
 def _design(u: FloatArray) -> FloatArray:

@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 from samplers.methods.two_stage.mixture.settings import DEFAULT_MIXTURE_SETTINGS, SubspaceSettings
 from samplers.problem import FloatArray
 from samplers.proposals.components import SubspaceGaussian, log_ratios
-from samplers.proposals.em import expectation_maximisation, k_means, one_hot, posterior
+from samplers.proposals.em import expectation_maximisation, one_hot, posterior
+from samplers.proposals.k_means import k_means
 from samplers.proposals.shrinkage import shrink_covariance
 from samplers.statistics.weights import normalise_weights
 

@@ -13,10 +13,10 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import logsumexp
 
 from samplers.problem import FloatArray
 from samplers.proposals.components import SubspaceGaussian, draw_counts, log_ratios, mixture_log_ratio
+from samplers.proposals.log_sums import log_sum_exp
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,7 +75,7 @@ class TermProposal:
         terms = [np.full(len(u), math.log(self.base_share))]
         for share, law in zip(self.shares, self.laws, strict=True):
             terms.append(math.log((1 - self.base_share) * share) + law.log_ratio(u))
-        return np.asarray(logsumexp(terms, axis=0))
+        return np.asarray(log_sum_exp(np.array(terms), axis=0))
 
     @property
     def stratum_shares(self) -> FloatArray:

@@ -9,6 +9,7 @@ from samplers.methods.two_stage.mixture.linear_model import (
     failure_edge,
     fit_hyperplane,
     half_space_proposals,
+    median,
 )
 from samplers.methods.two_stage.mixture.settings import DEFAULT_MIXTURE_SETTINGS
 from samplers.proposals.components import HalfSpaceNormal, SubspaceGaussian
@@ -233,3 +234,9 @@ def test_the_edge_of_a_few_points_is_not_beyond_the_true_one(n, rng):
     found = [failure_edge(3.0 + rng.exponential(size=n), np.ones(n), n, 0.02) for _ in range(200)]
     assert np.mean(np.array(found) > 3.0 + 0.05) < 0.15
     assert np.mean(found) > 3.0 - 3.0 / n
+
+
+@pytest.mark.parametrize("n", [1, 2, 5, 300, 301])
+def test_the_median_is_that_of_numpy(rng, n):
+    x = rng.standard_normal(n)
+    assert median(x) == np.median(x)

@@ -75,12 +75,6 @@ def test_a_fit_that_gains_nothing_ends(rng, monkeypatch):
     )
 
 
-@pytest.mark.parametrize("n", [1, 2, 5, 300, 301])
-def test_the_median_is_that_of_numpy(rng, n):
-    x = rng.standard_normal(n)
-    assert piecewise_linear._median(x) == np.median(x)
-
-
 def test_a_piece_with_too_few_points_is_given_up(rng):
     u, y = points(rng)
     third = LinearPieces(np.append(TRUE.intercepts, 50.0), np.vstack([TRUE.slopes, np.zeros(3)]))
