@@ -42,8 +42,8 @@ def k_means(x: FloatArray, weights: FloatArray, k: int, rng: np.random.Generator
     Example:
         >>> x = np.array([[0.0], [0.1], [9.0], [9.1], [9.2]])
         >>> labels = k_means(x, np.ones(5), 2, np.random.default_rng(0))
-        >>> labels[0] == labels[1], labels[2] == labels[3] == labels[4], labels[0] == labels[4]
-        (True, True, False)
+        >>> (labels == labels[4]).tolist()
+        [False, False, True, True, True]
     """
     centres = choose_centres(x, weights, k, rng)
     if len(centres) == 1:

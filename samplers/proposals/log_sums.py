@@ -19,7 +19,7 @@ def log_sum_exp(a: FloatArray, axis: int | None = None, weights: FloatArray | No
         weights: Not negative, of a shape that goes with that of `a`; all 1 where they are None.
 
     Example:
-        >>> float(np.exp(log_sum_exp(np.log([1.0, 2.0, 5.0]))))
+        >>> round(float(np.exp(log_sum_exp(np.log([1.0, 2.0, 5.0])))), 9)
         8.0
         >>> log_sum_exp(np.full((2, 1), -np.inf), axis=0)
         array([-inf])
