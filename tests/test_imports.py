@@ -103,11 +103,16 @@ def modules(root: Path, packages: tuple[str, ...] = PACKAGES) -> dict[str, Path]
     return found
 
 
-def imported(tree: ast.AST, module: str, is_package: bool, known: set[str]) -> Iterator[str]:
-    """Yield the dotted names that a tree imports; `from a import b` names `a.b` where that is a module.
+@functools.cache
+def imported(text: str, module: str, is_package: bool, known: frozenset[str]) -> frozenset[str]:
+    """Return the dotted names that a text imports; `from a import b` names `a.b` where that is a module.
 
     The values of a table `_LAZY` are modules that a package imports on first use.
     """
+    return frozenset(_imported(ast.parse(text), module, is_package, known))
+
+
+def _imported(tree: ast.AST, module: str, is_package: bool, known: frozenset[str]) -> Iterator[str]:
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
@@ -129,10 +134,11 @@ def import_graph(root: Path, packages: tuple[str, ...] = PACKAGES) -> dict[str, 
     An import inside a function that avoids a circle is the circle.
     """
     files = modules(root, packages)
+    known = frozenset(files)
     graph = {}
     for module, path in files.items():
-        tree = ast.parse(path.read_text(encoding="utf-8"))
-        graph[module] = set(imported(tree, module, path.name == "__init__.py", set(files))) - {module}
+        text = path.read_text(encoding="utf-8")
+        graph[module] = set(imported(text, module, path.name == "__init__.py", known)) - {module}
     return graph
 
 
@@ -214,12 +220,17 @@ def crowded(root: Path, packages: tuple[str, ...] = PACKAGES) -> dict[str, int]:
     return {folder: size for folder, size in sizes.items() if size > MOST_MODULES}
 
 
-def exported(path: Path) -> set[str]:
+def exported(path: Path) -> frozenset[str]:
     """Return the names in the `__all__` of a module."""
-    for node in ast.parse(path.read_text(encoding="utf-8")).body:
+    return _exported(path.read_text(encoding="utf-8"))
+
+
+@functools.cache
+def _exported(text: str) -> frozenset[str]:
+    for node in ast.parse(text).body:
         if isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == "__all__":
-            return {name for name in ast.literal_eval(node.value) if isinstance(name, str)}
-    return set()
+            return frozenset(name for name in ast.literal_eval(node.value) if isinstance(name, str))
+    return frozenset()
 
 
 def shadowed(root: Path) -> list[str]:

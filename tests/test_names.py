@@ -7,6 +7,8 @@ from collections import defaultdict
 from collections.abc import Iterator
 from pathlib import Path
 
+import pytest
+
 ROOT = Path(__file__).parents[1]
 PACKAGES = ("samplers", "rare_envs", "agents", "training")
 
@@ -27,6 +29,7 @@ TWINS = ("rare_envs/simulation/compiled/equations.py", "rare_envs/simulation/com
 QUESTION_WORDS = ("What", "How", "Where", "When", "Who", "Which", "Whether", "Why")
 
 
+@pytest.fixture(scope="module")
 def sources() -> dict[str, ast.Module]:
     """Return the syntax tree of every module of the packages, by its path in the repository."""
     return {
@@ -75,24 +78,24 @@ def test_module_of(path: str) -> Path:
 test_module_of.__test__ = False  # type: ignore[attr-defined]  # pytest takes its name for a test
 
 
-def test_one_name_has_one_meaning() -> None:
-    twice = {name: paths for name, paths in defined_twice(sources()).items() if name not in FAMILIES}
+def test_one_name_has_one_meaning(sources: dict[str, ast.Module]) -> None:
+    twice = {name: paths for name, paths in defined_twice(sources).items() if name not in FAMILIES}
     assert twice == {}
 
 
-def test_a_family_has_several_members() -> None:
-    assert set(FAMILIES) - set(defined_twice(sources())) == set()
+def test_a_family_has_several_members(sources: dict[str, ast.Module]) -> None:
+    assert set(FAMILIES) - set(defined_twice(sources)) == set()
 
 
-def test_a_module_says_what_it_is() -> None:
-    first_words = {path: (ast.get_docstring(tree) or "").partition(" ")[0] for path, tree in sources().items()}
+def test_a_module_says_what_it_is(sources: dict[str, ast.Module]) -> None:
+    first_words = {path: (ast.get_docstring(tree) or "").partition(" ")[0] for path, tree in sources.items()}
     assert [path for path, word in first_words.items() if not word or word in QUESTION_WORDS] == []
 
 
-def test_every_module_with_logic_has_its_tests() -> None:
+def test_every_module_with_logic_has_its_tests(sources: dict[str, ast.Module]) -> None:
     without = {
         path
-        for path, tree in sources().items()
+        for path, tree in sources.items()
         if not path.endswith(("__init__.py", "__main__.py")) and holds_logic(tree) and not test_module_of(path).exists()
     }
     assert without == set()
