@@ -8,9 +8,8 @@ import matplotlib
 from matplotlib.figure import Figure
 
 import samplers
-from rare_envs.files import replace_file
 from rare_envs.study.analysis.severity import Severity
-from rare_envs.study.plots import STYLE
+from rare_envs.study.plots import STYLE, save_figure
 
 
 def save_sensitivity(path: Path, sensitivity: samplers.Sensitivity) -> None:
@@ -23,8 +22,7 @@ def save_sensitivity(path: Path, sensitivity: samplers.Sensitivity) -> None:
     with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(14, 4.5), layout="constrained")
         sensitivity.plot(list(figure.subplots(1, 2)))
-        with replace_file(path) as draft:
-            figure.savefig(draft, dpi=120)
+        save_figure(path, figure)
 
 
 def save_severity(path: Path, severity: Severity) -> None:
@@ -37,5 +35,4 @@ def save_severity(path: Path, severity: Severity) -> None:
     with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(7, 4.5), layout="constrained")
         severity.plot(figure.subplots())
-        with replace_file(path) as draft:
-            figure.savefig(draft, dpi=120)
+        save_figure(path, figure)

@@ -11,8 +11,7 @@ from matplotlib.figure import Figure
 from rare_envs.exposure.human_benchmarks import CONTACTS_100CAR, REAR_END_CONTACTS_100CAR
 from rare_envs.exposure.rate import RateInterval
 from rare_envs.exposure.total_rate import TotalRate
-from rare_envs.files import replace_file
-from rare_envs.study.plots import HIT_COLOUR, LINE_COLOUR, ORDINARY_COLOUR, STYLE
+from rare_envs.study.plots import HIT_COLOUR, LINE_COLOUR, ORDINARY_COLOUR, STYLE, save_figure
 from rare_envs.study.rates.text import format_rate, format_share, format_with_interval, name_scenario, name_source
 
 FRACTION_BELOW = 0.1
@@ -44,8 +43,7 @@ def save_risk_plot(path: Path, ego: str, total: TotalRate) -> None:
         )
         draw_rates(left, total)
         draw_shares(right, total)
-        with replace_file(path) as draft:
-            figure.savefig(draft, dpi=120)
+        save_figure(path, figure)
 
 
 def draw_rates(axes: Axes, total: TotalRate) -> None:

@@ -5,11 +5,14 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from typer.testing import CliRunner, Result
 
 from rare_envs.scenarios.registry import scenario_named
+from rare_envs.study import plots
 from rare_envs.study.cli.app import app
 
 EGOS = """
@@ -86,6 +89,27 @@ def write_base(path: Path, gap: float) -> Path:
     }
     path.write_text(json.dumps(base))
     return path
+
+
+class QuickCanvas(FigureCanvasAgg):
+    """Draws everything small and where it stands: arranging labels takes longer than a small run."""
+
+    def print_png(self, *args: Any, **kwargs: Any) -> None:
+        self.figure.set_layout_engine("none")
+        self.figure.set_dpi(20)
+        super().print_png(*args, **kwargs)
+
+
+@pytest.fixture
+def full_pictures() -> None:
+    """Pictures as users have them: for tests that look at them."""
+
+
+@pytest.fixture(autouse=True)
+def quick_pictures(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Pictures by `QuickCanvas`, unless a test asks for `full_pictures`."""
+    if "full_pictures" not in request.fixturenames:
+        monkeypatch.setattr(plots, "FigureCanvasAgg", QuickCanvas)
 
 
 @pytest.fixture

@@ -21,6 +21,8 @@ from rare_envs.study.replay import drive_again
 
 FOLLOWING = "rare_envs/CarFollowing-v0"
 
+pytestmark = pytest.mark.usefixtures("full_pictures")
+
 
 @pytest.mark.parametrize("env_id", rare_envs.ENV_IDS)
 def test_the_legend_says_which_vehicle_is_which(env_id: str) -> None:

@@ -8,6 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+import pytest
 from matplotlib.image import imread
 from typer.testing import Result
 
@@ -20,6 +21,7 @@ FOLLOWING = "rare_envs/CarFollowing-v0"
 SMALL = ("estimate", FOLLOWING, "--method", "mc", "--max-sim", 2000)
 
 
+@pytest.mark.usefixtures("full_pictures")
 def test_the_run_folder_holds_numbers_failures_and_a_picture(cli: Cli, risky: str, tmp_path: Path) -> None:
     out = tmp_path / "runs" / "one"
     result = cli(*SMALL, "--base", risky, "--out", out, "--json")

@@ -18,6 +18,8 @@ from rare_envs.study.report import Report
 
 FOLLOWING = "rare_envs/CarFollowing-v0"
 
+pytestmark = pytest.mark.usefixtures("full_pictures")
+
 
 def test_a_picture_is_written(tmp_path: Path) -> None:
     problem = rare_envs.DrivingProblem(FOLLOWING, base="us101-gap")

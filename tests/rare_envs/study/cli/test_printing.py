@@ -50,6 +50,7 @@ def test_a_doubtful_number_says_so_and_exits_with_3(cli: Cli, safe: str) -> None
     assert answer.exit_code == 3 and json.loads(answer.stdout)["doubtful"] is True
 
 
+@pytest.mark.usefixtures("full_pictures")
 def test_an_upper_bound_by_plain_monte_carlo_is_an_answer(cli: Cli, safe: str, tmp_path: Path) -> None:
     result = cli(*SMALL, "--base", safe, "--out", tmp_path / "run")
     assert result.exit_code == 0

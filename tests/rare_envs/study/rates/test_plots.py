@@ -13,6 +13,8 @@ from rare_envs.study.rates.plots import draw_rates, draw_shares, save_risk_plot
 from rare_envs.study.rates.text import format_rate
 from tests.rare_envs.exposure.test_rate import rate
 
+pytestmark = pytest.mark.usefixtures("full_pictures")
+
 TOTAL = TotalRate((rate(spread=1.4), rate(1e-4, scenario="hard_brake", spread=1.0)))
 UNKNOWN = TotalRate((rate(0.0, math.inf, upper=1e-3),))
 

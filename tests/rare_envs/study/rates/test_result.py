@@ -36,6 +36,7 @@ def test_kinds_of_crash_add_up_to_the_rate(brake: ScenarioRisk) -> None:
     assert found.kinds == brake.kinds
 
 
+@pytest.mark.usefixtures("full_pictures")
 def test_notes_and_json(brake: ScenarioRisk, tmp_path: Path) -> None:
     found = Risk(ego="idm", scenarios=(brake,))
     assert found.notes == ("hard brake: a note",)
