@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from functools import partial
+from dataclasses import replace
+from functools import lru_cache, partial
 from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol, cast, runtime_checkable
@@ -84,21 +85,43 @@ def load_base(scenario: Scenario, base: str | PathLike[str] | Distribution | Non
 
 
 def _from_json(scenario: Scenario, source: str, text: str) -> Distribution:
-    return _from_dict(scenario, source, parse_json_object(text, f"Base distribution {source}"))
+    return _fit_to(scenario, source, _read_text(scenario.name, _names_of(scenario), source, text))
 
 
 def _from_dict(scenario: Scenario, source: str, data: Mapping[str, Any]) -> Distribution:
-    wanted = [p.name for p in scenario.parameters]
+    return _fit_to(scenario, source, _read(scenario.name, _names_of(scenario), source, data))
+
+
+def _names_of(scenario: Scenario) -> tuple[str, ...]:
+    return tuple(p.name for p in scenario.parameters)
+
+
+@lru_cache(maxsize=64)
+def _read_text(scenario: str, wanted: tuple[str, ...], source: str, text: str) -> FileDistribution | FittedDistribution:
+    """Return the distribution of a text. It is kept: a file has some 100 refits, an environment is made often."""
+    return _read(scenario, wanted, source, parse_json_object(text, f"Base distribution {source}"))
+
+
+def _read(
+    scenario: str, wanted: tuple[str, ...], source: str, data: Mapping[str, Any]
+) -> FileDistribution | FittedDistribution:
+    """Return the distribution of a file, a fitted one if the file says what it was fitted to."""
     names = data.get("names")
-    if names != wanted:
+    if names != list(wanted):
         raise ValueError(
-            f"Base distribution {source} does not fit {scenario.name}: "
-            f"expected names {wanted} in this order, got {names}."
+            f"Base distribution {source} does not fit {scenario}: "
+            f"expected names {list(wanted)} in this order, got {names}."
         )
     try:
-        distribution = _read(scenario, data)
+        if any(key in data for key in FITTED_KEYS):
+            return FittedDistribution.from_dict(data)
+        return read_distribution(data)
     except ValueError as error:
         raise ValueError(f"Base distribution {source}: {error}") from None
+
+
+def _fit_to(scenario: Scenario, source: str, distribution: FileDistribution | FittedDistribution) -> Distribution:
+    """Return the distribution as one of a scenario, with its size and range checked."""
     columns = len(scenario.column_parameters)
     if distribution.dim != columns:
         raise ValueError(
@@ -106,14 +129,9 @@ def _from_dict(scenario: Scenario, source: str, data: Mapping[str, Any]) -> Dist
             f"expected {columns} columns, got {distribution.dim}."
         )
     _check_box(scenario, source, distribution)
+    if isinstance(distribution, FittedDistribution):
+        return replace(distribution, siblings=partial(load_base, scenario))
     return distribution
-
-
-def _read(scenario: Scenario, data: Mapping[str, Any]) -> FileDistribution | FittedDistribution:
-    """Return the distribution of a file, a fitted one if the file says what it was fitted to."""
-    if any(key in data for key in FITTED_KEYS):
-        return FittedDistribution.from_dict(data, siblings=partial(load_base, scenario))
-    return read_distribution(data)
 
 
 def _check_box(scenario: Scenario, source: str, distribution: FileDistribution | FittedDistribution) -> None:

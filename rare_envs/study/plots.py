@@ -82,7 +82,7 @@ def save_figure(path: Path, figure: Figure) -> None:
     """
     figure.set_dpi(DOTS_PER_INCH)
     with replace_file(path) as draft:
-        FigureCanvasAgg(figure).print_png(draft)
+        FigureCanvasAgg(figure).print_png(draft)  # type: ignore[no-untyped-call]
 
 
 def _replay_likeliest_failure(report: Report) -> Drive | str:

@@ -47,6 +47,23 @@ def test_the_default_is_the_first() -> None:
     assert (load_base(highway_first).sample(10, rng()) == load_base(FOLLOWING, "highway").sample(10, rng())).all()
 
 
+def test_a_file_is_read_once_until_it_changes_and_knows_the_bases_of_its_own_scenario(tmp_path: Path) -> None:
+    one, again = (load_base(FOLLOWING) for _ in range(2))
+    assert isinstance(one, FittedDistribution) and isinstance(again, FittedDistribution)
+    assert one.distribution is again.distribution and one.refits == again.refits
+    text = FOLLOWING.bases[FOLLOWING.default_base].read_text(encoding="utf-8")
+    (tmp_path / "base.json").write_text(text)
+    twin = replace(FOLLOWING, bases={"own": tmp_path / "base.json", "other": FOLLOWING.bases["highway"]})
+    own = load_base(twin)
+    assert isinstance(own, FittedDistribution)
+    assert (own.sibling("other").sample(9, rng()) == load_base(FOLLOWING, "highway").sample(9, rng())).all()
+    with pytest.raises(ValueError, match="'other'"):
+        one.sibling("other")
+    (tmp_path / "base.json").write_text(json.dumps({**json.loads(text), "family": "another"}))
+    changed = load_base(twin)
+    assert isinstance(changed, FittedDistribution) and changed.family == "another"
+
+
 # --- dictionaries -------------------------------------------------------------------------------
 
 GAUSSIAN = {"weights": [1.0], "means": [[15.0, 40.0]], "covariances": [[[4.0, 0.0], [0.0, 25.0]]]}
