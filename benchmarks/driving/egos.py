@@ -51,7 +51,7 @@ intervals are those of sampling; the events behind a base distribution leave p o
 for car-following: under its default, `us101`, `idm` has 7.4e-11 and in 6,000 simulations of `imitation` nothing fails;
 `us101-gap` is a test distribution under which egos and methods can be compared.
 
-`vision` has {most:,} simulations at most, which take about five minutes of a core, by the first method only since
+`vision` has {most:,} simulations at most, in `Highway-v0` 6,000 (26 minutes of a core), by the first method only since
 its corrections ([camera](camera.md#the-ego-vision)). {missing}
 Rows of 100,000 steps are of short trainings and do not compare with those of 400,000: `ppo` in `HardBrake-v0` still
 crashes in a fifth of the brakings, where one of 400,000 steps crashed in 8e-05 under an earlier base of that scenario.
@@ -72,12 +72,12 @@ print(samplers.estimate(problem, seed=0, max_sim=3000))
 ```
 
 ```text
-P[f <= 0] = 7.5e-04
-  95 % interval [7.0e-04, 8.3e-04], c.o.v. 0.036
-  base distribution 95 %  1.7e-05 to 3.3e-02 (38 + 15 events of 17 scenes, 30 refits); predictive mean 4e-03
+P[f <= 0] = 7.4e-04
+  95 % interval [6.7e-04, 8.6e-04], c.o.v. 0.053
+  base distribution 95 %  1.2e-05 to 4.5e-02 (38 + 15 events of 17 scenes, 30 refits); predictive mean 5e-03
     assumes that the fitted family is correct (1 component, log gaps); errors of the family are not included
-  3,000 simulations, gain over Monte Carlo 349; two-stage, seed 0, converged; 1,082 failing points
-  valid if no failure region was missed; 330 base draws would have met one with probability above 9.0e-03 (95 %
+  3,000 simulations, gain over Monte Carlo 162; two-stage, seed 0, converged; 1,062 failing points
+  valid if no failure region was missed; 332 base draws would have met one with probability above 9.0e-03 (95 %
   confidence)
 ```
 """
