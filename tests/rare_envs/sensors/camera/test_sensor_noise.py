@@ -1,14 +1,15 @@
 """Sensor noise: the hash in plain integers, the exact distribution of its values, and that they are white."""
 
 import math
+import sys
 
 import numpy as np
 import pytest
 import torch
 from scipy import stats
 
-from rare_envs.sensors.camera import Camera, CameraContext, Weather
-from rare_envs.sensors.camera.sensor_noise import add_bytes, add_bytes_unsigned, draw_pixel_noise
+from rare_envs.sensors.camera import Camera, CameraContext, Weather, sensor_noise
+from rare_envs.sensors.camera.sensor_noise import draw_pixel_noise
 
 N = 3 * 66 * 200
 """Values of a picture."""
@@ -87,8 +88,15 @@ def test_noise_is_white() -> None:
     assert across.abs().max() < 5 / math.sqrt(N)
 
 
-def test_signed_and_unsigned_integers_give_the_same_noise() -> None:
-    """The first are those of a graphics card, the second those of a processor."""
-    rng = torch.Generator().manual_seed(3)
-    key, place = (torch.randint(-(2**31), 2**31, (n,), generator=rng).to(torch.int32) for n in (50, 3000))
-    assert torch.equal(add_bytes(key, place), add_bytes_unsigned(key, place))
+@pytest.mark.parametrize("cameras_at_once", [1, 40])
+def test_noise_is_the_same_where_numba_does_not_work(monkeypatch: pytest.MonkeyPatch, cameras_at_once: int) -> None:
+    context = cameras(*range(cameras_at_once))
+    found = draw_pixel_noise(context, 500)
+    monkeypatch.setattr(sensor_noise, "_find_compiled_noise", lambda: None)
+    assert torch.equal(found, draw_pixel_noise(context, 500))
+
+
+def test_one_camera_does_not_import_numba(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delitem(sys.modules, "numba", raising=False)
+    monkeypatch.setattr(sensor_noise, "_find_compiled_noise", lambda: pytest.fail("numba was asked for"))
+    draw_pixel_noise(cameras(1), 500)
