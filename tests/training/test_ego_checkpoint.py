@@ -20,7 +20,8 @@ from training import train_ego
 from training.ego_checkpoint import load_checkpoint
 
 ENV = "rare_envs/CutIn-v0"
-STEPS, ROWS = 480, 8
+ROWS = 8
+OFF_POLICY = ("sac", "td3", "dqn")
 
 
 def weights(path: Path) -> torch.Tensor:
@@ -45,11 +46,14 @@ def stop_after(monkeypatch: pytest.MonkeyPatch, count: int) -> None:
     monkeypatch.setattr(training.ego_training, "save_checkpoint", save_and_stop)
 
 
-@pytest.mark.parametrize("algo", ["ppo", "sac", "td3", "dqn"])
-def test_a_resumed_training_ends_alike(algo: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    common: dict[str, Any] = {"algo": algo, "steps": STEPS, "num_envs": ROWS, "progress": False}
+@pytest.mark.parametrize(("algo", "steps", "checkpoint"), [("ppo", 480, 2), *((a, 160, 11) for a in OFF_POLICY)])
+def test_a_resumed_training_ends_alike(
+    algo: str, steps: int, checkpoint: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Stopped half-way, with updates, and new scenarios for episodes that ended (after 0.8 s), before and after."""
+    common: dict[str, Any] = {"algo": algo, "steps": steps, "num_envs": ROWS, "progress": False, "horizon": 0.8}
     whole = train_ego(ENV, out=tmp_path / "whole.zip", **common)
-    stop_after(monkeypatch, 2 if algo == "ppo" else 31)
+    stop_after(monkeypatch, checkpoint)
     with pytest.raises(Stopped):
         train_ego(ENV, out=tmp_path / "ego.zip", checkpoint_interval=0.0, **common)
     monkeypatch.undo()

@@ -28,7 +28,7 @@ def finished(run, f=EASY.f):
     return run.result()
 
 
-FEW = {"surrogate": 900}
+FEW = {"surrogate": 450}
 """Simulations of three replicates, of the methods whose own work takes long."""
 
 
