@@ -70,7 +70,7 @@ import sys
 import samplers
 from samplers.testing import check_seed
 assert "sklearn" not in sys.modules
-check_seed(samplers.TwoStage())
+check_seed(samplers.CrossEntropy(family="mixture"))
 assert "sklearn" in sys.modules
 """
 
