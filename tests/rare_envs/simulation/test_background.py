@@ -4,6 +4,7 @@ import pytest
 import torch
 
 import agents
+from agents.names import LANE_CHANGING, RULE_BASED, SHIPPED_DRIVERS
 from rare_envs.control.lane_changing import LaneChangingDriver
 from rare_envs.simulation.background import (
     FIRST_DRAWS,
@@ -61,3 +62,11 @@ def test_drivers_are_found_by_name_and_wrong_names_refused():
     ):
         with pytest.raises(ValueError, match=message):
             find_drivers(wrong)
+
+
+@pytest.mark.parametrize("name", [*SHIPPED_DRIVERS, RULE_BASED, LANE_CHANGING])
+def test_each_shipped_driver_is_installed_by_its_name(name):
+    """Each name needs an entry point of its own."""
+    found = find_drivers(name)
+    assert type(found) is type(agents.load_driver(name))
+    assert getattr(found, "name", name) == name
