@@ -69,12 +69,13 @@ class PolicyDriver:
 
 def _replace_rows(observation: Tensor, rows: Tensor) -> Tensor:
     """Return an observation in which some rows are replaced by the first other row, or by zeros if there is none."""
-    if not bool(rows.any()):
+    replaced = rows.numpy(force=True)
+    if not replaced.any():
         return observation
     wide = rows.view(-1, *[1] * (observation.ndim - 1))
-    if bool(rows.all()):
+    if replaced.all():
         return observation.masked_fill(wide, 0)
-    return torch.where(wide, observation[int((~rows).int().argmax())], observation)
+    return torch.where(wide, observation[int(replaced.argmin())], observation)
 
 
 def as_driver(ego: Any, world: World, needs: EgoNeeds | None = None) -> Driver:

@@ -1,7 +1,9 @@
-"""Dense networks of Stable-Baselines3 queried layer by layer: the bits of `predict` without its way to the network.
+"""Dense networks of Stable-Baselines3 queried layer by layer: the actions of `predict` without its way to the network.
 
 `predict` sets the mode of every module, copies the observations and makes a distribution whose mean it takes. With 25
-observations that takes six times as long as the layers.
+observations that takes six times as long as the layers. Rectifiers give the bits of `predict`. Hyperbolic tangents are
+computed as logistic functions, tanh v = 2 (s(2 v) - 1/2), which torch has 3.5 times as fast; the factors stand in the
+weights. Actions then differ from those of `predict` as these do between batches of two sizes: by rounding.
 """
 
 from __future__ import annotations
@@ -19,16 +21,17 @@ from rare_envs.egos.sb3.dense_networks import read_dense_policy
 from rare_envs.egos.wrappers import NormalisedPolicy, RescaledPolicy
 from rare_envs.simulation.compiled.failures import NotCompiled
 
-_ACTIVATIONS = {"tanh": torch.tanh, "relu": torch.relu}
+_ACTIVATIONS = {"tanh": lambda doubled: doubled.sigmoid_().sub_(0.5), "relu": torch.relu_}
+_Layers = tuple[tuple[Tensor, Tensor], ...]
 
 
 @dataclass(frozen=True, eq=False)
 class DenseInference:
-    """A policy with continuous actions that is dense layers; it shares the policy's weights."""
+    """A policy with continuous actions that is dense layers, with the weights that it had when this was made."""
 
     policy: Any
     """Whose `predict` this one stands for."""
-    layers: tuple[tuple[Tensor, Tensor], ...]
+    layers: _Layers
     """Weights, shape (outputs, inputs), and biases, shape (outputs,), of each layer, first to last."""
     activation: str
     """Between the layers, "tanh" or "relu"."""
@@ -50,7 +53,7 @@ class DenseInference:
             for weights, biases in self.layers[:-1]:
                 values = between(linear(values, weights, biases))
             actions = linear(values, *self.layers[-1])
-        if not bool(actions.isfinite().all()):
+        if not np.isfinite(actions.numpy()).all():
             answer: tuple[NDArray[Any], Any] = self.policy.predict(
                 observation, state=state, episode_start=episode_start, deterministic=deterministic
             )
@@ -80,5 +83,19 @@ def find_inference(policy: Any) -> Any:
     on_cpu = str(getattr(getattr(policy, "same_as", policy), "device", "cpu")) == "cpu"  # of SB3 all have one
     if dense.clip is None or dense.rescale or dense.normalisation or not on_cpu:  # discrete actions, or wrapped twice
         return policy
-    layers = tuple((torch.from_numpy(weights), torch.from_numpy(biases)) for weights, biases in dense.layers)
+    layers: _Layers = tuple((torch.from_numpy(weights), torch.from_numpy(biases)) for weights, biases in dense.layers)
+    if dense.activation == "tanh":
+        layers = _scale_for_tangents(layers)
     return DenseInference(policy, layers, dense.activation, *map(torch.from_numpy, dense.clip))
+
+
+def _scale_for_tangents(layers: _Layers) -> _Layers:
+    """Return layers of which the hidden ones give twice their sums and take half of their tangents.
+
+    Both are powers of 2, so that nothing is rounded.
+    """
+    last = len(layers) - 1
+    return tuple(
+        (weights * (2 if place > 0 else 1) * (2 if place < last else 1), biases * (2 if place < last else 1))
+        for place, (weights, biases) in enumerate(layers)
+    )
