@@ -62,7 +62,9 @@ class TwoStage(Method):
 
     *Warnings* (`diagnostics.py`): uneven weights, base draws that fail more often than p allows, rounds that
     contradict the estimate, regions that the last draws hardly reach, and a search of so few lineages that M may
-    exceed 0.3; the message says what cannot be excluded in units of p. A region that neither f announces nor any draw
+    exceed 0.3; the message says what cannot be excluded in units of p. Where simulated failures lie off the way of the
+    last draws, a regression of f predicts their true c.o.v., and one of twice the stated c.o.v. is told
+    (`response_surface/`). A region that neither f announces nor any draw
     has hit gives no warning; `Estimate.unseen` bounds its probability.
 
     *Terms.* Problems that offer terms and their gradients, in 30 dimensions or more and with 1,000 simulations or more,

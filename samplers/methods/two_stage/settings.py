@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 
 from samplers.methods.two_stage.mixture.proposal import Kind
 from samplers.methods.two_stage.mixture.settings import DEFAULT_MIXTURE_SETTINGS, MixtureSettings
+from samplers.methods.two_stage.response_surface.settings import DEFAULT_SURFACE_SETTINGS, SurfaceSettings
 from samplers.methods.two_stage.terms.settings import DEFAULT_TERM_SETTINGS, TermSettings
 
 
@@ -386,6 +387,7 @@ class TwoStageSettings:
     refinement: RefinementSettings = RefinementSettings()
     fallback: FallbackSettings = FallbackSettings()
     diagnostics: DiagnosticSettings = DiagnosticSettings()
+    surfaces: SurfaceSettings = DEFAULT_SURFACE_SETTINGS
     mixture: MixtureSettings = DEFAULT_MIXTURE_SETTINGS
     terms: TermSettings = DEFAULT_TERM_SETTINGS
 

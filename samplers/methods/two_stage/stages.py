@@ -32,6 +32,7 @@ from samplers.methods.two_stage.multiple_importance import MultipleImportanceSam
 from samplers.methods.two_stage.noise_coordinates import marginalise_noise
 from samplers.methods.two_stage.refinement import RefinementState, refine_once, start_refinement, typical_weights
 from samplers.methods.two_stage.regions import ExplorationResult
+from samplers.methods.two_stage.response_surface.spread import LastDraws, Simulated, check_spread
 from samplers.methods.two_stage.settings import TwoStageSettings
 from samplers.methods.two_stage.simulator import (
     ComponentDraws,
@@ -296,7 +297,7 @@ def estimate_afresh(
     settings = context.settings
     typical = typical_weights(refinement, proposal)
     sample = StratifiedSample.empty(len(proposal.weights), inputs.dim, typical, settings.min_stratum_draws)
-    whole = sample
+    whole, kept = sample, Simulated.none(inputs.dim)
     size = context.left if goal.target_cov is None else context.target_batch
     while context.left_at_all > 0:
         try:
@@ -305,6 +306,8 @@ def estimate_afresh(
             stopped = True
             break
         sample = sample.add(batch, proposal, inputs, goal.gamma)
+        room = max(settings.surfaces.most_points - len(kept.y), 0)
+        kept = Simulated.join([kept, Simulated.of(batch.u[:room], batch.f[:room], goal.gamma)])
         whole = reduce(StratifiedSample.join, (each.sample for each in state.counted), sample)
         state = _record_draws(context, state, batch, whole.p, whole.cov, whole.draws.ess)
         if context.meets_target(whole.cov):
@@ -320,7 +323,11 @@ def estimate_afresh(
     parts = [part.sample.draws.weights_after(part.first, whole.draws.n) for part in (*state.counted, last)]
     return replace(
         outcome,
-        warnings=(*outcome.warnings, *_check(context, state, refinement, sample, whole)),
+        warnings=(
+            *outcome.warnings,
+            *_check(context, state, refinement, sample, whole),
+            *_check_spread(context, state, refinement, LastDraws(proposal, sample.draws.n, whole.p, sample.cov, kept)),
+        ),
         sample=replace(points, lineages=discovery.lineages),
         draw_weights=tuple(weights for part in parts for weights in part),
         status=Status.STOPPED if stopped else outcome.status,
@@ -413,6 +420,18 @@ def _check(
         *check_discovery(whole.p, refinement.exploration.discovery, context.goal.confidence, settings),
         *([] if refinement.noisy else check_efficiency(sample, settings)),
     ]
+
+
+def _check_spread(context: RunContext, state: RunState, refinement: RefinementState, draws: LastDraws) -> list[str]:
+    """Return a warning if a regression of f on all that was simulated predicts a far larger c.o.v. of the draws."""
+    gamma, axes, settings = context.goal.gamma, refinement.exploration.slopes, context.settings
+    if refinement.noisy:
+        return []
+    drawn = [Simulated.of(batch.u, batch.f, gamma) for batch in state.history.batches]
+    around = [Simulated.of(region.u, region.f, gamma) for region in refinement.regions]
+    rng = context.rng.spawn(1)[0]  # draws nothing from the run's own generator
+    searched = Simulated.join([*drawn, *around])
+    return check_spread(draws, searched, axes, rng, settings.surfaces, settings.mixture.pieces)
 
 
 def _outcome(context: RunContext, state: RunState, draws: Draws, cov: float, interval: Interval) -> Outcome:

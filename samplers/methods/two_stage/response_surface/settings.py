@@ -1,0 +1,52 @@
+"""Settings of the response surface and of the check by it, each with its reason."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+
+@dataclass(frozen=True, kw_only=True)
+class SurfaceSettings:
+    """When and how a regression of f is asked what the last draws may have missed (`spread.py`)."""
+
+    max_dim: int = 12
+    """Dimensions, or slopes, up to which a regression is tried."""
+    most_points: int = 6000
+    """Last draws that are kept for it at most."""
+    heavy_share: float = 0.01
+    """A failing point is heavy where it would be more than this share of p as one of the last draws."""
+    least_heavy: int = 3
+    """Simulated failures that are heavy from which on a regression is made. In 38 states that the draws describe well
+    32 of 380 runs came to that."""
+    process_points: int = 600
+    """Points that Kriging is conditioned on; as many more near the limit state test it."""
+    piece_points: int = 2500
+    """Points nearest to the limit state for the regression by pieces."""
+    pieces: int = 12
+    """Pieces to start with. With 24 the regressions of four of eleven series systems were not believed."""
+    piece_fits: int = 8
+    """Such regressions at most, from pieces around other failures; the one that is right most often is taken."""
+    compressions: tuple[float, ...] = (3.0, 10.0)
+    """Outcomes are tanh(f / (c s)), with s the median of their size at failures: what is far off matters little."""
+    min_accuracy: float = 0.95
+    """Share of points that the regression must place on the right side of the limit state: of points near it that the
+    fit had not seen, and of all simulated points that it says fail."""
+    min_heavy_accuracy: float = 0.8
+    """The same of the simulated points that it says fail and that are heavy. Where f only seems to fall towards failure
+    (a strip, a jump, a box off the way) it is below 0.02, on sums of loads and series systems 0.9 to 1."""
+    chains: int = 300
+    """Chains on the regression, from the failures of the last draws; their simulations cost nothing ..."""
+    steps: int = 100
+    """... and their steps, of which the second half counts. With 16 steps the c.o.v. of a series system was predicted
+    at a sixth, for the chains had not left the places that draws reach."""
+    max_ratio: float = 2.0
+    """Predicted over stated c.o.v. from which on there is a warning."""
+
+
+DEFAULT_SURFACE_SETTINGS = SurfaceSettings()
+LENGTHS = np.array([2.0, 4.0, 8.0, 14.0])
+"""Correlation lengths that Kriging chooses from, in standard deviations."""
+SEARCH_POINTS = 250
+"""Points for that choice."""
+NUGGET = 1e-4
+"""Variance of what is no part of the process, over that of the residuals of the trend."""
