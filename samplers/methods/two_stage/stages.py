@@ -306,7 +306,7 @@ def estimate_afresh(
             stopped = True
             break
         sample = sample.add(batch, proposal, inputs, goal.gamma)
-        room = max(settings.surfaces.most_points - len(kept.y), 0)
+        room = max(settings.surfaces.most_points - len(kept.y), 0) if _asks_surface(context, refinement) else 0
         kept = Simulated.join([kept, Simulated.of(batch.u[:room], batch.f[:room], goal.gamma)])
         whole = reduce(StratifiedSample.join, (each.sample for each in state.counted), sample)
         state = _record_draws(context, state, batch, whole.p, whole.cov, whole.draws.ess)
@@ -424,14 +424,21 @@ def _check(
 
 def _check_spread(context: RunContext, state: RunState, refinement: RefinementState, draws: LastDraws) -> list[str]:
     """Return a warning if a regression of f on all that was simulated predicts a far larger c.o.v. of the draws."""
-    gamma, axes, settings = context.goal.gamma, refinement.exploration.slopes, context.settings
-    if refinement.noisy:
+    gamma, settings = context.goal.gamma, context.settings
+    if not _asks_surface(context, refinement):
         return []
     drawn = [Simulated.of(batch.u, batch.f, gamma) for batch in state.history.batches]
     around = [Simulated.of(region.u, region.f, gamma) for region in refinement.regions]
     rng = context.rng.spawn(1)[0]  # draws nothing from the run's own generator
     searched = Simulated.join([*drawn, *around])
-    return check_spread(draws, searched, axes, rng, settings.surfaces, settings.mixture.pieces)
+    return check_spread(draws, searched, refinement.exploration.slopes, rng, settings.surfaces, settings.mixture.pieces)
+
+
+def _asks_surface(context: RunContext, refinement: RefinementState) -> bool:
+    """Return whether a regression of f may say what the draws do not show: in few coordinates, without noise."""
+    axes = refinement.exploration.slopes
+    dim = refinement.dim if axes is None else axes.shape[1]
+    return not refinement.noisy and 0 < dim <= context.settings.surfaces.max_dim
 
 
 def _outcome(context: RunContext, state: RunState, draws: Draws, cov: float, interval: Interval) -> Outcome:

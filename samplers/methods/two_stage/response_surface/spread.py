@@ -123,9 +123,8 @@ def predict_cov(
         settings: When the regression is believed.
         pieces: Of the regression by pieces.
     """
-    dim = searched.u.shape[1] if axes is None else axes.shape[1]
     starts = draws.kept.failing
-    if not 0 < dim <= settings.max_dim or draws.p == 0 or len(starts) == 0:
+    if draws.p == 0 or len(starts) == 0:
         return None
     known = Simulated.join([searched, draws.kept])
     if np.count_nonzero(draws.shares(known.failing) > settings.heavy_share) < settings.least_heavy:

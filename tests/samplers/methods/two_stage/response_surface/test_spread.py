@@ -7,6 +7,8 @@ import pytest
 from scipy.special import log_ndtr, ndtr
 
 import samplers
+from samplers.limit_states import half_space
+from samplers.methods.two_stage import stages
 from samplers.methods.two_stage.mixture.proposal import MixtureProposal, ProposalComponent
 from samplers.methods.two_stage.response_surface.settings import DEFAULT_SURFACE_SETTINGS
 from samplers.methods.two_stage.response_surface.spread import LastDraws, Simulated, check_spread, predict_cov
@@ -92,13 +94,19 @@ def test_a_strip_that_looks_like_a_half_space_is_not_believed(rng):
     assert predict_cov(draws, searched(strip, rng), None, rng) is None
 
 
-def test_more_dimensions_than_a_regression_is_for(rng):
-    """Nothing is tried."""
-    dim = DEFAULT_SURFACE_SETTINGS.max_dim + 1
-    u = rng.standard_normal((50, dim))
-    q = MixtureProposal([ProposalComponent(IsotropicNormal(dim), "base")], np.ones(1))
-    draws = LastDraws(q, 50, 0.5, 0.1, Simulated.of(u, u[:, 0], 0.0))
-    assert predict_cov(draws, Simulated.none(dim), None, rng) is None
+def test_no_failing_draw_no_prediction(rng):
+    """There is nothing that chains could start from."""
+    draws = LastDraws(proposal(1.2, 0.3), N, 0.0, math.inf, Simulated.none(2))
+    assert predict_cov(draws, searched(plane, rng), None, rng) is None
+
+
+@pytest.mark.parametrize(("dim", "asked"), [(2, True), (DEFAULT_SURFACE_SETTINGS.max_dim + 1, False)])
+def test_a_regression_is_asked_in_few_dimensions_only(dim, asked, monkeypatch):
+    """In more the draws are not even kept for it."""
+    calls = []
+    monkeypatch.setattr(stages, "check_spread", lambda *inputs: calls.append(inputs) or [])
+    samplers.estimate(half_space(dim).problem, "two-stage", seed=0, max_sim=2000)
+    assert bool(calls) == asked
 
 
 def test_infinite_outcomes_are_left_out():
