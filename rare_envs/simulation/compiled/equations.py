@@ -173,6 +173,16 @@ def steer_to_line(offset: float, heading: float, speed: float) -> float:
 def idm_acceleration(idm: IDMNumbers, speed: float, gap: float, closing_speed: float, desired_speed: float) -> float:
     """Return the acceleration [m/s^2]: `rare_envs.control.idm.IDM.acceleration`."""
     ratio = speed / desired_speed
+    square = ratio * ratio
+    free = square * square if idm.exponent == _FOUR else ratio**idm.exponent
+    return idm_interaction(idm, speed, gap, closing_speed, ratio, free)
+
+
+@compiled
+def idm_interaction(
+    idm: IDMNumbers, speed: float, gap: float, closing_speed: float, ratio: float, free: float
+) -> float:
+    """Return the acceleration [m/s^2] from the speed's ratio to the desired one and that to the power `exponent`."""
     headway = idm.time_headway + closing_speed * idm.closing_gain
     if idm.cut_off > ZERO:
         headway = max(headway, ZERO)
@@ -180,15 +190,19 @@ def idm_acceleration(idm: IDMNumbers, speed: float, gap: float, closing_speed: f
     if idm.jam_distance_speed != ZERO:
         desired_gap = desired_gap + idm.jam_distance_speed * np.sqrt(max(ratio, _LEAST_RATIO))
     share = desired_gap / max(gap + idm.added_length, _NEAREST)
-    square = ratio * ratio
-    free = square * square if idm.exponent == _FOUR else ratio**idm.exponent
     return at_least(idm.max_acceleration * (ONE - free - share * share), -idm.max_deceleration)
+
+
+@compiled
+def are_near(dx: float, dy: float) -> bool:
+    """Return whether centres are so near that bodies may overlap."""
+    return abs(dx) < _FAR and abs(dy) < _FAR
 
 
 @compiled
 def boxes_overlap(dx: float, dy: float, heading: float, other_heading: float) -> bool:
     """Return whether two bodies overlap: `rare_envs.traffic.oriented_boxes.boxes_overlap`, where centres are near."""
-    if not (abs(dx) < _FAR and abs(dy) < _FAR):
+    if not are_near(dx, dy):
         return False
     cos, sin = math.cos(heading), math.sin(heading)
     turn = other_heading - heading
@@ -242,9 +256,20 @@ def lead_in_lane(
 @compiled
 def ttc(gap: float, closing_speed: float, y: float, heading: float, speed: float, road: RoadWidth) -> float:
     """Return the time to collision [s]: `rare_envs.measures.time_to_collision.ttc`."""
-    to_lead = max(gap, _LEAST_GAP) / at_least(closing_speed, _LEAST_SPEED)
     across = speed * sine(heading)
     sign: float = np.sign(across)
     room = road.half - (y - road.middle) * sign
     to_edge = max(room, _LEAST_GAP) / max(abs(across), _LEAST_SPEED)
-    return at_most(at_most(to_lead, to_edge), _LARGEST_TTC)
+    return at_most(at_most(time_to_lead(gap, closing_speed), to_edge), _LARGEST_TTC)
+
+
+@compiled
+def straight_ttc(gap: float, closing_speed: float) -> float:
+    """Return `ttc` of a vehicle that drives straight on, which meets no edge."""
+    return at_most(time_to_lead(gap, closing_speed), _LARGEST_TTC)
+
+
+@compiled
+def time_to_lead(gap: float, closing_speed: float) -> float:
+    """Return the time to collision with the lead [s], without a cap: `time_to_collision._time_to_lead`."""
+    return max(gap, _LEAST_GAP) / at_least(closing_speed, _LEAST_SPEED)

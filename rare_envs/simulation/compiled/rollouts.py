@@ -13,9 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rare_envs.compilation import compiled, single
-from rare_envs.control.idm import IDM
 from rare_envs.measures.base import COLLISION
-from rare_envs.scenarios.cut_in import CUT_IN_DURATION, CUT_IN_MIN_LENGTH, CUTTER_IDM
+from rare_envs.scenarios.cut_in import CUT_IN_DURATION, CUT_IN_MIN_LENGTH
 from rare_envs.simulation.compiled.equations import (
     BODY_LENGTH,
     ONE,
@@ -36,36 +35,9 @@ from rare_envs.simulation.compiled.equations import (
     off_road,
     ttc,
 )
-from rare_envs.traffic.road import Road
 
 SingleArray: TypeAlias = NDArray[np.float32]
 _HIT, _LEAST_LENGTH, _DURATION, _THREE, _SIX = single(COLLISION, CUT_IN_MIN_LENGTH, CUT_IN_DURATION, 3.0, 6.0)
-
-
-def drive(script: str, x: NDArray[np.float64], ego: IDM, road: Road, dt: float, ticks: int) -> SingleArray:
-    """Return f of scenarios, shape (B,).
-
-    Args:
-        script: "car_following", "cut_in" or "hard_brake".
-        x: Scenarios within the physical box, shape (B, d).
-        ego: Its parameters.
-        road: A straight road with equal lanes.
-        dt: Tick [s].
-        ticks: Length of an episode.
-    """
-    columns = np.ascontiguousarray(x.T, dtype=np.float32)
-    idm, numbers, (tick,) = IDMNumbers.of(ego), RoadNumbers.of(road), single(dt)
-    f: SingleArray = np.empty(len(x), dtype=np.float32)
-    if script == "cut_in":
-        drive_cut_in(columns, idm, IDMNumbers.of(CUTTER_IDM), numbers, tick, ticks, f)
-    elif script == "car_following":
-        ego_speed, lead_speed, gap = columns
-        still = np.zeros_like(gap)
-        drive_behind_lead(ego_speed, lead_speed, gap, still, idm, numbers, tick, ticks, f)
-    else:
-        speed, gap, deceleration = columns
-        drive_behind_lead(speed, speed, gap, -deceleration, idm, numbers, tick, ticks, f)
-    return f
 
 
 @compiled
@@ -79,6 +51,14 @@ def bezier(progress: float, length: float, offset: float) -> tuple[float, float]
     """Return y and slope of the path: `rare_envs.scenarios.cut_in.bezier`."""
     t = min(max(progress / length, ZERO), ONE)
     return offset * (ONE + t * t * (TWO * t - _THREE)), offset * (_SIX * t * (t - ONE)) / length
+
+
+@compiled
+def path_length(columns: SingleArray, row: int) -> float:
+    """Return the length of a cutter's path [m], of x (d, B) of `CutIn-v0` or `CutIn-v1`."""
+    duration = columns[6, row] if len(columns) > 6 else _DURATION
+    length: float = max(columns[1, row] * duration, _LEAST_LENGTH)
+    return length
 
 
 @compiled
@@ -198,11 +178,10 @@ def drive_cut_in(
     for row in range(len(f)):
         speed = (columns[0, row], columns[1, row], columns[2, row])
         offset = columns[5, row]
-        duration = columns[6, row] if len(columns) > 6 else _DURATION
         start = columns[3, row] + BODY_LENGTH
         x, y = (ZERO, start, start + columns[4, row] + BODY_LENGTH), (ZERO, offset, ZERO)
         heading = (ZERO, ZERO, ZERO)
-        length, desired_speed = max(speed[1] * duration, _LEAST_LENGTH), max(speed[1], ONE)
+        length, desired_speed = path_length(columns, row), max(speed[1], ONE)
         gap, closing = lead_of(x, y, heading, speed, road)
         least = ttc(gap, closing, y[0], heading[0], speed[0], road)
         for _ in range(ticks):

@@ -70,10 +70,10 @@ class CompiledRollout:
         ego = self.ego if isinstance(self.ego, IDM) else self.ego()
         arguments = (self.road, self.dt, self.ticks)
         with compiler_failures():
-            from rare_envs.simulation.compiled import policy_rollouts, rollouts
+            from rare_envs.simulation.compiled import policy_rollouts, scripted_rollouts
 
             if isinstance(ego, IDM):
-                return rollouts.drive(self.script, x, ego, *arguments)
+                return scripted_rollouts.drive_by_idm(self.script, x, ego, *arguments)
             assert isinstance(ego, DensePolicy)
             return policy_rollouts.drive_by_policy(self.script, x, ego, *arguments)
 
@@ -185,7 +185,7 @@ def _import_compiler() -> None:
     if importlib.util.find_spec("numba") is None:
         raise NotCompiled("numba is not installed: pip install 'rare-envs[fast]'")
     try:
-        from rare_envs.simulation.compiled import policy_rollouts, rollouts  # noqa: F401
+        from rare_envs.simulation.compiled import policy_rollouts, scripted_rollouts  # noqa: F401
         from rare_envs.simulation.compiled.highway import traffic_rollouts  # noqa: F401
     except (ImportError, OSError, RuntimeError) as error:
         raise CompilerFails(f"numba is installed, but fails here: {one_line(error)}") from error

@@ -75,9 +75,10 @@ def test_where_numba_fails_torch_simulates_and_one_line_says_so(monkeypatch):
     def fail(*_):
         raise ImportError("Numba needs NumPy 2.5 or less")
 
-    for name in [name for name in sys.modules if name.startswith(selection.__package__ + ".r")]:
+    numeric = tuple(f"{selection.__package__}.{name}" for name in ("r", "scripted_rollouts"))
+    for name in [name for name in sys.modules if name.startswith(numeric)]:
         monkeypatch.delitem(sys.modules, name)
-    monkeypatch.delattr(sys.modules[selection.__package__], "rollouts", raising=False)
+    monkeypatch.delattr(sys.modules[selection.__package__], "scripted_rollouts", raising=False)
     monkeypatch.setattr("rare_envs.compilation.single", fail)
     with pytest.warns(UserWarning, match=r"fails here: .*NumPy 2\.5 or less; torch simulates, which is slower\.$"):
         problem = rare_envs.DrivingProblem(CAR_FOLLOWING)
@@ -90,7 +91,7 @@ def test_where_the_first_call_cannot_be_compiled_torch_simulates_and_one_line_sa
     def fail(*_):
         raise numba.core.errors.TypingError("No implementation of\nfunction")
 
-    monkeypatch.setattr("rare_envs.simulation.compiled.rollouts.drive", fail)
+    monkeypatch.setattr("rare_envs.simulation.compiled.scripted_rollouts.drive_by_idm", fail)
     problem, strict = (rare_envs.DrivingProblem(CAR_FOLLOWING, core=core) for core in ("auto", "numba"))
     line = "numba is installed, but fails here: TypingError: No implementation of function"
     with pytest.warns(UserWarning, match=f"^{line}; torch simulates, which is slower\\.$"):
@@ -118,8 +119,8 @@ def test_worlds_and_drivers_that_were_sent_stay_compiled():
 
 def test_a_process_without_numba_says_what_it_lacks(monkeypatch):
     problem = rare_envs.DrivingProblem(CAR_FOLLOWING, core="numba")
-    monkeypatch.delattr(sys.modules[selection.__package__], "rollouts")
-    monkeypatch.setitem(sys.modules, f"{selection.__package__}.rollouts", None)
+    monkeypatch.delattr(sys.modules[selection.__package__], "scripted_rollouts")
+    monkeypatch.setitem(sys.modules, f"{selection.__package__}.scripted_rollouts", None)
     with pytest.raises(ValueError, match=r"install 'rare-envs\[fast\]' wherever it is simulated, or make it with core"):
         problem.evaluate(np.array([[20.0, 15.0, 30.0]]))
 
