@@ -16,14 +16,14 @@ class SurfaceSettings:
     heavy_share: float = 0.01
     """A failing point is heavy where it would be more than this share of p as one of the last draws."""
     least_heavy: int = 3
-    """Simulated failures that are heavy from which on a regression is made. In 38 states that the draws describe well
-    32 of 380 runs came to that."""
+    """Simulated failures that are heavy from which on a regression is made. Of 380
+    runs on 38 states with nothing far off 54 came to that."""
     process_points: int = 600
     """Points that Kriging is conditioned on; as many more near the limit state test it."""
     piece_points: int = 2500
     """Points nearest to the limit state for the regression by pieces."""
     pieces: int = 12
-    """Pieces to start with. With 24 the regressions of four of eleven series systems were not believed."""
+    """Pieces to start with. With 24 those of four of twelve runs on a series system were not believed."""
     piece_fits: int = 8
     """Such regressions at most, from pieces around other failures; the one that is right most often is taken."""
     compressions: tuple[float, ...] = (3.0, 10.0)
@@ -33,14 +33,15 @@ class SurfaceSettings:
     fit had not seen, and of all simulated points that it says fail."""
     min_heavy_accuracy: float = 0.8
     """The same of the simulated points that it says fail and that are heavy. Where f only seems to fall towards failure
-    (a strip, a jump, a box off the way) it is below 0.02, on sums of loads and series systems 0.9 to 1."""
+    (a strip, a jump, a box off the way) it is below 0.02, on sums of loads and series systems 0.8 to 1."""
     chains: int = 300
     """Chains on the regression, from the failures of the last draws; their simulations cost nothing ..."""
     steps: int = 100
     """... and their steps, of which the second half counts. With 16 steps the c.o.v. of a series system was predicted
-    at a sixth, for the chains had not left the places that draws reach."""
+    at a fifth, for the chains had not left the places that draws reach."""
     max_ratio: float = 2.0
-    """Predicted over stated c.o.v. from which on there is a warning."""
+    """Predicted over stated c.o.v. from which on there is a warning. Of 400 runs on a sum of loads and a series system
+    three were far off, and had it; of 325 whose true ratio is below 1.5 none had."""
 
 
 DEFAULT_SURFACE_SETTINGS = SurfaceSettings()
