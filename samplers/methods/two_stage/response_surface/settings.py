@@ -41,7 +41,7 @@ class SurfaceSettings:
     at a fifth, for the chains had not left the places that draws reach."""
     max_ratio: float = 2.0
     """Predicted over stated c.o.v. from which on there is a warning. Of 400 runs on a sum of loads and a series system
-    three were far off, and had it; of 325 whose true ratio is below 1.5 none had."""
+    three were far off, of which two have it; of 325 whose true ratio is below 1.5 none had."""
 
 
 DEFAULT_SURFACE_SETTINGS = SurfaceSettings()
