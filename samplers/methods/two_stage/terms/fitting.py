@@ -1,6 +1,7 @@
 """Fitting of term proposals: subspaces of gradients, Gaussians around ends of walks and to weighted failures."""
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,7 +11,6 @@ from samplers.methods.two_stage.mixture.subspace_em import (
     GroupedPoints,
     SubspaceMixture,
     fit_subspace_mixture,
-    inflate_variances,
 )
 from samplers.methods.two_stage.terms.history import TermHistory
 from samplers.methods.two_stage.terms.law import ComponentGroup, TermLaw
@@ -79,19 +79,23 @@ def fit_law(
     guards: FloatArray,
     settings: LawSettings,
     rng: np.random.Generator,
+    likely: NDArray[np.bool_] | None = None,
 ) -> TermLaw:
     """Return the proposal fitted to weighted points u (n, d), with guards around the heaviest of them too.
 
     The covariances are those of many points, whose weights are tempered for it; the means and the shares follow fewer
-    and heavier points.
+    and heavier points, and only the `likely` ones (n,): failures, where u are points of a higher level too.
     """
     z = u @ axes
-    heaviest = np.argsort(-log_weights, kind="stable")[: settings.max_heavy]
+    likely = np.ones(len(u), dtype=bool) if likely is None else likely
+    heaviest = np.flatnonzero(likely)[np.argsort(-log_weights[likely], kind="stable")[: settings.max_heavy]]
     around = np.concatenate([u[heaviest], ends])[: settings.max_ends]
     many = temper_weights(log_weights, settings.shape_ess)
     points = GroupedPoints(z, many, 1 / float(many @ many), np.arange(len(z)))
     mixture = fit_subspace_mixture(points, settings.max_bumps, rng)
-    bumps, shares = _finish(mixture, z, many, temper_weights(log_weights, settings.mean_ess), settings)
+    few = np.zeros(len(u))
+    few[likely] = temper_weights(log_weights[likely], settings.mean_ess)
+    bumps, shares = _finish(mixture, z, many, few, settings)
     return build_law(axes, bumps, shares, around @ axes, guards @ axes, settings)
 
 
@@ -118,7 +122,7 @@ def _shape(component: SubspaceGaussian, z: FloatArray, weights: FloatArray, sett
     centred = (z - weights @ z / mass) * np.sqrt(weights / mass)[:, None]
     values, axes = np.linalg.eigh(centred.T @ centred)
     corrected = correct_eigenvalues(np.maximum(values, LEAST_VARIANCE_OF_COMPONENT), ess)
-    return SubspaceGaussian(axes, axes.T @ component.centre, inflate_variances(corrected, ess))
+    return SubspaceGaussian(axes, axes.T @ component.centre, corrected)
 
 
 def build_law(
@@ -170,26 +174,35 @@ def temper_weights(log_weights: FloatArray, wanted: float) -> FloatArray:
     return normalise_weights(low * log_weights)
 
 
-def near_points(
-    history: TermHistory, term: int, gamma: float, settings: RoundSettings
-) -> tuple[NDArray[np.int64], bool]:
-    """Return rows to fit a term to, and whether its failures among them are worth `ready_ess` points.
+class NearPoints(NamedTuple):
+    """Points that a term is fitted to."""
 
-    Failures that it is the least term of where there are `min_failures` of them, however uneven their weights: they
-    are nearer to the likely failures than any higher level is. Else the points under the lowest level of the term at
-    which they are worth `level_ess`.
+    rows: NDArray[np.int64]
+    """Of the history, those with the lowest values of the term first, shape (k,)."""
+    likely: NDArray[np.bool_]
+    """Which of them the mean follows: the failures once there are enough, shape (k,)."""
+    ready: bool
+    """Whether the failures are worth `ready_ess` points."""
+
+
+def near_points(history: TermHistory, term: int, gamma: float, settings: RoundSettings) -> NearPoints:
+    """Return the points under the lowest level of a term at which they are worth `level_ess`, and all its failures.
+
+    With `min_failures` or more failures that it is the least term of, however uneven their weights, the points are
+    those that it is the least of, and the failures are the likely ones: they are nearer to the likely failures than any
+    higher level is.
     """
     values, log_weights = history.terms.values[:, term], history.log_weights
     known = np.isfinite(history.terms.f)
     mine = known & (history.terms.least == term)
-    failing = np.flatnonzero(mine & history.failing(gamma))
-    if len(failing) >= settings.min_failures:
-        return failing, effective_sample_size(log_weights[failing]) >= settings.ready_ess
-    rows = np.flatnonzero(known)
+    fails = mine & history.failing(gamma)
+    enough = int(fails.sum()) >= settings.min_failures
+    rows = np.flatnonzero(mine if enough else known)
     rows = rows[np.argsort(values[rows], kind="stable")]
     w = np.exp(log_weights[rows] - log_weights[rows].max())
     ess = np.cumsum(w) ** 2 / np.cumsum(w**2)
-    enough = np.flatnonzero(ess >= settings.level_ess)
-    count = int(enough[0]) + 1 if len(enough) else len(rows)
-    under = int((values[rows] <= history.terms.threshold).sum())
-    return rows[: max(count, under)], False
+    reached = np.flatnonzero(ess >= settings.level_ess)
+    count = int(reached[0]) + 1 if len(reached) else len(rows)
+    rows = rows[: max(count, int((values[rows] <= history.terms.threshold).sum()))]
+    likely = fails[rows] if enough else np.ones(len(rows), dtype=bool)
+    return NearPoints(rows, likely, enough and effective_sample_size(log_weights[fails]) >= settings.ready_ess)

@@ -9,6 +9,7 @@ from scipy.special import ndtr
 
 from samplers.methods.two_stage.simulator import SimulationSteps
 from samplers.methods.two_stage.terms.fitting import (
+    NearPoints,
     PursuedTerm,
     choose_guards,
     find_axes,
@@ -103,7 +104,7 @@ def refit_terms(
     numbers = [one.number for one in pursued] + new
     near = [near_points(history, j, gamma, rounds) for j in numbers]
     each = max(min(rounds.gradients, rounds.max_gradients // max(len(numbers), 1)), 1)
-    chosen = [_draw_rows(rows, history.log_weights, each, rng) for rows, _ in near]
+    chosen = [_draw_rows(points.rows[points.likely], history.log_weights, each, rng) for points in near]
     while chosen and simulator.n_sim + simulator.offer.count_gradients(sum(map(len, chosen))) > limit:
         chosen = [rows[: len(rows) // 2] for rows in chosen]  # count_gradients(0) is 0
     rows, term = np.concatenate(chosen), np.repeat(numbers, [len(part) for part in chosen])
@@ -111,13 +112,14 @@ def refit_terms(
     excess = history.terms.values[rows, term] - history.terms.threshold
     found = describe_half_spaces(term, history.u[rows], slopes, excess)
     result = []
-    for number, (points, ready) in zip(numbers, near, strict=True):
+    for number, points in zip(numbers, near, strict=True):
         directions = found.of(number)
         old = next((one for one in pursued if one.number == number), None)
         if old is not None:
-            result.append(_refit_term(old, history, directions, points, ready, rng, settings))
+            result.append(_refit_term(old, history, directions, points, rng, settings))
         elif len(directions.term):
-            result.append(start_term(number, directions, history.u[points[: settings.law.max_ends]], settings.law))
+            ends = history.u[points.rows[points.likely][: settings.law.max_ends]]
+            result.append(start_term(number, directions, ends, settings.law))
     return result
 
 
@@ -125,18 +127,18 @@ def _refit_term(
     term: PursuedTerm,
     history: TermHistory,
     directions: Directions,
-    rows: NDArray[np.int64],
-    ready: bool,
+    points: NearPoints,
     rng: np.random.Generator,
     settings: TermSettings,
 ) -> PursuedTerm:
-    """Return a term with further gradients, fitted to some rows of the history."""
+    """Return a term with further gradients, fitted to some points of the history."""
     later = float(term.direction_weights.max()) * settings.rounds.later_weight
     weights = np.concatenate([term.direction_weights, np.full(len(directions.term), later)])
     directions = term.directions.join(directions)
     axes = find_axes(directions.values, weights, settings.law)
     guards = choose_guards(directions, settings.law)
-    law = fit_law(axes, history.u[rows], history.log_weights[rows], term.ends, guards, settings.law, rng)
+    rows, likely, ready = points
+    law = fit_law(axes, history.u[rows], history.log_weights[rows], term.ends, guards, settings.law, rng, likely)
     return replace(term, directions=directions, direction_weights=weights, law=law, ready=term.ready or ready)
 
 

@@ -93,11 +93,37 @@ def test_points_to_fit_to_are_failures_or_a_level(half_spaces, rng):
     problem, _, normals = half_spaces(20, 0.1, shares=(1.0, 1e-7))
     u = rng.standard_normal((600, 20))
     history = TermHistory.of_base_draws(u, problem.terms(u))
-    rows, ready = near_points(history, 0, 0.0, RoundSettings())
-    assert ready and len(rows) == int((problem.terms(u).values[:, 0] <= 0).sum())
-    rows, ready = near_points(history, 1, 0.0, RoundSettings())
-    assert not ready
-    assert set(rows) == set(np.argsort(-u @ normals[1])[:15])
+    near = near_points(history, 0, 0.0, RoundSettings())
+    assert near.ready and near.likely.all() and len(near.rows) == int((problem.terms(u).values[:, 0] <= 0).sum())
+    near = near_points(history, 1, 0.0, RoundSettings())
+    assert not near.ready and near.likely.all()
+    assert set(near.rows) == set(np.argsort(-u @ normals[1])[:15])
+
+
+def test_few_failures_have_the_points_of_a_level_beside_them(half_spaces, rng):
+    """Of 600 base draws a term with p = 0.02 has about 12 failures, all likely, and 3 of the lowest others."""
+    problem, _, normals = half_spaces(20, 0.02, shares=(1.0, 1e-7))
+    u = rng.standard_normal((600, 20))
+    near = near_points(TermHistory.of_base_draws(u, problem.terms(u)), 0, 0.0, RoundSettings())
+    failures = int((problem.terms(u).f <= 0).sum())
+    assert 6 <= failures < 15 and near.ready
+    np.testing.assert_array_equal(near.rows, np.argsort(-u @ normals[0])[:15])
+    np.testing.assert_array_equal(near.likely, np.arange(15) < failures)
+
+
+def test_the_mean_is_that_of_the_likely_points(rng):
+    """30 failures around 4, 60 points of a level around 3: the mean is 4, a slab of sd 0.3 is seen in all of them."""
+    u = rng.standard_normal((90, 12))
+    u[:, 0] = np.where(np.arange(90) < 30, 4.0, 3.0) + 0.1 * rng.standard_normal(90)
+    u[:, 1] *= 0.3
+    likely = np.arange(90) < 30
+    law = fit_law(np.eye(12)[:, :2], u, np.zeros(90), u[:0], u[:0], SETTINGS, rng, likely)
+    bumps = [group.components[0] for group in law.groups[:-2]]
+    shares = np.array([group.share for group in law.groups[:-2]])
+    centre = shares @ [bump.centre for bump in bumps] / shares.sum()
+    np.testing.assert_allclose(centre, u[likely, :2].mean(axis=0), atol=1e-9)
+    around = np.array([component.centre for component in law.groups[-1].components])
+    assert (around[:, 0] > 0.9 * 3.6).all()  # 0.9 times a failure each
 
 
 def test_the_heaviest_points_and_ends_are_guarded(rng):
