@@ -70,9 +70,9 @@ def load_driver(name: str | PathLike[str]) -> LearnedDriver | RuleDriver | LaneC
     """Load a driver by its name or from its file.
 
     Args:
-        name: "mgail4", "mgail3", "mgail2", "mgail", "gail" or "bc", which are shipped, and "imitation", which was
-            trained to be an ego; "idm", the rule-based driver, and "idm+mobil", which changes lanes too; or the path of
-            a file that `save_driver` wrote.
+        name: "mgail5", "mgail4", "mgail3", "mgail2", "mgail", "gail" or "bc", which are shipped, and "imitation", which
+            was trained to be an ego; "idm", the rule-based driver, and "idm+mobil", which changes lanes too; or the
+            path of a file that `save_driver` wrote.
 
     Returns:
         A `LearnedDriver`, or a `RuleDriver` or `LaneChangingDriver` with its default parameters.
@@ -177,7 +177,7 @@ def read_driver(path: str | PathLike[str]) -> LearnedDriver:
             weights=_weights(tensors, header["radius"], path),
             avoidance=None if rule is None else CollisionAvoidance.from_json(rule),
             hard_braking=header.get("hard_braking", 1.0),
-            changes=None if changes is None else LaneChanges(**changes),
+            changes=None if changes is None else LaneChanges.from_json(changes),
             name=header["name"],
         )
     except (AttributeError, TypeError, ValueError) as error:

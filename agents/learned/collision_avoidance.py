@@ -218,6 +218,24 @@ class CollisionAvoidance:
         )
         return left, right
 
+    def greatest_yaw_rates_within(self, features: Tensor, room: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the bounds of the yaw rate to the left and to the right [rad/s] that keep a vehicle within some room.
+
+        That is HighwayEnv's lateral controller towards the end of the room. Unlike beside a body, bounds below 0 steer
+        back as far as that takes.
+
+        Args:
+            features: What M vehicles in B scenarios perceive, shape (B, M, 51).
+            room: How far across they may go to the left and to the right [m], shape (B, M, 2).
+
+        Returns:
+            Shape (B, M) each.
+        """
+        speed, heading = features[..., SPEED_COLUMN], features[..., HEADING_COLUMN]
+        lag, across = self.heading_time * speed.clamp(min=_LEAST_SPEED), speed * torch.sin(heading)
+        wanted = room / self.lateral_time
+        return (wanted[..., 0] + across) / lag, (wanted[..., 1] - across) / lag
+
     def _speed_towards(self, features: Tensor, sin: Tensor) -> Tensor:
         """Return the own speed across towards the side of each beam [m/s], 0 or more, (B, M, 20); 0 without `close`."""
         if self.close is None:

@@ -172,7 +172,9 @@ class LearnedDriver:
         change, state = self.changes.step(features, state, innovations)
         bound = self.avoidance.greatest_acceleration_behind(change.gap, change.closing, features[..., SPEED_COLUMN])
         acceleration = torch.where(change.follows, torch.minimum(action[..., 0], bound), action[..., 0])
-        yaw_rate = torch.where(change.changing, change.yaw_rate.clamp(*self.yaw_rate), action[..., 1])
+        left, right = self.avoidance.greatest_yaw_rates_within(features, change.room)
+        inside = torch.minimum(torch.maximum(action[..., 1], -left), right)
+        yaw_rate = torch.where(change.changing, change.yaw_rate, inside).clamp(*self.yaw_rate)
         return torch.stack((acceleration, yaw_rate), dim=-1), state
 
     def _bound(self, features: Tensor, action: Tensor) -> Tensor:

@@ -59,7 +59,7 @@ LEAST_TICKS = 40
 """Ticks of record that a start needs."""
 BASELINE = "idm"
 """Row that the others are compared with, scene by scene."""
-LEARNED = ("bc", "gail", "mgail", "mgail2", "mgail3", "mgail4")
+LEARNED = ("bc", "gail", "mgail", "mgail2", "mgail3", "mgail4", "mgail5")
 SETTINGS = {"wosac_2024": WOSAC_2024, "wosac_2023": WOSAC_2023, "motorway": MOTORWAY}
 
 Decide = Callable[[Traffic, "Tensor | None"], tuple[Tensor, "Tensor | None"]]

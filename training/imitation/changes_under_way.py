@@ -1,10 +1,12 @@
 """A driver that takes up more of the lane changes under way, and keeps off whoever is very near.
 
     python -m training.imitation.changes_under_way DATA --out mgail4.safetensors [--driver mgail3]
+    python -m training.imitation.changes_under_way DATA --waiting --driver mgail4 --out mgail5.safetensors
 
 Nothing is trained. Which changes a driver takes up is a choice between those that it misses and those that nobody was
 making. Prints, in the scenes that the drivers learned from, both for several times that it looks ahead and
-several distances over the line at which it takes an unseen lane for granted.
+several distances over the line at which it takes an unseen lane for granted; with `--waiting` for several times within
+which who will be at the line is changing, whether the lane is free and seen or not.
 """
 
 from __future__ import annotations
@@ -21,7 +23,7 @@ from torch import Tensor
 from agents import LearnedDriver
 from agents.learned.adjacent_lanes import look_aside
 from agents.learned.collision_avoidance import CloseRange
-from agents.learned.lane_changes import LaneChanges
+from agents.learned.lane_changes import LaneChanges, Waiting
 from rare_envs.threads import use_one_thread
 from training.command_line import report_errors, run_command
 from training.data.trajectories import DT
@@ -35,6 +37,8 @@ FORESIGHT, OVER_LINE, KEPT_BRAKING = 2.4, 0.2, 0.75
 """Settings of mgail4: [s], [m], and the share of the braking beyond 2 m/s^2."""
 FORESIGHTS, LINES = (1.8, 2.1, 2.4, 2.7), (0.4, 0.2)
 """Of the table."""
+WITHIN = (1.5, 1.8, 2.1, 2.4)
+"""Of the table of `--waiting` [s]."""
 LATER = 3.0
 """Who crosses a line within this time [s] is changing; of who is recorded for as long and does not, it is an alarm."""
 LEAST_ACROSS = 0.2
@@ -135,20 +139,44 @@ def take_up_changes(driver: LearnedDriver, name: str) -> LearnedDriver:
     )
 
 
+def wait_for_gaps(driver: LearnedDriver, name: str) -> LearnedDriver:
+    """Return a driver with the settings of mgail5 and another name.
+
+    Raises:
+        ValueError: It has no lane changes.
+    """
+    if driver.changes is None:
+        raise ValueError(f"Expected a driver that changes lanes at a hazard rate, got {driver.name!r}.")
+    return replace(driver, changes=replace(driver.changes, waiting=Waiting()), name=name)
+
+
+def format_waiting(moving: Moving, changes: LaneChanges, within: Sequence[float] = WITHIN) -> str:
+    """Return the table of `--waiting` in Markdown; its first row is without."""
+    choices: dict[str, Waiting | None] = {"none": None} | {f"{each:g}": Waiting(foresight=each) for each in within}
+    lines = ["| within, s | taken up | alarms per 1,000 | off the road |", "|" + "---|" * 4]
+    for name, waiting in choices.items():
+        row = judge_recognition(moving, replace(changes, waiting=waiting))
+        lines.append(f"| {name} | {row.share:.2f} of {row.changing} | {row.alarms:.1f} | {row.off_road} |")
+    return "\n".join(lines)
+
+
 @use_one_thread()
 def main(
     data: Annotated[Path, typer.Argument(help="Folder with the compact tables of US 101.")],
     out: Annotated[Path, typer.Option(help="File to write, .safetensors.")],
     driver: Annotated[str, typer.Option(help="Name or file of a driver with lane changes.")] = "mgail3",
+    waiting: Annotated[bool, typer.Option("--waiting", help="Write one whose changes wait for a gap.")] = False,
 ) -> None:
     """Print how changes are told from other motion, and write a driver that takes up more of them."""
     with report_errors("changes_under_way"):
         before = load_learned_driver(driver)
-        made = take_up_changes(before, out.stem)
+        made = (wait_for_gaps if waiting else take_up_changes)(before, out.stem)
         learn, test = (stack_scenes(scenes) for scenes in load_scenes(Source("data", data)))
         assert made.changes is not None
-        print(format_recognition(collect_moving(learn), made.changes))
-        path = write_derived(made, driver, None, "changes under way, close range", "changes_under_way", test, out)
+        moving = collect_moving(learn)
+        print(format_waiting(moving, made.changes) if waiting else format_recognition(moving, made.changes))
+        difference = "changes that wait" if waiting else "changes under way, close range"
+        path = write_derived(made, driver, None, difference, "changes_under_way" + " --waiting" * waiting, test, out)
         print(f"Saved {path}.")
 
 

@@ -172,7 +172,7 @@ def write_derived(
         of: Name or file of the other.
         damping: Of its acceleration's noise [1/s]; None where the command has no such option.
         difference: In words.
-        module: Of this package, whose command makes it.
+        module: Of this package, whose command makes it; its options without a value may follow.
         test: Scenes that it has not learned from.
         out: File to write, .safetensors.
 

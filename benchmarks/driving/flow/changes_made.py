@@ -219,7 +219,7 @@ def main(
     scenes = stack_scenes(test if in_test else [*learn, *test])
     people = describe_changes(scenes)
     found = {"people": summarise_changes(people, exposure(scenes), None)}
-    for name, driver in load_named(drivers or ["mgail", "mgail2", "mgail3", "mgail4"]).items():
+    for name, driver in load_named(drivers or ["mgail", "mgail2", "mgail3", "mgail4", "mgail5"]).items():
         made = drive_as_recording(scenes, sampling_driver(driver, torch.Generator().manual_seed(0)))
         found[name] = summarise_changes(describe_changes(made), exposure(made), people)
         acts = [sampling_driver(driver, torch.Generator().manual_seed(seed)) for seed in range(3)]

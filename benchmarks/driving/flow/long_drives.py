@@ -53,7 +53,7 @@ SECONDS, SETTLING = 120.0, 60.0
 """Length of a run, and the part of it that flow and speed are not averaged over [s]."""
 REACH = 150.0
 """Vehicles this near to the seam of the ring are seen beyond it too [m]; the lidar's range is 100 m."""
-NAMES = ("mgail", "mgail2", "mgail3", "mgail4", "idm", "idm+mobil")
+NAMES = ("mgail", "mgail2", "mgail3", "mgail4", "mgail5", "idm", "idm+mobil")
 STOPPED = 1.0
 """Speed [m/s] below which a vehicle counts as stopped."""
 

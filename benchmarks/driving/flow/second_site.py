@@ -41,7 +41,7 @@ WIDTH = 1.9
 """Assumed of all vehicles [m]."""
 WINDOW = 20.0
 """Length of a window [s]."""
-NAMES = ("mgail", "mgail2", "mgail3", "mgail4")
+NAMES = ("mgail", "mgail2", "mgail3", "mgail4", "mgail5")
 
 
 def read_windows(folder: Path, seconds: float = WINDOW) -> Recording:

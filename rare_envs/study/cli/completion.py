@@ -11,8 +11,8 @@ import typer
 
 from rare_envs.startup import find_missing_libraries
 
-EGO_WORDS = ("idm", "human", "imitation", "mgail", "mgail2", "mgail3", "mgail4", "gail", "bc", "vision")
-DRIVER_WORDS = ("mgail", "mgail2", "mgail3", "mgail4", "gail", "bc", "idm", "idm+mobil")
+EGO_WORDS = ("idm", "human", "imitation", "mgail", "mgail2", "mgail3", "mgail4", "mgail5", "gail", "bc", "vision")
+DRIVER_WORDS = ("mgail", "mgail2", "mgail3", "mgail4", "mgail5", "gail", "bc", "idm", "idm+mobil")
 MEASURE_WORDS = (
     *("ttc", "lidar_ttc", "ttc_2d", "mttc", "thw", "drac", "required_deceleration", "btn", "near_crash", "ttb", "pet"),
     *("rss_longitudinal", "rss_lateral", "rss_margin", "clearance", "tet", "tit", "margin"),

@@ -178,8 +178,8 @@ def test_drivers_by_name(file):
 def test_unknown_names_get_a_suggestion(file, monkeypatch):
     with pytest.raises(
         ValueError,
-        match=r"'mgial' \(did you mean 'mgail'\?\); expected 'mgail', 'mgail2', 'mgail3', 'mgail4', 'gail', 'bc', "
-        r"'imitation', 'idm'",
+        match=r"'mgial' \(did you mean 'mgail'\?\); expected 'mgail', 'mgail2', 'mgail3', 'mgail4', 'mgail5', 'gail', "
+        r"'bc', 'imitation', 'idm'",
     ):
         load_driver("mgial")
     with pytest.raises(ValueError, match="did you mean 'idm'"):

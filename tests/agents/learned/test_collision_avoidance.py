@@ -216,3 +216,18 @@ def test_what_is_added_at_close_range_has_its_own_settings():
         ValueError, match=r"Expected close of the collision avoidance as a CloseRange or None, got 0\.3"
     ):
         CollisionAvoidance(close=0.3)
+
+
+@pytest.mark.parametrize("side", [0, 1])
+def test_within_some_room_steering_is_bounded_by_the_way_that_is_left_and_leads_back_from_beyond(side):
+    """At 20 m/s and 0.6 m/s towards a line, or away from it: (d / 0.6 s - v) / (0.2 s 20 m/s)."""
+    towards = -1.0 if side == 0 else 1.0
+    for across, distance in ((0.6, 0.9), (0.6, -0.3), (-0.6, 0.0)):
+        features = seen(speed=20.0)
+        features[..., HEADING_COLUMN] = towards * math.asin(across / 20.0)
+        room = torch.full((1, 1, 2), MAX_RANGE, dtype=torch.float64)
+        room[..., side] = distance
+        bounds = RULE.greatest_yaw_rates_within(features, room)
+        assert bounds[side].item() == pytest.approx((distance / 0.6 - across) / (0.2 * 20.0))
+        assert bounds[1 - side].item() > 40.0  # no bound
+    assert RULE.greatest_yaw_rates_within(seen(speed=0.0), torch.zeros(1, 1, 2))[0].item() == 0.0

@@ -6,7 +6,7 @@ import torch
 
 from agents import load_driver
 from agents.learned.collision_avoidance import CloseRange
-from agents.learned.lane_changes import LaneChanges
+from agents.learned.lane_changes import LaneChanges, Waiting
 from tests.agents.learned.test_lane_changes import OTHERS, on_lane
 from tests.training.imitation.synthetic_scenes import CROSSING, crossing_recording
 from training.imitation.changes_under_way import (
@@ -14,8 +14,10 @@ from training.imitation.changes_under_way import (
     TakenUp,
     collect_moving,
     format_recognition,
+    format_waiting,
     judge_recognition,
     take_up_changes,
+    wait_for_gaps,
 )
 from training.imitation.traffic.replayed_traffic import first_in_lane
 
@@ -91,6 +93,32 @@ def test_the_shipped_driver_is_mgail3_with_other_settings():
     assert all(same)
 
 
-def test_a_driver_without_lane_changes_is_refused():
+def test_with_waiting_changes_into_lanes_that_nobody_shows_are_taken_up_and_no_slower_ones():
+    """The middles reach the line in 1, 2.17 and 2.6 s, and the one at the road's edge in 0.7 s."""
+    changes = replace(LaneChanges(), foresight=0.9, waiting=Waiting(foresight=1.1))
+    taken = judge_recognition(made_moments(), changes)
+    assert (taken.share, taken.alarms, taken.off_road) == (0.5, 0.0, 1)
+
+
+def test_the_table_has_a_row_without_waiting_and_one_for_each_time():
+    lines = format_waiting(collect_moving(crossing_recording()), LaneChanges(), (1.5, 1.8)).splitlines()
+    assert [line.split("|")[1].strip() for line in lines[2:]] == ["none", "1.5", "1.8"]
+
+
+def test_the_shipped_driver_that_waits_is_mgail4_with_other_settings():
+    shipped, before = load_driver("mgail5"), load_driver("mgail4")
+    assert shipped.changes == wait_for_gaps(before, "mgail5").changes
+    assert shipped.changes == replace(before.changes, waiting=Waiting())
+    assert (shipped.avoidance, shipped.hard_braking, shipped.colour) == (
+        before.avoidance,
+        before.hard_braking,
+        before.colour,
+    )
+    same = [torch.equal(a, b) for a, b in zip(shipped.policy.parameters(), before.policy.parameters(), strict=True)]
+    assert all(same)
+
+
+@pytest.mark.parametrize("make", [take_up_changes, wait_for_gaps])
+def test_a_driver_without_lane_changes_is_refused(make):
     with pytest.raises(ValueError, match="Expected a driver that changes lanes at a hazard rate, got 'mgail2'"):
-        take_up_changes(load_driver("mgail2"), "any")
+        make(load_driver("mgail2"), "any")

@@ -39,7 +39,7 @@ def complete(line: str) -> list[str]:
         ("rare-envs estimate CutIn-v0 --ego i", ["idm", "imitation"]),
         ("rare-envs estimate CutIn-v0 --base us101-c", ["us101-closing"]),
         ("rare-envs estimate NoSuch-v0 --base u", []),
-        ("rare-envs compare idm mg", ["mgail", "mgail2", "mgail3", "mgail4"]),
+        ("rare-envs compare idm mg", ["mgail", "mgail2", "mgail3", "mgail4", "mgail5"]),
         ("rare-envs train-ego Car", ["CarFollowing-v0"]),
         ("rare-envs train-ego CutIn-v0 --algo ", list(HYPERPARAMETERS)),
         ("rare-envs list me", ["methods", "measures"]),
