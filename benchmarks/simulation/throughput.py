@@ -38,10 +38,10 @@ TICKS = 200
 ROADS = {CAR_FOLLOWING: reference.car_following_road, CUT_IN: reference.cut_in_road}
 FLOORS = {
     "car_following_idm": 1000.0,
-    "car_following_idm_compiled": 3000.0,
+    "car_following_idm_compiled": 20000.0,
     "cut_in_idm": 1000.0,
-    "cut_in_idm_compiled": 3500.0,
-    "car_following_ppo": 300.0,
+    "cut_in_idm_compiled": 8000.0,
+    "car_following_ppo": 400.0,
     "car_following_ppo_compiled": 700.0,
     "env_step": 20.0,
     "vec_step": 1000.0,
