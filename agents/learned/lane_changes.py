@@ -267,7 +267,10 @@ class LaneChanges:
         return torch.where(changing, side, 0.0)
 
     def _is_given_up(self, features: Tensor, lanes: AdjacentLanes, state: ChangeState) -> Tensor:
-        """Return whether a change has no gap before the line, or with `waiting` no lane behind it, shape (B, M)."""
+        """Return whether a change ends: no gap is left before the line, or, with `waiting`, it crossed the road's edge.
+
+        Shape (B, M).
+        """
         if self.waiting is not None:
             return _of_side(_to_lines(features), state.side) < 0.0
         gap = _of_side(_gap_after(lanes, 0.5 * self.accepted_time), state.side)

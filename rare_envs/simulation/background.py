@@ -221,7 +221,7 @@ def find_drivers(drivers: Any) -> Background | TrafficBackground | None:
     is_file = name.endswith(".safetensors")
     offered = "file" if is_file else name.partition("+")[0]
     if offered not in known:
-        names = sorted(set(known) - {"file"})
+        names = sorted({*known, *(f"{name}+mobil" for name in known if name == "idm")} - {"file"})
         listed = ", ".join(map(repr, names)) or "none is installed: pip install rare-envs"
         raise ValueError(
             f"Unknown drivers {name!r}{did_you_mean(name, names)}; expected one of {listed}, or a .safetensors file."

@@ -3,7 +3,8 @@
 `predict` sets the mode of every module, copies the observations and makes a distribution whose mean it takes. With 25
 observations that takes six times as long as the layers. Rectifiers give the bits of `predict`. Hyperbolic tangents are
 computed as logistic functions, tanh v = 2 (s(2 v) - 1/2), which torch has 3.5 times as fast; the factors stand in the
-weights. Actions then differ from those of `predict` as these do between batches of two sizes: by rounding.
+weights. Actions then differ from those of `predict` by rounding, a few times as much as these do between batches of two
+sizes. The speeds are those of 4,096 rows.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ _Layers = tuple[tuple[Tensor, Tensor], ...]
 
 @dataclass(frozen=True, eq=False)
 class DenseInference:
-    """A policy with continuous actions that is dense layers, with the weights that it had when this was made."""
+    """A policy with continuous actions that is dense layers; it is made anew for each rollout, with present weights."""
 
     policy: Any
     """Whose `predict` this one stands for."""

@@ -246,7 +246,7 @@ class EstimateOptions(QuestionOptions):
     core: Annotated[
         str,
         typer.Option(
-            help="What simulates: torch, numba (compiled; the IDM in scripted scenarios), or auto.",
+            help="What simulates: torch, numba (compiled, where it can be had: docs/speed.md), or auto.",
             autocompletion=complete_words("torch", "numba", "auto"),
         ),
     ] = "auto"

@@ -57,7 +57,7 @@ def test_it_is_found_by_name_and_tells_where_it_comes_from() -> None:
 
 
 def test_it_is_no_driver_of_the_traffic() -> None:
-    with pytest.raises(ValueError, match="expected one of 'bc', 'gail', 'idm', 'mgail'"):
+    with pytest.raises(ValueError, match=r"expected one of 'bc', 'gail', 'idm', 'idm\+mobil', 'mgail'"):
         rare_envs.DrivingProblem("rare_envs/CarFollowing-v0", drivers="imitation")
 
 

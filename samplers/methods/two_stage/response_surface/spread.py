@@ -12,7 +12,7 @@ v is large. So a place counts only where simulations of the search have failed.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -97,7 +97,7 @@ def check_spread(
         pieces: Of the regression by pieces.
     """
     predicted = predict_cov(draws, searched, axes, rng, settings, pieces)
-    if predicted is None or predicted <= settings.max_ratio * draws.cov:
+    if predicted is None or not predicted > settings.max_ratio * draws.cov:
         return []
     return [
         f"Failures lie where hardly a final draw comes: a regression of f predicts a c.o.v. of {predicted:.2g} where "
@@ -144,8 +144,8 @@ def predict_cov(
         return None
     weights = draws.shares(starts)
     first = starts[rng.choice(len(starts), settings.chains, p=weights / weights.sum())]
-    shares = draws.shares(_walk(predict, first, settings.steps, rng))
-    return math.sqrt(max(float(shares.mean()) - 1 / draws.n, 0.0))
+    means = [float(draws.shares(states).mean()) for states in _walk(predict, first, settings.steps, rng)]
+    return math.sqrt(max(float(np.mean(means)) - 1 / draws.n, 0.0))
 
 
 def _is_right(predict: Predictor, known: Simulated, draws: LastDraws, settings: SurfaceSettings) -> bool:
@@ -158,17 +158,16 @@ def _is_right(predict: Predictor, known: Simulated, draws: LastDraws, settings: 
     return bool(fails.mean() >= settings.min_accuracy and enough and fails[heavy].mean() >= settings.min_heavy_accuracy)
 
 
-def _walk(predict: Predictor, u: FloatArray, steps: int, rng: np.random.Generator) -> FloatArray:
-    """Return states of chains from u (k, d) given that they should fail, of the second half of their steps.
+def _walk(predict: Predictor, u: FloatArray, steps: int, rng: np.random.Generator) -> Iterator[FloatArray]:
+    """Yield states (k, d) of chains from u (k, d) given that they should fail, in the second half of their steps.
 
     Conditional sampling v = sqrt(1 - s^2) u + s xi, xi ~ N(0, I), as in subset simulation, all at one s.
     """
-    step, states = 0.5, []
+    step = 0.5
     for k in range(steps):
         proposed = math.sqrt(1 - step * step) * u + step * rng.standard_normal(u.shape)
         fails = predict(proposed) <= 0
         u = np.where(fails[:, None], proposed, u)
         step = min(max(step * math.exp(0.5 * (float(fails.mean()) - ACCEPTANCE)), MIN_STEP), 1.0)
         if k >= steps // 2:
-            states.append(u)
-    return np.concatenate(states)
+            yield u

@@ -102,15 +102,19 @@ def fit_law(
 def _finish(
     mixture: SubspaceMixture, z: FloatArray, many: FloatArray, few: FloatArray, settings: LawSettings
 ) -> tuple[list[SubspaceGaussian], FloatArray]:
-    """Return the components with the covariances of many points z (n, r) and the means of few, and their shares."""
+    """Return the components with the covariances of many points z (n, r) and the means of few, and their shares.
+
+    Components that none of the few belongs to are left out.
+    """
     shares = posterior(log_ratios(mixture.components, z) + np.log(mixture.weights)[:, None])
     bumps = [_shape(one, z, share * many, settings) for one, share in zip(mixture.components, shares, strict=True)]
     mass = shares @ few
     moved = [
-        SubspaceGaussian(one.axes, one.axes.T @ ((share * few) @ z / m), one.variance) if m > 0 else one
+        SubspaceGaussian(one.axes, one.axes.T @ ((share * few) @ z / m), one.variance)
         for one, share, m in zip(bumps, shares, mass, strict=True)
+        if m > 0
     ]
-    return moved, mass / mass.sum()
+    return moved, mass[mass > 0] / mass.sum()
 
 
 def _shape(component: SubspaceGaussian, z: FloatArray, weights: FloatArray, settings: LawSettings) -> SubspaceGaussian:
@@ -203,6 +207,7 @@ def near_points(history: TermHistory, term: int, gamma: float, settings: RoundSe
     ess = np.cumsum(w) ** 2 / np.cumsum(w**2)
     reached = np.flatnonzero(ess >= settings.level_ess)
     count = int(reached[0]) + 1 if len(reached) else len(rows)
-    rows = rows[: max(count, int((values[rows] <= history.terms.threshold).sum()))]
+    under = (values[rows] <= history.terms.threshold) | (fails[rows] & enough)
+    rows = rows[: max(count, int(np.flatnonzero(under)[-1]) + 1 if under.any() else 0)]
     likely = fails[rows] if enough else np.ones(len(rows), dtype=bool)
     return NearPoints(rows, likely, enough and effective_sample_size(log_weights[fails]) >= settings.ready_ess)

@@ -126,6 +126,16 @@ def test_the_mean_is_that_of_the_likely_points(rng):
     assert (around[:, 0] > 0.9 * 3.6).all()  # 0.9 times a failure each
 
 
+def test_a_component_without_likely_points_is_left_out(rng):
+    """All 200 failures lie on one side, 200 points of a level on the other."""
+    u = rng.standard_normal((400, 3))
+    likely = np.arange(400) < 200
+    u[:, 0] += np.where(likely, 60.0, -60.0)
+    law = fit_law(np.eye(3), u, np.zeros(400), u[:0], u[:0], SETTINGS, rng, likely)
+    assert all(group.share > 0 and (group.weights > 0).all() for group in law.groups)
+    assert all(group.components[0].centre[0] > 0 for group in law.groups[:-2])
+
+
 def test_the_heaviest_points_and_ends_are_guarded(rng):
     """One point of weight 50 stands apart from 60 others: it gets a Gaussian, and the first ends the places left."""
     u, ends = rng.standard_normal((61, 5)) + 3.0, np.full((40, 5), 2.0)
