@@ -7,10 +7,10 @@ import numpy as np
 
 from samplers.method import Goal, Steps
 from samplers.methods.base import Method
+from samplers.methods.noise_coordinates import marginalise_noise
 from samplers.methods.surrogate.run import SurrogateRun
 from samplers.methods.surrogate.settings import DEFAULT_SURROGATE_SETTINGS
 from samplers.methods.two_stage.method import run_two_stage
-from samplers.methods.two_stage.noise_coordinates import marginalise_noise
 from samplers.problem import Inputs
 from samplers.validation import check_count
 

@@ -9,6 +9,7 @@ from samplers.method import Goal, Interrupted, Steps, offer_of
 from samplers.methods.base import Method
 from samplers.methods.two_stage import stages
 from samplers.methods.two_stage.discovery.unexplored_terms import TermRecord, explore_terms
+from samplers.methods.two_stage.run_state import start_run
 from samplers.methods.two_stage.settings import DEFAULT_SETTINGS, TwoStageSettings
 from samplers.methods.two_stage.terms.search import search_terms, suits_terms
 from samplers.problem import Inputs
@@ -47,7 +48,7 @@ class TwoStage(Method):
     *Noise.* f may have noise of its own that is no part of x: p is then the marginal probability. No stored outcome
     is simulated again. A noisy f is recognised by 30 points right beside failing ones. Regions are then not
     separated, and half of the draws come from tempered Gaussians: the best proposal where failure is by chance.
-    Coordinates of x that the base distribution calls noise are not searched (`noise_coordinates.py`).
+    Coordinates of x that the base distribution calls noise are not searched (`methods/noise_coordinates.py`).
 
     *Interval* (`discovery/unseen.py`). Log-normal, with t quantiles where few draws carry the weight and Bernstein's
     bound where very few do; p-hat exp(q s) with s^2 = log(1 + c.o.v.^2). The upper end is at least Hall's, which
@@ -138,7 +139,7 @@ def _explore_and_estimate(
     inputs: Inputs, goal: Goal, budget: int, rng: np.random.Generator, settings: TwoStageSettings, record: TermRecord
 ) -> Steps:
     """Run all stages; `record` takes the terms of what the exploration simulates."""
-    context, state = stages.start_run(inputs, goal, budget, settings, rng)
+    context, state = start_run(inputs, goal, budget, settings, rng)
     if budget < settings.min_exploration_budget:
         least = settings.min_exploration_budget
         about = f"max_sim leaves {budget} simulations, too few for an exploration ({least}): base draws only."

@@ -1,19 +1,18 @@
-"""Stages of two-stage: the frozen state of a run, and the steps from one state to the next.
+"""Stages of two-stage: the steps of a run from one state to the next.
 
 A step that needs simulations is a generator: `state = yield from draw_first(context, state)`. Where `Interrupted`
 ends it, the caller goes on with the state before the step.
 """
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import reduce
-from typing import NamedTuple
 
 import numpy as np
 
 from samplers.importance.draws import Draws, weight_warnings, weighted_interval
 from samplers.mcmc.chains import RootedPoints
-from samplers.method import Goal, Interrupted, Outcome, Steps, no_outcome_share
+from samplers.method import Interrupted, Outcome, Steps, no_outcome_share
 from samplers.methods.two_stage import fallback
 from samplers.methods.two_stage.candidates import build_proposal
 from samplers.methods.two_stage.diagnostics import (
@@ -28,109 +27,22 @@ from samplers.methods.two_stage.discovery.uncovered import cover_failures, find_
 from samplers.methods.two_stage.discovery.unseen import discovery_interval
 from samplers.methods.two_stage.exploration import Sizes, find_regions, first_draws
 from samplers.methods.two_stage.mixture.proposal import MixtureProposal
-from samplers.methods.two_stage.multiple_importance import MultipleImportanceSample
-from samplers.methods.two_stage.noise_coordinates import marginalise_noise
 from samplers.methods.two_stage.refinement import RefinementState, refine_once, start_refinement, typical_weights
 from samplers.methods.two_stage.regions import ExplorationResult
 from samplers.methods.two_stage.response_surface.spread import LastDraws, Simulated, check_spread
+from samplers.methods.two_stage.run_state import CountedRound, RunContext, RunState
 from samplers.methods.two_stage.settings import TwoStageSettings
 from samplers.methods.two_stage.simulator import (
     ComponentDraws,
     SimulationSteps,
-    Simulator,
     close_trace,
     extend_trace,
 )
 from samplers.methods.two_stage.stratified import StratifiedSample
-from samplers.problem import FloatArray, Inputs
 from samplers.sample import DrawWeights, Sample
 from samplers.statistics.intervals import Interval, binomial_cov
 from samplers.statistics.weights import effective_sample_size
-from samplers.trace import Level, Status
-
-
-@dataclass(frozen=True, eq=False)
-class RunContext:
-    """What is fixed for a run, and the simulator that counts."""
-
-    inputs: Inputs
-    """All of x."""
-    simulator: Simulator
-    """Of the coordinates that are not noise."""
-    goal: Goal
-    settings: TwoStageSettings
-    budget: int
-    """Simulations that the exploration and the rounds are planned for."""
-    end: int
-    """Simulations that are never exceeded; more than `budget` where only a target c.o.v. is given."""
-    rng: np.random.Generator
-
-    @property
-    def left(self) -> int:
-        """Simulations left of the budget."""
-        return self.budget - self.simulator.n_sim
-
-    @property
-    def left_at_all(self) -> int:
-        """Simulations left before the end."""
-        return self.end - self.simulator.n_sim
-
-    @property
-    def target_batch(self) -> int:
-        """Draws after which a target c.o.v. is looked at."""
-        return max(self.budget // self.settings.target_batches, self.settings.min_target_batch)
-
-    @property
-    def noise_marginalised(self) -> bool:
-        """Whether x has coordinates of noise that are not searched."""
-        return self.simulator.inputs is not self.inputs
-
-    def meets_target(self, cov: float) -> bool:
-        """Return whether there is a target c.o.v. and this one meets it."""
-        return self.goal.target_cov is not None and cov <= self.goal.target_cov
-
-
-class CountedRound(NamedTuple):
-    """Draws of a round that count in p."""
-
-    sample: StratifiedSample
-    first: int
-    """Simulations before them."""
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class RunState:
-    """State of a run: draws so far and their trace."""
-
-    history: MultipleImportanceSample
-    """All draws from known components."""
-    base_u: FloatArray
-    """Base draws of the exploration, shape (n0, d)."""
-    base_f: FloatArray
-    """Their outcomes, shape (n0,)."""
-    base_draws: int = 0
-    """Base draws in all: of a proposal those of its first component."""
-    rounds: tuple[Draws, ...] = ()
-    """Draws of the rounds, each weighted as draws of its own proposal."""
-    counted: tuple["CountedRound", ...] = ()
-    """Those of the rounds that count in p."""
-    trace: tuple[Level, ...] = ()
-
-    def base_share(self, gamma: float) -> float:
-        """Return the share of the base draws with f <= gamma."""
-        return float((self.base_f <= gamma).mean())
-
-
-def start_run(
-    inputs: Inputs, goal: Goal, budget: int, settings: TwoStageSettings, rng: np.random.Generator
-) -> tuple[RunContext, RunState]:
-    """Return the run and its state before the first simulation; noise that is part of x is left to chance."""
-    open_ended = goal.max_sim is None and goal.target_cov is not None
-    end = budget + settings.max_batches * (budget // settings.target_batches) if open_ended else budget
-    searched = marginalise_noise(inputs, rng)
-    context = RunContext(inputs, Simulator(searched), goal, settings, budget, end, rng)
-    empty = MultipleImportanceSample.empty(searched.dim)
-    return context, RunState(history=empty, base_u=np.empty((0, searched.dim)), base_f=np.empty(0))
+from samplers.trace import Status
 
 
 def draw_first(context: RunContext, state: RunState) -> SimulationSteps[RunState]:

@@ -88,13 +88,7 @@ def check_spread(
 ) -> list[str]:
     """Return a warning if a regression of f predicts a c.o.v. far above that of the draws.
 
-    Args:
-        draws: Of the last proposal.
-        searched: All else that was simulated.
-        axes: Orthonormal directions in which f changes, shape (d, r); None for all coordinates.
-        rng: Source of randomness of the fits and of the chains.
-        settings: When the regression is believed.
-        pieces: Of the regression by pieces.
+    Arguments as of `predict_cov`.
     """
     predicted = predict_cov(draws, searched, axes, rng, settings, pieces)
     if predicted is None or not predicted > settings.max_ratio * draws.cov:

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from samplers.method import TermsOffer, request_gradients, request_terms, whole_simulations
-from samplers.methods.two_stage.noise_coordinates import noise_mask
+from samplers.methods.noise_coordinates import noise_mask
 from samplers.methods.two_stage.simulator import SimulationSteps
 from samplers.problem import (
     Distribution,

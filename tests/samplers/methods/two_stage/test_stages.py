@@ -13,6 +13,7 @@ from samplers.methods.two_stage import stages
 from samplers.methods.two_stage.candidates import build_proposal
 from samplers.methods.two_stage.exploration import Sizes
 from samplers.methods.two_stage.refinement import start_refinement
+from samplers.methods.two_stage.run_state import start_run
 from samplers.methods.two_stage.settings import DEFAULT_SETTINGS
 from samplers.problem import FunctionProblem
 from samplers.trace import Status
@@ -26,7 +27,7 @@ BUDGET = 2000
 def start(seed=0, budget=BUDGET, **goal):
     levels = []
     target = Goal(gamma=0.0, on_level=levels.append, **goal)
-    context, state = stages.start_run(PROBLEM, target, budget, DEFAULT_SETTINGS, np.random.default_rng(seed))
+    context, state = start_run(PROBLEM, target, budget, DEFAULT_SETTINGS, np.random.default_rng(seed))
     return context, state, levels
 
 

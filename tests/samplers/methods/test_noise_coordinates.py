@@ -6,7 +6,7 @@ from scipy import stats
 
 import samplers
 from samplers.limit_states import Reference
-from samplers.methods.two_stage.noise_coordinates import marginalise_noise, noise_mask
+from samplers.methods.noise_coordinates import marginalise_noise, noise_mask
 from samplers.problem import FunctionProblem, StandardNormal
 
 PHI = stats.norm.cdf
