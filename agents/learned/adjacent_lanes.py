@@ -18,11 +18,11 @@ from rare_envs.sensors.perception import FEATURES, HEADING_COLUMN, RANGE_COLUMNS
 LENGTH_COLUMN, LEFT_MARKER_COLUMN, RIGHT_MARKER_COLUMN = (
     FEATURES.index(name) for name in ("length", "left_marker", "right_marker")
 )
-_OVERLAP = 0.3
+LINE_OVERLAP = 0.3
 """A point counts to the next lane if it is no further than this before its line [m]: bodies stand near the line too."""
-_BEYOND = 0.25
+SHOWS_LANE_BEYOND = 0.25
 """Share of a lane's width by which a point has to be beyond the line to show that there is a lane."""
-_ALONG = 0.25
+LEAST_COSINE_ALONG = 0.25
 """Least cosine of beams whose range rate is taken for motion along the road."""
 
 
@@ -61,9 +61,9 @@ def look_aside(features: Tensor) -> AdjacentLanes:
     line = torch.stack((features[..., LEFT_MARKER_COLUMN], features[..., RIGHT_MARKER_COLUMN]), dim=-1)[..., None]
     width = (features[..., LEFT_MARKER_COLUMN] + features[..., RIGHT_MARKER_COLUMN])[..., None, None]
     met = ranges < MAX_RANGE
-    inside = met & (across > line - _OVERLAP) & (across < line + width)
+    inside = met & (across > line - LINE_OVERLAP) & (across < line + width)
     cos = torch.cos(beams)
-    known = cos.abs() > _ALONG
+    known = cos.abs() > LEAST_COSINE_ALONG
     rate = torch.where(known, features[..., None, RATE_COLUMNS] / torch.where(known, cos, 1.0), 0.0).expand_as(across)
     half = 0.5 * features[..., LENGTH_COLUMN, None, None]
     lead = torch.where(inside & (along > 0.0), along - half, torch.inf).min(dim=-1)
@@ -74,5 +74,5 @@ def look_aside(features: Tensor) -> AdjacentLanes:
         torch.where(lead.values < torch.inf, -lead_rate, 0.0),
         lag.values,
         torch.where(lag.values < torch.inf, lag_rate, 0.0),
-        (met & (across > line + _BEYOND * width)).any(dim=-1),
+        (met & (across > line + SHOWS_LANE_BEYOND * width)).any(dim=-1),
     )

@@ -20,7 +20,7 @@ from torch import Tensor
 from agents.learned.adjacent_lanes import LEFT_MARKER_COLUMN, RIGHT_MARKER_COLUMN
 from rare_envs.sensors.lidar import MAX_RANGE, beam_angles
 from rare_envs.sensors.perception import FEATURES, HEADING_COLUMN, RANGE_COLUMNS, RATE_COLUMNS, SPEED_COLUMN
-from rare_envs.simulation.compiled.highway import AvoidanceSettings
+from rare_envs.simulation.compiled.highway import AvoidanceSettings, CloseRangeSettings
 
 _LENGTH, _WIDTH = FEATURES.index("length"), FEATURES.index("width")
 _FORWARD, _SIDEWAYS, _ACROSS = 0.5, 0.3, 0.75
@@ -58,6 +58,10 @@ class CloseRange:
 
     def __post_init__(self) -> None:
         _check_positive(self)
+
+    def settings(self) -> CloseRangeSettings:
+        """Return the numbers for compiled rollouts."""
+        return CloseRangeSettings(**asdict(self))
 
 
 @dataclass(frozen=True)
@@ -118,7 +122,7 @@ class CollisionAvoidance:
     turning_radius: float = 6.4
     """[m], of the middle of AASHTO's design vehicle P."""
     close: CloseRange | None = None
-    """What is added where somebody is very near; None for nothing. Compiled rollouts do not have it."""
+    """What is added where somebody is very near; None for nothing."""
 
     def __post_init__(self) -> None:
         _check_positive(self)
@@ -130,7 +134,7 @@ class CollisionAvoidance:
         return cls(**{**values, "close": None if close is None else CloseRange(**close)})
 
     def settings(self) -> AvoidanceSettings:
-        """Return the numbers for compiled rollouts."""
+        """Return the numbers for compiled rollouts, but those of close range."""
         numbers = {name: value for name, value in asdict(self).items() if name != "close"}
         return AvoidanceSettings(
             **numbers,

@@ -9,9 +9,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from agents.learned.collision_avoidance import CollisionAvoidance
+from agents.learned.collision_avoidance import CloseRange, CollisionAvoidance
 from agents.learned.coloured_noise import WHITE_NOISE, AutoregressiveNoise
-from agents.learned.lane_changes import STATE_SIZE, ChangeState, LaneChanges
+from agents.learned.lane_changes import STATE_SIZE, ChangeState, LaneChanges, Waiting
 from agents.learned.networks import (
     ACTION_SIZE,
     FEATURE_CLIP,
@@ -185,13 +185,8 @@ class LearnedDriver:
         """Return its present numbers for compiled rollouts; None if its class, network or rule was changed."""
         if type(self) is not LearnedDriver or type(self.colour) is not AutoregressiveNoise:
             return None
-        rule = self.avoidance
-        if rule is not None and (type(rule) is not CollisionAvoidance or rule.close is not None):
-            return None
-        if self.changes is not None or self.hard_braking != 1.0:
-            return None
-        layers = read_layers(self.policy)
-        if layers is None:
+        rule, layers = self.avoidance, read_layers(self.policy)
+        if layers is None or not self._has_known_rules():
             return None
         scaling, colour = (value.numpy(force=True) for value in self.policy.scaling), self.colour
         feature_mean, feature_deviation, action_mean, action_deviation = scaling
@@ -209,8 +204,19 @@ class LearnedDriver:
             lag_1=colour.first,
             lag_2=colour.second,
             fresh=colour.scale,
-            avoidance=None if self.avoidance is None else self.avoidance.settings(),
+            avoidance=None if rule is None else rule.settings(),
+            eased_beyond=EASED_BEYOND,
+            hard_braking=self.hard_braking,
+            close_range=None if rule is None or rule.close is None else rule.close.settings(),
+            lane_changes=None if self.changes is None else self.changes.settings(),
         )
+
+    def _has_known_rules(self) -> bool:
+        """Return whether compiled rollouts know its rules: subclasses may do anything."""
+        rule, changes = self.avoidance, self.changes
+        parts = (rule, rule and rule.close, changes, changes and changes.waiting)
+        known = (CollisionAvoidance, CloseRange, LaneChanges, Waiting)
+        return all(part is None or type(part) is kind for part, kind in zip(parts, known, strict=True))
 
     def begin(self, draws: Tensor) -> Tensor:
         """Return the memory at the start, from independent standard normal draws (B, M, 2, 2).

@@ -82,6 +82,18 @@ def single(*values: float) -> tuple[float, ...]:
     return tuple(cast(float, np.float32(value)) for value in values)
 
 
+def whole(*values: int) -> tuple[int, ...]:
+    """Return whole numbers as constants to call compiled functions with.
+
+    A plain one is a type of its own to numba, which would compile the function anew for each.
+
+    Example:
+        >>> whole(0, 1)
+        (np.int64(0), np.int64(1))
+    """
+    return tuple(cast(int, np.int64(value)) for value in values)
+
+
 @cache
 def find_cache_folder(file: Path) -> Path | None:
     """Return the folder of the machine code of a source file, made if need be; None where none can be written.

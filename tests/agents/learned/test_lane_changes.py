@@ -309,13 +309,25 @@ def test_hard_braking_is_eased_but_for_the_rule():
         replace(plain, hard_braking=0.0)
 
 
-def test_lane_changes_need_the_rule_and_are_not_compiled():
+def test_lane_changes_need_the_rule():
     driver = load_driver("mgail3")
-    assert driver.dense_driver() is None
-    assert replace(driver, changes=None).dense_driver() is None
-    assert replace(driver, changes=None, hard_braking=1.0).dense_driver() is not None
     with pytest.raises(ValueError, match="Expected a rule of collision avoidance beside the lane changes"):
         replace(driver, avoidance=None)
+
+
+def test_compiled_rollouts_take_them_unless_they_were_changed():
+    class Others(LaneChanges):
+        """Begin at will."""
+
+    class Impatience(Waiting):
+        """Waits otherwise."""
+
+    driver = load_driver("mgail5")
+    dense = driver.dense_driver()
+    assert dense is not None and dense.hard_braking == 0.75 and dense.lane_changes == driver.changes.settings()
+    assert (dense.lane_changes.waits, load_driver("mgail4").dense_driver().lane_changes.waits) == (1.0, 0.0)
+    assert replace(driver, changes=Others()).dense_driver() is None
+    assert replace(driver, changes=LaneChanges(waiting=Impatience())).dense_driver() is None
 
 
 @pytest.mark.parametrize("changes", [CHANGES, WAITING])

@@ -10,12 +10,15 @@ from rare_envs.simulation.compiled.highway.dense_driver import (
     OffersDenseDriver,
     read_dense_driver,
 )
+from rare_envs.simulation.compiled.highway.driving_rules.settings import CloseRangeSettings, LaneChangeSettings
 from rare_envs.simulation.compiled.highway.highway_rollout import HighwayRollout, RolloutTerms, find_highway_rollout
 
 __all__ = [
     "AvoidanceSettings",
+    "CloseRangeSettings",
     "DenseDriver",
     "HighwayRollout",
+    "LaneChangeSettings",
     "OffersDenseDriver",
     "RolloutTerms",
     "find_highway_rollout",

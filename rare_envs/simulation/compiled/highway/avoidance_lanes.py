@@ -54,7 +54,7 @@ def limit_action(
         along, across = reach * cos, abs(reach * sin)
         gap = along - _HALF_LENGTH
         if cos > rule.forward and gap > ZERO and across < _HALF_WIDTH + rule.path_margin:
-            acceleration = at_most(_greatest_acceleration(speed, gap, -rate / cos, rule), acceleration)
+            acceleration = at_most(greatest_acceleration(speed, gap, -rate / cos, rule), acceleration)
         if abs(sin) > rule.sideways and abs(along) < _HALF_LENGTH + rule.reach:
             bound = _greatest_yaw_rate(speed, across, -rate / abs(sin) if abs(sin) > rule.across else ZERO, rule)
             if sin < ZERO:
@@ -67,7 +67,7 @@ def limit_action(
 
 
 @compiled
-def _greatest_acceleration(speed: float, gap: float, closing: float, rule: AvoidanceSettings) -> float:
+def greatest_acceleration(speed: float, gap: float, closing: float, rule: AvoidanceSettings) -> float:
     """Return the bound behind a body: `CollisionAvoidance.greatest_acceleration`."""
     lag, ahead = rule.deceleration * rule.reaction_time, at_least(speed - closing, ZERO)
     room = TWO * rule.deceleration * at_least(gap - rule.standstill_gap, ZERO) + ahead * ahead

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rare_envs.simulation.compiled.failures import NotCompiled
+from rare_envs.simulation.compiled.highway.driving_rules.settings import CloseRangeSettings, LaneChangeSettings
 
 Pair = tuple[float, float]
 
@@ -83,6 +84,14 @@ class DenseDriver:
     """Standard deviation of the fresh part of the noise."""
     avoidance: AvoidanceSettings | None = None
     """Bounds the actions; None for none."""
+    eased_beyond: float = 0.0
+    """Deceleration that is given in full [m/s^2]."""
+    hard_braking: float = 1.0
+    """Share that is given of what the network brakes beyond."""
+    close_range: CloseRangeSettings | None = None
+    """What bounds the actions at close range beside; None for nothing."""
+    lane_changes: LaneChangeSettings | None = None
+    """Lane changes by rule, which an ego does not make; None for none."""
 
 
 @runtime_checkable

@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rare_envs.compilation import compiled, compiled_fused, single
+from rare_envs.compilation import compiled, compiled_fused, single, whole
 from rare_envs.sensors.lidar import BEAMS
 from rare_envs.sensors.perception import FEATURES
 from rare_envs.simulation.compiled.dense_layer import apply_layer
@@ -19,6 +19,7 @@ from rare_envs.traffic.state import VEHICLE_LENGTH, VEHICLE_WIDTH
 
 _OUTPUTS = 4  # two means and two log deviations
 _LENGTH, _WIDTH, _HALF, _NOTHING = single(VEHICLE_LENGTH, VEHICLE_WIDTH, 0.5, 0.0)
+_ACCELERATION, _YAW_RATE = whole(0, 1)
 NO_NOISE = (_NOTHING, _NOTHING)
 """Of the two actions."""
 _OWN = FEATURES.index("range_-162")
@@ -172,8 +173,8 @@ def decide_action(
         driver: The driver.
     """
     return (
-        _limited_action(outputs[0, lane], outputs[2, lane], noise[0], 0, driver),
-        _limited_action(outputs[1, lane], outputs[3, lane], noise[1], 1, driver),
+        _limited_action(outputs[0, lane], outputs[2, lane], noise[0], _ACCELERATION, driver),
+        _limited_action(outputs[1, lane], outputs[3, lane], noise[1], _YAW_RATE, driver),
     )
 
 

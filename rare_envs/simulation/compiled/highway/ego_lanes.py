@@ -12,6 +12,10 @@ from rare_envs.simulation.compiled.highway.avoidance_lanes import limit_action
 from rare_envs.simulation.compiled.highway.curved_road import CurvedRoadNumbers, lane_middle
 from rare_envs.simulation.compiled.highway.dense_driver import DenseDriver
 from rare_envs.simulation.compiled.highway.driver_lanes import NO_NOISE, DriverBuffers, DriverNumbers, decide_action
+from rare_envs.simulation.compiled.highway.driving_rules.close_range import limit_action_near
+from rare_envs.simulation.compiled.highway.driving_rules.own_motion import perceive_own
+from rare_envs.simulation.compiled.highway.driving_rules.rule_lanes import ease_braking
+from rare_envs.simulation.compiled.highway.driving_rules.rule_numbers import TrafficRules
 from rare_envs.simulation.compiled.highway.traffic_slots import NO_ROW, Slots, TrafficRows
 from rare_envs.simulation.compiled.networks import LANES, NetworkNumbers, apply_network
 from rare_envs.simulation.compiled.policy_rollouts import PolicyNumbers, decode_row, observe_row
@@ -79,7 +83,13 @@ def apply_policies(rows: TrafficRows, slots: Slots, ego: EgoNumbers) -> None:
 
 @compiled
 def decide_ego(
-    rows: TrafficRows, slots: Slots, slot: int, beams: SingleArray, ego: EgoNumbers, road: CurvedRoadNumbers
+    rows: TrafficRows,
+    slots: Slots,
+    slot: int,
+    beams: SingleArray,
+    ego: EgoNumbers,
+    road: CurvedRoadNumbers,
+    driving_rules: TrafficRules | None,
 ) -> tuple[float, float]:
     """Return acceleration [m/s^2] and steering angle [rad] of the ego of a slot, whose network has been applied.
 
@@ -90,22 +100,40 @@ def decide_ego(
         beams: Of the egos of all slots, if they are learned drivers.
         ego: The ego.
         road: The road.
+        driving_rules: Of everybody, see `TrafficRules`.
     """
     row = slots.row[slot]
     y, heading, speed = rows.y[row, 0], rows.heading[row, 0], rows.speed[row, 0]
     if ego.kind == BY_POLICY:
         return ego.actions[slot, 0], ego.actions[slot, 1]
     if ego.kind == BY_DRIVER:
-        return steer_as_learned(ego, slot, beams, speed, slots.poses.curvature[slot, 0])
+        curvature = slots.poses.curvature[slot, 0]
+        return steer_as_learned(ego, slot, beams, y, heading, speed, curvature, road, driving_rules)
     acceleration = idm_acceleration(ego.idm, speed, slots.gap[slot], slots.closing[slot], ego.idm.desired_speed)
     return acceleration, steer_to_line(y - lane_middle(y, road), heading, speed)
 
 
 @compiled
 def steer_as_learned(
-    ego: EgoNumbers, slot: int, beams: SingleArray, speed: float, curvature: float
+    ego: EgoNumbers,
+    slot: int,
+    beams: SingleArray,
+    y: float,
+    heading: float,
+    speed: float,
+    curvature: float,
+    road: CurvedRoadNumbers,
+    driving_rules: TrafficRules | None,
 ) -> tuple[float, float]:
-    """Return acceleration [m/s^2] and steering angle [rad]: `agents.learned.driver.LearnedEgo.act`."""
+    """Return acceleration [m/s^2] and steering angle [rad]: `agents.learned.driver.LearnedEgo.act`.
+
+    With None for the rules the compiler leaves their branch out.
+    """
     acceleration, yaw_rate = decide_action(ego.buffers.outputs, slot, NO_NOISE, ego.driver)
-    acceleration, yaw_rate = limit_action(acceleration, yaw_rate, speed, beams, slot, ego.driver.avoidance)
+    if driving_rules is None:
+        acceleration, yaw_rate = limit_action(acceleration, yaw_rate, speed, beams, slot, ego.driver.avoidance)
+    else:
+        own = perceive_own(y, heading, speed, road)
+        acceleration = ease_braking(acceleration, driving_rules.ego)
+        acceleration, yaw_rate = limit_action_near(acceleration, yaw_rate, own, beams, slot, driving_rules.ego)
     return acceleration, steering_for(yaw_rate + speed * curvature, speed)

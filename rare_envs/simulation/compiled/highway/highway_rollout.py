@@ -30,6 +30,8 @@ if TYPE_CHECKING:
 
 DRIVERS_AT_ONCE = 128
 """Drivers around the egos that are computed side by side: those of 25 highways."""
+NOISE_MEMORY = 4
+"""Numbers that a driver keeps of its noise; those of lane changes stand behind them."""
 
 
 class RolloutTerms(NamedTuple):
@@ -87,6 +89,7 @@ class HighwayRollout:
         with compiler_failures():
             from rare_envs.simulation.compiled.highway.curved_road import CurvedRoadNumbers
             from rare_envs.simulation.compiled.highway.driver_lanes import DriverBuffers, DriverNumbers
+            from rare_envs.simulation.compiled.highway.driving_rules.rule_numbers import TrafficRules
             from rare_envs.simulation.compiled.highway.ego_lanes import EGOS_AT_ONCE, EgoNumbers
             from rare_envs.simulation.compiled.highway.traffic_rollouts import drive_among_learned
             from rare_envs.simulation.compiled.highway.traffic_slots import Sight, Slots
@@ -103,6 +106,7 @@ class HighwayRollout:
                 CurvedRoadNumbers.of(self.world.scenario.road),
                 self._rules(kind),
                 found,
+                TrafficRules.of(drivers, ego),
             )
         return RolloutTerms(*found)
 
@@ -123,7 +127,9 @@ class HighwayRollout:
 
         state, background = self.world.start_traffic(torch.from_numpy(np.ascontiguousarray(x)).float())
         assert background is not None
-        fields = (state.x, state.y, state.heading, state.speed, background.weights, background.draws, background.memory)
+        memory = background.memory.flatten(2)
+        noise, minds = memory[..., :NOISE_MEMORY].reshape(*memory.shape[:2], 2, 2), memory[..., NOISE_MEMORY:]
+        fields = (state.x, state.y, state.heading, state.speed, background.weights, background.draws, noise, minds)
         return TrafficRows(*(field.numpy().copy(order="C") for field in fields))
 
     def _found(self, rows: int, kind: int) -> Found:

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from rare_envs.compilation import compiled, single
+from rare_envs.compilation import compiled, single, whole
 from rare_envs.measures.base import COLLISION
 from rare_envs.simulation.compiled.equations import at_most, boxes_overlap, lead_in_lane, off_road, ttc
 from rare_envs.simulation.compiled.highway.curved_road import CurvedRoadNumbers, lane_middle
@@ -20,6 +20,7 @@ from rare_envs.simulation.compiled.highway.traffic_slots import NO_ROW, Found, P
 from rare_envs.simulation.compiled.rollouts import SingleArray
 
 _HIT, _FAR = single(COLLISION, np.inf)
+_FIRST, _EGO_ALONE = whole(0, 1)
 
 
 @compiled
@@ -72,7 +73,7 @@ def measure_row(
     if rules.terms == LEAD_TIMES:
         latest = slots.latest[: others + 1]
         time_terms(x, y, heading, speed, lane_middle(y[0], road), road, latest)
-        lower_terms(found, row, tick, 0, latest)
+        lower_terms(found, row, tick, _FIRST, latest)
     found.f[row] = at_most(value, found.f[row])
 
 
@@ -140,7 +141,7 @@ def record_collision(
     term = find_least(slots.latest[:count])
     if pairs and not touch(slots.poses, slot, others + 1):
         term = find_least(slots.latest[:others])
-    elif rules.terms == LEAD_TIMES and off_road(rows.y[row, 0], road) and not touch(slots.poses, slot, 1):
+    elif rules.terms == LEAD_TIMES and off_road(rows.y[row, 0], road) and not touch(slots.poses, slot, _EGO_ALONE):
         term = others
     term += count if tick > rules.cut else 0
     found.values[row, term], found.ticks[row, term] = _HIT, tick

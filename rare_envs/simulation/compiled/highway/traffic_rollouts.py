@@ -7,7 +7,7 @@ Drivers side by side do not depend on each other, so f of a row is the same bits
 
 import numpy as np
 
-from rare_envs.compilation import compiled, single
+from rare_envs.compilation import compiled, single, whole
 from rare_envs.simulation.compiled.highway.avoidance_lanes import limit_action
 from rare_envs.simulation.compiled.highway.curved_road import (
     CurvedRoadNumbers,
@@ -25,6 +25,9 @@ from rare_envs.simulation.compiled.highway.driver_lanes import (
     write_beam_features,
     write_own_features,
 )
+from rare_envs.simulation.compiled.highway.driving_rules.own_motion import perceive_own
+from rare_envs.simulation.compiled.highway.driving_rules.rule_lanes import carry_out
+from rare_envs.simulation.compiled.highway.driving_rules.rule_numbers import TrafficRules
 from rare_envs.simulation.compiled.highway.ego_lanes import (
     BY_DRIVER,
     BY_POLICY,
@@ -52,6 +55,7 @@ from rare_envs.simulation.compiled.rollouts import SingleArray
 FIRST_DRAW = 2
 """Draws before those of the ticks."""
 (_UNKNOWN,) = single(np.nan)
+_FIRST_ROW, _EGO, _OTHERS = whole(0, 0, 1)
 
 
 @compiled
@@ -65,6 +69,7 @@ def drive_among_learned(
     road: CurvedRoadNumbers,
     rules: Rules,
     found: Found,
+    driving_rules: TrafficRules | None,
 ) -> None:
     """Drive rows from start to horizon.
 
@@ -78,8 +83,9 @@ def drive_among_learned(
         road: The road.
         rules: What is simulated and measured.
         found: Written to.
+        driving_rules: Of everybody; with None the compiler leaves out what has to do with them.
     """
-    ego_looks, next_row = ego.kind == BY_DRIVER or rules.measure == BY_LIDAR, 0
+    ego_looks, next_row = ego.kind == BY_DRIVER or rules.measure == BY_LIDAR, _FIRST_ROW
     while True:
         next_row = fill_slots(rows, next_row, slots, buffers, road, found)
         if are_free(slots):
@@ -91,14 +97,14 @@ def drive_among_learned(
         if are_free(slots):
             continue
         measure_beams(sight.seen, sight.beams)
-        observe_drivers(rows, slots, sight.beams, 1, driver, buffers, road)
+        observe_drivers(rows, slots, sight.beams, _OTHERS, driver, buffers, road)
         apply_drivers(driver, buffers)
         if ego.kind == BY_POLICY:
             apply_policies(rows, slots, ego)
         elif ego.kind == BY_DRIVER:
-            observe_drivers(rows, slots, sight.ego_beams, 0, ego.driver, ego.buffers, road)
+            observe_drivers(rows, slots, sight.ego_beams, _EGO, ego.driver, ego.buffers, road)
             apply_drivers(ego.driver, ego.buffers)
-        move_rows(rows, slots, sight, driver, buffers, ego, road, rules, found)
+        move_rows(rows, slots, sight, driver, buffers, ego, road, rules, found, driving_rules)
 
 
 @compiled
@@ -144,6 +150,7 @@ def move_rows(
     road: CurvedRoadNumbers,
     rules: Rules,
     found: Found,
+    driving_rules: TrafficRules | None,
 ) -> None:
     """Move all rows by a tick, and free the slots of those with a collision; arguments as of `drive_among_learned`.
 
@@ -153,12 +160,12 @@ def move_rows(
         row = slots.row[slot]
         if row == NO_ROW:
             continue
-        acceleration, steering = decide_ego(rows, slots, slot, sight.ego_beams, ego, road)
+        acceleration, steering = decide_ego(rows, slots, slot, sight.ego_beams, ego, road, driving_rules)
         if acceleration != acceleration:
             found.f[row], slots.row[slot] = _UNKNOWN, NO_ROW
             continue
         moved = move_ego(rows, slots, slot, acceleration, steering, rules.dt)
-        move_drivers(rows, slots, slot, sight.beams, driver, buffers, rules.dt)
+        move_drivers(rows, slots, slot, sight.beams, driver, buffers, road, rules.dt, driving_rules)
         rows.x[row, 0], rows.y[row, 0], rows.heading[row, 0], rows.speed[row, 0] = moved
         place_row(rows, row, slot, slots.poses, road)
         slots.tick[slot] += 1
@@ -193,17 +200,25 @@ def move_drivers(
     beams: SingleArray,
     driver: DriverNumbers,
     buffers: DriverBuffers,
+    road: CurvedRoadNumbers,
     dt: float,
+    driving_rules: TrafficRules | None,
 ) -> None:
-    """Move vehicles 1 to N - 1 of a slot by a tick."""
-    row, noise, others = slots.row[slot], NO_NOISE, rows.x.shape[1] - 1
+    """Move vehicles 1 to N - 1 of a slot by a tick; arguments as of `drive_among_learned`."""
+    row, noise, fresh, others = slots.row[slot], NO_NOISE, NO_NOISE, rows.x.shape[1] - 1
     for other in range(1, others + 1):
         if rows.draws.shape[1]:
             draws = rows.draws[row, FIRST_DRAW + slots.tick[slot], other - 1]
-            noise = next_noise(rows.memory[row, other - 1], draws, driver)
+            noise, fresh = next_noise(rows.memory[row, other - 1], draws, driver), (draws[0], draws[1])
         lane, speed = others * slot + other - 1, rows.speed[row, other]
         acceleration, yaw_rate = decide_action(buffers.outputs, lane, noise, driver)
-        acceleration, yaw_rate = limit_action(acceleration, yaw_rate, speed, beams, lane, driver.avoidance)
+        if driving_rules is None:
+            acceleration, yaw_rate = limit_action(acceleration, yaw_rate, speed, beams, lane, driver.avoidance)
+        else:
+            own = perceive_own(rows.y[row, other], rows.heading[row, other], speed, road)
+            mind = rows.minds[row, other - 1]
+            action = (acceleration, yaw_rate)
+            acceleration, yaw_rate = carry_out(action, own, beams, lane, mind, fresh, driving_rules.drivers)
         moved = point_on_curve(
             rows.x[row, other],
             rows.y[row, other],

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from rare_envs.compilation import compiled, single
+from rare_envs.compilation import compiled, single, whole
 from rare_envs.sensors.lidar import BEAMS
 from rare_envs.simulation.compiled.highway.curved_road import CurvedRoadNumbers, place_on_curve
 from rare_envs.simulation.compiled.highway.driver_lanes import DriverBuffers
@@ -15,6 +15,7 @@ from rare_envs.simulation.compiled.rollouts import SingleArray
 NO_ROW = -1
 """Stands for the row of a slot in which none is driven."""
 (_FAR,) = single(np.inf)
+(_EGO,) = whole(0)
 
 
 class TrafficRows(NamedTuple):
@@ -31,6 +32,8 @@ class TrafficRows(NamedTuple):
     """Standard normal, shape (B, 2 + ticks, N - 1, 2); (B, 0, N - 1, 2) without noise."""
     memory: SingleArray
     """Of the noise, shape (B, N - 1, 2, 2)."""
+    minds: SingleArray
+    """What drivers keep in mind of lane changes, shape (B, N - 1, 10); (B, N - 1, 0) if they make none by rule."""
 
 
 class Found(NamedTuple):
@@ -171,7 +174,7 @@ def see_others(rows: TrafficRows, slots: Slots, sight: Sight, egos: bool) -> Non
         for vehicle in range(1, others + 1):
             place_bodies(slots.poses, speed, slot, vehicle, sight.seen, others * slot + vehicle - 1)
         if egos:
-            place_bodies(slots.poses, speed, slot, 0, sight.ego_seen, slot)
+            place_bodies(slots.poses, speed, slot, _EGO, sight.ego_seen, slot)
 
 
 @compiled

@@ -23,7 +23,8 @@ def test_the_idm_decides_as_in_torch():
     dense = read_dense_driver(problem.world.background)
     ego = ego_lanes.EgoNumbers.of(IDM(), dense)
     fields = [field.numpy() for field in episode.state[:4]]
-    rows = TrafficRows(*fields, *(np.zeros(shape, np.float32) for shape in ((10, 0), (10, 0, 5, 2), (10, 5, 2, 2))))
+    shapes = ((10, 0), (10, 0, 5, 2), (10, 5, 2, 2), (10, 5, 0))
+    rows = TrafficRows(*fields, *(np.zeros(shape, np.float32) for shape in shapes))
     slots = Slots.of(10, 6)
     slots.row[:] = np.arange(10)
     for row in range(10):
@@ -33,7 +34,7 @@ def test_the_idm_decides_as_in_torch():
         rows, slots, np.zeros((20, 384), np.float32), ROAD, Rules(0, False, 0, np.inf, np.float32(0.1), 9), found
     )
     beams = np.zeros((20, 384), np.float32)
-    decided = [ego_lanes.decide_ego(rows, slots, slot, beams, ego, ROAD) for slot in range(10)]
+    decided = [ego_lanes.decide_ego(rows, slots, slot, beams, ego, ROAD, None) for slot in range(10)]
     assert ego.kind == ego_lanes.BY_RULE and np.allclose(decided, expected, atol=1e-5)
 
 
@@ -42,8 +43,9 @@ def test_a_learned_ego_adds_the_curvature_of_the_road():
     ego = ego_lanes.EgoNumbers.of(dense, dense)
     ego.buffers.outputs[:] = 0.0
     beams = np.zeros((20, 384), np.float32)
+    own = [np.float32(each) for each in (5.0, 0.0, 20.0)]  # y, heading and speed
     straight, turning = (
-        ego_lanes.steer_as_learned(ego, 0, beams, np.float32(20.0), np.float32(k)) for k in (0.0, 1e-3)
+        ego_lanes.steer_as_learned(ego, 0, beams, *own, np.float32(k), ROAD, None) for k in (0.0, 1e-3)
     )
     assert ego.kind == ego_lanes.BY_DRIVER and straight[0] == turning[0]
     assert np.isclose(straight[0], np.clip(dense.action_mean[0], dense.low[0], dense.high[0]))

@@ -15,8 +15,8 @@ NO_BEAMS = np.zeros((20, 384), np.float32)
 def one_row(x=(100.0, 120.0, 150.0), y=(5.0, 5.0, 5.0), speed=(20.0, 10.0, 10.0)):
     """A row in the first of its slots."""
     fields = [np.array([values], np.float32) for values in (x, y, np.zeros(VEHICLES), speed)]
-    empty = np.zeros((1, 0), np.float32)
-    rows = TrafficRows(*fields, empty, np.zeros((1, 0, 2, 2), np.float32), np.zeros((1, 2, 2, 2), np.float32))
+    shapes = ((1, 0), (1, 0, 2, 2), (1, 2, 2, 2), (1, 2, 0))
+    rows = TrafficRows(*fields, *(np.zeros(shape, np.float32) for shape in shapes))
     slots = Slots.of(1, VEHICLES)
     slots.row[0] = 0
     place_row(rows, 0, 0, slots.poses, ROAD)

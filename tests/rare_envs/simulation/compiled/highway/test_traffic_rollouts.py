@@ -21,6 +21,9 @@ CASES = {
     "other drivers": {"drivers": "bc", "horizon": 4.0},
     "drivers with a rule": {"measure": "clearance", "drivers": "mgail2", "ego": FAST, "horizon": 8.0},
     "ego with a rule": {"measure": "lidar_ttc", "ego": "mgail2", "drivers": "bc", "horizon": 4.0},
+    "lane changes": {"measure": "clearance", "drivers": "mgail5", "ego": FAST, "horizon": 8.0},
+    "lane changes, ego with rules": {"measure": "lidar_ttc", "drivers": "mgail3", "ego": "mgail4", "horizon": 4.0},
+    "ego with more rules": {"measure": "lidar_ttc", "drivers": "bc", "ego": "mgail5", "noise": False, "horizon": 4.0},
     "collisions": {"ego": FAST, "drivers": "bc", "horizon": 8.0},
     "clearance": {"measure": "clearance", "ego": FAST, "drivers": "bc", "horizon": 8.0},
     "clearance, learned ego": {"measure": "clearance", "ego": "imitation", "horizon": 4.0},
@@ -40,13 +43,12 @@ def policy(choices=False, steady=0.05):
     return made
 
 
-@pytest.mark.parametrize("choices", [False, True])
-def test_policies_drive_as_in_the_torch_simulation(choices):
+@pytest.mark.parametrize(("choices", "drivers"), [(False, "mgail"), (True, "mgail"), (False, "mgail5")])
+def test_policies_drive_as_in_the_torch_simulation(choices, drivers):
+    action = "discrete" if choices else None
+    settings = {"ego": policy(choices), "action": action, "drivers": drivers, "horizon": 4.0}
     compiled, reference = (
-        rare_envs.DrivingProblem(
-            "rare_envs/Highway-v0", ego=policy(choices), action="discrete" if choices else None, horizon=4.0, core=core
-        )
-        for core in ("numba", "torch")
+        rare_envs.DrivingProblem("rare_envs/Highway-v0", core=core, **settings) for core in ("numba", "torch")
     )
     x = points(compiled, 60)
     found, expected = compiled.terms(x), reference.terms(x)
@@ -94,6 +96,8 @@ def test_f_is_that_of_the_torch_simulation(case):
     assert np.median(np.abs(f - expected)) < 1e-5
     if case in ("collisions", "clearance"):
         assert 0.02 < (expected == -1.0).mean() < 0.5
+    if case == "lane changes":
+        assert (expected == -1.0).sum() > 1
 
 
 @pytest.mark.parametrize(
@@ -107,6 +111,7 @@ def test_f_is_that_of_the_torch_simulation(case):
         ("clearance, learned ego", 1.5),
         ("any collisions", 0.0),
         ("any collisions", 1.5),
+        ("lane changes", 0.0),
     ],
 )
 def test_terms_are_those_of_the_torch_simulation(case, gamma):
@@ -121,7 +126,7 @@ def test_terms_are_those_of_the_torch_simulation(case, gamma):
     assert compiled.terms_with_f
 
 
-@pytest.mark.parametrize("case", ["ttc", "learned ego", "any collisions"])
+@pytest.mark.parametrize("case", ["ttc", "learned ego", "any collisions", "lane changes"])
 def test_a_row_is_the_same_bits_in_any_batch(case):
     problem, _ = problems(case)
     x = points(problem, 60)
@@ -143,7 +148,9 @@ def test_distances_and_their_ticks_are_those_of_the_torch_simulation(case):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("case", ["ttc", "collisions", "lidar", "learned ego", "clearance", "any collisions"])
+@pytest.mark.parametrize(
+    "case", ["ttc", "collisions", "lidar", "learned ego", "clearance", "any collisions", "lane changes"]
+)
 def test_f_is_that_of_the_torch_simulation_in_20_000_rollouts(case):
     compiled, reference = problems(case)
     x = points(compiled, 20_000)

@@ -18,7 +18,8 @@ def three_rows() -> traffic_slots.TrafficRows:
     y, heading, speed = np.full_like(x, 5.0), np.zeros_like(x), np.full_like(x, 10.0)
     weights = np.arange(12, dtype=np.float32).reshape(3, 4)
     draws, memory = np.zeros((3, 0, 2, 2), np.float32), np.zeros((3, 2, 2, 2), np.float32)
-    return traffic_slots.TrafficRows(x, y, heading, speed, weights, draws, memory)
+    minds = np.zeros((3, 2, 0), np.float32)
+    return traffic_slots.TrafficRows(x, y, heading, speed, weights, draws, memory, minds)
 
 
 def begun():
