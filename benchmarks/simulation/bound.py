@@ -29,7 +29,8 @@ REDUCTIONS = frozenset("any all sum mean amin amax min max argmin argmax prod cu
 """A simple operation for each element that they read."""
 ROOTS = frozenset("div sqrt rsqrt reciprocal remainder fmod floor_divide hypot linalg_vector_norm".split())
 CURVES = frozenset(
-    "sin cos tan asin acos atan atan2 arctan2 sinh cosh tanh exp expm1 log log1p pow sigmoid softplus softmax".split()
+    "sin cos tan asin acos atan atan2 arctan2 sinh cosh tanh exp expm1 log log1p pow sigmoid softplus softmax "
+    "special_log_ndtr".split()
 )
 PRODUCTS = {"mm": 0, "bmm": 0, "matmul": 0, "linear": 0, "addmm": 1, "baddbmm": 1}
 """Products of matrices, with the place of their first factor."""

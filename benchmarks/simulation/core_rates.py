@@ -24,6 +24,8 @@ from rare_envs.threads import use_one_thread
 
 CORES = ("torch", "numba")
 HARD_BRAKE = "rare_envs/HardBrake-v0"
+DRIVERS = ("mgail2", "mgail5")
+"""Of the traffic on the highway: without and with lane changes by rule."""
 
 
 def measure_rates(env_id: str, rows: int, terms: bool = False, **settings: Any) -> str:
@@ -51,29 +53,43 @@ def measure_answers(env_id: str, core: str, seeds: int = 4) -> str:
 
 
 @use_one_thread()
-def main(only_answers: Annotated[bool, typer.Option(help="Estimates alone.")] = False) -> None:
+def main(
+    only_answers: Annotated[bool, typer.Option(help="Estimates alone.")] = False,
+    only_highway: Annotated[bool, typer.Option(help="Rates on the highway alone.")] = False,
+) -> None:
     """Measure and print."""
-    if not only_answers:
+    if not (only_answers or only_highway):
         print_rates()
+    if not only_answers:
+        print_highway_rates()
+    if only_highway:
+        return
     for env_id in (CUT_IN, CAR_FOLLOWING):
         for core in ("auto", "torch"):
             print(f"{env_id}, estimates, core {core}: {measure_answers(env_id, core)}", flush=True)
 
 
 def print_rates() -> None:
-    """Measure and print rollouts a second."""
+    """Measure and print rollouts a second of the scripted scenarios."""
     for rows in (25, 6000, 100_000):
         for env_id in (CAR_FOLLOWING, CUT_IN, HARD_BRAKE):
             print(f"{env_id}, {rows:,} rows: {measure_rates(env_id, rows)}")
     for rows in (25, 6000):
         for env_id in (CAR_FOLLOWING, CUT_IN):
             print(f"{env_id}, PPO ego, {rows:,} rows: {measure_rates(env_id, rows, ego=ppo(env_id))}")
+
+
+def print_highway_rates() -> None:
+    """Measure and print rollouts a second of the highway."""
     for rows in (25, 100, 1024):
         learned = agents.load_ego("imitation")
         print(f"{HIGHWAY}, ttc, {rows:,} rows: {measure_rates(HIGHWAY, rows)}")
         print(f"{HIGHWAY}, ttc with terms, {rows:,} rows: {measure_rates(HIGHWAY, rows, terms=True)}")
         found = measure_rates(HIGHWAY, rows, measure="lidar_ttc", ego=learned)
         print(f"{HIGHWAY}, lidar_ttc, learned ego, {rows:,} rows: {found}")
+        for drivers in DRIVERS:
+            found = measure_rates(HIGHWAY, rows, drivers=drivers)
+            print(f"{HIGHWAY}, ttc, {drivers}, {rows:,} rows: {found}", flush=True)
 
 
 if __name__ == "__main__":

@@ -55,6 +55,7 @@ FLOORS = {
     "highway_1_compiled": 10.0,
     "highway_25_compiled": 300.0,
     "highway_1024_compiled": 300.0,
+    "highway_1024_mgail5_compiled": 300.0,
 }
 """Least ratios to HighwayEnv."""
 COUNTED = 256
@@ -63,6 +64,8 @@ BATCHES = (1, 64, 256, 512, 1024)
 """Batch sizes of the highway."""
 COMPILED_BATCHES = (1, 25, 1024)
 """Likewise with compiled rollouts."""
+CHANGING = "mgail5"
+"""Drivers that change lanes by rule."""
 CEILINGS = {
     "camera_64": 40.0,
     "camera_64_weather": 45.0,
@@ -223,9 +226,9 @@ def latency_ratio() -> dict[str, float]:
     }
 
 
-def measure_highway(batch: int, rounds: int, core: str = "torch") -> dict[str, float]:
+def measure_highway(batch: int, rounds: int, core: str = "torch", **settings: Any) -> dict[str, float]:
     """Compare Highway-v0, the IDM ego and five learned drivers, with HighwayEnv's six IDM vehicles and lidar."""
-    problem = rare_envs.DrivingProblem(HIGHWAY, measure="lidar_ttc", core=core)
+    problem = rare_envs.DrivingProblem(HIGHWAY, measure="lidar_ttc", core=core, **settings)
     seconds_of_traffic = problem.world.clock.seconds
     x = problem.base.sample(batch, np.random.default_rng(0))
     problem.evaluate(x)
@@ -310,6 +313,12 @@ def count_bound(machine: Mapping[str, float], env_id: str, **settings: Any) -> f
     return bound_rate(plain.evaluate, x, machine)
 
 
+def count_highway_bound(machine: Mapping[str, float], **settings: Any) -> float:
+    """Return the seconds of highway traffic a second that one core allows; arguments as of `count_bound`."""
+    seconds_of_traffic = rare_envs.DrivingProblem(HIGHWAY, **settings).world.clock.seconds
+    return seconds_of_traffic * count_bound(machine, HIGHWAY, measure="lidar_ttc", **settings)
+
+
 def stand_by_bound(row: dict[str, float], bound: float) -> dict[str, float]:
     """Return a row with the rate that one core allows, in the unit of its own, and the share of it that was reached."""
     return {**row, "bound_per_second": bound, "of_bound": row["per_second"] / bound}
@@ -339,12 +348,14 @@ def main(
     machine = measure_machine()
     if not only_camera:
         results = {"highway_memory": highway_memory()}  # first: a peak stays
-        traffic = {"env_id": HIGHWAY, "measure": "lidar_ttc"}
-        bound = rare_envs.DrivingProblem(**traffic).world.clock.seconds * count_bound(machine, **traffic)
+        bound = count_highway_bound(machine)
         for core, ending, batches in (("torch", "", BATCHES), ("numba", "_compiled", COMPILED_BATCHES)):
             for batch in batches:
                 row = measure_highway(batch, rounds, core)
                 results[f"highway_{batch}{ending}"] = stand_by_bound(row, bound)
+        row = measure_highway(BATCHES[-1], rounds, "numba", drivers=CHANGING)
+        bound = count_highway_bound(machine, drivers=CHANGING)
+        results[f"highway_{BATCHES[-1]}_{CHANGING}_compiled"] = stand_by_bound(row, bound)
     results["camera_64"] = measure_camera(64, rounds)
     results["camera_64_weather"] = measure_camera(64, rounds, weather=True)
     if not (only_highway or only_camera):

@@ -17,7 +17,8 @@ from rare_envs.simulation.compiled.networks import pad_units, tanh
 from rare_envs.simulation.compiled.rollouts import SingleArray
 from rare_envs.traffic.state import VEHICLE_LENGTH, VEHICLE_WIDTH
 
-_OUTPUTS = 4  # two means and two log deviations
+_OUTPUTS, _ACTIONS = 4, 2
+"""Two means and two log deviations; acceleration and yaw rate."""
 _LENGTH, _WIDTH, _HALF, _NOTHING = single(VEHICLE_LENGTH, VEHICLE_WIDTH, 0.5, 0.0)
 _ACCELERATION, _YAW_RATE = whole(0, 1)
 NO_NOISE = (_NOTHING, _NOTHING)
@@ -88,14 +89,17 @@ class DriverBuffers(NamedTuple):
     """Weights of each driver's last layer, shape (4 (units + 1), drivers)."""
     outputs: SingleArray
     """Shape (4, drivers)."""
+    actions: SingleArray
+    """Accelerations [m/s^2] and yaw rates [rad/s] that are carried out, shape (2, drivers)."""
 
     @classmethod
     def of(cls, driver: DenseDriver, drivers: int) -> "DriverBuffers":
         """Return arrays for so many of a driver, with its own last layer."""
         sizes = (pad_units(len(FEATURES)), *(pad_units(len(bias)) for _, bias in driver.hidden))
         head = np.ascontiguousarray(np.repeat(driver.head[:, None], drivers, axis=1), dtype=np.float32)
-        features, first, second, outputs = (np.zeros((size, drivers), dtype=np.float32) for size in (*sizes, _OUTPUTS))
-        return cls(features, first, second, head, outputs)
+        sizes += (_OUTPUTS, _ACTIONS)
+        features, first, second, *results = (np.zeros((size, drivers), dtype=np.float32) for size in sizes)
+        return cls(features, first, second, head, *results)
 
 
 @compiled

@@ -45,7 +45,7 @@ class EgoNumbers(NamedTuple):
     """Of the network, shape (widest layer, `LANES`)."""
     spare: SingleArray
     actions: SingleArray
-    """Of the policy: acceleration [m/s^2] and steering angle [rad], NaN if unknown, shape (slots, 2)."""
+    """Acceleration [m/s^2] and steering angle [rad], NaN if unknown, but of the IDM, shape (slots, 2)."""
 
     @classmethod
     def of(cls, ego: IDM | DenseDriver | DensePolicy, any_driver: DenseDriver) -> "EgoNumbers":
@@ -82,58 +82,56 @@ def apply_policies(rows: TrafficRows, slots: Slots, ego: EgoNumbers) -> None:
 
 
 @compiled
-def decide_ego(
+def steer_as_learned(
     rows: TrafficRows,
     slots: Slots,
-    slot: int,
     beams: SingleArray,
     ego: EgoNumbers,
     road: CurvedRoadNumbers,
     driving_rules: TrafficRules | None,
+) -> None:
+    """Write the actions of the learned egos of all slots: `agents.learned.driver.LearnedEgo.act` after its network.
+
+    Args:
+        rows: The traffic.
+        slots: In which it is driven.
+        beams: Of the egos of all slots.
+        ego: The ego, whose network has been applied.
+        road: The road.
+        driving_rules: Of everybody; with None the compiler leaves out what has to do with them.
+    """
+    for slot in range(len(slots.row)):
+        row = slots.row[slot]
+        if row == NO_ROW:
+            continue
+        speed = rows.speed[row, 0]
+        acceleration, yaw_rate = decide_action(ego.buffers.outputs, slot, NO_NOISE, ego.driver)
+        if driving_rules is None:
+            acceleration, yaw_rate = limit_action(acceleration, yaw_rate, speed, beams, slot, ego.driver.avoidance)
+        else:
+            own = perceive_own(rows.y[row, 0], rows.heading[row, 0], speed, road)
+            acceleration = ease_braking(acceleration, driving_rules.ego)
+            acceleration, yaw_rate = limit_action_near(acceleration, yaw_rate, own, beams, slot, driving_rules.ego)
+        yaw_rate += speed * slots.poses.curvature[slot, 0]
+        ego.actions[slot, 0], ego.actions[slot, 1] = acceleration, steering_for(yaw_rate, speed)
+
+
+@compiled
+def decide_ego(
+    rows: TrafficRows, slots: Slots, slot: int, ego: EgoNumbers, road: CurvedRoadNumbers
 ) -> tuple[float, float]:
-    """Return acceleration [m/s^2] and steering angle [rad] of the ego of a slot, whose network has been applied.
+    """Return acceleration [m/s^2] and steering angle [rad] of the ego of a slot; others than the IDM have decided.
 
     Args:
         rows: The traffic.
         slots: In which it is driven.
         slot: The ego's.
-        beams: Of the egos of all slots, if they are learned drivers.
         ego: The ego.
         road: The road.
-        driving_rules: Of everybody, see `TrafficRules`.
     """
+    if ego.kind != BY_RULE:
+        return ego.actions[slot, 0], ego.actions[slot, 1]
     row = slots.row[slot]
     y, heading, speed = rows.y[row, 0], rows.heading[row, 0], rows.speed[row, 0]
-    if ego.kind == BY_POLICY:
-        return ego.actions[slot, 0], ego.actions[slot, 1]
-    if ego.kind == BY_DRIVER:
-        curvature = slots.poses.curvature[slot, 0]
-        return steer_as_learned(ego, slot, beams, y, heading, speed, curvature, road, driving_rules)
     acceleration = idm_acceleration(ego.idm, speed, slots.gap[slot], slots.closing[slot], ego.idm.desired_speed)
     return acceleration, steer_to_line(y - lane_middle(y, road), heading, speed)
-
-
-@compiled
-def steer_as_learned(
-    ego: EgoNumbers,
-    slot: int,
-    beams: SingleArray,
-    y: float,
-    heading: float,
-    speed: float,
-    curvature: float,
-    road: CurvedRoadNumbers,
-    driving_rules: TrafficRules | None,
-) -> tuple[float, float]:
-    """Return acceleration [m/s^2] and steering angle [rad]: `agents.learned.driver.LearnedEgo.act`.
-
-    With None for the rules the compiler leaves their branch out.
-    """
-    acceleration, yaw_rate = decide_action(ego.buffers.outputs, slot, NO_NOISE, ego.driver)
-    if driving_rules is None:
-        acceleration, yaw_rate = limit_action(acceleration, yaw_rate, speed, beams, slot, ego.driver.avoidance)
-    else:
-        own = perceive_own(y, heading, speed, road)
-        acceleration = ease_braking(acceleration, driving_rules.ego)
-        acceleration, yaw_rate = limit_action_near(acceleration, yaw_rate, own, beams, slot, driving_rules.ego)
-    return acceleration, steering_for(yaw_rate + speed * curvature, speed)

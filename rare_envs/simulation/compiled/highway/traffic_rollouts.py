@@ -34,6 +34,7 @@ from rare_envs.simulation.compiled.highway.ego_lanes import (
     EgoNumbers,
     apply_policies,
     decide_ego,
+    steer_as_learned,
 )
 from rare_envs.simulation.compiled.highway.lidar_lanes import measure_beams
 from rare_envs.simulation.compiled.highway.measure_kinds import BY_LIDAR
@@ -99,12 +100,14 @@ def drive_among_learned(
         measure_beams(sight.seen, sight.beams)
         observe_drivers(rows, slots, sight.beams, _OTHERS, driver, buffers, road)
         apply_drivers(driver, buffers)
+        decide_drivers(rows, slots, sight.beams, driver, buffers, road, driving_rules)
         if ego.kind == BY_POLICY:
             apply_policies(rows, slots, ego)
         elif ego.kind == BY_DRIVER:
             observe_drivers(rows, slots, sight.ego_beams, _EGO, ego.driver, ego.buffers, road)
             apply_drivers(ego.driver, ego.buffers)
-        move_rows(rows, slots, sight, driver, buffers, ego, road, rules, found, driving_rules)
+            steer_as_learned(rows, slots, sight.ego_beams, ego, road, driving_rules)
+        move_rows(rows, slots, buffers, ego, road, rules, found)
 
 
 @compiled
@@ -140,17 +143,44 @@ def observe_drivers(
 
 
 @compiled
+def decide_drivers(
+    rows: TrafficRows,
+    slots: Slots,
+    beams: SingleArray,
+    driver: DriverNumbers,
+    buffers: DriverBuffers,
+    road: CurvedRoadNumbers,
+    driving_rules: TrafficRules | None,
+) -> None:
+    """Write the actions of vehicles 1 to N - 1 of all slots, whose network has been applied."""
+    others = rows.x.shape[1] - 1
+    for slot in range(len(slots.row)):
+        row, noise, fresh = slots.row[slot], NO_NOISE, NO_NOISE
+        if row == NO_ROW:
+            continue
+        for other in range(1, others + 1):
+            if rows.draws.shape[1]:
+                draws = rows.draws[row, FIRST_DRAW + slots.tick[slot], other - 1]
+                noise, fresh = next_noise(rows.memory[row, other - 1], draws, driver), (draws[0], draws[1])
+            lane, speed = others * slot + other - 1, rows.speed[row, other]
+            action = decide_action(buffers.outputs, lane, noise, driver)
+            if driving_rules is None:
+                action = limit_action(action[0], action[1], speed, beams, lane, driver.avoidance)
+            else:
+                own = perceive_own(rows.y[row, other], rows.heading[row, other], speed, road)
+                action = carry_out(action, own, beams, lane, rows.minds[row, other - 1], fresh, driving_rules.drivers)
+            buffers.actions[0, lane], buffers.actions[1, lane] = action
+
+
+@compiled
 def move_rows(
     rows: TrafficRows,
     slots: Slots,
-    sight: Sight,
-    driver: DriverNumbers,
     buffers: DriverBuffers,
     ego: EgoNumbers,
     road: CurvedRoadNumbers,
     rules: Rules,
     found: Found,
-    driving_rules: TrafficRules | None,
 ) -> None:
     """Move all rows by a tick, and free the slots of those with a collision; arguments as of `drive_among_learned`.
 
@@ -160,13 +190,12 @@ def move_rows(
         row = slots.row[slot]
         if row == NO_ROW:
             continue
-        acceleration, steering = decide_ego(rows, slots, slot, sight.ego_beams, ego, road, driving_rules)
+        acceleration, steering = decide_ego(rows, slots, slot, ego, road)
         if acceleration != acceleration:
             found.f[row], slots.row[slot] = _UNKNOWN, NO_ROW
             continue
-        moved = move_ego(rows, slots, slot, acceleration, steering, rules.dt)
-        move_drivers(rows, slots, slot, sight.beams, driver, buffers, road, rules.dt, driving_rules)
-        rows.x[row, 0], rows.y[row, 0], rows.heading[row, 0], rows.speed[row, 0] = moved
+        move_ego(rows, slots, slot, acceleration, steering, rules.dt)
+        move_drivers(rows, slots, slot, buffers.actions, rules.dt)
         place_row(rows, row, slot, slots.poses, road)
         slots.tick[slot] += 1
         if has_collided(rows, row, slot, slots.poses, road, rules.any_collision):
@@ -175,12 +204,10 @@ def move_rows(
 
 
 @compiled
-def move_ego(
-    rows: TrafficRows, slots: Slots, slot: int, acceleration: float, steering: float, dt: float
-) -> tuple[float, float, float, float]:
-    """Return x, y, heading and speed of the ego of a slot after a tick."""
+def move_ego(rows: TrafficRows, slots: Slots, slot: int, acceleration: float, steering: float, dt: float) -> None:
+    """Move the ego of a slot by a tick."""
     row = slots.row[slot]
-    return bicycle_on_curve(
+    moved = bicycle_on_curve(
         rows.x[row, 0],
         rows.y[row, 0],
         rows.heading[row, 0],
@@ -190,42 +217,22 @@ def move_ego(
         dt,
         slots.poses.curvature[slot, 0],
     )
+    rows.x[row, 0], rows.y[row, 0], rows.heading[row, 0], rows.speed[row, 0] = moved
 
 
 @compiled
-def move_drivers(
-    rows: TrafficRows,
-    slots: Slots,
-    slot: int,
-    beams: SingleArray,
-    driver: DriverNumbers,
-    buffers: DriverBuffers,
-    road: CurvedRoadNumbers,
-    dt: float,
-    driving_rules: TrafficRules | None,
-) -> None:
-    """Move vehicles 1 to N - 1 of a slot by a tick; arguments as of `drive_among_learned`."""
-    row, noise, fresh, others = slots.row[slot], NO_NOISE, NO_NOISE, rows.x.shape[1] - 1
+def move_drivers(rows: TrafficRows, slots: Slots, slot: int, actions: SingleArray, dt: float) -> None:
+    """Move vehicles 1 to N - 1 of a slot by a tick."""
+    row, others = slots.row[slot], rows.x.shape[1] - 1
     for other in range(1, others + 1):
-        if rows.draws.shape[1]:
-            draws = rows.draws[row, FIRST_DRAW + slots.tick[slot], other - 1]
-            noise, fresh = next_noise(rows.memory[row, other - 1], draws, driver), (draws[0], draws[1])
-        lane, speed = others * slot + other - 1, rows.speed[row, other]
-        acceleration, yaw_rate = decide_action(buffers.outputs, lane, noise, driver)
-        if driving_rules is None:
-            acceleration, yaw_rate = limit_action(acceleration, yaw_rate, speed, beams, lane, driver.avoidance)
-        else:
-            own = perceive_own(rows.y[row, other], rows.heading[row, other], speed, road)
-            mind = rows.minds[row, other - 1]
-            action = (acceleration, yaw_rate)
-            acceleration, yaw_rate = carry_out(action, own, beams, lane, mind, fresh, driving_rules.drivers)
+        lane = others * slot + other - 1
         moved = point_on_curve(
             rows.x[row, other],
             rows.y[row, other],
             rows.heading[row, other],
-            speed,
-            acceleration,
-            yaw_rate,
+            rows.speed[row, other],
+            actions[0, lane],
+            actions[1, lane],
             dt,
             slots.poses.curvature[slot, other],
         )

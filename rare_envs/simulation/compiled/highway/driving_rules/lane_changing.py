@@ -38,11 +38,9 @@ def remember_lanes(mind: SingleArray, left: LaneBeside, right: LaneBeside, own: 
     """Keep in mind where lanes are, also where a line was crossed: `LaneChanges._remember`."""
     offset = (own.left - own.right) * _HALF
     moved = ZERO if mind[CHANGE_SHARE] == UNSTARTED else mind[LAST_OFFSET] - offset
-    mind[UNSEEN_TIMES], mind[UNSEEN_TIMES + 1], mind[LAST_OFFSET] = (
-        mind[UNSEEN_TIMES] + _TICK,
-        mind[UNSEEN_TIMES + 1] + _TICK,
-        offset,
-    )
+    mind[LAST_OFFSET] = offset
+    mind[UNSEEN_TIMES] += _TICK
+    mind[UNSEEN_TIMES + 1] += _TICK
     if abs(moved) > _HALF * (own.left + own.right):
         mind[UNSEEN_TIMES], mind[UNSEEN_TIMES + 1] = (ZERO, _FAR) if moved > ZERO else (_FAR, ZERO)
         if moved * mind[CHANGE_SIDE] > ZERO:
@@ -81,11 +79,8 @@ def take_up_change(
     offset, width = side * ((own.left - own.right) * _HALF), own.left + own.right
     gone = clip(offset / at_least(width, ONE), changes.least_share, _HALF)
     mind[CHANGE_SHARE] = _HALF - math.sin(math.asin(ONE - TWO * gone) / _THREE)
-    mind[CHANGE_SIDE], mind[CHANGE_PACE], mind[CHANGE_DISTANCE] = (
-        side,
-        ONE / changes.duration,
-        max(width, width - offset),
-    )
+    mind[CHANGE_SIDE], mind[CHANGE_PACE] = side, ONE / changes.duration
+    mind[CHANGE_DISTANCE] = max(width, width - offset)
 
 
 @compiled

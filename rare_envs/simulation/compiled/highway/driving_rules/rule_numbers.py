@@ -7,18 +7,11 @@ from rare_envs.simulation.compiled.highway.avoidance_lanes import AvoidanceNumbe
 from rare_envs.simulation.compiled.highway.dense_driver import DenseDriver
 from rare_envs.simulation.compiled.highway.driving_rules.settings import CloseRangeSettings, LaneChangeSettings
 
-PATIENCES, UNSEEN_TIMES, CHANGE_SIDE, CHANGE_SHARE, CHANGE_PACE, CHANGE_DISTANCE, HAS_CROSSED, LAST_OFFSET = (
-    0,
-    2,
-    4,
-    5,
-    6,
-    7,
-    8,
-    9,
-)
-"""Places in a mind, an array of shape (10,): `agents.learned.lane_changes.ChangeState.pack`. The first two are of the
-left, behind each is that of the right."""
+PATIENCES, UNSEEN_TIMES = 0, 2
+"""Places in a mind, an array of shape (10,): `agents.learned.lane_changes.ChangeState.pack`. Those of the left; behind
+each is that of the right."""
+CHANGE_SIDE, CHANGE_SHARE, CHANGE_PACE, CHANGE_DISTANCE, HAS_CROSSED, LAST_OFFSET = range(4, 10)
+"""Likewise, of the change under way."""
 
 
 class DriverRules(NamedTuple):
