@@ -22,7 +22,7 @@ PACKAGES := agents rare_envs samplers training
 SOURCES := $(PACKAGES) tests benchmarks examples
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-slow test-lowest docs lint type format bench clean
+.PHONY: help demo test test-slow test-gpu test-lowest docs lint type format bench clean
 
 help:  ## Show this list.
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/  make \1|\2/p' $(MAKEFILE_LIST) | column -t -s '|'
@@ -35,6 +35,9 @@ test: $(VENV)/.installed  ## Run the tests (some minutes; WORKERS=8 for more pro
 
 test-slow: $(VENV)/.installed  ## Run the repeated-seed studies too.
 	@$(TESTS) -m "not gpu"
+
+test-gpu: $(VENV)/.installed  ## Run the tests that need a CUDA device (with a torch that has one).
+	@$(TESTS) -m gpu
 
 # Warnings of libraries that are older than those they rest on are none of ours.
 test-lowest: $(LOWEST)/.installed  ## Run the tests with the lowest versions that pyproject.toml allows.

@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from agents.settings import read_settings
+from rare_envs.devices import constant, fixed_draws, move_to
 from rare_envs.egos.policy import as_driver
 from rare_envs.sensors.perception import perceive_traffic
 from rare_envs.simulation.episode import Episode
@@ -200,6 +201,15 @@ class NoisyDriver:
         """Number of columns of x that are its noise, the last ones."""
         return math.prod(self.shape) if self.world.noise is True else 0
 
+    @property
+    def recordable(self) -> bool:
+        """Whether a GPU may record its operations: as of the driver behind the stack."""
+        return getattr(self.inner, "recordable", False)  # anybody's object
+
+    def to(self, device: torch.device) -> NoisyDriver:
+        """Return the driver with what is behind the stack on a device."""
+        return replace(self, inner=move_to(device, self.inner))
+
     def with_draws(self, draws: Tensor) -> NoisyDriver:
         """Return the driver of B episodes with standard normal draws, shape (B, `noise_columns`)."""
         return replace(self, draws=draws.reshape(-1, *self.shape))
@@ -230,7 +240,7 @@ class NoisyDriver:
         if self.draws is not None:
             fresh = self.draws[:, min(plan, self.draws.shape[1] - 1)]
         elif self.world.noise == "fixed":
-            fresh = _fixed_draws(self.shape)[plan].to(errors).expand_as(errors)
+            fresh = fixed_draws(self.shape, FIXED_STACK_SEED, errors)[plan].expand_as(errors)
         else:
             raise ValueError("Expected the draws of its noise: call with_draws first.")
         if plan == 0:
@@ -267,12 +277,7 @@ class NoisyDriver:
     def _actuate(self, before: Tensor, planned: Tensor) -> Tensor:
         """Return the actuators' output (B, 2) after a tick: first-order lags with limited rates."""
         stack, dt = self.stack, self.world.clock.dt
-        shares = [1.0 - math.exp(-dt / lag) if lag else 1.0 for lag in (stack.lag, stack.steering_lag)]
-        most = before.new_tensor([stack.jerk * dt, stack.steering_rate * dt])
-        change = (planned - before) * before.new_tensor(shares)
+        shares = tuple(1.0 - math.exp(-dt / lag) if lag else 1.0 for lag in (stack.lag, stack.steering_lag))
+        most = constant((stack.jerk * dt, stack.steering_rate * dt), before)
+        change = (planned - before) * constant(shares, before)
         return before + torch.maximum(torch.minimum(change, most), -most)
-
-
-def _fixed_draws(shape: tuple[int, int]) -> Tensor:
-    """Return the one sequence of draws of `noise="fixed"`."""
-    return torch.randn(shape, generator=torch.Generator().manual_seed(FIXED_STACK_SEED), dtype=torch.float64)

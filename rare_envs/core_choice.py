@@ -1,4 +1,4 @@
-"""CoreChoice: compiled rollouts for a world and its ego where they can be had, and torch for everything else."""
+"""CoreChoice: compiled or recorded rollouts of a world and its ego where they can be had, torch for all else."""
 
 from __future__ import annotations
 
@@ -6,10 +6,12 @@ import warnings
 from functools import partial
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from rare_envs.control.idm import IDM
-from rare_envs.egos.policy import PolicyDriver
+from rare_envs.egos.policy import PolicyDriver, find_device_driver
 from rare_envs.egos.sb3.dense_networks import read_dense_policy
 from rare_envs.simulation.compiled.failures import CompilerFails, NotCompiled, check_core
 from rare_envs.simulation.compiled.highway import HighwayRollout, OffersDenseDriver, RolloutTerms, read_dense_driver
@@ -19,8 +21,12 @@ from rare_envs.simulation.compiled.selection import (
     find_compiled_rollout,
     select_rollout,
 )
+from rare_envs.simulation.episode import Episode
+from rare_envs.simulation.recorded import RecordedRollouts
 from rare_envs.simulation.rollout import Driver
 from rare_envs.simulation.world import World
+
+_CPU = torch.device("cpu")
 
 
 class CoreChoice:
@@ -36,23 +42,28 @@ class CoreChoice:
         True
     """
 
-    def __init__(self, wanted: str, world: World, driver: Driver) -> None:
+    def __init__(self, wanted: str, world: World, driver: Driver, device: torch.device = _CPU, tile: int = 1) -> None:
         """Find the compiled rollout, if what was asked for is one and there is one.
 
         Args:
             wanted: One of `CORES`.
             world: The world.
             driver: The ego.
+            device: Where it is to be simulated.
+            tile: Most rollouts that torch makes at once.
 
         Raises:
             ValueError: There is no such core, or "numba" cannot simulate this.
         """
         check_core(wanted)
-        self.wanted = wanted
+        self.wanted, self._driver, self._device, self._tile = wanted, driver, device, tile
+        self._recorded: RecordedRollouts | None = None
         self.rollout: CompiledRollout | HighwayRollout | None = None
         if wanted == "torch":
             return
         try:
+            if device.type != "cpu":
+                raise NotCompiled(f"compiled rollouts are for the CPU, and device={str(device)!r} was asked for")
             self.rollout = find_compiled_rollout(world, compiled_ego(driver))
         except NotCompiled as reason:
             self._give_up(reason, warns=isinstance(reason, CompilerFails), stacklevel=4)
@@ -84,6 +95,25 @@ class CoreChoice:
         except NotCompiled as reason:
             self._give_up(reason, warns=True, stacklevel=6)
             return None
+
+    def roll_out(self, world: World, x: Tensor) -> Episode | None:
+        """Return the episodes of scenarios x (B, d), a tile at most, as a GPU alone makes them.
+
+        Returns:
+            None on the CPU, and where a policy has to be asked there: one that cannot decide elsewhere, or one after
+            which f is NaN, for then it is told what fails, and how.
+        """
+        if self._device.type == "cpu":
+            return None
+        known = self._recorded
+        driver = find_device_driver(self._driver, self._device, None if known is None else known.driver)
+        if driver is None:
+            return None
+        if known is None or known.driver is not driver:
+            known = self._recorded = RecordedRollouts(driver, self._tile)
+        end = known(world, x)
+        asks = isinstance(self._driver, PolicyDriver)
+        return None if asks and bool(end.f.isnan().any()) else end
 
     def _give_up(self, reason: NotCompiled, *, warns: bool, stacklevel: int) -> None:
         """Leave the simulation to torch, or raise a ValueError where that was not asked for."""

@@ -13,6 +13,7 @@ import torch
 from numpy.typing import NDArray
 
 from rare_envs.core_choice import CoreChoice, is_compiled_script
+from rare_envs.devices import find_device, move_to
 from rare_envs.distributions.space import Distribution, ScenarioSpace
 from rare_envs.egos.errors import reason_of
 from rare_envs.egos.loading import load_named_ego
@@ -47,6 +48,9 @@ LIDAR_TILE = 512
 CAMERA_TILE = 128
 """Likewise with a policy that takes pictures: its layers' values for all of them have to fit into memory."""
 
+GPU_TILES = 16
+"""Times as many rollouts at once on a GPU, which takes about as long for few as for thousands."""
+
 RULE_CHUNK = 4096
 """Rollouts of a rule-based ego that a worker makes at once: enough for torch, and some for each of several workers."""
 POLICY_CHUNK = 256
@@ -62,6 +66,7 @@ class DrivingProblem:
     Attributes:
         env_id: The environment's id.
         ego: The ego as it was given.
+        device: Where torch simulates.
         needs: What the ego needs of the world, and says about itself.
         world: The simulation.
         driver: The ego as a Driver.
@@ -86,6 +91,7 @@ class DrivingProblem:
         noise: bool | str = True,
         chunk_size: int | None = None,
         core: str = "auto",
+        device: str = "cpu",
         **make_kwargs: Any,
     ) -> None:
         """Check everything that can be checked before a simulation.
@@ -111,6 +117,9 @@ class DrivingProblem:
                 with learned drivers, the IDM, one of them or such a policy as ego, and `ttc`, `lidar_ttc` or
                 `clearance`; "auto" for the compiled ones where they can be had. They differ by rounding; an estimate
                 says which it used (`DrivingProblem.core`).
+            device: Where torch simulates: "cpu", or a GPU, "cuda" or "cuda:1". Networks of learned drivers and dense
+                layers of Stable-Baselines3 are copied there, a torch module stays on its own device, and other
+                policies are queried through the CPU. Rounding differs by device.
             **make_kwargs: Further keyword arguments of `gym.make` for this id. Without an `observation` the ego's
                 `observation_space` decides: a `Dict` names the kinds, the space of the lidar stands for "lidar", and
                 any other for "features".
@@ -126,10 +135,11 @@ class DrivingProblem:
         self.ego = ego
         ego = load_named_ego(ego)
         self._chunk_size = chunk_size
+        self.device = find_device(device)
         self.world: World
         self.space: ScenarioSpace
         scenario = find_scenario(env_id)
-        refuse_unknown(scenario, make_kwargs, more=("ego", "core", "chunk_size"))
+        refuse_unknown(scenario, make_kwargs, more=("ego", "core", "chunk_size", "device"))
         with _ego_errors_as_value_errors(ego):
             self.needs = resolve(ego, scenario.vehicles)
         make_kwargs["observation"] = make_kwargs.get("observation") or choose_observation(self.needs, scenario.vehicles)
@@ -139,8 +149,11 @@ class DrivingProblem:
         self.world, self.space = set_up(scenario, self.needs, measure=measure, base=base, noise=noise, **make_kwargs)
         with _ego_errors_as_value_errors(ego):
             self.driver = as_driver(ego, self.world, self.needs)
+        if self.device.type != "cpu":
+            self.world = replace(self.world, background=move_to(self.device, self.world.background))
+            self.driver = move_to(self.device, self.driver)
         self.varies = self.needs.varies
-        self._core = CoreChoice(core, self.world, self.driver)
+        self._core = CoreChoice(core, self.world, self.driver, self.device, self.tile)
         said_by_id = bool(layout) and not self.needs.queries_policy  # nobody named its actions
         for note in self.notes:
             if note != TAKEN_AS_ACCELERATIONS and not said_by_id:
@@ -156,7 +169,7 @@ class DrivingProblem:
         """Set an attribute; another world or driver has another compiled rollout, or none, and other gradients."""
         super().__setattr__(name, value)
         if name in ("world", "driver") and "_core" in vars(self):
-            self._core = CoreChoice(self._core.wanted, self.world, self.driver)
+            self._core = CoreChoice(self._core.wanted, self.world, self.driver, self.device, self.tile)
             vars(self).pop("gradient", None)
 
     def __repr__(self) -> str:
@@ -298,7 +311,10 @@ class DrivingProblem:
     def gradient(self) -> TermDifferentiator | None:
         """Gradients of the terms: `gradient(x, term, ticks)`; None where measure or drivers have none."""
         x = self.base.sample(1, np.random.default_rng(0))
-        return find_differentiator(self.world, self.driver, self.needs.queries_policy, x)
+        world, driver, cpu = self.world, self.driver, find_device("cpu")
+        if self.device != cpu:  # of the few rollouts that methods ask for at once the CPU has gradients sooner
+            world, driver = replace(world, background=move_to(cpu, world.background)), move_to(cpu, driver)
+        return find_differentiator(world, driver, self.needs.queries_policy, x)
 
     @property
     def gradient_cost(self) -> float:
@@ -323,11 +339,11 @@ class DrivingProblem:
         world, parts = replace(self.world, measurement=measurement), list[Crash]()
         with torch.inference_mode():
             for first in range(0, len(x), self.tile):
-                rows = torch.from_numpy(x[first : first + self.tile]).float()
+                rows = torch.from_numpy(x[first : first + self.tile]).float().to(self.device)
                 seen = rollout(world, self.driver, rows).statistics
                 assert seen is not None
                 parts.append(seen.crash)
-        return Crash(*(torch.cat(values) for values in zip(*parts, strict=True)))
+        return Crash(*(torch.cat(values).cpu() for values in zip(*parts, strict=True)))
 
     def crash_kinds(self, x: NDArray[np.float64]) -> list[str]:
         """Return words for the kinds of crash that scenarios x (n, d) end in, such as "rear_end"; see `crashes`."""
@@ -336,6 +352,11 @@ class DrivingProblem:
     @property
     def tile(self) -> int:
         """Number of rollouts simulated at once."""
+        factor = 1 if self.device.type == "cpu" else GPU_TILES
+        return factor * self._cpu_tile
+
+    @property
+    def _cpu_tile(self) -> int:
         if self.needs.queries_policy and "camera" in self.world.sensing.kinds:
             return CAMERA_TILE
         if self.world.uses_lidar or self.world.measurement.records:
@@ -363,7 +384,7 @@ class DrivingProblem:
         return f
 
     def _simulate_by_torch(self, x: NDArray[np.float64], failed_rows: dict[int, str] | None) -> NDArray[np.float64]:
-        parts = [end.f.numpy() for end in self._roll_out(self.world, x, failed_rows)]
+        parts = [end.f.numpy(force=True) for end in self._roll_out(self.world, x, failed_rows)]
         return np.concatenate([np.empty(0), *parts])
 
     def _simulate_terms(self, x: NDArray[np.float64], gamma: float, failed_rows: dict[int, str] | None) -> EpisodeTerms:
@@ -398,12 +419,14 @@ class DrivingProblem:
             failed_rows: Takes the rows on which a policy fails, with the reason; None if such a failure is raised.
         """
         for first in range(0, len(x), self.tile):
-            rows = torch.from_numpy(x[first : first + self.tile]).float()
+            rows = torch.from_numpy(x[first : first + self.tile]).float().to(self.device)
             driver, mine = self.driver, dict[int, str]()
             if failed_rows is not None and isinstance(driver, PolicyDriver):
                 driver = replace(driver, failed_rows=mine)
             with torch.inference_mode():
-                end = rollout(world, driver, rows)
+                end = self._core.roll_out(world, rows)
+                if end is None:
+                    end = rollout(world, driver, rows)
             if failed_rows is not None:
                 failed_rows.update({first + row: reason for row, reason in mine.items()})
             yield end

@@ -47,6 +47,7 @@ FLOORS = {
     """,
     "rare_envs": """
         version startup
+        devices
         traffic plugins arrays threads json_text files code_trust compilation
         distributions control sensors
         sensors.camera scenarios measures

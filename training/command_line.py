@@ -91,6 +91,7 @@ class DriverTrainingOptions:
     method: Annotated[AlgorithmOption, typer.Option(help="Algorithm.")] = AlgorithmOption.MGAIL
     seed: Annotated[int, typer.Option(help="The same seed gives the same weights.")] = 0
     updates: Annotated[int, typer.Option(min=1, help="Updates of the policy, after behaviour cloning.")] = 1500
+    device: Annotated[str, typer.Option(help="Where to train: cpu, or a GPU (cuda, cuda:1).")] = "cpu"
 
 
 @contextlib.contextmanager

@@ -115,7 +115,8 @@ def train_ego(
         resume: Go on with a training that was interrupted, from the checkpoint beside `out`.
         checkpoint_interval: Time between checkpoints [s]; the last one is removed when the ego is saved.
         retraining: An ego to go on from, in place of a new one, and failures that are mixed into the scenarios.
-        **make_kwargs: Keyword arguments of `gym.make` for this environment.
+        **make_kwargs: Keyword arguments of `gym.make_vec` for this environment; `device` places networks that
+            see pictures too.
 
     Returns:
         Path of the `.zip`, which `agents.load_ego` and Stable-Baselines3 read.
@@ -141,7 +142,7 @@ def train_ego(
     from rare_envs.scenarios.registry import find_scenario
 
     find_scenario(env_id)
-    target = _prepare_target(Path(out))
+    target, device = _prepare_target(Path(out)), make_kwargs.get("device", "cpu")
     arguments = {"env_id": env_id, "algo": algo, "steps": steps, "seed": seed, "num_envs": num_envs}
     arguments |= {name: str(value) for name, value in make_kwargs.items() if value is not None}
     arguments |= {} if retraining is None else retraining.arguments()
@@ -157,9 +158,9 @@ def train_ego(
         with use_one_thread(), _progress_bar(steps, progress) as callback:
             settings = _fit_to_run(hyperparameters, num_envs, steps)
             if retraining is None:
-                model = _make_model(algo, env, seed, settings, hyperparameters.policy)
+                model = _make_model(algo, env, seed, settings, hyperparameters.policy, device)
             else:
-                model = _continue_model(retraining, algo, env, seed, settings)
+                model = _continue_model(retraining, algo, env, seed, settings, device)
             if saved is not None:
                 model.get_env().reset()
                 restore_model(model, saved)
@@ -175,7 +176,9 @@ def train_ego(
     return target
 
 
-def _make_model(algo: str, env: Any, seed: int, settings: Mapping[str, Any], policy: Mapping[str, Any]) -> Any:
+def _make_model(
+    algo: str, env: Any, seed: int, settings: Mapping[str, Any], policy: Mapping[str, Any], device: str
+) -> Any:
     """Return a new model; ReLU is the activation of its networks unless `policy` names another."""
     import stable_baselines3
     from torch import nn
@@ -183,10 +186,13 @@ def _make_model(algo: str, env: Any, seed: int, settings: Mapping[str, Any], pol
     algorithm = getattr(stable_baselines3, algo.upper())  # its classes are named so
     policy = {"activation_fn": nn.ReLU, **policy}
     name = _policy_name(env.observation_space)
-    return algorithm(name, env, policy_kwargs=policy, seed=seed, device="cpu", **settings)
+    device = device if name != "MlpPolicy" else "cpu"  # on which small networks learn sooner, as SB3 says too
+    return algorithm(name, env, policy_kwargs=policy, seed=seed, device=device, **settings)
 
 
-def _continue_model(retraining: Retraining, algo: str, env: Any, seed: int, settings: Mapping[str, Any]) -> Any:
+def _continue_model(
+    retraining: Retraining, algo: str, env: Any, seed: int, settings: Mapping[str, Any], device: str
+) -> Any:
     """Return the model of an ego to train on, in an environment that draws its failures too.
 
     Raises:
@@ -198,7 +204,7 @@ def _continue_model(retraining: Retraining, algo: str, env: Any, seed: int, sett
     saved = load_saved_ego(retraining.ego, None)
     check_retrainable(saved, algo, env)
     env.set_attr("space", retraining.mix(env.get_attr("space")[0]))
-    model = _make_model(algo, env, seed, continue_settings(settings), saved.model.policy_kwargs)
+    model = _make_model(algo, env, seed, continue_settings(settings), saved.model.policy_kwargs, device)
     restore_parameters(model, saved)
     return model
 

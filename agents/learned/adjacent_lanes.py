@@ -12,6 +12,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from rare_envs.devices import constant
 from rare_envs.sensors.lidar import MAX_RANGE, beam_angles
 from rare_envs.sensors.perception import FEATURES, HEADING_COLUMN, RANGE_COLUMNS, RATE_COLUMNS
 
@@ -56,7 +57,7 @@ def look_aside(features: Tensor) -> AdjacentLanes:
     """
     ranges, beams = features[..., None, RANGE_COLUMNS], beam_angles(features)
     angle = beams + features[..., HEADING_COLUMN, None, None]
-    side = features.new_tensor((-1.0, 1.0))[:, None]
+    side = constant((-1.0, 1.0), features)[:, None]
     along, across = ranges * torch.cos(angle), side * ranges * torch.sin(angle)
     line = torch.stack((features[..., LEFT_MARKER_COLUMN], features[..., RIGHT_MARKER_COLUMN]), dim=-1)[..., None]
     width = (features[..., LEFT_MARKER_COLUMN] + features[..., RIGHT_MARKER_COLUMN])[..., None, None]

@@ -13,6 +13,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from rare_envs.devices import constant
+
 
 @dataclass(frozen=True)
 class AutoregressiveNoise:
@@ -86,19 +88,19 @@ class AutoregressiveNoise:
             Memory, shape (..., 2, 2): action, then the values one and two ticks ago.
         """
         if self.balanced:  # E[sum of all that follow] = (earlier second + last (first + second)) / (1 - first - second)
-            last, (first, second) = fresh[..., 0], (fresh.new_tensor(pair) for pair in (self.first, self.second))
+            last, (first, second) = fresh[..., 0], (constant(pair, fresh) for pair in (self.first, self.second))
             return torch.stack((last, -last * (first + second) / second), dim=-1)
-        correlation = fresh.new_tensor([a / (1 - b) for a, b in zip(self.first, self.second, strict=True)])
+        correlation = constant(tuple(a / (1 - b) for a, b in zip(self.first, self.second, strict=True)), fresh)
         earlier = fresh[..., 1]
         return torch.stack((correlation * earlier + (1 - correlation.square()).sqrt() * fresh[..., 0], earlier), dim=-1)
 
     def predict_mean(self, memory: Tensor) -> Tensor:
         """Return the mean of the next value given the last two: (..., 2, 2) -> (..., 2)."""
-        return memory[..., 0] * memory.new_tensor(self.first) + memory[..., 1] * memory.new_tensor(self.second)
+        return memory[..., 0] * constant(self.first, memory) + memory[..., 1] * constant(self.second, memory)
 
     def step(self, memory: Tensor, fresh: Tensor) -> tuple[Tensor, Tensor]:
         """Return the next value (..., 2) from standard normal draws (..., 2), and the memory after it."""
-        value = self.predict_mean(memory) + fresh.new_tensor(self.scale) * fresh
+        value = self.predict_mean(memory) + constant(self.scale, fresh) * fresh
         return value, torch.stack((value, memory[..., 0]), dim=-1)
 
 

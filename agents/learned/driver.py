@@ -1,7 +1,7 @@
 """Learned drivers: 51 features to acceleration and yaw rate, for whole batches of scenarios at once."""
 
 import copy
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
@@ -25,6 +25,7 @@ from agents.learned.networks import (
 )
 from agents.learned.weight_distribution import WeightDistribution
 from rare_envs.control import actions
+from rare_envs.devices import constant
 from rare_envs.sensors.perception import CURVATURE_COLUMN, SPEED_COLUMN
 from rare_envs.simulation.compiled.highway import DenseDriver
 from rare_envs.simulation.observation import LIDAR_SCALES, observation_space
@@ -81,6 +82,8 @@ class LearnedDriver:
     changes: LaneChanges | None = None
     """Lane changes, which need the rule; None for those of the network."""
     noisy: ClassVar[bool] = True
+    recordable: ClassVar[bool] = True
+    """Whether a GPU may record its operations: nothing about it changes."""
 
     def __post_init__(self) -> None:
         for name in ("acceleration", "yaw_rate"):
@@ -136,7 +139,7 @@ class LearnedDriver:
             normal = normal + log_std.exp() * noise
         scaling = policy.scaling
         action = scaling.action_mean + scaling.action_std * normal
-        low, high = action.new_tensor(tuple(zip(self.acceleration, self.yaw_rate, strict=True)))
+        low, high = constant(tuple(zip(self.acceleration, self.yaw_rate, strict=True)), action)
         action = self._ease_braking(action.clamp(low, high).to(features.dtype))
         if state is None or swings is None:
             return self._bound(features, action), memory if swings is None else swings
@@ -218,6 +221,10 @@ class LearnedDriver:
         known = (CollisionAvoidance, CloseRange, LaneChanges, Waiting)
         return all(part is None or type(part) is kind for part, kind in zip(parts, known, strict=True))
 
+    def to(self, device: torch.device) -> "LearnedDriver":
+        """Return the driver with a copy of its network on a device."""
+        return replace(self, policy=copy.deepcopy(self.policy).to(device))
+
     def begin(self, draws: Tensor) -> Tensor:
         """Return the memory at the start, from independent standard normal draws (B, M, 2, 2).
 
@@ -296,6 +303,8 @@ class LearnedEgo:
     driver: LearnedDriver
     needs_lidar: ClassVar[bool] = True
     """It needs a world in which vehicles look."""
+    recordable: ClassVar[bool] = True
+    """Whether a GPU may record its operations: nothing about it changes."""
 
     @property
     def observation_space(self) -> "spaces.Space[Any]":
@@ -312,6 +321,10 @@ class LearnedEgo:
         if episode.perception is None:
             raise ValueError('Expected a world in which vehicles look: make it with observation="lidar".')
         return self._decide(episode.perception[:, 0]), memory
+
+    def to(self, device: torch.device) -> "LearnedEgo":
+        """Return the ego with a copy of its network on a device."""
+        return replace(self, driver=self.driver.to(device))
 
     def dense_driver(self) -> DenseDriver | None:
         """Return its present numbers for compiled rollouts; None if its class or its network was changed."""

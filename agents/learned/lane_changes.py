@@ -24,6 +24,7 @@ from agents.learned.adjacent_lanes import (
     AdjacentLanes,
     look_aside,
 )
+from rare_envs.devices import constant
 from rare_envs.sensors.lidar import AHEAD_BEAM, MAX_RANGE
 from rare_envs.sensors.perception import (
     FEATURES,
@@ -279,7 +280,7 @@ class LaneChanges:
         led, lagged = lanes.lead_gap < torch.inf, lanes.lag_gap < torch.inf
         advantage = torch.where(led, -lanes.lead_closing, torch.where(lagged, lanes.lag_closing, 0.0))
         approach = -features[..., RATE_COLUMNS][..., AHEAD_BEAM, None].expand_as(advantage)
-        right = features.new_tensor((0.0, 1.0)).expand_as(advantage)
+        right = constant((0.0, 1.0), features).expand_as(advantage)
         speed = (features[..., SPEED_COLUMN, None] - USUAL_SPEED).expand_as(advantage).clamp(-2.0 * BOUND, 2.0 * BOUND)
         met = (each.clamp(-BOUND, BOUND) for each in (advantage, approach))
         return torch.stack((torch.ones_like(right), right, *met, speed), dim=-1)
@@ -352,7 +353,7 @@ class LaneChanges:
     ) -> ChangeState:
         """Return the state one tick of hazard later."""
         waits = (state.side == 0.0)[..., None] & (state.unseen < self.remembered) & self.may_begin(features, lanes)
-        coefficients = features.new_tensor(self.coefficients)
+        coefficients = constant(self.coefficients, features)
         hazard = torch.exp((self.covariates(features, lanes) * coefficients).sum(dim=-1))
         patience = torch.where(waits, state.patience - hazard * LEARNED_TICK, state.patience)
         ripe = patience <= 0.0

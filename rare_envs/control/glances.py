@@ -19,6 +19,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from rare_envs.devices import constant
+
 GLANCE_CDF: Final = (
     (0.05, 0.0),
     (0.15, 0.0048),
@@ -130,7 +132,7 @@ def draw_glances(draws: Tensor) -> Glances:
 
 def _interpolate(value: Tensor, known: list[float], result: list[float]) -> Tensor:
     """Return piecewise linear interpolation between increasing `known` values, as `numpy.interp`."""
-    x, y = value.new_tensor(known), value.new_tensor(result)
+    x, y = constant(tuple(known), value), constant(tuple(result), value)
     right = torch.searchsorted(x, value.contiguous()).clamp(1, len(known) - 1)
     share = ((value - x[right - 1]) / (x[right] - x[right - 1])).clamp(0.0, 1.0)
     return y[right - 1] + share * (y[right] - y[right - 1])

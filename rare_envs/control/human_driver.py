@@ -18,6 +18,7 @@ import torch
 from torch import Tensor
 
 from rare_envs.control.idm import IDM
+from rare_envs.devices import constant
 from rare_envs.traffic.lead import Lead
 from rare_envs.traffic.road import Road
 from rare_envs.traffic.state import VEHICLE_LENGTH, State
@@ -205,5 +206,5 @@ def respond(lead: Lead, speed: Tensor, model: HumanDriverModel) -> Tensor:
     each = model.idm.interaction(speed[:, None], ratio[:, None], lead)
     seen = torch.isfinite(lead.gap).sum(dim=1)
     weights = [1.0 / sum(j**-2 for j in range(1, n + 1)) if n else 1.0 for n in range(lead.gap.shape[1] + 1)]
-    weight = speed.new_tensor(weights)[seen]
+    weight = constant(tuple(weights), speed)[seen]
     return model.idm.combine(ratio, weight * each.sum(dim=1))

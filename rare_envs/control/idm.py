@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from numbers import Real
-from typing import Any, Protocol
+from typing import Any, ClassVar, Protocol
 
 import torch
 from torch import Tensor
@@ -80,6 +80,8 @@ class IDM:
     cut_off: bool = False
     """Whether T v + v dv / (2 sqrt(a_max b)) is cut off at 0, as Treiber and Kesting write it ("Traffic Flow Dynamics",
     2013, chapter 11): a lead that pulls away fast is then not braked for."""
+    recordable: ClassVar[bool] = True
+    """Whether a GPU may record its operations: nothing about it changes."""
 
     def __post_init__(self) -> None:
         for name in _POSITIVE + _NOT_NEGATIVE:

@@ -11,7 +11,7 @@ References:
     `envs/common/action.py` and `vehicle/controller.py`.
 """
 
-from functools import lru_cache
+from functools import cache
 from typing import NamedTuple
 
 import torch
@@ -19,6 +19,7 @@ from torch import Tensor
 
 from rare_envs.control.actions import FASTER, IDLE, LANE_LEFT, LANE_RIGHT, SLOWER
 from rare_envs.control.steering import steering_control
+from rare_envs.devices import constant
 from rare_envs.traffic.road import Road
 from rare_envs.traffic.state import State
 
@@ -125,7 +126,7 @@ def control_towards(aim: Aim, x: Tensor, y: Tensor, heading: Tensor, speed: Tens
     Returns:
         Acceleration [m/s^2] and steering angle [rad], in a last axis of 2.
     """
-    acceleration = (speed.new_tensor(TARGET_SPEEDS)[aim.speed] - speed) / _TAU_SPEED
+    acceleration = (constant(tuple(TARGET_SPEEDS), speed)[aim.speed] - speed) / _TAU_SPEED
     centres, _ = _lanes(road, y.dtype, y.device)
     if road.reference_line is not None:
         ahead = road.reference_line.at(x + speed * _TAU_PURSUIT).heading - road.reference_line.at(x).heading
@@ -140,7 +141,7 @@ def _nearest_speed(speed: Tensor) -> Tensor:
     return index.clamp(0, len(TARGET_SPEEDS) - 1).long()
 
 
-@lru_cache(maxsize=32)
+@cache  # never forgotten: recorded rollouts read it where it is
 def _lanes(road: Road, dtype: torch.dtype, device: torch.device) -> tuple[Tensor, Tensor]:
     """Return the centres and widths of the lanes [m]."""
     with torch.inference_mode(False):

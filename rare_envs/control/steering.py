@@ -10,8 +10,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from rare_envs.devices import are_zero
 from rare_envs.traffic.road import Road
-from rare_envs.traffic.vehicle_models import NEAR_ZERO, are_zero, steering_for
+from rare_envs.traffic.vehicle_models import NEAR_ZERO, steering_for
 
 TAU_LATERAL = 0.6
 """Time constant of the way back to the line [s], HighwayEnv's `TAU_LATERAL`."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import torch
 from torch import Tensor
@@ -100,6 +100,8 @@ class HumanDriver:
     without errors."""
     glances: Glances | None = None
     """When the eyes are off the road; None if they never are."""
+    recordable: ClassVar[bool] = True
+    """Whether a GPU may record its operations: nothing about it changes."""
 
     @property
     def delay(self) -> int:
@@ -135,6 +137,12 @@ class HumanDriver:
             errors=torch.stack(steps, dim=1) if steps else None,
             glances=draw_glances(glances) if self.model.glances else None,
         )
+
+    def to(self, device: torch.device) -> HumanDriver:
+        """Return the driver with its noise on a device."""
+        errors = None if self.errors is None else self.errors.to(device)
+        glances = None if self.glances is None else Glances(*(part.to(device) for part in self.glances))
+        return replace(self, errors=errors, glances=glances)
 
     def act(self, episode: Episode, memory: Any) -> tuple[Tensor, Any]:
         """Decide by what was seen a reaction time ago, or last; see `Driver`."""

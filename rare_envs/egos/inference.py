@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import reprlib
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -16,6 +16,17 @@ from rare_envs.egos.isolation import attempt_in_parts
 from rare_envs.sensors.kinds import map_kinds
 
 
+@runtime_checkable
+class DecidesOnDevice(Protocol):
+    """A policy without a memory that answers where the observations are, so that none of them goes to the CPU.
+
+    Nobody looks at its answers on the way: NaN goes on to f.
+    """
+
+    def decide(self, observation: Any) -> Tensor:
+        """Return actions, shape (B, 2), for observations of B rows, a tensor or several by name."""
+
+
 class PolicyQuery(NamedTuple):
     """A query of B rows."""
 
@@ -26,7 +37,7 @@ class PolicyQuery(NamedTuple):
     start: NDArray[np.bool_]
     """Rows that begin an episode, shape (B,)."""
     over: Tensor
-    """Rows whose action does not matter, boolean, shape (B,)."""
+    """Rows whose action does not matter, boolean, shape (B,), on the CPU as all of it."""
 
     def rows(self, part: slice) -> PolicyQuery:
         """Return some of the rows, for a policy without a memory."""
@@ -79,7 +90,7 @@ def _predict(policy: Any, query: PolicyQuery) -> tuple[Tensor, Any]:
     actions = np.asarray(action)
     if actions.dtype.kind not in "biuf":
         raise ValueError(f"Expected actions as numbers, one or two for each observation, got {reprlib.repr(action)}.")
-    return torch.as_tensor(actions).to(query.over.device), hidden
+    return torch.as_tensor(actions), hidden
 
 
 def _query_with_reasons(policy: Any, kind: str, query: PolicyQuery) -> tuple[Tensor, Any, dict[int, str]]:
@@ -129,4 +140,4 @@ def _ignored_action(kind: str, over: Tensor) -> Tensor:
     """Return the action of rows whose action does not matter, for as many rows as `over` has."""
     batch = len(over)
     nothing = torch.zeros(batch, dtype=torch.int64) if kind == "meta" else torch.zeros(batch, 2)
-    return read_actions(kind, nothing.to(over.device), batch, torch.ones_like(over))
+    return read_actions(kind, nothing, batch, torch.ones_like(over))

@@ -58,6 +58,14 @@ class ModuleEgo:
         with torch.no_grad():
             return self.module(shown).numpy(force=True), state
 
+    def decide(self, observation: Any) -> torch.Tensor:
+        """Return actions for observations of B rows, by the module on its own device."""
+        self.module.eval()
+        parameter = next(self.module.parameters(), torch.empty(0))
+        with torch.no_grad():
+            actions: torch.Tensor = self.module(map_kinds(lambda part: part.to(parameter), observation))
+        return actions
+
 
 def wrap_callable(ego: Any) -> Any:
     """Return a policy for a plain function or a torch module, and any other ego as it is.

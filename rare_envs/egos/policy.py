@@ -10,10 +10,11 @@ import torch
 from gymnasium import spaces
 from torch import Tensor
 
-from rare_envs.control.actions import DISCRETE_ACTIONS, IDLE, META_ACTIONS
-from rare_envs.egos.inference import PolicyQuery, query_policy
+from rare_envs.control.actions import DISCRETE_ACTIONS, IDLE, META_ACTIONS, to_physical
+from rare_envs.devices import move_to
+from rare_envs.egos.inference import DecidesOnDevice, PolicyQuery, query_policy
 from rare_envs.egos.needs import RULE_BASED_EGOS, WorldEgo, find_rule_based, resolve
-from rare_envs.egos.sb3.dense_inference import find_inference
+from rare_envs.egos.sb3.dense_inference import DenseInference, find_inference
 from rare_envs.egos.validation import refuse_ego
 from rare_envs.egos.wrappers import find_frame_stacking, wrap_policy
 from rare_envs.sensors.kinds import map_kinds
@@ -50,21 +51,63 @@ class PolicyDriver:
         Raises:
             ValueError: If the policy's actions are not finite or have the wrong shape, and `failed_rows` is None.
         """
-        state, over = episode.state, episode.collided
-        batch = len(over)
+        state, device = episode.state, episode.state.x.device
+        batch = len(state.x)
         hidden, tick, policy = (None, 0, find_inference(self.policy)) if memory is None else memory
         if tick % self.stride:
-            return torch.full((batch,), IDLE, device=state.x.device), (hidden, tick + 1, policy)
+            return torch.full((batch,), IDLE, device=device), (hidden, tick + 1, policy)
+        seen = observe(episode, self.observation)
+        over = episode.collided.cpu()
         if self.failed_rows:
             over = over.clone()
             over[list(self.failed_rows)] = True
-        seen = observe(episode, self.observation)
-        observation = map_kinds(lambda part: _replace_rows(part, over).numpy(force=True), seen)
+        observation = map_kinds(lambda part: _replace_rows(part.cpu(), over).numpy(force=True), seen)
         start = np.full(batch, memory is None)
         actions, hidden = query_policy(
             policy, self.action, PolicyQuery(observation, hidden, start, over), self.failed_rows
         )
-        return actions.to(state.x) if actions.is_floating_point() else actions, (hidden, tick + 1, policy)
+        actions = actions.to(state.x) if actions.is_floating_point() else actions.to(device)
+        return actions, (hidden, tick + 1, policy)
+
+
+@dataclass(frozen=True, eq=False)
+class DevicePolicyDriver:
+    """A policy with continuous actions that answers where the observations are: nothing of a tick goes to the CPU."""
+
+    policy: DecidesOnDevice
+    observation: str = "features"
+    """What it observes."""
+
+    @property
+    def recordable(self) -> bool:
+        """Whether its answers depend on the observations alone: those of layers that were copied, not of a module."""
+        return isinstance(self.policy, DenseInference)
+
+    def act(self, episode: Episode, memory: Any) -> tuple[Tensor, Any]:
+        """Observe and decide; NaN in the policy's answers goes on to f."""
+        actions = self.policy.decide(observe(episode, self.observation)).to(
+            episode.state.x.device
+        )  # a module has its own
+        return to_physical(actions, len(episode.collided), episode.collided).to(episode.state.x), memory
+
+
+def find_device_driver(driver: Driver, device: torch.device, before: Driver | None = None) -> Driver | None:
+    """Return what decides as a driver does on a GPU, with its present weights; None if only the CPU can query it.
+
+    Args:
+        driver: The ego.
+        device: The GPU.
+        before: What this returned before, to be returned again if nothing has changed.
+    """
+    if not isinstance(driver, PolicyDriver):
+        return driver
+    policy = find_inference(driver.policy)
+    if driver.action != "continuous" or not isinstance(policy, DecidesOnDevice):
+        return None
+    placed = move_to(device, policy) if isinstance(policy, DenseInference) else policy
+    if isinstance(before, DevicePolicyDriver) and isinstance(placed, DenseInference) and placed.equals(before.policy):
+        return before
+    return DevicePolicyDriver(placed, driver.observation)
 
 
 def _replace_rows(observation: Tensor, rows: Tensor) -> Tensor:

@@ -1,6 +1,7 @@
 """Environment of many scenarios at once: a `gymnasium.vector.VectorEnv` that is one batch, not many environments."""
 
 import json
+from dataclasses import replace
 from typing import Any
 
 import gymnasium as gym
@@ -12,6 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from rare_envs.control.actions import read_actions
+from rare_envs.devices import find_device, move_to
 from rare_envs.envs.batch_rows import (
     DrawsAhead,
     list_tensors,
@@ -61,6 +63,7 @@ class DrivingVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[Any]
         render_mode: str | None = None,
         autoreset_mode: AutoresetMode | str = AutoresetMode.SAME_STEP,
         core: str = "auto",
+        device: str = "cpu",
         **kwargs: Any,
     ) -> None:
         """Make the batch.
@@ -72,6 +75,8 @@ class DrivingVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[Any]
             autoreset_mode: Gymnasium's, or its value: "SameStep", "NextStep" or "Disabled".
             core: What carries out the steps, "torch" or "numba" (compiled, for scripted scenarios); "auto" for the
                 compiled ones where they can be had. They differ by rounding.
+            device: Where torch carries them out: "cpu", or a GPU, such as "cuda". Observations and rewards are arrays
+                as ever.
             **kwargs: See `rare_envs.make.set_up`.
 
         Raises:
@@ -82,7 +87,12 @@ class DrivingVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[Any]
         if render_mode not in (None, "rgb_array"):
             raise ValueError(f"Expected render_mode None or 'rgb_array' for a batch, got {render_mode!r}.")
         self._mode = read_autoreset_mode(autoreset_mode)
+        self.device = find_device(device)
+        if self.device.type != "cpu" and core == "numba":
+            raise ValueError(f"Expected core 'torch' or 'auto' with device={device!r}, got 'numba'.")
         world, self.space = set_up(env_id, **kwargs)
+        if self.device.type != "cpu":
+            world = replace(world, background=move_to(self.device, world.background))
         self.world = world.with_statistics()
         frames = self.world.clock.decisions_per_second
         self.metadata = {**self.metadata, "render_fps": frames, "autoreset_mode": self._mode}
@@ -99,7 +109,7 @@ class DrivingVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[Any]
         """Episodes that are over and were not replaced yet."""
         self._episode: Episode | None = None
         self._renderer: Renderer | None = None
-        self._compiled = find_scripted_step(self.world, core)
+        self._compiled = find_scripted_step(self.world, core) if self.device.type == "cpu" else None
 
     @property
     def np_random(self) -> np.random.Generator:
@@ -183,16 +193,16 @@ class DrivingVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[Any]
             if moved is None:
                 given = torch.as_tensor(np.asarray(actions))
                 given = read_actions(self.world.clock.action, given, self.num_envs, ignored)
-                episode, terms = advance(self.world, self._episode, given)
+                episode, terms = advance(self.world, self._episode, given.to(self.device))
             else:
                 episode, terms = moved.episode, moved.terms
             if started is not None:  # which do not move in the step that starts them
-                episode = merge_rows(episode, torch.from_numpy(np.flatnonzero(fresh)), started)
-            reward = terms.total.double().numpy()
+                episode = merge_rows(episode, self._place(np.flatnonzero(fresh)), started)
+            reward = terms.total.double().numpy(force=True)
         reward[fresh] = 0.0
         self._episode = episode
         self._tick += np.where(fresh, 0, self.world.clock.stride)
-        terminated = episode.collided.numpy() & ~fresh
+        terminated = episode.collided.numpy(force=True) & ~fresh
         truncated = (self._tick >= self.world.clock.ticks) & ~terminated & ~fresh
         features = None if moved is None or started is not None else moved.features
         observation, infos = self._finish(terms, terminated | truncated, fresh, features)
@@ -237,10 +247,15 @@ class DrivingVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[Any]
 
     def _observe(self, episode: Episode) -> Any:
         with torch.inference_mode():
-            return map_kinds(Tensor.numpy, observe(episode, self.world.sensing.observation))
+            seen = observe(episode, self.world.sensing.observation)
+            return map_kinds(lambda part: part.numpy(force=True), seen)
+
+    def _place(self, values: NDArray[Any]) -> Tensor:
+        """Return values as a tensor on the device."""
+        return torch.from_numpy(values).to(self.device)
 
     def _start(self, x: NDArray[np.float64]) -> Episode:
-        return self.world.start(torch.from_numpy(x).float())
+        return self.world.start(self._place(x).float())
 
     def _replace(self, rows: NDArray[np.intp], options: dict[str, Any] | None = None) -> Episode:
         """Start the episodes of some rows anew, and return them, a batch of R."""
@@ -252,22 +267,23 @@ class DrivingVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[Any]
         self._tick[rows] = 0
         with torch.inference_mode():
             started = self._start(x)
-            self._episode = merge_rows(self._episode, torch.from_numpy(rows), started)
+            self._episode = merge_rows(self._episode, self._place(rows), started)
         return started
 
     def _info(self, episode: Episode, mask: NDArray[np.bool_]) -> Info:
         assert episode.statistics is not None
-        collided = episode.collided.numpy()
+        collided = episode.collided.numpy(force=True)
         infos: Info = {}
         scenario: Info = {}
         for name, column in self.space.columns(self._x).items():
             put_masked(scenario, name, column, mask)
         put_masked(infos, "scenario", scenario, mask)
         put_masked(infos, "x", self._x.copy(), mask)
-        put_masked(infos, "min_ttc", np.where(collided, 0.0, episode.statistics.least_ttc.double().numpy()), mask)
+        least = episode.statistics.least_ttc.double().numpy(force=True)
+        put_masked(infos, "min_ttc", np.where(collided, 0.0, least), mask)
         put_masked(infos, "collision", collided.copy(), mask)
         put_masked(infos, "crashed", collided.copy(), mask)  # HighwayEnv's name of it
-        put_masked(infos, "speed", episode.state.speed[:, 0].double().numpy(), mask)
+        put_masked(infos, "speed", episode.state.speed[:, 0].double().numpy(force=True), mask)
         return infos
 
     def _end_info(self, episode: Episode, done: NDArray[np.bool_]) -> Info:
@@ -275,14 +291,14 @@ class DrivingVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[Any]
         infos: Info = {}
         assert episode.statistics is not None
         crash = episode.statistics.crash
-        crashed = done & (crash.kind != NONE).numpy()
-        kinds = np.array(CRASH_KINDS, dtype=object)[crash.kind.numpy()]
+        kind = crash.kind.numpy(force=True)
+        crashed, kinds = done & (kind != NONE), np.array(CRASH_KINDS, dtype=object)[kind]
         kinds[~crashed] = None
-        put_masked(infos, "measure", episode.f.double().numpy(), done)
+        put_masked(infos, "measure", episode.f.double().numpy(force=True), done)
         put_masked(infos, "collision_type", kinds, crashed)
         details: Info = {}
         for name, values in {**crash._asdict(), "kind": kinds}.items():
-            put_masked(details, name, values if name == "kind" else values.numpy(), crashed)
+            put_masked(details, name, values if name == "kind" else values.numpy(force=True), crashed)
         put_masked(infos, "crash", details, crashed)
         return infos
 
@@ -301,7 +317,7 @@ class DrivingVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[Any]
             "x": torch.from_numpy(self._x.copy()),
             "tick": torch.from_numpy(self._tick.copy()),
             "ended": torch.from_numpy(self._ended.copy()),
-            "episode": [tensor.clone() for tensor in list_tensors(self._episode)],
+            "episode": [tensor.clone().cpu() for tensor in list_tensors(self._episode)],
             "generator": json.dumps(self.np_random.bit_generator.state),
         }
 
@@ -311,7 +327,7 @@ class DrivingVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[Any]
         Raises:
             ValueError: They are of another environment.
         """
-        tensors = iter(state["episode"])
+        tensors = (tensor.to(self.device) for tensor in state["episode"])
         self._episode = put_tensors(self._episode, tensors)
         if next(tensors, None) is not None or state["x"].shape != self._x.shape:
             raise ValueError("The episodes are of another environment.")
@@ -365,5 +381,5 @@ def _terms(terms: RewardTerms, mask: NDArray[np.bool_]) -> Info:
     """Return the terms of the reward in Gymnasium's vector form."""
     infos: Info = {}
     for name, value in terms._asdict().items():
-        put_masked(infos, name, value.double().numpy(), mask)
+        put_masked(infos, name, value.double().numpy(force=True), mask)
     return infos

@@ -7,6 +7,7 @@ from typing import Any, Protocol, TypeAlias, runtime_checkable
 import torch
 from torch import Tensor
 
+from rare_envs.devices import may_hold
 from rare_envs.measures.moment import Moment
 
 COLLISION = -1.0
@@ -205,7 +206,7 @@ class Measure:
             worth = state
         elif callable(self.collision):
             new = now & ~before
-            worth = torch.where(new, self.collision(moment), state) if bool(new.any()) else state
+            worth = torch.where(new, self.collision(moment), state) if may_hold(new) else state
         else:
             worth = self.collision
         return torch.where(now, worth, f)

@@ -7,6 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from rare_envs.devices import constant
 from rare_envs.measures.base import COLLISION, EpisodeMeasure, MeasureState
 from rare_envs.measures.moment import Moment
 from rare_envs.measures.registry import find_measure
@@ -136,7 +137,7 @@ class WeightedSum:
 
     def __call__(self, f: Tensor) -> Tensor:
         """Return the sum over the first axis: (K, B) to (B,)."""
-        return (f * f.new_tensor(self.weights)[:, None]).sum(0)
+        return (f * constant(tuple(self.weights), f)[:, None]).sum(0)
 
 
 def _least(f: Tensor) -> Tensor:

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple, Protocol, runtime_checkable
 import torch
 from torch import Tensor
 
+from rare_envs.devices import may_hold
 from rare_envs.measures.base import EpisodeMeasure, Measure, MeasureState, MeasureTerms
 from rare_envs.measures.moment import Moment
 from rare_envs.measures.registry import CLEARANCE, PAIR_CLEARANCE
@@ -104,12 +105,12 @@ class TermTracker:
         values, ticks = state.values.clone(), state.ticks.clone()
         values[:, part] = torch.where(lower, latest, old)
         ticks[:, part] = torch.where(lower, tick, ticks[:, part])
-        rows = (now & ~before).nonzero()[:, 0]
-        if len(rows) and self.order.collision is not None:
-            term = first + self._find_hit(moment, latest)[rows]
-            worth = self._worth(moment, latest)[rows]
-            values[rows] = torch.maximum(values[rows], worth[:, None])
-            values[rows, term], ticks[rows, term] = worth, tick
+        new = now & ~before
+        if self.order.collision is not None and may_hold(new):
+            term, worth = first + self._find_hit(moment, latest), self._worth(moment, latest)[:, None]
+            hit = new[:, None] & (torch.arange(values.shape[1], device=term.device) == term[:, None])
+            values = torch.where(new[:, None], torch.maximum(values, worth), values)
+            values, ticks = torch.where(hit, worth, values), torch.where(hit, tick, ticks)
         return TermState(own, values, ticks, tick, state.ticks_in_all)
 
     def f(self, state: TermState) -> Tensor:

@@ -3,11 +3,11 @@
 import torch
 from torch import Tensor
 
+from rare_envs.devices import are_zero
 from rare_envs.measures.moment import GAP_MIN, STILL, Moment, acceleration_of_lead, gap_of
 from rare_envs.sensors.lidar import beam_angles
 from rare_envs.sensors.perception import RANGE_COLUMNS, RATE_COLUMNS, find_vehicles_met
 from rare_envs.traffic.lead import lead_index
-from rare_envs.traffic.vehicle_models import are_zero
 
 TTC_MAX = 10.0
 """Cap of the time to collision [s]; what is further away, or not closing, counts as this."""

@@ -12,6 +12,7 @@ import math
 import torch
 from torch import Tensor
 
+from rare_envs.devices import constant
 from rare_envs.distributions.space import Parameter
 from rare_envs.scenarios.base import DATA, Others, Scenario, drive_points
 from rare_envs.traffic.road import i80
@@ -25,7 +26,7 @@ START_LANES = (2, 0, 1, 3, 4, 5)
 def initial(x: Tensor) -> State:
     """Place six vehicles; six columns each: s along the road, t off the lane [m], heading [deg], speed [m/s]."""
     s, t, heading, speed = x.view(len(x), 4, VEHICLE_COUNT).unbind(dim=1)
-    middle = x.new_tensor([i80().centre(lane) for lane in START_LANES])
+    middle = constant(tuple(i80().centre(lane) for lane in START_LANES), x)
     return State(s.T.contiguous().T, t + middle, heading * (math.pi / 180.0), speed.clone(), theta=x[:, :0])
 
 

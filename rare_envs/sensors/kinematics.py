@@ -14,6 +14,7 @@ import torch
 from gymnasium import spaces
 from torch import Tensor
 
+from rare_envs.devices import constant
 from rare_envs.traffic.road import Road
 from rare_envs.traffic.state import LANE_WIDTH, VEHICLE_LENGTH, State
 
@@ -73,5 +74,5 @@ def observe_kinematics(state: State, road: Road, vehicle: int = 0) -> Tensor:
 
     rows = torch.cat((own, others), dim=1)
     rows = torch.nn.functional.pad(rows, (0, 0, 0, KINEMATICS_ROWS - rows.shape[1]))
-    scales = rows.new_tensor((1.0, VIEW, LANE_WIDTH * road.lanes, 2 * MAX_SPEED, 2 * MAX_SPEED))
+    scales = constant((1.0, VIEW, LANE_WIDTH * road.lanes, 2 * MAX_SPEED, 2 * MAX_SPEED), rows)
     return (rows / scales).clamp(-1.0, 1.0).float()

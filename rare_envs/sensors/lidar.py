@@ -12,11 +12,13 @@ References:
 """
 
 import math
-from functools import lru_cache
+from functools import cache
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
+
+from rare_envs.devices import can_look
 
 BEAMS = 20
 BEAM_SPACING = 2.0 * math.pi / BEAMS
@@ -159,8 +161,10 @@ def _first_met(bodies: Bodies, m: int) -> tuple[Tensor, Tensor]:
     facing = torch.round((bearing - FIRST_BEAM_ANGLE) / BEAM_SPACING).to(torch.int64)
 
     relative = bodies.heading[:, :m, None] - bodies.heading[:, None, :]
-    keys = torch.full((batch * m * BEAMS,), _NOTHING, dtype=torch.int64, device=dx.device)
     untested = distance < MAX_RANGE + half_diagonal
+    if not can_look(dx):
+        return _read_keys(_test_all_beams(bodies, dx, dy, relative, untested))
+    keys = torch.full((batch * m * BEAMS,), _NOTHING, dtype=torch.int64, device=dx.device)
     for offsets, sine in _WINDOWS if batch * m * v > _FEW else _WINDOWS[-1:]:
         enough = untested & (half_diagonal < sine * distance) if sine else untested
         pair = enough.flatten().nonzero().squeeze(1)  # observer and body, as a number in (B, m, V)
@@ -183,7 +187,30 @@ def _first_met(bodies: Bodies, m: int) -> tuple[Tensor, Tensor]:
         key = torch.where(meets, _key(enters, vehicle[:, None]), _NOTHING)
         slot = observer[:, None] * BEAMS + beam
         keys.scatter_reduce_(0, slot.flatten(), key.flatten(), "amin")
-    keys = keys.view(batch, m, BEAMS)
+    return _read_keys(keys.view(batch, m, BEAMS))
+
+
+def _test_all_beams(bodies: Bodies, dx: Tensor, dy: Tensor, relative: Tensor, in_range: Tensor) -> Tensor:
+    """Return the least `_key` of each beam, (B, m, 20), testing all with all bodies: what a GPU does soonest.
+
+    Args:
+        bodies: V of them.
+        dx: Middles of the bodies less the observers' [m], shape (B, m, V) as the next three.
+        dy: Likewise.
+        relative: Headings of the observers less the bodies' [rad].
+        in_range: Whether a beam could meet the body.
+    """
+    beam = torch.arange(BEAMS, device=dx.device)
+    heading, length, width = (field[:, None, :, None] for field in (bodies.heading, bodies.length, bodies.width))
+    turn = relative[..., None] + (FIRST_BEAM_ANGLE + BEAM_SPACING * beam)
+    enters, leaves = _crossing(dx[..., None], dy[..., None], heading, turn, length, width)
+    meets = in_range[..., None] & (enters <= leaves) & (leaves > 0.0) & (enters < MAX_RANGE)
+    vehicle = torch.arange(dx.shape[2], device=dx.device)[:, None]
+    return torch.where(meets, _key(enters, vehicle), _NOTHING).amin(2)
+
+
+def _read_keys(keys: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the vehicles, -1 for none, and their distances [m] that keys stand for, shapes as theirs."""
     distance = (keys >> _VEHICLE_BITS).to(torch.int32).view(torch.float32)
     return torch.where(keys == _NOTHING, -1, keys & (2**_VEHICLE_BITS - 1)), distance
 
@@ -193,7 +220,7 @@ def _take(field: Tensor, numbers: Tensor) -> Tensor:
     return field.flatten().index_select(0, numbers)[:, None]
 
 
-@lru_cache(maxsize=32)
+@cache  # never forgotten: recorded rollouts read it where it is
 def _offsets(offsets: tuple[int, ...], device: torch.device) -> Tensor:
     return torch.tensor(offsets, device=device)
 

@@ -12,6 +12,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from rare_envs.devices import constant
 from rare_envs.sensors.lidar import AHEAD_BEAM, BEAM_SPACING, BEAMS, Bodies, find_met, sense
 from rare_envs.traffic.road import Road, WorldPose
 from rare_envs.traffic.state import VEHICLE_LENGTH, VEHICLE_WIDTH, State
@@ -124,4 +125,4 @@ def find_vehicles_met(state: State, road: Road) -> Tensor:
 
 def _bodies(state: State, x: Tensor, y: Tensor, heading: Tensor) -> Bodies:
     """Return the vehicles' bodies at their places in the flat world, (B, N) each."""
-    return Bodies(x, y, heading, state.speed, x.new_tensor(VEHICLE_LENGTH), x.new_tensor(VEHICLE_WIDTH))
+    return Bodies(x, y, heading, state.speed, constant(VEHICLE_LENGTH, x), constant(VEHICLE_WIDTH, x))

@@ -191,12 +191,6 @@ def noise_size(ticks: int, vehicles: int) -> int:
     return (FIRST_DRAWS + ticks) * vehicles * 2
 
 
-def fixed_draws(ticks: int, vehicles: int) -> Tensor:
-    """Return the one sequence of draws of `noise="fixed"`, shape (1, 2 + T, M, 2)."""
-    generator = torch.Generator().manual_seed(FIXED_SEED)
-    return torch.randn(1, FIRST_DRAWS + ticks, vehicles, 2, generator=generator, dtype=torch.float64)
-
-
 def find_drivers(drivers: Any) -> Background | TrafficBackground | None:
     """Return the drivers that a keyword argument `drivers` names.
 

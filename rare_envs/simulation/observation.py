@@ -1,7 +1,7 @@
 """Observations of an ego: `features`, its own state and the others' relative to it, `lidar`, `camera` and others."""
 
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -9,6 +9,7 @@ import torch
 from gymnasium import spaces
 from torch import Tensor
 
+from rare_envs.devices import constant
 from rare_envs.sensors.camera import Camera, take_picture
 from rare_envs.sensors.kinds import kinds_of
 from rare_envs.sensors.kinematics import kinematics_space, observe_kinematics
@@ -109,7 +110,7 @@ def observe(episode: "Episode", observation: str, vehicle: int = 0) -> Any:
         return observe_kinematics(episode.state, episode.road, vehicle)
     if observation == "lidar":
         assert episode.perception is not None
-        scales = episode.perception.new_tensor(LIDAR_SCALES)
+        scales = constant(tuple(LIDAR_SCALES), episode.perception)
         return (episode.perception[:, vehicle] / scales).clamp(-CLIP, CLIP).float()
     if observation == "speed":
         return (episode.state.speed[:, vehicle, None] / EGO_FEATURES[0].scale).clamp(-CLIP, CLIP).float()
@@ -138,7 +139,7 @@ def observe_features(state: State) -> Tensor:
     return (torch.stack(values, dim=1) / scales).clamp(-CLIP, CLIP).float()
 
 
-@lru_cache(maxsize=32)
+@cache  # never forgotten: recorded rollouts read it where it is
 def _scales(vehicles: int, dtype: torch.dtype, device: torch.device) -> Tensor:
     """Return the scales of the entries of `features`, shape (3 + 4 (N - 1),)."""
     features = EGO_FEATURES + OTHER_FEATURES * (vehicles - 1)

@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from rare_envs.control.actions import MAX_ACCELERATION, MAX_STEERING
+from rare_envs.devices import constant
 from rare_envs.simulation.episode import Episode
 
 TARGET_SPEED = 21.72
@@ -78,7 +79,7 @@ def reward_terms(episode: Episode, action: Tensor) -> RewardTerms:
     width = episode.road.width
     offset = state.y[:, 0] - episode.road.centre_of(state.y[:, 0])
     offset = offset - torch.round(offset / width) * width  # off the road, as if lanes went on
-    effort = action / action.new_tensor([MAX_ACCELERATION, MAX_STEERING])
+    effort = action / constant((MAX_ACCELERATION, MAX_STEERING), action)
     gap = lead.gap.clamp(min=0.0)
     ttc = gap / lead.closing_speed.clamp(min=LEAST_CLOSING)
     return RewardTerms(

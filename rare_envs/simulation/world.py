@@ -12,15 +12,17 @@ from torch import Tensor
 
 from rare_envs.control.actions import space_of_actions
 from rare_envs.control.meta_actions import follow_meta_actions, initial_aim
+from rare_envs.devices import fixed_draws
 from rare_envs.measures import Moment
 from rare_envs.scenarios.base import Scenario
 from rare_envs.sensors.camera import CameraContext
 from rare_envs.sensors.perception import perceive_traffic
 from rare_envs.simulation.background import (
+    FIRST_DRAWS,
+    FIXED_SEED,
     Background,
     BackgroundState,
     TrafficBackground,
-    fixed_draws,
     needs_lidar,
     noise_size,
     query_background,
@@ -119,10 +121,6 @@ class World:
     @property
     def _noisy(self) -> bool:
         return self.background is not None and self.background.noisy and self.noise is not False
-
-    @cached_property
-    def _fixed_draws(self) -> Tensor:
-        return fixed_draws(self.clock.ticks, self._others)
 
     @property
     def observation_space(self) -> spaces.Space[Any]:
@@ -299,7 +297,9 @@ class World:
     def _draws(self, noise: Tensor) -> Tensor:
         """Return draws of the drivers' noise as a tensor of shape (B, 2 + T, M, 2), or (B, 0, M, 2) without noise."""
         if self._noisy and self.noise == "fixed":
-            return self._fixed_draws.to(noise).expand(len(noise), -1, -1, -1)
+            return fixed_draws((1, FIRST_DRAWS + self.clock.ticks, self._others, 2), FIXED_SEED, noise).expand(
+                len(noise), -1, -1, -1
+            )
         ticks = noise.shape[1] // (2 * self._others) if self._noisy else 0
         return noise.reshape(len(noise), ticks, self._others, 2)
 

@@ -241,7 +241,7 @@ def resume(
     """  # noqa: E501 (the example shows a whole message)
     journal, question = continue_journal(folder, mend)
     with closing(journal):
-        question = replace(open_question(asdict(question), folder, trust), core=question.core)
+        question = replace(open_question(asdict(question), folder, trust), core=question.core, device=question.device)
         if ego is not None and {find_ego_kind(ego), find_ego_kind(question.ego)} != {"remote"}:
             raise BadInput(f"Expected --ego for one whose address has changed only; the run has {question.ego!r}.")
         question = replace(question, ego=ego or question.ego, on_error=on_error or question.on_error)

@@ -68,6 +68,7 @@ class Question:
             number, unlike that of workers, belongs to the question; with workers it is `DrivingProblem.chunk_size`.
         core: What simulates, as in `DrivingProblem`: "torch", "numba" or "auto". A
             run goes on with what it began with.
+        device: Where torch simulates, as in `DrivingProblem`: "cpu", or a GPU, such as "cuda".
         sensitivity: Whether the report says what p is sensitive to; that takes no simulations.
         max_p: Limit that p is compared with, or None. The intervals of the answer have then ends at the one-sided
             `gate_confidence`, a coverage of twice that less 1.
@@ -110,6 +111,7 @@ class Question:
     given_base: bool = False
     chunk: int | None = None
     core: str = "auto"
+    device: str = "cpu"
 
     def __post_init__(self) -> None:
         """Take an id with HighwayEnv's layout as that of the scenario, with the observation and actions it means."""
@@ -329,6 +331,7 @@ def build_problem(question: Question, ego: Any) -> DrivingProblem:
             weather=question.weather,
             action=question.action,
             core=question.core,
+            device=question.device,
         )
 
 
@@ -354,7 +357,7 @@ def _answers_vary(problem: DrivingProblem) -> bool:
     Raises:
         BadInput: It raised, or its actions are not actions.
     """
-    x = torch.from_numpy(problem.space.sample(2, np.random.default_rng(0))).float()
+    x = torch.from_numpy(problem.space.sample(2, np.random.default_rng(0))).float().to(problem.device)
     try:
         first, again = (list(itertools.islice(drive(problem.world, problem.driver, x), 2))[1] for _ in range(2))
     except (Exception, SystemExit, EgoGone) as error:  # the ego is the user's: anything may happen in it

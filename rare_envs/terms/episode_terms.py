@@ -65,7 +65,7 @@ def simulate_terms(world: World, gamma: float, simulate: Callable[[World], Itera
         values.append(end.f[:, None] if tracker is None else end.measure_state.values)
         ticks.append(torch.full((len(end.f), 1), world.clock.ticks) if tracker is None else end.measure_state.ticks)
     names = ("f",) if tracker is None else tracker.names(world.scenario.vehicle_names)
-    return EpisodeTerms(_join(f), _join(values), torch.cat(ticks).numpy(), threshold, names)
+    return EpisodeTerms(_join(f), _join(values), torch.cat(ticks).numpy(force=True), threshold, names)
 
 
 def name_terms(
@@ -88,4 +88,4 @@ def name_terms(
 
 
 def _join(parts: list[Tensor]) -> FloatArray:
-    return torch.cat(parts).double().numpy()
+    return torch.cat(parts).double().numpy(force=True)

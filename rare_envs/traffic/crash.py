@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from rare_envs.devices import indices
 from rare_envs.traffic.oriented_boxes import axes_of, boxes_overlap, crossing, project_on_axes
 from rare_envs.traffic.pairs import pairs, velocities
 from rare_envs.traffic.road import Road
@@ -128,9 +129,9 @@ def crash_of_others(state: State, road: Road, before: State | None = None, dt: f
 
 def _pair_crash(state: State, road: Road, before: State | None, dt: float, which: slice) -> Crash:
     """Return the first contact among some pairs of vehicles."""
-    first, second = (list(index[which]) for index in pairs(state.x.shape[1]))
+    first, second = (indices(index[which], state.x) for index in pairs(state.x.shape[1]))
     nothing = Crash.nothing(state.x[:, 0])
-    if not first:
+    if not len(first):
         return nothing
     x, y, heading = road.to_world(state.x, state.y, state.heading)
     along, across = _velocities(state, road, heading, before, dt)
@@ -155,7 +156,7 @@ def _pair_crash(state: State, road: Road, before: State | None, dt: float, which
 
     towards = torch.sign(on_axis(axes.offset))  # the normal points from the first to the second
     closing = (-on_axis(rate) * towards).clamp(min=0.0)
-    index_one, index_two = (torch.tensor(each, device=x.device).expand_as(at) for each in (first, second))
+    index_one, index_two = (each.expand_as(at) for each in (first, second))
     couple = torch.stack((of(index_one), of(index_two)), -1)
     kind = _kind(of(axis), of(other - one), of(axes.offset[..., 0]))
     own, its = (_approach(state, before, dt, kind == SIDE, each) for each in (couple, couple.flip(-1)))
@@ -203,7 +204,7 @@ def _edge_crash(state: State, before: State | None, dt: float) -> Crash:
         across = (state.y[:, 0] - before.y[:, 0]) / dt
     change = torch.stack(((1.0 + RESTITUTION) * across.abs(), torch.zeros_like(across)), -1)
     risk = torch.stack((injury_risk(change[:, 0]), torch.zeros_like(across)), -1)
-    edge = crash.vehicles + torch.tensor([1, 0], device=across.device)
+    edge = crash.vehicles + indices((1, 0), across)
     return Crash(torch.full_like(crash.kind, ROAD_EDGE), edge, state.speed[:, 0], across.abs(), change, risk)
 
 

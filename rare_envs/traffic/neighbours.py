@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from functools import lru_cache
+from functools import cache
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
+from rare_envs.devices import constant
 from rare_envs.traffic.road import Road
 from rare_envs.traffic.state import VEHICLE_LENGTH, VEHICLE_WIDTH, State
 
@@ -45,7 +46,7 @@ class LaneTraffic(NamedTuple):
     @classmethod
     def of(cls, state: State, road: Road) -> LaneTraffic:
         """Return the traffic of a world, whose vehicles are all of one size."""
-        long, wide = state.x.new_tensor((VEHICLE_LENGTH, VEHICLE_WIDTH)).unbind()
+        long, wide = constant((VEHICLE_LENGTH, VEHICLE_WIDTH), state.x).unbind()
         edges = _edges(road, state.y.dtype, state.y.device).expand(len(state.x), -1)
         sizes = long.expand_as(state.x), wide.expand_as(state.x)
         return cls(state.x, state.y, state.heading, state.speed, *sizes, edges)
@@ -113,7 +114,7 @@ def nearest(distance: Tensor, among: Tensor) -> Tensor:
     return torch.where(least < torch.inf, index, -1)
 
 
-@lru_cache(maxsize=32)
+@cache  # never forgotten: recorded rollouts read it where it is
 def _edges(road: Road, dtype: torch.dtype, device: torch.device) -> Tensor:
     with torch.inference_mode(False):  # a tensor made under it could not be used for gradients later
         return torch.tensor([road.edges], dtype=dtype, device=device)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from rare_envs.devices import can_look, indices
 from rare_envs.traffic.oriented_boxes import DIAGONAL, boxes_overlap
 from rare_envs.traffic.pairs import pairs
 from rare_envs.traffic.road import Road, WorldPose
@@ -34,7 +35,7 @@ def ego_overlaps(state: State, road: Road, pose: WorldPose | None = None) -> Ten
 def others_overlap(state: State, road: Road, pose: WorldPose | None = None) -> Tensor:
     """Return whether two vehicles other than the ego overlap, boolean, shape (B,); arguments as of `ego_overlaps`."""
     n = state.x.shape[1] - 1
-    first, second = (list(index[n:]) for index in pairs(n + 1))
+    first, second = (indices(index[n:], state.x) for index in pairs(n + 1))
     overlapping: Tensor = _overlap_of(_in_world(state, road, pose), first, second).any(1)
     return overlapping
 
@@ -51,7 +52,7 @@ def pairwise_overlaps(state: State, road: Road, pose: WorldPose | None = None) -
         Boolean, shape (B, N, N), symmetric, nobody with itself; row 0 is `ego_overlaps`.
     """
     batch, n = state.x.shape
-    first, second = map(list, pairs(n))
+    first, second = (indices(index, state.x) for index in pairs(n))
     overlapping = _overlap_of(_in_world(state, road, pose), first, second)
     both = torch.zeros(batch, n, n, dtype=torch.bool, device=state.x.device)
     both[:, first, second] = overlapping
@@ -63,7 +64,7 @@ def _in_world(state: State, road: Road, pose: WorldPose | None) -> tuple[Tensor,
     return road.to_world(state.x, state.y, state.heading) if pose is None else pose[:3]
 
 
-def _overlap_of(place: tuple[Tensor, Tensor, Tensor], first: list[int], second: list[int]) -> Tensor:
+def _overlap_of(place: tuple[Tensor, Tensor, Tensor], first: Tensor, second: Tensor) -> Tensor:
     """Return which of P pairs of vehicles overlap, boolean, shape (B, P)."""
     x, y, heading = place
     dx, dy = x[:, second] - x[:, first], y[:, second] - y[:, first]
@@ -73,6 +74,8 @@ def _overlap_of(place: tuple[Tensor, Tensor, Tensor], first: list[int], second: 
 def _overlap_where_near(dx: Tensor, dy: Tensor, heading: Tensor, other_heading: Tensor) -> Tensor:
     """Return `boxes_overlap` of pairs (B, P), compared only where centres are near."""
     near: Tensor = (dx.abs() < DIAGONAL) & (dy.abs() < DIAGONAL)
+    if not can_look(near):
+        return near & boxes_overlap(dx, dy, heading, other_heading)
     if bool(near.any()):
         at = near.nonzero(as_tuple=True)
         near[at] = boxes_overlap(dx[at], dy[at], heading[at], other_heading[at])

@@ -6,6 +6,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from rare_envs.devices import indices
 from rare_envs.traffic.oriented_boxes import Axes, axes_of, project_on_axes
 from rare_envs.traffic.road import Road
 from rare_envs.traffic.state import State
@@ -49,11 +50,11 @@ def encounter(state: State, road: Road) -> Encounter:
 
 def encounters_of_all(state: State, road: Road) -> Encounter:
     """Return every pair of vehicles, P = N (N - 1) / 2, in the order of `pairs`."""
-    first, second = map(list, pairs(state.x.shape[1]))
+    first, second = (indices(index, state.x) for index in pairs(state.x.shape[1]))
     return _compare(state, road, first, second)
 
 
-def _compare(state: State, road: Road, first: list[int] | slice, second: list[int] | slice) -> Encounter:
+def _compare(state: State, road: Road, first: Tensor | slice, second: Tensor | slice) -> Encounter:
     """Return vehicles with others, by their indices; one may be compared with several."""
     x, y, heading = road.to_world(state.x, state.y, state.heading)
     along, across = velocities(state, heading)

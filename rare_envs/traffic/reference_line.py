@@ -2,7 +2,7 @@
 
 import math
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
@@ -176,7 +176,7 @@ def _nodes(curve: ReferenceLine) -> tuple[float, NDArray[np.float64], NDArray[np
     return step, curvature, heading
 
 
-@lru_cache(maxsize=32)
+@cache  # never forgotten: recorded rollouts read it where it is
 def _table(curve: ReferenceLine, dtype: torch.dtype, device: torch.device) -> tuple[Tensor, float]:
     """Return coefficients, shape (cells, 11), and the length of a cell [m].
 

@@ -7,7 +7,7 @@ it. In a straight road they are world coordinates too.
 import json
 import math
 from dataclasses import dataclass
-from functools import cache, cached_property, lru_cache
+from functools import cache, cached_property
 from importlib import resources
 from itertools import pairwise
 from typing import NamedTuple
@@ -162,7 +162,7 @@ class Road:
         return s, across, heading - point.heading
 
 
-@lru_cache(maxsize=32)
+@cache  # never forgotten: recorded rollouts read it where it is
 def _lane_table(road: Road, dtype: torch.dtype, device: torch.device) -> tuple[Tensor, Tensor, Tensor]:
     """Return the lines between lanes, and the left and the right line of each lane."""
     with torch.inference_mode(False):  # tables made under it could not be used for gradients later

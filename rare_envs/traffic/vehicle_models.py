@@ -9,6 +9,7 @@ import math
 import torch
 from torch import Tensor
 
+from rare_envs.devices import are_zero
 from rare_envs.traffic.state import VEHICLE_LENGTH
 
 STEERING_LIMIT = math.pi / 3
@@ -69,16 +70,6 @@ def bicycle(
     if curvature is not None:
         ahead, turn = _along_curve(ahead, turn, y, curvature)
     return x + ahead, y + distance * torch.sin(course), heading + turn, after
-
-
-def are_zero(*values: Tensor) -> bool:
-    """Return whether all of these are 0, where that is soon known and nothing is differentiated with respect to them.
-
-    Cars that go straight on in the middle of a lane then need no trigonometry; the result is the same.
-    """
-    if torch.is_grad_enabled() or values[0].device.type != "cpu":  # elsewhere to look at a value is to wait for it
-        return False
-    return not any(bool(value.any()) for value in values)
 
 
 def steering_for(yaw_rate: Tensor, speed: Tensor) -> Tensor:

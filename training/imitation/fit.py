@@ -20,6 +20,7 @@ from training.imitation.algorithms.mgail import update_mgail
 from training.imitation.progress import progress_bar, tensorboard_logs
 from training.imitation.traffic.recording import Recording, stack_scenes
 
+CPU = torch.device("cpu")
 UPDATE_RULES: dict[str, Update] = {"gail": update_gail, "mgail": update_mgail}
 """Update of each adversarial method."""
 CHECKPOINT_INTERVAL = 50
@@ -70,13 +71,14 @@ def prepare_data(scenes: Sequence[TrafficScene], test: Sequence[TrafficScene] = 
     return Data(recording, pairs, stack_scenes(test) if test else None)
 
 
-def make_learner(data: Data, config: Config, among: torch.Tensor | None = None) -> Learner:
+def make_learner(data: Data, config: Config, among: torch.Tensor | None = None, device: torch.device = CPU) -> Learner:
     """Return a training before its first update: a cloned policy and a new critic.
 
     Args:
         data: Recorded traffic.
         config: Settings.
         among: Scenes that are driven, with repetition, shape (k,); None for all that have pairs.
+        device: Where it is trained.
 
     Example:
         >>> from training.data import scenes_of, synthetic_traffic
@@ -86,10 +88,12 @@ def make_learner(data: Data, config: Config, among: torch.Tensor | None = None) 
         0
     """
     generator = torch.Generator().manual_seed(config.seed)
-    policy = clone_policy(data.pairs, config, generator)
-    critic = make_seeded(Critic, generator)
-    among = torch.unique(data.pairs.scene) if among is None else among
-    return Learner(config, data.recording, among, data.pairs, policy, critic, generator)
+    recording = Recording(*(field.to(device) for field in data.recording))
+    pairs = Pairs(*(field.to(device) for field in data.pairs))
+    policy = clone_policy(pairs, config, generator)
+    critic = make_seeded(Critic, generator).to(device)
+    among = torch.unique(pairs.scene) if among is None else among.to(device)
+    return Learner(config, recording, among, pairs, policy, critic, generator)
 
 
 def train_learner(

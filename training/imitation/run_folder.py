@@ -15,6 +15,7 @@ from typing import Any
 from agents import LearnedDriver, Provenance, save_driver
 from agents.learned.coloured_noise import WHITE_NOISE, AutoregressiveNoise
 from agents.learned.networks import Policy
+from rare_envs.devices import find_device
 from rare_envs.files import replace_text
 from training.imitation.algorithms.actions import ACTION_HIGH, ACTION_LOW
 from training.imitation.algorithms.config import HUMAN_NOISE, Config
@@ -30,7 +31,14 @@ NOISES = {"human": HUMAN_NOISE, "white": WHITE_NOISE}
 
 
 def train_driver(
-    source: Source, config: Config, out: Path, *, log: bool = False, progress: bool = False, measured: bool = True
+    source: Source,
+    config: Config,
+    out: Path,
+    *,
+    log: bool = False,
+    progress: bool = False,
+    measured: bool = True,
+    device: str = "cpu",
 ) -> Path:
     """Train a driver from files, from the first update or from where a training in the folder was stopped.
 
@@ -41,6 +49,8 @@ def train_driver(
         log: Write TensorBoard logs to it.
         progress: Show a bar on standard error.
         measured: Measure the driver in the scenes kept for tests, for the header of its file.
+        device: Where it is trained: "cpu", or a GPU, such as "cuda". Weights differ by rounding that grows with the
+            updates; what is drawn is the same.
 
     Returns:
         The file of the driver.
@@ -56,12 +66,13 @@ def train_driver(
     """
     if log:
         summary_writer()
+    place = find_device(device)
     settings = format_settings(source, config)
     check_folder(out, settings)
     data = prepare_data(*load_scenes(source))
     write_settings(out, settings)
-    policy = train_learner(make_learner(data, config), out, log, progress)
-    driver = driver_of(policy, config)
+    policy = train_learner(make_learner(data, config, device=place), out, log, progress)
+    driver = driver_of(policy.cpu(), config)
     provenance = Provenance(
         kind=config.method,
         command=command_of(source, config),

@@ -112,7 +112,7 @@ class ConfigOptions(DriverTrainingOptions):
             ValueError: A setting is outside its range.
         """
         # fields by name
-        values = {each.name: getattr(self, each.name) for each in fields(self) if each.name != "noise"}
+        values = {each.name: getattr(self, each.name) for each in fields(self) if each.name not in ("noise", "device")}
         return Config(**{**values, "method": self.method.value, "colour": NOISES[self.noise.value]})
 
 
@@ -126,7 +126,7 @@ def main(
 ) -> None:
     """Train a driver from recorded traffic. training/imitation/algorithms/config.py says what the settings mean."""
     with report_errors("train"):
-        path = train_driver(recordings.source(), options.config(), out, log=log, progress=True)
+        path = train_driver(recordings.source(), options.config(), out, log=log, progress=True, device=options.device)
     print(f"Saved {path}. Next: agents.load_driver({str(path)!r})")
 
 

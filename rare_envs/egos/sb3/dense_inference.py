@@ -48,18 +48,38 @@ class DenseInference:
         deterministic: bool = True,
     ) -> tuple[NDArray[Any], Any]:
         """Return mean actions for observations (B, F), clipped; where they are not finite, what `policy` does then."""
-        between = _ACTIVATIONS[self.activation]
         with torch.no_grad():
-            values = torch.from_numpy(np.ascontiguousarray(observation)).float()  # torch takes no negative strides
-            for weights, biases in self.layers[:-1]:
-                values = between(linear(values, weights, biases))
-            actions = linear(values, *self.layers[-1])
+            rows = np.ascontiguousarray(observation)  # torch takes no negative strides
+            actions = self._apply(torch.from_numpy(rows))
         if not np.isfinite(actions.numpy()).all():
             answer: tuple[NDArray[Any], Any] = self.policy.predict(
                 observation, state=state, episode_start=episode_start, deterministic=deterministic
             )
             return answer
         return actions.clamp(self.low, self.high).numpy(), state
+
+    def decide(self, observation: Tensor) -> Tensor:
+        """Return mean actions (B, 2) for observations (B, F), clipped, NaN where they are; all on its device."""
+        return self._apply(observation).clamp(self.low, self.high)
+
+    def to(self, device: torch.device) -> DenseInference:
+        """Return it with its weights on a device."""
+        layers: _Layers = tuple((weights.to(device), biases.to(device)) for weights, biases in self.layers)
+        return replace(self, layers=layers, low=self.low.to(device), high=self.high.to(device))
+
+    def equals(self, other: Any) -> bool:
+        """Return whether another has the same numbers on the same device."""
+        if not isinstance(other, DenseInference) or other.activation != self.activation:
+            return False
+        mine, its = ((*sum(each.layers, ()), each.low, each.high) for each in (self, other))
+        return len(mine) == len(its) and all(torch.equal(one, two) for one, two in zip(mine, its, strict=True))
+
+    def _apply(self, observation: Tensor) -> Tensor:
+        """Return the outputs of the last layer."""
+        between, values = _ACTIVATIONS[self.activation], observation.float()
+        for weights, biases in self.layers[:-1]:
+            values = between(linear(values, weights, biases))
+        return linear(values, *self.layers[-1])
 
 
 def find_inference(policy: Any) -> Any:

@@ -15,7 +15,7 @@ from rare_envs.study.question import Question, read_question
 
 MAX_TEXT = 2**16
 """Letters of a name or formula in a question."""
-_CHANGEABLE = ("trust", "on_error", "core")
+_CHANGEABLE = ("trust", "on_error", "core", "device")
 """Fields that a resumed run may change, or that follow from what is installed."""
 _ADDRESS = "ego"
 """Changes too where the ego is in another program."""
@@ -24,7 +24,7 @@ _ADDRESS = "ego"
 def open_question(recorded: object, folder: Path, trust: bool) -> Question:
     """Return the question of a folder, if its values are of the right types and what code it names may run.
 
-    What simulates it (`core`) is chosen anew, and files that have moved with the folder are found.
+    What simulates it (`core`) is chosen anew, on the CPU, and files that have moved with the folder are found.
 
     Args:
         recorded: Of the file.
@@ -38,7 +38,7 @@ def open_question(recorded: object, folder: Path, trust: bool) -> Question:
         >>> open_question({"env_id": "rare_envs/CutIn-v0", "gamma": 2.0}, Path("run"), trust=False).gamma
         2.0
     """
-    question = replace(read_question(recorded), trust=trust, core="auto")
+    question = replace(read_question(recorded), trust=trust, core="auto", device="cpu")
     if any(isinstance(value, str) and len(value) > MAX_TEXT for value in asdict(question).values()):
         raise BadInput(f"The question of the run in {str(folder)!r} has a name of more than {MAX_TEXT} letters.")
     with as_bad_input(ValueError):

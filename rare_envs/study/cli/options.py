@@ -250,6 +250,12 @@ class EstimateOptions(QuestionOptions):
             autocompletion=complete_words("torch", "numba", "auto"),
         ),
     ] = "auto"
+    device: Annotated[
+        str,
+        typer.Option(
+            help="Where torch simulates: cpu, or a GPU (cuda, cuda:1).", autocompletion=complete_words("cpu", "cuda")
+        ),
+    ] = "cpu"
     sensitivity: Annotated[
         bool,
         typer.Option("--sensitivity", help="Show what p is sensitive to: parameters of traffic and of its model."),

@@ -74,7 +74,8 @@ def describe_time(report: Report) -> str:
     """Return the wall time, how much of it was before an interruption, and what made the rollouts."""
     text = f"{report.seconds:.1f} s"
     earlier = f" ({report.earlier_seconds:.0f} s before it was resumed)" if report.earlier_seconds else ""
-    return f"{text}{earlier} by {report.study.question.core}"
+    question = report.study.question
+    return f"{text}{earlier} by {question.core}{'' if question.device == 'cpu' else f' on {question.device}'}"
 
 
 def summarise_crash(crash: dict[str, Any], labels: tuple[str, ...]) -> str:

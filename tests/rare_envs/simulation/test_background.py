@@ -6,11 +6,12 @@ import torch
 import agents
 from agents.names import LANE_CHANGING, RULE_BASED, SHIPPED_DRIVERS
 from rare_envs.control.lane_changing import LaneChangingDriver
+from rare_envs.devices import fixed_draws
 from rare_envs.simulation.background import (
     FIRST_DRAWS,
+    FIXED_SEED,
     BackgroundState,
     find_drivers,
-    fixed_draws,
     noise_size,
     step_background,
 )
@@ -19,8 +20,8 @@ from rare_envs.simulation.background import (
 def test_fixed_noise_is_one_sequence_and_no_noise_is_none():
     drivers = agents.load_driver("mgail")
     features = torch.randn(3, 5, 51)
-    draws = fixed_draws(7, 5)
-    torch.testing.assert_close(draws, fixed_draws(7, 5))
+    draws = fixed_draws((1, 2 + 7, 5, 2), FIXED_SEED, torch.zeros(1, dtype=torch.float64))
+    torch.testing.assert_close(draws, fixed_draws((1, 2 + 7, 5, 2), FIXED_SEED, torch.zeros(1, dtype=torch.float64)))
     quiet = BackgroundState.start(drivers, torch.zeros(3, 0), torch.zeros(3, 0, 5, 2))
     torch.testing.assert_close(step_background(drivers, quiet, features)[0], drivers.act(features)[0])
     noisy = BackgroundState.start(drivers, torch.zeros(3, 0), draws.expand(3, -1, -1, -1).float())
@@ -46,7 +47,7 @@ def test_rows_of_a_batch_may_be_at_different_ticks():
 
 
 def test_draws_are_two_for_each_vehicle_and_tick_and_four_for_the_start():
-    assert noise_size(100, 5) == (2 + 100) * 5 * 2 == fixed_draws(100, 5).numel()
+    assert noise_size(100, 5) == (2 + 100) * 5 * 2 == fixed_draws((1, 2 + 100, 5, 2), 1, torch.zeros(1)).numel()
     assert FIRST_DRAWS == 2
 
 

@@ -8,7 +8,7 @@ import torch
 from highway_env.utils import not_zero
 from torch import Tensor
 
-from rare_envs.traffic.vehicle_models import NEAR_ZERO, STEERING_LIMIT, are_zero, bicycle, point_mass, steering_for
+from rare_envs.traffic.vehicle_models import NEAR_ZERO, STEERING_LIMIT, bicycle, point_mass, steering_for
 from tests.rare_envs.traffic_states import F64, tensor
 
 
@@ -49,14 +49,6 @@ def test_straight_on_is_the_same_bits_beside_vehicles_that_turn_and_alone() -> N
     for one, other in zip(alone, beside, strict=True):
         assert torch.equal(one[:-1], other[:-1])
     assert alone[2][-1] != beside[2][-1]
-
-
-def test_zeros_are_looked_for_only_where_nothing_is_differentiated() -> None:
-    zero = torch.zeros(3)
-    assert not are_zero(zero)
-    with torch.no_grad():
-        assert are_zero(zero, -zero)
-        assert not are_zero(zero, torch.tensor([0.0, torch.nan]))
 
 
 def test_bicycle_gradient() -> None:

@@ -20,7 +20,7 @@ def clone_policy(pairs: Pairs, config: Config, generator: torch.Generator) -> Po
             `lateral_weight` are used.
         generator: Source of the initial weights and of the order of the pairs.
     """
-    policy = make_seeded(lambda: Policy(scaling_of(pairs), config.log_std_cap), generator)
+    policy = make_seeded(lambda: Policy(scaling_of(pairs), config.log_std_cap), generator).to(pairs.features.device)
     for _ in clone_epochs(policy, pairs, config, generator):
         pass
     return policy

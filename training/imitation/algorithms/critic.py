@@ -46,7 +46,7 @@ def critic_loss(critic: Critic, recorded: Tensor, made: Tensor, penalty: float, 
     The penalty is on the mean squared norm itself, not on its distance to 1 as in WGAN-GP: with a logistic loss
     nothing favours a slope of 1.
     """
-    share = torch.rand(len(recorded), 1, generator=generator)
+    share = torch.rand(len(recorded), 1, generator=generator).to(recorded.device)
     between = (share * recorded + (1.0 - share) * made).requires_grad_(True)
     (slope,) = torch.autograd.grad(critic(between).sum(), between, create_graph=True)
     told = nn.functional.softplus(-critic(recorded)).mean() + nn.functional.softplus(critic(made)).mean()

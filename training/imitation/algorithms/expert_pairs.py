@@ -5,7 +5,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from agents.learned.networks import FEATURE_SIZE, Scaling
+from agents.learned.networks import Scaling
 from rare_envs.sensors.perception import HEADING_COLUMN, SPEED_COLUMN
 from training.imitation.traffic.recording import Recording
 from training.imitation.traffic.replayed_traffic import replay_features, start_replay
@@ -55,7 +55,7 @@ def emphasise_lateral(pairs: Pairs, times: int) -> Pairs:
     if times == 1:
         return pairs
     fast = (torch.sin(pairs.features[:, HEADING_COLUMN]) * pairs.features[:, SPEED_COLUMN]).abs() > FAST_LATERAL_SPEED
-    rows = torch.cat((torch.arange(len(fast)), fast.nonzero().flatten().repeat(times - 1)))
+    rows = torch.cat((torch.arange(len(fast), device=fast.device), fast.nonzero().flatten().repeat(times - 1)))
     return Pairs(*(column[rows] for column in pairs))
 
 
@@ -68,5 +68,5 @@ def scaling_of(pairs: Pairs) -> Scaling:
     if len(pairs.features) < 2:
         raise ValueError(f"Expected two or more recorded pairs, got {len(pairs.features)}; are there any followers?")
     std = pairs.features.std(dim=0)
-    std = torch.where(std > 1e-6, std, torch.ones(FEATURE_SIZE))
+    std = torch.where(std > 1e-6, std, torch.ones_like(std))
     return Scaling(pairs.features.mean(dim=0), std, pairs.action.mean(dim=0), pairs.action.std(dim=0).clamp(min=1e-6))

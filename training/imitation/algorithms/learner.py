@@ -56,12 +56,12 @@ class Learner:
         config = self.config
         self.policy_optimiser = torch.optim.Adam(self.policy.parameters(), config.policy_rate, betas=POLICY_BETAS)
         self.critic_optimiser = torch.optim.Adam(self.critic.parameters(), config.critic_rate, betas=CRITIC_BETAS)
-        self.value = make_seeded(_make_value_network, self.generator)
+        self.value = make_seeded(_make_value_network, self.generator).to(self.device)
         self.value_optimiser = torch.optim.Adam(self.value.parameters(), config.value_rate)
         self.learned: tuple[str, ...] = _TRAINED_PARTS
         self.model: ForwardModel | None = None
         if config.learned_model:
-            self.model = make_seeded(ForwardModel, self.generator)
+            self.model = make_seeded(ForwardModel, self.generator).to(self.device)
             self.model_optimiser = torch.optim.Adam(self.model.parameters(), config.model_rate)
             self.learned += ("model", "model_optimiser")
         self.pools: list[ScenePool] = []
@@ -71,6 +71,11 @@ class Learner:
         )
         followed = emphasise_lateral(self.pairs, config.lateral_weight)
         self.clone_pairs = followed.features, normalise_action(self.policy, followed.action)
+
+    @property
+    def device(self) -> torch.device:
+        """Where traffic and networks are; numbers are drawn on the CPU, so that they are the same everywhere."""
+        return self.recording.x.device
 
     def linear_schedule(self, ends: tuple[int, int]) -> int:
         """Return the value at this update of a linear schedule of whole numbers."""
@@ -174,7 +179,7 @@ class Learner:
         """
         state = self.inherit(path)
         self.update, self.simulated = state["update"], state["simulated"]
-        self.generator.set_state(state["generator"])
+        self.generator.set_state(state["generator"].cpu())
         self.rollouts.extend(state["rollouts"])
         self.pools = [ScenePool(Traffic(**pool["traffic"]), pool["noise"], pool["age"]) for pool in state["pools"]]
 
@@ -187,7 +192,7 @@ class Learner:
         Raises:
             ValueError: The file is no checkpoint of such a training.
         """
-        state: dict[str, Any] = torch.load(path, weights_only=True)
+        state: dict[str, Any] = torch.load(path, map_location=self.device, weights_only=True)
         if not state.keys() >= {"update", "pools", *self.learned}:
             raise ValueError(f"Expected a checkpoint of a training in {str(path)!r}.")
         for name in self.learned:

@@ -66,7 +66,7 @@ def roll_out(
             features = model.substitute_gradient(policy, before, action, features, credit)
         mean, log_std = policy(features)
         expected = colour.predict_mean(memory)
-        noise, memory = colour.step(memory, torch.randn(expected.shape, generator=generator))
+        noise, memory = colour.step(memory, torch.randn(expected.shape, generator=generator).to(expected.device))
         action = mean + torch.exp(log_std) * noise
         moved = torch.cat((denormalise_action(policy, action), unused), dim=1)
         cost = _penalties(traffic, features if model is None else features.detach(), moved[:, :m], m)

@@ -100,4 +100,5 @@ def stack_scenes(scenes: Sequence[TrafficScene]) -> Recording:
 
 def parking_positions(like: Tensor) -> Tensor:
     """Return x of vehicles that do not exist [m], of the shape of the given tensor, (..., V)."""
-    return (PARKING_X - _PARKING_GAP * torch.arange(like.shape[-1], dtype=like.dtype)).expand_as(like)
+    number = torch.arange(like.shape[-1], dtype=like.dtype, device=like.device)
+    return (PARKING_X - _PARKING_GAP * number).expand_as(like)

@@ -66,7 +66,7 @@ def start_replay(
         rank = torch.where(driven, x, torch.inf).argsort(dim=1).argsort(dim=1)
         driven = driven & (rank < most)
     if only is not None:
-        driven = driven & (torch.arange(driven.shape[1]) == only[:, None])
+        driven = driven & (torch.arange(driven.shape[1], device=driven.device) == only[:, None])
     order = (2 * driven.int() + there.int()).argsort(dim=1, descending=True, stable=True)
     vehicle = order[:, : int(there.sum(dim=1).max())]
 

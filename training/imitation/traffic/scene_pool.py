@@ -43,7 +43,7 @@ def draw_pool(
     """
     scene = among[torch.randint(len(among), (size,), generator=generator)]
     last = (recording.ticks[scene] - shortest).clamp(min=1)
-    tick = (torch.rand(size, generator=generator) * last).long()
+    tick = (torch.rand(size, generator=generator).to(last.device) * last).long()
     traffic = start_replay(recording, scene, tick, most)
-    noise = colour.begin(torch.randn(size, traffic.drivers, 2, 2, generator=generator))
+    noise = colour.begin(torch.randn(size, traffic.drivers, 2, 2, generator=generator).to(last.device))
     return ScenePool(traffic, noise)

@@ -55,6 +55,13 @@ def train_ego_command(
     out: Annotated[Path, typer.Option(help="File to save the ego in.")] = Path("ego.zip"),
     seed: SeedOption = 0,
     num_envs: Annotated[int, typer.Option(help="Episodes that run side by side.")] = 256,
+    device: Annotated[
+        str,
+        typer.Option(
+            help="Where to simulate and to train: cpu, or a GPU (cuda, cuda:1).",
+            autocompletion=complete_words("cpu", "cuda"),
+        ),
+    ] = "cpu",
     resume: Annotated[bool, typer.Option("--resume", help="Go on with a training that was interrupted.")] = False,
     from_failures: Annotated[
         list[Path] | None,
@@ -87,6 +94,7 @@ def train_ego_command(
         algo, noise, retraining, next_seed = algo or "ppo", options.noise, None, None
         asked = {"observation": options.observation or "features", "action": options.action or "continuous"}
         world = {**options.arguments(), **asked}
+    place: dict[str, Any] = {} if device == "cpu" else {"device": device}
     with as_bad_input(ValueError, OSError):
         path = train_ego(
             env,
@@ -98,6 +106,7 @@ def train_ego_command(
             resume=resume,
             retraining=retraining,
             **world,
+            **place,
         )
     if as_json:
         answer = {"ego": str(path), "env_id": env, "algo": algo, "steps": steps, "seed": seed, **world}
@@ -157,7 +166,7 @@ def train_drivers_command(
     method = options.method.value
     with as_bad_input(ValueError):
         config = Config(method, options.seed, options.updates)  # type: ignore[arg-type]  # the options are its methods
-        path = train_driver(Source(*recordings.kind_and_path()), config, out, progress=True)
+        path = train_driver(Source(*recordings.kind_and_path()), config, out, progress=True, device=options.device)
     if as_json:
         print_json({"driver": str(path), "method": method, "seed": options.seed})
     else:

@@ -1,0 +1,110 @@
+"""Values on their devices: constants that are copied there once, and branches on values where to look costs nothing.
+
+A processor's values are at hand. To look at one of a GPU is to wait until everything before it is computed, and no
+recorded rollout can do it (`rare_envs.simulation.recorded`), so there both ways of a branch are computed.
+"""
+
+from __future__ import annotations
+
+import copy
+from functools import cache
+from typing import Any
+
+import torch
+from torch import Tensor
+
+
+def constant(values: Any, like: Tensor) -> Tensor:
+    """Return numbers as a tensor with dtype and device of another, made once.
+
+    Args:
+        values: A number, or tuples of them.
+        like: Any tensor.
+
+    Example:
+        >>> constant((1.0, 2.0), torch.zeros(3))
+        tensor([1., 2.])
+    """
+    return _make_constant(values, like.dtype, like.device)
+
+
+def indices(numbers: tuple[int, ...], like: Tensor) -> Tensor:
+    """Return indices, int64, on the device of a tensor, made once.
+
+    Example:
+        >>> torch.zeros(2, 3)[:, indices((0, 2), torch.zeros(1))].shape
+        torch.Size([2, 2])
+    """
+    return _make_constant(numbers, torch.int64, like.device)
+
+
+@cache  # never forgotten: recorded rollouts read it where it is
+def _make_constant(values: Any, dtype: torch.dtype, device: torch.device) -> Tensor:
+    with torch.inference_mode(False):  # made under it they could not be used for gradients later
+        return torch.tensor(values, dtype=dtype, device=device)
+
+
+def fixed_draws(shape: tuple[int, ...], seed: int, like: Tensor) -> Tensor:
+    """Return one sequence of standard normal draws with dtype and device of a tensor, made once.
+
+    They are drawn in double precision on the CPU, so that they are the same numbers on every device.
+
+    Example:
+        >>> fixed_draws((2, 3), seed=1, like=torch.zeros(1)).shape
+        torch.Size([2, 3])
+    """
+    return _draw(shape, seed, like.dtype, like.device)
+
+
+@cache  # likewise
+def _draw(shape: tuple[int, ...], seed: int, dtype: torch.dtype, device: torch.device) -> Tensor:
+    with torch.inference_mode(False):
+        generator = torch.Generator().manual_seed(seed)
+        return torch.randn(shape, generator=generator, dtype=torch.float64).to(device, dtype)
+
+
+def move_to(device: torch.device, thing: Any) -> Any:
+    """Return a driver or a policy on a device, if it has anything there (`to`), else itself.
+
+    Example:
+        >>> move_to(torch.device("meta"), torch.zeros(2)).device.type, move_to(torch.device("meta"), "idm")
+        ('meta', 'idm')
+    """
+    if isinstance(thing, torch.nn.Module):  # which moves itself: the caller's stays where it is
+        thing = copy.deepcopy(thing)
+    to = getattr(thing, "to", None)  # anybody's object
+    return to(device) if callable(to) else thing
+
+
+def can_look(value: Tensor) -> bool:
+    """Return whether a value is at hand.
+
+    Example:
+        >>> can_look(torch.zeros(2)), can_look(torch.zeros(2, device="meta"))
+        (True, False)
+    """
+    return value.device.type == "cpu"
+
+
+def may_hold(condition: Tensor) -> bool:
+    """Return whether a condition may hold anywhere: False only where it is seen that it does not.
+
+    Example:
+        >>> may_hold(torch.tensor([False, True])), may_hold(torch.tensor([False]))
+        (True, False)
+    """
+    return not can_look(condition) or bool(condition.any())
+
+
+def are_zero(*values: Tensor) -> bool:
+    """Return whether all of these are 0, where that is soon known and nothing is differentiated with respect to them.
+
+    Cars that go straight on in the middle of a lane then need no trigonometry; the result is the same.
+
+    Example:
+        >>> are_zero(torch.zeros(2)), are_zero(torch.zeros(2), torch.ones(2))
+        (True, False)
+    """
+    if torch.is_grad_enabled() or not can_look(values[0]):
+        return False
+    return not any(bool(value.any()) for value in values)

@@ -1,0 +1,131 @@
+"""RecordedRollouts: rollouts on a GPU, recorded when they are first made and played from then on."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from rare_envs.simulation.episode import Episode
+from rare_envs.simulation.recorded.recordability import is_recordable
+from rare_envs.simulation.rollout import Driver, rollout
+from rare_envs.simulation.world import World
+from rare_envs.traffic.tensor_trees import map_tensors
+
+STEPS = 4
+"""Numbers of rollouts that are recorded: a tile, a quarter of it, and so on; fewer rollouts are filled up."""
+MOST_RECORDINGS = 12
+"""Kept at once, with the memory of their operations; what was not played for longest goes first."""
+
+
+class RecordedRollouts:
+    """Rollouts of a driver on a GPU: as `rollout`, but for what the processor takes to start the operations.
+
+    What cannot be recorded is made by `rollout` itself: for users' drivers and measures see `is_recordable`, and where
+    an operation has to wait for the GPU, as those of a camera, the record breaks off.
+
+    Attributes:
+        driver: The ego, on the GPU.
+        sizes: Numbers of rollouts that are recorded, ascending.
+
+    Example:
+        >>> from rare_envs.control.idm import IDM
+        >>> from rare_envs.scenarios.car_following import CAR_FOLLOWING
+        >>> rollouts = RecordedRollouts(IDM(), tile=4096)
+        >>> rollouts.sizes
+        (64, 256, 1024, 4096)
+        >>> rollouts(World(CAR_FOLLOWING), torch.tensor([[20.0, 15.0, 30.0]])).f.tolist()  # on the CPU, not recorded
+        [6.0]
+    """
+
+    def __init__(self, driver: Driver, tile: int) -> None:
+        """Record nothing yet.
+
+        Args:
+            driver: The ego, on the GPU.
+            tile: Most rollouts at once.
+        """
+        self.driver = driver
+        self.sizes = tuple(sorted({max(1, tile // 4**step) for step in range(STEPS)}))
+        self._recordings: list[_Recording] = []
+        self._unrecordable: list[World] = []
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return what another process can take over: all but the recordings."""
+        return vars(self) | {"_recordings": []}
+
+    def __call__(self, world: World, x: Tensor) -> Episode:
+        """Drive B scenarios from start to horizon.
+
+        Args:
+            world: The world.
+            x: Scenarios, shape (B, d), of which B is at most a tile.
+
+        Returns:
+            The episodes at the horizon.
+        """
+        recording = self._find(world, x) if x.device.type == "cuda" and len(x) else None
+        return rollout(world, self.driver, x) if recording is None else recording.play(x)
+
+    def _find(self, world: World, x: Tensor) -> _Recording | None:
+        """Return the recording that x fits, made if need be; None where there cannot be one."""
+        size = next((size for size in self.sizes if size >= len(x)), None)
+        if size is None or world in self._unrecordable:
+            return None
+        for place, known in enumerate(self._recordings):
+            if known.x.shape == (size, x.shape[1]) and known.world == world:
+                self._recordings.append(self._recordings.pop(place))
+                return known
+        recording = record(world, self.driver, x, size) if is_recordable(world, self.driver) else None
+        if recording is None:
+            self._unrecordable.append(world)
+            return None
+        self._recordings = [*self._recordings[1 - MOST_RECORDINGS :], recording]
+        return recording
+
+
+@dataclass(frozen=True, eq=False)
+class _Recording:
+    """A rollout of a fixed number of scenarios, from numbers in one place to numbers in others."""
+
+    world: World
+    x: Tensor
+    """Where it reads scenarios, shape (size, d)."""
+    graph: torch.cuda.CUDAGraph
+    end: Episode
+    """Where it writes the episodes at the horizon."""
+
+    def play(self, x: Tensor) -> Episode:
+        """Return the episodes of scenarios x (B, d), B at most the size of the recording, at the horizon."""
+        batch = len(x)
+        self.x[:batch] = x
+        self.x[batch:] = x[0]  # scenarios that nobody asks for; any do
+        self.graph.replay()
+        return Episode(*map_tensors(lambda part: part[:batch].clone(), self.end))
+
+
+def record(world: World, driver: Driver, x: Tensor, size: int) -> _Recording | None:
+    """Return the record of a rollout of some scenarios; None where an operation cannot be recorded.
+
+    Args:
+        world: The world.
+        driver: The ego, on the GPU.
+        x: Scenarios, shape (B, d), on the GPU.
+        size: Number of scenarios of the record.
+    """
+    place = x[0].expand(size, -1).clone()
+    aside = torch.cuda.Stream(x.device)  # type: ignore[no-untyped-call]
+    aside.wait_stream(torch.cuda.current_stream(x.device))
+    with torch.cuda.stream(aside):  # makes constants, and what libraries make at their first call
+        rollout(world, driver, place)
+    torch.cuda.current_stream(x.device).wait_stream(aside)
+    graph = torch.cuda.CUDAGraph()
+    try:
+        with torch.cuda.graph(graph, capture_error_mode="thread_local"):
+            end = rollout(world, driver, place)
+    except (RuntimeError, TypeError):  # an operation that waits for the GPU, or leaves it
+        torch.cuda.synchronize(x.device)
+        return None
+    return _Recording(world, place, graph, end)
