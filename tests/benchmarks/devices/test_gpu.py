@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 
-from benchmarks.simulation import gpu
+from benchmarks.devices import gpu
 
 
 def test_every_part_is_measured_and_kept(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,6 +1,6 @@
 """How fast is a GPU? Rollouts, steps and estimates on it, beside one core of the processor of the same machine.
 
-    python -m benchmarks.simulation.gpu --out benchmarks/results/gpu.json
+    python -m benchmarks.devices.gpu --out benchmarks/results/gpu.json
 
 Rates are wall times, the least of some repetitions, with the scenarios copied to the GPU and f copied back: simulated
 vehicles times ticks a second. Exits with 1 if a goal is missed.

@@ -1,0 +1,1 @@
+"""Speed of devices other than the processor."""
