@@ -26,7 +26,7 @@ from rare_envs.simulation.compiled.highway.driver_lanes import (
     write_own_features,
 )
 from rare_envs.simulation.compiled.highway.driving_rules.own_motion import perceive_own
-from rare_envs.simulation.compiled.highway.driving_rules.rule_lanes import carry_out
+from rare_envs.simulation.compiled.highway.driving_rules.rule_lanes import apply_rules
 from rare_envs.simulation.compiled.highway.driving_rules.rule_numbers import TrafficRules
 from rare_envs.simulation.compiled.highway.ego_lanes import (
     BY_DRIVER,
@@ -168,7 +168,7 @@ def decide_drivers(
                 action = limit_action(action[0], action[1], speed, beams, lane, driver.avoidance)
             else:
                 own = perceive_own(rows.y[row, other], rows.heading[row, other], speed, road)
-                action = carry_out(action, own, beams, lane, rows.minds[row, other - 1], fresh, driving_rules.drivers)
+                action = apply_rules(action, own, beams, lane, rows.minds[row, other - 1], fresh, driving_rules.drivers)
             buffers.actions[0, lane], buffers.actions[1, lane] = action
 
 

@@ -33,7 +33,7 @@ _TICK, _FAR = single(LEARNED_TICK, np.inf)
 
 
 @compiled
-def carry_out(
+def apply_rules(
     action: tuple[float, float],
     own: OwnMotion,
     beams: SingleArray,

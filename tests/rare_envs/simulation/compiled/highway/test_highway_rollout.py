@@ -2,12 +2,15 @@
 
 import pickle
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 import agents
 import rare_envs
+from agents.learned.lane_changes import LaneChanges
+from agents.names import SHIPPED_DRIVERS
 from rare_envs.control import IDM
 from rare_envs.scenarios import highway
 from rare_envs.simulation import World
@@ -22,6 +25,33 @@ HIGHWAY = "rare_envs/Highway-v0"
 def test_measures_and_collisions_that_are_compiled(measure, collisions):
     problem = rare_envs.DrivingProblem(HIGHWAY, measure=measure, collisions=collisions)
     assert problem.core == "numba" and problem.terms_with_f
+
+
+@pytest.mark.parametrize("name", SHIPPED_DRIVERS)
+def test_shipped_drivers_are_compiled(name):
+    assert rare_envs.DrivingProblem(HIGHWAY, drivers=name).core == "numba"
+    assert rare_envs.DrivingProblem(HIGHWAY, ego=agents.load_ego(name)).core == "numba"
+
+
+def test_a_file_of_ones_own_with_lane_changes_is_compiled(tmp_path):
+    driver = replace(agents.load_driver("mgail5"), changes=LaneChanges(duration=5.0), hard_braking=0.9)
+    provenance = agents.read_provenance(Path(agents.__file__).with_name("data") / "mgail5.safetensors")
+    path = agents.save_driver(driver, provenance, tmp_path / "mine.safetensors")
+    compiled, reference = (
+        rare_envs.DrivingProblem(HIGHWAY, drivers=str(path), horizon=3.0, core=core) for core in ("auto", "torch")
+    )
+    x = compiled.base.sample(20, np.random.default_rng(0))
+    assert compiled.core == "numba" and np.abs(compiled.evaluate(x) - reference.evaluate(x)).max() < 1e-4
+
+
+def test_lane_changes_of_another_class_are_simulated_by_torch():
+    class Others(LaneChanges):
+        """Begin at will."""
+
+    driver = replace(agents.load_driver("mgail5"), changes=Others())
+    assert rare_envs.DrivingProblem(HIGHWAY, drivers=driver).core == "torch"
+    with pytest.raises(ValueError, match="a LearnedDriver with a network or methods of its own is not compiled"):
+        rare_envs.DrivingProblem(HIGHWAY, drivers=driver, core="numba")
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,7 @@ import torch
 
 import agents
 from rare_envs.simulation.compiled.highway import read_dense_driver
-from rare_envs.simulation.compiled.highway.driving_rules.rule_lanes import carry_out, ease_braking
+from rare_envs.simulation.compiled.highway.driving_rules.rule_lanes import apply_rules, ease_braking
 from rare_envs.simulation.compiled.highway.driving_rules.rule_numbers import DriverRules
 from tests.rare_envs.simulation.compiled.highway.driving_rules.scenes import (
     CHANGES,
@@ -42,7 +42,7 @@ def test_actions_and_minds_tick_after_tick(name):
             expected, memory = driver.act(features[:, None], None, draws, memory)
         beams, owns = beams_of(features), own_motions(features)
         for i in range(0, N, 3):
-            action = carry_out(
+            action = apply_rules(
                 tuple(plain[i, 0].numpy()), owns[i], beams, i, minds[i], tuple(draws[i, 0].numpy()), rules
             )
             assert np.allclose(action, expected[i, 0], rtol=1e-4, atol=1e-4)
