@@ -1,6 +1,8 @@
 """Candidates: the components that a proposal may be mixed from, and the shares that minimise its variance."""
 
+from collections.abc import Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 from scipy.special import log_ndtr
@@ -28,6 +30,15 @@ from samplers.proposals.components import (
 from samplers.proposals.von_mises_fisher import VonMisesFisherNakagami
 
 
+class PredictedFailures(NamedTuple):
+    """Points that should fail, from N(0, I) given that, by a regression of f."""
+
+    u: FloatArray
+    """For the weights, shape (n, d)."""
+    gaussians: Sequence[SubspaceGaussian] = ()
+    """Fitted to others, in the coordinates of the slopes where there are some."""
+
+
 def build_proposal(
     state: RefinementState,
     history: MultipleImportanceSample,
@@ -35,11 +46,12 @@ def build_proposal(
     mixture: MixtureSettings = DEFAULT_MIXTURE_SETTINGS,
     *,
     final: bool = False,
+    predicted: PredictedFailures | None = None,
 ) -> MixtureProposal:
     """Return the mixture for the next draws.
 
-    Its weights minimise the second moment of the estimate over the failures in `history`, with lower limits; before
-    the first round they are `settings.initial_shares`.
+    Its weights minimise the second moment of the estimate over the failures in `history`, or over predicted ones, with
+    lower limits; before the first round they are `settings.initial_shares`.
 
     Args:
         state: What is known of the regions.
@@ -47,15 +59,22 @@ def build_proposal(
         settings: Shares and lower limits.
         mixture: Of edges and weights.
         final: For the estimate: what is no use is dropped.
+        predicted: Failures by a regression of f, if they are to stand in for those met.
     """
     candidates = list_candidates(state, history, settings, mixture.edges)
+    if predicted is not None:
+        candidates += _describe_predicted(predicted.gaussians, state.exploration.slopes, settings)
     kinds = np.array([candidate.kind for candidate in candidates])
     start = np.array([settings.initial_shares[c.kind] / np.count_nonzero(kinds == c.kind) for c in candidates])
     weights = start / start.sum()
     if not state.rounds or len(history.u) == 0:
         return MixtureProposal(candidates, weights)
     floors = _set_floors(state, history, candidates, settings, radial=state.dim <= settings.radial_dim, final=final)
-    u, log_w = _smooth_indicators(history, state.gamma, settings) if state.noisy else (history.u, history.log_weights)
+    u, log_w = history.u, history.log_weights
+    if predicted is not None:
+        u, log_w = predicted.u, np.zeros(len(predicted.u))
+    elif state.noisy:
+        u, log_w = _smooth_indicators(history, state.gamma, settings)
     log_r = log_ratios([candidate.component for candidate in candidates], u)
     weights = minimise_second_moment(log_r, log_w, weights, floors, mixture.weights)
     keeps = kinds == "base"
@@ -65,6 +84,17 @@ def build_proposal(
         keeps = keeps | explored
     weights = np.where((weights < settings.min_share) & ~keeps, 0.0, weights)
     return MixtureProposal(candidates, raise_to_floors(weights / weights.sum(), floors))
+
+
+def _describe_predicted(
+    gaussians: Sequence[SubspaceGaussian], axes: FloatArray | None, settings: RefinementSettings
+) -> list[ProposalComponent]:
+    """Return components for Gaussians fitted to predicted failures, and tempered ones, of no region."""
+    sharp = [ProposalComponent(gaussian, "gaussian") for gaussian in gaussians]
+    inside = [*sharp, *_temper_gaussians(sharp, settings.tempering)]
+    if axes is None:
+        return inside
+    return [candidate._replace(component=LiftedComponent(candidate.component, axes)) for candidate in inside]
 
 
 def list_candidates(

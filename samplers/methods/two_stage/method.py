@@ -166,6 +166,7 @@ def _explore_and_estimate(
                 return (yield from stages.fall_back(context, state, exploration.levels))
             if not final:
                 refinement, proposal = yield from stages.cover(context, state, refinement, proposal, room)
+            proposal = stages.place(context, state, refinement, proposal, final=final)
     except Interrupted:
         return stages.estimate_early(context, state)
     outcome = yield from stages.estimate_afresh(context, state, refinement, proposal)

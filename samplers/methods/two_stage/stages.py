@@ -29,7 +29,9 @@ from samplers.methods.two_stage.exploration import Sizes, find_regions, first_dr
 from samplers.methods.two_stage.mixture.proposal import MixtureProposal
 from samplers.methods.two_stage.refinement import RefinementState, refine_once, start_refinement, typical_weights
 from samplers.methods.two_stage.regions import ExplorationResult
-from samplers.methods.two_stage.response_surface.spread import LastDraws, Simulated, check_spread
+from samplers.methods.two_stage.response_surface.placement import place_by_surface
+from samplers.methods.two_stage.response_surface.predicted_failures import PlannedDraws, Simulated
+from samplers.methods.two_stage.response_surface.spread import LastDraws, check_spread
 from samplers.methods.two_stage.run_state import CountedRound, RunContext, RunState
 from samplers.methods.two_stage.settings import TwoStageSettings
 from samplers.methods.two_stage.simulator import (
@@ -159,6 +161,25 @@ def cover(
     return covered, build_proposal(covered, state.history, settings.refinement, settings.mixture)
 
 
+def place(
+    context: RunContext, state: RunState, refinement: RefinementState, proposal: MixtureProposal, *, final: bool
+) -> MixtureProposal:
+    """Return the mixture by a regression of f where it is well better than the proposal for draws that count.
+
+    Args:
+        context: What is fixed for the run.
+        state: Draws so far.
+        refinement: What is known of the regions.
+        proposal: For the next draws.
+        final: For the estimate.
+    """
+    counts = final or len(state.rounds) >= _first_counted(state, context.goal.gamma, context.settings)
+    if not counts or not _asks_surface(context, refinement):
+        return proposal
+    rng = context.rng.spawn(1)[0]  # draws nothing from the run's own generator
+    return place_by_surface(proposal, refinement, state.history, context.left, rng, context.settings, final=final)
+
+
 def gives_up(
     context: RunContext,
     state: RunState,
@@ -233,12 +254,13 @@ def estimate_afresh(
     points = sample.to_sample(proposal, state.base_f, state.base_u, goal.gamma, whole.draws)
     last = CountedRound(sample, context.simulator.n_sim - sample.draws.n)
     parts = [part.sample.draws.weights_after(part.first, whole.draws.n) for part in (*state.counted, last)]
+    drawn = PlannedDraws(proposal, sample.draws.n, whole.p)
     return replace(
         outcome,
         warnings=(
             *outcome.warnings,
             *_check(context, state, refinement, sample, whole),
-            *_check_spread(context, state, refinement, LastDraws(proposal, sample.draws.n, whole.p, sample.cov, kept)),
+            *_check_spread(context, state, refinement, LastDraws(drawn, sample.cov, kept)),
         ),
         sample=replace(points, lineages=discovery.lineages),
         draw_weights=tuple(weights for part in parts for weights in part),
@@ -334,16 +356,13 @@ def _check(
     ]
 
 
-def _check_spread(context: RunContext, state: RunState, refinement: RefinementState, draws: LastDraws) -> list[str]:
+def _check_spread(context: RunContext, state: RunState, refinement: RefinementState, last: LastDraws) -> list[str]:
     """Return a warning if a regression of f on all that was simulated predicts a far larger c.o.v. of the draws."""
-    gamma, settings = context.goal.gamma, context.settings
     if not _asks_surface(context, refinement):
         return []
-    drawn = [Simulated.of(batch.u, batch.f, gamma) for batch in state.history.batches]
-    around = [Simulated.of(region.u, region.f, gamma) for region in refinement.regions]
+    searched, settings = Simulated.of_search(state.history, refinement), context.settings
     rng = context.rng.spawn(1)[0]  # draws nothing from the run's own generator
-    searched = Simulated.join([*drawn, *around])
-    return check_spread(draws, searched, refinement.exploration.slopes, rng, settings.surfaces, settings.mixture.pieces)
+    return check_spread(last, searched, refinement.exploration.slopes, rng, settings.surfaces, settings.mixture.pieces)
 
 
 def _asks_surface(context: RunContext, refinement: RefinementState) -> bool:

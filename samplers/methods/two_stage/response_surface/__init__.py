@@ -1,1 +1,1 @@
-"""Response surface: a regression of f on all that was simulated says whether the last draws reach its failures."""
+"""Response surface: a regression of f on all that was simulated says where failures are that draws hardly reach."""
