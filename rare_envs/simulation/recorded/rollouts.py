@@ -66,8 +66,11 @@ class RecordedRollouts:
         Returns:
             The episodes at the horizon.
         """
-        recording = self._find(world, x) if x.device.type == "cuda" and len(x) else None
-        return rollout(world, self.driver, x) if recording is None else recording.play(x)
+        if x.device.type != "cuda" or not len(x):
+            return rollout(world, self.driver, x)
+        with torch.cuda.device(x.device):  # else one of several GPUs would be recorded on the first
+            recording = self._find(world, x)
+            return rollout(world, self.driver, x) if recording is None else recording.play(x)
 
     def _find(self, world: World, x: Tensor) -> _Recording | None:
         """Return the recording that x fits, made if need be; None where there cannot be one."""

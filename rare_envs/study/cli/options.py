@@ -138,6 +138,12 @@ ActionOption = Annotated[
         autocompletion=complete_words(*ACTION_WORDS),
     ),
 ]
+DeviceOption = Annotated[
+    str,
+    typer.Option(
+        help="Where torch simulates: cpu, or a GPU (cuda, cuda:1).", autocompletion=complete_words("cpu", "cuda")
+    ),
+]
 EnsembleRunOption = Annotated[
     bool,
     typer.Option(
@@ -201,6 +207,7 @@ class QuestionOptions(WorldOptions):
         str,
         typer.Option(help="Which count: ego, or any, between others too.", autocompletion=complete_words("ego", "any")),
     ] = "ego"
+    device: DeviceOption = "cpu"
     ensemble_run: EnsembleRunOption = True
     trust: TrustOption = False
 
@@ -250,12 +257,6 @@ class EstimateOptions(QuestionOptions):
             autocompletion=complete_words("torch", "numba", "auto"),
         ),
     ] = "auto"
-    device: Annotated[
-        str,
-        typer.Option(
-            help="Where torch simulates: cpu, or a GPU (cuda, cuda:1).", autocompletion=complete_words("cpu", "cuda")
-        ),
-    ] = "cpu"
     sensitivity: Annotated[
         bool,
         typer.Option("--sensitivity", help="Show what p is sensitive to: parameters of traffic and of its model."),
@@ -304,6 +305,7 @@ class RiskOptions:
         ),
     ] = None
     ensemble_run: EnsembleRunOption = True
+    device: DeviceOption = "cpu"
     seed: SeedOption = 0
     algo: AlgoOption = None
     stats: StatsOption = None
