@@ -102,7 +102,8 @@ def are_zero(*values: Tensor) -> bool:
     Cars that go straight on in the middle of a lane then need no trigonometry; the result is the same.
 
     Example:
-        >>> are_zero(torch.zeros(2)), are_zero(torch.zeros(2), torch.ones(2))
+        >>> with torch.no_grad():
+        ...     are_zero(torch.zeros(2)), are_zero(torch.zeros(2), torch.ones(2))
         (True, False)
     """
     if torch.is_grad_enabled() or not can_look(values[0]):
