@@ -64,6 +64,7 @@ ABLATIONS: dict[str, Mapping[str, Any]] = {
     "floors of the regions": {"refinement.region_share": 0.0, "refinement.final_region_share": 0.0},
     "Gaussians": _without_kinds("gaussian"),
     "wide draws as deep as the levels": {"exploration.deep_draws": 0},
+    "placement by a regression": {"surfaces.min_gain": math.inf},
 }
 """Settings without a component, by its name."""
 
