@@ -91,7 +91,7 @@ def test_no_budget_is_exceeded_whatever_the_regions(recorder):
             for seed in range(3):
                 result = counted(recorder, problem, seed=seed, max_sim=max_sim)
                 assert result.n_sim <= max_sim
-                taken_over = any("p is from adaptive subset simulation" in text for text in result.warnings)
+                taken_over = any("p is from adaptive subset simulation" in text for text in result.remarks)
                 assert result.n_sim == max_sim or taken_over
 
 
