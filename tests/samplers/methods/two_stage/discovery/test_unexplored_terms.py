@@ -52,12 +52,14 @@ CASES = [
 def test_no_term_is_lost_in_any_seed(dim, share, steepness):
     """The estimate without the ball is (1 - share) p, with an interval that excludes p.
 
+    No run is below (1 - share / 2) p by more than two of the standard errors that it states, .02 p in most.
     The mean of 20 runs is within 4 of its standard errors, from their own spread, and 1 % for what the fits cost.
     By chance fewer than 16 of 20 intervals at 95 % hold p with probability 3e-4.
     """
     results = estimates(half_space_and_ball(dim, share, steepness), 20, max_sim=6000)
     ratios = np.array([result.p / P for result in results])
-    assert (ratios > 1 - share / 2).all()
+    stated = ratios * np.array([result.cov for result in results])
+    assert (ratios + 2 * stated > 1 - share / 2).all()
     assert abs(ratios.mean() - 1) < 4 * ratios.std(ddof=1) / np.sqrt(20) + 0.01
     covered = sum(result.interval[0] <= P <= result.interval[1] for result in results)
     assert covered >= 16
