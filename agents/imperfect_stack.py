@@ -20,6 +20,7 @@ from rare_envs.devices import constant, fixed_draws, move_to
 from rare_envs.egos.policy import as_driver
 from rare_envs.sensors.perception import perceive_traffic
 from rare_envs.simulation.episode import Episode
+from rare_envs.simulation.recorded import says_recordable
 from rare_envs.simulation.rollout import Driver, StochasticDriver
 from rare_envs.simulation.world import World
 from rare_envs.traffic.lead import lead_of
@@ -204,7 +205,7 @@ class NoisyDriver:
     @property
     def recordable(self) -> bool:
         """Whether a GPU may record its operations: as of the driver behind the stack."""
-        return getattr(self.inner, "recordable", False)  # anybody's object
+        return says_recordable(self.inner)
 
     def to(self, device: torch.device) -> NoisyDriver:
         """Return the driver with what is behind the stack on a device."""

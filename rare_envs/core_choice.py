@@ -100,8 +100,8 @@ class CoreChoice:
         """Return the episodes of scenarios x (B, d), a tile at most, as a GPU alone makes them.
 
         Returns:
-            None on the CPU, and where a policy has to be asked there: one that cannot decide elsewhere, or one after
-            which f is NaN, for then it is told what fails, and how.
+            None on the CPU, and where a policy has to be asked there: one that cannot decide elsewhere, or one that
+            fails, for then it is told on which rows, and how.
         """
         if self._device.type == "cpu":
             return None
@@ -111,9 +111,13 @@ class CoreChoice:
             return None
         if known is None or known.driver is not driver:
             known = self._recorded = RecordedRollouts(driver, self._tile)
-        end = known(world, x)
-        asks = isinstance(self._driver, PolicyDriver)
-        return None if asks and bool(end.f.isnan().any()) else end
+        if not isinstance(self._driver, PolicyDriver):
+            return known(world, x)
+        try:
+            end = known(world, x)
+        except Exception:  # the policy is the user's: anything may happen in it
+            return None
+        return None if has_nan(end) else end
 
     def _give_up(self, reason: NotCompiled, *, warns: bool, stacklevel: int) -> None:
         """Leave the simulation to torch, or raise a ValueError where that was not asked for."""
@@ -122,6 +126,21 @@ class CoreChoice:
         self.rollout = None
         if warns:
             warnings.warn(f"{reason}; torch simulates, which is slower.", stacklevel=stacklevel)
+
+
+def has_nan(end: Episode) -> bool:
+    """Return whether f or an ego is NaN at the horizon of any episode.
+
+    An action that is NaN leaves the ego so for good; f need not notice, since nobody is seen by or near such an ego.
+
+    Example:
+        >>> from rare_envs.scenarios.car_following import CAR_FOLLOWING
+        >>> has_nan(World(CAR_FOLLOWING).start(torch.tensor([[20.0, 15.0, 30.0]])))
+        False
+    """
+    state = end.state
+    own = (values[:, 0] for values in (state.x, state.y, state.heading, state.speed))
+    return bool(torch.stack([end.f.isnan(), *(values.isnan() for values in own)]).any())
 
 
 def compiled_ego(driver: Driver) -> CompiledEgo:

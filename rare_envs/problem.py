@@ -33,7 +33,7 @@ from rare_envs.scenarios.registry import find_scenario, split_layout
 from rare_envs.sensors.kinds import read_kinds
 from rare_envs.simulation.episode import Episode
 from rare_envs.simulation.measurement import Measurement
-from rare_envs.simulation.rollout import StochasticDriver, rollout
+from rare_envs.simulation.rollout import Driver, StochasticDriver, rollout
 from rare_envs.simulation.world import World
 from rare_envs.terms.episode_terms import EpisodeTerms, name_terms, simulate_terms
 from rare_envs.terms.gradients import ROLLOUTS_PER_GRADIENT, TermDifferentiator, find_differentiator
@@ -311,10 +311,21 @@ class DrivingProblem:
     def gradient(self) -> TermDifferentiator | None:
         """Gradients of the terms: `gradient(x, term, ticks)`; None where measure or drivers have none."""
         x = self.base.sample(1, np.random.default_rng(0))
-        world, driver, cpu = self.world, self.driver, find_device("cpu")
-        if self.device != cpu:  # of the few rollouts that methods ask for at once the CPU has gradients sooner
-            world, driver = replace(world, background=move_to(cpu, world.background)), move_to(cpu, driver)
+        world, driver = self.on_cpu()  # which has gradients of the few rollouts that methods ask for at once sooner
         return find_differentiator(world, driver, self.needs.queries_policy, x)
+
+    def on_cpu(self) -> tuple[World, Driver]:
+        """Return the world and the driver as they simulate on the CPU.
+
+        Example:
+            >>> problem = DrivingProblem("rare_envs/CutIn-v0")
+            >>> problem.on_cpu()[0] is problem.world
+            True
+        """
+        cpu = find_device("cpu")
+        if self.device == cpu:
+            return self.world, self.driver
+        return replace(self.world, background=move_to(cpu, self.world.background)), move_to(cpu, self.driver)
 
     @property
     def gradient_cost(self) -> float:

@@ -21,6 +21,7 @@ from agents.learned.networks import (
     Policy,
     apply_heads,
     head_weights,
+    is_plain,
     read_layers,
 )
 from agents.learned.weight_distribution import WeightDistribution
@@ -29,6 +30,7 @@ from rare_envs.devices import constant
 from rare_envs.sensors.perception import CURVATURE_COLUMN, SPEED_COLUMN
 from rare_envs.simulation.compiled.highway import DenseDriver
 from rare_envs.simulation.observation import LIDAR_SCALES, observation_space
+from rare_envs.simulation.recorded import says_recordable
 from rare_envs.traffic.vehicle_models import steering_for
 
 if TYPE_CHECKING:
@@ -82,8 +84,6 @@ class LearnedDriver:
     changes: LaneChanges | None = None
     """Lane changes, which need the rule; None for those of the network."""
     noisy: ClassVar[bool] = True
-    recordable: ClassVar[bool] = True
-    """Whether a GPU may record its operations: nothing about it changes."""
 
     def __post_init__(self) -> None:
         for name in ("acceleration", "yaw_rate"):
@@ -186,10 +186,8 @@ class LearnedDriver:
 
     def dense_driver(self) -> DenseDriver | None:
         """Return its present numbers for compiled rollouts; None if its class, network or rule was changed."""
-        if type(self) is not LearnedDriver or type(self.colour) is not AutoregressiveNoise:
-            return None
         rule, layers = self.avoidance, read_layers(self.policy)
-        if layers is None or not self._has_known_rules():
+        if type(self) is not LearnedDriver or layers is None or not self._has_known_rules():
             return None
         scaling, colour = (value.numpy(force=True) for value in self.policy.scaling), self.colour
         feature_mean, feature_deviation, action_mean, action_deviation = scaling
@@ -214,11 +212,16 @@ class LearnedDriver:
             lane_changes=None if self.changes is None else self.changes.settings(),
         )
 
+    @property
+    def recordable(self) -> bool:
+        """Whether a GPU may record its operations: network, noise and rules are of this package."""
+        return is_plain(self.policy) and self._has_known_rules()
+
     def _has_known_rules(self) -> bool:
-        """Return whether compiled rollouts know its rules: subclasses may do anything."""
+        """Return whether its noise and rules are of this package: subclasses may do anything."""
         rule, changes = self.avoidance, self.changes
-        parts = (rule, rule and rule.close, changes, changes and changes.waiting)
-        known = (CollisionAvoidance, CloseRange, LaneChanges, Waiting)
+        parts = (self.colour, rule, rule and rule.close, changes, changes and changes.waiting)
+        known = (AutoregressiveNoise, CollisionAvoidance, CloseRange, LaneChanges, Waiting)
         return all(part is None or type(part) is kind for part, kind in zip(parts, known, strict=True))
 
     def to(self, device: torch.device) -> "LearnedDriver":
@@ -303,8 +306,11 @@ class LearnedEgo:
     driver: LearnedDriver
     needs_lidar: ClassVar[bool] = True
     """It needs a world in which vehicles look."""
-    recordable: ClassVar[bool] = True
-    """Whether a GPU may record its operations: nothing about it changes."""
+
+    @property
+    def recordable(self) -> bool:
+        """Whether a GPU may record its operations: as of the driver."""
+        return says_recordable(self.driver)
 
     @property
     def observation_space(self) -> "spaces.Space[Any]":

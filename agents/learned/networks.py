@@ -139,13 +139,26 @@ def read_layers(policy: Policy) -> tuple[WeightsAndBiases, WeightsAndBiases] | N
         >>> [weight.shape for weight, _ in read_layers(Policy(scaling))]
         [(200, 51), (100, 200)]
     """
-    layers = (policy.first, policy.second)
-    modules = (policy, *layers, policy.head)
-    plain = type(policy) is Policy and all(type(layer) is nn.Linear for layer in modules[1:])
-    changed = any(vars(module).keys() & {"forward", "trunk", "normalise", "split"} for module in modules)
-    hooked = any(module._forward_hooks or module._forward_pre_hooks for module in modules)
     single = all(value.dtype == torch.float32 and value.device.type == "cpu" for value in policy.state_dict().values())
-    if changed or hooked or not (plain and single):
+    if not (is_plain(policy) and single):
         return None
+    layers = (policy.first, policy.second)
     first, second = ((layer.weight.numpy(force=True), layer.bias.numpy(force=True)) for layer in layers)
     return first, second
+
+
+def is_plain(policy: Policy) -> bool:
+    """Return whether a network does what a `Policy` does: its class and layers, nothing put in their place.
+
+    Example:
+        >>> policy = Policy(Scaling(torch.zeros(51), torch.ones(51), torch.zeros(2), torch.ones(2)))
+        >>> plain = is_plain(policy)
+        >>> policy.head.register_forward_hook(print) and plain, is_plain(policy)
+        (True, False)
+    """
+    if type(policy) is not Policy:
+        return False
+    modules = (policy, policy.first, policy.second, policy.head)
+    changed = any(vars(module).keys() & {"forward", "trunk", "normalise", "split"} for module in modules)
+    hooked = any(module._forward_hooks or module._forward_pre_hooks for module in modules)
+    return all(type(layer) is nn.Linear for layer in modules[1:]) and not (changed or hooked)

@@ -84,7 +84,8 @@ def to_physical(action: Tensor, batch: int, ignored: Tensor | None = None) -> Te
         ignored: Rows whose action does not matter, boolean of shape (B,); they get 0.
 
     Returns:
-        Acceleration [m/s^2] and steering angle [rad], shape (B, 2).
+        Acceleration [m/s^2] and steering angle [rad], shape (B, 2). Of actions on a GPU that are not finite they are
+        NaN: to raise an error there is to wait for it.
 
     Raises:
         ValueError: If shape or values are not those of an action.
@@ -94,13 +95,15 @@ def to_physical(action: Tensor, batch: int, ignored: Tensor | None = None) -> Te
     if action.shape == (batch,) and not action.is_floating_point():
         if bool(((action < 0) | (action >= len(DISCRETE_ACTIONS))).any()):
             raise ValueError(f"Expected action indices in 0..{len(DISCRETE_ACTIONS) - 1}, got {action.tolist()[:5]}.")
-        action = torch.from_numpy(DISCRETE_ACTIONS)[action]
+        action = torch.from_numpy(DISCRETE_ACTIONS).to(action.device)[action]
     action = action.float()  # a policy's float64 must mean the same here and in `Env.step`
     if action.shape != (batch, 2):
         raise ValueError(
             f"Expected actions of shape ({batch}, 2) in [-1, 1] (acceleration, steering), got {tuple(action.shape)}."
         )
-    if can_look(action) and not (finite := np.isfinite(action.numpy(force=True))).all():  # faster than torch.isfinite
+    if not can_look(action):
+        action = torch.where(torch.isfinite(action), action, torch.nan)
+    elif not (finite := np.isfinite(action.numpy(force=True))).all():  # faster than torch.isfinite
         bad = int((~finite.all(axis=1)).sum())
         raise ValueError(
             f"NaN or infinite actions for {bad} of {batch} observations; "

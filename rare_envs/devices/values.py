@@ -15,7 +15,7 @@ from torch import Tensor
 
 
 def constant(values: Any, like: Tensor) -> Tensor:
-    """Return numbers as a tensor with dtype and device of another, made once.
+    """Return numbers as a tensor with dtype and device of another, made once; nobody may write to it.
 
     Args:
         values: A number, or tuples of them.
@@ -29,7 +29,7 @@ def constant(values: Any, like: Tensor) -> Tensor:
 
 
 def indices(numbers: tuple[int, ...], like: Tensor) -> Tensor:
-    """Return indices, int64, on the device of a tensor, made once.
+    """Return indices, int64, on the device of a tensor, made once, as `constant`.
 
     Example:
         >>> torch.zeros(2, 3)[:, indices((0, 2), torch.zeros(1))].shape
@@ -45,7 +45,7 @@ def _make_constant(values: Any, dtype: torch.dtype, device: torch.device) -> Ten
 
 
 def fixed_draws(shape: tuple[int, ...], seed: int, like: Tensor) -> Tensor:
-    """Return one sequence of standard normal draws with dtype and device of a tensor, made once.
+    """Return one sequence of standard normal draws with dtype and device of a tensor, made once, as `constant`.
 
     They are drawn in double precision on the CPU, so that they are the same numbers on every device.
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import reprlib
-from typing import Any, NamedTuple, Protocol, runtime_checkable
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -14,17 +14,6 @@ from rare_envs.control.actions import read_actions
 from rare_envs.egos.errors import EgoGone, NoAnswer
 from rare_envs.egos.isolation import attempt_in_parts
 from rare_envs.sensors.kinds import map_kinds
-
-
-@runtime_checkable
-class DecidesOnDevice(Protocol):
-    """A policy without a memory that answers where the observations are, so that none of them goes to the CPU.
-
-    Nobody looks at its answers on the way: NaN goes on to f.
-    """
-
-    def decide(self, observation: Any) -> Tensor:
-        """Return actions, shape (B, 2), for observations of B rows, a tensor or several by name."""
 
 
 class PolicyQuery(NamedTuple):

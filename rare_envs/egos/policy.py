@@ -12,8 +12,9 @@ from torch import Tensor
 
 from rare_envs.control.actions import DISCRETE_ACTIONS, IDLE, META_ACTIONS, to_physical
 from rare_envs.devices import move_to
-from rare_envs.egos.inference import DecidesOnDevice, PolicyQuery, query_policy
+from rare_envs.egos.inference import PolicyQuery, query_policy
 from rare_envs.egos.needs import RULE_BASED_EGOS, WorldEgo, find_rule_based, resolve
+from rare_envs.egos.plain_callables import ModuleEgo
 from rare_envs.egos.sb3.dense_inference import DenseInference, find_inference
 from rare_envs.egos.validation import refuse_ego
 from rare_envs.egos.wrappers import find_frame_stacking, wrap_policy
@@ -74,7 +75,7 @@ class PolicyDriver:
 class DevicePolicyDriver:
     """A policy with continuous actions that answers where the observations are: nothing of a tick goes to the CPU."""
 
-    policy: DecidesOnDevice
+    policy: DenseInference | ModuleEgo
     observation: str = "features"
     """What it observes."""
 
@@ -84,10 +85,9 @@ class DevicePolicyDriver:
         return isinstance(self.policy, DenseInference)
 
     def act(self, episode: Episode, memory: Any) -> tuple[Tensor, Any]:
-        """Observe and decide; NaN in the policy's answers goes on to f."""
-        actions = self.policy.decide(observe(episode, self.observation)).to(
-            episode.state.x.device
-        )  # a module has its own
+        """Observe and decide; an ego whose policy does not answer by finite numbers is NaN from then on."""
+        actions = self.policy.decide(observe(episode, self.observation))
+        actions = actions.to(episode.state.x.device)  # a module has its own
         return to_physical(actions, len(episode.collided), episode.collided).to(episode.state.x), memory
 
 
@@ -102,7 +102,7 @@ def find_device_driver(driver: Driver, device: torch.device, before: Driver | No
     if not isinstance(driver, PolicyDriver):
         return driver
     policy = find_inference(driver.policy)
-    if driver.action != "continuous" or not isinstance(policy, DecidesOnDevice):
+    if driver.action != "continuous" or not isinstance(policy, DenseInference | ModuleEgo):
         return None
     placed = move_to(device, policy) if isinstance(policy, DenseInference) else policy
     if isinstance(before, DevicePolicyDriver) and isinstance(placed, DenseInference) and placed.equals(before.policy):

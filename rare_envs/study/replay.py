@@ -128,7 +128,7 @@ def drive_again(problem: DrivingProblem, x: NDArray[np.float64]) -> Drive:
         x: Scenario parameters, shape (d,).
 
     Returns:
-        The drive; its f is that of `problem.evaluate`.
+        The drive, made on the CPU; its f is that of `problem.evaluate`, but for rounding where that is on a GPU.
 
     Example:
         >>> problem = DrivingProblem("rare_envs/CarFollowing-v0", horizon=3.0)
@@ -138,7 +138,8 @@ def drive_again(problem: DrivingProblem, x: NDArray[np.float64]) -> Drive:
     """
     episodes: list[Episode] = []
     # single precision, as in `DrivingProblem.evaluate`, so that f comes out the same
-    for episode in drive(problem.world.with_statistics(), problem.driver, torch.from_numpy(x).float()[None]):
+    world, driver = problem.on_cpu()
+    for episode in drive(world.with_statistics(), driver, torch.from_numpy(x).float()[None]):
         episodes.append(episode)
         if bool(episode.collided):
             break

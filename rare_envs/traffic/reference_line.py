@@ -10,6 +10,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from rare_envs.devices import can_look
+
 MAX_CURVATURE = 0.005
 """Largest curvature [1/m], a radius of 200 m: below it the series in `ReferenceLine` are good to 1e-4 m a metre."""
 MAX_TURN = 0.5
@@ -126,6 +128,8 @@ class ReferenceLine:
         """Return the coefficients of the cells that s is in, and the way since their starts."""
         table, step = _table(self, s.dtype, s.device)
         number = torch.floor(s.detach() / step).clamp(-1, len(table) - 2)
+        if not can_look(number):  # an index beyond a table, which NaN would be, ends all work of a process on a GPU
+            number = number.nan_to_num()
         rows = torch.nn.functional.embedding(number.long() + 1, table)  # eight times as fast as an index
         return rows.unbind(-1), s - number * step
 

@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+import math
 import warnings
+from typing import Any
 
 import numpy as np
 import pytest
+import torch
 
 import rare_envs
 import samplers
 from rare_envs import core_choice
+from rare_envs.control import actions
 from rare_envs.control.idm import IDM
 from rare_envs.core_choice import CoreChoice, is_compiled_script
+from rare_envs.egos.policy import as_driver, find_device_driver
 from rare_envs.scenarios.car_following import CAR_FOLLOWING
 from rare_envs.scenarios.highway import HIGHWAY
 from rare_envs.simulation.compiled import selection
@@ -91,3 +96,58 @@ def test_scripts_are_compiled_ones_with_numba_or_without(monkeypatch: pytest.Mon
     assert is_compiled_script(WORLD, IDM())
     assert not is_compiled_script(World(HIGHWAY), IDM())
     assert not is_compiled_script(World(CAR_FOLLOWING, measurement=Measurement("clearance")), IDM())
+
+
+class Fails(torch.nn.Module):
+    """Goes straight on, but for the first row after some queries."""
+
+    def __init__(self, answer: float, after: int) -> None:
+        super().__init__()
+        self.answer, self.left = answer, after
+
+    def forward(self, seen: torch.Tensor) -> torch.Tensor:
+        actions = torch.zeros(len(seen), 2)
+        self.left -= 1
+        if self.left < 0:
+            if self.answer == 0.0:
+                raise ZeroDivisionError("the module's own error")
+            actions[0, 1] = self.answer
+        return actions
+
+
+def as_on_a_gpu(module: Any, measure: str, monkeypatch: pytest.MonkeyPatch) -> Any:
+    """Return what a choice for a GPU makes of two scenarios; the numbers stay here."""
+    monkeypatch.setattr(actions, "can_look", lambda _: False)
+    world = World(CAR_FOLLOWING, measurement=Measurement(measure))
+    choice = CoreChoice("torch", world, as_driver(module, world), torch.device("cuda"), tile=64)
+    with torch.inference_mode():
+        return choice.roll_out(world, torch.tensor([[20.0, 25.0, 30.0], [20.0, 25.0, 40.0]]))
+
+
+@pytest.mark.parametrize("answer", [0.0, math.nan, math.inf], ids=["error", "nan", "infinite"])
+@pytest.mark.parametrize("measure", ["ttc", "lidar_ttc", "pet", "drac"])
+@pytest.mark.parametrize("after", [0, 99])
+def test_a_policy_that_fails_on_a_gpu_is_queried_again(
+    answer: float, measure: str, after: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert as_on_a_gpu(Fails(answer, after), measure, monkeypatch) is None
+
+
+def test_one_that_does_not_fail_is_not(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert as_on_a_gpu(Fails(math.nan, after=100), "lidar_ttc", monkeypatch).f.isfinite().all()
+
+
+class Decides:
+    """A policy of somebody's, who has another use for the word."""
+
+    def predict(
+        self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = True
+    ) -> Any:
+        return np.zeros((len(observation), 2)), state
+
+    def decide(self, observation: Any) -> Any:
+        raise NotImplementedError
+
+
+def test_a_policy_of_anybody_is_queried_through_the_cpu() -> None:
+    assert find_device_driver(as_driver(Decides(), WORLD), torch.device("cuda")) is None

@@ -16,8 +16,8 @@ _OWN = "rare_envs."
 def is_recordable(world: World, driver: Driver) -> bool:
     """Return whether a rollout may be recorded once and played with other x.
 
-    What a recording does is fixed, as are the numbers in it. So it is for drivers that say that they never change
-    (`recordable`), for scenarios and measures of this package, not for what a user wrote.
+    What a recording does is fixed, as are the numbers in it. So it is for drivers whose own class says that they never
+    change (`says_recordable`), for scenarios and measures of this package, not for what a user wrote.
 
     Example:
         >>> from rare_envs.control.idm import IDM
@@ -26,10 +26,23 @@ def is_recordable(world: World, driver: Driver) -> bool:
         (True, False)
     """
     drivers = (driver,) if world.background is None else (driver, world.background)
-    steady = all(getattr(each, "recordable", False) for each in drivers)  # anybody's objects
+    steady = all(says_recordable(each) for each in drivers)
     scripts = (world.scenario.initial, world.scenario.others, world.scenario.driven)
     own = all(script is None or str(getattr(script, "__module__", "")).startswith(_OWN) for script in scripts)
     return steady and own and _is_known(world.measurement.episode_measure)
+
+
+def says_recordable(driver: Any) -> bool:
+    """Return whether a driver's own class says that it never changes; what it says is not inherited.
+
+    Example:
+        >>> from rare_envs.control.idm import IDM
+        >>> class Hesitant(IDM):
+        ...     "May do anything."
+        >>> says_recordable(IDM()), says_recordable(Hesitant())
+        (True, False)
+    """
+    return "recordable" in vars(type(driver)) and bool(driver.recordable)
 
 
 def _is_known(measure: Any) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,6 +19,8 @@ STEPS = 4
 """Numbers of rollouts that are recorded: a tile, a quarter of it, and so on; fewer rollouts are filled up."""
 MOST_RECORDINGS = 12
 """Kept at once, with the memory of their operations; what was not played for longest goes first."""
+_ONE_AT_A_TIME = threading.Lock()
+"""Threads would write their scenarios to the same place, or record each other's operations."""
 
 
 class RecordedRollouts:
@@ -51,6 +54,7 @@ class RecordedRollouts:
         self.sizes = tuple(sorted({max(1, tile // 4**step) for step in range(STEPS)}))
         self._recordings: list[_Recording] = []
         self._unrecordable: list[World] = []
+        """Of which the record broke off."""
 
     def __getstate__(self) -> dict[str, Any]:
         """Return what another process can take over: all but the recordings."""
@@ -69,19 +73,22 @@ class RecordedRollouts:
         if x.device.type != "cuda" or not len(x):
             return rollout(world, self.driver, x)
         with torch.cuda.device(x.device):  # else one of several GPUs would be recorded on the first
-            recording = self._find(world, x)
-            return rollout(world, self.driver, x) if recording is None else recording.play(x)
+            with _ONE_AT_A_TIME:
+                recording = self._find(world, x)
+                if recording is not None:
+                    return recording.play(x)
+            return rollout(world, self.driver, x)
 
     def _find(self, world: World, x: Tensor) -> _Recording | None:
         """Return the recording that x fits, made if need be; None where there cannot be one."""
         size = next((size for size in self.sizes if size >= len(x)), None)
-        if size is None or world in self._unrecordable:
+        if size is None or not is_recordable(world, self.driver) or world in self._unrecordable:
             return None
         for place, known in enumerate(self._recordings):
             if known.x.shape == (size, x.shape[1]) and known.world == world:
                 self._recordings.append(self._recordings.pop(place))
                 return known
-        recording = record(world, self.driver, x, size) if is_recordable(world, self.driver) else None
+        recording = record(world, self.driver, x, size)
         if recording is None:
             self._unrecordable.append(world)
             return None
@@ -126,7 +133,7 @@ def record(world: World, driver: Driver, x: Tensor, size: int) -> _Recording | N
     torch.cuda.current_stream(x.device).wait_stream(aside)
     graph = torch.cuda.CUDAGraph()
     try:
-        with torch.cuda.graph(graph, capture_error_mode="thread_local"):
+        with torch.cuda.graph(graph, stream=aside, capture_error_mode="thread_local"):  # torch's own is of one GPU
             end = rollout(world, driver, place)
     except (RuntimeError, TypeError):  # an operation that waits for the GPU, or leaves it
         torch.cuda.synchronize(x.device)

@@ -9,6 +9,7 @@ import torch
 from stable_baselines3 import DQN
 
 import rare_envs
+from rare_envs.control import actions
 from rare_envs.control.actions import (
     DISCRETE_ACTIONS,
     IDLE,
@@ -106,3 +107,12 @@ def test_agents_of_a_parallel_environment_act_by_index_too() -> None:
     alone.reset(seed=1)
     found, wanted = many.step({"ego": 1})[0], alone.step({"ego": DISCRETE_ACTIONS[1]})[0]
     np.testing.assert_array_equal(found["ego"], wanted["ego"])
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
+def test_what_is_not_finite_becomes_nan_where_nobody_can_look(value: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(actions, "can_look", lambda _: False)
+    physical = to_physical(
+        torch.tensor([[value, 0.5], [0.5, 0.5], [0.5, value]]), 3, torch.tensor([False, False, True])
+    )
+    assert physical.isnan().tolist() == [[True, False], [False, False], [False, False]]  # the last is ignored

@@ -1,6 +1,7 @@
 """A GPU simulates what the CPU does: the same collisions, f to rounding, for every scenario and every kind of ego."""
 
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ import samplers
 import training
 from rare_envs.simulation.recorded import RecordedRollouts
 from rare_envs.simulation.rollout import rollout
+from rare_envs.study.replay import drive_again
 from training.data import scenes_of, synthetic_traffic
 from training.imitation.algorithms.config import Config
 from training.imitation.fit import make_learner, prepare_data, train_learner
@@ -163,6 +165,50 @@ def test_what_fails_on_a_gpu_is_named() -> None:
     assert np.isnan(f).all()
     _, expected = rare_envs.DrivingProblem(CAR_FOLLOWING, ego=model, core="torch").attempt(x)
     assert reasons.keys() == expected.keys()
+
+
+class FailsLate(torch.nn.Module):
+    """Goes straight on until it is closer than 30 m to its lead, and knows nothing then."""
+
+    def forward(self, seen: torch.Tensor) -> torch.Tensor:
+        near = seen[:, 3] < 0.6  # the gap over 50 m
+        return torch.where(near, torch.nan, 0.0)[:, None].expand(-1, 2)
+
+
+@pytest.mark.parametrize("measure", ["ttc", "lidar_ttc", "pet"])
+def test_rows_that_fail_on_a_gpu_are_those_that_fail_on_the_cpu(measure: str) -> None:
+    on_cpu, on_gpu, x = of_both(CAR_FOLLOWING, 60, ego=FailsLate(), measure=measure)
+    (expected, failed), (f, failed_there) = on_cpu.attempt(x), on_gpu.attempt(x)
+    assert 0 < len(failed) < len(x)
+    assert failed_there.keys() == failed.keys()
+    np.testing.assert_allclose(f, expected, atol=ROUNDING)
+
+
+def test_a_policy_that_gives_nan_among_learned_drivers_is_named_and_leaves_the_gpu_at_work() -> None:
+    model = torch.nn.Linear(gym.make(HIGHWAY).observation_space.shape[0], 2)  # type: ignore[index]
+    with torch.no_grad():
+        model.bias += torch.nan
+    problem = rare_envs.DrivingProblem(HIGHWAY, ego=model, device="cuda")
+    x = problem.base.sample(5, np.random.default_rng(0))
+    f, reasons = problem.attempt(x)
+    assert np.isnan(f).all()
+    assert len(reasons) == len(x)
+    assert torch.ones(3, device="cuda").sum() == 3.0
+
+
+def test_threads_do_not_get_each_others_scenarios() -> None:
+    problem = rare_envs.DrivingProblem(CUT_IN, device="cuda")
+    parts = np.split(problem.base.sample(2000, np.random.default_rng(0)), 40)
+    with ThreadPoolExecutor(4) as threads:
+        together = list(threads.map(problem.evaluate, parts))
+    for part, f in zip(parts, together, strict=True):
+        np.testing.assert_array_equal(problem.evaluate(part), f)
+
+
+def test_a_failure_found_on_a_gpu_is_driven_again() -> None:
+    problem = rare_envs.DrivingProblem(HIGHWAY, device="cuda")
+    x = problem.base.sample(1, np.random.default_rng(0))
+    assert drive_again(problem, x[0]).f == pytest.approx(float(problem.evaluate(x)[0]), abs=ROUNDING)
 
 
 def test_an_estimate_on_a_gpu_agrees_with_that_on_the_cpu() -> None:

@@ -5,6 +5,7 @@ import math
 import pytest
 import torch
 
+from rare_envs.traffic import reference_line
 from rare_envs.traffic.reference_line import ReferenceLine
 from rare_envs.traffic.road import Road, i80
 
@@ -58,3 +59,15 @@ def test_curve_has_the_curvature_of_its_knots_and_is_straight_elsewhere() -> Non
     ).heading.tolist()
     assert (before, start) == (0.0, 0.0)
     assert after == end == pytest.approx(0.004 * 25)  # the sum of the curvatures at the knots times their spacing
+
+
+def test_a_place_that_is_nan_has_no_point_where_nobody_can_look(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(reference_line, "can_look", lambda _: False)
+    line = BEND.reference_line
+    assert line is not None
+    s = torch.tensor([10.0, torch.nan, 40.0])
+    point = line.at(s)
+    assert (
+        point.x.isnan().tolist() == point.y.isnan().tolist() == point.heading.isnan().tolist() == [False, True, False]
+    )
+    torch.testing.assert_close(point.x[::2], line.at(s[::2]).x, rtol=0, atol=0)

@@ -7,6 +7,7 @@ import pytest
 import torch
 
 import agents
+from agents.learned.lane_changes import LaneChanges
 from rare_envs.control.idm import IDM
 from rare_envs.control.lane_changing import LaneChangingDriver
 from rare_envs.egos.policy import as_driver
@@ -47,6 +48,23 @@ def test_egos_of_users_are_not_recorded_nor_behind_a_stack() -> None:
     assert not is_recordable(WORLD, Steady())
     behind = replace(as_driver(agents.load_ego("noisy:idm"), WORLD), inner=Steady())
     assert not is_recordable(WORLD, behind)
+
+
+def test_what_a_user_made_of_a_driver_of_this_package_is_not_recorded() -> None:
+    class Hesitant(IDM):
+        """Its class says nothing, and what it inherits does not count."""
+
+    class Bold(LaneChanges):
+        """Rules of one's own."""
+
+    assert not is_recordable(WORLD, Hesitant())
+    behind = replace(as_driver(agents.load_ego("noisy:idm"), WORLD), inner=Hesitant())
+    assert not is_recordable(WORLD, behind)
+    driver: Any = agents.load_driver("mgail5")
+    changed = replace(driver, changes=Bold())
+    assert not is_recordable(World(HIGHWAY, background=changed), IDM())
+    assert is_recordable(WORLD, agents.LearnedEgo(driver))
+    assert not is_recordable(WORLD, agents.LearnedEgo(changed))
 
 
 @pytest.mark.parametrize("measure", MEASURES)
