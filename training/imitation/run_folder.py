@@ -75,7 +75,7 @@ def train_driver(
     driver = driver_of(policy.cpu(), config)
     provenance = Provenance(
         kind=config.method,
-        command=command_of(source, config),
+        command=command_of(source, config, device),
         data=source.description,
         data_licence=source.licence,
         metrics=header_metrics(data.test, driver) if measured and data.test is not None else {},
@@ -99,13 +99,14 @@ def driver_of(policy: Policy, config: Config) -> LearnedDriver:
     return LearnedDriver(frozen, config.colour, acceleration, yaw_rate, name=config.method)
 
 
-def command_of(source: Source, config: Config) -> str:
-    """Return the command that repeats a training, without its folders."""
+def command_of(source: Source, config: Config, device: str = "cpu") -> str:
+    """Return the command that repeats a training on a device, without its folders."""
     words = []
     for option in fields(Config):
         value = getattr(config, option.name)  # a field by its name
         if option.name in ("method", "seed") or value != option.default:
             words += _option(option.name, value)
+    words += [] if device == "cpu" else ["--device", device]
     return f"python -m training.imitation.train {source.options} {shlex.join(words)}"
 
 

@@ -34,21 +34,23 @@ def test_the_command_line_has_every_setting():
             assert getattr(default, "value", default) == option.default, option.name
 
 
-def test_a_command_repeats_its_training(made_up, monkeypatch, tmp_path):
+@pytest.mark.parametrize("device", ["cpu", "cuda:1"])
+def test_a_command_repeats_its_training(device, made_up, monkeypatch, tmp_path):
     """What is written into a file, read by the command line, gives the same settings."""
     import typer
     from typer.testing import CliRunner
 
     config = tiny(method="mgail", seed=4, learned_model=True, colour=WHITE_NOISE, clone_weight=(0.2, 0.1))
     found = []
-    monkeypatch.setattr(command_line, "train_driver", lambda *given, **how: found.append(given) or tmp_path)
+    monkeypatch.setattr(command_line, "train_driver", lambda *given, **how: found.append((*given, how)) or tmp_path)
     app = typer.Typer()
     app.command()(command_line.main)
-    words = command_of(made_up, config).split()[3:]
+    words = command_of(made_up, config, device).split()[3:]
     result = CliRunner().invoke(app, [*words, "--out", str(tmp_path)])
     assert result.exit_code == 0, result.output
     assert found[0][1] == config
     assert found[0][0] == Source("data", Path("tables"))
+    assert found[0][-1]["device"] == device
 
 
 @pytest.mark.parametrize(

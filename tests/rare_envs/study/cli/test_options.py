@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import fields
+from pathlib import Path
 
 import pytest
 import typer
@@ -10,7 +11,7 @@ from rare_envs.study.cli.options import EstimateOptions, NoiseChoice, ScenarioOp
 from rare_envs.study.ego_check.subprocess_check import EgoCheckRequest
 from rare_envs.study.question import Question
 from rare_envs.version import __version__
-from tests.rare_envs.study.refusals import Cli
+from tests.rare_envs.study.refusals import FOLLOWING, Cli, assert_refused
 
 
 def test_defaults_are_those_of_a_question() -> None:
@@ -49,3 +50,23 @@ def test_the_command_line_takes_them_and_tells_its_version(cli: Cli) -> None:
     assert json.loads(found.stdout)["n_sim"] == 100
     version = cli("--version")
     assert (version.exit_code, version.stdout) == (0, f"rare-envs {__version__}\n")
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        ("estimate", FOLLOWING),
+        ("compare", "idm", "human", FOLLOWING),
+        ("plan", FOLLOWING),
+        ("risk", "idm"),
+        ("train-ego", FOLLOWING, "--steps", "10"),
+        ("train-drivers", "--data", "tables", "--out", "run", "--method", "bc"),
+    ],
+    ids=lambda command: command[0],
+)
+def test_a_device_that_is_not_here_is_refused_by_each_command(
+    command: tuple[str, ...], cli: Cli, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert_refused(cli(*command, "--device", "cuda:99"), "'cuda:99' is not here", "take 'cpu'")
+    assert list(tmp_path.iterdir()) == []
