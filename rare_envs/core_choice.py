@@ -115,7 +115,7 @@ class CoreChoice:
             return known(world, x)
         try:
             end = known(world, x)
-        except Exception:  # the policy is the user's: anything may happen in it
+        except (Exception, SystemExit):  # the policy is the user's: anything may happen in it
             return None
         return None if has_nan(end) else end
 

@@ -119,7 +119,8 @@ class DrivingProblem:
                 says which it used (`DrivingProblem.core`).
             device: Where torch simulates: "cpu", or a GPU, "cuda" or "cuda:1". Networks of learned drivers and dense
                 layers of Stable-Baselines3 are copied there, a torch module stays on its own device, and other
-                policies are queried through the CPU. Rounding differs by device.
+                policies are queried through the CPU. A `Driver` of your own is shown episodes there; it is moved by
+                its method `to`, if it has one. Rounding differs by device.
             **make_kwargs: Further keyword arguments of `gym.make` for this id. Without an `observation` the ego's
                 `observation_space` decides: a `Dict` names the kinds, the space of the lidar stands for "lidar", and
                 any other for "features".

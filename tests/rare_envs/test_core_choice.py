@@ -110,7 +110,7 @@ class Fails(torch.nn.Module):
         self.left -= 1
         if self.left < 0:
             if self.answer == 0.0:
-                raise ZeroDivisionError("the module's own error")
+                raise SystemExit(3)
             actions[0, 1] = self.answer
         return actions
 
