@@ -78,6 +78,6 @@ def test_a_measure_object_goes_with_an_ego_that_has_noise_of_its_own() -> None:
 
 def test_what_a_problem_takes_besides_is_listed_too() -> None:
     with pytest.raises(
-        TypeError, match=r"'cor' \(did you mean 'core'\?\); it takes ego, core, chunk_size, observation"
+        TypeError, match=r"'cor' \(did you mean 'core'\?\); it takes ego, core, chunk_size, device, observation"
     ):
         rare_envs.DrivingProblem("rare_envs/CutIn-v0", cor="numba")

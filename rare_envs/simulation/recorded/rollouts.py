@@ -88,7 +88,12 @@ class RecordedRollouts:
             if known.x.shape == (size, x.shape[1]) and known.world == world:
                 self._recordings.append(self._recordings.pop(place))
                 return known
-        recording = record(world, self.driver, x, size)
+        try:
+            recording = record(world, self.driver, x, size)
+        except torch.OutOfMemoryError:  # recordings keep their memory
+            self._recordings = []
+            torch.cuda.empty_cache()
+            recording = record(world, self.driver, x, size)
         if recording is None:
             self._unrecordable.append(world)
             return None
@@ -124,6 +129,9 @@ def record(world: World, driver: Driver, x: Tensor, size: int) -> _Recording | N
         driver: The ego, on the GPU.
         x: Scenarios, shape (B, d), on the GPU.
         size: Number of scenarios of the record.
+
+    Raises:
+        torch.OutOfMemoryError: The GPU has too little memory for them.
     """
     place = x[0].expand(size, -1).clone()
     aside = torch.cuda.Stream(x.device)  # type: ignore[no-untyped-call]
@@ -135,6 +143,8 @@ def record(world: World, driver: Driver, x: Tensor, size: int) -> _Recording | N
     try:
         with torch.cuda.graph(graph, stream=aside, capture_error_mode="thread_local"):  # torch's own is of one GPU
             end = rollout(world, driver, place)
+    except torch.OutOfMemoryError:
+        raise
     except (RuntimeError, TypeError):  # an operation that waits for the GPU, or leaves it
         torch.cuda.synchronize(x.device)
         return None

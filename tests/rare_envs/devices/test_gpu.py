@@ -123,7 +123,8 @@ def test_discrete_actions_and_a_camera_go_through_the_cpu() -> None:
     on_cpu, on_gpu, x = of_both(CAR_FOLLOWING, 200, ego=model, action="meta")
     assert_same(on_cpu.evaluate(x), on_gpu.evaluate(x))
     on_cpu, on_gpu, x = of_both(CAR_FOLLOWING, 8, ego="vision")
-    assert_same(on_cpu.evaluate(x), on_gpu.evaluate(x))
+    # bytes of pixels round differently, and its network differs by that from there on
+    np.testing.assert_allclose(on_cpu.evaluate(x), on_gpu.evaluate(x), atol=10 * ROUNDING)
 
 
 @pytest.mark.parametrize(

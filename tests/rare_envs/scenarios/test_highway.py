@@ -208,7 +208,7 @@ def test_wrong_arguments_are_refused(kwargs, message):
         (
             "measur",
             r"Highway-v0 takes no .* 'measur' \(did you mean 'measure'\?\); "
-            r"it takes (ego, core, chunk_size, )?observation,",
+            r"it takes (ego, core, chunk_size, device, )?observation,",
         ),
         ("speed", r"'speed' \(reset takes it as an option\)"),
         ("wheels", r"'wheels'; it takes"),

@@ -75,3 +75,19 @@ def test_a_record_that_broke_off_is_not_tried_again(monkeypatch: pytest.MonkeyPa
     assert recorded._find(World(CUT_IN), X) is None
     assert recorded._find(World(CUT_IN), X[:1]) is None
     assert len(tried) == 1
+
+
+def test_where_memory_is_short_the_recordings_go_first(
+    made: list[tuple[World, int]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    recorded, record = RecordedRollouts(IDM(), 64), rollouts.record
+    recorded._find(World(CUT_IN), X[:1])
+
+    def record_if_there_is_room(*given: Any) -> Any:
+        if recorded._recordings:
+            raise torch.OutOfMemoryError
+        return record(*given)
+
+    monkeypatch.setattr(rollouts, "record", record_if_there_is_room)
+    assert recorded._find(World(CUT_IN), X) is not None
+    assert [len(each.x) for each in recorded._recordings] == [4]
