@@ -100,7 +100,7 @@ def _weigh_crashes(
 
     The kind of each is added to `by_scenario`.
     """
-    if estimate.sample is None:
+    if estimate.sample is None or not estimate.p:  # no failures, or the search's alone
         return {}, None
     replayed = replay_failures(problem, estimate)
     failures = replayed.failures

@@ -141,7 +141,8 @@ ActionOption = Annotated[
 DeviceOption = Annotated[
     str,
     typer.Option(
-        help="Where torch simulates: cpu, or a GPU (cuda, cuda:1).", autocompletion=complete_words("cpu", "cuda")
+        help="Where torch simulates: cpu, or a GPU (cuda, cuda:1), which leaves numba out: docs/speed.md.",
+        autocompletion=complete_words("cpu", "cuda"),
     ),
 ]
 EnsembleRunOption = Annotated[

@@ -76,7 +76,8 @@ def check_discovery(
     if share <= settings.max_unseen_share:
         return []
     searches = f"{discovery.lineages:.0f}"
+    size = f"with probability up to {p * share / (1 - share):.1e} ({share:.0%} of p)" if p else "of unknown probability"
     return [
         f"Only {searches} independent search{'' if searches == '1' else 'es'} reached failure: further failure regions "
-        f"with probability up to {p * share / (1 - share):.1e} ({share:.0%} of p) cannot be excluded."
+        f"{size} cannot be excluded."
     ]

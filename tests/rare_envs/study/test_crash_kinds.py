@@ -102,3 +102,13 @@ def test_a_kind_that_the_list_lacks_is_added_with_its_crash(report: Report) -> N
     (added,) = [k for k, crash in enumerate(found.listed) if crash is not None and crash["kind"] == "rear_end"]
     assert len(found.listed) == len(estimate.failures) == len(short) + 1
     assert (estimate.failures.x[added] == failures.x[kinds.index("rear_end")]).all()
+
+
+def test_failures_that_the_search_alone_met_have_kinds_and_no_shares(report: Report) -> None:
+    sample = report.estimate.sample
+    assert sample is not None
+    searched = replace(report.estimate, p=0.0, sample=replace(sample, weights=np.zeros_like(sample.weights)))
+    kinds = classify_failures(report.study.problem, searched)
+    assert not kinds.unknown
+    assert kinds.shares == {}
+    assert kinds.listed == report.kinds.listed

@@ -102,3 +102,8 @@ def test_few_lineages(lineages, warns):
         assert found[0].startswith("Only 2 independent searches reached")
     if lineages == 1:
         assert found[0].startswith("Only 1 independent search reached")
+
+
+def test_where_the_final_draws_met_none_nothing_is_said_in_units_of_p():
+    (found,) = check_discovery(0.0, Discovery(1), 0.95)
+    assert found.endswith("further failure regions of unknown probability cannot be excluded.")
