@@ -20,6 +20,7 @@ import typer
 import rare_envs
 import samplers
 from benchmarks.simulation.throughput import CAR_FOLLOWING, CUT_IN, HIGHWAY, ppo
+from benchmarks.simulation.timing import seconds
 from rare_envs.devices import find_device
 from rare_envs.simulation.rollout import rollout
 from rare_envs.threads import use_one_thread
@@ -51,12 +52,7 @@ ENVIRONMENTS = (256, 4096)
 
 def least_time(work: Callable[[], object], repeat: int = 3) -> float:
     """Return the least wall time of some calls [s]."""
-    best = float("inf")
-    for _ in range(repeat):
-        start = time.perf_counter()
-        work()
-        best = min(best, time.perf_counter() - start)
-    return best
+    return seconds(work, repeat, time.perf_counter)
 
 
 def make_problem(name: str, **where: Any) -> Any:
@@ -79,8 +75,8 @@ def measure_rollouts(name: str, batches: tuple[int, ...], device: str) -> dict[s
         first = time.perf_counter() - start
         rows[str(batch)] = {
             "first_seconds": first,
-            "seconds": (seconds := least_time(lambda x=x: problem.evaluate(x))),
-            "vehicle_steps": batch * steps / seconds,
+            "seconds": (taken := least_time(lambda x=x: problem.evaluate(x))),
+            "vehicle_steps": batch * steps / taken,
         }
     in_steps = _in_steps(problem, some[:1024], device)
     cores = {}
