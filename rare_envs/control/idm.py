@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 from numbers import Real
 from typing import Any, ClassVar, Protocol
 
@@ -11,6 +12,7 @@ import torch
 from torch import Tensor
 
 from rare_envs.control.steering import lane_keeping
+from rare_envs.devices import scalars
 from rare_envs.traffic.lead import Lead
 from rare_envs.traffic.road import Road
 from rare_envs.traffic.state import VEHICLE_LENGTH, State
@@ -96,6 +98,11 @@ class IDM:
         """1 / (2 sqrt(a_max b)) [s^2/m], the factor of v dv in s*."""
         return 0.5 / math.sqrt(self.max_acceleration * self.comfortable_deceleration)
 
+    @cached_property
+    def _interaction_numbers(self) -> tuple[float, ...]:
+        jam = (self.jam_distance, self.jam_distance_speed)
+        return (self.time_headway, self.closing_gain, *jam, self.added_length)
+
     @classmethod
     def highway_env(cls, desired_speed: float) -> IDM:
         """Return HighwayEnv's `IDMVehicle`: distances of centres, jam distance 10 m, accelerations within 6 m/s^2."""
@@ -112,7 +119,7 @@ class IDM:
         Returns:
             Acceleration [m/s^2], shape (B,).
         """
-        ratio = speed / (self.desired_speed if desired_speed is None else desired_speed)
+        ratio = speed / (scalars((self.desired_speed,), speed)[0] if desired_speed is None else desired_speed)
         return self.combine(ratio, self.interaction(speed, ratio, lead))
 
     def interaction(self, speed: Tensor, ratio: Tensor, lead: Lead) -> Tensor:
@@ -123,22 +130,24 @@ class IDM:
             ratio: Its speed as a share of its desired speed.
             lead: The lead.
         """
-        headway = self.time_headway + lead.closing_speed * self.closing_gain
-        desired_gap = self.jam_distance + speed * (headway.clamp(min=0.0) if self.cut_off else headway)
+        time, gain, jam, jam_speed, added = scalars(self._interaction_numbers, speed)
+        headway = time + lead.closing_speed * gain
+        desired_gap = jam + speed * (headway.clamp_min(0.0) if self.cut_off else headway)
         if self.jam_distance_speed:
-            desired_gap = desired_gap + self.jam_distance_speed * ratio.clamp(min=MIN_RATIO).sqrt()
-        share: Tensor = desired_gap / (lead.gap + self.added_length).clamp(min=NEAR_ZERO)
+            desired_gap = desired_gap + jam_speed * ratio.clamp_min(MIN_RATIO).sqrt()
+        gap = lead.gap + added if self.added_length else lead.gap
+        share: Tensor = desired_gap / gap.clamp_min(NEAR_ZERO)
         return share.square()
 
     def combine(self, ratio: Tensor, interaction: Tensor) -> Tensor:
         """Return the acceleration [m/s^2] from speed / desired speed and (s*/gap)^2, of one shape."""
         free = ratio.square().square() if self.exponent == 4.0 else ratio.pow(self.exponent)
-        acceleration: Tensor = self.max_acceleration * (1.0 - free - interaction)
-        return acceleration.clamp(min=-self.max_deceleration)
+        one, largest = scalars((1.0, self.max_acceleration), ratio)
+        acceleration: Tensor = largest * (one - free - interaction)
+        return acceleration.clamp_min(-self.max_deceleration)
 
     def act(self, episode: EgoScene, memory: Any) -> tuple[Tensor, Any]:
         """Return IDM behind the lead and lane keeping across, shape (B, 2); there is no memory."""
-        state = episode.state
-        speed = state.speed[:, 0]
-        steering = lane_keeping(state.y[:, 0], state.heading[:, 0], speed, episode.road)
-        return torch.stack((self.acceleration(speed, episode.lead), steering), dim=1), memory
+        _, y, heading, speed = episode.state.vehicle(0)
+        steering = lane_keeping(y, heading, speed, episode.road)
+        return torch.stack((self.acceleration(speed, episode.lead), steering)).T, memory

@@ -28,6 +28,19 @@ def constant(values: Any, like: Tensor) -> Tensor:
     return _make_constant(values, like.dtype, like.device)
 
 
+def scalars(numbers: tuple[float, ...], like: Tensor) -> tuple[Tensor, ...]:
+    """Return numbers as tensors of shape (), made once, as `constant`.
+
+    An operation with a few rows takes half as long with such a tensor as with a number, of which torch makes one.
+
+    Example:
+        >>> half, two = scalars((0.5, 2.0), torch.zeros(3))
+        >>> half * torch.ones(2) + two
+        tensor([2.5000, 2.5000])
+    """
+    return _make_scalars(numbers, like.dtype, like.device)
+
+
 def indices(numbers: tuple[int, ...], like: Tensor) -> Tensor:
     """Return indices, int64, on the device of a tensor, made once, as `constant`.
 
@@ -42,6 +55,11 @@ def indices(numbers: tuple[int, ...], like: Tensor) -> Tensor:
 def _make_constant(values: Any, dtype: torch.dtype, device: torch.device) -> Tensor:
     with torch.inference_mode(False):  # made under it they could not be used for gradients later
         return torch.tensor(values, dtype=dtype, device=device)
+
+
+@cache  # likewise
+def _make_scalars(numbers: tuple[float, ...], dtype: torch.dtype, device: torch.device) -> tuple[Tensor, ...]:
+    return tuple(_make_constant(number, dtype, device) for number in numbers)
 
 
 def fixed_draws(shape: tuple[int, ...], seed: int, like: Tensor) -> Tensor:
@@ -83,7 +101,7 @@ def can_look(value: Tensor) -> bool:
         >>> can_look(torch.zeros(2)), can_look(torch.zeros(2, device="meta"))
         (True, False)
     """
-    return value.device.type == "cpu"
+    return value.is_cpu
 
 
 def may_hold(condition: Tensor) -> bool:
@@ -108,4 +126,7 @@ def are_zero(*values: Tensor) -> bool:
     """
     if torch.is_grad_enabled() or not can_look(values[0]):
         return False
-    return not any(bool(value.any()) for value in values)
+    for value in values:  # noqa: SIM110  (a third of the time of `any`)
+        if value.count_nonzero():
+            return False
+    return True

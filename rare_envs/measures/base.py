@@ -7,7 +7,7 @@ from typing import Any, Protocol, TypeAlias, runtime_checkable
 import torch
 from torch import Tensor
 
-from rare_envs.devices import may_hold
+from rare_envs.devices import may_hold, scalars
 from rare_envs.measures.moment import Moment
 
 COLLISION = -1.0
@@ -201,12 +201,12 @@ class Measure:
 
     def _with_collisions(self, state: Tensor, f: Tensor, moment: Moment, before: Tensor, now: Tensor) -> Tensor:
         """Return f of the moments, but in episodes with a collision what that counts as."""
-        worth: Tensor | float
+        worth: Tensor
         if self.collision is None:
             worth = state
         elif callable(self.collision):
             new = now & ~before
             worth = torch.where(new, self.collision(moment), state) if may_hold(new) else state
         else:
-            worth = self.collision
+            (worth,) = scalars((self.collision,), f)
         return torch.where(now, worth, f)

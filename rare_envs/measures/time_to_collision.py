@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor
 
-from rare_envs.devices import are_zero
+from rare_envs.devices import are_zero, scalars
 from rare_envs.measures.moment import GAP_MIN, STILL, Moment, acceleration_of_lead, gap_of
 from rare_envs.sensors.lidar import beam_angles
 from rare_envs.sensors.perception import RANGE_COLUMNS, RATE_COLUMNS, find_vehicles_met
@@ -43,9 +43,9 @@ def ttc(moment: Moment) -> Tensor:
         2.5
     """
     to_lead = _time_to_lead(moment)
-    if are_zero(moment.state.heading[:, 0]):  # straight on there is no edge
-        return to_lead.clamp(max=TTC_MAX)
-    return torch.minimum(to_lead, time_to_edge(moment)).clamp(max=TTC_MAX)
+    if are_zero(moment.state.heading.select(1, 0)):  # straight on there is no edge
+        return to_lead.clamp_max(TTC_MAX)
+    return torch.minimum(to_lead, time_to_edge(moment)).clamp_max(TTC_MAX)
 
 
 def ttc_terms(moment: Moment) -> Tensor:
@@ -59,7 +59,7 @@ def ttc_terms(moment: Moment) -> Tensor:
 def _time_to_lead(moment: Moment) -> Tensor:
     """Return gap / closing speed [s], without a cap, shape (B,)."""
     lead = moment.lead
-    return lead.gap.clamp(min=GAP_MIN) / lead.closing_speed.clamp(min=STILL)
+    return lead.gap.clamp_min(GAP_MIN) / lead.closing_speed.clamp_min(STILL)
 
 
 def time_to_edge(moment: Moment) -> Tensor:
@@ -68,10 +68,11 @@ def time_to_edge(moment: Moment) -> Tensor:
     Way to the edge / speed across the road towards it; without a cap, up to 20 000 s for an ego that drives straight.
     """
     state, road = moment.state, moment.road
-    across = state.speed[:, 0] * torch.sin(state.heading[:, 0])
-    offset = state.y[:, 0] - road.middle
-    room = road.lanes * road.width / 2 - offset * torch.sign(across)
-    return room.clamp(min=GAP_MIN) / across.abs().clamp(min=STILL)
+    _, y, heading, speed = state.vehicle(0)
+    middle, half = scalars((road.middle, road.lanes * road.width / 2), y)
+    across = speed * torch.sin(heading)
+    room = half - (y - middle) * torch.sign(across)
+    return room.clamp_min(GAP_MIN) / across.abs().clamp_min(STILL)
 
 
 def lidar_ttc(moment: Moment) -> Tensor:

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from rare_envs.devices import scalars
 from rare_envs.distributions.space import Parameter
 from rare_envs.traffic.road import Road
 from rare_envs.traffic.state import State
@@ -164,9 +165,9 @@ def keep_straight(state: State, acceleration: Tensor | float, dt: float) -> Othe
         >>> keep_straight(state, -2.0, dt=0.5).speed.tolist()
         [[19.0]]
     """
-    speed = state.speed[:, 1:]
-    after = (speed + acceleration * dt).clamp(min=0.0)
-    return Others(state.x[:, 1:] + speed * dt, state.y[:, 1:], state.heading[:, 1:], after)
+    speed, (tick,) = state.speed[:, 1:], scalars((dt,), state.speed)
+    after = (speed + acceleration * tick).clamp_min(0.0)
+    return Others(state.x[:, 1:] + speed * tick, state.y[:, 1:], state.heading[:, 1:], after)
 
 
 def drive_points(state: State, action: Tensor, dt: float, road: Road) -> Others:

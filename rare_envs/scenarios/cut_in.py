@@ -9,11 +9,12 @@ import torch
 from torch import Tensor
 
 from rare_envs.control.idm import IDM
+from rare_envs.devices import scalars
 from rare_envs.distributions.space import Parameter
 from rare_envs.scenarios.base import DATA, SPEED_RANGE, Others, Scenario, columns
 from rare_envs.traffic.lead import Lead
 from rare_envs.traffic.road import straight
-from rare_envs.traffic.state import VEHICLE_LENGTH, State
+from rare_envs.traffic.state import VEHICLE_LENGTH, State, fields_from_columns
 
 CUT_IN_DURATION = 4.0
 """Duration of the lane change where x has no column for it [s]."""
@@ -69,9 +70,10 @@ def bezier(progress: Tensor, length: Tensor, offset: Tensor) -> tuple[Tensor, Te
     Returns:
         y [m] and slope dy/dx, shape (B,) each.
     """
+    one, two, three, six = scalars((1.0, 2.0, 3.0, 6.0), progress)
     t = (progress / length).clamp(0.0, 1.0)
-    y = offset * (1.0 + t * t * (2.0 * t - 3.0))
-    slope = offset * (6.0 * t * (t - 1.0)) / length
+    y = offset * (one + t * t * (two * t - three))
+    slope = offset * (six * t * (t - one)) / length
     return y, slope
 
 
@@ -81,12 +83,11 @@ def others(state: State, dt: float) -> Others:
     The released code of Tian et al. also steers the cutter along a Bezier (30 m long, by pure pursuit, with the ego's
     IDM). Ours is exactly on the curve, whose length grows with the speed, and its desired speed is its initial one.
     """
-    desired_speed = state.theta[:, 3]
-    speed, lead_speed = state.speed[:, 1], state.speed[:, 2]
-    distance = state.x[:, 2] - state.x[:, 1]
-    lead = Lead(distance - VEHICLE_LENGTH, speed - lead_speed * torch.cos(state.heading[:, 1]))
-    acceleration = CUTTER_IDM.acceleration(speed, lead, desired_speed)
-    return _advance(state, (speed + acceleration * dt).clamp(min=0.0), lead_speed, dt)
+    (x, _, heading, speed), (lead_x, _, _, lead_speed) = state.vehicle(1), state.vehicle(2)
+    tick, body = scalars((dt, VEHICLE_LENGTH), x)
+    lead = Lead(lead_x - x - body, speed - lead_speed * torch.cos(heading))
+    acceleration = CUTTER_IDM.acceleration(speed, lead, state.theta[:, 3])
+    return _advance(state, (speed + acceleration * tick).clamp_min(0.0), lead_speed, dt)
 
 
 def driven(state: State, action: Tensor, dt: float) -> Others:
@@ -98,15 +99,12 @@ def driven(state: State, action: Tensor, dt: float) -> Others:
 def _advance(state: State, speed: Tensor, lead_speed: Tensor, dt: float) -> Others:
     """Return both after the tick: the cutter on its path, the lead straight on, with new speeds (B,)."""
     start, length, offset, _ = state.theta.unbind(dim=1)
-    x = state.x[:, 1] + state.speed[:, 1] * torch.cos(state.heading[:, 1]) * dt
+    (x, _, heading, old_speed), (lead_x, _, _, lead_old_speed) = state.vehicle(1), state.vehicle(2)
+    tick, nothing = scalars((dt, 0.0), x)
+    x, lead_x = x + old_speed * torch.cos(heading) * tick, lead_x + lead_old_speed * tick
     y, slope = bezier(x - start, length, offset)
-    zero = torch.zeros_like(y)
-    return Others(
-        x=columns(x, state.x[:, 2] + state.speed[:, 2] * dt),
-        y=columns(y, zero),
-        heading=columns(torch.atan(slope), zero),
-        speed=columns(speed, lead_speed),
-    )
+    zero = nothing.expand_as(y)
+    return Others(*fields_from_columns((x, lead_x), (y, zero), (torch.atan(slope), zero), (speed, lead_speed)))
 
 
 TIMED_BASES = ("us101", "us101-closing", "i80", "i80-closing", "highway")

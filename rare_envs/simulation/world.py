@@ -36,7 +36,7 @@ from rare_envs.simulation.sensing import Sensing, WeatherDistributions
 from rare_envs.traffic.lead import lead_of
 from rare_envs.traffic.overlap import ego_overlaps, others_overlap
 from rare_envs.traffic.road import WorldPose
-from rare_envs.traffic.state import State
+from rare_envs.traffic.state import State, fields_from_columns
 from rare_envs.traffic.vehicle_models import bicycle
 
 
@@ -266,10 +266,9 @@ class World:
             The episodes one tick later.
         """
         old, dt, road, background_state = episode.state, self.clock.dt, episode.road, episode.background_state
-        steered = action if commanded is None else action[:, 0]
-        ego = (old.x[:, 0], old.y[:, 0], old.heading[:, 0], old.speed[:, 0])
-        curvature = None if road.reference_line is None else road.curvature(old.x[:, 0])
-        moved = bicycle(*ego, steered[:, 0], steered[:, 1], dt, curvature)
+        ego, (acceleration, steering) = old.vehicle(0), (action if commanded is None else action[:, 0]).unbind(1)
+        curvature = None if road.reference_line is None else road.curvature(ego[0])
+        moved = bicycle(*ego, acceleration, steering, dt, curvature)
         driver_actions = None
         if self.background is None or background_state is None:
             others = self.scenario.others(old, dt)
@@ -281,8 +280,8 @@ class World:
         overridden = episode.overridden
         if commanded is not None or overridden is not None:
             others, overridden = apply_overrides(episode, action, commanded, others, driver_actions, dt)
-        x, y, heading, speed = (torch.cat((first[None], rest.T)).T for first, rest in zip(moved, others, strict=True))
-        state = State(x, y, heading, speed, old.theta)
+        fields = ((first, *rest.unbind(1)) for first, rest in zip(moved, others, strict=True))
+        state = State(*fields_from_columns(*fields), old.theta)
         place = self._place(state)
         hit = ego_overlaps(state, road, place).any(dim=1) | road.off_road(state.y[:, 0])
         if self.measurement.collisions == "any":

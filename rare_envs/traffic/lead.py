@@ -5,6 +5,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from rare_envs.devices import scalars
 from rare_envs.traffic.road import Road
 from rare_envs.traffic.state import VEHICLE_LENGTH, VEHICLE_WIDTH, State
 
@@ -45,16 +46,21 @@ def lead_of(state: State, road: Road) -> Lead:
         >>> lead.gap.item(), lead.closing_speed.item()  # vehicles are 5 m long
         (25.0, 5.0)
     """
-    x, y = state.x[:, 0], state.y[:, 0]
-    lane_y, reach = road.centre_of(y), (road.width + VEHICLE_WIDTH) / 2
-    ahead = state.x[:, 1:] - x[:, None]
-    relevant = (ahead >= 0) & ((state.y[:, 1:] - lane_y[:, None]).abs() <= reach)
-    along = state.speed[:, 1:] * torch.cos(state.heading[:, 1:] - state.heading[:, :1])
-    nearest, lead_speed = torch.full_like(x, torch.inf), state.speed[:, 0]
-    for way, seen, speed in zip(ahead.unbind(1), relevant.unbind(1), along.unbind(1), strict=True):
-        nearer = seen & (way <= nearest)
-        nearest, lead_speed = torch.where(nearer, way, nearest), torch.where(nearer, speed, lead_speed)
-    return Lead(nearest - VEHICLE_LENGTH, state.speed[:, 0] - lead_speed)
+    others = state.x.shape[1] - 1
+    (x, others_x), (y, others_y) = (field.split_with_sizes((1, others), 1) for field in state[:2])
+    own_heading, *headings = state.heading.unbind(1)
+    own_speed, *speeds = state.speed.unbind(1)
+    zero, reach, nowhere, length = scalars(
+        (0.0, (road.width + VEHICLE_WIDTH) / 2, torch.inf, VEHICLE_LENGTH), own_speed
+    )
+    ahead = others_x - x
+    relevant = (ahead >= zero) & ((others_y - road.centre_of(y)).abs() <= reach)
+    nearest, heading, speed = nowhere, own_heading, own_speed
+    for way, seen, its_heading, its_speed in zip(ahead.unbind(1), relevant.unbind(1), headings, speeds, strict=True):
+        nearer = seen if nearest is nowhere else seen & (way <= nearest)
+        nearest = torch.where(nearer, way, nearest)
+        heading, speed = torch.where(nearer, its_heading, heading), torch.where(nearer, its_speed, speed)
+    return Lead(nearest - length, own_speed - speed * torch.cos(heading - own_heading))
 
 
 def lead_index(state: State, road: Road) -> Tensor:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from rare_envs.devices import can_look, indices
+from rare_envs.devices import can_look, indices, may_hold, scalars
 from rare_envs.traffic.oriented_boxes import DIAGONAL, boxes_overlap
 from rare_envs.traffic.pairs import pairs
 from rare_envs.traffic.road import Road, WorldPose
@@ -27,9 +27,7 @@ def ego_overlaps(state: State, road: Road, pose: WorldPose | None = None) -> Ten
     Returns:
         Boolean, shape (B, N - 1).
     """
-    x, y, heading = _in_world(state, road, pose)
-    dx, dy = x[:, 1:] - x[:, :1], y[:, 1:] - y[:, :1]
-    return _overlap_where_near(dx, dy, heading[:, :1].expand_as(dx), heading[:, 1:])
+    return _overlap_of(_in_world(state, road, pose), slice(0, 1), slice(1, None))
 
 
 def others_overlap(state: State, road: Road, pose: WorldPose | None = None) -> Tensor:
@@ -64,19 +62,20 @@ def _in_world(state: State, road: Road, pose: WorldPose | None) -> tuple[Tensor,
     return road.to_world(state.x, state.y, state.heading) if pose is None else pose[:3]
 
 
-def _overlap_of(place: tuple[Tensor, Tensor, Tensor], first: Tensor, second: Tensor) -> Tensor:
-    """Return which of P pairs of vehicles overlap, boolean, shape (B, P)."""
+def _overlap_of(place: tuple[Tensor, Tensor, Tensor], first: Tensor | slice, second: Tensor | slice) -> Tensor:
+    """Return which of P pairs of vehicles overlap, boolean, shape (B, P); one may be compared with several."""
     x, y, heading = place
-    dx, dy = x[:, second] - x[:, first], y[:, second] - y[:, first]
-    return _overlap_where_near(dx, dy, heading[:, first], heading[:, second])
-
-
-def _overlap_where_near(dx: Tensor, dy: Tensor, heading: Tensor, other_heading: Tensor) -> Tensor:
-    """Return `boxes_overlap` of pairs (B, P), compared only where centres are near."""
-    near: Tensor = (dx.abs() < DIAGONAL) & (dy.abs() < DIAGONAL)
+    dx, (diagonal,) = x[:, second] - x[:, first], scalars((DIAGONAL,), x)
+    near: Tensor = dx.abs() < diagonal
+    if not may_hold(near):  # of a few rows mostly
+        return near
+    dy = y[:, second] - y[:, first]
+    near = near & (dy.abs() < diagonal)
+    other = heading[:, second]
+    one = heading[:, first].expand_as(other)
     if not can_look(near):
-        return near & boxes_overlap(dx, dy, heading, other_heading)
+        return near & boxes_overlap(dx, dy, one, other)
     if bool(near.any()):
         at = near.nonzero(as_tuple=True)
-        near[at] = boxes_overlap(dx[at], dy[at], heading[at], other_heading[at])
+        near[at] = boxes_overlap(dx[at], dy[at], one[at], other[at])
     return near

@@ -15,6 +15,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from rare_envs.devices import scalars
 from rare_envs.traffic.reference_line import ReferenceLine
 
 
@@ -95,10 +96,11 @@ class Road:
             lane = self.lane_of(y)
             return (left[lane] + right[lane]) / 2
         first = self.centre(0)
+        start, width = scalars((first, self.width), y)
         if self.lanes == 1:
-            return torch.full_like(y, first)
-        lane = torch.round((y - first if first else y) / self.width).clamp(0, self.lanes - 1)
-        return lane * self.width + first if first else lane * self.width
+            return start.expand_as(y)
+        lane = torch.round((y - start if first else y) / width).clamp(0, self.lanes - 1)
+        return lane * width + start if first else lane * width
 
     def markers(self, y: Tensor) -> tuple[Tensor, Tensor]:
         """Return the distances to the left and right marker of the own lane [m], negative beyond it: off the road."""
@@ -108,7 +110,8 @@ class Road:
 
     def off_road(self, y: Tensor) -> Tensor:
         """Return whether y is beyond an outer edge of the road."""
-        return (y - self.middle).abs() > (self.edges[-1] - self.edges[0]) / 2
+        middle, half = scalars((self.middle, (self.edges[-1] - self.edges[0]) / 2), y)
+        return (y - middle).abs() > half
 
     def curvature(self, x: Tensor) -> Tensor:
         """Return the curvature of the reference line [1/m], positive where the road turns to the right."""

@@ -9,7 +9,7 @@ import math
 import torch
 from torch import Tensor
 
-from rare_envs.devices import are_zero
+from rare_envs.devices import are_zero, scalars
 from rare_envs.traffic.state import VEHICLE_LENGTH
 
 STEERING_LIMIT = math.pi / 3
@@ -61,12 +61,13 @@ def bicycle(
         >>> round(x.item(), 2), round(speed.item(), 2)
         (2.0, 20.1)
     """
-    distance, after = speed * dt, (speed + acceleration * dt).clamp(min=0.0)
+    tick, half, half_length = scalars((dt, 0.5, VEHICLE_LENGTH / 2), speed)
+    distance, after = speed * tick, (speed + acceleration * tick).clamp_min(0.0)
     if curvature is None and are_zero(steering, heading):
         return x + distance, y, heading, after
-    slip = torch.atan(torch.tan(steering) * 0.5)
+    slip = torch.atan(torch.tan(steering) * half)
     course = heading + slip
-    ahead, turn = distance * torch.cos(course), distance * torch.sin(slip) / (VEHICLE_LENGTH / 2)
+    ahead, turn = distance * torch.cos(course), distance * torch.sin(slip) / half_length
     if curvature is not None:
         ahead, turn = _along_curve(ahead, turn, y, curvature)
     return x + ahead, y + distance * torch.sin(course), heading + turn, after
@@ -125,11 +126,12 @@ def point_mass(
         >>> round(heading.item(), 3)
         0.03
     """
-    distance = speed * dt
-    ahead, turn = distance * torch.cos(heading), yaw_rate * dt
+    (tick,) = scalars((dt,), speed)
+    distance = speed * tick
+    ahead, turn = distance * torch.cos(heading), yaw_rate * tick
     if curvature is not None:
         ahead, turn = _along_curve(ahead, turn, y, curvature)
-    return x + ahead, y + distance * torch.sin(heading), heading + turn, (speed + acceleration * dt).clamp(min=0.0)
+    return x + ahead, y + distance * torch.sin(heading), heading + turn, (speed + acceleration * tick).clamp_min(0.0)
 
 
 def _along_curve(ahead: Tensor, turn: Tensor, y: Tensor, curvature: Tensor) -> tuple[Tensor, Tensor]:
