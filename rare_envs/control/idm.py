@@ -148,6 +148,6 @@ class IDM:
 
     def act(self, episode: EgoScene, memory: Any) -> tuple[Tensor, Any]:
         """Return IDM behind the lead and lane keeping across, shape (B, 2); there is no memory."""
-        _, y, heading, speed = episode.state.vehicle(0)
+        _, y, heading, speed = episode.state.vehicles[0]
         steering = lane_keeping(y, heading, speed, episode.road)
         return torch.stack((self.acceleration(speed, episode.lead), steering)).T, memory

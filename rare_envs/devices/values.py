@@ -126,7 +126,4 @@ def are_zero(*values: Tensor) -> bool:
     """
     if torch.is_grad_enabled() or not can_look(values[0]):
         return False
-    for value in values:  # noqa: SIM110  (a third of the time of `any`)
-        if value.count_nonzero():
-            return False
-    return True
+    return not any(value.count_nonzero() for value in values)  # of a tensor sooner than `any`

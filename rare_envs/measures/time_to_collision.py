@@ -43,7 +43,7 @@ def ttc(moment: Moment) -> Tensor:
         2.5
     """
     to_lead = _time_to_lead(moment)
-    if are_zero(moment.state.heading.select(1, 0)):  # straight on there is no edge
+    if are_zero(moment.state.vehicles[0].heading):  # straight on there is no edge
         return to_lead.clamp_max(TTC_MAX)
     return torch.minimum(to_lead, time_to_edge(moment)).clamp_max(TTC_MAX)
 
@@ -68,7 +68,7 @@ def time_to_edge(moment: Moment) -> Tensor:
     Way to the edge / speed across the road towards it; without a cap, up to 20 000 s for an ego that drives straight.
     """
     state, road = moment.state, moment.road
-    _, y, heading, speed = state.vehicle(0)
+    _, y, heading, speed = state.vehicles[0]
     middle, half = scalars((road.middle, road.lanes * road.width / 2), y)
     across = speed * torch.sin(heading)
     room = half - (y - middle) * torch.sign(across)

@@ -3,6 +3,7 @@
 import torch
 from torch import Tensor
 
+from rare_envs.devices import scalars
 from rare_envs.distributions.space import Parameter
 from rare_envs.scenarios.base import DATA, SPEED_RANGE, Others, Scenario, columns, keep_straight
 from rare_envs.traffic.road import straight
@@ -24,7 +25,8 @@ def initial(x: Tensor) -> State:
 
 def others(state: State, dt: float) -> Others:
     """Move the lead at its speed."""
-    return keep_straight(state, 0.0, dt)
+    speed, (tick,) = state.speed[:, 1:], scalars((dt,), state.speed)
+    return Others(state.x[:, 1:] + speed * tick, state.y[:, 1:], state.heading[:, 1:], speed)
 
 
 def driven(state: State, action: Tensor, dt: float) -> Others:

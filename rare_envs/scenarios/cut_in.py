@@ -14,7 +14,7 @@ from rare_envs.distributions.space import Parameter
 from rare_envs.scenarios.base import DATA, SPEED_RANGE, Others, Scenario, columns
 from rare_envs.traffic.lead import Lead
 from rare_envs.traffic.road import straight
-from rare_envs.traffic.state import VEHICLE_LENGTH, State, fields_from_columns
+from rare_envs.traffic.state import VEHICLE_LENGTH, State
 
 CUT_IN_DURATION = 4.0
 """Duration of the lane change where x has no column for it [s]."""
@@ -83,7 +83,7 @@ def others(state: State, dt: float) -> Others:
     The released code of Tian et al. also steers the cutter along a Bezier (30 m long, by pure pursuit, with the ego's
     IDM). Ours is exactly on the curve, whose length grows with the speed, and its desired speed is its initial one.
     """
-    (x, _, heading, speed), (lead_x, _, _, lead_speed) = state.vehicle(1), state.vehicle(2)
+    (x, _, heading, speed), (lead_x, _, _, lead_speed) = state.vehicles[1:]
     tick, body = scalars((dt, VEHICLE_LENGTH), x)
     lead = Lead(lead_x - x - body, speed - lead_speed * torch.cos(heading))
     acceleration = CUTTER_IDM.acceleration(speed, lead, state.theta[:, 3])
@@ -99,12 +99,13 @@ def driven(state: State, action: Tensor, dt: float) -> Others:
 def _advance(state: State, speed: Tensor, lead_speed: Tensor, dt: float) -> Others:
     """Return both after the tick: the cutter on its path, the lead straight on, with new speeds (B,)."""
     start, length, offset, _ = state.theta.unbind(dim=1)
-    (x, _, heading, old_speed), (lead_x, _, _, lead_old_speed) = state.vehicle(1), state.vehicle(2)
+    (x, _, heading, old_speed), (lead_x, _, _, lead_old_speed) = state.vehicles[1:]
     tick, nothing = scalars((dt, 0.0), x)
     x, lead_x = x + old_speed * torch.cos(heading) * tick, lead_x + lead_old_speed * tick
     y, slope = bezier(x - start, length, offset)
     zero = nothing.expand_as(y)
-    return Others(*fields_from_columns((x, lead_x), (y, zero), (torch.atan(slope), zero), (speed, lead_speed)))
+    table = torch.stack((x, lead_x, y, zero, torch.atan(slope), zero, speed, lead_speed))
+    return Others(*table.view(4, 2, len(x)).mT.unbind(0))
 
 
 TIMED_BASES = ("us101", "us101-closing", "i80", "i80-closing", "highway")

@@ -9,7 +9,7 @@ import torch
 from gymnasium import spaces
 from torch import Tensor
 
-from rare_envs.devices import constant
+from rare_envs.devices import constant, scalars
 from rare_envs.sensors.camera import Camera, take_picture
 from rare_envs.sensors.kinds import kinds_of
 from rare_envs.sensors.kinematics import kinematics_space, observe_kinematics
@@ -126,14 +126,14 @@ def observe_features(state: State) -> Tensor:
     Returns:
         Shape (B, 3 + 4 (N - 1)), float32, within +-`CLIP`: the ego's features, then each other vehicle's.
     """
-    along = state.speed * torch.cos(state.heading)
-    values = [state.speed[:, 0], state.y[:, 0], state.heading[:, 0]]
-    for j in range(1, state.x.shape[1]):
+    (ego, *others), (length,) = state.vehicles, scalars((VEHICLE_LENGTH,), state.x)
+    values, along = [ego.speed, ego.y, ego.heading], ego.speed * torch.cos(ego.heading)
+    for other in others:
         values += [
-            state.x[:, j] - state.x[:, 0] - VEHICLE_LENGTH,
-            along[:, j] - along[:, 0],
-            state.y[:, j] - state.y[:, 0],
-            state.speed[:, j] * torch.sin(state.heading[:, j]),
+            other.x - ego.x - length,
+            other.speed * torch.cos(other.heading) - along,
+            other.y - ego.y,
+            other.speed * torch.sin(other.heading),
         ]
     scales = _scales(state.x.shape[1], state.x.dtype, state.x.device)
     return (torch.stack(values, dim=1) / scales).clamp(-CLIP, CLIP).float()

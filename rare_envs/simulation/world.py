@@ -36,7 +36,7 @@ from rare_envs.simulation.sensing import Sensing, WeatherDistributions
 from rare_envs.traffic.lead import lead_of
 from rare_envs.traffic.overlap import ego_overlaps, others_overlap
 from rare_envs.traffic.road import WorldPose
-from rare_envs.traffic.state import State, fields_from_columns
+from rare_envs.traffic.state import State
 from rare_envs.traffic.vehicle_models import bicycle
 
 
@@ -266,8 +266,8 @@ class World:
             The episodes one tick later.
         """
         old, dt, road, background_state = episode.state, self.clock.dt, episode.road, episode.background_state
-        ego, (acceleration, steering) = old.vehicle(0), (action if commanded is None else action[:, 0]).unbind(1)
-        curvature = None if road.reference_line is None else road.curvature(ego[0])
+        ego, (acceleration, steering) = old.vehicles[0], (action if commanded is None else action[:, 0]).unbind(1)
+        curvature = None if road.reference_line is None else road.curvature(ego.x)
         moved = bicycle(*ego, acceleration, steering, dt, curvature)
         driver_actions = None
         if self.background is None or background_state is None:
@@ -280,10 +280,10 @@ class World:
         overridden = episode.overridden
         if commanded is not None or overridden is not None:
             others, overridden = apply_overrides(episode, action, commanded, others, driver_actions, dt)
-        fields = ((first, *rest.unbind(1)) for first, rest in zip(moved, others, strict=True))
-        state = State(*fields_from_columns(*fields), old.theta)
+        rest = zip(*(field.unbind(1) for field in others), strict=True)
+        state = State.of_vehicles((moved, *rest), old.theta)
         place = self._place(state)
-        hit = ego_overlaps(state, road, place).any(dim=1) | road.off_road(state.y[:, 0])
+        hit = ego_overlaps(state, road, place).any(dim=1) | road.off_road(state.vehicles[0].y)
         if self.measurement.collisions == "any":
             hit = hit | others_overlap(state, road)
         episode = episode._replace(background_state=background_state, overridden=overridden)

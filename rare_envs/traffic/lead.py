@@ -46,21 +46,19 @@ def lead_of(state: State, road: Road) -> Lead:
         >>> lead.gap.item(), lead.closing_speed.item()  # vehicles are 5 m long
         (25.0, 5.0)
     """
-    others = state.x.shape[1] - 1
-    (x, others_x), (y, others_y) = (field.split_with_sizes((1, others), 1) for field in state[:2])
-    own_heading, *headings = state.heading.unbind(1)
-    own_speed, *speeds = state.speed.unbind(1)
-    zero, reach, nowhere, length = scalars(
-        (0.0, (road.width + VEHICLE_WIDTH) / 2, torch.inf, VEHICLE_LENGTH), own_speed
-    )
-    ahead = others_x - x
-    relevant = (ahead >= zero) & ((others_y - road.centre_of(y)).abs() <= reach)
-    nearest, heading, speed = nowhere, own_heading, own_speed
-    for way, seen, its_heading, its_speed in zip(ahead.unbind(1), relevant.unbind(1), headings, speeds, strict=True):
-        nearer = seen if nearest is nowhere else seen & (way <= nearest)
-        nearest = torch.where(nearer, way, nearest)
-        heading, speed = torch.where(nearer, its_heading, heading), torch.where(nearer, its_speed, speed)
-    return Lead(nearest - length, own_speed - speed * torch.cos(heading - own_heading))
+    own, *others = state.vehicles
+    numbers = (0.0, (road.width + VEHICLE_WIDTH) / 2, torch.inf, VEHICLE_LENGTH)
+    zero, reach, nowhere, length = scalars(numbers, own.x)
+    lane_y = road.centre_of(own.y)
+    nearest, heading, speed = nowhere, own.heading, own.speed
+    for other in others:
+        ahead = other.x - own.x
+        nearer = (ahead >= zero) & ((other.y - lane_y).abs() <= reach)
+        if nearest is not nowhere:
+            nearer = nearer & (ahead <= nearest)
+        nearest = torch.where(nearer, ahead, nearest)
+        heading, speed = torch.where(nearer, other.heading, heading), torch.where(nearer, other.speed, speed)
+    return Lead(nearest - length, own.speed - speed * torch.cos(heading - own.heading))
 
 
 def lead_index(state: State, road: Road) -> Tensor:

@@ -1,5 +1,7 @@
 """Traffic states: B scenarios with N vehicles each."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -14,7 +16,31 @@ LANE_WIDTH = 4.0
 """Lane width [m], HighwayEnv's."""
 
 
-class State(NamedTuple):
+class Vehicle(NamedTuple):
+    """One vehicle in B scenarios: the columns of the fields of a `State`, shape (B,)."""
+
+    x: Tensor
+    y: Tensor
+    heading: Tensor
+    speed: Tensor
+
+
+class _Fields(NamedTuple):
+    """Fields of a `State`."""
+
+    x: Tensor
+    """Centres along the road [m], shape (B, N)."""
+    y: Tensor
+    """Centres across the road [m], shape (B, N)."""
+    heading: Tensor
+    """Headings relative to the road [rad], shape (B, N)."""
+    speed: Tensor
+    """Speeds along the headings [m/s], never negative, shape (B, N)."""
+    theta: Tensor
+    """Parameters that the scenario fixes for the whole episode, shape (B, P); it defines the P columns."""
+
+
+class State(_Fields):
     """Traffic of B scenarios with N vehicles; vehicle 0 is the ego.
 
     The frame is HighwayEnv's: x along the road, y across it and positive to the right, the ego's first lane centred
@@ -28,27 +54,41 @@ class State(NamedTuple):
         [[15.0, 20.0]]
     """
 
-    x: Tensor
-    """Centres along the road [m], shape (B, N)."""
-    y: Tensor
-    """Centres across the road [m], shape (B, N)."""
-    heading: Tensor
-    """Headings relative to the road [rad], shape (B, N)."""
-    speed: Tensor
-    """Speeds along the headings [m/s], never negative, shape (B, N)."""
-    theta: Tensor
-    """Parameters that the scenario fixes for the whole episode, shape (B, P); it defines the P columns."""
+    _columns: tuple[Vehicle, ...] | None = None
+    """Columns from which the state was made, in the same memory: views of them would cost an operation each."""
 
-    def vehicle(self, index: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Return x, y, heading and speed of one vehicle, shape (B,) each."""
-        return (
-            self.x.select(1, index),
-            self.y.select(1, index),
-            self.heading.select(1, index),
-            self.speed.select(1, index),
-        )
+    @property
+    def vehicles(self) -> tuple[Vehicle, ...]:
+        """Each vehicle by itself, the ego first."""
+        if self._columns is not None:
+            return self._columns
+        fields = (field.unbind(1) for field in self[:4])
+        return tuple(Vehicle(*columns) for columns in zip(*fields, strict=True))
 
-    def seen_by(self, vehicle: int) -> "State":
+    @classmethod
+    def of_vehicles(cls, vehicles: Sequence[Sequence[Tensor]], theta: Tensor) -> State:
+        """Return the state of N vehicles, of which the columns are copied, all at once.
+
+        Each stays contiguous in memory, as ticks work on one vehicle's at a time.
+
+        Args:
+            vehicles: x, y, heading and speed of each, shape (B,) each.
+            theta: As the field.
+
+        Example:
+            >>> zero, speed = torch.zeros(2), torch.tensor([20.0, 10.0])
+            >>> state = State.of_vehicles([(zero, zero, zero, speed), (zero + 30.0, zero, zero, speed)], zero[:, None])
+            >>> state.x.tolist(), state.vehicles[1].x.tolist()
+            ([[0.0, 30.0], [0.0, 30.0]], [30.0, 30.0])
+        """
+        n = len(vehicles)
+        table = torch.stack([column for field in zip(*vehicles, strict=True) for column in field])
+        x, y, heading, speed = table.view(4, n, table.shape[1]).mT.unbind(0)
+        state, columns = cls(x, y, heading, speed, theta), table.unbind(0)
+        state._columns = tuple(Vehicle(*columns[number::n]) for number in range(n))
+        return state
+
+    def seen_by(self, vehicle: int) -> State:
         """Return the same traffic with another vehicle in the ego's place; the others follow in their order.
 
         Args:
@@ -58,20 +98,3 @@ class State(NamedTuple):
             return self
         order = [vehicle, *(j for j in range(self.x.shape[1]) if j != vehicle)]
         return State(self.x[:, order], self.y[:, order], self.heading[:, order], self.speed[:, order], self.theta)
-
-
-def fields_from_columns(*fields: Sequence[Tensor]) -> tuple[Tensor, ...]:
-    """Return fields of N vehicles, shape (B, N) each, from one column (B,) of each vehicle.
-
-    Columns are contiguous in memory, as ticks work on one vehicle's at a time, and copied all at once.
-
-    Args:
-        fields: For each field, such as x, its N columns.
-
-    Example:
-        >>> near, far = torch.tensor([1.0, 2.0]), torch.tensor([3.0, 4.0])
-        >>> [field.tolist() for field in fields_from_columns((near, far), (far, near))]
-        [[[1.0, 3.0], [2.0, 4.0]], [[3.0, 1.0], [4.0, 2.0]]]
-    """
-    columns = torch.stack([column for field in fields for column in field])
-    return columns.view(len(fields), len(fields[0]), columns.shape[1]).mT.unbind(0)
