@@ -8,15 +8,18 @@ References:
     "Real-time collision detection", 2005, sections 4.4 and 5.5.
 """
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
+from rare_envs.devices import scalars
 from rare_envs.traffic.state import VEHICLE_LENGTH, VEHICLE_WIDTH
 
 DIAGONAL = (VEHICLE_LENGTH**2 + VEHICLE_WIDTH**2) ** 0.5
 """Bodies whose centres are further apart than this [m] do not touch."""
+_SIZE = (VEHICLE_LENGTH, VEHICLE_WIDTH)
 _LENGTHS = (VEHICLE_LENGTH / 2, VEHICLE_WIDTH / 2)
 
 
@@ -51,8 +54,8 @@ def boxes_overlap(
     dy: Tensor,
     heading: Tensor,
     other_heading: Tensor,
-    size: tuple[Tensor | float, Tensor | float] = (VEHICLE_LENGTH, VEHICLE_WIDTH),
-    other_size: tuple[Tensor | float, Tensor | float] = (VEHICLE_LENGTH, VEHICLE_WIDTH),
+    size: tuple[Tensor | float, Tensor | float] = _SIZE,
+    other_size: tuple[Tensor | float, Tensor | float] = _SIZE,
 ) -> Tensor:
     """Return whether two vehicles' bodies overlap, by the separating axis theorem.
 
@@ -80,11 +83,22 @@ def boxes_overlap(
     cos, sin = torch.cos(turn), torch.sin(turn)
     other_along, other_across = along * cos + across * sin, across * cos - along * sin
     cos, sin = cos.abs(), sin.abs()
-    (length, width), (other_length, other_width) = ((0.5 * long, 0.5 * wide) for long, wide in (size, other_size))
-    overlap = along.abs() < length + other_length * cos + other_width * sin
-    overlap = overlap & (across.abs() < width + other_length * sin + other_width * cos)
-    overlap = overlap & (other_along.abs() < other_length + length * cos + width * sin)
-    return overlap & (other_across.abs() < other_width + length * sin + width * cos)
+    half, other_half = _halves(size, dx), _halves(other_size, dx)
+    reach = _reach(half, other_half, cos, sin)
+    other_reach = reach if other_size is size else _reach(other_half, half, cos, sin)
+    overlap = (along.abs() < reach[0]) & (across.abs() < reach[1])
+    return overlap & (other_along.abs() < other_reach[0]) & (other_across.abs() < other_reach[1])
+
+
+def _halves(size: tuple[Tensor | float, Tensor | float], like: Tensor) -> list[Tensor]:
+    """Return half of length and width [m]."""
+    return [0.5 * side if isinstance(side, Tensor) else scalars((0.5 * side,), like)[0] for side in size]
+
+
+def _reach(half: Sequence[Tensor], other: Sequence[Tensor], cos: Tensor, sin: Tensor) -> tuple[Tensor, Tensor]:
+    """Return how far from the centre of a body that of one turned by an angle may be along and across it [m]."""
+    (length, width), (other_length, other_width) = half, other
+    return length + other_length * cos + other_width * sin, width + other_length * sin + other_width * cos
 
 
 def project_on_axes(x: Tensor, y: Tensor, heading: Tensor, other_heading: Tensor) -> Tensor:
@@ -117,9 +131,8 @@ def axes_of(dx: Tensor, dy: Tensor, heading: Tensor, other_heading: Tensor) -> A
     """
     turn = other_heading - heading
     cos, sin = torch.cos(turn).abs(), torch.sin(turn).abs()
-    half_length, half_width = _LENGTHS
-    along = half_length + half_length * cos + half_width * sin
-    across = half_width + half_length * sin + half_width * cos
+    half = _halves(_SIZE, dx)
+    along, across = _reach(half, half, cos, sin)
     return Axes(project_on_axes(dx, dy, heading, other_heading), torch.stack((along, across, along, across), -1))
 
 

@@ -2,7 +2,7 @@
 
 import torch
 
-from rare_envs.devices import are_zero, constant, may_hold, move_to
+from rare_envs.devices import are_zero, constant, may_hold, move_to, scalars
 
 
 def test_zeros_are_looked_for_only_where_nothing_is_differentiated() -> None:
@@ -21,6 +21,16 @@ def test_a_constant_is_one_tensor_of_each_dtype_and_can_be_differentiated_throug
     x = torch.ones(2, requires_grad=True)
     (slope,) = torch.autograd.grad((x * made).sum(), x)
     assert torch.equal(slope, made)
+
+
+def test_numbers_as_tensors_give_the_bits_of_numbers() -> None:
+    x = torch.rand(1000, generator=torch.Generator().manual_seed(0))
+    tenth, one = scalars((0.1, 1.0), x)
+    assert torch.equal(x * tenth, x * 0.1)
+    assert torch.equal(x / tenth, x / 0.1)
+    assert torch.equal(one - x, 1.0 - x)
+    assert torch.equal(x > tenth, x > 0.1)
+    assert scalars((0.1, 1.0), x.double())[0].dtype == torch.float64
 
 
 def test_where_values_are_not_at_hand_conditions_may_hold_and_nothing_is_zero() -> None:

@@ -1,5 +1,7 @@
 """States: sizes of vehicles and lanes, and the same traffic seen from another vehicle."""
 
+import copy
+
 import torch
 from highway_env.road.lane import AbstractLane
 from highway_env.vehicle.kinematics import Vehicle
@@ -33,3 +35,30 @@ def test_the_second_vehicle_and_the_ego_change_places_and_back() -> None:
     state = numbered(3)
     assert all(map(torch.equal, state.seen_by(1).seen_by(1), state))
     assert state.seen_by(0) is state
+
+
+def test_vehicles_and_fields_are_the_same_numbers_however_the_state_was_made() -> None:
+    state = numbered(3)
+    made = State.of_vehicles(state.vehicles, state.theta)
+    assert all(map(torch.equal, made, state))
+    for number, (known, viewed) in enumerate(zip(made.vehicles, state.vehicles, strict=True)):
+        for own, field, column in zip(known, made[:4], viewed, strict=True):
+            assert torch.equal(own, column)
+            assert own.data_ptr() == field[:, number].data_ptr()
+
+
+def test_a_changed_or_copied_state_has_its_own_vehicles() -> None:
+    state = State.of_vehicles(numbered(2).vehicles, torch.zeros(2, 0))
+    faster = state._replace(speed=state.speed + 1)
+    assert torch.equal(faster.vehicles[1].speed, state.vehicles[1].speed + 1)
+    copied = copy.deepcopy(state)
+    copied.x.zero_()
+    assert copied.vehicles[1].x.eq(0).all()
+    assert state.vehicles[1].x.ne(0).all()
+
+
+def test_what_is_differentiated_goes_through_vehicles_and_fields_alike() -> None:
+    x = torch.ones(2, requires_grad=True)
+    state = State.of_vehicles([(x, 2 * x, x, x)], x[:, None])
+    (slope,) = torch.autograd.grad((state.y[:, 0] + state.vehicles[0].y).sum(), x)
+    assert slope.tolist() == [4.0, 4.0]
