@@ -260,7 +260,7 @@ def estimate_afresh(
         warnings=(
             *outcome.warnings,
             *_check(context, state, refinement, sample, whole),
-            *_check_spread(context, state, refinement, LastDraws(drawn, sample.cov, kept)),
+            *_check_spread(context, state, refinement, LastDraws(drawn, sample.draws.cov, kept)),
         ),
         sample=replace(points, lineages=discovery.lineages),
         draw_weights=tuple(weights for part in parts for weights in part),

@@ -1,7 +1,9 @@
 """Stratified samples: draws from mixtures, a fixed number from each component, and p with its error.
 
 With n_k of n draws from component k and y = weight times indicator of failure, p-hat = sum(y) / n, and its variance is
-sum_k n_k var_k(y) / n^2: that between the components, which independent draws of the mixture would add, is none.
+sum_k n_k var_k(y) / n^2: that between the components, which independent draws of the mixture would add, is none. The
+weights are calibrated (`samplers/importance/calibration.py`): what the known mass of each kind of component explains of
+y counts no more.
 """
 
 import math
@@ -9,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from samplers.importance.calibration import calibrate
 from samplers.importance.draws import Draws
 from samplers.methods.two_stage.mixture.proposal import MixtureProposal
 from samplers.methods.two_stage.settings import DEFAULT_SETTINGS
@@ -31,9 +34,9 @@ class StratifiedSample:
     counts: FloatArray
     """Draws of each component, shape (k,)."""
     sums: FloatArray
-    """Of y in each component, shape (k,)."""
+    """Of what calibration leaves of y in each component, shape (k,)."""
     squares: FloatArray
-    """Of y^2 in each component, shape (k,)."""
+    """Of its squares, shape (k,)."""
     typical: FloatArray
     """Weight of a typical point of each region, whether or not a draw has met one, shape (m,)."""
     u_safe: FloatArray
@@ -52,10 +55,12 @@ class StratifiedSample:
     def add(self, batch: ComponentDraws, proposal: MixtureProposal, inputs: Inputs, gamma: float) -> "StratifiedSample":
         """Return the sample with another batch from the same proposal."""
         fails = batch.f <= gamma
-        log_weights = proposal.log_weights(batch.u)
-        y = np.where(fails, np.exp(np.minimum(log_weights, MAX_LOG_WEIGHT)), 0.0)
+        ratios, log_weights = proposal.drawn(batch.counts).kind_ratios(batch.u)
         owner, k = np.repeat(np.arange(len(batch.counts)), batch.counts), len(batch.counts)
+        calibration = calibrate(ratios, owner)
+        y = calibration.residuals(np.where(fails, np.exp(np.minimum(log_weights, MAX_LOG_WEIGHT)), 0.0))
         x = inputs.base.from_standard_normal(batch.u) if batch.x is None else batch.x
+        log_weights = log_weights + np.log(calibration.factors)
         return StratifiedSample(
             self.draws.join(Draws.from_outcomes(batch.f, log_weights, x, gamma)),
             self.counts + batch.counts,
@@ -135,7 +140,7 @@ class StratifiedSample:
         more = base_f > gamma
         u = np.concatenate([self.u_safe, base_u[more]])
         log_base = math.log(n_base) if n_base else -math.inf
-        log_density = np.logaddexp(math.log(n) - proposal.log_weights(u), log_base)
+        log_density = np.logaddexp(math.log(n) - proposal.drawn(self.counts).log_weights(u), log_base)
         own = np.arange(len(counted.f) + len(self.u_safe))
         return Sample(
             f=np.concatenate([counted.f, self.draws.f_safe, base_f[more]]),

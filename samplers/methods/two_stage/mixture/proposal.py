@@ -65,9 +65,29 @@ class MixtureProposal:
 
     def log_weights(self, u: FloatArray) -> FloatArray:
         """Return log(phi / q) at u (n, d), shape (n,)."""
+        log_r, weights = self._log_ratios(u)
+        return -mixture_log_ratio(log_r, weights)
+
+    def kind_ratios(self, u: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return q_kind / q at u (n, d) for the mixture of the components of each kind, (n, m), and log(phi / q)."""
+        log_r, weights = self._log_ratios(u)
+        log_q = mixture_log_ratio(log_r, weights)
+        kinds = np.array([one.kind for one, a in zip(self.candidates, self.weights, strict=True) if a > 0])
+        masses = weights[:, None] * np.exp(log_r - log_q)
+        ratios = [masses[kinds == kind].sum(axis=0) / weights[kinds == kind].sum() for kind in dict.fromkeys(kinds)]
+        return np.stack(ratios, axis=1), -log_q
+
+    def drawn(self, counts: FloatArray | NDArray[np.int64]) -> "MixtureProposal":
+        """Return the mixture that draws come from of which counts (k,) are from each component.
+
+        The same where the first component, the base distribution, has none: it bounds the weights.
+        """
+        return MixtureProposal(self.candidates, counts / counts.sum()) if counts[0] > 0 else self
+
+    def _log_ratios(self, u: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return log(q_k / phi) of the components drawn from, shape (m, n), and their weights (m,)."""
         used = self.weights > 0
-        log_r = log_ratios([c for c, a in zip(self.components, used, strict=True) if a], u)
-        return -mixture_log_ratio(log_r, self.weights[used])
+        return log_ratios([c for c, a in zip(self.components, used, strict=True) if a], u), self.weights[used]
 
     def draw(self, n: int, rng: np.random.Generator) -> tuple[FloatArray, NDArray[np.int64]]:
         """Draw n points (n, d), one component after the other; return them and how many are from which (k,)."""
