@@ -29,8 +29,6 @@ RIDGE = 0.1
 """r: a control whose variance within the strata is well below this explains little, and few draws would decide b."""
 LEAST_FACTOR = 0.1
 """Least c of a draw: where one would have less, all go only part of the way from 1. One run in 20 has such draws."""
-DRAWS_PER_CONTROL = 30
-"""With fewer draws for each control the bias would count, and weights stay as they are."""
 
 
 class Calibration(NamedTuple):
@@ -58,12 +56,13 @@ class Calibration(NamedTuple):
         return np.asarray(mean + (y - mean - self.controls @ (self.slopes.T @ y)) / (1 - leverage))
 
 
-def calibrate(ratios: FloatArray, strata: NDArray[np.int64]) -> Calibration:
+def calibrate(ratios: FloatArray, strata: NDArray[np.int64], draws_per_control: int) -> Calibration:
     """Return calibrated weights of draws from a mixture q.
 
     Args:
         ratios: h, densities of mass 1 over q at each draw, shape (n, m): its components, or mixtures of some of them.
         strata: The component that each draw is from, shape (n,).
+        draws_per_control: Weights of fewer draws for each control stay as they are.
 
     Example:
         P[u > 2.1] = 0.01786 by 500 draws of N(2, 1) and 500 of N(0, 1) given u > 2, a hundred times:
@@ -74,13 +73,13 @@ def calibrate(ratios: FloatArray, strata: NDArray[np.int64]) -> Calibration:
         ...     u = np.concatenate([2 + rng.standard_normal(500), -ndtri(ndtr(-2) * rng.random(500))])
         ...     h = np.stack([np.exp(2 * u - 2), (u > 2) / ndtr(-2)], axis=1)  # over the density of N(0, 1) ...
         ...     weights = 2 / h.sum(axis=1)
-        ...     c = calibrate(h * weights[:, None], np.repeat([0, 1], 500)).factors  # ... and over that of the mixture
+        ...     c = calibrate(h * weights[:, None], np.repeat([0, 1], 500), 30).factors  # ... and of the mixture
         ...     p.append([(weights * (u > 2.1)).mean(), (c * weights * (u > 2.1)).mean()])
         >>> np.mean(p, axis=0).round(4), np.std(p, axis=0).round(5)
         (array([0.0179, 0.0179]), array([0.00042, 0.00036]))
     """
     n, m = ratios.shape
-    if n < DRAWS_PER_CONTROL * m:
+    if n < draws_per_control * m:
         none = np.empty((n, 0))
         return Calibration(np.ones(n), none, none, strata)
     controls = ratios - _stratum_means(ratios, strata)

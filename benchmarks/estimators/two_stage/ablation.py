@@ -65,6 +65,7 @@ ABLATIONS: dict[str, Mapping[str, Any]] = {
     "Gaussians": _without_kinds("gaussian"),
     "wide draws as deep as the levels": {"exploration.deep_draws": 0},
     "placement by a regression": {"surfaces.min_gain": math.inf},
+    "calibrated weights": {"draws_per_control": 10**9},
 }
 """Settings without a component, by its name."""
 

@@ -379,6 +379,9 @@ class TwoStageSettings:
     min_stratum_draws: int = 10
     """Of components with fewer draws the second moment stands in for the variance: that of a handful is worth
     nothing."""
+    draws_per_control: int = 30
+    """Draws of a round for each kind of component from which on their weights are calibrated: with fewer the bias by
+    estimated slopes would count."""
     exploration: ExplorationSettings = ExplorationSettings()
     lines: LineSettings = LineSettings()
     terms_alone: TermsAloneSettings = TermsAloneSettings()

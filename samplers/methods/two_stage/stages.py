@@ -95,7 +95,7 @@ def draw_round(
     gamma, settings = context.goal.gamma, context.settings
     if len(state.rounds) >= _first_counted(state, gamma, settings):
         inputs = context.simulator.inputs
-        empty = StratifiedSample.empty(len(proposal.weights), inputs.dim, np.empty(0), settings.min_stratum_draws)
+        empty = StratifiedSample.empty(len(proposal.weights), inputs.dim, np.empty(0), settings)
         counted = CountedRound(empty.add(batch, proposal, inputs, gamma), batch.first)
         state = replace(state, counted=(*state.counted, counted))
     draws = Draws.from_outcomes(batch.f, proposal.log_weights(batch.u), batch.u, gamma)
@@ -229,7 +229,7 @@ def estimate_afresh(
     goal, inputs, stopped = context.goal, context.simulator.inputs, False
     settings = context.settings
     typical = typical_weights(refinement, proposal)
-    sample = StratifiedSample.empty(len(proposal.weights), inputs.dim, typical, settings.min_stratum_draws)
+    sample = StratifiedSample.empty(len(proposal.weights), inputs.dim, typical, settings)
     whole, kept = sample, Simulated.none(inputs.dim)
     size = context.left if goal.target_cov is None else context.target_batch
     while context.left_at_all > 0:

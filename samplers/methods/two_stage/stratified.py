@@ -14,7 +14,7 @@ import numpy as np
 from samplers.importance.calibration import calibrate
 from samplers.importance.draws import Draws
 from samplers.methods.two_stage.mixture.proposal import MixtureProposal
-from samplers.methods.two_stage.settings import DEFAULT_SETTINGS
+from samplers.methods.two_stage.settings import DEFAULT_SETTINGS, TwoStageSettings
 from samplers.methods.two_stage.simulator import ComponentDraws
 from samplers.problem import FloatArray, Inputs
 from samplers.sample import Sample
@@ -41,23 +41,23 @@ class StratifiedSample:
     """Weight of a typical point of each region, whether or not a draw has met one, shape (m,)."""
     u_safe: FloatArray
     """The draws that did not fail, in the order of `draws.f_safe`, shape (m, d)."""
-    min_stratum_draws: int = DEFAULT_SETTINGS.min_stratum_draws
-    """Draws of a component under which its second moment stands in for its variance."""
+    settings: TwoStageSettings = DEFAULT_SETTINGS
+    """Least draws of a component for a variance, and of a control for calibrated weights."""
 
     @classmethod
     def empty(
-        cls, k: int, dim: int, typical: FloatArray, min_stratum_draws: int = DEFAULT_SETTINGS.min_stratum_draws
+        cls, k: int, dim: int, typical: FloatArray, settings: TwoStageSettings = DEFAULT_SETTINGS
     ) -> "StratifiedSample":
         """Return a sample without draws, of a proposal of k components in d dimensions."""
         zero, none = np.zeros(k), Draws(0, np.empty(0), np.empty(0))
-        return cls(none, zero, zero, zero, typical, np.empty((0, dim)), min_stratum_draws)
+        return cls(none, zero, zero, zero, typical, np.empty((0, dim)), settings)
 
     def add(self, batch: ComponentDraws, proposal: MixtureProposal, inputs: Inputs, gamma: float) -> "StratifiedSample":
         """Return the sample with another batch from the same proposal."""
         fails = batch.f <= gamma
         ratios, log_weights = proposal.drawn(batch.counts).kind_ratios(batch.u)
         owner, k = np.repeat(np.arange(len(batch.counts)), batch.counts), len(batch.counts)
-        calibration = calibrate(ratios, owner)
+        calibration = calibrate(ratios, owner, self.settings.draws_per_control)
         y = calibration.residuals(np.where(fails, np.exp(np.minimum(log_weights, MAX_LOG_WEIGHT)), 0.0))
         x = inputs.base.from_standard_normal(batch.u) if batch.x is None else batch.x
         log_weights = log_weights + np.log(calibration.factors)
@@ -68,7 +68,7 @@ class StratifiedSample:
             self.squares + np.bincount(owner, weights=y * y, minlength=k),
             self.typical,
             np.concatenate([self.u_safe, batch.u[~fails]]),
-            self.min_stratum_draws,
+            self.settings,
         )
 
     def join(self, earlier: "StratifiedSample") -> "StratifiedSample":
@@ -90,7 +90,7 @@ class StratifiedSample:
             np.concatenate([earlier.squares, self.squares]),
             self.typical,
             np.concatenate([earlier.u_safe, self.u_safe]),
-            self.min_stratum_draws,
+            self.settings,
         )
 
     @property
@@ -107,7 +107,7 @@ class StratifiedSample:
         """
         if len(self.draws.f) == 0:
             return math.inf
-        many = self.counts >= self.min_stratum_draws
+        many = self.counts >= self.settings.min_stratum_draws
         n, s1, s2 = self.counts[many], self.sums[many], self.squares[many]
         within = float(((s2 - s1 * s1 / n) * n / (n - 1)).sum()) + float(self.squares[~many].sum())
         typical = min(float(self.typical.max(initial=0.0)), MAX_TYPICAL_SHARE * self.draws.n * self.p)

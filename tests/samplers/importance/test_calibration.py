@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from samplers.importance.calibration import DRAWS_PER_CONTROL, LEAST_FACTOR, calibrate
+from samplers.importance.calibration import LEAST_FACTOR, calibrate
 
 BETA = 1.7
 P = stats.norm.sf(BETA)
@@ -30,7 +30,7 @@ def variance(residuals, strata):
 def test_what_a_component_knows_exactly_has_hardly_an_error(rng):
     u, strata, h = draw([100, 450, 450], rng)
     y = h[:, 0] * (u > 1.5)  # P[u > 1.5] is that component's own probability
-    calibrated = calibrate(h, strata)
+    calibrated = calibrate(h, strata, 30)
     exact = stats.norm.sf(1.5)
     plain = variance(y, strata)
     assert variance(calibrated.residuals(y), strata) < 0.05 * plain
@@ -42,7 +42,7 @@ def test_right_on_average_with_the_variance_that_it_says(rng):
     p, own, plain = [], [], []
     for _ in range(runs):
         u, strata, h = draw(counts, rng)
-        y, calibrated = h[:, 0] * (u > BETA), calibrate(h, strata)
+        y, calibrated = h[:, 0] * (u > BETA), calibrate(h, strata, 30)
         p.append((calibrated.factors * y).mean())
         own.append(variance(calibrated.residuals(y), strata))
         plain.append(variance(y, strata))
@@ -54,7 +54,7 @@ def test_right_on_average_with_the_variance_that_it_says(rng):
 
 def test_known_masses_come_out_but_for_the_ridge(rng):
     u, strata, h = draw([100, 450, 450], rng)
-    calibrated = calibrate(h, strata)
+    calibrated = calibrate(h, strata, 30)
     off = np.abs(h.mean(axis=0) - 1)
     left = np.abs((calibrated.factors[:, None] * h).mean(axis=0) - 1)
     varied = np.array([variance(column, strata) for column in h.T]) * len(u) > 0.3
@@ -62,9 +62,9 @@ def test_known_masses_come_out_but_for_the_ridge(rng):
 
 
 def test_few_draws_keep_their_weights(rng):
-    few = DRAWS_PER_CONTROL * 3 - 1
+    few = 30 * 3 - 1
     u, strata, h = draw([few - 60, 30, 30], rng)
-    calibrated = calibrate(h, strata)
+    calibrated = calibrate(h, strata, 30)
     np.testing.assert_array_equal(calibrated.factors, 1.0)
     y = h[:, 0] * (u > BETA)
     np.testing.assert_array_equal(calibrated.residuals(y), y)
@@ -75,14 +75,14 @@ def test_no_weight_falls_under_a_tenth(rng):
     n = 200
     h = np.ones((n, 1))
     h[0] = 60.0
-    calibrated = calibrate(h, np.zeros(n, dtype=np.int64))
+    calibrated = calibrate(h, np.zeros(n, dtype=np.int64), 30)
     assert calibrated.factors.min() == pytest.approx(LEAST_FACTOR)
     assert (calibrated.factors > 0).all()
 
 
 def test_residuals_keep_the_mean_of_each_stratum_and_ask_more_of_draws_that_decide_the_fit(rng):
     u, strata, h = draw([60, 120, 120], rng)
-    y, calibrated = h[:, 0] * (u > BETA), calibrate(h, strata)
+    y, calibrated = h[:, 0] * (u > BETA), calibrate(h, strata, 30)
     fitted = y - calibrated.controls @ (calibrated.slopes.T @ y)
     residuals = calibrated.residuals(y)
     for k in range(3):
