@@ -29,7 +29,7 @@ def constant(values: Any, like: Tensor) -> Tensor:
 
 
 def scalars(numbers: tuple[float, ...], like: Tensor) -> tuple[Tensor, ...]:
-    """Return numbers as tensors of shape (), made once, as `constant`.
+    """Return numbers as tensors of shape (), made once, as `constant`; floating-point ones whatever `like` has.
 
     An operation with a few rows takes half as long with such a tensor as with a number, of which torch makes one.
 
@@ -38,7 +38,8 @@ def scalars(numbers: tuple[float, ...], like: Tensor) -> tuple[Tensor, ...]:
         >>> half * torch.ones(2) + two
         tensor([2.5000, 2.5000])
     """
-    return _make_scalars(numbers, like.dtype, like.device)
+    dtype = like.dtype if like.is_floating_point() else torch.get_default_dtype()
+    return _make_scalars(numbers, dtype, like.device)
 
 
 def indices(numbers: tuple[int, ...], like: Tensor) -> Tensor:

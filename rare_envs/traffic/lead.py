@@ -58,6 +58,8 @@ def lead_of(state: State, road: Road) -> Lead:
             nearer = nearer & (ahead <= nearest)
         nearest = torch.where(nearer, ahead, nearest)
         heading, speed = torch.where(nearer, other.heading, heading), torch.where(nearer, other.speed, speed)
+    if nearest is nowhere:
+        nearest = torch.full_like(own.x, torch.inf)
     return Lead(nearest - length, own.speed - speed * torch.cos(heading - own.heading))
 
 

@@ -98,7 +98,7 @@ class Road:
         first = self.centre(0)
         start, width = scalars((first, self.width), y)
         if self.lanes == 1:
-            return start.expand_as(y)
+            return torch.full_like(y, first)
         lane = torch.round((y - start if first else y) / width).clamp(0, self.lanes - 1)
         return lane * width + start if first else lane * width
 

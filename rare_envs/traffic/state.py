@@ -88,6 +88,10 @@ class State(_Fields):
         state._columns = tuple(Vehicle(*columns[number::n]) for number in range(n))
         return state
 
+    def __reduce__(self) -> tuple[type[State], tuple[Tensor, ...]]:
+        """Pickle the fields alone: columns would each bring the memory of all."""
+        return type(self), tuple(self)
+
     def seen_by(self, vehicle: int) -> State:
         """Return the same traffic with another vehicle in the ego's place; the others follow in their order.
 

@@ -44,7 +44,7 @@ class Calibration(NamedTuple):
     """Of each draw, shape (n,)."""
 
     def residuals(self, y: FloatArray) -> FloatArray:
-        """Return y (n,) less what the controls explain of it, shape (n,), with the same mean in each stratum.
+        """Return y (n,) less what the controls explain of how it deviates from its mean in each stratum, shape (n,).
 
         The variance of p is that of these in place of y. Each deviation is divided by 1 less the leverage of its draw,
         as in the jackknife, for a regression follows the draws that it is fitted to.

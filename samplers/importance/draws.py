@@ -36,7 +36,7 @@ class Draws:
     f: FloatArray
     """Outcomes of the k failing ones, shape (k,)."""
     log_weights: FloatArray
-    """log(p0 / q) at the failing ones, shape (k,)."""
+    """log(p0 / q) at the failing ones, calibrated or not, shape (k,)."""
     x: FloatArray = field(default_factory=lambda: np.empty((0, 0)))
     """The failing ones in physical space, shape (k, d)."""
     f_safe: FloatArray = field(default_factory=lambda: np.empty(0))

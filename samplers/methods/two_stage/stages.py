@@ -248,8 +248,8 @@ def estimate_afresh(
     if sample.draws.n == 0:
         early = estimate_early(context, state)
         return early if stopped else replace(early, status=Status.BUDGET)
-    largest_weight, discovery = 1 / settings.refinement.base_share, refinement.exploration.discovery
-    interval = discovery_interval(whole.draws, whole.cov, goal.confidence, largest_weight, discovery)
+    discovery = refinement.exploration.discovery
+    interval = discovery_interval(whole.draws, whole.cov, goal.confidence, whole.largest_weight, discovery)
     outcome = _outcome(context, state, whole.draws, whole.cov, interval)
     points = sample.to_sample(proposal, state.base_f, state.base_u, goal.gamma, whole.draws)
     last = CountedRound(sample, context.simulator.n_sim - sample.draws.n)

@@ -43,6 +43,8 @@ class StratifiedSample:
     """The draws that did not fail, in the order of `draws.f_safe`, shape (m, d)."""
     settings: TwoStageSettings = DEFAULT_SETTINGS
     """Least draws of a component for a variance, and of a control for calibrated weights."""
+    largest_weight: float = 1.0
+    """Bound of the weights: 1 over the share of base draws, times the largest calibration factor of a failing draw."""
 
     @classmethod
     def empty(
@@ -55,12 +57,14 @@ class StratifiedSample:
     def add(self, batch: ComponentDraws, proposal: MixtureProposal, inputs: Inputs, gamma: float) -> "StratifiedSample":
         """Return the sample with another batch from the same proposal."""
         fails = batch.f <= gamma
-        ratios, log_weights = proposal.drawn(batch.counts).kind_ratios(batch.u)
+        drawn = proposal.drawn(batch.counts)
+        ratios, log_weights = drawn.kind_ratios(batch.u)
         owner, k = np.repeat(np.arange(len(batch.counts)), batch.counts), len(batch.counts)
         calibration = calibrate(ratios, owner, self.settings.draws_per_control)
         y = calibration.residuals(np.where(fails, np.exp(np.minimum(log_weights, MAX_LOG_WEIGHT)), 0.0))
         x = inputs.base.from_standard_normal(batch.u) if batch.x is None else batch.x
         log_weights = log_weights + np.log(calibration.factors)
+        largest = float(calibration.factors[fails].max(initial=1.0)) / drawn.weights[0]
         return StratifiedSample(
             self.draws.join(Draws.from_outcomes(batch.f, log_weights, x, gamma)),
             self.counts + batch.counts,
@@ -69,6 +73,7 @@ class StratifiedSample:
             self.typical,
             np.concatenate([self.u_safe, batch.u[~fails]]),
             self.settings,
+            max(self.largest_weight, largest),
         )
 
     def join(self, earlier: "StratifiedSample") -> "StratifiedSample":
@@ -91,6 +96,7 @@ class StratifiedSample:
             self.typical,
             np.concatenate([earlier.u_safe, self.u_safe]),
             self.settings,
+            max(self.largest_weight, earlier.largest_weight),
         )
 
     @property

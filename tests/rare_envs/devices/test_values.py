@@ -51,3 +51,8 @@ def test_a_module_is_copied_and_the_caller_s_stays_where_it_is() -> None:
     moved = move_to(torch.device("meta"), module)
     assert moved.weight.device.type == "meta"
     assert module.weight.device.type == "cpu"
+
+
+def test_numbers_beside_integers_stay_numbers() -> None:
+    (half,) = scalars((0.5,), torch.arange(3))
+    assert half.item() == 0.5

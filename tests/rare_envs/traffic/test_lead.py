@@ -42,3 +42,10 @@ def test_the_index_of_the_lead_is_that_of_the_vehicle_whose_gap_is_given() -> No
     rows = torch.arange(batch)
     torch.testing.assert_close(lead.gap[~nobody], (x[rows, index] - x[:, 0] - VEHICLE_LENGTH)[~nobody])
     torch.testing.assert_close(lead.closing_speed[~nobody], (speed[:, 0] - speed[rows, index])[~nobody])
+
+
+def test_an_ego_alone_has_a_gap_for_each_scenario() -> None:
+    x = torch.zeros(3, 1)
+    lead = lead_of(State(x, x, x, x + 20.0, x[:, :0]), straight(1))
+    assert lead.gap.tolist() == [math.inf] * 3
+    assert lead.closing_speed.tolist() == [0.0] * 3

@@ -276,3 +276,9 @@ def test_fast_enough_to_be_called_every_tick() -> None:
 def test_off_road() -> None:
     for lanes, y, outside in [(1, 1.9, False), (1, 2.1, True), (1, -2.1, True), (2, 5.9, False), (2, 6.1, True)]:
         assert straight(lanes).off_road(torch.tensor([y])).item() is outside
+
+
+def test_a_lane_s_centre_may_be_changed_by_whoever_asks_for_it() -> None:
+    road, y = straight(1), torch.zeros(1)
+    road.centre_of(y).add_(5.0)
+    assert road.centre_of(y).item() == 0.0

@@ -29,7 +29,7 @@ class LastDraws(NamedTuple):
 
     draws: PlannedDraws
     cov: float
-    """Their own c.o.v."""
+    """Their c.o.v. as that of independent draws, as the predicted one is."""
     kept: Simulated
     """The first ones."""
 

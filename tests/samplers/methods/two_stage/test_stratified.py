@@ -194,3 +194,16 @@ def test_points_that_are_known_in_physical_space_are_not_mapped_again(rng, monke
     known = strata(drawn._replace(x=drawn.u + 10.0))
     np.testing.assert_array_equal(known.draws.x, mapped.draws.x + 10.0)
     assert known.p == mapped.p
+
+
+def test_the_bound_of_the_weights_follows_the_draws_of_the_base(rng):
+    """No weight of a failing draw exceeds it, calibrated or not; batches have the larger of their bounds."""
+    many, few = batch([200, 300, 300, 200], rng), batch([10, 30, 30, 30], rng)
+    kinds = ["base", "gaussian", "tempered", "half-space"]
+    candidates = [ProposalComponent(one, kind) for (one, _), kind in zip(PARTS, kinds, strict=True)]
+    apart = MixtureProposal(candidates, WEIGHTS)
+    found = strata(many, proposal=apart)
+    assert found.largest_weight > 1 / 0.2  # some factor is above 1
+    assert np.exp(found.draws.log_weights).max() <= found.largest_weight
+    assert strata(few).largest_weight == pytest.approx(10.0)
+    assert strata(few).join(found).largest_weight == pytest.approx(max(10.0, found.largest_weight))
