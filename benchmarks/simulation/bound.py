@@ -25,7 +25,9 @@ SIMPLE = frozenset(
     "bitwise_and bitwise_or bitwise_not __and__ __or__ __lshift__ __rshift__".split()
 )
 """Sums, products, comparisons, choices."""
-REDUCTIONS = frozenset("any all count_nonzero sum mean amin amax min max argmin argmax prod cumsum cummin cummax".split())
+REDUCTIONS = frozenset(
+    "any all count_nonzero sum mean amin amax min max argmin argmax prod cumsum cummin cummax".split()
+)
 """A simple operation for each element that they read."""
 ROOTS = frozenset("div sqrt rsqrt reciprocal remainder fmod floor_divide hypot linalg_vector_norm".split())
 CURVES = frozenset(
