@@ -55,7 +55,7 @@ class DrawWeights:
     first: int
     """Simulations that its run had spent before the first of them."""
     log_weights: FloatArray
-    """log(p0 / q) - log(N) for N draws in all, in the order of the simulations, shape (n,)."""
+    """log(p0 / q) - log(N) for N draws in all, calibrated or not, in the order of the simulations, shape (n,)."""
     run: int = 0
     """Replicate that made them."""
     log_share: float = 0.0
