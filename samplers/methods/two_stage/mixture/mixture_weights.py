@@ -68,7 +68,7 @@ def minimise_second_moment(
     a, limits = start, _FloorIndex.of(floors, len(start))
     for _ in range(settings.updates):
         q = np.maximum(a @ ratio, LEAST_DENSITY_RATIO)
-        a = a * np.sqrt((ratio * (scaled / (q * q))).sum(axis=1))
+        a = a * np.sqrt(ratio @ (scaled / (q * q)))
         a = limits.apply(a / a.sum())
     return a
 
@@ -91,37 +91,41 @@ def raise_to_floors(a: FloatArray, floors: Sequence[Floor]) -> FloatArray:
 class _FloorIndex(NamedTuple):
     """Floors as they are read in every update of the weights."""
 
-    members: FloatArray
-    """Ones where a component (k) belongs to a floor (m), shape (m, k)."""
-    least: FloatArray
-    """Shape (m,)."""
-    rows: tuple[NDArray[np.intp], ...]
-    """The components of each floor."""
+    groups: NDArray[np.intp]
+    """Floor of each component, shape (k,); m where it has none."""
+    least: list[float]
+    """Least share of each, 0 without a floor; m + 1."""
 
     @classmethod
     def of(cls, floors: Sequence[Floor], k: int) -> "_FloorIndex":
         """Return the floors of k components."""
-        members = np.array([floor.members for floor in floors], dtype=np.float64).reshape(len(floors), k)
-        least = np.array([floor.least for floor in floors])
-        return cls(members, least, tuple(np.flatnonzero(floor.members) for floor in floors))
+        groups = np.full(k, len(floors))
+        for number, floor in enumerate(floors):
+            groups[floor.members] = number
+        return cls(groups, [*(each.least for each in floors), 0.0])
 
     def apply(self, a: FloatArray) -> FloatArray:
         """Return weights raised to the floors, see `raise_to_floors`."""
-        raised: NDArray[np.bool_] | None = None
-        while True:
-            low = self.members @ a < self.least - FLOOR_ROUNDING
-            if raised is not None:
-                low &= ~raised
-            if not low.any():
-                return a
-            raised = low if raised is None else raised | low
-            others = ~self.members[raised].any(axis=0)
-            rest, total = float(a[others].sum()), float(self.least[raised].sum())
-            room = max(1 - total, 0.0) if rest > 0 else 0.0
-            a = np.where(others, a * (room / rest if rest > 0 else 0.0), a)
-            for i in np.flatnonzero(raised):
-                rows = self.rows[i]
-                weights = a.take(rows)
-                own = float(np.add.reduce(weights))
-                inside = weights / own if own > 0 else np.full(len(rows), 1 / len(rows))
-                a[rows] = inside * (self.least[i] if room > 0 else self.least[i] / total)
+        own = np.bincount(self.groups, a, len(self.least))
+        shares = _raise_shares(own.tolist(), self.least)
+        if shares is None:
+            return a
+        inside = np.where(own > 0, own, np.bincount(self.groups, minlength=len(own)))[self.groups]
+        return np.where(own[self.groups] > 0, a, 1.0) / inside * np.array(shares)[self.groups]
+
+
+def _raise_shares(shares: list[float], least: list[float]) -> list[float] | None:
+    """Return shares of groups (m,) raised to their least ones, the others lowered; None where none is too low."""
+    raised: set[int] = set()
+    while True:
+        low = {k for k, share in enumerate(shares) if share < least[k] - FLOOR_ROUNDING} - raised
+        if not low:
+            return shares if raised else None
+        raised |= low
+        total, rest = sum(least[k] for k in raised), sum(share for k, share in enumerate(shares) if k not in raised)
+        room = max(1 - total, 0.0) if rest > 0 else 0.0
+        lowered = room / rest if rest > 0 else 0.0
+        shares = [
+            share * lowered if k not in raised else least[k] if room > 0 else least[k] / total
+            for k, share in enumerate(shares)
+        ]

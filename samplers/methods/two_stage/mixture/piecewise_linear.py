@@ -82,14 +82,14 @@ def fit_pieces(
     before, lowest, idle = None, math.inf, 0
     for _ in range(settings.iterations):
         own, agrees, deviation = assign_points(pieces, u, y, inlier_sigmas)
-        agreeing = deviation[agrees]
-        square = float(np.add.reduce(agreeing * agreeing)) / len(agreeing)  # `mean` takes longer to begin
+        if inlier_sigmas < math.inf:
+            own, deviation = np.where(agrees, own, NO_PIECE), deviation[agrees]
+        square = float(deviation @ deviation) / len(deviation)
         idle = 0 if square < (1 - LEAST_GAIN) * lowest else idle + 1
         lowest = min(lowest, square)
-        own = np.where(agrees, own, NO_PIECE)
-        if idle == patience or (before is not None and (own == before).all()):
+        if idle == patience or (before is not None and np.array_equal(own, before)):
             break
-        groups = [np.flatnonzero(own == k) for k in range(len(pieces.intercepts))]
+        groups = [(own == k).nonzero()[0] for k in range(len(pieces.intercepts))]
         groups = [group for group in groups if len(group) >= least]
         if not groups:
             return None
@@ -134,10 +134,9 @@ def _design(u: FloatArray) -> FloatArray:
 def _regress(design: FloatArray, y: FloatArray, groups: Iterable[NDArray[np.int64]], ridge: float) -> LinearPieces:
     """Return the ridge regressions of y (n,) at some groups of points, one piece each; `design` is (n, d + 1)."""
     dim = design.shape[1] - 1
-    chosen = [(design.take(group, axis=0), y[group]) for group in groups]
+    chosen = [(design.take(group, axis=0), y.take(group)) for group in groups]
     normal = np.array([x.T @ x for x, _ in chosen])
-    slopes = np.arange(dim)
-    normal[:, slopes, slopes] += ridge  # the intercept has no penalty
-    moments = np.array([x.T @ values for x, values in chosen])
+    normal[:, range(dim), range(dim)] += ridge  # the intercept has no penalty
+    moments = np.array([values @ x for x, values in chosen])
     coefficients = np.linalg.solve(normal, moments[:, :, None])[:, :, 0]
     return LinearPieces(coefficients[:, dim], coefficients[:, :dim])
