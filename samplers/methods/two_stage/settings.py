@@ -280,7 +280,7 @@ class RefinementSettings:
     40 intervals miss p, with it none. Without `tempered` the variance is a quarter smaller: they are for noise, and for
     regions that are badly described. `half-space` and `wide` buy nothing over all (1.01 and 1.02 +- 0.05, 168 runs on
     48 limit states): they guard the coverage on sector_d6 and oscillator_d100, and on loads_d7 and crossing_d6
-    (`docs/estimator_results.md`)."""
+    (`docs/estimator_experiments.md`)."""
     wide_scale: float = 1.5
     """Standard deviation of the wide component."""
     tempering: tuple[float, ...] = (0.5,)
