@@ -1,11 +1,15 @@
 """What is the IDM ego's collision probability? Plain Monte Carlo, no sampler of ours involved.
 
-    python -m benchmarks.estimators.truth --rollouts 1e7
+    python -m benchmarks.estimators.truth --rollouts 1e7 --workers 2
 
-writes `benchmarks/results/truth.json`, which the tests of the samplers compare with.
+writes `benchmarks/results/truth.json`, which the tests of the samplers compare with. The counts do not depend on the
+number of processes: every chunk of rollouts has a seed of its own.
 """
 
 import json
+from concurrent.futures import ProcessPoolExecutor
+from functools import cache, partial
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Annotated
 
@@ -30,7 +34,19 @@ TRUTH_BASES = (
 """Collisions elsewhere are too rare for plain Monte Carlo, and with learned drivers a rollout is too slow."""
 
 
-def truth(env_id: str, base: str, rollouts: int, seed: int) -> dict[str, float | int | str]:
+def count_collisions(env_id: str, base: str, seed: int, chunk: int, size: int = ROLLOUT_CHUNK) -> int:
+    """Return the collisions among the rollouts of one chunk."""
+    problem = _make_problem(env_id, base)
+    with use_one_thread():
+        return int((problem.evaluate(problem.base.sample(size, np.random.default_rng((seed, chunk)))) <= 0.0).sum())
+
+
+@cache
+def _make_problem(env_id: str, base: str) -> rare_envs.DrivingProblem:
+    return rare_envs.DrivingProblem(env_id, base=base)
+
+
+def truth(env_id: str, base: str, rollouts: int, seed: int, workers: int = 1) -> dict[str, float | int | str]:
     """Count collisions in independent draws from the base distribution.
 
     Args:
@@ -38,16 +54,15 @@ def truth(env_id: str, base: str, rollouts: int, seed: int) -> dict[str, float |
         base: Name of the base distribution.
         rollouts: Number of rollouts.
         seed: Seed of the draws.
+        workers: Processes.
 
     Returns:
         The counts, the proportion and its standard error.
     """
-    problem = rare_envs.DrivingProblem(env_id, base=base)
-    rng = np.random.default_rng(seed)
     sizes = [min(ROLLOUT_CHUNK, rollouts - first) for first in range(0, rollouts, ROLLOUT_CHUNK)]
-    collisions = 0
-    for size in track(sizes, description=f"{env_id} {base}"):
-        collisions += int((problem.evaluate(problem.base.sample(size, rng)) <= 0.0).sum())
+    with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
+        counts = pool.map(partial(count_collisions, env_id, base, seed), range(len(sizes)), sizes)
+        collisions = sum(track(counts, description=f"{env_id} {base}", total=len(sizes)))
     p = collisions / rollouts
     return {
         "env_id": env_id,
@@ -62,16 +77,16 @@ def truth(env_id: str, base: str, rollouts: int, seed: int) -> dict[str, float |
     }
 
 
-@use_one_thread()
 def main(
     rollouts: Annotated[float, typer.Option(help="Rollouts for each scenario and base.")] = 1e7,
     seed: int = 2026,
+    workers: Annotated[int, typer.Option(min=1, help="Processes.")] = 1,
     out: Path = TRUTH_RESULT,
 ) -> None:
     """Measure both scenarios with two bases each and write the result."""
     results = []
     for env_id, base in TRUTH_BASES:
-        results.append(truth(env_id, base, int(rollouts), seed))
+        results.append(truth(env_id, base, int(rollouts), seed, workers))
         print(json.dumps(results[-1]))
         command = f"python -m benchmarks.estimators.truth --rollouts {rollouts:g} --seed {seed}"
         versions = {"rare_envs": rare_envs.__version__, "torch": torch.__version__, "numpy": np.__version__}
