@@ -13,7 +13,7 @@ import numpy as np
 import typer
 
 from benchmarks.simulation.timing import seconds
-from rare_envs.distributions import pooled_mixture, truncated_normal
+from rare_envs.distributions import mixture_conditionals, pooled_mixture, truncated_normal
 from rare_envs.distributions.quantiles import column_quantiles, mixture_quantile
 from rare_envs.distributions.space import Distribution
 from rare_envs.scenarios.base_distributions import load_base
@@ -45,9 +45,13 @@ WAYS: dict[str, Callable[..., column_quantiles.Quantiles]] = {
 @contextmanager
 def use(way: str) -> Iterator[None]:
     """Let mixtures and pools find quantiles in one way."""
+    find_compiled = mixture_conditionals.find_compiled
+    if way != "compiled":
+        mixture_conditionals.find_compiled = lambda: None  # else whole rows at once
     for module in (truncated_normal, pooled_mixture):
         module.find_quantiles = WAYS[way]
     yield
+    mixture_conditionals.find_compiled = find_compiled
     for module in (truncated_normal, pooled_mixture):
         module.find_quantiles = column_quantiles.find_quantiles
 

@@ -66,6 +66,11 @@ class CoordinateMixture:
             object.__setattr__(self, name, getattr(conditionals, name))  # a field by its name
 
     @property
+    def conditionals(self) -> MixtureConditionals:
+        """Its coordinates one by one, each given the earlier ones."""
+        return self._conditionals
+
+    @property
     def dim(self) -> int:
         """Number of columns d."""
         return self.coordinates.dim
@@ -82,12 +87,7 @@ class CoordinateMixture:
 
     def log_prob(self, x: ArrayLike) -> FloatArray:
         """Return the log density, (n, d) -> (n,); -inf outside the box."""
-        points = self._conditionals.rows("x", x)
-        inside = ((points >= self.low) & (points <= self.high)).all(axis=1)
-        out = np.full(len(points), -np.inf)
-        inner = self.coordinates.interior(points[inside])
-        out[inside] = self._conditionals.log_prob(inner) + self.coordinates.log_jacobian(inner)
-        return out
+        return self._conditionals.log_prob(x)
 
     def to_standard_normal(self, x: ArrayLike) -> FloatArray:
         """Map points in the box to standard normal space, (n, d) -> (n, d), as `TruncatedGaussianMixture` does.

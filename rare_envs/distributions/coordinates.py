@@ -94,6 +94,11 @@ class Coordinates:
         return tuple(map(self.names.index, self.order)) if self.order else tuple(range(self.dim))
 
     @cached_property
+    def key(self) -> tuple[object, ...]:
+        """What tells coordinates apart: two of the same key are equal."""
+        return (self.low.tobytes(), self.high.tobytes(), self.kinds, self.names, self.order)
+
+    @cached_property
     def _sources(self) -> dict[int, tuple[int, int]]:
         """Columns of the speed behind and the gap, of each column that is a speed ahead."""
         closing = {j: kind for j, kind in enumerate(self.kinds) if isinstance(kind, ClosingSpeed)}

@@ -15,7 +15,7 @@ from rare_envs.distributions.coordinate_mixture import CoordinateMixture
 from rare_envs.distributions.frequency import EventFrequency
 from rare_envs.distributions.mixture_conditionals import COMPONENT_FIELDS
 from rare_envs.distributions.parameters import DistributionParameter, HasParameters
-from rare_envs.distributions.pooled_mixture import number_coordinates, pool_mixtures
+from rare_envs.distributions.pooled_mixture import Refits, number_coordinates, pool_mixtures
 from rare_envs.distributions.reading import (
     FileDistribution,
     read_distribution,
@@ -139,7 +139,7 @@ class FittedDistribution:
     """Loader of other base distributions of the same scenario, by name or file."""
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "refits", tuple(self.refits))
+        object.__setattr__(self, "refits", Refits(self.refits))
         object.__setattr__(self, "checks", tuple(self.checks))
         require_text("family", self.family)
         if not isinstance(self.record, Mapping):

@@ -5,8 +5,10 @@ Every operation works row by row: a row of the result does not depend, bit for b
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import cache, cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -14,6 +16,7 @@ from numpy.typing import ArrayLike
 
 from rare_envs.arrays import FloatArray
 from rare_envs.distributions.coordinates import Coordinates, as_finite, move_inside
+from rare_envs.distributions.rows.box_points import BoxPoints, CoordinateRun, describe_points, find_ranges, split_runs
 from rare_envs.distributions.truncated_normal import (
     TruncatedConditional,
     choose,
@@ -75,9 +78,19 @@ class MixtureConditionals:
         """Number of coordinates d."""
         return int(self.means.shape[1])
 
-    def log_prob(self, x: FloatArray) -> FloatArray:
-        """Return the log density of the coordinates of points in the box, (n, d) -> (n,)."""
-        return apply_by_chunks(self._log_prob, x, 1)[:, 0]
+    def log_prob(self, x: ArrayLike) -> FloatArray:
+        """Return the log density of points, (n, d) -> (n,); -inf outside the box.
+
+        Raises:
+            ValueError: Wrong shape.
+        """
+        return self.log_prob_at(describe_points(self.coordinates, self.rows("x", x)))
+
+    def log_prob_at(self, points: BoxPoints) -> FloatArray:
+        """Return the same from what equal coordinates say of n points, (n,)."""
+        out = np.full(len(points.inside), -np.inf)
+        out[points.inside] = self._log_prob(points) + points.log_jacobian
+        return out
 
     def to_standard_normal(self, x: FloatArray) -> FloatArray:
         """Map points in the box to standard normal space, (n, d) -> (n, d); u_j rises with column j of x."""
@@ -163,17 +176,41 @@ class MixtureConditionals:
         log_weights = reweight(conditional.log_weights, residual, conditional.scale)
         return ConditioningState(log_weights, (*state.residuals, residual))
 
-    def _log_prob(self, x: FloatArray) -> FloatArray:
-        state, total = self.start(), np.zeros(len(x))
-        for j in self.coordinates.columns:
-            conditional = self.next_conditional(state, self.coordinates.bounds(j, x))
-            total = total - conditional.log_whole_mass()
-            state = self.observe(conditional, state, self.coordinates.coordinate(j, x))
-            density = log_sum(state.log_weights)
-            total = total + density
-            # Kept relative to the largest, so that far points do not run away.
-            state = state._replace(log_weights=state.log_weights - density)
-        return total[:, None]
+    @cached_property
+    def _runs(self) -> tuple[CoordinateRun, ...]:
+        return split_runs(self.coordinates)
+
+    @cached_property
+    def _parameters(self) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+        """Parameters as compiled code takes them: of the components in the last axis, and not read-only."""
+        factors = np.ascontiguousarray(np.moveaxis(self._factors, 0, -1))
+        log_scales = np.log(np.einsum("iik->ik", factors))
+        return np.log(self.weights), np.array(self.means.T, order="C"), factors, log_scales
+
+    def _log_prob(self, points: BoxPoints) -> FloatArray:
+        rows = find_compiled()
+        return self._log_prob_by_coordinates(points) if rows is None else self._log_prob_by_rows(points, rows)
+
+    def _log_prob_by_rows(self, points: BoxPoints, rows: Any) -> FloatArray:
+        out, fits = rows.find_log_densities(self._parameters, points.ranges, points.y)
+        if not fits.all():
+            out[~fits] = self._log_prob_by_coordinates(points.take(~fits))
+        return np.asarray(out)
+
+    def _log_prob_by_coordinates(self, points: BoxPoints) -> FloatArray:
+        out = np.zeros(points.y.shape[1])
+        for start in range(0, len(out), CHUNK_ROWS):
+            chunk, total = points.take(slice(start, start + CHUNK_ROWS)), out[start : start + CHUNK_ROWS]
+            state = self.start()
+            for y, low, high in zip(chunk.y, *chunk.ranges, strict=True):
+                conditional = self.next_conditional(state, (low, high))
+                total -= conditional.log_whole_mass()
+                state = self.observe(conditional, state, y)
+                density = log_sum(state.log_weights)
+                total += density
+                # Kept relative to the largest, so that far points do not run away.
+                state = state._replace(log_weights=state.log_weights - density)
+        return out
 
     def _to_normal(self, x: FloatArray) -> FloatArray:
         state, u = self.start(), np.empty_like(x)
@@ -187,6 +224,22 @@ class MixtureConditionals:
         return u
 
     def _from_normal(self, u: FloatArray) -> FloatArray:
+        rows = find_compiled()
+        return self._from_normal_by_coordinates(u) if rows is None else self._from_normal_by_rows(u, rows)
+
+    def _from_normal_by_rows(self, u: FloatArray, rows: Any) -> FloatArray:
+        states, x = rows.RowStates(self._parameters, len(u)), np.empty_like(u)
+        for first, columns, signs, fixed in self._runs:
+            ranges = find_ranges(self.coordinates, columns, x) if fixed is None else fixed
+            x[:, columns] = states.map_coordinates(first, ranges, u[:, columns] * signs)
+            for j in columns:
+                if self.coordinates.kinds[j] != "plain":
+                    x[:, j] = self.coordinates.value(j, np.ascontiguousarray(x[:, j]), x)
+        if not states.fits.all():
+            x[~states.fits] = self._from_normal_by_coordinates(u[~states.fits])
+        return x
+
+    def _from_normal_by_coordinates(self, u: FloatArray) -> FloatArray:
         state, x = self.start(), np.empty_like(u)
         for j in self.coordinates.columns:
             bounds = self.coordinates.bounds(j, x)
@@ -222,6 +275,35 @@ class MixtureConditionals:
             x[:, j] = self.coordinates.value(j, y[:, i], x)
             log_weights = reweight(log_weights, (y[:, i] - mean) / scale, scale)
         return x
+
+
+def find_compiled() -> Any:
+    """Return the module `compiled_rows` where this process has numba, else None."""
+    return _load_compiled() if "numba" in sys.modules else None
+
+
+@cache
+def _load_compiled() -> Any:
+    """Return the module; None where numba does not work, or SciPy's functions are others to it."""
+    try:
+        from rare_envs.distributions.rows import compiled_rows
+
+        sample, u = _sample()
+        x, known = sample._from_normal_by_rows(u, compiled_rows), sample._from_normal_by_coordinates(u)
+        points = describe_points(sample.coordinates, x)
+        densities = sample._log_prob_by_rows(points, compiled_rows), sample._log_prob_by_coordinates(points)
+        same = np.array_equal(x, known) and np.allclose(*densities, rtol=1e-12, atol=1e-12)
+    except Exception:  # a compiler may raise anything, and is not needed
+        return None
+    return compiled_rows if same else None
+
+
+def _sample() -> tuple[MixtureConditionals, FloatArray]:
+    """Return a mixture in a box that cuts each component differently, and points for it."""
+    low, high, weights = np.array([-1.0, 0.5]), np.array([2.0, 30.0]), np.array([0.3, 0.7])
+    means, covariances = np.array([[0.0, 1.0], [-3.0, 9.0]]), np.array([[[1.0, 0.5], [0.5, 2.0]], 0.1 * np.eye(2)])
+    sample = MixtureConditionals(Coordinates(low, high, ("plain", "plain")), weights, means, covariances)
+    return sample, np.random.default_rng(0).normal(0.0, 3.0, (64, 2))
 
 
 def apply_by_chunks(function: Callable[[FloatArray], FloatArray], points: FloatArray, columns: int) -> FloatArray:

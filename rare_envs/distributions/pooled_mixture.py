@@ -23,10 +23,44 @@ from rare_envs.distributions.mixture_conditionals import (
 from rare_envs.distributions.quantiles.column_quantiles import find_quantiles
 from rare_envs.distributions.quantiles.mixture_quantile import MixtureColumn
 from rare_envs.distributions.quantiles.pool_by_logarithms import PoolTerm, find_quantiles_by_logarithms
+from rare_envs.distributions.rows.box_points import BoxPoints, describe_points
+from rare_envs.distributions.space import Distribution
 from rare_envs.distributions.truncated_mixture import TruncatedGaussianMixture
 from rare_envs.distributions.truncated_normal import TruncatedConditional, log_sum
 
 BoxMixture = TruncatedGaussianMixture | CoordinateMixture
+
+
+class Refits(tuple[Distribution, ...]):
+    """Distributions of the same X, of which densities are computed together.
+
+    Example:
+        >>> Refits([TruncatedGaussianMixture([1.0], [[m]], [[[1.0]]], [-9.0], [9.0]) for m in (0.0, 1.0)]).log_probs(
+        ...     np.array([[0.0], [1.0], [10.0]])
+        ... ).round(3).tolist()
+        [[-0.919, -1.419, -inf], [-1.419, -0.919, -inf]]
+    """
+
+    __slots__ = ()
+
+    def log_probs(self, x: FloatArray) -> FloatArray:
+        """Return the log density of each, (n, d) -> (R, n); where points are in equal coordinates is found once.
+
+        Raises:
+            ValueError: Wrong shape.
+        """
+        known: dict[tuple[object, ...], BoxPoints] = {}
+        out = np.empty((len(self), len(x)))
+        for row, each in zip(out, self, strict=True):
+            if isinstance(each, BoxMixture):
+                conditionals = each.conditionals
+                key = conditionals.coordinates.key
+                if key not in known:
+                    known[key] = describe_points(conditionals.coordinates, conditionals.rows("x", x))
+                row[:] = conditionals.log_prob_at(known[key])
+            else:
+                row[:] = each.log_prob(x)
+        return out
 
 
 def pool_mixtures(mixtures: Sequence[BoxMixture]) -> CoordinateMixture | PooledMixture:

@@ -88,6 +88,11 @@ class TruncatedGaussianMixture:
             object.__setattr__(self, name, getattr(conditionals if name in COMPONENT_FIELDS else plain, name))
 
     @property
+    def conditionals(self) -> MixtureConditionals:
+        """Its coordinates one by one, each given the earlier ones."""
+        return self._conditionals
+
+    @property
     def dim(self) -> int:
         """Number of coordinates d."""
         return self._conditionals.dim
@@ -106,11 +111,7 @@ class TruncatedGaussianMixture:
         Returns:
             Log density, shape (n,).
         """
-        points = self._conditionals.rows("x", x)
-        inside = ((points >= self.low) & (points <= self.high)).all(axis=1)
-        out = np.full(len(points), -np.inf)
-        out[inside] = self._conditionals.log_prob(points[inside])
-        return out
+        return self._conditionals.log_prob(x)
 
     def to_standard_normal(self, x: ArrayLike) -> FloatArray:
         """Map to standard normal space by Rosenblatt: u_j = Phi^-1(P(X_j <= x_j | x_1, ..., x_{j-1})).

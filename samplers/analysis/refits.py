@@ -92,6 +92,14 @@ class HasCoveringEnsemble(HasEnsemble, Protocol):
 
 
 @runtime_checkable
+class HasLogProbs(Protocol):
+    """A sequence of refits whose densities can be computed together, in less time than one by one."""
+
+    def log_probs(self, x: FloatArray, /) -> FloatArray:
+        """Return the log density of each of R refits at x (k, d), shape (R, k)."""
+
+
+@runtime_checkable
 class HasParts(Protocol):
     """A problem whose failures have parts, each with a probability of its own that is wanted under the refits."""
 
@@ -194,10 +202,15 @@ def refit_log_ratios(estimate: WeightedEstimate, refits: Sequence[HasLogProb]) -
     known = estimate.refit_ratios.find(of)
     if known is None:
         old = log_density(base, sample.x)
-        rows = [subtract_log_densities(refit, old, sample.x) for refit in refits]
-        known = np.array(rows, dtype=np.float64).reshape(len(rows), len(sample.x))
+        new = refits.log_probs(sample.x) if isinstance(refits, HasLogProbs) else _log_densities(refits, sample.x)
+        known = subtract_log_densities(new, old, sample.x)
         estimate.refit_ratios.keep(of, known)
     return known
+
+
+def _log_densities(refits: Sequence[HasLogProb], x: FloatArray) -> FloatArray:
+    """Return the log density of each refit at x (k, d), shape (R, k)."""
+    return np.array([log_density(refit, x) for refit in refits], dtype=np.float64).reshape(len(refits), len(x))
 
 
 def reweight_to_refits(

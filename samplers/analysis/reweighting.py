@@ -154,7 +154,7 @@ def log_density_ratios(estimate: WeightedEstimate, new_base: HasLogProb, x: Floa
         raise ValueError(f"No point failed (f <= {estimate.gamma:g}): there is nothing to reweight.")
     check_dimensions_fit(new_base, x.shape[1])
     check_support(base, new_base, x.shape[1], estimate.seed)
-    return subtract_log_densities(new_base, log_density(base, x), x)
+    return subtract_log_densities(log_density(new_base, x), log_density(base, x), x)
 
 
 def require_base(estimate: WeightedEstimate) -> Distribution:
@@ -167,24 +167,23 @@ def require_base(estimate: WeightedEstimate) -> Distribution:
     return estimate.base
 
 
-def subtract_log_densities(new_base: HasLogProb, old: FloatArray, x: FloatArray) -> FloatArray:
-    """Return log p1(x) - log p0(x), shape (k,).
+def subtract_log_densities(new: FloatArray, old: FloatArray, x: FloatArray) -> FloatArray:
+    """Return log p1(x) - log p0(x), shape (k,), or (R, k) for R new bases.
 
     Args:
-        new_base: p1.
+        new: log p1 at x, shape (k,) or (R, k).
         old: log p0 at x, shape (k,).
         x: Points, shape (k, d).
 
     Raises:
         ValueError: If a density is not finite (p1 may be 0).
     """
-    new = log_density(new_base, x)
-    wrong = np.isnan(new) | np.isposinf(new) | ~np.isfinite(old)
+    wrong = ~((new < np.inf) & np.isfinite(old))  # NaN is not below
     if wrong.any():
-        row = int(np.argmax(wrong))
+        place = np.unravel_index(int(np.argmax(wrong)), wrong.shape)
         raise ValueError(
-            f"Expected finite densities at the failing points; at {x[row]} log_prob is {new[row]} under the new base "
-            f"and {old[row]} under the old."
+            f"Expected finite densities at the failing points; at {x[place[-1]]} log_prob is {new[place]} under the "
+            f"new base and {old[place[-1]]} under the old."
         )
     return new - old
 

@@ -40,7 +40,7 @@ ALL_U = 8.3
 """From here on Phi is 1 but for rounding, and need not be computed."""
 
 
-def _scipy_function(name: str, arguments: int) -> Any:
+def scipy_function(name: str, arguments: int) -> Any:
     """Return a function of SciPy for compiled code, by a symbol of its own, so that the code can be kept."""
     symbol = f"rare_envs_{name}"
     llvmlite.binding.add_symbol(symbol, get_cython_function_address("scipy.special.cython_special", name))
@@ -49,11 +49,11 @@ def _scipy_function(name: str, arguments: int) -> Any:
 
 
 # The last argument of these is Cython's own, and 0.
-_ndtr = _scipy_function("__pyx_fuse_1ndtr", 1)
-_ndtri = _scipy_function("ndtri", 1)
-_exp2 = _scipy_function("exp2", 1)
-_xlogy = _scipy_function("__pyx_fuse_1xlogy", 2)
-_xlog1py = _scipy_function("__pyx_fuse_1xlog1py", 2)
+_ndtr = scipy_function("__pyx_fuse_1ndtr", 1)
+_ndtri = scipy_function("ndtri", 1)
+_exp2 = scipy_function("exp2", 1)
+_xlogy = scipy_function("__pyx_fuse_1xlogy", 2)
+_xlog1py = scipy_function("__pyx_fuse_1xlog1py", 2)
 
 
 def search_by_rows(column: MixtureColumn, u: FloatArray) -> tuple[FloatArray, NDArray[np.bool_]]:
@@ -62,14 +62,14 @@ def search_by_rows(column: MixtureColumn, u: FloatArray) -> tuple[FloatArray, ND
     found, fits = np.zeros(n), np.zeros(n, dtype=np.bool_)
     # numba compiles anew for arrays of another layout, or that cannot be written
     log_weights, mean, scale, low, high, share, u = map(
-        _plain_array, (column.log_weights, column.mean, column.scale, column.low, column.high, column.share, u)
+        plain_array, (column.log_weights, column.mean, column.scale, column.low, column.high, column.share, u)
     )
     edges, scratch = np.array(column.edges), np.empty((2, N_FIELDS, k))
     _find_quantiles(log_weights, mean, scale, low, high, edges, share, column.n_plain, u, scratch, found, fits)
     return found, fits
 
 
-def _plain_array(array: FloatArray) -> FloatArray:
+def plain_array(array: FloatArray) -> FloatArray:
     """Return an array in C order that can be written."""
     flags = array.flags
     return array if flags.c_contiguous and flags.writeable else np.array(array, np.float64, order="C")
@@ -115,7 +115,7 @@ def _find_quantiles(
             known, tail_fits = known_right, right_fits
         ends = _mirrored_ends(low[i], high[i], sign, n_plain < len(mean))
         if not (alike and known >= 0 and low[known] == low[i] and high[known] == high[i]):
-            tail_fits = _set_tail(log_weights, mean, scale, edges, share, n_plain, i, sign, ends, tail)
+            tail_fits = set_tail(log_weights, mean, scale, edges, share, n_plain, i, sign, ends, tail)
         if side == 1:
             known_right, right_fits = i, tail_fits
         else:
@@ -123,9 +123,24 @@ def _find_quantiles(
         below = max(-abs(u[i]), MIN_U)
         fits[i] = tail_fits and below > MIN_U
         if fits[i]:
-            narrow, narrow_log = _least_scales(scale, n_plain, i)
-            guess = _guess(tail, n_plain, sign, ends, below)
-            found[i] = sign * _solve(tail, n_plain, sign, ends, narrow, narrow_log, below, guess)
+            found[i] = solve_row(scale, n_plain, i, sign, ends, tail, below)
+
+
+@compiled
+def solve_row(
+    scale: FloatArray,
+    n_plain: int,
+    i: int,
+    sign: float,
+    ends: tuple[float, float, float, float],
+    tail: FloatArray,
+    below: float,
+) -> float:
+    """Return the quantile of row i from the fields of its tail, which `set_tail` has written, at Phi(below)."""
+    narrow, narrow_log = _least_scales(scale, n_plain, i)
+    guess = _guess(tail, n_plain, sign, ends, below)
+    quantile: float = sign * _solve(tail, n_plain, sign, ends, narrow, narrow_log, below, guess)
+    return quantile
 
 
 @compiled
@@ -164,7 +179,7 @@ def _least_scales(scale: FloatArray, n_plain: int, i: int) -> tuple[float, float
 
 
 @compiled
-def _set_tail(
+def set_tail(
     log_weights: FloatArray,
     mean: FloatArray,
     scale: FloatArray,

@@ -1,8 +1,11 @@
 """Conditionals one by one: shapes, chunks, and the agreement of density, map and draws with those of plain boxes."""
 
+import sys
+
 import numpy as np
 import pytest
 
+from rare_envs.distributions import mixture_conditionals
 from rare_envs.distributions.coordinates import CoordinateKind, Coordinates
 from rare_envs.distributions.mixture_conditionals import CHUNK_ROWS, MixtureConditionals
 from rare_envs.distributions.truncated_mixture import TruncatedGaussianMixture
@@ -42,3 +45,38 @@ def test_shapes_and_points_are_checked() -> None:
         conditionals.rows("x", np.zeros((3, 1)))
     with pytest.raises(ValueError, match=r"x\[1, 0\] = 5 is outside the box"):
         conditionals.rows_in_box([[0.0, 0.0], [5.0, 0.0]])
+
+
+@pytest.fixture
+def _forget():
+    mixture_conditionals._load_compiled.cache_clear()
+    yield
+    mixture_conditionals._load_compiled.cache_clear()
+
+
+@pytest.mark.usefixtures("_forget")
+def test_compiled_code_that_fails_or_gives_other_values_is_left_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    rows = pytest.importorskip("rare_envs.distributions.rows.compiled_rows", reason="numba is not installed")
+    assert mixture_conditionals.find_compiled() is rows
+    find = rows.find_log_densities
+
+    def shift(*arguments):
+        out, fits = find(*arguments)
+        return out + 1e-9, fits
+
+    def fail(*arguments):
+        raise RuntimeError("no compiler")
+
+    for function in (shift, fail):
+        mixture_conditionals._load_compiled.cache_clear()
+        monkeypatch.setattr(rows, "find_log_densities", function)
+        assert mixture_conditionals.find_compiled() is None
+
+
+def test_numba_is_not_imported_for_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delitem(sys.modules, "numba", raising=False)
+    assert mixture_conditionals.find_compiled() is None
+    conditionals = MixtureConditionals(BOX, *PARTS)
+    x = conditionals.from_standard_normal(np.zeros((3, 2)))
+    assert np.isfinite(conditionals.log_prob(x)).all()
+    assert "numba" not in sys.modules

@@ -5,7 +5,7 @@ import pytest
 from scipy import integrate, stats
 
 from rare_envs.distributions import ClosingSpeed, CoordinateMixture, Coordinates, TruncatedGaussianMixture
-from rare_envs.distributions.pooled_mixture import PooledMixture, pool_mixtures
+from rare_envs.distributions.pooled_mixture import PooledMixture, Refits, pool_mixtures
 
 NAMES = ("speed", "lead_speed", "gap")
 BOX = {"low": [0.0, 0.0, 1.0], "high": [45.0, 45.0, 150.0], "names": NAMES}
@@ -88,3 +88,14 @@ def test_pools_that_cannot_be_are_refused() -> None:
         PooledMixture((IN_CLOSING, IN_LOG_GAP), [0.5, 0.5])
     with pytest.raises(ValueError, match="Expected 1 weights with sum 1"):
         PooledMixture((IN_CLOSING,), [0.5, 0.5])
+
+
+def test_densities_of_refits_are_those_of_each() -> None:
+    plain = TruncatedGaussianMixture([1.0], [[14.0, 14.0, 30.0]], [np.diag([9.0, 9.0, 99.0])], BOX["low"], BOX["high"])
+    refits = Refits([IN_CLOSING, IN_LOG_GAP, POOL, plain, IN_PLAIN, IN_CLOSING])
+    x = np.concatenate([POOL.sample(50, np.random.default_rng(2)), [[46.0, 20.0, 9.0], [20.0, 20.0, np.nan]]])
+    assert np.array_equal(refits.log_probs(x), [each.log_prob(x) for each in refits])
+    assert np.isneginf(refits.log_probs(x)[:, 50:]).all()
+    assert Refits().log_probs(x).shape == (0, 52)
+    with pytest.raises(ValueError, match=r"Expected x of shape \(n, 3\), got \(4, 2\)"):
+        refits.log_probs(np.zeros((4, 2)))

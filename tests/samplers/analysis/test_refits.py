@@ -249,3 +249,23 @@ def test_density_ratios_are_computed_once_for_a_run():
     sample = replace(result.sample)
     assert refit_log_ratios(replace(result, sample=sample), base.refits) is not first
     assert [refit.calls for refit in base.refits] == [2, 2, 2]
+
+
+class TogetherRefits(tuple):
+    """Refits whose densities are given together."""
+
+    calls = 0
+
+    def log_probs(self, x):
+        self.calls += 1
+        return np.array([refit.log_prob(x) for refit in self])
+
+
+def test_densities_may_be_given_together():
+    estimate = samplers.estimate(HalfSpace(fitted([normal()])), seed=1, max_sim=3000)
+    one_by_one = [normal(-0.2), normal(0.3)]
+    together = TogetherRefits(one_by_one)
+    known = refit_log_ratios(estimate, one_by_one)
+    assert np.array_equal(refit_log_ratios(estimate, together), known)
+    refit_log_ratios(estimate, together)
+    assert together.calls == 1
