@@ -204,7 +204,7 @@ def _set_log_densities(
                 mean, rate, mass = means[i, k], rates[i, k], masses[i, k]
                 for m in range(i):
                     mean += factors[i, m, k] * residuals[m, k]
-                if not (alike and mean == centres[i, k]):
+                if not (mean == centres[i, k] and (alike or i == 0)):
                     mass = _plain_mass((low - mean) * rate, (high - mean) * rate)
                     centres[i, k], masses[i, k] = mean, mass
                 is_whole, is_known = is_whole and mass == 1.0, is_known and mass >= 0.0
