@@ -37,9 +37,9 @@ class TwoStage(Method):
 
     p-hat is unbiased, as the estimate from each mixture is given what came before it, with two exceptions. Whether
     another method takes over after the third round or later, and how many simulations chains then take before the next
-    one, depends on draws that count. With a target c.o.v., the draws decide themselves when they end. (Weighting all
-    draws as if from one mixture, as adaptive multiple importance sampling does, would bias p by some per cent and make
-    intervals too short.)
+    one, depends on draws that count. With a target c.o.v., the draws decide themselves when they end, which
+    costs a bias of the order of its square (`docs/two_stage.md`). (Weighting all draws as if from one mixture, as
+    adaptive multiple importance sampling does, would bias p by some per cent and make intervals too short.)
 
     All stages work in standard normal space, so that wide draws stay within the support of the parameters. A run
     yields 45 to 90 batches, half of them steps of the levels and the lines of descent. Regression of f, subset
