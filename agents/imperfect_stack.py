@@ -204,7 +204,7 @@ class NoisyDriver:
 
     @property
     def recordable(self) -> bool:
-        """Whether a GPU may record its operations: as of the driver behind the stack."""
+        """Whether its operations may be recorded: as of the driver behind the stack."""
         return says_recordable(self.inner)
 
     def to(self, device: torch.device) -> NoisyDriver:

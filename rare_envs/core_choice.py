@@ -22,7 +22,7 @@ from rare_envs.simulation.compiled.selection import (
     select_rollout,
 )
 from rare_envs.simulation.episode import Episode
-from rare_envs.simulation.recorded import RecordedRollouts
+from rare_envs.simulation.recorded import RecordedRollouts, RecordedTicks
 from rare_envs.simulation.rollout import Driver
 from rare_envs.simulation.world import World
 
@@ -58,6 +58,7 @@ class CoreChoice:
         check_core(wanted)
         self.wanted, self._driver, self._device, self._tile = wanted, driver, device, tile
         self._recorded: RecordedRollouts | None = None
+        self._recorded_ticks = RecordedTicks(driver)
         self.rollout: CompiledRollout | HighwayRollout | None = None
         if wanted == "torch":
             return
@@ -97,14 +98,15 @@ class CoreChoice:
             return None
 
     def roll_out(self, world: World, x: Tensor) -> Episode | None:
-        """Return the episodes of scenarios x (B, d), a tile at most, as a GPU alone makes them.
+        """Return the episodes of scenarios x (B, d), a tile at most, by operations that are recorded.
 
         Returns:
-            None on the CPU, and where a policy has to be asked there: one that cannot decide elsewhere, or one that
-            fails, for then it is told on which rows, and how.
+            None on the CPU of more than a few rows and where nothing is recorded; on a GPU where a policy has to be
+            asked on the CPU: one that cannot decide elsewhere, or one that fails, for then it is told on which rows,
+            and how.
         """
         if self._device.type == "cpu":
-            return None
+            return self._recorded_ticks(world, x)
         known = self._recorded
         driver = find_device_driver(self._driver, self._device, None if known is None else known.driver)
         if driver is None:

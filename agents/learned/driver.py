@@ -214,7 +214,7 @@ class LearnedDriver:
 
     @property
     def recordable(self) -> bool:
-        """Whether a GPU may record its operations: network, noise and rules are of this package."""
+        """Whether its operations may be recorded: network, noise and rules are of this package."""
         return is_plain(self.policy) and self._has_known_rules()
 
     def _has_known_rules(self) -> bool:
@@ -309,7 +309,7 @@ class LearnedEgo:
 
     @property
     def recordable(self) -> bool:
-        """Whether a GPU may record its operations: as of the driver."""
+        """Whether its operations may be recorded: as of the driver."""
         return says_recordable(self.driver)
 
     @property

@@ -39,7 +39,7 @@ class RuleDriver:
     weights: ClassVar[None] = None
     noisy: ClassVar[bool] = False
     recordable: ClassVar[bool] = True
-    """Whether a GPU may record its operations: nothing about it changes."""
+    """Whether its operations may be recorded: nothing about it changes."""
 
     def begin(self, draws: Tensor) -> Tensor:
         """Return an empty memory: (B, M, 2, 2) -> (B, M, 0)."""

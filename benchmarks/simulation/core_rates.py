@@ -18,6 +18,7 @@ from benchmarks.simulation.throughput import (
     CUT_IN,
     HIGHWAY,
     ppo,
+    simulate_by_operators,
 )
 from benchmarks.simulation.timing import seconds
 from rare_envs.threads import use_one_thread
@@ -41,23 +42,37 @@ def measure_rates(env_id: str, rows: int, terms: bool = False, **settings: Any) 
 
 
 def measure_answers(env_id: str, core: str, seeds: int = 4) -> str:
-    """Return the times of estimates in those of their simulations in one call of torch."""
+    """Return the times of estimates in those of their simulations in one call of torch's operators."""
     problem, plain = (
         rare_envs.DrivingProblem(env_id, base=ANSWER_BASES[env_id], core=each) for each in (core, "torch")
     )
     x = plain.base.sample(ANSWER_SIMULATIONS, np.random.default_rng(0))
-    call = seconds(lambda: plain.evaluate(x), repeat=4)
+    call = seconds(lambda: simulate_by_operators(plain, x), repeat=4)
     samplers.estimate(problem, seed=0, max_sim=ANSWER_SIMULATIONS)  # imports and compiles
     taken = [seconds(lambda k=k: samplers.estimate(problem, seed=k, max_sim=ANSWER_SIMULATIONS)) for k in range(seeds)]
     return ", ".join(f"{each / call:.1f}" for each in taken)
+
+
+def measure_recorded(env_id: str, rows: int, rounds: int = 20) -> str:
+    """Return how many times as fast recorded ticks are as torch's operators, the two in turn."""
+    problem = rare_envs.DrivingProblem(env_id, core="torch")
+    x = problem.base.sample(rows, np.random.default_rng(0))
+    works = (lambda: simulate_by_operators(problem, x), lambda: problem.evaluate(x))
+    taken = [[seconds(work) for work in works] for _ in range(rounds)]
+    operators, recorded = np.min(taken, 0)
+    return f"{1e3 * operators:.1f} / {1e3 * recorded:.1f} ms, {operators / recorded:.1f} times as fast"
 
 
 @use_one_thread()
 def main(
     only_answers: Annotated[bool, typer.Option(help="Estimates alone.")] = False,
     only_highway: Annotated[bool, typer.Option(help="Rates on the highway alone.")] = False,
+    only_recorded: Annotated[bool, typer.Option(help="Recorded ticks beside torch's operators alone.")] = False,
 ) -> None:
     """Measure and print."""
+    if only_recorded:
+        print_recorded()
+        return
     if not (only_answers or only_highway):
         print_rates()
     if not only_answers:
@@ -77,6 +92,13 @@ def print_rates() -> None:
     for rows in (25, 6000):
         for env_id in (CAR_FOLLOWING, CUT_IN):
             print(f"{env_id}, PPO ego, {rows:,} rows: {measure_rates(env_id, rows, ego=ppo(env_id))}")
+
+
+def print_recorded() -> None:
+    """Measure and print what recorded ticks save."""
+    for rows in (25, 100, 600, 6000, 16_384):
+        for env_id in (CAR_FOLLOWING, CUT_IN, HARD_BRAKE):
+            print(f"{env_id}, {rows:,} rows: {measure_recorded(env_id, rows)}", flush=True)
 
 
 def print_highway_rates() -> None:

@@ -83,7 +83,7 @@ class IDM:
     """Whether T v + v dv / (2 sqrt(a_max b)) is cut off at 0, as Treiber and Kesting write it ("Traffic Flow Dynamics",
     2013, chapter 11): a lead that pulls away fast is then not braked for."""
     recordable: ClassVar[bool] = True
-    """Whether a GPU may record its operations: nothing about it changes."""
+    """Whether its operations may be recorded: nothing about it changes."""
 
     def __post_init__(self) -> None:
         for name in _POSITIVE + _NOT_NEGATIVE:

@@ -57,7 +57,7 @@ class LaneChangingDriver:
     weights: ClassVar[None] = None
     noisy: ClassVar[bool] = False
     recordable: ClassVar[bool] = True
-    """Whether a GPU may record its operations: nothing about it changes."""
+    """Whether its operations may be recorded: nothing about it changes."""
 
     def __post_init__(self) -> None:
         if not self.lateral_speed > 0:

@@ -101,7 +101,7 @@ class HumanDriver:
     glances: Glances | None = None
     """When the eyes are off the road; None if they never are."""
     recordable: ClassVar[bool] = True
-    """Whether a GPU may record its operations: nothing about it changes."""
+    """Whether its operations may be recorded: nothing about it changes."""
 
     @property
     def delay(self) -> int:
