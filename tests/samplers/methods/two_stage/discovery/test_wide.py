@@ -38,6 +38,17 @@ def test_starts_are_half_the_least_wide_and_half_at_random(rng):
     assert set(few.choose(30, rng)[:, 0]) == set(range(10))
 
 
+@pytest.mark.parametrize("seed", range(20))
+def test_a_region_with_few_wide_failures_is_not_left_out(seed):
+    """Of 100 failures 4 are in a region of their own: at random 36 % of the choices would have none of them."""
+    rng = np.random.default_rng(seed)
+    axes = np.repeat([[4.0, 0.0, 0.0, 0.0, 0.0, 0.0], [0.0, -4.0, 0.0, 0.0, 0.0, 0.0]], [96, 4], axis=0)
+    u = axes + rng.standard_normal((100, 6))
+    chosen = WideFailures(u, np.full(100, 2.2), np.zeros(100)).choose(24, rng)
+    assert len(np.unique(chosen, axis=0)) == 24
+    assert np.count_nonzero(chosen[:, 1] < -2.0) >= 1
+
+
 def test_wide_failures_have_the_weights_of_their_mixture(drive, rng):
     draws = drive(draw_wide(Simulator(HALF_SPACE), ((1.5, 4000), (3.0, 4000)), rng), HALF_SPACE).value
     wide = WideFailures.among(draws, 0.0)
