@@ -22,8 +22,6 @@ _ELEMENTWISE = {
     "bitwise_not": "invert",
     "__or__": "bitwise_or",
     "bitwise_or": "bitwise_or",
-    "clamp_max": "minimum",
-    "clamp_min": "maximum",
     "div": "divide",
     "eq": "equal",
     "ge": "greater_equal",
@@ -41,6 +39,7 @@ _ELEMENTWISE = {
     "where": "where",
 }
 """Operations of torch to functions of NumPy with the same arguments."""
+_CLAMPS = ("clamp", "clamp_max", "clamp_min")
 _BY_TORCH = ("asin", "atan", "cos", "sin", "sqrt", "tan")
 _END = 2**63 - 1
 """Of a slice that has none."""
@@ -84,11 +83,11 @@ FUNCTIONS: dict[str, Any] = {
     "nonzero": np.nonzero,
 }
 """What the texts of `write_operation` name."""
-MAKING = frozenset((*_ELEMENTWISE, *_BY_TORCH, "clamp", "rsub"))
+MAKING = frozenset((*_ELEMENTWISE, *_BY_TORCH, *_CLAMPS, "rsub"))
 """Operations whose result is a new array: no other name stands for a part of it."""
 COPYING = frozenset(("any", "index", "nonzero_numpy"))
 """Operations with other results that are new arrays."""
-NUMERIC = frozenset((*_ELEMENTWISE, "clamp", "full_like", "rsub"))
+NUMERIC = frozenset((*_ELEMENTWISE, *_CLAMPS, "full_like", "rsub"))
 """Operations with numbers among their arguments."""
 
 
@@ -101,7 +100,7 @@ def write_operation(name: str, args: Sequence[Any]) -> str | None:
 
     Example:
         >>> write_operation("clamp", ("speed", None, "most")), write_operation("slice", ("x", 1, 1, 3))
-        ('minimum(speed, most)', 'x[:, 1:3]')
+        ('minimum(most, speed)', 'x[:, 1:3]')
     """
     match name, *args:
         case known, *_ if known in _ELEMENTWISE:
@@ -110,10 +109,10 @@ def write_operation(name: str, args: Sequence[Any]) -> str | None:
             return f"{name}({values})"
         case "rsub", values, other:
             return f"subtract({other}, {values})"
-        case "clamp", values, *bounds:
-            least, most = (*bounds, None)[:2]
-            text = values if least is None else f"maximum({values}, {least})"
-            return text if most is None else f"minimum({text}, {most})"
+        case "clamp_min" | "clamp_max" | "clamp", values, *bounds:
+            least, most = (None, *bounds) if name == "clamp_max" else (*bounds, None)[:2]
+            text = values if least is None else f"maximum({least}, {values})"
+            return text if most is None else f"minimum({most}, {text})"  # of two zeros NumPy takes the second
         case "any", values, int(axis):
             return f"any_along({values}, {axis})"
         case "stack", list(parts):

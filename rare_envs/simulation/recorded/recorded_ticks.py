@@ -57,10 +57,13 @@ class RecordedTicks:
     def __call__(self, world: World, x: Tensor) -> Episode | None:
         """Drive B scenarios x (B, d) from start to horizon; None where `rollout` has to, as for the first time.
 
-        It has to where gradients are taken, and where somebody watches what torch does (a dispatch mode).
+        It has to where gradients are taken, where somebody watches what torch does (a dispatch mode), and in double
+        precision: the numbers in a recording are single.
         """
         watched = torch.is_grad_enabled() or _get_current_dispatch_mode() is not None
-        if watched or not 0 < len(x) <= FILLED_ROWS[-1] or isinstance(self.driver, StochasticDriver):
+        if watched or x.dtype != torch.float32 or isinstance(self.driver, StochasticDriver):
+            return None
+        if not 0 < len(x) <= FILLED_ROWS[-1]:
             return None
         ticks = self._find(world)
         return None if ticks is None else ticks.play(x)

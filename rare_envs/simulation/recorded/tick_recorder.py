@@ -79,7 +79,7 @@ class TickRecorder(TorchDispatchMode):
         >>> with torch.inference_mode(), TickRecorder([speed], {}) as recorder:
         ...     slower = (speed - 1.0).clamp_min(0.0)
         >>> [step.text for step in recorder.parts[0][0].steps], recorder.name_of(slower)
-        (['v0 = subtract(i0, c0)', 'v1 = maximum(v0, c1)'], 'v1')
+        (['v0 = subtract(i0, c0)', 'v1 = maximum(c1, v0)'], 'v1')
     """
 
     def __init__(self, inputs: Sequence[Tensor], constants: dict[Any, Constant]) -> None:

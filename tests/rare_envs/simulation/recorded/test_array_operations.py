@@ -10,6 +10,7 @@ from rare_envs.simulation.recorded.array_operations import FUNCTIONS, fill_like,
 
 A, B = torch.tensor([[0.5, -2.0, torch.nan], [torch.inf, 0.0, 3.5]]), torch.tensor([[1.5, -2.0, 1.0], [0.25, 0.0, 2.5]])
 FEW = torch.tensor([0.0, 1.0, 0.3])
+ZEROS = torch.tensor([0.0, -0.0]).repeat(9)
 
 
 @pytest.mark.parametrize(
@@ -19,6 +20,12 @@ FEW = torch.tensor([0.0, 1.0, 0.3])
         ("rsub", (A, B), B - A),
         ("div", (A, B), A / B),
         ("clamp_min", (A, B), torch.maximum(A, B)),
+        ("clamp_max", (A, B), torch.minimum(A, B)),
+        *(
+            (name, (ZEROS, bound), getattr(ZEROS, name)(bound.item()))
+            for name in ("clamp_min", "clamp_max", "clamp")
+            for bound in (torch.tensor(0.0), torch.tensor(-0.0))
+        ),
         ("clamp", (A, None, B), torch.minimum(A, B)),
         ("clamp", (A, B), torch.maximum(A, B)),
         ("round", (A,), A.round()),

@@ -123,6 +123,16 @@ def test_nothing_is_recorded_where_gradients_are_taken() -> None:
     assert not ticks._known
 
 
+def test_double_precision_is_left_to_torch() -> None:
+    ticks, world = RecordedTicks(IDM()), World(CUT_IN)
+    with torch.inference_mode():
+        assert [ticks(world, X.double()) for _ in range(3)] == [None] * 3
+        ticks(world, X)
+        found = ticks(world, X)
+    assert found is not None
+    assert found.f.dtype == torch.float32
+
+
 def test_who_watches_torch_sees_all_of_it() -> None:
     problem, x = draw("CutIn-v0", 8)
     counts = []
