@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import NamedTuple, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -29,6 +29,7 @@ from rare_envs.distributions.truncated_mixture import TruncatedGaussianMixture
 from rare_envs.distributions.truncated_normal import TruncatedConditional, log_sum
 
 BoxMixture = TruncatedGaussianMixture | CoordinateMixture
+_BOX_MIXTURES = get_args(BoxMixture)
 
 
 class Refits(tuple[Distribution, ...]):
@@ -47,19 +48,22 @@ class Refits(tuple[Distribution, ...]):
         """Return the log density of each, (n, d) -> (R, n); where points are in equal coordinates is found once.
 
         Raises:
-            ValueError: Wrong shape.
+            ValueError: Wrong shape, of x or of the densities of a refit of the user's.
         """
         known: dict[tuple[object, ...], BoxPoints] = {}
         out = np.empty((len(self), len(x)))
         for row, each in zip(out, self, strict=True):
-            if isinstance(each, BoxMixture):
+            if type(each) in _BOX_MIXTURES:  # a class of the user's may have another density
                 conditionals = each.conditionals
                 key = conditionals.coordinates.key
                 if key not in known:
                     known[key] = describe_points(conditionals.coordinates, conditionals.rows("x", x))
                 row[:] = conditionals.log_prob_at(known[key])
             else:
-                row[:] = each.log_prob(x)
+                values = np.asarray(each.log_prob(x))
+                if values.shape != row.shape:
+                    raise ValueError(f"Expected log_prob of a refit of shape {row.shape}, got {values.shape}.")
+                row[:] = values
         return out
 
 

@@ -99,3 +99,19 @@ def test_densities_of_refits_are_those_of_each() -> None:
     assert Refits().log_probs(x).shape == (0, 52)
     with pytest.raises(ValueError, match=r"Expected x of shape \(n, 3\), got \(4, 2\)"):
         refits.log_probs(np.zeros((4, 2)))
+
+
+def test_refits_of_users_have_their_own_densities() -> None:
+    class Flat(TruncatedGaussianMixture):
+        def log_prob(self, x):
+            return np.full(len(x), -1.0)
+
+    class OneNumber(TruncatedGaussianMixture):
+        def log_prob(self, x):
+            return -1.0
+
+    shape = ([1.0], [[14.0, 14.0, 30.0]], [np.diag([9.0, 9.0, 99.0])], BOX["low"], BOX["high"])
+    x = POOL.sample(4, np.random.default_rng(2))
+    assert Refits([TruncatedGaussianMixture(*shape), Flat(*shape)]).log_probs(x)[1].tolist() == [-1.0] * 4
+    with pytest.raises(ValueError, match=r"of a refit of shape \(4,\), got \(\)"):
+        Refits([OneNumber(*shape)]).log_probs(x)
