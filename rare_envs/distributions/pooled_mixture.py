@@ -53,7 +53,7 @@ class Refits(tuple[Distribution, ...]):
         known: dict[tuple[object, ...], BoxPoints] = {}
         out = np.empty((len(self), len(x)))
         for row, each in zip(out, self, strict=True):
-            if type(each) in _BOX_MIXTURES:  # a class of the user's may have another density
+            if isinstance(each, BoxMixture) and type(each) in _BOX_MIXTURES:  # a class of the user's may have another density
                 conditionals = each.conditionals
                 key = conditionals.coordinates.key
                 if key not in known:

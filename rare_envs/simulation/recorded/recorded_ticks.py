@@ -63,13 +63,13 @@ class RecordedTicks:
         watched = torch.is_grad_enabled() or _get_current_dispatch_mode() is not None
         if watched or x.dtype != torch.float32 or isinstance(self.driver, StochasticDriver):
             return None
-        if not 0 < len(x) <= FILLED_ROWS[-1]:
+        if not 0 < len(x) <= FILLED_ROWS[-1] or not is_recordable(world, self.driver):
             return None
         ticks = self._find(world)
         return None if ticks is None else ticks.play(x)
 
     def _find(self, world: World) -> _WorldTicks | None:
-        """Return the ticks of a world that was simulated before."""
+        """Return the ticks of a recordable world that was simulated before."""
         with _ONE_AT_A_TIME:
             for place, known in enumerate(self._known):
                 if known.world is world or known.world == world:
@@ -80,11 +80,11 @@ class RecordedTicks:
 
 
 class _WorldTicks:
-    """Ticks of a world and its ego."""
+    """Ticks of a world and its ego, which may be recorded."""
 
     def __init__(self, world: World, driver: Driver) -> None:
         self.world, self._driver = world, driver
-        self._program = TickProgram(self._tick) if is_recordable(world, driver) else None
+        self._program: TickProgram | None = TickProgram(self._tick)
         self._form: Any = None
         """Episodes, their vehicles and the driver's memory, with any tensors in them."""
 

@@ -67,9 +67,9 @@ class TickProgram:
             raise NotRecorded("too many ways")
         with torch.inference_mode():
             rows = next(each for each in FILLED_ROWS if each >= len(values[0]))
-            inputs = [_fill_up(torch.from_numpy(each), rows) for each in values]
-            recorder = TickRecorder(inputs, self._constants)
             try:
+                inputs = [_fill_up(torch.from_numpy(each), rows) for each in values]
+                recorder = TickRecorder(inputs, self._constants)
                 self._tick(*inputs)  # makes constants
                 with recorder:
                     after = self._tick(*inputs)

@@ -143,10 +143,12 @@ class TickRecorder(TorchDispatchMode):
         """Return the name of a tensor: of an input, of what was computed, or of a constant.
 
         Raises:
-            ValueError: It is for looking only.
+            ValueError: It is for looking only, or is a constant with as many rows as the inputs have now.
         """
         if id(tensor) in self._counted:
             raise ValueError("a count is computed with")
+        if id(tensor) not in self._names and self._rows in tensor.shape:
+            raise ValueError("rows that are no input's")
         return self._names.get(id(tensor)) or self._name_constant(id(tensor), tensor.numpy(), tensor)
 
     def _look(self, name: str, seen: bool) -> None:

@@ -103,6 +103,25 @@ def test_drivers_of_users_are_left_to_torch() -> None:
         assert [ticks(World(CUT_IN), X) for _ in range(3)] == [None] * 3
 
 
+def test_measures_of_users_are_not_compared() -> None:
+    class Gap:
+        """Equal to nothing that it can tell."""
+
+        __hash__ = object.__hash__
+
+        def __call__(self, moment: Any) -> torch.Tensor:
+            return moment.lead.gap
+
+        def __eq__(self, other: object) -> bool:
+            raise AssertionError
+
+    ticks = RecordedTicks(IDM())
+    with torch.inference_mode():
+        for measure in (Gap(), "ttc", Gap()):
+            ticks(World(CUT_IN, measurement=Measurement(measure)), X)
+    assert len(ticks._known) == 1
+
+
 class Watch(TorchDispatchMode):
     """Counts operations of torch."""
 

@@ -63,3 +63,8 @@ def test_a_tick_that_depends_on_more_than_its_values_is_not_recorded() -> None:
 def test_what_fails_is_not_recorded() -> None:
     with pytest.raises(NotRecorded, match="sigmoid is not known"):
         TickProgram(lambda x: (x.sigmoid(),)).record(np.zeros(1, np.float32))
+
+
+def test_what_has_no_rows_is_not_recorded() -> None:
+    with pytest.raises(NotRecorded):
+        TickProgram(lambda speed, time: (speed, time)).record(np.ones(2, np.float32), np.zeros((), np.float32))

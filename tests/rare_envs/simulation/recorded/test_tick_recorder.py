@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
@@ -10,8 +11,8 @@ from torch import Tensor
 from rare_envs.simulation.recorded.tick_recorder import TickRecorder
 
 ROWS = 1009
-WHOLE = torch.arange(ROWS)
-OWN = torch.full((ROWS,), 2.0)
+WHOLE = torch.arange(1)
+OWN = torch.full((1,), 2.0)
 
 
 def record(work: Callable[[Tensor], Any], values: Tensor | None = None) -> list[str]:
@@ -91,6 +92,8 @@ def _stacked(x: Tensor) -> Tensor:
         (lambda x: torch.add(x, x, alpha=2), "has settings"),
         (lambda x: torch.zeros_like(x, dtype=torch.int64), "has settings"),
         (lambda x: x * WHOLE, "has another result"),
+        (lambda x: x + OWN.repeat(ROWS), "is not known"),
+        (lambda x: x + torch.from_numpy(np.ones(ROWS, np.float32)), "rows that are no input's"),
     ],
 )
 def test_what_cannot_be_written_is_refused(work: Callable[[Tensor], Any], reason: str) -> None:
