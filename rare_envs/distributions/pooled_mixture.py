@@ -30,6 +30,7 @@ from rare_envs.distributions.truncated_normal import TruncatedConditional, log_s
 
 BoxMixture = TruncatedGaussianMixture | CoordinateMixture
 _BOX_MIXTURES = get_args(BoxMixture)
+"""A class of the user's below one of these may have another density."""
 
 
 class Refits(tuple[Distribution, ...]):
@@ -53,7 +54,7 @@ class Refits(tuple[Distribution, ...]):
         known: dict[tuple[object, ...], BoxPoints] = {}
         out = np.empty((len(self), len(x)))
         for row, each in zip(out, self, strict=True):
-            if isinstance(each, BoxMixture) and type(each) in _BOX_MIXTURES:  # a class of the user's may have another density
+            if isinstance(each, BoxMixture) and type(each) in _BOX_MIXTURES:
                 conditionals = each.conditionals
                 key = conditionals.coordinates.key
                 if key not in known:
