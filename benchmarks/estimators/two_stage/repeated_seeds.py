@@ -64,6 +64,12 @@ class SeededRun:
         return self.low <= self.truth <= self.high
 
     @property
+    def error_over_own(self) -> float:
+        """Error over the standard error that the run states; 0 where it states none, as of p = 0."""
+        own = self.cov * self.p
+        return (self.p - self.truth) / own if 0 < own < math.inf else 0.0
+
+    @property
     def far_off(self) -> bool:
         """Whether the error is more than FAR_OFF own standard errors."""
         return not abs(self.p - self.truth) <= FAR_OFF * self.cov * self.p
@@ -88,6 +94,8 @@ class Row:
     """Root mean square relative error."""
     own_cov: float
     """Median of those stated."""
+    error_over_own: float
+    """Root mean square of the errors over the run's own standard errors: 1 where these are right."""
     gain: float
     """(1 - p) / p / (n_sim x mean square relative error)."""
     coverage: float
@@ -163,6 +171,7 @@ def summarise_runs(name: str, runs: Sequence[SeededRun]) -> Row:
         mean=float(ratio.mean()),
         cov=math.sqrt(square),
         own_cov=float(np.median([run.cov for run in runs])),
+        error_over_own=math.sqrt(np.mean([run.error_over_own**2 for run in runs])),
         gain=(1 - p) / p / (n_sim * square) if one and square > 0 else math.nan,
         coverage=float(np.mean([run.covered for run in runs])),
         low=sum(run.high < run.truth for run in runs),
@@ -178,14 +187,14 @@ def summarise_runs(name: str, runs: Sequence[SeededRun]) -> Row:
 def describe_row(row: Row) -> str:
     """Return a row of the table."""
     return (
-        f"| {row.problem} | {row.dim} | {row.p:.2e} | {row.mean:.3f} | {row.cov:.3f} ({row.own_cov:.3f}) | "
+        f"| {row.problem} | {row.dim} | {row.p:.2e} | {row.mean:.3f} | {row.cov:.3f} ({row.own_cov:.3f}) | {row.error_over_own:.2f} | "
         f"{row.gain:.3g} | {row.coverage:.1%} | {row.low} : {row.high} | {row.upper_over_lower:.2f} | "
         f"{row.far_off}, {row.far_off_warned} | {row.right_warned:.0%} | {row.n_sim:,.0f} |"
     )
 
 
-HEADER = """| problem | d | p | mean | c.o.v. (own) | gain | coverage | low : high | U/L | off, warned | right | n |
-|---|---|---|---|---|---|---|---|---|---|---|---|"""
+HEADER = """| problem | d | p | mean | c.o.v. (own) | error / own | gain | coverage | low : high | U/L | off, warned | right | n |
+|---|---|---|---|---|---|---|---|---|---|---|---|---|"""
 
 
 def read_runs(path: Path | None) -> list[SeededRun]:

@@ -37,6 +37,8 @@ def test_a_row_counts_misses_and_warnings():
     assert (row.far_off, row.far_off_warned, row.right_warned) == (2, 0, pytest.approx(0.5))
     assert row.mean == pytest.approx((1 + 0.5 + 1.25 + 0) / 4)
     assert row.gain == pytest.approx(999 / (1000 * (0.25 + 0.0625 + 1) / 4))
+    # errors of 0, 10 and 2 of the run's own standard errors, and one that states none
+    assert row.error_over_own == pytest.approx(math.sqrt((0 + 10**2 + 2**2 + 0) / 4))
     both = summarise_runs("all", [RUN, replace(RUN, problem="two")])
     assert math.isnan(both.gain)
 
