@@ -101,7 +101,7 @@ class CoreChoice:
         """Return the episodes of scenarios x (B, d), a tile at most, by operations that are recorded.
 
         Returns:
-            None on the CPU of more than a few rows and where nothing is recorded; on a GPU where a policy has to be
+            None on the CPU where nothing is recorded; on a GPU where a policy has to be
             asked on the CPU: one that cannot decide elsewhere, or one that fails, for then it is told on which rows,
             and how.
         """

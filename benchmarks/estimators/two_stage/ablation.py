@@ -62,7 +62,7 @@ ABLATIONS: dict[str, Mapping[str, Any]] = {
     "chains from uncovered failures": {"refinement.uncovered_budget": 0.0},
     "chains along a direction": {"regions.direction_r2": 1.1},
     "floors of the regions": {"refinement.region_share": 0.0, "refinement.final_region_share": 0.0},
-    "Gaussians and placement": {**_without_kinds("gaussian"), "surfaces.min_gain": math.inf},
+    "Gaussians": _without_kinds("gaussian"),
     "wide draws as deep as the levels": {"exploration.deep_draws": 0},
     "placement by a regression": {"surfaces.min_gain": math.inf},
     "calibrated weights": {"draws_per_control": 10**9},

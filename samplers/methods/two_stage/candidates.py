@@ -63,7 +63,8 @@ def build_proposal(
     """
     candidates = list_candidates(state, history, settings, mixture.edges)
     if predicted is not None:
-        candidates += _describe_predicted(predicted.gaussians, state.exploration.slopes, settings)
+        described = _describe_predicted(predicted.gaussians, state.exploration.slopes, settings)
+        candidates += [candidate for candidate in described if candidate.kind in settings.initial_shares]
     kinds = np.array([candidate.kind for candidate in candidates])
     start = np.array([settings.initial_shares[c.kind] / np.count_nonzero(kinds == c.kind) for c in candidates])
     weights = start / start.sum()

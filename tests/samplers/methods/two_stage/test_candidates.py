@@ -7,7 +7,12 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from samplers.methods.two_stage.candidates import _smooth_indicators, build_proposal, list_candidates
+from samplers.methods.two_stage.candidates import (
+    PredictedFailures,
+    _smooth_indicators,
+    build_proposal,
+    list_candidates,
+)
 from samplers.methods.two_stage.mixture.proposal import NO_REGION
 from samplers.methods.two_stage.multiple_importance import MultipleImportanceSample
 from samplers.methods.two_stage.refinement import NearDraws, refine_once, start_refinement
@@ -249,3 +254,14 @@ def test_smoothed_weights_count_draws_by_how_likely_they_fail(rng):
     assert np.abs(found - expected).mean() < 0.05
     # P[U1 + noise > 3] with two standard normals
     assert np.exp(log_weights).sum() == pytest.approx(stats.norm.sf(3 / np.sqrt(2)), rel=0.25)
+
+
+@pytest.mark.parametrize("kind", ["gaussian", "tempered"])
+def test_a_kind_without_a_share_is_not_placed_either(exact_region, rng, kind):
+    state, history, _ = after_round(exact_region, rng)
+    shares = {name: a for name, a in SETTINGS.initial_shares.items() if name != kind}
+    gaussian = SubspaceGaussian(np.eye(3)[:, :1], np.array([BETA]), np.array([1.0]))
+    predicted = PredictedFailures(history.u[:50], [gaussian])
+    proposal = build_proposal(state, history, replace(SETTINGS, initial_shares=shares), predicted=predicted)
+    assert kind not in kinds_of(proposal.candidates)
+    assert proposal.weights.sum() == pytest.approx(1.0)
