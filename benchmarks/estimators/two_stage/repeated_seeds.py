@@ -187,14 +187,17 @@ def summarise_runs(name: str, runs: Sequence[SeededRun]) -> Row:
 def describe_row(row: Row) -> str:
     """Return a row of the table."""
     return (
-        f"| {row.problem} | {row.dim} | {row.p:.2e} | {row.mean:.3f} | {row.cov:.3f} ({row.own_cov:.3f}) | {row.error_over_own:.2f} | "
-        f"{row.gain:.3g} | {row.coverage:.1%} | {row.low} : {row.high} | {row.upper_over_lower:.2f} | "
-        f"{row.far_off}, {row.far_off_warned} | {row.right_warned:.0%} | {row.n_sim:,.0f} |"
+        f"| {row.problem} | {row.dim} | {row.p:.2e} | {row.mean:.3f} | {row.cov:.3f} ({row.own_cov:.3f}) | "
+        f"{row.error_over_own:.2f} | {row.gain:.3g} | {row.coverage:.1%} | {row.low} : {row.high} | "
+        f"{row.upper_over_lower:.2f} | {row.far_off}, {row.far_off_warned} | {row.right_warned:.0%} | "
+        f"{row.n_sim:,.0f} |"
     )
 
 
-HEADER = """| problem | d | p | mean | c.o.v. (own) | error / own | gain | coverage | low : high | U/L | off, warned | right | n |
-|---|---|---|---|---|---|---|---|---|---|---|---|---|"""
+NAMES = "problem, d, p, mean, c.o.v. (own), error / own, gain, coverage, low : high, U/L, off warned, right, n".split(
+    ", "
+)
+HEADER = f"| {' | '.join(NAMES)} |\n|{'---|' * len(NAMES)}"
 
 
 def read_runs(path: Path | None) -> list[SeededRun]:
