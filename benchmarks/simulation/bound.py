@@ -49,6 +49,9 @@ MOVES = frozenset(
 """What moves, makes or finds numbers: nothing of it need remain in a fused loop."""
 CACHED = 1 << 14
 """Elements of arrays on which rates are measured: 64 KiB, within a core's own cache."""
+SHORT, LONG = 500, 20
+"""Repetitions of work that takes a tenth of a millisecond and some milliseconds: a machine that is shared stands still
+for longer than a few of them take."""
 MATRIX = 384
 """Rows and columns of the matrices likewise."""
 
@@ -115,11 +118,14 @@ def measure_machine() -> dict[str, float]:
     for work in (lambda: _polynomials(numbers, 1), lambda: _quotients(numbers, 1), lambda: tanh(numbers)):
         work()  # compiles
     return {
-        "simple": 17 * 100 * CACHED / seconds(lambda: _polynomials(numbers, 100), 5),
-        "roots": 100 * CACHED / seconds(lambda: _quotients(numbers, 100), 5),
-        "curves": 100 * CACHED / seconds(lambda: [tanh(numbers) for _ in range(100)], 5),
-        "products": 2 * MATRIX**3 * 10 / seconds(lambda: [torch.mm(matrix, matrix, out=product) for _ in range(10)], 5),
-        "bytes": 2 * large.nbytes / seconds(large.copy, 5),
+        "simple": 17 * 100 * CACHED / seconds(lambda: _polynomials(numbers, 100), SHORT),
+        "roots": 100 * CACHED / seconds(lambda: _quotients(numbers, 100), SHORT),
+        "curves": 100 * CACHED / seconds(lambda: [tanh(numbers) for _ in range(100)], SHORT),
+        "products": 2
+        * MATRIX**3
+        * 10
+        / seconds(lambda: [torch.mm(matrix, matrix, out=product) for _ in range(10)], LONG),
+        "bytes": 2 * large.nbytes / seconds(large.copy, LONG),
     }
 
 

@@ -33,6 +33,8 @@ from samplers.benchmark.runs import about
 
 OUT = Path("build/throughput.json")
 """Where the result goes by default."""
+LEAST_ESTIMATES = 5
+"""Of which the median is judged: one in three is repeated under the pool of the refits."""
 CAR_FOLLOWING, CUT_IN, HIGHWAY = (f"rare_envs/{name}-v0" for name in ("CarFollowing", "CutIn", "Highway"))
 HORIZON = 20.0
 """Episodes of 200 ticks, as in the published baselines."""
@@ -121,7 +123,7 @@ def measure_answer(env_id: str, rounds: int) -> dict[str, float]:
     samplers.estimate(problem, seed=0, max_sim=ANSWER_SIMULATIONS)  # imports and compiles
     simulate_by_operators(plain, x)
     answers, calls = [], []
-    for seed in range(rounds):
+    for seed in range(max(rounds, LEAST_ESTIMATES)):
         answers.append(seconds(lambda seed=seed: samplers.estimate(problem, seed=seed, max_sim=ANSWER_SIMULATIONS)))
         calls.append(seconds(lambda: simulate_by_operators(plain, x), repeat=3))
     ratios = np.divide(answers, calls)
