@@ -27,7 +27,7 @@ RUNS = {
     "many faces": (samplers.FunctionProblem(lambda u: 4.2 - np.abs(u).max(axis=1), 10), 6000, None),
     "sixteen faces": (samplers.FunctionProblem(lambda u: 4.2 - np.abs(u).max(axis=1), 8), 6000, None),
     "all around": (shell().problem, 6000, None),
-    "a sum of losses": (samplers.FunctionProblem(lambda u: 18.0 - np.exp(0.8 * u).sum(axis=1), 5), 6000, None),
+    "a sum of losses": (samplers.FunctionProblem(lambda u: 19.0 - np.exp(0.8 * u).sum(axis=1), 5), 6000, None),
     "noise": (samplers.FunctionProblem(lambda u: 3.0 - u[:, 0] + NOISE.normal(size=len(u)), 2), 2000, None),
     "subset simulation instead": (samplers.FunctionProblem(lambda u: 4.5 - np.abs(u).max(axis=1), 20), 6000, 0.9),
     "Monte Carlo instead": (half_space(2, 0.5).problem, 1000, None),
