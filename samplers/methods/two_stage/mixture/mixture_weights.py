@@ -111,7 +111,7 @@ class _FloorIndex(NamedTuple):
         if shares is None:
             return a
         inside = np.where(own > 0, own, np.bincount(self.groups, minlength=len(own)))[self.groups]
-        return np.where(own[self.groups] > 0, a, 1.0) / inside * np.array(shares)[self.groups]
+        return np.asarray(np.where(own[self.groups] > 0, a, 1.0) / inside * np.array(shares)[self.groups])
 
 
 def _raise_shares(shares: list[float], least: list[float]) -> list[float] | None:
