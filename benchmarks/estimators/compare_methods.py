@@ -6,7 +6,7 @@ Runs every method many times on every problem of `samplers.benchmark.catalogue` 
 spread of the estimates (c.o.v.) beside the mean c.o.v. that the runs state, gain over plain Monte Carlo at equal error,
 how often the 95 % interval holds p, the share of runs with a warning, the worst error, simulations, calls of f, and the
 method's own processor time; then, for each method, coverage over all problems, the power of the warnings, the targets
-missed. `benchmarks/results/estimators_two_stage.json` is what `--runs 200 --methods two-stage --json FILE` wrote.
+missed.
 
 `--methods two-stage,adss --problems two_d30,six_d8` selects; `--rotation 7` turns the input space of every problem by
 another random rotation than the catalogue's, which changes no probability.
