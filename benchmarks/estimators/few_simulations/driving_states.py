@@ -1,7 +1,7 @@
 """The driving scenarios with IDM as limit states, for bases whose p is known from 300 million rollouts.
 
 A set for `benchmarks.estimators.two_stage.repeated_seeds --set` and for `study`. The truths are those of
-`benchmarks/results/truth.json` (2,459, 5,045, 15,667 and 6,062 collisions: standard errors of 2.0, 1.4, 0.8 and 1.3 %).
+`benchmarks/results/truth.json` (36,650, 77,499, 234,665 and 92,038 collisions: standard errors of 0.2 to 0.5 %).
 """
 
 import json
