@@ -29,7 +29,7 @@ COUNTED_COLLISIONS = {
     "cut_in_us101_d6": CountedCollisions("rare_envs/CutIn-v0", "us101-15-offsets", 15_667, 20_000_000),
     "cut_in_highway_d6": CountedCollisions("rare_envs/CutIn-v0", "highway", 6062, 20_000_000),
 }
-"""As `python -m benchmarks.estimators.truth --rollouts 2e7` has counted them."""
+"""Counted once, and fixed with the version of the benchmark; `benchmarks/results/truth.json` counts more rollouts."""
 
 
 def make_driving_state(counted: CountedCollisions) -> LimitState:

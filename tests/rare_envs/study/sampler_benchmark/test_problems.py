@@ -9,10 +9,14 @@ from benchmarks.estimators.truth import TRUTH_RESULT
 from rare_envs.study.sampler_benchmark.problems import ALL_PROBLEMS, COUNTED_COLLISIONS, make_driving_state
 
 
-def test_the_counts_are_those_of_the_committed_result() -> None:
-    rows = json.loads(TRUTH_RESULT.read_text())["results"]
-    counted = {(row["env_id"], row["base"], row["collisions"], row["rollouts"]) for row in rows}
-    assert {tuple(each) for each in COUNTED_COLLISIONS.values()} == counted
+def test_the_counts_agree_with_longer_ones() -> None:
+    """Those of the benchmark are fixed with its version; the committed result has 15 times as many draws, others."""
+    longer = {(row["env_id"], row["base"]): row for row in json.loads(TRUTH_RESULT.read_text())["results"]}
+    assert {(each.env_id, each.base) for each in COUNTED_COLLISIONS.values()} == set(longer)
+    for each in COUNTED_COLLISIONS.values():
+        row, p = longer[each.env_id, each.base], each.collisions / each.rollouts
+        error = np.hypot(row["standard_error"], np.sqrt(p / each.rollouts))
+        assert abs(p - row["p"]) < 4 * error
 
 
 @pytest.mark.parametrize("name", COUNTED_COLLISIONS)
