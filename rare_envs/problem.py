@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from rare_envs.core_choice import CoreChoice, is_compiled_script
 from rare_envs.devices import find_device, move_to
+from rare_envs.devices.batch_sizes import chunk_size, tile_size
 from rare_envs.distributions.space import Distribution, ScenarioSpace
 from rare_envs.egos.errors import reason_of
 from rare_envs.egos.loading import load_named_ego
@@ -38,23 +39,6 @@ from rare_envs.simulation.world import World
 from rare_envs.terms.episode_terms import EpisodeTerms, name_terms, simulate_terms
 from rare_envs.terms.gradients import ROLLOUTS_PER_GRADIENT, TermDifferentiator, find_differentiator
 from rare_envs.traffic.crash import CRASH_KINDS, Crash
-
-RULE_TILE = 16384
-"""Rollouts that a rule-based ego drives at once: the number at which eager torch is fastest."""
-POLICY_TILE = 4096
-"""Likewise with a policy; fixed, because matrix products round differently by batch size."""
-LIDAR_TILE = 512
-"""Likewise with lidar, or a measure that keeps whole episodes: small enough for all of it to stay in the cache."""
-CAMERA_TILE = 128
-"""Likewise with a policy that takes pictures: its layers' values for all of them have to fit into memory."""
-
-GPU_TILES = 16
-"""Times as many rollouts at once on a GPU, which takes about as long for few as for thousands."""
-
-RULE_CHUNK = 4096
-"""Rollouts of a rule-based ego that a worker makes at once: enough for torch, and some for each of several workers."""
-POLICY_CHUNK = 256
-"""Likewise with a policy, which is slower."""
 
 
 class DrivingProblem:
@@ -364,23 +348,19 @@ class DrivingProblem:
     @property
     def tile(self) -> int:
         """Number of rollouts simulated at once."""
-        factor = 1 if self.device.type == "cpu" else GPU_TILES
-        return factor * self._cpu_tile
-
-    @property
-    def _cpu_tile(self) -> int:
-        if self.needs.queries_policy and "camera" in self.world.sensing.kinds:
-            return CAMERA_TILE
-        if self.world.uses_lidar or self.world.measurement.records:
-            return LIDAR_TILE
-        return POLICY_TILE if isinstance(self.driver, PolicyDriver) else RULE_TILE
+        return tile_size(
+            self.device,
+            by_policy=isinstance(self.driver, PolicyDriver),
+            takes_pictures=self.needs.queries_policy and "camera" in self.world.sensing.kinds,
+            keeps_much=self.world.uses_lidar or self.world.measurement.records,
+        )
 
     @property
     def chunk_size(self) -> int:
         """Number of rollouts that a worker makes at once."""
         if self._chunk_size is not None:
             return self._chunk_size
-        return min(self.tile, POLICY_CHUNK if isinstance(self.driver, PolicyDriver) else RULE_CHUNK)
+        return chunk_size(self.tile, by_policy=isinstance(self.driver, PolicyDriver))
 
     def _simulate(self, x: NDArray[np.float64], failed_rows: dict[int, str] | None) -> NDArray[np.float64]:
         x = self.space.validate(np.atleast_2d(x))

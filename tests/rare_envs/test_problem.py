@@ -13,7 +13,7 @@ import agents
 import rare_envs
 import samplers
 import training
-from rare_envs.problem import POLICY_TILE
+from rare_envs.devices.batch_sizes import POLICY_TILE
 from rare_envs.scenarios.registry import SCENARIOS
 
 

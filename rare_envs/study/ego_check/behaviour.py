@@ -11,8 +11,8 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 
+from rare_envs.devices.batch_sizes import CAMERA_TILE
 from rare_envs.egos.faults import FaultTolerant
-from rare_envs.problem import CAMERA_TILE
 from rare_envs.sensors.kinds import kinds_of
 from rare_envs.study.ego_check.findings import Finding, report_failure, report_pass, report_warning
 from rare_envs.study.ego_check.interface import (

@@ -14,7 +14,7 @@ from stable_baselines3.common.env_checker import check_env as sb3_check_env
 from stable_baselines3.common.vec_env import VecFrameStack
 
 import rare_envs
-from rare_envs.problem import CAMERA_TILE
+from rare_envs.devices.batch_sizes import CAMERA_TILE
 from rare_envs.sensors.camera import Camera
 from rare_envs.sensors.kinds import map_kinds, read_kinds
 from training import sb3_vec_env
