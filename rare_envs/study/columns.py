@@ -43,13 +43,7 @@ def draw_ordinary(space: ScenarioSpace) -> FloatArray:
 
 
 def find_ordinary_range(values: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the ends between which nine of ten ordinary values lie, of each column of (n, k).
-
-    Example:
-        >>> low, high = find_ordinary_range(np.arange(101.0)[:, None])
-        >>> float(low[0]), float(high[0])
-        (5.0, 95.0)
-    """
+    """Return the ends between which nine of ten ordinary values lie, of each column of (n, k)."""
     low, high = np.quantile(values, (0.05, 0.95), axis=0)
     return low, high
 

@@ -29,15 +29,7 @@ class BadInput(Exception):
 
 @contextlib.contextmanager
 def as_bad_input(*kinds: type[BaseException]) -> Iterator[None]:
-    r"""Raise errors of these kinds as `BadInput`.
-
-    Example:
-        >>> with as_bad_input(ValueError):
-        ...     raise ValueError("Expected seed\n  to be a whole number.")
-        Traceback (most recent call last):
-            ...
-        rare_envs.study.errors.BadInput: Expected seed to be a whole number.
-    """
+    """Raise errors of these kinds as `BadInput`."""
     try:
         yield
     except kinds as error:

@@ -140,11 +140,7 @@ class Question:
 
     @property
     def _two_sided_confidence(self) -> float:
-        """Coverage of an interval whose ends are at `gate_confidence` each.
-
-        Raises:
-            ValueError: The limit or the confidence is out of range.
-        """
+        """Coverage of an interval whose ends are at `gate_confidence` each."""
         if not 0.0 < cast(float, self.max_p) < 1.0:
             raise ValueError(f"Expected max_p above 0 and below 1, got {self.max_p!r}.")
         if not 0.5 < self.gate_confidence < 1.0:
@@ -185,12 +181,6 @@ def read_question(values: Any) -> Question:
 
     Raises:
         BadInput: It is no question.
-
-    Example:
-        >>> read_question({"env_id": "rare_envs/CutIn-v0", "gamma": "low"})
-        Traceback (most recent call last):
-            ...
-        rare_envs.study.errors.BadInput: Expected gamma of the recorded question to be a number, got 'low'.
     """
     if not isinstance(values, dict) or "env_id" not in values:
         raise BadInput(f"Expected a recorded question, an object with env_id, got {reprlib.repr(values)}.")
@@ -282,11 +272,7 @@ def prepare(question: Question, ego: Any = None) -> Study:
 
 
 def _check_threshold(question: Question) -> None:
-    """Refuse a threshold below every value that a measure of this package takes; warn of one at which crashes count.
-
-    Raises:
-        ValueError: f <= gamma cannot happen.
-    """
+    """Refuse a threshold below every value that a measure of this package takes; warn of one at which crashes count."""
     measure = MEASURES.get(question.measure)
     least = getattr(measure, "collision", None)
     if not isinstance(least, float) or question.gamma >= 0.0:
@@ -336,11 +322,7 @@ def build_problem(question: Question, ego: Any) -> DrivingProblem:
 
 
 def _load_ensemble(question: Question) -> Distribution:
-    """Return the mixture of the refits of the base distribution.
-
-    Raises:
-        ValueError: It has none.
-    """
+    """Return the mixture of the refits of the base distribution."""
     base = load_base(find_scenario(question.env_id), question.base)
     if not isinstance(base, FittedDistribution) or not base.refits:
         name = "the default" if question.base is None else repr(question.base)
@@ -353,9 +335,6 @@ def _answers_vary(problem: DrivingProblem) -> bool:
     """Return whether the ego answers differently when it is queried twice with ordinary traffic at time 0.
 
     This finds a broken ego before the simulations, and one whose answers vary from run to run.
-
-    Raises:
-        BadInput: It raised, or its actions are not actions.
     """
     x = torch.from_numpy(problem.space.sample(2, np.random.default_rng(0))).float().to(problem.device)
     try:

@@ -36,11 +36,6 @@ def has_exact_bound(estimate: samplers.Estimate) -> bool:
     """Return whether the answer is the upper end: no simulation failed, and all are draws from the base distribution.
 
     The end is then exact, so that the warning that nothing failed is a remark.
-
-    Example:
-        >>> never = samplers.FunctionProblem(lambda x: 9.0 - x[:, 0], dim=1)
-        >>> [has_exact_bound(samplers.estimate(never, method, seed=0, max_sim=600)) for method in ("mc", "ss")]
-        [True, False]
     """
     return estimate.status is samplers.Status.NO_HITS and estimate.base_draws == estimate.n_sim
 

@@ -93,10 +93,6 @@ def count_found(recorded: Mapping[str, Any], n_listed: int) -> int:
     Args:
         recorded: Its result.json.
         n_listed: Failures in its table, which are fewer where it found many.
-
-    Example:
-        >>> count_found({"n_failures": 1649}, 1000), count_found({}, 12)
-        (1649, 12)
     """
     found = recorded.get("n_failures")
     return found if isinstance(found, int) and found > n_listed else n_listed

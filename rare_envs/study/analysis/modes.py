@@ -122,13 +122,6 @@ def label_modes(u: FloatArray, kinds: NDArray[np.object_]) -> NDArray[np.object_
     Args:
         u: Failures in standard normal space, shape (n, k).
         kinds: Their kinds of crash, shape (n,).
-
-    Example:
-        >>> rng = np.random.default_rng(0)
-        >>> u = rng.standard_normal((400, 2)) * 0.3 + np.repeat([[3.0, 0.0], [-3.0, 0.0]], 200, axis=0)
-        >>> labels = label_modes(u, np.full(400, "side", dtype=object))
-        >>> len(set(labels[:200])), len(set(labels[200:])), len(set(labels))
-        (1, 1, 2)
     """
     labels = np.empty(len(kinds), dtype=object)
     for kind in dict.fromkeys(kinds.tolist()):

@@ -22,12 +22,7 @@ _FIELDS = ("ego", "stats", "base", "drivers", "measure", "also_under")
 
 
 def describe_places(files: Iterable[str], folder: Path) -> dict[str, str]:
-    """Return where files lie as seen from the folder of a run, by their paths.
-
-    Example:
-        >>> describe_places(["egos/a.zip"], Path("runs/a"))
-        {'egos/a.zip': '../../egos/a.zip'}
-    """
+    """Return where files lie as seen from the folder of a run, by their paths."""
     places = {}
     for name in files:
         try:

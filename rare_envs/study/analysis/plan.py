@@ -24,12 +24,6 @@ def plan_from_result(recorded: Mapping[str, Any], target_cov: float) -> tuple[sa
     Raises:
         BadInput: A number that is needed is missing or none, or the run is no pilot: nothing failed, or its c.o.v. is
             above 0.5.
-
-    Example:
-        >>> recorded = {"p": 1e-4, "cov": 0.02, "n_sim": 6000, "final_draws": 2000, "seconds": 12.0,
-        ...             "method": {"name": "two-stage"}}
-        >>> [each.n_sim for each in plan_from_result(recorded, 0.01)]
-        [12000, 99990000]
     """
     p, cov, n_sim, seconds = (_read_number(recorded, name) for name in ("p", "cov", "n_sim", "seconds"))
     described = recorded.get("method")
@@ -82,12 +76,7 @@ def plan_by_pilots(
 
 
 def format_seconds(seconds: float) -> str:
-    """Return a time in a unit of its size.
-
-    Example:
-        >>> [format_seconds(each) for each in (0.2, 59.0, 3600.0, 1e6)]
-        ['1 s', '59 s', '60 min', '278 h']
-    """
+    """Return a time in a unit of its size."""
     for size, unit in ((120.0, "s"), (7200.0, "min")):
         if seconds < size:
             return f"{max(1, math.ceil(seconds / {'s': 1, 'min': 60}[unit]))} {unit}"
@@ -95,11 +84,7 @@ def format_seconds(seconds: float) -> str:
 
 
 def _read_number(recorded: Mapping[str, Any], name: str) -> float:
-    """Return a number of at least 0.
-
-    Raises:
-        BadInput: It is none.
-    """
+    """Return a number of at least 0."""
     value = recorded.get(name)
     if isinstance(value, bool) or not isinstance(value, int | float) or not (math.isfinite(value) and value >= 0):
         why = " (the run found no failure)" if name == "cov" and value is None else ""

@@ -33,10 +33,6 @@ def open_question(recorded: object, folder: Path, trust: bool) -> Question:
 
     Raises:
         BadInput: It is no question, or was not asked here and names code; nothing of that has been run then.
-
-    Example:
-        >>> open_question({"env_id": "rare_envs/CutIn-v0", "gamma": 2.0}, Path("run"), trust=False).gamma
-        2.0
     """
     question = replace(read_question(recorded), trust=trust, core="auto", device="cpu")
     if any(isinstance(value, str) and len(value) > MAX_TEXT for value in asdict(question).values()):
@@ -57,11 +53,6 @@ def is_same_question(recorded: object, question: Question) -> bool:
     Args:
         recorded: Of a file.
         question: The question.
-
-    Example:
-        >>> asked = Question(env_id="rare_envs/CutIn-v0", seed=1)
-        >>> is_same_question(asdict(replace(asked, on_error="bound")), asked), is_same_question({"seed": 2}, asked)
-        (True, False)
     """
     asked = _record(question)
     if find_ego_kind(question.ego) == "remote":
@@ -70,12 +61,7 @@ def is_same_question(recorded: object, question: Question) -> bool:
 
 
 def list_code(question: Question) -> list[str]:
-    """Return the code that a question names, as `module:name`.
-
-    Example:
-        >>> list_code(Question(env_id="mine:Mine-v0", ego="process:mine:make?timeout=3", measure="stl:always (g > 2)"))
-        ['mine:make', 'mine:Mine-v0']
-    """
+    """Return the code that a question names, as `module:name`."""
     ego, measure, env_id = strip_prefixes(question.ego), question.measure, question.env_id
     found = [ego] if find_ego_kind(ego) == "function" else []
     found += [measure] if ":" in measure and not measure.startswith("stl:") else []

@@ -23,14 +23,7 @@ MOST_DIFFERING = 0.05
 
 
 class Repeatability(NamedTuple):
-    """Simulations done again.
-
-    Example:
-        >>> print(Repeatability(68, 0, 0.0).warning or "as it should be")
-        as it should be
-        >>> print(Repeatability(68, 40, 3.5).warning)
-        of 68 simulations done again in another order and company 40 gave another f, by up to 3.5: the ego or the measure is random, keeps something from one call to the next, or mixes the rows of a batch, so p may be wrong by any factor; rare-envs check-ego may say where
-    """  # noqa: E501 (the example shows a whole message)
+    """Simulations done again."""
 
     n: int
     """How many."""
@@ -56,13 +49,6 @@ class RowKeeper(WrappedProblem):
 
     Half of them are a uniform sample, half those with f nearest to the threshold, which decide p: in ordinary traffic
     most scenarios have the largest f there is, whatever the ego does.
-
-    Example:
-        >>> import rare_envs
-        >>> keeper = RowKeeper(rare_envs.DrivingProblem("rare_envs/CarFollowing-v0"), gamma=0.0, size=4)
-        >>> _ = keeper.evaluate(np.array([[20.0, 15.0, 30.0]] * 5))
-        >>> keeper.x.shape, keeper.f.round(2)
-        ((4, 3), array([6., 6., 6., 6.]))
     """
 
     def __init__(self, problem: Any, gamma: float, size: int = KEPT_ROWS) -> None:

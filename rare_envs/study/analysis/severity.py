@@ -231,12 +231,7 @@ def _further_severities(
 
 
 def format_ends(low: float, high: float) -> str:
-    """Return an interval of a probability, or what it is below.
-
-    Example:
-        >>> format_ends(1e-4, 2e-3), format_ends(0.0, 2e-3), format_ends(0.0, 1.0)
-        ('1.0e-04 to 2.0e-03', 'below 2.0e-03', 'not bounded')
-    """
+    """Return an interval of a probability, or what it is below."""
     if low > 0:
         return f"{low:.1e} to {high:.1e}"
     return f"below {high:.1e}" if high < 1 else "not bounded"

@@ -13,14 +13,7 @@ REACH = 0.5
 
 
 def compute_threshold_curve(estimate: samplers.Estimate) -> samplers.Curve | None:
-    """Return p over thresholds with its band; None where the run does not tell it.
-
-    Example:
-        >>> problem = samplers.FunctionProblem(lambda x: 3.0 - x[:, 0], dim=2)
-        >>> curve = compute_threshold_curve(samplers.estimate(problem, "ce", seed=0, max_sim=4000))
-        >>> float(curve.gammas[0]), 0.3 < float(curve.p[-1]) < 0.7
-        (0.0, True)
-    """
+    """Return p over thresholds with its band; None where the run does not tell it."""
     if estimate.sample is None or estimate.p <= 0:
         return None
     top = _find_quantile(estimate.sample)

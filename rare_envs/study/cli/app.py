@@ -25,7 +25,6 @@ from rare_envs.study.cli.commands.report import report_command
 from rare_envs.study.cli.commands.reproduce import reproduce_app
 from rare_envs.study.cli.commands.serve_ego import serve_ego_command
 from rare_envs.study.cli.commands.train import train_drivers_command, train_ego_command
-from rare_envs.study.cli.completion import EGO_WORDS, complete_kind, complete_scenario, complete_words
 from rare_envs.study.cli.examples import add_examples, format_examples
 from rare_envs.study.cli.options import (
     AlgoOption,
@@ -85,7 +84,6 @@ def list_command(
         typer.Argument(
             metavar="[WHAT]",
             help="environments, methods, egos, drivers, measures, weather, all, or an environment.",
-            autocompletion=complete_kind,
         ),
     ] = None,
     as_json: JsonOption = False,
@@ -138,9 +136,7 @@ def risk_command(
 def bases_command(
     scenario: Annotated[
         str,
-        typer.Argument(
-            metavar="SCENARIO", help="Environment, or its short name: cut_in.", autocompletion=complete_scenario
-        ),
+        typer.Argument(metavar="SCENARIO", help="Environment, or its short name: cut_in."),
     ],
     as_json: JsonOption = False,
 ) -> None:
@@ -165,13 +161,9 @@ app.command("resume")(resume_command)
 def compare_command(
     ego_a: Annotated[
         str,
-        typer.Argument(
-            metavar="EGO_A", help="An ego, as for estimate --ego.", autocompletion=complete_words(*EGO_WORDS)
-        ),
+        typer.Argument(metavar="EGO_A", help="An ego, as for estimate --ego."),
     ],
-    ego_b: Annotated[
-        str, typer.Argument(metavar="EGO_B", help="The other ego.", autocompletion=complete_words(*EGO_WORDS))
-    ],
+    ego_b: Annotated[str, typer.Argument(metavar="EGO_B", help="The other ego.")],
     env: EnvArgument,
     options: QuestionOptions,
     max_sim: Annotated[

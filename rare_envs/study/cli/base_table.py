@@ -24,10 +24,6 @@ def list_bases(scenario: str) -> dict[str, dict[str, Any]]:
 
     Raises:
         ValueError: There is no such scenario, or a base cannot be read.
-
-    Example:
-        >>> list_bases("highway")["okelly2018"]["frequency"] is None
-        True
     """
     found = find_scenario(resolve_scenario(scenario))
     return {name: _describe_base(found, name) for name in found.bases}

@@ -24,15 +24,7 @@ KINDS = ("environments", *TITLES, "weather", EVERYTHING)
 
 
 def print_overview(entries: dict[str, Any]) -> None:
-    """Print all names that `list_names` returns, without their meanings: a screen of 80 columns and 24 lines.
-
-    Example:
-        >>> from rare_envs.study.cli.catalogue import list_names
-        >>> print_overview(list_names())  # doctest: +ELLIPSIS, +NORMALIZE_WHITESPACE
-        environments              parameters
-          rare_envs/CarFollowing-v0 ego_speed, lead_speed, gap
-        ...
-    """
+    """Print all names that `list_names` returns, without their meanings: a screen of 80 columns and 24 lines."""
     console = Console(highlight=False, markup=False)
     environments = Table.grid(padding=(0, 1))
     environments.add_row(Text("environments", style="bold"), Text("parameters", style="bold"))
@@ -82,10 +74,6 @@ def choose_entries(entries: dict[str, Any], what: str) -> dict[str, Any]:
     Args:
         entries: What `list_names` returns.
         what: One of `KINDS`, or the id of an environment.
-
-    Example:
-        >>> choose_entries({"egos": {"idm": "by rule"}, "drivers": {}}, "egos")
-        {'egos': {'idm': 'by rule'}}
     """
     if what == EVERYTHING:
         return entries
@@ -100,10 +88,6 @@ def check_kind(entries: dict[str, Any], what: str) -> str:
 
     Raises:
         BadInput: There is no such kind or environment.
-
-    Example:
-        >>> check_kind({"environments": {"rare_envs/CutIn-v0": {}}}, "CutIn-v0")
-        'rare_envs/CutIn-v0'
     """
     known: dict[str, str] = {name: name for name in (*KINDS, *entries["environments"])}
     known |= {name.partition("/")[2]: name for name in entries["environments"]}

@@ -61,12 +61,7 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
 
 
 def format_examples(command: str) -> str:
-    r"""Return the text below a help page, whose lines are not to be filled; empty where there are no examples.
-
-    Example:
-        >>> format_examples("report")
-        '\x08\nExamples:\n  rare-envs report runs/cutin --figures pdf'
-    """
+    """Return the text below a help page, whose lines are not to be filled; empty where there are no examples."""
     lines = EXAMPLES.get(command, ())
     return "\n".join(("\b", "Examples:", *(f"  {line}" for line in lines))) if lines else ""
 

@@ -24,13 +24,7 @@ class ExecutorKind(str, Enum):
 
 @dataclass(frozen=True, kw_only=True)
 class ExecutorOptions:
-    """Where simulations are made; none of these options changes the answer.
-
-    Example:
-        >>> ExecutorOptions(workers=2, time_limit=60.0).make()
-        LocalProcesses(workers=2, time_limit=60.0, memory_limit=None)
-        >>> ExecutorOptions().make()
-    """
+    """Where simulations are made; none of these options changes the answer."""
 
     workers: Annotated[
         int | None, typer.Option(help="Processes that simulate; by default this one, or all cores of --executor.")
@@ -57,11 +51,7 @@ class ExecutorOptions:
 
         Raises:
             ValueError: If the file names an executor that there is not.
-
-        Example:
-            >>> ExecutorOptions(workers=2).fill({"workers": 8, "executor": "local"}, {"workers"})
-            ExecutorOptions(workers=2, executor=<ExecutorKind.LOCAL: 'local'>, address=None, time_limit=None, memory_limit=None)
-        """  # noqa: E501 (the example shows a whole object)
+        """
         values = {name: value for name, value in others.items() if name not in typed and value is not None}
         kinds = [kind.value for kind in ExecutorKind]
         if values.get("executor", kinds[0]) not in kinds:

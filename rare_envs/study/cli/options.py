@@ -14,26 +14,9 @@ from typing import Annotated, Any
 
 import typer
 
-from rare_envs.study.cli.completion import (
-    ACTION_WORDS,
-    DRIVER_WORDS,
-    EGO_WORDS,
-    MEASURE_WORDS,
-    OBSERVATION_WORDS,
-    complete_base,
-    complete_environment,
-    complete_method,
-    complete_words,
-)
-
 
 class NoiseChoice(str, Enum):
-    """Names for the `noise` argument of `DrivingProblem`: True, "fixed" and False.
-
-    Example:
-        >>> NoiseChoice("off").argument
-        False
-    """
+    """Names for the `noise` argument of `DrivingProblem`: True, "fixed" and False."""
 
     ON = "on"
     FIXED = "fixed"
@@ -52,10 +35,6 @@ class NoiseChoice(str, Enum):
 
 def read_count(text: str) -> int:
     """Return the whole number that a text stands for, such as "10000" or "1e4".
-
-    Example:
-        >>> read_count("1e4"), read_count("-5")
-        (10000, -5)
 
     Raises:
         typer.BadParameter: If it is no whole number.
@@ -79,12 +58,7 @@ LEADER_SCENARIOS = {"cut-in": "cut_in", "car-following": "car_following"}
 
 
 def read_environment(text: str | None) -> str | None:
-    """Return the id of an environment with its namespace, where it was typed without.
-
-    Example:
-        >>> read_environment("CutIn-v0"), read_environment("mine:Overtaking-v0"), read_environment(None)
-        ('rare_envs/CutIn-v0', 'mine:Overtaking-v0', None)
-    """
+    """Return the id of an environment with its namespace, where it was typed without."""
     from rare_envs.scenarios.registry import complete_id
 
     return None if text is None else complete_id(text)
@@ -95,13 +69,12 @@ EnvArgument = Annotated[
     typer.Argument(
         metavar="ENV",
         help="Environment, such as rare_envs/CutIn-v0.",
-        autocompletion=complete_environment,
         callback=read_environment,
     ),
 ]
 EgoArgument = Annotated[
     str,
-    typer.Argument(metavar="EGO", help="An ego, as for estimate --ego.", autocompletion=complete_words(*EGO_WORDS)),
+    typer.Argument(metavar="EGO", help="An ego, as for estimate --ego."),
 ]
 ForceOption = Annotated[bool, typer.Option("--force", help="Replace what the folder of --out has of an earlier run.")]
 AlgoOption = Annotated[str | None, typer.Option(help="Algorithm of the .zip, if the file does not tell.")]
@@ -127,7 +100,6 @@ ObservationOption = Annotated[
     typer.Option(
         help="Observation of the ego: features, lidar, kinematics, camera, speed, or camera+lidar; by default the "
         "one that the ego's space fits.",
-        autocompletion=complete_words(*OBSERVATION_WORDS),
     ),
 ]
 ActionOption = Annotated[
@@ -135,14 +107,12 @@ ActionOption = Annotated[
     typer.Option(
         help="Actions of the ego: continuous or discrete, each tick, or HighwayEnv's meta, each second; by default "
         "those that its space fits.",
-        autocompletion=complete_words(*ACTION_WORDS),
     ),
 ]
 DeviceOption = Annotated[
     str,
     typer.Option(
         help="Where torch simulates: cpu, or a GPU (cuda, cuda:1), which leaves numba out: docs/speed.md.",
-        autocompletion=complete_words("cpu", "cuda"),
     ),
 ]
 EnsembleRunOption = Annotated[
@@ -158,14 +128,11 @@ EnsembleRunOption = Annotated[
 class ScenarioOptions:
     """Options of each command that drives an ego: the scenario, and the interface of the ego."""
 
-    base: Annotated[
-        str | None, typer.Option(help="Base distribution: a name or a JSON file.", autocompletion=complete_base)
-    ] = None
+    base: Annotated[str | None, typer.Option(help="Base distribution: a name or a JSON file.")] = None
     drivers: Annotated[
         str | None,
         typer.Option(
             help="Of the vehicles around: mgail, mgail2, mgail3, mgail4, mgail5, gail, bc, idm, idm+mobil or a file.",
-            autocompletion=complete_words(*DRIVER_WORDS),
         ),
     ] = None
     observation: ObservationOption = None
@@ -192,21 +159,18 @@ class WorldOptions(ScenarioOptions):
 class QuestionOptions(WorldOptions):
     """Options of a question: method, measure, threshold."""
 
-    method: Annotated[
-        str, typer.Option(help="Estimation method; see rare-envs list methods.", autocompletion=complete_method)
-    ] = "auto"
+    method: Annotated[str, typer.Option(help="Estimation method; see rare-envs list methods.")] = "auto"
     measure: Annotated[
         str,
         typer.Option(
             help="Safety measure f, small is dangerous: a name, module:function or stl:FORMULA.",
-            autocompletion=complete_words(*MEASURE_WORDS),
         ),
     ] = "ttc"
     gamma: Annotated[float, typer.Option(help="Threshold: P[f <= gamma]; 0 counts collisions.")] = 0.0
     seed: SeedOption = 0
     collisions: Annotated[
         str,
-        typer.Option(help="Which count: ego, or any, between others too.", autocompletion=complete_words("ego", "any")),
+        typer.Option(help="Which count: ego, or any, between others too."),
     ] = "ego"
     device: DeviceOption = "cpu"
     ensemble_run: EnsembleRunOption = True
@@ -221,7 +185,6 @@ class EstimateOptions(QuestionOptions):
         str,
         typer.Option(
             help="A name, a .zip or .onnx, module:function, tcp://..., noisy:EGO; see rare-envs list egos.",
-            autocompletion=complete_words(*EGO_WORDS),
         ),
     ] = "idm"
     algo: AlgoOption = None
@@ -244,7 +207,6 @@ class EstimateOptions(QuestionOptions):
         str,
         typer.Option(
             help="Where the ego fails twice: raise, failure or bound.",
-            autocompletion=complete_words("raise", "failure", "bound"),
         ),
     ] = "raise"
     chunk: Annotated[
@@ -255,7 +217,6 @@ class EstimateOptions(QuestionOptions):
         str,
         typer.Option(
             help="What simulates: torch, numba (compiled, where it can be had: docs/speed.md), or auto.",
-            autocompletion=complete_words("torch", "numba", "auto"),
         ),
     ] = "auto"
     sensitivity: Annotated[
@@ -283,7 +244,6 @@ class RiskOptions:
         typer.Option(
             "--with",
             help="Scenario of new leaders beside hard brake: cut-in or car-following.",
-            autocompletion=complete_words(*LEADER_SCENARIOS),
         ),
     ] = "cut-in"
     sites: Annotated[
@@ -293,9 +253,7 @@ class RiskOptions:
     base: Annotated[
         list[str] | None, typer.Option(help="SCENARIO=NAME or FILE, in place of the site's base; may be repeated.")
     ] = None
-    method: Annotated[
-        str, typer.Option(help="Estimation method; see rare-envs list methods.", autocompletion=complete_method)
-    ] = "auto"
+    method: Annotated[str, typer.Option(help="Estimation method; see rare-envs list methods.")] = "auto"
     max_sim: Annotated[
         int | None,
         typer.Option(
@@ -319,10 +277,6 @@ class RiskOptions:
 
         Raises:
             ValueError: A base has another form.
-
-        Example:
-            >>> RiskOptions(sites="us101,i80", base=["cut_in=mine.json"]).arguments()["bases"]
-            {'cut_in': 'mine.json'}
         """
         values = {field.name: getattr(self, field.name) for field in fields(self)}
         pairs = [each.partition("=") for each in values.pop("base") or []]

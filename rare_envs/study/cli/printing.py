@@ -207,14 +207,7 @@ def _print_failure(console: Console, report: Report) -> None:
 
 
 def _summarise_block(name: str, values: FloatArray, ordinary: FloatArray, normal: FloatArray) -> str:
-    """Return a summary of a block of many values.
-
-    Args:
-        name: Of the parameter.
-        values: Of the failure, shape (k,).
-        ordinary: Of ordinary scenarios, shape (n, k).
-        normal: Both in standard normal space, the failure's first, shape (1 + n, k).
-    """
+    """Return a summary of a block of many values."""
     distance = np.linalg.norm(normal, axis=1)
     low, high = np.quantile(distance[1:], (0.05, 0.95))
     spread = (values - ordinary.mean(axis=0)) / np.maximum(ordinary.std(axis=0), 1e-12)

@@ -167,13 +167,6 @@ def name_options(message: str, options: Mapping[str, str]) -> str:
 
     A name of one word is an ordinary word too: it is replaced behind "Expected" at the beginning alone. What is said
     of a file of --config stays as it is: its keys are these names.
-
-    Example:
-        >>> options = {"max_sim": "--max-sim", "seed": "--seed"}
-        >>> name_options("Expected max_sim of at least 1, got -5.", options)
-        'Expected --max-sim of at least 1, got -5.'
-        >>> name_options("Expected seed of at least 0, got -1 (the seed).", options)
-        'Expected --seed of at least 0, got -1 (the seed).'
     """
     if message.startswith("'"):
         return message

@@ -30,14 +30,7 @@ class Row(NamedTuple):
 
 
 def list_rows(report: Report) -> list[Row]:
-    """Return the lines between the intervals and the most likely failure.
-
-    Example:
-        >>> from rare_envs.study import Question, prepare, run
-        >>> report = run(prepare(Question(env_id="rare_envs/CarFollowing-v0", method="mc", max_sim=100, horizon=1.0)))
-        >>> [row.name for row in list_rows(report)]
-        ['collisions', 'c.o.v.', 'method', 'valid']
-    """
+    """Return the lines between the intervals and the most likely failure."""
     estimate = report.estimate
     return [
         *_describe_rate(report),

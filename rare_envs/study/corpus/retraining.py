@@ -45,13 +45,7 @@ def plan_retraining(folders: Sequence[Path], share: float, trust: bool = False) 
     Raises:
         BadInput: There is no such run, the runs differ in more than ego and seed, there is no failure, or the ego is no
             `.zip` that can be trained on.
-
-    Example:
-        >>> plan_retraining([Path("runs/nowhere")], 0.25)
-        Traceback (most recent call last):
-            ...
-        rare_envs.study.errors.BadInput: No run in 'runs/nowhere': expected result.json and failures.csv, as rare-envs estimate --out writes.
-    """  # noqa: E501 (the example shows a whole message)
+    """
     questions = [open_question(read_recorded(folder).get("question"), folder, trust) for folder in folders]
     failures = [failure for folder in folders for failure in read_run(folder, trust)]
     last = questions[-1]

@@ -88,12 +88,6 @@ def choose_likely(failures: Sequence[StoredFailure], most: int, modes: Sequence[
         failures: The most likely first.
         most: Their number.
         modes: Numbers of the failures that stand for a mode each.
-
-    Example:
-        >>> kinds = ["rear_end"] * 3 + ["side"]
-        >>> failures = [StoredFailure("", {}, {}, -1.0, 0.0 - k, crash=kind) for k, kind in enumerate(kinds)]
-        >>> [(each.log_p0, each.crash) for each in choose_likely(failures, 2)]
-        [(0.0, 'rear_end'), (-3.0, 'side')]
     """
     first: dict[str, int] = {}
     for number, failure in enumerate(failures):

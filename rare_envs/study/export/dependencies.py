@@ -11,12 +11,6 @@ def import_scenariogeneration(part: str) -> Any:
 
     Raises:
         ValueError: It is not installed.
-
-    Example:
-        >>> import_scenariogeneration("nothing")
-        Traceback (most recent call last):
-            ...
-        ValueError: OpenSCENARIO and OpenDRIVE need scenariogeneration: pip install "rare-envs[export]".
     """
     try:
         return importlib.import_module(f"scenariogeneration.{part}")

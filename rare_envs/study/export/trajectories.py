@@ -18,17 +18,7 @@ from samplers.problem import FloatArray
 
 @dataclass(frozen=True)
 class WorldTrajectories:
-    """T + 1 moments of N vehicles, the ego first, in a right-handed flat world.
-
-    Example:
-        >>> from rare_envs import DrivingProblem
-        >>> from rare_envs.study import drive_again
-        >>> problem = DrivingProblem("rare_envs/CutIn-v0", horizon=1.0)
-        >>> drive = drive_again(problem, np.array([20.0, 15.0, 20.0, 30.0, 60.0, 3.5]))
-        >>> found = find_trajectories(drive)
-        >>> found.names, found.y[0].round(1).tolist()  # the cutter begins on the right of the ego
-        (('ego', 'cutter', 'lead'), [0.0, -3.5, 0.0])
-    """
+    """T + 1 moments of N vehicles, the ego first, in a right-handed flat world."""
 
     names: tuple[str, ...]
     """Of the vehicles, length N; the ego is "ego"."""

@@ -57,14 +57,7 @@ def read_recorded_events(path: Path, names: list[str]) -> FloatArray:
 
 
 def find_nearest_event(x: FloatArray, events: FloatArray, ordinary: FloatArray) -> NearestEvent:
-    """Return the event nearest to a failure x (k,), among events (n, k), beside ordinary scenarios (m, k).
-
-    Example:
-        >>> ordinary = np.random.default_rng(0).standard_normal((1000, 2))
-        >>> found = find_nearest_event(np.array([4.0, 0.0]), np.array([[1.0, 0.0], [0.0, 0.0]]), ordinary)
-        >>> found.values.tolist(), round(found.distance, 1), found.rarer < 0.05
-        ([1.0, 0.0], 2.1, True)
-    """
+    """Return the event nearest to a failure x (k,), among events (n, k), beside ordinary scenarios (m, k)."""
     spread = np.maximum(ordinary.std(axis=0), 1e-12)
     distances = _distances(x[None], events, spread)[0]
     nearest = int(distances.argmin())

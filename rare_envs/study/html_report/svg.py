@@ -33,12 +33,6 @@ class FigureOfPage:
         size: Width and height [inch].
         narrow: As draw and size, for a narrow screen; None for the same figure, which has to be moved there where it is
             wide.
-
-    Example:
-        >>> figure = FigureOfPage("line", "A line.", lambda figure: figure.subplots().plot([0, 1]), (3, 2))
-        >>> text = figure.to_svg()
-        >>> text.startswith("<svg"), "http" in text.replace("http://www.w3.org/", "")
-        (True, False)
     """
 
     def __init__(

@@ -11,12 +11,7 @@ _BROKEN_NUMBER = re.compile(r"(?<=\d) (?=%|× 10)|(?<=×) (?=10)")
 
 
 def keep_numbers_whole(value: object) -> object:
-    """Return text without line breaks within its numbers; anything else, pictures and styles too, as it is.
-
-    Example:
-        >>> keep_numbers_whole("0.11 % to 0.15 %").split(" ")[1]  # the others do not break
-        'to'
-    """
+    """Return text without line breaks within its numbers; anything else, pictures and styles too, as it is."""
     if not isinstance(value, str) or isinstance(value, Markup):
         return value
     return _BROKEN_NUMBER.sub("\xa0", value)

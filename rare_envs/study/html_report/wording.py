@@ -24,12 +24,6 @@ def format_probability(p: float | None, like: float | None = None) -> str:
     Args:
         p: The probability.
         like: Another one that stands beside it and decides on the form; itself by default.
-
-    Example:
-        >>> format_probability(0.0242), format_probability(3.1e-5), format_probability(0.0), format_probability(None)
-        ('2.4 %', '3.1 × 10⁻⁵', '0', 'not known')
-        >>> format_probability(0.00085, like=0.0012)
-        '0.085 %'
     """
     if p is None or not math.isfinite(p):
         return "not known"
@@ -42,12 +36,7 @@ def format_probability(p: float | None, like: float | None = None) -> str:
 
 
 def format_odds(p: float) -> str:
-    """Return a probability as one in so many.
-
-    Example:
-        >>> format_odds(0.0242), format_odds(0.3), format_odds(0.0)
-        ('about 1 in 41', 'about 30 in 100', 'none')
-    """
+    """Return a probability as one in so many."""
     if p <= 0:
         return "none"
     if p > 0.1:
@@ -57,26 +46,14 @@ def format_odds(p: float) -> str:
 
 
 def explain_no_gain(p: float) -> str:
-    """Return why there is no gain over Monte Carlo.
-
-    Example:
-        >>> explain_no_gain(0.0), explain_no_gain(1e-5)
-        ('not known, as nothing that failed counts in p', 'not known, as the c.o.v. is 1 or more')
-    """
+    """Return why there is no gain over Monte Carlo."""
     if p <= 0:
         return "not known, as nothing that failed counts in p"
     return "none, as every scenario fails" if p >= 1 else "not known, as the c.o.v. is 1 or more"
 
 
 def describe_event(result: Result) -> str:
-    """Return what is counted, in words.
-
-    Example:
-        >>> describe_event({"gamma": 0.0, "question": {"measure": "ttc"}})
-        'ends in a collision'
-        >>> describe_event({"gamma": 1.5, "question": {"measure": "ttc"}})
-        'comes to f ≤ 1.5, f being the least ttc'
-    """
+    """Return what is counted, in words."""
     question = result.get("question") or {}
     measure, gamma = str(question.get("measure", "")), float(result.get("gamma", 0.0))
     if measure == "ttc" and gamma == 0.0:
@@ -86,13 +63,7 @@ def describe_event(result: Result) -> str:
 
 
 def summarise_answer(result: Result, base: str) -> str:
-    """Return the answer in a sentence, or two.
-
-    Example:
-        >>> question = {"env_id": "rare_envs/CutIn-v0", "ego": "idm", "measure": "ttc"}
-        >>> summarise_answer({"p": 0.0242, "gamma": 0.0, "question": question, "n_sim": 3000}, "us101")
-        'About 1 in 41 scenarios ends in a collision. Scenarios: rare_envs/CutIn-v0 with traffic as in us101.'
-    """
+    """Return the answer in a sentence, or two."""
     p = float(result["p"])
     where = f"Scenarios: {(result.get('question') or {}).get('env_id')} with traffic as in {base}."
     if p > 0:
@@ -106,12 +77,7 @@ def summarise_answer(result: Result, base: str) -> str:
 
 
 def describe_validity(result: Result) -> str:
-    """Return what the answer rests on, in the words of `samplers.Estimate.proviso`.
-
-    Example:
-        >>> describe_validity({"p": 0.0, "n_failures": 3, "base_draws": 600, "unseen": 0.005, "confidence": 0.95})
-        'valid if no failure region was missed; 600 draws of ordinary traffic would have met one with probability above 0.5 % (95 % confidence)'
-    """  # noqa: E501 (the example shows a whole sentence)
+    """Return what the answer rests on, in the words of `samplers.Estimate.proviso`."""
     draws = int(result.get("base_draws") or 0)
     if draws == 0:
         return "valid if no failure region was missed (no draws of ordinary traffic limit its probability)"
@@ -165,15 +131,7 @@ def describe_intervals(result: Result) -> list[tuple[str, str, str]]:
 
 
 def describe_wide_base(result: Result) -> str:
-    """Return how far the events behind the base distribution leave p open; empty where that is less than `WIDE_BASE`.
-
-    Example:
-        >>> base = {"interval": [1e-5, 2e-3], "fitted_to": "38 events"}
-        >>> describe_wide_base({"p": 1e-4, "base_uncertainty": base})
-        'the recorded events leave p open by a factor of 200, from 1.0 × 10⁻⁵ to 2.0 × 10⁻³ (38 events)'
-        >>> describe_wide_base({"p": 1e-4, "base_uncertainty": {**base, "interval": [1e-3, 2e-3]}})
-        ''
-    """
+    """Return how far the events behind the base distribution leave p open; empty below `WIDE_BASE`."""
     base = result.get("base_uncertainty")
     if not isinstance(base, dict) or not result["p"]:
         return ""
@@ -203,13 +161,7 @@ def describe_rate(result: Result) -> list[str]:
 
 
 def describe_method(result: Result) -> str:
-    """Return the method with the settings that it used.
-
-    Example:
-        >>> result = {"method": {"name": "two-stage", "settings": {"n": 6000}}, "question": {"max_sim": 1000}}
-        >>> describe_method(result), describe_method({**result, "question": {"max_sim": None}})
-        ('two-stage max_sim = 1000', 'two-stage n = 6000')
-    """
+    """Return the method with the settings that it used."""
     name, settings = str(result["method"]["name"]), dict(result["method"]["settings"])
     max_sim = (result.get("question") or {}).get("max_sim")
     if max_sim is not None:
@@ -220,22 +172,12 @@ def describe_method(result: Result) -> str:
 
 
 def describe_kind(kind: str) -> str:
-    """Return a kind of crash in words.
-
-    Example:
-        >>> describe_kind("side"), describe_kind("")
-        ('flank against flank', 'kind of crash not known')
-    """
+    """Return a kind of crash in words."""
     return KIND_DESCRIPTIONS.get(kind, kind or "kind of crash not known")
 
 
 def name_measure(name: str) -> str:
-    """Return a measure with the unit of f, for an axis.
-
-    Example:
-        >>> name_measure("ttc"), name_measure("mine:measure"), name_measure("stl:always (ttc > 2)")
-        ('ttc [s]', 'measure f', 'measure f')
-    """
+    """Return a measure with the unit of f, for an axis."""
     measure = MEASURES.get(name)
     if measure is None:
         return "measure f"

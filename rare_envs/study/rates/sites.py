@@ -23,11 +23,6 @@ def list_sites(scenario: Scenario) -> dict[str, str]:
     """Return the sites of a scenario: the name of the first base of each, and the site in words.
 
     Further bases of a site are other families for the same events, no other site; an assembled base has none.
-
-    Example:
-        >>> from rare_envs.scenarios.registry import scenario_named
-        >>> list_sites(scenario_named("cut_in"))
-        {'us101': 'US 101, Los Angeles, 07:50, congested', 'i80': 'I-80, Emeryville, 16:00, congested'}
     """
     found: dict[str, str] = {}
     for name in scenario.bases:

@@ -16,22 +16,12 @@ LARGE, SMALL, SMALL_BESIDE = 99.5, 0.01, 0.001
 
 
 def format_rate(value: float) -> str:
-    """Return a rate with two digits.
-
-    Example:
-        >>> [format_rate(value) for value in (202.5, 5.14, 0.26, 0.0007, 0.0)]
-        ['200', '5.1', '0.26', '7.0e-04', '0']
-    """
+    """Return a rate with two digits."""
     return format_alike(value)[0]
 
 
 def format_alike(*values: float) -> list[str]:
-    """Return rates with two digits, all as decimals or all with powers of ten.
-
-    Example:
-        >>> format_alike(0.011, 0.001, 0.12), format_alike(0.011, 1e-4, 0.12), format_alike(11.0, 0.16, 820.0)
-        (['0.011', '0.0010', '0.12'], ['1.1e-02', '1.0e-04', '1.2e-01'], ['11', '0.16', '820'])
-    """
+    """Return rates with two digits, all as decimals or all with powers of ten."""
     sizes = [value for value in values if value > 0 and math.isfinite(value)]
     least = SMALL if max(sizes, default=SMALL) < SMALL else SMALL_BESIDE
     decimal = all(value >= least for value in sizes)
@@ -58,24 +48,13 @@ def format_with_interval(value: float, interval: RateInterval, unit: str = "", l
         interval: Its interval.
         unit: Behind the rate, with a space before it.
         level: Before the interval, with a space after it.
-
-    Example:
-        >>> format_with_interval(0.011, (0.001, 0.12), " per hour")
-        '0.011 per hour (0.0010 to 0.12)'
-        >>> format_with_interval(2e-7, (0.0, 1700.0), level="95 %: ")
-        '2.0e-07 (95 %: below 1.7e+03)'
     """
     middle, low, high = format_alike(value, *interval)
     return f"{middle}{unit} ({level}{f'{low} to' if interval[0] > 0 else 'below'} {high})"
 
 
 def format_share(share: float) -> str:
-    """Return a share in per cent: whole, or one digit below 1 %.
-
-    Example:
-        >>> format_share(0.844), format_share(0.0012)
-        ('84 %', '0.1 %')
-    """
+    """Return a share in per cent: whole, or one digit below 1 %."""
     return f"{100 * share:.0f} %" if share >= 0.01 else f"{100 * share:.1g} %"
 
 
@@ -103,22 +82,12 @@ def describe_injuries(rate: CollisionRate | TotalRate) -> str:
 
 
 def describe_sources(shares: tuple[VarianceShare, ...]) -> str:
-    """Return the sources of the uncertainty of a total, the largest first.
-
-    Example:
-        >>> describe_sources((VarianceShare("base", "cut_in", 0.84), VarianceShare("counts", "", 0.16)))
-        '84 % the cut-in distribution, 16 % event counts'
-    """
+    """Return the sources of the uncertainty of a total, the largest first."""
     return ", ".join(f"{format_share(each.share)} {name_source(each)}" for each in shares)
 
 
 def describe_further_events(needed: FurtherEvents) -> str:
-    """Return how many further events would halve the uncertainty, in words.
-
-    Example:
-        >>> describe_further_events(FurtherEvents("cut_in", 312, 114))
-        'about 310 further recorded cut-ins would halve it'
-    """
+    """Return how many further events would halve the uncertainty, in words."""
     events = name_events(needed.scenario)
     if needed.number is not None:
         return f"about {format_rate(needed.number)} further recorded {events} would halve it"

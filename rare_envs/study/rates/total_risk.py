@@ -124,11 +124,7 @@ def _check_scenarios(scenarios: Sequence[str], sites: Sequence[str], bases: Mapp
 
 
 def _prepare(ego: Any, name: str, base: str, options: Mapping[str, Any]) -> Study:
-    """Return the study of one scenario.
-
-    Raises:
-        BadInput: Something cannot be used.
-    """
+    """Return the study of one scenario."""
     named = isinstance(ego, str)
     try:
         question = Question(env_id=env_id_of(name), ego=ego if named else type(ego).__name__, base=base, **options)

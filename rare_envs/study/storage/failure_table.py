@@ -71,11 +71,7 @@ def read_failures(folder: Path) -> dict[str, NDArray[Any]]:
 
 
 def _read_table(path: Path) -> dict[str, NDArray[Any]]:
-    """Return the columns of a table by name.
-
-    Raises:
-        ValueError: It is no table, or a cell is no number.
-    """
+    """Return the columns of a table by name."""
     header, *rows = csv.reader(io.StringIO(read_text_file(path))) or [[]]
     if any(len(row) != len(header) for row in rows):
         raise ValueError("a row has more or fewer cells than the header")
@@ -89,11 +85,7 @@ def _read_table(path: Path) -> dict[str, NDArray[Any]]:
 
 
 def _read_blocks(path: Path) -> dict[str, NDArray[Any]]:
-    """Return the large blocks by name, shape (n, size).
-
-    Raises:
-        ValueError: The file is damaged.
-    """
+    """Return the large blocks by name, shape (n, size)."""
     try:
         check_ordinary(path)
         with zipfile.ZipFile(path) as archive:

@@ -188,11 +188,7 @@ def load_study(folder: str | Path) -> LoadedStudy:
 
 
 def _read_object(path: Path) -> dict[str, Any]:
-    """Return the object of a JSON file.
-
-    Raises:
-        BadInput: It holds none.
-    """
+    """Return the object of a JSON file."""
     try:
         return parse_json_object(read_text_file(path), repr(str(path)))
     except (OSError, ValueError) as error:

@@ -45,10 +45,6 @@ class QuestionLoader(yaml.SafeLoader):  # type: ignore[misc]  # PyYAML has no ty
     """YAML with the numbers of YAML 1.2: 1e-4 is one, where 1.1 has a text, and 12:30 is none, where 1.1 has 750.
 
     Words for yes and no are those of 1.1: on, off, yes and no are among them.
-
-    Example:
-        >>> yaml.load("[1e-4, 12:30, 010, .5, off]", Loader=QuestionLoader)
-        [0.0001, '12:30', 10, 0.5, False]
     """
 
     yaml_implicit_resolvers: ClassVar = {
@@ -71,21 +67,13 @@ QuestionLoader.add_implicit_resolver(
 
 
 def read_question_file(path: Path) -> dict[str, Any]:
-    r"""Return the fields of `Question` that a file gives, and the options of `EXECUTOR_KEYS`.
+    """Return the fields of `Question` that a file gives, and the options of `EXECUTOR_KEYS`.
 
     Args:
         path: Of a YAML file, which may be JSON.
 
     Raises:
         BadInput: It cannot be read, or has unknown keys or values of a wrong type.
-
-    Example:
-        >>> from tempfile import TemporaryDirectory
-        >>> with TemporaryDirectory() as folder:
-        ...     path = Path(folder) / "study.yaml"
-        ...     _ = path.write_text("env: rare_envs/CutIn-v0\nmax-sim: 3000\nnoise: off\n")
-        ...     read_question_file(path)
-        {'env_id': 'rare_envs/CutIn-v0', 'max_sim': 3000, 'noise': False}
     """
     given = _load_mapping(path)
     named = {_find_field(key): value for key, value in given.items()}
@@ -132,11 +120,6 @@ def join_question(given: Mapping[str, Any], env: str | None, options: Mapping[st
 
     Raises:
         BadInput: Neither names an environment.
-
-    Example:
-        >>> question = join_question({"env_id": "a", "seed": 5, "gamma": 1.0}, None, {"seed": 7, "gamma": 0}, {"seed"})
-        >>> question.env_id, question.seed, question.gamma
-        ('a', 7, 1.0)
     """
     named = {**options, **given, **{name: value for name, value in options.items() if name in typed}}
     if env is not None:
@@ -147,11 +130,7 @@ def join_question(given: Mapping[str, Any], env: str | None, options: Mapping[st
 
 
 def _load_mapping(path: Path) -> dict[str, Any]:
-    """Return what a YAML file holds, with words as keys.
-
-    Raises:
-        BadInput: It cannot be read, or is no mapping.
-    """
+    """Return what a YAML file holds, with words as keys."""
     try:
         if path.stat().st_size > MAX_QUESTION_BYTES:
             raise BadInput(f"{str(path)!r} has more than {MAX_QUESTION_BYTES:,} bytes.")
@@ -170,11 +149,7 @@ def _load_mapping(path: Path) -> dict[str, Any]:
 
 
 def _refuse_repeated_keys(path: Path, text: str) -> None:
-    """Refuse a key that stands twice, of which PyYAML takes the last one without a word.
-
-    Raises:
-        BadInput: There is one.
-    """
+    """Refuse a key that stands twice, of which PyYAML takes the last one without a word."""
     node = yaml.compose(text, Loader=yaml.SafeLoader)
     keys = [key.value for key, _ in node.value] if isinstance(node, yaml.MappingNode) else []
     for key in keys:

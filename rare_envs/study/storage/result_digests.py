@@ -19,13 +19,6 @@ def digest_results(folder: Path) -> dict[str, str]:
 
     Raises:
         OSError: One of them cannot be read.
-
-    Example:
-        >>> from tempfile import TemporaryDirectory
-        >>> with TemporaryDirectory() as folder:
-        ...     _ = (Path(folder) / "result.json").write_text("{}")
-        ...     digest_results(Path(folder))
-        {'result.json': '2afb9b83f9314e5d029766197f539792'}
     """
     return {name: _digest_file(folder / name) for name in DIGESTED if (folder / name).is_file()}
 
@@ -39,10 +32,6 @@ def find_changed_results(folder: Path, about: Mapping[str, Any]) -> list[str]:
 
     Raises:
         OSError: A file cannot be read.
-
-    Example:
-        >>> find_changed_results(Path("runs/nowhere"), {"results": {"result.json": "2afb9b83f9314e5d029766197f539792"}})
-        ['result.json']
     """
     written = about.get("results")
     if not isinstance(written, Mapping):

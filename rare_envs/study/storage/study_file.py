@@ -43,14 +43,7 @@ LIBRARIES = (
 
 
 def describe_study(study: Study, folder: Path = Path()) -> dict[str, Any]:
-    """Return what study.json holds at the beginning of a run, whose folder is given.
-
-    Example:
-        >>> from rare_envs.study import prepare
-        >>> about = describe_study(prepare(Question(env_id="rare_envs/CarFollowing-v0", seed=5)))
-        >>> about["seed"], about["ego"]["kind"], about["base"]["name"], about["parameters"][2]
-        (5, 'rule', 'us101', {'name': 'gap', 'unit': 'm', 'size': 1})
-    """
+    """Return what study.json holds at the beginning of a run, whose folder is given."""
     question, space = study.question, study.problem.space
     files = digest_files(question)
     rows = zip(space.names, space.units, space.sizes, strict=True)

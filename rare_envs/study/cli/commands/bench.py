@@ -8,7 +8,6 @@ from typing import Annotated
 import typer
 
 from rare_envs.plugins import working_directory_first
-from rare_envs.study.cli.completion import complete_methods
 from rare_envs.study.cli.options import JsonOption
 from rare_envs.study.cli.shell import keep_stdout_for_the_answer, print_json
 from rare_envs.study.errors import as_bad_input
@@ -29,7 +28,7 @@ def bench_command() -> None:
 @bench_app.command("samplers")
 @use_one_thread()
 def bench_samplers_command(
-    method: Annotated[str, typer.Option(help=METHOD_HELP, autocompletion=complete_methods)] = "auto,mc,adss",
+    method: Annotated[str, typer.Option(help=METHOD_HELP)] = "auto,mc,adss",
     groups: Annotated[str, typer.Option("--set", help="Sets: analytic, highdim, public, driving.")] = "analytic,public",
     problems: Annotated[str, typer.Option(help="Problems by name instead of sets.")] = "",
     budget: Annotated[str, typer.Option(help="Simulations of a run, with commas.")] = "300,1500,6000",

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from rare_envs.study.cli.completion import EGO_WORDS, complete_words
 from rare_envs.study.cli.options import (
     ActionOption,
     AlgoOption,
@@ -54,9 +53,7 @@ def corpus_add_command(
 @corpus_app.command("run")
 @use_one_thread()
 def corpus_run_command(
-    ego: Annotated[
-        str, typer.Option(help="The ego to try, as for estimate --ego.", autocompletion=complete_words(*EGO_WORDS))
-    ],
+    ego: Annotated[str, typer.Option(help="The ego to try, as for estimate --ego.")],
     corpus: CorpusOption = Path("corpus"),
     junit: Annotated[Path | None, typer.Option(help="File for a JUnit report.")] = None,
     algo: AlgoOption = None,

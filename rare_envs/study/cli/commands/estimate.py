@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 import typer
 
 from rare_envs.scenarios.registry import is_highway_env_id
-from rare_envs.study.cli.completion import complete_environment
 from rare_envs.study.cli.executor_options import ExecutorOptions
 from rare_envs.study.cli.options import (
     DetailsOption,
@@ -50,7 +49,6 @@ def estimate_command(
         typer.Argument(
             metavar="ENV",
             help="Environment, such as rare_envs/CutIn-v0; or in --config.",
-            autocompletion=complete_environment,
         ),
     ] = None,
     config: Annotated[
@@ -107,11 +105,7 @@ def _estimate_highway_env(
 
 
 def _refuse_options_of_a_limit(typed: set[str]) -> None:
-    """Refuse options that a question without --max-p would ignore.
-
-    Raises:
-        BadInput: One was typed. A folder of an older run may have them, so that the question itself allows them.
-    """
+    """Refuse options that a question without --max-p would ignore."""
     for name, option in (("given_base", "--given-base"), ("gate_confidence", "--confidence")):
         if name in typed:
             raise BadInput(f"Expected {option} together with --max-p, the limit of p.")

@@ -7,7 +7,6 @@ from typing import Annotated
 
 import typer
 
-from rare_envs.study.cli.completion import complete_words
 from rare_envs.study.cli.options import JsonOption, TrustOption
 from rare_envs.study.cli.shell import keep_stdout_for_the_answer, print_json
 from rare_envs.study.errors import BadInput, as_bad_input, output_file
@@ -23,14 +22,12 @@ def export_command(
         str,
         typer.Option(
             help="openscenario, carla (for scenario_runner) or commonroad.",
-            autocompletion=complete_words("openscenario", "carla", "commonroad"),
         ),
     ] = "openscenario",
     ego: Annotated[
         str | None,
         typer.Option(
             help="recorded: it follows its trajectory; free: it only has a start. carla leaves it free.",
-            autocompletion=complete_words("recorded", "free"),
         ),
     ] = None,
     trust: TrustOption = False,

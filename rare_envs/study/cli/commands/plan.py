@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from rare_envs.study.cli.completion import EGO_WORDS, complete_environment, complete_words
 from rare_envs.study.cli.options import AlgoOption, JsonOption, QuestionOptions, StatsOption
 from rare_envs.study.cli.shell import is_typed, keep_stdout_for_the_answer, print_json
 from rare_envs.study.errors import BadInput, as_bad_input
@@ -28,16 +27,13 @@ def plan_command(
         typer.Argument(
             metavar="ENV|RUN",
             help="Environment, of which pilots are run; or the folder of a run.",
-            autocompletion=complete_environment,
         ),
     ],
     options: QuestionOptions,
     cov: Annotated[
         float, typer.Option("--cov", "--target-cov", help="Coefficient of variation that is wished for.")
     ] = 0.1,
-    ego: Annotated[
-        str, typer.Option(help="An ego, as for estimate --ego.", autocompletion=complete_words(*EGO_WORDS))
-    ] = "idm",
+    ego: Annotated[str, typer.Option(help="An ego, as for estimate --ego.")] = "idm",
     pilot: Annotated[
         int | None, typer.Option(help="Simulations of each pilot.", show_default="the method's own budget")
     ] = None,
@@ -80,11 +76,7 @@ def _check_environment(target: str) -> None:
 
 
 def _refuse_options_of_pilots(context: typer.Context) -> None:
-    """Refuse what was typed beside the folder of a run, which has a question of its own.
-
-    Raises:
-        BadInput: There is such an option.
-    """
+    """Refuse what was typed beside the folder of a run, which has a question of its own."""
     typed = sorted(name for name in context.params if is_typed(context, name))
     refused = [name for name in typed if name not in ("target", "cov", "as_json")]
     if refused:

@@ -9,7 +9,6 @@ from typing import Annotated
 import typer
 
 from rare_envs.study.cli.commands.corpus import replay_all
-from rare_envs.study.cli.completion import EGO_WORDS, complete_words
 from rare_envs.study.cli.options import JsonOption, TrustOption
 from rare_envs.study.cli.shell import DOUBTFUL, is_typed, keep_stdout_for_the_answer, print_json
 from rare_envs.study.errors import BadInput, output_file
@@ -26,7 +25,6 @@ def replay_command(
         str | None,
         typer.Option(
             help="Another ego, as for estimate --ego, in the place of the run's.",
-            autocompletion=complete_words(*EGO_WORDS),
         ),
     ] = None,
     replay_each: Annotated[

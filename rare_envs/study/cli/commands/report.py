@@ -7,7 +7,6 @@ from typing import Annotated
 
 import typer
 
-from rare_envs.study.cli.completion import complete_words
 from rare_envs.study.cli.options import JsonOption, TrustOption
 from rare_envs.study.cli.shell import keep_stdout_for_the_answer, print_json
 from rare_envs.threads import use_one_thread
@@ -25,7 +24,6 @@ def report_command(
         str | None,
         typer.Option(
             help="Figures as files too, beside the page: svg, pdf or png.",
-            autocompletion=complete_words("svg", "pdf", "png"),
         ),
     ] = None,
     trust: TrustOption = False,

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from rare_envs.study.cli.completion import complete_environment, complete_words
 from rare_envs.study.cli.options import (
     JsonOption,
     NoiseChoice,
@@ -38,7 +37,6 @@ def train_ego_command(
             metavar="[ENV]",
             help="Environment, such as rare_envs/CutIn-v0; --from-failures tells it.",
             callback=read_environment,
-            autocompletion=complete_environment,
         ),
     ] = None,
     algo: Annotated[
@@ -46,7 +44,6 @@ def train_ego_command(
         typer.Option(
             help="Stable-Baselines3 algorithm; --from-failures tells it.",
             show_default="ppo",
-            autocompletion=complete_words("ppo", "a2c", "sac", "td3", "dqn"),
         ),
     ] = None,
     steps: Annotated[
@@ -59,7 +56,6 @@ def train_ego_command(
         str,
         typer.Option(
             help="Where to simulate and to train: cpu, or a GPU (cuda, cuda:1).",
-            autocompletion=complete_words("cpu", "cuda"),
         ),
     ] = "cpu",
     resume: Annotated[bool, typer.Option("--resume", help="Go on with a training that was interrupted.")] = False,
@@ -122,11 +118,7 @@ def train_ego_command(
 def _read_plan(
     runs: list[Path], share: float, trust: bool, env: str | None, algo: str | None, options: WorldOptions
 ) -> RetrainingPlan:
-    """Return how to train on with the failures of runs.
-
-    Raises:
-        BadInput: The runs cannot be used, or an option says otherwise than they do.
-    """
+    """Return how to train on with the failures of runs."""
     from rare_envs.study.corpus.retraining import plan_retraining
 
     if options != WorldOptions():
