@@ -1,4 +1,4 @@
-"""Page of the documentation about papers, from the committed records of `rare-envs reproduce`.
+"""Page of the documentation about papers, from the committed records of `python -m benchmarks.papers`.
 
     python -m benchmarks.papers.page
 
@@ -16,8 +16,8 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks import RESULTS
-from rare_envs.study.reproduction.markdown import format_reproduction
-from rare_envs.study.reproduction.okelly2018.scales import CORE_SPEEDS, SEARCHES, STUDY_SCALES, StudyScale
+from benchmarks.papers.markdown import format_reproduction
+from benchmarks.papers.okelly2018.scales import CORE_SPEEDS, SEARCHES, STUDY_SCALES, StudyScale
 
 PAPERS_PAGE = Path(__file__).parents[2] / "docs" / "papers.md"
 PAPERS = ("tian2024", "okelly2018", "okelly2018_full", "okelly2018_vision")
@@ -39,10 +39,10 @@ HEAD = """\
 
 One command makes the tables and figures of a paper anew, beside those that were printed:
 
-    rare-envs reproduce tian2024 --out tian2024 --scale small    # 5 replications; full: the paper's 20
-    rare-envs reproduce okelly2018 --out okelly2018
+    python -m benchmarks.papers tian2024 --out tian2024 --scale small    # 5 replications; full: the paper's 20
+    python -m benchmarks.papers okelly2018 --out okelly2018
 
-Each writes `reproduction.html` (tables with a column of differences, figures in the paper's axes),
+Each writes `reproduction.md` (tables with a column of differences), figures in the paper's axes, and
 `reproduction.json` (all numbers, the command, versions, machine and seeds, from which the page is made) and the single
 runs, with which the same command goes on where it has ended. A folder holds one reproduction: another paper, ego, scale
 or seed is refused. This page is made from the records in `benchmarks/results`; to read one:
@@ -83,8 +83,8 @@ def format_scales(records: Mapping[str, Mapping[str, Any]]) -> str:
         "picture for each of 100 steps and a network looks at it: about "
         f"{vision:g} rollouts a second of a core's processor time (an AMD EPYC), where the lidar ego makes "
         f"{lidar:,.0f}. That is {hours[0]:.1f} core hours for the small scale and {hours[1]:.0f} for the full one; "
-        "`rare-envs reproduce okelly2018 --ego vision --scale full --executor ray` is for a cluster. With this ego "
-        "failures are so rare that the small scale's naive p rests on one event at most, so that it does not say "
+        "`python -m benchmarks.papers okelly2018 --ego vision --scale full --workers 64` is for a large machine. "
+        "With this ego failures are so rare that the small scale's naive p rests on one event at most, so that it does not say "
         "whether cross-entropy gains what the paper's Table 2 and Figure 3 show; its draws fail by the hundred, with "
         "weights that add up to next to nothing, as with the lidar ego."
     )

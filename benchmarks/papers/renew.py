@@ -1,37 +1,31 @@
 """Rows of our own methods in the committed records of both papers, made anew; the paper's methods stay as they are.
 
-    python -m benchmarks.papers.renew FOLDER
-    python -m benchmarks.papers.renew FOLDER --paper tian2024 --method two-stage
-
-makes these rows, writes their runs to FOLDER and goes on with those that are there; then it puts the rows into
-`benchmarks/results` and writes `docs/papers.md`. That is what `rare-envs reproduce` gives at the same seeds, without
-the hours of the other rows. With `--method ""` no row is made: tables and texts follow from the committed runs alone.
+The runs are written to a folder and those that are there are kept. The rows are what a whole reproduction gives at the
+same seeds, without the hours of the other rows.
 """
 
 from __future__ import annotations
 
-import argparse
 import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from benchmarks import RESULTS
+from benchmarks.papers.okelly2018.estimates import ThresholdEstimate
+from benchmarks.papers.okelly2018.reproduction import make_okelly_record
+from benchmarks.papers.okelly2018.study import HighwayStudy, estimate_own
+from benchmarks.papers.okelly2018.summary import compare_own
 from benchmarks.papers.page import PAPERS, read_records
 from benchmarks.papers.page import main as write_page
-from rare_envs.json_text import format_json
-from rare_envs.study.reproduction.okelly2018.estimates import ThresholdEstimate
-from rare_envs.study.reproduction.okelly2018.reproduction import make_okelly_record
-from rare_envs.study.reproduction.okelly2018.study import HighwayStudy, estimate_own
-from rare_envs.study.reproduction.okelly2018.summary import compare_own
-from rare_envs.study.reproduction.tian2024.catalogue import METHOD_ROWS
-from rare_envs.study.reproduction.tian2024.figures import collect_figures
-from rare_envs.study.reproduction.tian2024.replications import (
+from benchmarks.papers.tian2024.catalogue import METHOD_ROWS
+from benchmarks.papers.tian2024.figures import collect_figures
+from benchmarks.papers.tian2024.replications import (
     ReplicationRun,
     run_replication,
 )
-from rare_envs.study.reproduction.tian2024.study import TianPlan, open_replications, record_replications
-from rare_envs.threads import use_one_thread
+from benchmarks.papers.tian2024.study import TianPlan, open_replications, record_replications
+from rare_envs.json_text import format_json
 from samplers.benchmark.runs import map_jobs
 from samplers.serialization import to_json_value
 
@@ -104,25 +98,20 @@ def renew_okelly(record: dict[str, Any], folder: Path, own: bool = True) -> dict
     return {**anew, "about": about, "findings": record["findings"]}
 
 
-def main() -> None:
-    """Read the command line."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("folder", type=Path, help="of the new runs")
-    parser.add_argument("--paper", choices=PAPERS, help="one record; all if none is named")
-    parser.add_argument("--method", default=OWN_METHOD, help="methods with commas")
-    arguments = parser.parse_args()
-    methods = [name for name in arguments.method.split(",") if name]
+def renew(folder: Path, papers: Sequence[str] = PAPERS, methods: Sequence[str] = (OWN_METHOD,)) -> None:
+    """Put rows of our own methods, made anew, into committed records, and write the page of the papers.
+
+    Args:
+        folder: Of the new runs.
+        papers: Records, by name.
+        methods: Whose rows are made; none makes no row: tables and texts follow from the committed runs alone.
+    """
     for paper, record in read_records().items():
-        if arguments.paper not in (None, paper):
+        if paper not in papers:
             continue
-        with use_one_thread():
-            if paper == "tian2024":
-                anew = renew_tian(record, arguments.folder / paper, methods)
-            else:
-                anew = renew_okelly(record, arguments.folder / paper, OWN_METHOD in methods)
+        if paper == "tian2024":
+            anew = renew_tian(record, folder / paper, methods)
+        else:
+            anew = renew_okelly(record, folder / paper, OWN_METHOD in methods)
         (RESULTS / f"{paper}.json").write_text(format_json(anew) + "\n", encoding="utf-8")
     write_page()
-
-
-if __name__ == "__main__":
-    main()

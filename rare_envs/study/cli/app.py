@@ -22,7 +22,6 @@ from rare_envs.study.cli.commands.fit import fit_command
 from rare_envs.study.cli.commands.plan import plan_command
 from rare_envs.study.cli.commands.replay import replay_command
 from rare_envs.study.cli.commands.report import report_command
-from rare_envs.study.cli.commands.reproduce import reproduce_app
 from rare_envs.study.cli.commands.serve_ego import serve_ego_command
 from rare_envs.study.cli.commands.train import train_drivers_command, train_ego_command
 from rare_envs.study.cli.examples import add_examples, format_examples
@@ -205,7 +204,6 @@ app.command("replay")(replay_command)
 app.command("export")(export_command)
 app.add_typer(corpus_app, name="corpus", cls=SummarisedCommands)
 app.add_typer(bench_app, name="bench", cls=SummarisedCommands)
-app.add_typer(reproduce_app, name="reproduce", cls=SummarisedCommands)
 app.command("plan")(plan_command)
 app.command("report")(report_command)
 app.command("check-ego")(check_ego_command)

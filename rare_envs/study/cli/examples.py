@@ -50,12 +50,6 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
     "corpus run": ("rare-envs corpus run --ego new.zip --corpus corpus --junit corpus.xml",),
     "bench": ("rare-envs bench samplers --method mc,adss --runs 5",),
     "bench samplers": ("rare-envs bench samplers --method auto,mine:sampler --set analytic --budget 1500 --runs 20",),
-    "reproduce": (
-        "rare-envs reproduce tian2024 --scale small --out runs/tian2024",
-        "rare-envs reproduce okelly2018 --out runs/okelly2018",
-    ),
-    "reproduce tian2024": ("rare-envs reproduce tian2024 --scale small --workers 4 --out runs/tian2024",),
-    "reproduce okelly2018": ("rare-envs reproduce okelly2018 --out runs/okelly2018 --ego vision --at-most 2000",),
 }
 """Commands to examples of them, in one line each."""
 

@@ -6,8 +6,8 @@ import pytest
 
 from benchmarks.papers.page import PAPERS_PAGE, format_papers_page, format_scales, read_records
 from benchmarks.papers.renew import read_replications
-from rare_envs.study.reproduction.tian2024.replications import ReplicationJob, ReplicationRun, run_replication
-from rare_envs.study.reproduction.tian2024.tables import make_method_tables
+from benchmarks.papers.tian2024.replications import ReplicationJob, ReplicationRun, run_replication
+from benchmarks.papers.tian2024.tables import make_method_tables
 from rare_envs.threads import use_one_thread
 from samplers.serialization import to_json_value
 from tests.benchmarks.papers.same_records import assert_same

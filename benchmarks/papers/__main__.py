@@ -1,0 +1,131 @@
+"""Tables and figures of published papers, made anew and set beside those that were printed.
+
+    python -m benchmarks.papers tian2024 --out runs/tian2024 --scale small
+    python -m benchmarks.papers okelly2018 --out runs/okelly2018 --ego vision --at-most 2000
+    python -m benchmarks.papers renew runs/renewed --paper tian2024
+
+Each writes `reproduction.json`, `reproduction.md` and figures, and the single runs, with which the same command goes
+on. `renew` makes the rows of our own methods in the committed records anew.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Mapping
+from concurrent.futures import Executor, ProcessPoolExecutor
+from contextlib import AbstractContextManager, nullcontext
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+from benchmarks.papers.okelly2018.reproduction import reproduce_okelly2018
+from benchmarks.papers.okelly2018.study import HighwayStudy
+from benchmarks.papers.page import PAPERS
+from benchmarks.papers.record import discard_runs
+from benchmarks.papers.renew import OWN_METHOD, renew
+from benchmarks.papers.tian2024.study import REPLICATIONS_FILE, SCALES, TianPlan, reproduce_tian2024
+from rare_envs.study.errors import BadInput
+from rare_envs.threads import use_one_thread
+
+
+def main(words: list[str] | None = None) -> int:
+    """Run the command line; returns the exit code: 0 done, 2 bad input."""
+    arguments = _make_parser().parse_args(words)
+    try:
+        with use_one_thread():
+            _COMMANDS[arguments.command](arguments)
+    except (BadInput, ValueError, OSError) as error:
+        print(f"benchmarks.papers: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print("The runs so far are in the folder; the same command goes on with them.", file=sys.stderr)
+        return 130
+    return 0
+
+
+def _make_parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks.papers", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    commands = parser.add_subparsers(dest="command", required=True)
+    tian = commands.add_parser("tian2024", help="Tian et al. 2024: Tables II and III, Figures 6 to 8")
+    tian.add_argument("--scale", choices=SCALES, default="full", help="5 replications of every method, or 20")
+    tian.add_argument("--replications", type=int, help="of every method, instead of the scale's")
+    tian.add_argument("--monte-carlo-replications", type=int, help="of Monte Carlo, which takes most of the time")
+    tian.add_argument("--further-replications", type=int, help="of the methods that the paper does not have")
+    tian.add_argument("--seed", type=int, default=0, help="of the first replication")
+    tian.add_argument("--afresh", action="store_true", help="delete the runs in the folder and make all anew")
+    okelly = commands.add_parser("okelly2018", help="O'Kelly et al. 2018: Tables 1 and 2, Figures 2 and 3")
+    okelly.add_argument("--scale", default="small", help="small, or full: the paper's, for days")
+    okelly.add_argument("--ego", default="lidar", help="lidar (Table 1, Figure 2) or vision (Table 2, Figure 3)")
+    okelly.add_argument("--seed", type=int, default=2018, help="of all draws")
+    okelly.add_argument("--at-most", type=int, help="rollouts to make now; the record says what is not run")
+    for command, name in ((tian, "tian2024"), (okelly, "okelly2018")):
+        command.add_argument("--out", type=Path, default=Path(name), help="folder of runs and record")
+        command.add_argument("--workers", type=int, default=1, help="processes")
+        command.add_argument("--json", action="store_true", help="print the record")
+    renewed = commands.add_parser("renew", help="rows of our own methods in the committed records, made anew")
+    renewed.add_argument("folder", type=Path, help="of the new runs")
+    renewed.add_argument("--paper", choices=PAPERS, help="one record; all if none is named")
+    renewed.add_argument("--method", default=OWN_METHOD, help="methods with commas; none makes no row")
+    return parser
+
+
+def _run_tian(arguments: argparse.Namespace) -> None:
+    number = arguments.replications or SCALES[arguments.scale]
+    plan = TianPlan(
+        replications=number,
+        seed=arguments.seed,
+        monte_carlo=arguments.monte_carlo_replications,
+        further=arguments.further_replications,
+    )
+    if arguments.afresh:
+        discard_runs(arguments.out / REPLICATIONS_FILE, "tian2024")
+    options = {"--monte-carlo-replications": plan.monte_carlo, "--further-replications": plan.further}
+    fewer = "".join(f" {name} {value}" for name, value in options.items() if value is not None)
+    command = f"python -m benchmarks.papers tian2024 --replications {number}{fewer} --seed {plan.seed}"
+    record = reproduce_tian2024(plan, arguments.out, command, arguments.workers, progress=True)
+    _tell(record, arguments)
+
+
+def _run_okelly(arguments: argparse.Namespace) -> None:
+    if arguments.at_most is not None and arguments.at_most < 0:
+        raise BadInput(f"Expected --at-most to be 0 or more, got {arguments.at_most}.")
+    study = HighwayStudy(arguments.ego, arguments.scale, arguments.seed)
+    command = (
+        f"python -m benchmarks.papers okelly2018 --scale {study.scale} --ego {study.ego} --seed {study.seed} "
+        "--out FOLDER"
+    )
+    with _open_workers(arguments.workers) as executor:
+        record = reproduce_okelly2018(study, arguments.out, command, executor, arguments.at_most, progress=True)
+    _tell(record, arguments)
+
+
+def _open_workers(workers: int) -> AbstractContextManager[Executor | None]:
+    if workers < 1:
+        raise BadInput(f"Expected --workers to be 1 or more, got {workers}.")
+    return nullcontext() if workers == 1 else ProcessPoolExecutor(workers, mp_context=get_context("spawn"))
+
+
+def _tell(record: Mapping[str, Any], arguments: argparse.Namespace) -> None:
+    if arguments.json:
+        print(json.dumps(record))
+        return
+    for note in record["notes"]:
+        print(note)
+    for found in record["findings"]:
+        print(f"{found['claim']}: {found['verdict']}. {found['statistic']}.")
+    print(f"Wrote {arguments.out / 'reproduction.json'} and {arguments.out / 'reproduction.md'}.")
+
+
+def _run_renewal(arguments: argparse.Namespace) -> None:
+    papers = PAPERS if arguments.paper is None else (arguments.paper,)
+    renew(arguments.folder, papers, [name for name in arguments.method.split(",") if name])
+
+
+_COMMANDS = {"tian2024": _run_tian, "okelly2018": _run_okelly, "renew": _run_renewal}
+
+if __name__ == "__main__":
+    sys.exit(main())

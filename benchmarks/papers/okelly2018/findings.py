@@ -1,0 +1,222 @@
+"""Statements of the paper about failures, tested: failing runs against ordinary ones, run by run."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import stats
+
+from benchmarks.papers.record import TestedClaim
+from samplers.problem import FloatArray
+from samplers.statistics.intervals import Interval
+
+NEXT_LANES = (2, 3)
+"""Vehicles that start in the lanes beside the ego's, see `rare_envs.scenarios.highway.START_LANES`."""
+BESIDE = 10.0
+"""Distance along the road within which a neighbour closes the way to its lane [m]."""
+STARTS = ("s", "t", "heading", "speed")
+RESAMPLES = 999
+LEAST_P = 1e-99
+"""The least p value that is printed."""
+StartColumns = Mapping[str, FloatArray]
+"""Scenario parameters by name, (n, 6) each, the ego first."""
+
+
+@dataclass(frozen=True)
+class PaperClaim:
+    """A statement of the paper as a ratio of failing runs to ordinary ones.
+
+    Example:
+        >>> claim = PaperClaim("trailing vehicles are faster", above=True, printed=1.2)
+        >>> claim.judge((1.02, 1.08))
+        'holds, but less: 1.2 in the paper'
+    """
+
+    text: str
+    above: bool
+    """Whether the ratio is to be above 1, else below."""
+    printed: float | None = None
+    """The ratio that the paper prints."""
+
+    def judge(self, interval: Interval | None) -> str:
+        """Return what the 95 % interval of the ratio says of the claim."""
+        if interval is None or not all(math.isfinite(end) for end in interval):
+            return "cannot be told"
+        low, high = interval
+        if low <= 1.0 <= high:
+            return "not seen here"
+        if (low > 1.0) != self.above:
+            return "the opposite here"
+        if self.printed is None or low <= self.printed <= high:
+            return "holds"
+        less = abs(math.log(self.printed)) > max(abs(math.log(max(low, 1e-9))), abs(math.log(high)))
+        return f"holds, but {'less' if less else 'more'}: {self.printed:g} in the paper"
+
+
+def speed_behind(columns: StartColumns) -> FloatArray:
+    """Return the mean speed of the vehicles that start behind the ego [m/s], NaN where there is none, shape (n,)."""
+    behind = columns["s"][:, 1:] < columns["s"][:, :1]
+    count = behind.sum(axis=1)
+    total = np.where(behind, columns["speed"][:, 1:], 0.0).sum(axis=1)
+    return np.asarray(np.where(count > 0, total / np.maximum(count, 1), np.nan))
+
+
+def distance_beside(columns: StartColumns) -> FloatArray:
+    """Return the mean distance along the road to the vehicles in the lanes beside [m], shape (n,)."""
+    along = np.abs(columns["s"][:, 1:] - columns["s"][:, :1])
+    return np.asarray(along[:, [j - 1 for j in NEXT_LANES]].mean(axis=1))
+
+
+def is_boxed_in(columns: StartColumns) -> FloatArray:
+    """Return 1 where both vehicles in the lanes beside start within `BESIDE` of the ego, else 0, shape (n,)."""
+    along = np.abs(columns["s"][:, 1:] - columns["s"][:, :1])[:, [j - 1 for j in NEXT_LANES]]
+    return np.asarray((along <= BESIDE).all(axis=1), dtype=np.float64)
+
+
+def spread_of_starts(columns: StartColumns, base: StartColumns) -> FloatArray:
+    """Return the squared distance of the starts from their own mean, in variances of a base sample, shape (n,).
+
+    Its mean is the ratio of variances to those of the base, averaged over all 24 variables.
+
+    Args:
+        columns: Of runs.
+        base: Of ordinary ones, whose variances are the units.
+    """
+    parts = [
+        (columns[name] - columns[name].mean(axis=0)) ** 2 / base[name].var(axis=0, ddof=1) * _unbias(columns[name])
+        for name in STARTS
+    ]
+    return np.asarray(np.concatenate(parts, axis=1).mean(axis=1))
+
+
+def _unbias(values: FloatArray) -> float:
+    return len(values) / max(len(values) - 1, 1)
+
+
+def compare_means(
+    claim: PaperClaim, quantity: str, failing: FloatArray, ordinary: FloatArray, groups: str = "failing / ordinary"
+) -> TestedClaim:
+    """Test a claim on the ratio of two means, a value of each run: Welch's t, and a bootstrap interval of the ratio.
+
+    Args:
+        claim: What the paper says.
+        quantity: What the values are, in words.
+        failing: Values of failing runs, shape (n,); NaN ones are left out.
+        ordinary: Values of ordinary runs, shape (m,).
+        groups: What the two are.
+
+    Example:
+        >>> rng = np.random.default_rng(0)
+        >>> claim = PaperClaim("they are faster", above=True, printed=1.2)
+        >>> found = compare_means(claim, "speed [m/s]", rng.normal(12, 1, 200), rng.normal(10, 1, 200))
+        >>> round(found.value, 1), found.verdict
+        (1.2, 'holds')
+    """
+    failing, ordinary = failing[~np.isnan(failing)], ordinary[~np.isnan(ordinary)]
+    sizes = f"{len(failing):,} and {len(ordinary):,} runs"
+    if min(len(failing), len(ordinary)) > 1 and not ordinary.any():
+        return _compare_shares(claim, f"{quantity}, {groups}", failing, ordinary)
+    if len(failing) < 2 or len(ordinary) < 2 or ordinary.mean() == 0.0:
+        known = [f"{values.mean():.3g}" if len(values) else "none" for values in (failing, ordinary)]
+        return TestedClaim(
+            claim=claim.text,
+            statistic=f"{quantity}, {groups}: {' and '.join(known)}, {sizes}",
+            value=None,
+            interval=None,
+            verdict="cannot be told",
+        )
+    interval = bootstrap_ratio(failing, ordinary)
+    # equal values in both groups have no spread, and no statistic
+    if failing.std() == 0.0 and ordinary.std() == 0.0:
+        test = "no spread"
+    else:
+        found = stats.ttest_ind(failing, ordinary, equal_var=False)
+        test = f"Welch's t = {float(found.statistic):.1f}, p = {max(float(found.pvalue), LEAST_P):.1g}"
+    means = f"{failing.mean():.3g} / {ordinary.mean():.3g}"
+    return TestedClaim(
+        claim=claim.text,
+        statistic=f"{quantity}, {groups}: {means}; {test}; {sizes}",
+        value=float(failing.mean() / ordinary.mean()),
+        interval=interval,
+        verdict=claim.judge(interval),
+    )
+
+
+def _compare_shares(claim: PaperClaim, quantity: str, failing: FloatArray, ordinary: FloatArray) -> TestedClaim:
+    """Test a claim by the shares of runs that have any of it, where no ordinary run has: there is no ratio of means."""
+    counts = [(int(np.count_nonzero(values)), len(values)) for values in (failing, ordinary)]
+    low, high = difference_interval(*counts)
+    found = stats.fisher_exact(np.array([[k, n - k] for k, n in counts]))
+    shares = " and ".join(f"{k:,} of {n:,}" for k, n in counts)
+    seen = "holds" if (low > 0.0) == claim.above else "the opposite here"
+    return TestedClaim(
+        claim=claim.text,
+        statistic=f"{quantity}: difference of the shares of runs with any, {shares}; "
+        f"Fisher's exact test, p = {float(found.pvalue):.1g}",
+        value=counts[0][0] / counts[0][1] - counts[1][0] / counts[1][1],
+        interval=(low, high),
+        verdict="not seen here" if low <= 0.0 <= high else seen,
+    )
+
+
+def difference_interval(first: tuple[int, int], second: tuple[int, int]) -> Interval:
+    """Return the 95 % interval of a difference of two shares (Newcombe 1998, method 10).
+
+    Args:
+        first: Events, and runs.
+        second: Those that are taken off.
+
+    Example:
+        >>> low, high = difference_interval((56, 70), (48, 80))  # the example of the paper
+        >>> round(low, 4), round(high, 4)
+        (0.0524, 0.3339)
+    """
+    (p, low, high), (q, least, most) = (_wilson_interval(k, n) for k, n in (first, second))
+    return p - q - math.hypot(p - low, most - q), p - q + math.hypot(high - p, q - least)
+
+
+def _wilson_interval(k: int, n: int) -> tuple[float, float, float]:
+    """Return a share and the ends of its 95 % interval."""
+    ends = stats.binomtest(k, n).proportion_ci(0.95, method="wilson")
+    return k / n, float(ends.low), float(ends.high)
+
+
+def bootstrap_ratio(failing: FloatArray, ordinary: FloatArray) -> Interval:
+    """Return the 95 % percentile interval of the ratio of two means; the same bits every time."""
+    rng = np.random.default_rng(0)
+    means = [
+        np.array([values[rng.integers(0, len(values), len(values))].mean() for _ in range(RESAMPLES)])
+        for values in (failing, ordinary)
+    ]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ratios = means[0] / means[1]
+    low, high = np.nanpercentile(ratios, [2.5, 97.5])
+    return float(low), float(high)
+
+
+BOXED_IN = PaperClaim("vehicles box in the ego", above=True)
+NEARER_NEIGHBOURS = PaperClaim("vehicles box in the ego: neighbours are nearer", above=False)
+FASTER_BEHIND = PaperClaim("vehicles behind the ego are 20 % faster", above=True, printed=1.2)
+LESS_VARIANCE = PaperClaim("variances of the initial conditions are 50 % smaller", above=False, printed=0.5)
+_OF_STARTS: tuple[tuple[PaperClaim, str, Callable[[StartColumns], FloatArray]], ...] = (
+    (BOXED_IN, f"share of starts with a vehicle within {BESIDE:g} m in both lanes beside", is_boxed_in),
+    (NEARER_NEIGHBOURS, "distance to the vehicles in the lanes beside at the start [m]", distance_beside),
+    (FASTER_BEHIND, "initial speed of the vehicles that start behind [m/s]", speed_behind),
+)
+
+
+def compare_starts(failing: StartColumns, ordinary: StartColumns, groups: str) -> list[TestedClaim]:
+    """Test what the paper says of initial conditions.
+
+    Args:
+        failing: Parameters of failing runs, or of draws from the sampler that was found.
+        ordinary: Of ordinary runs.
+        groups: What the two are, "failing / ordinary".
+    """
+    found = [compare_means(claim, words, value(failing), value(ordinary), groups) for claim, words, value in _OF_STARTS]
+    spreads = [spread_of_starts(columns, ordinary) for columns in (failing, ordinary)]
+    words = "variance of the 24 initial values, mean over them, in units of the base's"
+    return [*found, compare_means(LESS_VARIANCE, words, spreads[0], spreads[1], groups)]

@@ -1,0 +1,204 @@
+"""Replications: one run of a method on a system in a scenario, with every simulation counted."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from functools import cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks.papers.tian2024.catalogue import (
+    EPISODE_SECONDS,
+    METHOD_ROWS,
+    SCENARIO_ROWS,
+    SYSTEMS,
+    TRAFFIC_BASE,
+)
+from rare_envs.problem import DrivingProblem
+from samplers.benchmark.runs import SeededEstimate, use_one_core
+from samplers.estimation import estimate
+from samplers.method import whole_simulations
+from samplers.methods.two_stage.method import TwoStage
+from samplers.result import Estimate
+
+MOST_TRACE_POINTS = 60
+"""Of a run's estimate on its way."""
+SHOWN_POINTS = 150
+"""Points of a level that Figure 7 shows."""
+FIGURE7_METHOD = "SS"
+
+
+@dataclass(frozen=True)
+class ReplicationJob:
+    """A replication that is to be made; the name of each part is one of the catalogue.
+
+    Example:
+        >>> run = run_replication(ReplicationJob("car-following", "IDM", "ADSS", seed=0))
+        >>> run.simulated == run.n_sim, run.final <= run.n_sim
+        (True, True)
+    """
+
+    scenario: str
+    system: str
+    method: str
+    seed: int
+    points: bool = False
+    """Whether points of the levels are kept, for Figure 7."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReplicationRun(SeededEstimate):
+    """What came of it."""
+
+    scenario: str
+    system: str
+    n_sim: int
+    """Simulations that the method states."""
+    simulated: int
+    """All simulations that were made, counted outside the method."""
+    final: int
+    """Those behind the estimate: without the search of importance sampling and cross-entropy."""
+    levels: int
+    """Levels, iterations or batches."""
+    warnings: tuple[str, ...]
+    trace: tuple[tuple[int, float, float], ...]
+    """Simulations so far, estimate and threshold on the way."""
+    level_means: tuple[tuple[float, ...], ...] = ()
+    """Subset simulation: means of the parameters among the points of each level that are in its subset."""
+    level_points: tuple[tuple[tuple[float, ...], ...], ...] = ()
+    """Subset simulation: some of these points, in the order of the scenario's parameters."""
+
+    def to_line(self) -> dict[str, Any]:
+        """Return the run as a line of a file has it."""
+        return asdict(self)
+
+    @classmethod
+    def from_line(cls, content: dict[str, Any]) -> ReplicationRun:
+        """Return the run of a line."""
+        trace = tuple((int(n), float(p), float(level)) for n, p, level in content["trace"])
+        nested = {name: _as_tuples(content[name]) for name in ("level_means", "level_points")}
+        return cls(**{**content, **nested, "trace": trace, "warnings": tuple(content["warnings"])})
+
+    @property
+    def key(self) -> tuple[str, str, str, int]:
+        """What tells runs apart."""
+        return self.scenario, self.system, self.method, self.seed
+
+
+class CountedSimulations:
+    """A problem that counts what it simulates, whatever the method says."""
+
+    def __init__(self, problem: Any) -> None:
+        self.problem = problem
+        self.simulated = 0
+        """Rollouts so far, and those that gradients took as long as."""
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.problem, name)
+
+    def evaluate(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return f of scenarios x (n, d), shape (n,)."""
+        self.simulated += len(x)
+        f: NDArray[np.float64] = self.problem.evaluate(x)
+        return f
+
+    def terms(self, x: NDArray[Any], gamma: float = 0.0) -> Any:
+        """Return the terms of scenarios x (n, d)."""
+        self.simulated += len(x)
+        return self.problem.terms(x, gamma)
+
+    def gradient(self, x: NDArray[Any], term: NDArray[Any], ticks: NDArray[Any], gamma: float = 0.0) -> Any:
+        """Return the gradients of one term of each of the scenarios x (n, d)."""
+        gradients = self.problem.gradient(x, term, ticks, gamma)
+        self.simulated += whole_simulations(gradients.cost)
+        return gradients
+
+
+@cache
+def driving_problem(scenario: str, system: str) -> DrivingProblem:
+    """Return the problem of a scenario and a system under test; gamma = 0 is a collision."""
+    return DrivingProblem(
+        SCENARIO_ROWS[scenario].env_id, ego=SYSTEMS[system], base=TRAFFIC_BASE, horizon=EPISODE_SECONDS
+    )
+
+
+def run_replication(job: ReplicationJob) -> ReplicationRun:
+    """Make one replication."""
+    row = METHOD_ROWS[job.method]
+    problem = CountedSimulations(driving_problem(job.scenario, job.system))
+    with use_one_core():
+        result = estimate(
+            problem,
+            row.find_method(job.system),
+            seed=job.seed,
+            max_sim=row.max_sim,
+            target_cov=row.target_cov,
+            keep_points=job.points,
+            ensemble_run=False,
+        )
+    means, points = _subsets(result, len(problem.problem.world.scenario.parameters)) if job.points else ((), ())
+    return ReplicationRun(
+        scenario=job.scenario,
+        system=job.system,
+        method=job.method,
+        seed=job.seed,
+        p=result.p,
+        low=result.interval[0],
+        high=result.interval[1],
+        cov=result.cov,
+        n_sim=result.n_sim,
+        simulated=problem.simulated,
+        final=_count_final(result),
+        levels=len(result.trace),
+        warnings=result.warnings,
+        trace=_thin_trace(result),
+        level_means=means,
+        level_points=points,
+    )
+
+
+def _count_final(result: Estimate) -> int:
+    """Return the draws that have a weight in p; all simulations where the points of chains stand for each other."""
+    weighted = result.simulations.weights if result.simulations is not None else ()
+    if not weighted and isinstance(result.method, TwoStage) and result.sample is not None:
+        return result.sample.n_units  # the search by terms weights points of its own
+    return sum(len(part.log_weights) for part in weighted) or result.n_sim
+
+
+def _thin_trace(result: Estimate) -> tuple[tuple[int, float, float], ...]:
+    """Return simulations so far, estimate and threshold after some levels, the last included."""
+    spent = np.cumsum([level.n_sim for level in result.trace])
+    step = max(1, -(-len(spent) // MOST_TRACE_POINTS))
+    chosen = sorted({*range(0, len(spent), step), len(spent) - 1}) if len(spent) else []
+    return tuple((int(spent[k]), result.trace[k].estimate, result.trace[k].gamma) for k in chosen)
+
+
+Levels = tuple[tuple[float, ...], ...]
+
+
+def _subsets(result: Estimate, dim: int) -> tuple[Levels, tuple[Levels, ...]]:
+    """Return, of the points that each level of subset simulation found in its subset, the means and some of them.
+
+    Args:
+        result: With all its points.
+        dim: Parameters that are not noise, the first of x.
+    """
+    assert result.points is not None
+    assert result.simulations is not None
+    x, f = result.points.x[:, :dim], result.points.f
+    stage = result.simulations.describe(0, result.n_sim).stage
+    bounds = [np.inf, *(level.gamma for level in result.trace[:-1])]
+    subsets = [x[(stage == level) & (f <= bound)] for level, bound in enumerate(bounds)]
+    means = tuple(tuple(float(value) for value in subset.mean(axis=0)) for subset in subsets if len(subset))
+    points = tuple(_round_rows(subset[:SHOWN_POINTS]) for subset in subsets)
+    return means, points
+
+
+def _round_rows(x: NDArray[np.float64]) -> Levels:
+    return tuple(tuple(round(float(value), 3) for value in row) for row in x)
+
+
+def _as_tuples(value: Any) -> Any:
+    return tuple(_as_tuples(each) for each in value) if isinstance(value, list | tuple) else value

@@ -1,1 +1,0 @@
-"""Tables and figures of published papers, made anew and set beside those that were printed."""

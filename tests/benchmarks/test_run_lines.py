@@ -1,0 +1,87 @@
+"""Lines of runs: made once, made again where a stop has cut them off, refused where they do not belong."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import pytest
+
+from benchmarks.run_lines import RunLines
+from rare_envs.study.errors import BadInput
+
+HEADER = {"rare_envs": "1", "scale": "small"}
+
+
+def lines_of(folder: Path, **changes) -> RunLines:
+    return RunLines(
+        folder / "runs.jsonl", {**HEADER, **changes}, dict, dict, key_of_job=str, key_of_run=lambda run: run["key"]
+    )
+
+
+class Maker:
+    """Makes runs and remembers for which jobs."""
+
+    def __init__(self) -> None:
+        self.made: list[str] = []
+
+    def __call__(self, jobs):
+        for job in jobs:
+            self.made.append(job)
+            yield {"key": job, "value": 1.0 / float(job)}
+
+
+def test_only_missing_runs_are_made_and_all_come_in_their_order(tmp_path: Path) -> None:
+    maker = Maker()
+    lines_of(tmp_path).complete(["3", "1"], maker)
+    runs = lines_of(tmp_path).complete(["1", "2", "3"], maker)
+    assert [run["key"] for run in runs] == ["1", "2", "3"]
+    assert maker.made == ["3", "1", "2"]
+
+
+def test_a_torn_line_is_made_again(tmp_path: Path) -> None:
+    maker = Maker()
+    whole = lines_of(tmp_path).complete(["1", "2"], maker)
+    file = tmp_path / "runs.jsonl"
+    text = file.read_text()
+    file.write_text(text[:-5])
+    assert lines_of(tmp_path).complete(["1", "2"], maker) == whole
+    assert maker.made == ["1", "2", "2"]
+    assert file.read_text() == text
+
+
+def test_a_stop_keeps_what_was_made(tmp_path: Path) -> None:
+    def stop(jobs):
+        yield from Maker()(jobs[:1])
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        lines_of(tmp_path).complete(["1", "2"], stop)
+    maker = Maker()
+    lines_of(tmp_path).complete(["1", "2"], maker, progress=True)
+    assert maker.made == ["2"]
+
+
+def test_numbers_that_json_has_not_come_back(tmp_path: Path) -> None:
+    values = {"a": math.nan, "b": math.inf, "c": -math.inf, "d": 0.1}
+    lines = lines_of(tmp_path)
+    lines.complete(["1"], lambda jobs: [{"key": "1", **values}])
+    (run,) = lines.read()
+    assert math.isnan(run["a"])
+    assert (run["b"], run["c"], run["d"]) == (math.inf, -math.inf, 0.1)
+
+
+def test_runs_of_something_else_are_refused(tmp_path: Path) -> None:
+    lines_of(tmp_path).complete(["1"], Maker())
+    with pytest.raises(BadInput, match="has runs of scale small, this is full: choose another --out"):
+        lines_of(tmp_path, scale="full").complete(["1"], Maker())
+
+
+@pytest.mark.parametrize(
+    ("text", "said"), [("x\n", "line 1"), ("{}\n", "line 1"), ("[]\n", "line 1"), ('{"rare_envs": "1"}\n', "line 1")]
+)
+def test_a_damaged_file_is_refused_in_one_line(tmp_path: Path, text: str, said: str) -> None:
+    (tmp_path / "runs.jsonl").write_text(text)
+    with pytest.raises(BadInput, match=said) as caught:
+        lines_of(tmp_path).read()
+    assert "\n" not in str(caught.value)
