@@ -85,7 +85,7 @@ def format_scales(records: Mapping[str, Mapping[str, Any]]) -> str:
         f"{lidar:,.0f}. That is {hours[0]:.1f} core hours for the small scale and {hours[1]:.0f} for the full one; "
         "`python -m benchmarks.papers okelly2018 --ego vision --scale full --workers 64` is for a large machine. "
         "With this ego failures are so rare that the small scale's naive p rests on one event at most, so that it does "
-        "not say whether cross-entropy gains what the paper's Table 2 and Figure 3 show; its draws fail by the hundred, "
+        "not say whether cross-entropy gains what Table 2 and Figure 3 of the paper show; its draws fail often, "
         "with weights that add up to next to nothing, as with the lidar ego."
     )
     return SCALES_HEAD + "\n".join(rows) + f"\n\n{text}\n"
