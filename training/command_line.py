@@ -75,7 +75,6 @@ class EventOptions(RecordingOptions):
 class AlgorithmOption(str, Enum):
     """Algorithms that train drivers of the traffic, as an option."""
 
-    BC = "bc"
     GAIL = "gail"
     MGAIL = "mgail"
 

@@ -1,11 +1,10 @@
 """How human are the drivers? All vehicles of held-out scenes driven by each, compared with the people in them.
 
-    python -m benchmarks.driving.realism DATA [DRIVER ...] --out FOLDER
+    python -m benchmarks.driving.realism DATA [DRIVER ...] [--json FILE]
 
-DATA is the folder with the tables of US 101; drivers are files or the names of shipped ones. Writes
-`benchmarks/results/imitation.json`, and `imitation.md` (tables) and figures into FOLDER. Beside the drivers stand the
-record itself, constant velocity and IDM with lane keeping; of a driver that has a distribution of its weights, policies
-drawn from it and policies moved within a search box too.
+DATA is the folder with the tables of US 101; drivers are files or the names of shipped ones. Prints a table and writes
+`benchmarks/results/imitation.json`. Beside the drivers stand the record itself, constant velocity and IDM with lane
+keeping; of a driver that has a distribution of its weights, policies drawn from it too.
 
 Each driver is measured with several sequences of noise; standard errors are by bootstrap over the test scenes, which
 share vehicles, so they are rather too small. Divergences are from the people in the test scenes; those of the record
@@ -17,10 +16,11 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
+import numpy as np
 import torch
 import typer
 from torch import Tensor
@@ -29,25 +29,24 @@ from agents import LearnedDriver, load_driver, read_driver
 from agents.learned.networks import ACTION_SIZE
 from agents.learned.rule_driver import RuleDriver
 from benchmarks import RESULTS
-from benchmarks.driving.realism_figures import format_tables, write_figures
-from benchmarks.driving.realism_rows import (
-    Effort,
-    Judge,
-    measure_boxes,
-    measure_drawn,
-    measure_errors,
-    measure_on_highway,
-    measure_people,
-    noisy_drivers,
-)
 from rare_envs.threads import use_one_thread
 from samplers.benchmark.runs import about
-from training.imitation.algorithms.expert_pairs import collect_pairs
 from training.imitation.datasets import Source, load_scenes
-from training.imitation.evaluation.behaviour import Act
-from training.imitation.evaluation.driving_statistics import BINS
-from training.imitation.evaluation.realism import record_statistics
+from training.imitation.evaluation.behaviour import Act, sampling_driver
+from training.imitation.evaluation.driving_statistics import BINS, DrivingStatistics, add_statistics
+from training.imitation.evaluation.realism import (
+    bootstrap_errors,
+    collect_statistics,
+    record_statistics,
+    summarise_realism,
+)
 from training.imitation.traffic.recording import Recording, stack_scenes
+
+SECONDS = (10.0, 20.0)
+"""Times for which scenes are driven [s]."""
+RATES = ("collision", "ever", "off_road", "hard_brake", "lane_changes")
+ERRORS = ("position", "speed", "lateral")
+Row = dict[str, Any]
 
 
 def constant_velocity(features: Tensor, memory: Tensor | None) -> tuple[Tensor, Tensor | None]:
@@ -60,48 +59,97 @@ def rule_driver(features: Tensor, memory: Tensor | None) -> tuple[Tensor, Tensor
     return RuleDriver().act(features, None, None, memory)
 
 
+@dataclass(frozen=True)
+class Judge:
+    """Comparison of drivers with people."""
+
+    test: Recording
+    recorded: DrivingStatistics
+    """Statistics of the people in the test scenes."""
+
+    def row(self, name: str, kind: str, acts: Sequence[Act]) -> Row:
+        """Return the realism of a driver; of `acts` there is one for each sequence of noise, or for each policy."""
+        runs = [collect_statistics(self.test, act, SECONDS) for act in acts]
+        return {"name": name, "kind": kind, **self.figures({time: [run[time] for run in runs] for time in SECONDS})}
+
+    def figures(self, runs: dict[float, list[DrivingStatistics]]) -> Row:
+        """Return values and standard errors of several runs together, and the collision rate of each."""
+        out: Row = {}
+        for seconds, parts in runs.items():
+            whole = add_statistics(parts)
+            out[f"{seconds:g} s"] = {
+                **asdict(summarise_realism(whole, self.recorded)),
+                "standard_error": asdict(bootstrap_errors(whole, self.recorded, np.random.default_rng(0))),
+                "collisions": [summarise_realism(part, self.recorded).collision for part in parts],
+            }
+        return out
+
+
+def noisy_drivers(driver: LearnedDriver, number: int, weights: Tensor | None = None) -> list[Act]:
+    """Return a driver with several sequences of noise."""
+    return [sampling_driver(driver, torch.Generator().manual_seed(seed), weights) for seed in range(number)]
+
+
+def measure_people(train: Recording, judge: Judge) -> Row:
+    """Return the record's own rates, and divergences between its training and its test scenes."""
+    learned = summarise_realism(record_statistics(train), judge.recorded)
+    row = {"name": "people", "kind": "reference", **judge.figures({time: [judge.recorded] for time in SECONDS})}
+    for seconds in SECONDS:
+        row[f"{seconds:g} s"]["divergence"] = learned.divergence
+        row[f"{seconds:g} s"]["hard_brake_in_training_scenes"] = learned.hard_brake
+    return row
+
+
+def measure_drawn(name: str, driver: LearnedDriver, judge: Judge, draws: int) -> Row:
+    """Return the realism of policies drawn from the distribution of a driver's weights, one sequence of noise each."""
+    assert driver.weights is not None
+    weights = torch.from_numpy(driver.weights.sample(draws, np.random.default_rng(0))).float()
+    acts = [noisy_drivers(driver, 1, row)[0] for row in weights]
+    return judge.row(f"{name}, drawn from its distribution", "distribution", acts)
+
+
 def measure_all(
     train: Recording,
     test: Recording,
     drivers: dict[str, LearnedDriver],
-    effort: Effort,
+    noises: int,
+    draws: int,
     say: Callable[[str], None] = lambda text: None,
-    weights: bool = True,
-) -> dict[str, Any]:
-    """Return everything that is measured, ready for JSON.
+) -> list[Row]:
+    """Return all rows, ready for JSON.
 
     Args:
         train: Scenes that the drivers learned from.
         test: Scenes that they did not.
         drivers: Drivers by name.
-        effort: Amount of simulation.
+        noises: Sequences of noise of each driver.
+        draws: Policies drawn from each distribution of weights.
         say: Function that is called with the name of each measurement.
-        weights: Whether policies with drawn and moved weights are measured too.
     """
-    judge = Judge(test, record_statistics(test), effort)
-    features = collect_pairs(test).features
-    rules: dict[str, Act] = {"constant velocity": constant_velocity, "IDM, lane keeping": rule_driver}
+    judge = Judge(test, record_statistics(test))
     rows = [measure_people(train, judge)]
-    errors, highways = {}, []
-    for name, act in rules.items():
+    for name, act in {"constant velocity": constant_velocity, "IDM, lane keeping": rule_driver}.items():
         say(name)
         rows.append(judge.row(name, "reference", [act]))
-        errors[name] = measure_errors(test, act, effort, rollouts=1)
-        highways.append(measure_on_highway(name, act, judge))
     for name, driver in drivers.items():
         say(name)
-        rows.append(judge.row(name, "driver", noisy_drivers(driver, effort.noises)))
-        errors[name] = measure_errors(test, noisy_drivers(driver, 1)[0], effort)
-        highways.append(measure_on_highway(name, noisy_drivers(driver, 1)[0], judge))
-        if weights and driver.weights is not None:
-            say(f"{name}, weights drawn and moved")
-            rows += [measure_drawn(name, driver, judge), *measure_boxes(name, driver, features, judge)]
-    return {
-        "realism": rows,
-        "replayed": errors,
-        "highway": highways,
-        "bins": {name: list(bins) for name, bins in BINS.items()},
-    }
+        rows.append(judge.row(name, "driver", noisy_drivers(driver, noises)))
+        if driver.weights is not None:
+            rows.append(measure_drawn(name, driver, judge, draws))
+    return rows
+
+
+def format_table(rows: Sequence[Row], seconds: str) -> str:
+    """Return the rows over one time, such as "10 s", as a table in Markdown; standard errors in brackets."""
+    head = ["driver", *RATES, "speed", *(f"JS {name}" for name in BINS), f"RMSE 5 s: {', '.join(ERRORS)}"]
+    lines = [head, ["---"] * len(head)]
+    for row in rows:
+        one = row[seconds]
+        rates = [f"{one[name]:.4f} ({one['standard_error'][name]:.4f})" for name in RATES]
+        apart = [f"{one['divergence'][name]:.3f}" for name in BINS]
+        errors = "/".join(f"{one['rmse'][name]:.2f}" for name in ERRORS) if one["rmse"] else ""
+        lines.append([row["name"], *rates, f"{one['mean_speed']:.1f}", *apart, errors])
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
 def load_named(words: Sequence[str]) -> dict[str, LearnedDriver]:
@@ -116,40 +164,6 @@ def load_named(words: Sequence[str]) -> dict[str, LearnedDriver]:
     return out
 
 
-@use_one_thread()
-def main(
-    data: Annotated[Path, typer.Argument(help="Folder with the compact tables of US 101.")],
-    drivers: Annotated[
-        list[str] | None, typer.Argument(help="Files or shipped names; mgail, gail and bc if none.")
-    ] = None,
-    out: Annotated[Path, typer.Option(help="Folder for tables and figures.")] = Path("imitation"),
-    result: Annotated[Path, typer.Option("--json", help="File for the result.")] = RESULTS / "imitation.json",
-    noises: Annotated[int, typer.Option(help="Sequences of noise of each driver.")] = Effort.noises,
-    draws: Annotated[int, typer.Option(help="Policies drawn from distributions and boxes.")] = Effort.draws,
-    rollouts: Annotated[int, typer.Option(help="Of each segment among recorded others.")] = Effort.rollouts,
-    weights: Annotated[bool, typer.Option(help="Measure drawn and moved weights too.")] = True,
-) -> None:
-    """Measure how human drivers are, and draw it."""
-    begun = time.perf_counter()
-    effort = replace(Effort(), noises=noises, draws=draws, rollouts=rollouts)
-    train, test = (stack_scenes(scenes) for scenes in load_scenes(Source("data", data)))
-    chosen = load_named(drivers or ["mgail", "gail", "bc"])
-    found = measure_all(
-        train,
-        test,
-        chosen,
-        effort,
-        lambda text: print(f"{time.perf_counter() - begun:5.0f} s  {text}", flush=True),
-        weights,
-    )
-    found["about"] = about(torch=torch.__version__, **asdict(effort), seconds=round(time.perf_counter() - begun))
-    out.mkdir(parents=True, exist_ok=True)
-    result.write_text(json.dumps(round_numbers(found), indent=1) + "\n", encoding="utf-8")
-    (out / "imitation.md").write_text(format_tables(found), encoding="utf-8")
-    write_figures(found, out)
-    print(format_tables(found))
-
-
 def round_numbers(value: Any) -> Any:
     """Return numbers with five significant digits."""
     if isinstance(value, dict):
@@ -157,6 +171,29 @@ def round_numbers(value: Any) -> Any:
     if isinstance(value, list):
         return [round_numbers(part) for part in value]
     return float(f"{value:.5g}") if isinstance(value, float) else value
+
+
+@use_one_thread()
+def main(
+    data: Annotated[Path, typer.Argument(help="Folder with the compact tables of US 101.")],
+    drivers: Annotated[list[str] | None, typer.Argument(help="Files or shipped names; gail and mgail if none.")] = None,
+    result: Annotated[Path, typer.Option("--json", help="File for the result.")] = RESULTS / "imitation.json",
+    noises: Annotated[int, typer.Option(help="Sequences of noise of each driver.")] = 3,
+    draws: Annotated[int, typer.Option(help="Policies drawn from each distribution.")] = 6,
+) -> None:
+    """Measure how human drivers are."""
+    begun = time.perf_counter()
+    train, test = (stack_scenes(scenes) for scenes in load_scenes(Source("data", data)))
+
+    def say(text: str) -> None:
+        print(f"{time.perf_counter() - begun:5.0f} s  {text}", flush=True)
+
+    rows = measure_all(train, test, load_named(drivers or ["gail", "mgail"]), noises, draws, say)
+    facts = about(torch=torch.__version__, noises=noises, draws=draws, seconds=round(time.perf_counter() - begun))
+    found = round_numbers({"realism": rows, "bins": {name: list(bins) for name, bins in BINS.items()}, "about": facts})
+    result.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
+    for seconds in SECONDS:
+        print(f"\n{seconds:g} s:\n\n{format_table(rows, f'{seconds:g} s')}")
 
 
 if __name__ == "__main__":

@@ -4,12 +4,10 @@
 
 DATA is the folder with the tables of US 101. Every 2 s of the seven test scenes, where 4 s or more of the record are
 left, all vehicles but the first of each lane are driven for up to 8 s, 32 times, and the record is scored under these
-rollouts (`training.imitation.evaluation.sim_agents_score`). Prints a table and writes
+rollouts (`benchmarks.driving.sim_agents`). Prints a table and writes
 `benchmarks/results/realism_score.json`.
 
-Two rows are people. *The record itself*, 32 copies, is the most that any driver can reach whose rollouts are all alike.
-*People resampled* gives every vehicle the motion of another recorded vehicle, one of the training scenes that began at
-nearly the same speed: people's motion, but nobody reacts to anybody.
+*The record itself*, 32 copies, is the most that any driver can reach whose rollouts are all alike.
 
 What differs from the challenge: a straight motorway of 100 to 300 m, vehicles only, smoothed positions, a history of
 one step, agents are scored until they leave the window, and steps of rollouts count only where the record has them.
@@ -33,8 +31,8 @@ from torch import Tensor
 
 from agents import LearnedDriver, load_driver
 from benchmarks import RESULTS
-from benchmarks.driving.people_resampled import DONORS, find_donors, resample_people
 from benchmarks.driving.realism import constant_velocity, round_numbers, rule_driver
+from benchmarks.driving.sim_agents import MOTORWAY, SCENE_ROLLOUTS, WOSAC_2024, motion_features, score_features
 from rare_envs.control.lane_changing import LaneChangingDriver
 from rare_envs.threads import use_one_thread
 from rare_envs.traffic.neighbours import LaneTraffic
@@ -42,14 +40,6 @@ from samplers.benchmark.runs import about
 from training.data.trajectories import DT
 from training.imitation.datasets import Source, load_scenes
 from training.imitation.evaluation.behaviour import Act, regular_starts, sampling_driver
-from training.imitation.evaluation.sim_agents_features import motion_features
-from training.imitation.evaluation.sim_agents_score import (
-    MOTORWAY,
-    SCENE_ROLLOUTS,
-    WOSAC_2023,
-    WOSAC_2024,
-    score_features,
-)
 from training.imitation.traffic.recording import Recording, stack_scenes
 from training.imitation.traffic.replayed_traffic import Traffic, lane_of, replay_features, start_replay, step_replay
 
@@ -59,8 +49,8 @@ LEAST_TICKS = 40
 """Ticks of record that a start needs."""
 BASELINE = "idm"
 """Row that the others are compared with, scene by scene."""
-LEARNED = ("bc", "gail", "mgail", "mgail2", "mgail3", "mgail4", "mgail5")
-SETTINGS = {"wosac_2024": WOSAC_2024, "wosac_2023": WOSAC_2023, "motorway": MOTORWAY}
+LEARNED = ("gail", "mgail")
+SETTINGS = {"wosac_2024": WOSAC_2024, "motorway": MOTORWAY}
 
 Decide = Callable[[Traffic, "Tensor | None"], tuple[Tensor, "Tensor | None"]]
 """Function from traffic and a memory, None at first, to actions of the driven vehicles (B, M, 2) and the new memory."""
@@ -183,7 +173,6 @@ def average_scenes(rows: list[dict[str, Any]]) -> dict[str, Any]:
 
 
 def measure_scores(
-    train: Recording,
     test: Recording,
     drivers: dict[str, LearnedDriver],
     seed: int = 0,
@@ -191,7 +180,7 @@ def measure_scores(
     say: Callable[[str], None] = lambda text: None,
 ) -> dict[str, dict[str, Any]]:
     """Return the averages of every row by its name; each start of each driver has noise of its own from the seed."""
-    starts, donors = list(find_starts(test)), find_donors(train, TICKS)
+    starts = list(find_starts(test))
 
     def generator(row: int, start: int) -> torch.Generator:
         return torch.Generator().manual_seed(1_000_000 * seed + 1_000 * row + start)
@@ -201,9 +190,6 @@ def measure_scores(
 
     rows: dict[str, Callable[[int, Start], Tensor]] = {
         "the record itself": lambda k, start: start.states[None],
-        "people resampled": lambda k, start: resample_people(
-            start.traffic, start.states, donors, rollouts, generator(0, k)
-        ),
         "constant velocity": alike(by_features(constant_velocity)),
         "idm": alike(by_features(rule_driver)),
         "idm+mobil": alike(by_lanes(LaneChangingDriver())),
@@ -253,17 +239,16 @@ def main(
 ) -> None:
     """Score drivers, print the table and write the result."""
     begun = time.process_time()
-    train, test = (stack_scenes(scenes) for scenes in load_scenes(Source("data", data)))
+    test = stack_scenes(load_scenes(Source("data", data))[1])
     drivers: dict[str, Any] = {name: load_driver(name) for name in names or LEARNED}
     found = measure_scores(
-        train,
         test,
         drivers,
         seed,
         rollouts,
         lambda name: print(f"{time.process_time() - begun:5.0f} s  {name}", flush=True),
     )
-    settings = {"seed": seed, "rollouts": rollouts, "ticks": TICKS, "donors": DONORS}
+    settings = {"seed": seed, "rollouts": rollouts, "ticks": TICKS}
     command = (
         f"python -m benchmarks.driving.realism_score DATA {' '.join(names or ())} --seed {seed} --rollouts {rollouts}"
     )

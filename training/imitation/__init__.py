@@ -1,4 +1,4 @@
-"""Imitation: drivers learned from recorded traffic by behaviour cloning, GAIL and MGAIL."""
+"""Imitation: drivers learned from recorded traffic by GAIL and MGAIL."""
 
 from training.imitation.algorithms.config import Config
 from training.imitation.datasets import Source, load_scenes

@@ -32,7 +32,6 @@ from rare_envs.files import replace_file
 from rare_envs.threads import use_one_thread
 from samplers.problem import FloatArray
 from training.command_line import report_errors, run_command
-from training.imitation.algorithms.behaviour_cloning import clone_epochs
 from training.imitation.algorithms.config import Config
 from training.imitation.algorithms.critic import Critic
 from training.imitation.algorithms.expert_pairs import Pairs
@@ -53,7 +52,7 @@ class Ensemble:
 
     members: int = 32
     updates: int = 60
-    """Number of updates of each member; one of a driver that was only cloned makes as many epochs as its base."""
+    """Number of updates of each member."""
     seed: int = 0
 
     def __post_init__(self) -> None:
@@ -101,14 +100,10 @@ def train_member(
     policy = copy.deepcopy(driver.policy)
     policy.head.requires_grad_(True)
     visited: list[Tensor] = []
-    if config.method == "bc":
-        for _ in clone_epochs(policy, pairs, config, generator):
-            visited.append(head_weights(policy).detach())
-    else:
-        learner = Learner(config, data.recording, drawn, pairs, policy, Critic(), generator)
-        learner.inherit(checkpoint)
-        for _ in run_updates(learner, UPDATE_RULES[config.method]):
-            visited.append(head_weights(policy).detach())
+    learner = Learner(config, data.recording, drawn, pairs, policy, Critic(), generator)
+    learner.inherit(checkpoint)
+    for _ in run_updates(learner, UPDATE_RULES[config.method]):
+        visited.append(head_weights(policy).detach())
     late = torch.stack(visited[len(visited) // 2 :]).double().numpy()
     return Member(late[-1], late.std(axis=0))
 

@@ -120,15 +120,11 @@ def train_learner(
     Example:
         >>> from training.data import scenes_of, synthetic_traffic
         >>> data = prepare_data(scenes_of(synthetic_traffic(), seconds=4.0))
-        >>> policy = train_learner(make_learner(data, Config(method="bc", epochs=1)))
+        >>> policy = train_learner(make_learner(data, Config(updates=1, epochs=1, scenes=2, warm_up=0)))
         >>> mean, log_std = policy(data.pairs.features)
         >>> mean.shape
         torch.Size([708, 2])
     """
-    if learner.config.method == "bc":
-        if out is not None:
-            learner.save(out / CHECKPOINT)
-        return learner.policy
     if out is not None and (out / CHECKPOINT).exists():
         learner.load(out / CHECKPOINT)
     with progress_bar(learner, progress) as show, tensorboard_logs(out if log else None, learner.update) as write:

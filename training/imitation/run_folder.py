@@ -89,10 +89,10 @@ def driver_of(policy: Policy, config: Config) -> LearnedDriver:
     Example:
         >>> from training.data import scenes_of, synthetic_traffic
         >>> data = prepare_data(scenes_of(synthetic_traffic(), seconds=4.0))
-        >>> config = Config(method="bc", epochs=1)
+        >>> config = Config(updates=1, epochs=1, scenes=2, warm_up=0)
         >>> driver = driver_of(train_learner(make_learner(data, config)), config)
         >>> driver.name, driver.acceleration
-        ('bc', (-8.0, 4.0))
+        ('mgail', (-8.0, 4.0))
     """
     frozen = policy.eval().requires_grad_(False)
     acceleration, yaw_rate = zip(ACTION_LOW, ACTION_HIGH, strict=True)
@@ -116,8 +116,6 @@ def _option(name: str, value: Any) -> list[str]:
         named = [word for word, colour in NOISES.items() if colour == value]
         return ["--noise", *named] if named else []
     flag = "--" + name.replace("_", "-")
-    if isinstance(value, bool):
-        return [flag] if value else [flag.replace("--", "--no-")]
     return [flag, *(str(part) for part in (value if isinstance(value, tuple) else (value,)))]
 
 

@@ -71,7 +71,6 @@ class ConfigOptions(DriverTrainingOptions):
     clone_rate: Number = DEFAULTS.clone_rate
     weight_decay: Number = DEFAULTS.weight_decay
     log_std_cap: Number = DEFAULTS.log_std_cap
-    lateral_weight: Count = DEFAULTS.lateral_weight
     pools: Count = DEFAULTS.pools
     scenes: Count = DEFAULTS.scenes
     horizon: TickRange = DEFAULTS.horizon
@@ -95,9 +94,6 @@ class ConfigOptions(DriverTrainingOptions):
     warm_up: Annotated[int, typer.Option(min=0, help="Rounds of the critic alone.")] = DEFAULTS.warm_up
     gradient_penalty: Number = DEFAULTS.gradient_penalty
     credit: Number = DEFAULTS.credit
-    learned_model: Annotated[bool, typer.Option(help="MGAIL: gradient of a learned model.")] = DEFAULTS.learned_model
-    model_rate: Number = DEFAULTS.model_rate
-    model_steps: Count = DEFAULTS.model_steps
     discount: Number = DEFAULTS.discount
     gae: Number = DEFAULTS.gae
     clip: Number = DEFAULTS.clip

@@ -35,7 +35,7 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
         "rare-envs train-ego rare_envs/CutIn-v0 --steps 200000 --out ppo.zip",
         "rare-envs train-ego rare_envs/CutIn-v0 --algo dqn --out dqn.zip",
     ),
-    "train-drivers": ("rare-envs train-drivers --highd path/to/highD/data --out runs/drivers --method bc",),
+    "train-drivers": ("rare-envs train-drivers --highd path/to/highD/data --out runs/drivers --method gail",),
     "check-ego": (
         "rare-envs check-ego ppo.zip rare_envs/CutIn-v0",
         "rare-envs check-ego tcp://127.0.0.1:5555 rare_envs/CutIn-v0",

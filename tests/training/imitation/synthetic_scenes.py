@@ -8,11 +8,8 @@ import torch
 from agents.learned.networks import Policy, Scaling
 from training.data.scenes import TrafficScene
 from training.imitation.algorithms.config import Config
-from training.imitation.traffic.recording import stack_scenes
 
 DT = 0.1
-CROSSING = 30
-"""Tick at which the vehicle of `crossing_recording` is in its new lane."""
 EDGES = (0.0, 3.6, 7.2, 10.8)
 TINY = Config(
     updates=6,
@@ -78,14 +75,3 @@ def plain_policy():
     with torch.random.fork_rng():
         torch.manual_seed(0)
         return Policy(scaling)
-
-
-def crossing_recording():
-    """In the second of two scenes the rear vehicle of the left lane moves to the right at 1 m/s from tick 12 to 48."""
-    made = stack_scenes(scenes(2))
-    y, heading = made.y.clone(), made.heading.clone()
-    tick = torch.arange(y.shape[1])
-    y[:, :, 0], heading[:, :, 0] = 1.8, 0.0
-    y[1, :, 0] = 3.601 + 0.1 * (tick.clamp(12, 48) - CROSSING)
-    heading[1, 12:48, 0] = 0.1 / (0.1 * made.speed[1, 12:48, 0])
-    return made._replace(y=y, heading=torch.asin(heading))

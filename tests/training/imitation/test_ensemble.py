@@ -37,7 +37,7 @@ def made_up():
         yield
 
 
-@pytest.fixture(scope="module", params=["bc", "gail", "mgail"])
+@pytest.fixture(scope="module", params=["gail", "mgail"])
 def run(request, made_up, tmp_path_factory):
     folder = tmp_path_factory.mktemp(request.param)
     train_driver(Source("data", folder), dataclasses.replace(BASE, method=request.param), folder)

@@ -62,13 +62,13 @@ def test_a_training_that_could_not_begin_does_not_block_its_folder(tmp_path):
     """A typo in the path of the data, and the same folder again with the right one."""
     out = tmp_path / "run"
     with pytest.raises(ValueError, match=r"no ngsim_us101_scenes\.parquet in the folder 'nope'"):
-        train_driver(Source("data", Path("nope")), Config(method="bc", epochs=1), out)
+        train_driver(Source("data", Path("nope")), tiny(updates=1), out)
     assert not out.exists()
     with pytest.raises(ValueError, match="Cannot read"):
-        train_driver(Source("ngsim", tmp_path / "nope.csv"), Config(method="bc", epochs=1), out)
+        train_driver(Source("ngsim", tmp_path / "nope.csv"), tiny(updates=1), out)
     write_ngsim(tmp_path / "mine.csv", simulate(seed=1))
     source = Source("ngsim", tmp_path / "mine.csv")
-    assert train_driver(source, Config(method="bc", epochs=1), out, measured=False).exists()
+    assert train_driver(source, tiny(updates=1), out, measured=False).exists()
 
 
 @pytest.mark.parametrize("name", ["ngsim", "highd"])

@@ -40,7 +40,7 @@ def test_a_command_repeats_its_training(device, made_up, monkeypatch, tmp_path):
     import typer
     from typer.testing import CliRunner
 
-    config = tiny(method="mgail", seed=4, learned_model=True, colour=WHITE_NOISE, clone_weight=(0.2, 0.1))
+    config = tiny(method="mgail", seed=4, colour=WHITE_NOISE, clone_weight=(0.2, 0.1))
     found = []
     monkeypatch.setattr(command_line, "train_driver", lambda *given, **how: found.append((*given, how)) or tmp_path)
     app = typer.Typer()
@@ -69,10 +69,10 @@ def test_the_command_line_says_what_is_missing(words, message, tmp_path):
 
 
 def test_the_shared_command_line_trains_drivers(made_up, tmp_path, capsys):
-    words = ["train-drivers", "--data", "tables", "--method", "bc", "--out", str(tmp_path / "run"), "--json"]
+    words = ["train-drivers", "--data", "tables", "--method", "gail", "--updates", "1", "--out", str(tmp_path / "run"), "--json"]
     assert rare_envs_command(words) == 0
     answer = json.loads(capsys.readouterr().out)
-    assert read_provenance(answer["driver"]).kind == answer["method"] == "bc"
+    assert read_provenance(answer["driver"]).kind == answer["method"] == "gail"
 
 
 @pytest.mark.parametrize("words", [["--data", "t", "--method", "sac"], ["--data", "nowhere"], []])

@@ -8,7 +8,7 @@ import torch
 from agents.learned.networks import Policy
 from training.imitation.algorithms.actions import log_likelihood, normalise_action
 from training.imitation.algorithms.config import Config
-from training.imitation.algorithms.expert_pairs import Pairs, emphasise_lateral, scaling_of
+from training.imitation.algorithms.expert_pairs import Pairs, scaling_of
 
 
 def clone_policy(pairs: Pairs, config: Config, generator: torch.Generator) -> Policy:
@@ -16,8 +16,7 @@ def clone_policy(pairs: Pairs, config: Config, generator: torch.Generator) -> Po
 
     Args:
         pairs: Recorded driving.
-        config: Settings, of which `epochs`, `batch`, `clone_rate`, `weight_decay`, `log_std_cap` and
-            `lateral_weight` are used.
+        config: Settings, of which `epochs`, `batch`, `clone_rate`, `weight_decay` and `log_std_cap` are used.
         generator: Source of the initial weights and of the order of the pairs.
     """
     policy = make_seeded(lambda: Policy(scaling_of(pairs), config.log_std_cap), generator).to(pairs.features.device)
@@ -34,7 +33,6 @@ def clone_epochs(policy: Policy, pairs: Pairs, config: Config, generator: torch.
     Yields:
         None after each epoch.
     """
-    pairs = emphasise_lateral(pairs, config.lateral_weight)
     optimiser = torch.optim.Adam(policy.parameters(), lr=config.clone_rate, weight_decay=config.weight_decay)
     action = normalise_action(policy, pairs.action)
     for _ in range(config.epochs):

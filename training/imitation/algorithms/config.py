@@ -7,7 +7,7 @@ from typing import Literal
 
 from agents.learned.coloured_noise import AutoregressiveNoise
 
-Algorithm = Literal["bc", "gail", "mgail"]
+Algorithm = Literal["gail", "mgail"]
 
 
 HUMAN_NOISE = AutoregressiveNoise.from_oscillators(frequency=(1.70, 1.57), damping=(0.845, 0.40))
@@ -17,8 +17,8 @@ HUMAN_NOISE = AutoregressiveNoise.from_oscillators(frequency=(1.70, 1.57), dampi
 _VALID_RANGES: tuple[tuple[tuple[str, ...], Callable[[float], bool], str], ...] = (
     (
         (
-            *("batch", "lateral_weight", "pools", "scenes", "horizon", "age", "drivers"),
-            *("critic_steps", "critic_batch", "memory", "model_steps", "ppo_epochs", "ppo_batch"),
+            *("updates", "batch", "pools", "scenes", "horizon", "age", "drivers"),
+            *("critic_steps", "critic_batch", "memory", "ppo_epochs", "ppo_batch"),
         ),
         lambda value: value >= 1,
         ">= 1",
@@ -38,7 +38,7 @@ _VALID_RANGES: tuple[tuple[tuple[str, ...], Callable[[float], bool], str], ...] 
         ">= 0",
     ),
     (
-        ("clone_weight", "clone_rate", "policy_rate", "critic_rate", "model_rate", "value_rate", "clip"),
+        ("clone_weight", "clone_rate", "policy_rate", "critic_rate", "value_rate", "clip"),
         lambda value: 0 < value < math.inf,
         "> 0",
     ),
@@ -66,17 +66,13 @@ class Config:
     updates: int = 1500
     """Number of updates of the policy after behaviour cloning."""
 
-    # behaviour cloning, which every method starts from
+    # behaviour cloning, from which both methods start
     epochs: int = 6
     batch: int = 512
     clone_rate: float = 1e-3
     weight_decay: float = 1e-4
     log_std_cap: float = 0.0
     """Upper bound of the logarithm of the standard deviation, see `agents.learned.networks.Policy`."""
-    lateral_weight: int = 1
-    """Number of times that recorded moments of fast lateral motion count in the likelihood, see
-    `training.imitation.algorithms.expert_pairs.emphasise_lateral`. With more than 1, drivers complete more of the lane
-    changes that are under way."""
 
     # rollouts
     pools: int = 5
@@ -126,10 +122,6 @@ class Config:
     # MGAIL
     credit: float = 0.97
     """Share of the gradient of the state that is passed on to the tick before."""
-    learned_model: bool = False
-    """Take the gradient through a learned forward model, as Baram et al. do, instead of the simulator."""
-    model_rate: float = 1e-3
-    model_steps: int = 10
 
     # GAIL, by proximal policy optimisation
     discount: float = 0.97
@@ -140,12 +132,8 @@ class Config:
     value_rate: float = 1e-3
 
     def __post_init__(self) -> None:
-        if self.method not in ("bc", "gail", "mgail"):
-            raise ValueError(f"Expected method 'bc', 'gail' or 'mgail', got {self.method!r}.")
-        if self.learned_model and self.method != "mgail":
-            raise ValueError(f"Expected method 'mgail' with learned_model, got {self.method!r}.")
-        if self.updates < 1:
-            raise ValueError(f"Expected updates >= 1, got {self.updates}; a driver that is only cloned is method 'bc'.")
+        if self.method not in ("gail", "mgail"):
+            raise ValueError(f"Expected method 'gail' or 'mgail', got {self.method!r}.")
         for names, holds, expected in _VALID_RANGES:
             for name in names:
                 value = getattr(self, name)  # a field by its name

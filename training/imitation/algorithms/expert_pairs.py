@@ -6,12 +6,8 @@ import torch
 from torch import Tensor
 
 from agents.learned.networks import Scaling
-from rare_envs.sensors.perception import HEADING_COLUMN, SPEED_COLUMN
 from training.imitation.traffic.recording import Recording
 from training.imitation.traffic.replayed_traffic import replay_features, start_replay
-
-FAST_LATERAL_SPEED = 0.4
-"""Lateral speed [m/s] above which a moment is repeated, see `emphasise_lateral`."""
 
 
 class Pairs(NamedTuple):
@@ -41,22 +37,6 @@ def collect_pairs(recording: Recording) -> Pairs:
         actions.append(action[driven])
         scenes.append(scene[:, None].expand_as(driven)[driven])
     return Pairs(torch.cat(features), torch.cat(actions), torch.cat(scenes))
-
-
-def emphasise_lateral(pairs: Pairs, times: int) -> Pairs:
-    """Return the pairs with those repeated in which a vehicle moves across its lane faster than `FAST_LATERAL_SPEED`.
-
-    They are one in twenty in the recordings of US 101, and most belong to lane changes.
-
-    Args:
-        pairs: Recorded driving.
-        times: Number of times that such a moment is in the result.
-    """
-    if times == 1:
-        return pairs
-    fast = (torch.sin(pairs.features[:, HEADING_COLUMN]) * pairs.features[:, SPEED_COLUMN]).abs() > FAST_LATERAL_SPEED
-    rows = torch.cat((torch.arange(len(fast), device=fast.device), fast.nonzero().flatten().repeat(times - 1)))
-    return Pairs(*(column[rows] for column in pairs))
 
 
 def scaling_of(pairs: Pairs) -> Scaling:

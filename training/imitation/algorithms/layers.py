@@ -1,4 +1,4 @@
-"""Layers of the networks that a training needs beside the policy: critic, value and forward model."""
+"""Layers of the networks that a training needs beside the policy: critic and value."""
 
 from collections.abc import Callable
 

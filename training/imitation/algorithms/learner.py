@@ -17,8 +17,7 @@ from training.imitation.algorithms.actions import log_likelihood, normalise_acti
 from training.imitation.algorithms.behaviour_cloning import make_seeded
 from training.imitation.algorithms.config import Config
 from training.imitation.algorithms.critic import Critic, critic_inputs, train_critic
-from training.imitation.algorithms.expert_pairs import Pairs, emphasise_lateral
-from training.imitation.algorithms.forward_model import ForwardModel, train_model
+from training.imitation.algorithms.expert_pairs import Pairs
 from training.imitation.algorithms.layers import two_hidden_layers
 from training.imitation.algorithms.rollout import RolloutSteps, roll_out
 from training.imitation.traffic.recording import Recording
@@ -58,19 +57,10 @@ class Learner:
         self.critic_optimiser = torch.optim.Adam(self.critic.parameters(), config.critic_rate, betas=CRITIC_BETAS)
         self.value = make_seeded(_make_value_network, self.generator).to(self.device)
         self.value_optimiser = torch.optim.Adam(self.value.parameters(), config.value_rate)
-        self.learned: tuple[str, ...] = _TRAINED_PARTS
-        self.model: ForwardModel | None = None
-        if config.learned_model:
-            self.model = make_seeded(ForwardModel, self.generator).to(self.device)
-            self.model_optimiser = torch.optim.Adam(self.model.parameters(), config.model_rate)
-            self.learned += ("model", "model_optimiser")
         self.pools: list[ScenePool] = []
         self.rollouts: deque[Tensor] = deque(maxlen=config.memory)
-        self.recorded = critic_inputs(
-            self.policy, self.pairs.features, normalise_action(self.policy, self.pairs.action)
-        )
-        followed = emphasise_lateral(self.pairs, config.lateral_weight)
-        self.clone_pairs = followed.features, normalise_action(self.policy, followed.action)
+        self.clone_pairs = self.pairs.features, normalise_action(self.policy, self.pairs.action)
+        self.recorded = critic_inputs(self.policy, *self.clone_pairs)
 
     @property
     def device(self) -> torch.device:
@@ -100,7 +90,7 @@ class Learner:
             self.pools[index] = self._new_pool()
         horizon = self.linear_schedule(config.horizon)
         steps, self.pools[index] = roll_out(
-            self.recording, self.policy, self.pools[index], horizon, config.colour, credit, self.generator, self.model
+            self.recording, self.policy, self.pools[index], horizon, config.colour, credit, self.generator
         )
         self.simulated += len(steps.features)
         return steps
@@ -132,23 +122,12 @@ class Learner:
             self.generator,
         )
 
-    def learn_model(self, steps: RolloutSteps) -> float:
-        """Train the forward model on the rollout, if there is one, and return its error."""
-        if self.model is None:
-            return 0.0
-        config, ticks = self.config, self.linear_schedule(self.config.horizon)
-        seen, done = (part.detach().view(ticks, -1, part.shape[1]) for part in (steps.features, steps.action))
-        return train_model(
-            self.model, self.model_optimiser, self.policy, seen, done, config.model_steps, config.batch, self.generator
-        )
-
     def warm_up(self) -> None:
-        """Train critic and forward model before the policy moves."""
+        """Train the critic before the policy moves."""
         for _ in range(self.config.warm_up):
             with torch.no_grad():
                 steps = self.drive(1.0)
             self.learn_critic(steps)
-            self.learn_model(steps)
 
     def clone_loss(self) -> Tensor:
         """Return the negative log likelihood of a batch of recorded actions."""
@@ -162,8 +141,8 @@ class Learner:
         state = {
             "update": self.update,
             "simulated": self.simulated,
-            # attributes that each algorithm names in `learned`
-            **{name: getattr(self, name).state_dict() for name in self.learned},
+            # attributes by name
+            **{name: getattr(self, name).state_dict() for name in _TRAINED_PARTS},
             "generator": self.generator.get_state(),
             "rollouts": list(self.rollouts),
             "pools": [{"traffic": pool.traffic._asdict(), "noise": pool.noise, "age": pool.age} for pool in self.pools],
@@ -193,9 +172,9 @@ class Learner:
             ValueError: The file is no checkpoint of such a training.
         """
         state: dict[str, Any] = torch.load(path, map_location=self.device, weights_only=True)
-        if not state.keys() >= {"update", "pools", *self.learned}:
+        if not state.keys() >= {"update", "pools", *_TRAINED_PARTS}:
             raise ValueError(f"Expected a checkpoint of a training in {str(path)!r}.")
-        for name in self.learned:
+        for name in _TRAINED_PARTS:
             getattr(self, name).load_state_dict(state[name])  # likewise
         return state
 

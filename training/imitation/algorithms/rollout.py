@@ -8,7 +8,6 @@ from torch import Tensor
 from agents.learned.coloured_noise import AutoregressiveNoise
 from agents.learned.networks import Policy
 from training.imitation.algorithms.actions import denormalise_action
-from training.imitation.algorithms.forward_model import ForwardModel
 from training.imitation.algorithms.penalties import Penalties, compute_penalties
 from training.imitation.traffic.recording import Recording
 from training.imitation.traffic.replayed_traffic import Traffic, detach_traffic, replay_features, step_replay
@@ -36,7 +35,6 @@ def roll_out(
     colour: AutoregressiveNoise,
     credit: float,
     generator: torch.Generator,
-    model: ForwardModel | None = None,
 ) -> tuple[RolloutSteps, ScenePool]:
     """Drive a pool for some ticks.
 
@@ -48,7 +46,6 @@ def roll_out(
         colour: Noise of the actions.
         credit: Share of the gradient of the state that each tick passes on to the tick before.
         generator: Source of the noise.
-        model: Forward model whose gradient replaces that of the simulator.
 
     Returns:
         The moments, differentiable in the policy's weights, and the pool afterwards, which is not.
@@ -58,21 +55,16 @@ def roll_out(
     driven = traffic.driven[:, :m]
     unused = traffic.x.new_zeros(*traffic.x.shape[:1], traffic.x.shape[1] - m, 2)
     rows = []
-    features: Tensor | None = None
-    action: Tensor | None = None
     for _ in range(ticks):
-        before, features = features, replay_features(traffic, m)
-        if model is not None and before is not None and action is not None:
-            features = model.substitute_gradient(policy, before, action, features, credit)
+        features = replay_features(traffic, m)
         mean, log_std = policy(features)
         expected = colour.predict_mean(memory)
         noise, memory = colour.step(memory, torch.randn(expected.shape, generator=generator).to(expected.device))
         action = mean + torch.exp(log_std) * noise
         moved = torch.cat((denormalise_action(policy, action), unused), dim=1)
-        cost = _penalties(traffic, features if model is None else features.detach(), moved[:, :m], m)
+        cost = _penalties(traffic, features, moved[:, :m], m)
         rows.append([part[driven] for part in (features, action, *cost, expected)])
-        traffic = step_replay(recording, traffic, moved)
-        traffic = _scale_gradient(traffic, credit) if model is None else detach_traffic(traffic)
+        traffic = _scale_gradient(step_replay(recording, traffic, moved), credit)
     features, action, *costs, expected = (torch.cat(column) for column in zip(*rows, strict=True))
     return RolloutSteps(features, action, Penalties(*costs), expected), ScenePool(
         detach_traffic(traffic), memory, pool.age + ticks

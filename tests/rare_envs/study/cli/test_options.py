@@ -60,7 +60,7 @@ def test_the_command_line_takes_them_and_tells_its_version(cli: Cli) -> None:
         ("plan", FOLLOWING),
         ("risk", "idm"),
         ("train-ego", FOLLOWING, "--steps", "10"),
-        ("train-drivers", "--data", "tables", "--out", "run", "--method", "bc"),
+        ("train-drivers", "--data", "tables", "--out", "run", "--method", "gail"),
     ],
     ids=lambda command: command[0],
 )

@@ -14,7 +14,6 @@ def test_learning_rates_fall_after_the_schedules():
     "settings",
     [
         {"method": "sac"},
-        {"method": "gail", "learned_model": True},
         {"updates": 0},
         {"epochs": -1},
         {"pools": 0},
@@ -28,5 +27,5 @@ def test_learning_rates_fall_after_the_schedules():
     ],
 )
 def test_settings_are_checked(settings):
-    with pytest.raises(ValueError, match=f"Expected {next(iter(settings))}|with learned_model"):
+    with pytest.raises(ValueError, match=f"Expected {next(iter(settings))}"):
         Config(**settings)

@@ -1,16 +1,26 @@
-"""Features of motion that the Waymo Open Sim Agents Challenge scores: kinematic, interactive and of the road.
+"""Realism score after the Waymo Open Sim Agents Challenge: how likely is the recorded future under many rollouts?
 
-All follow from poses and sizes, as in the challenge: speeds and accelerations are central differences of positions and
-headings, distances are those of rectangles. The road is straight, between two edges.
+Features of motion follow from poses and sizes, as in the challenge: speeds and accelerations are central differences of
+positions and headings, distances are those of rectangles. The road is straight, between two edges. Of every feature and
+every agent, a histogram over the steps of all rollouts is smoothed by a pseudocount. The likelihood of a feature is the
+exponential of the mean, over agents and valid steps, of the logarithm of the probability of the recorded value's bin.
+Collision and leaving the road are one event per agent and rollout. The score is the weighted mean of the nine
+likelihoods: 0 to 1, higher is better. It is no probability: even a copy of the record scores less than 1, because the
+bins pool the steps of 8 s.
 
 References:
-    Montali et al., "The Waymo Open Sim Agents Challenge", 2023; the definitions that the text leaves open are those of
-    the released evaluation (github.com/waymo-research/waymo-open-dataset, `sim_agents_metrics`, 2024).
+    Montali et al., "The Waymo Open Sim Agents Challenge", 2023 (arXiv 2305.12032); the definitions that the text leaves
+    open, and the settings, are those of the released evaluation of 2024
+    (github.com/waymo-research/waymo-open-dataset, `sim_agents_metrics`).
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -53,20 +63,7 @@ def motion_features(
         `FEATURE_NAMES` to values of shape (..., scored agents, T) in SI units, NaN where a feature does not exist;
         those of collision and off-road are 0 or 1 by step.
 
-    Raises:
-        ValueError: If shapes do not fit together.
-
-    Example:
-        >>> states = torch.zeros(2, 5, 3)  # two agents that drive straight on, one 10 m behind the other
-        >>> states[..., 0] = torch.tensor([[0.0], [10.0]]) + torch.arange(5.0)
-        >>> valid, sizes = torch.ones(2, 5, dtype=bool), torch.tensor([[4.0, 2.0], [4.0, 2.0]])
-        >>> features = motion_features(states, valid, sizes, edges=(-2.0, 2.0))
-        >>> features["linear_speed"][0].tolist()  # 1 m in 0.1 s
-        [nan, 10.0, 10.0, 10.0, nan]
-        >>> features["distance_to_nearest_object"][0, 0].item(), features["distance_to_road_edge"][0, 0].item()
-        (6.0, -1.0)
     """
-    _check(states, valid, sizes)
     if states.ndim > 3 and len(states) > AT_ONCE:  # small parts stay in the processor's cache
         parts = [motion_features(part, valid, sizes, edges, scored) for part in torch.split(states, AT_ONCE)]
         return {name: torch.cat([part[name] for part in parts]) for name in FEATURE_NAMES}
@@ -84,17 +81,6 @@ def motion_features(
     return {
         name: torch.where(mask, value, torch.nan) for name, value, mask in zip(FEATURE_NAMES, values, kept, strict=True)
     }
-
-
-def _check(states: Tensor, valid: Tensor, sizes: Tensor) -> None:
-    if states.ndim < 3 or states.shape[-1] != POSE:
-        raise ValueError(f"Expected poses of shape (..., n_agents, T, {POSE}), got {tuple(states.shape)}.")
-    agents, steps = states.shape[-3:-1]
-    if valid.shape != (agents, steps) or sizes.shape != (agents, 2):
-        raise ValueError(
-            f"Expected a mask of shape {(agents, steps)} and sizes of shape {(agents, 2)} for these poses, got "
-            f"{tuple(valid.shape)} and {tuple(sizes.shape)}."
-        )
 
 
 def kinematic_features(states: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -174,10 +160,6 @@ def box_distance_of_sizes(
         size: Length and width of the first [m].
         other_size: Of the other [m].
 
-    Example:
-        >>> at, size = torch.tensor([7.0, 3.0]), (torch.tensor(4.0), torch.tensor(2.0))
-        >>> box_distance_of_sizes(at, 0 * at, 0 * at, size, size).tolist()  # 3 m apart, and 1 m into each other
-        [3.0, -1.0]
     """
     cos, sin = torch.cos(turn), torch.sin(turn)
     other_along, other_across = along * cos + across * sin, across * cos - along * sin
@@ -216,3 +198,167 @@ def _outermost(states: Tensor, sizes: Tensor, edges: tuple[float, float]) -> Ten
     length, width = sizes[:, :1], sizes[:, 1:]
     reach = 0.5 * (length * torch.sin(heading).abs() + width * torch.cos(heading).abs())
     return torch.maximum(edges[0] - (y - reach), (y + reach) - edges[1])
+
+
+SCENE_ROLLOUTS = 32
+"""Rollouts of the challenge."""
+BUCKETS = MappingProxyType({"kinematic": KINEMATIC, "interactive": INTERACTIVE, "map_based": MAP_BASED})
+"""Groups of features that the challenge's table has."""
+EVENTS = ("collision_indication", "offroad_indication")
+"""Features of which only whether they ever occur counts."""
+
+
+class FeatureSetting(NamedTuple):
+    """Histogram of a feature, and its weight in the score."""
+
+    low: float
+    """Lowest edge; values below count in the first bin."""
+    high: float
+    """Highest edge; values above count in the last bin."""
+    bins: int
+    weight: float
+    pseudocount: float = 0.1
+    """Added to the count of every bin."""
+
+
+Settings = Mapping[str, FeatureSetting]
+
+
+def _event(weight: float) -> FeatureSetting:
+    return FeatureSetting(-0.5, 1.5, 2, weight, 0.001)
+
+
+WOSAC_2024: Settings = MappingProxyType(
+    {
+        "linear_speed": FeatureSetting(0.0, 25.0, 10, 0.05),
+        "linear_acceleration": FeatureSetting(-12.0, 12.0, 11, 0.05),
+        "angular_speed": FeatureSetting(-0.628, 0.628, 11, 0.05),
+        "angular_acceleration": FeatureSetting(-3.14, 3.14, 11, 0.05),
+        "distance_to_nearest_object": FeatureSetting(-5.0, 40.0, 10, 0.1),
+        "collision_indication": _event(0.25),
+        "time_to_collision": FeatureSetting(0.0, 5.0, 10, 0.1),
+        "distance_to_road_edge": FeatureSetting(-20.0, 40.0, 10, 0.1),
+        "offroad_indication": _event(0.25),
+    }
+)
+"""The challenge's settings."""
+MOTORWAY: Settings = MappingProxyType(
+    {
+        **WOSAC_2024,
+        "linear_speed": FeatureSetting(0.0, 30.0, 30, 0.05),
+        "linear_acceleration": FeatureSetting(-4.2, 4.2, 21, 0.05),
+        "angular_speed": FeatureSetting(-0.105, 0.105, 21, 0.05),
+        "angular_acceleration": FeatureSetting(-0.42, 0.42, 21, 0.05),
+        "distance_to_nearest_object": FeatureSetting(-2.0, 20.0, 22, 0.1),
+        "distance_to_road_edge": FeatureSetting(-10.0, 2.0, 24, 0.1),
+    }
+)
+"""Ours: the weights of 2024 with bins for smoothed motorway traffic, where nearly all recorded yaw rates lie in one
+published bin."""
+
+
+@dataclass(frozen=True)
+class SimAgentsScore:
+    """Score of rollouts of one scene.
+
+    """
+
+    meta: float
+    """The realism score: weighted mean of the likelihoods."""
+    buckets: Mapping[str, float]
+    """Weighted means of each group of features in `BUCKETS`."""
+    likelihoods: Mapping[str, float]
+    """Likelihood of each feature."""
+    min_ade: float
+    """Least over the rollouts of the mean distance from the recorded position [m]."""
+
+
+def score_features(
+    simulated: Mapping[str, Tensor],
+    recorded: Mapping[str, Tensor],
+    valid: Tensor,
+    settings: Settings,
+    min_ade: float,
+    copies: int = 1,
+) -> SimAgentsScore:
+    """Return the score of features that `motion_features` gave.
+
+    Args:
+        simulated: Of the rollouts, shape (R, n, T) each.
+        recorded: Of the record, shape (n, T) each.
+        valid: Steps that count, boolean, shape (n, T).
+        settings: Histograms and weights.
+        min_ade: Kept in the score [m].
+        copies: As in `score_rollouts`.
+
+    Raises:
+        ValueError: If a recorded feature exists at no valid step.
+    """
+    likelihoods = {
+        name: feature_likelihood(name, simulated[name], recorded[name], valid, settings[name], copies)
+        for name in FEATURE_NAMES
+    }
+    buckets = {bucket: _weighted(likelihoods, settings, members) for bucket, members in BUCKETS.items()}
+    return SimAgentsScore(_weighted(likelihoods, settings, FEATURE_NAMES), buckets, likelihoods, min_ade)
+
+
+def _weighted(likelihoods: Mapping[str, float], settings: Settings, features: tuple[str, ...]) -> float:
+    total = sum(settings[feature].weight for feature in features)
+    return sum(settings[feature].weight * likelihoods[feature] for feature in features) / total
+
+
+def feature_likelihood(
+    name: str, simulated: Tensor, recorded: Tensor, valid: Tensor, setting: FeatureSetting, copies: int = 1
+) -> float:
+    """Return the likelihood of a recorded feature, 0 to 1.
+
+    Args:
+        name: Of the feature; those in `EVENTS` count by whether they occur at any valid step.
+        simulated: Shape (R, n, T), NaN where the feature does not exist.
+        recorded: Shape (n, T), likewise.
+        valid: Which steps count, boolean, shape (n, T).
+        setting: Histogram.
+        copies: How often each rollout counts.
+
+    Raises:
+        ValueError: If the recorded feature exists at no valid step.
+    """
+    valid = valid & torch.isfinite(recorded)
+    if not bool(valid.any()):
+        raise ValueError(f"Expected a recorded {name} at some valid step, got none; take longer records.")
+    if name in EVENTS:
+        simulated = ((simulated > 0) & valid).any(dim=-1, keepdim=True).to(simulated)
+        recorded = ((recorded > 0) & valid).any(dim=-1, keepdim=True).to(recorded)
+        valid = valid.any(dim=-1, keepdim=True)
+    log_likelihood = histogram_log_likelihood(simulated, recorded, valid, setting, copies)
+    return float(log_likelihood[valid].mean().exp())
+
+
+def histogram_log_likelihood(
+    simulated: Tensor, recorded: Tensor, valid: Tensor, setting: FeatureSetting, copies: int = 1
+) -> Tensor:
+    """Return the logarithm of the probability of the recorded values' bins, of each agent's histogram.
+
+    Args:
+        simulated: Shape (R, n, T); its values at valid steps, if finite, make the histogram of each of the n agents.
+        recorded: Shape (n, T).
+        valid: Boolean, shape (n, T); elsewhere the result means nothing.
+        setting: Histogram.
+        copies: How often each simulated value counts.
+
+    Returns:
+        Shape (n, T), double precision.
+
+    """
+    counted = (valid & torch.isfinite(simulated)).double()
+    place = _bin_of(simulated, setting).movedim(0, 1).flatten(1)  # (n, R T)
+    counts = torch.zeros(len(recorded), setting.bins, dtype=torch.float64)
+    counts.scatter_add_(1, place, counted.movedim(0, 1).flatten(1))
+    counts = copies * counts + setting.pseudocount
+    logarithms = (counts / counts.sum(dim=1, keepdim=True)).log()
+    return logarithms.gather(1, _bin_of(recorded, setting))
+
+
+def _bin_of(values: Tensor, setting: FeatureSetting) -> Tensor:
+    share = (torch.nan_to_num(values, nan=setting.low).double() - setting.low) / (setting.high - setting.low)
+    return (share * setting.bins).floor().clamp(0, setting.bins - 1).long()

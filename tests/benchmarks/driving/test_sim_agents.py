@@ -1,4 +1,4 @@
-"""Features of motion by hand, and distances against the exact ones of the simulator's bodies."""
+"""Features of motion and the realism score by hand, and distances against those of the simulator's bodies."""
 
 import math
 
@@ -6,16 +6,21 @@ import pytest
 import torch
 
 from rare_envs.traffic.oriented_boxes import axes_of, box_distance
-from training.imitation.evaluation.sim_agents_features import (
+from benchmarks.driving.sim_agents import (
     FAR,
     FEATURE_NAMES,
     MAX_TIME_TO_COLLISION,
+    WOSAC_2024,
+    FeatureSetting,
     box_distance_of_sizes,
+    feature_likelihood,
+    histogram_log_likelihood,
     kinematic_features,
     motion_features,
 )
 
 EDGES = (-1.75, 5.25)
+HALVES = FeatureSetting(0.0, 2.0, 2, 1.0, pseudocount=0.5)
 T = 9
 CLOCK = 0.1 * torch.arange(T, dtype=torch.float64)
 
@@ -126,12 +131,41 @@ def test_a_distance_does_not_depend_on_who_is_first():
     torch.testing.assert_close(there, back)
 
 
-def test_wrong_shapes_are_refused():
-    states, valid, sizes = torch.zeros(2, 5, 3), torch.ones(2, 5, dtype=torch.bool), torch.ones(2, 2)
-    for wrong, message in (
-        ((states[..., :2], valid, sizes), "Expected poses of shape"),
-        ((states, valid[:1], sizes), "Expected a mask of shape"),
-        ((states, valid, sizes[:, :1]), "Expected a mask of shape"),
-    ):
-        with pytest.raises(ValueError, match=message):
-            motion_features(*wrong, EDGES)
+def test_a_histogram_of_two_bins():
+    """Agent 0: 3 of 4 values in the first bin, (3 + .5) / (4 + 1); agent 1: none of 4, and one beyond the last edge."""
+    simulated = torch.tensor([[[0.1, 0.9], [1.1, 9.0]], [[0.2, 1.5], [1.9, 1.0]]])
+    recorded = torch.tensor([[0.5, 1.5], [-3.0, 1.2]])
+    found = histogram_log_likelihood(simulated, recorded, torch.ones(2, 2, dtype=torch.bool), HALVES).exp()
+    torch.testing.assert_close(found, torch.tensor([[3.5 / 5, 1.5 / 5], [0.5 / 5, 4.5 / 5]], dtype=torch.float64))
+
+
+def test_the_likelihood_is_the_geometric_mean_over_agents_and_steps():
+    simulated = torch.tensor([[[0.1, 0.9], [1.1, 9.0]], [[0.2, 1.5], [1.9, 1.0]]])
+    recorded, valid = torch.tensor([[0.5, 1.5], [0.5, 1.2]]), torch.ones(2, 2, dtype=torch.bool)
+    expected = (0.7 * 0.3 * 0.1 * 0.9) ** 0.25
+    assert feature_likelihood("linear_speed", simulated, recorded, valid, HALVES) == pytest.approx(expected)
+
+
+def test_invalid_and_missing_steps_count_neither_in_the_histogram_nor_in_the_mean():
+    simulated = torch.tensor([[[0.1, 0.9, 1.5]], [[0.2, math.nan, 1.5]]])
+    recorded, valid = torch.tensor([[0.5, 1.5, 0.5]]), torch.tensor([[True, True, False]])
+    # three values are left, all in the first bin
+    expected = math.sqrt(3.5 / 4 * 0.5 / 4)
+    assert feature_likelihood("linear_speed", simulated, recorded, valid, HALVES) == pytest.approx(expected)
+    missing = torch.tensor([[0.5, math.nan, 0.5]])
+    assert feature_likelihood("linear_speed", simulated, missing, valid, HALVES) == pytest.approx(2.5 / 3)
+
+
+def test_an_event_counts_once_in_a_rollout():
+    """Of four rollouts one collides, at two steps; agent 0 of the record collides, agent 1 does not."""
+    simulated = torch.zeros(4, 2, 5)
+    simulated[0, :, 2:4] = 1.0
+    recorded = torch.zeros(2, 5)
+    recorded[0, 1] = 1.0
+    valid = torch.ones(2, 5, dtype=torch.bool)
+    setting = WOSAC_2024["collision_indication"]
+    expected = math.sqrt(1.001 / 4.002 * 3.001 / 4.002)
+    assert feature_likelihood("collision_indication", simulated, recorded, valid, setting) == pytest.approx(expected)
+    valid[:, 2:] = False  # then no rollout collides while the record goes on
+    expected = math.sqrt(0.001 / 4.002 * 4.001 / 4.002)
+    assert feature_likelihood("collision_indication", simulated, recorded, valid, setting) == pytest.approx(expected)
