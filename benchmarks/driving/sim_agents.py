@@ -259,9 +259,7 @@ published bin."""
 
 @dataclass(frozen=True)
 class SimAgentsScore:
-    """Score of rollouts of one scene.
-
-    """
+    """Score of rollouts of one scene."""
 
     meta: float
     """The realism score: weighted mean of the likelihoods."""

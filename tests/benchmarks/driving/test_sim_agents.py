@@ -5,7 +5,6 @@ import math
 import pytest
 import torch
 
-from rare_envs.traffic.oriented_boxes import axes_of, box_distance
 from benchmarks.driving.sim_agents import (
     FAR,
     FEATURE_NAMES,
@@ -18,6 +17,7 @@ from benchmarks.driving.sim_agents import (
     kinematic_features,
     motion_features,
 )
+from rare_envs.traffic.oriented_boxes import axes_of, box_distance
 
 EDGES = (-1.75, 5.25)
 HALVES = FeatureSetting(0.0, 2.0, 2, 1.0, pseudocount=0.5)

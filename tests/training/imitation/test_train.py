@@ -69,8 +69,8 @@ def test_the_command_line_says_what_is_missing(words, message, tmp_path):
 
 
 def test_the_shared_command_line_trains_drivers(made_up, tmp_path, capsys):
-    words = ["train-drivers", "--data", "tables", "--method", "gail", "--updates", "1", "--out", str(tmp_path / "run"), "--json"]
-    assert rare_envs_command(words) == 0
+    words = ["train-drivers", "--data", "tables", "--method", "gail", "--updates", "1", "--json"]
+    assert rare_envs_command([*words, "--out", str(tmp_path / "run")]) == 0
     answer = json.loads(capsys.readouterr().out)
     assert read_provenance(answer["driver"]).kind == answer["method"] == "gail"
 

@@ -1,7 +1,6 @@
 """Pairs of recorded driving: which moments, and how often."""
 
 import pytest
-import torch
 
 from tests.training.imitation.synthetic_scenes import scene
 from training.imitation.algorithms.expert_pairs import collect_pairs, scaling_of
