@@ -13,7 +13,7 @@ COPY --from=build /wheels /wheels
 # The CPU build of torch is a tenth of the size of the CUDA build; give another index for a GPU.
 ARG TORCH_INDEX=https://download.pytorch.org/whl/cpu
 RUN pip install --no-cache-dir --index-url "$TORCH_INDEX" "$(grep '^torch==' /tmp/constraints.txt)" \
-    && pip install --no-cache-dir -c /tmp/constraints.txt "$(ls /wheels/*.whl)[driving,fast]" \
+    && pip install --no-cache-dir -c /tmp/constraints.txt "$(ls /wheels/*.whl)[driving]" \
     && rm -r /wheels /tmp/constraints.txt
 ARG USER_ID=1000
 RUN useradd --uid "$USER_ID" --create-home user && mkdir -p /data/runs && chown -R user /data

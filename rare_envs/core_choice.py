@@ -1,4 +1,4 @@
-"""CoreChoice: compiled or recorded rollouts of a world and its ego where they can be had, torch for all else."""
+"""CoreChoice: compiled rollouts of a world and its ego where they can be had, torch for all else."""
 
 from __future__ import annotations
 
@@ -14,15 +14,14 @@ from rare_envs.control.idm import IDM
 from rare_envs.egos.policy import PolicyDriver, find_device_driver
 from rare_envs.egos.sb3.dense_networks import read_dense_policy
 from rare_envs.simulation.compiled.failures import CompilerFails, NotCompiled, check_core
-from rare_envs.simulation.compiled.highway import HighwayRollout, OffersDenseDriver, RolloutTerms, read_dense_driver
 from rare_envs.simulation.compiled.selection import (
     CompiledEgo,
     CompiledRollout,
     find_compiled_rollout,
     select_rollout,
 )
+from rare_envs.simulation.cuda_graphs import RecordedRollouts
 from rare_envs.simulation.episode import Episode
-from rare_envs.simulation.recorded import RecordedRollouts, RecordedTicks
 from rare_envs.simulation.rollout import Driver
 from rare_envs.simulation.world import World
 
@@ -58,8 +57,7 @@ class CoreChoice:
         check_core(wanted)
         self.wanted, self._driver, self._device, self._tile = wanted, driver, device, tile
         self._recorded: RecordedRollouts | None = None
-        self._recorded_ticks = RecordedTicks(driver)
-        self.rollout: CompiledRollout | HighwayRollout | None = None
+        self.rollout: CompiledRollout | None = None
         if wanted == "torch":
             return
         try:
@@ -83,30 +81,15 @@ class CoreChoice:
             self._give_up(reason, warns=True, stacklevel=6)
             return None
 
-    def run_terms(self, x: NDArray[np.float64], gamma: float) -> RolloutTerms | None:
-        """Return f and terms of scenarios x (n, d) for a threshold of f; None where torch has to simulate.
-
-        Raises:
-            ValueError: Compiled rollouts were asked for, and have become impossible.
-        """
-        if not isinstance(self.rollout, HighwayRollout):
-            return None
-        try:
-            return self.rollout.terms(x, gamma)
-        except NotCompiled as reason:
-            self._give_up(reason, warns=True, stacklevel=6)
-            return None
-
     def roll_out(self, world: World, x: Tensor) -> Episode | None:
         """Return the episodes of scenarios x (B, d), a tile at most, by operations that are recorded.
 
         Returns:
-            None on the CPU where nothing is recorded; on a GPU where a policy has to be
-            asked on the CPU: one that cannot decide elsewhere, or one that fails, for then it is told on which rows,
-            and how.
+            None on the CPU, and on a GPU where a policy has to be asked on the CPU: one that cannot decide
+            elsewhere, or one that fails, for then it is told on which rows, and how.
         """
         if self._device.type == "cpu":
-            return self._recorded_ticks(world, x)
+            return None
         known = self._recorded
         driver = find_device_driver(self._driver, self._device, None if known is None else known.driver)
         if driver is None:
@@ -153,8 +136,6 @@ def compiled_ego(driver: Driver) -> CompiledEgo:
     """
     if type(driver) is PolicyDriver:
         return partial(read_dense_policy, driver.policy)
-    if isinstance(driver, OffersDenseDriver):
-        return partial(read_dense_driver, driver)
     if type(driver) is not IDM:
         raise NotCompiled(f"the ego, a {type(driver).__name__}, is not compiled")
     return driver
@@ -169,6 +150,7 @@ def is_compiled_script(world: World, driver: Driver) -> bool:
         True
     """
     try:
-        return isinstance(select_rollout(world, compiled_ego(driver)), CompiledRollout)
+        select_rollout(world, compiled_ego(driver))
     except NotCompiled:
         return False
+    return True

@@ -36,7 +36,7 @@ from rare_envs.simulation.episode import Episode
 from rare_envs.simulation.measurement import Measurement
 from rare_envs.simulation.rollout import Driver, StochasticDriver, rollout
 from rare_envs.simulation.world import World
-from rare_envs.terms.episode_terms import EpisodeTerms, name_terms, simulate_terms
+from rare_envs.terms.episode_terms import EpisodeTerms, simulate_terms
 from rare_envs.terms.gradients import ROLLOUTS_PER_GRADIENT, TermDifferentiator, find_differentiator
 from rare_envs.traffic.crash import CRASH_KINDS, Crash
 
@@ -97,10 +97,9 @@ class DrivingProblem:
                 rules and 256 with a policy, or what fits into memory. Few suit a slow ego. A network rounds differently
                 by batch, so another number gives other bits; another number of workers does not.
             core: What simulates: "torch", the reference, for everything; "numba", compiled rollouts, for the scripted
-                scenarios with the IDM or a policy of dense layers as ego and the measure `ttc`, and for the highway
-                with learned drivers, the IDM, one of them or such a policy as ego, and `ttc`, `lidar_ttc` or
-                `clearance`; "auto" for the compiled ones where they can be had. They differ by rounding; an estimate
-                says which it used (`DrivingProblem.core`).
+                scenarios with the IDM or a policy of dense layers as ego and the measure `ttc`; "auto" for the compiled
+                ones where they can be had. They differ by rounding; an estimate says which it used
+                (`DrivingProblem.core`).
             device: Where torch simulates: "cpu", or a GPU, "cuda" or "cuda:1". Networks of learned drivers and dense
                 layers of Stable-Baselines3 are copied there, a torch module stays on its own device, and other
                 policies are queried through the CPU. A `Driver` of your own is shown episodes there; it is moved by
@@ -381,26 +380,9 @@ class DrivingProblem:
 
     def _simulate_terms(self, x: NDArray[np.float64], gamma: float, failed_rows: dict[int, str] | None) -> EpisodeTerms:
         x = self.space.validate(np.atleast_2d(x))
-        found = self._core.run_terms(x, gamma)
-        if found is not None:
-            terms = name_terms(self.world, gamma, *found)
-            if self.needs.queries_policy and np.isnan(terms.f).any():  # torch tells what fails there, and how
-                self._simulate_unknown_terms(terms, x, gamma, failed_rows)
-            self._check_known(x, terms.f, failed_rows)
-            return terms
         terms = simulate_terms(self.world, gamma, lambda world: self._roll_out(world, x, failed_rows))
         self._check_known(x, terms.f, failed_rows)
         return terms
-
-    def _simulate_unknown_terms(
-        self, terms: EpisodeTerms, x: NDArray[np.float64], gamma: float, failed_rows: dict[int, str] | None
-    ) -> None:
-        """Write the terms of rows whose f is NaN as torch simulates them; arguments as of `_roll_out`."""
-        rows, failed = np.flatnonzero(np.isnan(terms.f)), None if failed_rows is None else dict[int, str]()
-        known = simulate_terms(self.world, gamma, lambda world: self._roll_out(world, x[rows], failed))
-        terms.f[rows], terms.values[rows], terms.ticks[rows] = known.f, known.values, known.ticks
-        if failed_rows is not None and failed is not None:
-            failed_rows.update({int(rows[row]): reason for row, reason in failed.items()})
 
     def _roll_out(self, world: World, x: NDArray[np.float64], failed_rows: dict[int, str] | None) -> Iterator[Episode]:
         """Yield the episodes of scenarios x (n, d) at the horizon, tile by tile.

@@ -21,6 +21,7 @@ DRIVING = (
     "highway_env",
     "jinja2",
     "matplotlib",
+    "numba",
     "pettingzoo",
     "pyarrow",
     "stable_baselines3",

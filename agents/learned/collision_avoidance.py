@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields
+from dataclasses import dataclass, fields
 from typing import Any
 
 import torch
@@ -20,7 +20,6 @@ from torch import Tensor
 from agents.learned.adjacent_lanes import LEFT_MARKER_COLUMN, RIGHT_MARKER_COLUMN
 from rare_envs.sensors.lidar import MAX_RANGE, beam_angles
 from rare_envs.sensors.perception import FEATURES, HEADING_COLUMN, RANGE_COLUMNS, RATE_COLUMNS, SPEED_COLUMN
-from rare_envs.simulation.compiled.highway import AvoidanceSettings, CloseRangeSettings
 
 _LENGTH, _WIDTH = FEATURES.index("length"), FEATURES.index("width")
 _FORWARD, _SIDEWAYS, _ACROSS = 0.5, 0.3, 0.75
@@ -58,10 +57,6 @@ class CloseRange:
 
     def __post_init__(self) -> None:
         _check_positive(self)
-
-    def settings(self) -> CloseRangeSettings:
-        """Return the numbers for compiled rollouts."""
-        return CloseRangeSettings(**asdict(self))
 
 
 @dataclass(frozen=True)
@@ -132,18 +127,6 @@ class CollisionAvoidance:
         """Return the rule whose fields were written as JSON; earlier files have no `close`."""
         close = values.get("close")
         return cls(**{**values, "close": None if close is None else CloseRange(**close)})
-
-    def settings(self) -> AvoidanceSettings:
-        """Return the numbers for compiled rollouts, but those of close range."""
-        numbers = {name: value for name, value in asdict(self).items() if name != "close"}
-        return AvoidanceSettings(
-            **numbers,
-            forward=_FORWARD,
-            sideways=_SIDEWAYS,
-            across=_ACROSS,
-            gap_divisor=_LEAST_GAP,
-            speed_divisor=_LEAST_SPEED,
-        )
 
     def limit(self, features: Tensor, action: Tensor) -> Tensor:
         """Return actions within the bounds, differentiable in both arguments.

@@ -14,23 +14,19 @@ from agents.learned.coloured_noise import WHITE_NOISE, AutoregressiveNoise
 from agents.learned.lane_changes import STATE_SIZE, ChangeState, LaneChanges, Waiting
 from agents.learned.networks import (
     ACTION_SIZE,
-    FEATURE_CLIP,
     FEATURE_SIZE,
     HEAD_SIZE,
     HIDDEN_SIZES,
     Policy,
     apply_heads,
-    head_weights,
     is_plain,
-    read_layers,
 )
 from agents.learned.weight_distribution import WeightDistribution
 from rare_envs.control import actions
 from rare_envs.devices import constant
 from rare_envs.sensors.perception import CURVATURE_COLUMN, SPEED_COLUMN
-from rare_envs.simulation.compiled.highway import DenseDriver
+from rare_envs.simulation.cuda_graphs import says_recordable
 from rare_envs.simulation.observation import LIDAR_SCALES, observation_space
-from rare_envs.simulation.recorded import says_recordable
 from rare_envs.traffic.vehicle_models import steering_for
 
 if TYPE_CHECKING:
@@ -184,34 +180,6 @@ class LearnedDriver:
         """Return actions within the bounds of the rule, if there is one."""
         return action if self.avoidance is None else self.avoidance.limit(features, action)
 
-    def dense_driver(self) -> DenseDriver | None:
-        """Return its present numbers for compiled rollouts; None if its class, network or rule was changed."""
-        rule, layers = self.avoidance, read_layers(self.policy)
-        if type(self) is not LearnedDriver or layers is None or not self._has_known_rules():
-            return None
-        scaling, colour = (value.numpy(force=True) for value in self.policy.scaling), self.colour
-        feature_mean, feature_deviation, action_mean, action_deviation = scaling
-        return DenseDriver(
-            feature_mean,
-            feature_deviation,
-            FEATURE_CLIP,
-            hidden=layers,
-            head=head_weights(self.policy).numpy(force=True),
-            log_deviation_cap=float(self.policy.log_std_cap),
-            action_mean=tuple(action_mean),
-            action_deviation=tuple(action_deviation),
-            low=(self.acceleration[0], self.yaw_rate[0]),
-            high=(self.acceleration[1], self.yaw_rate[1]),
-            lag_1=colour.first,
-            lag_2=colour.second,
-            fresh=colour.scale,
-            avoidance=None if rule is None else rule.settings(),
-            eased_beyond=EASED_BEYOND,
-            hard_braking=self.hard_braking,
-            close_range=None if rule is None or rule.close is None else rule.close.settings(),
-            lane_changes=None if self.changes is None else self.changes.settings(),
-        )
-
     @property
     def recordable(self) -> bool:
         """Whether its operations may be recorded: network, noise and rules are of this package."""
@@ -331,10 +299,6 @@ class LearnedEgo:
     def to(self, device: torch.device) -> "LearnedEgo":
         """Return the ego with a copy of its network on a device."""
         return replace(self, driver=self.driver.to(device))
-
-    def dense_driver(self) -> DenseDriver | None:
-        """Return its present numbers for compiled rollouts; None if its class or its network was changed."""
-        return self.driver.dense_driver() if type(self) is LearnedEgo else None
 
     @torch.inference_mode()
     def predict(

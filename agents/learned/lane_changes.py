@@ -9,18 +9,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields
+from dataclasses import dataclass, fields
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 from agents.learned.adjacent_lanes import (
-    LEAST_COSINE_ALONG,
     LEFT_MARKER_COLUMN,
-    LINE_OVERLAP,
     RIGHT_MARKER_COLUMN,
-    SHOWS_LANE_BEYOND,
     AdjacentLanes,
     look_aside,
 )
@@ -34,7 +31,6 @@ from rare_envs.sensors.perception import (
     SPEED_COLUMN,
 )
 from rare_envs.simulation.clock import LEARNED_TICK
-from rare_envs.simulation.compiled.highway import LaneChangeSettings
 
 _WIDTH = FEATURES.index("width")
 COVARIATES = ("constant", "right", "advantage", "approach", "speed")
@@ -214,33 +210,6 @@ class LaneChanges:
         """Return the lane changes whose fields were written as JSON; earlier files have no `waiting`."""
         waiting = values.get("waiting")
         return cls(**{**values, "waiting": None if waiting is None else Waiting(**waiting)})
-
-    def settings(self) -> LaneChangeSettings:
-        """Return the numbers for compiled rollouts."""
-        own = {name: value for name, value in asdict(self).items() if name not in ("coefficients", "waiting")}
-        constant, right, advantage, approach, speed = self.coefficients
-        waiting = self.waiting or Waiting()
-        return LaneChangeSettings(
-            constant=constant,
-            right=right,
-            advantage=advantage,
-            approach=approach,
-            speed=speed,
-            **own,
-            waits=float(self.waiting is not None),
-            waiting_foresight=waiting.foresight,
-            edge_margin=waiting.margin,
-            bound=BOUND,
-            usual_speed=USUAL_SPEED,
-            settled=_SETTLED,
-            latest=_LATEST,
-            extreme=_EXTREME,
-            speed_divisor=_LEAST_SPEED,
-            least_share=_LEAST_SHARE,
-            overlap=LINE_OVERLAP,
-            beyond=SHOWS_LANE_BEYOND,
-            along=LEAST_COSINE_ALONG,
-        )
 
     def begin(self, draws: Tensor) -> ChangeState:
         """Return the state before anything was perceived, from standard normal draws (B, M, 2)."""

@@ -2,9 +2,7 @@
 
 from typing import NamedTuple
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor, nn
 
 FEATURE_SIZE = 51
@@ -22,7 +20,6 @@ HEAD_GAIN, LOG_STD_BIAS = 0.1, -1.0
 """Factor on the first weights of the last layer, and its first biases of log standard deviations: a new network acts
 almost alike everywhere, with noise of about a quarter of the recorded spread, from which cloning starts smoothly."""
 
-WeightsAndBiases = tuple[NDArray[np.float32], NDArray[np.float32]]
 """Weights, shape (outputs, inputs), and biases, shape (outputs,)."""
 
 
@@ -126,25 +123,6 @@ def apply_heads(hidden: Tensor, weights: Tensor) -> Tensor:
     """
     layer = weights.view(len(weights), 2 * ACTION_SIZE, HIDDEN_SIZES[-1] + 1)
     return torch.baddbmm(layer[:, None, :, -1], hidden, layer[:, :, :-1].mT)
-
-
-def read_layers(policy: Policy) -> tuple[WeightsAndBiases, WeightsAndBiases] | None:
-    """Return the two hidden layers for compiled rollouts.
-
-    Returns:
-        None if the network is not a `Policy` in single precision on the CPU, to the last part.
-
-    Example:
-        >>> scaling = Scaling(torch.zeros(51), torch.ones(51), torch.zeros(2), torch.ones(2))
-        >>> [weight.shape for weight, _ in read_layers(Policy(scaling))]
-        [(200, 51), (100, 200)]
-    """
-    single = all(value.dtype == torch.float32 and value.device.type == "cpu" for value in policy.state_dict().values())
-    if not (is_plain(policy) and single):
-        return None
-    layers = (policy.first, policy.second)
-    first, second = ((layer.weight.numpy(force=True), layer.bias.numpy(force=True)) for layer in layers)
-    return first, second
 
 
 def is_plain(policy: Policy) -> bool:

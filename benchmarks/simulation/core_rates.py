@@ -53,26 +53,12 @@ def measure_answers(env_id: str, core: str, seeds: int = 4) -> str:
     return ", ".join(f"{each / call:.1f}" for each in taken)
 
 
-def measure_recorded(env_id: str, rows: int, rounds: int = 20) -> str:
-    """Return how many times as fast recorded ticks are as torch's operators, the two in turn."""
-    problem = rare_envs.DrivingProblem(env_id, core="torch")
-    x = problem.base.sample(rows, np.random.default_rng(0))
-    works = (lambda: simulate_by_operators(problem, x), lambda: problem.evaluate(x))
-    taken = [[seconds(work) for work in works] for _ in range(rounds)]
-    operators, recorded = np.min(taken, 0)
-    return f"{1e3 * operators:.1f} / {1e3 * recorded:.1f} ms, {operators / recorded:.1f} times as fast"
-
-
 @use_one_thread()
 def main(
     only_answers: Annotated[bool, typer.Option(help="Estimates alone.")] = False,
     only_highway: Annotated[bool, typer.Option(help="Rates on the highway alone.")] = False,
-    only_recorded: Annotated[bool, typer.Option(help="Recorded ticks beside torch's operators alone.")] = False,
 ) -> None:
     """Measure and print."""
-    if only_recorded:
-        print_recorded()
-        return
     if not (only_answers or only_highway):
         print_rates()
     if not only_answers:
@@ -92,13 +78,6 @@ def print_rates() -> None:
     for rows in (25, 6000):
         for env_id in (CAR_FOLLOWING, CUT_IN):
             print(f"{env_id}, PPO ego, {rows:,} rows: {measure_rates(env_id, rows, ego=ppo(env_id))}")
-
-
-def print_recorded() -> None:
-    """Measure and print what recorded ticks save."""
-    for rows in (25, 100, 600, 6000, 16_384):
-        for env_id in (CAR_FOLLOWING, CUT_IN, HARD_BRAKE):
-            print(f"{env_id}, {rows:,} rows: {measure_recorded(env_id, rows)}", flush=True)
 
 
 def print_highway_rates() -> None:

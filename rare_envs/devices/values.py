@@ -1,7 +1,7 @@
 """Values on their devices: constants that are copied there once, and branches on values where to look costs nothing.
 
 A processor's values are at hand. To look at one of a GPU is to wait until everything before it is computed, and no
-recorded rollout can do it (`rare_envs.simulation.recorded`), so there both ways of a branch are computed.
+recorded rollout can do it (`rare_envs.simulation.cuda_graphs`), so there both ways of a branch are computed.
 """
 
 from __future__ import annotations

@@ -68,24 +68,5 @@ def simulate_terms(world: World, gamma: float, simulate: Callable[[World], Itera
     return EpisodeTerms(_join(f), _join(values), torch.cat(ticks).numpy(force=True), threshold, names)
 
 
-def name_terms(
-    world: World, gamma: float, f: NDArray[np.floating], values: NDArray[np.floating], ticks: NDArray[np.int64]
-) -> EpisodeTerms:
-    """Return terms that a compiled rollout has told apart, with their names and threshold.
-
-    Args:
-        world: The world, with a measure that has terms.
-        gamma: Threshold of f.
-        f: The measure, shape (n,).
-        values: Terms, shape (n, J).
-        ticks: At which they are attained, shape (n, J).
-    """
-    own = world.measurement.episode_measure
-    order, threshold = find_order(own, world.measurement.collisions, gamma)
-    assert order is not None
-    names = TermTracker(own, order).names(world.scenario.vehicle_names)
-    return EpisodeTerms(f.astype(np.float64), values.astype(np.float64), ticks, threshold, names)
-
-
 def _join(parts: list[Tensor]) -> FloatArray:
     return torch.cat(parts).double().numpy(force=True)

@@ -47,7 +47,7 @@ def compiler_failures() -> Iterator[None]:
         yield
     except ImportError as error:
         raise CompilerFails(
-            f"the compiled rollouts fail in this process: {error}; install 'rare-envs[fast]' wherever it is "
+            f"the compiled rollouts fail in this process: {error}; install 'rare-envs[driving]' wherever it is "
             "simulated, or make it with core='torch'"
         ) from error
     except Exception as error:

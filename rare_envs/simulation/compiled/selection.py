@@ -11,13 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rare_envs.control.idm import IDM
+from rare_envs.measures import MEASURES
 from rare_envs.plugins import one_line
 from rare_envs.scenarios import car_following, cut_in, hard_brake
 from rare_envs.simulation.compiled.dense_policy import DensePolicy
 from rare_envs.simulation.compiled.failures import CompilerFails, NotCompiled, compiler_failures
-from rare_envs.simulation.compiled.highway.dense_driver import DenseDriver
-from rare_envs.simulation.compiled.highway.highway_rollout import HighwayRollout, find_highway_rollout
-from rare_envs.simulation.compiled.highway.measure_kinds import BY_TTC, find_measure_kind
 from rare_envs.simulation.observation import EGO_FEATURES, OTHER_FEATURES
 
 if TYPE_CHECKING:
@@ -33,9 +31,9 @@ COMPILED_SCRIPTS = {
 """Names of compiled scripts to the initial state and the motion of the other vehicles that they have."""
 
 
-CompiledEgo = IDM | Callable[[], DensePolicy | DenseDriver]
-"""An ego that compiled rollouts carry out: the IDM, or what reads the network of a policy or of a learned driver, with
-its present weights."""
+CompiledEgo = IDM | Callable[[], DensePolicy]
+"""An ego that compiled rollouts carry out: the IDM, or what reads the network of a policy with its present
+weights."""
 
 
 @dataclass(frozen=True)
@@ -74,11 +72,10 @@ class CompiledRollout:
 
             if isinstance(ego, IDM):
                 return scripted_rollouts.drive_by_idm(self.script, x, ego, *arguments)
-            assert isinstance(ego, DensePolicy)
             return policy_rollouts.drive_by_policy(self.script, x, ego, *arguments)
 
 
-def find_compiled_rollout(world: World, ego: CompiledEgo) -> CompiledRollout | HighwayRollout:
+def find_compiled_rollout(world: World, ego: CompiledEgo) -> CompiledRollout:
     """Return the compiled rollout of a world and its ego.
 
     Args:
@@ -102,18 +99,12 @@ def find_compiled_rollout(world: World, ego: CompiledEgo) -> CompiledRollout | H
     return found
 
 
-def select_rollout(world: World, ego: CompiledEgo) -> CompiledRollout | HighwayRollout:
+def select_rollout(world: World, ego: CompiledEgo) -> CompiledRollout:
     """Return `find_compiled_rollout`, whether numba can be used here or not.
 
     Raises:
         NotCompiled: There is none.
     """
-    if world.background is not None:
-        policy = None if isinstance(ego, IDM) else ego()
-        obstacle = _find_policy_obstacle(world, policy) if isinstance(policy, DensePolicy) else ""
-        if obstacle:
-            raise NotCompiled(obstacle)
-        return find_highway_rollout(world, ego)
     obstacle = _find_obstacle(world)
     if obstacle:
         raise NotCompiled(obstacle)
@@ -133,17 +124,15 @@ def find_compiled_script(world: World) -> str:
         CompilerFails: numba cannot be used here.
     """
     plain = replace(world, measurement=replace(world.measurement, statistics=False))
-    obstacle = "worlds with drivers are not compiled" if world.background is not None else _find_obstacle(plain)
+    obstacle = _find_obstacle(plain)
     if obstacle or world.uses_lidar or "camera" in world.sensing.kinds:
         raise NotCompiled(obstacle or f"the observation {world.sensing.observation!r} is not compiled")
     _import_compiler()
     return _find_script(world.scenario)
 
 
-def _find_policy_obstacle(world: World, policy: DensePolicy | DenseDriver) -> str:
+def _find_policy_obstacle(world: World, policy: DensePolicy) -> str:
     """Return why the torch simulation is needed with a policy as ego; empty if it is not."""
-    if not isinstance(policy, DensePolicy):
-        return "an ego that acts by lidar is not compiled in a scripted scenario"
     if world.sensing.observation != "features":
         return f"the observation {world.sensing.observation!r} is not compiled"
     if world.clock.action == "meta":
@@ -156,10 +145,11 @@ def _find_obstacle(world: World) -> str:
     """Return why the torch simulation of a script is needed, whatever the ego; empty if it is not."""
     scenario, measurement = world.scenario, world.measurement
     obstacles = {
+        "worlds with drivers are not compiled": world.background is not None,
         f"the script of the scenario {scenario.name!r} is not compiled": not _find_script(scenario),
         "curved roads and lanes of different widths are not compiled": scenario.road.reference_line is not None
         or not scenario.road.equal,
-        f"the measure {measurement.measure!r} is not compiled": find_measure_kind(measurement) != BY_TTC,
+        f"the measure {measurement.measure!r} is not compiled": measurement.episode_measure != MEASURES["ttc"],
         "statistics of episodes are not compiled": measurement.statistics,
         "collisions of other vehicles are not compiled": measurement.collisions != "ego",
         "parameters of the weather are not compiled": sum(world.columns) != scenario.size,
@@ -183,9 +173,8 @@ def _import_compiler() -> None:
         CompilerFails: It is, but fails: with this NumPy, or since it can write its cache nowhere.
     """
     if importlib.util.find_spec("numba") is None:
-        raise NotCompiled("numba is not installed: pip install 'rare-envs[fast]'")
+        raise NotCompiled("numba is not installed: pip install 'rare-envs[driving]'")
     try:
         from rare_envs.simulation.compiled import policy_rollouts, scripted_rollouts  # noqa: F401
-        from rare_envs.simulation.compiled.highway import traffic_rollouts  # noqa: F401
     except (ImportError, OSError, RuntimeError) as error:
         raise CompilerFails(f"numba is installed, but fails here: {one_line(error)}") from error

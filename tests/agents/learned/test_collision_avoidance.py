@@ -193,19 +193,6 @@ def test_the_rule_is_read_from_the_file(close, tmp_path):
     assert read_driver(path).avoidance == rule
 
 
-def test_compiled_rollouts_take_the_rule_unless_it_was_changed():
-    class Other(CollisionAvoidance):
-        """Bounds of its own."""
-
-    dense = load_driver("mgail2").dense_driver()
-    assert dense is not None and dense.avoidance is not None and dense.avoidance.deceleration == 2.0
-    assert replace(load_driver("mgail2"), avoidance=Other()).dense_driver() is None
-    close = replace(load_driver("mgail2"), avoidance=CLOSE).dense_driver()
-    assert close is not None and close.close_range == CLOSE.close.settings() and dense.close_range is None
-    changed = CollisionAvoidance(close=type("OtherRange", (CloseRange,), {})())
-    assert replace(load_driver("mgail2"), avoidance=changed).dense_driver() is None
-
-
 @pytest.mark.parametrize("value", [0.0, -1.0, math.nan, math.inf, True, "2"])
 def test_settings_are_positive_numbers(value):
     with pytest.raises(ValueError, match="Expected deceleration of the collision avoidance above 0"):

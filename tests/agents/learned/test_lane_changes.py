@@ -315,21 +315,6 @@ def test_lane_changes_need_the_rule():
         replace(driver, avoidance=None)
 
 
-def test_compiled_rollouts_take_them_unless_they_were_changed():
-    class Others(LaneChanges):
-        """Begin at will."""
-
-    class Impatience(Waiting):
-        """Waits otherwise."""
-
-    driver = load_driver("mgail5")
-    dense = driver.dense_driver()
-    assert dense is not None and dense.hard_braking == 0.75 and dense.lane_changes == driver.changes.settings()
-    assert (dense.lane_changes.waits, load_driver("mgail4").dense_driver().lane_changes.waits) == (1.0, 0.0)
-    assert replace(driver, changes=Others()).dense_driver() is None
-    assert replace(driver, changes=LaneChanges(waiting=Impatience())).dense_driver() is None
-
-
 @pytest.mark.parametrize("changes", [CHANGES, WAITING])
 def test_lane_changes_are_read_from_the_file(tmp_path, changes):
     driver = replace(load_driver("mgail3"), changes=changes, hard_braking=0.9)

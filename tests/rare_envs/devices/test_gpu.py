@@ -16,7 +16,7 @@ import agents
 import rare_envs
 import samplers
 import training
-from rare_envs.simulation.recorded import RecordedRollouts
+from rare_envs.simulation.cuda_graphs import RecordedRollouts
 from rare_envs.simulation.rollout import rollout
 from rare_envs.study.replay import drive_again
 from training.data import scenes_of, synthetic_traffic

@@ -8,7 +8,7 @@ from rare_envs.simulation.compiled.failures import CompilerFails, NotCompiled, c
 @pytest.mark.parametrize(
     ("error", "line"),
     [
-        (ImportError("No module named 'numba'"), "install 'rare-envs\\[fast\\]' wherever it is simulated"),
+        (ImportError("No module named 'numba'"), "install 'rare-envs\\[driving\\]' wherever it is simulated"),
         (RuntimeError("no\nspace"), "fails here: RuntimeError: no space$"),
     ],
 )

@@ -27,9 +27,10 @@ X = np.array([[20.0, 15.0, 30.0]])
     [
         (CAR_FOLLOWING, {"measure": "thw"}, "measure 'thw'"),
         (CAR_FOLLOWING, {"ego": "human"}, "HumanDriver"),
-        (CAR_FOLLOWING, {"drivers": "mgail"}, "scenario 'car_following' with drivers"),
+        (CAR_FOLLOWING, {"drivers": "mgail"}, "worlds with drivers"),
         ("rare_envs/CutIn-v0", {"collisions": "any"}, "collisions of other vehicles"),
-        (CAR_FOLLOWING, {"ego": "imitation"}, "an ego that acts by lidar is not compiled in a scripted scenario"),
+        (CAR_FOLLOWING, {"ego": "imitation"}, "a LearnedEgo, is not compiled"),
+        ("rare_envs/Highway-v0", {}, "worlds with drivers are not compiled"),
     ],
 )
 def test_what_is_not_compiled_is_simulated_by_torch(env_id, arguments, reason):
@@ -67,7 +68,7 @@ def test_without_numba_torch_simulates(monkeypatch):
         warnings.simplefilter("error")
         problem = rare_envs.DrivingProblem(CAR_FOLLOWING)
     assert problem.core == "torch"
-    with pytest.raises(ValueError, match=r"numba is not installed: pip install 'rare-envs\[fast\]'"):
+    with pytest.raises(ValueError, match=r"numba is not installed: pip install 'rare-envs\[driving\]'"):
         rare_envs.DrivingProblem(CAR_FOLLOWING, core="numba")
 
 
@@ -121,7 +122,9 @@ def test_a_process_without_numba_says_what_it_lacks(monkeypatch):
     problem = rare_envs.DrivingProblem(CAR_FOLLOWING, core="numba")
     monkeypatch.delattr(sys.modules[selection.__package__], "scripted_rollouts")
     monkeypatch.setitem(sys.modules, f"{selection.__package__}.scripted_rollouts", None)
-    with pytest.raises(ValueError, match=r"install 'rare-envs\[fast\]' wherever it is simulated, or make it with core"):
+    with pytest.raises(
+        ValueError, match=r"install 'rare-envs\[driving\]' wherever it is simulated"
+    ):
         problem.evaluate(np.array([[20.0, 15.0, 30.0]]))
 
 
