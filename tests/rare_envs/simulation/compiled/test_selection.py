@@ -122,9 +122,7 @@ def test_a_process_without_numba_says_what_it_lacks(monkeypatch):
     problem = rare_envs.DrivingProblem(CAR_FOLLOWING, core="numba")
     monkeypatch.delattr(sys.modules[selection.__package__], "scripted_rollouts")
     monkeypatch.setitem(sys.modules, f"{selection.__package__}.scripted_rollouts", None)
-    with pytest.raises(
-        ValueError, match=r"install 'rare-envs\[driving\]' wherever it is simulated"
-    ):
+    with pytest.raises(ValueError, match=r"install 'rare-envs\[driving\]' wherever it is simulated"):
         problem.evaluate(np.array([[20.0, 15.0, 30.0]]))
 
 
