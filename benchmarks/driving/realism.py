@@ -29,8 +29,8 @@ from agents import LearnedDriver, load_driver, read_driver
 from agents.learned.networks import ACTION_SIZE
 from agents.learned.rule_driver import RuleDriver
 from benchmarks import RESULTS
+from benchmarks.samplers.runs import about
 from rare_envs.threads import use_one_thread
-from samplers.benchmark.runs import about
 from training.imitation.datasets import Source, load_scenes
 from training.imitation.evaluation.behaviour import Act, sampling_driver
 from training.imitation.evaluation.driving_statistics import BINS, DrivingStatistics, add_statistics

@@ -36,7 +36,6 @@ from benchmarks.driving.sim_agents import MOTORWAY, SCENE_ROLLOUTS, WOSAC_2024, 
 from rare_envs.control.lane_changing import LaneChangingDriver
 from rare_envs.threads import use_one_thread
 from rare_envs.traffic.neighbours import LaneTraffic
-from samplers.benchmark.runs import about
 from training.data.trajectories import DT
 from training.imitation.datasets import Source, load_scenes
 from training.imitation.evaluation.behaviour import Act, regular_starts, sampling_driver

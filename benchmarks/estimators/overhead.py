@@ -21,8 +21,7 @@ from rich.progress import track
 from threadpoolctl import threadpool_limits
 
 import samplers
-from benchmarks.estimators.compare_methods import parse_names
-from samplers.benchmark.runs import Meter, about
+from benchmarks.samplers.runs import Meter, about
 from samplers.limit_states import half_space
 from samplers.problem import FunctionProblem
 from samplers.serialization import to_json_value
@@ -96,7 +95,7 @@ def main(
     out: Annotated[Path | None, typer.Option("--json", help="Write the figures here.")] = None,
 ) -> None:
     """Measure, print the table and whether the default method is fast enough."""
-    names = parse_names(methods, list(samplers.METHODS), "method")
+    names = methods.split(",") if methods else list(samplers.METHODS)
     pairs = [(name, dim) for name in names for dim in TARGETS]
     console = Console(stderr=True)
     rows = [

@@ -13,9 +13,9 @@ from matplotlib.figure import Figure
 
 import rare_envs
 from benchmarks.papers.markdown import format_reproduction
+from benchmarks.samplers.runs import about
 from rare_envs.json_text import format_json
 from rare_envs.study.errors import BadInput
-from samplers.benchmark.runs import about
 from samplers.serialization import to_json_value
 
 

@@ -25,8 +25,8 @@ from benchmarks.papers.tian2024.replications import (
     run_replication,
 )
 from benchmarks.papers.tian2024.study import TianPlan, open_replications, record_replications
+from benchmarks.samplers.runs import map_jobs
 from rare_envs.json_text import format_json
-from samplers.benchmark.runs import map_jobs
 from samplers.serialization import to_json_value
 
 FURTHER = tuple(name for name, row in METHOD_ROWS.items() if not row.paper)

@@ -17,12 +17,12 @@ import typer
 
 import rare_envs
 import samplers
+from benchmarks.samplers.runs import about
 from benchmarks.simulation import highway_env_reference as reference
 from benchmarks.simulation.throughput import CAR_FOLLOWING, CUT_IN, HIGHWAY
 from benchmarks.simulation.timing import seconds
 from rare_envs.scenarios import VEHICLE_LENGTH, Others, Parameter, Scenario, State, straight
 from rare_envs.threads import use_one_thread
-from samplers.benchmark.runs import about
 
 BATCHES = (1, 10, 100, 1000, 10_000)
 SCENARIOS = {"car-following": CAR_FOLLOWING, "cut-in": CUT_IN, "highway, learned drivers": HIGHWAY}

@@ -28,7 +28,7 @@ from benchmarks.estimators.two_stage.repeated_seeds import (
     run_seed,
     summarise_runs,
 )
-from samplers.benchmark.runs import about
+from benchmarks.samplers.runs import about
 from samplers.serialization import to_json_value
 
 

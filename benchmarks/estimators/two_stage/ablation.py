@@ -24,7 +24,7 @@ from threadpoolctl import threadpool_limits
 import samplers
 from benchmarks.estimators.two_stage.repeated_seeds import NamedState, load_set
 from benchmarks.estimators.two_stage.setting_sensitivity import VariedTwoStage
-from samplers.benchmark.runs import about
+from benchmarks.samplers.runs import about
 from samplers.methods.two_stage.settings import DEFAULT_SETTINGS, TwoStageSettings
 from samplers.problem import FunctionProblem
 from samplers.serialization import to_json_value

@@ -22,9 +22,8 @@ import typer
 from threadpoolctl import threadpool_limits
 
 import samplers
-from benchmarks.estimators.targets import TARGET_PROBLEMS
-from samplers.benchmark.catalogue import PROBLEMS
-from samplers.benchmark.runs import about
+from benchmarks.samplers.problems import PROBLEMS
+from benchmarks.samplers.runs import about
 from samplers.problem import FloatArray, FunctionProblem
 from samplers.serialization import to_json_value
 
@@ -128,8 +127,9 @@ def load_set(path: Path) -> Iterator[NamedState]:
 
 def load_catalogue() -> Iterator[NamedState]:
     """Yield the problems of the benchmark's catalogue."""
-    for name in TARGET_PROBLEMS:
-        case = PROBLEMS[name]
+    for name, case in PROBLEMS.items():
+        if case.group in ("public", "driving"):
+            continue
         state = case.make()
         problem = state.problem(case.rotation, noise_seed=0)
         yield NamedState(name, problem.evaluate, state.dim, state.p)

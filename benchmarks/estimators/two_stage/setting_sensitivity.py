@@ -23,10 +23,9 @@ from rich.progress import track
 from threadpoolctl import threadpool_limits
 
 import samplers
-from benchmarks.estimators.compare_methods import parse_names
 from benchmarks.estimators.two_stage.variations import VARIATIONS
-from samplers.benchmark.catalogue import PROBLEMS
-from samplers.benchmark.runs import about, limit_state
+from benchmarks.samplers.problems import PROBLEMS, limit_state
+from benchmarks.samplers.runs import about
 from samplers.method import Goal, Steps
 from samplers.methods.two_stage.method import run_two_stage
 from samplers.methods.two_stage.settings import DEFAULT_SETTINGS, TwoStageSettings
@@ -154,7 +153,7 @@ def main(
     out: Annotated[Path | None, typer.Option("--json", help="Write the figures here.")] = None,
 ) -> None:
     """Run all variations and print the table."""
-    jobs = list(list_jobs(parse_names(only, list(VARIATIONS), "variation")))
+    jobs = list(list_jobs(only.split(",") if only else list(VARIATIONS)))
     command = f"python -m benchmarks.estimators.two_stage.setting_sensitivity {' '.join(sys.argv[1:])}"
     rows: list[Sensitivity] = []
     print(HEADER)

@@ -17,7 +17,7 @@ from typing import Annotated
 import typer
 
 from benchmarks.estimators.two_stage.repeated_seeds import SeededRun, read_runs
-from samplers.benchmark.runs import about
+from benchmarks.samplers.runs import about
 
 WORDS = 6
 """First words of a text that name its kind."""

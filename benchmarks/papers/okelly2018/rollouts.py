@@ -14,7 +14,7 @@ import numpy as np
 
 from benchmarks.papers.okelly2018.search import draw_chunk
 from benchmarks.run_lines import RunLines, drop_torn_line
-from samplers.benchmark.runs import map_jobs
+from benchmarks.samplers.runs import map_jobs
 from samplers.methods.cross_entropy import Product
 from samplers.problem import FloatArray
 

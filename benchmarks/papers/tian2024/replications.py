@@ -16,8 +16,8 @@ from benchmarks.papers.tian2024.catalogue import (
     SYSTEMS,
     TRAFFIC_BASE,
 )
+from benchmarks.samplers.runs import SeededEstimate, use_one_core
 from rare_envs.problem import DrivingProblem
-from samplers.benchmark.runs import SeededEstimate, use_one_core
 from samplers.estimation import estimate
 from samplers.method import whole_simulations
 from samplers.methods.two_stage.method import TwoStage

@@ -30,7 +30,7 @@ from benchmarks.papers.tian2024.replications import (
 )
 from benchmarks.papers.tian2024.tables import make_method_tables
 from benchmarks.run_lines import RunLines
-from samplers.benchmark.runs import map_jobs
+from benchmarks.samplers.runs import map_jobs
 
 REPLICATIONS_FILE = "runs.jsonl"
 SCALES = {"small": 5, "full": 20}

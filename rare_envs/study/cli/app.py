@@ -12,7 +12,6 @@ from typing import Annotated
 
 import typer
 
-from rare_envs.study.cli.commands.bench import bench_app
 from rare_envs.study.cli.commands.check_ego import check_ego_command
 from rare_envs.study.cli.commands.corpus import corpus_app
 from rare_envs.study.cli.commands.estimate import estimate_command, resume_command, show_report
@@ -203,14 +202,13 @@ app.command("export-ego")(export_ego_command)
 app.command("replay")(replay_command)
 app.command("export")(export_command)
 app.add_typer(corpus_app, name="corpus", cls=SummarisedCommands)
-app.add_typer(bench_app, name="bench", cls=SummarisedCommands)
 app.command("plan")(plan_command)
 app.command("report")(report_command)
 app.command("check-ego")(check_ego_command)
 app.command("serve-ego")(serve_ego_command)
 
 
-require_driving(app, but="bench")
+require_driving(app)
 add_examples(app)
 app.info.epilog = format_examples("")
 

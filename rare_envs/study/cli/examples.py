@@ -48,8 +48,6 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
     ),
     "corpus add": ("rare-envs corpus add runs/cutin --corpus corpus --most 5",),
     "corpus run": ("rare-envs corpus run --ego new.zip --corpus corpus --junit corpus.xml",),
-    "bench": ("rare-envs bench samplers --method mc,adss --runs 5",),
-    "bench samplers": ("rare-envs bench samplers --method auto,mine:sampler --set analytic --budget 1500 --runs 20",),
 }
 """Commands to examples of them, in one line each."""
 

@@ -73,18 +73,13 @@ class DrivingCommand(TyperCommand):
         return super().invoke(ctx)
 
 
-def require_driving(app: typer.Typer, but: str) -> None:
-    """Let all commands of an app be `DrivingCommand`s, those of its groups too.
-
-    Args:
-        app: The app.
-        but: Name of the group whose commands need no such library.
-    """
+def require_driving(app: typer.Typer) -> None:
+    """Let all commands of an app be `DrivingCommand`s, those of its groups too."""
     for command in app.registered_commands:
         command.cls = DrivingCommand
     for group in app.registered_groups:
-        if group.name != but and group.typer_instance is not None:
-            require_driving(group.typer_instance, but)
+        if group.typer_instance is not None:
+            require_driving(group.typer_instance)
 
 
 class OneLineErrors(SummarisedCommands):

@@ -1,7 +1,7 @@
 """Variations of two-stage's settings."""
 
 from benchmarks.estimators.two_stage.variations import VARIATIONS
-from samplers.benchmark.catalogue import PROBLEMS
+from benchmarks.samplers.problems import PROBLEMS
 from samplers.methods.two_stage.settings import DEFAULT_SETTINGS
 
 

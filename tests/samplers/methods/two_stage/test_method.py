@@ -6,7 +6,7 @@ import pytest
 from scipy import stats
 
 import samplers
-from samplers.benchmark.catalogue import PROBLEMS
+from benchmarks.samplers.problems import PROBLEMS
 from samplers.limit_states import Reference, four_branches, half_space, plateau, shell
 from samplers.problem import FunctionProblem
 

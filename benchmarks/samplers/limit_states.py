@@ -1,9 +1,9 @@
 """Kinds of limit states with known P[f(U) <= 0], U ~ N(0, I), as a benchmark needs them.
 
 More than `samplers.limit_states`, which it builds on: several regions in many dimensions, noise, jumps, ties, islands,
-intersections. All are written along the axes; N(0, I) is the same in every direction, so any rotation of them has the
-same p. `samplers.benchmark.catalogue` has the parameters; the probabilities are closed forms or one-dimensional
-integrals.
+intersections, dozens of regions, hundreds of dimensions without a direction that matters. All are written along the
+axes; N(0, I) is the same in every direction, so any rotation of them has the same p. `problems.py` has the parameters;
+the probabilities are closed forms or one-dimensional integrals, but for the random networks.
 """
 
 import functools
@@ -12,24 +12,23 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import log_ndtr
+from scipy.integrate import quad
+from scipy.special import log_ndtr, ndtr
 from scipy.stats import chi2, ncx2
 
 from samplers.limit_states import Reference, integrate, normal_cdf, normal_mean
 from samplers.problem import FloatArray, FunctionProblem
 
 PointFunction = Callable[[FloatArray], FloatArray]
+HIDDEN, OUTPUTS = 50, 10
+"""Units of a random network's layer, and its outputs."""
+NETWORKS = {30: (3.5, 3.0200e-4, 2.7e-6), 400: (3.3, 2.5473e-4, 2.5e-6)}
+"""Inputs to limit, p and its standard error, by 4e7 plain draws."""
 
 
 @dataclass(frozen=True)
 class LimitState:
-    """f, failing where f <= 0, and how likely that is.
-
-    Example:
-        >>> state = LimitState(lambda u: 3.0 - u[:, 0], dim=2, p=1.3499e-3)
-        >>> state.problem().evaluate(np.array([[3.5, 0.0]])).tolist()
-        [-0.5]
-    """
+    """f, failing where f <= 0, and how likely that is."""
 
     f: PointFunction
     """Maps points of N(0, I), shape (n, d), to (n,)."""
@@ -189,6 +188,38 @@ def hidden_box(slope: float = 0.5, beta: float = 4.6) -> LimitState:
 def never(dim: int = 4) -> LimitState:
     """No failure that anyone will see: f = 50 - u_1; p = Phi(-50) is 0 in double precision."""
     return LimitState(lambda u: np.asarray(50.0 - u[:, 0]), dim, 0.0)
+
+
+def slabs(dim: int, beta: float) -> LimitState:
+    """Beyond beta along any axis, either way: 2 d regions. f = beta - max |u|, p = 1 - (1 - 2 Phi(-beta))^d."""
+    p = -math.expm1(dim * math.log1p(-2.0 * float(ndtr(-beta))))
+    return LimitState(lambda u: beta - np.abs(u).max(axis=1), dim, p)
+
+
+def squares(dim: int, power: float, limit: float) -> LimitState:
+    """A weighted sum of squares: f = limit - sum_k k^(-power) u_k^2; p by inversion (Imhof 1961, equation 3.2)."""
+    weights = np.arange(1.0, dim + 1.0) ** -power
+
+    def integrand(t: float) -> float:
+        angle = 0.5 * np.arctan(weights * t).sum() - 0.5 * limit * t
+        return math.sin(angle) / (t * math.exp(0.25 * np.log1p((weights * t) ** 2).sum()))
+
+    p = 0.5 + quad(integrand, 0.0, np.inf, limit=1000)[0] / math.pi
+    return LimitState(lambda u: limit - u**2 @ weights, dim, p)
+
+
+def network(dim: int) -> LimitState:
+    """A random network of one layer: f = limit - max |tanh(2 u W) V|, W and V Gaussian of variance 1 / inputs."""
+    first, second = network_weights(dim)
+    limit, p, error = NETWORKS[dim]
+    return LimitState(lambda u: limit - np.abs(np.tanh(2.0 * u @ first) @ second).max(axis=1), dim, p, error)
+
+
+def network_weights(dim: int) -> tuple[FloatArray, FloatArray]:
+    """Return the weights of a random network's two layers, (dim, units) and (units, outputs)."""
+    rng = np.random.default_rng(3)
+    first = rng.standard_normal((dim, HIDDEN)) / math.sqrt(dim)
+    return first, rng.standard_normal((HIDDEN, OUTPUTS)) / math.sqrt(HIDDEN)
 
 
 def _rotated(f: PointFunction, rotation: FloatArray) -> PointFunction:

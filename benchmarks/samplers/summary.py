@@ -1,4 +1,4 @@
-"""Runs into figures: per method and problem, pooled, and whether warnings come with the runs that are wrong."""
+"""Runs into figures: per method and problem, faults beyond chance, and whether warnings come with the wrong runs."""
 
 import math
 import re
@@ -8,24 +8,32 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy import stats
+from scipy.special import ndtr, stdtrit
 
-from samplers.benchmark.runs import OWN_CATALOGUE, MethodRun, limit_state
+from benchmarks.samplers.problems import limit_state
+from benchmarks.samplers.runs import MethodRun
 from samplers.problem import FloatArray
 
 LONGEST_EXAMPLE = 100
 """Letters of an error in a table."""
+BIAS_ERRORS = 4.0
+"""Standard errors that a mean of many runs may be off: by chance 1 of 16,000 unbiased means is further off."""
+LEAST_RUNS = 5
+"""With fewer bias is not judged: they may agree by chance, as plain draws with equal numbers of hits do."""
+NOTICED_BIAS = 0.02
+"""Bias below which nobody would mind, over p."""
+NOMINAL_COVERAGE = 0.95
+CHANCE = 1e-3
+"""Probability that a method of nominal coverage is called one that covers too little."""
+READ_DIGITS = 1e-10
+"""Relative error that no draws reach in every run."""
+BUDGET_EXCESS = 0.01
+"""Share of the budget by which it may be exceeded."""
 
 
 @dataclass(frozen=True)
 class Cell:
-    """One method on one problem. NaN where a figure has no meaning, as ratios where p = 0.
-
-    Example:
-        >>> from samplers.benchmark import Job, run_all
-        >>> (cell,) = cells_of(run_all(Job("mc", "common_d4", seed, max_sim=1000) for seed in range(10)))
-        >>> cell.runs, cell.n_sim, cell.coverage
-        (10, 1000.0, 1.0)
-    """
+    """One method on one problem. NaN where a figure has no meaning, as ratios where p = 0."""
 
     method: str
     problem: str
@@ -81,19 +89,12 @@ class Cell:
         return float(found.low), float(found.high)
 
 
-def cells_of(runs: Iterable[MethodRun], catalogue: str = OWN_CATALOGUE) -> list[Cell]:
-    """Return one cell for each method, problem and budget, in the order of their first runs.
-
-    Example:
-        >>> from samplers.benchmark import Job, run_all
-        >>> jobs = [Job("mc", "common_d4", seed, budget) for seed in range(2) for budget in (500, 1000)]
-        >>> [(cell.max_sim, cell.runs) for cell in cells_of(run_all(jobs))]
-        [(500, 2), (1000, 2)]
-    """
+def cells_of(runs: Iterable[MethodRun]) -> list[Cell]:
+    """Return one cell for each method, problem and budget, in the order of their first runs."""
     groups: dict[tuple[str, str, int | None], list[MethodRun]] = defaultdict(list)
     for run in runs:
         groups[run.method, run.problem, run.max_sim].append(run)
-    states = [limit_state(group[0].problem, catalogue) for group in groups.values()]
+    states = [limit_state(group[0].problem) for group in groups.values()]
     return [cell_of(group, state.p, state.standard_error) for group, state in zip(groups.values(), states, strict=True)]
 
 
@@ -198,19 +199,12 @@ class Power:
     """Runs with each warning (numbers as #): wrong, right, neither."""
 
 
-def power_of(runs: Iterable[MethodRun], catalogue: str = OWN_CATALOGUE) -> Power:
-    """Return the power of the warnings over runs of one method.
-
-    Example:
-        >>> from samplers.benchmark import Job, run_all
-        >>> power = power_of(run_all(Job("mc", "common_d4", seed, 1000) for seed in range(10)))
-        >>> power.wrong, power.right
-        (0, 8)
-    """
+def power_of(runs: Iterable[MethodRun]) -> Power:
+    """Return the power of the warnings over runs of one method."""
     counts: Counter[str] = Counter()
     texts: dict[str, Counter[str]] = defaultdict(Counter)
     for run in runs:
-        off = own_errors_off(run, limit_state(run.problem, catalogue).p)
+        off = own_errors_off(run, limit_state(run.problem).p)
         kind = "wrong" if off > 4 else "right" if off <= 2 else "neither"
         counts[kind] += 1
         counts[f"{kind} warned"] += bool(run.warnings)
@@ -240,3 +234,79 @@ def _mean(values: Sequence[float] | FloatArray) -> float:
 def _spread(values: FloatArray) -> float:
     with np.errstate(invalid="ignore"):  # an infinite answer has no spread
         return float(np.std(values, ddof=1)) if len(values) > 1 else math.nan
+
+
+def find_faults(cell: Cell, knowable: bool = True) -> tuple[str, ...]:
+    """Return the faults of a method on a problem in words; none where it does what it claims.
+
+    Args:
+        cell: Its runs.
+        knowable: False where no method can know of a region of failure: bias and coverage are not judged there.
+    """
+    found = _find_broken_runs(cell)
+    if cell.max_sim is not None and cell.n_sim > (1 + BUDGET_EXCESS) * cell.max_sim:
+        found.append(f"makes {cell.n_sim / cell.max_sim:.2g} times the simulations of its budget")
+    if cell.same_points:  # one run, so that nothing is known of its bias and coverage
+        return (*found, _describe_one_run(cell))
+    ended = cell.runs - cell.raised
+    if not knowable or not ended:
+        return tuple(found)
+    if cell.p > 0 and cell.worst < READ_DIGITS:
+        found.append(f"p to {-math.log10(READ_DIGITS):.0f} digits in every run, as no draws give it")
+    bias = cell.mean_over_p - 1.0
+    error = math.hypot(cell.mean_se, cell.reference_error)
+    if ended >= LEAST_RUNS and abs(bias) > max(errors_allowed(ended) * error, NOTICED_BIAS) and not _is_bad_luck(cell):
+        found.append(f"biased: mean / p {cell.mean_over_p:.3g} +- {error:.2g}")
+    if _is_too_low(cell):
+        low, high = cell.coverage_interval
+        held = f"intervals hold p in {100 * cell.coverage:.0f} % of {cell.runs} runs"
+        found.append(f"{held} ({100 * low:.0f} to {100 * high:.0f} %)")
+    return tuple(found)
+
+
+def _find_broken_runs(cell: Cell) -> list[str]:
+    """Return faults of single runs, which need no chance to be called so."""
+    found = []
+    if cell.raised:
+        found.append(f"raised in {cell.raised} of {cell.runs} runs ({cell.example})")
+    if cell.impossible:
+        example = "" if cell.raised else f" ({cell.example})"
+        found.append(f"answers that cannot be in {100 * cell.impossible:.0f} % of the runs{example}")
+    if cell.hidden:
+        found.append(f"states fewer simulations than it made in {100 * cell.hidden:.0f} % of the runs")
+    if cell.overstated:
+        found.append(f"states more simulations than it made in {100 * cell.overstated:.0f} % of the runs")
+    if cell.without_f:
+        found.append(f"answers without a simulation in {100 * cell.without_f:.0f} % of the runs")
+    return found
+
+
+def _describe_one_run(cell: Cell) -> str:
+    held = "holds" if cell.coverage > 0 else "does not hold"
+    ratio = f", p over the true one {cell.mean_over_p:.3g}" if cell.p > 0 else ""
+    return f"the same points at every seed: {cell.runs} runs are one, whose interval {held} p{ratio}"
+
+
+def errors_allowed(runs: int) -> float:
+    """Return the standard errors that a mean of so many runs may be off, by Student's distribution."""
+    return float(stdtrit(runs - 1, ndtr(BIAS_ERRORS)))
+
+
+def _is_bad_luck(cell: Cell) -> bool:
+    """Return whether a mean below p may come from few hits or none, which show too small a spread.
+
+    The variance of a mean of hits is as its expectation, so that around p it is what was seen, over mean / p. Where
+    no run saw a failure, plain Monte Carlo of all simulations sees none with probability exp(-n p).
+    """
+    if cell.mean_over_p == 0:
+        return math.exp(-cell.p * cell.n_sim * cell.runs) > 2 * float(ndtr(-BIAS_ERRORS))
+    if not 0 < cell.mean_over_p < 1:
+        return False
+    error = math.hypot(cell.mean_se / math.sqrt(cell.mean_over_p), cell.reference_error)
+    return 1 - cell.mean_over_p <= BIAS_ERRORS * error
+
+
+def _is_too_low(cell: Cell) -> bool:
+    """Return whether a method that covers as it claims would hardly ever cover so little."""
+    held = round(cell.coverage * cell.runs)
+    return float(stats.binom.cdf(held, cell.runs, NOMINAL_COVERAGE)) < CHANCE

@@ -9,41 +9,30 @@ import platform
 import time
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import BrokenExecutor, Executor, ProcessPoolExecutor
-from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
-from functools import cache
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
 import scipy
+from threadpoolctl import threadpool_limits
 
-from samplers.benchmark.analytic_states import LimitState
-from samplers.benchmark.catalogue import BenchmarkProblem
-from samplers.benchmark.solvers import Solver, digest_method, find_method
-from samplers.estimation import estimate
-from samplers.method import Stepping
-from samplers.problem import FloatArray, FunctionProblem
-from samplers.result import Estimate
+from benchmarks.samplers.other_libraries import OTHER_SOLVERS, Solver
+from benchmarks.samplers.problems import find_problem, limit_state
+from samplers import METHODS, Estimate, FunctionProblem, Stepping, estimate
+from samplers.problem import FloatArray
 
 _Job = TypeVar("_Job")
 _Run = TypeVar("_Run")
 
-OWN_CATALOGUE = "samplers.benchmark.catalogue:PROBLEMS"
 GUARD_FACTOR = 50
 """Times its budget that a method of somebody else may simulate before it is stopped."""
 
 
 @dataclass(frozen=True)
 class Job:
-    """One run to be made.
-
-    Example:
-        >>> run = run_once(Job("mc", "lin_d2", seed=1, max_sim=1000))
-        >>> run.n_sim, run.stated, run.p, run.error
-        (1000, 1000, 0.0, '')
-    """
+    """One run to be made."""
 
     method: str
     """A name of `samplers.METHODS`, or `module:attribute`; see `find_method`."""
@@ -52,9 +41,7 @@ class Job:
     max_sim: int | None = None
     replicates: int = 1
     rotation: int | None = None
-    """Seed of the rotation of the input space; None for the catalogue's own."""
-    catalogue: str = OWN_CATALOGUE
-    """Module and attribute of the problems by name."""
+    """Seed of the rotation of the input space; None for the problem's own."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -72,13 +59,7 @@ class SeededEstimate:
 
 @dataclass(frozen=True, kw_only=True)
 class MethodRun(SeededEstimate):
-    """What came of a run.
-
-    Example:
-        >>> run = run_once(Job("mc", "common_d4", seed=0, max_sim=1000))
-        >>> run.low < run.p < run.high, run.calls
-        (True, 1)
-    """
+    """What came of a run."""
 
     problem: str
     n_sim: int
@@ -97,8 +78,6 @@ class MethodRun(SeededEstimate):
     """Simulations that the method states, None if it does not say; fewer than `n_sim` are hidden ones."""
     points: str = ""
     """Digest of the points at which f was evaluated, in their order: runs of other seeds have other ones."""
-    source: str = ""
-    """Digest of the code of a method of somebody else, version of another library; empty for our own."""
 
 
 class Meter:
@@ -139,30 +118,35 @@ class LimitReached(RuntimeError):
     """f was asked for more than it may be."""
 
 
-@cache
-def find_problem(name: str, catalogue: str = OWN_CATALOGUE) -> BenchmarkProblem:
-    """Return a problem of a catalogue.
+def find_method(name: str) -> Stepping | Solver:
+    """Return a method by its name, or by where it stands.
+
+    Args:
+        name: A name of `samplers.METHODS` or `OTHER_SOLVERS`; or `module:attribute`, the attribute a class with the
+            protocol of our methods (`samplers.testing.check_method` checks it) or a function that is called as
+            solver(problem, seed=..., max_sim=...) and returns p, low and high, with the c.o.v. if it knows it.
 
     Raises:
-        ValueError: It has no such problem.
+        ValueError: There is no such method.
     """
-    module, _, attribute = catalogue.partition(":")
-    problems = getattr(importlib.import_module(module), attribute)
-    if name not in problems:
-        raise ValueError(f"Unknown problem {name!r} of {catalogue}; known: {', '.join(problems)}.")
-    found: BenchmarkProblem = problems[name]
-    return found
-
-
-@cache
-def limit_state(name: str, catalogue: str = OWN_CATALOGUE) -> LimitState:
-    """Return the limit state of a problem; its p is computed once."""
-    return find_problem(name, catalogue).make()
-
-
-def rotation_of(job: Job) -> int | None:
-    """Return the seed of the rotation that the run is made under."""
-    return find_problem(job.problem, job.catalogue).rotation if job.rotation is None else job.rotation
+    if name in OTHER_SOLVERS:
+        return OTHER_SOLVERS[name]
+    if ":" not in name:
+        if name not in METHODS:
+            raise ValueError(
+                f"Unknown method {name!r}; known: {', '.join([*METHODS, *OTHER_SOLVERS])}, module:attribute."
+            )
+        return METHODS[name]()
+    module, _, attribute = name.partition(":")
+    try:
+        found = getattr(importlib.import_module(module), attribute)
+    except (ImportError, AttributeError) as error:
+        raise ValueError(f"Cannot load the method {name}: {error}") from None
+    if isinstance(found, type):
+        found = found()
+    if not isinstance(found, Stepping) and not callable(found):
+        raise ValueError(f"Expected {name} to be a method or a function, got {type(found).__name__}.")
+    return found  # type: ignore[no-any-return]  # either, by now
 
 
 def run_once(job: Job, method: Stepping | Solver | None = None) -> MethodRun:
@@ -171,18 +155,13 @@ def run_once(job: Job, method: Stepping | Solver | None = None) -> MethodRun:
     Args:
         job: The run; its method is found by name.
         method: The method itself instead, of which the job has a name of your choice.
-
-    Example:
-        >>> def certain(problem, seed, max_sim):
-        ...     return 1e-3, 0.9e-3, 1.1e-3
-        >>> run_once(Job("certain", "lin_d2", seed=0), certain).n_sim  # whatever it claims
-        0
     """
-    state = limit_state(job.problem, job.catalogue)
+    state = limit_state(job.problem)
+    rotation = find_problem(job.problem).rotation if job.rotation is None else job.rotation
     method = find_method(job.method) if method is None else method
     own = isinstance(method, Stepping)
     limit = None if own or job.max_sim is None else GUARD_FACTOR * job.max_sim
-    meter = Meter(state.problem(rotation_of(job), noise_seed=job.seed).evaluate, limit)
+    meter = Meter(state.problem(rotation, noise_seed=job.seed).evaluate, limit)
     problem = FunctionProblem(meter, state.dim)
     with use_one_core():
         start = time.process_time()
@@ -191,10 +170,11 @@ def run_once(job: Job, method: Stepping | Solver | None = None) -> MethodRun:
                 answer: Any = estimate(problem, method, seed=job.seed, max_sim=job.max_sim, replicates=job.replicates)
             else:
                 answer = method(problem, seed=job.seed, max_sim=job.max_sim)
-            run = read_answer(job, meter, time.process_time() - start, answer)
+            return read_answer(job, meter, time.process_time() - start, answer)
         except (Exception, SystemExit) as error:  # what a method does must not end a benchmark
-            run = record_failure(job, meter, time.process_time() - start, error)
-        return replace(run, source=digest_method(method))
+            run = _record(job, meter, time.process_time() - start, (math.nan,) * 4, "raised")
+            cause = meter.reached or error
+            return replace(run, error=f"{type(cause).__name__}: {cause}")
 
 
 def read_answer(job: Job, meter: Meter, seconds: float, answer: Any) -> MethodRun:
@@ -221,13 +201,6 @@ def read_answer(job: Job, meter: Meter, seconds: float, answer: Any) -> MethodRu
     return replace(run, warnings=tuple(warnings), stated=stated)
 
 
-def record_failure(job: Job, meter: Meter, seconds: float, error: BaseException) -> MethodRun:
-    """Return the record of a run that raised."""
-    run = _record(job, meter, seconds, (math.nan,) * 4, "raised")
-    cause = meter.reached or error
-    return replace(run, error=f"{type(cause).__name__}: {cause}")
-
-
 def _record(
     job: Job, meter: Meter, seconds: float, numbers: tuple[float, float, float, float], status: str
 ) -> MethodRun:
@@ -250,38 +223,19 @@ def _record(
     )
 
 
-def run_all(
-    jobs: Iterable[Job],
-    workers: int = 1,
-    once: Callable[[Job], MethodRun] = run_once,
-    executor: Executor | None = None,
-) -> Iterator[MethodRun]:
-    """Make the runs in order, in this process or in several.
-
-    Args:
-        jobs: Runs to be made.
-        workers: Processes; with 1 the runs are made in this one.
-        once: Makes one of them.
-        executor: Where the runs are made instead, for example a dask client's.
-
-    Example:
-        >>> [run.n_sim for run in run_all(Job("mc", "lin_d2", seed, max_sim=100) for seed in range(3))]
-        [100, 100, 100]
-    """
-    yield from map_jobs(once, jobs, workers, executor)
-
-
 def map_jobs(
     once: Callable[[_Job], _Run], jobs: Iterable[_Job], workers: int = 1, executor: Executor | None = None
 ) -> Iterator[_Run]:
-    """Return what a function gives for jobs of any kind, in order; see `run_all`.
+    """Return what a function gives for jobs of any kind, in order, from this process or from several.
+
+    Args:
+        once: Makes one of them.
+        jobs: What it is called with.
+        workers: Processes; with 1 the runs are made in this one.
+        executor: Where the runs are made instead, for example a dask client's.
 
     Raises:
         ChildProcessError: A worker process ended in the midst of a run.
-
-    Example:
-        >>> list(map_jobs(abs, [-1, 2]))
-        [1, 2]
     """
     if executor is not None:
         yield from executor.map(once, jobs)
@@ -293,20 +247,12 @@ def map_jobs(
             try:
                 yield from pool.map(once, jobs)
             except BrokenExecutor:
-                raise ChildProcessError(
-                    "A worker process ended in the midst of a run. The same command goes on; with one worker the runs "
-                    "are made in this process."
-                ) from None
+                raise ChildProcessError("A worker process ended in the midst of a run.") from None
 
 
-def use_one_core() -> AbstractContextManager[object]:
-    """Return a context in which linear algebra uses one thread, where threadpoolctl is installed."""
-    try:
-        from threadpoolctl import threadpool_limits
-    except ImportError:
-        return nullcontext()
-    limits: AbstractContextManager[object] = threadpool_limits(limits=1)
-    return limits
+def use_one_core() -> threadpool_limits:
+    """Return a context in which linear algebra uses one thread."""
+    return threadpool_limits(limits=1)
 
 
 def about(**settings: Any) -> dict[str, Any]:
