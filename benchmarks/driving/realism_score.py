@@ -33,6 +33,7 @@ from agents import LearnedDriver, load_driver
 from benchmarks import RESULTS
 from benchmarks.driving.realism import constant_velocity, round_numbers, rule_driver
 from benchmarks.driving.sim_agents import MOTORWAY, SCENE_ROLLOUTS, WOSAC_2024, motion_features, score_features
+from benchmarks.samplers.runs import about
 from rare_envs.control.lane_changing import LaneChangingDriver
 from rare_envs.threads import use_one_thread
 from rare_envs.traffic.neighbours import LaneTraffic
