@@ -1,0 +1,257 @@
+"""Page of results, from the committed records: `python -m benchmarks.results_page` writes `docs/results.md`.
+
+Every table names the command that made its record; the records in `benchmarks/results` have more than the page shows.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from benchmarks import RESULTS
+
+PAGE = Path(__file__).parents[1] / "docs" / "results.md"
+HEAD = """\
+# Results
+
+`python -m benchmarks.results_page` writes this page from the records in `benchmarks/results`, each of which has the
+command that made it. To read one:
+
+```python
+import json
+from pathlib import Path
+
+import rare_envs
+
+results = Path(rare_envs.__file__).parents[1] / "benchmarks" / "results"  # of a clone of the repository
+record = json.loads((results / "truth.json").read_text())
+for row in record["results"]:
+    print(f"{row['env_id']}, {row['base']}: p = {row['p']:.2e} by {row['rollouts']:,} rollouts")
+```
+
+```text
+rare_envs/CarFollowing-v0, us101-gap: p = 1.22e-04 by 300,000,000 rollouts
+rare_envs/CarFollowing-v0, highway: p = 2.58e-04 by 300,000,000 rollouts
+rare_envs/CutIn-v0, us101-15-offsets: p = 7.82e-04 by 300,000,000 rollouts
+rare_envs/CutIn-v0, highway: p = 3.07e-04 by 300,000,000 rollouts
+```
+
+- *mean / p*: mean of the estimates over the seeds, relative to the exact or reference probability.
+- *coverage*: share of the runs whose 95 % interval covers p.
+- *c.o.v. (own)*: coefficient of variation over the seeds, and the one that the runs state.
+- *gain*: simulations that plain Monte Carlo needs for the same mean square error, over those of the method.
+"""
+PAPERS = ("tian2024", "okelly2018", "okelly2018_full", "okelly2018_vision")
+COMPARED = ("mean of p", "gain over plain Monte Carlo", "p (", "variance, naive / sampler")
+"""Quantities of a paper's tables that the page shows, by their beginnings."""
+
+
+def read(name: str) -> dict[str, Any]:
+    """Return a committed record."""
+    record: dict[str, Any] = json.loads((RESULTS / f"{name}.json").read_text(encoding="utf-8"))
+    return record
+
+
+def format_table(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """Return a table as Markdown.
+
+    Example:
+        >>> print(format_table(["a", "b"], [["1", "2"]]))
+        | a | b |
+        |---|---|
+        | 1 | 2 |
+    """
+    return "\n".join(f"| {' | '.join(row)} |" for row in [heads, *rows]).replace(
+        f"| {' | '.join(heads)} |", f"| {' | '.join(heads)} |\n{'|---' * len(heads)}|", 1
+    )
+
+
+def name_of(env_id: str) -> str:
+    """Return an environment's id without its namespace."""
+    return env_id.removeprefix("rare_envs/")
+
+
+def format_traffic() -> Iterator[str]:
+    """Yield the section of methods in traffic."""
+    record = read("against_truth")
+    yield f"## Methods in traffic\n\n`{record['command']}`, against the 300 million rollouts above.\n"
+    heads = ("scenario, base", "method", "mean / p", "coverage", "c.o.v. (own)", "simulations", "gain")
+    yield format_table(
+        heads,
+        (
+            (
+                f"{name_of(cell['env_id'])}, {cell['base']}",
+                f"`{cell['method']}`",
+                f"{cell['mean'] / cell['truth']:.3f}",
+                f"{cell['coverage']:.0%}",
+                _format_cov(cell),
+                f"{cell['n_sim']:,.0f}",
+                f"{cell['gain']:,.3g}",
+            )
+            for cell in record["cells"]
+            if cell["method"] != "auto"
+        ),
+    )
+
+
+def format_known() -> Iterator[str]:
+    """Yield the section of limit states with known p, worst gain first."""
+    records = [read(f"two_stage_seeds_{name}") for name in ("third", "hard", "visible", "blind")]
+    yield "## Two-stage where p is known\n\n6,000 simulations, 60 seeds each, worst gain first. *low : high* counts"
+    yield "intervals wholly below and wholly above p; *error / own* is the root mean square of a run's error over the"
+    yield "standard error that it states.\n"
+    yield from (f"- `{record['about']['command'].partition(' --')[0]}`" for record in records[:1])
+    yield ""
+    rows = sorted((row for record in records for row in record["rows"] if row["gain"] is not None), key=lambda row: float(row["gain"]))
+    heads = ("problem", "p", "gain", "coverage", "low : high", "c.o.v. (own)", "error / own")
+    yield format_table(
+        heads,
+        (
+            (
+                row["problem"],
+                f"{row['p']:.2g}",
+                f"{row['gain']:,.3g}",
+                f"{row['coverage']:.0%}",
+                f"{row['low']} : {row['high']}",
+                _format_cov(row),
+                f"{row['error_over_own']:.2f}",
+            )
+            for row in rows
+        ),
+    )
+
+
+def format_few() -> Iterator[str]:
+    """Yield the section of small budgets."""
+    record = read("few_simulations")
+    yield "## The surrogate with 300 simulations\n"
+    rows = [row for row in record["rows"] if row["max_sim"] == 300 and row["runs"] >= 5]
+    yield format_table(
+        ("problem", "d", "p", "runs", "gain", "coverage", "c.o.v. (own)"),
+        (
+            (
+                row["problem"],
+                str(row["dim"]),
+                f"{row['p']:.1e}",
+                str(row["runs"]),
+                f"{row['gain']:,.3g}",
+                f"{row['coverage']:.0%}",
+                _format_cov(row),
+            )
+            for row in rows
+        ),
+    )
+
+
+def _format_cov(row: Mapping[str, Any]) -> str:
+    """Return the spread over seeds and what runs state, an en dash where a run does not know it."""
+    shown = ["–" if row[key] is None else f"{row[key]:.3f}" for key in ("cov", "own_cov")]
+    return f"{shown[0]} ({shown[1]})"
+
+
+def format_bases() -> Iterator[str]:
+    """Yield the section of intervals from refits."""
+    record = read("recipe_coverage")
+    yield f"## Intervals of the base distribution\n\n`{record['command']}`: worlds with known p, coordinates and"
+    yield "components chosen anew in each refit.\n"
+    yield format_table(
+        ("world", "draws", "covers p", "wholly below p", "not determined", "sampling interval covers p"),
+        (
+            (
+                f"{world['name']}, {world['events']} events",
+                str(world["repetitions"]),
+                *(f"{world[key]:.0%}" for key in ("covered", "below", "undetermined", "sampling_covered")),
+            )
+            for world in record["worlds"]
+        ),
+    )
+
+
+def format_egos(ids: frozenset[str]) -> Iterator[str]:
+    """Yield the section of the shipped egos.
+
+    Args:
+        ids: Environments that there are.
+    """
+    record = read("egos")
+    yield f"## Shipped egos\n\n`{record['command']}`: p of a collision within 10 s by two-stage.\n"
+    cells = [cell for cell in record["cells"] if cell["method"] == "two-stage" and cell["env_id"] in ids]
+    yield format_table(
+        ("scenario", "ego", "p", "95 % interval", "simulations", "warnings", "likeliest crash"),
+        (
+            (
+                name_of(cell["env_id"]),
+                f"`{cell['ego']}`" + (f", {cell['steps']:,} steps" if cell["steps"] else ""),
+                f"{cell['p']:.1e}",
+                f"{cell['low']:.1e} to {cell['high']:.1e}",
+                f"{cell['n_sim']:,}",
+                str(len(cell["warnings"])),
+                cell["words"] or "none found",
+            )
+            for cell in cells
+        ),
+    )
+
+
+def format_papers() -> Iterator[str]:
+    """Yield the section of both papers: p and gains; the records have every row."""
+    yield "## Papers\n\nWhat the papers print beside what this package finds; every row, the released code and the"
+    yield "reasons of differences are in the records, and in `reproduction.md` of `python -m benchmarks.papers`.\n"
+    for name in PAPERS:
+        record = read(name)
+        rows = [
+            (*value["labels"], value["quantity"], _number(value["paper"]), _number(value["ours"]))
+            for table in record["tables"]
+            for value in table["values"]
+            if value["quantity"].startswith(COMPARED) and None not in (value["paper"], value["ours"])
+        ]
+        yield f"\n`{record['command']}`\n"
+        yield format_table(("row", "of", "quantity", "paper", "ours"), rows)
+
+
+def _number(value: float) -> str:
+    return f"{value:.3g}" if 1e-3 <= abs(value) < 1000 else f"{value:,.0f}" if value >= 1000 else f"{value:.2e}"
+
+
+def format_speed() -> Iterator[str]:
+    """Yield the section of speed."""
+    record = read("throughput")
+    yield "## Speed\n\n`make bench`: rates over those of HighwayEnv's own objects in the same process"
+    yield f"({record['machine']['processor']}, one core).\n"
+    rows = [(key.replace("_", " "), row) for key, row in record["results"].items() if row.get("ratio")]
+    yield format_table(
+        ("what", "times as fast", "least to most"),
+        (
+            (name, f"{row['ratio']:,.3g}", f"{row['ratio_min']:,.3g} to {row['ratio_max']:,.3g}")
+            for name, row in rows
+            if "ratio_min" in row
+        ),
+    )
+
+
+def format_page() -> str:
+    """Return the page as Markdown."""
+    import rare_envs
+
+    sections = (
+        format_traffic(),
+        format_known(),
+        format_few(),
+        format_bases(),
+        format_egos(frozenset(rare_envs.ENV_IDS)),
+        format_papers(),
+        format_speed(),
+    )
+    return "\n".join([HEAD, *("\n".join(section) + "\n" for section in sections)])
+
+
+def main() -> None:
+    """Write the page."""
+    PAGE.write_text(format_page(), encoding="utf-8")
+    print(f"Wrote {PAGE}.")
+
+
+if __name__ == "__main__":
+    main()
