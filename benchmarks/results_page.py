@@ -43,7 +43,7 @@ rare_envs/CutIn-v0, highway: p = 3.07e-04 by 300,000,000 rollouts
 - *c.o.v. (own)*: coefficient of variation over the seeds, and the one that the runs state.
 - *gain*: simulations that plain Monte Carlo needs for the same mean square error, over those of the method.
 """
-PAPERS = ("tian2024", "okelly2018", "okelly2018_full", "okelly2018_vision")
+SHOWN_PAPERS = ("tian2024", "okelly2018_full", "okelly2018_vision")
 COMPARED = ("mean of p", "gain over plain Monte Carlo", "p (", "variance, naive / sampler")
 """Quantities of a paper's tables that the page shows, by their beginnings."""
 
@@ -199,7 +199,7 @@ def format_papers() -> Iterator[str]:
     """Yield the section of both papers: p and gains; the records have every row."""
     yield "## Papers\n\nWhat the papers print beside what this package finds; every row, the released code and the"
     yield "reasons of differences are in the records, and in `reproduction.md` of `python -m benchmarks.papers`.\n"
-    for name in PAPERS:
+    for name in SHOWN_PAPERS:
         record = read(name)
         rows = [
             (*value["labels"], value["quantity"], _number(value["paper"]), _number(value["ours"]))

@@ -22,9 +22,8 @@ from typing import Any
 
 from benchmarks.papers.okelly2018.reproduction import reproduce_okelly2018
 from benchmarks.papers.okelly2018.study import HighwayStudy
-from benchmarks.papers.page import PAPERS
 from benchmarks.papers.record import discard_runs
-from benchmarks.papers.renew import OWN_METHOD, renew
+from benchmarks.papers.renew import OWN_METHOD, PAPERS, renew
 from benchmarks.papers.tian2024.study import REPLICATIONS_FILE, SCALES, TianPlan, reproduce_tian2024
 from rare_envs.study.errors import BadInput
 from rare_envs.threads import use_one_thread

@@ -6,6 +6,7 @@ same seeds, without the hours of the other rows.
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Sequence
 from pathlib import Path
@@ -16,8 +17,6 @@ from benchmarks.papers.okelly2018.estimates import ThresholdEstimate
 from benchmarks.papers.okelly2018.reproduction import make_okelly_record
 from benchmarks.papers.okelly2018.study import HighwayStudy, estimate_own
 from benchmarks.papers.okelly2018.summary import compare_own
-from benchmarks.papers.page import PAPERS, read_records
-from benchmarks.papers.page import main as write_page
 from benchmarks.papers.tian2024.catalogue import METHOD_ROWS
 from benchmarks.papers.tian2024.figures import collect_figures
 from benchmarks.papers.tian2024.replications import (
@@ -31,9 +30,16 @@ from samplers.serialization import to_json_value
 
 FURTHER = tuple(name for name, row in METHOD_ROWS.items() if not row.paper)
 """Methods of Tian et al.'s tables that their paper does not have."""
+PAPERS = ("tian2024", "okelly2018", "okelly2018_full", "okelly2018_vision")
+"""Committed records: the `reproduction.json` of a run."""
 OWN_METHOD = "two-stage"
 """The default method, whose rows O'Kelly et al.'s tables have."""
 _NUMBERS = ("seed", "p", "low", "high", "cov", "n_sim", "simulated", "final", "levels")
+
+
+def read_records() -> dict[str, dict[str, Any]]:
+    """Return the committed records by paper."""
+    return {paper: json.loads((RESULTS / f"{paper}.json").read_text(encoding="utf-8")) for paper in PAPERS}
 
 
 def read_replications(record: dict[str, Any]) -> list[ReplicationRun]:
@@ -99,7 +105,7 @@ def renew_okelly(record: dict[str, Any], folder: Path, own: bool = True) -> dict
 
 
 def renew(folder: Path, papers: Sequence[str] = PAPERS, methods: Sequence[str] = (OWN_METHOD,)) -> None:
-    """Put rows of our own methods, made anew, into committed records, and write the page of the papers.
+    """Put rows of our own methods, made anew, into committed records.
 
     Args:
         folder: Of the new runs.
@@ -114,4 +120,3 @@ def renew(folder: Path, papers: Sequence[str] = PAPERS, methods: Sequence[str] =
         else:
             anew = renew_okelly(record, folder / paper, OWN_METHOD in methods)
         (RESULTS / f"{paper}.json").write_text(format_json(anew) + "\n", encoding="utf-8")
-    write_page()

@@ -22,7 +22,7 @@ from benchmarks.papers.okelly2018.rollouts import split_jobs
 from benchmarks.papers.okelly2018.scales import CORE_SPEEDS, PRINTED_SEARCH, SEARCHES
 from benchmarks.papers.okelly2018.search import draw_chunk, make_base, take_step
 from benchmarks.papers.okelly2018.study import HighwayStudy
-from benchmarks.papers.page import read_records
+from benchmarks.papers.renew import read_records
 from rare_envs.threads import use_one_thread
 
 

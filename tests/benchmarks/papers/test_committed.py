@@ -1,11 +1,10 @@
-"""The page about papers is what the committed records give, and the records are what the command gives."""
+"""The committed records are what the command gives."""
 
 from __future__ import annotations
 
 import pytest
 
-from benchmarks.papers.page import PAPERS_PAGE, format_papers_page, format_scales, read_records
-from benchmarks.papers.renew import read_replications
+from benchmarks.papers.renew import read_records, read_replications
 from benchmarks.papers.tian2024.replications import ReplicationJob, ReplicationRun, run_replication
 from benchmarks.papers.tian2024.tables import make_method_tables
 from rare_envs.threads import use_one_thread
@@ -25,19 +24,6 @@ def runs_of(record, scenario: str, system: str, method: str):
         if (runs["scenario"], runs["system"], runs["method"]) == (scenario, system, method)
     ]
     return found
-
-
-def test_the_page_is_what_the_records_give() -> None:
-    assert PAPERS_PAGE.read_text(encoding="utf-8") == format_papers_page(), "run python -m benchmarks.papers.page"
-
-
-def test_the_page_says_of_each_record_what_was_run_of_its_scale() -> None:
-    text = format_scales(read_records())
-    rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in text.splitlines() if line.startswith("| O'K")]
-    assert [row[2:] for row in rows] == [["192,000", "small"], ["3,700,000", "full"], ["20,000", "small"]]
-    assert [row[1] for row in rows[:2]] == ["192,000 rollouts", "3,700,000 rollouts"]
-    made = int(rows[2][1].replace(",", "").partition(" ")[0])
-    assert ("not complete" in text) == (made < 20_000)
 
 
 @pytest.mark.parametrize(
