@@ -104,7 +104,10 @@ def format_known() -> Iterator[str]:
     yield "standard error that it states.\n"
     yield from (f"- `{record['about']['command'].partition(' --')[0]}`" for record in records[:1])
     yield ""
-    rows = sorted((row for record in records for row in record["rows"] if row["gain"] is not None), key=lambda row: float(row["gain"]))
+    rows = sorted(
+        (row for record in records for row in record["rows"] if row["gain"] is not None),
+        key=lambda row: float(row["gain"]),
+    )
     heads = ("problem", "p", "gain", "coverage", "low : high", "c.o.v. (own)", "error / own")
     yield format_table(
         heads,

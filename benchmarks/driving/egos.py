@@ -3,7 +3,8 @@
     python -m benchmarks.driving.egos
 
 trains a PPO and a DQN ego in each scenario as the demo does, unless they are there already, asks `TwoStage` and
-`AdaptiveSubsetSimulation` about every ego in every scenario, and writes benchmarks/results/egos.json. What that file has is not simulated again, but for the egos that are named: `--only
+`AdaptiveSubsetSimulation` about every ego in every scenario, and writes
+benchmarks/results/egos.json. What that file has is not simulated again, but for the egos that are named: `--only
 vision,ppo`. The rows of `vision`, whose pictures take time, come by
 
     python -m benchmarks.driving.egos --only vision --methods two-stage --env HardBrake-v0 --at-most 600
@@ -35,6 +36,8 @@ BASES = {"rare_envs/CarFollowing-v0": "us101-gap"}
 """Base distributions in place of the default, where collisions are too rare under that to compare egos."""
 MOST = {"vision": 1500}
 """Simulations of one run at most; the others get what the methods take by themselves."""
+
+
 @dataclass(frozen=True)
 class EgoResult:
     """One ego in one scenario, by one method."""
@@ -66,9 +69,7 @@ def train_cached(algo: str, env_id: str, steps: int, folder: Path) -> Path:
     return path if path.exists() else train_ego(env_id, algo, steps, seed=0, out=path, base=BASES.get(env_id))
 
 
-def evaluate_ego(
-    env_id: str, ego: str, method: str, steps: int, runs: Path, at_most: int | None = None
-) -> EgoResult:
+def evaluate_ego(env_id: str, ego: str, method: str, steps: int, runs: Path, at_most: int | None = None) -> EgoResult:
     """Estimate, and name the likeliest failure that the first of `METHODS` has found.
 
     Args:

@@ -7,8 +7,7 @@ import copy
 import pytest
 
 from benchmarks.papers import renew
-from benchmarks.papers.renew import read_records
-from benchmarks.papers.renew import renew_okelly, renew_tian
+from benchmarks.papers.renew import read_records, renew_okelly, renew_tian
 from benchmarks.papers.tian2024.replications import ReplicationJob
 from tests.benchmarks.papers.same_records import assert_same
 
