@@ -72,8 +72,9 @@ def load_ego(
     Args:
         spec: "idm"; "human", an attentive human driver; either with other parameters as "idm?time_headway=2&exponent=2"
             (fields of `rare_envs.IDM` and `rare_envs.control.human_driver.HumanDriverModel`); "imitation", the shipped
-            ego with lidar; "vision", PilotNet on the front camera; "mgail", "gail" or "bc", drivers of the traffic,
-            which as egos act by their mean actions; a path to a `.safetensors` with one of these kinds; a path to a
+            ego with lidar; "vision", PilotNet on the front camera; "mgail" or "gail", drivers of the traffic,
+            which as egos act by their mean actions ("mgail?rules=0" by its network alone); a path to a `.safetensors`
+            with one of these kinds; a path to a
             `.zip` saved by Stable-Baselines3; "hf:USER/REPOSITORY", such a `.zip` of the Hugging Face Hub
             (`agents.sb3.hub`); a path to an `.onnx` file (see `agents.onnx.ego.OnnxEgo` for its form);
             `module:function`, a function without arguments that returns an ego (modules in the working directory are
@@ -190,14 +191,14 @@ def find_ego_kind(spec: str) -> EgoKind:
     """Return the kind of ego of a name, file, address or function; the header identifies a `.safetensors` file.
 
     Example:
-        >>> [find_ego_kind(spec) for spec in ("idm", "bc", "tcp://host:5555", "noisy:idm", "ego.onnx", "file:make")]
+        >>> [find_ego_kind(spec) for spec in ("idm", "gail", "tcp://host:5555", "noisy:idm", "ego.onnx", "file:make")]
         ['rule', 'learned', 'remote', 'noisy', 'onnx', 'function']
     """
     if spec.partition("?")[0] in (RULE_BASED, HUMAN):
         return "rule"
     if spec == VISION or (spec.endswith(SUFFIX) and holds_vision(spec)):
         return "vision"
-    if spec in (*SHIPPED_DRIVERS, *SHIPPED_EGOS) or spec.endswith(SUFFIX):
+    if spec.partition("?")[0] in (*SHIPPED_DRIVERS, *SHIPPED_EGOS) or spec.endswith(SUFFIX):
         return "learned"
     if spec.startswith("process:"):
         return "process"

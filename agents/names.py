@@ -10,5 +10,5 @@ VISION = "vision"
 """The shipped ego with a camera."""
 SHIPPED_EGOS = ("imitation",)
 """Shipped drivers that were trained to be egos: by their mean actions they keep lane and distance, see docs/egos.md."""
-SHIPPED_DRIVERS = ("mgail", "mgail2", "mgail3", "mgail4", "mgail5", "gail", "bc")
+SHIPPED_DRIVERS = ("mgail", "gail")
 """Shipped drivers of the traffic."""

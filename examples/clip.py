@@ -27,7 +27,7 @@ def main(
     at: Annotated[float, typer.Option(help="Moment of the PNG [s].")] = 5.0,
     seconds: Annotated[float, typer.Option(help="Length of the clip [s].")] = 20.0,
     drivers: Annotated[
-        str, typer.Option(help="As for rare-envs estimate: mgail5, mgail, idm or a file, say.")
+        str, typer.Option(help="As for rare-envs estimate: mgail, mgail?rules=0, idm or a file, say.")
     ] = "mgail",
     ego: Annotated[str, typer.Option(help="An ego as for rare-envs estimate.")] = "mgail",
     env: Annotated[str, typer.Option(help="Environment.")] = "rare_envs/Highway-v0",

@@ -71,10 +71,10 @@ def set_up(
         dt: Tick [s].
         base: Distribution of the scenario's own parameters: the name of a shipped one, the path of a JSON file, or a
             distribution object; None takes the scenario's default.
-        drivers: Drivers of the vehicles around the ego: "mgail", "gail", "bc", "idm", "idm+mobil" (which changes lanes
-            too), the path of a driver's file, a `Background` or a `TrafficBackground`; None takes the scenario's
-            default, which is its script but for the highway. The weights of learned drivers are parameters of the
-            scenario.
+        drivers: Drivers of the vehicles around the ego: "mgail", "mgail?rules=0", "gail", "idm", "idm+mobil"
+            (which changes lanes too), the path of a driver's file, a `Background` or a `TrafficBackground`; None takes
+            the scenario's default, which is its script but for the highway. The weights of learned drivers are
+            parameters of the scenario.
         noise: What becomes of the drivers' noise. True: it is part of x, standard normal columns behind the others.
             "fixed": one sequence for all x, so that probabilities are conditional on it. False: mean actions.
         collisions: Which count: those of the "ego", or "any", those between two other vehicles too.

@@ -28,6 +28,7 @@ from agents.learned.lane_changes import LaneChanges
 from agents.learned.networks import ACTION_SIZE, FEATURE_CLIP, FEATURE_SIZE, HEAD_SIZE, Policy, Scaling
 from agents.learned.rule_driver import RuleDriver
 from agents.learned.weight_distribution import WeightDistribution
+from agents.settings import read_settings
 from agents.names import LANE_CHANGING, RULE_BASED, SHIPPED_DRIVERS, SHIPPED_EGOS
 from rare_envs.control.lane_changing import LaneChangingDriver
 from rare_envs.files import replace_file
@@ -48,7 +49,7 @@ class Provenance:
     """Origin of a driver: data, training and measured quality.
 
     Example:
-        >>> Provenance(kind="bc", command="python train.py", data="own recordings", data_licence="CC0").metrics
+        >>> Provenance(kind="gail", command="python train.py", data="own recordings", data_licence="CC0").metrics
         {}
     """
 
@@ -66,13 +67,21 @@ class Provenance:
     """Settings of the fit of the distribution of its weights."""
 
 
+@dataclass(frozen=True)
+class DriverSettings:
+    """What can be set in the name of a shipped driver."""
+
+    rules: bool = True
+    """Whether its rules bound its actions and change lanes."""
+
+
 def load_driver(name: str | PathLike[str]) -> LearnedDriver | RuleDriver | LaneChangingDriver:
     """Load a driver by its name or from its file.
 
     Args:
-        name: "mgail5", "mgail4", "mgail3", "mgail2", "mgail", "gail" or "bc", which are shipped, and "imitation", which
-            was trained to be an ego; "idm", the rule-based driver, and "idm+mobil", which changes lanes too; or the
-            path of a file that `save_driver` wrote.
+        name: "mgail" or "gail", which are shipped, and "imitation", which was trained to be an ego; "mgail?rules=0", it
+            without its rules; "idm", the rule-based driver, and "idm+mobil", which changes lanes too; or the path of a
+            file that `save_driver` wrote.
 
     Returns:
         A `LearnedDriver`, or a `RuleDriver` or `LaneChangingDriver` with its default parameters.
@@ -82,8 +91,10 @@ def load_driver(name: str | PathLike[str]) -> LearnedDriver | RuleDriver | LaneC
         ValueError: The name is none of these, or the file is no driver.
 
     Example:
-        >>> load_driver("bc").name
-        'bc'
+        >>> load_driver("gail").name
+        'gail'
+        >>> load_driver("mgail?rules=0").changes is None
+        True
         >>> load_driver("idm").noisy
         False
     """
@@ -92,9 +103,12 @@ def load_driver(name: str | PathLike[str]) -> LearnedDriver | RuleDriver | LaneC
         return RuleDriver()
     if text == LANE_CHANGING:
         return LaneChangingDriver()
-    if text in (*SHIPPED_DRIVERS, *SHIPPED_EGOS):
-        with resources.as_file(resources.files("agents") / "data" / f"{text}{SUFFIX}") as path:
-            return read_driver(path)
+    shipped, _, query = text.partition("?")
+    if shipped in (*SHIPPED_DRIVERS, *SHIPPED_EGOS):
+        settings = DriverSettings(**read_settings(DriverSettings, query))
+        with resources.as_file(resources.files("agents") / "data" / f"{shipped}{SUFFIX}") as path:
+            driver = read_driver(path)
+        return driver if settings.rules else driver.without_rules()
     if text.endswith(SUFFIX) or Path(text).is_file():
         return read_driver(text)
     names = (*SHIPPED_DRIVERS, *SHIPPED_EGOS, RULE_BASED, LANE_CHANGING)
@@ -121,10 +135,10 @@ def save_driver(driver: LearnedDriver, provenance: Provenance, path: str | PathL
     Example:
         >>> import tempfile
         >>> with tempfile.TemporaryDirectory() as folder:
-        ...     origin = Provenance(kind="bc", command="-", data="-", data_licence="CC0")
-        ...     path = save_driver(load_driver("bc"), origin, Path(folder) / "mine.safetensors")
+        ...     origin = Provenance(kind="gail", command="-", data="-", data_licence="CC0")
+        ...     path = save_driver(load_driver("gail"), origin, Path(folder) / "mine.safetensors")
         ...     print(read_driver(path).name, read_provenance(path).data_licence)
-        bc CC0
+        gail CC0
     """
     path = Path(path)
     tensors = {_POLICY + name: value.detach().cpu().contiguous() for name, value in driver.policy.state_dict().items()}

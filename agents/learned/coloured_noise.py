@@ -106,3 +106,5 @@ class AutoregressiveNoise:
 
 WHITE_NOISE = AutoregressiveNoise()
 """Independent from tick to tick."""
+HUMAN_NOISE = AutoregressiveNoise.from_oscillators(frequency=(1.70, 1.57), damping=(0.845, 0.40))
+"""With the autocorrelation of what cloning leaves unexplained in the record, within 0.03 up to 1 s."""

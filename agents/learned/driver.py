@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from agents.learned.collision_avoidance import CloseRange, CollisionAvoidance
-from agents.learned.coloured_noise import WHITE_NOISE, AutoregressiveNoise
+from agents.learned.coloured_noise import HUMAN_NOISE, WHITE_NOISE, AutoregressiveNoise
 from agents.learned.lane_changes import STATE_SIZE, ChangeState, LaneChanges, Waiting
 from agents.learned.networks import (
     ACTION_SIZE,
@@ -192,6 +192,10 @@ class LearnedDriver:
         known = (AutoregressiveNoise, CollisionAvoidance, CloseRange, LaneChanges, Waiting)
         return all(part is None or type(part) is kind for part, kind in zip(parts, known, strict=True))
 
+    def without_rules(self) -> "LearnedDriver":
+        """Return the network alone, with the noise of recorded driving: no bounds and no lane changes by rule."""
+        return replace(self, colour=HUMAN_NOISE, avoidance=None, hard_braking=1.0, changes=None)
+
     def to(self, device: torch.device) -> "LearnedDriver":
         """Return the driver with a copy of its network on a device."""
         return replace(self, policy=copy.deepcopy(self.policy).to(device))
@@ -242,7 +246,7 @@ def replace_head(policy: Policy, weights: Tensor) -> Policy:
 
     Example:
         >>> from agents import load_driver
-        >>> changed = replace_head(load_driver("bc").policy, torch.zeros(404))
+        >>> changed = replace_head(load_driver("gail").policy, torch.zeros(404))
         >>> changed(torch.zeros(1, 51))[0].tolist()
         [[0.0, 0.0]]
     """

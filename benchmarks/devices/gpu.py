@@ -37,7 +37,7 @@ QUESTIONS: dict[str, dict[str, Any]] = {
     "cut_in_human": {"env_id": CUT_IN, "ego": "human"},
     "highway": {"env_id": HIGHWAY},
     "highway_lidar_ttc": {"env_id": HIGHWAY, "measure": "lidar_ttc", "ego": "imitation"},
-    "highway_mgail5": {"env_id": HIGHWAY, "drivers": "mgail5"},
+    "highway_mgail": {"env_id": HIGHWAY, "drivers": "mgail"},
 }
 """Problems by name."""
 COMPILED = ("car_following", "cut_in", "highway")

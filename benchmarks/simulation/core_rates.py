@@ -25,7 +25,7 @@ from rare_envs.threads import use_one_thread
 
 CORES = ("torch", "numba")
 HARD_BRAKE = "rare_envs/HardBrake-v0"
-DRIVERS = ("mgail2", "mgail5")
+DRIVERS = ("mgail?rules=0", "mgail")
 """Of the traffic on the highway: without and with lane changes by rule."""
 
 

@@ -59,5 +59,5 @@ HIGHWAY = Scenario(
     initial=initial,
     others=others,
     driven=driven,
-    drivers="mgail",
+    drivers="mgail?rules=0",
 )

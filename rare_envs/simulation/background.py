@@ -196,8 +196,8 @@ def find_drivers(drivers: Any) -> Background | TrafficBackground | None:
 
     Args:
         drivers: None for the scenario's script, a `Background` or `TrafficBackground`, the name of an installed one
-            ("mgail"; "idm+mobil" is looked up as "idm", whose loader gets the whole name), or the path of a file that
-            the package `agents` wrote.
+            ("mgail"; "idm+mobil" and "mgail?rules=0" are looked up as "idm" and "mgail", whose loaders get the whole
+            name), or the path of a file that the package `agents` wrote.
 
     Raises:
         ValueError: If it is none of these.
@@ -213,7 +213,7 @@ def find_drivers(drivers: Any) -> Background | TrafficBackground | None:
     known = {entry.name: entry for entry in entry_points(group=DRIVERS_GROUP)}
     name = str(drivers)
     is_file = name.endswith(".safetensors")
-    offered = "file" if is_file else name.partition("+")[0]
+    offered = "file" if is_file else name.partition("?")[0].partition("+")[0]
     if offered not in known:
         names = sorted({*known, *(f"{name}+mobil" for name in known if name == "idm")} - {"file"})
         listed = ", ".join(map(repr, names)) or "none is installed: pip install rare-envs"

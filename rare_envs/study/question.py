@@ -36,7 +36,7 @@ class Question:
 
     Attributes:
         env_id: Environment, such as "rare_envs/CutIn-v0".
-        ego: "idm", a learned driver ("mgail", "gail", "bc" or its file), a path to a Stable-Baselines3 `.zip`, or
+        ego: "idm", a learned driver ("mgail", "gail" or its file), a path to a Stable-Baselines3 `.zip`, or
             `module:function`.
         algo: Algorithm of a `.zip`; recognised from the file when None.
         stats: File of the `VecNormalize` statistics of a `.zip`; None to look for one beside it.

@@ -185,7 +185,7 @@ def test_any_ego_can_be_behind_a_stack() -> None:
         def predict(self, observation: Any, **_: Any) -> Any:
             return np.zeros((len(observation), 2)), None
 
-    for ego in (Coast(), load_ego("bc")):
+    for ego in (Coast(), load_ego("gail")):
         around = problem(NoisyEgo(ego), horizon=1.0)
         assert np.isfinite(around.evaluate(around.base.sample(5, np.random.default_rng(0)))).all()
 

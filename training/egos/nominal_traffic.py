@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from agents import load_driver
-from agents.learned.coloured_noise import AutoregressiveNoise
+from agents.learned.coloured_noise import HUMAN_NOISE, AutoregressiveNoise
 from agents.learned.rule_driver import RuleDriver
 from rare_envs.distributions.space import Parameter
 from rare_envs.scenarios.base import SPEED_RANGE, Others, Scenario, columns
@@ -30,7 +30,6 @@ from rare_envs.simulation.background import Background, DriverWeights, TrafficBa
 from rare_envs.traffic.reference_line import ReferenceLine
 from rare_envs.traffic.road import Road, i80, straight
 from rare_envs.traffic.state import LANE_WIDTH, VEHICLE_LENGTH, State
-from training.imitation.algorithms.config import HUMAN_NOISE
 
 SECONDS = 60.0
 """Length of a rollout [s]."""
@@ -182,7 +181,7 @@ CASES = MappingProxyType(
         "straight": Case(make_ordinary_traffic("straight", straight(3, LANE_WIDTH), 1), OrdinaryDrivers, draw_starts),
         "i80": Case(make_ordinary_traffic("i80", i80(), 2), OrdinaryDrivers, draw_starts),
         "bends": Case(make_ordinary_traffic("bends", make_bends(), 1), OrdinaryDrivers, draw_starts),
-        "highway": Case(HIGHWAY, partial(load_driver, "mgail"), _highway_starts),
+        "highway": Case(HIGHWAY, partial(load_driver, "mgail?rules=0"), _highway_starts),
     }
 )
 """A straight road, the I-80 as it is, a road that winds more, and `rare_envs/Highway-v0` with its learned drivers."""

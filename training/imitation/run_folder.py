@@ -13,12 +13,12 @@ from pathlib import Path
 from typing import Any
 
 from agents import LearnedDriver, Provenance, save_driver
-from agents.learned.coloured_noise import WHITE_NOISE, AutoregressiveNoise
+from agents.learned.coloured_noise import HUMAN_NOISE, WHITE_NOISE, AutoregressiveNoise
 from agents.learned.networks import Policy
 from rare_envs.devices import find_device
 from rare_envs.files import replace_text
 from training.imitation.algorithms.actions import ACTION_HIGH, ACTION_LOW
-from training.imitation.algorithms.config import HUMAN_NOISE, Config
+from training.imitation.algorithms.config import Config
 from training.imitation.datasets import Source, load_scenes
 from training.imitation.evaluation.realism import header_metrics
 from training.imitation.fit import CHECKPOINT, make_learner, prepare_data, train_learner

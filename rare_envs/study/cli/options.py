@@ -132,7 +132,7 @@ class ScenarioOptions:
     drivers: Annotated[
         str | None,
         typer.Option(
-            help="Of the vehicles around: mgail, mgail2, mgail3, mgail4, mgail5, gail, bc, idm, idm+mobil or a file.",
+            help="Of the vehicles around: mgail, mgail?rules=0, gail, idm, idm+mobil or a file.",
         ),
     ] = None
     observation: ObservationOption = None

@@ -174,17 +174,6 @@ def test_gradients_are_those_of_finite_differences(rule):
     assert torch.autograd.gradcheck(rule.limit, (features, action))
 
 
-def test_the_shipped_driver_is_mgail_with_the_rule():
-    plain, ruled = load_driver("mgail"), load_driver("mgail2")
-    assert torch.equal(head_weights(plain.policy), head_weights(ruled.policy))
-    assert ruled.avoidance == RULE
-    features = seen(range_0=30.0 + HALF_LENGTH, rate_0=-20.0).float()
-    one, other = (replace(driver, avoidance=None).act(features)[0] for driver in (plain, ruled))
-    assert torch.equal(one, other)
-    assert float(ruled.act(features)[0][0, 0, 0]) == pytest.approx(-400.0 / 59.0)
-    assert float(one[0, 0, 0]) > -400.0 / 59.0
-
-
 @pytest.mark.parametrize("close", [None, CloseRange(closing_time=0.7)])
 def test_the_rule_is_read_from_the_file(close, tmp_path):
     rule = CollisionAvoidance(reaction_time=0.9, close=close)

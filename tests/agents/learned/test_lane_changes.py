@@ -212,7 +212,7 @@ def test_behind_a_line_the_lane_that_was_left_is_known_and_the_other_side_is_not
 
 @pytest.mark.parametrize("changes", [CHANGES, WAITING])
 def test_gradients_are_those_of_finite_differences(changes):
-    driver = replace(load_driver("mgail3"), changes=changes, policy=load_driver("mgail3").policy.double())
+    driver = replace(load_driver("mgail"), changes=changes, policy=load_driver("mgail").policy.double())
     state = begin(right=0.0)
     for tick in range(12):
         y = 0.02 * tick
@@ -259,7 +259,7 @@ def test_there_is_a_finite_coefficient_of_each_covariate(coefficients):
 
 
 def test_a_driver_with_lane_changes_keeps_them_in_its_memory():
-    driver = load_driver("mgail3")
+    driver = load_driver("mgail")
     generator = torch.Generator().manual_seed(0)
     memory = driver.begin(torch.randn(2, 3, 2, 2, generator=generator))
     assert memory.shape == (2, 3, 4 + STATE_SIZE)
@@ -272,7 +272,7 @@ def test_a_driver_with_lane_changes_keeps_them_in_its_memory():
 
 
 def test_a_ripe_driver_steers_into_the_next_lane_and_keeps_off_whoever_is_ahead_there():
-    driver, draws = load_driver("mgail3"), torch.zeros(1, 1, 2, 2)
+    driver, draws = load_driver("mgail"), torch.zeros(1, 1, 2, 2)
     draws[..., 1, 1] = 8.0  # no patience for a change to the right
     free, ahead = (
         on_lane(**beams).float() for beams in (OTHERS, {"range_18": 10.0, "rate_18": -2.0, "range_m36": 11.0})
@@ -286,7 +286,8 @@ def test_a_ripe_driver_steers_into_the_next_lane_and_keeps_off_whoever_is_ahead_
 
 
 def test_a_driver_that_waits_steers_back_from_the_edge_of_the_road():
-    driver, none = load_driver("mgail3"), torch.zeros(1, 1, 2)
+    shipped, none = load_driver("mgail"), torch.zeros(1, 1, 2)
+    driver = replace(shipped, changes=replace(shipped.changes, waiting=None))
     begins = driver.begin(torch.zeros(1, 1, 2, 2))
     waits = replace(driver, changes=replace(driver.changes, waiting=Waiting()))
     outside = on_lane(1.8 + 0.3, 0.0).float()  # 0.3 m over the line at 20 m/s
@@ -298,27 +299,27 @@ def test_a_driver_that_waits_steers_back_from_the_edge_of_the_road():
 
 
 def test_hard_braking_is_eased_but_for_the_rule():
-    plain = replace(load_driver("mgail2"), avoidance=None)
+    plain = load_driver("mgail?rules=0")
     features = on_lane(range_0=9.0, rate_0=-9.0).float()
     own = float(plain.act(features)[0][..., 0])
     assert own < -EASED_BEYOND
     eased = float(replace(plain, hard_braking=0.7).act(features)[0][..., 0])
     assert eased == pytest.approx(-EASED_BEYOND + 0.7 * (own + EASED_BEYOND))
-    assert float(load_driver("mgail3").act(features)[0][..., 0]) == pytest.approx(-(9.0**2) / (2.0 * 6.0))
+    assert float(load_driver("mgail").act(features)[0][..., 0]) == pytest.approx(-(9.0**2) / (2.0 * 6.0))
     with pytest.raises(ValueError, match=r"Expected a share of hard braking in \(0, 1\], got 0"):
         replace(plain, hard_braking=0.0)
 
 
 def test_lane_changes_need_the_rule():
-    driver = load_driver("mgail3")
+    driver = load_driver("mgail")
     with pytest.raises(ValueError, match="Expected a rule of collision avoidance beside the lane changes"):
         replace(driver, avoidance=None)
 
 
 @pytest.mark.parametrize("changes", [CHANGES, WAITING])
 def test_lane_changes_are_read_from_the_file(tmp_path, changes):
-    driver = replace(load_driver("mgail3"), changes=changes, hard_braking=0.9)
-    path = save_driver(driver, read_provenance("agents/data/mgail3.safetensors"), tmp_path / "mine.safetensors")
+    driver = replace(load_driver("mgail"), changes=changes, hard_braking=0.9)
+    path = save_driver(driver, read_provenance("agents/data/mgail.safetensors"), tmp_path / "mine.safetensors")
     read = read_driver(path)
     assert (read.changes, read.hard_braking, read.colour) == (changes, 0.9, driver.colour)
     assert read.colour.balanced

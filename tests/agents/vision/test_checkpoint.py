@@ -29,7 +29,7 @@ def test_a_network_of_ones_own_is_kept_in_a_file(tmp_path: Path) -> None:
 
 def test_files_of_another_kind_are_refused() -> None:
     with pytest.raises(ValueError, match="no vision"):
-        load_vision(Path("agents/data/bc.safetensors"))
+        load_vision(Path("agents/data/gail.safetensors"))
     with pytest.raises(FileNotFoundError, match="No vision at"):
         load_vision("nowhere.safetensors")
 

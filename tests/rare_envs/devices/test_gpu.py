@@ -65,7 +65,7 @@ EGOS: dict[str, Callable[[str], Any]] = {
     "ppo": ppo,
     "ppo of rectifiers": lambda env_id: ppo(env_id, policy_kwargs={"activation_fn": torch.nn.ReLU}),
     "a stack": lambda env_id: agents.load_ego("noisy:idm"),
-    "a learned driver": lambda env_id: "mgail2",
+    "a learned driver": lambda env_id: "mgail",
     "a function": lambda env_id: lambda seen: np.tile([0.1, 0.0], (len(seen), 1)),
     "a module": lambda env_id: torch.nn.Linear(gym.make(env_id).observation_space.shape[0], 2),  # type: ignore[index]
 }
@@ -81,7 +81,7 @@ def test_scripts_end_alike(env_id: str, ego: str) -> None:
     assert (f < 0.0).any()
 
 
-@pytest.mark.parametrize("drivers", ["mgail", "mgail5", "bc", "idm+mobil"])
+@pytest.mark.parametrize("drivers", ["mgail?rules=0", "mgail", "gail", "idm+mobil"])
 @pytest.mark.parametrize("measure", ["ttc", "lidar_ttc", "clearance"])
 def test_the_highway_ends_alike(drivers: str, measure: str) -> None:
     on_cpu, on_gpu, x = of_both(HIGHWAY, 200, drivers=drivers, measure=measure)
@@ -128,7 +128,7 @@ def test_discrete_actions_and_a_camera_go_through_the_cpu() -> None:
 
 
 @pytest.mark.parametrize(
-    ("env_id", "settings"), [(CUT_IN, {}), (HIGHWAY, {"drivers": "mgail5"}), (CUT_IN, {"ego": "human"})]
+    ("env_id", "settings"), [(CUT_IN, {}), (HIGHWAY, {"drivers": "mgail"}), (CUT_IN, {"ego": "human"})]
 )
 def test_recorded_rollouts_have_the_bits_of_torch(env_id: str, settings: dict[str, Any]) -> None:
     problem = rare_envs.DrivingProblem(env_id, device="cuda", **settings)

@@ -57,7 +57,7 @@ def test_noise_that_nobody_has_is_pointed_out(cli: Cli, risky: str) -> None:
     words = ("estimate", FOLLOWING, "--base", risky, "--method", "mc", "--max-sim", 500, "--noise", "fixed")
     assert "note: --noise fixed changes nothing" in cli(*words).stdout
     assert len(json.loads(cli(*words, "--json").stdout)["notes"]) == 1
-    for more in (("--drivers", "bc"), ("--noise", "on")):
+    for more in (("--drivers", "gail"), ("--noise", "on")):
         assert json.loads(cli(*words, *more, "--json").stdout)["notes"] == []
 
 

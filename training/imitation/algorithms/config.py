@@ -5,13 +5,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
-from agents.learned.coloured_noise import AutoregressiveNoise
+from agents.learned.coloured_noise import HUMAN_NOISE, AutoregressiveNoise
 
 Algorithm = Literal["gail", "mgail"]
-
-
-HUMAN_NOISE = AutoregressiveNoise.from_oscillators(frequency=(1.70, 1.57), damping=(0.845, 0.40))
-"""Noise with the autocorrelation of what cloning leaves unexplained in the record, within 0.03 up to 1 s."""
 
 
 _VALID_RANGES: tuple[tuple[tuple[str, ...], Callable[[float], bool], str], ...] = (

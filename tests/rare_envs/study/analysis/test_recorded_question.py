@@ -214,5 +214,5 @@ def test_values_of_every_field_are_taken_back(received: Path) -> None:
 
 
 def test_what_is_no_code_is_not_listed() -> None:
-    for ego in ("idm", "ego.zip", "noisy:bc", "tcp://127.0.0.1:5555", "process:imitation?timeout=3"):
+    for ego in ("idm", "ego.zip", "noisy:gail", "tcp://127.0.0.1:5555", "process:imitation?timeout=3"):
         assert list_code(Question(env_id=FOLLOWING, ego=ego)) == []

@@ -23,7 +23,7 @@ HIGHWAY = ("estimate", "rare_envs/Highway-v0", "--measure", "lidar_ttc", "--gamm
 @pytest.mark.usefixtures("full_pictures")
 def test_the_highway_end_to_end(cli: Cli, tmp_path: Path) -> None:
     """Blocks of x in every place where parameters are told, and drivers and horizon in the record."""
-    words = ("--ego", "bc", "--drivers", "gail", "--noise", "fixed", "--method", "mc", "--max-sim", 256, "--details")
+    words = ("--ego", "mgail", "--drivers", "gail", "--noise", "fixed", "--method", "mc", "--max-sim", 256, "--details")
     result = cli(*HIGHWAY, *words, "--out", tmp_path)
     assert result.exit_code in (0, 3), result.output
     assert "the drivers' noise is one fixed sequence" in result.stdout
@@ -34,7 +34,7 @@ def test_the_highway_end_to_end(cli: Cli, tmp_path: Path) -> None:
 
     answer = json.loads((tmp_path / "result.json").read_text())
     asked = answer["question"]
-    assert (asked["drivers"], asked["ego"], asked["horizon"], asked["noise"]) == ("gail", "bc", 2.0, "fixed")
+    assert (asked["drivers"], asked["ego"], asked["horizon"], asked["noise"]) == ("gail", "mgail", 2.0, "fixed")
     assert asked["observation"] == "lidar"
     assert answer["given"] == "the drivers' noise is one fixed sequence"
     likely = answer["failures"][0]["parameters"]

@@ -182,7 +182,7 @@ def test_a_good_ego_passes(broken: str, ego: str) -> None:
     assert ("none" in result["memory"].found) == (ego == "good")
 
 
-@pytest.mark.parametrize("ego", ["idm", "noisy:idm", "bc"])
+@pytest.mark.parametrize("ego", ["idm", "noisy:idm", "gail"])
 def test_egos_without_predict_are_driven_only(ego: str) -> None:
     result = findings(ego)
     assert result["driving"].status == "pass"
