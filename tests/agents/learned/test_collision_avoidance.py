@@ -7,7 +7,6 @@ import torch
 from agents import load_driver, read_driver, read_provenance, save_driver
 from agents.learned.adjacent_lanes import LEFT_MARKER_COLUMN, RIGHT_MARKER_COLUMN
 from agents.learned.collision_avoidance import CloseRange, CollisionAvoidance
-from agents.learned.networks import head_weights
 from rare_envs.sensors.lidar import MAX_RANGE
 from rare_envs.sensors.perception import FEATURES, HEADING_COLUMN
 
