@@ -32,8 +32,8 @@ if TYPE_CHECKING:
     from rare_envs.egos.faults import FaultTolerant
     from rare_envs.interop import HighwayEnvProblem, HighwayEnvScenario, highway_env_problem
     from rare_envs.problem import DrivingProblem
-    from rare_envs.study.rates.total_risk import risk
-    from rare_envs.study.storage.loaded_study import load_study
+    from rare_envs.study.risk import risk
+    from rare_envs.study.run_folder import load_study
 
     ENV_IDS: tuple[str, ...]
     """Ids of all environments, your own included."""
@@ -70,8 +70,8 @@ _LAZY = {
     "ScenarioSpace": "rare_envs.distributions.space",
     "TruncatedGaussianMixture": "rare_envs.distributions.truncated_mixture",
     "highway_env_problem": "rare_envs.interop",
-    "load_study": "rare_envs.study.storage.loaded_study",
-    "risk": "rare_envs.study.rates.total_risk",
+    "load_study": "rare_envs.study.run_folder",
+    "risk": "rare_envs.study.risk",
 }
 
 _import_lazily = make_lazy_getattr(__name__, _LAZY)

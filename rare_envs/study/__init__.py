@@ -8,17 +8,16 @@ from typing import TYPE_CHECKING
 from rare_envs.plugins import make_lazy_getattr
 
 if TYPE_CHECKING:
-    from rare_envs.study.analysis.severity import Severity, severity_curve
     from rare_envs.study.compare import EgoComparison, compare_egos
     from rare_envs.study.errors import BadInput
     from rare_envs.study.evaluate import resume, run, run_into
     from rare_envs.study.question import Question, Study, prepare
     from rare_envs.study.replay import Drive, drive_again
     from rare_envs.study.report import Report
-    from rare_envs.study.run_directory import write_run
-    from rare_envs.study.storage.failure_table import read_failures
-    from rare_envs.study.storage.loaded_study import LoadedStudy, load_study
+    from rare_envs.study.run_folder import LoadedStudy, load_study, read_failures
+    from rare_envs.study.severity import Severity, severity_curve
     from rare_envs.study.video import write_film
+    from rare_envs.study.writing import write_run
 
 __all__ = [
     "BadInput",
@@ -46,22 +45,22 @@ _LAZY = {
     "BadInput": "rare_envs.study.errors",
     "Drive": "rare_envs.study.replay",
     "EgoComparison": "rare_envs.study.compare",
-    "LoadedStudy": "rare_envs.study.storage.loaded_study",
+    "LoadedStudy": "rare_envs.study.run_folder",
     "Question": "rare_envs.study.question",
     "Report": "rare_envs.study.report",
-    "Severity": "rare_envs.study.analysis.severity",
+    "Severity": "rare_envs.study.severity",
     "Study": "rare_envs.study.question",
     "compare_egos": "rare_envs.study.compare",
     "drive_again": "rare_envs.study.replay",
-    "load_study": "rare_envs.study.storage.loaded_study",
+    "load_study": "rare_envs.study.run_folder",
     "prepare": "rare_envs.study.question",
-    "read_failures": "rare_envs.study.storage.failure_table",
+    "read_failures": "rare_envs.study.run_folder",
     "resume": "rare_envs.study.evaluate",
     "run": "rare_envs.study.evaluate",
     "run_into": "rare_envs.study.evaluate",
-    "severity_curve": "rare_envs.study.analysis.severity",
+    "severity_curve": "rare_envs.study.severity",
     "write_film": "rare_envs.study.video",
-    "write_run": "rare_envs.study.run_directory",
+    "write_run": "rare_envs.study.writing",
 }
 
 __getattr__ = make_lazy_getattr(__name__, _LAZY)

@@ -11,9 +11,6 @@ from pathlib import Path
 import samplers
 from agents.loading import find_ego_kind
 from rare_envs.egos.errors import EgoGone
-from rare_envs.study.analysis.recorded_question import note_question, open_question
-from rare_envs.study.analysis.repeatability import Repeatability, RowKeeper, check_repeatability
-from rare_envs.study.crash_kinds import CrashKinds, classify_failures, list_all_kinds
 from rare_envs.study.errors import BadInput, output_folder
 from rare_envs.study.execution.interruption import (
     NOT_KEPT,
@@ -25,12 +22,22 @@ from rare_envs.study.execution.interruption import (
 )
 from rare_envs.study.execution.simulated_problem import SimulatedProblem, open_problem
 from rare_envs.study.journal import JOURNAL, begin_journal, check_same_files, continue_journal
+from rare_envs.study.modes import CrashKinds, classify_failures, list_all_kinds
 from rare_envs.study.question import Study, prepare
+from rare_envs.study.recorded_question import note_question, open_question
+from rare_envs.study.repeatability import Repeatability, RowKeeper, check_repeatability
 from rare_envs.study.report import Report
-from rare_envs.study.run_directory import check_no_results, remove_drafts, remove_results, write_run
+from rare_envs.study.run_folder import STUDY
 from rare_envs.study.storage.episode_recorder import EpisodeRecorder
-from rare_envs.study.storage.names import STUDY
-from rare_envs.study.storage.study_file import begin_study_file, finish_study_file, note_resumption
+from rare_envs.study.writing import (
+    begin_study_file,
+    check_no_results,
+    finish_study_file,
+    note_resumption,
+    remove_drafts,
+    remove_results,
+    write_run,
+)
 from samplers.execution.executors import Executor, ExecutorError
 from samplers.execution.journal import JournalFile
 from samplers.execution.progress import Pace, open_listener

@@ -1,4 +1,4 @@
-"""Picture of an evaluation: convergence, failures among ordinary traffic, and the likeliest failure from above."""
+"""Pictures: of an evaluation, of what p is sensitive to, of the severity of collisions and of a risk."""
 
 from __future__ import annotations
 
@@ -14,12 +14,18 @@ from matplotlib.patches import Rectangle
 from matplotlib.transforms import Affine2D
 from numpy.typing import NDArray
 
+import samplers
 from rare_envs.distributions.space import ScenarioSpace
 from rare_envs.egos.errors import EgoGone, reason_of
+from rare_envs.exposure.human_benchmarks import CONTACTS_100CAR, REAR_END_CONTACTS_100CAR
+from rare_envs.exposure.rate import RateInterval
+from rare_envs.exposure.total_rate import TotalRate
 from rare_envs.files import replace_file
 from rare_envs.study.columns import draw_ordinary, list_columns
 from rare_envs.study.replay import Drive, drive_again
 from rare_envs.study.report import Report
+from rare_envs.study.severity import Severity
+from rare_envs.study.text import format_rate, format_share, format_with_interval, name_scenario, name_source
 from rare_envs.traffic.palette import CRASH_COLOUR, vehicle_colour
 from rare_envs.traffic.road import Road
 from rare_envs.traffic.state import VEHICLE_LENGTH, VEHICLE_WIDTH
@@ -27,6 +33,7 @@ from samplers.problem import FloatArray
 
 if TYPE_CHECKING:
     from samplers.sample import Failures
+
 
 BACKGROUND_DRAWS = 2000
 """Ordinary scenarios drawn behind the failures."""
@@ -287,3 +294,109 @@ def _write_message(axes: Axes, text: str) -> None:
     """Write a sentence in place of a drawing."""
     axes.set_axis_off()
     axes.text(0.5, 0.5, text, ha="center", va="center", transform=axes.transAxes)
+
+
+def save_sensitivity(path: Path, sensitivity: samplers.Sensitivity) -> None:
+    """Draw importance and derivatives as bars and save the picture.
+
+    Args:
+        path: `.png` to write.
+        sensitivity: What to draw.
+    """
+    with matplotlib.rc_context(STYLE):
+        figure = Figure(figsize=(14, 4.5), layout="constrained")
+        sensitivity.plot(list(figure.subplots(1, 2)))
+        save_figure(path, figure)
+
+
+def save_severity(path: Path, severity: Severity) -> None:
+    """Draw the curve of delta-v with its bands and save the picture.
+
+    Args:
+        path: `.png` to write.
+        severity: What to draw.
+    """
+    with matplotlib.rc_context(STYLE):
+        figure = Figure(figsize=(7, 4.5), layout="constrained")
+        severity.plot(figure.subplots())
+        save_figure(path, figure)
+
+
+FRACTION_BELOW = 0.1
+"""Left end of the axis over the smallest number on it, where an interval reaches down to 0."""
+
+
+def save_risk_plot(path: Path, ego: str, total: TotalRate) -> None:
+    """Draw a total and the rates of which it is the sum, and save it.
+
+    Args:
+        path: `.png` to write.
+        ego: The ego, for the title.
+        total: The rates.
+    """
+    with matplotlib.rc_context(STYLE):
+        height = 1.6 + 0.45 * max(len(total.rates) + 1, len(total.shares))
+        figure = Figure(figsize=(12, height), layout="constrained")
+        left, right = figure.subplots(1, 2, width_ratios=(1.5, 1.0))
+        figure.suptitle(
+            f"ego {ego}: "
+            + format_with_interval(
+                total.per_million_km,
+                total.interval_per_million_km,
+                " collisions per million km",
+                f"{100 * total.confidence:g} %: ",
+            ),
+            fontsize=12,
+            fontweight="bold",
+        )
+        draw_rates(left, total)
+        draw_shares(right, total)
+        save_figure(path, figure)
+
+
+def draw_rates(axes: Axes, total: TotalRate) -> None:
+    """Draw the rate of each scenario and their sum, with intervals, and lines for people."""
+    rows: list[tuple[str, float, RateInterval]] = [
+        (name_scenario(rate.scenario), rate.per_million_km, rate.interval_per_million_km) for rate in total.rates
+    ]
+    rows.append(("total", total.per_million_km, total.interval_per_million_km))
+    people = (CONTACTS_100CAR, REAR_END_CONTACTS_100CAR)
+    shown = [end for _, _, ends in rows for end in ends if end > 0]
+    start = FRACTION_BELOW * min(*shown, people[1].per_million_km)
+    for row, (name, rate, (low, high)) in enumerate(rows):
+        colour = HIT_COLOUR if name == "total" else LINE_COLOUR
+        if low > 0:
+            axes.plot([low, high], [row, row], color=colour, linewidth=3, alpha=0.5, solid_capstyle="butt")
+            axes.plot(rate, row, "o", color=colour)
+        else:  # an upper end alone: an arrow out of the axis, without a point
+            style = {"arrowstyle": "->", "color": colour, "linewidth": 2}
+            axes.annotate("", (start, row), (high, row), arrowprops=style)
+            axes.plot(high, row, "|", color=colour, markersize=12, markeredgewidth=2)
+            axes.annotate(f"below {format_rate(high)}", (high, row), (6, -3), textcoords="offset points", fontsize=8)
+    axes.set_xscale("log")
+    axes.set_xlim(start, max(*shown, people[0].per_million_km) / FRACTION_BELOW)
+    for each, dashes in zip(people, ("--", ":"), strict=True):
+        axes.axvline(each.per_million_km, color="black", linewidth=1, linestyle=dashes, label=each.kind)
+    axes.set_yticks(range(len(rows)), [name for name, _, _ in rows])
+    axes.set_ylim(len(rows) + 0.4, -0.6)  # room for the legend below
+    axes.set_xlabel("collisions per million km")
+    axes.legend(title="people (100-Car)", loc="lower left", fontsize=8, frameon=False)
+
+
+def draw_shares(axes: Axes, total: TotalRate) -> None:
+    """Draw the shares of the sources of the uncertainty as bars."""
+    shares = total.shares
+    of_what = "" if len(total.determined) == len(total.rates) else " of the determined part"
+    axes.set_title(f"sources of the uncertainty{of_what}\n(shares of the variance)", fontsize=10)
+    if not shares:
+        axes.set_axis_off()
+        axes.text(0.5, 0.5, "not known: no rate has a lower end", ha="center", va="center", transform=axes.transAxes)
+        return
+    axes.barh(range(len(shares)), [100 * each.share for each in shares], color=LINE_COLOUR)
+    for row, each in enumerate(shares):
+        axes.text(100 * each.share + 1, row, format_share(each.share), va="center")
+    axes.set_yticks(range(len(shares)), [name_source(each) for each in shares])
+    axes.set_ylim(len(shares) - 0.4, -0.6)
+    axes.set_xlim(0, 115)
+    axes.set_xlabel("%")
+    axes.grid(axis="x", color=ORDINARY_COLOUR, alpha=0.4)

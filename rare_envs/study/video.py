@@ -16,15 +16,13 @@ from rare_envs.envs.rendering import AGENT, FRAME_WIDTH, Colour, Renderer
 from rare_envs.files import read_text_file, replace_file
 from rare_envs.json_text import parse_json_object
 from rare_envs.problem import DrivingProblem
-from rare_envs.study.analysis.moved_files import warn_of_changed_files
-from rare_envs.study.analysis.recorded_question import open_question
 from rare_envs.study.columns import MAX_SHOWN, format_value
 from rare_envs.study.errors import BadInput, as_bad_input, output_file
 from rare_envs.study.journal import refuse_unfinished
 from rare_envs.study.question import prepare
+from rare_envs.study.recorded_question import open_question, warn_of_changed_files
 from rare_envs.study.replay import Drive
-from rare_envs.study.storage.failure_table import read_failures
-from rare_envs.study.storage.names import FAILURES, RESULT
+from rare_envs.study.run_folder import FAILURES, RESULT, read_failures
 from rare_envs.traffic.palette import CRASH_COLOUR, OTHER_COLOURS, ROLE_COLOURS, as_rgb
 
 CURVES_HEIGHT = 144

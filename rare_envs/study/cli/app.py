@@ -12,17 +12,15 @@ from typing import Annotated
 
 import typer
 
-from rare_envs.study.cli.commands.check_ego import check_ego_command
-from rare_envs.study.cli.commands.corpus import corpus_app
-from rare_envs.study.cli.commands.estimate import estimate_command, resume_command, show_report
-from rare_envs.study.cli.commands.export_ego import export_ego_command
-from rare_envs.study.cli.commands.export_failure import export_command
-from rare_envs.study.cli.commands.fit import fit_command
-from rare_envs.study.cli.commands.plan import plan_command
-from rare_envs.study.cli.commands.replay import replay_command
-from rare_envs.study.cli.commands.report import report_command
-from rare_envs.study.cli.commands.serve_ego import serve_ego_command
-from rare_envs.study.cli.commands.train import train_drivers_command, train_ego_command
+from rare_envs.study.cli.egos import (
+    check_ego_command,
+    export_ego_command,
+    fit_command,
+    serve_ego_command,
+    train_drivers_command,
+    train_ego_command,
+)
+from rare_envs.study.cli.estimate import estimate_command, plan_command, resume_command, show_report
 from rare_envs.study.cli.examples import add_examples, format_examples
 from rare_envs.study.cli.options import (
     AlgoOption,
@@ -35,6 +33,7 @@ from rare_envs.study.cli.options import (
     StatsOption,
     read_count,
 )
+from rare_envs.study.cli.runs import corpus_app, export_command, replay_command, report_command
 from rare_envs.study.cli.shell import (
     DOUBTFUL,
     OneLineErrors,
@@ -87,8 +86,7 @@ def list_command(
     as_json: JsonOption = False,
 ) -> None:
     """Show the names of environments, methods, egos, drivers and measures; with one of these words, what they mean."""
-    from rare_envs.study.cli.catalogue import list_names
-    from rare_envs.study.cli.catalogue_table import check_kind, choose_entries, print_details, print_overview
+    from rare_envs.study.cli.listing import check_kind, choose_entries, list_names, print_details, print_overview
 
     entries = list_names()
     chosen = None if what is None else check_kind(entries, what)
@@ -115,7 +113,7 @@ def risk_command(
     as_json: JsonOption = False,
 ) -> None:
     """Estimate collisions per million km, summed over scenarios, with an interval."""
-    from rare_envs.study.rates.total_risk import risk
+    from rare_envs.study.risk import risk
 
     with (
         show_what_is_known(lambda known: show_report(known, None, as_json)),
@@ -139,7 +137,7 @@ def bases_command(
     as_json: JsonOption = False,
 ) -> None:
     """List the base distributions of a scenario: events, site, family, fit, frequency and predictive checks."""
-    from rare_envs.study.cli.base_table import list_bases, print_bases, resolve_scenario
+    from rare_envs.study.cli.listing import list_bases, print_bases, resolve_scenario
 
     with as_bad_input(ValueError):
         found = list_bases(scenario)

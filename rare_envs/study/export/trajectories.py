@@ -6,7 +6,9 @@ coordinates are those of `rare_envs.traffic.road.Road.to_world`, mirrored.
 
 from __future__ import annotations
 
+import importlib
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -14,6 +16,20 @@ import torch
 from rare_envs.study.replay import Drive
 from rare_envs.traffic.road import Road
 from samplers.problem import FloatArray
+
+
+def import_scenariogeneration(part: str) -> Any:
+    """Return `scenariogeneration.xosc` or `.xodr`.
+
+    Raises:
+        ValueError: It is not installed.
+    """
+    try:
+        return importlib.import_module(f"scenariogeneration.{part}")
+    except ImportError as error:
+        raise ValueError(
+            'OpenSCENARIO and OpenDRIVE need scenariogeneration: pip install "rare-envs[export]".'
+        ) from error
 
 
 @dataclass(frozen=True)

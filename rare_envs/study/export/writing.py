@@ -11,8 +11,7 @@ from numpy.typing import ArrayLike
 from rare_envs.plugins import did_you_mean
 from rare_envs.problem import DrivingProblem
 from rare_envs.study.export.commonroad import write_commonroad
-from rare_envs.study.export.road_network import write_road
-from rare_envs.study.export.storyboard import StoryOptions, write_story
+from rare_envs.study.export.openscenario import StoryOptions, write_road, write_story
 from rare_envs.study.export.trajectories import find_trajectories
 from rare_envs.study.replay import Drive, drive_again
 from rare_envs.version import __version__

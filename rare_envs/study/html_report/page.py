@@ -12,17 +12,24 @@ import numpy as np
 
 from rare_envs.files import replace_text
 from rare_envs.plugins import one_line
-from rare_envs.study.analysis.moved_files import warn_of_changed_files
-from rare_envs.study.analysis.recorded_question import open_question
-from rare_envs.study.analysis.repeatability import Repeatability
 from rare_envs.study.columns import draw_ordinary, list_columns
 from rare_envs.study.errors import BadInput, as_bad_input, output_file, output_folder
-from rare_envs.study.html_report.atlas import AtlasEntry, AtlasSource, build_atlas
-from rare_envs.study.html_report.figures import MAX_HISTOGRAMS, figure_of_parameters, figures_of_result, passes_levels
-from rare_envs.study.html_report.recorded_events import read_recorded_events
-from rare_envs.study.html_report.svg import FORMATS, FigureOfPage
+from rare_envs.study.html_report.atlas import AtlasEntry, AtlasSource, build_atlas, read_recorded_events
+from rare_envs.study.html_report.figures import (
+    FORMATS,
+    MAX_HISTOGRAMS,
+    FigureOfPage,
+    figure_of_parameters,
+    figures_of_result,
+    passes_levels,
+)
 from rare_envs.study.html_report.templating import render_template
-from rare_envs.study.html_report.wording import (
+from rare_envs.study.journal import refuse_unfinished
+from rare_envs.study.question import prepare
+from rare_envs.study.recorded_question import open_question, warn_of_changed_files
+from rare_envs.study.repeatability import Repeatability
+from rare_envs.study.run_folder import EPISODES, REPORT, RESULT, STUDY, LoadedStudy, load_study
+from rare_envs.study.text import (
     describe_intervals,
     describe_kind,
     describe_method,
@@ -34,10 +41,6 @@ from rare_envs.study.html_report.wording import (
     name_measure,
     summarise_answer,
 )
-from rare_envs.study.journal import refuse_unfinished
-from rare_envs.study.question import prepare
-from rare_envs.study.storage.loaded_study import LoadedStudy, load_study
-from rare_envs.study.storage.names import EPISODES, REPORT, RESULT, STUDY
 from rare_envs.traffic.palette import CRASH_COLOUR, ROLE_COLOURS
 from samplers.problem import FloatArray
 from samplers.trace import describe_outcome

@@ -11,8 +11,8 @@ import numpy as np
 from rare_envs.distributions.space import ScenarioSpace
 from rare_envs.egos.wrapped_problem import WrappedProblem
 from rare_envs.study.execution.simulated_problem import SimulatedProblem
+from rare_envs.study.run_folder import EPISODES
 from rare_envs.study.storage.episode_file import EpisodeBatch, EpisodeDraft, write_episodes
-from rare_envs.study.storage.names import EPISODES
 from samplers.problem import FloatArray, Terms
 from samplers.result import Estimate
 

@@ -17,7 +17,7 @@ import rare_envs
 import samplers
 from rare_envs.scenarios.registry import SCENARIOS, scenario_named
 from rare_envs.study.cli.app import app
-from rare_envs.study.cli.catalogue import list_names
+from rare_envs.study.cli.listing import list_names
 from tests.rare_envs.scenarios.standing import STANDING
 
 with warnings.catch_warnings():

@@ -97,7 +97,7 @@ def run_command(
     """Run a command, without pictures, and exit with its code."""
     from rare_envs.problem import DrivingProblem
     from rare_envs.study import cli, run_directory
-    from rare_envs.study.cli.executor_options import ExecutorOptions
+    from rare_envs.study.cli.options import ExecutorOptions
     from samplers.execution.journal import JournalFile
     from tests.samplers.execution.executors.real_executors import open_executor
 

@@ -11,7 +11,7 @@ import pytest
 from scipy import stats
 
 from rare_envs.study import Question, prepare, run
-from rare_envs.study.collision_rate import compute_rate, describe_left_out, describe_probability, find_frequency
+from rare_envs.study.report import compute_rate, describe_left_out, describe_probability, find_frequency
 from tests.rare_envs.study.fitted_files import write_fitted
 
 

@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from rare_envs.study.storage.failure_table import read_failures
+from rare_envs.study.run_folder import read_failures
 from tests.rare_envs.study.refusals import assert_refused
 
 FOLLOWING = "rare_envs/CarFollowing-v0"

@@ -13,11 +13,11 @@ import pytest
 import rare_envs
 import samplers
 from rare_envs.control.idm import IDM
-from rare_envs.study.crash_kinds import classify_failures, list_all_kinds
+from rare_envs.study.modes import classify_failures, list_all_kinds
 from rare_envs.study.question import Question, Study
 from rare_envs.study.report import Report
-from rare_envs.study.run_directory import write_run
-from rare_envs.study.storage.failure_table import CRASH, read_failures
+from rare_envs.study.run_folder import CRASH, read_failures
+from rare_envs.study.writing import write_run
 
 CUT_IN = "rare_envs/CutIn-v0"
 
@@ -52,7 +52,7 @@ def test_shares_in_the_result_add_up_to_p(report: Report) -> None:
 def test_each_failure_of_the_list_has_its_crash(
     report: Report, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("rare_envs.study.run_directory.save_plot", lambda *_: None)  # pictures have their own tests
+    monkeypatch.setattr("rare_envs.study.run_folder.save_plot", lambda *_: None)  # pictures have their own tests
     write_run(tmp_path, report)
     with (tmp_path / "failures.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))

@@ -20,7 +20,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 import rare_envs
 from rare_envs.study import Question, corpus, evaluate, prepare, run_directory
 from rare_envs.study.html_report import atlas
-from rare_envs.study.html_report.svg import FigureOfPage
+from rare_envs.study.html_report.figures import FigureOfPage
 from rare_envs.study.journal import JOURNAL, begin_journal
 from samplers.execution.journal import JournalRecord
 from tests.rare_envs.study.conftest import write_base

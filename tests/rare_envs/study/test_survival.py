@@ -22,7 +22,7 @@ from rare_envs.study import evaluate, run_directory
 from rare_envs.study.errors import BadInput
 from rare_envs.study.journal import JOURNAL, continue_journal
 from rare_envs.study.question import Question, prepare
-from rare_envs.study.storage.names import RESULT_FILES
+from rare_envs.study.run_folder import RESULT_FILES
 from samplers.execution.record_file import RecordFile
 from tests.rare_envs.study.conftest import write_base
 from tests.rare_envs.study.forked_command import TILE, ForkedCommand

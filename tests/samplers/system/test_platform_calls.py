@@ -16,7 +16,7 @@ from samplers.system.platform_calls import end_process, lock_file, sync_folder
 
 ROOT = Path(__file__).parents[3]
 SCRIPT = Path(__file__).with_name("without_posix.py")
-PLACES = {"samplers/system/platform_calls.py", "rare_envs/study/ego_check/behaviour.py"}
+PLACES = {"samplers/system/platform_calls.py", "rare_envs/study/ego_check/checks.py"}
 """Modules that may import what one system alone has, and only where it is there."""
 
 

@@ -8,7 +8,7 @@ import pytest
 import rare_envs
 import samplers
 from rare_envs.control.idm import IDM
-from rare_envs.study.analysis.failure_replay import replay_failures
+from rare_envs.study.severity import replay_failures
 from rare_envs.traffic.crash import CRASH_KINDS
 
 CUT_IN = "rare_envs/CutIn-v0"

@@ -7,8 +7,8 @@ from typing import Any
 import pytest
 
 from rare_envs.study import Question
-from rare_envs.study.analysis.plan import plan_by_pilots, plan_from_result
 from rare_envs.study.errors import BadInput
+from rare_envs.study.plan import plan_by_pilots, plan_from_result
 
 RECORDED = {
     "p": 1e-3,

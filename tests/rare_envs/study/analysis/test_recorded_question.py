@@ -13,11 +13,11 @@ import numpy as np
 import pytest
 
 from rare_envs.study import Question, prepare, run_into
-from rare_envs.study.analysis.recorded_question import is_same_question, list_code, open_question
 from rare_envs.study.errors import BadInput
 from rare_envs.study.evaluate import resume
 from rare_envs.study.journal import begin_journal
-from rare_envs.study.storage.names import BLOCKS, FAILURES, RESULT
+from rare_envs.study.recorded_question import is_same_question, list_code, open_question
+from rare_envs.study.run_folder import BLOCKS, FAILURES, RESULT
 from rare_envs.study.video import find_failure
 
 FOLLOWING = "rare_envs/CarFollowing-v0"

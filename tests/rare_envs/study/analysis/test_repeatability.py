@@ -9,7 +9,7 @@ import pytest
 
 import rare_envs
 from rare_envs.study import Question, prepare, run
-from rare_envs.study.analysis.repeatability import KEPT_ROWS, ROWS_ALONE, RowKeeper
+from rare_envs.study.repeatability import KEPT_ROWS, ROWS_ALONE, RowKeeper
 
 QUESTION = Question(
     env_id="rare_envs/CarFollowing-v0", base="us101-gap", gamma=3.0, horizon=3.0, method="mc", max_sim=300

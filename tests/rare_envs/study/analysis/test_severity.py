@@ -15,12 +15,11 @@ import samplers
 from rare_envs.control.idm import IDM
 from rare_envs.distributions import EventCounts, FittedDistribution
 from rare_envs.study import severity_curve
-from rare_envs.study.analysis.failure_replay import replay_failures
-from rare_envs.study.analysis.severity import Severity, compute_severity
-from rare_envs.study.cli.printing import print_report
-from rare_envs.study.crash_kinds import classify_failures
+from rare_envs.study.modes import classify_failures
 from rare_envs.study.question import Question, Study
 from rare_envs.study.report import Report
+from rare_envs.study.severity import Severity, compute_severity, replay_failures
+from rare_envs.study.text import print_report
 from rare_envs.traffic.crash import injury_risk
 
 FOLLOWING, CUT_IN = "rare_envs/CarFollowing-v0", "rare_envs/CutIn-v0"

@@ -3,7 +3,7 @@ import pytest
 from scipy import stats
 
 import samplers
-from rare_envs.study.analysis.threshold_curve import N_THRESHOLDS, compute_threshold_curve
+from rare_envs.study.report import N_THRESHOLDS, compute_threshold_curve
 
 
 @pytest.mark.parametrize("method", ["mc", "two-stage", "adss"])

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 import samplers
-from rare_envs.study.analysis.modes import find_modes
-from rare_envs.study.analysis.unlisted import list_every_mode
+from rare_envs.study.modes import find_modes, list_every_mode
 from rare_envs.study.storage.episode_file import digest_scenario
 from samplers.problem import FloatArray
 

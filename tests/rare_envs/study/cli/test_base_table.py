@@ -9,7 +9,7 @@ import pytest
 
 from rare_envs.scenarios.hard_brake import HARD_BRAKE
 from rare_envs.scenarios.registry import SCENARIOS
-from rare_envs.study.cli.base_table import list_bases, print_bases
+from rare_envs.study.cli.listing import list_bases, print_bases
 from tests.rare_envs.study.fitted_files import fitted_entries
 from tests.rare_envs.study.refusals import Cli, assert_refused
 

@@ -13,8 +13,7 @@ from gymnasium import spaces
 from typer.testing import Result
 
 import rare_envs
-from rare_envs.study.ego_check.behaviour import EGO_CHECKS
-from rare_envs.study.ego_check.probe import Probe
+from rare_envs.study.ego_check.checks import EGO_CHECKS, Probe
 
 Cli = Callable[..., Result]
 CUT_IN = "rare_envs/CutIn-v0"

@@ -8,8 +8,7 @@ from collections.abc import Callable
 import pytest
 from typer.testing import Result
 
-from rare_envs.study.cli.catalogue import list_names
-from rare_envs.study.cli.catalogue_table import KINDS, TITLES, print_overview
+from rare_envs.study.cli.listing import KINDS, TITLES, list_names, print_overview
 
 Cli = Callable[..., Result]
 

@@ -11,7 +11,7 @@ import pytest
 from typer.testing import Result
 
 import samplers
-from rare_envs.study.cli.executor_options import ExecutorKind, ExecutorOptions
+from rare_envs.study.cli.options import ExecutorKind, ExecutorOptions
 from tests.rare_envs.study.refusals import FOLLOWING, assert_refused
 
 Cli = Callable[..., Result]

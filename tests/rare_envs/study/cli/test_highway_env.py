@@ -12,7 +12,7 @@ import pytest
 from stable_baselines3 import DQN
 
 import samplers
-from rare_envs.study.cli.highway_env import ESTIMATE_FILE
+from rare_envs.study.cli.estimate import ESTIMATE_FILE
 from tests.rare_envs.study.refusals import FOLLOWING, Cli, assert_refused
 
 

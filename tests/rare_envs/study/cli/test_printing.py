@@ -15,8 +15,8 @@ import pytest
 from typer.testing import Result
 
 from rare_envs import study
-from rare_envs.study.cli.printing import print_report
 from rare_envs.study.html_report.page import list_doubts
+from rare_envs.study.text import print_report
 
 Cli = Callable[..., Result]
 

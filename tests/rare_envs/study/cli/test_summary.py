@@ -12,7 +12,7 @@ import pytest
 from typer.testing import Result
 
 from rare_envs.study import Question, prepare, run
-from rare_envs.study.cli.summary import list_rows
+from rare_envs.study.text import list_rows
 
 Cli = Callable[..., Result]
 

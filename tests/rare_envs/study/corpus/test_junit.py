@@ -6,9 +6,7 @@ import math
 import xml.etree.ElementTree as ET
 from pathlib import Path
 
-from rare_envs.study.corpus.junit import write_junit
-from rare_envs.study.corpus.stored_failure import StoredFailure
-from rare_envs.study.corpus.trial import Trial
+from rare_envs.study.corpus import StoredFailure, Trial, write_junit
 
 
 def test_cases_and_counts(tmp_path: Path) -> None:

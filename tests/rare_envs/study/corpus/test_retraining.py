@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 
 from rare_envs.study import Question, prepare, run_into
-from rare_envs.study.corpus.retraining import plan_retraining
-from rare_envs.study.corpus.storage import read_run
+from rare_envs.study.corpus import plan_retraining, read_run
 from rare_envs.study.errors import BadInput
 from training import train_ego
 

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from rare_envs.study import Question, prepare, run_into
-from rare_envs.study.corpus.storage import add_run, choose_likely, join_x, read_corpus, read_run
-from rare_envs.study.corpus.stored_failure import StoredFailure
+from rare_envs.study.corpus import StoredFailure, add_run, choose_likely, join_x, read_corpus, read_run
 from rare_envs.study.errors import BadInput
 
 

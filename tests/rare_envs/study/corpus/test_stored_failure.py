@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rare_envs.study.corpus.stored_failure import (
+from rare_envs.study.corpus import (
     WORLD_FIELDS,
     StoredFailure,
     make_stored,

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from rare_envs.study import Question
-from rare_envs.study.corpus.stored_failure import StoredFailure, make_stored
-from rare_envs.study.corpus.trial import EgoChoice, try_ego
+from rare_envs.study.corpus import EgoChoice, StoredFailure, make_stored, try_ego
 from rare_envs.study.errors import BadInput
 
 FOLLOWING = Question(env_id="rare_envs/CarFollowing-v0", horizon=4.0)

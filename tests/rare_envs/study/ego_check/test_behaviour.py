@@ -8,14 +8,14 @@ import pytest
 from numpy.typing import NDArray
 
 import rare_envs
-from rare_envs.study.ego_check.behaviour import (
+from rare_envs.study.ego_check.checks import (
+    Probe,
     check_determinism,
     check_driving,
     check_latency,
     check_memory,
     check_row_independence,
 )
-from rare_envs.study.ego_check.probe import Probe
 
 
 class Ego:

@@ -8,13 +8,13 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 import rare_envs
-from rare_envs.study.ego_check.interface import (
+from rare_envs.study.ego_check.checks import (
+    Probe,
     check_actions,
     check_declared_spaces,
     check_extreme_observations,
     check_normalisation,
 )
-from rare_envs.study.ego_check.probe import Probe
 
 
 class Ego:

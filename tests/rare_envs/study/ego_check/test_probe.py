@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 import rare_envs
-from rare_envs.study.ego_check.probe import BATCH_ROWS, Probe, largest_difference
+from rare_envs.study.ego_check.checks import BATCH_ROWS, Probe, largest_difference
 
 
 class Counting:

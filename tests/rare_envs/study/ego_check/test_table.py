@@ -2,8 +2,7 @@
 
 import pytest
 
-from rare_envs.study.ego_check.findings import report_failure, report_pass, report_warning
-from rare_envs.study.ego_check.table import VERDICTS, print_findings
+from rare_envs.study.ego_check.findings import VERDICTS, print_findings, report_failure, report_pass, report_warning
 
 
 def test_findings_remedies_and_verdict_are_printed(capsys: pytest.CaptureFixture[str]) -> None:

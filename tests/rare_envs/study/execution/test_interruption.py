@@ -14,7 +14,7 @@ import pytest
 
 from rare_envs.problem import DrivingProblem
 from rare_envs.study import evaluate, question
-from rare_envs.study.rates import total_risk
+from rare_envs.study import risk as total_risk
 from samplers import estimation
 from samplers.execution.journal import JournalFile, JournalRecord
 from samplers.execution.record_file import RecordFile

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from rare_envs.study.export.road_network import write_road
+from rare_envs.study.export.openscenario import write_road
 from rare_envs.traffic.road import Road, i80
 from tests.rare_envs.study.export.readers import RoadReader
 

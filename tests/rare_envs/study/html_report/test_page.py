@@ -20,9 +20,9 @@ from PIL import Image
 from typer.testing import Result
 
 from rare_envs.study import BadInput, Question, prepare, run_into
+from rare_envs.study.html_report.figures import FigureOfPage
 from rare_envs.study.html_report.page import SECTIONS, list_doubts, render_page, write_html_report
-from rare_envs.study.html_report.svg import FigureOfPage
-from rare_envs.study.storage.loaded_study import load_study
+from rare_envs.study.run_folder import load_study
 from rare_envs.traffic.palette import ROLE_COLOURS, as_rgb
 
 VOID = {"meta", "br", "img", "link", "path", "use", "rect", "circle", "line", "polygon"}

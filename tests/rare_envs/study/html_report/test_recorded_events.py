@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from rare_envs.study import BadInput
-from rare_envs.study.html_report.recorded_events import find_nearest_event, read_recorded_events
+from rare_envs.study.html_report.atlas import find_nearest_event, read_recorded_events
 
 
 def test_the_nearest_event_is_the_nearest_in_deviations() -> None:

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 from matplotlib.figure import Figure
 
-from rare_envs.study.html_report.svg import FORMATS, FigureOfPage
+from rare_envs.study.html_report.figures import FORMATS, FigureOfPage
 
 
 def draw(figure: Figure) -> None:

@@ -4,7 +4,7 @@ from typing import Any
 
 import pytest
 
-from rare_envs.study.html_report.wording import (
+from rare_envs.study.text import (
     describe_intervals,
     describe_rate,
     describe_validity,

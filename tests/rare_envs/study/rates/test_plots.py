@@ -9,8 +9,8 @@ import pytest
 from matplotlib.figure import Figure
 
 from rare_envs.exposure import TotalRate
-from rare_envs.study.rates.plots import draw_rates, draw_shares, save_risk_plot
-from rare_envs.study.rates.text import format_rate
+from rare_envs.study.plots import draw_rates, draw_shares, save_risk_plot
+from rare_envs.study.text import format_rate
 from tests.rare_envs.exposure.test_rate import rate
 
 pytestmark = pytest.mark.usefixtures("full_pictures")

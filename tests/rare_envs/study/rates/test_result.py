@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 
 from rare_envs.study import Question, prepare, run
-from rare_envs.study.collision_rate import compute_rate
-from rare_envs.study.rates.result import Risk, ScenarioRisk
+from rare_envs.study.report import compute_rate
+from rare_envs.study.risk import Risk, ScenarioRisk
 from tests.rare_envs.study.fitted_files import write_fitted
 
 

@@ -12,7 +12,7 @@ import pytest
 from rare_envs.scenarios.hard_brake import HARD_BRAKE
 from rare_envs.scenarios.registry import SCENARIOS, scenario_named
 from rare_envs.study import Question, Report, prepare, run
-from rare_envs.study.rates.sites import check_sites, choose_base, compare_sites, list_sites
+from rare_envs.study.risk import check_sites, choose_base, compare_sites, list_sites
 from tests.rare_envs.study.fitted_files import fitted_entries
 
 OTHER_SITE = {"source": {"site": "another", "data": "more"}}

@@ -7,7 +7,7 @@ import math
 import pytest
 
 from rare_envs.exposure.total_rate import FurtherEvents, TotalRate, VarianceShare
-from rare_envs.study.rates.text import (
+from rare_envs.study.text import (
     describe_further_events,
     describe_parts,
     describe_uncertainty,

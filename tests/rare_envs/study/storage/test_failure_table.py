@@ -8,7 +8,7 @@ import pytest
 from typer.testing import Result
 
 import rare_envs
-from rare_envs.study.storage.failure_table import CRASH, read_failures
+from rare_envs.study.run_folder import CRASH, read_failures
 
 Cli = Callable[..., Result]
 FOLLOWING = "rare_envs/CarFollowing-v0"

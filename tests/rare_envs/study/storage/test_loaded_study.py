@@ -10,7 +10,7 @@ import pytest
 
 import rare_envs
 from rare_envs.study import BadInput, Question, prepare, run_into
-from rare_envs.study.storage import loaded_study
+from rare_envs.study import run_folder as loaded_study
 
 
 @pytest.fixture(scope="module")

@@ -9,8 +9,7 @@ import pytest
 from typer.testing import Result
 
 from rare_envs.study import BadInput, Question
-from rare_envs.study.cli.executor_options import ExecutorKind, ExecutorOptions
-from rare_envs.study.cli.options import EstimateOptions
+from rare_envs.study.cli.options import EstimateOptions, ExecutorKind, ExecutorOptions
 from rare_envs.study.storage.question_file import EXECUTOR_KEYS, NOT_IN_FILES, read_question_file
 
 Cli = Callable[..., Result]

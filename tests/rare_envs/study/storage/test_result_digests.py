@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from rare_envs.study.storage.result_digests import DIGESTED, digest_results, find_changed_results
+from rare_envs.study.run_folder import DIGESTED, digest_results, find_changed_results
 
 
 @pytest.fixture

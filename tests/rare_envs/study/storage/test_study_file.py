@@ -5,8 +5,8 @@ from dataclasses import replace
 from pathlib import Path
 
 from rare_envs.study import Question, prepare
-from rare_envs.study.storage.result_digests import find_changed_results
-from rare_envs.study.storage.study_file import (
+from rare_envs.study.run_folder import find_changed_results
+from rare_envs.study.writing import (
     _describe_command,
     begin_study_file,
     describe_study,

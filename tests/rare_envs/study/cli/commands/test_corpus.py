@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from rare_envs.study.cli.commands.corpus import FAILS
+from rare_envs.study.cli.runs import FAILS
 from tests.rare_envs.study.refusals import SMALL, Cli, assert_refused
 
 
@@ -37,7 +37,7 @@ def test_a_corpus_that_an_ego_passes(cli: Cli, run: Path) -> None:
     cli("corpus", "add", "run")
     from dataclasses import replace
 
-    from rare_envs.study.corpus.storage import read_corpus
+    from rare_envs.study.corpus import read_corpus
 
     for stored in read_corpus(Path("corpus")):
         strict = replace(stored, world={**stored.world, "gamma": -2.0})

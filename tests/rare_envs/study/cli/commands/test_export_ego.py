@@ -14,7 +14,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from typer.testing import Result
 
 from agents import load_ego
-from rare_envs.study.cli.commands.export_ego import export_ego
+from rare_envs.study.cli.egos import export_ego
 from rare_envs.study.errors import BadInput
 from tests.rare_envs.study.refusals import assert_refused
 

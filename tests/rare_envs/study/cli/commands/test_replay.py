@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 from PIL import Image
 
-from rare_envs.study.cli.commands.corpus import FAILS
-from rare_envs.study.storage.failure_table import read_failures
+from rare_envs.study.cli.runs import FAILS
+from rare_envs.study.run_folder import read_failures
 from rare_envs.study.video import CURVES_HEIGHT, LAST_FRAME_TICKS
 from tests.rare_envs.study.refusals import FOLLOWING, SMALL, Cli, assert_refused
 

@@ -1,27 +1,172 @@
-"""LoadedStudy: the folder of a run, read without simulating: numbers, failures, and the table of simulations."""
+"""Folder of a run: its files, and how they are read again without simulating; docs/run_folder.md describes them."""
 
 from __future__ import annotations
 
 import contextlib
+import csv
+import hashlib
+import io
 import math
 import reprlib
-from collections.abc import Iterator
+import zipfile
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 from numpy.typing import NDArray
 
-from rare_envs.files import read_text_file
+from rare_envs.files import check_ordinary, read_text_file
 from rare_envs.json_text import parse_json_object
+from rare_envs.plugins import one_line
 from rare_envs.study.errors import BadInput
-from rare_envs.study.storage.failure_table import read_failures
-from rare_envs.study.storage.names import EPISODES, FAILURES, RESULT, STUDY, STUDY_FORMAT
-from rare_envs.study.storage.result_digests import find_changed_results
 
 if TYPE_CHECKING:
     import pyarrow
+
+
+STUDY = "study.json"
+"""What was asked, by what command and with which versions."""
+STUDY_FORMAT = 1
+"""Version of the fields of study.json; see docs/run_folder.md."""
+RESULT, FAILURES, BLOCKS, PLOT = "result.json", "failures.csv", "failures.npz", "plot.png"
+"""Blocks are what a table has no room for: of more than `columns.MAX_SHOWN` values, drivers' weights and noise."""
+EPISODES = "episodes.parquet"
+"""All simulations."""
+REPORT = "report.html"
+SENSITIVITY = "sensitivity.png"
+"""Bars of what p is sensitive to, if the question asks for it."""
+SEVERITY = "severity.png"
+"""P[collision with delta-v > v] over v, if there are collisions."""
+FAULTS, FAULT_BLOCKS = "faults.csv", "faults.npz"
+"""The same as of failures for scenarios on which the ego failed."""
+RESULT_FILES = (RESULT, FAILURES, BLOCKS, PLOT, SENSITIVITY, SEVERITY, FAULTS, FAULT_BLOCKS, STUDY, EPISODES, REPORT)
+
+
+MAX_BLOCK_BYTES = 1 << 30
+"""Bytes of blocks that are unpacked at most: a thousand failures with a quarter of a million values each."""
+CRASH = (
+    "crash",
+    "striking",
+    "struck",
+    "impact_speed",
+    "closing_speed",
+    "delta_v_striking",
+    "delta_v_struck",
+    "injury_risk_striking",
+    "injury_risk_struck",
+)
+"""Columns of failures.csv that say what a failure ended in: `rare_envs.traffic.crash.Crash`."""
+
+
+def read_failures(folder: Path) -> dict[str, NDArray[Any]]:
+    """Read the failures of a run, the most likely first.
+
+    Args:
+        folder: Of `rare-envs estimate --out`.
+
+    Returns:
+        Parameters by name, shape (n,), or (n, size) for blocks; then "f" and "log_p0", shape (n,), and what the
+        failure ended in: "crash" (words) and the numbers of `CRASH`, NaN without a crash. The parameters of row k
+        replay by `env.reset(options={name: failures[name][k] for name in env.unwrapped.space.names})`.
+
+    Raises:
+        FileNotFoundError: There is no such run.
+        ValueError: One of its files is damaged.
+
+    Example:
+        >>> from tempfile import TemporaryDirectory
+        >>> from rare_envs.study import Question, prepare, run_into
+        >>> question = Question(
+        ...     env_id="rare_envs/CarFollowing-v0", base="us101-gap", gamma=3.0, horizon=3.0, method="mc", max_sim=1000
+        ... )
+        >>> with TemporaryDirectory() as folder:
+        ...     report = run_into(Path(folder), prepare(question))
+        ...     failures = read_failures(Path(folder))
+        >>> failures["gap"].shape, str(failures["crash"][0]), round(float(failures["f"][0]), 2)
+        ((21,), 'none', 2.57)
+    """
+    try:
+        failures = _read_table(folder / FAILURES)
+    except (csv.Error, ValueError) as error:
+        raise ValueError(f"{str(folder / FAILURES)!r} is damaged: {str(error).rstrip('.')}.") from error
+    if (folder / BLOCKS).exists():
+        failures |= _read_blocks(folder / BLOCKS)
+    lengths = {name: len(values) for name, values in failures.items()}
+    if not {"f", "log_p0"} <= set(lengths) or len(set(lengths.values())) > 1:
+        raise ValueError(f"The files of failures in {str(folder)!r} are damaged: they do not have the same rows.")
+    return failures
+
+
+def _read_table(path: Path) -> dict[str, NDArray[Any]]:
+    """Return the columns of a table by name."""
+    header, *rows = csv.reader(io.StringIO(read_text_file(path))) or [[]]
+    if any(len(row) != len(header) for row in rows):
+        raise ValueError("a row has more or fewer cells than the header")
+    columns: dict[str, list[NDArray[Any]]] = {}
+    for column, name in enumerate(header):
+        cells = [row[column] for row in rows]
+        words = name == CRASH[0]
+        values = np.array(cells, dtype=str) if words else np.array([float(cell or "nan") for cell in cells])
+        columns.setdefault(name.partition("[")[0], []).append(values)
+    return {name: parts[0] if len(parts) == 1 else np.stack(parts, axis=1) for name, parts in columns.items()}
+
+
+def _read_blocks(path: Path) -> dict[str, NDArray[Any]]:
+    """Return the large blocks by name, shape (n, size)."""
+    try:
+        check_ordinary(path)
+        with zipfile.ZipFile(path) as archive:
+            if sum(each.file_size for each in archive.infolist()) > MAX_BLOCK_BYTES:
+                raise ValueError(f"more than {MAX_BLOCK_BYTES:,} bytes unpacked")
+        with np.load(path, allow_pickle=False) as blocks:
+            found = {name: np.asarray(blocks[name]) for name in blocks.files}
+        if any(block.dtype.kind != "f" or block.ndim != 2 for block in found.values()):
+            raise ValueError("a block is no table of numbers")
+    except Exception as error:  # the zip, its compression and NumPy's headers have errors of their own
+        raise ValueError(f"{str(path)!r} is damaged: {one_line(error)}.") from error
+    return {name: block.astype(np.float64) for name, block in found.items()}
+
+
+DIGESTED = (RESULT, FAILURES, BLOCKS, FAULTS, FAULT_BLOCKS, EPISODES)
+"""Files that hold numbers of a run; pictures follow from them."""
+_BLOCK = 1 << 20
+
+
+def digest_results(folder: Path) -> dict[str, str]:
+    """Return the BLAKE2b digests of the files with numbers in a folder, by name.
+
+    Raises:
+        OSError: One of them cannot be read.
+    """
+    return {name: _digest_file(folder / name) for name in DIGESTED if (folder / name).is_file()}
+
+
+def find_changed_results(folder: Path, about: Mapping[str, Any]) -> list[str]:
+    """Return the files with numbers that are not what the run wrote: changed, removed or added since.
+
+    Args:
+        folder: Of the run.
+        about: What its study.json holds. One without digests, of an earlier version, tells nothing.
+
+    Raises:
+        OSError: A file cannot be read.
+    """
+    written = about.get("results")
+    if not isinstance(written, Mapping):
+        return []
+    now = digest_results(folder)
+    return [name for name in DIGESTED if now.get(name) != written.get(name)]
+
+
+def _digest_file(path: Path) -> str:
+    digest = hashlib.blake2b(digest_size=16)
+    with path.open("rb") as file:
+        while block := file.read(_BLOCK):
+            digest.update(block)
+    return digest.hexdigest()
 
 
 MAX_TABLE_BYTES = 2**32

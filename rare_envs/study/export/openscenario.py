@@ -1,11 +1,4 @@
-"""Storyboard: a drive as ASAM OpenSCENARIO XML 1.2, or 1.0 for CARLA's scenario_runner.
-
-Every vehicle is put to its place with its speed and follows its trajectory, a polyline with times, by position. A
-vehicle's position in OpenSCENARIO is that of its rear axle, and its bounding box says where its centre is.
-
-scenario_runner reads 1.0 alone, spawns actors at their centres, knows its ego by the name "hero" and the property
-`type`, and takes whoever has no controller for its own: so the ego has "external_control" and no trajectory there.
-"""
+"""OpenSCENARIO and OpenDRIVE: a drive as a storyboard, and its road."""
 
 from __future__ import annotations
 
@@ -16,11 +9,75 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 
 from rare_envs.files import replace_file
-from rare_envs.study.export.dependencies import import_scenariogeneration
-from rare_envs.study.export.trajectories import WorldTrajectories
+from rare_envs.study.export.trajectories import WorldTrajectories, import_scenariogeneration
+from rare_envs.traffic.reference_line import ReferenceLine, list_cells
+from rare_envs.traffic.road import Road
 from rare_envs.traffic.state import VEHICLE_LENGTH, VEHICLE_WIDTH
+
+ROAD_ID = 0
+
+
+def write_road(path: Path, road: Road, start: float, end: float, name: str) -> None:
+    """Write an OpenDRIVE file.
+
+    Args:
+        path: The file, `.xodr`.
+        road: The road.
+        start: Begin of it along the road [m]; s = 0 is there.
+        end: End of it [m]; a curved road is written to the end of its curve at least.
+        name: Of the road.
+
+    Raises:
+        ValueError: The library scenariogeneration is not installed.
+    """
+    xodr = import_scenariogeneration("xodr")
+    planview = xodr.PlanView()
+    if road.reference_line is None:
+        planview.add_fixed_geometry(xodr.Line(end - start), start, 0.0, 0.0)
+    else:
+        _add_curve(xodr, planview, road.reference_line, start, end)
+    network = xodr.OpenDrive(name, revMinor="6")
+    network.add_road(xodr.Road(ROAD_ID, planview, _make_lanes(xodr, road), name=name))
+    with replace_file(path) as draft:
+        network.adjust_roads_and_lanes()
+        network.write_xml(str(draft))
+
+
+def _add_curve(xodr: Any, planview: Any, line: ReferenceLine, start: float, end: float) -> None:
+    """Add a reference line: straight, its cells as cubics, and straight again."""
+    cells = list_cells(line)
+    begin = min(start, 0.0)
+    if begin < 0.0:
+        planview.add_fixed_geometry(xodr.Line(-begin), begin, 0.0, 0.0)
+    for cell in cells:
+        cubic = xodr.ParamPoly3(
+            0.0, 1.0, 0.0, cell.cubic_u, 0.0, 0.0, -cell.square_w, -cell.cubic_w, prange="arcLength", length=cell.length
+        )
+        planview.add_fixed_geometry(cubic, cell.x, -cell.y, -cell.heading)
+    length = cells[0].length * len(cells)
+    last = line.at(torch.tensor([length], dtype=torch.float64))
+    rest = max(end - length, 1.0)
+    planview.add_fixed_geometry(xodr.Line(rest), last.x.item(), -last.y.item(), -last.heading.item())
+
+
+def _make_lanes(xodr: Any, road: Road) -> Any:
+    """Return right lanes with the widths of the road's, solid lines at its edges and broken ones between lanes."""
+    solid, broken = (xodr.RoadMark(kind, width=0.15) for kind in (xodr.RoadMarkType.solid, xodr.RoadMarkType.broken))
+    centre = xodr.Lane(xodr.LaneType.none, a=0.0)
+    centre.add_roadmark(solid)
+    section = xodr.LaneSection(0.0, centre)
+    for lane in range(road.lanes):
+        right = xodr.Lane(xodr.LaneType.driving, a=road.edges[lane + 1] - road.edges[lane])
+        right.add_roadmark(solid if lane == road.lanes - 1 else broken)
+        section.add_right_lane(right)
+    lanes = xodr.Lanes()
+    lanes.add_lanesection(section)
+    lanes.add_laneoffset(xodr.LaneOffset(0.0, -road.edges[0]))
+    return lanes
+
 
 WHEELBASE = 2.8
 """Distance of the axles [m]; a usual car of 5 m."""

@@ -1,0 +1,341 @@
+"""Commands that estimate: `estimate`, `resume` and `plan`, in HighwayEnv's own environments too."""
+
+from __future__ import annotations
+
+import math
+import shlex
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, NoReturn
+
+import typer
+
+from rare_envs.scenarios.registry import is_highway_env_id
+from rare_envs.study.cli.options import (
+    AlgoOption,
+    DetailsOption,
+    EstimateOptions,
+    ExecutorOptions,
+    ForceOption,
+    JsonOption,
+    QuestionOptions,
+    StatsOption,
+    TrustOption,
+)
+from rare_envs.study.cli.shell import (
+    DOUBTFUL,
+    is_typed,
+    keep_stdout_for_the_answer,
+    print_json,
+    print_whole,
+    say_early_stop,
+    show_what_is_known,
+)
+from rare_envs.study.errors import BadInput, as_bad_input, output_folder
+from rare_envs.threads import use_one_thread
+from training.command_line import spread_options
+
+if TYPE_CHECKING:
+    from rare_envs.study.question import Question
+    from samplers import Estimate, Executor, PlannedRun
+
+
+OPTIONS = frozenset(
+    "env ego algo stats trust method measure gamma seed max_sim target_cov replicates on_error noise horizon chunk "
+    "workers executor address time_limit memory_limit config out force as_json".split()
+)
+"""Parameters of the command that HighwayEnv's environments have; the others are of the batched simulation."""
+ESTIMATE_FILE = "estimate.safetensors"
+"""File in the folder of `--out`; `samplers.Estimate.load` reads it."""
+HELD = "HighwayEnv's environment as it is: what it holds fixed is held; rare_envs.highway_env_problem varies it too"
+"""Condition of p."""
+
+
+def estimate_highway_env(
+    question: Question, typed: set[str], out: Path | None, force: bool, executor: Executor | None
+) -> dict[str, Any]:
+    """Estimate how often an ego crashes in one of HighwayEnv's environments, as that environment draws its traffic.
+
+    Args:
+        question: With an id of HighwayEnv.
+        typed: Parameters of the command that were given.
+        out: Folder for the estimate, or None.
+        force: Replace an earlier one there.
+        executor: Where to simulate; None for this process.
+
+    Returns:
+        The answer, JSON-ready, with the text of the estimate as "text", and whether a warning casts doubt on the number
+        as "doubtful".
+
+    Raises:
+        BadInput: An option does not go with such an environment, the ego does not fit, or the folder cannot be used.
+        RunInterrupted: It was interrupted; this has the answer of those made.
+    """
+    import agents
+    import rare_envs
+    import samplers
+    from rare_envs.study.execution.interruption import FIRST_BATCH, RunInterrupted, describe_stop
+
+    refused = sorted(typed - OPTIONS)
+    if refused:
+        raise BadInput(
+            f"{question.env_id!r} is an environment of HighwayEnv, which has no --{refused[0].replace('_', '-')}; "
+            f"expected {', '.join(rare_envs.ENV_IDS)} with it."
+        )
+    file = None if out is None else out / ESTIMATE_FILE
+    if file is not None and file.exists() and not force:
+        raise BadInput(f"There is a finished run in {str(out)!r} ({ESTIMATE_FILE}): replace it by --force.")
+    with as_bad_input(ValueError, OSError, TypeError):
+        samplers.get_method(question.method)
+        ego = agents.load_ego(question.ego, algo=question.algo, trust=question.trust, stats=question.stats)
+        settings: dict[str, Any] = {} if question.horizon is None else {"horizon": question.horizon}
+        problem = rare_envs.highway_env_problem(
+            question.env_id, ego, measure=question.measure, noise=question.noise, fixed="highway_env", **settings
+        )
+        try:
+            with problem:
+                result = samplers.estimate(
+                    problem,
+                    question.method,
+                    progress=True,
+                    executor=executor,
+                    **_read_arguments(question),
+                )
+        except samplers.EstimationInterrupted as stopped:
+            known = _describe(question, problem, stopped.estimate)
+            raise RunInterrupted(describe_stop(stopped.estimate), known) from None
+        except KeyboardInterrupt:
+            raise RunInterrupted(FIRST_BATCH) from None
+    if file is not None:
+        with output_folder(file.parent):
+            result.save(file)
+    return _describe(question, problem, result)
+
+
+def _read_arguments(question: Question) -> dict[str, Any]:
+    """Return the arguments of `samplers.estimate` that a question has."""
+    names = ("gamma", "seed", "max_sim", "target_cov", "replicates", "on_error")
+    return {name: getattr(question.run_arguments, name) for name in names}
+
+
+def _describe(question: Question, problem: Any, result: Estimate) -> dict[str, Any]:
+    """Return the answer, JSON-ready."""
+    from rare_envs.study.report import has_exact_bound
+
+    shown = result
+    if has_exact_bound(result):  # the warning that nothing failed casts no doubt on the upper end
+        shown = replace(result, warnings=(), remarks=(*result.warnings, *result.remarks))
+    lines = [f"{question.env_id}, ego {question.ego}", str(shown), f"  given {HELD}"]
+    likeliest = {}
+    if len(result.failures):
+        likeliest = {name: _as_plain(value) for name, value in problem.space.named(result.failures.x[0]).items()}
+        lines.append(f"  most likely failure: {', '.join(f'{name} {value}' for name, value in likeliest.items())}")
+    about = {"env_id": question.env_id, "ego": question.ego, "given": HELD, "most_likely": likeliest}
+    return {**result.to_dict(), **about, "doubtful": bool(shown.warnings), "text": "\n".join(lines)}
+
+
+def _as_plain(value: Any) -> Any:
+    """Return a number, or a list of such, with three decimals."""
+    import numpy as np
+
+    return np.round(value, 3).tolist()
+
+
+GATE_CODES = {"passes": 0, "fails": 4, "undecided": 5}
+"""Exit codes of a comparison of p with a limit."""
+
+
+@spread_options
+@say_early_stop()
+@use_one_thread()
+def estimate_command(
+    context: typer.Context,
+    options: EstimateOptions,
+    places: ExecutorOptions,
+    env: Annotated[
+        str | None,
+        typer.Argument(
+            metavar="ENV",
+            help="Environment, such as rare_envs/CutIn-v0; or in --config.",
+        ),
+    ] = None,
+    config: Annotated[
+        Path | None, typer.Option(help="YAML file with ENV (env: ...) and options; those given here come first.")
+    ] = None,
+    out: Annotated[Path | None, typer.Option(help="Folder of the run: result.json, episodes.parquet and more.")] = None,
+    force: ForceOption = False,
+    as_json: JsonOption = False,
+    details: DetailsOption = False,
+) -> None:
+    """Estimate how often an ego fails, with an interval, and show its most likely failure."""
+    from rare_envs.study.evaluate import run, run_into
+    from rare_envs.study.question import prepare
+    from rare_envs.study.storage.question_file import EXECUTOR_KEYS, join_question, read_question_file
+
+    typed = {name for name in context.params if is_typed(context, name)}
+    given = {} if config is None else read_question_file(config)
+    with as_bad_input(ValueError):
+        places = places.fill({name: given.pop(name) for name in EXECUTOR_KEYS if name in given}, typed)
+    question = join_question(given, env, options.arguments(), typed)
+    if question.max_p is None:
+        _refuse_options_of_a_limit(typed | set(given))
+    if is_highway_env_id(question.env_id):
+        _estimate_highway_env(question, typed, out, force, as_json, places)
+    with show_what_is_known(lambda known: show_report(known, None, as_json, details)), keep_stdout_for_the_answer():
+        with as_bad_input(ValueError):
+            executor = places.make()
+        study = prepare(question)
+        report = (
+            run(study, progress=True, executor=executor)
+            if out is None
+            else run_into(out, study, progress=True, force=force, executor=executor)
+        )
+    _answer(report, out, as_json, details)
+
+
+def _estimate_highway_env(
+    question: Question, typed: set[str], out: Path | None, force: bool, as_json: bool, places: ExecutorOptions
+) -> NoReturn:
+    """Estimate in an environment of HighwayEnv, print the answer and exit."""
+    from rare_envs.study.cli.estimate import estimate_highway_env
+
+    def show(answer: dict[str, Any], where: str = "") -> None:
+        text = answer.pop("text")
+        if as_json:
+            print_json(answer)
+        else:
+            print(f"{text}{where}")
+
+    with show_what_is_known(show), keep_stdout_for_the_answer(), as_bad_input(ValueError):
+        answer = estimate_highway_env(question, typed, out, force, places.make())
+    print_whole(lambda: show(answer, "" if out is None else f"\nWrote {out}."))
+    raise typer.Exit(DOUBTFUL if answer["doubtful"] else 0)
+
+
+def _refuse_options_of_a_limit(typed: set[str]) -> None:
+    """Refuse options that a question without --max-p would ignore."""
+    for name, option in (("given_base", "--given-base"), ("gate_confidence", "--confidence")):
+        if name in typed:
+            raise BadInput(f"Expected {option} together with --max-p, the limit of p.")
+
+
+def _answer(report: Any, out: Path | None, as_json: bool, details: bool) -> NoReturn:
+    """Print a report and exit."""
+    print_whole(lambda: show_report(report, out, as_json, details))
+    if report.verdict is not None:
+        raise typer.Exit(GATE_CODES[report.verdict.decision])
+    raise typer.Exit(DOUBTFUL if report.doubtful else 0)
+
+
+def show_report(report: Any, out: Path | None, as_json: bool, details: bool = False) -> None:
+    """Print a report."""
+    from rare_envs.study.text import print_report
+
+    if as_json:
+        print_json(report.to_dict())
+    else:
+        print_report(report, out, details)
+        if not details:
+            where = "--details" if out is None else f"rare-envs report {shlex.quote(str(out))}"
+            print(f"all intervals and parameters: {where}")
+
+
+@spread_options
+@say_early_stop("Stopped before the run went on; what it had kept is still there.")
+@use_one_thread()
+def resume_command(
+    run: Annotated[
+        Path, typer.Argument(metavar="RUN", help="Folder of an estimate --out that has not come to its end.")
+    ],
+    places: ExecutorOptions,
+    ego: Annotated[str | None, typer.Option(help="New address of an ego in another program, tcp://...")] = None,
+    on_error: Annotated[str | None, typer.Option(help="Instead of what the run had: raise, failure or bound.")] = None,
+    trust: TrustOption = False,
+    mend: Annotated[
+        bool, typer.Option("--mend", help="Of a damaged journal, keep the simulations before the damage.")
+    ] = False,
+    as_json: JsonOption = False,
+    details: DetailsOption = False,
+) -> None:
+    """Continue an interrupted run; the result is the same as without the interruption."""
+    from rare_envs.study.evaluate import resume
+
+    with show_what_is_known(lambda known: show_report(known, None, as_json, details)), keep_stdout_for_the_answer():
+        with as_bad_input(ValueError):
+            executor = places.make()
+        report = resume(run, ego, on_error, trust, progress=True, mend=mend, executor=executor)
+    _answer(report, run, as_json, details)
+
+
+@spread_options
+@use_one_thread()
+def plan_command(
+    context: typer.Context,
+    target: Annotated[
+        str,
+        typer.Argument(
+            metavar="ENV|RUN",
+            help="Environment, of which pilots are run; or the folder of a run.",
+        ),
+    ],
+    options: QuestionOptions,
+    cov: Annotated[
+        float, typer.Option("--cov", "--target-cov", help="Coefficient of variation that is wished for.")
+    ] = 0.1,
+    ego: Annotated[str, typer.Option(help="An ego, as for estimate --ego.")] = "idm",
+    pilot: Annotated[
+        int | None, typer.Option(help="Simulations of each pilot.", show_default="the method's own budget")
+    ] = None,
+    algo: AlgoOption = None,
+    stats: StatsOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Plan simulations and wall time for a precision, by each of --method (joined by commas) and plain Monte Carlo."""
+    from rare_envs.study.corpus import read_recorded
+    from rare_envs.study.plan import plan_by_pilots, plan_from_result
+    from rare_envs.study.question import Question
+    from samplers.validation import check_number
+
+    with as_bad_input(ValueError):
+        check_number("--cov", cov, 0.0, math.inf)  # before the pilots
+    with keep_stdout_for_the_answer():
+        if Path(target).is_dir():
+            _refuse_options_of_pilots(context)
+            found = plan_from_result(read_recorded(Path(target)), cov)
+        else:
+            arguments = options.arguments()
+            methods = [name.strip() for name in str(arguments.pop("method")).split(",")]
+            _check_environment(target)
+            question = Question(env_id=target, ego=ego, algo=algo, stats=stats, max_sim=pilot, **arguments)
+            found = plan_by_pilots(question, methods, cov, progress=True)
+    if as_json:
+        print_json({"target_cov": cov, "runs": [each.to_dict() for each in found]})
+    else:
+        _print_plan(found, cov)
+
+
+def _check_environment(target: str) -> None:
+    """Raise a BadInput unless a target, which is no folder, is the name of an environment."""
+    from rare_envs.scenarios.registry import find_scenario
+
+    try:
+        find_scenario(target)
+    except ValueError as error:
+        raise BadInput(f"There is no folder {target!r} of a run. {error}") from error
+
+
+def _refuse_options_of_pilots(context: typer.Context) -> None:
+    """Refuse what was typed beside the folder of a run, which has a question of its own."""
+    typed = sorted(name for name in context.params if is_typed(context, name))
+    refused = [name for name in typed if name not in ("target", "cov", "as_json")]
+    if refused:
+        raise BadInput(f"Expected the folder of a run without --{refused[0].replace('_', '-')}: nothing is simulated.")
+
+
+def _print_plan(found: tuple[PlannedRun, ...], cov: float) -> None:
+    from rare_envs.study.plan import format_seconds
+
+    print(f"For a c.o.v. of {cov:g} (--target-cov {cov:g}):")
+    for each in found:
+        time = "" if each.seconds is None else f", about {format_seconds(each.seconds)} at the pilot's speed"
+        print(f"  {each.method:<12} {each.n_sim:>15,} simulations{time}")

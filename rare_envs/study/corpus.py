@@ -1,0 +1,668 @@
+"""Corpus: failures kept as regression scenarios, each a file, and what another ego does in them."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import re
+import reprlib
+import time
+import xml.etree.ElementTree as ET
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, fields, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+import agents
+from agents.loading import find_ego_kind
+from agents.sb3.saved_ego import load_saved_ego
+from rare_envs.files import check_ordinary, read_text_file, replace_file, replace_text
+from rare_envs.json_text import parse_json_object
+from rare_envs.make import set_up
+from rare_envs.problem import DrivingProblem
+from rare_envs.scenarios.registry import find_scenario
+from rare_envs.study.errors import BadInput, as_bad_input, output_folder
+from rare_envs.study.journal import refuse_unfinished
+from rare_envs.study.question import Question, build_problem, prepare, read_question
+from rare_envs.study.recorded_question import note_question, open_question
+from rare_envs.study.run_folder import CRASH, FAILURES, RESULT, read_failures
+from rare_envs.study.video import REPLAY_TOLERANCE, RecordedFailure, count_found
+from rare_envs.version import __version__
+from training import Retraining
+
+STORED_FORMAT = 1
+"""Number of the format."""
+MAX_STORED = 2**26
+"""Bytes of a file that are read at most; 400,000 values take 10 MB."""
+MAX_WORD = 300
+"""Letters of a word that is shown."""
+WORLD_FIELDS = ("measure", "gamma", "noise", "drivers", "horizon", "collisions", "weather")
+"""Fields of a `Question` that decide what happens in a scenario and what counts as a failure, the ego apart."""
+
+
+@dataclass(frozen=True)
+class StoredFailure:
+    """A scenario in which an ego failed.
+
+    Attributes:
+        env_id: The environment.
+        world: Values of `WORLD_FIELDS`.
+        x: Scenario parameters by name, each of shape (size,).
+        f: The measure that was recorded.
+        log_p0: Log density under the base distribution.
+        ego: The ego that failed, as its run named it.
+        crash: Kind of its crash, in words.
+        base: Base distribution of the run; the scenario's default when None. It says how likely x is, and does not
+            change what happens in it.
+        versions: Versions of this program and of the libraries that simulate.
+
+    Example:
+        >>> world = {**{name: getattr(Question(env_id=""), name) for name in WORLD_FIELDS}, "horizon": 4.0}
+        >>> x = {"ego_speed": [20.0], "lead_speed": [5.0], "gap": [10.0]}
+        >>> stored = StoredFailure("rare_envs/CarFollowing-v0", world, x, f=-1.0, log_p0=-9.0, ego="idm")
+        >>> stored.key, parse_stored(stored.to_json(), "the file") == stored
+        ('d1b67d1f89efd1b8', True)
+    """
+
+    env_id: str
+    world: Mapping[str, Any]
+    x: Mapping[str, list[float]]
+    f: float
+    log_p0: float
+    ego: str = ""
+    crash: str = ""
+    base: str | None = None
+    versions: Mapping[str, str] | None = None
+
+    @property
+    def digest(self) -> str:
+        """SHA-256 of what decides the scenario: environment, world and x."""
+        content = [self.env_id, dict(self.world), dict(self.x)]
+        return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
+
+    @property
+    def key(self) -> str:
+        """First letters of `digest`: the name of its file."""
+        return self.digest[:16]
+
+    @property
+    def gamma(self) -> float:
+        """Threshold: f of this or less is a failure."""
+        return float(self.world["gamma"])
+
+    def question_values(self) -> dict[str, Any]:
+        """Return the scenario as values of a `Question`, with the rule-based ego in it."""
+        return {"env_id": self.env_id, "ego": "idm", **self.world}
+
+    def to_json(self) -> str:
+        """Return the text of its file."""
+        content = {"format": STORED_FORMAT, "sha256": self.digest, **asdict(self)}
+        content["f"], content["log_p0"] = (value if math.isfinite(value) else None for value in (self.f, self.log_p0))
+        return json.dumps(content, allow_nan=False, indent=1) + "\n"
+
+
+def describe_versions() -> dict[str, str]:
+    """Return the versions that the outcome of a simulation may depend on."""
+    import torch
+
+    return {"rare_envs": __version__, "torch": torch.__version__, "numpy": np.__version__}
+
+
+def make_stored(
+    question: Question, x: Mapping[str, NDArray[np.float64]], f: float, log_p0: float, crash: str
+) -> StoredFailure:
+    """Return a failure of a run as it is stored.
+
+    Args:
+        question: Of the run.
+        x: Parameters by name, each a number or (size,).
+        f: The measure.
+        log_p0: Log density.
+        crash: Kind of crash.
+    """
+    values = {name: np.atleast_1d(part).astype(np.float64).tolist() for name, part in x.items()}
+    world = {name: getattr(question, name) for name in WORLD_FIELDS}
+    base, versions = _name_base(question), describe_versions()
+    return StoredFailure(question.env_id, world, values, f, log_p0, question.ego, crash, base, versions)
+
+
+def _name_base(question: Question) -> str | None:
+    """Return the name of the base distribution, the scenario's default where the question names none."""
+    try:
+        return question.base or find_scenario(question.env_id).default_base
+    except ValueError:  # a scenario of the user's that is not there any longer
+        return None
+
+
+def parse_stored(text: str, source: str) -> StoredFailure:
+    """Return the failure that a file has.
+
+    Args:
+        text: Of the file, which anybody may have written.
+        source: Its name, for messages.
+
+    Raises:
+        ValueError: It is no stored failure, or was changed after it was written.
+    """
+    content = parse_json_object(text, source)
+    if content.get("format") != STORED_FORMAT:
+        raise ValueError(f"{source}: expected format {STORED_FORMAT}, got {reprlib.repr(content.get('format'))}.")
+    try:
+        stored = StoredFailure(**{each.name: content[each.name] for each in fields(StoredFailure)})
+    except KeyError as error:
+        raise ValueError(f"{source} has no {error}.") from None
+    _check_words(stored, source)
+    _check_numbers(stored, source)
+    if stored.digest != content.get("sha256"):
+        raise ValueError(f"{source}: the scenario is not the one that was stored (its sha256 differs).")
+    f, log_p0 = (math.nan if value is None else float(value) for value in (stored.f, stored.log_p0))
+    return StoredFailure(
+        **{**{each.name: content[each.name] for each in fields(StoredFailure)}, "f": f, "log_p0": log_p0}
+    )
+
+
+def _check_words(stored: StoredFailure, source: str) -> None:
+    words = (stored.env_id, stored.ego, stored.crash)
+    if not all(isinstance(word, str) and len(word) <= MAX_WORD for word in words):
+        raise ValueError(f"{source}: expected env_id, ego and crash of up to {MAX_WORD} letters.")
+    if stored.base is not None and not isinstance(stored.base, str):
+        raise ValueError(f"{source}: expected base to be a name or null.")
+    if not isinstance(stored.world, dict) or set(stored.world) != set(WORLD_FIELDS):
+        raise ValueError(f"{source}: expected a world with {', '.join(WORLD_FIELDS)}.")
+
+
+def _check_numbers(stored: StoredFailure, source: str) -> None:
+    x = stored.x
+    rows = x.values() if isinstance(x, dict) else ()
+    if not rows or not all(isinstance(row, list) and all(_is_number(value) for value in row) for row in rows):
+        raise ValueError(f"{source}: expected x with lists of finite numbers by name.")
+    gamma = stored.world["gamma"]
+    if not _is_number(gamma) or not all(value is None or _is_number(value) for value in (stored.f, stored.log_p0)):
+        raise ValueError(f"{source}: expected gamma, f and log_p0 to be numbers.")
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+
+
+def read_stored(path: Path) -> StoredFailure:
+    """Read a file of a corpus.
+
+    Raises:
+        ValueError: It is no stored failure.
+        OSError: It cannot be read.
+    """
+    check_ordinary(path, MAX_STORED)
+    content = path.read_bytes()
+    return parse_stored(content.decode("utf-8", "replace"), repr(str(path)))
+
+
+MAX_CORPUS_FILES = 100_000
+"""Files of a corpus that are read at most."""
+
+
+def read_run(folder: Path, trust: bool = False) -> list[StoredFailure]:
+    """Return the failures of a run, the most likely first; nothing is simulated and no ego is loaded.
+
+    Args:
+        folder: Of `rare-envs estimate --out`.
+        trust: Trust the code that a run from elsewhere names.
+
+    Raises:
+        BadInput: There is no such run, it is not finished, its files are damaged, or it is not trusted.
+
+    Example:
+        >>> read_run(Path("runs/nowhere"))
+        Traceback (most recent call last):
+            ...
+        rare_envs.study.errors.BadInput: No run in 'runs/nowhere': expected result.json and failures.csv, as rare-envs estimate --out writes.
+    """  # noqa: E501 (the example shows a whole message)
+    question = open_question(read_recorded(folder).get("question"), folder, trust)
+    try:
+        table = read_failures(folder)
+    except OSError as error:
+        raise BadInput(_no_run(folder)) from error
+    except ValueError as error:
+        raise BadInput(error) from error
+    names = [name for name in table if name not in ("f", "log_p0", *CRASH)]
+    if not names or not all(np.isfinite(table[name]).all() for name in names):
+        raise BadInput(f"The files of failures in {str(folder)!r} are damaged: a parameter is no number.")
+    words = table.get(CRASH[0])
+    return [
+        make_stored(
+            question,
+            {name: table[name][k] for name in names},
+            float(table["f"][k]),
+            float(table["log_p0"][k]),
+            "" if words is None else str(words[k]),
+        )
+        for k in range(len(table["f"]))
+    ]
+
+
+def read_recorded(folder: Path) -> dict[str, Any]:
+    """Return what the file `RESULT` of a finished run has.
+
+    Raises:
+        BadInput: There is no such run, or it is not finished.
+    """
+    refuse_unfinished(folder)
+    try:
+        return parse_json_object(read_text_file(folder / RESULT), repr(str(folder / RESULT)))
+    except OSError as error:
+        raise BadInput(_no_run(folder)) from error
+    except ValueError as error:
+        raise BadInput(error) from error
+
+
+def _no_run(folder: Path) -> str:
+    return f"No run in {str(folder)!r}: expected {RESULT} and {FAILURES}, as rare-envs estimate --out writes."
+
+
+def choose_likely(failures: Sequence[StoredFailure], most: int, modes: Sequence[int] = ()) -> list[StoredFailure]:
+    """Return the `most` most likely failures, one of each kind of crash and mode among them as far as there is room.
+
+    Args:
+        failures: The most likely first.
+        most: Their number.
+        modes: Numbers of the failures that stand for a mode each.
+    """
+    first: dict[str, int] = {}
+    for number, failure in enumerate(failures):
+        first.setdefault(failure.crash, number)
+    order = list(dict.fromkeys([*first.values(), *modes, *range(len(failures))]))
+    return [failures[number] for number in sorted(order[:most])]
+
+
+def add_run(run: Path, corpus: Path, most: int = 20, trust: bool = False) -> tuple[list[StoredFailure], int]:
+    """Add failures of a run to a corpus; those that it has already stay as they are.
+
+    Args:
+        run: Folder of `rare-envs estimate --out`.
+        corpus: Folder of the corpus; is made, if need be.
+        most: Number of failures, the most likely ones and one of each kind of crash and each mode.
+        trust: Trust the code that a run from elsewhere names.
+
+    Returns:
+        The failures, and how many of them are new.
+
+    Raises:
+        BadInput: There is no such run, or the corpus cannot be written.
+
+    Example:
+        >>> from tempfile import TemporaryDirectory
+        >>> from rare_envs.study import Question, prepare, run_into
+        >>> question = Question(
+        ...     env_id="rare_envs/CarFollowing-v0", base="us101-gap", gamma=3.0, horizon=3.0, method="mc", max_sim=1000
+        ... )
+        >>> with TemporaryDirectory() as folder:
+        ...     report = run_into(Path(folder) / "run", prepare(question))
+        ...     chosen, new = add_run(Path(folder) / "run", Path(folder) / "corpus", most=5)
+        ...     len(chosen), new, len(read_corpus(Path(folder) / "corpus"))
+        (5, 5, 5)
+    """
+    if most < 1:
+        raise BadInput(f"Expected at least one failure to add, got {most}.")
+    failures = read_run(run, trust)
+    chosen = choose_likely(failures, most, _find_modes(read_recorded(run), len(failures)))
+    if not chosen:
+        raise BadInput(f"The run in {str(run)!r} has no failure.")
+    new = 0
+    with output_folder(corpus), as_bad_input(OSError):
+        for failure in chosen:
+            path = corpus / f"{failure.key}.json"
+            if not path.exists():
+                replace_text(path, failure.to_json())
+                new += 1
+            note_question(read_question(failure.question_values()))
+    return chosen, new
+
+
+def _find_modes(recorded: Mapping[str, Any], n: int) -> list[int]:
+    """Return the numbers of the failures, below n, that stand for a mode each; what is no number is left out."""
+    modes = recorded.get("modes")
+    numbers = [mode.get("failure") for mode in modes if isinstance(mode, dict)] if isinstance(modes, list) else []
+    return [number for number in numbers if type(number) is int and 0 <= number < n]
+
+
+def read_corpus(folder: Path) -> list[StoredFailure]:
+    """Read a corpus, in the order of its files' names.
+
+    Raises:
+        BadInput: There is none, or one of its files is damaged.
+
+    Example:
+        >>> read_corpus(Path("nowhere"))
+        Traceback (most recent call last):
+            ...
+        rare_envs.study.errors.BadInput: There is no corpus in 'nowhere': rare-envs corpus add RUN makes one.
+    """
+    paths = sorted(folder.glob("*.json"))
+    if not paths:
+        raise BadInput(f"There is no corpus in {str(folder)!r}: rare-envs corpus add RUN makes one.")
+    if len(paths) > MAX_CORPUS_FILES:
+        raise BadInput(f"The corpus in {str(folder)!r} has more than {MAX_CORPUS_FILES:,} files.")
+    with as_bad_input(ValueError, OSError):
+        return [read_stored(path) for path in paths]
+
+
+def join_x(failures: Sequence[StoredFailure], names: Sequence[str], sizes: Sequence[int]) -> NDArray[np.float64]:
+    """Return x (n, d) of failures for a problem with these parameters.
+
+    An ego's own noise, `ego_noise`, belongs to the ego that failed: another one has zeros, its mean actions.
+
+    Raises:
+        ValueError: A failure lacks a parameter, or has another size of it.
+    """
+    rows = []
+    for failure in failures:
+        parts: list[Any] = []
+        for name, size in zip(names, sizes, strict=True):
+            part = failure.x.get(name)
+            if name == "ego_noise" and (part is None or len(part) != size):
+                part = [0.0] * size
+            if part is None or len(part) != size:
+                raise ValueError(
+                    f"Stored failure {failure.key} has {0 if part is None else len(part)} values of {name}, its "
+                    f"scenario has {size}: {failure.env_id} or its drivers have changed since."
+                )
+            parts += part
+        rows.append(parts)
+    return np.array(rows, dtype=np.float64)
+
+
+NO_FAILURE = "The run has no failure."
+TrialOutcome = Literal["passed", "failed", "error"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class EgoChoice:
+    """An ego as options name it, and its interface.
+
+    Example:
+        >>> EgoChoice(ego="ppo.zip", observation="lidar")
+        EgoChoice(ego='ppo.zip', algo=None, stats=None, observation='lidar', action=None)
+    """
+
+    ego: str
+    algo: str | None = None
+    stats: str | None = None
+    observation: str | None = None
+    action: str | None = None
+
+
+@dataclass(frozen=True)
+class Trial:
+    """An ego in one stored scenario.
+
+    Attributes:
+        failure: The scenario.
+        outcome: "passed" if f > gamma, "failed" if not, "error" if the ego failed to answer.
+        f: Its measure; NaN after an error.
+        crash: Kind of its crash, where it failed.
+        reason: The error.
+
+    Example:
+        >>> stored = StoredFailure("rare_envs/CutIn-v0", {"gamma": 0.0}, {"x": [1.0]}, f=-1.0, log_p0=-9.0)
+        >>> trial = Trial(stored, "passed", f=1.5)
+        >>> trial.same, trial.to_dict()["outcome"]
+        (False, 'passed')
+    """
+
+    failure: StoredFailure
+    outcome: TrialOutcome
+    f: float
+    crash: str = ""
+    reason: str = ""
+
+    @property
+    def same(self) -> bool:
+        """Whether f is the one that was recorded."""
+        return abs(self.f - self.failure.f) <= REPLAY_TOLERANCE or (math.isnan(self.f) and math.isnan(self.failure.f))
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain values for JSON."""
+        return {
+            "key": self.failure.key,
+            "env_id": self.failure.env_id,
+            "outcome": self.outcome,
+            "f": self.f if math.isfinite(self.f) else None,
+            "gamma": self.failure.gamma,
+            "f_recorded": self.failure.f if math.isfinite(self.failure.f) else None,
+            "crash": self.crash,
+            "crash_recorded": self.failure.crash,
+            "ego_recorded": self.failure.ego,
+            "reason": self.reason,
+        }
+
+
+def try_ego(
+    failures: Sequence[StoredFailure], choice: EgoChoice, folder: Path, trust: bool = False
+) -> tuple[list[Trial], float]:
+    """Drive an ego through stored scenarios, those of one world side by side.
+
+    Args:
+        failures: The scenarios.
+        choice: The ego.
+        folder: Where they are from, for messages.
+        trust: Let the ego's file run code, and code that the scenarios name.
+
+    Returns:
+        A trial of each, in their order, and the wall time of all [s].
+
+    Raises:
+        BadInput: The ego cannot be used, or a scenario is not one of its world any longer.
+
+    Example:
+        >>> from rare_envs.study.corpus import WORLD_FIELDS
+        >>> world = {name: getattr(Question(env_id=""), name) for name in WORLD_FIELDS}
+        >>> x = {"ego_speed": [20.0], "lead_speed": [5.0], "gap": [10.0]}
+        >>> stored = StoredFailure("rare_envs/CarFollowing-v0", world, x, f=-1.0, log_p0=-9.0)
+        >>> (trial,), _ = try_ego([stored], EgoChoice(ego="idm"), Path("corpus"))
+        >>> trial.outcome, trial.f, trial.crash
+        ('failed', -1.0, 'rear_end')
+    """
+    worlds: dict[str, list[int]] = {}
+    for number, failure in enumerate(failures):
+        worlds.setdefault(json.dumps(failure.question_values(), sort_keys=True), []).append(number)
+    questions = {text: open_question(json.loads(text), folder, trust) for text in worlds}
+    start = time.perf_counter()
+    with as_bad_input(ValueError, OSError, ImportError), np.errstate():
+        ego = agents.load_ego(choice.ego, algo=choice.algo, trust=trust, stats=choice.stats)
+        trials: dict[int, Trial] = {}
+        for text, numbers in worlds.items():
+            problem = _build(questions[text], choice, ego)
+            trials |= zip(numbers, _try_world(problem, [failures[k] for k in numbers]), strict=True)
+    return [trials[number] for number in range(len(failures))], time.perf_counter() - start
+
+
+def repeat_run(folder: Path, failures: Sequence[StoredFailure], trust: bool = False) -> tuple[list[Trial], float]:
+    """Drive the ego of a run through its failures again; arguments and errors as of `try_ego`.
+
+    Args:
+        folder: Of the run.
+        failures: Of `read_run`.
+        trust: As `try_ego`.
+    """
+    start = time.perf_counter()
+    with as_bad_input(ValueError, OSError):
+        question = open_question(read_recorded(folder).get("question"), folder, trust)
+        problem = prepare(question).problem
+        trials = _try_world(problem, failures)
+    return trials, time.perf_counter() - start
+
+
+def find_for_ego(folder: Path, number: int, ego: str, trust: bool = False) -> RecordedFailure:
+    """Return failure `number` of a run, with another ego in its world.
+
+    Raises:
+        BadInput: There is no such run or failure, or the ego cannot be used.
+    """
+    failures = read_run(folder, trust)
+    if not 0 <= number < len(failures):
+        raise BadInput(f"Expected a failure from 0 to {len(failures) - 1}, got {number}." if failures else NO_FAILURE)
+    failure = failures[number]
+    problem, x = load_world(failure, EgoChoice(ego=ego), folder, trust)
+    return RecordedFailure(
+        problem, x, failure.f, failure.log_p0, len(failures), count_found(read_recorded(folder), len(failures))
+    )
+
+
+def load_world(
+    failure: StoredFailure, choice: EgoChoice, folder: Path, trust: bool = False
+) -> tuple[DrivingProblem, NDArray[np.float64]]:
+    """Return the world of a stored failure with another ego in it, and x (d,).
+
+    Raises:
+        BadInput: As `try_ego`.
+    """
+    question = open_question(failure.question_values(), folder, trust)
+    with as_bad_input(ValueError, OSError, ImportError), np.errstate():
+        ego = agents.load_ego(choice.ego, algo=choice.algo, trust=trust, stats=choice.stats)
+        problem = _build(question, choice, ego)
+        x = problem.space.validate(join_x([failure], problem.space.names, problem.space.sizes))
+    return problem, x[0]
+
+
+def _build(question: Question, choice: EgoChoice, ego: Any) -> DrivingProblem:
+    asked = replace(question, ego=choice.ego, observation=choice.observation, action=choice.action)
+    return build_problem(asked, ego)
+
+
+def _try_world(problem: DrivingProblem, failures: Sequence[StoredFailure]) -> list[Trial]:
+    """Return the trials of scenarios of one world."""
+    x = problem.space.validate(join_x(failures, problem.space.names, problem.space.sizes))
+    f, reasons = problem.attempt(x)
+    failed = np.array([k not in reasons and f[k] <= failures[k].gamma for k in range(len(x))])
+    kinds = iter(problem.crash_kinds(x[failed]) if failed.any() else ())
+    return [
+        Trial(failure, "error", math.nan, reason=reasons[k])
+        if k in reasons
+        else Trial(failure, "failed" if failed[k] else "passed", float(f[k]), next(kinds) if failed[k] else "")
+        for k, failure in enumerate(failures)
+    ]
+
+
+_NOT_XML = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
+"""Characters that XML 1.0 cannot hold."""
+
+
+def write_junit(path: Path, trials: Sequence[Trial], ego: str, seconds: float) -> None:
+    """Write a report of test cases, one for each stored scenario.
+
+    Args:
+        path: The file.
+        trials: Of the ego.
+        ego: Its name.
+        seconds: Wall time of all of them [s].
+
+    Raises:
+        OSError: It cannot be written.
+    """
+    outcomes = [trial.outcome for trial in trials]
+    counts = {
+        "tests": str(len(trials)),
+        "failures": str(outcomes.count("failed")),
+        "errors": str(outcomes.count("error")),
+        "skipped": "0",
+        "time": f"{seconds:.3f}",
+    }
+    root = ET.Element("testsuites", {name: value for name, value in counts.items() if name != "skipped"})
+    suite = ET.SubElement(root, "testsuite", {"name": _clean(f"rare-envs corpus, ego {ego}"), **counts})
+    for trial in trials:
+        case = ET.SubElement(
+            suite,
+            "testcase",
+            classname=_clean(trial.failure.env_id),
+            name=trial.failure.key,
+            time=f"{seconds / len(trials):.3f}",
+        )
+        if trial.outcome != "passed":
+            kind = "failure" if trial.outcome == "failed" else "error"
+            element = ET.SubElement(case, kind, message=_clean(describe_trial(trial)), type=_clean(trial.crash or kind))
+            element.text = _clean(describe_trial(trial))
+    ET.indent(root)
+    with replace_file(path) as draft:
+        ET.ElementTree(root).write(draft, encoding="utf-8", xml_declaration=True)
+
+
+def describe_trial(trial: Trial) -> str:
+    """Return what happened, in a line."""
+    if trial.outcome == "error":
+        return f"the ego failed to answer: {trial.reason}"
+    how = f", {trial.crash}" if trial.crash not in ("", "none") else ""
+    before = f"; recorded f = {trial.failure.f:.4g} of {trial.failure.ego or 'an ego'}"
+    return f"f = {trial.f:.4g} {'<=' if trial.outcome == 'failed' else '>'} {trial.failure.gamma:g}{how}{before}"
+
+
+def _clean(text: str) -> str:
+    return _NOT_XML.sub("?", text)
+
+
+TRAINED_FIELDS = ("base", "drivers", "observation", "action", "horizon", "noise", "weather", "collisions")
+"""Fields of a `Question` that are keyword arguments of the environment to train in."""
+
+
+@dataclass(frozen=True)
+class RetrainingPlan:
+    """Arguments of `training.train_ego` that runs tell."""
+
+    env_id: str
+    algo: str
+    """Algorithm of the ego."""
+    world: Mapping[str, Any]
+    """Keyword arguments of the environment, `TRAINED_FIELDS`."""
+    retraining: Retraining
+    next_seed: int
+    """Least seed above those of the runs, for an estimate that shares no draw with them."""
+
+
+def plan_retraining(folders: Sequence[Path], share: float, trust: bool = False) -> RetrainingPlan:
+    """Return how to train the ego of the last of some runs on with the failures of all.
+
+    Args:
+        folders: Of `rare-envs estimate --out`, of one environment with the same options.
+        share: Share of episodes that begin in a failure.
+        trust: Trust the code that a run from elsewhere names.
+
+    Raises:
+        BadInput: There is no such run, the runs differ in more than ego and seed, there is no failure, or the ego is no
+            `.zip` that can be trained on.
+    """
+    questions = [open_question(read_recorded(folder).get("question"), folder, trust) for folder in folders]
+    failures = [failure for folder in folders for failure in read_run(folder, trust)]
+    last = questions[-1]
+    for folder, question in zip(folders, questions, strict=True):
+        _check_same(question, last, folder, folders[-1])
+    if not failures:
+        raise BadInput(f"There is no failure in {', '.join(repr(str(folder)) for folder in folders)} to train with.")
+    if find_ego_kind(last.ego) != "zip":
+        raise BadInput(
+            f"Expected a run of an ego that train-ego has saved (.zip) in {str(folders[-1])!r}, got {last.ego!r}."
+        )
+    world = {name: getattr(last, name) for name in TRAINED_FIELDS}
+    world |= {"observation": last.observation or "features", "action": last.action or "continuous"}
+    with as_bad_input(ValueError, OSError):
+        saved = load_saved_ego(Path(last.ego), last.algo, trust, last.stats)
+        if saved.statistics is not None:
+            raise ValueError(
+                f"Cannot train {last.ego!r} on: it was trained behind VecNormalize, which train-ego has not."
+            )
+        _, space = set_up(last.env_id, **world)
+        retraining = Retraining(Path(last.ego), join_x(failures, space.names, space.sizes), share)
+    return RetrainingPlan(last.env_id, saved.algorithm, world, retraining, 1 + max(each.seed for each in questions))
+
+
+def _check_same(question: Question, last: Question, folder: Path, last_folder: Path) -> None:
+    """Raise a BadInput if two runs are not of one environment with the same options."""
+    for name in ("env_id", *TRAINED_FIELDS):
+        one, other = getattr(question, name), getattr(last, name)  # fields by their names
+        if one != other:
+            raise BadInput(
+                f"Expected runs of one environment with the same options, got {name} = {one!r} in {str(folder)!r} and "
+                f"{other!r} in {str(last_folder)!r}."
+            )

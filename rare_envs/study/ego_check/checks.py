@@ -1,0 +1,427 @@
+"""Checks of an ego: spaces, normalisation, actions, determinism, memory, independent rows, latency, a few drives.
+
+Each check is a function from a `Probe` to findings; `EGO_CHECKS` lists all of them.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from gymnasium import spaces
+
+from agents.sb3.saved_ego import SavedEgo
+from rare_envs.arrays import AnyArray
+from rare_envs.devices.batch_sizes import CAMERA_TILE
+from rare_envs.egos.errors import reason_of
+from rare_envs.egos.faults import FaultTolerant
+from rare_envs.egos.policy import PolicyDriver
+from rare_envs.egos.wrappers import find_frame_stacking
+from rare_envs.problem import DrivingProblem
+from rare_envs.sensors.kinds import batch_size, kinds_of, map_kinds
+from rare_envs.simulation.observation import observe
+from rare_envs.simulation.rollout import drive
+from rare_envs.study.ego_check.findings import Finding, report_failure, report_pass, report_warning
+
+BATCH_ROWS = 32
+"""Observations in a query."""
+
+
+@dataclass(frozen=True)
+class Probe:
+    """An ego in its environment, and observations to query it with."""
+
+    ego: Any
+    problem: DrivingProblem
+    seen: Any
+    """Observations of ordinary scenarios at time 0, shape (ROWS, ...), or several of that kind by name."""
+
+    @classmethod
+    def of(cls, ego: Any, problem: DrivingProblem) -> Probe:
+        """Return a probe with observations of ordinary scenarios at time 0."""
+        x = problem.base.sample(BATCH_ROWS, np.random.default_rng(0))
+        with torch.inference_mode():
+            start = next(drive(problem.world, problem.driver, torch.from_numpy(x).float()))
+            seen = map_kinds(torch.Tensor.numpy, observe(start, problem.world.sensing.observation))
+        return cls(ego, problem, seen)
+
+    @property
+    def space(self) -> spaces.Space[Any]:
+        """Space of the environment's observations."""
+        return self.problem.world.observation_space
+
+    def transform_seen(self, change: Callable[[AnyArray], Any]) -> Any:
+        """Return the observations after a function, each of its own type."""
+        return map_kinds(lambda part: np.asarray(change(part)).astype(part.dtype), self.seen)
+
+    def repeat_seen(self, size: int) -> Any:
+        """Return as many observations as `size`, repeating those that there are."""
+        return self.transform_seen(lambda part: np.resize(part, (size, *part.shape[1:])))
+
+    @property
+    def policy(self) -> Any:
+        """Policy of the ego with the wrappers of its training; None if the ego is a driver."""
+        return self.problem.driver.policy if isinstance(self.problem.driver, PolicyDriver) else None
+
+    def query(self, observation: Any, state: Any = None, start: Any = None) -> tuple[AnyArray, Any]:
+        """Return the actions as numbers, and the memory."""
+        begun = np.full(batch_size(observation), state is None) if start is None else start
+        action, state = self.policy.predict(
+            map_kinds(np.copy, observation), state=state, episode_start=begun, deterministic=True
+        )
+        return np.asarray(action), state
+
+
+def largest_difference(one: AnyArray, other: AnyArray) -> float:
+    """Return the largest difference of actions; infinite where shapes or NaN differ."""
+    if one.shape != other.shape:
+        return np.inf
+    apart = np.abs(one.astype(float) - other.astype(float))
+    apart[np.isnan(one.astype(float)) & np.isnan(other.astype(float))] = 0.0
+    return float(np.nan_to_num(apart, nan=np.inf).max(initial=0.0))
+
+
+OUTLYING = 5.0
+"""Standard deviations of the training; observations beyond are unlike those that the ego was trained on."""
+MANY_OUTLYING = 0.2
+"""Share of ordinary scenarios with such observations from which the statistics are most likely of another ego."""
+
+
+def check_declared_spaces(probe: Probe) -> Iterator[Finding]:
+    """Compare declared spaces with the environment's; that they fit at all was found when the problem was made."""
+    world = probe.problem.world
+    ours = probe.space, world.action_space
+    # the ego is the user's: it need not declare anything
+    observed, acted = (getattr(probe.ego, f"{name}_space", None) for name in ("observation", "action"))
+    if observed is None or acted is None:
+        missing = " and ".join(
+            name for name, space in (("observation_space", observed), ("action_space", acted)) if space is None
+        )
+        yield report_warning(
+            "spaces",
+            f"it has no {missing}",
+            "taken at its word; declare them, so that a mix-up is noticed",
+            False,
+        )
+    if observed is not None:
+        frames, _ = find_frame_stacking(ours[0], observed) or (1, False)
+        stacked = f", {frames} frames of {ours[0].shape or ours[0]}" if frames > 1 else ""
+        words = f"{observed.shape} {observed.dtype}" if observed.shape is not None else str(observed)
+        yield report_pass("observations", f"{words}{stacked}")
+        if observed.dtype is not None and np.issubdtype(observed.dtype, np.floating) != np.issubdtype(
+            ours[0].dtype, np.floating
+        ):
+            yield report_warning(
+                "observations", f"it was made for {observed.dtype}, here they are {ours[0].dtype}", "train it on these"
+            )
+    if isinstance(acted, spaces.Box) and isinstance(ours[1], spaces.Box):
+        same = np.array_equal(acted.low, ours[1].low) and np.array_equal(acted.high, ours[1].high)
+        unbounded = not (np.isfinite(acted.low).any() or np.isfinite(acted.high).any())
+        if same or unbounded:
+            yield report_pass("action space", "in [-1, 1]" if same else "unbounded; clipped to [-1, 1]")
+        else:
+            yield report_warning(
+                "action space",
+                f"from {acted.low.tolist()} to {acted.high.tolist()}, the environment's from -1 to 1",
+                "they are rescaled, as behind RescaleAction; if its units differ, put a function of yours around it",
+            )
+    elif acted is not None:
+        yield report_pass("action space", str(acted))
+
+
+def check_normalisation(probe: Probe) -> Iterator[Finding]:
+    """Check whether the VecNormalize statistics of a saved ego suit the observations here."""
+    if not isinstance(probe.ego, SavedEgo):
+        return
+    missing = probe.ego.find_missing_statistics(probe.space)
+    if missing:
+        yield report_warning(
+            "normalisation", f"no VecNormalize statistics, but {missing}", "name their file with --stats"
+        )
+        return
+    if probe.ego.statistics is None:
+        yield Finding(
+            "normalisation",
+            "pass",
+            "no VecNormalize statistics beside the file",
+            "if it was trained behind VecNormalize, put vecnormalize.pkl there, or name it with --stats",
+        )
+        return
+    statistics = probe.ego.statistics
+    if not statistics.norm_obs:
+        yield report_pass("normalisation", f"{probe.ego.statistics_path} does not normalise observations")
+        return
+    if isinstance(probe.seen, dict) or probe.seen.ndim > 2:
+        yield report_pass(
+            "normalisation", f"{probe.ego.statistics_path}; of such observations their fit is not checked"
+        )
+        return
+    single = statistics.observation_space.shape == probe.seen.shape[1:]
+    seen = (
+        probe.seen if single else np.repeat(probe.seen, statistics.observation_space.shape[0] // probe.seen.shape[1], 1)
+    )
+    beyond = float((np.abs(statistics.normalize_obs(seen)) > OUTLYING).any(axis=1).mean())
+    result = (
+        f"{probe.ego.statistics_path}: {beyond:.0%} of ordinary scenarios are over {OUTLYING:g} standard deviations off"
+    )
+    if beyond > MANY_OUTLYING:
+        yield report_warning(
+            "normalisation", result, "are these the statistics of this policy, and of this environment?"
+        )
+    else:
+        yield report_pass("normalisation", result)
+
+
+def check_actions(probe: Probe) -> Iterator[Finding]:
+    """Check shape, type and range of actions on ordinary observations."""
+    action, _ = probe.query(probe.seen)
+    declared = getattr(probe.ego, "action_space", None)  # likewise
+    whole = np.issubdtype(action.dtype, np.integer)
+    expected = (BATCH_ROWS,) if whole else (BATCH_ROWS, 2)
+    if action.shape != expected or action.dtype == object:
+        yield report_failure(
+            "actions",
+            f"{action.dtype} of shape {action.shape}",
+            f"return shape {(BATCH_ROWS, 2)}, or {BATCH_ROWS} whole numbers",
+        )
+        return
+    if not np.isfinite(action).all():
+        bad = int((~np.isfinite(action)).reshape(BATCH_ROWS, -1).any(axis=1).sum())
+        yield report_failure(
+            "actions", f"NaN or infinite for {bad} of {BATCH_ROWS} observations", "check weights and normalisation"
+        )
+        return
+    if isinstance(declared, spaces.Discrete) != whole and declared is not None:
+        yield report_failure(
+            "actions", f"{action.dtype} of shape {action.shape}, but it says {declared}", "make both agree"
+        )
+        return
+    beyond = 0.0 if whole else float((np.abs(action) > 1.0 + 1e-6).mean())
+    if beyond:
+        yield report_warning(
+            "actions",
+            f"{beyond:.0%} beyond [-1, 1], up to {np.abs(action).max():.3g}",
+            "they are clipped",
+            False,
+        )
+    if len(np.unique(action.round(6), axis=0)) == 1:
+        yield report_warning(
+            "actions", f"the same for all {BATCH_ROWS} observations: {action[0].tolist()}", "does it look at all?"
+        )
+    else:
+        yield report_pass("actions", f"{action.dtype} of shape (B{', 2' if not whole else ''}), finite")
+
+
+def check_extreme_observations(probe: Probe) -> Iterator[Finding]:
+    """Query the ego with zeros (rows whose episode is over), with the bounds of its observations, and with NaN."""
+    space = probe.space
+    boxes = dict(space.spaces) if isinstance(space, spaces.Dict) else space
+    cases = {
+        "zeros": probe.transform_seen(np.zeros_like),
+        "the lower end": map_kinds(lambda part, box: _fill_with_bound(box.low, -1.0, part), probe.seen, boxes),
+        "the upper end": map_kinds(lambda part, box: _fill_with_bound(box.high, 1.0, part), probe.seen, boxes),
+    }
+    bad = []
+    for name, case in cases.items():
+        try:
+            action, _ = probe.query(case)
+            bad += [] if np.isfinite(action).all() else [f"{name}: NaN or infinite"]
+        except (Exception, SystemExit) as error:
+            bad.append(f"{name}: {reason_of(error)}")
+    if bad:
+        yield report_failure(
+            "range",
+            "; ".join(bad),
+            "such observations come; rows are zeros after a crash",
+        )
+    else:
+        yield report_pass("range", "finite at zeros and at both ends of what is observed")
+    if not isinstance(probe.seen, dict) and probe.seen.dtype == np.uint8:
+        return
+    try:
+        action, _ = probe.query(map_kinds(lambda part: part if part.dtype == np.uint8 else part * np.nan, probe.seen))
+        finite = bool(np.isfinite(action).all())
+        yield report_pass(
+            "NaN", "answered by numbers; the environment never gives NaN" if finite else "answered by NaN"
+        )
+    except (Exception, SystemExit) as error:
+        yield report_pass("NaN", f"refused: {reason_of(error)}")
+
+
+def _fill_with_bound(bound: AnyArray, unbounded: float, part: AnyArray) -> AnyArray:
+    """Return observations at a bound of their space, or at `unbounded` where it has none."""
+    return np.broadcast_to(np.where(np.isfinite(bound), bound, unbounded), part.shape).astype(part.dtype)
+
+
+ACTION_ROUNDING = 1e-3
+"""Differences of actions above this are not rounding."""
+BATCH_SIZES = (1, 64, 1024)
+"""Batch sizes at which latency is measured."""
+CAMERA_BATCH_SIZES = (1, 16, CAMERA_TILE)
+"""The same for an ego with a camera, which never gets a larger batch."""
+TYPICAL_SIMULATIONS = 6000
+"""Simulations of a usual estimation, to express latency as its duration."""
+SLOW_SECONDS = 3600.0
+"""Duration of such an estimation [s] from which latency is worth a warning."""
+LEAK_MEGABYTES = 64.0
+"""Growth of the process over 100 calls [MB] from which it is worth a warning."""
+MANY_COLLISIONS = 0.5
+"""Share of ordinary scenarios: an ego that collides in more has most likely been given wrong inputs."""
+
+
+def check_determinism(probe: Probe) -> Iterator[Finding]:
+    """Check whether an answer repeats, and whether it depends on earlier calls."""
+    other = probe.transform_seen(lambda part: np.roll(part, 1, axis=0) * 0.5)
+    first, second = probe.query(probe.seen)[0], probe.query(probe.seen)[0]
+    probe.query(other)
+    third = probe.query(probe.seen)[0]
+    if largest_difference(first, second) == 0.0 and largest_difference(first, third) == 0.0:
+        yield report_pass("determinism", "the same answer to the same observations")
+    elif largest_difference(first, second) == 0.0:
+        yield report_failure(
+            "determinism",
+            "its answers depend on earlier calls",
+            "carry its memory in the state that predict returns: batches of many scenarios take turns",
+        )
+    else:
+        yield report_warning(
+            "determinism",
+            f"its answers vary from call to call, by up to {largest_difference(first, second):.2g}",
+            "random, or a memory not in its state; p is then over this too, and failures may not replay",
+        )
+
+
+def check_memory(probe: Probe) -> Iterator[Finding]:
+    """Check whether the ego has a memory, and whether it is reset where an episode begins."""
+    first, state = probe.query(probe.seen)
+    if state is None:
+        yield report_pass("memory", "none: an answer depends on one observation")
+        return
+    for _ in range(2):
+        _, state = probe.query(probe.transform_seen(lambda part: part * 0.9), state)
+    begun = np.zeros(BATCH_ROWS, dtype=bool)
+    begun[: BATCH_ROWS // 2] = True
+    again, _ = probe.query(probe.seen, state, begun)
+    off = largest_difference(first[begun], again[begun])
+    if off > ACTION_ROUNDING:
+        yield report_warning(
+            "memory",
+            f"kept in its state, but rows that begin an episode are off by {off:.2g}",
+            "reset the rows of episode_start; here whole batches begin together, so this may not matter",
+            False,
+        )
+    else:
+        yield report_pass("memory", "kept in its state, reset where an episode begins")
+
+
+def check_row_independence(probe: Probe) -> Iterator[Finding]:
+    """Check whether a row's answer depends on the other rows, their order or their number."""
+    whole = probe.query(probe.seen)[0]
+    order = np.random.default_rng(1).permutation(BATCH_ROWS)
+    shuffled = largest_difference(probe.query(probe.transform_seen(lambda part: part[order]))[0], whole[order])
+    single = [probe.transform_seen(lambda part, row=row: part[row : row + 1]) for row in range(8)]  # type: ignore[misc]
+    alone = largest_difference(np.concatenate([probe.query(row)[0] for row in single]), whole[:8])
+    for name, off in (("order of the batch", shuffled), ("size of the batch", alone)):
+        if off > ACTION_ROUNDING:
+            yield report_failure(
+                name,
+                f"actions change with it, by up to {off:.2g}",
+                "a row must not depend on the others; is a batch norm in training mode?",
+            )
+        else:
+            yield report_pass(name, "no effect" if off == 0.0 else f"rounding, {off:.1g}")
+
+
+def check_latency(probe: Probe) -> Iterator[Finding]:
+    """Measure the duration of a call by batch size."""
+    times = {}
+    sizes = CAMERA_BATCH_SIZES if "camera" in kinds_of(probe.problem.world.sensing.observation) else BATCH_SIZES
+    for size in sizes:
+        observation = probe.repeat_seen(size)
+        probe.query(observation)
+        durations = []
+        for _ in range(5 if size < sizes[-1] else 3):
+            begun = time.perf_counter()
+            probe.query(observation)
+            durations.append(time.perf_counter() - begun)
+        times[size] = float(np.median(durations))
+    calls = ", ".join(f"{1e3 * seconds:.2g} ms for {size}" for size, seconds in times.items())
+    needed = TYPICAL_SIMULATIONS / sizes[-1] * times[sizes[-1]] * probe.problem.world.clock.ticks
+    if needed > SLOW_SECONDS:
+        yield report_warning(
+            "latency", f"{calls}: {needed / 3600:.1f} h for {TYPICAL_SIMULATIONS} simulations", "batch its work", False
+        )
+    else:
+        yield report_pass("latency", f"{calls}: {needed:.0f} s for {TYPICAL_SIMULATIONS} simulations")
+
+
+def check_memory_growth(probe: Probe) -> Iterator[Finding]:
+    """Measure by how much the process grows over 100 calls."""
+    pictures = "camera" in kinds_of(probe.problem.world.sensing.observation)
+    observation = probe.repeat_seen(4 if pictures else 256)
+    for _ in range(20):
+        probe.query(observation)
+    before = _read_megabytes()
+    for _ in range(100):
+        probe.query(observation)
+    grown = _read_megabytes() - before
+    if grown > LEAK_MEGABYTES:
+        yield report_warning(
+            "space",
+            f"{grown:.0f} MB more after 100 calls",
+            "it keeps what it has seen; a long run ends early",
+            False,
+        )
+    else:
+        yield report_pass("space", f"{before:.0f} MB in all, {max(grown, 0.0):.0f} MB more after 100 calls")
+
+
+def check_driving(probe: Probe) -> Iterator[Finding]:
+    """Drive a few ordinary scenarios."""
+    tolerant = FaultTolerant(probe.problem)
+    f = tolerant.evaluate(probe.problem.base.sample(BATCH_ROWS, np.random.default_rng(2)))
+    if tolerant.faults:
+        yield report_failure(
+            "driving",
+            f"fails on {len(tolerant.faults)} of {BATCH_ROWS} ordinary scenarios: {tolerant.faults[0].reason}",
+            "mend it, or count such scenarios with --on-error failure or bound",
+        )
+        return
+    crashed = float((f == -1.0).mean())
+    result = f"collides in {crashed:.0%} of {BATCH_ROWS} ordinary scenarios"
+    if crashed > MANY_COLLISIONS:
+        yield report_warning("driving", result, "does it see and act as in its training? is it trained?")
+    else:
+        yield report_pass("driving", result)
+
+
+EGO_CHECKS: tuple[Callable[[Probe], Iterator[Finding]], ...] = (
+    check_declared_spaces,
+    check_normalisation,
+    check_actions,
+    check_determinism,
+    check_memory,
+    check_row_independence,
+    check_extreme_observations,
+    check_driving,
+    check_latency,
+    check_memory_growth,
+)
+
+
+def _read_megabytes() -> float:
+    """Return the memory of this process [MB]: the present use where the system reports it, else the peak."""
+    try:
+        with open("/proc/self/statm") as file:
+            return int(file.read().split()[1]) * 4096 / 2**20
+    except OSError:
+        try:
+            import resource
+        except ImportError:  # Windows, where the standard library does not tell
+            return 0.0
+        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (2**20 if sys.platform == "darwin" else 2**10)

@@ -1,0 +1,441 @@
+"""Risk: collisions of an ego per hour and per million km over scenarios that count nothing twice."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from os import PathLike
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rare_envs.distributions.fitted import FittedDistribution
+from rare_envs.distributions.frequency import EventFrequency
+from rare_envs.distributions.space import Distribution
+from rare_envs.exposure import HUMAN_BENCHMARKS, CollisionRate, TotalRate, describe_human_contacts
+from rare_envs.exposure.base_record import read_site
+from rare_envs.exposure.rate import MILLION_KM
+from rare_envs.files import replace_text
+from rare_envs.json_text import format_json
+from rare_envs.plugins import did_you_mean
+from rare_envs.scenarios.base import Scenario
+from rare_envs.scenarios.base_distributions import load_base
+from rare_envs.scenarios.registry import env_id_of, scenario_named
+from rare_envs.study.errors import BadInput, as_bad_input
+from rare_envs.study.evaluate import run, run_into
+from rare_envs.study.execution.interruption import RunInterrupted, keep_answer
+from rare_envs.study.plots import save_risk_plot
+from rare_envs.study.question import Question, Study, prepare
+from rare_envs.study.report import Report, find_frequency
+from rare_envs.study.text import (
+    describe_injuries,
+    describe_uncertainty,
+    format_rate,
+    format_share,
+    format_with_interval,
+    name_scenario,
+)
+from rare_envs.study.writing import check_no_results
+from rare_envs.version import __version__
+
+
+def list_sites(scenario: Scenario) -> dict[str, str]:
+    """Return the sites of a scenario: the name of the first base of each, and the site in words.
+
+    Further bases of a site are other families for the same events, no other site; an assembled base has none.
+    """
+    found: dict[str, str] = {}
+    for name in scenario.bases:
+        site = _read_site_of(load_base(scenario, name))
+        if site and site not in found.values():
+            found[name] = site
+    return found
+
+
+def check_sites(scenarios: Sequence[Scenario], sites: Sequence[str]) -> None:
+    """Raise a ValueError unless sites are different ones, each of a scenario at least."""
+    if not sites or len(set(sites)) < len(sites):
+        raise ValueError(f"Expected one site or more, such as us101, each once; got {', '.join(sites) or 'none'}.")
+    known = {name for scenario in scenarios for name in list_sites(scenario)}
+    for site in (each for each in sites if each not in known):
+        owner = next((scenario for scenario in scenarios if site in scenario.bases), None)
+        if owner is None:
+            names = ", ".join(scenario.name for scenario in scenarios)
+            hint = did_you_mean(site, known)
+            raise ValueError(f"No base of {names} is of a site {site!r}{hint}; there are {', '.join(sorted(known))}.")
+        place = _read_site_of(load_base(owner, site))
+        further = f"is a further base of the site {_name_of(owner, place)!r}" if place else "has no site"
+        raise ValueError(
+            f"{site!r} is no site: this base of {owner.name} {further}. The sites are {', '.join(sorted(known))}; "
+            f"--base {owner.name}={site} takes it as the base."
+        )
+
+
+def choose_base(scenario: Scenario, given: str | PathLike[str] | None, site: str) -> tuple[str, tuple[str, ...]]:
+    """Return the base distribution of a scenario at a site, and notes on it.
+
+    Where that of the site has no event frequency, it is the first one that has, as the notes say.
+
+    Args:
+        scenario: The scenario.
+        given: Name or file that the user gave for it; None for the site's.
+        site: Name of a site.
+
+    Raises:
+        ValueError: The scenario has no base of the site. A sum of rates at different sites is that of no road.
+    """
+    if given is not None:
+        return str(given), ()
+    sites = list_sites(scenario)
+    if site not in sites:
+        raise ValueError(
+            f"{scenario.name} has no base of the site {site!r} (it has {', '.join(sites) or 'none'}): "
+            f"--base {scenario.name}={scenario.default_base} takes another one."
+        )
+    if _has_frequency(scenario, site):
+        return site, ()
+    found = next((name for name in scenario.bases if _has_frequency(scenario, name)), site)
+    return found, () if found == site else (f"it has no event frequency at {site!r}: {found!r} is used",)
+
+
+def _has_frequency(scenario: Scenario, name: str) -> bool:
+    base = load_base(scenario, name)
+    return isinstance(base, FittedDistribution) and base.frequency is not None
+
+
+def compare_sites(report: Report, sites: Sequence[str], progress: bool = False) -> dict[str, float]:
+    """Return rates per km at other sites over that of a report, by name.
+
+    They come from the simulations of the report, reweighted. Where these do not suffice, sites that are asked for are
+    simulated, and others left out; all are left out where nothing failed.
+
+    Args:
+        report: With a rate.
+        sites: Names of sites that are asked for; those that the scenario lacks are left out.
+        progress: Show a bar on standard error.
+    """
+    study = report.study
+    if report.estimate.p == 0 or report.rate is None:
+        return {}
+    factors = {}
+    for name, frequency in _other_frequencies(study).items():
+        p = _estimate_under(report, name, name in sites, progress)
+        if p > 0:
+            factors[name] = p * frequency.per_km / report.rate.per_million_km * MILLION_KM
+    return factors
+
+
+def _other_frequencies(study: Study) -> dict[str, EventFrequency]:
+    """Return the frequencies of the events at each other site, by its name, as far as they were counted."""
+    scenario = study.problem.world.scenario
+    own = _read_site_of(study.base)
+    found = {}
+    for name, site in list_sites(scenario).items():
+        base = load_base(scenario, name)
+        if site != own and isinstance(base, FittedDistribution) and base.frequency is not None:
+            found[name] = base.frequency
+    return found
+
+
+def _read_site_of(base: Distribution) -> str:
+    """Return the site of a base distribution in words; empty where it was not fitted to events of one."""
+    return read_site(base.record) if isinstance(base, FittedDistribution) else ""
+
+
+def _name_of(scenario: Scenario, place: str) -> str:
+    """Return the name of a site of a scenario."""
+    return next(name for name, site in list_sites(scenario).items() if site == place)
+
+
+def _estimate_under(report: Report, name: str, asked: bool, progress: bool) -> float:
+    """Return p under another base; NaN where the simulations do not give it and it was not asked for."""
+    other = report.study.under(name)
+    try:
+        return report.estimate.reweight(other.problem.base).p
+    except ValueError:
+        return run(other, progress).estimate.p if asked else math.nan
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ScenarioRisk:
+    """One scenario of a risk."""
+
+    report: Report
+    """Its evaluation."""
+    rate: CollisionRate
+    """Its collisions per hour and per km."""
+    site_factors: Mapping[str, float]
+    """Rates under the bases of other sites over that under its own, by name, as far as they are known."""
+    notes: tuple[str, ...] = ()
+
+    @property
+    def name(self) -> str:
+        """Name of the scenario."""
+        return self.rate.scenario
+
+    @property
+    def base_name(self) -> str:
+        """Name or file of the base distribution."""
+        return self.report.study.base_name
+
+    @property
+    def events(self) -> int | None:
+        """Recorded events behind the base distribution, of its first part; None where nobody says."""
+        base = self.report.study.base
+        return base.events.used[0] if isinstance(base, FittedDistribution) else None
+
+    @property
+    def kinds(self) -> dict[str, float]:
+        """Collisions per million km by kind of crash; empty where it is not known."""
+        scale = self.rate.frequency.per_km * MILLION_KM
+        return {kind: scale * share.p for kind, share in self.report.kinds.shares.items()}
+
+    def describe(self) -> str:
+        """Return the line of the table: frequency x p = rate, its interval, and the events behind it."""
+        rate, base = self.rate, self.report.study.base
+        behind = base.fitted_to if isinstance(base, FittedDistribution) else "events not known"
+        version = self.report.study.question.env_id.rpartition("/")[2]  # whose bases may have the same names
+        factors = {name: factor for name, factor in self.site_factors.items() if factor > 0}
+        sites = "".join(f", under {name} {factor:.2g} times as much" for name, factor in factors.items())
+        return (
+            f"{name_scenario(self.name):<13} {format_rate(rate.frequency.per_km)} per km x {rate.probability.p:.1e} = "
+            f"{format_with_interval(rate.per_million_km, rate.interval_per_million_km, ' ')}   "
+            f"{behind} ({self.base_name} of {version}){sites}"
+        )
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain values for JSON."""
+        return {
+            **self.rate.to_dict(),
+            "base": self.base_name,
+            "events": self.events,
+            "site_factors": dict(self.site_factors),
+            "kinds_per_million_km": self.kinds,
+            "notes": list(self.notes),
+            "report": self.report.to_dict(),
+        }
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Risk:
+    """Collisions of an ego per hour and per million km, with what their uncertainty comes from."""
+
+    ego: str
+    """The ego, as it was named."""
+    scenarios: tuple[ScenarioRisk, ...]
+
+    @cached_property
+    def total(self) -> TotalRate:
+        """Sum over the scenarios."""
+        return TotalRate(tuple(each.rate for each in self.scenarios))
+
+    @cached_property
+    def injuries(self) -> TotalRate | None:
+        """Serious injuries (MAIS 3 or more), summed over the scenarios with collisions; None where there are none."""
+        rates = tuple(
+            replace(each.report.injury_rate, site_log_sd=each.rate.site_log_sd)
+            for each in self.scenarios
+            if each.report.injury_rate is not None
+        )
+        return TotalRate(rates) if rates else None
+
+    @property
+    def kinds(self) -> dict[str, float]:
+        """Collisions per million km by kind of crash, the most frequent first."""
+        sums: dict[str, float] = {}
+        for each in self.scenarios:
+            for kind, rate in each.kinds.items():
+                sums[kind] = sums.get(kind, 0.0) + rate
+        return dict(sorted(sums.items(), key=lambda kind: -kind[1]))
+
+    @property
+    def recorded_events(self) -> dict[str, int]:
+        """Recorded events behind each base distribution, by scenario."""
+        return {each.name: each.events for each in self.scenarios if each.events is not None}
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """Doubts about p and about the error of its base distribution, by scenario."""
+        return tuple(f"{name_scenario(each.name)}: {text}" for each in self.scenarios for text in each.report.warnings)
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Errors that are left out, and bases that differ from those asked for."""
+        return tuple(f"{name_scenario(each.name)}: {text}" for each in self.scenarios for text in each.notes)
+
+    def __str__(self) -> str:
+        """Return the table, for people."""
+        total = self.total
+        level = f"{100 * total.confidence:g} %: "
+        per_km = format_with_interval(total.per_million_km, total.interval_per_million_km, " ", level)
+        per_hour = format_with_interval(total.per_hour, total.interval_per_hour, " ", level)
+        lines = [
+            f"collisions per million km  {per_km}   {describe_human_contacts()}",
+            *(f"  {each.describe()}" for each in self.scenarios),
+            f"  per hour      {per_hour}",
+            *self._describe_kinds(),
+            *([] if self.injuries is None else [f"  {describe_injuries(self.injuries)}"]),
+        ]
+        uncertainty = describe_uncertainty(total, self.recorded_events)
+        lines += [uncertainty] if uncertainty else []
+        lines += [f"warning: {text}" for text in self.warnings]
+        return "\n".join(lines + [f"note: {text}" for text in self.notes])
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain values for JSON."""
+        needed = self.total.further_events(self.recorded_events)
+        return {
+            "ego": self.ego,
+            **self.total.to_dict(),
+            "scenarios": {each.name: each.to_dict() for each in self.scenarios},
+            "kinds_per_million_km": self.kinds,
+            "injuries": None if self.injuries is None else self.injuries.to_dict(),
+            "further_events": None if needed is None else needed._asdict(),
+            "people": [benchmark.to_dict() for benchmark in HUMAN_BENCHMARKS],
+            "doubtful": bool(self.warnings),
+            "warnings": list(self.warnings),
+            "notes": list(self.notes),
+            "version": __version__,
+        }
+
+    def save_plot(self, path: str | PathLike[str]) -> None:
+        """Draw the rates with their intervals and what the uncertainty comes from, and save it as a .png."""
+        save_risk_plot(Path(path), self.ego, self.total)
+
+    def _describe_kinds(self) -> list[str]:
+        whole = sum(self.kinds.values())
+        parts = [f"{kind} {format_rate(rate)} ({format_share(rate / whole)})" for kind, rate in self.kinds.items()]
+        return [f"  by kind       {', '.join(parts)}"] if whole > 0 else []
+
+
+SCENARIO_SET = ("cut_in", "hard_brake")
+"""Scenarios that count nothing twice."""
+TWICE = ("cut_in", "car_following")
+"""Scenarios of which a set may have one: a cut-in gives the ego a new leader, so that car-following behind new leaders
+contains the cut-ins."""
+
+
+def risk(
+    ego: Any,
+    *,
+    scenarios: Sequence[str] = SCENARIO_SET,
+    sites: str | Sequence[str] = ("us101",),
+    bases: Mapping[str, str | PathLike[str]] | None = None,
+    out: str | PathLike[str] | None = None,
+    progress: bool = False,
+    force: bool = False,
+    **options: Any,
+) -> Risk:
+    """Estimate the collisions of an ego per million km, with an interval that holds what is not known of traffic.
+
+    Each scenario's p is multiplied by the frequency of its events, and the products are added. The interval holds the
+    errors of the counted events, of the fitted base distributions and of the simulations; with several `sites` also
+    the spread between them. All holds for an ego that takes over at the moment of each event.
+
+    Args:
+        ego: Its name, file or address, as for `agents.load_ego`; or an object, as for `DrivingProblem`.
+        scenarios: Names of scenarios that count nothing twice; car_following may stand in place of cut_in.
+        sites: Names of sites, each that of the first base fitted to events of it, such as "us101": the bases of the
+            first are used, and the spread of the rate between it and the others is part of the interval. Each
+            scenario must have a base of the first site, or one in `bases`.
+        bases: Base distributions, names or JSON files, by scenario, in place of those of the first site.
+        out: Folder for the picture, the numbers and a folder of each scenario, see `rare-envs risk --out`.
+        progress: Show a bar on standard error.
+        force: Replace runs that the folder has, finished or not.
+        **options: Further fields of `rare_envs.study.Question`: seed, max_sim (of each scenario), method, and so on.
+
+    Raises:
+        BadInput: An argument cannot be used; a scenario has no frequency of its events; or the ego failed.
+        RunInterrupted: It was interrupted; the message says what is known.
+
+    Example:
+        >>> risk("idm", scenarios=("cut_in", "car_following"))
+        Traceback (most recent call last):
+            ...
+        rare_envs.study.errors.BadInput: Expected one of cut_in, car_following: a cut-in is a new leader, and would count twice.
+    """  # noqa: E501 (the example shows a whole message)
+    sites = (sites,) if isinstance(sites, str) else sites
+    _check_scenarios(scenarios, sites, bases or {})
+    with as_bad_input(ValueError):
+        chosen = {name: choose_base(scenario_named(name), (bases or {}).get(name), sites[0]) for name in scenarios}
+    prepared = []
+    for name in scenarios:
+        base, notes = chosen[name]
+        study = _prepare(ego, name, base, options)
+        with as_bad_input(ValueError):
+            find_frequency(study)
+        prepared.append((study, notes))
+    folder = None if out is None else Path(out)
+    if folder is not None and not force:
+        for name in scenarios:  # all of them, before the first one is run
+            check_no_results(folder / name)
+    done: list[ScenarioRisk] = []
+    for study, notes in prepared:
+        try:
+            done.append(_evaluate(study, notes, sites[1:], folder, progress, force))
+        except RunInterrupted as error:
+            raise RunInterrupted(f"{error}{_describe_done(done)}", error.report) from None
+    found = Risk(ego=ego if isinstance(ego, str) else type(ego).__name__, scenarios=tuple(done))
+    if folder is not None:
+        write_risk(folder, found)
+    return found
+
+
+def write_risk(folder: Path, found: Risk) -> None:
+    """Write risk.json and risk.png into an existing folder."""
+    replace_text(folder / "risk.json", format_json(found.to_dict()) + "\n")
+    found.save_plot(folder / "risk.png")
+
+
+def _describe_done(done: Sequence[ScenarioRisk]) -> str:
+    """Return what is known of scenarios whose runs are done, behind a space; empty if there are none."""
+    return f" Done before: {'; '.join(' '.join(one.describe().split()) for one in done)}." if done else ""
+
+
+def _check_scenarios(scenarios: Sequence[str], sites: Sequence[str], bases: Mapping[str, Any]) -> None:
+    """Raise a BadInput unless the scenarios exist, count nothing twice, and have bases of these sites."""
+    with as_bad_input(ValueError):
+        known = [scenario_named(name) for name in scenarios]
+    if not scenarios or len(set(scenarios)) < len(scenarios):
+        raise BadInput(f"Expected one or more different scenarios, got {', '.join(scenarios) or 'none'}.")
+    if set(TWICE) <= set(scenarios):
+        raise BadInput(f"Expected one of {', '.join(TWICE)}: a cut-in is a new leader, and would count twice.")
+    if not sites:
+        raise BadInput("Expected one site or more, such as us101.")
+    with as_bad_input(ValueError):
+        check_sites(known, sites)
+    for name in bases:
+        if name not in scenarios:
+            raise BadInput(f"A base is given for {name!r}, which is none of {', '.join(scenarios)}.")
+
+
+def _prepare(ego: Any, name: str, base: str, options: Mapping[str, Any]) -> Study:
+    """Return the study of one scenario."""
+    named = isinstance(ego, str)
+    try:
+        question = Question(env_id=env_id_of(name), ego=ego if named else type(ego).__name__, base=base, **options)
+    except TypeError as error:
+        raise BadInput(f"Cannot use an option of risk: {error}") from error
+    return prepare(question, None if named else ego)
+
+
+def _evaluate(
+    study: Study, notes: tuple[str, ...], other_sites: Sequence[str], folder: Path | None, progress: bool, force: bool
+) -> ScenarioRisk:
+    """Run one scenario and return its rate, with the spread between sites if there are others."""
+    name = study.problem.world.scenario.name
+    report = run(study, progress) if folder is None else run_into(folder / name, study, progress, force)
+    assert report.rate is not None  # `risk` has looked for the frequency before
+    with keep_answer(report):
+        factors = compare_sites(report, other_sites, progress)
+    logs = [0.0, *(float(np.log(factors[site])) for site in other_sites if factors.get(site, 0) > 0)]
+    spread = float(np.std(logs, ddof=1)) if len(logs) > 1 else 0.0
+    return ScenarioRisk(
+        report=report,
+        rate=replace(report.rate, site_log_sd=spread),
+        site_factors=factors,
+        notes=(*notes, *report.notes),
+    )
