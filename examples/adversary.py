@@ -4,7 +4,7 @@
 
 The cutter of the cut-in scenario is rewarded for bringing the ego, a rule-based driver, into danger, and pays for
 driving as no road user does. What it finds is what can go wrong; how probable that is, it cannot say: see
-docs/agents.md.
+docs/environments.md.
 """
 
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Write docs/gallery.md: a failure in each scenario, an adversary at work, and what was drawn.
+"""Draw the pictures of docs/environments.md: a failure in each scenario, and an adversary at work.
 
     python -m examples.gallery
 
@@ -24,30 +24,6 @@ WIDE = 2.5
 """Draws are taken this many times as far from the mean, in standard normal space, to meet failures."""
 NARROW = 480
 """Width of the pictures [pixels]."""
-HEAD = """# Gallery
-
-What failures look like; every picture on this page was drawn by `python -m examples.gallery`. Green is the ego, blue
-the lead, orange the cutter, grey other vehicles; who has crashed has a red outline, a vehicle that an agent drives a
-purple one. Above the road are time, speed, gap and time to collision, below it the measure over time: of the moment
-(grey) and of the episode so far (black). `rare-envs replay RUN --failure 0 --out clip.gif` draws the same for what
-your run has found.
-
-```python
-import numpy as np
-
-import rare_envs
-from rare_envs.study import drive_again, write_film
-
-problem = rare_envs.DrivingProblem("rare_envs/CutIn-v0", horizon=2.0)
-drive = drive_again(problem, np.array([30.0, 24.0, 28.0, 1.7, 40.0, 3.9]))
-write_film("clip.gif", drive, width=480)
-print(drive.f, drive.crash["kind"], f"{drive.crash['closing_speed']:.2f} m/s")
-```
-
-```text
--1.0 side 1.33 m/s
-```
-"""
 
 
 def worst(env_id: str, draws: int, seed: int = 0) -> Drive:
@@ -89,42 +65,27 @@ def attack(steps: int, out: Path) -> str:
     shown = [picture.quantize(COLOURS) for picture in pictures]
     durations = [100] * (len(shown) - 1) + [1000]
     shown[0].save(out, save_all=True, append_images=shown[1:], duration=durations, loop=0, optimize=True)
-    return (
-        f"The cutter learned to make the rule-based ego crash: in {rates[1]:.0%} of {n:,} scenarios instead of "
-        f"{rates[0]:.2%}. That is [no probability](agents.md#an-adversary)."
-    )
+    return f"the ego crashes in {rates[1]:.0%} of {n:,} scenarios instead of {rates[0]:.2%}"
 
 
 def main(
-    docs: Annotated[Path, typer.Option(help="Folder of the page.")] = Path("docs"),
+    images: Annotated[Path, typer.Option(help="Folder of the pictures.")] = Path("docs/images"),
     draws: Annotated[int, typer.Option(help="Wide draws for each scripted scenario.")] = 20_000,
     steps: Annotated[int, typer.Option(help="Of the adversary's training; 0 leaves it out.")] = 200_000,
 ) -> None:
-    """Draw everything and write the page."""
+    """Draw everything and say what is to be seen."""
     torch.set_num_threads(1)
-    images = docs / "images"
     images.mkdir(parents=True, exist_ok=True)
-    parts = [HEAD]
     for env_id, scenario in SCENARIOS.items():
         if not env_id.endswith("-v0"):
             continue  # versions of a scenario look alike
         drive = worst(env_id, draws if scenario.drivers is None else draws // 100)
-        name = f"gallery_{scenario.name}.gif"
-        write_film(images / name, drive, width=NARROW, every=2)
+        write_film(images / f"gallery_{scenario.name}.gif", drive, width=NARROW, every=2)
         crash = drive.crash
-        what = (
-            f"no crash, f = {drive.f:.2f} s"
-            if crash is None
-            else f"{crash['kind']}, {crash['closing_speed']:.1f} m/s closing"
-        )
-        parts.append(f"## {env_id}\n\n![{scenario.name}: {what}](images/{name})\n\n{what}\n")
-        print(f"{env_id}: {what}")
+        what = "no crash" if crash is None else f"{crash['kind']}, {crash['closing_speed']:.1f} m/s closing"
+        print(f"{env_id}: f = {drive.f:.2f} s, {what}")
     if steps:
-        words = attack(steps, images / "gallery_adversary.gif")
-        parts.append(
-            f"## An adversary\n\n![The cutter crashes into the ego](images/gallery_adversary.gif)\n\n{words}\n"
-        )
-    (docs / "gallery.md").write_text("\n".join(parts), encoding="utf-8")
+        print(f"An adversary: {attack(steps, images / 'gallery_adversary.gif')}")
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""The recipes of docs/loggers.md for Weights & Biases and MLflow: against both libraries, and against doubles of them.
+"""The recipes of docs/using_results.md for Weights & Biases and MLflow: against both libraries, and against doubles of them.
 
 The libraries are no dependency of the project, so that the doubles, which take what the signatures of wandb 0.31 and
 mlflow 3.17 take and refuse what these refuse, run everywhere.
@@ -18,7 +18,7 @@ import pytest
 
 import samplers
 
-PAGE = (Path(__file__).parents[1] / "docs/loggers.md").read_text(encoding="utf-8")
+PAGE = (Path(__file__).parents[1] / "docs/using_results.md").read_text(encoding="utf-8")
 HELPERS, WANDB, MLFLOW = (
     next(code for code in re.findall(r"^```\w*\n(.*?)^```$", PAGE, re.MULTILINE | re.DOTALL) if name in code)
     for name in ("def to_wandb(", "wandb.init(", "mlflow.start_run(")
