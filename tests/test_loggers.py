@@ -1,4 +1,4 @@
-"""The recipes of docs/using_results.md for Weights & Biases and MLflow: against both libraries, and against doubles of them.
+"""The recipes of docs/using_results.md for Weights & Biases and MLflow, against both libraries and doubles of them.
 
 The libraries are no dependency of the project, so that the doubles, which take what the signatures of wandb 0.31 and
 mlflow 3.17 take and refuse what these refuse, run everywhere.
