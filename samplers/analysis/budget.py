@@ -9,8 +9,8 @@ is its cost with `target_cov=c`, if the pilot had the method's own budget and so
 runs (subset simulation) is repeated: N(c) = N0 (c0 / c)^2, but at least 5 runs. Plain Monte Carlo needs
 (1 - p) / (p c^2).
 
-The pilot knows its own c.o.v. to a few ten per cent, and another seed finds another proposal: what becomes of that is
-measured by `benchmarks/uncertainty/planning.py`.
+The pilot knows its own c.o.v. to a few ten per cent, and another seed finds another proposal: a plan
+is right within a factor of about 2.
 """
 
 from __future__ import annotations
