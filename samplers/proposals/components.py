@@ -153,17 +153,14 @@ class HalfSpaceNormal:
     axis: FloatArray
     """Unit vector, shape (d,)."""
     start: float
-    across: SubspaceGaussian | None = None
-    """Distribution within the plane if it is not N(0, I); its axes are orthogonal to `axis`."""
 
     def log_ratio(self, u: FloatArray) -> FloatArray:
         """Return the logarithm of 1 / Phi(-start) beyond the plane, -inf before it."""
-        ratio = np.where(u @ self.axis >= self.start, -float(log_ndtr(-self.start)), -np.inf)
-        return ratio if self.across is None else ratio + self.across.log_ratio(u)
+        return np.where(u @ self.axis >= self.start, -float(log_ndtr(-self.start)), -np.inf)
 
     def sample(self, n: int, rng: np.random.Generator) -> FloatArray:
         """Draw n points."""
-        xi = rng.standard_normal((n, len(self.axis))) if self.across is None else self.across.sample(n, rng)
+        xi = rng.standard_normal((n, len(self.axis)))
         t = -ndtri_exp(np.log1p(-rng.random(n)) + log_ndtr(-self.start))
         return np.asarray(xi + np.outer(t - xi @ self.axis, self.axis))
 

@@ -1,13 +1,11 @@
 """Candidates: the components that a proposal may be mixed from, and the shares that minimise its variance."""
 
-from collections.abc import Sequence
 from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
 from scipy.special import log_ndtr
 
-from samplers.methods.two_stage.mixture.boundary import fit_half_spaces, fit_radial
+from samplers.methods.two_stage.mixture.boundary import fit_radial
 from samplers.methods.two_stage.mixture.mixture_weights import Floor, minimise_second_moment, raise_to_floors
 from samplers.methods.two_stage.mixture.proposal import MixtureProposal, ProposalComponent
 from samplers.methods.two_stage.mixture.settings import (
@@ -21,22 +19,12 @@ from samplers.methods.two_stage.refinement import RefinementState
 from samplers.methods.two_stage.settings import RefinementSettings
 from samplers.problem import FloatArray
 from samplers.proposals.components import (
-    HalfSpaceNormal,
     IsotropicNormal,
     LiftedComponent,
     SubspaceGaussian,
     log_ratios,
 )
 from samplers.proposals.von_mises_fisher import VonMisesFisherNakagami
-
-
-class PredictedFailures(NamedTuple):
-    """Points that should fail, from N(0, I) given that, by a regression of f."""
-
-    u: FloatArray
-    """For the weights, shape (n, d)."""
-    gaussians: Sequence[SubspaceGaussian] = ()
-    """Fitted to others, in the coordinates of the slopes where there are some."""
 
 
 def build_proposal(
@@ -46,12 +34,11 @@ def build_proposal(
     mixture: MixtureSettings = DEFAULT_MIXTURE_SETTINGS,
     *,
     final: bool = False,
-    predicted: PredictedFailures | None = None,
 ) -> MixtureProposal:
     """Return the mixture for the next draws.
 
-    Its weights minimise the second moment of the estimate over the failures in `history`, or over predicted ones, with
-    lower limits; before the first round they are `settings.initial_shares`.
+    Its weights minimise the second moment of the estimate over the failures in `history`, with lower limits; before
+    the first round they are `settings.initial_shares`.
 
     Args:
         state: What is known of the regions.
@@ -59,12 +46,8 @@ def build_proposal(
         settings: Shares and lower limits.
         mixture: Of edges and weights.
         final: For the estimate: what is no use is dropped.
-        predicted: Failures by a regression of f, if they are to stand in for those met.
     """
     candidates = list_candidates(state, history, settings, mixture.edges)
-    if predicted is not None:
-        described = _describe_predicted(predicted.gaussians, state.exploration.slopes, settings)
-        candidates += [candidate for candidate in described if candidate.kind in settings.initial_shares]
     kinds = np.array([candidate.kind for candidate in candidates])
     start = np.array([settings.initial_shares[c.kind] / np.count_nonzero(kinds == c.kind) for c in candidates])
     weights = start / start.sum()
@@ -72,9 +55,7 @@ def build_proposal(
         return MixtureProposal(candidates, weights)
     floors = _set_floors(state, history, candidates, settings, radial=state.dim <= settings.radial_dim, final=final)
     u, log_w = history.u, history.log_weights
-    if predicted is not None:
-        u, log_w = predicted.u, np.zeros(len(predicted.u))
-    elif state.noisy:
+    if state.noisy:
         u, log_w = _smooth_indicators(history, state.gamma, settings)
     log_r = log_ratios([candidate.component for candidate in candidates], u)
     weights = minimise_second_moment(log_r, log_w, weights, floors, mixture.weights)
@@ -85,17 +66,6 @@ def build_proposal(
         keeps = keeps | explored
     weights = np.where((weights < settings.min_share) & ~keeps, 0.0, weights)
     return MixtureProposal(candidates, raise_to_floors(weights / weights.sum(), floors))
-
-
-def _describe_predicted(
-    gaussians: Sequence[SubspaceGaussian], axes: FloatArray | None, settings: RefinementSettings
-) -> list[ProposalComponent]:
-    """Return components for Gaussians fitted to predicted failures, and tempered ones, of no region."""
-    sharp = [ProposalComponent(gaussian, "gaussian") for gaussian in gaussians]
-    inside = [*sharp, *_temper_gaussians(sharp, settings.tempering)]
-    if axes is None:
-        return inside
-    return [candidate._replace(component=LiftedComponent(candidate.component, axes)) for candidate in inside]
 
 
 def list_candidates(
@@ -115,7 +85,6 @@ def list_candidates(
         ProposalComponent(IsotropicNormal(state.dim, settings.wide_scale), "wide"),
         *_fit_radial_components(state, history, settings, edges),
         *regional,
-        *([] if state.noisy else _fit_half_space_components(state, history, settings, edges)),
         *_fit_directional_components(state, history),
         *_temper_gaussians(regional, settings.noisy_tempering if state.noisy else settings.tempering),
     ]
@@ -179,23 +148,6 @@ def _weighted_failures(state: RefinementState, history: MultipleImportanceSample
     if state.rounds and len(history.u):
         return history.u, truncate_weights(history.log_weights)
     return state.points, np.full(len(state.points), 1 / len(state.points))
-
-
-def _fit_half_space_components(
-    state: RefinementState, history: MultipleImportanceSample, settings: RefinementSettings, edges: EdgeSettings
-) -> list[ProposalComponent]:
-    """Return half-spaces through the edge of the failures that each Gaussian describes."""
-    u = history.u if state.rounds else state.points
-    log_w = history.log_weights if state.rounds else np.zeros(len(u))
-    if len(u) == 0:
-        return []
-    owner = log_ratios(state.gaussians, u).argmax(axis=0)
-    half_spaces: list[HalfSpaceNormal] = []
-    for k, gaussian in enumerate(state.gaussians):
-        own = owner == k
-        if np.count_nonzero(own) >= settings.min_owned_failures:
-            half_spaces += fit_half_spaces(gaussian, u[own], np.exp(log_w[own] - log_w[own].max()), edges)
-    return [ProposalComponent(half_space, "half-space") for half_space in half_spaces]
 
 
 def _share_among_regions(state: RefinementState, history: MultipleImportanceSample) -> FloatArray:

@@ -25,21 +25,20 @@ class TwoStage(Method):
        points that walk downhill each alone; chains inside the failure region from all of these. Two failing points are
        of one region if the point half way between them fails.
     2. *Refinement* (`refinement.py`, `candidates.py`): each region is described by Gaussians, by a hyperplane from
-       linear regression of f where f is linear, by a corner of several where f is the greatest of linear functions, by
-       half-spaces through the edge of its failures and by a radius.
+       linear regression of f where f is linear, by a corner of several where f is the greatest of linear functions,
+       and by a radius.
        Three rounds of draws follow, each from a mixture of these, and up to two more while a draw is worth less than
        a tenth of a failure. The weights minimise the estimated variance (`mixture_weights.py`), with lower limits for
        the base distribution, for tempered Gaussians (which bound weights where a Gaussian is a bad description) and
-       for each region. After each round but the last, chains grow from failures that the next proposal would hardly
-       reach (`discovery/uncovered.py`).
+       for each region.
     3. *Estimate* (`stratified.py`): fresh draws from the last mixture, stratified by component, together with those of
        the rounds from the third on, each weighted as a draw of its own mixture.
 
     p-hat is unbiased, as the estimate from each mixture is given what came before it, with two exceptions. Whether
-    another method takes over after the third round or later, and how many simulations chains then take before the next
-    one, depends on draws that count. With a target c.o.v., the draws decide themselves when they end, which
-    costs a bias of the order of its square (`docs/two_stage.md`). (Weighting all draws as if from one mixture, as
-    adaptive multiple importance sampling does, would bias p by some per cent and make intervals too short.)
+    another method takes over after the third round or later depends on draws that count. With a target c.o.v., the
+    draws decide themselves when they end, which costs a bias of the order of its square (`docs/two_stage.md`).
+    (Weighting all draws as if from one mixture, as adaptive multiple importance sampling does, would bias p by some
+    per cent and make intervals too short.)
 
     All stages work in standard normal space, so that wide draws stay within the support of the parameters. A run
     yields 45 to 90 batches, half of them steps of the levels and the lines of descent. Regression of f, subset
@@ -63,9 +62,7 @@ class TwoStage(Method):
 
     *Warnings* (`diagnostics.py`): uneven weights, base draws that fail more often than p allows, rounds that
     contradict the estimate, regions that the last draws hardly reach, and a search of so few lineages that M may
-    exceed 0.3; the message says what cannot be excluded in units of p. Where simulated failures lie off the way of the
-    last draws, a regression of f predicts their true c.o.v., and one of twice the stated c.o.v. is told
-    (`response_surface/`). A region that neither f announces nor any draw
+    exceed 0.3; the message says what cannot be excluded in units of p. A region that neither f announces nor any draw
     has hit gives no warning; `Estimate.unseen` bounds its probability.
 
     *Terms.* Problems that offer terms and their gradients, in 30 dimensions or more and with 1,000 simulations or more,
@@ -164,9 +161,6 @@ def _explore_and_estimate(
             state, refinement, proposal, final = yield from steps
             if stages.gives_up(context, state, refinement, proposal, number, final=final):
                 return (yield from stages.fall_back(context, state, exploration.levels))
-            if not final:
-                refinement, proposal = yield from stages.cover(context, state, refinement, proposal, room)
-            proposal = stages.place(context, state, refinement, proposal, final=final)
     except Interrupted:
         return stages.estimate_early(context, state)
     outcome = yield from stages.estimate_afresh(context, state, refinement, proposal)

@@ -28,7 +28,7 @@ from samplers.problem import FloatArray
 from samplers.proposals.components import HalfSpaceUnion, SubspaceGaussian, log_ratios
 from samplers.statistics.weights import effective_sample_size
 
-SHARP_KINDS = ("gaussian", "linear", "corner", "explored", "half-space", "radial")
+SHARP_KINDS = ("gaussian", "linear", "corner", "explored", "radial")
 """Components that are meant to hold failures only."""
 TYPICAL_QUANTILE = 0.75
 """Of the mean weights of chains: that of the heaviest may be where hardly any failure is."""

@@ -10,7 +10,6 @@ from dataclasses import dataclass, field
 
 from samplers.methods.two_stage.mixture.proposal import Kind
 from samplers.methods.two_stage.mixture.settings import DEFAULT_MIXTURE_SETTINGS, MixtureSettings
-from samplers.methods.two_stage.response_surface.settings import DEFAULT_SURFACE_SETTINGS, SurfaceSettings
 from samplers.methods.two_stage.terms.settings import DEFAULT_TERM_SETTINGS, TermSettings
 
 
@@ -24,7 +23,6 @@ def _initial_shares() -> dict[Kind, float]:
         "corner": 0.3,
         "explored": 0.2,
         "tempered": 0.25,
-        "half-space": 0.1,
         "spread": 0.2,
         "directional": 0.1,
     }
@@ -263,12 +261,6 @@ class RefinementSettings:
     70, and 26 with the half-spaces of the pieces of f; with 0.15 of it these gave 150."""
     explored_share: float = 0.01
     """Share that components from the exploration keep until the last round."""
-    uncovered_share: float = 0.05
-    """Share of p that a failing point may stand for as one of the last draws; from more than that, chains grow.
-    Without them 3 of 48 intervals missed p on the four problems where they come most often, with them 1
-    (`benchmarks/results/two_stage_seeds_uncovered.json`)."""
-    uncovered_budget: float = 0.1
-    """Share of what is left for these chains, after each round but the last."""
     min_share: float = 0.004
     """Components with less of the draws are left out."""
     initial_shares: dict[Kind, float] = field(default_factory=_initial_shares)
@@ -278,9 +270,8 @@ class RefinementSettings:
     131 times as large on sphere_d20 (radial), 15 times on two_d30 and 4 times on three_d6 and steps_d6 (linear). On
     twelve others with 2 seeds it is 1.6 times as large without `corner`, 20 times on corner_d5. Without `explored` 5 of
     40 intervals miss p, with it none. Without `tempered` the variance is a quarter smaller: they are for noise, and for
-    regions that are badly described. `half-space` and `wide` buy nothing over all (1.01 and 1.02 +- 0.05, 168 runs on
-    48 limit states): they guard the coverage on sector_d6 and oscillator_d100, and on loads_d7 and crossing_d6
-    (`docs/estimator_experiments.md`)."""
+    regions that are badly described. `wide` buys nothing over all (1.02 +- 0.05, 168 runs on 48 limit
+    states): it guards the coverage on loads_d7 and crossing_d6."""
     wide_scale: float = 1.5
     """Standard deviation of the wide component."""
     tempering: tuple[float, ...] = (0.5,)
@@ -295,8 +286,6 @@ class RefinementSettings:
     """Independent points that a chain is worth."""
     min_refit_failures: int = 6
     """Failures, all in all, from which on Gaussians and half-spaces are fitted again."""
-    min_owned_failures: int = 10
-    """Failures of a Gaussian that a half-space through their edge needs."""
     min_radial_failures: int = 20
     """Failures that a radial component needs."""
     min_log_ratio: float = 1.0
@@ -390,7 +379,6 @@ class TwoStageSettings:
     refinement: RefinementSettings = RefinementSettings()
     fallback: FallbackSettings = FallbackSettings()
     diagnostics: DiagnosticSettings = DiagnosticSettings()
-    surfaces: SurfaceSettings = DEFAULT_SURFACE_SETTINGS
     mixture: MixtureSettings = DEFAULT_MIXTURE_SETTINGS
     terms: TermSettings = DEFAULT_TERM_SETTINGS
 

@@ -23,15 +23,11 @@ from samplers.methods.two_stage.diagnostics import (
     check_rounds,
 )
 from samplers.methods.two_stage.discovery.slopes import find_slopes
-from samplers.methods.two_stage.discovery.uncovered import cover_failures, find_uncovered
 from samplers.methods.two_stage.discovery.unseen import discovery_interval
 from samplers.methods.two_stage.exploration import Sizes, find_regions, first_draws
 from samplers.methods.two_stage.mixture.proposal import MixtureProposal
 from samplers.methods.two_stage.refinement import RefinementState, refine_once, start_refinement, typical_weights
 from samplers.methods.two_stage.regions import ExplorationResult
-from samplers.methods.two_stage.response_surface.placement import place_by_surface
-from samplers.methods.two_stage.response_surface.predicted_failures import PlannedDraws, Simulated
-from samplers.methods.two_stage.response_surface.spread import LastDraws, check_spread
 from samplers.methods.two_stage.run_state import CountedRound, RunContext, RunState
 from samplers.methods.two_stage.settings import TwoStageSettings
 from samplers.methods.two_stage.simulator import (
@@ -137,49 +133,6 @@ def refine(
     return state, refinement, proposal, final
 
 
-def cover(
-    context: RunContext, state: RunState, refinement: RefinementState, proposal: MixtureProposal, room: int
-) -> SimulationSteps[tuple[RefinementState, MixtureProposal]]:
-    """Give failures that the proposal of the next round hardly reaches components of their own.
-
-    Args:
-        context: What is fixed for the run.
-        state: Draws so far.
-        refinement: What is known of the regions.
-        proposal: For the next round.
-        room: Simulations that the exploration has left.
-    """
-    settings, rng = context.settings, context.rng
-    if refinement.noisy or refinement.scattered:
-        return refinement, proposal
-    last = int((1 - sum(settings.refinement.round_shares)) * room)
-    points = find_uncovered(refinement, state.history, proposal, last, settings.refinement)
-    within = int(settings.refinement.uncovered_budget * context.left)
-    covered = yield from cover_failures(context.simulator, refinement, points, within, rng, settings)
-    if covered is refinement:
-        return refinement, proposal
-    return covered, build_proposal(covered, state.history, settings.refinement, settings.mixture)
-
-
-def place(
-    context: RunContext, state: RunState, refinement: RefinementState, proposal: MixtureProposal, *, final: bool
-) -> MixtureProposal:
-    """Return the mixture by a regression of f where it is well better than the proposal for draws that count.
-
-    Args:
-        context: What is fixed for the run.
-        state: Draws so far.
-        refinement: What is known of the regions.
-        proposal: For the next draws.
-        final: For the estimate.
-    """
-    counts = final or len(state.rounds) >= _first_counted(state, context.goal.gamma, context.settings)
-    if not counts or not _asks_surface(context, refinement):
-        return proposal
-    rng = context.rng.spawn(1)[0]  # draws nothing from the run's own generator
-    return place_by_surface(proposal, refinement, state.history, context.left, rng, context.settings, final=final)
-
-
 def gives_up(
     context: RunContext,
     state: RunState,
@@ -230,7 +183,7 @@ def estimate_afresh(
     settings = context.settings
     typical = typical_weights(refinement, proposal)
     sample = StratifiedSample.empty(len(proposal.weights), inputs.dim, typical, settings)
-    whole, kept = sample, Simulated.none(inputs.dim)
+    whole = sample
     size = context.left if goal.target_cov is None else context.target_batch
     while context.left_at_all > 0:
         try:
@@ -239,8 +192,6 @@ def estimate_afresh(
             stopped = True
             break
         sample = sample.add(batch, proposal, inputs, goal.gamma)
-        room = max(settings.surfaces.most_points - len(kept.y), 0) if _asks_surface(context, refinement) else 0
-        kept = Simulated.join([kept, Simulated.of(batch.u[:room], batch.f[:room], goal.gamma)])
         whole = reduce(StratifiedSample.join, (each.sample for each in state.counted), sample)
         state = _record_draws(context, state, batch, whole.p, whole.cov, whole.draws.ess)
         if context.meets_target(whole.cov):
@@ -254,14 +205,9 @@ def estimate_afresh(
     points = sample.to_sample(proposal, state.base_f, state.base_u, goal.gamma, whole.draws)
     last = CountedRound(sample, context.simulator.n_sim - sample.draws.n)
     parts = [part.sample.draws.weights_after(part.first, whole.draws.n) for part in (*state.counted, last)]
-    drawn = PlannedDraws(proposal, sample.draws.n, whole.p)
     return replace(
         outcome,
-        warnings=(
-            *outcome.warnings,
-            *_check(context, state, refinement, sample, whole),
-            *_check_spread(context, state, refinement, LastDraws(drawn, sample.draws.cov, kept)),
-        ),
+        warnings=(*outcome.warnings, *_check(context, state, refinement, sample, whole)),
         sample=replace(points, lineages=discovery.lineages),
         draw_weights=tuple(weights for part in parts for weights in part),
         status=Status.STOPPED if stopped else outcome.status,
@@ -354,22 +300,6 @@ def _check(
         *check_discovery(whole.p, refinement.exploration.discovery, context.goal.confidence, settings),
         *([] if refinement.noisy else check_efficiency(sample, settings)),
     ]
-
-
-def _check_spread(context: RunContext, state: RunState, refinement: RefinementState, last: LastDraws) -> list[str]:
-    """Return a warning if a regression of f on all that was simulated predicts a far larger c.o.v. of the draws."""
-    if not _asks_surface(context, refinement):
-        return []
-    searched, settings = Simulated.of_search(state.history, refinement), context.settings
-    rng = context.rng.spawn(1)[0]  # draws nothing from the run's own generator
-    return check_spread(last, searched, refinement.exploration.slopes, rng, settings.surfaces, settings.mixture.pieces)
-
-
-def _asks_surface(context: RunContext, refinement: RefinementState) -> bool:
-    """Return whether a regression of f may say what the draws do not show: in few coordinates, without noise."""
-    axes = refinement.exploration.slopes
-    dim = refinement.dim if axes is None else axes.shape[1]
-    return not refinement.noisy and 0 < dim <= context.settings.surfaces.max_dim
 
 
 def _outcome(context: RunContext, state: RunState, draws: Draws, cov: float, interval: Interval) -> Outcome:

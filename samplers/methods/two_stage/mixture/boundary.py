@@ -1,65 +1,20 @@
-"""Proposals that begin where failure begins: half-spaces through the edge of a Gaussian's failures, and a radius.
+"""Radial proposal: every direction alike, from the radius on where nearly all failures begin.
 
-Both start before nearly all failures: a failure before the start of a proposal with an edge is drawn by others only,
-and the rare heavy weight that it then has is what no estimate of the error knows of.
+A failure within the radius is drawn by others only, and the rare heavy weight that it then has is what no estimate of
+the error knows of.
 """
 
 import numpy as np
 
-from samplers.methods.two_stage.mixture.linear_model import failure_edge, weighted_quantile
+from samplers.methods.two_stage.mixture.linear_model import weighted_quantile
 from samplers.methods.two_stage.mixture.settings import DEFAULT_MIXTURE_SETTINGS, EdgeSettings
 from samplers.problem import FloatArray
-from samplers.proposals.components import HalfSpaceNormal, RadialLaw, SubspaceGaussian
+from samplers.proposals.components import RadialLaw
 
-MIN_NORM = 1e-6
-"""A centre nearer to the origin than this has no direction."""
 MIN_VARIANCE = 1e-6
-"""Smallest variance across a half-space, and of |u|^2: failures may coincide in a direction."""
+"""Smallest variance of |u|^2."""
 MIN_SCALE = 1e-3
 """Least scale of the Gamma distribution of |u|^2: it must be positive."""
-
-
-def fit_half_spaces(
-    gaussian: SubspaceGaussian,
-    u: FloatArray,
-    weights: FloatArray,
-    settings: EdgeSettings = DEFAULT_MIXTURE_SETTINGS.edges,
-) -> list[HalfSpaceNormal]:
-    """Return half-spaces through the edge of a Gaussian's failures, orthogonal to the direction of its centre.
-
-    N(0, I) beyond the edge, and, where the Gaussian has a full covariance, the same with that covariance within the
-    plane. None where the edge is nearer to the origin than `min_distance`.
-
-    Args:
-        gaussian: Describes these failures.
-        u: Failures, shape (n, d).
-        weights: Their importance weights, of any scale, shape (n,).
-        settings: Where the edge is.
-    """
-    centre, dim = gaussian.centre, len(gaussian.axes)
-    norm = float(np.linalg.norm(centre))
-    if norm < MIN_NORM:
-        return []
-    axis = centre / norm
-    ess = float(weights.sum()) ** 2 / float((weights**2).sum())
-    start = failure_edge(u @ axis, weights, ess, settings.share, settings) - settings.slack
-    if start < settings.min_distance:
-        return []
-    half_spaces = [HalfSpaceNormal(axis, start)]
-    if gaussian.axes.shape[1] == dim > 1:
-        half_spaces.append(HalfSpaceNormal(axis, start, _project(gaussian, axis)))
-    return half_spaces
-
-
-def _project(gaussian: SubspaceGaussian, axis: FloatArray) -> SubspaceGaussian:
-    """Return a Gaussian of full covariance, projected on the plane through 0 that is orthogonal to axis (d,)."""
-    dim = len(axis)
-    across = np.eye(dim) - np.outer(axis, axis)
-    covariance = gaussian.axes * gaussian.variance @ gaussian.axes.T
-    values, vectors = np.linalg.eigh(across @ covariance @ across)
-    within = np.argsort(np.abs(vectors.T @ axis))[: dim - 1]
-    axes = vectors[:, within]
-    return SubspaceGaussian(axes, axes.T @ gaussian.centre, np.maximum(values[within], MIN_VARIANCE))
 
 
 def fit_radial(

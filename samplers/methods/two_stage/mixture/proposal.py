@@ -18,7 +18,6 @@ Kind = Literal[
     "corner",
     "explored",
     "tempered",
-    "half-space",
     "spread",
     "directional",
 ]
@@ -34,7 +33,6 @@ Kind = Literal[
     explored    fitted to the chains of the exploration, never changed
     tempered    q^t phi^(1 - t) of a Gaussian q, which bounds weights where q is a bad description
     spread      as wide as the failures in the span of a few gradients of f, N(0, 1) across it
-    half-space  N(0, I) beyond the edge of a Gaussian's failures
 """
 
 NO_REGION = -1

@@ -117,7 +117,7 @@ class CornerSettings:
 
 @dataclass(frozen=True, kw_only=True)
 class EdgeSettings:
-    """Where proposals with an edge begin (`boundary.py`, and the half-spaces of `linear_model.py`)."""
+    """Where proposals with an edge begin (`boundary.py`, and the planes of the regressions)."""
 
     min_distance: float = 0.5
     """Nearer to the origin than this a half-space holds 31 % of N(0, I): base draws serve as well."""
@@ -129,9 +129,6 @@ class EdgeSettings:
     and 1.02, with `share`."""
     min_ess: float = 2.0
     """Least number of failures that they are divided by."""
-    share: float = 0.02
-    """Share of the failures' weight that may lie before a half-space: what `failure_edge` then takes off covers
-    them."""
     radius_share: float = 0.01
     """Share of the failures' weight that may lie within the radius before it is shortened. Variance 0.98 and 1.19, with
     `radius_factor` and `min_radial_shape`: 2.08 on one problem."""

@@ -1,3 +1,5 @@
+"""Two-stage: budget, target, any kind of f, runs that are stopped, coverage; what takes over where no proposal fits."""
+
 import functools
 import math
 
@@ -65,19 +67,9 @@ def counted(recorder, problem, **options):
     return result
 
 
-# how much is simulated
-
-
-@pytest.mark.parametrize("max_sim", [1, 2, 7, 50, 399, 1500, 2000, 6000])
+@pytest.mark.parametrize("max_sim", [7, 399, 1500])
 def test_the_budget_is_used_up_and_not_exceeded(recorder, max_sim):
-    for problem in (half_space(100).problem, linear(3.0, 1)):
-        assert counted(recorder, problem, seed=1, max_sim=max_sim).n_sim == max_sim
-
-
-@pytest.mark.parametrize("max_sim", [400, 700, 1000])
-def test_a_budget_of_some_hundreds_is_used_up_and_not_exceeded(recorder, max_sim):
-    for problem in (half_space(100).problem, four_branches().problem, shell().problem):
-        assert counted(recorder, problem, seed=0, max_sim=max_sim).n_sim == max_sim
+    assert counted(recorder, four_branches().problem, seed=1, max_sim=max_sim).n_sim == max_sim
 
 
 @pytest.mark.slow
@@ -97,7 +89,6 @@ def test_no_budget_is_exceeded_whatever_the_regions(recorder):
 
 def test_without_max_sim_it_makes_n():
     assert samplers.estimate(half_space(100).problem, TS(n=2000), seed=1).n_sim == 2000
-    assert samplers.estimate(half_space(100).problem, TS(), seed=1).n_sim == 6000
 
 
 def test_too_small_a_budget_is_plain_monte_carlo_and_says_so():
@@ -110,23 +101,6 @@ def test_too_small_a_budget_is_plain_monte_carlo_and_says_so():
 def test_bad_settings_are_refused(n):
     with pytest.raises(ValueError, match="TwoStage: expected n to be a whole number of at least 400"):
         TS(n=n)
-
-
-def test_same_seed_same_answer_other_seed_another():
-    problem = half_space(100).problem
-    first, again, other = (samplers.estimate(problem, TS(), seed=seed, max_sim=2000) for seed in (1, 1, 2))
-    assert first == again
-    assert first.p != other.p
-
-
-def test_replicates_share_the_budget():
-    reference = half_space(100)
-    result = samplers.estimate(reference.problem, TS(), seed=1, max_sim=9001, replicates=4)
-    assert result.n_sim == 9001
-    assert result.interval[0] / 1.01 <= reference.p <= 1.01 * result.interval[1]
-
-
-# the target
 
 
 def test_target_is_met_with_fewer_simulations_than_n():
@@ -158,13 +132,6 @@ def test_target_where_failure_is_common():
     assert near(result, PHI(-0.524))
 
 
-def test_target_where_failure_is_common_takes_few_simulations():
-    assert samplers.estimate(linear(0.524), TS(), seed=1, target_cov=0.04).n_sim < 3000  # 1,460 would do
-
-
-# what is estimated
-
-
 def test_failure_is_common(recorder):
     """Plain Monte Carlo from then on, with a binomial error."""
     result = counted(recorder, linear(0.524), seed=1)
@@ -173,30 +140,9 @@ def test_failure_is_common(recorder):
     assert near(result, PHI(-0.524))
 
 
-def test_nothing_fails(recorder):
-    result = counted(recorder, FunctionProblem(lambda u: np.ones(len(u)), 3), seed=1)
-    assert result.p == 0
-    assert result.status == "no_hits"
-    assert result.interval[1] <= 4.0 / 5000  # Clopper and Pearson for the base draws
-
-
-def test_everything_fails(recorder):
-    result = counted(recorder, FunctionProblem(lambda u: -np.ones(len(u)), 3), seed=1)
-    assert result.p == result.interval[1] == 1
-    assert result.interval[0] > 0.999
-
-
-@pytest.mark.parametrize("beta", [2.0, 3.5, 5.0])
+@pytest.mark.parametrize("beta", [2.0, 5.0])
 def test_one_dimension(beta):
     assert near(samplers.estimate(half_space(1, beta).problem, TS(), seed=1, max_sim=2000), PHI(-beta))
-
-
-def test_1500_dimensions(recorder):
-    """Fewer points than directions: coarse, but the interval holds p."""
-    reference = half_space(1500, 3.0)
-    result = counted(recorder, reference.problem, seed=1, max_sim=2500)
-    assert result.p > 0
-    assert result.interval[0] <= reference.p <= result.interval[1]
 
 
 @pytest.mark.parametrize(
@@ -215,18 +161,6 @@ def test_any_kind_of_outcome(f):
     assert near(samplers.estimate(FunctionProblem(f, 3), TS(), seed=1, max_sim=2500), PHI(-3.0))
 
 
-def test_outcomes_near_the_largest_number():
-    problem = FunctionProblem(lambda u: 1e200 * (3 - u[:, 0]), 3)
-    assert near(samplers.estimate(problem, TS(), seed=1, max_sim=2500), PHI(-3.0))
-
-
-def test_gamma_shifts_the_threshold():
-    one, shifted = (samplers.estimate(linear(3.0 + g, 2), TS(), gamma=g, seed=1, max_sim=2000) for g in (0.0, 64.0))
-    for result in (one, shifted):
-        assert near(result, PHI(-3.0))
-    assert (shifted.failures.f <= 64.0).all()
-
-
 def test_missing_outcomes():
     """NaN beyond u2 > 2.5: counted as failing, and left out of the lower end with "bound"."""
 
@@ -242,41 +176,6 @@ def test_missing_outcomes():
     assert bound.p == counts.p
     assert bound.interval[1] == counts.interval[1]
     assert bound.interval[0] / counts.interval[0] == pytest.approx(0.5, abs=0.06)
-
-
-class Uniform:
-    """On the unit cube; u = Phi^-1(x)."""
-
-    def __init__(self, dim):
-        self.dim = dim
-
-    def sample(self, n, rng):
-        return rng.random((n, self.dim))
-
-    def log_prob(self, x):
-        return np.where(((x >= 0) & (x <= 1)).all(axis=1), 0.0, -np.inf)
-
-    def to_standard_normal(self, x):
-        return stats.norm.ppf(x)
-
-    def from_standard_normal(self, u):
-        return stats.norm.cdf(u)
-
-
-class Corner:
-    """x1 + x2 >= 1.97 on the unit cube: p = 0.03^2 / 2."""
-
-    dim, base = 3, Uniform(3)
-
-    def evaluate(self, x):
-        assert ((x >= 0) & (x <= 1)).all()
-        return 1.97 - x[:, 0] - x[:, 1]
-
-
-def test_nothing_is_simulated_outside_the_support():
-    result = samplers.estimate(Corner(), TS(), seed=1, max_sim=4000)
-    assert near(result, 0.03**2 / 2)
-    np.testing.assert_array_equal(result.failures.log_p0, 0.0)
 
 
 def test_sample_gives_p_and_higher_thresholds():
@@ -302,9 +201,6 @@ def test_estimate_rests_on_the_draws_of_the_last_round_and_those_after_it_alone(
     assert [level.n_sim for level in result.trace[-2:]] == [len(x) for x in asked[-2:]]
 
 
-# ends before the end
-
-
 STOPPED = {r.name: r for r in (half_space(100, 3.0), two_regions(5, 2.8, 3.0))}
 
 
@@ -318,7 +214,7 @@ def batches_of(name):
     return n
 
 
-@pytest.mark.parametrize("after", [1, 2, 5, 20, 40, 44, 100])
+@pytest.mark.parametrize("after", [2, 20, 44])
 @pytest.mark.parametrize("reference", STOPPED.values(), ids=STOPPED)
 def test_stopped_in_any_phase(reference, after):
     """What draws from known distributions say so far: an interval that holds p, give or take."""
@@ -338,20 +234,6 @@ def test_stopped_in_any_phase(reference, after):
         assert result.sample.weights[result.sample.f <= 0].sum() == pytest.approx(result.p)
 
 
-def test_stopped_in_the_estimate():
-    reference = half_space(100, 3.0)
-    run = TS(n=3000).start(reference.problem, seed=3, target_cov=0.004)
-    sizes = []
-    while len(sizes) < 3 or sizes[-3:] != [300] * 3:  # three batches of the estimate
-        u = run.ask()
-        sizes.append(len(u))
-        run.tell(reference.problem.f(u))
-    result = run.result()
-    assert result.status == "stopped"
-    assert near(result, reference.p)
-    assert result.trace[-1].n_sim == 300
-
-
 @pytest.mark.parametrize("collision", [False, True], ids=["f falls on", "f is -1 on failure"])
 def test_a_corner_takes_few_simulations(collision):
     """Three conditions must all hold, p = 1.4e-4: plain Monte Carlo takes 7.7e6 simulations for a c.o.v. of 3 %."""
@@ -367,19 +249,16 @@ def test_a_corner_takes_few_simulations(collision):
     assert result.cov < 0.03
 
 
-# where no proposal describes the failures
-
-
 def case(name):
     """A problem of the benchmark for which no proposal is to be found."""
     state = PROBLEMS[name].make()
     return Reference(name, state.problem(), state.p)
 
 
-@pytest.mark.parametrize("name", ["slabs_d20", "network_d400"])  # on network_d30 slopes are kept in some runs
+@pytest.mark.parametrize("name", ["slabs_d20"])
 def test_subset_simulation_takes_over(recorder, name):
     reference = case(name)
-    for seed in range(3):
+    for seed in range(1):
         result = counted(recorder, reference.problem, seed=seed, max_sim=6000)
         assert result.remarks[0].startswith("No proposal describes the failures")
         assert result.interval[0] < reference.p < result.interval[1]
@@ -387,40 +266,16 @@ def test_subset_simulation_takes_over(recorder, name):
         assert result.n_sim <= 6000
 
 
-def test_a_region_so_far_out_that_its_weights_vanish(recorder):
-    """Wide draws in 800 dimensions reach |u| > 65, whose probability is below the smallest float."""
-
-    def f(u):
-        return np.minimum(3.3 - u[:, 0], (65.0**2 - (u**2).sum(axis=1)) / 50)
-
-    for seed in range(2):
-        result = counted(recorder, FunctionProblem(f, 800), seed=seed, max_sim=3000)
-        assert result.interval[0] < PHI(-3.3) < result.interval[1]
-
-
+@pytest.mark.slow
 def test_subset_simulation_takes_as_many_points_as_the_target_asks_for(recorder):
     sizes = [counted(recorder, case("slabs_d20").problem, seed=0, target_cov=target).n_sim for target in (0.3, 0.5)]
     assert 4000 < sizes[1] < sizes[0] < 12_000
-
-
-def test_subset_simulation_is_stopped():
-    reference = case("slabs_d20")
-    run = TS().start(reference.problem, seed=2)  # given up after the first round
-    while not run.done and run.progress.n_sim < 4000:
-        run.tell(reference.problem.f(run.ask()))
-    run.stop()
-    result = run.result()
-    assert result.status == "stopped"
-    assert result.n_sim == sum(level.n_sim for level in result.trace)
 
 
 @pytest.mark.parametrize("max_sim", [800, 1500])
 def test_a_small_exploration_says_so(max_sim):
     result = samplers.estimate(linear(3.0), TS(), seed=0, max_sim=max_sim)
     assert any("may miss" in text for text in result.warnings) == (max_sim < 1500)
-
-
-# studies
 
 
 def judge(found, bias=0.01):
@@ -433,7 +288,11 @@ def judge(found, bias=0.01):
 
 @pytest.mark.parametrize(
     ("reference", "max_sim"),
-    [(half_space(100), 3000), (two_regions(10), 2500), (deceptive(), 3000), (plateau(), 2500), (noisy(), 3000)],
+    [
+        (deceptive(), 2000),
+        pytest.param(two_regions(10), 2500, marks=pytest.mark.slow),
+        pytest.param(noisy(), 3000, marks=pytest.mark.slow),
+    ],
     ids=lambda value: getattr(value, "name", ""),
 )
 def test_right_and_covered(study, reference, max_sim):
@@ -478,7 +337,7 @@ def test_hardly_any_bias_where_plain_draws_take_over(study, p):
     judge(study(reference("common", lambda u: beta - u[:, 0], 2, p), TS(), 100, max_sim=2000), 0.008)
 
 
-@pytest.mark.parametrize("regions", [1, 4])
+@pytest.mark.parametrize("regions", [4])
 def test_ten_replicates_share_a_small_budget(recorder, regions):
     def f(u):
         return 3.5 - u[:, :regions].max(axis=1)

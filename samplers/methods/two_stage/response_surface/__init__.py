@@ -1,1 +1,0 @@
-"""Response surface: a regression of f on all that was simulated says where failures are that draws hardly reach."""
