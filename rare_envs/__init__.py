@@ -27,8 +27,8 @@ if not _is_bare:
 
 if TYPE_CHECKING:
     from rare_envs.control.idm import IDM
+    from rare_envs.distributions.mixture import TruncatedGaussianMixture
     from rare_envs.distributions.space import ScenarioSpace
-    from rare_envs.distributions.truncated_mixture import TruncatedGaussianMixture
     from rare_envs.egos.faults import FaultTolerant
     from rare_envs.interop import HighwayEnvProblem, HighwayEnvScenario, highway_env_problem
     from rare_envs.problem import DrivingProblem
@@ -68,7 +68,7 @@ _LAZY = {
     "HighwayEnvProblem": "rare_envs.interop",
     "HighwayEnvScenario": "rare_envs.interop",
     "ScenarioSpace": "rare_envs.distributions.space",
-    "TruncatedGaussianMixture": "rare_envs.distributions.truncated_mixture",
+    "TruncatedGaussianMixture": "rare_envs.distributions.mixture",
     "highway_env_problem": "rare_envs.interop",
     "load_study": "rare_envs.study.run_folder",
     "risk": "rare_envs.study.risk",

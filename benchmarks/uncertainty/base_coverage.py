@@ -23,7 +23,7 @@ from scipy import stats
 import samplers
 from benchmarks import RESULTS
 from rare_envs.distributions.fitted import FittedDistribution
-from rare_envs.distributions.truncated_mixture import TruncatedGaussianMixture
+from rare_envs.distributions.mixture import TruncatedGaussianMixture
 from samplers.problem import FloatArray
 from training.scenario_fitting.event_filters import EventSet
 from training.scenario_fitting.refits import draw_events

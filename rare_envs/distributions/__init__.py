@@ -1,10 +1,9 @@
 """Distributions of scenario parameters, with exact maps to standard normal space, and the spaces they live on."""
 
 from rare_envs.distributions.beta import BetaDistribution
-from rare_envs.distributions.coordinate_mixture import CoordinateMixture
 from rare_envs.distributions.coordinates import ClosingSpeed, Coordinates
-from rare_envs.distributions.fitted import EventCounts, FittedDistribution, PredictiveCheck
-from rare_envs.distributions.frequency import EventFrequency
+from rare_envs.distributions.fitted import EventCounts, EventFrequency, FittedDistribution, PredictiveCheck
+from rare_envs.distributions.mixture import CoordinateMixture, TruncatedGaussianMixture
 from rare_envs.distributions.parameters import DistributionParameter, HasParameters
 from rare_envs.distributions.product import (
     BlockDistribution,
@@ -14,7 +13,6 @@ from rare_envs.distributions.product import (
     join_independent,
 )
 from rare_envs.distributions.space import Distribution, Parameter, ScenarioSpace
-from rare_envs.distributions.truncated_mixture import TruncatedGaussianMixture
 
 __all__ = [
     "BetaDistribution",

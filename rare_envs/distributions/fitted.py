@@ -2,30 +2,153 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
-from typing import Any, cast
+from dataclasses import MISSING, asdict, dataclass, field, fields, replace
+from typing import Any, TypeVar, cast
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from rare_envs.arrays import FloatArray
 from rare_envs.distributions.beta import BetaDistribution
-from rare_envs.distributions.coordinate_mixture import CoordinateMixture
-from rare_envs.distributions.frequency import EventFrequency
-from rare_envs.distributions.mixture_conditionals import COMPONENT_FIELDS
+from rare_envs.distributions.mixture import COMPONENT_FIELDS, CoordinateMixture, TruncatedGaussianMixture
 from rare_envs.distributions.parameters import DistributionParameter, HasParameters
-from rare_envs.distributions.pooled_mixture import Refits, number_coordinates, pool_mixtures
-from rare_envs.distributions.reading import (
-    FileDistribution,
-    read_distribution,
-    read_record,
-    require_count,
-    require_number,
-    require_text,
-)
+from rare_envs.distributions.pooled import Refits, number_coordinates, pool_mixtures
 from rare_envs.distributions.space import Distribution
-from rare_envs.distributions.truncated_mixture import TruncatedGaussianMixture
+
+FileDistribution = TruncatedGaussianMixture | CoordinateMixture | BetaDistribution
+RecordT = TypeVar("RecordT")
+
+
+def read_distribution(data: Mapping[str, Any]) -> FileDistribution:
+    """Return the distribution of the kind that the keys of a file tell: Beta, a mixture in coordinates, or plain.
+
+    Raises:
+        ValueError: A key is missing or its value is not valid.
+    """
+    if "alpha" in data:
+        return BetaDistribution.from_dict(data)
+    if "coordinates" in data or data.get("order") or data.get("logarithmic"):
+        return CoordinateMixture.from_dict(data)
+    return TruncatedGaussianMixture.from_dict(data)
+
+
+def read_record(kind: type[RecordT], what: str, data: object) -> RecordT:
+    """Return a frozen dataclass from an object of a file, with the same names.
+
+    Args:
+        kind: The dataclass, whose constructor checks the values.
+        what: Key of the object, for messages.
+        data: The object.
+
+    Raises:
+        ValueError: Not an object, or a name is unknown or missing, or a value is not valid.
+    """
+    names = [each.name for each in fields(kind)]  # type: ignore[arg-type]  # a dataclass
+    if not isinstance(data, Mapping):
+        raise ValueError(f"Expected {what} as an object with {', '.join(names)}, got {data!r}.")
+    unknown = [str(name) for name in data if name not in names]
+    needed = [each.name for each in fields(kind) if each.default is MISSING]  # type: ignore[arg-type]
+    missing = [name for name in needed if name not in data]
+    if unknown or missing:
+        wrong = f"unknown {', '.join(unknown)}" if unknown else f"no {', '.join(missing)}"
+        raise ValueError(f"Expected {what} as an object with {', '.join(names)}, got {wrong}.")
+    return kind(**data)
+
+
+def require_count(what: str, value: object, least: int = 1) -> None:
+    """Raise a ValueError unless a value is a whole number, `least` or more."""
+    if isinstance(value, bool) or not isinstance(value, int) or value < least:
+        raise ValueError(f"Expected {what} as a whole number, {least} or more, got {value!r}.")
+
+
+def require_number(what: str, value: object, low: float = 0.0, high: float = math.inf) -> None:
+    """Raise a ValueError unless a value is a finite number above `low` and at most `high`."""
+    if isinstance(value, bool) or not isinstance(value, int | float) or not low < value <= high or math.isinf(value):
+        above = f"above {low:g}" if math.isinf(high) else f"above {low:g}, at most {high:g}"
+        raise ValueError(f"Expected {what} as a number {above}, got {value!r}.")
+
+
+def require_text(what: str, value: object) -> None:
+    """Raise a ValueError unless a value is a text that is not empty."""
+    if not isinstance(value, str) or not value.strip():
+        raise ValueError(f"Expected {what} as a text, got {value!r}.")
+
+
+@dataclass(frozen=True, kw_only=True)
+class EventFrequency:
+    """Events counted in recordings, and the share of them that the base distribution stands for.
+
+    With n events counted in T hours, and a share s of them estimated from m events (k = s m of which had it):
+
+        rate = n s / T
+        Var(log rate) = 1 / n + (1 - s) / (s m) = 1 / n + 1 / k - 1 / m
+
+    The first term is a Poisson count's, the second a binomial proportion's, both to first order (delta method).
+
+    Raises:
+        ValueError: A count or an exposure is not positive, the share is not in (0, 1], or a text is missing.
+
+    Example:
+        >>> cut_ins = EventFrequency(  # 38 of 46 with both gaps in the ranges of the scenario
+        ...     count=1221,
+        ...     hours=112.0,
+        ...     km=3900.0,
+        ...     share=38 / 46,
+        ...     share_events=46,
+        ...     definition="lane changes into the lane ahead of a vehicle",
+        ...     source="NGSIM US 101, complete",
+        ... )
+        >>> round(cut_ins.per_hour, 1), round(cut_ins.per_km, 2), round(cut_ins.log_sd, 3)
+        (9.0, 0.26, 0.073)
+    """
+
+    count: int
+    """Events counted, n."""
+    hours: float
+    """Vehicle-hours in which they were counted."""
+    km: float
+    """Vehicle-kilometres in which they were counted."""
+    share: float = 1.0
+    """Share of the counted events that are as the base distribution's."""
+    share_events: int | None = None
+    """Events of which the share is the share, m; None if it is known without error."""
+    definition: str
+    """What was counted, in words."""
+    source: str
+    """Where it was counted."""
+
+    def __post_init__(self) -> None:
+        require_count("count of the frequency", self.count)
+        require_number("hours of the frequency", self.hours)
+        require_number("km of the frequency", self.km)
+        require_number("share of the frequency", self.share, high=1.0)
+        if self.share_events is not None:
+            require_count("share_events of the frequency", self.share_events)
+        require_text("definition of the frequency", self.definition)
+        require_text("source of the frequency", self.source)
+
+    @property
+    def per_hour(self) -> float:
+        """Events per vehicle-hour."""
+        return self.count * self.share / self.hours
+
+    @property
+    def per_km(self) -> float:
+        """Events per vehicle-kilometre."""
+        return self.count * self.share / self.km
+
+    @property
+    def log_sd(self) -> float:
+        """Standard deviation of the logarithm of the rate, of the counts alone; sites differ by more."""
+        share_variance = 0.0 if self.share_events is None else (1.0 - self.share) / (self.share * self.share_events)
+        return math.sqrt(1.0 / self.count + share_variance)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the fields by name, ready for JSON."""
+        return asdict(self)
+
 
 FITTED_KEYS = ("refits", "events", "family", "frequency", "checks")
 """Keys of a base file of which each makes it a fitted one; these then need `events` and `family`."""

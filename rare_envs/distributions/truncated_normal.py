@@ -1,44 +1,57 @@
-"""Truncated normals: one-dimensional normal mixtures cut to an interval, their masses, quantiles and inverses.
+"""One-dimensional normal mixtures cut to an interval: masses, maps to and from the standard normal, draws.
 
-Arrays hold components in rows and points in columns, (K, n). Everything is in logarithms of the
-smaller tail, and every column is computed on its own: no sum, and no stopping rule, depends on how
-many columns there are.
+Arrays hold components in rows and points in columns, (K, n). A column does not depend, bit for bit, on the others of a
+call. Masses and the map to the standard normal are in logarithms of the smaller tail. Quantiles are found in plain
+numbers by Newton's method, and where these do not do, by a bracketing search on the map in logarithms.
 """
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple, cast
+from collections.abc import Callable
+from functools import reduce
+from typing import Any, NamedTuple, Protocol, cast
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import log_ndtr, ndtr, ndtri_exp
+from scipy.optimize import elementwise
+from scipy.special import log_ndtr, ndtr, ndtri, ndtri_exp
+from typing_extensions import Self
 
 from rare_envs.arrays import FloatArray
-from rare_envs.distributions.quantiles.column_quantiles import find_quantiles
-from rare_envs.distributions.quantiles.mixture_quantile import (
-    MIN_CONTRACTION,
-    MIN_MASS,
-    MixtureColumn,
-    sum_components,
-)
 
+SQRT_2PI = np.sqrt(2.0 * np.pi)
 LOG_SQRT_2PI = 0.5 * np.log(2.0 * np.pi)
-MAX_ITERATIONS = 200
-"""Of the root search; bisection alone would need about 60."""
-ROOT_TOLERANCE = 1e-9
-"""Of the root search, relative to 1 + |u|: three digits more than the 1e-6 to which samplers compare coordinates."""
 NARROW = 1e-3
 """Intervals of less than this over (1 + |a|) are integrated by the midpoint rule: its error, (width a)^4, is then as
 small as the cancellation in a difference of distribution functions, 1e-12."""
+SERIES_WIDTH = 0.1
+"""The same by a series with four terms, of relative error 1e-16."""
 ALL = 8.3
 """From here on Phi is 1 but for rounding."""
+MIN_MASS = 1e-200
+"""Least mass of an untruncated mixture in its interval, and..."""
+MIN_U = -30.0
+"""...least quantile scale, Phi(-30) = 5e-198, for which plain numbers do."""
+TAIL_U = -1.5
+"""Quantile scale below which the first guess also looks at single components."""
+LOWEST, HIGHEST = -35.0, 7.0
+"""On the quantile scale; below, Phi nearly underflows, and above it is so near to 1 that its rounding leads astray."""
+LAST_STEP = 1e-8
+"""A step of Newton's method of less than this times the narrowest scale over (1 + |u|) is the last: it leaves the
+square of this."""
+MIN_CONTRACTION = 0.75
+"""A step that does not shrink at least by this factor is left for a bisection, which halves."""
+MAX_STEPS = 200
+"""Bisection alone would need about 60."""
+MAX_ERROR = 1e3
+"""On the quantile scale; at an end of an interval it is infinite, which a search for a root cannot interpolate."""
 
 
 class TruncatedConditional(NamedTuple):
     """One coordinate given the earlier ones: a one-dimensional mixture cut to [low, high].
 
-    Rows are columns here: log_weights and mean have shape (K, n), or (K, 1) if they are the same in
-    all rows, and scale (K, 1); low and high are scalars or (n,). log_weights need not be normalised.
+    log_weights, which need not be normalised, and mean have shape (K, n), or (K, 1) if they are the same in all rows,
+    and scale (K, 1); low and high are scalars or (n,).
     """
 
     log_weights: FloatArray
@@ -75,35 +88,40 @@ class TruncatedConditional(NamedTuple):
 
     def to_normal(self, x: FloatArray) -> FloatArray:
         """Return Phi^-1 of the distribution function at x (n,), by the smaller tail."""
+        return quantile_scale(*self.log_masses(x))
+
+    def log_masses(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the log masses of the mixture below and above x (n,), its weights as they are, (n,) each."""
         a, b, c = ((end - self.mean) / self.scale for end in (self.low, x, self.high))
         below, above = (x - self.low) / self.scale, (self.high - x) / self.scale
         lower = log_sum(self.log_weights + log_interval(a, b, below))
-        upper = log_sum(self.log_weights + log_interval(b, c, above))
-        total = np.logaddexp(lower, upper)
-        tail = np.minimum(lower, upper) - total
-        return cast(FloatArray, np.where(lower <= upper, 1.0, -1.0) * ndtri_exp(tail))
+        return lower, log_sum(self.log_weights + log_interval(b, c, above))
 
     def from_normal(self, u: FloatArray) -> FloatArray:
-        """Invert `to_normal`, (n,) -> (n,); rows that do not fit into plain numbers are solved in logarithms."""
-        n_components, n = len(self.mean), len(u)
-        low, high = np.full(n, self.low, dtype=np.float64), np.full(n, self.high, dtype=np.float64)
-        edges, whole = (0, n_components), np.ones((1, 1))
-        column = MixtureColumn(self.log_weights, self.mean, self.scale, low, high, edges, whole, n_components)
-        found, fits = find_quantiles(column, u)
+        """Invert `to_normal`, (n,) -> (n,)."""
+        tail, fits = Tail.of(self, u)
+        below = np.maximum(-np.abs(u), MIN_U)
+        found, fits = tail.sign * solve(tail, below, tail.guess(below)), fits & (below > MIN_U)
         if not fits.all():
             rest = np.flatnonzero(~fits)
-            found[rest] = self.take(rest).from_normal_by_logarithms(u[rest])
+            low, high = (np.full(len(u), end)[rest] for end in (self.low, self.high))
+            found[rest] = find_root(lambda x, rows: self.take(rest[rows]).to_normal(x), u[rest], low, high)
         return found
 
-    def from_normal_by_logarithms(self, u: FloatArray) -> FloatArray:
-        """Invert `to_normal`, (n,) -> (n,), however far out; positive u are solved in the mirror image."""
-        sign = np.where(u > 0, -1.0, 1.0)
-        return sign * _solve_lower_tail(self.mirror(u > 0), sign * u)
 
-    def mirror(self, rows: NDArray[np.bool_]) -> TruncatedConditional:
-        """Return the distributions of -x in some rows, boolean (n,), and of x in the others."""
-        low, high = np.where(rows, -self.high, self.low), np.where(rows, -self.low, self.high)
-        return TruncatedConditional(self.log_weights, np.where(rows, -1.0, 1.0) * self.mean, self.scale, low, high)
+def find_root(
+    to_normal: Callable[[FloatArray, NDArray[np.intp]], FloatArray], u: FloatArray, low: FloatArray, high: FloatArray
+) -> FloatArray:
+    """Return x in [low, high] where a rising map from x (m,) in some rows (m,) to the standard normal is u, (n,)."""
+
+    def find_error(x: FloatArray, rows: FloatArray) -> FloatArray:
+        chosen = rows.astype(np.intp)
+        error = np.clip(to_normal(x, chosen) - u[chosen], -MAX_ERROR, MAX_ERROR)
+        error = np.where(x <= low[chosen], -MAX_ERROR, error)
+        return np.where(x >= high[chosen], MAX_ERROR, error)
+
+    rows = np.arange(len(u), dtype=np.float64)
+    return np.asarray(elementwise.find_root(find_error, (low, high), args=(rows,)).x)
 
 
 def _take_rows(array: Any, rows: NDArray[np.intp]) -> Any:
@@ -111,141 +129,162 @@ def _take_rows(array: Any, rows: NDArray[np.intp]) -> Any:
     return array if np.shape(array)[-1:] in ((), (1,)) else np.take(array, rows, axis=-1)
 
 
-def _solve_lower_tail(conditional: TruncatedConditional, u: FloatArray) -> FloatArray:
-    """Return the root x of conditional.to_normal(x) = u for u <= 0, row by row.
+class Invertible(Protocol):
+    """Distribution functions of n rows, to be inverted from their lower ends."""
 
-    Newton's method on the quantile scale (exact for one component far from the box), else on the
-    mass scale (exact where the box cuts a flat density), else bisection; each row stops by itself.
+    @property
+    def low(self) -> FloatArray:
+        """Lower ends of their intervals, (n,)."""
+
+    @property
+    def high(self) -> FloatArray:
+        """Upper ends, (n,)."""
+
+    def take(self, rows: NDArray[np.intp]) -> Self:
+        """Return those of some rows."""
+
+    def evaluate(self, x: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return the functions, their densities, and over what length these change, at x (n,)."""
+
+
+class Tail(NamedTuple):
+    """Distribution functions to be inverted from their lower ends in plain numbers; rows with u > 0 are mirrored.
+
+    A component whose interval begins above its mean is turned round: the difference of its distribution functions is
+    then read from its smaller tail, as that of the others is.
     """
-    score = conditional.log_weights + conditional.log_mass()
-    mass = log_sum(score)
-    root = guess_quantile(conditional, u, score)
-    rows = np.arange(len(u))
-    search = TailSearch.start(conditional, mass, u, root)
-    for _ in range(MAX_ITERATIONS):
-        search, done = search.advance()
-        root[rows] = search.x
+
+    sign: FloatArray
+    """-1 in rows that are mirrored, (n,)."""
+    low: FloatArray
+    high: FloatArray
+    """Interval, (n,)."""
+    mean: FloatArray
+    """(K, n)."""
+    rate: FloatArray
+    """One over the scale, negative for components that are turned round, (K, n)."""
+    start: FloatArray
+    """Lower end in units of the component, turned round where it is, so not above 0, (K, n)."""
+    start_mass: FloatArray
+    """Phi of this, (K, n)."""
+    mass: FloatArray
+    """Mass of the component in the interval, negative where it is turned round, (K, n)."""
+    weight: FloatArray
+    """Of the component, negative where it is turned round; times the mass they sum to 1, (K, n)."""
+    narrow: FloatArray
+    """Least scale of the components, (n,)."""
+
+    @classmethod
+    def of(cls, conditional: TruncatedConditional, u: FloatArray) -> tuple[Tail, NDArray[np.bool_]]:
+        """Return the distribution functions to be inverted at u (n,), and which rows fit into plain numbers."""
+        sign = np.where(u > 0.0, -1.0, 1.0)
+        low, high = (np.full(len(u), end, dtype=np.float64) for end in (conditional.low, conditional.high))
+        low, high = np.where(sign < 0.0, -high, low), np.where(sign < 0.0, -low, high)
+        mean = sign * conditional.mean
+        scale = np.broadcast_to(conditional.scale, mean.shape)
+        start = (low - mean) / scale
+        turned = np.where(start > 0.0, -1.0, 1.0)
+        rate, start = turned / scale, -np.abs(start)
+        tail = cls(sign, low, high, mean, rate, start, ndtr(start), rate, rate, scale.min(axis=0))
+        mass = tail._rise(high)
+        top = conditional.log_weights.max(axis=0)
+        weight = np.exp(conditional.log_weights - np.where(np.isfinite(top), top, 0.0))
+        total = sum_components(weight * mass * turned)
+        fits = total >= MIN_MASS
+        return tail._replace(mass=mass, weight=weight * turned / np.where(fits, total, 1.0)), fits
+
+    def take(self, rows: NDArray[np.intp]) -> Tail:
+        """Return those of some rows."""
+        return Tail(*(np.take(array, rows, axis=-1) for array in self))
+
+    def guess(self, u: FloatArray) -> FloatArray:
+        """Return about where the distribution functions are Phi(u), (n,) for u <= 0; exact for K = 1.
+
+        That of a normal of equal moments. In the tail between the least quantile of the components at Phi(u) and, since
+        each component alone gives a part of the probability, the least one at Phi(u) over their weights.
+        """
+        p = ndtr(u)
+        with np.errstate(divide="ignore", over="ignore"):  # a component without weight
+            guess = most = self._least_quantile(p / self.weight)
+        if len(self.mean) > 1:
+            share = self.weight * self.mass
+            mean = sum_components(share * self.mean)
+            away = self.mean - mean
+            normal = mean + np.sqrt(sum_components(share * (1.0 / (self.rate * self.rate) + away * away))) * u
+            between = np.minimum(np.maximum(normal, self._least_quantile(p * self.mass)), most)
+            guess = np.where(u < TAIL_U, between, normal)
+        return np.minimum(np.maximum(guess, self.low), self.high)
+
+    def _least_quantile(self, mass: FloatArray) -> FloatArray:
+        """Return the least end up to which some component has a mass (K, n), negative where turned round; (n,)."""
+        b = ndtri(np.minimum(np.maximum(self.start_mass + mass, 0.0), 1.0))
+        return np.asarray((self.mean + b / self.rate).min(axis=0))
+
+    def evaluate(self, x: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return the distribution functions, the densities, and over what length these change, at x (n,)."""
+        b = (x - self.mean) * self.rate
+        density = np.exp(-0.5 * b * b) * self.weight * self.rate
+        return sum_components(self._rise(x) * self.weight), sum_components(density) / SQRT_2PI, self.narrow
+
+    def _rise(self, x: FloatArray) -> FloatArray:
+        """Return the masses of the components between the lower ends and x (n,), (K, n)."""
+        rise = np.asarray(ndtr((x - self.mean) * self.rate)) - self.start_mass
+        width = (x - self.low) * self.rate
+        near = np.abs(width) < SERIES_WIDTH / (1.0 - self.start)
+        if near.any():
+            rise[near] = _narrow_mass(self.start[near], width[near])
+        return rise
+
+
+def _narrow_mass(a: FloatArray, width: FloatArray) -> FloatArray:
+    """Return Phi(a + width) - Phi(a) by the series about the middle of the interval, of either sign."""
+    middle, half = a + 0.5 * width, 0.5 * width
+    m2, h2 = middle * middle, half * half
+    fourth, sixth = (m2 - 6.0) * m2 + 3.0, ((m2 - 15.0) * m2 + 45.0) * m2 - 15.0
+    series = 1.0 + h2 / 6.0 * (m2 - 1.0 + h2 / 20.0 * (fourth + h2 / 42.0 * sixth))
+    return np.asarray(width * np.exp(-0.5 * m2) / SQRT_2PI * series)
+
+
+def solve(tail: Invertible, u: FloatArray, x: FloatArray) -> FloatArray:
+    """Return where distribution functions are Phi(u), (n,), from first guesses x (n,); each row stops by itself.
+
+    Newton's method on the quantile scale, near the end of the interval on that of the mass, else bisection.
+    """
+    found, rows = x.copy(), np.arange(len(u))
+    left, right = tail.low, tail.high
+    last = right - left
+    for _ in range(MAX_STEPS):
+        step, reach, rises = _step(tail, u, x)
+        left, right = np.where(rises, x, left), np.where(rises, right, x)
+        target = x + step
+        fits = (target >= left) & (target <= right) & (np.abs(step) <= MIN_CONTRACTION * last)
+        middle = left + 0.5 * (right - left)  # an end where the bracket has no float inside
+        target = np.where(fits, target, middle)
+        last = np.abs(target - x)
+        done = fits & (last <= LAST_STEP * reach)
+        done |= (middle == left) | (middle == right) | (target == x)
+        found[rows] = x = target
         keep = np.flatnonzero(~done)
         if keep.size == 0:
             break
         if keep.size < len(rows):
-            rows, search = rows[keep], search.take(keep)
-    return root
+            tail, rows = tail.take(keep), rows[keep]
+            u, x, left, right, last = (array[keep] for array in (u, x, left, right, last))
+    return found
 
 
-def guess_quantile(conditional: TruncatedConditional, u: FloatArray, score: FloatArray) -> FloatArray:
-    """Return the quantile of the truncated normal with the moments of the mixture; exact for K = 1.
-
-    Args:
-        conditional: The mixture.
-        u: What is wanted on the quantile scale, (n,).
-        score: Logarithms of the masses of the components in the interval times their weights, (K, n).
-    """
-    weights = np.exp(score - log_sum(score))
-    mean = sum_components(weights * conditional.mean)
-    scale = np.sqrt(sum_components(weights * (conditional.scale**2 + (conditional.mean - mean) ** 2)))
-    a, b = (conditional.low - mean) / scale, (conditional.high - mean) / scale
-    guess = mean + scale * truncated_quantile(a, b, log_ndtr(u), log_ndtr(-u))
-    return np.clip(guess, conditional.low, conditional.high)
-
-
-class TailSearch(NamedTuple):
-    """State of the search for a root in the lower tail, one column per row still running."""
-
-    conditional: TruncatedConditional
-    log_cdf_low: FloatArray  # (K, n) log Phi at the lower end, and of its mirror image
-    log_sf_low: FloatArray
-    mass: FloatArray  # (n,) log mass of the box under the unnormalised weights
-    u: FloatArray
-    x: FloatArray
-    left: FloatArray
-    right: FloatArray
-    step: FloatArray  # (n,) size of the last step
-
-    @classmethod
-    def start(cls, conditional: TruncatedConditional, mass: FloatArray, u: FloatArray, x: FloatArray) -> TailSearch:
-        """Return the search from x (n,); mass is the log mass of the box under the unnormalised weights, (n,)."""
-        a = (conditional.low - conditional.mean) / conditional.scale
-        width = conditional.high - conditional.low
-        return cls(conditional, log_ndtr(a), log_ndtr(-a), mass, u, x, conditional.low, conditional.high, width)
-
-    def take(self, keep: NDArray[np.intp]) -> TailSearch:
-        """Return the search of some rows."""
-        columns = (self.log_cdf_low[:, keep], self.log_sf_low[:, keep])
-        return TailSearch(self.conditional.take(keep), *columns, *(array[keep] for array in self[3:]))
-
-    def log_cdf(self, x: FloatArray) -> FloatArray:
-        """Return the log mass of [low, x] under the unnormalised weights, (n,)."""
-        return self._replace(x=x)._log_cdf_and_ends()[0]
-
-    def log_cdf_and_density(self) -> tuple[FloatArray, FloatArray]:
-        """Return the log mass of [low, x] and log density at x under the unnormalised weights, (n,)."""
-        log_cdf, b = self._log_cdf_and_ends()
-        return log_cdf, log_sum(reweight(self.conditional.log_weights, b, self.conditional.scale))
-
-    def _log_cdf_and_ends(self) -> tuple[FloatArray, FloatArray]:
-        """Return the log mass of [low, x] (n,), and x in units of each component (K, n)."""
-        conditional = self.conditional
-        a, b = (conditional.low - conditional.mean) / conditional.scale, (self.x - conditional.mean) / conditional.scale
-        width = (self.x - conditional.low) / conditional.scale
-        flip = a + b > 0
-        end = log_ndtr(np.where(flip, -b, b))
-        lower = np.where(flip, end, self.log_cdf_low)
-        upper = np.where(flip, self.log_sf_low, end)
-        return log_sum(conditional.log_weights + log_difference(lower, upper, a, width)), b
-
-    def advance(self) -> tuple[TailSearch, NDArray[np.bool_]]:
-        """Return the search after one step of every row, and which rows have converged."""
-        log_cdf, log_density = self.log_cdf_and_density()
-        bracket = RootBracket(self.u, self.x, self.left, self.right, self.step)
-        bracket, done = bracket.advance(np.minimum(log_cdf - self.mass, 0.0), log_density - self.mass)
-        return self._replace(x=bracket.x, left=bracket.left, right=bracket.right, step=bracket.step), done
-
-
-class RootBracket(NamedTuple):
-    """Guesses of quantiles with the brackets that they lie in; row by row, (n,) each."""
-
-    u: FloatArray
-    """What is wanted on the quantile scale."""
-    x: FloatArray
-    left: FloatArray
-    right: FloatArray
-    step: FloatArray
-    """Size of the last step."""
-
-    def advance(self, tail: FloatArray, log_density: FloatArray) -> tuple[RootBracket, NDArray[np.bool_]]:
-        """Return the search after one step of every row, and which rows have converged.
-
-        Newton's method on the quantile scale, else on the mass scale, else bisection.
-
-        Args:
-            tail: Logarithm of the distribution function at x, (n,).
-            log_density: At x, (n,).
-        """
-        with np.errstate(all="ignore"):  # the ends of the box give inf and nan: bisected below
-            quantile = ndtri_exp(tail)
-            error = quantile - self.u
-            newton = -error * np.exp(-(log_density + 0.5 * quantile**2 + LOG_SQRT_2PI))
-            by_mass = np.expm1(log_ndtr(self.u) - tail) * np.exp(tail - log_density)
-        left = np.where(error <= 0, self.x, self.left)
-        right = np.where(error > 0, self.x, self.right)
-        fits = self._fits(newton, left, right)
-        move = np.where(fits, newton, by_mass)
-        fits |= self._fits(by_mass, left, right)
-        middle = left + 0.5 * (right - left)
-        x = np.where(fits, self.x + move, middle)
-        done = fits & (np.abs(error) <= ROOT_TOLERANCE * (1.0 + np.abs(self.u)))
-        done |= (right - left <= 2.0 * np.spacing(np.abs(self.x))) | (x == self.x)
-        return RootBracket(self.u, x, left, right, np.abs(x - self.x)), done
-
-    def take(self, rows: NDArray[np.intp]) -> RootBracket:
-        """Return those of some rows."""
-        return RootBracket(*(array[rows] for array in self))
-
-    def _fits(self, move: FloatArray, left: FloatArray, right: FloatArray) -> NDArray[np.bool_]:
-        """Return whether a step stays in the bracket and shrinks; where not, bisection is faster."""
-        target = self.x + move
-        return (target >= left) & (target <= right) & (np.abs(move) <= MIN_CONTRACTION * self.step)
+def _step(tail: Invertible, u: FloatArray, x: FloatArray) -> tuple[FloatArray, FloatArray, NDArray[np.bool_]]:
+    """Return a step of each row, NaN where there is none, over what length it holds, and whether the root is ahead."""
+    cdf, density, length = tail.evaluate(x)
+    distance, length = x - tail.low, length / (1.0 - u)
+    close = distance < length  # there the mass is nearly linear, and the quantile scale has a pole at the end
+    with np.errstate(all="ignore"):  # the ends of the interval give inf and nan: bisected
+        q = ndtri(np.minimum(np.maximum(cdf, 0.0), 1.0))
+        by_quantile = (u - q) * np.exp(-0.5 * q * q) / (density * SQRT_2PI)
+        step = np.where(close, (ndtr(u) - cdf) / density, by_quantile)
+        step = np.where((q >= LOWEST) & (q <= HIGHEST), step, np.nan)
+    reach = np.where(close, length, np.minimum(distance, length))
+    return step, reach, np.where(np.isnan(step), u - q, step) >= 0.0
 
 
 def _plain_mass(a: FloatArray, b: FloatArray) -> tuple[FloatArray, NDArray[np.bool_]]:
@@ -258,15 +297,16 @@ def _plain_mass(a: FloatArray, b: FloatArray) -> tuple[FloatArray, NDArray[np.bo
     return np.where(turned, -mass, mass), narrow
 
 
+def quantile_scale(lower: FloatArray, upper: FloatArray) -> FloatArray:
+    """Return Phi^-1 of a distribution function by the smaller tail, from logarithms of masses below and above, (n,)."""
+    tail = np.minimum(lower, upper) - np.logaddexp(lower, upper)
+    return cast(FloatArray, np.where(lower <= upper, 1.0, -1.0) * ndtri_exp(tail))
+
+
 def log_interval(a: FloatArray, b: FloatArray, width: FloatArray) -> FloatArray:
     """Return log(Phi(b) - Phi(a)) for a < b, accurate in both tails; `width` is b - a without rounding."""
     flip = a + b > 0  # mirrored, so that both ends are read from the lower tail
     lower, upper = log_ndtr(np.where(flip, -b, a)), log_ndtr(np.where(flip, -a, b))
-    return log_difference(lower, upper, a, width)
-
-
-def log_difference(lower: FloatArray, upper: FloatArray, a: FloatArray, width: FloatArray) -> FloatArray:
-    """Return log(exp(upper) - exp(lower)), replaced by a series for narrow intervals at a."""
     with np.errstate(divide="ignore"):  # an empty interval has log mass -inf
         out = upper + np.log(-np.expm1(np.minimum(lower - upper, 0.0)))
         a = np.broadcast_to(a, out.shape)
@@ -315,3 +355,8 @@ def log_sum(values: FloatArray) -> FloatArray:
     top = np.where(np.isfinite(top), top, 0.0)
     with np.errstate(divide="ignore"):
         return cast(FloatArray, top + np.log(sum_components(np.exp(values - top))))
+
+
+def sum_components(values: FloatArray) -> FloatArray:
+    """Sum over components, (K, n) -> (n,), in a fixed order: np.sum picks it by the shape."""
+    return reduce(np.add, values)

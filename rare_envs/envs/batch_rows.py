@@ -12,10 +12,9 @@ from torch import Tensor
 
 from rare_envs.arrays import FloatArray
 from rare_envs.distributions.beta import BetaDistribution
-from rare_envs.distributions.coordinate_mixture import CoordinateMixture
 from rare_envs.distributions.fitted import FittedDistribution
+from rare_envs.distributions.mixture import CoordinateMixture, TruncatedGaussianMixture
 from rare_envs.distributions.space import Distribution
-from rare_envs.distributions.truncated_mixture import TruncatedGaussianMixture
 from rare_envs.measures.base import RowsReplaceable
 from rare_envs.sensors.kinds import map_kinds
 from rare_envs.traffic.tensor_trees import map_leaves, map_tensors

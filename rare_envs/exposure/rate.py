@@ -28,7 +28,7 @@ import numpy as np
 from scipy.special import ndtri
 
 from rare_envs.arrays import FloatArray
-from rare_envs.distributions.frequency import EventFrequency
+from rare_envs.distributions.fitted import EventFrequency
 
 RateInterval = tuple[float, float]
 FEW_EVENTS = 10

@@ -11,8 +11,8 @@ from highway_env.vehicle.controller import ControlledVehicle, MDPVehicle
 from highway_env.vehicle.kinematics import Vehicle
 
 from rare_envs.distributions.beta import BetaDistribution
+from rare_envs.distributions.mixture import TruncatedGaussianMixture
 from rare_envs.distributions.space import Distribution, Parameter
-from rare_envs.distributions.truncated_mixture import TruncatedGaussianMixture
 
 Values = Mapping[str, Any]
 """Names to numbers, or to arrays for parameters of several vehicles."""

@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING, Any, Protocol, cast, runtime_checkable
 
 import numpy as np
 
-from rare_envs.distributions.fitted import FITTED_KEYS, FittedDistribution
-from rare_envs.distributions.reading import FileDistribution, read_distribution
+from rare_envs.distributions.fitted import FITTED_KEYS, FileDistribution, FittedDistribution, read_distribution
 from rare_envs.distributions.space import Distribution
 from rare_envs.json_text import parse_json_object
 from rare_envs.plugins import did_you_mean

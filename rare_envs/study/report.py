@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 
 import samplers
 from agents.sb3.saved_ego import SavedEgo
-from rare_envs.distributions.fitted import FittedDistribution
-from rare_envs.distributions.frequency import EventFrequency
+from rare_envs.distributions.fitted import EventFrequency, FittedDistribution
 from rare_envs.distributions.space import Distribution
 from rare_envs.egos.faults import Fault
 from rare_envs.egos.wrappers import describe_missing_normalisation

@@ -12,8 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from rare_envs.distributions.fitted import FittedDistribution
-from rare_envs.distributions.frequency import EventFrequency
+from rare_envs.distributions.fitted import EventFrequency, FittedDistribution
 from rare_envs.distributions.space import Distribution
 from rare_envs.exposure import HUMAN_BENCHMARKS, CollisionRate, TotalRate, describe_human_contacts
 from rare_envs.exposure.base_record import read_site

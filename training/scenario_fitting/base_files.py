@@ -10,9 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from rare_envs.distributions.coordinate_mixture import CoordinateMixture
-from rare_envs.distributions.fitted import FittedDistribution
-from rare_envs.distributions.frequency import EventFrequency
+from rare_envs.distributions.fitted import EventFrequency, FittedDistribution
+from rare_envs.distributions.mixture import CoordinateMixture
 from rare_envs.distributions.space import Parameter
 from rare_envs.scenarios.registry import scenario_named
 from samplers.problem import FloatArray

@@ -13,8 +13,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from rare_envs.distributions.coordinate_mixture import CoordinateMixture
 from rare_envs.distributions.coordinates import ClosingSpeed, CoordinateKind, Coordinates
+from rare_envs.distributions.mixture import CoordinateMixture
 from rare_envs.distributions.space import Parameter
 from samplers.problem import FloatArray
 from training.scenario_fitting.event_filters import EventSet

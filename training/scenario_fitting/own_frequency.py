@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from rare_envs.distributions.frequency import EventFrequency
+from rare_envs.distributions.fitted import EventFrequency
 from training.data.brakings import braking_exposure
 from training.data.events import Events
 from training.data.trajectories import DT, Trajectories

@@ -14,9 +14,8 @@ from typing import Any
 
 import numpy as np
 
-from rare_envs.distributions.coordinate_mixture import CoordinateMixture
 from rare_envs.distributions.coordinates import CoordinateKind, Coordinates
-from rare_envs.distributions.truncated_mixture import TruncatedGaussianMixture
+from rare_envs.distributions.mixture import CoordinateMixture, TruncatedGaussianMixture
 from rare_envs.scenarios.registry import scenario_named
 from samplers.problem import FloatArray
 from training.scenario_fitting.base_files import mass_outside

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from rare_envs.arrays import FloatArray
 from rare_envs.distributions.beta import BetaDistribution
-from rare_envs.distributions.coordinate_mixture import CoordinateMixture
+from rare_envs.distributions.mixture import CoordinateMixture
 from rare_envs.distributions.space import Distribution, Parameter
 from rare_envs.sensors.camera.pinhole import Camera
 

@@ -9,10 +9,8 @@ import pytest
 from numpy.typing import NDArray
 from scipy import integrate, stats
 
-from rare_envs.distributions.coordinate_mixture import CoordinateMixture
 from rare_envs.distributions.coordinates import ClosingSpeed, Coordinates
-from rare_envs.distributions.mixture_conditionals import CHUNK_ROWS
-from rare_envs.distributions.truncated_mixture import TruncatedGaussianMixture
+from rare_envs.distributions.mixture import CHUNK_ROWS, CoordinateMixture, TruncatedGaussianMixture
 
 LOG = CoordinateMixture.from_dict(
     {

@@ -8,10 +8,9 @@ import numpy as np
 import pytest
 
 from rare_envs.distributions.beta import BetaDistribution
-from rare_envs.distributions.coordinate_mixture import CoordinateMixture
 from rare_envs.distributions.fitted import EventCounts, FittedDistribution, PredictiveCheck
+from rare_envs.distributions.mixture import CoordinateMixture, TruncatedGaussianMixture
 from rare_envs.distributions.space import Distribution
-from rare_envs.distributions.truncated_mixture import TruncatedGaussianMixture
 from tests.rare_envs.distributions.test_frequency import CUT_INS
 
 NAMES = ["speed", "lead_speed", "gap"]
@@ -128,7 +127,7 @@ def test_an_ensemble_of_plain_mixtures_or_of_nothing() -> None:
     with pytest.raises(ValueError, match="needs refits that are Gaussian mixtures"):
         replace(base, refits=(fit, beta)).ensemble()
     logs = CoordinateMixture.from_dict({**fit.to_dict(), "low": [1.0], "high": [9.0], "coordinates": ["log"]})
-    plain = replace(fit, low=[1.0], high=[9.0])
+    plain = TruncatedGaussianMixture(fit.weights, fit.means, fit.covariances, [1.0], [9.0])
     both = replace(base, distribution=logs, refits=(logs, plain)).ensemble()
     x = np.linspace(1.5, 5.0, 9)[:, None]
     mean = 0.5 * (np.exp(logs.log_prob(x)) + np.exp(plain.log_prob(x)))

@@ -6,8 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rare_envs.distributions.frequency import EventFrequency
-from rare_envs.distributions.reading import read_record
+from rare_envs.distributions.fitted import EventFrequency, read_record
 
 CUT_INS = EventFrequency(
     count=1221,

@@ -112,7 +112,8 @@ def test_blocks_without_parameters_stay_and_columns_are_those_of_the_whole() -> 
 
 
 def test_components_are_numbered_like_those_of_another_mixture() -> None:
-    swapped = replace(PLAIN, weights=PLAIN.weights[::-1], means=PLAIN.means[::-1] + 0.1, covariances=COVARIANCES[::-1])
+    arrays = PLAIN.weights[::-1], PLAIN.means[::-1] + 0.1, COVARIANCES[::-1]
+    swapped = TruncatedGaussianMixture(*arrays, PLAIN.low, PLAIN.high)
     own, like = arrays_of(swapped), arrays_of(PLAIN)
     assert own is not None and like is not None
     assert match_components(own, like) == [1, 0]

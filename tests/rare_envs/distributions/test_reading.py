@@ -5,10 +5,15 @@ from typing import Any
 import pytest
 
 from rare_envs.distributions.beta import BetaDistribution
-from rare_envs.distributions.coordinate_mixture import CoordinateMixture
-from rare_envs.distributions.fitted import PredictiveCheck
-from rare_envs.distributions.reading import read_distribution, read_record, require_count, require_number, require_text
-from rare_envs.distributions.truncated_mixture import TruncatedGaussianMixture
+from rare_envs.distributions.fitted import (
+    PredictiveCheck,
+    read_distribution,
+    read_record,
+    require_count,
+    require_number,
+    require_text,
+)
+from rare_envs.distributions.mixture import CoordinateMixture, TruncatedGaussianMixture
 
 NORMAL: dict[str, Any] = {"weights": [1.0], "means": [[2.0]], "covariances": [[[1.0]]], "low": [1.0], "high": [9.0]}
 

@@ -8,10 +8,8 @@ import pytest
 from scipy import stats
 from scipy.special import ndtri_exp
 
-from rare_envs.distributions.coordinate_mixture import CoordinateMixture
 from rare_envs.distributions.fitted import FittedDistribution
-from rare_envs.distributions.mixture_conditionals import CHUNK_ROWS
-from rare_envs.distributions.truncated_mixture import TruncatedGaussianMixture
+from rare_envs.distributions.mixture import CHUNK_ROWS, CoordinateMixture, TruncatedGaussianMixture
 from rare_envs.scenarios.base_distributions import load_base
 from rare_envs.scenarios.registry import SCENARIOS, scenario_named
 

@@ -7,7 +7,6 @@ from scipy import special, stats
 
 from rare_envs.distributions.truncated_normal import (
     NARROW,
-    RootBracket,
     TruncatedConditional,
     choose,
     log_interval,
@@ -222,19 +221,6 @@ def test_a_component_of_weight_0_is_never_chosen() -> None:
 def test_log_of_a_sum_overflows_neither_up_nor_down() -> None:
     values = np.array([[1000.0, -1000.0, -np.inf, 0.0], [1000.0, -1000.0, -np.inf, np.log(3.0)]])
     np.testing.assert_allclose(log_sum(values), [1000 + np.log(2), -1000 + np.log(2), -np.inf, np.log(4)], rtol=1e-15)
-
-
-def test_a_quantile_is_found_from_anywhere_in_its_bracket() -> None:
-    """Of the exponential distribution: the mass scale helps where the quantile scale leads out of the bracket."""
-    u = np.array([-6.0, -1.0, 0.0, 1.5])
-    start = np.array([19.0, 1e-3, 10.0, 1e-6])
-    search = RootBracket(u, start, np.zeros(4), np.full(4, 20.0), np.full(4, 20.0))
-    for _ in range(60):
-        search, done = search.advance(np.log(-np.expm1(-search.x)), -search.x)
-        if done.all():
-            break
-    np.testing.assert_allclose(search.x, stats.expon.ppf(stats.norm.cdf(u)), rtol=1e-8)
-    assert (search.take(np.array([2])).x == search.x[2]).all()
 
 
 def test_where_no_component_has_mass_the_last_one_is_chosen_without_a_warning() -> None:

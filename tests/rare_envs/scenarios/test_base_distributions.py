@@ -11,10 +11,9 @@ from numpy.typing import NDArray
 
 import rare_envs
 from rare_envs.distributions.beta import BetaDistribution
-from rare_envs.distributions.coordinate_mixture import CoordinateMixture
 from rare_envs.distributions.fitted import FittedDistribution
+from rare_envs.distributions.mixture import CoordinateMixture, TruncatedGaussianMixture
 from rare_envs.distributions.space import Distribution, ScenarioSpace
-from rare_envs.distributions.truncated_mixture import TruncatedGaussianMixture
 from rare_envs.scenarios.base import Scenario
 from rare_envs.scenarios.base_distributions import load_base
 from rare_envs.scenarios.registry import SCENARIOS, scenario_named

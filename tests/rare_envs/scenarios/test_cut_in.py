@@ -8,9 +8,9 @@ import pytest
 import torch
 
 import rare_envs
-from rare_envs.distributions.coordinate_mixture import CoordinateMixture
 from rare_envs.distributions.coordinates import Coordinates
 from rare_envs.distributions.fitted import FittedDistribution
+from rare_envs.distributions.mixture import CoordinateMixture
 from rare_envs.scenarios.base_distributions import load_base
 from rare_envs.scenarios.cut_in import CUT_IN, CUT_IN_DURATION, TIMED_CUT_IN, bezier
 from rare_envs.simulation.world import World

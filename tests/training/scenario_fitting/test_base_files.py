@@ -5,9 +5,9 @@ import json
 import numpy as np
 import pytest
 
-from rare_envs.distributions.coordinate_mixture import CoordinateMixture
 from rare_envs.distributions.coordinates import ClosingSpeed, Coordinates
-from rare_envs.distributions.frequency import EventFrequency
+from rare_envs.distributions.fitted import EventFrequency
+from rare_envs.distributions.mixture import CoordinateMixture
 from rare_envs.scenarios.base_distributions import load_base
 from rare_envs.scenarios.registry import scenario_named
 from training.scenario_fitting import mixture as mixture_fit

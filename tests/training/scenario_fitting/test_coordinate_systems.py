@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from rare_envs.distributions.coordinate_mixture import CoordinateMixture
+from rare_envs.distributions.mixture import CoordinateMixture
 from rare_envs.scenarios.registry import scenario_named
 from training.scenario_fitting import mixture as mixture_fit
 from training.scenario_fitting.coordinate_systems import (

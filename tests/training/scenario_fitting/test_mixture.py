@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from rare_envs.distributions.truncated_mixture import TruncatedGaussianMixture
+from rare_envs.distributions.mixture import TruncatedGaussianMixture
 from training.scenario_fitting import mixture as mixture_fit
 from training.scenario_fitting.mixture import (
     COVARIANCE_FLOOR,

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.stats import norm
 
-from rare_envs.distributions.truncated_mixture import TruncatedGaussianMixture
+from rare_envs.distributions.mixture import TruncatedGaussianMixture
 from training.scenario_fitting.predictive_checks import CHECK_DRAWS, DANGEROUS_STATES, check_predictions
 
 NAMES = ("ego_speed", "lead_speed", "gap")

@@ -10,7 +10,7 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import NDArray
 
-from rare_envs.distributions.frequency import EventFrequency
+from rare_envs.distributions.fitted import EventFrequency
 from rare_envs.distributions.space import Parameter
 from rare_envs.scenarios.registry import env_id_of, scenario_named, split_version
 from samplers.problem import FloatArray

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rare_envs.distributions.frequency import EventFrequency
+from rare_envs.distributions.fitted import EventFrequency
 from rare_envs.distributions.space import Parameter
 from rare_envs.scenarios.registry import scenario_named
 from samplers.problem import FloatArray

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from rare_envs.distributions.reading import read_distribution
+from rare_envs.distributions.fitted import read_distribution
 from rare_envs.scenarios.registry import scenario_named
 from samplers.problem import FloatArray
 from training.data.ngsim_tables import read_columns

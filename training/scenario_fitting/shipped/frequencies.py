@@ -6,7 +6,7 @@ per vehicle-hour, the complete recording 11.
 
 from __future__ import annotations
 
-from rare_envs.distributions.frequency import EventFrequency
+from rare_envs.distributions.fitted import EventFrequency
 
 LANE_CHANGE_COUNTS = (
     "wein2004/lane-change-externality, outputs/tables/02_detection_summary.md: complete NGSIM recordings; lane changes "

@@ -1,1 +1,0 @@
-"""Rows of points in all coordinates of a mixture at once: what they have in common, their densities and maps."""
