@@ -8,10 +8,11 @@ from typing import TYPE_CHECKING
 from rare_envs.plugins import make_lazy_getattr
 
 if TYPE_CHECKING:
+    from rare_envs.study.arguments import Question
     from rare_envs.study.compare import EgoComparison, compare_egos
     from rare_envs.study.errors import BadInput
     from rare_envs.study.evaluate import resume, run, run_into
-    from rare_envs.study.question import Question, Study, prepare
+    from rare_envs.study.question import Study, prepare
     from rare_envs.study.replay import Drive, drive_again
     from rare_envs.study.report import Report
     from rare_envs.study.run_folder import LoadedStudy, load_study, read_failures
@@ -46,7 +47,7 @@ _LAZY = {
     "Drive": "rare_envs.study.replay",
     "EgoComparison": "rare_envs.study.compare",
     "LoadedStudy": "rare_envs.study.run_folder",
-    "Question": "rare_envs.study.question",
+    "Question": "rare_envs.study.arguments",
     "Report": "rare_envs.study.report",
     "Severity": "rare_envs.study.severity",
     "Study": "rare_envs.study.question",

@@ -12,10 +12,11 @@ import samplers
 from rare_envs.egos.errors import EgoGone
 from rare_envs.files import replace_text
 from rare_envs.json_text import format_json
+from rare_envs.study.arguments import Question
 from rare_envs.study.errors import BadInput, as_bad_input, output_folder
 from rare_envs.study.evaluate import recheck
 from rare_envs.study.execution.interruption import FIRST_BATCH, RunInterrupted, describe_stop
-from rare_envs.study.question import Question, Study, prepare
+from rare_envs.study.question import Study, prepare
 from rare_envs.study.repeatability import RowKeeper
 from rare_envs.study.writing import check_no_results, write_failures
 from rare_envs.version import __version__

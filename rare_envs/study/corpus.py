@@ -25,9 +25,10 @@ from rare_envs.json_text import parse_json_object
 from rare_envs.make import set_up
 from rare_envs.problem import DrivingProblem
 from rare_envs.scenarios.registry import find_scenario
+from rare_envs.study.arguments import Question, read_question
 from rare_envs.study.errors import BadInput, as_bad_input, output_folder
 from rare_envs.study.journal import refuse_unfinished
-from rare_envs.study.question import Question, build_problem, prepare, read_question
+from rare_envs.study.question import build_problem, prepare
 from rare_envs.study.recorded_question import note_question, open_question
 from rare_envs.study.run_folder import CRASH, FAILURES, RESULT, read_failures
 from rare_envs.study.video import REPLAY_TOLERANCE, RecordedFailure, count_found

@@ -9,9 +9,10 @@ from dataclasses import replace
 from typing import Any
 
 import samplers
+from rare_envs.study.arguments import Question
 from rare_envs.study.errors import BadInput, as_bad_input
 from rare_envs.study.evaluate import run
-from rare_envs.study.question import Question, prepare
+from rare_envs.study.question import prepare
 
 
 def plan_from_result(recorded: Mapping[str, Any], target_cov: float) -> tuple[samplers.PlannedRun, ...]:

@@ -17,9 +17,9 @@ from agents.loading import find_ego_kind, strip_prefixes
 from rare_envs.code_trust import check_code_trust, note_own_run
 from rare_envs.files import read_text_file
 from rare_envs.json_text import parse_json_object
+from rare_envs.study.arguments import Question, read_question
 from rare_envs.study.errors import BadInput, as_bad_input
 from rare_envs.study.journal import digest_contents, digest_files, find_changed_files
-from rare_envs.study.question import Question, read_question
 from rare_envs.study.run_folder import STUDY
 
 _FIELDS = ("ego", "stats", "base", "drivers", "measure", "also_under")

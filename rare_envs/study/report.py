@@ -23,8 +23,9 @@ from rare_envs.exposure.rate import CollisionProbability, CollisionRate
 from rare_envs.measures.base import Measure
 from rare_envs.measures.registry import MEASURES
 from rare_envs.scenarios.registry import find_scenario
+from rare_envs.study.arguments import Question
 from rare_envs.study.modes import CrashKinds, FailureMode, find_modes
-from rare_envs.study.question import Question, Study
+from rare_envs.study.question import Study
 from rare_envs.study.repeatability import Repeatability
 from rare_envs.study.severity import Severity
 from rare_envs.version import __version__

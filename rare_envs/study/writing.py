@@ -24,11 +24,12 @@ from rare_envs.distributions.fitted import FittedDistribution
 from rare_envs.distributions.space import ScenarioSpace
 from rare_envs.files import read_text_file, replace_file, replace_text
 from rare_envs.json_text import format_json, parse_json_object
+from rare_envs.study.arguments import Question
 from rare_envs.study.columns import MAX_SHOWN, list_columns
 from rare_envs.study.errors import BadInput
 from rare_envs.study.journal import digest_contents, digest_files, find_ego_files
 from rare_envs.study.plots import save_plot, save_sensitivity, save_severity
-from rare_envs.study.question import Question, Study
+from rare_envs.study.question import Study
 from rare_envs.study.recorded_question import describe_places, is_same_question
 from rare_envs.study.report import Report
 from rare_envs.study.run_folder import (

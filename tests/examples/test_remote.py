@@ -12,8 +12,9 @@ import pytest
 
 import rare_envs
 from agents import load_ego
+from rare_envs.study.arguments import Question
 from rare_envs.study.ego_check.findings import Finding, exit_code
-from rare_envs.study.ego_check.subprocess_check import EgoCheckRequest, run_checks
+from rare_envs.study.ego_check.subprocess_check import run_checks
 
 pytest.importorskip("zmq", reason="the extra remote is optional")
 FOLDER = Path(__file__).parents[2] / "examples" / "remote"
@@ -37,7 +38,7 @@ def test_the_examples_pass_the_check_and_drive_alike() -> None:
         with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
             assert process.stdout is not None
             address = process.stdout.readline().strip()
-            findings = [each for each in run_checks(EgoCheckRequest(address, ENV)) if isinstance(each, Finding)]
+            findings = [each for each in run_checks(Question(env_id=ENV, ego=address)) if isinstance(each, Finding)]
             ego = load_ego(f"{address}?timeout=20&patience=20")
             problem = rare_envs.DrivingProblem(ENV, ego=ego)
             answers.append(problem.evaluate(problem.base.sample(50, np.random.default_rng(0))))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ast
-import json
 import os
 import re
 import subprocess
@@ -115,7 +114,6 @@ def test_importing_a_package_without_its_libraries_names_the_command(package: st
         (["--version"], f"rare-envs {__version__}"),
         (["--help"], "train-ego"),
         (["estimate", "--help"], "--max-sim"),
-        (["bench", "samplers", "--help"], "--budget"),
     ],
 )
 def test_version_and_help_need_no_library_of_the_extra(
@@ -126,37 +124,12 @@ def test_version_and_help_need_no_library_of_the_extra(
     assert shown in done.stdout
 
 
-def test_completion_needs_no_library_of_the_extra(
-    bare: Callable[..., subprocess.CompletedProcess[str]], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("_RARE_ENVS_COMPLETE", "complete_bash")
-    for line, found in (
-        ("rare-envs estimate Car", ["CarFollowing-v0"]),
-        ("rare-envs estimate CutIn-v0 --base us", []),
-        ("rare-envs estimate CutIn-v0 --method ad", ["adss"]),
-    ):
-        monkeypatch.setenv("COMP_WORDS", line)
-        monkeypatch.setenv("COMP_CWORD", str(line.count(" ")))
-        done = bare()
-        assert (done.stdout.split(), done.stderr) == (found, "")
-
-
-def test_methods_are_measured_without_the_extra(bare: Callable[..., subprocess.CompletedProcess[str]]) -> None:
-    plan = ("--method", "mc", "--budget", "200", "--runs", "2", "--workers", "2")
-    done = bare("bench", "samplers", "--problems", "lin_d2", *plan, "--out", "bench", "--json")
-    assert done.returncode == 0, done.stderr
-    (cell,) = json.loads(done.stdout)["cells"]
-    assert (cell["method"], cell["runs"]) == ("mc", 2)
-
-
 @pytest.mark.parametrize(
     ("words", "what"),
     [
         (["list"], "rare-envs list needs"),
         (["estimate", "CutIn-v0", "--seed", "1"], "rare-envs estimate needs"),
         (["corpus", "run", "--ego", "idm"], "rare-envs corpus run needs"),
-        (["bench", "samplers", "--set", "driving", "--method", "mc"], "Problems of the set driving need"),
-        (["bench", "samplers", "--method", "rare_envs:DrivingProblem"], "Cannot load the method"),
     ],
 )
 def test_a_command_that_needs_the_extra_says_so_in_one_line(

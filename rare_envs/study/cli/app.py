@@ -7,7 +7,7 @@ Exit codes: 0 done, 2 bad input (one line on standard error), 3 done with warnin
 from __future__ import annotations
 
 import sys
-from pathlib import Path
+from collections.abc import Callable
 from typing import Annotated
 
 import typer
@@ -20,35 +20,71 @@ from rare_envs.study.cli.egos import (
     train_drivers_command,
     train_ego_command,
 )
-from rare_envs.study.cli.estimate import estimate_command, plan_command, resume_command, show_report
-from rare_envs.study.cli.examples import add_examples, format_examples
-from rare_envs.study.cli.options import (
-    AlgoOption,
-    EgoArgument,
-    EnvArgument,
-    ForceOption,
-    JsonOption,
-    QuestionOptions,
-    RiskOptions,
-    StatsOption,
-    read_count,
+from rare_envs.study.cli.estimate import (
+    compare_command,
+    estimate_command,
+    plan_command,
+    resume_command,
+    risk_command,
 )
-from rare_envs.study.cli.runs import corpus_app, export_command, replay_command, report_command
-from rare_envs.study.cli.shell import (
-    DOUBTFUL,
-    OneLineErrors,
-    SummarisedCommands,
-    ignore_signals,
-    keep_stdout_for_the_answer,
-    print_json,
-    require_driving,
-    say_early_stop,
-    show_what_is_known,
+from rare_envs.study.cli.options import JsonOption
+from rare_envs.study.cli.runs import (
+    corpus_add_command,
+    corpus_run_command,
+    export_command,
+    replay_command,
+    report_command,
 )
+from rare_envs.study.cli.shell import OneLineErrors, SummarisedCommands, ignore_signals, print_json
 from rare_envs.study.errors import as_bad_input
-from rare_envs.threads import use_one_thread
 from rare_envs.version import __version__
-from training.command_line import spread_options
+
+EXAMPLES: dict[str, tuple[str, ...]] = {
+    "": ("rare-envs list", "rare-envs estimate rare_envs/CutIn-v0 --ego idm --max-sim 3000"),
+    "list": ("rare-envs list", "rare-envs list egos", "rare-envs list CutIn-v0"),
+    "estimate": (
+        "rare-envs estimate rare_envs/CutIn-v0 --ego ppo.zip --out runs/cutin",
+        "rare-envs estimate rare_envs/CarFollowing-v0 --base us101-gap --method mc --max-sim 1e5",
+        "rare-envs estimate highway-fast-v0 --ego dqn.zip --max-sim 300",
+    ),
+    "resume": ("rare-envs resume runs/cutin", "rare-envs resume runs/cutin --workers 4"),
+    "risk": ("rare-envs risk ppo.zip --out runs/risk", "rare-envs risk idm --sites us101,i80"),
+    "bases": ("rare-envs bases cut_in", "rare-envs bases rare_envs/HardBrake-v0 --json"),
+    "compare": ("rare-envs compare old.zip new.zip rare_envs/CutIn-v0 --out runs/compared",),
+    "plan": ("rare-envs plan rare_envs/CutIn-v0 --ego ppo.zip --cov 0.1", "rare-envs plan runs/cutin --cov 0.05"),
+    "replay": (
+        "rare-envs replay runs/cutin --out crash.gif",
+        "rare-envs replay runs/cutin --failure 3 --ego new.zip",
+        "rare-envs replay runs/cutin --all",
+    ),
+    "report": ("rare-envs report runs/cutin --figures pdf",),
+    "export": (
+        "rare-envs export runs/cutin --out crash.xosc",
+        "rare-envs export runs/cutin --out crash.xml --format commonroad",
+    ),
+    "fit": (
+        "rare-envs fit --highd path/to/highD/data --out bases --name cologne",
+        "rare-envs fit --tgsim path/to/tgsim --cut-gaps --scenario cut_in --out bases",
+    ),
+    "train-ego": (
+        "rare-envs train-ego rare_envs/CutIn-v0 --steps 200000 --out ppo.zip",
+        "rare-envs train-ego rare_envs/CutIn-v0 --algo dqn --out dqn.zip",
+    ),
+    "train-drivers": ("rare-envs train-drivers --highd path/to/highD/data --out runs/drivers --method gail",),
+    "check-ego": (
+        "rare-envs check-ego ppo.zip rare_envs/CutIn-v0",
+        "rare-envs check-ego tcp://127.0.0.1:5555 rare_envs/CutIn-v0",
+    ),
+    "serve-ego": ("rare-envs serve-ego ppo.zip --bind tcp://127.0.0.1:5555",),
+    "export-ego": ("rare-envs export-ego ppo.zip ppo.onnx",),
+    "corpus": (
+        "rare-envs corpus add runs/cutin",
+        "rare-envs corpus run --ego new.zip --junit corpus.xml",
+    ),
+    "corpus add": ("rare-envs corpus add runs/cutin --corpus corpus --most 5",),
+    "corpus run": ("rare-envs corpus run --ego new.zip --corpus corpus --junit corpus.xml",),
+}
+"""Commands to examples of them, in one line each."""
 
 app = typer.Typer(
     cls=OneLineErrors,
@@ -74,7 +110,6 @@ def common_options(
     """How often does a driving policy crash? Train one, estimate its rare failures, see the most likely."""
 
 
-@app.command("list")
 def list_command(
     what: Annotated[
         str | None,
@@ -98,37 +133,6 @@ def list_command(
         print_details(entries, chosen)
 
 
-app.command("estimate")(estimate_command)
-
-
-@app.command("risk")
-@spread_options
-@say_early_stop()
-@use_one_thread()
-def risk_command(
-    ego: EgoArgument,
-    options: RiskOptions,
-    out: Annotated[Path | None, typer.Option(help="Folder for risk.json, risk.png and a run of each scenario.")] = None,
-    force: ForceOption = False,
-    as_json: JsonOption = False,
-) -> None:
-    """Estimate collisions per million km, summed over scenarios, with an interval."""
-    from rare_envs.study.risk import risk
-
-    with (
-        show_what_is_known(lambda known: show_report(known, None, as_json)),
-        keep_stdout_for_the_answer(),
-        as_bad_input(ValueError),
-    ):
-        found = risk(ego, out=out, progress=True, force=force, **options.arguments())
-    if as_json:
-        print_json(found.to_dict())
-    else:
-        print(found if out is None else f"{found}\nWrote {out}.")
-    raise typer.Exit(DOUBTFUL if found.warnings else 0)
-
-
-@app.command("bases")
 def bases_command(
     scenario: Annotated[
         str,
@@ -147,68 +151,42 @@ def bases_command(
         print_bases(resolve_scenario(scenario), found)
 
 
-app.command("resume")(resume_command)
+def format_examples(command: str) -> str:
+    """Return the text below a help page, whose lines are not to be filled; empty where there are no examples."""
+    lines = EXAMPLES.get(command, ())
+    return "\n".join(("\b", "Examples:", *(f"  {line}" for line in lines))) if lines else ""
 
 
-@app.command("compare")
-@spread_options
-@say_early_stop()
-@use_one_thread()
-def compare_command(
-    ego_a: Annotated[
-        str,
-        typer.Argument(metavar="EGO_A", help="An ego, as for estimate --ego."),
-    ],
-    ego_b: Annotated[str, typer.Argument(metavar="EGO_B", help="The other ego.")],
-    env: EnvArgument,
-    options: QuestionOptions,
-    max_sim: Annotated[
-        int,
-        typer.Option(
-            help="Largest number of simulations, of both egos together.", parser=read_count, metavar="INTEGER"
-        ),
-    ] = 12_000,
-    algo: AlgoOption = None,
-    stats: StatsOption = None,
-    algo_b: Annotated[str | None, typer.Option(help="As --algo, for the .zip of EGO_B.")] = None,
-    stats_b: Annotated[str | None, typer.Option(help="As --stats, for the .zip of EGO_B.")] = None,
-    out: Annotated[Path | None, typer.Option(help="Folder for comparison.json and failures.csv.")] = None,
-    force: ForceOption = False,
-    as_json: JsonOption = False,
-) -> None:
-    """Estimate how many times likelier ego A fails than ego B, with an interval, from the same scenarios."""
-    from rare_envs.study.compare import compare_egos
-    from rare_envs.study.question import Question
-
-    question = Question(env_id=env, ego=ego_a, max_sim=max_sim, algo=algo, stats=stats, **options.arguments())
-    with show_what_is_known(print), keep_stdout_for_the_answer():
-        comparison = compare_egos(question, ego_b, progress=True, out=out, force=force, algo_b=algo_b, stats_b=stats_b)
-    if as_json:
-        print_json(comparison.answer)
-    else:
-        notes = "".join(f"\n  note: {note}" for note in comparison.answer["notes"])
-        print(f"A = {ego_a}, B = {ego_b}, {env}\n{comparison.comparison}{notes}")
-        if out is not None:
-            print(f"Wrote {out}.")
-    raise typer.Exit(DOUBTFUL if comparison.comparison.warnings else 0)
-
-
-app.command("fit")(fit_command)
-app.command("train-ego")(train_ego_command)
-app.command("train-drivers")(train_drivers_command)
-app.command("export-ego")(export_ego_command)
-app.command("replay")(replay_command)
-app.command("export")(export_command)
-app.add_typer(corpus_app, name="corpus", cls=SummarisedCommands)
-app.command("plan")(plan_command)
-app.command("report")(report_command)
-app.command("check-ego")(check_ego_command)
-app.command("serve-ego")(serve_ego_command)
-
-
-require_driving(app)
-add_examples(app)
+COMMANDS: dict[str, Callable[..., None]] = {
+    "list": list_command,
+    "estimate": estimate_command,
+    "risk": risk_command,
+    "bases": bases_command,
+    "resume": resume_command,
+    "compare": compare_command,
+    "fit": fit_command,
+    "train-ego": train_ego_command,
+    "train-drivers": train_drivers_command,
+    "export-ego": export_ego_command,
+    "replay": replay_command,
+    "export": export_command,
+    "plan": plan_command,
+    "report": report_command,
+    "check-ego": check_ego_command,
+    "serve-ego": serve_ego_command,
+    "corpus add": corpus_add_command,
+    "corpus run": corpus_run_command,
+}
+corpus_app = typer.Typer(
+    cls=SummarisedCommands,
+    help="Keep failures as regression scenarios, and try other egos in them.",
+    epilog=format_examples("corpus"),
+)
+app.add_typer(corpus_app, name="corpus")
 app.info.epilog = format_examples("")
+for _name, _command in COMMANDS.items():
+    _group, _, _word = _name.rpartition(" ")
+    (corpus_app if _group else app).command(_word, epilog=format_examples(_name))(_command)
 
 
 def main() -> None:

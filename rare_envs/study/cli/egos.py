@@ -4,25 +4,25 @@ from __future__ import annotations
 
 import shlex
 import sys
+from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from rare_envs.study.arguments import Question
 from rare_envs.study.cli.options import (
-    AlgoOption,
+    EGO_FILE,
+    NOISE,
+    SCENARIO,
+    WORLD,
     EgoArgument,
     EnvArgument,
     JsonOption,
-    NoiseChoice,
-    ScenarioOptions,
-    SeedOption,
-    StatsOption,
-    TrustOption,
-    WorldOptions,
-    read_count,
+    count_option,
     read_environment,
+    take_options,
 )
 from rare_envs.study.cli.shell import keep_stdout_for_the_answer, print_json
 from rare_envs.study.errors import BadInput, as_bad_input, output_file
@@ -34,10 +34,10 @@ if TYPE_CHECKING:
     from training import Retraining
 
 
-@spread_options
+@take_options(*WORLD, "seed", "trust")
 @use_one_thread()
 def train_ego_command(
-    options: WorldOptions,
+    asked: dict[str, Any],
     env: Annotated[
         str | None,
         typer.Argument(
@@ -47,24 +47,12 @@ def train_ego_command(
         ),
     ] = None,
     algo: Annotated[
-        str | None,
-        typer.Option(
-            help="Stable-Baselines3 algorithm; --from-failures tells it.",
-            show_default="ppo",
-        ),
+        str | None, typer.Option(help="Stable-Baselines3 algorithm; --from-failures tells it.", show_default="ppo")
     ] = None,
-    steps: Annotated[
-        int, typer.Option(help="Environment steps to train for.", parser=read_count, metavar="INTEGER")
-    ] = 200_000,
+    steps: Annotated[int, count_option("Environment steps to train for.")] = 200_000,
     out: Annotated[Path, typer.Option(help="File to save the ego in.")] = Path("ego.zip"),
-    seed: SeedOption = 0,
     num_envs: Annotated[int, typer.Option(help="Episodes that run side by side.")] = 256,
-    device: Annotated[
-        str,
-        typer.Option(
-            help="Where to simulate and to train: cpu, or a GPU (cuda, cuda:1).",
-        ),
-    ] = "cpu",
+    device: Annotated[str, typer.Option(help="Where to simulate and to train: cpu, or a GPU (cuda, cuda:1).")] = "cpu",
     resume: Annotated[bool, typer.Option("--resume", help="Go on with a training that was interrupted.")] = False,
     from_failures: Annotated[
         list[Path] | None,
@@ -77,7 +65,6 @@ def train_ego_command(
     failure_share: Annotated[
         float, typer.Option(help="Share of episodes that begin in a failure, with --from-failures.")
     ] = 0.25,
-    trust: TrustOption = False,
     as_json: JsonOption = False,
 ) -> None:
     """Train an ego on the batched simulation and save it for `rare-envs estimate --ego`.
@@ -87,16 +74,17 @@ def train_ego_command(
     from training import train_ego
     from training.ego_training import HYPERPARAMETERS
 
+    seed, trust = asked.pop("seed"), asked.pop("trust")
     if from_failures:
-        plan = _read_plan(from_failures, failure_share, trust, env, algo, options)
+        plan = _read_plan(from_failures, failure_share, trust, env, algo, asked)
         env, algo, world, retraining = plan.env_id, plan.algo, dict(plan.world), plan.retraining
-        noise, next_seed = NoiseChoice.of(world["noise"]), plan.next_seed
+        next_seed: int | None = plan.next_seed
     elif env is None:
         raise BadInput("Expected an environment, such as rare_envs/CutIn-v0, or --from-failures RUN; rare-envs list.")
     else:
-        algo, noise, retraining, next_seed = algo or "ppo", options.noise, None, None
-        asked = {"observation": options.observation or "features", "action": options.action or "continuous"}
-        world = {**options.arguments(), **asked}
+        algo, retraining, next_seed = algo or "ppo", None, None
+        usual = {"observation": "features", "action": "continuous"}
+        world = {name: usual.get(name) if value is None else value for name, value in asked.items()}
     place: dict[str, Any] = {} if device == "cpu" else {"device": device}
     with as_bad_input(ValueError, OSError):
         path = train_ego(
@@ -115,20 +103,20 @@ def train_ego_command(
         answer = {"ego": str(path), "env_id": env, "algo": algo, "steps": steps, "seed": seed, **world}
         print_json(answer | ({} if retraining is None else _describe_retraining(retraining)))
         return
-    if HYPERPARAMETERS[algo].discrete and options.action is None:
+    if HYPERPARAMETERS[algo].discrete and asked["action"] is None:
         world["action"] = "discrete"  # which is what the algorithm made of it
     seed_words = "" if next_seed is None else f" --seed {next_seed}"
-    words = f"rare-envs estimate {env} --ego {shlex.quote(str(path))}{_estimate_options(world, noise)}{seed_words}"
+    words = f"rare-envs estimate {env} --ego {shlex.quote(str(path))}{_estimate_options(world)}{seed_words}"
     print(f"Saved {path}. Next: {words}")
 
 
 def _read_plan(
-    runs: list[Path], share: float, trust: bool, env: str | None, algo: str | None, options: WorldOptions
+    runs: list[Path], share: float, trust: bool, env: str | None, algo: str | None, asked: Mapping[str, Any]
 ) -> RetrainingPlan:
     """Return how to train on with the failures of runs."""
     from rare_envs.study.corpus import plan_retraining
 
-    if options != WorldOptions():
+    if any(value != getattr(Question(env_id=""), name) for name, value in asked.items()):
         raise BadInput("The world of --from-failures is that of the run: leave --base, --drivers and the like out.")
     with keep_stdout_for_the_answer():
         plan = plan_retraining(runs, share, trust)
@@ -143,10 +131,11 @@ def _describe_retraining(retraining: Retraining) -> dict[str, Any]:
     return {"retrained": str(retraining.ego), "failures": failures, "failure_share": share}
 
 
-def _estimate_options(world: dict[str, Any], noise: NoiseChoice) -> str:
+def _estimate_options(world: Mapping[str, Any]) -> str:
     """Return the options with which `estimate` makes the world that an ego was trained in."""
-    usual = {"noise": NoiseChoice.ON.value, "observation": "features", "action": "continuous", "collisions": "ego"}
-    values = {**world, "noise": noise.value, "weather": None}
+    usual = {"noise": "on", "observation": "features", "action": "continuous", "collisions": "ego"}
+    noise = next(word for word, argument in NOISE.items() if argument == world["noise"])
+    values = {**world, "noise": noise, "weather": None}
     told = {name: str(value) for name, value in values.items() if value not in (None, usual.get(name))}
     words = "".join(f" --{name} {shlex.quote(value)}" for name, value in told.items())
     return words + (" --weather" if world["weather"] else "")
@@ -206,24 +195,20 @@ def fit_command(
         print("\n".join(f"{path}: rare-envs estimate ENV --base {path}" for path in files))
 
 
-@spread_options
+@take_options(*SCENARIO, *EGO_FILE, "trust")
 def check_ego_command(
     ego: EgoArgument,
     env: EnvArgument,
-    options: ScenarioOptions,
-    algo: AlgoOption = None,
-    stats: StatsOption = None,
-    trust: TrustOption = False,
+    asked: dict[str, Any],
     time_limit: Annotated[float, typer.Option(help="Seconds that one check may take.")] = 30.0,
     show_all: Annotated[bool, typer.Option("--all", help="Show each check that passed in a row of its own.")] = False,
     as_json: JsonOption = False,
 ) -> None:
     """Check in seconds whether an ego fits: spaces, normalisation, determinism, memory, speed. 2: it does not."""
     from rare_envs.study.ego_check.findings import VERDICTS, exit_code, print_findings
-    from rare_envs.study.ego_check.subprocess_check import EgoCheckRequest, check_ego
+    from rare_envs.study.ego_check.subprocess_check import check_ego
 
-    request = EgoCheckRequest(ego, env, algo, trust, stats=stats, time_limit=time_limit, **options.arguments())
-    findings = check_ego(request)
+    findings = check_ego(Question(env_id=env, ego=ego, **asked), time_limit)
     code = exit_code(findings)
     if as_json:
         print_json(
@@ -234,33 +219,16 @@ def check_ego_command(
     raise typer.Exit(code)
 
 
+@take_options(*EGO_FILE, "trust")
 @use_one_thread()
 def serve_ego_command(
     ego: EgoArgument,
+    asked: dict[str, Any],
     bind: Annotated[
         str, typer.Option(help="Address; beyond 127.0.0.1 it needs RARE_ENVS_SECRET.")
     ] = "tcp://127.0.0.1:5555",
-    algo: AlgoOption = None,
-    stats: StatsOption = None,
-    trust: TrustOption = False,
 ) -> None:
     """Serve an ego to simulations in other processes or on other machines (estimate --ego tcp://...)."""
-    serve_ego(ego, bind, algo=algo, trust=trust, stats=stats)
-
-
-def serve_ego(spec: str, bind: str, algo: str | None = None, trust: bool = False, stats: str | None = None) -> None:
-    """Answer requests for an ego until it is interrupted.
-
-    Args:
-        spec: As for `agents.load_ego`.
-        bind: Address to listen on, such as "tcp://127.0.0.1:5555".
-        algo: Algorithm of a `.zip`, if the file does not tell.
-        trust: As for `agents.load_ego`.
-        stats: Likewise.
-
-    Raises:
-        BadInput: The ego cannot be loaded or served, or the address cannot be used.
-    """
     import agents
     from rare_envs.egos.validation import is_policy
 
@@ -270,28 +238,27 @@ def serve_ego(spec: str, bind: str, algo: str | None = None, trust: bool = False
     except ImportError as error:
         raise BadInput("Serving needs pyzmq and msgpack: pip install 'rare-envs[remote]'.") from error
     try:
-        ego = agents.load_ego(spec, algo=algo, trust=trust, stats=stats)
-        if not is_policy(ego):
-            raise ValueError(f"Expected an ego with predict, got {spec!r}, which needs more than observations.")
-        server = EgoServer(ego, bind, read_secret(), name=spec)
+        loaded = agents.load_ego(ego, **asked)
+        if not is_policy(loaded):
+            raise ValueError(f"Expected an ego with predict, got {ego!r}, which needs more than observations.")
+        server = EgoServer(loaded, bind, read_secret(), name=ego)
     except (ValueError, OSError) as error:
         raise BadInput(error) from error
     with server:
-        print(f"Serving {spec} at {server.address}; stop with Ctrl-C.", file=sys.stderr, flush=True)
+        print(f"Serving {ego} at {server.address}; stop with Ctrl-C.", file=sys.stderr, flush=True)
         server.run()
 
 
+@take_options(*EGO_FILE, "trust")
 def export_ego_command(
+    asked: dict[str, Any],
     model: Annotated[Path, typer.Argument(metavar="MODEL", help="A .zip saved by Stable-Baselines3.")],
     out: Annotated[Path, typer.Argument(metavar="OUT", help="The .onnx file to write.")],
-    algo: AlgoOption = None,
-    stats: StatsOption = None,
-    trust: TrustOption = False,
     as_json: JsonOption = False,
 ) -> None:
     """Write a saved policy as ONNX, normalisation, memory and clipping included, and check that both act alike."""
     with keep_stdout_for_the_answer():
-        done = export_ego(model, out, algo=algo, trust=trust, stats=stats)
+        done = export_ego(model, out, **asked)
     if as_json:
         print_json(done)
     else:
@@ -304,21 +271,7 @@ def export_ego_command(
 def export_ego(
     model: Path, out: Path, algo: str | None = None, trust: bool = False, stats: str | None = None
 ) -> dict[str, Any]:
-    """Write a Stable-Baselines3 `.zip` as ONNX and check that both act alike.
-
-    Args:
-        model: The `.zip`.
-        out: The file to write, ending in `.onnx`.
-        algo: Algorithm of the `.zip`, if the file does not tell.
-        trust: As for `agents.load_ego`.
-        stats: Likewise.
-
-    Returns:
-        What was written, JSON-ready.
-
-    Raises:
-        BadInput: The model cannot be read, the file cannot be written, or they act differently.
-    """
+    """Write a Stable-Baselines3 `.zip` as ONNX, check that both act alike, and return what was written, JSON-ready."""
     if model.suffix != ".zip":
         raise BadInput(
             f"Only policies saved by Stable-Baselines3, files that end in .zip, are exported; got {str(model)!r}."

@@ -9,14 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from rare_envs.study.cli.options import (
-    ActionOption,
-    AlgoOption,
-    JsonOption,
-    ObservationOption,
-    StatsOption,
-    TrustOption,
-)
+from rare_envs.study.cli.options import EGO_FILE, JsonOption, RunArgument, TrustOption, take_options
 from rare_envs.study.cli.shell import DOUBTFUL, is_typed, keep_stdout_for_the_answer, print_json
 from rare_envs.study.errors import BadInput, as_bad_input, output_file
 from rare_envs.threads import use_one_thread
@@ -27,7 +20,7 @@ if TYPE_CHECKING:
 
 @use_one_thread()
 def report_command(
-    run: Annotated[Path, typer.Argument(metavar="RUN", help="Folder that rare-envs estimate --out has written.")],
+    run: RunArgument,
     out: Annotated[Path | None, typer.Option(help="The .html file; report.html in RUN by default.")] = None,
     events: Annotated[
         Path | None,
@@ -57,12 +50,9 @@ FAILS = 4
 """Exit code where the ego fails in a stored scenario, as where p is above a limit."""
 CorpusOption = Annotated[Path, typer.Option(help="Folder of the corpus.")]
 
-corpus_app = typer.Typer(help="Keep failures as regression scenarios, and try other egos in them.")
 
-
-@corpus_app.command("add")
 def corpus_add_command(
-    run: Annotated[Path, typer.Argument(metavar="RUN", help="Folder that rare-envs estimate --out has written.")],
+    run: RunArgument,
     corpus: CorpusOption = Path("corpus"),
     most: Annotated[int, typer.Option(help="Failures to add: the most likely, and one of each kind of crash.")] = 20,
     trust: TrustOption = False,
@@ -79,23 +69,19 @@ def corpus_add_command(
         print(f"Added {new} of {len(chosen)} failures to {corpus}{'' if new else '; it had all of them'}.")
 
 
-@corpus_app.command("run")
+@take_options(*EGO_FILE, "observation", "action", "trust")
 @use_one_thread()
 def corpus_run_command(
     ego: Annotated[str, typer.Option(help="The ego to try, as for estimate --ego.")],
+    asked: dict[str, Any],
     corpus: CorpusOption = Path("corpus"),
     junit: Annotated[Path | None, typer.Option(help="File for a JUnit report.")] = None,
-    algo: AlgoOption = None,
-    stats: StatsOption = None,
-    observation: ObservationOption = None,
-    action: ActionOption = None,
-    trust: TrustOption = False,
     as_json: JsonOption = False,
 ) -> None:
     """Try an ego in all scenarios of a corpus. Exit code 0: it fails in none; 4: it does."""
     from rare_envs.study.corpus import EgoChoice, read_corpus, try_ego, write_junit
 
-    choice = EgoChoice(ego=ego, algo=algo, stats=stats, observation=observation, action=action)
+    trust, choice = asked.pop("trust"), EgoChoice(ego=ego, **asked)
     with keep_stdout_for_the_answer(), contextlib.nullcontext() if junit is None else output_file(junit):
         trials, seconds = try_ego(read_corpus(corpus), choice, corpus, trust)
         if junit is not None:
@@ -162,7 +148,7 @@ def _print_trials(trials: Sequence[Trial], most: int = 20) -> None:
 @use_one_thread()
 def replay_command(
     context: typer.Context,
-    run: Annotated[Path, typer.Argument(metavar="RUN", help="Folder that rare-envs estimate --out has written.")],
+    run: RunArgument,
     failure: Annotated[int, typer.Option(help="Which failure; 0 is the most likely.")] = 0,
     out: Annotated[Path | None, typer.Option(help="A .gif of the drive, or a .png of its worst moment.")] = None,
     ego: Annotated[
@@ -220,7 +206,7 @@ def replay_command(
 
 @use_one_thread()
 def export_command(
-    run: Annotated[Path, typer.Argument(metavar="RUN", help="Folder that rare-envs estimate --out has written.")],
+    run: RunArgument,
     out: Annotated[Path, typer.Option(help="The .xosc to write, its road beside it as .xodr; .xml for CommonRoad.")],
     failure: Annotated[int, typer.Option(help="Which failure; 0 is the most likely.")] = 0,
     format: Annotated[

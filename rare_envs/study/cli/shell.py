@@ -16,11 +16,11 @@ from types import FrameType
 from typing import Any, NoReturn
 
 import typer
-from typer.core import TyperCommand, TyperGroup
+from typer.core import TyperGroup
 
 from rare_envs.egos.errors import EgoGone
-from rare_envs.startup import require_libraries, restore_signals
-from rare_envs.study.errors import BadInput, as_bad_input
+from rare_envs.startup import find_missing_libraries, restore_signals
+from rare_envs.study.errors import BadInput
 
 DOUBTFUL = 3
 """Exit code of a command that is done, with warnings that make its number doubtful."""
@@ -63,25 +63,6 @@ class SummarisedCommands(TyperGroup):
             formatter.write_dl(rows)
 
 
-class DrivingCommand(TyperCommand):
-    """A command that needs the libraries of the extra `driving`; its help does not."""
-
-    def invoke(self, ctx: Any) -> Any:
-        """Run the command, or say in one line what to install."""
-        with as_bad_input(ImportError):
-            require_libraries(what=f"{ctx.command_path} needs")
-        return super().invoke(ctx)
-
-
-def require_driving(app: typer.Typer) -> None:
-    """Let all commands of an app be `DrivingCommand`s, those of its groups too."""
-    for command in app.registered_commands:
-        command.cls = DrivingCommand
-    for group in app.registered_groups:
-        if group.typer_instance is not None:
-            require_driving(group.typer_instance)
-
-
 class OneLineErrors(SummarisedCommands):
     """Commands whose errors are one line on standard error and exit code 2.
 
@@ -114,6 +95,11 @@ class OneLineErrors(SummarisedCommands):
             _fail(f"{said.rstrip('.')}{'' if said.endswith('?') else '.'} See {help_command} --help.")
         except (BadInput, EgoGone) as error:
             _fail(str(error))
+        except ImportError:
+            missing = ", ".join(find_missing_libraries())
+            if not missing:
+                raise
+            _fail(f"{self._find_path(words)} needs {missing}, not installed: pip install 'rare-envs[driving]'.")
         except BrokenPipeError:  # whoever read the answer has enough of it
             os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # nothing more to say when Python flushes
             sys.exit(128 + _SIGPIPE)
@@ -176,6 +162,11 @@ def is_typed(context: typer.Context, name: str) -> bool:
     """Return whether an option of a command was typed, not left at its default."""
     source = context.get_parameter_source(name)
     return source is not None and source.name == "COMMANDLINE"
+
+
+def list_typed(context: typer.Context) -> set[str]:
+    """Return the names of the parameters of a command that were typed."""
+    return {name for name in context.params if is_typed(context, name)}
 
 
 @contextlib.contextmanager

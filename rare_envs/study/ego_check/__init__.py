@@ -6,12 +6,11 @@ from rare_envs.plugins import make_lazy_getattr
 
 if TYPE_CHECKING:
     from rare_envs.study.ego_check.findings import Finding
-    from rare_envs.study.ego_check.subprocess_check import EgoCheckRequest, check_ego
+    from rare_envs.study.ego_check.subprocess_check import check_ego
 
-__all__ = ["EgoCheckRequest", "Finding", "check_ego"]
+__all__ = ["Finding", "check_ego"]
 
 _LAZY = {
-    "EgoCheckRequest": "rare_envs.study.ego_check.subprocess_check",
     "Finding": "rare_envs.study.ego_check.findings",
     "check_ego": "rare_envs.study.ego_check.subprocess_check",
 }

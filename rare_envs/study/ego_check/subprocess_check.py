@@ -13,69 +13,26 @@ import sys
 import threading
 from collections.abc import Iterator
 from contextlib import suppress
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from rare_envs.scenarios.registry import find_scenario
+from rare_envs.study.arguments import Question
 from rare_envs.study.ego_check.findings import Finding, report_failure, report_pass, report_warning
 from rare_envs.study.errors import BadInput
 from rare_envs.threads import use_one_thread
-
-if TYPE_CHECKING:
-    from rare_envs.study.question import Question
 
 START_TIMEOUT = 60.0
 """Duration that the process may take before its first check [s]."""
 
 
-@dataclass(frozen=True)
-class EgoCheckRequest:
-    """An ego, and the environment in which it is checked.
-
-    Attributes:
-        ego: As for `agents.load_ego`.
-        env_id: Environment.
-        algo: Algorithm of a `.zip`, if the file does not tell.
-        trust: As for `agents.load_ego`.
-        observation: Observation of the ego; None for the one that it declares.
-        action: Kind of its actions; None for the one that it fits.
-        time_limit: Duration that one check may take [s].
-        base: Base distribution of the scenarios that it drives; the environment's default when None.
-        drivers: Of the vehicles around it; the environment's default when None.
-        stats: File of the `VecNormalize` statistics of a `.zip`; None to look for one beside it.
-        horizon: Length of an episode [s]; the environment's when None.
-
-    Example:
-        >>> EgoCheckRequest("ppo.zip", "rare_envs/CutIn-v0").time_limit
-        30.0
-    """
-
-    ego: str
-    env_id: str
-    algo: str | None = None
-    trust: bool = False
-    observation: str | None = None
-    action: str | None = None
-    time_limit: float = 30.0
-    base: str | None = None
-    drivers: str | None = None
-    horizon: float | None = None
-    stats: str | None = None
-
-    @property
-    def question(self) -> Question:
-        """The question in whose problem the ego is checked."""
-        from rare_envs.study.question import Question
-
-        shared = {field.name for field in fields(Question)} & set(asdict(self))
-        return Question(**{name: value for name, value in asdict(self).items() if name in shared})
-
-
-def check_ego(request: EgoCheckRequest) -> list[Finding]:
-    """Check an ego.
+def check_ego(question: Question, time_limit: float = 30.0) -> list[Finding]:
+    """Check the ego of a question in the problem of that question.
 
     Args:
-        request: The ego and its environment.
+        question: The ego, its environment, and what it sees there.
+        time_limit: Duration that one check may take [s].
 
     Returns:
         The findings in order; the last one is a failure if the ego cannot be loaded, hangs or dies.
@@ -84,7 +41,7 @@ def check_ego(request: EgoCheckRequest) -> list[Finding]:
         BadInput: The environment or the ego is unknown, or there is no such file.
 
     Example:
-        >>> for finding in check_ego(EgoCheckRequest("https://example.org/ego.zip", "rare_envs/CutIn-v0")):
+        >>> for finding in check_ego(Question(env_id="rare_envs/CutIn-v0", ego="https://example.org/ego.zip")):
         ...     print(finding.check, finding.status, finding.found)
         origin fail 'https://example.org/ego.zip' is a remote place
     """
@@ -92,15 +49,14 @@ def check_ego(request: EgoCheckRequest) -> list[Finding]:
     from agents.missing_file import report_missing_file
     from agents.sb3.file_trust import TRUST_ADVICE, TRUST_CONSEQUENCE, find_origin_risks
     from agents.sb3.normalisation import find_statistics
-    from rare_envs.scenarios.registry import find_scenario, split_layout
 
     try:
-        find_scenario(split_layout(request.env_id)[0])
+        find_scenario(question.env_id)
     except ValueError as error:
         raise BadInput(error) from error
-    if request.time_limit <= 0:
-        raise BadInput(f"Expected a time limit of some seconds, got {request.time_limit}.")
-    name = strip_prefixes(request.ego)
+    if time_limit <= 0:
+        raise BadInput(f"Expected a time limit of some seconds, got {time_limit}.")
+    name = strip_prefixes(question.ego)
     findings, kind = [], find_ego_kind(name)
     if kind == "url":
         return [
@@ -114,24 +70,24 @@ def check_ego(request: EgoCheckRequest) -> list[Finding]:
         raise BadInput(report_missing_file(Path(name)))
     if kind == "zip":
         reasons = find_origin_risks(Path(name), find_statistics(Path(name)))
-        if reasons and not request.trust:
+        if reasons and not question.trust:
             return [report_failure("origin", "; ".join(reasons), TRUST_ADVICE)]
         place = f" ({'; '.join(reasons)})" if reasons else ""
         held = f"a Stable-Baselines3 .zip can hold code{place}"
-        if request.trust:
+        if question.trust:
             findings.append(report_warning("origin", held, f"you said --trust: {TRUST_CONSEQUENCE}", False))
         else:
             findings.append(report_pass("origin", f"{held}; opened here is only what is known to be harmless"))
-    return findings + list(_check_in_subprocess(request))
+    return findings + list(_check_in_subprocess(question, time_limit))
 
 
-def _check_in_subprocess(request: EgoCheckRequest) -> Iterator[Finding]:
+def _check_in_subprocess(question: Question, time_limit: float) -> Iterator[Finding]:
     """Yield the findings of a subprocess, and a failure if it hangs or dies."""
-    words = [sys.executable, "-m", "rare_envs.study.ego_check.subprocess_check", json.dumps(asdict(request))]
+    words = [sys.executable, "-m", "rare_envs.study.ego_check.subprocess_check", json.dumps(asdict(question))]
     with subprocess.Popen(words, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, text=True) as process:
         lines: queue.Queue[str | None] = queue.Queue()
         threading.Thread(target=_forward_lines, args=(process.stdout, lines), daemon=True).start()
-        doing, limit, done = "loading", max(START_TIMEOUT, request.time_limit), False
+        doing, limit, done = "loading", max(START_TIMEOUT, time_limit), False
         while not done:
             try:
                 line = lines.get(timeout=limit)
@@ -144,7 +100,7 @@ def _check_in_subprocess(request: EgoCheckRequest) -> Iterator[Finding]:
                 break
             with suppress(json.JSONDecodeError):  # other output of libraries
                 event = json.loads(line)
-                doing, limit = event.get("doing", doing), request.time_limit
+                doing, limit = event.get("doing", doing), time_limit
                 done = event.get("done", False)
                 if "finding" in event:
                     yield Finding(**event["finding"])
@@ -163,7 +119,7 @@ def _forward_lines(stream: Any, lines: queue.Queue[str | None]) -> None:
 # --- in that process ---------------------------------------------------------------------------
 
 
-def run_checks(request: EgoCheckRequest) -> Iterator[Finding | str]:
+def run_checks(question: Question) -> Iterator[Finding | str]:
     """Load the ego and check it: yield findings, and before each check its name."""
     import agents
     from agents.loading import find_ego_kind
@@ -173,17 +129,17 @@ def run_checks(request: EgoCheckRequest) -> Iterator[Finding | str]:
     from rare_envs.study.ego_check.protocol import check_protocol
     from rare_envs.study.question import build_problem
 
-    if find_ego_kind(request.ego) == "remote":
+    if find_ego_kind(question.ego) == "remote":
         yield "protocol"
-        findings = list(check_protocol(request.ego))
+        findings = list(check_protocol(question.ego))
         yield from findings
         if any(finding.status == "fail" for finding in findings):
             return
     yield "loading"
     try:
-        ego = agents.load_ego(request.ego, algo=request.algo, trust=request.trust, stats=request.stats)
+        ego = agents.load_ego(question.ego, algo=question.algo, trust=question.trust, stats=question.stats)
         yield report_pass("loading", f"{type(ego).__name__}" if not isinstance(ego, str) else ego)
-        problem = build_problem(request.question, ego)
+        problem = build_problem(question, ego)
         for note in problem.notes:
             if note in (AMBIGUOUS, TAKEN_AS_ACCELERATIONS):  # of other bounds than ours a check of its own tells
                 yield report_warning("action space", note, "say which by --action", note == AMBIGUOUS)
@@ -207,7 +163,7 @@ def _main(arguments: str) -> None:
     out = os.fdopen(os.dup(1), "w", buffering=1)
     os.dup2(2, 1)  # an ego may print
     with use_one_thread():
-        for each in run_checks(EgoCheckRequest(**json.loads(arguments))):
+        for each in run_checks(Question(**json.loads(arguments))):
             out.write(json.dumps({"doing": each} if isinstance(each, str) else {"finding": asdict(each)}) + "\n")
     out.write(json.dumps({"done": True}) + "\n")
 

@@ -12,7 +12,8 @@ from agents import load_ego
 from agents.vision.checkpoint import load_vision
 from agents.vision.ego import LAG, SPEED_SCALE, VisionEgo, to_actions, update_memory
 from agents.vision.pilotnet import HEIGHT, WIDTH, luma
-from rare_envs.study.ego_check.subprocess_check import EgoCheckRequest, check_ego
+from rare_envs.study.arguments import Question
+from rare_envs.study.ego_check.subprocess_check import check_ego
 
 CUT_IN = "rare_envs/CutIn-v0"
 
@@ -117,7 +118,7 @@ def test_it_drives_behind_a_stack_and_in_a_process_of_its_own(spec: str) -> None
 
 
 def test_check_ego_finds_nothing_wrong_with_it() -> None:
-    findings = check_ego(EgoCheckRequest("vision", CUT_IN, horizon=0.5))
+    findings = check_ego(Question(env_id=CUT_IN, ego="vision", horizon=0.5))
     assert {finding.check for finding in findings} >= {"memory", "latency", "driving"}
     assert {finding.status for finding in findings if finding.check != "latency"} == {"pass"}
 

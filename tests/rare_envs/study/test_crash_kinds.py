@@ -13,8 +13,9 @@ import pytest
 import rare_envs
 import samplers
 from rare_envs.control.idm import IDM
+from rare_envs.study.arguments import Question
 from rare_envs.study.modes import classify_failures, list_all_kinds
-from rare_envs.study.question import Question, Study
+from rare_envs.study.question import Study
 from rare_envs.study.report import Report
 from rare_envs.study.run_folder import CRASH, read_failures
 from rare_envs.study.writing import write_run

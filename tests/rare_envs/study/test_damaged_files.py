@@ -16,10 +16,11 @@ import pytest
 from typer.testing import CliRunner, Result
 
 from rare_envs.study import evaluate, run_directory
+from rare_envs.study.arguments import Question, read_question
 from rare_envs.study.cli.app import app
 from rare_envs.study.errors import BadInput
 from rare_envs.study.journal import JOURNAL, begin_journal
-from rare_envs.study.question import Question, prepare, read_question
+from rare_envs.study.question import prepare
 from samplers.execution.journal import JournalRecord
 
 Cli = Callable[..., Result]

@@ -7,8 +7,9 @@ from collections.abc import Callable
 
 from typer.testing import Result
 
+from rare_envs.study.arguments import Question
 from rare_envs.study.evaluate import run
-from rare_envs.study.question import Question, prepare
+from rare_envs.study.question import prepare
 
 Cli = Callable[..., Result]
 

@@ -21,9 +21,10 @@ from typer.testing import Result
 import rare_envs
 from rare_envs.problem import DrivingProblem
 from rare_envs.study import evaluate, run_directory
+from rare_envs.study.arguments import Question
 from rare_envs.study.errors import BadInput
 from rare_envs.study.journal import JOURNAL, begin_journal, continue_journal, digest_files
-from rare_envs.study.question import Question, prepare
+from rare_envs.study.question import prepare
 from samplers.execution.executors import ExecutorError
 from samplers.execution.record_file import RecordFile
 from tests.rare_envs.study.refusals import FOLLOWING, assert_refused

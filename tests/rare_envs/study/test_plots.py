@@ -7,6 +7,7 @@ import pytest
 from matplotlib.figure import Figure
 
 import rare_envs
+from rare_envs.study.arguments import Question
 from rare_envs.study.evaluate import run
 from rare_envs.study.plots import (
     MOMENTS,
@@ -16,7 +17,7 @@ from rare_envs.study.plots import (
     rank_shifted_parameters,
     save_plot,
 )
-from rare_envs.study.question import Question, prepare
+from rare_envs.study.question import prepare
 from rare_envs.study.replay import drive_again
 
 FOLLOWING = "rare_envs/CarFollowing-v0"

@@ -13,10 +13,11 @@ from typer.testing import Result
 import agents
 import rare_envs
 from rare_envs.egos.spaces.ambiguities import AmbiguousActions
+from rare_envs.study.arguments import Question
 from rare_envs.study.ego_check.findings import Finding
-from rare_envs.study.ego_check.subprocess_check import EgoCheckRequest, run_checks
+from rare_envs.study.ego_check.subprocess_check import run_checks
 from rare_envs.study.errors import BadInput
-from rare_envs.study.question import Question, build_problem, prepare
+from rare_envs.study.question import prepare
 from tests.rare_envs.study.refusals import assert_refused
 
 SMALL = ("estimate", "rare_envs/CarFollowing-v0", "--method", "mc", "--max-sim", 400)
@@ -63,7 +64,7 @@ def test_what_actions_are_taken_for_is_pointed_out(cli: Cli, tmp_path: Path, mon
     )
     assert json.loads(cli(*both, "--json").stdout)["notes"] == [f"A: {note}"]
     assert f"note: A: {note}" in cli(*both).stdout
-    asked = EgoCheckRequest("idle_egos:Idle", FOLLOWING, observation="kinematics", action="continuous")
+    asked = Question(env_id=FOLLOWING, ego="idle_egos:Idle", observation="kinematics", action="continuous")
     (found,) = (each for each in run_checks(asked) if isinstance(each, Finding) and each.found == note)
     assert (found.check, found.status) == ("action space", "warn")
     with pytest.warns(AmbiguousActions, match="--action meta"):
@@ -94,14 +95,6 @@ def test_an_unknown_word_is_refused(cli: Cli) -> None:
     result = cli(*SMALL, "--on-error", "bonud")
     assert (result.exit_code, result.stdout) == (2, "")
     assert "Did you mean 'bound'" in result.stderr
-
-
-def test_the_check_of_an_ego_and_a_question_build_the_same_problem() -> None:
-    request = EgoCheckRequest("idm", FOLLOWING, observation="lidar", base="highway", horizon=3.0)
-    question = request.question
-    assert question == Question(env_id=FOLLOWING, observation="lidar", base="highway", horizon=3.0)
-    world = build_problem(question, "idm").world
-    assert (world.sensing.observation, world.clock.horizon) == ("lidar", 3.0)
 
 
 @pytest.mark.parametrize(

@@ -19,9 +19,10 @@ from typer.testing import Result
 import rare_envs
 from rare_envs.problem import DrivingProblem
 from rare_envs.study import evaluate, run_directory
+from rare_envs.study.arguments import Question
 from rare_envs.study.errors import BadInput
 from rare_envs.study.journal import JOURNAL, continue_journal
-from rare_envs.study.question import Question, prepare
+from rare_envs.study.question import prepare
 from rare_envs.study.run_folder import RESULT_FILES
 from samplers.execution.record_file import RecordFile
 from tests.rare_envs.study.conftest import write_base

@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
+from rare_envs.study.arguments import Question
 from rare_envs.study.errors import BadInput
 from rare_envs.study.journal import digest_files, find_changed_files
-from rare_envs.study.question import Question
 from rare_envs.study.recorded_question import find_moved_files
 from tests.rare_envs.study.refusals import SMALL, Cli, assert_refused
 

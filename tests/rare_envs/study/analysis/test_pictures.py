@@ -11,9 +11,10 @@ from typer.testing import CliRunner
 import rare_envs
 import samplers
 from rare_envs.study import run_into
+from rare_envs.study.arguments import Question
 from rare_envs.study.cli.app import app
 from rare_envs.study.plots import save_sensitivity, save_severity
-from rare_envs.study.question import Question, prepare
+from rare_envs.study.question import prepare
 from rare_envs.study.report import Report
 
 FOLLOWING = "rare_envs/CarFollowing-v0"

@@ -15,8 +15,9 @@ import samplers
 from rare_envs.control.idm import IDM
 from rare_envs.distributions import EventCounts, FittedDistribution
 from rare_envs.study import severity_curve
+from rare_envs.study.arguments import Question
 from rare_envs.study.modes import classify_failures
-from rare_envs.study.question import Question, Study
+from rare_envs.study.question import Study
 from rare_envs.study.report import Report
 from rare_envs.study.severity import Severity, compute_severity, replay_failures
 from rare_envs.study.text import print_report

@@ -9,8 +9,7 @@ from typing import Any
 import pytest
 import typer
 
-from rare_envs.study.cli.app import app
-from rare_envs.study.cli.examples import EXAMPLES, add_examples, format_examples
+from rare_envs.study.cli.app import EXAMPLES, app
 from tests.rare_envs.study.refusals import Cli
 
 
@@ -55,11 +54,3 @@ def test_summaries_are_whole_and_no_line_is_wider_than_the_terminal(cli: Cli, mo
         assert max(map(len, shown.splitlines())) <= 80
         assert "...\n" not in shown.partition("Commands:")[2]
     assert "and show its most likely failure." in " ".join(cli("--help").stdout.split())
-
-
-def test_a_command_without_examples_has_nothing_below_its_help() -> None:
-    other = typer.Typer()
-    other.command("nothing")(lambda: None)
-    add_examples(other)
-    assert other.registered_commands[0].epilog == format_examples("nothing") == ""
-    assert format_examples("report").splitlines() == ["\b", "Examples:", *(f"  {line}" for line in EXAMPLES["report"])]

@@ -1,35 +1,24 @@
-"""Options of the command line: their defaults are those of a question."""
+"""Options of the command line: those of a question."""
 
 import json
-from dataclasses import fields
 from pathlib import Path
 
 import pytest
 import typer
+from typer.testing import CliRunner
 
-from rare_envs.study.cli.options import EstimateOptions, NoiseChoice, ScenarioOptions, WorldOptions, read_count
-from rare_envs.study.ego_check.subprocess_check import EgoCheckRequest
-from rare_envs.study.question import Question
+from rare_envs.study.cli.options import read_count, take_options
 from rare_envs.version import __version__
 from tests.rare_envs.study.refusals import FOLLOWING, Cli, assert_refused
 
 
-def test_defaults_are_those_of_a_question() -> None:
-    assert Question(env_id="rare_envs/CutIn-v0", **EstimateOptions().arguments()) == Question(
-        env_id="rare_envs/CutIn-v0"
-    )
-    assert {field.name for field in fields(Question)} == {field.name for field in fields(EstimateOptions)} | {"env_id"}
-
-
-def test_defaults_are_those_of_a_check() -> None:
-    assert EgoCheckRequest("idm", "rare_envs/CutIn-v0", **ScenarioOptions().arguments()) == EgoCheckRequest(
-        "idm", "rare_envs/CutIn-v0"
-    )
-
-
-@pytest.mark.parametrize(("choice", "argument"), [("on", True), ("fixed", "fixed"), ("off", False)])
-def test_noise_is_an_argument_of_the_problem(choice: str, argument: bool | str) -> None:
-    assert WorldOptions(noise=NoiseChoice(choice)).arguments()["noise"] is argument
+def test_a_word_of_noise_is_an_argument_of_the_problem() -> None:
+    shown = []
+    app = typer.Typer()
+    app.command()(take_options("noise", "seed")(lambda asked: shown.append(asked)))
+    for words in ([], ["--noise", "fixed"], ["--noise", "off", "--seed", "1e1"]):
+        assert CliRunner().invoke(app, words).exit_code == 0
+    assert shown == [{"noise": True, "seed": 0}, {"noise": "fixed", "seed": 0}, {"noise": False, "seed": 10}]
 
 
 @pytest.mark.parametrize(

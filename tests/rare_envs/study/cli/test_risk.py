@@ -56,7 +56,7 @@ BAD = {
     "unknown leaders": (["idm", "--with", "merge"], ["merge"]),
     "two bases for one scenario": (
         ["idm", "--base", "hard_brake=us101", "--base", "hard_brake=mine.json"],
-        ["one --base for each scenario", "2 for 'hard_brake'"],
+        ["one --base for each scenario", "several for 'hard_brake'"],
     ),
     "uncounted leaders": (
         ["idm", "--with", "highway"],

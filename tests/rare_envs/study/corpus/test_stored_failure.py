@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from rare_envs.study.arguments import Question
 from rare_envs.study.corpus import (
     WORLD_FIELDS,
     StoredFailure,
@@ -17,7 +18,6 @@ from rare_envs.study.corpus import (
     parse_stored,
     read_stored,
 )
-from rare_envs.study.question import Question
 
 QUESTION = Question(env_id="rare_envs/CarFollowing-v0", horizon=4.0, gamma=0.5, ego="mine:make")
 X = {"ego_speed": np.array(20.1), "lead_speed": np.array(5.0 / 3.0), "gap": np.array(10.0)}

@@ -8,14 +8,15 @@ from typing import Any
 import numpy as np
 import pytest
 
+from rare_envs.study.arguments import Question
 from rare_envs.study.ego_check.findings import Finding
-from rare_envs.study.ego_check.subprocess_check import EgoCheckRequest, run_checks
+from rare_envs.study.ego_check.subprocess_check import run_checks
 
 ENV = "rare_envs/CarFollowing-v0"
 
 
 def findings(ego: str) -> dict[str, Finding]:
-    return {each.check: each for each in run_checks(EgoCheckRequest(ego, ENV)) if isinstance(each, Finding)}
+    return {each.check: each for each in run_checks(Question(env_id=ENV, ego=ego)) if isinstance(each, Finding)}
 
 
 def test_a_server_that_keeps_to_the_protocol_passes() -> None:

@@ -13,8 +13,9 @@ from typer.testing import Result
 
 import agents
 from agents.sb3.file_trust import find_origin_risks
+from rare_envs.study.arguments import Question
 from rare_envs.study.ego_check.findings import Finding, exit_code
-from rare_envs.study.ego_check.subprocess_check import EgoCheckRequest, check_ego, run_checks
+from rare_envs.study.ego_check.subprocess_check import check_ego, run_checks
 
 Cli = Callable[..., Result]
 ENV = "rare_envs/CarFollowing-v0"
@@ -137,7 +138,7 @@ def broken(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
 
 
 def findings(ego: str) -> dict[str, Finding]:
-    return {each.check: each for each in run_checks(EgoCheckRequest(ego, ENV)) if isinstance(each, Finding)}
+    return {each.check: each for each in run_checks(Question(env_id=ENV, ego=ego)) if isinstance(each, Finding)}
 
 
 @pytest.mark.parametrize(
@@ -238,7 +239,7 @@ def test_an_ego_that_is_not_what_it_says_is_one_line_and_one_finding(
         ego = f"liars_here:{name}"
         result = cli("estimate", ENV, "--ego", ego, "--method", "mc", "--max-sim", 5, "--horizon", 1)
         assert (result.exit_code, result.stdout, result.stderr.count("\n")) == (2, "", 1), (name, result.output)
-        found = [each for each in run_checks(EgoCheckRequest(ego, ENV, horizon=1.0)) if isinstance(each, Finding)]
+        found = [each for each in run_checks(Question(env_id=ENV, ego=ego, horizon=1.0)) if isinstance(each, Finding)]
         assert exit_code(found) == 2, (name, found)
 
 
@@ -288,7 +289,7 @@ def test_a_zip_that_others_can_write_to_is_refused_by_every_command(what: str, s
 
 @pytest.mark.filterwarnings("ignore:.*are mapped to")
 def test_actions_of_other_bounds_are_told_once(broken: str) -> None:
-    every = run_checks(EgoCheckRequest(f"{broken}:another_unit", ENV))
+    every = run_checks(Question(env_id=ENV, ego=f"{broken}:another_unit"))
     (told,) = (each for each in every if isinstance(each, Finding) and each.check == "action space")
     assert told.status == "warn" and "--action" not in told.advice
 
@@ -297,9 +298,9 @@ def test_a_zip_of_ones_own_is_no_warning(tmp_path: Path, monkeypatch: pytest.Mon
     monkeypatch.chdir(tmp_path)
     Path("ego.zip").touch()
     monkeypatch.setattr("rare_envs.study.ego_check.subprocess_check._check_in_subprocess", lambda _: iter(()))
-    (origin,) = check_ego(EgoCheckRequest("ego.zip", ENV))
+    (origin,) = check_ego(Question(env_id=ENV, ego="ego.zip"))
     assert (origin.check, origin.status) == ("origin", "pass")
-    (trusted,) = check_ego(EgoCheckRequest("ego.zip", ENV, trust=True))
+    (trusted,) = check_ego(Question(env_id=ENV, ego="ego.zip", trust=True))
     assert trusted.status == "warn" and "whatever code is in it runs" in trusted.advice
 
 

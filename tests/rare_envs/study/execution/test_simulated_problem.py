@@ -11,9 +11,10 @@ import pytest
 import samplers
 from rare_envs.problem import DrivingProblem
 from rare_envs.study import evaluate, run_directory
+from rare_envs.study.arguments import Question
 from rare_envs.study.errors import BadInput
 from rare_envs.study.journal import JOURNAL
-from rare_envs.study.question import Question, prepare
+from rare_envs.study.question import prepare
 from rare_envs.study.report import Report
 from samplers.execution.progress import Progress
 from tests.rare_envs.study.execution.faulty import FAULTY

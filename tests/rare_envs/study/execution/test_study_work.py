@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 
 from rare_envs.egos.errors import EgoFault
+from rare_envs.study.arguments import Question
 from rare_envs.study.errors import BadInput
 from rare_envs.study.execution.study_work import StudyWork
-from rare_envs.study.question import Question, prepare
+from rare_envs.study.question import prepare
 from samplers.execution.executors.chunks import Chunk
 from samplers.execution.executors.packing import unpack_terms
 from tests.rare_envs.study.execution.faulty import FAULTY

@@ -12,33 +12,15 @@ from typing import Any, ClassVar
 import yaml
 
 from rare_envs.plugins import did_you_mean
+from rare_envs.study.arguments import ExecutorOptions, Question, check_types, option_name
 from rare_envs.study.errors import BadInput
-from rare_envs.study.question import TYPE_WORDS, Question, read_question
 
 MAX_QUESTION_BYTES = 2**20
-ENV_KEY = "env"
-"""Key of the environment; the others are the options of `rare-envs estimate`, with - or _ between words."""
-OPTION_KEYS = {ENV_KEY: "env_id", "confidence": "gate_confidence"}
-"""Keys that are no names of fields of `Question`: they are called as the options are."""
-EXECUTOR_KEYS: dict[str, tuple[type, ...]] = {
-    "workers": (int,),
-    "executor": (str,),
-    "address": (str,),
-    "time_limit": (int, float),
-    "memory_limit": (int, float),
-}
-"""Options that say where simulations are made, which is no part of the question, with their types."""
-COUNTS = ("workers", *(field.name for field in fields(Question) if field.type in ("int", "int | None")))
-"""Keys of whole numbers, which may be written as 1e6."""
 NOT_IN_FILES = ("trust",)
 """Whoever asks decides whether code runs, not a file."""
-
-
+KEYS = {option_name(each): each for kind in (Question, ExecutorOptions) for each in fields(kind)}
+"""Keys, with - or _ between words, and the fields that they stand for."""
 INTEGER, FLOAT = "tag:yaml.org,2002:int", "tag:yaml.org,2002:float"
-
-
-def _is_whole(value: Any) -> bool:
-    return isinstance(value, float) and value.is_integer()
 
 
 class QuestionLoader(yaml.SafeLoader):  # type: ignore[misc]  # PyYAML has no types
@@ -67,46 +49,34 @@ QuestionLoader.add_implicit_resolver(
 
 
 def read_question_file(path: Path) -> dict[str, Any]:
-    """Return the fields of `Question` that a file gives, and the options of `EXECUTOR_KEYS`.
-
-    Args:
-        path: Of a YAML file, which may be JSON.
+    """Return the fields of `Question` and `ExecutorOptions` that a YAML file, which may be JSON, gives.
 
     Raises:
         BadInput: It cannot be read, or has unknown keys or values of a wrong type.
     """
     given = _load_mapping(path)
-    named = {_find_field(key): value for key, value in given.items()}
-    known = [*(field.name for field in fields(Question) if field.name not in NOT_IN_FILES), *EXECUTOR_KEYS]
-    for key in given:
-        name = _find_field(key)
+    named = {key.replace("-", "_"): value for key, value in given.items()}
+    for key, name in zip(given, (key.replace("-", "_") for key in given), strict=True):
         if name in NOT_IN_FILES:
             raise BadInput(f"{str(path)!r} cannot say {key}: give --{key} on the command line.")
-        if name not in known:
-            options = {name: option for option, name in OPTION_KEYS.items()}
-            names = [options.get(each, each) for each in known]
-            hint = did_you_mean(key.replace("-", "_"), names)
-            raise BadInput(f"{str(path)!r} has an unknown key {key!r}{hint}. It may have: {', '.join(names)}.")
+        if name not in KEYS:
+            known = [each for each in KEYS if each not in NOT_IN_FILES]
+            hint = did_you_mean(name, known)
+            raise BadInput(f"{str(path)!r} has an unknown key {key!r}{hint}. It may have: {', '.join(known)}.")
     if len(named) < len(given):
         raise BadInput(f"{str(path)!r} gives the same option twice.")
-    named = {name: int(value) if name in COUNTS and _is_whole(value) else value for name, value in named.items()}
+    named = {name: _as_whole(name, value) for name, value in named.items()}
     try:
-        read_question({"env_id": "", **named})
+        check_types({name: KEYS[name] for name in named}, named)
     except BadInput as error:
-        text = str(error).replace(" of the recorded question", "").replace("gate_confidence", "confidence")
-        raise BadInput(f"{str(path)!r}: {text}") from error
-    for name, types in EXECUTOR_KEYS.items():
-        value = named.get(name)
-        if value is not None and (not isinstance(value, types) or isinstance(value, bool)):
-            expected = " or ".join(TYPE_WORDS[kind.__name__] for kind in types)
-            raise BadInput(f"{str(path)!r}: Expected {name} to be {expected}, got {reprlib.repr(value)}.")
-    return named
+        raise BadInput(f"{str(path)!r}: {error}") from error
+    return {KEYS[name].name: value for name, value in named.items()}
 
 
-def _find_field(key: str) -> str:
-    """Return the name of the field or option that a key stands for."""
-    name = key.replace("-", "_")
-    return OPTION_KEYS.get(name, name)
+def _as_whole(name: str, value: Any) -> Any:
+    """Return the value of a key; a whole number where it takes one, which may be written as 1e6."""
+    whole = "int" in str(KEYS[name].type).split(" | ") and isinstance(value, float) and value.is_integer()
+    return int(value) if whole else value
 
 
 def join_question(given: Mapping[str, Any], env: str | None, options: Mapping[str, Any], typed: set[str]) -> Question:
@@ -121,12 +91,17 @@ def join_question(given: Mapping[str, Any], env: str | None, options: Mapping[st
     Raises:
         BadInput: Neither names an environment.
     """
-    named = {**options, **given, **{name: value for name, value in options.items() if name in typed}}
+    named = join_options(given, options, typed)
     if env is not None:
         named["env_id"] = env
     if "env_id" not in named:
-        raise BadInput(f"Expected an environment: rare-envs estimate ENV, or {ENV_KEY}: ENV in the file of --config.")
+        raise BadInput("Expected an environment: rare-envs estimate ENV, or env: ENV in the file of --config.")
     return Question(**named)
+
+
+def join_options(given: Mapping[str, Any], options: Mapping[str, Any], typed: set[str]) -> dict[str, Any]:
+    """Return options by name: what was typed, else what a file gives, else the default."""
+    return {**options, **given, **{name: value for name, value in options.items() if name in typed}}
 
 
 def _load_mapping(path: Path) -> dict[str, Any]:
