@@ -77,7 +77,7 @@ def sb3_agents_env(
         agents: Names of the vehicles that act, of A; None for all. With one of them in the background this is the
             training of an adversary.
         ego: Driver of the ego if it is no agent: "idm", a driver or a policy.
-        rewards: Reward functions by agent (`rare_envs.multi_agent.rewards`); by default that of an ego, in its own
+        rewards: Reward functions by agent (`rare_envs.multi_agent`); by default that of an ego, in its own
             view.
         seed: Seed of the first reset; an algorithm's own seed replaces it.
         **make_kwargs: Keyword arguments of `gym.make` for this environment.

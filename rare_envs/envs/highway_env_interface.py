@@ -1,15 +1,74 @@
-"""Attributes that code for HighwayEnv reads from `env.unwrapped`: configuration, road, vehicle and actions."""
+"""Attributes that scripts for HighwayEnv read from `env.unwrapped`: configuration, vehicle and actions."""
 
 import warnings
+from collections import UserDict
 from collections.abc import Mapping
 from functools import cached_property
 from typing import Any
 
-from rare_envs.envs.highway_env_configuration import PICTURE_KEYS, FixedConfiguration
-from rare_envs.envs.highway_env_objects import make_scene
+from rare_envs.control.actions import MAX_ACCELERATION, MAX_STEERING
+from rare_envs.envs.rendering import make_scene
+from rare_envs.make import CONFIGURATION_ARGUMENTS
+from rare_envs.plugins import did_you_mean
 from rare_envs.simulation.episode import Episode
 from rare_envs.simulation.reward import COLLISION_COST
 from rare_envs.simulation.world import World
+
+PICTURE_KEYS = frozenset(
+    {
+        "screen_width",
+        "screen_height",
+        "centering_position",
+        "scaling",
+        "show_trajectories",
+        "render_agent",
+        "offscreen_rendering",
+        "manual_control",
+        "real_time_rendering",
+    }
+)
+"""Keys of HighwayEnv's configuration that change neither traffic nor spaces; they are kept, and the picture is ours."""
+FRAME_RATE = "simulation_frequency"
+"""The key that HighwayEnv's scripts set before they record a video, for more frames."""
+
+
+class FixedConfiguration(UserDict[str, Any]):
+    """A configuration that is read like a dictionary, and refuses to set what is fixed when the environment is made.
+
+    The frame rate stays too, but with a warning: HighwayEnv's scripts set it after the training, for a smoother video.
+    """
+
+    def __init__(self, values: Mapping[str, Any]) -> None:
+        """Take over values by HighwayEnv's key; dictionaries among them refuse likewise."""
+        super().__init__()
+        self.data = {k: FixedConfiguration(v) if isinstance(v, dict) else v for k, v in values.items()}
+
+    def __setitem__(self, name: str, value: Any) -> None:
+        """Set a key of the picture, or another one to the value that it has.
+
+        Raises:
+            ValueError: If the value would change, of another key than the frame rate.
+        """
+        if name in PICTURE_KEYS:
+            self.data[name] = value
+        elif name not in self:
+            raise ValueError(f"Unknown key {name!r}{did_you_mean(name, self)} of config; it has {', '.join(self)}.")
+        elif self[name] != value and name == FRAME_RATE:
+            warnings.warn(
+                f"config[{name!r}] stays {self[name]!r}, not {value!r}: the time between frames is fixed when the "
+                "environment is made, by gym.make's argument dt.",
+                stacklevel=2,
+            )
+        elif self[name] != value:
+            argument = CONFIGURATION_ARGUMENTS.get(name)
+            advice = f"give gym.make the argument {argument}" if argument else "it belongs to the scenario"
+            raise ValueError(
+                f"Expected config[{name!r}] to stay {self[name]!r}, got {value!r}; "
+                f"it is fixed when the environment is made: {advice}."
+            )
+
+    def __delitem__(self, name: str) -> None:
+        raise ValueError(f"Expected config to keep its key {name!r}; copy it with dict(config) to change the copy.")
 
 
 class HighwayEnvInterface:
@@ -19,30 +78,20 @@ class HighwayEnvInterface:
         >>> import gymnasium
         >>> env = gymnasium.make("rare_envs/CutIn-kinematics-v0").unwrapped
         >>> _ = env.reset(seed=0, options={"ego_speed": 20.0, "cut_in_gap": 30.0})
-        >>> env.vehicle.speed, env.vehicle.crashed, len(env.road.vehicles)
+        >>> env.vehicle.speed, env.vehicle.crashed, len(env.vehicle.road.vehicles)
         (20.0, False, 3)
         >>> env.action_type.actions_indexes["FASTER"], env.config["policy_frequency"]
         (3, 1)
-        >>> _ = env.step(1)
-        >>> env.time, env.get_available_actions(), env.observation_type.observe().shape
-        (1.0, [1, 2, 3], (5, 5))
     """
 
     world: World
     render_mode: str | None
-    reset: Any
-    """Of the environment."""
     _episode: Episode | None
-    _tick: int
-    _scene: tuple[Episode, Any] | None = None
+    _recorder: Any = None
 
     @cached_property
     def config(self) -> FixedConfiguration:
-        """The configuration under HighwayEnv's names: frequencies [Hz], duration [s], vehicles beside the ego.
-
-        What concerns the picture may be set; for every other key a new value raises a `ValueError` that says which
-        argument of gym.make to use.
-        """
+        """The configuration under HighwayEnv's names: frequencies [Hz], duration [s], vehicles beside the ego."""
         clock, scenario = self.world.clock, self.world.scenario
         kinds = {"meta": "DiscreteMetaAction", "discrete": "DiscreteAction", "continuous": "ContinuousAction"}
         observation = self.world.sensing.observation
@@ -65,83 +114,35 @@ class HighwayEnvInterface:
         return FixedConfiguration(values)
 
     def configure(self, config: Mapping[str, Any] | None) -> None:
-        """Take a change of the configuration as HighwayEnv's method does, as far as it concerns the picture.
-
-        Args:
-            config: Keys and values. What defines scenario, spaces and time is fixed when the environment is made; such
-                a change is left out, with a warning that names it.
-        """
-        stay = []
+        """Take a change of the configuration as HighwayEnv's method does; what is fixed is left out with a warning."""
         for name, value in (config or {}).items():
-            if name in PICTURE_KEYS:
+            try:
                 self.config[name] = value
-            elif name not in self.config or self.config[name] != value:
-                stay.append(name)
-        if stay:
-            warnings.warn(
-                f"configure() leaves {', '.join(stay)} as they are: the scenario and its time are fixed when the "
-                "environment is made; gym.make takes dt, horizon, observation, action and base.",
-                stacklevel=2,
-            )
-
-    @property
-    def road(self) -> Any:
-        """The road with all vehicles, the ego first, a `highway_env.road.road.Road`.
-
-        Before the first reset, as with HighwayEnv, that of an episode which is begun for it.
-        """
-        if self._episode is None:
-            self.reset()
-        assert self._episode is not None
-        if self._scene is None or self._scene[0] is not self._episode:
-            self._scene = (self._episode, make_scene(self._episode))
-        return self._scene[1]
-
-    @property
-    def controlled_vehicles(self) -> list[Any]:
-        """The ego, in a list."""
-        vehicles: list[Any] = self.road.vehicles
-        return vehicles[:1]
+            except ValueError as error:
+                warnings.warn(str(error), stacklevel=2)
 
     @property
     def vehicle(self) -> Any:
-        """The ego, a `highway_env.vehicle.kinematics.Vehicle` at this moment."""
-        return self.controlled_vehicles[0]
+        """The ego, a `highway_env.vehicle.kinematics.Vehicle` at this moment; its `road` has all vehicles.
+
+        Raises:
+            RuntimeError: Before the first reset.
+        """
+        if self._episode is None:
+            raise RuntimeError("Expected reset() before vehicle is read.")
+        return make_scene(self._episode).vehicles[0]
 
     @property
     def action_type(self) -> Any:
-        """HighwayEnv's description of the actions, with their space; with indices it has `actions_indexes`."""
-        from rare_envs.envs.highway_env_actions import describe_actions
+        """HighwayEnv's description of the actions; of meta-actions it has `actions_indexes`."""
+        from highway_env.envs.common.action import ContinuousAction, DiscreteMetaAction
 
-        return describe_actions(self, self.world.clock.action)
+        if self.world.clock.action == "meta":
+            return DiscreteMetaAction(self)
+        ranges = (-MAX_ACCELERATION, MAX_ACCELERATION), (-MAX_STEERING, MAX_STEERING)
+        return ContinuousAction(self, acceleration_range=ranges[0], steering_range=ranges[1])
 
-    def get_available_actions(self) -> list[int]:
-        """Return the indices of the actions that are possible now, as HighwayEnv does.
-
-        Raises:
-            ValueError: If actions are continuous.
-            RuntimeError: Before the first reset.
-        """
-        if self.world.clock.action == "continuous":
-            raise ValueError('Expected actions with indices, got action="continuous"; make it with action="meta".')
-        if self._episode is None:
-            raise RuntimeError("Expected reset() before get_available_actions().")
-        available: list[int] = self.action_type.get_available_actions()
-        return available
-
-    @property
-    def observation_type(self) -> Any:
-        """What the ego observes, with HighwayEnv's `space()` and `observe()`, which gives the observation of now."""
-        from rare_envs.envs.highway_env_observations import describe_observation
-
-        return describe_observation(self, self.world.sensing.observation)
-
-    @property
-    def time(self) -> float:
-        """Time since the reset [s]."""
-        return round(self._tick * self.world.clock.dt, 9)
-
-    @property
-    def steps(self) -> int:
-        """Ticks since the reset, as HighwayEnv counts them: simulation steps, not decisions."""
-        return self._tick
+    def set_record_video_wrapper(self, wrapper: Any) -> None:
+        """Let Gymnasium's `RecordVideo` have a frame of every tick of a meta-action, not one a second."""
+        self._recorder = wrapper
+        wrapper.frames_per_sec = round(1.0 / self.world.clock.dt)

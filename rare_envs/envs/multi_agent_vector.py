@@ -14,12 +14,10 @@ from rare_envs.control.actions import IDLE, read_actions
 from rare_envs.egos.loading import load_named_ego
 from rare_envs.egos.needs import resolve
 from rare_envs.egos.policy import as_driver
-from rare_envs.envs.batch_rows import merge_rows, put_masked, to_object_rows
 from rare_envs.envs.parallel import select_agents, select_rewards
+from rare_envs.envs.rows_and_infos import merge_rows, put_masked, to_object_rows
 from rare_envs.make import set_up
-from rare_envs.multi_agent.episode import MultiAgentEpisode, start
-from rare_envs.multi_agent.rewards import Reward, total_of
-from rare_envs.multi_agent.step import step_agents
+from rare_envs.multi_agent import MultiAgentEpisode, Reward, start, step_agents, total_of
 from rare_envs.sensors.kinds import map_kinds
 from rare_envs.simulation.ego_interface import EgoNeeds
 from rare_envs.simulation.observation import observe

@@ -15,12 +15,10 @@ from rare_envs.control.actions import IDLE, read_actions
 from rare_envs.egos.loading import load_named_ego
 from rare_envs.egos.needs import resolve
 from rare_envs.egos.policy import as_driver
-from rare_envs.envs.display import RENDER_MODES, Display
-from rare_envs.envs.info import Info, SingleObservation, episode_info, step_info
+from rare_envs.envs.rendering import RENDER_MODES, Display
+from rare_envs.envs.rows_and_infos import Info, SingleObservation, episode_info, step_info
 from rare_envs.make import set_up
-from rare_envs.multi_agent.episode import MultiAgentEpisode, start
-from rare_envs.multi_agent.rewards import Reward, own_reward, total_of
-from rare_envs.multi_agent.step import step_agents
+from rare_envs.multi_agent import MultiAgentEpisode, Reward, own_reward, start, step_agents, total_of
 from rare_envs.plugins import did_you_mean
 from rare_envs.scenarios.base import Scenario
 from rare_envs.sensors.kinds import map_kinds
@@ -35,7 +33,7 @@ class DrivingParallelEnv(ParallelEnv[str, SingleObservation, NDArray[np.float32]
 
     A vehicle without an action keeps its driver: the scenario's script or learned drivers, and for the ego the driver
     `ego`. An agent terminates when its vehicle touches another one or leaves the road, is truncated at the horizon,
-    and then leaves `agents`; its vehicle rolls out, see `rare_envs.multi_agent.episode`.
+    and then leaves `agents`; its vehicle rolls out, see `rare_envs.multi_agent`.
 
     Example:
         >>> env = DrivingParallelEnv("rare_envs/CutIn-v0")

@@ -1,18 +1,125 @@
 """Pictures of episodes: roads and vehicles by HighwayEnv's own graphics, numbers above, a legend below."""
 
 from collections.abc import Collection
+from itertools import pairwise
 from typing import Any, NamedTuple
 
+import gymnasium as gym
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
-from rare_envs.envs.highway_env_objects import find_crashed, make_traffic, world_places, world_point
+from rare_envs.control.meta_actions import TARGET_SPEEDS
 from rare_envs.scenarios.base import Scenario
 from rare_envs.simulation.episode import Episode
 from rare_envs.simulation.world import World
+from rare_envs.traffic.overlap import pairwise_overlaps
 from rare_envs.traffic.palette import CRASH_COLOUR, ROLE_COLOURS, as_rgb
 from rare_envs.traffic.road import Road
 from rare_envs.traffic.state import VEHICLE_LENGTH, VEHICLE_WIDTH, State
+
+_SEGMENT = 6 * 4.33
+"""A curve is drawn as straight pieces this long [m]: six stripes of HighwayEnv's."""
+_AHEAD, _BEHIND = 4, 2
+"""Pieces drawn ahead of the ego's and behind it."""
+
+
+def make_traffic(state: State, road: Road, row: int = 0) -> Any:
+    """Return HighwayEnv's road around the ego, with the vehicles where they are.
+
+    Args:
+        state: Traffic of B scenarios.
+        road: Their road.
+        row: Which one.
+
+    Returns:
+        A `highway_env.road.road.Road`; its `vehicles` are `highway_env.vehicle.kinematics.Vehicle`, the ego first.
+
+    Example:
+        >>> from rare_envs.traffic import straight
+        >>> x = torch.tensor([[0.0, 30.0]])
+        >>> traffic = make_traffic(State(x, 0 * x, 0 * x, torch.tensor([[20.0, 15.0]]), theta=x[:, :0]), straight(2))
+        >>> [vehicle.speed for vehicle in traffic.vehicles], traffic.vehicles[0].lane_index
+        ([20.0, 15.0], ('0', '1', 0))
+    """
+    from highway_env.road.road import Road as Traffic
+    from highway_env.vehicle.kinematics import Vehicle
+
+    traffic = Traffic(make_network(road, float(state.x[row, 0])))
+    for (x, y, heading), speed in zip(world_places(state, road, row), state.speed[row].tolist(), strict=True):
+        traffic.vehicles.append(Vehicle(traffic, [x, y], heading, speed))
+    return traffic
+
+
+def make_scene(episode: Episode, crashed: Collection[int] | None = None) -> Any:
+    """Return HighwayEnv's road of an episode as code of its users reads it: who has crashed, and the ego's targets.
+
+    Args:
+        episode: A batch of one.
+        crashed: Indices of the vehicles that have crashed; None for the ego, if it has, and whom it touches.
+
+    Returns:
+        As `make_traffic`; with meta-actions the ego is a `highway_env.vehicle.controller.MDPVehicle`.
+    """
+    from highway_env.vehicle.controller import MDPVehicle
+
+    traffic = make_traffic(episode.state, episode.road)
+    if crashed is None:
+        crashed = find_crashed(episode.state, episode.road) if bool(episode.collided) else ()
+    if episode.aim is not None:
+        seen = traffic.vehicles[0]
+        target = (*seen.lane_index[:2], int(episode.aim.lane[0, 0]))
+        aim = TARGET_SPEEDS[int(episode.aim.speed[0, 0])]
+        speeds = np.array(TARGET_SPEEDS)
+        traffic.vehicles[0] = MDPVehicle(traffic, seen.position, seen.heading, seen.speed, target, aim, speeds)
+    for j, vehicle in enumerate(traffic.vehicles):
+        vehicle.crashed = j in crashed
+    return traffic
+
+
+def find_crashed(state: State, road: Road) -> set[int]:
+    """Return the ego and the vehicles that it touches, in a batch of one."""
+    return {0, *pairwise_overlaps(state, road)[0, 0].nonzero().flatten().tolist()}
+
+
+def world_places(state: State, road: Road, row: int = 0) -> list[list[float]]:
+    """Return X, Y [m] and heading [rad] in the world of each vehicle of a row, shape (N, 3)."""
+    places: list[list[float]] = torch.stack(
+        road.to_world(state.x[row], state.y[row], state.heading[row]), dim=1
+    ).tolist()
+    return places
+
+
+def make_network(road: Road, x: float) -> Any:
+    """Return HighwayEnv's road network of the lanes around x [m]; a curve in straight pieces, each a road of its own.
+
+    Example:
+        >>> from rare_envs.traffic import straight
+        >>> [lane.width for lane in make_network(straight(3), 0.0).lanes_list()]
+        [4.0, 4.0, 4.0]
+    """
+    from highway_env.road.lane import LineType, StraightLane
+    from highway_env.road.road import RoadNetwork
+
+    here = x // _SEGMENT
+    cuts = [-1e3, 9e3] if road.reference_line is None else [_SEGMENT * (here + k) for k in range(-_BEHIND, _AHEAD + 2)]
+    network = RoadNetwork()
+    for lane in range(road.lanes):
+        y, width = road.centre(lane), road.edges[lane + 1] - road.edges[lane]
+        left = LineType.CONTINUOUS_LINE if lane == 0 else LineType.STRIPED
+        right = LineType.CONTINUOUS_LINE if lane == road.lanes - 1 else LineType.NONE
+        for number, (start, end) in enumerate(pairwise(cuts)):
+            piece = StraightLane(world_point(road, start, y), world_point(road, end, y), width, [left, right])
+            network.add_lane(str(number), str(number + 1), piece)
+    return network
+
+
+def world_point(road: Road, x: float, y: float) -> NDArray[np.float64]:
+    """Return world coordinates [m], shape (2,), of a point of the road."""
+    zero = torch.zeros((), dtype=torch.float64)
+    world_x, world_y, _ = road.to_world(zero + x, zero + y, zero)
+    return np.array([float(world_x), float(world_y)])
+
 
 FRAME_WIDTH, FRAME_HEIGHT = 800, 160
 """Size of the picture of the road [pixels]; it is higher where the road asks for it."""
@@ -184,3 +291,71 @@ def _corners(x: float, y: float, heading: float) -> list[tuple[float, float]]:
     cos, sin = np.cos(heading), np.sin(heading)
     box = ((along, across), (along, -across), (-along, -across), (-along, across))
     return [(x + a * cos - b * sin, y + a * sin + b * cos) for a, b in box]
+
+
+RENDER_MODES = ("rgb_array", "human")
+
+
+class Display:
+    """The picture of an environment in its render mode; HighwayEnv's graphics are loaded for the first one.
+
+    Args:
+        world: Of the episodes.
+        mode: None, "rgb_array" for images, or "human" for a window.
+
+    Raises:
+        ValueError: If the mode is none of these.
+
+    Example:
+        >>> import numpy as np, rare_envs, torch
+        >>> world = rare_envs.DrivingProblem("rare_envs/CarFollowing-v0").world
+        >>> episode = world.start(torch.tensor([[20.0, 20.0, 30.0]]))
+        >>> display = Display(world, "rgb_array")
+        >>> display.draw(episode, time=0.0).shape
+        (208, 800, 3)
+        >>> display.close()
+    """
+
+    def __init__(self, world: World, mode: str | None) -> None:
+        if mode is not None and mode not in RENDER_MODES:
+            raise ValueError(f"Expected render_mode None, 'rgb_array' or 'human', got {mode!r}.")
+        self._world = world
+        self._mode = mode
+        self._renderer: Renderer | None = None
+
+    @property
+    def is_window(self) -> bool:
+        """Whether pictures are shown in a window."""
+        return self._mode == "human"
+
+    def draw(
+        self,
+        episode: Episode | None,
+        time: float,
+        agents: Collection[int] = (),
+        crashed: Collection[int] | None = None,
+    ) -> NDArray[np.uint8] | None:
+        """Return the picture of an episode, or show it in the window; a warning where there is none to draw.
+
+        Args:
+            episode: A batch of one; None before the first.
+            time: Since its start [s].
+            agents: Vehicles that agents drive.
+            crashed: Vehicles that have crashed; None for the ego, if it has, and those that it touches.
+        """
+        if self._mode is None or episode is None:
+            gym.logger.warn(
+                "Nothing to render: make the environment with render_mode='rgb_array' or 'human', and reset it first."
+            )
+            return None
+        if self._renderer is None:
+            clock = self._world.clock
+            self._renderer = Renderer(self._world, self.is_window, clock.decisions_per_second)
+        image = self._renderer.draw(episode, time, agents=agents, crashed=crashed)
+        return None if self.is_window else image
+
+    def close(self) -> None:
+        """Close the window."""
+        if self._renderer is not None:
+            self._renderer.close()
+            self._renderer = None

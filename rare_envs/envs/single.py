@@ -1,6 +1,5 @@
 """Environment of one scenario at a time: a `gymnasium.Env` over a batch of one."""
 
-from collections.abc import Mapping
 from typing import Any, cast
 
 import gymnasium as gym
@@ -9,9 +8,9 @@ import torch
 from numpy.typing import NDArray
 
 from rare_envs.control.actions import read_actions
-from rare_envs.envs.display import RENDER_MODES, Display
 from rare_envs.envs.highway_env_interface import HighwayEnvInterface
-from rare_envs.envs.info import SingleObservation, episode_info, step_info
+from rare_envs.envs.rendering import RENDER_MODES, Display
+from rare_envs.envs.rows_and_infos import SingleObservation, episode_info, step_info
 from rare_envs.make import set_up
 from rare_envs.sensors.kinds import map_kinds
 from rare_envs.simulation.compiled.scripted_step import find_scripted_step
@@ -28,9 +27,8 @@ class DrivingEnv(HighwayEnvInterface, gym.Env[SingleObservation, Any]):
     `rare_envs.control.meta_actions`, for one second. Reward: see `rare_envs.simulation.reward`. The episode terminates
     with a collision and is truncated at the horizon. `info` carries `scenario`, `x`, `min_ttc` [s], `collision`,
     `crashed` (the same), `speed` [m/s] and `reward_terms`, and at the end `measure` (f(x)), `collision_type` and
-    `crash`, which say who ran into whom and how hard (`rare_envs.traffic.crash`), or None. Code for HighwayEnv reads
-    `config`, `road`, `vehicle`, `time`, `action_type`, `observation_type` and more, see
-    `rare_envs.envs.highway_env_interface`.
+    `crash`, which say who ran into whom and how hard (`rare_envs.traffic.crash`), or None. Scripts for HighwayEnv
+    find what they read, see `rare_envs.envs.highway_env_interface`.
 
     Example:
         >>> import gymnasium
@@ -65,18 +63,8 @@ class DrivingEnv(HighwayEnvInterface, gym.Env[SingleObservation, Any]):
         self._x = np.full(self.space.dim, np.nan)
         self._episode: Episode | None = None
         self._tick = 0
-        self._recorder: Any = None
         self._compiled = find_scripted_step(self.world, core)
         self._between = False
-
-    def set_record_video_wrapper(self, wrapper: Any) -> None:
-        """Let Gymnasium's `RecordVideo` have a frame of every tick of a meta-action, not one a second.
-
-        Args:
-            wrapper: The `RecordVideo`, as HighwayEnv's method of this name takes it.
-        """
-        self._recorder = wrapper
-        wrapper.frames_per_sec = round(1.0 / self.world.clock.dt)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -86,8 +74,7 @@ class DrivingEnv(HighwayEnvInterface, gym.Env[SingleObservation, Any]):
         Args:
             seed: Seeds the draw of the scenario.
             options: Scenario parameters by name, or {"x": vector} for all of them. What is not given is drawn: a
-                whole x comes from the base distribution, then the given parameters replace theirs. "config" is taken
-                as `configure` takes it.
+                whole x comes from the base distribution, then the given parameters replace theirs.
 
         Returns:
             Observation and info.
@@ -96,9 +83,6 @@ class DrivingEnv(HighwayEnvInterface, gym.Env[SingleObservation, Any]):
             ValueError: If an option is unknown, of the wrong shape, NaN or outside its range.
         """
         super().reset(seed=seed)
-        if isinstance(options, Mapping) and "config" in options:
-            self.configure(options["config"])
-            options = {name: value for name, value in options.items() if name != "config"}
         self._x = self.space.scenario_x(options, 1, self.np_random)[0]
         self._tick = 0
         with torch.inference_mode():

@@ -14,8 +14,10 @@ from torch import Tensor
 
 from rare_envs.control.actions import read_actions
 from rare_envs.devices import find_device, move_to
-from rare_envs.envs.batch_rows import (
+from rare_envs.envs.rendering import Renderer
+from rare_envs.envs.rows_and_infos import (
     DrawsAhead,
+    Info,
     list_tensors,
     merge_rows,
     put_masked,
@@ -23,8 +25,6 @@ from rare_envs.envs.batch_rows import (
     replace_rows,
     to_object_rows,
 )
-from rare_envs.envs.info import Info
-from rare_envs.envs.rendering import Renderer
 from rare_envs.make import set_up
 from rare_envs.sensors.kinds import map_kinds
 from rare_envs.simulation.compiled.scripted_step import find_scripted_step

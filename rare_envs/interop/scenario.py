@@ -15,9 +15,16 @@ from highway_env.utils import class_from_path
 from rare_envs.arrays import FloatArray
 from rare_envs.distributions.product import NoiseDistribution, join_independent
 from rare_envs.distributions.space import Parameter, ScenarioSpace
-from rare_envs.interop.environments import LAYOUTS
-from rare_envs.interop.measures import HIGHWAY_ENV_MEASURES
-from rare_envs.interop.parameters import IDM_PARAMETERS, Group, Layout, idm_groups, restore_class_parameters, set_idm
+from rare_envs.interop.layouts import (
+    IDM_PARAMETERS,
+    LAYOUTS,
+    Group,
+    Layout,
+    idm_groups,
+    restore_class_parameters,
+    set_idm,
+)
+from rare_envs.interop.scene import HIGHWAY_ENV_MEASURES
 from rare_envs.measures.base import COLLISION
 from rare_envs.measures.time_to_collision import TTC_MAX
 from rare_envs.plugins import did_you_mean

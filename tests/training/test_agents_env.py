@@ -9,7 +9,7 @@ import training
 from examples import adversary, shared_policy
 from rare_envs.distributions.beta import BetaDistribution
 from rare_envs.envs.multi_agent_vector import AgentsVectorEnv
-from rare_envs.multi_agent.rewards import adversary_reward
+from rare_envs.multi_agent import adversary_reward
 from rare_envs.threads import use_one_thread
 
 CUT_IN = "rare_envs/CutIn-v0"

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from rare_envs.distributions import BetaDistribution, NoiseDistribution, ProductDistribution, TruncatedGaussianMixture
 from rare_envs.distributions.space import Distribution
-from rare_envs.envs.batch_rows import ROWS_AHEAD, DrawsAhead, merge_rows, put_masked, replace_rows, to_object_rows
+from rare_envs.envs.rows_and_infos import ROWS_AHEAD, DrawsAhead, merge_rows, put_masked, replace_rows, to_object_rows
 
 BETA = BetaDistribution([2.0, 0.5], [2.0, 3.0], [0.0, 1.0], [1.0, 4.0])
 MIXTURE = TruncatedGaussianMixture([0.4, 0.6], [[0.0], [2.0]], [[[1.0]], [[0.3]]], [-1.0], [3.0])

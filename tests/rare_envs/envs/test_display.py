@@ -6,8 +6,7 @@ import pytest
 import torch
 
 import rare_envs
-from rare_envs.envs.display import Display
-from rare_envs.envs.rendering import Renderer
+from rare_envs.envs.rendering import Display, Renderer
 
 
 @pytest.fixture(scope="module")

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from rare_envs.envs.highway_env_objects import (
+from rare_envs.envs.rendering import (
     find_crashed,
     make_network,
     make_scene,

@@ -6,9 +6,9 @@ import pytest
 import torch
 
 import rare_envs  # noqa: F401  (registers its ids)
-from rare_envs.envs.info import episode_info, step_info
+from rare_envs.envs.rows_and_infos import episode_info, step_info
 from rare_envs.make import set_up
-from rare_envs.multi_agent.episode import start
+from rare_envs.multi_agent import start
 from rare_envs.simulation.reward import reward_terms
 
 

@@ -10,7 +10,7 @@ from gymnasium.utils.env_checker import data_equivalence
 from pettingzoo.utils import parallel_to_aec
 
 import rare_envs
-from rare_envs.multi_agent.rewards import own_reward
+from rare_envs.multi_agent import own_reward
 
 with warnings.catch_warnings():
     warnings.simplefilter("ignore")  # PettingZoo's test module imports what PettingZoo has deprecated

@@ -8,7 +8,7 @@ import pytest
 from numpy.typing import NDArray
 
 import rare_envs
-from rare_envs.envs.batch_rows import DRAWS_IN_A_ROW
+from rare_envs.envs.rows_and_infos import DRAWS_IN_A_ROW
 from rare_envs.envs.vector import DrivingVectorEnv, read_autoreset_mode
 from rare_envs.scenarios.registry import SCENARIOS
 
@@ -90,7 +90,7 @@ def test_same_seed_same_episodes(env_id: str) -> None:
 def test_scenarios_are_those_of_one_draw_after_the_other(env_id: str, monkeypatch: pytest.MonkeyPatch) -> None:
     runs = []
     for in_a_row in (DRAWS_IN_A_ROW, ()):
-        monkeypatch.setattr("rare_envs.envs.batch_rows.DRAWS_IN_A_ROW", in_a_row)
+        monkeypatch.setattr("rare_envs.envs.rows_and_infos.DRAWS_IN_A_ROW", in_a_row)
         batch = rare_envs.make_batch(env_id, 4, horizon=0.5)
         _, infos = batch.reset(seed=6)
         rows = [infos["x"]]

@@ -5,7 +5,7 @@ from collections.abc import Iterator
 import pytest
 from highway_env.vehicle.behavior import IDMVehicle
 
-from rare_envs.interop.parameters import restore_class_parameters
+from rare_envs.interop.layouts import restore_class_parameters
 
 
 @pytest.fixture(autouse=True)

@@ -5,7 +5,7 @@ from typing import Any
 import highway_env  # noqa: F401  (registers the ids)
 
 from rare_envs import HighwayEnvScenario
-from rare_envs.interop.simulation import make_highway_env
+from rare_envs.interop.problem import make_highway_env
 
 SMALL = {"vehicles_count": 6, "duration": 5}
 CONFIGS: dict[str, dict[str, Any] | None] = {

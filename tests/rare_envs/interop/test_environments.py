@@ -8,7 +8,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy import stats
 
-from rare_envs.interop.simulation import make_highway_env
+from rare_envs.interop.problem import make_highway_env
 from tests.rare_envs.interop.scenes import CONFIGS, others, scenario
 
 

@@ -5,8 +5,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rare_envs.interop.fast_observation import install_fast_observation
-from rare_envs.interop.simulation import make_highway_env
+from rare_envs.interop.problem import make_highway_env
+from rare_envs.interop.scene import install_fast_observation
 
 FEATURES = ["presence", "x", "y", "vx", "vy", "heading", "cos_h", "sin_h", "long_off", "cos_d"]
 KINDS: dict[str, tuple[str, dict[str, Any]]] = {

@@ -10,8 +10,8 @@ from highway_env.vehicle.kinematics import Vehicle
 from numpy.typing import NDArray
 
 import rare_envs
-from rare_envs.interop.measures import HIGHWAY_ENV_MEASURES, contact_time
-from rare_envs.interop.simulation import make_highway_env
+from rare_envs.interop.problem import make_highway_env
+from rare_envs.interop.scene import HIGHWAY_ENV_MEASURES, contact_time
 from rare_envs.traffic.oriented_boxes import axes_of, project_on_axes, time_to_contact
 from tests.rare_envs.interop.egos import Always
 

@@ -11,7 +11,7 @@ from stable_baselines3 import DQN
 
 import rare_envs
 import samplers
-from rare_envs.interop.simulation import make_highway_env
+from rare_envs.interop.problem import make_highway_env
 from tests.rare_envs.interop.egos import Always
 
 FAST = {"vehicles_count": 3, "duration": 4}

@@ -9,7 +9,7 @@ import pytest
 from highway_env.vehicle.behavior import IDMVehicle
 
 from rare_envs import HighwayEnvScenario
-from rare_envs.interop.simulation import make_highway_env
+from rare_envs.interop.problem import make_highway_env
 from tests.rare_envs.interop.scenes import CONFIGS, SMALL, scenario
 
 

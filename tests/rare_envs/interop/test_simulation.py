@@ -10,7 +10,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 import rare_envs
 from rare_envs.egos.wrappers import wrap_policy
-from rare_envs.interop.simulation import make_highway_env, strip_ego
+from rare_envs.interop.problem import make_highway_env, strip_ego
 from tests.rare_envs.interop.egos import Always, faster
 
 FAST = {"vehicles_count": 3, "duration": 4}

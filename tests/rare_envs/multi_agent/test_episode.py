@@ -4,7 +4,7 @@ import numpy as np
 import torch
 
 from rare_envs.make import set_up
-from rare_envs.multi_agent.episode import start, step_traffic, view_order
+from rare_envs.multi_agent import start, step_traffic, view_order
 
 CUT_IN = "rare_envs/CutIn-v0"
 

@@ -8,8 +8,7 @@ import torch
 from torch import Tensor
 
 import rare_envs
-from rare_envs.multi_agent import adversary_reward
-from rare_envs.multi_agent.rewards import terms_of, total_of
+from rare_envs.multi_agent import adversary_reward, terms_of, total_of
 
 FOLLOWING = "rare_envs/CarFollowing-v0"
 

@@ -5,9 +5,7 @@ import torch
 
 from rare_envs.control.actions import IDLE
 from rare_envs.control.idm import IDM
-from rare_envs.multi_agent import own_reward, play
-from rare_envs.multi_agent.episode import start
-from rare_envs.multi_agent.step import step_agents
+from rare_envs.multi_agent import own_reward, play, start, step_agents
 from rare_envs.scenarios.car_following import CAR_FOLLOWING
 from rare_envs.simulation.clock import Clock
 from rare_envs.simulation.decision import advance

@@ -15,7 +15,7 @@ import agents
 import rare_envs
 import samplers
 from rare_envs import HighwayEnvScenario
-from rare_envs.interop.parameters import restore_class_parameters
+from rare_envs.interop.layouts import restore_class_parameters
 from rare_envs.scenarios.registry import SCENARIOS
 
 Cli = Callable[..., Result]

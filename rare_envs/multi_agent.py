@@ -1,0 +1,367 @@
+"""Several agents: one traffic, seen by every vehicle as if it were the ego; its step, and the agents' rewards."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple, Protocol, TypeAlias, runtime_checkable
+
+import torch
+from torch import Tensor
+
+from rare_envs.control.actions import IDLE
+from rare_envs.control.meta_actions import initial_aim
+from rare_envs.egos.policy import PolicyDriver
+from rare_envs.simulation.decision import TickReward, hold_finished, run_ticks
+from rare_envs.simulation.episode import Episode
+from rare_envs.simulation.reward import COLLISION_COST, RewardTerms, reward_terms
+from rare_envs.simulation.rollout import Driver
+from rare_envs.simulation.world import World
+from rare_envs.traffic.overlap import pairwise_overlaps
+
+__all__ = ["AdversaryTerms", "Transition", "adversary_reward", "own_reward", "play"]
+
+
+class MultiAgentEpisode(NamedTuple):
+    """B episodes of N vehicles at one moment."""
+
+    traffic: Episode
+    """The world's episodes, which go on as long as there is an agent."""
+    views: tuple[Episode, ...]
+    """The episodes as each vehicle sees them, itself in the ego's place with a lead, a measure and collisions of its
+    own; after its collision they stay as they were then."""
+    disabled: Tensor
+    """Mask of vehicles that have crashed, or were hit by one that had, boolean, shape (B, N). A disabled vehicle
+    takes no actions: it rolls out as HighwayEnv's crashed vehicles do."""
+
+    @property
+    def collided(self) -> Tensor:
+        """Mask of vehicles that have touched another one or left the road by now, boolean, shape (B, N)."""
+        return torch.stack([view.collided for view in self.views], dim=1)
+
+
+def start(world: World, x: Tensor) -> MultiAgentEpisode:
+    """Begin B episodes.
+
+    Args:
+        world: The world.
+        x: Scenario parameters, as in `World.start`.
+    """
+    traffic = world.start(x)
+    none = torch.zeros_like(traffic.state.x, dtype=torch.bool)
+    traffic = traffic._replace(overridden=none)
+    camera = traffic.camera_context
+    others = (
+        world.start_from(
+            traffic.state.seen_by(j),
+            _view_perception(traffic.perception, j),
+            camera_context=camera and camera._replace(viewer=j),
+        )
+        for j in range(1, world.scenario.vehicles)
+    )
+    return MultiAgentEpisode(traffic, (traffic, *others), none)
+
+
+def step_traffic(world: World, episode: MultiAgentEpisode, action: Tensor, commanded: Tensor) -> MultiAgentEpisode:
+    """Move every vehicle by one tick.
+
+    Contacts between vehicles that follow script or drivers are recorded, and do not change their motion, as in an
+    environment of one agent. A vehicle is disabled when it touches the ego, a commanded or a disabled vehicle, which is
+    disabled too; so is the ego or a commanded vehicle that leaves the road.
+
+    Args:
+        world: The world.
+        episode: B episodes.
+        action: Acceleration [m/s^2] and steering angle [rad] of the vehicles, shape (B, N, 2); the ego's always counts.
+        commanded: Which vehicles take their action, boolean, shape (B, N).
+
+    Returns:
+        The episodes one tick later.
+    """
+    traffic, disabled, road = episode.traffic, episode.disabled, world.scenario.road
+    active = commanded | disabled
+    speed = traffic.state.speed
+    rolling_out = torch.stack((-speed, torch.zeros_like(speed)), dim=-1)
+    traffic = world.step(traffic, torch.where(disabled[..., None], rolling_out, action), active)
+    state = traffic.state
+    touching, off = pairwise_overlaps(state, road), road.off_road(state.y)
+    hit = touching.any(dim=2)
+    if world.measurement.collisions == "any":
+        hit = hit.any(dim=1, keepdim=True)
+    hit = hit | off
+    views = [traffic]
+    for j, view in enumerate(episode.views[1:], start=1):
+        views.append(world.update(view, state.seen_by(j), _view_perception(traffic.perception, j), hit[:, j]))
+    held = tuple(
+        hold_finished(old.collided, old, new) if bool(old.collided.any()) else new
+        for old, new in zip(episode.views, views, strict=True)
+    )
+    active = active | (torch.arange(active.shape[1], device=active.device) == 0)
+    struck = (touching & (active[:, :, None] | active[:, None, :])).any(dim=2) | (off & active)
+    return MultiAgentEpisode(traffic, held, disabled | struck)
+
+
+def view_order(vehicle: int, vehicles: int) -> list[int]:
+    """Return the vehicles in the order of `State.seen_by`.
+
+    Example:
+        >>> view_order(1, 3)
+        [1, 0, 2]
+    """
+    return [vehicle, *(j for j in range(vehicles) if j != vehicle)]
+
+
+def _view_perception(perception: Tensor | None, vehicle: int) -> Tensor | None:
+    """Return the vehicles' lidar features in the order of `State.seen_by`."""
+    return None if perception is None else perception[:, view_order(vehicle, perception.shape[1])]
+
+
+class Transition(NamedTuple):
+    """A tick of one agent: all that a reward may depend on.
+
+    Example:
+        >>> Transition._fields
+        ('before', 'after', 'vehicle', 'action')
+    """
+
+    before: MultiAgentEpisode
+    after: MultiAgentEpisode
+    vehicle: int
+    """Index of the agent's vehicle."""
+    action: Tensor
+    """Acceleration [m/s^2] and steering angle [rad] of its vehicle, shape (B, 2); 0 where its driver decided."""
+
+
+Reward: TypeAlias = Callable[[Transition], Any]
+"""From a transition to a reward of shape (B,): a tensor, or a named tuple of terms with their sum as `total`."""
+
+
+@runtime_checkable
+class SummedTerms(Protocol):
+    """A reward as a named tuple of terms."""
+
+    @property
+    def total(self) -> Tensor:
+        """The reward, shape (B,)."""
+
+    def _asdict(self) -> dict[str, Tensor]:
+        """Return the terms by name, shape (B,) each."""
+
+
+def own_reward(transition: Transition) -> RewardTerms:
+    """Return the reward that egos are trained on, for any vehicle: in its own view.
+
+    Args:
+        transition: Of B episodes.
+
+    Example:
+        >>> import rare_envs
+        >>> env = rare_envs.parallel_env("rare_envs/CutIn-v0", agents=["cutter"], rewards={"cutter": own_reward})
+        >>> _ = env.reset(seed=0)
+        >>> *_, infos = env.step({"cutter": [0.0, 0.0]})
+        >>> list(infos["cutter"]["reward_terms"])
+        ['progress', 'comfort', 'lane', 'risk', 'headway', 'collision']
+    """
+    return reward_terms(transition.after.views[transition.vehicle], transition.action)
+
+
+class AdversaryTerms(NamedTuple):
+    """Terms of an adversary's reward of one tick, shape (B,) each; the reward is their sum.
+
+    Example:
+        >>> import torch
+        >>> float(AdversaryTerms(*torch.tensor([[0.5], [0.0], [-0.25], [-0.125], [0.0]])).total)
+        0.125
+    """
+
+    danger: Tensor
+    """1 - TTC / 4 s where the ego's time to collision is shorter than that."""
+    collision: Tensor
+    """30 in the tick in which the ego collides."""
+    comfort: Tensor
+    """-0.1 (acceleration / 5 m/s^2)^2 - 0.1 (steering / 0.1 rad)^2, so that it drives as road users do."""
+    lane: Tensor
+    """-0.5 (offset from the centre of the nearest lane / half a lane)^2."""
+    fault: Tensor
+    """-30 in the tick in which it collides with anything but the ego: the road's edge or another vehicle."""
+
+    @property
+    def total(self) -> Tensor:
+        """The reward, shape (B,)."""
+        return self.danger + self.collision + self.comfort + self.lane + self.fault
+
+
+def adversary_reward(transition: Transition) -> AdversaryTerms:
+    """Return the reward of a vehicle that brings the ego into danger, and stays a road user while it does.
+
+    Args:
+        transition: Of B episodes.
+
+    Example:
+        >>> import rare_envs
+        >>> env = rare_envs.parallel_env("rare_envs/CutIn-v0", agents=["cutter"], rewards={"cutter": adversary_reward})
+        >>> _ = env.reset(seed=0)
+        >>> *_, infos = env.step({"cutter": [0.0, 0.0]})
+        >>> infos["cutter"]["reward_terms"]["collision"]
+        0.0
+    """
+    ego, view = transition.after.views[0], transition.after.views[transition.vehicle]
+    own = reward_terms(view, transition.action)
+    danger = -reward_terms(ego, torch.zeros_like(transition.action)).risk
+    crash = ego.collided & ~transition.before.views[0].collided
+    alone = view.collided & ~transition.before.views[transition.vehicle].collided & ~crash
+    return AdversaryTerms(
+        danger=torch.where(ego.collided, torch.zeros_like(danger), danger),
+        collision=COLLISION_COST * crash.to(danger.dtype),
+        comfort=own.comfort,
+        lane=own.lane,
+        fault=-COLLISION_COST * alone.to(danger.dtype),
+    )
+
+
+def total_of(reward: Any) -> Tensor:
+    """Return a reward as a tensor of shape (B,).
+
+    Args:
+        reward: What a reward function returned.
+
+    Raises:
+        ValueError: If it is neither a tensor of shape (B,) nor terms with such a `total`.
+    """
+    total = reward.total if isinstance(reward, SummedTerms) else reward
+    if not isinstance(total, Tensor) or total.ndim != 1:
+        raise ValueError(f"Expected a reward of shape (B,) or terms with a `total`, got {reward!r}.")
+    return total
+
+
+def terms_of(reward: Any) -> dict[str, Tensor]:
+    """Return the terms of a reward by name; one, "reward", if it has none."""
+    has_terms = type(reward) is RewardTerms or isinstance(reward, SummedTerms)  # the first is usual, and fast
+    return dict(reward._asdict()) if has_terms else {"reward": reward}
+
+
+class JointStepResult(NamedTuple):
+    """Result of the agents' decisions."""
+
+    episode: MultiAgentEpisode
+    rewards: dict[int, Any]
+    """By vehicle, as its reward function gives them: their mean over the ticks, where ticks after its collision count
+    as 0."""
+    memory: Any
+    """Of the ego's driver."""
+
+
+class _Joint(NamedTuple):
+    """What goes on from tick to tick."""
+
+    episode: MultiAgentEpisode
+    memory: Any
+    """Of the ego's driver."""
+
+    @property
+    def collided(self) -> Tensor:
+        """Which vehicles have collided, boolean, shape (B, N)."""
+        return self.episode.collided
+
+
+def step_agents(
+    world: World,
+    episode: MultiAgentEpisode,
+    action: Tensor,
+    commanded: Tensor,
+    rewards: Mapping[int, Reward],
+    ego: Driver,
+    memory: Any = None,
+) -> JointStepResult:
+    """Carry out decisions, as `rare_envs.simulation.decision.advance` does for one agent.
+
+    Vehicles that have collided are held by `step_traffic`, because some may have before the decision.
+
+    Args:
+        world: The world.
+        episode: B episodes.
+        action: Of all vehicles: physical, shape (B, N, 2), or meta-actions, shape (B, N).
+        commanded: Which vehicles take their action, boolean, shape (B, N).
+        rewards: Reward functions by vehicle.
+        ego: Drives the ego where it is not commanded.
+        memory: The ego's driver's.
+
+    Returns:
+        The episodes at the time of the next decision, rewards and memory.
+    """
+
+    def tick(old: _Joint, chosen: Tensor, first: bool) -> tuple[_Joint, list[TickReward]]:
+        before = old.episode
+        traffic, physical, kept = _combine_actions(world, before, chosen, commanded, ego, old.memory)
+        after = step_traffic(world, before._replace(traffic=traffic), physical, commanded)
+        earned = [
+            TickReward(reward(Transition(before, after, j, physical[:, j])), before.views[j].collided)
+            for j, reward in rewards.items()
+        ]
+        return _Joint(after, kept), earned
+
+    end, means = run_ticks(world.clock, _Joint(episode, memory), action, tick)
+    return JointStepResult(end.episode, dict(zip(rewards, means, strict=True)), end.memory)
+
+
+def _combine_actions(
+    world: World, episode: MultiAgentEpisode, action: Tensor, commanded: Tensor, ego: Driver, memory: Any
+) -> tuple[Episode, Tensor, Any]:
+    """Combine the agents' actions with those of the ego's driver.
+
+    Returns:
+        The traffic with its new aims, accelerations and steering angles (B, N, 2), and the memory of the ego's driver.
+    """
+    by_driver = ~commanded[:, 0]
+    driven: Tensor | None = None
+    if bool(by_driver.any()):
+        driven, memory = ego.act(episode.views[0], memory)
+        if not driven.is_floating_point():  # a policy with meta-actions in such a world
+            mixed = torch.where(by_driver, driven, action[:, 0])
+            action, driven = torch.cat((mixed[:, None], action[:, 1:]), dim=1), None
+    traffic, physical = world.decode_meta_actions(episode.traffic, action, commanded)
+    first = torch.arange(physical.shape[1], device=physical.device) == 0
+    physical = torch.where((commanded | first)[..., None], physical, torch.zeros_like(physical))
+    if driven is None:
+        return traffic, physical, memory
+    physical = torch.where((first & by_driver[:, None])[..., None], driven[:, None].to(physical), physical)
+    if traffic.aim is not None:  # the ego aims for nothing while a driver drives it
+        where = initial_aim(traffic.state, traffic.road)
+        aim = (torch.where(first & by_driver[:, None], new, old) for new, old in zip(where, traffic.aim, strict=True))
+        traffic = traffic._replace(aim=type(where)(*aim))
+    return traffic, physical, memory
+
+
+def play(world: World, x: Tensor, policies: Mapping[int, Any], ego: Driver) -> MultiAgentEpisode:
+    """Drive B scenarios from start to horizon with policies in some of the vehicles.
+
+    Example:
+        >>> from rare_envs.control.idm import IDM
+        >>> from rare_envs.scenarios.car_following import CAR_FOLLOWING
+        >>> x = torch.tensor([[20.0, 15.0, 30.0]])  # ego and lead speed [m/s], gap [m]
+        >>> play(World(CAR_FOLLOWING), x, {}, IDM()).collided  # of ego and lead
+        tensor([[False, False]])
+
+    Args:
+        world: The world.
+        x: Scenario parameters, shape (B, d).
+        policies: Objects with Stable-Baselines3's `predict`, by vehicle; the others keep their drivers.
+        ego: Drives the ego if it has no policy.
+
+    Returns:
+        The episodes at the horizon.
+    """
+    observation, action_kind = world.sensing.observation, world.clock.action
+    drivers = {vehicle: PolicyDriver(policy, observation, action_kind) for vehicle, policy in policies.items()}
+    episode, memory = start(world, x), None
+    memories: dict[int, Any] = dict.fromkeys(drivers)
+    batch, n = episode.disabled.shape
+    commanded = torch.zeros(batch, n, dtype=torch.bool, device=x.device)
+    commanded[:, list(drivers)] = True
+    shape = (batch, n) if action_kind == "meta" else (batch, n, 2)
+    for _ in range(world.clock.ticks // world.clock.stride):
+        action = torch.full(shape, IDLE) if action_kind == "meta" else torch.zeros(shape)
+        for vehicle, driver in drivers.items():
+            chosen, memories[vehicle] = driver.act(episode.views[vehicle], memories[vehicle])
+            action[:, vehicle] = chosen
+        episode, _, memory = step_agents(world, episode, action, commanded, {}, ego, memory)
+    return episode
