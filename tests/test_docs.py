@@ -71,7 +71,14 @@ def _without_padding(text: str) -> str:
     return re.sub(r"(?<=[\[(])\s+|\s+(?=[\])])", "", text.strip())
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+QUICK = ("README.md", "tutorial.md")
+"""Pages whose code runs by default."""
+
+
+@pytest.mark.parametrize(
+    "page",
+    [pytest.param(page, id=page.name, marks=[] if page.name in QUICK else pytest.mark.slow) for page in PAGES],
+)
 @use_one_thread()
 def test_code_of_a_page(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     if page.name == "measures.md":

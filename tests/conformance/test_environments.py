@@ -18,7 +18,13 @@ from rare_envs.simulation.rollout import drive
 KINDS = [kind for kind in OBSERVATIONS if kind != "camera"]
 """Images have a suite of their own: they are slow, and not every wrapper is for them."""
 every = pytest.mark.parametrize("env_id", rare_envs.ENV_IDS)
-each_kind = pytest.mark.parametrize(("observation", "action"), list(product(KINDS, ACTIONS)))
+each_kind = pytest.mark.parametrize(
+    ("observation", "action"),
+    [
+        pytest.param(kind, action, marks=[] if kind == KINDS[0] or action == next(iter(ACTIONS)) else pytest.mark.slow)
+        for kind, action in product(KINDS, ACTIONS)
+    ],
+)
 WRAPPERS = {
     "TimeLimit": lambda env: wrappers.TimeLimit(env, 3),
     "RecordEpisodeStatistics": wrappers.RecordEpisodeStatistics,
