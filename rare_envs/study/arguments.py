@@ -32,14 +32,7 @@ _TYPE_WORDS = {"str": "a text", "int": "a whole number", "float": "a number", "b
 
 
 def argument(default: Any, help: str, **about: Any) -> Any:
-    """Return a field with the text of its option.
-
-    Args:
-        default: Its value where none is given.
-        help: What it is.
-        **about: "option", the name of option and key where it is not that of the field; "flags", the words of a switch
-            that has two; "show_default", the default in words; "count", whether 1e4 is such a number too.
-    """
+    """Return a field with the text of its option."""
     return field(default=default, metadata={"help": help, **about})
 
 
@@ -130,11 +123,7 @@ class Question:
 
     @property
     def run_arguments(self) -> RunArguments:
-        """The arguments of `samplers.estimate`.
-
-        Raises:
-            ValueError: If one of them is out of range.
-        """
+        """The arguments of `samplers.estimate`."""
         from samplers.execution.arguments import RunArguments
 
         return RunArguments(
@@ -157,11 +146,7 @@ class Question:
         return round(2.0 * self.gate_confidence - 1.0, 12)  # 0.9, where floating point has 0.8999999999999999
 
     def check(self) -> Stepping:
-        """Return the method, after a check of all that is known before the ego is loaded, which takes seconds.
-
-        Raises:
-            ValueError: An argument of `samplers.estimate` is out of range, or there is no such method or environment.
-        """
+        """Return the method, after a check of all that is known before the ego is loaded, which takes seconds."""
         import samplers
         from samplers.validation import check_whole
 
@@ -186,11 +171,7 @@ class ExecutorOptions:
     memory_limit: float | None = argument(None, "GiB that the simulations of a worker process may take (Linux).")
 
     def make(self) -> Executor | None:
-        """Return the executor; None for this process.
-
-        Raises:
-            ValueError: If an option is out of range, or does not go with the executor.
-        """
+        """Return the executor; None for this process."""
         import samplers
 
         settings = {"--address": self.address, "--time-limit": self.time_limit, "--memory-limit": self.memory_limit}
@@ -217,14 +198,7 @@ def option_name(argument: Field[Any]) -> str:
 
 
 def read_question(values: Any) -> Question:
-    """Return the question that a file has, without the fields that this version does not know.
-
-    Args:
-        values: From JSON, of any form.
-
-    Raises:
-        BadInput: It is no question.
-    """
+    """Return the question that a file has, without the fields that this version does not know."""
     if not isinstance(values, dict) or "env_id" not in values:
         raise BadInput(f"Expected a recorded question, an object with env_id, got {reprlib.repr(values)}.")
     known = {each.name: each for each in fields(Question) if each.name in values}

@@ -15,23 +15,23 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 import agents
 from agents.loading import find_ego_kind
 from agents.sb3.saved_ego import load_saved_ego
-from rare_envs.files import check_ordinary, read_text_file, replace_file, replace_text
+from rare_envs.files import check_ordinary, replace_file, replace_text
 from rare_envs.json_text import parse_json_object
 from rare_envs.make import set_up
 from rare_envs.problem import DrivingProblem
 from rare_envs.scenarios.registry import find_scenario
 from rare_envs.study.arguments import Question, read_question
 from rare_envs.study.errors import BadInput, as_bad_input, output_folder
-from rare_envs.study.journal import refuse_unfinished
 from rare_envs.study.question import build_problem, prepare
-from rare_envs.study.recorded_question import note_question, open_question
-from rare_envs.study.run_folder import CRASH, FAILURES, RESULT, read_failures
-from rare_envs.study.video import REPLAY_TOLERANCE, RecordedFailure, count_found
+from rare_envs.study.recorded_question import load_finished, note_question, open_question, open_run
+from rare_envs.study.run_folder import CRASH, LoadedStudy
+from rare_envs.study.video import REPLAY_TOLERANCE, RecordedFailure, check_number_of_failure, count_found
 from rare_envs.version import __version__
 from training import Retraining
 
@@ -60,13 +60,6 @@ class StoredFailure:
         base: Base distribution of the run; the scenario's default when None. It says how likely x is, and does not
             change what happens in it.
         versions: Versions of this program and of the libraries that simulate.
-
-    Example:
-        >>> world = {**{name: getattr(Question(env_id=""), name) for name in WORLD_FIELDS}, "horizon": 4.0}
-        >>> x = {"ego_speed": [20.0], "lead_speed": [5.0], "gap": [10.0]}
-        >>> stored = StoredFailure("rare_envs/CarFollowing-v0", world, x, f=-1.0, log_p0=-9.0, ego="idm")
-        >>> stored.key, parse_stored(stored.to_json(), "the file") == stored
-        ('d1b67d1f89efd1b8', True)
     """
 
     env_id: str
@@ -106,28 +99,14 @@ class StoredFailure:
         return json.dumps(content, allow_nan=False, indent=1) + "\n"
 
 
-def describe_versions() -> dict[str, str]:
-    """Return the versions that the outcome of a simulation may depend on."""
-    import torch
-
-    return {"rare_envs": __version__, "torch": torch.__version__, "numpy": np.__version__}
-
-
 def make_stored(
     question: Question, x: Mapping[str, NDArray[np.float64]], f: float, log_p0: float, crash: str
 ) -> StoredFailure:
-    """Return a failure of a run as it is stored.
-
-    Args:
-        question: Of the run.
-        x: Parameters by name, each a number or (size,).
-        f: The measure.
-        log_p0: Log density.
-        crash: Kind of crash.
-    """
+    """Return a failure of a run as it is stored."""
     values = {name: np.atleast_1d(part).astype(np.float64).tolist() for name, part in x.items()}
     world = {name: getattr(question, name) for name in WORLD_FIELDS}
-    base, versions = _name_base(question), describe_versions()
+    versions = {"rare_envs": __version__, "torch": torch.__version__, "numpy": np.__version__}
+    base = _name_base(question)
     return StoredFailure(question.env_id, world, values, f, log_p0, question.ego, crash, base, versions)
 
 
@@ -140,49 +119,41 @@ def _name_base(question: Question) -> str | None:
 
 
 def parse_stored(text: str, source: str) -> StoredFailure:
-    """Return the failure that a file has.
-
-    Args:
-        text: Of the file, which anybody may have written.
-        source: Its name, for messages.
-
-    Raises:
-        ValueError: It is no stored failure, or was changed after it was written.
-    """
+    """Return the failure that a file has, which anybody may have written; `source` is its name, for messages."""
     content = parse_json_object(text, source)
     if content.get("format") != STORED_FORMAT:
         raise ValueError(f"{source}: expected format {STORED_FORMAT}, got {reprlib.repr(content.get('format'))}.")
     try:
-        stored = StoredFailure(**{each.name: content[each.name] for each in fields(StoredFailure)})
+        values = {each.name: content[each.name] for each in fields(StoredFailure)}
     except KeyError as error:
         raise ValueError(f"{source} has no {error}.") from None
-    _check_words(stored, source)
-    _check_numbers(stored, source)
+    _check_words(values, source)
+    _check_numbers(values, source)
+    for name in ("f", "log_p0"):
+        values[name] = math.nan if values[name] is None else float(values[name])
+    stored = StoredFailure(**values)
     if stored.digest != content.get("sha256"):
         raise ValueError(f"{source}: the scenario is not the one that was stored (its sha256 differs).")
-    f, log_p0 = (math.nan if value is None else float(value) for value in (stored.f, stored.log_p0))
-    return StoredFailure(
-        **{**{each.name: content[each.name] for each in fields(StoredFailure)}, "f": f, "log_p0": log_p0}
-    )
+    return stored
 
 
-def _check_words(stored: StoredFailure, source: str) -> None:
-    words = (stored.env_id, stored.ego, stored.crash)
+def _check_words(values: Mapping[str, Any], source: str) -> None:
+    words = (values["env_id"], values["ego"], values["crash"])
     if not all(isinstance(word, str) and len(word) <= MAX_WORD for word in words):
         raise ValueError(f"{source}: expected env_id, ego and crash of up to {MAX_WORD} letters.")
-    if stored.base is not None and not isinstance(stored.base, str):
+    if values["base"] is not None and not isinstance(values["base"], str):
         raise ValueError(f"{source}: expected base to be a name or null.")
-    if not isinstance(stored.world, dict) or set(stored.world) != set(WORLD_FIELDS):
+    if not isinstance(values["world"], dict) or set(values["world"]) != set(WORLD_FIELDS):
         raise ValueError(f"{source}: expected a world with {', '.join(WORLD_FIELDS)}.")
 
 
-def _check_numbers(stored: StoredFailure, source: str) -> None:
-    x = stored.x
-    rows = x.values() if isinstance(x, dict) else ()
-    if not rows or not all(isinstance(row, list) and all(_is_number(value) for value in row) for row in rows):
+def _check_numbers(values: Mapping[str, Any], source: str) -> None:
+    rows = values["x"].values() if isinstance(values["x"], dict) else ()
+    if not rows or not all(isinstance(row, list) and all(map(_is_number, row)) for row in rows):
         raise ValueError(f"{source}: expected x with lists of finite numbers by name.")
-    gamma = stored.world["gamma"]
-    if not _is_number(gamma) or not all(value is None or _is_number(value) for value in (stored.f, stored.log_p0)):
+    if not _is_number(values["world"]["gamma"]) or not all(
+        values[name] is None or _is_number(values[name]) for name in ("f", "log_p0")
+    ):
         raise ValueError(f"{source}: expected gamma, f and log_p0 to be numbers.")
 
 
@@ -191,12 +162,7 @@ def _is_number(value: object) -> bool:
 
 
 def read_stored(path: Path) -> StoredFailure:
-    """Read a file of a corpus.
-
-    Raises:
-        ValueError: It is no stored failure.
-        OSError: It cannot be read.
-    """
+    """Read a file of a corpus."""
     check_ordinary(path, MAX_STORED)
     content = path.read_bytes()
     return parse_stored(content.decode("utf-8", "replace"), repr(str(path)))
@@ -215,63 +181,30 @@ def read_run(folder: Path, trust: bool = False) -> list[StoredFailure]:
 
     Raises:
         BadInput: There is no such run, it is not finished, its files are damaged, or it is not trusted.
+    """
+    return _list_failures(load_finished(folder), trust)
 
-    Example:
-        >>> read_run(Path("runs/nowhere"))
-        Traceback (most recent call last):
-            ...
-        rare_envs.study.errors.BadInput: No run in 'runs/nowhere': expected result.json and failures.csv, as rare-envs estimate --out writes.
-    """  # noqa: E501 (the example shows a whole message)
-    question = open_question(read_recorded(folder).get("question"), folder, trust)
-    try:
-        table = read_failures(folder)
-    except OSError as error:
-        raise BadInput(_no_run(folder)) from error
-    except ValueError as error:
-        raise BadInput(error) from error
+
+def _list_failures(run: LoadedStudy, trust: bool) -> list[StoredFailure]:
+    question, table = open_run(run, trust), run.failures
     names = [name for name in table if name not in ("f", "log_p0", *CRASH)]
     if not names or not all(np.isfinite(table[name]).all() for name in names):
-        raise BadInput(f"The files of failures in {str(folder)!r} are damaged: a parameter is no number.")
-    words = table.get(CRASH[0])
+        raise BadInput(f"The files of failures in {str(run.folder)!r} are damaged: a parameter is no number.")
+    crashes = table.get(CRASH[0], [""] * len(table["f"]))
     return [
         make_stored(
             question,
             {name: table[name][k] for name in names},
             float(table["f"][k]),
             float(table["log_p0"][k]),
-            "" if words is None else str(words[k]),
+            str(crashes[k]),
         )
         for k in range(len(table["f"]))
     ]
 
 
-def read_recorded(folder: Path) -> dict[str, Any]:
-    """Return what the file `RESULT` of a finished run has.
-
-    Raises:
-        BadInput: There is no such run, or it is not finished.
-    """
-    refuse_unfinished(folder)
-    try:
-        return parse_json_object(read_text_file(folder / RESULT), repr(str(folder / RESULT)))
-    except OSError as error:
-        raise BadInput(_no_run(folder)) from error
-    except ValueError as error:
-        raise BadInput(error) from error
-
-
-def _no_run(folder: Path) -> str:
-    return f"No run in {str(folder)!r}: expected {RESULT} and {FAILURES}, as rare-envs estimate --out writes."
-
-
 def choose_likely(failures: Sequence[StoredFailure], most: int, modes: Sequence[int] = ()) -> list[StoredFailure]:
-    """Return the `most` most likely failures, one of each kind of crash and mode among them as far as there is room.
-
-    Args:
-        failures: The most likely first.
-        most: Their number.
-        modes: Numbers of the failures that stand for a mode each.
-    """
+    """Return the `most` most likely failures, one of each kind of crash and mode among them as far as there is room."""
     first: dict[str, int] = {}
     for number, failure in enumerate(failures):
         first.setdefault(failure.crash, number)
@@ -293,23 +226,12 @@ def add_run(run: Path, corpus: Path, most: int = 20, trust: bool = False) -> tup
 
     Raises:
         BadInput: There is no such run, or the corpus cannot be written.
-
-    Example:
-        >>> from tempfile import TemporaryDirectory
-        >>> from rare_envs.study import Question, prepare, run_into
-        >>> question = Question(
-        ...     env_id="rare_envs/CarFollowing-v0", base="us101-gap", gamma=3.0, horizon=3.0, method="mc", max_sim=1000
-        ... )
-        >>> with TemporaryDirectory() as folder:
-        ...     report = run_into(Path(folder) / "run", prepare(question))
-        ...     chosen, new = add_run(Path(folder) / "run", Path(folder) / "corpus", most=5)
-        ...     len(chosen), new, len(read_corpus(Path(folder) / "corpus"))
-        (5, 5, 5)
     """
     if most < 1:
         raise BadInput(f"Expected at least one failure to add, got {most}.")
-    failures = read_run(run, trust)
-    chosen = choose_likely(failures, most, _find_modes(read_recorded(run), len(failures)))
+    study = load_finished(run)
+    failures = _list_failures(study, trust)
+    chosen = choose_likely(failures, most, _find_modes(study.result, len(failures)))
     if not chosen:
         raise BadInput(f"The run in {str(run)!r} has no failure.")
     new = 0
@@ -335,12 +257,6 @@ def read_corpus(folder: Path) -> list[StoredFailure]:
 
     Raises:
         BadInput: There is none, or one of its files is damaged.
-
-    Example:
-        >>> read_corpus(Path("nowhere"))
-        Traceback (most recent call last):
-            ...
-        rare_envs.study.errors.BadInput: There is no corpus in 'nowhere': rare-envs corpus add RUN makes one.
     """
     paths = sorted(folder.glob("*.json"))
     if not paths:
@@ -355,9 +271,6 @@ def join_x(failures: Sequence[StoredFailure], names: Sequence[str], sizes: Seque
     """Return x (n, d) of failures for a problem with these parameters.
 
     An ego's own noise, `ego_noise`, belongs to the ego that failed: another one has zeros, its mean actions.
-
-    Raises:
-        ValueError: A failure lacks a parameter, or has another size of it.
     """
     rows = []
     for failure in failures:
@@ -376,18 +289,12 @@ def join_x(failures: Sequence[StoredFailure], names: Sequence[str], sizes: Seque
     return np.array(rows, dtype=np.float64)
 
 
-NO_FAILURE = "The run has no failure."
 TrialOutcome = Literal["passed", "failed", "error"]
 
 
 @dataclass(frozen=True, kw_only=True)
 class EgoChoice:
-    """An ego as options name it, and its interface.
-
-    Example:
-        >>> EgoChoice(ego="ppo.zip", observation="lidar")
-        EgoChoice(ego='ppo.zip', algo=None, stats=None, observation='lidar', action=None)
-    """
+    """An ego as options name it, and its interface."""
 
     ego: str
     algo: str | None = None
@@ -406,12 +313,6 @@ class Trial:
         f: Its measure; NaN after an error.
         crash: Kind of its crash, where it failed.
         reason: The error.
-
-    Example:
-        >>> stored = StoredFailure("rare_envs/CutIn-v0", {"gamma": 0.0}, {"x": [1.0]}, f=-1.0, log_p0=-9.0)
-        >>> trial = Trial(stored, "passed", f=1.5)
-        >>> trial.same, trial.to_dict()["outcome"]
-        (False, 'passed')
     """
 
     failure: StoredFailure
@@ -457,15 +358,6 @@ def try_ego(
 
     Raises:
         BadInput: The ego cannot be used, or a scenario is not one of its world any longer.
-
-    Example:
-        >>> from rare_envs.study.corpus import WORLD_FIELDS
-        >>> world = {name: getattr(Question(env_id=""), name) for name in WORLD_FIELDS}
-        >>> x = {"ego_speed": [20.0], "lead_speed": [5.0], "gap": [10.0]}
-        >>> stored = StoredFailure("rare_envs/CarFollowing-v0", world, x, f=-1.0, log_p0=-9.0)
-        >>> (trial,), _ = try_ego([stored], EgoChoice(ego="idm"), Path("corpus"))
-        >>> trial.outcome, trial.f, trial.crash
-        ('failed', -1.0, 'rear_end')
     """
     worlds: dict[str, list[int]] = {}
     for number, failure in enumerate(failures):
@@ -481,52 +373,28 @@ def try_ego(
     return [trials[number] for number in range(len(failures))], time.perf_counter() - start
 
 
-def repeat_run(folder: Path, failures: Sequence[StoredFailure], trust: bool = False) -> tuple[list[Trial], float]:
-    """Drive the ego of a run through its failures again; arguments and errors as of `try_ego`.
-
-    Args:
-        folder: Of the run.
-        failures: Of `read_run`.
-        trust: As `try_ego`.
-    """
-    start = time.perf_counter()
+def repeat_run(folder: Path, trust: bool = False) -> tuple[list[Trial], float]:
+    """Drive the ego of a run through its failures again; returns and errors as of `try_ego`."""
+    start, run = time.perf_counter(), load_finished(folder)
+    failures = _list_failures(run, trust)
     with as_bad_input(ValueError, OSError):
-        question = open_question(read_recorded(folder).get("question"), folder, trust)
-        problem = prepare(question).problem
+        problem = prepare(open_run(run, trust)).problem
         trials = _try_world(problem, failures)
     return trials, time.perf_counter() - start
 
 
 def find_for_ego(folder: Path, number: int, ego: str, trust: bool = False) -> RecordedFailure:
-    """Return failure `number` of a run, with another ego in its world.
-
-    Raises:
-        BadInput: There is no such run or failure, or the ego cannot be used.
-    """
-    failures = read_run(folder, trust)
-    if not 0 <= number < len(failures):
-        raise BadInput(f"Expected a failure from 0 to {len(failures) - 1}, got {number}." if failures else NO_FAILURE)
+    """Return failure `number` of a run, with another ego in its world."""
+    run = load_finished(folder)
+    failures = _list_failures(run, trust)
+    check_number_of_failure(number, len(failures))
     failure = failures[number]
-    problem, x = load_world(failure, EgoChoice(ego=ego), folder, trust)
-    return RecordedFailure(
-        problem, x, failure.f, failure.log_p0, len(failures), count_found(read_recorded(folder), len(failures))
-    )
-
-
-def load_world(
-    failure: StoredFailure, choice: EgoChoice, folder: Path, trust: bool = False
-) -> tuple[DrivingProblem, NDArray[np.float64]]:
-    """Return the world of a stored failure with another ego in it, and x (d,).
-
-    Raises:
-        BadInput: As `try_ego`.
-    """
     question = open_question(failure.question_values(), folder, trust)
     with as_bad_input(ValueError, OSError, ImportError), np.errstate():
-        ego = agents.load_ego(choice.ego, algo=choice.algo, trust=trust, stats=choice.stats)
-        problem = _build(question, choice, ego)
+        problem = _build(question, EgoChoice(ego=ego), agents.load_ego(ego, trust=trust))
         x = problem.space.validate(join_x([failure], problem.space.names, problem.space.sizes))
-    return problem, x[0]
+    found = count_found(run.result, len(failures))
+    return RecordedFailure(problem, x[0], failure.f, failure.log_p0, len(failures), found)
 
 
 def _build(question: Question, choice: EgoChoice, ego: Any) -> DrivingProblem:
@@ -560,9 +428,6 @@ def write_junit(path: Path, trials: Sequence[Trial], ego: str, seconds: float) -
         trials: Of the ego.
         ego: Its name.
         seconds: Wall time of all of them [s].
-
-    Raises:
-        OSError: It cannot be written.
     """
     outcomes = [trial.outcome for trial in trials]
     counts = {
@@ -623,19 +488,10 @@ class RetrainingPlan:
 
 
 def plan_retraining(folders: Sequence[Path], share: float, trust: bool = False) -> RetrainingPlan:
-    """Return how to train the ego of the last of some runs on with the failures of all.
-
-    Args:
-        folders: Of `rare-envs estimate --out`, of one environment with the same options.
-        share: Share of episodes that begin in a failure.
-        trust: Trust the code that a run from elsewhere names.
-
-    Raises:
-        BadInput: There is no such run, the runs differ in more than ego and seed, there is no failure, or the ego is no
-            `.zip` that can be trained on.
-    """
-    questions = [open_question(read_recorded(folder).get("question"), folder, trust) for folder in folders]
-    failures = [failure for folder in folders for failure in read_run(folder, trust)]
+    """Return how to train the ego of the last of some runs on with the failures of all."""
+    runs = [load_finished(folder) for folder in folders]
+    questions = [open_run(run, trust) for run in runs]
+    failures = [failure for run in runs for failure in _list_failures(run, trust)]
     last = questions[-1]
     for folder, question in zip(folders, questions, strict=True):
         _check_same(question, last, folder, folders[-1])

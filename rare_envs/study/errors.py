@@ -41,12 +41,6 @@ def output_folder(path: Path) -> Iterator[None]:
     """Make the folder for results before the work, so that no run ends without a place to write to.
 
     If the work fails, new folders are removed again, as far as they are empty.
-
-    Args:
-        path: The folder; it may exist.
-
-    Raises:
-        BadInput: It is a file, or cannot be made or written to.
     """
     new = [folder for folder in (path, *path.parents) if not os.path.exists(folder)]
     try:
@@ -61,14 +55,7 @@ def output_folder(path: Path) -> Iterator[None]:
 
 @contextlib.contextmanager
 def output_file(path: Path) -> Iterator[None]:
-    """Make the folder of a file before the work, as `output_folder` does.
-
-    Args:
-        path: The file; it may exist.
-
-    Raises:
-        BadInput: It is a folder, or its folder cannot be made or written to.
-    """
+    """Make the folder of a file before the work, as `output_folder` does."""
     if path.is_dir():
         raise BadInput(f"Expected a file to write, got the folder {str(path)!r}.")
     with output_folder(path.parent):

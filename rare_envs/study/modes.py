@@ -66,13 +66,7 @@ class FailureMode:
 def find_modes(
     space: ScenarioSpace, estimate: samplers.Estimate, crashes: Mapping[str, str]
 ) -> tuple[FailureMode, ...]:
-    """Return the modes of failure of a run, the largest first; none where nothing failed or there are no weights.
-
-    Args:
-        space: Of x.
-        estimate: The run.
-        crashes: Kinds of crash of its failures, by `digest_scenario`.
-    """
+    """Return the modes of failure of a run, the largest first; none where nothing failed or there are no weights."""
     found = assign_modes(space, estimate, crashes)
     if found is None:
         return ()
@@ -192,13 +186,7 @@ def _mean_parameters(space: ScenarioSpace, x: FloatArray, weights: FloatArray) -
 def list_every_mode(
     space: ScenarioSpace, estimate: samplers.Estimate, crashes: Mapping[str, str]
 ) -> tuple[samplers.Estimate, NDArray[np.int64]]:
-    """Return an estimate whose list of failures has one of each mode and kind of crash, and where the new ones stand.
-
-    Args:
-        space: Of x.
-        estimate: The run.
-        crashes: Kinds of crash of its failures, by `digest_scenario`.
-    """
+    """Return an estimate that lists a failure of each mode and kind of crash, and where the new ones stand."""
     if estimate.failures.total <= len(estimate.failures) or estimate.sample is None or estimate.p <= 0:
         return estimate, np.empty(0, dtype=np.int64)
     longer = _append(estimate, _find_kinds(estimate, crashes))
@@ -303,13 +291,7 @@ def classify_failures(problem: DrivingProblem, estimate: samplers.Estimate) -> C
 def list_all_kinds(
     problem: DrivingProblem, estimate: samplers.Estimate, kinds: CrashKinds
 ) -> tuple[samplers.Estimate, CrashKinds]:
-    """Return both with one failure at least of each kind of crash and each mode in the list of failures.
-
-    Args:
-        problem: Of the run.
-        estimate: The run; its list has the most likely failures.
-        kinds: From `classify_failures`.
-    """
+    """Return both with one failure at least of each kind of crash and each mode in the list of failures."""
     if not kinds.by_scenario:
         return estimate, kinds
     longer, added = list_every_mode(problem.space, estimate, kinds.by_scenario)

@@ -16,16 +16,7 @@ from rare_envs.study.question import prepare
 
 
 def plan_from_result(recorded: Mapping[str, Any], target_cov: float) -> tuple[samplers.PlannedRun, ...]:
-    """Return what the method of a run, and plain Monte Carlo, need.
-
-    Args:
-        recorded: Content of its result.json, which anybody may have written.
-        target_cov: Coefficient of variation that is wished for.
-
-    Raises:
-        BadInput: A number that is needed is missing or none, or the run is no pilot: nothing failed, or its c.o.v. is
-            above 0.5.
-    """
+    """Return what the method of a run, and plain Monte Carlo, need."""
     p, cov, n_sim, seconds = (_read_number(recorded, name) for name in ("p", "cov", "n_sim", "seconds"))
     described = recorded.get("method")
     name = described.get("name") if isinstance(described, Mapping) else None
@@ -48,17 +39,7 @@ def plan_from_result(recorded: Mapping[str, Any], target_cov: float) -> tuple[sa
 def plan_by_pilots(
     question: Question, methods: Sequence[str], target_cov: float, progress: bool = False
 ) -> tuple[samplers.PlannedRun, ...]:
-    """Run a pilot by each method, and return what each needs; plain Monte Carlo last.
-
-    Args:
-        question: What is to be estimated; its max_sim is that of each pilot.
-        methods: Names of methods.
-        target_cov: Coefficient of variation that is wished for.
-        progress: Show a bar on standard error.
-
-    Raises:
-        BadInput: The question cannot be answered, or a pilot is none: nothing failed, or its c.o.v. is above 0.5.
-    """
+    """Run a pilot by each method, and return what each needs; plain Monte Carlo last."""
     found: dict[str, samplers.PlannedRun] = {}
     with as_bad_input(ValueError):
         for name in methods:  # all of them before the first pilot, which may take hours

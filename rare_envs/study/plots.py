@@ -58,12 +58,7 @@ LINE_COLOUR, HIT_COLOUR, ORDINARY_COLOUR = "#3b6fb5", "#c0392b", "#b8b8b8"
 
 
 def save_plot(path: Path, report: Report) -> None:
-    """Draw a report and save it.
-
-    Args:
-        path: `.png` to write.
-        report: What to draw.
-    """
+    """Draw a report and save it."""
     with matplotlib.rc_context(STYLE):
         view = _relative_view_height(report.study.problem.world.scenario.road)
         figure = Figure(figsize=(16, 5.4 * (MOMENTS * view + CURVES) / (MOMENTS + CURVES)), layout="constrained")
@@ -81,12 +76,7 @@ def save_plot(path: Path, report: Report) -> None:
 
 
 def save_figure(path: Path, figure: Figure) -> None:
-    """Save a picture, drawn and laid out once: `Figure.savefig` does both twice, for the same pixels.
-
-    Args:
-        path: `.png` to write.
-        figure: The picture.
-    """
+    """Save a picture, drawn and laid out once: `Figure.savefig` does both twice, for the same pixels."""
     figure.set_dpi(DOTS_PER_INCH)
     with replace_file(path) as draft:
         FigureCanvasAgg(figure).print_png(draft)  # type: ignore[no-untyped-call]
@@ -187,9 +177,6 @@ def rank_shifted_parameters(space: ScenarioSpace, ordinary: FloatArray, failures
         space: Of the parameters.
         ordinary: Scenarios from the base distribution, shape (n, d).
         failures: Failures, shape (m, d).
-
-    Returns:
-        Indices of columns of x, by |mean shift| / standard deviation; those of large blocks are left out.
     """
     shown = np.flatnonzero([column.shown for column in list_columns(space)])
     spread = np.maximum(ordinary[:, shown].std(axis=0), 1e-12)
@@ -220,12 +207,7 @@ def draw_failures(axes: Axes, space: ScenarioSpace, failures: Failures) -> None:
 
 
 def draw_drive(axes: list[Axes], drive: Drive) -> None:
-    """Draw the seconds up to the worst moment of a drive from above, and its gap and speeds over time.
-
-    Args:
-        axes: `MOMENTS` views from above, then one for the curves.
-        drive: The drive.
-    """
+    """Draw the seconds up to the worst moment of a drive from above, and its gap and speeds over time."""
     first = int(np.argmin(np.abs(drive.time - (drive.time[drive.worst] - LAST_SECONDS))))
     for view, t in zip(axes[:MOMENTS], np.linspace(first, drive.worst, MOMENTS).round(), strict=True):
         draw_moment(view, drive, int(t))
@@ -297,12 +279,7 @@ def _write_message(axes: Axes, text: str) -> None:
 
 
 def save_sensitivity(path: Path, sensitivity: samplers.Sensitivity) -> None:
-    """Draw importance and derivatives as bars and save the picture.
-
-    Args:
-        path: `.png` to write.
-        sensitivity: What to draw.
-    """
+    """Draw importance and derivatives as bars and save the picture."""
     with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(14, 4.5), layout="constrained")
         sensitivity.plot(list(figure.subplots(1, 2)))
@@ -310,12 +287,7 @@ def save_sensitivity(path: Path, sensitivity: samplers.Sensitivity) -> None:
 
 
 def save_severity(path: Path, severity: Severity) -> None:
-    """Draw the curve of delta-v with its bands and save the picture.
-
-    Args:
-        path: `.png` to write.
-        severity: What to draw.
-    """
+    """Draw the curve of delta-v with its bands and save the picture."""
     with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(7, 4.5), layout="constrained")
         severity.plot(figure.subplots())
@@ -327,13 +299,7 @@ FRACTION_BELOW = 0.1
 
 
 def save_risk_plot(path: Path, ego: str, total: TotalRate) -> None:
-    """Draw a total and the rates of which it is the sum, and save it.
-
-    Args:
-        path: `.png` to write.
-        ego: The ego, for the title.
-        total: The rates.
-    """
+    """Draw a total and the rates of which it is the sum, and save it."""
     with matplotlib.rc_context(STYLE):
         height = 1.6 + 0.45 * max(len(total.rates) + 1, len(total.shares))
         figure = Figure(figsize=(12, height), layout="constrained")

@@ -51,12 +51,7 @@ class Study:
         return load_base(find_scenario(self.question.env_id), self.question.base)
 
     def under(self, base: str) -> Study:
-        """Return the same study with another base distribution, by name or file; the ego is the one that is loaded.
-
-        Raises:
-            ValueError: There is no such base, or it does not fit the scenario.
-            OSError: A file cannot be read.
-        """
+        """Return the same study with another base distribution, by name or file; the ego is the one that is loaded."""
         question = replace(self.question, base=base, ensemble=False)
         return replace(self, question=question, problem=build_problem(question, self.problem.ego))
 
@@ -124,16 +119,7 @@ def _check_threshold(question: Question) -> None:
 
 
 def build_problem(question: Question, ego: Any) -> DrivingProblem:
-    """Return the problem of a question; what it cannot check is among its notes, without a warning.
-
-    Args:
-        question: The question.
-        ego: The ego that it names, loaded.
-
-    Raises:
-        ValueError: An argument is invalid or the ego does not fit.
-        OSError: A file cannot be read.
-    """
+    """Return the problem of a question; what it cannot check is among its notes, without a warning."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", AmbiguousActions)
         warnings.simplefilter("ignore", MissingStatistics)  # the report says it

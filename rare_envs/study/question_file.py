@@ -49,11 +49,7 @@ QuestionLoader.add_implicit_resolver(
 
 
 def read_question_file(path: Path) -> dict[str, Any]:
-    """Return the fields of `Question` and `ExecutorOptions` that a YAML file, which may be JSON, gives.
-
-    Raises:
-        BadInput: It cannot be read, or has unknown keys or values of a wrong type.
-    """
+    """Return the fields of `Question` and `ExecutorOptions` that a YAML file, which may be JSON, gives."""
     given = _load_mapping(path)
     named = {key.replace("-", "_"): value for key, value in given.items()}
     for key, name in zip(given, (key.replace("-", "_") for key in given), strict=True):
@@ -80,17 +76,7 @@ def _as_whole(name: str, value: Any) -> Any:
 
 
 def join_question(given: Mapping[str, Any], env: str | None, options: Mapping[str, Any], typed: set[str]) -> Question:
-    """Return the question of a file and a command line.
-
-    Args:
-        given: Fields that the file gives.
-        env: Environment on the command line, if there is one.
-        options: All options, with their defaults.
-        typed: Names of those that were typed; they come before the file.
-
-    Raises:
-        BadInput: Neither names an environment.
-    """
+    """Return the question of a file and a command line."""
     named = join_options(given, options, typed)
     if env is not None:
         named["env_id"] = env

@@ -19,8 +19,8 @@ from rare_envs.files import read_text_file
 from rare_envs.json_text import parse_json_object
 from rare_envs.study.arguments import Question, read_question
 from rare_envs.study.errors import BadInput, as_bad_input
-from rare_envs.study.journal import digest_contents, digest_files, find_changed_files
-from rare_envs.study.run_folder import STUDY
+from rare_envs.study.journal import digest_contents, digest_files, find_changed_files, refuse_unfinished
+from rare_envs.study.run_folder import STUDY, LoadedStudy, load_study
 
 _FIELDS = ("ego", "stats", "base", "drivers", "measure", "also_under")
 """Fields of a question that can name files."""
@@ -41,13 +41,6 @@ def find_moved_files(question: Question, folder: Path) -> Question:
     """Return the question of a run with files that are not where they were in the places that they have now.
 
     A file is looked for where it lay as seen from the folder of the run; its content must be what it was.
-
-    Args:
-        question: As the run recorded it.
-        folder: Of the run.
-
-    Raises:
-        BadInput: A file has moved with the folder, and has changed.
     """
     about = _read_about(folder)
     before, places = (_texts(about.get(name)) for name in ("files", "file_places"))
@@ -58,12 +51,7 @@ def find_moved_files(question: Question, folder: Path) -> Question:
 
 
 def warn_of_changed_files(question: Question, folder: Path) -> None:
-    """Warn where a file of a run, or the statistics beside its ego, are not what they were when it was begun.
-
-    Args:
-        question: With the places that files have now.
-        folder: Of the run; one of an earlier version has no digests and is not compared.
-    """
+    """Warn where a file of a run, or the statistics beside its ego, are not what they were when it was begun."""
     about = _read_about(folder)
     changed = find_changed_files(_texts(about["files"]), digest_files(question)) if "files" in about else []
     if changed:
@@ -120,22 +108,30 @@ MAX_TEXT = 2**16
 """Letters of a name or formula in a question."""
 _CHANGEABLE = ("trust", "on_error", "core", "device")
 """Fields that a resumed run may change, or that follow from what is installed."""
-_ADDRESS = "ego"
-"""Changes too where the ego is in another program."""
+
+
+def load_finished(folder: Path) -> LoadedStudy:
+    """Return a finished run with its failures.
+
+    Raises:
+        BadInput: There is none, it is not finished, or its files are damaged.
+    """
+    refuse_unfinished(folder)
+    study = load_study(folder)
+    with as_bad_input(OSError, ValueError):
+        _ = study.failures  # read now
+    return study
+
+
+def open_run(study: LoadedStudy, trust: bool) -> Question:
+    """Return the question of a finished run, see `open_question`."""
+    return open_question(study.result.get("question"), study.folder, trust)
 
 
 def open_question(recorded: object, folder: Path, trust: bool) -> Question:
     """Return the question of a folder, if its values are of the right types and what code it names may run.
 
     What simulates it (`core`) is chosen anew, on the CPU, and files that have moved with the folder are found.
-
-    Args:
-        recorded: Of the file.
-        folder: Where it is, for messages.
-        trust: Let the code that it names run, and the ego's file.
-
-    Raises:
-        BadInput: It is no question, or was not asked here and names code; nothing of that has been run then.
     """
     question = replace(read_question(recorded), trust=trust, core="auto", device="cpu")
     if any(isinstance(value, str) and len(value) > MAX_TEXT for value in asdict(question).values()):
@@ -151,15 +147,10 @@ def note_question(question: Question) -> None:
 
 
 def is_same_question(recorded: object, question: Question) -> bool:
-    """Return whether a recorded question is this one, but for what a run that is resumed may change.
-
-    Args:
-        recorded: Of a file.
-        question: The question.
-    """
+    """Return whether a recorded question is this one, but for what a run that is resumed may change."""
     asked = _record(question)
     if find_ego_kind(question.ego) == "remote":
-        del asked[_ADDRESS]
+        del asked["ego"]  # its address may change
     return isinstance(recorded, Mapping) and all(recorded.get(name) == value for name, value in asked.items())
 
 

@@ -52,13 +52,7 @@ class RowKeeper(WrappedProblem):
     """
 
     def __init__(self, problem: Any, gamma: float, size: int = KEPT_ROWS) -> None:
-        """Wrap a problem.
-
-        Args:
-            problem: The problem.
-            gamma: Threshold of f.
-            size: Scenarios to keep.
-        """
+        """Wrap a problem."""
         super().__init__(problem)
         self._gamma, self._size, self._seen = gamma, size // 2, 0
         self._sample = (np.empty((0, problem.dim)), np.empty(0))
@@ -108,15 +102,7 @@ class RowKeeper(WrappedProblem):
 
 
 def check_repeatability(problem: Any, kept: RowKeeper) -> Repeatability:
-    """Simulate the kept scenarios again: in another order and in small batches, and a few each alone.
-
-    Args:
-        problem: A `DrivingProblem`.
-        kept: After a run.
-
-    Raises:
-        EgoGone: The ego cannot be queried any more.
-    """
+    """Simulate the kept scenarios again: in another order and in small batches, and a few each alone."""
     tolerant = FaultTolerant(problem)
     order = np.random.default_rng(1).permutation(len(kept.f))
     batches = [order[first : first + COMPANY] for first in range(0, len(order), COMPANY)]

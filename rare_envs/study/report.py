@@ -65,11 +65,7 @@ COLLISION_MEASURE = "ttc"
 
 
 def find_frequency(study: Study) -> EventFrequency:
-    """Return the frequency of the events whose failures a question counts.
-
-    Raises:
-        ValueError: p is no probability of a collision per event, or nobody counted the events.
-    """
+    """Return the frequency of the events whose failures a question counts."""
     reason = _explain_no_collisions(study.question)
     if reason:
         raise ValueError(f"no rate per hour or km: {reason}")
@@ -85,15 +81,7 @@ def find_frequency(study: Study) -> EventFrequency:
 
 
 def compute_rate(study: Study, estimate: samplers.Estimate) -> CollisionRate:
-    """Return the rate of collisions of an estimate.
-
-    Args:
-        study: The question, loaded.
-        estimate: Its answer.
-
-    Raises:
-        ValueError: As in `find_frequency`.
-    """
+    """Return the rate of collisions of an estimate."""
     return CollisionRate(
         scenario=study.problem.world.scenario.name,
         probability=describe_probability(estimate),
@@ -104,16 +92,7 @@ def compute_rate(study: Study, estimate: samplers.Estimate) -> CollisionRate:
 
 
 def compute_injury_rate(study: Study, estimate: samplers.Estimate, severity: Severity) -> CollisionRate:
-    """Return the rate of serious injuries (MAIS 3 or more) of an estimate: injuries per event in place of p.
-
-    Args:
-        study: The question, loaded.
-        estimate: Its answer.
-        severity: Of the collisions.
-
-    Raises:
-        ValueError: As in `find_frequency`.
-    """
+    """Return the rate of serious injuries (MAIS 3 or more) of an estimate: injuries per event in place of p."""
     injuries = severity.injuries
     probability = _describe_value(injuries.value, injuries.cov, injuries.interval, severity.injuries_base)
     return replace(compute_rate(study, estimate), probability=probability)
@@ -145,12 +124,7 @@ def _describe_value(
 
 
 def describe_left_out(study: Study, estimate: samplers.Estimate) -> tuple[str, ...]:
-    """Return which errors the interval of the rate leaves out, and why there is no lower end; empty if it holds all.
-
-    Args:
-        study: The question, loaded.
-        estimate: Its answer.
-    """
+    """Return which errors the interval of the rate leaves out, and why there is no lower end; empty if it holds all."""
     base, found = estimate.base_uncertainty, []
     if study.question.ensemble:
         mean = "ensemble: p is the mean over the refits, which stands for the error of the base distribution"

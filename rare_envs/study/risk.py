@@ -78,14 +78,6 @@ def choose_base(scenario: Scenario, given: str | PathLike[str] | None, site: str
     """Return the base distribution of a scenario at a site, and notes on it.
 
     Where that of the site has no event frequency, it is the first one that has, as the notes say.
-
-    Args:
-        scenario: The scenario.
-        given: Name or file that the user gave for it; None for the site's.
-        site: Name of a site.
-
-    Raises:
-        ValueError: The scenario has no base of the site. A sum of rates at different sites is that of no road.
     """
     if given is not None:
         return str(given), ()
@@ -111,11 +103,6 @@ def compare_sites(report: Report, sites: Sequence[str], progress: bool = False) 
 
     They come from the simulations of the report, reweighted. Where these do not suffice, sites that are asked for are
     simulated, and others left out; all are left out where nothing failed.
-
-    Args:
-        report: With a rate.
-        sites: Names of sites that are asked for; those that the scenario lacks are left out.
-        progress: Show a bar on standard error.
     """
     study = report.study
     if report.estimate.p == 0 or report.rate is None:

@@ -136,24 +136,12 @@ _BLOCK = 1 << 20
 
 
 def digest_results(folder: Path) -> dict[str, str]:
-    """Return the BLAKE2b digests of the files with numbers in a folder, by name.
-
-    Raises:
-        OSError: One of them cannot be read.
-    """
+    """Return the BLAKE2b digests of the files with numbers in a folder, by name."""
     return {name: _digest_file(folder / name) for name in DIGESTED if (folder / name).is_file()}
 
 
 def find_changed_results(folder: Path, about: Mapping[str, Any]) -> list[str]:
-    """Return the files with numbers that are not what the run wrote: changed, removed or added since.
-
-    Args:
-        folder: Of the run.
-        about: What its study.json holds. One without digests, of an earlier version, tells nothing.
-
-    Raises:
-        OSError: A file cannot be read.
-    """
+    """Return the files with numbers that are not what the run wrote: changed, removed or added since."""
     written = about.get("results")
     if not isinstance(written, Mapping):
         return []
@@ -232,16 +220,7 @@ class LoadedStudy:
         return self.folder / EPISODES
 
     def episodes(self, columns: list[str] | None = None, failed: bool | None = None) -> pyarrow.Table:
-        """Return the table of all simulations, a row each; docs/run_folder.md has its columns.
-
-        Args:
-            columns: Those wanted; None for all.
-            failed: Only failing simulations, or only the others; None for all.
-
-        Raises:
-            FileNotFoundError: The folder has no such table.
-            ValueError: The file is damaged, has no such columns, or these take more than `MAX_TABLE_BYTES`.
-        """
+        """Return the table of all simulations, a row each; docs/run_folder.md has its columns."""
         import pyarrow.parquet as pq
 
         where = None if failed is None else [("failed", "=", failed)]

@@ -49,11 +49,7 @@ class ReplayedFailures(NamedTuple):
 def replay_failures(
     problem: DrivingProblem, estimate: samplers.Estimate, most: int | None = MAX_REPLAYED
 ) -> ReplayedFailures:
-    """Drive failing points of a run once more.
-
-    Raises:
-        ValueError: If there are none or no weighted points, or the ego's answers vary from run to run.
-    """
+    """Drive failing points of a run once more."""
     if problem.varies:
         raise ValueError("The ego's answers vary from run to run, so that its failures cannot be seen again.")
     failures = weigh_failures(estimate, most)
@@ -181,9 +177,6 @@ class Severity:
         """Draw P[collision with delta-v > v] over v with the bands of sampling and base distribution.
 
         Needs matplotlib.
-
-        Args:
-            ax: Where to draw, or the path of an image to write, such as "p.png"; None takes pyplot's current axes.
         """
         with drawing_axes(ax) as axes:
             self.curve.plot(axes)

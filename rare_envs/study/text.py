@@ -56,14 +56,7 @@ def _format_decimal(value: float) -> str:
 
 
 def format_with_interval(value: float, interval: RateInterval, unit: str = "", level: str = "") -> str:
-    """Return a rate with its interval, or what it is below, all numbers in one form.
-
-    Args:
-        value: The rate.
-        interval: Its interval.
-        unit: Behind the rate, with a space before it.
-        level: Before the interval, with a space after it.
-    """
+    """Return a rate with its interval, or what it is below, all numbers in one form."""
     middle, low, high = format_alike(value, *interval)
     return f"{middle}{unit} ({level}{f'{low} to' if interval[0] > 0 else 'below'} {high})"
 
@@ -113,10 +106,6 @@ def describe_uncertainty(total: TotalRate, recorded: dict[str, int]) -> str:
     """Return what the uncertainty of a total comes from; empty if it is not known.
 
     Where a rate is not determined, the shares are those of the sum of the others.
-
-    Args:
-        total: The total.
-        recorded: Events behind the base of each scenario, by its name.
     """
     parts = []
     if total.shares:
@@ -146,12 +135,7 @@ SIZED_BY_BUDGET = ("mc", "is", "two-stage", "surrogate")
 
 
 def format_probability(p: float | None, like: float | None = None) -> str:
-    """Return a probability for people: as a percentage, or in powers of ten where it is small.
-
-    Args:
-        p: The probability.
-        like: Another one that stands beside it and decides on the form; itself by default.
-    """
+    """Return a probability for people: as a percentage, or in powers of ten where it is small."""
     if p is None or not math.isfinite(p):
         return "not known"
     if p <= 0:

@@ -13,16 +13,14 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
 from rare_envs.envs.rendering import AGENT, FRAME_WIDTH, Colour, Renderer
-from rare_envs.files import read_text_file, replace_file
-from rare_envs.json_text import parse_json_object
+from rare_envs.files import replace_file
 from rare_envs.problem import DrivingProblem
 from rare_envs.study.columns import MAX_SHOWN, format_value
 from rare_envs.study.errors import BadInput, as_bad_input, output_file
-from rare_envs.study.journal import refuse_unfinished
 from rare_envs.study.question import prepare
-from rare_envs.study.recorded_question import open_question, warn_of_changed_files
+from rare_envs.study.recorded_question import load_finished, open_run, warn_of_changed_files
 from rare_envs.study.replay import Drive
-from rare_envs.study.run_folder import FAILURES, RESULT, read_failures
+from rare_envs.study.run_folder import FAILURES
 from rare_envs.traffic.palette import CRASH_COLOUR, OTHER_COLOURS, ROLE_COLOURS, as_rgb
 
 CURVES_HEIGHT = 144
@@ -50,58 +48,33 @@ class RecordedFailure(NamedTuple):
 
 
 def find_failure(folder: Path, number: int, trust: bool = False) -> RecordedFailure:
-    """Return failure `number` of a run, the most likely being number 0.
-
-    Args:
-        folder: Of `rare-envs estimate --out`.
-        number: Which failure.
-        trust: Let the ego's file run code, as the run was allowed to, and code that a run from elsewhere names.
-
-    Raises:
-        BadInput: There is no such run or failure, or what it was about cannot be loaded any longer.
-    """
-    refuse_unfinished(folder)
-    try:
-        recorded = parse_json_object(read_text_file(folder / RESULT), repr(str(folder / RESULT)))
-        table = read_failures(folder)
-    except OSError as error:
-        raise BadInput(
-            f"No run in {str(folder)!r}: expected {RESULT} and {FAILURES}, as rare-envs estimate --out writes."
-        ) from error
-    except ValueError as error:
-        raise BadInput(error) from error
-    question = open_question(recorded.get("question"), folder, trust)
+    """Return failure `number` of a run, the most likely being number 0."""
+    run = load_finished(folder)
+    question, table, count = open_run(run, trust), run.failures, len(run.failures["f"])
     warn_of_changed_files(question, folder)
     with as_bad_input(TypeError, OverflowError, RecursionError, MemoryError):
         problem = prepare(question).problem
-    count = len(table["f"])
+    check_number_of_failure(number, count)
+    x, found = join_parameters(table, problem, number), count_found(run.result, count)
+    return RecordedFailure(problem, x, float(table["f"][number]), float(table["log_p0"][number]), count, found)
+
+
+def check_number_of_failure(number: int, count: int) -> None:
+    """Raise a BadInput unless a run that lists `count` failures has this one."""
+    if not count:
+        raise BadInput("The run has no failure.")
     if not 0 <= number < count:
-        raise BadInput(
-            f"Expected a failure from 0 to {count - 1}, got {number}." if count else "The run has no failure."
-        )
-    x = join_parameters(table, problem, number)
-    return RecordedFailure(
-        problem, x, float(table["f"][number]), float(table["log_p0"][number]), count, count_found(recorded, count)
-    )
+        raise BadInput(f"Expected a failure from 0 to {count - 1}, got {number}.")
 
 
 def count_found(recorded: Mapping[str, Any], n_listed: int) -> int:
-    """Return the number of failures that a run found.
-
-    Args:
-        recorded: Its result.json.
-        n_listed: Failures in its table, which are fewer where it found many.
-    """
+    """Return the number of failures that a run found."""
     found = recorded.get("n_failures")
     return found if isinstance(found, int) and found > n_listed else n_listed
 
 
 def join_parameters(table: dict[str, NDArray[Any]], problem: DrivingProblem, number: int) -> NDArray[np.float64]:
-    """Return x (d,) of a row.
-
-    Raises:
-        BadInput: The columns are others than those of the problem, or x is no scenario of its traffic.
-    """
+    """Return x (d,) of a row."""
     names = problem.space.names
     if not set(names) <= set(table):
         raise BadInput(f"Expected {FAILURES} with the columns {', '.join(names)}; the run is of another problem.")
@@ -156,14 +129,7 @@ def _draw_curves_strip(drive: Drive) -> tuple[Image.Image, Any]:
 
 
 def describe_drive(recorded: RecordedFailure, drive: Drive, number: int, ego: str | None = None) -> list[str]:
-    """Return the drive in words, line by line.
-
-    Args:
-        recorded: The failure.
-        drive: Its drive.
-        number: Which failure of the run it is.
-        ego: Another ego, if one drove in the place of the run's.
-    """
+    """Return the drive in words, line by line."""
     space, labels = recorded.problem.space, recorded.problem.world.scenario.labels
     listed = f" ({recorded.n_listed:,} of them listed)" if recorded.n_listed < recorded.n_found else ""
     lines = [
@@ -194,11 +160,7 @@ def describe_drive(recorded: RecordedFailure, drive: Drive, number: int, ego: st
 
 
 def check_film_path(path: Path | str) -> None:
-    """Refuse a name whose pictures cannot be written.
-
-    Raises:
-        BadInput: It ends neither in .gif nor in .png.
-    """
+    """Refuse a name whose pictures cannot be written."""
     path = Path(path)
     if path.suffix.lower() not in (".gif", ".png"):
         raise BadInput(f"Expected a file that ends in .gif (the drive) or .png (its worst moment), got {str(path)!r}.")

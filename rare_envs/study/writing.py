@@ -81,15 +81,7 @@ def write_run(folder: Path, report: Report) -> None:
 
 
 def check_no_results(folder: Path, *names: str) -> None:
-    """Raise a BadInput if a folder has results of a finished run, or files of these names.
-
-    Args:
-        folder: It need not exist.
-        names: Names of further files.
-
-    Raises:
-        BadInput: It has one of them.
-    """
+    """Raise a BadInput if a folder has results of a finished run, or files of these names."""
     for name in (RESULT, FAILURES, *names):
         if (folder / name).exists():
             raise BadInput(f"There is a finished run in {str(folder)!r} ({name}): replace it by --force.")
@@ -212,11 +204,7 @@ def describe_study(study: Study, folder: Path = Path()) -> dict[str, Any]:
 
 
 def begin_study_file(folder: Path, study: Study) -> None:
-    """Write study.json of a run that begins.
-
-    Raises:
-        OSError: It cannot be written.
-    """
+    """Write study.json of a run that begins."""
     replace_text(folder / STUDY, format_json(describe_study(study, folder)) + "\n")
 
 
@@ -242,9 +230,6 @@ def finish_study_file(folder: Path, study: Study, seconds: float) -> None:
         folder: Of the run.
         study: What was asked.
         seconds: Wall time, that before interruptions included [s].
-
-    Raises:
-        OSError: It cannot be written.
     """
     try:
         begun = parse_json_object(read_text_file(folder / STUDY), STUDY)

@@ -177,8 +177,8 @@ def plan_command(
     as_json: JsonOption = False,
 ) -> None:
     """Plan simulations and wall time for a precision, by each of --method (joined by commas) and plain Monte Carlo."""
-    from rare_envs.study.corpus import read_recorded
     from rare_envs.study.plan import plan_by_pilots, plan_from_result
+    from rare_envs.study.recorded_question import load_finished
     from samplers.validation import check_number
 
     with as_bad_input(ValueError):
@@ -186,7 +186,7 @@ def plan_command(
     with keep_stdout_for_the_answer():
         if Path(target).is_dir():
             _refuse_options_of_pilots(context)
-            found = plan_from_result(read_recorded(Path(target)), cov)
+            found = plan_from_result(load_finished(Path(target)).result, cov)
         else:
             methods = [name.strip() for name in asked.pop("method").split(",")]
             _check_environment(target)
@@ -345,23 +345,7 @@ def _answer_highway_env(
 def estimate_highway_env(
     question: Question, typed: set[str], out: Path | None, force: bool, executor: Executor | None
 ) -> dict[str, Any]:
-    """Estimate how often an ego crashes in one of HighwayEnv's environments, as that environment draws its traffic.
-
-    Args:
-        question: With an id of HighwayEnv.
-        typed: Parameters of the command that were given.
-        out: Folder for the estimate, or None.
-        force: Replace an earlier one there.
-        executor: Where to simulate; None for this process.
-
-    Returns:
-        The answer, JSON-ready, with the text of the estimate as "text", and whether a warning casts doubt on the number
-        as "doubtful".
-
-    Raises:
-        BadInput: An option does not go with such an environment, the ego does not fit, or the folder cannot be used.
-        RunInterrupted: It was interrupted; this has the answer of those made.
-    """
+    """Estimate how often an ego crashes in one of HighwayEnv's environments, as that environment draws its traffic."""
     import agents
     import rare_envs
     import samplers

@@ -55,13 +55,7 @@ DRIVERS = {
 
 
 def list_names() -> dict[str, Any]:
-    """Return everything that can be named on the command line, as JSON-ready values.
-
-    Returns:
-        "environments" (id to parameters, vehicles, bases, drivers and what learned drivers add to x, with their noise
-        and for an episode of the usual length), "highway_env" (HighwayEnv's own ids that have parameters), "weather"
-        (parameters that `--weather` adds), "methods", "egos", "drivers", "measures".
-    """
+    """Return everything that can be named on the command line, as JSON-ready values."""
     import highway_env  # noqa: F401  (registers its ids)
 
     from rare_envs.interop.scenario import SUPPORTED
@@ -134,12 +128,7 @@ def print_overview(entries: dict[str, Any]) -> None:
 
 
 def print_details(entries: dict[str, Any], what: str) -> None:
-    """Print the names of one kind with their meanings.
-
-    Args:
-        entries: What `list_names` returns.
-        what: One of `KINDS`, or the id of an environment.
-    """
+    """Print the names of one kind with their meanings."""
     console, whole = Console(highlight=False), what == EVERYTHING
     environments = entries["environments"]
     for env_id, environment in environments.items():
@@ -158,12 +147,7 @@ def print_details(entries: dict[str, Any], what: str) -> None:
 
 
 def choose_entries(entries: dict[str, Any], what: str) -> dict[str, Any]:
-    """Return the part of the names that `print_details` prints, under the keys that it has in the whole.
-
-    Args:
-        entries: What `list_names` returns.
-        what: One of `KINDS`, or the id of an environment.
-    """
+    """Return the part of the names that `print_details` prints, under the keys that it has in the whole."""
     if what == EVERYTHING:
         return entries
     if what not in KINDS:
@@ -173,11 +157,7 @@ def choose_entries(entries: dict[str, Any], what: str) -> dict[str, Any]:
 
 
 def check_kind(entries: dict[str, Any], what: str) -> str:
-    """Return what to show in detail: a kind, or the id that an id or its part behind the slash means.
-
-    Raises:
-        BadInput: There is no such kind or environment.
-    """
+    """Return what to show in detail: a kind, or the id that an id or its part behind the slash means."""
     known: dict[str, str] = {name: name for name in (*KINDS, *entries["environments"])}
     known |= {name.partition("/")[2]: name for name in entries["environments"]}
     if what not in known:
@@ -216,14 +196,7 @@ def _make_meaning_table(title: str, meanings: dict[str, str]) -> Table:
 
 
 def list_bases(scenario: str) -> dict[str, dict[str, Any]]:
-    """Return what is known of each base distribution of a scenario, by name, the default first; JSON-ready.
-
-    Args:
-        scenario: Environment id or short name.
-
-    Raises:
-        ValueError: There is no such scenario, or a base cannot be read.
-    """
+    """Return what is known of each base distribution of a scenario, by name, the default first; JSON-ready."""
     found = find_scenario(resolve_scenario(scenario))
     return {name: _describe_base(found, name) for name in found.bases}
 

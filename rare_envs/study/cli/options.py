@@ -27,11 +27,7 @@ NOISE = {"on": True, "fixed": "fixed", "off": False}
 
 
 def read_count(text: str) -> int:
-    """Return the whole number that a text stands for, such as "10000" or "1e4".
-
-    Raises:
-        typer.BadParameter: If it is no whole number.
-    """
+    """Return the whole number that a text stands for, such as "10000" or "1e4"."""
     try:
         return int(text)
     except ValueError:
@@ -105,12 +101,7 @@ _KINDS: dict[str, Any] = {"noise": NoiseKind, "executor": ExecutorKind | None}
 
 
 def take_options(*names: str, executor: bool = False) -> Callable[[Callable[..., Any]], Callable[..., None]]:
-    """Let a command take options of `Question`, which it gets as the mapping `asked`.
-
-    Args:
-        *names: Of the fields.
-        executor: Whether it takes those of `ExecutorOptions` too, as the mapping `places`.
-    """
+    """Let a command take options of `Question`, which it gets as the mapping `asked`."""
     groups: dict[str, tuple[type[Any], tuple[str, ...]]] = {"asked": (Question, names)}
     if executor:
         groups["places"] = (ExecutorOptions, tuple(field.name for field in fields(ExecutorOptions)))

@@ -100,9 +100,7 @@ def replay_all(run: Path, ego: str | None, trust: bool, as_json: bool) -> None:
         failures = read_run(run, trust)
         if not failures:
             raise BadInput(f"The run in {str(run)!r} has no failure.")
-        trials, seconds = (
-            repeat_run(run, failures, trust) if ego is None else try_ego(failures, EgoChoice(ego=ego), run, trust)
-        )
+        trials, seconds = repeat_run(run, trust) if ego is None else try_ego(failures, EgoChoice(ego=ego), run, trust)
     if ego is not None:
         _answer_trials(trials, ego, seconds, as_json)
     different = [trial for trial in trials if not trial.same]

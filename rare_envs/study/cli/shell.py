@@ -225,11 +225,7 @@ def _fail(message: str) -> NoReturn:
 
 @contextlib.contextmanager
 def say_early_stop(words: str = NOTHING_MADE) -> Iterator[None]:
-    """Print in one line what is known of a run that is interrupted before it has begun; for a command.
-
-    Args:
-        words: The line.
-    """
+    """Print in one line what is known of a run that is interrupted before it has begun; for a command."""
     try:
         yield
     except KeyboardInterrupt as error:
@@ -243,9 +239,6 @@ def show_what_is_known(show: Callable[[Any], None]) -> Iterator[None]:
     """Print what a run knows that was interrupted, or whose results could not be written.
 
     The message of the interruption, one line, comes first: whoever ended the process may not wait for the rest.
-
-    Args:
-        show: Prints a report.
     """
     try:
         yield
@@ -259,11 +252,7 @@ def show_what_is_known(show: Callable[[Any], None]) -> Iterator[None]:
 
 
 def print_whole(show: Callable[[], None]) -> None:
-    """Print an answer to its end: the first signal meanwhile changes nothing, as the command is about to end by itself.
-
-    Raises:
-        AnswerCut: There was a second signal.
-    """
+    """Print an answer to its end: the first signal meanwhile changes nothing, as the command is about to end."""
     from samplers.execution.interruption import defer_signals  # slow to import, and known by now
 
     whole = False

@@ -65,13 +65,7 @@ VERDICTS = {
 
 
 def print_findings(findings: list[Finding], title: str, everything: bool = False) -> None:
-    """Print findings with their remedies, and the verdict.
-
-    Args:
-        findings: Of all checks.
-        title: Above them.
-        everything: A row for each that passed too; else they are named in one row, so that all fits a screen.
-    """
+    """Print findings with their remedies, and the verdict."""
     console = Console(highlight=False)
     table = Table("check", "", "found", "what to do", title=Text(title), title_justify="left", title_style="bold")
     shown = [

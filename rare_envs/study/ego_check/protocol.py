@@ -16,11 +16,7 @@ PROTOCOL_ADVICE = "docs/remote.md has the protocol"
 
 
 def check_protocol(spec: str) -> Iterator[Finding]:
-    """Check a server.
-
-    Args:
-        spec: "tcp://host:port", with time-outs as for `agents.load_ego`.
-    """
+    """Check a server."""
     try:
         from agents.remote import protocol
         from agents.remote.client import TIMEOUT, LinkError, parse_address

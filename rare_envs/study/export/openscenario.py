@@ -29,9 +29,6 @@ def write_road(path: Path, road: Road, start: float, end: float, name: str) -> N
         start: Begin of it along the road [m]; s = 0 is there.
         end: End of it [m]; a curved road is written to the end of its curve at least.
         name: Of the road.
-
-    Raises:
-        ValueError: The library scenariogeneration is not installed.
     """
     xodr = import_scenariogeneration("xodr")
     planview = xodr.PlanView()
@@ -120,17 +117,7 @@ class StoryOptions:
 
 
 def write_story(path: Path, trajectories: WorldTrajectories, road_file: str, options: StoryOptions) -> None:
-    """Write an OpenSCENARIO file.
-
-    Args:
-        path: The file, `.xosc`.
-        trajectories: Of the vehicles.
-        road_file: The OpenDRIVE file, relative to the folder of `path`.
-        options: Its form.
-
-    Raises:
-        ValueError: The library scenariogeneration is not installed.
-    """
+    """Write an OpenSCENARIO file."""
     xosc = import_scenariogeneration("xosc")
     xosc.VersionBase().setVersion(minor=options.minor_version)
     board = xosc.StoryBoard(_make_init(xosc, trajectories, options), _make_stop(xosc, trajectories, options))

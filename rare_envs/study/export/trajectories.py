@@ -19,11 +19,7 @@ from samplers.problem import FloatArray
 
 
 def import_scenariogeneration(part: str) -> Any:
-    """Return `scenariogeneration.xosc` or `.xodr`.
-
-    Raises:
-        ValueError: It is not installed.
-    """
+    """Return `scenariogeneration.xosc` or `.xodr`."""
     try:
         return importlib.import_module(f"scenariogeneration.{part}")
     except ImportError as error:

@@ -121,11 +121,7 @@ def export_drive(
 
 
 def check_export(path: Path | str, format: str, ego: str | None) -> bool:
-    """Return whether the ego is left free.
-
-    Raises:
-        ValueError: There is no such format, the name has another ending, or the ego cannot be so.
-    """
+    """Return whether the ego is left free."""
     if format not in EXPORT_FORMATS:
         raise ValueError(
             f"Expected a format of {', '.join(EXPORT_FORMATS)}, got {format!r}{did_you_mean(format, EXPORT_FORMATS)}."

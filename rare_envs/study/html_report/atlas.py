@@ -42,15 +42,8 @@ class NearestEvent(NamedTuple):
 def read_recorded_events(path: Path, names: list[str]) -> FloatArray:
     """Read events from a CSV file with a column for each of some parameters; others are not looked at.
 
-    Args:
-        path: Of the file.
-        names: Of the parameters.
-
     Returns:
         Events, shape (n, k); rows with an empty cell are left out.
-
-    Raises:
-        BadInput: It cannot be read, or has not these columns, or no events.
     """
     try:
         with path.open(newline="", encoding="utf-8") as file:

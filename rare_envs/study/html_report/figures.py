@@ -121,13 +121,7 @@ def draw_estimate_over_simulations(figure: Figure, result: Result) -> None:
 
 
 def draw_levels(figure: Figure, result: Result, stacked: bool = False) -> None:
-    """Draw the share of each level's points below its threshold, and the threshold, where that changes.
-
-    Args:
-        figure: To draw into.
-        result: Of the run.
-        stacked: Whether the panels stand one below the other.
-    """
+    """Draw the share of each level's points below its threshold, and the threshold, where that changes."""
     panels = _make_panels(figure, 2 if passes_levels(result) else 1, stacked)
     shares = panels[0]
     trace = [level for level in result.get("trace") or [] if level["run"] == 0]

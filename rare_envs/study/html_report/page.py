@@ -24,11 +24,10 @@ from rare_envs.study.html_report.figures import (
     passes_levels,
 )
 from rare_envs.study.html_report.templating import render_template
-from rare_envs.study.journal import refuse_unfinished
 from rare_envs.study.question import prepare
-from rare_envs.study.recorded_question import open_question, warn_of_changed_files
+from rare_envs.study.recorded_question import load_finished, open_run, warn_of_changed_files
 from rare_envs.study.repeatability import Repeatability
-from rare_envs.study.run_folder import EPISODES, REPORT, RESULT, STUDY, LoadedStudy, load_study
+from rare_envs.study.run_folder import EPISODES, REPORT, RESULT, STUDY, LoadedStudy
 from rare_envs.study.text import (
     describe_intervals,
     describe_kind,
@@ -78,18 +77,14 @@ def write_html_report(
     """
     if figures is not None and figures not in FORMATS:
         raise BadInput(f"Expected --figures {', '.join(FORMATS)}, got {figures!r}.")
-    refuse_unfinished(folder)
-    study, page = load_study(folder), out or folder / REPORT
+    study, page = load_finished(folder), out or folder / REPORT
     with output_file(page):
         return _write(study, page, trust, events, figures)
 
 
 def _write(study: LoadedStudy, page: Path, trust: bool, events: Path | None, kind: str | None) -> list[Path]:
     """Write the page of a run, and its figures where their kind is given; return the files."""
-    folder = study.folder
-    with as_bad_input(ValueError):
-        failures = study.failures
-    question = open_question(study.question, folder, trust)
+    folder, failures, question = study.folder, study.failures, open_run(study, trust)
     warn_of_changed_files(question, folder)
     problem = prepare(question).problem
     columns = [column for column in list_columns(problem.space) if column.shown]

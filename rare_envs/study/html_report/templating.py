@@ -18,12 +18,7 @@ def keep_numbers_whole(value: object) -> object:
 
 
 def render_template(name: str, **values: Any) -> str:
-    """Return a page.
-
-    Args:
-        name: File among the templates.
-        **values: What the template names.
-    """
+    """Return a page."""
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader("rare_envs.study.html_report"),
         autoescape=True,

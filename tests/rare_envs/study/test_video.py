@@ -36,7 +36,7 @@ def test_a_drive_that_comes_out_otherwise_says_why(run):
 
 
 def test_no_run(tmp_path):
-    with pytest.raises(BadInput, match="No run in"):
+    with pytest.raises(BadInput, match="No finished run in"):
         find_failure(tmp_path, 0)
 
 

@@ -41,7 +41,7 @@ def test_each_kind_of_crash_is_among_the_chosen() -> None:
 
 
 def test_refusals(run: Path, tmp_path: Path) -> None:
-    with pytest.raises(BadInput, match="No run in"):
+    with pytest.raises(BadInput, match="No finished run in"):
         add_run(tmp_path, tmp_path / "corpus")
     with pytest.raises(BadInput, match="at least one"):
         add_run(run, tmp_path / "corpus", most=0)

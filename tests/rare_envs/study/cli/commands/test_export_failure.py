@@ -38,7 +38,7 @@ def test_a_missing_folder_is_made_and_goes_with_an_export_that_fails(cli: Cli, r
 
 
 def test_refusals_are_one_line(cli: Cli, run: Path, tmp_path: Path) -> None:
-    assert_refused(cli("export", tmp_path / "none", "--out", tmp_path / "a.xosc"), "No run in")
+    assert_refused(cli("export", tmp_path / "none", "--out", tmp_path / "a.xosc"), "No finished run in")
     assert_refused(cli("export", run, "--out", tmp_path / "a.gif"), "ends in .xosc")
     assert_refused(cli("export", run, "--format", "carla", "--ego", "recorded", "--out", tmp_path / "a.xosc"), "free")
     assert_refused(

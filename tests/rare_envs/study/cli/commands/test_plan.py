@@ -20,7 +20,7 @@ def test_a_plan_from_pilots_and_one_from_a_folder(cli: Cli, risky: str, safe: st
     none = cli("plan", FOLLOWING, "--base", safe, "--method", "mc", "--pilot", 200)
     assert none.exit_code == 2 and none.stdout == ""
     assert "found no failure" in none.stderr.splitlines()[-1]  # behind the bar
-    assert_refused(cli("plan", tmp_path), "No run in")
+    assert_refused(cli("plan", tmp_path), "No finished run in")
     for options in (("--method", "ce"), ("--pilot", 500), ("--ego", "human")):
         assert_refused(cli("plan", tmp_path / "run", *options), f"without {options[0]}")
     assert_refused(cli("plan", FOLLOWING, "--base", risky, "--method", "mc,nope", "--pilot", 100), "'nope'")

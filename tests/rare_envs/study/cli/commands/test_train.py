@@ -17,7 +17,7 @@ BAD_TRAININGS = {
     "no steps": ([FOLLOWING, "--steps", "0"], ["steps", "0"]),
     "no environments": ([FOLLOWING, "--num-envs", "0"], ["--num-envs", "0"]),
     "no environment": ([], ["--from-failures"]),
-    "no run": (["--from-failures", "nowhere"], ["No run in 'nowhere'"]),
+    "no run": (["--from-failures", "nowhere"], ["No finished run in 'nowhere'"]),
     "the run tells the world": (["--from-failures", "nowhere", "--base", "us101"], ["leave --base"]),
     "out is a folder": ([FOLLOWING, "--out", "."], ["folder"]),
 }
