@@ -9,7 +9,7 @@ from torch import Tensor
 from agents import LearnedDriver
 from rare_envs.sensors.lidar import AHEAD_BEAM
 from rare_envs.sensors.perception import RANGE_COLUMNS, RATE_COLUMNS
-from rare_envs.traffic.oriented_boxes import boxes_overlap
+from rare_envs.traffic.bodies import boxes_overlap
 from training.data.trajectories import DT
 from training.imitation.traffic.recording import Recording
 from training.imitation.traffic.replayed_traffic import Traffic, lane_of, replay_features, start_replay, step_replay
