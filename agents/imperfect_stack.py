@@ -23,7 +23,7 @@ from rare_envs.simulation.cuda_graphs import says_recordable
 from rare_envs.simulation.episode import Episode
 from rare_envs.simulation.rollout import Driver, StochasticDriver
 from rare_envs.simulation.world import World
-from rare_envs.traffic.neighbours import lead_of
+from rare_envs.traffic.lead import lead_of
 from rare_envs.traffic.state import State
 
 OWN_ERRORS, ERRORS_PER_VEHICLE = 3, 4

@@ -64,7 +64,7 @@ def set_up(
             ("camera", "lidar"), make a `Dict`.
         action: "continuous"; "discrete", five accelerations for algorithms such as DQN, see
             `rare_envs.control.actions.DISCRETE_ACTIONS`; or "meta" (HighwayEnv's, see
-            `rare_envs.control.actions`: a step is then one second).
+            `rare_envs.control.meta_actions`: a step is then one second).
         measure: The safety measure: a name in `rare_envs.measures.MEASURES`, "stl:FORMULA", "module:name", a
             `Measure` or another of its kind, or a function; see `rare_envs.measures.find_measure`.
         horizon: Length of an episode [s]; None takes the scenario's.

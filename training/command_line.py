@@ -11,9 +11,8 @@ import functools
 import inspect
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, fields, is_dataclass
-from enum import Enum
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, get_type_hints
+from typing import Annotated, Any, ClassVar, Literal, get_type_hints
 
 import typer
 
@@ -72,22 +71,15 @@ class EventOptions(RecordingOptions):
     KINDS: ClassVar[tuple[str, ...]] = (*RecordingOptions.KINDS, "coifman")
 
 
-class AlgorithmOption(str, Enum):
-    """Algorithms that train drivers of the traffic, as an option."""
-
-    GAIL = "gail"
-    MGAIL = "mgail"
-
-
 @dataclass(frozen=True, kw_only=True)
 class DriverTrainingOptions:
     """Options of each command that trains drivers of the traffic.
 
-    The defaults are those of `training.imitation.algorithms.config.Config`, written out because importing that takes
+    The defaults are those of `training.imitation.config.Config`, written out because importing that takes
     seconds.
     """
 
-    method: Annotated[AlgorithmOption, typer.Option(help="Algorithm.")] = AlgorithmOption.MGAIL
+    method: Annotated[Literal["gail", "mgail"], typer.Option(help="Algorithm.")] = "mgail"
     seed: Annotated[int, typer.Option(help="The same seed gives the same weights.")] = 0
     updates: Annotated[int, typer.Option(min=1, help="Updates of the policy, after behaviour cloning.")] = 1500
     device: Annotated[str, typer.Option(help="Where to train: cpu, or a GPU (cuda, cuda:1).")] = "cpu"
@@ -148,7 +140,10 @@ def spread_options(command: Callable[..., None]) -> Callable[..., None]:
     def spread(**values: Any) -> None:
         for name, group in groups.items():
             taken = {field.name: values.pop(field.name) for field in fields(group) if field.name in values}
-            values[name] = group(**taken)
+            try:
+                values[name] = group(**taken)
+            except ValueError as error:
+                raise typer.BadParameter(str(error)) from None
         command(**values)
 
     keyword_only = [parameter.replace(kind=inspect.Parameter.KEYWORD_ONLY) for parameter in parameters]

@@ -111,7 +111,7 @@ class CollisionAvoidance:
     reach: float = 1.0
     """A point is beside if it is no further than this before or behind the own body [m]."""
     lateral_time: float = 0.6
-    """T_y [s], HighwayEnv's time constant, as in `rare_envs.control.idm`."""
+    """T_y [s], HighwayEnv's time constant, as in `rare_envs.control.steering`."""
     heading_time: float = 0.2
     """T_psi [s], likewise."""
     turning_radius: float = 6.4

@@ -31,16 +31,19 @@ from agents.learned.rule_driver import RuleDriver
 from benchmarks import RESULTS
 from benchmarks.samplers.runs import about
 from rare_envs.threads import use_one_thread
-from training.imitation.datasets import Source, load_scenes
-from training.imitation.evaluation.behaviour import Act, sampling_driver
-from training.imitation.evaluation.driving_statistics import BINS, DrivingStatistics, add_statistics
-from training.imitation.evaluation.realism import (
-    bootstrap_errors,
+from samplers.problem import FloatArray
+from training.imitation.evaluate import (
+    BINS,
+    Act,
+    DrivingStatistics,
+    Realism,
     collect_statistics,
     record_statistics,
+    sampling_driver,
     summarise_realism,
 )
-from training.imitation.traffic.recording import Recording, stack_scenes
+from training.imitation.traffic import Recording, stack_scenes
+from training.imitation.train import Source, load_scenes
 
 SECONDS = (10.0, 20.0)
 """Times for which scenes are driven [s]."""
@@ -57,6 +60,34 @@ def constant_velocity(features: Tensor, memory: Tensor | None) -> tuple[Tensor, 
 def rule_driver(features: Tensor, memory: Tensor | None) -> tuple[Tensor, Tensor | None]:
     """Return actions of IDM and lane keeping."""
     return RuleDriver().act(features, None, None, memory)
+
+
+def add_statistics(tallies: Sequence[DrivingStatistics]) -> DrivingStatistics:
+    """Return the sum of several statistics of the same scenes."""
+
+    def add(parts: Sequence[dict[str, FloatArray]]) -> dict[str, FloatArray]:
+        return {key: np.sum([part[key] for part in parts], axis=0) for key in parts[0]}
+
+    steps, vehicles, *groups = zip(*tallies, strict=True)
+    return DrivingStatistics(np.sum(steps, axis=0), np.sum(vehicles, axis=0), *(add(group) for group in groups))
+
+
+def bootstrap_errors(
+    driven: DrivingStatistics, recorded: DrivingStatistics, rng: np.random.Generator, draws: int = 200
+) -> Realism:
+    """Return standard errors by bootstrap over scenes; scenes that share vehicles are taken as independent."""
+    scenes = len(driven.steps)
+    drawn = [
+        asdict(summarise_realism(driven, recorded, times))
+        for times in rng.multinomial(scenes, [1 / scenes] * scenes, draws)
+    ]
+
+    def spread(values: list[Any]) -> Any:
+        if isinstance(values[0], dict):
+            return {key: spread([value[key] for value in values]) for key in values[0]}
+        return float(np.std(values, ddof=1))
+
+    return Realism(**{name: spread([one[name] for one in drawn]) for name in drawn[0]})
 
 
 @dataclass(frozen=True)

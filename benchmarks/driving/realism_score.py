@@ -37,11 +37,18 @@ from benchmarks.samplers.runs import about
 from rare_envs.control.lane_changing import LaneChangingDriver
 from rare_envs.threads import use_one_thread
 from rare_envs.traffic.neighbours import LaneTraffic
-from training.data.trajectories import DT
-from training.imitation.datasets import Source, load_scenes
-from training.imitation.evaluation.behaviour import Act, regular_starts, sampling_driver
-from training.imitation.traffic.recording import Recording, stack_scenes
-from training.imitation.traffic.replayed_traffic import Traffic, lane_of, replay_features, start_replay, step_replay
+from training.data.table import DT
+from training.imitation.evaluate import Act, regular_starts, sampling_driver
+from training.imitation.traffic import (
+    Recording,
+    Traffic,
+    lane_of,
+    replay_features,
+    stack_scenes,
+    start_replay,
+    step_replay,
+)
+from training.imitation.train import Source, load_scenes
 
 TICKS = 80
 """Ticks of a rollout: 8 s, as in the challenge."""

@@ -25,7 +25,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from training.data.trajectories import DT
+from training.data.table import DT
 
 POSE = 3
 """Numbers in a pose: x along the road [m], y across it and positive to the right [m], heading [rad]."""

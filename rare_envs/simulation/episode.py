@@ -6,13 +6,13 @@ from typing import Any, NamedTuple
 
 from torch import Tensor
 
-from rare_envs.control.actions import Aim
+from rare_envs.control.meta_actions import Aim
 from rare_envs.measures import EpisodeMeasure
 from rare_envs.measures.registry import MEASURES
 from rare_envs.sensors.camera import CameraContext
 from rare_envs.simulation.background import BackgroundState
 from rare_envs.simulation.episode_statistics import EpisodeStatistics
-from rare_envs.traffic.neighbours import Lead
+from rare_envs.traffic.lead import Lead
 from rare_envs.traffic.road import Road
 from rare_envs.traffic.state import State
 

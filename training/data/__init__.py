@@ -2,15 +2,17 @@
 
 from training.data.brakings import hard_brake_events
 from training.data.events import car_following_events, cut_in_events
-from training.data.formats.coifman_li import load_coifman_li
-from training.data.formats.highd import highd_recordings, load_highd
-from training.data.formats.i24_motion import load_i24_motion
-from training.data.formats.ngsim import load_ngsim
-from training.data.formats.tgsim import find_tgsim_files, load_tgsim
-from training.data.scenes import TrafficScene, load_us101_scenes, split_by_clock
-from training.data.synthetic import synthetic_traffic
-from training.data.trajectories import NOBODY, Trajectories, read_trajectories, tabulate, write_trajectories
-from training.data.windows import scenes_of
+from training.data.formats import (
+    find_tgsim_files,
+    highd_recordings,
+    load_coifman_li,
+    load_highd,
+    load_i24_motion,
+    load_ngsim,
+    load_tgsim,
+)
+from training.data.scenes import TrafficScene, load_us101_scenes, scenes_of, split_by_clock
+from training.data.table import NOBODY, Trajectories, read_trajectories, synthetic_traffic, tabulate, write_trajectories
 
 __all__ = [
     "NOBODY",

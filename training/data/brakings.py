@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from samplers.problem import FloatArray
 from training.data.events import Events, bumper_gaps
 from training.data.smoothing import CUTOFF_ALONG, smooth_positions
-from training.data.trajectories import DT, NOBODY, Trajectories
+from training.data.table import DT, NOBODY, Trajectories
 
 BRAKING_ONSET = 0.5
 """Deceleration [m/s^2] above which a vehicle brakes."""

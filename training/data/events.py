@@ -1,18 +1,21 @@
-"""Events in recorded traffic: pairs of a follower and its leader, and cut-ins.
+"""Events in recorded traffic: pairs of a follower and its leader, and cut-ins; pooled and written to files.
 
 The definitions are those behind the shipped `us101` distributions; docs/data.md states them in full.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
 from numpy.typing import NDArray
+from pyarrow import csv
 
 from samplers.problem import FloatArray
-from training.data.lane_change_courses import LATERAL_SPAN, LATERAL_SPEED, course_durations, time_between_spans
-from training.data.trajectories import DT, Trajectories
+from training.data.table import DT, Trajectories
 
 Events = dict[str, NDArray[Any]]
 
@@ -23,6 +26,10 @@ MIN_LANE_FRAMES = 8
 ASSUMED_START = 13
 """Frames from the start of a lane change to its crossing where positions across were not recorded: mean of the 42
 recorded starts on US 101 (1.3 s, standard deviation 0.9 s)."""
+LATERAL_SPEED = 0.2
+"""Speed across above which a lane change has begun and is not over [m/s]."""
+LATERAL_SPAN = 5
+"""Number of frames over which the speed across is measured: 0.5 s."""
 
 CAR_FOLLOWING_COLUMNS = (
     *("recording", "frame", "lane", "ego", "lead", "v_ego", "v_lead", "gap", "a_ego", "a_lead", "n", "at_entry"),
@@ -144,7 +151,7 @@ def find_duration(trajectories: Trajectories, crossing: int, first: int, last: i
     side = np.sign(t.lane[crossing] - t.lane[crossing - 1])
     for end in range(crossing, last - LATERAL_SPAN + 1) if seen else ():
         if side * (t.y[end + LATERAL_SPAN] - t.y[end]) <= LATERAL_SPEED * LATERAL_SPAN * DT:
-            above = time_between_spans(np.array([start]), np.array([end]), DT)
+            above = time_between_spans(np.array([start]), np.array([end]))
             moved = side * (t.y[end + LATERAL_SPAN] - t.y[start - LATERAL_SPAN])
             return float(course_durations(above, np.array([moved]))[0])
     return float("nan")
@@ -234,3 +241,79 @@ def _find_neighbours(
         if ahead.size:
             before[i] = ahead[np.argmin(front[ahead])]
     return behind, before
+
+
+def course_durations(above: FloatArray, displacement: FloatArray) -> FloatArray:
+    """Return the durations T of cubic courses that move across faster than `LATERAL_SPEED` for as long as recorded.
+
+    A recording shows for how long a vehicle moves across faster than some speed; when it begins and ends to move cannot
+    be seen. The course y = D (3 t^2 - 2 t^3), t from 0 to 1 in T, has the speed across 6 D t (1 - t) / T, above v for
+    T sqrt(1 - 2 v T / (3 D)). The shorter of the two T is taken; where a course never moves that long, the one that
+    does so longest, T = D / v.
+
+    Args:
+        above: Time above `LATERAL_SPEED` [s], shape (n,).
+        displacement: D [m], shape (n,).
+
+    Returns:
+        T [s], shape (n,); NaN where the time is not known or the vehicle did not move to its new side.
+
+    Example:
+        >>> course_durations(np.array([3.64, 3.0, np.nan]), np.array([3.1, -0.4, 3.1])).round(2).tolist()
+        [4.0, nan, nan]
+    """
+    known = np.isfinite(above) & (displacement > 0.0)
+    time, side = np.where(known, above, 0.0), np.where(known, displacement, 1.0)
+    low, high = np.zeros_like(time), side / LATERAL_SPEED
+    for _ in range(60):
+        middle = 0.5 * (low + high)
+        short = middle * np.sqrt(np.maximum(1.0 - 2.0 * LATERAL_SPEED * middle / (3.0 * side), 0.0)) < time
+        low, high = np.where(short, middle, low), np.where(short, high, middle)
+    return np.where(known, low, np.nan)
+
+
+def time_around_peak(speed: FloatArray, time: FloatArray) -> float:
+    """Return how long the speed is above `LATERAL_SPEED` around its largest value [s].
+
+    Example:
+        >>> time_around_peak(np.array([0.3, 0.1, 0.5, 0.9, 0.4, 0.1]), 0.1 * np.arange(6.0)).__round__(2)
+        0.3
+    """
+    slow = np.flatnonzero(speed <= LATERAL_SPEED)
+    peak = int(np.argmax(speed))
+    first = slow[slow < peak].max(initial=-1) + 1
+    behind = slow[slow > peak].min(initial=len(speed))
+    return float((behind - first) * np.median(np.diff(time)))
+
+
+def time_between_spans(start: FloatArray, end: FloatArray) -> FloatArray:
+    """Return the time above `LATERAL_SPEED` of changes that are found by their mean speed over `LATERAL_SPAN` frames.
+
+    The last slow span before a change ends at its start, the first slow one after it begins at its end. The speed falls
+    to that of a span in its middle, half a frame nearer to the change in the mean.
+
+    Args:
+        start: Frames of the starts, shape (n,).
+        end: Frames of the ends, shape (n,).
+    """
+    return (end - start + LATERAL_SPAN - 1) * DT
+
+
+def concatenate_events(parts: Sequence[Events]) -> Events:
+    """Return the events of several tables as one.
+
+    Raises:
+        ValueError: No table is given.
+    """
+    if not parts:
+        raise ValueError("Expected events of at least one recording, got none.")
+    return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+
+
+def write_events(events: Mapping[str, NDArray[Any]], path: Path | str) -> None:
+    """Write events to a CSV file, missing values as empty fields."""
+    columns = {
+        name: pa.array(np.round(values, 4) if values.dtype.kind == "f" else values, from_pandas=True)
+        for name, values in events.items()
+    }
+    csv.write_csv(pa.table(columns), path)

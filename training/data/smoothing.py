@@ -1,4 +1,4 @@
-"""Smoothing of recorded positions, and the actions that reproduce the smooth track.
+"""Smoothing of recorded positions, the actions that reproduce the smooth track, and tracks of other frame rates.
 
 Positions from video jitter by centimetres, which two differences at 0.1 s turn into metres per second squared. They are
 smoothed before they are differentiated (Thiemann, Treiber, Kesting, "Estimating acceleration and lane-changing dynamics
@@ -12,9 +12,12 @@ from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline
 from scipy.linalg import cho_solve_banded, cholesky_banded
 
 from samplers.problem import FloatArray
+from training.data.table import DT
 
 CUTOFF_ALONG = 0.40
 """Frequency [Hz] at which the gain along the road is one half; docs/data.md has accelerations by cut-off."""
@@ -22,6 +25,11 @@ CUTOFF_ACROSS = 0.35
 """Frequency [Hz] at which the gain across the road is one half."""
 MIN_HEADING_SPEED = 2.0
 """Speed [m/s] along the road below which the heading is computed as at this speed, because it would be noise."""
+
+LARGEST_STEP = 1.5
+"""Frames between two rows of a vehicle from which on its track is cut: between 1 (no hole) and 2 (one is missing)."""
+ROUNDING = 1e-6
+"""Tolerance [ticks] within which the end of a track counts as a multiple of `DT`: more than times are rounded by."""
 
 
 class Motion(NamedTuple):
@@ -100,3 +108,44 @@ def infer_motion(x: FloatArray, y: FloatArray, dt: float) -> Motion:
 def _pad(values: FloatArray, n: int) -> FloatArray:
     """Return the values followed by NaN, shape (n,)."""
     return np.concatenate([values, np.full(n - len(values), np.nan)])
+
+
+class ResampledTracks(NamedTuple):
+    """Rows at multiples of `DT`."""
+
+    vehicle: FloatArray
+    """Number of the vehicle, shape (rows,)."""
+    frame: FloatArray
+    """Time in units of `DT`, shape (rows,)."""
+    splined: FloatArray
+    """Columns interpolated by cubic splines, shape (rows, a)."""
+    linear: FloatArray
+    """Columns interpolated linearly, shape (rows, b)."""
+    nearest: NDArray[np.intp]
+    """Row of the original that is nearest in time, shape (rows,)."""
+
+
+def resample_tracks(
+    vehicle: FloatArray, time: FloatArray, dt: float, splined: FloatArray, linear: FloatArray
+) -> ResampledTracks:
+    """Return tracks at multiples of `DT`, cut at their holes.
+
+    Args:
+        vehicle: Number of the vehicle, shape (n,).
+        time: Time of each row [s], shape (n,).
+        dt: Time between the frames of the file [s].
+        splined: Columns to interpolate by cubic splines, such as positions, shape (n, a).
+        linear: Columns to interpolate linearly, shape (n, b).
+    """
+    order = np.lexsort([time, vehicle])
+    cuts = 1 + np.flatnonzero((np.diff(vehicle[order]) != 0) | (np.diff(time[order]) > LARGEST_STEP * dt))
+    parts: list[ResampledTracks] = []
+    for piece in np.split(order, cuts):
+        t = time[piece]
+        frame = np.arange(np.ceil(t[0] / DT - ROUNDING), np.floor(t[-1] / DT + ROUNDING) + 1.0)
+        at = np.clip(frame * DT, t[0], t[-1])
+        smooth = CubicSpline(t, splined[piece])(at) if len(t) > 3 else splined[piece][np.searchsorted(t, at)]
+        straight = np.column_stack([np.interp(at, t, column) for column in linear[piece].T])
+        nearest = piece[np.minimum(np.rint((at - t[0]) / dt).astype(np.int64), len(t) - 1)]
+        parts.append(ResampledTracks(np.full(len(frame), vehicle[piece[0]]), frame, smooth, straight, nearest))
+    return ResampledTracks(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))

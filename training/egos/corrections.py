@@ -44,11 +44,10 @@ from training.egos.correction_labels import Labelled, record_drive
 from training.egos.imitation import JUDGED, JUDGED_SEED
 from training.egos.nominal_driving import draw_inputs, judge_all_cases, make_world
 from training.egos.nominal_traffic import CASES
-from training.imitation.algorithms.expert_pairs import collect_pairs
-from training.imitation.datasets import Source, load_scenes
-from training.imitation.evaluation.realism import header_metrics
-from training.imitation.run_folder import DRIVER
-from training.imitation.traffic.recording import stack_scenes
+from training.imitation.clone import collect_pairs
+from training.imitation.evaluate import header_metrics
+from training.imitation.traffic import stack_scenes
+from training.imitation.train import DRIVER, Source, load_scenes
 
 OUTPUT_WEIGHTS = (1.0, 3.0, 0.3, 0.3)
 """Weights of the outputs in the loss: acceleration, yaw rate and the logarithms of their standard deviations."""

@@ -24,7 +24,8 @@ from rare_envs.simulation.clock import Clock
 from rare_envs.simulation.episode import Episode
 from rare_envs.simulation.sensing import Sensing
 from rare_envs.simulation.world import World
-from rare_envs.traffic.road import ReferenceLine, Road, i80
+from rare_envs.traffic.reference_line import ReferenceLine
+from rare_envs.traffic.road import Road, i80
 from rare_envs.traffic.state import VEHICLE_LENGTH, State
 from training.egos.nominal_traffic import OrdinaryDrivers, draw_starts, make_ordinary_traffic
 

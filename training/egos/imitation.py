@@ -28,14 +28,23 @@ from training.command_line import RunFolderOption, report_errors, run_command
 from training.data.scenes import TrafficScene
 from training.egos.encounters import EncounterSpec, make_scenes
 from training.egos.nominal_driving import judge_all_cases
-from training.imitation.algorithms.config import Config
-from training.imitation.algorithms.expert_pairs import collect_pairs
-from training.imitation.algorithms.learner import Learner
-from training.imitation.datasets import Source, load_scenes
-from training.imitation.evaluation.realism import header_metrics
-from training.imitation.fit import Data, make_learner, train_learner
-from training.imitation.run_folder import DRIVER, check_folder, driver_of, format_settings, write_settings
-from training.imitation.traffic.recording import stack_scenes
+from training.imitation.clone import collect_pairs
+from training.imitation.config import Config
+from training.imitation.evaluate import header_metrics
+from training.imitation.learner import Learner
+from training.imitation.traffic import stack_scenes
+from training.imitation.train import (
+    DRIVER,
+    Data,
+    Source,
+    check_folder,
+    driver_of,
+    format_settings,
+    load_scenes,
+    make_learner,
+    train_learner,
+    write_settings,
+)
 
 NAME = "imitation"
 CONFIG = Config(

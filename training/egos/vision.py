@@ -37,8 +37,7 @@ from training.command_line import RunFolderOption, report_errors, run_command
 from training.egos.expert_driver import AUXILIARY_SIZE
 from training.egos.image_dataset import LabelledPictures, collect, concatenate, mirror
 from training.egos.nominal_driving import judge_all_cases
-from training.imitation.fit import CHECKPOINT
-from training.imitation.run_folder import check_folder, write_settings
+from training.imitation.train import CHECKPOINT, check_folder, write_settings
 
 FILE = "vision.safetensors"
 JUDGE_SEED = 2026

@@ -26,11 +26,11 @@ import typer
 from rare_envs.files import replace_text
 from rare_envs.scenarios.registry import scenario_named
 from training.command_line import EventOptions, report_errors, run_command, spread_options
-from training.data.event_tables import EXTRACTORS, concatenate_events, write_events
-from training.data.events import Events
-from training.data.formats.recordings import load_recordings
-from training.data.formats.text_columns import Gaps
-from training.data.trajectories import Trajectories
+from training.data.brakings import hard_brake_events
+from training.data.columns import Gaps
+from training.data.events import Events, car_following_events, concatenate_events, cut_in_events, write_events
+from training.data.formats import load_recordings
+from training.data.table import Trajectories
 from training.scenario_fitting.base_files import FitRequest, fit_base, format_base
 from training.scenario_fitting.event_filters import EVENT_RECIPES, filter_events, read_events
 from training.scenario_fitting.fit_progress import FitProgress, ignore_progress
@@ -40,6 +40,12 @@ from training.scenario_fitting.shipped.bases import SHIPPED_BASES, ShippedBase, 
 from training.scenario_fitting.shipped.cut_ins import CUT_IN_V0, CUT_IN_V1
 from training.scenario_fitting.shipped.following_states import check_against_following
 
+EXTRACTORS = {
+    "car_following": car_following_events,
+    "cut_in": cut_in_events,
+    "hard_brake": hard_brake_events,
+}
+"""Functions that extract the events of a scenario."""
 PACKAGE_COMMAND = "python -m training.scenario_fitting.fit --data DIR --out rare_envs/data"
 """Command that writes the files of the package."""
 OWN_COMMAND = "python -m training.scenario_fitting.fit, with --highd or another option of recordings"

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from rare_envs.distributions.fitted import EventFrequency
 from training.data.brakings import braking_exposure
 from training.data.events import Events
-from training.data.trajectories import DT, Trajectories
+from training.data.table import DT, Trajectories
 from training.scenario_fitting.shipped.frequencies import CUT_INS_US101, NEW_LEADERS, braking_frequency
 
 OWN_SOURCE = "counted in the recordings themselves"

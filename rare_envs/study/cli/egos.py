@@ -146,17 +146,15 @@ def _estimate_options(world: Mapping[str, Any]) -> str:
 def train_drivers_command(
     out: RunFolderOption, recordings: RecordingOptions, options: DriverTrainingOptions, as_json: JsonOption = False
 ) -> None:
-    """Train background drivers from recorded traffic; `python -m training.imitation.train` has every setting."""
-    from training.imitation.algorithms.config import Config
-    from training.imitation.datasets import Source
-    from training.imitation.run_folder import train_driver
+    """Train background drivers from recorded traffic; `python -m training.imitation` has every setting."""
+    from training.imitation.config import Config
+    from training.imitation.train import Source, train_driver
 
-    method = options.method.value
     with as_bad_input(ValueError):
-        config = Config(method, options.seed, options.updates)  # type: ignore[arg-type]  # the options are its methods
+        config = Config(options.method, options.seed, options.updates)
         path = train_driver(Source(*recordings.kind_and_path()), config, out, progress=True, device=options.device)
     if as_json:
-        print_json({"driver": str(path), "method": method, "seed": options.seed})
+        print_json({"driver": str(path), "method": options.method, "seed": options.seed})
     else:
         print(f"Saved {path}. Load it with agents.load_driver({str(path)!r}).")
 

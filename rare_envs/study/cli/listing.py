@@ -16,7 +16,8 @@ import samplers
 from agents.learned.networks import HEAD_SIZE
 from rare_envs.distributions.fitted import FittedDistribution
 from rare_envs.exposure.base_record import explain_no_frequency, read_source
-from rare_envs.measures.base import Measure, TraceMeasure
+from rare_envs.measures.base import Measure
+from rare_envs.measures.episode_trace import TraceMeasure
 from rare_envs.measures.registry import MEASURES
 from rare_envs.plugins import did_you_mean
 from rare_envs.scenarios.base import Scenario

@@ -11,8 +11,8 @@ from agents.learned.networks import head_weights
 from benchmarks.driving import realism
 from benchmarks.driving.realism import format_table, load_named, measure_all, round_numbers
 from tests.training.imitation.synthetic_scenes import scenes
-from training.imitation.algorithms.config import Config
-from training.imitation.fit import make_learner, prepare_data
+from training.imitation.config import Config
+from training.imitation.train import make_learner, prepare_data
 
 
 @pytest.fixture(scope="module")

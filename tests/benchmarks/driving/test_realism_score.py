@@ -22,7 +22,7 @@ from benchmarks.driving.realism_score import (
 from benchmarks.driving.sim_agents import FEATURE_NAMES
 from rare_envs.control.lane_changing import LaneChangingDriver
 from tests.training.imitation.synthetic_scenes import plain_policy, scenes
-from training.imitation.traffic.recording import stack_scenes
+from training.imitation.traffic import stack_scenes
 
 
 @pytest.fixture(scope="module", autouse=True)

@@ -20,8 +20,8 @@ from rare_envs.simulation.cuda_graphs import RecordedRollouts
 from rare_envs.simulation.rollout import rollout
 from rare_envs.study.replay import drive_again
 from training.data import scenes_of, synthetic_traffic
-from training.imitation.algorithms.config import Config
-from training.imitation.fit import make_learner, prepare_data, train_learner
+from training.imitation.config import Config
+from training.imitation.train import make_learner, prepare_data, train_learner
 
 pytestmark = [
     pytest.mark.gpu,

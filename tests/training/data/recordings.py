@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from training.data.trajectories import NOBODY, Trajectories, find_leaders, tabulate
+from training.data.table import NOBODY, Trajectories, find_leaders, tabulate
 
 FOOT = 0.3048
 LANE = 3.75

@@ -3,7 +3,7 @@
 import numpy as np
 
 from training.data import NOBODY, tabulate
-from training.data.trajectories import DT
+from training.data.table import DT
 
 LENGTH = 4.5
 PAUSE = 60

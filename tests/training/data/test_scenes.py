@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
+from tests.training.data.recordings import cutting_in
 from tests.training.shared_data import DATA, needs_data
-from training.data.ngsim_tables import SCENES_FILE
-from training.data.scenes import TrafficScene, load_us101_scenes, split_by_clock
+from training.data.scenes import TrafficScene, load_us101_scenes, scenes_of, split_by_clock
 from training.data.smoothing import MIN_HEADING_SPEED
-from training.data.trajectories import DT
+from training.data.table import COLUMNS, DT, SCENES_FILE, synthetic_traffic, tabulate
 
 
 def tiny_scene(**changes):
@@ -76,3 +76,25 @@ def test_recorded_scenes_are_what_was_measured():
 def test_a_missing_file_is_named(tmp_path):
     with pytest.raises(ValueError, match=SCENES_FILE):
         load_us101_scenes(tmp_path)
+
+
+def test_scenes_follow_the_record_and_meet_where_they_were_cut():
+    table = synthetic_traffic(seconds=12.0)
+    (whole,) = scenes_of(table, seconds=100.0)
+    first, second, _ = scenes_of(table, seconds=4.0)
+    np.testing.assert_array_equal(np.concatenate((first.x, second.x)), whole.x[:80])
+    assert (first.acted & ~first.leads_lane()).any(axis=0).sum() == 6
+    assert np.nanmax(np.abs(whole.acceleration)) < 1.5  # the recorded speeds have 1.3 m/s^2
+
+
+def test_what_scenes_need_is_named():
+    table = cutting_in()
+    columns = {name: table.column(name) for name in COLUMNS}
+    with pytest.raises(ValueError, match=r"'r' has no lane boundaries.*y = 1\.8 to 5\.2 m.*lane 1 at 1\.8 m"):
+        scenes_of(tabulate(columns))
+    with pytest.raises(ValueError, match=r"nobody between its lane boundaries, -7 to 0 m; its vehicles are at y ="):
+        scenes_of(tabulate(columns, {"r": (-7.0, -3.5, 0.0)}))
+    with pytest.raises(ValueError, match="Scenes need width"):
+        scenes_of(tabulate({name: table.column(name) for name in COLUMNS} | {"width": np.nan}))
+    with pytest.raises(ValueError, match=r"scenes of 0\.4 s or more"):
+        scenes_of(table, seconds=0.1)

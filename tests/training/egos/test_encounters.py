@@ -10,8 +10,7 @@ from rare_envs.simulation.clock import Clock
 from rare_envs.simulation.rollout import drive
 from rare_envs.simulation.world import World
 from training.egos.encounters import APART, EncounterSpec, make_scenes
-from training.imitation.traffic.recording import stack_scenes
-from training.imitation.traffic.replayed_traffic import start_replay, step_replay
+from training.imitation.traffic import stack_scenes, start_replay, step_replay
 
 
 def test_an_encounter_is_the_scenario_with_its_ego_free() -> None:

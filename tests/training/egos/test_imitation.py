@@ -13,14 +13,14 @@ import rare_envs
 from rare_envs.simulation.observation import observation_space
 from tests.training.imitation.synthetic_scenes import scene
 from tests.training.shared_data import DATA, needs_data
-from training.data.ngsim_tables import SCENES_FILE
+from training.data.table import SCENES_FILE
 from training.egos.corrections import CorrectionConfig
 from training.egos.encounters import EncounterSpec
 from training.egos.imitation import CONFIG, prepare_learner, train_imitation_ego
 from training.egos.nominal_driving import judge, summarise_verdicts
 from training.egos.nominal_traffic import CASES
-from training.imitation.algorithms.config import Config
-from training.imitation.fit import train_learner
+from training.imitation.config import Config
+from training.imitation.train import train_learner
 
 
 @pytest.fixture(scope="module")

@@ -5,9 +5,8 @@ from pathlib import Path
 import pytest
 
 from tests.training.imitation.synthetic_scenes import scenes
-from training.imitation.datasets import Source
-from training.imitation.fit import prepare_data
-from training.imitation.traffic.recording import stack_scenes
+from training.imitation.traffic import stack_scenes
+from training.imitation.train import Source, prepare_data
 
 
 @pytest.fixture(scope="session")
@@ -18,7 +17,7 @@ def data():
 @pytest.fixture
 def made_up(monkeypatch):
     """A source that reads nothing from files."""
-    monkeypatch.setattr("training.imitation.run_folder.load_scenes", lambda source: (scenes(2), scenes(3)[2:]))
+    monkeypatch.setattr("training.imitation.train.load_scenes", lambda source: (scenes(2), scenes(3)[2:]))
     return Source("data", Path("somewhere/tables"))
 
 

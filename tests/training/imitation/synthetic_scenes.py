@@ -7,7 +7,8 @@ import torch
 
 from agents.learned.networks import Policy, Scaling
 from training.data.scenes import TrafficScene
-from training.imitation.algorithms.config import Config
+from training.imitation.config import Config
+from training.imitation.traffic import start_replay
 
 DT = 0.1
 EDGES = (0.0, 3.6, 7.2, 10.8)
@@ -75,3 +76,8 @@ def plain_policy():
     with torch.random.fork_rng():
         torch.manual_seed(0)
         return Policy(scaling)
+
+
+def at_start(recording, tick=0):
+    rows = torch.arange(len(recording.x))
+    return start_replay(recording, rows, torch.full_like(rows, tick))

@@ -1,19 +1,48 @@
-"""The command lines that train drivers: every setting, repeatable commands, one line for an error."""
+"""Trainings from files to drivers: folders, the user's own recordings, command lines, logs, what is refused."""
 
 import dataclasses
 import inspect
 import json
+import sys
 from pathlib import Path
 
 import pytest
+import torch
+import typer
+from typer.testing import CliRunner
 
-from agents import read_provenance
+from agents import load_driver, read_provenance
 from agents.learned.coloured_noise import WHITE_NOISE
-from tests.training.imitation.synthetic_scenes import tiny
-from training.imitation import train as command_line
-from training.imitation.algorithms.config import Config
-from training.imitation.datasets import Source
-from training.imitation.run_folder import command_of
+from agents.learned.networks import head_weights
+from tests.training.data.published_files import i24_documents, tgsim_rows, write_i24, write_tgsim
+from tests.training.data.recordings import simulate, write_highd, write_ngsim
+from tests.training.imitation.synthetic_scenes import TINY, scene, scenes, tiny
+from training.imitation import __main__ as command_line
+from training.imitation.config import Config
+from training.imitation.train import (
+    Source,
+    command_of,
+    load_scenes,
+    make_learner,
+    prepare_data,
+    read_training_settings,
+    split_end,
+    train_driver,
+    train_learner,
+)
+
+OWN = Config(updates=1, epochs=1, pools=1, scenes=2, horizon=(3, 3), critic_batch=64, warm_up=1)
+
+
+@pytest.fixture(scope="module")
+def traffic():
+    return simulate(seed=2, lanes=2, per_lane=6, seconds=16.0)
+
+
+def run(words):
+    app = typer.Typer()
+    app.command()(command_line.main)
+    return CliRunner().invoke(app, words)
 
 
 def rare_envs_command(words):
@@ -24,58 +53,165 @@ def rare_envs_command(words):
     return stop.value.code
 
 
-def test_the_command_line_has_every_setting():
+def test_a_folder_holds_a_driver_that_says_where_it_comes_from(made_up, tmp_path):
+    config = tiny(method="mgail", updates=1, noise="white", horizon=(2, 3))
+    path = train_driver(made_up, config, tmp_path / "run")
+    driver = load_driver(path)
+    assert driver.colour == WHITE_NOISE
+    assert driver.name == "mgail"
+    provenance = read_provenance(path)
+    assert provenance.kind == "mgail"
+    assert "--data tables --method mgail --seed 0 --updates 1" in provenance.command
+    assert "--noise white" in provenance.command
+    assert "--horizon 2 3" in provenance.command
+    assert provenance.metrics["10 s"]["vehicles"] > 0
+    assert "NGSIM" in provenance.data
+    assert read_training_settings(tmp_path / "run") == (made_up, config)
+
+
+def test_a_folder_keeps_to_its_settings(made_up, tmp_path):
+    path = train_driver(made_up, tiny(updates=1), tmp_path, measured=False)
+    first = head_weights(load_driver(path).policy)
+    again = train_driver(made_up, tiny(updates=1), tmp_path, measured=False)
+    assert torch.equal(head_weights(load_driver(again).policy), first)
+    with pytest.raises(ValueError, match="other settings"):
+        train_driver(made_up, tiny(updates=2), tmp_path, measured=False)
+    with pytest.raises(ValueError, match=r"no training\.json"):
+        read_training_settings(tmp_path / "elsewhere")
+
+
+def test_a_training_that_could_not_begin_does_not_block_its_folder(tmp_path):
+    """A typo in the path of the data, and the same folder again with the right one."""
+    out = tmp_path / "run"
+    with pytest.raises(ValueError, match=r"no ngsim_us101_scenes\.parquet in the folder 'nope'"):
+        train_driver(Source("data", Path("nope")), tiny(updates=1), out)
+    assert not out.exists()
+    with pytest.raises(ValueError, match="Cannot read"):
+        train_driver(Source("ngsim", tmp_path / "nope.csv"), tiny(updates=1), out)
+    write_ngsim(tmp_path / "mine.csv", simulate(seed=1, lanes=2, per_lane=6, seconds=12.0))
+    source = Source("ngsim", tmp_path / "mine.csv")
+    assert train_driver(source, tiny(updates=1), out, measured=False).exists()
+
+
+@pytest.mark.parametrize("kind", ["ngsim", "highd"])
+def test_a_driver_learns_from_own_recordings(kind, traffic, tmp_path):
+    if kind == "ngsim":
+        path = tmp_path / "us-101.csv"
+        write_ngsim(path, traffic)
+    else:
+        path = tmp_path / "highd"
+        write_highd(path, traffic, simulate(seed=3, lanes=2, per_lane=4, seconds=8.0))
+    driver = train_driver(Source(kind, path, seconds=4.0), OWN, tmp_path / "run")
+    provenance = read_provenance(driver)
+    assert f"--{kind} {path.name} --seconds 4" in provenance.command
+    assert str(tmp_path) not in provenance.command
+    assert provenance.metrics["10 s"]["vehicles"] > 5
+    assert ("non-commercial" in provenance.data_licence) == (kind == "highd")
+    actions, _ = load_driver(driver).act(torch.zeros(1, 2, 51))
+    assert torch.isfinite(actions).all()
+
+
+def test_the_end_of_each_recording_is_kept_for_tests():
+    named = [dataclasses.replace(scenes(1)[0], name=f"{side}-{start}") for side in "ab" for start in range(10)]
+    learn, test = split_end(named)
+    assert [scene.name for scene in test] == ["a-8", "a-9", "b-8", "b-9"]
+    assert len(learn) == 16
+    assert split_end(named[:1])[1] == ()
+
+
+def test_a_source_is_of_a_known_kind():
+    with pytest.raises(ValueError, match="ngsim"):
+        Source("waymo", Path("data"))
+
+
+def test_a_source_of_another_format_is_learned_from(traffic, tmp_path):
+    write_tgsim(tmp_path / "I294.csv", tgsim_rows(traffic))
+    write_i24(tmp_path / "morning.json", i24_documents(traffic))
+    for kind, name in (("tgsim", "I294.csv"), ("i24", "morning.json")):
+        source = Source(kind, tmp_path / name, seconds=4.0)
+        learn, test = load_scenes(source)
+        assert len(learn) >= 2 and len(test) == 1
+        assert source.options == f"--{kind} {name} --seconds 4"
+        assert name.partition(".")[0] in source.description and source.licence
+
+
+def test_seeds_decide_the_weights(data):
+    first, second, third = (
+        head_weights(train_learner(make_learner(data, tiny(updates=1, seed=seed)))) for seed in (1, 1, 2)
+    )
+    assert torch.equal(first, second)
+    assert not torch.equal(first, third)
+
+
+def test_scenes_without_followers_are_refused():
+
+    with pytest.raises(ValueError, match="Nobody follows"):
+        prepare_data([scene(vehicles=3)])
+    with pytest.raises(ValueError, match="got none"):
+        prepare_data([])
+
+
+def test_the_command_line_has_every_setting_with_its_default():
     options = inspect.signature(command_line.main).parameters
-    names = {option.name for option in dataclasses.fields(Config)} - {"colour"} | {"noise"}
-    assert names <= set(options)
-    for option in dataclasses.fields(Config):
-        if option.name in options:
-            default = options[option.name].default
-            assert getattr(default, "value", default) == option.default, option.name
+    assert {field.name: field.default for field in dataclasses.fields(Config)}.items() <= {
+        name: option.default for name, option in options.items()
+    }.items()
 
 
 @pytest.mark.parametrize("device", ["cpu", "cuda:1"])
 def test_a_command_repeats_its_training(device, made_up, monkeypatch, tmp_path):
     """What is written into a file, read by the command line, gives the same settings."""
-    import typer
-    from typer.testing import CliRunner
-
-    config = tiny(method="mgail", seed=4, colour=WHITE_NOISE, clone_weight=(0.2, 0.1))
+    config = tiny(method="gail", seed=4, noise="white", clone_weight=(0.2, 0.1))
     found = []
     monkeypatch.setattr(command_line, "train_driver", lambda *given, **how: found.append((*given, how)) or tmp_path)
-    app = typer.Typer()
-    app.command()(command_line.main)
-    words = command_of(made_up, config, device).split()[3:]
-    result = CliRunner().invoke(app, [*words, "--out", str(tmp_path)])
+    result = run([*command_of(made_up, config, device).split()[3:], "--out", str(tmp_path)])
     assert result.exit_code == 0, result.output
-    assert found[0][1] == config
-    assert found[0][0] == Source("data", Path("tables"))
-    assert found[0][-1]["device"] == device
+    source, settings, _, how = found[0]
+    assert (source, settings, how["device"]) == (Source("data", Path("tables")), config, device)
 
 
 @pytest.mark.parametrize(
     ("words", "message"),
-    [([], "one of --data"), (["--data", "nowhere"], "nowhere"), (["--ngsim", "a", "--highd", "b"], "one of")],
+    [
+        ([], "one of --data"),
+        (["--data", "nowhere"], "nowhere"),
+        (["--ngsim", "a", "--highd", "b"], "one of"),
+        (["--data", "nowhere", "--pools", "0"], "Expected pools >= 1, got 0"),
+    ],
 )
 def test_the_command_line_says_what_is_missing(words, message, tmp_path):
-    import typer
-    from typer.testing import CliRunner
-
-    app = typer.Typer()
-    app.command()(command_line.main)
-    result = CliRunner().invoke(app, [*words, "--out", str(tmp_path / "run")])
+    result = run([*words, "--out", str(tmp_path / "run")])
     assert result.exit_code == 2
     assert message in result.output
 
 
-def test_the_shared_command_line_trains_drivers(made_up, tmp_path, capsys):
-    words = ["train-drivers", "--data", "tables", "--method", "gail", "--updates", "1", "--json"]
+def test_the_shared_command_line_trains_drivers(monkeypatch, tmp_path, capsys):
+    asked = []
+    monkeypatch.setattr(
+        "training.imitation.train.train_driver", lambda *given, **how: asked.append(given[:2]) or tmp_path / "it"
+    )
+    words = ["train-drivers", "--data", "tables", "--method", "gail", "--updates", "7", "--json"]
     assert rare_envs_command([*words, "--out", str(tmp_path / "run")]) == 0
+    assert asked == [(Source("data", Path("tables")), Config("gail", 0, 7))]
     answer = json.loads(capsys.readouterr().out)
-    assert read_provenance(answer["driver"]).kind == answer["method"] == "gail"
+    assert answer == {"driver": str(tmp_path / "it"), "method": "gail", "seed": 0}
 
 
 @pytest.mark.parametrize("words", [["--data", "t", "--method", "sac"], ["--data", "nowhere"], []])
 def test_the_shared_command_line_refuses_in_one_line(words, tmp_path, capsys):
     assert rare_envs_command(["train-drivers", *words, "--out", str(tmp_path / "run")]) == 2
     assert len(capsys.readouterr().err.strip().splitlines()) == 1
+
+
+def test_logs_go_to_tensorboard(data, tmp_path):
+    pytest.importorskip("tensorboard", reason="the extra logs is optional")
+    train_learner(make_learner(data, tiny(updates=2)), tmp_path, log=True)
+    assert list(tmp_path.glob("events.out.*"))
+
+
+def test_logs_without_tensorboard_are_refused(data, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "torch.utils.tensorboard", None)
+    with pytest.raises(ValueError, match=r"rare-envs\[logs\]"):
+        train_learner(make_learner(data, tiny(updates=1)), tmp_path, log=True)
+    with pytest.raises(ValueError, match=r"rare-envs\[logs\]"):  # before the data are even looked for
+        train_driver(Source("data", tmp_path / "nowhere"), TINY, tmp_path / "run", log=True)

@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 
 from rare_envs.scenarios.base_distributions import load_base
 from rare_envs.scenarios.registry import scenario_named
-from tests.training.data.formats.published_files import (
+from tests.training.data.published_files import (
     CLOCK,
     coifman_matrix,
     i24_documents,
@@ -24,11 +24,9 @@ from tests.training.data.recordings import simulate, write_highd, write_ngsim
 from tests.training.data.stopping_traffic import PAUSE, stopping_traffic
 from tests.training.shared_data import DATA, needs_data
 from training.data.brakings import braking_exposure
-from training.data.events import (
-    cut_in_events,
-)
-from training.data.formats.ngsim import load_ngsim
-from training.data.windows import scenes_of
+from training.data.events import cut_in_events
+from training.data.formats import load_ngsim
+from training.data.scenes import scenes_of
 from training.scenario_fitting import fit as fit_scenarios
 from training.scenario_fitting import mixture as mixture_fit
 from training.scenario_fitting.coordinate_systems import BIC_TIE

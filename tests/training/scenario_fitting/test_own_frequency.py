@@ -6,7 +6,7 @@ import pytest
 from tests.training.data.stopping_traffic import stopping_traffic
 from training.data.brakings import braking_exposure
 from training.data.events import car_following_events, cut_in_events
-from training.data.synthetic import synthetic_traffic
+from training.data.table import synthetic_traffic
 from training.scenario_fitting.own_frequency import ObservedTraffic, count_events
 
 

@@ -20,8 +20,7 @@ from rare_envs.traffic.state import VEHICLE_LENGTH
 from samplers.problem import FloatArray
 from training.command_line import run_command
 from training.data.brakings import SHORTEST_TRACK, TrackBrakings, braking_spans, describe_brakings, track_exposure
-from training.data.ngsim_tables import VEHICLES_FILE, read_columns
-from training.data.trajectories import DT
+from training.data.table import DT, VEHICLES_FILE, read_columns
 
 POSITION_WINDOW = 11
 """Number of ticks over which positions, and then speeds, are averaged: recorded accelerations are mostly noise."""

@@ -11,7 +11,7 @@ import numpy as np
 from rare_envs.distributions.fitted import read_distribution
 from rare_envs.scenarios.registry import scenario_named
 from samplers.problem import FloatArray
-from training.data.ngsim_tables import read_columns
+from training.data.table import read_columns
 from training.scenario_fitting.predictive_checks import check_predictions
 from training.scenario_fitting.shipped.new_leaders import CIRCLES_FILE
 

@@ -13,9 +13,8 @@ from pathlib import Path
 import numpy as np
 
 from samplers.problem import FloatArray
-from training.data.lane_change_courses import course_durations, time_around_peak, time_between_spans
-from training.data.ngsim_tables import read_columns
-from training.data.trajectories import DT
+from training.data.events import course_durations, time_around_peak, time_between_spans
+from training.data.table import DT, read_columns
 from training.scenario_fitting.event_filters import read_csv_columns
 from training.scenario_fitting.shipped.lateral_offsets import (
     CHANGES_FILE,
@@ -56,7 +55,7 @@ def change_shapes(folder: Path) -> FloatArray:
     )
     settled = settled_changes(rows)
     start, end, first, last = (rows[name][settled] for name in ("start_s", "end_s", "start_seen", "end_seen"))
-    above = time_between_spans(np.round(start / DT), np.round(end / DT), DT)
+    above = time_between_spans(np.round(start / DT), np.round(end / DT))
     above = np.where(first.astype(bool) & last.astype(bool), above, np.nan)
     displacement = settled_displacements(folder)
     return np.column_stack([displacement, course_durations(above, displacement)])

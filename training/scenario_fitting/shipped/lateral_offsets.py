@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from samplers.problem import FloatArray
-from training.data.ngsim_tables import read_columns
+from training.data.table import read_columns
 from training.scenario_fitting.event_filters import read_csv_columns
 
 PROFILES_FILE = "lane_change_profiles.parquet"

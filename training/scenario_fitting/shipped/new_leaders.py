@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from samplers.problem import FloatArray
-from training.data.ngsim_tables import read_columns
+from training.data.table import read_columns
 
 CIRCLES_FILE = "i24_circles_following.parquet"
 MIN_JUMP = 6.0

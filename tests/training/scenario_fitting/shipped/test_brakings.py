@@ -6,7 +6,7 @@ import pytest
 from rare_envs.scenarios.hard_brake import US101
 from tests.training.shared_data import DATA, needs_data
 from training.data.brakings import find_standstill_brakings
-from training.data.ngsim_tables import VEHICLES_FILE
+from training.data.table import VEHICLES_FILE
 from training.scenario_fitting.shipped.brakings import find_brakings, load_brakings, log_moments
 
 

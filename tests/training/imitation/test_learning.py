@@ -1,0 +1,324 @@
+"""GAIL and MGAIL and their parts: settings, penalties, gradients, critic; trainings that learn and resume."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from agents.learned.networks import Policy
+from tests.training.imitation.synthetic_scenes import SMALL, at_start, generator, plain_policy, scenes, tiny
+from training.imitation.adversarial import (
+    advantages,
+    clipped_surrogate,
+    conditional_action,
+    rewards,
+    update_mgail,
+    value_inputs,
+)
+from training.imitation.clone import collect_pairs, log_likelihood, scaling_of
+from training.imitation.config import Config
+from training.imitation.learner import Critic, critic_inputs, critic_loss, policy_cost, run_updates
+from training.imitation.rollout import Penalties, ScenePool, compute_penalties, roll_out, total_cost
+from training.imitation.traffic import Recording, Traffic, stack_scenes
+from training.imitation.train import make_learner, train_learner
+
+
+def test_learning_rates_fall_after_the_schedules():
+    config = Config(updates=1000, anneal=0.7, last_rate=0.1)
+    assert [config.rate_factor(update) for update in (0, 700, 850, 1000)] == pytest.approx([1.0, 1.0, 0.55, 0.1])
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"method": "sac"},
+        {"updates": 0},
+        {"epochs": -1},
+        {"pools": 0},
+        {"horizon": (15, 0)},
+        {"clone_weight": (0.1, 0.0)},
+        {"policy_rate": float("nan")},
+        {"edge_weight": -1.0},
+        {"discount": 1.1},
+        {"anneal": 0.0},
+        {"last_rate": 2.0},
+    ],
+)
+def test_settings_are_checked(settings):
+    with pytest.raises(ValueError, match=f"Expected {next(iter(settings))}"):
+        Config(**settings)
+
+
+def moment(x, y, speed, edges=(0.0, 3.6, 7.2)):
+    """Traffic of one scene whose vehicles are 4.5 m long and 2 m wide, and features with nothing in sight."""
+    x, y, speed = (torch.tensor([values]) for values in (x, y, speed))
+    there = torch.ones_like(x, dtype=torch.bool)
+    sizes, edges, row = (0 * x + 4.5, 0 * x + 2.0), torch.tensor([edges]), torch.zeros(1, dtype=torch.long)
+    vehicle = torch.arange(x.shape[1])[None]
+    features = torch.zeros(1, x.shape[1], 51)
+    features[..., 11:31] = 100.0
+    return Traffic(x, y, 0 * x, speed, *sizes, edges, row, row, vehicle, there, there), features
+
+
+def test_penalties_on_paper():
+    traffic, features = moment([0.0, 6.0, 0.0], [1.8, 1.8, 5.4], [0.0, 0.0, 0.0])
+    action = torch.tensor([[[-3.0, 0.0], [0.0, 0.0], [0.0, 0.0]]])
+    cost = compute_penalties(traffic, features, action)
+    # 1.5 m to the car ahead, which overlaps across by 2 m: (1 - 1.5 / 3) (1 + 2 / 0.8); 1.6 m beside the third: none
+    assert cost.collision[0].tolist() == pytest.approx([0.5 * 3.5, 0.5 * 3.5, 0.0])
+    assert cost.brake[0].tolist() == [1.0, 0.0, 0.0]
+    assert (cost.edge == 0).all()
+    off = compute_penalties(traffic._replace(y=traffic.y - 1.5), features, action)
+    assert off.edge[0, 0] == pytest.approx(0.7)
+
+
+def test_closing_in_costs_before_contact():
+    traffic, features = moment([1.0], [1.8], [1.0], (0.0, 3.6))
+    features[..., 11 + 9], features[..., 31 + 9] = 22.25, -10.0  # 20 m of gap, 10 m/s: 2.5 m/s^2 are needed
+    assert compute_penalties(traffic, features, torch.zeros(1, 1, 2)).collision == pytest.approx(0.1)
+
+
+def test_manners_cost_on_paper():
+    """Distance to whoever reaches into the own path, the middle of the lane, and the limit."""
+    traffic, features = moment([0.0, 20.5, 14.5], [1.8, 1.8, 4.2], [30.0, 24.0, 30.0])
+    features[0, :, 0], features[0, :, 2] = torch.tensor([0.0, -0.2, 0.6]), traffic.speed[0]
+    cost = compute_penalties(traffic, features, torch.zeros(1, 3, 2))
+    # 16 m to the lead, less 6 in which to slow down at 3 m/s^2, of 2 + 1.2 * 30 m. The third is as near to it,
+    # but, 0.4 m beside its path, only half in it
+    assert cost.headway[0].tolist() == pytest.approx([1 - 10 / 38, 0.0, 0.5 * (1 - (1.5 - 6) / 38)])
+    assert cost.lane[0].tolist() == pytest.approx([0.0, 0.0, 0.3])
+    assert cost.speed[0].tolist() == pytest.approx([0.1, 0.0, 0.1])
+
+
+def test_total_cost_by_hand():
+    costs = Penalties(*(torch.tensor([float(value)]) for value in (1, 2, 3, 4, 5, 6)))
+    names = ("collision", "edge", "brake", "headway", "lane", "speed")
+    weights = {f"{name}_weight": 10.0**power for power, name in enumerate(names)}
+    assert total_cost(Config(critic_weight=0.5, **weights), torch.tensor([2.0]), costs).tolist() == [654322.0]
+
+
+def doubled(recording):
+    return Recording(*(field.double() if field.is_floating_point() else field for field in recording))
+
+
+def test_the_gradient_of_a_rollout_is_that_of_finite_differences(recording):
+    recording = doubled(recording)
+    policy = Policy(scaling_of(collect_pairs(stack_scenes(scenes())))).double()
+    traffic = Traffic(*(f.double() if f.is_floating_point() else f for f in at_start(recording)))
+    noise = torch.randn(3, traffic.drivers, 2, 2, generator=torch.Generator().manual_seed(3)).double()
+    head = policy.head.weight
+
+    def cost():
+        generator = torch.Generator().manual_seed(0)
+        steps, _ = roll_out(recording, policy, ScenePool(traffic, noise), 20, Config().colour, 1.0, generator)
+        return (steps.features[:, 31:].square().mean() + steps.action.square().mean()) + steps.costs.collision.mean()
+
+    (gradient,) = torch.autograd.grad(cost(), head)
+    direction = torch.randn(head.shape, generator=torch.Generator().manual_seed(1)).double()
+    eps = 1e-6
+    with torch.no_grad():
+        head += eps * direction
+        above = cost()
+        head -= 2 * eps * direction
+        below = cost()
+        head += eps * direction
+    slope = float((above - below) / (2 * eps))
+    assert float((gradient * direction).sum()) == pytest.approx(slope, rel=1e-6)
+
+
+def test_credit_decay_changes_gradients_only(recording):
+    policy = Policy(scaling_of(collect_pairs(recording)))
+    traffic = at_start(recording)
+    noise = torch.zeros(3, traffic.drivers, 2, 2)
+
+    def rolled(credit):
+        steps, pool = roll_out(
+            recording, policy, ScenePool(traffic, noise), 5, Config().colour, credit, torch.Generator().manual_seed(0)
+        )
+        (gradient,) = torch.autograd.grad(steps.features.sum(), policy.head.weight)
+        return pool.traffic.x, gradient
+
+    (x, full), (same, decayed) = rolled(1.0), rolled(0.5)
+    torch.testing.assert_close(x, same, rtol=1e-6, atol=1e-4)
+    assert decayed.norm() < full.norm()
+
+
+def test_the_critic_s_loss_by_hand():
+    """A linear critic w.x: the penalty is |w|^2 wherever it is taken, and the rest is the logistic loss."""
+    critic = Critic()
+    w = torch.randn(53, generator=generator()) * 0.1
+    critic.layers = torch.nn.Sequential(torch.nn.Linear(53, 1, bias=False))
+    with torch.no_grad():
+        critic.layers[0].weight.copy_(w)
+    recorded, made = torch.randn(7, 53, generator=generator(1)), torch.randn(7, 53, generator=generator(2))
+    loss = critic_loss(critic, recorded, made, 0.5, generator())
+    expected = np.log1p(np.exp(-(recorded @ w).numpy())).mean() + np.log1p(np.exp((made @ w).numpy())).mean()
+    assert float(loss.detach()) == pytest.approx(expected + 0.5 * float(w @ w), rel=1e-5)
+
+
+def test_the_gradient_penalty_of_a_deep_critic_by_finite_differences():
+    torch.manual_seed(0)
+    critic = Critic().double()
+    recorded, made = (torch.randn(4, 53, generator=generator(k)).double() for k in range(2))
+    penalty = critic_loss(critic, recorded, made, 1.0, generator(5)) - critic_loss(
+        critic, recorded, made, 0.0, generator(5)
+    )
+    share = torch.rand(4, 1, generator=generator(5))
+    between = share * recorded + (1 - share) * made
+    eps, slopes = 1e-6, torch.zeros(4, 53).double()
+    with torch.no_grad():
+        for j in range(53):
+            step = torch.zeros(53).double()
+            step[j] = eps
+            slopes[:, j] = (critic(between + step) - critic(between - step)) / (2 * eps)
+    assert float(penalty.detach()) == pytest.approx(float(slopes.square().sum(dim=1).mean()), rel=1e-6)
+
+
+def test_advantages_by_hand():
+    """Two ticks, discount 0.5, lambda 0.5: delta_1 = 2 + 0.5 * 4 - 2 = 2, delta_0 = 1 + 0.5 * 2 - 1 = 1."""
+    reward, value = torch.tensor([[1.0], [2.0]]), torch.tensor([[1.0], [2.0], [4.0]])
+    assert advantages(reward, value, 0.5, 0.5).flatten().tolist() == [1.5, 2.0]
+
+
+def test_advantages_without_decay_are_returns_less_values():
+    reward, value = torch.randn(6, 3, generator=generator()), torch.randn(7, 3, generator=generator(1))
+    left = torch.stack([reward[t:].sum(dim=0) + value[-1] - value[t] for t in range(6)])
+    torch.testing.assert_close(advantages(reward, value, 1.0, 1.0), left)
+
+
+def test_the_clipped_surrogate():
+    ratio = torch.tensor([1.5, 0.5, 1.5, 0.5, 1.1])
+    advantage = torch.tensor([2.0, 2.0, -2.0, -2.0, 1.0])
+    # a gain is not followed beyond 1.2, a loss is counted in full
+    assert clipped_surrogate(ratio, advantage, 0.2).tolist() == pytest.approx([2.4, 1.0, -3.0, -1.6, 1.1])
+
+
+def autocorrelation(colour, k, n):
+    a, b = colour.first[k], colour.second[k]
+    rho = [1.0, a / (1 - b)]
+    for _ in range(n):
+        rho.append(a * rho[-1] + b * rho[-2])
+    return np.array(rho)
+
+
+def gaussian_log_density(x, correlation):
+    lags = np.abs(np.subtract.outer(np.arange(len(x)), np.arange(len(x))))
+    matrix = correlation[lags]
+    _, log_det = np.linalg.slogdet(matrix)
+    return -0.5 * (x @ np.linalg.solve(matrix, x) + log_det + len(x) * math.log(2 * math.pi))
+
+
+def test_coloured_actions_have_the_joint_density_that_their_conditionals_multiply_to():
+    """log p(a_1, .., a_T) of a stationary Gaussian process against the sum of conditionals and of the first two."""
+    colour, ticks = Config().colour, 6
+    policy = plain_policy().double()
+    features = torch.randn(ticks, 51, generator=generator(2)).double()
+    mean, log_std = policy(features)
+    memory = colour.begin(torch.randn(1, 2, 2, generator=generator(3)).double())
+    start, total, noises = memory.clone(), 0.0, []
+    for t in range(ticks):
+        expected = colour.predict_mean(memory)
+        noise, memory = colour.step(memory, torch.randn(1, 2, generator=generator(4 + t)).double())
+        action = mean[t : t + 1] + torch.exp(log_std[t : t + 1]) * noise
+        moments = conditional_action(policy, features[t : t + 1], expected, colour)
+        total += float(log_likelihood(*moments, action).detach())
+        noises.append(noise[0])
+    for k in range(2):  # acceleration, yaw rate
+        correlation = autocorrelation(colour, k, ticks + 2)
+        process = np.array([start[0, k, 1].item(), start[0, k, 0].item(), *(float(noise[k]) for noise in noises)])
+        joint = gaussian_log_density(process, correlation) - gaussian_log_density(process[:2], correlation)
+        total -= joint - float(log_std[:, k].detach().sum())
+    assert total == pytest.approx(0.0, abs=1e-9)
+
+
+def test_rewards_are_the_costs_of_mgail_with_another_sign(data):
+    weights = {"critic_weight": 3.0, "collision_weight": 8.0, "edge_weight": 4.0, "brake_weight": 2.0}
+    learner = make_learner(data, dataclasses.replace(SMALL, **weights))
+    with torch.no_grad():
+        steps = learner.drive(1.0)
+        likeness = policy_cost(learner.critic, critic_inputs(learner.policy, steps.features, steps.action))
+        reward = rewards(learner, steps)
+    torch.testing.assert_close(
+        reward, -(3 * likeness + 8 * steps.costs.collision + 4 * steps.costs.edge + 2 * steps.costs.brake)
+    )
+    assert value_inputs(learner.policy, steps).shape == (len(reward), 53)
+
+
+def test_gail_brakes_less_when_braking_costs(data):
+    config = dataclasses.replace(
+        SMALL,
+        method="gail",
+        updates=25,
+        scenes=8,
+        noise="white",
+        policy_rate=3e-3,
+        clone_weight=(1e-9, 1e-9),
+        critic_weight=0.0,
+    )
+    learner = make_learner(data, config)
+    with torch.no_grad():
+        learner.policy.head.bias[0], learner.policy.head.bias[2] = -6.0, 1.0
+        before = float(learner.drive(1.0).costs.brake.mean())
+    train_learner(learner)
+    with torch.no_grad():
+        after = float(learner.drive(1.0).costs.brake.mean())
+    assert after < 0.7 * before
+
+
+def test_mgail_lowers_its_loss(data):
+    """Twelve updates from a poor start: less braking."""
+    config = dataclasses.replace(
+        SMALL, policy_rate=1e-2, clone_weight=(1e-9, 1e-9), critic_weight=0.0, collision_weight=0.0, edge_weight=0.0
+    )
+    learner = make_learner(data, config)
+    with torch.no_grad():
+        learner.policy.head.bias[0] = -10.0  # brakes at about 4 m/s^2
+    losses = [entry["brake"] for entry in run_updates(learner, update_mgail)]
+    assert losses[-1] < 0.7 * losses[0]
+
+
+def weights(policy):
+    return torch.cat([value.flatten() for value in policy.state_dict().values()])
+
+
+@pytest.mark.parametrize("method", ["gail", "mgail"])
+def test_a_killed_training_resumes_to_the_same_weights(data, method, tmp_path):
+    config = tiny(method=method)
+    whole = train_learner(make_learner(data, config))
+    stopped = make_learner(data, config)
+
+    class Killed(Exception):
+        pass
+
+    save = stopped.save
+
+    def save_and_die(path):
+        save(path)
+        raise Killed
+
+    stopped.save = save_and_die
+    with pytest.raises(Killed):
+        train_learner(stopped, tmp_path, every=3)
+    assert stopped.update == 3
+    resumed = train_learner(make_learner(data, config), tmp_path, every=3)
+    assert torch.equal(weights(resumed), weights(whole))
+    assert not torch.equal(weights(make_learner(data, config).policy), weights(whole))
+
+
+def test_rates_of_the_optimisers_follow_the_schedule(data):
+    learner = make_learner(data, tiny(updates=2, anneal=0.5, policy_rate=3e-4, critic_rate=4e-4))
+    train_learner(learner)
+    (group,) = learner.policy_optimiser.param_groups
+    assert group["lr"] == pytest.approx(3e-4)
+    learner.update = 2
+    learner.set_rates()
+    assert learner.critic_optimiser.param_groups[0]["lr"] == pytest.approx(4e-5)
+    assert learner.policy_optimiser.param_groups[0]["lr"] == pytest.approx(3e-5)
+
+
+def test_nothing_is_drawn_from_the_global_generator(data):
+    before = torch.get_rng_state()
+    train_learner(make_learner(data, tiny(method="gail", updates=1)))
+    assert torch.equal(torch.get_rng_state(), before)

@@ -1,0 +1,225 @@
+"""Ensembles in miniature, and the distribution of their last layers: dependences recovered, penalty chosen."""
+
+import json
+
+import numpy as np
+import pytest
+import torch
+
+from agents import read_driver, read_provenance
+from agents.learned.networks import HEAD_SIZE, head_weights
+from agents.learned.weight_distribution import WEIGHT_NAMES, WeightDistribution
+from tests.training.imitation.synthetic_scenes import scenes, tiny
+from training.imitation import weights as module
+from training.imitation.config import Config
+from training.imitation.train import DRIVER, Source, prepare_data, train_driver
+from training.imitation.weights import (
+    Ensemble,
+    Member,
+    fit_weights,
+    make_ensemble,
+    measure_spread,
+    member_config,
+    select_scenes,
+    train_members,
+)
+
+FEW = Ensemble(members=10, updates=2)
+D = 12
+NAMES = tuple(f"w{j}" for j in range(D))
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("mgail")
+    with pytest.MonkeyPatch.context() as patch:
+        for place in ("train", "weights"):
+            patch.setattr(f"training.imitation.{place}.load_scenes", lambda source: (scenes(2, vehicles=6), ()))
+        train_driver(Source("data", folder), tiny(updates=2, horizon=(2, 3), warm_up=1), folder)
+        yield folder
+
+
+def test_members_differ_and_the_driver_is_saved_with_their_distribution(run, monkeypatch):
+    fit = module.fit_weights
+    monkeypatch.setattr(module, "fit_weights", lambda members: fit(members, penalties=(0.8,)))
+    members = train_members(run, FEW)
+    weights = np.stack([member.weights for member in members])
+    base = read_driver(run / DRIVER)
+    assert weights.shape == (10, HEAD_SIZE)
+    assert (weights.std(axis=0) > 0).all()  # none inert
+    assert (np.abs(weights - head_weights(base.policy).numpy()).max(axis=1) > 0).all()
+    path = make_ensemble(run, FEW, run / "whole.safetensors")
+    driver, provenance = read_driver(path), read_provenance(path)
+    np.testing.assert_allclose(driver.weights.mean, weights.mean(axis=0))
+    for name, value in base.policy.state_dict().items():
+        assert torch.equal(driver.policy.state_dict()[name], value)
+    assert provenance.ensemble["members"] == 10
+    assert provenance.ensemble["between_median"] > 0
+    assert provenance.kind == read_provenance(run / DRIVER).kind
+
+
+def test_members_are_kept_and_are_the_same_when_trained_again(run):
+    kept = run / "members-2-0"
+    first = train_members(run, FEW)
+    path = kept / "004.npz"
+    path.unlink()
+    before = (kept / "003.npz").stat().st_mtime_ns
+    again = train_members(run, FEW)
+    assert (kept / "003.npz").stat().st_mtime_ns == before
+    np.testing.assert_array_equal(first[4].weights, again[4].weights)
+    np.savez(path, base=np.zeros(HEAD_SIZE), weights=first[4].weights, within=first[4].within)
+    with pytest.raises(ValueError, match="another driver"):
+        train_members(run, FEW)
+
+
+def test_a_folder_without_a_training_is_refused(tmp_path):
+    with pytest.raises(ValueError, match="Expected a training"):
+        make_ensemble(tmp_path, FEW, tmp_path / "a.safetensors")
+
+
+def test_scenes_are_drawn_with_their_pairs_as_often_as_they_are_drawn():
+    pairs = prepare_data(scenes(3)).pairs
+    drawn = torch.tensor([2, 0, 2])
+    chosen = select_scenes(pairs, drawn)
+    count = [(pairs.scene == scene).sum() for scene in drawn]
+    assert len(chosen.scene) == sum(count)
+    assert (chosen.scene == 2).sum() == 2 * count[0]
+    assert not (chosen.scene == 1).any()
+
+
+def test_members_go_on_where_the_schedules_of_the_base_ended():
+    config = member_config(Config(clone_weight=(0.1, 0.03), horizon=(15, 30)), 60)
+    assert config.geometric_schedule(config.clone_weight, 0) == pytest.approx(0.03)
+    assert config.horizon == (30, 30)
+    assert config.warm_up == 0
+    assert config.critic_weight == Config().critic_weight
+
+
+def test_spread_on_paper():
+    members = [Member(np.array([0.0, 1.0]), np.array([0.1, 0.2])), Member(np.array([2.0, 1.5]), np.array([0.3, 0.2]))]
+    spread = measure_spread(members, base=np.array([0.0, 1.25]))
+    assert spread["between_max"] == pytest.approx(np.sqrt(2))
+    assert spread["within_median"] == pytest.approx(0.2)
+    assert spread["bias_max"] == pytest.approx(1.0)
+    assert spread["bias_over_spread"] == pytest.approx(np.sqrt(1.0 / (2.0 + 0.125)))
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [({"members": 9}, r"10 or more members.*, got 9\."), ({"updates": 1}, r"2 or more updates.*, got 1\.")],
+)
+def test_too_few_are_refused(settings, message):
+    with pytest.raises(ValueError, match=message):
+        Ensemble(**settings)
+
+
+def chain() -> np.ndarray:
+    """Precision of a chain: each weight depends on its neighbours alone."""
+    return np.eye(D) * 2.0 + np.diag(np.full(D - 1, -0.9), 1) + np.diag(np.full(D - 1, -0.9), -1)
+
+
+@pytest.fixture
+def truth():
+    return WeightDistribution(np.linspace(-1.0, 1.0, D), chain() * 1e4)
+
+
+@pytest.fixture
+def rng():
+    return np.random.default_rng(0)
+
+
+def test_it_finds_the_dependences_and_predicts_new_members(truth, rng):
+    fit = fit_weights(truth.sample(200, rng), names=NAMES, shrinkage=0.05)
+    beside = np.abs(np.diag(fit.distribution.precision, 1)) / np.abs(np.diag(fit.distribution.precision)).mean()
+    assert (beside > 0.05).all()
+    assert 0.0 < fit.metadata["nonzeros"] < 0.8
+    new = truth.sample(2_000, rng)
+    alone = WeightDistribution(fit.distribution.mean, np.diag(1 / fit.distribution.std**2))
+    gain = fit.distribution.log_prob(new) - alone.log_prob(new)
+    assert gain.mean() > 5 * gain.std() / np.sqrt(len(new))
+
+
+def test_means_and_spreads_are_those_of_the_members(truth, rng):
+    members = truth.sample(40, rng)
+    fit = fit_weights(members, names=NAMES, radius=0.02)
+    np.testing.assert_allclose(fit.distribution.mean, members.mean(axis=0), rtol=1e-12)
+    np.testing.assert_allclose(fit.distribution.std, members.std(axis=0, ddof=1), rtol=0.02)
+    assert fit.distribution.radius == 0.02
+
+
+def test_the_penalty_with_the_best_held_out_likelihood_is_taken(truth, rng):
+    fit = fit_weights(truth.sample(60, rng), names=NAMES)
+    tried = fit.metadata["tried"]
+    scores = [row["held_out_log_likelihood"] for row in tried]
+    best = tried[int(np.argmax(scores))]
+    assert {name: fit.metadata[name] for name in best} == best
+    assert [row["penalty"] for row in tried] == list(module.PENALTIES)
+    assert fit.metadata["stopped"] == "no penalty left"
+    assert json.loads(json.dumps(fit.metadata, allow_nan=False)) == fit.metadata
+
+
+def test_held_out_likelihood_by_hand(truth, rng):
+    """With a penalty over all correlations the weights are independent, fold by fold."""
+    members = truth.sample(10, rng)
+    fit = fit_weights(members, names=NAMES, penalties=(0.8,), folds=2)
+    scores = []
+    for held_out, rest in ((members[:5], members[5:]), (members[5:], members[:5])):
+        z = (held_out - rest.mean(axis=0)) / rest.std(axis=0, ddof=1)
+        scores.append((-0.5 * z**2 - np.log(rest.std(axis=0, ddof=1)) - 0.5 * np.log(2 * np.pi)).sum(axis=1))
+    assert fit.metadata["held_out_log_likelihood"] == pytest.approx(np.mean(scores), rel=1e-9)
+    assert (fit.metadata["nonzeros"], fit.metadata["condition"]) == (0.0, pytest.approx(1.0))
+
+
+def test_the_ladder_stops_at_the_first_failure(truth, rng, monkeypatch):
+    members = truth.sample(60, rng)
+    solve = module.graphical_lasso
+    asked = []
+
+    def fails_below(correlation, penalty, **settings):
+        asked.append(penalty)
+        if penalty < 0.4:
+            raise FloatingPointError("Non SPD result")
+        return solve(correlation, penalty, **settings)
+
+    monkeypatch.setattr(module, "graphical_lasso", fails_below)
+    fit = fit_weights(members, names=NAMES)
+    assert [row["penalty"] for row in fit.metadata["tried"]] == [0.8, 0.7, 0.6, 0.5, 0.4]
+    assert fit.metadata["penalty"] >= 0.4
+    assert fit.metadata["stopped"] == "penalty 0.3 failed: Non SPD result"
+    assert asked.count(0.3) == len(module.INNER_TOLERANCES)  # the coarser tolerance was tried too
+    assert 0.25 not in asked
+    with pytest.raises(ValueError, match=r"penalty 0\.3 failed: Non SPD result.*larger penalty"):
+        fit_weights(members, names=NAMES, penalties=(0.3, 0.2))
+
+
+@pytest.mark.parametrize("value", [0.25, np.nan, np.inf])
+def test_an_inert_weight_is_named(rng, value):
+    members = rng.standard_normal((10, 404))
+    members[:, 303] = value
+    assert WEIGHT_NAMES[303] == "log_std_yaw_rate_0"
+    with pytest.raises(ValueError, match=r"1 of 404 are inert.*: log_std_yaw_rate_0"):
+        fit_weights(members)
+
+
+@pytest.mark.parametrize(
+    ("members", "settings", "message"),
+    [
+        (np.zeros((10, 3)), {}, r"shape \(K, 12\), got \(10, 3\)"),
+        (np.zeros((7, D)), {}, "7 members in 5 folds"),
+        (np.zeros((10, D)), {"penalties": (0.1, 0.2)}, "descending"),
+        (np.zeros((10, D)), {"penalties": ()}, "descending"),
+        (np.zeros((10, D)), {"shrinkage": 1.0}, "shrinkage"),
+    ],
+)
+def test_impossible_settings_are_refused(members, settings, message):
+    with pytest.raises(ValueError, match=message):
+        fit_weights(members, names=NAMES, **settings)
+
+
+def test_the_global_generator_is_left_alone(truth, rng):
+    members = truth.sample(20, rng)
+    before = np.random.get_state()[1:3]  # noqa: NPY002
+    fit_weights(members, names=NAMES)
+    after = np.random.get_state()[1:3]  # noqa: NPY002
+    np.testing.assert_array_equal(after[0], before[0])
+    assert after[1] == before[1]

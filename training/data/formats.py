@@ -1,0 +1,642 @@
+"""Recordings in the published formats of NGSIM, highD, TGSIM, I-24 MOTION, and Coifman and Li, as trajectory tables.
+
+Each format is a map of columns, which says their names and units, and what its positions mean:
+
+- **NGSIM**: CSV with a header, or the published text of 18 columns without one. Feet, `Global_Time` in ms; positions
+  are those of the front centre, `Local_Y` along the road and `Local_X` across, to the right of the left edge. Lane 1
+  is the leftmost. U.S. Department of Transportation, record 8ect-6jqj.
+- **highD**: `XX_tracks.csv`, `XX_tracksMeta.csv` and `XX_recordingMeta.csv`, metres, 25 Hz. x runs to the right and y
+  down in the drone's picture; both are those of the upper left corner of a box, whose `width` is its extent along the
+  road. Vehicles of drivingDirection 1 use the upper lanes and move towards -x; they are turned by half a turn.
+  Krajewski, Bock, Kloeker, Eckstein, "The highD dataset", ITSC 2018.
+- **TGSIM**: CSV of motorways, metres, 10 Hz; earlier downloads have hyphens in place of underscores. Positions are
+  those of the reference picture, whose origin is the top left corner (y runs down); which point of a vehicle is meant
+  is not said, and taken to be the centre. There is no axis of the road: that of each direction is fitted to the paths
+  (`fit_road_axis`), lanes are numbered from the left in the direction of travel, and rows whose lane has the other
+  sign than most are outside the lanes (-1 on I-395 is a shoulder). catalog.data.gov, "Third Generation Simulation Data
+  (TGSIM) I-90/I-94 Moving Trajectories"; Ammourah et al., Transportation Research Record, 2025.
+- **I-24 MOTION**, format 1.x: one JSON array with a document for each fragment of a trajectory, feet, 25 Hz, of the
+  back centre. x runs eastward in both directions of travel; y is positive on the westbound side, 0 in the median.
+  Westbound, lane 1 is at 12 to 24 ft and lanes 2 to 4 follow; eastbound is taken to be the mirror image.
+  v1.x_I-24MOTION_data_documentation.pdf as quoted by three public readers; Gloudemans et al., Transportation Research
+  Part C 155, 104311, 2023.
+- **Coifman and Li**: I-80 by hand, a MATLAB file with a matrix `data` of NGSIM's 18 columns, of which seven are
+  filled. `Local_Y` is that of the *rear* bumper; positions across the road and lengths are zeros. Transportation
+  Research Part B 105, 2017, 362-377.
+"""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.io import loadmat
+from scipy.io.matlab import MatReadError
+
+from samplers.problem import FloatArray
+from training.data.columns import (
+    Column,
+    Gaps,
+    Rows,
+    check_clock,
+    check_lengths,
+    check_tracks,
+    read_documents,
+    read_header,
+    read_matrix,
+    read_table,
+)
+from training.data.road_axis import estimate_lane_edges, fit_road_axis, lanes_of, number_lanes
+from training.data.smoothing import LARGEST_STEP, resample_tracks
+from training.data.table import DT, NOBODY, Trajectories, find_leaders, tabulate
+
+FOOT = 0.3048
+"""Length of a foot [m]."""
+NGSIM = {
+    "vehicle": Column(("Vehicle_ID",), place=0),
+    "time": Column(("Global_Time",), place=3),
+    "y": Column(("Local_X",), FOOT, 4),
+    "x": Column(("Local_Y",), FOOT, 5),
+    "length": Column(("v_Length",), FOOT, 8),
+    "width": Column(("v_Width",), FOOT, 9),
+    "speed": Column(("v_Vel",), FOOT, 11),
+    "acceleration": Column(("v_Acc",), FOOT, 12),
+    "lane": Column(("Lane_ID",), place=13),
+    "leader": Column(("Preceding",), place=14),
+}
+NGSIM_LOCATION = {"location": Column(("Location",), text=True)}
+NGSIM_STEP, NGSIM_PAUSE, RENUMBER_OFFSET = 100.0, 60_000.0, 1_000_000
+"""Time between frames, and that after which a number that comes back belongs to another vehicle, because each 15
+minutes were numbered anew [ms]; the number is then raised, once for each time that it comes back."""
+COIFMAN_LI = {name: NGSIM[name] for name in ("vehicle", "x", "speed", "acceleration", "lane", "leader")} | {
+    "frame": Column(("Frame_ID",), place=1)
+}
+COIFMAN_EMPTY = {name: NGSIM[name] for name in ("y", "length")}
+"""Columns that are zero in Coifman and Li's file, and filled in NGSIM's own."""
+MEAN_LENGTH = 4.87
+"""Length [m] assumed of a vehicle whose length is not known: mean of 222 vehicles of this recording, from NGSIM."""
+HIGHD = {
+    "frame": Column(("frame",)),
+    "vehicle": Column(("id",)),
+    "x": Column(("x",)),
+    "y": Column(("y",)),
+    "length": Column(("width",)),
+    "width": Column(("height",)),
+    "vx": Column(("xVelocity",)),
+    "vy": Column(("yVelocity",)),
+    "acceleration": Column(("xAcceleration",)),
+    "leader": Column(("precedingId",)),
+}
+HIGHD_VEHICLES = {"vehicle": Column(("id",)), "direction": Column(("drivingDirection",))}
+HIGHD_RECORDING = {
+    "rate": Column(("frameRate",)),
+    "upper": Column(("upperLaneMarkings",), text=True),
+    "lower": Column(("lowerLaneMarkings",), text=True),
+}
+HIGHD_SIDES = {1: "upper", 2: "lower"}
+"""Names of the two carriageways by drivingDirection."""
+TGSIM = {"vehicle": Column(("id",)), "time": Column(("time",))} | {
+    name: Column((header, header.replace("_", "-")))
+    for name, header in {
+        "x": "xloc_kf",
+        "y": "yloc_kf",
+        "lane": "lane_kf",
+        "speed": "speed_kf",
+        "acceleration": "acceleration_kf",
+        "length": "length_smoothed",
+        "width": "width_smoothed",
+    }.items()
+}
+TGSIM_RUN = {"run": Column(("run_index", "run-index"))}
+TGSIM_STREETS = {"speed_kf_x", "speed-kf-x"}
+"""Headers of the files of streets, which give two components of the speed."""
+TGSIM_DIRECTIONS = (("right", "down"), ("left", "up"))
+"""Names of directions of travel in the picture, along x and along y, towards larger and smaller values."""
+I24 = {
+    "time": Column(("timestamp",)),
+    "x": Column(("x_position",), FOOT),
+    "y": Column(("y_position",), FOOT),
+    "length": Column(("length",), FOOT),
+    "width": Column(("width",), FOOT),
+    "direction": Column(("direction",)),
+}
+I24_ARRAYS = ("time", "x", "y")
+"""Fields that hold an array with one value for each frame; the others hold a number."""
+I24_STEP = 0.04
+"""Time between frames [s]."""
+I24_EDGES = tuple(round(FOOT * edge, 4) for edge in (12.0, 24.0, 36.0, 48.0, 60.0))
+"""Lane boundaries [m] to the right of the median."""
+I24_SIDES = {-1: "west", 1: "east"}
+"""Names of the two carriageways by direction."""
+REVERSING = 1.0
+"""Mean speed [m/s] above which moving against one's direction is an error."""
+RECORDING_KINDS = ("ngsim", "highd", "tgsim", "i24", "coifman")
+"""Kinds of files that are read, as options of the command line call them."""
+
+
+def load_recordings(
+    kind: str,
+    path: Path | str,
+    *,
+    location: str | None = None,
+    recordings: tuple[str, ...] = (),
+    between: tuple[float, float] | None = None,
+    gaps: Gaps = "error",
+) -> Iterator[Trajectories]:
+    """Yield the tables of files of one kind, each read when it is asked for.
+
+    Args:
+        kind: One of `RECORDING_KINDS`.
+        path: File, or folder of highD or TGSIM.
+        location: Which of the locations of an NGSIM file to read, where it has several.
+        recordings: Which recordings of highD to read, such as "01"; all if empty.
+        between: First and last moment of I-24 MOTION to read, Unix time [s]; everything if None.
+        gaps: What is done where a vehicle is missing for some frames: "error" raises, "cut" cuts its track.
+
+    Raises:
+        ValueError: The kind is unknown, or a file is missing or broken.
+    """
+    if kind == "highd":
+        yield from (load_highd(path, name, gaps=gaps) for name in recordings or highd_recordings(path))
+    elif kind == "tgsim":
+        yield from (load_tgsim(file, gaps=gaps) for file in find_tgsim_files(path))
+    elif kind == "ngsim":
+        yield load_ngsim(path, location=location, gaps=gaps)
+    elif kind == "i24":
+        yield load_i24_motion(path, between=between, gaps=gaps)
+    elif kind == "coifman":
+        yield load_coifman_li(path, gaps=gaps)
+    else:
+        raise ValueError(f"Expected one of {', '.join(RECORDING_KINDS)}, got {kind!r}.")
+
+
+def load_ngsim(path: Path | str, *, location: str | None = None, gaps: Gaps = "error") -> Trajectories:
+    r"""Return the trajectories of one raw NGSIM file; the recording is named after the file, or after the location.
+
+    Args:
+        path: CSV with the published header (the order of columns does not matter, others are ignored), or text with the
+            18 published columns and no header, separated by blanks or commas.
+        location: Which of the file's locations to read, such as "us-101", where it has several.
+        gaps: What is done where a vehicle is missing for some frames: "error" raises, "cut" cuts its track.
+
+    Returns:
+        The table, with lane boundaries estimated by `estimate_lane_edges`.
+
+    Raises:
+        ValueError: The file cannot be read, lacks a column, holds impossible values, or has several locations.
+
+    Example:
+        >>> import pathlib, tempfile
+        >>> header = "Vehicle_ID,Global_Time,Local_X,Local_Y,v_Length,v_Width,v_Vel,v_Acc,Lane_ID,Preceding"
+        >>> rows = [f"7,{100 * k},6,{5 * k},15,6,50,0,1,0" for k in range(3)]
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     path = pathlib.Path(folder) / "road.csv"
+        ...     _ = path.write_text("\n".join([header, *rows]))
+        ...     table = load_ngsim(path)
+        >>> table.speed.round(2).tolist()
+        [15.24, 15.24, 15.24]
+    """
+    path = Path(path)
+    header = [name.lower() for name in read_header(path)]
+    if not any(character.isalpha() for character in header[0]):
+        rows = read_matrix(path, NGSIM)
+    else:
+        rows = read_table(path, NGSIM | NGSIM_LOCATION if "location" in header else NGSIM)
+    if "location" not in rows.columns:
+        if location is not None:
+            raise ValueError(f"{path} has no column Location; leave location out.")
+        return _ngsim_table(rows, path.stem, gaps)
+    places = sorted({str(place) for place in rows["location"]})
+    if location is None and len(places) > 1:
+        raise ValueError(f"{path} has the locations {', '.join(places)}; choose one with location=.")
+    if location is not None and location not in places:
+        raise ValueError(f"{path} has the locations {', '.join(places)}, not {location}.")
+    location = location or places[0]
+    return _ngsim_table(rows.select(rows["location"] == location), location, gaps)
+
+
+def _ngsim_table(rows: Rows, recording: str, gaps: Gaps) -> Trajectories:
+    """Return rows as a table, with centres in place of fronts."""
+    frame = np.rint(rows["time"] / NGSIM_STEP)
+    check_lengths(rows, rows["length"], "feet")
+    vehicle, leader = _renumber(rows["vehicle"], rows["leader"], frame)
+    check_tracks(rows, vehicle, frame, rows["x"], rows["speed"], NGSIM_STEP / 1000.0, gaps)
+    lane = rows["lane"].astype(np.int64)
+    columns = {
+        "recording": recording,
+        "vehicle": vehicle,
+        "frame": frame,
+        "x": rows["x"] - 0.5 * rows["length"],
+        "lane": lane,
+        "leader": leader,
+        **{name: rows[name] for name in ("y", "speed", "acceleration", "length", "width")},
+    }
+    edges = estimate_lane_edges(rows["y"], lane)
+    return tabulate(columns, {recording: edges} if edges else {})
+
+
+def _renumber(vehicle: FloatArray, leader: FloatArray, frame: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the numbers of vehicles and leaders, with new ones where a number was given again after a pause."""
+    order = np.lexsort([frame, vehicle])
+    fresh = np.append(True, np.diff(vehicle[order]) != 0)
+    again = np.append(False, (np.diff(vehicle[order]) == 0) & (np.diff(frame[order]) > NGSIM_PAUSE / NGSIM_STEP))
+    times = np.cumsum(again)
+    since = np.maximum.accumulate(np.where(fresh, np.arange(len(times)), 0))
+    number = np.empty(len(vehicle))
+    number[order] = vehicle[order] + RENUMBER_OFFSET * (times - times[since])
+    unled = leader <= 0
+    if not again.any():
+        return number, np.where(unled, NOBODY, leader)
+    span = np.ptp(frame) + 1.0
+    keys, wanted = (values * span + (frame - frame.min()) for values in (vehicle, leader))
+    place = np.minimum(np.searchsorted(keys[order], wanted), len(keys) - 1)
+    known = (keys[order][place] == wanted) & ~unled
+    return number, np.where(known, number[order][place], NOBODY)
+
+
+def load_coifman_li(
+    path: Path | str, *, ngsim: Path | str | None = None, length: float = MEAN_LENGTH, gaps: Gaps = "error"
+) -> Trajectories:
+    r"""Return the recording of Coifman and Li; it is named after the file.
+
+    A gap is the distance of the rear bumpers less the length of the follower, so an assumed length shifts it.
+
+    Args:
+        path: The MATLAB file, or a text file of its 18 columns without a header, separated by blanks or commas.
+        ngsim: Raw NGSIM file of the same period, for the lengths of the vehicles that are in both.
+        length: Length assumed of all others [m].
+        gaps: What is done where a vehicle is missing for some frames: "error" raises, "cut" cuts its track.
+
+    Returns:
+        The table, without lane boundaries; y and width are NaN. Lanes are numbered as in the file: 1 the leftmost, 6
+        the rightmost, 9 to the right of that.
+
+    Raises:
+        ValueError: The file cannot be read, is another's, or holds impossible values.
+
+    Example:
+        >>> import pathlib, tempfile
+        >>> rows = [f"7 {k} 0 0 0 {5 * k} 0 0 0 0 0 50 0 1 0 0 0 0" for k in range(1, 4)]
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     path = pathlib.Path(folder) / "i80.txt"
+        ...     _ = path.write_text("\n".join(rows))
+        ...     table = load_coifman_li(path, length=4.0)
+        >>> (table.x - 0.5 * table.length).round(3).tolist()
+        [1.524, 3.048, 4.572]
+    """
+    path = Path(path)
+    if not length > 0.0:
+        raise ValueError(f"Expected a positive length, got {length:g}.")
+    rows = read_matrix(path, COIFMAN_LI | COIFMAN_EMPTY, _read_mat(path) if path.suffix.lower() == ".mat" else None)
+    if filled := [column.names[0] for name, column in COIFMAN_EMPTY.items() if (rows[name] != 0.0).any()]:
+        raise ValueError(
+            f"{path} has values in {' and '.join(filled)}, which are empty in the data of Coifman and Li; is it a "
+            "file of NGSIM's own, whose positions are those of the front?"
+        )
+    check_tracks(rows, rows["vehicle"], rows["frame"], rows["x"], rows["speed"], DT, gaps)
+    lengths = np.full(len(rows), length) if ngsim is None else _known_lengths(rows["vehicle"], Path(ngsim), length)
+    columns = {
+        "recording": path.stem,
+        "x": rows["x"] + 0.5 * lengths,
+        "y": np.nan,
+        "length": lengths,
+        "width": np.nan,
+        "leader": np.where(rows["leader"] > 0, rows["leader"], NOBODY),
+        **{name: rows[name] for name in ("vehicle", "frame", "speed", "acceleration", "lane")},
+    }
+    return tabulate(columns)
+
+
+def _read_mat(path: Path) -> FloatArray:
+    """Return the matrix `data` of a MATLAB file."""
+    try:
+        data = loadmat(path, variable_names=["data"]).get("data")
+    except (OSError, ValueError, TypeError, NotImplementedError, MatReadError, zlib.error) as error:
+        raise ValueError(f"Cannot read {path}: {error}") from None
+    if data is None:
+        raise ValueError(f"{path} has no matrix 'data'; is it the file of Coifman and Li?")
+    if np.ndim(data) != 2 or np.asarray(data).dtype.kind not in "fiu":
+        raise ValueError(f"{path}: expected 'data' to be a matrix of numbers.")
+    return np.asarray(data, dtype=np.float64)
+
+
+def _known_lengths(vehicle: FloatArray, ngsim: Path, length: float) -> FloatArray:
+    """Return lengths by the numbers of vehicles [m], shape (rows,): NGSIM's median, or the assumed one."""
+    other = load_ngsim(ngsim, gaps="cut")
+    numbers, index = np.unique(other.vehicle, return_inverse=True)
+    order = np.lexsort([other.length, index.ravel()])
+    starts = np.searchsorted(index.ravel()[order], np.arange(len(numbers) + 1))
+    medians = other.length[order][(starts[:-1] + starts[1:] - 1) // 2]
+    place = np.minimum(np.searchsorted(numbers, vehicle), len(numbers) - 1)
+    known = numbers[place] == vehicle
+    if not known.any():
+        raise ValueError(f"{ngsim} has none of the vehicles; is it the recording of I-80 from 16:00 to 16:15?")
+    return np.where(known, medians[place], length)
+
+
+def highd_recordings(folder: Path | str) -> tuple[str, ...]:
+    """Return the numbers of the recordings in a folder, such as "01".
+
+    Raises:
+        ValueError: The folder holds none.
+
+    Example:
+        >>> highd_recordings("no_such_folder")
+        Traceback (most recent call last):
+        ValueError: There is no folder no_such_folder; expected the data folder of highD, with files XX_tracks.csv.
+    """
+    if not Path(folder).is_dir():
+        raise ValueError(f"There is no folder {folder}; expected the data folder of highD, with files XX_tracks.csv.")
+    names = tuple(sorted(path.name.removesuffix("_tracks.csv") for path in Path(folder).glob("*_tracks.csv")))
+    if not names:
+        raise ValueError(f"{folder} has no files XX_tracks.csv; is it the data folder of highD?")
+    return names
+
+
+def load_highd(folder: Path | str, recording: str, *, gaps: Gaps = "error") -> Trajectories:
+    """Return one recording of highD as a table of two carriageways, such as "01-upper" and "01-lower", at 10 Hz.
+
+    Positions are interpolated by cubic splines, speeds and accelerations linearly; the leader is that of the nearest
+    frame. Lanes are counted from the left in the direction of travel, by the lane markings.
+
+    Args:
+        folder: Folder with the three files of the recording.
+        recording: Its number, such as "01".
+        gaps: What is done where a vehicle is missing for some frames: "error" raises, "cut" cuts its track.
+
+    Raises:
+        ValueError: A file cannot be read, lacks a column or holds impossible values.
+
+    Example:
+        >>> load_highd("no_such_folder", "01")  # doctest: +ELLIPSIS
+        Traceback (most recent call last):
+        ValueError: Cannot read no_such_folder/01_recordingMeta.csv: ...
+    """
+    folder = Path(folder)
+    rate, markings = _highd_recording(folder / f"{recording}_recordingMeta.csv")
+    directions = _highd_directions(folder / f"{recording}_tracksMeta.csv")
+    rows = read_table(folder / f"{recording}_tracks.csv", HIGHD)
+    vehicles, index = np.unique(rows["vehicle"], return_inverse=True)
+    direction = np.array([directions.get(int(vehicle), 0) for vehicle in vehicles])[index.ravel()]
+    if (direction == 0).any():
+        row = int(np.argmax(direction == 0))
+        raise rows.error(row, f"vehicle {rows['vehicle'][row]:g} is not in the file of tracksMeta.")
+    sign = np.where(direction == 1, -1.0, 1.0)
+    check_lengths(rows, rows["length"], "metres")
+    x, speed = sign * (rows["x"] + 0.5 * rows["length"]), np.hypot(rows["vx"], rows["vy"])
+    check_tracks(rows, rows["vehicle"], rows["frame"], x, speed, 1.0 / rate, gaps)
+    if (backwards := sign * rows["vx"] < -REVERSING).any():
+        row = int(np.argmax(backwards))
+        raise rows.error(row, f"vehicle {rows['vehicle'][row]:g} moves against its drivingDirection.")
+    tracks = resample_tracks(
+        rows["vehicle"],
+        rows["frame"] / rate,
+        1.0 / rate,
+        np.column_stack([x, sign * (rows["y"] + 0.5 * rows["width"])]),
+        np.column_stack([speed, sign * rows["acceleration"], rows["length"], rows["width"]]),
+    )
+    leader, side = rows["leader"][tracks.nearest], direction[tracks.nearest]
+    names = {number: f"{recording}-{name}" for number, name in HIGHD_SIDES.items()}
+    edges = {names[1]: tuple(-y for y in reversed(markings[0])), names[2]: markings[1]}
+    lane = np.zeros(len(side))
+    for number in np.unique(side):
+        lane[side == number] = lanes_of(tracks.splined[side == number, 1], edges[names[number]])
+    columns = {
+        "recording": np.array([names[1], names[2]])[side - 1],
+        "vehicle": tracks.vehicle,
+        "frame": tracks.frame,
+        **dict(zip(("x", "y"), tracks.splined.T, strict=True)),
+        **dict(zip(("speed", "acceleration", "length", "width"), tracks.linear.T, strict=True)),
+        "lane": lane,
+        "leader": np.where(leader > 0, leader, NOBODY),
+    }
+    return tabulate(columns, {names[number]: edges[names[number]] for number in np.unique(side)})
+
+
+def _highd_recording(path: Path) -> tuple[float, tuple[tuple[float, ...], tuple[float, ...]]]:
+    """Return the frame rate [Hz], and the lane markings [m] of the upper and of the lower lanes, top to bottom."""
+    rows = read_table(path, HIGHD_RECORDING)
+    rate = float(rows["rate"][0])
+    if rate < 1.0 / DT:
+        raise rows.error(0, f"frameRate is {rate:g}, at least {1.0 / DT:g} Hz is needed.")
+    try:
+        upper, lower = (tuple(float(y) for y in str(rows[side][0]).split(";")) for side in ("upper", "lower"))
+    except ValueError:
+        raise rows.error(0, "lane markings must be numbers separated by semicolons.") from None
+    if any(len(side) < 2 or not (np.diff(side) > 0.0).all() for side in (upper, lower)):
+        raise rows.error(0, "expected at least two lane markings on each side, increasing.")
+    return rate, (upper, lower)
+
+
+def _highd_directions(path: Path) -> dict[int, int]:
+    """Return the driving direction of each vehicle, 1 or 2."""
+    rows = read_table(path, HIGHD_VEHICLES)
+    bad = ~np.isin(rows["direction"], list(HIGHD_SIDES))
+    if bad.any():
+        row = int(np.argmax(bad))
+        raise rows.error(row, f"drivingDirection is {rows['direction'][row]:g}, expected 1 or 2.")
+    return {int(vehicle): int(side) for vehicle, side in zip(rows["vehicle"], rows["direction"], strict=True)}
+
+
+def find_tgsim_files(path: Path | str) -> tuple[Path, ...]:
+    """Return a file, or the files of trajectories in a folder, which may hold others, such as lines of lanes.
+
+    Raises:
+        ValueError: The folder holds none.
+
+    Example:
+        >>> find_tgsim_files("no_such_folder")
+        Traceback (most recent call last):
+        ValueError: no_such_folder has no CSV file with a column xloc_kf; is it a folder with files of TGSIM?
+    """
+    path, wanted = Path(path), TGSIM["x"].names
+    if path.is_file():
+        return (path,)
+
+    def holds_positions(file: Path) -> bool:
+        try:
+            return bool({name.lower() for name in read_header(file)} & set(wanted))
+        except ValueError:
+            return False
+
+    found = tuple(file for file in sorted(path.glob("*.csv")) if holds_positions(file))
+    if not found:
+        raise ValueError(f"{path} has no CSV file with a column {wanted[0]}; is it a folder with files of TGSIM?")
+    return found
+
+
+def load_tgsim(path: Path | str, *, gaps: Gaps = "error") -> Trajectories:
+    r"""Return a file of TGSIM as a table of its runs and directions, such as "I395-1-right".
+
+    Args:
+        path: CSV file of a motorway.
+        gaps: What is done where a vehicle is missing for some frames, or a field is empty: "error" raises, "cut" cuts
+            its track there.
+
+    Returns:
+        The table, with lane boundaries estimated by `estimate_lane_edges`. y is 0 on the fitted axis.
+
+    Raises:
+        ValueError: The file cannot be read, lacks a column, or holds impossible values.
+
+    Example:
+        >>> import pathlib, tempfile
+        >>> header = "id,time,xloc_kf,yloc_kf,lane_kf,speed_kf,acceleration_kf,length_smoothed,width_smoothed,run_index"
+        >>> rows = [f"{lane},{k / 10},{3 * k},{3.6 * lane},{lane},30,0,4.5,1.8,1" for lane in (1, 2) for k in range(99)]
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     path = pathlib.Path(folder) / "I294.csv"
+        ...     _ = path.write_text("\n".join([header, *rows]))
+        ...     table = load_tgsim(path)
+        >>> str(table.recording[0]), table.y[[0, -1]].round(2).tolist()
+        ('I294-1-right', [-1.8, 1.8])
+    """
+    path = Path(path)
+    header = {name.lower() for name in read_header(path)}
+    if header & TGSIM_STREETS:
+        raise ValueError(f"{path} is of streets (speed_kf_x); only TGSIM's files of motorways are read.")
+    has_runs = bool(header & set(TGSIM_RUN["run"].names))
+    rows = read_table(path, TGSIM | TGSIM_RUN if has_runs else TGSIM, leave_out_empty=gaps == "cut")
+    check_lengths(rows, rows["length"], "metres")
+    run = rows["run"] if has_runs else np.ones(len(rows))
+    parts = [
+        part
+        for number in np.unique(run)
+        for part in _tgsim_directions(rows.select(run == number), f"{path.stem}-{number:g}", gaps)
+    ]
+    columns = {name: np.concatenate([part[name] for part, _ in parts]) for name in parts[0][0]}
+    return tabulate(columns, {str(part["recording"][0]): lines for part, lines in parts if lines})
+
+
+def _tgsim_directions(rows: Rows, name: str, gaps: Gaps) -> Iterator[tuple[dict[str, NDArray[Any]], tuple[float, ...]]]:
+    """Yield the columns and lane boundaries of each direction of travel of a run."""
+    order = np.lexsort([rows["time"], rows["vehicle"]])
+    same = np.diff(rows["vehicle"][order]) == 0
+    check_clock(rows, np.diff(rows["time"][order])[same], DT)
+    offset = np.median(np.mod(rows["time"] / DT + 0.5, 1.0)) - 0.5  # of a clock that does not start at a tick
+    frame = np.rint(rows["time"] / DT - offset)
+    move = np.zeros((len(rows), 2))  # since the vehicle's row before
+    order = np.lexsort([frame, rows["vehicle"]])
+    for column, axis in enumerate(("x", "y")):
+        move[order[1:], column] = np.where(same, np.diff(rows[axis][order]), 0.0)
+    spread = np.linalg.eigh(np.cov(np.stack([rows["x"], rows["y"]])))[1][:, -1]
+    index = np.unique(rows["lane"], return_inverse=True)[1].ravel()
+    forward = (np.bincount(index, move @ spread) >= 0.0)[index]
+    for chosen in (forward, ~forward):
+        if chosen.any():
+            yield _tgsim_columns(rows.select(chosen), name, frame[chosen], move[chosen].sum(axis=0), gaps)
+
+
+def _tgsim_columns(
+    rows: Rows, name: str, frame: FloatArray, heading: FloatArray, gaps: Gaps
+) -> tuple[dict[str, NDArray[Any]], tuple[float, ...]]:
+    """Return the columns of the table and the lane boundaries of one direction of travel."""
+    numbers = rows["lane"].astype(np.int64)
+    x, y = fit_road_axis(rows["x"], rows["y"], numbers, heading).project(rows["x"], rows["y"])
+    check_tracks(rows, rows["vehicle"], frame, x, rows["speed"], DT, gaps)
+    lane = number_lanes(y, numbers)
+    ahead = find_leaders(frame.astype(np.int64), lane, x + 0.5 * rows["length"])
+    along = int(abs(heading[1]) > abs(heading[0]))
+    columns = {
+        "recording": np.full(len(rows), f"{name}-{TGSIM_DIRECTIONS[int(heading[along] < 0.0)][along]}"),
+        "frame": frame,
+        "x": x,
+        "y": y,
+        "lane": lane,
+        "leader": np.where(ahead >= 0, rows["vehicle"][ahead], NOBODY),
+        **{name: rows[name] for name in ("vehicle", "speed", "acceleration", "length", "width")},
+    }
+    return columns, estimate_lane_edges(y, lane)
+
+
+def load_i24_motion(
+    path: Path | str, *, between: tuple[float, float] | None = None, gaps: Gaps = "error"
+) -> Trajectories:
+    """Return a file of I-24 MOTION as a table of its carriageways, such as "morning-west", at 10 Hz.
+
+    Positions are interpolated by cubic splines. Speeds are the slopes of the positions, which were smoothed before
+    they were published; accelerations are not recorded (NaN). Leaders are the nearest ahead in the lane. Fragments are
+    vehicles of their own, numbered from 1 in the order of the file. A row takes about 100 bytes, and a morning has
+    1e8 of them: choose a part of it with `between`.
+
+    Args:
+        path: The JSON file, unpacked.
+        between: First and last moment to read, Unix time [s]; everything if None.
+        gaps: What is done where a vehicle is missing for some frames: "error" raises, "cut" cuts its track.
+
+    Raises:
+        ValueError: The file cannot be read, lacks a field or holds impossible values; the message counts documents
+            from 1.
+
+    Example:
+        >>> import json, pathlib, tempfile
+        >>> frames = [round(0.04 * k, 2) for k in range(100)]
+        >>> document = {"_id": {"$oid": "6f"}, "timestamp": frames, "x_position": [9e5 - 80 * t for t in frames]}
+        >>> document |= {"y_position": [30.0] * 100, "length": 15.0, "width": 6.0, "direction": -1}
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     path = pathlib.Path(folder) / "morning.json"
+        ...     _ = path.write_text(json.dumps([document]))
+        ...     table = load_i24_motion(path)
+        >>> str(table.recording[0]), int(table.lane[0]), round(float(table.speed[5]), 3)
+        ('morning-west', 2, 24.384)
+    """
+    path = Path(path)
+    rows = read_documents(path, I24, I24_ARRAYS, between)
+    sign, vehicle, length = rows["direction"], rows["vehicle"], rows["length"]
+    if (wrong := ~np.isin(sign, list(I24_SIDES))).any():
+        row = int(np.argmax(wrong))
+        raise rows.error(row, f"direction is {sign[row]:g}, expected 1 or -1.")
+    check_lengths(rows, length, "feet")
+    x = sign * rows["x"] + 0.5 * length
+    start = np.floor(rows["time"].min())  # differences of Unix times are coarse in double precision
+    time = rows["time"] - start
+    slope = _slopes(vehicle, time, x)
+    _check_directions(rows, slope)
+    speed = np.maximum(slope, 0.0)
+    fresh = np.append(True, np.diff(vehicle) != 0)
+    check_clock(rows, np.diff(time)[~fresh[1:]], I24_STEP, "; is it format 1.x?")
+    begun = np.minimum.reduceat(time, np.flatnonzero(fresh))[np.cumsum(fresh) - 1]
+    check_tracks(rows, vehicle, np.rint((time - begun) / I24_STEP), x, speed, I24_STEP, gaps)
+    splined, linear = np.column_stack([x, -sign * rows["y"]]), np.column_stack([speed, length, rows["width"]])
+    tracks = resample_tracks(vehicle, time, I24_STEP, splined, linear)
+    if not len(tracks.frame):
+        raise ValueError(f"{path} has no vehicle for {DT:g} s.")
+    names = {number: f"{path.stem}-{name}" for number, name in I24_SIDES.items()}
+    recording = np.where(sign[tracks.nearest] < 0, names[-1], names[1])
+    frame, lane = np.rint(tracks.frame).astype(np.int64), lanes_of(tracks.splined[:, 1], I24_EDGES)
+    ahead = find_leaders(frame, lane, tracks.splined[:, 0] + 0.5 * tracks.linear[:, 1], recording)
+    columns = {
+        "recording": recording,
+        "vehicle": tracks.vehicle,
+        "frame": frame + round(start / DT),
+        **dict(zip(("x", "y"), tracks.splined.T, strict=True)),
+        **dict(zip(("speed", "length", "width"), tracks.linear.T, strict=True)),
+        "acceleration": np.nan,
+        "lane": lane,
+        "leader": np.where(ahead >= 0, tracks.vehicle[ahead], NOBODY),
+    }
+    return tabulate(columns, dict.fromkeys(np.unique(recording).tolist(), I24_EDGES))
+
+
+def _slopes(vehicle: FloatArray, time: FloatArray, x: FloatArray) -> FloatArray:
+    """Return the slope of x over time [m/s] within each track, shape (rows,); 0 for a single row."""
+    order = np.lexsort([time, vehicle])
+    joined = (np.diff(vehicle[order]) == 0) & (np.diff(time[order]) <= LARGEST_STEP * I24_STEP)
+    step = np.where(joined, np.maximum(np.diff(time[order]), 1e-9), 0.0)
+    move = np.where(joined, np.diff(x[order]), 0.0)
+    duration = np.append(step, 0.0) + np.append(0.0, step)
+    result = np.zeros(len(x))
+    result[order] = (np.append(move, 0.0) + np.append(0.0, move)) / np.where(duration > 0.0, duration, 1.0)
+    return result
+
+
+def _check_directions(rows: Rows, slope: FloatArray) -> None:
+    """Check that no vehicle moves against its direction on average."""
+    numbers, index = np.unique(rows["vehicle"], return_inverse=True)
+    mean = np.bincount(index.ravel(), slope) / np.bincount(index.ravel())
+    if (mean < -REVERSING).any():
+        row = int(np.argmax(rows["vehicle"] == numbers[np.argmax(mean < -REVERSING)]))
+        raise rows.error(row, f"the vehicle moves against its direction, {rows['direction'][row]:g}.")

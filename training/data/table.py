@@ -1,0 +1,303 @@
+"""Trajectory tables, the one form that every loader returns and all other modules read; and columns of other tables."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+from numpy.typing import NDArray
+
+from samplers.problem import FloatArray
+
+Integers = NDArray[np.int64]
+
+DT = 0.1
+"""Time between frames [s]."""
+NOBODY = -1
+"""Leader of a vehicle that follows nobody."""
+SCENES_FILE = "ngsim_us101_scenes.parquet"
+VEHICLES_FILE = "ngsim_us101_vehicles.parquet"
+US101_EDGES = (0.0, 3.49, 6.87, 10.20, 13.52, 17.25, 21.0)
+"""Lane boundaries of US 101 [m], measured from the left edge of the road; lane 6 is the weaving lane."""
+_METADATA = b"rare_envs.edges"
+_TYPES: dict[str, Any] = {"recording": np.str_} | dict.fromkeys(("vehicle", "frame", "lane", "leader"), np.int64)
+
+
+@dataclass(frozen=True)
+class Trajectories:
+    """Positions of vehicles, one row per vehicle and frame, sorted by recording, vehicle and frame.
+
+    x runs along the road in the direction of travel, y across it, positive to the right. Both are those of the centre
+    of the vehicle's box. Every column has shape (rows,).
+
+    Raises:
+        ValueError: Columns differ in length, rows are not sorted or occur twice, or values are impossible.
+
+    Example:
+        >>> from training.data import synthetic_traffic
+        >>> table = synthetic_traffic(seconds=2.0)
+        >>> second = table.select(table.vehicle == 1)
+        >>> len(second), int(second.lane[0]), round(float(second.time[-1]), 1)
+        (20, 2, 1.9)
+    """
+
+    recording: NDArray[np.str_]
+    """Name of the recording: one carriageway, recorded without a break."""
+    vehicle: Integers
+    """Number of the vehicle within the recording."""
+    frame: Integers
+    """Number of the time step, `DT` apart, common to all vehicles of a recording; a missing frame is a hole."""
+    x: FloatArray
+    """[m]"""
+    y: FloatArray
+    """[m]; NaN where it was not recorded."""
+    speed: FloatArray
+    """As recorded [m/s], not negative."""
+    acceleration: FloatArray
+    """As recorded, along the road [m/s^2]; NaN where it was not recorded."""
+    length: FloatArray
+    """[m]; NaN where it was not recorded (x is the front then)."""
+    width: FloatArray
+    """[m]; NaN where it was not recorded."""
+    lane: Integers
+    """Number of the lane, 1 the leftmost; 0 outside the lanes or not recorded."""
+    leader: Integers
+    """Number of the vehicle ahead in the same lane, `NOBODY` where none is recorded."""
+    edges: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
+    """y of the lane boundaries of a recording, left to right [m]: lane n is between the n-th and the next."""
+
+    def __post_init__(self) -> None:
+        sizes = {name: self.column(name).shape for name in COLUMNS}
+        if len(set(sizes.values())) != 1 or len(self.vehicle.shape) != 1:
+            raise ValueError(f"Expected columns of one length, got {sizes}.")
+        if not len(self):
+            raise ValueError("Expected a table of trajectories with at least one row, got none.")
+        same = (self.recording[1:] == self.recording[:-1]) & (self.vehicle[1:] == self.vehicle[:-1])
+        later = (self.recording[1:] > self.recording[:-1]) | (
+            (self.recording[1:] == self.recording[:-1]) & (self.vehicle[1:] > self.vehicle[:-1])
+        )
+        wrong = np.flatnonzero(~(later | (same & (self.frame[1:] > self.frame[:-1]))))
+        if wrong.size:
+            raise ValueError(f"Rows {wrong[0]} and {wrong[0] + 1} are not in order of recording, vehicle and frame.")
+        for name, bad, wanted in (
+            ("x", ~np.isfinite(self.x), "a finite number"),
+            ("speed", ~(self.speed >= 0.0), "of at least 0"),
+            ("length", self.length <= 0.0, "above 0"),
+            ("width", self.width <= 0.0, "above 0"),
+            ("lane", self.lane < 0, "of at least 0"),
+        ):
+            if bad.any():
+                row = int(np.argmax(bad))
+                raise ValueError(f"Row {row}: expected {name} {wanted}, got {self.column(name)[row]:g}.")
+        for name, edges in self.edges.items():
+            if not (np.diff(edges) > 0.0).all():
+                raise ValueError(f"Lane boundaries of {name} must increase to the right, got {edges}.")
+
+    def __len__(self) -> int:
+        return len(self.vehicle)
+
+    def column(self, name: str) -> NDArray[Any]:
+        """Return a column by its name."""
+        values: NDArray[Any] = getattr(self, name)  # a field by its name
+        return values
+
+    def select(self, chosen: NDArray[Any]) -> Trajectories:
+        """Return the chosen rows, given as a mask or as increasing indices."""
+        return replace(self, **{name: self.column(name)[chosen] for name in COLUMNS})
+
+    @property
+    def time(self) -> FloatArray:
+        """Clock of the recording [s]."""
+        return np.asarray(DT * self.frame, dtype=np.float64)
+
+    def track_starts(self) -> NDArray[np.int64]:
+        """Return the rows at which a track starts: another recording or vehicle, or the first frame after a hole."""
+        same = (self.recording[1:] == self.recording[:-1]) & (self.vehicle[1:] == self.vehicle[:-1])
+        return np.append(0, 1 + np.flatnonzero(~(same & (np.diff(self.frame) == 1))))
+
+    def find_rows(self, vehicle: Integers) -> Integers:
+        """Return the rows of other vehicles at the same recording and frame, shape (rows,); -1 where there is none.
+
+        Args:
+            vehicle: Number of the vehicle to find for each row, shape (rows,).
+        """
+        recordings = np.unique(self.recording, return_inverse=True)[1].ravel()
+        vehicles, frames = np.ptp(self.vehicle) + 1, np.ptp(self.frame) + 1
+        frame = self.frame - self.frame.min()
+        keys = (recordings * vehicles + self.vehicle - self.vehicle.min()) * frames + frame
+        wanted = (recordings * vehicles + vehicle - self.vehicle.min()) * frames + frame
+        row = np.minimum(np.searchsorted(keys, wanted), len(self) - 1)
+        known = (keys[row] == wanted) & (self.vehicle[row] == vehicle)
+        return np.where(known, row, -1).astype(np.int64)
+
+
+COLUMNS = tuple(f.name for f in fields(Trajectories) if f.name != "edges")
+"""Names of the columns."""
+
+
+def tabulate(columns: Mapping[str, Any], edges: Mapping[str, tuple[float, ...]] | None = None) -> Trajectories:
+    """Return a table made of columns in any order of rows.
+
+    Args:
+        columns: Values by name of column; one number or name stands for all rows, except in "vehicle".
+        edges: Lane boundaries of each recording, see `Trajectories.edges`.
+
+    Raises:
+        ValueError: A row occurs twice, or a value is impossible.
+
+    Example:
+        >>> table = tabulate(
+        ...     {
+        ...         "recording": "my road",
+        ...         "vehicle": [2, 1, 1],
+        ...         "frame": [0, 1, 0],
+        ...         "x": [30.0, 11.5, 10.0],
+        ...         "y": 1.75,
+        ...         "speed": 15.0,
+        ...         "acceleration": 0.0,
+        ...         "length": 4.5,
+        ...         "width": 1.8,
+        ...         "lane": 1,
+        ...         "leader": [NOBODY, NOBODY, 2],
+        ...     }
+        ... )
+        >>> table.x.tolist()
+        [10.0, 11.5, 30.0]
+    """
+    size = np.shape(columns["vehicle"])
+    arrays = {name: np.broadcast_to(np.asarray(columns[name], _TYPES.get(name, np.float64)), size) for name in COLUMNS}
+    order = np.lexsort([arrays[name] for name in ("frame", "vehicle", "recording")])
+    return Trajectories(**{name: values[order] for name, values in arrays.items()}, edges=dict(edges or {}))
+
+
+def find_leaders(frame: Integers, lane: Integers, x: FloatArray, recording: NDArray[Any] | None = None) -> Integers:
+    """Return the rows of the nearest vehicles ahead in the same lane, shape (rows,).
+
+    Args:
+        frame: Number of the time step, shape (rows,).
+        lane: Number of the lane, shape (rows,); 0 is no lane.
+        x: Position along the road [m], shape (rows,).
+        recording: Name of the recording, shape (rows,); None if all rows are of one.
+
+    Returns:
+        -1 where nobody is ahead, or the vehicle is in no lane.
+    """
+    group = np.zeros(len(x), np.int64) if recording is None else np.unique(recording, return_inverse=True)[1].ravel()
+    order = np.lexsort([x, lane, frame, group])
+    sames = [np.diff(values[order]) == 0 for values in (lane, frame, group)]
+    result = np.full(len(x), -1, dtype=np.int64)
+    follows = np.append(sames[0] & sames[1] & sames[2] & (lane[order][1:] > 0), False)
+    result[order[follows]] = order[1:][follows[:-1]]
+    return result
+
+
+def write_trajectories(trajectories: Trajectories, path: Path | str) -> None:
+    """Write a table to a parquet file, with the lane boundaries in its metadata.
+
+    Example:
+        >>> import tempfile
+        >>> from training.data import synthetic_traffic
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     write_trajectories(synthetic_traffic(seconds=2.0), f"{folder}/table.parquet")
+        ...     len(read_trajectories(f"{folder}/table.parquet"))
+        180
+    """
+    edges = json.dumps({name: list(values) for name, values in trajectories.edges.items()})
+    table = pa.table({name: pa.array(trajectories.column(name)) for name in COLUMNS})
+    pq.write_table(table.replace_schema_metadata({_METADATA: edges.encode()}), path)
+
+
+def read_trajectories(path: Path | str) -> Trajectories:
+    """Return a table from a file of `write_trajectories`.
+
+    Raises:
+        ValueError: The file cannot be read, lacks a column or holds impossible values.
+
+    Example:
+        >>> read_trajectories("no_such_table.parquet")  # doctest: +ELLIPSIS
+        Traceback (most recent call last):
+        ValueError: Cannot read trajectories from no_such_table.parquet: ...
+    """
+    try:
+        table = pq.read_table(path)
+    except (OSError, pa.ArrowInvalid) as error:
+        raise ValueError(f"Cannot read trajectories from {path}: {error}") from None
+    missing = [name for name in COLUMNS if name not in table.column_names]
+    if missing:
+        raise ValueError(f"{path} lacks the columns {', '.join(missing)}.")
+    edges = json.loads((table.schema.metadata or {}).get(_METADATA, b"{}"))
+    try:
+        columns = {name: table[name].to_numpy() for name in COLUMNS}
+        return tabulate(columns, {name: tuple(values) for name, values in edges.items()})
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from None
+
+
+def read_columns(path: Path, names: tuple[str, ...]) -> dict[str, NDArray[Any]]:
+    """Return columns of a parquet file.
+
+    Raises:
+        ValueError: The file is missing, cannot be read or lacks a column.
+    """
+    if not path.is_file():
+        raise ValueError(
+            f"There is no {path.name} in the folder {str(path.parent)!r}. That is one of the compact tables, which are "
+            "no part of the package; recordings of your own are read in the formats of docs/data.md."
+        )
+    try:
+        table = pq.read_table(path)
+    except (OSError, pa.ArrowInvalid) as error:
+        raise ValueError(f"Cannot read recorded traffic from {path}: {error}") from None
+    missing = [name for name in names if name not in table.column_names]
+    if missing:
+        raise ValueError(f"{path} lacks the columns {', '.join(missing)}.")
+    return {name: table[name].to_numpy() for name in names}
+
+
+def synthetic_traffic(seconds: float = 12.0, lanes: int = 3, per_lane: int = 3) -> Trajectories:
+    """Return vehicles that follow each other, speed up and slow down, and sway within their lanes.
+
+    Speeds are 12 + cos(1.3 t + k) m/s and lateral positions swing by 0.2 m, with a phase of its own for each vehicle k.
+
+    Args:
+        seconds: Duration [s].
+        lanes: Number of lanes, 3.6 m wide.
+        per_lane: Vehicles in each lane.
+
+    Returns:
+        A table of one recording, "synthetic", with lane boundaries; accelerations are not recorded (NaN).
+
+    Example:
+        >>> table = synthetic_traffic(seconds=2.0)
+        >>> len(table), table.edges["synthetic"]
+        (180, (0.0, 3.6, 7.2, 10.8))
+    """
+    vehicles = np.arange(lanes * per_lane)
+    frame = np.arange(round(seconds / DT))
+    time = DT * frame[:, None]
+    speed = 12.0 + np.cos(1.3 * time + vehicles)
+    x = 25.0 * (vehicles // lanes) + DT * np.cumsum(speed, axis=0)
+    lane = vehicles % lanes
+    y = 3.6 * (lane + 0.5) + 0.2 * np.sin(time + 2.0 * vehicles)
+    columns = {
+        "recording": "synthetic",
+        "vehicle": np.tile(vehicles, len(frame)),
+        "frame": np.repeat(frame, len(vehicles)),
+        "x": x.ravel(),
+        "y": y.ravel(),
+        "speed": speed.ravel(),
+        "acceleration": np.nan,
+        "length": 4.5,
+        "width": 1.8,
+        "lane": np.tile(1 + lane, len(frame)),
+    }
+    row = find_leaders(columns["frame"], columns["lane"], columns["x"])
+    leader = np.where(row >= 0, columns["vehicle"][row], NOBODY)
+    edges = tuple(round(3.6 * k, 6) for k in range(lanes + 1))
+    return tabulate({**columns, "leader": leader}, {"synthetic": edges})

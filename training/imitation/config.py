@@ -1,0 +1,142 @@
+"""Settings of a training, with the values that the shipped drivers were trained with."""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal
+
+from agents.learned.coloured_noise import HUMAN_NOISE, WHITE_NOISE, AutoregressiveNoise
+
+NOISES = {"human": HUMAN_NOISE, "white": WHITE_NOISE}
+
+_RANGES: tuple[tuple[str, Callable[[float], bool], str], ...] = (
+    (
+        "updates batch pools scenes horizon age drivers critic_steps critic_batch memory ppo_epochs ppo_batch",
+        lambda value: value >= 1,
+        ">= 1",
+    ),
+    (
+        "epochs warm_up weight_decay gradient_penalty critic_weight collision_weight edge_weight brake_weight "
+        "headway_weight lane_weight speed_weight",
+        lambda value: 0 <= value < math.inf,
+        ">= 0",
+    ),
+    ("clone_weight clone_rate policy_rate critic_rate value_rate clip", lambda value: 0 < value < math.inf, "> 0"),
+    ("anneal last_rate", lambda value: 0 < value <= 1, "in (0, 1]"),
+    ("credit discount gae", lambda value: 0 <= value <= 1, "in [0, 1]"),
+)
+"""Names of settings, the condition on each value, and its text. Schedules of weights are geometric, so not 0."""
+
+
+@dataclass(frozen=True)
+class Config:
+    """Settings of the training of a driver; the command line has an option for each.
+
+    Pairs are values at the start and at the end of a schedule.
+
+    Raises:
+        ValueError: A setting is outside its range.
+
+    Example:
+        >>> config = Config(method="gail", updates=1000)
+        >>> config.rate_factor(0), round(config.rate_factor(1000), 2)
+        (1.0, 0.1)
+    """
+
+    method: Literal["gail", "mgail"] = "mgail"
+    seed: int = 0
+    updates: int = 1500
+    """Number of updates of the policy after behaviour cloning."""
+    noise: Literal["human", "white"] = "human"
+    """Noise of acceleration and yaw rate: coloured as people's, or white as that of O'Kelly et al."""
+
+    # behaviour cloning, from which both methods start
+    epochs: int = 6
+    batch: int = 512
+    clone_rate: float = 1e-3
+    weight_decay: float = 1e-4
+    log_std_cap: float = 0.0
+    """Upper bound of the logarithm of the standard deviation, see `agents.learned.networks.Policy`."""
+
+    # rollouts
+    pools: int = 5
+    """Number of sets of scenes that are driven in turn and continued from update to update, so that late moments are
+    visited."""
+    scenes: int = 8
+    """Number of scenes in a pool."""
+    horizon: tuple[int, int] = (15, 30)
+    """Number of ticks of a rollout."""
+    age: tuple[int, int] = (30, 150)
+    """Number of ticks after which a pool is restarted from the record."""
+    drivers: tuple[int, int] = (60, 60)
+    """Most vehicles of a scene that are driven: a curriculum over the number of agents (Bhattacharyya et al. 2018)."""
+
+    # costs of the policy
+    critic_weight: float = 3.0
+    clone_weight: tuple[float, float] = (0.1, 0.06)
+    """Weight of the likelihood of recorded actions, a geometric schedule."""
+    anneal: float = 0.7
+    """Share of the training in which the schedules run."""
+    collision_weight: float = 16.0
+    edge_weight: float = 16.0
+    brake_weight: float = 1.0
+    headway_weight: float = 0.0
+    """Weight of following closely, which people do: 0 for drivers of the traffic, as the next two."""
+    lane_weight: float = 0.0
+    """Weight of being away from the middle of the lane."""
+    speed_weight: float = 0.0
+    """Weight of exceeding the speed limit."""
+
+    # optimisation
+    policy_rate: float = 3e-4
+    critic_rate: float = 4e-4
+    last_rate: float = 0.1
+    """Share of the learning rates of policy and critic that is left at the end. They fall once the schedules have
+    ended, so that the policy settles: only that of the last update is kept."""
+    critic_steps: int = 3
+    critic_batch: int = 512
+    memory: int = 8
+    """Number of rollouts that the critic learns from."""
+    warm_up: int = 30
+    """Number of rounds in which only the critic learns."""
+    gradient_penalty: float = 0.5
+    credit: float = 0.97
+    """Of MGAIL: share of the gradient of the state that is passed on to the tick before."""
+
+    # GAIL, by proximal policy optimisation
+    discount: float = 0.97
+    gae: float = 0.95
+    clip: float = 0.2
+    ppo_epochs: int = 4
+    ppo_batch: int = 2048
+    value_rate: float = 1e-3
+
+    def __post_init__(self) -> None:
+        if self.method not in ("gail", "mgail"):
+            raise ValueError(f"Expected method 'gail' or 'mgail', got {self.method!r}.")
+        if self.noise not in NOISES:
+            raise ValueError(f"Expected noise 'human' or 'white', got {self.noise!r}.")
+        for names, holds, expected in _RANGES:
+            for name in names.split():
+                value = getattr(self, name)  # a field by its name
+                if not all(holds(part) for part in (value if isinstance(value, tuple) else (value,))):
+                    raise ValueError(f"Expected {name} {expected}, got {value}.")
+
+    @property
+    def colour(self) -> AutoregressiveNoise:
+        """The noise."""
+        return NOISES[self.noise]
+
+    def rate_factor(self, update: int) -> float:
+        """Return the factor of the learning rates at an update: 1, then linearly down to `last_rate`."""
+        start = self.anneal * self.updates
+        return 1.0 - (1.0 - self.last_rate) * min(max((update - start) / max(self.updates - start, 1.0), 0.0), 1.0)
+
+    def share(self, update: int) -> float:
+        """Return how far the schedules have come at an update, 0 to 1."""
+        return min(update / max(self.anneal * self.updates, 1.0), 1.0)
+
+    def geometric_schedule(self, ends: tuple[float, float], update: int) -> float:
+        """Return the value at an update of a schedule between two ends."""
+        first, last = ends
+        return float(first * (last / first) ** self.share(update))

@@ -1,0 +1,442 @@
+"""How a driver behaves in recorded scenes, all vehicles driven by it, compared with the people in them.
+
+Rates are per vehicle-step, as in RAIL; `ever` counts vehicles. Divergences are Jensen-Shannon, in nats, over fixed
+bins that fit smoothed data; Kuefler et al.'s bins are far wider.
+
+References:
+    Kuefler, Morton, Wheeler and Kochenderfer, "Imitating driver behavior with generative adversarial networks",
+    2017. Bhattacharyya et al., "Simulating emergent properties of human driving behavior using multi-agent reward
+    augmented imitation learning", 2019.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass
+from types import MappingProxyType
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from agents import LearnedDriver
+from rare_envs.sensors.lidar import AHEAD_BEAM, MAX_RANGE
+from rare_envs.sensors.perception import RANGE_COLUMNS, RATE_COLUMNS
+from rare_envs.traffic.oriented_boxes import boxes_overlap
+from samplers.problem import FloatArray
+from training.data.table import DT
+from training.imitation.traffic import Recording, Traffic, lane_of, replay_features, start_replay, step_replay
+
+Act = Callable[[Tensor, "Tensor | None"], tuple[Tensor, "Tensor | None"]]
+"""Function from features (B, M, 51) and a memory, None at first, to actions (B, M, 2) [m/s^2, rad/s] and the new
+memory."""
+HARD_BRAKE_ACCELERATION = -3.0
+"""Acceleration [m/s^2] from which on a brake is hard."""
+ERROR_TIME = 5.0
+"""Time [s] after which positions are compared with the record, all vehicles driven."""
+BINS = MappingProxyType(
+    {
+        "speed": (0.0, 30.0, 60),
+        "acceleration": (-5.0, 4.0, 60),
+        "jerk": (-12.0, 12.0, 60),
+        "yaw_rate": (-0.12, 0.12, 60),
+        "inverse_ttc": (-1.0, 1.0, 60),
+        "gap": (0.0, 100.0, 50),
+    }
+)
+"""Lowest and highest edge and number of bins of each quantity; values beyond count in the outermost bin. Units are m/s,
+m/s^2, m/s^3, rad/s, 1/s (closing speed over range of the beam ahead) and m (of that beam)."""
+LEAST_RANGE = 0.1
+"""Range of the beam ahead [m] to which shorter ones are raised before it divides the closing speed."""
+SHARES = ("hard_brake", "collision", "off_road")
+ERROR_NAMES = ("position", "speed", "lateral")
+"""Errors against the record."""
+
+
+def sampling_driver(driver: LearnedDriver, generator: torch.Generator, weights: Tensor | None = None) -> Act:
+    """Return a function that draws the actions of a learned driver, with its noise.
+
+    Args:
+        driver: The driver.
+        generator: Source of the noise.
+        weights: Last layers of each scene, shape (B, 404), or of all, shape (404,); None for the driver's own.
+
+    Example:
+        >>> from agents import load_driver
+        >>> act = sampling_driver(load_driver("mgail"), torch.Generator().manual_seed(0))
+        >>> actions, memory = act(torch.zeros(1, 3, 51), None)
+        >>> actions.shape
+        torch.Size([1, 3, 2])
+    """
+
+    def act(features: Tensor, memory: Tensor | None) -> tuple[Tensor, Tensor | None]:
+        draws = (*features.shape[:2], 2)
+        if memory is None:
+            memory = driver.begin(torch.randn(*draws, 2, generator=generator))
+        last = None if weights is None else weights.expand(len(features), -1)
+        return driver.act(features, last, torch.randn(draws, generator=generator), memory)
+
+    return act
+
+
+def regular_starts(recording: Recording, seconds: float = 2.0) -> tuple[Tensor, Tensor]:
+    """Return scenes and ticks of starts every few seconds from the start of every scene, shape (B,) each."""
+    stride = round(seconds / DT)
+    starts = [
+        (scene, tick) for scene, ticks in enumerate(recording.ticks.tolist()) for tick in range(0, ticks - 1, stride)
+    ]
+    scene, tick = torch.tensor(starts).T
+    return scene, tick
+
+
+class DrivingStep(NamedTuple):
+    """Traffic at one tick, and the actions taken in it."""
+
+    traffic: Traffic
+    """Traffic before the action."""
+    features: Tensor
+    """Features of the first M vehicles, shape (B, M, 51)."""
+    action: Tensor
+    """Actions of the first M vehicles, shape (B, M, 2)."""
+
+
+def drive_traffic(recording: Recording, traffic: Traffic, act: Act, ticks: int) -> Iterator[DrivingStep]:
+    """Yield each tick, before its action, of traffic whose driven vehicles a driver drives."""
+    m = traffic.drivers
+    unused = torch.zeros(*traffic.x.shape[:1], traffic.x.shape[1] - m, 2)
+    memory = None
+    for _ in range(ticks):
+        features = replay_features(traffic, m)
+        action, memory = act(features, memory)
+        yield DrivingStep(traffic, features, action)
+        traffic = step_replay(recording, traffic, torch.cat((action, unused), dim=1))
+
+
+class Behaviour(NamedTuple):
+    """Motion and contacts of n vehicles in T ticks; shapes (T, n) unless said, NaN where a value is not known."""
+
+    scene: Tensor
+    """Scene of each vehicle, shape (n,)."""
+    known: Tensor
+    """True where the vehicle is there and counts; elsewhere its other values mean nothing."""
+    speed: Tensor
+    """[m/s]."""
+    acceleration: Tensor
+    """[m/s^2]."""
+    yaw_rate: Tensor
+    """[rad/s]."""
+    ahead: Tensor
+    """Range of the beam ahead [m]."""
+    rate: Tensor
+    """Range rate of the beam ahead [m/s]."""
+    contact: Tensor
+    """True where its body overlaps with another that it did not overlap with at the start."""
+    off_road: Tensor
+    """True where its middle is beyond the edge of the road."""
+    changed: Tensor
+    """True where its lane differs from that of the tick before."""
+
+
+def find_overlaps(traffic: Traffic, m: int) -> Tensor:
+    """Return True for pairs of bodies that overlap: the first m vehicles with all, shape (B, m, V)."""
+    x, y, heading, length, width = (
+        (field[:, :m, None], field[:, None, :])
+        for field in (traffic.x, traffic.y, traffic.heading, traffic.length, traffic.width)
+    )
+    sizes = zip(length, width, strict=True)
+    touching = boxes_overlap(x[1] - x[0], y[1] - y[0], *heading, *sizes)
+    return touching & ~torch.eye(m, traffic.x.shape[1], dtype=torch.bool)
+
+
+def behaviour_of(moments: Iterator[DrivingStep]) -> Behaviour:
+    """Return the behaviour of driven vehicles from a start on."""
+    rows: list[tuple[Tensor, ...]] = []
+    scene = driven = overlapping = lane = torch.zeros(0)
+    with torch.inference_mode():
+        for moment in moments:
+            traffic, m = moment.traffic, moment.action.shape[1]
+            now, touching = lane_of(traffic.y, traffic.edges)[:, :m], find_overlaps(traffic, m)
+            if not rows:
+                driven, overlapping, lane = traffic.driven[:, :m], touching, now
+                scene = traffic.scene[:, None].expand_as(driven)[driven]
+            row = _row(moment, (touching & ~overlapping).any(dim=2), now != lane)
+            rows.append(tuple(column[driven] for column in row))
+            lane = now
+    columns = [torch.stack(column) for column in zip(*rows, strict=True)]
+    return Behaviour(scene, torch.ones_like(columns[0], dtype=torch.bool), *columns)
+
+
+def recorded_behaviour(recording: Recording) -> Behaviour:
+    """Return the behaviour of people: every vehicle of the record at every tick at which it could have been driven.
+
+    Overlaps in the record are errors of measurement and count as contact.
+    """
+    scenes, _, vehicles = recording.x.shape
+    known, rows = [], []
+    before, scene = torch.full((scenes, vehicles), -1), torch.arange(scenes)
+    for tick in range(int(recording.ticks.max())):
+        at = recording.ticks.clamp(max=tick + 1) - 1
+        traffic = start_replay(recording, scene, at)
+        m = traffic.drivers
+        vehicle = traffic.vehicle[:, :m]
+        moment = DrivingStep(traffic, replay_features(traffic, m), recording.actions(scene, at, vehicle))
+        lane, last = lane_of(traffic.y, traffic.edges)[:, :m], before.gather(1, vehicle)
+        driven = traffic.driven[:, :m] & (at == tick)[:, None]
+        row = _row(moment, find_overlaps(traffic, m).any(dim=2), (lane != last) & (last >= 0))
+        known.append(torch.zeros(scenes, vehicles, dtype=torch.bool).scatter(1, vehicle, driven).flatten())
+        rows.append([column.new_zeros(scenes, vehicles).scatter(1, vehicle, column).flatten() for column in row])
+        before = torch.full_like(before, -1).scatter(1, vehicle, torch.where(driven, lane, -1))
+    columns = [torch.stack(column) for column in zip(*rows, strict=True)]
+    return Behaviour(scene.repeat_interleave(vehicles), torch.stack(known), *columns)
+
+
+def _row(moment: DrivingStep, contact: Tensor, changed: Tensor) -> tuple[Tensor, ...]:
+    """Return the columns of `Behaviour` from `speed` on, shape (B, M) each."""
+    traffic, m = moment.traffic, moment.action.shape[1]
+    y = traffic.y[:, :m]
+    ahead, rate = (moment.features[..., columns][..., AHEAD_BEAM] for columns in (RANGE_COLUMNS, RATE_COLUMNS))
+    off_road = (y < traffic.edges[:, :1]) | (y > traffic.edges[:, -1:])
+    return traffic.speed[:, :m], *moment.action.unbind(dim=-1), ahead, rate, contact, off_road, changed
+
+
+class Errors(NamedTuple):
+    """Differences from the record, of the n vehicles that are still recorded."""
+
+    scene: Tensor
+    """Scene of each vehicle, shape (n,), as the others."""
+    position: Tensor
+    """[m]."""
+    speed: Tensor
+    """[m/s]."""
+    lateral: Tensor
+    """[m]."""
+
+
+def current_errors(recording: Recording, traffic: Traffic) -> Errors:
+    """Return differences of driven vehicles from their recorded places at this tick."""
+    at = traffic.tick.minimum(recording.ticks[traffic.scene] - 1)
+    recorded = recording.present[traffic.scene, at].gather(1, traffic.vehicle)
+    known = recorded & traffic.driven & (traffic.tick == at)[:, None]
+
+    def off(name: str) -> Tensor:
+        record: Tensor = getattr(recording, name)[traffic.scene, at].gather(1, traffic.vehicle)  # a field by its name
+        made: Tensor = getattr(traffic, name)  # likewise
+        return (made - record)[known]
+
+    along, across = off("x"), off("y")
+    scene = traffic.scene[:, None].expand_as(known)[known]
+    return Errors(scene, (along.square() + across.square()).sqrt(), off("speed"), across)
+
+
+class DrivingStatistics(NamedTuple):
+    """Sums over the vehicle-steps of each of S scenes, from which rates, divergences and errors follow."""
+
+    steps: FloatArray
+    """Number of vehicle-steps, shape (S,)."""
+    vehicles: FloatArray
+    """Number of vehicles, shape (S,)."""
+    sums: dict[str, FloatArray]
+    """Hard braking, collision, off-road, lane changes and speed by vehicle-step, `ever` by vehicle, shape (S,) each."""
+    counts: dict[str, FloatArray]
+    """Histogram of each quantity, shape (S, bins)."""
+    squared: dict[str, FloatArray]
+    """Squared errors of position [m^2], speed and lateral position after 5 s, and their number, shape (S,) each."""
+
+
+def binned_quantities(behaviour: Behaviour) -> dict[str, tuple[Tensor, Tensor]]:
+    """Return the values of each quantity in `BINS` with their scenes, shape (k,) each."""
+    known = behaviour.known
+    both = known[1:] & known[:-1]
+    meets = known & (behaviour.ahead < MAX_RANGE)
+    scene = behaviour.scene.expand_as(known)
+    jerk = (behaviour.acceleration[1:] - behaviour.acceleration[:-1]) / DT
+    inverse_ttc = -behaviour.rate / behaviour.ahead.clamp(min=LEAST_RANGE)
+    return {
+        "speed": (behaviour.speed[known], scene[known]),
+        "acceleration": (behaviour.acceleration[known], scene[known]),
+        "jerk": (jerk[both], scene[1:][both]),
+        "yaw_rate": (behaviour.yaw_rate[known], scene[known]),
+        "inverse_ttc": (inverse_ttc[meets], scene[meets]),
+        "gap": (behaviour.ahead[known], scene[known]),
+    }
+
+
+def sum_by_scene(behaviour: Behaviour, scenes: int, errors: Errors | None = None) -> DrivingStatistics:
+    """Return the statistics of some behaviour in S scenes, with errors after 5 s where these are known."""
+    known = behaviour.known
+
+    def by_scene(scene: Tensor, values: Tensor) -> FloatArray:
+        return np.bincount(scene.numpy(), values.double().numpy(), minlength=scenes).astype(np.float64)
+
+    def steps(values: Tensor) -> FloatArray:
+        return by_scene(behaviour.scene, (values.double() * known).sum(dim=0))
+
+    counts = {}
+    for name, (values, scene) in binned_quantities(behaviour).items():
+        low, high, bins = BINS[name]
+        place = ((values.double() - low) / (high - low) * bins).floor().clamp(0, bins - 1).long()
+        flat = np.bincount((scene * bins + place).numpy(), minlength=scenes * bins)
+        counts[name] = flat.reshape(scenes, bins).astype(np.float64)
+    squared = {}
+    if errors is not None:
+        # fields by name
+        squared = {name: by_scene(errors.scene, getattr(errors, name).square()) for name in ERROR_NAMES}
+        squared["number"] = by_scene(errors.scene, torch.ones_like(errors.position))
+    return DrivingStatistics(
+        steps=steps(known),
+        vehicles=by_scene(behaviour.scene, known.any(dim=0)),
+        sums={
+            "hard_brake": steps(behaviour.acceleration <= HARD_BRAKE_ACCELERATION),
+            "collision": steps(behaviour.contact),
+            "off_road": steps(behaviour.off_road),
+            "lane_changes": steps(behaviour.changed),
+            "speed": steps(behaviour.speed),
+            "ever": by_scene(behaviour.scene, (behaviour.contact & known).any(dim=0)),
+        },
+        counts=counts,
+        squared=squared,
+    )
+
+
+@dataclass(frozen=True)
+class Realism:
+    """Rates of a driver in recorded scenes, and its differences from people.
+
+    Example:
+        >>> shares = {"hard_brake": 0.0, "collision": 0.01, "ever": 0.05, "off_road": 0.0}
+        >>> Realism(vehicles=20, **shares, lane_changes=0.1, mean_speed=14.0, divergence={}, rmse={}).collision
+        0.01
+    """
+
+    vehicles: int
+    hard_brake: float
+    """Share of vehicle-steps at -3 m/s^2 or less."""
+    collision: float
+    """Share of vehicle-steps in which bodies overlap; pairs that overlap at the start are left out."""
+    ever: float
+    """Share of vehicles that collide at all."""
+    off_road: float
+    """Share of vehicle-steps with the middle of the vehicle beyond the edge."""
+    lane_changes: float
+    """Lane changes per vehicle and 10 s."""
+    mean_speed: float
+    """[m/s]."""
+    divergence: dict[str, float]
+    """Jensen-Shannon divergence from the record [nats], of each quantity in `BINS`."""
+    rmse: dict[str, float]
+    """Root mean square error against the record after 5 s: position [m], speed [m/s], lateral [m]."""
+
+
+def jensen_shannon(p: FloatArray, q: FloatArray) -> float:
+    """Return the Jensen-Shannon divergence of two distributions on the same bins [nats], 0 to log 2.
+
+    Example:
+        >>> round(jensen_shannon(np.array([1.0, 0.0]), np.array([0.0, 1.0])), 4)
+        0.6931
+    """
+    middle = 0.5 * (p + q)
+
+    def kl(a: FloatArray) -> float:
+        inside = a > 0
+        return float((a[inside] * np.log(a[inside] / middle[inside])).sum())
+
+    return 0.5 * kl(p) + 0.5 * kl(q)
+
+
+def summarise_realism(
+    driven: DrivingStatistics, recorded: DrivingStatistics, times: FloatArray | None = None
+) -> Realism:
+    """Return rates, divergences and errors from the statistics of a driver.
+
+    Args:
+        driven: Statistics of the driver.
+        recorded: Statistics of the record that it is compared with.
+        times: Number of times that each scene counts, shape (S,); None for once.
+    """
+    times = np.ones_like(driven.steps) if times is None else times
+    steps, vehicles = times @ driven.steps, times @ driven.vehicles
+
+    def share(counts: FloatArray, of: FloatArray) -> FloatArray:
+        total = of @ counts
+        return np.asarray(total / max(total.sum(), 1.0))
+
+    ones = np.ones_like(recorded.steps)
+    rmse = {}
+    if driven.squared and (number := times @ driven.squared["number"]) > 0:
+        rmse = {name: float(np.sqrt(times @ driven.squared[name] / number)) for name in ERROR_NAMES}
+    return Realism(
+        vehicles=int(vehicles),
+        **{name: float(times @ driven.sums[name] / steps) for name in SHARES},
+        ever=float(times @ driven.sums["ever"] / vehicles),
+        lane_changes=float(times @ driven.sums["lane_changes"] / steps * 10.0 / DT),
+        mean_speed=float(times @ driven.sums["speed"] / steps),
+        divergence={
+            name: jensen_shannon(share(driven.counts[name], times), share(recorded.counts[name], ones)) for name in BINS
+        },
+        rmse=rmse,
+    )
+
+
+def collect_statistics(
+    recording: Recording, act: Act, seconds: tuple[float, ...], starts: tuple[Tensor, Tensor] | None = None
+) -> dict[float, DrivingStatistics]:
+    """Drive recorded scenes and return the statistics up to each of some times.
+
+    Args:
+        recording: Scenes that the driver has not learned from.
+        act: Driver of all vehicles.
+        seconds: Times [s], the longest last.
+        starts: Scenes and ticks to start from; None for every 2 s of every scene.
+    """
+    met: list[Errors] = []
+
+    def watch() -> Iterator[DrivingStep]:
+        traffic = start_replay(recording, *(regular_starts(recording) if starts is None else starts))
+        for tick, moment in enumerate(drive_traffic(recording, traffic, act, round(seconds[-1] / DT))):
+            if tick == round(ERROR_TIME / DT):
+                met.append(current_errors(recording, moment.traffic))
+            yield moment
+
+    whole = behaviour_of(watch())
+    out = {}
+    for time in seconds:
+        part = Behaviour(whole.scene, *(column[: round(time / DT)] for column in whole[1:]))
+        out[time] = sum_by_scene(part, len(recording.x), met[0] if met else None)
+    return out
+
+
+def measure(
+    recording: Recording, act: Act, starts: tuple[Tensor, Tensor] | None = None, seconds: float = 10.0
+) -> Realism:
+    """Drive recorded scenes and compare with the record.
+
+    Args:
+        recording: Scenes that the driver has not learned from.
+        act: Driver of all vehicles.
+        starts: Scenes and ticks to start from; None for every 2 s of every scene.
+        seconds: Time for which each start is driven [s].
+
+    Example:
+        >>> from training.data import scenes_of, synthetic_traffic
+        >>> from training.imitation import prepare_data
+        >>> recording = prepare_data(scenes_of(synthetic_traffic(), seconds=4.0)).recording
+        >>> act = lambda features, memory: (torch.zeros(*features.shape[:2], 2), None)
+        >>> realism = measure(recording, act, seconds=1.0)
+        >>> realism.vehicles, realism.collision
+        (36, 0.0)
+    """
+    driven = collect_statistics(recording, act, (seconds,), starts)[seconds]
+    return summarise_realism(driven, record_statistics(recording))
+
+
+def record_statistics(recording: Recording) -> DrivingStatistics:
+    """Return the statistics of people in the recorded scenes."""
+    return sum_by_scene(recorded_behaviour(recording), len(recording.x))
+
+
+def header_metrics(recording: Recording, driver: LearnedDriver, seed: int = 0) -> dict[str, dict[str, Any]]:
+    """Return the metrics in the header of a driver's file: `Realism` over 10 s and 20 s, with one sequence of noise."""
+    act = sampling_driver(driver, torch.Generator().manual_seed(seed))
+    driven, recorded = collect_statistics(recording, act, (10.0, 20.0)), record_statistics(recording)
+    return {f"{seconds:g} s": asdict(summarise_realism(one, recorded)) for seconds, one in driven.items()}

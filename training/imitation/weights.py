@@ -1,0 +1,362 @@
+"""An ensemble of drivers around a trained one, and the distribution of their last layers, by graphical lasso.
+
+    python -m training.imitation.weights runs/mgail --members 32 --out mgail.safetensors
+
+A member continues the training of the base: from the base's weights, with the base's critic, optimisers and losses as
+they were at its end, and with the trunk frozen. Members differ by chance alone: each draws its scenes from the base's
+with repetition, both those that it drives in and those that its driving is compared with. Any other difference (new
+critics, other weights of the losses) would move all members the same way, and their mean away from the base.
+
+Scenes of one recording overlap in vehicles and time, and a run is short. So the spread says how far the last layer can
+move without loss; it is no posterior. A few dozen members say next to nothing about most of the 81,406 correlations of
+404 weights. So the correlations are first shrunk towards 0, the graphical lasso keeps the dependences that stand out,
+and the penalty that decides how many it keeps is the one with the greatest likelihood of held-out members.
+
+References:
+    Friedman, Hastie and Tibshirani, "Sparse inverse covariance estimation with the graphical lasso", Biostatistics
+    9, 2008.
+    O'Kelly, Sinha, Namkoong, Duchi and Tedrake, "Scalable end-to-end autonomous vehicle testing via rare-event
+    simulation", NeurIPS 2018, section 4.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import copy
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated, Any, NamedTuple
+
+import numpy as np
+import torch
+import typer
+from rich.console import Console
+from rich.progress import track
+from sklearn.covariance import graphical_lasso
+from sklearn.exceptions import ConvergenceWarning
+from torch import Tensor
+
+from agents import LearnedDriver, read_driver, read_provenance, save_driver
+from agents.learned.networks import head_weights
+from agents.learned.weight_distribution import RADIUS, WEIGHT_NAMES, WeightDistribution
+from rare_envs.files import replace_file
+from rare_envs.threads import use_one_thread
+from samplers.problem import FloatArray
+from training.command_line import report_errors, run_command
+from training.imitation.clone import Pairs
+from training.imitation.config import Config
+from training.imitation.learner import Critic, Learner, run_updates
+from training.imitation.train import (
+    CHECKPOINT,
+    DRIVER,
+    UPDATE_RULES,
+    Data,
+    load_scenes,
+    prepare_data,
+    read_training_settings,
+)
+
+PENALTIES = (0.8, 0.7, 0.6, 0.5, 0.4, 0.3, 0.25, 0.2, 0.15, 0.1)
+"""Penalties on correlations, in the order they are tried; with `SHRINKAGE` the first keeps no dependence."""
+SHRINKAGE = 0.25
+"""Share of the identity that is mixed into the correlations."""
+FOLDS = 5
+"""Number of parts that members are held out in."""
+DUALITY_GAP = 0.05
+"""Duality gap [nats] at which the lasso has converged: far less than the likelihoods of two penalties differ by."""
+INNER_TOLERANCES = (1e-6, 1e-4)
+"""Tolerances of the lasso's inner problems: the first needs fewer rounds, the second succeeds where the first fails."""
+
+
+@dataclass(frozen=True)
+class Ensemble:
+    """Settings of an ensemble.
+
+    Raises:
+        ValueError: There are too few members to fit a distribution, or too few updates.
+    """
+
+    members: int = 32
+    updates: int = 60
+    """Number of updates of each member."""
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        if self.members < 2 * FOLDS:
+            raise ValueError(f"Expected {2 * FOLDS} or more members to fit a distribution, got {self.members}.")
+        if self.updates < 2:
+            raise ValueError(f"Expected 2 or more updates of each member, got {self.updates}.")
+
+
+class Member(NamedTuple):
+    """A trained member."""
+
+    weights: FloatArray
+    """Weights of its last layer, shape (404,)."""
+    within: FloatArray
+    """Standard deviation of each weight over the second half of its run, shape (404,)."""
+
+
+def member_config(base: Config, updates: int) -> Config:
+    """Return the base's settings with all schedules at their ends."""
+    names = ("horizon", "age", "drivers", "clone_weight")
+    last: dict[str, Any] = {name: (getattr(base, name)[1],) * 2 for name in names}  # fields by name
+    return replace(base, updates=updates, warm_up=0, **last)
+
+
+def train_member(
+    data: Data, driver: LearnedDriver, base: Config, checkpoint: Path, ensemble: Ensemble, number: int
+) -> Member:
+    """Train a member.
+
+    Args:
+        data: Data that the base learned from.
+        driver: The base.
+        base: Settings of the base.
+        checkpoint: Checkpoint of the base's training.
+        ensemble: Settings of the ensemble.
+        number: Number of the member; with the ensemble's seed it decides everything random.
+    """
+    (seed,) = np.random.SeedSequence([ensemble.seed, number]).generate_state(1)
+    generator = torch.Generator().manual_seed(int(seed))
+    scenes = torch.unique(data.pairs.scene)
+    drawn = scenes[torch.randint(len(scenes), (len(scenes),), generator=generator)]
+    policy = copy.deepcopy(driver.policy)
+    policy.head.requires_grad_(True)
+    config, pairs = member_config(base, ensemble.updates), select_scenes(data.pairs, drawn)
+    learner = Learner(config, data.recording, drawn, pairs, policy, Critic(), generator)
+    learner.inherit(checkpoint)
+    visited = [head_weights(policy).detach() for _ in run_updates(learner, UPDATE_RULES[config.method])]
+    late = torch.stack(visited[len(visited) // 2 :]).double().numpy()
+    return Member(late[-1], late.std(axis=0))
+
+
+def select_scenes(pairs: Pairs, drawn: Tensor) -> Pairs:
+    """Return the pairs of the scenes that were drawn, as often as they were drawn."""
+    rows = torch.cat([(pairs.scene == scene).nonzero().flatten() for scene in drawn])
+    return Pairs(*(column[rows] for column in pairs))
+
+
+def train_members(folder: Path, ensemble: Ensemble, progress: bool = False) -> list[Member]:
+    """Train an ensemble around the driver in a folder; members that are kept there are not trained again.
+
+    Raises:
+        ValueError: The folder holds no finished training, or members of another driver.
+    """
+    source, base = read_training_settings(folder)
+    driver = read_driver(folder / DRIVER)
+    own = head_weights(driver.policy).double().numpy()
+    kept = folder / f"members-{ensemble.updates}-{ensemble.seed}"
+    kept.mkdir(exist_ok=True)
+    data = prepare_data(load_scenes(source)[0])
+    members = []
+    for number in track(range(ensemble.members), "members", console=Console(stderr=True), disable=not progress):
+        path = kept / f"{number:03}.npz"
+        if not path.exists():
+            member = train_member(data, driver, base, folder / CHECKPOINT, ensemble, number)
+            with replace_file(path) as draft:
+                np.savez(draft, base=own, weights=member.weights, within=member.within)
+        with np.load(path) as saved:
+            if not np.array_equal(saved["base"], own):
+                raise ValueError(f"{str(path)!r} is a member around another driver; remove {str(kept)!r}.")
+            members.append(Member(saved["weights"], saved["within"]))
+    return members
+
+
+def measure_spread(members: list[Member], base: FloatArray) -> dict[str, float]:
+    """Return how far members are from each other, move within their runs, and are on average from the base."""
+    weights = np.stack([member.weights for member in members])
+    between, within = weights.std(axis=0, ddof=1), np.stack([member.within for member in members]).mean(axis=0)
+    bias = np.abs(weights.mean(axis=0) - base)
+    found = {}
+    for name, values in (("between", between), ("within", within), ("bias", bias)):
+        found |= {f"{name}_median": float(np.median(values)), f"{name}_max": float(values.max())}
+    return {**found, "bias_over_spread": float(np.sqrt(np.square(bias).mean() / np.square(between).mean()))}
+
+
+def make_ensemble(folder: Path, ensemble: Ensemble, out: Path, progress: bool = False) -> Path:
+    """Write a copy of the driver of a finished training, with a distribution of its weights, to a `.safetensors` file.
+
+    Raises:
+        ValueError: There is no finished training, or no distribution can be fitted.
+    """
+    members = train_members(folder, ensemble, progress)
+    driver, provenance = read_driver(folder / DRIVER), read_provenance(folder / DRIVER)
+    fit = fit_weights(np.stack([member.weights for member in members]))
+    spread = measure_spread(members, head_weights(driver.policy).double().numpy())
+    command = f"python -m training.imitation.weights RUN --members {ensemble.members} --updates {ensemble.updates}"
+    about = {"command": f"{command} --seed {ensemble.seed}", **spread, **fit.metadata}
+    return save_driver(replace(driver, weights=fit.distribution), replace(provenance, ensemble=about), out)
+
+
+_FAILURES = (FloatingPointError, ConvergenceWarning, RuntimeWarning, np.linalg.LinAlgError)
+"""Exceptions of the lasso if it has no answer, or one that is not positive definite."""
+
+
+class WeightFit(NamedTuple):
+    """A fitted distribution and a record of the fit."""
+
+    distribution: WeightDistribution
+    metadata: dict[str, Any]
+    """Record of the fit, ready for JSON: members, folds, shrinkage, penalty (chosen), nonzeros (share of the
+    off-diagonal entries of the precision), condition (of the precision of standardised weights), spread_median,
+    spread_max, stopped (why no smaller penalty was tried), tried: for each penalty its nonzeros, condition and
+    held-out log-likelihood per member."""
+
+
+def fit_weights(
+    members: FloatArray,
+    *,
+    radius: float = RADIUS,
+    penalties: Sequence[float] = PENALTIES,
+    shrinkage: float = SHRINKAGE,
+    folds: int = FOLDS,
+    names: Sequence[str] = WEIGHT_NAMES,
+) -> WeightFit:
+    """Return the Gaussian N(mean, precision^-1) fitted to the weights of an ensemble.
+
+    Penalties are tried in descending order until one fails, on all members or without one of the folds; the one with
+    the greatest held-out log-likelihood is taken.
+
+    Args:
+        members: Last layers of K drivers, shape (K, 404). Members that depend on each other (iterates of one run) must
+            be neighbours, because a fold holds out consecutive members.
+        radius: Distance by which a search may move each mean.
+        penalties: Penalties to try, in descending order.
+        shrinkage: Share of the identity mixed into the correlations.
+        folds: Number of times that members are held out.
+        names: Names of the columns in error messages.
+
+    Raises:
+        ValueError: There are too few members, a weight is not finite or the same in all members of a fit, or not even
+            the first penalty succeeds.
+
+    Example:
+        >>> members = np.random.default_rng(0).standard_normal((20, 3))
+        >>> fit = fit_weights(members, names=("a", "b", "c"))
+        >>> fit.metadata["members"], fit.distribution.mean.shape
+        (20, (3,))
+    """
+    members = np.asarray(members, dtype=np.float64)
+    _check_arguments(members, penalties, shrinkage, folds, names)
+    everyone = _moments(members, shrinkage, names)
+    held_out = np.array_split(np.arange(len(members)), folds)
+    without = [_moments(np.delete(members, fold, axis=0), shrinkage, names) for fold in held_out]
+
+    tried: list[dict[str, float]] = []
+    precisions: list[FloatArray] = []
+    stopped = "no penalty left"
+    for penalty in penalties:
+        try:
+            precision = _lasso(everyone.correlation, penalty)
+            fitted = [_to_distribution(part, _lasso(part.correlation, penalty), radius) for part in without]
+        except _FAILURES as failure:
+            stopped = f"penalty {penalty} failed: {' '.join(str(failure).split())[:120]}"
+            break
+        scores = np.concatenate([part.log_prob(members[fold]) for part, fold in zip(fitted, held_out, strict=True)])
+        likelihood = {"penalty": float(penalty), "held_out_log_likelihood": float(scores.mean())}
+        tried.append({**likelihood, **_describe_precision(precision)})
+        precisions.append(precision)
+    if not tried:
+        raise ValueError(f"No distribution could be fitted: {stopped}. Start at a larger penalty or shrink more.")
+    best = int(np.argmax([row["held_out_log_likelihood"] for row in tried]))
+    metadata = {
+        "members": len(members),
+        "folds": folds,
+        "shrinkage": shrinkage,
+        **{name: tried[best][name] for name in ("penalty", "held_out_log_likelihood", "nonzeros", "condition")},
+        "spread_median": float(np.median(everyone.spread)),
+        "spread_max": float(everyone.spread.max()),
+        "stopped": stopped,
+        "tried": tried,
+    }
+    return WeightFit(_to_distribution(everyone, precisions[best], radius), metadata)
+
+
+def _check_arguments(
+    members: FloatArray, penalties: Sequence[float], shrinkage: float, folds: int, names: Sequence[str]
+) -> None:
+    """Raise ValueError for arguments of `fit_weights` that do not fit together."""
+    if members.ndim != 2 or members.shape[1] != len(names):
+        raise ValueError(f"Expected members of shape (K, {len(names)}), got {members.shape}.")
+    if folds < 2 or len(members) < 2 * folds:
+        raise ValueError(f"Expected at least 2 folds of 2 members each, got {len(members)} members in {folds} folds.")
+    if not 0.0 < shrinkage < 1.0 or list(penalties) != sorted(penalties, reverse=True) or not penalties:
+        raise ValueError(f"Expected shrinkage in (0, 1) and descending penalties, got {shrinkage} and {penalties}.")
+
+
+class _Moments(NamedTuple):
+    """Mean, standard deviation (404,) and correlation, shrunk towards the identity (404, 404), of members' weights."""
+
+    mean: FloatArray
+    spread: FloatArray
+    correlation: FloatArray
+
+
+def _moments(members: FloatArray, shrinkage: float, names: Sequence[str]) -> _Moments:
+    """Return the moments of members; a ValueError if a weight is not finite, or the same in all members."""
+    inert = ~np.isfinite(members).all(axis=0) | (members == members[0]).all(axis=0)
+    if inert.any():
+        some = ", ".join(names[j] for j in np.flatnonzero(inert)[:5])
+        raise ValueError(
+            f"Expected every weight to vary among the members, but {inert.sum()} of {len(names)} are inert "
+            f"(the same in all, or not finite): {some}{', ...' if inert.sum() > 5 else ''}. "
+            "Does a clamp keep gradients from them?"
+        )
+    mean, spread = members.mean(axis=0), members.std(axis=0, ddof=1)
+    normal = (members - mean) / spread
+    correlation = (1.0 - shrinkage) * normal.T @ normal / (len(members) - 1)
+    np.fill_diagonal(correlation, 1.0)
+    return _Moments(mean, spread, correlation)
+
+
+def _lasso(correlation: FloatArray, penalty: float) -> FloatArray:
+    """Return the sparse precision of standardised weights; one of `_FAILURES` if no inner tolerance succeeds."""
+    for tolerance in INNER_TOLERANCES[:-1]:
+        with contextlib.suppress(*_FAILURES):
+            return _solve_lasso(correlation, penalty, tolerance)
+    return _solve_lasso(correlation, penalty, INNER_TOLERANCES[-1])
+
+
+def _solve_lasso(correlation: FloatArray, penalty: float, tolerance: float) -> FloatArray:
+    """Return the precision at one inner tolerance."""
+    state = np.random.get_state()  # noqa: NPY002 - scikit-learn draws a number that nothing depends on
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            _, precision = graphical_lasso(correlation, penalty, tol=DUALITY_GAP, enet_tol=tolerance)
+    finally:
+        np.random.set_state(state)  # noqa: NPY002
+    np.linalg.cholesky(precision)
+    return np.asarray(precision, dtype=np.float64)
+
+
+def _to_distribution(moments: _Moments, precision: FloatArray, radius: float) -> WeightDistribution:
+    """Return the distribution with a precision of standardised weights."""
+    return WeightDistribution(moments.mean, precision / np.outer(moments.spread, moments.spread), radius)
+
+
+def _describe_precision(precision: FloatArray) -> dict[str, float]:
+    """Return the share of nonzero off-diagonal entries, and the condition number."""
+    beside = precision[~np.eye(len(precision), dtype=bool)]
+    return {"nonzeros": float((beside != 0.0).mean()), "condition": float(np.linalg.cond(precision))}
+
+
+@use_one_thread()
+def main(
+    run: Annotated[Path, typer.Argument(help="Folder of a finished training.")],
+    out: Annotated[Path, typer.Option(help="The driver with the distribution of its weights, .safetensors.")],
+    members: Annotated[int, typer.Option(help="Members to train.")] = Ensemble.members,
+    updates: Annotated[int, typer.Option(help="Of each member.")] = Ensemble.updates,
+    seed: Annotated[int, typer.Option(help="The same seed gives the same distribution.")] = Ensemble.seed,
+) -> None:
+    """Train an ensemble around a driver and fit the distribution of its last layer's weights."""
+    with report_errors("weights"):
+        path = make_ensemble(run, Ensemble(members, updates, seed), out, progress=True)
+    print(f"Saved {path}.")
+
+
+if __name__ == "__main__":
+    run_command(main)

@@ -1,0 +1,1 @@
+"""Recipes: how each file that is shipped was made, one script for each."""
