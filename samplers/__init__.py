@@ -3,14 +3,12 @@
 It needs NumPy and SciPy, and nothing about driving. Begin with `estimate`.
 """
 
-from samplers.analysis.base_uncertainty import BaseUncertainty
-from samplers.analysis.budget import Pilot, PlannedRun, plan_runs
+from samplers.analysis.base_error import BaseUncertainty, RatioUncertainty, compute_ratio_uncertainty
 from samplers.analysis.curve import Curve
-from samplers.analysis.failure_modes import Share
-from samplers.analysis.gate import Verdict
-from samplers.analysis.ratio_uncertainty import RatioUncertainty, compute_ratio_uncertainty
+from samplers.analysis.gate import Pilot, PlannedRun, Verdict, plan_runs
+from samplers.analysis.kinds import Share
 from samplers.analysis.refits import FittedBase
-from samplers.analysis.reweighting import Reweighted
+from samplers.analysis.reweight import Reweighted
 from samplers.analysis.sensitivity import Sensitivity
 from samplers.comparison import Comparison, compare
 from samplers.distributions import as_distribution
@@ -24,15 +22,13 @@ from samplers.execution.run import Run
 from samplers.method import Goal, Interrupted, Outcome, Stepping, Steps
 from samplers.methods.auto import Auto
 from samplers.methods.base import Method
-from samplers.methods.cross_entropy.beta_block import BetaBlock
-from samplers.methods.cross_entropy.blocks import Product
-from samplers.methods.cross_entropy.gaussian_blocks import GaussianBlock, MappedBlock, MixtureBlock, NormalBlock
-from samplers.methods.cross_entropy.method import CrossEntropy
+from samplers.methods.blocks import BetaBlock, GaussianBlock, MappedBlock, MixtureBlock, NormalBlock, Product
+from samplers.methods.cross_entropy import CrossEntropy
 from samplers.methods.importance_sampling import ImportanceSampling
 from samplers.methods.improved_cross_entropy import ImprovedCrossEntropy
 from samplers.methods.monte_carlo import MonteCarlo
-from samplers.methods.subset_simulation import AdaptiveSubsetSimulation, SubsetSimulation
-from samplers.methods.surrogate.method import Surrogate
+from samplers.methods.subset import AdaptiveSubsetSimulation, SubsetSimulation
+from samplers.methods.surrogate import Surrogate
 from samplers.methods.two_stage.method import TwoStage
 from samplers.problem import (
     Distribution,

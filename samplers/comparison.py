@@ -11,25 +11,21 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import stdtrit
 
-from samplers.analysis.base import cov_inflation, require_sample
-from samplers.analysis.ratio_uncertainty import RatioUncertainty, summarise_ratio
+from samplers.analysis.base_error import RatioUncertainty, summarise_ratio
 from samplers.analysis.refits import find_fitted_base, reweight_runs_to_refits
-from samplers.analysis.reweighting import MAX_LOG
+from samplers.analysis.reweight import MAX_LOG
+from samplers.analysis.weighted import cov_inflation, has_independent_points, interval_of_sum, require_sample
+from samplers.display import drawing_axes, html_table
+from samplers.estimate_display import indent_lines
 from samplers.estimation import estimate
 from samplers.execution.arguments import RunArguments, check_problem
 from samplers.execution.progress import Listener
 from samplers.method import Stepping
 from samplers.methods.auto import Auto
-from samplers.presentation.drawing import drawing_axes
-from samplers.presentation.estimate_display import indent_lines
-from samplers.presentation.notebook_html import html_table
-from samplers.presentation.object_file import read_object, register_stored, write_object
 from samplers.problem import FloatArray, Problem, condition_of, names_of_columns
 from samplers.result import Estimate, without_base
-from samplers.serialization import to_json_value
-from samplers.statistics.cluster_sums import has_independent_points, interval_of_sum
-from samplers.statistics.intervals import Interval, degrees_of_freedom, zero_hit_bound
-from samplers.statistics.weights import effective_number
+from samplers.statistics import Interval, degrees_of_freedom, effective_number, zero_hit_bound
+from samplers.stored import read_object, register_stored, to_json_value, write_object
 from samplers.system.optional_libraries import needs_library
 from samplers.validation import check_whole
 

@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 
 from samplers.problem import FloatArray, Inputs, TermGradients, Terms
 from samplers.sample import DrawWeights, Sample
-from samplers.statistics.intervals import binomial_cov, clopper_pearson
-from samplers.statistics.weights import normalise_weights
+from samplers.statistics import binomial_cov, clopper_pearson, normalise_weights
 from samplers.trace import Level, Status
 
 

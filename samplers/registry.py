@@ -9,14 +9,14 @@ from typing import Any, cast
 
 from samplers.method import Stepping
 from samplers.methods.auto import Auto
-from samplers.methods.cross_entropy.method import CrossEntropy
+from samplers.methods.cross_entropy import CrossEntropy
 from samplers.methods.importance_sampling import ImportanceSampling
 from samplers.methods.improved_cross_entropy import ImprovedCrossEntropy
 from samplers.methods.monte_carlo import MonteCarlo
-from samplers.methods.subset_simulation import AdaptiveSubsetSimulation, SubsetSimulation
-from samplers.methods.surrogate.method import Surrogate
+from samplers.methods.subset import AdaptiveSubsetSimulation, SubsetSimulation
+from samplers.methods.surrogate import Surrogate
 from samplers.methods.two_stage.method import TwoStage
-from samplers.presentation.object_file import register_stored
+from samplers.stored import register_stored
 from samplers.validation import check_name
 
 ENTRY_POINT_GROUP = "rare_envs.samplers"

@@ -10,23 +10,30 @@ from typing import TYPE_CHECKING, Any, cast
 
 from numpy.typing import ArrayLike
 
-from samplers.analysis.base import RatioStore, require_sample
-from samplers.analysis.base_uncertainty import BaseUncertainty, compute_base_uncertainty
-from samplers.analysis.budget import Pilot
+from samplers.analysis.base_error import BaseUncertainty, compute_base_uncertainty
 from samplers.analysis.curve import Curve, compute_curve
-from samplers.analysis.failure_modes import Share, split_by_kind
-from samplers.analysis.gate import Verdict, judge_estimate
-from samplers.analysis.reweighting import Reweighted, find_sibling, reweight_estimate
-from samplers.analysis.sensitivity.parameter_sensitivity import Sensitivity, compute_sensitivity
+from samplers.analysis.gate import Pilot, Verdict, judge_estimate
+from samplers.analysis.kinds import Share, split_by_kind
+from samplers.analysis.reweight import Reweighted, find_sibling, reweight_estimate
+from samplers.analysis.sensitivity import Sensitivity, compute_sensitivity
+from samplers.analysis.weighted import RatioStore, require_sample
+from samplers.estimate_display import EstimateDisplay
 from samplers.method import Stepping
-from samplers.presentation.estimate_display import EstimateDisplay
-from samplers.presentation.object_file import is_stored, read_object, register_stored, write_object
-from samplers.presentation.point_table import arrow_table, columns_of_sample, columns_of_simulations, set_apart
-from samplers.presentation.stored_method import StoredMethod
 from samplers.problem import Distribution, FloatArray
 from samplers.sample import DrawWeights, Failures, Layer, Sample, SimulatedPoints, SimulationIndex
-from samplers.serialization import to_json_value
-from samplers.statistics.intervals import zero_hit_bound
+from samplers.statistics import zero_hit_bound
+from samplers.stored import (
+    StoredMethod,
+    arrow_table,
+    columns_of_sample,
+    columns_of_simulations,
+    is_stored,
+    read_object,
+    register_stored,
+    set_apart,
+    to_json_value,
+    write_object,
+)
 from samplers.system.optional_libraries import needs_library
 from samplers.trace import Level, Status
 

@@ -41,7 +41,7 @@ from rare_envs.measures.combination import Combined
 from rare_envs.scenarios import load_base
 from rare_envs.scenarios.registry import find_scenario
 from rare_envs.threads import use_one_thread
-from samplers.statistics.intervals import Interval, clopper_pearson
+from samplers.statistics import Interval, clopper_pearson
 
 CALIBRATION_RESULT = RESULTS / "human_calibration.json"
 PAGE, MEASURED = Path("docs/human_driver.md"), "## Measured"

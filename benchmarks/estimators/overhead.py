@@ -24,7 +24,7 @@ import samplers
 from benchmarks.samplers.runs import Meter, about
 from samplers.limit_states import half_space
 from samplers.problem import FunctionProblem
-from samplers.serialization import to_json_value
+from samplers.stored import to_json_value
 
 TARGETS = {6: 0.3, 428: 2.0}
 """Seconds for the default method, by dimension."""

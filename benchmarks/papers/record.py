@@ -16,7 +16,7 @@ from benchmarks.papers.markdown import format_reproduction
 from benchmarks.samplers.runs import about
 from rare_envs.json_text import format_json
 from rare_envs.study.errors import BadInput
-from samplers.serialization import to_json_value
+from samplers.stored import to_json_value
 
 
 @dataclass(frozen=True, kw_only=True)

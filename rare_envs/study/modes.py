@@ -27,8 +27,7 @@ from rare_envs.study.severity import MAX_REPLAYED, Severity, compute_severity, r
 from rare_envs.study.storage.episode_file import digest_scenario
 from rare_envs.traffic.crash import CRASH_KINDS, Crash, describe_crash
 from samplers.analysis import NO_OUTCOME_LABEL, sum_by_label
-from samplers.analysis.base import require_sample
-from samplers.analysis.failure_weights import choose_failures
+from samplers.analysis.weighted import choose_failures, require_sample
 from samplers.problem import FloatArray
 
 MAX_CLUSTERED = 2000

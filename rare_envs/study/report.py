@@ -29,10 +29,10 @@ from rare_envs.study.question import Study
 from rare_envs.study.repeatability import Repeatability
 from rare_envs.study.severity import Severity
 from rare_envs.version import __version__
-from samplers.analysis.base_uncertainty import FIT_BIAS
+from samplers.analysis.base_error import FIT_BIAS
+from samplers.analysis.refits import refit_quantile
 from samplers.sample import Sample
-from samplers.statistics.intervals import Interval
-from samplers.statistics.refit_families import refit_quantile
+from samplers.statistics import Interval
 
 N_THRESHOLDS = 25
 REACH = 0.5

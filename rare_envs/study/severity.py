@@ -24,7 +24,7 @@ from samplers.analysis import (
     expect_under_refits,
     weigh_failures,
 )
-from samplers.presentation.drawing import drawing_axes
+from samplers.display import drawing_axes
 from samplers.problem import FloatArray
 
 if TYPE_CHECKING:

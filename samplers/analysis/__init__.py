@@ -1,20 +1,19 @@
 """Analyses of an estimate without new simulations: thresholds, base distributions, kinds of failure, sensitivities."""
 
-from samplers.analysis.base_uncertainty import BaseUncertainty
+from samplers.analysis.base_error import BaseUncertainty, RatioUncertainty, RefitBand
 from samplers.analysis.curve import Curve
-from samplers.analysis.exceedance import Exceedance, compute_exceedance
-from samplers.analysis.failure_expectation import (
+from samplers.analysis.expectation import (
+    Exceedance,
     FailureExpectation,
     FurtherFailures,
+    compute_exceedance,
     expect_over_failures,
     expect_under_refits,
 )
-from samplers.analysis.failure_modes import NO_OUTCOME_LABEL, Share, sum_by_label
-from samplers.analysis.failure_weights import WeightedFailures, weigh_failures
-from samplers.analysis.ratio_uncertainty import RatioUncertainty
-from samplers.analysis.refit_band import RefitBand
-from samplers.analysis.reweighting import Reweighted
+from samplers.analysis.kinds import NO_OUTCOME_LABEL, Share, sum_by_label
+from samplers.analysis.reweight import Reweighted
 from samplers.analysis.sensitivity import Sensitivity
+from samplers.analysis.weighted import WeightedFailures, weigh_failures
 
 __all__ = [
     "NO_OUTCOME_LABEL",

@@ -8,16 +8,20 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 from numpy.typing import ArrayLike
 
-from samplers.analysis.base import MIN_UNITS, WeightedEstimate, cov_inflation, no_outcome_weight, require_sample
-from samplers.presentation.curve_display import CurveDisplay
-from samplers.presentation.drawing import drawing_axes
-from samplers.presentation.object_file import register_stored
+from samplers.analysis.weighted import (
+    MIN_UNITS,
+    WeightedEstimate,
+    cov_inflation,
+    no_outcome_weight,
+    require_sample,
+    simultaneous_intervals,
+    unit_sums,
+)
+from samplers.display import CurveDisplay, drawing_axes
 from samplers.problem import FloatArray
 from samplers.sample import Sample
-from samplers.serialization import to_json_value
-from samplers.statistics.cluster_sums import unit_sums
-from samplers.statistics.simultaneous import simultaneous_intervals
-from samplers.statistics.unseen_share import add_unseen
+from samplers.statistics import add_unseen
+from samplers.stored import register_stored, to_json_value
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -10,7 +10,7 @@ from scipy.special import chdtrc, stdtrit
 
 from samplers.method import Outcome
 from samplers.sample import DrawWeights, Sample
-from samplers.statistics.intervals import Interval, binomial_cov
+from samplers.statistics import Interval, binomial_cov
 from samplers.trace import Level, Status
 
 OWN_ERROR_FACTOR = 1.5

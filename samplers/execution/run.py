@@ -19,7 +19,7 @@ from samplers.method import Answer, Choice, Choosing, Goal, Outcome, Request, St
 from samplers.problem import FloatArray, Inputs, TermGradients, Terms, condition_of, names_of_columns
 from samplers.result import Estimate
 from samplers.sample import SimulatedPoints, SimulationIndex
-from samplers.statistics.intervals import gain_over_monte_carlo
+from samplers.statistics import gain_over_monte_carlo
 from samplers.trace import Status
 
 MIN_REPLICATES = 5

@@ -4,7 +4,7 @@ from samplers.methods.base import Method
 from samplers.methods.importance_sampling import ImportanceSampling
 from samplers.methods.improved_cross_entropy import ImprovedCrossEntropy
 from samplers.methods.monte_carlo import MonteCarlo
-from samplers.methods.subset_simulation import AdaptiveSubsetSimulation, SubsetSimulation
+from samplers.methods.subset import AdaptiveSubsetSimulation, SubsetSimulation
 
 __all__ = [
     "AdaptiveSubsetSimulation",

@@ -7,7 +7,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from samplers.importance.search import (
+from samplers.importance import (
     Round,
     Search,
     draw_after_search,
@@ -19,10 +19,8 @@ from samplers.importance.search import (
 from samplers.method import Goal, Interrupted, Steps
 from samplers.methods.base import Method
 from samplers.problem import FloatArray, Inputs, StandardNormal
-from samplers.proposals.gaussian import TiltedNormal
-from samplers.proposals.mixture import Mixture, ProposalDistribution
-from samplers.statistics.thresholds import next_level
-from samplers.statistics.weights import normalise_weights
+from samplers.proposals import Mixture, ProposalDistribution, TiltedNormal
+from samplers.statistics import next_level, normalise_weights
 from samplers.trace import Level, Status
 from samplers.validation import check_count, check_setting
 

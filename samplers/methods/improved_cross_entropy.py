@@ -8,10 +8,12 @@ from typing import ClassVar, Literal
 import numpy as np
 from scipy.special import log_ndtr
 
-from samplers.importance.sampling import count_final_draws, defensive_mixture
-from samplers.importance.search import (
+from samplers.components import VonMisesFisherNakagami
+from samplers.importance import (
     Round,
     Search,
+    count_final_draws,
+    defensive_mixture,
     draw_after_search,
     plan_rounds,
     pool_rounds,
@@ -20,13 +22,15 @@ from samplers.importance.search import (
 )
 from samplers.method import Goal, Interrupted, Steps
 from samplers.methods.base import Method
-from samplers.methods.mixture_em import WidenableMixture, fit_proposal_mixture
 from samplers.problem import FloatArray, Inputs, StandardNormal
-from samplers.proposals.gaussian import TiltedNormal
-from samplers.proposals.mixture import ProposalDistribution
-from samplers.proposals.shrinkage import fit_shrunk_gaussian
-from samplers.proposals.von_mises_fisher import VonMisesFisherNakagami
-from samplers.statistics.weights import normalise_weights
+from samplers.proposals import (
+    ProposalDistribution,
+    TiltedNormal,
+    WidenableMixture,
+    fit_proposal_mixture,
+    fit_shrunk_gaussian,
+)
+from samplers.statistics import normalise_weights
 from samplers.trace import Level, Status
 from samplers.validation import check_choice, check_count, check_setting
 

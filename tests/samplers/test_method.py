@@ -6,7 +6,7 @@ import pytest
 
 import samplers
 from samplers.method import MANY_FAILURES, no_outcome_share
-from samplers.statistics.intervals import binomial_cov, clopper_pearson
+from samplers.statistics import binomial_cov, clopper_pearson
 
 
 def test_budget_is_max_sim_or_without_limit():

@@ -9,7 +9,7 @@ import pytest
 import samplers
 from samplers.limit_states import half_space
 from samplers.sample import Failures
-from samplers.serialization import to_json_value
+from samplers.stored import to_json_value
 from tests.samplers.fitted_bases import fitted, resampled, run
 
 

@@ -4,7 +4,7 @@ import math
 import numpy as np
 import pytest
 
-from samplers.serialization import to_json_value
+from samplers.stored import to_json_value
 
 
 @pytest.mark.parametrize(

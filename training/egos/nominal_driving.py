@@ -37,7 +37,7 @@ from rare_envs.simulation.world import World
 from rare_envs.traffic.crash import NONE, ROAD_EDGE
 from rare_envs.traffic.lead import lead_index
 from rare_envs.traffic.state import VEHICLE_LENGTH, VEHICLE_WIDTH, State
-from samplers.statistics.intervals import clopper_pearson
+from samplers.statistics import clopper_pearson
 from training.command_line import report_errors, run_command
 from training.egos.nominal_traffic import CASES, FLOOR_GAP, FLOOR_HEADWAY, SECONDS, Case
 

@@ -25,7 +25,7 @@ import samplers
 from benchmarks.samplers.problems import PROBLEMS
 from benchmarks.samplers.runs import about
 from samplers.problem import FloatArray, FunctionProblem
-from samplers.serialization import to_json_value
+from samplers.stored import to_json_value
 
 FAR_OFF = 4.0
 """A run is far off if its error is more than so many of its own standard errors; a normal one is once in 16,000."""

@@ -9,8 +9,7 @@ import numpy as np
 from scipy.stats.contingency import relative_risk
 
 from samplers.problem import FloatArray
-from samplers.statistics.intervals import Interval, clopper_pearson
-from samplers.statistics.weights import effective_sample_size
+from samplers.statistics import Interval, clopper_pearson, effective_sample_size
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ from scipy import stats
 
 from benchmarks.papers.record import TestedClaim
 from samplers.problem import FloatArray
-from samplers.statistics.intervals import Interval
+from samplers.statistics import Interval
 
 NEXT_LANES = (2, 3)
 """Vehicles that start in the lanes beside the ego's, see `rare_envs.scenarios.highway.START_LANES`."""

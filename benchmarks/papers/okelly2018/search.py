@@ -13,10 +13,9 @@ from typing import NamedTuple
 import numpy as np
 
 from benchmarks.papers.okelly2018.scales import SearchSettings
-from samplers.methods.cross_entropy import BetaBlock, NormalBlock, Product
-from samplers.methods.cross_entropy.blocks import announced_blocks
+from samplers.methods.blocks import BetaBlock, NormalBlock, Product, announced_blocks
 from samplers.problem import FloatArray, Inputs
-from samplers.statistics.weights import effective_sample_size, normalise_weights
+from samplers.statistics import effective_sample_size, normalise_weights
 
 
 class SearchStep(NamedTuple):

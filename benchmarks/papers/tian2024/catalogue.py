@@ -6,11 +6,11 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 from samplers.method import Stepping
-from samplers.methods.cross_entropy.method import CrossEntropy
+from samplers.methods.cross_entropy import CrossEntropy
 from samplers.methods.importance_sampling import ImportanceSampling
 from samplers.methods.improved_cross_entropy import ImprovedCrossEntropy
 from samplers.methods.monte_carlo import MonteCarlo
-from samplers.methods.subset_simulation import AdaptiveSubsetSimulation, SubsetSimulation
+from samplers.methods.subset import AdaptiveSubsetSimulation, SubsetSimulation
 from samplers.methods.two_stage.method import TwoStage
 
 TRAFFIC_BASE = "highway"

@@ -1,41 +1,378 @@
-"""Exploration: the search for every region of failure, the first stage of `TwoStage`.
-
-Five sources. Subset simulation and lines of descent follow f downhill; the others use no more than whether a point
-fails, so that plateaus, ties, jumps and misleading level sets do not matter to them:
-
-1. Draws from the base distribution, and wide ones from N(0, s^2 I): a half-space at distance beta fails with
-   probability Phi(-beta / s), whatever the dimension (`discovery/wide.py`).
-2. Subset simulation from the base draws, for regions too small to be hit by wide draws (`discovery/levels.py`).
-3. Lines of descent from low base draws, each a trial of its own of which region is found (`discovery/lines.py`). They
-   use nothing of the subset simulation, and are walked in the same batches (`discovery/joint_batches.py`).
-4. Chains inside the region of failure (pCN), started from all of these, so that wide failures become likely ones
-   (`regions.py`).
-5. The points half way between two failing points: if one fails, the two belong to one region (`regions.py`).
-"""
+"""Joint batches: searches that use nothing of each other ask for their simulations together, in one batch."""
 
 import math
+from contextlib import suppress
 from dataclasses import dataclass
+from typing import Generic, NamedTuple, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.special import ndtri
 
-from samplers.method import Goal
-from samplers.methods.two_stage.discovery.joint_batches import join_batches
-from samplers.methods.two_stage.discovery.levels import descend_levels
-from samplers.methods.two_stage.discovery.lines import LineEnds, choose_roots, walk_lines
-from samplers.methods.two_stage.discovery.unseen import Discovery, count_lineages
-from samplers.methods.two_stage.discovery.wide import WideFailures, bisect_towards_origin, find_wide_failures
+from samplers.components import IsotropicNormal, MixtureComponent, draw_components, log_ratios, mixture_log_ratio
+from samplers.mcmc import Chains, Growth, NextLevel, ScaledKernel, descend, independent_chains
+from samplers.method import Goal, Interrupted
+from samplers.methods.subset import descent_cov, level_record, multiply_levels, subset_interval
 from samplers.methods.two_stage.regions import (
+    Discovery,
     ExplorationResult,
     Labels,
     Region,
     SubsetPoints,
+    count_lineages,
     grow_regions,
     label_regions,
 )
 from samplers.methods.two_stage.settings import DEFAULT_SETTINGS, ExplorationSettings, LineSettings, TwoStageSettings
 from samplers.methods.two_stage.simulator import ComponentDraws, SimulationSteps, Simulator
 from samplers.problem import FloatArray
-from samplers.proposals.components import IsotropicNormal, MixtureComponent, draw_components
+from samplers.statistics import next_level
+from samplers.trace import Level, Status
+
+_A = TypeVar("_A")
+_B = TypeVar("_B")
+_T = TypeVar("_T")
+
+
+def join_batches(first: SimulationSteps[_A], second: SimulationSteps[_B]) -> SimulationSteps[tuple[_A, _B]]:
+    """Run two computations side by side and return what both return.
+
+    Each batch holds the points that the first one waits for and then those of the second one, so that there are as
+    many batches as the longer one alone has. They take turns in this order whatever the simulations take, so that one
+    seed gives one answer; each should have a random generator of its own. `Interrupted` ends both.
+
+    Args:
+        first: Yields points (n, d), as all steps of a run do.
+        second: Likewise.
+
+    Example:
+        >>> def halve(x, times):
+        ...     for _ in range(times):
+        ...         x = yield x
+        ...     return x
+        >>> both = join_batches(halve(np.array([[8.0]]), 1), halve(np.array([[16.0], [24.0]]), 3))
+        >>> x, sizes = next(both), []
+        >>> try:
+        ...     while True:
+        ...         sizes.append(len(x))
+        ...         x = both.send(x / 2)
+        ... except StopIteration as end:
+        ...     one, two = end.value
+        >>> sizes, one.tolist(), two.tolist()
+        ([3, 2, 2], [[4.0]], [[2.0], [3.0]])
+    """
+    one, other = _Activity(first), _Activity(second)
+    while waiting := [each for each in (one, other) if each.points is not None]:
+        try:
+            f = yield np.concatenate([each.points for each in waiting if each.points is not None])
+        except Interrupted:
+            for each in waiting:
+                each.interrupt()
+            raise
+        for each in waiting:
+            f = each.take(f)
+    return one.result, other.result
+
+
+class _Activity(Generic[_T]):
+    """A computation that was begun: the points that it waits for, None once it has its result."""
+
+    points: FloatArray | None
+    result: _T
+
+    def __init__(self, steps: SimulationSteps[_T]) -> None:
+        self._steps = steps
+        self._advance(None)
+
+    def take(self, f: FloatArray) -> FloatArray:
+        """Go on with the first of these outcomes (m,), one for each of its points; return the others."""
+        assert self.points is not None
+        own, others = f[: len(self.points)], f[len(self.points) :]
+        self._advance(own)
+        return others
+
+    def interrupt(self) -> None:
+        """Let it count what it simulated: there will be no outcomes."""
+        with suppress(Interrupted):
+            self._steps.throw(Interrupted())
+
+    def _advance(self, f: FloatArray | None) -> None:
+        try:
+            self.points = next(self._steps) if f is None else self._steps.send(f)
+        except StopIteration as end:
+            self.points, self.result = None, end.value
+
+
+@dataclass(frozen=True)
+class ExplorationPlanner:
+    """Levels whose seeds are a random part of the points below the threshold, in chains of equal length."""
+
+    gamma: float
+    """Threshold of failure."""
+    n: int
+    """Points per level, a few more where the chains do not divide them."""
+    budget: int
+    """Simulations for all levels."""
+    settings: ExplorationSettings
+
+    def plan_next(self, chains: Chains, depth: int, n_sim: int, rng: np.random.Generator) -> NextLevel | Status:
+        """Return the next level, or how the descent ends: converged once `level_fraction` of the points fail."""
+        points = chains.by_step()
+        if depth == 0 and np.count_nonzero(points.f <= self.gamma) >= self.settings.common_failures:
+            return Status.CONVERGED
+        threshold = next_level(points.f, self.settings.level_fraction, self.gamma)
+        if threshold == self.gamma:
+            return Status.CONVERGED
+        if threshold is None or depth >= self.settings.max_levels:
+            return Status.STALLED
+        seeds = rng.permutation(np.flatnonzero(points.f <= threshold))[: self.n // self.settings.points_per_seed]
+        steps = max(1, math.ceil(self.n / len(seeds)) - 1)
+        if n_sim + steps * len(seeds) > self.budget:
+            return Status.BUDGET
+        return NextLevel(threshold, points.select(seeds), np.full(len(seeds), steps + 1))
+
+
+def descend_levels(
+    simulator: Simulator,
+    u: FloatArray,
+    f: FloatArray,
+    goal: Goal,
+    n: int,
+    most: int,
+    rng: np.random.Generator,
+    explore: ExplorationSettings,
+) -> SimulationSteps[SubsetPoints]:
+    """Run subset simulation from base draws u (n, d), f (n,), until a tenth of a level fails or the budget is used.
+
+    Where failures are common among the base draws, they are the last level.
+
+    All candidates are kept, for the regressions around the regions; there is no estimate, so no level is recorded.
+    """
+    kernel = ScaledKernel(
+        "conditional", "unit", explore.initial_scale, explore.level_acceptance, deviations=np.ones(u.shape[1])
+    )
+    gamma = goal.gamma
+    planner = ExplorationPlanner(gamma, n, most - simulator.n_sim, explore)
+    levels, thresholds = list[Growth](), list[float]()
+
+    def record(growth: Growth, planned: NextLevel | Status) -> None:
+        levels.append(growth)
+        thresholds.append(planned.threshold if isinstance(planned, NextLevel) else gamma)
+
+    start = Growth.start(independent_chains(u, f), kernel)
+    status = yield from descend(simulator.inputs, start, planner, record, rng)
+    outcomes = np.concatenate([level.f_candidates for level in levels])
+    simulator.n_sim += len(outcomes)
+    if status is Status.STOPPED:
+        raise Interrupted
+    last = levels[-1].chains
+    failing = last.where(last.f <= gamma)
+    return SubsetPoints(
+        np.unique(failing.u, axis=0),
+        np.concatenate([level.candidates for level in levels]),
+        outcomes,
+        len(levels) - 1,
+        np.unique(failing.roots),
+        _upper_end([level.chains for level in levels], thresholds, goal),
+    )
+
+
+def _upper_end(levels: list[Chains], thresholds: list[float], goal: Goal) -> float:
+    """Return the upper end of p by subset simulation."""
+    trace = list[Level]()
+    for chains, threshold in zip(levels, thresholds, strict=True):
+        trace.append(level_record(chains, threshold, multiply_levels(trace)))
+    roots = levels[-1].where(levels[-1].f <= goal.gamma).roots
+    cov = max(multiply_levels(trace).cov, descent_cov(roots, trace[0].n_points))
+    return subset_interval(levels[-1], goal, trace, cov)[1]
+
+
+class LineEnds(NamedTuple):
+    """The lines that came to a failure."""
+
+    u: FloatArray
+    """Failing points, shape (k, d)."""
+    roots: NDArray[np.int64]
+    """Index of the base draw that each started from, shape (k,)."""
+
+
+def choose_roots(
+    f: FloatArray, n: int, rng: np.random.Generator, settings: LineSettings = DEFAULT_SETTINGS.lines
+) -> NDArray[np.int64]:
+    """Return the indices of at most n base draws with outcomes f (m,) to start from: a random part of the lowest."""
+    lowest = np.lexsort((rng.random(len(f)), f))[: max(int(settings.root_share * len(f)), n)]
+    return rng.permutation(lowest)[:n]
+
+
+def walk_lines(
+    simulator: Simulator,
+    u: FloatArray,
+    f: FloatArray,
+    gamma: float,
+    scale: float,
+    rng: np.random.Generator,
+    settings: LineSettings = DEFAULT_SETTINGS.lines,
+) -> SimulationSteps[tuple[FloatArray, NDArray[np.bool_]]]:
+    """Walk downhill from points u (n, d) with outcomes f (n,); return where the lines end, and which of them fail.
+
+    A step has one try or more, v = sqrt(1 - s^2) u + s xi with xi ~ N(0, I); in the first of them xi is that of the
+    step before if that was a gain. The line goes to the first try with f(v) < f(u), else to the first with f(v) = f(u).
+    All lines take a step in one batch: where half of them have arrived, the others have two tries each. The longer it
+    takes, the fewer lines go on. They end together: when all have arrived, at twice the median time of arrival once
+    most have, where hardly any arrives, or at the limit of simulations (times `scale`).
+    """
+    u, f, n = u.copy(), f.copy(), len(f)
+    s, kept, gained = np.full(n, settings.initial_step), np.zeros_like(u), np.zeros(n, dtype=bool)
+    arrival = np.where(f <= gamma, 0.0, np.inf)
+    used = time = 0
+    while np.isinf(arrival).any() and not _is_late(arrival, time, used / scale, settings):
+        on = np.flatnonzero(np.isinf(arrival))
+        on = on[on < max(1, scale * settings.steps / max(time, 1))]
+        if len(on) == 0:
+            break
+        tries = min(n // len(on), settings.most_tries)
+        xi = rng.standard_normal((len(on), tries, u.shape[1]))
+        xi[gained[on], 0] = kept[on[gained[on]]]
+        v = np.sqrt(1 - s[on, None, None] ** 2) * u[on, None] + s[on, None, None] * xi
+        new = (yield from simulator.evaluate(v.reshape(-1, u.shape[1]))).reshape(xi.shape[:2])
+        used, time = used + new.size, time + 1
+        fresh = np.ones(new.shape, dtype=bool)
+        fresh[:, 0] = ~gained[on]
+        change = settings.adaptation * (((new <= f[on, None]) - settings.acceptance) * fresh).sum(axis=1)
+        s[on] = np.clip(s[on] * np.exp(change), *settings.step_range)
+        best = np.arange(len(on)), _choose_tries(f[on], new)
+        kept[on], gained[on], moves = xi[best], new[best] < f[on], new[best] <= f[on]
+        u[on[moves]], f[on[moves]] = v[best][moves], new[best][moves]
+        arrival[on[f[on] <= gamma]] = time
+    return u, np.isfinite(arrival)
+
+
+def _choose_tries(f: FloatArray, new: FloatArray) -> NDArray[np.int64]:
+    """Return the number of the try (n,) that each line goes to from f (n,), if any: the first gain, else the first tie.
+
+    Not the best one, which would be more often where f falls steeply, whichever region that is.
+
+    Args:
+        f: Outcomes where the lines are, shape (n,).
+        new: Outcomes of their tries, shape (n, tries).
+    """
+    gain, tie = new < f[:, None], new == f[:, None]
+    return np.asarray(np.where(gain.any(axis=1), gain.argmax(axis=1), tie.argmax(axis=1)))
+
+
+def _is_late(arrival: FloatArray, time: int, used: float, settings: LineSettings) -> bool:
+    """Return whether the lines that are still on their way are given up."""
+    arrived = np.isfinite(arrival)
+    share = float(arrived.mean())
+    if share >= settings.most_arrived and time >= settings.patience * float(np.median(arrival[arrived])):
+        return True
+    return used >= settings.limit or (used >= settings.first_look and share < settings.few_arrived)
+
+
+TINY = 1e-300
+"""Least length to divide by."""
+
+
+class WideFailures(NamedTuple):
+    """The wide draws that failed."""
+
+    u: FloatArray
+    """Shape (k, d)."""
+    scale: FloatArray
+    """The s that each was drawn with, shape (k,)."""
+    log_weights: FloatArray
+    """log(phi / q), up to a constant, with q the mixture of the wide draws, shape (k,)."""
+
+    @classmethod
+    def among(cls, draws: ComponentDraws, gamma: float) -> "WideFailures":
+        """Return the failing ones of draws from several N(0, s^2 I)."""
+        fails = draws.f <= gamma
+        scales = [component.scale for component in draws.components if isinstance(component, IsotropicNormal)]
+        density = mixture_log_ratio(log_ratios(draws.components, draws.u[fails]), draws.counts.astype(np.float64))
+        return cls(draws.u[fails], np.repeat(scales, draws.counts)[fails], -density)
+
+    def choose(self, n: int, rng: np.random.Generator) -> FloatArray:
+        """Return at most n of them, shape (m, d): half of them the least wide ones, the rest in other directions.
+
+        Each of the rest is the one furthest in direction from all before it: no region that was met is left out by
+        chance, as one in six of six_d8 was in 1 run of 60.
+        """
+        order = np.lexsort((rng.random(len(self.scale)), self.scale))
+        near, rest = order[: n // 2], rng.permutation(order[n // 2 :])
+        if len(order) > n:
+            rest = rest[_spread_directions(self.u[near], self.u[rest], n - len(near))]
+        return np.take(self.u, np.append(near, rest), axis=0)
+
+
+def _spread_directions(known: FloatArray, u: FloatArray, n: int) -> NDArray[np.intp]:
+    """Return the rows of n of the points u (m, d), m >= n, one by one the furthest in direction from all before it.
+
+    Args:
+        known: Points before all of them, shape (k, d).
+        u: Points.
+        n: How many.
+    """
+    known, u = (points / np.maximum(np.linalg.norm(points, axis=1, keepdims=True), TINY) for points in (known, u))
+    cosine = (u @ known.T).max(axis=1, initial=-1.0)
+    chosen = np.empty(n, dtype=np.intp)
+    for place in range(n):
+        k = chosen[place] = int(cosine.argmin())
+        cosine = np.maximum(cosine, u @ u[k])
+        cosine[k] = np.inf
+    return chosen
+
+
+def draw_wide(
+    simulator: Simulator, wide: tuple[tuple[float, int], ...], rng: np.random.Generator
+) -> SimulationSteps[ComponentDraws]:
+    """Simulate wide draws: for each (s, n), n of N(0, s^2 I)."""
+    components = [IsotropicNormal(simulator.inputs.dim, scale) for scale, _ in wide]
+    counts = np.array([n for _, n in wide])
+    u = draw_components(components, counts, rng)
+    f = yield from simulator.evaluate(u)
+    return ComponentDraws(list(components), counts, u, f)
+
+
+def find_wide_failures(
+    simulator: Simulator,
+    first: ComponentDraws,
+    gamma: float,
+    levels: int,
+    n: int,
+    rng: np.random.Generator,
+    settings: ExplorationSettings,
+) -> SimulationSteps[WideFailures]:
+    """Return the failures among wide draws, and among wider ones if the levels went deep.
+
+    Args:
+        simulator: Gives outcomes.
+        first: The wide draws so far.
+        gamma: Threshold of failure.
+        levels: Of subset simulation: it ended at a probability of about 10^-(levels + 1/2).
+        n: How many wider ones.
+        rng: Source of randomness.
+        settings: Scales.
+    """
+    scale = -float(ndtri(10 ** -(levels + 0.5))) / settings.depth_ratio
+    if scale > settings.deep_scale:
+        deep = yield from draw_wide(simulator, ((scale, n),), rng)
+        first = ComponentDraws(
+            [*first.components, *deep.components],
+            np.concatenate([first.counts, deep.counts]),
+            np.concatenate([first.u, deep.u]),
+            np.concatenate([first.f, deep.f]),
+        )
+    return WideFailures.among(first, gamma)
+
+
+def bisect_towards_origin(simulator: Simulator, u: FloatArray, gamma: float, steps: int) -> SimulationSteps[FloatArray]:
+    """Move failing points (n, d) towards the origin along their rays, by bisection; they still fail."""
+    safe, failing = np.zeros(len(u)), np.ones(len(u))
+    for _ in range(steps):
+        middle = 0.5 * (safe + failing)
+        fails = (yield from simulator.evaluate(u * middle[:, None])) <= gamma
+        failing, safe = np.where(fails, middle, failing), np.where(fails, safe, middle)
+    return u * failing[:, None]
 
 
 @dataclass(frozen=True)

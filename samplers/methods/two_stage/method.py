@@ -8,10 +8,10 @@ import numpy as np
 from samplers.method import Goal, Interrupted, Steps, offer_of
 from samplers.methods.base import Method
 from samplers.methods.two_stage import stages
-from samplers.methods.two_stage.discovery.unexplored_terms import TermRecord, explore_terms
-from samplers.methods.two_stage.run_state import start_run
 from samplers.methods.two_stage.settings import DEFAULT_SETTINGS, TwoStageSettings
+from samplers.methods.two_stage.stages import start_run
 from samplers.methods.two_stage.terms.search import search_terms, suits_terms
+from samplers.methods.two_stage.terms_alone import TermRecord, explore_terms
 from samplers.problem import Inputs
 from samplers.validation import check_count
 

@@ -1,7 +1,6 @@
-"""Failure regions: chains grow inside them, and the points half way between failing points separate them.
+"""The share of p that was not found, and the interval that holds it.
 
-A half way point uses f by its sign only: if it fails, the two points are of one region. Near convex regions are
-separated by this in any dimension, however alike they look.
+`samplers/statistics/unseen_share.py` has the equations; here lineages are counted.
 """
 
 import math
@@ -9,13 +8,72 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import betaincinv
 
-from samplers.methods.two_stage.discovery.unseen import Discovery
-from samplers.methods.two_stage.mixture.linear_model import descent_direction
-from samplers.methods.two_stage.mixture.settings import DEFAULT_MIXTURE_SETTINGS, LinearModelSettings, MixtureSettings
-from samplers.methods.two_stage.settings import DEFAULT_SETTINGS, RegionSettings
+from samplers.importance import Draws, weighted_interval
+from samplers.methods.two_stage.planes import descent_direction
+from samplers.methods.two_stage.settings import (
+    DEFAULT_MIXTURE_SETTINGS,
+    DEFAULT_SETTINGS,
+    LinearModelSettings,
+    MixtureSettings,
+    RegionSettings,
+)
 from samplers.methods.two_stage.simulator import SimulationSteps, Simulator
 from samplers.problem import FloatArray
+from samplers.statistics import PRIOR_SHARE, Interval, add_unseen, effective_sample_size, skewed_upper_end
+
+HITS_PER_LINEAGE = 4
+"""Wide failures that count as one lineage at least: draws of N(0, s^2 I) are independent, but reach some regions more
+often than others."""
+
+
+class Discovery(NamedTuple):
+    """How thorough the search for regions was."""
+
+    lineages: float
+    """Independent lineages that reached failure."""
+    ceiling: float = 1.0
+    """Upper end of p by the search's own subset simulation, or by as many of its levels as there were."""
+
+    def unseen_share(self, confidence: float) -> float:
+        """Return the upper end of the share of p in regions that were not found.
+
+        Example:
+            >>> [round(Discovery(n).unseen_share(0.95), 3) for n in (4, 25, 200)]
+            [0.24, 0.039, 0.005]
+        """
+        return float(betaincinv(PRIOR_SHARE, self.lineages, 0.5 + confidence / 2))
+
+
+def count_lineages(roots: int, wide_log_weights: FloatArray) -> float:
+    """Return the number of independent lineages.
+
+    Args:
+        roots: Distinct base draws whose line of descent, or path of subset simulation, came to a failure.
+        wide_log_weights: log(phi / q) of the wide draws that failed, shape (k,).
+    """
+    return roots + max(effective_sample_size(wide_log_weights), len(wide_log_weights) / HITS_PER_LINEAGE)
+
+
+def discovery_interval(
+    draws: Draws, cov: float, confidence: float, largest_weight: float, discovery: Discovery
+) -> Interval:
+    """Return the interval of p from weighted draws, its upper end raised by their skewness and by what is unseen.
+
+    Args:
+        draws: From the last proposal.
+        cov: C.o.v. of p.
+        confidence: Nominal coverage.
+        largest_weight: Bound of the weights.
+        discovery: How thorough the search was.
+    """
+    low, high = weighted_interval(draws, confidence, largest_weight, cov, discovery.ceiling)
+    if len(draws.f) == 0:
+        return low, high
+    high = max(high, skewed_upper_end(draws.p, cov, draws.skewness / draws.n**0.5, confidence))
+    return low, add_unseen(draws.p, high, discovery.lineages, confidence)
+
 
 Labels = NDArray[np.int64]
 """Number of the region of each point or chain, from 0, shape (n,)."""

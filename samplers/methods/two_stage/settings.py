@@ -1,19 +1,414 @@
-"""Settings of two-stage: the numbers of its stages, each with its reason.
+"""Settings of the mixtures of two-stage: regression, expectation-maximisation, edges, weights.
 
-Users set `TwoStage.n` only. Where no other reason stands beside a number, it was chosen together with the others on the
-problems of `benchmarks/estimators/catalogue.py` at 6,000 simulations: some 30 configurations, up to 40 runs each, by
-which differences in gain of less than a factor of two cannot be told from chance. Numbers of the
-algorithms that fit mixtures stand in `mixture/settings.py`.
+Below, "variance x and y" are the variances that runs state with a setting halved and doubled (or moved as far as makes
+sense), over those with the default one: geometric means over four problems of the catalogue where it acts, 10 seeds
+each, 6,000 simulations (`benchmarks/results/setting_sensitivity.json` has values, problems, standard errors and
+coverage). Standard errors are 0.05 to 0.15 where none is given: up to 1.2 a ratio may be chance, all the more as rows
+on the same problems share their default runs. Settings of one mechanism were moved together; one of them has the
+figures.
 """
 
 from dataclasses import dataclass, field
 
-from samplers.methods.two_stage.mixture.proposal import Kind
-from samplers.methods.two_stage.mixture.settings import DEFAULT_MIXTURE_SETTINGS, MixtureSettings
-from samplers.methods.two_stage.terms.settings import DEFAULT_TERM_SETTINGS, TermSettings
+
+@dataclass(frozen=True, kw_only=True)
+class LinearModelSettings:
+    """Robust regression of f, and half-spaces beyond its hyperplane (`linear_model.py`)."""
+
+    ridges: tuple[float, float] = (1.0, 1e-3)
+    """Ridge penalties; the smaller one is tried where points are enough for ordinary regression.
+    Variance 0.94 and 1.00 (both of them moved)."""
+    lad_iterations: int = 12
+    """Steps of iteratively reweighted least squares towards least absolute deviations. Variance 1.01 and 0.95, with
+    the settings from here to `min_left_out_lad`."""
+    lad_ridge: float = 1e-3
+    """Ridge penalty of these steps, the smaller one of `ridges`: it keeps the matrix regular."""
+    lad_smoothing: float = 1e-3
+    """Share of the median deviation that is added to each before it divides: exact points have no infinite weight."""
+    min_left_out: float = 1e-3
+    """Least 1 - leverage that a residual is divided by: a point that alone decides on a slope has leverage 1."""
+    min_left_out_lad: float = 1e-2
+    """The same in the steps towards least absolute deviations, where one such point must not hold all the weight."""
+    inlier_sigmas: float = 3.0
+    """Deviation up to which a point agrees with a hyperplane, in standard deviations (Rousseeuw and Leroy use 2.5).
+    Variance 1.07 and 1.00, with `agreeing_share` and `trimmed_share`."""
+    min_points: int = 5
+    """Points that a regression needs. Variance 1.00 and 1.00, hardly a run differs, with `min_points_per_dim` and
+    `min_failures`: at 6,000 simulations points are seldom as few."""
+    min_points_per_dim: float = 1.2
+    """With `min_points` + this many points per dimension the small ridge and outliers can be judged."""
+    trimmed_share: float = 0.02
+    """Share of the outcomes left out at either end: f may be capped or wild there."""
+    exact_r2: float = 0.999
+    """R^2 from which f is linear. Variance 0.98 +- 0.02 and 1.03 +- 0.02 for half and twice the distance of both limits
+    from 1."""
+    boundary_r2: float = 0.95
+    """R^2 from which the hyperplane, or the planes of a corner, locate the failure boundary. Corners down to 0.8 bought
+    nothing: with 0.98 for 0.8 the variance was 0.996 +- 0.05 times as large (67 runs on the 14 limit states with such
+    ones), and with 0.95 for 0.98 0.97 +- 0.02 times, on drive_d6 0.92 (20 runs on five)."""
+    min_r2: float = 0.3
+    """R^2 under which a hyperplane is no help; that of pure noise stays below (`test_noise_has_no_hyperplane`).
+    At 0.15 no run differs, at 0.6 variance 0.97 +- 0.03."""
+    agreeing_share: float = 0.6
+    """Share of the points that must agree with a hyperplane for it to be more than chance: over half, for two regions
+    may have half each."""
+    crossing_errors: float = 2.0
+    """Standard errors of a prediction by which a half-space begins before the hyperplane. Variance 1.06 and 1.05, with
+    `nearest_share` and `same_region_share`."""
+    nearest_share: float = 0.03
+    """Share of the failures that may lie before the edge, where the hyperplane does not locate it: none of 33 or
+    fewer."""
+    min_failures: int = 8
+    """Failures that half-space proposals need: `failure_edge` takes a quarter of the mean excess off the least of
+    eight."""
+    same_region_share: float = 0.5
+    """Failures nearer than this share of the median distance along the axis are another region's."""
+    widening: float = 1.3
+    """Variance of the Gaussian over that of N(0, 1) beyond the edge: too small a variance makes weights unbounded, too
+    large a one costs a few draws. Variance 1.10 at 1.15 and 0.98 at 1.6."""
 
 
-def _initial_shares() -> dict[Kind, float]:
+@dataclass(frozen=True, kw_only=True)
+class PieceSettings:
+    """f as the least of linear functions (`least_of_planes.py`)."""
+
+    n: int = 24
+    """Pieces to start with; on oscillator_d100 10 to 20 of them are left."""
+    iterations: int = 20
+    """Regressions of each piece: by then hardly a point changes its piece."""
+    points_per_dim: int = 2
+    """A piece starts from so many points per dimension ..."""
+    least_points: int = 6
+    """... and so many more; it is given up with fewer than one per dimension and these."""
+    first_ridge: float = 0.3
+    """Ridge penalty of the first regressions, which rest on few points."""
+    ridge: float = 1e-3
+    """The same of the later ones, the smaller one of `LinearModelSettings.ridges`."""
+    crossing_errors: float = 4.0
+    """Standard deviations of its residuals by which a half-space begins before its plane. With 2 and 3 the intervals
+    held p in 90 and 88 % of 60 runs on oscillator_d100, for the slopes leave out some of the direction of a plane; with
+    4 in all of them, at the same gain."""
+    min_r2: float = 0.8
+    """R^2 under which f is no least of linear functions. It is 0.93 to 0.98 on oscillator_d100, 0.81 to 0.91 on
+    duffing_d60, and negative on screen_d40, where f is the largest of three."""
+    highest: float = 0.1
+    """Share of the outcomes left out at the upper end: what f is far from failure does not matter."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class CornerSettings:
+    """f as the greatest of linear functions (`greatest_of_planes.py`)."""
+
+    n: int = 6
+    """Pieces to start with."""
+    starts: int = 3
+    """Fits from other points at most, until one explains f ..."""
+    promising_r2: float = 0.9
+    """... where the first one has this R^2: the corners of screen_d40 had 0.94 and more."""
+    patience: int = 4
+    """Steps of a fit without a gain that end it; with 3, two corners of 16 of common3_d9 were lost."""
+    points_per_dim: int = 100
+    """Points of a fit per dimension at most, evenly spaced: more take time, and show the same planes."""
+    min_start: float = -1.0
+    """Planes nearer than this hold 84 % of N(0, I) or more: the corner is hardly larger without them."""
+    min_turn: float = 0.1
+    """Sine of the least angle between a plane and the span of those before it: two at less are one."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class EdgeSettings:
+    """Where proposals with an edge begin (`boundary.py`, and the planes of the regressions)."""
+
+    min_distance: float = 0.5
+    """Nearer to the origin than this a half-space holds 31 % of N(0, I): base draws serve as well."""
+    slack: float = 0.02
+    """By how much a half-space begins before the edge, in standard deviations of N(0, I). Variance 0.85 and 1.20, where
+    hyperplanes are the boundary; half of it may be better, if failures before the start stay as rare."""
+    mean_excesses: float = 2.0
+    """Mean excesses over the quantile, divided by the number of failures, by which an edge is put back. Variance 0.98
+    and 1.02, with `share`."""
+    min_ess: float = 2.0
+    """Least number of failures that they are divided by."""
+    radius_share: float = 0.01
+    """Share of the failures' weight that may lie within the radius before it is shortened. Variance 0.98 and 1.19, with
+    `radius_factor` and `min_radial_shape`: 2.08 on one problem."""
+    radius_factor: float = 0.98
+    """|u|^2 at that quantile, times this, is where radial draws begin: the least of few lies beyond the edge of
+    many."""
+    min_radial_shape: float = 0.3
+    """Least shape of the Gamma distribution of |u|^2: with less, nearly all draws are at its start."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SubspaceSettings:
+    """Mixtures fitted to weighted points (`subspace_em.py`)."""
+
+    high_dim: int = 40
+    """Above this many dimensions a component has one direction of its own: some hundred points do not show more.
+    Variance 1.06 +- 0.03 at 20 (1.27 on one problem in 30 dimensions) and 1.05 +- 0.03 at 80 (1.23 in 60)."""
+    sizes: tuple[int, ...] = (1, 2, 3, 4, 6, 8)
+    """Numbers of components that are tried; `max_worse` of them without a better score end the search."""
+    max_worse: int = 2
+    """The score of a fit is uneven in their number: after one that is worse, a better one may follow. Variance 1.03 and
+    1.15, with `covariance_parameters_per_dim` and `points_per_component`."""
+    max_em_iterations: int = 25
+    """M-steps at most. Variance 1.02 and 1.09, with `min_relative_gain` and `em_restarts`."""
+    min_relative_gain: float = 1e-3
+    """Expectation-maximisation ends where a step raises the log likelihood by less than this share of it."""
+    em_restarts: int = 3
+    """Starts for each number of components; k-means++ draws its centres."""
+    min_ess: float = 2.0
+    """Points that any component is taken to rest on: the formulae divide by their number."""
+    refit_steps: int = 2
+    """M-steps between two rounds of draws; the rounds go on from there. Variance 1.00 and 1.07."""
+    min_refit_points: int = 5
+    """A component with fewer points stays where it is."""
+    refit_ess: float = 30.0
+    """Effective points that a component is fitted to, as its mean and a shrunk covariance need them ..."""
+    refit_ess_per_dim: float = 3.0
+    """... or this many per dimension. Where the weights are less even, they are raised to a power less than 1.
+    Variance 2.8 (47 on one problem) and 0.92 +- 0.06, with the numbers of points above and below and half or twice the
+    step of the power."""
+    points_per_refit_ess: float = 3.0
+    """Points of a component for each of them: no more is asked of it than a third of its points."""
+    power_step: float = 0.1
+    """By how much the power falls from trial to trial; the effective number of points grows as it does."""
+    max_spread: float = 4.0
+    """Largest variance along the one direction in high dimensions; a few points of another region give more.
+    Variance 1.01 +- 0.01 and 0.98 +- 0.01, with `max_mean_excess`."""
+    standard_errors: float = 2.0
+    """By how many of them a variance under 1 is raised: too small a variance makes weights unbounded.
+    Variance 1.19 +- 0.18 and 1.03."""
+    max_mean_excess: float = 0.5
+    """Share of a mean that is taken off as noise at most: of few points in hundreds of dimensions noise is all there
+    is."""
+    covariance_parameters_per_dim: float = 2.0
+    """Parameters of a covariance that BIC counts at most, per dimension: with all d (d + 1) / 2 of them some dozens of
+    points would never have a second component."""
+    min_bic_ess: float = 3.0
+    """Least number of points that BIC takes: log(n) would fall under 1 with fewer."""
+    points_per_component: float = 4.0
+    """Effective points for each component at least."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class MixtureWeightSettings:
+    """Search for the best weights of a mixture (`mixture_weights.py`)."""
+
+    updates: int = 60
+    """Multiplicative updates: they come within 2 % of the least second moment (`test_weights_are_nearly_the_best`).
+    Variance 1.10 and 1.17: what is left is chance."""
+    negligible: float = 30.0
+    """Points whose weight is e^-30 of the largest one do not matter."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class MixtureSettings:
+    """All settings of the mixtures."""
+
+    linear_model: LinearModelSettings = LinearModelSettings()
+    pieces: PieceSettings = PieceSettings()
+    corner: CornerSettings = CornerSettings()
+    edges: EdgeSettings = EdgeSettings()
+    subspace: SubspaceSettings = SubspaceSettings()
+    weights: MixtureWeightSettings = MixtureWeightSettings()
+
+
+DEFAULT_MIXTURE_SETTINGS = MixtureSettings()
+
+
+@dataclass(frozen=True, kw_only=True)
+class WalkSettings:
+    """Gradient walks to the failures of each term (`walks.py`)."""
+
+    candidate_quantile: float = 0.2
+    """A term is a main one where it is the least of some base draws under this quantile of the least term ..."""
+    candidate_share: float = 0.005
+    """... which are at least this share of all base draws: 3 of 600."""
+    walkers: int = 72
+    """Walks of all main terms together at `usual_budget`, in proportion with less; each has between `min_walkers` and
+    `max_walkers`."""
+    usual_budget: int = 6000
+    min_walkers: int = 6
+    max_walkers: int = 24
+    """More find nothing more on Highway-v0 (prototype); half of them start where the term is attained late."""
+    scouts: int = 2
+    """Walks of every other term: the least of 600 draws may hide a term that is far there and near along its
+    gradient."""
+    max_scouted: int = 12
+    """Other terms that are scouted at most, those with the lowest values first; all that ever are the least are,
+    however many. A hundred more would eat the budget."""
+    start_quantile: float = 0.5
+    """Walks start at the lowest values of each half, early and late, of the draws under this quantile."""
+    steps: int = 8
+    """Steps at most: 6 reach beta = 4.5 (prototype), 8 reach 6."""
+    first_step: float = 1.3
+    """Length of the first step in standard deviations (prototype)."""
+    growth: float = 1.3
+    """Factor of the length after a step downhill, and ..."""
+    shrinkage: float = 0.4
+    """... after one uphill: roughness of f is shorter than that (prototype)."""
+    beyond: float = 0.03
+    """Standard deviations by which a step aims beyond the threshold along the gradient: rounding must not stop it."""
+    budget_share: float = 0.25
+    """Share of the budget that walks use at most, gradients at what they may cost."""
+    max_distance: float = 7.0
+    """Walks end where the half-space of their gradient is further than this from the origin: Phi(-7) = 1e-12."""
+    negligible: float = 1e-5
+    """A term is left to base draws where Phi(-beta), beta the median of its failing walks, is this share of the largest
+    one. The plane of a gradient is a poor guide where terms are curved: of two with a fifth and four fifths of p it was
+    3e-4 (`test_curved_terms`)."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class LawSettings:
+    """Proposal of one term in the subspace of its gradients (`law.py`, `fitting.py`); shares are relative."""
+
+    rank: int = 8
+    """Right singular vectors kept: failures of a term are nearly one half-space, 8 hold its curvature (prototype)."""
+    least_singular: float = 0.05
+    """Singular vectors under this share of the first are left out: there the term hardly changes, its failures are
+    N(0, 1), and what is fitted instead makes heavy weights. In 10 stored runs of each ego E[w^2] of the collisions that
+    other runs found falls by a tenth (imitation) and a third (IDM) against 0.1; 0.03 and rank 12 are worse for one."""
+    bump_share: float = 0.5
+    """Share of the fitted Gaussians."""
+    tempered_share: float = 0.3
+    """Share of them nearer to the origin and wider, which bounds weights where they are too narrow or, being fitted to
+    draws of proposals that lie beyond the likely failures, too far out ..."""
+    tempered_mean: float = 0.75
+    tempered_variance: float = 1.7
+    """... with mean and variance times these. What adds to the variance fills the slab. A mean times 0.85 has 1.1
+    times the E[w^2] of the stored runs' collisions; 0.7 has 0.9 times it, but a heavy draw in one of ten series systems
+    of half-spaces."""
+    end_share: float = 0.12
+    """Share of Gaussians around the ends of the walks: a mode that no draw has met yet stays in reach ..."""
+    end_mean: float = 0.9
+    end_variance: float = 3.0
+    """... with the end times the one as mean, and the variance of the nearest fitted Gaussian times the other, at most
+    1."""
+    guard_share: float = 0.08
+    """Share of N(design point, I) for half-spaces of gradients near failures: modes of a term in other directions than
+    the one fitted to; where a mode is that half-space, no weight in it exceeds exp(-beta^2 / 2) over its share."""
+    max_guards: int = 12
+    """Such half-spaces at most, the nearest first."""
+    guard_spacing: float = 1.5
+    """Least distance between their design points; Gaussians nearer than that are one."""
+    max_ends: int = 24
+    """Ends kept of a term."""
+    max_heavy: int = 12
+    """Of these the points of largest weight, once there are points from proposals: a mode of which one draw is known is
+    not left to the mixture fitted to all."""
+    prior_points: float = 20.0
+    """Points that I counts as in the covariance of the ends."""
+    shape_points: float = 1.5
+    """Effective points for each dimension from which on a covariance is Stein's estimate of theirs. Between "ahead" and
+    "behind" of a car collisions have a variance of 0.05 in one direction, which shrinkage towards I made 0.4: 0.67
+    times the E[w^2] of collisions of the IDM ego, over chains of 13,000 failures."""
+    max_bumps: int = 3
+    """Gaussians of a term at most."""
+    shape_ess: float = 160.0
+    """Weights are raised to a power below 1 until they are worth this many points, for the covariances ..."""
+    mean_ess: float = 20.0
+    """... and this many, of failures alone, for the means. With 40 E[w^2] is 1.04 to 1.06 times as large over fresh
+    draws of `lidar_ttc`, of collisions 1.00 to 1.03. With 40 for the covariances too it was 1.1 times (stored runs):
+    collisions lie in a slab (not too far ahead nor behind), whose width was then shrunk to twice what it is."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RoundSettings:
+    """Rounds of draws and the final ones (`rounds.py`, `estimate.py`); shares are of the budget."""
+
+    base: float = 0.1
+    """Base draws: 600 of 6,000; with more the budget goes to what hardly fails."""
+    max_base: int = 2000
+    min_base: int = 100
+    common_share: float = 0.1
+    """Where this share of the base draws fails, plain Monte Carlo is as good as anything."""
+    monte_carlo_batch: int = 10_000
+    """Draws of a batch of plain Monte Carlo; with a target c.o.v. they are `target_batch`."""
+    size: float = 0.1
+    """Draws of an adaptive round."""
+    base_share: float = 0.04
+    """Share of base draws in every proposal: no weight exceeds 25."""
+    share_ess: float = 400.0
+    """Weights that the shares of the terms follow are raised to a power below 1 until failures are worth this many
+    points: one heavy draw would give its term most of the next round. E[w^2] of the IDM ego's collisions over chains
+    of failures is 0.89 times that of untempered weights, of `lidar_ttc` and with `imitation` the same."""
+    min_term_share: float = 0.14
+    """Least share of a term, since one heavy draw of another would leave it next to nothing; less where there are more
+    than five. With 0.17 two terms with 0.5 % of p took a third of the draws."""
+    waiting_share: float = 0.35
+    """Weight of a term whose threshold is reached while another's is not (prototype)."""
+    ready_ess: float = 6.0
+    """Effective number of failures at which a term is fitted to failures and no longer to a higher level: waiting for
+    50 takes 7 to 9 rounds (prototype)."""
+    min_failures: int = 5
+    """Failures of a term that its means are fitted to, with tempered weights, where they are worth fewer."""
+    level_ess: float = 15.0
+    """Effective number of points that covariances are fitted to: under the lowest level that has as many where the
+    failures are worth fewer, for these lie in the same slab; with too few failures the means too. Together with
+    covariances that are no longer raised by two standard errors E[w^2] over fresh draws is 0.84 and 0.93 times that
+    before (collisions), 0.91, 0.85 and 0.85 times (`lidar_ttc`). 20 and 30 are worse for some."""
+    gradients: int = 12
+    """Gradients of a term for each fit, at points drawn by weight; fewer where terms are many."""
+    max_gradients: int = 48
+    """Gradients of all terms for each fit."""
+    later_weight: float = 1.5
+    """Weight of gradients over those of the round before: later ones are at likelier failures."""
+    ready_rounds: int = 1
+    """Rounds in a row with all terms at the threshold after which the estimate begins, which goes on fitting."""
+    final_share: float = 0.52
+    """Adaptive rounds end where no more than this share of the budget is left."""
+    refit_share: float = 0.03
+    """Share kept for the gradients of each fit between the final rounds; what they leave goes to the last round."""
+    final_sizes: tuple[float, ...] = (0.22, 0.33, 0.45)
+    """Final rounds, as shares of what is left."""
+    final_weights: tuple[float, ...] = (0.25, 0.7, 1.0)
+    """Weight of a draw of each in p, fixed beforehand so that p stays unbiased. The proposals become better: E[w^2] of
+    collisions with the IDM ego is 240, 100 and 42 in the three, of `lidar_ttc` about the same in all."""
+    target_batch: int = 500
+    """Draws of each further batch where a target c.o.v. is not yet met."""
+    max_batches: int = 100
+    """Such batches at most."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class DoubtSettings:
+    """When an estimate is doubted, and when it is given up."""
+
+    between_factor: float = 1.5
+    """Factor of sum c_r^2 (p_r - p)^2, the variance that the rounds show: with 3 rounds it is 2 / 3 of it."""
+    min_ess: float = 20.0
+    """Effective number of failures of the last round under which its spread is not known."""
+    max_point_share: float = 0.25
+    """Share of p in one draw that says the same."""
+    max_other_share: float = 0.05
+    """Share of p in failures of terms that were not pursued from which on there is a warning."""
+    fallback_rate: float = 0.001
+    """Effective failures for each draw of the last adaptive round under which the mixture is given up. On Highway-v0 a
+    good one has 0.005 to 0.009, and at p = 6e-5 subset simulation gains 3 to 8 (prototype): 0.001 gains 17."""
+    min_fallback_budget: int = 300
+    """Simulations under which subset simulation is not worth it."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class TermSettings:
+    """All settings of the search by terms."""
+
+    min_dim: int = 30
+    """Dimensions from which it replaces the exploration of two-stage."""
+    min_budget: int = 1000
+    """Simulations under which there is no room for walks, rounds and an estimate."""
+    walks: WalkSettings = WalkSettings()
+    law: LawSettings = LawSettings()
+    rounds: RoundSettings = RoundSettings()
+    doubts: DoubtSettings = DoubtSettings()
+
+
+DEFAULT_TERM_SETTINGS = TermSettings()
+
+
+def _initial_shares() -> dict[str, float]:
     return {
         "base": 0.1,
         "wide": 0.05,
@@ -263,7 +658,7 @@ class RefinementSettings:
     """Share that components from the exploration keep until the last round."""
     min_share: float = 0.004
     """Components with less of the draws are left out."""
-    initial_shares: dict[Kind, float] = field(default_factory=_initial_shares)
+    initial_shares: dict[str, float] = field(default_factory=_initial_shares)
     """Shares of the kinds where nothing is known yet; of those present, in proportion.
 
     What a kind is worth, on ten problems of the catalogue with 4 seeds each: without it the stated variance (median) is

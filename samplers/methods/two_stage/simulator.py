@@ -7,9 +7,9 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from samplers.components import MixtureComponent
 from samplers.method import Goal
 from samplers.problem import FloatArray, Inputs
-from samplers.proposals.components import MixtureComponent
 from samplers.trace import Level
 
 _T = TypeVar("_T")

@@ -1,46 +1,223 @@
-"""Stages of two-stage: the steps of a run from one state to the next.
-
-A step that needs simulations is a generator: `state = yield from draw_first(context, state)`. Where `Interrupted`
-ends it, the caller goes on with the state before the step.
-"""
+"""The state of a run of two-stage, frozen, and what is fixed for the run."""
 
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import reduce
+from typing import NamedTuple
 
 import numpy as np
 
-from samplers.importance.draws import Draws, weight_warnings, weighted_interval
-from samplers.mcmc.chains import RootedPoints
-from samplers.method import Interrupted, Outcome, Steps, no_outcome_share
-from samplers.methods.two_stage import fallback
-from samplers.methods.two_stage.candidates import build_proposal
-from samplers.methods.two_stage.diagnostics import (
+from samplers.importance import Draws, weight_warnings, weighted_interval
+from samplers.mcmc import RootedPoints
+from samplers.method import Goal, Interrupted, Outcome, Steps, no_outcome_share
+from samplers.methods.noise_coordinates import marginalise_noise
+from samplers.methods.subset import AdaptiveSubsetSimulation
+from samplers.methods.two_stage.exploration import Sizes, find_regions, first_draws
+from samplers.methods.two_stage.mixture import MixtureProposal
+from samplers.methods.two_stage.refinement import (
+    RefinementState,
+    build_proposal,
+    refine_once,
+    start_refinement,
+    typical_weights,
+)
+from samplers.methods.two_stage.regions import ExplorationResult, discovery_interval
+from samplers.methods.two_stage.settings import DEFAULT_SETTINGS, FallbackSettings, TwoStageSettings
+from samplers.methods.two_stage.simulator import (
+    ComponentDraws,
+    SimulationSteps,
+    Simulator,
+    close_trace,
+    extend_trace,
+)
+from samplers.methods.two_stage.slopes import find_slopes
+from samplers.methods.two_stage.stratified import (
+    MultipleImportanceSample,
+    StratifiedSample,
     check_base_draws,
     check_discovery,
     check_efficiency,
     check_regions,
     check_rounds,
 )
-from samplers.methods.two_stage.discovery.slopes import find_slopes
-from samplers.methods.two_stage.discovery.unseen import discovery_interval
-from samplers.methods.two_stage.exploration import Sizes, find_regions, first_draws
-from samplers.methods.two_stage.mixture.proposal import MixtureProposal
-from samplers.methods.two_stage.refinement import RefinementState, refine_once, start_refinement, typical_weights
-from samplers.methods.two_stage.regions import ExplorationResult
-from samplers.methods.two_stage.run_state import CountedRound, RunContext, RunState
-from samplers.methods.two_stage.settings import TwoStageSettings
-from samplers.methods.two_stage.simulator import (
-    ComponentDraws,
-    SimulationSteps,
-    close_trace,
-    extend_trace,
-)
-from samplers.methods.two_stage.stratified import StratifiedSample
+from samplers.problem import FloatArray, Inputs
 from samplers.sample import DrawWeights, Sample
-from samplers.statistics.intervals import Interval, binomial_cov
-from samplers.statistics.weights import effective_sample_size
-from samplers.trace import Status
+from samplers.statistics import Interval, binomial_cov, effective_sample_size
+from samplers.trace import Level, Status
+
+
+@dataclass(frozen=True, eq=False)
+class RunContext:
+    """What is fixed for a run, and the simulator that counts."""
+
+    inputs: Inputs
+    """All of x."""
+    simulator: Simulator
+    """Of the coordinates that are not noise."""
+    goal: Goal
+    settings: TwoStageSettings
+    budget: int
+    """Simulations that the exploration and the rounds are planned for."""
+    end: int
+    """Simulations that are never exceeded; more than `budget` where only a target c.o.v. is given."""
+    rng: np.random.Generator
+
+    @property
+    def left(self) -> int:
+        """Simulations left of the budget."""
+        return self.budget - self.simulator.n_sim
+
+    @property
+    def left_at_all(self) -> int:
+        """Simulations left before the end."""
+        return self.end - self.simulator.n_sim
+
+    @property
+    def target_batch(self) -> int:
+        """Draws after which a target c.o.v. is looked at."""
+        return max(self.budget // self.settings.target_batches, self.settings.min_target_batch)
+
+    @property
+    def noise_marginalised(self) -> bool:
+        """Whether x has coordinates of noise that are not searched."""
+        return self.simulator.inputs is not self.inputs
+
+    def meets_target(self, cov: float) -> bool:
+        """Return whether there is a target c.o.v. and this one meets it."""
+        return self.goal.target_cov is not None and cov <= self.goal.target_cov
+
+
+class CountedRound(NamedTuple):
+    """Draws of a round that count in p."""
+
+    sample: StratifiedSample
+    first: int
+    """Simulations before them."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class RunState:
+    """State of a run: draws so far and their trace."""
+
+    history: MultipleImportanceSample
+    """All draws from known components."""
+    base_u: FloatArray
+    """Base draws of the exploration, shape (n0, d)."""
+    base_f: FloatArray
+    """Their outcomes, shape (n0,)."""
+    base_draws: int = 0
+    """Base draws in all: of a proposal those of its first component."""
+    rounds: tuple[Draws, ...] = ()
+    """Draws of the rounds, each weighted as draws of its own proposal."""
+    counted: tuple[CountedRound, ...] = ()
+    """Those of the rounds that count in p."""
+    trace: tuple[Level, ...] = ()
+
+    def base_share(self, gamma: float) -> float:
+        """Return the share of the base draws with f <= gamma."""
+        return float((self.base_f <= gamma).mean())
+
+
+def start_run(
+    inputs: Inputs, goal: Goal, budget: int, settings: TwoStageSettings, rng: np.random.Generator
+) -> tuple[RunContext, RunState]:
+    """Return the run and its state before the first simulation; noise that is part of x is left to chance."""
+    open_ended = goal.max_sim is None and goal.target_cov is not None
+    end = budget + settings.max_batches * (budget // settings.target_batches) if open_ended else budget
+    searched = marginalise_noise(inputs, rng)
+    context = RunContext(inputs, Simulator(searched), goal, settings, budget, end, rng)
+    empty = MultipleImportanceSample.empty(searched.dim)
+    return context, RunState(history=empty, base_u=np.empty((0, searched.dim)), base_f=np.empty(0))
+
+
+def meets_too_few(
+    draws: Draws,
+    number: int,
+    levels: int,
+    settings: FallbackSettings = DEFAULT_SETTINGS.fallback,
+    *,
+    share: float = 1.0,
+) -> bool:
+    """Return whether the draws of a round meet so few failures that subset simulation does better with the rest.
+
+    Args:
+        draws: Of the last round.
+        number: Of this round, from 1.
+        levels: Levels of subset simulation in the exploration.
+        settings: Failures that each draw must be worth.
+        share: Of that number, which is enough.
+    """
+    early = settings.early_rates
+    rate = early[number - 1] if number <= len(early) else settings.relative_rate / max(levels, settings.min_levels)
+    return draws.ess < share * rate * draws.n
+
+
+def misses_regions(draws: Draws, typical: FloatArray, settings: FallbackSettings = DEFAULT_SETTINGS.fallback) -> bool:
+    """Return whether a proposal is far from most of the regions found.
+
+    Args:
+        draws: Of the last round.
+        typical: Weights of typical points of the regions as draws of the proposal, shape (m,).
+        settings: The limit.
+    """
+    return float(np.median(typical)) > settings.max_typical * draws.p
+
+
+def reconcile(subset_outcome: Outcome, earlier: Outcome) -> Outcome:
+    """Return the outcome of subset simulation, or the earlier one where its interval lies above it.
+
+    Subset simulation follows f downhill; wide draws also find regions that f does not announce. The interval of the
+    earlier outcome then grows to hold both.
+
+    Args:
+        subset_outcome: By subset simulation.
+        earlier: From all draws of the exploration and the rounds.
+    """
+    if earlier.interval[0] <= subset_outcome.p:
+        return subset_outcome
+    interval = (
+        min(earlier.interval[0], subset_outcome.interval[0]),
+        max(earlier.interval[1], subset_outcome.interval[1]),
+    )
+    about = f"Subset simulation, which took over, missed failure regions found before; it gives {subset_outcome.p:.1e}."
+    warnings = (*earlier.warnings, *subset_outcome.warnings, about)
+    remarks = (*earlier.remarks, *subset_outcome.remarks)
+    return replace(earlier, interval=interval, status=subset_outcome.status, warnings=warnings, remarks=remarks)
+
+
+def run_subset_simulation(
+    inputs: Inputs,
+    goal: Goal,
+    levels: int,
+    budget: int,
+    known: RootedPoints | None,
+    rng: np.random.Generator,
+    settings: FallbackSettings = DEFAULT_SETTINGS.fallback,
+) -> Steps:
+    """Run adaptive subset simulation with the points per level that a budget or a target c.o.v. asks for.
+
+    Args:
+        inputs: Dimension and base distribution.
+        goal: Threshold, confidence and target.
+        levels: Levels that subset simulation passed in the exploration.
+        budget: Simulations that are never exceeded.
+        known: Base draws of the exploration, from which it starts, if these have all coordinates.
+        rng: Source of randomness.
+        settings: How points per level follow from the budget.
+    """
+    levels = max(levels, settings.min_levels)
+    n = int((budget + (0 if known is None else len(known.f))) / (1 + settings.level_share * (levels + 0.5)))
+    if goal.target_cov is not None:
+        n = min(n, math.ceil(settings.chain_points * (levels + 1) / goal.target_cov**2))
+    n = max(n, settings.min_points)
+    known = known and known.select(np.arange(min(n, len(known.f))))
+    outcome = yield from AdaptiveSubsetSimulation(n=n).steps(inputs, replace(goal, max_sim=budget), rng, known)
+    about = (
+        "No proposal describes the failures: p is from adaptive subset simulation with the remaining "
+        f"{budget:,} simulations; run by itself (--method adss) it uses all of them."
+    )
+    counted_before = 0 if known is None else len(known.f)
+    return replace(outcome.remark_first(about), base_draws=outcome.base_draws - counted_before)
 
 
 def draw_first(context: RunContext, state: RunState) -> SimulationSteps[RunState]:
@@ -150,11 +327,11 @@ def gives_up(
         return False  # a tempered mixture meets few failures but does not miss any: nothing else is better
     last = state.rounds[-1]
     share = settings.sloped_rate if refinement.within is not None else 1.0
-    if fallback.meets_too_few(last, number, refinement.exploration.levels, settings, share=share):
+    if meets_too_few(last, number, refinement.exploration.levels, settings, share=share):
         return True
     described = refinement.noisy or refinement.within is not None  # ends of lines in a ring are no typical failures
     doubtful = final and not described and last.ess < context.settings.refinement.good_rate * last.n
-    return doubtful and fallback.misses_regions(last, typical_weights(refinement, proposal), settings)
+    return doubtful and misses_regions(last, typical_weights(refinement, proposal), settings)
 
 
 def fall_back(context: RunContext, state: RunState, levels: int) -> Steps:
@@ -164,11 +341,11 @@ def fall_back(context: RunContext, state: RunState, levels: int) -> Steps:
         known = None
     state = _close_trace(context, state)
     before = estimate_early(context, state)
-    outcome = yield from fallback.run_subset_simulation(
+    outcome = yield from run_subset_simulation(
         context.inputs, context.goal, levels, context.left_at_all, known, context.rng, context.settings.fallback
     )
     unfinished = outcome.status is Status.STOPPED and outcome.p == 0  # no estimate, then
-    whole = before if unfinished else fallback.reconcile(outcome, before)
+    whole = before if unfinished else reconcile(outcome, before)
     return replace(whole, trace=state.trace + outcome.trace, base_draws=state.base_draws + outcome.base_draws)
 
 

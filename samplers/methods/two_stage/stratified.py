@@ -1,27 +1,93 @@
-"""Stratified samples: draws from mixtures, a fixed number from each component, and p with its error.
+"""Multiple importance sampling: draws of several proposals, weighted as draws from the mixture of all of them.
 
-With n_k of n draws from component k and y = weight times indicator of failure, p-hat = sum(y) / n, and its variance is
-sum_k n_k var_k(y) / n^2: that between the components, which independent draws of the mixture would add, is none. The
-weights are calibrated (`samplers/importance/calibration.py`): what the known mass of each kind of component explains of
-y counts no more.
+With n_k draws from component q_k and n in all, every draw has the weight phi / sum_k (n_k / n) q_k (deterministic
+mixture weights, the balance heuristic): no weight is larger than n / n_0 where n_0 draws are from phi itself.
+
+References:
+    Veach and Guibas, "Optimally combining sampling techniques for Monte Carlo rendering", SIGGRAPH 1995.
+    Owen and Zhou, "Safe and effective importance sampling", JASA 95, 2000.
 """
 
 import math
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
+from scipy.special import bdtrc
 
-from samplers.importance.calibration import calibrate
-from samplers.importance.draws import Draws
-from samplers.methods.two_stage.mixture.proposal import MixtureProposal
-from samplers.methods.two_stage.settings import DEFAULT_SETTINGS, TwoStageSettings
+from samplers.components import MixtureComponent, log_ratios, mixture_log_ratio
+from samplers.importance import Draws, calibrate
+from samplers.methods.two_stage.mixture import MixtureProposal
+from samplers.methods.two_stage.regions import Discovery
+from samplers.methods.two_stage.settings import DEFAULT_SETTINGS, DiagnosticSettings, TwoStageSettings
 from samplers.methods.two_stage.simulator import ComponentDraws
 from samplers.problem import FloatArray, Inputs
 from samplers.sample import Sample
+from samplers.statistics import effective_sample_size
+
+
+@dataclass(frozen=True, eq=False)
+class MultipleImportanceSample:
+    """All draws of a run from known components; `add` returns the sample with another batch.
+
+    Later proposals depend on earlier draws, so that p from these weights is biased low by some per cent: they serve to
+    fit the next proposal and for a run that is stopped early, not for the estimate.
+    """
+
+    u: FloatArray
+    """The failing draws, shape (k, d)."""
+    log_weights: FloatArray
+    """log(phi / q) - log(n) at the failing draws, shape (k,): their exponentials add up to an estimate of p."""
+    batches: tuple[ComponentDraws, ...] = ()
+    components: tuple[MixtureComponent, ...] = ()
+    """Those drawn from, one for each batch that it was part of."""
+    counts: FloatArray = field(default_factory=lambda: np.empty(0))
+    """Draws of each of `components`."""
+
+    @classmethod
+    def empty(cls, dim: int) -> "MultipleImportanceSample":
+        """Return a sample without draws in d dimensions."""
+        return cls(np.empty((0, dim)), np.empty(0))
+
+    @property
+    def n(self) -> int:
+        """Number of draws."""
+        return sum(len(batch.f) for batch in self.batches)
+
+    def add(self, batch: ComponentDraws, gamma: float) -> "MultipleImportanceSample":
+        """Return the sample with another batch; the failing ones are those with f <= gamma."""
+        used = tuple(c for c, n in zip(batch.components, batch.counts, strict=True) if n > 0)
+        used_counts = batch.counts[batch.counts > 0].astype(np.float64)
+        components, counts = self.components + used, np.concatenate([self.counts, used_counts])
+        failing = batch.u[batch.f <= gamma]
+        known = np.logaddexp(-self.log_weights, mixture_log_ratio(log_ratios(used, self.u), used_counts))
+        added = mixture_log_ratio(log_ratios(components, failing), counts)
+        return MultipleImportanceSample(
+            np.concatenate([self.u, failing]),
+            -np.append(known, added),
+            (*self.batches, batch),
+            components,
+            counts,
+        )
+
+    def within(self, axes: FloatArray) -> "MultipleImportanceSample":
+        """Return the failing draws alone, in the coordinates of orthonormal axes (d, r)."""
+        return MultipleImportanceSample(self.u @ axes, self.log_weights)
+
+    def all_draws(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return all draws, failing or not: u (n, d), f (n,) and log(phi / q) - log(n), shape (n,)."""
+        u = np.concatenate([batch.u for batch in self.batches])
+        f = np.concatenate([batch.f for batch in self.batches])
+        return u, f, -mixture_log_ratio(log_ratios(self.components, u), self.counts)
+
+    def to_draws(self, inputs: Inputs, gamma: float) -> Draws:
+        """Return all draws as those from one proposal."""
+        u, f, log_weights = self.all_draws()
+        return Draws.from_outcomes(f, log_weights + math.log(self.n), inputs.base.from_standard_normal(u), gamma)
+
 
 MAX_LOG_WEIGHT = 700.0
 """exp(709) is the largest number; base draws bound all weights that matter far below."""
-
 MAX_TYPICAL_SHARE = 0.25
 """More in one draw would be met often enough to be seen; a typical weight beyond is of a place without failures."""
 
@@ -155,3 +221,73 @@ class StratifiedSample:
             n_units=counted.n + n_base,
             x=counted.x,
         )
+
+
+def check_base_draws(
+    p: float, hits: int, n: int, settings: DiagnosticSettings = DEFAULT_SETTINGS.diagnostics
+) -> list[str]:
+    """Return a warning if more of n base draws failed than an estimate p allows, by a binomial test.
+
+    Base draws do not depend on the proposal: they hit a missed region as often as any other of its probability.
+    """
+    if hits == 0 or bdtrc(hits - 1, n, min(p, 1.0)) > settings.false_alarm:
+        return []
+    expected = n * p
+    return [f"{hits} of {n:,} base draws failed, but p = {p:.2e} predicts {expected:.2g}: a failure region was missed."]
+
+
+def check_rounds(
+    final: StratifiedSample, rounds: Sequence[Draws], settings: DiagnosticSettings = DEFAULT_SETTINGS.diagnostics
+) -> list[str]:
+    """Return a warning if the rounds before, each weighted by its own proposal, contradict the estimate.
+
+    Weighted as draws from the mixture of all rounds' proposals they would be worth more, but give a p that is often too
+    low by a third, for later proposals depend on earlier draws.
+    """
+    n = sum(draws.n for draws in rounds)
+    log_weights = np.concatenate([np.empty(0), *(draws.log_weights for draws in rounds)])
+    if len(final.draws.f) == 0 or effective_sample_size(log_weights) < settings.min_rounds_ess:
+        return []
+    w = np.exp(log_weights)
+    before, error = float(w.sum()) / n, math.sqrt(float((w * w).sum())) / n
+    apart = abs(before - final.p) / math.hypot(error, final.cov * final.p)
+    if apart < settings.max_deviation:
+        return []
+    return [f"The search rounds give p = {before:.2e}, {apart:.1f} standard errors from the final estimate."]
+
+
+def check_efficiency(final: StratifiedSample, settings: DiagnosticSettings = DEFAULT_SETTINGS.diagnostics) -> list[str]:
+    """Return a warning if the draws are worth so few failures that there may be weights heavier than any met."""
+    draws = final.draws
+    if len(draws.f) == 0 or draws.ess >= settings.min_final_rate * draws.n:
+        return []
+    return [f"Effective sample size of {draws.n:,} draws: {draws.ess:.0f} failures; larger weights may be missing."]
+
+
+def check_regions(final: StratifiedSample, settings: DiagnosticSettings = DEFAULT_SETTINGS.diagnostics) -> list[str]:
+    """Return a warning if a point of the exploration in some region would be a large share of p as a draw.
+
+    The proposal does not describe such a region, and that the final draws met hardly any of that weight says nothing.
+    """
+    share = final.typical / max(final.draws.n * final.p, 1e-300)
+    lost = int((share > settings.max_point_share).sum())
+    if lost == 0 or len(final.draws.f) == 0:
+        return []
+    return [
+        f"The proposal barely covers {lost} of {len(share)} regions found: one draw there adds {share.max():.0%} of p."
+    ]
+
+
+def check_discovery(
+    p: float, discovery: Discovery, confidence: float, settings: DiagnosticSettings = DEFAULT_SETTINGS.diagnostics
+) -> list[str]:
+    """Return a warning if so few lineages reached failure that much of p may be in regions that were not found."""
+    share = discovery.unseen_share(confidence)
+    if share <= settings.max_unseen_share:
+        return []
+    searches = f"{discovery.lineages:.0f}"
+    size = f"with probability up to {p * share / (1 - share):.1e} ({share:.0%} of p)" if p else "of unknown probability"
+    return [
+        f"Only {searches} independent search{'' if searches == '1' else 'es'} reached failure: further failure regions "
+        f"{size} cannot be excluded."
+    ]

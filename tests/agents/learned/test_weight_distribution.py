@@ -7,7 +7,7 @@ import pytest
 from scipy import stats
 
 from agents.learned.weight_distribution import RADIUS, WeightDistribution
-from samplers.methods.cross_entropy.blocks import announced_blocks
+from samplers.methods.blocks import announced_blocks
 
 PRECISION = np.array([[4.0, 1.0, 0.0], [1.0, 3.0, -0.5], [0.0, -0.5, 2.0]])
 MEAN = np.array([1.0, -2.0, 0.5])

@@ -7,7 +7,7 @@ import rare_envs
 import samplers
 from rare_envs.egos.faults import FaultTolerant
 from rare_envs.egos.wrapped_problem import WrappedProblem
-from samplers.statistics.intervals import clopper_pearson
+from samplers.statistics import clopper_pearson
 
 
 def test_terms_and_gradients_go_through_any_number_of_problems() -> None:

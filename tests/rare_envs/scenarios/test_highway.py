@@ -58,7 +58,7 @@ def test_to_standard_normal_and_back():
 
 def test_cross_entropy_finds_the_blocks():
     """24 Beta, 404 Normal in the box, and noise that stays: 428 and more dimensions."""
-    from samplers.methods.cross_entropy.blocks import announced_blocks
+    from samplers.methods.blocks import announced_blocks
 
     problem = rare_envs.DrivingProblem(HIGHWAY, measure="lidar_ttc", **SHORT)
     blocks = announced_blocks(problem)

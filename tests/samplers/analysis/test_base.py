@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import samplers
-from samplers.analysis.base import cov_inflation, no_outcome_weight, require_sample
+from samplers.analysis.weighted import cov_inflation, no_outcome_weight, require_sample
 from samplers.sample import Sample
 
 SAMPLE = Sample(

@@ -7,7 +7,7 @@ import pytest
 from scipy import stats
 
 import samplers
-from samplers.analysis.base_uncertainty import (
+from samplers.analysis.base_error import (
     explain_missing_spread,
     scale_by_exp,
 )

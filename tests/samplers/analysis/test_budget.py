@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 import samplers
-from samplers.analysis.budget import Pilot, plan_runs
+from samplers.analysis.gate import Pilot, plan_runs
 from samplers.limit_states import half_space
 
 

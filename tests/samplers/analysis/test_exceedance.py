@@ -6,10 +6,9 @@ import pytest
 from scipy import stats
 
 import samplers
-from samplers.analysis.exceedance import compute_exceedance
-from samplers.analysis.failure_expectation import FurtherFailures
-from samplers.analysis.failure_weights import weigh_failures
-from samplers.statistics.unseen_share import raise_log_end
+from samplers.analysis.expectation import FurtherFailures, compute_exceedance
+from samplers.analysis.weighted import weigh_failures
+from samplers.statistics import raise_log_end
 from tests.samplers.fitted_bases import FittedWithEnsemble, fitted, normal, resampled
 from tests.samplers.fitted_bases import run as run_fitted
 

@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from samplers.analysis.failure_expectation import FurtherFailures, expect_over_failures, expect_under_refits
-from samplers.analysis.failure_weights import weigh_failures
+from samplers.analysis.expectation import FurtherFailures, expect_over_failures, expect_under_refits
+from samplers.analysis.weighted import weigh_failures
 from tests.samplers.analysis.half_space_tail import BETA, METHODS, PHI, P, estimate_half_space
 from tests.samplers.analysis.sensitivity.parametric_normal import ALPHA, fitted, run
 from tests.samplers.fitted_bases import FittedWithEnsemble, normal

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 import samplers
-from samplers.analysis.failure_weights import (
+from samplers.analysis.weighted import (
     choose_failures,
     mean_over_failures,
     weigh_failures,

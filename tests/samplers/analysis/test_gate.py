@@ -9,7 +9,7 @@ import pytest
 from scipy import stats
 
 import samplers
-from samplers.analysis.base_uncertainty import BaseUncertainty
+from samplers.analysis.base_error import BaseUncertainty
 from samplers.analysis.gate import judge_estimate
 
 BASE = BaseUncertainty(

@@ -8,7 +8,7 @@ import pytest
 from scipy import stats
 
 import samplers
-from samplers.analysis.ratio_uncertainty import summarise_ratio
+from samplers.analysis.base_error import summarise_ratio
 from samplers.analysis.refits import RefitSums
 from tests.samplers.fitted_bases import FittedNormal, FittedWithEnsemble, HalfSpace, fitted, normal, resampled
 

@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from samplers.analysis import base_uncertainty, refit_band
-from samplers.analysis.refit_band import compute_refit_band
+from samplers.analysis import base_error as base_uncertainty
+from samplers.analysis import base_error as refit_band
+from samplers.analysis.base_error import compute_refit_band
 from samplers.analysis.refits import RefitSums
-from samplers.statistics.unseen_share import raise_log_end
+from samplers.statistics import raise_log_end
 
 THRESHOLDS = np.array([0.0, 1.0, 2.0, 3.0])
 N_EVENTS, N_REFITS = 40, 30

@@ -16,7 +16,7 @@ from samplers.analysis.refits import (
     refit_log_ratios,
     reweight_to_refits,
 )
-from samplers.analysis.reweighting import find_sibling
+from samplers.analysis.reweight import find_sibling
 from tests.samplers.fitted_bases import BETA, FittedWithEnsemble, HalfSpace, fitted, normal, resampled, run
 
 

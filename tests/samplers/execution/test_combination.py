@@ -10,7 +10,7 @@ from samplers.execution.combination import combine, combined_cov
 from samplers.limit_states import half_space
 from samplers.method import Outcome
 from samplers.sample import Sample
-from samplers.statistics.intervals import binomial_cov, clopper_pearson
+from samplers.statistics import binomial_cov, clopper_pearson
 from samplers.trace import Status
 
 

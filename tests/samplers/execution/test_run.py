@@ -11,7 +11,7 @@ from samplers.execution.replicate import Replicate
 from samplers.execution.run import Run, split_budget
 from samplers.limit_states import half_space
 from samplers.method import Goal, Outcome
-from samplers.statistics.intervals import binomial_cov, clopper_pearson
+from samplers.statistics import binomial_cov, clopper_pearson
 
 EASY = half_space(2, 2.0).problem
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from samplers.importance.calibration import LEAST_FACTOR, calibrate
+from samplers.importance import LEAST_FACTOR, calibrate
 
 BETA = 1.7
 P = stats.norm.sf(BETA)

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from samplers.importance.draws import Draws, bernstein_bound, weight_warnings, weighted_interval
-from samplers.statistics.intervals import clopper_pearson
+from samplers.importance import Draws, bernstein_bound, weight_warnings, weighted_interval
+from samplers.statistics import clopper_pearson
 
 
 def weighing(*weights, n=1000):

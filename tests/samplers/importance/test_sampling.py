@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from samplers.importance.sampling import count_final_draws, defensive_mixture, simulate_until
+from samplers.importance import count_final_draws, defensive_mixture, simulate_until
 from samplers.limit_states import half_space
 from samplers.method import Goal
 from samplers.problem import FunctionProblem
-from samplers.proposals.gaussian import Gaussian
+from samplers.proposals import Gaussian
 
 
 def test_final_draws_are_what_is_left_or_what_was_set():

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from samplers.importance.search import (
+from samplers.importance import (
     Round,
     Search,
     draw_after_search,
@@ -17,7 +17,7 @@ from samplers.importance.search import (
 from samplers.limit_states import half_space
 from samplers.method import Goal
 from samplers.problem import StandardNormal
-from samplers.proposals.gaussian import Gaussian, TiltedNormal
+from samplers.proposals import Gaussian, TiltedNormal
 from samplers.trace import Status
 
 BASE = StandardNormal(2)

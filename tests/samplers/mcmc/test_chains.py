@@ -4,8 +4,16 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from samplers.mcmc.chains import Chains, RootedPoints, chain_lengths, draw_first_level, grow_chains, independent_chains
-from samplers.mcmc.kernels import FixedMetropolis, ScaledKernel
+from samplers.mcmc import (
+    Chains,
+    FixedMetropolis,
+    RootedPoints,
+    ScaledKernel,
+    chain_lengths,
+    draw_first_level,
+    grow_chains,
+    independent_chains,
+)
 from samplers.method import Interrupted
 from samplers.problem import FunctionProblem
 

@@ -7,9 +7,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from samplers.mcmc.chains import Growth, chain_lengths, independent_chains
-from samplers.mcmc.descent import NextLevel, descend
-from samplers.mcmc.kernels import ScaledKernel
+from samplers.mcmc import Growth, NextLevel, ScaledKernel, chain_lengths, descend, independent_chains
 from samplers.method import Interrupted
 from samplers.problem import FunctionProblem
 from samplers.trace import Status

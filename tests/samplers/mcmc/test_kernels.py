@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from samplers.mcmc.kernels import (
+from samplers.mcmc import (
     FixedMetropolis,
     ScaledKernel,
     accept_candidates,

@@ -5,12 +5,12 @@ import pytest
 from scipy import stats
 
 import samplers
-from samplers.importance.search import Round, Search, round_record
+from samplers.importance import Round, Search, round_record
 from samplers.limit_states import four_branches, half_space, parabola, plateau
 from samplers.method import Goal
 from samplers.methods.importance_sampling import unreached_share
 from samplers.problem import FunctionProblem, StandardNormal
-from samplers.proposals.gaussian import TiltedNormal
+from samplers.proposals import TiltedNormal
 from samplers.trace import Status
 
 IS = samplers.ImportanceSampling

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 import samplers
-from samplers.methods import kept_draws
-from samplers.methods.kept_draws import EvenlySpaced, KeptDraws
+from samplers.methods import monte_carlo as kept_draws
+from samplers.methods.monte_carlo import EvenlySpaced, KeptDraws
 
 
 @pytest.mark.parametrize("batch", [1, 3, 7, 100])

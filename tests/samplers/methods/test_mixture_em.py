@@ -1,11 +1,15 @@
 import numpy as np
 import pytest
 
-from samplers.methods.mixture_em import WidenableMixture, fit_mixture_of_size, fit_proposal_mixture
-from samplers.proposals.gaussian import Gaussian
-from samplers.proposals.mixture import Mixture
-from samplers.proposals.shrinkage import fit_shrunk_gaussian
-from samplers.proposals.von_mises_fisher import VonMisesFisherNakagami
+from samplers.components import VonMisesFisherNakagami
+from samplers.proposals import (
+    Gaussian,
+    Mixture,
+    WidenableMixture,
+    fit_mixture_of_size,
+    fit_proposal_mixture,
+    fit_shrunk_gaussian,
+)
 
 TWO = Mixture(
     np.array([0.3, 0.7]),

@@ -9,9 +9,9 @@ from scipy import stats
 
 import samplers
 from samplers.limit_states import half_space
-from samplers.mcmc.chains import Chains
+from samplers.mcmc import Chains
 from samplers.method import Goal
-from samplers.methods.subset_estimate import (
+from samplers.methods.subset import (
     LevelProduct,
     descent_cov,
     effective_roots,
@@ -21,7 +21,7 @@ from samplers.methods.subset_estimate import (
     summarise,
 )
 from samplers.problem import FunctionProblem
-from samplers.statistics.intervals import log_normal_interval
+from samplers.statistics import log_normal_interval
 from samplers.trace import Status
 
 ADSS = samplers.AdaptiveSubsetSimulation

@@ -5,8 +5,8 @@ import pytest
 
 import samplers
 from samplers.limit_states import half_space
-from samplers.mcmc.chains import independent_chains
-from samplers.methods.subset_levels import SubsetPlanner
+from samplers.mcmc import independent_chains
+from samplers.methods.subset import SubsetPlanner
 from samplers.problem import FunctionProblem
 from samplers.trace import Status
 
@@ -76,7 +76,7 @@ def test_stalls_honestly_where_everything_ties():
     result = run(FunctionProblem(lambda x: np.full(len(x), 10.0), 2))
     assert result.n_sim == 1000
     assert result.status == "no_hits"
-    assert result.interval == samplers.statistics.intervals.clopper_pearson(0, 1000, 0.95)
+    assert result.interval == samplers.statistics.clopper_pearson(0, 1000, 0.95)
     assert any("No progress" in text for text in result.warnings)
 
 
@@ -97,7 +97,7 @@ def test_a_budget_under_level_zero_is_named_as_the_reason(max_sim):
     )
     assert "max_sim was used up at level 0" in result.warnings[1]
     assert not any("ties" in text for text in result.warnings)
-    assert result.interval == samplers.statistics.intervals.clopper_pearson(0, max_sim, 0.95)
+    assert result.interval == samplers.statistics.clopper_pearson(0, max_sim, 0.95)
 
 
 def test_a_budget_for_few_points_has_the_status_budget():

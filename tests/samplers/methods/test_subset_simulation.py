@@ -7,7 +7,7 @@ from scipy import stats
 import samplers
 from samplers.limit_states import half_space, plateau, shell
 from samplers.method import Goal
-from samplers.methods.subset_estimate import descent_cov
+from samplers.methods.subset import descent_cov
 from samplers.problem import FunctionProblem
 from samplers.trace import Status
 
@@ -51,7 +51,7 @@ def test_no_level_after_the_answer_is_known(recorder):
     f = recorder(half_space(2, -stats.norm.ppf(0.3)).problem.f)
     result = run(FunctionProblem(f, 2))
     assert result.n_sim == f.rows == 1000
-    assert result.interval == samplers.statistics.intervals.clopper_pearson(round(1000 * result.p), 1000, 0.95)
+    assert result.interval == samplers.statistics.clopper_pearson(round(1000 * result.p), 1000, 0.95)
     result = run(half_space(2, -stats.norm.ppf(0.03)).problem)
     assert [level.gamma == 0.0 for level in result.trace] == [False, True]
 

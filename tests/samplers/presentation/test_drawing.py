@@ -10,7 +10,7 @@ import pytest
 from matplotlib import pyplot
 
 import samplers
-from samplers.presentation.drawing import drawing_axes
+from samplers.display import drawing_axes
 
 matplotlib.use("Agg")
 PNG, PDF = b"\x89PNG", b"%PDF"

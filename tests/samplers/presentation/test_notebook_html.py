@@ -1,7 +1,7 @@
 from html.parser import HTMLParser
 
 import samplers
-from samplers.presentation import html_table
+from samplers.display import html_table
 
 
 class Reader(HTMLParser):

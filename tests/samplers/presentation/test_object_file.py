@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import samplers
-from samplers.presentation import read_object, register_stored, write_object
+from samplers.stored import read_object, register_stored, write_object
 
 
 @dataclass(frozen=True)

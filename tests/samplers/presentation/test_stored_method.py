@@ -1,7 +1,7 @@
 import pytest
 
 import samplers
-from samplers.presentation import StoredMethod
+from samplers.stored import StoredMethod
 
 
 class Other(samplers.Method):

@@ -6,8 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 
-from samplers.limit_states import half_space
-from samplers.proposals.components import (
+from samplers.components import (
     HalfSpaceIntersection,
     HalfSpaceNormal,
     HalfSpaceUnion,
@@ -20,6 +19,7 @@ from samplers.proposals.components import (
     log_ratios,
     mixture_log_ratio,
 )
+from samplers.limit_states import half_space
 
 N = 20_000
 

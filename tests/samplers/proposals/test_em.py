@@ -6,10 +6,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from samplers.proposals.em import expectation_maximisation, one_hot, posterior
-from samplers.proposals.gaussian import Gaussian
-from samplers.proposals.k_means import k_means
-from samplers.proposals.mixture import Mixture
+from samplers.proposals import Gaussian, Mixture, expectation_maximisation, k_means, one_hot, posterior
 
 
 @dataclass

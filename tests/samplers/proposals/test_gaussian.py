@@ -2,8 +2,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from samplers.proposals.gaussian import Gaussian, weighted_moments
-from samplers.proposals.mixture import Mixture
+from samplers.proposals import Gaussian, Mixture, weighted_moments
 
 MEAN = np.array([1.0, -0.5])
 COVARIANCE = np.array([[1.5, 0.4], [0.4, 0.6]])

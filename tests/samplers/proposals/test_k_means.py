@@ -5,7 +5,7 @@ import warnings
 import numpy as np
 import pytest
 
-from samplers.proposals.k_means import LLOYD_STEPS, choose_centres, k_means
+from samplers.proposals import LLOYD_STEPS, choose_centres, k_means
 
 
 def test_centres_are_far_apart_and_distinct(rng):

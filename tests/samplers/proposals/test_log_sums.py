@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.special import logsumexp
 
-from samplers.proposals.log_sums import log_sum_exp
+from samplers.statistics import log_sum_exp
 
 
 def numbers(rng, shape):

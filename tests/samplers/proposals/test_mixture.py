@@ -4,10 +4,8 @@ import numpy as np
 import pytest
 from scipy import integrate, stats
 
-from samplers.proposals.em import posterior
-from samplers.proposals.gaussian import Gaussian
-from samplers.proposals.mixture import GaussianMixture, Mixture
-from samplers.proposals.von_mises_fisher import VonMisesFisherNakagami
+from samplers.components import VonMisesFisherNakagami
+from samplers.proposals import Gaussian, GaussianMixture, Mixture, posterior
 
 ONE = GaussianMixture(
     np.array([0.25, 0.75]), [Gaussian(np.array([m]), np.array([[s]])) for m, s in ((-2, 0.5), (3, 2))]

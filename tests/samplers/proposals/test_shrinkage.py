@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
-from samplers.proposals.gaussian import Gaussian, Moments
-from samplers.proposals.shrinkage import (
+from samplers.proposals import (
+    Gaussian,
+    Moments,
     correct_eigenvalues,
     fit_shrunk_gaussian,
     shrink_covariance,

@@ -5,8 +5,8 @@ import pytest
 from scipy import stats
 from scipy.special import iv
 
+from samplers.components import VonMisesFisherNakagami, concentration, directions, log_normaliser
 from samplers.problem import StandardNormal
-from samplers.proposals.von_mises_fisher import VonMisesFisherNakagami, concentration, directions, log_normaliser
 
 
 @pytest.mark.parametrize("dim", [1, 2, 3, 20, 100, 1500])

@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from samplers.analysis.weighted import has_independent_points, unit_sums
 from samplers.sample import Layer, Sample
-from samplers.statistics.cluster_sums import has_independent_points, unit_sums
 
 
 def plain(f):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from samplers.statistics.intervals import (
+from samplers.statistics import (
     binomial_cov,
     clopper_pearson,
     correlation_factor,

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from samplers.statistics.refit_families import (
+from samplers.analysis.refits import (
     RefitFamily,
     expect_over_families,
     find_log_ends,

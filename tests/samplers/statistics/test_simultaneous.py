@@ -2,9 +2,8 @@ import numpy as np
 import pytest
 
 import samplers
-from samplers.statistics.cluster_sums import unit_sums
-from samplers.statistics.intervals import clopper_pearson
-from samplers.statistics.simultaneous import simultaneous_intervals, simultaneous_level
+from samplers.analysis.weighted import simultaneous_intervals, simultaneous_level, unit_sums
+from samplers.statistics import clopper_pearson
 
 
 def level_of(correlation):

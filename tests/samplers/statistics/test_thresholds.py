@@ -1,6 +1,6 @@
 import numpy as np
 
-from samplers.statistics.thresholds import next_level
+from samplers.statistics import next_level
 
 
 def test_distinct_outcomes_give_the_quantile_with_its_true_share(rng):

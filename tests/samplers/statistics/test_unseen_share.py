@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from samplers.statistics.unseen_share import PRIOR_SHARE, add_unseen
+from samplers.statistics import PRIOR_SHARE, add_unseen
 
 
 def test_the_upper_end_is_the_quantile_of_both_errors_together():

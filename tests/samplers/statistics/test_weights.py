@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from samplers.statistics.weights import effective_sample_size, largest_weight_share, normalise_weights
+from samplers.statistics import effective_sample_size, largest_weight_share, normalise_weights
 
 
 def test_effective_sample_size():

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import samplers
-from samplers.methods.cross_entropy.kl_projection import project_mean
+from samplers.methods.blocks import project_mean
 from samplers.system.optional_libraries import needs_library
 
 

@@ -1,40 +1,105 @@
-"""Search by terms: failures of a least over terms, in tens to thousands of dimensions.
-
-f is a least over terms (which car is hit, ahead or behind, early or late), and each term's failures are nearly one
-half-space. In standard normal space:
-
-1. *Walks* (`walks.py`): from low base draws of every term that matters downhill along its gradient to its failures.
-2. *Rounds* (`rounds.py`, `fitting.py`, `law.py`): for each term Gaussians in the subspace of its gradients, N(0, I)
-   across it; fitted anew after every round to all draws so far, weighted by the balance heuristic.
-3. *Estimate* (`estimate.py`): three final rounds, each from a proposal fitted to what came before, with exact weights
-   and shares in p that were fixed beforehand: p = sum_r c_r mean(w_r 1{f <= gamma}) counts failures of any term.
-
-Each p_r is unbiased given the past: subspaces, terms and Gaussians may be wrong and p stays right; only its c.o.v.
-suffers. Where the rounds show that they are wrong, adaptive subset simulation takes over, on the order of the terms.
-"""
+"""Order of the terms: any method follows the least term in place of f where it asks for f."""
 
 import math
+from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass, replace
+from typing import TypeVar, cast
 
 import numpy as np
 
-from samplers.importance.draws import Draws, weight_warnings, weighted_interval
-from samplers.method import Goal, Interrupted, Outcome, Steps, TermsOffer, no_outcome_share
+from samplers.importance import Draws, weight_warnings, weighted_interval
+from samplers.method import Goal, Interrupted, Outcome, Steps, TermsOffer, no_outcome_share, request_terms
 from samplers.methods.monte_carlo import MonteCarlo
-from samplers.methods.two_stage.fallback import run_subset_simulation
+from samplers.methods.two_stage.settings import DEFAULT_TERM_SETTINGS, TermSettings
 from samplers.methods.two_stage.simulator import SimulationSteps, close_trace, extend_trace
-from samplers.methods.two_stage.terms.estimate import CombinedRounds, FinalRound, doubt
-from samplers.methods.two_stage.terms.fitting import PursuedTerm
-from samplers.methods.two_stage.terms.history import TermHistory
-from samplers.methods.two_stage.terms.order import order_by_terms
-from samplers.methods.two_stage.terms.rounds import mix_terms, pursue_walked, refit_terms
-from samplers.methods.two_stage.terms.settings import DEFAULT_TERM_SETTINGS, TermSettings
-from samplers.methods.two_stage.terms.space import TermSimulator
-from samplers.methods.two_stage.terms.walks import choose_starts, choose_terms, count_walks, walk_downhill
-from samplers.problem import Inputs
-from samplers.statistics.intervals import binomial_cov, clopper_pearson
-from samplers.statistics.weights import effective_sample_size
+from samplers.methods.two_stage.stages import run_subset_simulation
+from samplers.methods.two_stage.terms.fitting import PursuedTerm, TermHistory
+from samplers.methods.two_stage.terms.rounds import (
+    CombinedRounds,
+    FinalRound,
+    doubt,
+    mix_terms,
+    pursue_walked,
+    refit_terms,
+)
+from samplers.methods.two_stage.terms.walks import (
+    TermSimulator,
+    choose_starts,
+    choose_terms,
+    count_walks,
+    walk_downhill,
+)
+from samplers.problem import FloatArray, Inputs, Terms
+from samplers.statistics import binomial_cov, clopper_pearson, effective_sample_size
 from samplers.trace import Level, Status
+
+_T = TypeVar("_T")
+
+
+def ordering_values(terms: Terms, gamma: float) -> FloatArray:
+    """Return values (n,) that are <= gamma just where f is, and elsewhere in the order of the least term.
+
+    Where f is no better than a flag (a collision is -1, however it happened) the least term tells near from far.
+    """
+    shifted = terms.lowest - terms.threshold + gamma
+    above = float(np.nextafter(gamma, np.inf))
+    values = np.where(terms.f <= gamma, np.minimum(shifted, gamma), np.maximum(shifted, above))
+    return np.where(np.isneginf(terms.f), -np.inf, values)
+
+
+def answer_by_terms(
+    steps: Generator[FloatArray, FloatArray, _T], read: Callable[[FloatArray, Terms], FloatArray]
+) -> Generator[FloatArray, FloatArray, _T]:
+    """Run steps that ask for f, with terms requested in its place; return what they return.
+
+    Args:
+        steps: Yields points x (n, d), is sent numbers (n,).
+        read: Gives these numbers from points and their terms.
+    """
+    answer: FloatArray | None = None
+    while True:
+        try:
+            x = next(steps) if answer is None else steps.send(answer)
+        except StopIteration as end:
+            return cast(_T, end.value)
+        if len(x) == 0:
+            answer = np.empty(0)
+            continue
+        try:
+            terms = yield from request_terms(x)
+        except BaseException as error:
+            try:
+                steps.throw(error)
+            except StopIteration as end:
+                return cast(_T, end.value)
+            raise
+        answer = read(x, terms)
+
+
+def order_by_terms(steps: Steps, gamma: float) -> Steps:
+    """Run steps with the least term in place of f; the outcome's points have f again.
+
+    Their layers are left out: they are thresholds of the order, not of f.
+    """
+    f_of: dict[float, float] = {}
+
+    def read(_: FloatArray, terms: Terms) -> FloatArray:
+        answer = ordering_values(terms, gamma)
+        f_of.update(zip(answer.tolist(), terms.f.tolist(), strict=True))
+        return answer
+
+    return _with_f((yield from answer_by_terms(steps, read)), f_of)
+
+
+def _with_f(outcome: Outcome, f_of: dict[float, float]) -> Outcome:
+    """Return the outcome with f in place of the order among its points."""
+    if outcome.sample is None:
+        return outcome
+    return replace(outcome, sample=replace(outcome.sample, f=_look_up(outcome.sample.f.tolist(), f_of), layers=()))
+
+
+def _look_up(values: Sequence[float], f_of: dict[float, float]) -> FloatArray:
+    return np.array([f_of.get(value, value) for value in values])
 
 
 def suits_terms(inputs: Inputs, offer: TermsOffer | None, budget: int, settings: TermSettings) -> bool:

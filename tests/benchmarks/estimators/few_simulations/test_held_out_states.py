@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from benchmarks.estimators.few_simulations.held_out_states import make
-from samplers.proposals.gaussian import Gaussian
+from samplers.proposals import Gaussian
 
 STATES = make()
 

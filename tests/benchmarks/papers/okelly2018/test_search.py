@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from samplers.proposals import Gaussian
 
 from benchmarks.papers.okelly2018.scales import SearchSettings
 from benchmarks.papers.okelly2018.search import (
@@ -13,8 +14,7 @@ from benchmarks.papers.okelly2018.search import (
     take_step,
 )
 from samplers import FunctionProblem
-from samplers.methods.cross_entropy import BetaBlock, NormalBlock, Product
-from samplers.proposals import Gaussian
+from samplers.methods.blocks import BetaBlock, NormalBlock, Product
 
 BASE = Product(
     (

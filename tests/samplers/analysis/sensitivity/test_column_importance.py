@@ -5,8 +5,8 @@ import pytest
 from scipy import stats
 
 import samplers
-from samplers.analysis.failure_weights import WeightedFailures
-from samplers.analysis.sensitivity.column_importance import relative_entropies
+from samplers.analysis.sensitivity import relative_entropies
+from samplers.analysis.weighted import WeightedFailures
 from tests.samplers.analysis.sensitivity.parametric_normal import ALPHA, BASE, BETA, HAZARD, ParametricNormal, run
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import samplers
-from samplers.analysis.sensitivity.parameter_scores import parameter_scores, refit_displacements
+from samplers.analysis.sensitivity import parameter_scores, refit_displacements
 from tests.samplers.analysis.sensitivity.parametric_normal import ALPHA, BASE, BETA, HAZARD, fitted, run
 
 

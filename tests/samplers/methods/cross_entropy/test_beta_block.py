@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import optimize, stats
 
-from samplers.methods.cross_entropy.beta_block import BetaBlock
+from samplers.methods.blocks import BetaBlock
 
 BETA = BetaBlock(alpha=[2.0, 3.0], beta=[2.0, 1.5], low=[80.0, -0.25], high=[120.0, 0.25])
 

@@ -5,10 +5,8 @@ import pytest
 from scipy import stats
 
 from samplers import Distribution
-from samplers.methods.cross_entropy.beta_block import BetaBlock
-from samplers.methods.cross_entropy.blocks import Product, announced_blocks
-from samplers.methods.cross_entropy.gaussian_blocks import GaussianBlock, NormalBlock
-from samplers.proposals.gaussian import Gaussian
+from samplers.methods.blocks import BetaBlock, GaussianBlock, NormalBlock, Product, announced_blocks
+from samplers.proposals import Gaussian
 
 MEAN, COVARIANCE = np.array([0.3, -0.2, 0.1]), np.array([[0.5, 0.2, 0.0], [0.2, 0.4, 0.1], [0.0, 0.1, 0.3]])
 BETA = BetaBlock(alpha=[2.0, 3.0], beta=[2.0, 1.5], low=[80.0, -0.25], high=[120.0, 0.25])

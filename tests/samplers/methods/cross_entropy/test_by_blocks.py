@@ -9,10 +9,8 @@ from scipy import integrate, stats
 
 import samplers
 from samplers.method import Goal
-from samplers.methods.cross_entropy.beta_block import BetaBlock
-from samplers.methods.cross_entropy.blocks import Product
-from samplers.methods.cross_entropy.gaussian_blocks import NormalBlock
-from samplers.proposals.gaussian import Gaussian
+from samplers.methods.blocks import BetaBlock, NormalBlock, Product
+from samplers.proposals import Gaussian
 
 CE = samplers.CrossEntropy
 

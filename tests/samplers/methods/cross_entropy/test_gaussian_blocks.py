@@ -4,7 +4,7 @@ from scipy import stats
 
 import samplers
 from samplers.distributions import as_distribution
-from samplers.methods.cross_entropy.gaussian_blocks import GaussianBlock, MappedBlock
+from samplers.methods.blocks import GaussianBlock, MappedBlock
 from samplers.proposals import Gaussian
 
 

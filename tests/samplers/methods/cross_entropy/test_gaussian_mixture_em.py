@@ -2,10 +2,8 @@
 
 import numpy as np
 
-from samplers.methods.cross_entropy.gaussian_blocks import MixtureBlock
-from samplers.methods.cross_entropy.gaussian_mixture_em import fit_mixture_towards
-from samplers.proposals.gaussian import Gaussian
-from samplers.proposals.mixture import GaussianMixture
+from samplers.methods.blocks import MixtureBlock, fit_mixture_towards
+from samplers.proposals import Gaussian, GaussianMixture
 
 
 def uniform_weights(n):

@@ -5,7 +5,7 @@ import pytest
 from scipy import optimize, stats
 from scipy.special import betaln
 
-from samplers.methods.cross_entropy.kl_projection import beta_statistics, project_beta, project_mean
+from samplers.methods.blocks import beta_statistics, project_beta, project_mean
 
 BOX = (1.5, 7.0)
 
@@ -97,7 +97,7 @@ def test_mean_projection_against_a_generic_solver(rng, scale):
 
 
 def test_mean_projection_needs_no_solver_where_the_answer_is_known(rng, monkeypatch):
-    monkeypatch.setattr("samplers.methods.cross_entropy.kl_projection._box_least_squares", None)
+    monkeypatch.setattr("samplers.methods.blocks._box_least_squares", None)
     cholesky, target = correlated(6, rng), 0.01 * rng.standard_normal(6)
     np.testing.assert_array_equal(project_mean(target, np.zeros(6), cholesky, 1.0), target)
     np.testing.assert_array_equal(project_mean(target, np.zeros(6), cholesky, np.inf), target)

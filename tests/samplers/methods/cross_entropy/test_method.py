@@ -6,14 +6,20 @@ import pytest
 from scipy import stats
 
 import samplers
-from samplers.importance.draws import Draws, bernstein_bound, weight_warnings, weighted_cov, weighted_interval
-from samplers.importance.sampling import defensive_mixture, simulate_draws
+from samplers.importance import (
+    Draws,
+    bernstein_bound,
+    defensive_mixture,
+    simulate_draws,
+    weight_warnings,
+    weighted_cov,
+    weighted_interval,
+)
 from samplers.limit_states import four_branches, half_space, parabola, plateau, two_modes
-from samplers.methods.cross_entropy.blocks import Product
-from samplers.methods.cross_entropy.gaussian_blocks import GaussianBlock, NormalBlock
-from samplers.methods.cross_entropy.method import value_at
+from samplers.methods.blocks import GaussianBlock, NormalBlock, Product
+from samplers.methods.cross_entropy import value_at
 from samplers.problem import FunctionProblem
-from samplers.proposals.gaussian import Gaussian
+from samplers.proposals import Gaussian
 
 CE = samplers.CrossEntropy
 
@@ -179,7 +185,7 @@ def test_a_common_event_is_left_to_plain_draws():
     result = samplers.estimate(reference.problem, CE(), seed=1)
     assert result.n_sim == 5000
     assert result.p == result.trace[-1].p
-    assert result.interval == samplers.statistics.intervals.clopper_pearson(round(4000 * result.p), 4000, 0.95)
+    assert result.interval == samplers.statistics.clopper_pearson(round(4000 * result.p), 4000, 0.95)
 
 
 def test_no_hit_is_bounded_through_the_base_draws():

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from samplers.importance.search import Round
-from samplers.methods.cross_entropy.search import best_iterate, make_iterate
+from samplers.importance import Round
+from samplers.methods.cross_entropy import best_iterate, make_iterate
 
 
 def test_an_iterate_holds_quantile_level_and_estimate():

@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from samplers.methods.surrogate.estimate import BASE, DOUBTED, SURROGATE, WIDE, EstimateDraws
-from samplers.methods.surrogate.pool import PoolDraws
+from samplers.methods.surrogate import BASE, DOUBTED, SURROGATE, WIDE, EstimateDraws, PoolDraws
 
 
 def drawn(parts, weights):

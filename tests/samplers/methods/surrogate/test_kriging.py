@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from samplers.methods.surrogate.kriging import compress_outcomes, fit_kriging, outcome_scale
+from samplers.methods.kriging import compress_outcomes, fit_kriging, outcome_scale
 
 
 def points(n, dim, seed=0, scale=2.0):

@@ -3,10 +3,15 @@
 import numpy as np
 import pytest
 
-from samplers.methods.surrogate.kriging import Prediction, fit_kriging
-from samplers.methods.surrogate.learning import choose_batch, design_size, draw_design, learning_size
-from samplers.methods.surrogate.pool import draw_mixture_pool, first_mixture
-from samplers.methods.surrogate.settings import LearningSettings
+from samplers.methods.kriging import LearningSettings, Prediction, fit_kriging
+from samplers.methods.surrogate import (
+    choose_batch,
+    design_size,
+    draw_design,
+    draw_mixture_pool,
+    first_mixture,
+    learning_size,
+)
 
 SETTINGS = LearningSettings()
 

@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 from scipy.stats import norm
 
-from samplers.methods.surrogate.kriging import Prediction
-from samplers.methods.surrogate.pool import Pool, build_pool_proposal, first_mixture, fit_mixture
-from samplers.methods.surrogate.settings import PoolSettings, ProposalSettings
+from samplers.methods.kriging import PoolSettings, Prediction, ProposalSettings
+from samplers.methods.surrogate import Pool, build_pool_proposal, first_mixture, fit_mixture
 from samplers.problem import StandardNormal
 
 SCALES = (1.0, 1.5, 2.2, 3.0)

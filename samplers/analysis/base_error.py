@@ -1,0 +1,536 @@
+"""Uncertainty of the base distribution: the interval of p that the events behind a fitted base allow.
+
+With p_b the probability under refit b, s the standard deviation of log p_b and t a quantile of Student's t,
+
+    p exp(-t S) to p exp(t S),    S^2 = s^2 + cov^2 + 0.2^2,
+
+the upper end raised by the share of p that a search may have missed, as that of the sampling interval is
+(`samplers.statistics`): S does not hold it, since the refits miss what the run misses. It is nowhere
+narrower than the sampling interval, which of few draws is wider than their c.o.v. says.
+
+Where refits choose their family anew, each family has such an interval, and the whole reaches from the lowest end to
+the highest; what is expected for the next event is a sum over the families (`samplers.analysis.refits`).
+Percentiles of the p_b are not used: refits repeat the bias of the fit, and 30 of them do not reach the outer 2.5 %, so
+that percentiles cover 76 and 82 % (38 and 400 events) and miss on the unsafe side. This interval covers 93 and 92 %
+where the family of distributions is the true one (`benchmarks/uncertainty/base_coverage.py`). Another family is not
+covered by it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+
+from samplers.analysis.refits import (
+    MAX_UNCOVERED_SHARE,
+    EnsembleEstimate,
+    FittedBase,
+    RefitSums,
+    count_uncovered,
+    deviate_within_families,
+    expect_over_families,
+    find_fitted_base,
+    find_log_ends,
+    read_refit_families,
+    reweight_runs_to_refits,
+    split_families,
+)
+from samplers.analysis.weighted import (
+    WeightedEstimate,
+    band_generator,
+    no_outcome_weight,
+    require_sample,
+    simultaneous_level,
+)
+from samplers.problem import FloatArray
+from samplers.statistics import Interval
+from samplers.stored import to_json_value
+
+FIT_BIAS = 0.2
+"""Bias of the fit itself in log p (floor of the covariances, local optima of the mixture), which refits repeat: it
+keeps the interval of thousands of events from being too narrow, and is nothing beside the spread at 38."""
+MAX_SPREAD = 2.0
+"""Standard deviation of log p_b above which the events do not determine p."""
+MIN_REFITS = 2
+"""Refits, and clusters of events, from which there is a spread at all."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class BaseUncertainty:
+    """What is known of p, given the events that the base distribution was fitted to.
+
+    Example:
+        >>> found = BaseUncertainty(
+        ...     p=7.8e-4, interval=(3.2e-5, 1.9e-2), expected=2e-3, spread=1.4, bound=None, confidence=0.95,
+        ...     p_refits=(2e-4, 1e-3, 3e-3), ess_refits=(150.0, 200.0, 90.0), clusters=17,
+        ...     fitted_to="38 + 15 events of 17 scenes", family="1 component, log gaps")
+        >>> print(found)  # doctest: +NORMALIZE_WHITESPACE
+        base distribution 95 %  3.2e-05 to 1.9e-02 (38 + 15 events of 17 scenes, 3 refits); predictive mean
+        2e-03
+          assumes that the fitted family is correct (1 component, log gaps); errors of the family are not included
+    """
+
+    p: float
+    """Probability under the base distribution itself."""
+    interval: Interval | None
+    """Interval that should hold the p of the true distribution with probability `confidence`, if that is of the fitted
+    family; None where the events do not determine p, or p under the refits is not known."""
+    expected: float | None
+    """Probability that the next event fails, the error of the fit averaged: p exp(s^2 / 2) with s the standard
+    deviation of log p over the refits; over several families of refits the sum of such means, by their shares."""
+    spread: float
+    """Standard deviation of log p over the refits; NaN where it is not known."""
+    bound: float | None
+    """Upper end in place of an interval, where the events do not determine p (a spread above 2)."""
+    confidence: float
+    """Nominal coverage of `interval`."""
+    p_refits: tuple[float, ...]
+    """p under each refit; empty where it is not known."""
+    ess_refits: tuple[float, ...]
+    """Effective number of failing points behind each of these; a path of a Markov chain counts as one."""
+    clusters: int
+    """Independent clusters among the events."""
+    fitted_to: str
+    """The events in words."""
+    family: str
+    """The family of distributions in words."""
+    n_sim: int = 0
+    """Simulations of the further run under the mixture of the refits; 0 where none was needed."""
+    reason: str = ""
+    """Why p under the refits, or their spread, is not known; empty if it is."""
+    warnings: tuple[str, ...] = ()
+    """What makes these numbers doubtful."""
+
+    def __str__(self) -> str:
+        """Return a few lines for people."""
+        behind = f"({self.fitted_to}, {len(self.p_refits)} refits)"
+        if self.interval is not None:
+            low, high = self.interval
+            first = f"{100 * self.confidence:g} %  {low:.1e} to {high:.1e} {behind}"
+            first += "" if self.expected is None else f"; predictive mean {self.expected:.0e}"
+        elif self.bound is not None:
+            below = f"below {self.bound:.1e} in this family" if self.bound < 1 else "nor an upper end in this family"
+            first = f" the events do not determine p; {below} {behind}"
+        else:
+            return f"base distribution  no interval: {self.reason}"
+        lines = [
+            f"base distribution {first}",
+            f"  assumes that the fitted family is correct ({self.family}); errors of the family are not included",
+        ]
+        if self.n_sim:
+            lines.append(f"  p of the refits from a further {self.n_sim:,} simulations under their mixture")
+        return "\n".join(lines + [f"  warning: {text}" for text in self.warnings])
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain numbers for JSON; NaN becomes None."""
+        return {name: to_json_value(value) for name, value in asdict(self).items()}
+
+
+def compute_base_uncertainty(estimate: EnsembleEstimate) -> BaseUncertainty | None:
+    """Return the uncertainty of p that the events leave, or None where the base distribution has no refits.
+
+    p under each refit comes from the failing points of the run; where there is a further run under the mixture of the
+    refits, from those of the two that are worth more effective points under that refit. The lower end leaves out
+    points without an outcome where these only bound p (`on_error="bound"`).
+
+    Args:
+        estimate: With weighted points, on a base distribution with refits; see `Estimate.base_uncertainty`.
+    """
+    fitted = find_fitted_base(estimate.base)
+    if fitted is None:
+        return None
+    sums, low_factor, reason = RefitSums(np.empty((1, 0)), np.empty((1, 0))), 1.0, ""
+    try:
+        sums = reweight_runs_to_refits(estimate, fitted.refits)
+        low_factor = _lower_factor(estimate)
+    except ValueError as error:
+        reason = str(error)
+    further = estimate.ensemble_run
+    doubts = [] if further is None else [f"in the further run: {text}" for text in further.warnings]
+    return summarise_refits(
+        estimate.p,
+        estimate.cov,
+        estimate.confidence,
+        fitted,
+        sums,
+        sampling=estimate.interval,
+        lineages=read_lineages(estimate),
+        low_factor=low_factor,
+        n_sim=0 if further is None else further.n_sim,
+        doubts=doubts,
+        reason=reason,
+    )
+
+
+def summarise_refits(
+    value: float,
+    cov: float,
+    confidence: float,
+    fitted: FittedBase,
+    sums: RefitSums,
+    *,
+    sampling: Interval | None = None,
+    lineages: float = math.inf,
+    low_factor: float = 1.0,
+    largest: float = 1.0,
+    n_sim: int = 0,
+    doubts: Sequence[str] = (),
+    reason: str = "",
+) -> BaseUncertainty:
+    """Return the uncertainty of a probability, or of another expectation over failures, from its values under refits.
+
+    Args:
+        value: Under the base distribution itself.
+        cov: Its coefficient of variation.
+        confidence: Nominal coverage of the interval.
+        fitted: The base.
+        sums: Values under each refit, one row; as shares of `largest`.
+        sampling: Interval of the sampling alone, which the interval is to hold; None where it need not.
+        lineages: Independent searches behind the value, see `Sample.lineages`; inf without a search.
+        low_factor: Factor of the lower end.
+        largest: Largest value possible, 1 for a probability.
+        n_sim: Simulations of a further run.
+        doubts: Further warnings.
+        reason: Why the values are not known.
+    """
+    log_values, ess = sums.log_p[0] + math.log(largest), sums.ess[0]
+    reason = reason or explain_missing_spread(log_values, fitted.clusters)
+    interval, expected, spread, bound = None, None, math.nan, None
+    if not reason:
+        spread = float(log_values.std(ddof=1))
+        families = split_families(math.log(value), log_values, read_refit_families(fitted, len(log_values)))
+        below, above = find_log_ends(families, cov**2 + FIT_BIAS**2, confidence, fitted.clusters, lineages)
+        low, high = low_factor * scale_by_exp(1.0, below), min(largest, scale_by_exp(1.0, above))
+        low, high = (low, high) if sampling is None else (min(low, sampling[0]), max(high, sampling[1]))
+        if spread <= MAX_SPREAD:
+            interval, expected = (low, high), expect_over_families(families, largest)
+        else:
+            bound = high
+    return BaseUncertainty(
+        p=value,
+        interval=interval,
+        expected=expected,
+        spread=spread,
+        bound=bound,
+        reason=reason,
+        confidence=confidence,
+        p_refits=tuple(float(each) for each in np.exp(log_values)),
+        ess_refits=tuple(float(each) for each in ess),
+        clusters=fitted.clusters,
+        fitted_to=fitted.fitted_to,
+        family=fitted.family,
+        n_sim=n_sim,
+        warnings=(*describe_coverage(ess), *doubts),
+    )
+
+
+def explain_missing_spread(log_values: FloatArray, clusters: int) -> str:
+    """Return why values of the refits (R,), as logarithms, have no spread; empty if they have one."""
+    if len(log_values) < MIN_REFITS or clusters < MIN_REFITS:
+        return f"a spread needs {MIN_REFITS} refits and {MIN_REFITS} clusters, got {len(log_values)} and {clusters}."
+    missing = int(np.count_nonzero(~np.isfinite(log_values)))
+    if missing:
+        return f"{missing} of {len(log_values)} refits have no density at any failing point, so that p is not known."
+    return ""
+
+
+def scale_by_exp(value: float, exponent: float) -> float:
+    """Return value exp(exponent) for value > 0, formed in logarithms; inf where that is no float."""
+    exponent += math.log(value)
+    return math.exp(exponent) if exponent < math.log(np.finfo(np.float64).max) else math.inf
+
+
+def describe_coverage(ess: FloatArray) -> tuple[str, ...]:
+    """Return a warning if more than a tenth of the refits rest on under 10 effective failing points (R,)."""
+    few = count_uncovered(ess)
+    if few <= MAX_UNCOVERED_SHARE * len(ess):
+        return ()
+    return (f"{few} of {len(ess)} refits rest on under 10 effective failing points: the spread is coarse.",)
+
+
+def read_lineages(estimate: WeightedEstimate) -> float:
+    """Return the independent searches that reached failure behind an estimate; inf without a search or points."""
+    return math.inf if estimate.sample is None else estimate.sample.lineages
+
+
+def _lower_factor(estimate: WeightedEstimate) -> float:
+    """Return the share of p from points that have an outcome where the others only bound p; else 1."""
+    sample = require_sample(estimate)
+    return 1 - no_outcome_weight(estimate, sample) / float(sample.weights[sample.f <= estimate.gamma].sum())
+
+
+RATIO_CHECK_DRAWS = 16
+"""Draws at which the refits of two estimates are compared."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RatioUncertainty:
+    """What is known of the ratio of two probabilities, given the events that their base distribution was fitted to.
+
+    Example:
+        >>> found = RatioUncertainty(
+        ...     ratio=1.8, interval=(1.1, 2.9), spread=0.15, confidence=0.95, ratio_refits=(1.7, 1.9, 2.1),
+        ...     ess_refits=(150.0, 200.0, 90.0), clusters=17, fitted_to="38 + 15 events of 17 scenes",
+        ...     family="1 component, log gaps")
+        >>> print(found)
+        base distribution 95 %  1.1 to 2.9 (38 + 15 events of 17 scenes, 3 refits)
+          assumes that the fitted family is correct (1 component, log gaps); errors of the family are not included
+    """
+
+    ratio: float
+    """p_1 / p_2 under the base distribution itself."""
+    interval: Interval | None
+    """Interval that should hold the ratio under the true distribution with probability `confidence`, if that is of
+    the fitted family; None where the events do not determine it, or it is not known under the refits."""
+    spread: float
+    """Standard deviation of the logarithm of the ratio over the refits; NaN where it is not known."""
+    confidence: float
+    """Nominal coverage of `interval`."""
+    ratio_refits: tuple[float, ...]
+    """The ratio under each refit; empty where it is not known."""
+    ess_refits: tuple[float, ...]
+    """Effective number of failing points behind each of these, of the one of the two that has fewer."""
+    clusters: int
+    """Independent clusters among the events."""
+    fitted_to: str
+    """The events in words."""
+    family: str
+    """The family of distributions in words."""
+    n_sim: int = 0
+    """Simulations of further runs under the mixture of the refits; 0 where none was needed."""
+    reason: str = ""
+    """Why there is no interval; empty if there is one."""
+    warnings: tuple[str, ...] = ()
+    """What makes these numbers doubtful."""
+
+    def __str__(self) -> str:
+        """Return a few lines for people."""
+        if self.interval is None:
+            return f"base distribution  no interval: {self.reason}"
+        low, high = self.interval
+        lines = [
+            f"base distribution {100 * self.confidence:g} %  {low:.2g} to {high:.2g} "
+            f"({self.fitted_to}, {len(self.ratio_refits)} refits)",
+            f"  assumes that the fitted family is correct ({self.family}); errors of the family are not included",
+        ]
+        if self.n_sim:
+            lines.append(f"  under the refits from a further {self.n_sim:,} simulations under their mixture")
+        return "\n".join(lines + [f"  warning: {text}" for text in self.warnings])
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain numbers for JSON; NaN and infinities become None."""
+        return {name: to_json_value(value) for name, value in asdict(self).items()}
+
+
+def compute_ratio_uncertainty(first: EnsembleEstimate, second: EnsembleEstimate) -> RatioUncertainty:
+    """Return p_1 / p_2 of two estimates with the interval that the events behind their base distribution allow.
+
+    The two are estimates of their own on the same base distribution, of two egos for example. `samplers.compare`
+    estimates a ratio from the same draws for both, and states this uncertainty too (`Comparison.base_uncertainty`).
+
+    Args:
+        first: Estimate of p_1, on a base distribution with refits.
+        second: Estimate of p_2, on the same base distribution; it may have noise coordinates of its own.
+
+    Raises:
+        ValueError: If a base has no refits or the refits differ, the confidence differs, or an estimate has no failing
+            points.
+
+    Example:
+        >>> import samplers
+        >>> problem = samplers.FunctionProblem(lambda x: 3.0 - x[:, 0], dim=2)
+        >>> result = samplers.estimate(problem, seed=0, max_sim=2000)
+        >>> compute_ratio_uncertainty(result, result)
+        Traceback (most recent call last):
+            ...
+        ValueError: Expected two estimates on the same base distribution with refits, got StandardNormal.
+    """
+    bases = _require_same_refits(first, second)
+    if first.confidence != second.confidence:
+        raise ValueError(
+            f"Expected the same confidence, got {first.confidence:g} and {second.confidence:g}; give both estimates "
+            "one confidence=..."
+        )
+    one, two = (reweight_runs_to_refits(each, base.refits) for each, base in zip((first, second), bases, strict=True))
+    further = [each.ensemble_run for each in (first, second) if each.ensemble_run is not None]
+    return summarise_ratio(
+        first.p / second.p,
+        math.hypot(first.cov, second.cov),
+        RefitSums(np.concatenate([one.log_p, two.log_p]), np.concatenate([one.ess, two.ess])),
+        bases[0],
+        first.confidence,
+        sum(run.n_sim for run in further),
+    )
+
+
+def summarise_ratio(
+    ratio: float,
+    cov: float,
+    sums: RefitSums | None,
+    fitted: FittedBase,
+    confidence: float,
+    n_sim: int = 0,
+    sampling: Interval | None = None,
+) -> RatioUncertainty:
+    """Return the uncertainty of a ratio.
+
+    Args:
+        ratio: p_1 / p_2 under the base distribution itself.
+        cov: Standard error of its logarithm.
+        sums: The two probabilities under R refits, shape (2, R); None where one of them is 0 in the run itself.
+        fitted: The base distribution.
+        confidence: Nominal coverage.
+        n_sim: Simulations of further runs.
+        sampling: Interval of the sampling alone, which the interval is to hold; None where it need not.
+    """
+    log_ratios, ess, reason = np.empty(0), np.empty(0), "one of the two never failed."
+    if sums is not None:
+        known = np.isfinite(sums.log_p).all(axis=0)
+        log_ratios = np.where(known, np.subtract(*np.where(known, sums.log_p, 0.0)), -np.inf)
+        ess = sums.ess.min(axis=0)
+        reason = explain_missing_spread(log_ratios, fitted.clusters)
+    spread = math.nan if reason else float(log_ratios.std(ddof=1))
+    interval = None
+    if spread > MAX_SPREAD:
+        reason = f"the events do not determine the ratio: the spread of its logarithm is {spread:.1f}."
+    elif not reason:
+        families = split_families(math.log(ratio), log_ratios, read_refit_families(fitted, len(log_ratios)))
+        ends = find_log_ends(families, cov**2 + FIT_BIAS**2, confidence, fitted.clusters)
+        low, high = (scale_by_exp(1.0, end) for end in ends)
+        interval = (low, high) if sampling is None else (min(low, sampling[0]), max(high, sampling[1]))
+    return RatioUncertainty(
+        ratio=ratio,
+        interval=interval,
+        spread=spread,
+        confidence=confidence,
+        ratio_refits=tuple(scale_by_exp(1.0, float(each)) for each in log_ratios),
+        ess_refits=tuple(float(each) for each in ess),
+        clusters=fitted.clusters,
+        fitted_to=fitted.fitted_to,
+        family=fitted.family,
+        n_sim=n_sim,
+        reason=reason,
+        warnings=describe_coverage(ess),
+    )
+
+
+def _require_same_refits(first: EnsembleEstimate, second: EnsembleEstimate) -> tuple[FittedBase, FittedBase]:
+    """Return the bases of both, or raise a ValueError unless both have the same refits.
+
+    Densities are compared where both have the same coordinates; with noise coordinates of one of them only the number
+    of refits and the events can be.
+    """
+    bases = [find_fitted_base(each.base) for each in (first, second)]
+    for base, each in zip(bases, (first, second), strict=True):
+        if base is None:
+            raise ValueError(
+                f"Expected two estimates on the same base distribution with refits, got {type(each.base).__name__}."
+            )
+    one, two = (base for base in bases if base is not None)
+    x, y = (base.sample(RATIO_CHECK_DRAWS, np.random.default_rng(0)) for base in (one, two))
+    same = (one.fitted_to, one.family, len(one.refits)) == (two.fitted_to, two.family, len(two.refits))
+    if same and x.shape == y.shape:
+        pairs = zip(one.refits, two.refits, strict=True)
+        same = all(np.allclose(a.log_prob(x), b.log_prob(x), rtol=1e-9, atol=1e-9) for a, b in pairs)
+    if not same:
+        raise ValueError(
+            f"Expected two estimates under the same refits, got {len(one.refits)} of {one.fitted_to} ({one.family}) "
+            f"and {len(two.refits)} of {two.fitted_to} ({two.family}), with other densities."
+        )
+    return one, two
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class RefitBand:
+    """Band of an exceedance curve that the events behind a fitted base allow, for all thresholds together.
+
+    Fields of shape (k,) belong to the thresholds of the curve.
+
+    Example:
+        >>> ends = {"low": np.array([1e-4, 0.0]), "high": np.array([4e-3, 4e-3]), "spread": np.array([0.9, np.nan])}
+        >>> band = RefitBand(**ends, confidence=0.95, n_refits=30, fitted_to="40 events", family="1 component")
+        >>> band.to_dict()["spread"]
+        [0.9, None]
+    """
+
+    low: FloatArray
+    """Lower ends, shape (k,); 0 where the events do not determine the probability, or too few units exceed the
+    threshold, and no higher threshold has one."""
+    high: FloatArray
+    """Upper ends, shape (k,); where too few units exceed the threshold, that of the next lower one."""
+    spread: FloatArray
+    """Standard deviation of log P over the refits, shape (k,); NaN where it is not known."""
+    confidence: float
+    """Nominal probability that the band holds the truth at all thresholds together, if it is of the fitted family."""
+    n_refits: int
+    """Number of refits."""
+    fitted_to: str
+    """The events in words."""
+    family: str
+    """The family of distributions in words."""
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain lists and numbers for JSON; NaN becomes None."""
+        values = asdict(self)
+        return {name: to_json_value(v.tolist() if isinstance(v, np.ndarray) else v) for name, v in values.items()}
+
+
+def compute_refit_band(
+    thresholds: FloatArray,
+    p: FloatArray,
+    cov: FloatArray,
+    correlation: FloatArray,
+    sums: RefitSums,
+    fitted: FittedBase,
+    *,
+    confidence: float,
+    seed: int,
+    lineages: float = math.inf,
+) -> RefitBand:
+    """Return the band for probabilities P[failure and v > t] at k thresholds t.
+
+    Args:
+        thresholds: t in any order, shape (k,).
+        p: Under the base itself, shape (k,); 0 where it is not known.
+        cov: Their coefficients of variation, shape (k,).
+        correlation: Of their sampling errors, shape (k, k).
+        sums: The same under R refits, k parts.
+        fitted: The base.
+        confidence: Nominal coverage of the band.
+        seed: Of the run.
+        lineages: Independent searches behind p, see `Sample.lineages`.
+    """
+    known = [i for i in range(len(p)) if p[i] > 0 and not explain_missing_spread(sums.log_p[i], fitted.clusters)]
+    low, high, spread = np.zeros(len(p)), np.ones(len(p)), np.full(len(p), np.nan)
+    if known:
+        errors = _correlate_errors(cov[known], correlation[np.ix_(known, known)], sums.log_p[known], fitted)
+        level = simultaneous_level(errors, confidence, band_generator(seed))
+    for i in known:
+        values = RefitSums(sums.log_p[i : i + 1], sums.ess[i : i + 1])
+        found = summarise_refits(float(p[i]), float(cov[i]), level, fitted, values, lineages=lineages)
+        low[i], high[i] = found.interval or (0.0, 1.0 if found.bound is None else found.bound)
+        spread[i] = found.spread
+    rising = np.argsort(thresholds)
+    high[rising] = np.minimum.accumulate(high[rising])
+    low[rising] = np.maximum.accumulate(low[rising][::-1])[::-1]
+    return RefitBand(
+        low=low,
+        high=high,
+        spread=spread,
+        confidence=confidence,
+        n_refits=len(fitted.refits),
+        fitted_to=fitted.fitted_to,
+        family=fitted.family,
+    )
+
+
+def _correlate_errors(cov: FloatArray, correlation: FloatArray, log_p: FloatArray, fitted: FittedBase) -> FloatArray:
+    """Return the correlation of the errors of log p at k thresholds, shape (k, k); log_p of R refits is (k, R)."""
+    deviations, freedom = deviate_within_families(log_p, read_refit_families(fitted, log_p.shape[1]))
+    covariance = deviations @ deviations.T / freedom + np.outer(cov, cov) * correlation + FIT_BIAS**2
+    scale = 1 / np.sqrt(np.diag(covariance))
+    return np.asarray(covariance * np.outer(scale, scale))

@@ -1,0 +1,381 @@
+"""Expectations over failures: E[h(X); failure] of a quantity h >= 0, with the errors of sampling and of the base."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from os import PathLike
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from samplers.analysis.base_error import BaseUncertainty, RefitBand, compute_refit_band, read_lineages, summarise_refits
+from samplers.analysis.curve import ProbabilityCurve, as_thresholds
+from samplers.analysis.refits import (
+    EnsembleEstimate,
+    FittedBase,
+    RefitSums,
+    choose_better_run,
+    find_fitted_base,
+    reweight_to_refits,
+)
+from samplers.analysis.weighted import (
+    MIN_UNITS,
+    UnitSums,
+    WeightedEstimate,
+    WeightedFailures,
+    interval_of_sum,
+    require_sample,
+    simultaneous_intervals,
+    unit_sums,
+)
+from samplers.display import drawing_axes
+from samplers.problem import FloatArray
+from samplers.sample import Sample
+from samplers.statistics import Interval, effective_number
+from samplers.stored import to_json_value
+
+
+@dataclass(frozen=True, kw_only=True)
+class FailureExpectation:
+    """E[h(X); failure], the expectation of a quantity h >= 0 that is 0 where nothing fails.
+
+    Example:
+        With p = 0.01 and E[h(X) | failure] = 2:
+
+        >>> found = FailureExpectation(value=0.02, interval=(0.01, 0.04), confidence=0.95, cov=0.35, per_failure=2.0)
+        >>> found.value / found.per_failure, found.to_dict()["interval"]
+        (0.01, [0.01, 0.04])
+    """
+
+    value: float
+    """The expectation, over all X."""
+    interval: Interval
+    """Interval that should hold it with probability `confidence`."""
+    confidence: float
+    """Nominal coverage of `interval`."""
+    cov: float
+    """Coefficient of variation of `value`."""
+    per_failure: float
+    """E[h(X) | failure]."""
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain numbers for JSON."""
+        return {name: to_json_value(value) for name, value in asdict(self).items()}
+
+
+def expect_over_failures(
+    failures: WeightedFailures, values: FloatArray, confidence: float = 0.95
+) -> FailureExpectation:
+    """Return E[h(X); failure] = sum of w h, with a log-normal interval from the spread over independent units.
+
+    Args:
+        failures: Weighted failing points.
+        values: h >= 0 at these points, shape (k,).
+        confidence: Nominal coverage of the interval.
+
+    Raises:
+        ValueError: If h is not one finite number >= 0 per point, or 0 at all of them.
+
+    Example:
+        h = 1, 1, 3, 3 at 4 failures among 400 plain draws: (1 + 1 + 3 + 3) / 400.
+
+        >>> failures = WeightedFailures(
+        ...     x=np.zeros((4, 2)), rows=np.arange(4), has_outcome=np.full(4, True), weights=np.full(4, 1 / 400),
+        ...     units=np.arange(4), n_units=400, independent=True, inflation=1.0, total=4)
+        >>> found = expect_over_failures(failures, np.array([1.0, 1.0, 3.0, 3.0]))
+        >>> round(found.value, 6), round(found.per_failure, 6)
+        (0.02, 2.0)
+    """
+    h = np.asarray(values, dtype=np.float64)
+    if h.shape != failures.weights.shape or not (np.isfinite(h).all() and (h >= 0).all()):
+        raise ValueError(f"Expected a finite value >= 0 for each of {len(failures.weights)} points, got {values!r}.")
+    largest = float(h.max())
+    if largest == 0:
+        raise ValueError("The quantity is 0 at every failing point: its expectation has no interval.")
+    terms = failures.weights * h
+    value, cov = float(terms.sum()), failures.cov_of_sum(terms)
+    units = effective_number(failures.unit_totals(terms))
+    # in units of the largest value, so that the cut at 1 is the bound h <= largest
+    low, high = interval_of_sum(value / largest, cov, units, failures.independent, confidence)
+    return FailureExpectation(
+        value=value,
+        interval=(low * largest, high * largest),
+        confidence=confidence,
+        cov=cov,
+        per_failure=value / float(failures.weights.sum()),
+    )
+
+
+class FurtherFailures(NamedTuple):
+    """Failing points of the further run under the mixture of the refits, with a quantity at them.
+
+    Example:
+        >>> import samplers
+        >>> from samplers.analysis.weighted import weigh_failures
+        >>> problem = samplers.FunctionProblem(lambda x: 1.0 - x[:, 0], dim=2)
+        >>> failures = weigh_failures(samplers.estimate(problem, "mc", seed=0, max_sim=1000))
+        >>> bool((FurtherFailures(failures, failures.x[:, 0]).values >= 1.0).all())
+        True
+    """
+
+    failures: WeightedFailures
+    values: FloatArray
+    """Shape (k,)."""
+
+
+def expect_under_refits(
+    estimate: EnsembleEstimate,
+    failures: WeightedFailures,
+    values: FloatArray,
+    expectation: FailureExpectation,
+    further: FurtherFailures | None = None,
+) -> BaseUncertainty | None:
+    """Return the uncertainty of E[h(X); failure] that the events behind a fitted base leave, as that of p.
+
+    Args:
+        estimate: The run.
+        failures: Its weighted failing points.
+        values: h at these points, shape (k,).
+        expectation: E[h(X); failure] under the base itself.
+        further: The same of the run's `ensemble_run`, if it has one; without it the points of the run itself count.
+
+    Returns:
+        Its `p` is the expectation; None where the base has no refits.
+
+    Example:
+        h = 2 at every failing point, P[x >= 1] under N(0, 1) and under its refits N(-0.2, 1), N(0, 1) and N(0.2, 1):
+        2 Phi(-1.2), 2 Phi(-1) and 2 Phi(-0.8).
+
+        >>> import samplers
+        >>> from types import SimpleNamespace
+        >>> from samplers.analysis.weighted import weigh_failures
+        >>> from samplers.proposals import Gaussian
+        >>> class FittedNormal(samplers.StandardNormal):
+        ...     refits = [Gaussian(np.array([mean]), np.eye(1)) for mean in (-0.2, 0.0, 0.2)]
+        ...     clusters, fitted_to, family = 17, "40 events of 17 scenes", "normal"
+        >>> problem = SimpleNamespace(dim=1, base=FittedNormal(1), evaluate=lambda x: 1.0 - x[:, 0])
+        >>> result = samplers.estimate(problem, "mc", seed=0, max_sim=10_000)
+        >>> failures = weigh_failures(result)
+        >>> h = np.full(len(failures.x), 2.0)
+        >>> found = expect_under_refits(result, failures, h, expect_over_failures(failures, h))
+        >>> [round(value, 2) for value in found.p_refits]
+        [0.23, 0.32, 0.42]
+    """
+    fitted = find_fitted_base(estimate.base)
+    if fitted is None:
+        return None
+    largest = max(float(np.max(values)), 0.0 if further is None else float(np.max(further.values)))
+    more = None if further is None else (further.failures, further.values[None] / largest)
+    sums, reason = RefitSums(np.empty((1, 0)), np.empty((1, 0))), ""
+    try:
+        sums = sum_parts_under_refits(estimate, fitted, (failures, values[None] / largest), more)
+    except ValueError as error:
+        reason = str(error)
+    return summarise_refits(
+        expectation.value,
+        expectation.cov,
+        estimate.confidence,
+        fitted,
+        sums,
+        sampling=expectation.interval,
+        lineages=read_lineages(estimate),
+        largest=largest,
+        n_sim=0 if further is None or estimate.ensemble_run is None else estimate.ensemble_run.n_sim,
+        reason=reason,
+    )
+
+
+def sum_parts_under_refits(
+    estimate: EnsembleEstimate,
+    fitted: FittedBase,
+    own: tuple[WeightedFailures, FloatArray],
+    further: tuple[WeightedFailures, FloatArray] | None = None,
+) -> RefitSums:
+    """Return m parts of p under R refits, each from the run or its further run, whichever has more points for it.
+
+    Args:
+        estimate: The run.
+        fitted: Its base.
+        own: Its weighted failing points and what share of each belongs to each part, shape (m, k).
+        further: The same of its `ensemble_run`.
+
+    Raises:
+        ValueError: If nothing failed, or a density is not finite.
+    """
+    found = [reweight_to_refits(estimate, fitted.refits, _spread_over_all(estimate, *own))]
+    run = estimate.ensemble_run
+    if further is not None and run is not None:
+        found.append(reweight_to_refits(run, fitted.refits, _spread_over_all(run, *further)))
+    return choose_better_run(found)
+
+
+def _spread_over_all(estimate: WeightedEstimate, failures: WeightedFailures, shares: FloatArray) -> FloatArray:
+    """Return shares (m, k) of some failing points as shares (m, total) of all, which add up to the same parts of p."""
+    sample = require_sample(estimate)
+    weights = sample.weights[sample.f <= estimate.gamma]
+    parts = np.zeros((len(shares), failures.total))
+    parts[:, failures.rows] = shares * (weights.sum() / weights[failures.rows].sum())
+    return parts
+
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+NOWHERE = 1e308
+"""Stands for the f of points that exceed no threshold: above all thresholds, and finite."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Exceedance(ProbabilityCurve):
+    """P[failure and v(X) > t] at several thresholds t, with a band that should hold all of them at once.
+
+    `low` is 0 where fewer than 5 effective independent units exceed the threshold, and `high` there that of the next
+    lower threshold, which bounds it.
+
+    Example:
+        >>> import samplers
+        >>> from samplers.analysis import weigh_failures
+        >>> problem = samplers.FunctionProblem(lambda x: 3.0 - x[:, 0], dim=2)
+        >>> result = samplers.estimate(problem, "mc", seed=0, max_sim=100_000)
+        >>> failures = weigh_failures(result)
+        >>> curve = compute_exceedance(result, failures, failures.x[:, 0], [3.0, 3.5])  # Phi(-3), Phi(-3.5)
+        >>> print(curve)
+                   t P[failure, v > t]   95 % band
+                   3  1.410e-03   [1.162e-03, 1.695e-03]
+                 3.5  2.700e-04   [1.686e-04, 4.090e-04]
+    """
+
+    thresholds: FloatArray
+    """Thresholds t, shape (k,), in the order asked for."""
+    base: RefitBand | None = None
+    """Band that the events behind the base distribution allow; None where it has no refits, or these tell
+    nothing of any threshold."""
+
+    axis = "thresholds"
+    symbol = "t"
+    event = "failure, v > t"
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain lists and numbers for JSON."""
+        return {**super().to_dict(), "base": None if self.base is None else self.base.to_dict()}
+
+    def plot(self, ax: Axes | str | PathLike[str] | None = None) -> Axes:
+        """Draw the curve, its band and that of the base distribution, p on a log scale; needs matplotlib.
+
+        Args:
+            ax: Where to draw, or the path of an image to write, such as "p.png"; None takes pyplot's current axes.
+        """
+        with drawing_axes(ax) as axes:
+            super().plot(axes)
+            axes.collections[-1].set_label(f"sampling, {100 * self.confidence:g} % of all together")
+            if self.base is not None:
+                positive = np.concatenate([self.p / 10, self.base.low])
+                order, floor = np.argsort(self.thresholds), positive[positive > 0].min(initial=1.0)
+                low, high = (np.maximum(each[order], floor) for each in (self.base.low, self.base.high))
+                label = f"base distribution, {100 * self.base.confidence:g} % of all together"
+                axes.fill_between(self.thresholds[order], low, high, color="C1", alpha=0.2, linewidth=0, label=label)
+            axes.legend(frameon=False)
+        return axes
+
+
+def compute_exceedance(
+    estimate: EnsembleEstimate,
+    failures: WeightedFailures,
+    values: FloatArray,
+    thresholds: ArrayLike,
+    further: FurtherFailures | None = None,
+) -> Exceedance:
+    """Return P[failure and v > t] over thresholds t, with a simultaneous (sup-t) band as that of `Estimate.curve`.
+
+    Where the base has refits, the curve also has the band that its events allow.
+
+    Args:
+        estimate: The run.
+        failures: Its weighted failing points.
+        values: v at these points, shape (k,); -inf where it exceeds no threshold.
+        thresholds: Thresholds t, in any order.
+        further: Failing points of the run's `ensemble_run` with v, if it has one; they count for the refits alone.
+
+    Raises:
+        ValueError: If v is not one number per point, or a threshold is not finite.
+
+    Example:
+        v = x_1 where x_2 > 0, in plain draws from N(0, I): Phi(-1) / 2 = 0.079 and Phi(-2) / 2 = 0.011.
+
+        >>> import samplers
+        >>> from samplers.analysis import weigh_failures
+        >>> problem = samplers.FunctionProblem(lambda x: 1.0 - x[:, 0], dim=2)
+        >>> result = samplers.estimate(problem, "mc", seed=0, max_sim=10_000)
+        >>> failures = weigh_failures(result)
+        >>> v = np.where(failures.x[:, 1] > 0, failures.x[:, 0], -np.inf)
+        >>> compute_exceedance(result, failures, v, [1.0, 2.0]).p.round(2).tolist()
+        [0.08, 0.01]
+    """
+    v = np.asarray(values, dtype=np.float64)
+    if v.shape != failures.weights.shape or np.isnan(v).any() or np.isposinf(v).any():
+        raise ValueError(f"Expected a number for each of {len(failures.weights)} points, got {values!r}.")
+    asked = as_thresholds(thresholds)
+    below = np.nextafter(-asked, -np.inf)  # -v <= below says v > t
+    grid, place = np.unique(np.append(below, NOWHERE), return_inverse=True)
+    sums = _sum_by_threshold(failures, np.where(np.isneginf(v), NOWHERE, -v), grid)
+    cov = np.where(sums.is_count, 1.0, failures.inflation) * sums.cov
+    use = np.flatnonzero(sums.ess >= MIN_UNITS)
+    low, high = simultaneous_intervals(sums, use, sums.p, cov, estimate.confidence, estimate.seed)
+    low = np.maximum.accumulate(low)
+    high = np.minimum.accumulate(high[::-1])[::-1]
+    here = place[:-1]
+    enough = np.where(sums.ess >= MIN_UNITS, sums.p, 0.0)
+    sampling = enough[here], cov[here], sums.correlation[np.ix_(here, here)]
+    return Exceedance(
+        thresholds=asked,
+        p=sums.p[here],
+        low=low[here],
+        high=high[here],
+        cov=cov[here],
+        ess=sums.ess[here],
+        confidence=estimate.confidence,
+        base=_band_under_refits(estimate, (failures, v), further, asked, sampling),
+    )
+
+
+def _sum_by_threshold(failures: WeightedFailures, f: FloatArray, grid: FloatArray) -> UnitSums:
+    """Return the sums of the weights of points with f (k,) up to each of rising thresholds."""
+    sample = Sample(f=f, weights=failures.weights, units=failures.units, n_units=failures.n_units, x=failures.x)
+    sums = unit_sums(sample, grid)
+    return UnitSums(p=sums.p, second=sums.second, n_units=sums.n_units, independent=failures.independent)
+
+
+def _band_under_refits(
+    estimate: EnsembleEstimate,
+    own: tuple[WeightedFailures, FloatArray],
+    further: FurtherFailures | None,
+    thresholds: FloatArray,
+    sampling: tuple[FloatArray, FloatArray, FloatArray],
+) -> RefitBand | None:
+    """Return the band that refits allow for probabilities at k thresholds; None where these tell nothing of any.
+
+    `sampling` has the probabilities (k,), 0 where too few units exceed the threshold, their c.o.v. (k,) and the
+    correlation of their errors (k, k).
+    """
+    fitted = find_fitted_base(estimate.base)
+    if fitted is None:
+        return None
+    beyond = [
+        None if each is None else (each[0], (each[1] > thresholds[:, None]).astype(np.float64))
+        for each in (own, further)
+    ]
+    assert beyond[0] is not None
+    try:
+        sums = sum_parts_under_refits(estimate, fitted, beyond[0], beyond[1])
+    except ValueError:  # p itself is not known under the refits, as `BaseUncertainty` says
+        return None
+    band = compute_refit_band(
+        thresholds,
+        *sampling,
+        sums,
+        fitted,
+        confidence=estimate.confidence,
+        seed=estimate.seed,
+        lineages=read_lineages(estimate),
+    )
+    return band if np.isfinite(band.spread).any() else None

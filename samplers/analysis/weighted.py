@@ -1,0 +1,408 @@
+"""Weighted points behind an estimate: sums over independent units and their intervals, failures and their weights.
+
+A unit is what was drawn independently: a draw, or a point of level 0 with all that descends from it.
+With T_c the sum of the weights in unit c, p-hat = sum T_c and its variance is sum T_c^2 - p^2 / n.
+
+References:
+    Lee and Whiteley, "Variance estimation in the particle filter", Biometrika 105, 2018 (the spread from roots).
+    Montiel Olea and Plagborg-Moller, "Simultaneous confidence bands: theory, implementation, and an
+    application to SVARs", Journal of Applied Econometrics 34, 2019 (the sup-t band).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, replace
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csr_array
+from scipy.special import ndtr
+
+from samplers.problem import Distribution, FloatArray
+from samplers.sample import Sample
+from samplers.statistics import Interval, clopper_pearson, degrees_of_freedom, effective_number, log_normal_interval
+
+MIN_UNITS = 5.0
+"""Effective number of independent units (draws; paths of chains) that a result must rest on: fewer give a useless t
+interval."""
+
+
+@dataclass(eq=False)
+class RatioStore:
+    """Logarithms of density ratios at the failing points of a run, kept once they were computed.
+
+    Example:
+        >>> store, of = RatioStore(), (object(), object())
+        >>> store.find(of) is None
+        True
+        >>> store.keep(of, np.zeros((2, 3)))
+        >>> store.find(of).shape
+        (2, 3)
+    """
+
+    _of: tuple[object, ...] = ()
+    _ratios: FloatArray = field(default_factory=lambda: np.empty((0, 0)), repr=False)
+
+    def find(self, of: tuple[object, ...]) -> FloatArray | None:
+        """Return what was kept for these very objects; None if it was for others."""
+        same = len(of) == len(self._of) > 0 and all(a is b for a, b in zip(of, self._of, strict=True))
+        return self._ratios if same else None
+
+    def keep(self, of: tuple[object, ...], ratios: FloatArray) -> None:
+        """Keep the ratios that belong to these objects, and forget those before."""
+        self._of, self._ratios = of, ratios
+
+
+class HasName(Protocol):
+    """An object with a name, for messages."""
+
+    @property
+    def name(self) -> str:
+        """Name on the command line."""
+
+
+class HasTotal(Protocol):
+    """Failing points with their number, for messages."""
+
+    @property
+    def total(self) -> int:
+        """Number of failing points that were simulated."""
+
+
+class WeightedEstimate(Protocol):
+    """The attributes of an estimate that curves, reweighting and shares by kind read.
+
+    `samplers.Estimate` is one; each attribute is described there.
+    """
+
+    @property
+    def p(self) -> float:
+        """Estimated probability."""
+
+    @property
+    def cov(self) -> float:
+        """Coefficient of variation of p."""
+
+    @property
+    def gamma(self) -> float:
+        """Threshold of failure."""
+
+    @property
+    def interval(self) -> tuple[float, float]:
+        """Interval of p."""
+
+    @property
+    def confidence(self) -> float:
+        """Nominal coverage of the interval."""
+
+    @property
+    def seed(self) -> int:
+        """Seed of the run."""
+
+    @property
+    def on_error(self) -> str:
+        """Rule for points where f raised or gave NaN."""
+
+    @property
+    def method(self) -> HasName:
+        """The method."""
+
+    @property
+    def sample(self) -> Sample | None:
+        """The weighted points behind p."""
+
+    @property
+    def base(self) -> Distribution | None:
+        """Distribution of X."""
+
+    @property
+    def failures(self) -> HasTotal:
+        """Failing points that were kept."""
+
+    @property
+    def refit_ratios(self) -> RatioStore:
+        """Density ratios of the refits of the base, once they were asked for."""
+
+
+def require_sample(estimate: WeightedEstimate) -> Sample:
+    """Return the weighted points of an estimate, or raise a ValueError that says there are none."""
+    if estimate.sample is None:
+        raise ValueError(
+            f"The method {estimate.method.name!r} gave no weighted points (Outcome.sample), which this needs; "
+            "or the run was stopped before there were any."
+        )
+    return estimate.sample
+
+
+def cov_inflation(estimate: WeightedEstimate, own_cov: float) -> float:
+    """Return the factor max(1, c.o.v. of the estimate / c.o.v. of its units at gamma); 1 where either is not known."""
+    if not math.isfinite(estimate.cov) or not 0 < own_cov < math.inf:
+        return 1.0
+    return max(1.0, estimate.cov / own_cov)
+
+
+def no_outcome_weight(estimate: WeightedEstimate, sample: Sample) -> float:
+    """Return the weight of points without an outcome if they do not count in the lower end ("bound"); else 0."""
+    return float(sample.weights[np.isneginf(sample.f)].sum()) if estimate.on_error == "bound" else 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class UnitSums:
+    """Sums over units at G thresholds."""
+
+    p: FloatArray
+    """Sum of the weights of the points with f <= g, shape (G,)."""
+    second: FloatArray
+    """Sum over units of T_c(g) T_c(g'), shape (G, G)."""
+    n_units: int
+    """Units drawn."""
+    independent: bool
+    """Whether every point is a unit of its own."""
+
+    @property
+    def cov(self) -> FloatArray:
+        """Coefficient of variation of `p`, shape (G,); inf where p = 0."""
+        square = self.p**2  # may underflow
+        relative = np.divide(np.diag(self.second), square, out=np.full(len(self.p), np.inf), where=square > 0)
+        return np.asarray(np.sqrt(np.maximum(relative - 1 / self.n_units, 0.0)))
+
+    @property
+    def ess(self) -> FloatArray:
+        """Effective number of units behind `p`, (sum T)^2 / sum T^2, shape (G,)."""
+        second = np.diag(self.second)
+        return np.divide(self.p**2, second, out=np.zeros(len(self.p)), where=second > 0)
+
+    @property
+    def is_count(self) -> NDArray[np.bool_]:
+        """Mask of those `p` that are shares of n_units equal draws, one point each: T_c is 0 or 1 / n, shape (G,)."""
+        return np.isclose(np.diag(self.second) * self.n_units, self.p, rtol=1e-9, atol=0.0)
+
+    @property
+    def correlation(self) -> FloatArray:
+        """Correlation of `p` between thresholds, shape (G, G); 0 to those that do not vary."""
+        covariance = self.second - np.outer(self.p, self.p) / self.n_units
+        deviation = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+        varies = deviation > 1e-7 * self.p  # less is rounding: it is the root of a difference
+        scale = np.where(varies, 1 / np.where(varies, deviation, 1.0), 0.0)
+        return np.asarray(covariance * np.outer(scale, scale))
+
+
+def unit_sums(sample: Sample, gammas: FloatArray) -> UnitSums:
+    """Return the sums over units of a sample at rising thresholds, shape (G,).
+
+    A point enters at the first threshold that is not below its f (nor below its layer's range) and
+    leaves where the range of its layer ends, so that the sums are running sums over thresholds.
+    """
+    rows, columns, steps = [], [], []
+    for layer in sample.all_layers:
+        enters = np.searchsorted(gammas, np.maximum(layer.f, layer.low))
+        leaves = np.full(len(enters), np.searchsorted(gammas, layer.high))
+        seen = enters < leaves
+        rows += [layer.units[seen]] * 2
+        columns += [enters[seen], leaves[seen]]
+        steps += [layer.weights[seen], -layer.weights[seen]]
+    shape = (sample.n_units, len(gammas) + 1)
+    place = (np.concatenate(rows), np.concatenate(columns))
+    increments = csr_array((np.concatenate(steps), place), shape=shape)
+    products = (increments.T @ increments).toarray()
+    return UnitSums(
+        p=np.cumsum(np.asarray(increments.sum(axis=0)))[:-1],
+        second=np.cumsum(np.cumsum(products, axis=0), axis=1)[:-1, :-1],
+        n_units=sample.n_units,
+        independent=has_independent_points(sample),
+    )
+
+
+def has_independent_points(sample: Sample) -> bool:
+    """Return whether every point of a sample is a unit of its own (a draw, no chain)."""
+    return not sample.layers and len(np.unique(sample.units)) == len(sample.units)
+
+
+def interval_of_sum(p: float, cov: float, ess: float, independent: bool, confidence: float) -> Interval:
+    """Return a log-normal interval of p > 0 with the t quantile of `ess` effective units."""
+    return log_normal_interval(p, cov, confidence, df=degrees_of_freedom(ess, independent))
+
+
+def interval_of_count(p: float, n: int, confidence: float) -> Interval:
+    """Return the exact binomial interval of a share p of n draws."""
+    return clopper_pearson(round(p * n), n, confidence)
+
+
+EIGENVALUE_ROUNDING = 1e-10
+"""Eigenvalues of a G x G correlation up to G times this are rounding: its trace is G."""
+BAND_DRAWS = 10_000
+"""Draws of the largest deviation; its 95 % quantile is then good to about 1 %."""
+BAND_STREAM = 2**31
+"""Spawn key of the generator for these draws; the runs have 0, 1, 2, ..."""
+
+
+def simultaneous_intervals(
+    sums: UnitSums, use: NDArray[np.intp], p: FloatArray, cov: FloatArray, confidence: float, seed: int
+) -> tuple[FloatArray, FloatArray]:
+    """Return pointwise intervals of p at one level, at which they should hold together; 0 to 1 where they are not used.
+
+    Args:
+        sums: Over units, at G thresholds.
+        use: Indices of the thresholds that count.
+        p: Probabilities, shape (G,).
+        cov: Their coefficients of variation, shape (G,).
+        confidence: Nominal coverage of all.
+        seed: Of the run.
+
+    Returns:
+        Lower and upper ends, shape (G,) each.
+    """
+    level = simultaneous_level(sums.correlation[np.ix_(use, use)], confidence, band_generator(seed))
+    low, high = np.zeros(len(p)), np.ones(len(p))
+    for i in use:
+        if sums.is_count[i]:
+            low[i], high[i] = interval_of_count(float(sums.p[i]), sums.n_units, level)
+        else:
+            low[i], high[i] = interval_of_sum(float(p[i]), float(cov[i]), float(sums.ess[i]), sums.independent, level)
+    return low, high
+
+
+def band_generator(seed: int) -> np.random.Generator:
+    """Return the generator of the draws for a band of a run with this seed."""
+    return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(BAND_STREAM,)))
+
+
+def simultaneous_level(correlation: NDArray[np.float64], confidence: float, rng: np.random.Generator) -> float:
+    """Return the level of pointwise intervals that together hold with probability `confidence`.
+
+    Args:
+        correlation: Of the estimates, shape (G, G); rows of zeros for those that do not vary.
+        confidence: Nominal coverage of all.
+        rng: Generator of the draws.
+    """
+    values, vectors = np.linalg.eigh(correlation)
+    some = values > EIGENVALUE_ROUNDING * max(len(values), 1)
+    if np.count_nonzero(some) <= 1:
+        return confidence
+    roots = vectors[:, some] * np.sqrt(values[some])
+    largest = np.abs(rng.standard_normal((BAND_DRAWS, roots.shape[1])) @ roots.T).max(axis=1)
+    level = 1 - 2 * float(ndtr(-np.quantile(largest, confidence)))
+    return max(level, confidence)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class WeightedFailures:
+    """Failing points of a run, all or evenly spaced among them, with weights that add up to p.
+
+    Example:
+        4 failures among 400 plain draws: p = 0.01 with a c.o.v. of sqrt((1 - p) / (400 p)).
+
+        >>> failures = WeightedFailures(
+        ...     x=np.zeros((4, 2)), rows=np.arange(4), has_outcome=np.full(4, True), weights=np.full(4, 1 / 400),
+        ...     units=np.arange(4), n_units=400, independent=True, inflation=1.0, total=4)
+        >>> round(failures.cov_of_sum(failures.weights), 4), round(math.sqrt(0.99 / 4), 4)
+        (0.4975, 0.4975)
+    """
+
+    x: FloatArray
+    """The points, shape (k, d)."""
+    rows: NDArray[np.int64]
+    """Their rows among all failing points, `Sample.x`, shape (k,)."""
+    has_outcome: NDArray[np.bool_]
+    """Where f gave a value; elsewhere the point counts as failing because f raised or gave NaN, shape (k,)."""
+    weights: FloatArray
+    """Weights scaled so that they add up to the estimate's p, shape (k,)."""
+    units: NDArray[np.int64]
+    """Independent unit of each point, see `Sample`, shape (k,)."""
+    n_units: int
+    """Independent units drawn in the run."""
+    independent: bool
+    """Whether every point of the run is a unit of its own."""
+    inflation: float
+    """Factor by which the estimate's c.o.v. exceeds that of the weights' sum."""
+    total: int
+    """Failing points that the run has."""
+
+    def unit_totals(self, terms: FloatArray) -> FloatArray:
+        """Return the sums over units of terms (k,) or (k, m): one row for each unit that has a point."""
+        owners = np.unique(self.units, return_inverse=True)[1]
+        totals = np.zeros((owners.max(initial=-1) + 1, *terms.shape[1:]))
+        np.add.at(totals, owners, terms)
+        return totals
+
+    def cov_of_sum(self, terms: FloatArray) -> float:
+        """Return the c.o.v. of the sum of terms (k,) over independent units; inf for a sum of 0."""
+        effective = effective_number(self.unit_totals(terms))
+        if effective == 0:
+            return math.inf
+        return self.inflation * math.sqrt(max(1 / effective - 1 / self.n_units, 0.0))
+
+
+def choose_failures(sample: Sample, gamma: float, most: int | None = None) -> NDArray[np.int64]:
+    """Return rows of `Sample.x`: all of them, or `most` evenly spaced ones where there are more.
+
+    Raises:
+        ValueError: If `most` is not positive.
+    """
+    if most is not None and most < 1:
+        raise ValueError(f"Expected most of at least 1 point, got {most!r}.")
+    rows = np.arange(int(np.count_nonzero(sample.f <= gamma)))
+    if most is None or len(rows) <= most:
+        return rows
+    return rows[np.linspace(0, len(rows) - 1, most).round().astype(np.int64)]
+
+
+def weigh_failures(estimate: WeightedEstimate, most: int | None = None) -> WeightedFailures:
+    """Return the failing points of an estimate with weights that add up to its p.
+
+    Args:
+        estimate: With weighted points.
+        most: At most so many points, evenly spaced; None for all.
+
+    Raises:
+        ValueError: If there are no weighted points, or none failed.
+
+    Example:
+        >>> import samplers
+        >>> problem = samplers.FunctionProblem(lambda x: 2.0 - x[:, 0], dim=1)
+        >>> result = samplers.estimate(problem, "mc", seed=0, max_sim=1000)
+        >>> failures = weigh_failures(result)
+        >>> failures.total == result.failures.total, bool((failures.x >= 2.0).all())
+        (True, True)
+        >>> bool(np.allclose(failures.weights, 1 / 1000))  # plain draws
+        True
+    """
+    sample = require_sample(estimate)
+    failing = np.flatnonzero(sample.f <= estimate.gamma)
+    rows = choose_failures(sample, estimate.gamma, most)
+    chosen = failing[rows]
+    weights = sample.weights[chosen]
+    if not weights.sum() > 0:
+        raise ValueError(f"No point failed (f <= {estimate.gamma:g}): there is nothing to analyse.")
+    raw = WeightedFailures(
+        x=sample.x[rows],
+        rows=rows,
+        has_outcome=~np.isneginf(sample.f[chosen]),
+        weights=weights * (estimate.p / float(weights.sum())),
+        units=sample.units[chosen],
+        n_units=sample.n_units,
+        independent=has_independent_points(sample),
+        inflation=1.0,
+        total=len(failing),
+    )
+    return replace(raw, inflation=cov_inflation(estimate, raw.cov_of_sum(raw.weights)))
+
+
+def mean_over_failures(failures: WeightedFailures, values: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return E[h(X) | failure] and its standard error, for m quantities h at once.
+
+    The mean is a ratio of two sums, so its variance is that of the sum of w (h - mean) over independent units.
+
+    Args:
+        failures: Weighted failing points.
+        values: h at these points, shape (k, m).
+
+    Returns:
+        Means and standard errors, shape (m,) each.
+    """
+    share = failures.weights / failures.weights.sum()
+    means = share @ values
+    totals = failures.unit_totals(share[:, None] * (values - means))
+    return means, failures.inflation * np.sqrt((totals**2).sum(axis=0))

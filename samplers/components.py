@@ -1,0 +1,443 @@
+"""Components of proposal mixtures in standard normal space, each with its density ratio to N(0, I).
+
+Where a component is N(0, I) in most directions, its ratio depends on the few others only, which keeps weights exact
+and cheap in hundreds of dimensions.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import gammaln, ive, log_ndtr, ndtri_exp
+
+from samplers.problem import LOG_TWO_PI, FloatArray
+from samplers.statistics import log_sum_exp
+
+ROWS_FROM = 8
+"""With so many coordinates sums over them are taken point by point; fewer are added in the same order either way."""
+
+
+class MixtureComponent(Protocol):
+    """A distribution in standard normal space with a known density ratio to N(0, I).
+
+    Example:
+        >>> import numpy as np
+        >>> base: MixtureComponent = IsotropicNormal(dim=2)
+        >>> base.log_ratio(np.array([[1.0, 2.0]]))  # N(0, I) itself
+        array([0.])
+    """
+
+    def log_ratio(self, u: FloatArray) -> FloatArray:
+        """Return log(q / phi) at u (n, d), shape (n,); -inf where the density q is 0."""
+
+    def sample(self, n: int, rng: np.random.Generator) -> FloatArray:
+        """Draw n independent points, shape (n, d)."""
+
+
+@dataclass(frozen=True, eq=False)
+class IsotropicNormal:
+    """N(0, scale^2 I); the base distribution where scale is 1.
+
+    Example:
+        >>> import numpy as np
+        >>> IsotropicNormal(dim=2, scale=2.0).log_ratio(np.zeros((1, 2))).round(4)  # -2 log 2
+        array([-1.3863])
+    """
+
+    dim: int
+    scale: float = 1.0
+
+    def log_ratio(self, u: FloatArray) -> FloatArray:
+        """Return 0.5 |u|^2 (1 - scale^-2) - d log(scale)."""
+        square = np.einsum("ij,ij->i", u, u)
+        return np.asarray(0.5 * square * (1 - self.scale**-2) - self.dim * math.log(self.scale))
+
+    def sample(self, n: int, rng: np.random.Generator) -> FloatArray:
+        """Draw n points."""
+        return self.scale * rng.standard_normal((n, self.dim))
+
+
+@dataclass(frozen=True, eq=False)
+class SubspaceGaussian:
+    """Independent Gaussians along some orthonormal axes, N(0, 1) in every direction outside their span.
+
+    Example:
+        >>> import numpy as np
+        >>> component = SubspaceGaussian(np.eye(100)[:, :1], mean=np.array([3.0]), variance=np.array([0.1]))
+        >>> u = component.sample(1000, np.random.default_rng(0))
+        >>> u.shape, round(float(u[:, 0].mean()), 1), round(float(u[:, 1:].std()), 1)
+        ((1000, 100), 3.0, 1.0)
+        >>> component.centre[:3]
+        array([3., 0., 0.])
+    """
+
+    axes: FloatArray
+    """Orthonormal columns, shape (d, r)."""
+    mean: FloatArray
+    """Along the axes, shape (r,)."""
+    variance: FloatArray
+    """Along the axes, shape (r,)."""
+
+    @property
+    def centre(self) -> FloatArray:
+        """Mean, shape (d,)."""
+        return self.axes @ self.mean
+
+    def log_ratio(self, u: FloatArray) -> FloatArray:
+        """Return the log ratio; it depends on the coordinates along the axes only."""
+        t, mean, variance, axis = u @ self.axes, self.mean, self.variance, 1
+        if len(mean) < ROWS_FROM:  # the same sums, coordinate by coordinate
+            t, mean, variance, axis = np.ascontiguousarray(t.T), mean[:, None], variance[:, None], 0
+        terms = t * t - (t - mean) ** 2 / variance - np.log(variance)
+        return np.asarray(0.5 * terms.sum(axis=axis))
+
+    def sample(self, n: int, rng: np.random.Generator) -> FloatArray:
+        """Draw n points."""
+        xi = rng.standard_normal((n, len(self.axes)))
+        t = xi @ self.axes
+        return np.asarray(xi + (self.mean + np.sqrt(self.variance) * t - t) @ self.axes.T)
+
+    def temper(self, power: float) -> "SubspaceGaussian":
+        """Return q^power phi^(1 - power), normalised: nearer to the origin and wider.
+
+        With a noisy f, where points fail with probability pi, failures have density q ~ phi pi and the best
+        proposal is phi sqrt(pi): the tempered one with power 1/2.
+        """
+        precision = power / self.variance + (1 - power)
+        return SubspaceGaussian(self.axes, power * self.mean / self.variance / precision, 1 / precision)
+
+
+@dataclass(frozen=True, eq=False)
+class LiftedComponent:
+    """A component in the coordinates of some orthonormal axes, N(0, 1) in every direction outside their span.
+
+    Example:
+        >>> import numpy as np
+        >>> ring = LiftedComponent(RadialLaw(dim=2, start=9.0, shape=1.0, scale=2.0), axes=np.eye(100)[:, :2])
+        >>> u = ring.sample(1000, np.random.default_rng(0))
+        >>> bool((np.linalg.norm(u[:, :2], axis=1) > 3.0).all()), round(float(u[:, 2:].std()), 1)
+        (True, 1.0)
+    """
+
+    within: MixtureComponent
+    """In r dimensions."""
+    axes: FloatArray
+    """Orthonormal columns, shape (d, r)."""
+
+    def log_ratio(self, u: FloatArray) -> FloatArray:
+        """Return the log ratio; it depends on the coordinates along the axes only."""
+        return self.within.log_ratio(u @ self.axes)
+
+    def sample(self, n: int, rng: np.random.Generator) -> FloatArray:
+        """Draw n points."""
+        xi = rng.standard_normal((n, len(self.axes)))
+        return np.asarray(xi + (self.within.sample(n, rng) - xi @ self.axes) @ self.axes.T)
+
+
+@dataclass(frozen=True, eq=False)
+class HalfSpaceNormal:
+    """N(0, I) beyond a plane, axis . u >= start: the optimal proposal for a failure half-space.
+
+    Example:
+        >>> import numpy as np
+        >>> component = HalfSpaceNormal(np.array([1.0, 0.0]), start=3.0)
+        >>> bool((component.sample(100, np.random.default_rng(0))[:, 0] >= 3.0).all())
+        True
+        >>> np.exp(-component.log_ratio(np.array([[4.0, 1.0], [2.0, 0.0]]))).round(5)  # Phi(-3) beyond, else no density
+        array([0.00135,     inf])
+    """
+
+    axis: FloatArray
+    """Unit vector, shape (d,)."""
+    start: float
+
+    def log_ratio(self, u: FloatArray) -> FloatArray:
+        """Return the logarithm of 1 / Phi(-start) beyond the plane, -inf before it."""
+        return np.where(u @ self.axis >= self.start, -float(log_ndtr(-self.start)), -np.inf)
+
+    def sample(self, n: int, rng: np.random.Generator) -> FloatArray:
+        """Draw n points."""
+        xi = rng.standard_normal((n, len(self.axis)))
+        t = -ndtri_exp(np.log1p(-rng.random(n)) + log_ndtr(-self.start))
+        return np.asarray(xi + np.outer(t - xi @ self.axis, self.axis))
+
+
+@dataclass(frozen=True, eq=False)
+class HalfSpaceUnion:
+    """N(0, I) beyond one of several planes, each in proportion to its probability, for a series system of them.
+
+    The density is phi(u) k(u) / sum_j Phi(-start_j), where u is beyond k(u) of the planes.
+
+    Example:
+        Beyond u1 = 3 and u2 = 3, with 2 Phi(-3) = 0.0027:
+
+        >>> import numpy as np
+        >>> union = HalfSpaceUnion(axes=np.eye(2), starts=np.array([3.0, 3.0]))
+        >>> np.exp(-union.log_ratio(np.array([[4.0, 0.0], [4.0, 4.0], [0.0, 0.0]]))).round(5)
+        array([0.0027 , 0.00135,     inf])
+        >>> bool((union.sample(100, np.random.default_rng(0)).max(axis=1) >= 3.0).all())
+        True
+
+    References:
+        Au and Beck, "First excursion probabilities for linear systems by very efficient importance sampling",
+        Probabilistic Engineering Mechanics 16, 2001.
+    """
+
+    axes: FloatArray
+    """Unit vectors, shape (k, d)."""
+    starts: FloatArray
+    """Distances of the planes from the origin, shape (k,)."""
+
+    def log_ratio(self, u: FloatArray) -> FloatArray:
+        """Return log k(u) less the logarithm of the sum of the half-spaces' probabilities."""
+        beyond = np.count_nonzero(u @ self.axes.T >= self.starts, axis=1)
+        with np.errstate(divide="ignore"):
+            return np.asarray(np.log(beyond) - log_sum_exp(log_ndtr(-self.starts)))
+
+    def sample(self, n: int, rng: np.random.Generator) -> FloatArray:
+        """Draw n points."""
+        log_p = log_ndtr(-self.starts)
+        chosen = rng.choice(len(self.starts), n, p=np.exp(log_p - log_sum_exp(log_p)))
+        axes, xi = self.axes[chosen], rng.standard_normal((n, self.axes.shape[1]))
+        t = -ndtri_exp(np.log1p(-rng.random(n)) + log_p[chosen])
+        return np.asarray(xi + (t - (xi * axes).sum(axis=1))[:, None] * axes)
+
+
+@dataclass(frozen=True, eq=False)
+class HalfSpaceIntersection:
+    """A corner, the points beyond all of several planes: N(0, 1) cut to it, one coordinate after the other.
+
+    In orthonormal coordinates t, of which the first k span the axes in their order, plane i asks for t_i >= low_i,
+    where low_i depends on the coordinates before it. The density is phi(u) / prod_i Phi(-low_i) within the corner. It
+    is N(0, I) cut to the corner where the axes are orthogonal, and near it elsewhere; 1 / density never exceeds
+    1 / phi(u).
+
+    Example:
+        Beyond u1 = 2 and u2 = 1.5, with Phi(-2) Phi(-1.5) = 0.00152:
+
+        >>> import numpy as np
+        >>> corner = HalfSpaceIntersection(axes=np.eye(2), starts=np.array([2.0, 1.5]))
+        >>> np.exp(-corner.log_ratio(np.array([[3.0, 2.0], [3.0, 1.0]]))).round(5)
+        array([0.00152,     inf])
+        >>> bool((corner.sample(100, np.random.default_rng(0)) >= corner.starts).all())
+        True
+
+    References:
+        Genz, "Numerical computation of multivariate normal probabilities", Journal of Computational and Graphical
+        Statistics 1, 1992 (the coordinates one after the other).
+    """
+
+    axes: FloatArray
+    """Linearly independent unit vectors, shape (k, d); first those that are the least likely to be passed."""
+    starts: FloatArray
+    """Distances of the planes from the origin, shape (k,)."""
+
+    def log_ratio(self, u: FloatArray) -> FloatArray:
+        """Return -sum_i log Phi(-low_i) within the corner, -inf outside."""
+        across, along = self._coordinates()
+        t, ratio = u @ across, np.zeros(len(u))
+        for i in range(len(self.starts)):
+            low = (self.starts[i] - t[:, :i] @ along[i, :i]) / along[i, i]
+            ratio = np.where(t[:, i] >= low, ratio - log_ndtr(-low), -np.inf)
+        return ratio
+
+    def sample(self, n: int, rng: np.random.Generator) -> FloatArray:
+        """Draw n points."""
+        across, along = self._coordinates()
+        xi, t = rng.standard_normal((n, len(across))), np.empty((n, len(self.starts)))
+        for i in range(len(self.starts)):
+            low = (self.starts[i] - t[:, :i] @ along[i, :i]) / along[i, i]
+            t[:, i] = -ndtri_exp(np.log1p(-rng.random(n)) + log_ndtr(-low))
+        return np.asarray(xi + (t - xi @ across) @ across.T)
+
+    def _coordinates(self) -> tuple[FloatArray, FloatArray]:
+        """Return the directions of t, columns (d, k), and each axis in them, lower triangular (k, k)."""
+        q, r = np.linalg.qr(self.axes.T)
+        signs = np.sign(np.diag(r))
+        return q * signs, (r * signs[:, None]).T
+
+
+@dataclass(frozen=True, eq=False)
+class RadialLaw:
+    """Uniform directions with |u|^2 = start + Gamma(shape, scale): for failure beyond a radius.
+
+    Example:
+        >>> import numpy as np
+        >>> component = RadialLaw(dim=6, start=25.0, shape=1.0, scale=2.0)
+        >>> u = component.sample(100, np.random.default_rng(0))
+        >>> bool((np.linalg.norm(u, axis=1) > 5.0).all())
+        True
+        >>> component.log_ratio(np.zeros((1, 6)))
+        array([-inf])
+    """
+
+    dim: int
+    start: float
+    shape: float
+    scale: float
+
+    def log_ratio(self, u: FloatArray) -> FloatArray:
+        """Return the log ratio of the densities of |u|^2: shifted Gamma over chi-squared with d degrees of freedom."""
+        square = np.einsum("ij,ij->i", u, u)
+        beyond = square > self.start
+        ratio = np.full(len(u), -np.inf)
+        r, s, half = square[beyond], square[beyond] - self.start, self.dim / 2
+        log_chi2 = (half - 1) * np.log(r) - r / 2 - half * math.log(2) - gammaln(half)
+        log_gamma = (self.shape - 1) * np.log(s) - s / self.scale - gammaln(self.shape)
+        ratio[beyond] = log_gamma - self.shape * math.log(self.scale) - log_chi2
+        return ratio
+
+    def sample(self, n: int, rng: np.random.Generator) -> FloatArray:
+        """Draw n points."""
+        direction = rng.standard_normal((n, self.dim))
+        direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+        return np.asarray(direction * np.sqrt(self.start + self.scale * rng.gamma(self.shape, size=n))[:, None])
+
+
+def log_ratios(components: Sequence[MixtureComponent], u: FloatArray) -> FloatArray:
+    """Return the log ratios of k components at u (n, d), shape (k, n)."""
+    return np.array([component.log_ratio(u) for component in components]).reshape(len(components), len(u))
+
+
+def mixture_log_ratio(log_r: FloatArray, weights: FloatArray) -> FloatArray:
+    """Return the log ratio of sum_k weights_k q_k from those of the q_k (k, n), shape (n,)."""
+    return np.asarray(log_sum_exp(log_r, axis=0, weights=weights[:, None]))
+
+
+def draw_counts(weights: FloatArray, n: int, rng: np.random.Generator) -> NDArray[np.int64]:
+    """Share n draws among components: n weights_k rounded up or down, n weights_k on average (systematic sampling)."""
+    bounds = np.floor(np.cumsum(weights / weights.sum() * n) + rng.random())
+    bounds[-1] = n  # but for rounding errors
+    return np.diff(np.concatenate([[0.0], np.minimum(bounds, n)])).astype(np.int64)
+
+
+def draw_components(
+    components: Sequence[MixtureComponent], counts: NDArray[np.int64], rng: np.random.Generator
+) -> FloatArray:
+    """Draw counts_k points from each component, one component after the other."""
+    return np.concatenate([c.sample(int(k), rng) for c, k in zip(components, counts, strict=True)])
+
+
+LARGEST_RESULTANT = 0.999
+"""Mean resultant lengths above this are cut: the concentration would run away on a few close points."""
+LEAST_CONCENTRATION = 1e-3
+"""Stands for 0, where the direction is uniform: the formulae divide by it."""
+LEAST_SHAPE = 0.5
+"""Least m of a Nakagami distribution."""
+LARGEST_SHAPE = 1e4
+"""A radius with a c.o.v. of 0.5 %; points at one radius would give an infinite m."""
+LARGE_ORDER = 50.0
+"""Order of the Bessel function from which on its asymptotic expansion is used; its logarithm is then exact to 2e-7."""
+
+
+@dataclass(frozen=True, eq=False)
+class VonMisesFisherNakagami:
+    """u = r a with a ~ von Mises-Fisher(mu, kappa) on the unit sphere and r ~ Nakagami(m, omega).
+
+    Example:
+        >>> import numpy as np
+        >>> towards = VonMisesFisherNakagami(mu=np.eye(50)[0], kappa=200.0, m=25.0, omega=50.0)
+        >>> u = towards.sample(2000, np.random.default_rng(0))
+        >>> radius = np.linalg.norm(u, axis=1)
+        >>> round(float((radius**2).mean())), round(float((u[:, 0] / radius).mean()), 1)  # E[r^2], E[mu' a]
+        (50, 0.9)
+    """
+
+    mu: FloatArray
+    """Mean direction, of length 1, shape (d,)."""
+    kappa: float
+    """Concentration."""
+    m: float
+    """Shape of the radius: r^2 ~ Gamma(m, omega / m)."""
+    omega: float
+    """E[r^2]."""
+
+    @classmethod
+    def standard(cls, dim: int) -> "VonMisesFisherNakagami":
+        """Return N(0, I), but for a concentration that cannot be 0."""
+        return cls(np.eye(dim)[0], LEAST_CONCENTRATION, dim / 2, float(dim))
+
+    @classmethod
+    def fit(cls, u: FloatArray, weights: FloatArray) -> "VonMisesFisherNakagami":
+        """Fit to points u (n, d) with weights (n,): matched mean direction, E[r^2] and E[r^4].
+
+        The squared length of the mean direction is on average 1 / n too large (for one without any; n the
+        effective number of points), which in many dimensions would be a concentration of its own: it is taken off.
+        """
+        weights = weights / weights.sum()
+        dim, radius = u.shape[1], np.linalg.norm(u, axis=1)
+        resultant = weights @ (u / radius[:, None])
+        length = float(np.linalg.norm(resultant))
+        mu = resultant / length if length > 0 else np.eye(dim)[0]
+        chance = float(weights @ weights)
+        length = math.sqrt(max((length**2 - chance) / (1 - chance), 0.0)) if chance < 1 else length
+        square = float(weights @ radius**2)
+        spread = float(weights @ (radius**2 - square) ** 2)
+        shape = min(square * square / spread, LARGEST_SHAPE) if spread > 0 else LARGEST_SHAPE
+        return cls(mu, concentration(length, dim), max(shape, LEAST_SHAPE), square)
+
+    def widen(self, factor: float) -> "VonMisesFisherNakagami":
+        """Return the same with deviations of direction and radius about `factor` times as large."""
+        kappa, m = self.kappa / factor**2, self.m / factor**2
+        return VonMisesFisherNakagami(self.mu, max(kappa, LEAST_CONCENTRATION), max(m, LEAST_SHAPE), self.omega)
+
+    def sample(self, n: int, rng: np.random.Generator) -> FloatArray:
+        """Draw n independent points, shape (n, d)."""
+        radius = np.sqrt(rng.gamma(self.m, self.omega / self.m, n))
+        return radius[:, None] * directions(self.mu, self.kappa, n, rng)
+
+    def log_prob(self, u: FloatArray, /) -> FloatArray:
+        """Return the log density at u (n, d), shape (n,)."""
+        dim = len(self.mu)
+        radius = np.maximum(np.linalg.norm(u, axis=1), np.finfo(np.float64).tiny)
+        m, omega = self.m, self.omega
+        nakagami = (
+            math.log(2)
+            + m * math.log(m / omega)
+            - float(gammaln(m))
+            + (2 * m - 1) * np.log(radius)
+            - m / omega * radius**2
+        )
+        fisher = log_normaliser(self.kappa, dim) + self.kappa * ((u @ self.mu) / radius)
+        return np.asarray(nakagami + fisher - (dim - 1) * np.log(radius))
+
+    def log_ratio(self, u: FloatArray) -> FloatArray:
+        """Return the log density less that of N(0, I) at u (n, d), shape (n,)."""
+        return np.asarray(self.log_prob(u) + 0.5 * (np.einsum("ij,ij->i", u, u) + len(self.mu) * LOG_TWO_PI))
+
+
+def concentration(length: float, dim: int) -> float:
+    """Return kappa of the mean resultant length, R (d - R^2) / (1 - R^2)."""
+    r = min(length, LARGEST_RESULTANT)
+    return max(r * (dim - r * r) / (1 - r * r), LEAST_CONCENTRATION)
+
+
+def log_normaliser(kappa: float, dim: int) -> float:
+    """Return the logarithm of the von Mises-Fisher density's factor before exp(kappa mu' a).
+
+    log kappa^v - log (2 pi)^(v + 1) - log I_v(kappa) with v = d / 2 - 1; for large orders, where I_v
+    underflows, by its uniform asymptotic expansion.
+    """
+    v = dim / 2 - 1
+    if v < LARGE_ORDER:
+        log_bessel = math.log(float(ive(v, kappa))) + kappa
+    else:
+        root = math.hypot(v, kappa)
+        t = v / root
+        series = 1 + (3 * t - 5 * t**3) / (24 * v) + (81 * t**2 - 462 * t**4 + 385 * t**6) / (1152 * v * v)
+        log_bessel = root + v * math.log(kappa / (v + root)) - 0.5 * (LOG_TWO_PI + math.log(root)) + math.log(series)
+    return v * math.log(kappa) - (v + 1) * LOG_TWO_PI - log_bessel
+
+
+def directions(mu: FloatArray, kappa: float, n: int, rng: np.random.Generator) -> FloatArray:
+    """Draw n directions from the von Mises-Fisher distribution, shape (n, d)."""
+    if len(mu) == 1:  # two directions
+        with_mu = rng.random(n) < 1 / (1 + math.exp(-2 * kappa))
+        return np.asarray(np.where(with_mu, mu[0], -mu[0])[:, None])
+    from scipy import stats  # takes a second to import
+
+    distribution = stats.vonmises_fisher(mu, kappa)  # type: ignore[arg-type]  # the stubs ask for a whole kappa
+    return np.asarray(distribution.rvs(n, random_state=rng)).reshape(n, len(mu))

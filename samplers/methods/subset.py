@@ -1,0 +1,506 @@
+"""Levels of subset simulation with any kernel: how many points each has, and when the run ends.
+
+The loop is `samplers.mcmc`, the estimate from all levels `subset_estimate`.
+
+References:
+    Au and Beck, "Estimation of small failure probabilities in high dimensions by subset simulation",
+    Probabilistic Engineering Mechanics 16, 2001.
+"""
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import reduce
+from typing import ClassVar, Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from samplers.mcmc import (
+    Chains,
+    FixedMetropolis,
+    Growth,
+    Kernel,
+    NextLevel,
+    RootedPoints,
+    ScaledKernel,
+    chain_lengths,
+    descend,
+    draw_first_level,
+)
+from samplers.method import Goal, Outcome, Steps, no_outcome_share
+from samplers.methods.base import Method
+from samplers.problem import FloatArray, Inputs
+from samplers.sample import Layer, Sample
+from samplers.statistics import (
+    Interval,
+    binomial_cov,
+    clopper_pearson,
+    correlation_factor,
+    log_normal_interval,
+    next_level,
+)
+from samplers.trace import Level, Status
+from samplers.validation import check_choice, check_count, check_setting
+
+LONGEST_CHAIN = 50
+"""More steps than this from a handful of seeds cost calls of f and add little."""
+FEWEST_SEEDS = 10
+"""A level is not made smaller for the sake of the budget than this many seeds allow."""
+USUAL_LEVELS = 4
+"""Levels that shall fit into a small budget: down to p = p0^4, 1e-4."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SubsetPlanner:
+    """Levels of n points whose seeds are all points below the threshold, as the estimate of the error needs them."""
+
+    n: int
+    """Points per level, N."""
+    p0: float
+    """Wanted conditional probability of each level."""
+    max_levels: int
+    """Levels after which the method gives up, level 0 included."""
+    gamma: float
+    """Threshold of failure."""
+    budget: int
+    """Simulations for the levels after level 0."""
+
+    def plan_next(self, chains: Chains, depth: int, n_sim: int, rng: np.random.Generator) -> NextLevel | Status:
+        """Return the next level, or how the run ends: converged once p0 of the present points fail."""
+        left = self.budget - n_sim
+        threshold = next_level(chains.f[chains.used], self.p0, self.gamma)
+        if threshold == self.gamma:
+            return Status.CONVERGED
+        if left == 0 and chains.f.size < self.n:
+            return Status.BUDGET  # too few points of level 0 to speak of ties
+        if threshold is None or depth + 1 >= self.max_levels:
+            return Status.STALLED
+        seeds = chains.where(chains.f <= threshold)
+        n_seeds = len(seeds.f)
+        if left < n_seeds:
+            return Status.BUDGET  # not one step for every chain
+        return NextLevel(threshold, seeds, chain_lengths(self._points_of_level(n_seeds, left), n_seeds, rng))
+
+    def _points_of_level(self, n_seeds: int, left: int) -> int:
+        """Return how many points the next level shall have, its seeds included."""
+        longest = max(LONGEST_CHAIN, math.ceil(1 / self.p0))
+        return max(min(self.n, n_seeds + left, n_seeds * longest), n_seeds)
+
+
+@dataclass(frozen=True, kw_only=True)
+class SubsetLevels:
+    """The settings that all kinds of subset simulation share."""
+
+    n: int
+    """Points per level, N."""
+    p0: float
+    """Wanted conditional probability of each level."""
+    max_levels: int
+    """Levels after which the method gives up."""
+
+    def steps(
+        self,
+        inputs: Inputs,
+        goal: Goal,
+        rng: np.random.Generator,
+        kernel: Kernel,
+        known: RootedPoints | None = None,
+    ) -> Steps:
+        """Go from level to level until the share of failures among its points is p0 or more.
+
+        Args:
+            inputs: Of the problem.
+            goal: Threshold and budget.
+            rng: Source of randomness.
+            kernel: Of the first chains.
+            known: Base draws whose outcomes are known, fewer than n: level 0 begins with them.
+        """
+        n_known = 0 if known is None else len(known.f)
+        n, gamma = self._points_per_level(goal.budget + n_known), goal.gamma
+        levels, trace = list[Chains](), list[Level]()
+
+        def record(growth: Growth, planned: NextLevel | Status) -> None:
+            threshold = planned.threshold if isinstance(planned, NextLevel) else gamma
+            levels.append(growth.chains)
+            trace.append(level_record(growth.chains, threshold, multiply_levels(trace)))
+            goal.on_level(trace[-1])
+
+        first = yield from draw_first_level(inputs, max(min(n, goal.budget + n_known), n_known), rng, known)
+        left = goal.budget - first.n_new
+        planner = SubsetPlanner(n=n, p0=self.p0, max_levels=self.max_levels, gamma=gamma, budget=left)
+        status = yield from descend(inputs, Growth.start(first, kernel), planner, record, rng)
+        outcome = summarise(levels[-1], goal, trace, status)
+        return replace(
+            outcome,
+            warnings=(*self._budget_warnings(n, goal.budget + n_known), *outcome.warnings),
+            sample=weighted_points(inputs, levels, trace, gamma),
+        )
+
+    def _points_per_level(self, budget: int) -> int:
+        """Return the points per level: fewer than n where the budget does not hold the usual levels."""
+        fitting = int(budget / (1 + (USUAL_LEVELS - 1) * (1 - self.p0)))  # seeds are not simulated again
+        return min(self.n, max(math.ceil(FEWEST_SEEDS / self.p0), fitting))
+
+    def _budget_warnings(self, n: int, budget: int) -> list[str]:
+        """Return the warning about a budget that is too small for n points per level."""
+        if budget < n:
+            return [f"max_sim leaves {budget} of the {n} simulations that level 0 needs at least: plain draws only."]
+        coarse = n < self.n / 2
+        return [f"max_sim leaves {budget} simulations: {n} points per level, not {self.n}."] if coarse else []
+
+
+ACCEPTANCE_RANGE = (0.15, 0.85)
+"""Acceptance without a warning: below it chains hardly move, above it their steps are short."""
+FEW_CHAINS = 20
+"""Fewer seeds than this make a level coarse: its c.o.v. is 0.2 or more."""
+LARGE_COV = 0.5
+"""C.o.v. that is worth a warning; the interval then spans a factor of 2.5 to either side."""
+
+
+class LevelProduct(NamedTuple):
+    """Probability of the last level reached, as a product over the levels."""
+
+    p: float = 1.0
+    """Probability of the last level reached."""
+    cov: float = 0.0
+    """Its coefficient of variation."""
+
+
+def level_record(chains: Chains, threshold: float, passed: LevelProduct) -> Level:
+    """Return the record of a level: the true share of its points with f <= threshold."""
+    below = chains.used & (chains.f <= threshold)
+    total = int(chains.lengths.sum())
+    share = int(below.sum()) / total
+    effective = total / (1 + correlation_factor(below, chains.lengths))
+    return Level(
+        gamma=threshold,
+        p=share,
+        estimate=passed.p * share,
+        n_sim=chains.n_new,
+        n_points=total,
+        cov=binomial_cov(share, effective),
+        acceptance=chains.acceptance,
+        ess=effective,
+    )
+
+
+def include_level(passed: LevelProduct, level: Level) -> LevelProduct:
+    """Return the product with one more level, taken as independent of the others."""
+    square = (1 + passed.cov**2) * (1 + level.cov**2) - 1
+    return LevelProduct(p=passed.p * level.p, cov=math.sqrt(square))
+
+
+def multiply_levels(trace: Sequence[Level]) -> LevelProduct:
+    """Return the product over the levels; 1 of none."""
+    return reduce(include_level, trace, LevelProduct())
+
+
+def weighted_points(inputs: Inputs, levels: list[Chains], trace: list[Level], gamma: float) -> Sample:
+    """Return the points of all levels with their weights.
+
+    A point of level j counts where it lies above the threshold that leads on to level j + 1 (below it, the
+    points of level j + 1 speak), with weight P_j / N_j: the probability of its level over its points.
+    """
+    kept = [c.where(c.f > record.gamma) for c, record in zip(levels[:-1], trace[:-1], strict=True)]
+    kept.append(levels[-1].where(levels[-1].used))
+    reached = np.cumprod([1.0, *(record.p for record in trace[:-1])])
+    weights = reached / [record.n_points for record in trace]
+    last = kept[-1]  # every point with f <= gamma is one of these
+    return Sample(
+        f=np.concatenate([points.f for points in kept]),
+        weights=np.repeat(weights, [len(points.f) for points in kept]),
+        units=np.concatenate([points.roots for points in kept]),
+        n_units=trace[0].n_points,
+        x=inputs.base.from_standard_normal(last.u[last.f <= gamma]),
+        layers=tuple(_layers(levels, trace, weights)),
+    )
+
+
+def _layers(levels: list[Chains], trace: list[Level], weights: FloatArray) -> Iterator[Layer]:
+    """Go through the levels with all their points; level j has thresholds from that of level j + 1 to its own."""
+    thresholds = [math.inf, *(record.gamma for record in trace[:-1]), -math.inf]
+    for chains, weight, high, low in zip(levels, weights, thresholds, thresholds[1:], strict=False):
+        points = chains.where(chains.used)
+        yield Layer(f=points.f, weights=np.full(len(points.f), weight), units=points.roots, low=low, high=high)
+
+
+def summarise(chains: Chains, goal: Goal, trace: list[Level], status: Status) -> Outcome:
+    """Return the outcome after a last level `chains`, of which the last of `trace` counted f <= gamma."""
+    _, hits, roots = chains.where(chains.f <= goal.gamma)
+    product = multiply_levels(trace)
+    cov = max(product.cov, descent_cov(roots, trace[0].n_points))
+    return Outcome(
+        p=product.p,
+        interval=subset_interval(chains, goal, trace, cov),
+        cov=cov,
+        status=status if len(hits) or status is Status.STOPPED else Status.NO_HITS,
+        warnings=(*_end_warnings(len(trace) - 1, status, len(hits), cov), *_chain_warnings(trace)),
+        trace=tuple(trace),
+        no_outcome_share=no_outcome_share(hits),
+        base_draws=trace[0].n_points,
+    )
+
+
+def subset_interval(chains: Chains, goal: Goal, trace: list[Level], cov: float) -> Interval:
+    """Return the interval of p = prod of the shares in `trace`, whose c.o.v. is `cov`, after a last level `chains`."""
+    roots = chains.where(chains.f <= goal.gamma).roots
+    if len(trace) == 1:
+        return clopper_pearson(len(roots), trace[0].n_points, goal.confidence)
+    if len(roots) == 0:
+        return _interval_without_hits(chains, goal, trace)
+    p = multiply_levels(trace).p
+    return log_normal_interval(p, cov, goal.confidence, df=max(effective_roots(roots) - 1, 1.0))
+
+
+def _interval_without_hits(chains: Chains, goal: Goal, trace: list[Level]) -> Interval:
+    """Return the interval of p where no point of the last level fails.
+
+    The level reached is as uncertain as its descent, and its share as if each of its roots were one point.
+    """
+    passed, roots = multiply_levels(trace[:-1]), chains.where(chains.used).roots
+    independent = effective_roots(roots)
+    cov = max(passed.cov, descent_cov(roots, trace[0].n_points))
+    reached = log_normal_interval(passed.p, cov, goal.confidence, df=max(independent - 1, 1.0))[1]
+    return 0.0, reached * clopper_pearson(0, max(int(independent), 1), goal.confidence)[1]
+
+
+def effective_roots(roots: NDArray[np.int64]) -> float:
+    """Return how many points of level 0 the failing points (k,) effectively descend from, (sum h)^2 / sum h^2.
+
+    So many independent terms, less one for their mean, are the degrees of freedom of the c.o.v.: as a rule 8 to 15
+    with N = 1000 and p = 2e-4, too few for a normal quantile.
+    """
+    h = np.bincount(roots).astype(np.float64)
+    return float(h.sum() ** 2 / (h * h).sum())
+
+
+def descent_cov(roots: NDArray[np.int64], n: int) -> float:
+    """Return the c.o.v. of p-hat that the descent of the failing points shows.
+
+    With h_i failing points descending from point i of n at level 0, p-hat is proportional to the
+    mean of the h_i. Were the thresholds fixed, these would be independent, so
+    c.o.v.^2 = sum h_i^2 / (sum h_i)^2 - 1/n. Unlike the product over levels this holds the
+    correlation between levels: a lucky point at level 0 is lucky at all.
+
+    Args:
+        roots: For each failing point the point of level 0 from which it descends, shape (k,).
+        n: Points of level 0.
+    """
+    if roots.size == 0:
+        return math.inf
+    return math.sqrt(max(1 / effective_roots(roots) - 1 / n, 0.0))
+
+
+def _end_warnings(depth: int, status: Status, hits: int, cov: float) -> list[str]:
+    """Return what the end of the run at level `depth` and its failures leave doubtful."""
+    found, failing = [], f"{hits} failing point{'' if hits == 1 else 's'}"
+    if status is Status.STALLED:
+        found.append(f"No progress beyond level {depth}: f is constant there, or the limit on levels was reached.")
+    if status is Status.BUDGET:
+        found.append(f"max_sim was used up at level {depth}; p rests on {failing}.")
+    if status is Status.STOPPED:
+        found.append(f"Stopped at level {depth}; p rests on {failing}.")
+    if hits == 0:
+        found.append("No failure was seen: p = 0 with a one-sided interval.")
+    elif cov > LARGE_COV:
+        found.append(f"The c.o.v. is {cov:.2f}: few independent paths lead to the failures seen.")
+    return found
+
+
+def _chain_warnings(trace: list[Level]) -> list[str]:
+    """Return which levels have chains that mix badly, or few of them."""
+    low, high = ACCEPTANCE_RANGE
+    found = [
+        f"Acceptance {level.acceptance:.2f} at level {k} is outside [{low}, {high}]: the chains explore badly."
+        for k, level in enumerate(trace)
+        if level.acceptance is not None and not low <= level.acceptance <= high
+    ]
+    for k, level in enumerate(trace[:-1], start=1):
+        seeds = round(level.p * level.n_points)
+        if seeds < FEW_CHAINS:
+            found.append(f"Level {k} grew from {seeds} seeds only: the estimate is coarse.")
+    return found
+
+
+@dataclass(frozen=True, kw_only=True)
+class SubsetSimulation(Method):
+    """Subset simulation with the component-wise modified Metropolis algorithm.
+
+    P[f <= gamma] is the product of conditional probabilities P[F_j | F_(j-1)] of nested level
+    sets F_j = {f <= b_j}. Level 0 is plain Monte Carlo; from level 1 on, every point inside F_j
+    starts a Markov chain that stays in F_j. A move proposes a symmetric step of every component,
+    keeps each with probability min(1, phi(new) / phi(old)), and is taken if it ends in F_j. Works
+    in standard normal space. "SS" of Tian et al.
+
+    Where the paper and this implementation differ:
+
+    - *Chains* move together, one step per call of f, so that f gets about p0 N rows per call.
+    - *A candidate equal to its point* (no component moved; every third or so in one dimension)
+      is not simulated again; a level then costs less than (1 - p0) N.
+    - *Ties.* Thresholds are outcomes that occurred, with their true share (`next_level`); the
+      paper books p0 for every level but the last.
+    - *c.o.v.* The larger of the paper's (equations 25 to 29, with levels taken as independent)
+      and the one from the descent of the failing points (`descent_cov`), which does not.
+
+    The script that Tian et al. released for this method does not run; where it can be read it maps
+    to normal space through marginals only.
+
+    The interval is log-normal with the t quantile of the independent paths that reach the failures
+    (`effective_roots`), or Clopper-Pearson where level 0 already answers. p-hat has a bias of order
+    1/N. A small max_sim is dealt with as in `AdaptiveSubsetSimulation`.
+
+    Args:
+        n: Points per level, N. (Tian et al. have 500.)
+        p0: Wanted conditional probability of each level.
+        distribution: Distribution of a component's steps: "uniform" as Au and Beck, "normal" as Tian et al.
+        spread: Half-width of the uniform, standard deviation of the normal distribution.
+        max_levels: Levels after which the method gives up.
+
+    References:
+        Au and Beck, "Estimation of small failure probabilities in high dimensions by subset
+        simulation", Probabilistic Engineering Mechanics 16, 2001.
+
+    Example:
+        >>> import samplers
+        >>> problem = samplers.FunctionProblem(lambda u: 3.5 - u.sum(axis=1) / 10**0.5, dim=10)  # P = 2.33e-4
+        >>> result = samplers.estimate(problem, samplers.SubsetSimulation(n=500), seed=0)
+        >>> result.interval[0] < 2.326e-4 < result.interval[1], len(result.trace), result.n_sim < 2000
+        (True, 4, True)
+    """
+
+    n: int = 1000
+    p0: float = 0.1
+    distribution: Literal["uniform", "normal"] = "uniform"
+    spread: float = 1.0
+    max_levels: int = 30
+
+    name: ClassVar[str] = "ss"
+    stops_at_target: ClassVar[bool] = False
+
+    def __post_init__(self) -> None:
+        """Check the settings."""
+        who = "SubsetSimulation"
+        check_count(who, "n", self.n, 10)
+        check_count(who, "max_levels", self.max_levels, 1)
+        check_setting(who, "p0", self.p0, 0.0, 0.5)
+        check_choice(who, "distribution", self.distribution, ("uniform", "normal"))
+        check_setting(who, "spread", self.spread, 0.0, math.inf)
+
+    def steps(self, inputs: Inputs, goal: Goal, rng: np.random.Generator) -> Steps:
+        """Go from level to level until the share of failures among its points is p0 or more."""
+        descent = SubsetLevels(n=self.n, p0=self.p0, max_levels=self.max_levels)
+        return (
+            yield from descent.steps(inputs, goal, rng, FixedMetropolis(self.spread, distribution=self.distribution))
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class AdaptiveSubsetSimulation(Method):
+    """Subset simulation whose step adapts to the acceptance rate.
+
+    P[f <= gamma] is the product of conditional probabilities P[F_j | F_(j-1)] of nested level
+    sets F_j = {f <= b_j} (Tian et al., equations 4 to 6). Level 0 is plain Monte Carlo; from
+    level 1 on, every point inside F_j starts a Markov chain that stays in F_j. Works in standard
+    normal space.
+
+    Where the paper, its released code and this implementation differ:
+
+    - *Proposal.* The paper speaks of conditional sampling, with standard deviations of at most 1
+      (equation 14), and prints a Metropolis ratio r = phi(new) / phi(old) per component (equations
+      19, 20); the code draws the conditional (AR-1) proposal rho u + sigma xi, rho^2 = 1 - sigma^2,
+      and has no ratio. Only one of the two is right at a time. The AR-1 proposal leaves N(0, 1)
+      invariant on its own (its own Metropolis ratio is 1 everywhere); with r on top the invariant
+      distribution would be phi^2, N(0, 1/2), and p far too small. The ratio r is exact for a symmetric step
+      u + sigma xi. So "conditional" is the code's reading and "metropolis" the printed one with the
+      step that it is right for. The default is "conditional": no component ever stays, so every
+      candidate is new. A level of 1000 points is then worth 381 independent ones against 299 in 2
+      dimensions and 385 against 372 in 100, and the spread of p-hat is 13 to 23 % smaller.
+    - *Adaptation.* Paper and code run N_a = 10 chains to their end, then adapt the scale for the
+      next 10. Ours moves all chains together, one step per call of f, and adapts after each step
+      with the same rule (equation 16), so that f gets about p0 N rows per call and a level takes
+      about 1/p0 - 1 calls. The scale is carried to the next level; paper and code start again.
+    - *sigma0.* 1 ("unit") as the code has hard-selected it; the paper's seed standard deviations
+      (equations 17, 18) are "seeds" (the code's version of them averages over the wrong axis).
+      They depend on the very points that are moved, which biases p where d is large: -12 % on a
+      hypersphere with d = 20, against +4 % with 1.
+    - *Seeds* keep their stored outcome; the code simulates them again, which costs p0 N calls
+      per level and biases p when f is noisy.
+    - *End.* No level is simulated once p0 N points have f <= gamma; the code runs one more.
+    - *Ties.* Thresholds are outcomes that occurred, with their true share (`next_level`); the
+      code takes an interpolated percentile and books p0 whatever the share.
+    - *c.o.v.* Au and Beck's chain correlation, chains kept apart; the code mixes the chains. The
+      released "Cov" column is the square of a c.o.v.
+
+    The c.o.v. is the larger of two: Au and Beck's, which takes the levels as independent, and the
+    one from the descent of the failing points (`descent_cov`), which does not. The interval is
+    log-normal with the t quantile of the independent paths that reach the failures
+    (`effective_roots`), or Clopper-Pearson where level 0 already answers. p-hat has a bias of order
+    1/N (+1 to +4 % at N = 1000 and p = 2e-4).
+
+    Where max_sim does not hold four levels of n points (3.7 n with p0 = 0.1), N is what lets them
+    fit, but at least 10 / p0; a warning says so where that is less than half of n. With a smaller
+    max_sim there is level 0 only.
+
+    Args:
+        n: Points per level, N. (The paper has 500.)
+        p0: Wanted conditional probability of each level.
+        proposal: "conditional" as in the released code or "metropolis" as printed, see above.
+        sigma0: Proposal standard deviations before scaling: 1, or those of the seeds.
+        scale: First value of the scale lambda.
+        target_acceptance: Acceptance rate that the scale is steered to, a*.
+        max_levels: Levels after which the method gives up.
+
+    References:
+        Tian, Fu, Zhang, Tang and Sun, "Accelerated verification of autonomous driving systems
+        based on adaptive subset simulation", IEEE Transactions on Intelligent Vehicles, 2024.
+        Papaioannou, Betz, Zwirglmaier and Straub, "MCMC algorithms for subset simulation",
+        Probabilistic Engineering Mechanics 41, 2015.
+        Lee and Whiteley, "Variance estimation in the particle filter", Biometrika 105, 2018.
+
+    Example:
+        >>> import samplers
+        >>> problem = samplers.FunctionProblem(lambda u: 3.5 - u.sum(axis=1) / 10**0.5, dim=10)  # P = 2.33e-4
+        >>> result = samplers.estimate(problem, samplers.AdaptiveSubsetSimulation(), seed=0)
+        >>> result.interval[0] < 2.326e-4 < result.interval[1], result.n_sim
+        (True, 3700)
+        >>> [f"{level.gamma:.2f}" for level in result.trace]  # thresholds b_1, b_2, ... down to gamma
+        ['2.17', '1.15', '0.34', '0.00']
+    """
+
+    n: int = 1000
+    p0: float = 0.1
+    proposal: Literal["conditional", "metropolis"] = "conditional"
+    sigma0: Literal["unit", "seeds"] = "unit"
+    scale: float = 0.6
+    target_acceptance: float = 0.44
+    max_levels: int = 30
+
+    name: ClassVar[str] = "adss"
+    stops_at_target: ClassVar[bool] = False
+
+    def __post_init__(self) -> None:
+        """Check the settings."""
+        who = "AdaptiveSubsetSimulation"
+        check_count(who, "n", self.n, 10)
+        check_count(who, "max_levels", self.max_levels, 1)
+        check_setting(who, "p0", self.p0, 0.0, 0.5)
+        check_setting(who, "scale", self.scale, 0.0, math.inf)
+        check_setting(who, "target_acceptance", self.target_acceptance, 0.0, 1.0)
+        check_choice(who, "proposal", self.proposal, ("conditional", "metropolis"))
+        check_choice(who, "sigma0", self.sigma0, ("unit", "seeds"))
+
+    def steps(self, inputs: Inputs, goal: Goal, rng: np.random.Generator, known: RootedPoints | None = None) -> Steps:
+        """Go from level to level until the share of failures among its points is p0 or more.
+
+        Args:
+            inputs: Of the problem.
+            goal: Threshold and budget.
+            rng: Source of randomness.
+            known: Base draws whose outcomes are known, at most n: level 0 begins with them.
+        """
+        kernel = ScaledKernel(
+            self.proposal, self.sigma0, self.scale, self.target_acceptance, deviations=np.ones(inputs.dim)
+        )
+        descent = SubsetLevels(n=self.n, p0=self.p0, max_levels=self.max_levels)
+        return (yield from descent.steps(inputs, goal, rng, kernel, known))

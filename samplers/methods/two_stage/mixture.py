@@ -1,0 +1,471 @@
+"""The mixture proposal of two-stage: its components and their weights."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from samplers.components import (
+    MixtureComponent,
+    RadialLaw,
+    SubspaceGaussian,
+    draw_components,
+    draw_counts,
+    log_ratios,
+    mixture_log_ratio,
+)
+from samplers.methods.two_stage.planes import weighted_quantile
+from samplers.methods.two_stage.settings import (
+    DEFAULT_MIXTURE_SETTINGS,
+    EdgeSettings,
+    MixtureWeightSettings,
+    SubspaceSettings,
+)
+from samplers.problem import FloatArray
+from samplers.proposals import expectation_maximisation, k_means, one_hot, posterior, shrink_covariance
+from samplers.statistics import normalise_weights
+
+Kind = Literal[
+    "base",
+    "wide",
+    "radial",
+    "gaussian",
+    "linear",
+    "corner",
+    "explored",
+    "tempered",
+    "spread",
+    "directional",
+]
+"""Where a component of a proposal comes from:
+
+    base        N(0, I), which bounds all weights
+    wide        N(0, s^2 I)
+    directional a direction and a radius, for failures like a shell or a cone
+    radial      every direction alike, from the radius of the failures on
+    gaussian    fitted to weighted failures
+    linear      a half-space and its Gaussian, from linear regression of f
+    corner      N(0, I) beyond all of several planes, from regression of f as the greatest of linear functions
+    explored    fitted to the chains of the exploration, never changed
+    tempered    q^t phi^(1 - t) of a Gaussian q, which bounds weights where q is a bad description
+    spread      as wide as the failures in the span of a few gradients of f, N(0, 1) across it
+"""
+NO_REGION = -1
+"""Region of a component that belongs to none in particular."""
+
+
+class ProposalComponent(NamedTuple):
+    """A component of a proposal, and where it comes from."""
+
+    component: MixtureComponent
+    kind: Kind
+    region: int = NO_REGION
+
+
+@dataclass(frozen=True)
+class MixtureProposal:
+    """A mixture sum_k a_k q_k to draw from."""
+
+    candidates: list[ProposalComponent]
+    """The components; those of weight 0 are not drawn from."""
+    weights: FloatArray
+    """a_k, adding up to 1, shape (k,)."""
+
+    @property
+    def components(self) -> list[MixtureComponent]:
+        """Its components q_k."""
+        return [candidate.component for candidate in self.candidates]
+
+    def log_weights(self, u: FloatArray) -> FloatArray:
+        """Return log(phi / q) at u (n, d), shape (n,)."""
+        log_r, weights = self._log_ratios(u)
+        return -mixture_log_ratio(log_r, weights)
+
+    def kind_ratios(self, u: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return q_kind / q at u (n, d) for the mixture of the components of each kind, (n, m), and log(phi / q)."""
+        log_r, weights = self._log_ratios(u)
+        log_q = mixture_log_ratio(log_r, weights)
+        kinds = np.array([one.kind for one, a in zip(self.candidates, self.weights, strict=True) if a > 0])
+        masses = weights[:, None] * np.exp(log_r - log_q)
+        ratios = [masses[kinds == kind].sum(axis=0) / weights[kinds == kind].sum() for kind in dict.fromkeys(kinds)]
+        return np.stack(ratios, axis=1), -log_q
+
+    def drawn(self, counts: FloatArray | NDArray[np.int64]) -> "MixtureProposal":
+        """Return the mixture that draws come from of which counts (k,) are from each component.
+
+        The same where the first component, the base distribution, has none: it bounds the weights.
+        """
+        return MixtureProposal(self.candidates, counts / counts.sum()) if counts[0] > 0 else self
+
+    def _log_ratios(self, u: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return log(q_k / phi) of the components drawn from, shape (m, n), and their weights (m,)."""
+        used = self.weights > 0
+        return log_ratios([c for c, a in zip(self.components, used, strict=True) if a], u), self.weights[used]
+
+    def draw(self, n: int, rng: np.random.Generator) -> tuple[FloatArray, NDArray[np.int64]]:
+        """Draw n points (n, d), one component after the other; return them and how many are from which (k,)."""
+        counts = draw_counts(self.weights, n, rng)
+        return draw_components(self.components, counts, rng), counts
+
+
+LEAST_MIXING = 1e-6
+"""Least weight of a component while others move; none is given up."""
+LEAST_VARIANCE_OF_COMPONENT = 1e-6
+"""Points may coincide."""
+SHORT_MEAN = 1e-9
+"""A mean shorter than this has no direction; its length divides."""
+TINY_WEIGHT = 1e-300
+"""Stands for 0 where a logarithm or a quotient is taken."""
+
+
+class GroupedPoints(NamedTuple):
+    """Weighted points to which components are fitted."""
+
+    u: FloatArray
+    """Shape (n, d)."""
+    weights: FloatArray
+    """Adding up to 1, shape (n,)."""
+    ess: float
+    """How many independent points they are worth."""
+    groups: NDArray[np.int64]
+    """Points of one group (a chain) belong to one component; numbers from 0, shape (n,)."""
+
+    @property
+    def n_groups(self) -> int:
+        """Number of groups."""
+        return int(self.groups.max()) + 1
+
+
+class SubspaceMixture(NamedTuple):
+    """A fitted mixture."""
+
+    components: list[SubspaceGaussian]
+    weights: FloatArray
+    score: float
+    """Log likelihood, in independent points, less the BIC penalty."""
+
+
+def fit_shrunk_subspace_gaussian(
+    u: FloatArray, weights: FloatArray, ess: float, settings: SubspaceSettings = DEFAULT_MIXTURE_SETTINGS.subspace
+) -> tuple[SubspaceGaussian, float]:
+    """Return the component of weighted points, and the share of the shrinkage target in its covariance.
+
+    Its covariance is shrunk as by `shrink_covariance`. Above `high_dim` dimensions it is the target alone: one
+    direction, that of the mean, and N(0, 1) across it.
+
+    Args:
+        u: Points, shape (n, d).
+        weights: Adding up to 1, shape (n,).
+        ess: How many independent points they are worth.
+        settings: Limits of variances and of the mean's correction.
+    """
+    dim = u.shape[1]
+    mean = weights @ u
+    norm = float(np.linalg.norm(mean))
+    v = mean / norm if norm > 0 else np.eye(dim)[0]
+    along = float(weights @ (u @ v - norm) ** 2)
+    if dim > settings.high_dim:
+        # Noise makes the mean of few points too long, by (d - 1) / ess in the square, and turns it.
+        excess = min((dim - 1) / (ess * max(norm, SHORT_MEAN) ** 2), settings.max_mean_excess)
+        variance = np.array([min(along * (1 - excess) + excess, settings.max_spread)])
+        raised = inflate_variances(variance, ess, settings)
+        return SubspaceGaussian(v[:, None], np.array([norm * (1 - excess)]), raised), 1.0
+    centred = (u - mean) * np.sqrt(weights)[:, None]  # `weighted_moments` would lose digits of small variances far out
+    shrunk, share = shrink_covariance(centred.T @ centred, v, along, ess)
+    values, axes = np.linalg.eigh(shrunk)
+    return SubspaceGaussian(axes, axes.T @ mean, inflate_variances(values, ess, settings)), share
+
+
+def inflate_variances(
+    variance: FloatArray, ess: float, settings: SubspaceSettings = DEFAULT_MIXTURE_SETTINGS.subspace
+) -> FloatArray:
+    """Return variances (r,), those under 1 raised by some of their standard errors.
+
+    Too small a variance makes weights unbounded, too large a one costs a few draws.
+    """
+    variance = np.maximum(variance, LEAST_VARIANCE_OF_COMPONENT)
+    error = math.sqrt(2 / max(ess, settings.min_ess))
+    raised = np.minimum(variance * (1 + settings.standard_errors * error), 1.0)
+    return np.where(variance < 1, raised, variance)
+
+
+def fit_subspace_mixture(
+    points: GroupedPoints,
+    most: int,
+    rng: np.random.Generator,
+    settings: SubspaceSettings = DEFAULT_MIXTURE_SETTINGS.subspace,
+) -> SubspaceMixture:
+    """Return a mixture of at most `most` components, their number chosen by BIC."""
+    best = None
+    worse = 0
+    for k in (size for size in settings.sizes if size <= most):
+        if k > 1 and (k > points.n_groups or points.ess < settings.points_per_component * k):
+            break
+        restarts = 1 if k == 1 else settings.em_restarts
+        found = max(
+            (_fit_from(points, _initial_responsibilities(points, k, rng), settings) for _ in range(restarts)),
+            key=lambda mix: mix.score,
+        )
+        if best is None or found.score > best.score:
+            best, worse = found, 0
+        else:
+            worse += 1
+        if worse == settings.max_worse:
+            break
+    assert best is not None  # one component can always be fitted
+    return best
+
+
+def _initial_responsibilities(points: GroupedPoints, k: int, rng: np.random.Generator) -> FloatArray:
+    """Return responsibilities (k, n) to start from: clusters of the groups' means."""
+    n_groups = points.n_groups
+    mass = np.bincount(points.groups, weights=points.weights, minlength=n_groups).astype(np.float64)
+    means = np.zeros((n_groups, points.u.shape[1]))
+    np.add.at(means, points.groups, points.u * points.weights[:, None])
+    return one_hot(k_means(means / np.maximum(mass, TINY_WEIGHT)[:, None], mass / mass.sum(), k, rng)[points.groups], k)
+
+
+class _Fitted(NamedTuple):
+    """Components with the share of the shrinkage target in each, and their weights."""
+
+    components: list[SubspaceGaussian]
+    target_shares: list[float]
+    weights: FloatArray
+
+
+@dataclass(frozen=True)
+class _GroupedFamily:
+    """Mixtures in which all points of a group come from one component, see `samplers.proposals.Family`."""
+
+    points: GroupedPoints
+    settings: SubspaceSettings
+
+    def maximise(self, responsibilities: FloatArray) -> _Fitted:
+        """Return the components that have at least one point, from responsibilities (k, n)."""
+        u, weights, ess, _ = self.points
+        mass = (responsibilities * weights).sum(axis=1)
+        shares, mass = responsibilities[mass * ess > 1], mass[mass * ess > 1]
+        fits = [
+            fit_shrunk_subspace_gaussian(
+                u, share * weights / m, max(float(m) * ess, self.settings.min_ess), self.settings
+            )
+            for share, m in zip(shares, mass, strict=True)
+        ]
+        return _Fitted([one for one, _ in fits], [share for _, share in fits], mass / mass.sum())
+
+    def log_terms(self, mixture: _Fitted) -> FloatArray:
+        """Return log(weight_j) and the log ratio to N(0, I) of each point's group, in independent points, (k, n)."""
+        u, weights, ess, groups = self.points
+        per_point = log_ratios(mixture.components, u) * (ess * weights)
+        per_group = np.array([np.bincount(groups, weights=row, minlength=self.points.n_groups) for row in per_point])
+        return np.asarray((per_group + np.log(mixture.weights)[:, None])[:, groups])
+
+
+def _fit_from(points: GroupedPoints, start: FloatArray, settings: SubspaceSettings) -> SubspaceMixture:
+    """Return the mixture that expectation-maximisation reaches from responsibilities (k, n)."""
+    once_per_group = 1 / np.bincount(points.groups)[points.groups]
+    fit, log_likelihood = expectation_maximisation(
+        _GroupedFamily(points, settings),
+        start,
+        once_per_group,
+        settings.max_em_iterations,
+        lambda total: settings.min_relative_gain * abs(total),
+    )
+    dim = points.u.shape[1]
+    most = settings.covariance_parameters_per_dim * dim
+    covariances = [min((1 - share) * dim * (dim + 1) / 2, most) for share in fit.target_shares]
+    parameters = len(fit.components) - 1 + sum(dim + 1 + size for size in covariances)
+    penalty = 0.5 * math.log(max(points.ess, settings.min_bic_ess)) * parameters
+    return SubspaceMixture(fit.components, fit.weights, log_likelihood - penalty)
+
+
+def refit_components(
+    components: list[SubspaceGaussian],
+    u: FloatArray,
+    log_weights: FloatArray,
+    settings: SubspaceSettings = DEFAULT_MIXTURE_SETTINGS.subspace,
+) -> list[SubspaceGaussian]:
+    """Return components moved to weighted points u (n, d), each by those that are its own.
+
+    Some steps of expectation-maximisation from the present components; their number stays, so that one with few
+    points is not lost.
+    """
+    weights = truncate_weights(log_weights)
+    log_mixing = np.zeros(len(components))
+    for _ in range(settings.refit_steps):
+        shares = posterior(log_ratios(components, u) + log_mixing[:, None])
+        log_w = np.log(np.maximum(weights, TINY_WEIGHT))
+        components = [_refit(one, u, share, log_w, settings) for one, share in zip(components, shares, strict=True)]
+        log_mixing = np.log(np.maximum((shares * weights).sum(axis=1), LEAST_MIXING))
+    return components
+
+
+def _refit(
+    component: SubspaceGaussian, u: FloatArray, shares: FloatArray, log_weights: FloatArray, settings: SubspaceSettings
+) -> SubspaceGaussian:
+    """Return a component fitted to its share (n,) of weighted points.
+
+    Where the weights are too uneven to fit it, they are raised to powers less than 1 until they are not.
+    """
+    count = float(shares.sum())
+    if count < settings.min_refit_points:
+        return component
+    wanted = max(settings.refit_ess, settings.refit_ess_per_dim * u.shape[1])
+    wanted = min(wanted, count / settings.points_per_refit_ess)
+    log_shares = np.log(np.maximum(shares, TINY_WEIGHT))
+    for power in np.arange(1.0, 0.0, -settings.power_step):
+        w = normalise_weights(log_shares + power * log_weights)
+        ess = 1 / float((w * w).sum())
+        if ess >= wanted:
+            break
+    return fit_shrunk_subspace_gaussian(u, w, max(ess, settings.min_ess), settings)[0]
+
+
+def truncate_weights(log_weights: FloatArray) -> FloatArray:
+    """Return weights that add up to 1, those over sqrt(n) times their mean cut to that (Ionides 2008)."""
+    w = normalise_weights(log_weights)
+    w = np.minimum(w, 1 / math.sqrt(len(w)))
+    return np.asarray(w / w.sum())
+
+
+MIN_VARIANCE = 1e-6
+"""Smallest variance of |u|^2."""
+MIN_SCALE = 1e-3
+"""Least scale of the Gamma distribution of |u|^2: it must be positive."""
+
+
+def fit_radial(
+    u: FloatArray, weights: FloatArray, settings: EdgeSettings = DEFAULT_MIXTURE_SETTINGS.edges
+) -> RadialLaw:
+    """Return the radial distribution whose |u|^2 has the moments of failures u (n, d) with weights (n,).
+
+    |u|^2 = start + Gamma(shape, scale) in every direction, with shape = mean^2 / variance and scale = variance / mean
+    of what |u|^2 exceeds the start by.
+    """
+    square = np.einsum("ij,ij->i", u, u)
+    start = settings.radius_factor * weighted_quantile(square, weights, settings.radius_share)
+    outside = square > start
+    excess, w = square[outside] - start, weights[outside]
+    mean = float(np.average(excess, weights=w))
+    variance = max(float(np.average((excess - mean) ** 2, weights=w)), MIN_VARIANCE)
+    shape = max(mean * mean / variance, settings.min_radial_shape)
+    return RadialLaw(u.shape[1], start, shape, max(variance / mean, MIN_SCALE))
+
+
+LEAST_DENSITY_RATIO = 1e-150
+"""Least ratio of densities to divide by."""
+FLOOR_ROUNDING = 1e-12
+"""A group that is this little below its floor has reached it."""
+
+
+@dataclass(frozen=True, eq=False)
+class Floor:
+    """Components that together get at least some share of the draws."""
+
+    members: NDArray[np.bool_]
+    """Which components, shape (k,)."""
+    least: float
+    """Their least share."""
+
+
+def minimise_second_moment(
+    log_r: FloatArray,
+    log_weights: FloatArray,
+    start: FloatArray,
+    floors: Sequence[Floor],
+    settings: MixtureWeightSettings = DEFAULT_MIXTURE_SETTINGS.weights,
+) -> FloatArray:
+    """Return weights a (k,) of a mixture q_a = sum_k a_k q_k that minimise the second moment of its estimate.
+
+    That is sum_i w_i (phi / q_a)(u_i) over failing points u_i with importance weights w_i, convex in a. Each update
+    multiplies a_k by the square root of G_k = sum_i w_i (phi q_k / q_a^2)(u_i); at the optimum all G_k with a_k > 0
+    are equal.
+
+    Args:
+        log_r: log(q_k / phi) at the failing points, shape (k, n).
+        log_weights: Of the failing points, shape (n,).
+        start: First weights, shape (k,).
+        floors: Lower limits of disjoint groups, kept in every update.
+        settings: Number of updates.
+
+    Example:
+        Two components without overlap, 10 points of ratio 4 and 40 of ratio 1: weights are as the roots of 10 / 4 and
+        40 / 1, 1 to 4.
+
+        >>> log_r = np.full((2, 50), -np.inf)
+        >>> log_r[0, :10], log_r[1, 10:] = np.log(4), 0.0
+        >>> minimise_second_moment(log_r, np.zeros(50), np.array([0.5, 0.5]), []).round(3)
+        array([0.2, 0.8])
+    """
+    matter = log_weights > log_weights.max() - settings.negligible
+    log_r, log_weights = log_r[:, matter], log_weights[matter]
+    largest = log_r.max(axis=0)
+    ratio = np.exp(log_r - largest)
+    scaled = np.exp(log_weights - largest - (log_weights - largest).max())
+    a, limits = start, _FloorIndex.of(floors, len(start))
+    for _ in range(settings.updates):
+        q = np.maximum(a @ ratio, LEAST_DENSITY_RATIO)
+        a = a * np.sqrt(ratio @ (scaled / (q * q)))
+        a = limits.apply(a / a.sum())
+    return a
+
+
+def raise_to_floors(a: FloatArray, floors: Sequence[Floor]) -> FloatArray:
+    """Return weights (k,) raised to the floors, the others lowered in proportion; they add up to 1.
+
+    Members of a floor keep their proportions; without any weight they share the floor evenly. Lowering may bring
+    another group under its floor, which is then raised too. Floors that add up to more than 1 are lowered in
+    proportion.
+
+    Example:
+        >>> floor = Floor(np.array([True, True, False, False]), 0.2)
+        >>> raise_to_floors(np.array([0.0, 0.0, 0.4, 0.6]), [floor]).round(2)
+        array([0.1 , 0.1 , 0.32, 0.48])
+    """
+    return _FloorIndex.of(floors, len(a)).apply(a)
+
+
+class _FloorIndex(NamedTuple):
+    """Floors as they are read in every update of the weights."""
+
+    groups: NDArray[np.intp]
+    """Floor of each component, shape (k,); m where it has none."""
+    least: list[float]
+    """Least share of each, 0 without a floor; m + 1."""
+
+    @classmethod
+    def of(cls, floors: Sequence[Floor], k: int) -> "_FloorIndex":
+        """Return the floors of k components."""
+        groups = np.full(k, len(floors))
+        for number, floor in enumerate(floors):
+            groups[floor.members] = number
+        return cls(groups, [*(each.least for each in floors), 0.0])
+
+    def apply(self, a: FloatArray) -> FloatArray:
+        """Return weights raised to the floors, see `raise_to_floors`."""
+        own = np.bincount(self.groups, a, len(self.least))
+        shares = _raise_shares(own.tolist(), self.least)
+        if shares is None:
+            return a
+        inside = np.where(own > 0, own, np.bincount(self.groups, minlength=len(own)))[self.groups]
+        return np.asarray(np.where(own[self.groups] > 0, a, 1.0) / inside * np.array(shares)[self.groups])
+
+
+def _raise_shares(shares: list[float], least: list[float]) -> list[float] | None:
+    """Return shares of groups (m,) raised to their least ones, the others lowered; None where none is too low."""
+    raised: set[int] = set()
+    while True:
+        low = {k for k, share in enumerate(shares) if share < least[k] - FLOOR_ROUNDING} - raised
+        if not low:
+            return shares if raised else None
+        raised |= low
+        total, rest = sum(least[k] for k in raised), sum(share for k, share in enumerate(shares) if k not in raised)
+        room = max(1 - total, 0.0) if rest > 0 else 0.0
+        lowered = room / rest if rest > 0 else 0.0
+        shares = [
+            share * lowered if k not in raised else least[k] if room > 0 else least[k] / total
+            for k, share in enumerate(shares)
+        ]

@@ -1,1 +1,0 @@
-"""The mixture proposal of two-stage: its components and their weights."""

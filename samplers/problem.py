@@ -1,0 +1,530 @@
+"""Problem: the probability P[f(X) <= gamma] of a function f and a base distribution of X; small f is dangerous."""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from html import escape
+from typing import Any, Protocol, TypeGuard, runtime_checkable
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from samplers.distributions import as_distribution
+from samplers.errors import EvaluationError, one_per_row
+from samplers.validation import check_number, check_whole
+
+FloatArray = NDArray[np.float64]
+
+
+@runtime_checkable
+class Distribution(Protocol):
+    """A distribution on R^d with an exact map to and from standard normal space.
+
+    One that is also `HasNoise` says which coordinates are the simulation's own randomness.
+
+    Example:
+        Half-normal in each coordinate: x = Phi^-1((1 + Phi(u)) / 2).
+
+        >>> import numpy as np, samplers
+        >>> from scipy import stats
+        >>> class HalfNormal:
+        ...     def sample(self, n, rng):
+        ...         return np.abs(rng.standard_normal((n, 2)))
+        ...     def log_prob(self, x):
+        ...         return stats.halfnorm.logpdf(x).sum(axis=1)
+        ...     def to_standard_normal(self, x):
+        ...         return stats.norm.ppf(stats.halfnorm.cdf(x))
+        ...     def from_standard_normal(self, u):
+        ...         return stats.halfnorm.ppf(stats.norm.cdf(u))
+        >>> base = HalfNormal()
+        >>> isinstance(base, samplers.Distribution)
+        True
+        >>> base.from_standard_normal(np.zeros((1, 2))).round(4)
+        array([[0.6745, 0.6745]])
+    """
+
+    def sample(self, n: int, rng: np.random.Generator) -> FloatArray:
+        """Draw n independent points, shape (n, d)."""
+
+    def log_prob(self, x: FloatArray) -> FloatArray:
+        """Log density at x (n, d), shape (n,)."""
+
+    def to_standard_normal(self, x: FloatArray) -> FloatArray:
+        """Map x from this distribution, shape (n, d), to u ~ N(0, I), shape (n, d)."""
+
+    def from_standard_normal(self, u: FloatArray) -> FloatArray:
+        """Map u ~ N(0, I), shape (n, d), to x from this distribution, shape (n, d)."""
+
+
+class Inputs(Protocol):
+    """The random input X of a problem; all that a method knows of it.
+
+    Example:
+        A method asks for points of it; who has the simulator answers.
+
+        >>> import samplers
+        >>> class Places:
+        ...     dim, base = 2, samplers.StandardNormal(2)
+        >>> run = samplers.MonteCarlo(batch=100).start(Places(), seed=0, max_sim=300)
+        >>> run.ask().shape
+        (100, 2)
+    """
+
+    @property
+    def dim(self) -> int:
+        """Number of dimensions d of x."""
+
+    @property
+    def base(self) -> Distribution:
+        """Distribution of X."""
+
+
+@runtime_checkable
+class HasNoise(Protocol):
+    """A base distribution some of whose coordinates are the simulation's own randomness.
+
+    They are independent standard normal. `TwoStage` does not search among them: it draws them as they come.
+
+    Example:
+        >>> import numpy as np, samplers
+        >>> class OneIsNoise(samplers.StandardNormal):
+        ...     noise = np.array([False, True])
+        >>> isinstance(OneIsNoise(2), HasNoise), isinstance(samplers.StandardNormal(2), HasNoise)
+        (True, False)
+    """
+
+    @property
+    def noise(self) -> NDArray[np.bool_] | None:
+        """Mask of the coordinates of x that are noise, shape (d,); None for none."""
+
+
+@runtime_checkable
+class Problem(Inputs, Protocol):
+    """P[f(X) <= gamma] for X ~ base; small f is dangerous.
+
+    Any object with these three attributes is one; nothing has to be inherited.
+
+    Example:
+        >>> import samplers
+        >>> class Disc:
+        ...     dim = 2
+        ...     base = samplers.StandardNormal(2)
+        ...     def evaluate(self, x):
+        ...         return 3.0 - (x**2).sum(axis=1) ** 0.5
+        >>> isinstance(Disc(), samplers.Problem)
+        True
+        >>> result = samplers.estimate(Disc(), seed=0, max_sim=3000)  # P = exp(-9 / 2) = 0.0111
+        >>> print(f"{result.p:.3f}")
+        0.011
+    """
+
+    def evaluate(self, x: FloatArray) -> FloatArray:
+        """Simulate the rows of x (n, d); return f, shape (n,), float64."""
+
+
+@runtime_checkable
+class ConditionalProblem(Protocol):
+    """A problem that holds something fixed, so that its p is conditional on it.
+
+    Example:
+        >>> class Wet:
+        ...     given = "a wet road"
+        >>> isinstance(Wet(), ConditionalProblem)
+        True
+    """
+
+    @property
+    def given(self) -> str:
+        """Condition, in words; empty without one."""
+
+
+@runtime_checkable
+class NamedProblem(Protocol):
+    """A problem whose columns of x have names, which tables of its results take.
+
+    Example:
+        >>> import samplers
+        >>> braking = samplers.FunctionProblem(lambda x: x[:, 0], 2, column_names=("speed", "gap"))
+        >>> isinstance(braking, NamedProblem), braking.column_names
+        (True, ('speed', 'gap'))
+    """
+
+    @property
+    def column_names(self) -> Sequence[str]:
+        """Names of the d columns of x; empty without names."""
+
+
+@dataclass(frozen=True, eq=False)
+class Terms:
+    """f of some points together with the terms that it is the least of: f fails where one of its terms does.
+
+    A term is a part of a series system: another car that may be hit, a pair of them, a beam of the lidar. For one
+    threshold gamma the failures are those of the terms, {f <= gamma} = {min_j values[:, j] <= threshold}. The terms
+    need not be f's own. Where failure is a collision, `values` may be clearances with threshold 0: they tell near from
+    far where f does not.
+
+    Example:
+        >>> import numpy as np
+        >>> terms = Terms(np.array([1.0, -2.0]), np.array([[1.0, 3.0], [0.5, -2.0]]), np.zeros((2, 2), dtype=int), 0.0)
+        >>> terms.least, terms.lowest
+        (array([0, 1]), array([ 1., -2.]))
+    """
+
+    f: FloatArray
+    """The problem's own f, shape (n,)."""
+    values: FloatArray
+    """Terms, in the order in which to search: small is dangerous; shape (n, J)."""
+    ticks: NDArray[np.int64]
+    """Index of the time at which each term is attained, 0 where time means nothing; shape (n, J)."""
+    threshold: float
+    """Terms fail at or below it."""
+    names: tuple[str, ...] = ()
+    """Names of the J terms for messages; numbers where there are none."""
+
+    @property
+    def least(self) -> NDArray[np.int64]:
+        """Number of the least term, shape (n,)."""
+        return np.asarray(self.values.argmin(axis=1), dtype=np.int64)
+
+    @property
+    def lowest(self) -> FloatArray:
+        """Value of the least term, shape (n,)."""
+        return np.asarray(self.values.min(axis=1))
+
+
+@dataclass(frozen=True, eq=False)
+class TermGradients:
+    """Gradients of one term of each point, and what they cost.
+
+    Example:
+        >>> import numpy as np
+        >>> TermGradients(np.zeros((2, 3)), cost=6.0).cost
+        6.0
+    """
+
+    values: FloatArray
+    """Gradient with respect to x of the term asked for, shape (n, d); NaN in rows that have none."""
+    cost: float
+    """Simulations that they took, all rows together."""
+
+
+@runtime_checkable
+class HasTerms(Protocol):
+    """A problem whose f is the least of several terms, and that can tell them apart.
+
+    Methods may ask for terms in place of f, at the price of one simulation a row. An attribute that is None counts as
+    not offered, so that a class can offer it for some of its objects only. Where terms take another simulation than f,
+    a slower one that rounds otherwise, an attribute `terms_with_f` of the problem that is False says so.
+
+    Example:
+        >>> import samplers
+        >>> problem = samplers.FunctionProblem(dim=2, terms=lambda x: 3.0 - x)
+        >>> isinstance(problem, samplers.HasTerms), isinstance(problem, samplers.HasTermGradients)
+        (True, False)
+    """
+
+    def terms(self, x: FloatArray, gamma: float = 0.0) -> Terms:
+        """Simulate the rows of x (n, d); return f and terms whose least decides whether f <= gamma."""
+
+
+@runtime_checkable
+class HasTermGradients(HasTerms, Protocol):
+    """A problem with terms that also has their gradients.
+
+    Example:
+        >>> import numpy as np, samplers
+        >>> problem = samplers.FunctionProblem(
+        ...     dim=2, terms=lambda x: 3.0 - x, gradient=lambda x, term: -np.eye(2)[term]
+        ... )
+        >>> isinstance(problem, samplers.HasTermGradients)
+        True
+        >>> problem.gradient(np.zeros((1, 2)), term=np.array([1]), ticks=np.array([0])).values
+        array([[-0., -1.]])
+    """
+
+    @property
+    def gradient_cost(self) -> float:
+        """Simulations that a row of `gradient` takes at most, above 0; a budget is planned with it."""
+
+    def gradient(
+        self, x: FloatArray, term: NDArray[np.int64], ticks: NDArray[np.int64], gamma: float = 0.0
+    ) -> TermGradients:
+        """Return the gradient with respect to x of one term for each row of x (n, d).
+
+        Args:
+            x: Points whose terms are known, shape (n, d).
+            term: Number of the term, shape (n,).
+            ticks: Index of the time at which `terms` found it attained, shape (n,).
+            gamma: Threshold of f that `terms` was given.
+        """
+
+
+def offers_terms(problem: object) -> TypeGuard[HasTerms]:
+    """Return whether a problem has terms.
+
+    Example:
+        >>> import samplers
+        >>> offers_terms(samplers.FunctionProblem(lambda x: x[:, 0], 2))
+        False
+        >>> offers_terms(samplers.FunctionProblem(dim=2, terms=lambda x: x))
+        True
+    """
+    return callable(getattr(problem, "terms", None))  # a user's object
+
+
+def condition_of(problem: Inputs) -> str:
+    """Return what a problem holds fixed, in words; empty for nothing.
+
+    Example:
+        >>> import samplers
+        >>> condition_of(samplers.FunctionProblem(lambda x: x[:, 0], 2))
+        ''
+    """
+    return str(problem.given) if isinstance(problem, ConditionalProblem) else ""
+
+
+def names_of_columns(problem: Inputs) -> tuple[str, ...]:
+    """Return the names of the columns of x of a problem; empty where it has none.
+
+    Raises:
+        ValueError: If they are not as many different names as it has dimensions.
+
+    Example:
+        >>> import samplers
+        >>> names_of_columns(samplers.FunctionProblem(lambda x: x[:, 0], 2, column_names=["speed", "gap"]))
+        ('speed', 'gap')
+    """
+    names = tuple(problem.column_names) if isinstance(problem, NamedProblem) else ()
+    if names and (len(set(names)) != int(problem.dim) or not all(isinstance(name, str) for name in names)):
+        raise ValueError(f"Expected column_names of a problem to be {int(problem.dim)} different names, got {names!r}.")
+    return names
+
+
+LOG_TWO_PI = float(np.log(2 * np.pi))
+
+
+@dataclass(frozen=True)
+class StandardNormal:
+    """N(0, I) in `dim` dimensions; its map to standard normal space is the identity.
+
+    Raises:
+        ValueError: If dim is not a positive whole number.
+
+    Example:
+        >>> import numpy as np, samplers
+        >>> base = samplers.StandardNormal(2)
+        >>> base.log_prob(np.zeros((1, 2))).round(4)  # -log(2 pi)
+        array([-1.8379])
+    """
+
+    dim: int
+    """Number of dimensions d."""
+
+    def __post_init__(self) -> None:
+        """Check the dimension."""
+        check_whole("dim", self.dim, 1)
+
+    def sample(self, n: int, rng: np.random.Generator) -> FloatArray:
+        """Draw n independent points, shape (n, d)."""
+        return rng.standard_normal((n, self.dim))
+
+    def log_prob(self, x: FloatArray) -> FloatArray:
+        """Log density at x (n, d), shape (n,)."""
+        return np.asarray(-0.5 * (np.einsum("ij,ij->i", x, x) + self.dim * LOG_TWO_PI))
+
+    def to_standard_normal(self, x: FloatArray) -> FloatArray:
+        """Return x itself."""
+        return x
+
+    def from_standard_normal(self, u: FloatArray) -> FloatArray:
+        """Return u itself."""
+        return u
+
+
+@dataclass(frozen=True, repr=False)
+class FunctionProblem:
+    """Any vectorised function, under N(0, I) or another base distribution.
+
+    Args:
+        f: Maps points of shape (n, d) to values of shape (n,); small is dangerous. It may be left out where there are
+            `terms`: it is then their least. See `vectorized` for an f of one point.
+        dim: Number of dimensions d; may be left out where the base has one.
+        terms: Maps points of shape (n, d) to terms of shape (n, J) whose least is f, for a series system that fails
+            where one of its parts does; None for none. The problem's own `terms` gives `Terms`.
+        gradient: Maps points of shape (n, d) and the numbers of their terms, shape (n,), to the gradients of these
+            terms, shape (n, d); None for none. The problem's own `gradient` gives `TermGradients`.
+        gradient_cost: Simulations that a row of `gradient` counts as.
+        vectorized: False where f maps one point of shape (d,) to a number, as a program does that simulates one drive.
+        chunk_size: Rows that workers get at once (`estimate(..., workers=2)`); None for 16, and for 1 of an f of one
+            point.
+        base: Distribution of X: N(0, I) by default, a `Distribution`, or what `as_distribution` takes: a frozen
+            distribution of SciPy (of one coordinate: all `dim` have it), one of OpenTURNS, or a list of them.
+        column_names: Names of the columns of x, for tables; those of the description of an OpenTURNS distribution by
+            default.
+
+    Raises:
+        ValueError: If f, terms or gradient is not callable, f and terms are missing both, dim is not a positive
+            whole number, or base does not fit.
+
+    Example:
+        >>> import numpy as np, samplers
+        >>> problem = samplers.FunctionProblem(lambda x: 3.0 - x[:, 0], dim=2)
+        >>> problem.evaluate(np.array([[1.0, 0.0], [4.0, 0.0]]))
+        array([ 2., -1.])
+
+        An f of one point, such as a simulation of one drive:
+
+        >>> drive = samplers.FunctionProblem(lambda x: 3.0 - x[0], dim=2, vectorized=False)
+        >>> drive.evaluate(np.array([[1.0, 0.0], [4.0, 0.0]]))
+        array([ 2., -1.])
+
+        Other distributions, here of SciPy:
+
+        >>> from scipy import stats
+        >>> strength, load = stats.lognorm(0.1, scale=9.0), stats.gumbel_r(3.0)
+        >>> samplers.FunctionProblem(lambda x: x[:, 0] - x[:, 1], base=[strength, load])
+        <FunctionProblem of <lambda>, 2 dimensions, base IndependentDistributions>
+
+        A series system, which fails where either coordinate exceeds 3:
+
+        >>> series = samplers.FunctionProblem(dim=2, terms=lambda x: 3.0 - x)
+        >>> series.evaluate(np.array([[1.0, 0.0], [4.0, 0.0]]))
+        array([ 2., -1.])
+        >>> series.terms(np.array([[4.0, 0.0]])).values
+        array([[-1.,  3.]])
+    """
+
+    f: Callable[[FloatArray], ArrayLike] | None = None
+    dim: int = 0
+    terms: Any = None
+    gradient: Any = None
+    gradient_cost: float = 3.0
+    """A gradient by reverse-mode differentiation takes 2 to 4 evaluations (Griewank and Walther, "Evaluating
+    derivatives", 2008, section 4.6)."""
+    vectorized: bool = True
+    chunk_size: int | None = None
+    base: Any = None
+    column_names: Sequence[str] = ()
+
+    def __post_init__(self) -> None:
+        """Check the arguments; the functions of terms and gradients become those of the protocols."""
+        if not (callable(self.f) or (self.f is None and self.terms is not None)):
+            raise ValueError(f"Expected f to be a function of an (n, d) array, got {self.f!r}.")
+        self._set_base()
+        names = self.column_names or (self.base.column_names if isinstance(self.base, NamedProblem) else ())
+        object.__setattr__(self, "column_names", tuple(names))
+        names_of_columns(self)
+        for name, wrap in (("terms", _FunctionTerms), ("gradient", _FunctionGradients)):
+            function = getattr(self, name)  # terms, gradient
+            if function is None or isinstance(function, wrap):
+                continue
+            if not callable(function):
+                raise ValueError(f"Expected {name} to be a function of an (n, d) array, got {function!r}.")
+            object.__setattr__(self, name, wrap(function, self.dim, self.gradient_cost))
+        check_number("gradient_cost", self.gradient_cost, 0.0, math.inf)
+        if self.chunk_size is not None:
+            check_whole("chunk_size", self.chunk_size, 1)
+
+    def _set_base(self) -> None:
+        """Set the base distribution and the dimension, each of which may follow from the other."""
+        if self.base is None:
+            if self.dim == 0:  # as it is where it was not given
+                raise ValueError(
+                    "Expected dim, a whole number of at least 1, or base, the distribution of x; got neither."
+                )
+            check_whole("dim", self.dim, 1)
+            object.__setattr__(self, "base", StandardNormal(self.dim))
+            return
+        base = as_distribution(self.base, self.dim or None)
+        object.__setattr__(self, "base", base)
+        if self.dim == 0 and hasattr(base, "dim"):  # a user's distribution need not have it
+            object.__setattr__(self, "dim", int(base.dim))
+        check_whole("dim", self.dim, 1)
+
+    def __repr__(self) -> str:
+        """Return one line."""
+        what = "terms" if self.f is None else getattr(self.f, "__name__", type(self.f).__name__)  # a user's function
+        base = "" if isinstance(self.base, StandardNormal) else f", base {type(self.base).__name__}"
+        return f"<FunctionProblem of {what}, {self.dim} dimension{'s' * (self.dim != 1)}{base}>"
+
+    def _repr_html_(self) -> str:
+        """Return the problem and its base distribution for notebooks."""
+        return f"<p>{escape(repr(self)[1:-1])}</p><p>base: {escape(repr(self.base))}</p>"
+
+    def evaluate(self, x: FloatArray) -> FloatArray:
+        """Call f on the rows of x (n, d); return its values as float64.
+
+        Raises:
+            ValueError: If x is not of shape (n, d), or f does not return one number per row.
+        """
+        _check_points(x, self.dim)
+        if self.f is None:
+            return np.asarray(self.terms(x).f)
+        if not self.vectorized:
+            values: Any = [self.f(row) for row in x]
+            return one_per_row(values, len(x))
+        hint = f"f gets a batch of points of shape (n, {self.dim}); pass vectorized=False for an f of one point."
+        try:
+            f = self.f(x)
+        except Exception as error:  # the function is the user's
+            if _takes_one_point(self.f, x):
+                raise EvaluationError(f"f raised {type(error).__name__} ({error}): {hint}") from error
+            raise
+        try:
+            return one_per_row(f, len(x))
+        except EvaluationError as error:
+            if str(error).endswith(f"got {(len(x), 1)}."):  # as functions of OpenTURNS return
+                hint = "Return its only column, f(x)[:, 0]."
+            raise EvaluationError(str(error) if f is None else f"{error} {hint}") from error
+
+
+def _takes_one_point(f: Callable[[FloatArray], Any], x: FloatArray) -> bool:
+    """Return whether f gives a number for the first point of x (n, d), and raises for it as a batch of one."""
+    try:
+        f(x[:1].copy())
+        return False
+    except Exception:  # of the user's function, whatever it is
+        pass
+    try:
+        return np.ndim(f(x[0].copy())) == 0
+    except Exception:
+        return False
+
+
+@dataclass(frozen=True)
+class _FunctionTerms:
+    """`HasTerms.terms` by a function from points (n, d) to terms (n, J)."""
+
+    function: Callable[[FloatArray], ArrayLike]
+    dim: int
+    gradient_cost: float
+
+    def __call__(self, x: FloatArray, gamma: float = 0.0) -> Terms:
+        """Return the terms at x (n, d); f is their least."""
+        _check_points(x, self.dim)
+        values = np.asarray(self.function(x), dtype=np.float64)
+        if values.ndim != 2 or len(values) != len(x) or values.shape[1] == 0:
+            raise EvaluationError(f"Expected terms of shape ({len(x)}, J), one row per row of x, got {values.shape}.")
+        return Terms(values.min(axis=1), values, np.zeros(values.shape, dtype=np.int64), gamma)
+
+
+@dataclass(frozen=True)
+class _FunctionGradients:
+    """`HasTermGradients.gradient` by a function from points (n, d) and terms (n,) to gradients (n, d)."""
+
+    function: Callable[[FloatArray, NDArray[np.int64]], ArrayLike]
+    dim: int
+    gradient_cost: float
+
+    def __call__(
+        self, x: FloatArray, term: NDArray[np.int64], ticks: NDArray[np.int64], gamma: float = 0.0
+    ) -> TermGradients:
+        """Return the gradients; time means nothing to a function, and its terms are the same for every gamma."""
+        _check_points(x, self.dim)
+        return TermGradients(np.asarray(self.function(x, term), dtype=np.float64), self.gradient_cost * len(x))
+
+
+def _check_points(x: FloatArray, dim: int) -> None:
+    """Raise a ValueError unless x is of shape (n, dim)."""
+    if np.ndim(x) != 2 or np.shape(x)[1] != dim:
+        raise ValueError(f"Expected x of shape (n, {dim}), got {np.shape(x)}.")

@@ -1,0 +1,528 @@
+"""Gaussians with their densities and moments."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple, Protocol, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import solve_triangular
+from scipy.optimize import isotonic_regression
+
+from samplers.problem import LOG_TWO_PI, FloatArray, StandardNormal
+from samplers.statistics import log_sum_exp
+
+
+class Moments(NamedTuple):
+    """Mean parameters of a Gaussian: E[u] and E[u u']."""
+
+    first: FloatArray
+    """Shape (d,)."""
+    second: FloatArray
+    """Shape (d, d)."""
+
+    @property
+    def covariance(self) -> FloatArray:
+        """E[u u'] - E[u] E[u]', shape (d, d)."""
+        return self.second - np.outer(self.first, self.first)
+
+    def mix_with(self, other: Moments, share: float) -> Moments:
+        """Return the moments of the mixture of this distribution, with weight `share`, and another one."""
+        return Moments(share * self.first + (1 - share) * other.first, share * self.second + (1 - share) * other.second)
+
+
+@dataclass(frozen=True, eq=False)
+class Gaussian:
+    """N(mean, L L') with lower triangular L.
+
+    Example:
+        >>> import numpy as np
+        >>> from samplers.proposals import Gaussian
+        >>> proposal = Gaussian.from_covariance(np.zeros(2), np.array([[4.0, 0.0], [0.0, 1.0]]))
+        >>> proposal.log_prob(np.zeros((1, 2))).round(4)  # -log(2 pi sqrt(4))
+        array([-2.531])
+    """
+
+    mean: FloatArray
+    """Shape (d,)."""
+    cholesky: FloatArray
+    """L, shape (d, d)."""
+
+    @classmethod
+    def standard(cls, dim: int) -> Gaussian:
+        """Return N(0, I)."""
+        return cls(np.zeros(dim), np.eye(dim))
+
+    @classmethod
+    def from_covariance(cls, mean: FloatArray, covariance: FloatArray) -> Gaussian:
+        """Return N(mean, covariance) from a mean (d,) and a positive definite covariance (d, d)."""
+        return cls(mean, np.asarray(np.linalg.cholesky(covariance), dtype=np.float64))
+
+    @property
+    def dim(self) -> int:
+        """Number of coordinates d."""
+        return len(self.mean)
+
+    @property
+    def covariance(self) -> FloatArray:
+        """L L', shape (d, d)."""
+        return self.cholesky @ self.cholesky.T
+
+    @property
+    def moments(self) -> Moments:
+        """E[u] and E[u u']."""
+        return Moments(self.mean, self.covariance + np.outer(self.mean, self.mean))
+
+    def widen(self, factor: float) -> Gaussian:
+        """Return the same with all standard deviations multiplied by factor."""
+        return Gaussian(self.mean, factor * self.cholesky)
+
+    def sample(self, n: int, rng: np.random.Generator) -> FloatArray:
+        """Draw n independent points, shape (n, d)."""
+        return self.from_standard_normal(rng.standard_normal((n, self.dim)))
+
+    def log_prob(self, u: FloatArray) -> FloatArray:
+        """Return the log density at u (n, d), shape (n,)."""
+        z = self.to_standard_normal(u)
+        log_det = float(np.log(np.diag(self.cholesky)).sum())
+        return np.asarray(-0.5 * np.einsum("ij,ij->i", z, z) - log_det - 0.5 * self.dim * LOG_TWO_PI)
+
+    def to_standard_normal(self, u: FloatArray) -> FloatArray:
+        """Return L^-1 (u - mean) of the rows of u (n, d)."""
+        return np.asarray(solve_triangular(self.cholesky, (u - self.mean).T, lower=True).T)
+
+    def from_standard_normal(self, z: FloatArray) -> FloatArray:
+        """Return mean + L z of the rows of z (n, d)."""
+        return np.asarray(self.mean + z @ self.cholesky.T)
+
+
+def weighted_moments(u: FloatArray, weights: FloatArray) -> Moments:
+    """Return E[u] and E[u u'] of points u (n, d) under weights (n,) that add up to 1."""
+    return Moments(weights @ u, (u * weights[:, None]).T @ u)
+
+
+@dataclass(frozen=True, eq=False)
+class TiltedNormal:
+    """N(shift, I), that is N(0, I) tilted by exp(shift' u - |shift|^2 / 2).
+
+    Example:
+        >>> import numpy as np
+        >>> tilted = TiltedNormal(np.array([3.0, 0.0]))
+        >>> u = np.array([[3.0, 1.0]])
+        >>> (tilted.log_prob(u) - TiltedNormal(np.zeros(2)).log_prob(u)).round(6)  # shift' u - |shift|^2 / 2
+        array([4.5])
+    """
+
+    shift: FloatArray
+    """Shape (d,)."""
+
+    def sample(self, n: int, rng: np.random.Generator) -> FloatArray:
+        """Draw n independent points, shape (n, d)."""
+        return self.shift + rng.standard_normal((n, len(self.shift)))
+
+    def log_prob(self, u: FloatArray, /) -> FloatArray:
+        """Return the log density at u (n, d), shape (n,)."""
+        return StandardNormal(len(self.shift)).log_prob(u - self.shift)
+
+
+class SupportsLogProb(Protocol):
+    """A distribution whose density is known."""
+
+    def log_prob(self, u: FloatArray, /) -> FloatArray:
+        """Return the log density at u (n, d), shape (n,)."""
+
+
+class ProposalDistribution(SupportsLogProb, Protocol):
+    """A distribution that can be drawn from and whose density is known; all that importance sampling needs.
+
+    Example:
+        >>> import numpy as np
+        >>> from samplers.proposals import TiltedNormal
+        >>> proposal: ProposalDistribution = TiltedNormal(np.array([3.0]))
+        >>> proposal.sample(5, np.random.default_rng(0)).shape
+        (5, 1)
+    """
+
+    def sample(self, n: int, rng: np.random.Generator) -> FloatArray:
+        """Draw n independent points, shape (n, d)."""
+
+
+@dataclass(frozen=True, eq=False)
+class Mixture:
+    """A mixture of distributions.
+
+    Example:
+        >>> import numpy as np
+        >>> from samplers.proposals import Gaussian
+        >>> left, right = (Gaussian(np.array([mean]), np.eye(1)) for mean in (-4.0, 4.0))
+        >>> mixture = Mixture(np.array([0.25, 0.75]), [left, right])
+        >>> bool(0.2 < (mixture.sample(1000, np.random.default_rng(0)) < 0).mean() < 0.3)
+        True
+        >>> np.exp(mixture.log_prob(np.array([[4.0]]))).round(3)  # 0.75 / sqrt(2 pi)
+        array([0.299])
+    """
+
+    weights: FloatArray
+    """Shape (k,), adding up to 1."""
+    components: Sequence[ProposalDistribution]
+    """k of them."""
+
+    def sample(self, n: int, rng: np.random.Generator) -> FloatArray:
+        """Draw n independent points, shape (n, d)."""
+        counts = rng.multinomial(n, self.weights)
+        parts = [c.sample(int(k), rng) for c, k in zip(self.components, counts, strict=True)]
+        return rng.permutation(np.concatenate(parts))
+
+    def log_prob(self, u: FloatArray, /) -> FloatArray:
+        """Return the log density at u (n, d), shape (n,)."""
+        return np.asarray(log_sum_exp(self.log_terms(u), axis=0))
+
+    def log_terms(self, u: FloatArray) -> FloatArray:
+        """Return log(weight_j q_j) of the components at u (n, d), shape (k, n)."""
+        return np.stack([np.log(w) + c.log_prob(u) for w, c in zip(self.weights, self.components, strict=True)])
+
+
+@dataclass(frozen=True, eq=False)
+class GaussianMixture(Mixture):
+    """A mixture of Gaussians.
+
+    Example:
+        >>> import numpy as np
+        >>> from samplers.proposals import Gaussian
+        >>> mixture = GaussianMixture(np.ones(1), [Gaussian.standard(2)])
+        >>> mixture.widen(1.5).components[0].covariance.diagonal()
+        array([2.25, 2.25])
+    """
+
+    components: Sequence[Gaussian]
+
+    def widen(self, factor: float) -> GaussianMixture:
+        """Return the same with the standard deviations of all components multiplied by factor."""
+        return GaussianMixture(self.weights, [component.widen(factor) for component in self.components])
+
+
+LEAST_VARIANCE = 1e-8
+"""Added to the variance in every direction: points may coincide."""
+PRIOR_DIM = 10
+"""Above this many dimensions the present covariance counts as more than d + 1 points, in proportion to d."""
+
+
+def shrink_covariance(
+    covariance: FloatArray, direction: FloatArray, along: float, n: float
+) -> tuple[FloatArray, float]:
+    """Return the covariance S drawn towards T = I + (along - 1) v v', and the share of T.
+
+    T is the covariance of N(0, I) beyond a plane with normal v. Its share is the expected square error of S over the
+    square distance between S and T (Ledoit and Wolf), but at least that of (d + 1) / 2 points, counted beside n of S:
+    T where n is small for d, S where n is large.
+
+    Args:
+        covariance: S, of weighted points, shape (d, d).
+        direction: v, the unit vector of their mean, shape (d,).
+        along: Their variance along v.
+        n: Number of independent points that they are worth.
+    """
+    dim = len(direction)
+    target = np.eye(dim) + (along - 1) * np.outer(direction, direction)
+    noise = (float(np.trace(covariance)) ** 2 + float((covariance * covariance).sum())) / n
+    distance = float(((covariance - target) ** 2).sum())
+    share = max(noise / distance if distance > noise else 1.0, (dim + 1) / (2 * (dim + 1 + n)))
+    return (1 - share) * covariance + share * target, share
+
+
+def correct_eigenvalues(values: FloatArray, n: float) -> FloatArray:
+    """Return the eigenvalues of a covariance without their bias, by Stein's estimator.
+
+    Of few points the small eigenvalues are too small and the large ones too large. Each is divided by
+    1 - (d - 1) / n + (2 / n) sum_j l_i / (l_i - l_j): small ones change by a factor, where a target of variance 1 would
+    add to them. Failures between two planes have a variance of 0.05 across, which a tenth of I triples.
+
+    Args:
+        values: l, in increasing order, positive, shape (d,).
+        n: Independent points that they are estimated from, more than d.
+
+    Example:
+        >>> import numpy as np
+        >>> correct_eigenvalues(np.array([0.05, 1.0, 2.0]), n=20.0).round(3)
+        array([0.056, 1.105, 1.663])
+    """
+    gaps = values[:, None] - values
+    gaps[gaps == 0] = np.inf  # its own, and equal ones
+    factors = 1 - (len(values) - 1) / n + (2 / n) * (values[:, None] / gaps).sum(axis=1)
+    logs = np.log(values) - np.log(np.where(factors > 0, factors, 1.0))
+    return np.asarray(np.exp(isotonic_regression(logs).x))
+
+
+def fit_shrunk_gaussian(u: FloatArray, weights: FloatArray) -> Gaussian:
+    """Return the Gaussian of weighted points with its covariance shrunk, see `shrink_covariance`.
+
+    Args:
+        u: Points, shape (n, d).
+        weights: Adding up to 1, shape (n,).
+    """
+    moments = weighted_moments(u, weights)
+    mean, s = moments.first, moments.covariance
+    v = mean / max(float(np.linalg.norm(mean)), np.finfo(np.float64).tiny)
+    along = max(float(v @ s @ v), LEAST_VARIANCE)
+    shrunk, _ = shrink_covariance(s, v, along, 1 / float(weights @ weights))
+    return Gaussian.from_covariance(mean, shrunk + LEAST_VARIANCE * np.eye(len(mean)))
+
+
+def shrink_towards_present(target: Moments, present: Gaussian, n: float) -> Gaussian:
+    """Return the Gaussian with the target's mean and its covariance drawn towards the present one.
+
+    The present covariance counts as (d + 1) max(1, d / PRIOR_DIM) points beside the n behind the target: in many
+    dimensions the noise of the d (d + 1) / 2 entries of a covariance ruins importance weights.
+
+    Args:
+        target: Moments of weighted points.
+        present: The Gaussian that the points are drawn from.
+        n: Number of independent points that they are worth.
+    """
+    prior = (present.dim + 1) * max(1.0, present.dim / PRIOR_DIM)
+    share = prior / (prior + n)
+    return Gaussian.from_covariance(target.first, (1 - share) * target.covariance + share * present.covariance)
+
+
+LLOYD_STEPS = 4
+"""Times at most that k-means moves its centres; it only has to give expectation-maximisation a start."""
+
+
+def choose_centres(x: FloatArray, weights: FloatArray, k: int, rng: np.random.Generator) -> FloatArray:
+    """Return at most k of the points x (n, d) as centres (k, d), drawn far from one another (k-means++).
+
+    Each is drawn with a probability proportional to weight times squared distance from those before. There are fewer
+    where the points with a weight have fewer distinct places.
+    """
+    odds, chosen, nearest = weights, list[int](), np.full(len(x), np.inf)
+    while len(chosen) < k and odds.sum() > 0:
+        chosen.append(int(rng.choice(len(x), p=odds / odds.sum())))
+        nearest = np.minimum(nearest, ((x - x[chosen[-1]]) ** 2).sum(axis=1))
+        odds = weights * nearest
+    return np.asarray(x[chosen])
+
+
+def k_means(x: FloatArray, weights: FloatArray, k: int, rng: np.random.Generator) -> NDArray[np.int64]:
+    """Return clusters (n,) of weighted points x (n, d), numbered from 0: k-means++, then Lloyd's steps.
+
+    Two centres that differ by a rounding error may give one cluster, and one without points.
+
+    Args:
+        x: Points.
+        weights: Shape (n,).
+        k: Clusters at most.
+        rng: Source of randomness.
+
+    Example:
+        >>> x = np.array([[0.0], [0.1], [9.0], [9.1], [9.2]])
+        >>> labels = k_means(x, np.ones(5), 2, np.random.default_rng(0))
+        >>> (labels == labels[4]).tolist()
+        [False, False, True, True, True]
+    """
+    centres = choose_centres(x, weights, k, rng)
+    if len(centres) == 1:
+        return np.zeros(len(x), dtype=np.int64)
+    mean = x.mean(axis=0)
+    x, centres = x - mean, centres - mean  # distances lose fewer digits near the origin
+    labels = _nearest(x, centres)
+    for _ in range(LLOYD_STEPS):
+        moved = _means(x, weights, labels, centres)
+        if (moved == centres).all():
+            break
+        before, labels, centres = labels, _nearest(x, moved), moved
+        if (labels == before).all():
+            break
+    return labels
+
+
+def _nearest(x: FloatArray, centres: FloatArray) -> NDArray[np.int64]:
+    """Return the nearest of the centres (k, d) to each of the points x (n, d), the first of several."""
+    return np.asarray((np.einsum("ij,ij->i", centres, centres) - 2.0 * (x @ centres.T)).argmin(axis=1))
+
+
+def _means(x: FloatArray, weights: FloatArray, labels: NDArray[np.int64], centres: FloatArray) -> FloatArray:
+    """Return the means of the clusters (k, d); one without points moves to the point furthest from its own centre."""
+    k = len(centres)
+    mass = np.bincount(labels, weights=weights, minlength=k).astype(np.float64)
+    sums = np.stack([np.bincount(labels, weights=row, minlength=k) for row in x.T * weights], axis=1).astype(np.float64)
+    if not mass.all():
+        _fill_empty(x, weights, labels, centres, sums, mass)
+    means = sums * (1 / np.where(mass > 0, mass, 1.0))[:, None]
+    return means if mass.all() else np.where(mass[:, None] > 0, means, means[mass.argmax()])
+
+
+def _fill_empty(
+    x: FloatArray,
+    weights: FloatArray,
+    labels: NDArray[np.int64],
+    centres: FloatArray,
+    sums: FloatArray,
+    mass: FloatArray,
+) -> None:
+    """Give clusters without points one each in `sums` (k, d) and `mass` (k,): those furthest from their own centres."""
+    distance = ((x - centres[labels]) ** 2).sum(axis=1)
+    if distance.max() == 0:  # there are more clusters than places
+        return
+    for cluster, point in zip(np.flatnonzero(mass == 0), np.argsort(-distance, kind="stable"), strict=False):
+        share = x[point] * weights[point]
+        sums[labels[point]] -= share
+        mass[labels[point]] -= weights[point]
+        sums[cluster], mass[cluster] = share, weights[point]
+
+
+MixtureT = TypeVar("MixtureT")
+
+
+class Family(Protocol[MixtureT]):
+    """A family of mixtures that is fitted to weighted points; it holds the points."""
+
+    def maximise(self, responsibilities: FloatArray) -> MixtureT:
+        """Return the likeliest mixture (M-step), given how far each component explains each point, shape (k, n).
+
+        It may drop components.
+        """
+
+    def log_terms(self, mixture: MixtureT) -> FloatArray:
+        """Return log(weight_j q_j) of the components at the points, shape (k, n)."""
+
+
+def expectation_maximisation(
+    family: Family[MixtureT],
+    responsibilities: FloatArray,
+    weights: FloatArray,
+    max_steps: int,
+    least_gain: Callable[[float], float],
+) -> tuple[MixtureT, float]:
+    """Return the mixture reached from some responsibilities, and its weighted log likelihood.
+
+    Args:
+        family: What is fitted, with its points.
+        responsibilities: To start from, shape (k, n), columns that add up to 1.
+        weights: Of the points, shape (n,).
+        max_steps: M-steps at most.
+        least_gain: Given the log likelihood, the rise of it with which to go on.
+    """
+    reached = -np.inf
+    for _ in range(max_steps):
+        mixture = family.maximise(responsibilities)
+        terms = family.log_terms(mixture)
+        total = log_sum_exp(terms, axis=0)
+        log_likelihood = float(weights @ total)
+        if log_likelihood - reached < least_gain(log_likelihood):
+            break
+        reached, responsibilities = log_likelihood, np.exp(terms - total)
+    return mixture, log_likelihood
+
+
+def posterior(terms: FloatArray) -> FloatArray:
+    """Return how likely each point comes from each component, from log(weight_j q_j), both of shape (k, n)."""
+    return np.asarray(np.exp(terms - log_sum_exp(terms, axis=0)))
+
+
+def one_hot(labels: NDArray[np.int64], k: int) -> FloatArray:
+    """Return responsibilities (k, n) of 0 and 1 from labels (n,)."""
+    return np.equal(labels, np.arange(k)[:, None]).astype(np.float64)
+
+
+class WidenableDistribution(ProposalDistribution, Protocol):
+    """A component of a mixture that can be widened."""
+
+    def widen(self, factor: float) -> WidenableDistribution:
+        """Return the same, more spread out by about this factor."""
+
+
+@dataclass(frozen=True, eq=False)
+class WidenableMixture(Mixture):
+    """A mixture of distributions that can be widened."""
+
+    components: Sequence[WidenableDistribution]
+
+    def widen(self, factor: float) -> WidenableMixture:
+        """Return the mixture with every component more spread out by about this factor."""
+        return WidenableMixture(self.weights, [component.widen(factor) for component in self.components])
+
+
+Fit = Callable[[FloatArray, FloatArray], WidenableDistribution]
+"""Fits one component to points (n, d) with weights (n,) that add up to 1."""
+MAX_EM_STEPS = 50
+"""M-steps at most."""
+LEAST_EM_GAIN = 1e-3
+"""Expectation-maximisation ends where a step raises the mean log likelihood by less."""
+LEAST_WEIGHT = 0.01
+"""Components of less weight are dropped: with 1000 points they would rest on fewer than 10."""
+LEAST_OF_EVEN_SHARE = 0.5
+"""Of more than 50 components, those with less than this share of 1 / k are: the heaviest one always stays."""
+
+
+def fit_proposal_mixture(
+    fit: Fit, u: FloatArray, weights: FloatArray, most: int, size: int, rng: np.random.Generator
+) -> WidenableMixture:
+    """Return the mixture of 1 to `most` components with the best Bayesian information criterion.
+
+    The criterion counts the effective number of points, (sum w)^2 / sum w^2. More components are tried for
+    as long as they raise it.
+
+    Args:
+        fit: Fits one component.
+        u: Points, shape (n, d).
+        weights: Adding up to 1, shape (n,).
+        most: Components at most.
+        size: Parameters of one component.
+        rng: Source of randomness, for the first centres.
+    """
+    points = 1 / float(weights @ weights)
+    best, highest = WidenableMixture(np.ones(1), [fit(u, weights)]), -np.inf
+    for k in range(1, most + 1):
+        if k * size >= points:  # the criterion means nothing there
+            break
+        mixture = best if k == 1 else fit_mixture_of_size(fit, u, weights, k, rng)
+        score = points * float(weights @ mixture.log_prob(u)) - 0.5 * (k * size + k - 1) * np.log(points)
+        if score <= highest:
+            break
+        best, highest = mixture, score
+    return best
+
+
+@dataclass(frozen=True, eq=False)
+class _WeightedPoints:
+    """Mixtures with k components at most that are fitted to weighted points, see `samplers.proposals.Family`."""
+
+    fit: Fit
+    u: FloatArray
+    weights: FloatArray
+    k: int
+
+    def maximise(self, responsibilities: FloatArray) -> WidenableMixture:
+        """Return the mixture of the components that have weight enough."""
+        mass = self.weights * responsibilities
+        totals = mass.sum(axis=1)
+        kept = totals > min(LEAST_WEIGHT, LEAST_OF_EVEN_SHARE / self.k)
+        components = [self.fit(self.u, part / part.sum()) for part in mass[kept]]
+        return WidenableMixture(totals[kept] / totals[kept].sum(), components)
+
+    def log_terms(self, mixture: WidenableMixture) -> FloatArray:
+        """Return log(weight_j q_j) of the components at the points, shape (k, n)."""
+        return mixture.log_terms(self.u)
+
+
+def fit_mixture_of_size(
+    fit: Fit, u: FloatArray, weights: FloatArray, k: int, rng: np.random.Generator
+) -> WidenableMixture:
+    """Return a mixture of at most k components by expectation-maximisation, from distant first centres."""
+    family = _WeightedPoints(fit, u, weights, k)
+    start = initial_responsibilities(u, weights, k, rng)
+    mixture, _ = expectation_maximisation(family, start, weights, MAX_EM_STEPS, lambda _: LEAST_EM_GAIN)
+    return mixture
+
+
+def initial_responsibilities(u: FloatArray, weights: FloatArray, k: int, rng: np.random.Generator) -> FloatArray:
+    """Return to which of k centres each point is nearest in direction, as zeros and ones (k, n).
+
+    Directions, as separate regions of failure lie in separate directions from the origin.
+    """
+    a = u / np.maximum(np.linalg.norm(u, axis=1, keepdims=True), np.finfo(np.float64).tiny)
+    centres = choose_centres(a, weights, k, rng)
+    distances = np.stack([((a - centre) ** 2).sum(axis=1) for centre in centres])
+    return one_hot(distances.argmin(axis=0), k)

@@ -1,0 +1,325 @@
+"""Serialization: values as JSON has them."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from enum import Enum
+from os import PathLike
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from samplers.problem import FloatArray
+from samplers.sample import Sample, SimulatedPoints, SimulationIndex
+from samplers.system.optional_libraries import needs_library
+
+
+def to_json_value(value: Any) -> Any:
+    """Return value with None for NaN and infinities inside it, and Python's numbers for those of NumPy.
+
+    Args:
+        value: A number, a string, None, or lists, tuples and dicts of these.
+    """
+    if isinstance(value, np.generic):
+        value = value.item()
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if isinstance(value, dict):
+        return {key: to_json_value(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [to_json_value(item) for item in value]
+    return value
+
+
+FILE_FORMAT = "samplers 1"
+"""First word of the metadata; another one is of another version."""
+_KEY = "samplers"
+_Stored = TypeVar("_Stored")
+_CLASSES: dict[str, type] = {}
+
+
+def register_stored(*classes: type) -> None:
+    """Name dataclasses and enumerations that files may hold; they are known by their name.
+
+    Raises:
+        ValueError: If another class has the name.
+
+    Example:
+        >>> register_stored(type("Level", (), {}))
+        Traceback (most recent call last):
+            ...
+        ValueError: Another class named Level is stored in files already.
+    """
+    for cls in classes:
+        if _CLASSES.setdefault(cls.__name__, cls) is not cls:
+            raise ValueError(f"Another class named {cls.__name__} is stored in files already.")
+
+
+def is_stored(value: object) -> bool:
+    """Return whether the class of a value is one that files may hold."""
+    return _CLASSES.get(type(value).__name__) is type(value)
+
+
+def write_object(path: str | PathLike[str], value: object) -> None:
+    """Write an object of a registered class to a file.
+
+    Args:
+        path: Of the file; any name will do.
+        value: The object.
+
+    Raises:
+        TypeError: If it holds something of a class that is not registered.
+        OSError: If the file cannot be written.
+
+    Example:
+        >>> write_object("nowhere", object())
+        Traceback (most recent call last):
+            ...
+        TypeError: A value of class object cannot be written to a file; to_dict() has plain values.
+    """
+    from safetensors import SafetensorError
+    from safetensors.numpy import save_file
+
+    arrays: dict[str, NDArray[Any]] = {}
+    text = json.dumps(_encode(value, arrays), allow_nan=False)
+    try:
+        save_file(arrays, str(path), metadata={"format": FILE_FORMAT, _KEY: text})
+    except SafetensorError as error:
+        raise OSError(f"Cannot write {str(path)!r}: {error}") from error
+
+
+def read_object(path: str | PathLike[str], cls: type[_Stored]) -> _Stored:
+    """Return the object that a file holds.
+
+    Args:
+        path: Of the file.
+        cls: Class that the object must have.
+
+    Raises:
+        FileNotFoundError: If there is no such file.
+        ValueError: If the file is damaged, is no such file, or holds an object of another class; one line.
+
+    Example:
+        >>> from tempfile import TemporaryDirectory
+        >>> import samplers
+        >>> with TemporaryDirectory() as folder:
+        ...     write_object(f"{folder}/status", samplers.Status.BUDGET)
+        ...     print(read_object(f"{folder}/status", samplers.Status))
+        budget
+    """
+    from safetensors import SafetensorError, safe_open
+
+    where = repr(str(path))
+    if not Path(path).is_file():
+        raise FileNotFoundError(f"There is no file {where}.")
+    try:
+        with safe_open(str(path), framework="np") as file:
+            about = file.metadata() or {}
+            arrays = {name: file.get_tensor(name) for name in file.keys()}  # not a mapping
+        if about.get("format") != FILE_FORMAT:
+            raise ValueError(f"expected the format {FILE_FORMAT!r}, got {about.get('format')!r}")
+        value = _decode(json.loads(about[_KEY]), arrays)
+    except OSError as error:
+        raise ValueError(f"Cannot read {where}: {error.strerror or error}.") from error
+    except (SafetensorError, ValueError, KeyError, TypeError, IndexError, AttributeError, RecursionError) as error:
+        reason = " ".join(str(error).split()) or type(error).__name__
+        raise ValueError(f"Cannot read {where}, it is damaged or no file of a result: {reason}.") from error
+    if not isinstance(value, cls):
+        raise ValueError(f"Expected {cls.__name__} in {where}, got {type(value).__name__}.")
+    return value
+
+
+def _encode(value: Any, arrays: dict[str, NDArray[Any]]) -> Any:
+    """Return value as JSON has it; its arrays are added to `arrays`."""
+    if isinstance(value, np.generic):
+        value = value.item()
+    if isinstance(value, Enum):
+        return {"enum": [_name_of(value), value.value]}
+    if value is None or isinstance(value, bool | int | str):
+        return value
+    if isinstance(value, float):
+        return value if math.isfinite(value) else {"float": repr(value)}
+    if isinstance(value, np.ndarray):
+        name = f"array{len(arrays)}"
+        arrays[name] = np.ascontiguousarray(value)  # safetensors writes the memory as it lies
+        return {"array": name}
+    if isinstance(value, list | tuple):
+        return {"tuple" if isinstance(value, tuple) else "list": [_encode(item, arrays) for item in value]}
+    if isinstance(value, Mapping):
+        return {"dict": [[_encode(key, arrays), _encode(item, arrays)] for key, item in value.items()]}
+    if not dataclasses.is_dataclass(value):
+        raise TypeError(
+            f"A value of class {type(value).__name__} cannot be written to a file; to_dict() has plain values."
+        )
+    fields = {f.name: getattr(value, f.name) for f in dataclasses.fields(value) if f.init}  # fields by name
+    return {"object": [_name_of(value), {name: _encode(item, arrays) for name, item in fields.items()}]}
+
+
+def _name_of(value: object) -> str:
+    """Return the name of a value's class, which must be registered."""
+    if not is_stored(value):
+        raise TypeError(
+            f"An object of class {type(value).__name__} cannot be written to a file; to_dict() has plain values."
+        )
+    return type(value).__name__
+
+
+def _decode(data: Any, arrays: Mapping[str, NDArray[Any]]) -> Any:
+    """Return the value that `_encode` has written."""
+    if not isinstance(data, dict):
+        return data
+    ((kind, content),) = data.items()
+    if kind == "float":
+        return float(content)
+    if kind == "array":
+        return arrays[content]
+    if kind == "list":
+        return [_decode(item, arrays) for item in content]
+    if kind == "tuple":
+        return tuple(_decode(item, arrays) for item in content)
+    if kind == "dict":
+        return {_decode(key, arrays): _decode(item, arrays) for key, item in content}
+    if kind not in ("enum", "object"):
+        raise ValueError(f"unknown kind of value {kind!r}")
+    name, inside = content
+    if name not in _CLASSES:
+        raise ValueError(f"unknown class {name!r}")
+    if kind == "enum":
+        return _CLASSES[name](inside)
+    return _CLASSES[name](**{key: _decode(item, arrays) for key, item in inside.items()})
+
+
+@dataclass(frozen=True)
+class StoredMethod:
+    """A method of another package in a result that was read from a file; it cannot run.
+
+    Example:
+        >>> StoredMethod("lattice", True, {"n": "100"}).steps(None, None, None)
+        Traceback (most recent call last):
+            ...
+        ValueError: The method 'lattice' was read from a file and cannot run; make one of its class.
+    """
+
+    name: str
+    """Name on the command line."""
+    stops_at_target: bool
+    """As in `samplers.Stepping`."""
+    settings: dict[str, str] = field(default_factory=dict)
+    """Settings as text, by name."""
+
+    def steps(self, inputs: Any, goal: Any, rng: Any) -> NoReturn:
+        """Raise a ValueError: the code of the method is not known."""
+        raise ValueError(f"The method {self.name!r} was read from a file and cannot run; make one of its class.")
+
+
+if TYPE_CHECKING:
+    import pyarrow
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class PointColumns:
+    """Columns of a table of n points.
+
+    Example:
+        >>> import numpy as np
+        >>> columns = PointColumns(
+        ...     x=np.zeros((1, 2)), rows=np.array([1]), columns={"f": np.array([2.0, -1.0])}, missing={}
+        ... )
+        >>> arrow_table(columns, ()).to_pydict()
+        {'f': [2.0, -1.0], 'x1': [None, 0.0], 'x2': [None, 0.0]}
+    """
+
+    x: FloatArray
+    """Points that are known, shape (k, d)."""
+    rows: NDArray[np.int64]
+    """Their rows in the table, shape (k,)."""
+    columns: dict[str, NDArray[Any]]
+    """The other columns by name, shape (n,) each."""
+    missing: dict[str, NDArray[np.bool_]]
+    """Rows of some of these columns that have no value, shape (n,) each."""
+
+
+def arrow_table(points: PointColumns, names: Sequence[str]) -> pyarrow.Table:
+    """Return points as an Arrow table: the columns by name, then one for each coordinate of x.
+
+    Args:
+        points: The columns; coordinates of points that are not known are null.
+        names: Names of the d coordinates; x1, x2, ... where there are none.
+
+    Raises:
+        ValueError: If names are not d different ones, or one is that of another column.
+
+    Example:
+        >>> points = PointColumns(x=np.ones((1, 1)), rows=np.array([0]), columns={"f": np.zeros(1)}, missing={})
+        >>> arrow_table(points, ["gap"]).to_pylist()
+        [{'f': 0.0, 'gap': 1.0}]
+    """
+    with needs_library("pyarrow", "A table"):
+        import pyarrow as pa
+
+    dim = points.x.shape[1]
+    chosen = list(names) or [f"x{i + 1}" for i in range(dim)]
+    if len(chosen) != dim or len({*chosen, *points.columns}) != dim + len(points.columns):
+        raise ValueError(
+            f"Expected {dim} different names of the columns of x, none of them {', '.join(points.columns)}; "
+            f"got {list(names)!r}."
+        )
+    n = len(next(iter(points.columns.values())))
+    unknown = np.ones(n, dtype=bool)
+    unknown[points.rows] = False
+    table = {name: pa.array(column, mask=points.missing.get(name)) for name, column in points.columns.items()}
+    for name, values in zip(chosen, points.x.T, strict=True):
+        column = np.full(n, np.nan)
+        column[points.rows] = values
+        table[name] = pa.array(column, mask=unknown)
+    return pa.table(table)
+
+
+def set_apart(names: Sequence[str], points: PointColumns) -> list[str]:
+    """Return names of coordinates with "x." before those that are the name of another column.
+
+    Example:
+        >>> points = PointColumns(x=np.ones((1, 2)), rows=np.array([0]), columns={"f": np.zeros(1)}, missing={})
+        >>> set_apart(["gap", "f"], points)
+        ['gap', 'x.f']
+    """
+    return [f"x.{name}" if name in points.columns else name for name in names]
+
+
+def columns_of_sample(sample: Sample, gamma: float) -> PointColumns:
+    """Return the weighted points behind an estimate: f, weight, unit, failed; x of the failing ones.
+
+    Args:
+        sample: The points.
+        gamma: Threshold of failure.
+    """
+    failed = sample.f <= gamma
+    columns = {"f": sample.f, "weight": sample.weights, "unit": sample.units, "failed": failed}
+    return PointColumns(x=sample.x, rows=np.flatnonzero(failed), columns=columns, missing={"f": np.isneginf(sample.f)})
+
+
+def columns_of_simulations(points: SimulatedPoints, index: SimulationIndex, gamma: float) -> PointColumns:
+    """Return all simulations of a run in their order: f, weight, run, stage, failed, and x.
+
+    Args:
+        points: The simulations.
+        index: What each was made for.
+        gamma: Threshold of failure.
+    """
+    about, lost = index.describe(0, len(points.f)), np.isnan(points.f)
+    weight = np.exp(about.log_weight)
+    columns = {
+        "f": points.f,
+        "weight": weight,
+        "run": about.run,
+        "stage": about.stage,
+        "failed": lost | (points.f <= gamma),
+    }
+    missing = {"f": lost, "weight": np.isnan(weight), "stage": about.stage < 0}
+    return PointColumns(x=points.x, rows=np.arange(len(points.f)), columns=columns, missing=missing)
