@@ -8,12 +8,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from samplers.proposals import Gaussian
 
 import samplers
 from benchmarks.papers.okelly2018.rollouts import ChunkOutcomes, RolloutFolder, split_jobs
 from rare_envs.study.errors import BadInput
 from samplers.methods.cross_entropy import NormalBlock, Product
+from samplers.proposals import Gaussian
 
 BASE = Product((NormalBlock(Gaussian.standard(2)),))
 HEADER = {"rare_envs": "1", "seed": 3}

@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from samplers.proposals import Gaussian
 
 from benchmarks.papers.okelly2018.scales import SearchSettings
 from benchmarks.papers.okelly2018.search import (
@@ -15,6 +14,7 @@ from benchmarks.papers.okelly2018.search import (
 )
 from samplers import FunctionProblem
 from samplers.methods.blocks import BetaBlock, NormalBlock, Product
+from samplers.proposals import Gaussian
 
 BASE = Product(
     (
