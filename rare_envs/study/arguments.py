@@ -92,10 +92,7 @@ class Question:
         None, "State p under these bases too, by the same simulations: us101-closing,i80."
     )
     max_sim: int | None = argument(
-        None,
-        "Largest number of simulations.",
-        count=True,
-        show_default="that of the method, 6,000 for two-stage",
+        None, "Largest number of simulations.", count=True, show_default="that of the method, 6,000 for two-stage"
     )
     target_cov: float | None = argument(None, "Stop at this coefficient of variation.")
     replicates: int = argument(1, "Independent runs, combined by their mean.")

@@ -233,10 +233,7 @@ def draw_moment(axes: Axes, drive: Drive, t: int) -> None:
     for y in drive.road.edges:
         edge = y in (left, right)
         axes.axhline(
-            y,
-            color="black" if edge else ORDINARY_COLOUR,
-            linewidth=1,
-            dashes=(None, None) if edge else (6, 6),
+            y, color="black" if edge else ORDINARY_COLOUR, linewidth=1, dashes=(None, None) if edge else (6, 6)
         )
     furthest = float(np.max(drive.position[:, :1, 0] - drive.position[..., 0])) + VEHICLE_LENGTH
     axes.set_xlim(-min(max(VIEW_BEHIND, furthest), VIEW_FAR_BEHIND), VIEW_AHEAD)

@@ -20,13 +20,7 @@ from rare_envs.study.cli.egos import (
     train_drivers_command,
     train_ego_command,
 )
-from rare_envs.study.cli.estimate import (
-    compare_command,
-    estimate_command,
-    plan_command,
-    resume_command,
-    risk_command,
-)
+from rare_envs.study.cli.estimate import compare_command, estimate_command, plan_command, resume_command, risk_command
 from rare_envs.study.cli.options import JsonOption
 from rare_envs.study.cli.runs import (
     corpus_add_command,
@@ -77,10 +71,7 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
     ),
     "serve-ego": ("rare-envs serve-ego ppo.zip --bind tcp://127.0.0.1:5555",),
     "export-ego": ("rare-envs export-ego ppo.zip ppo.onnx",),
-    "corpus": (
-        "rare-envs corpus add runs/cutin",
-        "rare-envs corpus run --ego new.zip --junit corpus.xml",
-    ),
+    "corpus": ("rare-envs corpus add runs/cutin", "rare-envs corpus run --ego new.zip --junit corpus.xml"),
     "corpus add": ("rare-envs corpus add runs/cutin --corpus corpus --most 5",),
     "corpus run": ("rare-envs corpus run --ego new.zip --corpus corpus --junit corpus.xml",),
 }
@@ -114,8 +105,7 @@ def list_command(
     what: Annotated[
         str | None,
         typer.Argument(
-            metavar="[WHAT]",
-            help="environments, methods, egos, drivers, measures, weather, all, or an environment.",
+            metavar="[WHAT]", help="environments, methods, egos, drivers, measures, weather, all, or an environment."
         ),
     ] = None,
     as_json: JsonOption = False,
@@ -134,10 +124,7 @@ def list_command(
 
 
 def bases_command(
-    scenario: Annotated[
-        str,
-        typer.Argument(metavar="SCENARIO", help="Environment, or its short name: cut_in."),
-    ],
+    scenario: Annotated[str, typer.Argument(metavar="SCENARIO", help="Environment, or its short name: cut_in.")],
     as_json: JsonOption = False,
 ) -> None:
     """List the base distributions of a scenario: events, site, family, fit, frequency and predictive checks."""

@@ -178,14 +178,7 @@ def fit_command(
 
     with keep_stdout_for_the_answer(), as_bad_input(ValueError, OSError):
         files = fit_bases(
-            recordings,
-            out,
-            cut_gaps=cut_gaps,
-            scenarios=scenario,
-            name=name,
-            n_refits=refits,
-            seed=seed,
-            progress=True,
+            recordings, out, cut_gaps=cut_gaps, scenarios=scenario, name=name, n_refits=refits, seed=seed, progress=True
         )
     if as_json:
         print_json({"bases": [str(path) for path in files]})

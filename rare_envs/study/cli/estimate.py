@@ -63,8 +63,7 @@ def estimate_command(
     asked: dict[str, Any],
     places: dict[str, Any],
     env: Annotated[
-        str | None,
-        typer.Argument(metavar="ENV", help="Environment, such as rare_envs/CutIn-v0; or in --config."),
+        str | None, typer.Argument(metavar="ENV", help="Environment, such as rare_envs/CutIn-v0; or in --config.")
     ] = None,
     config: Annotated[
         Path | None, typer.Option(help="YAML file with ENV (env: ...) and options; those given here come first.")
@@ -160,11 +159,7 @@ def resume_command(
 def plan_command(
     context: typer.Context,
     target: Annotated[
-        str,
-        typer.Argument(
-            metavar="ENV|RUN",
-            help="Environment, of which pilots are run; or the folder of a run.",
-        ),
+        str, typer.Argument(metavar="ENV|RUN", help="Environment, of which pilots are run; or the folder of a run.")
     ],
     asked: dict[str, Any],
     cov: Annotated[
@@ -239,8 +234,7 @@ def risk_command(
         list[str] | None, typer.Option(help="SCENARIO=NAME or FILE, in place of the site's base; may be repeated.")
     ] = None,
     max_sim: Annotated[
-        int | None,
-        count_option("Largest number of simulations of each scenario.", show_default=DEFAULT_BUDGET),
+        int | None, count_option("Largest number of simulations of each scenario.", show_default=DEFAULT_BUDGET)
     ] = None,
     out: Annotated[Path | None, typer.Option(help="Folder for risk.json, risk.png and a run of each scenario.")] = None,
     force: ForceOption = False,
@@ -370,11 +364,7 @@ def estimate_highway_env(
         try:
             with problem:
                 result = samplers.estimate(
-                    problem,
-                    question.method,
-                    progress=True,
-                    executor=executor,
-                    **_read_arguments(question),
+                    problem, question.method, progress=True, executor=executor, **_read_arguments(question)
                 )
         except samplers.EstimationInterrupted as stopped:
             known = _describe(question, problem, stopped.estimate)

@@ -67,16 +67,14 @@ def _find_field(owner: type[Any], name: str) -> Field[Any]:
 
 
 EnvArgument = Annotated[
-    str,
-    typer.Argument(metavar="ENV", help="Environment, such as rare_envs/CutIn-v0.", callback=read_environment),
+    str, typer.Argument(metavar="ENV", help="Environment, such as rare_envs/CutIn-v0.", callback=read_environment)
 ]
 EgoArgument = Annotated[str, typer.Argument(metavar="EGO", help="An ego, as for estimate --ego.")]
 RunArgument = Annotated[Path, typer.Argument(metavar="RUN", help="Folder that rare-envs estimate --out has written.")]
 TrustOption = Annotated[bool, option_of("trust")]
 ForceOption = Annotated[bool, typer.Option("--force", help="Replace what the folder of --out has of an earlier run.")]
 DetailsOption = Annotated[
-    bool,
-    typer.Option("--details", help="Print all intervals, and all parameters of the most likely failure."),
+    bool, typer.Option("--details", help="Print all intervals, and all parameters of the most likely failure.")
 ]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object and nothing else.")]
 

@@ -26,12 +26,7 @@ def report_command(
         Path | None,
         typer.Option(help="CSV of recorded events, with columns named as the parameters: how near they come."),
     ] = None,
-    figures: Annotated[
-        str | None,
-        typer.Option(
-            help="Figures as files too, beside the page: svg, pdf or png.",
-        ),
-    ] = None,
+    figures: Annotated[str | None, typer.Option(help="Figures as files too, beside the page: svg, pdf or png.")] = None,
     trust: TrustOption = False,
     as_json: JsonOption = False,
 ) -> None:
@@ -150,10 +145,7 @@ def replay_command(
     failure: Annotated[int, typer.Option(help="Which failure; 0 is the most likely.")] = 0,
     out: Annotated[Path | None, typer.Option(help="A .gif of the drive, or a .png of its worst moment.")] = None,
     ego: Annotated[
-        str | None,
-        typer.Option(
-            help="Another ego, as for estimate --ego, in the place of the run's.",
-        ),
+        str | None, typer.Option(help="Another ego, as for estimate --ego, in the place of the run's.")
     ] = None,
     replay_each: Annotated[
         bool, typer.Option("--all", help="Simulate all failures again and compare their f; without a film.")
@@ -208,16 +200,11 @@ def export_command(
     out: Annotated[Path, typer.Option(help="The .xosc to write, its road beside it as .xodr; .xml for CommonRoad.")],
     failure: Annotated[int, typer.Option(help="Which failure; 0 is the most likely.")] = 0,
     format: Annotated[
-        str,
-        typer.Option(
-            help="openscenario, carla (for scenario_runner) or commonroad.",
-        ),
+        str, typer.Option(help="openscenario, carla (for scenario_runner) or commonroad.")
     ] = "openscenario",
     ego: Annotated[
         str | None,
-        typer.Option(
-            help="recorded: it follows its trajectory; free: it only has a start. carla leaves it free.",
-        ),
+        typer.Option(help="recorded: it follows its trajectory; free: it only has a start. carla leaves it free."),
     ] = None,
     trust: TrustOption = False,
     as_json: JsonOption = False,

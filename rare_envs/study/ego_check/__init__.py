@@ -10,10 +10,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Finding", "check_ego"]
 
-_LAZY = {
-    "Finding": "rare_envs.study.ego_check.findings",
-    "check_ego": "rare_envs.study.ego_check.subprocess_check",
-}
+_LAZY = {"Finding": "rare_envs.study.ego_check.findings", "check_ego": "rare_envs.study.ego_check.subprocess_check"}
 """Imported on first use: `subprocess_check` is also a program, which must not be imported before."""
 
 __getattr__ = make_lazy_getattr(__name__, _LAZY)

@@ -103,10 +103,7 @@ def check_declared_spaces(probe: Probe) -> Iterator[Finding]:
             name for name, space in (("observation_space", observed), ("action_space", acted)) if space is None
         )
         yield report_warning(
-            "spaces",
-            f"it has no {missing}",
-            "taken at its word; declare them, so that a mix-up is noticed",
-            False,
+            "spaces", f"it has no {missing}", "taken at its word; declare them, so that a mix-up is noticed", False
         )
     if observed is not None:
         frames, _ = find_frame_stacking(ours[0], observed) or (1, False)
@@ -204,10 +201,7 @@ def check_actions(probe: Probe) -> Iterator[Finding]:
     beyond = 0.0 if whole else float((np.abs(action) > 1.0 + 1e-6).mean())
     if beyond:
         yield report_warning(
-            "actions",
-            f"{beyond:.0%} beyond [-1, 1], up to {np.abs(action).max():.3g}",
-            "they are clipped",
-            False,
+            "actions", f"{beyond:.0%} beyond [-1, 1], up to {np.abs(action).max():.3g}", "they are clipped", False
         )
     if len(np.unique(action.round(6), axis=0)) == 1:
         yield report_warning(
@@ -234,11 +228,7 @@ def check_extreme_observations(probe: Probe) -> Iterator[Finding]:
         except (Exception, SystemExit) as error:
             bad.append(f"{name}: {reason_of(error)}")
     if bad:
-        yield report_failure(
-            "range",
-            "; ".join(bad),
-            "such observations come; rows are zeros after a crash",
-        )
+        yield report_failure("range", "; ".join(bad), "such observations come; rows are zeros after a crash")
     else:
         yield report_pass("range", "finite at zeros and at both ends of what is observed")
     if not isinstance(probe.seen, dict) and probe.seen.dtype == np.uint8:
@@ -372,10 +362,7 @@ def check_memory_growth(probe: Probe) -> Iterator[Finding]:
     grown = _read_megabytes() - before
     if grown > LEAK_MEGABYTES:
         yield report_warning(
-            "space",
-            f"{grown:.0f} MB more after 100 calls",
-            "it keeps what it has seen; a long run ends early",
-            False,
+            "space", f"{grown:.0f} MB more after 100 calls", "it keeps what it has seen; a long run ends early", False
         )
     else:
         yield report_pass("space", f"{before:.0f} MB in all, {max(grown, 0.0):.0f} MB more after 100 calls")
