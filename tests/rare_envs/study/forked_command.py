@@ -96,7 +96,7 @@ def run_command(
 ) -> None:
     """Run a command, without pictures, and exit with its code."""
     from rare_envs.problem import DrivingProblem
-    from rare_envs.study import cli, run_directory
+    from rare_envs.study import cli, writing
     from rare_envs.study.cli.options import ExecutorOptions
     from samplers.execution.journal import JournalFile
     from tests.samplers.execution.executors.real_executors import open_executor
@@ -106,7 +106,7 @@ def run_command(
         os.dup2(os.open(path, os.O_WRONLY), number)
     sys.argv = ["rare-envs", *words]
     DrivingProblem.tile = TILE
-    run_directory.save_plot = lambda path, report: None
+    writing.save_plot = lambda path, report: None
     append = JournalFile.append
     JournalFile.append = lambda *words: (append(*words), time.sleep(pause))[0]  # type: ignore[method-assign]
     if kill_at:

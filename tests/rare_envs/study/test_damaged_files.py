@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner, Result
 
-from rare_envs.study import evaluate, run_directory
+from rare_envs.study import evaluate, writing
 from rare_envs.study.arguments import Question, read_question
 from rare_envs.study.cli.app import app
 from rare_envs.study.errors import BadInput
@@ -144,7 +144,7 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A finished run with a few failures."""
     folder = tmp_path_factory.mktemp("finished")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(run_directory, "save_plot", lambda path, report: None)
+        patch.setattr(writing, "save_plot", lambda path, report: None)
         evaluate.run_into(
             folder / "run",
             prepare(Question(env_id=FOLLOWING, base="us101-gap", gamma=3.0, horizon=2.0, method="mc", max_sim=600)),
@@ -193,7 +193,7 @@ def test_damaged_blocks_are_one_line(number: int, run: Path) -> None:
 def test_a_damaged_journal_is_continued_or_refused_in_one_line(
     n: int, run: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(run_directory, "save_plot", lambda path, report: None)
+    monkeypatch.setattr(writing, "save_plot", lambda path, report: None)
     asked = Question(env_id=FOLLOWING, base="us101-gap", gamma=3.0, horizon=1.0, method="mc", max_sim=60)
     journal = begin_journal(run, asked)
     for _ in range(3):

@@ -20,7 +20,7 @@ from typer.testing import Result
 
 import rare_envs
 from rare_envs.problem import DrivingProblem
-from rare_envs.study import evaluate, run_directory
+from rare_envs.study import evaluate, writing
 from rare_envs.study.arguments import Question
 from rare_envs.study.errors import BadInput
 from rare_envs.study.journal import JOURNAL, begin_journal, continue_journal, digest_files
@@ -66,7 +66,7 @@ def frail(here: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.syspath_prepend(str(here))
     monkeypatch.setenv("FRAIL", "gone")
     monkeypatch.setattr(DrivingProblem, "tile", 200)
-    monkeypatch.setattr(run_directory, "save_plot", lambda path, report: None)
+    monkeypatch.setattr(writing, "save_plot", lambda path, report: None)
     return here
 
 

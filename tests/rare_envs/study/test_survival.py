@@ -18,7 +18,7 @@ from typer.testing import Result
 
 import rare_envs
 from rare_envs.problem import DrivingProblem
-from rare_envs.study import evaluate, run_directory
+from rare_envs.study import evaluate, writing
 from rare_envs.study.arguments import Question
 from rare_envs.study.errors import BadInput
 from rare_envs.study.journal import JOURNAL, continue_journal
@@ -45,7 +45,7 @@ KILLS = (1, 2, 3, 4, 5, 6, 8, 10, 12)
 
 @pytest.fixture
 def no_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(run_directory, "save_plot", lambda path, report: None)
+    monkeypatch.setattr(writing, "save_plot", lambda path, report: None)
     monkeypatch.setattr(DrivingProblem, "tile", 200)
 
 

@@ -10,7 +10,7 @@ import pytest
 
 import samplers
 from rare_envs.problem import DrivingProblem
-from rare_envs.study import evaluate, run_directory
+from rare_envs.study import evaluate, writing
 from rare_envs.study.arguments import Question
 from rare_envs.study.errors import BadInput
 from rare_envs.study.journal import JOURNAL
@@ -35,7 +35,7 @@ ASKED = Question(
 @pytest.fixture
 def faulty(here: Path, risky: str, monkeypatch: pytest.MonkeyPatch) -> Path:
     (here / "faulty.py").write_text(FAULTY)
-    monkeypatch.setattr(run_directory, "save_plot", lambda path, report: None)
+    monkeypatch.setattr(writing, "save_plot", lambda path, report: None)
     return here
 
 
