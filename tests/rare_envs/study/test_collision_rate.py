@@ -11,7 +11,7 @@ import pytest
 from scipy import stats
 
 from rare_envs.study import Question, prepare, run
-from rare_envs.study.report import compute_rate, describe_left_out, describe_probability, find_frequency
+from rare_envs.study.report import describe_left_out, find_frequency
 from tests.rare_envs.study.fitted_files import write_fitted
 
 
@@ -54,26 +54,6 @@ def test_injuries_per_km_are_injuries_per_event_times_the_frequency_with_their_o
     assert report.to_dict()["injury_rate"]["per_hour"] == rate.per_hour
     nothing = run(prepare(question(fitted, collisions="any")))
     assert nothing.injury_rate is None  # such a p has no rate
-
-
-def test_without_refits_the_error_of_the_base_is_left_out(tmp_path: Path) -> None:
-    report = run(prepare(question(write_fitted(tmp_path / "b.json", "hard_brake", refits=None))))
-    assert report.rate is not None
-    variance = report.rate.log_variance
-    assert variance.base == 0.0
-    assert variance == pytest.approx((1 / 42, report.estimate.cov**2, 0.0, 0.0))
-
-
-def test_events_that_do_not_determine_p_leave_an_upper_end(tmp_path: Path) -> None:
-    base = write_fitted(tmp_path / "wide.json", "hard_brake", spread=3.0, shift=3.0)
-    report = run(prepare(question(base, max_sim=2000, gamma=0.0)))
-    uncertainty = report.estimate.base_uncertainty
-    assert uncertainty is not None and uncertainty.bound is not None
-    found = describe_probability(report.estimate)
-    assert not found.determined
-    assert found.upper == uncertainty.bound
-    assert report.rate is not None and report.rate.interval_per_hour[0] == 0.0
-    assert report.notes[-1].startswith(f"the events do not determine p (spread {uncertainty.spread:.1f})")
 
 
 def test_nothing_failed(tmp_path: Path) -> None:
@@ -123,41 +103,3 @@ def test_scenarios_and_bases_without_counted_events_have_no_rate(env: str) -> No
     study = prepare(Question(env_id=env, base=base, drivers="idm" if base is None else None, method="mc"))
     with pytest.raises(ValueError, match="nobody counted"):
         find_frequency(study)
-
-
-def test_a_base_without_a_frequency_has_no_rate_and_the_report_says_so(tmp_path: Path) -> None:
-    report = run(prepare(question(write_fitted(tmp_path / "b.json", "hard_brake", frequency=None), max_sim=50)))
-    assert report.rate is None
-    assert "b.json" in report.no_rate
-    data = report.to_dict()
-    assert (data["rate"], data["no_rate"]) == (None, report.no_rate)
-
-
-def test_the_mixture_of_the_refits_keeps_the_frequency(fitted: str) -> None:
-    report = run(prepare(question(fitted, ensemble=True)))
-    assert report.estimate.base_uncertainty is None
-    assert report.rate is not None
-    assert report.rate.per_hour == pytest.approx(42 / 5.64 * report.estimate.p)
-    assert report.rate.log_variance.base == 0.0
-    (note,) = describe_left_out(report.study, report.estimate)
-    assert "stands for the error of the base distribution" in note
-
-
-def test_the_mixture_of_the_refits_where_nothing_failed_has_both_notes(tmp_path: Path) -> None:
-    base = write_fitted(tmp_path / "safe.json", "hard_brake", spread=0.0, means=[[5.0, 100.0, 1.0]])
-    safe = run(prepare(question(base, max_sim=100)))
-    study = replace(safe.study, question=replace(safe.study.question, ensemble=True))
-    assert [note.split(":")[0] for note in describe_left_out(study, safe.estimate)] == ["ensemble", "nothing failed"]
-
-
-def test_scenarios_fitted_to_the_same_events_are_told_by_their_data(tmp_path: Path) -> None:
-    names = [write_fitted(tmp_path / f"{number}.json", "hard_brake") for number in range(2)]
-    names.append(write_fitted(tmp_path / "other.json", "hard_brake", provenance={"source": {"data": "others"}}))
-    names.append(write_fitted(tmp_path / "unknown.json", "hard_brake", provenance={}))
-    keys = []
-    for name in names:
-        study = prepare(question(name, max_sim=50))
-        keys.append(compute_rate(study, run(study).estimate).fitted_to)
-    assert keys[0] == keys[1] != ""
-    assert keys[2] not in ("", keys[0])
-    assert keys[3] == ""

@@ -2,8 +2,6 @@
 
 import json
 
-import pytest
-
 from rare_envs.study.run_folder import read_failures
 from tests.rare_envs.study.refusals import assert_refused
 
@@ -52,21 +50,6 @@ def test_a_folder_of_results(cli, risky, here):
     assert failures["gap"].shape == failures["log_p0"].shape == failures["f"].shape
     assert cli("replay", here / "run").exit_code == 2
     assert cli(*words, "--collisions", "none").exit_code == 2
-
-
-def test_the_same_ego_twice(cli, risky):
-    result = cli("compare", "idm", "idm", FOLLOWING, "--base", risky, "--method", "mc", "--max-sim", 2000, "--json")
-    found = json.loads(result.stdout)
-    assert found["ratio"] == 1.0
-    assert found["interval"][0] < 1.0 < found["interval"][1]
-    assert found["both"] == pytest.approx(found["a"]["p"])
-
-
-def test_a_missing_ego_is_named(cli):
-    result = cli("compare", "idm", "nowhere.zip", FOLLOWING)
-    assert result.exit_code == 2
-    assert "nowhere.zip" in result.stderr
-    assert result.stdout == ""
 
 
 def test_an_ego_with_noise_in_x_is_refused_beside_one_without(cli):

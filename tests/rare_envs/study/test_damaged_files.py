@@ -7,7 +7,7 @@ import json
 import os
 import shutil
 import zipfile
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +23,6 @@ from rare_envs.study.journal import JOURNAL, begin_journal
 from rare_envs.study.question import prepare
 from samplers.execution.journal import JournalRecord
 
-Cli = Callable[..., Result]
 FOLLOWING = "rare_envs/CarFollowing-v0"
 ODD: tuple[Any, ...] = (
     None, True, -1, 10**400, 1e308, "", "x" * 300, "\x00", [], [[[[]]]], {}, {"a": {}}, float("nan"), float("inf"),

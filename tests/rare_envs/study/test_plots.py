@@ -36,15 +36,6 @@ def test_the_legend_says_which_vehicle_is_which(env_id: str) -> None:
     assert [text.get_text() for text in legend.get_texts()] == [*speeds, "gap to the vehicle ahead"]
 
 
-def test_the_most_shifted_parameters_come_first() -> None:
-    space = rare_envs.DrivingProblem("rare_envs/CutIn-v0").space
-    ordinary = space.sample(4000, np.random.default_rng(0))
-    failures = space.sample(400, np.random.default_rng(1))
-    failures[:, 3] -= 2.0 * ordinary[:, 3].std()
-    failures[:, 1] += 1.0 * ordinary[:, 1].std()
-    assert rank_shifted_parameters(space, ordinary, failures)[:2] == [3, 1]
-
-
 def test_weights_and_noise_are_never_the_most_shifted() -> None:
     space = rare_envs.DrivingProblem("rare_envs/Highway-v0", horizon=2.0).space
     ordinary = space.sample(500, np.random.default_rng(0))
@@ -54,13 +45,6 @@ def test_weights_and_noise_are_never_the_most_shifted() -> None:
     order = rank_shifted_parameters(space, ordinary, failures)
     assert order[:2] == [19, 18]
     assert sorted(order) == list(range(24))
-
-
-def test_replicates_and_policies_are_drawn_too(here: Path, risky: str, tmp_path: Path) -> None:
-    question = Question(env_id=FOLLOWING, base=risky, ego="egos_here:coasting", replicates=3, max_sim=3000, method="mc")
-    report = run(prepare(question))
-    save_plot(tmp_path / "plot.png", report)
-    assert (tmp_path / "plot.png").stat().st_size > 20_000
 
 
 def test_a_run_without_a_failure_shows_how_its_bound_falls(tmp_path: Path) -> None:

@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-import rare_envs
 from rare_envs.study import Question, prepare, run
 from rare_envs.study.repeatability import KEPT_ROWS, ROWS_ALONE, RowKeeper
 
@@ -65,12 +64,6 @@ def test_others_are_not_suspected(ego: Any) -> None:
     assert (found.n, found.n_differing, found.warning) == (KEPT_ROWS + ROWS_ALONE, 0, "")
 
 
-def test_an_ego_that_says_that_it_varies_is_not_checked() -> None:
-    ego = RandomLater()
-    ego.deterministic = False  # type: ignore[attr-defined]
-    assert run(prepare(QUESTION, ego=ego)).repeatability is None
-
-
 class Numbered:
     """f is the number of the row."""
 
@@ -94,13 +87,3 @@ def test_every_row_has_the_same_chance_to_be_kept() -> None:
     expected = 400 * 4 / 9
     assert counts[5] == 0
     assert np.abs(np.delete(counts, 5) - expected).max() < 5 * (expected * 5 / 9) ** 0.5
-
-
-def test_scenarios_whose_terms_were_simulated_are_kept_like_others() -> None:
-    problem = rare_envs.DrivingProblem("rare_envs/CutIn-v0", measure="clearance", horizon=1.0)
-    x = problem.base.sample(300, np.random.default_rng(0))
-    by_terms, by_f = RowKeeper(problem, gamma=5.0), RowKeeper(problem, gamma=5.0)
-    assert by_terms.terms is not None
-    np.testing.assert_array_equal(by_terms.terms(x, 5.0).f, by_f.evaluate(x))
-    np.testing.assert_array_equal(by_terms.x, by_f.x)
-    np.testing.assert_array_equal(by_terms.f, by_f.f)

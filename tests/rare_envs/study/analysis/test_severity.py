@@ -15,12 +15,7 @@ import samplers
 from rare_envs.control.idm import IDM
 from rare_envs.distributions import EventCounts, FittedDistribution
 from rare_envs.study import severity_curve
-from rare_envs.study.arguments import Question
-from rare_envs.study.modes import classify_failures
-from rare_envs.study.question import Study
-from rare_envs.study.report import Report
-from rare_envs.study.severity import Severity, compute_severity, replay_failures
-from rare_envs.study.text import print_report
+from rare_envs.study.severity import compute_severity, replay_failures
 from rare_envs.traffic.crash import injury_risk
 
 FOLLOWING, CUT_IN = "rare_envs/CarFollowing-v0", "rare_envs/CutIn-v0"
@@ -58,17 +53,6 @@ def test_a_coasting_ego_hits_at_half_the_closing_speed() -> None:
     assert severity.largest_delta_v == pytest.approx(6.0, rel=0.01)
     assert severity.injuries.per_failure == pytest.approx((one + six) / 2, rel=0.01)
     assert severity.injuries.value == pytest.approx(0.1 * (one + six) / 2, rel=0.01)
-
-
-def test_of_plain_draws_the_curve_counts_crashes(problem: rare_envs.DrivingProblem, plain: samplers.Estimate) -> None:
-    severity = severity_curve(problem, plain, thresholds=[0.0, 1.0, 2.0])
-    crash = problem.crashes(plain.sample.x)  # type: ignore[union-attr]
-    worst = crash.delta_v.amax(dim=1)
-    counts = [int((worst > v).sum()) for v in (0.0, 1.0, 2.0)]
-    assert counts[0] > counts[2] > 0
-    assert severity.curve.p.tolist() == pytest.approx([count / 4000 for count in counts])
-    assert severity.injuries.value == pytest.approx(float(crash.injury_risk.sum()) / 4000)
-    assert severity.n_replayed == severity.n_failures == len(crash.kind)
 
 
 def test_two_stage_and_monte_carlo_agree(problem: rare_envs.DrivingProblem, plain: samplers.Estimate) -> None:
@@ -114,53 +98,6 @@ def test_scenarios_without_an_outcome_are_left_out_and_said(problem: rare_envs.D
     assert severity.unknown == pytest.approx(2 / len(failing))
     assert severity.curve.p[0] == pytest.approx((len(failing) - 2) / 1000)
     assert "of p have no outcome and are left out" in str(severity)
-
-
-def test_the_replay_is_shared_with_the_kinds_and_goes_to_print_and_json(
-    problem: rare_envs.DrivingProblem, plain: samplers.Estimate, capsys: pytest.CaptureFixture[str]
-) -> None:
-    study = Study(Question(env_id=CUT_IN, method="mc"), problem, samplers.get_method("mc"))
-    report = Report(study, plain, 1.0, kinds=classify_failures(problem, plain))
-    severity = report.kinds.severity
-    assert isinstance(severity, Severity)
-    saved = json.loads(json.dumps(report.to_dict()["severity"], allow_nan=False))
-    assert saved["injuries"]["value"] == severity.injuries.value
-    assert saved["curve"]["delta_v"][:3] == [0.0, 0.1, 0.2]  # fine steps up to 2.5 m/s
-    print_report(report, details=True)
-    printed = capsys.readouterr().out
-    for line in str(severity).splitlines():
-        assert line in printed
-    print_report(report)
-    assert f"  severity        {severity.summarise()}\n" in capsys.readouterr().out
-
-
-def test_most_limits_what_is_driven_again(problem: rare_envs.DrivingProblem, plain: samplers.Estimate) -> None:
-    severity = severity_curve(problem, plain, most=7)
-    assert severity.n_replayed == 7
-    assert f"from 7 of {plain.failures.total} failing scenarios" in str(severity)
-
-
-def test_a_picture(problem: rare_envs.DrivingProblem, plain: samplers.Estimate) -> None:
-    from matplotlib.figure import Figure
-
-    axes = severity_curve(problem, plain).plot(Figure().subplots())
-    assert axes.get_xlabel() == "delta-v [m/s]"
-
-
-def test_bad_input_is_refused(problem: rare_envs.DrivingProblem, plain: samplers.Estimate) -> None:
-    idm = rare_envs.DrivingProblem(FOLLOWING)
-    near = samplers.estimate(idm, "mc", max_sim=500, gamma=3.0, seed=0)
-    with pytest.raises(ValueError, match=r"^No failure \(f <= 3\) that was driven again is a collision\.$"):
-        severity_curve(idm, near)
-    with pytest.raises(ValueError, match=r"^No point failed"):
-        severity_curve(idm, samplers.estimate(idm, "mc", max_sim=100, seed=0))
-    without = replace(plain, sample=None)
-    with pytest.raises(ValueError, match="gave no weighted points"):
-        severity_curve(problem, without)
-    problem_that_varies = rare_envs.DrivingProblem(CUT_IN, ego=IDM(max_deceleration=1.0))
-    problem_that_varies.varies = True
-    with pytest.raises(ValueError, match="vary from run to run"):
-        severity_curve(problem_that_varies, plain)
 
 
 def moved_base(sd: float, number: int = 20) -> FittedDistribution:

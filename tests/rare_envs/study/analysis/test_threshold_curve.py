@@ -16,8 +16,3 @@ def test_the_curve_starts_at_p_and_its_band_holds_the_truth(method: str) -> None
     truth = stats.norm.cdf(curve.gammas - 2.5)
     assert np.mean((curve.low <= truth) & (truth <= curve.high)) > 0.9
     assert 0.3 < curve.p[-1] < 0.7
-
-
-def test_without_failures_there_is_no_curve() -> None:
-    problem = samplers.FunctionProblem(lambda x: 9.0 - x[:, 0], dim=2)
-    assert compute_threshold_curve(samplers.estimate(problem, "mc", seed=0, max_sim=100)) is None

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
@@ -48,9 +46,3 @@ def test_a_kind_beyond_the_list_gets_its_most_likely_failure(
     assert [mode.failure for mode in find_modes(Plane(), longer, crashes)] == [0, 1000]  # type: ignore[arg-type]
     again, more = list_every_mode(Plane(), longer, crashes)  # type: ignore[arg-type]
     assert again is longer and not len(more)
-
-
-def test_a_complete_list_stays_as_it_is(run: tuple[samplers.Estimate, dict[str, str]]) -> None:
-    estimate, crashes = run
-    complete = replace(estimate, failures=replace(estimate.failures, total=len(estimate.failures)))
-    assert list_every_mode(Plane(), complete, crashes)[0] is complete  # type: ignore[arg-type]

@@ -45,22 +45,11 @@ def test_the_table_for_people(fitted: None, capsys: pytest.CaptureFixture[str]) 
     assert "plain frequency not known, no rate per hour or km: nobody counted" in text
 
 
-@pytest.mark.parametrize("env_id", SCENARIOS)
-def test_every_shipped_base_can_be_listed(env_id: str) -> None:
-    assert list(list_bases(env_id)) == list(SCENARIOS[env_id].bases)
-
-
 def test_the_command(cli: Cli, fitted: None) -> None:
     answer = json.loads(cli("bases", "hard_brake", "--json").stdout)
     assert answer["bases"]["us101"]["fitted_to"] == "42 events of 40 scenes"
     assert answer["env_id"] == "rare_envs/HardBrake-v0"
     assert "42 events of 40 scenes" in cli("bases", "hard_brake").stdout
-
-
-def test_the_version_of_the_scenario_is_said_as_both_have_a_us101(cli: Cli) -> None:
-    newest, first = (cli("bases", name).stdout for name in ("cut_in", "rare_envs/CutIn-v0"))
-    assert newest.startswith("base distributions of rare_envs/CutIn-v1\nus101 ") and "38 + 259 events" in newest
-    assert first.startswith("base distributions of rare_envs/CutIn-v0\nus101 ") and "38 + 265 events" in first
 
 
 def test_unknown_scenarios_are_refused(cli: Cli) -> None:

@@ -55,9 +55,3 @@ def test_list_shows_what_there_is(cli: Cli) -> None:
     assert "weights (404 values), noise (1,020 values)" in " ".join(shown.split())
     for name in (*agents.names.SHIPPED_DRIVERS, "okelly2018", "lidar_ttc"):
         assert name in shown
-
-
-def test_the_list_has_the_weather(cli: Cli) -> None:
-    listed = json.loads(cli("list", "--json").stdout)["weather"]
-    assert [each["name"] for each in listed] == ["fog", "sun_elevation", "sun_azimuth", "sensor_noise"]
-    assert "sun_elevation" in cli("list", "weather").stdout

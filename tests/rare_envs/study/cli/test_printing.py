@@ -7,16 +7,12 @@ import re
 import subprocess
 import sys
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import pytest
 from typer.testing import Result
 
-from rare_envs import study
 from rare_envs.study.html_report.page import list_doubts
-from rare_envs.study.text import print_report
 
 Cli = Callable[..., Result]
 
@@ -61,46 +57,3 @@ def test_an_upper_bound_by_plain_monte_carlo_is_an_answer(cli: Cli, safe: str, t
     assert written["doubtful"] is False and list_doubts(written) == []
     assert written["interval"][1] == pytest.approx(1 - 0.025 ** (1 / 2000))
     assert (tmp_path / "run" / "plot.png").stat().st_size > 10_000
-
-
-def test_what_to_check_is_said_where_something_may_be_missed(cli: Cli, here: Path, risky: str, safe: str) -> None:
-    words = ("estimate", FOLLOWING, "--method", "adss", "--max-sim", 2000, "--base")
-    assert "check: " not in cli(*words, risky, "--ego", "egos_here:coasting").stdout  # base draws saw it often
-    assert "check: --method mc --max-sim 300000" in cli(*words, safe).stdout  # whoever drives
-
-
-class Fitted:
-    """A base distribution that was fitted, with refits that are all like it."""
-
-    clusters, fitted_to, family = 17, "38 + 15 events of 17 scenes", "1 component, log gaps"
-
-    def __init__(self, distribution: Any) -> None:
-        self.distribution, self.refits = distribution, (distribution,) * 30
-        self.sample, self.log_prob = distribution.sample, distribution.log_prob
-        self.to_standard_normal = distribution.to_standard_normal
-        self.from_standard_normal = distribution.from_standard_normal
-
-
-def test_the_base_distribution_stands_under_the_sampling_interval(
-    risky: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    report = study.run(study.prepare(study.Question(env_id=FOLLOWING, method="mc", max_sim=2000, base=risky)))
-    print_report(report)
-    plain = capsys.readouterr().out.splitlines()
-    told = [line for line in plain if "base distribution" in line]
-    assert len(told) == 1 and "no interval" in told[0] and "has no refits" in told[0]
-    estimate = replace(report.estimate, base=Fitted(report.estimate.base))
-    print_report(replace(report, estimate=estimate))
-    lines = capsys.readouterr().out.splitlines()
-    found = estimate.base_uncertainty
-    assert found is not None
-    assert lines[:2] + lines[4:] == [line for line in plain if line not in told]
-    assert lines[2:4] == [f"  {line}" for line in str(found).splitlines()]
-    assert lines[2].startswith("  base distribution 95 %  ")
-    assert json.loads(json.dumps(replace(report, estimate=estimate).to_dict()))["base_uncertainty"]["clusters"] == 17
-
-
-def test_less_precision_than_wished_is_no_doubt(cli: Cli, risky: str) -> None:
-    result = cli(*SMALL, "--base", risky, "--target-cov", 0.01)
-    assert result.exit_code == 0
-    assert "remark: The target c.o.v. 0.01 was not met: 0." in result.stdout and "warning" not in result.stdout

@@ -30,24 +30,6 @@ def test_the_table_and_the_folder(cli: Cli, bases: list[str], here: Path) -> Non
     assert (here / "out" / "risk.png").exists()
 
 
-def test_json_alone_on_standard_output(cli: Cli, bases: list[str]) -> None:
-    result = cli("risk", "idm", *bases, *FEW, "--seed", 3, "--json")
-    data = json.loads(result.stdout)
-    assert set(data["scenarios"]) == {"cut_in", "hard_brake"}
-    assert data["scenarios"]["cut_in"]["report"]["seed"] == 3
-    assert data["interval_per_million_km"][0] < data["per_million_km"] < data["interval_per_million_km"][1]
-
-
-def test_new_leaders_in_place_of_cut_ins(cli: Cli, here: Path) -> None:
-    words = [
-        word
-        for name in ("car_following", "hard_brake")
-        for word in ("--base", f"{name}={write_fitted(here / f'{name}.json', name)}")
-    ]
-    result = cli("risk", "idm", "--with", "car-following", *words, *FEW, "--json")
-    assert set(json.loads(result.stdout)["scenarios"]) == {"car_following", "hard_brake"}
-
-
 BAD = {
     "misspelt ego": (["imd"], ["idm"]),
     "missing ego": ([], ["EGO"]),
@@ -101,16 +83,6 @@ def test_estimate_prints_the_rate_beside_people(cli: Cli, here: Path) -> None:
     assert data["rate"]["per_hour"] == pytest.approx(42 / 5.64 * data["p"])
 
 
-def test_estimate_says_which_error_the_rate_leaves_out(cli: Cli, here: Path) -> None:
-    whole = write_fitted(here / "whole.json", "hard_brake")
-    assert "note:" not in cli(*BRAKE, "--base", whole).stdout
-    without = write_fitted(here / "without.json", "hard_brake", refits=None)
-    assert "note: the error of the base distribution is not known (no refits)" in cli(*BRAKE, "--base", without).stdout
-    safe = write_fitted(here / "safe.json", "hard_brake", means=[[5.0, 100.0, 1.0]])
-    said = "note: nothing failed: the upper end is that of the simulations, without the error of the distribution"
-    assert said in cli(*BRAKE, "--base", safe).stdout
-
-
 def test_estimate_says_in_one_line_why_there_is_no_rate(cli: Cli, here: Path) -> None:
     base = write_fitted(here / "fitted.json", "hard_brake")
     for words, said in (
@@ -121,25 +93,6 @@ def test_estimate_says_in_one_line_why_there_is_no_rate(cli: Cli, here: Path) ->
         lines = [line for line in cli(*BRAKE, *words).stdout.splitlines() if "no rate" in line]
         assert len(lines) == 1
         assert said in lines[0]
-
-
-def test_the_mixture_of_the_refits_as_base(cli: Cli, here: Path) -> None:
-    base = write_fitted(here / "fitted.json", "hard_brake", spread=1.0)
-    data = json.loads(cli(*BRAKE, "--base", base, "--ensemble", "--json").stdout)
-    notes = [line for line in cli(*BRAKE, "--base", base, "--ensemble").stdout.splitlines() if line.startswith("note")]
-    assert len(notes) == 1
-    assert notes[0].startswith("note: ensemble: p is the mean over the refits")
-    assert "no interval of that error is given" in notes[0]
-    assert data["notes"] == [notes[0].removeprefix("note: ")]
-    assert data["question"]["ensemble"] is True
-    assert data["average"] == f"mean over the 30 refits of {base}"
-    assert data["average"] in cli(*BRAKE, "--base", base, "--ensemble").stdout.splitlines()[0]
-    shown = cli(*BRAKE, "--base", base, "--ensemble", "--sensitivity").stdout
-    assert "without --ensemble derivatives are by those of the base" in shown
-    assert "component" not in shown.partition("importance of the parameters")[2]
-    assert data["base_uncertainty"] is None
-    without = write_fitted(here / "without.json", "hard_brake", refits=None)
-    assert_refused(cli(*BRAKE, "--base", without, "--ensemble"), "without.json", "no refits")
 
 
 def test_p_under_other_bases(cli: Cli, here: Path) -> None:

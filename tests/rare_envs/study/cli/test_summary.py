@@ -5,14 +5,10 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
 from typer.testing import Result
-
-from rare_envs.study import Question, prepare, run
-from rare_envs.study.text import list_rows
 
 Cli = Callable[..., Result]
 
@@ -40,17 +36,3 @@ def test_what_is_unusual_in_the_most_likely_failure_is_named(cli: Cli, risky: st
         assert float(value) == pytest.approx(failure[name], abs=0.005)
         assert not float(low) <= failure[name] <= float(high)
     assert bool(named) != ("nothing beyond" in line)
-
-
-def test_rare_kinds_are_counted_and_not_named(risky: str) -> None:
-    question = Question(env_id="rare_envs/CarFollowing-v0", method="mc", max_sim=2000, base=risky)
-    report = run(prepare(question))
-    [share] = report.kinds.shares.values()
-    shares = {
-        "rear_end": share,
-        "side": replace(share, of_failures=9e-5),
-        "rear_ended": replace(share, of_failures=2e-4),
-    }
-    rows = dict(list_rows(replace(report, kinds=replace(report.kinds, shares=shares))))
-    kinds = "100 % the ego runs into a vehicle ahead; 0.02 % the ego is run into from behind; 1 rarer than 0.01 %"
-    assert rows["of which"] == kinds

@@ -13,7 +13,6 @@ import pytest
 from rare_envs.study.arguments import Question
 from rare_envs.study.corpus import (
     WORLD_FIELDS,
-    StoredFailure,
     make_stored,
     parse_stored,
     read_stored,
@@ -90,15 +89,3 @@ def test_two_hundred_damaged_files_are_refused_or_the_same(tmp_path: Any) -> Non
         except ValueError:
             refused += 1
     assert refused > 50
-
-
-def test_a_stored_failure_is_a_question() -> None:
-    assert isinstance(STORED, StoredFailure)
-    values = STORED.question_values()
-    assert values["ego"] == "idm" and Question(**values).horizon == 4.0
-
-
-def test_the_default_base_is_named() -> None:
-    assert STORED.base == "us101" and json.loads(STORED.to_json())["base"] == "us101"
-    assert make_stored(replace(QUESTION, base="i80"), X, f=-1.0, log_p0=-9.25, crash="").base == "i80"
-    assert make_stored(replace(QUESTION, env_id="gone/Road-v0"), X, f=-1.0, log_p0=-9.25, crash="").base is None

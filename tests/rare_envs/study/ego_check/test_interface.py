@@ -10,10 +10,7 @@ from numpy.typing import NDArray
 import rare_envs
 from rare_envs.study.ego_check.checks import (
     Probe,
-    check_actions,
     check_declared_spaces,
-    check_extreme_observations,
-    check_normalisation,
 )
 
 
@@ -49,20 +46,3 @@ def test_a_range_of_actions_that_is_not_the_environments_is_told(high: float, st
     probe = probe_of(action_space=spaces.Box(-high, high, (2,)))
     (finding,) = (each for each in check_declared_spaces(probe) if each.check == "action space")
     assert finding.status == status
-
-
-@pytest.mark.parametrize(
-    ("scale", "expected"), [(1.0, ["pass"]), (2.0, ["warn", "pass"]), (np.nan, ["fail"]), (0.0, ["warn"])]
-)
-def test_actions(scale: float, expected: list[str]) -> None:
-    assert [finding.status for finding in check_actions(probe_of(scale=scale))] == expected
-
-
-def test_zeros_and_bounds_are_observed() -> None:
-    findings = {finding.check: finding for finding in check_extreme_observations(probe_of())}
-    assert findings["range"].status == "pass"
-    assert findings["NaN"].found == "answered by NaN"
-
-
-def test_only_saved_egos_have_statistics() -> None:
-    assert list(check_normalisation(probe_of())) == []

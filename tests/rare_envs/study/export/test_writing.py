@@ -43,13 +43,6 @@ def test_x_is_checked(problem: DrivingProblem, tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_missing_folder_is_made(problem: DrivingProblem, tmp_path: Path) -> None:
-    (file,) = export_scenario(problem, X, tmp_path / "a" / "b" / "c.xml", "commonroad")
-    assert file.stat().st_size > 1000
-    with pytest.raises(OSError):
-        export_scenario(problem, X, file / "c.xml", "commonroad")
-
-
 def test_a_missing_library_is_named(problem: DrivingProblem, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for name in [name for name in sys.modules if name.startswith("scenariogeneration")]:
         monkeypatch.delitem(sys.modules, name)

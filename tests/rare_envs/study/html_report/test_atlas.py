@@ -47,8 +47,3 @@ def test_an_ego_that_cannot_be_driven_again_costs_the_pictures_alone(
     assert replay.drive_again is not fail
     (entry,) = build_atlas(source, [MODE])
     assert entry.clip == "" and entry.figures == [] and "gone" in entry.missing and entry.parameters
-
-
-def test_a_mode_without_a_listed_failure_has_its_share(source: AtlasSource) -> None:
-    (entry,) = build_atlas(source, [{**MODE, "failure": None}])
-    assert entry.parameters == [] and "none of its failures" in entry.missing and entry.share.startswith("75 % of p")

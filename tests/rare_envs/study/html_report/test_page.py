@@ -10,7 +10,6 @@ import re
 import shutil
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -21,8 +20,7 @@ from typer.testing import Result
 
 from rare_envs.study import BadInput, Question, prepare, run_into
 from rare_envs.study.html_report.figures import FigureOfPage
-from rare_envs.study.html_report.page import SECTIONS, list_doubts, render_page, write_html_report
-from rare_envs.study.run_folder import load_study
+from rare_envs.study.html_report.page import SECTIONS, list_doubts, write_html_report
 from rare_envs.traffic.palette import ROLE_COLOURS, as_rgb
 
 VOID = {"meta", "br", "img", "link", "path", "use", "rect", "circle", "line", "polygon"}
@@ -90,17 +88,6 @@ def test_the_page_says_what_the_files_say(folder: Path) -> None:
     assert len(figures) >= 8
 
 
-@pytest.mark.parametrize("thresholds", [(0.0, 0.0), (4.0, 0.0)])
-def test_the_caption_of_the_levels_names_thresholds_only_where_they_are_drawn(
-    folder: Path, thresholds: tuple[float, float]
-) -> None:
-    study = load_study(folder)
-    trace = [{**study.result["trace"][0], "gamma": gamma} for gamma in thresholds]
-    figures = {"levels": FigureOfPage("levels", "Levels.", lambda figure: figure.subplots(), (3, 2))}
-    text = render_page(replace(study, result={**study.result, "gamma": 0.0, "trace": trace}), figures, [])
-    assert ("and the threshold on its way to gamma" in text) == (thresholds[0] > 0)
-
-
 def test_in_the_clip_every_vehicle_has_its_colour(folder: Path) -> None:
     text = (folder / "report.html").read_text(encoding="utf-8")
     clip = re.search(r"data:image/gif;base64,([A-Za-z0-9+/=]+)", text)
@@ -127,21 +114,6 @@ def test_warnings_come_first_and_text_of_files_is_escaped(folder: Path, tmp_path
     assert "not what the run wrote, by the digests in its study.json: result.json" in text
 
 
-def test_names_of_egos_and_bases_are_escaped(folder: Path) -> None:
-    study, script = load_study(folder), "<script>alert(1)</script>"
-    result = {**study.result, "question": {**study.question, "ego": script, "env_id": f'"{script}'}}
-    about = {**study.about, "ego": {**study.about["ego"], "name": script}, "base": {"name": script}, "command": script}
-    text = render_page(replace(study, result=result, about=about), {}, [])
-    assert "<script" not in text and text.count("&lt;script&gt;alert(1)") >= 6
-
-
-def test_commands_and_folders_are_those_to_paste(folder: Path, tmp_path: Path) -> None:
-    run = Path(shutil.copytree(folder, tmp_path / "5 % of it"))
-    study = load_study(run)
-    text = render_page(replace(study, about={**study.about, "command": "rare-envs resume '5 % of it'"}), {}, [])
-    assert "rare-envs resume &#39;5 % of it&#39;</code>" in text and "5\xa0% of it" not in text
-
-
 DAMAGED = {
     "result.json": [{"kinds": [1]}, {"modes": ["x"]}, {"method": "x"}, {"confidence": "x"}, {"n_sim": "x"}],
     "study.json": [{"versions": [1]}, {"base": [1]}],
@@ -161,44 +133,12 @@ def test_a_damaged_file_is_one_line(
     assert not (tmp_path / "page.html").exists()
 
 
-def test_a_table_that_is_no_file_is_one_line(folder: Path, tmp_path: Path) -> None:
-    run = Path(shutil.copytree(folder, tmp_path / "run"))
-    (run / "episodes.parquet").unlink()
-    (run / "episodes.parquet").mkdir()
-    with pytest.raises(BadInput, match=r"There is no episodes\.parquet"):
-        write_html_report(run)
-
-
 def test_doubts_are_those_of_method_base_and_f() -> None:
     base = {"warnings": ["few events"]}
     found = list_doubts({"warnings": ["coarse"], "base_uncertainty": base, "doubtful": True})
     assert found == ["coarse", "base distribution: few events"]
     assert list_doubts({"doubtful": True, "missing_statistics": "no statistics"}) == ["no statistics"]
     assert list_doubts({"doubtful": False}) == [] and len(list_doubts({"doubtful": True})) == 1
-
-
-@pytest.mark.parametrize(
-    ("interval", "said"),
-    [([1e-5, 1e-2], "by a factor of 1,000"), (None, "do not bound p"), ([1e-3, 3e-3], "No warnings")],
-)
-def test_a_wide_interval_of_the_base_is_a_warning(interval: list[float] | None, said: str, folder: Path) -> None:
-    study = load_study(folder)
-    base = {"interval": interval, "fitted_to": "38 events", "confidence": 0.95, "expected": None}
-    result = {**study.result, "warnings": [], "doubtful": False, "base_uncertainty": base}
-    text = render_page(replace(study, result=result), {}, [])
-    assert said in text and ("The run has no doubts" in text) == (said == "No warnings")
-
-
-def test_a_warning_beside_an_exact_bound_is_a_note(
-    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(FigureOfPage, "to_svg", lambda _: "")
-    run = Path(shutil.copytree(folder, tmp_path / "run"))
-    bound = {"status": "no_hits", "doubtful": False, "warnings": ["None of 9 failed."], "remarks": ["Cut short."]}
-    (run / "result.json").write_text(json.dumps(json.loads((run / "result.json").read_text()) | bound))
-    write_html_report(run, out=tmp_path / "page.html")
-    text = (tmp_path / "page.html").read_text()
-    assert "<dt>note</dt><dd>None of 9 failed.</dd><dt>note</dt><dd>Cut short.</dd>" in text
 
 
 def test_recorded_events_and_figures_as_files(folder: Path, tmp_path: Path, cli: Callable[..., Result]) -> None:
@@ -221,19 +161,6 @@ def test_a_run_without_failures_has_a_page(tmp_path: Path, safe: str) -> None:
     page = Page(text)
     assert page.wrong == [] and [name for name in page.ids if name in SECTIONS] == list(SECTIONS)
     assert "None of 50 simulations ends in a collision" in text and "No failure was found." in text
-
-
-def test_on_a_phone_every_number_of_a_table_has_its_heading(folder: Path) -> None:
-    text = (folder / "report.html").read_text(encoding="utf-8")
-    tables = re.findall(r"<table.*?</table>", text, re.DOTALL)
-    assert len(tables) >= 4 and all(table.startswith('<table class="cards') for table in tables)
-    for table in tables:
-        heads = re.findall(r"<th[^>]*>([^<]*)</th>", table)
-        for row in re.findall(r"<tr><td.*?</tr>", table):
-            cells = re.findall(r'<td(?: class="([^"]*)")?(?: data-head="([^"]*)")?>', row)
-            assert len(cells) == len(heads)
-            for head, (kind, named) in zip(heads, cells, strict=True):
-                assert named == head or (kind != "n" and not named)
 
 
 def find_chromium() -> str | None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
@@ -12,7 +11,7 @@ import pytest
 from rare_envs.scenarios.hard_brake import HARD_BRAKE
 from rare_envs.scenarios.registry import SCENARIOS, scenario_named
 from rare_envs.study import Question, Report, prepare, run
-from rare_envs.study.risk import check_sites, choose_base, compare_sites, list_sites
+from rare_envs.study.risk import choose_base, compare_sites
 from tests.rare_envs.study.fitted_files import fitted_entries
 
 OTHER_SITE = {"source": {"site": "another", "data": "more"}}
@@ -54,33 +53,6 @@ def test_a_site_that_is_asked_for_is_simulated_if_need_be(sites: None) -> None:
     assert set(factors) == {"near", "far"}
     p = run(prepare(Question(env_id="rare_envs/HardBrake-v0", base="far", method="mc", max_sim=1000))).estimate.p
     assert factors["far"] == pytest.approx(p / own.estimate.p)
-
-
-def test_a_site_is_the_first_base_of_it(sites: None) -> None:
-    brake = scenario_named("hard_brake")
-    assert list_sites(brake) == {"us101": "site of hard_brake", "near": "another", "far": "a third"}
-    check_sites([brake], ["near", "us101"])
-    for given, said in (
-        (["near-gap"], "'near-gap' is no site: this base of hard_brake is a further base of the site 'near'"),
-        (["assembled"], "'assembled' is no site: this base of hard_brake has no site"),
-        (["us101", "naer"], "of a site 'naer' (did you mean 'near'?); there are far, near, us101"),
-        (["near", "near"], "each once; got near, near"),
-        ([], "got none"),
-    ):
-        with pytest.raises(ValueError, match=re.escape(said)):
-            check_sites([brake], given)
-
-
-def test_shipped_sites_are_two_for_cut_ins_and_one_for_brakings() -> None:
-    assert list(list_sites(scenario_named("cut_in"))) == ["us101", "i80"]
-    assert list(list_sites(scenario_named("hard_brake"))) == ["us101"]
-    assert list(list_sites(scenario_named("car_following"))) == ["us101", "i80", "i24"]
-
-
-def test_nothing_is_known_where_nothing_failed(tmp_path: Path) -> None:
-    own = run(prepare(Question(env_id="rare_envs/HardBrake-v0", method="mc", max_sim=20)))
-    assert own.estimate.p == 0
-    assert compare_sites(own, ("us101",)) == {}
 
 
 def test_the_base_of_a_scenario_at_a_site() -> None:

@@ -6,16 +6,11 @@ import math
 
 import pytest
 
-from rare_envs.exposure.total_rate import FurtherEvents, TotalRate, VarianceShare
+from rare_envs.exposure.total_rate import TotalRate
 from rare_envs.study.text import (
-    describe_further_events,
-    describe_parts,
     describe_uncertainty,
     format_rate,
     format_with_interval,
-    name_events,
-    name_scenario,
-    name_source,
 )
 from tests.rare_envs.exposure.test_rate import frequency, rate
 
@@ -36,10 +31,6 @@ def test_two_digits(value: float, text: str) -> None:
     assert format_rate(value) == text
 
 
-def test_an_interval_from_zero_is_a_bound() -> None:
-    assert format_with_interval(0.0, (0.0, 0.0123)) == "0 (below 0.012)"
-
-
 @pytest.mark.parametrize(
     ("value", "interval", "text"),
     [
@@ -57,37 +48,9 @@ def test_a_rate_and_its_interval_have_one_form(value: float, interval: tuple[flo
     assert format_with_interval(value, interval) == text
 
 
-def test_words_of_scenarios_events_and_sources() -> None:
-    assert (name_scenario("cut_in"), name_scenario("car_following")) == ("cut-in", "car following")
-    assert (name_events("cut_in"), name_events("mine")) == ("cut-ins", "events")
-    assert name_source(VarianceShare("site", "cut_in", 0.5)) == "cut-in at other sites"
-    assert name_source(VarianceShare("sampling", "", 0.5)) == "simulation"
-
-
-def test_events_that_alone_would_not_halve_it() -> None:
-    text = describe_further_events(FurtherEvents("hard_brake", None, 126))
-    assert text == "further brakings alone would not halve it; about 130 would halve their own part"
-
-
 def test_the_line_of_a_total_names_the_largest_source_first() -> None:
     total = TotalRate((rate(spread=1.4, counted=frequency(100)),))
     text = describe_uncertainty(total, {"cut_in": 38})
     assert text.startswith("the uncertainty is 99 % the cut-in distribution, 0.5 % event counts, 0.02 % simulation;")
     assert "120 further recorded cut-ins would halve it (a spread falls with 1 / sqrt(events))" in text
     assert "further" not in describe_uncertainty(total, {})
-
-
-def test_shares_are_those_of_the_determined_part_where_a_rate_is_not_determined() -> None:
-    unknown = rate(0.0, upper=1e-3, scenario="hard_brake")
-    text = describe_uncertainty(TotalRate((rate(spread=1.4, counted=frequency(100)), unknown)), {"cut_in": 38})
-    assert text.startswith("the uncertainty of the determined part is 99 % the cut-in distribution, ")
-    assert "hard brake is not determined, and adds " in text
-    assert "halve" not in text
-
-
-def test_a_rate_that_is_not_determined_has_no_parts_but_raises_the_upper_end() -> None:
-    unknown = rate(0.0, upper=1e-3)
-    assert describe_parts(unknown) == ""
-    high = format_rate(unknown.interval_per_million_km[1])
-    text = describe_uncertainty(TotalRate((unknown,)), {"cut_in": 38})
-    assert text == f"cut-in is not determined, and adds {high} to the upper end"

@@ -67,35 +67,6 @@ def test_an_ego_that_is_an_object(bases: dict[str, str]) -> None:
     assert found.scenarios[0].report.estimate.p > 0.2
 
 
-def test_a_base_without_refits_leaves_its_error_out_and_says_so(tmp_path: Path) -> None:
-    base = write_fitted(tmp_path / "b.json", "hard_brake", refits=None)
-    found = rare_envs.risk("idm", scenarios=("hard_brake",), bases={"hard_brake": base}, **FEW)
-    assert "no refits" in found.notes[0]
-    assert {each.source for each in found.total.shares} == {"counts", "sampling"}
-    assert found.to_dict()["further_events"] is None
-
-
-def test_nothing_failed_gives_an_upper_end(tmp_path: Path) -> None:
-    base = write_fitted(tmp_path / "safe.json", "hard_brake", means=[[5.0, 100.0, 1.0]])
-    found = rare_envs.risk("idm", scenarios=("hard_brake",), bases={"hard_brake": base}, **FEW)
-    assert found.total.per_million_km == 0.0
-    assert found.total.interval_per_million_km[0] == 0.0
-    assert "nothing failed" in " ".join(found.notes)
-    assert "below" in str(found)
-    json.dumps(found.to_dict(), allow_nan=False)
-
-
-def test_events_that_do_not_determine_p_count_in_the_upper_end(tmp_path: Path, bases: dict[str, str]) -> None:
-    wide = write_fitted(tmp_path / "wide.json", "hard_brake", spread=3.0, shift=3.0)
-    found = rare_envs.risk("idm", bases={**bases, "hard_brake": wide}, **{**FEW, "max_sim": 2000})
-    cut_in, brake = (each.rate for each in found.scenarios)
-    assert not brake.determined
-    high = found.total.interval_per_million_km[1]
-    both = cut_in.interval_per_million_km[1] + brake.interval_per_million_km[1]
-    assert high == pytest.approx(both, rel=0.05)  # that of the cut-ins is at p = 1, where draws end too
-    assert "do not determine" in " ".join(found.notes)
-
-
 def test_the_spread_between_sites_widens_the_interval(monkeypatch: pytest.MonkeyPatch) -> None:
     """Two sites whose rates differ by a factor r: the sd of the logarithm is log(r) / sqrt(2)."""
     brake = SCENARIOS["rare_envs/HardBrake-v0"]
@@ -110,15 +81,6 @@ def test_the_spread_between_sites_widens_the_interval(monkeypatch: pytest.Monkey
     assert two.total.rates[0].site_log_sd == pytest.approx(abs(math.log(factor)) / math.sqrt(2))
     assert two.total.interval_per_hour[1] > one.total.interval_per_hour[1]
     assert ", under i80 " in str(one)
-
-
-def test_another_site_needs_a_base_for_each_scenario(monkeypatch: pytest.MonkeyPatch, bases: dict[str, str]) -> None:
-    """Cut-ins of I-80 and brakings of US 101 are those of no road: whoever adds them says so."""
-    entries = {name: fitted_entries("cut_in", provenance={"source": {"site": name}}) for name in ("us101", "i80")}
-    cut_in = replace(SCENARIOS["rare_envs/CutIn-v1"], bases=entries)
-    monkeypatch.setitem(SCENARIOS._entries, "rare_envs/CutIn-v1", cut_in)
-    found = rare_envs.risk("idm", sites=["i80"], bases={"hard_brake": bases["hard_brake"]}, **FEW)
-    assert [each.base_name for each in found.scenarios] == ["i80", bases["hard_brake"]]
 
 
 REFUSED = {

@@ -39,18 +39,6 @@ def test_other_libraries_read_the_table(folder: Path) -> None:
     assert np.exp(frame.log_weight[frame.failed]).sum() == pytest.approx(p) == pytest.approx(study.p)
 
 
-def test_polars_reads_the_table(folder: Path) -> None:
-    frame = pytest.importorskip("polars").read_parquet(rare_envs.load_study(folder).episodes_path)
-    assert frame.height == 300
-
-
-def test_duckdb_reads_the_table(folder: Path) -> None:
-    duckdb = pytest.importorskip("duckdb")
-    study = rare_envs.load_study(folder)
-    found = duckdb.sql(f"SELECT sum(exp(log_weight)) FROM '{study.episodes_path}' WHERE failed").fetchall()[0]
-    assert found[0] == pytest.approx(study.p)
-
-
 def test_loading_takes_neither_torch_nor_the_simulation(folder: Path) -> None:
     code = (
         "import sys, rare_envs; study = rare_envs.load_study(sys.argv[1]); study.episodes(); study.failures\n"
@@ -93,16 +81,6 @@ def test_a_damaged_table_and_unknown_columns_are_refused(folder: Path, tmp_path:
     (tmp_path / "episodes.parquet").write_bytes(study.episodes_path.read_bytes()[:-40])
     with pytest.raises(ValueError, match=r"episodes\.parquet"):
         rare_envs.load_study(tmp_path).episodes()
-
-
-@pytest.mark.parametrize("text", ["{}", '{"format": 2}', '{"format": null}', '{"format": [[[]]]}'])
-def test_an_unknown_format_of_the_study_is_refused_in_one_line(folder: Path, tmp_path: Path, text: str) -> None:
-    for name in ("result.json", "failures.csv"):
-        (tmp_path / name).write_bytes((folder / name).read_bytes())
-    assert rare_envs.load_study(tmp_path).about == {}  # a run of an earlier version
-    (tmp_path / "study.json").write_text(text)
-    with pytest.raises(BadInput, match=r"^Expected format 1 in '.*study\.json', got .*: the file is damaged"):
-        rare_envs.load_study(tmp_path)
 
 
 def test_a_table_that_is_too_large_for_memory_is_refused(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:

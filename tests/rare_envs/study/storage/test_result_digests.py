@@ -22,15 +22,3 @@ def test_every_bit_counts(run: Path) -> None:
     content[-1] ^= 1
     (run / DIGESTED[1]).write_bytes(content)
     assert find_changed_results(run, written) == [DIGESTED[1]]
-
-
-def test_files_that_were_removed_or_added_are_changes(run: Path) -> None:
-    written = {"results": digest_results(run)}
-    (run / DIGESTED[0]).unlink()
-    (run / DIGESTED[3]).touch()
-    assert find_changed_results(run, written) == [DIGESTED[0], DIGESTED[3]]
-
-
-@pytest.mark.parametrize("about", [{}, {"results": None}, {"results": [1]}])
-def test_a_study_without_digests_tells_nothing(run: Path, about: dict[str, object]) -> None:
-    assert find_changed_results(run, about) == []

@@ -15,12 +15,6 @@ def test_a_remote_file_is_refused(cli: Cli) -> None:
     assert "remote place" in refused.stdout
 
 
-def test_the_id_of_the_training_is_known(cli: Cli) -> None:
-    """And says what is observed and done: the driver by rule does without."""
-    findings = json.loads(cli("check-ego", "idm", "rare_envs/CutIn-kinematics-v0", "--json").stdout)["findings"]
-    assert all(each["status"] != "fail" for each in findings)
-
-
 def test_an_unknown_environment_is_one_line(cli: Cli) -> None:
     refused = cli("check-ego", "idm", "rare_envs/CutIn-v9")
     assert (refused.exit_code, refused.stdout) == (2, "")

@@ -92,8 +92,3 @@ def test_what_the_ego_observes_can_be_chosen(cli: Cli, here: Path) -> None:
     for chosen in ((), ("--observation", "lidar")):  # an ego that expects the lidar's 51 numbers need not say so
         result = cli(*words, *chosen, "--json")
         assert json.loads(result.stdout)["question"]["observation"] == "lidar"
-
-
-def test_help_calls_replicates_what_samplers_calls_them(cli: Cli) -> None:
-    shown = cli("estimate", "--help").stdout.replace("│", " ")
-    assert "Independent runs, combined by their mean" in " ".join(shown.split())

@@ -13,7 +13,6 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from typer.testing import Result
 
-from agents import load_ego
 from rare_envs.study.cli.egos import export_ego
 from rare_envs.study.errors import BadInput
 from tests.rare_envs.study.refusals import assert_refused
@@ -30,26 +29,6 @@ def model(tmp_path: Path) -> Path:
     ppo.save(tmp_path / "ego.zip")
     env.save(str(tmp_path / "vecnormalize.pkl"))
     return tmp_path / "ego.zip"
-
-
-def test_the_report_says_what_was_compared(model: Path, tmp_path: Path) -> None:
-    pytest.importorskip("onnxruntime", reason="the extra onnx is optional")
-    pytest.importorskip("onnx", reason="the extra onnx is optional")
-    out, statistics = tmp_path / "ego.onnx", tmp_path / "vecnormalize.pkl"
-    done = export_ego(model, out)
-    difference = done.pop("largest_difference")
-    assert 0.0 <= difference <= done["tolerance"]
-    assert done == {
-        "model": str(model),
-        "algorithm": "ppo",
-        "vec_normalize": str(statistics),
-        "onnx": str(out),
-        "tolerance": 1e-5,
-        "observations_tried": 20 * (1 + 7 + 64),
-    }
-    assert load_ego(out).action_space == load_ego(model).action_space
-    statistics.unlink()
-    assert export_ego(model, out)["vec_normalize"] is None
 
 
 def test_the_command_prints_the_report(cli: Cli, model: Path, tmp_path: Path) -> None:

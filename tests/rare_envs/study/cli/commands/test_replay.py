@@ -48,17 +48,6 @@ def test_a_failure_of_a_run_is_shown(cli: Cli, run: Path, tmp_path: Path) -> Non
         assert said in words
 
 
-@pytest.mark.parametrize("more", [(), ("--ego", "idm")])
-def test_the_number_of_failures_is_that_of_the_answer(more: tuple[str, ...], cli: Cli, run: Path) -> None:
-    result = json.loads((run / "result.json").read_text())
-    n_listed = result["n_failures"]
-    (run / "result.json").write_text(json.dumps({**result, "n_failures": 1649}))  # of which the table has the likeliest
-    said = cli("replay", run, *more).stdout
-    assert f"Failure 0 of 1,649 found ({n_listed} of them listed) in {FOLLOWING}" in said
-    answer = json.loads(cli("replay", run, "--json", *more).stdout)
-    assert (answer["failures"], answer["n_failures"]) == (n_listed, 1649)
-
-
 def test_bad_input_is_one_line(cli: Cli, run: Path) -> None:
     for words, said in (
         (["--failure", 100000], "Expected a failure from 0 to"),
@@ -70,14 +59,6 @@ def test_bad_input_is_one_line(cli: Cli, run: Path) -> None:
         assert result.exit_code == 2
         assert said in result.stderr
         assert len(result.stderr.strip().splitlines()) == 1
-
-
-def test_a_film_goes_into_a_new_folder(cli: Cli, run: Path, tmp_path: Path) -> None:
-    out = tmp_path / "films" / "new" / "worst.png"
-    assert cli("replay", run, "--failure", 100000, "--out", out).exit_code == 2
-    assert not (tmp_path / "films").exists()
-    assert cli("replay", run, "--out", out).exit_code == 0
-    assert out.stat().st_size > 1000
 
 
 def test_another_f_than_recorded_is_a_warning(cli: Cli, run: Path) -> None:

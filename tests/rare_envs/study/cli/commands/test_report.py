@@ -8,7 +8,6 @@ import pytest
 from typer.testing import Result
 
 from rare_envs.study.html_report import page
-from tests.rare_envs.study.refusals import SMALL, assert_refused
 
 Cli = Callable[..., Result]
 
@@ -27,18 +26,6 @@ def test_options_reach_the_report_and_the_answer_names_the_files(
     assert json.loads(cli(*words, "--json").stdout) == {"report": "a.html", "figures": ["figures/curve.pdf"]}
     assert asked == [Path("run"), True, Path("e.csv"), Path("a.html"), "pdf"]
     assert cli(*words).stdout == "Wrote a.html and 1 figures.\n"
-
-
-def test_where_the_page_goes_is_known_before_the_work(cli: Cli, risky: str, tmp_path: Path) -> None:
-    assert cli(*SMALL, "--base", risky, "--out", tmp_path / "run").exit_code in (0, 3)
-    (tmp_path / "file").write_text("mine")
-    assert_refused(cli("report", tmp_path / "run", "--out", tmp_path), "Expected a file to write, got the folder")
-    assert_refused(cli("report", tmp_path / "run", "--out", tmp_path / "file" / "a.html"), "there is a file of that")
-    assert cli("report", tmp_path / "run", "--out", tmp_path / "new" / "pages" / "a.html").exit_code == 0
-    assert sorted(path.name for path in (tmp_path / "new" / "pages").iterdir()) == ["a.html"]
-    (tmp_path / "run" / "study.json").write_text("{}")
-    assert_refused(cli("report", tmp_path / "run", "--out", tmp_path / "other" / "a.html"), "Expected format 1")
-    assert not (tmp_path / "other").exists()
 
 
 def test_a_folder_without_a_run_is_refused_in_one_line(cli: Cli, tmp_path: Path) -> None:
