@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import contextlib
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import jinja2
 import numpy as np
+from markupsafe import Markup
 
 from rare_envs.files import replace_text
 from rare_envs.plugins import one_line
@@ -23,7 +25,6 @@ from rare_envs.study.html_report.figures import (
     figures_of_result,
     passes_levels,
 )
-from rare_envs.study.html_report.templating import render_template
 from rare_envs.study.question import prepare
 from rare_envs.study.recorded_question import load_finished, open_run, warn_of_changed_files
 from rare_envs.study.repeatability import Repeatability
@@ -43,6 +44,29 @@ from rare_envs.study.text import (
 from rare_envs.traffic.palette import CRASH_COLOUR, ROLE_COLOURS
 from samplers.problem import FloatArray
 from samplers.trace import describe_outcome
+
+_BROKEN_NUMBER = re.compile(r"(?<=\d) (?=%|× 10)|(?<=×) (?=10)")
+"""Spaces within a number: "0.12 %", "3.1 × 10⁻⁵"."""
+
+
+def keep_numbers_whole(value: object) -> object:
+    """Return text without line breaks within its numbers; anything else, pictures and styles too, as it is."""
+    if not isinstance(value, str) or isinstance(value, Markup):
+        return value
+    return _BROKEN_NUMBER.sub("\xa0", value)
+
+
+def render_template(name: str, **values: Any) -> str:
+    """Return a page."""
+    environment = jinja2.Environment(
+        loader=jinja2.PackageLoader("rare_envs.study.html_report"),
+        autoescape=True,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        finalize=keep_numbers_whole,
+    )
+    return environment.get_template(name).render(**values)
+
 
 SECTIONS = ("warnings", "answer", "convergence", "levels", "weights", "curve", "parameters", "kinds", "atlas", "made")
 """Ids of the sections of the page, in their order."""
