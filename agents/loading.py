@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from pathlib import Path
 from typing import Any, Final, Literal, Protocol, cast, runtime_checkable
 
@@ -10,15 +11,15 @@ from numpy.typing import NDArray
 
 from agents.learned.checkpoints import SUFFIX, load_driver
 from agents.learned.driver import LearnedDriver, LearnedEgo
-from agents.names import HUMAN, RULE_BASED, SHIPPED_DRIVERS, SHIPPED_EGOS, VISION
-from agents.python_function import call_factory
+from agents.names import HUMAN, RULE_BASED, SHIPPED_DRIVERS, SHIPPED_EGOS, VISION, read_settings
 from agents.sb3.hub import HUB_PREFIX, find_hub_model
 from agents.sb3.saved_ego import load_saved_ego
-from agents.settings import read_settings
-from agents.vision.checkpoint import holds_vision, load_vision
+from agents.vision import holds_vision, load_vision
 from rare_envs.control.idm import IDM
 from rare_envs.egos.errors import EgoGone
-from rare_envs.plugins import did_you_mean
+from rare_envs.egos.plain_callables import wrap_callable
+from rare_envs.egos.validation import is_policy, refuse_ego
+from rare_envs.plugins import did_you_mean, import_object, one_line
 
 EXPECTED_EGO: Final = (
     f"{', '.join(map(repr, (RULE_BASED, HUMAN, *SHIPPED_EGOS, VISION, *SHIPPED_DRIVERS)))}, a path to a {SUFFIX} or "
@@ -76,7 +77,7 @@ def load_ego(
             which as egos act by their mean actions ("mgail?rules=0" by its network alone); a path to a `.safetensors`
             with one of these kinds; a path to a
             `.zip` saved by Stable-Baselines3; "hf:USER/REPOSITORY", such a `.zip` of the Hugging Face Hub
-            (`agents.sb3.hub`); a path to an `.onnx` file (see `agents.onnx.ego.OnnxEgo` for its form);
+            (`agents.sb3.hub`); a path to an `.onnx` file (see `agents.onnx.OnnxEgo` for its form);
             `module:function`, a function without arguments that returns an ego (modules in the working directory are
             found); `tcp://host:port` for an ego in another program (docs/remote.md); or `process:EGO` or `noisy:EGO`.
             `process:EGO` is any of these files and functions in a process of its own, which is ended and started anew
@@ -134,14 +135,14 @@ def load_ego(
     if kind in ("remote", "process"):
         return _load_elsewhere(kind, text, algo, trust, stats)
     if kind == "onnx":
-        from agents.onnx.ego import OnnxEgo
+        from agents.onnx import OnnxEgo
 
         return OnnxEgo(Path(text))
     if kind == "vision":
         return load_vision(text)
     if kind == "learned":
         return LearnedEgo(cast(LearnedDriver, load_driver(text)))
-    return cast(Ego, call_factory(text)) if kind == "function" else _load_rule_based(text)
+    return cast(Ego, _call_factory(text)) if kind == "function" else _load_rule_based(text)
 
 
 def _load_rule_based(text: str) -> Any:
@@ -158,6 +159,37 @@ def _load_rule_based(text: str) -> Any:
         return IDM(**read_settings(IDM, query))
     except ValueError as error:
         raise ValueError(f"The ego {text!r}: {error}") from None
+
+
+def _call_factory(spec: str) -> Any:
+    """Return what `module:function` gives: "idm" or an object with `predict`; a plain function is wrapped in one."""
+    function = import_object(spec, f"the ego {spec!r}")
+    if not callable(function):
+        raise ValueError(f"Expected {spec!r} to be a function that returns an ego, got {type(function).__name__}.")
+    needed = _list_needed_arguments(function)
+    if needed:
+        raise ValueError(
+            f"Expected {spec!r} to be a function without arguments that returns the ego, got one that needs "
+            f"{', '.join(needed)}; for an ego that is a function, name another one that returns it."
+        )
+    try:
+        ego = wrap_callable(function())
+    except (Exception, SystemExit) as error:  # the function is the user's: anything may happen in it
+        raise ValueError(f"{spec!r} failed to make an ego: {one_line(error)}.") from error
+    rule_based = isinstance(ego, str) and ego == RULE_BASED  # an array, say, compares element by element
+    if not rule_based and not is_policy(ego):
+        refuse_ego(ego, f"from {spec!r}")
+    return ego
+
+
+def _list_needed_arguments(function: Any) -> list[str]:
+    """Return the arguments without which a function cannot be called; empty where that cannot be told."""
+    try:
+        parameters = inspect.signature(function).parameters.values()
+    except (TypeError, ValueError):  # of a function in C
+        return []
+    open_ended = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
+    return [p.name for p in parameters if p.default is p.empty and p.kind not in open_ended]
 
 
 def _load_elsewhere(kind: EgoKind, text: str, algo: str | None, trust: bool, stats: str | Path | None) -> Ego:

@@ -28,8 +28,7 @@ from agents.learned.lane_changes import LaneChanges
 from agents.learned.networks import ACTION_SIZE, FEATURE_CLIP, FEATURE_SIZE, HEAD_SIZE, Policy, Scaling
 from agents.learned.rule_driver import RuleDriver
 from agents.learned.weight_distribution import WeightDistribution
-from agents.names import LANE_CHANGING, RULE_BASED, SHIPPED_DRIVERS, SHIPPED_EGOS
-from agents.settings import read_settings
+from agents.names import LANE_CHANGING, RULE_BASED, SHIPPED_DRIVERS, SHIPPED_EGOS, read_settings
 from rare_envs.control.lane_changing import LaneChangingDriver
 from rare_envs.files import replace_file
 from rare_envs.json_text import parse_json_object

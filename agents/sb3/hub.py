@@ -14,7 +14,7 @@ import warnings
 from pathlib import Path
 from typing import NamedTuple
 
-from agents.sb3.normalisation import find_statistics
+from agents.sb3.statistics import find_statistics
 from rare_envs.plugins import one_line
 
 HUB_PREFIX = "hf:"

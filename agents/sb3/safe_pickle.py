@@ -1,23 +1,176 @@
-"""Restricted unpickling: only listed reconstructions happen, with checked arguments, so a pickle cannot run code.
+"""Files of others: whether anybody could have written them, and their pickles opened so that they cannot run code.
 
 A pickle names classes and functions, calls them and fills what they return. Here a name gives a class of a short list
-of families, which may be referred to but is not called, or stands for a function of `agents.sb3.pickle_values`, which
-checks its arguments; and only objects of known classes are filled. The interpreter is that of the standard library in
-Python, so that each step can be checked; what it makes takes memory in proportion to the content.
+of families, which may be referred to but is not called, or a function of this module, which checks its arguments, and
+only objects of known classes are filled. What NumPy's own functions accept is not safe to pass on
+(`numpy.ndarray(shape, dtype, buffer)` with a dtype of objects takes bytes of the file for addresses), so arrays are
+numbers, filled with as many bytes as they have. What is made takes memory in proportion to the content.
 """
 
 from __future__ import annotations
 
 import importlib
 import io
+import math
+import os
 import pickle
 import re
+import stat
 from collections import OrderedDict
-from collections.abc import Callable, Mapping
-from enum import Enum
-from typing import Any, ClassVar, NamedTuple
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, ClassVar
 
-from agents.sb3.pickle_values import RECONSTRUCTIONS, ForbiddenObject, fill_value, is_key
+import numpy as np
+from numpy.typing import NDArray
+
+TRUST = "if you trust where the file comes from, load it with trust=True (--trust)"
+"""Advice on a file that was not opened."""
+TRUST_CONSEQUENCE = "it is opened as Stable-Baselines3 does, and whatever code is in it runs"
+"""Consequence of trust=True."""
+TRUST_ADVICE = (
+    "others may have put something else there: copy it to a folder of your own, or take away their right to write "
+    f"(chmod o-w). With --trust (trust=True) it is opened nevertheless; mind that {TRUST_CONSEQUENCE}, "
+    "where otherwise only what is known to be harmless is made of it"
+)
+"""Advice on a risk."""
+
+
+def find_origin_risks(*files: Path | None) -> list[str]:
+    """Return reasons not to open files; empty if there are none. Files that do not exist give none.
+
+    A file is at risk if everybody may write to it or replace it, in its folder or one above. Where everybody may add
+    files but not replace those of others (/tmp), a file of another user is at risk.
+    """
+    if os.name != "posix":  # others' rights are not in the mode
+        return []
+    risks = [risk for file in files if file is not None and file.exists() for risk in _find_risks(file.resolve())]
+    return list(dict.fromkeys(risks))
+
+
+def _find_risks(path: Path) -> list[str]:
+    status = path.stat()
+    risks = [f"{str(path)!r} is writable by everybody"] if status.st_mode & stat.S_IWOTH else []
+    for folder in path.parents:
+        mode = folder.stat().st_mode
+        if not mode & stat.S_IWOTH:
+            continue
+        if not mode & stat.S_ISVTX:
+            risks.append(f"the folder {str(folder)!r} is writable by everybody")
+        elif folder == path.parent and status.st_uid not in (0, os.getuid()):
+            risks.append(f"{str(path)!r} belongs to another user, in a folder to which everybody may add")
+    return risks
+
+
+class ForbiddenObject(pickle.UnpicklingError):
+    """A file names a class or function that is not on the list, or holds something that it could not have."""
+
+
+def require(holds: object, what: str) -> None:
+    """Refuse a file unless a condition holds."""
+    if not holds:
+        raise ForbiddenObject(what)
+
+
+def open_pickle(content: bytes) -> Any:
+    """Return the object in a pickle.
+
+    Raises:
+        ForbiddenObject: It names a class or function that is not listed, or takes another step that is not; nothing has
+            been called then.
+        Exception: The pickle is damaged; anything may be raised.
+    """
+    return _RestrictedUnpickler(io.BytesIO(content)).load()
+
+
+# --- numbers ----------------------------------------------------------------------------------------
+
+MAX_AXES, MAX_SIZE = 8, 2**31
+"""Most axes of an array, and the largest size of one."""
+_NUMBERS = re.compile(r"[<>=|]?(b1|[iu][1248]|f[248])")
+"""Names of the dtypes of numbers."""
+_PLAIN_DTYPE = (None, None, None, -1, -1, 0)
+"""What the state of a dtype has behind its version and byte order: no fields, no shape, no alignment of its own."""
+
+
+def _make_dtype(name: Any, *_: Any) -> np.dtype[Any]:
+    require(isinstance(name, str) and _NUMBERS.fullmatch(name), f"it holds an array of {name!r:.50}, not of numbers")
+    return np.dtype(name, copy=True)
+
+
+def _fill_dtype(dtype: np.dtype[Any], state: Any) -> None:
+    plain = type(state) is tuple and len(state) >= 8 and state[1] in ("<", ">", "=", "|") and state[2:8] == _PLAIN_DTYPE
+    require(plain, "it holds a dtype that is not one of numbers")
+    dtype.__setstate__((3, state[1], *_PLAIN_DTYPE))  # type: ignore[attr-defined]
+
+
+def _make_array(*_: Any) -> NDArray[Any]:
+    return np.empty(0, np.uint8)
+
+
+def _fill_array(array: NDArray[Any], state: Any) -> None:
+    once = not array.size and array.base is None and type(state) is tuple and len(state) == 5
+    require(once, "it holds an array twice")
+    _, shape, dtype, fortran, content = state
+    filled = _fits(shape, dtype, content) and isinstance(content, bytes) and isinstance(fortran, int)
+    require(filled, "it holds an array that its bytes do not fill")
+    array.__setstate__((1, shape, dtype, bool(fortran), content))  # type: ignore[arg-type]  # as pickles have it
+
+
+def _read_buffer(content: Any, dtype: Any, shape: Any, order: Any = "C", axes: Any = None) -> NDArray[Any]:
+    whole = _fits(shape, dtype, content) and order in ("C", "F") and axes is None
+    require(whole, "it holds an array that its bytes do not fill")
+    return np.frombuffer(bytearray(content), dtype=dtype).reshape(shape, order=order)
+
+
+def _make_scalar(dtype: Any, content: Any = None) -> Any:
+    require(_fits((), dtype, content), "it holds a strange number")
+    return np.frombuffer(content, dtype=dtype)[0]
+
+
+def _fits(shape: Any, dtype: Any, content: Any) -> bool:
+    """Return whether content fills an array of numbers of a shape."""
+    if not isinstance(dtype, np.dtype) or dtype.kind not in "biuf" or dtype.itemsize > 8:
+        return False
+    if type(shape) is not tuple or len(shape) > MAX_AXES or not isinstance(content, bytes | bytearray):
+        return False
+    sizes = all(type(size) is int and 0 <= size < MAX_SIZE for size in shape)
+    return sizes and len(content) == math.prod(shape) * dtype.itemsize
+
+
+def _make_ordered(items: Any = ()) -> OrderedDict[Any, Any]:
+    pairs = isinstance(items, list | tuple) and all(isinstance(one, list | tuple) and len(one) == 2 for one in items)
+    require(pairs and all(_is_key(key) for key, _ in items), "it has keys that are no text or numbers")
+    return OrderedDict((key, value) for key, value in items)
+
+
+def _leave_out(*_: Any) -> None:
+    """Stand for a random generator: a space without one makes its own."""
+
+
+def _refuse_call(*_: Any) -> None:
+    raise ForbiddenObject("it makes an array over memory that it names")
+
+
+CALLED: dict[str, Callable[..., Any]] = {
+    "numpy.dtype": _make_dtype,
+    "numpy.ndarray": _refuse_call,
+    "numpy._core.numeric._frombuffer": _read_buffer,
+    "numpy._core.multiarray._reconstruct": _make_array,
+    "numpy._core.multiarray.scalar": _make_scalar,
+    "numpy.random._pickle.__generator_ctor": _leave_out,
+    "numpy.random._pickle.__bit_generator_ctor": _leave_out,
+    "numpy.random._pickle.__randomstate_ctor": _leave_out,
+    "numpy.random.bit_generator.__pyx_unpickle_SeedSequence": _leave_out,
+    "numpy.random.bit_generator.SeedSequence": _leave_out,
+    "numpy.random._pcg64.PCG64": _leave_out,
+    "numpy.random._mt19937.MT19937": _leave_out,
+    "collections.OrderedDict": _make_ordered,
+}
+"""Names in a pickle to the functions that they stand for."""
+
+
+# --- objects ----------------------------------------------------------------------------------------
 
 REFERRED_BASES = {
     "torch.nn": ("torch.nn.Module",),
@@ -34,182 +187,106 @@ MADE_BASES = {
     ),
 }
 """Likewise, whose instances may be made, empty, and filled."""
-CALLED_CLASSES = {
-    "stable_baselines3": (
-        "stable_baselines3.common.type_aliases.TrainFreq",
-        "stable_baselines3.common.type_aliases.TrainFrequencyUnit",
-    )
-}
-"""Likewise, whose constructors take plain values and keep them."""
-
-
-class _Reconstruction(NamedTuple):
-    """A name that stands for a checked function."""
-
-    name: str
-    function: Callable[..., Any]
-
 
 _PythonUnpickler: Any = getattr(pickle, "_Unpickler")  # noqa: B009  (in Python, not in C; unknown to type checkers)
 
 
-class RestrictedUnpickler(_PythonUnpickler):  # type: ignore[misc]
+class _RestrictedUnpickler(_PythonUnpickler):  # type: ignore[misc]
     """Unpickler that takes listed steps only."""
 
     dispatch: ClassVar[dict[int, Callable[..., None]]] = dict(_PythonUnpickler.dispatch)
-    reconstructions: ClassVar[dict[str, Callable[..., Any]]] = RECONSTRUCTIONS
-    """What names stand for."""
 
     def find_class(self, module: str, name: str) -> Any:
-        """Return the class, or the reconstruction, of that name.
-
-        Raises:
-            ForbiddenObject: It is not listed.
-        """
+        """Return the function or the class that a name stands for."""
         module = re.sub(r"^numpy\.core\.", "numpy._core.", module)  # what NumPy 1 called it
-        if f"{module}.{name}" in self.reconstructions:
-            return _Reconstruction(f"{module}.{name}", self.reconstructions[f"{module}.{name}"])
-        found = None if "." in name else self.find_listed_class(module, name)
-        if found is None:
-            raise ForbiddenObject(f"it asks for {module}.{name}, which may run code")
-        return found
-
-    def find_listed_class(self, module: str, name: str) -> type | None:
-        """Return a class of the listed families; None if it is of none."""
-        for table in (REFERRED_BASES, MADE_BASES, CALLED_CLASSES):
+        if f"{module}.{name}" in CALLED:
+            return CALLED[f"{module}.{name}"]
+        for table in (REFERRED_BASES, MADE_BASES):
             for package, bases in table.items():
-                if module == package or module.startswith(f"{package}."):
+                if "." not in name and f"{module}.".startswith(f"{package}."):
                     named = getattr(importlib.import_module(module), name, None)  # pickles name what they need
                     if _is_subclass(named, bases):
                         return named
-        return None
-
-    def persistent_load(self, pid: Any) -> Any:
-        """Refuse objects that are kept elsewhere."""
-        raise ForbiddenObject("it refers to something outside of it")
-
-    def call(self, function: Any, arguments: Any) -> Any:
-        """Return what a listed function gives for arguments that it has checked."""
-        if not isinstance(arguments, tuple):
-            raise pickle.UnpicklingError("arguments that are no tuple")
-        if isinstance(function, _Reconstruction):
-            return function.function(*arguments)
-        if _is_listed(function, CALLED_CLASSES) and all(isinstance(one, int | str | Enum) for one in arguments):
-            return function(*arguments)
-        raise ForbiddenObject(f"it calls {_name_of(function)}, which may run code")
-
-    def make(self, cls: Any, arguments: Any, keywords: Any = None) -> Any:
-        """Return a new object of a listed class, not initialised."""
-        if _is_listed(cls, MADE_BASES) and arguments == () and not keywords:
-            return cls.__new__(cls)
-        if keywords:
-            raise ForbiddenObject(f"it makes {_name_of(cls)} with keyword arguments")
-        return self.call(cls, arguments)
+        raise ForbiddenObject(f"it asks for {module}.{name}, which may run code")
 
     def load_reduce(self) -> None:
         """REDUCE: call a function."""
-        arguments = self.stack.pop()
-        self.stack[-1] = self.call(self.stack[-1], arguments)
+        arguments, function = self.stack.pop(), self.stack[-1]
+        known = any(function is each for each in CALLED.values())
+        require(known, f"it calls {getattr(function, '__qualname__', type(function).__name__)}, which may run code")
+        self.stack[-1] = function(*arguments)
 
     def load_newobj(self) -> None:
-        """NEWOBJ: make an object."""
-        arguments = self.stack.pop()
-        self.stack[-1] = self.make(self.stack[-1], arguments)
-
-    def load_newobj_ex(self) -> None:
-        """NEWOBJ_EX: make an object with keyword arguments."""
-        keywords, arguments = self.stack.pop(), self.stack.pop()
-        self.stack[-1] = self.make(self.stack[-1], arguments, keywords)
+        """NEWOBJ: make an empty object."""
+        arguments, cls = self.stack.pop(), self.stack[-1]
+        listed = any(_is_subclass(cls, bases) for bases in MADE_BASES.values())
+        if listed and arguments == ():
+            self.stack[-1] = cls.__new__(cls)
+        else:
+            self.stack.append(arguments)
+            self.load_reduce()
 
     def load_build(self) -> None:
         """BUILD: fill an object."""
         state = self.stack.pop()
-        fill_value(self.stack[-1], state)
-
-    def load_append(self) -> None:
-        """APPEND to a list."""
-        value = self.stack.pop()
-        _expect(self.stack[-1], list).append(value)
-
-    def load_appends(self) -> None:
-        """APPENDS to a list."""
-        values = self.pop_mark()
-        _expect(self.stack[-1], list).extend(values)
-
-    def load_setitem(self) -> None:
-        """SETITEM of a mapping."""
-        value, key = self.stack.pop(), self.stack.pop()
-        _set_items(self.stack[-1], [key, value])
-
-    def load_setitems(self) -> None:
-        """SETITEMS of a mapping."""
-        items = self.pop_mark()
-        _set_items(self.stack[-1], items)
-
-    def load_dict(self) -> None:
-        """DICT of the items on the stack."""
-        items = self.pop_mark()
-        self.append({})
-        _set_items(self.stack[-1], items)
-
-    def load_additems(self) -> None:
-        """ADDITEMS to a set."""
-        items = self.pop_mark()
-        _expect(self.stack[-1], set).update(_checked_keys(items))
-
-    def load_frozenset(self) -> None:
-        """FROZENSET of the items on the stack."""
-        items = self.pop_mark()
-        self.append(frozenset(_checked_keys(items)))
+        _fill(self.stack[-1], state)
 
     def load_refused(self) -> None:
-        """Refuse what no pickle of today's needs."""
+        """Refuse what no saved model needs."""
         raise ForbiddenObject("it takes a step that no saved model needs")
 
-    def get_extension(self, code: int) -> None:
-        """Refuse names by number."""
-        self.load_refused()
+
+def _check_keys(load: Callable[..., None], keys: slice) -> Callable[..., None]:
+    """Return a step of the unpickler whose keys, a part of the stack, are checked first: some take ages to hash."""
+
+    def load_checked(self: Any) -> None:
+        require(all(map(_is_key, self.stack[keys])), "it has keys that are no text or numbers")
+        load(self)
+
+    return load_checked
 
 
-for _opcode, _method in {
-    pickle.REDUCE: RestrictedUnpickler.load_reduce,
-    pickle.NEWOBJ: RestrictedUnpickler.load_newobj,
-    pickle.NEWOBJ_EX: RestrictedUnpickler.load_newobj_ex,
-    pickle.BUILD: RestrictedUnpickler.load_build,
-    pickle.APPEND: RestrictedUnpickler.load_append,
-    pickle.APPENDS: RestrictedUnpickler.load_appends,
-    pickle.SETITEM: RestrictedUnpickler.load_setitem,
-    pickle.SETITEMS: RestrictedUnpickler.load_setitems,
-    pickle.DICT: RestrictedUnpickler.load_dict,
-    pickle.ADDITEMS: RestrictedUnpickler.load_additems,
-    pickle.FROZENSET: RestrictedUnpickler.load_frozenset,
-    pickle.INST: RestrictedUnpickler.load_refused,
-    pickle.OBJ: RestrictedUnpickler.load_refused,
-    pickle.NEXT_BUFFER: RestrictedUnpickler.load_refused,
-}.items():
-    RestrictedUnpickler.dispatch[_opcode[0]] = _method
+def _is_key(value: object) -> bool:
+    """Return whether a value is a text, a number, or a short tuple of such, which are quick to hash."""
+    plain = str | bytes | int | float | None
+    return isinstance(value, plain) or (
+        type(value) is tuple and len(value) <= MAX_AXES and all(isinstance(one, plain) for one in value)
+    )
 
 
-def _set_items(mapping: Any, items: list[Any]) -> None:
-    if type(mapping) not in (dict, OrderedDict):
-        raise ForbiddenObject(f"it sets items of {type(mapping).__name__}")
-    mapping.update(zip(_checked_keys(items[::2]), items[1::2], strict=True))
+_STEPS = _RestrictedUnpickler.dispatch
+for _opcode, _keys in (
+    (pickle.SETITEM, slice(-2, -1)),
+    (pickle.SETITEMS, slice(None, None, 2)),
+    (pickle.DICT, slice(None, None, 2)),
+    (pickle.ADDITEMS, slice(None)),
+    (pickle.FROZENSET, slice(None)),
+):
+    _STEPS[_opcode[0]] = _check_keys(_STEPS[_opcode[0]], _keys)
+for _opcode in (pickle.NEWOBJ_EX, pickle.INST, pickle.OBJ, pickle.NEXT_BUFFER, pickle.EXT1, pickle.EXT2, pickle.EXT4):
+    _STEPS[_opcode[0]] = _RestrictedUnpickler.load_refused
+_STEPS[pickle.REDUCE[0]] = _RestrictedUnpickler.load_reduce
+_STEPS[pickle.NEWOBJ[0]] = _RestrictedUnpickler.load_newobj
+_STEPS[pickle.BUILD[0]] = _RestrictedUnpickler.load_build
 
 
-def _checked_keys(keys: list[Any]) -> list[Any]:
-    if not all(map(is_key, keys)):
-        raise ForbiddenObject("it has keys that are no text or numbers")
-    return keys
+def _fill(value: Any, state: Any) -> None:
+    """Fill an object that was made empty."""
+    from gymnasium.spaces import Space
+    from stable_baselines3.common.running_mean_std import RunningMeanStd
+    from stable_baselines3.common.vec_env import VecNormalize
 
-
-def _expect(value: Any, kind: type) -> Any:
-    if type(value) is not kind:
-        raise ForbiddenObject(f"it adds to {type(value).__name__}")
-    return value
-
-
-def _is_listed(value: Any, table: Mapping[str, tuple[str, ...]]) -> bool:
-    return any(_is_subclass(value, bases) for bases in table.values())
+    if value is None:  # left out
+        return
+    if isinstance(value, np.ndarray):
+        _fill_array(value, state)
+    elif isinstance(value, np.dtype):
+        _fill_dtype(value, state)
+    else:
+        known = isinstance(value, Space | RunningMeanStd | VecNormalize)
+        named = isinstance(state, dict) and all(isinstance(name, str) for name in state)
+        require(known and named, f"it holds contents of {type(value).__name__}")
+        getattr(value, "__setstate__", value.__dict__.update)(state)  # in Python, and keeps what it is given
 
 
 def _is_subclass(value: Any, bases: tuple[str, ...]) -> bool:
@@ -217,31 +294,6 @@ def _is_subclass(value: Any, bases: tuple[str, ...]) -> bool:
 
 
 def _import_class(path: str) -> type:
-    """Import `module.Class`."""
     module, _, name = path.rpartition(".")
     imported: type = getattr(importlib.import_module(module), name)  # of the tables, imported when needed
     return imported
-
-
-def _name_of(value: Any) -> str:
-    return f"{value.__module__}.{value.__qualname__}" if isinstance(value, type) else type(value).__name__
-
-
-def open_pickle(content: bytes) -> Any:
-    """Return the object in a pickle.
-
-    Raises:
-        ForbiddenObject: It names a class or function that is not listed, or takes another step that is not; nothing has
-            been called then.
-        Exception: The pickle is damaged; anything may be raised.
-
-    Example:
-        >>> import fractions
-        >>> open_pickle(pickle.dumps({"gamma": 0.98}))
-        {'gamma': 0.98}
-        >>> open_pickle(pickle.dumps(fractions.Fraction(1, 2)))
-        Traceback (most recent call last):
-        ...
-        agents.sb3.pickle_values.ForbiddenObject: it asks for fractions.Fraction, which may run code
-    """
-    return RestrictedUnpickler(io.BytesIO(content)).load()

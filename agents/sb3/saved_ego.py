@@ -16,17 +16,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from agents.missing_file import report_missing_file
-from agents.sb3.file_trust import TRUST, check_origin
-from agents.sb3.model_building import build_model
-from agents.sb3.normalisation import (
+from agents.names import report_missing_file
+from agents.sb3.archive import build_model, find_algorithm, find_algorithm_class, make_training_stubs, read_header
+from agents.sb3.safe_pickle import TRUST, TRUST_ADVICE, ForbiddenObject, find_origin_risks
+from agents.sb3.statistics import (
     describe_missing_statistics,
     find_statistics,
     load_statistics,
     open_last_observation,
 )
-from agents.sb3.pickle_values import ForbiddenObject
-from agents.sb3.zip_header import find_algorithm, find_algorithm_class, make_training_stubs, read_header
 from rare_envs.egos.wrappers import FrameStackedPolicy, NormalisedPolicy, find_stacking
 from rare_envs.plugins import one_line
 
@@ -124,13 +122,7 @@ def load_saved_ego(path: Path, algo: str | None, trust: bool = False, stats: str
     Raises:
         FileNotFoundError: The file, or that of the statistics, does not exist.
         ValueError: It is no model, is damaged, or needs trust: because of its content, or because other users may write
-            to it or its statistics (`agents.sb3.file_trust`).
-
-    Example:
-        >>> load_saved_ego(Path("no/such/ego.zip"), None)
-        Traceback (most recent call last):
-        ...
-        FileNotFoundError: No ego at 'no/such/ego.zip': the folder 'no/such' does not exist.
+            to it or its statistics (`agents.sb3.safe_pickle.find_origin_risks`).
     """
     if not path.exists():
         raise report_missing_file(path)
@@ -139,8 +131,8 @@ def load_saved_ego(path: Path, algo: str | None, trust: bool = False, stats: str
     statistics_path = find_statistics(path) if stats is None else Path(stats)
     if statistics_path is not None and not statistics_path.is_file():
         raise FileNotFoundError(f"No VecNormalize statistics at {str(statistics_path)!r}.")
-    if not trust:
-        check_origin(path, statistics_path)
+    if not trust and (risks := find_origin_risks(path, statistics_path)):
+        raise ValueError(f"Will not open it: {'; '.join(risks)}; {TRUST_ADVICE}.")
     header = read_header(path)
     name = algo.lower() if algo is not None else find_algorithm(header, path)
     algorithm = find_algorithm_class(name, path)

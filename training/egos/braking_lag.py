@@ -16,7 +16,7 @@ import typer
 from numpy.typing import NDArray
 
 from agents import load_ego
-from agents.vision.pilotnet import ACCELERATION_UNIT
+from agents.vision import ACCELERATION_UNIT
 from rare_envs import DrivingProblem
 from rare_envs.egos.needs import resolve
 from rare_envs.egos.policy import as_driver

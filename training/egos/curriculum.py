@@ -12,7 +12,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from agents.vision.ego import OBSERVATION
+from agents.vision import OBSERVATION
 from rare_envs.distributions.space import Parameter
 from rare_envs.scenarios.base import SPEED_RANGE, Others, Scenario, columns
 from rare_envs.scenarios.base_distributions import load_base

@@ -8,8 +8,7 @@ import torch
 from torch import Tensor
 
 from agents.learned.rule_driver import HEADING_TIME, OFFSET_TIME
-from agents.vision.ego import MIN_STEERING_SPEED
-from agents.vision.pilotnet import ACCELERATION_UNIT, TURN_UNIT
+from agents.vision import ACCELERATION_UNIT, MIN_STEERING_SPEED, TURN_UNIT
 from rare_envs.control.actions import MAX_STEERING
 from rare_envs.control.idm import IDM
 from rare_envs.simulation.episode import Episode

@@ -10,8 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from agents.vision.ego import LAG, VisionEgo, to_actions, update_memory
-from agents.vision.pilotnet import PilotNet, luma
+from agents.vision import LAG, PilotNet, VisionEgo, luma, to_actions, update_memory
 from rare_envs.control.actions import to_physical
 from rare_envs.sensors.camera import Weather, take_picture
 from rare_envs.simulation.episode import Episode

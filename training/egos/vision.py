@@ -28,9 +28,7 @@ from rich.progress import Progress
 from torch import nn
 
 from agents import Provenance
-from agents.vision.checkpoint import save_vision
-from agents.vision.ego import VisionEgo
-from agents.vision.pilotnet import PILOTNET_HIDDEN_UNITS, PilotNet
+from agents.vision import PILOTNET_HIDDEN_UNITS, PilotNet, VisionEgo, save_vision
 from rare_envs.files import replace_file
 from rare_envs.threads import use_one_thread
 from training.command_line import RunFolderOption, report_errors, run_command

@@ -31,9 +31,7 @@ from torch import nn
 import rare_envs
 import samplers
 from agents import Provenance
-from agents.vision.checkpoint import load_vision, read_vision_provenance, save_vision
-from agents.vision.ego import OBSERVATION, VisionEgo
-from agents.vision.pilotnet import PilotNet
+from agents.vision import OBSERVATION, PilotNet, VisionEgo, load_vision, read_vision_provenance, save_vision
 from rare_envs.files import replace_text
 from rare_envs.scenarios.base_distributions import load_base
 from rare_envs.scenarios.registry import find_scenario

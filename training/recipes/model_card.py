@@ -12,7 +12,7 @@ from typing import Annotated, Any
 import typer
 
 from agents import LearnedDriver, Provenance, read_driver, read_provenance
-from agents.vision.checkpoint import holds_vision, read_vision_provenance
+from agents.vision import holds_vision, read_vision_provenance
 from rare_envs.files import replace_text
 from training.command_line import run_command
 

@@ -46,9 +46,9 @@ def check_ego(question: Question, time_limit: float = 30.0) -> list[Finding]:
         origin fail 'https://example.org/ego.zip' is a remote place
     """
     from agents.loading import EGO_SUFFIXES, EXPECTED_EGO, find_ego_kind, strip_prefixes, suggest_ego
-    from agents.missing_file import report_missing_file
-    from agents.sb3.file_trust import TRUST_ADVICE, TRUST_CONSEQUENCE, find_origin_risks
-    from agents.sb3.normalisation import find_statistics
+    from agents.names import report_missing_file
+    from agents.sb3.safe_pickle import TRUST_ADVICE, TRUST_CONSEQUENCE, find_origin_risks
+    from agents.sb3.statistics import find_statistics
 
     try:
         find_scenario(question.env_id)

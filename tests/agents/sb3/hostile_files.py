@@ -15,9 +15,10 @@ import pickle
 import resource
 import sys
 import zipfile
+from collections import OrderedDict
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -91,39 +92,50 @@ def _give(value: Any) -> Any:
     return value
 
 
+class Storage(NamedTuple):
+    """A storage of a `.pth`: a record in the archive, said to hold so many numbers."""
+
+    count: int
+
+
+class Tensors(pickle.Pickler):
+    """Pickles as torch writes them."""
+
+    def persistent_id(self, value: Any) -> Any:
+        return ("storage", torch.FloatStorage, "0", "cpu", value.count) if isinstance(value, Storage) else None
+
+
 def tensor_members(mark: Path) -> dict[str, bytes]:
     """Contents of `policy.pth` by what they try."""
 
-    def archive(compressed: bool = False, **members: bytes) -> bytes:
-        kind = zipfile.ZIP_DEFLATED if compressed else zipfile.ZIP_STORED
-        file = io.BytesIO()
+    def archive(value: Any, content: bytes = bytes(8), kind: int = zipfile.ZIP_STORED) -> bytes:
+        pickled, file = io.BytesIO(), io.BytesIO()
+        Tensors(pickled, protocol=2).dump(value)
         with zipfile.ZipFile(file, "w", kind, compresslevel=1) as written:
-            for name, content in members.items():
-                written.writestr(f"archive/{name.replace('__', '/').replace('_pkl', '.pkl')}", content)
+            members = {"data.pkl": pickled.getvalue(), "version": b"3\n", "byteorder": b"little", "data/0": content}
+            for name, each in members.items():
+                written.writestr(f"archive/{name}", each)
         return file.getvalue()
 
-    tensor = b"ctorch._utils\n_rebuild_tensor_v2\n"
-    head = b"((S'storage'\nctorch\nFloatStorage\nS'0'\nS'cpu'\n"
+    def tensor(count: int, shape: tuple[int, ...], stride: tuple[int, ...], offset: int = 0) -> dict[str, Any]:
+        parts = (Storage(count), offset, shape, stride, False, OrderedDict())
+        return {"w": Call(torch._utils._rebuild_tensor_v2, *parts)}
+
     legacy = io.BytesIO()
     torch.save({"weight": torch.ones(2)}, legacy, _use_new_zipfile_serialization=False)
-
-    def stated(count: int, shape: bytes, stride: bytes, offset: int = 0) -> bytes:
-        storage = head + b"I%d\ntQ" % count
-        return b"(dS'w'\n" + tensor + storage + b"I%d\n" % offset + shape + stride + b"I00\nNtRs."
-
     return {
-        "compressed": archive(True, data_pkl=stated(6 * 2**24, b"(I1\nt", b"(I1\nt"), data__0=bytes(24 * 2**24)),
-        "storage too large": archive(data_pkl=stated(10**9, b"(I1\nt", b"(I1\nt"), data__0=bytes(8)),
-        "tensor too large": archive(data_pkl=stated(2, b"(I1000000000\nt", b"(I1\nt"), data__0=bytes(8)),
-        "stretched": archive(data_pkl=stated(2, b"(I1000000000\nt", b"(I0\nt"), data__0=bytes(8)),
-        "before its storage": archive(data_pkl=stated(2, b"(I1\nt", b"(I1\nt", -(10**6)), data__0=bytes(8)),
-        "backwards": archive(data_pkl=stated(2, b"(I2\nt", b"(I-1\nt"), data__0=bytes(8)),
-        "no storage": archive(data_pkl=stated(2, b"(I1\nt", b"(I1\nt")),
-        "code in tensors": archive(data_pkl=pickle.dumps(Call(Path.mkdir, mark), protocol=2)),
+        "compressed": archive(tensor(6 * 2**24, (1,), (1,)), bytes(24 * 2**24), zipfile.ZIP_DEFLATED),
+        "storage too large": archive(tensor(10**9, (1,), (1,))),
+        "tensor too large": archive(tensor(2, (10**9,), (1,))),
+        "stretched": archive(tensor(2, (10**9,), (0,))),
+        "before its storage": archive(tensor(2, (1,), (1,), -(10**6))),
+        "backwards": archive(tensor(2, (2,), (-1,))),
+        "no numbers": archive(tensor(2, (2,), (1,)), b""),
+        "code in tensors": archive(Call(Path.mkdir, mark)),
         "old format": legacy.getvalue(),
         "no tensors": b"",
         "noise": np.random.default_rng(0).bytes(5000),
-        "an array": archive(data_pkl=pickle.dumps([1, 2], protocol=2)),
+        "an array": archive([1, 2]),
     }
 
 

@@ -1,4 +1,4 @@
-"""Saved policies of every algorithm drive a batch as they drive one environment behind the wrappers of training."""
+"""Saved policies of every algorithm act as they did, and drive as behind the wrappers of their training."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from gymnasium.wrappers import FrameStackObservation
 from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecNormalize
 
 import rare_envs
-from agents import SavedEgo, load_ego
+from agents import Ego, SavedEgo, load_ego
 from rare_envs.egos.wrappers import FrameStackedPolicy, find_stacking
 
 contrib = pytest.importorskip("sb3_contrib", reason="sb3-contrib is optional")
@@ -33,16 +33,16 @@ BOX = spaces.Box(-1.0, 1.0, (2,), np.float32)
 class Still(gym.Env[np.ndarray, Any]):
     """Spaces of the environment, and nothing else."""
 
-    def __init__(self, action_space: spaces.Space[Any] = BOX) -> None:
-        self.observation_space = spaces.Box(-5.0, 5.0, (FEATURES,), np.float32)
+    def __init__(self, action_space: spaces.Space[Any] = BOX, features: int = FEATURES) -> None:
+        self.observation_space = spaces.Box(-5.0, 5.0, (features,), np.float32)
         self.action_space = action_space
 
     def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
         super().reset(seed=seed)
-        return self.np_random.normal(0.5, 2.0, FEATURES).astype(np.float32), {}
+        return self.np_random.normal(0.5, 2.0, self.observation_space.shape).astype(np.float32), {}
 
     def step(self, action: Any) -> Any:
-        return self.np_random.normal(0.5, 2.0, FEATURES).astype(np.float32), 0.0, False, False, {}
+        return self.reset()[0], 0.0, False, False, {}
 
 
 def loud(model: Any) -> Any:
@@ -60,6 +60,7 @@ ALGORITHMS = {
     "ppo": (sb3.PPO, "MlpPolicy", {}),
     "ppo with gSDE, squashed": (sb3.PPO, "MlpPolicy", {"use_sde": True, "policy_kwargs": {"squash_output": True}}),
     "a2c": (sb3.A2C, "MlpPolicy", {"policy_kwargs": {"activation_fn": torch.nn.ReLU}}),
+    "a2c with Adam": (sb3.A2C, "MlpPolicy", {"use_rms_prop": False}),
     "sac": (sb3.SAC, "MlpPolicy", OFF_POLICY),
     "td3": (sb3.TD3, "MlpPolicy", OFF_POLICY),
     "ddpg": (sb3.DDPG, "MlpPolicy", OFF_POLICY),
@@ -75,11 +76,92 @@ ALGORITHMS = {
 }
 
 
-def untrained(name: str, env: Any = None) -> Any:
+def untrained(name: str, env: Any = None, **more: Any) -> Any:
     algorithm, policy, settings = ALGORITHMS[name]
     discrete = name in ("dqn", "qrdqn", "maskable ppo")
     env = Still(spaces.Discrete(5) if discrete else BOX) if env is None else env
-    return loud(algorithm(policy, env, seed=0, device="cpu", **settings))
+    return loud(algorithm(policy, env, device="cpu", **{"seed": 0, **settings, **more}))
+
+
+def saved(tmp_path: Path, name: str = "ppo", **more: Any) -> Path:
+    untrained(name, **more).save(tmp_path / "ego.zip")
+    return tmp_path / "ego.zip"
+
+
+def load(path: Path, **options: Any) -> SavedEgo:
+    ego = load_ego(path, **options)
+    assert isinstance(ego, SavedEgo) and isinstance(ego, Ego)
+    return ego
+
+
+def rewrite(source: Path, target: Path, change: dict[str, bytes]) -> Path:
+    """Copy a zip with members replaced."""
+    with zipfile.ZipFile(source) as old, zipfile.ZipFile(target, "w") as new:
+        for name in old.namelist():
+            new.writestr(name, change.get(name, old.read(name)))
+    return target
+
+
+def change_settings(path: Path, **entries: Any) -> Path:
+    """Write a model with other settings beside it."""
+    data = {**json.loads(zipfile.ZipFile(path).read("data")), **entries}
+    return rewrite(path, path.with_name("changed.zip"), {"data": json.dumps(data).encode()})
+
+
+@pytest.mark.parametrize("name", ALGORITHMS)
+def test_a_saved_model_is_recognised_and_acts_as_before(name: str, tmp_path: Path) -> None:
+    model = untrained(name)
+    model.save(tmp_path / "ego.zip")
+    ego = load(tmp_path / "ego.zip")
+    expected = name.partition(",")[0].partition(" with")[0].replace(" ", "_")
+    assert ego.algorithm == ("td3" if name == "ddpg" else expected)
+    assert (ego.observation_space, ego.action_space) == (model.observation_space, model.action_space)
+    seen = np.random.default_rng(3).normal(0.5, 2.0, (16, FEATURES)).astype(np.float32)
+    actions, _ = ego.predict(seen)
+    np.testing.assert_array_equal(actions, model.predict(seen, deterministic=True)[0])
+    assert len(np.unique(actions, axis=0)) > 1
+
+
+class OwnPolicy(sb3.sac.policies.SACPolicy):
+    """A user's subclass, whose module says nothing about the algorithm."""
+
+
+def test_a_policy_class_of_the_user_needs_trust_and_is_recognised_by_its_settings(tmp_path: Path) -> None:
+    sb3.SAC(OwnPolicy, Still(), device="cpu", **OFF_POLICY).save(tmp_path / "ego.zip")
+    with pytest.raises(ValueError, match=r"'policy_class' it asks for .*OwnPolicy, which may run code.*trust=True"):
+        load_ego(tmp_path / "ego.zip")
+    assert load(tmp_path / "ego.zip", trust=True).algorithm == "sac"
+
+
+def test_loading_leaves_the_global_generators_alone(tmp_path: Path) -> None:
+    path = saved(tmp_path, seed=5)
+    drawn = []
+    for _ in range(2):
+        load_ego(path)
+        drawn += [np.random.random(), float(torch.rand(()))]  # noqa: NPY002 (the generator under test)
+    assert len(set(drawn)) == 4
+
+
+def test_a_large_replay_buffer_is_not_allocated(tmp_path: Path) -> None:
+    load(change_settings(saved(tmp_path, "sac"), buffer_size=10**13))  # far beyond any memory
+
+
+def test_algo_overrides_what_the_file_says(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = saved(tmp_path)
+    assert load(path, algo="PPO").algorithm == "ppo"
+    for wrong, said in (("sac", r"Cannot load .* as SAC"), ("pp0", r"Unknown algorithm 'pp0' \(did you mean 'ppo'")):
+        with pytest.raises(ValueError, match=said):
+            load_ego(path, algo=wrong)
+    monkeypatch.setitem(__import__("sys").modules, "sb3_contrib", None)  # as if not installed
+    with pytest.raises(ValueError, match=r"RecurrentPPO.*pip install sb3-contrib"):
+        load_ego(path, algo="recurrent_ppo")
+    unknown = {"policy_class": {"__module__": "mine"}}
+    members = {"data": json.dumps(unknown).encode()}
+    with pytest.raises(ValueError, match=r"Cannot tell which algorithm .* name it with algo: ppo"):
+        load_ego(rewrite(path, tmp_path / "mine.zip", members))
+
+
+# --- drives -------------------------------------------------------------------------------------
 
 
 def drive_alone(policy: Any, env: Any, x: np.ndarray) -> float:
@@ -109,7 +191,7 @@ def scenarios(problem: rare_envs.DrivingProblem, count: int) -> np.ndarray:
     return x
 
 
-def assert_same_drives(loaded: Any, policy: Any, env: Any, count: int = 6) -> None:
+def assert_same_drives(loaded: Any, policy: Any, env: Any, count: int = 4) -> None:
     problem = rare_envs.DrivingProblem(ENV, ego=loaded, horizon=HORIZON)
     x = scenarios(problem, count)
     alone = [drive_alone(policy, env, row) for row in x]
@@ -118,26 +200,11 @@ def assert_same_drives(loaded: Any, policy: Any, env: Any, count: int = 6) -> No
     assert len(set(alone)) > 2
 
 
-@pytest.mark.parametrize("name", ALGORITHMS)
+@pytest.mark.parametrize("name", ["dqn", "recurrent ppo"])
 def test_a_saved_policy_drives_as_in_its_own_loop(name: str, tmp_path: Path) -> None:
     model = untrained(name)
     model.save(tmp_path / "ego.zip")
-    ego = load_ego(tmp_path / "ego.zip")
-    assert isinstance(ego, SavedEgo)
-    assert_same_drives(ego, model, one_env())
-
-
-def test_the_memory_of_a_recurrent_policy_matters_here() -> None:
-    """Else the test above could not tell whether it is carried."""
-    model = untrained("recurrent ppo")
-
-    class Forgetful:
-        def predict(self, observation: Any, state: Any, episode_start: Any, deterministic: bool) -> Any:
-            return model.predict(observation, None, None, deterministic)
-
-    x = scenarios(rare_envs.DrivingProblem(ENV), 6)
-    f = [rare_envs.DrivingProblem(ENV, ego=ego, horizon=HORIZON).evaluate(x) for ego in (model, Forgetful())]
-    assert np.abs(f[0] - f[1]).max() > 0.01
+    assert_same_drives(load(tmp_path / "ego.zip"), model, one_env())
 
 
 def trained(statistics: VecNormalize) -> VecNormalize:
@@ -156,16 +223,14 @@ WRAPPERS = {
 }
 
 
-@pytest.mark.parametrize("algorithm", ["ppo", "recurrent ppo"])
 @pytest.mark.parametrize("wrapping", WRAPPERS)
-def test_wrappers_of_the_training_are_put_back(wrapping: str, algorithm: str, tmp_path: Path) -> None:
+def test_wrappers_of_the_training_are_put_back(wrapping: str, tmp_path: Path) -> None:
     env = WRAPPERS[wrapping](one_env())
-    model = untrained(algorithm, env)
+    model = untrained("recurrent ppo", env)
     model.save(tmp_path / "ego.zip")
     if model.get_vec_normalize_env() is not None:
         model.get_vec_normalize_env().save(str(tmp_path / "vecnormalize.pkl"))
-    assert_same_drives(model, model, env)
-    assert_same_drives(load_ego(tmp_path / "ego.zip"), model, env)
+    assert_same_drives(load(tmp_path / "ego.zip"), model, env)
 
 
 def test_gymnasiums_frames_have_an_axis_of_their_own(tmp_path: Path) -> None:
@@ -204,7 +269,53 @@ def test_frames_of_one_row_begin_anew_where_its_episode_does() -> None:
     np.testing.assert_array_equal(shown, [[11.0, 12.0], [0.0, 22.0]])
 
 
-# --- files that would run code -----------------------------------------------------------------
+# --- files that are no egos, or that would run code -----------------------------------------------
+
+
+def refuse(path: Path, said: str, **options: Any) -> None:
+    with pytest.raises(ValueError, match=said) as caught:
+        load_ego(path, **options)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("members", "said"),
+    [
+        ({}, "not a Stable-Baselines3 model"),
+        ({"data": "{}", "policy.pth": ""}, "not a Stable-Baselines3 model"),
+        ({"data": "[1]", "policy.pth": ""}, "not a Stable-Baselines3 model"),
+        ({"data": "{", "policy.pth": ""}, "is damaged"),
+        ({"data": "[" * 100_000, "policy.pth": ""}, "is damaged"),
+    ],
+)
+def test_other_archives_are_refused(members: dict[str, str], said: str, tmp_path: Path) -> None:
+    with zipfile.ZipFile(tmp_path / "ego.zip", "w") as archive:
+        for name, content in members.items():
+            archive.writestr(name, content)
+    refuse(tmp_path / "ego.zip", said)
+
+
+def test_damaged_files_are_refused_in_one_line(tmp_path: Path) -> None:
+    path = saved(tmp_path)
+    refuse(rewrite(path, tmp_path / "broken.zip", {"policy.pth": b"not weights"}), r"Cannot load .*broken\.zip' as PPO")
+    other = saved(tmp_path, env=Still(features=FEATURES + 1))
+    weights = zipfile.ZipFile(other).read("policy.pth")
+    refuse(rewrite(saved(tmp_path), tmp_path / "mixed.zip", {"policy.pth": weights}), "Cannot load .* as PPO")
+    content = path.read_bytes()
+    for cut in (0.0, 0.3, 0.9, 0.999):
+        path.write_bytes(content[: int(len(content) * cut)])
+        refuse(path, r"ego\.zip' is (not a zip file|damaged|a zip file but not)")
+    (tmp_path / "folder.zip").mkdir()
+    refuse(tmp_path / "folder.zip", "got the folder")
+
+
+def test_an_archive_that_would_fill_the_memory_is_not_unpacked(tmp_path: Path) -> None:
+    path = tmp_path / "bomb.zip"
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
+        archive.writestr("data", b'{"policy_class": {}}')
+        archive.writestr("policy.pth", bytes(65 * 2**20))
+    for trust in (False, True):
+        refuse(path, r"would unpack from 0\.\d to 68 MB", trust=trust)
 
 
 class Hostile:
@@ -219,42 +330,70 @@ class Hostile:
 
 @pytest.mark.parametrize("entry", ["policy_kwargs", "observation_space", "policy_class", "env"])
 def test_a_hostile_zip_is_refused_and_runs_nothing(entry: str, tmp_path: Path) -> None:
-    untrained("ppo").save(tmp_path / "good.zip")
     mark = tmp_path / "was_here"
-    with zipfile.ZipFile(tmp_path / "good.zip") as good, zipfile.ZipFile(tmp_path / "ego.zip", "w") as bad:
-        for name in good.namelist():
-            content = good.read(name)
-            if name == "data":
-                code = base64.b64encode(pickle.dumps(Hostile(mark))).decode()
-                content = json.dumps({**json.loads(content), entry: {":serialized:": code}}).encode()
-            bad.writestr(name, content)
-    with pytest.raises(ValueError, match=rf"Will not load .*ego\.zip.*in its '{entry}' it asks for posix\.mkdir"):
-        load_ego(tmp_path / "ego.zip", algo="ppo")
+    code = base64.b64encode(pickle.dumps(Hostile(mark))).decode()
+    path = change_settings(saved(tmp_path), **{entry: {":serialized:": code}})
+    refuse(path, rf"Will not load .*zip.*in its '{entry}' it asks for posix\.mkdir", algo="ppo")
     assert not mark.exists()
 
 
 def test_names_that_lead_out_of_an_archive_lead_nowhere(tmp_path: Path) -> None:
-    env = gym.make("rare_envs/CarFollowing-v0")
     inside = tmp_path / "inside"
     inside.mkdir()
-    sb3.PPO("MlpPolicy", env, n_steps=8, batch_size=8, device="cpu").save(inside / "ego.zip")
-    with zipfile.ZipFile(inside / "ego.zip", "a") as archive:
+    path = saved(inside)
+    with zipfile.ZipFile(path, "a") as archive:
         archive.writestr("../outside.txt", b"x")
         archive.writestr("/outside.txt", b"x")
-    load_ego(inside / "ego.zip")
-    assert [path.name for path in tmp_path.iterdir()] == ["inside"]
-    assert [path.name for path in inside.iterdir()] == ["ego.zip"]
+    load_ego(path)
+    assert [entry.name for folder in (tmp_path, inside) for entry in folder.iterdir()] == ["inside", "ego.zip"]
 
 
-def test_hostile_statistics_are_refused_and_run_nothing(tmp_path: Path) -> None:
-    untrained("ppo").save(tmp_path / "ego.zip")
-    mark = tmp_path / "was_here"
-    (tmp_path / "vecnormalize.pkl").write_bytes(pickle.dumps(Hostile(mark)))
-    with pytest.raises(ValueError, match=r"Will not read the VecNormalize statistics .*posix\.mkdir, which may run"):
-        load_ego(tmp_path / "ego.zip")
-    assert not mark.exists()
+def test_what_saved_models_hold_survives(tmp_path: Path) -> None:
+    """Spaces and arrays come back as they were, those written by NumPy 1 too."""
+    box = spaces.Box(np.arange(7.0).astype(">f4"), np.inf, (7,), np.float32, seed=3)
+    box.sample()
+    path = saved(tmp_path)
+    for protocol in (3, 4, 5):
+        content = pickle.dumps(box, protocol=protocol)
+        old = content.replace(b"numpy._core.multiarray", b"numpy.core.multiarray") if protocol == 3 else content
+        assert (old != content) == (protocol == 3)
+        entry = {":serialized:": base64.b64encode(old).decode()}
+        assert load(change_settings(path, observation_space=entry)).observation_space == box
 
 
-def test_an_ego_is_not_fetched(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match=r"Will not load an ego from 'https://example\.org/ego\.zip': download"):
-        load_ego("https://example.org/ego.zip")
+# --- who may have written a file ------------------------------------------------------------------
+
+posix = pytest.mark.skipif(os.name != "posix", reason="rights of other users are in the mode")
+
+
+@pytest.fixture
+def own(tmp_path: Path) -> Path:
+    """A policy in a folder that only its owner can write to."""
+    folder = tmp_path / "folder"
+    folder.mkdir(mode=0o755)
+    path = saved(folder)
+    path.chmod(0o644)
+    return path
+
+
+@posix
+def test_what_everybody_may_write_to_needs_trust(own: Path, tmp_path: Path) -> None:
+    load_ego(own)
+    for place, mode in ((own, 0o644), (own.parent, 0o755), (tmp_path, 0o755)):
+        place.chmod(0o777)
+        refuse(own, rf"Will not open it: '{place}' is writable by everybody|the folder '{place}' is writable")
+        assert load(own, trust=True).algorithm == "ppo"
+        place.chmod(mode)
+    link = tmp_path / "link.zip"
+    link.symlink_to(own)
+    load_ego(link)
+    own.chmod(0o666)
+    refuse(link, f"Will not open it: '{own}' is writable by everybody")
+
+
+@posix
+def test_in_a_folder_such_as_tmp_the_owner_counts(own: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    own.parent.chmod(0o1777)
+    load_ego(own)
+    os.chown(own, 12345, -1) if os.getuid() == 0 else monkeypatch.setattr("os.getuid", lambda: own.stat().st_uid + 1)
+    refuse(own, "belongs to another user, in a folder to which everybody may add")

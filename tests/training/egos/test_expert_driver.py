@@ -3,7 +3,7 @@
 import numpy as np
 import torch
 
-from agents.vision.ego import to_actions
+from agents.vision import to_actions
 from rare_envs.control.actions import to_physical
 from training.egos.curriculum import make_situations, start_situation
 from training.egos.expert_driver import EXPERT_BRAKES, auxiliary_targets, expert_outputs

@@ -3,7 +3,7 @@
 import numpy as np
 import torch
 
-from agents.vision.pilotnet import PilotNet
+from agents.vision import PilotNet
 from training.egos.curriculum import make_situations, start_situation
 from training.egos.image_dataset import collect, concatenate, drive_and_label, mirror
 

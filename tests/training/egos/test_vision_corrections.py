@@ -11,8 +11,7 @@ import torch
 import typer
 
 import training.egos.vision_corrections as corrections
-from agents.vision.checkpoint import load_vision
-from agents.vision.pilotnet import PilotNet, luma
+from agents.vision import PilotNet, load_vision, luma
 from training.egos.image_dataset import LabelledPictures
 from training.egos.vision_corrections import (
     VisionCorrectionConfig,

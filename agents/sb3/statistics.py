@@ -12,9 +12,7 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 
-from agents.sb3.file_trust import TRUST
-from agents.sb3.pickle_values import ForbiddenObject
-from agents.sb3.safe_pickle import open_pickle
+from agents.sb3.safe_pickle import TRUST, ForbiddenObject, open_pickle
 from rare_envs.egos.wrappers import UNBOUNDED, find_stacking
 from rare_envs.plugins import one_line
 
@@ -48,12 +46,7 @@ def _statistics_candidates(path: Path) -> Iterator[Path]:
 
 
 def find_statistics(path: Path) -> Path | None:
-    """Return the file of the `VecNormalize` statistics of a model, or None.
-
-    Example:
-        >>> find_statistics(Path("no/such/ego.zip")) is None
-        True
-    """
+    """Return the file of the `VecNormalize` statistics of a model, or None."""
     return next((file for file in _statistics_candidates(path) if file.is_file()), None)
 
 
@@ -132,13 +125,6 @@ def describe_missing_statistics(header: Mapping[str, Any], last: Any, own: Any, 
         last: The last observations of its training, as far as the file holds them.
         own: The space of observations that it declares.
         expected: That of the environment in which it is to drive.
-
-    Example:
-        >>> box = spaces.Box(-1.0, 1.0, (2,))
-        >>> describe_missing_statistics({}, np.array([[3.5, 0.0]]), box, box)
-        'the last observations of its training reach 3.5, beyond the bounds of those here'
-        >>> describe_missing_statistics({}, np.array([[0.5, 0.0]]), box, box)
-        ''
     """
     if _has_original_observations(header, last):
         return "its file says that it was trained behind VecNormalize"

@@ -1,5 +1,6 @@
 """The ego that sees: its network, its memory, its file, and that it is shown what it needs wherever it is named."""
 
+from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
@@ -8,12 +9,22 @@ import pytest
 import torch
 
 import rare_envs
-from agents import load_ego
-from agents.vision.checkpoint import load_vision
-from agents.vision.ego import LAG, SPEED_SCALE, VisionEgo, to_actions, update_memory
-from agents.vision.pilotnet import HEIGHT, WIDTH, luma
-from rare_envs.study.arguments import Question
-from rare_envs.study.ego_check.subprocess_check import check_ego
+from agents import Provenance, load_ego
+from agents.learned.checkpoints import write_file
+from agents.vision import (
+    HEIGHT,
+    LAG,
+    SPEED_SCALE,
+    WIDTH,
+    PilotNet,
+    VisionEgo,
+    load_vision,
+    luma,
+    read_vision_provenance,
+    save_vision,
+    to_actions,
+    update_memory,
+)
 
 CUT_IN = "rare_envs/CutIn-v0"
 
@@ -105,7 +116,7 @@ def test_it_is_shown_its_own_speed_and_nothing_else_beside_the_picture() -> None
     env.close()
 
 
-@pytest.mark.parametrize("spec", ["noisy:vision", "process:vision"])
+@pytest.mark.parametrize("spec", ["noisy:vision", pytest.param("process:vision", marks=pytest.mark.slow)])
 def test_it_drives_behind_a_stack_and_in_a_process_of_its_own(spec: str) -> None:
     problem = rare_envs.DrivingProblem(CUT_IN, ego=load_ego(spec), horizon=0.3)
     assert problem.world.sensing.observation == "camera+speed"
@@ -117,12 +128,6 @@ def test_it_drives_behind_a_stack_and_in_a_process_of_its_own(spec: str) -> None
         np.testing.assert_allclose(f, plain.evaluate(x), atol=1e-6)
 
 
-def test_check_ego_finds_nothing_wrong_with_it() -> None:
-    findings = check_ego(Question(env_id=CUT_IN, ego="vision", horizon=0.5))
-    assert {finding.check for finding in findings} >= {"memory", "latency", "driving"}
-    assert {finding.status for finding in findings if finding.check != "latency"} == {"pass"}
-
-
 def test_another_observation_is_refused_with_the_right_one_named() -> None:
     with pytest.raises(ValueError, match="choose observation='camera\\+speed'"):
         rare_envs.DrivingProblem(CUT_IN, ego=load_ego("vision"), observation="features")
@@ -131,3 +136,72 @@ def test_another_observation_is_refused_with_the_right_one_named() -> None:
 def test_another_tick_is_refused():
     with pytest.raises(ValueError, match=r"Expected dt=0.1 s"):
         rare_envs.DrivingProblem("rare_envs/CutIn-v0", ego=load_ego("vision"), dt=0.05)
+
+
+def test_the_network_is_that_of_the_paper() -> None:
+    """Bojarski et al., Fig. 4: sizes of the feature maps, and about 250,000 parameters."""
+    network, maps = PilotNet(), []
+    for convolution in network.convolutions:
+        convolution.register_forward_hook(lambda _module, _given, out: maps.append(tuple(out.shape[1:])))
+    with torch.no_grad():
+        out = network(pictures(2), pictures(2)[..., 0], torch.tensor([3.0, 20.0]))
+    assert out.shape == (2, 2)
+    assert maps == [(24, 31, 98), (36, 14, 47), (48, 5, 22), (64, 3, 20), (64, 1, 18)]
+    assert sum(weight.numel() for weight in network.parameters()) == 252_880
+
+
+def test_channels_are_the_yuv_of_itu_bt_601() -> None:
+    """U and V by their definitions as scaled differences of blue and red to the luma."""
+    picture = pictures(1, 3)
+    red, green, blue = (picture[..., k].double() for k in range(3))
+    y = 0.299 * red + 0.587 * green + 0.114 * blue
+    u, v = 0.436 * (blue - y) / (1 - 0.114), 0.615 * (red - y) / (1 - 0.299)
+    earlier = pictures(1, 4)[..., 0]
+    with torch.no_grad():
+        channels = PilotNet().channels(picture, earlier).double()
+    expected = torch.stack((y / 127.5 - 1, u / 127.5, v / 127.5, (y - earlier.double()) / 127.5), dim=1)
+    assert channels.shape == (1, 4, HEIGHT, WIDTH)
+    torch.testing.assert_close(channels, expected, atol=2e-5, rtol=0.0)
+    assert float((luma(picture).double() - y).abs().max()) < 1.0
+
+
+def test_a_network_of_ones_own_is_kept_in_a_file(tmp_path: Path) -> None:
+    torch.manual_seed(0)
+    network = PilotNet()
+    provenance = Provenance(kind="dagger", command="train", data="none", data_licence="MIT", metrics={"kept": 1.0})
+    path = save_vision(network, provenance, tmp_path / "mine.safetensors")
+    loaded = load_ego(path)
+    assert isinstance(loaded, VisionEgo)
+    with torch.no_grad():
+        picture = torch.randint(0, 256, (2, 66, 200, 3), dtype=torch.uint8, generator=torch.Generator().manual_seed(0))
+        arguments = picture, luma(picture), torch.tensor([3.0, 20.0])
+        torch.testing.assert_close(loaded.network(*arguments), network(*arguments), atol=1e-5, rtol=0.0)
+    assert read_vision_provenance(path) == provenance
+
+
+def test_files_of_another_kind_are_refused() -> None:
+    with pytest.raises(ValueError, match="no vision"):
+        load_vision(Path(__file__).parents[2] / "agents/data/gail.safetensors")
+    with pytest.raises(FileNotFoundError, match="No vision at"):
+        load_vision("nowhere.safetensors")
+
+
+def test_a_damaged_or_foreign_network_is_refused(tmp_path: Path) -> None:
+    torch.manual_seed(0)
+    network = PilotNet()
+    provenance = Provenance(kind="-", command="-", data="-", data_licence="-")
+    with torch.no_grad():
+        network.head.bias[0] = torch.nan
+    with pytest.raises(ValueError, match=r"inf or NaN in head\.bias"):
+        save_vision(network, provenance, tmp_path / "nan.safetensors")
+    assert list(tmp_path.iterdir()) == []
+    tensors = {name: value.contiguous() for name, value in PilotNet().state_dict().items()}
+    form = {"format": 1, "observation": "camera+speed", "picture": [66, 200], "lag": 5}
+    for change, reason in (({"lag": 3}, "has lag 3; this version reads 5"), ({"format": 2}, "has format 2")):
+        path = write_file(tmp_path / "other.safetensors", tensors, "vision", {**form, **change})
+        with pytest.raises(ValueError, match=reason):
+            load_vision(path)
+    tensors["head.bias"] = torch.zeros(3)
+    path = write_file(tmp_path / "shape.safetensors", tensors, "vision", form)
+    with pytest.raises(ValueError, match=r"head\.bias of shape \(2,\)"):
+        load_vision(path)

@@ -1,7 +1,8 @@
-"""Exports act as the policies that they were made of."""
+"""ONNX files as egos: exported ones act as the policies that they were made of, plain ones drive too."""
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -13,17 +14,15 @@ import stable_baselines3 as sb3
 import torch
 from gymnasium import spaces
 from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecNormalize
+from torch import nn
 
 import rare_envs
 from agents import load_ego
-from agents.onnx.export import ACTION_TOLERANCE, compare_actions, export_onnx
-from agents.sb3.saved_ego import load_saved_ego
+from agents.onnx import ACTION_TOLERANCE, compare_actions, export_onnx
 
-onnx = pytest.importorskip("onnx", reason="the extra onnx is optional")
+pytest.importorskip("onnx", reason="the extra onnx is optional")
 pytest.importorskip("onnxruntime", reason="the extra onnx is optional")
 contrib = pytest.importorskip("sb3_contrib", reason="sb3-contrib is optional")
-
-
 ENV = "rare_envs/CarFollowing-v0"
 
 
@@ -60,13 +59,8 @@ POLICIES: dict[str, Callable[[], Any]] = {
     "ppo, other bounds": lambda: sb3.PPO("MlpPolicy", vec_env(spaces.Box(np.float32([-0.1, 0.0]), np.float32(0.01)))),
     "squashed": lambda: sb3.PPO("MlpPolicy", vec_env(), use_sde=True, policy_kwargs={"squash_output": True}),
     "sac": lambda: sb3.SAC("MlpPolicy", vec_env(spaces.Box(-2.0, 3.0, (2,), np.float32)), **BUFFER),
-    "td3": lambda: sb3.TD3("MlpPolicy", vec_env(), **BUFFER),
     "dqn": lambda: sb3.DQN("MlpPolicy", vec_env(spaces.Discrete(5)), **BUFFER),
-    "qrdqn": lambda: contrib.QRDQN("MlpPolicy", vec_env(spaces.Discrete(5)), **BUFFER),
     "normalised": lambda: sb3.PPO("MlpPolicy", seen(VecNormalize(vec_env(), clip_obs=1.0))),
-    "recurrent": lambda: contrib.RecurrentPPO("MlpLstmPolicy", vec_env(), policy_kwargs={"n_lstm_layers": 2}),
-    "stacked": lambda: sb3.PPO("MlpPolicy", VecFrameStack(vec_env(), 3)),
-    "normalised, then stacked": lambda: sb3.PPO("MlpPolicy", VecFrameStack(seen(VecNormalize(vec_env())), 3)),
     "stacked, then normalised": lambda: sb3.PPO("MlpPolicy", seen(VecNormalize(VecFrameStack(vec_env(), 3)))),
     "normalised, then stacked, recurrent": lambda: contrib.RecurrentPPO(
         "MlpLstmPolicy", VecFrameStack(seen(VecNormalize(vec_env())), 2)
@@ -85,7 +79,7 @@ def saved(tmp_path: Path) -> Callable[[str], Any]:
         model.save(tmp_path / "ego.zip")
         if model.get_vec_normalize_env() is not None:
             model.get_vec_normalize_env().save(str(tmp_path / "vecnormalize.pkl"))
-        return load_saved_ego(tmp_path / "ego.zip", None)
+        return load_ego(tmp_path / "ego.zip")
 
     return save
 
@@ -103,19 +97,19 @@ def test_an_exported_policy_acts_as_before(name: str, saved: Any, tmp_path: Path
     assert sorted(path.name for path in tmp_path.glob("*onnx*")) == ["ego.onnx"]
 
 
-@pytest.mark.parametrize("name", ["normalised", "recurrent", "normalised, then stacked"])
+@pytest.mark.parametrize("name", ["normalised, then stacked, recurrent"])
 def test_an_exported_policy_drives_as_before(name: str, saved: Any, tmp_path: Path) -> None:
     ego = saved(name)
     export_onnx(ego, tmp_path / "ego.onnx")
     problems = [rare_envs.DrivingProblem(ENV, ego=each, horizon=2.0) for each in (ego, load_ego(tmp_path / "ego.onnx"))]
-    x = problems[0].base.sample(30, np.random.default_rng(0))
+    x = problems[0].base.sample(15, np.random.default_rng(0))
     f = [problem.evaluate(x) for problem in problems]
     np.testing.assert_allclose(f[1], f[0], atol=1e-3)
-    assert len(np.unique(f[0])) > 10
+    assert len(np.unique(f[0])) > 8
 
 
 def test_a_memory_begins_anew_where_an_episode_does(saved: Any, tmp_path: Path) -> None:
-    export_onnx(saved("recurrent"), tmp_path / "ego.onnx")
+    export_onnx(saved("normalised, then stacked, recurrent"), tmp_path / "ego.onnx")
     ego = load_ego(tmp_path / "ego.onnx")
     observation = np.ones((2, 7), np.float32)
     first, state = ego.predict(observation, None, np.ones(2, bool))
@@ -125,7 +119,68 @@ def test_a_memory_begins_anew_where_an_episode_does(saved: Any, tmp_path: Path) 
 
 
 def test_an_export_that_acts_otherwise_is_not_written(saved: Any, tmp_path: Path, monkeypatch: Any) -> None:
-    monkeypatch.setattr("agents.onnx.export.ACTION_TOLERANCE", 1e-12)
+    monkeypatch.setattr("agents.onnx.ACTION_TOLERANCE", 1e-12)
     with pytest.raises(ValueError, match=r"acts differently, by up to .*; nothing was written"):
         export_onnx(saved("ppo"), tmp_path / "ego.onnx")
     assert list(tmp_path.glob("*onnx*")) == []
+
+
+# --- files from elsewhere ----------------------------------------------------------------------
+
+
+def write(module: nn.Module, path: Path, batch: int = 1, dynamic: bool = True) -> Path:
+    """Plain PyTorch's export."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        axes = {"obs": {0: "n"}} if dynamic else None
+        example = torch.zeros(batch, 7)
+        torch.onnx.export(module, (example,), str(path), input_names=["obs"], dynamic_axes=axes, dynamo=False)
+    return path
+
+
+@pytest.mark.parametrize("fixed", [None, 3])
+def test_a_network_of_plain_pytorch_drives(fixed: int | None, tmp_path: Path) -> None:
+    torch.manual_seed(0)
+    network = nn.Sequential(nn.Linear(7, 16), nn.Tanh(), nn.Linear(16, 2)).requires_grad_(False)
+    ego = load_ego(write(network, tmp_path / "ego.onnx", batch=fixed or 1, dynamic=fixed is None))
+    assert ego.fixed_batch == fixed
+    observation = np.random.default_rng(0).normal(size=(5, 7)).astype(np.float32)
+    np.testing.assert_allclose(ego.predict(observation)[0], network(torch.from_numpy(observation)), atol=1e-6)
+
+    class Same:
+        def predict(self, observation: Any, state: Any, episode_start: Any, deterministic: bool) -> Any:
+            return network(torch.from_numpy(observation)).numpy(), None
+
+    problems = [rare_envs.DrivingProblem(ENV, ego=each, horizon=1.0) for each in (ego, Same())]
+    x = problems[0].base.sample(10, np.random.default_rng(0))
+    np.testing.assert_allclose(problems[0].evaluate(x), problems[1].evaluate(x), atol=1e-4)
+
+
+def test_the_best_of_five_scores_is_the_action(tmp_path: Path) -> None:
+    network = nn.Linear(7, 5).requires_grad_(False)
+    ego = load_ego(write(network, tmp_path / "ego.onnx"))
+    assert ego.action_space == spaces.Discrete(5)
+    observation = np.random.default_rng(0).normal(size=(20, 7)).astype(np.float32)
+    expected = network(torch.from_numpy(observation)).argmax(dim=1)
+    np.testing.assert_array_equal(ego.predict(observation)[0], expected)
+
+
+def test_another_size_of_observations_is_refused(tmp_path: Path) -> None:
+    ego = load_ego(write(nn.Linear(7, 2), tmp_path / "ego.onnx"))
+    with pytest.raises(ValueError, match="The ego expects observations"):
+        rare_envs.DrivingProblem("rare_envs/CutIn-v0", ego=ego)
+
+
+class TwoOutputs(nn.Module):
+    def forward(self, observation: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        return observation[:, :2], observation
+
+
+def test_files_of_another_form_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError, match="No ego at"):
+        load_ego(tmp_path / "nowhere.onnx")
+    (tmp_path / "broken.onnx").write_bytes(b"not a graph")
+    with pytest.raises(ValueError, match=r"Cannot load .*broken\.onnx' as ONNX"):
+        load_ego(tmp_path / "broken.onnx")
+    with pytest.raises(ValueError, match=r"one input .* one output"):
+        load_ego(write(TwoOutputs(), tmp_path / "two.onnx"))

@@ -1,0 +1,336 @@
+"""The `.zip` of a Stable-Baselines3 policy: its settings, its algorithm, and the model built from it without its code.
+
+The archive has a member `data`: JSON with simple values as they are and other values as
+`{":type:": ..., "__module__": ..., ":serialized:": <pickle>}`, and members `*.pth` with tensors. Names of settings and
+the policy's module are enough to tell the algorithms apart. The pickles are opened by `agents.sb3.safe_pickle`, the
+tensors by torch's own reader of weights; what they hold goes to Stable-Baselines3 in a new archive of our own. The file
+also says how large the networks are, and Stable-Baselines3 builds them before it compares them with the tensors, so a
+network of more numbers than the file holds is refused as it is built.
+"""
+
+from __future__ import annotations
+
+import base64
+import importlib
+import io
+import json
+import math
+import pickle
+import re
+import zipfile
+import zlib
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import torch
+from gymnasium import spaces
+from torch import Tensor
+from torch.utils._python_dispatch import TorchDispatchMode
+
+from agents.sb3.safe_pickle import ForbiddenObject, open_pickle, require
+from rare_envs.plugins import did_you_mean
+
+CORE_ALGORITHMS = ("ppo", "a2c", "sac", "td3", "ddpg", "dqn")  # in stable_baselines3
+CONTRIB_CLASSES = {  # in sb3_contrib, an optional package: name -> class
+    "recurrent_ppo": "RecurrentPPO",
+    "maskable_ppo": "MaskablePPO",
+    "trpo": "TRPO",
+    "tqc": "TQC",
+    "qrdqn": "QRDQN",
+    "crossq": "CrossQ",
+    "ars": "ARS",
+}
+POLICY_MODULES = {  # start of the policy's module -> algorithm; "common" policies serve several
+    "stable_baselines3.sac.": "sac",
+    "stable_baselines3.td3.": "td3",  # DDPG is TD3 with other settings, and acts alike
+    "stable_baselines3.dqn.": "dqn",
+    "sb3_contrib.common.recurrent.": "recurrent_ppo",
+    "sb3_contrib.ppo_recurrent.": "recurrent_ppo",
+    "sb3_contrib.common.maskable.": "maskable_ppo",
+    "sb3_contrib.ppo_mask.": "maskable_ppo",
+    "sb3_contrib.tqc.": "tqc",
+    "sb3_contrib.qrdqn.": "qrdqn",
+    "sb3_contrib.crossq.": "crossq",
+    "sb3_contrib.ars.": "ars",
+}
+SETTINGS_OF_ALGORITHM = {  # a setting that only this algorithm has; the first that is present decides
+    "top_quantiles_to_drop_per_net": "tqc",
+    "cg_max_steps": "trpo",
+    "n_delta": "ars",
+    "clip_range": "ppo",
+    "target_policy_noise": "td3",
+    "target_entropy": "sac",
+    "exploration_initial_eps": "dqn",
+    "gae_lambda": "a2c",  # on-policy, and none of the above: A2C with RMSprop or Adam
+}
+TRAINING_STUBS: Mapping[str, Any] = {
+    **dict.fromkeys(("seed", "lr_schedule", "clip_range_vf", "exploration_schedule", "delta_std_schedule", "weights")),
+    **dict.fromkeys(("action_noise", "replay_buffer_class", "rollout_buffer_class", "ep_info_buffer")),
+    **dict.fromkeys(("ep_success_buffer", "_last_obs", "_last_episode_starts", "_last_original_obs")),
+    "_last_lstm_states": None,
+    "learning_rate": 0.0,
+    "clip_range": 0.0,
+    "n_envs": 1,
+    "n_steps": 1,
+    "train_freq": 1,
+    "buffer_size": 1,
+    "optimize_memory_usage": False,
+}
+"""Stand-ins for the entries that only training needs: those pickles break between versions of Python, a replay buffer
+would allocate its full memory, and a seed would reset the global generators. Entries that a model lacks are ignored."""
+MAX_UNPACKED, MAX_RATIO = 64 * 2**20, 20
+"""Bytes that any archive may unpack to, and the factor by which a larger one may grow: Stable-Baselines3 stores its
+members uncompressed, so 20 refuses no policy."""
+MAX_VALUES = 1_000_000
+"""Values in the settings of a model."""
+MAX_OBSERVED = 2**22
+"""Most numbers of an observation, and most actions to choose from."""
+SPARE_NUMBERS, SPARE_TENSORS = 2**24, 10_000
+"""Numbers and tensors that building may take beside a multiple of those in the file: buffers, initial values."""
+_PER_HELD = 8
+"""Numbers and tensors that building may take for each in the file (networks, initial values, optimisers), and bytes of
+tensors for each byte of a member, which tensors may share."""
+_FACTORY = re.compile(
+    r"aten\.(new_)?(empty|zeros|ones|full|rand|randn|randint|arange|eye|randperm|linspace)(_strided)?\b"
+)
+"""Operations of torch that make a tensor of a size that they are told."""
+_STATE_MEMBER = re.compile(r"(?!pytorch_variables|tensors)[a-z][a-z0-9_]*(\.[a-z][a-z0-9_]*)*\.pth")
+"""Members with tensors, but for those that only training needs."""
+
+
+class ArchiveTooLarge(ValueError):
+    """An archive that would take far more memory than its own size."""
+
+
+def read_header(file: Path | BinaryIO, name: str | None = None) -> dict[str, Any]:
+    """Read the settings of a saved model without opening its pickles.
+
+    Args:
+        file: A file that exists, or its content.
+        name: Its name in messages; the path when None.
+
+    Returns:
+        The entries of the member `data`, and "version" (of Stable-Baselines3).
+
+    Raises:
+        ValueError: The file is not a zip, is damaged, or is not a model of Stable-Baselines3.
+    """
+    name = str(file) if name is None else name
+    if not zipfile.is_zipfile(file):
+        raise ValueError(f"{name!r} is not a zip file (or is cut short); expected a model saved by Stable-Baselines3.")
+    try:
+        with zipfile.ZipFile(file) as archive:
+            _check_size(archive, name)
+            members = set(archive.namelist())
+            header = _parse_settings(archive.read("data"), name) if "data" in members else None
+            version = "_stable_baselines3_version"
+            version = archive.read(version).decode().strip() if version in members else "unknown"
+    except ArchiveTooLarge:
+        raise
+    except (zipfile.BadZipFile, zlib.error, ValueError, RuntimeError, RecursionError, OSError) as error:
+        raise ValueError(f"{name!r} is damaged ({error}); save the model again.") from error
+    if not isinstance(header, dict) or "policy.pth" not in members or "policy_class" not in header:
+        raise ValueError(
+            f"{name!r} is a zip file but not a Stable-Baselines3 model: it lacks its members "
+            "'data' and 'policy.pth'. Write it with model.save(path)."
+        )
+    return {**header, "version": version}
+
+
+def _check_size(archive: zipfile.ZipFile, name: str) -> None:
+    """Refuse an archive that would fill the memory."""
+    unpacked = sum(member.file_size for member in archive.infolist())
+    assert archive.fp is not None
+    packed = archive.fp.seek(0, io.SEEK_END)  # not the sum over members, which may share their bytes
+    if unpacked > max(MAX_UNPACKED, MAX_RATIO * packed):
+        raise ArchiveTooLarge(
+            f"{name!r} would unpack from {packed / 1e6:.1f} to {unpacked / 1e6:,.0f} MB; no policy does that."
+        )
+
+
+def _parse_settings(content: bytes, name: str) -> Any:
+    """Return the JSON of the settings, unless it has more values than any policy: each takes some 100 bytes."""
+    if content.count(b",") + content.count(b"[") + content.count(b"{") > MAX_VALUES:
+        raise ArchiveTooLarge(f"{name!r} has more than {MAX_VALUES:,} values in its settings; no policy does that.")
+    return json.loads(content)
+
+
+def find_algorithm(header: Mapping[str, Any], path: Path) -> str:
+    """Return the name of the algorithm of a saved model.
+
+    Args:
+        header: From `read_header`.
+        path: The file, for messages.
+
+    Returns:
+        One of `CORE_ALGORITHMS` or `CONTRIB_CLASSES`.
+
+    Raises:
+        ValueError: No algorithm fits.
+    """
+    policy = header.get("policy_class")
+    module = str(policy.get("__module__", "")) if isinstance(policy, dict) else ""
+    by_module = [name for start, name in POLICY_MODULES.items() if module.startswith(start)]
+    by_setting = [name for setting, name in SETTINGS_OF_ALGORITHM.items() if setting in header]
+    for name in (*by_module, *by_setting):
+        return name
+    raise ValueError(
+        f"Cannot tell which algorithm saved {str(path)!r} (policy from {module or 'unknown'!r}); "
+        f"name it with algo: {', '.join((*CORE_ALGORITHMS, *CONTRIB_CLASSES))}."
+    )
+
+
+def find_algorithm_class(name: str, path: Path) -> Any:
+    """Return the class of an algorithm, with its `load`.
+
+    Args:
+        name: One of `CORE_ALGORITHMS` or `CONTRIB_CLASSES`.
+        path: The file that needs it, for messages.
+
+    Raises:
+        ValueError: The name is unknown, or its package is not installed.
+    """
+    if name in CORE_ALGORITHMS:
+        return getattr(importlib.import_module("stable_baselines3"), name.upper())  # a class by its name
+    if name in CONTRIB_CLASSES:
+        try:
+            return getattr(importlib.import_module("sb3_contrib"), CONTRIB_CLASSES[name])  # likewise
+        except ImportError as error:
+            raise ValueError(
+                f"{str(path)!r} holds {CONTRIB_CLASSES[name]}, which needs a package that is not "
+                "installed: pip install sb3-contrib."
+            ) from error
+    known = (*CORE_ALGORITHMS, *CONTRIB_CLASSES)
+    raise ValueError(f"Unknown algorithm {name!r}{did_you_mean(name, known)}; expected one of {', '.join(known)}.")
+
+
+def make_training_stubs() -> dict[str, Any]:
+    """Return stand-ins for the entries that only training needs, as `custom_objects` of `load`."""
+    return {**TRAINING_STUBS, "replay_buffer_kwargs": {}, "rollout_buffer_kwargs": {}}
+
+
+def build_model(algorithm: Any, content: bytes, name: str) -> Any:
+    """Return the model in a `.zip`, on the CPU.
+
+    Args:
+        algorithm: Its class in Stable-Baselines3.
+        content: The file's.
+        name: The file's, for messages.
+
+    Raises:
+        ForbiddenObject: It holds something that may run code, or builds more than it holds.
+        Exception: It is damaged; anything may be raised.
+    """
+    given = make_training_stubs()
+    given = {**_open_objects(read_header(io.BytesIO(content), name), set(given)), **given}
+    for key in ("observation_space", "action_space"):
+        _check_space(given.get(key))
+    clean, held = _rewrite(content)
+    numbers, tensors = sum(one.numel() for one in held), len(held)
+    with _BoundedTensors(SPARE_NUMBERS + _PER_HELD * numbers, SPARE_TENSORS + _PER_HELD * tensors):
+        return algorithm.load(clean, device="cpu", custom_objects=given)
+
+
+def _open_objects(header: Mapping[str, Any], without: set[str]) -> dict[str, Any]:
+    """Open the pickled entries of a model's settings safely; an error names the entry."""
+    opened = {}
+    for key, value in header.items():
+        if key in without or not isinstance(value, dict) or ":serialized:" not in value:
+            continue
+        try:
+            opened[key] = open_pickle(base64.b64decode(str(value[":serialized:"])))
+        except ForbiddenObject as error:
+            raise ForbiddenObject(f"in its {key!r} {error}") from error
+    return opened
+
+
+def _rewrite(content: bytes) -> tuple[io.BytesIO, list[Tensor]]:
+    """Return an archive of the same settings and of tensors that have been read safely, and these tensors."""
+    clean, held = io.BytesIO(), list[Tensor]()
+    with zipfile.ZipFile(io.BytesIO(content)) as given, zipfile.ZipFile(clean, "w") as archive:
+        for member in dict.fromkeys(given.namelist()):
+            if member in ("data", "_stable_baselines3_version"):
+                archive.writestr(member, given.read(member))
+            if _STATE_MEMBER.fullmatch(member):
+                try:
+                    state = _read_tensors(given.read(member))
+                except ForbiddenObject as error:
+                    raise ForbiddenObject(f"in its {member!r} {error}") from error
+                held += _find_tensors(state)
+                with archive.open(member, "w") as file:
+                    torch.save(state, file)
+    clean.seek(0)
+    return clean, held
+
+
+def _read_tensors(content: bytes) -> Any:
+    """Return what a `.pth` member holds: mappings, lists, plain values and tensors that fit into it, on the CPU.
+
+    Raises:
+        ForbiddenObject: It would fill the memory.
+        Exception: It holds something else, or is damaged.
+    """
+    if not zipfile.is_zipfile(io.BytesIO(content)):
+        raise ValueError("its tensors are not in the format of torch 1.6 and later")
+    with zipfile.ZipFile(io.BytesIO(content)) as archive:
+        infos = archive.infolist()
+    stored = all(info.compress_type == zipfile.ZIP_STORED for info in infos)
+    fits = stored and sum(info.file_size for info in infos) <= len(content)
+    require(fits, "its tensors would unpack to more than the file holds")
+    try:
+        state = torch.load(io.BytesIO(content), map_location="cpu", weights_only=True)
+    except pickle.UnpicklingError:  # whose message advises to load it unsafely
+        raise ValueError("its tensors are damaged, or there is something else among them") from None
+    size = sum(one.numel() * one.element_size() for one in _find_tensors(state))
+    require(size <= _PER_HELD * len(content), "it holds tensors larger than their storage")
+    return state
+
+
+def _find_tensors(value: Any) -> Iterator[Tensor]:
+    """Yield the tensors in mappings and lists."""
+    if isinstance(value, Tensor):
+        yield value
+    elif isinstance(value, Mapping | list | tuple):
+        for one in value.values() if isinstance(value, Mapping) else value:
+            yield from _find_tensors(one)
+
+
+class _BoundedTensors(TorchDispatchMode):  # type: ignore[no-untyped-call]
+    """Mode in which torch makes no more tensors and numbers than a limit."""
+
+    def __init__(self, numbers: int, tensors: int) -> None:
+        super().__init__()  # type: ignore[no-untyped-call]
+        self._numbers, self._tensors = numbers, tensors
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        if _FACTORY.match(str(func)):
+            self._tensors -= 1
+            self._numbers -= max((_count_numbers(one) for one in args), default=0)
+            within = self._numbers >= 0 and self._tensors >= 0
+            require(within, "it describes networks of more numbers than it holds")
+        return func(*args, **(kwargs or {}))
+
+
+def _count_numbers(argument: Any) -> int:
+    """Return the numbers of a tensor of which this is the shape or the length."""
+    if isinstance(argument, list | tuple) and all(isinstance(size, int) for size in argument):
+        return math.prod(argument)
+    return argument if isinstance(argument, int) else 0
+
+
+def _check_space(space: Any, depth: int = 0) -> None:
+    """Refuse a space whose parts do not go together, or of which one element would fill the memory."""
+    if isinstance(space, spaces.Dict) and depth == 0:
+        for part in space.spaces.values():
+            _check_space(part, 1)
+        return
+    if isinstance(space, spaces.Box):
+        good = space.low.shape == space.high.shape == space.shape and space.low.size <= MAX_OBSERVED
+    elif isinstance(space, spaces.Discrete):
+        good = 0 < int(space.n) <= MAX_OBSERVED
+    elif isinstance(space, spaces.MultiDiscrete):
+        good = 0 < int(space.nvec.sum()) <= MAX_OBSERVED
+    else:
+        good = isinstance(space, spaces.MultiBinary) and 0 < math.prod(space.shape) <= MAX_OBSERVED
+    require(good, f"its space is none that a policy could have ({type(space).__name__})")
