@@ -25,8 +25,8 @@ from benchmarks import RESULTS
 from rare_envs.distributions.fitted import FittedDistribution
 from rare_envs.distributions.mixture import TruncatedGaussianMixture
 from samplers.problem import FloatArray
-from training.scenario_fitting.event_filters import EventSet
-from training.scenario_fitting.refits import draw_events
+from training.fit.coordinates import draw_events
+from training.fit.filters import EventSet
 
 COVERAGE_RESULT = RESULTS / "base_coverage.json"
 DIM = 3
@@ -35,7 +35,7 @@ REFITS = 30
 MAX_SIM = 2000
 """Simulations of an estimate: a half-space needs no more for a c.o.v. of 2 %."""
 VARIANCE_FLOOR = 0.01
-"""Added to variances of standardised events, as in `training.scenario_fitting.mixture`."""
+"""Added to variances of standardised events, as in `training.fit.mixture`."""
 BOX = 30.0
 """Half the width of the box of the fitted Gaussians; it cuts off nothing."""
 DIRECTION = np.full(DIM, DIM**-0.5)

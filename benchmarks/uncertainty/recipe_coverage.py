@@ -27,8 +27,8 @@ from rare_envs.distributions.mixture import CoordinateMixture
 from rare_envs.scenarios.base_distributions import load_base
 from rare_envs.scenarios.registry import scenario_named
 from samplers.problem import FloatArray
-from training.scenario_fitting.base_files import FitRequest, fit_base
-from training.scenario_fitting.event_filters import EventSet
+from training.fit.base import FitRequest, fit_base
+from training.fit.filters import EventSet
 
 RECIPE_RESULT = RESULTS / "recipe_coverage.json"
 RECIPE_LINES = RESULTS / "recipe_coverage.jsonl"

@@ -19,7 +19,7 @@ US101 = {
     "weights": [1.0],
     "logarithmic": [False, True, True],
     "provenance": {
-        "kind": "moments of recorded events, by python -m training.scenario_fitting.shipped.brakings",
+        "kind": "moments of recorded events",
         "source": "NGSIM, US 101 (Los Angeles, southbound, 15 June 2005, congested), 370 vehicles over 640 m each",
         "events": "265 brakings by 3 m/s or more; speed at their beginning, gap of the braking vehicle to its own lead "
         "at that time (nobody's who follows is recorded), strongest deceleration of positions smoothed over 1 s",

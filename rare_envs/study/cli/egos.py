@@ -174,7 +174,7 @@ def fit_command(
     as_json: JsonOption = False,
 ) -> None:
     """Fit base distributions to recorded traffic, with refits that say how far the events determine them."""
-    from training.scenario_fitting.fit import fit_bases
+    from training.fit.recordings import fit_bases
 
     with keep_stdout_for_the_answer(), as_bad_input(ValueError, OSError):
         files = fit_bases(

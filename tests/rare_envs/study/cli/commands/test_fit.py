@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-import training.scenario_fitting.fit as fitting
+import training.fit.recordings as fitting
 from tests.rare_envs.study.refusals import Cli, assert_refused
 
 

@@ -1,75 +1,119 @@
-"""Fit of base distributions to recorded traffic, written as JSON.
+"""Base distributions fitted to recorded traffic, written as JSON: what `rare-envs fit` does.
 
-    rare-envs fit --data DIR --out rare_envs/data
-    rare-envs fit --highd DIR --out bases
-
-The first line makes the files of the package from events of US 101, I-80 and I-24. The second first extracts the events
-of your own recordings, for car-following, cut-in and hard brake: of highD, or with --ngsim, --tgsim, --i24 or --coifman
-of other formats (docs/data.md).
-
-Events are filtered and fitted with Gaussian mixtures with full covariances. The events choose the number of components
-(by the Bayesian information criterion) and the coordinates (by that and by the likelihood of events held out). The fit
-is repeated on events drawn anew, whole scenes at a time: these refits say what the events are worth. Expected counts of
+Events of car-following, cut-in and hard brake are extracted from recordings in any of the formats of docs/data.md,
+filtered, and fitted with Gaussian mixtures with full covariances. The events choose the number of components (by the
+Bayesian information criterion) and the coordinates (by that and by the likelihood of events held out). The fit is
+repeated on events drawn anew, whole scenes at a time: these refits say what the events are worth. Expected counts of
 dangerous states are compared with the recorded ones, and the frequency of the events is counted. All of it is in the
 one file of a base.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+import time
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
 
 import numpy as np
 import typer
 
+from rare_envs.distributions.fitted import EventFrequency
 from rare_envs.files import replace_text
 from rare_envs.scenarios.registry import scenario_named
-from training.command_line import EventOptions, report_errors, run_command, spread_options
-from training.data.brakings import hard_brake_events
+from training.command_line import EventOptions
+from training.data.brakings import braking_exposure, hard_brake_events
 from training.data.columns import Gaps
 from training.data.events import Events, car_following_events, concatenate_events, cut_in_events, write_events
 from training.data.formats import load_recordings
-from training.data.table import Trajectories
-from training.scenario_fitting.base_files import FitRequest, fit_base, format_base
-from training.scenario_fitting.event_filters import EVENT_RECIPES, filter_events, read_events
-from training.scenario_fitting.fit_progress import FitProgress, ignore_progress
-from training.scenario_fitting.own_frequency import ObservedTraffic, count_events
-from training.scenario_fitting.published_highway import build_highway_base
-from training.scenario_fitting.shipped.bases import SHIPPED_BASES, ShippedBase, name_file
-from training.scenario_fitting.shipped.cut_ins import CUT_IN_V0, CUT_IN_V1
-from training.scenario_fitting.shipped.following_states import check_against_following
+from training.data.table import DT, Trajectories
+from training.fit.base import FitRequest, fit_base, format_base
+from training.fit.filters import EVENT_DEFINITIONS, EVENT_RECIPES, filter_events, read_events
 
+COMMAND = "rare-envs fit, with --highd or another option of recordings"
 EXTRACTORS = {
     "car_following": car_following_events,
     "cut_in": cut_in_events,
     "hard_brake": hard_brake_events,
 }
 """Functions that extract the events of a scenario."""
-PACKAGE_COMMAND = "python -m training.scenario_fitting.fit --data DIR --out rare_envs/data"
-"""Command that writes the files of the package."""
-OWN_COMMAND = "python -m training.scenario_fitting.fit, with --highd or another option of recordings"
-"""Command that writes bases of a user's own recordings."""
+SECONDS_BETWEEN = 5.0
+"""A count is printed when the line before it is this old [s], so that a short fit prints few lines."""
 
 
-def fit_shipped_base(base: ShippedBase, data: Path, seed: int = 0, n_refits: int | None = None) -> str:
-    """Return the text of the file of a base of the package.
+class FitProgress:
+    """Prints on standard error what a fit is doing, and its counts every few seconds."""
+
+    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+        """Begin with nothing printed; the clock gives the time [s]."""
+        self._clock = clock
+        self._printed = 0.0
+
+    def say(self, text: str) -> None:
+        """Print a line."""
+        self._printed = self._clock()
+        typer.echo(text, err=True)
+
+    def counter(self, name: str) -> Callable[[str], None]:
+        """Return a function that prints a line about what has a name, if the one before it is not too young."""
+
+        def count(text: str) -> None:
+            if self._clock() - self._printed >= SECONDS_BETWEEN:
+                self.say(f"{name}: {text}")
+
+        return count
+
+
+@dataclass(frozen=True)
+class ObservedTraffic:
+    """Time and distance of all vehicles of recordings."""
+
+    hours: float = 0.0
+    """Vehicle-hours."""
+    km: float = 0.0
+    """Vehicle-kilometres."""
+    braking_hours: float = 0.0
+    """Vehicle-hours in which a braking could begin and be seen."""
+    braking_km: float = 0.0
+    """Vehicle-kilometres in that time."""
+
+    def plus(self, table: Trajectories) -> ObservedTraffic:
+        """Return the traffic with one more recording."""
+        seconds, metres = len(table) * DT, float(table.speed.sum()) * DT
+        braking_seconds, braking_metres = braking_exposure(table)
+        return ObservedTraffic(
+            self.hours + seconds / 3600.0,
+            self.km + metres / 1000.0,
+            self.braking_hours + braking_seconds / 3600.0,
+            self.braking_km + braking_metres / 1000.0,
+        )
+
+
+def count_events(scenario: str, events: Events, used: int, traffic: ObservedTraffic) -> EventFrequency | None:
+    """Return the frequency of the events of a user's own recordings; None where nothing was recorded to count.
+
+    Cut-ins: lane changes with a vehicle behind in the new lane, times the share of these that the filters keep.
+    Car-following: pairs that begin while the ego is in the picture already, times the share that the filters keep.
+    Brakings to a standstill: those that are fitted.
 
     Args:
-        base: One of `SHIPPED_BASES`.
-        data: Folder with the compact tables.
-        seed: Seed of the fits.
-        n_refits: Number of refits, see `refit`.
-
-    Raises:
-        ValueError: A table cannot be read.
+        scenario: "car_following", "cut_in" or "hard_brake".
+        events: Columns of all its events, before the filters.
+        used: Events that the filters keep.
+        traffic: Of the recordings.
     """
-    events, frequency = base.read(data)
-    source = {**base.source, "moment": base.moment}
-    request = FitRequest(
-        base.scenario, events, source, PACKAGE_COMMAND, frequency, base.system, n_refits=n_refits, seed=seed
-    )
-    return format_base(base.scenario, fit_base(request).to_dict())
+    about = {"definition": EVENT_DEFINITIONS[scenario], "source": "counted in the recordings themselves"}
+    if scenario == "hard_brake":
+        hours, km = traffic.braking_hours, traffic.braking_km
+        return EventFrequency(count=used, hours=hours, km=km, **about) if used else None
+    if scenario == "car_following":
+        count = int((~events["at_entry"]).sum())
+    else:
+        count = int(((events["phase"] == "start") & (events["ego"] >= 0)).sum())
+    if count == 0 or used == 0:
+        return None
+    share = {"share": used / count, "share_events": count}
+    return EventFrequency(count=count, hours=traffic.hours, km=traffic.km, **share, **about)
 
 
 def fit_own_bases(
@@ -128,11 +172,11 @@ def fit_own_bases(
         recipe = EVENT_RECIPES[scenario]
         events = filter_events(read_events(path, recipe), recipe, scenario_named(scenario).parameters)
         frequency = count_events(scenario, pooled[scenario], len(events.joint), traffic)
-        request = FitRequest(scenario, events, source, OWN_COMMAND, frequency, n_refits=n_refits, seed=seed)
+        request = FitRequest(scenario, events, source, COMMAND, frequency, n_refits=n_refits, seed=seed)
         if progress:
             progress.say(f"{scenario}: {len(events.joint):,} events; fitting")
         try:
-            base = fit_base(request, ignore_progress if progress is None else progress.counter(scenario))
+            base = fit_base(request, progress.counter(scenario)) if progress else fit_base(request)
         except ValueError as error:
             too_few.append(f"{path}: {error}")
             if len(too_few) == len(chosen):
@@ -140,36 +184,10 @@ def fit_own_bases(
                 raise ValueError(f"{too_few[-1]}{every}") from None
             typer.echo(f"{too_few[-1]} No base of {scenario} is written.", err=True)
             continue
-        written.append(_write(out / f"{scenario}_{name}.json", format_base(scenario, base.to_dict())))
+        written.append(write_base(out / f"{scenario}_{name}.json", format_base(scenario, base.to_dict())))
         if not base.refits:
             typer.echo(f"{base.fitted_to}: too few to say how far they determine {scenario}; no refits", err=True)
     return written
-
-
-@spread_options
-def main(
-    out: Annotated[Path, typer.Option(help="Folder for the JSON files.")],
-    recordings: EventOptions,
-    cut_gaps: Annotated[bool, typer.Option("--cut-gaps", help="Cut tracks where frames are missing.")] = False,
-    scenario: Annotated[
-        list[str] | None, typer.Option(help="Which to fit; all that have enough events if none is named.")
-    ] = None,
-    name: Annotated[str, typer.Option(help="Name of the bases of your own recordings.")] = "own",
-    refits: Annotated[int | None, typer.Option(help="Refits: 30, or 100 where their components differ.", min=2)] = None,
-    seed: Annotated[int, typer.Option(help="Seed of the fits.", min=0)] = 0,
-) -> None:
-    """Write base distributions: those of the package, or those of your own recordings."""
-    with report_errors("fit"):
-        fit_bases(
-            recordings,
-            out,
-            cut_gaps=cut_gaps,
-            scenarios=scenario,
-            name=name,
-            n_refits=refits,
-            seed=seed,
-            progress=True,
-        )
 
 
 def fit_bases(
@@ -211,36 +229,18 @@ def fit_bases(
     if not name or Path(name).name != name:
         raise ValueError(f"Expected --name as a part of file names, such as cologne, got {name!r}.")
     if kind == "data":
-        return _write_package_bases(path, scenarios or known, out, seed, n_refits)
+        from training.recipes.bases import fit_shipped_bases
+
+        texts = fit_shipped_bases(path, scenarios or known, seed, n_refits)
+        return [write_base(out / file, text) for file, text in texts]
     gaps: Gaps = "cut" if cut_gaps else "error"
     tables = load_recordings(kind, path, location=recordings.location, between=recordings.between, gaps=gaps)
     return fit_own_bases(tables, scenarios, out, name, seed, n_refits, FitProgress() if progress else None)
 
 
-def _write_package_bases(
-    data: Path, scenarios: Sequence[str], out: Path, seed: int, n_refits: int | None
-) -> list[Path]:
-    """Write the bases of the package, each as soon as it is fitted, and return their files."""
-    files = []
-    for base in SHIPPED_BASES:
-        if scenario_named(base.scenario).name in scenarios:
-            text = fit_shipped_base(base, data, seed, n_refits)
-            files.append(_write(out / base.file, text))
-    for scenario in ("car_following", CUT_IN_V0, CUT_IN_V1):
-        if scenario_named(scenario).name in scenarios:
-            content = build_highway_base(scenario)
-            if scenario == "car_following":
-                content = check_against_following(content, data)
-            files.append(_write(out / name_file(scenario, "highway"), format_base(scenario, content)))
-    return files
-
-
-def _write(path: Path, text: str) -> Path:
+def write_base(path: Path, text: str) -> Path:
+    """Write the file of a base, whose folder is made, print its name, and return it."""
     path.parent.mkdir(parents=True, exist_ok=True)
     replace_text(path, text)
     typer.echo(path)
     return path
-
-
-if __name__ == "__main__":
-    run_command(main)

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from rare_envs.traffic.road import Road, i80
-from training.scenario_fitting import i80_road
+from training.recipes import i80_road
 
 F64 = torch.float64
 

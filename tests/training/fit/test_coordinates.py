@@ -1,25 +1,34 @@
-"""Coordinate systems: criteria in common units, densities of held-out events, and which system events choose."""
+"""Coordinate systems: common units, held-out events, which system events choose; refits of whole clusters."""
+
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from rare_envs.distributions.mixture import CoordinateMixture
 from rare_envs.scenarios.registry import scenario_named
-from training.scenario_fitting import mixture as mixture_fit
-from training.scenario_fitting.coordinate_systems import (
+from training.fit import coordinates as module
+from training.fit import mixture as mixture_fit
+from training.fit.coordinates import (
     COORDINATE_SYSTEMS,
+    FOLD_STARTS,
     SYSTEMS_APART,
     choose_system,
+    describe_family,
+    draw_events,
     fit_system,
     held_out_log_prob,
+    refit,
 )
-from training.scenario_fitting.event_filters import EventSet
+from training.fit.filters import EventSet
 
 FOLLOWING = scenario_named("car_following").parameters
 CUT_IN = scenario_named("cut_in").parameters
 PLAIN, LOG_GAP, CLOSING = COORDINATE_SYSTEMS["car_following"]
 COMPONENT = ([1.0], [[15.0, 2.8, 0.0]], [np.diag([9.0, 0.16, 0.04])])
 """Speed, log gap, closing speed over the root of the gap."""
+ERROR_PATTERN = np.tile([1.0, -1.0], 25)
+"""Losses of 50 clusters with mean 0; their sum has the standard error sqrt(50) x 1.0102."""
 
 
 @pytest.fixture
@@ -72,12 +81,6 @@ def test_held_out_events_are_not_in_the_fit(quick):
     assert (known[:10] > scores[:10] + 2.0).all()
 
 
-def test_too_few_events_are_not_predicted():
-    """Three events are left to fit three parameters."""
-    events = EventSet(closing_events(6).joint, np.repeat([0, 1], 3))
-    assert np.isnan(held_out_log_prob(events, PLAIN, FOLLOWING)).all()
-
-
 def test_columns_apart_are_independent(quick):
     rng = np.random.default_rng(1)
     joint = np.column_stack([rng.normal(15.0, 2.0, (60, 3)), rng.uniform(5.0, 40.0, (60, 2))])
@@ -91,10 +94,6 @@ def test_columns_apart_are_independent(quick):
     np.testing.assert_allclose(mean[5:], logs.mean(axis=0), rtol=1e-5)
     # Up to the floor under variances, 1 % of each.
     np.testing.assert_allclose(covariance[5:, 5:], np.cov(logs.T, bias=True), rtol=0.011)
-
-
-ERROR_PATTERN = np.tile([1.0, -1.0], 25)
-"""Losses of 50 clusters with mean 0; their sum has the standard error sqrt(50) x 1.0102."""
 
 
 @pytest.mark.parametrize(("errors", "chosen"), [(1.5, 1), (2.5, 0)])
@@ -128,10 +127,86 @@ def test_a_tie_of_the_criterion_is_decided_by_the_events_held_out():
     assert choose_system([9.9, 8.0], [good, slightly_worse], np.arange(50)) == 0
 
 
-@pytest.mark.parametrize("system", [PLAIN, LOG_GAP, CLOSING])
-def test_a_parameter_that_does_not_vary_is_named(system):
+def test_a_parameter_that_does_not_vary_is_named():
     events = closing_events(40)
     joint = events.joint.copy()
     joint[:, 0] = 20.0
     with pytest.raises(ValueError, match="Expected ego_speed to vary, got 20 in all 40 events"):
-        fit_system(EventSet(joint, events.clusters), system, FOLLOWING)
+        fit_system(EventSet(joint, events.clusters), LOG_GAP, FOLLOWING)
+
+
+def events(n, seed=0, per_cluster=1):
+    rng = np.random.default_rng(seed)
+    x = np.column_stack([rng.normal(15.0, 3.0, (n, 2)), np.exp(rng.normal(3.0, 0.4, n))])
+    return EventSet(x, np.arange(n) // per_cluster)
+
+
+def test_clusters_are_drawn_whole():
+    drawn = draw_events(events(60, per_cluster=3), np.random.default_rng(1))
+    original = events(60, per_cluster=3).joint
+    assert len(drawn.joint) == 60
+    assert len(np.unique(drawn.clusters)) == 20  # one drawn twice counts as two
+    for label in np.unique(drawn.clusters):
+        rows = drawn.joint[drawn.clusters == label]
+        first = int(np.flatnonzero((original == rows[0]).all(axis=1))[0])
+        assert first % 3 == 0
+        assert (rows == original[first : first + 3]).all()
+
+
+def test_columns_apart_are_drawn_by_themselves():
+    base = events(20)
+    apart = np.arange(15.0)[:, None]
+    drawn = draw_events(EventSet(base.joint, base.clusters, apart), np.random.default_rng(0))
+    assert drawn.apart.shape == (15, 1)
+    assert 5 < len(np.unique(drawn.apart)) < 15
+
+
+def test_the_spread_is_the_standard_error_of_the_mean(quick):
+    """Of n independent events: sd / sqrt(n), here from 40 refits, so to 11 % (two standard errors 23 %)."""
+    n = 200
+    recorded = events(n)
+    fits = [each.distribution for each in refit(recorded, [LOG_GAP], FOLLOWING, n=40)]
+    means = np.array([fit.weights @ fit.means[:, 0] for fit in fits])
+    assert means.std(ddof=1) == pytest.approx(recorded.joint[:, 0].std() / np.sqrt(n), rel=0.3)
+
+
+def test_more_refits_where_the_number_of_components_differs(monkeypatch):
+    monkeypatch.setattr(module, "N_REFITS", 4)
+    monkeypatch.setattr(module, "MORE_REFITS", 7)
+    for numbers, wanted in (([1, 1, 1, 1], 4), ([1, 2, 1, 1, 1, 1, 1], 7)):
+        made = iter(numbers)
+
+        def fit(*_, made=made):
+            return SimpleNamespace(family=f"{next(made)} components", bic=0.0, bic_apart=0.0)
+
+        monkeypatch.setattr(module, "fit_system", fit)
+        families = [each.family for each in refit(events(25), [LOG_GAP], FOLLOWING)]
+        assert families == [f"{number} components" for number in numbers[:wanted]]
+
+
+def test_coordinates_are_chosen_anew_in_each_refit(quick):
+    """By the BIC of the events drawn; 400 events of logarithms of gaps leave no doubt."""
+    systems = COORDINATE_SYSTEMS["car_following"][:2]
+    few, many = (refit(events(n, seed=1), systems, FOLLOWING, n=6) for n in (25, 400))
+    assert {each.system.name for each in many} == {"log gap"}
+    drawn = draw_events(events(25, seed=1), np.random.default_rng(0))
+    criteria = [fit_system(drawn, system, FOLLOWING, 0, FOLD_STARTS).bic for system in systems]
+    assert few[0].bic == min(criteria)
+    assert few[0].system is systems[int(np.argmin(criteria))]
+
+
+def test_the_family_says_in_which_coordinates_refits_are():
+    log, plain = (SimpleNamespace(system=system) for system in COORDINATE_SYSTEMS["car_following"][1::-1])
+    assert describe_family("1 component, log gap", [log, log]) == "1 component, log gap"
+    assert describe_family("1 component, log gap", [plain, log, log]) == (
+        "1 component, log gap; of the refits 2 in log gap, 1 in plain"
+    )
+
+
+def test_refits_follow_the_seed_and_few_clusters_have_none(quick):
+    told = []
+    one = refit(events(30), [LOG_GAP], FOLLOWING, seed=3, n=3, report=told.append)
+    other = refit(events(30), [LOG_GAP], FOLLOWING, seed=3, n=3)
+    assert [fit.distribution.to_dict() for fit in one] == [fit.distribution.to_dict() for fit in other]
+    assert told == [f"refit {number} of 3" for number in (1, 2, 3)]
+    assert refit(events(40, per_cluster=10), [LOG_GAP], FOLLOWING) == ()

@@ -1,6 +1,6 @@
 """Road of Interstate 80 at Emeryville, fitted to its survey and written as the table of the package.
 
-    python -m training.scenario_fitting.i80_road FOLDER [--out rare_envs/data/i80.json]
+    python -m training.recipes.i80_road FOLDER [--out rare_envs/data/i80.json]
 
 FOLDER holds `lanes.csv` (lane, s, x, y: points on the centre lines of six lanes, lane 0 the rightmost) and
 `boundaries.csv` (boundary, x, y: the lines to the left of those lanes), in metres, y positive to the left of x. The
@@ -25,7 +25,7 @@ from rare_envs.traffic.road import Road
 from samplers.problem import FloatArray
 from training.command_line import report_errors, run_command
 
-ROAD_COMMAND = "python -m training.scenario_fitting.i80_road FOLDER"
+ROAD_COMMAND = "python -m training.recipes.i80_road FOLDER"
 SURVEY_SOURCE = (
     "Survey drawings of the NGSIM I-80 study section, Emeryville, California (FHWA), as released with "
     "travelbureau/RareSim (MIT licence); fitted by a curve with piecewise linear curvature and constant lane offsets."

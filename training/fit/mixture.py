@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from samplers.problem import FloatArray
-from training.scenario_fitting.expectation_maximisation import EmFit, fit_mixture_of_starts
+from training.fit.expectation_maximisation import EmFit, fit_mixture_of_starts
 
 MAX_COMPONENTS = 5
 """Most components that are tried."""

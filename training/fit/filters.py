@@ -87,6 +87,12 @@ EVENT_RECIPES = {
     "hard_brake": EventRecipe("hard_brake_events.csv", ("speed", "gap", "deceleration")),
 }
 """Recipes by scenario."""
+EVENT_DEFINITIONS = {
+    "car_following": "a vehicle in the picture gets a new leader, which it follows for 2 s or more",
+    "cut_in": "a vehicle changes into the lane ahead of another, gaps within the ranges of the scenario",
+    "hard_brake": "the vehicle ahead brakes by 3 m/s or more, to less than 1 m/s",
+}
+"""What is counted as an event of a scenario."""
 FILTER_REASONS = {
     "missing": "no ego behind or no lead ahead was recorded, so the parameter has no value",
     "not at_entry": "the pair was there when the ego came into the picture: following under way, no new leader",

@@ -1,0 +1,258 @@
+"""Fits to a user's own recordings: filters, frequencies, files of each format, progress, and what is refused."""
+
+import csv
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from rare_envs.scenarios.base_distributions import load_base
+from rare_envs.scenarios.registry import scenario_named
+from tests.training.data.published_files import (
+    CLOCK,
+    coifman_matrix,
+    i24_documents,
+    tgsim_rows,
+    write_coifman,
+    write_i24,
+    write_tgsim,
+)
+from tests.training.data.recordings import simulate, write_highd, write_ngsim
+from tests.training.data.stopping_traffic import PAUSE, stopping_traffic
+from training.command_line import EventOptions
+from training.data.brakings import braking_exposure
+from training.data.events import car_following_events, cut_in_events
+from training.data.table import synthetic_traffic
+from training.fit import mixture as mixture_fit
+from training.fit.filters import EVENT_RECIPES, filter_events, read_events
+from training.fit.recordings import (
+    SECONDS_BETWEEN,
+    FitProgress,
+    ObservedTraffic,
+    count_events,
+    fit_bases,
+    fit_own_bases,
+)
+
+GOOD = [15.0, 14.0, 16.0, 12.0, 20.0, 3.0, 4.5]
+
+
+@pytest.fixture(scope="module")
+def simulated():
+    return simulate(0, lanes=3, per_lane=12, seconds=20.0, changers=0.8)
+
+
+@pytest.fixture
+def quick(monkeypatch):
+    monkeypatch.setattr(mixture_fit, "EM_STARTS", 1)
+
+
+def fit(out, between=None, scenarios=None, **source):
+    return fit_bases(EventOptions(**source, between=between), out, scenarios=scenarios, n_refits=2, progress=True)
+
+
+def write_events(path, rows):
+    columns = ["phase", *EVENT_RECIPES["cut_in"].columns, "start_seen", "recording", "frame"]
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        writer.writerow(columns)
+        writer.writerows(rows)
+
+
+def test_filters_drop_and_count(tmp_path):
+    path = tmp_path / EVENT_RECIPES["cut_in"].file
+    write_events(
+        path,
+        [
+            ["start", *GOOD, True, "a", 299],
+            ["crossing", *GOOD, True, "a", 299],
+            ["start", *GOOD, False, "a", 300],
+            ["start", "", *GOOD[1:], True, "a", 1],  # no ego
+            ["start", *GOOD[:3], -2.0, *GOOD[4:], True, "a", 1],  # side by side
+            ["start", *GOOD[:5], 1.5, 4.5, True, "b", 10],  # bodies overlap across
+            ["start", 16.0, *GOOD[1:], True, "a", 10],
+            ["start", *GOOD[:6], "", True, "a", 11],  # the end was not recorded
+            ["start", *GOOD[:6], 1.2, True, "a", 12],  # faster than tyres allow
+        ],
+    )
+    recipe, box = EVENT_RECIPES["cut_in"], scenario_named("cut_in").parameters
+    events = filter_events(read_events(path, recipe), recipe, box)
+    points, shapes, log = events.joint, events.apart, events.log
+    # speeds and gaps count even where the offset at the start was not seen or is out of range, or the duration
+    assert points.tolist() == [GOOD[:5], GOOD[:5], GOOD[:5], [16.0, *GOOD[1:5]], GOOD[:5], GOOD[:5]]
+    assert shapes.tolist() == [[3.0, 4.5], [3.0, 4.5]]
+    # 30 s windows: frame 299 of a, frame 300 of a, frame 10 of b, frame 10 of a
+    assert (events.clusters == events.clusters[[0, 3]][:, None]).tolist() == [
+        [True, False, False, True, True, True]
+    ] * 2
+    assert (events.counts.used, events.counts.clusters, events.counts.cluster) == ((6, 2), 3, "half-minute")
+    assert log[0]["events"] == 8
+    assert [entry["events"] for entry in log if entry["rule"] == "events used"] == [6, 2]
+    dropped = {entry["rule"]: entry["dropped"] for entry in log if entry.get("dropped")}
+    assert dropped == {
+        "v_ego is given": 1,
+        "start_seen": 1,
+        "1 <= gap_ego_cutin <= 120 m": 1,
+        "2.2 <= lateral_offset <= 5 m": 1,
+        "duration is given": 1,
+        "1.5 <= duration <= 12 s": 1,
+    }
+
+
+def test_missing_column_is_named(tmp_path):
+    path = tmp_path / "events.csv"
+    path.write_text("v_ego,v_lead\n1,2\n", encoding="utf-8")
+    with pytest.raises(ValueError, match="lacks the columns gap"):
+        read_events(path, EVENT_RECIPES["car_following"])
+
+
+def test_pairs_that_were_under_way_are_no_new_leaders(tmp_path):
+    path = tmp_path / "car_following_events.csv"
+    rows = ["v_ego,v_lead,gap,at_entry,recording,frame", "10,9,20,true,a,0", "11,9,20,false,a,5", "12,9,0.5,false,a,9"]
+    path.write_text("\n".join(rows) + "\n", encoding="utf-8")
+    recipe = EVENT_RECIPES["car_following"]
+    events = filter_events(read_events(path, recipe), recipe, scenario_named("car_following").parameters)
+    assert events.joint.tolist() == [[11.0, 9.0, 20.0]]
+    dropped = {entry["rule"]: entry["dropped"] for entry in events.log if entry.get("dropped")}
+    assert dropped == {"not at_entry": 1, "1 <= gap <= 150 m": 1}
+
+
+def test_exposure_is_time_and_distance_of_all_vehicles():
+    table = synthetic_traffic(seconds=10.0, per_lane=2)
+    exposure = ObservedTraffic().plus(table).plus(table)
+    assert exposure.hours == pytest.approx(2 * len(table) * 0.1 / 3600)
+    assert exposure.km == pytest.approx(2 * table.speed.mean() * len(table) * 0.1 / 1000)
+
+
+def test_pairs_at_the_entry_do_not_count():
+    """Nobody changes lane, so that all pairs are there from the first frame on: no new leader was recorded."""
+    table = synthetic_traffic(seconds=4.0, per_lane=2)
+    events = car_following_events(table)
+    assert events["at_entry"].all()
+    assert count_events("car_following", events, len(events["ego"]), ObservedTraffic().plus(table)) is None
+
+
+def test_new_leaders_count_with_the_share_that_is_used():
+    events = {"at_entry": np.array([True, False, False, True, False, False]), "ego": np.arange(6)}
+    frequency = count_events("car_following", events, 3, ObservedTraffic(hours=2.0, km=100.0))
+    assert frequency is not None
+    assert (frequency.count, frequency.share_events) == (4, 4)
+    assert frequency.per_hour == pytest.approx(3 / 2.0)
+
+
+def test_cut_ins_count_with_the_share_that_is_used():
+    events = {"phase": np.array(["start", "crossing"] * 4), "ego": np.array([1, 1, 2, 2, -1, -1, 3, 3])}
+    frequency = count_events("cut_in", events, 2, ObservedTraffic(hours=2.0, km=100.0))
+    assert frequency is not None
+    assert (frequency.count, frequency.share_events) == (3, 3)
+    assert frequency.per_hour == pytest.approx(3 / 2.0 * 2 / 3)
+    assert frequency.per_km == pytest.approx(3 / 100.0 * 2 / 3)
+    none = cut_in_events(synthetic_traffic(seconds=3.0, per_lane=2))
+    assert count_events("cut_in", none, 0, ObservedTraffic(2.0, 100.0)) is None
+
+
+def test_brakings_count_in_the_time_in_which_they_could_begin():
+    table = stopping_traffic((10.0, 14.0), (6.0, 15.0), (1.5, 2.5))
+    traffic = ObservedTraffic().plus(table).plus(table)
+    seconds, metres = braking_exposure(table)
+    frequency = count_events("hard_brake", {}, 4, traffic)
+    assert frequency is not None
+    assert (frequency.count, frequency.share) == (4, 1.0)
+    assert frequency.per_hour == pytest.approx(4 / (2 * seconds / 3600))
+    assert frequency.per_km == pytest.approx(4 / (2 * metres / 1000))
+    assert count_events("hard_brake", {}, 0, traffic) is None
+
+
+@pytest.mark.parametrize("kind", ["highd", "ngsim", "tgsim", "i24"])
+def test_bases_are_fitted_to_recordings_of_every_kind(kind, simulated, quick, tmp_path, capsys):
+    data = tmp_path / "data"
+    data.mkdir()
+    if kind == "highd":
+        write_highd(data, simulated, simulate(1, lanes=2, per_lane=4, seconds=8.0))
+    elif kind == "ngsim":
+        write_ngsim(data / "us101.csv", simulated)
+    elif kind == "tgsim":
+        write_tgsim(data / "I294_L1.csv", tgsim_rows(simulated, radius=900.0, angle=2.6))
+    else:
+        write_i24(data / "morning.json", i24_documents(simulated))
+    path = data if kind in ("highd", "tgsim") else next(data.iterdir())
+    files = fit(tmp_path / "bases", **{kind: path})
+    assert [file.name for file in files] == ["car_following_own.json", "cut_in_own.json"]
+    assert "hard_brake_events.csv: 0 events are too few" in capsys.readouterr().err  # nobody stops
+    recording = {"highd": "01-lower, 01-upper", "ngsim": "us101", "tgsim": "I294_L1-1-left", "i24": "morning-west"}
+    for scenario, file in zip(("car_following", "cut_in"), files, strict=True):
+        points = load_base(scenario_named(scenario), file).sample(100, np.random.default_rng(0))
+        assert np.isfinite(points).all() and 12.0 < points[:, 0].mean() < 25.0  # simulated: 9 to 27 m/s
+        source = json.loads(file.read_text(encoding="utf-8"))["provenance"]["source"]
+        assert source["data"] == f"recordings {recording[kind]}"
+
+
+def test_too_few_events_are_an_error_that_names_all_scenarios(simulated, quick, tmp_path, capsys):
+    path = write_i24(tmp_path / "morning.json", i24_documents(simulated))
+    every = "No base of car_following, cut_in, hard_brake is written: give more recordings."
+    with pytest.raises(ValueError, match=every):
+        fit(tmp_path, (CLOCK, CLOCK + 2.0), i24=path)
+    path = write_coifman(tmp_path / "i80.mat", coifman_matrix(simulated))
+    capsys.readouterr()
+    with pytest.raises(ValueError, match="too few"):  # there is no lateral offset
+        fit(tmp_path, scenarios=["cut_in"], coifman=path)
+    read, events = capsys.readouterr().err.splitlines()
+    assert "rows read" in read and events.startswith("cut_in: ") and events.endswith(" events; fitting")
+
+
+def test_a_hard_brake_base_is_fitted_to_brakings_to_a_standstill(quick, tmp_path):
+    """The recipe of the shipped base: filters, refits of half-minutes, checks and frequency in one file."""
+    rng = np.random.default_rng(4)
+    n = 40
+    speeds, decelerations = rng.uniform(8.0, 16.0, n), np.exp(rng.normal(np.log(2.0), 0.25, n))
+    table = stopping_traffic(speeds, np.exp(rng.normal(np.log(12.0), 0.4, n)), decelerations)
+    fit_own_bases([table], ["hard_brake"], tmp_path, "stops", n_refits=3)
+    base = load_base(scenario_named("hard_brake"), tmp_path / "hard_brake_stops.json")
+    assert base.events.used == (n,) and base.events.cluster == "half-minute"
+    assert base.events.clusters == len(np.unique((400 * np.arange(n) + PAUSE - 8) // 300))
+    assert len(base.refits) == 3
+    points = base.sample(2000, np.random.default_rng(0))
+    for column, recorded in ((0, speeds), (2, decelerations)):
+        assert points[:, column].mean() == pytest.approx(recorded.mean(), rel=0.12)
+    assert base.frequency.count == n
+    seconds, metres = braking_exposure(table)
+    assert base.frequency.per_hour == pytest.approx(3600 * n / seconds, rel=1e-3)
+    assert base.frequency.per_km == pytest.approx(1000 * n / metres, rel=1e-3)
+    assert [check.name for check in base.checks] == ["time headway < 0.5 s", "deceleration > 3 m/s^2", "gap < 3 m"]
+    selection = base.record["selection"]
+    assert [each["coordinates"] for each in selection] == ["plain", "log gap", "log gap, log deceleration"]
+    dropped = {rule["rule"]: rule["dropped"] for rule in base.record["filters"] if rule.get("dropped")}
+    assert dropped == {"gap is given": n}  # the leaders
+
+
+@pytest.mark.parametrize(
+    ("source", "options", "message"),
+    [
+        ({"highd": "none"}, {}, "There is no folder none; expected the data folder of highD"),
+        ({"ngsim": "none.csv"}, {}, "Cannot read none.csv"),
+        ({"data": "none"}, {}, "Cannot read events from"),
+        ({"ngsim": "none.csv"}, {"scenarios": ["merge"]}, "Unknown scenario merge"),
+        ({"ngsim": "none.csv"}, {"name": "a/b"}, "part of file names, such as cologne, got 'a/b'"),
+    ],
+)
+def test_bad_arguments_are_refused(source, options, message, tmp_path):
+    recordings = EventOptions(**{kind: Path(path) for kind, path in source.items()})
+    with pytest.raises(ValueError, match=message):
+        fit_bases(recordings, tmp_path / "out", **options)
+
+
+def test_counts_are_printed_every_few_seconds(capsys):
+    now = 100.0
+    progress = FitProgress(clock=lambda: now)
+    count = progress.counter("cut_in")
+    progress.say("cut_in: 40 events")
+    for number in range(20):
+        now += 0.3 * SECONDS_BETWEEN
+        count(f"refit {number + 1} of 20")
+    printed = capsys.readouterr()
+    assert printed.out == ""
+    assert printed.err.splitlines() == [
+        "cut_in: 40 events",
+        *(f"cut_in: refit {number} of 20" for number in range(4, 21, 4)),
+    ]

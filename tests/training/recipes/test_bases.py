@@ -1,0 +1,222 @@
+"""Bases of the package: their events as the recordings have them, and files that say what they are worth."""
+
+import json
+from importlib import resources
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+from rare_envs.scenarios.base_distributions import load_base
+from rare_envs.scenarios.registry import scenario_named
+from tests.training.shared_data import DATA, needs_data
+from training.fit.base import format_base
+from training.fit.coordinates import BIC_TIE
+from training.recipes.bases import (
+    CHANGES_FILE,
+    PROFILES_FILE,
+    SHIPPED_BASES,
+    find_new_leaders,
+    fit_shipped_base,
+    lane_change_shapes,
+    name_file,
+)
+from training.recipes.highway_bases import (
+    CIRCLES_FILE,
+    HIGHWAY_BASES,
+    STATE_TICKS,
+    build_highway_base,
+    check_against_following,
+    load_following_states,
+)
+
+COUNTS = {
+    ("car_following", "us101"): ((470,), 28, "scene"),
+    ("car_following", "i80"): ((152,), 30, "half-minute"),
+    ("car_following", "i80-all-pairs"): ((2116,), 34, "half-minute"),
+    ("car_following", "i24"): ((98,), 24, "drive"),
+    ("rare_envs/CutIn-v1", "us101"): ((38, 259), 17, "scene"),
+    ("rare_envs/CutIn-v1", "i80"): ((50, 131), 25, "half-minute"),
+    ("rare_envs/CutIn-v0", "us101"): ((38, 265), 17, "scene"),
+    ("rare_envs/CutIn-v0", "us101-15-offsets"): ((38, 15), 17, "scene"),
+    ("rare_envs/CutIn-v0", "i80"): ((50, 131), 25, "half-minute"),
+    ("hard_brake", "us101"): ((41,), 22, "half-minute"),
+}
+
+
+def shipped(name):
+    return json.loads((resources.files("rare_envs") / "data" / name).read_text(encoding="utf-8"))
+
+
+@needs_data("us101_car_following_events.csv", "i24_circles_following.parquet", "lane_change_profiles.parquet")
+@pytest.mark.parametrize("base", SHIPPED_BASES, ids=lambda base: f"{base.scenario}-{base.name}")
+def test_recorded_events(base):
+    events, frequency = base.read(DATA)
+    box = scenario_named(base.scenario).parameters
+    if (base.scenario, base.name) in COUNTS:
+        counts = events.counts
+        assert (counts.used, counts.clusters, counts.cluster) == COUNTS[base.scenario, base.name]
+    for column, p in zip(events.joint.T, box, strict=False):
+        assert ((column >= p.low) & (column <= p.high)).all()
+    assert (frequency is None) == ("no_frequency" in base.source)
+    if frequency is not None:
+        assert 1.0 < frequency.per_hour < 60.0
+    if frequency is not None and "CutIn" not in base.scenario:  # the cut-ins are counted in longer recordings
+        assert round(frequency.count * frequency.share) == len(events.joint)
+
+
+@pytest.mark.parametrize("base", SHIPPED_BASES, ids=lambda base: f"{base.scenario}-{base.name}")
+def test_shipped_files_say_what_they_are_worth(base):
+    file = shipped(base.file)
+    record = file["provenance"]
+    assert {"site", "data", "licence", "moment"} <= set(record["source"])
+    least = min(s["bic"] for s in record["selection"])
+    own = next(s for s in record["selection"] if s["coordinates"] == record["coordinates"])
+    assert record["bic"] == own["bic"]
+    chosen = min((c for c in own["components"] if c["accepted"]), key=lambda c: c["bic"])
+    assert chosen["number"] == len(file["weights"])
+    assert record["coordinates"].startswith(base.system or " ") or own["bic"] <= least + BIC_TIE
+    fitted = load_base(scenario_named(base.scenario), base.name)
+    families = {(len(refit.weights), refit.coordinates.kinds) for refit in fitted.refits}
+    assert len(fitted.refits) == (30 if len(families) == 1 else 100)
+    kinds = {kinds for _, kinds in families}
+    assert ("; of the refits" in file["family"]) == (len(kinds) > 1)
+    assert base.system is None or kinds == {fitted.distribution.coordinates.kinds}
+    assert (fitted.frequency is None) == ("no_frequency" in record["source"])
+
+
+def test_the_offset_of_a_cut_in_is_fitted_apart():
+    base = load_base(scenario_named("rare_envs/CutIn-v0"), "us101-15-offsets")
+    assert base.events.used == (38, 15)
+    covariance = np.array(base.distribution.covariances[0])
+    assert (covariance[5, :5] == 0.0).all()
+    assert (covariance[:5, :5] != 0.0).all()
+
+
+@needs_data("us101_cut_in_events.csv", "lane_change_profiles.parquet")
+@pytest.mark.parametrize(
+    "base",
+    [
+        pytest.param(b, marks=() if b.name == "us101" and "CutIn-v0" in b.scenario else pytest.mark.slow)
+        for b in SHIPPED_BASES
+    ],
+    ids=lambda base: f"{base.scenario}-{base.name}",
+)
+def test_fit_of_the_recorded_events_is_the_shipped_file(base):
+    """Up to the last digits, which other library versions may round differently; two of the refits."""
+    written, expected = json.loads(fit_shipped_base(base, DATA, n_refits=2)), shipped(base.file)
+    for one, other in [(written, expected), *zip(written.pop("refits"), expected.pop("refits")[:2], strict=True)]:
+        for key in ("weights", "means", "covariances"):
+            np.testing.assert_allclose(one.pop(key), other.pop(key), rtol=1e-4, atol=1e-4)
+    new, old = written.pop("provenance"), expected.pop("provenance")
+    one, other = (each.pop("family").split(";")[0] for each in (written, expected))  # behind it are counts of refits
+    assert one == other
+    assert written == expected
+    assert new["bic"] == pytest.approx(old["bic"], abs=0.1)
+    for key in ("source", "filters", "settings", "command", "coordinates"):
+        assert new[key] == old[key]
+
+
+@pytest.mark.parametrize("scenario", HIGHWAY_BASES)
+def test_highway_files_are_what_the_script_writes(scenario):
+    written = json.loads(format_base(scenario, build_highway_base(scenario)))
+    expected = shipped(name_file(scenario, "highway"))
+    for name in ("checks", "checked_against"):  # what recordings say of it
+        expected["provenance"].pop(name, None)
+    assert written == expected
+    assert "NOT fitted" in written["provenance"]["kind"]
+
+
+def test_states_are_apart_and_within_the_ranges(tmp_path):
+    n = 6 * STATE_TICKS
+    tick = np.arange(n)
+    gap = np.where(tick < 2 * STATE_TICKS, 30.0, np.where(tick < 3 * STATE_TICKS, np.nan, 200.0))
+    gap[4 * STATE_TICKS :] = 0.1 * tick[4 * STATE_TICKS :]
+    rows = {"t": 0.1 * tick, "speed": np.full(n, 25.0), "gap": gap, "rel_speed": np.full(n, -2.0)}
+    pq.write_table(pa.table({**rows, "radar": tick < 5 * STATE_TICKS}), tmp_path / CIRCLES_FILE)
+    states = load_following_states(tmp_path)
+    # twice at 30 m, then nobody, then 200 m, then 40 m, then no radar
+    np.testing.assert_allclose(states, [[25.0, 23.0, 30.0], [25.0, 23.0, 30.0], [25.0, 23.0, 40.0]])
+    checked = check_against_following(build_highway_base("car_following"), tmp_path)
+    assert checked["provenance"]["checked_against"].startswith("3 states of following")
+    assert {each["recorded"] for each in checked["provenance"]["checks"]} == {0}
+
+
+@needs_data(CIRCLES_FILE)
+def test_the_shipped_checks_are_those_of_the_recorded_states():
+    expected = shipped("car_following_highway.json")["provenance"]
+    written = check_against_following(build_highway_base("car_following"), DATA)["provenance"]
+    assert written["checked_against"] == expected["checked_against"]
+    for one, other in zip(written["checks"], expected["checks"], strict=True):
+        assert (one["name"], one["recorded"]) == (other["name"], other["recorded"])
+        assert one["expected"] == pytest.approx(other["expected"], rel=0.01)
+
+
+def drive(gaps, speed=25.0, relative=-1.0):
+    gap = np.concatenate([np.full(n, value) for value, n in gaps])
+    return np.full(len(gap), speed), np.full(len(gap), relative), gap
+
+
+@pytest.mark.parametrize(
+    ("gaps", "expected"),
+    [
+        ([(60.0, 50), (30.0, 50)], [30.0]),  # somebody cuts in
+        ([(30.0, 50), (60.0, 50)], [60.0]),  # the leader leaves
+        ([(np.nan, 50), (60.0, 50)], [60.0]),  # nobody, then somebody
+        ([(60.0, 50), (55.0, 50)], []),  # less than 6 m
+        ([(60.0, 50), (np.nan, 50)], []),  # nobody is ahead any more
+        ([(60.0, 50), (30.0, 10)], []),  # the record ends before the new leader is tracked
+        ([(60.0, 50), (30.0, 10), (50.0, 40)], []),  # it jumps again within the second after
+        ([(60.0, 50), (30.0, 50), (50.0, 50)], [30.0, 50.0]),
+    ],
+)
+def test_jumps(gaps, expected):
+    found = find_new_leaders(*drive(gaps))
+    assert found[:, 2].tolist() == expected
+    assert (found[:, :2] == [25.0, 24.0]).all()
+
+
+def test_profiles_of_cubic_courses_have_their_durations(tmp_path):
+    """The time above 0.2 m/s is counted in frames of 0.1 s."""
+    parts = []
+    for side, number, far, duration in (("left", 1, 3.4, 4.0), ("right", 1, 2.8, 7.0), ("right", 2, 3.0, 2.5)):
+        sign = 1.0 if side == "right" else -1.0
+        t = 0.1 * np.arange(120)
+        s = np.clip((t - 2.0) / duration, 0.0, 1.0)
+        across, speed = far * (3.0 * s**2 - 2.0 * s**3), 6.0 * far * s * (1.0 - s) / duration
+        rows = {"t": t, "across": 5.0 + sign * across, "v_across": sign * speed}
+        parts.append(pa.table({"site": ["i80"] * 120, "side": [side] * 120, "change": [number] * 120, **rows}))
+    pq.write_table(pa.concat_tables(parts[::-1]), tmp_path / PROFILES_FILE)
+    found = lane_change_shapes(tmp_path, "i80")
+    np.testing.assert_allclose(found[:, 0], [3.4, 2.8, 3.0], atol=1e-12)
+    np.testing.assert_allclose(found[:, 1], [4.0, 7.0, 2.5], atol=0.15)
+
+
+def test_changes_have_a_duration_where_start_and_end_were_seen(tmp_path):
+    """From 1.6 s before the crossing to 1.7 s after it, and 0.4 s for the spans: 3.7 s above 0.2 m/s, T = 4.07 s."""
+    header = "before_s,after_s,start_seen,end_seen,start_s,end_s,across_-4s,across_+4s,across_-3s,across_+3s\n"
+    seen = [
+        "5,5,True,True,-1.6,1.7,-1.5,1.6,-1.4,1.5",
+        "5,5,True,False,-1.6,1.7,-1.5,1.6,,",
+        "2,5,True,True,-1,1,-1,1,,",
+    ]
+    (tmp_path / CHANGES_FILE).write_text(header + "\n".join(seen) + "\n", encoding="utf-8")
+    found = lane_change_shapes(tmp_path, "us101")
+    expected = 3.7**2  # of T^2 (1 - 2 v T / (3 D)) with v = 0.2 m/s and D = 3.1 m
+    assert found[0, 0] == pytest.approx(3.1)
+    assert found[0, 1] ** 2 * (1.0 - 0.4 * found[0, 1] / 9.3) == pytest.approx(expected, rel=1e-9)
+    assert found[0, 1] == pytest.approx(4.07, abs=0.01)
+    assert found[1, 0] == pytest.approx(3.1) and np.isnan(found[1, 1])
+    assert len(found) == 2
+
+
+@needs_data(PROFILES_FILE, CHANGES_FILE)
+@pytest.mark.parametrize(("site", "n", "inside"), [("i80", 165, 131), ("us101", 301, 265)])
+def test_recorded_offsets(site, n, inside):
+    offsets = lane_change_shapes(DATA, site)[:, 0]
+    offsets = offsets[np.isfinite(offsets)]
+    assert len(offsets) == n
+    within = offsets[(offsets >= 2.2) & (offsets <= 5.0)]
+    assert len(within) == inside
+    assert 2.9 < within.mean() < 3.5  # a lane is 3.7 m wide
