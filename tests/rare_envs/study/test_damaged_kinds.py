@@ -6,8 +6,9 @@ With `-m slow` 150 of each kind, more than 2,000 in all.
 from __future__ import annotations
 
 import importlib.util
+import json
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -16,22 +17,23 @@ import numpy as np
 import pytest
 import stable_baselines3 as sb3
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+from typer.testing import CliRunner, Result
 
 import rare_envs
 from rare_envs.study import Question, corpus, evaluate, prepare, writing
+from rare_envs.study.cli.app import app
 from rare_envs.study.html_report import atlas
 from rare_envs.study.html_report.figures import FigureOfPage
 from rare_envs.study.journal import JOURNAL, begin_journal
 from samplers.execution.journal import JournalRecord
 from tests.rare_envs.study.conftest import write_base
-from tests.rare_envs.study.test_damaged_files import (
-    FOLLOWING,
-    assert_one_line,
-    cli,
-    damage_bytes,
-    damage_json,
-    damage_table,
-)
+
+FOLLOWING = "rare_envs/CarFollowing-v0"
+ODD: tuple[Any, ...] = (
+    None, True, -1, 10**400, 1e308, "", "x" * 300, "\x00", [], [[[[]]]], {}, {"a": {}}, float("nan"), float("inf"),
+)  # fmt: skip
+"""Values of which each stands somewhere where another one is expected."""
+
 
 QUICK, MANY = 4, 150
 Damage = Callable[[bytes, np.random.Generator], bytes]
@@ -40,6 +42,74 @@ YAML = "env: rare_envs/CarFollowing-v0\nmethod: mc\nmax-sim: 20\nhorizon: 0.5\ns
 NGSIM = "Vehicle_ID,Frame_ID,Global_Time,Local_X,Local_Y,v_Length,v_Width,v_Class,v_Vel,Lane_ID\n"
 MARK = "ran"
 """File that code in a damaged file would write."""
+
+
+def cli(*words: str) -> Result:
+    return CliRunner().invoke(app, list(words))
+
+
+def assert_one_line(result: Result, *accepted: int) -> None:
+    """Exit code 2 with one line, or one of those that say that the damage did not matter; never another exception."""
+    assert isinstance(result.exception, SystemExit | None), repr(result.exception)
+    assert result.exit_code in (2, *accepted), result.output
+    assert "Traceback" not in result.stderr
+    if result.exit_code == 2:
+        lines = [line for line in result.stderr.splitlines() if line.startswith("rare-envs: ")]
+        assert len(lines) == 1, result.stderr
+
+
+def nested(depth: int) -> str:
+    return "[" * depth + "]" * depth
+
+
+def paths_of(value: Any, at: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
+    """Yield the places of a JSON value, objects and lists first."""
+    yield at
+    if isinstance(value, dict | list):
+        for key in value if isinstance(value, dict) else range(min(len(value), 2)):
+            yield from paths_of(value[key], (*at, key))
+
+
+def replaced(value: Any, at: tuple[Any, ...], new: Any) -> Any:
+    """Return a JSON value with another one in one of its places."""
+    if not at:
+        return new
+    copy = json.loads(json.dumps(value))
+    inner = copy
+    for key in at[:-1]:
+        inner = inner[key]
+    inner[at[-1]] = new
+    return copy
+
+
+def damage_bytes(content: bytes, rng: np.random.Generator) -> bytes:
+    """Cut, flip, fill with zeros, double or mix up."""
+    kind, at = int(rng.integers(5)), int(rng.integers(max(len(content), 1)))
+    flipped = content[:at] + bytes([content[at] ^ int(rng.integers(1, 256))]) + content[at + 1 :]
+    zeroed = content[:at] + bytes(min(50, len(content) - at)) + content[at + 50 :]
+    return (content[:at], flipped, zeroed, content + content[at:], content[at:] + content[:at])[kind]
+
+
+def damage_json(text: bytes, rng: np.random.Generator, inside: str | None = None) -> bytes:
+    """Replace a value by an odd one, or the text by one that parsers do not like."""
+    if rng.random() < 0.2:
+        texts = (nested(100_000), '{"a":' * 5000, "1" * 10_000, "\ufeff{}", '{"question": 1e999}', "nan")
+        return texts[rng.integers(len(texts))].encode()
+    value = json.loads(text)
+    places = [at for at in paths_of(value) if inside is None or (at and at[0] == inside)]
+    at = places[rng.integers(len(places))]
+    return json.dumps(replaced(value, at, ODD[rng.integers(len(ODD))])).encode()
+
+
+def damage_table(content: bytes, rng: np.random.Generator) -> bytes:
+    """Replace a cell, a row or the header of a table."""
+    rows = content.decode().splitlines()
+    row = int(rng.integers(len(rows)))
+    cells = rows[row].split(",")
+    odd = ("", "nan", "inf", "1e400", "x", '"', "\x00", "x" * 200_000, "-1e300")
+    cells[rng.integers(len(cells))] = odd[rng.integers(len(odd))]
+    damaged = [*rows[:row], ",".join(cells if rng.random() < 0.7 else cells[:-1]), *rows[row + 1 :]]
+    return "\n".join(damaged if rng.random() < 0.8 else damaged[:1]).encode()
 
 
 class Kind(NamedTuple):

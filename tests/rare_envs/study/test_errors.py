@@ -21,17 +21,6 @@ def test_a_folder_is_there_during_the_work_and_stays(tmp_path: Path) -> None:
     assert (tmp_path / "a" / "b").is_dir()
 
 
-def test_new_empty_folders_go_if_the_work_fails(tmp_path: Path) -> None:
-    (tmp_path / "old").mkdir()
-    with pytest.raises(RuntimeError), output_folder(tmp_path / "old" / "new" / "newer"):
-        raise RuntimeError
-    assert list(tmp_path.rglob("*")) == [tmp_path / "old"]
-    with pytest.raises(RuntimeError), output_folder(tmp_path / "kept"):
-        (tmp_path / "kept" / "result").write_text("1")
-        raise RuntimeError
-    assert (tmp_path / "kept" / "result").exists()
-
-
 def test_a_folder_that_cannot_be_is_refused(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(BadInput, match="there is a file of that name"), output_folder(tmp_path / "file"):

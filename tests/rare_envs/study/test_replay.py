@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
-import agents
 import rare_envs
 from rare_envs.study.replay import drive_again
 
@@ -51,22 +48,6 @@ def test_the_worst_moment_of_a_near_miss_is_where_its_time_to_collision_is_least
     assert not drive.collided
     assert 0 < drive.worst == int(np.argmin(ttc))
     assert drive.f == pytest.approx(ttc.min(), rel=1e-5)
-
-
-def test_a_replay_without_a_collision_ends_at_the_horizon() -> None:
-    problem = rare_envs.DrivingProblem(FOLLOWING, horizon=3.0)
-    drive = drive_again(problem, np.array([10.0, 10.0, 100.0]))
-    assert not drive.collided
-    assert drive.time[-1] == pytest.approx(3.0)
-    assert drive.f > 0
-
-
-def test_a_replay_asks_a_policy_as_the_rollout_does(here: Path, risky: str) -> None:
-    problem = rare_envs.DrivingProblem(FOLLOWING, ego=agents.load_ego("egos_here:coasting"))
-    x = np.array([[20.0, 10.0, 25.0], [20.0, 19.0, 50.0]])
-    assert [drive_again(problem, row).f for row in x] == problem.evaluate(x).tolist()
-    # coasting closes 25 m at 10 m/s
-    assert drive_again(problem, x[0]).time[-1] == pytest.approx(2.5, abs=0.15)
 
 
 def test_moments_by_hand():

@@ -39,28 +39,6 @@ def test_the_result_names_the_statistics_that_were_applied(cli, tmp_path):
     assert "normalised by" in shown and "warning: the ego has no" not in shown
 
 
-def test_a_function_that_returns_a_model_without_its_statistics_is_told(
-    cli: Cli, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    lines = (
-        "import gymnasium as gym, rare_envs, stable_baselines3 as sb3",
-        f"env = gym.wrappers.NormalizeObservation(gym.make({FOLLOWING!r}, horizon=1.0))",
-        "def make(): return sb3.PPO('MlpPolicy', env, n_steps=8, batch_size=8, device='cpu')",
-    )
-    (tmp_path / "ego_behind_normalisation.py").write_text("\n".join(lines))
-    monkeypatch.syspath_prepend(tmp_path)
-    shown = cli(*SMALL, "--ego", "ego_behind_normalisation:make", "--horizon", "1").stdout
-    assert "warning: the ego has no VecNormalize statistics, but it declares observations without bounds" in shown
-
-
-def test_noise_that_nobody_has_is_pointed_out(cli: Cli, risky: str) -> None:
-    words = ("estimate", FOLLOWING, "--base", risky, "--method", "mc", "--max-sim", 500, "--noise", "fixed")
-    assert "note: --noise fixed changes nothing" in cli(*words).stdout
-    assert len(json.loads(cli(*words, "--json").stdout)["notes"]) == 1
-    for more in (("--drivers", "gail"), ("--noise", "on")):
-        assert json.loads(cli(*words, *more, "--json").stdout)["notes"] == []
-
-
 @pytest.mark.parametrize(
     ("ego", "reason"), [("nan_when_close", "NaN or infinite"), ("exiting_when_close", "SystemExit(7)")]
 )

@@ -9,9 +9,7 @@ from pathlib import Path
 import pytest
 
 from rare_envs.study.arguments import Question
-from rare_envs.study.errors import BadInput
 from rare_envs.study.journal import digest_files, find_changed_files
-from rare_envs.study.recorded_question import find_moved_files
 from tests.rare_envs.study.refusals import SMALL, Cli, assert_refused
 
 
@@ -38,28 +36,6 @@ def test_a_file_that_moved_and_changed_is_refused(cli: Cli, moved: Path) -> None
     with (moved / "base.json").open("a") as file:
         file.write(" ")
     assert_refused(cli("replay", moved / "runs/a"), "base.json", "has changed")
-
-
-def test_another_file_under_the_old_path_is_not_taken(moved: Path) -> None:
-    Path("base.json").write_text("{}")
-    recorded = json.loads((moved / "runs/a/study.json").read_text())["question"]
-    found = find_moved_files(Question(**recorded), moved / "runs/a")
-    assert Path(str(found.base)).resolve() == moved / "base.json"
-
-
-@pytest.mark.parametrize("ego", ["egos/a.zip", "noisy:egos/a.zip?delay=1", "process:egos/a.zip"])
-def test_an_ego_is_found_behind_its_prefixes(ego: str, here: Path) -> None:
-    (here / "new/egos").mkdir(parents=True)
-    (here / "new/run").mkdir()
-    (here / "new/egos/a.zip").write_bytes(b"weights")
-    digest = digest_files(Question(env_id="", ego="new/egos/a.zip"))["new/egos/a.zip"]
-    about = {"files": {"egos/a.zip": digest}, "file_places": {"egos/a.zip": "../egos/a.zip"}}
-    (here / "new/run/study.json").write_text(json.dumps(about))
-    found = find_moved_files(Question(env_id="", ego=ego), Path("new/run"))
-    assert found.ego == ego.replace("egos/a.zip", "new/run/../egos/a.zip")
-    (here / "new/run/study.json").write_text(json.dumps({**about, "files": {"egos/a.zip": "0"}}))
-    with pytest.raises(BadInput, match="has changed"):
-        find_moved_files(Question(env_id="", ego=ego), Path("new/run"))
 
 
 @pytest.mark.parametrize("name", ["vecnormalize.pkl", "vec_normalize.pkl", "ego_vecnormalize.pkl", "mine.pkl"])

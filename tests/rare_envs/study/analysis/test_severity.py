@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 from dataclasses import replace
 
 import numpy as np
@@ -78,28 +77,6 @@ def test_collisions_of_others_count_only_if_asked_for(problem: rare_envs.Driving
     assert any_vehicle.curve.p[0] - own.curve.p[0] == pytest.approx(1 / 2000)
 
 
-def test_near_misses_are_no_collisions(problem: rare_envs.DrivingProblem) -> None:
-    estimate = samplers.estimate(problem, "mc", max_sim=2000, gamma=1.5, seed=0)
-    severity = severity_curve(problem, estimate, thresholds=[-1.0])
-    collisions = sum(kind not in ("none", "others") for kind in problem.crash_kinds(estimate.sample.x))  # type: ignore[union-attr]
-    assert severity.curve.p[0] == pytest.approx(collisions / 2000)
-    assert severity.curve.p[0] < estimate.p
-
-
-def test_scenarios_without_an_outcome_are_left_out_and_said(problem: rare_envs.DrivingProblem) -> None:
-    run = samplers.estimate(problem, "mc", max_sim=1000, seed=0)
-    sample = run.sample
-    assert sample is not None
-    failing = np.flatnonzero(sample.f <= 0)
-    f = sample.f.copy()
-    f[failing[:2]] = -np.inf
-    changed = replace(run, sample=samplers.Sample.of_equal_draws(f, sample.x))
-    severity = severity_curve(problem, changed, thresholds=[-1.0])
-    assert severity.unknown == pytest.approx(2 / len(failing))
-    assert severity.curve.p[0] == pytest.approx((len(failing) - 2) / 1000)
-    assert "of p have no outcome and are left out" in str(severity)
-
-
 def moved_base(sd: float, number: int = 20) -> FittedDistribution:
     """Return the car-following base with plain gaps and refits whose means are moved by as many standard errors."""
     plain_base = rare_envs.DrivingProblem(FOLLOWING, base="us101-gap").base.distribution  # type: ignore[attr-defined]
@@ -141,19 +118,3 @@ def test_curve_and_injuries_have_the_intervals_of_a_fitted_base() -> None:
     saved = json.loads(json.dumps(severity.to_dict(), allow_nan=False))
     assert saved["injuries_base"]["spread"] == wide.spread
     assert saved["curve"]["base"]["low"] == band.low.tolist()
-
-
-def test_severity_under_a_refit_is_that_of_the_failures_reweighted_to_it() -> None:
-    """Spread of log P[delta-v > 1 m/s] over the refits, from `reweight` of an estimate in which only these fail."""
-    base = moved_base(0.1, number=6)
-    problem = rare_envs.DrivingProblem(FOLLOWING, base=base)
-    estimate = samplers.estimate(problem, seed=0, max_sim=2500)
-    severity = severity_curve(problem, estimate, thresholds=[1.0])
-    sample = estimate.sample
-    assert sample is not None and severity.curve.base is not None
-    worst = problem.crashes(sample.x).delta_v.amax(dim=1).numpy()
-    f = sample.f.copy()
-    f[np.flatnonzero(f <= 0)] = np.where(worst > 1.0, -1.0, 5.0)
-    harder = replace(estimate, p=float(severity.curve.p[0]), sample=replace(sample, f=f, x=sample.x[worst > 1.0]))
-    logs = [math.log(harder.reweight(refit).p) for refit in base.refits]
-    assert severity.curve.base.spread[0] == pytest.approx(np.std(logs, ddof=1), rel=1e-6)

@@ -54,13 +54,3 @@ def test_weather_on_the_command_line(cli: Cli, tmp_path: Path) -> None:
     found = json.loads(cli(*words, "--horizon", "1", "--out", str(out), "--json").stdout)
     assert found["question"]["weather"] is True
     assert found["question"]["observation"] == "camera+lidar"
-
-
-def test_training_on_pictures(cli: Cli, tmp_path: Path) -> None:
-    ego = tmp_path / "sees.zip"
-    words = ["train-ego", CUT_IN, "--observation", "camera", "--weather", "--num-envs", "2", "--steps", "8"]
-    result = cli(*words, "--horizon", "0.4", "--algo", "a2c", "--out", str(ego))
-    assert "--observation camera" in result.stdout and "--weather" in result.stdout
-    words = ["estimate", CUT_IN, "--ego", str(ego), "--observation", "camera", "--weather", "--method", "mc"]
-    found = json.loads(cli(*words, "--horizon", "0.4", "--max-sim", "8", "--json").stdout)
-    assert found["n_sim"] == 8

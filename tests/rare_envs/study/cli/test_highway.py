@@ -63,20 +63,6 @@ def test_the_highway_end_to_end(cli: Cli, tmp_path: Path) -> None:
     assert (tmp_path / "plot.png").stat().st_size > 50_000
 
 
-def test_an_ego_is_trained_in_the_world_that_was_asked_for(cli: Cli, risky: str, tmp_path: Path) -> None:
-    ego = tmp_path / "ego.zip"
-    world = ("--drivers", "idm", "--observation", "lidar", "--horizon", 3, "--noise", "off", "--base", risky)
-    words = ("train-ego", FOLLOWING, "--steps", 64, "--num-envs", 8, "--out", ego)
-    trained = cli(*words, *world)
-    assert trained.exit_code == 0, trained.output
-    again = trained.stdout.replace("\n", " ").partition(f"--ego {ego} ")[2]
-    asked = {f"--base {risky}", "--drivers idm", "--noise off", "--horizon 3.0", "--observation lidar"}
-    assert {f"--{words.strip()}" for words in again.split("--")[1:]} == asked
-    assert agents.load_ego(ego).observation_space.shape == (51,)
-    answer = json.loads(cli(*words, *world, "--json").stdout)
-    assert (answer["drivers"], answer["horizon"], answer["noise"]) == ("idm", 3.0, False)
-
-
 @pytest.mark.parametrize(
     ("words", "said"),
     [

@@ -32,9 +32,6 @@ def test_the_table_and_the_folder(cli: Cli, bases: list[str], here: Path) -> Non
 
 BAD = {
     "misspelt ego": (["imd"], ["idm"]),
-    "missing ego": ([], ["EGO"]),
-    "unknown site": (["idm", "--sites", "us102"], ["us102", "us101"]),
-    "no site": (["idm", "--sites", ","], ["site"]),
     "unknown leaders": (["idm", "--with", "merge"], ["merge"]),
     "two bases for one scenario": (
         ["idm", "--base", "hard_brake=us101", "--base", "hard_brake=mine.json"],
@@ -48,12 +45,9 @@ BAD = {
         ["idm", "--sites", "us101-closing"],
         ["no site", "'us101'", "cut_in=us101-closing"],
     ),
-    "a base without its scenario": (["idm", "--base", "mine.json"], ["SCENARIO=NAME"]),
-    "a base of an unknown scenario": (["idm", "--base", "merge=mine.json"], ["merge"]),
     "a base that is no file": (["idm", "--base", "cut_in=mine.json"], ["mine.json"]),
     "a damaged base": (["idm", "--base", "cut_in=broken.json"], ["broken.json", "JSON"]),
     "a base without frequency": (["idm", "--base", "cut_in=highway"], ["'highway'", "nobody counted"]),
-    "a misspelt method": (["idm", "--method", "addss"], ["adss"]),
     "no budget": (["idm", "--max-sim", "0"], ["--max-sim"]),
 }
 

@@ -21,7 +21,6 @@ from rare_envs.study.cli.shell import (
     OneLineErrors,
     Terminated,
     keep_stdout_for_the_answer,
-    name_options,
     one_line_warnings,
     print_whole,
     signals_as_exceptions,
@@ -198,9 +197,3 @@ def test_an_error_names_the_option_that_was_typed(cli: Cli, words: tuple[object,
     refused = cli("estimate", FOLLOWING, *words)
     assert_refused(refused, message)
     assert not re.search(r"[a-z]_[a-z]", refused.stderr)
-
-
-def test_what_is_said_of_a_file_keeps_its_keys() -> None:
-    options = {"max_sim": "--max-sim"}
-    assert name_options("'study.yaml' has an unknown key 'max_sims' (max_sim?)", options).endswith("(max_sim?)")
-    assert name_options("f(max_sim=3) and a/max_sim", options) == "f(max_sim=3) and a/max_sim"

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import base64
-import io
 import json
-import os
 import re
 import shutil
 from collections import Counter
@@ -13,15 +10,12 @@ from collections.abc import Callable
 from html.parser import HTMLParser
 from pathlib import Path
 
-import numpy as np
 import pytest
-from PIL import Image
 from typer.testing import Result
 
 from rare_envs.study import BadInput, Question, prepare, run_into
 from rare_envs.study.html_report.figures import FigureOfPage
 from rare_envs.study.html_report.page import SECTIONS, list_doubts, write_html_report
-from rare_envs.traffic.palette import ROLE_COLOURS, as_rgb
 
 VOID = {"meta", "br", "img", "link", "path", "use", "rect", "circle", "line", "polygon"}
 
@@ -88,18 +82,6 @@ def test_the_page_says_what_the_files_say(folder: Path) -> None:
     assert len(figures) >= 8
 
 
-def test_in_the_clip_every_vehicle_has_its_colour(folder: Path) -> None:
-    text = (folder / "report.html").read_text(encoding="utf-8")
-    clip = re.search(r"data:image/gif;base64,([A-Za-z0-9+/=]+)", text)
-    assert clip is not None
-    picture = Image.open(io.BytesIO(base64.b64decode(clip[1])))
-    assert 10 <= getattr(picture, "n_frames", 1) <= 60
-    for frame in (0, picture.n_frames - 1):  # type: ignore[attr-defined]
-        picture.seek(frame)
-        colours = {tuple(each) for each in np.asarray(picture.convert("RGB")).reshape(-1, 3).tolist()}
-        assert {as_rgb(ROLE_COLOURS["ego"]), as_rgb(ROLE_COLOURS["lead"])} <= colours
-
-
 def test_warnings_come_first_and_text_of_files_is_escaped(folder: Path, tmp_path: Path) -> None:
     run = tmp_path / "run"
     shutil.copytree(folder, run)
@@ -161,39 +143,6 @@ def test_a_run_without_failures_has_a_page(tmp_path: Path, safe: str) -> None:
     page = Page(text)
     assert page.wrong == [] and [name for name in page.ids if name in SECTIONS] == list(SECTIONS)
     assert "None of 50 simulations ends in a collision" in text and "No failure was found." in text
-
-
-def find_chromium() -> str | None:
-    """Return a browser to look with: RARE_ENVS_CHROMIUM, or one that is installed."""
-    names = ("chromium", "chromium-browser", "google-chrome", "chrome")
-    return os.environ.get("RARE_ENVS_CHROMIUM") or next(filter(None, map(shutil.which, names)), None)
-
-
-@pytest.mark.parametrize("width", [1280, 390])
-def test_a_browser_shows_the_page_without_a_network_and_without_sideways_scrolling(folder: Path, width: int) -> None:
-    playwright = pytest.importorskip("playwright.sync_api", reason="needs playwright")
-    chromium = find_chromium()
-    if chromium is None:
-        pytest.skip("needs a Chromium: set RARE_ENVS_CHROMIUM")
-    with playwright.sync_playwright() as started:
-        browser = started.chromium.launch(
-            executable_path=chromium, args=["--no-sandbox", "--single-process", "--no-zygote"]
-        )
-        tab = browser.new_context(viewport={"width": width, "height": 900}, offline=True).new_page()
-        said: list[str] = []
-        tab.on("console", lambda message: said.append(message.text))
-        tab.on("request", lambda request: said.append(request.url) if request.url.startswith("http") else None)
-        tab.goto(f"file://{folder / 'report.html'}")
-        assert tab.evaluate("document.documentElement.scrollWidth") == width
-        for inner, outer in (("table", "e.parentElement"), ("figure", "e")):
-            wide = f"[...document.querySelectorAll('{inner}')].filter(e => e.scrollWidth > {outer}.clientWidth).length"
-            assert tab.evaluate(wide) == 0, inner
-        shown = "[...document.querySelectorAll('figure svg')].filter(e => e.clientWidth > 0).map(e => e.ariaLabel)"
-        captions = tab.evaluate(shown)
-        assert len(captions) == len(set(captions)) >= 5  # a figure with a form for narrow screens is shown in one form
-        assert said == []
-        assert len(tab.pdf(format="A4")) > 20_000
-        browser.close()
 
 
 def test_what_has_no_report_is_refused(folder: Path, tmp_path: Path, cli: Callable[..., Result]) -> None:

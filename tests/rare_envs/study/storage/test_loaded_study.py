@@ -5,7 +5,6 @@ import subprocess
 import sys
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 import rare_envs
@@ -30,13 +29,6 @@ def test_what_is_loaded_is_what_the_files_hold(folder: Path) -> None:
     low, high = study.interval
     assert low <= study.p <= high
     assert set(study.column_names) >= {"gap", "f", "failed", "log_weight", "crash", "error", "seconds"}
-
-
-def test_other_libraries_read_the_table(folder: Path) -> None:
-    study = rare_envs.load_study(folder)
-    p = np.exp(study.episodes(failed=True)["log_weight"].to_numpy()).sum()
-    frame = pytest.importorskip("pandas").read_parquet(study.episodes_path)
-    assert np.exp(frame.log_weight[frame.failed]).sum() == pytest.approx(p) == pytest.approx(study.p)
 
 
 def test_loading_takes_neither_torch_nor_the_simulation(folder: Path) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -77,18 +76,3 @@ def test_an_ego_that_fails_on_the_way_is_one_line(cli: Cli, here: Path, risky: s
     (here / "old").mkdir()
     assert_refused(cli(*words, here / "old"), said)
     assert (here / "old").exists()
-
-
-def test_what_the_ego_observes_can_be_chosen(cli: Cli, here: Path) -> None:
-    (here / "looking.py").write_text(
-        "import egos_here\n"
-        "def make():\n"
-        "    ego = egos_here.coasting()\n"
-        "    ego.observation_space = egos_here.Box(-5.0, 5.0, (51,))\n"
-        "    return ego\n"
-    )
-    words = (*SMALL[:-1], 100, "--ego", "looking:make")
-    assert_refused(cli(*words, "--observation", "kinematics"), "51")
-    for chosen in ((), ("--observation", "lidar")):  # an ego that expects the lidar's 51 numbers need not say so
-        result = cli(*words, *chosen, "--json")
-        assert json.loads(result.stdout)["question"]["observation"] == "lidar"
