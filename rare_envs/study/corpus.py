@@ -31,7 +31,7 @@ from rare_envs.study.errors import BadInput, as_bad_input, output_folder
 from rare_envs.study.question import build_problem, prepare
 from rare_envs.study.recorded_question import load_finished, note_question, open_question, open_run
 from rare_envs.study.run_folder import CRASH, LoadedStudy
-from rare_envs.study.video import REPLAY_TOLERANCE, RecordedFailure, check_number_of_failure, count_found
+from rare_envs.study.video import OWN_NOISE, REPLAY_TOLERANCE
 from rare_envs.version import __version__
 from training import Retraining
 
@@ -277,7 +277,7 @@ def join_x(failures: Sequence[StoredFailure], names: Sequence[str], sizes: Seque
         parts: list[Any] = []
         for name, size in zip(names, sizes, strict=True):
             part = failure.x.get(name)
-            if name == "ego_noise" and (part is None or len(part) != size):
+            if name == OWN_NOISE and (part is None or len(part) != size):
                 part = [0.0] * size
             if part is None or len(part) != size:
                 raise ValueError(
@@ -381,20 +381,6 @@ def repeat_run(folder: Path, trust: bool = False) -> tuple[list[Trial], float]:
         problem = prepare(open_run(run, trust)).problem
         trials = _try_world(problem, failures)
     return trials, time.perf_counter() - start
-
-
-def find_for_ego(folder: Path, number: int, ego: str, trust: bool = False) -> RecordedFailure:
-    """Return failure `number` of a run, with another ego in its world."""
-    run = load_finished(folder)
-    failures = _list_failures(run, trust)
-    check_number_of_failure(number, len(failures))
-    failure = failures[number]
-    question = open_question(failure.question_values(), folder, trust)
-    with as_bad_input(ValueError, OSError, ImportError), np.errstate():
-        problem = _build(question, EgoChoice(ego=ego), agents.load_ego(ego, trust=trust))
-        x = problem.space.validate(join_x([failure], problem.space.names, problem.space.sizes))
-    found = count_found(run.result, len(failures))
-    return RecordedFailure(problem, x[0], failure.f, failure.log_p0, len(failures), found)
 
 
 def _build(question: Question, choice: EgoChoice, ego: Any) -> DrivingProblem:

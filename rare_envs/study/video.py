@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import IO, Any, NamedTuple
 
@@ -33,6 +33,10 @@ MARKER: Colour = (200, 0, 150)
 """Line at the present moment in the curves."""
 
 
+OWN_NOISE = "ego_noise"
+"""Parameter that an ego has which is random itself."""
+
+
 class RecordedFailure(NamedTuple):
     """A failure as a run has recorded it."""
 
@@ -47,38 +51,44 @@ class RecordedFailure(NamedTuple):
     """Number of failures that it found."""
 
 
-def find_failure(folder: Path, number: int, trust: bool = False) -> RecordedFailure:
-    """Return failure `number` of a run, the most likely being number 0."""
+def find_failure(folder: Path, number: int, trust: bool = False, ego: str | None = None) -> RecordedFailure:
+    """Return failure `number` of a run, the most likely being number 0; with another ego in its world, if one is named.
+
+    What code the run or the egos name runs only with `trust`, unless the run was made here.
+
+    Raises:
+        BadInput: There is no such run or failure, or what it was about cannot be loaded any longer.
+    """
     run = load_finished(folder)
     question, table, count = open_run(run, trust), run.failures, len(run.failures["f"])
     warn_of_changed_files(question, folder)
-    with as_bad_input(TypeError, OverflowError, RecursionError, MemoryError):
-        problem = prepare(question).problem
-    check_number_of_failure(number, count)
-    x, found = join_parameters(table, problem, number), count_found(run.result, count)
-    return RecordedFailure(problem, x, float(table["f"][number]), float(table["log_p0"][number]), count, found)
-
-
-def check_number_of_failure(number: int, count: int) -> None:
-    """Raise a BadInput unless a run that lists `count` failures has this one."""
     if not count:
         raise BadInput("The run has no failure.")
     if not 0 <= number < count:
         raise BadInput(f"Expected a failure from 0 to {count - 1}, got {number}.")
-
-
-def count_found(recorded: Mapping[str, Any], n_listed: int) -> int:
-    """Return the number of failures that a run found."""
-    found = recorded.get("n_failures")
-    return found if isinstance(found, int) and found > n_listed else n_listed
+    if ego is not None:
+        question = replace(question, ego=ego, algo=None, stats=None, observation=None, action=None)
+    with as_bad_input(TypeError, OverflowError, RecursionError, MemoryError):
+        problem = prepare(question).problem
+    x, found = join_parameters(table, problem, number), run.result.get("n_failures")
+    n_found = found if isinstance(found, int) and found > count else count
+    return RecordedFailure(problem, x, float(table["f"][number]), float(table["log_p0"][number]), count, n_found)
 
 
 def join_parameters(table: dict[str, NDArray[Any]], problem: DrivingProblem, number: int) -> NDArray[np.float64]:
-    """Return x (d,) of a row."""
-    names = problem.space.names
-    if not set(names) <= set(table):
-        raise BadInput(f"Expected {FAILURES} with the columns {', '.join(names)}; the run is of another problem.")
-    x = np.concatenate([np.atleast_1d(table[name][number]) for name in names])
+    """Return x (d,) of a row; an ego that is random, where the run's was not, has zeros for its noise.
+
+    Raises:
+        BadInput: The columns are others than those of the problem, or x is no scenario of its traffic.
+    """
+    space, parts = problem.space, []
+    for name, size in zip(space.names, space.sizes, strict=True):
+        part = np.atleast_1d(table[name][number]) if name in table else np.empty(0)
+        if not len(part) and name != OWN_NOISE:
+            names = ", ".join(space.names)
+            raise BadInput(f"Expected {FAILURES} with the columns {names}; the run is of another problem.")
+        parts.append(np.zeros(size) if name == OWN_NOISE and len(part) != size else part)
+    x = np.concatenate(parts)
     if x.shape != (problem.dim,) or not np.isfinite(x).all() or not np.isfinite(problem.base.log_prob(x[None])).all():
         raise BadInput(f"Failure {number} in {FAILURES} is no scenario of {problem.env_id} and its base distribution.")
     return x

@@ -113,13 +113,12 @@ def take_options(*names: str, executor: bool = False) -> Callable[[Callable[...,
 
         parameters: list[inspect.Parameter] = []
         for name, parameter in inspect.signature(command, eval_str=True).parameters.items():
-            own = (
-                [_make_parameter(groups[name][0], each) for each in groups[name][1]] if name in groups else [parameter]
-            )
-            parameters += [each.replace(kind=inspect.Parameter.KEYWORD_ONLY) for each in own]
+            owner, known = groups.get(name, (None, ()))
+            made = [parameter] if owner is None else [_make_parameter(owner, each) for each in known]
+            parameters += [each.replace(kind=inspect.Parameter.KEYWORD_ONLY) for each in made]
         spread.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
         spread.__annotations__ = {each.name: each.annotation for each in parameters}
-        del spread.__wrapped__  # type: ignore[attr-defined]
+        del spread.__wrapped__
         return spread
 
     return decorate
@@ -129,7 +128,7 @@ def _make_parameter(owner: type[Any], name: str) -> inspect.Parameter:
     """Return the option of a field, as Typer reads it from a signature."""
     kind = _KINDS.get(name) or get_type_hints(owner)[name]
     default = NoiseKind.ON if name == "noise" else _find_field(owner, name).default
-    annotation = Annotated[kind, option_of(name, owner)]
+    annotation = Annotated[kind, option_of(name, owner)]  # type: ignore[valid-type]  # known when the command is made
     return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=annotation)
 
 

@@ -154,7 +154,6 @@ def replay_command(
     as_json: JsonOption = False,
 ) -> None:
     """Replay a failure that a run has found, and show it with its measure over time."""
-    from rare_envs.study.corpus import find_for_ego
     from rare_envs.study.replay import drive_again
     from rare_envs.study.video import REPLAY_TOLERANCE, check_film_path, describe_drive, find_failure, write_film
 
@@ -167,7 +166,7 @@ def replay_command(
     if out is not None:
         check_film_path(out)
     with keep_stdout_for_the_answer(), contextlib.nullcontext() if out is None else output_file(out):
-        recorded = find_failure(run, failure, trust) if ego is None else find_for_ego(run, failure, ego, trust)
+        recorded = find_failure(run, failure, trust, ego)
         drive = drive_again(recorded.problem, recorded.x)
         if out is not None:
             write_film(out, drive)

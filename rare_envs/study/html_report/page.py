@@ -27,7 +27,6 @@ from rare_envs.study.html_report.figures import (
 )
 from rare_envs.study.question import prepare
 from rare_envs.study.recorded_question import load_finished, open_run, warn_of_changed_files
-from rare_envs.study.repeatability import Repeatability
 from rare_envs.study.run_folder import EPISODES, REPORT, RESULT, STUDY, LoadedStudy
 from rare_envs.study.text import (
     describe_intervals,
@@ -127,18 +126,18 @@ def _write(study: LoadedStudy, page: Path, trust: bool, events: Path | None, kin
 
 def render_page(study: LoadedStudy, figures: Mapping[str, FigureOfPage], atlas: Sequence[AtlasEntry]) -> str:
     """Return the page as text; everything that files say is escaped."""
-    result = study.result
+    result, doubts = study.result, _list_texts(study.result, "doubts")
     return render_template(
         "report.html.j2",
         result=result,
         about=study.about,
         folder=str(study.folder),
         summary=summarise_answer(result, str((study.about.get("base") or {}).get("name") or "its default base")),
-        doubts=[*_describe_changes(study), *list_doubts(result), *filter(None, [describe_wide_base(result)])],
-        remarks=_list_notes(result),
+        doubts=[*_describe_changes(study), *doubts, *filter(None, [describe_wide_base(result)])],
+        remarks=[text for text in _list_texts(result, "warnings", "remarks", "notes") if text not in doubts],
         intervals=describe_intervals(result),
         validity=describe_validity(result),
-        end=describe_outcome(str(result.get("status")), list_doubts(result)),
+        end=describe_outcome(str(result.get("status")), doubts),
         no_gain=explain_no_gain(float(result["p"])),
         rate=describe_rate(result),
         method=describe_method(result),
@@ -169,32 +168,9 @@ def _describe_changes(study: LoadedStudy) -> list[str]:
     return [f"not what the run wrote, by the digests in its {STUDY}: {', '.join(changed)}"] if changed else []
 
 
-def list_doubts(result: Mapping[str, Any]) -> list[str]:
-    """Return all warnings of a run: of the method, of its base distribution, of the ego's statistics, and of f."""
-    doubts = [] if _has_exact_bound(result) else [str(text) for text in result.get("warnings") or []]
-    base = result.get("base_uncertainty")
-    if isinstance(base, dict):
-        doubts += [f"base distribution: {text}" for text in base.get("warnings") or []]
-    if result.get("missing_statistics"):
-        doubts.append(str(result["missing_statistics"]))
-    again = result.get("repeatability")
-    if isinstance(again, dict):
-        warning = Repeatability(**again).warning
-        doubts += [warning] if warning else []
-    if result.get("doubtful") and not doubts:
-        doubts.append("the run had warnings that its result.json does not hold: see what the command printed")
-    return doubts
-
-
-def _list_notes(result: Mapping[str, Any]) -> list[str]:
-    """Return what casts no doubt on the answer; where that is an exact bound, the warnings of the method too."""
-    warnings = (result.get("warnings") or []) if _has_exact_bound(result) else []
-    return [str(text) for text in (*warnings, *(result.get("remarks") or []), *(result.get("notes") or []))]
-
-
-def _has_exact_bound(result: Mapping[str, Any]) -> bool:
-    """Return whether none of the draws from the base distribution failed, which casts no doubt on the bound."""
-    return result.get("status") == "no_hits" and result.get("doubtful") is False
+def _list_texts(result: Mapping[str, Any], *names: str) -> list[str]:
+    """Return the texts that some entries of a result list."""
+    return [str(text) for name in names for text in result.get(name) or []]
 
 
 def _make_figures(study: LoadedStudy, source: AtlasSource) -> dict[str, FigureOfPage]:

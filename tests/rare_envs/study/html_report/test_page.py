@@ -15,7 +15,7 @@ from typer.testing import Result
 
 from rare_envs.study import BadInput, Question, prepare, run_into
 from rare_envs.study.html_report.figures import FigureOfPage
-from rare_envs.study.html_report.page import SECTIONS, list_doubts, write_html_report
+from rare_envs.study.html_report.page import SECTIONS, write_html_report
 
 VOID = {"meta", "br", "img", "link", "path", "use", "rect", "circle", "line", "polygon"}
 
@@ -86,12 +86,12 @@ def test_warnings_come_first_and_text_of_files_is_escaped(folder: Path, tmp_path
     run = tmp_path / "run"
     shutil.copytree(folder, run)
     result = json.loads((run / "result.json").read_text())
-    result |= {"warnings": ["<script>alert(1)</script> the estimate is coarse"], "notes": ["<b>a note</b>"]}
-    result["repeatability"] = {"n": 68, "n_differing": 40, "largest": 3.5}
+    coarse = "<script>alert(1)</script> the estimate is coarse"
+    result |= {"warnings": [coarse], "doubts": [coarse], "notes": ["<b>a note</b>"]}
     (run / "result.json").write_text(json.dumps(result))
     text = write_html_report(run)[0].read_text(encoding="utf-8")
     assert "<script>" not in text and "&lt;script&gt;alert(1)&lt;/script&gt; the estimate is coarse" in text
-    assert text.index("the estimate is coarse") < text.index("The answer") and "gave another f" in text
+    assert text.index("the estimate is coarse") < text.index("The answer")
     assert "&lt;b&gt;a note" in text
     assert "not what the run wrote, by the digests in its study.json: result.json" in text
 
@@ -113,14 +113,6 @@ def test_a_damaged_file_is_one_line(
     with pytest.raises(BadInput, match=r"result\.json or study\.json in .* is damaged"):
         write_html_report(run, out=tmp_path / "page.html")
     assert not (tmp_path / "page.html").exists()
-
-
-def test_doubts_are_those_of_method_base_and_f() -> None:
-    base = {"warnings": ["few events"]}
-    found = list_doubts({"warnings": ["coarse"], "base_uncertainty": base, "doubtful": True})
-    assert found == ["coarse", "base distribution: few events"]
-    assert list_doubts({"doubtful": True, "missing_statistics": "no statistics"}) == ["no statistics"]
-    assert list_doubts({"doubtful": False}) == [] and len(list_doubts({"doubtful": True})) == 1
 
 
 def test_recorded_events_and_figures_as_files(folder: Path, tmp_path: Path, cli: Callable[..., Result]) -> None:
