@@ -13,7 +13,7 @@ import sys
 
 from agents.remote.framing import add_length, read_message
 from agents.remote.request_handler import RequestHandler
-from rare_envs.egos.validation import is_policy
+from rare_envs.egos.errors import is_policy
 from rare_envs.threads import use_one_thread
 
 

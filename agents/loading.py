@@ -16,9 +16,8 @@ from agents.sb3.hub import HUB_PREFIX, find_hub_model
 from agents.sb3.saved_ego import load_saved_ego
 from agents.vision import holds_vision, load_vision
 from rare_envs.control.idm import IDM
-from rare_envs.egos.errors import EgoGone
-from rare_envs.egos.plain_callables import wrap_callable
-from rare_envs.egos.validation import is_policy, refuse_ego
+from rare_envs.egos.errors import EgoGone, is_policy, refuse_ego
+from rare_envs.egos.needs import wrap_callable
 from rare_envs.plugins import did_you_mean, import_object, one_line
 
 EXPECTED_EGO: Final = (

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from rare_envs.control.idm import IDM
+from rare_envs.egos.dense_policies import read_dense_policy
 from rare_envs.egos.policy import PolicyDriver, find_device_driver
-from rare_envs.egos.sb3.dense_networks import read_dense_policy
 from rare_envs.simulation.compiled.failures import CompilerFails, NotCompiled, check_core
 from rare_envs.simulation.compiled.selection import (
     CompiledEgo,

@@ -64,7 +64,7 @@ def set_up(
             ("camera", "lidar"), make a `Dict`.
         action: "continuous"; "discrete", five accelerations for algorithms such as DQN, see
             `rare_envs.control.actions.DISCRETE_ACTIONS`; or "meta" (HighwayEnv's, see
-            `rare_envs.control.meta_actions`: a step is then one second).
+            `rare_envs.control.actions`: a step is then one second).
         measure: The safety measure: a name in `rare_envs.measures.MEASURES`, "stl:FORMULA", "module:name", a
             `Measure` or another of its kind, or a function; see `rare_envs.measures.find_measure`.
         horizon: Length of an episode [s]; None takes the scenario's.
@@ -80,7 +80,7 @@ def set_up(
         collisions: Which count: those of the "ego", or "any", those between two other vehicles too.
         camera: Of the observation "camera": a `rare_envs.sensors.camera.Camera`, or the size (height, width) of its
             pictures; None for 66 x 200.
-        weather: Whether weather and the camera's noise are part of x, see `rare_envs.sensors.camera.weather`; without
+        weather: Whether weather and the camera's noise are part of x, see `rare_envs.sensors.camera.context`; without
             it there is a clear day. Weather does not change the traffic.
         **unknown: Any other argument, which is refused.
 

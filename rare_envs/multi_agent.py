@@ -8,15 +8,14 @@ from typing import Any, NamedTuple, Protocol, TypeAlias, runtime_checkable
 import torch
 from torch import Tensor
 
-from rare_envs.control.actions import IDLE
-from rare_envs.control.meta_actions import initial_aim
+from rare_envs.control.actions import IDLE, initial_aim
 from rare_envs.egos.policy import PolicyDriver
 from rare_envs.simulation.decision import TickReward, hold_finished, run_ticks
 from rare_envs.simulation.episode import Episode
 from rare_envs.simulation.reward import COLLISION_COST, RewardTerms, reward_terms
 from rare_envs.simulation.rollout import Driver
 from rare_envs.simulation.world import World
-from rare_envs.traffic.overlap import pairwise_overlaps
+from rare_envs.traffic.bodies import pairwise_overlaps
 
 __all__ = ["AdversaryTerms", "Transition", "adversary_reward", "own_reward", "play"]
 

@@ -17,17 +17,18 @@ from rare_envs.devices import find_device, move_to
 from rare_envs.devices.batch_sizes import chunk_size, tile_size
 from rare_envs.distributions.space import Distribution, ScenarioSpace
 from rare_envs.egos.errors import reason_of
-from rare_envs.egos.loading import load_named_ego
-from rare_envs.egos.needs import resolve
-from rare_envs.egos.policy import PolicyDriver, as_driver
-from rare_envs.egos.spaces.ambiguities import (
+from rare_envs.egos.needs import (
     DRIVES_ITSELF,
     TAKEN_AS_ACCELERATIONS,
     AmbiguousActions,
     MissingStatistics,
+    choose_action,
+    choose_observation,
+    load_named_ego,
     name_ambiguities,
+    resolve,
 )
-from rare_envs.egos.spaces.choice import choose_action, choose_observation
+from rare_envs.egos.policy import PolicyDriver, as_driver
 from rare_envs.egos.wrappers import describe_missing_normalisation
 from rare_envs.make import refuse_unknown, set_up
 from rare_envs.scenarios.registry import find_scenario, split_layout

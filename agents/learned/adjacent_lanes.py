@@ -13,8 +13,7 @@ import torch
 from torch import Tensor
 
 from rare_envs.devices import constant
-from rare_envs.sensors.lidar import MAX_RANGE, beam_angles
-from rare_envs.sensors.perception import FEATURES, HEADING_COLUMN, RANGE_COLUMNS, RATE_COLUMNS
+from rare_envs.sensors.lidar import FEATURES, HEADING_COLUMN, MAX_RANGE, RANGE_COLUMNS, RATE_COLUMNS, beam_angles
 
 LENGTH_COLUMN, LEFT_MARKER_COLUMN, RIGHT_MARKER_COLUMN = (
     FEATURES.index(name) for name in ("length", "left_marker", "right_marker")

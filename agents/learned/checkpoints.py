@@ -30,10 +30,9 @@ from agents.learned.rule_driver import RuleDriver
 from agents.learned.weight_distribution import WeightDistribution
 from agents.names import LANE_CHANGING, RULE_BASED, SHIPPED_DRIVERS, SHIPPED_EGOS, read_settings
 from rare_envs.control.lane_changing import LaneChangingDriver
-from rare_envs.files import replace_file
-from rare_envs.json_text import parse_json_object
+from rare_envs.files import parse_json_object, replace_file
 from rare_envs.plugins import did_you_mean
-from rare_envs.sensors.perception import FEATURES
+from rare_envs.sensors.lidar import FEATURES
 
 SUFFIX = ".safetensors"
 FORMAT = 1

@@ -18,8 +18,15 @@ import torch
 from torch import Tensor
 
 from agents.learned.adjacent_lanes import LEFT_MARKER_COLUMN, RIGHT_MARKER_COLUMN
-from rare_envs.sensors.lidar import MAX_RANGE, beam_angles
-from rare_envs.sensors.perception import FEATURES, HEADING_COLUMN, RANGE_COLUMNS, RATE_COLUMNS, SPEED_COLUMN
+from rare_envs.sensors.lidar import (
+    FEATURES,
+    HEADING_COLUMN,
+    MAX_RANGE,
+    RANGE_COLUMNS,
+    RATE_COLUMNS,
+    SPEED_COLUMN,
+    beam_angles,
+)
 
 _LENGTH, _WIDTH = FEATURES.index("length"), FEATURES.index("width")
 _FORWARD, _SIDEWAYS, _ACROSS = 0.5, 0.3, 0.75
@@ -111,7 +118,7 @@ class CollisionAvoidance:
     reach: float = 1.0
     """A point is beside if it is no further than this before or behind the own body [m]."""
     lateral_time: float = 0.6
-    """T_y [s], HighwayEnv's time constant, as in `rare_envs.control.steering`."""
+    """T_y [s], HighwayEnv's time constant, as in `rare_envs.control.idm`."""
     heading_time: float = 0.2
     """T_psi [s], likewise."""
     turning_radius: float = 6.4

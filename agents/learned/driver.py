@@ -24,7 +24,7 @@ from agents.learned.networks import (
 from agents.learned.weight_distribution import WeightDistribution
 from rare_envs.control import actions
 from rare_envs.devices import constant
-from rare_envs.sensors.perception import CURVATURE_COLUMN, SPEED_COLUMN
+from rare_envs.sensors.lidar import CURVATURE_COLUMN, SPEED_COLUMN
 from rare_envs.simulation.cuda_graphs import says_recordable
 from rare_envs.simulation.observation import LIDAR_SCALES, observation_space
 from rare_envs.traffic.vehicle_models import steering_for

@@ -22,11 +22,12 @@ from agents.learned.adjacent_lanes import (
     look_aside,
 )
 from rare_envs.devices import constant
-from rare_envs.sensors.lidar import AHEAD_BEAM, MAX_RANGE
-from rare_envs.sensors.perception import (
+from rare_envs.sensors.lidar import (
+    AHEAD_BEAM,
     FEATURES,
     HEADING_COLUMN,
     LANE_OFFSET_COLUMN,
+    MAX_RANGE,
     RATE_COLUMNS,
     SPEED_COLUMN,
 )

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor, nn
 
 FEATURE_SIZE = 51
-"""Features of `rare_envs.sensors.perception.FEATURES`."""
+"""Features of `rare_envs.sensors.lidar.FEATURES`."""
 HIDDEN_SIZES = (200, 100)
 """Units of the two hidden layers (O'Kelly et al. 2018, section 4)."""
 ACTION_SIZE = 2

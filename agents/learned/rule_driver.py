@@ -7,21 +7,20 @@ import torch
 from torch import Tensor
 
 from rare_envs.control.idm import IDM
-from rare_envs.sensors.lidar import AHEAD_BEAM, MAX_RANGE
-from rare_envs.sensors.perception import FEATURES, RANGE_COLUMNS, RATE_COLUMNS
-from rare_envs.traffic.lead import Lead
+from rare_envs.sensors.lidar import AHEAD_BEAM, FEATURES, MAX_RANGE, RANGE_COLUMNS, RATE_COLUMNS
+from rare_envs.traffic.neighbours import Lead
 from rare_envs.traffic.vehicle_models import NEAR_ZERO
 
 _OFFSET, _HEADING, _SPEED, _LENGTH = (FEATURES.index(name) for name in ("lane_offset", "heading", "speed", "length"))
 OFFSET_TIME = 0.6
-"""The lateral speed that is aimed at is lane offset / this [s], as in `rare_envs.control.steering`."""
+"""The lateral speed that is aimed at is lane offset / this [s], as in `rare_envs.control.idm`."""
 HEADING_TIME = 0.2
-"""The yaw rate is heading error / this [s], as in `rare_envs.control.steering`."""
+"""The yaw rate is heading error / this [s], as in `rare_envs.control.idm`."""
 
 
 @dataclass(frozen=True)
 class RuleDriver:
-    """IDM behind what the beam ahead meets, and the lane keeping of `rare_envs.control.steering` as a yaw rate.
+    """IDM behind what the beam ahead meets, and the lane keeping of `rare_envs.control.idm` as a yaw rate.
 
     It has the interface of a `LearnedDriver`, so that one harness measures both; it has no weights and no noise, and
     knows vehicles in its lane only where the beam meets them.

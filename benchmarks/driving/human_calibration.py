@@ -36,8 +36,8 @@ from rare_envs.exposure.human_benchmarks import (
 )
 from rare_envs.exposure.rate import MILLION_KM
 from rare_envs.measures import find_measure
-from rare_envs.measures.braking import MAX_BRAKING, RAPID_BRAKING
-from rare_envs.measures.combination import Combined
+from rare_envs.measures.longitudinal import MAX_BRAKING, RAPID_BRAKING
+from rare_envs.measures.registry import Combined
 from rare_envs.scenarios import load_base
 from rare_envs.scenarios.registry import find_scenario
 from rare_envs.threads import use_one_thread

@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 import rare_envs
 from benchmarks.papers.markdown import format_reproduction
 from benchmarks.samplers.runs import about
-from rare_envs.json_text import format_json
+from rare_envs.files import format_json
 from rare_envs.study.errors import BadInput
 from samplers.stored import to_json_value
 

@@ -8,8 +8,7 @@ from rare_envs.control.actions import (
     META_ACTIONS,
     action_space,
 )
-from rare_envs.control.idm import IDM
-from rare_envs.control.steering import lane_keeping
+from rare_envs.control.idm import IDM, lane_keeping
 
 __all__ = [
     "ACTIONS",

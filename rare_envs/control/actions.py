@@ -1,13 +1,27 @@
-"""Actions of policies: their kinds and spaces, checks, and scaling to an acceleration and a steering angle."""
+"""Actions of policies: their kinds, spaces and scaling, and HighwayEnv's meta-actions with the controllers that follow.
 
-from typing import Any
+With meta-actions a policy names a lane or a speed once a second, as `DiscreteMetaAction` with an `MDPVehicle`; in
+between a speed controller and a steering controller act at every tick. Their targets are an `Aim`, the only memory
+there is. On a straight road the motion is HighwayEnv's own. On a curved one lanes, offsets and headings are those along
+the road, and the steering looks ahead by 0.1 s as HighwayEnv's does on its curved lanes.
+
+References:
+    Leurent, "An environment for autonomous driving decision-making", 2018: HighwayEnv,
+    `envs/common/action.py` and `vehicle/controller.py`.
+"""
+
+from functools import cache
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from gymnasium import spaces
 from torch import Tensor
 
+from rare_envs.control.idm import steering_control
 from rare_envs.devices import can_look, constant
+from rare_envs.traffic.road import Road
+from rare_envs.traffic.state import State
 
 ACTIONS = ("continuous", "discrete", "meta")
 """Kinds of actions."""
@@ -22,7 +36,7 @@ DISCRETE_ACTIONS = np.array([[-1.0, 0.0], [-0.4, 0.0], [0.0, 0.0], [0.2, 0.0], [
 """For algorithms with discrete actions: row k is the continuous action of index k (-5, -2, 0, 1, 2 m/s^2, straight)."""
 
 META_ACTIONS = ("LANE_LEFT", "IDLE", "LANE_RIGHT", "FASTER", "SLOWER")
-"""HighwayEnv's meta-actions, by index; what they do is in `rare_envs.control.meta_actions`."""
+"""HighwayEnv's meta-actions, by index; what they do is in `rare_envs.control.actions`."""
 LANE_LEFT, IDLE, LANE_RIGHT, FASTER, SLOWER = range(len(META_ACTIONS))
 
 
@@ -110,3 +124,129 @@ def to_physical(action: Tensor, batch: int, ignored: Tensor | None = None) -> Te
             "check the policy's weights and observation normalisation."
         )
     return action.clamp(-1.0, 1.0) * constant((MAX_ACCELERATION, MAX_STEERING), action)
+
+
+TARGET_SPEEDS = (20.0, 25.0, 30.0)
+"""Speeds [m/s] that a policy may choose, equally spaced."""
+DECISION = 1.0
+"""Time between two decisions of the policy [s]: HighwayEnv's `policy_frequency` of 1 Hz."""
+_TAU_SPEED = 0.6
+"""Time constant of the speed controller [s]."""
+_REACHABLE_LANES = 2.0
+"""Lane widths up to which the middle of a target lane may be away: HighwayEnv's `is_reachable_from`."""
+_TAU_PURSUIT = 0.1
+"""Time ahead at which the steering controller reads the road's heading [s]."""
+
+
+class Aim(NamedTuple):
+    """Targets of the controllers; integers of one shape, one for each vehicle."""
+
+    lane: Tensor
+    """Index of the target lane, 0 the leftmost."""
+    speed: Tensor
+    """Index of the target speed in `TARGET_SPEEDS`."""
+
+
+def initial_aim(state: State, road: Road) -> Aim:
+    """Return the first targets, shape (B, N): the vehicle's lane, and the target speed nearest to its speed."""
+    return Aim(road.lane_of(state.y), _nearest_speed(state.speed))
+
+
+def follow_meta_actions(
+    aim: Aim, action: Tensor, commanded: Tensor | None, state: State, road: Road
+) -> tuple[Aim, Tensor]:
+    """Turn meta-actions into what the controllers do in one tick.
+
+    A vehicle whose action does not count has no aim of its own: when it is first commanded, its aim is where it is.
+
+    Args:
+        aim: Targets of all vehicles, shape (B, N).
+        action: Meta-actions of the ego, shape (B,); with `commanded` of all vehicles, shape (B, N).
+        commanded: Which vehicles follow their action, boolean, shape (B, N), the ego always; None for the ego alone.
+        state: Traffic of B scenarios.
+        road: Their road.
+
+    Returns:
+        The new aim, and acceleration [m/s^2] and steering angle [rad], shape (B, 2), or (B, N, 2) with `commanded`.
+    """
+    if commanded is None:
+        pad = state.x.shape[1] - 1
+        alone, physical = follow_meta_actions(
+            aim,
+            torch.nn.functional.pad(action[:, None], (0, pad), value=IDLE),
+            torch.zeros_like(state.x, dtype=torch.bool),
+            state,
+            road,
+        )
+        return alone, physical[:, 0]
+    follows = commanded.clone()
+    follows[:, 0] = True
+    aim = Aim(*(torch.where(follows, old, new) for old, new in zip(aim, initial_aim(state, road), strict=True)))
+    aim = update_aim(aim, torch.where(follows, action, IDLE), state.y, state.speed, road)
+    return aim, control_towards(aim, state.x, state.y, state.heading, state.speed, road)
+
+
+def update_aim(aim: Aim, action: Tensor, y: Tensor, speed: Tensor, road: Road) -> Aim:
+    """Return the targets after meta-actions.
+
+    Left and right move the target lane by one from the present target, if there is such a lane and its middle is within
+    two lane widths of the vehicle. Faster and slower aim for the speed after or before the one nearest to the vehicle's
+    present speed (not to the present target).
+
+    Args:
+        aim: The targets so far.
+        action: Indices of `rare_envs.control.actions.META_ACTIONS`, of the same shape.
+        y: Place across the road [m], likewise.
+        speed: Speed [m/s], likewise.
+        road: The road.
+
+    Returns:
+        The new targets; where the action is idle, the same.
+    """
+    centres, widths = _lanes(road, y.dtype, y.device)
+    aside = (action == LANE_RIGHT).long() - (action == LANE_LEFT).long()
+    wanted = (aim.lane + aside).clamp(0, road.lanes - 1)
+    reachable = (y - centres[wanted]).abs() <= _REACHABLE_LANES * widths[wanted]
+    change = (action == FASTER).long() - (action == SLOWER).long()
+    changed = (_nearest_speed(speed) + change).clamp(0, len(TARGET_SPEEDS) - 1)
+    return Aim(torch.where(reachable, wanted, aim.lane), torch.where(change != 0, changed, aim.speed))
+
+
+def control_towards(aim: Aim, x: Tensor, y: Tensor, heading: Tensor, speed: Tensor, road: Road) -> Tensor:
+    """Return the actions of HighwayEnv's two low-level controllers for one tick.
+
+    Acceleration is (target speed - speed) / 0.6 s, without a limit. Steering as in
+    `rare_envs.control.idm.steering_control`, towards the middle of the target lane.
+
+    Args:
+        aim: Their targets.
+        x: Place along the road [m], of the same shape, as the other tensors.
+        y: Place across the road [m].
+        heading: Relative to the road [rad].
+        speed: [m/s].
+        road: The road.
+
+    Returns:
+        Acceleration [m/s^2] and steering angle [rad], in a last axis of 2.
+    """
+    acceleration = (constant(tuple(TARGET_SPEEDS), speed)[aim.speed] - speed) / _TAU_SPEED
+    centres, _ = _lanes(road, y.dtype, y.device)
+    if road.reference_line is not None:
+        ahead = road.reference_line.at(x + speed * _TAU_PURSUIT).heading - road.reference_line.at(x).heading
+        heading = heading - ahead
+    return torch.stack((acceleration, steering_control(y - centres[aim.lane], heading, speed)), dim=-1)
+
+
+def _nearest_speed(speed: Tensor) -> Tensor:
+    """Return the index of the nearest target speed; half-way between two the even one, as NumPy rounds."""
+    first, last = TARGET_SPEEDS[0], TARGET_SPEEDS[-1]
+    index = torch.round((speed - first) / (last - first) * (len(TARGET_SPEEDS) - 1))
+    return index.clamp(0, len(TARGET_SPEEDS) - 1).long()
+
+
+@cache  # never forgotten: recorded rollouts read it where it is
+def _lanes(road: Road, dtype: torch.dtype, device: torch.device) -> tuple[Tensor, Tensor]:
+    """Return the centres and widths of the lanes [m]."""
+    with torch.inference_mode(False):
+        edges = torch.tensor(road.edges, dtype=dtype, device=device)
+        return (edges[1:] + edges[:-1]) / 2, edges[1:] - edges[:-1]

@@ -1,17 +1,166 @@
-"""IDM + MOBIL: rule-based drivers of the traffic that follow, keep their lane, and change it where that is worth it."""
+"""IDM + MOBIL: rule-based drivers that follow, keep their lane, and change it where that is worth it.
+
+MOBIL minimises the overall braking that a change induces. A change to a neighbouring lane is worth it if
+
+    a~_c - a_c + p [(a~_n - a_n) + (a~_o - a_o)] > a_th,
+
+with the accelerations of the changing vehicle c, its new follower n and its old follower o before and after (~) the
+change, all by the car-following model; and safe if a~_n >= -b_safe.
+
+References:
+    Kesting, Treiber and Helbing, "General lane-changing model MOBIL for car-following models", Transportation Research
+    Record 1999, 86-94, 2007: their symmetric rules, no lane is for overtaking only.
+    Leurent, "An environment for autonomous driving decision-making", 2018: HighwayEnv, `IDMVehicle.mobil`.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from typing import ClassVar
+from dataclasses import dataclass, field, replace
+from typing import ClassVar, NamedTuple
 
 import torch
 from torch import Tensor
 
-from rare_envs.control.idm import IDM
-from rare_envs.control.mobil import LaneChoice, Mobil, acceleration_behind
-from rare_envs.control.steering import TAU_LATERAL, yaw_rate_towards
-from rare_envs.traffic.neighbours import OWN, LaneTraffic, find_neighbours, nearest
+from rare_envs.control.idm import IDM, TAU_LATERAL, yaw_rate_towards
+from rare_envs.traffic.neighbours import LEFT, OWN, RIGHT, LaneTraffic, Lead, Neighbours, find_neighbours, nearest
+
+_SIDES = (LEFT, RIGHT)
+_NO_LIMIT = 1e12
+"""A deceleration [m/s^2] that no gap asks for."""
+
+
+class LaneChoice(NamedTuple):
+    """Value of changes of M vehicles to the lane on the left and on the right; shapes (B, M, 2)."""
+
+    incentive: Tensor
+    """Left-hand side of the criterion [m/s^2]; -inf where there is no lane."""
+    safe: Tensor
+    """Whether there is a lane, and nobody would have to brake harder than is safe."""
+    wanted: Tensor
+    """Whether the change is safe and worth it."""
+
+
+@dataclass(frozen=True)
+class Mobil:
+    """Parameters of MOBIL.
+
+    Threshold and safe deceleration are those of Kesting et al. (2007). Where HighwayEnv's `IDMVehicle` differs
+    (`Mobil.highway_env`): politeness 0, a threshold of 0.2 m/s^2, at most 2 m/s^2 of braking imposed. It does not look
+    at what the changing vehicle itself would have to brake. Vehicles count in a lane up to 1 m beyond its edge, so that
+    one counts in two lanes. Of two lanes that are worth it HighwayEnv takes the right one, we the better one.
+    Accelerations are not limited to what the brakes can do, in both and in the paper.
+
+    Raises:
+        ValueError: If the safe deceleration is not positive, or the threshold or the delay is negative.
+
+    Example:
+        >>> from rare_envs.traffic import State, straight
+        >>> x, y = torch.tensor([[0.0, 20.0]]), torch.tensor([[4.0, 4.0]])  # a slow lead, the left lane is free
+        >>> state = State(x, y, 0 * x, torch.tensor([[20.0, 10.0]]), theta=x[:, :0])
+        >>> choice = Mobil().choose(LaneTraffic.of(state, straight(2)), slice(0, 1), IDM())
+        >>> choice.wanted.tolist()
+        [[[True, False]]]
+    """
+
+    politeness: float = 0.25
+    """p: weight of the others' accelerations; the middle of the range of 0 to 0.5 that Treiber calls realistic on his
+    page about the model."""
+    threshold: float = 0.1
+    """a_th [m/s^2]."""
+    safe_deceleration: float = 4.0
+    """b_safe [m/s^2]."""
+    delay: float = 1.0
+    """Time between two decisions of a vehicle [s], HighwayEnv's; the paper decides at every step."""
+    own_safety: bool = True
+    """Whether the changing vehicle's own braking is limited by b_safe too: a vehicle that is abreast with its centre
+    ahead is no follower, so that the paper's criterion does not see it."""
+    reach: float = 0.0
+    """Distance beyond a lane's edge [m] up to which a centre counts in the lane."""
+    least_speed: float = 1.0
+    """Speed [m/s] below which nobody begins a change, HighwayEnv's."""
+
+    def __post_init__(self) -> None:
+        if not self.safe_deceleration > 0 or self.threshold < 0 or self.delay < 0:
+            raise ValueError(
+                "Expected a positive safe deceleration and a threshold and a delay that are not negative, got "
+                f"{self.safe_deceleration}, {self.threshold} and {self.delay}."
+            )
+
+    @classmethod
+    def highway_env(cls) -> Mobil:
+        """Return the parameters and conventions of HighwayEnv's `IDMVehicle`."""
+        return cls(0.0, 0.2, 2.0, 1.0, own_safety=False, reach=1.0)
+
+    def choose(self, traffic: LaneTraffic, who: slice, idm: IDM, target: Tensor | None = None) -> LaneChoice:
+        """Return what changes to the left and to the right are worth.
+
+        Args:
+            traffic: B scenes of V vehicles.
+            who: The M vehicles that choose, of the V.
+            idm: Model by which everybody accelerates.
+            target: Lane that each vehicle moves to, its own if it keeps it, int64, shape (B, V); None if all keep it.
+        """
+        around = find_neighbours(traffic, who, traffic.lane if target is None else target, self.reach)
+        return self.judge(traffic, who, idm, around)
+
+    def judge(self, traffic: LaneTraffic, who: slice, idm: IDM, around: Neighbours) -> LaneChoice:
+        """Return the same for known neighbours."""
+        unlimited = replace(idm, max_deceleration=_NO_LIMIT)
+        batch, m, _ = around.lead.shape
+        own = torch.arange(traffic.x.shape[1], device=traffic.x.device)[who].view(1, m, 1).expand(batch, m, 2)
+        lead, follower = around.lead[..., _SIDES], around.follower[..., _SIDES]
+        old_lead, old_follower = around.lead[..., OWN, None], around.follower[..., OWN, None]
+
+        def by(behind: Tensor, ahead: Tensor) -> Tensor:
+            return acceleration_behind(traffic, unlimited, behind, ahead)
+
+        after = by(own, lead)
+        of_follower = by(follower, own)
+        gain = after - by(own[..., :1], old_lead)
+        others = of_follower - by(follower, lead) + by(old_follower, old_lead) - by(old_follower, own[..., :1])
+        exists = around.exists[..., _SIDES]
+        incentive = torch.where(exists, gain + self.politeness * others, -torch.inf)
+        safe = exists & (of_follower >= -self.safe_deceleration)
+        if self.own_safety:
+            safe = safe & (after >= -self.safe_deceleration)
+        return LaneChoice(incentive, safe, safe & (incentive >= self.threshold))
+
+
+def acceleration_behind(traffic: LaneTraffic, idm: IDM, follower: Tensor, lead: Tensor) -> Tensor:
+    """Return the acceleration of followers behind leads [m/s^2]; 0 where there is no follower.
+
+    Args:
+        traffic: B scenes of V vehicles.
+        idm: The model.
+        follower: Indices of the V, -1 for none, int64, shape (B, M, K) or one that broadcasts with it.
+        lead: Likewise.
+
+    Returns:
+        Shape (B, M, K).
+
+    Example:
+        >>> from rare_envs.traffic import State, straight
+        >>> x = torch.tensor([[0.0, 30.0]])
+        >>> traffic = LaneTraffic.of(State(x, 0 * x, 0 * x, 0 * x + 15.0, theta=x[:, :0]), straight(1))
+        >>> first, second, nobody = (torch.tensor([[[k]]]) for k in (0, 1, -1))
+        >>> round(acceleration_behind(traffic, IDM(), first, second).item(), 2)  # 25 m behind another
+        0.2
+        >>> acceleration_behind(traffic, IDM(), nobody, first).item()
+        0.0
+    """
+    follower, lead = follower + torch.zeros_like(lead), lead + torch.zeros_like(follower)
+
+    def of(values: Tensor, index: Tensor) -> Tensor:
+        return values[:, None, :].expand(-1, index.shape[1], -1).gather(2, index.clamp(min=0))
+
+    speed = of(traffic.speed, follower)
+    centres = of(traffic.x, lead) - of(traffic.x, follower)
+    gap = centres - 0.5 * (of(traffic.length, lead) + of(traffic.length, follower))
+    along = of(traffic.speed, lead) * torch.cos(of(traffic.heading, lead) - of(traffic.heading, follower))
+    free = lead < 0
+    gap, closing_speed = torch.where(free, torch.inf, gap), torch.where(free, 0.0, speed - along)
+    return torch.where(follower < 0, 0.0, idm.acceleration(speed, Lead(gap, closing_speed)))
+
 
 SETTLED = 0.5
 """A change ends when the centre of the vehicle is this close to the middle of its target lane [m]."""
@@ -19,7 +168,7 @@ SETTLED = 0.5
 
 @dataclass(frozen=True)
 class LaneChangingDriver:
-    """IDM along the road, MOBIL for the lane, and the lane keeping of `rare_envs.control.steering` towards it.
+    """IDM along the road, MOBIL for the lane, and the lane keeping of `rare_envs.control.idm` towards it.
 
     Vehicles decide once in `Mobil.delay`, each in a phase of its own that follows from its place when it is first
     driven, as in HighwayEnv. A change under way is not reconsidered until it ends (the centre is within `SETTLED` of

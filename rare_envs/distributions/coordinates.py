@@ -201,8 +201,8 @@ class Coordinates:
     def from_dict(cls, data: Mapping[str, Any]) -> Coordinates:
         """Return the coordinates that `to_dict` describes.
 
-        `coordinates` lists "plain", "log" or {"closing_behind": column, "gap": column}, in the order of x. Older files
-        have a list `logarithmic` of true and false in its place.
+        `coordinates` lists "plain", "log" or {"closing_behind": column, "gap": column}, in the order of x; plain ones
+        may be left out.
 
         Raises:
             ValueError: An entry is not valid.
@@ -304,21 +304,10 @@ def _format_kind(kind: CoordinateKind) -> str | dict[str, str]:
 
 
 def _read_kinds(data: Mapping[str, Any]) -> tuple[CoordinateKind, ...]:
-    if "coordinates" not in data:
-        return _read_flags(data)
-    if data.get("logarithmic"):
-        raise ValueError("Expected coordinates or logarithmic, not both.")
-    kinds = data["coordinates"]
+    kinds = data.get("coordinates", ["plain"] * as_finite("low", data["low"]).size)
     if not isinstance(kinds, list | tuple):
         raise ValueError(f"Expected coordinates as a list, one for each column, got {kinds!r}.")
     return tuple(map(_read_kind, kinds))
-
-
-def _read_flags(data: Mapping[str, Any]) -> tuple[CoordinateKind, ...]:
-    flags = data.get("logarithmic") or [False] * as_finite("low", data["low"]).size
-    if not isinstance(flags, list | tuple) or not all(isinstance(flag, bool) for flag in flags):
-        raise ValueError(f"Expected logarithmic as a list of true and false, got {flags!r}.")
-    return tuple("log" if flag else "plain" for flag in flags)
 
 
 def _read_kind(kind: Any) -> CoordinateKind:

@@ -29,7 +29,7 @@ def read_distribution(data: Mapping[str, Any]) -> FileDistribution:
     """
     if "alpha" in data:
         return BetaDistribution.from_dict(data)
-    if "coordinates" in data or data.get("order") or data.get("logarithmic"):
+    if "coordinates" in data or data.get("order"):
         return CoordinateMixture.from_dict(data)
     return TruncatedGaussianMixture.from_dict(data)
 
@@ -438,7 +438,7 @@ def _read_refit(i: int, refit: object, data: Mapping[str, Any]) -> FileDistribut
         wrong = f"no {', '.join(missing)}" if missing else f"{', '.join(others)} of its own"
         raise ValueError(f"Expected refits[{i}] with {', '.join(wanted)}, for the rest as its base, got {wrong}.")
     # Coordinates of its own come with an order of their own, or that of x.
-    inherited = {k: v for k, v in data.items() if "coordinates" not in refit or k not in ("order", "logarithmic")}
+    inherited = {k: v for k, v in data.items() if "coordinates" not in refit or k != "order"}
     try:
         return read_distribution({**inherited, **refit})
     except ValueError as error:

@@ -118,7 +118,7 @@ def find_root(
         chosen = rows.astype(np.intp)
         error = np.clip(to_normal(x, chosen) - u[chosen], -MAX_ERROR, MAX_ERROR)
         error = np.where(x <= low[chosen], -MAX_ERROR, error)
-        return np.where(x >= high[chosen], MAX_ERROR, error)
+        return np.asarray(np.where(x >= high[chosen], MAX_ERROR, error))
 
     rows = np.arange(len(u), dtype=np.float64)
     return np.asarray(elementwise.find_root(find_error, (low, high), args=(rows,)).x)
@@ -316,7 +316,7 @@ def log_interval(a: FloatArray, b: FloatArray, width: FloatArray) -> FloatArray:
             square = (a[narrow] + 0.5 * w) ** 2
             series = np.log(w) + np.log1p((square - 1.0) * w * w / 24.0)
             out[narrow] = series - 0.5 * square - LOG_SQRT_2PI
-    return out
+    return cast(FloatArray, out)
 
 
 def truncated_quantile(a: FloatArray, b: FloatArray, log_v: FloatArray, log_1mv: FloatArray) -> FloatArray:

@@ -1,8 +1,10 @@
-"""Errors of egos: an ego that is gone, that does not answer, or that failed on a scenario."""
+"""Errors of egos; policies are known by their `predict`, and what is no ego is refused in the same words."""
 
 from __future__ import annotations
 
-from typing import ClassVar
+import inspect
+from collections.abc import Sequence
+from typing import Any, ClassVar, NoReturn
 
 
 class EgoGone(BaseException):
@@ -48,3 +50,74 @@ def reason_of(error: BaseException) -> str:
     if isinstance(error, ValueError) and words:  # ours say what is wrong by themselves
         return words
     return f"{type(error).__name__}: {words}" if words and not isinstance(error, SystemExit) else repr(error)
+
+
+def is_policy(ego: object) -> bool:
+    """Return whether an object, and not a class, has Stable-Baselines3's `predict`.
+
+    Example:
+        >>> class Coasting:
+        ...     def predict(self, observation, state=None, episode_start=None, deterministic=True): ...
+        >>> is_policy(Coasting()), is_policy(Coasting), is_policy("idm")
+        (True, False, False)
+    """
+    # not isinstance of a Protocol, which takes a predict that is no function, and misses one that is passed on
+    return not isinstance(ego, type) and callable(getattr(ego, "predict", None))
+
+
+def check_predict(ego: Any) -> None:
+    """Refuse a policy whose `predict` does not take the arguments that Stable-Baselines3's takes.
+
+    Args:
+        ego: An object with `predict`.
+
+    Raises:
+        ValueError: If it takes fewer, as a `predict(observation)` does.
+
+    Example:
+        >>> class Short:
+        ...     def predict(self, observation): ...
+        >>> check_predict(Short())
+        Traceback (most recent call last):
+        ValueError: Expected predict(observation, state, episode_start, deterministic), as Stable-Baselines3 has it, got predict(observation) of Short.
+    """  # noqa: E501 (the example shows a whole message)
+    try:
+        signature = inspect.signature(ego.predict)
+    except (TypeError, ValueError):  # of a built-in function it is not known
+        return
+    try:
+        signature.bind(None, state=None, episode_start=None, deterministic=True)
+    except TypeError as error:
+        raise ValueError(
+            "Expected predict(observation, state, episode_start, deterministic), as Stable-Baselines3 has it, got "
+            f"predict{signature} of {type(ego).__name__}."
+        ) from error
+
+
+def refuse_ego(ego: object, origin: str = "", known: Sequence[str] = ("idm",)) -> NoReturn:
+    """Refuse what is no ego.
+
+    Args:
+        ego: A name, a class, or an object that is no ego.
+        origin: Where it came from, if not from the caller, such as "from make_ego()".
+        known: Names of egos that would have been taken.
+
+    Raises:
+        ValueError: Always; it says what was expected.
+
+    Example:
+        >>> refuse_ego(3, "from make_ego()")
+        Traceback (most recent call last):
+        ValueError: Expected 'idm' or an object with a method predict(observation, ...), got int from make_ego().
+    """
+    origin, names = f" {origin}" if origin else "", ", ".join(map(repr, known))
+    if isinstance(ego, str):
+        raise ValueError(
+            f"Unknown ego {ego!r}{origin}; expected {names} or an object. Names and files become objects by "
+            f"agents.load_ego({ego!r})."
+        )
+    if isinstance(ego, type):
+        raise ValueError(f"Expected an ego, got the class {ego.__name__}{origin}; make or train one of it first.")
+    raise ValueError(
+        f"Expected {names} or an object with a method predict(observation, ...), got {type(ego).__name__}{origin}."
+    )

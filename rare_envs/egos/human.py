@@ -9,11 +9,14 @@ from typing import Any, ClassVar, NamedTuple
 import torch
 from torch import Tensor
 
-from rare_envs.control.glances import MOST_URGENT_GLANCE, Glances, count_glance_draws, draw_glances
 from rare_envs.control.human_driver import (
+    MOST_URGENT_GLANCE,
+    Glances,
     HumanDriverModel,
     Percept,
     anticipate,
+    count_glance_draws,
+    draw_glances,
     estimate_leads,
     in_wandering_zone,
     inverse_tau,
@@ -21,7 +24,7 @@ from rare_envs.control.human_driver import (
     respond,
     step_errors,
 )
-from rare_envs.control.steering import lane_keeping
+from rare_envs.control.idm import lane_keeping
 from rare_envs.simulation.episode import Episode
 from rare_envs.simulation.world import World
 

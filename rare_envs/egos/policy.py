@@ -12,11 +12,10 @@ from torch import Tensor
 
 from rare_envs.control.actions import DISCRETE_ACTIONS, IDLE, META_ACTIONS, to_physical
 from rare_envs.devices import move_to
+from rare_envs.egos.dense_policies import DenseInference, find_inference
+from rare_envs.egos.errors import refuse_ego
 from rare_envs.egos.inference import PolicyQuery, query_policy
-from rare_envs.egos.needs import RULE_BASED_EGOS, WorldEgo, find_rule_based, resolve
-from rare_envs.egos.plain_callables import ModuleEgo
-from rare_envs.egos.sb3.dense_inference import DenseInference, find_inference
-from rare_envs.egos.validation import refuse_ego
+from rare_envs.egos.needs import RULE_BASED_EGOS, ModuleEgo, WorldEgo, find_rule_based, resolve
 from rare_envs.egos.wrappers import find_frame_stacking, wrap_policy
 from rare_envs.sensors.kinds import map_kinds
 from rare_envs.simulation.background import Background, TrafficBackground

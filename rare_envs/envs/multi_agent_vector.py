@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from rare_envs.control.actions import IDLE, read_actions
-from rare_envs.egos.loading import load_named_ego
-from rare_envs.egos.needs import resolve
+from rare_envs.egos.needs import load_named_ego, resolve
 from rare_envs.egos.policy import as_driver
 from rare_envs.envs.parallel import select_agents, select_rewards
 from rare_envs.envs.rows_and_infos import merge_rows, put_masked, to_object_rows

@@ -12,8 +12,7 @@ from pettingzoo import ParallelEnv
 from torch import Tensor
 
 from rare_envs.control.actions import IDLE, read_actions
-from rare_envs.egos.loading import load_named_ego
-from rare_envs.egos.needs import resolve
+from rare_envs.egos.needs import load_named_ego, resolve
 from rare_envs.egos.policy import as_driver
 from rare_envs.envs.rendering import RENDER_MODES, Display
 from rare_envs.envs.rows_and_infos import Info, SingleObservation, episode_info, step_info

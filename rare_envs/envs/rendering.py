@@ -9,11 +9,11 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from rare_envs.control.meta_actions import TARGET_SPEEDS
+from rare_envs.control.actions import TARGET_SPEEDS
 from rare_envs.scenarios.base import Scenario
 from rare_envs.simulation.episode import Episode
 from rare_envs.simulation.world import World
-from rare_envs.traffic.overlap import pairwise_overlaps
+from rare_envs.traffic.bodies import pairwise_overlaps
 from rare_envs.traffic.palette import CRASH_COLOUR, ROLE_COLOURS, as_rgb
 from rare_envs.traffic.road import Road
 from rare_envs.traffic.state import VEHICLE_LENGTH, VEHICLE_WIDTH, State

@@ -20,7 +20,7 @@ from rare_envs.multi_agent import terms_of, view_order
 from rare_envs.sensors.kinds import map_kinds
 from rare_envs.simulation.episode import Episode
 from rare_envs.traffic.crash import describe_crash
-from rare_envs.traffic.tensor_trees import map_leaves, map_tensors
+from rare_envs.traffic.state import map_leaves, map_tensors
 
 _T = TypeVar("_T")
 ROWS_AHEAD = 256

@@ -24,7 +24,7 @@ class DrivingEnv(HighwayEnvInterface, gym.Env[SingleObservation, Any]):
 
     Observation: `features`, see `rare_envs.simulation.observation`. Action: acceleration and steering in [-1, 1], see
     `rare_envs.control.actions`, for one tick; with `action="meta"` one of HighwayEnv's meta-actions, see
-    `rare_envs.control.meta_actions`, for one second. Reward: see `rare_envs.simulation.reward`. The episode terminates
+    `rare_envs.control.actions`, for one second. Reward: see `rare_envs.simulation.reward`. The episode terminates
     with a collision and is truncated at the horizon. `info` carries `scenario`, `x`, `min_ttc` [s], `collision`,
     `crashed` (the same), `speed` [m/s] and `reward_terms`, and at the end `measure` (f(x)), `collision_type` and
     `crash`, which say who ran into whom and how hard (`rare_envs.traffic.crash`), or None. Scripts for HighwayEnv

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from rare_envs.arrays import FloatArray
 from rare_envs.distributions.space import Distribution, ScenarioSpace
-from rare_envs.egos.validation import is_policy, refuse_ego
+from rare_envs.egos.errors import is_policy, refuse_ego
 from rare_envs.egos.wrappers import wrap_policy
 from rare_envs.interop.layouts import restore_class_parameters, set_idm
 from rare_envs.interop.scenario import HighwayEnvScenario

@@ -26,7 +26,7 @@ from rare_envs.interop.layouts import (
 )
 from rare_envs.interop.scene import HIGHWAY_ENV_MEASURES
 from rare_envs.measures.base import COLLISION
-from rare_envs.measures.time_to_collision import TTC_MAX
+from rare_envs.measures.longitudinal import TTC_MAX
 from rare_envs.plugins import did_you_mean
 
 SUPPORTED = (

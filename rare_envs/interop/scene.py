@@ -12,7 +12,7 @@ from highway_env.utils import lmap
 from numpy.typing import NDArray
 
 from rare_envs.arrays import FloatArray
-from rare_envs.measures.time_to_collision import TTC_MAX
+from rare_envs.measures.longitudinal import TTC_MAX
 
 TTC_MIN = 0.01
 """They are at least this [s], so that only a collision comes to 0 or less."""

@@ -1,25 +1,39 @@
 """Safety measures: how close an episode came to a collision; small is dangerous, always finite."""
 
-from rare_envs.measures.base import COLLISION, EpisodeMeasure, Measure, MeasureTerms
-from rare_envs.measures.braking import (
+from rare_envs.measures.base import COLLISION, EpisodeMeasure, Measure, MeasureTerms, Moment, Trace, TraceMeasure
+from rare_envs.measures.longitudinal import (
     DECELERATION_MAX,
+    EXPOSURE_MAX,
     MAX_BRAKING,
+    TTC_CRITICAL,
+    TTC_MAX,
+    Exposure,
     btn,
     drac,
     evasive_manoeuvre,
+    lidar_ttc,
+    mttc,
     required_deceleration,
+    tet,
+    thw,
+    tit,
     ttb,
+    ttc,
 )
-from rare_envs.measures.combination import Combined, minimum, weighted, with_collision
-from rare_envs.measures.encroachment import PET_MAX, pet
-from rare_envs.measures.episode_trace import Trace, TraceMeasure
-from rare_envs.measures.exposure import EXPOSURE_MAX, TTC_CRITICAL, Exposure, tet, tit
-from rare_envs.measures.moment import Moment
-from rare_envs.measures.registry import MEASURES, find_measure
-from rare_envs.measures.rss import MARGIN_MAX, RSS, rss_lateral, rss_longitudinal, rss_margin
+from rare_envs.measures.registry import MEASURES, Combined, find_measure, minimum, weighted, with_collision
 from rare_envs.measures.temporal_logic import SIGNALS, stl
-from rare_envs.measures.time_to_collision import TTC_MAX, lidar_ttc, mttc, thw, ttc
-from rare_envs.measures.two_dimensional import clearance, margin, ttc_2d
+from rare_envs.measures.two_dimensional import (
+    MARGIN_MAX,
+    PET_MAX,
+    RSS,
+    clearance,
+    margin,
+    pet,
+    rss_lateral,
+    rss_longitudinal,
+    rss_margin,
+    ttc_2d,
+)
 
 __all__ = [
     "COLLISION",

@@ -18,10 +18,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from rare_envs.measures.braking import drac
-from rare_envs.measures.episode_trace import Trace, TraceMeasure
-from rare_envs.measures.moment import Moment
-from rare_envs.measures.time_to_collision import thw, ttc
+from rare_envs.measures.base import Moment, Trace, TraceMeasure
+from rare_envs.measures.longitudinal import drac, thw, ttc
 from rare_envs.measures.two_dimensional import clearance
 
 ROBUSTNESS_MAX = 1e6

@@ -10,8 +10,7 @@ import torch
 from torch import Tensor
 
 from rare_envs.devices import may_hold
-from rare_envs.measures.base import EpisodeMeasure, Measure, MeasureState, MeasureTerms
-from rare_envs.measures.moment import Moment
+from rare_envs.measures.base import EpisodeMeasure, Measure, MeasureState, MeasureTerms, Moment
 from rare_envs.measures.registry import CLEARANCE, PAIR_CLEARANCE
 
 

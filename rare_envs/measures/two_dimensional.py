@@ -1,13 +1,32 @@
-"""Measures in two dimensions: the ego and every other vehicle as oriented boxes in the plane."""
+"""Measures in two dimensions: distances and times of oriented boxes, encroachment, and RSS.
+
+References:
+    Shalev-Shwartz, Shammah and Shashua, "On a formal model of safe and scalable self-driving cars", 2017: safe
+    longitudinal distance (same direction), safe lateral distance, dangerous situation.
+"""
+
+from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from rare_envs.measures.moment import GAP_MIN, Moment
-from rare_envs.measures.time_to_collision import TTC_MAX, time_to_edge
-from rare_envs.traffic.oriented_boxes import box_distance, time_to_contact
-from rare_envs.traffic.overlap import ego_overlaps, pairwise_overlaps
-from rare_envs.traffic.pairs import Encounter, encounter, encounters_of_all, least, pairs
+from rare_envs.measures.base import GAP_MIN, Moment, Trace
+from rare_envs.measures.longitudinal import TTC_MAX, time_to_edge
+from rare_envs.traffic.bodies import (
+    Encounter,
+    axes_of,
+    box_distance,
+    ego_overlaps,
+    encounter,
+    encounters_of_all,
+    least,
+    pairs,
+    pairwise_overlaps,
+    separation,
+    time_to_contact,
+)
+from rare_envs.traffic.state import VEHICLE_LENGTH, VEHICLE_WIDTH
 
 CLEARANCE_MAX = 1000.0
 """Cap of distances [m], where there is nobody."""
@@ -24,7 +43,7 @@ TIME_MIN = 1e-3
 def ttc_2d(moment: Moment) -> Tensor:
     """Return the time until the ego's box touches that of any other vehicle, if velocities and headings stay.
 
-    An exact swept test (`rare_envs.traffic.oriented_boxes.time_to_contact`) with every vehicle, whatever its lane, and
+    An exact swept test (`rare_envs.traffic.bodies.time_to_contact`) with every vehicle, whatever its lane, and
     the way to the edge of the road as in `ttc`; the least of them, at most `TTC_MAX`.
 
     Critical values: as for `ttc`, often 1.5 to 4 s.
@@ -164,3 +183,250 @@ def _margins(moment: Moment) -> Tensor:
     slow = (root - closing) / (2.0 * DRIFT**2)
     inverse = torch.where(closing > 0, 2.0 / (root + closing.clamp(min=0.0)), slow)
     return (gap.clamp(min=0.0) * inverse).amax(-1).clamp(min=TIME_MIN)
+
+
+PET_MAX = 5.0
+"""Cap of the post-encroachment time [s]; whoever comes later is no conflict."""
+NEAR = 25.0
+"""Centres further apart than this [m] are not looked at: no tick of delay brings bodies from there to contact."""
+TERNARY_STEPS = 16
+"""Steps of the search within a tick: to (2/3)^16 = 0.2 % of it."""
+PET_MIN = 1e-3
+"""And its floor [s], so that only a collision comes to 0 or less."""
+
+
+def pet(trace: Trace) -> Tensor:
+    """Return the post-encroachment time (PET): the least time between one body leaving a place and another taking it.
+
+    The place is ground that the bodies of the ego and of another vehicle both cover in the course of the episode,
+    either of them first. For every delay the ego's body is compared with where the other was (or will be) that much
+    earlier (or later), at all moments and on the straight ways between them. The least delay with an overlap is found
+    to a fraction of a tick, from how far apart the bodies were one tick of delay sooner.
+
+    Critical values: 1 to 1.5 s; under 1 s is a serious conflict.
+
+    Args:
+        trace: Of B episodes.
+
+    Returns:
+        Post-encroachment time [s], in (0, PET_MAX], over all other vehicles, shape (B,).
+
+    References:
+        Allen, Shin and Cooper, "Analysis of traffic conflicts and collisions", Transportation Research Record 667,
+        1978.
+
+    Example:
+        >>> import rare_envs
+        >>> problem = rare_envs.DrivingProblem("rare_envs/CarFollowing-v0", measure="pet", horizon=4.0)
+        >>> problem.evaluate([[20.0, 20.0, 30.0]]).round(2).tolist()  # the lead's rear was there so long ago
+        [1.55]
+    """
+    x, y, heading = trace.road.to_world(trace.state.x, trace.state.y, trace.state.heading)
+    pet = torch.full_like(x[0, :, 0], PET_MAX)
+    rows = torch.arange(len(pet), device=x.device)  # those without an overlap so far
+    last = min(len(x) - 1, round(PET_MAX / trace.dt))
+    nearer = None  # separations at one tick of delay less
+    for delay in range(last + 1):
+        apart = _apart(x, y, heading, trace.valid, delay)
+        if nearer is not None:
+            # the later of the two moments stays, the earlier one is a tick further back
+            sooner = nearer[:, 1:]
+            share = sooner / (sooner - apart).clamp(min=1e-12)
+            time = torch.where((apart <= 0) & (sooner > 0), (delay - 1 + share) * trace.dt, PET_MAX).amin((0, 1, 3))
+            pet = pet.index_copy(0, rows, time.clamp(PET_MIN, PET_MAX))
+            open_ = time >= PET_MAX
+            rows = rows[open_]
+            if not len(rows):
+                break
+            x, y, heading, apart = x[:, open_], y[:, open_], heading[:, open_], apart[:, :, open_]
+            trace = trace._replace(valid=trace.valid[:, open_])
+        nearer = apart
+    return pet
+
+
+def _apart(x: Tensor, y: Tensor, heading: Tensor, valid: Tensor, delay: int) -> Tensor:
+    """Return how far apart bodies are at a delay [m], the ego second and the ego first; `NEAR` where not driven.
+
+    Of each moment the least since the moment before: for one delay both bodies move on together.
+
+    Returns:
+        Shape (2, T - delay, B, N - 1); by the later of the two moments.
+    """
+    early, late = slice(0, len(x) - delay), slice(delay, len(x))
+
+    def between(one: slice, other: slice) -> Tensor:
+        dx, dy = x[other, :, 1:] - x[one, :, :1], y[other, :, 1:] - y[one, :, :1]
+        return torch.stack((dx, dy, heading[one, :, :1].expand_as(dx), heading[other, :, 1:]))
+
+    pose = torch.stack((between(late, early), between(early, late)), 1)  # (4, 2, T - delay, B, N - 1)
+    near = pose[0].square() + pose[1].square() < NEAR**2
+    apart = torch.full_like(pose[0], NEAR)
+    apart[near] = separation(axes_of(*pose[:, near]))
+    now, before = pose[:, :, 1:], pose[:, :, :-1]
+    ends = torch.minimum(apart[:, 1:], apart[:, :-1])
+    between_ticks = (ends > 0) & (ends < (now[:2] - before[:2]).abs().sum(0))
+    if bool(between_ticks.any()):
+        least = _least_between(before[:, between_ticks], now[:, between_ticks])
+        apart[:, 1:][between_ticks] = torch.minimum(ends[between_ticks], least)
+    return torch.where(valid[late, :, None], apart, NEAR)
+
+
+def _least_between(before: Tensor, now: Tensor) -> Tensor:
+    """Return the least separation on the straight ways between two poses (4, K), shape (K,), by ternary search.
+
+    The separation is a convex function of the time, so of two inner points the one that is further apart is left out.
+    """
+    low, high = torch.zeros_like(now[0]), torch.ones_like(now[0])
+    apart = torch.full_like(low, NEAR)
+    for _ in range(TERNARY_STEPS):
+        third = (high - low) / 3
+        left, right = (separation(axes_of(*torch.lerp(before, now, at))) for at in (low + third, high - third))
+        low, high = torch.where(left > right, low + third, low), torch.where(left > right, high, high - third)
+        apart = torch.minimum(left, right)
+    return apart
+
+
+MARGIN_MAX = 1000.0
+"""Cap of margins [m], where there is nobody."""
+
+
+@dataclass(frozen=True)
+class RSS:
+    """Parameters of the model. The paper leaves them open; these are the starting values of Intel's ad-rss-lib.
+
+    Example:
+        >>> from functools import partial
+        >>> from rare_envs.measures import Measure
+        >>> stricter = Measure(partial(rss_margin, rss=RSS(response=2.0)), collision=-1000.0, unit="m")
+        >>> stricter.of.keywords["rss"].brake_most
+        8.0
+    """
+
+    response: float = 1.0
+    """Response time rho of the ego [s]."""
+    response_others: float = 2.0
+    """Response time rho of the others [s]."""
+    accelerate: float = 3.5
+    """Largest acceleration during the response [m/s^2]."""
+    brake_least: float = 4.0
+    """Least braking of whoever follows [m/s^2]."""
+    brake_most: float = 8.0
+    """Hardest braking of whoever leads [m/s^2]."""
+    swerve: float = 0.2
+    """Largest lateral acceleration during the response [m/s^2]."""
+    steady: float = 0.8
+    """Least lateral braking after it [m/s^2]."""
+    wander: float = 0.1
+    """Lateral fluctuation mu [m]."""
+
+
+class Margins(NamedTuple):
+    """Distance less the safe one, of the ego and every other vehicle [m], shape (B, N - 1); too near if negative."""
+
+    along: Tensor
+    """Longitudinal: of whoever is behind, the ego or the other, to whoever is ahead."""
+    across: Tensor
+    """Lateral."""
+
+
+def margins(moment: Moment, rss: RSS) -> Margins:
+    """Return the margins of the ego with every other vehicle, along and across the road.
+
+    d_along = [v_r rho + a rho^2 / 2 + (v_r + a rho)^2 / (2 b_least) - v_f^2 / (2 b_most)]+ with v_r the speed of the
+    rear vehicle and v_f of the front one.
+
+    d_across = mu + [(v1 + v1') / 2 rho + v1'^2 / (2 b) - (v2 + v2') / 2 rho + v2'^2 / (2 b)]+ with v1 and v2 the
+    lateral speeds of the left and the right vehicle, positive to the right, v1' = v1 + a rho and v2' = v2 - a rho. The
+    squares are ways towards the other: 0 here for a vehicle that still moves away after its response.
+
+    Distances are those between boxes that are not turned. Vehicles that are level along the road (across it) have no
+    distance there; who is ahead (on the right) is told by centres.
+    """
+    state = moment.state
+    dx, dy = state.x[:, 1:] - state.x[:, :1], state.y[:, 1:] - state.y[:, :1]
+    along, across = state.speed * torch.cos(state.heading), state.speed * torch.sin(state.heading)
+    ahead, right = dx >= 0, dy >= 0
+    rear, front = torch.where(ahead, along[:, :1], along[:, 1:]), torch.where(ahead, along[:, 1:], along[:, :1])
+    response = torch.where(ahead, rss.response, rss.response_others)
+    faster = rear + rss.accelerate * response
+    way = (rear + faster) / 2 * response + faster.square() / (2 * rss.brake_least)
+    safe_along = (way - front.square() / (2 * rss.brake_most)).clamp(min=0.0)
+    side = torch.where(right, 1.0, -1.0)
+    sway = _sway(across[:, :1] * side, rss.response, rss) + _sway(-across[:, 1:] * side, rss.response_others, rss)
+    return Margins(
+        (dx.abs() - VEHICLE_LENGTH).clamp(min=0.0) - safe_along,
+        (dy.abs() - VEHICLE_WIDTH).clamp(min=0.0) - rss.wander - sway.clamp(min=0.0),
+    )
+
+
+def _sway(towards: Tensor, response: float, rss: RSS) -> Tensor:
+    """Return the lateral way [m] until at rest of a vehicle that first accelerates towards the other."""
+    faster = towards + rss.swerve * response
+    return (towards + faster) / 2 * response + faster.clamp(min=0.0).square() / (2 * rss.steady)
+
+
+def rss_longitudinal(moment: Moment, rss: RSS = RSS()) -> Tensor:
+    """Return the longitudinal RSS margin: distance less the safe one, of vehicles whose lateral distance is not safe.
+
+    Critical value: 0.
+
+    Args:
+        moment: Of B scenarios.
+        rss: Parameters.
+
+    Returns:
+        The least margin over the other vehicles [m], shape (B,).
+
+    Example:
+        >>> from rare_envs.measures import Moment
+        >>> moment = Moment.of_two(gap=60.0, speed=20.0, lead_speed=20.0)
+        >>> round(rss_longitudinal(moment).item(), 3)  # 60 - (21.75 + 23.5^2 / 8 - 20^2 / 16)
+        -5.781
+    """
+    of = margins(moment, rss)
+    return least(torch.where(of.across < 0, of.along, MARGIN_MAX), MARGIN_MAX)
+
+
+def rss_lateral(moment: Moment, rss: RSS = RSS()) -> Tensor:
+    """Return the lateral RSS margin: distance less the safe one, of vehicles whose longitudinal distance is not safe.
+
+    Critical value: 0.
+
+    Args:
+        moment: Of B scenarios.
+        rss: Parameters.
+
+    Returns:
+        The least margin over the other vehicles [m], shape (B,).
+
+    Example:
+        >>> from rare_envs.measures import Moment
+        >>> moment = Moment.of_two(gap=60.0, speed=20.0, lead_speed=20.0)
+        >>> round(rss_lateral(moment).item(), 3)  # level across, and 0.725 m of safe distance
+        -0.725
+    """
+    of = margins(moment, rss)
+    return least(torch.where(of.along < 0, of.across, MARGIN_MAX), MARGIN_MAX)
+
+
+def rss_margin(moment: Moment, rss: RSS = RSS()) -> Tensor:
+    """Return the RSS margin: a situation is dangerous where neither distance to a vehicle is safe.
+
+    The larger of the two margins with each vehicle, the least over vehicles: negative exactly in a dangerous situation.
+
+    Critical value: 0.
+
+    Args:
+        moment: Of B scenarios.
+        rss: Parameters.
+
+    Returns:
+        The margin [m], shape (B,).
+
+    Example:
+        >>> from rare_envs.measures import Moment
+        >>> moment = Moment.of_two(gap=60.0, speed=20.0, lead_speed=20.0)
+        >>> round(rss_margin(moment).item(), 3)  # the larger of both
+        -0.725
+    """
+    return least(torch.maximum(*margins(moment, rss)), MARGIN_MAX)

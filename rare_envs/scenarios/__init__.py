@@ -9,8 +9,7 @@ if TYPE_CHECKING:
     from rare_envs.distributions.space import Parameter
     from rare_envs.scenarios.base import Others, Scenario, columns, drive_points, keep_straight
     from rare_envs.scenarios.base_distributions import load_base
-    from rare_envs.traffic.reference_line import ReferenceLine
-    from rare_envs.traffic.road import Road, i80, straight
+    from rare_envs.traffic.road import ReferenceLine, Road, i80, straight
     from rare_envs.traffic.state import LANE_WIDTH, VEHICLE_LENGTH, VEHICLE_WIDTH, State
 
 __all__ = [
@@ -40,7 +39,7 @@ _LAZY = {
     "VEHICLE_WIDTH": "rare_envs.traffic.state",
     "Others": "rare_envs.scenarios.base",
     "Parameter": "rare_envs.distributions.space",
-    "ReferenceLine": "rare_envs.traffic.reference_line",
+    "ReferenceLine": "rare_envs.traffic.road",
     "Road": "rare_envs.traffic.road",
     "Scenario": "rare_envs.scenarios.base",
     "State": "rare_envs.traffic.state",

@@ -17,7 +17,7 @@ US101 = {
     "means": [[10.6561, 2.5113, 0.7264]],
     "covariances": [[[13.7428, 1.1543, 0.1011], [1.1543, 0.2879, -0.0142], [0.1011, -0.0142, 0.1254]]],
     "weights": [1.0],
-    "logarithmic": [False, True, True],
+    "coordinates": ["plain", "log", "log"],
     "provenance": {
         "kind": "moments of recorded events",
         "source": "NGSIM, US 101 (Los Angeles, southbound, 15 June 2005, congested), 370 vehicles over 640 m each",

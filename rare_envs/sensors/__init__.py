@@ -1,9 +1,15 @@
 """Sensors: lidar and perception of learned drivers, HighwayEnv's kinematics, the camera, and kinds of observation."""
 
-from rare_envs.sensors.kinds import OBSERVATIONS, read_kinds
-from rare_envs.sensors.kinematics import KINEMATICS_FEATURES, observe_kinematics
-from rare_envs.sensors.lidar import AHEAD_BEAM, BEAMS, MAX_RANGE
-from rare_envs.sensors.perception import FEATURES, RANGE_COLUMNS, RATE_COLUMNS, perceive_traffic
+from rare_envs.sensors.kinds import KINEMATICS_FEATURES, OBSERVATIONS, observe_kinematics, read_kinds
+from rare_envs.sensors.lidar import (
+    AHEAD_BEAM,
+    BEAMS,
+    FEATURES,
+    MAX_RANGE,
+    RANGE_COLUMNS,
+    RATE_COLUMNS,
+    perceive_traffic,
+)
 
 __all__ = [
     "AHEAD_BEAM",

@@ -1,7 +1,25 @@
-"""Kinds of observation: their names, and functions of one kind or of several together by name."""
+"""Kinds of observation by name, and HighwayEnv's `Kinematics`: the ego and the vehicles nearest to it, one row each.
+
+Layout, normalisation, order and clipping are those of `KinematicObservation` with HighwayEnv's defaults, so its users'
+policies read ours as their own. Positions and velocities are along and across the road: on a straight one that is
+HighwayEnv's frame, on a curved one it is what the lanes mean there, not a compass direction.
+
+References:
+    Leurent, "An environment for autonomous driving decision-making", 2018: HighwayEnv,
+    `envs/common/observation.py` and `road/road.py` (`close_objects_to`).
+"""
 
 from collections.abc import Callable
 from typing import Any
+
+import numpy as np
+import torch
+from gymnasium import spaces
+from torch import Tensor
+
+from rare_envs.devices import constant
+from rare_envs.traffic.road import Road
+from rare_envs.traffic.state import LANE_WIDTH, VEHICLE_LENGTH, State
 
 OBSERVATIONS = ("features", "lidar", "kinematics", "camera", "speed")
 """Kinds of observation by name."""
@@ -56,3 +74,63 @@ def map_kinds(function: Callable[..., Any], *observed: Any) -> Any:
 def batch_size(observed: Any) -> int:
     """Return the number of rows of an observation."""
     return len(next(iter(observed.values()))) if isinstance(observed, dict) else len(observed)
+
+
+KINEMATICS_ROWS = 5
+"""Vehicles in the observation, the observer first; missing ones are rows of zeros."""
+KINEMATICS_FEATURES = ("presence", "x", "y", "vx", "vy")
+"""Columns: 1 for a vehicle that is there; place [m] and velocity [m/s] along and across the road, of the observer as
+they are, of the others less the observer's."""
+MAX_SPEED = 40.0
+"""HighwayEnv's largest speed [m/s], from which its scales come."""
+VIEW = 5 * MAX_SPEED
+"""Vehicles whose centres are nearer than this [m] are seen, and x is divided by it; vx and vy by 2 `MAX_SPEED`, y by
+4 m for each lane."""
+BEHIND = 2 * VEHICLE_LENGTH
+"""Vehicles whose centres are this far behind [m], or further, are not seen."""
+
+
+def kinematics_space() -> "spaces.Box[np.float32]":
+    """Return the space of `observe_kinematics`, as HighwayEnv declares it, without bounds.
+
+    What is observed is clipped to [-1, 1] here as there, but Stable-Baselines3's `load(path, env)` wants equal spaces.
+    """
+    return spaces.Box(-np.inf, np.inf, (KINEMATICS_ROWS, len(KINEMATICS_FEATURES)), np.float32)
+
+
+def observe_kinematics(state: State, road: Road, vehicle: int = 0) -> Tensor:
+    """Return what a vehicle observes.
+
+    The others are those within `VIEW` and less than `BEHIND` behind, nearest along the road first (vehicles at one
+    distance in the order of the state), at most four of them.
+
+    Args:
+        state: Traffic of B scenarios.
+        road: Their road.
+        vehicle: Which of the N vehicles observes.
+
+    Returns:
+        Shape (B, 5, 5), float32, in [-1, 1]: rows of `KINEMATICS_FEATURES`, the observer's first.
+
+    Example:
+        >>> from rare_envs.traffic import straight
+        >>> x = torch.tensor([[0.0, 100.0]])
+        >>> state = State(x, 0 * x, 0 * x, torch.tensor([[20.0, 10.0]]), theta=x[:, :0])
+        >>> observe_kinematics(state, straight(1))[0, :2].tolist()  # presence, x / 200, y, vx / 80, vy
+        [[1.0, 0.0, 0.0, 0.25, 0.0], [1.0, 0.5, 0.0, -0.125, 0.0]]
+    """
+    moving = (state.x, state.y, state.speed * torch.cos(state.heading), state.speed * torch.sin(state.heading))
+    values = torch.stack((torch.ones_like(state.x), *moving), dim=-1)
+    own = values[:, vehicle : vehicle + 1]
+    others = torch.cat((values[:, :vehicle], values[:, vehicle + 1 :]), dim=1)
+    others = torch.cat((others[..., :1], others[..., 1:] - own[..., 1:]), dim=-1)
+
+    along, across = others[..., 1], others[..., 2]
+    seen = (torch.hypot(along, across) < VIEW) & (along > -BEHIND)
+    nearest = torch.where(seen, along.abs(), torch.inf).sort(dim=1, stable=True).indices[:, : KINEMATICS_ROWS - 1]
+    others = (others * seen[..., None]).gather(1, nearest[..., None].expand(-1, -1, len(KINEMATICS_FEATURES)))
+
+    rows = torch.cat((own, others), dim=1)
+    rows = torch.nn.functional.pad(rows, (0, 0, 0, KINEMATICS_ROWS - rows.shape[1]))
+    scales = constant((1.0, VIEW, LANE_WIDTH * road.lanes, 2 * MAX_SPEED, 2 * MAX_SPEED), rows)
+    return (rows / scales).clamp(-1.0, 1.0).float()

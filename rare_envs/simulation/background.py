@@ -63,7 +63,7 @@ class Background(Protocol):
         """Decide for one tick.
 
         Args:
-            features: `rare_envs.sensors.perception.FEATURES` of each vehicle, shape (B, M, 51).
+            features: `rare_envs.sensors.lidar.FEATURES` of each vehicle, shape (B, M, 51).
             weights: Weights of each scenario, shape (B, `weights.dim`); None for the driver's own.
             innovations: Standard normal draws, shape (B, M, 2); None for mean actions.
             memory: As the last call returned it, at the start `begin`.
@@ -135,7 +135,7 @@ def step_background(drivers: Background, state: BackgroundState, features: Tenso
     Args:
         drivers: Of the M vehicles.
         state: Theirs.
-        features: `rare_envs.sensors.perception.FEATURES` of each vehicle, shape (B, M, 51).
+        features: `rare_envs.sensors.lidar.FEATURES` of each vehicle, shape (B, M, 51).
 
     Returns:
         Accelerations [m/s^2] and yaw rates [rad/s], shape (B, M, 2), and the state one tick later. Beyond the last

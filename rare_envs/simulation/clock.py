@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from numbers import Real
 
-from rare_envs.control.meta_actions import DECISION
+from rare_envs.control.actions import DECISION
 
 LONGEST_TICK = 1.0
 """Largest dt [s]: at motorway speed a vehicle moves 40 m in it, farther than gaps are."""

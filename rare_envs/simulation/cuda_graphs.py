@@ -19,7 +19,7 @@ from rare_envs.measures.terms import TermTracker
 from rare_envs.simulation.episode import Episode
 from rare_envs.simulation.rollout import Driver, rollout
 from rare_envs.simulation.world import World
-from rare_envs.traffic.tensor_trees import map_tensors
+from rare_envs.traffic.state import map_tensors
 
 STEPS = 4
 """Numbers of rollouts that are recorded: a tile, a quarter of it, and so on; fewer rollouts are filled up."""

@@ -11,7 +11,7 @@ from rare_envs.simulation.clock import Clock
 from rare_envs.simulation.episode import Episode
 from rare_envs.simulation.reward import RewardTerms, reward_terms
 from rare_envs.simulation.world import World
-from rare_envs.traffic.lead import Lead
+from rare_envs.traffic.neighbours import Lead
 from rare_envs.traffic.state import State
 
 

@@ -6,13 +6,13 @@ from typing import Any, NamedTuple
 
 from torch import Tensor
 
-from rare_envs.control.meta_actions import Aim
+from rare_envs.control.actions import Aim
 from rare_envs.measures import EpisodeMeasure
 from rare_envs.measures.registry import MEASURES
 from rare_envs.sensors.camera import CameraContext
 from rare_envs.simulation.background import BackgroundState
 from rare_envs.simulation.episode_statistics import EpisodeStatistics
-from rare_envs.traffic.lead import Lead
+from rare_envs.traffic.neighbours import Lead
 from rare_envs.traffic.road import Road
 from rare_envs.traffic.state import State
 
@@ -39,7 +39,7 @@ class Episode(NamedTuple):
     road: Road
     """The road that all are on."""
     perception: Tensor | None = None
-    """Lidar features of the vehicles in this state, `rare_envs.sensors.perception.FEATURES`, shape (B, N, 51), the ego
+    """Lidar features of the vehicles in this state, `rare_envs.sensors.lidar.FEATURES`, shape (B, N, 51), the ego
     first; None in a world without lidar."""
     background_state: BackgroundState | None = None
     """State of the drivers around the ego, if they are not the scenario's script."""

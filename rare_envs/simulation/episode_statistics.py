@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 
 from rare_envs.measures import Moment, ttc
+from rare_envs.traffic.bodies import others_overlap
 from rare_envs.traffic.crash import NONE, Crash, crash_of, crash_of_others
-from rare_envs.traffic.overlap import others_overlap
 from rare_envs.traffic.state import State
 
 

@@ -11,8 +11,7 @@ from torch import Tensor
 
 from rare_envs.devices import constant, scalars
 from rare_envs.sensors.camera import Camera, take_picture
-from rare_envs.sensors.kinds import kinds_of
-from rare_envs.sensors.kinematics import kinematics_space, observe_kinematics
+from rare_envs.sensors.kinds import kinds_of, kinematics_space, observe_kinematics
 from rare_envs.sensors.lidar import BEAMS, MAX_RANGE
 from rare_envs.traffic.state import LANE_WIDTH, VEHICLE_LENGTH, State
 

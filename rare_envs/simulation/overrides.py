@@ -7,7 +7,7 @@ from torch import Tensor
 
 from rare_envs.control.idm import IDM
 from rare_envs.scenarios.base import Others, drive_points
-from rare_envs.traffic.lead import lead_of
+from rare_envs.traffic.neighbours import lead_of
 from rare_envs.traffic.vehicle_models import bicycle
 
 if TYPE_CHECKING:

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from rare_envs.distributions.space import Distribution, Parameter
 from rare_envs.sensors.camera import Camera, CameraContext, clear_day
-from rare_envs.sensors.camera.weather import read_weather, weather_parameters
+from rare_envs.sensors.camera.context import read_weather, weather_parameters
 from rare_envs.sensors.kinds import kinds_of
 from rare_envs.simulation.observation import observation_space
 

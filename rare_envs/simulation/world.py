@@ -10,13 +10,12 @@ import torch
 from gymnasium import spaces
 from torch import Tensor
 
-from rare_envs.control.actions import space_of_actions
-from rare_envs.control.meta_actions import follow_meta_actions, initial_aim
+from rare_envs.control.actions import follow_meta_actions, initial_aim, space_of_actions
 from rare_envs.devices import fixed_draws
 from rare_envs.measures import Moment
 from rare_envs.scenarios.base import Scenario
 from rare_envs.sensors.camera import CameraContext
-from rare_envs.sensors.perception import perceive_traffic
+from rare_envs.sensors.lidar import perceive_traffic
 from rare_envs.simulation.background import (
     FIRST_DRAWS,
     FIXED_SEED,
@@ -33,8 +32,8 @@ from rare_envs.simulation.episode_statistics import EpisodeStatistics
 from rare_envs.simulation.measurement import Measurement
 from rare_envs.simulation.overrides import apply_overrides
 from rare_envs.simulation.sensing import Sensing, WeatherDistributions
-from rare_envs.traffic.lead import lead_of
-from rare_envs.traffic.overlap import ego_overlaps, others_overlap
+from rare_envs.traffic.bodies import ego_overlaps, others_overlap
+from rare_envs.traffic.neighbours import lead_of
 from rare_envs.traffic.road import WorldPose
 from rare_envs.traffic.state import State
 from rare_envs.traffic.vehicle_models import bicycle

@@ -10,8 +10,7 @@ from typing import Any, NamedTuple
 
 import samplers
 from rare_envs.egos.errors import EgoGone
-from rare_envs.files import replace_text
-from rare_envs.json_text import format_json
+from rare_envs.files import format_json, replace_text
 from rare_envs.study.arguments import Question
 from rare_envs.study.errors import BadInput, as_bad_input, output_folder
 from rare_envs.study.evaluate import recheck

@@ -17,7 +17,7 @@ import samplers
 from rare_envs.distributions.fitted import FittedDistribution
 from rare_envs.distributions.space import Distribution
 from rare_envs.egos.errors import EgoGone
-from rare_envs.egos.spaces.ambiguities import AmbiguousActions, MissingStatistics
+from rare_envs.egos.needs import AmbiguousActions, MissingStatistics
 from rare_envs.measures.registry import MEASURES
 from rare_envs.problem import DrivingProblem
 from rare_envs.scenarios.base_distributions import load_base

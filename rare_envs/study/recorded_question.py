@@ -15,8 +15,7 @@ from typing import Any
 
 from agents.loading import find_ego_kind, strip_prefixes
 from rare_envs.code_trust import check_code_trust, note_own_run
-from rare_envs.files import read_text_file
-from rare_envs.json_text import parse_json_object
+from rare_envs.files import parse_json_object, read_text_file
 from rare_envs.study.arguments import Question, read_question
 from rare_envs.study.errors import BadInput, as_bad_input
 from rare_envs.study.journal import digest_contents, digest_files, find_changed_files, refuse_unfinished

@@ -18,8 +18,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rare_envs.files import check_ordinary, read_text_file
-from rare_envs.json_text import parse_json_object
+from rare_envs.files import check_ordinary, parse_json_object, read_text_file
 from rare_envs.plugins import one_line
 from rare_envs.study.errors import BadInput
 

@@ -22,8 +22,7 @@ import samplers
 from agents.loading import find_ego_kind, strip_prefixes
 from rare_envs.distributions.fitted import FittedDistribution
 from rare_envs.distributions.space import ScenarioSpace
-from rare_envs.files import read_text_file, replace_file, replace_text
-from rare_envs.json_text import format_json, parse_json_object
+from rare_envs.files import format_json, parse_json_object, read_text_file, replace_file, replace_text
 from rare_envs.study.arguments import Question
 from rare_envs.study.columns import MAX_SHOWN, list_columns
 from rare_envs.study.errors import BadInput

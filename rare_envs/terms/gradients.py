@@ -11,13 +11,13 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from rare_envs.arrays import FloatArray
-from rare_envs.measures.moment import Moment
+from rare_envs.measures.base import Moment
 from rare_envs.measures.terms import TermMeasure, find_order
 from rare_envs.simulation.episode import Episode
 from rare_envs.simulation.measurement import Measurement
 from rare_envs.simulation.rollout import Driver, StochasticDriver, begin_drive, drive_tick
 from rare_envs.simulation.world import World
-from rare_envs.traffic.tensor_trees import map_tensors
+from rare_envs.traffic.state import map_tensors
 
 GRADIENT_TILE = 256
 """Rollouts that are differentiated at once, at most."""

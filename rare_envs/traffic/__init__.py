@@ -1,10 +1,9 @@
 """Traffic: the state of vehicles on a road, vehicle models, geometry, overlap and crashes."""
 
+from rare_envs.traffic.bodies import boxes_overlap
 from rare_envs.traffic.crash import CRASH_KINDS, Crash, describe_crash, injury_risk
-from rare_envs.traffic.lead import Lead, lead_of
-from rare_envs.traffic.oriented_boxes import boxes_overlap
-from rare_envs.traffic.reference_line import ReferenceLine
-from rare_envs.traffic.road import Road, WorldPose, i80, straight
+from rare_envs.traffic.neighbours import Lead, lead_of
+from rare_envs.traffic.road import ReferenceLine, Road, WorldPose, i80, straight
 from rare_envs.traffic.state import LANE_WIDTH, VEHICLE_LENGTH, VEHICLE_WIDTH, State
 from rare_envs.traffic.vehicle_models import bicycle, point_mass
 

@@ -10,8 +10,7 @@ import torch
 from torch import Tensor
 
 from rare_envs.devices import indices
-from rare_envs.traffic.oriented_boxes import axes_of, boxes_overlap, crossing, project_on_axes
-from rare_envs.traffic.pairs import pairs, velocities
+from rare_envs.traffic.bodies import axes_of, boxes_overlap, crossing, pairs, project_on_axes, velocities
 from rare_envs.traffic.road import Road
 from rare_envs.traffic.state import State
 

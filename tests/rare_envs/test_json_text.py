@@ -2,7 +2,7 @@
 
 import pytest
 
-from rare_envs.json_text import parse_json_object
+from rare_envs.files import parse_json_object
 
 
 def test_an_object_comes_back():

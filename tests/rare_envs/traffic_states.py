@@ -2,8 +2,7 @@
 
 import torch
 
-from rare_envs.traffic.reference_line import ReferenceLine
-from rare_envs.traffic.road import Road
+from rare_envs.traffic.road import ReferenceLine, Road
 from rare_envs.traffic.state import State
 
 F64 = torch.float64

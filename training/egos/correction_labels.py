@@ -14,7 +14,7 @@ from agents.learned.networks import Policy
 from rare_envs.control.idm import IDM
 from rare_envs.simulation.rollout import drive
 from rare_envs.simulation.world import World
-from rare_envs.traffic.lead import Lead
+from rare_envs.traffic.neighbours import Lead
 from rare_envs.traffic.state import VEHICLE_LENGTH, VEHICLE_WIDTH, State
 
 EXPERT = IDM(

@@ -17,15 +17,14 @@ from rare_envs.distributions.space import Parameter
 from rare_envs.scenarios.base import SPEED_RANGE, Others, Scenario, columns
 from rare_envs.scenarios.base_distributions import load_base
 from rare_envs.scenarios.registry import scenario_named
-from rare_envs.sensors.camera.weather import CLEAR, SENSOR_NOISE_DISTRIBUTION, SUN_DISTRIBUTION
-from rare_envs.sensors.perception import perceive_traffic
+from rare_envs.sensors.camera.context import CLEAR, SENSOR_NOISE_DISTRIBUTION, SUN_DISTRIBUTION
+from rare_envs.sensors.lidar import perceive_traffic
 from rare_envs.simulation.background import Background, TrafficBackground, find_drivers
 from rare_envs.simulation.clock import Clock
 from rare_envs.simulation.episode import Episode
 from rare_envs.simulation.sensing import Sensing
 from rare_envs.simulation.world import World
-from rare_envs.traffic.reference_line import ReferenceLine
-from rare_envs.traffic.road import Road, i80
+from rare_envs.traffic.road import ReferenceLine, Road, i80
 from rare_envs.traffic.state import VEHICLE_LENGTH, State
 from training.egos.nominal_traffic import OrdinaryDrivers, draw_starts, make_ordinary_traffic
 

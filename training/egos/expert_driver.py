@@ -29,7 +29,7 @@ OFFSET_UNIT, HEADING_UNIT, CURVATURE_UNIT, NEAR_GAP, CLOSING_UNIT = 0.5, 0.05, 0
 def expert_outputs(episode: Episode, brakes: float = EXPERT_BRAKES) -> Tensor:
     """Return the outputs that the network should give.
 
-    Acceleration is IDM's behind the lead. The yaw rate is that of `rare_envs.control.steering` with the road's
+    Acceleration is IDM's behind the lead. The yaw rate is that of `rare_envs.control.idm` with the road's
     curvature fed forward, so that it does not run wide, and with at most `MAX_HEADING` towards the lane. Below
     `MIN_STEERING_SPEED` it uses that speed for the curvature of the path, which is gentle.
 

@@ -35,7 +35,7 @@ from rare_envs.simulation.rollout import Driver, drive
 from rare_envs.simulation.sensing import Sensing
 from rare_envs.simulation.world import World
 from rare_envs.traffic.crash import NONE, ROAD_EDGE
-from rare_envs.traffic.lead import lead_index
+from rare_envs.traffic.neighbours import lead_index
 from rare_envs.traffic.state import VEHICLE_LENGTH, VEHICLE_WIDTH, State
 from samplers.statistics import clopper_pearson
 from training.command_line import report_errors, run_command

@@ -25,10 +25,9 @@ from rare_envs.scenarios.base import SPEED_RANGE, Others, Scenario, columns
 from rare_envs.scenarios.base_distributions import load_base
 from rare_envs.scenarios.car_following import CAR_FOLLOWING
 from rare_envs.scenarios.highway import HIGHWAY
-from rare_envs.sensors.perception import SPEED_COLUMN
+from rare_envs.sensors.lidar import SPEED_COLUMN
 from rare_envs.simulation.background import Background, DriverWeights, TrafficBackground
-from rare_envs.traffic.reference_line import ReferenceLine
-from rare_envs.traffic.road import Road, i80, straight
+from rare_envs.traffic.road import ReferenceLine, Road, i80, straight
 from rare_envs.traffic.state import LANE_WIDTH, VEHICLE_LENGTH, State
 
 SECONDS = 60.0

@@ -21,9 +21,8 @@ import torch
 from torch import Tensor
 
 from agents import LearnedDriver
-from rare_envs.sensors.lidar import AHEAD_BEAM, MAX_RANGE
-from rare_envs.sensors.perception import RANGE_COLUMNS, RATE_COLUMNS
-from rare_envs.traffic.oriented_boxes import boxes_overlap
+from rare_envs.sensors.lidar import AHEAD_BEAM, MAX_RANGE, RANGE_COLUMNS, RATE_COLUMNS
+from rare_envs.traffic.bodies import boxes_overlap
 from samplers.problem import FloatArray
 from training.data.table import DT
 from training.imitation.traffic import Recording, Traffic, lane_of, replay_features, start_replay, step_replay

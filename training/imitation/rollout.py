@@ -17,8 +17,7 @@ from torch import Tensor
 
 from agents.learned.coloured_noise import AutoregressiveNoise
 from agents.learned.networks import Policy
-from rare_envs.sensors.lidar import AHEAD_BEAM
-from rare_envs.sensors.perception import LANE_OFFSET_COLUMN, RANGE_COLUMNS, RATE_COLUMNS, SPEED_COLUMN
+from rare_envs.sensors.lidar import AHEAD_BEAM, LANE_OFFSET_COLUMN, RANGE_COLUMNS, RATE_COLUMNS, SPEED_COLUMN
 from training.imitation.clone import denormalise_action
 from training.imitation.config import Config
 from training.imitation.traffic import Recording, Traffic, replay_features, start_replay, step_replay

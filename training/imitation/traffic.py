@@ -12,8 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from rare_envs.sensors.lidar import Bodies
-from rare_envs.sensors.perception import OnRoad, perceive
+from rare_envs.sensors.lidar import Bodies, OnRoad, perceive
 from training.data.scenes import TrafficScene
 from training.data.table import DT
 

@@ -4,7 +4,7 @@
 
 FOLDER holds `lanes.csv` (lane, s, x, y: points on the centre lines of six lanes, lane 0 the rightmost) and
 `boundaries.csv` (boundary, x, y: the lines to the left of those lanes), in metres, y positive to the left of x. The
-reference line is a `rare_envs.traffic.reference_line.ReferenceLine` in the middle of the leftmost lane. Its curvatures,
+reference line is a `rare_envs.traffic.road.ReferenceLine` in the middle of the leftmost lane. Its curvatures,
 its start and a constant distance to each other lane are fitted by least squares to all lanes but the rightmost, which
 bends towards two ramps.
 """
@@ -20,8 +20,7 @@ from pyarrow import ArrowInvalid, csv
 from scipy.optimize import least_squares
 
 from rare_envs.files import replace_text
-from rare_envs.traffic.reference_line import ReferenceLine
-from rare_envs.traffic.road import Road
+from rare_envs.traffic.road import ReferenceLine, Road
 from samplers.problem import FloatArray
 from training.command_line import report_errors, run_command
 

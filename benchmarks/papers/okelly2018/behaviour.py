@@ -11,9 +11,8 @@ from torch import Tensor
 
 from benchmarks.papers.okelly2018.findings import PaperClaim, compare_means
 from benchmarks.papers.record import TestedClaim
-from rare_envs.measures.time_to_collision import TTC_MAX
-from rare_envs.sensors.lidar import beam_angles
-from rare_envs.sensors.perception import RANGE_COLUMNS, RATE_COLUMNS
+from rare_envs.measures.longitudinal import TTC_MAX
+from rare_envs.sensors.lidar import RANGE_COLUMNS, RATE_COLUMNS, beam_angles
 from rare_envs.simulation.episode import Episode
 from rare_envs.simulation.rollout import drive
 from samplers.problem import FloatArray

@@ -5,12 +5,22 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from rare_envs.sensors.camera.ground import Lines, View, colour_ground, cover_of, road_lines
-from rare_envs.sensors.camera.light import RGB, Light, colour_sky, light_of
-from rare_envs.sensors.camera.pinhole import Camera, Pixels, pixels
-from rare_envs.sensors.camera.sensor_noise import draw_pixel_noise
-from rare_envs.sensors.camera.vehicles import PAINT, Boxes, cast_shadows, draw_boxes
-from rare_envs.sensors.camera.weather import CameraContext
+from rare_envs.sensors.camera.context import Camera, CameraContext, Pixels, pixels
+from rare_envs.sensors.camera.surfaces import (
+    PAINT,
+    RGB,
+    Boxes,
+    Light,
+    Lines,
+    View,
+    cast_shadows,
+    colour_ground,
+    colour_sky,
+    cover_of,
+    draw_boxes,
+    light_of,
+    road_lines,
+)
 from rare_envs.traffic.road import Road
 from rare_envs.traffic.state import State
 
@@ -108,3 +118,35 @@ def _draw(scene: PictureScene, road: Road, camera: Camera, seen: Pixels, colours
 def _colours(vehicles: int, viewer: int) -> list[RGB]:
     """Return the colours of the vehicles that a viewer sees, in the order of `State.seen_by`."""
     return [PAINT[(j - 1) % len(PAINT)] for j in range(vehicles) if j != viewer]
+
+
+WEYL_STEP = -1640531535
+"""2^32 over the golden ratio, as int32: Weyl's sequence spreads consecutive numbers."""
+MIXING_FACTORS = (0x7FEB352D, 0x846CA68B - 2**32)
+"""Of a mixing function with low bias: Wellons, "Prospecting for hash functions", 2018 (lowbias32)."""
+EVEN_BYTES, BOTH_HALVES = 0x00FF00FF, 0x00010001
+"""Bytes 0 and 2 of a word, and the factor that adds its halves in the upper one."""
+BYTES_MEAN, BYTES_DEVIATION = 4 * 127.5, (4 * (256**2 - 1) / 12) ** 0.5
+"""Of the sum of four bytes."""
+
+
+def draw_pixel_noise(context: CameraContext, values: int) -> Tensor:
+    """Return the noise of one picture for each of B cameras, shape (B, values), mean 0 and variance 1.
+
+    A 32-bit hash of key, tick, viewer and pixel gives four bytes; their sum, centred and scaled, is nearly normal (the
+    Irwin-Hall distribution of four terms, which ends at 3.5 standard deviations). Nothing is random but the key.
+    """
+    key = context.weather.key.to(torch.int32)
+    for number in (context.tick, torch.full_like(context.tick, context.viewer)):
+        key = _mix_bits(key + (number.to(torch.int32) + 1) * WEYL_STEP)
+    place = torch.arange(values, dtype=torch.int32, device=key.device) * WEYL_STEP
+    bits = _mix_bits(place + key[:, None])
+    pairs = (bits >> 8).bitwise_and_(EVEN_BYTES).add_(bits.bitwise_and_(EVEN_BYTES))  # bytes 0 + 1 and 2 + 3
+    return (pairs.mul_(BOTH_HALVES) >> 16).sub(BYTES_MEAN).div_(BYTES_DEVIATION)
+
+
+def _mix_bits(bits: Tensor) -> Tensor:
+    """Scramble 32-bit integers, in place; multiplication wraps around."""
+    bits.bitwise_xor_((bits >> 16).bitwise_and_(0xFFFF)).mul_(MIXING_FACTORS[0])
+    bits.bitwise_xor_((bits >> 15).bitwise_and_(0x1FFFF)).mul_(MIXING_FACTORS[1])
+    return bits.bitwise_xor_((bits >> 16).bitwise_and_(0xFFFF))

@@ -48,7 +48,7 @@ class Contact(NamedTuple):
     since: float
     """When they began to [s], at most 0; the least number if they are at rest."""
     axis: int
-    """Along which they overlapped last, see `rare_envs.traffic.oriented_boxes.Axes`."""
+    """Along which they overlapped last, see `rare_envs.traffic.bodies.Axes`."""
     closing: float
     """Speed at which they closed along it [m/s]."""
     impact: float

@@ -12,12 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rare_envs.compilation import compiled, single
-from rare_envs.control.idm import IDM, MIN_RATIO
-from rare_envs.control.steering import MAX_HEADING_COMMAND, TAU_HEADING, TAU_LATERAL
-from rare_envs.measures.moment import GAP_MIN, STILL
-from rare_envs.measures.time_to_collision import TTC_MAX
+from rare_envs.control.idm import IDM, MAX_HEADING_COMMAND, MIN_RATIO, TAU_HEADING, TAU_LATERAL
+from rare_envs.measures.base import GAP_MIN, STILL
+from rare_envs.measures.longitudinal import TTC_MAX
 from rare_envs.traffic import vehicle_models
-from rare_envs.traffic.oriented_boxes import DIAGONAL
+from rare_envs.traffic.bodies import DIAGONAL
 from rare_envs.traffic.road import Road
 from rare_envs.traffic.state import VEHICLE_LENGTH, VEHICLE_WIDTH
 
@@ -156,13 +155,13 @@ def centre_of(y: float, road: RoadNumbers) -> float:
 
 @compiled
 def lane_keeping(y: float, heading: float, speed: float, road: RoadNumbers) -> float:
-    """Return the steering angle [rad]: `rare_envs.control.steering.lane_keeping`."""
+    """Return the steering angle [rad]: `rare_envs.control.idm.lane_keeping`."""
     return steer_to_line(y - centre_of(y, road), heading, speed)
 
 
 @compiled
 def steer_to_line(offset: float, heading: float, speed: float) -> float:
-    """Return the steering angle [rad]: `rare_envs.control.steering.steering_control`."""
+    """Return the steering angle [rad]: `rare_envs.control.idm.steering_control`."""
     speed = max(speed, _NEAREST)
     command = math.asin(clip(offset / (_LATERAL_GAIN * speed), -ONE, ONE))
     command = clip(command, -_MAX_HEADING, _MAX_HEADING)
@@ -201,7 +200,7 @@ def are_near(dx: float, dy: float) -> bool:
 
 @compiled
 def boxes_overlap(dx: float, dy: float, heading: float, other_heading: float) -> bool:
-    """Return whether two bodies overlap: `rare_envs.traffic.oriented_boxes.boxes_overlap`, where centres are near."""
+    """Return whether two bodies overlap: `rare_envs.traffic.bodies.boxes_overlap`, where centres are near."""
     if not are_near(dx, dy):
         return False
     cos, sin = math.cos(heading), math.sin(heading)
@@ -231,7 +230,7 @@ def lead_of(
     speed: PerVehicle,
     road: RoadNumbers,
 ) -> tuple[float, float]:
-    """Return gap [m] and closing speed [m/s] of vehicle 0's lead: `rare_envs.traffic.lead.lead_of`; arguments (N,)."""
+    """Return gap [m] and closing speed [m/s] of vehicle 0's lead: `traffic.neighbours.lead_of`; arguments (N,)."""
     return lead_in_lane(x, y, heading, speed, centre_of(y[0], road), road.reach)
 
 
@@ -255,7 +254,7 @@ def lead_in_lane(
 
 @compiled
 def ttc(gap: float, closing_speed: float, y: float, heading: float, speed: float, road: RoadWidth) -> float:
-    """Return the time to collision [s]: `rare_envs.measures.time_to_collision.ttc`."""
+    """Return the time to collision [s]: `rare_envs.measures.longitudinal.ttc`."""
     across = speed * sine(heading)
     sign: float = np.sign(across)
     room = road.half - (y - road.middle) * sign

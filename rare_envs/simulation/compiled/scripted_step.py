@@ -17,7 +17,7 @@ from rare_envs.simulation.episode import Episode
 from rare_envs.simulation.episode_statistics import EpisodeStatistics
 from rare_envs.simulation.reward import RewardTerms
 from rare_envs.traffic.crash import Crash
-from rare_envs.traffic.lead import Lead
+from rare_envs.traffic.neighbours import Lead
 from rare_envs.traffic.state import State
 
 if TYPE_CHECKING:

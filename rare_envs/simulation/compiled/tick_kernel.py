@@ -118,7 +118,7 @@ def tick_scripted(
 
 @compiled
 def others_touch(x: SingleArray, y: SingleArray, heading: SingleArray) -> bool:
-    """Return whether two vehicles other than the ego overlap: `rare_envs.traffic.overlap.others_overlap`."""
+    """Return whether two vehicles other than the ego overlap: `rare_envs.traffic.bodies.others_overlap`."""
     for one in range(1, len(x)):
         for other in range(one + 1, len(x)):
             if boxes_overlap(x[other] - x[one], y[other] - y[one], heading[one], heading[other]):

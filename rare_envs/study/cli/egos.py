@@ -221,7 +221,7 @@ def serve_ego_command(
 ) -> None:
     """Serve an ego to simulations in other processes or on other machines (estimate --ego tcp://...)."""
     import agents
-    from rare_envs.egos.validation import is_policy
+    from rare_envs.egos.errors import is_policy
 
     try:
         from agents.remote.server import EgoServer

@@ -15,15 +15,14 @@ from rich.text import Text
 import samplers
 from agents.learned.networks import HEAD_SIZE
 from rare_envs.distributions.fitted import FittedDistribution
-from rare_envs.exposure.base_record import explain_no_frequency, read_source
-from rare_envs.measures.base import Measure
-from rare_envs.measures.episode_trace import TraceMeasure
+from rare_envs.exposure.rate import explain_no_frequency, read_source
+from rare_envs.measures.base import Measure, TraceMeasure
 from rare_envs.measures.registry import MEASURES
 from rare_envs.plugins import did_you_mean
 from rare_envs.scenarios.base import Scenario
 from rare_envs.scenarios.base_distributions import TextFile, load_base
 from rare_envs.scenarios.registry import SCENARIOS, env_id_of, find_scenario, kinematics_id
-from rare_envs.sensors.camera.weather import CONDITIONS, SENSOR_NOISE
+from rare_envs.sensors.camera.context import CONDITIONS, SENSOR_NOISE
 from rare_envs.simulation.background import noise_size
 from rare_envs.study.errors import BadInput
 from rare_envs.study.text import format_rate

@@ -124,7 +124,7 @@ def run_checks(question: Question) -> Iterator[Finding | str]:
     import agents
     from agents.loading import find_ego_kind
     from rare_envs.egos.errors import EgoGone, reason_of
-    from rare_envs.egos.spaces.ambiguities import AMBIGUOUS, TAKEN_AS_ACCELERATIONS
+    from rare_envs.egos.needs import AMBIGUOUS, TAKEN_AS_ACCELERATIONS
     from rare_envs.study.ego_check.checks import EGO_CHECKS, Probe, check_driving
     from rare_envs.study.ego_check.protocol import check_protocol
     from rare_envs.study.question import build_problem

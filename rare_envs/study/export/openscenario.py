@@ -13,8 +13,7 @@ import torch
 
 from rare_envs.files import replace_file
 from rare_envs.study.export.trajectories import WorldTrajectories, import_scenariogeneration
-from rare_envs.traffic.reference_line import ReferenceLine, list_cells
-from rare_envs.traffic.road import Road
+from rare_envs.traffic.road import ReferenceLine, Road, list_cells
 from rare_envs.traffic.state import VEHICLE_LENGTH, VEHICLE_WIDTH
 
 ROAD_ID = 0

@@ -4,8 +4,7 @@ import pytest
 import torch
 
 from agents.learned.adjacent_lanes import LEFT_MARKER_COLUMN, RIGHT_MARKER_COLUMN, look_aside
-from rare_envs.sensors.lidar import Bodies
-from rare_envs.sensors.perception import HEADING_COLUMN, LANE_OFFSET_COLUMN, OnRoad, perceive
+from rare_envs.sensors.lidar import HEADING_COLUMN, LANE_OFFSET_COLUMN, Bodies, OnRoad, perceive
 from tests.agents.learned.test_collision_avoidance import seen
 
 WIDTH = 3.6

@@ -7,8 +7,7 @@ import torch
 from agents import load_driver, read_driver, read_provenance, save_driver
 from agents.learned.adjacent_lanes import LEFT_MARKER_COLUMN, RIGHT_MARKER_COLUMN
 from agents.learned.collision_avoidance import CloseRange, CollisionAvoidance
-from rare_envs.sensors.lidar import MAX_RANGE
-from rare_envs.sensors.perception import FEATURES, HEADING_COLUMN
+from rare_envs.sensors.lidar import FEATURES, HEADING_COLUMN, MAX_RANGE
 
 RULE = CollisionAvoidance()
 CLOSE = CollisionAvoidance(close=CloseRange())

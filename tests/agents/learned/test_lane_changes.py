@@ -9,8 +9,7 @@ from agents import load_driver, read_driver, read_provenance, save_driver
 from agents.learned.adjacent_lanes import LEFT_MARKER_COLUMN, RIGHT_MARKER_COLUMN
 from agents.learned.driver import EASED_BEYOND
 from agents.learned.lane_changes import STATE_SIZE, ChangeState, LaneChanges, Waiting, patience_of
-from rare_envs.sensors.lidar import MAX_RANGE
-from rare_envs.sensors.perception import HEADING_COLUMN, LANE_OFFSET_COLUMN
+from rare_envs.sensors.lidar import HEADING_COLUMN, LANE_OFFSET_COLUMN, MAX_RANGE
 from tests.agents.learned.test_collision_avoidance import seen
 
 WIDTH = 3.6

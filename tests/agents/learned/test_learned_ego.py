@@ -10,7 +10,7 @@ import torch
 import rare_envs
 from agents import LearnedDriver, LearnedEgo, load_driver
 from rare_envs.control.actions import MAX_ACCELERATION
-from rare_envs.sensors.perception import CURVATURE_COLUMN, SPEED_COLUMN
+from rare_envs.sensors.lidar import CURVATURE_COLUMN, SPEED_COLUMN
 from rare_envs.simulation.observation import LIDAR_SCALES
 from rare_envs.traffic.vehicle_models import STEERING_LIMIT, bicycle, steering_for
 

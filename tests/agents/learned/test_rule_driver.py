@@ -5,9 +5,8 @@ import torch
 
 from agents.learned.rule_driver import RuleDriver
 from rare_envs.control.idm import IDM
-from rare_envs.sensors.lidar import AHEAD_BEAM
-from rare_envs.sensors.perception import RANGE_COLUMNS, RATE_COLUMNS
-from rare_envs.traffic.lead import Lead
+from rare_envs.sensors.lidar import AHEAD_BEAM, RANGE_COLUMNS, RATE_COLUMNS
+from rare_envs.traffic.neighbours import Lead
 
 
 def seen(offset=0.0, heading=0.0, speed=15.0, ahead=100.0, rate=0.0):

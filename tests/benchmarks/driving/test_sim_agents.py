@@ -17,7 +17,7 @@ from benchmarks.driving.sim_agents import (
     kinematic_features,
     motion_features,
 )
-from rare_envs.traffic.oriented_boxes import axes_of, box_distance
+from rare_envs.traffic.bodies import axes_of, box_distance
 
 EDGES = (-1.75, 5.25)
 HALVES = FeatureSetting(0.0, 2.0, 2, 1.0, pseudocount=0.5)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from rare_envs.control.glances import (
+from rare_envs.control.human_driver import (
     GLANCE_CDF,
     MEAN_GLANCE,
     MEAN_ON_ROAD,

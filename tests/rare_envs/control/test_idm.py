@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from rare_envs.control.idm import IDM
-from rare_envs.traffic.lead import Lead
+from rare_envs.traffic.neighbours import Lead
 from tests.rare_envs.traffic_states import F64, tensor
 
 

@@ -5,13 +5,11 @@ import pytest
 import torch
 
 from rare_envs.control.idm import IDM
-from rare_envs.control.lane_changing import SETTLED, LaneChangingDriver
-from rare_envs.control.mobil import Mobil
+from rare_envs.control.lane_changing import SETTLED, LaneChangingDriver, Mobil
 from rare_envs.make import set_up
 from rare_envs.traffic import straight
-from rare_envs.traffic.lead import Lead
-from rare_envs.traffic.neighbours import LaneTraffic
-from rare_envs.traffic.oriented_boxes import boxes_overlap
+from rare_envs.traffic.bodies import boxes_overlap
+from rare_envs.traffic.neighbours import LaneTraffic, Lead
 from rare_envs.traffic.state import State
 from rare_envs.traffic.vehicle_models import point_mass
 from tests.rare_envs.traffic_states import traffic

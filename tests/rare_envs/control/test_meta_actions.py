@@ -16,10 +16,18 @@ from stable_baselines3 import DQN
 
 import rare_envs
 from benchmarks.simulation.highway_env_scene import HighwayEnvScene
-from rare_envs.control.actions import FASTER, IDLE, LANE_LEFT, LANE_RIGHT, SLOWER
-from rare_envs.control.meta_actions import TARGET_SPEEDS, follow_meta_actions, initial_aim
+from rare_envs.control.actions import (
+    FASTER,
+    IDLE,
+    LANE_LEFT,
+    LANE_RIGHT,
+    SLOWER,
+    TARGET_SPEEDS,
+    follow_meta_actions,
+    initial_aim,
+)
 from rare_envs.make import set_up
-from rare_envs.sensors.kinematics import observe_kinematics
+from rare_envs.sensors.kinds import observe_kinematics
 from rare_envs.study import Question
 from rare_envs.traffic.road import i80, straight
 from rare_envs.traffic.state import State

@@ -10,7 +10,7 @@ from highway_env.road.road import RoadNetwork
 from highway_env.vehicle.behavior import IDMVehicle
 
 from rare_envs.control.idm import IDM
-from rare_envs.control.mobil import Mobil
+from rare_envs.control.lane_changing import Mobil
 from rare_envs.traffic import straight
 from rare_envs.traffic.neighbours import LaneTraffic
 from rare_envs.traffic.state import State

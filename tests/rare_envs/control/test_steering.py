@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from rare_envs.control.steering import lane_keeping, steering_control
+from rare_envs.control.idm import lane_keeping, steering_control
 from rare_envs.traffic.road import straight
 from rare_envs.traffic.vehicle_models import bicycle
 from tests.rare_envs.traffic_states import F64, tensor

@@ -12,8 +12,7 @@ import torch
 
 import agents
 import rare_envs
-from rare_envs.control.glances import Glances
-from rare_envs.control.human_driver import HumanDriverModel
+from rare_envs.control.human_driver import Glances, HumanDriverModel
 from rare_envs.control.idm import IDM
 from rare_envs.egos.human import HumanDriver, HumanEgo
 from rare_envs.simulation.rollout import drive

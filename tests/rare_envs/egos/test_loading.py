@@ -7,7 +7,7 @@ from stable_baselines3 import PPO
 import agents
 import rare_envs
 import training
-from rare_envs.egos.loading import load_named_ego
+from rare_envs.egos.needs import load_named_ego
 
 X = [[20.0, 15.0, 30.0], [30.0, 5.0, 20.0]]
 ENV_ID = "rare_envs/CarFollowing-v0"

@@ -6,7 +6,7 @@ import torch
 
 import rare_envs
 import samplers
-from rare_envs.egos.plain_callables import FunctionEgo, ModuleEgo, wrap_callable
+from rare_envs.egos.needs import FunctionEgo, ModuleEgo, wrap_callable
 
 X = [[20.0, 15.0, 30.0], [30.0, 5.0, 20.0], [25.0, 24.0, 60.0]]
 

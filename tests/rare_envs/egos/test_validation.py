@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 import rare_envs
-from rare_envs.egos.validation import check_predict, is_policy, refuse_ego
+from rare_envs.egos.errors import check_predict, is_policy, refuse_ego
 
 
 class Still:
@@ -72,5 +72,5 @@ def test_a_refusal_says_what_was_expected(ego: object, origin: str, message: str
 
 
 def test_the_module_needs_no_torch() -> None:
-    code = "import sys, rare_envs.egos.validation; sys.exit('torch' in sys.modules)"
+    code = "import sys, rare_envs.egos.errors; sys.exit('torch' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

@@ -1,6 +1,6 @@
 from __future__ import annotations
 
-from rare_envs.exposure.base_record import SOURCE_FIELDS, read_site, read_source
+from rare_envs.exposure.rate import SOURCE_FIELDS, read_site, read_source
 
 
 def test_a_record_that_says_nothing() -> None:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 import rare_envs
 from rare_envs.interop.problem import make_highway_env
 from rare_envs.interop.scene import HIGHWAY_ENV_MEASURES, contact_time
-from rare_envs.traffic.oriented_boxes import axes_of, project_on_axes, time_to_contact
+from rare_envs.traffic.bodies import axes_of, project_on_axes, time_to_contact
 from tests.rare_envs.interop.egos import Always
 
 FAST = {"vehicles_count": 3, "duration": 4}

@@ -28,7 +28,7 @@ from rare_envs.measures import (
     ttc_2d,
 )
 from rare_envs.measures.registry import MEASURES, find_measure
-from rare_envs.traffic.lead import lead_of
+from rare_envs.traffic.neighbours import lead_of
 from rare_envs.traffic.road import i80, straight
 from rare_envs.traffic.state import State
 from tests.rare_envs.measures.moments import (

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from rare_envs.measures import Moment, btn, drac, required_deceleration, thw, ttc
-from rare_envs.traffic.lead import lead_of
+from rare_envs.traffic.neighbours import lead_of
 from rare_envs.traffic.road import straight
 from rare_envs.traffic.state import State
 

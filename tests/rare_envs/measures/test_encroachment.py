@@ -11,7 +11,7 @@ from rare_envs.measures import (
     Trace,
     pet,
 )
-from rare_envs.traffic.lead import lead_of
+from rare_envs.traffic.neighbours import lead_of
 from rare_envs.traffic.road import straight
 from rare_envs.traffic.state import State
 from tests.rare_envs.measures.moments import (

@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from rare_envs.measures.moment import GAP_MAX, GAP_MIN, Moment, acceleration_of_lead, gap_of
+from rare_envs.measures.base import GAP_MAX, GAP_MIN, Moment, acceleration_of_lead, gap_of
 from tests.rare_envs.measures.moments import F64, moment
 
 EGO = (0.0, 0.0, 0.0, 20.0)

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from rare_envs.measures import TTC_MAX, Moment, mttc, ttc
-from rare_envs.traffic.lead import Lead
+from rare_envs.traffic.neighbours import Lead
 from rare_envs.traffic.road import straight
 from tests.rare_envs.measures.moments import TIME, drives, following, path
 from tests.rare_envs.traffic_states import tensor, traffic

@@ -12,8 +12,7 @@ from rare_envs.distributions.space import Parameter
 from rare_envs.scenarios.base import columns, drive_points, keep_straight
 from rare_envs.scenarios.cut_in import CUT_IN
 from rare_envs.scenarios.highway import HIGHWAY
-from rare_envs.traffic.reference_line import ReferenceLine
-from rare_envs.traffic.road import Road, straight
+from rare_envs.traffic.road import ReferenceLine, Road, straight
 from rare_envs.traffic.state import State
 from tests.rare_envs.scenarios.standing import STANDING
 

@@ -73,7 +73,7 @@ WITH_LOGARITHM = {"weights": [1.0], "means": [[15.0, 3.5]], "covariances": [[[4.
     ("content", "kind", "median"),
     [
         (GAUSSIAN, TruncatedGaussianMixture, [15.0, 40.0]),
-        ({**WITH_LOGARITHM, "logarithmic": [False, True]}, CoordinateMixture, [15.0, np.exp(3.5)]),
+        ({**WITH_LOGARITHM, "coordinates": ["plain", "log"]}, CoordinateMixture, [15.0, np.exp(3.5)]),
         ({"alpha": [2.0, 2.0], "beta": [2.0, 2.0]}, BetaDistribution, [17.5, 80.0]),
     ],
 )

@@ -14,7 +14,7 @@ from rare_envs.distributions.beta import BetaDistribution
 from rare_envs.distributions.product import NoiseDistribution, ProductDistribution
 from rare_envs.measures import TTC_MAX, Moment, lidar_ttc
 from rare_envs.scenarios.highway import START_LANES
-from rare_envs.sensors.perception import perceive_traffic
+from rare_envs.sensors.lidar import perceive_traffic
 from rare_envs.simulation.rollout import drive
 from rare_envs.traffic.road import i80
 

@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 
 from rare_envs.scenarios.base import Others, Scenario
+from rare_envs.scenarios.base_distributions import try_scenario
 from rare_envs.scenarios.registry import SCENARIOS
-from rare_envs.scenarios.validation import try_scenario
 from rare_envs.traffic.state import State
 from tests.rare_envs.scenarios.standing import STANDING, driven, initial, others
 

@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from rare_envs.sensors.kinematics import KINEMATICS_FEATURES, KINEMATICS_ROWS, kinematics_space, observe_kinematics
+from rare_envs.sensors.kinds import KINEMATICS_FEATURES, KINEMATICS_ROWS, kinematics_space, observe_kinematics
 from rare_envs.traffic.road import straight
 from rare_envs.traffic.state import State
 from tests.rare_envs.traffic_states import ARC, traffic

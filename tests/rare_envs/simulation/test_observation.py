@@ -7,7 +7,7 @@ import torch
 
 import rare_envs
 from rare_envs.make import set_up
-from rare_envs.sensors.perception import perceive_traffic
+from rare_envs.sensors.lidar import perceive_traffic
 from rare_envs.simulation.observation import CLIP, observation_space, observe
 
 

@@ -12,7 +12,7 @@ from typer.testing import Result
 
 import agents
 import rare_envs
-from rare_envs.egos.spaces.ambiguities import AmbiguousActions
+from rare_envs.egos.needs import AmbiguousActions
 from rare_envs.study.arguments import Question
 from rare_envs.study.ego_check.findings import Finding
 from rare_envs.study.ego_check.subprocess_check import run_checks

@@ -10,6 +10,7 @@ import torch
 
 import rare_envs
 import samplers
+from rare_envs.traffic.bodies import others_overlap
 from rare_envs.traffic.crash import (
     CRASH_KINDS,
     Crash,
@@ -18,7 +19,6 @@ from rare_envs.traffic.crash import (
     describe_crash,
     injury_risk,
 )
-from rare_envs.traffic.overlap import others_overlap
 from rare_envs.traffic.road import straight
 from tests.rare_envs.traffic.slow_boxes import corners, nearest, overlap
 from tests.rare_envs.traffic_states import F64, traffic

@@ -5,7 +5,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from rare_envs.traffic.oriented_boxes import (
+from rare_envs.traffic.bodies import (
     Axes,
     axes_of,
     box_distance,

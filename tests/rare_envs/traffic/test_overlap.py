@@ -3,9 +3,8 @@
 import numpy as np
 import torch
 
-from rare_envs.traffic.overlap import ego_overlaps, others_overlap, pairwise_overlaps
-from rare_envs.traffic.reference_line import ReferenceLine
-from rare_envs.traffic.road import Road, i80, straight
+from rare_envs.traffic.bodies import ego_overlaps, others_overlap, pairwise_overlaps
+from rare_envs.traffic.road import ReferenceLine, Road, i80, straight
 from rare_envs.traffic.state import State
 from tests.rare_envs.traffic.slow_boxes import corners, overlap
 from tests.rare_envs.traffic_states import F64, traffic

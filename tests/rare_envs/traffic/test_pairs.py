@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from rare_envs.traffic.pairs import encounter, least, pairs, velocities
+from rare_envs.traffic.bodies import encounter, least, pairs, velocities
 from rare_envs.traffic.road import straight
 from tests.rare_envs.traffic_states import ARC, F64, RADIUS, tensor, traffic
 

@@ -5,9 +5,8 @@ import math
 import pytest
 import torch
 
-from rare_envs.traffic import reference_line
-from rare_envs.traffic.reference_line import ReferenceLine
-from rare_envs.traffic.road import Road, i80
+from rare_envs.traffic import road as reference_line
+from rare_envs.traffic.road import ReferenceLine, Road, i80
 
 F64 = torch.float64
 BEND = Road((-2.0, 2.0, 5.0), ReferenceLine(25.0, (0.0, 0.002, 0.004, -0.002, 0.0)))

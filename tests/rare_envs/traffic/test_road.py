@@ -16,8 +16,7 @@ from rare_envs.scenarios.highway import HIGHWAY
 from rare_envs.simulation.rollout import drive
 from rare_envs.simulation.world import World
 from rare_envs.traffic.palette import as_rgb, vehicle_colour
-from rare_envs.traffic.reference_line import ReferenceLine
-from rare_envs.traffic.road import Road, i80, straight
+from rare_envs.traffic.road import ReferenceLine, Road, i80, straight
 from rare_envs.traffic.state import State
 from rare_envs.traffic.vehicle_models import bicycle, point_mass
 

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import pytest
 import torch
 
-from rare_envs.traffic.tensor_trees import map_leaves, map_tensors
+from rare_envs.traffic.state import map_leaves, map_tensors
 
 
 class Pair(NamedTuple):

@@ -5,7 +5,7 @@ import torch
 
 from rare_envs.control.idm import IDM
 from rare_envs.simulation.rollout import drive
-from rare_envs.traffic.lead import lead_of
+from rare_envs.traffic.neighbours import lead_of
 from training.egos.nominal_driving import make_world
 from training.egos.nominal_traffic import CASES, draw_starts
 

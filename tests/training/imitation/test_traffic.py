@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from rare_envs.sensors.perception import FEATURES
+from rare_envs.sensors.lidar import FEATURES
 from tests.training.imitation.synthetic_scenes import at_start, generator, scene, tiny
 from training.imitation.rollout import draw_pool
 from training.imitation.traffic import replay_features, stack_scenes, start_replay, step_replay

@@ -9,7 +9,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 import rare_envs
 import training
-from rare_envs.egos.sb3.dense_inference import DenseInference, find_inference
+from rare_envs.egos.dense_policies import DenseInference, find_inference
 from rare_envs.egos.wrappers import NormalisedPolicy, RescaledPolicy, wrap_policy
 
 CUT_IN = "rare_envs/CutIn-v0"

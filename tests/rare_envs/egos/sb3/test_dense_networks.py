@@ -10,7 +10,7 @@ from stable_baselines3 import A2C, PPO, SAC
 
 import agents
 import rare_envs
-from rare_envs.egos.sb3.dense_networks import read_dense_policy
+from rare_envs.egos.dense_policies import read_dense_policy
 from rare_envs.simulation.compiled.failures import NotCompiled
 
 CAR_FOLLOWING = "rare_envs/CarFollowing-v0"

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 
-from rare_envs.egos.spaces.ambiguities import AMBIGUOUS, TAKEN_AS_ACCELERATIONS, name_ambiguities
+from rare_envs.egos.needs import AMBIGUOUS, TAKEN_AS_ACCELERATIONS, name_ambiguities
 
 
 @pytest.mark.parametrize(

@@ -9,8 +9,7 @@ import pytest
 from gymnasium import spaces
 
 import rare_envs
-from rare_envs.egos.spaces.ambiguities import AmbiguousActions
-from rare_envs.egos.spaces.choice import choose_action, choose_observation, find_fitting_kinds, takes_indices
+from rare_envs.egos.needs import AmbiguousActions, choose_action, choose_observation, find_fitting_kinds, takes_indices
 from rare_envs.sensors.kinds import OBSERVATIONS
 from rare_envs.simulation.ego_interface import EgoNeeds
 from rare_envs.simulation.observation import observation_space

@@ -3,8 +3,7 @@
 import torch
 
 from rare_envs.sensors.camera import Weather
-from rare_envs.traffic.reference_line import MAX_CURVATURE, ReferenceLine
-from rare_envs.traffic.road import Road
+from rare_envs.traffic.road import MAX_CURVATURE, ReferenceLine, Road
 
 SHARPEST = Road((-2.0, 2.0, 6.0), ReferenceLine(50.0, (0.0, MAX_CURVATURE, MAX_CURVATURE, 0.0)))
 """A bend as sharp as roads may be."""

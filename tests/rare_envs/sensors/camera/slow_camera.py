@@ -12,10 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rare_envs.sensors.camera import Camera
-from rare_envs.sensors.camera import ground as g
-from rare_envs.sensors.camera import light as li
-from rare_envs.sensors.camera import vehicles as b
-from rare_envs.sensors.camera.pinhole import GROUND_RANGE
+from rare_envs.sensors.camera import surfaces as b
+from rare_envs.sensors.camera import surfaces as g
+from rare_envs.sensors.camera import surfaces as li
+from rare_envs.sensors.camera.context import GROUND_RANGE
 from rare_envs.traffic.road import Road
 from rare_envs.traffic.state import VEHICLE_LENGTH, VEHICLE_WIDTH
 

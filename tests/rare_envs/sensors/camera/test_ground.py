@@ -7,23 +7,27 @@ import torch
 from torch import Tensor
 
 from rare_envs.sensors.camera import Camera
-from rare_envs.sensors.camera.ground import (
+from rare_envs.sensors.camera.context import Pixels, pixels
+from rare_envs.sensors.camera.surfaces import (
+    AIR,
     ASPHALT,
     DASH,
+    DIFFUSE,
+    DIRECT,
     LINE_WIDTH,
     PERIOD,
     VERGE,
     WHITE_LINE,
     YELLOW_LINE,
     Cover,
+    Light,
     Lines,
     View,
     colour_ground,
     cover_of,
+    light_of,
     road_lines,
 )
-from rare_envs.sensors.camera.light import AIR, DIFFUSE, DIRECT, Light, light_of
-from rare_envs.sensors.camera.pinhole import Pixels, pixels
 from rare_envs.traffic.road import Road, i80, straight
 from tests.rare_envs.sensors.camera.scenes import SHARPEST, weather
 

@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from rare_envs.sensors.camera.light import (
+from rare_envs.sensors.camera.surfaces import (
     AIR,
     DIFFUSE,
     DIRECT,

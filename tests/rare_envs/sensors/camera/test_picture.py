@@ -9,8 +9,7 @@ from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
 from rare_envs.sensors.camera import Camera, CameraContext, Weather, clear_day, take_picture
-from rare_envs.sensors.camera.ground import ASPHALT, DASH, PERIOD
-from rare_envs.sensors.camera.vehicles import BODY_HEIGHT
+from rare_envs.sensors.camera.surfaces import ASPHALT, BODY_HEIGHT, DASH, PERIOD
 from rare_envs.traffic.road import Road, i80, straight
 from rare_envs.traffic.state import VEHICLE_LENGTH, VEHICLE_WIDTH, State
 from tests.rare_envs.sensors.camera.scenes import SHARPEST, weather

@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from rare_envs.sensors.camera.pinhole import GROUND_RANGE, Camera, find_camera, pixels
+from rare_envs.sensors.camera.context import GROUND_RANGE, Camera, find_camera, pixels
 
 
 def test_rays_span_the_field_of_view() -> None:

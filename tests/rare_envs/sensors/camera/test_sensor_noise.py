@@ -1,15 +1,14 @@
 """Sensor noise: the hash in plain integers, the exact distribution of its values, and that they are white."""
 
 import math
-import sys
 
 import numpy as np
 import pytest
 import torch
 from scipy import stats
 
-from rare_envs.sensors.camera import Camera, CameraContext, Weather, sensor_noise
-from rare_envs.sensors.camera.sensor_noise import draw_pixel_noise
+from rare_envs.sensors.camera import Camera, CameraContext, Weather
+from rare_envs.sensors.camera.picture import draw_pixel_noise
 
 N = 3 * 66 * 200
 """Values of a picture."""
@@ -86,17 +85,3 @@ def test_noise_is_white() -> None:
     pairs = torch.cat(pictures)
     across = torch.corrcoef(pairs) - torch.eye(len(pairs))
     assert across.abs().max() < 5 / math.sqrt(N)
-
-
-@pytest.mark.parametrize("cameras_at_once", [1, 40])
-def test_noise_is_the_same_where_numba_does_not_work(monkeypatch: pytest.MonkeyPatch, cameras_at_once: int) -> None:
-    context = cameras(*range(cameras_at_once))
-    found = draw_pixel_noise(context, 500)
-    monkeypatch.setattr(sensor_noise, "_find_compiled_noise", lambda: None)
-    assert torch.equal(found, draw_pixel_noise(context, 500))
-
-
-def test_one_camera_does_not_import_numba(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.delitem(sys.modules, "numba", raising=False)
-    monkeypatch.setattr(sensor_noise, "_find_compiled_noise", lambda: pytest.fail("numba was asked for"))
-    draw_pixel_noise(cameras(1), 500)

@@ -7,17 +7,21 @@ import torch
 from torch import Tensor
 
 from rare_envs.sensors.camera import Camera
-from rare_envs.sensors.camera.light import AIR, DIFFUSE, DIRECT, Light, light_of
-from rare_envs.sensors.camera.pinhole import pixels
-from rare_envs.sensors.camera.vehicles import (
+from rare_envs.sensors.camera.context import pixels
+from rare_envs.sensors.camera.surfaces import (
+    AIR,
     BODY_HEIGHT,
+    DIFFUSE,
+    DIRECT,
     GLASS,
     PAINT,
     WINDOWS,
     Boxes,
+    Light,
     cast_shadows,
     draw_boxes,
     find_candidates,
+    light_of,
     project_points,
 )
 from tests.rare_envs.sensors.camera.scenes import weather

@@ -19,7 +19,7 @@ from rare_envs.make import build_space
 from rare_envs.scenarios.base_distributions import load_base
 from rare_envs.scenarios.registry import find_scenario
 from rare_envs.sensors.camera import Camera, CameraContext, Weather, take_picture
-from rare_envs.sensors.camera.weather import (
+from rare_envs.sensors.camera.context import (
     CONDITIONS,
     FOG_DISTRIBUTION,
     SENSOR_NOISE,

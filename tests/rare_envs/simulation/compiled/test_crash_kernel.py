@@ -8,7 +8,7 @@ from rare_envs.simulation.compiled import crash_kernel
 from rare_envs.simulation.compiled.equations import RoadNumbers
 from rare_envs.simulation.episode_statistics import EpisodeStatistics
 from rare_envs.traffic import crash, straight
-from rare_envs.traffic.overlap import ego_overlaps, others_overlap
+from rare_envs.traffic.bodies import ego_overlaps, others_overlap
 from rare_envs.traffic.state import State
 
 N, ROAD, DT = 2000, straight(2), np.float32(0.1)

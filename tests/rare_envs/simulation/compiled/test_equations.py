@@ -7,14 +7,13 @@ import pytest
 import torch
 
 from rare_envs.compilation import single
-from rare_envs.control.idm import IDM
-from rare_envs.control.steering import lane_keeping
+from rare_envs.control.idm import IDM, lane_keeping
 from rare_envs.measures import Moment
-from rare_envs.measures.time_to_collision import ttc
+from rare_envs.measures.longitudinal import ttc
 from rare_envs.simulation.compiled import equations
 from rare_envs.traffic import straight
-from rare_envs.traffic.lead import Lead, lead_of
-from rare_envs.traffic.oriented_boxes import boxes_overlap
+from rare_envs.traffic.bodies import boxes_overlap
+from rare_envs.traffic.neighbours import Lead, lead_of
 from rare_envs.traffic.state import State
 from rare_envs.traffic.vehicle_models import bicycle, steering_for
 

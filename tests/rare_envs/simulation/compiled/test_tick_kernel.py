@@ -10,8 +10,8 @@ from rare_envs.simulation.compiled.equations import RoadNumbers
 from rare_envs.simulation.observation import observe_features
 from rare_envs.simulation.reward import RewardTerms, reward_terms
 from rare_envs.traffic import straight
-from rare_envs.traffic.lead import lead_of
-from rare_envs.traffic.overlap import others_overlap
+from rare_envs.traffic.bodies import others_overlap
+from rare_envs.traffic.neighbours import lead_of
 from rare_envs.traffic.state import State
 
 N, ROAD = 300, straight(2)

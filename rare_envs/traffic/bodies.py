@@ -1,21 +1,26 @@
-"""Oriented boxes, the bodies of vehicles: overlap, distance, depth of an overlap and time to contact of two of them.
+"""Bodies of vehicles, oriented boxes: overlap, distance, depth of an overlap and time to contact of two of them.
 
 Two convex bodies are apart exactly if they are apart along one of the axes of their sides (the separating axis
-theorem); of two boxes there are four.
+theorem); of two boxes there are four. Bodies are compared in the flat world: where the road turns, differences along it
+are not distances.
 
 References:
     Gottschalk, Lin and Manocha, "OBBTree: a hierarchical structure for rapid interference detection", 1996; Ericson,
     "Real-time collision detection", 2005, sections 4.4 and 5.5.
 """
 
+from __future__ import annotations
+
 from collections.abc import Sequence
+from functools import lru_cache
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from rare_envs.devices import scalars
-from rare_envs.traffic.state import VEHICLE_LENGTH, VEHICLE_WIDTH
+from rare_envs.devices import can_look, indices, may_hold, scalars
+from rare_envs.traffic.road import Road, WorldPose
+from rare_envs.traffic.state import VEHICLE_LENGTH, VEHICLE_WIDTH, State
 
 DIAGONAL = (VEHICLE_LENGTH**2 + VEHICLE_WIDTH**2) ** 0.5
 """Bodies whose centres are further apart than this [m] do not touch."""
@@ -207,3 +212,121 @@ def time_to_contact(axes: Axes, rate: Tensor) -> Tensor:
     times = crossing(axes, rate)
     enter, leave = times.enter.amax(-1), times.leave.amin(-1)
     return torch.where((enter < leave) & (leave > 0), enter.clamp(min=0.0), torch.inf)
+
+
+class Encounter(NamedTuple):
+    """P pairs of vehicles in B scenarios; shapes (B, P), of axes (B, P, 4)."""
+
+    axes: Axes
+    """Of the first and the other."""
+    rate: Tensor
+    """Velocity of the other less that of the first along the axes [m/s]."""
+    turn: Tensor
+    """Heading of the other less that of the first [rad]."""
+
+
+@lru_cache(maxsize=32)
+def pairs(vehicles: int) -> tuple[tuple[int, ...], tuple[int, ...]]:
+    """Return every pair of vehicles once, the lower index first; those of the ego come first."""
+    both = [(i, j) for i in range(vehicles) for j in range(i + 1, vehicles)]
+    return tuple(i for i, _ in both), tuple(j for _, j in both)
+
+
+def velocities(state: State, heading: Tensor) -> tuple[Tensor, Tensor]:
+    """Return velocities along the axes that headings (B, N) are measured from [m/s], shape (B, N) each."""
+    return state.speed * torch.cos(heading), state.speed * torch.sin(heading)
+
+
+def least(values: Tensor, nobody: float) -> Tensor:
+    """Return the least over pairs (B, P), shape (B,), and at most the value for nobody."""
+    return torch.nn.functional.pad(values, (0, 1), value=nobody).amin(1)
+
+
+def encounter(state: State, road: Road) -> Encounter:
+    """Return the ego with each of the N - 1 other vehicles.
+
+    They are compared in the world: where the road turns, ways along it are not distances.
+    """
+    return _compare(state, road, slice(0, 1), slice(1, None))
+
+
+def encounters_of_all(state: State, road: Road) -> Encounter:
+    """Return every pair of vehicles, P = N (N - 1) / 2, in the order of `pairs`."""
+    first, second = (indices(index, state.x) for index in pairs(state.x.shape[1]))
+    return _compare(state, road, first, second)
+
+
+def _compare(state: State, road: Road, first: Tensor | slice, second: Tensor | slice) -> Encounter:
+    """Return vehicles with others, by their indices; one may be compared with several."""
+    x, y, heading = road.to_world(state.x, state.y, state.heading)
+    along, across = velocities(state, heading)
+    other = heading[:, second]
+    one = heading[:, first].expand_as(other)
+    axes = axes_of(x[:, second] - x[:, first], y[:, second] - y[:, first], one, other)
+    rate = project_on_axes(along[:, second] - along[:, first], across[:, second] - across[:, first], one, other)
+    return Encounter(axes, rate, other - one)
+
+
+def ego_overlaps(state: State, road: Road, pose: WorldPose | None = None) -> Tensor:
+    """Return which vehicles' bodies overlap the ego's.
+
+    Args:
+        state: Traffic of B scenarios.
+        road: Their road.
+        pose: Where they are in the world, if that is known already.
+
+    Returns:
+        Boolean, shape (B, N - 1).
+    """
+    return _overlap_of(_in_world(state, road, pose), slice(0, 1), slice(1, None))
+
+
+def others_overlap(state: State, road: Road, pose: WorldPose | None = None) -> Tensor:
+    """Return whether two vehicles other than the ego overlap, boolean, shape (B,); arguments as of `ego_overlaps`."""
+    n = state.x.shape[1] - 1
+    first, second = (indices(index[n:], state.x) for index in pairs(n + 1))
+    overlapping: Tensor = _overlap_of(_in_world(state, road, pose), first, second).any(1)
+    return overlapping
+
+
+def pairwise_overlaps(state: State, road: Road, pose: WorldPose | None = None) -> Tensor:
+    """Return which vehicles' bodies overlap which.
+
+    Args:
+        state: Traffic of B scenarios.
+        road: Their road.
+        pose: Where they are in the world, if that is known already.
+
+    Returns:
+        Boolean, shape (B, N, N), symmetric, nobody with itself; row 0 is `ego_overlaps`.
+    """
+    batch, n = state.x.shape
+    first, second = (indices(index, state.x) for index in pairs(n))
+    overlapping = _overlap_of(_in_world(state, road, pose), first, second)
+    both = torch.zeros(batch, n, n, dtype=torch.bool, device=state.x.device)
+    both[:, first, second] = overlapping
+    both[:, second, first] = overlapping
+    return both
+
+
+def _in_world(state: State, road: Road, pose: WorldPose | None) -> tuple[Tensor, Tensor, Tensor]:
+    return road.to_world(state.x, state.y, state.heading) if pose is None else pose[:3]
+
+
+def _overlap_of(place: tuple[Tensor, Tensor, Tensor], first: Tensor | slice, second: Tensor | slice) -> Tensor:
+    """Return which of P pairs of vehicles overlap, boolean, shape (B, P); one may be compared with several."""
+    x, y, heading = place
+    dx, (diagonal,) = x[:, second] - x[:, first], scalars((DIAGONAL,), x)
+    near: Tensor = dx.abs() < diagonal
+    if not may_hold(near):  # of a few rows mostly
+        return near
+    dy = y[:, second] - y[:, first]
+    near = near & (dy.abs() < diagonal)
+    other = heading[:, second]
+    one = heading[:, first].expand_as(other)
+    if not can_look(near):
+        return near & boxes_overlap(dx, dy, one, other)
+    if bool(near.any()):
+        at = near.nonzero(as_tuple=True)
+        near[at] = boxes_overlap(dx[at], dy[at], one[at], other[at])
+    return near

@@ -1,1 +1,0 @@
-"""Spaces of policies: the observation and the actions that they fit, and the check of a choice."""

@@ -1,0 +1,489 @@
+"""Colours of what a camera sees: sky and air, the ground with its lane lines, vehicles and their shadows.
+
+A surface shows its colour times diffuse light plus, where the sun shines on it, direct light times the cosine to its
+normal (Lambert). Of what leaves a surface exp(-fog x distance) arrives, the rest is the colour of the air (Koschmieder
+1924). Fog takes from the direct light what is lost on the way through a layer of 100 m, and gives half of it back as
+diffuse light. Colours are the displayed ones, red, green and blue from 0 to 1.
+
+Each row of pixels looks at a straight line across the camera's heading. Along it the road's own coordinates are
+smooth, so they are found exactly at three points near the road and by a parabola in between. Vehicles are boxes: only
+pixels in the rectangle around a body or a shadow are tested, as a list of candidates. A ray is cut with the three slabs
+of a box in the box's own frame (Kay and Kajiya 1986); the nearest box wins.
+"""
+
+import math
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from rare_envs.sensors.camera.context import Camera, Pixels, Weather
+from rare_envs.traffic.road import Road
+from rare_envs.traffic.state import VEHICLE_LENGTH, VEHICLE_WIDTH
+
+DIRECT, DIFFUSE = 0.65, 0.45
+"""Light of the sun on a surface that faces it, and of the sky, in clear air."""
+FOG_DEPTH = 100.0
+"""Height of the foggy layer [m]."""
+SKY_PATH = 10_000.0
+"""Longest way through the air to the sky [m]."""
+RGB = tuple[float, float, float]
+AIR: RGB = (0.80, 0.82, 0.84)
+ZENITH: RGB = (0.36, 0.55, 0.86)
+HORIZON: RGB = (0.74, 0.83, 0.92)
+SUN: RGB = (1.30, 1.25, 1.10)
+STEEP = 0.35
+"""Sine of the angle above the horizon from which on the sky has the colour of the zenith."""
+GLOW = 64
+"""Power of the cosine of the angle to the sun by which the sky turns to its colour: half at 8 degrees."""
+
+
+class Light(NamedTuple):
+    """Light in T pictures."""
+
+    fog: Tensor
+    """Extinction coefficient [1/m], shape (T,)."""
+    sun: Tensor
+    """Direction of the sun in the camera's level frame (forward, right, up), shape (T, 3)."""
+    direct: Tensor
+    """Light of the sun on a surface that faces it, shape (T,)."""
+    diffuse: Tensor
+    """Light on a surface in the shade, shape (T,)."""
+    brightness: Tensor
+    """Of sky and air, shape (T,)."""
+
+    def through(self, distance: Tensor, frame: Tensor | None = None) -> Tensor:
+        """Return the part of the light that passes a way through the air.
+
+        Args:
+            distance: Its length [m], shape (...) for all pictures, or one for each entry of `frame`.
+            frame: Numbers of pictures.
+
+        Returns:
+            Shape (T, ...), or that of `frame`.
+        """
+        if frame is None:
+            return torch.exp(-self.fog.view(-1, *[1] * distance.ndim) * distance)
+        return torch.exp(-self.fog[frame] * distance)
+
+
+def light_of(weather: Weather, heading: Tensor) -> Light:
+    """Return the light in the frame of cameras with these headings [rad], shape (T,)."""
+    fog, elevation = weather.fog.float(), weather.sun_elevation.float()
+    turn = (weather.sun_azimuth - heading).float()
+    level, up = torch.cos(elevation), torch.sin(elevation)
+    sun = torch.stack((level * torch.cos(turn), level * torch.sin(turn), up), dim=1)
+    passed = torch.exp(-fog * FOG_DEPTH / up)
+    diffuse = DIFFUSE + 0.5 * DIRECT * up * (1.0 - passed)
+    return Light(fog, sun, DIRECT * passed, diffuse, 0.6 + 0.4 * up)
+
+
+def colour_sky(light: Light, ray: Tensor, norm: Tensor) -> Tensor:
+    """Return the colours of the sky.
+
+    Args:
+        light: Of T pictures.
+        ray: Directions, shape (3, K).
+        norm: Their lengths, shape (K,).
+
+    Returns:
+        Shape (T, 3, K).
+    """
+    direction = ray / norm
+    up = direction[2].clamp(min=FOG_DEPTH / SKY_PATH)
+    clear = light.through(FOG_DEPTH / up)
+    towards = light.sun[:, 0, None] * direction[0] + light.sun[:, 1, None] * direction[1]
+    glow = (towards + light.sun[:, 2, None] * direction[2]).clamp(min=0.0).pow(GLOW)
+    glow = glow * (light.direct / DIRECT)[:, None]
+    steep = (direction[2] / STEEP).clamp(0.0, 1.0)
+    image = ray.new_empty(len(light.fog), 3, ray.shape[1])
+    brightness = light.brightness[:, None]
+    for channel in range(3):
+        blue = (HORIZON[channel] + (ZENITH[channel] - HORIZON[channel]) * steep) * brightness
+        blue = blue + glow * (SUN[channel] - blue)
+        air = AIR[channel] * brightness
+        torch.addcmul(air, clear, blue - air, out=image[:, channel])
+    return image
+
+
+ASPHALT: RGB = (0.36, 0.36, 0.38)
+VERGE: RGB = (0.38, 0.43, 0.25)
+WHITE_LINE: RGB = (0.92, 0.92, 0.92)
+YELLOW_LINE: RGB = (0.90, 0.72, 0.18)
+LINE_WIDTH = 0.15
+"""Of lane lines [m]: 6 inches, the upper end of a normal line (MUTCD, chapter 3A)."""
+DASH, PERIOD = 3.05, 12.19
+"""Length of a dash and from one to the next [m]: 10 ft lines, 30 ft gaps (MUTCD, chapter 3A)."""
+_REACH = 15.0
+"""From the middle to the outer ones of the three points at which a row's road coordinates are exact, at most [m]."""
+_OFF = 40.0
+"""Points further off the reference line are taken to be there [m]; whatever their place, they are on no road."""
+
+
+class View(NamedTuple):
+    """Poses of T cameras in the flat world, shapes (T,)."""
+
+    x: Tensor
+    """[m]."""
+    y: Tensor
+    """[m]."""
+    heading: Tensor
+    """[rad]."""
+
+
+class Lines(NamedTuple):
+    """Road coordinates along the R rows of T pictures as functions of the place r to the right [m]; (T, R, 1) each."""
+
+    s: tuple[Tensor, Tensor, Tensor]
+    """Coefficients of 1, r and r^2 of the way along the road [m], whole periods of dashes left out."""
+    t: tuple[Tensor, Tensor, Tensor]
+    """Likewise of the place to the right of the reference line."""
+    turn: Tensor
+    """Sine of the camera's heading relative to the road there."""
+
+
+def road_lines(view: View, road: Road, seen: Pixels) -> Lines:
+    """Return road coordinates of what the rows of ground pixels look at."""
+    x, y, heading = (part[:, None] for part in view)
+    forward = seen.forward[:, 0].to(x)
+    cos, sin = torch.cos(heading), torch.sin(heading)
+    half = seen.right[:, -1].to(x)  # to the middle of the last column
+    at, _, angle = road.from_world(x, y, heading)
+    near_x, near_y, near_heading = road.to_world(
+        at + forward * torch.cos(angle), torch.full_like(forward, road.middle).expand(len(x), -1), torch.zeros_like(at)
+    )
+    middle = (near_y - y) * cos - (near_x - x) * sin
+    middle = torch.minimum(torch.maximum(middle, -half), half)
+    reach = half.clamp(min=1.0, max=_REACH)
+    places = torch.stack((middle - reach, middle, middle + reach))
+    point_x, point_y = x + forward * cos - places * sin, y + forward * sin + places * cos
+    across = (point_y - near_y) * torch.cos(near_heading) - (point_x - near_x) * torch.sin(near_heading)
+    excess = across - across.clamp(-_OFF, _OFF)
+    point_x, point_y = point_x + excess * torch.sin(near_heading), point_y - excess * torch.cos(near_heading)
+    s, t, angle = road.from_world(point_x, point_y, heading.expand_as(point_x))
+    whole = torch.floor(s[1] / PERIOD) * PERIOD
+    return Lines(
+        _quadratic(s - whole, middle, reach),
+        _quadratic(t + excess, middle, reach),
+        torch.sin(angle[1])[..., None].float(),
+    )
+
+
+def _quadratic(values: Tensor, middle: Tensor, reach: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Return the coefficients of the parabola through values (3, T, R) at middle - reach, middle and middle + reach."""
+    left, centre, right = values
+    slope, bend = (right - left) / (2 * reach), (right + left - 2 * centre) / (2 * reach.square())
+    constant = centre - middle * (slope - middle * bend)
+    one, linear, square = (part[..., None].float() for part in (constant, slope - 2 * middle * bend, bend))
+    return one, linear, square
+
+
+class Cover(NamedTuple):
+    """Share of each ground pixel that each surface covers, from 0 to 1, shapes (T, R, W)."""
+
+    road: Tensor
+    """The road, lines included."""
+    white: Tensor
+    yellow: Tensor
+
+
+def cover_of(lines: Lines, road: Road, seen: Pixels) -> Cover:
+    """Return what covers the pixels' footprints on the ground.
+
+    A pixel sees a strip across the road as wide as the change of t over the pixel, in which a line covers its overlap;
+    so far lines fade rather than flicker. The left edge is a yellow line, the right edge a white one, the lines between
+    lanes are white dashes (MUTCD: a carriageway of one direction).
+    """
+    (s0, s1, s2), (t0, t1, t2) = lines.s, lines.t
+    t = torch.addcmul(t1, t2, seen.right).mul_(seen.right).add_(t0)
+    strip = (t1 * seen.right_per_row).addcmul_(lines.turn, seen.forward_per_row).abs_()
+    strip.add_((t1 * seen.right_per_column).abs_()).clamp_(min=1e-4)
+    share = strip.reciprocal()
+
+    def band(middle: float, reach: Tensor, most: Tensor) -> Tensor:
+        """Return the width of a band's overlap with the strip [m]; `reach` is half of both, `most` the less of both."""
+        distance = (t - middle).abs_()
+        overlap = torch.sub(reach, distance, out=distance).clamp_(min=0.0)
+        return torch.minimum(overlap, most, out=overlap)
+
+    left, *inner, right = road.edges
+    whole = right - left + LINE_WIDTH
+    line = (0.5 * strip).add_(0.5 * LINE_WIDTH), strip.clamp(max=LINE_WIDTH)
+    surface = band(road.middle, (0.5 * strip).add_(0.5 * whole), strip.clamp(max=whole))
+    white = torch.zeros_like(t)
+    if inner:
+        for edge in inner:
+            white += band(edge, *line)
+        s = torch.addcmul(s1, s2, seen.right).mul_(seen.right).add_(s0)
+        white *= _dashes(s, (t1 * seen.forward_per_row).addcmul(lines.turn, seen.right_per_row, value=-1.0))
+    white += band(right, *line)
+    return Cover(surface.mul_(share), white.mul_(share), band(left, *line).mul_(share))
+
+
+def _dashes(s: Tensor, length: Tensor) -> Tensor:
+    """Return the part of stretches of road, by middle and length (of any sign) [m], on which there are dashes."""
+    length = length.abs().clamp(min=1e-3)
+
+    def before(way: Tensor) -> Tensor:
+        """Return the length of dashes from 0 to a place."""
+        periods = torch.floor(way / PERIOD)
+        return (way - periods * PERIOD).clamp_(max=DASH).add_(periods, alpha=DASH)
+
+    return before(s + 0.5 * length).sub_(before(s - 0.5 * length)).div_(length)
+
+
+def colour_ground(cover: Cover, shade: Tensor | None, light: Light, seen: Pixels) -> Tensor:
+    """Return the colours of the ground.
+
+    Args:
+        cover: What covers it.
+        shade: Which pixels are in a shadow, boolean, shape (T, R, W), or None for none of them.
+        light: Of the T pictures.
+        seen: What the pixels see.
+
+    Returns:
+        Shape (T, 3, R, W).
+    """
+    clear = light.through(seen.distance)
+    sunny = (light.diffuse + light.direct * light.sun[:, 2]).view(-1, 1, 1)
+    lit = clear * sunny if shade is None else clear * torch.where(shade, light.diffuse.view(-1, 1, 1), sunny)
+    image = clear.new_empty(len(clear), 3, *clear.shape[1:])
+    for channel in range(3):
+        colour = cover.road * (ASPHALT[channel] - VERGE[channel]) + VERGE[channel]
+        colour.add_(cover.white, alpha=WHITE_LINE[channel] - ASPHALT[channel])
+        colour.add_(cover.yellow, alpha=YELLOW_LINE[channel] - ASPHALT[channel])
+        air = (AIR[channel] * light.brightness).view(-1, 1, 1)
+        torch.addcmul(air * (1.0 - clear), colour, lit, out=image[:, channel])
+    return image
+
+
+BODY_HEIGHT = 1.5
+"""Of every vehicle [m], a usual car's."""
+PAINT: tuple[RGB, ...] = (
+    (0.62, 0.12, 0.10),
+    (0.16, 0.27, 0.52),
+    (0.78, 0.78, 0.76),
+    (0.14, 0.14, 0.15),
+    (0.50, 0.52, 0.54),
+    (0.70, 0.60, 0.32),
+)
+"""Colours of vehicles 1, 2, ..., in turn."""
+GLASS: RGB = (0.10, 0.13, 0.16)
+WINDOWS = (0.90, 1.35)
+"""Between these heights [m] the sides are windows."""
+_NEAR = 0.3
+"""Depth in front of the camera up to which projections are not trusted [m]."""
+
+
+class Boxes(NamedTuple):
+    """Vehicles in the frames of T cameras, shapes (T, N)."""
+
+    forward: Tensor
+    """Middle, ahead of the camera [m]."""
+    right: Tensor
+    """Middle, to the right of the camera [m]."""
+    cos: Tensor
+    """Of the heading relative to the camera's, positive to the right."""
+    sin: Tensor
+
+    def corners(self) -> tuple[Tensor, Tensor]:
+        """Return places of the four vertical edges, forward and right, shapes (T, N, 4)."""
+        along = self.cos.new_tensor((0.5, 0.5, -0.5, -0.5)) * VEHICLE_LENGTH
+        across = self.cos.new_tensor((0.5, -0.5, 0.5, -0.5)) * VEHICLE_WIDTH
+        cos, sin = self.cos[..., None], self.sin[..., None]
+        return self.forward[..., None] + along * cos - across * sin, self.right[..., None] + along * sin + across * cos
+
+
+class Candidates(NamedTuple):
+    """Pixels that a box or its shadow may cover; shapes (C,)."""
+
+    box: Tensor
+    """Number of the box, frame by frame, 0 to T N - 1."""
+    row: Tensor
+    """Row of the pixel."""
+    pixel: Tensor
+    """Number of the pixel in the picture, row by row."""
+
+
+def project_points(camera: Camera, forward: Tensor, right: Tensor, up: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Return points in the camera's frame, along its axis.
+
+    Args:
+        camera: The camera.
+        forward: Ahead of it [m], any shape, as the others.
+        right: To its right [m].
+        up: Above the ground [m].
+
+    Returns:
+        How far they are to the right of its axis, below it, and along it [m]. A point at (r, d, z) is seen in column
+        `width` / 2 + `focal` r / z and row `height` / 2 + `focal` d / z; (0, 0) is the picture's upper left corner.
+    """
+    cos, sin = math.cos(camera.pitch), math.sin(camera.pitch)
+    above = up - camera.mount_height
+    return right, -forward * sin - above * cos, forward * cos - above * sin
+
+
+def find_candidates(camera: Camera, forward: Tensor, right: Tensor, up: Tensor, first_row: int = 0) -> Candidates:
+    """Pixels in the rectangles around the convex hulls of sets of K points.
+
+    What is behind the camera is cut off at a plane just ahead of it, where the hull is no wider than the points are.
+
+    Args:
+        camera: The camera.
+        forward: As in `project_points`, shape (T, N, K), as the others.
+        right: Likewise.
+        up: Likewise.
+        first_row: First row that counts.
+    """
+    right, down, depth = project_points(camera, forward, right, up)
+    scale = camera.focal / depth.clamp(min=_NEAR)
+    near, cut = camera.focal / _NEAR, (depth < _NEAR).any(-1)
+    some = (depth > _NEAR).any(-1)  # else the rectangle is empty
+
+    def limits(place: Tensor, first: int, last: int, size: int) -> tuple[Tensor, Tensor]:
+        seen = place * scale
+        low, high = seen.amin(-1), seen.amax(-1)
+        low = torch.where(cut, torch.minimum(low, place.amin(-1) * near), low)
+        high = torch.where(cut, torch.maximum(high, place.amax(-1) * near), high)
+        low, high = (low + 0.5 * size).floor().clamp(first, last), (high + 0.5 * size).ceil().clamp(first, last)
+        return low.long().flatten(), torch.where(some, high, low).long().flatten()
+
+    left, end = limits(right, 0, camera.width, camera.width)
+    top, bottom = limits(down, first_row, camera.height, camera.height)
+    box, line = _enumerate_groups(torch.where(end > left, bottom - top, 0))
+    row = line + top.index_select(0, box)
+    stretch, place = _enumerate_groups((end - left).index_select(0, box))
+    start = row * camera.width + left.index_select(0, box)
+    return Candidates(
+        box.index_select(0, stretch), row.index_select(0, stretch), start.index_select(0, stretch) + place
+    )
+
+
+def _enumerate_groups(count: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the group of every member of n groups, and its number within it from 0, of the sizes of the groups."""
+    group = torch.repeat_interleave(count)
+    return group, torch.arange(len(group), device=count.device) - (count.cumsum(0) - count).index_select(0, group)
+
+
+def _slab(origin: Tensor, inverse: Tensor, size: float) -> tuple[Tensor, Tensor]:
+    """Return where rays enter and leave the space between planes at +-size / 2, in lengths of their directions.
+
+    Args:
+        origin: Of the rays, across the planes [m].
+        inverse: One over their directions across the planes; infinite along them.
+        size: Distance of the planes [m].
+    """
+    one, other = (-0.5 * size - origin).mul_(inverse), (0.5 * size - origin).mul_(inverse)
+    return torch.minimum(one, other), torch.maximum(one, other)
+
+
+def _to_box_frame(forward: Tensor, right: Tensor, cos: Tensor, sin: Tensor) -> tuple[Tensor, Tensor]:
+    """Return a vector in a box's own frame."""
+    return forward * cos + right * sin, right * cos - forward * sin
+
+
+def _pick(numbers: Tensor, *values: Tensor) -> tuple[Tensor, ...]:
+    """Return entries of flat tensors by their numbers (C,)."""
+    return tuple(value.flatten().index_select(0, numbers) for value in values)
+
+
+def cast_shadows(boxes: Boxes, light: Light, camera: Camera, seen: Pixels) -> Tensor | None:
+    """Return which ground pixels see no sun because of a box, boolean, shape (T, R, W); None if all do.
+
+    Shadows count for all N boxes, that of the camera's own vehicle included.
+    """
+    sun_forward, sun_right, sun_up = light.sun[:, :, None].unbind(1)
+    forward, right = boxes.corners()
+    steep = (BODY_HEIGHT / sun_up)[..., None]
+    moved = forward - sun_forward[..., None] * steep, right - sun_right[..., None] * steep
+    forward, right = torch.cat((forward, moved[0]), -1), torch.cat((right, moved[1]), -1)
+    at = find_candidates(camera, forward, right, torch.zeros_like(forward), seen.sky)
+    if not len(at.box):
+        return None
+    origin = _to_box_frame(boxes.forward, boxes.right, boxes.cos, boxes.sin)
+    sun = _to_box_frame(sun_forward, sun_right, boxes.cos, boxes.sin)
+    above = (BODY_HEIGHT / sun_up).expand_as(boxes.cos)
+    x0, y0, cos, sin, inverse_x, inverse_y, leaves = _pick(
+        at.box, *origin, boxes.cos, boxes.sin, 1.0 / sun[0], 1.0 / sun[1], above
+    )
+    pixel = at.pixel - seen.sky * camera.width
+    (ground_forward,), (ground_right,) = _pick(at.row - seen.sky, seen.forward), _pick(pixel, seen.right)
+    x, y = _to_box_frame(ground_forward, ground_right, cos, sin)
+    near_x, far_x = _slab(x - x0, inverse_x, VEHICLE_LENGTH)
+    near_y, far_y = _slab(y - y0, inverse_y, VEHICLE_WIDTH)
+    enters = torch.maximum(near_x, near_y).clamp_(min=0.0)
+    (dark,) = (enters <= torch.minimum(torch.minimum(far_x, far_y), leaves)).nonzero(as_tuple=True)
+    shade = torch.zeros(len(boxes.cos), *seen.right.shape, dtype=torch.bool, device=x.device)
+    box, pixel = _pick(dark, at.box, pixel)
+    frame = torch.div(box, boxes.cos.shape[1], rounding_mode="floor")
+    shade.view(-1).index_fill_(0, frame * seen.right.numel() + pixel, True)
+    return shade
+
+
+def draw_boxes(image: Tensor, boxes: Boxes, light: Light, camera: Camera, seen: Pixels, colours: Tensor) -> None:
+    """Draw boxes into pictures.
+
+    Args:
+        image: Colours, shape (T, H W, 3), changed in place.
+        boxes: N boxes in each.
+        light: Of the pictures.
+        camera: The camera.
+        seen: What its pixels see.
+        colours: Of the boxes, shape (N, 3).
+    """
+    forward, right = (torch.cat((part, part), -1) for part in boxes.corners())
+    up = torch.zeros_like(forward)
+    up[..., 4:] = BODY_HEIGHT
+    at = find_candidates(camera, forward, right, up)
+    if not len(at.box):
+        return
+    origin = _to_box_frame(-boxes.forward, -boxes.right, boxes.cos, boxes.sin)
+    ray_forward, ray_right, ray_up = seen.ray
+    middle = camera.mount_height - 0.5 * BODY_HEIGHT
+    near_z, far_z = _slab(torch.full_like(ray_up, middle), 1.0 / ray_up, BODY_HEIGHT)  # the same for all boxes
+    x0, y0, cos, sin = _pick(at.box, *origin, boxes.cos, boxes.sin)
+    way_forward, way_right, near_z, far_z = _pick(at.pixel, ray_forward, ray_right, near_z, far_z)
+    x, y = _to_box_frame(way_forward, way_right, cos, sin)
+    near_x, far_x = _slab(x0, x.reciprocal_(), VEHICLE_LENGTH)
+    near_y, far_y = _slab(y0, y.reciprocal_(), VEHICLE_WIDTH)
+    enters = torch.maximum(torch.maximum(near_x, near_y), near_z)
+    (hit,) = ((enters <= torch.minimum(torch.minimum(far_x, far_y), far_z)) & (enters > 0.0)).nonzero(as_tuple=True)
+
+    n, size = boxes.cos.shape[1], image.shape[1]
+    box, pixel, enters, near_y, near_z = _pick(hit, at.box, at.pixel, enters, near_y, near_z)
+    frame = torch.div(box, n, rounding_mode="floor")
+    slot = frame * size + pixel
+    key = enters.view(torch.int32).to(torch.int64) * (n * len(image)) + box
+    nearest = torch.full((len(image) * size,), torch.iinfo(torch.int64).max, device=image.device)
+    nearest.scatter_reduce_(0, slot, key, "amin")
+    (won,) = (nearest.index_select(0, slot) == key).nonzero(as_tuple=True)
+
+    box, frame, pixel, slot, enters, near_y, near_z = _pick(won, box, frame, pixel, slot, enters, near_y, near_z)
+    axis = torch.where(near_z == enters, 2, (near_y == enters).long())
+    (climb,) = _pick(pixel, ray_up)
+    level = camera.mount_height + enters * climb
+    glass = (axis < 2) & (level > WINDOWS[0]) & (level < WINDOWS[1])
+    colour = _faces(boxes, origin, light, colours).index_select(0, (box * 3 + axis) * 2 + glass)
+    clear = light.through(enters * seen.norm.index_select(0, pixel), frame)[:, None]
+    air = (light.brightness[:, None] * colour.new_tensor(AIR)).index_select(0, frame)
+    image.view(-1, 3).index_copy_(0, slot, torch.addcmul(air, clear, colour - air))
+
+
+def _faces(boxes: Boxes, origin: tuple[Tensor, Tensor], light: Light, colours: Tensor) -> Tensor:
+    """Return the colours of the faces that a camera sees: front or rear, a side and the roof, body and windows.
+
+    Args:
+        boxes: N boxes in T pictures.
+        origin: The camera in the boxes' own frames [m]; it sees the faces on its side.
+        light: Of the pictures.
+        colours: Of the boxes, shape (N, 3).
+
+    Returns:
+        Shape (T N 3 2, 3).
+    """
+    sun_forward, sun_right, sun_up = light.sun[:, :, None].unbind(1)
+    along, across = _to_box_frame(sun_forward, sun_right, boxes.cos, boxes.sin)
+    facing = torch.stack((along * origin[0].sign(), across * origin[1].sign(), sun_up.expand_as(along)), dim=-1)
+    bright = light.diffuse[:, None, None] + light.direct[:, None, None] * facing.clamp(min=0.0)
+    paints = torch.stack((colours, colours.new_tensor(GLASS).expand_as(colours)), dim=1)
+    return (bright[..., None, None] * paints[:, None]).view(-1, 3)
