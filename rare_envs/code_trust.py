@@ -22,12 +22,7 @@ MAX_NOTES = 2**24
 
 
 def find_notes() -> Path:
-    """Return the file with the notes, in the user's folder for states of programs (XDG_STATE_HOME).
-
-    Example:
-        >>> find_notes().name
-        'runs'
-    """
+    """Return the file with the notes, in the user's folder for states of programs (XDG_STATE_HOME)."""
     state = os.environ.get("XDG_STATE_HOME") or str(Path.home() / ".local" / "state")
     return Path(state) / "rare-envs" / "runs"
 
@@ -54,13 +49,7 @@ def check_code_trust(question: Mapping[str, Any], code: Sequence[str], folder: P
 
     Raises:
         ValueError: It is not trusted.
-
-    Example:
-        >>> check_code_trust({"ego": "mine:make"}, ["mine:make"], Path("run"), trust=False)
-        Traceback (most recent call last):
-            ...
-        ValueError: The run in 'run' was not made here, and its question runs code: 'mine:make'. Look at that code, then add --trust (trust=True) once; that is remembered until question or code change.
-    """  # noqa: E501 (the example shows a whole message)
+    """
     if not code:
         return
     trusted = _digest_trusted(question, code)
@@ -78,12 +67,7 @@ def check_code_trust(question: Mapping[str, Any], code: Sequence[str], folder: P
 
 
 def find_module_file(name: str) -> Path | None:
-    """Return the file of the module in `module:name`, found without running anything; None if there is none.
-
-    Example:
-        >>> find_module_file("json.decoder:JSONDecoder").name
-        'decoder.py'
-    """
+    """Return the file of the module in `module:name`, found without running anything; None if there is none."""
     parts = name.partition(":")[0].split(".")
     for folder in (os.getcwd(), *sys.path):
         base = Path(folder, *parts)

@@ -32,17 +32,6 @@ def replace_file(path: str | Path) -> Iterator[Path]:
 
     Raises:
         OSError: The draft cannot be written.
-
-    Example:
-        >>> from tempfile import TemporaryDirectory
-        >>> with TemporaryDirectory() as folder:
-        ...     path = Path(folder) / "answer.txt"
-        ...     _ = path.write_text("the earlier one")
-        ...     with contextlib.suppress(RuntimeError), replace_file(path) as draft:
-        ...         _ = draft.write_text("half of the new o")
-        ...         raise RuntimeError
-        ...     path.read_text(), len(list(path.parent.iterdir()))
-        ('the earlier one', 1)
     """
     path = Path(os.path.realpath(path))
     draft = path.with_name(f".{path.stem}.{os.getpid()}.part{path.suffix}")
@@ -77,12 +66,6 @@ def check_ordinary(path: str | Path, most: int | None = None) -> None:
     Raises:
         ValueError: It is none, or has more bytes.
         OSError: There is none, or nobody may look at it.
-
-    Example:
-        >>> check_ordinary("/dev/null")
-        Traceback (most recent call last):
-            ...
-        ValueError: '/dev/null' is no ordinary file.
     """
     found = os.stat(path)
     if not stat.S_ISREG(found.st_mode):
@@ -126,14 +109,6 @@ def parse_json_object(text: str, source: str) -> dict[str, Any]:
 
     Raises:
         ValueError: If it is not valid JSON, or no object.
-
-    Example:
-        >>> parse_json_object('{"format": 1}', "the header")
-        {'format': 1}
-        >>> parse_json_object("[1]", "The header")
-        Traceback (most recent call last):
-            ...
-        ValueError: The header: expected a JSON object, got list.
     """
     try:
         data = json.loads(text, parse_int=_parse_int)
@@ -147,26 +122,14 @@ def parse_json_object(text: str, source: str) -> dict[str, Any]:
 
 
 def format_json(value: dict[str, Any]) -> str:
-    """Return JSON with one entry per line, but lists of numbers in one line.
-
-    Example:
-        >>> print(format_json({"p": 0.5, "interval": [0.25, 0.75]}))
-        {
-          "p": 0.5,
-          "interval": [0.25, 0.75]
-        }
-    """
+    """Return JSON with one entry per line, but lists of numbers in one line."""
     text = json.dumps(value, indent=2, allow_nan=False)
     # a line that ends with a bracket is no part of a string, which would have no line breaks
     return re.sub(r"\[\n([^\[\]{}\"]*)\n *\]", lambda match: f"[{' '.join(match[1].split())}]", text)
 
 
 def _parse_int(digits: str) -> int:
-    """Return a whole number that a float can hold.
-
-    Raises:
-        ValueError: If it is larger.
-    """
+    """Return a whole number that a float can hold."""
     if len(digits) > _MAX_DIGITS:
         raise ValueError(f"a whole number of {len(digits)} digits")
     return int(digits)

@@ -87,11 +87,6 @@ def set_up(
     Returns:
         The world and the space of its parameters.
 
-    Example:
-        >>> world, space = set_up("rare_envs/CutIn-v0", horizon=4.0)
-        >>> world.clock.ticks, space.dim
-        (40, 6)
-
     Raises:
         TypeError: If there is no such argument; the message suggests the nearest and lists all.
         ValueError: If an argument is not one of those; the message says what is.
@@ -141,11 +136,7 @@ def refuse_unknown(scenario: Scenario, arguments: Mapping[str, Any], more: Seque
 
 @torch.inference_mode()
 def _try_measure(world: World, space: ScenarioSpace) -> None:
-    """Evaluate a user's measure on two drives of one tick, so that a broken one is found before the simulations.
-
-    Raises:
-        ValueError: If it raises, or does not give one finite number for each.
-    """
+    """Evaluate a user's measure on two drives of one tick, so that a broken one is found before the simulations."""
     drawn = space.sample(2, np.random.default_rng(0))
     x = torch.from_numpy(drawn[:, : sum(world.columns)]).float()  # the ego, whose noise is behind, is not asked
     measure = world.measurement.measure

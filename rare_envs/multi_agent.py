@@ -100,12 +100,7 @@ def step_traffic(world: World, episode: MultiAgentEpisode, action: Tensor, comma
 
 
 def view_order(vehicle: int, vehicles: int) -> list[int]:
-    """Return the vehicles in the order of `State.seen_by`.
-
-    Example:
-        >>> view_order(1, 3)
-        [1, 0, 2]
-    """
+    """Return the vehicles in the order of `State.seen_by`."""
     return [vehicle, *(j for j in range(vehicles) if j != vehicle)]
 
 
@@ -305,11 +300,7 @@ def step_agents(
 def _combine_actions(
     world: World, episode: MultiAgentEpisode, action: Tensor, commanded: Tensor, ego: Driver, memory: Any
 ) -> tuple[Episode, Tensor, Any]:
-    """Combine the agents' actions with those of the ego's driver.
-
-    Returns:
-        The traffic with its new aims, accelerations and steering angles (B, N, 2), and the memory of the ego's driver.
-    """
+    """Combine the agents' actions with those of the ego's driver."""
     by_driver = ~commanded[:, 0]
     driven: Tensor | None = None
     if bool(by_driver.any()):

@@ -49,10 +49,6 @@ def import_module(name: str, purpose: str) -> ModuleType:
 
     Raises:
         ValueError: If importing it fails in whatever way, which the message says in one line.
-
-    Example:
-        >>> round(import_module("math", "this example").pi, 4)
-        3.1416
     """
     try:
         with working_directory_first():
@@ -70,10 +66,6 @@ def import_object(spec: str, purpose: str) -> Any:
 
     Raises:
         ValueError: If spec has another form, the module cannot be imported or has nothing of that name.
-
-    Example:
-        >>> import_object("math:hypot", "this example")(3.0, 4.0)
-        5.0
     """
     module_name, _, name = spec.partition(":")
     if not module_name or not name:
@@ -92,15 +84,6 @@ def make_lazy_getattr(package: str, modules: Mapping[str, str]) -> Callable[[str
     Args:
         package: Its dotted name.
         modules: The module that defines each name.
-
-    Example:
-        >>> get = make_lazy_getattr("shapes", {"pi": "math"})
-        >>> round(get("pi"), 4)
-        3.1416
-        >>> get("tau")
-        Traceback (most recent call last):
-            ...
-        AttributeError: module 'shapes' has no attribute 'tau'
     """
 
     def get(name: str) -> Any:
@@ -112,12 +95,7 @@ def make_lazy_getattr(package: str, modules: Mapping[str, str]) -> Callable[[str
 
 
 def did_you_mean(name: str, valid: Iterable[str]) -> str:
-    """Return `" (did you mean 'x'?)"` for the nearest valid name, or "" if none is near; capitals make no difference.
-
-    Example:
-        >>> did_you_mean("CutIm-v0", ["rare_envs/CutIn-v0", "rare_envs/Highway-v0"])
-        " (did you mean 'rare_envs/CutIn-v0'?)"
-    """
+    """Return `" (did you mean 'x'?)"` for the nearest valid name, or "" if none is near; whatever the capitals."""
     names = {v.lower(): v for v in valid}
     names |= {short.split("/")[-1]: v for short, v in names.items()}  # an id without its namespace
     near = difflib.get_close_matches(name.lower(), list(names), n=1)
@@ -128,10 +106,6 @@ def one_line(error: BaseException) -> str:
     """Return an exception as one line without a full stop: its class, and up to 200 characters of its message.
 
     Colours of a terminal, which numba's messages have where colorama is installed, are left out.
-
-    Example:
-        >>> one_line(RuntimeError("no   weights."))
-        'RuntimeError: no weights'
     """
     words = " ".join(_COLOUR.sub("", str(error)).split()).rstrip(".")
     kind = type(error).__name__
@@ -140,13 +114,7 @@ def one_line(error: BaseException) -> str:
 
 @contextlib.contextmanager
 def working_directory_first() -> Iterator[None]:
-    """Search modules in the working directory first, as `python -m` does and console scripts do not.
-
-    Example:
-        >>> with working_directory_first():
-        ...     sys.path[0] == os.getcwd()
-        True
-    """
+    """Search modules in the working directory first, as `python -m` does and console scripts do not."""
     here = os.getcwd()
     sys.path.insert(0, here)
     try:

@@ -89,12 +89,7 @@ class Glances(NamedTuple):
 
 
 def count_glances(horizon: float) -> int:
-    """Return how many glances are drawn for an episode [s]: five standard deviations more than begin on average.
-
-    Example:
-        >>> count_glances(10.0)
-        12
-    """
+    """Return how many glances are drawn for an episode [s]: five standard deviations more than begin on average."""
     mean = horizon / MEAN_ON_ROAD
     return math.ceil(mean + 5.0 * math.sqrt(mean) + 2.0)
 
@@ -105,12 +100,7 @@ def count_glance_draws(horizon: float) -> int:
 
 
 def glance_duration(share: Tensor) -> Tensor:
-    """Return the duration [s] that a share of all glances does not exceed: the quantile function, any shape.
-
-    Example:
-        >>> glance_duration(torch.tensor([0.5, 0.95])).round(decimals=2)  # median, 95 %
-        tensor([0.7300, 1.9100])
-    """
+    """Return the duration [s] that a share of all glances does not exceed: the quantile function, any shape."""
     return _interpolate(share, [p for _, p in GLANCE_CDF], [d for d, _ in GLANCE_CDF])
 
 
@@ -184,10 +174,6 @@ class HumanDriverModel:
     """Parameters of an attentive human driver; each is published, none is fitted.
 
     Values of the book and of Regulation 157 are as quoted or implemented in public; neither text was consulted.
-
-    Example:
-        >>> HumanDriverModel(reaction_time=1.0).reaction_time
-        1.0
 
     Raises:
         ValueError: If a number is negative.

@@ -52,14 +52,6 @@ class Mobil:
 
     Raises:
         ValueError: If the safe deceleration is not positive, or the threshold or the delay is negative.
-
-    Example:
-        >>> from rare_envs.traffic import State, straight
-        >>> x, y = torch.tensor([[0.0, 20.0]]), torch.tensor([[4.0, 4.0]])  # a slow lead, the left lane is free
-        >>> state = State(x, y, 0 * x, torch.tensor([[20.0, 10.0]]), theta=x[:, :0])
-        >>> choice = Mobil().choose(LaneTraffic.of(state, straight(2)), slice(0, 1), IDM())
-        >>> choice.wanted.tolist()
-        [[[True, False]]]
     """
 
     politeness: float = 0.25
@@ -137,16 +129,6 @@ def acceleration_behind(traffic: LaneTraffic, idm: IDM, follower: Tensor, lead: 
 
     Returns:
         Shape (B, M, K).
-
-    Example:
-        >>> from rare_envs.traffic import State, straight
-        >>> x = torch.tensor([[0.0, 30.0]])
-        >>> traffic = LaneTraffic.of(State(x, 0 * x, 0 * x, 0 * x + 15.0, theta=x[:, :0]), straight(1))
-        >>> first, second, nobody = (torch.tensor([[[k]]]) for k in (0, 1, -1))
-        >>> round(acceleration_behind(traffic, IDM(), first, second).item(), 2)  # 25 m behind another
-        0.2
-        >>> acceleration_behind(traffic, IDM(), nobody, first).item()
-        0.0
     """
     follower, lead = follower + torch.zeros_like(lead), lead + torch.zeros_like(follower)
 
@@ -184,16 +166,6 @@ class LaneChangingDriver:
 
     Raises:
         ValueError: If the lateral speed is not positive.
-
-    Example:
-        >>> from rare_envs.traffic import State, straight
-        >>> x, y = torch.tensor([[0.0, 20.0]]), torch.tensor([[4.0, 4.0]])  # a slow lead, the left lane is free
-        >>> state = State(x, y, 0 * x, torch.tensor([[20.0, 10.0]]), theta=x[:, :0])
-        >>> driver = LaneChangingDriver(mobil=Mobil(delay=0.0))
-        >>> memory = driver.begin(torch.zeros(1, 1, 2, 2))
-        >>> action, memory = driver.decide(LaneTraffic.of(state, straight(2)), slice(0, 1), memory, 0.1)
-        >>> action[0, 0, 1].item() < 0  # it turns to the left
-        True
     """
 
     idm: IDM = field(default_factory=IDM)

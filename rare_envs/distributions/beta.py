@@ -145,12 +145,7 @@ class BetaDistribution:
         return np.asarray((self.high - self.low) * slope * gradients)
 
     def _share(self, u: FloatArray, columns: NDArray[np.intp]) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return the distance from the nearer tail's end as a share of the range, and the shape parameters from there.
-
-        Args:
-            u: Points in standard normal space, of any shape.
-            columns: Number of the variable of each, of a shape that broadcasts with it.
-        """
+        """Return how far from the nearer end as a share of the range, and the shape parameters from there."""
         left, alpha, beta = u < 0.0, self.alpha[columns], self.beta[columns]
         first, second = np.where(left, alpha, beta), np.where(left, beta, alpha)
         return np.asarray(special.betaincinv(first, second, special.ndtr(-np.abs(u)))), first, second

@@ -382,13 +382,7 @@ class TruncatedGaussianMixture(CoordinateMixture):
         super().__init__(Coordinates(low, high, kinds), *arrays)  # type: ignore[arg-type]  # made arrays there
 
     def with_parameters(self, values: ArrayLike) -> TruncatedGaussianMixture:
-        """Return the mixture with other values of its parameters in the same box; weights are scaled to add up to 1.
-
-        Example:
-            >>> normal = TruncatedGaussianMixture([1.0], [[0.0]], [[[4.0]]], [-9.0], [9.0])
-            >>> normal.with_parameters([1.0, 3.0]).covariances.tolist()  # mean and standard deviation
-            [[[9.0]]]
-        """
+        """Return the mixture with other values of its parameters in the same box; weights are scaled to add up to 1."""
         return TruncatedGaussianMixture(*set_mixture_parameters(self._arrays, values), self.low, self.high)
 
     def to_dict(self) -> dict[str, Any]:

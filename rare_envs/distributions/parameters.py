@@ -173,10 +173,6 @@ def name_coordinates(coordinates: Coordinates, names: Sequence[str] = ()) -> lis
     """Return the coordinates of a mixture in words, in their order.
 
     "closing to lead_speed" is the coordinate `ClosingSpeed` of that column, (speed behind - lead_speed) / sqrt(gap).
-
-    Example:
-        >>> name_coordinates(Coordinates([1.0, 0.0], [9.0, 1.0], ("log", "plain")), ("gap", "speed"))
-        ['log gap', 'speed']
     """
     columns = tuple(names) or coordinates.names or number_columns(coordinates.dim)
     labels = []

@@ -40,14 +40,7 @@ MIN_SHARE = 1e-20
 
 
 class Refits(tuple[Distribution, ...]):
-    """Distributions of the same X, of which densities are computed together.
-
-    Example:
-        >>> Refits([TruncatedGaussianMixture([1.0], [[m]], [[[1.0]]], [-9.0], [9.0]) for m in (0.0, 1.0)]).log_probs(
-        ...     np.array([[0.0], [1.0], [10.0]])
-        ... ).round(3).tolist()
-        [[-0.919, -1.419, -inf], [-1.419, -0.919, -inf]]
-    """
+    """Distributions of the same X, of which densities are computed together."""
 
     __slots__ = ()
 
@@ -87,11 +80,6 @@ def pool_mixtures(mixtures: Sequence[CoordinateMixture]) -> CoordinateMixture | 
 
     Raises:
         ValueError: The boxes differ, or no order of the columns serves all coordinates.
-
-    Example:
-        >>> narrow, wide = (TruncatedGaussianMixture([1.0], [[0.0]], [[[s * s]]], [-9.0], [9.0]) for s in (1.0, 2.0))
-        >>> np.exp(pool_mixtures([narrow, wide]).log_prob([[0.0]])).round(3).tolist()  # (0.399 + 0.199) / 2
-        [0.299]
     """
     for i, each in enumerate(mixtures):
         if not (np.array_equal(each.low, mixtures[0].low) and np.array_equal(each.high, mixtures[0].high)):
@@ -140,11 +128,7 @@ def _align(pools: Sequence[CoordinateMixture]) -> tuple[CoordinateMixture, ...]:
 
 
 def _reorder(mixture: CoordinateMixture, names: tuple[str, ...], columns: tuple[int, ...]) -> CoordinateMixture:
-    """Return a mixture with its coordinates in the order of these columns of x.
-
-    Raises:
-        ValueError: A coordinate depends on a column that comes later.
-    """
+    """Return a mixture with its coordinates in the order of these columns of x."""
     own = mixture.coordinates
     if own.columns == columns:
         return mixture
@@ -204,15 +188,6 @@ class PooledMixture:
 
     Raises:
         ValueError: The columns differ in order, or there is not one weight for each part.
-
-    Example:
-        >>> plain, log = (Coordinates([1.0], [99.0], (kind,), ("gap",)) for kind in ("plain", "log"))
-        >>> wide, narrow = [[[9.0]]], [[[0.01]]]
-        >>> parts = CoordinateMixture(plain, [1.0], [[20.0]], wide), CoordinateMixture(log, [1.0], [[3.0]], narrow)
-        >>> pool = PooledMixture(parts, [0.5, 0.5])
-        >>> x = pool.from_standard_normal([[1.0], [3.0]])
-        >>> x.round(1).tolist(), pool.to_standard_normal(x).round(6).tolist()
-        ([[22.6], [28.4]], [[1.0], [3.0]])
     """
 
     parts: tuple[CoordinateMixture, ...]

@@ -29,13 +29,7 @@ SB3 = "stable_baselines3"
 
 @runtime_checkable
 class RenamedPolicy(Protocol):
-    """An ego whose `predict` is that of another policy.
-
-    Example:
-        >>> from types import SimpleNamespace
-        >>> isinstance(SimpleNamespace(same_as=None), RenamedPolicy), isinstance(object(), RenamedPolicy)
-        (True, False)
-    """
+    """An ego whose `predict` is that of another policy."""
 
     @property
     def same_as(self) -> Any:
@@ -51,13 +45,6 @@ def read_dense_policy(policy: Any) -> DensePolicy:
 
     Raises:
         NotCompiled: It is none of these; the message says what it is.
-
-    Example:
-        >>> import gymnasium, rare_envs
-        >>> from stable_baselines3 import PPO
-        >>> model = PPO("MlpPolicy", gymnasium.make("rare_envs/CarFollowing-v0"), device="cpu")
-        >>> [weight.shape for weight, _ in read_dense_policy(model).layers]
-        [(64, 7), (64, 64), (2, 64)]
     """
     if type(policy) is RescaledPolicy:
         return replace(read_dense_policy(policy.policy), rescale=(policy.low, policy.high))
@@ -211,13 +198,6 @@ def find_inference(policy: Any) -> Any:
 
     Args:
         policy: Has Stable-Baselines3's `predict`; it may stand behind wrappers.
-
-    Example:
-        >>> import gymnasium, rare_envs
-        >>> from stable_baselines3 import PPO
-        >>> model = PPO("MlpPolicy", gymnasium.make("rare_envs/CarFollowing-v0"), device="cpu")
-        >>> type(find_inference(model)).__name__, find_inference("anything else")
-        ('DenseInference', 'anything else')
     """
     if type(policy) in (RescaledPolicy, NormalisedPolicy):
         return replace(policy, policy=find_inference(policy.policy))

@@ -40,12 +40,7 @@ class EgoFault(ValueError):
 
 
 def reason_of(error: BaseException) -> str:
-    """Return what went wrong, in one line.
-
-    Example:
-        >>> reason_of(RuntimeError("no road"))
-        'RuntimeError: no road'
-    """
+    """Return what went wrong, in one line."""
     words = " ".join(str(error).split())
     if isinstance(error, ValueError) and words:  # ours say what is wrong by themselves
         return words
@@ -53,14 +48,7 @@ def reason_of(error: BaseException) -> str:
 
 
 def is_policy(ego: object) -> bool:
-    """Return whether an object, and not a class, has Stable-Baselines3's `predict`.
-
-    Example:
-        >>> class Coasting:
-        ...     def predict(self, observation, state=None, episode_start=None, deterministic=True): ...
-        >>> is_policy(Coasting()), is_policy(Coasting), is_policy("idm")
-        (True, False, False)
-    """
+    """Return whether an object, and not a class, has Stable-Baselines3's `predict`."""
     # not isinstance of a Protocol, which takes a predict that is no function, and misses one that is passed on
     return not isinstance(ego, type) and callable(getattr(ego, "predict", None))
 
@@ -73,14 +61,7 @@ def check_predict(ego: Any) -> None:
 
     Raises:
         ValueError: If it takes fewer, as a `predict(observation)` does.
-
-    Example:
-        >>> class Short:
-        ...     def predict(self, observation): ...
-        >>> check_predict(Short())
-        Traceback (most recent call last):
-        ValueError: Expected predict(observation, state, episode_start, deterministic), as Stable-Baselines3 has it, got predict(observation) of Short.
-    """  # noqa: E501 (the example shows a whole message)
+    """
     try:
         signature = inspect.signature(ego.predict)
     except (TypeError, ValueError):  # of a built-in function it is not known
@@ -104,11 +85,6 @@ def refuse_ego(ego: object, origin: str = "", known: Sequence[str] = ("idm",)) -
 
     Raises:
         ValueError: Always; it says what was expected.
-
-    Example:
-        >>> refuse_ego(3, "from make_ego()")
-        Traceback (most recent call last):
-        ValueError: Expected 'idm' or an object with a method predict(observation, ...), got int from make_ego().
     """
     origin, names = f" {origin}" if origin else "", ", ".join(map(repr, known))
     if isinstance(ego, str):

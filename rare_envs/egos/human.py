@@ -38,16 +38,7 @@ _ALWAYS = 10**6
 
 @dataclass(frozen=True)
 class HumanEgo:
-    """An attentive human driver; a `DrivingProblem` turns it into a driver of its world.
-
-    Example:
-        >>> import rare_envs
-        >>> problem = rare_envs.DrivingProblem("rare_envs/CarFollowing-v0", ego="human")
-        >>> problem.space.names  # 40 for the errors of estimation, 26 for glances
-        ('ego_speed', 'lead_speed', 'gap', 'ego_noise')
-        >>> problem.dim
-        69
-    """
+    """An attentive human driver; a `DrivingProblem` turns it into a driver of its world."""
 
     model: HumanDriverModel = field(default_factory=HumanDriverModel)
     """Its parameters."""
@@ -167,11 +158,7 @@ class HumanDriver:
         return torch.stack((actual, steering), dim=1), later
 
     def _begin(self, episode: Episode) -> _HumanMemory:
-        """Return the memory at time 0: the driver knows the vehicles of its lane, which have kept their speeds.
-
-        Raises:
-            ValueError: The noise of the driver is part of x and was not given.
-        """
+        """Return the memory at time 0: the driver knows the vehicles of its lane, which have kept their speeds."""
         if self.noise_columns and self.errors is None and self.glances is None:
             raise ValueError("Expected the draws of its noise: call with_draws first.")
         state, road = episode.state, episode.road
@@ -197,11 +184,6 @@ class HumanDriver:
         """Return what the driver knows of a reaction time ago: what it saw then, or what follows from its last look.
 
         While the eyes are off the road the others are taken to keep their speeds; the own motion is felt.
-
-        Args:
-            memory: Of the driver.
-            late: What there was to see then.
-            away: Whether the eyes were off the road then, boolean, shape (B,).
         """
         moved = self.world.clock.dt if memory.tick > self.delay else 0.0
         distance = memory.known.distance + moved * (memory.known.speed - memory.late_speed[:, None])

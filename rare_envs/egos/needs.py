@@ -31,13 +31,7 @@ from rare_envs.simulation.world import World
 
 @dataclass(frozen=True)
 class FunctionEgo:
-    """A function from observations to actions as an ego.
-
-    Example:
-        >>> ego = FunctionEgo(lambda observation: np.tile([-0.4, 0.0], (len(observation), 1)))
-        >>> ego.predict(np.zeros((2, 11)))[0].tolist()
-        [[-0.4, 0.0], [-0.4, 0.0]]
-    """
+    """A function from observations to actions as an ego."""
 
     function: Callable[[Any], Any]
     """Maps observations of B scenarios, (B, ...) or several of that kind by name, to actions, (B, 2) in [-1, 1] or
@@ -52,13 +46,7 @@ class FunctionEgo:
 
 @dataclass(frozen=True)
 class ModuleEgo:
-    """A torch module from observations to actions as an ego: in evaluation mode, without gradients, on its own device.
-
-    Example:
-        >>> ego = ModuleEgo(torch.nn.Linear(11, 2))
-        >>> ego.predict(np.zeros((3, 11), np.float32))[0].shape
-        (3, 2)
-    """
+    """A torch module from observations to actions as an ego: in evaluation mode, without gradients."""
 
     module: torch.nn.Module
     """Maps observations of B scenarios to actions, as the function of a `FunctionEgo`; float tensors in its dtype."""
@@ -83,12 +71,7 @@ class ModuleEgo:
 
 
 def wrap_callable(ego: Any) -> Any:
-    """Return a policy for a plain function or a torch module, and any other ego as it is.
-
-    Example:
-        >>> type(wrap_callable(torch.nn.Linear(11, 2))).__name__, wrap_callable("idm")
-        ('ModuleEgo', 'idm')
-    """
+    """Return a policy for a plain function or a torch module, and any other ego as it is."""
     if isinstance(ego, type) or not callable(ego) or is_policy(ego):
         return ego
     if any(hasattr(ego, name) for name in ("act", "in_world")):  # a driver, or an ego of worlds, that has __call__ too
@@ -110,14 +93,6 @@ def find_fitting_kinds(observed: Any, vehicles: int = 1) -> tuple[str, ...]:
 
     Returns:
         Kinds as `rare_envs.sensors.kinds.read_kinds` writes them; none if nothing fits.
-
-    Example:
-        >>> find_fitting_kinds(observation_space(3, "features"), vehicles=3)
-        ('features',)
-        >>> find_fitting_kinds(observation_space(13, "lidar"), vehicles=13)  # 3 + 4 * 12 numbers, as the lidar has
-        ('features', 'lidar')
-        >>> find_fitting_kinds(spaces.Box(-1.0, 1.0, (22,)), vehicles=3)  # two frames
-        ('features',)
     """
     if isinstance(observed, spaces.Dict):
         names = set(observed.spaces)
@@ -149,11 +124,6 @@ def choose_observation(needs: EgoNeeds, vehicles: int) -> str:
 
     Raises:
         ValueError: Several fit its space, or none does.
-
-    Example:
-        >>> choose_observation(EgoNeeds(observations=("features", "lidar")), vehicles=13)
-        Traceback (most recent call last):
-        ValueError: The ego's observations fit features and lidar: say which by observation=... (--observation).
     """
     if len(needs.observations) == 1:
         return needs.observations[0]
@@ -181,13 +151,6 @@ def choose_action(action_space: Any, observation: str) -> str:
 
     Raises:
         ValueError: Both fit.
-
-    Example:
-        >>> choose_action(spaces.Discrete(5), "features")
-        'continuous'
-        >>> choose_action(spaces.Discrete(5), "kinematics")  # doctest: +ELLIPSIS
-        Traceback (most recent call last):
-        ValueError: The ego's actions 0 to 4 fit two kinds: HighwayEnv's meta-actions (action='meta', --action meta; ...
     """
     if takes_indices(action_space) and "kinematics" in observation.split("+"):
         raise ValueError(
@@ -236,13 +199,6 @@ def name_ambiguities(action_space: Any, kinds: Collection[str]) -> tuple[str, ..
     Args:
         action_space: The policy's; None if it has none.
         kinds: Of observations that it gets.
-
-    Example:
-        >>> import gymnasium
-        >>> name_ambiguities(gymnasium.spaces.Discrete(5), ("kinematics",)) == (AMBIGUOUS,)
-        True
-        >>> name_ambiguities(gymnasium.spaces.Box(-0.1, 0.1, (2,)), ("features",))[0][:47]
-        "the ego's actions, between [-0.1, -0.1] and [0."
     """
     found = []
     if takes_indices(action_space):
@@ -369,12 +325,6 @@ LOADER = "agents.loading"
 
 def load_named_ego(ego: Any) -> Any:
     """Return the ego that a name or file stands for, see `agents.load_ego`, and any other ego as it is.
-
-    Example:
-        >>> load_named_ego("idm")
-        'idm'
-        >>> type(load_named_ego("imitation")).__name__
-        'LearnedEgo'
 
     Raises:
         FileNotFoundError: The file does not exist.

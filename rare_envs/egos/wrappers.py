@@ -103,10 +103,6 @@ def find_action_bounds(space: Any) -> tuple[NDArray[Any], NDArray[Any]] | None:
 
     Raises:
         ValueError: A lower bound is not below the upper one.
-
-    Example:
-        >>> find_action_bounds(spaces.Box(-2.0, 2.0, (2,)))[1].tolist(), find_action_bounds(spaces.Box(-1.0, 1.0, (2,)))
-        ([2.0, 2.0], None)
     """
     if not isinstance(space, spaces.Box) or space.shape != (2,) or not np.isfinite([space.low, space.high]).all():
         return None
@@ -122,10 +118,6 @@ def find_stacking(given: Shape, wanted: Shape) -> tuple[int, bool] | None:
 
     Returns:
         Their number, and whether they lie along an axis of their own; None if the shapes do not go together.
-
-    Example:
-        >>> find_stacking((11,), (44,)), find_stacking((11,), (4, 11)), find_stacking((11,), (12,))
-        ((4, False), (4, True), None)
     """
     if wanted == given:
         return 1, False
@@ -191,10 +183,6 @@ def describe_missing_normalisation(policy: Any, given: spaces.Space[Any]) -> str
             of `VecNormalize`; those of Gymnasium's `NormalizeObservation` stay in its training environments, and the
             bounds of its observations tell. Of any other object nothing is said.
         given: Space of the environment's observations.
-
-    Example:
-        >>> describe_missing_normalisation(object(), spaces.Box(-1.0, 1.0, (2,)))
-        ''
     """
     if hasattr(policy, "find_missing_statistics"):
         return str(policy.find_missing_statistics(given))

@@ -72,17 +72,7 @@ class FixedConfiguration(UserDict[str, Any]):
 
 
 class HighwayEnvInterface:
-    """Attributes of HighwayEnv's environments, for code that reads them: they tell, and do not steer.
-
-    Example:
-        >>> import gymnasium
-        >>> env = gymnasium.make("rare_envs/CutIn-kinematics-v0").unwrapped
-        >>> _ = env.reset(seed=0, options={"ego_speed": 20.0, "cut_in_gap": 30.0})
-        >>> env.vehicle.speed, env.vehicle.crashed, len(env.vehicle.road.vehicles)
-        (20.0, False, 3)
-        >>> env.action_type.actions_indexes["FASTER"], env.config["policy_frequency"]
-        (3, 1)
-    """
+    """Attributes of HighwayEnv's environments, for code that reads them: they tell, and do not steer."""
 
     world: World
     render_mode: str | None

@@ -34,13 +34,6 @@ def make_traffic(state: State, road: Road, row: int = 0) -> Any:
 
     Returns:
         A `highway_env.road.road.Road`; its `vehicles` are `highway_env.vehicle.kinematics.Vehicle`, the ego first.
-
-    Example:
-        >>> from rare_envs.traffic import straight
-        >>> x = torch.tensor([[0.0, 30.0]])
-        >>> traffic = make_traffic(State(x, 0 * x, 0 * x, torch.tensor([[20.0, 15.0]]), theta=x[:, :0]), straight(2))
-        >>> [vehicle.speed for vehicle in traffic.vehicles], traffic.vehicles[0].lane_index
-        ([20.0, 15.0], ('0', '1', 0))
     """
     from highway_env.road.road import Road as Traffic
     from highway_env.vehicle.kinematics import Vehicle
@@ -91,13 +84,7 @@ def world_places(state: State, road: Road, row: int = 0) -> list[list[float]]:
 
 
 def make_network(road: Road, x: float) -> Any:
-    """Return HighwayEnv's road network of the lanes around x [m]; a curve in straight pieces, each a road of its own.
-
-    Example:
-        >>> from rare_envs.traffic import straight
-        >>> [lane.width for lane in make_network(straight(3), 0.0).lanes_list()]
-        [4.0, 4.0, 4.0]
-    """
+    """Return HighwayEnv's road network of the lanes around x [m]; a curve in straight pieces."""
     from highway_env.road.lane import LineType, StraightLane
     from highway_env.road.road import RoadNetwork
 
@@ -305,15 +292,6 @@ class Display:
 
     Raises:
         ValueError: If the mode is none of these.
-
-    Example:
-        >>> import numpy as np, rare_envs, torch
-        >>> world = rare_envs.DrivingProblem("rare_envs/CarFollowing-v0").world
-        >>> episode = world.start(torch.tensor([[20.0, 20.0, 30.0]]))
-        >>> display = Display(world, "rgb_array")
-        >>> display.draw(episode, time=0.0).shape
-        (208, 800, 3)
-        >>> display.close()
     """
 
     def __init__(self, world: World, mode: str | None) -> None:

@@ -33,13 +33,6 @@ class DrawsAhead:
     """Draws from a distribution, the same as by its `sample`, but many rows at once, which are kept for later calls.
 
     Of a distribution that is not known to draw row by row, just the wanted rows are drawn.
-
-    Example:
-        >>> base = BetaDistribution([2.0], [2.0], [0.0], [1.0])
-        >>> ahead, rng = DrawsAhead(base), np.random.default_rng(0)
-        >>> drawn = [ahead.sample(2, rng), ahead.sample(1, rng)]
-        >>> np.array_equal(np.vstack(drawn), base.sample(3, np.random.default_rng(0)))
-        True
     """
 
     def __init__(self, base: Distribution) -> None:
@@ -90,11 +83,6 @@ def merge_rows(old: _T, rows: Tensor, new: _T) -> _T:
         old: Of B scenarios.
         rows: Indices of R of them, shape (R,).
         new: Of R scenarios.
-
-    Example:
-        >>> import torch
-        >>> merge_rows((torch.zeros(3), "road"), torch.tensor([1]), (torch.ones(1), "road"))
-        (tensor([0., 1., 0.]), 'road')
     """
 
     def merge(old: Any, new: Any) -> Any:
@@ -114,11 +102,6 @@ def list_tensors(value: Any) -> list[Tensor]:
 
     Raises:
         ValueError: A part keeps its rows in a way of its own.
-
-    Example:
-        >>> import torch
-        >>> list_tensors((torch.zeros(1), ("road", torch.ones(1))))
-        [tensor([0.]), tensor([1.])]
     """
     found = list[Tensor]()
 
@@ -180,14 +163,7 @@ def replace_rows(observation: Any, rows: NDArray[np.intp], fresh: Any) -> Any:
 
 
 def put_masked(infos: dict[str, Any], key: str, value: Any, mask: NDArray[np.bool_]) -> None:
-    """Put an entry with its mask into infos, in Gymnasium's vector form.
-
-    Example:
-        >>> infos = {}
-        >>> put_masked(infos, "speed", [20.0, 0.0], np.array([True, False]))
-        >>> infos
-        {'speed': [20.0, 0.0], '_speed': array([ True, False])}
-    """
+    """Put an entry with its mask into infos, in Gymnasium's vector form."""
     infos[key] = value
     infos[f"_{key}"] = mask.copy()
 

@@ -215,14 +215,7 @@ class DrivingVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[Any]
         fresh: NDArray[np.bool_],
         features: NDArray[np.float32] | None,
     ) -> tuple[NDArray[np.float32], Info]:
-        """Return observations and infos after a step, and replace what ended if that is to be in the same step.
-
-        Args:
-            terms: Of the reward.
-            done: Episodes that have ended in the step.
-            fresh: Those that it has started.
-            features: The observation `features`, where it is known already.
-        """
+        """Return observations and infos after a step, and replace what ended if that is to be in the same step."""
         assert self._episode is not None
         episode, infos, everyone = self._episode, Info(), np.ones(self.num_envs, dtype=bool)
         known: Any = features if self.world.sensing.observation == "features" else None
@@ -347,12 +340,7 @@ class DrivingVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[Any]
 
 
 def clear_rows(actions: Any, rows: NDArray[np.bool_]) -> NDArray[Any]:
-    """Return actions with 0 in some rows, boolean (B,); those of another number of rows as they are.
-
-    Example:
-        >>> clear_rows([[1.0, 0.5], [1.0, 0.5]], np.array([True, False])).tolist()
-        [[0.0, 0.0], [1.0, 0.5]]
-    """
+    """Return actions with 0 in some rows, boolean (B,); those of another number of rows as they are."""
     cleared: NDArray[Any] = np.asarray(actions)
     if rows.any() and cleared.shape[:1] == rows.shape:
         cleared = cleared.copy()
@@ -365,10 +353,6 @@ def read_autoreset_mode(mode: AutoresetMode | str) -> AutoresetMode:
 
     Raises:
         ValueError: There is no such mode.
-
-    Example:
-        >>> read_autoreset_mode("NextStep")
-        <AutoresetMode.NEXT_STEP: 'NextStep'>
     """
     try:
         return AutoresetMode(mode)

@@ -352,11 +352,7 @@ class HighwayEnvProblem:
 
 
 def _pickle_task(task: DriveTask) -> bytes:
-    """Return a task as bytes, as it goes to worker processes.
-
-    Raises:
-        ValueError: If something in it cannot be pickled.
-    """
+    """Return a task as bytes, as it goes to worker processes."""
     import cloudpickle
 
     try:

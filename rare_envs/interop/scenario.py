@@ -192,11 +192,7 @@ class HighwayEnvScenario(gym.Wrapper[Any, Any, Any, Any]):
 
 
 def _find_layout(env: gym.Env[Any, Any]) -> Layout:
-    """Return the layout of an environment.
-
-    Raises:
-        ValueError: If there is none for it.
-    """
+    """Return the layout of an environment."""
     inner: Any = env.unwrapped
     plain: Any = env
     while isinstance(plain, OrderEnforcing | PassiveEnvChecker | TimeLimit):
@@ -223,11 +219,7 @@ def _find_measure(measure: str | Callable[[Any], float]) -> Callable[[Any], floa
 
 
 def _hold_parameters(groups: list[Group], fixed: Mapping[str, Any] | str | None) -> dict[str, Any]:
-    """Return the values of the parameters that are held, checked against their ranges.
-
-    Raises:
-        ValueError: If a parameter is unknown, is drawn together with others, or its value is outside its range.
-    """
+    """Return the values of the parameters that are held, checked against their ranges."""
     usual = {group.parameters[0].name: group.usual for group in groups if group.usual is not None}
     if fixed is None or fixed == "highway_env":
         return usual if fixed else {}

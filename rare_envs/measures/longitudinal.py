@@ -36,9 +36,6 @@ def ttc(moment: Moment) -> Tensor:
     Without the edge, f would not announce that an ego is about to leave the road, and methods that follow f downhill
     would miss that way to crash.
 
-    Args:
-        moment: Of B scenarios.
-
     Returns:
         Time to collision [s], in (0, TTC_MAX], shape (B,).
 
@@ -91,9 +88,6 @@ def lidar_ttc(moment: Moment) -> Tensor:
     no more than the moments before it (`Measure.collision`). In the released code beams that meet nothing and those
     that do not close count as infinite; here everything is at most `TTC_MAX`.
 
-    Args:
-        moment: Of B scenarios.
-
     Returns:
         Time to collision [s], in [0, TTC_MAX], shape (B,).
 
@@ -116,9 +110,6 @@ def lidar_ttc_terms(moment: Moment) -> Tensor:
     """Return `lidar_ttc` by vehicle that a beam meets, and by whether that beam looks ahead or behind.
 
     Beams square to the ego look ahead. A vehicle that no beam meets has `TTC_MAX`.
-
-    Args:
-        moment: Of B scenarios.
 
     Returns:
         Time to collision [s], shape (B, 2 (N - 1)): of each vehicle ahead, then behind.
@@ -157,9 +148,6 @@ def mttc(moment: Moment) -> Tensor:
 
     Critical values: as for the time to collision, often 1.5 to 4 s.
 
-    Args:
-        moment: Of B scenarios.
-
     Returns:
         Modified time to collision [s], in (0, TTC_MAX], shape (B,).
 
@@ -191,9 +179,6 @@ def thw(moment: Moment) -> Tensor:
 
     Critical values: 2 s is taught to drivers, under 0.9 s is fined in Germany (Vogel, 2003).
 
-    Args:
-        moment: Of B scenarios.
-
     Returns:
         Time headway [s], in (0, TTC_MAX], shape (B,).
 
@@ -224,9 +209,6 @@ def drac(moment: Moment) -> Tensor:
 
     Critical value: 3.4 m/s^2, the deceleration that most drivers find comfortable (AASHTO, 2004).
 
-    Args:
-        moment: Of B scenarios.
-
     Returns:
         Deceleration [m/s^2], in [0, DECELERATION_MAX], shape (B,).
 
@@ -252,9 +234,6 @@ def required_deceleration(moment: Moment) -> Tensor:
     first, if 2 gap / dv > w / b or dv <= 0: v^2 / (2 (gap + w^2 / (2 b))). If b = 0 it is `drac`.
 
     Critical values: 3.4 m/s^2 is comfortable, above 8 m/s^2 a dry road gives no more.
-
-    Args:
-        moment: Of B scenarios.
 
     Returns:
         Deceleration [m/s^2], in [0, DECELERATION_MAX], shape (B,).
@@ -292,9 +271,6 @@ def evasive_manoeuvre(moment: Moment) -> Tensor:
     crash constitutes a rapid maneuver". Here only the ego counts, and all its braking.
 
     Critical value: 1.
-
-    Args:
-        moment: Of B scenarios.
 
     Returns:
         Without unit, in [0, DECELERATION_MAX / RAPID_BRAKING], shape (B,); 0 at the start.

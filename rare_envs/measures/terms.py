@@ -53,13 +53,6 @@ class TermTracker:
     """A measure with terms to search by: its own, or those of another measure whose order is better.
 
     f is the measure's. Terms that are cut at a share of the horizon come part by part: K early ones, then K late ones.
-
-    Example:
-        >>> from rare_envs.measures import MEASURES, Moment
-        >>> tracker = TermTracker(MEASURES["ttc"], MEASURES["clearance"])
-        >>> state = tracker.start(Moment.of_two(gap=25.0, speed=20.0, lead_speed=10.0), ticks=100)
-        >>> tracker.f(state).tolist(), state.values.tolist()  # nothing is known of the late moments yet
-        ([2.5], [[25.0, 1000.0]])
     """
 
     measure: EpisodeMeasure
@@ -152,13 +145,6 @@ def find_order(measure: EpisodeMeasure, collisions: str, gamma: float) -> tuple[
         measure: Whose f it is.
         collisions: Those that count, "ego" or "any".
         gamma: Threshold of f.
-
-    Example:
-        >>> from rare_envs.measures import MEASURES
-        >>> find_order(MEASURES["ttc"], "ego", 0.0)[0] is MEASURES["clearance"]
-        True
-        >>> find_order(MEASURES["ttc"], "ego", 1.5)[0] is MEASURES["ttc"]
-        True
     """
     if gamma == 0.0 and isinstance(measure, Measure) and measure.collisions_only:
         return (PAIR_CLEARANCE if collisions == "any" else CLEARANCE), 0.0

@@ -48,9 +48,6 @@ def ttc_2d(moment: Moment) -> Tensor:
 
     Critical values: as for `ttc`, often 1.5 to 4 s.
 
-    Args:
-        moment: Of B scenarios.
-
     Returns:
         Time to collision [s], in (0, TTC_MAX], shape (B,).
 
@@ -70,9 +67,6 @@ def clearance(moment: Moment) -> Tensor:
     """Return the exact distance between the ego's body and the nearest other.
 
     Critical value: none is agreed on; 0.5 m beside and 2 m ahead are small.
-
-    Args:
-        moment: Of B scenarios.
 
     Returns:
         Distance [m], in [0.01, CLEARANCE_MAX], shape (B,).
@@ -97,9 +91,6 @@ def margin(moment: Moment) -> Tensor:
     where times to collision are capped. It is positive until contact; as a measure (`MEASURES["margin"]`) a collision
     comes to the negative speed at which the bodies met, so it goes on past contact too. It is ours: an order for
     samplers, not a quantity of the literature.
-
-    Args:
-        moment: Of B scenarios.
 
     Returns:
         Margin [s], positive, shape (B,).
@@ -206,6 +197,7 @@ def pet(trace: Trace) -> Tensor:
     Critical values: 1 to 1.5 s; under 1 s is a serious conflict.
 
     Args:
+        moment: Of B scenarios.
         trace: Of B episodes.
 
     Returns:
@@ -248,9 +240,6 @@ def _apart(x: Tensor, y: Tensor, heading: Tensor, valid: Tensor, delay: int) -> 
     """Return how far apart bodies are at a delay [m], the ego second and the ego first; `NEAR` where not driven.
 
     Of each moment the least since the moment before: for one delay both bodies move on together.
-
-    Returns:
-        Shape (2, T - delay, B, N - 1); by the later of the two moments.
     """
     early, late = slice(0, len(x) - delay), slice(delay, len(x))
 

@@ -76,15 +76,7 @@ def env_id_of(name: str) -> str:
 
     Raises:
         ValueError: If there is no such scenario; the message suggests the nearest name and lists all.
-
-    Example:
-        >>> env_id_of("cut_in"), env_id_of("rare_envs/CutIn-v0")
-        ('rare_envs/CutIn-v1', 'rare_envs/CutIn-v0')
-        >>> env_id_of("cutin")
-        Traceback (most recent call last):
-        ...
-        ValueError: Unknown scenario 'cutin' (did you mean 'cut_in'?); there are car_following, cut_in, highway, hard_brake.
-    """  # noqa: E501 (the example shows a whole message)
+    """
     name = complete_id(name)
     if name in SCENARIOS:
         return name
@@ -107,12 +99,7 @@ def _newest_ids() -> dict[str, str]:
 
 
 def split_version(env_id: str) -> tuple[str, int | None]:
-    """Return an id without its version, and the version; None where it has none.
-
-    Example:
-        >>> split_version("rare_envs/CutIn-v1")
-        ('rare_envs/CutIn', 1)
-    """
+    """Return an id without its version, and the version; None where it has none."""
     found = re.fullmatch(r"(.*)-v(\d+)", env_id)
     return (found[1], int(found[2])) if found else (env_id, None)
 
@@ -153,12 +140,7 @@ def find_scenario(env_id: str) -> Scenario:
 
 
 def is_highway_env_id(env_id: object) -> bool:
-    """Return whether an id is that of an environment of HighwayEnv that `rare_envs.highway_env_problem` takes.
-
-    Example:
-        >>> is_highway_env_id("highway-fast-v0"), is_highway_env_id("rare_envs/Highway-v0")
-        (True, False)
-    """
+    """Return whether an id is that of an environment of HighwayEnv that `rare_envs.highway_env_problem` takes."""
     return re.match(r"(highway(-fast)?|merge|intersection|roundabout)-v\d", str(env_id)) is not None
 
 
@@ -166,10 +148,6 @@ def complete_id(env_id: str) -> str:
     """Return an id with its namespace: of "CutIn-v0", or "CutIn-kinematics-v0", the one that ends so; else as it is.
 
     The word "rare_envs:" before it, by which `gym.make` imports this package, is left out.
-
-    Example:
-        >>> complete_id("CutIn-v0"), complete_id("rare_envs:rare_envs/CutIn-v0"), complete_id("Cut-v0")
-        ('rare_envs/CutIn-v0', 'rare_envs/CutIn-v0', 'Cut-v0')
     """
     if isinstance(env_id, str):  # what is no id is refused where the scenario is looked for
         env_id = env_id.removeprefix("rare_envs:")
@@ -186,10 +164,6 @@ def kinematics_id(env_id: str) -> str:
     """Return the id under which an environment has HighwayEnv's layout.
 
     For `gym.make` and `gym.make_vec`, so that scripts written for HighwayEnv run with nothing but the id changed.
-
-    Example:
-        >>> kinematics_id("rare_envs/CutIn-v0")
-        'rare_envs/CutIn-kinematics-v0'
     """
     name, _, version = env_id.rpartition("-v")
     return f"{name}-kinematics-v{version}"
@@ -199,12 +173,6 @@ def split_layout(env_id: str) -> tuple[str, dict[str, str]]:
     """Return the id of the scenario itself for an id with HighwayEnv's layout, and the keyword arguments it stands for.
 
     The id may lack its namespace, see `complete_id`.
-
-    Example:
-        >>> split_layout("rare_envs/CutIn-kinematics-v0")
-        ('rare_envs/CutIn-v0', {'observation': 'kinematics', 'action': 'meta'})
-        >>> split_layout("rare_envs/CutIn-v0")
-        ('rare_envs/CutIn-v0', {})
     """
     layouts, env_id = {kinematics_id(each): each for each in SCENARIOS}, complete_id(env_id)
     known = isinstance(env_id, str) and env_id in layouts

@@ -120,19 +120,7 @@ def find_met(bodies: Bodies, observers: int) -> Tensor:
 def _crossing(
     dx: Tensor, dy: Tensor, heading: Tensor, turn: Tensor, length: Tensor, width: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Return where a beam enters and leaves a box, as distances along the beam (slab method; Kay and Kajiya, 1986).
-
-    Args:
-        dx: Middle of the box less the beam's origin [m].
-        dy: Likewise.
-        heading: Heading of the box [rad].
-        turn: Direction of the beam less the heading of the box [rad].
-        length: Of the box [m].
-        width: Of the box [m].
-
-    Returns:
-        Distances [m]; the beam's line misses the box where the first is greater than the second.
-    """
+    """Return where a beam enters and leaves a box, as distances along the beam (slab method; Kay and Kajiya, 1986)."""
     cos, sin = torch.cos(heading), torch.sin(heading)
     along, across = _away_from_zero(torch.cos(turn)).reciprocal(), _away_from_zero(torch.sin(turn)).reciprocal()
     middle_along, half_along = (dx * cos + dy * sin) * along, 0.5 * length * along.abs()
@@ -148,11 +136,7 @@ def _away_from_zero(value: Tensor) -> Tensor:
 
 
 def _first_met(bodies: Bodies, m: int) -> tuple[Tensor, Tensor]:
-    """Return what each beam of the first m vehicles meets first.
-
-    Returns:
-        Index of the vehicle, -1 for none, and the distance to it [m] in single precision, shapes (B, m, 20).
-    """
+    """Return what each beam of the first m vehicles meets first."""
     batch, v = bodies.x.shape
     dx = bodies.x[:, None, :] - bodies.x[:, :m, None]
     dy = bodies.y[:, None, :] - bodies.y[:, :m, None]
@@ -193,15 +177,7 @@ def _first_met(bodies: Bodies, m: int) -> tuple[Tensor, Tensor]:
 
 
 def _test_all_beams(bodies: Bodies, dx: Tensor, dy: Tensor, relative: Tensor, in_range: Tensor) -> Tensor:
-    """Return the least `_key` of each beam, (B, m, 20), testing all with all bodies: what a GPU does soonest.
-
-    Args:
-        bodies: V of them.
-        dx: Middles of the bodies less the observers' [m], shape (B, m, V) as the next three.
-        dy: Likewise.
-        relative: Headings of the observers less the bodies' [rad].
-        in_range: Whether a beam could meet the body.
-    """
+    """Return the least `_key` of each beam, (B, m, 20), testing all with all bodies: what a GPU does soonest."""
     beam = torch.arange(BEAMS, device=dx.device)
     heading, length, width = (field[:, None, :, None] for field in (bodies.heading, bodies.length, bodies.width))
     turn = relative[..., None] + (FIRST_BEAM_ANGLE + BEAM_SPACING * beam)
@@ -330,15 +306,7 @@ def perceive_traffic(state: State, road: Road, pose: WorldPose | None = None) ->
 
 
 def find_vehicles_met(state: State, road: Road) -> Tensor:
-    """Return the index of the vehicle that each of the ego's beams meets first, -1 for none, int64, shape (B, 20).
-
-    Example:
-        >>> from rare_envs.traffic import straight
-        >>> x = torch.tensor([[0.0, 30.0]])
-        >>> state = State(x, 0 * x, 0 * x, torch.tensor([[20.0, 10.0]]), theta=x[:, :0])
-        >>> find_vehicles_met(state, straight(1))[0, AHEAD_BEAM - 1 : AHEAD_BEAM + 2].tolist()
-        [-1, 1, -1]
-    """
+    """Return the index of the vehicle that each of the ego's beams meets first, -1 for none, int64, shape (B, 20)."""
     return find_met(_bodies(state, *road.to_world(state.x, state.y, state.heading)), 1)[:, 0]
 
 

@@ -81,16 +81,7 @@ LEFT, OWN, RIGHT = range(3)
 
 
 class LaneTraffic(NamedTuple):
-    """V vehicles in B scenes, each scene with its lanes.
-
-    Example:
-        >>> from rare_envs.traffic import straight
-        >>> x = torch.tensor([[0.0, 30.0]])
-        >>> state = State(x, y=0 * x + 4.2, heading=0 * x, speed=0 * x + 20.0, theta=x[:, :0])
-        >>> traffic = LaneTraffic.of(state, straight(3))
-        >>> traffic.lane.tolist(), traffic.centre(traffic.lane).tolist()
-        ([[1, 1]], [[4.0, 4.0]])
-    """
+    """V vehicles in B scenes, each scene with its lanes."""
 
     x: Tensor
     """Centres along the road [m], shape (B, V), as the next five."""
@@ -146,14 +137,6 @@ def find_neighbours(traffic: LaneTraffic, who: slice, target: Tensor, reach: flo
         target: Lane that each vehicle moves to, its own if it keeps it, int64, shape (B, V). A vehicle counts as one in
             its target lane, as one does that has signalled.
         reach: A vehicle also counts as one in a lane while its centre is at most this far beyond the lane's edge [m].
-
-    Example:
-        >>> from rare_envs.traffic import straight
-        >>> x, y = torch.tensor([[0.0, 30.0, -20.0]]), torch.tensor([[0.0, 0.0, 4.0]])
-        >>> traffic = LaneTraffic.of(State(x, y, 0 * x, 0 * x + 20.0, theta=x[:, :0]), straight(2))
-        >>> found = find_neighbours(traffic, slice(0, 1), traffic.lane)
-        >>> found.lead.tolist(), found.follower.tolist(), found.exists.tolist()
-        ([[[-1, 1, -1]]], [[[-1, -1, 2]]], [[[False, True, True]]])
     """
     lane = traffic.lane
     wanted = lane[:, who, None] + torch.arange(-1, 2, device=lane.device)  # (B, M, 3)

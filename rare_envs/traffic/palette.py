@@ -16,19 +16,10 @@ def vehicle_colour(name: str, number: int = 0) -> str:
     Args:
         name: What the scenario calls it.
         number: Of the vehicle, to tell those of other names apart.
-
-    Example:
-        >>> vehicle_colour("ego"), vehicle_colour("lead") == vehicle_colour("lead", 5)
-        ('#22aa3c', True)
     """
     return OTHER_COLOURS[number % len(OTHER_COLOURS)] if name not in ROLE_COLOURS else ROLE_COLOURS[name]
 
 
 def as_rgb(colour: str) -> tuple[int, int, int]:
-    """Return a colour as numbers from 0 to 255.
-
-    Example:
-        >>> as_rgb("#22aa3c")
-        (34, 170, 60)
-    """
+    """Return a colour as numbers from 0 to 255."""
     return int(colour[1:3], 16), int(colour[3:5], 16), int(colour[5:7], 16)

@@ -161,13 +161,7 @@ class LineCell(NamedTuple):
 
 
 def list_cells(curve: ReferenceLine) -> list[LineCell]:
-    """Return the cells of a line between its first and its last knot, in order.
-
-    Example:
-        >>> cells = list_cells(ReferenceLine(spacing=50.0, curvature=(0.0, 0.002, 0.0)))
-        >>> len(cells), cells[1].length, round(cells[1].heading, 4)
-        (10, 10.0, 0.002)
-    """
+    """Return the cells of a line between its first and its last knot, in order."""
     table, step = _table(curve, torch.float64, torch.device("cpu"))
     rows = table[1:-1].tolist()  # without the straights before and after the curve
     return [

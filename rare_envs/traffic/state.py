@@ -74,12 +74,6 @@ class State(_Fields):
         Args:
             vehicles: x, y, heading and speed of each, shape (B,) each.
             theta: As the field.
-
-        Example:
-            >>> zero, speed = torch.zeros(2), torch.tensor([20.0, 10.0])
-            >>> state = State.of_vehicles([(zero, zero, zero, speed), (zero + 30.0, zero, zero, speed)], zero[:, None])
-            >>> state.x.tolist(), state.vehicles[1].x.tolist()
-            ([[0.0, 30.0], [0.0, 30.0]], [30.0, 30.0])
         """
         n = len(vehicles)
         table = torch.stack([column for field in zip(*vehicles, strict=True) for column in field])
@@ -111,12 +105,7 @@ class State(_Fields):
 
 
 def map_leaves(function: Callable[..., Any], tree: Any, *others: Any) -> Any:
-    """Return the tree with a function of its leaves, and of those of others of the same form, in their places.
-
-    Example:
-        >>> map_leaves(lambda old, new: max(old, new), (1, (5, 2)), (3, (4, 6)))
-        (3, (5, 6))
-    """
+    """Return the tree with a function of its leaves, and of those of others of the same form, in their places."""
     if not isinstance(tree, tuple):
         return function(tree, *others)
     parts = [map_leaves(function, *each) for each in zip(tree, *others, strict=True)]
@@ -124,11 +113,5 @@ def map_leaves(function: Callable[..., Any], tree: Any, *others: Any) -> Any:
 
 
 def map_tensors(function: Callable[[Tensor], Any], tree: Any) -> Any:
-    """Return the tree with a function of its tensors in their places; the rest, as the road, stays.
-
-    Example:
-        >>> import torch
-        >>> map_tensors(lambda part: part[1:], (torch.arange(3), "road"))
-        (tensor([1, 2]), 'road')
-    """
+    """Return the tree with a function of its tensors in their places; the rest, as the road, stays."""
     return map_leaves(lambda leaf: function(leaf) if isinstance(leaf, Tensor) else leaf, tree)

@@ -366,13 +366,7 @@ def _enumerate_groups(count: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _slab(origin: Tensor, inverse: Tensor, size: float) -> tuple[Tensor, Tensor]:
-    """Return where rays enter and leave the space between planes at +-size / 2, in lengths of their directions.
-
-    Args:
-        origin: Of the rays, across the planes [m].
-        inverse: One over their directions across the planes; infinite along them.
-        size: Distance of the planes [m].
-    """
+    """Return where rays enter and leave the space between planes at +-size / 2, in lengths of their directions."""
     one, other = (-0.5 * size - origin).mul_(inverse), (0.5 * size - origin).mul_(inverse)
     return torch.minimum(one, other), torch.maximum(one, other)
 
@@ -470,17 +464,7 @@ def draw_boxes(image: Tensor, boxes: Boxes, light: Light, camera: Camera, seen: 
 
 
 def _faces(boxes: Boxes, origin: tuple[Tensor, Tensor], light: Light, colours: Tensor) -> Tensor:
-    """Return the colours of the faces that a camera sees: front or rear, a side and the roof, body and windows.
-
-    Args:
-        boxes: N boxes in T pictures.
-        origin: The camera in the boxes' own frames [m]; it sees the faces on its side.
-        light: Of the pictures.
-        colours: Of the boxes, shape (N, 3).
-
-    Returns:
-        Shape (T N 3 2, 3).
-    """
+    """Return the colours of the faces that a camera sees: front or rear, a side and the roof, body and windows."""
     sun_forward, sun_right, sun_up = light.sun[:, :, None].unbind(1)
     along, across = _to_box_frame(sun_forward, sun_right, boxes.cos, boxes.sin)
     facing = torch.stack((along * origin[0].sign(), across * origin[1].sign(), sun_up.expand_as(along)), dim=-1)
