@@ -65,10 +65,3 @@ def test_an_ego_that_answers_at_random_is_named(cli, risky, here):
     found = json.loads(result.stdout)["warnings"]
     assert [text for text in found if text.startswith("B: of ") and "gave another f" in text]
     assert not [text for text in found if text.startswith("A: ")]
-
-
-def test_each_ego_has_its_own_statistics(cli, here):
-    for option in ("--stats", "--stats-b"):
-        refused = cli("compare", "idm", "idm", FOLLOWING, option, "nowhere.pkl", "--max-sim", 100)
-        assert refused.exit_code == 2, option
-        assert refused.stderr.count("\n") == 1

@@ -53,7 +53,7 @@ def test_shares_in_the_result_add_up_to_p(report: Report) -> None:
 def test_each_failure_of_the_list_has_its_crash(
     report: Report, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("rare_envs.study.run_folder.save_plot", lambda *_: None)  # pictures have their own tests
+    monkeypatch.setattr("rare_envs.study.writing.save_plot", lambda *_: None)  # pictures have their own tests
     write_run(tmp_path, report)
     with (tmp_path / "failures.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
@@ -85,12 +85,6 @@ def test_what_cannot_be_driven_again_is_not_known_and_said() -> None:
     assert report.to_dict()["failures"][0]["crash"] is None
 
 
-def test_no_failures_no_kinds() -> None:
-    problem = rare_envs.DrivingProblem(CUT_IN)
-    kinds = classify_failures(problem, samplers.estimate(problem, "mc", max_sim=50, seed=0))
-    assert (kinds.shares, kinds.listed, kinds.unknown) == ({}, (), "")
-
-
 def test_a_kind_that_the_list_lacks_is_added_with_its_crash(report: Report) -> None:
     problem, failures = report.study.problem, report.estimate.failures
     kinds = [crash["kind"] if crash else "none" for crash in report.crashes]
@@ -103,13 +97,3 @@ def test_a_kind_that_the_list_lacks_is_added_with_its_crash(report: Report) -> N
     (added,) = [k for k, crash in enumerate(found.listed) if crash is not None and crash["kind"] == "rear_end"]
     assert len(found.listed) == len(estimate.failures) == len(short) + 1
     assert (estimate.failures.x[added] == failures.x[kinds.index("rear_end")]).all()
-
-
-def test_failures_that_the_search_alone_met_have_kinds_and_no_shares(report: Report) -> None:
-    sample = report.estimate.sample
-    assert sample is not None
-    searched = replace(report.estimate, p=0.0, sample=replace(sample, weights=np.zeros_like(sample.weights)))
-    kinds = classify_failures(report.study.problem, searched)
-    assert not kinds.unknown
-    assert kinds.shares == {}
-    assert kinds.listed == report.kinds.listed

@@ -38,11 +38,6 @@ Cli = Callable[..., Result]
 FOLLOWING = "rare_envs/CarFollowing-v0"
 
 
-def test_a_question_is_checked_in_python_as_on_the_command_line() -> None:
-    with pytest.raises(BadInput, match="'adss'"):
-        prepare(Question(env_id=FOLLOWING, method="addss"))
-
-
 def test_what_actions_are_taken_for_is_pointed_out(cli: Cli, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A policy from HighwayEnv without its meta-actions runs all the same, and behaves arbitrarily."""
     (tmp_path / "idle_egos.py").write_text(DISCRETE)
@@ -109,7 +104,7 @@ def test_what_is_known_before_the_ego_is_loaded_is_checked_first(wrong: dict[str
         prepare(question)
 
 
-@pytest.mark.parametrize(("measure", "gamma"), [("ttc", -1.5), ("clearance", -2.0), ("drac", -1e6)])
+@pytest.mark.parametrize(("measure", "gamma"), [("ttc", -1.5), ("drac", -1e6)])
 def test_a_threshold_that_nothing_reaches_is_refused(measure: str, gamma: float) -> None:
     with pytest.raises(BadInput, match="cannot happen"):
         prepare(Question(env_id="rare_envs/CarFollowing-v0", measure=measure, gamma=gamma))
@@ -120,6 +115,6 @@ def test_a_threshold_that_only_collisions_reach_is_told() -> None:
         prepare(Question(env_id="rare_envs/CarFollowing-v0", gamma=-1.0))
 
 
-@pytest.mark.parametrize(("measure", "gamma"), [("margin", -5.0), ("rss_margin", -3.0), ("ttb", -1.0), ("ttc", 0.0)])
+@pytest.mark.parametrize(("measure", "gamma"), [("margin", -5.0), ("ttc", 0.0)])
 def test_a_threshold_within_the_values_of_a_measure_is_taken(measure: str, gamma: float) -> None:
     assert prepare(Question(env_id="rare_envs/CarFollowing-v0", measure=measure, gamma=gamma)).question.gamma == gamma

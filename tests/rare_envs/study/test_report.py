@@ -66,6 +66,7 @@ def test_scenarios_on_which_the_ego_fails_are_listed(cli: Cli, here: Path, risky
     assert not (here / "run" / "faults.csv").exists()
 
 
+@pytest.mark.slow
 def test_a_doubt_about_the_base_distribution_makes_a_report_doubtful() -> None:
     """Some 20 failures tell p to a quarter, and are too few to tell it under each of 30 refits."""
     study = prepare(Question(env_id="rare_envs/CutIn-v0", method="mc", max_sim=20_000, seed=1))

@@ -38,7 +38,7 @@ def test_a_file_that_moved_and_changed_is_refused(cli: Cli, moved: Path) -> None
     assert_refused(cli("replay", moved / "runs/a"), "base.json", "has changed")
 
 
-@pytest.mark.parametrize("name", ["vecnormalize.pkl", "vec_normalize.pkl", "ego_vecnormalize.pkl", "mine.pkl"])
+@pytest.mark.parametrize("name", ["vecnormalize.pkl", "mine.pkl"])
 def test_statistics_of_an_ego_are_part_of_it(name: str, here: Path) -> None:
     (here / "ego.zip").write_bytes(b"weights")
     question = Question(env_id="", ego="noisy:ego.zip", stats="mine.pkl" if name == "mine.pkl" else None)

@@ -23,17 +23,6 @@ def fitted(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(SCENARIOS._entries, "rare_envs/HardBrake-v0", replace(HARD_BRAKE, bases=bases))
 
 
-def test_all_that_is_known_of_a_fitted_base_is_listed(fitted: None) -> None:
-    base = list_bases("hard_brake")["us101"]
-    assert base["fitted_to"] == "42 events of 40 scenes"
-    assert base["events"] == {"used": [42], "clusters": 40, "cluster": "scene"}
-    assert (base["refits"], base["family"], base["coordinates"]) == (30, "1 component", "plain")
-    assert (base["bic"], base["held_out_log_prob"]) == (1086.8, -14.6)
-    assert (base["site"], base["date"], base["licence"]) == ("site of hard_brake", "2005-06-15", "CC0")
-    assert base["frequency"]["per_hour"] == pytest.approx(42 / 5.64)
-    assert base["checks"] == [{"name": "TTC < 5 s", "recorded": 2, "expected": 7.5}]
-
-
 def test_the_table_for_people(fitted: None, capsys: pytest.CaptureFixture[str]) -> None:
     print_bases("rare_envs/HardBrake-v0", list_bases("rare_envs/HardBrake-v0"))
     text = " ".join(capsys.readouterr().out.split())

@@ -8,7 +8,6 @@ from pathlib import Path
 import pytest
 
 from rare_envs.study.cli.estimate import GATE_CODES
-from rare_envs.study.cli.shell import DOUBTFUL
 from tests.rare_envs.study.refusals import SMALL, Cli, assert_refused
 
 
@@ -23,11 +22,6 @@ def test_exit_codes(cli: Cli, risky: str, limit: float, decision: str) -> None:
     assert answer["confidence"] == 0.9 and answer["gate"]["confidence"] == 0.95  # no 0.8999999999999999
 
 
-def test_codes_are_new_ones() -> None:
-    others = {code for decision, code in GATE_CODES.items() if decision != "passes"}
-    assert len(others) == 2 and not others & {0, 1, 2, DOUBTFUL}
-
-
 def test_one_sentence_is_printed_and_a_resumed_run_has_it_too(cli: Cli, risky: str, tmp_path: Path) -> None:
     result = cli(*SMALL, "--base", risky, "--max-p", 0.2, "--confidence", 0.99, "--out", tmp_path / "run")
     assert result.exit_code == 0
@@ -35,11 +29,6 @@ def test_one_sentence_is_printed_and_a_resumed_run_has_it_too(cli: Cli, risky: s
     assert "98 % interval" in result.stdout and "(each end is one-sided at 99 %, for --max-p)" in result.stdout
     recorded = json.loads((tmp_path / "run" / "result.json").read_text())
     assert recorded["question"]["max_p"] == 0.2 and recorded["gate"]["decision"] == "passes"
-
-
-def test_without_a_limit_nothing_changes(cli: Cli, risky: str) -> None:
-    answer = json.loads(cli(*SMALL, "--base", risky, "--json").stdout)
-    assert answer["gate"] is None and answer["confidence"] == 0.95
 
 
 @pytest.mark.parametrize(

@@ -49,17 +49,12 @@ def change(content: dict[str, Any], **values: Any) -> str:
         {"sha256": "0" * 64},
         {"x": {**STORED.x, "gap": [3.0]}},  # changed after it was stored
         {"x": {**STORED.x, "gap": ["3"]}},
-        {"x": {**STORED.x, "gap": 3.0}},
         {"x": []},
-        {"x": {}},
         {"env_id": 3},
-        {"env_id": "e" * 1000},
-        {"ego": None},
         {"base": 7},
         {"world": {}},
         {"world": {**STORED.world, "gamma": "low"}},
         {"f": "NaN"},
-        {"f": True},
     ],
 )
 def test_what_was_changed_is_refused(values: dict[str, Any]) -> None:

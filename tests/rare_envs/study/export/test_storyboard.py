@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import xml.etree.ElementTree as ET
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -81,39 +80,6 @@ def test_positions_are_read_back_on_the_road(which: str, tmp_path: Path, request
             ours = int(np.searchsorted(drive.road.edges[1:-1], y_ours, side="right"))
             near_line = np.abs(np.array(drive.road.edges) - y_ours).min() < CENTIMETRE
             assert near_line or road.lane_at(float(lateral)) == -1 - ours
-
-
-def corners(x: float, y: float, heading: float) -> np.ndarray[Any, Any]:
-    """Corners of a body of 5 m by 2 m, (4, 2)."""
-    ahead, aside = np.array([np.cos(heading), np.sin(heading)]), np.array([-np.sin(heading), np.cos(heading)])
-    return np.array([[x, y] + 2.5 * i * ahead + 1.0 * j * aside for i in (-1, 1) for j in (-1, 1)])
-
-
-def bodies_touch(one: np.ndarray[Any, Any], other: np.ndarray[Any, Any]) -> bool:
-    """Whether no direction of a side keeps two rows (time, x, y, heading) apart."""
-    boxes = corners(*one[1:]), corners(*other[1:])
-    for heading in (one[3], other[3]):
-        for turn in (0.0, np.pi / 2):
-            axis = np.array([np.cos(heading + turn), np.sin(heading + turn)])
-            first, second = (box @ axis for box in boxes)
-            if first.max() < second.min() or second.max() < first.min():
-                return False
-    return True
-
-
-def test_a_crash_is_a_crash_in_the_file(cut_in: Drive, tmp_path: Path) -> None:
-    """Bodies touch at the last vertices and at none before."""
-    assert cut_in.collided
-    read = read_centres(export(cut_in, tmp_path, "openscenario"))
-    touch = [bodies_touch(one, other) for one, other in zip(read["Ego"], read["cutter"], strict=True)]
-    assert touch == [False] * (len(touch) - 1) + [True]
-
-
-def test_vehicles_follow_their_trajectories_from_the_start(cut_in: Drive, tmp_path: Path) -> None:
-    """One that begins after time 0 goes straight on for a tick: 8 cm beside its trajectory in esmini."""
-    story = ET.parse(export(cut_in, tmp_path, "openscenario"))
-    rules = [one.attrib["rule"] for one in story.iterfind(".//StartTrigger//SimulationTimeCondition")]
-    assert rules == ["greaterOrEqual"] * 4  # the act, and the events of three vehicles
 
 
 def test_the_reference_point_is_the_rear_axle(cut_in: Drive, tmp_path: Path) -> None:

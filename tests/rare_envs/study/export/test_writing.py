@@ -35,14 +35,6 @@ def test_what_cannot_be_is_refused(tmp_path: Path, name: str, format: str, ego: 
         check_export(tmp_path / name, format, ego)
 
 
-def test_x_is_checked(problem: DrivingProblem, tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="Expected one scenario"):
-        export_scenario(problem, [X, X], tmp_path / "a.xml", "commonroad")
-    with pytest.raises(ValueError):
-        export_scenario(problem, [20.0, np.nan, 10.0], tmp_path / "a.xml", "commonroad")
-    assert list(tmp_path.iterdir()) == []
-
-
 def test_a_missing_library_is_named(problem: DrivingProblem, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for name in [name for name in sys.modules if name.startswith("scenariogeneration")]:
         monkeypatch.delitem(sys.modules, name)

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 import rare_envs
-from rare_envs.study import replay
 from rare_envs.study.html_report.atlas import AtlasSource, build_atlas
 
 MODE = {"crash": "rear_end", "p": 0.01, "interval": [0.005, 0.02], "of_failures": 0.75, "failure": 0}
@@ -35,15 +34,3 @@ def test_an_entry_says_what_happened_and_how_to_see_it_again(source: AtlasSource
         ("gap [m]", "10.00"),
     ]
     assert [figure.name for figure in entry.figures] == ["mode1-views", "mode1-measure", "mode1-speeds"]
-
-
-def test_an_ego_that_cannot_be_driven_again_costs_the_pictures_alone(
-    source: AtlasSource, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def fail(*_: object) -> None:
-        raise RuntimeError("gone")
-
-    monkeypatch.setattr("rare_envs.study.html_report.atlas.drive_again", fail)
-    assert replay.drive_again is not fail
-    (entry,) = build_atlas(source, [MODE])
-    assert entry.clip == "" and entry.figures == [] and "gone" in entry.missing and entry.parameters

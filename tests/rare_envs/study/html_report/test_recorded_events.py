@@ -30,8 +30,3 @@ def test_files_without_such_events_are_refused(tmp_path: Path, text: str, messag
     (tmp_path / "events.csv").write_text(text)
     with pytest.raises(BadInput, match=message):
         read_recorded_events(tmp_path / "events.csv", ["a", "gap"])
-
-
-def test_other_columns_and_rows_with_gaps_do_not_matter(tmp_path: Path) -> None:
-    (tmp_path / "events.csv").write_text("site,gap,a\nx,1,2\ny,,3\nz,4,5\n")
-    assert read_recorded_events(tmp_path / "events.csv", ["a", "gap"]).tolist() == [[2.0, 1.0], [5.0, 4.0]]

@@ -47,14 +47,6 @@ def test_other_sites_are_known_from_the_same_simulations(sites: None) -> None:
     assert factors["near"] == pytest.approx(2 * p.p / own.estimate.p, rel=0.15)
 
 
-def test_a_site_that_is_asked_for_is_simulated_if_need_be(sites: None) -> None:
-    own = report()
-    factors = compare_sites(own, ("far", "nowhere"))
-    assert set(factors) == {"near", "far"}
-    p = run(prepare(Question(env_id="rare_envs/HardBrake-v0", base="far", method="mc", max_sim=1000))).estimate.p
-    assert factors["far"] == pytest.approx(p / own.estimate.p)
-
-
 def test_the_base_of_a_scenario_at_a_site() -> None:
     assert choose_base(HARD_BRAKE, None, "us101") == ("us101", ())
     assert choose_base(HARD_BRAKE, Path("mine.json"), "us101") == ("mine.json", ())

@@ -85,17 +85,10 @@ def test_the_spread_between_sites_widens_the_interval(monkeypatch: pytest.Monkey
 
 REFUSED = {
     "counted twice": ({"scenarios": ("cut_in", "car_following")}, "count twice"),
-    "no scenario": ({"scenarios": ()}, "one or more"),
-    "unknown scenario": ({"scenarios": ("merge",)}, "merge"),
-    "unknown site": ({"sites": ("us102",)}, "us102"),
-    "no site": ({"sites": ()}, "site"),
     "site of one scenario alone": ({"sites": ("i80",), "bases": {}}, "hard_brake has no base of the site 'i80'"),
     "base of another scenario": ({"bases": {"highway": "x.json"}}, "highway"),
-    "no such base": ({"bases": {"cut_in": "x.json"}}, "x.json"),
     "no frequency": ({"bases": {"cut_in": "highway"}}, "nobody counted"),
     "unknown option": ({"speed": 3}, "speed"),
-    "another measure": ({"measure": "drac"}, "drac"),
-    "unknown ego": ({"ego": "imd"}, "idm"),
 }
 
 

@@ -29,14 +29,6 @@ def test_a_failure_becomes_files(cli: Cli, run: Path, tmp_path: Path) -> None:
     assert result.stdout == f"Wrote {tmp_path / 'a.xosc'} and {tmp_path / 'a.xodr'}.\n"
 
 
-def test_a_missing_folder_is_made_and_goes_with_an_export_that_fails(cli: Cli, run: Path, tmp_path: Path) -> None:
-    out, options = tmp_path / "new" / "newer" / "a.xml", ("--format", "commonroad")
-    assert_refused(cli("export", run, *options, "--failure", 10_000, "--out", out), "from 0 to")
-    assert not (tmp_path / "new").exists()
-    assert cli("export", run, *options, "--out", out).exit_code == 0 and out.exists()
-    assert_refused(cli("export", run, *options, "--out", out / "b.xml"), "Cannot make the folder", "file of that name")
-
-
 def test_refusals_are_one_line(cli: Cli, run: Path, tmp_path: Path) -> None:
     assert_refused(cli("export", tmp_path / "none", "--out", tmp_path / "a.xosc"), "No finished run in")
     assert_refused(cli("export", run, "--out", tmp_path / "a.gif"), "ends in .xosc")

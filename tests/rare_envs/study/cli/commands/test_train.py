@@ -10,12 +10,8 @@ import pytest
 from tests.rare_envs.study.refusals import FOLLOWING, SMALL, Cli, assert_refused
 
 BAD_TRAININGS = {
-    "unknown environment": (["rare_envs/CutIn-v7"], ["rare_envs/CutIn-v"]),
     "misspelt algorithm": ([FOLLOWING, "--algo", "poo"], ["'ppo'"]),
-    "misspelt algorithm, steps as 1e5": ([FOLLOWING, "--algo", "poo", "--steps", "1e5"], ["'ppo'"]),
     "half a step": ([FOLLOWING, "--steps", "2.5"], ["'--steps': expected a whole number, such as 10000 or 1e4"]),
-    "no steps": ([FOLLOWING, "--steps", "0"], ["steps", "0"]),
-    "no environments": ([FOLLOWING, "--num-envs", "0"], ["--num-envs", "0"]),
     "no environment": ([], ["--from-failures"]),
     "no run": (["--from-failures", "nowhere"], ["No finished run in 'nowhere'"]),
     "the run tells the world": (["--from-failures", "nowhere", "--base", "us101"], ["leave --base"]),
