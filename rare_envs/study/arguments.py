@@ -70,7 +70,7 @@ class Question:
     seed: int = argument(0, "Seed; the same seed gives the same answer.", count=True)
     collisions: str = argument("ego", "Which count: ego, or any, between others too.")
     device: str = argument(
-        "cpu", "Where torch simulates: cpu, or a GPU (cuda, cuda:1), which leaves numba out: docs/speed.md."
+        "cpu", "Where torch simulates: cpu, or a GPU (cuda, cuda:1), which leaves numba out: docs/executors.md."
     )
     ensemble_run: bool = argument(
         True,
@@ -101,7 +101,7 @@ class Question:
         None, "Simulations at once, few for a slow ego; with --workers 256, and 4,096 of rules."
     )
     core: str = argument(
-        "auto", "What simulates: torch, numba (compiled, where it can be had: docs/speed.md), or auto."
+        "auto", "What simulates: torch, numba (compiled, where it can be had: docs/executors.md), or auto."
     )
     sensitivity: bool = argument(False, "Show what p is sensitive to: parameters of traffic and of its model.")
     max_p: float | None = argument(

@@ -1,4 +1,4 @@
-"""Folder of a run: its files, and how they are read again without simulating; docs/run_folder.md describes them."""
+"""Folder of a run: its files, and how they are read again without simulating; docs/using_results.md describes them."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 STUDY = "study.json"
 """What was asked, by what command and with which versions."""
 STUDY_FORMAT = 1
-"""Version of the fields of study.json; see docs/run_folder.md."""
+"""Version of the fields of study.json; see docs/using_results.md."""
 RESULT, FAILURES, BLOCKS, PLOT = "result.json", "failures.csv", "failures.npz", "plot.png"
 """Blocks are what a table has no room for: of more than `columns.MAX_SHOWN` values, drivers' weights and noise."""
 EPISODES = "episodes.parquet"
@@ -219,7 +219,7 @@ class LoadedStudy:
         return self.folder / EPISODES
 
     def episodes(self, columns: list[str] | None = None, failed: bool | None = None) -> pyarrow.Table:
-        """Return the table of all simulations, a row each; docs/run_folder.md has its columns."""
+        """Return the table of all simulations, a row each; docs/using_results.md has its columns."""
         import pyarrow.parquet as pq
 
         where = None if failed is None else [("failed", "=", failed)]

@@ -39,7 +39,7 @@ EGOS = {
     "hf:USER/REPOSITORY": "such a policy of the Hugging Face Hub, from its cache on this machine or downloaded",
     "FILE.onnx": "graph from observations to actions; rare-envs export-ego writes one of a .zip",
     "module:function": "what your function returns: any object with Stable-Baselines3's predict",
-    "tcp://HOST:PORT": "program in any language, see docs/remote.md; rare-envs serve-ego serves one of these",
+    "tcp://HOST:PORT": "program in any language, see docs/egos.md; rare-envs serve-ego serves one of these",
     "process:EGO": "one of these in a process of its own, for an ego that may hang or die",
     "noisy:EGO": "one of these behind the imperfections of a full stack, see docs/egos.md",
 }

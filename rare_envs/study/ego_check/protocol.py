@@ -1,4 +1,4 @@
-"""Conformance of a server to the protocol of docs/remote.md, tested over its socket message by message."""
+"""Conformance of a server to the protocol of docs/egos.md, tested over its socket message by message."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from rare_envs.egos.errors import EgoGone, reason_of
 from rare_envs.sensors.kinds import map_kinds
 from rare_envs.study.ego_check.findings import Finding, report_failure, report_pass
 
-PROTOCOL_ADVICE = "docs/remote.md has the protocol"
+PROTOCOL_ADVICE = "docs/egos.md has the protocol"
 
 
 def check_protocol(spec: str) -> Iterator[Finding]:

@@ -53,12 +53,6 @@ def test_what_actions_are_taken_for_is_pointed_out(cli: Cli, tmp_path: Path, mon
     accelerating = json.loads(cli(*words).stdout)
     assert ["--action discrete" in line for line in accelerating["notes"]] == [True]
     assert accelerating["question"]["action"] == "continuous"
-    both = (
-        *("compare", "idle_egos:Idle", "idm", FOLLOWING),
-        *("--method", "mc", "--max-sim", 20, *kinematics, "--action", "continuous"),
-    )
-    assert json.loads(cli(*both, "--json").stdout)["notes"] == [f"A: {note}"]
-    assert f"note: A: {note}" in cli(*both).stdout
     asked = Question(env_id=FOLLOWING, ego="idle_egos:Idle", observation="kinematics", action="continuous")
     (found,) = (each for each in run_checks(asked) if isinstance(each, Finding) and each.found == note)
     assert (found.check, found.status) == ("action space", "warn")

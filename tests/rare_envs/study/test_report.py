@@ -40,7 +40,11 @@ def test_the_result_names_the_statistics_that_were_applied(cli, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("ego", "reason"), [("nan_when_close", "NaN or infinite"), ("exiting_when_close", "SystemExit(7)")]
+    ("ego", "reason"),
+    [
+        ("nan_when_close", "NaN or infinite"),
+        pytest.param("exiting_when_close", "SystemExit(7)", marks=pytest.mark.slow),
+    ],
 )
 def test_scenarios_on_which_the_ego_fails_are_listed(cli: Cli, here: Path, risky: str, ego: str, reason: str) -> None:
     words = (*SMALL, "--base", risky, "--ego", f"egos_here:{ego}", "--out", here / "run")

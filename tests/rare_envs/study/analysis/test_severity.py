@@ -54,6 +54,7 @@ def test_a_coasting_ego_hits_at_half_the_closing_speed() -> None:
     assert severity.injuries.value == pytest.approx(0.1 * (one + six) / 2, rel=0.01)
 
 
+@pytest.mark.slow
 def test_two_stage_and_monte_carlo_agree(problem: rare_envs.DrivingProblem, plain: samplers.Estimate) -> None:
     thresholds = [0.0, 1.0, 2.0]
     one = severity_curve(problem, plain, thresholds)

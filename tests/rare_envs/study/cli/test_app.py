@@ -5,11 +5,14 @@ from __future__ import annotations
 import subprocess
 import sys
 
+import pytest
+
 
 def run(*words: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run([sys.executable, "-m", "rare_envs", *words], capture_output=True, text=True, check=False)
 
 
+@pytest.mark.slow
 def test_the_installed_command_behaves_the_same() -> None:
     refused = run("estimate", "CutIn")
     assert (refused.returncode, refused.stdout) == (2, "")

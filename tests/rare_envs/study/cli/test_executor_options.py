@@ -41,6 +41,7 @@ def test_options_that_do_not_go_together_are_one_line(cli: Cli, words: Any, said
     assert_refused(cli("estimate", FOLLOWING, *words), said)
 
 
+@pytest.mark.slow
 def test_workers_change_the_progress_line_alone(cli: Cli, here: Path, risky: str) -> None:
     words = ["estimate", FOLLOWING, "--base", risky, "--method", "mc", "--max-sim", 400, "--gamma", 2, "--horizon", 1]
     one = cli(*words, "--chunk", 100, "--json")

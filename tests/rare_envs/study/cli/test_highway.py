@@ -20,6 +20,7 @@ FOLLOWING = "rare_envs/CarFollowing-v0"
 HIGHWAY = ("estimate", "rare_envs/Highway-v0", "--measure", "lidar_ttc", "--gamma", 1.0, "--horizon", 2)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("full_pictures")
 def test_the_highway_end_to_end(cli: Cli, tmp_path: Path) -> None:
     """Blocks of x in every place where parameters are told, and drivers and horizon in the record."""

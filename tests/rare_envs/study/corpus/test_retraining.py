@@ -41,6 +41,7 @@ def test_a_plan_has_the_failures_of_all_runs_and_the_ego_of_the_last(ego: str, r
     assert np.array_equal(plan.retraining.failures, x)
 
 
+@pytest.mark.slow
 def test_runs_that_do_not_go_together_are_refused(ego: str, risky: str, safe: str, tmp_path: Path) -> None:
     own = shutil.copy(ego, tmp_path / "own.zip")
     first, other = make_run(tmp_path / "first", risky, ego=str(own)), make_run(tmp_path / "other", safe)

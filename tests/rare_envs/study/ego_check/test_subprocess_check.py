@@ -297,6 +297,7 @@ def test_a_zip_of_ones_own_is_no_warning(tmp_path: Path, monkeypatch: pytest.Mon
     assert trusted.status == "warn" and "whatever code is in it runs" in trusted.advice
 
 
+@pytest.mark.slow
 def test_trust_opens_it_all_the_same(saved: Path, cli: Cli) -> None:
     saved.chmod(0o666)
     found = json.loads(cli("check-ego", saved, ENV, "--json", "--trust").stdout)["findings"]

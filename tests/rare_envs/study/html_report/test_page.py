@@ -82,7 +82,10 @@ def test_the_page_says_what_the_files_say(folder: Path) -> None:
     assert len(figures) >= 8
 
 
-def test_warnings_come_first_and_text_of_files_is_escaped(folder: Path, tmp_path: Path) -> None:
+def test_warnings_come_first_and_text_of_files_is_escaped(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(FigureOfPage, "to_svg", lambda _: "")
     run = tmp_path / "run"
     shutil.copytree(folder, run)
     result = json.loads((run / "result.json").read_text())
@@ -115,7 +118,10 @@ def test_a_damaged_file_is_one_line(
     assert not (tmp_path / "page.html").exists()
 
 
-def test_recorded_events_and_figures_as_files(folder: Path, tmp_path: Path, cli: Callable[..., Result]) -> None:
+def test_recorded_events_and_figures_as_files(
+    folder: Path, tmp_path: Path, cli: Callable[..., Result], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(FigureOfPage, "to_svg", lambda _: "")
     events = tmp_path / "events.csv"
     events.write_text("gap,ego_speed,lead_speed,site\n20,21,10,a\n60,20,20,b\n,1,2,c\n")
     out = tmp_path / "page.html"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from dataclasses import replace
 from pathlib import Path
@@ -47,18 +46,6 @@ def test_the_total_is_the_sum_of_frequency_times_p(bases: dict[str, str]) -> Non
     assert "people: 21 contacts of all kinds" in text
     assert "38 + 15 events of 17 scenes" in text
     assert "the uncertainty is" in text
-
-
-def test_the_folder_has_numbers_a_picture_and_each_run(bases: dict[str, str], tmp_path: Path) -> None:
-    found = rare_envs.risk("idm", bases=bases, out=tmp_path / "out", **FEW)
-    names = sorted(path.name for path in (tmp_path / "out").iterdir())
-    assert names == ["cut_in", "hard_brake", "risk.json", "risk.png"]
-    data = json.loads((tmp_path / "out" / "risk.json").read_text())
-    assert data["per_million_km"] == found.total.per_million_km
-    assert data["scenarios"]["cut_in"]["report"]["p"] == found.scenarios[0].report.estimate.p
-    assert data["people"][0]["count"] == 68
-    assert sum(each["share"] for each in data["shares_of_variance"]) == pytest.approx(1.0)
-    assert (tmp_path / "out" / "cut_in" / "result.json").exists()
 
 
 def test_an_ego_that_is_an_object(bases: dict[str, str]) -> None:

@@ -52,11 +52,10 @@ def test_bad_input_is_one_line_before_any_simulation(
     assert not (here / "new").exists()
 
 
-@pytest.mark.parametrize(("ego", "said"), [("nan_when_close", "NaN"), ("exiting_when_close", "SystemExit(7)")])
-def test_an_ego_that_fails_on_the_way_is_one_line(cli: Cli, here: Path, risky: str, ego: str, said: str) -> None:
-    words = (*SMALL[:-1], 300, "--base", risky, "--ego", f"egos_here:{ego}", "--out")
-    assert_refused(cli(*words, here / "new" / "run"), said)
+def test_an_ego_that_fails_on_the_way_is_one_line(cli: Cli, here: Path, risky: str) -> None:
+    words = (*SMALL[:-1], 300, "--base", risky, "--ego", "egos_here:nan_when_close", "--out")
+    assert_refused(cli(*words, here / "new" / "run"), "NaN")
     assert not (here / "new").exists()
     (here / "old").mkdir()
-    assert_refused(cli(*words, here / "old"), said)
+    assert_refused(cli(*words, here / "old"), "NaN")
     assert (here / "old").exists()
