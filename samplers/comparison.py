@@ -15,8 +15,7 @@ from samplers.analysis.base_error import RatioUncertainty, summarise_ratio
 from samplers.analysis.refits import find_fitted_base, reweight_runs_to_refits
 from samplers.analysis.reweight import MAX_LOG
 from samplers.analysis.weighted import cov_inflation, has_independent_points, interval_of_sum, require_sample
-from samplers.display import drawing_axes, html_table
-from samplers.estimate_display import indent_lines
+from samplers.display import drawing_axes, html_table, indent_lines
 from samplers.estimation import estimate
 from samplers.execution.arguments import RunArguments, check_problem
 from samplers.execution.progress import Listener

@@ -21,14 +21,7 @@ ROWS_FROM = 8
 
 
 class MixtureComponent(Protocol):
-    """A distribution in standard normal space with a known density ratio to N(0, I).
-
-    Example:
-        >>> import numpy as np
-        >>> base: MixtureComponent = IsotropicNormal(dim=2)
-        >>> base.log_ratio(np.array([[1.0, 2.0]]))  # N(0, I) itself
-        array([0.])
-    """
+    """A distribution in standard normal space with a known density ratio to N(0, I)."""
 
     def log_ratio(self, u: FloatArray) -> FloatArray:
         """Return log(q / phi) at u (n, d), shape (n,); -inf where the density q is 0."""
@@ -39,13 +32,7 @@ class MixtureComponent(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class IsotropicNormal:
-    """N(0, scale^2 I); the base distribution where scale is 1.
-
-    Example:
-        >>> import numpy as np
-        >>> IsotropicNormal(dim=2, scale=2.0).log_ratio(np.zeros((1, 2))).round(4)  # -2 log 2
-        array([-1.3863])
-    """
+    """N(0, scale^2 I); the base distribution where scale is 1."""
 
     dim: int
     scale: float = 1.0
@@ -62,17 +49,7 @@ class IsotropicNormal:
 
 @dataclass(frozen=True, eq=False)
 class SubspaceGaussian:
-    """Independent Gaussians along some orthonormal axes, N(0, 1) in every direction outside their span.
-
-    Example:
-        >>> import numpy as np
-        >>> component = SubspaceGaussian(np.eye(100)[:, :1], mean=np.array([3.0]), variance=np.array([0.1]))
-        >>> u = component.sample(1000, np.random.default_rng(0))
-        >>> u.shape, round(float(u[:, 0].mean()), 1), round(float(u[:, 1:].std()), 1)
-        ((1000, 100), 3.0, 1.0)
-        >>> component.centre[:3]
-        array([3., 0., 0.])
-    """
+    """Independent Gaussians along some orthonormal axes, N(0, 1) in every direction outside their span."""
 
     axes: FloatArray
     """Orthonormal columns, shape (d, r)."""
@@ -112,15 +89,7 @@ class SubspaceGaussian:
 
 @dataclass(frozen=True, eq=False)
 class LiftedComponent:
-    """A component in the coordinates of some orthonormal axes, N(0, 1) in every direction outside their span.
-
-    Example:
-        >>> import numpy as np
-        >>> ring = LiftedComponent(RadialLaw(dim=2, start=9.0, shape=1.0, scale=2.0), axes=np.eye(100)[:, :2])
-        >>> u = ring.sample(1000, np.random.default_rng(0))
-        >>> bool((np.linalg.norm(u[:, :2], axis=1) > 3.0).all()), round(float(u[:, 2:].std()), 1)
-        (True, 1.0)
-    """
+    """A component in the coordinates of some orthonormal axes, N(0, 1) in every direction outside their span."""
 
     within: MixtureComponent
     """In r dimensions."""
@@ -139,16 +108,7 @@ class LiftedComponent:
 
 @dataclass(frozen=True, eq=False)
 class HalfSpaceNormal:
-    """N(0, I) beyond a plane, axis . u >= start: the optimal proposal for a failure half-space.
-
-    Example:
-        >>> import numpy as np
-        >>> component = HalfSpaceNormal(np.array([1.0, 0.0]), start=3.0)
-        >>> bool((component.sample(100, np.random.default_rng(0))[:, 0] >= 3.0).all())
-        True
-        >>> np.exp(-component.log_ratio(np.array([[4.0, 1.0], [2.0, 0.0]]))).round(5)  # Phi(-3) beyond, else no density
-        array([0.00135,     inf])
-    """
+    """N(0, I) beyond a plane, axis . u >= start: the optimal proposal for a failure half-space."""
 
     axis: FloatArray
     """Unit vector, shape (d,)."""
@@ -170,16 +130,6 @@ class HalfSpaceUnion:
     """N(0, I) beyond one of several planes, each in proportion to its probability, for a series system of them.
 
     The density is phi(u) k(u) / sum_j Phi(-start_j), where u is beyond k(u) of the planes.
-
-    Example:
-        Beyond u1 = 3 and u2 = 3, with 2 Phi(-3) = 0.0027:
-
-        >>> import numpy as np
-        >>> union = HalfSpaceUnion(axes=np.eye(2), starts=np.array([3.0, 3.0]))
-        >>> np.exp(-union.log_ratio(np.array([[4.0, 0.0], [4.0, 4.0], [0.0, 0.0]]))).round(5)
-        array([0.0027 , 0.00135,     inf])
-        >>> bool((union.sample(100, np.random.default_rng(0)).max(axis=1) >= 3.0).all())
-        True
 
     References:
         Au and Beck, "First excursion probabilities for linear systems by very efficient importance sampling",
@@ -214,16 +164,6 @@ class HalfSpaceIntersection:
     where low_i depends on the coordinates before it. The density is phi(u) / prod_i Phi(-low_i) within the corner. It
     is N(0, I) cut to the corner where the axes are orthogonal, and near it elsewhere; 1 / density never exceeds
     1 / phi(u).
-
-    Example:
-        Beyond u1 = 2 and u2 = 1.5, with Phi(-2) Phi(-1.5) = 0.00152:
-
-        >>> import numpy as np
-        >>> corner = HalfSpaceIntersection(axes=np.eye(2), starts=np.array([2.0, 1.5]))
-        >>> np.exp(-corner.log_ratio(np.array([[3.0, 2.0], [3.0, 1.0]]))).round(5)
-        array([0.00152,     inf])
-        >>> bool((corner.sample(100, np.random.default_rng(0)) >= corner.starts).all())
-        True
 
     References:
         Genz, "Numerical computation of multivariate normal probabilities", Journal of Computational and Graphical
@@ -262,17 +202,7 @@ class HalfSpaceIntersection:
 
 @dataclass(frozen=True, eq=False)
 class RadialLaw:
-    """Uniform directions with |u|^2 = start + Gamma(shape, scale): for failure beyond a radius.
-
-    Example:
-        >>> import numpy as np
-        >>> component = RadialLaw(dim=6, start=25.0, shape=1.0, scale=2.0)
-        >>> u = component.sample(100, np.random.default_rng(0))
-        >>> bool((np.linalg.norm(u, axis=1) > 5.0).all())
-        True
-        >>> component.log_ratio(np.zeros((1, 6)))
-        array([-inf])
-    """
+    """Uniform directions with |u|^2 = start + Gamma(shape, scale): for failure beyond a radius."""
 
     dim: int
     start: float
@@ -335,16 +265,7 @@ LARGE_ORDER = 50.0
 
 @dataclass(frozen=True, eq=False)
 class VonMisesFisherNakagami:
-    """u = r a with a ~ von Mises-Fisher(mu, kappa) on the unit sphere and r ~ Nakagami(m, omega).
-
-    Example:
-        >>> import numpy as np
-        >>> towards = VonMisesFisherNakagami(mu=np.eye(50)[0], kappa=200.0, m=25.0, omega=50.0)
-        >>> u = towards.sample(2000, np.random.default_rng(0))
-        >>> radius = np.linalg.norm(u, axis=1)
-        >>> round(float((radius**2).mean())), round(float((u[:, 0] / radius).mean()), 1)  # E[r^2], E[mu' a]
-        (50, 0.9)
-    """
+    """u = r a with a ~ von Mises-Fisher(mu, kappa) on the unit sphere and r ~ Nakagami(m, omega)."""
 
     mu: FloatArray
     """Mean direction, of length 1, shape (d,)."""

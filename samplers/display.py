@@ -15,18 +15,7 @@ from samplers.system.optional_libraries import needs_library
 
 
 def html_table(title: str, rows: Iterable[Sequence[str]], header: Sequence[str] = (), notes: Iterable[str] = ()) -> str:
-    """Return a table as HTML, with a caption and a list of notes below it.
-
-    Args:
-        title: Caption; none if it is empty.
-        rows: Cells of each row, as plain text; the first one names the row.
-        header: Names of the columns; none for a table without a header.
-        notes: Sentences that follow the table.
-
-    Example:
-        >>> html_table("P[f <= 0]", [("p", "1e-3")], notes=["few draws"])
-        '<table><caption>P[f &lt;= 0]</caption><tr><th>p</th><td>1e-3</td></tr></table><ul><li>few draws</li></ul>'
-    """
+    """Return a table as HTML, with a caption and a list of notes below it."""
     caption = f"<caption>{escape(title)}</caption>" if title else ""
     head = "".join(f"<th>{escape(name)}</th>" for name in header)
     body = "".join(f"<tr>{_cells(row)}</tr>" for row in rows)
@@ -48,22 +37,9 @@ if TYPE_CHECKING:
 def drawing_axes(ax: Axes | str | PathLike[str] | None) -> Iterator[Axes]:
     """Yield the axes to draw in; a file is written when the block ends. Needs matplotlib.
 
-    Args:
-        ax: Axes; None for the current ones of pyplot; the path of an image, such as "p.png" or "p.pdf", for a figure
-            of its own, which pyplot does not know.
-
     Raises:
         TypeError: If it is something else.
         ValueError: If matplotlib writes no such kind of image.
-
-    Example:
-        >>> with drawing_axes(None) as axes:
-        ...     _ = axes.set_title("p")
-        >>> with drawing_axes(3.0) as axes:
-        ...     pass
-        Traceback (most recent call last):
-            ...
-        TypeError: Expected axes of matplotlib or the path of an image, such as "p.png", got float.
     """
     if ax is None:
         with needs_library("matplotlib", "A drawing"):
@@ -92,17 +68,7 @@ _Curve = TypeVar("_Curve", bound="CurveDisplay")
 
 
 class CurveDisplay:
-    """What a curve of probabilities with a band offers beside its text; `samplers.Curve` has it.
-
-    Example:
-        >>> import samplers
-        >>> problem = samplers.FunctionProblem(lambda x: 3.0 - x[:, 0], dim=2)
-        >>> curve = samplers.estimate(problem, "mc", seed=0, max_sim=10_000).curve([0.0, 1.0])
-        >>> curve
-        <Curve P[f <= g] at 2 thresholds, 0 to 1: 1.600e-03 to 2.370e-02, 95 % band>
-        >>> curve.to_arrow().column_names
-        ['gammas', 'p', 'low', 'high', 'cov', 'ess']
-    """
+    """What a curve of probabilities with a band offers beside its text; `samplers.Curve` has it."""
 
     axis: ClassVar[str]
     event: ClassVar[str]
@@ -131,9 +97,6 @@ class CurveDisplay:
     def save(self, path: str | PathLike[str]) -> None:
         """Write the curve to a file that `load` reads, of the format safetensors.
 
-        Args:
-            path: Of the file.
-
         Raises:
             OSError: If it cannot be written.
         """
@@ -142,9 +105,6 @@ class CurveDisplay:
     @classmethod
     def load(cls: type[_Curve], path: str | PathLike[str]) -> _Curve:
         """Return the curve that `save` has written.
-
-        Args:
-            path: Of the file.
 
         Raises:
             FileNotFoundError: If there is no such file.
@@ -168,3 +128,8 @@ class CurveDisplay:
         ]
         header = ("threshold", f"P[{self.event}]", f"{100 * self.confidence:g} % band")
         return html_table("", rows, header)
+
+
+def indent_lines(value: object | None) -> list[str]:
+    """Return the lines of a value as text, each indented by two spaces; none for None."""
+    return [] if value is None else [f"  {line}" for line in str(value).splitlines()]

@@ -42,14 +42,6 @@ class IndependentDistributions:
 
     Args:
         parts: In the order of the coordinates.
-
-    Example:
-        >>> import numpy as np
-        >>> from scipy import stats
-        >>> from samplers.distributions import ScipyDistribution
-        >>> base = IndependentDistributions((ScipyDistribution(stats.norm(5, 1)), ScipyDistribution(stats.uniform())))
-        >>> base.from_standard_normal(np.zeros((1, 2)))
-        array([[5. , 0.5]])
     """
 
     parts: tuple[SizedDistribution, ...]
@@ -108,13 +100,6 @@ class ScipyDistribution:
 
     Raises:
         ValueError: If it is discrete, or its parameters are invalid.
-
-    Example:
-        >>> import numpy as np
-        >>> from scipy import stats
-        >>> base = ScipyDistribution(stats.expon(scale=2.0))
-        >>> base.from_standard_normal(np.zeros((1, 1))).round(4)  # its median is 2 log 2
-        array([[1.3863]])
     """
 
     frozen: Any
@@ -177,13 +162,6 @@ class ScipyMultivariateNormal:
 
     Raises:
         ValueError: If the covariance is singular.
-
-    Example:
-        >>> import numpy as np
-        >>> from scipy import stats
-        >>> base = ScipyMultivariateNormal(stats.multivariate_normal([1.0, 2.0], [[4.0, 0.0], [0.0, 9.0]]))
-        >>> base.from_standard_normal(np.ones((1, 2)))
-        array([[3., 5.]])
     """
 
     frozen: Any
@@ -265,12 +243,6 @@ class OpenTurnsDistribution:
             transformation of a multivariate Student distribution does not lead to N(0, I). That of a Dirichlet
             distribution in OpenTURNS 1.27 does not have its density. That of a copula without marginals,
             `NormalCopula`, in OpenTURNS 1.23 is not undone by its inverse.
-
-    Example:
-        >>> import numpy as np, openturns
-        >>> base = OpenTurnsDistribution(openturns.JointDistribution([openturns.Exponential(2.0), openturns.Normal()]))
-        >>> base.from_standard_normal(np.zeros((1, 2))).round(4)  # the median of the first is log(2) / 2
-        array([[0.3466, 0.    ]])
     """
 
     distribution: Any

@@ -63,20 +63,6 @@ def calibrate(ratios: FloatArray, strata: NDArray[np.int64], draws_per_control: 
         ratios: h, densities of mass 1 over q at each draw, shape (n, m): its components, or mixtures of some of them.
         strata: The component that each draw is from, shape (n,).
         draws_per_control: Weights of fewer draws for each control stay as they are.
-
-    Example:
-        P[u > 2.1] = 0.01786 by 500 draws of N(2, 1) and 500 of N(0, 1) given u > 2, a hundred times:
-
-        >>> from scipy.special import ndtr, ndtri
-        >>> rng, p = np.random.default_rng(0), []
-        >>> for _ in range(100):
-        ...     u = np.concatenate([2 + rng.standard_normal(500), -ndtri(ndtr(-2) * rng.random(500))])
-        ...     h = np.stack([np.exp(2 * u - 2), (u > 2) / ndtr(-2)], axis=1)  # over the density of N(0, 1) ...
-        ...     weights = 2 / h.sum(axis=1)
-        ...     c = calibrate(h * weights[:, None], np.repeat([0, 1], 500), 30).factors  # ... and of the mixture
-        ...     p.append([(weights * (u > 2.1)).mean(), (c * weights * (u > 2.1)).mean()])
-        >>> np.mean(p, axis=0).round(4), np.std(p, axis=0).round(5)
-        (array([0.0179, 0.0179]), array([0.00042, 0.00036]))
     """
     n, m = ratios.shape
     if n < draws_per_control * m:
@@ -105,15 +91,7 @@ LARGE_SHARE = 0.15
 
 @dataclass(frozen=True, eq=False)
 class Draws:
-    """Independent draws from one proposal; p rests on the failing ones.
-
-    Example:
-        >>> import numpy as np
-        >>> f, log_weights = np.array([-1.0, 2.0, -0.5, 3.0]), np.log([0.01, 1.0, 0.03, 2.0])
-        >>> draws = Draws.from_outcomes(f, log_weights, x=np.zeros((4, 1)), gamma=0.0)
-        >>> draws.n, round(draws.p, 6), round(draws.ess, 6)  # (0.01 + 0.03) / 4, (1 + 3)^2 / (1 + 9)
-        (4, 0.01, 1.6)
-    """
+    """Independent draws from one proposal; p rests on the failing ones."""
 
     n: int
     """Number of draws."""
@@ -156,12 +134,7 @@ class Draws:
         )
 
     def weights_after(self, first: int, total: int | None = None) -> tuple[DrawWeights, ...]:
-        """Return the weight of each draw in p, in the order of their simulation, of which this many came before.
-
-        Args:
-            first: Simulations before the first draw.
-            total: Draws that p is the mean of, where others count too; None for these alone.
-        """
+        """Return the weight of each draw in p, in the order of their simulation, of which this many came before."""
         if len(self.fails) != self.n:
             return ()
         in_order = np.empty(self.n)
@@ -219,20 +192,6 @@ def weighted_interval(
 
     Without a failing draw p <= largest_weight P_q[failure] gives a one-sided interval. Where all
     weights are 1 the draws are plain Monte Carlo and the interval is Clopper-Pearson's.
-
-    Args:
-        draws: From one proposal.
-        confidence: Nominal coverage.
-        largest_weight: Bound of the weights.
-        cov: C.o.v. of p; None for that of independent draws.
-        ceiling: Upper end of p from elsewhere.
-
-    Example:
-        >>> import numpy as np
-        >>> draws = Draws(n=1000, f=np.zeros(400), log_weights=np.full(400, np.log(1e-4)))
-        >>> low, high = weighted_interval(draws, confidence=0.95, largest_weight=10.0)
-        >>> f"{draws.p:.2e} in [{low:.2e}, {high:.2e}]"
-        '4.00e-05 in [3.71e-05, 4.32e-05]'
     """
     hits = len(draws.f)
     if hits == 0 or largest_weight == 1.0:
@@ -251,12 +210,6 @@ def bernstein_bound(draws: Draws, confidence: float, largest_weight: float) -> f
     The empirical Bernstein bound of Maurer and Pontil, theorem 4, for the mean of n terms in
     [0, largest_weight], at the level (1 - confidence) / 2. It is wide (7 / 3 largest_weight / n
     and more), which is what draws that hardly reach the failures deserve.
-
-    Example:
-        >>> import numpy as np
-        >>> draws = Draws(n=1000, f=np.zeros(3), log_weights=np.zeros(3))
-        >>> f"{bernstein_bound(draws, confidence=0.95, largest_weight=1.0):.3f}"
-        '0.018'
     """
     log_term = math.log(4 / (1 - confidence))
     weights, less = np.exp(draws.log_weights), max(draws.n - 1, 1)
@@ -462,13 +415,7 @@ class FinalDraws(NamedTuple):
         return binomial_cov(self.draws.p, self.draws.n) if self.largest_weight == 1 else self.draws.cov
 
     def outcome(self, goal: Goal, status: Status, warnings: Sequence[str]) -> Outcome:
-        """Return the outcome of a run with these draws.
-
-        Args:
-            goal: Has the confidence of the interval.
-            status: How the run ended if it was not interrupted and some draw failed.
-            warnings: About the search; those about the draws are added.
-        """
+        """Return the outcome of a run with these draws."""
         ended = status if len(self.draws.f) else Status.NO_HITS
         from_search = self.n_first > 0
         early = ["Stopped before the final draws: the estimate rests on those of the search."]
@@ -553,19 +500,7 @@ def draw_after_search(
     rng: np.random.Generator,
     space: Space | None = None,
 ) -> Generator[FloatArray, FloatArray, FinalDraws]:
-    """Simulate the final draws; without any, as the run was stopped, take those of the search.
-
-    Args:
-        inputs: Of the problem.
-        goal: Threshold and target.
-        search: The finished search.
-        sampler: What to draw from, in `space`.
-        base_share: Share of the base distribution in `sampler`, in (0, 1]; no weight exceeds 1 / base_share.
-        limit: Final draws at most.
-        batch: Draws per call of f.
-        rng: Source of randomness.
-        space: Space of the search; None for standard normal space.
-    """
+    """Simulate the final draws; without any, as the run was stopped, take those of the search."""
     limit = 0 if search.status is Status.STOPPED else limit
     draws, trace, stopped = yield from simulate_until(inputs, sampler, goal, limit, batch, rng, space)
     largest, n_base = 1 / base_share, search.base_draws + int(base_share * draws.n)

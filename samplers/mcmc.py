@@ -25,14 +25,7 @@ class Step(NamedTuple):
 
 
 class Kernel(Protocol):
-    """Proposal of the moves of a level's chains, with its adaptation.
-
-    Example:
-        >>> import numpy as np
-        >>> kernel: Kernel = ScaledKernel("conditional", "unit", 0.6, 0.44, deviations=np.ones(2))
-        >>> kernel.start_level(np.zeros((3, 2))).propose(np.zeros((3, 2)), np.random.default_rng(0)).shape
-        (3, 2)
-    """
+    """Proposal of the moves of a level's chains, with its adaptation."""
 
     def start_level(self, seeds: FloatArray) -> "Kernel":
         """Return the kernel for a level whose chains start at these points (n, d)."""
@@ -46,15 +39,7 @@ class Kernel(Protocol):
 
 @dataclass(frozen=True)
 class FixedMetropolis:
-    """Component-wise Metropolis whose spread never changes (Au and Beck).
-
-    Example:
-        >>> import numpy as np
-        >>> kernel, rng = FixedMetropolis(spread=1.0, distribution="uniform"), np.random.default_rng(0)
-        >>> moved = kernel.propose(np.zeros((1000, 2)), rng)
-        >>> bool((np.abs(moved) <= 1.0).all()), bool((moved == 0).any())  # some components stay
-        (True, True)
-    """
+    """Component-wise Metropolis whose spread never changes (Au and Beck)."""
 
     spread: float
     """Half-width of the uniform or standard deviation of the normal steps."""
@@ -77,17 +62,7 @@ class FixedMetropolis:
 
 @dataclass(frozen=True, eq=False)
 class ScaledKernel:
-    """Conditional sampling or component-wise Metropolis with an adaptive scale (Tian et al. 2024).
-
-    Example:
-        >>> import numpy as np
-        >>> kernel = ScaledKernel("conditional", "unit", scale=0.6, target=0.44, deviations=np.ones(2))
-        >>> round(kernel.adapt(acceptance=0.24, iteration=4).scale, 3)  # 0.6 exp((0.24 - 0.44) / 2)
-        0.543
-        >>> u = kernel.propose(np.random.default_rng(0).standard_normal((10_000, 2)), np.random.default_rng(1))
-        >>> round(float(u.std()), 1)  # leaves N(0, I) invariant
-        1.0
-    """
+    """Conditional sampling or component-wise Metropolis with an adaptive scale (Tian et al. 2024)."""
 
     proposal: Literal["conditional", "metropolis"]
     sigma0: Literal["unit", "seeds"]
@@ -338,14 +313,7 @@ class LevelPlanner(Protocol):
     """The choice of the levels: a frozen dataclass of thresholds, sizes and limits, as a rule."""
 
     def plan_next(self, chains: Chains, depth: int, n_sim: int, rng: np.random.Generator) -> NextLevel | Status:
-        """Return the level that follows on the present one, or how the descent ends with the present one.
-
-        Args:
-            chains: The present level.
-            depth: Its number; 0 for the independent points that the descent starts from.
-            n_sim: Simulations made for levels 1 to `depth`.
-            rng: Source of randomness.
-        """
+        """Return the level that follows on the present one, or how the descent ends with the present one."""
 
 
 LevelReport = Callable[[Growth, NextLevel | Status], None]
@@ -357,44 +325,8 @@ def descend(
 ) -> Generator[FloatArray, FloatArray, Status]:
     """Go from level to level until the planner ends the descent or `Interrupted` is thrown in.
 
-    Args:
-        inputs: Of the problem.
-        start: Level 0 and the kernel of the first chains.
-        planner: Chooses each level.
-        report: Gets each level. One that was interrupted comes last, with Status.STOPPED.
-        rng: Source of randomness.
-
     Returns:
         How the descent ended.
-
-    Example:
-        The lower half of the points is the next level, in chains of two, three times:
-
-        >>> from samplers.mcmc import independent_chains
-        >>> from samplers.mcmc import FixedMetropolis
-        >>> from samplers.problem import FunctionProblem
-        >>> class Halves:
-        ...     def plan_next(self, chains, depth, n_sim, rng):
-        ...         if depth == 3:
-        ...             return Status.CONVERGED
-        ...         median = float(np.median(chains.f))
-        ...         seeds = chains.where(chains.f <= median)
-        ...         return NextLevel(median, seeds, np.full(len(seeds.f), 2))
-        >>> problem, rng = FunctionProblem(lambda u: u[:, 0], dim=2), np.random.default_rng(0)
-        >>> u = rng.standard_normal((10_000, 2))
-        >>> start = Growth.start(independent_chains(u, problem.evaluate(u)), FixedMetropolis(1.0, "uniform"))
-        >>> medians = []
-        >>> steps = descend(problem, start, Halves(), lambda growth, _: medians.append(np.median(growth.chains.f)), rng)
-        >>> x = next(steps)
-        >>> try:
-        ...     while True:
-        ...         x = steps.send(problem.evaluate(x))
-        ... except StopIteration as end:
-        ...     print(end.value)
-        converged
-        >>> exact = [0.0, -0.674, -1.150, -1.534]  # Phi^-1 of 1/2, 1/4, 1/8, 1/16
-        >>> bool(np.allclose(medians, exact, rtol=0, atol=0.1))
-        True
     """
     growth, depth, n_sim = start, 0, 0
     while True:

@@ -57,18 +57,7 @@ class Distribution(Protocol):
 
 
 class Inputs(Protocol):
-    """The random input X of a problem; all that a method knows of it.
-
-    Example:
-        A method asks for points of it; who has the simulator answers.
-
-        >>> import samplers
-        >>> class Places:
-        ...     dim, base = 2, samplers.StandardNormal(2)
-        >>> run = samplers.MonteCarlo(batch=100).start(Places(), seed=0, max_sim=300)
-        >>> run.ask().shape
-        (100, 2)
-    """
+    """The random input X of a problem; all that a method knows of it."""
 
     @property
     def dim(self) -> int:
@@ -84,13 +73,6 @@ class HasNoise(Protocol):
     """A base distribution some of whose coordinates are the simulation's own randomness.
 
     They are independent standard normal. `TwoStage` does not search among them: it draws them as they come.
-
-    Example:
-        >>> import numpy as np, samplers
-        >>> class OneIsNoise(samplers.StandardNormal):
-        ...     noise = np.array([False, True])
-        >>> isinstance(OneIsNoise(2), HasNoise), isinstance(samplers.StandardNormal(2), HasNoise)
-        (True, False)
     """
 
     @property
@@ -120,38 +102,6 @@ class Problem(Inputs, Protocol):
 
     def evaluate(self, x: FloatArray) -> FloatArray:
         """Simulate the rows of x (n, d); return f, shape (n,), float64."""
-
-
-@runtime_checkable
-class ConditionalProblem(Protocol):
-    """A problem that holds something fixed, so that its p is conditional on it.
-
-    Example:
-        >>> class Wet:
-        ...     given = "a wet road"
-        >>> isinstance(Wet(), ConditionalProblem)
-        True
-    """
-
-    @property
-    def given(self) -> str:
-        """Condition, in words; empty without one."""
-
-
-@runtime_checkable
-class NamedProblem(Protocol):
-    """A problem whose columns of x have names, which tables of its results take.
-
-    Example:
-        >>> import samplers
-        >>> braking = samplers.FunctionProblem(lambda x: x[:, 0], 2, column_names=("speed", "gap"))
-        >>> isinstance(braking, NamedProblem), braking.column_names
-        (True, ('speed', 'gap'))
-    """
-
-    @property
-    def column_names(self) -> Sequence[str]:
-        """Names of the d columns of x; empty without names."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -260,27 +210,13 @@ class HasTermGradients(HasTerms, Protocol):
 
 
 def offers_terms(problem: object) -> TypeGuard[HasTerms]:
-    """Return whether a problem has terms.
-
-    Example:
-        >>> import samplers
-        >>> offers_terms(samplers.FunctionProblem(lambda x: x[:, 0], 2))
-        False
-        >>> offers_terms(samplers.FunctionProblem(dim=2, terms=lambda x: x))
-        True
-    """
+    """Return whether a problem has terms."""
     return callable(getattr(problem, "terms", None))  # a user's object
 
 
 def condition_of(problem: Inputs) -> str:
-    """Return what a problem holds fixed, in words; empty for nothing.
-
-    Example:
-        >>> import samplers
-        >>> condition_of(samplers.FunctionProblem(lambda x: x[:, 0], 2))
-        ''
-    """
-    return str(problem.given) if isinstance(problem, ConditionalProblem) else ""
+    """Return what a problem holds fixed, in words; empty for nothing."""
+    return str(getattr(problem, "given", ""))  # a user's object
 
 
 def names_of_columns(problem: Inputs) -> tuple[str, ...]:
@@ -288,13 +224,8 @@ def names_of_columns(problem: Inputs) -> tuple[str, ...]:
 
     Raises:
         ValueError: If they are not as many different names as it has dimensions.
-
-    Example:
-        >>> import samplers
-        >>> names_of_columns(samplers.FunctionProblem(lambda x: x[:, 0], 2, column_names=["speed", "gap"]))
-        ('speed', 'gap')
     """
-    names = tuple(problem.column_names) if isinstance(problem, NamedProblem) else ()
+    names = tuple(getattr(problem, "column_names", ()))  # a user's object
     if names and (len(set(names)) != int(problem.dim) or not all(isinstance(name, str) for name in names)):
         raise ValueError(f"Expected column_names of a problem to be {int(problem.dim)} different names, got {names!r}.")
     return names
@@ -411,7 +342,7 @@ class FunctionProblem:
         if not (callable(self.f) or (self.f is None and self.terms is not None)):
             raise ValueError(f"Expected f to be a function of an (n, d) array, got {self.f!r}.")
         self._set_base()
-        names = self.column_names or (self.base.column_names if isinstance(self.base, NamedProblem) else ())
+        names = self.column_names or getattr(self.base, "column_names", ())
         object.__setattr__(self, "column_names", tuple(names))
         names_of_columns(self)
         for name, wrap in (("terms", _FunctionTerms), ("gradient", _FunctionGradients)):

@@ -35,15 +35,7 @@ class Moments(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Gaussian:
-    """N(mean, L L') with lower triangular L.
-
-    Example:
-        >>> import numpy as np
-        >>> from samplers.proposals import Gaussian
-        >>> proposal = Gaussian.from_covariance(np.zeros(2), np.array([[4.0, 0.0], [0.0, 1.0]]))
-        >>> proposal.log_prob(np.zeros((1, 2))).round(4)  # -log(2 pi sqrt(4))
-        array([-2.531])
-    """
+    """N(mean, L L') with lower triangular L."""
 
     mean: FloatArray
     """Shape (d,)."""
@@ -105,15 +97,7 @@ def weighted_moments(u: FloatArray, weights: FloatArray) -> Moments:
 
 @dataclass(frozen=True, eq=False)
 class TiltedNormal:
-    """N(shift, I), that is N(0, I) tilted by exp(shift' u - |shift|^2 / 2).
-
-    Example:
-        >>> import numpy as np
-        >>> tilted = TiltedNormal(np.array([3.0, 0.0]))
-        >>> u = np.array([[3.0, 1.0]])
-        >>> (tilted.log_prob(u) - TiltedNormal(np.zeros(2)).log_prob(u)).round(6)  # shift' u - |shift|^2 / 2
-        array([4.5])
-    """
+    """N(shift, I), that is N(0, I) tilted by exp(shift' u - |shift|^2 / 2)."""
 
     shift: FloatArray
     """Shape (d,)."""
@@ -135,15 +119,7 @@ class SupportsLogProb(Protocol):
 
 
 class ProposalDistribution(SupportsLogProb, Protocol):
-    """A distribution that can be drawn from and whose density is known; all that importance sampling needs.
-
-    Example:
-        >>> import numpy as np
-        >>> from samplers.proposals import TiltedNormal
-        >>> proposal: ProposalDistribution = TiltedNormal(np.array([3.0]))
-        >>> proposal.sample(5, np.random.default_rng(0)).shape
-        (5, 1)
-    """
+    """A distribution that can be drawn from and whose density is known; all that importance sampling needs."""
 
     def sample(self, n: int, rng: np.random.Generator) -> FloatArray:
         """Draw n independent points, shape (n, d)."""
@@ -151,18 +127,7 @@ class ProposalDistribution(SupportsLogProb, Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Mixture:
-    """A mixture of distributions.
-
-    Example:
-        >>> import numpy as np
-        >>> from samplers.proposals import Gaussian
-        >>> left, right = (Gaussian(np.array([mean]), np.eye(1)) for mean in (-4.0, 4.0))
-        >>> mixture = Mixture(np.array([0.25, 0.75]), [left, right])
-        >>> bool(0.2 < (mixture.sample(1000, np.random.default_rng(0)) < 0).mean() < 0.3)
-        True
-        >>> np.exp(mixture.log_prob(np.array([[4.0]]))).round(3)  # 0.75 / sqrt(2 pi)
-        array([0.299])
-    """
+    """A mixture of distributions."""
 
     weights: FloatArray
     """Shape (k,), adding up to 1."""
@@ -186,15 +151,7 @@ class Mixture:
 
 @dataclass(frozen=True, eq=False)
 class GaussianMixture(Mixture):
-    """A mixture of Gaussians.
-
-    Example:
-        >>> import numpy as np
-        >>> from samplers.proposals import Gaussian
-        >>> mixture = GaussianMixture(np.ones(1), [Gaussian.standard(2)])
-        >>> mixture.widen(1.5).components[0].covariance.diagonal()
-        array([2.25, 2.25])
-    """
+    """A mixture of Gaussians."""
 
     components: Sequence[Gaussian]
 
@@ -242,11 +199,6 @@ def correct_eigenvalues(values: FloatArray, n: float) -> FloatArray:
     Args:
         values: l, in increasing order, positive, shape (d,).
         n: Independent points that they are estimated from, more than d.
-
-    Example:
-        >>> import numpy as np
-        >>> correct_eigenvalues(np.array([0.05, 1.0, 2.0]), n=20.0).round(3)
-        array([0.056, 1.105, 1.663])
     """
     gaps = values[:, None] - values
     gaps[gaps == 0] = np.inf  # its own, and equal ones
@@ -275,19 +227,10 @@ def shrink_towards_present(target: Moments, present: Gaussian, n: float) -> Gaus
 
     The present covariance counts as (d + 1) max(1, d / PRIOR_DIM) points beside the n behind the target: in many
     dimensions the noise of the d (d + 1) / 2 entries of a covariance ruins importance weights.
-
-    Args:
-        target: Moments of weighted points.
-        present: The Gaussian that the points are drawn from.
-        n: Number of independent points that they are worth.
     """
     prior = (present.dim + 1) * max(1.0, present.dim / PRIOR_DIM)
     share = prior / (prior + n)
     return Gaussian.from_covariance(target.first, (1 - share) * target.covariance + share * present.covariance)
-
-
-LLOYD_STEPS = 4
-"""Times at most that k-means moves its centres; it only has to give expectation-maximisation a start."""
 
 
 def choose_centres(x: FloatArray, weights: FloatArray, k: int, rng: np.random.Generator) -> FloatArray:
@@ -304,92 +247,18 @@ def choose_centres(x: FloatArray, weights: FloatArray, k: int, rng: np.random.Ge
     return np.asarray(x[chosen])
 
 
-def k_means(x: FloatArray, weights: FloatArray, k: int, rng: np.random.Generator) -> NDArray[np.int64]:
-    """Return clusters (n,) of weighted points x (n, d), numbered from 0: k-means++, then Lloyd's steps.
-
-    Two centres that differ by a rounding error may give one cluster, and one without points.
-
-    Args:
-        x: Points.
-        weights: Shape (n,).
-        k: Clusters at most.
-        rng: Source of randomness.
-
-    Example:
-        >>> x = np.array([[0.0], [0.1], [9.0], [9.1], [9.2]])
-        >>> labels = k_means(x, np.ones(5), 2, np.random.default_rng(0))
-        >>> (labels == labels[4]).tolist()
-        [False, False, True, True, True]
-    """
+def start_from_centres(x: FloatArray, weights: FloatArray, k: int, rng: np.random.Generator) -> FloatArray:
+    """Return to which of k distant centres each of the points x (n, d) is nearest, as zeros and ones (k, n)."""
     centres = choose_centres(x, weights, k, rng)
-    if len(centres) == 1:
-        return np.zeros(len(x), dtype=np.int64)
-    mean = x.mean(axis=0)
-    x, centres = x - mean, centres - mean  # distances lose fewer digits near the origin
-    labels = _nearest(x, centres)
-    for _ in range(LLOYD_STEPS):
-        moved = _means(x, weights, labels, centres)
-        if (moved == centres).all():
-            break
-        before, labels, centres = labels, _nearest(x, moved), moved
-        if (labels == before).all():
-            break
-    return labels
-
-
-def _nearest(x: FloatArray, centres: FloatArray) -> NDArray[np.int64]:
-    """Return the nearest of the centres (k, d) to each of the points x (n, d), the first of several."""
-    return np.asarray((np.einsum("ij,ij->i", centres, centres) - 2.0 * (x @ centres.T)).argmin(axis=1))
-
-
-def _means(x: FloatArray, weights: FloatArray, labels: NDArray[np.int64], centres: FloatArray) -> FloatArray:
-    """Return the means of the clusters (k, d); one without points moves to the point furthest from its own centre."""
-    k = len(centres)
-    mass = np.bincount(labels, weights=weights, minlength=k).astype(np.float64)
-    sums = np.stack([np.bincount(labels, weights=row, minlength=k) for row in x.T * weights], axis=1).astype(np.float64)
-    if not mass.all():
-        _fill_empty(x, weights, labels, centres, sums, mass)
-    means = sums * (1 / np.where(mass > 0, mass, 1.0))[:, None]
-    return means if mass.all() else np.where(mass[:, None] > 0, means, means[mass.argmax()])
-
-
-def _fill_empty(
-    x: FloatArray,
-    weights: FloatArray,
-    labels: NDArray[np.int64],
-    centres: FloatArray,
-    sums: FloatArray,
-    mass: FloatArray,
-) -> None:
-    """Give clusters without points one each in `sums` (k, d) and `mass` (k,): those furthest from their own centres."""
-    distance = ((x - centres[labels]) ** 2).sum(axis=1)
-    if distance.max() == 0:  # there are more clusters than places
-        return
-    for cluster, point in zip(np.flatnonzero(mass == 0), np.argsort(-distance, kind="stable"), strict=False):
-        share = x[point] * weights[point]
-        sums[labels[point]] -= share
-        mass[labels[point]] -= weights[point]
-        sums[cluster], mass[cluster] = share, weights[point]
+    return one_hot(np.stack([((x - centre) ** 2).sum(axis=1) for centre in centres]).argmin(axis=0), k)
 
 
 MixtureT = TypeVar("MixtureT")
 
 
-class Family(Protocol[MixtureT]):
-    """A family of mixtures that is fitted to weighted points; it holds the points."""
-
-    def maximise(self, responsibilities: FloatArray) -> MixtureT:
-        """Return the likeliest mixture (M-step), given how far each component explains each point, shape (k, n).
-
-        It may drop components.
-        """
-
-    def log_terms(self, mixture: MixtureT) -> FloatArray:
-        """Return log(weight_j q_j) of the components at the points, shape (k, n)."""
-
-
 def expectation_maximisation(
-    family: Family[MixtureT],
+    maximise: Callable[[FloatArray], MixtureT],
+    log_terms: Callable[[MixtureT], FloatArray],
     responsibilities: FloatArray,
     weights: FloatArray,
     max_steps: int,
@@ -398,7 +267,9 @@ def expectation_maximisation(
     """Return the mixture reached from some responsibilities, and its weighted log likelihood.
 
     Args:
-        family: What is fitted, with its points.
+        maximise: Returns the likeliest mixture (M-step) given how far each component explains each point, shape (k, n);
+            it may drop components.
+        log_terms: Returns log(weight_j q_j) of the components of a mixture at the points, shape (k, n).
         responsibilities: To start from, shape (k, n), columns that add up to 1.
         weights: Of the points, shape (n,).
         max_steps: M-steps at most.
@@ -406,8 +277,8 @@ def expectation_maximisation(
     """
     reached = -np.inf
     for _ in range(max_steps):
-        mixture = family.maximise(responsibilities)
-        terms = family.log_terms(mixture)
+        mixture = maximise(responsibilities)
+        terms = log_terms(mixture)
         total = log_sum_exp(terms, axis=0)
         log_likelihood = float(weights @ total)
         if log_likelihood - reached < least_gain(log_likelihood):
@@ -485,44 +356,23 @@ def fit_proposal_mixture(
     return best
 
 
-@dataclass(frozen=True, eq=False)
-class _WeightedPoints:
-    """Mixtures with k components at most that are fitted to weighted points, see `samplers.proposals.Family`."""
-
-    fit: Fit
-    u: FloatArray
-    weights: FloatArray
-    k: int
-
-    def maximise(self, responsibilities: FloatArray) -> WidenableMixture:
-        """Return the mixture of the components that have weight enough."""
-        mass = self.weights * responsibilities
-        totals = mass.sum(axis=1)
-        kept = totals > min(LEAST_WEIGHT, LEAST_OF_EVEN_SHARE / self.k)
-        components = [self.fit(self.u, part / part.sum()) for part in mass[kept]]
-        return WidenableMixture(totals[kept] / totals[kept].sum(), components)
-
-    def log_terms(self, mixture: WidenableMixture) -> FloatArray:
-        """Return log(weight_j q_j) of the components at the points, shape (k, n)."""
-        return mixture.log_terms(self.u)
-
-
 def fit_mixture_of_size(
     fit: Fit, u: FloatArray, weights: FloatArray, k: int, rng: np.random.Generator
 ) -> WidenableMixture:
     """Return a mixture of at most k components by expectation-maximisation, from distant first centres."""
-    family = _WeightedPoints(fit, u, weights, k)
-    start = initial_responsibilities(u, weights, k, rng)
-    mixture, _ = expectation_maximisation(family, start, weights, MAX_EM_STEPS, lambda _: LEAST_EM_GAIN)
+
+    def maximise(responsibilities: FloatArray) -> WidenableMixture:
+        """Return the mixture of the components that have weight enough."""
+        mass = weights * responsibilities
+        totals = mass.sum(axis=1)
+        kept = totals > min(LEAST_WEIGHT, LEAST_OF_EVEN_SHARE / k)
+        components = [fit(u, part / part.sum()) for part in mass[kept]]
+        return WidenableMixture(totals[kept] / totals[kept].sum(), components)
+
+    # Separate regions of failure lie in separate directions from the origin.
+    directions = u / np.maximum(np.linalg.norm(u, axis=1, keepdims=True), np.finfo(np.float64).tiny)
+    start = start_from_centres(directions, weights, k, rng)
+    mixture, _ = expectation_maximisation(
+        maximise, lambda mixture: mixture.log_terms(u), start, weights, MAX_EM_STEPS, lambda _: LEAST_EM_GAIN
+    )
     return mixture
-
-
-def initial_responsibilities(u: FloatArray, weights: FloatArray, k: int, rng: np.random.Generator) -> FloatArray:
-    """Return to which of k centres each point is nearest in direction, as zeros and ones (k, n).
-
-    Directions, as separate regions of failure lie in separate directions from the origin.
-    """
-    a = u / np.maximum(np.linalg.norm(u, axis=1, keepdims=True), np.finfo(np.float64).tiny)
-    centres = choose_centres(a, weights, k, rng)
-    distances = np.stack([((a - centre) ** 2).sum(axis=1) for centre in centres])
-    return one_hot(distances.argmin(axis=0), k)

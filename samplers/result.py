@@ -1,23 +1,26 @@
 """Result: the estimate that `estimate` returns."""
 
 import json
+import math
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, field, fields, is_dataclass, replace
+from dataclasses import asdict, dataclass, fields, is_dataclass, replace
 from functools import cached_property
 from importlib import import_module
 from os import PathLike
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any, TypeVar, cast
 
+import numpy as np
 from numpy.typing import ArrayLike
 
 from samplers.analysis.base_error import BaseUncertainty, compute_base_uncertainty
-from samplers.analysis.curve import Curve, compute_curve
+from samplers.analysis.curve import Curve, compute_curve, lowest_known_threshold
 from samplers.analysis.gate import Pilot, Verdict, judge_estimate
 from samplers.analysis.kinds import Share, split_by_kind
 from samplers.analysis.reweight import Reweighted, find_sibling, reweight_estimate
 from samplers.analysis.sensitivity import Sensitivity, compute_sensitivity
-from samplers.analysis.weighted import RatioStore, require_sample
-from samplers.estimate_display import EstimateDisplay
+from samplers.analysis.weighted import require_sample
+from samplers.display import drawing_axes, html_table, indent_lines
+from samplers.estimate_data import EstimateData
 from samplers.method import Stepping
 from samplers.problem import Distribution, FloatArray
 from samplers.sample import DrawWeights, Failures, Layer, Sample, SimulatedPoints, SimulationIndex
@@ -35,15 +38,19 @@ from samplers.stored import (
     write_object,
 )
 from samplers.system.optional_libraries import needs_library
-from samplers.trace import Level, Status
+from samplers.trace import Level, Status, describe_outcome
 
 if TYPE_CHECKING:
     import pandas
     import pyarrow
+    from matplotlib.axes import Axes
+
+PLOTTED_THRESHOLDS = 60
+"""Thresholds of the curve that `Estimate.plot` draws."""
 
 
-@dataclass(frozen=True, kw_only=True, repr=False)  # its text and line are those of the display
-class Estimate(EstimateDisplay):
+@dataclass(frozen=True, kw_only=True, repr=False)
+class Estimate(EstimateData):
     """P[f(X) <= gamma] with its interval, its cost and its failures.
 
     Example:
@@ -51,64 +58,11 @@ class Estimate(EstimateDisplay):
         >>> problem = samplers.FunctionProblem(lambda x: 3.5 - x.sum(axis=1) / 10**0.5, dim=10)
         >>> result = samplers.estimate(problem, seed=0, max_sim=6000)  # P = Phi(-3.5) = 2.326e-4
         >>> print(f"{result.p:.2e}, c.o.v. {result.cov:.2f}, {result.n_sim} simulations, {result.status}")
-        2.35e-04, c.o.v. 0.01, 6000 simulations, converged
+        2.34e-04, c.o.v. 0.01, 6000 simulations, converged
         >>> low, high = result.interval
         >>> low < 2.326e-4 < high, result.warnings
         (True, ())
     """
-
-    p: float
-    """Estimated probability."""
-    interval: tuple[float, float]
-    """Interval that should hold the true p with probability `confidence`."""
-    confidence: float
-    """Nominal coverage of `interval`."""
-    cov: float
-    """Estimated coefficient of variation of p; inf where p = 0."""
-    gamma: float
-    """Threshold of failure."""
-    n_sim: int
-    """Simulated points of the whole run, search included."""
-    gain: float
-    """Plain Monte Carlo runs for the same c.o.v., divided by n_sim; NaN where p is 0 or 1."""
-    status: Status
-    """End of the run."""
-    warnings: tuple[str, ...]
-    """Reasons for which the numbers are doubtful; empty if none is known."""
-    remarks: tuple[str, ...] = ()
-    """Facts about how the run went that cast no doubt on the numbers, such as a change of method."""
-    trace: tuple[Level, ...]
-    """One entry per level, iteration or batch."""
-    failures: Failures
-    """Failing points, the most likely first."""
-    method: Stepping
-    """The method and its settings."""
-    seed: int
-    """Seed that gives the same run again."""
-    sample: Sample | None = field(default=None, compare=False, repr=False)
-    """The weighted points behind p; None if the method cannot give them."""
-    base: Distribution | None = field(default=None, compare=False, repr=False)
-    """Distribution of X."""
-    on_error: str = field(default="raise", repr=False)
-    """Treatment of rows on which f raised or gave NaN."""
-    base_draws: int = 0
-    """Simulations that were independent draws from the base distribution."""
-    given: str = ""
-    """Condition of p, which the problem holds fixed: its attribute `given`, if it has one."""
-    column_names: tuple[str, ...] = field(default=(), compare=False, repr=False)
-    """Names of the columns of x, the problem's attribute `column_names`; empty where it has none."""
-    choice: str = field(default="", compare=False)
-    """Method that `Auto` chose and why; empty where the method was named."""
-    chose_another: bool = field(default=False, compare=False, repr=False)
-    """Whether that is another method than the usual one, which the text says; `to_dict` has every choice."""
-    ensemble_run: "Estimate | None" = field(default=None, compare=False, repr=False)
-    """The further run under the mixture of the refits of the base, where `estimate` needed one."""
-    simulations: SimulationIndex | None = field(default=None, compare=False, repr=False)
-    """What each simulation was made for, and its weight in p; those of `ensemble_run` come after them."""
-    points: SimulatedPoints | None = field(default=None, compare=False, repr=False)
-    """All simulations, where `estimate` was told to keep them (`keep_points=True`)."""
-    refit_ratios: RatioStore = field(default_factory=RatioStore, compare=False, repr=False)
-    """Density ratios of the refits at the failing points, kept by the analyses that need them."""
 
     @property
     def unseen(self) -> float:
@@ -214,7 +168,7 @@ class Estimate(EstimateDisplay):
         Raises:
             ValueError: If the limit is not above 0 and below 1.
         """
-        return judge_estimate(self, max_p, given_base)
+        return judge_estimate(self, max_p, None if given_base else self.base_uncertainty)
 
     def pilot(self, seconds: float | None = None) -> Pilot:
         """Return this run as one that others are planned from, by `samplers.plan_runs`.
@@ -294,6 +248,72 @@ class Estimate(EstimateDisplay):
             f"{fixed}if no failure region was missed; {self.base_draws:,} base draws would have met one with "
             f"probability above {self.unseen:.1e} ({100 * self.confidence:g} % confidence)"
         )
+
+    def plot(self, ax: "Axes | str | PathLike[str] | None" = None) -> "Axes":
+        """Draw P[f <= g] over thresholds g with its band, and p with its interval at gamma; needs matplotlib.
+
+        Raises:
+            ValueError: If the method gave no weighted points, or too few of them to draw a curve.
+        """
+        sample = require_sample(self)
+        finite = sample.f[np.isfinite(sample.f)]
+        low = max(lowest_known_threshold(sample, self.gamma), finite.min(initial=math.inf))
+        if not math.isfinite(low):
+            raise ValueError("There is nothing to draw: too few simulations came near failure; give more of them.")
+        order = np.argsort(finite)
+        reached = np.cumsum(sample.weights[np.isfinite(sample.f)][order])
+        high = float(finite[order][min(np.searchsorted(reached, reached[-1] / 2), len(order) - 1)])
+        grid = np.unique([*np.linspace(low, max(low, high, self.gamma), PLOTTED_THRESHOLDS), max(low, self.gamma)])
+        with drawing_axes(ax) as axes:
+            self.curve(grid).plot(axes)
+            axes.axvline(self.gamma, linestyle=":", color="0.4")
+            if self.p > 0:
+                below, above = self.p - self.interval[0], self.interval[1] - self.p
+                axes.errorbar([self.gamma], [self.p], yerr=[[below], [above]], fmt="o", capsize=4, color="0.2")
+            axes.set_title(f"P[f ≤ {self.gamma:g}] = {self.p:.2e}")
+        return axes
+
+    def __repr__(self) -> str:
+        """Return one line; `str` has all of it."""
+        low, high = self.interval
+        doubts = f", {len(self.warnings)} warning{'s' * (len(self.warnings) != 1)}" if self.warnings else ""
+        return (
+            f"<Estimate P[f <= {self.gamma:g}] = {self.p:.3e} [{low:.3e}, {high:.3e}], {self.n_sim:,} simulations, "
+            f"{self.method.name}, {self.status}{doubts}>"
+        )
+
+    def _repr_html_(self) -> str:
+        """Return a table for notebooks."""
+        low, high = self.interval
+        rows = [
+            (f"{100 * self.confidence:g} % interval", f"{low:.3e} to {high:.3e}"),
+            ("c.o.v.", "not known" if math.isinf(self.cov) else f"{self.cov:.3g}"),
+            *([("base distribution", str(self.base_uncertainty))] if self.base_uncertainty is not None else []),
+            ("simulations", f"{self.n_sim:,}"),
+            *([] if math.isnan(self.gain) else [("gain over Monte Carlo", f"{self.gain:.3g}")]),
+            ("failing points", f"{self.failures.total:,}"),
+            ("method", f"{self.method.name}, seed {self.seed}, {describe_outcome(self.status, self.warnings)}"),
+            ("valid", self.proviso),
+        ]
+        notes = [*(f"remark: {text}" for text in self.remarks), *(f"warning: {text}" for text in self.warnings)]
+        return html_table(f"P[f <= {self.gamma:g}] = {self.p:.3e}", rows, notes=notes)
+
+    def __str__(self) -> str:
+        """Return a few lines for people."""
+        low, high = self.interval
+        gain = "" if math.isnan(self.gain) else f", gain over Monte Carlo {self.gain:.3g}"
+        cov = "not known" if math.isinf(self.cov) else f"{self.cov:.3g}"
+        lines = [
+            f"P[f <= {self.gamma:g}] = {self.p:.3e}",
+            f"  {100 * self.confidence:g} % interval [{low:.3e}, {high:.3e}], c.o.v. {cov}",
+            *indent_lines(self.base_uncertainty),
+            f"  {self.n_sim:,} simulations{gain}; {self.method.name}, seed {self.seed}, "
+            f"{describe_outcome(self.status, self.warnings)}; {self.failures.total:,} failing points",
+            *([f"  chosen {self.choice}"] if self.chose_another else []),
+            f"  valid {self.proviso}",
+        ]
+        lines += [f"  remark: {text}" for text in self.remarks]
+        return "\n".join(lines + [f"  warning: {text}" for text in self.warnings])
 
     def to_arrow(self, names: Sequence[str] = ()) -> "pyarrow.Table":
         """Return simulated points with their weights as an Arrow table, a row each.
@@ -418,6 +438,9 @@ def method_settings(method: Stepping) -> dict[str, Any]:
     return {each.name: getattr(method, each.name) for each in fields(method)} if is_dataclass(method) else {}
 
 
+_EstimateT = TypeVar("_EstimateT", bound=EstimateData)
+
+
 @dataclass(frozen=True)
 class StoredEstimate:
     """An estimate as a file has it."""
@@ -426,7 +449,7 @@ class StoredEstimate:
     base_uncertainty: BaseUncertainty | None
 
 
-def without_base(estimate: Estimate) -> Estimate:
+def without_base(estimate: _EstimateT) -> _EstimateT:
     """Return an estimate without what a file cannot hold."""
     method, further = estimate.method, estimate.ensemble_run
     if not is_stored(method):
@@ -437,9 +460,9 @@ def without_base(estimate: Estimate) -> Estimate:
         base=None,
         method=method,
         ensemble_run=None if further is None else without_base(further),
-        refit_ratios=RatioStore(),
+        refit_ratios=[],
     )
 
 
-register_stored(StoredEstimate, Estimate, BaseUncertainty, Failures, Level, Status, StoredMethod, RatioStore)
+register_stored(StoredEstimate, Estimate, BaseUncertainty, Failures, Level, Status, StoredMethod)
 register_stored(Sample, Layer, DrawWeights, SimulationIndex, SimulatedPoints)

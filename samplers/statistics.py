@@ -29,12 +29,6 @@ def log_sum_exp(a: FloatArray, axis: int | None = None, weights: FloatArray | No
         a: Logarithms, any shape.
         axis: Along which the sum is taken; it is dropped.
         weights: Not negative, of a shape that goes with that of `a`; all 1 where they are None.
-
-    Example:
-        >>> round(float(np.exp(log_sum_exp(np.log([1.0, 2.0, 5.0])))), 9)
-        8.0
-        >>> log_sum_exp(np.full((2, 1), -np.inf), axis=0)
-        array([-inf])
     """
     if weights is not None:
         a = np.where(weights == 0, -np.inf, a)
@@ -52,22 +46,12 @@ def log_sum_exp(a: FloatArray, axis: int | None = None, weights: FloatArray | No
 
 
 def normalise_weights(log_weights: FloatArray) -> FloatArray:
-    """Return weights proportional to exp(log_weights) (n,) that add up to 1.
-
-    Example:
-        >>> normalise_weights(np.log([1.0, 3.0]))
-        array([0.25, 0.75])
-    """
+    """Return weights proportional to exp(log_weights) (n,) that add up to 1."""
     return np.asarray(np.exp(log_weights - log_sum_exp(log_weights)))
 
 
 def effective_sample_size(log_weights: FloatArray) -> float:
-    """Return Kish's (sum w)^2 / sum w^2 of weights given as logarithms (n,); 0 for none.
-
-    Example:
-        >>> print(f"{effective_sample_size(np.log([1.0, 1.0, 2.0])):.3f}")  # 16 / 6
-        2.667
-    """
+    """Return Kish's (sum w)^2 / sum w^2 of weights given as logarithms (n,); 0 for none."""
     if log_weights.size == 0:
         return 0.0
     return float(np.exp(2 * log_sum_exp(log_weights) - log_sum_exp(2 * log_weights)))
@@ -94,18 +78,7 @@ LARGE_ESS = 200
 
 
 def clopper_pearson(hits: int, n: int, confidence: float) -> Interval:
-    """Return the exact binomial interval of a share; one-sided where hits is 0 or n.
-
-    Args:
-        hits: Failing draws.
-        n: Independent draws.
-        confidence: Nominal coverage.
-
-    Example:
-        >>> low, high = clopper_pearson(10, 1000, confidence=0.95)
-        >>> print(f"{low:.4f} {high:.4f}")
-        0.0048 0.0183
-    """
+    """Return the exact binomial interval of a share; one-sided where hits is 0 or n."""
     tail = (1 - confidence) / 2
     low = 0.0 if hits == 0 else float(betaincinv(hits, n - hits + 1, tail))
     high = 1.0 if hits == n else float(betaincinv(hits + 1, n - hits, 1 - tail))
@@ -116,10 +89,6 @@ def zero_hit_bound(n: int, confidence: float) -> float:
     """Return the upper bound of a probability of which n independent draws showed nothing; 1 where n = 0.
 
     The one-sided interval of Clopper and Pearson, with all of 1 - confidence at the upper end.
-
-    Example:
-        >>> print(f"{zero_hit_bound(1000, confidence=0.95):.5f}")  # about 3 / n
-        0.00299
     """
     return -math.expm1(math.log1p(-confidence) / n) if n else 1.0
 
@@ -128,11 +97,6 @@ def log_normal_interval(p: float, cov: float, confidence: float, df: float = mat
     """Return p exp(-+ q s), s^2 = log(1 + cov^2), q the normal (or, with finite df, t) quantile.
 
     For estimators whose logarithm is nearly normal; p must be positive. Cut at 1.
-
-    Example:
-        >>> low, high = log_normal_interval(1e-4, cov=0.2, confidence=0.95)
-        >>> print(f"{low:.2e} {high:.2e}")
-        6.78e-05 1.47e-04
     """
     quantile = float(stdtrit(df, 0.5 + confidence / 2))
     half = quantile * math.sqrt(math.log1p(cov * cov))
@@ -144,16 +108,6 @@ def skewed_upper_end(p: float, cov: float, skewness: float, confidence: float) -
 
     With g the skewness of the mean (that of a term over sqrt(n), here cut to [0, MAX_SKEWNESS]) and z the normal
     quantile, the end is p (1 + 3 cov / g (1 - (1 - g (z + g / 6))^(1/3))).
-
-    Args:
-        p: The mean.
-        cov: Its coefficient of variation.
-        skewness: Its skewness.
-        confidence: Nominal coverage of both ends together.
-
-    Example:
-        >>> [f"{skewed_upper_end(1e-4, 0.1, skewness, confidence=0.95):.3e}" for skewness in (0.0, 0.2, 0.4)]
-        ['1.196e-04', '1.234e-04', '1.319e-04']
     """
     z, g = float(ndtri(0.5 + confidence / 2)), min(skewness, MAX_SKEWNESS)
     if g < MIN_SKEWNESS:
@@ -173,12 +127,7 @@ def degrees_of_freedom(ess: float, independent: bool) -> float:
 
 
 def binomial_cov(p: float, n: float) -> float:
-    """Return the c.o.v. of a share p of n independent points; inf where p = 0.
-
-    Example:
-        >>> print(f"{binomial_cov(0.01, 1000):.3f}")  # about 1 / sqrt(hits)
-        0.315
-    """
+    """Return the c.o.v. of a share p of n independent points; inf where p = 0."""
     return math.sqrt((1 - p) / (p * n)) if p > 0 else math.inf
 
 
@@ -186,10 +135,6 @@ def gain_over_monte_carlo(p: float, cov: float, n_sim: int) -> float:
     """Return Monte Carlo runs for the same c.o.v. divided by n_sim.
 
     NaN where p is 0 or 1, and from a c.o.v. of 1 on: p itself is then not known.
-
-    Example:
-        >>> print(f"{gain_over_monte_carlo(1e-4, cov=0.1, n_sim=5000):.0f}")
-        200
     """
     if not 0 < p < 1 or not 0 < cov < 1 or n_sim == 0:
         return math.nan
@@ -233,16 +178,6 @@ def next_level(f: FloatArray, fraction: float, gamma: float) -> float | None:
     q, an outcome that occurred, so that the share of f <= q is its true share. Where many outcomes tie at q (time to
     collision capped for most scenarios), the share of f <= q may be far above `fraction`. Then the largest distinct
     outcome below q is taken if its share is nearer (in ratio) or if q would keep more than half of the points.
-
-    Args:
-        f: Outcomes; +inf is allowed.
-        fraction: Wanted share, p0 or rho, in (0, 1).
-        gamma: Final threshold; never passed.
-
-    Example:
-        >>> f = np.arange(10.0)
-        >>> next_level(f, fraction=0.2, gamma=-1.0), next_level(f, fraction=0.2, gamma=3.0)
-        (1.0, 3.0)
     """
     n = len(f)
     wanted = fraction * n
@@ -264,37 +199,14 @@ QUANTILES = 400
 
 
 def add_unseen(p: float, high: float, lineages: float, confidence: float) -> float:
-    """Return the upper end of p, `high` for the regions known, with the share that is unseen after some lineages.
-
-    Args:
-        p: Estimate.
-        high: Its upper end for the regions known.
-        lineages: Independent ones that reached failure; inf for no allowance.
-        confidence: Nominal coverage of the interval.
-
-    Example:
-        >>> round(add_unseen(1e-4, 1.1e-4, lineages=25, confidence=0.95) * 1e4, 3)
-        1.11
-    """
+    """Return the upper end of p, `high` for the regions known, with the share that is unseen after some lineages."""
     if not 0 < p < high or np.isinf(lineages):
         return high
     return float(min(1.0, p * np.exp(raise_log_end(float(np.log(high / p)), lineages, confidence))))
 
 
 def raise_log_end(half: float, lineages: float, confidence: float) -> float:
-    """Return how far the upper end of log p lies above its estimate, `half` without the share that is unseen.
-
-    Args:
-        half: Above 0.
-        lineages: As for `add_unseen`.
-        confidence: Nominal coverage of the interval.
-
-    Example:
-        Beside half a width of 2, a share of some per cent is next to nothing; beside 0.1 it is not.
-
-        >>> [round(raise_log_end(half, 25, 0.95), 3) for half in (0.1, 2.0)]
-        [0.108, 2.004]
-    """
+    """Return how far the upper end of log p lies above its estimate, `half` without the share that is unseen."""
     if np.isinf(lineages):
         return half
     tail = 0.5 + confidence / 2

@@ -21,11 +21,7 @@ from samplers.system.optional_libraries import needs_library
 
 
 def to_json_value(value: Any) -> Any:
-    """Return value with None for NaN and infinities inside it, and Python's numbers for those of NumPy.
-
-    Args:
-        value: A number, a string, None, or lists, tuples and dicts of these.
-    """
+    """Return value with None for NaN and infinities inside it, and Python's numbers for those of NumPy."""
     if isinstance(value, np.generic):
         value = value.item()
     if isinstance(value, float):
@@ -49,12 +45,6 @@ def register_stored(*classes: type) -> None:
 
     Raises:
         ValueError: If another class has the name.
-
-    Example:
-        >>> register_stored(type("Level", (), {}))
-        Traceback (most recent call last):
-            ...
-        ValueError: Another class named Level is stored in files already.
     """
     for cls in classes:
         if _CLASSES.setdefault(cls.__name__, cls) is not cls:
@@ -69,19 +59,9 @@ def is_stored(value: object) -> bool:
 def write_object(path: str | PathLike[str], value: object) -> None:
     """Write an object of a registered class to a file.
 
-    Args:
-        path: Of the file; any name will do.
-        value: The object.
-
     Raises:
         TypeError: If it holds something of a class that is not registered.
         OSError: If the file cannot be written.
-
-    Example:
-        >>> write_object("nowhere", object())
-        Traceback (most recent call last):
-            ...
-        TypeError: A value of class object cannot be written to a file; to_dict() has plain values.
     """
     from safetensors import SafetensorError
     from safetensors.numpy import save_file
@@ -97,21 +77,9 @@ def write_object(path: str | PathLike[str], value: object) -> None:
 def read_object(path: str | PathLike[str], cls: type[_Stored]) -> _Stored:
     """Return the object that a file holds.
 
-    Args:
-        path: Of the file.
-        cls: Class that the object must have.
-
     Raises:
         FileNotFoundError: If there is no such file.
         ValueError: If the file is damaged, is no such file, or holds an object of another class; one line.
-
-    Example:
-        >>> from tempfile import TemporaryDirectory
-        >>> import samplers
-        >>> with TemporaryDirectory() as folder:
-        ...     write_object(f"{folder}/status", samplers.Status.BUDGET)
-        ...     print(read_object(f"{folder}/status", samplers.Status))
-        budget
     """
     from safetensors import SafetensorError, safe_open
 
@@ -197,14 +165,7 @@ def _decode(data: Any, arrays: Mapping[str, NDArray[Any]]) -> Any:
 
 @dataclass(frozen=True)
 class StoredMethod:
-    """A method of another package in a result that was read from a file; it cannot run.
-
-    Example:
-        >>> StoredMethod("lattice", True, {"n": "100"}).steps(None, None, None)
-        Traceback (most recent call last):
-            ...
-        ValueError: The method 'lattice' was read from a file and cannot run; make one of its class.
-    """
+    """A method of another package in a result that was read from a file; it cannot run."""
 
     name: str
     """Name on the command line."""
@@ -224,16 +185,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class PointColumns:
-    """Columns of a table of n points.
-
-    Example:
-        >>> import numpy as np
-        >>> columns = PointColumns(
-        ...     x=np.zeros((1, 2)), rows=np.array([1]), columns={"f": np.array([2.0, -1.0])}, missing={}
-        ... )
-        >>> arrow_table(columns, ()).to_pydict()
-        {'f': [2.0, -1.0], 'x1': [None, 0.0], 'x2': [None, 0.0]}
-    """
+    """Columns of a table of n points."""
 
     x: FloatArray
     """Points that are known, shape (k, d)."""
@@ -248,17 +200,8 @@ class PointColumns:
 def arrow_table(points: PointColumns, names: Sequence[str]) -> pyarrow.Table:
     """Return points as an Arrow table: the columns by name, then one for each coordinate of x.
 
-    Args:
-        points: The columns; coordinates of points that are not known are null.
-        names: Names of the d coordinates; x1, x2, ... where there are none.
-
     Raises:
         ValueError: If names are not d different ones, or one is that of another column.
-
-    Example:
-        >>> points = PointColumns(x=np.ones((1, 1)), rows=np.array([0]), columns={"f": np.zeros(1)}, missing={})
-        >>> arrow_table(points, ["gap"]).to_pylist()
-        [{'f': 0.0, 'gap': 1.0}]
     """
     with needs_library("pyarrow", "A table"):
         import pyarrow as pa
@@ -282,36 +225,19 @@ def arrow_table(points: PointColumns, names: Sequence[str]) -> pyarrow.Table:
 
 
 def set_apart(names: Sequence[str], points: PointColumns) -> list[str]:
-    """Return names of coordinates with "x." before those that are the name of another column.
-
-    Example:
-        >>> points = PointColumns(x=np.ones((1, 2)), rows=np.array([0]), columns={"f": np.zeros(1)}, missing={})
-        >>> set_apart(["gap", "f"], points)
-        ['gap', 'x.f']
-    """
+    """Return names of coordinates with "x." before those that are the name of another column."""
     return [f"x.{name}" if name in points.columns else name for name in names]
 
 
 def columns_of_sample(sample: Sample, gamma: float) -> PointColumns:
-    """Return the weighted points behind an estimate: f, weight, unit, failed; x of the failing ones.
-
-    Args:
-        sample: The points.
-        gamma: Threshold of failure.
-    """
+    """Return the weighted points behind an estimate: f, weight, unit, failed; x of the failing ones."""
     failed = sample.f <= gamma
     columns = {"f": sample.f, "weight": sample.weights, "unit": sample.units, "failed": failed}
     return PointColumns(x=sample.x, rows=np.flatnonzero(failed), columns=columns, missing={"f": np.isneginf(sample.f)})
 
 
 def columns_of_simulations(points: SimulatedPoints, index: SimulationIndex, gamma: float) -> PointColumns:
-    """Return all simulations of a run in their order: f, weight, run, stage, failed, and x.
-
-    Args:
-        points: The simulations.
-        index: What each was made for.
-        gamma: Threshold of failure.
-    """
+    """Return all simulations of a run in their order: f, weight, run, stage, failed, and x."""
     about, lost = index.describe(0, len(points.f)), np.isnan(points.f)
     weight = np.exp(about.log_weight)
     columns = {

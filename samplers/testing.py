@@ -34,15 +34,6 @@ def check_method(method: Stepping) -> None:
 
     Raises:
         AssertionError: If a check fails; the text says what was expected.
-
-    Example:
-        >>> import samplers
-        >>> from samplers import testing
-        >>> testing.check_form(samplers.MonteCarlo())  # check_method(...) runs this check and all others
-        >>> testing.check_form("mc")
-        Traceback (most recent call last):
-            ...
-        AssertionError: 'mc': expected the attributes name, stops_at_target and steps.
     """
     for check in METHOD_CHECKS:
         check(method)
@@ -59,11 +50,6 @@ def check_base(base: Distribution, dim: int) -> None:
 
     Raises:
         AssertionError: If something does not fit; the text says what. Probability below 1e-6 if all fits.
-
-    Example:
-        >>> import samplers
-        >>> from samplers import testing
-        >>> testing.check_base(samplers.StandardNormal(3), 3)
     """
     fault = find_base_fault(base, dim)
     if fault is not None:

@@ -36,14 +36,7 @@ class Status(str, Enum):
 
 
 def describe_outcome(status: Status | str, warnings: Sequence[str]) -> str:
-    """Return how a run ended, in words: "converged" stands alone only where there is no warning.
-
-    Example:
-        >>> describe_outcome(Status.CONVERGED, ()), describe_outcome(Status.BUDGET, ("One draw carries 40 % of p.",))
-        ('converged', 'budget')
-        >>> describe_outcome("converged", ("One draw carries 40 % of p.",))
-        'came to its end with 1 warning'
-    """
+    """Return how a run ended, in words: "converged" stands alone only where there is no warning."""
     if status != Status.CONVERGED or not warnings:
         return str(status)
     return f"came to its end with {len(warnings)} warning{'s' * (len(warnings) != 1)}"

@@ -27,7 +27,6 @@ import numpy as np
 
 from samplers.analysis.refits import (
     MAX_UNCOVERED_SHARE,
-    EnsembleEstimate,
     FittedBase,
     RefitSums,
     count_uncovered,
@@ -40,12 +39,12 @@ from samplers.analysis.refits import (
     split_families,
 )
 from samplers.analysis.weighted import (
-    WeightedEstimate,
     band_generator,
     no_outcome_weight,
     require_sample,
     simultaneous_level,
 )
+from samplers.estimate_data import EstimateData
 from samplers.problem import FloatArray
 from samplers.statistics import Interval
 from samplers.stored import to_json_value
@@ -130,15 +129,12 @@ class BaseUncertainty:
         return {name: to_json_value(value) for name, value in asdict(self).items()}
 
 
-def compute_base_uncertainty(estimate: EnsembleEstimate) -> BaseUncertainty | None:
+def compute_base_uncertainty(estimate: EstimateData) -> BaseUncertainty | None:
     """Return the uncertainty of p that the events leave, or None where the base distribution has no refits.
 
     p under each refit comes from the failing points of the run; where there is a further run under the mixture of the
     refits, from those of the two that are worth more effective points under that refit. The lower end leaves out
     points without an outcome where these only bound p (`on_error="bound"`).
-
-    Args:
-        estimate: With weighted points, on a base distribution with refits; see `Estimate.base_uncertainty`.
     """
     fitted = find_fitted_base(estimate.base)
     if fitted is None:
@@ -181,22 +177,7 @@ def summarise_refits(
     doubts: Sequence[str] = (),
     reason: str = "",
 ) -> BaseUncertainty:
-    """Return the uncertainty of a probability, or of another expectation over failures, from its values under refits.
-
-    Args:
-        value: Under the base distribution itself.
-        cov: Its coefficient of variation.
-        confidence: Nominal coverage of the interval.
-        fitted: The base.
-        sums: Values under each refit, one row; as shares of `largest`.
-        sampling: Interval of the sampling alone, which the interval is to hold; None where it need not.
-        lineages: Independent searches behind the value, see `Sample.lineages`; inf without a search.
-        low_factor: Factor of the lower end.
-        largest: Largest value possible, 1 for a probability.
-        n_sim: Simulations of a further run.
-        doubts: Further warnings.
-        reason: Why the values are not known.
-    """
+    """Return the uncertainty of a probability, or of another mean over failures, from its values under refits."""
     log_values, ess = sums.log_p[0] + math.log(largest), sums.ess[0]
     reason = reason or explain_missing_spread(log_values, fitted.clusters)
     interval, expected, spread, bound = None, None, math.nan, None
@@ -252,12 +233,12 @@ def describe_coverage(ess: FloatArray) -> tuple[str, ...]:
     return (f"{few} of {len(ess)} refits rest on under 10 effective failing points: the spread is coarse.",)
 
 
-def read_lineages(estimate: WeightedEstimate) -> float:
+def read_lineages(estimate: EstimateData) -> float:
     """Return the independent searches that reached failure behind an estimate; inf without a search or points."""
     return math.inf if estimate.sample is None else estimate.sample.lineages
 
 
-def _lower_factor(estimate: WeightedEstimate) -> float:
+def _lower_factor(estimate: EstimateData) -> float:
     """Return the share of p from points that have an outcome where the others only bound p; else 1."""
     sample = require_sample(estimate)
     return 1 - no_outcome_weight(estimate, sample) / float(sample.weights[sample.f <= estimate.gamma].sum())
@@ -326,7 +307,7 @@ class RatioUncertainty:
         return {name: to_json_value(value) for name, value in asdict(self).items()}
 
 
-def compute_ratio_uncertainty(first: EnsembleEstimate, second: EnsembleEstimate) -> RatioUncertainty:
+def compute_ratio_uncertainty(first: EstimateData, second: EstimateData) -> RatioUncertainty:
     """Return p_1 / p_2 of two estimates with the interval that the events behind their base distribution allow.
 
     The two are estimates of their own on the same base distribution, of two egos for example. `samplers.compare`
@@ -418,7 +399,7 @@ def summarise_ratio(
     )
 
 
-def _require_same_refits(first: EnsembleEstimate, second: EnsembleEstimate) -> tuple[FittedBase, FittedBase]:
+def _require_same_refits(first: EstimateData, second: EstimateData) -> tuple[FittedBase, FittedBase]:
     """Return the bases of both, or raise a ValueError unless both have the same refits.
 
     Densities are compared where both have the same coordinates; with noise coordinates of one of them only the number

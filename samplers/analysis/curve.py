@@ -10,7 +10,6 @@ from numpy.typing import ArrayLike
 
 from samplers.analysis.weighted import (
     MIN_UNITS,
-    WeightedEstimate,
     cov_inflation,
     no_outcome_weight,
     require_sample,
@@ -18,6 +17,7 @@ from samplers.analysis.weighted import (
     unit_sums,
 )
 from samplers.display import CurveDisplay, drawing_axes
+from samplers.estimate_data import EstimateData
 from samplers.problem import FloatArray
 from samplers.sample import Sample
 from samplers.statistics import add_unseen
@@ -76,11 +76,7 @@ class ProbabilityCurve(CurveDisplay):
         return {**data, "confidence": self.confidence}
 
     def plot(self, ax: "Axes | str | PathLike[str] | None" = None) -> "Axes":
-        """Draw the curve and its band over the thresholds, p on a log scale; needs matplotlib.
-
-        Args:
-            ax: Where to draw, or the path of an image to write, such as "p.png"; None takes pyplot's current axes.
-        """
+        """Draw the curve and its band over the thresholds, p on a log scale; needs matplotlib."""
         with drawing_axes(ax) as axes:
             order = np.argsort(self._over)
             t, p, low, high = (each[order] for each in (self._over, self.p, self.low, self.high))
@@ -119,7 +115,7 @@ class Curve(ProbabilityCurve):
 register_stored(Curve)
 
 
-def compute_curve(estimate: WeightedEstimate, gammas: ArrayLike) -> Curve:
+def compute_curve(estimate: EstimateData, gammas: ArrayLike) -> Curve:
     """Return the curve of an estimate at thresholds; see `Estimate.curve`.
 
     p is the sum of the weights of the points with f <= g. Where the estimate at gamma is not that sum
@@ -208,7 +204,7 @@ def lowest_known_threshold(sample: Sample, gamma: float) -> float:
     return min(start, gamma) if (sample.weights[sample.f <= gamma] > 0).any() else start
 
 
-def anchor_at_estimate(estimate: WeightedEstimate, sums: FloatArray, at_gamma: int) -> FloatArray:
+def anchor_at_estimate(estimate: EstimateData, sums: FloatArray, at_gamma: int) -> FloatArray:
     """Return the sums (G,) at rising thresholds, moved so that they equal the estimate at gamma, and cut at 1."""
     own = float(sums[at_gamma])
     if own == 0 or math.isclose(own, estimate.p, rel_tol=1e-9):

@@ -12,7 +12,6 @@ from numpy.typing import ArrayLike
 from samplers.analysis.base_error import BaseUncertainty, RefitBand, compute_refit_band, read_lineages, summarise_refits
 from samplers.analysis.curve import ProbabilityCurve, as_thresholds
 from samplers.analysis.refits import (
-    EnsembleEstimate,
     FittedBase,
     RefitSums,
     choose_better_run,
@@ -22,7 +21,6 @@ from samplers.analysis.refits import (
 from samplers.analysis.weighted import (
     MIN_UNITS,
     UnitSums,
-    WeightedEstimate,
     WeightedFailures,
     interval_of_sum,
     require_sample,
@@ -30,6 +28,7 @@ from samplers.analysis.weighted import (
     unit_sums,
 )
 from samplers.display import drawing_axes
+from samplers.estimate_data import EstimateData
 from samplers.problem import FloatArray
 from samplers.sample import Sample
 from samplers.statistics import Interval, effective_number
@@ -125,7 +124,7 @@ class FurtherFailures(NamedTuple):
 
 
 def expect_under_refits(
-    estimate: EnsembleEstimate,
+    estimate: EstimateData,
     failures: WeightedFailures,
     values: FloatArray,
     expectation: FailureExpectation,
@@ -187,7 +186,7 @@ def expect_under_refits(
 
 
 def sum_parts_under_refits(
-    estimate: EnsembleEstimate,
+    estimate: EstimateData,
     fitted: FittedBase,
     own: tuple[WeightedFailures, FloatArray],
     further: tuple[WeightedFailures, FloatArray] | None = None,
@@ -210,7 +209,7 @@ def sum_parts_under_refits(
     return choose_better_run(found)
 
 
-def _spread_over_all(estimate: WeightedEstimate, failures: WeightedFailures, shares: FloatArray) -> FloatArray:
+def _spread_over_all(estimate: EstimateData, failures: WeightedFailures, shares: FloatArray) -> FloatArray:
     """Return shares (m, k) of some failing points as shares (m, total) of all, which add up to the same parts of p."""
     sample = require_sample(estimate)
     weights = sample.weights[sample.f <= estimate.gamma]
@@ -279,7 +278,7 @@ class Exceedance(ProbabilityCurve):
 
 
 def compute_exceedance(
-    estimate: EnsembleEstimate,
+    estimate: EstimateData,
     failures: WeightedFailures,
     values: FloatArray,
     thresholds: ArrayLike,
@@ -346,7 +345,7 @@ def _sum_by_threshold(failures: WeightedFailures, f: FloatArray, grid: FloatArra
 
 
 def _band_under_refits(
-    estimate: EnsembleEstimate,
+    estimate: EstimateData,
     own: tuple[WeightedFailures, FloatArray],
     further: FurtherFailures | None,
     thresholds: FloatArray,

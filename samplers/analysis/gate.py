@@ -13,43 +13,16 @@ from __future__ import annotations
 
 import math
 from dataclasses import asdict, dataclass
-from typing import Any, Literal, Protocol
+from typing import Any, Literal
 
 from samplers.analysis.base_error import BaseUncertainty
+from samplers.estimate_data import EstimateData
 from samplers.statistics import Interval, zero_hit_bound
 from samplers.stored import to_json_value
 from samplers.trace import Status
 from samplers.validation import check_number
 
 Decision = Literal["passes", "fails", "undecided"]
-
-
-class HasLimits(Protocol):
-    """An estimate with an interval and what is known of its base distribution."""
-
-    @property
-    def interval(self) -> Interval:
-        """Interval of p."""
-
-    @property
-    def confidence(self) -> float:
-        """Nominal coverage of the interval."""
-
-    @property
-    def status(self) -> Status:
-        """End of the run."""
-
-    @property
-    def base_draws(self) -> int:
-        """Simulations that were independent draws from the base."""
-
-    @property
-    def warnings(self) -> tuple[str, ...]:
-        """Doubts about p."""
-
-    @property
-    def base_uncertainty(self) -> BaseUncertainty | None:
-        """The uncertainty that the events leave."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -64,7 +37,7 @@ class Verdict:
         >>> problem = samplers.FunctionProblem(lambda x: 3.5 - x.sum(axis=1) / 10**0.5, dim=10)
         >>> result = samplers.estimate(problem, seed=0, max_sim=6000, confidence=0.9)  # p = 2.3e-4
         >>> print(result.meets(1e-3))
-        passes: p is below 0.001 with 95 % confidence (one-sided upper end 2.41e-04)
+        passes: p is below 0.001 with 95 % confidence (one-sided upper end 2.40e-04)
         >>> bool(result.meets(1e-4)), result.meets(1e-4).decision
         (False, 'fails')
     """
@@ -107,20 +80,14 @@ class Verdict:
         return {**{name: to_json_value(value) for name, value in asdict(self).items()}, "text": str(self)}
 
 
-def judge_estimate(estimate: HasLimits, max_p: float, given_base: bool = False) -> Verdict:
-    """Return whether p is below a limit.
-
-    Args:
-        estimate: The estimate.
-        max_p: The limit, above 0 and below 1.
-        given_base: Take the base distribution as given, without the uncertainty that its events leave.
+def judge_estimate(estimate: EstimateData, max_p: float, base: BaseUncertainty | None) -> Verdict:
+    """Return whether p is below a limit, under the uncertainty of a fitted base where it is given.
 
     Raises:
         ValueError: The limit is no such number.
     """
     if not (isinstance(max_p, int | float) and 0.0 < max_p < 1.0):
         raise ValueError(f"Expected max_p above 0 and below 1, got {max_p!r}.")
-    base = None if given_base else estimate.base_uncertainty
     confidence = round(0.5 + estimate.confidence / 2, 12)
     none_failed = estimate.status is Status.NO_HITS
     own = (0.0, zero_hit_bound(estimate.base_draws, confidence)) if none_failed else estimate.interval

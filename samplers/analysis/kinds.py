@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 
 from samplers.analysis.weighted import (
     UnitSums,
-    WeightedEstimate,
     choose_failures,
     cov_inflation,
     has_independent_points,
@@ -18,6 +17,7 @@ from samplers.analysis.weighted import (
     require_sample,
     unit_sums,
 )
+from samplers.estimate_data import EstimateData
 from samplers.problem import FloatArray
 from samplers.sample import Sample
 from samplers.statistics import Interval
@@ -57,7 +57,7 @@ class Share:
 
 
 def split_by_kind(
-    estimate: WeightedEstimate, label: Callable[[FloatArray], Sequence[str]], most: int | None = None
+    estimate: EstimateData, label: Callable[[FloatArray], Sequence[str]], most: int | None = None
 ) -> dict[str, Share]:
     """Return p by kind of failure; see `Estimate.shares`.
 
@@ -74,7 +74,7 @@ def split_by_kind(
     return sum_by_label(estimate, rows, label_failures(sample.f[failing[rows]], sample.x[rows], label))
 
 
-def sum_by_label(estimate: WeightedEstimate, rows: NDArray[np.int64], labels: NDArray[np.object_]) -> dict[str, Share]:
+def sum_by_label(estimate: EstimateData, rows: NDArray[np.int64], labels: NDArray[np.object_]) -> dict[str, Share]:
     """Return p by label of failing points; see `split_by_kind`.
 
     Args:
@@ -126,7 +126,7 @@ def sum_points(sample: Sample, rows: NDArray[np.int64], gamma: float) -> UnitSum
     return unit_sums(replace(sample, f=f, layers=()), np.array([gamma]))
 
 
-def make_share(estimate: WeightedEstimate, sums: UnitSums, total: float, grow: float, points: int) -> Share:
+def make_share(estimate: EstimateData, sums: UnitSums, total: float, grow: float, points: int) -> Share:
     """Return the share of a kind from the sums of its weights; the weights of all failing points add up to `total`."""
     part = float(sums.p[0]) / total if total > 0 else 0.0
     p, sample = estimate.p * part, require_sample(estimate)

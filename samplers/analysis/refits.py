@@ -24,7 +24,8 @@ from samplers.analysis.reweight import (
     require_base,
     subtract_log_densities,
 )
-from samplers.analysis.weighted import WeightedEstimate, require_sample
+from samplers.analysis.weighted import require_sample
+from samplers.estimate_data import EstimateData
 from samplers.problem import Distribution, FloatArray
 from samplers.statistics import effective_number, raise_log_end
 
@@ -109,26 +110,6 @@ class HasParts(Protocol):
         """Return what share of failing points x (k, d) belongs to each of m parts, shape (m, k)."""
 
 
-class EnsembleEstimate(WeightedEstimate, Protocol):
-    """An estimate that may have a further run under the mixture of the refits."""
-
-    @property
-    def interval(self) -> tuple[float, float]:
-        """Interval of p, of the sampling alone."""
-
-    @property
-    def n_sim(self) -> int:
-        """Simulated points of the whole run."""
-
-    @property
-    def warnings(self) -> tuple[str, ...]:
-        """What makes the numbers doubtful."""
-
-    @property
-    def ensemble_run(self) -> EnsembleEstimate | None:
-        """The further run."""
-
-
 class RefitSums(NamedTuple):
     """Sums over the failing points under R refits, for m parts of p."""
 
@@ -189,25 +170,21 @@ def _count_outside(distribution: HasLogProb, x: FloatArray) -> int:
     return int(np.count_nonzero(~np.isfinite(log_density(distribution, x))))
 
 
-def refit_log_ratios(estimate: WeightedEstimate, refits: Sequence[HasLogProb]) -> FloatArray:
+def refit_log_ratios(estimate: EstimateData, refits: Sequence[HasLogProb]) -> FloatArray:
     """Return log(refit_b(x_i) / base(x_i)) at the failing points, shape (R, k); computed once for an estimate.
-
-    Args:
-        estimate: The run; its base may be any distribution that has density where the refits have.
-        refits: R distributions; the same sequence again gives what was computed before.
 
     Raises:
         ValueError: If there are no weighted points, or a density is not finite.
     """
     sample, base = require_sample(estimate), require_base(estimate)
     of = (sample, base, refits)
-    known = estimate.refit_ratios.find(of)
-    if known is None:
-        old = log_density(base, sample.x)
-        new = refits.log_probs(sample.x) if isinstance(refits, HasLogProbs) else _log_densities(refits, sample.x)
-        known = subtract_log_densities(new, old, sample.x)
-        estimate.refit_ratios.keep(of, known)
-    return known
+    for kept, ratios in estimate.refit_ratios:
+        if all(a is b for a, b in zip(kept, of, strict=True)):
+            return ratios
+    old = log_density(base, sample.x)
+    new = refits.log_probs(sample.x) if isinstance(refits, HasLogProbs) else _log_densities(refits, sample.x)
+    estimate.refit_ratios[:] = [(of, subtract_log_densities(new, old, sample.x))]
+    return estimate.refit_ratios[0][1]
 
 
 def _log_densities(refits: Sequence[HasLogProb], x: FloatArray) -> FloatArray:
@@ -216,7 +193,7 @@ def _log_densities(refits: Sequence[HasLogProb], x: FloatArray) -> FloatArray:
 
 
 def reweight_to_refits(
-    estimate: WeightedEstimate, refits: Sequence[HasLogProb], parts: FloatArray | None = None
+    estimate: EstimateData, refits: Sequence[HasLogProb], parts: FloatArray | None = None
 ) -> RefitSums:
     """Return p under each refit, p_b = sum of w_i refit_b(x_i) / base(x_i) over the failing points.
 
@@ -237,7 +214,7 @@ def reweight_to_refits(
     return _sum_parts(estimate, refit_log_ratios(estimate, refits), parts)
 
 
-def _sum_parts(estimate: WeightedEstimate, log_ratios: FloatArray, parts: FloatArray | None) -> RefitSums:
+def _sum_parts(estimate: EstimateData, log_ratios: FloatArray, parts: FloatArray | None) -> RefitSums:
     """Return the sums over the failing points from the density ratios there, shape (R, k)."""
     sample = require_sample(estimate)
     failing = sample.f <= estimate.gamma
@@ -253,7 +230,7 @@ def _sum_parts(estimate: WeightedEstimate, log_ratios: FloatArray, parts: FloatA
 
 
 def reweight_runs_to_refits(
-    estimate: EnsembleEstimate,
+    estimate: EstimateData,
     refits: Sequence[HasLogProb],
     split: Callable[[FloatArray], FloatArray] | None = None,
 ) -> RefitSums:
@@ -261,12 +238,6 @@ def reweight_runs_to_refits(
 
     The mixture of the refits has its failing points where the refits with the largest p have theirs: the others may
     rest on fewer points than in the first run.
-
-    Args:
-        estimate: With weighted points.
-        refits: R distributions.
-        split: Returns parts of p (m, k) for points (k, d), see `reweight_to_refits`; None for p itself. All parts
-            come from the same run.
 
     Raises:
         ValueError: As in `reweight_to_refits`.
@@ -324,15 +295,11 @@ def pool_refits(base: HasEnsemble) -> Distribution:
     return base.covering_ensemble() if isinstance(base, HasCoveringEnsemble) else base.ensemble()
 
 
-def needs_ensemble_run(estimate: WeightedEstimate, split: Callable[[FloatArray], FloatArray] | None = None) -> bool:
+def needs_ensemble_run(estimate: EstimateData, split: Callable[[FloatArray], FloatArray] | None = None) -> bool:
     """Return whether a further run under the mixture of the refits would tell p, or a part of it, under them.
 
     False where the base has no refits or no `ensemble`, or where the run, or a part of it, has few effective failing
     points under its own base: another of that size would have as few.
-
-    Args:
-        estimate: The run.
-        split: Returns parts of p (m, k) for points (k, d), see `reweight_to_refits`; None for p itself.
     """
     fitted = find_fitted_base(estimate.base)
     if fitted is None or not isinstance(fitted, HasEnsemble):
@@ -363,12 +330,7 @@ class HasRefitFamilies(Protocol):
 
 
 class RefitFamily(NamedTuple):
-    """Refits of one family: log p is about normal around the centre.
-
-    Example:
-        >>> RefitFamily(centre=-7.0, variance=1.0, freedom=29, share=1.0).share
-        1.0
-    """
+    """Refits of one family: log p is about normal around the centre."""
 
     centre: float
     """Of log p: that of the base distribution itself in its own family, the mean of the refits in another."""
@@ -399,12 +361,6 @@ def split_families(log_p: float, log_values: FloatArray, family_of: NDArray[np.i
         log_p: Of the base itself.
         log_values: Of each refit, shape (R,), with R > 1.
         family_of: Of each refit, shape (R,).
-
-    Example:
-        >>> values = np.array([-1.0, 0.0, 1.0] * 10 + [-11.0, -10.0, -9.0] * 10)
-        >>> own, other = split_families(0.2, values, np.repeat([0, 1], 30))
-        >>> own.centre, other.centre, own.share, round(own.variance, 3)
-        (0.2, -10.0, 0.5, 0.69)
     """
     family_of = _merge_single_members(family_of)
     deviations, free = deviate_within_families(log_values[None], family_of)
@@ -419,14 +375,7 @@ def split_families(log_p: float, log_values: FloatArray, family_of: NDArray[np.i
 
 
 def deviate_within_families(log_values: FloatArray, family_of: NDArray[np.int64]) -> tuple[FloatArray, int]:
-    """Return deviations of values (k, R) from the mean of their family, shape (k, R), and their degrees of freedom.
-
-    Example:
-        >>> values, family_of = np.array([[1.0, 3.0, 7.0, 8.0, 9.0]]), np.repeat([0, 1], [2, 3])
-        >>> deviations, freedom = deviate_within_families(values, family_of)
-        >>> deviations.tolist(), freedom
-        ([[-1.0, 1.0, -1.0, 0.0, 1.0]], 3)
-    """
+    """Return deviations of values (k, R) from the mean of their family, shape (k, R), and their degrees of freedom."""
     names, index = np.unique(_merge_single_members(family_of), return_inverse=True)
     means = np.stack([log_values[:, index == i].mean(axis=1) for i in range(len(names))], axis=1)
     return log_values - means[:, index], len(family_of) - len(names)
@@ -449,21 +398,6 @@ def find_log_ends(
     Each has the interval centre -+ t S; S^2 is its variance plus `other_variance`, t the quantile for its degrees of
     freedom. The upper end holds the share of p in regions of failure that a search may have missed, which is missing
     under all refits alike. Families that hardly any refits choose are left out, but not that of the base.
-
-    Args:
-        families: That of the base first.
-        other_variance: Variance of the logarithm from other sources.
-        confidence: Nominal coverage.
-        clusters: Independent clusters of events.
-        lineages: Independent searches that reached failure, see `Sample.lineages`; inf without a search.
-
-    Example:
-        Refits of another family, 10 below, lower the lower end alone; t is 2.045 for 29 degrees of freedom:
-
-        >>> families = RefitFamily(0.0, 1.0, 29, 0.5), RefitFamily(-10.0, 4.0, 29, 0.5)
-        >>> low, high = find_log_ends(families, other_variance=0.0, confidence=0.95, clusters=100)
-        >>> round(low, 2), round(high, 3)
-        (-14.09, 2.045)
     """
     ends = []
     for number, family in enumerate(families):
@@ -475,13 +409,7 @@ def find_log_ends(
 
 
 def refit_quantile(confidence: float, freedom: int, clusters: int) -> float:
-    """Return t, the quantile of Student's t for a variance over refits.
-
-    Args:
-        confidence: Probability between the quantile and its negative.
-        freedom: Degrees of freedom of the variance, refits less 1.
-        clusters: Independent clusters of events, which leave no more than these less 1.
-    """
+    """Return t, the quantile of Student's t for a variance over refits."""
     return float(stdtrit(min(freedom, clusters - 1), 0.5 + confidence / 2))
 
 
@@ -490,17 +418,6 @@ def expect_over_families(families: Sequence[RefitFamily], largest: float = 1.0) 
 
     The sum of share exp(centre + variance / 2), the mean of a log-normal variable, over all families; none counts for
     more than the largest value possible.
-
-    Args:
-        families: Of the refits; their shares add up to 1.
-        largest: Largest value possible, 1 for a probability.
-
-    Example:
-        Half of the refits expect exp(-4.6 + 0.8 / 2) = 0.015 and half exp(-11.5 + 0.8 / 2), which is next to nothing:
-
-        >>> families = RefitFamily(-4.6, 0.8, 29, 0.5), RefitFamily(-11.5, 0.8, 29, 0.5)
-        >>> round(expect_over_families(families), 4)
-        0.0075
     """
     log_largest = math.log(largest)
     return sum(each.share * math.exp(min(each.centre + each.variance / 2, log_largest)) for each in families)

@@ -8,13 +8,13 @@ import numpy as np
 
 from samplers.analysis.weighted import (
     MIN_UNITS,
-    WeightedEstimate,
     cov_inflation,
     has_independent_points,
     interval_of_sum,
     require_sample,
 )
 from samplers.distributions import as_distribution, can_convert
+from samplers.estimate_data import EstimateData
 from samplers.problem import Distribution, FloatArray
 from samplers.statistics import Interval, add_unseen, effective_number
 from samplers.stored import to_json_value
@@ -99,7 +99,7 @@ class Reweighted:
         return {name: to_json_value(value) for name, value in asdict(self).items()}
 
 
-def reweight_estimate(estimate: WeightedEstimate, new_base: Any) -> Reweighted:
+def reweight_estimate(estimate: EstimateData, new_base: Any) -> Reweighted:
     """Return p under another base; see `Estimate.reweight`.
 
     p1 = sum of w r over the failing points, r = p1(x) / p0(x). With T_c the sums over units, its
@@ -146,7 +146,7 @@ def reweight_estimate(estimate: WeightedEstimate, new_base: Any) -> Reweighted:
     )
 
 
-def log_density_ratios(estimate: WeightedEstimate, new_base: HasLogProb, x: FloatArray) -> FloatArray:
+def log_density_ratios(estimate: EstimateData, new_base: HasLogProb, x: FloatArray) -> FloatArray:
     """Return log(p1 / p0) at the failing points x (k, d), shape (k,).
 
     Raises:
@@ -161,7 +161,7 @@ def log_density_ratios(estimate: WeightedEstimate, new_base: HasLogProb, x: Floa
     return subtract_log_densities(log_density(new_base, x), log_density(base, x), x)
 
 
-def require_base(estimate: WeightedEstimate) -> Distribution:
+def require_base(estimate: EstimateData) -> Distribution:
     """Return the base distribution of an estimate, or raise a ValueError that says it is not known."""
     if estimate.base is None:
         raise ValueError(
@@ -230,7 +230,7 @@ def log_density(distribution: HasLogProb, x: FloatArray) -> FloatArray:
     return values
 
 
-def check_enough(estimate: WeightedEstimate, ess: float, units: float) -> None:
+def check_enough(estimate: EstimateData, ess: float, units: float) -> None:
     """Raise a ValueError where too few points or units carry the new estimate."""
     if ess >= MIN_POINTS and units >= MIN_UNITS:
         return

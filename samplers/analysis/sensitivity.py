@@ -12,7 +12,8 @@ import numpy as np
 
 from samplers.analysis.refits import find_fitted_base, reweight_to_refits
 from samplers.analysis.reweight import HasLogProb, log_density, require_base
-from samplers.analysis.weighted import WeightedEstimate, WeightedFailures, mean_over_failures, weigh_failures
+from samplers.analysis.weighted import WeightedFailures, mean_over_failures, weigh_failures
+from samplers.estimate_data import EstimateData
 from samplers.problem import Distribution, FloatArray
 from samplers.statistics import effective_number
 from samplers.stored import to_json_value
@@ -46,13 +47,6 @@ def rank_columns(
     failures: WeightedFailures, base: Distribution, names: Sequence[str], sizes: Sequence[int]
 ) -> tuple[ColumnImportance, ...]:
     """Return the importance of each parameter of x, the most important first.
-
-    Args:
-        failures: Weighted failing points.
-        base: Distribution of X; its map to standard normal space says what u_j belongs to column j, given the columns
-            that come earlier in its order.
-        names: Names of the parameters.
-        sizes: Columns of each.
 
     Raises:
         ValueError: If a single point failed, which has no spread.
@@ -142,12 +136,7 @@ class ParametricBase(Protocol):
         """Log density at x (n, d), shape (n,)."""
 
     def parameters(self, names: Sequence[str] = (), like: object = None) -> Sequence[BaseParameter]:
-        """Return the parameters.
-
-        Args:
-            names: Of the columns of x, for the names of the parameters.
-            like: A distribution of the same family whose numbering of components is followed.
-        """
+        """Return the parameters."""
 
     def with_parameters(self, values: FloatArray) -> HasLogProb:
         """Return the same distribution with other values of the parameters, in the order of `parameters()`."""
@@ -191,11 +180,6 @@ def refit_displacements(
 
     Refits that have other parameters (another number of components) are left out.
 
-    Args:
-        base: With m parameters.
-        refits: Distributions.
-        columns: Names of the columns of x.
-
     Returns:
         Displacements, shape (R, m), and the indices of the R refits.
     """
@@ -238,7 +222,7 @@ class SpreadShares:
 
 
 def share_spread(
-    estimate: WeightedEstimate, base: ParametricBase, derivatives: FloatArray, labels: Sequence[str]
+    estimate: EstimateData, base: ParametricBase, derivatives: FloatArray, labels: Sequence[str]
 ) -> SpreadShares:
     """Return the shares of the parameters in the spread of log p over the refits of the base.
 
@@ -441,7 +425,7 @@ class Sensitivity:
 
 
 def compute_sensitivity(
-    estimate: WeightedEstimate, names: Sequence[str] = (), sizes: Sequence[int] = (), by_parameters: bool = True
+    estimate: EstimateData, names: Sequence[str] = (), sizes: Sequence[int] = (), by_parameters: bool = True
 ) -> Sensitivity:
     """Return the sensitivity of p; see `Estimate.sensitivity`.
 

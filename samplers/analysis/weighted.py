@@ -12,15 +12,15 @@ References:
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, replace
-from typing import Protocol
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 from scipy.special import ndtr
 
-from samplers.problem import Distribution, FloatArray
+from samplers.estimate_data import EstimateData
+from samplers.problem import FloatArray
 from samplers.sample import Sample
 from samplers.statistics import Interval, clopper_pearson, degrees_of_freedom, effective_number, log_normal_interval
 
@@ -29,104 +29,7 @@ MIN_UNITS = 5.0
 interval."""
 
 
-@dataclass(eq=False)
-class RatioStore:
-    """Logarithms of density ratios at the failing points of a run, kept once they were computed.
-
-    Example:
-        >>> store, of = RatioStore(), (object(), object())
-        >>> store.find(of) is None
-        True
-        >>> store.keep(of, np.zeros((2, 3)))
-        >>> store.find(of).shape
-        (2, 3)
-    """
-
-    _of: tuple[object, ...] = ()
-    _ratios: FloatArray = field(default_factory=lambda: np.empty((0, 0)), repr=False)
-
-    def find(self, of: tuple[object, ...]) -> FloatArray | None:
-        """Return what was kept for these very objects; None if it was for others."""
-        same = len(of) == len(self._of) > 0 and all(a is b for a, b in zip(of, self._of, strict=True))
-        return self._ratios if same else None
-
-    def keep(self, of: tuple[object, ...], ratios: FloatArray) -> None:
-        """Keep the ratios that belong to these objects, and forget those before."""
-        self._of, self._ratios = of, ratios
-
-
-class HasName(Protocol):
-    """An object with a name, for messages."""
-
-    @property
-    def name(self) -> str:
-        """Name on the command line."""
-
-
-class HasTotal(Protocol):
-    """Failing points with their number, for messages."""
-
-    @property
-    def total(self) -> int:
-        """Number of failing points that were simulated."""
-
-
-class WeightedEstimate(Protocol):
-    """The attributes of an estimate that curves, reweighting and shares by kind read.
-
-    `samplers.Estimate` is one; each attribute is described there.
-    """
-
-    @property
-    def p(self) -> float:
-        """Estimated probability."""
-
-    @property
-    def cov(self) -> float:
-        """Coefficient of variation of p."""
-
-    @property
-    def gamma(self) -> float:
-        """Threshold of failure."""
-
-    @property
-    def interval(self) -> tuple[float, float]:
-        """Interval of p."""
-
-    @property
-    def confidence(self) -> float:
-        """Nominal coverage of the interval."""
-
-    @property
-    def seed(self) -> int:
-        """Seed of the run."""
-
-    @property
-    def on_error(self) -> str:
-        """Rule for points where f raised or gave NaN."""
-
-    @property
-    def method(self) -> HasName:
-        """The method."""
-
-    @property
-    def sample(self) -> Sample | None:
-        """The weighted points behind p."""
-
-    @property
-    def base(self) -> Distribution | None:
-        """Distribution of X."""
-
-    @property
-    def failures(self) -> HasTotal:
-        """Failing points that were kept."""
-
-    @property
-    def refit_ratios(self) -> RatioStore:
-        """Density ratios of the refits of the base, once they were asked for."""
-
-
-def require_sample(estimate: WeightedEstimate) -> Sample:
+def require_sample(estimate: EstimateData) -> Sample:
     """Return the weighted points of an estimate, or raise a ValueError that says there are none."""
     if estimate.sample is None:
         raise ValueError(
@@ -136,14 +39,14 @@ def require_sample(estimate: WeightedEstimate) -> Sample:
     return estimate.sample
 
 
-def cov_inflation(estimate: WeightedEstimate, own_cov: float) -> float:
+def cov_inflation(estimate: EstimateData, own_cov: float) -> float:
     """Return the factor max(1, c.o.v. of the estimate / c.o.v. of its units at gamma); 1 where either is not known."""
     if not math.isfinite(estimate.cov) or not 0 < own_cov < math.inf:
         return 1.0
     return max(1.0, estimate.cov / own_cov)
 
 
-def no_outcome_weight(estimate: WeightedEstimate, sample: Sample) -> float:
+def no_outcome_weight(estimate: EstimateData, sample: Sample) -> float:
     """Return the weight of points without an outcome if they do not count in the lower end ("bound"); else 0."""
     return float(sample.weights[np.isneginf(sample.f)].sum()) if estimate.on_error == "bound" else 0.0
 
@@ -349,7 +252,7 @@ def choose_failures(sample: Sample, gamma: float, most: int | None = None) -> ND
     return rows[np.linspace(0, len(rows) - 1, most).round().astype(np.int64)]
 
 
-def weigh_failures(estimate: WeightedEstimate, most: int | None = None) -> WeightedFailures:
+def weigh_failures(estimate: EstimateData, most: int | None = None) -> WeightedFailures:
     """Return the failing points of an estimate with weights that add up to its p.
 
     Args:

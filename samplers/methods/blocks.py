@@ -269,38 +269,6 @@ EMPTY = float(np.finfo(np.float64).eps)
 """A component with less weight has no points left."""
 
 
-@dataclass(frozen=True, eq=False)
-class _TowardsPoints:
-    """Mixtures between the present one and weighted points, see `samplers.proposals.Family`."""
-
-    present: GaussianMixture
-    """P, with as many components as there are responsibilities."""
-    x: FloatArray
-    weights: FloatArray
-    alpha: float
-    """Share of the points."""
-
-    def maximise(self, responsibilities: FloatArray) -> GaussianMixture:
-        """Return weights, means and covariances; a component without any weight stays as it is."""
-        shares, components = [], []
-        parts = zip(self.present.weights, self.present.components, self.weights * responsibilities, strict=True)
-        for weight, component, mass in parts:
-            total = float(mass.sum())
-            share = self.alpha * total + (1 - self.alpha) * weight
-            shares.append(share)
-            if share < EMPTY:
-                components.append(component)
-                continue
-            mass = mass / total if total > 0 else np.full(len(self.x), 1 / len(self.x))
-            target = weighted_moments(self.x, mass).mix_with(component.moments, self.alpha * total / share)
-            components.append(shrink_towards_present(target, component, 1 / float(mass @ mass)))
-        return GaussianMixture(np.maximum(shares, np.finfo(np.float64).tiny) / sum(shares), components)
-
-    def log_terms(self, mixture: GaussianMixture) -> FloatArray:
-        """Return log(weight_j q_j) of the components at the points, shape (k, n)."""
-        return mixture.log_terms(self.x)
-
-
 def fit_mixture_towards(
     present: GaussianMixture, k: int, x: FloatArray, weights: FloatArray, alpha: float
 ) -> GaussianMixture:
@@ -324,8 +292,26 @@ def fit_mixture_towards(
         present = GaussianMixture(np.full(k, 1 / k), [present.components[0]] * k)
     else:
         start = posterior(present.log_terms(x))
-    family = _TowardsPoints(present, x, weights, alpha)
-    mixture, _ = expectation_maximisation(family, start, weights, EM_STEPS, lambda _: -np.inf)
+
+    def maximise(responsibilities: FloatArray) -> GaussianMixture:
+        """Return weights, means and covariances; a component without any weight stays as it is."""
+        shares, components = [], []
+        parts = zip(present.weights, present.components, weights * responsibilities, strict=True)
+        for weight, component, mass in parts:
+            total = float(mass.sum())
+            share = alpha * total + (1 - alpha) * weight
+            shares.append(share)
+            if share < EMPTY:
+                components.append(component)
+                continue
+            mass = mass / total if total > 0 else np.full(len(x), 1 / len(x))
+            target = weighted_moments(x, mass).mix_with(component.moments, alpha * total / share)
+            components.append(shrink_towards_present(target, component, 1 / float(mass @ mass)))
+        return GaussianMixture(np.maximum(shares, np.finfo(np.float64).tiny) / sum(shares), components)
+
+    mixture, _ = expectation_maximisation(
+        maximise, lambda mixture: mixture.log_terms(x), start, weights, EM_STEPS, lambda _: -np.inf
+    )
     used = mixture.weights > EMPTY
     components = [component for component, kept in zip(mixture.components, used, strict=True) if kept]
     return GaussianMixture(mixture.weights[used] / mixture.weights[used].sum(), components)

@@ -261,14 +261,7 @@ class CrossEntropy(Method):
         return ended(Status.CONVERGED if level == goal.gamma else Status.STALLED)
 
     def _project(self, proposal: Product, elite: FloatArray, log_ratios: FloatArray, alpha: float) -> Product:
-        """Return the proposal after one step of equation 2 towards the elite points.
-
-        Args:
-            proposal: P_theta_k.
-            elite: Shape (n, d).
-            log_ratios: log(p0 / p_theta_k) of each block, shape (blocks, n).
-            alpha: Step size.
-        """
+        """Return the proposal after one step of equation 2 towards the elite points."""
         if self.likelihood_ratio == "joint":
             log_ratios = np.broadcast_to(log_ratios.sum(axis=0), log_ratios.shape)
         return proposal.project(elite, np.stack([normalise_weights(ratios) for ratios in log_ratios]), alpha)

@@ -178,15 +178,7 @@ class Prediction(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Kriging:
-    """A fitted process.
-
-    Example:
-        >>> import numpy as np
-        >>> u = np.random.default_rng(0).standard_normal((40, 2))
-        >>> kriging = fit_kriging(u, 2.0 - u[:, 0])
-        >>> np.exp(kriging.predict(np.array([[1.0, 0.0], [3.0, 0.0]])).log_fail).round(3)
-        array([0., 1.])
-    """
+    """A fitted process."""
 
     process: Any
     """scikit-learn's `GaussianProcessRegressor`, fitted to standardised outcomes."""

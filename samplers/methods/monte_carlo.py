@@ -33,13 +33,6 @@ class EvenlySpaced:
     Attributes:
         stride: s.
         n: Rows seen.
-
-    Example:
-        >>> rows = EvenlySpaced(4)
-        >>> for batch in np.split(np.arange(12.0), 3):
-        ...     rows.add(batch)
-        >>> rows.values.tolist(), rows.stride
-        ([0.0, 4.0, 8.0], 4)
     """
 
     def __init__(self, most: int, shape: tuple[int, ...] = ()) -> None:
@@ -70,13 +63,6 @@ class KeptDraws:
     Args:
         gamma: Threshold of failure.
         dim: Number of dimensions of x.
-
-    Example:
-        >>> draws = KeptDraws(gamma=0.0, dim=1)
-        >>> draws.add(np.array([[3.0], [5.0]]), np.array([1.0, -1.0]))
-        1
-        >>> draws.to_sample().weights.tolist(), draws.to_sample().x.tolist()
-        ([0.5, 0.5], [[5.0]])
     """
 
     def __init__(self, gamma: float, dim: int, most: int = MOST_DRAWS, most_failing: int | None = None) -> None:

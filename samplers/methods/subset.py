@@ -107,15 +107,7 @@ class SubsetLevels:
         kernel: Kernel,
         known: RootedPoints | None = None,
     ) -> Steps:
-        """Go from level to level until the share of failures among its points is p0 or more.
-
-        Args:
-            inputs: Of the problem.
-            goal: Threshold and budget.
-            rng: Source of randomness.
-            kernel: Of the first chains.
-            known: Base draws whose outcomes are known, fewer than n: level 0 begins with them.
-        """
+        """Go from level to level until the share of failures among its points is p0 or more."""
         n_known = 0 if known is None else len(known.f)
         n, gamma = self._points_per_level(goal.budget + n_known), goal.gamma
         levels, trace = list[Chains](), list[Level]()

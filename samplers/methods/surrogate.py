@@ -269,19 +269,11 @@ class EstimateDraws:
         return math.hypot(self.draws.cov, math.sqrt(self.pool_variance))
 
     def count_lineages(self, failing_batches: int) -> float:
-        """Return the independent lineages that reached failure.
-
-        Args:
-            failing_batches: Batches of learning that met failures.
-        """
+        """Return the independent lineages that reached failure."""
         return max(count_lineages(failing_batches, self.log_wide_weights), 1.0)
 
     def skill_warnings(self, least: float) -> list[str]:
-        """Return the warning that the surrogate leads to few failures, if so.
-
-        Args:
-            least: Share of the surrogate's draws that should fail.
-        """
+        """Return the warning that the surrogate leads to few failures, if so."""
         n, failing = self.kinds[:, SURROGATE]
         if failing >= least * n:
             return []

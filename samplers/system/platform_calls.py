@@ -23,12 +23,6 @@ def lock_file(file: IO[bytes]) -> bool:
 
     The system lets go of the lock when the process ends, however. File systems that know no locks (some network
     drives) grant every lock.
-
-    Example:
-        >>> from tempfile import TemporaryFile
-        >>> with TemporaryFile() as file:
-        ...     lock_file(file)
-        True
     """
     try:
         import fcntl
@@ -55,19 +49,7 @@ def _lock_byte(file: IO[bytes]) -> bool:
 
 
 def end_process(child: subprocess.Popen[bytes]) -> None:
-    """End a process at once, and what it has started where it leads a group of processes.
-
-    Args:
-        child: Started with `start_new_session=True`, which Windows ignores.
-
-    Example:
-        >>> import subprocess, sys
-        >>> words = [sys.executable, "-c", "import time; time.sleep(60)"]
-        >>> with subprocess.Popen(words, start_new_session=True) as child:
-        ...     end_process(child)
-        >>> child.returncode == 0
-        False
-    """
+    """End a process at once, and what it has started where it leads a group of processes."""
     with suppress(OSError):
         if child.returncode is not None:  # its number may be that of another process by now
             return
@@ -78,15 +60,7 @@ def end_process(child: subprocess.Popen[bytes]) -> None:
 
 
 def limit_memory(n_bytes: int | None) -> None:
-    """Let this process have so many bytes more than now, where the system can limit data (Linux).
-
-    Args:
-        n_bytes: None for no limit.
-
-    Example:
-        >>> limit_memory(None) is None
-        True
-    """
+    """Let this process have so many bytes more than now, where the system can limit data (Linux)."""
     if n_bytes is None:
         return
     try:
@@ -103,12 +77,7 @@ def limit_memory(n_bytes: int | None) -> None:
 
 
 def sync_folder(folder: Path) -> None:
-    """Return when the name of a new file is on the disk, where folders can be opened.
-
-    Example:
-        >>> sync_folder(Path(".")) is None
-        True
-    """
+    """Return when the name of a new file is on the disk, where folders can be opened."""
     try:
         descriptor = os.open(folder, os.O_RDONLY)
     except PermissionError:  # Windows opens no folder

@@ -1,17 +1,16 @@
+"""Outcomes, contract and base class of a method; checks of arguments."""
+
 import math
-import sys
+from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 import pytest
 
 import samplers
-from samplers.method import MANY_FAILURES, no_outcome_share
+from samplers.method import Outcome, no_outcome_share
+from samplers.methods.base import Method
 from samplers.statistics import binomial_cov, clopper_pearson
-
-
-def test_budget_is_max_sim_or_without_limit():
-    assert samplers.Goal(gamma=0.0, max_sim=7).budget == 7
-    assert samplers.Goal(gamma=0.0).budget == sys.maxsize
 
 
 @pytest.mark.parametrize(("hits", "n"), [(1, 50), (20, 400), (400, 400)])
@@ -30,33 +29,53 @@ def test_no_hit_has_a_one_sided_interval_and_a_warning():
     assert outcome.warnings == ("None of 1,000 simulations failed: p = 0 with a one-sided interval.",)
 
 
-@pytest.mark.parametrize(("hits", "warned"), [(1, True), (MANY_FAILURES - 1, True), (MANY_FAILURES, False)])
-def test_few_hits_are_warned_of(hits, warned):
-    outcome = samplers.Outcome.of_counts(hits, 10_000, 0.95, trace=())
-    assert bool(outcome.warnings) == warned
-    assert warned == (outcome.cov > 1 / math.sqrt(MANY_FAILURES))
-
-
-def test_share_of_points_without_an_outcome():
-    f = np.array([-np.inf, 1.0, -np.inf, 2.0])
-    assert no_outcome_share(f) == 0.5
-    assert no_outcome_share(f, np.log([1.0, 2.0, 3.0, 4.0])) == pytest.approx(0.4)
-    assert no_outcome_share(np.empty(0)) == 0.0
-
-
 def test_all_or_none_without_an_outcome_is_exact_whatever_the_weights():
     log_weights = np.log(np.array([0.1, 0.2, 0.7]))
     assert no_outcome_share(np.full(3, -np.inf), log_weights) == 1.0
     assert no_outcome_share(np.zeros(3), log_weights) == 0.0
 
 
-def test_a_method_is_whatever_has_a_name_and_steps():
-    class Mine:
-        name, stops_at_target = "mine", False
+@dataclass(frozen=True, kw_only=True)
+class Batches(Method):
+    """Two batches of base draws."""
 
-        def steps(self, inputs, goal, rng):
-            yield inputs.base.sample(1, rng)
+    n: int = 500
+    name: ClassVar[str] = "batches"
+    stops_at_target: ClassVar[bool] = False
 
-    assert isinstance(Mine(), samplers.Stepping)
-    assert not isinstance(Mine(), samplers.Method)  # has no `start`
-    assert not isinstance(object(), samplers.Stepping)
+    def steps(self, inputs, goal, rng):
+        parts = []
+        for _ in range(2):
+            parts.append((yield inputs.base.sample(self.n, rng)))
+        f = np.concatenate(parts)
+        hits = int((f <= goal.gamma).sum())
+        return Outcome.of_counts(hits, len(f), goal.confidence, [], no_outcome_share(f[f <= goal.gamma]))
+
+
+PROBLEM = samplers.FunctionProblem(lambda u: 1.0 - u[:, 0], dim=2)
+
+
+def test_start_gives_what_estimate_gives():
+    run = Batches().start(PROBLEM, seed=3)
+    asked = 0
+    while not run.done:
+        x = run.ask()
+        asked += len(x)
+        run.tell(PROBLEM.evaluate(x))
+    assert asked == 1000
+    assert run.result().p == samplers.estimate(PROBLEM, Batches(), seed=3).p
+
+
+def test_start_needs_no_evaluate():
+    """Dimension and base distribution are enough."""
+
+    class Inputs:
+        dim = 2
+        base = samplers.StandardNormal(2)
+
+    assert Batches().start(Inputs(), seed=0).ask().shape == (500, 2)
+
+
+def test_wrong_arguments_are_refused_at_the_start():
+    with pytest.raises(ValueError, match="confidence"):
+        Batches().start(PROBLEM, confidence=2.0)

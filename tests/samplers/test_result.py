@@ -1,3 +1,5 @@
+"""What an estimate says and keeps."""
+
 import json
 import math
 from dataclasses import replace
@@ -10,6 +12,7 @@ import samplers
 from samplers.limit_states import half_space
 from samplers.sample import Failures
 from samplers.stored import to_json_value
+from samplers.trace import Status, describe_outcome
 from tests.samplers.fitted_bases import fitted, resampled, run
 
 
@@ -194,3 +197,9 @@ def test_the_uncertainty_of_the_base_is_kept_and_computed_anew_with_the_base(tmp
     with_base = samplers.Estimate.load(tmp_path / "result", base=base)
     assert "base_uncertainty" not in vars(with_base)
     assert with_base.base_uncertainty == found.base_uncertainty
+
+
+def test_converged_does_not_stand_beside_warnings():
+    assert describe_outcome(Status.CONVERGED, ()) == "converged"
+    assert describe_outcome(Status.CONVERGED, ("a", "b")) == "came to its end with 2 warnings"
+    assert describe_outcome(Status.STALLED, ("a",)) == describe_outcome("stalled", ()) == "stalled"

@@ -44,22 +44,6 @@ def join_batches(first: SimulationSteps[_A], second: SimulationSteps[_B]) -> Sim
     Args:
         first: Yields points (n, d), as all steps of a run do.
         second: Likewise.
-
-    Example:
-        >>> def halve(x, times):
-        ...     for _ in range(times):
-        ...         x = yield x
-        ...     return x
-        >>> both = join_batches(halve(np.array([[8.0]]), 1), halve(np.array([[16.0], [24.0]]), 3))
-        >>> x, sizes = next(both), []
-        >>> try:
-        ...     while True:
-        ...         sizes.append(len(x))
-        ...         x = both.send(x / 2)
-        ... except StopIteration as end:
-        ...     one, two = end.value
-        >>> sizes, one.tolist(), two.tolist()
-        ([3, 2, 2], [[4.0]], [[2.0], [3.0]])
     """
     one, other = _Activity(first), _Activity(second)
     while waiting := [each for each in (one, other) if each.points is not None]:
@@ -251,10 +235,6 @@ def _choose_tries(f: FloatArray, new: FloatArray) -> NDArray[np.int64]:
     """Return the number of the try (n,) that each line goes to from f (n,), if any: the first gain, else the first tie.
 
     Not the best one, which would be more often where f falls steeply, whichever region that is.
-
-    Args:
-        f: Outcomes where the lines are, shape (n,).
-        new: Outcomes of their tries, shape (n, tries).
     """
     gain, tie = new < f[:, None], new == f[:, None]
     return np.asarray(np.where(gain.any(axis=1), gain.argmax(axis=1), tie.argmax(axis=1)))
@@ -305,13 +285,7 @@ class WideFailures(NamedTuple):
 
 
 def _spread_directions(known: FloatArray, u: FloatArray, n: int) -> NDArray[np.intp]:
-    """Return the rows of n of the points u (m, d), m >= n, one by one the furthest in direction from all before it.
-
-    Args:
-        known: Points before all of them, shape (k, d).
-        u: Points.
-        n: How many.
-    """
+    """Return the rows of n of the points u (m, d), m >= n, one by one the furthest in direction from all before it."""
     known, u = (points / np.maximum(np.linalg.norm(points, axis=1, keepdims=True), TINY) for points in (known, u))
     cosine = (u @ known.T).max(axis=1, initial=-1.0)
     chosen = np.empty(n, dtype=np.intp)
@@ -342,17 +316,7 @@ def find_wide_failures(
     rng: np.random.Generator,
     settings: ExplorationSettings,
 ) -> SimulationSteps[WideFailures]:
-    """Return the failures among wide draws, and among wider ones if the levels went deep.
-
-    Args:
-        simulator: Gives outcomes.
-        first: The wide draws so far.
-        gamma: Threshold of failure.
-        levels: Of subset simulation: it ended at a probability of about 10^-(levels + 1/2).
-        n: How many wider ones.
-        rng: Source of randomness.
-        settings: Scales.
-    """
+    """Return the failures among wide draws, and among wider ones if the levels went deep."""
     scale = -float(ndtri(10 ** -(levels + 0.5))) / settings.depth_ratio
     if scale > settings.deep_scale:
         deep = yield from draw_wide(simulator, ((scale, n),), rng)

@@ -115,15 +115,7 @@ class TwoStage(Method):
 def run_two_stage(
     inputs: Inputs, goal: Goal, budget: int, rng: np.random.Generator, settings: TwoStageSettings = DEFAULT_SETTINGS
 ) -> Steps:
-    """Estimate P[f(X) <= goal.gamma] with settings that need not be the default ones.
-
-    Args:
-        inputs: Dimension and base distribution.
-        goal: Threshold, confidence, target and budget.
-        budget: Simulations to plan for.
-        rng: Source of randomness.
-        settings: Of all stages.
-    """
+    """Estimate P[f(X) <= goal.gamma] with settings that need not be the default ones."""
     offer = offer_of(inputs)
     if offer is not None and suits_terms(inputs, offer, budget, settings.terms):
         return (yield from search_terms(inputs, offer, goal, budget, rng, settings.terms))

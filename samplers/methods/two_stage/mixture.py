@@ -25,7 +25,7 @@ from samplers.methods.two_stage.settings import (
     SubspaceSettings,
 )
 from samplers.problem import FloatArray
-from samplers.proposals import expectation_maximisation, k_means, one_hot, posterior, shrink_covariance
+from samplers.proposals import expectation_maximisation, posterior, shrink_covariance, start_from_centres
 from samplers.statistics import normalise_weights
 
 Kind = Literal[
@@ -225,7 +225,9 @@ def _initial_responsibilities(points: GroupedPoints, k: int, rng: np.random.Gene
     mass = np.bincount(points.groups, weights=points.weights, minlength=n_groups).astype(np.float64)
     means = np.zeros((n_groups, points.u.shape[1]))
     np.add.at(means, points.groups, points.u * points.weights[:, None])
-    return one_hot(k_means(means / np.maximum(mass, TINY_WEIGHT)[:, None], mass / mass.sum(), k, rng)[points.groups], k)
+    return start_from_centres(means / np.maximum(mass, TINY_WEIGHT)[:, None], mass / mass.sum(), k, rng)[
+        :, points.groups
+    ]
 
 
 class _Fitted(NamedTuple):
@@ -236,39 +238,30 @@ class _Fitted(NamedTuple):
     weights: FloatArray
 
 
-@dataclass(frozen=True)
-class _GroupedFamily:
-    """Mixtures in which all points of a group come from one component, see `samplers.proposals.Family`."""
+def _fit_from(points: GroupedPoints, start: FloatArray, settings: SubspaceSettings) -> SubspaceMixture:
+    """Return the mixture that expectation-maximisation reaches from responsibilities (k, n); a group stays together."""
+    u, weights, ess, groups = points
 
-    points: GroupedPoints
-    settings: SubspaceSettings
-
-    def maximise(self, responsibilities: FloatArray) -> _Fitted:
-        """Return the components that have at least one point, from responsibilities (k, n)."""
-        u, weights, ess, _ = self.points
+    def maximise(responsibilities: FloatArray) -> _Fitted:
+        """Return the components that have at least one point."""
         mass = (responsibilities * weights).sum(axis=1)
         shares, mass = responsibilities[mass * ess > 1], mass[mass * ess > 1]
         fits = [
-            fit_shrunk_subspace_gaussian(
-                u, share * weights / m, max(float(m) * ess, self.settings.min_ess), self.settings
-            )
+            fit_shrunk_subspace_gaussian(u, share * weights / m, max(float(m) * ess, settings.min_ess), settings)
             for share, m in zip(shares, mass, strict=True)
         ]
         return _Fitted([one for one, _ in fits], [share for _, share in fits], mass / mass.sum())
 
-    def log_terms(self, mixture: _Fitted) -> FloatArray:
-        """Return log(weight_j) and the log ratio to N(0, I) of each point's group, in independent points, (k, n)."""
-        u, weights, ess, groups = self.points
+    def log_terms(mixture: _Fitted) -> FloatArray:
+        """Return log(weight_j) and the log ratio to N(0, I) of each point's group, in independent points."""
         per_point = log_ratios(mixture.components, u) * (ess * weights)
-        per_group = np.array([np.bincount(groups, weights=row, minlength=self.points.n_groups) for row in per_point])
+        per_group = np.array([np.bincount(groups, weights=row, minlength=points.n_groups) for row in per_point])
         return np.asarray((per_group + np.log(mixture.weights)[:, None])[:, groups])
 
-
-def _fit_from(points: GroupedPoints, start: FloatArray, settings: SubspaceSettings) -> SubspaceMixture:
-    """Return the mixture that expectation-maximisation reaches from responsibilities (k, n)."""
-    once_per_group = 1 / np.bincount(points.groups)[points.groups]
+    once_per_group = 1 / np.bincount(groups)[groups]
     fit, log_likelihood = expectation_maximisation(
-        _GroupedFamily(points, settings),
+        maximise,
+        log_terms,
         start,
         once_per_group,
         settings.max_em_iterations,
@@ -390,15 +383,6 @@ def minimise_second_moment(
         start: First weights, shape (k,).
         floors: Lower limits of disjoint groups, kept in every update.
         settings: Number of updates.
-
-    Example:
-        Two components without overlap, 10 points of ratio 4 and 40 of ratio 1: weights are as the roots of 10 / 4 and
-        40 / 1, 1 to 4.
-
-        >>> log_r = np.full((2, 50), -np.inf)
-        >>> log_r[0, :10], log_r[1, 10:] = np.log(4), 0.0
-        >>> minimise_second_moment(log_r, np.zeros(50), np.array([0.5, 0.5]), []).round(3)
-        array([0.2, 0.8])
     """
     matter = log_weights > log_weights.max() - settings.negligible
     log_r, log_weights = log_r[:, matter], log_weights[matter]
@@ -419,11 +403,6 @@ def raise_to_floors(a: FloatArray, floors: Sequence[Floor]) -> FloatArray:
     Members of a floor keep their proportions; without any weight they share the floor evenly. Lowering may bring
     another group under its floor, which is then raised too. Floors that add up to more than 1 are lowered in
     proportion.
-
-    Example:
-        >>> floor = Floor(np.array([True, True, False, False]), 0.2)
-        >>> raise_to_floors(np.array([0.0, 0.0, 0.4, 0.6]), [floor]).round(2)
-        array([0.1 , 0.1 , 0.32, 0.48])
     """
     return _FloorIndex.of(floors, len(a)).apply(a)
 

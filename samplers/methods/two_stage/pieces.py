@@ -167,18 +167,6 @@ def union_of_half_spaces(
         gamma: Threshold of failure.
         rng: Source of randomness: pieces start at failures chosen at random.
         settings: Of the regression and of the edges.
-
-    Example:
-        f is the least of 3 - u1 and 3 - u2:
-
-        >>> rng = np.random.default_rng(0)
-        >>> u = rng.normal(1.5, 1.5, (400, 2))
-        >>> union = union_of_half_spaces(u, (3 - u).min(axis=1), 0.0, rng)
-        >>> union.axes[np.argsort(union.axes[:, 1])].round(2) + 0.0
-        array([[1., 0.],
-               [0., 1.]])
-        >>> union.starts.round(2)
-        array([2.98, 2.98])
     """
     edges, linear, dim = settings.edges, settings.linear_model, u.shape[1]
     finite = np.isfinite(f) & (np.abs(f) < LARGEST_OUTCOME)
@@ -270,17 +258,6 @@ def intersection_of_half_spaces(
         f: Their outcomes, shape (n,); infinite ones are left out.
         gamma: Threshold of failure.
         settings: Of the regression and of the edges.
-
-    Example:
-        f is the greatest of 2 - u1 and 1.5 - u2:
-
-        >>> u = np.random.default_rng(0).normal(1.5, 1.5, (400, 2))
-        >>> corner = intersection_of_half_spaces(u, (np.array([2, 1.5]) - u).max(axis=1), 0.0)
-        >>> corner.axes.round(2) + 0.0
-        array([[1., 0.],
-               [0., 1.]])
-        >>> corner.starts.round(2)
-        array([1.98, 1.48])
     """
     finite = np.isfinite(f) & (np.abs(f) < LARGEST_OUTCOME)
     u, f = u[finite], f[finite]

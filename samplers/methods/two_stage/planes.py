@@ -136,14 +136,6 @@ def half_space_proposals(
         f: Outcomes of these, shape (n,).
         gamma: Threshold of failure.
         settings: Of the regression and of the edge.
-
-    Example:
-        f = 3 - u1: a Gaussian at E[Z | Z > 3] = 3.28, and N(0, I) given u1 >= 3 - 0.02.
-
-        >>> u = np.random.default_rng(0).normal([3, 0], 1, (200, 2))
-        >>> gaussian, half_space = half_space_proposals(u[u[:, 0] > 3], u, 3 - u[:, 0])
-        >>> gaussian.centre.round(2) + 0.0, half_space.axis.round(2) + 0.0, round(half_space.start, 2)
-        (array([3.28, 0.  ]), array([1., 0.]), 2.98)
     """
     linear, edges = settings.linear_model, settings.edges
     hyperplane = fit_hyperplane(u, f, linear)
@@ -204,24 +196,14 @@ def failure_edge(
 
 
 def weighted_quantile(x: FloatArray, weights: FloatArray, share: float) -> float:
-    """Return the smallest x (n,) up to which at least this share of the weights (n,) lies.
-
-    Example:
-        >>> weighted_quantile(np.array([3.0, 1.0, 2.0]), np.array([1.0, 1.0, 2.0]), 0.5)
-        2.0
-    """
+    """Return the smallest x (n,) up to which at least this share of the weights (n,) lies."""
     order = np.argsort(x)
     total = np.cumsum(weights[order])
     return float(x[order][min(int(np.searchsorted(total, share * total[-1])), len(x) - 1)])
 
 
 def median(x: FloatArray) -> float:
-    """Return the median of x (n,), n > 0 and without NaN: for short arrays several times as fast as `np.median`.
-
-    Example:
-        >>> median(np.array([3.0, 1.0, 2.0, 9.0]))
-        2.5
-    """
+    """Return the median of x (n,), n > 0 and without NaN: for short arrays several times as fast as `np.median`."""
     middle = len(x) // 2
     ordered = np.partition(x, (middle - 1, middle) if len(x) % 2 == 0 else middle)
     return float(ordered[middle] if len(x) % 2 else 0.5 * (ordered[middle - 1] + ordered[middle]))

@@ -127,15 +127,7 @@ def start_refinement(
     rng: np.random.Generator,
     mixture: MixtureSettings = DEFAULT_MIXTURE_SETTINGS,
 ) -> RefinementState:
-    """Return the initial state, from the exploration alone; also in the coordinates of its slopes.
-
-    Args:
-        exploration: Regions of the exploration, at least one.
-        gamma: Threshold of failure.
-        settings: Numbers of Gaussians.
-        rng: Source of randomness of the fits.
-        mixture: Of the fits.
-    """
+    """Return the initial state, from the exploration alone; also in the coordinates of its slopes."""
     state = _describe_regions(exploration, gamma, settings, rng, mixture)
     axes = exploration.slopes
     if axes is None or axes.shape[1] == 0:
@@ -176,17 +168,7 @@ def refine_once(
     rng: np.random.Generator,
     mixture: MixtureSettings = DEFAULT_MIXTURE_SETTINGS,
 ) -> RefinementState:
-    """Return the state after a round of draws.
-
-    Args:
-        state: Before it.
-        history: All draws so far, those of this round included.
-        proposal: What the round drew from.
-        batch: Its draws.
-        settings: How many failures a fit needs.
-        rng: Source of randomness of the fits.
-        mixture: Of the fits.
-    """
+    """Return the state after a round of draws."""
     kinds = np.repeat([candidate.kind for candidate in proposal.candidates], batch.counts)
     sharp, near = np.isin(kinds, SHARP_KINDS), ~np.isin(kinds, DISTANT_KINDS)
     u = batch.u[near]
@@ -302,13 +284,6 @@ def build_proposal(
 
     Its weights minimise the second moment of the estimate over the failures in `history`, with lower limits; before
     the first round they are `settings.initial_shares`.
-
-    Args:
-        state: What is known of the regions.
-        history: All draws so far.
-        settings: Shares and lower limits.
-        mixture: Of edges and weights.
-        final: For the estimate: what is no use is dropped.
     """
     candidates = list_candidates(state, history, settings, mixture.edges)
     kinds = np.array([candidate.kind for candidate in candidates])
@@ -437,14 +412,6 @@ def _set_floors(
     """Return the least shares: of each region and its tempered Gaussians, spread and radial components and base draws.
 
     They add up to 1 at most: base draws keep theirs, which bounds all weights, the others are lowered in proportion.
-
-    Args:
-        state: What is known of the regions.
-        history: All draws so far.
-        candidates: All components.
-        settings: The shares.
-        radial: Whether there are few enough dimensions for radial components to reach a place off the regions.
-        final: For the estimate.
     """
     kinds = np.array([candidate.kind for candidate in candidates])
     regions = np.array([candidate.region for candidate in candidates])

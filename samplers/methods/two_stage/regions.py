@@ -37,12 +37,7 @@ class Discovery(NamedTuple):
     """Upper end of p by the search's own subset simulation, or by as many of its levels as there were."""
 
     def unseen_share(self, confidence: float) -> float:
-        """Return the upper end of the share of p in regions that were not found.
-
-        Example:
-            >>> [round(Discovery(n).unseen_share(0.95), 3) for n in (4, 25, 200)]
-            [0.24, 0.039, 0.005]
-        """
+        """Return the upper end of the share of p in regions that were not found."""
         return float(betaincinv(PRIOR_SHARE, self.lineages, 0.5 + confidence / 2))
 
 
@@ -59,15 +54,7 @@ def count_lineages(roots: int, wide_log_weights: FloatArray) -> float:
 def discovery_interval(
     draws: Draws, cov: float, confidence: float, largest_weight: float, discovery: Discovery
 ) -> Interval:
-    """Return the interval of p from weighted draws, its upper end raised by their skewness and by what is unseen.
-
-    Args:
-        draws: From the last proposal.
-        cov: C.o.v. of p.
-        confidence: Nominal coverage.
-        largest_weight: Bound of the weights.
-        discovery: How thorough the search was.
-    """
+    """Return the interval of p from weighted draws, its upper end raised by their skewness and by what is unseen."""
     low, high = weighted_interval(draws, confidence, largest_weight, cov, discovery.ceiling)
     if len(draws.f) == 0:
         return low, high
@@ -244,16 +231,6 @@ def _pcn_chains(
     The proposal sqrt(1 - sigma^2) u + sigma xi, xi ~ N(0, I), leaves N(0, I) invariant; it is accepted if it fails.
     With directions the step sigma is that along them, and every other direction is drawn nearly afresh: failures
     beyond a plane are standard normal there, and chains forget where they started at once.
-
-    Args:
-        simulator: Gives outcomes.
-        u: Failing points, shape (n, d).
-        sigma: First steps, shape (n,).
-        directions: Unit vectors, shape (n, d), or None.
-        steps: Number of steps.
-        gamma: Threshold of failure.
-        rng: Source of randomness.
-        settings: Adaptation of the steps.
     """
     across = np.ones(len(u))
     states, proposals, outcomes = [], [], []

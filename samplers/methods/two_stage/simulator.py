@@ -71,18 +71,7 @@ def extend_trace(
     cov: float,
     ess: float | None = None,
 ) -> tuple[Level, ...]:
-    """Return the trace with one more level, which has all of `n_sim` simulations that no earlier one has.
-
-    Args:
-        trace: Levels so far.
-        goal: Has the threshold, and is told of the level.
-        n_sim: Simulations made so far.
-        p: Share of the level's points that fail.
-        estimate: Estimate so far.
-        n_points: Points behind p.
-        cov: C.o.v. of p.
-        ess: Effective number of failing points.
-    """
+    """Return the trace with one more level, which has all of `n_sim` simulations that no earlier one has."""
     made = n_sim - sum(level.n_sim for level in trace)
     level = Level(gamma=goal.gamma, p=p, estimate=estimate, n_sim=made, n_points=n_points, cov=cov, ess=ess)
     goal.on_level(level)

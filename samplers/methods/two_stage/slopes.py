@@ -34,15 +34,6 @@ def find_slopes(
 
     The gradients are made in three batches. Later ones go where the known directions explain least, and are not made
     where there are too many directions, or where the batch before was explained by what was known.
-
-    Args:
-        simulator: Gives outcomes.
-        exploration: Regions of failure.
-        gamma: Threshold of failure.
-        room: Simulations left of the budget.
-        rng: Source of randomness.
-        settings: Dimensions, simulations, step.
-        high_dim: Above so many dimensions a component has one direction without slopes.
     """
     dim = simulator.inputs.dim
     short = exploration.scattered or dim > high_dim

@@ -138,15 +138,7 @@ def meets_too_few(
     *,
     share: float = 1.0,
 ) -> bool:
-    """Return whether the draws of a round meet so few failures that subset simulation does better with the rest.
-
-    Args:
-        draws: Of the last round.
-        number: Of this round, from 1.
-        levels: Levels of subset simulation in the exploration.
-        settings: Failures that each draw must be worth.
-        share: Of that number, which is enough.
-    """
+    """Return whether the draws of a round meet so few failures that subset simulation does better with the rest."""
     early = settings.early_rates
     rate = early[number - 1] if number <= len(early) else settings.relative_rate / max(levels, settings.min_levels)
     return draws.ess < share * rate * draws.n
@@ -168,10 +160,6 @@ def reconcile(subset_outcome: Outcome, earlier: Outcome) -> Outcome:
 
     Subset simulation follows f downhill; wide draws also find regions that f does not announce. The interval of the
     earlier outcome then grows to hold both.
-
-    Args:
-        subset_outcome: By subset simulation.
-        earlier: From all draws of the exploration and the rounds.
     """
     if earlier.interval[0] <= subset_outcome.p:
         return subset_outcome
@@ -194,17 +182,7 @@ def run_subset_simulation(
     rng: np.random.Generator,
     settings: FallbackSettings = DEFAULT_SETTINGS.fallback,
 ) -> Steps:
-    """Run adaptive subset simulation with the points per level that a budget or a target c.o.v. asks for.
-
-    Args:
-        inputs: Dimension and base distribution.
-        goal: Threshold, confidence and target.
-        levels: Levels that subset simulation passed in the exploration.
-        budget: Simulations that are never exceeded.
-        known: Base draws of the exploration, from which it starts, if these have all coordinates.
-        rng: Source of randomness.
-        settings: How points per level follow from the budget.
-    """
+    """Run adaptive subset simulation with the points per level that a budget or a target c.o.v. asks for."""
     levels = max(levels, settings.min_levels)
     n = int((budget + (0 if known is None else len(known.f))) / (1 + settings.level_share * (levels + 0.5)))
     if goal.target_cov is not None:
@@ -289,16 +267,7 @@ def _first_counted(state: RunState, gamma: float, settings: TwoStageSettings) ->
 def refine(
     context: RunContext, state: RunState, refinement: RefinementState, number: int, room: int, proposal: MixtureProposal
 ) -> SimulationSteps[tuple[RunState, RefinementState, MixtureProposal, bool]]:
-    """Run one round of refinement; return also the proposal that follows from it, and whether that is the last one.
-
-    Args:
-        context: What is fixed for the run.
-        state: Draws so far.
-        refinement: What is known of the regions.
-        number: Of the round, from 1.
-        room: Simulations that the exploration has left.
-        proposal: What to draw from.
-    """
+    """Run one round of refinement; return also the proposal that follows from it, and whether that is the last one."""
     settings = context.settings.refinement
     shares = (*settings.round_shares, *settings.further_shares)
     n = int(shares[number - 1] * room)
@@ -403,14 +372,7 @@ def estimate_early(context: RunContext, state: RunState) -> Outcome:
 
 
 def run_monte_carlo(context: RunContext, state: RunState, *, counted: bool = True) -> Steps:
-    """Spend the rest on base draws.
-
-    Args:
-        context: What is fixed for the run.
-        state: Draws so far.
-        counted: Whether the base draws made so far count. They must not where they have decided that plain Monte Carlo
-            follows, for that would bias p; unless the run is stopped before it has any other.
-    """
+    """Spend the rest on base draws."""
     goal, inputs, stopped, first = context.goal, context.simulator.inputs, False, context.simulator.n_sim
     u, f = (state.base_u, state.base_f) if counted else (state.base_u[:0], state.base_f[:0])
     size = context.settings.monte_carlo_batch if goal.target_cov is None else context.target_batch
@@ -460,15 +422,7 @@ def _check(
     sample: StratifiedSample,
     whole: StratifiedSample,
 ) -> list[str]:
-    """Return the warnings of all checks of an estimate.
-
-    Args:
-        context: What is fixed for the run.
-        state: Draws so far.
-        refinement: What is known of the regions.
-        sample: Draws of the last proposal.
-        whole: All draws that count.
-    """
+    """Return the warnings of all checks of an estimate."""
     settings, hits = context.settings.diagnostics, int((state.base_f <= context.goal.gamma).sum())
     return [
         *check_base_draws(whole.p, hits, len(state.base_f), settings),

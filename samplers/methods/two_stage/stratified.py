@@ -147,9 +147,6 @@ class StratifiedSample:
 
         Where the shares of the draws do not depend on outcomes p stays unbiased, and since the later mixture makes an
         unbiased p of whatever came before, the errors of the two are uncorrelated.
-
-        Args:
-            earlier: Of another proposal, drawn before this one was made.
         """
         if earlier.draws.n == 0:
             return self

@@ -99,18 +99,7 @@ def explore_terms(
     rng: np.random.Generator,
     settings: TwoStageSettings = DEFAULT_SETTINGS,
 ) -> SimulationSteps[ExplorationResult]:
-    """Search for failures of the terms that the exploration has met but has no failures of; add their regions.
-
-    Args:
-        simulator: Gives outcomes.
-        exploration: What was found so far.
-        record: All points so far, with their terms.
-        first: Base draws and wide draws, the first of these points.
-        gamma: Threshold of f.
-        room: Simulations that are left for rounds and estimate.
-        rng: Source of randomness.
-        settings: Of all stages.
-    """
+    """Search for failures of the terms that the exploration has met but has no failures of; add their regions."""
     if exploration.noisy or exploration.scattered or not record.several:
         return exploration
     x, terms = record.join()
@@ -222,14 +211,7 @@ def _descend_alone(
 def _run_together(
     simulator: Simulator, searches: list[SimulationSteps[FloatArray]], terms: NDArray[np.int64], far: float
 ) -> SimulationSteps[list[FloatArray]]:
-    """Run searches that yield points u, each on its own term, in common batches; return what they return.
-
-    Args:
-        simulator: Counts.
-        searches: Are sent values of their terms.
-        terms: Number of the term of each.
-        far: A search whose points all have abs(u)^2 above it ends with nothing.
-    """
+    """Run searches that yield points u, each on its own term, in common batches; return what they return."""
     ends = [np.empty((0, simulator.inputs.dim))] * len(searches)
     sent: dict[int, FloatArray | None] = dict.fromkeys(range(len(searches)))
     while sent:

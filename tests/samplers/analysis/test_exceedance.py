@@ -1,3 +1,5 @@
+"""Exceedance of a quantity at failures, with bands."""
+
 import json
 import math
 
@@ -6,10 +8,10 @@ import pytest
 from scipy import stats
 
 import samplers
-from samplers.analysis.expectation import FurtherFailures, compute_exceedance
+from samplers.analysis.expectation import compute_exceedance
 from samplers.analysis.weighted import weigh_failures
 from samplers.statistics import raise_log_end
-from tests.samplers.fitted_bases import FittedWithEnsemble, fitted, normal, resampled
+from tests.samplers.fitted_bases import fitted, normal, resampled
 from tests.samplers.fitted_bases import run as run_fitted
 
 BETA = 2.5
@@ -60,19 +62,6 @@ def test_the_comparison_is_strict_and_points_without_a_value_never_count():
     assert ties.p.tolist() == [pytest.approx(result.p), 0.0, 0.0]
     none = compute_exceedance(result, failures, np.full(len(failures.x), -np.inf), [-1e300, 0.0])
     assert none.p.tolist() == [0.0, 0.0]
-
-
-def test_of_plain_draws_one_threshold_has_the_binomial_interval():
-    result = run("mc", max_sim=10_000)
-    curve = curve_of(result, [0.0])
-    assert (curve.low[0], curve.high[0]) == pytest.approx(result.interval)
-
-
-def test_some_points_give_a_wider_band_around_the_same_curve():
-    result = run(max_sim=6_000)
-    every, some = curve_of(result, [3.0]), curve_of(result, [3.0], most=300)
-    assert some.high[0] / some.low[0] > every.high[0] / every.low[0]
-    assert some.p[0] == pytest.approx(every.p[0], rel=0.3)
 
 
 def test_json_and_picture(tmp_path):
@@ -127,25 +116,3 @@ def test_what_refits_do_not_determine_has_an_upper_end_only():
     assert curve_of(run(), [3.0]).base is None
     for few in (fitted(base.refits[:1]), fitted(base.refits, clusters=1)):
         assert curve_of(run_fitted(few), [3.0]).base is None
-
-
-def test_the_further_run_tells_of_refits_that_the_first_does_not_reach():
-    base = fitted([normal(0.0)] * 6 + [normal(7.0, 0.2 + 0.01 * i) for i in range(4)], kind=FittedWithEnsemble)
-    result = run_fitted(base)
-    failures, more = weigh_failures(result), weigh_failures(result.ensemble_run)
-    further = FurtherFailures(more, more.x[:, 0])
-    curve = compute_exceedance(result, failures, failures.x[:, 0], [3.5], further)
-    exact = np.std([stats.norm.logsf(3.5, refit.means[0], refit.sds[0]) for refit in base.refits], ddof=1)
-    assert curve.base.spread[0] == pytest.approx(exact, rel=0.1)
-
-
-def test_the_picture_has_both_bands():
-    from matplotlib.figure import Figure
-
-    curve = curve_of(run_fitted(fitted(resampled(400, 20))), [3.0, 3.25, 3.5])
-    axes = curve.plot(Figure().subplots())
-    labels = [text.get_text() for text in axes.get_legend().get_texts()]
-    assert labels == ["sampling, 95 % of all together", "base distribution, 95 % of all together"]
-    band = axes.collections[1].get_paths()[0].vertices
-    assert band[:, 1].max() == pytest.approx(curve.base.high.max())
-    assert band[:, 1].min() == pytest.approx(curve.base.low.min())

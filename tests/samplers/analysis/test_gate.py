@@ -1,4 +1,4 @@
-"""The gate: its three answers, and how often it is wrong at the limit."""
+"""Decisions by a limit, and plans of further runs."""
 
 from __future__ import annotations
 
@@ -10,7 +10,8 @@ from scipy import stats
 
 import samplers
 from samplers.analysis.base_error import BaseUncertainty
-from samplers.analysis.gate import judge_estimate
+from samplers.analysis.gate import Pilot, judge_estimate, plan_runs
+from samplers.limit_states import half_space
 
 BASE = BaseUncertainty(
     p=1e-4,
@@ -30,8 +31,8 @@ BASE = BaseUncertainty(
 class Known:
     """An estimate that the gate looks at."""
 
-    def __init__(self, base: BaseUncertainty | None = None, warnings: tuple[str, ...] = ()) -> None:
-        self.interval, self.confidence, self.warnings, self.base_uncertainty = (8e-5, 1.2e-4), 0.9, warnings, base
+    def __init__(self, warnings: tuple[str, ...] = ()) -> None:
+        self.interval, self.confidence, self.warnings = (8e-5, 1.2e-4), 0.9, warnings
         self.status, self.base_draws = samplers.Status.CONVERGED, 500
 
 
@@ -51,7 +52,7 @@ class Known:
     ],
 )
 def test_decisions(max_p: float, base: BaseUncertainty | None, given: bool, decision: str) -> None:
-    verdict = judge_estimate(Known(base), max_p, given)
+    verdict = judge_estimate(Known(), max_p, None if given else base)
     assert verdict.decision == decision and bool(verdict) is (decision == "passes")
     assert verdict.confidence == 0.95 and verdict.includes_base is (base is not None and not given)
     assert str(verdict).startswith(decision) and "\n" not in str(verdict)
@@ -59,17 +60,17 @@ def test_decisions(max_p: float, base: BaseUncertainty | None, given: bool, deci
 
 
 def test_a_warning_leaves_it_undecided() -> None:
-    verdict = judge_estimate(Known(warnings=("weights are uneven.",)), 2e-4)
+    verdict = judge_estimate(Known(warnings=("weights are uneven.",)), 2e-4, None)
     assert verdict.decision == "undecided" and "weights are uneven" in str(verdict)
     doubtful = replace(BASE, warnings=("the spread is coarse.",))
-    assert judge_estimate(Known(doubtful), 2e-3).decision == "undecided"
-    assert judge_estimate(Known(doubtful), 2e-4, given_base=True).decision == "passes"
+    assert judge_estimate(Known(), 2e-3, doubtful).decision == "undecided"
+    assert judge_estimate(Known(), 2e-4, None).decision == "passes"
 
 
 @pytest.mark.parametrize("max_p", [0.0, 1.0, -1.0, float("nan"), "low"])
 def test_a_limit_is_a_probability(max_p: float) -> None:
     with pytest.raises(ValueError, match="max_p"):
-        judge_estimate(Known(), max_p)
+        judge_estimate(Known(), max_p, None)
 
 
 def test_it_is_as_often_wrong_as_it_says() -> None:
@@ -97,3 +98,38 @@ def test_no_failure_of_a_search_is_worth_its_base_draws_alone() -> None:
     assert result.p == 0.0 and 0 < result.base_draws
     limit = 1 - 0.05 ** (1 / result.base_draws)
     assert result.meets(1.001 * limit) and not result.meets(0.999 * limit)
+
+
+def pilot(**values: object) -> Pilot:
+    return Pilot(**{"method": "ce", "p": 1e-3, "cov": 0.1, "n_sim": 1000, "final_draws": 400, **values})  # type: ignore[arg-type]
+
+
+def test_a_method_that_goes_on() -> None:
+    own, plain = plan_runs(pilot(seconds=10.0), 0.05)
+    assert (own.method, own.n_sim, own.seconds) == ("ce", 600 + 4 * 400, 22.0)
+    assert (plain.method, plain.n_sim) == ("mc", 399_600)
+    assert plan_runs(pilot(), 0.2)[0].n_sim == 700 and plan_runs(pilot(), 0.2)[0].seconds is None
+
+
+def test_a_method_of_single_runs() -> None:
+    counts = [plan_runs(pilot(final_draws=None), target)[0].n_sim for target in (0.1, 0.09, 0.05, 0.01)]
+    assert counts == [1000, 5000, 5000, 100_000]
+
+
+@pytest.mark.parametrize(
+    ("values", "word"), [({"p": 0.0}, "no failure"), ({"cov": 0.8}, "0.8"), ({"cov": float("nan")}, "nan")]
+)
+def test_what_is_no_pilot(values: dict[str, float], word: str) -> None:
+    with pytest.raises(ValueError, match=word):
+        pilot(**values)
+    with pytest.raises(ValueError, match="target_cov"):
+        plan_runs(pilot(), 0.0)
+
+
+@pytest.mark.parametrize("method", ["mc", "ce", "two-stage"])
+def test_a_plan_is_within_a_factor_of_two(method: str) -> None:
+    problem = half_space(5, 2.0).problem
+    first = samplers.estimate(problem, method, seed=0, max_sim=10_000 if method == "mc" else None)
+    planned = plan_runs(first.pilot(), first.cov / 2)[0]
+    run = samplers.estimate(problem, method, seed=1, target_cov=first.cov / 2)
+    assert 0.5 < planned.n_sim / run.n_sim < 2.0

@@ -1,7 +1,9 @@
+"""Ratios of two probabilities under refits of one base."""
+
 import functools
 import json
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,19 +12,11 @@ from scipy import stats
 import samplers
 from samplers.analysis.base_error import summarise_ratio
 from samplers.analysis.refits import RefitSums
-from tests.samplers.fitted_bases import FittedNormal, FittedWithEnsemble, HalfSpace, fitted, normal, resampled
+from tests.samplers.fitted_bases import FittedWithEnsemble, HalfSpace, fitted, normal, resampled
 
 SHIFTED = [normal(mean) for mean in np.linspace(-0.6, 0.6, 30)]
 FAR = [*SHIFTED[:26], *[normal(7.0, 0.2 + 0.01 * i) for i in range(4)]]
 BASE, FAR_BASE = fitted(SHIFTED), fitted(FAR, FittedWithEnsemble)
-
-
-class TwoFamilies(FittedNormal):
-    """Of 50 refits the last 20 are of a family of their own."""
-
-    @property
-    def refit_families(self):
-        return [0] * 30 + [1] * 20
 
 
 @functools.cache
@@ -53,19 +47,6 @@ def test_the_interval_by_hand():
     assert found.spread == pytest.approx(spread)
 
 
-def test_another_family_of_refits_moves_the_end_on_its_side_alone():
-    """20 refits in which both egos fail alike, of a family of their own, around a ratio of 1 for 4 of the fit itself.
-
-    One spread over all would raise the upper end as well. t is 2.045 for 30 refits and 2.093 for 20.
-    """
-    own, other = math.log(4.0) + np.linspace(-0.3, 0.3, 30), np.linspace(-0.1, 0.1, 20)
-    base = fitted(SHIFTED + SHIFTED[:20], TwoFamilies, clusters=500)
-    sums = RefitSums(np.stack([np.concatenate([own, other]) - 9.0, np.full(50, -9.0)]), np.full((2, 50), 100.0))
-    low, high = summarise_ratio(4.0, 0.1, sums, base, 0.95).interval
-    assert low == pytest.approx(math.exp(-2.093024 * math.sqrt(other.var(ddof=1) + 0.05)))
-    assert high == pytest.approx(4.0 * math.exp(2.045230 * math.sqrt(own.var(ddof=1) + 0.05)))
-
-
 def test_the_ratio_is_known_better_than_either():
     first, second = estimates()
     found = samplers.compute_ratio_uncertainty(first, second)
@@ -93,13 +74,6 @@ def test_two_sides_of_one_run():
     assert json.loads(json.dumps(found.to_dict()))["base_uncertainty"]["ratio_refits"] == list(ratio.ratio_refits)
 
 
-def test_a_comparison_without_refits_says_what_it_did():
-    found = samplers.compare(HalfSpace(normal(), 3.0), HalfSpace(normal(), 3.3), seed=2, max_sim=6000)
-    assert found.base_uncertainty is None
-    assert found.to_dict()["base_uncertainty"] is None
-    assert "base distribution" not in str(found)
-
-
 def test_the_further_run_of_a_comparison_simulates_both():
     rows = []
 
@@ -118,32 +92,6 @@ def test_the_further_run_of_a_comparison_simulates_both():
     forbidden = samplers.compare(Counting(base, 3.0), Counting(base, 3.3), seed=2, max_sim=6000, ensemble_run=False)
     assert forbidden.base_uncertainty.n_sim == 0
     assert "rest on under 10" in forbidden.base_uncertainty.warnings[0]
-
-
-def test_the_further_run_of_a_comparison_is_made_for_the_side_that_lacks_points():
-    """B fails where A does and x_2 >= 1, so p_A / p_B = 1 / Phi(-1) = 6.30 under each refit."""
-
-    class Corner(HalfSpace):
-        def evaluate(self, x):
-            return np.maximum(super().evaluate(x), 1.0 - x[:, 1])
-
-    base = fitted([normal(3.0, 0.5)] * 30, FittedWithEnsemble)
-    a, b = HalfSpace(base, 2.0), Corner(base, 2.0)
-    without = samplers.compare(a, b, "mc", seed=1, max_sim=20_000, ensemble_run=False).base_uncertainty
-    found = samplers.compare(a, b, "mc", seed=1, max_sim=20_000)
-    assert max(without.ess_refits) < 10.0 < min(found.either.base_uncertainty.ess_refits)
-    assert min(found.base_uncertainty.ess_refits) > 1000.0
-    assert found.base_uncertainty.n_sim == 20_000
-    assert np.array(found.base_uncertainty.ratio_refits) == pytest.approx(1 / stats.norm.sf(1.0), rel=0.1)
-    alone = samplers.estimate(a, "mc", seed=1, max_sim=10_000)
-    assert alone.ensemble_run is None  # A by itself needs none
-
-
-def test_two_runs_with_further_runs():
-    first, second = estimates(FAR_BASE)
-    found = samplers.compute_ratio_uncertainty(first, second)
-    assert found.n_sim == first.ensemble_run.n_sim + second.ensemble_run.n_sim
-    assert np.log(found.ratio_refits) == pytest.approx(np.log(exact_ratios(FAR)), abs=0.25)
 
 
 def test_the_interval_of_a_comparison_holds_that_of_its_sampling():
@@ -174,30 +122,6 @@ def test_ratios_that_the_events_do_not_determine():
     unknown = summarise_ratio(2.0, 0.1, RefitSums(log_p, np.full((2, 30), 50.0)), base, 0.95)
     assert unknown.reason.startswith("1 of 30 refits have no density")
     assert math.isnan(unknown.spread)
-
-
-@dataclass(frozen=True, eq=False)
-class WithNoise(FittedNormal):
-    """The same base with a coordinate of noise."""
-
-    def sample(self, n, rng):
-        return np.column_stack([super().sample(n, rng), rng.standard_normal(n)])
-
-    def log_prob(self, x):
-        return super().log_prob(x[:, :2]) + stats.norm.logpdf(x[:, 2])
-
-    def to_standard_normal(self, x):
-        return np.column_stack([super().to_standard_normal(x[:, :2]), x[:, 2]])
-
-    from_standard_normal = to_standard_normal  # N(0, 1): the identity
-
-
-def test_one_of_the_two_may_have_noise_coordinates():
-    plain, _ = estimates()
-    base = WithNoise(np.zeros(1), np.ones(1), refits=tuple(WithNoise(r.means, r.sds) for r in SHIFTED))
-    noisy = samplers.estimate(HalfSpace(base, 3.3, dim=3), seed=2, max_sim=3000)
-    found = samplers.compute_ratio_uncertainty(plain, noisy)
-    assert np.log(found.ratio_refits) == pytest.approx(np.log(exact_ratios(SHIFTED)), abs=0.3)
 
 
 @pytest.mark.parametrize(

@@ -67,33 +67,6 @@ def test_one_threshold_has_the_interval_of_its_own():
     assert band.spread[0] == pytest.approx(np.sqrt(20 / 29))
 
 
-def test_errors_that_are_one_and_the_same_need_no_higher_level():
-    values = np.array([-1.0, 0.0, 1.0] * 10)
-    band = band_of(np.array([-5.0, -7.0]), [values - 5.0, values - 7.0], np.array([1.0, 2.0]))
-    half = 2.045230 * np.sqrt(20 / 29 + 0.04)
-    assert np.log(band.high) == pytest.approx([half - 5.0, half - 7.0])
-
-
-def test_errors_of_two_thresholds_that_are_independent_have_the_level_of_both():
-    """The level of each is sqrt(0.95), whose t quantile with 31 degrees of freedom is 2.36 in place of 2.04."""
-    first, second = np.repeat([-4.0, 4.0], 16), np.tile([-4.0, 4.0], 16)
-    band = band_of(np.array([-25.0, -30.0]), [first - 25.0, second - 30.0], np.array([1.0, 2.0]))
-    level = 0.95**0.5
-    quantile = stats.t.ppf(0.5 + level / 2, 31)
-    half = quantile * np.sqrt(16 * 32 / 31 + 0.04)
-    assert np.log(band.high) == pytest.approx([half - 25.0, half - 30.0], rel=0.02)
-
-
-def test_the_distance_between_families_does_not_correlate_thresholds():
-    """Both thresholds have families 9 apart, and independent errors within them."""
-    first, second = np.tile(np.repeat([-1.0, 1.0], 8), 2), np.tile([-1.0, 1.0], 16)
-    shift, family_of = np.repeat([0.0, -9.0], 16), np.repeat([0, 1], 16)
-    log_p = np.array([-5.0, -7.0])
-    apart = band_of(log_p, [first + shift - 5.0, second + shift - 7.0], np.array([1.0, 2.0]), family_of)
-    alone = band_of(log_p, [first[:16] - 5.0, second[:16] - 7.0], np.array([1.0, 2.0]))
-    assert apart.high == pytest.approx(alone.high, rel=0.01)
-
-
 def test_both_ends_fall_and_a_threshold_without_a_spread_takes_those_beside_it():
     values = np.array([-1.0, 0.0, 1.0] * 10)
     log_p = np.array([-7.0, -5.0, -7.5, -6.0])  # at thresholds 3, 1, 4, 2

@@ -1,5 +1,8 @@
+"""Refits of a fitted base: p under each, further runs."""
+
 import math
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -7,17 +10,18 @@ from scipy import stats
 
 import samplers
 from samplers.analysis.refits import (
-    RefitSums,
-    are_uncovered,
     check_refits,
+    expect_over_families,
     find_fitted_base,
+    find_log_ends,
     needs_ensemble_run,
     pool_refits,
+    read_refit_families,
     refit_log_ratios,
     reweight_to_refits,
+    split_families,
 )
-from samplers.analysis.reweight import find_sibling
-from tests.samplers.fitted_bases import BETA, FittedWithEnsemble, HalfSpace, fitted, normal, resampled, run
+from tests.samplers.fitted_bases import FittedWithEnsemble, HalfSpace, fitted, normal, resampled, run
 
 
 def test_only_a_base_with_refits_is_fitted():
@@ -37,12 +41,6 @@ def test_p_of_each_refit_is_the_exact_one(method):
     assert (sums.ess > 10).all()
     assert (errors < 4 * (1 / np.sqrt(sums.ess[0]) + result.cov)).all()
     assert errors.mean() < 0.3
-
-
-def test_refits_equal_to_the_base_give_its_p():
-    base = fitted([normal()] * 3)
-    result = run(base)
-    assert np.exp(reweight_to_refits(result, base.refits).log_p) == pytest.approx(np.full((1, 3), result.p))
 
 
 def test_the_sum_by_hand_of_plain_draws():
@@ -84,16 +82,6 @@ def test_densities_far_below_the_smallest_float_keep_their_logarithm():
     x = result.sample.x
     terms = far.log_prob(x) - normal().log_prob(x)
     assert log_p == pytest.approx(terms.max() + np.log(np.exp(terms - terms.max()).sum()) - math.log(20_000))
-
-
-def test_points_reach_the_refits_or_not():
-    def sums(*ess, log_p=-5.0):
-        return RefitSums(np.full((1, len(ess)), log_p), np.array([ess], dtype=float))
-
-    assert not are_uncovered(sums(*[100] * 27, 9, 9, 9))
-    assert are_uncovered(sums(*[100] * 26, 9, 9, 9, 9))
-    assert not are_uncovered(sums(10, 10))
-    assert are_uncovered(sums(*[100] * 30, log_p=-np.inf))
 
 
 def test_the_decision_needs_points_and_an_ensemble():
@@ -212,20 +200,6 @@ def test_what_cannot_be_reweighted_says_so():
         reweight_to_refits(replace(run(base), base=None), base.refits)
 
 
-def test_siblings_by_name():
-    base = fitted(others={"i80": normal(0.1)})
-    assert find_sibling(base, "i80") is base.others["i80"]
-    with pytest.raises(ValueError, match="got 'i81'"):
-        find_sibling(base, "i81")
-    with pytest.raises(ValueError, match=r"knows no others by name.*'i80'"):
-        find_sibling(samplers.StandardNormal(2), "i80")
-    result = run(base)
-    assert result.under("i80").p == result.reweight(normal(0.1)).p == result.under(normal(0.1)).p
-    assert result.under("i80").p == pytest.approx(stats.norm.sf(BETA - 0.1), rel=0.1)
-    with pytest.raises(ValueError, match="Estimate again with the new base"):
-        result.under(normal(12.0, 0.2))
-
-
 class CountedRefit:
     """A refit that counts how often its density is asked for."""
 
@@ -251,21 +225,53 @@ def test_density_ratios_are_computed_once_for_a_run():
     assert [refit.calls for refit in base.refits] == [2, 2, 2]
 
 
-class TogetherRefits(tuple):
-    """Refits whose densities are given together."""
-
-    calls = 0
-
-    def log_probs(self, x):
-        self.calls += 1
-        return np.array([refit.log_prob(x) for refit in self])
+OWN = np.array([-1.0, 0.0, 1.0] * 20)
+"""60 refits around 0, variance 40 / 59."""
+T = {4: 2.776445, 11: 2.200985, 59: 2.000995, 64: 1.997730}
+"""97.5 % points of Student's t from a table."""
 
 
-def test_densities_may_be_given_together():
-    estimate = samplers.estimate(HalfSpace(fitted([normal()])), seed=1, max_sim=3000)
-    one_by_one = [normal(-0.2), normal(0.3)]
-    together = TogetherRefits(one_by_one)
-    known = refit_log_ratios(estimate, one_by_one)
-    assert np.array_equal(refit_log_ratios(estimate, together), known)
-    refit_log_ratios(estimate, together)
-    assert together.calls == 1
+def ends_of(log_p, values, family_of, other_variance=0.0, clusters=1000):
+    return find_log_ends(split_families(log_p, values, family_of), other_variance, 0.95, clusters)
+
+
+def test_one_family_has_the_interval_around_p_itself():
+    half = T[59] * np.sqrt(40 / 59 + 0.04)
+    assert ends_of(0.3, OWN, np.zeros(60, dtype=int), 0.04) == pytest.approx((0.3 - half, 0.3 + half))
+
+
+@pytest.mark.parametrize(("shift", "end"), [(-8.0, 0), (8.0, 1)])
+def test_another_family_moves_the_end_on_its_side_alone(shift, end):
+    """12 refits of its own around its mean: variance 8 / 11, and 11 degrees of freedom."""
+    values = np.concatenate([OWN, shift + OWN[:12]])
+    wanted = np.array([-1.0, 1.0]) * T[59] * np.sqrt(40 / 59)
+    wanted[end] = shift + np.sign(shift) * T[11] * np.sqrt(8 / 11)
+    assert ends_of(0.0, values, np.repeat([0, 3], [60, 12])) == pytest.approx(tuple(wanted))
+
+
+def test_a_family_of_few_refits_takes_the_pooled_spread_and_one_of_hardly_any_none():
+    values = np.concatenate([OWN, 5.0 + OWN[:6], [90.0]])
+    family_of = np.repeat([0, 1, 2], [60, 6, 1])
+    pooled = (40 + 4) / (67 - 3)
+    low, high = ends_of(0.0, values, family_of)
+    assert low == pytest.approx(-T[59] * np.sqrt(40 / 59))
+    assert high == pytest.approx(5.0 + T[64] * np.sqrt(pooled))
+
+
+def test_what_two_families_expect_by_hand():
+    """60 refits around log 0.01 and 30 around log 1e-5, of variances 40 / 59 and 20 / 29.
+
+    2 / 3 of 0.01 exp(20 / 59) = 0.014035 and 1 / 3 of 1e-5 exp(10 / 29) = 1.412e-5. The spread over all, 3.4, would
+    have made exp(5.7) = 290 times p of it.
+    """
+    values = np.concatenate([np.log(0.01) + OWN, np.log(1e-5) + OWN[:30]])
+    assert values.std(ddof=1) == pytest.approx(3.38, abs=0.01)
+    families = split_families(np.log(0.01), values, np.repeat([0, 1], [60, 30]))
+    assert expect_over_families(families) == pytest.approx(0.014035 * 2 / 3 + 1.412e-5 / 3, rel=1e-3)
+
+
+def test_a_base_may_know_no_families_and_must_know_all():
+    assert read_refit_families(object(), 3).tolist() == [0, 0, 0]
+    assert read_refit_families(SimpleNamespace(refit_families=(0, 1, 1)), 3).tolist() == [0, 1, 1]
+    with pytest.raises(ValueError, match="one family for each of 3 refits"):
+        read_refit_families(SimpleNamespace(refit_families=(0, 1)), 3)

@@ -1,12 +1,9 @@
-"""The choice of a method."""
-
-import inspect
+"""The default: which method it takes, and that nothing else changes."""
 
 import numpy as np
 import pytest
 
 import samplers
-from rare_envs.study import Question
 from samplers.execution.arguments import InputsOnly
 from samplers.limit_states import half_space
 from samplers.method import Goal, TermsOffer
@@ -60,19 +57,6 @@ def test_the_result_is_that_of_the_method_chosen(max_sim, name):
     assert samplers.estimate(problem, name, seed=4, max_sim=max_sim).choice == ""
 
 
-def test_replicates_share_the_budget_before_the_choice():
-    result = samplers.estimate(half_space(2, 3.0).problem, "auto", seed=4, max_sim=1500, replicates=3)
-    assert result.method.name == "surrogate"
-
-
-def test_steps_are_those_of_the_method_chosen():
-    """For callers that drive a method by themselves."""
-    problem = half_space(2, 3.0).problem
-    goal = Goal(gamma=0.0, max_sim=300)
-    first = [next(m.steps(problem, goal, np.random.default_rng(1))) for m in (samplers.Auto(), samplers.Surrogate())]
-    np.testing.assert_array_equal(*first)
-
-
 def test_a_search_by_terms_is_named():
     """Two coordinates are searched and 100 are noise: with terms and 1,000 simulations that is a search by terms."""
 
@@ -82,12 +66,6 @@ def test_a_search_by_terms_is_named():
     for offer, expected in ((None, "two-stage"), (TermsOffer(gradient_cost=5.0), "two-stage by terms")):
         inputs = InputsOnly(102, Base(102), offer)
         assert samplers.Auto().choose(inputs, Goal(gamma=0.0, max_sim=1000)).why.startswith(f"{expected}: 1,000")
-
-
-def test_it_is_the_default_of_whatever_takes_a_method():
-    for function in (samplers.estimate, samplers.compare):
-        assert inspect.signature(function).parameters["method"].default == samplers.Auto()
-    assert Question(env_id="rare_envs/CutIn-v0").method == "auto"
 
 
 def test_a_run_goes_on_from_its_journal_in_chunks_and_by_ask_and_tell(tmp_path, recorder):

@@ -1,3 +1,5 @@
+"""Importance sampling by exponential tilting."""
+
 import math
 
 import numpy as np
@@ -5,11 +7,9 @@ import pytest
 from scipy import stats
 
 import samplers
-from samplers.importance import Round, Search, round_record
 from samplers.limit_states import four_branches, half_space, parabola, plateau
 from samplers.method import Goal
-from samplers.methods.importance_sampling import unreached_share
-from samplers.problem import FunctionProblem, StandardNormal
+from samplers.problem import StandardNormal
 from samplers.proposals import TiltedNormal
 from samplers.trace import Status
 
@@ -54,57 +54,12 @@ def test_stops_at_the_relative_half_width():
     assert aimed.cov <= 0.02
 
 
-def test_says_where_the_draws_did_not_suffice():
-    result = samplers.estimate(half_space().problem, IS(half_width=0.01), seed=1, max_sim=4000)
-    assert (result.n_sim, result.status) == (4000, "budget")
-    assert any("All draws were used" in text for text in result.remarks) and not result.warnings
-
-
-def test_an_unmet_target_is_said_once_and_as_of_all_methods():
-    result = samplers.estimate(half_space().problem, IS(), seed=1, max_sim=4000, target_cov=0.01)
-    assert result.status == "budget"
-    assert [text for text in result.remarks if "c.o.v." in text] == list(result.remarks[-1:])
-    assert result.remarks[-1].startswith("The target c.o.v. 0.01 was not met: 0.0") and not result.warnings
-
-
 @pytest.mark.parametrize("reference", [four_branches(3.0)], ids=lambda r: r.name)
 def test_base_draws_where_one_tilt_does_not_serve(study, reference):
     """A tilt towards one branch would miss the others and say nothing."""
     found = study(reference, IS(), 20)
     assert all(any("draws from the base distribution replace it" in text for text in r.warnings) for r in found.results)
     assert found.covered >= 16
-
-
-def test_share_of_points_where_the_tilt_does_not_lead(rng):
-    """Half of two opposite regions, nothing of one region."""
-    u = rng.standard_normal((4000, 2))
-    f = 1.5 - abs(u[:, 0])  # two regions
-    first = Round(StandardNormal(2), TiltedNormal(np.zeros(2)), u, f)
-    search = Search([first], [round_record(0.0, 4000, np.zeros((first.f <= 0).sum()))], Status.CONVERGED)
-    inputs = FunctionProblem(lambda x: 1.5 - abs(x[:, 0]), 2)
-    assert unreached_share(search, np.array([2.0, 0.0]), inputs, 0.0) == pytest.approx(0.5, abs=0.06)
-    one = first._replace(f=1.5 - u[:, 0])
-    search = Search([one], [round_record(0.0, 4000, np.zeros((one.f <= 0).sum()))], Status.CONVERGED)
-    assert unreached_share(search, np.array([2.0, 0.0]), inputs, 0.0) == 0
-
-
-@pytest.mark.parametrize("at", [1, 2, 3, 4, 5, 6])
-def test_interrupted_anywhere_it_answers_from_what_was_simulated(drive, at):
-    problem = half_space().problem
-    steps = IS(half_width=0.01).steps(problem, Goal(gamma=0.0), np.random.default_rng(2))
-    outcome, f = drive(steps, problem, interrupt_at=at)
-    assert outcome.status is Status.STOPPED
-    assert sum(level.n_sim for level in outcome.trace) == len(f)
-    assert outcome.interval[0] <= half_space().p <= outcome.interval[1]
-    sample = outcome.sample
-    assert sample.weights[sample.f <= 0].sum() == pytest.approx(outcome.p)
-
-
-@pytest.mark.parametrize("dim", [1, 1500])
-def test_any_number_of_dimensions(dim):
-    reference = half_space(dim, 2.5)
-    result = samplers.estimate(reference.problem, IS(), seed=1, max_sim=5000)
-    assert result.interval[0] <= reference.p <= result.interval[1]
 
 
 @pytest.mark.parametrize(

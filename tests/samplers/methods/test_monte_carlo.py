@@ -1,8 +1,14 @@
+"""Plain Monte Carlo, and what it keeps of long runs."""
+
+from __future__ import annotations
+
 import numpy as np
 import pytest
 
 import samplers
 from samplers.limit_states import half_space
+from samplers.methods import monte_carlo as kept_draws
+from samplers.methods.monte_carlo import KeptDraws
 
 EASY = half_space(2, beta=1.5)
 
@@ -28,18 +34,6 @@ def test_says_when_the_target_was_missed():
     result = samplers.estimate(EASY.problem, "mc", seed=1, target_cov=0.01, max_sim=3000)
     assert result.status == "budget"
     assert any("target" in text for text in result.remarks)
-
-
-def test_without_max_sim_n_is_the_limit():
-    result = samplers.estimate(EASY.problem, samplers.MonteCarlo(n=2000), seed=1, target_cov=0.01)
-    assert result.n_sim == 2000
-    assert result.status == "budget"
-
-
-def test_few_hits_are_worth_a_warning():
-    result = samplers.estimate(EASY.problem, "mc", seed=2, max_sim=30)
-    assert 0 < result.failures.total < 5
-    assert "coarse" in result.warnings[0]
 
 
 def test_draws_from_the_base_itself():
@@ -75,7 +69,30 @@ def test_gives_all_its_draws_with_equal_weight(recorder):
     np.testing.assert_array_equal(sample.x, f.points[sample.f <= 0])
 
 
-def test_the_papers_stop_at_a_relative_half_width_of_a_fifth():
-    result = samplers.estimate(EASY.problem, samplers.MonteCarlo(batch=100), seed=1, target_cov=0.102)
-    half_width = (result.interval[1] - result.interval[0]) / 2
-    assert half_width / result.p == pytest.approx(0.2, rel=0.05)
+def test_thinned_draws_keep_p_and_match_failing_points_with_their_f(rng: np.random.Generator) -> None:
+    x = rng.standard_normal((1000, 2))
+    f = np.where(x[:, 1] > 1.5, -np.inf, x[:, 0])
+    draws = KeptDraws(-0.5, 2, most=100, most_failing=30)
+    for first in range(0, 1000, 90):
+        draws.add(x[first : first + 90], f[first : first + 90])
+    sample, fails = draws.to_sample(), f <= -0.5
+    failing = sample.f <= -0.5
+    assert np.isclose(sample.weights[failing].sum(), fails.mean(), rtol=1e-12)
+    assert np.isclose(sample.weights.sum(), 1.0, rtol=1e-12)
+    assert len(sample.f) <= 130 and failing.sum() <= 30
+    stride = len(x[fails]) // failing.sum() + 1
+    expected = x[fails][::stride]
+    assert np.array_equal(sample.x, expected) and np.array_equal(sample.f[failing], f[fails][::stride])
+    assert draws.no_outcome_share == np.isneginf(f[fails]).mean()
+
+
+def test_memory_does_not_grow_with_the_draws() -> None:
+    draws = KeptDraws(0.0, 1)
+    zeros, x = np.zeros(100_000), np.zeros((100_000, 1))
+    for _ in range(40):  # 4e6 draws, half of them failing
+        zeros[::2] = 1.0
+        draws.add(x, zeros)
+    kept = sum(part.nbytes for rows in (draws._f, draws._x, draws._f_failing) for part in rows._parts)
+    limit = 8 * kept_draws.MOST_DRAWS + 2 * kept_draws.MOST_FAILING_BYTES
+    assert kept <= limit
+    assert len(draws.to_sample().f) < 2 * kept_draws.MOST_DRAWS + kept_draws.MOST_FAILING_BYTES // 8

@@ -1,3 +1,5 @@
+"""Coordinates of noise are drawn, not searched."""
+
 import dataclasses
 
 import numpy as np
@@ -6,7 +8,7 @@ from scipy import stats
 
 import samplers
 from samplers.limit_states import Reference
-from samplers.methods.noise_coordinates import marginalise_noise, noise_mask
+from samplers.methods.noise_coordinates import marginalise_noise
 from samplers.problem import FunctionProblem, StandardNormal
 
 PHI = stats.norm.cdf
@@ -72,13 +74,6 @@ def test_failures_replay_and_their_noise_is_noise():
     assert np.all(np.abs(size - 1) < 6 * np.sqrt(2 / 300))
 
 
-def test_the_same_seed_gives_the_same_noise_and_another_another():
-    f, _ = PROBLEMS["noise beside a parameter"]
-    first, again, other = (samplers.estimate(problem(f), seed=seed, max_sim=1500) for seed in (1, 1, 2))
-    assert first.p == again.p != other.p
-    np.testing.assert_array_equal(first.failures[0].x, again.failures[0].x)
-
-
 def test_points_keep_their_noise():
     inputs = marginalise_noise(problem(sum_of), np.random.default_rng(0))
     assert inputs.dim == 3
@@ -89,15 +84,6 @@ def test_points_keep_their_noise():
     assert np.abs(again[3:, 3:] - x[:, 3:]).min(axis=0).max() > 0
     np.testing.assert_array_equal(inputs.base.to_standard_normal(x), u)
     assert inputs.base.sample(4, np.random.default_rng(2)).shape == (4, 303)
-
-
-def test_inputs_without_noise_are_searched_as_they_are():
-    plain, rng = FunctionProblem(sum_of, 303), np.random.default_rng(0)
-    assert marginalise_noise(plain, rng) is plain
-    assert not noise_mask(plain).any()
-    all_noise = problem_with_noise(sum_of, 303, first=0)
-    assert marginalise_noise(all_noise, rng) is all_noise
-    assert rng.random() == np.random.default_rng(0).random()  # no number was drawn
 
 
 @pytest.mark.slow

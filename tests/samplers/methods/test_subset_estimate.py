@@ -1,11 +1,10 @@
-"""Estimate of subset simulation: shares, c.o.v., intervals."""
+"""The estimate from levels: p, its c.o.v. by chains and by descent."""
 
 import math
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy import stats
 
 import samplers
 from samplers.limit_states import half_space
@@ -14,8 +13,6 @@ from samplers.method import Goal
 from samplers.methods.subset import (
     LevelProduct,
     descent_cov,
-    effective_roots,
-    include_level,
     level_record,
     multiply_levels,
     summarise,
@@ -45,40 +42,12 @@ def test_p_is_the_product_of_true_shares():
     assert result.trace[-1].gamma == 0.0
 
 
-def test_level_zero_is_part_of_the_cov():
-    result = run(half_space(2, -stats.norm.ppf(0.03)).problem)
-    zero, last = result.trace
-    assert zero.cov == pytest.approx(math.sqrt(0.9 / (0.1 * 1000)))
-    both = math.sqrt((1 + zero.cov**2) * (1 + last.cov**2) - 1)
-    assert result.cov >= both * (1 - 1e-12)
-    assert include_level(LevelProduct(), zero).cov == pytest.approx(zero.cov)
-
-
 def test_chain_correlation_is_in_the_cov_of_a_level():
     """Chains that never leave their side are worth one point each."""
     level = level_record(frozen(100, 10), 0.0, LevelProduct())
     assert level.p == 0.1
     assert level.ess == pytest.approx(100)
     assert level.cov == pytest.approx(math.sqrt(0.9 / (0.1 * 100)))
-
-
-def test_chains_are_kept_apart_end_to_end():
-    """Real chains are correlated: gamma is well above 0; it would vanish with mixed chains."""
-    ess = [level.ess for seed in range(20) for level in run(half_space().problem, seed).trace[1:]]
-    assert 200 < np.mean(ess) < 600
-
-
-def test_descent_cov():
-    """All descendants of one point: worth one point. One each: binomial."""
-    assert descent_cov(np.full(50, 7), 1000) == pytest.approx(math.sqrt(1 - 1 / 1000))
-    assert descent_cov(np.arange(100), 1000) == pytest.approx(math.sqrt(0.9 / (0.1 * 1000)))
-    assert math.isinf(descent_cov(np.empty(0, dtype=int), 1000))
-
-
-def test_effective_roots():
-    assert effective_roots(np.full(50, 7)) == 1
-    assert effective_roots(np.arange(100)) == 100
-    assert effective_roots(np.array([1, 1, 4, 9])) == pytest.approx(16 / 6)
 
 
 def test_cov_is_the_larger_of_chain_correlation_and_descent():
@@ -119,9 +88,3 @@ def test_no_failure_from_one_path_excludes_nothing():
         result = samplers.estimate(FunctionProblem(f, 2), ADSS(max_levels=6), seed=seed)
         assert result.p == 0
         assert result.interval[1] > 0.01
-
-
-def test_no_chains_no_acceptance():
-    trace = run(half_space().problem).trace
-    assert trace[0].acceptance is None
-    assert all(0 < level.acceptance < 1 for level in trace[1:])

@@ -241,14 +241,7 @@ class CombinedRounds:
         )
 
     def interval(self, confidence: float, base_share: float, cov: float, ceiling: float) -> tuple[float, float]:
-        """Return the log-normal interval; with t quantiles and Bernstein's bound where few draws carry p.
-
-        Args:
-            confidence: Nominal coverage.
-            base_share: Share of base draws in every round.
-            cov: C.o.v. of p.
-            ceiling: Upper end of p by base draws; it stands in for Bernstein's bound where that is larger.
-        """
+        """Return the log-normal interval; with t quantiles and Bernstein's bound where few draws carry p."""
         factors = self.shares / np.array([len(one.log_weights) for one in self.rounds])
         largest = float(factors.max() * sum(len(one.log_weights) for one in self.rounds)) / base_share
         return weighted_interval(self.draws, confidence, largest, cov, ceiling)

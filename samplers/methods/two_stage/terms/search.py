@@ -158,16 +158,7 @@ def search_terms(
     rng: np.random.Generator,
     settings: TermSettings = DEFAULT_TERM_SETTINGS,
 ) -> Steps:
-    """Estimate P[f(X) <= goal.gamma] by terms and their gradients.
-
-    Args:
-        inputs: Dimension and base distribution.
-        offer: Terms and gradients, see `suits_terms`.
-        goal: Threshold, confidence, target and budget.
-        budget: Simulations to plan for.
-        rng: Source of randomness.
-        settings: Of all stages.
-    """
+    """Estimate P[f(X) <= goal.gamma] by terms and their gradients."""
     rounds = settings.rounds
     open_ended = goal.max_sim is None and goal.target_cov is not None
     end = budget + rounds.max_batches * rounds.target_batch if open_ended else budget

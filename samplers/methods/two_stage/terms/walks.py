@@ -253,15 +253,7 @@ def choose_terms(terms: Terms, settings: WalkSettings) -> tuple[list[int], list[
 
 
 def count_walks(n_main: int, n_others: int, budget: int, step: float, settings: WalkSettings) -> tuple[int, int]:
-    """Return the walks of each main term, and how many other terms are scouted, so that all can make two steps.
-
-    Args:
-        n_main: Main terms.
-        n_others: Other terms.
-        budget: Simulations of the run.
-        step: Simulations that a step takes at most, its gradient included.
-        settings: Of the walks.
-    """
+    """Return the walks of each main term, and how many other terms are scouted, so that all can make two steps."""
     affordable = int(settings.budget_share * budget / (MIN_WALK_STEPS * step))
     walkers = settings.walkers * min(1.0, budget / settings.usual_budget)
     wanted = int(np.clip(walkers / max(n_main, 1), settings.min_walkers, settings.max_walkers))

@@ -1,0 +1,132 @@
+"""Importance of columns, derivatives by parameters, shares of the spread over refits."""
+
+import numpy as np
+import pytest
+from scipy import stats
+
+import samplers
+from tests.samplers.analysis.sensitivity.parametric_normal import (
+    ALPHA,
+    BASE,
+    BETA,
+    HAZARD,
+    ParametricNormal,
+    fitted,
+    run,
+)
+
+
+@pytest.fixture(scope="module")
+def result():
+    return run(max_sim=6000)
+
+
+def test_importance_of_a_half_space_is_the_squared_direction(result):
+    """D_j of the half-space in closed form from mean alpha_j h and variance 1 - alpha_j^2 h (h - beta)."""
+    mean = ALPHA * HAZARD
+    variance = 1 - ALPHA**2 * HAZARD * (HAZARD - BETA)
+    exact = (mean**2 + variance - 1 - np.log(variance)) / 2 / -np.log(stats.norm.sf(BETA))
+    for each in result.sensitivity().columns:
+        j = int(each.name[1]) - 1
+        assert each.importance == pytest.approx(exact[j], abs=4 * each.error + 0.003)
+        assert each.direction == pytest.approx(mean[j], abs=0.15)
+    assert sum(each.importance for each in result.sensitivity().columns) < 1.0
+    far = stats.norm.pdf(8.0) / stats.norm.sf(8.0)
+    assert (0.64 * far**2) / 2 / -stats.norm.logsf(8.0) == pytest.approx(0.64, abs=0.06)  # the limit alpha_j^2
+
+
+def test_columns_of_a_block_count_together(result):
+    blocks = {each.name: each for each in result.sensitivity(["a", "rest"], [1, 2]).columns}
+    alone = {each.name: each for each in result.sensitivity().columns}
+    joint = alone["x2"].importance + alone["x3"].importance
+    assert blocks["a"].importance == pytest.approx(alone["x1"].importance)
+    assert blocks["rest"].importance == pytest.approx(joint, abs=0.003)
+    assert blocks["rest"].direction > 0
+
+
+def test_irrelevant_noise_has_no_importance():
+    """300 columns of noise: without the correction of the bias their block would have most of it."""
+    base = samplers.StandardNormal(302)
+    problem = samplers.FunctionProblem(lambda x: 3.0 - x[:, 0], 302)
+    problem = type("P", (), {"dim": 302, "base": base, "evaluate": staticmethod(problem.evaluate)})()
+    found = samplers.estimate(problem, "mc", seed=0, max_sim=200_000).sensitivity(["x", "noise"], [2, 300])
+    importance = {each.name: each.importance for each in found.columns}
+    assert importance["x"] > 0.6
+    assert importance["noise"] < 0.05
+
+
+def test_a_single_failing_point_says_so():
+    problem = samplers.FunctionProblem(lambda x: 3.0 - x[:, 0], dim=2)
+    result = samplers.estimate(problem, "mc", seed=0, max_sim=1000)
+    assert result.failures.total == 1
+    with pytest.raises(ValueError, match="A single point failed"):
+        result.sensitivity()
+
+
+@pytest.mark.parametrize("method", ["two-stage", "mc", "is", "ce", "adss"])
+def test_derivatives_are_those_of_the_half_space(method):
+    """By a mean, per standard deviation: alpha_j h with h = phi / Phi(-); by a sd, per 10 %: 0.1 alpha_j^2 beta h."""
+    found = run(method=method, max_sim=60_000 if method == "mc" else 6000).sensitivity()
+    expected = dict(
+        zip(
+            [each.name for each in BASE.parameters()],
+            [*(ALPHA * HAZARD), *(0.1 * ALPHA**2 * BETA * HAZARD)],
+            strict=True,
+        )
+    )
+    for each in found.parameters:
+        assert each.d_log_p == pytest.approx(expected[each.name], abs=4 * each.error + 1e-6)
+        assert 0 < each.error < 0.5
+
+
+def test_standard_errors_are_those_of_repetitions():
+    """The spread of 30 runs over the stated error: 1 within the error of 30 draws."""
+    found = [
+        {each.name: each for each in run(method="is", seed=seed, max_sim=1500).sensitivity().parameters}
+        for seed in range(30)
+    ]
+    for j, name in enumerate(("mean of x1", "mean of x3")):
+        z = np.array([(each[name].d_log_p - (ALPHA * HAZARD)[2 * j]) / each[name].error for each in found])
+        assert abs(z.mean()) < 4 / np.sqrt(30)
+        assert 0.6 < z.std() < 1.5
+
+
+def test_derivatives_agree_with_finite_differences_of_common_draws(result):
+    """The same failing points under bases to both sides: no error of sampling between the two."""
+    parameters = BASE.parameters()
+    values = np.array([each.value for each in parameters])
+    derivatives = {each.name: each.d_log_p for each in result.sensitivity().parameters}
+    for i, each in enumerate(parameters):
+        step = np.zeros(len(values))
+        step[i] = 1e-3 * each.change
+        up, down = (result.reweight(BASE.with_parameters(values + sign * step)).p for sign in (1, -1))
+        assert derivatives[each.name] == pytest.approx((np.log(up) - np.log(down)) / 2e-3, abs=1e-3)
+
+
+def test_shares_of_the_spread_add_up_and_name_what_varies():
+    """Var of g_i delta_i: (0.8 h 0.3)^2 by the mean and (0.1 x 0.36 beta h)^2 by the sd."""
+    found = run(fitted(200), max_sim=6000).sensitivity(["speed", "gap", "offset"])
+    shares = {each.name: each.share for each in found.parameters}
+    assert sum(shares.values()) == pytest.approx(1.0)
+    one, two = (0.8 * HAZARD * 0.3) ** 2, (0.1 * 0.36 * BETA * HAZARD) ** 2
+    assert shares["mean of speed"] == pytest.approx(one / (one + two), abs=0.08)
+    assert sum(found.shares.values()) == pytest.approx(1.0)
+    assert next(iter(found.shares)) == "speed"
+    assert found.parameters[0].name == "mean of speed"
+    assert found.correlation > 0.97
+    assert found.first_order_spread == pytest.approx(found.spread, rel=0.15)
+    assert "more recordings of speed would narrow the interval most" in str(found)
+
+
+def test_without_comparable_refits_there_are_no_shares(result):
+    assert result.sensitivity().shares == {}
+    assert "no refits" in str(result.sensitivity())
+    base = fitted(15)
+    for refit in base.refits[:8]:
+        refit.parameters = lambda names=(), like=None: []
+    found = run(base).sensitivity()
+    assert (found.shares, found.n_refits) == ({}, (7, 15))
+    assert found.reason == "only 7 of 15 refits have the parameters of the base, so that no share is known"
+    same = fitted(12)
+    same.refits = (ParametricNormal(BASE.mean, BASE.sd),) * 12
+    assert "does not differ" in run(same).sensitivity().reason

@@ -1,0 +1,237 @@
+"""Intervals that the events behind a fitted base allow: of p, of a ratio, of a curve."""
+
+import json
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy import stats
+
+import samplers
+from samplers.analysis.refits import reweight_runs_to_refits
+from tests.samplers.fitted_bases import (
+    BETA,
+    FittedWithEnsemble,
+    HalfSpace,
+    fitted,
+    normal,
+    run,
+)
+
+WIDE = [normal(mean, sd) for mean in np.linspace(-2.0, 2.0, 6) for sd in (0.5, 0.75, 1.0, 1.5, 2.0)]
+"""30 refits so far apart that the events determine nothing."""
+SHIFTED = [normal(mean) for mean in np.linspace(-0.6, 0.6, 30)]
+"""30 refits with a spread of log p of about 1.2."""
+FAR = [*SHIFTED[:26], *[normal(7.0, 0.2 + 0.01 * i) for i in range(4)]]
+"""The same with four that no point of a run under N(0, 1) reaches."""
+BASE, FAR_BASE = fitted(SHIFTED), fitted(FAR, FittedWithEnsemble)
+
+
+def after(result, lineages):
+    """Return a result as if so many independent searches had found its failures; inf for plain draws."""
+    return replace(result, sample=replace(result.sample, lineages=lineages))
+
+
+def test_the_interval_by_hand():
+    """30 refits of 17 scenes: 16 degrees of freedom; t = 2.120. Plain draws miss no region."""
+    result = after(run(BASE), math.inf)
+    found = result.base_uncertainty
+    spread = np.std(np.log(found.p_refits), ddof=1)
+    half = 2.119905 * math.sqrt(spread**2 + result.cov**2 + 0.04)
+    assert found.interval == pytest.approx((result.p * math.exp(-half), result.p * math.exp(half)), rel=1e-6)
+    assert found.expected == pytest.approx(result.p * math.exp(spread**2 / 2))
+    assert found.spread == pytest.approx(spread)
+    assert (found.p, found.bound, found.reason, found.n_sim) == (result.p, None, "", 0)
+    exact = np.log([refit.p for refit in SHIFTED])
+    assert found.spread == pytest.approx(exact.std(ddof=1), rel=0.05)
+    assert np.log(found.p_refits) == pytest.approx(exact, abs=0.3)
+
+
+def test_the_upper_end_holds_what_a_search_may_have_missed():
+    """97.5 % point of p exp(S T) / (1 - M), M ~ Beta(1/10, lineages); the other numbers do not change."""
+    without, found = (after(run(BASE), lineages).base_uncertainty for lineages in (math.inf, 3.0))
+    assert (found.interval[0], found.spread, found.expected) == (without.interval[0], without.spread, without.expected)
+    rng = np.random.default_rng(0)
+    sigma = math.log(without.interval[1] / without.p) / stats.norm.ppf(0.975)
+    drawn = sigma * rng.standard_normal(10**6) - np.log1p(-rng.beta(0.1, 3.0, 10**6))
+    assert np.quantile(drawn, 0.975) > math.log(without.interval[1] / without.p) + 0.03
+    assert math.log(found.interval[1] / found.p) == pytest.approx(np.quantile(drawn, 0.975), abs=0.02)
+
+
+def test_events_that_do_not_determine_p_give_a_bound_and_no_interval():
+    result = run(fitted(WIDE))
+    found = result.base_uncertainty
+    assert found.spread > 2
+    assert found.interval is found.expected is None
+    half = 2.119905 * math.sqrt(found.spread**2 + result.cov**2 + 0.04)
+    assert found.bound == pytest.approx(min(1.0, result.p * math.exp(half)), rel=1e-6)
+    assert "the events do not determine p; nor an upper end in this family" in str(result)
+    assert "predictive mean" not in str(result)
+    assert "do not determine p; below 1.0e-02 in this family" in str(replace(found, bound=0.01))
+
+
+def test_the_upper_end_stays_below_one():
+    base = fitted([normal(mean) for mean in np.linspace(-2.0, 2.0, 30)])
+    found = samplers.estimate(HalfSpace(base, 1.0), "mc", seed=0, max_sim=20_000).base_uncertainty
+    assert found.interval[1] == 1.0
+    assert max(found.p_refits) <= 1.0
+    assert found.expected <= 1.0
+
+
+def test_a_base_without_refits_prints_what_it_did():
+    plain, fitted_run = run(normal()), run(BASE)
+    assert plain.base_uncertainty is run(fitted()).base_uncertainty is None
+    assert plain.to_dict()["base_uncertainty"] is None
+    lines = [line for line in str(fitted_run).splitlines() if "base distribution" not in line and "family" not in line]
+    assert str(plain).splitlines() == lines
+    assert (plain.p, plain.interval, plain.n_sim) == (fitted_run.p, fitted_run.interval, fitted_run.n_sim)
+
+
+def test_the_lines_stand_under_the_sampling_interval():
+    result = run(BASE)
+    lines, found = str(result).splitlines(), result.base_uncertainty
+    low, high = found.interval
+    assert lines[1].startswith("  95 % interval [")
+    assert lines[2] == (
+        f"  base distribution 95 %  {low:.1e} to {high:.1e} (38 + 15 events of 17 scenes, 30 refits); "
+        f"predictive mean {found.expected:.0e}"
+    )
+    assert lines[3] == (
+        "    assumes that the fitted family is correct (1 component, log gaps); errors of the family are not included"
+    )
+    assert "simulations, gain" in lines[4]
+
+
+def test_json_has_all_of_it():
+    for refits in (SHIFTED, WIDE):
+        result = run(fitted(refits))
+        data = json.loads(result.to_json())["base_uncertainty"]
+        found = result.base_uncertainty
+        assert data["interval"] == (None if found.interval is None else list(found.interval))
+        assert data["p_refits"] == list(found.p_refits)
+        assert data["ess_refits"] == list(found.ess_refits)
+        assert (data["spread"], data["expected"], data["bound"]) == (found.spread, found.expected, found.bound)
+        assert (data["clusters"], data["fitted_to"]) == (17, "38 + 15 events of 17 scenes")
+        assert len(data["p_refits"]) == len(data["ess_refits"]) == 30
+
+
+@pytest.mark.parametrize(
+    ("change", "text"),
+    [
+        (lambda: samplers.estimate(HalfSpace(BASE, 9.0), "mc", seed=1, max_sim=100), "nothing failed"),
+        (lambda: replace(run(BASE), sample=None), "gave no weighted points"),
+        (lambda: run(fitted(SHIFTED[:1])), "needs 2 refits and 2 clusters, got 1 and 17"),
+        (lambda: run(fitted(SHIFTED, clusters=1)), "needs 2 refits and 2 clusters, got 30 and 1"),
+        (lambda: run(fitted([*SHIFTED, Impossible()])), "1 of 31 refits have no density at any failing point"),
+    ],
+)
+def test_where_the_spread_is_not_known_one_sentence_says_why(change, text):
+    result = change()
+    found = result.base_uncertainty
+    assert found.interval is found.expected is found.bound is None
+    assert math.isnan(found.spread)
+    assert text in found.reason
+    assert f"base distribution  no interval: {found.reason}" in str(result)
+    assert json.loads(result.to_json())["base_uncertainty"]["spread"] is None
+
+
+@pytest.mark.parametrize("max_sim", [1, 2, 20])
+@pytest.mark.parametrize("method", ["two-stage", "mc", "adss", "ce", "surrogate"])
+@pytest.mark.parametrize("beta", [0.0, 3.0])
+def test_after_hardly_any_simulations_one_line_says_what_is_known(method, max_sim, beta):
+    result = samplers.estimate(HalfSpace(BASE, beta), method, seed=1, max_sim=max_sim)
+    found = result.base_uncertainty
+    (line,) = (each.strip() for each in str(result).splitlines() if "base distribution" in each)
+    if found.interval is not None:
+        assert 0.0 <= found.interval[0] <= result.p <= found.interval[1] <= 1.0
+        assert line.startswith("base distribution 95 %")
+    else:
+        assert line.startswith(("base distribution  no interval: ", "base distribution  the events do not determine p"))
+        assert "nothing failed" in line or result.p > 0
+    assert "nan" not in line and "inf " not in line
+    json.loads(result.to_json())
+
+
+def test_of_a_run_that_was_stopped_the_interval_holds_that_of_the_sampling():
+    """Of the first batch of a search, 16 failures with a c.o.v. of 0.56: few draws are worth a wider quantile."""
+    started = samplers.TwoStage().start(HalfSpace(fitted([normal()] * 30)), seed=1, max_sim=3000)
+    started.tell(BETA - started.ask()[:, 0])
+    result = started.result()
+    low, high = result.base_uncertainty.interval
+    assert result.n_sim < 3000 and result.cov > 0.5
+    assert low <= result.interval[0] < result.interval[1] <= high
+    assert str(result).count("base distribution 95 %") == 1
+
+
+class Impossible:
+    """N(0, 1), without density where the half-space fails; its draws from the base at the front door do not."""
+
+    def log_prob(self, x):
+        return np.where(x[:, 0] < 2.99, normal().log_prob(x), -np.inf)
+
+
+def test_points_without_an_outcome_are_not_in_the_lower_end_where_they_only_bound():
+    class Failing(HalfSpace):
+        def evaluate(self, x):
+            return np.where((x[:, 1] > 0.5) & (x[:, 0] > 2.0), np.nan, super().evaluate(x))
+
+    bound, counted = (
+        samplers.estimate(Failing(BASE), "mc", seed=1, max_sim=20_000, on_error=on_error)
+        for on_error in ("bound", "failure")
+    )
+    failing = bound.sample.f <= 0
+    share = bound.sample.weights[np.isneginf(bound.sample.f)].sum() / bound.sample.weights[failing].sum()
+    assert 0.5 < share < 1
+    one, two = bound.base_uncertainty, counted.base_uncertainty
+    assert one.p_refits == two.p_refits
+    assert one.interval == (pytest.approx((1 - share) * two.interval[0]), two.interval[1])
+
+
+def test_replicates_are_reweighted_together():
+    result = run(BASE, replicates=4, max_sim=8000)
+    found = result.base_uncertainty
+    assert np.log(found.p_refits) == pytest.approx(np.log([refit.p for refit in SHIFTED]), abs=0.3)
+    assert min(found.ess_refits) > min(run(BASE, max_sim=2000).base_uncertainty.ess_refits)
+
+
+def test_a_further_run_is_made_exactly_where_the_points_do_not_reach_the_refits():
+    near = run(fitted(SHIFTED, FittedWithEnsemble))
+    assert near.ensemble_run is None
+    assert near.base_uncertainty.n_sim == 0
+    three = run(fitted([*SHIFTED[:27], *FAR[27:]], FittedWithEnsemble))
+    assert sum(ess < 10 for ess in three.base_uncertainty.ess_refits) == 3
+    assert three.ensemble_run is None
+    four = run(FAR_BASE)
+    assert four.ensemble_run is not None
+
+
+def test_the_further_run_knows_p_of_the_refits_and_leaves_p_as_it_is():
+    base = FAR_BASE
+    result, without = run(base), run(base, ensemble_run=False)
+    assert without.ensemble_run is None
+    assert (result.p, result.interval, result.n_sim) == (without.p, without.interval, without.n_sim)
+    found = result.base_uncertainty
+    assert 0 < found.n_sim == result.ensemble_run.n_sim <= 3000  # max_sim limits it anew
+    assert np.log(found.p_refits) == pytest.approx(np.log([refit.p for refit in FAR]), abs=0.3)
+    assert min(found.ess_refits) > 10
+    assert f"from a further {found.n_sim:,} simulations under their mixture" in str(result)
+    assert sum(ess < 10 for ess in without.base_uncertainty.ess_refits) == 4
+    assert without.base_uncertainty.warnings == (
+        "4 of 30 refits rest on under 10 effective failing points: the spread is coarse.",
+    )
+    assert "warning: 4 of 30 refits" in str(without)
+    assert result.ensemble_run.p == pytest.approx(np.mean([refit.p for refit in FAR]), rel=0.1)
+
+
+def test_each_refit_takes_the_run_that_knows_it_better():
+    result = run(FAR_BASE)
+    refits = result.base.refits
+    own, further, both = (
+        reweight_runs_to_refits(each, refits)
+        for each in (replace(result, ensemble_run=None), result.ensemble_run, result)
+    )
+    assert both.ess.tolist() == np.maximum(own.ess, further.ess).tolist()
+    assert (own.ess > further.ess).any() and (own.ess < further.ess).any()
+    chosen = np.where(own.ess > further.ess, own.log_p, further.log_p)
+    assert both.log_p.tolist() == chosen.tolist()

@@ -1,0 +1,218 @@
+"""Cross-entropy by blocks: families, projections, products."""
+
+import time
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from scipy import optimize, stats
+from scipy.special import betaln
+
+import samplers
+from samplers import Distribution
+from samplers.distributions import as_distribution
+from samplers.methods.blocks import (
+    BetaBlock,
+    MappedBlock,
+    NormalBlock,
+    Product,
+    announced_blocks,
+    beta_statistics,
+    project_beta,
+    project_mean,
+)
+from samplers.proposals import Gaussian
+
+BETA = BetaBlock(alpha=[2.0, 3.0], beta=[2.0, 1.5], low=[80.0, -0.25], high=[120.0, 0.25])
+
+
+def uniform_weights(n):
+    return np.full(n, 1 / n)
+
+
+def test_beta_density_against_scipy(rng):
+    x = BETA.sample(500, rng)
+    expected = stats.beta([2, 3], [2, 1.5], [80, -0.25], [40, 0.5]).logpdf(x).sum(axis=1)
+    np.testing.assert_allclose(BETA.log_prob(x), expected)
+    assert np.isneginf(BETA.log_prob(np.array([[79.0, 0.0], [100.0, 0.3]]))).all()
+
+
+def test_beta_map_reaches_far_tails():
+    u = np.array([[-9.0, -9.0], [9.0, 9.0], [-30.0, 30.0]])
+    x = BETA.from_standard_normal(u)
+    assert ((x > BETA.low) & (x < BETA.high)).all()
+    assert np.isfinite(BETA.log_prob(x)).all()
+    np.testing.assert_allclose(BETA.to_standard_normal(BETA.from_standard_normal(u / 3))[:2], u[:2] / 3, atol=1e-6)
+
+
+def test_beta_step_is_the_projection_of_the_mixture(rng):
+    """Against the mixture's own likelihood: draws of Q and of P, weighted, in a generic solver."""
+    block = BetaBlock(alpha=2.0, beta=2.0, low=0.0, high=1.0)
+    elite = rng.beta(4.0, 1.8, size=(40_000, 1))
+    moved = block.project(elite, uniform_weights(len(elite)), 0.8)
+    y = np.concatenate([elite[:, 0], rng.beta(2.0, 2.0, size=10_000)])  # 0.8 to 0.2
+    generic = optimize.minimize(lambda t: -stats.beta(*t).logpdf(y).mean(), [2.0, 2.0], bounds=[(1.5, 7.0)] * 2)
+    np.testing.assert_allclose([moved.alpha[0], moved.beta[0]], generic.x, rtol=0.03)
+
+
+@pytest.mark.parametrize("change", [{"alpha": 1.0}, {"beta": 9.0}, {"low": 120.0}, {"box": (0.0, 7.0)}])
+def test_beta_settings_out_of_range(change):
+    with pytest.raises(ValueError, match="BetaBlock: expected alpha and beta in the box"):
+        BetaBlock(**{"alpha": 2.0, "beta": 2.0, "low": 80.0, "high": 120.0, **change})
+
+
+MEAN, COVARIANCE = np.array([0.3, -0.2, 0.1]), np.array([[0.5, 0.2, 0.0], [0.2, 0.4, 0.1], [0.0, 0.1, 0.3]])
+NORMAL = NormalBlock(Gaussian.from_covariance(MEAN, COVARIANCE), radius=0.4)
+BASE = Product((BETA, NORMAL))
+
+
+def test_product_is_a_distribution_with_an_exact_map(rng):
+    assert isinstance(BASE, Distribution)
+    assert BASE.dim == 5
+    x = BASE.sample(20_000, rng)
+    u = BASE.to_standard_normal(x)
+    np.testing.assert_allclose(BASE.from_standard_normal(u), x, rtol=1e-9, atol=1e-9)
+    for column in u.T:
+        assert stats.kstest(column, "norm").pvalue > 1e-3
+    np.testing.assert_allclose(np.cov(u.T), np.eye(5), atol=0.05)
+    expected = BETA.log_prob(x[:, :2]) + stats.multivariate_normal(MEAN, COVARIANCE).logpdf(x[:, 2:])
+    np.testing.assert_allclose(BASE.log_prob(x), expected)
+
+
+def test_normal_steps_stay_in_the_box_around_the_base_mean():
+    block = NORMAL
+    for _ in range(5):
+        block = block.project(np.tile(MEAN + 3, (4, 1)), uniform_weights(4), 0.8)
+    np.testing.assert_allclose(np.abs(block.gaussian.mean - MEAN).max(), 0.4)
+    np.testing.assert_array_equal(block.gaussian.cholesky, NORMAL.gaussian.cholesky)
+
+
+def test_blocks_by_attributes_alone(rng):
+    """A base distribution that knows nothing of this package announces its blocks as plain objects."""
+    entries = (
+        SimpleNamespace(alpha=BETA.alpha, beta=BETA.beta, low=BETA.low, high=BETA.high, box=(1.0, 8.0)),
+        SimpleNamespace(mean=MEAN, covariance=COVARIANCE, radius=0.4),
+    )
+    base = SimpleNamespace(blocks=entries, log_prob=BASE.log_prob)
+    found = announced_blocks(SimpleNamespace(dim=5, base=base))
+    x = BASE.sample(10, rng)
+    np.testing.assert_allclose(found.log_prob(x), BASE.log_prob(x))
+    assert found.blocks[0].box == (1.0, 8.0)
+    assert found.blocks[1].radius == 0.4
+
+
+@pytest.mark.parametrize(
+    ("base", "message"),
+    [
+        (SimpleNamespace(), "needs a base distribution with an attribute blocks"),
+        (SimpleNamespace(blocks=(SimpleNamespace(mean=MEAN),)), "expected a block with alpha, beta, low and high"),
+        (SimpleNamespace(blocks=(BETA,), log_prob=BETA.log_prob), "are not its distribution"),
+        (SimpleNamespace(blocks=BASE.blocks, log_prob=lambda x: BASE.log_prob(x) + 0.01), "are not its distribution"),
+    ],
+)
+def test_blocks_that_do_not_fit(base, message):
+    with pytest.raises(ValueError, match=message):
+        announced_blocks(SimpleNamespace(dim=5, base=base))
+
+
+BOX = (1.5, 7.0)
+
+
+def generic_beta(statistics, low, high):
+    """The same problem by a quasi-Newton solver with bounds, from three starts."""
+    runs = [
+        optimize.minimize(
+            lambda t: betaln(*t) - t @ statistics,
+            start,
+            jac=lambda t: beta_statistics(*t) - statistics,
+            method="L-BFGS-B",
+            bounds=[(low, high)] * 2,
+            options={"ftol": 1e-15, "gtol": 1e-11, "maxiter": 1000},
+        )
+        for start in ([2.0, 2.0], [low, high], [high, low])
+    ]
+    return min(runs, key=lambda run: run.fun)
+
+
+def test_beta_projection_against_a_generic_solver(rng):
+    """Statistics of distributions in and far out of the box: optima inside, on the four edges, in the four corners."""
+    alpha, beta = np.exp(rng.uniform(np.log(0.2), np.log(60), size=(2, 300)))
+    statistics = beta_statistics(alpha, beta)
+    # a few points instead of a distribution: both statistics high, as no Beta in the box has them
+    few = rng.uniform(0.01, 0.99, size=(50, 3))
+    statistics = np.concatenate([statistics, np.stack([np.log(few).mean(axis=1), np.log1p(-few).mean(axis=1)], 1)])
+    found = project_beta(statistics, *BOX)
+    assert ((found >= BOX[0]) & (found <= BOX[1])).all()
+    for own, row in zip(found, statistics, strict=True):
+        generic = generic_beta(row, *BOX)
+        value = betaln(*own) - own @ row
+        assert value <= generic.fun + 1e-10 * abs(generic.fun)
+        np.testing.assert_allclose(own, generic.x, atol=2e-4)
+    at_low, at_high = found == BOX[0], found == BOX[1]
+    kinds = {tuple(kind) for kind in (np.where(at_low, -1, 0) + np.where(at_high, 1, 0)).tolist()}
+    assert len(kinds) == 9  # inside, four edges, four corners
+
+
+def correlated(dim, rng, scale=0.05):
+    factors = rng.standard_normal((dim, dim // 4 + 1))
+    covariance = scale**2 * (factors @ factors.T / factors.shape[1] + 0.2 * np.eye(dim))
+    return np.linalg.cholesky(covariance)
+
+
+def distance(mean, target, cholesky):
+    """Kullback-Leibler divergence from N(target, S) to N(mean, S)."""
+    return 0.5 * np.sum(np.linalg.solve(cholesky, mean - target) ** 2)
+
+
+@pytest.mark.parametrize("scale", [1e-3, 0.05, 100.0])
+def test_mean_projection_against_a_generic_solver(rng, scale):
+    """The answer of bounded least squares; clipping each coordinate is worse."""
+    for dim in (2, 5, 30):
+        cholesky, centre = correlated(dim, rng, scale), scale * rng.standard_normal(dim)
+        target, radius = centre + scale * rng.standard_normal(dim), 0.5 * scale
+        inverse = np.linalg.inv(cholesky)
+        generic = optimize.lsq_linear(inverse, inverse @ (target - centre), (-radius, radius), tol=1e-14).x + centre
+        found = project_mean(target, centre, cholesky, radius)
+        assert np.abs(found - centre).max() <= radius * (1 + 1e-12)
+        np.testing.assert_allclose(found, generic, atol=1e-5 * scale)
+    clipped = np.clip(target, centre - radius, centre + radius)
+    assert distance(found, target, cholesky) < 0.99 * distance(clipped, target, cholesky)
+
+
+def test_mean_projection_of_404_weights_is_fast(rng):
+    cholesky = correlated(404, rng)
+    target = 0.02 * rng.standard_normal(404)
+    project_mean(target, np.zeros(404), cholesky, 0.01)  # imports the solver
+    start = time.perf_counter()
+    found = project_mean(target, np.zeros(404), cholesky, 0.01)
+    assert time.perf_counter() - start < 5.0  # 0.1 s as a rule
+    slope = np.linalg.solve(cholesky @ cholesky.T, target - found)
+    free = np.abs(found) < 0.01 * (1 - 1e-9)
+    assert 0 < free.sum() < 404
+    assert np.abs(slope[free]).max() < 1e-6 * np.abs(slope).max()
+    assert (slope[~free] * found[~free] >= 0).all()
+
+
+@pytest.fixture
+def moved():
+    block = MappedBlock(as_distribution(stats.expon()))
+    elite = stats.expon.isf([[1e-3], [2e-3], [4e-3], [8e-3]])
+    return block.project(elite, np.full(4, 0.25), alpha=0.8)
+
+
+def test_a_moved_block_is_a_distribution(moved):
+    """Its density integrates to 1, and its draws have it."""
+    x = np.linspace(1e-9, 60.0, 600_001)[:, None]
+    density = np.exp(moved.log_prob(x))
+    assert np.trapezoid(density, x[:, 0]) == pytest.approx(1.0, abs=1e-4)
+    cdf = np.interp(np.sort(moved.sample(4000, np.random.default_rng(0))[:, 0]), x[:, 0], np.cumsum(density) * 1e-4)
+    assert stats.kstest(cdf, "uniform").pvalue > 1e-3
+
+
+def test_a_product_takes_distributions_of_scipy_and_openturns():
+    openturns = pytest.importorskip("openturns")
+    base = samplers.Product(
+        [stats.lognorm(0.5), samplers.BetaBlock(alpha=2.0, beta=2.0, low=0.0, high=1.0), openturns.ClaytonCopula(2.0)]
+    )
+    assert base.dim == 4
+    assert isinstance(base.blocks[0], MappedBlock)

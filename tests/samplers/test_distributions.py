@@ -1,0 +1,106 @@
+"""Bases of SciPy and OpenTURNS: maps, tails, p with exact values."""
+
+import pickle
+import sys
+
+import numpy as np
+import pytest
+from scipy import stats
+
+import samplers
+from samplers.distributions import IndependentDistributions, ScipyDistribution, ScipyMultivariateNormal, as_distribution
+
+
+def test_one_coordinate_is_repeated():
+    base = as_distribution(stats.norm(2.0, 1.0), dim=3)
+    np.testing.assert_array_equal(base.from_standard_normal(np.zeros((1, 3))), [[2.0, 2.0, 2.0]])
+
+
+@pytest.mark.parametrize("base", ["us101", stats.norm, samplers.StandardNormal, [], [1.0], 3.0])
+def test_other_things_are_refused(base):
+    with pytest.raises(ValueError, match=r"Expected a frozen distribution of scipy\.stats"):
+        as_distribution(base)
+
+
+def test_dimensions_must_fit():
+    with pytest.raises(ValueError, match="base distribution of 3 dimensions, got 2"):
+        samplers.FunctionProblem(lambda x: x[:, 0], dim=3, base=stats.multivariate_normal([0.0, 0.0]))
+
+
+def test_lists_are_independent_in_their_order():
+    base = as_distribution([stats.uniform(5.0, 1.0), stats.multivariate_normal([1.0, 2.0])])
+    assert isinstance(base, IndependentDistributions)
+    x = base.sample(4, np.random.default_rng(0))
+    assert ((x[:, 0] > 5.0) & (x[:, 0] < 6.0)).all()
+    np.testing.assert_allclose(base.log_prob(x), stats.multivariate_normal([1.0, 2.0]).logpdf(x[:, 1:]))
+
+
+def test_openturns_is_not_imported():
+    assert "openturns" not in {name for name in sys.modules if "samplers" in name}
+    for name, module in sys.modules.items():
+        if name.startswith("samplers.") and module is not None:
+            assert not hasattr(module, "openturns"), name
+
+
+ONE = [stats.norm(3, 2), stats.lognorm(0.5), stats.gumbel_r(1, 2), stats.beta(2, 5), stats.t(3), stats.expon(scale=4)]
+
+
+@pytest.mark.parametrize("frozen", ONE, ids=lambda frozen: frozen.dist.name)
+def test_the_map_keeps_probabilities(frozen):
+    base = ScipyDistribution(frozen)
+    u = np.array([-6.0, -2.0, 0.0, 0.5, 3.0])[:, None]
+    x = base.from_standard_normal(u)
+    np.testing.assert_allclose(frozen.cdf(x[:3]), stats.norm.cdf(u[:3]), rtol=1e-9)
+    np.testing.assert_allclose(frozen.sf(x[2:]), stats.norm.sf(u[2:]), rtol=1e-9)
+    np.testing.assert_allclose(base.to_standard_normal(x), u, rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    "frozen", [stats.norm(3, 2), stats.lognorm(0.5), stats.expon()], ids=["norm", "lognorm", "expon"]
+)
+def test_both_tails_keep_their_digits(frozen):
+    base, u = ScipyDistribution(frozen), np.array([[-25.0], [25.0]])
+    np.testing.assert_allclose(base.to_standard_normal(base.from_standard_normal(u)), u, rtol=1e-9)
+
+
+def test_array_parameters_are_independent_coordinates():
+    base = ScipyDistribution(stats.norm([1.0, 2.0, 3.0], [1.0, 0.5, 2.0]))
+    assert base.dim == 3
+    np.testing.assert_array_equal(base.from_standard_normal(np.ones((1, 3))), [[2.0, 2.5, 5.0]])
+    x = np.array([[0.0, 1.0, 2.0], [1.0, 2.0, 3.0]])
+    np.testing.assert_allclose(base.log_prob(x), stats.norm([1, 2, 3], [1, 0.5, 2]).logpdf(x).sum(axis=1))
+
+
+def test_multivariate_normal_has_its_moments_and_density():
+    mean, covariance = np.array([1.0, -2.0]), np.array([[4.0, 1.5], [1.5, 1.0]])
+    frozen = stats.multivariate_normal(mean, covariance)
+    base = ScipyMultivariateNormal(frozen)
+    square_root = base.from_standard_normal(np.eye(2)) - mean
+    np.testing.assert_allclose(square_root.T @ square_root, covariance)
+    x = base.sample(5, np.random.default_rng(0))
+    np.testing.assert_allclose(base.log_prob(x), frozen.logpdf(x))
+    np.testing.assert_allclose(base.from_standard_normal(base.to_standard_normal(x)), x)
+    assert ScipyMultivariateNormal(stats.multivariate_normal(2.0, 9.0)).from_standard_normal(np.ones((1, 1))) == 5.0
+
+
+@pytest.mark.parametrize("base", [stats.lognorm(0.5), stats.multivariate_normal([1.0, 2.0])])
+def test_they_travel_to_workers(base):
+    copy = pickle.loads(pickle.dumps(samplers.as_distribution(base)))
+    np.testing.assert_array_equal(copy.from_standard_normal(np.ones((1, copy.dim))).shape, (1, copy.dim))
+
+
+def test_what_has_no_map_is_refused():
+    with pytest.raises(ValueError, match="covariance of rank 2, got rank 1"):
+        ScipyMultivariateNormal(stats.multivariate_normal([0, 0], [[1, 1], [1, 1]], allow_singular=True))
+    with pytest.raises(ValueError, match="discrete poisson"):
+        ScipyDistribution(stats.poisson(3.0))
+    with pytest.raises(ValueError, match="valid parameters of norm"):
+        ScipyDistribution(stats.norm(0.0, -1.0))
+
+
+def test_p_of_strength_and_load_is_exact():
+    """R ~ N(10, 1), S ~ N(5, 0.8): P[R <= S] = Phi(-5 / sqrt(1.64)) = 4.7e-5."""
+    problem = samplers.FunctionProblem(lambda x: x[:, 0] - x[:, 1], base=[stats.norm(10, 1), stats.norm(5, 0.8)])
+    result = samplers.estimate(problem, "two-stage", seed=0, max_sim=3000)
+    exact = stats.norm.cdf(-5 / 1.64**0.5)
+    assert abs(result.p / exact - 1) < 4 * result.cov < 0.5

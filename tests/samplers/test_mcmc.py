@@ -1,0 +1,256 @@
+"""Markov chains: invariance, descent through levels, interruption."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from samplers.mcmc import (
+    FixedMetropolis,
+    Growth,
+    NextLevel,
+    RootedPoints,
+    ScaledKernel,
+    accept_candidates,
+    adapted_scale,
+    chain_lengths,
+    conditional_proposal,
+    descend,
+    grow_chains,
+    independent_chains,
+    metropolis_candidates,
+)
+from samplers.method import Interrupted
+from samplers.problem import FunctionProblem
+from samplers.trace import Status
+
+LEVEL = -1.0
+
+
+def height(u):
+    return -u[:, 0]
+
+
+def scaled(proposal, scale, dim=2):
+    return ScaledKernel(proposal, "unit", scale, 0.44, np.ones(dim))
+
+
+KERNELS = {
+    "conditional, small": scaled("conditional", 0.3),
+    "conditional, large": scaled("conditional", 0.9),
+    "metropolis": scaled("metropolis", 0.8),
+    "metropolis, uniform": FixedMetropolis(1.0, "uniform"),
+    "metropolis, normal": FixedMetropolis(2.5, "normal"),
+}
+
+
+@pytest.mark.parametrize("kernel", KERNELS.values(), ids=KERNELS)
+def test_every_kernel_leaves_the_conditioned_distribution_invariant(rng, kernel):
+    n = 20_000
+    u = rng.standard_normal((n, 2))
+    u[:, 0] = stats.norm.isf(rng.random(n) * stats.norm.sf(-LEVEL))
+    f = height(u)
+    for _ in range(10):
+        candidates = kernel.propose(u, rng)
+        u, f, _ = accept_candidates(u, f, candidates, height(candidates), LEVEL)
+    assert (f <= LEVEL).all()
+    assert stats.kstest(u[:, 0], stats.truncnorm(-LEVEL, np.inf).cdf).pvalue > 1e-3
+    assert stats.kstest(u[:, 1], stats.norm.cdf).pvalue > 1e-3
+
+
+def test_the_printed_ratio_is_wrong_for_the_conditional_proposal(rng):
+    """Why "metropolis" takes a symmetric step: with the AR-1 one the ratio makes the distribution N(0, 1/2)."""
+    u = rng.standard_normal((20_000, 1))
+    for _ in range(60):
+        steps = conditional_proposal(u, np.full(1, 0.8), rng) - u
+        u = metropolis_candidates(u, steps, rng)
+    assert stats.kstest(u[:, 0], stats.norm(0, np.sqrt(0.5)).cdf).pvalue > 1e-3
+    assert stats.kstest(u[:, 0], stats.norm.cdf).pvalue < 1e-12
+
+
+def test_only_the_adaptive_kernel_changes(rng):
+    fixed, kernel = FixedMetropolis(1.0, "uniform"), scaled("conditional", 0.6)
+    assert fixed.adapt(1.0, 1) == fixed == fixed.start_level(np.ones((4, 2)))
+    assert kernel.adapt(0.64, 4).scale == pytest.approx(0.6 * np.exp(0.1))
+    assert kernel.adapt(1.0, 1).scale == 1.0
+    seeds = rng.standard_normal((50, 2)) * [0.2, 3.0]
+    np.testing.assert_array_equal(kernel.start_level(seeds).deviations, [1, 1])
+    own = ScaledKernel("conditional", "seeds", 0.6, 0.44, np.ones(2)).start_level(seeds).deviations
+    np.testing.assert_allclose(own, seeds.std(axis=0, ddof=1))
+
+
+def test_scale_follows_the_acceptance():
+    assert adapted_scale(0.6, 0.44, 1, 0.44, 1.0) == pytest.approx(0.6)
+    assert adapted_scale(0.6, 0.64, 4, 0.44, 1.0) == pytest.approx(0.6 * np.exp(0.1))
+    assert adapted_scale(0.6, 0.0, 1, 0.44, 1.0) == pytest.approx(0.6 * np.exp(-0.44))
+    assert adapted_scale(0.9, 1.0, 1, 0.44, 1.0) == 1.0
+
+
+PROBLEM = FunctionProblem(lambda u: -u[:, 0], dim=2)
+PCN = ScaledKernel("conditional", "unit", 0.6, 0.44, deviations=np.ones(2))
+
+
+def seeds_beyond(level, n, rng):
+    """Return exact draws of N(0, I) given f <= level, with roots 100, 101, ..."""
+    u = rng.standard_normal((n, 2))
+    u[:, 0] = stats.norm.isf(rng.random(n) * stats.norm.sf(-level))
+    return RootedPoints(u, PROBLEM.evaluate(u), 100 + np.arange(n))
+
+
+def test_lengths_add_up_and_differ_by_one(rng):
+    lengths = chain_lengths(23, 5, rng)
+    assert lengths.sum() == 23
+    assert sorted(lengths) == [4, 4, 5, 5, 5]
+    assert len({tuple(chain_lengths(23, 5, rng)) for _ in range(50)}) > 3  # which ones is random
+
+
+@pytest.mark.parametrize("kernel", [PCN, FixedMetropolis(1.0, "uniform")])
+def test_chains_stay_inside_and_keep_their_distribution(kernel, drive, rng):
+    """From exact draws beyond a plane at 2 every point is one: mean and variance along the normal by Mills' ratio."""
+    seeds = seeds_beyond(-2.0, 2000, rng)
+    growth, f = drive(grow_chains(PROBLEM, seeds, -2.0, np.full(2000, 6), kernel, rng), PROBLEM)
+    chains = growth.chains
+    assert (chains.f <= -2.0).all()
+    np.testing.assert_array_equal(chains.f, -chains.u[:, :, 0])
+    last = chains.u[:, -1, 0]
+    mean = stats.norm.pdf(2.0) / stats.norm.sf(2.0)
+    deviation = np.sqrt(1 + 2.0 * mean - mean**2)
+    assert abs(last.mean() - mean) < 4 * deviation / np.sqrt(2000)
+    assert abs(chains.u[:, -1, 1].mean()) < 4 / np.sqrt(2000)
+    assert len(f) == chains.n_new == len(growth.f_candidates)
+    np.testing.assert_array_equal(growth.f_candidates, f)
+    np.testing.assert_array_equal(PROBLEM.evaluate(growth.candidates), f)
+
+
+def test_points_that_stay_are_not_simulated_again(drive, rng):
+    """In one of two dimensions Metropolis moves no component of every ninth candidate or so."""
+    seeds = seeds_beyond(-2.0, 500, rng)
+    growth, f = drive(grow_chains(PROBLEM, seeds, -2.0, np.full(500, 5), FixedMetropolis(3.0, "uniform"), rng), PROBLEM)
+    assert len(f) < 4 * 500
+    assert growth.chains.n_new == len(f)
+
+
+def test_interrupted_chains_keep_the_steps_made(rng):
+    steps = grow_chains(PROBLEM, seeds_beyond(-1.0, 4, rng), -1.0, np.full(4, 5), PCN, rng)
+    x = next(steps)
+    steps.send(PROBLEM.evaluate(x))
+    with pytest.raises(StopIteration) as ended:
+        steps.throw(Interrupted())
+    growth = ended.value.value
+    assert growth.interrupted
+    assert growth.chains.u.shape == (4, 2, 2)
+    assert growth.chains.n_new == 4
+    assert (growth.chains.lengths == 2).all()
+
+
+@dataclass(frozen=True)
+class Quantiles:
+    """All points below the quantile p0 are seeds; levels have as many points as the first."""
+
+    p0: float
+    depth: int
+    budget: float = math.inf
+
+    def plan_next(self, chains, depth, n_sim, rng):
+        f = chains.f[chains.used]
+        if depth == self.depth:
+            return Status.CONVERGED
+        threshold = float(np.quantile(f, self.p0, method="lower"))
+        seeds = chains.where(chains.f <= threshold)
+        if n_sim + len(f) - len(seeds.f) > self.budget:
+            return Status.BUDGET
+        return NextLevel(threshold, seeds, chain_lengths(len(f), len(seeds.f), rng))
+
+
+class Scripted:
+    """Goes on with the lowest five points, in chains of three, and keeps what it was told."""
+
+    def __init__(self, levels, end=Status.STALLED):
+        self.levels, self.end, self.told = levels, end, []
+
+    def plan_next(self, chains, depth, n_sim, rng):
+        self.told.append((depth, n_sim, chains.f.size))
+        if depth == self.levels:
+            return self.end
+        points = chains.by_step()
+        lowest = np.argsort(points.f, kind="stable")[:5]
+        return NextLevel(float(points.f[lowest[-1]]), points.select(lowest), np.full(5, 3))
+
+
+def start_from(n, rng):
+    u = rng.standard_normal((n, 2))
+    return Growth.start(independent_chains(u, PROBLEM.evaluate(u)), PCN)
+
+
+def reported(drive, planner, rng, n=20):
+    """Return what was reported, the status, and the outcomes of all that was simulated."""
+    levels = []
+    steps = descend(PROBLEM, start_from(n, rng), planner, lambda *level: levels.append(level), rng)
+    status, f = drive(steps, PROBLEM)
+    return levels, status, f
+
+
+def test_thresholds_fall_and_points_stay_below_them(drive, rng):
+    levels, status, _ = reported(drive, Quantiles(0.1, 4), rng, n=500)
+    assert status is Status.CONVERGED
+    planned = [level for _, level in levels[:-1]]
+    thresholds = [level.threshold for level in planned]
+    assert thresholds == sorted(thresholds, reverse=True)
+    assert len(set(thresholds)) == len(thresholds) == 4
+    for (growth, _), level, (grown, _) in zip(levels, planned, levels[1:], strict=False):
+        assert (level.seeds.f <= level.threshold).all()
+        assert set(level.seeds.f) <= set(growth.chains.f[growth.chains.used])
+        np.testing.assert_array_equal(grown.chains.u[:, 0], level.seeds.u)
+        np.testing.assert_array_equal(grown.chains.lengths, level.lengths)
+        used = grown.chains.used
+        assert (grown.chains.f[used] <= level.threshold).all()
+        np.testing.assert_array_equal(grown.chains.f[used], PROBLEM.evaluate(grown.chains.u[used]))
+
+
+@pytest.mark.parametrize("batch", range(4))
+def test_an_interrupted_level_comes_last(batch, drive, rng):
+    """Two batches a level: one that is interrupted at its first batch has its seeds only."""
+    planner = Scripted(levels=9)
+    levels, start = [], start_from(20, rng)
+    steps = descend(PROBLEM, start, planner, lambda *level: levels.append(level), rng)
+    x = next(steps)
+    for _ in range(batch):
+        x = steps.send(PROBLEM.evaluate(x))
+    with pytest.raises(StopIteration) as ended:
+        steps.throw(Interrupted())
+    assert ended.value.value is Status.STOPPED
+    last, planned = levels[-1]
+    assert planned is Status.STOPPED
+    assert last.interrupted
+    assert last.chains.n_new == 5 * (batch % 2)
+    assert last.chains.u.shape == (5, 1 + batch % 2, 2)
+    assert len(planner.told) == 1 + batch // 2  # it is not asked about an unfinished level
+    assert len(levels) == 2 + batch // 2
+
+
+def test_a_budget_ends_it_before_the_level_that_does_not_fit(drive, rng):
+    """Levels of 101 points from 11 seeds take 90 simulations: 300 are enough for three of them."""
+    levels, status, f = reported(drive, Quantiles(0.1, 9, budget=300), rng, n=101)
+    assert status is Status.BUDGET
+    assert [growth.chains.n_new for growth, _ in levels[1:]] == [90, 90, 90]
+    assert len(f) == 270
+
+
+def product_of_shares(drive, beta, rng):
+    """Return the product of the shares of three levels of 1000 points with p0 = 0.1, the last one at beta."""
+    levels, _, _ = reported(drive, Quantiles(0.1, 2), rng, n=1000)
+    p = 1.0
+    for growth, planned in levels:
+        threshold = planned.threshold if isinstance(planned, NextLevel) else -beta
+        p *= float((growth.chains.f[growth.chains.used] <= threshold).mean())
+    return p
+
+
+def test_the_product_of_shares_is_the_probability_of_a_half_space(drive, rng):
+    """The mean of 30 runs agrees with Phi(-3) = 1.35e-3 within four of its own standard errors."""
+    found = np.array([product_of_shares(drive, 3.0, rng) for _ in range(30)])
+    error = found.std(ddof=1) / math.sqrt(len(found))
+    assert error < 0.08 * stats.norm.sf(3.0)
+    assert abs(found.mean() - stats.norm.sf(3.0)) < 4 * error

@@ -1,0 +1,169 @@
+"""Problems of functions: what is refused, with which hint."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass, field
+
+import numpy as np
+import pytest
+from scipy import stats
+
+import samplers
+from samplers.problem import FloatArray, Terms
+
+
+def test_standard_normal_density_and_map(rng):
+    base = samplers.StandardNormal(3)
+    x = base.sample(50, rng)
+    np.testing.assert_allclose(base.log_prob(x), stats.multivariate_normal(np.zeros(3)).logpdf(x))
+    np.testing.assert_array_equal(base.from_standard_normal(base.to_standard_normal(x)), x)
+    assert isinstance(base, samplers.Distribution)
+
+
+@pytest.mark.parametrize("dim", [0, -1, 2.0, "2", True])
+def test_dim_must_be_a_positive_whole_number(dim):
+    with pytest.raises(ValueError, match="whole number of at least 1"):
+        samplers.FunctionProblem(lambda x: x[:, 0], dim)
+    with pytest.raises(ValueError, match="whole number of at least 1"):
+        samplers.StandardNormal(dim)
+
+
+def test_f_must_be_callable():
+    with pytest.raises(ValueError, match="function"):
+        samplers.FunctionProblem(3.0, 2)
+
+
+@pytest.mark.parametrize("x", [np.zeros(2), np.zeros((3, 1)), np.zeros((3, 3)), np.zeros((1, 3, 2)), 0.0])
+def test_x_must_be_rows_of_d_numbers(x):
+    with pytest.raises(ValueError, match=r"Expected x of shape \(n, 2\), got \("):
+        samplers.FunctionProblem(lambda x: x[..., 0], 2).evaluate(x)
+
+
+@pytest.mark.parametrize(
+    "f",
+    [
+        lambda x: 1.0,
+        lambda x: x,
+        lambda x: x[1:, 0],
+        lambda x: None,
+        lambda x: ["far"] * len(x),
+        lambda x: 1j * x[:, 0],
+    ],
+    ids=["scalar", "x", "short", "none", "words", "complex"],
+)
+@pytest.mark.parametrize("on_error", ["raise", "failure", "bound"])
+def test_f_must_give_one_real_number_per_row(f, on_error):
+    """Not an outcome that is missing, but an f that is none: no rule for errors covers it."""
+    with pytest.raises(samplers.EvaluationError, match=r"Expected f to return shape \(50,\), one"):
+        samplers.estimate(samplers.FunctionProblem(f, 2), "mc", seed=1, max_sim=50, on_error=on_error)
+
+
+def test_a_series_system_is_given_by_its_terms_alone():
+    problem = samplers.FunctionProblem(dim=2, terms=lambda x: 3.0 - x, gradient=lambda x, term: -np.eye(2)[term])
+    x = np.array([[1.0, 0.0], [4.0, 5.0]])
+    np.testing.assert_array_equal(problem.evaluate(x), [2.0, -2.0])
+    terms = problem.terms(x, gamma=1.0)
+    np.testing.assert_array_equal(terms.values, 3.0 - x)
+    np.testing.assert_array_equal(terms.f, terms.lowest)
+    np.testing.assert_array_equal(terms.least, [0, 1])
+    assert terms.threshold == 1.0
+    gradients = problem.gradient(x, terms.least, terms.ticks[[0, 1], terms.least])
+    np.testing.assert_array_equal(gradients.values, [[-1.0, 0.0], [0.0, -1.0]])
+    assert gradients.cost == 2 * problem.gradient_cost
+
+
+def test_a_copy_of_a_problem_with_terms_has_the_same_terms():
+    problem = samplers.FunctionProblem(dim=2, terms=lambda x: 3.0 - x)
+    assert dataclasses.replace(problem) == problem
+    np.testing.assert_array_equal(dataclasses.replace(problem).terms(np.zeros((1, 2))).values, [[3.0, 3.0]])
+
+
+@pytest.mark.parametrize(
+    "arguments", [{"terms": 3.0}, {"terms": abs, "gradient": 3.0}, {"terms": abs, "gradient_cost": 0}]
+)
+def test_terms_and_gradients_must_be_functions_and_cost_something(arguments):
+    with pytest.raises(ValueError, match="Expected"):
+        samplers.FunctionProblem(dim=2, **arguments)
+
+
+@pytest.mark.parametrize(
+    "terms", [lambda x: x[:, 0], lambda x: x[1:], lambda x: x[:, :0]], ids=["flat", "short", "none"]
+)
+def test_terms_must_be_a_row_for_every_row(terms):
+    with pytest.raises(samplers.EvaluationError, match=r"Expected terms of shape \(3, J\)"):
+        samplers.FunctionProblem(dim=2, terms=terms).terms(np.zeros((3, 2)))
+
+
+@pytest.mark.parametrize(
+    "f",
+    [
+        lambda x: 3.0 - x[0],
+        lambda x: 3.0 - max(x),
+        lambda x: 3.0 - float(x[0]),
+        lambda x: 1.0 if x[0] > x[1] else 2.0,
+        lambda x: 3.0,
+    ],
+    ids=["row", "max", "float", "branch", "constant"],
+)
+def test_an_f_of_one_point_gets_a_hint(f):
+    problem = samplers.FunctionProblem(f, dim=2)
+    with pytest.raises(
+        samplers.EvaluationError, match=r"batch of points of shape \(n, 2\); pass vectorized=False"
+    ) as error:
+        samplers.estimate(problem, "mc", seed=0, max_sim=100)
+    assert "\n" not in str(error.value)
+    assert (
+        samplers.estimate(samplers.FunctionProblem(f, dim=2, vectorized=False), "mc", seed=0, max_sim=100).n_sim == 100
+    )
+
+
+def test_an_f_that_returns_a_column_is_told_to_take_it():
+    column = samplers.FunctionProblem(lambda x: 3.0 - x[:, :1], dim=2)
+    with pytest.raises(samplers.EvaluationError, match=r"got \(100, 1\)\. Return its only column, f\(x\)\[:, 0\]\."):
+        column.evaluate(np.zeros((100, 2)))
+    ragged = samplers.FunctionProblem(lambda x: [[1.0], [2.0, 3.0]], dim=2)
+    with pytest.raises(samplers.EvaluationError, match="pass vectorized=False"):
+        ragged.evaluate(np.zeros((2, 2)))
+
+
+def test_an_f_of_batches_that_raises_gets_none():
+    def f(x):
+        if (x[..., 0] > 1.0).any():
+            raise ValueError("off the map")
+        return x.sum(axis=-1)
+
+    problem = samplers.FunctionProblem(f, dim=2)
+    with pytest.raises(samplers.EvaluationError, match="off the map") as error:
+        samplers.estimate(problem, "mc", seed=0, max_sim=100)
+    assert "vectorized" not in str(error.value)
+    assert samplers.estimate(problem, "mc", seed=0, max_sim=100, on_error="failure").p > 0.1
+
+
+@pytest.mark.parametrize("names", [["a"], ["a", "a"], ["a", 1]])
+def test_names_of_columns_that_do_not_fit_are_refused(names):
+    with pytest.raises(ValueError, match="2 different names, got"):
+        samplers.FunctionProblem(lambda x: x[:, 0], dim=2, column_names=names)
+
+
+@dataclass
+class OwnProblem:
+    """A user's problem, of no class of the package."""
+
+    dim: int = 2
+    base: samplers.StandardNormal = field(default_factory=lambda: samplers.StandardNormal(2))
+
+    def evaluate(self, x: FloatArray) -> FloatArray:
+        return np.asarray(x[:, 0])
+
+
+class WithTerms(OwnProblem):
+    def terms(self, x: FloatArray, gamma: float = 0.0) -> Terms:
+        return Terms(x.min(axis=1), x, np.zeros(x.shape, dtype=np.int64), gamma)
+
+
+def test_the_least_term_and_the_lowest_value_are_those_of_each_row() -> None:
+    x = np.array([[2.0, -1.0], [0.5, 3.0]])
+    terms = WithTerms().terms(x)
+    np.testing.assert_array_equal(terms.least, [1, 0])
+    np.testing.assert_array_equal(terms.lowest, [-1.0, 0.5])

@@ -1,0 +1,217 @@
+"""Gaussians and mixtures fitted to weighted points."""
+
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from samplers.components import VonMisesFisherNakagami
+from samplers.proposals import (
+    Gaussian,
+    Mixture,
+    Moments,
+    correct_eigenvalues,
+    expectation_maximisation,
+    fit_proposal_mixture,
+    fit_shrunk_gaussian,
+    one_hot,
+    shrink_covariance,
+    shrink_towards_present,
+    start_from_centres,
+    weighted_moments,
+)
+
+MEAN = np.array([1.0, -0.5])
+COVARIANCE = np.array([[1.5, 0.4], [0.4, 0.6]])
+
+
+def test_gaussian_density_against_scipy(rng):
+    gaussian = Gaussian.from_covariance(MEAN, COVARIANCE)
+    u = rng.standard_normal((50, 2)) * 3
+    np.testing.assert_allclose(gaussian.log_prob(u), stats.multivariate_normal(MEAN, COVARIANCE).logpdf(u))
+
+
+def test_weighted_fit_recovers_the_truth(rng):
+    """Draws from N(0, I) with weights p / q have the moments of p."""
+    target = Gaussian.from_covariance(np.array([0.5, 0.0]), np.diag([0.8, 1.0]))
+    base = Gaussian.standard(2)
+    u = base.sample(200_000, rng)
+    weights = np.exp(target.log_prob(u) - base.log_prob(u))
+    moments = weighted_moments(u, weights / weights.sum())
+    np.testing.assert_allclose(moments.first, target.mean, atol=0.02)
+    np.testing.assert_allclose(moments.covariance, target.covariance, atol=0.04)
+
+
+def test_mixture_density_and_draws(rng):
+    one, two = Gaussian.standard(2), Gaussian.from_covariance(MEAN + 3, COVARIANCE)
+    mixture = Mixture(np.array([0.3, 0.7]), [one, two])
+    u = mixture.sample(50_000, rng)
+    expected = np.log(0.3 * np.exp(one.log_prob(u)) + 0.7 * np.exp(two.log_prob(u)))
+    np.testing.assert_allclose(mixture.log_prob(u), expected)
+    se = u.std(axis=0) / np.sqrt(len(u))
+    assert (np.abs(u.mean(axis=0) - 0.7 * two.mean) < 4 * se).all()
+
+
+@dataclass
+class UnitVariance:
+    """Mixtures of N(mean, I): the textbook M-step; it keeps the log likelihoods that it saw."""
+
+    u: np.ndarray
+    weights: np.ndarray
+
+    def __post_init__(self):
+        self.seen = []
+
+    def maximise(self, responsibilities):
+        mass = responsibilities * self.weights
+        totals = mass.sum(axis=1)
+        means = mass @ self.u / totals[:, None]
+        return Mixture(totals / totals.sum(), [Gaussian(mean, np.eye(len(mean))) for mean in means])
+
+    def log_terms(self, mixture):
+        self.seen.append(float(self.weights @ mixture.log_prob(self.u)))
+        return mixture.log_terms(self.u)
+
+
+def two_groups(rng, n=2000):
+    """0.25 of the points around (-3, 0), the others around (3, 1)."""
+    first = rng.random(n) < 0.25
+    return rng.standard_normal((n, 2)) + np.where(first[:, None], [-3.0, 0.0], [3.0, 1.0])
+
+
+def fit(u, weights, k, rng, steps=60):
+    family = UnitVariance(u, weights)
+    start = start_from_centres(u, weights, k, rng)
+    return *expectation_maximisation(family.maximise, family.log_terms, start, weights, steps, lambda _: 1e-8), family
+
+
+def _climb(family, *arguments):
+    return expectation_maximisation(family.maximise, family.log_terms, *arguments)
+
+
+def test_two_gaussians_are_recovered(rng):
+    """Standard errors: 1 / sqrt(500) of a mean, 0.01 of a weight; four of each."""
+    mixture, _, _ = fit(two_groups(rng), np.full(2000, 1 / 2000), 2, rng)
+    order = np.argsort(mixture.weights)
+    np.testing.assert_allclose(mixture.weights[order], [0.25, 0.75], atol=0.04)
+    means = np.array([mixture.components[j].mean for j in order])
+    np.testing.assert_allclose(means, [[-3.0, 0.0], [3.0, 1.0]], atol=4 / np.sqrt(500))
+
+
+def test_every_step_raises_the_likelihood(rng):
+    mixture, reached, family = fit(two_groups(rng) * 0.5, np.full(2000, 1 / 2000), 3, rng)
+    assert len(family.seen) > 5
+    assert all(after >= before - 1e-12 for before, after in pairwise(family.seen))
+    assert reached == pytest.approx(family.seen[-1])
+    assert reached == pytest.approx(float(mixture.log_prob(family.u).mean()))
+
+
+def test_a_weight_of_two_is_a_point_twice(rng):
+    u = two_groups(rng, 300)
+    weights = np.where(np.arange(300) < 100, 2.0, 1.0)
+    start = one_hot((u[:, 0] > 0).astype(np.int64), 2)
+    twice = np.concatenate([u, u[:100]])
+    start_twice = np.concatenate([start, start[:, :100]], axis=1)
+    once, _ = _climb(UnitVariance(u, weights / 400), start, weights / 400, 5, lambda _: -np.inf)
+    even = np.full(400, 1 / 400)
+    both, _ = _climb(UnitVariance(twice, even), start_twice, even, 5, lambda _: -np.inf)
+    np.testing.assert_allclose(once.weights, both.weights)
+    for a, b in zip(once.components, both.components, strict=True):
+        np.testing.assert_allclose(a.mean, b.mean)
+
+
+def equal(n):
+    return np.full(n, 1 / n)
+
+
+def test_share_of_the_target_by_hand():
+    """S = diag(3, 1), T = I: noise (16 + 10) / n over a distance of 4, but at least that of (d + 1) / 2 points."""
+    s, v = np.diag([3.0, 1.0]), np.array([0.0, 1.0])
+    shrunk, share = shrink_covariance(s, v, 1.0, 26.0)
+    assert share == pytest.approx(0.25)
+    np.testing.assert_allclose(shrunk, np.diag([2.5, 1.0]))
+    assert shrink_covariance(s, v, 1.0, 5.0)[1] == 1.0  # noise 5.2 over 4
+    assert shrink_covariance(s, v, 1.0, 100.0)[1] == pytest.approx(0.065)
+    far = np.diag([1000.0, 1, 1, 1, 1, 1])  # noise over distance is 2.01 / n: the floor of about 3.5 / n holds
+    assert shrink_covariance(far, np.eye(6)[5], 1.0, 1e4)[1] == pytest.approx(7 / (2 * 10_007))
+
+
+def test_covariance_is_shrunk_where_points_are_few_for_the_dimensions(rng):
+    """Failures beyond a plane: I but for the variance along the mean."""
+    dim = 60
+    u = rng.standard_normal((120, dim))
+    u[:, 0] = 3.5 + 0.3 * abs(u[:, 0])
+    found = np.linalg.eigvalsh(fit_shrunk_gaussian(u, equal(120)).covariance)
+    own = np.linalg.eigvalsh(np.cov(u.T))
+    assert own[-1] > 2.5  # noise of the covariance itself
+    assert found[0] < 0.2  # the direction that matters
+    assert 0.8 < found[1] < found[-1] < 1.3
+
+
+@pytest.mark.parametrize("n", [1, 2, 5])
+def test_few_or_equal_points_give_a_proper_gaussian(n, rng):
+    for u in (rng.standard_normal((n, 4)), np.ones((n, 4)), np.zeros((n, 4))):
+        assert np.isfinite(fit_shrunk_gaussian(u, equal(n)).log_prob(u)).all()
+
+
+def test_present_covariance_counts_as_points():
+    """In 2 dimensions as 3 points, in 20 as 21 x 2."""
+    target = Moments(np.array([1.0, 0.0]), np.diag([1.0, 0.0]))  # covariance 0
+    found = shrink_towards_present(target, Gaussian.standard(2), 7.0)
+    np.testing.assert_allclose(found.covariance, 0.3 * np.eye(2))
+    np.testing.assert_allclose(found.mean, [1.0, 0.0])
+    zero = Moments(np.zeros(20), np.zeros((20, 20)))
+    np.testing.assert_allclose(shrink_towards_present(zero, Gaussian.standard(20), 42.0).covariance, 0.5 * np.eye(20))
+
+
+def test_eigenvalues_lose_their_bias(rng):
+    """30 points in 8 dimensions: the least eigenvalue is a fifth too small on average, the corrected one is right."""
+    truth = np.array([0.05, 0.2, 0.4, 1.0, 1.0, 1.0, 1.3, 1.6])
+    draws = rng.standard_normal((300, 30, 8)) * np.sqrt(truth)
+    values, vectors = np.linalg.eigh(np.array([np.cov(u.T) for u in draws]))
+    corrected = np.array([correct_eigenvalues(each, 30.0) for each in values])
+    assert values[:, 0].mean() < 0.85 * 0.05
+    assert abs(corrected[:, 0].mean() - 0.05) < 4 * corrected[:, 0].std() / np.sqrt(300)
+    # Stein's loss of K, tr(K / S) - log det(K / S) - d, for which the estimator is made
+    spread = np.einsum("nij,nij,i->nj", vectors, vectors, 1 / truth)
+    own, new = ((spread * each).sum(axis=1) - np.log(each / truth).sum(axis=1) - 8 for each in (values, corrected))
+    assert (own - new).mean() > 4 * (own - new).std() / np.sqrt(300)
+
+
+TWO = Mixture(
+    np.array([0.3, 0.7]),
+    [
+        Gaussian(np.array([3.0, 0.0]), np.diag([0.5, 1.0])),
+        Gaussian(np.array([-1.0, 3.0]), np.array([[0.8, 0.0], [0.3, 0.4]])),
+    ],
+)
+
+
+def test_mixture_is_recovered(rng):
+    found = fit_proposal_mixture(fit_shrunk_gaussian, TWO.sample(8000, rng), equal(8000), 4, 5, rng)
+    order = np.argsort(found.weights)
+    assert len(order) == 2  # the criterion finds the number
+    np.testing.assert_allclose(found.weights[order], TWO.weights, atol=0.03)
+    for k, component in zip(order, TWO.components, strict=True):
+        np.testing.assert_allclose(found.components[k].mean, component.mean, atol=0.1)
+        np.testing.assert_allclose(found.components[k].covariance, component.covariance, atol=0.1)
+
+
+def test_weighted_points_stand_for_their_distribution(rng):
+    """Draws of a wide distribution under weights p / q."""
+    wide = Gaussian(np.zeros(2), 3 * np.eye(2))
+    u = wide.sample(40_000, rng)
+    weights = np.exp(TWO.log_prob(u) - wide.log_prob(u))
+    found = fit_proposal_mixture(fit_shrunk_gaussian, u, weights / weights.sum(), 4, 5, rng)
+    test = TWO.sample(4000, rng)
+    assert np.mean(TWO.log_prob(test) - found.log_prob(test)) < 0.02  # Kullback-Leibler divergence
+
+
+def test_mixture_of_directions(rng):
+    distributions = [VonMisesFisherNakagami(np.eye(8)[k], 40.0, 10.0, 16.0) for k in (0, 3)]
+    u = np.concatenate([distribution.sample(1000, rng) for distribution in distributions])
+    found = fit_proposal_mixture(VonMisesFisherNakagami.fit, u, equal(2000), 4, 10, rng)
+    assert len(found.components) == 2
+    assert sorted(int(np.argmax(c.mu)) for c in found.components) == [0, 3]

@@ -1,0 +1,247 @@
+"""Statistics against SciPy, by hand and by draws."""
+
+import math
+
+import numpy as np
+import pytest
+from scipy import stats
+from scipy.special import logsumexp
+
+import samplers
+from samplers.analysis.weighted import simultaneous_intervals, simultaneous_level, unit_sums
+from samplers.sample import Layer, Sample
+from samplers.statistics import (
+    PRIOR_SHARE,
+    add_unseen,
+    clopper_pearson,
+    correlation_factor,
+    effective_sample_size,
+    largest_weight_share,
+    log_normal_interval,
+    log_sum_exp,
+    next_level,
+    normalise_weights,
+)
+
+
+def test_clopper_pearson_against_scipy():
+    for hits in (0, 1, 7, 49, 50):
+        exact = stats.binomtest(hits, 50).proportion_ci(0.9, method="exact")
+        np.testing.assert_allclose(clopper_pearson(hits, 50, 0.9), exact)
+
+
+def test_clopper_pearson_is_one_sided_at_the_ends():
+    assert clopper_pearson(0, 100, 0.95)[0] == 0.0
+    assert clopper_pearson(0, 100, 0.95)[1] == pytest.approx(1 - 0.025**0.01)
+    assert clopper_pearson(100, 100, 0.95)[1] == 1.0
+
+
+def test_log_normal_covers_a_log_normal_estimate(rng):
+    cov, p, runs = 0.3, 1e-4, 4000
+    sigma = math.sqrt(math.log1p(cov**2))
+    estimates = p * np.exp(sigma * rng.standard_normal(runs))
+    inside = [low <= p <= high for low, high in (log_normal_interval(e, cov, 0.95) for e in estimates)]
+    assert abs(np.mean(inside) - 0.95) < 4 * math.sqrt(0.95 * 0.05 / runs)
+
+
+def test_log_normal_is_cut_at_one_and_wider_with_few_degrees_of_freedom():
+    assert log_normal_interval(0.9, 0.5, 0.95)[1] == 1.0
+    narrow, wide = log_normal_interval(1e-3, 0.2, 0.95), log_normal_interval(1e-3, 0.2, 0.95, df=4)
+    assert wide[0] < narrow[0] < 1e-3 < narrow[1] < wide[1]
+
+
+def lengths_of(inside):
+    return np.full(len(inside), inside.shape[1])
+
+
+def test_correlation_factor_of_frozen_chains_is_length_minus_one():
+    inside = np.repeat(np.arange(40)[:, None] < 10, 8, axis=1)
+    assert correlation_factor(inside, lengths_of(inside)) == pytest.approx(7.0)
+
+
+def markov_chains(rng, chains, steps, p, stay):
+    """Indicator chains that keep their value with probability `stay`, else draw it anew."""
+    inside = rng.random((chains, steps)) < p
+    keep = rng.random((chains, steps)) < stay
+    for t in range(1, steps):
+        inside[:, t] = np.where(keep[:, t], inside[:, t - 1], inside[:, t])
+    return inside
+
+
+def test_correlation_factor_predicts_the_variance_of_a_share(rng):
+    chains, steps, p, stay, runs = 100, 10, 0.1, 0.8, 1500
+    sets = [markov_chains(rng, chains, steps, p, stay) for _ in range(runs)]
+    shares = np.array([inside.mean() for inside in sets])
+    predicted = [(1 + correlation_factor(s, lengths_of(s))) * p * (1 - p) / (chains * steps) for s in sets]
+    # the variance of 1500 shares has a relative standard error of sqrt(2 / 1500) = 3.7 %
+    assert np.mean(predicted) == pytest.approx(shares.var(), rel=0.15)
+
+
+def test_correlation_factor_with_unequal_lengths(rng):
+    """Against the sum over all pairs inside a chain, written out."""
+    inside = markov_chains(rng, 30, 6, 0.3, 0.7)
+    lengths = rng.integers(1, 7, size=30)
+    used = [row[:length].astype(float) for row, length in zip(inside, lengths, strict=True)]
+    n = sum(len(row) for row in used)
+    p = sum(row.sum() for row in used) / n
+    pairs = sum(2 * (row[i] * row[j] - p * p) for row in used for i in range(len(row)) for j in range(i + 1, len(row)))
+    expected = pairs / (n * p * (1 - p))
+    assert expected > 0
+    assert correlation_factor(inside, lengths) == pytest.approx(expected)
+
+
+def test_distinct_outcomes_give_the_quantile_with_its_true_share(rng):
+    f = rng.permutation(np.arange(1, 1001)) / 10
+    assert next_level(f, 0.1, -1.0) == 10.0
+    assert np.count_nonzero(f <= 10.0) == 100
+
+
+def test_gamma_as_soon_as_enough_points_fail():
+    f = np.arange(100.0)
+    assert next_level(f, 0.1, 9.0) == 9.0  # ten points, exactly the fraction
+    assert next_level(f, 0.1, 50.0) == 50.0
+    assert next_level(f, 0.1, 8.0) == 9.0
+
+
+def test_ties_at_a_cap_give_the_largest_value_below():
+    f = np.concatenate([np.full(930, 10.0), np.linspace(1, 9, 70)])
+    assert next_level(f, 0.1, 0.0) == 9.0
+    assert next_level(np.array([10.0] * 95 + [-1.0] * 5), 0.1, 0.0) == 0.0  # never past gamma
+
+
+def test_no_way_on_where_all_or_most_outcomes_tie():
+    assert next_level(np.full(100, 10.0), 0.1, 0.0) is None
+    assert next_level(np.array([10.0] * 80 + [20.0] * 20), 0.1, 0.0) is None
+    assert next_level(np.full(100, np.inf), 0.1, 0.0) is None
+
+
+def test_the_upper_end_is_the_quantile_of_both_errors_together():
+    """Against a million draws of p exp(s Z) / (1 - M)."""
+    rng = np.random.default_rng(0)
+    n = 10**6
+    for lineages, sigma in ((4, 0.02), (25, 0.05), (200, 0.3), (25, 0.3)):
+        z, m = rng.standard_normal(n), rng.beta(PRIOR_SHARE, lineages, n)
+        high = np.exp(stats.norm.ppf(0.975) * sigma)
+        assert add_unseen(1e-3, 1e-3 * high, lineages, 0.95) / 1e-3 == pytest.approx(
+            np.quantile(np.exp(sigma * z) / (1 - m), 0.975), rel=0.01
+        )
+
+
+def test_effective_sample_size():
+    assert effective_sample_size(np.zeros(10)) == pytest.approx(10)
+    assert effective_sample_size(np.log([1.0, 3.0])) == pytest.approx(16 / 10)
+    assert effective_sample_size(np.empty(0)) == 0
+
+
+def test_weights_far_outside_the_range_of_floats():
+    log_weights = np.array([-5000.0, -5000.0 + np.log(3)])
+    np.testing.assert_allclose(normalise_weights(log_weights), [0.25, 0.75])
+    assert effective_sample_size(log_weights) == pytest.approx(1.6)
+    assert largest_weight_share(log_weights) == pytest.approx(0.75)
+    assert largest_weight_share(np.empty(0)) == 0
+
+
+def numbers(rng, shape):
+    """Logarithms of any size, a fifth of them -inf, some columns wholly so."""
+    a = rng.normal(0.0, 50.0, shape)
+    a[rng.random(shape) < 0.2] = -np.inf
+    if len(shape) == 2:
+        a[:, rng.random(shape[1]) < 0.1] = -np.inf
+    return a
+
+
+@pytest.mark.parametrize("shape", [(1,), (7,), (3000,), (1, 5), (30, 1200), (6, 40)])
+@pytest.mark.parametrize("axis", [None, 0])
+def test_the_bits_are_those_of_scipy(rng, shape, axis):
+    if axis is None and len(shape) == 2:
+        shape = (shape[0] * shape[1],)
+    a = numbers(rng, shape)
+    np.testing.assert_array_equal(log_sum_exp(a, axis=axis), logsumexp(a, axis=axis))
+
+
+def test_a_sum_of_nothing_and_one_beyond_all_numbers():
+    assert log_sum_exp(np.empty(0)) == -np.inf
+    np.testing.assert_array_equal(log_sum_exp(np.empty((0, 3)), axis=0), np.full(3, -np.inf))
+    assert log_sum_exp(np.array([0.0, np.inf])) == np.inf
+    assert np.isnan(log_sum_exp(np.array([0.0, np.nan])))
+    assert float(log_sum_exp(np.array([1000.0, 1000.0]))) == 1000.0 + np.log(2.0)
+
+
+def plain(f):
+    """Draws from the base, all with the same weight."""
+    f = np.array(f, dtype=float)
+    n = len(f)
+    return Sample(f=f, weights=np.full(n, 1 / n), units=np.arange(n), n_units=n, x=f[f <= 0, None])
+
+
+@pytest.fixture
+def families(rng):
+    """60 weighted points that descend from 12 of 20 units."""
+    f, weights, units = rng.normal(size=60), rng.uniform(0.0, 0.02, 60), rng.integers(0, 12, 60)
+    return Sample(f=f, weights=weights, units=units, n_units=20, x=f[f <= 0, None])
+
+
+def test_sums_are_those_over_units(families):
+    gammas = np.array([-1.0, 0.0, 0.7])
+    totals = np.zeros((20, 3))
+    for f, weight, unit in zip(families.f, families.weights, families.units, strict=True):
+        totals[unit] += weight * (f <= gammas)
+    sums = unit_sums(families, gammas)
+    np.testing.assert_allclose(sums.p, totals.sum(axis=0))
+    np.testing.assert_allclose(sums.second, totals.T @ totals)
+    np.testing.assert_allclose(sums.ess, totals.sum(axis=0) ** 2 / (totals**2).sum(axis=0))
+    # p is 20 times a mean: its variance is that of 20 totals, (n - 1) / n of what is unbiased
+    np.testing.assert_allclose(sums.cov, np.sqrt(20 * totals.var(axis=0)) / totals.sum(axis=0))
+    np.testing.assert_allclose(sums.correlation, np.corrcoef(totals.T))
+    assert not sums.independent
+    assert not sums.is_count.any()
+
+
+def test_shares_of_plain_draws_are_binomial():
+    """Of 10 draws 0, 5, 9 and 10 have f <= g: nested indicators, with r = sqrt(p (1 - q) / (q (1 - p))) for p <= q."""
+    sums = unit_sums(plain(range(10)), np.array([-0.5, 4.0, 8.5, 20.0]))
+    np.testing.assert_allclose(sums.p, [0.0, 0.5, 0.9, 1.0])
+    np.testing.assert_allclose(sums.cov, [np.inf, np.sqrt(0.5 / 5), np.sqrt(0.1 / 9), 0.0], atol=1e-7)
+    np.testing.assert_allclose(sums.ess, [0.0, 5.0, 9.0, 10.0])
+    assert sums.is_count[1:].all()
+    r = np.sqrt(0.5 * 0.1 / (0.9 * 0.5))
+    expected = np.zeros((4, 4))  # what does not vary is correlated with nothing
+    expected[1:3, 1:3] = [[1.0, r], [r, 1.0]]
+    np.testing.assert_allclose(sums.correlation, expected, atol=1e-12)
+
+
+def test_a_layer_speaks_for_its_own_thresholds():
+    """Levels at 2 and 0: thresholds from 0 to 2 rest on all points of the first, those below on the second."""
+    first = Layer(f=np.array([3.0, 1.0, -1.0]), weights=np.full(3, 0.3), units=np.array([0, 1, 2]), low=0.0)
+    second = Layer(f=np.array([-1.0, -2.0]), weights=np.full(2, 0.1), units=np.array([2, 2]), high=0.0)
+    sample = Sample(
+        f=np.array([-1.0, -2.0]),
+        weights=np.full(2, 0.1),
+        units=np.array([2, 2]),
+        n_units=3,
+        x=np.zeros((2, 1)),
+        layers=(first, second),
+    )
+    sums = unit_sums(sample, np.array([-1.5, -0.5, 0.0, 1.0, 3.0]))
+    np.testing.assert_allclose(sums.p, [0.1, 0.2, 0.3, 0.6, 0.9])
+    np.testing.assert_allclose(np.diag(sums.second), [0.01, 0.04, 0.09, 0.18, 0.27])
+
+
+def level_of(correlation):
+    return simultaneous_level(np.array(correlation), 0.95, np.random.default_rng(0))
+
+
+@pytest.mark.parametrize("number", [2, 5])
+def test_independent_estimates_need_the_root(number):
+    """All of k hold together with 0.95 if each does with 0.95^(1 / k); 10,000 draws know the quantile to about 1 %."""
+    assert level_of(np.eye(number)) == pytest.approx(0.95 ** (1 / number), abs=0.004)
+
+
+def test_intervals_of_counts_are_exact_at_the_common_level_and_open_where_they_are_not_used():
+    f = np.concatenate([np.full(20, -1.0), np.full(30, 0.5), np.full(950, 2.0)])
+    sums = unit_sums(samplers.Sample.of_equal_draws(f, np.zeros((20, 1))), np.array([0.0, 1.0]))
+    low, high = simultaneous_intervals(sums, np.array([0]), sums.p, sums.cov, 0.95, seed=0)
+    assert (low[0], high[0]) == pytest.approx(clopper_pearson(20, 1000, 0.95))
+    assert (low[1], high[1]) == (0.0, 1.0)
+    both, _ = simultaneous_intervals(sums, np.array([0, 1]), sums.p, sums.cov, 0.95, seed=0)
+    assert both[0] < low[0]
