@@ -98,7 +98,7 @@ class Sample:
     passed early: p there rests on all points of that level, not on the few of them that the next ones descend from."""
     lineages: float = math.inf
     """Independent searches that reached failure, where p rests on a proposal that was fitted to what they found: the
-    upper end of p holds the share that they may have missed (`statistics/unseen_share.py`). inf without a search."""
+    upper end of p holds the share that they may have missed (`statistics.py`). inf without a search."""
 
     @property
     def all_layers(self) -> tuple[Layer, ...]:

@@ -45,7 +45,7 @@ class KrigingSettings:
 
 @dataclass(frozen=True, kw_only=True)
 class LearningSettings:
-    """The points that kriging learns from (`learning.py`)."""
+    """The points that kriging learns from (`surrogate.py`)."""
 
     share: float = 2 / 3
     """Largest share of the budget; a third at least is left for the draws of the estimate."""
@@ -76,7 +76,7 @@ class LearningSettings:
 
 @dataclass(frozen=True, kw_only=True)
 class PoolSettings:
-    """The pool of draws that the points to simulate are chosen from (`pool.py`); none of them costs a simulation."""
+    """The pool of draws that points to simulate are chosen from (`surrogate.py`); none of them costs a simulation."""
 
     learning_size: int = 3000
     """Draws of the pool in each batch of learning."""
@@ -96,7 +96,7 @@ class PoolSettings:
 
 @dataclass(frozen=True, kw_only=True)
 class ProposalSettings:
-    """What the draws of the estimate are drawn from (`pool.py`); the surrogate has the rest.
+    """What the draws of the estimate are drawn from (`surrogate.py`); the surrogate has the rest.
 
     On the IDM cut-in, 300 simulations, 10 seeds: without doubted draws and random points 8 of 10 intervals held p and
     the gain was 34; with doubted draws alone 10 and 76, with both 10 and 190.

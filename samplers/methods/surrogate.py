@@ -485,18 +485,18 @@ class SurrogateRun:
 class Surrogate(Method):
     """Kriging as a guide and importance sampling on the simulator: for 100 to 1,500 simulations in few dimensions.
 
-    1. *Learning* (`learning.py`, `kriging.py`): a first design of Latin hypercubes of N(0, s^2 I), s = 1 to 3, then
+    1. *Learning* (`surrogate.py`, `kriging.py`): a first design of Latin hypercubes of N(0, s^2 I), s = 1 to 3, then
        batches where phi sqrt(P[fail] P[safe]) is large, P by kriging; three in ten points are drawn where the surrogate
        would see doubt if its standard deviations were four times as large. It takes two thirds of the budget at most,
        and ends earlier where the rest is forecast to give a c.o.v. of 2 %.
-    2. *Estimate* (`pool.py`, `estimate.py`): fresh draws from 70 % q ~ phi sqrt(P[fail]), 15 % the same with these
+    2. *Estimate* (`surrogate.py`, `estimate.py`): fresh draws from 70 % q ~ phi sqrt(P[fail]), 15 % the same with these
        larger standard deviations, 10 % base distribution, 5 % wide distributions, weighted by phi over the density of
        this mixture, and nothing else. The surrogate only says where to simulate, and learns from the first half of the
        draws before the second is made. Given the learning p-hat is unbiased; its c.o.v. includes the error of the
        density's constant, which is a mean over a pool of 20,000 draws that are not simulated.
 
     *Interval.* Log-normal with t quantiles, Bernstein's bound where under 10 effective draws failed. The upper end also
-    holds what no draw can have met (`two_stage/discovery/unseen.py`, a batch of learning with failures as a lineage).
+    holds what no draw can have met (`two_stage/regions.py`, a batch of learning with failures as a lineage).
     With a few hundred simulations that is a large part of it.
 
     *Noise.* Coordinates that the base distribution calls noise are drawn, not learned; kriging takes what they do to f,

@@ -20,15 +20,15 @@ from samplers.validation import check_count
 class TwoStage(Method):
     """Explore, then estimate from draws that had no part in it; few simulations for any number of failure regions.
 
-    1. *Exploration* (`exploration.py`, `discovery/`, `regions.py`): base draws; wide draws from N(0, s^2 I), with s as
+    1. *Exploration* (`exploration.py`, `regions.py`): base draws; wide draws from N(0, s^2 I), with s as
        large as the levels went deep; subset simulation from the base draws and, in the same batches, lines of descent,
        points that walk downhill each alone; chains inside the failure region from all of these. Two failing points are
        of one region if the point half way between them fails.
-    2. *Refinement* (`refinement.py`, `candidates.py`): each region is described by Gaussians, by a hyperplane from
+    2. *Refinement* (`refinement.py`): each region is described by Gaussians, by a hyperplane from
        linear regression of f where f is linear, by a corner of several where f is the greatest of linear functions,
        and by a radius.
        Three rounds of draws follow, each from a mixture of these, and up to two more while a draw is worth less than
-       a tenth of a failure. The weights minimise the estimated variance (`mixture_weights.py`), with lower limits for
+       a tenth of a failure. The weights minimise the estimated variance (`mixture.py`), with lower limits for
        the base distribution, for tempered Gaussians (which bound weights where a Gaussian is a bad description) and
        for each region.
     3. *Estimate* (`stratified.py`): fresh draws from the last mixture, stratified by component, together with those of
@@ -49,7 +49,7 @@ class TwoStage(Method):
     separated, and half of the draws come from tempered Gaussians: the best proposal where failure is by chance.
     Coordinates of x that the base distribution calls noise are not searched (`methods/noise_coordinates.py`).
 
-    *Interval* (`discovery/unseen.py`). Log-normal, with t quantiles where few draws carry the weight and Bernstein's
+    *Interval* (`regions.py`). Log-normal, with t quantiles where few draws carry the weight and Bernstein's
     bound where very few do; p-hat exp(q s) with s^2 = log(1 + c.o.v.^2). The upper end is at least Hall's, which
     knows the skewness of the weights, and holds the share M of p in regions that were not found:
 
@@ -60,7 +60,7 @@ class TwoStage(Method):
     1 - M. The 97.5 % point of M is 0.24 for nu = 4, 0.04 for 25, 0.005 for 200. The c.o.v. is that of the sampling
     alone.
 
-    *Warnings* (`diagnostics.py`): uneven weights, base draws that fail more often than p allows, rounds that
+    *Warnings* (`stratified.py`): uneven weights, base draws that fail more often than p allows, rounds that
     contradict the estimate, regions that the last draws hardly reach, and a search of so few lineages that M may
     exceed 0.3; the message says what cannot be excluded in units of p. A region that neither f announces nor any draw
     has hit gives no warning; `Estimate.unseen` bounds its probability.
@@ -68,12 +68,12 @@ class TwoStage(Method):
     *Terms.* Problems that offer terms and their gradients, in 30 dimensions or more and with 1,000 simulations or more,
     are searched by another algorithm (`terms/search.py`). Where terms are offered otherwise, all points of the
     exploration are simulated with them, and a term of which no state of the chains fails is searched alone
-    (`discovery/unexplored_terms.py`); a remark names those that were the least somewhere and did not reach failure.
+    (`terms_alone.py`); a remark names those that were the least somewhere and did not reach failure.
 
     *Other methods take over* where a tenth of the base draws fails, or no failure is found (plain Monte Carlo for the
     rest), and where no mixture describes the failures: dozens of regions, hundreds of dimensions without a direction
     that matters, failures that noise alone decides on. That is decided after each round, by what its draws are
-    worth; adaptive subset simulation in all coordinates then goes on from the base draws (`fallback.py`), and a remark
+    worth; adaptive subset simulation in all coordinates then goes on from the base draws (`stages.py`), and a remark
     says so.
 
     Args:

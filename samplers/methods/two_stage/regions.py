@@ -1,6 +1,6 @@
 """The share of p that was not found, and the interval that holds it.
 
-`samplers/statistics/unseen_share.py` has the equations; here lineages are counted.
+`samplers/statistics.py` has the equations; here lineages are counted.
 """
 
 import math

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 
 @dataclass(frozen=True, kw_only=True)
 class LinearModelSettings:
-    """Robust regression of f, and half-spaces beyond its hyperplane (`linear_model.py`)."""
+    """Robust regression of f, and half-spaces beyond its hyperplane (`planes.py`)."""
 
     ridges: tuple[float, float] = (1.0, 1e-3)
     """Ridge penalties; the smaller one is tried where points are enough for ordinary regression.
@@ -70,7 +70,7 @@ class LinearModelSettings:
 
 @dataclass(frozen=True, kw_only=True)
 class PieceSettings:
-    """f as the least of linear functions (`least_of_planes.py`)."""
+    """f as the least of linear functions (`pieces.py`)."""
 
     n: int = 24
     """Pieces to start with; on oscillator_d100 10 to 20 of them are left."""
@@ -97,7 +97,7 @@ class PieceSettings:
 
 @dataclass(frozen=True, kw_only=True)
 class CornerSettings:
-    """f as the greatest of linear functions (`greatest_of_planes.py`)."""
+    """f as the greatest of linear functions (`pieces.py`)."""
 
     n: int = 6
     """Pieces to start with."""
@@ -117,7 +117,7 @@ class CornerSettings:
 
 @dataclass(frozen=True, kw_only=True)
 class EdgeSettings:
-    """Where proposals with an edge begin (`boundary.py`, and the planes of the regressions)."""
+    """Where proposals with an edge begin (`mixture.py`, and the planes of the regressions)."""
 
     min_distance: float = 0.5
     """Nearer to the origin than this a half-space holds 31 % of N(0, I): base draws serve as well."""
@@ -141,7 +141,7 @@ class EdgeSettings:
 
 @dataclass(frozen=True, kw_only=True)
 class SubspaceSettings:
-    """Mixtures fitted to weighted points (`subspace_em.py`)."""
+    """Mixtures fitted to weighted points (`mixture.py`)."""
 
     high_dim: int = 40
     """Above this many dimensions a component has one direction of its own: some hundred points do not show more.
@@ -193,7 +193,7 @@ class SubspaceSettings:
 
 @dataclass(frozen=True, kw_only=True)
 class MixtureWeightSettings:
-    """Search for the best weights of a mixture (`mixture_weights.py`)."""
+    """Search for the best weights of a mixture (`mixture.py`)."""
 
     updates: int = 60
     """Multiplicative updates: they come within 2 % of the least second moment (`test_weights_are_nearly_the_best`).
@@ -262,7 +262,7 @@ class WalkSettings:
 
 @dataclass(frozen=True, kw_only=True)
 class LawSettings:
-    """Proposal of one term in the subspace of its gradients (`law.py`, `fitting.py`); shares are relative."""
+    """Proposal of one term in the subspace of its gradients (`fitting.py`, `fitting.py`); shares are relative."""
 
     rank: int = 8
     """Right singular vectors kept: failures of a term are nearly one half-space, 8 hold its curvature (prototype)."""
@@ -474,7 +474,7 @@ class ExplorationSettings:
 
 @dataclass(frozen=True, kw_only=True)
 class LineSettings:
-    """Lines of descent (`discovery/lines.py`); numbers of simulations hold for `ExplorationSettings.usual_budget`."""
+    """Lines of descent (`exploration.py`); numbers of simulations hold for `ExplorationSettings.usual_budget`."""
 
     n: int = 24
     """Lines. Half of them arrive, as a rule. With 30 the exploration costs 60 to 110 simulations more, and the c.o.v.
@@ -511,7 +511,7 @@ class LineSettings:
 
 @dataclass(frozen=True, kw_only=True)
 class TermsAloneSettings:
-    """Searches on single terms of f (`discovery/unexplored_terms.py`)."""
+    """Searches on single terms of f (`terms_alone.py`)."""
 
     lines: int = 4
     """Lines of descent, and starts of chains, of each term, as of each region."""
@@ -586,7 +586,7 @@ class RegionSettings:
 
 @dataclass(frozen=True, kw_only=True)
 class SlopeSettings:
-    """Gradients of f by finite differences (`discovery/slopes.py`)."""
+    """Gradients of f by finite differences (`slopes.py`)."""
 
     min_dim: int = 15
     """Dimensions from which on they are sought: with fewer, chains show as much."""
@@ -614,7 +614,7 @@ class SlopeSettings:
 
 @dataclass(frozen=True, kw_only=True)
 class RefinementSettings:
-    """Rounds of draws, and the shares of the components in a proposal (`refinement.py`, `candidates.py`)."""
+    """Rounds of draws, and the shares of the components in a proposal (`refinement.py`)."""
 
     round_shares: tuple[float, ...] = (0.09, 0.12, 0.14)
     """Share of what the exploration leaves that each round draws; the rest is for the estimate."""
@@ -698,7 +698,7 @@ class RefinementSettings:
 
 @dataclass(frozen=True, kw_only=True)
 class FallbackSettings:
-    """When a proposal is given up for subset simulation (`fallback.py`)."""
+    """When a proposal is given up for subset simulation (`stages.py`)."""
 
     min_fallback_budget: int = 300
     """Simulations under which subset simulation is not worth it."""
@@ -726,7 +726,7 @@ class FallbackSettings:
 
 @dataclass(frozen=True, kw_only=True)
 class DiagnosticSettings:
-    """When an estimate is doubted (`diagnostics.py`)."""
+    """When an estimate is doubted (`stratified.py`)."""
 
     false_alarm: float = 1e-3
     """Probability with which a check of the base draws warns of a right estimate."""
