@@ -11,7 +11,6 @@ from samplers.methods.base import Method
 from samplers.methods.noise_coordinates import noise_mask
 from samplers.methods.surrogate import Surrogate
 from samplers.methods.two_stage.method import TwoStage
-from samplers.methods.two_stage.settings import DEFAULT_TERM_SETTINGS
 from samplers.methods.two_stage.terms.search import suits_terms
 from samplers.problem import Inputs
 from samplers.validation import check_setting
@@ -76,7 +75,7 @@ class Auto(Method):
         slow = (self.seconds_per_simulation or 0.0) >= SLOW and goal.target_cov is None
         usual = SLOW_BUDGET if slow else TwoStage().n
         budget = usual if goal.max_sim is None else goal.max_sim
-        by_terms = suits_terms(inputs, offer_of(inputs), budget, DEFAULT_TERM_SETTINGS)
+        by_terms = suits_terms(inputs, offer_of(inputs), budget)
         few = FEW[0] <= budget <= FEW[1] and dim <= MOST_DIMS
         method = Surrogate() if few else TwoStage()
         how = method.name + " by terms" * by_terms

@@ -114,10 +114,6 @@ class ProposalSettings:
 class SurrogateSettings:
     """All of them, and those of the estimate."""
 
-    kriging: KrigingSettings = KrigingSettings()
-    learning: LearningSettings = LearningSettings()
-    pool: PoolSettings = PoolSettings()
-    proposal: ProposalSettings = ProposalSettings()
     least_budget: int = 60
     """With fewer simulations all are base draws."""
     most_dims: int = 20
@@ -136,7 +132,11 @@ class SurrogateSettings:
     """Share of the draws proposed by the surrogate that should fail; with less it has little skill, and a warning."""
 
 
-DEFAULT_SURROGATE_SETTINGS = SurrogateSettings()
+KRIGING = KrigingSettings()
+LEARNING = LearningSettings()
+POOL = PoolSettings()
+PROPOSAL = ProposalSettings()
+RUN = SurrogateSettings()
 LARGEST = 1e300
 """Larger outcomes stand for infinite ones."""
 IMPUTED_SPREAD = 3.0
@@ -220,7 +220,6 @@ def fit_kriging(
     u: FloatArray,
     y: FloatArray,
     before: Kriging | None = None,
-    settings: KrigingSettings = DEFAULT_SURROGATE_SETTINGS.kriging,
 ) -> Kriging:
     """Fit a process to outcomes.
 
@@ -228,22 +227,21 @@ def fit_kriging(
         u: Points, shape (n, d).
         y: f - gamma there, shape (n,); may be infinite.
         before: Fitted to some of them: its covariance parameters are kept unless there are many more points.
-        settings: Numbers.
     """
-    search = before is None or len(y) >= settings.refit_growth * before.n_searched
-    scale = outcome_scale(y, settings) if before is None or search else before.scale
-    outcomes = compress_outcomes(y, scale, settings)
+    search = before is None or len(y) >= KRIGING.refit_growth * before.n_searched
+    scale = outcome_scale(y) if before is None or search else before.scale
+    outcomes = compress_outcomes(y, scale)
     # a search begins afresh: from the last result it may stay where few points had led it
-    kernel = before.process.kernel_ if before is not None and not search else _initial_kernel(u.shape[1], settings)
+    kernel = before.process.kernel_ if before is not None and not search else _initial_kernel(u.shape[1])
     z, censored = outcomes.z, outcomes.capped | outcomes.floored
-    if censored.any() and (~censored).sum() >= settings.least_uncensored:
-        kernel, z = _impute_first(kernel, u, outcomes, settings, search=search)
-    turns = settings.imputations if censored.any() else 0
+    if censored.any() and (~censored).sum() >= KRIGING.least_uncensored:
+        kernel, z = _impute_first(kernel, u, outcomes, search=search)
+    turns = KRIGING.imputations if censored.any() else 0
     for turn in range(1 + turns):
         standard, mean, sd = _standardise(z)
         if search and turn == turns:
-            nearest = np.argsort(np.abs(z), kind="stable")[: settings.most_points]
-            kernel = _search_kernel(kernel, u[nearest], standard[nearest], settings)
+            nearest = np.argsort(np.abs(z), kind="stable")[: KRIGING.most_points]
+            kernel = _search_kernel(kernel, u[nearest], standard[nearest])
         process = _condition(kernel, u, standard)
         left_out, left_out_sd = _leave_one_out(process, standard)
         residuals = (standard - left_out) / left_out_sd
@@ -253,7 +251,7 @@ def fit_kriging(
     near = np.abs(left_out - limit) < NEAR_LIMIT * left_out_sd
     inflation = math.sqrt(float((residuals[near] ** 2).mean())) if near.any() else 1.0
     n_searched = len(y) if before is None or search else before.n_searched
-    inflation = min(max(inflation, 1.0), settings.most_inflation)
+    inflation = min(max(inflation, 1.0), KRIGING.most_inflation)
     if outcomes.floored.any():  # these do not tell where f would be 0
         limit += _find_shift(left_out - limit, inflation * left_out_sd, y <= 0)
     return Kriging(process, limit, inflation, scale, n_searched)
@@ -274,18 +272,16 @@ def _find_shift(mean: FloatArray, sd: FloatArray, fails: NDArray[np.bool_]) -> f
     return float(minimize_scalar(loss, bounds=(-LARGEST_SHIFT, LARGEST_SHIFT), method="bounded").x)
 
 
-def outcome_scale(y: FloatArray, settings: KrigingSettings = DEFAULT_SURROGATE_SETTINGS.kriging) -> float:
+def outcome_scale(y: FloatArray) -> float:
     """Return the scale c of outcomes y = f - gamma (n,)."""
     sizes = np.abs(y[(np.abs(y) < LARGEST) & (y != 0)])
-    return settings.outcome_scale * (float(np.median(sizes)) if len(sizes) else 1.0)
+    return KRIGING.outcome_scale * (float(np.median(sizes)) if len(sizes) else 1.0)
 
 
-def compress_outcomes(
-    y: FloatArray, scale: float, settings: KrigingSettings = DEFAULT_SURROGATE_SETTINGS.kriging
-) -> _Outcomes:
+def compress_outcomes(y: FloatArray, scale: float) -> _Outcomes:
     """Return compressed outcomes of y = f - gamma (n,), and which of them stand at a cap or floor of f."""
     y = np.clip(y, *_finite_range(y[np.abs(y) < LARGEST]))
-    ties = max(settings.least_ties, settings.tie_share * len(y))
+    ties = max(KRIGING.least_ties, KRIGING.tie_share * len(y))
     capped, floored = (y == y.max()) & (y > 0), (y == y.min()) & (y <= 0)
     return _Outcomes(np.arcsinh(y / scale), capped & (capped.sum() >= ties), floored & (floored.sum() >= ties))
 
@@ -296,15 +292,13 @@ def _finite_range(y: FloatArray) -> tuple[float, float]:
     return -(size or 1.0), size or 1.0
 
 
-def _impute_first(
-    kernel: Any, u: FloatArray, outcomes: _Outcomes, settings: KrigingSettings, *, search: bool
-) -> tuple[Any, FloatArray]:
+def _impute_first(kernel: Any, u: FloatArray, outcomes: _Outcomes, *, search: bool) -> tuple[Any, FloatArray]:
     """Return covariance and outcomes (n,) where censored ones are predicted from all others."""
     free = ~(outcomes.capped | outcomes.floored)
     standard, mean, sd = _standardise(outcomes.z[free])
     if search:
-        nearest = np.argsort(np.abs(outcomes.z[free]), kind="stable")[: settings.most_points]
-        kernel = _search_kernel(kernel, u[free][nearest], standard[nearest], settings)
+        nearest = np.argsort(np.abs(outcomes.z[free]), kind="stable")[: KRIGING.most_points]
+        kernel = _search_kernel(kernel, u[free][nearest], standard[nearest])
     predicted = _condition(kernel, u[free], standard).predict(u)
     return kernel, _impute(outcomes, mean + sd * predicted)
 
@@ -322,20 +316,20 @@ def _standardise(z: FloatArray) -> tuple[FloatArray, float, float]:
     return (z - mean) / sd, mean, sd
 
 
-def _initial_kernel(dim: int, settings: KrigingSettings) -> Any:
+def _initial_kernel(dim: int) -> Any:
     """Return a Matern covariance with a length for each coordinate, and a nugget."""
     from sklearn.gaussian_process.kernels import ConstantKernel, Matern, WhiteKernel  # slow to import
 
     lengths = np.full(dim, 2.0 * math.sqrt(dim))  # about the distance between two draws
-    smooth = ConstantKernel(1.0, (1e-2, 1e3)) * Matern(lengths, (0.2, 100.0), nu=settings.smoothness)
+    smooth = ConstantKernel(1.0, (1e-2, 1e3)) * Matern(lengths, (0.2, 100.0), nu=KRIGING.smoothness)
     return smooth + WhiteKernel(1e-4, (1e-8, 1.0))
 
 
-def _search_kernel(kernel: Any, u: FloatArray, z: FloatArray, settings: KrigingSettings) -> Any:
+def _search_kernel(kernel: Any, u: FloatArray, z: FloatArray) -> Any:
     """Return the covariance whose parameters have the highest likelihood near those of `kernel`."""
 
     def climb(loss: Any, start: Any, bounds: Any) -> tuple[FloatArray, float]:
-        options: Any = {"maxiter": settings.hyperparameter_steps}
+        options: Any = {"maxiter": KRIGING.hyperparameter_steps}
         found = minimize(loss, start, jac=True, method="L-BFGS-B", bounds=bounds, options=options)
         return found.x, found.fun
 

@@ -28,13 +28,12 @@ from samplers.importance import (
 from samplers.method import Goal, Interrupted, Outcome, Steps, no_outcome_share
 from samplers.methods.base import Method
 from samplers.methods.kriging import (
-    DEFAULT_SURROGATE_SETTINGS,
+    LEARNING,
+    POOL,
+    PROPOSAL,
+    RUN,
     Kriging,
-    LearningSettings,
-    PoolSettings,
     Prediction,
-    ProposalSettings,
-    SurrogateSettings,
     fit_kriging,
 )
 from samplers.methods.noise_coordinates import marginalise_noise
@@ -109,15 +108,15 @@ def draw_mixture_pool(kriging: Kriging, mixture: Mixture, n: int, rng: np.random
     return Pool(u, StandardNormal(u.shape[1]).log_prob(u) - mixture.log_prob(u), kriging.predict(u))
 
 
-def fit_mixture(pool: Pool, scales: tuple[float, ...], settings: PoolSettings, rng: np.random.Generator) -> Mixture:
+def fit_mixture(pool: Pool, scales: tuple[float, ...], rng: np.random.Generator) -> Mixture:
     """Return base, wide and fitted Gaussians, the last fitted to draws of the pool in proportion to the proposal."""
-    chosen = rng.choice(len(pool.u), settings.fitted_points, p=normalise_weights(pool.log_proposal))
+    chosen = rng.choice(len(pool.u), POOL.fitted_points, p=normalise_weights(pool.log_proposal))
     points, dim = pool.u[chosen], pool.u.shape[1]
     equal = np.full(len(points), 1 / len(points))
-    fitted = fit_proposal_mixture(fit_shrunk_gaussian, points, equal, settings.components, 3 * dim, rng)
-    base, wide, share = settings.shares
+    fitted = fit_proposal_mixture(fit_shrunk_gaussian, points, equal, POOL.components, 3 * dim, rng)
+    base, wide, share = POOL.shares
     shares = [base, *np.full(len(scales) - 1, wide / (len(scales) - 1)), share]
-    return Mixture(np.array(shares), [*isotropic_normals(dim, scales), fitted.widen(settings.widening)])
+    return Mixture(np.array(shares), [*isotropic_normals(dim, scales), fitted.widen(POOL.widening)])
 
 
 class PoolDraws(NamedTuple):
@@ -165,25 +164,25 @@ class PoolProposal(NamedTuple):
         return PoolDraws(self.pool.u[chosen], log_weights, part, self.log_wide_weights[chosen])
 
 
-def build_pool_proposal(pool: Pool, scales: tuple[float, ...], settings: ProposalSettings) -> PoolProposal:
+def build_pool_proposal(pool: Pool, scales: tuple[float, ...]) -> PoolProposal:
     """Return the proposal for the estimate."""
     wide = first_mixture(pool.u.shape[1], scales[1:])
     log_wide_weights = StandardNormal(pool.u.shape[1]).log_prob(pool.u) - wide.log_prob(pool.u)
     logs = (pool.log_proposal, pool.log_weights, pool.log_weights - log_wide_weights, pool.log_doubted)
-    others = (settings.base_share, settings.wide_share, settings.doubted_share)
+    others = (PROPOSAL.base_share, PROPOSAL.wide_share, PROPOSAL.doubted_share)
     shares = np.array([1 - sum(others), *others])
     return PoolProposal(pool, shares, np.array([normalise_weights(log) for log in logs]), log_wide_weights)
 
 
-def design_size(budget: int, dim: int, settings: LearningSettings) -> int:
+def design_size(budget: int, dim: int) -> int:
     """Return the number of points of the first design, a multiple of the number of its scales."""
-    size = min(int(settings.design_share * budget), settings.design_least + settings.design_per_dim * dim)
-    return max(size // len(settings.scales), 1) * len(settings.scales)
+    size = min(int(LEARNING.design_share * budget), LEARNING.design_least + LEARNING.design_per_dim * dim)
+    return max(size // len(LEARNING.scales), 1) * len(LEARNING.scales)
 
 
-def learning_size(budget: int, settings: LearningSettings) -> int:
+def learning_size(budget: int) -> int:
     """Return the number of simulations for learning at most, the first design included."""
-    return min(int(settings.share * budget), settings.most)
+    return min(int(LEARNING.share * budget), LEARNING.most)
 
 
 def draw_design(n: int, dim: int, scales: tuple[float, ...], rng: np.random.Generator) -> FloatArray:
@@ -195,9 +194,7 @@ def draw_design(n: int, dim: int, scales: tuple[float, ...], rng: np.random.Gene
     return np.concatenate([scale * cube for scale, cube in zip(scales, cubes, strict=True)])
 
 
-def choose_batch(
-    kriging: Kriging, pool: Pool, n: int, settings: LearningSettings, rng: np.random.Generator
-) -> FloatArray:
+def choose_batch(kriging: Kriging, pool: Pool, n: int, rng: np.random.Generator) -> FloatArray:
     """Choose the next n points to learn from, shape (n, d).
 
     Candidates are drawn from the pool in proportion to phi sqrt(P[fail] P[safe]). Of these, one after the other, the
@@ -206,14 +203,14 @@ def choose_batch(
     drawn at random, where a surrogate that is not believed leaves both open.
     """
     weights = normalise_weights(pool.log_doubt)
-    n_candidates = min(settings.candidates * n, int(np.count_nonzero(weights)))
+    n_candidates = min(LEARNING.candidates * n, int(np.count_nonzero(weights)))
     among = np.unique(rng.choice(len(pool.u), n_candidates, p=weights))
     if len(among) < n:  # nearly all weight lies on few draws
-        among = np.argsort(pool.log_doubt)[-settings.candidates * n :]
+        among = np.argsort(pool.log_doubt)[-LEARNING.candidates * n :]
     u, mean = pool.u[among], pool.prediction.mean[among]
     covariance, noise = kriging.covariance(u), kriging.noise
     chosen = list[int]()
-    n_random = int(settings.random_share * n)
+    n_random = int(LEARNING.random_share * n)
     for _ in range(min(n - n_random, len(among))):
         doubt = -np.abs(mean) / np.sqrt(np.maximum(np.diag(covariance), 0.0) + noise + 1e-12)
         doubt[chosen] = -np.inf
@@ -287,25 +284,22 @@ class SurrogateRun:
         inputs: Without coordinates that are noise.
         goal: Threshold, confidence, target and budget.
         budget: Simulations to plan for.
-        settings: Numbers.
         rng: Source of randomness.
     """
 
-    def __init__(
-        self, inputs: Inputs, goal: Goal, budget: int, settings: SurrogateSettings, rng: np.random.Generator
-    ) -> None:
-        self.inputs, self.goal, self.budget, self.settings, self.rng = inputs, goal, budget, settings, rng
+    def __init__(self, inputs: Inputs, goal: Goal, budget: int, rng: np.random.Generator) -> None:
+        self.inputs, self.goal, self.budget, self.rng = inputs, goal, budget, rng
         self.u, self.f = np.empty((0, inputs.dim)), np.empty(0)
         self.trace: list[Level] = []
         self.n_design, self.failing_batches = 0, 0
 
     def steps(self) -> Steps:
         """Learn; then estimate, or leave it to plain Monte Carlo."""
-        learning, scales = self.settings.learning, self.settings.learning.scales
+        scales = LEARNING.scales
         try:
-            self.n_design = design_size(self.budget, self.inputs.dim, learning)
+            self.n_design = design_size(self.budget, self.inputs.dim)
             yield from self._simulate(draw_design(self.n_design, self.inputs.dim, scales, self.rng))
-            if (self.f[: self.n_design // len(scales)] <= self.goal.gamma).mean() >= learning.common_share:
+            if (self.f[: self.n_design // len(scales)] <= self.goal.gamma).mean() >= LEARNING.common_share:
                 return (yield from self.draw_base())
             kriging = yield from self._learn()
         except Interrupted:
@@ -341,38 +335,38 @@ class SurrogateRun:
 
     def _learn(self) -> Generator[FloatArray, FloatArray, Kriging]:
         """Simulate batches where the surrogate is in doubt, until it is good enough or has its share of the budget."""
-        learning, scales = self.settings.learning, self.settings.learning.scales
-        most = learning_size(self.budget, learning)
-        size = max((most - self.n_design) // learning.batches, learning.least_batch)
-        kriging = fit_kriging(self.u, self.f - self.goal.gamma, None, self.settings.kriging)
+        scales = LEARNING.scales
+        most = learning_size(self.budget)
+        size = max((most - self.n_design) // LEARNING.batches, LEARNING.least_batch)
+        kriging = fit_kriging(self.u, self.f - self.goal.gamma, None)
         mixture, good = first_mixture(self.inputs.dim, scales), 0
         surprises = list[float]()
         while len(self.f) < most and good < 2:
-            pool = draw_mixture_pool(kriging, mixture, self.settings.pool.learning_size, self.rng)
+            pool = draw_mixture_pool(kriging, mixture, POOL.learning_size, self.rng)
             before = int((self.f <= self.goal.gamma).sum())
-            batch = choose_batch(kriging, pool, min(size, most - len(self.f)), learning, self.rng)
+            batch = choose_batch(kriging, pool, min(size, most - len(self.f)), self.rng)
             expected = np.exp(kriging.predict(batch).log_fail)
             yield from self._simulate(batch)
             surprises.append(float((self.f[-len(batch) :] <= self.goal.gamma).sum() - expected.sum()))
-            allowed = learning.most_surprise * math.sqrt(2 * float((expected * (1 - expected)).sum()) + 1)
+            allowed = LEARNING.most_surprise * math.sqrt(2 * float((expected * (1 - expected)).sum()) + 1)
             calibrated = abs(sum(surprises[-2:])) <= allowed
             failures = int((self.f <= self.goal.gamma).sum())
             self.failing_batches += failures > before
             forecast = pool.forecast_cov(self.budget - len(self.f))
-            good = good + 1 if failures and calibrated and forecast < learning.forecast_cov else 0
-            mixture = fit_mixture(pool, scales, self.settings.pool, self.rng)
-            kriging = fit_kriging(self.u, self.f - self.goal.gamma, kriging, self.settings.kriging)
+            good = good + 1 if failures and calibrated and forecast < LEARNING.forecast_cov else 0
+            mixture = fit_mixture(pool, scales, self.rng)
+            kriging = fit_kriging(self.u, self.f - self.goal.gamma, kriging)
         self._mixture = mixture
         return kriging
 
     def _build_proposal(self, kriging: Kriging) -> PoolProposal:
         """Return the proposal for the estimate."""
-        scales, settings = self.settings.learning.scales, self.settings.pool
-        for _ in range(settings.final_rounds):
-            pool = draw_mixture_pool(kriging, self._mixture, settings.final_size // 4, self.rng)
-            self._mixture = fit_mixture(pool, scales, settings, self.rng)
-        pool = draw_mixture_pool(kriging, self._mixture, settings.final_size, self.rng)
-        return build_pool_proposal(pool, scales, self.settings.proposal)
+        scales = LEARNING.scales
+        for _ in range(POOL.final_rounds):
+            pool = draw_mixture_pool(kriging, self._mixture, POOL.final_size // 4, self.rng)
+            self._mixture = fit_mixture(pool, scales, self.rng)
+        pool = draw_mixture_pool(kriging, self._mixture, POOL.final_size, self.rng)
+        return build_pool_proposal(pool, scales)
 
     def _count_draws(self) -> int:
         """Return the number of draws of the estimate at most."""
@@ -398,9 +392,9 @@ class SurrogateRun:
             made = made.add(new, f, x, goal.gamma, proposal.pool_variance)
             left -= len(f)
             self._record_draws(f, made)
-            if left > 0 and made.draws.n < self.settings.most_learned:
+            if left > 0 and made.draws.n < RUN.most_learned:
                 self.u, self.f = np.concatenate([self.u, new.u]), np.concatenate([self.f, f])
-                kriging = fit_kriging(self.u, self.f - goal.gamma, kriging, self.settings.kriging)
+                kriging = fit_kriging(self.u, self.f - goal.gamma, kriging)
                 proposal = self._build_proposal(kriging)
         if made.draws.n == 0:
             return self._estimate_early(Status.STOPPED if stopped else Status.BUDGET)
@@ -409,8 +403,8 @@ class SurrogateRun:
     def _part_size(self, left: int) -> int:
         """Return the number of draws of one part."""
         if self.goal.target_cov is not None:
-            return max(int(self.settings.target_batch * self.budget), 1)
-        return min(self.settings.largest_batch, math.ceil(left / self.settings.parts))
+            return max(int(RUN.target_batch * self.budget), 1)
+        return min(RUN.largest_batch, math.ceil(left / RUN.parts))
 
     def _record_draws(self, f: FloatArray, made: EstimateDraws) -> None:
         """Add a part of the estimate, with outcomes f (n,), to the trace."""
@@ -433,7 +427,7 @@ class SurrogateRun:
         return replace(
             outcome,
             interval=(outcome.interval[0], high),
-            warnings=(*outcome.warnings, *made.skill_warnings(self.settings.least_skill)),
+            warnings=(*outcome.warnings, *made.skill_warnings(RUN.least_skill)),
             base_draws=int(made.kinds[0, BASE]),
             sample=replace(made.draws.sample, lineages=lineages),
         )
@@ -442,7 +436,7 @@ class SurrogateRun:
         """Return log(phi / q) of the points of the design, q the equal mixture of its scales; of the failing ones."""
         u, f = self.u[: self.n_design], self.f[: self.n_design]
         u = u[f <= self.goal.gamma] if failing else u
-        design = first_mixture(self.inputs.dim, self.settings.learning.scales)
+        design = first_mixture(self.inputs.dim, LEARNING.scales)
         return StandardNormal(self.inputs.dim).log_prob(u) - design.log_prob(u)
 
     def _estimate_early(self, status: Status) -> Outcome:
@@ -450,12 +444,12 @@ class SurrogateRun:
         n = self.n_design
         x = self.inputs.base.from_standard_normal(self.u[:n])
         draws = Draws.from_outcomes(self.f[:n], self._design_log_weights(failing=False), x, self.goal.gamma)
-        outcome = self._outcome(draws, draws.cov, float(len(self.settings.learning.scales)), status)
+        outcome = self._outcome(draws, draws.cov, float(len(LEARNING.scales)), status)
         return replace(outcome, draw_weights=draws.weights_after(0))
 
     def _interval(self, draws: Draws, cov: float, largest_weight: float) -> Interval:
         """Return the interval of p from weighted draws, for the regions that they know of."""
-        if draws.ess < self.settings.least_ess:
+        if draws.ess < RUN.least_ess:
             return weighted_interval(draws, self.goal.confidence, largest_weight, cov)
         return log_normal_interval(draws.p, cov, self.goal.confidence, degrees_of_freedom(draws.ess, independent=True))
 
@@ -535,17 +529,17 @@ class Surrogate(Method):
 
     def __post_init__(self) -> None:
         """Check the settings."""
-        check_count("Surrogate", "n", self.n, DEFAULT_SURROGATE_SETTINGS.least_budget)
+        check_count("Surrogate", "n", self.n, RUN.least_budget)
 
     def steps(self, inputs: Inputs, goal: Goal, rng: np.random.Generator) -> Steps:
         """Learn, then estimate."""
-        settings, budget = DEFAULT_SURROGATE_SETTINGS, self.n if goal.max_sim is None else goal.max_sim
+        budget = self.n if goal.max_sim is None else goal.max_sim
         searched = marginalise_noise(inputs, rng)
-        if searched.dim > settings.most_dims:
-            about = f"Kriging serves up to {settings.most_dims} dimensions, not {searched.dim:,}: two-stage takes over."
+        if searched.dim > RUN.most_dims:
+            about = f"Kriging serves up to {RUN.most_dims} dimensions, not {searched.dim:,}: two-stage takes over."
             return (yield from run_two_stage(inputs, goal, budget, rng)).remark_first(about)
-        run = SurrogateRun(searched, goal, budget, settings, rng)
-        if budget < settings.least_budget:
-            about = f"max_sim leaves {budget} simulations, too few to learn from ({settings.least_budget}): "
+        run = SurrogateRun(searched, goal, budget, rng)
+        if budget < RUN.least_budget:
+            about = f"max_sim leaves {budget} simulations, too few to learn from ({RUN.least_budget}): "
             return (yield from run.draw_base()).remark_first(about + "base draws only.")
         return (yield from run.steps())

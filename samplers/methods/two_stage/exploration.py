@@ -23,7 +23,11 @@ from samplers.methods.two_stage.regions import (
     grow_regions,
     label_regions,
 )
-from samplers.methods.two_stage.settings import DEFAULT_SETTINGS, ExplorationSettings, LineSettings, TwoStageSettings
+from samplers.methods.two_stage.settings import (
+    EXPLORATION,
+    LINES,
+    SUBSPACE,
+)
 from samplers.methods.two_stage.simulator import ComponentDraws, SimulationSteps, Simulator
 from samplers.problem import FloatArray
 from samplers.statistics import next_level
@@ -97,19 +101,18 @@ class ExplorationPlanner:
     """Points per level, a few more where the chains do not divide them."""
     budget: int
     """Simulations for all levels."""
-    settings: ExplorationSettings
 
     def plan_next(self, chains: Chains, depth: int, n_sim: int, rng: np.random.Generator) -> NextLevel | Status:
         """Return the next level, or how the descent ends: converged once `level_fraction` of the points fail."""
         points = chains.by_step()
-        if depth == 0 and np.count_nonzero(points.f <= self.gamma) >= self.settings.common_failures:
+        if depth == 0 and np.count_nonzero(points.f <= self.gamma) >= EXPLORATION.common_failures:
             return Status.CONVERGED
-        threshold = next_level(points.f, self.settings.level_fraction, self.gamma)
+        threshold = next_level(points.f, EXPLORATION.level_fraction, self.gamma)
         if threshold == self.gamma:
             return Status.CONVERGED
-        if threshold is None or depth >= self.settings.max_levels:
+        if threshold is None or depth >= EXPLORATION.max_levels:
             return Status.STALLED
-        seeds = rng.permutation(np.flatnonzero(points.f <= threshold))[: self.n // self.settings.points_per_seed]
+        seeds = rng.permutation(np.flatnonzero(points.f <= threshold))[: self.n // EXPLORATION.points_per_seed]
         steps = max(1, math.ceil(self.n / len(seeds)) - 1)
         if n_sim + steps * len(seeds) > self.budget:
             return Status.BUDGET
@@ -124,7 +127,6 @@ def descend_levels(
     n: int,
     most: int,
     rng: np.random.Generator,
-    explore: ExplorationSettings,
 ) -> SimulationSteps[SubsetPoints]:
     """Run subset simulation from base draws u (n, d), f (n,), until a tenth of a level fails or the budget is used.
 
@@ -133,10 +135,10 @@ def descend_levels(
     All candidates are kept, for the regressions around the regions; there is no estimate, so no level is recorded.
     """
     kernel = ScaledKernel(
-        "conditional", "unit", explore.initial_scale, explore.level_acceptance, deviations=np.ones(u.shape[1])
+        "conditional", "unit", EXPLORATION.initial_scale, EXPLORATION.level_acceptance, deviations=np.ones(u.shape[1])
     )
     gamma = goal.gamma
-    planner = ExplorationPlanner(gamma, n, most - simulator.n_sim, explore)
+    planner = ExplorationPlanner(gamma, n, most - simulator.n_sim)
     levels, thresholds = list[Growth](), list[float]()
 
     def record(growth: Growth, planned: NextLevel | Status) -> None:
@@ -180,11 +182,9 @@ class LineEnds(NamedTuple):
     """Index of the base draw that each started from, shape (k,)."""
 
 
-def choose_roots(
-    f: FloatArray, n: int, rng: np.random.Generator, settings: LineSettings = DEFAULT_SETTINGS.lines
-) -> NDArray[np.int64]:
+def choose_roots(f: FloatArray, n: int, rng: np.random.Generator) -> NDArray[np.int64]:
     """Return the indices of at most n base draws with outcomes f (m,) to start from: a random part of the lowest."""
-    lowest = np.lexsort((rng.random(len(f)), f))[: max(int(settings.root_share * len(f)), n)]
+    lowest = np.lexsort((rng.random(len(f)), f))[: max(int(LINES.root_share * len(f)), n)]
     return rng.permutation(lowest)[:n]
 
 
@@ -195,7 +195,7 @@ def walk_lines(
     gamma: float,
     scale: float,
     rng: np.random.Generator,
-    settings: LineSettings = DEFAULT_SETTINGS.lines,
+    room: int | None = None,
 ) -> SimulationSteps[tuple[FloatArray, NDArray[np.bool_]]]:
     """Walk downhill from points u (n, d) with outcomes f (n,); return where the lines end, and which of them fail.
 
@@ -203,18 +203,19 @@ def walk_lines(
     step before if that was a gain. The line goes to the first try with f(v) < f(u), else to the first with f(v) = f(u).
     All lines take a step in one batch: where half of them have arrived, the others have two tries each. The longer it
     takes, the fewer lines go on. They end together: when all have arrived, at twice the median time of arrival once
-    most have, where hardly any arrives, or at the limit of simulations (times `scale`).
+    most have, where hardly any arrives, or at the limit of simulations (times `scale`); with `room` they have so many,
+    however few arrive.
     """
     u, f, n = u.copy(), f.copy(), len(f)
-    s, kept, gained = np.full(n, settings.initial_step), np.zeros_like(u), np.zeros(n, dtype=bool)
+    s, kept, gained = np.full(n, LINES.initial_step), np.zeros_like(u), np.zeros(n, dtype=bool)
     arrival = np.where(f <= gamma, 0.0, np.inf)
     used = time = 0
-    while np.isinf(arrival).any() and not _is_late(arrival, time, used / scale, settings):
+    while np.isinf(arrival).any() and not _is_late(arrival, time, used / scale, room):
         on = np.flatnonzero(np.isinf(arrival))
-        on = on[on < max(1, scale * settings.steps / max(time, 1))]
+        on = on[on < max(1, scale * LINES.steps / max(time, 1))]
         if len(on) == 0:
             break
-        tries = min(n // len(on), settings.most_tries)
+        tries = min(n // len(on), LINES.most_tries)
         xi = rng.standard_normal((len(on), tries, u.shape[1]))
         xi[gained[on], 0] = kept[on[gained[on]]]
         v = np.sqrt(1 - s[on, None, None] ** 2) * u[on, None] + s[on, None, None] * xi
@@ -222,8 +223,8 @@ def walk_lines(
         used, time = used + new.size, time + 1
         fresh = np.ones(new.shape, dtype=bool)
         fresh[:, 0] = ~gained[on]
-        change = settings.adaptation * (((new <= f[on, None]) - settings.acceptance) * fresh).sum(axis=1)
-        s[on] = np.clip(s[on] * np.exp(change), *settings.step_range)
+        change = LINES.adaptation * (((new <= f[on, None]) - LINES.acceptance) * fresh).sum(axis=1)
+        s[on] = np.clip(s[on] * np.exp(change), *LINES.step_range)
         best = np.arange(len(on)), _choose_tries(f[on], new)
         kept[on], gained[on], moves = xi[best], new[best] < f[on], new[best] <= f[on]
         u[on[moves]], f[on[moves]] = v[best][moves], new[best][moves]
@@ -240,13 +241,15 @@ def _choose_tries(f: FloatArray, new: FloatArray) -> NDArray[np.int64]:
     return np.asarray(np.where(gain.any(axis=1), gain.argmax(axis=1), tie.argmax(axis=1)))
 
 
-def _is_late(arrival: FloatArray, time: int, used: float, settings: LineSettings) -> bool:
+def _is_late(arrival: FloatArray, time: int, used: float, room: int | None) -> bool:
     """Return whether the lines that are still on their way are given up."""
     arrived = np.isfinite(arrival)
     share = float(arrived.mean())
-    if share >= settings.most_arrived and time >= settings.patience * float(np.median(arrival[arrived])):
+    if share >= LINES.most_arrived and time >= LINES.patience * float(np.median(arrival[arrived])):
         return True
-    return used >= settings.limit or (used >= settings.first_look and share < settings.few_arrived)
+    if room is not None:
+        return used >= room
+    return used >= LINES.limit or (used >= LINES.first_look and share < LINES.few_arrived)
 
 
 TINY = 1e-300
@@ -314,11 +317,10 @@ def find_wide_failures(
     levels: int,
     n: int,
     rng: np.random.Generator,
-    settings: ExplorationSettings,
 ) -> SimulationSteps[WideFailures]:
     """Return the failures among wide draws, and among wider ones if the levels went deep."""
-    scale = -float(ndtri(10 ** -(levels + 0.5))) / settings.depth_ratio
-    if scale > settings.deep_scale:
+    scale = -float(ndtri(10 ** -(levels + 0.5))) / EXPLORATION.depth_ratio
+    if scale > EXPLORATION.deep_scale:
         deep = yield from draw_wide(simulator, ((scale, n),), rng)
         first = ComponentDraws(
             [*first.components, *deep.components],
@@ -361,19 +363,19 @@ class Sizes:
     """Simulations of the whole exploration."""
 
     @classmethod
-    def within(cls, budget: int, settings: ExplorationSettings = DEFAULT_SETTINGS.exploration) -> "Sizes":
+    def within(cls, budget: int) -> "Sizes":
         """Return the sizes for a budget."""
-        usual = settings.usual_budget
+        usual = EXPLORATION.usual_budget
         scale = budget / usual if budget < usual else math.sqrt(budget / usual)
         return cls(
             scale=scale,
-            base=round(settings.base * scale),
-            wide=tuple((width, round(n * scale)) for width, n in settings.wide),
-            level=max(settings.least_level, round(settings.level * scale)),
-            starts=max(settings.least_starts, round(settings.starts * scale)),
-            level_starts=max(settings.least_level_starts, round(settings.level_starts * scale)),
-            most=int(settings.descent_share * budget),
-            limit=int(settings.share * budget),
+            base=round(EXPLORATION.base * scale),
+            wide=tuple((width, round(n * scale)) for width, n in EXPLORATION.wide),
+            level=max(EXPLORATION.least_level, round(EXPLORATION.level * scale)),
+            starts=max(EXPLORATION.least_starts, round(EXPLORATION.starts * scale)),
+            level_starts=max(EXPLORATION.least_level_starts, round(EXPLORATION.level_starts * scale)),
+            most=int(EXPLORATION.descent_share * budget),
+            limit=int(EXPLORATION.share * budget),
         )
 
 
@@ -396,35 +398,32 @@ def find_regions(
     goal: Goal,
     sizes: Sizes,
     rng: np.random.Generator,
-    settings: TwoStageSettings = DEFAULT_SETTINGS,
 ) -> SimulationSteps[ExplorationResult]:
     """Find the regions of failure, starting from the first draws; none if nothing fails."""
-    n_base, gamma, explore = int(first.counts[0]), goal.gamma, settings.exploration
+    n_base, gamma = int(first.counts[0]), goal.gamma
     base_u, base_f = first.u[:n_base], first.f[:n_base]
     drawn = ComponentDraws(first.components[1:], first.counts[1:], first.u[n_base:], first.f[n_base:])
     for_levels, for_lines = rng.spawn(2)
     (descent, wide), lines = yield from join_batches(
-        _pass_levels(simulator, base_u, base_f, drawn, goal, sizes, for_levels, explore),
-        _find_lines(simulator, base_u, base_f, gamma, sizes.scale, for_lines, settings),
+        _pass_levels(simulator, base_u, base_f, drawn, goal, sizes, for_levels),
+        _find_lines(simulator, base_u, base_f, gamma, sizes.scale, for_lines),
     )
     roots = len(np.union1d(descent.roots, lines.roots))
     discovery = Discovery(count_lineages(roots, wide.log_weights), descent.ceiling)
-    most = max(2, (sizes.limit - simulator.n_sim) // explore.chain_cost)
+    most = max(2, (sizes.limit - simulator.n_sim) // EXPLORATION.chain_cost)
     far, (labels, _) = yield from join_batches(
-        bisect_towards_origin(simulator, wide.choose(min(sizes.starts, most), rng), gamma, explore.bisections),
-        label_regions(simulator, lines.u, gamma, sizes.limit, settings.regions),
+        bisect_towards_origin(simulator, wide.choose(min(sizes.starts, most), rng), gamma, EXPLORATION.bisections),
+        label_regions(simulator, lines.u, gamma, sizes.limit),
     )
-    if _is_scattered(labels, simulator.inputs.dim, settings):
+    if _is_scattered(labels, simulator.inputs.dim):
         region = Region(lines.u[:, None], descent.u, descent.f)
         return ExplorationResult([region], noisy=False, scattered=True, levels=descent.levels, discovery=discovery)
-    near = _choose_lines(lines.u, labels, rng, settings.lines)
+    near = _choose_lines(lines.u, labels, rng)
     others = min(max(sizes.level_starts, sizes.starts + sizes.level_starts - len(far)), most - len(far))
     starts = np.concatenate([far, near, rng.permutation(descent.failing)[: max(others - len(near), 0)]])
     if len(starts) == 0:
         return ExplorationResult([], noisy=False, discovery=discovery)
-    result = yield from grow_regions(
-        simulator, starts, descent, gamma, sizes.limit, rng, settings.regions, settings.mixture
-    )
+    result = yield from grow_regions(simulator, starts, descent, gamma, sizes.limit, rng)
     return result._replace(discovery=discovery)
 
 
@@ -436,12 +435,11 @@ def _pass_levels(
     goal: Goal,
     sizes: Sizes,
     rng: np.random.Generator,
-    explore: ExplorationSettings,
 ) -> SimulationSteps[tuple[SubsetPoints, WideFailures]]:
     """Run subset simulation from base draws u (n, d), f (n,), and make the wide draws as wide as it went deep."""
-    descent = yield from descend_levels(simulator, u, f, goal, sizes.level, sizes.most, rng, explore)
-    more = round(explore.deep_draws * sizes.scale)
-    wide = yield from find_wide_failures(simulator, drawn, goal.gamma, descent.levels, more, rng, explore)
+    descent = yield from descend_levels(simulator, u, f, goal, sizes.level, sizes.most, rng)
+    more = round(EXPLORATION.deep_draws * sizes.scale)
+    wide = yield from find_wide_failures(simulator, drawn, goal.gamma, descent.levels, more, rng)
     return descent, wide
 
 
@@ -452,23 +450,22 @@ def _find_lines(
     gamma: float,
     scale: float,
     rng: np.random.Generator,
-    settings: TwoStageSettings,
 ) -> SimulationSteps[LineEnds]:
     """Walk lines of descent from base draws u (n, d) with outcomes f (n,), and their ends towards the origin."""
-    roots = choose_roots(f, max(1, round(scale * settings.lines.n)), rng, settings.lines)
-    ends, failing = yield from walk_lines(simulator, u[roots], f[roots], gamma, scale, rng, settings.lines)
-    near = yield from bisect_towards_origin(simulator, ends[failing], gamma, settings.exploration.bisections)
+    roots = choose_roots(f, max(1, round(scale * LINES.n)), rng)
+    ends, failing = yield from walk_lines(simulator, u[roots], f[roots], gamma, scale, rng)
+    near = yield from bisect_towards_origin(simulator, ends[failing], gamma, EXPLORATION.bisections)
     return LineEnds(near, roots[failing])
 
 
-def _is_scattered(labels: Labels, dim: int, settings: TwoStageSettings) -> bool:
+def _is_scattered(labels: Labels, dim: int) -> bool:
     """Return whether lines of descent lie in so many regions, in many dimensions, that chains would not relax there."""
     regions = int(labels.max(initial=-1)) + 1
-    return dim > settings.mixture.subspace.high_dim and regions >= settings.lines.many_regions
+    return dim > SUBSPACE.high_dim and regions >= LINES.many_regions
 
 
-def _choose_lines(u: FloatArray, labels: Labels, rng: np.random.Generator, settings: LineSettings) -> FloatArray:
+def _choose_lines(u: FloatArray, labels: Labels, rng: np.random.Generator) -> FloatArray:
     """Return ends of lines (n, d) for chains to start from: a few of each region."""
     order = rng.permutation(len(u))
-    chosen = [order[labels[order] == k][: settings.starts] for k in range(int(labels.max(initial=-1)) + 1)]
+    chosen = [order[labels[order] == k][: LINES.starts] for k in range(int(labels.max(initial=-1)) + 1)]
     return np.take(u, np.concatenate([np.empty(0, dtype=np.int64), *chosen]), axis=0)

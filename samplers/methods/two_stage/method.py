@@ -8,7 +8,7 @@ import numpy as np
 from samplers.method import Goal, Interrupted, Steps, offer_of
 from samplers.methods.base import Method
 from samplers.methods.two_stage import stages
-from samplers.methods.two_stage.settings import DEFAULT_SETTINGS, TwoStageSettings
+from samplers.methods.two_stage.settings import TWO_STAGE
 from samplers.methods.two_stage.stages import start_run
 from samplers.methods.two_stage.terms.search import search_terms, suits_terms
 from samplers.methods.two_stage.terms_alone import TermRecord, explore_terms
@@ -105,43 +105,39 @@ class TwoStage(Method):
 
     def __post_init__(self) -> None:
         """Check the settings."""
-        check_count("TwoStage", "n", self.n, DEFAULT_SETTINGS.min_exploration_budget)
+        check_count("TwoStage", "n", self.n, TWO_STAGE.min_exploration_budget)
 
     def steps(self, inputs: Inputs, goal: Goal, rng: np.random.Generator) -> Steps:
         """Explore, refine, estimate."""
         return run_two_stage(inputs, goal, self.n if goal.max_sim is None else goal.max_sim, rng)
 
 
-def run_two_stage(
-    inputs: Inputs, goal: Goal, budget: int, rng: np.random.Generator, settings: TwoStageSettings = DEFAULT_SETTINGS
-) -> Steps:
+def run_two_stage(inputs: Inputs, goal: Goal, budget: int, rng: np.random.Generator) -> Steps:
     """Estimate P[f(X) <= goal.gamma] with settings that need not be the default ones."""
     offer = offer_of(inputs)
-    if offer is not None and suits_terms(inputs, offer, budget, settings.terms):
-        return (yield from search_terms(inputs, offer, goal, budget, rng, settings.terms))
+    if offer is not None and suits_terms(inputs, offer, budget):
+        return (yield from search_terms(inputs, offer, goal, budget, rng))
     record = TermRecord(offered=offer is not None and offer.with_f)
-    outcome = yield from _explore_and_estimate(inputs, goal, budget, rng, settings, record)
+    outcome = yield from _explore_and_estimate(inputs, goal, budget, rng, record)
     return replace(outcome, remarks=(*outcome.remarks, *record.unreached.describe(outcome.p)))
 
 
 def _explore_and_estimate(
-    inputs: Inputs, goal: Goal, budget: int, rng: np.random.Generator, settings: TwoStageSettings, record: TermRecord
+    inputs: Inputs, goal: Goal, budget: int, rng: np.random.Generator, record: TermRecord
 ) -> Steps:
     """Run all stages; `record` takes the terms of what the exploration simulates."""
-    context, state = start_run(inputs, goal, budget, settings, rng)
-    if budget < settings.min_exploration_budget:
-        least = settings.min_exploration_budget
+    context, state = start_run(inputs, goal, budget, rng)
+    if budget < TWO_STAGE.min_exploration_budget:
+        least = TWO_STAGE.min_exploration_budget
         about = f"max_sim leaves {budget} simulations, too few for an exploration ({least}): base draws only."
         return (yield from stages.run_monte_carlo(context, state)).remark_first(about)
     try:
         state = yield from record.watch(stages.draw_first(context, state))
-        if state.base_share(goal.gamma) >= settings.common_share:
+        if state.base_share(goal.gamma) >= TWO_STAGE.common_share:
             return (yield from stages.run_monte_carlo(context, state, counted=False))
         state, exploration = yield from record.watch(stages.explore(context, state))
         room, first = context.left, state.history.batches[0]
-        exploration = yield from explore_terms(
-            context.simulator, exploration, record, first, goal.gamma, room, rng, settings
-        )
+        exploration = yield from explore_terms(context.simulator, exploration, record, first, goal.gamma, room, rng)
         if not exploration.regions:
             return (yield from stages.run_monte_carlo(context, state))
         refinement, proposal = stages.begin_refinement(context, state, exploration)
@@ -156,8 +152,8 @@ def _explore_and_estimate(
     except Interrupted:
         return stages.estimate_early(context, state)
     outcome = yield from stages.estimate_afresh(context, state, refinement, proposal)
-    if budget >= settings.sufficient_budget:
+    if budget >= TWO_STAGE.sufficient_budget:
         return outcome
-    enough = settings.sufficient_budget
+    enough = TWO_STAGE.sufficient_budget
     about = f"A search of only {budget:,} simulations may miss failure regions ({enough:,} are recommended)."
     return replace(outcome, warnings=(*outcome.warnings, about))

@@ -19,10 +19,9 @@ from samplers.components import (
 )
 from samplers.methods.two_stage.planes import weighted_quantile
 from samplers.methods.two_stage.settings import (
-    DEFAULT_MIXTURE_SETTINGS,
-    EdgeSettings,
-    MixtureWeightSettings,
-    SubspaceSettings,
+    EDGES,
+    SUBSPACE,
+    WEIGHTS,
 )
 from samplers.problem import FloatArray
 from samplers.proposals import expectation_maximisation, posterior, shrink_covariance, start_from_centres
@@ -148,9 +147,7 @@ class SubspaceMixture(NamedTuple):
     """Log likelihood, in independent points, less the BIC penalty."""
 
 
-def fit_shrunk_subspace_gaussian(
-    u: FloatArray, weights: FloatArray, ess: float, settings: SubspaceSettings = DEFAULT_MIXTURE_SETTINGS.subspace
-) -> tuple[SubspaceGaussian, float]:
+def fit_shrunk_subspace_gaussian(u: FloatArray, weights: FloatArray, ess: float) -> tuple[SubspaceGaussian, float]:
     """Return the component of weighted points, and the share of the shrinkage target in its covariance.
 
     Its covariance is shrunk as by `shrink_covariance`. Above `high_dim` dimensions it is the target alone: one
@@ -160,35 +157,32 @@ def fit_shrunk_subspace_gaussian(
         u: Points, shape (n, d).
         weights: Adding up to 1, shape (n,).
         ess: How many independent points they are worth.
-        settings: Limits of variances and of the mean's correction.
     """
     dim = u.shape[1]
     mean = weights @ u
     norm = float(np.linalg.norm(mean))
     v = mean / norm if norm > 0 else np.eye(dim)[0]
     along = float(weights @ (u @ v - norm) ** 2)
-    if dim > settings.high_dim:
+    if dim > SUBSPACE.high_dim:
         # Noise makes the mean of few points too long, by (d - 1) / ess in the square, and turns it.
-        excess = min((dim - 1) / (ess * max(norm, SHORT_MEAN) ** 2), settings.max_mean_excess)
-        variance = np.array([min(along * (1 - excess) + excess, settings.max_spread)])
-        raised = inflate_variances(variance, ess, settings)
+        excess = min((dim - 1) / (ess * max(norm, SHORT_MEAN) ** 2), SUBSPACE.max_mean_excess)
+        variance = np.array([min(along * (1 - excess) + excess, SUBSPACE.max_spread)])
+        raised = inflate_variances(variance, ess)
         return SubspaceGaussian(v[:, None], np.array([norm * (1 - excess)]), raised), 1.0
     centred = (u - mean) * np.sqrt(weights)[:, None]  # `weighted_moments` would lose digits of small variances far out
     shrunk, share = shrink_covariance(centred.T @ centred, v, along, ess)
     values, axes = np.linalg.eigh(shrunk)
-    return SubspaceGaussian(axes, axes.T @ mean, inflate_variances(values, ess, settings)), share
+    return SubspaceGaussian(axes, axes.T @ mean, inflate_variances(values, ess)), share
 
 
-def inflate_variances(
-    variance: FloatArray, ess: float, settings: SubspaceSettings = DEFAULT_MIXTURE_SETTINGS.subspace
-) -> FloatArray:
+def inflate_variances(variance: FloatArray, ess: float) -> FloatArray:
     """Return variances (r,), those under 1 raised by some of their standard errors.
 
     Too small a variance makes weights unbounded, too large a one costs a few draws.
     """
     variance = np.maximum(variance, LEAST_VARIANCE_OF_COMPONENT)
-    error = math.sqrt(2 / max(ess, settings.min_ess))
-    raised = np.minimum(variance * (1 + settings.standard_errors * error), 1.0)
+    error = math.sqrt(2 / max(ess, SUBSPACE.min_ess))
+    raised = np.minimum(variance * (1 + SUBSPACE.standard_errors * error), 1.0)
     return np.where(variance < 1, raised, variance)
 
 
@@ -196,24 +190,23 @@ def fit_subspace_mixture(
     points: GroupedPoints,
     most: int,
     rng: np.random.Generator,
-    settings: SubspaceSettings = DEFAULT_MIXTURE_SETTINGS.subspace,
 ) -> SubspaceMixture:
     """Return a mixture of at most `most` components, their number chosen by BIC."""
     best = None
     worse = 0
-    for k in (size for size in settings.sizes if size <= most):
-        if k > 1 and (k > points.n_groups or points.ess < settings.points_per_component * k):
+    for k in (size for size in SUBSPACE.sizes if size <= most):
+        if k > 1 and (k > points.n_groups or points.ess < SUBSPACE.points_per_component * k):
             break
-        restarts = 1 if k == 1 else settings.em_restarts
+        restarts = 1 if k == 1 else SUBSPACE.em_restarts
         found = max(
-            (_fit_from(points, _initial_responsibilities(points, k, rng), settings) for _ in range(restarts)),
+            (_fit_from(points, _initial_responsibilities(points, k, rng)) for _ in range(restarts)),
             key=lambda mix: mix.score,
         )
         if best is None or found.score > best.score:
             best, worse = found, 0
         else:
             worse += 1
-        if worse == settings.max_worse:
+        if worse == SUBSPACE.max_worse:
             break
     assert best is not None  # one component can always be fitted
     return best
@@ -238,7 +231,7 @@ class _Fitted(NamedTuple):
     weights: FloatArray
 
 
-def _fit_from(points: GroupedPoints, start: FloatArray, settings: SubspaceSettings) -> SubspaceMixture:
+def _fit_from(points: GroupedPoints, start: FloatArray) -> SubspaceMixture:
     """Return the mixture that expectation-maximisation reaches from responsibilities (k, n); a group stays together."""
     u, weights, ess, groups = points
 
@@ -247,7 +240,7 @@ def _fit_from(points: GroupedPoints, start: FloatArray, settings: SubspaceSettin
         mass = (responsibilities * weights).sum(axis=1)
         shares, mass = responsibilities[mass * ess > 1], mass[mass * ess > 1]
         fits = [
-            fit_shrunk_subspace_gaussian(u, share * weights / m, max(float(m) * ess, settings.min_ess), settings)
+            fit_shrunk_subspace_gaussian(u, share * weights / m, max(float(m) * ess, SUBSPACE.min_ess))
             for share, m in zip(shares, mass, strict=True)
         ]
         return _Fitted([one for one, _ in fits], [share for _, share in fits], mass / mass.sum())
@@ -264,14 +257,14 @@ def _fit_from(points: GroupedPoints, start: FloatArray, settings: SubspaceSettin
         log_terms,
         start,
         once_per_group,
-        settings.max_em_iterations,
-        lambda total: settings.min_relative_gain * abs(total),
+        SUBSPACE.max_em_iterations,
+        lambda total: SUBSPACE.min_relative_gain * abs(total),
     )
     dim = points.u.shape[1]
-    most = settings.covariance_parameters_per_dim * dim
+    most = SUBSPACE.covariance_parameters_per_dim * dim
     covariances = [min((1 - share) * dim * (dim + 1) / 2, most) for share in fit.target_shares]
     parameters = len(fit.components) - 1 + sum(dim + 1 + size for size in covariances)
-    penalty = 0.5 * math.log(max(points.ess, settings.min_bic_ess)) * parameters
+    penalty = 0.5 * math.log(max(points.ess, SUBSPACE.min_bic_ess)) * parameters
     return SubspaceMixture(fit.components, fit.weights, log_likelihood - penalty)
 
 
@@ -279,7 +272,6 @@ def refit_components(
     components: list[SubspaceGaussian],
     u: FloatArray,
     log_weights: FloatArray,
-    settings: SubspaceSettings = DEFAULT_MIXTURE_SETTINGS.subspace,
 ) -> list[SubspaceGaussian]:
     """Return components moved to weighted points u (n, d), each by those that are its own.
 
@@ -288,33 +280,31 @@ def refit_components(
     """
     weights = truncate_weights(log_weights)
     log_mixing = np.zeros(len(components))
-    for _ in range(settings.refit_steps):
+    for _ in range(SUBSPACE.refit_steps):
         shares = posterior(log_ratios(components, u) + log_mixing[:, None])
         log_w = np.log(np.maximum(weights, TINY_WEIGHT))
-        components = [_refit(one, u, share, log_w, settings) for one, share in zip(components, shares, strict=True)]
+        components = [_refit(one, u, share, log_w) for one, share in zip(components, shares, strict=True)]
         log_mixing = np.log(np.maximum((shares * weights).sum(axis=1), LEAST_MIXING))
     return components
 
 
-def _refit(
-    component: SubspaceGaussian, u: FloatArray, shares: FloatArray, log_weights: FloatArray, settings: SubspaceSettings
-) -> SubspaceGaussian:
+def _refit(component: SubspaceGaussian, u: FloatArray, shares: FloatArray, log_weights: FloatArray) -> SubspaceGaussian:
     """Return a component fitted to its share (n,) of weighted points.
 
     Where the weights are too uneven to fit it, they are raised to powers less than 1 until they are not.
     """
     count = float(shares.sum())
-    if count < settings.min_refit_points:
+    if count < SUBSPACE.min_refit_points:
         return component
-    wanted = max(settings.refit_ess, settings.refit_ess_per_dim * u.shape[1])
-    wanted = min(wanted, count / settings.points_per_refit_ess)
+    wanted = max(SUBSPACE.refit_ess, SUBSPACE.refit_ess_per_dim * u.shape[1])
+    wanted = min(wanted, count / SUBSPACE.points_per_refit_ess)
     log_shares = np.log(np.maximum(shares, TINY_WEIGHT))
-    for power in np.arange(1.0, 0.0, -settings.power_step):
+    for power in np.arange(1.0, 0.0, -SUBSPACE.power_step):
         w = normalise_weights(log_shares + power * log_weights)
         ess = 1 / float((w * w).sum())
         if ess >= wanted:
             break
-    return fit_shrunk_subspace_gaussian(u, w, max(ess, settings.min_ess), settings)[0]
+    return fit_shrunk_subspace_gaussian(u, w, max(ess, SUBSPACE.min_ess))[0]
 
 
 def truncate_weights(log_weights: FloatArray) -> FloatArray:
@@ -330,21 +320,19 @@ MIN_SCALE = 1e-3
 """Least scale of the Gamma distribution of |u|^2: it must be positive."""
 
 
-def fit_radial(
-    u: FloatArray, weights: FloatArray, settings: EdgeSettings = DEFAULT_MIXTURE_SETTINGS.edges
-) -> RadialLaw:
+def fit_radial(u: FloatArray, weights: FloatArray) -> RadialLaw:
     """Return the radial distribution whose |u|^2 has the moments of failures u (n, d) with weights (n,).
 
     |u|^2 = start + Gamma(shape, scale) in every direction, with shape = mean^2 / variance and scale = variance / mean
     of what |u|^2 exceeds the start by.
     """
     square = np.einsum("ij,ij->i", u, u)
-    start = settings.radius_factor * weighted_quantile(square, weights, settings.radius_share)
+    start = EDGES.radius_factor * weighted_quantile(square, weights, EDGES.radius_share)
     outside = square > start
     excess, w = square[outside] - start, weights[outside]
     mean = float(np.average(excess, weights=w))
     variance = max(float(np.average((excess - mean) ** 2, weights=w)), MIN_VARIANCE)
-    shape = max(mean * mean / variance, settings.min_radial_shape)
+    shape = max(mean * mean / variance, EDGES.min_radial_shape)
     return RadialLaw(u.shape[1], start, shape, max(variance / mean, MIN_SCALE))
 
 
@@ -369,7 +357,6 @@ def minimise_second_moment(
     log_weights: FloatArray,
     start: FloatArray,
     floors: Sequence[Floor],
-    settings: MixtureWeightSettings = DEFAULT_MIXTURE_SETTINGS.weights,
 ) -> FloatArray:
     """Return weights a (k,) of a mixture q_a = sum_k a_k q_k that minimise the second moment of its estimate.
 
@@ -382,15 +369,14 @@ def minimise_second_moment(
         log_weights: Of the failing points, shape (n,).
         start: First weights, shape (k,).
         floors: Lower limits of disjoint groups, kept in every update.
-        settings: Number of updates.
     """
-    matter = log_weights > log_weights.max() - settings.negligible
+    matter = log_weights > log_weights.max() - WEIGHTS.negligible
     log_r, log_weights = log_r[:, matter], log_weights[matter]
     largest = log_r.max(axis=0)
     ratio = np.exp(log_r - largest)
     scaled = np.exp(log_weights - largest - (log_weights - largest).max())
     a, limits = start, _FloorIndex.of(floors, len(start))
-    for _ in range(settings.updates):
+    for _ in range(WEIGHTS.updates):
         q = np.maximum(a @ ratio, LEAST_DENSITY_RATIO)
         a = a * np.sqrt(ratio @ (scaled / (q * q)))
         a = limits.apply(a / a.sum())

@@ -17,10 +17,10 @@ from numpy.typing import NDArray
 from samplers.components import HalfSpaceIntersection, HalfSpaceUnion
 from samplers.methods.two_stage.planes import INLIER_ROUNDING, LARGEST_OUTCOME, MAD_TO_SIGMA, failure_edge, median
 from samplers.methods.two_stage.settings import (
-    DEFAULT_MIXTURE_SETTINGS,
-    LinearModelSettings,
-    MixtureSettings,
-    PieceSettings,
+    CORNER,
+    EDGES,
+    LINEAR_MODEL,
+    PIECES,
 )
 from samplers.problem import FloatArray
 
@@ -47,29 +47,28 @@ class LinearPieces(NamedTuple):
         return LinearPieces(self.intercepts[kept], self.slopes[kept])
 
 
-def points_of_piece(dim: int, settings: PieceSettings) -> int:
+def points_of_piece(dim: int) -> int:
     """Return the points that a piece starts from."""
-    return settings.points_per_dim * dim + settings.least_points
+    return PIECES.points_per_dim * dim + PIECES.least_points
 
 
-def start_pieces(u: FloatArray, y: FloatArray, centres: NDArray[np.int64], settings: PieceSettings) -> LinearPieces:
+def start_pieces(u: FloatArray, y: FloatArray, centres: NDArray[np.int64]) -> LinearPieces:
     """Return the regressions of y (n,) on the points u (n, d) around each of the `centres`, rows of u."""
     distance = np.linalg.norm(u[centres, None] - u, axis=2)
-    around = points_of_piece(u.shape[1], settings)
+    around = points_of_piece(u.shape[1])
     near = np.argpartition(distance, around - 1, axis=1)[:, :around]
-    return _regress(_design(u), y, near, settings.first_ridge)
+    return _regress(_design(u), y, near, PIECES.first_ridge)
 
 
-def fit_plane(u: FloatArray, y: FloatArray, settings: PieceSettings) -> LinearPieces:
+def fit_plane(u: FloatArray, y: FloatArray) -> LinearPieces:
     """Return the regression of y (n,) on all points u (n, d) as the only piece."""
-    return _regress(_design(u), y, [np.arange(len(y))], settings.ridge)
+    return _regress(_design(u), y, [np.arange(len(y))], PIECES.ridge)
 
 
 def fit_pieces(
     pieces: LinearPieces,
     u: FloatArray,
     y: FloatArray,
-    settings: PieceSettings,
     inlier_sigmas: float = math.inf,
     patience: int | None = None,
 ) -> LinearPieces | None:
@@ -79,14 +78,13 @@ def fit_pieces(
         pieces: To start from.
         u: Points, shape (n, d).
         y: Their values, shape (n,).
-        settings: Most steps, ridge penalty and points of a piece; one with fewer is given up, and None is left of none.
         inlier_sigmas: As in `assign_points`: points that do not agree are left out.
         patience: Steps without a gain, a mean square of residuals that is a `LEAST_GAIN` lower, that end the fit as
             well: where pieces do not explain y, points move to and fro. None: no number of them does.
     """
-    least, design = u.shape[1] + settings.least_points, _design(u)
+    least, design = u.shape[1] + PIECES.least_points, _design(u)
     before, lowest, idle = None, math.inf, 0
-    for _ in range(settings.iterations):
+    for _ in range(PIECES.iterations):
         own, agrees, deviation = assign_points(pieces, u, y, inlier_sigmas)
         if inlier_sigmas < math.inf:
             own, deviation = np.where(agrees, own, NO_PIECE), deviation[agrees]
@@ -99,7 +97,7 @@ def fit_pieces(
         groups = [group for group in groups if len(group) >= least]
         if not groups:
             return None
-        pieces, before = _regress(design, y, groups, settings.ridge), own
+        pieces, before = _regress(design, y, groups, PIECES.ridge), own
     return pieces
 
 
@@ -153,7 +151,6 @@ def union_of_half_spaces(
     f: FloatArray,
     gamma: float,
     rng: np.random.Generator,
-    settings: MixtureSettings = DEFAULT_MIXTURE_SETTINGS,
 ) -> HalfSpaceUnion | None:
     """Return the half-spaces in which the pieces of f fail, or None where pieces do not explain f.
 
@@ -166,31 +163,30 @@ def union_of_half_spaces(
             out.
         gamma: Threshold of failure.
         rng: Source of randomness: pieces start at failures chosen at random.
-        settings: Of the regression and of the edges.
     """
-    edges, linear, dim = settings.edges, settings.linear_model, u.shape[1]
+    dim = u.shape[1]
     finite = np.isfinite(f) & (np.abs(f) < LARGEST_OUTCOME)
     if not finite.any():
         return None
-    used = finite & (f <= np.quantile(f[finite], 1 - settings.pieces.highest))
+    used = finite & (f <= np.quantile(f[finite], 1 - PIECES.highest))
     u, f = u[used], f[used]
     unit, fails = float(f.std()), np.flatnonzero(f <= gamma)
-    if unit == 0 or len(fails) < linear.min_failures or len(f) < points_of_piece(dim, settings.pieces):
+    if unit == 0 or len(fails) < LINEAR_MODEL.min_failures or len(f) < points_of_piece(dim):
         return None
     y = (f - gamma) / unit
-    centres = rng.choice(fails, min(settings.pieces.n, len(fails)), replace=False)
-    pieces = fit_pieces(start_pieces(u, y, centres, settings.pieces), u, y, settings.pieces)
+    centres = rng.choice(fails, min(PIECES.n, len(fails)), replace=False)
+    pieces = fit_pieces(start_pieces(u, y, centres), u, y)
     if pieces is None:
         return None
     predicted = pieces.predict(u)
     own, residual = predicted.argmin(axis=1), y - predicted.min(axis=1)
-    if 1 - float(residual @ residual) / float(((y - y.mean()) ** 2).sum()) < settings.pieces.min_r2:
+    if 1 - float(residual @ residual) / float(((y - y.mean()) ** 2).sum()) < PIECES.min_r2:
         return None
     steepness = np.linalg.norm(pieces.slopes, axis=1)
     counts, error = piece_errors(own, residual, len(steepness), dim)
     with np.errstate(divide="ignore", invalid="ignore"):
-        starts = (pieces.intercepts - settings.pieces.crossing_errors * error) / steepness - edges.slack
-        kept = (counts > 0) & np.isfinite(starts) & (starts > edges.min_distance)  # a flat piece has no edge
+        starts = (pieces.intercepts - PIECES.crossing_errors * error) / steepness - EDGES.slack
+        kept = (counts > 0) & np.isfinite(starts) & (starts > EDGES.min_distance)  # a flat piece has no edge
         axes = -pieces.slopes / steepness[:, None]
     return HalfSpaceUnion(axes[kept], starts[kept]) if kept.any() else None
 
@@ -219,17 +215,17 @@ class PiecewiseFit(NamedTuple):
         """R^2 times the share of the points that agree."""
         return self.r2 * self.share
 
-    def is_exact(self, settings: LinearModelSettings) -> bool:
+    def is_exact(self) -> bool:
         """Return whether f is what the pieces say at most of the points."""
-        return self.r2 > settings.exact_r2 and self.share > settings.agreeing_share
+        return self.r2 > LINEAR_MODEL.exact_r2 and self.share > LINEAR_MODEL.agreeing_share
 
-    def is_whole(self, settings: LinearModelSettings) -> bool:
+    def is_whole(self) -> bool:
         """Return whether it is so at nearly all of them: a fit with a piece fewer leaves the points of that one out."""
-        return self.is_exact(settings) and self.explained > settings.boundary_r2
+        return self.is_exact() and self.explained > LINEAR_MODEL.boundary_r2
 
-    def locates_edges(self, settings: LinearModelSettings) -> bool:
+    def locates_edges(self) -> bool:
         """Return whether the pieces locate where failure begins."""
-        return self.r2 > settings.boundary_r2 and self.share > settings.agreeing_share
+        return self.r2 > LINEAR_MODEL.boundary_r2 and self.share > LINEAR_MODEL.agreeing_share
 
 
 class PiecewiseSample(NamedTuple):
@@ -245,7 +241,6 @@ def intersection_of_half_spaces(
     u: FloatArray,
     f: FloatArray,
     gamma: float,
-    settings: MixtureSettings = DEFAULT_MIXTURE_SETTINGS,
 ) -> HalfSpaceIntersection | None:
     """Return the corner in which all pieces of f fail, or None where no two or more pieces explain f.
 
@@ -257,78 +252,76 @@ def intersection_of_half_spaces(
         u: Points around one failure region, shape (n, d).
         f: Their outcomes, shape (n,); infinite ones are left out.
         gamma: Threshold of failure.
-        settings: Of the regression and of the edges.
     """
     finite = np.isfinite(f) & (np.abs(f) < LARGEST_OUTCOME)
     u, f = u[finite], f[finite]
     fails = f <= gamma
     used = (np.ones(len(f), dtype=bool), fails, ~fails)
-    samples = [_scale_sample(u[rows], gamma - f[rows], settings) for rows in used]
-    fit = _find_fit([sample for sample in samples if sample is not None], settings)
-    if fit is None or not fit.locates_edges(settings.linear_model):
+    samples = [_scale_sample(u[rows], gamma - f[rows]) for rows in used]
+    fit = _find_fit([sample for sample in samples if sample is not None])
+    if fit is None or not fit.locates_edges():
         return None
-    axes, starts = _find_planes(fit, settings)
+    axes, starts = _find_planes(fit)
     if (fit.y < 0).all():  # f may jump where failure begins
-        starts = np.minimum(starts, _edges_along(axes, u[fails], settings))
-    return _beyond_planes(axes, starts, settings)
+        starts = np.minimum(starts, _edges_along(axes, u[fails]))
+    return _beyond_planes(axes, starts)
 
 
-def _scale_sample(u: FloatArray, y: FloatArray, settings: MixtureSettings) -> PiecewiseSample | None:
+def _scale_sample(u: FloatArray, y: FloatArray) -> PiecewiseSample | None:
     """Return at most some of the points u (n, d), with y (n,) in units of its spread; None where they are too few."""
     size, dim = float(np.abs(y).max()) if len(y) else 0.0, u.shape[1]
     unit = size * float((y / size).std()) if size > 0 else 0.0  # a square may overflow
-    if unit == 0 or len(y) < points_of_piece(dim, settings.pieces):
+    if unit == 0 or len(y) < points_of_piece(dim):
         return None
-    rows = _spread(len(y), settings.corner.points_per_dim * dim)
+    rows = _spread(len(y), CORNER.points_per_dim * dim)
     return PiecewiseSample(u[rows], y[rows] / unit)
 
 
-def _find_fit(samples: list[PiecewiseSample], settings: MixtureSettings) -> PiecewiseFit | None:
+def _find_fit(samples: list[PiecewiseSample]) -> PiecewiseFit | None:
     """Return the best of some fits of pieces, None without one.
 
     One of each sample, until one is exact. Where the best of them has several pieces and is promising, its sample has
     further ones, which start elsewhere.
     """
-    corner, linear = settings.corner, settings.linear_model
     best, chosen = None, None
     for sample in samples:
-        fit = _fit_from(sample, 0, settings)
+        fit = _fit_from(sample, 0)
         if fit is not None and (best is None or fit.explained > best.explained):
             best, chosen = fit, sample
-        if best is not None and best.is_exact(linear):
+        if best is not None and best.is_exact():
             break
-    if best is None or chosen is None or len(best.pieces.intercepts) == 1 or best.r2 < corner.promising_r2:
+    if best is None or chosen is None or len(best.pieces.intercepts) == 1 or best.r2 < CORNER.promising_r2:
         return best
-    for start in range(1, corner.starts):
-        if best.is_whole(linear):
+    for start in range(1, CORNER.starts):
+        if best.is_whole():
             break
-        fit = _fit_from(chosen, start, settings)
+        fit = _fit_from(chosen, start)
         if fit is not None and fit.explained > best.explained:
             best = fit
     return best
 
 
-def _fit_from(sample: PiecewiseSample, start: int, settings: MixtureSettings) -> PiecewiseFit | None:
+def _fit_from(sample: PiecewiseSample, start: int) -> PiecewiseFit | None:
     """Return the fit of pieces from the points of one of the starts; None where it explains too little of y.
 
     Where one plane explains y, that is the fit. Points that do not agree are left out at last only: before, they may be
     those of a piece that is still to come.
     """
-    (u, y), corner, linear = sample, settings.corner, settings.linear_model
-    plane = _judge(fit_plane(u, y, settings.pieces), sample, linear.inlier_sigmas)
-    if plane.is_whole(linear):
+    (u, y) = sample
+    plane = _judge(fit_plane(u, y), sample, LINEAR_MODEL.inlier_sigmas)
+    if plane.is_whole():
         return plane
     order = np.argsort(y, kind="stable")
-    centres = order[_spread(len(order), corner.n, (start + 0.5) / corner.starts)]
-    first = start_pieces(u, y, centres, settings.pieces)
-    pieces = fit_pieces(first, u, y, settings.pieces, patience=corner.patience)
+    centres = order[_spread(len(order), CORNER.n, (start + 0.5) / CORNER.starts)]
+    first = start_pieces(u, y, centres)
+    pieces = fit_pieces(first, u, y, patience=CORNER.patience)
     if pieces is None:
         return None
     pieces = _prune(pieces, u, y)
-    if _judge(pieces, sample, linear.inlier_sigmas).r2 < settings.pieces.min_r2:
+    if _judge(pieces, sample, LINEAR_MODEL.inlier_sigmas).r2 < PIECES.min_r2:
         return None
-    pieces = fit_pieces(pieces, u, y, settings.pieces, linear.inlier_sigmas, corner.patience)
-    return None if pieces is None else _judge(pieces, sample, linear.inlier_sigmas)
+    pieces = fit_pieces(pieces, u, y, LINEAR_MODEL.inlier_sigmas, CORNER.patience)
+    return None if pieces is None else _judge(pieces, sample, LINEAR_MODEL.inlier_sigmas)
 
 
 def _spread(n: int, most: int, offset: float = 0.0) -> NDArray[np.int64]:
@@ -365,36 +358,36 @@ def _prune(pieces: LinearPieces, u: FloatArray, y: FloatArray) -> LinearPieces:
     return pieces.take(kept)
 
 
-def _find_planes(fit: PiecewiseFit, settings: MixtureSettings) -> tuple[FloatArray, FloatArray]:
+def _find_planes(fit: PiecewiseFit) -> tuple[FloatArray, FloatArray]:
     """Return the axes (k, d) of the pieces that have points and a direction, and where each begins to fail, (k,)."""
     residual = fit.y - fit.pieces.predict(fit.u).min(axis=1)
     counts, error = piece_errors(fit.own, residual, len(fit.pieces.intercepts), fit.u.shape[1])
     kept = np.flatnonzero((counts > 0) & (np.linalg.norm(fit.pieces.slopes, axis=1) > 0))
     pieces, error = fit.pieces.take(kept), error[kept]
     steepness = np.linalg.norm(pieces.slopes, axis=1)
-    starts = -(pieces.intercepts + settings.linear_model.crossing_errors * error) / steepness - settings.edges.slack
+    starts = -(pieces.intercepts + LINEAR_MODEL.crossing_errors * error) / steepness - EDGES.slack
     return pieces.slopes / steepness[:, None], starts
 
 
-def _edges_along(axes: FloatArray, failures: FloatArray, settings: MixtureSettings) -> FloatArray:
+def _edges_along(axes: FloatArray, failures: FloatArray) -> FloatArray:
     """Return where failures (n, d) begin along axes (k, d), shape (k,); infinity where there are none."""
-    n, share = len(failures), settings.linear_model.nearest_share
+    n, share = len(failures), LINEAR_MODEL.nearest_share
     if n == 0:
         return np.full(len(axes), np.inf)
-    edges = [failure_edge(failures @ axis, np.ones(n), n, share, settings.edges) for axis in axes]
-    return np.array(edges) - settings.edges.slack
+    edges = [failure_edge(failures @ axis, np.ones(n), n, share) for axis in axes]
+    return np.array(edges) - EDGES.slack
 
 
-def _beyond_planes(axes: FloatArray, starts: FloatArray, settings: MixtureSettings) -> HalfSpaceIntersection | None:
+def _beyond_planes(axes: FloatArray, starts: FloatArray) -> HalfSpaceIntersection | None:
     """Return the corner beyond planes, the furthest first; None of fewer than two.
 
     Planes that hold nearly all draws, and those that are nearly parallel to further ones, are left out.
     """
-    useful = np.flatnonzero(starts > settings.corner.min_start)
+    useful = np.flatnonzero(starts > CORNER.min_start)
     kept: list[int] = []
     for k in useful[np.argsort(-starts[useful])]:
         across = axes[k] - _project_on(axes[kept], axes[k])
-        if np.linalg.norm(across) > settings.corner.min_turn:
+        if np.linalg.norm(across) > CORNER.min_turn:
             kept.append(int(k))
     return HalfSpaceIntersection(axes[kept], starts[kept]) if len(kept) > 1 else None
 

@@ -18,10 +18,8 @@ from scipy.special import log_ndtr
 
 from samplers.components import HalfSpaceNormal, MixtureComponent, SubspaceGaussian
 from samplers.methods.two_stage.settings import (
-    DEFAULT_MIXTURE_SETTINGS,
-    EdgeSettings,
-    LinearModelSettings,
-    MixtureSettings,
+    EDGES,
+    LINEAR_MODEL,
 )
 from samplers.problem import LOG_TWO_PI, FloatArray
 
@@ -60,9 +58,9 @@ class Hyperplane(NamedTuple):
         """R^2 times the share of the points that agree."""
         return self.r2 * self.share
 
-    def locates_boundary(self, settings: LinearModelSettings) -> bool:
+    def locates_boundary(self) -> bool:
         """Return whether it also locates the failure boundary."""
-        return self.r2 > settings.boundary_r2 and self.share > settings.agreeing_share
+        return self.r2 > LINEAR_MODEL.boundary_r2 and self.share > LINEAR_MODEL.agreeing_share
 
     def crossing(self, gamma: float, errors: float) -> float:
         """Return where along the axis f falls to gamma, less some standard errors of a prediction of that.
@@ -73,9 +71,7 @@ class Hyperplane(NamedTuple):
         return self.at + (self.level - gamma - errors * error) / self.steepness
 
 
-def fit_hyperplane(
-    u: FloatArray, f: FloatArray, settings: LinearModelSettings = DEFAULT_MIXTURE_SETTINGS.linear_model
-) -> Hyperplane:
+def fit_hyperplane(u: FloatArray, f: FloatArray) -> Hyperplane:
     """Return the hyperplane that f follows at points u (n, d), f (n,); axis 0 and R^2 0 where there is none.
 
     Infinite outcomes and the share `trimmed_share` at either end are left out.
@@ -83,15 +79,15 @@ def fit_hyperplane(
     dim = u.shape[1]
     none = Hyperplane(np.zeros(dim), 0.0, 0.0, 0.0, 0.0, 1.0, 0.0)
     finite = np.isfinite(f) & (np.abs(f) < LARGEST_OUTCOME)
-    if finite.sum() < settings.min_points:
+    if finite.sum() < LINEAR_MODEL.min_points:
         return none
-    low, high = np.quantile(f[finite], [settings.trimmed_share, 1 - settings.trimmed_share])
+    low, high = np.quantile(f[finite], [LINEAR_MODEL.trimmed_share, 1 - LINEAR_MODEL.trimmed_share])
     usual = finite & (f >= low) & (f <= high)
     size = float(np.abs(f[usual]).max()) if usual.any() else 0.0
     if size == 0.0:
         return none
     x, y = u[usual], f[usual] / size
-    slope, r2, near = _fit_robust(x, y, settings)
+    slope, r2, near = _fit_robust(x, y)
     norm = float(np.linalg.norm(slope))
     if norm == 0:
         return none
@@ -100,9 +96,7 @@ def fit_hyperplane(
     return Hyperplane(axis, size * norm, at, level, r2, float(near.mean()), spread)
 
 
-def descent_direction(
-    u: FloatArray, f: FloatArray, settings: LinearModelSettings = DEFAULT_MIXTURE_SETTINGS.linear_model
-) -> tuple[FloatArray, float]:
+def descent_direction(u: FloatArray, f: FloatArray) -> tuple[FloatArray, float]:
     """Return the unit direction in which f falls, shape (d,), and how much of f it explains.
 
     That is R^2 (leave-one-out) times the share of the points that agree; direction 0 where there is none.
@@ -110,9 +104,8 @@ def descent_direction(
     Args:
         u: Points, shape (n, d).
         f: Their outcomes, shape (n,); infinite ones and the share `trimmed_share` at either end are left out.
-        settings: Of the regression.
     """
-    hyperplane = fit_hyperplane(u, f, settings)
+    hyperplane = fit_hyperplane(u, f)
     return hyperplane.axis, hyperplane.explained
 
 
@@ -121,7 +114,6 @@ def half_space_proposals(
     u: FloatArray,
     f: FloatArray,
     gamma: float = 0.0,
-    settings: MixtureSettings = DEFAULT_MIXTURE_SETTINGS,
 ) -> list[MixtureComponent]:
     """Return proposals for a failure region that a hyperplane bounds, or [] if f is not nearly linear there.
 
@@ -135,39 +127,38 @@ def half_space_proposals(
         u: Points around them, failing or not, shape (n, d).
         f: Outcomes of these, shape (n,).
         gamma: Threshold of failure.
-        settings: Of the regression and of the edge.
     """
-    linear, edges = settings.linear_model, settings.edges
-    hyperplane = fit_hyperplane(u, f, linear)
-    if hyperplane.explained < linear.exact_r2:  # outside the region, f may be that of another one
+    hyperplane = fit_hyperplane(u, f)
+    if hyperplane.explained < LINEAR_MODEL.exact_r2:  # outside the region, f may be that of another one
         inside = f <= gamma
-        alone = fit_hyperplane(u[inside], f[inside], linear)
-        better = alone.locates_boundary(linear) and alone.explained > hyperplane.explained
+        alone = fit_hyperplane(u[inside], f[inside])
+        better = alone.locates_boundary() and alone.explained > hyperplane.explained
         hyperplane = alone if better else hyperplane
-    if hyperplane.explained < linear.min_r2 or len(failures) < linear.min_failures:
+    if hyperplane.explained < LINEAR_MODEL.min_r2 or len(failures) < LINEAR_MODEL.min_failures:
         return []
-    beta = _find_boundary(hyperplane, failures @ hyperplane.axis, gamma, settings)
-    if beta < edges.min_distance:
+    beta = _find_boundary(hyperplane, failures @ hyperplane.axis, gamma)
+    if beta < EDGES.min_distance:
         return []
     mean = math.exp(-0.5 * (beta * beta + LOG_TWO_PI) - float(log_ndtr(-beta)))
     variance = max(1 + beta * mean - mean * mean, MIN_GAUSSIAN_VARIANCE)
-    gaussian = SubspaceGaussian(hyperplane.axis[:, None], np.array([mean]), np.array([linear.widening * variance]))
-    return [gaussian, HalfSpaceNormal(hyperplane.axis, beta - edges.slack)]
+    gaussian = SubspaceGaussian(
+        hyperplane.axis[:, None], np.array([mean]), np.array([LINEAR_MODEL.widening * variance])
+    )
+    return [gaussian, HalfSpaceNormal(hyperplane.axis, beta - EDGES.slack)]
 
 
-def _find_boundary(hyperplane: Hyperplane, along: FloatArray, gamma: float, settings: MixtureSettings) -> float:
+def _find_boundary(hyperplane: Hyperplane, along: FloatArray, gamma: float) -> float:
     """Return where along its axis a half-space of failures begins, given how far the failures are along it, (m,).
 
     0 where the failures are around the origin.
     """
-    linear, edges = settings.linear_model, settings.edges
     middle = float(np.median(along))
-    if middle < edges.min_distance:
+    if middle < EDGES.min_distance:
         return 0.0
-    if hyperplane.locates_boundary(linear):
-        return hyperplane.crossing(gamma, linear.crossing_errors)
-    along = along[along > linear.same_region_share * middle]
-    return failure_edge(along, np.ones(len(along)), len(np.unique(along)), linear.nearest_share, edges)
+    if hyperplane.locates_boundary():
+        return hyperplane.crossing(gamma, LINEAR_MODEL.crossing_errors)
+    along = along[along > LINEAR_MODEL.same_region_share * middle]
+    return failure_edge(along, np.ones(len(along)), len(np.unique(along)), LINEAR_MODEL.nearest_share)
 
 
 def failure_edge(
@@ -175,7 +166,6 @@ def failure_edge(
     weights: FloatArray,
     ess: float,
     share: float,
-    settings: EdgeSettings = DEFAULT_MIXTURE_SETTINGS.edges,
 ) -> float:
     """Return where weighted failures begin, given how far along a direction they lie, shape (n,).
 
@@ -188,11 +178,10 @@ def failure_edge(
         weights: Importance weights, of any scale, shape (n,).
         ess: How many independent failures they are worth.
         share: Share of the weights that may lie before the quantile.
-        settings: By how much the edge is put back.
     """
     first = weighted_quantile(along, weights, share)
     excess = max(float(np.average(along, weights=weights)) - first, 0.0)
-    return first - settings.mean_excesses * excess / max(ess, settings.min_ess)
+    return first - EDGES.mean_excesses * excess / max(ess, EDGES.min_ess)
 
 
 def weighted_quantile(x: FloatArray, weights: FloatArray, share: float) -> float:
@@ -209,7 +198,7 @@ def median(x: FloatArray) -> float:
     return float(ordered[middle] if len(x) % 2 else 0.5 * (ordered[middle - 1] + ordered[middle]))
 
 
-def _fit_ridge(x: FloatArray, y: FloatArray, settings: LinearModelSettings) -> tuple[FloatArray, float]:
+def _fit_ridge(x: FloatArray, y: FloatArray) -> tuple[FloatArray, float]:
     """Return the slope (d,) of the ridge regression of y (n,) on x (n, d), and its leave-one-out R^2.
 
     Of the `ridges`, where points are enough for both, the one with the larger R^2: a large ridge turns and lifts a
@@ -218,15 +207,17 @@ def _fit_ridge(x: FloatArray, y: FloatArray, settings: LinearModelSettings) -> t
     n, dim = x.shape
     xc, yc = x - x.mean(axis=0), y - y.mean()
     total = float(yc @ yc)
-    if total <= 0 or n < settings.min_points:
+    if total <= 0 or n < LINEAR_MODEL.min_points:
         return np.zeros(dim), 0.0
-    ridges = settings.ridges if _has_many_points(n, dim, settings) else settings.ridges[:1]
-    return max((_solve_ridge(xc, yc, total, ridge, settings.min_left_out) for ridge in ridges), key=lambda fit: fit[1])
+    ridges = LINEAR_MODEL.ridges if _has_many_points(n, dim) else LINEAR_MODEL.ridges[:1]
+    return max(
+        (_solve_ridge(xc, yc, total, ridge, LINEAR_MODEL.min_left_out) for ridge in ridges), key=lambda fit: fit[1]
+    )
 
 
-def _has_many_points(n: int, dim: int, settings: LinearModelSettings) -> bool:
+def _has_many_points(n: int, dim: int) -> bool:
     """Return whether n points in d dimensions are enough to judge the small ridge and outliers."""
-    return n >= settings.min_points_per_dim * dim + settings.min_points
+    return n >= LINEAR_MODEL.min_points_per_dim * dim + LINEAR_MODEL.min_points
 
 
 def _solve_ridge(
@@ -244,39 +235,37 @@ def _solve_ridge(
     return slope, 1 - float(left_out @ left_out) / total
 
 
-def _fit_robust(
-    x: FloatArray, y: FloatArray, settings: LinearModelSettings
-) -> tuple[FloatArray, float, NDArray[np.bool_]]:
+def _fit_robust(x: FloatArray, y: FloatArray) -> tuple[FloatArray, float, NDArray[np.bool_]]:
     """Return slope and R^2 as `_fit_ridge` does, without the few points of another region, and the points used (n,).
 
     Least absolute deviations by reweighting find the points that agree; `_fit_ridge` is fitted to these.
     """
     n, dim = x.shape
-    slope, r2 = _fit_ridge(x, y, settings)
+    slope, r2 = _fit_ridge(x, y)
     everything = np.ones(n, dtype=bool)
-    if r2 > settings.exact_r2 or not _has_many_points(n, dim, settings):
+    if r2 > LINEAR_MODEL.exact_r2 or not _has_many_points(n, dim):
         return slope, r2, everything
-    near = _find_inliers(x, y, settings)
-    robust, robust_r2 = _fit_ridge(x[near], y[near], settings)
+    near = _find_inliers(x, y)
+    robust, robust_r2 = _fit_ridge(x[near], y[near])
     share = float(near.mean())
-    better = robust_r2 * share > r2 or (robust_r2 > settings.exact_r2 and share > settings.agreeing_share)
+    better = robust_r2 * share > r2 or (robust_r2 > LINEAR_MODEL.exact_r2 and share > LINEAR_MODEL.agreeing_share)
     return (robust, robust_r2, near) if better else (slope, r2, everything)
 
 
-def _find_inliers(x: FloatArray, y: FloatArray, settings: LinearModelSettings) -> NDArray[np.bool_]:
+def _find_inliers(x: FloatArray, y: FloatArray) -> NDArray[np.bool_]:
     """Return which points (n,) lie on the hyperplane of least absolute (leave-one-out) deviations."""
     n, dim = x.shape
     design = np.column_stack([x, np.ones(n)])
-    penalty = np.diag(np.append(np.full(dim, settings.lad_ridge), 0.0))
+    penalty = np.diag(np.append(np.full(dim, LINEAR_MODEL.lad_ridge), 0.0))
     w, weighted = np.ones(n), np.empty_like(design)
-    for _ in range(settings.lad_iterations):
+    for _ in range(LINEAR_MODEL.lad_iterations):
         np.multiply(design, w[:, None], out=weighted)
         inverse = np.linalg.inv(weighted.T @ design + penalty)
         leverage = np.einsum("ij,ij->i", weighted @ inverse, design)
         residual = np.abs(y - design @ (inverse @ (weighted.T @ y)))
-        deviation = residual / np.maximum(1 - leverage, settings.min_left_out_lad)
+        deviation = residual / np.maximum(1 - leverage, LINEAR_MODEL.min_left_out_lad)
         typical = median(deviation)
-        w = 1 / (deviation + settings.lad_smoothing * typical + LAD_MIN_DEVIATION)
+        w = 1 / (deviation + LINEAR_MODEL.lad_smoothing * typical + LAD_MIN_DEVIATION)
         w *= n / w.sum()
-    limit = settings.inlier_sigmas * MAD_TO_SIGMA * typical
+    limit = LINEAR_MODEL.inlier_sigmas * MAD_TO_SIGMA * typical
     return np.asarray(deviation <= limit + INLIER_ROUNDING * np.ptp(y))

@@ -36,11 +36,8 @@ from samplers.methods.two_stage.pieces import intersection_of_half_spaces, union
 from samplers.methods.two_stage.planes import half_space_proposals
 from samplers.methods.two_stage.regions import ExplorationResult, Region
 from samplers.methods.two_stage.settings import (
-    DEFAULT_MIXTURE_SETTINGS,
-    EdgeSettings,
-    MixtureSettings,
-    RefinementSettings,
-    SubspaceSettings,
+    REFINEMENT,
+    SUBSPACE,
 )
 from samplers.methods.two_stage.simulator import ComponentDraws
 from samplers.methods.two_stage.stratified import MultipleImportanceSample
@@ -123,37 +120,33 @@ class RefinementState:
 def start_refinement(
     exploration: ExplorationResult,
     gamma: float,
-    settings: RefinementSettings,
     rng: np.random.Generator,
-    mixture: MixtureSettings = DEFAULT_MIXTURE_SETTINGS,
 ) -> RefinementState:
     """Return the initial state, from the exploration alone; also in the coordinates of its slopes."""
-    state = _describe_regions(exploration, gamma, settings, rng, mixture)
+    state = _describe_regions(exploration, gamma, rng)
     axes = exploration.slopes
     if axes is None or axes.shape[1] == 0:
         return state
-    within = _describe_regions(exploration.within(axes), gamma, settings, rng, mixture)
-    return replace(state, within=_add_pieces(within, rng, mixture))
+    within = _describe_regions(exploration.within(axes), gamma, rng)
+    return replace(state, within=_add_pieces(within, rng))
 
 
 def _describe_regions(
     exploration: ExplorationResult,
     gamma: float,
-    settings: RefinementSettings,
     rng: np.random.Generator,
-    mixture: MixtureSettings,
 ) -> RefinementState:
     """Return the initial state in the coordinates of the exploration."""
-    most = settings.noisy_gaussians if exploration.noisy else settings.gaussians_per_region
+    most = REFINEMENT.noisy_gaussians if exploration.noisy else REFINEMENT.gaussians_per_region
     explored = tuple(
         ProposalComponent(gaussian, "explored", k)
         for k, region in enumerate(exploration.regions)
-        for gaussian in _fit_chains(region, most, settings.points_per_chain, rng, mixture.subspace)
+        for gaussian in _fit_chains(region, most, REFINEMENT.points_per_chain, rng)
     )
     linear = tuple(
         proposal
         for k, region in enumerate(exploration.regions)
-        for proposal in _propose_edges(k, region.points, region.u, region.f, gamma, mixture)
+        for proposal in _propose_edges(k, region.points, region.u, region.f, gamma)
     )
     gaussians = [candidate.component for candidate in explored if isinstance(candidate.component, SubspaceGaussian)]
     return RefinementState(exploration=exploration, gamma=gamma, explored=explored, gaussians=gaussians, linear=linear)
@@ -164,9 +157,7 @@ def refine_once(
     history: MultipleImportanceSample,
     proposal: MixtureProposal,
     batch: ComponentDraws,
-    settings: RefinementSettings,
     rng: np.random.Generator,
-    mixture: MixtureSettings = DEFAULT_MIXTURE_SETTINGS,
 ) -> RefinementState:
     """Return the state after a round of draws."""
     kinds = np.repeat([candidate.kind for candidate in proposal.candidates], batch.counts)
@@ -174,7 +165,7 @@ def refine_once(
     u = batch.u[near]
     draws = NearDraws(u, batch.f[near], proposal.log_weights(u))
     hit_rate = float((batch.f[sharp] <= state.gamma).mean()) if sharp.any() else 0.0
-    return _learn(state, history, draws, hit_rate, settings, rng, mixture)
+    return _learn(state, history, draws, hit_rate, rng)
 
 
 def _learn(
@@ -182,30 +173,28 @@ def _learn(
     history: MultipleImportanceSample,
     draws: NearDraws,
     hit_rate: float,
-    settings: RefinementSettings,
     rng: np.random.Generator,
-    mixture: MixtureSettings,
 ) -> RefinementState:
     """Return the state, and that in the coordinates of the slopes, moved to the failures of `history`."""
     axes, within = state.exploration.slopes, state.within
     if axes is not None and within is not None:
-        within = _learn(within, history.within(axes), draws.within(axes), hit_rate, settings, rng, mixture)
-        within = _add_pieces(within, rng, mixture)
+        within = _learn(within, history.within(axes), draws.within(axes), hit_rate, rng)
+        within = _add_pieces(within, rng)
     state = replace(state, rounds=(*state.rounds, draws), hit_rate=hit_rate, within=within)
-    if len(history.u) < settings.min_refit_failures:
+    if len(history.u) < REFINEMENT.min_refit_failures:
         return state
     return replace(
         state,
-        gaussians=refit_components(state.gaussians, history.u, history.log_weights, mixture.subspace),
-        linear=_fit_linear(state, settings, mixture),
+        gaussians=refit_components(state.gaussians, history.u, history.log_weights),
+        linear=_fit_linear(state),
     )
 
 
-def _add_pieces(state: RefinementState, rng: np.random.Generator, mixture: MixtureSettings) -> RefinementState:
+def _add_pieces(state: RefinementState, rng: np.random.Generator) -> RefinementState:
     """Return the state with the half-spaces of a piecewise linear f, where f is one, beside its other proposals."""
     known = [(region.u, region.f) for region in state.regions] + [(draws.u, draws.f) for draws in state.rounds]
     u, f = np.concatenate([points for points, _ in known]), np.concatenate([outcomes for _, outcomes in known])
-    union = union_of_half_spaces(u, f, state.gamma, rng, mixture)
+    union = union_of_half_spaces(u, f, state.gamma, rng)
     others = tuple(one for one in state.linear if not isinstance(one.component, HalfSpaceUnion))
     return replace(state, linear=others if union is None else (*others, ProposalComponent(union, "linear")))
 
@@ -224,9 +213,7 @@ def typical_weights(state: RefinementState, proposal: MixtureProposal) -> FloatA
     return np.array(typical)
 
 
-def _fit_chains(
-    region: Region, most: int, points_per_chain: float, rng: np.random.Generator, subspace: SubspaceSettings
-) -> list[SubspaceGaussian]:
+def _fit_chains(region: Region, most: int, points_per_chain: float, rng: np.random.Generator) -> list[SubspaceGaussian]:
     """Return at most `most` Gaussians fitted to the chains of a region; a chain belongs to one of them."""
     chains, steps, dim = region.chains.shape
     n = chains * steps
@@ -236,24 +223,22 @@ def _fit_chains(
         ess=points_per_chain * chains,
         groups=np.repeat(np.arange(chains), steps),
     )
-    return fit_subspace_mixture(points, most if dim <= subspace.high_dim else 1, rng, subspace).components
+    return fit_subspace_mixture(points, most if dim <= SUBSPACE.high_dim else 1, rng).components
 
 
-def _fit_linear(
-    state: RefinementState, settings: RefinementSettings, mixture: MixtureSettings
-) -> tuple[ProposalComponent, ...]:
+def _fit_linear(state: RefinementState) -> tuple[ProposalComponent, ...]:
     """Return half-space proposals from what was known of each region and the draws nearest to it."""
     u, f = np.concatenate([draws.u for draws in state.rounds]), np.concatenate([draws.f for draws in state.rounds])
     log_r = log_ratios([candidate.component for candidate in state.explored], u)
     nearest = np.array([candidate.region for candidate in state.explored])[log_r.argmax(axis=0)]
-    owner = np.where(log_r.max(axis=0) > settings.min_log_ratio, nearest, NO_REGION)
+    owner = np.where(log_r.max(axis=0) > REFINEMENT.min_log_ratio, nearest, NO_REGION)
     fails = f <= state.gamma
     proposals: list[ProposalComponent] = []
     for k, region in enumerate(state.regions):
         own = owner == k
         failures = np.concatenate([region.points, u[own & fails]])
         around, outcomes = np.concatenate([region.u, u[own]]), np.concatenate([region.f, f[own]])
-        proposals += _propose_edges(k, failures, around, outcomes, state.gamma, mixture)
+        proposals += _propose_edges(k, failures, around, outcomes, state.gamma)
     return tuple(proposals)
 
 
@@ -263,11 +248,10 @@ def _propose_edges(
     u: FloatArray,
     f: FloatArray,
     gamma: float,
-    mixture: MixtureSettings,
 ) -> list[ProposalComponent]:
     """Return proposals from regression of f (n,) at u (n, d) around a region: a half-space, and a corner of several."""
-    half_spaces = half_space_proposals(failures, u, f, gamma, mixture)
-    corner = intersection_of_half_spaces(u, f, gamma, mixture)
+    half_spaces = half_space_proposals(failures, u, f, gamma)
+    corner = intersection_of_half_spaces(u, f, gamma)
     proposals = [ProposalComponent(component, "linear", region) for component in half_spaces]
     return proposals if corner is None else [*proposals, ProposalComponent(corner, "corner", region)]
 
@@ -275,8 +259,6 @@ def _propose_edges(
 def build_proposal(
     state: RefinementState,
     history: MultipleImportanceSample,
-    settings: RefinementSettings,
-    mixture: MixtureSettings = DEFAULT_MIXTURE_SETTINGS,
     *,
     final: bool = False,
 ) -> MixtureProposal:
@@ -285,32 +267,30 @@ def build_proposal(
     Its weights minimise the second moment of the estimate over the failures in `history`, with lower limits; before
     the first round they are `settings.initial_shares`.
     """
-    candidates = list_candidates(state, history, settings, mixture.edges)
+    candidates = list_candidates(state, history)
     kinds = np.array([candidate.kind for candidate in candidates])
-    start = np.array([settings.initial_shares[c.kind] / np.count_nonzero(kinds == c.kind) for c in candidates])
+    start = np.array([REFINEMENT.initial_shares[c.kind] / np.count_nonzero(kinds == c.kind) for c in candidates])
     weights = start / start.sum()
     if not state.rounds or len(history.u) == 0:
         return MixtureProposal(candidates, weights)
-    floors = _set_floors(state, history, candidates, settings, radial=state.dim <= settings.radial_dim, final=final)
+    floors = _set_floors(state, history, candidates, radial=state.dim <= REFINEMENT.radial_dim, final=final)
     u, log_w = history.u, history.log_weights
     if state.noisy:
-        u, log_w = _smooth_indicators(history, state.gamma, settings)
+        u, log_w = _smooth_indicators(history, state.gamma)
     log_r = log_ratios([candidate.component for candidate in candidates], u)
-    weights = minimise_second_moment(log_r, log_w, weights, floors, mixture.weights)
+    weights = minimise_second_moment(log_r, log_w, weights, floors)
     keeps = kinds == "base"
     if not final:
         explored = np.isin(kinds, ["explored", "linear", "corner", "spread"])
-        weights = np.where(explored, np.maximum(weights, settings.explored_share), weights)
+        weights = np.where(explored, np.maximum(weights, REFINEMENT.explored_share), weights)
         keeps = keeps | explored
-    weights = np.where((weights < settings.min_share) & ~keeps, 0.0, weights)
+    weights = np.where((weights < REFINEMENT.min_share) & ~keeps, 0.0, weights)
     return MixtureProposal(candidates, raise_to_floors(weights / weights.sum(), floors))
 
 
 def list_candidates(
     state: RefinementState,
     history: MultipleImportanceSample,
-    settings: RefinementSettings,
-    edges: EdgeSettings = DEFAULT_MIXTURE_SETTINGS.edges,
 ) -> list[ProposalComponent]:
     """Return the components that the next proposal may have; the first is the base distribution."""
     gaussians = [
@@ -320,25 +300,23 @@ def list_candidates(
     regional = gaussians + ([] if state.noisy else list(state.linear)) + (list(state.explored) if state.rounds else [])
     candidates = [
         ProposalComponent(IsotropicNormal(state.dim), "base"),
-        ProposalComponent(IsotropicNormal(state.dim, settings.wide_scale), "wide"),
-        *_fit_radial_components(state, history, settings, edges),
+        ProposalComponent(IsotropicNormal(state.dim, REFINEMENT.wide_scale), "wide"),
+        *_fit_radial_components(state, history),
         *regional,
         *_fit_directional_components(state, history),
-        *_temper_gaussians(regional, settings.noisy_tempering if state.noisy else settings.tempering),
+        *_temper_gaussians(regional, REFINEMENT.noisy_tempering if state.noisy else REFINEMENT.tempering),
     ]
-    candidates += _lift_candidates(state, history, settings, edges)
-    return [candidate for candidate in candidates if candidate.kind in settings.initial_shares]
+    candidates += _lift_candidates(state, history)
+    return [candidate for candidate in candidates if candidate.kind in REFINEMENT.initial_shares]
 
 
-def _lift_candidates(
-    state: RefinementState, history: MultipleImportanceSample, settings: RefinementSettings, edges: EdgeSettings
-) -> list[ProposalComponent]:
+def _lift_candidates(state: RefinementState, history: MultipleImportanceSample) -> list[ProposalComponent]:
     """Return components in the span of the slopes, if the exploration has found some, N(0, 1) across it."""
     axes = state.exploration.slopes
     if state.within is None or axes is None:
         return []
     failures = history.within(axes)
-    inside = [c for c in list_candidates(state.within, failures, settings, edges) if c.kind not in ("base", "wide")]
+    inside = [c for c in list_candidates(state.within, failures) if c.kind not in ("base", "wide")]
     inside.append(ProposalComponent(_fit_spread(state.within, failures), "spread"))
     return [candidate._replace(component=LiftedComponent(candidate.component, axes)) for candidate in inside]
 
@@ -360,16 +338,14 @@ def _temper_gaussians(components: list[ProposalComponent], powers: tuple[float, 
     ]
 
 
-def _fit_radial_components(
-    state: RefinementState, history: MultipleImportanceSample, settings: RefinementSettings, edges: EdgeSettings
-) -> list[ProposalComponent]:
+def _fit_radial_components(state: RefinementState, history: MultipleImportanceSample) -> list[ProposalComponent]:
     """Return radial components around the chains' points and around the weighted failures; none in one dimension."""
     if state.dim < 2:
         return []
-    radial = [fit_radial(state.points, np.ones(len(state.points)), edges)]
-    if len(history.u) >= settings.min_radial_failures:
+    radial = [fit_radial(state.points, np.ones(len(state.points)))]
+    if len(history.u) >= REFINEMENT.min_radial_failures:
         log_w = history.log_weights
-        radial.append(fit_radial(history.u, np.exp(log_w - log_w.max()), edges))
+        radial.append(fit_radial(history.u, np.exp(log_w - log_w.max())))
     return [ProposalComponent(component, "radial") for component in radial]
 
 
@@ -404,7 +380,6 @@ def _set_floors(
     state: RefinementState,
     history: MultipleImportanceSample,
     candidates: list[ProposalComponent],
-    settings: RefinementSettings,
     *,
     radial: bool,
     final: bool,
@@ -416,30 +391,28 @@ def _set_floors(
     kinds = np.array([candidate.kind for candidate in candidates])
     regions = np.array([candidate.region for candidate in candidates])
     spread = state.scattered and state.within is not None
-    extra = 0.0 if spread else settings.extra_tempered_share * (1 - state.hit_rate)
-    tempered = settings.noisy_tempered_share if state.noisy else settings.tempered_share + extra
+    extra = 0.0 if spread else REFINEMENT.extra_tempered_share * (1 - state.hit_rate)
+    tempered = REFINEMENT.noisy_tempered_share if state.noisy else REFINEMENT.tempered_share + extra
     n = len(state.regions)
     floors = [Floor(kinds == "tempered", tempered)]
     if n > 1 and not state.scattered:
         shares = _share_among_regions(state, history)
         floors = [Floor((kinds == "tempered") & (regions == k), tempered * shares[k]) for k in range(n)]
-    if state.scattered or (state.rounds and state.rounds[-1].worth(state.gamma) < settings.good_rate):
-        floors.append(Floor(kinds == "spread", settings.spread_share))
+    if state.scattered or (state.rounds and state.rounds[-1].worth(state.gamma) < REFINEMENT.good_rate):
+        floors.append(Floor(kinds == "spread", REFINEMENT.spread_share))
     if state.scattered or (radial and not state.noisy):
-        floors.append(Floor(kinds == "radial", settings.radial_share))
+        floors.append(Floor(kinds == "radial", REFINEMENT.radial_share))
     if n > 1 and not state.scattered:
-        share = settings.final_region_share if final else settings.region_share
+        share = REFINEMENT.final_region_share if final else REFINEMENT.region_share
         floors += [Floor((regions == k) & (kinds != "tempered"), share / n) for k in range(n)]
-    base = settings.noisy_base_share if state.noisy else settings.base_share
+    base = REFINEMENT.noisy_base_share if state.noisy else REFINEMENT.base_share
     floors = [floor for floor in floors if floor.members.any()]
     fit = min(1.0, (1 - base) / max(sum(floor.least for floor in floors), base))
     floors = [replace(floor, least=fit * floor.least) for floor in floors]
     return [*floors, Floor(kinds == "base", base)] if "base" in kinds else floors
 
 
-def _smooth_indicators(
-    history: MultipleImportanceSample, gamma: float, settings: RefinementSettings
-) -> tuple[FloatArray, FloatArray]:
+def _smooth_indicators(history: MultipleImportanceSample, gamma: float) -> tuple[FloatArray, FloatArray]:
     """Return all draws u (n, d), and log weights (n,) that hold the probability that they fail, by logistic regression.
 
     With a noisy f the few failures among the draws near the origin carry large weights by chance. What the weights of
@@ -449,8 +422,8 @@ def _smooth_indicators(
     from sklearn.preprocessing import PolynomialFeatures
 
     u, f, log_w = history.all_draws()
-    degree = 2 if u.shape[1] <= settings.quadratic_dim else 1
+    degree = 2 if u.shape[1] <= REFINEMENT.quadratic_dim else 1
     x = PolynomialFeatures(degree, include_bias=False).fit_transform(u)
-    model = LogisticRegression(C=settings.logistic_penalty, max_iter=settings.logistic_iterations, random_state=0)
-    odds = model.fit(x, f <= gamma).decision_function(x) / settings.probit_scale
+    model = LogisticRegression(C=REFINEMENT.logistic_penalty, max_iter=REFINEMENT.logistic_iterations, random_state=0)
+    odds = model.fit(x, f <= gamma).decision_function(x) / REFINEMENT.probit_scale
     return u, log_w + log_ndtr(odds)

@@ -13,11 +13,8 @@ from scipy.special import betaincinv
 from samplers.importance import Draws, weighted_interval
 from samplers.methods.two_stage.planes import descent_direction
 from samplers.methods.two_stage.settings import (
-    DEFAULT_MIXTURE_SETTINGS,
-    DEFAULT_SETTINGS,
-    LinearModelSettings,
-    MixtureSettings,
-    RegionSettings,
+    REGIONS,
+    SUBSPACE,
 )
 from samplers.methods.two_stage.simulator import SimulationSteps, Simulator
 from samplers.problem import FloatArray
@@ -156,8 +153,6 @@ def grow_regions(
     gamma: float,
     limit: int,
     rng: np.random.Generator,
-    settings: RegionSettings = DEFAULT_SETTINGS.regions,
-    mixture: MixtureSettings = DEFAULT_MIXTURE_SETTINGS,
 ) -> SimulationSteps[ExplorationResult]:
     """Run chains from failing points, twice; sort them into regions after each time.
 
@@ -171,33 +166,29 @@ def grow_regions(
         gamma: Threshold of failure.
         limit: Simulations after which points are no longer compared.
         rng: Source of randomness.
-        settings: Numbers and steps of chains.
-        mixture: From how many dimensions on these are others, and the regression that gives chains a direction.
     """
     dim = starts.shape[1]
-    high_dim = dim > mixture.subspace.high_dim
-    steps = settings.steps_high_dim if high_dim else settings.steps
-    sigma = np.full(len(starts), settings.initial_step)
-    first = yield from _pcn_chains(simulator, starts, sigma, None, steps[0], gamma, rng, settings)
-    if (yield from _is_noisy(simulator, first.ends, gamma, rng, settings)):
-        last = yield from _pcn_chains(simulator, first.ends, first.sigma, None, steps[1], gamma, rng, settings)
+    high_dim = dim > SUBSPACE.high_dim
+    steps = REGIONS.steps_high_dim if high_dim else REGIONS.steps
+    sigma = np.full(len(starts), REGIONS.initial_step)
+    first = yield from _pcn_chains(simulator, starts, sigma, None, steps[0], gamma, rng)
+    if (yield from _is_noisy(simulator, first.ends, gamma, rng)):
+        last = yield from _pcn_chains(simulator, first.ends, first.sigma, None, steps[1], gamma, rng)
         region = last.to_region()._replace(chains=last.states[:, 1:])
         return ExplorationResult([region], noisy=True, levels=descent.levels)
     reserve = len(starts) * (steps[1] + 1)  # for the second chains, and one look at where they end
-    labels, _ = yield from label_regions(simulator, first.ends, gamma, limit - reserve, settings)
+    labels, _ = yield from label_regions(simulator, first.ends, gamma, limit - reserve)
     room = max(limit - simulator.n_sim - reserve, 0) // (steps[1] + 1)
-    few, many = settings.chains_per_region
-    wanted = min(max(few, math.ceil(settings.points_per_dim * dim / steps[1])), many)
-    chosen = _replicate_seeds(labels, wanted, min(room, settings.max_replicated), rng)
+    few, many = REGIONS.chains_per_region
+    wanted = min(max(few, math.ceil(REGIONS.points_per_dim * dim / steps[1])), many)
+    chosen = _replicate_seeds(labels, wanted, min(room, REGIONS.max_replicated), rng)
     first, labels = first.select(chosen), labels[chosen]
-    directions = _estimate_directions(first, labels, descent, settings, mixture.linear_model)
-    last = yield from _pcn_chains(
-        simulator, first.ends, first.sigma, directions[labels], steps[1], gamma, rng, settings
-    )
-    labels, scattered = yield from label_regions(simulator, last.ends, gamma, limit, settings)
-    regions = _collect_regions(first, last, labels, settings.late_steps_high_dim if high_dim else settings.late_steps)
+    directions = _estimate_directions(first, labels, descent)
+    last = yield from _pcn_chains(simulator, first.ends, first.sigma, directions[labels], steps[1], gamma, rng)
+    labels, scattered = yield from label_regions(simulator, last.ends, gamma, limit)
+    regions = _collect_regions(first, last, labels, REGIONS.late_steps_high_dim if high_dim else REGIONS.late_steps)
     if len(regions) == 1:
-        regions = [_add_subset_points(regions[0], descent, settings)]
+        regions = [_add_subset_points(regions[0], descent)]
     return ExplorationResult(regions, noisy=False, scattered=scattered, levels=descent.levels)
 
 
@@ -224,7 +215,6 @@ def _pcn_chains(
     steps: int,
     gamma: float,
     rng: np.random.Generator,
-    settings: RegionSettings = DEFAULT_SETTINGS.regions,
 ) -> SimulationSteps[ChainPaths]:
     """Move chains inside the failure region by pCN, each with its own step.
 
@@ -245,11 +235,11 @@ def _pcn_chains(
         fails = f <= gamma
         u = np.where(fails[:, None], proposal, u)
         if directions is None:
-            change = settings.adaptation * (fails - settings.chain_acceptance) / math.sqrt(step)
-            sigma = np.clip(sigma * np.exp(change), settings.min_step, 1.0)
+            change = REGIONS.adaptation * (fails - REGIONS.chain_acceptance) / math.sqrt(step)
+            sigma = np.clip(sigma * np.exp(change), REGIONS.min_step, 1.0)
         else:
-            across = np.clip(across * np.where(fails, *settings.across_factors), settings.min_across, 1.0)
-            sigma = np.clip(sigma * np.where(fails, *settings.along_factors), settings.min_step, 1.0)
+            across = np.clip(across * np.where(fails, *REGIONS.across_factors), REGIONS.min_across, 1.0)
+            sigma = np.clip(sigma * np.where(fails, *REGIONS.along_factors), REGIONS.min_step, 1.0)
         states.append(u)
         proposals.append(proposal)
         outcomes.append(f)
@@ -261,16 +251,15 @@ def _is_noisy(
     u: FloatArray,
     gamma: float,
     rng: np.random.Generator,
-    settings: RegionSettings = DEFAULT_SETTINGS.regions,
 ) -> SimulationSteps[bool]:
     """Return whether points right beside failing ones (n, d) do not always fail."""
-    u = rng.permutation(u)[: settings.probes]
-    f = yield from simulator.evaluate(u + settings.probe_distance * rng.standard_normal(u.shape))
-    return float((f <= gamma).mean()) < settings.noisy_share
+    u = rng.permutation(u)[: REGIONS.probes]
+    f = yield from simulator.evaluate(u + REGIONS.probe_distance * rng.standard_normal(u.shape))
+    return float((f <= gamma).mean()) < REGIONS.noisy_share
 
 
 def label_regions(
-    simulator: Simulator, u: FloatArray, gamma: float, limit: int, settings: RegionSettings = DEFAULT_SETTINGS.regions
+    simulator: Simulator, u: FloatArray, gamma: float, limit: int
 ) -> SimulationSteps[tuple[Labels, bool]]:
     """Sort failing points (n, d) into regions, numbered from 0: those half way to whose first point fails.
 
@@ -284,16 +273,16 @@ def label_regions(
     labels = np.full(len(u), -1)
     scattered = False
     joined, all_compared = np.zeros((len(u), len(u)), dtype=bool), False
-    for k in range(settings.max_regions):
+    for k in range(REGIONS.max_regions):
         free = np.flatnonzero(labels < 0)
-        scattered = k >= settings.many_regions and len(free) > settings.scattered_share * len(u)
+        scattered = k >= REGIONS.many_regions and len(free) > REGIONS.scattered_share * len(u)
         if len(free) == 0 or scattered:
             break
         first = free[np.argmin((u[free] ** 2).sum(axis=1))]
         labels[first] = k
         others = free[free != first]
         if not all_compared:
-            all_compared = len(free) <= settings.few_points
+            all_compared = len(free) <= REGIONS.few_points
             left, right = free[_all_pairs(len(free))] if all_compared else (np.full_like(others, first), others)
             if simulator.n_sim + len(left) > limit:
                 break
@@ -326,37 +315,31 @@ def _estimate_directions(
     paths: ChainPaths,
     labels: Labels,
     descent: SubsetPoints,
-    settings: RegionSettings,
-    linear_model: LinearModelSettings,
 ) -> FloatArray:
     """Return the direction of each region, shape (m, d); the points of subset simulation belong to the only one."""
     n = labels.max() + 1
     only = descent if n == 1 else None
-    return np.array([_estimate_direction(paths.select(labels == k), only, settings, linear_model) for k in range(n)])
+    return np.array([_estimate_direction(paths.select(labels == k), only) for k in range(n)])
 
 
 def _estimate_direction(
     paths: ChainPaths,
     descent: SubsetPoints | None,
-    settings: RegionSettings = DEFAULT_SETTINGS.regions,
-    linear_model: LinearModelSettings = DEFAULT_MIXTURE_SETTINGS.linear_model,
 ) -> FloatArray:
     """Return the direction in which a region lies, shape (d,): where f falls if it does so linearly, else its mean."""
     region = paths.to_region()
     if descent is not None:
-        region = _add_subset_points(region, descent, settings)
-    axis, r2 = descent_direction(region.u, region.f, linear_model)
-    if r2 > settings.direction_r2:
+        region = _add_subset_points(region, descent)
+    axis, r2 = descent_direction(region.u, region.f)
+    if r2 > REGIONS.direction_r2:
         return axis
-    mean = paths.states[:, -settings.mean_steps :].mean(axis=(0, 1))
+    mean = paths.states[:, -REGIONS.mean_steps :].mean(axis=(0, 1))
     return np.asarray(mean / max(float(np.linalg.norm(mean)), 1e-12))
 
 
-def _add_subset_points(
-    region: Region, descent: SubsetPoints, settings: RegionSettings = DEFAULT_SETTINGS.regions
-) -> Region:
+def _add_subset_points(region: Region, descent: SubsetPoints) -> Region:
     """Return a region with the lower points of subset simulation, if its own are too few for a regression."""
-    if len(region.u) >= settings.min_points_per_dim * region.u.shape[1] or len(descent.f) == 0:
+    if len(region.u) >= REGIONS.min_points_per_dim * region.u.shape[1] or len(descent.f) == 0:
         return region
-    low = descent.f <= np.quantile(descent.f, settings.lower_share, method="lower")  # f may be infinite
+    low = descent.f <= np.quantile(descent.f, REGIONS.lower_share, method="lower")  # f may be infinite
     return Region(region.chains, np.concatenate([region.u, descent.u[low]]), np.concatenate([region.f, descent.f[low]]))

@@ -1,11 +1,8 @@
-"""Settings of the mixtures of two-stage: regression, expectation-maximisation, edges, weights.
+"""Settings of two-stage: the numbers of its stages, each with its reason.
 
-Below, "variance x and y" are the variances that runs state with a setting halved and doubled (or moved as far as makes
-sense), over those with the default one: geometric means over four problems of the catalogue where it acts, 10 seeds
-each, 6,000 simulations (`benchmarks/results/setting_sensitivity.json` has values, problems, standard errors and
-coverage). Standard errors are 0.05 to 0.15 where none is given: up to 1.2 a ratio may be chance, all the more as rows
-on the same problems share their default runs. Settings of one mechanism were moved together; one of them has the
-figures.
+Users set `TwoStage.n` only. Where no other reason stands beside a number, it was chosen together with the others on the
+problems of the benchmark of samplers at 6,000 simulations: some 30 configurations, up to 40 runs each, by which
+differences in gain of less than a factor of two cannot be told from chance.
 """
 
 from dataclasses import dataclass, field
@@ -16,11 +13,9 @@ class LinearModelSettings:
     """Robust regression of f, and half-spaces beyond its hyperplane (`planes.py`)."""
 
     ridges: tuple[float, float] = (1.0, 1e-3)
-    """Ridge penalties; the smaller one is tried where points are enough for ordinary regression.
-    Variance 0.94 and 1.00 (both of them moved)."""
+    """Ridge penalties; the smaller one is tried where points are enough for ordinary regression."""
     lad_iterations: int = 12
-    """Steps of iteratively reweighted least squares towards least absolute deviations. Variance 1.01 and 0.95, with
-    the settings from here to `min_left_out_lad`."""
+    """Steps of iteratively reweighted least squares towards least absolute deviations."""
     lad_ridge: float = 1e-3
     """Ridge penalty of these steps, the smaller one of `ridges`: it keeps the matrix regular."""
     lad_smoothing: float = 1e-3
@@ -30,18 +25,15 @@ class LinearModelSettings:
     min_left_out_lad: float = 1e-2
     """The same in the steps towards least absolute deviations, where one such point must not hold all the weight."""
     inlier_sigmas: float = 3.0
-    """Deviation up to which a point agrees with a hyperplane, in standard deviations (Rousseeuw and Leroy use 2.5).
-    Variance 1.07 and 1.00, with `agreeing_share` and `trimmed_share`."""
+    """Deviation up to which a point agrees with a hyperplane, in standard deviations (Rousseeuw and Leroy use 2.5)."""
     min_points: int = 5
-    """Points that a regression needs. Variance 1.00 and 1.00, hardly a run differs, with `min_points_per_dim` and
-    `min_failures`: at 6,000 simulations points are seldom as few."""
+    """Points that a regression needs."""
     min_points_per_dim: float = 1.2
     """With `min_points` + this many points per dimension the small ridge and outliers can be judged."""
     trimmed_share: float = 0.02
     """Share of the outcomes left out at either end: f may be capped or wild there."""
     exact_r2: float = 0.999
-    """R^2 from which f is linear. Variance 0.98 +- 0.02 and 1.03 +- 0.02 for half and twice the distance of both limits
-    from 1."""
+    """R^2 from which f is linear."""
     boundary_r2: float = 0.95
     """R^2 from which the hyperplane, or the planes of a corner, locate the failure boundary. Corners down to 0.8 bought
     nothing: with 0.98 for 0.8 the variance was 0.996 +- 0.05 times as large (67 runs on the 14 limit states with such
@@ -53,8 +45,7 @@ class LinearModelSettings:
     """Share of the points that must agree with a hyperplane for it to be more than chance: over half, for two regions
     may have half each."""
     crossing_errors: float = 2.0
-    """Standard errors of a prediction by which a half-space begins before the hyperplane. Variance 1.06 and 1.05, with
-    `nearest_share` and `same_region_share`."""
+    """Standard errors of a prediction by which a half-space begins before the hyperplane."""
     nearest_share: float = 0.03
     """Share of the failures that may lie before the edge, where the hyperplane does not locate it: none of 33 or
     fewer."""
@@ -65,7 +56,7 @@ class LinearModelSettings:
     """Failures nearer than this share of the median distance along the axis are another region's."""
     widening: float = 1.3
     """Variance of the Gaussian over that of N(0, 1) beyond the edge: too small a variance makes weights unbounded, too
-    large a one costs a few draws. Variance 1.10 at 1.15 and 0.98 at 1.6."""
+    large a one costs a few draws."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -122,16 +113,13 @@ class EdgeSettings:
     min_distance: float = 0.5
     """Nearer to the origin than this a half-space holds 31 % of N(0, I): base draws serve as well."""
     slack: float = 0.02
-    """By how much a half-space begins before the edge, in standard deviations of N(0, I). Variance 0.85 and 1.20, where
-    hyperplanes are the boundary; half of it may be better, if failures before the start stay as rare."""
+    """By how much a half-space begins before the edge, in standard deviations of N(0, I)."""
     mean_excesses: float = 2.0
-    """Mean excesses over the quantile, divided by the number of failures, by which an edge is put back. Variance 0.98
-    and 1.02, with `share`."""
+    """Mean excesses over the quantile, divided by the number of failures, by which an edge is put back."""
     min_ess: float = 2.0
     """Least number of failures that they are divided by."""
     radius_share: float = 0.01
-    """Share of the failures' weight that may lie within the radius before it is shortened. Variance 0.98 and 1.19, with
-    `radius_factor` and `min_radial_shape`: 2.08 on one problem."""
+    """Share of the failures' weight that may lie within the radius before it is shortened."""
     radius_factor: float = 0.98
     """|u|^2 at that quantile, times this, is where radial draws begin: the least of few lies beyond the edge of
     many."""
@@ -144,15 +132,13 @@ class SubspaceSettings:
     """Mixtures fitted to weighted points (`mixture.py`)."""
 
     high_dim: int = 40
-    """Above this many dimensions a component has one direction of its own: some hundred points do not show more.
-    Variance 1.06 +- 0.03 at 20 (1.27 on one problem in 30 dimensions) and 1.05 +- 0.03 at 80 (1.23 in 60)."""
+    """Above this many dimensions a component has one direction of its own: some hundred points do not show more."""
     sizes: tuple[int, ...] = (1, 2, 3, 4, 6, 8)
     """Numbers of components that are tried; `max_worse` of them without a better score end the search."""
     max_worse: int = 2
-    """The score of a fit is uneven in their number: after one that is worse, a better one may follow. Variance 1.03 and
-    1.15, with `covariance_parameters_per_dim` and `points_per_component`."""
+    """The score of a fit is uneven in their number: after one that is worse, a better one may follow."""
     max_em_iterations: int = 25
-    """M-steps at most. Variance 1.02 and 1.09, with `min_relative_gain` and `em_restarts`."""
+    """M-steps at most."""
     min_relative_gain: float = 1e-3
     """Expectation-maximisation ends where a step raises the log likelihood by less than this share of it."""
     em_restarts: int = 3
@@ -160,25 +146,21 @@ class SubspaceSettings:
     min_ess: float = 2.0
     """Points that any component is taken to rest on: the formulae divide by their number."""
     refit_steps: int = 2
-    """M-steps between two rounds of draws; the rounds go on from there. Variance 1.00 and 1.07."""
+    """M-steps between two rounds of draws; the rounds go on from there."""
     min_refit_points: int = 5
     """A component with fewer points stays where it is."""
     refit_ess: float = 30.0
     """Effective points that a component is fitted to, as its mean and a shrunk covariance need them ..."""
     refit_ess_per_dim: float = 3.0
-    """... or this many per dimension. Where the weights are less even, they are raised to a power less than 1.
-    Variance 2.8 (47 on one problem) and 0.92 +- 0.06, with the numbers of points above and below and half or twice the
-    step of the power."""
+    """... or this many per dimension. Where the weights are less even, they are raised to a power less than 1."""
     points_per_refit_ess: float = 3.0
     """Points of a component for each of them: no more is asked of it than a third of its points."""
     power_step: float = 0.1
     """By how much the power falls from trial to trial; the effective number of points grows as it does."""
     max_spread: float = 4.0
-    """Largest variance along the one direction in high dimensions; a few points of another region give more.
-    Variance 1.01 +- 0.01 and 0.98 +- 0.01, with `max_mean_excess`."""
+    """Largest variance along the one direction in high dimensions; a few points of another region give more."""
     standard_errors: float = 2.0
-    """By how many of them a variance under 1 is raised: too small a variance makes weights unbounded.
-    Variance 1.19 +- 0.18 and 1.03."""
+    """By how many of them a variance under 1 is raised: too small a variance makes weights unbounded."""
     max_mean_excess: float = 0.5
     """Share of a mean that is taken off as noise at most: of few points in hundreds of dimensions noise is all there
     is."""
@@ -196,25 +178,9 @@ class MixtureWeightSettings:
     """Search for the best weights of a mixture (`mixture.py`)."""
 
     updates: int = 60
-    """Multiplicative updates: they come within 2 % of the least second moment (`test_weights_are_nearly_the_best`).
-    Variance 1.10 and 1.17: what is left is chance."""
+    """Multiplicative updates: they come within 2 % of the least second moment (`test_weights_are_nearly_the_best`)."""
     negligible: float = 30.0
     """Points whose weight is e^-30 of the largest one do not matter."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class MixtureSettings:
-    """All settings of the mixtures."""
-
-    linear_model: LinearModelSettings = LinearModelSettings()
-    pieces: PieceSettings = PieceSettings()
-    corner: CornerSettings = CornerSettings()
-    edges: EdgeSettings = EdgeSettings()
-    subspace: SubspaceSettings = SubspaceSettings()
-    weights: MixtureWeightSettings = MixtureWeightSettings()
-
-
-DEFAULT_MIXTURE_SETTINGS = MixtureSettings()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -399,13 +365,6 @@ class TermSettings:
     """Dimensions from which it replaces the exploration of two-stage."""
     min_budget: int = 1000
     """Simulations under which there is no room for walks, rounds and an estimate."""
-    walks: WalkSettings = WalkSettings()
-    law: LawSettings = LawSettings()
-    rounds: RoundSettings = RoundSettings()
-    doubts: DoubtSettings = DoubtSettings()
-
-
-DEFAULT_TERM_SETTINGS = TermSettings()
 
 
 def _initial_shares() -> dict[str, float]:
@@ -766,16 +725,25 @@ class TwoStageSettings:
     draws_per_control: int = 30
     """Draws of a round for each kind of component from which on their weights are calibrated: with fewer the bias by
     estimated slopes would count."""
-    exploration: ExplorationSettings = ExplorationSettings()
-    lines: LineSettings = LineSettings()
-    terms_alone: TermsAloneSettings = TermsAloneSettings()
-    regions: RegionSettings = RegionSettings()
-    slopes: SlopeSettings = SlopeSettings()
-    refinement: RefinementSettings = RefinementSettings()
-    fallback: FallbackSettings = FallbackSettings()
-    diagnostics: DiagnosticSettings = DiagnosticSettings()
-    mixture: MixtureSettings = DEFAULT_MIXTURE_SETTINGS
-    terms: TermSettings = DEFAULT_TERM_SETTINGS
 
 
-DEFAULT_SETTINGS = TwoStageSettings()
+EXPLORATION = ExplorationSettings()
+LINES = LineSettings()
+TERMS_ALONE = TermsAloneSettings()
+REGIONS = RegionSettings()
+SLOPES = SlopeSettings()
+REFINEMENT = RefinementSettings()
+FALLBACK = FallbackSettings()
+DIAGNOSTICS = DiagnosticSettings()
+TWO_STAGE = TwoStageSettings()
+LINEAR_MODEL = LinearModelSettings()
+PIECES = PieceSettings()
+CORNER = CornerSettings()
+EDGES = EdgeSettings()
+SUBSPACE = SubspaceSettings()
+WEIGHTS = MixtureWeightSettings()
+WALKS = WalkSettings()
+LAW = LawSettings()
+ROUNDS = RoundSettings()
+DOUBTS = DoubtSettings()
+TERMS = TermSettings()

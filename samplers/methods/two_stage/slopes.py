@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from samplers.methods.two_stage.regions import ExplorationResult
-from samplers.methods.two_stage.settings import SlopeSettings
+from samplers.methods.two_stage.settings import SLOPES
 from samplers.methods.two_stage.simulator import SimulationSteps, Simulator
 from samplers.problem import FloatArray
 
@@ -27,7 +27,6 @@ def find_slopes(
     gamma: float,
     room: int,
     rng: np.random.Generator,
-    settings: SlopeSettings,
     high_dim: int,
 ) -> SimulationSteps[FloatArray | None]:
     """Return orthonormal directions in which f changes around the failures, shape (d, r); None where they are not few.
@@ -37,23 +36,23 @@ def find_slopes(
     """
     dim = simulator.inputs.dim
     short = exploration.scattered or dim > high_dim
-    n = min(int((settings.high_dim_share if short else settings.share) * room / (dim + 1)), settings.most)
-    if dim < settings.min_dim or n < settings.least or exploration.noisy or not exploration.regions:
+    n = min(int((SLOPES.high_dim_share if short else SLOPES.share) * room / (dim + 1)), SLOPES.most)
+    if dim < SLOPES.min_dim or n < SLOPES.least or exploration.noisy or not exploration.regions:
         return None
     points = _collect_points(exploration, gamma, rng)
-    first = max(n - n // 2, settings.least)
+    first = max(n - n // 2, SLOPES.least)
     chosen = np.argsort(points.turns, kind="stable")[:first]
-    slopes = yield from _differentiate(simulator, points.u[chosen], settings.step)
+    slopes = yield from _differentiate(simulator, points.u[chosen], SLOPES.step)
     for size in ((n - first + 1) // 2, (n - first) // 2):
-        if not _have_few_directions(slopes, settings):
+        if not _have_few_directions(slopes):
             return None
-        axes, points = _leading_directions(slopes, settings), points.leave_out(chosen)
+        axes, points = _leading_directions(slopes), points.leave_out(chosen)
         chosen = _choose_unexplained(points, size, axes)
-        more = yield from _differentiate(simulator, points.u[chosen], settings.step)
+        more = yield from _differentiate(simulator, points.u[chosen], SLOPES.step)
         slopes = np.concatenate([slopes, more])
-        if ((more @ axes) ** 2).sum() >= settings.explained * len(more):
+        if ((more @ axes) ** 2).sum() >= SLOPES.explained * len(more):
             break
-    return _leading_directions(slopes, settings) if _have_few_directions(slopes, settings) else None
+    return _leading_directions(slopes) if _have_few_directions(slopes) else None
 
 
 class _Points(NamedTuple):
@@ -121,21 +120,21 @@ def _differentiate(simulator: Simulator, u: FloatArray, step: float) -> Simulati
     return np.asarray(unit[np.isfinite(unit).all(axis=1)])
 
 
-def _have_few_directions(slopes: FloatArray, settings: SlopeSettings) -> bool:
+def _have_few_directions(slopes: FloatArray) -> bool:
     """Return whether unit gradients (k, d) lie in fewer directions than random ones would.
 
     The squares s^2 of the singular values of k random directions are worth about k d / (k + d) equal ones: that is
     (sum s^2)^2 / sum s^4.
     """
     k, dim = slopes.shape
-    if k < settings.least:
+    if k < SLOPES.least:
         return False
     squares = np.linalg.svd(slopes, compute_uv=False) ** 2
-    return bool(squares.sum() ** 2 / (squares**2).sum() <= settings.few * k * dim / (k + dim))
+    return bool(squares.sum() ** 2 / (squares**2).sum() <= SLOPES.few * k * dim / (k + dim))
 
 
-def _leading_directions(slopes: FloatArray, settings: SlopeSettings) -> FloatArray:
+def _leading_directions(slopes: FloatArray) -> FloatArray:
     """Return the principal directions (d, r) of unit gradients (k, d)."""
     _, sizes, axes = np.linalg.svd(slopes, full_matrices=False)
-    used = sizes**2 > settings.least_part * len(slopes)
-    return np.asarray(axes[used][: settings.most_axes].T)
+    used = sizes**2 > SLOPES.least_part * len(slopes)
+    return np.asarray(axes[used][: SLOPES.most_axes].T)

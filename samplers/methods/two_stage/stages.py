@@ -22,7 +22,13 @@ from samplers.methods.two_stage.refinement import (
     typical_weights,
 )
 from samplers.methods.two_stage.regions import ExplorationResult, discovery_interval
-from samplers.methods.two_stage.settings import DEFAULT_SETTINGS, FallbackSettings, TwoStageSettings
+from samplers.methods.two_stage.settings import (
+    EXPLORATION,
+    FALLBACK,
+    REFINEMENT,
+    SUBSPACE,
+    TWO_STAGE,
+)
 from samplers.methods.two_stage.simulator import (
     ComponentDraws,
     SimulationSteps,
@@ -55,7 +61,6 @@ class RunContext:
     simulator: Simulator
     """Of the coordinates that are not noise."""
     goal: Goal
-    settings: TwoStageSettings
     budget: int
     """Simulations that the exploration and the rounds are planned for."""
     end: int
@@ -75,7 +80,7 @@ class RunContext:
     @property
     def target_batch(self) -> int:
         """Draws after which a target c.o.v. is looked at."""
-        return max(self.budget // self.settings.target_batches, self.settings.min_target_batch)
+        return max(self.budget // TWO_STAGE.target_batches, TWO_STAGE.min_target_batch)
 
     @property
     def noise_marginalised(self) -> bool:
@@ -118,14 +123,12 @@ class RunState:
         return float((self.base_f <= gamma).mean())
 
 
-def start_run(
-    inputs: Inputs, goal: Goal, budget: int, settings: TwoStageSettings, rng: np.random.Generator
-) -> tuple[RunContext, RunState]:
+def start_run(inputs: Inputs, goal: Goal, budget: int, rng: np.random.Generator) -> tuple[RunContext, RunState]:
     """Return the run and its state before the first simulation; noise that is part of x is left to chance."""
     open_ended = goal.max_sim is None and goal.target_cov is not None
-    end = budget + settings.max_batches * (budget // settings.target_batches) if open_ended else budget
+    end = budget + TWO_STAGE.max_batches * (budget // TWO_STAGE.target_batches) if open_ended else budget
     searched = marginalise_noise(inputs, rng)
-    context = RunContext(inputs, Simulator(searched), goal, settings, budget, end, rng)
+    context = RunContext(inputs, Simulator(searched), goal, budget, end, rng)
     empty = MultipleImportanceSample.empty(searched.dim)
     return context, RunState(history=empty, base_u=np.empty((0, searched.dim)), base_f=np.empty(0))
 
@@ -134,25 +137,23 @@ def meets_too_few(
     draws: Draws,
     number: int,
     levels: int,
-    settings: FallbackSettings = DEFAULT_SETTINGS.fallback,
     *,
     share: float = 1.0,
 ) -> bool:
     """Return whether the draws of a round meet so few failures that subset simulation does better with the rest."""
-    early = settings.early_rates
-    rate = early[number - 1] if number <= len(early) else settings.relative_rate / max(levels, settings.min_levels)
+    early = FALLBACK.early_rates
+    rate = early[number - 1] if number <= len(early) else FALLBACK.relative_rate / max(levels, FALLBACK.min_levels)
     return draws.ess < share * rate * draws.n
 
 
-def misses_regions(draws: Draws, typical: FloatArray, settings: FallbackSettings = DEFAULT_SETTINGS.fallback) -> bool:
+def misses_regions(draws: Draws, typical: FloatArray) -> bool:
     """Return whether a proposal is far from most of the regions found.
 
     Args:
         draws: Of the last round.
         typical: Weights of typical points of the regions as draws of the proposal, shape (m,).
-        settings: The limit.
     """
-    return float(np.median(typical)) > settings.max_typical * draws.p
+    return float(np.median(typical)) > FALLBACK.max_typical * draws.p
 
 
 def reconcile(subset_outcome: Outcome, earlier: Outcome) -> Outcome:
@@ -180,14 +181,13 @@ def run_subset_simulation(
     budget: int,
     known: RootedPoints | None,
     rng: np.random.Generator,
-    settings: FallbackSettings = DEFAULT_SETTINGS.fallback,
 ) -> Steps:
     """Run adaptive subset simulation with the points per level that a budget or a target c.o.v. asks for."""
-    levels = max(levels, settings.min_levels)
-    n = int((budget + (0 if known is None else len(known.f))) / (1 + settings.level_share * (levels + 0.5)))
+    levels = max(levels, FALLBACK.min_levels)
+    n = int((budget + (0 if known is None else len(known.f))) / (1 + FALLBACK.level_share * (levels + 0.5)))
     if goal.target_cov is not None:
-        n = min(n, math.ceil(settings.chain_points * (levels + 1) / goal.target_cov**2))
-    n = max(n, settings.min_points)
+        n = min(n, math.ceil(FALLBACK.chain_points * (levels + 1) / goal.target_cov**2))
+    n = max(n, FALLBACK.min_points)
     known = known and known.select(np.arange(min(n, len(known.f))))
     outcome = yield from AdaptiveSubsetSimulation(n=n).steps(inputs, replace(goal, max_sim=budget), rng, known)
     about = (
@@ -200,7 +200,7 @@ def run_subset_simulation(
 
 def draw_first(context: RunContext, state: RunState) -> SimulationSteps[RunState]:
     """Make the base draws and the wide draws of the exploration."""
-    gamma, sizes = context.goal.gamma, Sizes.within(context.budget, context.settings.exploration)
+    gamma, sizes = context.goal.gamma, Sizes.within(context.budget)
     first = yield from first_draws(context.simulator, sizes, context.rng)
     state = replace(
         state,
@@ -215,14 +215,10 @@ def draw_first(context: RunContext, state: RunState) -> SimulationSteps[RunState
 
 def explore(context: RunContext, state: RunState) -> SimulationSteps[tuple[RunState, ExplorationResult]]:
     """Find the failure regions, starting from the first draws; there are none where nothing fails."""
-    gamma, sizes = context.goal.gamma, Sizes.within(context.budget, context.settings.exploration)
-    exploration = yield from find_regions(
-        context.simulator, state.history.batches[0], context.goal, sizes, context.rng, context.settings
-    )
-    slope_settings, high_dim = context.settings.slopes, context.settings.mixture.subspace.high_dim
-    slopes = yield from find_slopes(
-        context.simulator, exploration, gamma, context.left, context.rng, slope_settings, high_dim
-    )
+    gamma, sizes = context.goal.gamma, Sizes.within(context.budget)
+    exploration = yield from find_regions(context.simulator, state.history.batches[0], context.goal, sizes, context.rng)
+    high_dim = SUBSPACE.high_dim
+    slopes = yield from find_slopes(context.simulator, exploration, gamma, context.left, context.rng, high_dim)
     exploration = exploration._replace(slopes=slopes)
     n = sum(len(region.f) for region in exploration.regions)
     fails = sum(int((region.f <= gamma).sum()) for region in exploration.regions)
@@ -233,9 +229,9 @@ def begin_refinement(
     context: RunContext, state: RunState, exploration: ExplorationResult
 ) -> tuple[RefinementState, MixtureProposal]:
     """Return what the exploration shows of its regions, at least one, and the proposal of the first round."""
-    settings, mixture, rng = context.settings.refinement, context.settings.mixture, context.rng
-    refinement = start_refinement(exploration, context.goal.gamma, settings, rng, mixture)
-    return refinement, build_proposal(refinement, state.history, settings, mixture)
+    rng = context.rng
+    refinement = start_refinement(exploration, context.goal.gamma, rng)
+    return refinement, build_proposal(refinement, state.history)
 
 
 def draw_round(
@@ -243,39 +239,38 @@ def draw_round(
 ) -> SimulationSteps[tuple[RunState, RefinementState]]:
     """Draw n points from a proposal and learn from them."""
     state, batch = yield from _draw(context, state, proposal, n)
-    gamma, settings = context.goal.gamma, context.settings
-    if len(state.rounds) >= _first_counted(state, gamma, settings):
+    gamma = context.goal.gamma
+    if len(state.rounds) >= _first_counted(state, gamma):
         inputs = context.simulator.inputs
-        empty = StratifiedSample.empty(len(proposal.weights), inputs.dim, np.empty(0), settings)
+        empty = StratifiedSample.empty(len(proposal.weights), inputs.dim, np.empty(0))
         counted = CountedRound(empty.add(batch, proposal, inputs, gamma), batch.first)
         state = replace(state, counted=(*state.counted, counted))
     draws = Draws.from_outcomes(batch.f, proposal.log_weights(batch.u), batch.u, gamma)
     history = state.history.add(batch._replace(x=None), gamma)
-    refinement = refine_once(refinement, history, proposal, batch, settings.refinement, context.rng, settings.mixture)
+    refinement = refine_once(refinement, history, proposal, batch, context.rng)
     ess = effective_sample_size(history.log_weights)
     state = replace(state, history=history, rounds=(*state.rounds, draws))
     p = float(np.exp(history.log_weights).sum())
     return _record_draws(context, state, batch, p, 1 / math.sqrt(ess) if ess else math.inf, ess), refinement
 
 
-def _first_counted(state: RunState, gamma: float, settings: TwoStageSettings) -> int:
+def _first_counted(state: RunState, gamma: float) -> int:
     """Return the number of rounds that do not count in p; base draws decide, which do not count either."""
-    common = np.count_nonzero(state.base_f <= gamma) >= settings.exploration.common_failures
-    return settings.refinement.counted_from - int(common)
+    common = np.count_nonzero(state.base_f <= gamma) >= EXPLORATION.common_failures
+    return REFINEMENT.counted_from - int(common)
 
 
 def refine(
     context: RunContext, state: RunState, refinement: RefinementState, number: int, room: int, proposal: MixtureProposal
 ) -> SimulationSteps[tuple[RunState, RefinementState, MixtureProposal, bool]]:
     """Run one round of refinement; return also the proposal that follows from it, and whether that is the last one."""
-    settings = context.settings.refinement
-    shares = (*settings.round_shares, *settings.further_shares)
+    shares = (*REFINEMENT.round_shares, *REFINEMENT.further_shares)
     n = int(shares[number - 1] * room)
     if n > 0:
         state, refinement = yield from draw_round(context, state, refinement, proposal, n)
-    enough = refinement.noisy or not state.rounds or state.rounds[-1].ess >= settings.good_rate * state.rounds[-1].n
-    final = number == len(shares) or (enough and number >= len(settings.round_shares))
-    proposal = build_proposal(refinement, state.history, settings, context.settings.mixture, final=final)
+    enough = refinement.noisy or not state.rounds or state.rounds[-1].ess >= REFINEMENT.good_rate * state.rounds[-1].n
+    final = number == len(shares) or (enough and number >= len(REFINEMENT.round_shares))
+    proposal = build_proposal(refinement, state.history, final=final)
     return state, refinement, proposal, final
 
 
@@ -289,18 +284,17 @@ def gives_up(
     final: bool,
 ) -> bool:
     """Return whether subset simulation does better with the rest, after a round of draws; `final`: after the last."""
-    settings = context.settings.fallback
-    if context.left_at_all < settings.min_fallback_budget or not state.rounds:
+    if context.left_at_all < FALLBACK.min_fallback_budget or not state.rounds:
         return False
     if refinement.noisy and not (final and context.noise_marginalised):
         return False  # a tempered mixture meets few failures but does not miss any: nothing else is better
     last = state.rounds[-1]
-    share = settings.sloped_rate if refinement.within is not None else 1.0
-    if meets_too_few(last, number, refinement.exploration.levels, settings, share=share):
+    share = FALLBACK.sloped_rate if refinement.within is not None else 1.0
+    if meets_too_few(last, number, refinement.exploration.levels, share=share):
         return True
     described = refinement.noisy or refinement.within is not None  # ends of lines in a ring are no typical failures
-    doubtful = final and not described and last.ess < context.settings.refinement.good_rate * last.n
-    return doubtful and misses_regions(last, typical_weights(refinement, proposal), settings)
+    doubtful = final and not described and last.ess < REFINEMENT.good_rate * last.n
+    return doubtful and misses_regions(last, typical_weights(refinement, proposal))
 
 
 def fall_back(context: RunContext, state: RunState, levels: int) -> Steps:
@@ -311,7 +305,7 @@ def fall_back(context: RunContext, state: RunState, levels: int) -> Steps:
     state = _close_trace(context, state)
     before = estimate_early(context, state)
     outcome = yield from run_subset_simulation(
-        context.inputs, context.goal, levels, context.left_at_all, known, context.rng, context.settings.fallback
+        context.inputs, context.goal, levels, context.left_at_all, known, context.rng
     )
     unfinished = outcome.status is Status.STOPPED and outcome.p == 0  # no estimate, then
     whole = before if unfinished else reconcile(outcome, before)
@@ -326,9 +320,8 @@ def estimate_afresh(
     p rests on these draws and on those of the rounds that count, each weighted as a draw of its own proposal.
     """
     goal, inputs, stopped = context.goal, context.simulator.inputs, False
-    settings = context.settings
     typical = typical_weights(refinement, proposal)
-    sample = StratifiedSample.empty(len(proposal.weights), inputs.dim, typical, settings)
+    sample = StratifiedSample.empty(len(proposal.weights), inputs.dim, typical)
     whole = sample
     size = context.left if goal.target_cov is None else context.target_batch
     while context.left_at_all > 0:
@@ -375,7 +368,7 @@ def run_monte_carlo(context: RunContext, state: RunState, *, counted: bool = Tru
     """Spend the rest on base draws."""
     goal, inputs, stopped, first = context.goal, context.simulator.inputs, False, context.simulator.n_sim
     u, f = (state.base_u, state.base_f) if counted else (state.base_u[:0], state.base_f[:0])
-    size = context.settings.monte_carlo_batch if goal.target_cov is None else context.target_batch
+    size = TWO_STAGE.monte_carlo_batch if goal.target_cov is None else context.target_batch
     while context.left_at_all > 0:
         new_u = context.rng.standard_normal((min(context.left_at_all, size), inputs.dim))
         try:
@@ -423,13 +416,13 @@ def _check(
     whole: StratifiedSample,
 ) -> list[str]:
     """Return the warnings of all checks of an estimate."""
-    settings, hits = context.settings.diagnostics, int((state.base_f <= context.goal.gamma).sum())
+    hits = int((state.base_f <= context.goal.gamma).sum())
     return [
-        *check_base_draws(whole.p, hits, len(state.base_f), settings),
-        *check_rounds(sample, state.rounds, settings),
-        *check_regions(whole, settings),
-        *check_discovery(whole.p, refinement.exploration.discovery, context.goal.confidence, settings),
-        *([] if refinement.noisy else check_efficiency(sample, settings)),
+        *check_base_draws(whole.p, hits, len(state.base_f)),
+        *check_rounds(sample, state.rounds),
+        *check_regions(whole),
+        *check_discovery(whole.p, refinement.exploration.discovery, context.goal.confidence),
+        *([] if refinement.noisy else check_efficiency(sample)),
     ]
 
 

@@ -19,7 +19,10 @@ from samplers.components import MixtureComponent, log_ratios, mixture_log_ratio
 from samplers.importance import Draws, calibrate
 from samplers.methods.two_stage.mixture import MixtureProposal
 from samplers.methods.two_stage.regions import Discovery
-from samplers.methods.two_stage.settings import DEFAULT_SETTINGS, DiagnosticSettings, TwoStageSettings
+from samplers.methods.two_stage.settings import (
+    DIAGNOSTICS,
+    TWO_STAGE,
+)
 from samplers.methods.two_stage.simulator import ComponentDraws
 from samplers.problem import FloatArray, Inputs
 from samplers.sample import Sample
@@ -107,18 +110,14 @@ class StratifiedSample:
     """Weight of a typical point of each region, whether or not a draw has met one, shape (m,)."""
     u_safe: FloatArray
     """The draws that did not fail, in the order of `draws.f_safe`, shape (m, d)."""
-    settings: TwoStageSettings = DEFAULT_SETTINGS
-    """Least draws of a component for a variance, and of a control for calibrated weights."""
     largest_weight: float = 1.0
     """Bound of the weights: 1 over the share of base draws, times the largest calibration factor of a failing draw."""
 
     @classmethod
-    def empty(
-        cls, k: int, dim: int, typical: FloatArray, settings: TwoStageSettings = DEFAULT_SETTINGS
-    ) -> "StratifiedSample":
+    def empty(cls, k: int, dim: int, typical: FloatArray) -> "StratifiedSample":
         """Return a sample without draws, of a proposal of k components in d dimensions."""
         zero, none = np.zeros(k), Draws(0, np.empty(0), np.empty(0))
-        return cls(none, zero, zero, zero, typical, np.empty((0, dim)), settings)
+        return cls(none, zero, zero, zero, typical, np.empty((0, dim)))
 
     def add(self, batch: ComponentDraws, proposal: MixtureProposal, inputs: Inputs, gamma: float) -> "StratifiedSample":
         """Return the sample with another batch from the same proposal."""
@@ -126,7 +125,7 @@ class StratifiedSample:
         drawn = proposal.drawn(batch.counts)
         ratios, log_weights = drawn.kind_ratios(batch.u)
         owner, k = np.repeat(np.arange(len(batch.counts)), batch.counts), len(batch.counts)
-        calibration = calibrate(ratios, owner, self.settings.draws_per_control)
+        calibration = calibrate(ratios, owner, TWO_STAGE.draws_per_control)
         y = calibration.residuals(np.where(fails, np.exp(np.minimum(log_weights, MAX_LOG_WEIGHT)), 0.0))
         x = inputs.base.from_standard_normal(batch.u) if batch.x is None else batch.x
         log_weights = log_weights + np.log(calibration.factors)
@@ -138,7 +137,6 @@ class StratifiedSample:
             self.squares + np.bincount(owner, weights=y * y, minlength=k),
             self.typical,
             np.concatenate([self.u_safe, batch.u[~fails]]),
-            self.settings,
             max(self.largest_weight, largest),
         )
 
@@ -158,7 +156,6 @@ class StratifiedSample:
             np.concatenate([earlier.squares, self.squares]),
             self.typical,
             np.concatenate([earlier.u_safe, self.u_safe]),
-            self.settings,
             max(self.largest_weight, earlier.largest_weight),
         )
 
@@ -176,7 +173,7 @@ class StratifiedSample:
         """
         if len(self.draws.f) == 0:
             return math.inf
-        many = self.counts >= self.settings.min_stratum_draws
+        many = self.counts >= TWO_STAGE.min_stratum_draws
         n, s1, s2 = self.counts[many], self.sums[many], self.squares[many]
         within = float(((s2 - s1 * s1 / n) * n / (n - 1)).sum()) + float(self.squares[~many].sum())
         typical = min(float(self.typical.max(initial=0.0)), MAX_TYPICAL_SHARE * self.draws.n * self.p)
@@ -220,22 +217,18 @@ class StratifiedSample:
         )
 
 
-def check_base_draws(
-    p: float, hits: int, n: int, settings: DiagnosticSettings = DEFAULT_SETTINGS.diagnostics
-) -> list[str]:
+def check_base_draws(p: float, hits: int, n: int) -> list[str]:
     """Return a warning if more of n base draws failed than an estimate p allows, by a binomial test.
 
     Base draws do not depend on the proposal: they hit a missed region as often as any other of its probability.
     """
-    if hits == 0 or bdtrc(hits - 1, n, min(p, 1.0)) > settings.false_alarm:
+    if hits == 0 or bdtrc(hits - 1, n, min(p, 1.0)) > DIAGNOSTICS.false_alarm:
         return []
     expected = n * p
     return [f"{hits} of {n:,} base draws failed, but p = {p:.2e} predicts {expected:.2g}: a failure region was missed."]
 
 
-def check_rounds(
-    final: StratifiedSample, rounds: Sequence[Draws], settings: DiagnosticSettings = DEFAULT_SETTINGS.diagnostics
-) -> list[str]:
+def check_rounds(final: StratifiedSample, rounds: Sequence[Draws]) -> list[str]:
     """Return a warning if the rounds before, each weighted by its own proposal, contradict the estimate.
 
     Weighted as draws from the mixture of all rounds' proposals they would be worth more, but give a p that is often too
@@ -243,31 +236,31 @@ def check_rounds(
     """
     n = sum(draws.n for draws in rounds)
     log_weights = np.concatenate([np.empty(0), *(draws.log_weights for draws in rounds)])
-    if len(final.draws.f) == 0 or effective_sample_size(log_weights) < settings.min_rounds_ess:
+    if len(final.draws.f) == 0 or effective_sample_size(log_weights) < DIAGNOSTICS.min_rounds_ess:
         return []
     w = np.exp(log_weights)
     before, error = float(w.sum()) / n, math.sqrt(float((w * w).sum())) / n
     apart = abs(before - final.p) / math.hypot(error, final.cov * final.p)
-    if apart < settings.max_deviation:
+    if apart < DIAGNOSTICS.max_deviation:
         return []
     return [f"The search rounds give p = {before:.2e}, {apart:.1f} standard errors from the final estimate."]
 
 
-def check_efficiency(final: StratifiedSample, settings: DiagnosticSettings = DEFAULT_SETTINGS.diagnostics) -> list[str]:
+def check_efficiency(final: StratifiedSample) -> list[str]:
     """Return a warning if the draws are worth so few failures that there may be weights heavier than any met."""
     draws = final.draws
-    if len(draws.f) == 0 or draws.ess >= settings.min_final_rate * draws.n:
+    if len(draws.f) == 0 or draws.ess >= DIAGNOSTICS.min_final_rate * draws.n:
         return []
     return [f"Effective sample size of {draws.n:,} draws: {draws.ess:.0f} failures; larger weights may be missing."]
 
 
-def check_regions(final: StratifiedSample, settings: DiagnosticSettings = DEFAULT_SETTINGS.diagnostics) -> list[str]:
+def check_regions(final: StratifiedSample) -> list[str]:
     """Return a warning if a point of the exploration in some region would be a large share of p as a draw.
 
     The proposal does not describe such a region, and that the final draws met hardly any of that weight says nothing.
     """
     share = final.typical / max(final.draws.n * final.p, 1e-300)
-    lost = int((share > settings.max_point_share).sum())
+    lost = int((share > DIAGNOSTICS.max_point_share).sum())
     if lost == 0 or len(final.draws.f) == 0:
         return []
     return [
@@ -275,12 +268,10 @@ def check_regions(final: StratifiedSample, settings: DiagnosticSettings = DEFAUL
     ]
 
 
-def check_discovery(
-    p: float, discovery: Discovery, confidence: float, settings: DiagnosticSettings = DEFAULT_SETTINGS.diagnostics
-) -> list[str]:
+def check_discovery(p: float, discovery: Discovery, confidence: float) -> list[str]:
     """Return a warning if so few lineages reached failure that much of p may be in regions that were not found."""
     share = discovery.unseen_share(confidence)
-    if share <= settings.max_unseen_share:
+    if share <= DIAGNOSTICS.max_unseen_share:
         return []
     searches = f"{discovery.lineages:.0f}"
     size = f"with probability up to {p * share / (1 - share):.1e} ({share:.0%} of p)" if p else "of unknown probability"

@@ -9,7 +9,6 @@ the ends, and their regions become components like any others.
 
 import math
 from collections.abc import Generator
-from dataclasses import replace
 from typing import NamedTuple, TypeVar
 
 import numpy as np
@@ -20,7 +19,10 @@ from samplers.components import IsotropicNormal
 from samplers.method import request_terms
 from samplers.methods.two_stage.exploration import bisect_towards_origin, choose_roots, walk_lines
 from samplers.methods.two_stage.regions import ExplorationResult, SubsetPoints, grow_regions
-from samplers.methods.two_stage.settings import DEFAULT_SETTINGS, TermsAloneSettings, TwoStageSettings
+from samplers.methods.two_stage.settings import (
+    EXPLORATION,
+    TERMS_ALONE,
+)
 from samplers.methods.two_stage.simulator import ComponentDraws, SimulationSteps, Simulator
 from samplers.methods.two_stage.terms.search import answer_by_terms
 from samplers.problem import FloatArray, FunctionProblem, Terms
@@ -97,32 +99,31 @@ def explore_terms(
     gamma: float,
     room: int,
     rng: np.random.Generator,
-    settings: TwoStageSettings = DEFAULT_SETTINGS,
 ) -> SimulationSteps[ExplorationResult]:
     """Search for failures of the terms that the exploration has met but has no failures of; add their regions."""
     if exploration.noisy or exploration.scattered or not record.several:
         return exploration
     x, terms = record.join()
     fails = (terms.values <= terms.threshold) & np.isfinite(terms.f)[:, None]
-    own, within = settings.terms_alone, int(settings.terms_alone.chain_share * room)
+    within = int(TERMS_ALONE.chain_share * room)
     known, met, others = _rank_missing(simulator, exploration, x, terms, fails, int(first.counts[0]))
-    searched = met[: math.ceil(own.line_share * room / own.usual_cost)]
-    scouted = others[: math.ceil(own.scout_share * room / own.usual_cost)]
-    starts = [_choose_failures(simulator, x[fails[:, j]], terms.values[fails[:, j], j], own.lines) for j in known]
-    for group, share in ((searched, own.line_share), (scouted, own.scout_share)):
+    searched = met[: math.ceil(TERMS_ALONE.line_share * room / TERMS_ALONE.usual_cost)]
+    scouted = others[: math.ceil(TERMS_ALONE.scout_share * room / TERMS_ALONE.usual_cost)]
+    starts = [
+        _choose_failures(simulator, x[fails[:, j]], terms.values[fails[:, j], j], TERMS_ALONE.lines) for j in known
+    ]
+    for group, share in ((searched, TERMS_ALONE.line_share), (scouted, TERMS_ALONE.scout_share)):
         each = int(share * room) // max(len(group), 1)
-        starts += [_choose_low_draws(first, terms, j, each, rng, settings) for j in group]
-    descents = [_descend_alone(start, terms.threshold, rng, settings) for start in starts]
-    far, numbers = _farthest(exploration, own), np.array([*known, *searched, *scouted], dtype=np.int64)
+        starts += [_choose_low_draws(first, terms, j, each, rng) for j in group]
+    descents = [_descend_alone(start, terms.threshold, rng) for start in starts]
+    far, numbers = _farthest(exploration), np.array([*known, *searched, *scouted], dtype=np.int64)
     ends = yield from _run_together(simulator, descents, numbers, far)
     likely = [points[(points**2).sum(axis=1) <= far] for points in ends]
-    ranked = [points[rank] for rank in range(own.lines) for points in likely if rank < len(points)]
-    chosen = np.array(ranked[: within // settings.exploration.chain_cost])
+    ranked = [points[rank] for rank in range(TERMS_ALONE.lines) for points in likely if rank < len(points)]
+    chosen = np.array(ranked[: within // EXPLORATION.chain_cost])
     if len(chosen):
         none = SubsetPoints(chosen[:0], chosen[:0], np.empty(0))
-        grown = yield from grow_regions(
-            simulator, chosen, none, gamma, simulator.n_sim + within, rng, settings.regions, settings.mixture
-        )
+        grown = yield from grow_regions(simulator, chosen, none, gamma, simulator.n_sim + within, rng)
         discovery = exploration.discovery._replace(lineages=max(exploration.discovery.lineages, 1.0))
         exploration = exploration._replace(regions=[*exploration.regions, *grown.regions], discovery=discovery)
     names = terms.names or tuple(str(j) for j in range(terms.values.shape[1]))
@@ -164,10 +165,10 @@ def _rank_missing(
     return known, met, others
 
 
-def _farthest(exploration: ExplorationResult, settings: TermsAloneSettings) -> float:
+def _farthest(exploration: ExplorationResult) -> float:
     """Return abs(u)^2 from which on a failure is too improbable beside those known to matter; inf where none is."""
     likeliest = [float((region.points**2).sum(axis=1).min()) for region in exploration.regions]
-    return min(likeliest, default=math.inf) - 2 * math.log(settings.least_density)
+    return min(likeliest, default=math.inf) - 2 * math.log(TERMS_ALONE.least_density)
 
 
 class _Starts(NamedTuple):
@@ -189,23 +190,18 @@ def _choose_failures(simulator: Simulator, x: FloatArray, values: FloatArray, n:
     return _Starts(u[nearest], values[nearest], 0)
 
 
-def _choose_low_draws(
-    first: ComponentDraws, terms: Terms, term: int, room: int, rng: np.random.Generator, settings: TwoStageSettings
-) -> _Starts:
+def _choose_low_draws(first: ComponentDraws, terms: Terms, term: int, room: int, rng: np.random.Generator) -> _Starts:
     """Return base draws where a term is low; they are the first points that were simulated."""
     values = terms.values[: int(first.counts[0]), term]
-    roots = choose_roots(values, settings.terms_alone.lines, rng, settings.lines)
+    roots = choose_roots(values, TERMS_ALONE.lines, rng)
     return _Starts(first.u[roots], values[roots], room)
 
 
-def _descend_alone(
-    start: _Starts, threshold: float, rng: np.random.Generator, settings: TwoStageSettings
-) -> SimulationSteps[FloatArray]:
+def _descend_alone(start: _Starts, threshold: float, rng: np.random.Generator) -> SimulationSteps[FloatArray]:
     """Walk to failures of a term and towards the origin; yields points u, is sent values of the term."""
     own = Simulator(FunctionProblem(lambda u: u[:, 0], start.u.shape[1]))  # its x is u
-    patient = replace(settings.lines, limit=start.room, first_look=start.room)
-    ends, failing = yield from walk_lines(own, start.u, start.values, threshold, 1.0, rng, patient)
-    return (yield from bisect_towards_origin(own, ends[failing], threshold, settings.exploration.bisections))
+    ends, failing = yield from walk_lines(own, start.u, start.values, threshold, 1.0, rng, start.room)
+    return (yield from bisect_towards_origin(own, ends[failing], threshold, EXPLORATION.bisections))
 
 
 def _run_together(

@@ -23,7 +23,7 @@ from samplers.methods.two_stage.mixture import (
     SubspaceMixture,
     fit_subspace_mixture,
 )
-from samplers.methods.two_stage.settings import LawSettings, RoundSettings
+from samplers.methods.two_stage.settings import LAW, ROUNDS
 from samplers.methods.two_stage.terms.walks import Directions
 from samplers.problem import FloatArray, Terms
 from samplers.proposals import correct_eigenvalues, posterior
@@ -186,33 +186,33 @@ class PursuedTerm:
     """Whether the law was fitted to failures."""
 
 
-def find_axes(directions: FloatArray, weights: FloatArray, settings: LawSettings) -> FloatArray:
+def find_axes(directions: FloatArray, weights: FloatArray) -> FloatArray:
     """Return the right singular vectors of weighted directions (k, d) that matter as columns, shape (d, r)."""
     _, values, right = np.linalg.svd(directions * weights[:, None], full_matrices=False)
-    kept = values[: settings.rank] > settings.least_singular * values[0]
-    return np.asarray(right[: settings.rank][kept].T)
+    kept = values[: LAW.rank] > LAW.least_singular * values[0]
+    return np.asarray(right[: LAW.rank][kept].T)
 
 
-def choose_guards(directions: Directions, settings: LawSettings) -> FloatArray:
+def choose_guards(directions: Directions) -> FloatArray:
     """Return design points (m, d) that are apart from each other, those nearest to the origin first."""
     points = directions.design_points
     distance = np.linalg.norm(points, axis=1)
     order = [row for row in np.argsort(distance, kind="stable") if np.isfinite(distance[row])]
     chosen = list[int]()
     for row in order:
-        if all(np.linalg.norm(points[row] - points[other]) >= settings.guard_spacing for other in chosen):
+        if all(np.linalg.norm(points[row] - points[other]) >= LAW.guard_spacing for other in chosen):
             chosen.append(int(row))
-    return np.asarray(points[chosen[: settings.max_guards]])
+    return np.asarray(points[chosen[: LAW.max_guards]])
 
 
-def first_law(axes: FloatArray, ends: FloatArray, guards: FloatArray, settings: LawSettings) -> TermLaw:
+def first_law(axes: FloatArray, ends: FloatArray, guards: FloatArray) -> TermLaw:
     """Return the proposal around ends of walks (m, d): one Gaussian, drawn towards variance 1, and its guards."""
     z = ends @ axes
     n, centred = len(z), z - z.mean(axis=0)
-    covariance = (centred.T @ centred + settings.prior_points * np.eye(z.shape[1])) / (n + settings.prior_points)
+    covariance = (centred.T @ centred + LAW.prior_points * np.eye(z.shape[1])) / (n + LAW.prior_points)
     values, vectors = np.linalg.eigh(covariance)
     bump = SubspaceGaussian(vectors, vectors.T @ z.mean(axis=0), values)
-    return build_law(axes, [bump], np.ones(1), z, guards @ axes, settings)
+    return build_law(axes, [bump], np.ones(1), z, guards @ axes)
 
 
 def fit_law(
@@ -221,7 +221,6 @@ def fit_law(
     log_weights: FloatArray,
     ends: FloatArray,
     guards: FloatArray,
-    settings: LawSettings,
     rng: np.random.Generator,
     likely: NDArray[np.bool_] | None = None,
 ) -> TermLaw:
@@ -232,26 +231,26 @@ def fit_law(
     """
     z = u @ axes
     likely = np.ones(len(u), dtype=bool) if likely is None else likely
-    heaviest = np.flatnonzero(likely)[np.argsort(-log_weights[likely], kind="stable")[: settings.max_heavy]]
-    around = np.concatenate([u[heaviest], ends])[: settings.max_ends]
-    many = temper_weights(log_weights, settings.shape_ess)
+    heaviest = np.flatnonzero(likely)[np.argsort(-log_weights[likely], kind="stable")[: LAW.max_heavy]]
+    around = np.concatenate([u[heaviest], ends])[: LAW.max_ends]
+    many = temper_weights(log_weights, LAW.shape_ess)
     points = GroupedPoints(z, many, 1 / float(many @ many), np.arange(len(z)))
-    mixture = fit_subspace_mixture(points, settings.max_bumps, rng)
+    mixture = fit_subspace_mixture(points, LAW.max_bumps, rng)
     few = np.zeros(len(u))
-    few[likely] = temper_weights(log_weights[likely], settings.mean_ess)
-    bumps, shares = _finish(mixture, z, many, few, settings)
-    return build_law(axes, bumps, shares, around @ axes, guards @ axes, settings)
+    few[likely] = temper_weights(log_weights[likely], LAW.mean_ess)
+    bumps, shares = _finish(mixture, z, many, few)
+    return build_law(axes, bumps, shares, around @ axes, guards @ axes)
 
 
 def _finish(
-    mixture: SubspaceMixture, z: FloatArray, many: FloatArray, few: FloatArray, settings: LawSettings
+    mixture: SubspaceMixture, z: FloatArray, many: FloatArray, few: FloatArray
 ) -> tuple[list[SubspaceGaussian], FloatArray]:
     """Return the components with the covariances of many points z (n, r) and the means of few, and their shares.
 
     Components that none of the few belongs to are left out.
     """
     shares = posterior(log_ratios(mixture.components, z) + np.log(mixture.weights)[:, None])
-    bumps = [_shape(one, z, share * many, settings) for one, share in zip(mixture.components, shares, strict=True)]
+    bumps = [_shape(one, z, share * many) for one, share in zip(mixture.components, shares, strict=True)]
     mass = shares @ few
     moved = [
         SubspaceGaussian(one.axes, one.axes.T @ ((share * few) @ z / m), one.variance)
@@ -261,11 +260,11 @@ def _finish(
     return moved, mass[mass > 0] / mass.sum()
 
 
-def _shape(component: SubspaceGaussian, z: FloatArray, weights: FloatArray, settings: LawSettings) -> SubspaceGaussian:
+def _shape(component: SubspaceGaussian, z: FloatArray, weights: FloatArray) -> SubspaceGaussian:
     """Return a component with Stein's estimate of the covariance of weighted points z (n, r), if they are enough."""
     mass = weights.sum()
     ess = effective_number(weights)
-    if ess < settings.shape_points * z.shape[1]:
+    if ess < LAW.shape_points * z.shape[1]:
         return component
     centred = (z - weights @ z / mass) * np.sqrt(weights / mass)[:, None]
     values, axes = np.linalg.eigh(centred.T @ centred)
@@ -279,35 +278,31 @@ def build_law(
     weights: FloatArray,
     ends: FloatArray,
     guards: FloatArray,
-    settings: LawSettings,
 ) -> TermLaw:
     """Return bumps, the same tempered, and Gaussians around ends and design points z (m, r), as one proposal."""
     tempered = tuple(
-        SubspaceGaussian(b.axes, settings.tempered_mean * b.mean, settings.tempered_variance * b.variance)
-        for b in bumps
+        SubspaceGaussian(b.axes, LAW.tempered_mean * b.mean, LAW.tempered_variance * b.variance) for b in bumps
     )
     groups = [
-        ComponentGroup(settings.bump_share * float(w / weights.sum()), (bump,), np.ones(1))
+        ComponentGroup(LAW.bump_share * float(w / weights.sum()), (bump,), np.ones(1))
         for bump, w in zip(bumps, weights, strict=True)
     ]
-    groups.append(ComponentGroup(settings.tempered_share, tempered, weights / weights.sum()))
+    groups.append(ComponentGroup(LAW.tempered_share, tempered, weights / weights.sum()))
     if len(ends):
         nearest = np.argmax(log_ratios(bumps, ends) + np.log(weights)[:, None], axis=0)
-        around = tuple(
-            _around(bumps[k], settings.end_mean * end, settings) for k, end in zip(nearest, ends, strict=True)
-        )
-        groups.append(ComponentGroup(settings.end_share, around, np.full(len(ends), 1 / len(ends))))
+        around = tuple(_around(bumps[k], LAW.end_mean * end) for k, end in zip(nearest, ends, strict=True))
+        groups.append(ComponentGroup(LAW.end_share, around, np.full(len(ends), 1 / len(ends))))
     if len(guards):
         identity = np.eye(guards.shape[1])
         half_spaces = tuple(SubspaceGaussian(identity, guard, np.ones(len(guard))) for guard in guards)
-        groups.append(ComponentGroup(settings.guard_share, half_spaces, np.full(len(guards), 1 / len(guards))))
+        groups.append(ComponentGroup(LAW.guard_share, half_spaces, np.full(len(guards), 1 / len(guards))))
     total = sum(group.share for group in groups)
     return TermLaw(axes, tuple(ComponentGroup(g.share / total, g.components, g.weights) for g in groups))
 
 
-def _around(bump: SubspaceGaussian, centre: FloatArray, settings: LawSettings) -> SubspaceGaussian:
+def _around(bump: SubspaceGaussian, centre: FloatArray) -> SubspaceGaussian:
     """Return a Gaussian around a point z (r,), in the shape of a bump but wider."""
-    return SubspaceGaussian(bump.axes, bump.axes.T @ centre, np.minimum(settings.end_variance * bump.variance, 1.0))
+    return SubspaceGaussian(bump.axes, bump.axes.T @ centre, np.minimum(LAW.end_variance * bump.variance, 1.0))
 
 
 def temper_weights(log_weights: FloatArray, wanted: float) -> FloatArray:
@@ -333,7 +328,7 @@ class NearPoints(NamedTuple):
     """Whether the failures are worth `ready_ess` points."""
 
 
-def near_points(history: TermHistory, term: int, gamma: float, settings: RoundSettings) -> NearPoints:
+def near_points(history: TermHistory, term: int, gamma: float) -> NearPoints:
     """Return the points under the lowest level of a term at which they are worth `level_ess`, and all its failures.
 
     With `min_failures` or more failures that it is the least term of, however uneven their weights, the points are
@@ -344,14 +339,14 @@ def near_points(history: TermHistory, term: int, gamma: float, settings: RoundSe
     known = np.isfinite(history.terms.f)
     mine = known & (history.terms.least == term)
     fails = mine & history.failing(gamma)
-    enough = int(fails.sum()) >= settings.min_failures
+    enough = int(fails.sum()) >= ROUNDS.min_failures
     rows = np.flatnonzero(mine if enough else known)
     rows = rows[np.argsort(values[rows], kind="stable")]
     w = np.exp(log_weights[rows] - log_weights[rows].max())
     ess = np.cumsum(w) ** 2 / np.cumsum(w**2)
-    reached = np.flatnonzero(ess >= settings.level_ess)
+    reached = np.flatnonzero(ess >= ROUNDS.level_ess)
     count = int(reached[0]) + 1 if len(reached) else len(rows)
     under = (values[rows] <= history.terms.threshold) | (fails[rows] & enough)
     rows = rows[: max(count, int(np.flatnonzero(under)[-1]) + 1 if under.any() else 0)]
     likely = fails[rows] if enough else np.ones(len(rows), dtype=bool)
-    return NearPoints(rows, likely, enough and effective_sample_size(log_weights[fails]) >= settings.ready_ess)
+    return NearPoints(rows, likely, enough and effective_sample_size(log_weights[fails]) >= ROUNDS.ready_ess)

@@ -9,7 +9,12 @@ from numpy.typing import NDArray
 from scipy.special import ndtr
 
 from samplers.importance import Draws, weight_warnings, weighted_interval
-from samplers.methods.two_stage.settings import DoubtSettings, LawSettings, RoundSettings, TermSettings
+from samplers.methods.two_stage.settings import (
+    DOUBTS,
+    LAW,
+    ROUNDS,
+    WALKS,
+)
 from samplers.methods.two_stage.simulator import SimulationSteps
 from samplers.methods.two_stage.terms.fitting import (
     NearPoints,
@@ -29,35 +34,33 @@ from samplers.sample import DrawWeights
 from samplers.statistics import effective_number, largest_weight_share, normalise_weights
 
 
-def pursue_walked(walks: Walks, history: TermHistory, settings: TermSettings) -> list[PursuedTerm]:
+def pursue_walked(walks: Walks, history: TermHistory) -> list[PursuedTerm]:
     """Return the terms that walks came near, with proposals around their ends; those that hardly fail are left out."""
     found, tails = list[PursuedTerm](), list[float]()
     for term in np.unique(np.concatenate([walks.term, walks.failing_terms])):
-        directions, ends = walks.directions.of(term), _ends(walks, history, int(term), settings)
+        directions, ends = walks.directions.of(term), _ends(walks, history, int(term))
         if len(ends) and len(directions.term):
-            found.append(start_term(int(term), directions, ends, settings.law))
+            found.append(start_term(int(term), directions, ends))
             arrived = walks.distance[(walks.term == term) & (walks.values <= history.terms.threshold)]
             arrived = arrived[np.isfinite(arrived)]
             tails.append(float(ndtr(-np.median(arrived))) if len(arrived) else math.nan)
-    least = settings.walks.negligible * max((tail for tail in tails if tail > 0), default=0.0)
+    least = WALKS.negligible * max((tail for tail in tails if tail > 0), default=0.0)
     return [one for one, tail in zip(found, tails, strict=True) if not tail < least]
 
 
-def start_term(number: int, directions: Directions, ends: FloatArray, settings: LawSettings) -> PursuedTerm:
+def start_term(number: int, directions: Directions, ends: FloatArray) -> PursuedTerm:
     """Return a term with a proposal around ends (m, d), from its gradients."""
     weights = np.ones(len(directions.term))
-    law = first_law(
-        find_axes(directions.values, weights, settings), ends, choose_guards(directions, settings), settings
-    )
+    law = first_law(find_axes(directions.values, weights), ends, choose_guards(directions))
     return PursuedTerm(number, directions, weights, ends, law)
 
 
-def _ends(walks: Walks, history: TermHistory, term: int, settings: TermSettings) -> FloatArray:
+def _ends(walks: Walks, history: TermHistory, term: int) -> FloatArray:
     """Return the ends of a term's walks: those that fail, else the lower half if one came half way."""
-    mine = (walks.term == term) & ~(walks.distance > settings.walks.max_distance)
+    mine = (walks.term == term) & ~(walks.distance > WALKS.max_distance)
     failing = mine & (walks.values <= history.terms.threshold)
     on_the_way = walks.failures[walks.failing_terms == term]
-    ends = np.concatenate([walks.u[failing], on_the_way])[: settings.law.max_ends]
+    ends = np.concatenate([walks.u[failing], on_the_way])[: LAW.max_ends]
     if len(ends) or not mine.any():
         return ends
     values, threshold = walks.values[mine], history.terms.threshold
@@ -66,9 +69,7 @@ def _ends(walks: Walks, history: TermHistory, term: int, settings: TermSettings)
     return walks.u[mine][lower] if values.min() <= half_way else ends
 
 
-def mix_terms(
-    pursued: list[PursuedTerm], history: TermHistory, gamma: float, s: RoundSettings, final: bool = False
-) -> TermProposal:
+def mix_terms(pursued: list[PursuedTerm], history: TermHistory, gamma: float, final: bool = False) -> TermProposal:
     """Return the mixture over the terms.
 
     With all of them at the threshold pi_j is proportional to sqrt(sum_j W^2), the sum over failures that the term is
@@ -78,13 +79,13 @@ def mix_terms(
     k = len(pursued)
     if final or all(one.ready for one in pursued):
         failing = history.failing(gamma)
-        w, least = temper_weights(history.log_weights[failing], s.share_ess), history.terms.least[failing]
+        w, least = temper_weights(history.log_weights[failing], ROUNDS.share_ess), history.terms.least[failing]
         size = np.array([np.sqrt((w[least == one.number] ** 2).sum()) for one in pursued])
         shares = size / size.sum() if size.sum() > 0 else np.full(k, 1 / k)
-        shares = np.maximum(shares, min(s.min_term_share, 0.7 / k))
+        shares = np.maximum(shares, min(ROUNDS.min_term_share, 0.7 / k))
     else:
-        shares = np.array([s.waiting_share if one.ready else 1.0 for one in pursued])
-    return TermProposal(history.u.shape[1], s.base_share, tuple(one.law for one in pursued), shares / shares.sum())
+        shares = np.array([ROUNDS.waiting_share if one.ready else 1.0 for one in pursued])
+    return TermProposal(history.u.shape[1], ROUNDS.base_share, tuple(one.law for one in pursued), shares / shares.sum())
 
 
 def refit_terms(
@@ -94,18 +95,16 @@ def refit_terms(
     gamma: float,
     limit: int,
     rng: np.random.Generator,
-    settings: TermSettings,
 ) -> SimulationSteps[list[PursuedTerm]]:
     """Return the terms with proposals fitted to all draws, after a few more gradients of each at likely points.
 
     Terms that failures showed and nobody pursued join them.
     """
-    rounds = settings.rounds
     known = {one.number for one in pursued}
     new = [int(j) for j in np.unique(history.terms.least[history.failing(gamma)]) if j not in known]
     numbers = [one.number for one in pursued] + new
-    near = [near_points(history, j, gamma, rounds) for j in numbers]
-    each = max(min(rounds.gradients, rounds.max_gradients // max(len(numbers), 1)), 1)
+    near = [near_points(history, j, gamma) for j in numbers]
+    each = max(min(ROUNDS.gradients, ROUNDS.max_gradients // max(len(numbers), 1)), 1)
     chosen = [_draw_rows(points.rows[points.likely], history.log_weights, each, rng) for points in near]
     while chosen and simulator.n_sim + simulator.offer.count_gradients(sum(map(len, chosen))) > limit:
         chosen = [rows[: len(rows) // 2] for rows in chosen]  # count_gradients(0) is 0
@@ -118,10 +117,10 @@ def refit_terms(
         directions = found.of(number)
         old = next((one for one in pursued if one.number == number), None)
         if old is not None:
-            result.append(_refit_term(old, history, directions, points, rng, settings))
+            result.append(_refit_term(old, history, directions, points, rng))
         elif len(directions.term):
-            ends = history.u[points.rows[points.likely][: settings.law.max_ends]]
-            result.append(start_term(number, directions, ends, settings.law))
+            ends = history.u[points.rows[points.likely][: LAW.max_ends]]
+            result.append(start_term(number, directions, ends))
     return result
 
 
@@ -131,16 +130,15 @@ def _refit_term(
     directions: Directions,
     points: NearPoints,
     rng: np.random.Generator,
-    settings: TermSettings,
 ) -> PursuedTerm:
     """Return a term with further gradients, fitted to some points of the history."""
-    later = float(term.direction_weights.max()) * settings.rounds.later_weight
+    later = float(term.direction_weights.max()) * ROUNDS.later_weight
     weights = np.concatenate([term.direction_weights, np.full(len(directions.term), later)])
     directions = term.directions.join(directions)
-    axes = find_axes(directions.values, weights, settings.law)
-    guards = choose_guards(directions, settings.law)
+    axes = find_axes(directions.values, weights)
+    guards = choose_guards(directions)
     rows, likely, ready = points
-    law = fit_law(axes, history.u[rows], history.log_weights[rows], term.ends, guards, settings.law, rng, likely)
+    law = fit_law(axes, history.u[rows], history.log_weights[rows], term.ends, guards, rng, likely)
     return replace(term, directions=directions, direction_weights=weights, law=law, ready=term.ready or ready)
 
 
@@ -256,20 +254,20 @@ class CombinedRounds:
         return other / total if total > 0 else 0.0
 
 
-def doubt(combined: CombinedRounds, pursued: list[int], settings: DoubtSettings) -> list[str]:
+def doubt(combined: CombinedRounds, pursued: list[int]) -> list[str]:
     """Return the warnings about an estimate."""
     every = "failing draws of all rounds" if len(combined.rounds) > 1 else "failing draws"
     warnings = [text.replace("failing draws", every) for text in weight_warnings(combined.draws)]
     last = combined.rounds[-1].y(combined.gamma)
     ess = effective_number(last)
-    if 0 < ess < settings.min_ess:
+    if 0 < ess < DOUBTS.min_ess:
         warnings.append(
             f"Effective sample size of the last round's failing draws: {ess:.0f}; its standard error is unreliable."
         )
     failing = last[last > 0]
-    if len(failing) and largest_weight_share(np.log(failing)) > settings.max_point_share:
-        warnings.append(f"One draw carries more than {100 * settings.max_point_share:.0f} % of the last round.")
+    if len(failing) and largest_weight_share(np.log(failing)) > DOUBTS.max_point_share:
+        warnings.append(f"One draw carries more than {100 * DOUBTS.max_point_share:.0f} % of the last round.")
     other = combined.share_of_others(pursued)
-    if other > settings.max_other_share:
+    if other > DOUBTS.max_other_share:
         warnings.append(f"{100 * other:.0f} % of p comes from terms without a proposal of their own.")
     return warnings

@@ -10,7 +10,7 @@ import numpy as np
 from samplers.importance import Draws, weight_warnings, weighted_interval
 from samplers.method import Goal, Interrupted, Outcome, Steps, TermsOffer, no_outcome_share, request_terms
 from samplers.methods.monte_carlo import MonteCarlo
-from samplers.methods.two_stage.settings import DEFAULT_TERM_SETTINGS, TermSettings
+from samplers.methods.two_stage.settings import DOUBTS, ROUNDS, TERMS, WALKS
 from samplers.methods.two_stage.simulator import SimulationSteps, close_trace, extend_trace
 from samplers.methods.two_stage.stages import run_subset_simulation
 from samplers.methods.two_stage.terms.fitting import PursuedTerm, TermHistory
@@ -102,10 +102,10 @@ def _look_up(values: Sequence[float], f_of: dict[float, float]) -> FloatArray:
     return np.array([f_of.get(value, value) for value in values])
 
 
-def suits_terms(inputs: Inputs, offer: TermsOffer | None, budget: int, settings: TermSettings) -> bool:
+def suits_terms(inputs: Inputs, offer: TermsOffer | None, budget: int) -> bool:
     """Return whether to search by terms: terms and gradients are offered, x is long and the budget holds a search."""
     offered = offer is not None and offer.gradient_cost is not None
-    return offered and inputs.dim >= settings.min_dim and budget >= settings.min_budget
+    return offered and inputs.dim >= TERMS.min_dim and budget >= TERMS.min_budget
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,7 +119,6 @@ class TermSearch:
     end: int
     """Simulations that are never exceeded."""
     rng: np.random.Generator
-    settings: TermSettings
 
     @property
     def left(self) -> int:
@@ -156,16 +155,14 @@ def search_terms(
     goal: Goal,
     budget: int,
     rng: np.random.Generator,
-    settings: TermSettings = DEFAULT_TERM_SETTINGS,
 ) -> Steps:
     """Estimate P[f(X) <= goal.gamma] by terms and their gradients."""
-    rounds = settings.rounds
     open_ended = goal.max_sim is None and goal.target_cov is not None
-    end = budget + rounds.max_batches * rounds.target_batch if open_ended else budget
-    search = TermSearch(TermSimulator(inputs, offer), goal, budget, end, rng, settings)
+    end = budget + ROUNDS.max_batches * ROUNDS.target_batch if open_ended else budget
+    search = TermSearch(TermSimulator(inputs, offer), goal, budget, end, rng)
     state = yield from _draw_base(search)
     try:
-        if state.base_rate >= rounds.common_share:
+        if state.base_rate >= ROUNDS.common_share:
             return (yield from _run_monte_carlo(search, state))
         state = yield from _walk(search, state)
         state = yield from _run_rounds(search, state)
@@ -178,8 +175,7 @@ def search_terms(
 
 def _draw_base(search: TermSearch) -> SimulationSteps[SearchState]:
     """Make the base draws."""
-    rounds = search.settings.rounds
-    n = min(max(int(rounds.base * search.budget), rounds.min_base), rounds.max_base)
+    n = min(max(int(ROUNDS.base * search.budget), ROUNDS.min_base), ROUNDS.max_base)
     u = search.rng.standard_normal((n, search.simulator.inputs.dim))
     terms = yield from search.simulator.terms(u)
     failures = int((terms.f <= search.goal.gamma).sum())
@@ -191,28 +187,28 @@ def _draw_base(search: TermSearch) -> SimulationSteps[SearchState]:
 
 def _walk(search: TermSearch, state: SearchState) -> SimulationSteps[SearchState]:
     """Walk to the failures of main terms and of others; pursue those that are reached."""
-    walking, terms, simulator = search.settings.walks, state.history.terms, search.simulator
-    main, others = choose_terms(terms, walking)
+    terms, simulator = state.history.terms, search.simulator
+    main, others = choose_terms(terms)
     step = simulator.offer.count_gradients(1) + 1
-    each, scouted = count_walks(len(main), len(others), search.budget, step, walking)
-    planned = ((main, each), (others[:scouted], walking.scouts))
-    starts = [(j, choose_starts(terms, j, n, walking)) for group, n in planned for j in group]
+    each, scouted = count_walks(len(main), len(others), search.budget, step)
+    planned = ((main, each), (others[:scouted], WALKS.scouts))
+    starts = [(j, choose_starts(terms, j, n)) for group, n in planned for j in group]
     rows = np.concatenate([part for _, part in starts] or [np.empty(0, dtype=np.int64)])
     term = np.repeat([j for j, _ in starts], [len(part) for _, part in starts]).astype(np.int64)
     chosen = replace(terms, f=terms.f[rows], values=terms.values[rows], ticks=terms.ticks[rows])
-    limit = simulator.n_sim + int(walking.budget_share * search.budget)
-    walks = yield from walk_downhill(simulator, state.history.u[rows], chosen, term, search.goal.gamma, limit, walking)
-    state = replace(state, pursued=tuple(pursue_walked(walks, state.history, search.settings)))
+    limit = simulator.n_sim + int(WALKS.budget_share * search.budget)
+    walks = yield from walk_downhill(simulator, state.history.u[rows], chosen, term, search.goal.gamma, limit)
+    state = replace(state, pursued=tuple(pursue_walked(walks, state.history)))
     reached = float((walks.values <= terms.threshold).mean()) if len(walks.values) else 0.0
     return _record(search, state, reached, state.trace[-1].estimate, len(rows), math.inf)
 
 
 def _run_rounds(search: TermSearch, state: SearchState) -> SimulationSteps[SearchState]:
     """Draw and refit until all terms have been at the threshold twice, or the rest is for the estimate."""
-    rounds, ready = search.settings.rounds, 0
-    size = int(rounds.size * search.budget)
-    reserve = int((rounds.final_share - rounds.refit_share) * search.budget)
-    while state.pursued and ready < rounds.ready_rounds and search.left - size >= rounds.final_share * search.budget:
+    ready = 0
+    size = int(ROUNDS.size * search.budget)
+    reserve = int((ROUNDS.final_share - ROUNDS.refit_share) * search.budget)
+    while state.pursued and ready < ROUNDS.ready_rounds and search.left - size >= ROUNDS.final_share * search.budget:
         state, _ = yield from _draw_round(search, state, size)
         state = yield from _refit(search, state, reserve)
         ready = ready + 1 if all(term.ready for term in state.pursued) else 0
@@ -223,8 +219,8 @@ def _draw_round(
     search: TermSearch, state: SearchState, n: int, final: bool = False
 ) -> SimulationSteps[tuple[SearchState, FinalRound]]:
     """Draw n points from the present proposal; they join the history."""
-    gamma, rounds = search.goal.gamma, search.settings.rounds
-    proposal = mix_terms(list(state.pursued), state.history, gamma, rounds, final)
+    gamma = search.goal.gamma
+    proposal = mix_terms(list(state.pursued), state.history, gamma, final)
     u, strata = proposal.draw(n, search.rng)
     first = search.simulator.n_sim
     terms = yield from search.simulator.terms(u)
@@ -255,7 +251,6 @@ def _refit(search: TermSearch, state: SearchState, reserve: int) -> SimulationSt
         search.goal.gamma,
         search.budget - reserve,
         search.rng,
-        search.settings,
     )
     return replace(state, pursued=tuple(pursued))
 
@@ -265,22 +260,21 @@ def _gives_up(search: TermSearch, state: SearchState) -> bool:
 
     They do not where a draw is worth less than `fallback_rate` failures, or less than a base draw.
     """
-    doubts = search.settings.doubts
-    worthless = state.last_rate < max(doubts.fallback_rate, state.base_rate)
-    return worthless and search.left >= doubts.min_fallback_budget
+    worthless = state.last_rate < max(DOUBTS.fallback_rate, state.base_rate)
+    return worthless and search.left >= DOUBTS.min_fallback_budget
 
 
 def _estimate(search: TermSearch, state: SearchState) -> Steps:
     """Make the final rounds; with a target c.o.v. end when it is met, or draw further batches until then."""
-    rounds, goal = search.settings.rounds, search.goal
-    room, stopped = search.left - int((len(rounds.final_sizes) - 1) * rounds.refit_share * search.budget), False
-    plan = [(int(share * room), factor) for share, factor in zip(rounds.final_sizes, rounds.final_weights, strict=True)]
+    goal = search.goal
+    room, stopped = search.left - int((len(ROUNDS.final_sizes) - 1) * ROUNDS.refit_share * search.budget), False
+    plan = [(int(share * room), factor) for share, factor in zip(ROUNDS.final_sizes, ROUNDS.final_weights, strict=True)]
     ceiling = state.ceiling
     while not stopped:
         number = len(state.finals)
         if number and goal.target_cov is not None and _combine(search, state).cov(_between(search)) <= goal.target_cov:
             break
-        size, factor = plan[number] if number < len(plan) else (rounds.target_batch, 1.0)
+        size, factor = plan[number] if number < len(plan) else (ROUNDS.target_batch, 1.0)
         last = number == len(plan) - 1
         if number >= len(plan) and (goal.target_cov is None or search.simulator.n_sim >= search.end):
             break
@@ -297,7 +291,7 @@ def _estimate(search: TermSearch, state: SearchState) -> Steps:
 
 
 def _between(search: TermSearch) -> float:
-    return search.settings.doubts.between_factor
+    return DOUBTS.between_factor
 
 
 def _combine(search: TermSearch, state: SearchState) -> CombinedRounds:
@@ -306,16 +300,16 @@ def _combine(search: TermSearch, state: SearchState) -> CombinedRounds:
 
 def _conclude(search: TermSearch, state: SearchState, stopped: bool) -> Outcome:
     """Return the outcome of the final rounds."""
-    settings, goal, combined = search.settings, search.goal, _combine(search, state)
+    goal, combined = search.goal, _combine(search, state)
     cov, draws = combined.cov(_between(search)), combined.draws
     state = _close_trace(search, state)
     status = Status.CONVERGED if len(draws.f) else Status.NO_HITS
     return Outcome(
         p=combined.p,
-        interval=combined.interval(goal.confidence, settings.rounds.base_share, cov, state.ceiling),
+        interval=combined.interval(goal.confidence, ROUNDS.base_share, cov, state.ceiling),
         cov=cov,
         status=Status.STOPPED if stopped else status,
-        warnings=tuple(doubt(combined, [one.number for one in state.pursued], settings.doubts)),
+        warnings=tuple(doubt(combined, [one.number for one in state.pursued])),
         trace=state.trace,
         no_outcome_share=no_outcome_share(draws.f, draws.log_weights),
         sample=draws.sample,
@@ -346,8 +340,8 @@ def _estimate_early(search: TermSearch, state: SearchState) -> Outcome:
 
 def _run_monte_carlo(search: TermSearch, state: SearchState) -> Steps:
     """Spend the rest on base draws; those made so far decided on this and do not count."""
-    left, rounds = search.end - search.simulator.n_sim, search.settings.rounds
-    batch = rounds.monte_carlo_batch if search.goal.target_cov is None else rounds.target_batch
+    left = search.end - search.simulator.n_sim
+    batch = ROUNDS.monte_carlo_batch if search.goal.target_cov is None else ROUNDS.target_batch
     method = MonteCarlo(n=left, batch=batch)
     outcome = yield from method.steps(search.simulator.inputs, replace(search.goal, max_sim=left), search.rng)
     return _after(search, state, outcome)

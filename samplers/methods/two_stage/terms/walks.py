@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from samplers.method import TermsOffer, request_gradients, request_terms, whole_simulations
 from samplers.methods.noise_coordinates import noise_mask
-from samplers.methods.two_stage.settings import WalkSettings
+from samplers.methods.two_stage.settings import WALKS
 from samplers.methods.two_stage.simulator import SimulationSteps
 from samplers.problem import (
     Distribution,
@@ -237,36 +237,36 @@ class Walks:
     """Their least terms, shape (k,)."""
 
 
-def choose_terms(terms: Terms, settings: WalkSettings) -> tuple[list[int], list[int]]:
+def choose_terms(terms: Terms) -> tuple[list[int], list[int]]:
     """Return main terms, which are often the least among low draws, and other terms to scout, most promising first."""
     lowest, known = terms.lowest, np.isfinite(terms.values).all(axis=1)
     if not known.any():
         return [], []
-    low = known & (lowest <= np.quantile(lowest[known], settings.candidate_quantile))
+    low = known & (lowest <= np.quantile(lowest[known], WALKS.candidate_quantile))
     n_terms = terms.values.shape[1]
     counts = np.bincount(terms.least[low], minlength=n_terms)
     ever = np.bincount(terms.least[known], minlength=n_terms) > 0
-    main = [j for j in range(n_terms) if counts[j] >= max(settings.candidate_share * len(lowest), 1)]
+    main = [j for j in range(n_terms) if counts[j] >= max(WALKS.candidate_share * len(lowest), 1)]
     order = np.lexsort((terms.values[known].min(axis=0), ~ever))  # those that ever are the least come first
     others = [int(j) for j in order if j not in main]
-    return main, others[: max(settings.max_scouted, int(ever.sum()) - len(main))]
+    return main, others[: max(WALKS.max_scouted, int(ever.sum()) - len(main))]
 
 
-def count_walks(n_main: int, n_others: int, budget: int, step: float, settings: WalkSettings) -> tuple[int, int]:
+def count_walks(n_main: int, n_others: int, budget: int, step: float) -> tuple[int, int]:
     """Return the walks of each main term, and how many other terms are scouted, so that all can make two steps."""
-    affordable = int(settings.budget_share * budget / (MIN_WALK_STEPS * step))
-    walkers = settings.walkers * min(1.0, budget / settings.usual_budget)
-    wanted = int(np.clip(walkers / max(n_main, 1), settings.min_walkers, settings.max_walkers))
+    affordable = int(WALKS.budget_share * budget / (MIN_WALK_STEPS * step))
+    walkers = WALKS.walkers * min(1.0, budget / WALKS.usual_budget)
+    wanted = int(np.clip(walkers / max(n_main, 1), WALKS.min_walkers, WALKS.max_walkers))
     each = min(wanted, max(affordable // max(n_main, 1), 2))
-    return each, min(n_others, max(affordable - each * n_main, 0) // settings.scouts)
+    return each, min(n_others, max(affordable - each * n_main, 0) // WALKS.scouts)
 
 
-def choose_starts(terms: Terms, term: int, n: int, settings: WalkSettings) -> NDArray[np.int64]:
+def choose_starts(terms: Terms, term: int, n: int) -> NDArray[np.int64]:
     """Return the rows from which n walks of a term start: low values, half of them attained late."""
     values, ticks = terms.values[:, term], terms.ticks[:, term]
     order = np.argsort(values, kind="stable")
     order = order[np.isfinite(values[order])]
-    lower = order[: max(int(settings.start_quantile * len(order)), n)]
+    lower = order[: max(int(WALKS.start_quantile * len(order)), n)]
     late = ticks[lower] > np.median(ticks[lower])
     chosen = [*lower[late][: n // 2], *lower[~late][: n - n // 2]]
     chosen += [row for row in lower if row not in chosen][: n - len(chosen)]
@@ -280,7 +280,6 @@ def walk_downhill(
     term: NDArray[np.int64],
     gamma: float,
     limit: int,
-    settings: WalkSettings,
 ) -> SimulationSteps[Walks]:
     """Walk from points u (m, d) with known terms down one term each, until it fails or the steps are used up.
 
@@ -294,17 +293,16 @@ def walk_downhill(
         term: The term that each walk follows, shape (m,).
         gamma: Threshold of f.
         limit: Value of `simulator.n_sim` that is not exceeded.
-        settings: Of the steps.
     """
     rows = np.arange(len(u))
     distance = np.full(len(u), np.nan)
     start_values = terms.values[rows, term]
     u, values, ticks = u.copy(), terms.values[rows, term].copy(), terms.ticks[rows, term].copy()
-    slope, length, moved = np.full_like(u, np.nan), np.full(len(u), settings.first_step), np.ones(len(u), dtype=bool)
+    slope, length, moved = np.full_like(u, np.nan), np.full(len(u), WALKS.first_step), np.ones(len(u), dtype=bool)
     passed = describe_half_spaces(term[:0], u[:0], u[:0], values[:0])
     failing = list[tuple[FloatArray, NDArray[np.int64]]]()
-    for step in range(settings.steps):
-        open_ = (values > terms.threshold) & ~(distance > settings.max_distance)
+    for step in range(WALKS.steps):
+        open_ = (values > terms.threshold) & ~(distance > WALKS.max_distance)
         fresh = np.flatnonzero(moved & (open_ | (step == 0)))
         cost = simulator.offer.count_gradients(len(fresh)) + int(open_.sum())
         if not (len(fresh) or open_.any()) or simulator.n_sim + cost > limit:
@@ -317,10 +315,10 @@ def walk_downhill(
         passed = passed.join(describe_half_spaces(term[fresh], u[fresh], slope[fresh], excess[fresh]))
         ahead_of = excess / np.where(sloping, norm, np.nan)
         distance[good] = ahead_of[good] - np.einsum("ij,ij->i", slope[good], u[good]) / norm[good]
-        walkers = np.flatnonzero(open_ & sloping & (distance <= settings.max_distance))
+        walkers = np.flatnonzero(open_ & sloping & (distance <= WALKS.max_distance))
         if len(walkers) == 0:
             break
-        size = np.minimum(ahead_of[walkers] + settings.beyond, length[walkers])
+        size = np.minimum(ahead_of[walkers] + WALKS.beyond, length[walkers])
         ahead = u[walkers] - (size / norm[walkers])[:, None] * slope[walkers]
         seen = yield from simulator.terms(ahead)
         known = np.isfinite(seen.f)
@@ -331,7 +329,7 @@ def walk_downhill(
         taken = walkers[fell]
         u[taken], values[taken] = ahead[fell], value[fell]
         ticks[taken] = seen.ticks[np.flatnonzero(fell), term[taken]]
-        length[walkers] *= np.where(fell, settings.growth, settings.shrinkage)
+        length[walkers] *= np.where(fell, WALKS.growth, WALKS.shrinkage)
         moved = np.zeros(len(u), dtype=bool)
         moved[taken] = True
     return Walks(
