@@ -45,7 +45,9 @@ def test_noise_does_not_count_as_dimensions():
     assert (choice.method.name, choice.why) == ("surrogate", "surrogate: 300 simulations for 2 dimensions")
 
 
-@pytest.mark.parametrize(("max_sim", "name"), [(300, "surrogate"), (2000, "two-stage")])
+@pytest.mark.parametrize(
+    ("max_sim", "name"), [pytest.param(300, "surrogate", marks=pytest.mark.slow), (2000, "two-stage")]
+)
 def test_the_result_is_that_of_the_method_chosen(max_sim, name):
     problem = half_space(2, 3.0).problem
     result = samplers.estimate(problem, "auto", seed=4, max_sim=max_sim)
@@ -68,6 +70,7 @@ def test_a_search_by_terms_is_named():
         assert samplers.Auto().choose(inputs, Goal(gamma=0.0, max_sim=1000)).why.startswith(f"{expected}: 1,000")
 
 
+@pytest.mark.slow
 def test_a_run_goes_on_from_its_journal_in_chunks_and_by_ask_and_tell(tmp_path, recorder):
     f = recorder(half_space(2, 3.0).problem.evaluate)
     problem = samplers.FunctionProblem(f, dim=2)

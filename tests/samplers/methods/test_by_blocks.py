@@ -38,6 +38,7 @@ class BlockProblem:
         return integrate.quad(lambda y: stats.norm.sf(self.beta + 4 * (y - 0.5)) * stats.beta.pdf(y, 2, 2), 0, 1)[0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("ratio", ["joint", "block"])
 def test_right_and_covered(study, ratio):
     problem = BlockProblem(3, 6, 4.0, radius=0.1)
@@ -49,6 +50,7 @@ def test_right_and_covered(study, ratio):
     assert {str(result.status) for result in found.results} == {"converged"}
 
 
+@pytest.mark.slow
 def test_the_paper_s_highway_of_428_dimensions():
     """24 Beta, 404 Normal with full covariance and the mean in a box of 0.01."""
     problem = BlockProblem(24, 404, 4.0, radius=0.01)

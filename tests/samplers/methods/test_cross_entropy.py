@@ -43,6 +43,7 @@ def test_final_draws_are_independent_of_the_search(recorder):
     assert len(f.batches[-1]) == 4000
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("tied", [0.6, 0.85, 0.95])
 def test_ties_at_a_cap(study, tied):
     found = study(plateau(3, 3.2, tied), CE(), 60)
@@ -58,7 +59,15 @@ def test_mean_family(study, dim):
     assert found.covered >= stats.binom.ppf(1e-3, 60, 0.88)
 
 
-@pytest.mark.parametrize("reference", [two_modes(), four_branches(3.0), parabola()], ids=lambda r: r.name)
+@pytest.mark.parametrize(
+    "reference",
+    [
+        two_modes(),
+        pytest.param(four_branches(3.0), marks=pytest.mark.slow),
+        pytest.param(parabola(), marks=pytest.mark.slow),
+    ],
+    ids=lambda r: r.name,
+)
 def test_mixture_family(study, reference):
     found = study(reference, CE(family="mixture"), 40)
     assert abs(found.ratios.mean() - 1) < 4 * mean_error(found) + 0.02
@@ -164,6 +173,7 @@ def test_warns_when_few_draws_carry_the_estimate():
     assert wide[1] / wide[0] > 10
 
 
+@pytest.mark.slow
 def test_interval_of_a_hopeless_proposal_still_holds_p():
     """d = 300: the weights degenerate, p-hat is far too small, and the result does not hide it."""
     reference = half_space(300)

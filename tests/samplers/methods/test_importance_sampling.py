@@ -34,9 +34,13 @@ def test_the_tilt_is_the_mean_of_the_failures(drive):
     np.testing.assert_allclose(tilt.shift, np.full(2, length / math.sqrt(2)), atol=0.1)
 
 
-@pytest.mark.parametrize("reference", [half_space(), parabola(), plateau()], ids=lambda r: r.name)
+@pytest.mark.parametrize(
+    "reference",
+    [pytest.param(half_space(), marks=pytest.mark.slow), pytest.param(parabola(), marks=pytest.mark.slow), plateau()],
+    ids=lambda r: r.name,
+)
 def test_unbiased_and_covered_where_one_tilt_serves(study, reference):
-    runs = 150
+    runs = 60
     found = study(reference, IS(), runs)
     assert abs(found.ratios.mean() - 1) < 4 * found.ratios.std(ddof=1) / math.sqrt(runs)
     assert found.covered >= stats.binom.ppf(1e-3, runs, 0.93)

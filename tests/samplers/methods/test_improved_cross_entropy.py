@@ -25,14 +25,14 @@ def gain(found):
 @pytest.mark.parametrize(
     ("reference", "family", "least"),
     [
-        (half_space(), "gaussian", 700),
-        (half_space(), "mixture", 1500),
-        (half_space(), "vmfn", 700),
-        (parabola(), "mixture", 700),
+        pytest.param(half_space(), "gaussian", 700, marks=pytest.mark.slow),
+        pytest.param(half_space(), "mixture", 1500, marks=pytest.mark.slow),
+        pytest.param(half_space(), "vmfn", 700, marks=pytest.mark.slow),
+        pytest.param(parabola(), "mixture", 700, marks=pytest.mark.slow),
         (four_branches(), "mixture", 10),
-        (plateau(), "mixture", 1000),
-        (shell(), "vmfn", 1000),
-        (half_space(100), "vmfn", 80),
+        pytest.param(plateau(), "mixture", 1000, marks=pytest.mark.slow),
+        pytest.param(shell(), "vmfn", 1000, marks=pytest.mark.slow),
+        pytest.param(half_space(100), "vmfn", 80, marks=pytest.mark.slow),
     ],
     ids=lambda v: getattr(v, "name", v),
 )

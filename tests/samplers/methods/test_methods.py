@@ -12,7 +12,7 @@ from samplers.problem import FunctionProblem
 from samplers.registry import METHODS
 from samplers.testing import METHOD_CHECKS, check_accuracy, check_budget, check_dimensions, check_interruption
 
-MAX_SIM = {"two-stage": 3000, "surrogate": 250}
+MAX_SIM = {"two-stage": 3000, "surrogate": 150}
 """Simulations of a run, where they are not the method's own number."""
 SLOW_CHECKS = (check_accuracy, check_budget, check_dimensions, check_interruption)
 
@@ -20,7 +20,12 @@ SLOW_CHECKS = (check_accuracy, check_budget, check_dimensions, check_interruptio
 ALL = sorted(set(METHODS) - {"auto"})  # "auto" is another of them; those of other packages too
 
 
-@pytest.fixture(params=ALL)
+SLOW = pytest.mark.slow
+WHOLE = [pytest.param(name, marks=SLOW if name == "surrogate" else ()) for name in ALL]
+"""Kriging takes seconds of its own: one estimate of it stands among the quick tests."""
+
+
+@pytest.fixture(params=WHOLE)
 def method(request):
     return samplers.get_method(request.param)
 

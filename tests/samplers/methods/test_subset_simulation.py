@@ -58,6 +58,7 @@ def test_no_level_after_the_answer_is_known(recorder):
     assert [level.gamma == 0.0 for level in result.trace] == [False, True]
 
 
+@pytest.mark.slow
 def test_own_cov_matches_the_spread(study):
     """40 % off would be seen; leaving out the chain correlation makes it 35 % too small."""
     reference, runs = half_space(), 300
@@ -66,9 +67,11 @@ def test_own_cov_matches_the_spread(study):
     assert 0.85 < found.own_cov / spread < 1.2
 
 
-@pytest.mark.parametrize("tied", [0.6, 0.9, 0.95])
+@pytest.mark.parametrize(
+    "tied", [pytest.param(0.6, marks=pytest.mark.slow), 0.9, pytest.param(0.95, marks=pytest.mark.slow)]
+)
 def test_ties_at_a_cap(study, tied):
-    reference, runs = plateau(3, 3.0, tied), 60
+    reference, runs = plateau(3, 3.0, tied), 40
     found = study(reference, ADSS(), runs)
     assert all(result.status == "converged" for result in found.results)
     error = found.ratios.std(ddof=1) / math.sqrt(runs)
@@ -87,6 +90,7 @@ def test_a_budget_in_the_middle_of_a_level_is_used_and_said():
     assert any("max_sim was used up at level 4" in text for text in result.warnings)
 
 
+@pytest.mark.slow
 def test_a_small_budget_is_spent_well(study):
     """A thousand simulations: Monte Carlo would have a c.o.v. of 0.86."""
     reference, runs = half_space(2, 3.0), 200
@@ -97,6 +101,7 @@ def test_a_small_budget_is_spent_well(study):
     assert found.covered >= stats.binom.ppf(1e-3, runs, 0.88)
 
 
+@pytest.mark.slow
 def test_noise_of_f_is_kept_with_the_point(study):
     """Fresh noise at every call: simulating the seeds again would bias p by -20 % and more."""
     noise = np.random.default_rng(3)
@@ -167,9 +172,11 @@ def test_the_weighted_points_give_p_at_every_threshold(drive, method):
 
 
 @pytest.mark.parametrize("method", BOTH, ids=IDS)
-@pytest.mark.parametrize("reference", [half_space(1, 3.0), half_space(30, 3.0)], ids=["d1", "d30"])
+@pytest.mark.parametrize(
+    "reference", [half_space(1, 3.0), pytest.param(half_space(30, 3.0), marks=pytest.mark.slow)], ids=["d1", "d30"]
+)
 def test_every_kernel_gives_p(study, method, reference):
-    runs = 40
+    runs = 20
     found = study(reference, method, runs)
     error = found.ratios.std(ddof=1) / math.sqrt(runs)
     assert abs(found.ratios.mean() - 1) < 4 * error + 0.05
