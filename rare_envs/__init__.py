@@ -29,7 +29,6 @@ if TYPE_CHECKING:
     from rare_envs.control.idm import IDM
     from rare_envs.distributions.mixture import TruncatedGaussianMixture
     from rare_envs.distributions.space import ScenarioSpace
-    from rare_envs.egos.faults import FaultTolerant
     from rare_envs.interop import HighwayEnvProblem, HighwayEnvScenario, highway_env_problem
     from rare_envs.problem import DrivingProblem
     from rare_envs.study.risk import risk
@@ -42,7 +41,6 @@ __all__ = [
     "ENV_IDS",
     "IDM",
     "DrivingProblem",
-    "FaultTolerant",
     "HighwayEnvProblem",
     "HighwayEnvScenario",
     "ScenarioSpace",
@@ -64,7 +62,6 @@ if not _is_bare:
 _LAZY = {
     "DrivingProblem": "rare_envs.problem",
     "IDM": "rare_envs.control.idm",
-    "FaultTolerant": "rare_envs.egos.faults",
     "HighwayEnvProblem": "rare_envs.interop",
     "HighwayEnvScenario": "rare_envs.interop",
     "ScenarioSpace": "rare_envs.distributions.space",

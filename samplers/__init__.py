@@ -10,15 +10,12 @@ from samplers.analysis.kinds import Share
 from samplers.analysis.refits import FittedBase
 from samplers.analysis.reweight import Reweighted
 from samplers.analysis.sensitivity import Sensitivity
+from samplers.arguments import RunArguments
 from samplers.comparison import Comparison, compare
 from samplers.distributions import as_distribution
 from samplers.errors import EvaluationError
-from samplers.estimation import estimate
-from samplers.execution.arguments import RunArguments
-from samplers.execution.executors import Executor, ExecutorError, FuturesPool, InProcess, LocalProcesses, RayCluster
-from samplers.execution.interruption import EstimationInterrupted
-from samplers.execution.progress import Progress
-from samplers.execution.run import Run
+from samplers.estimation import EstimationInterrupted, estimate
+from samplers.executors import Executor, ExecutorError, FuturesPool, InProcess, LocalProcesses, RayCluster
 from samplers.method import Goal, Interrupted, Outcome, Stepping, Steps
 from samplers.methods.auto import Auto
 from samplers.methods.base import Method
@@ -40,8 +37,10 @@ from samplers.problem import (
     TermGradients,
     Terms,
 )
+from samplers.progress import Progress
 from samplers.registry import METHODS, get_method
 from samplers.result import Estimate
+from samplers.run import Run
 from samplers.sample import Failure, Failures, Layer, Sample, SimulatedPoints
 from samplers.trace import Level, Status
 

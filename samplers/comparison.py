@@ -17,8 +17,8 @@ from samplers.analysis.reweight import MAX_LOG
 from samplers.analysis.weighted import cov_inflation, has_independent_points, interval_of_sum, require_sample
 from samplers.display import drawing_axes, html_table, indent_lines
 from samplers.estimation import estimate
-from samplers.execution.arguments import RunArguments, check_problem
-from samplers.execution.progress import Listener
+from samplers.arguments import RunArguments, check_problem
+from samplers.progress import Listener
 from samplers.method import Stepping
 from samplers.methods.auto import Auto
 from samplers.problem import FloatArray, Problem, condition_of, names_of_columns

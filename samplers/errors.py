@@ -38,7 +38,7 @@ def one_per_row(outcomes: ArrayLike, n: int) -> NDArray[np.float64]:
 
     Called wherever outcomes of foreign code come in, each of which can be used without the others: a function
     (`FunctionProblem.evaluate`), outcomes told by the user (`Run.tell`), and the halves of a batch that raises, whose
-    lengths must be right before they are joined (`isolate_failing_rows`).
+    lengths must be right before they are joined (`samplers.chunks.isolate`).
 
     Raises:
         EvaluationError: If they are not n real numbers.
@@ -60,7 +60,6 @@ def one_per_row(outcomes: ArrayLike, n: int) -> NDArray[np.float64]:
     return f
 
 
-def describe_row(x: NDArray[np.float64], row: int) -> str:
-    """Return words that name a row of a batch x (n, d)."""
-    shown = np.array2string(x[row], precision=6, threshold=8, separator=", ", max_line_width=10**6)
-    return f"row {row} of a batch of {len(x)}, x = {shown}"
+def describe_point(x: NDArray[np.float64]) -> str:
+    """Return a point x (d,) in one line."""
+    return np.array2string(x, precision=6, threshold=8, separator=", ", max_line_width=10**6)

@@ -1,33 +1,56 @@
 """Estimation: `estimate`, which runs a method on a problem that it can evaluate itself."""
 
+import contextlib
 import math
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from os import PathLike
+from pathlib import Path
 
 from samplers.analysis.refits import HasEnsemble, HasParts, needs_ensemble_run, pool_refits
+from samplers.arguments import InputsOnly, RunArguments, check_attributes, check_problem, choose_seed, find_base_fault
 from samplers.errors import OnError
-from samplers.execution.arguments import InputsOnly, RunArguments, check_attributes, check_problem, choose_seed
-from samplers.execution.base_check import find_base_fault
-from samplers.execution.executors.base import Executor, WorkerPool
-from samplers.execution.executors.chunks import find_chunk_size
-from samplers.execution.executors.problem_work import ProblemWork
-from samplers.execution.executors.selection import AnyExecutor, find_executor
-from samplers.execution.interruption import EstimationInterrupted, defer_signals
-from samplers.execution.journaled_evaluation import JournaledEvaluation, open_journal
-from samplers.execution.progress import Listener, Pace, Progress, open_listener
-from samplers.execution.responder import Responder
-from samplers.execution.run import Run
+from samplers.evaluate import Evaluator
+from samplers.executors import AnyExecutor, find_executor
+from samplers.journal import Journal, JournalError, NothingRecorded
 from samplers.method import Stepping
 from samplers.methods.auto import Auto
 from samplers.methods.two_stage.method import TwoStage
 from samplers.problem import Inputs, Problem, StandardNormal
+from samplers.progress import Listener, Pace, Progress, open_listener
 from samplers.registry import get_method
 from samplers.result import Estimate
+from samplers.run import Run
+from samplers.system import defer_signals
 from samplers.trace import Status
 from samplers.validation import check_number
+
+
+class EstimationInterrupted(KeyboardInterrupt):
+    """An estimation was interrupted (Ctrl-C); it knows what the simulations made so far say.
+
+    Example:
+        >>> import samplers
+        >>> calls = []
+        >>> def f(x):
+        ...     calls.append(len(x))
+        ...     if len(calls) == 3:
+        ...         raise KeyboardInterrupt  # as Ctrl-C does
+        ...     return 2.0 - x[:, 0]
+        >>> try:
+        ...     result = samplers.estimate(samplers.FunctionProblem(f, 2), "mc", seed=0)
+        ... except samplers.EstimationInterrupted as stopped:
+        ...     result = stopped.estimate
+        >>> result.n_sim, round(result.p, 4), str(result.status)
+        (20000, 0.0228, 'stopped')
+    """
+
+    def __init__(self, estimate: Estimate) -> None:
+        self.estimate = estimate
+        """The estimate from the simulations made so far."""
+        super().__init__(f"Interrupted after {estimate.n_sim:,} simulations; the estimate so far (`.estimate`):")
+        self.args = (f"{self.args[0]}\n{estimate}",)
 
 
 def estimate(
@@ -91,7 +114,7 @@ def estimate(
         journal: File that keeps finished simulations, batch by batch. The same call continues a run that was
             interrupted or killed from there, and comes to the result of an undisturbed run; the file stays when the
             run is done, and the same call then takes no simulations. A power cut loses one second
-            (`samplers.execution.journal.SYNC_SECONDS`) and the batch. A file that is damaged, used by another process,
+            (`samplers.journal.SYNC_SECONDS`) and the batch. A file that is damaged, used by another process,
             or was made for other points or another f is refused.
         workers: Processes of this machine that simulate, each with one thread; short for
             `executor=LocalProcesses(workers)`. None simulates here, and gives f whole batches.
@@ -131,43 +154,50 @@ def estimate(
     check_attributes(problem, ("dim", "base", "evaluate"))
     chosen = get_method(method) if isinstance(method, str) else method
     arguments = RunArguments(gamma, seed, max_sim, target_cov, confidence, replicates, on_error)
-    conditions = _StopConditions(time_limit, stop)
+    conditions = StopConditions(time_limit, stop)
     if not (callable(progress) or isinstance(progress, bool)):
         raise ValueError(f"Expected progress to be True, False or a function, got {progress!r}.")
-    _check_base(problem)
+    check_base(problem)
     places = find_executor(workers, executor)
-    work = ProblemWork(problem, arguments.gamma, on_error)
-    with open_journal(journal, problem, seed) as kept:
-        known = seed if kept is None else kept.head["seed"]
-        arguments = replace(arguments, seed=choose_seed(known))
-        with _open_pool(places, work, arguments) as pool:
-            size = None if pool is None else find_chunk_size(problem)
-            evaluation = JournaledEvaluation(work, kept, pool, size)
-            responder = Responder(problem, arguments.gamma, on_error, evaluation)
-            simulation = _Simulation(responder, evaluation, pool, conditions, progress, keep_points)
+    with _open_journal(journal, problem, seed) as kept:
+        known = choose_seed(seed if kept is None else kept.head["seed"])
+        arguments = replace(arguments, seed=known)
+        with Evaluator(problem, arguments.gamma, on_error, journal=kept, executor=places, seed=known) as evaluator:
+            simulation = Simulation(evaluator, progress, conditions, keep_points)
             try:
                 result = simulation.run(problem, chosen, arguments)
-                split = problem.failing_parts if isinstance(problem, HasParts) else None
-                if ensemble_run and result.status is not Status.STOPPED and needs_ensemble_run(result, split):
-                    further = _run_under_ensemble(simulation, problem, chosen, arguments, result)
-                    result = replace(result, ensemble_run=further)
+                if ensemble_run:
+                    result = simulation.add_ensemble_run(result, chosen, arguments)
             except EstimationInterrupted as stopped:
-                raise EstimationInterrupted(_add_remarks(stopped.estimate, responder)) from None
-    return _add_remarks(result, responder)
+                raise EstimationInterrupted(_add_remarks(stopped.estimate, evaluator)) from None
+    return _add_remarks(result, evaluator)
 
 
-@contextmanager
-def _open_pool(executor: Executor | None, work: ProblemWork, arguments: RunArguments) -> Iterator[WorkerPool | None]:
-    """Yield the workers of a run; None without an executor."""
-    if executor is None:
+@contextlib.contextmanager
+def _open_journal(path: str | PathLike[str] | None, problem: Inputs, seed: int | None) -> Iterator[Journal | None]:
+    """Yield the journal at a path, begun or continued, and close it; None for no path.
+
+    Raises:
+        JournalError: It was begun with another dimension or seed.
+        OSError: It cannot be read or written.
+    """
+    if path is None:
         yield None
         return
-    assert arguments.seed is not None
-    with executor.open(work, arguments.seed) as pool:
-        yield pool
+    file, begun = Path(path), {"dim": int(problem.dim), "seed": choose_seed(seed)}
+    try:
+        journal = Journal.open(file)
+    except (FileNotFoundError, NothingRecorded):
+        journal = Journal.create(file, begun)
+    with contextlib.closing(journal):
+        for name, wanted in (("dim", begun["dim"]), ("seed", seed)):
+            had = journal.head.get(name)
+            if not isinstance(had, int) or wanted not in (None, had):
+                raise JournalError(f"{str(path)!r} was begun with {name} {had!r}, and this run has {wanted!r}.")
+        yield journal
 
 
-def _check_base(problem: Problem) -> None:
+def check_base(problem: Problem) -> None:
     """Raise a ValueError if the base distribution's map does not fit its draws: p would be wrong without a warning."""
     check_problem(problem, ("dim", "base", "evaluate"))
     if type(problem.base) is StandardNormal:
@@ -177,72 +207,7 @@ def _check_base(problem: Problem) -> None:
         raise ValueError(f"The parts of problem.base ({type(problem.base).__name__}) do not fit together: {fault}.")
 
 
-@dataclass(frozen=True)
-class _Simulation:
-    """What the runs of one estimation share: how f is called, when they end and who is told."""
-
-    responder: Responder
-    evaluation: JournaledEvaluation
-    pool: WorkerPool | None
-    conditions: "_StopConditions"
-    progress: bool | Listener
-    keep_points: bool
-
-    def run(self, inputs: Inputs, method: Stepping, arguments: RunArguments) -> Estimate:
-        """Run a method to its end, or to the first condition that stops it.
-
-        Raises:
-            EstimationInterrupted: If it is interrupted after the first batch.
-        """
-        with open_listener(self.progress, arguments.max_sim) as listener:
-            if self.pool is not None and listener is not None:
-                pace = Pace(listener, self.pool.workers, self.evaluation)
-                self.evaluation.on_chunk, listener = pace.on_chunk, pace.on_progress
-            run = Run(inputs, method, arguments, listener, self.responder.offer, self.keep_points)
-            try:
-                self._simulate(run)
-            except KeyboardInterrupt:
-                if run.progress.n_sim == 0:
-                    raise
-                run.stop("Interrupted")
-                raise EstimationInterrupted(run.result()) from None
-        return run.result()
-
-    def _simulate(self, run: Run) -> None:
-        while not run.done:
-            answers = self.responder.respond(run.requests)
-            with defer_signals():  # a method that is interrupted while it computes could not conclude
-                run.answer(answers)
-            why = self.conditions.reason(run.progress)
-            if why is not None:
-                run.stop(why)
-
-
-def _run_under_ensemble(
-    simulation: _Simulation, problem: Problem, method: Stepping, arguments: RunArguments, first: Estimate
-) -> Estimate | None:
-    """Return the run under the mixture of the refits, or None where the base cannot make one of them.
-
-    `TwoStage` makes it where the method cannot search under a mixture.
-    """
-    if not isinstance(problem.base, HasEnsemble):
-        return None
-    further = replace(arguments, seed=first.seed, target_cov=None, replicates=1)
-    try:
-        inputs = InputsOnly(int(problem.dim), pool_refits(problem.base))
-    except ValueError:  # refits that are no mixtures; the first run stands, with a warning of `BaseUncertainty`
-        return None
-    try:
-        Run(inputs, method, further)
-    except ValueError:  # blocks of a product, which a mixture has none of
-        method = TwoStage()
-    try:
-        return simulation.run(inputs, method, further)
-    except KeyboardInterrupt:
-        raise EstimationInterrupted(first) from None
-
-
-class _StopConditions:
+class StopConditions:
     """Conditions that end a run before its time.
 
     Args:
@@ -253,7 +218,7 @@ class _StopConditions:
         ValueError: If time_limit is not a positive number, or stop is not a function.
     """
 
-    def __init__(self, time_limit: float | None, stop: Callable[[Progress], bool] | None) -> None:
+    def __init__(self, time_limit: float | None = None, stop: Callable[[Progress], bool] | None = None) -> None:
         if time_limit is not None:
             check_number("time_limit", time_limit, 0.0, math.inf)
         if not (stop is None or callable(stop)):
@@ -271,11 +236,75 @@ class _StopConditions:
         return None
 
 
-def _add_remarks(result: Estimate, responder: Responder) -> Estimate:
+@dataclass(frozen=True)
+class Simulation:
+    """What the runs of one estimation share: how f is called, who is told and when they end."""
+
+    evaluator: Evaluator
+    progress: bool | Listener = False
+    conditions: StopConditions = field(default_factory=StopConditions)
+    keep_points: bool = False
+
+    def run(self, inputs: Inputs, method: Stepping, arguments: RunArguments) -> Estimate:
+        """Run a method to its end, or to the first condition that stops it.
+
+        Raises:
+            EstimationInterrupted: If it is interrupted after the first batch.
+        """
+        with open_listener(self.progress, arguments.max_sim) as listener:
+            if self.evaluator.workers and listener is not None:
+                pace = Pace(listener, self.evaluator.workers, self.evaluator)
+                self.evaluator.on_chunk, listener = pace.on_chunk, pace.on_progress
+            run = Run(inputs, method, arguments, listener, self.evaluator.offer, self.keep_points)
+            try:
+                while not run.done:
+                    answers = self.evaluator.respond(run.requests)
+                    with defer_signals():  # a method that is interrupted while it computes could not conclude
+                        run.answer(answers)
+                    why = self.conditions.reason(run.progress)
+                    if why is not None:
+                        run.stop(why)
+            except KeyboardInterrupt:
+                if run.progress.n_sim == 0:
+                    raise
+                run.stop("Interrupted")
+                raise EstimationInterrupted(run.result()) from None
+        return run.result()
+
+    def add_ensemble_run(self, first: Estimate, method: Stepping, arguments: RunArguments) -> Estimate:
+        """Return an estimate with the run under the mixture of the refits, where it needs one and there can be one.
+
+        `TwoStage` makes it where the method cannot search under a mixture.
+
+        Raises:
+            EstimationInterrupted: If it is interrupted; what is known is the first run.
+        """
+        problem = self.evaluator.problem
+        split = problem.failing_parts if isinstance(problem, HasParts) else None
+        if first.status is Status.STOPPED or not needs_ensemble_run(first, split):
+            return first
+        if not isinstance(problem.base, HasEnsemble):
+            return first
+        further = replace(arguments, seed=first.seed, target_cov=None, replicates=1)
+        try:
+            inputs = InputsOnly(int(problem.dim), pool_refits(problem.base))
+        except ValueError:  # refits that are no mixtures; the first run stands, with a warning of `BaseUncertainty`
+            return first
+        try:
+            Run(inputs, method, further)
+        except ValueError:  # blocks of a product, which a mixture has none of
+            method = TwoStage()
+        try:
+            return replace(first, ensemble_run=self.run(inputs, method, further))
+        except KeyboardInterrupt:
+            raise EstimationInterrupted(first) from None
+
+
+def _add_remarks(result: Estimate, evaluator: Evaluator) -> Estimate:
     """Return the result with remarks on rows that were simulated again, or lost with their workers."""
     remarks = []
-    if responder.n_retried:
-        remarks.append(f"{responder.n_retried} rows were simulated again to find those on which f raises.")
-    if responder.lost:
-        remarks.append(f"No worker survived {len(responder.lost)} rows; of the first: {responder.lost[0]}.")
+    if evaluator.n_retried:
+        remarks.append(f"{evaluator.n_retried} rows were simulated again to find those on which f raises.")
+    if evaluator.lost:
+        remarks.append(f"No worker survived {len(evaluator.lost)} rows; of the first: {evaluator.lost[0]}.")
     return replace(result, remarks=(*result.remarks, *remarks)) if remarks else result

@@ -15,7 +15,7 @@ from typing import Any
 from rare_envs.files import replace_file
 from rare_envs.plugins import did_you_mean
 from rare_envs.threads import use_one_thread
-from samplers.execution.progress import NARROW_TERMINAL
+from samplers.progress import NARROW_TERMINAL
 from training.ego_checkpoint import load_checkpoint, restore_model, save_checkpoint
 from training.ego_retraining import Retraining, check_retrainable, continue_settings, restore_parameters
 

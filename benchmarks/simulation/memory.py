@@ -27,15 +27,16 @@ space = None
 if table:
     from pathlib import Path
     import rare_envs
-    from rare_envs.study.storage.episode_file import EpisodeBatch, EpisodeDraft, write_episodes
+    from rare_envs.study.episodes import EpisodeTable
+    from samplers.evaluate import Simulated
     space = rare_envs.DrivingProblem("rare_envs/CarFollowing-v0").space
-    draft = EpisodeDraft(Path(sys.argv[3]), space)
+    episodes = EpisodeTable(Path(sys.argv[3]), space)
 
 def f(x):
     out = 3.0 - x[:, 0]
     if table:
         rows = np.column_stack((x, x[:, :1]))
-        draft.add(EpisodeBatch(rows, out, [None] * len(x), np.zeros(len(x))))
+        episodes.add(Simulated(rows, out, [], np.zeros(len(x))))
     return out
 
 before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
@@ -43,7 +44,7 @@ journal = sys.argv[3] + "/journal.bin" if table else None
 problem = samplers.FunctionProblem(f, dim=2)
 result = samplers.estimate(problem, "mc", seed=0, max_sim=n, journal=journal)
 if table:
-    write_episodes(Path(sys.argv[3]) / "episodes.parquet", draft, result, {})
+    episodes.write(result, {})
 after = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
 print(result.p, before / 1024, after / 1024)
 """

@@ -2,19 +2,16 @@
 
 from typing import TYPE_CHECKING
 
-from rare_envs.egos.errors import EgoFault, EgoGone, NoAnswer
+from rare_envs.egos.errors import EgoGone, NoAnswer
 from rare_envs.plugins import make_lazy_getattr
 
 if TYPE_CHECKING:
-    from rare_envs.egos.faults import Fault, FaultTolerant
     from rare_envs.egos.needs import WrappedEgo, resolve
     from rare_envs.egos.policy import as_driver
 
-__all__ = ["EgoFault", "EgoGone", "Fault", "FaultTolerant", "NoAnswer", "WrappedEgo", "as_driver", "resolve"]
+__all__ = ["EgoGone", "NoAnswer", "WrappedEgo", "as_driver", "resolve"]
 
 _LAZY = {
-    "Fault": "rare_envs.egos.faults",
-    "FaultTolerant": "rare_envs.egos.faults",
     "WrappedEgo": "rare_envs.egos.needs",
     "as_driver": "rare_envs.egos.policy",
     "resolve": "rare_envs.egos.needs",

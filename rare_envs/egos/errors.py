@@ -26,17 +26,8 @@ class NoAnswer(RuntimeError):
         'NoAnswer: no answer within 10 s'
     """
 
-
-class EgoFault(ValueError):
-    """The ego has failed on a scenario, twice.
-
-    Example:
-        >>> EgoFault("The ego failed twice.").final
-        True
-    """
-
-    final: ClassVar[bool] = True
-    """The ego has been queried again already, so nobody needs to; `samplers` reads this attribute."""
+    waits: ClassVar[bool] = True
+    """Each costs its time, or a process that starts again; `samplers` reads this attribute."""
 
 
 def reason_of(error: BaseException) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import reprlib
 from typing import Any, NamedTuple
 
@@ -11,8 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from rare_envs.control.actions import read_actions
-from rare_envs.egos.errors import EgoGone, NoAnswer
-from rare_envs.egos.isolation import attempt_in_parts
+from rare_envs.egos.errors import EgoGone, NoAnswer, reason_of
 from rare_envs.sensors.kinds import map_kinds
 
 
@@ -102,27 +102,52 @@ def _isolate_failing_rows(
 ) -> tuple[Tensor, dict[int, str]] | None:
     """Query again, after an error, in parts until the rows that fail stand alone.
 
-    Args:
-        policy: The policy.
-        kind: Of its actions.
-        query: Rows on which it failed.
-        error: How.
+    The rule is that of `samplers.chunks.split_rows`, for the rows of one tick: no other tick is driven again.
 
     Returns:
         Actions and reasons by row; None if the policy turns out to have a memory.
+
+    Raises:
+        EgoGone: The ego cannot be queried any more.
     """
+    whole = len(query.start)
+    actions, reasons = list[Tensor](), dict[int, str]()
+    waiting: list[tuple[int, int, BaseException | None]] = [(0, whole, error)]
+    while waiting:
+        first, n, met = waiting.pop()
+        part = query.rows(slice(first, first + n))
+        if met is None:
+            try:
+                found, hidden, why = _query_with_reasons(policy, kind, part)
+            except (Exception, SystemExit) as raised:  # the policy is the user's: anything may happen in it
+                met = raised
+            else:
+                if hidden is not None:
+                    return None
+                actions.append(found)
+                reasons.update({first + row: reason for row, reason in why.items()})
+                continue
+        elif n == 1 and not isinstance(met, NoAnswer):
+            waiting.append((first, 1, None))  # once more
+            continue
+        if n == 1:
+            actions.append(_ignored_action(kind, part.over))
+            reasons[first] = reason_of(met)
+            continue
+        size = _part_size(n, met, whole)
+        starts = range(first, first + n, size)
+        waiting += [(start, min(size, first + n - start), None) for start in reversed(starts)]
+    return torch.cat(actions), reasons
 
-    def attempt(rows: range) -> tuple[Tensor, dict[int, str]] | None:
-        actions, hidden, reasons = _query_with_reasons(policy, kind, query.rows(slice(rows.start, rows.stop)))
-        if hidden is not None:
-            return None
-        return actions, {rows.start + row: reason for row, reason in reasons.items()}
 
-    def give_up(row: int) -> Tensor:
-        return _ignored_action(kind, query.over[row : row + 1])
+def _part_size(n: int, error: BaseException, whole: int) -> int:
+    """Return how many of n rows to query at a time after an error: half of them, as that takes the fewest queries.
 
-    attempted = attempt_in_parts(attempt, give_up, range(len(query.start)), error)
-    return None if attempted is None else (torch.cat(attempted[0]), attempted[1])
+    If no answer came, queries are cheap, but waiting for one that does not come, or for a process that starts again, is
+    not: then the root of the whole batch, and after that each row alone.
+    """
+    root = math.isqrt(whole) if isinstance(error, NoAnswer) else (n + 1) // 2
+    return root if 1 < root < n else 1
 
 
 def _ignored_action(kind: str, over: Tensor) -> Tensor:

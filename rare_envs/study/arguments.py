@@ -121,7 +121,7 @@ class Question:
     @property
     def run_arguments(self) -> RunArguments:
         """The arguments of `samplers.estimate`."""
-        from samplers.execution.arguments import RunArguments
+        from samplers.arguments import RunArguments
 
         return RunArguments(
             gamma=self.gamma,

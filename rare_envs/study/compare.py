@@ -14,11 +14,12 @@ from rare_envs.files import format_json, replace_text
 from rare_envs.study.arguments import Question
 from rare_envs.study.errors import BadInput, as_bad_input, output_folder
 from rare_envs.study.evaluate import recheck
-from rare_envs.study.execution.interruption import FIRST_BATCH, RunInterrupted, describe_stop
+from rare_envs.study.interruption import FIRST_BATCH, RunInterrupted, describe_stop
 from rare_envs.study.question import Study, prepare
 from rare_envs.study.repeatability import RowKeeper
 from rare_envs.study.writing import check_no_results, write_failures
 from rare_envs.version import __version__
+from samplers.evaluate import Evaluator
 
 COMPARISON = "comparison.json"
 UNUSED_FIELDS = ("target_cov", "replicates", "on_error", "sensitivity")
@@ -81,12 +82,12 @@ def compare_egos(
             f"Expected two egos with the same x, got {a.problem.dim} and {b.problem.dim} dimensions, as an ego that is "
             "random has its own in x: estimate each by itself."
         )
-    kept = {name: RowKeeper(study.problem, question.gamma) for name, study in (("A", a), ("B", b))}
+    kept = {name: RowKeeper(study.problem.dim, question.gamma) for name, study in (("A", a), ("B", b))}
     with contextlib.nullcontext() if out is None else output_folder(out):
         with as_bad_input(ValueError, EgoGone), _say_what_is_known():
             comparison = samplers.compare(
-                kept["A"],
-                kept["B"],
+                _watch(a, kept["A"]),
+                _watch(b, kept["B"]),
                 a.method,
                 gamma=question.gamma,
                 seed=question.seed,
@@ -107,6 +108,13 @@ def compare_egos(
             replace_text(out / COMPARISON, format_json(answer) + "\n")
             write_failures(out, a.problem.space, comparison.either.failures)
     return EgoComparison(comparison, answer)
+
+
+def _watch(study: Study, keeper: RowKeeper) -> Evaluator:
+    """Return the problem of a study, some of whose simulations are kept."""
+    evaluator = Evaluator(study.problem, study.question.gamma, name="The ego")
+    evaluator.watchers.append(keeper.keep)
+    return evaluator
 
 
 @contextlib.contextmanager

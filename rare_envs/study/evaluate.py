@@ -4,15 +4,21 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from contextlib import closing
+from contextlib import ExitStack, closing
 from dataclasses import asdict, replace
 from pathlib import Path
+from typing import Any
 
+import numpy as np
+
+import agents
 import samplers
 from agents.loading import find_ego_kind
 from rare_envs.egos.errors import EgoGone
+from rare_envs.problem import DrivingProblem
+from rare_envs.study.episodes import EpisodeTable
 from rare_envs.study.errors import BadInput, output_folder
-from rare_envs.study.execution.interruption import (
+from rare_envs.study.interruption import (
     NOT_KEPT,
     RunInterrupted,
     describe_early_stop,
@@ -20,15 +26,20 @@ from rare_envs.study.execution.interruption import (
     describe_stop,
     keep_answer,
 )
-from rare_envs.study.execution.simulated_problem import SimulatedProblem, open_problem
-from rare_envs.study.journal import JOURNAL, begin_journal, check_same_files, continue_journal
+from rare_envs.study.journal import (
+    JOURNAL,
+    begin_journal,
+    check_same_files,
+    continue_journal,
+    digest_files,
+    find_changed_files,
+)
 from rare_envs.study.modes import CrashKinds, classify_failures, list_all_kinds
-from rare_envs.study.question import Study, prepare
+from rare_envs.study.question import Question, Study, build_problem, prepare
 from rare_envs.study.recorded_question import note_question, open_question
 from rare_envs.study.repeatability import Repeatability, RowKeeper, check_repeatability
 from rare_envs.study.report import Report
 from rare_envs.study.run_folder import STUDY
-from rare_envs.study.storage.episode_recorder import EpisodeRecorder
 from rare_envs.study.writing import (
     begin_study_file,
     check_no_results,
@@ -38,9 +49,10 @@ from rare_envs.study.writing import (
     remove_results,
     write_run,
 )
-from samplers.execution.executors import Executor, ExecutorError
-from samplers.execution.journal import JournalFile
-from samplers.execution.progress import Pace, open_listener
+from samplers.estimation import Simulation, check_base
+from samplers.evaluate import Evaluator
+from samplers.executors import Executor, ExecutorError
+from samplers.journal import Journal
 
 
 class UnwrittenResults(BadInput):
@@ -55,7 +67,7 @@ class UnwrittenResults(BadInput):
 def run(
     study: Study,
     progress: bool | Callable[[samplers.Progress], None] = False,
-    journal: JournalFile | None = None,
+    journal: Journal | None = None,
     executor: Executor | None = None,
     folder: Path | None = None,
 ) -> Report:
@@ -89,44 +101,41 @@ def run(
     """
     start, study = time.perf_counter(), settle_chunk(study, executor)
     advice = "" if journal else NOT_KEPT
-    recorder: EpisodeRecorder | None = None
-    problem: SimulatedProblem | None = None
-    try:
-        with open_problem(study, journal, executor) as problem:
-            recorder = None if folder is None else EpisodeRecorder(problem, folder, study.problem.space)
-            keeper = RowKeeper(recorder or problem, study.question.gamma)
-            estimate = _estimate(study, keeper, problem, progress)
-    except EgoGone as error:
-        raise BadInput(f"{error}{advice}") from error
-    except (ValueError, ExecutorError) as error:
-        raise BadInput(error) from error
-    except samplers.EstimationInterrupted as stopped:
-        assert problem is not None
-        report = _report_early(study, problem, stopped.estimate, time.perf_counter() - start)
-        raise RunInterrupted(f"{describe_stop(report.estimate)}{advice}", report) from None
-    except KeyboardInterrupt:
-        n_made, n_failed = (0, 0) if problem is None else (problem.n_made, problem.n_failed)
-        raise RunInterrupted(f"{describe_early_stop(n_made, n_failed)}{advice if n_made else ''}") from None
-    else:
-        report = _report_early(study, problem, estimate, time.perf_counter() - start)
+    evaluator = open_evaluator(study, journal, executor)
+    table = None if folder is None else EpisodeTable(folder, study.problem.space)
+    keeper = RowKeeper(study.problem.dim, study.question.gamma)
+    evaluator.watchers += [keeper.keep, *([] if table is None else [table.add])]
+    with ExitStack() as stack:
+        if table is not None:
+            stack.callback(table.close)
+        try:
+            estimate = _estimate(study, evaluator, progress)
+        except EgoGone as error:
+            raise BadInput(f"{error}{advice}") from error
+        except (ValueError, ExecutorError) as error:
+            raise BadInput(error) from error
+        except samplers.EstimationInterrupted as stopped:
+            report = _report_early(study, evaluator, stopped.estimate, time.perf_counter() - start)
+            raise RunInterrupted(f"{describe_stop(report.estimate)}{advice}", report) from None
+        except KeyboardInterrupt:
+            known = describe_early_stop(evaluator.n_made, evaluator.n_failed)
+            raise RunInterrupted(f"{known}{advice if evaluator.n_made else ''}") from None
+        report = _report_early(study, evaluator, estimate, time.perf_counter() - start)
         with keep_answer(report):
             kinds = classify_failures(study.problem, estimate)
             estimate, kinds = list_all_kinds(study.problem, estimate, kinds)
             report = replace(report, estimate=estimate, kinds=kinds)
-            if recorder is not None:
-                recorder.write(estimate, kinds.by_scenario)
-    finally:
-        if recorder is not None:
-            recorder.close()
+            if table is not None:
+                table.write(estimate, kinds.by_scenario)
     with keep_answer(report):
         again = recheck(study, keeper)
-    return replace(report, repeatability=again, lost="" if recorder is None else recorder.lost)
+    return replace(report, repeatability=again, lost="" if table is None else table.lost)
 
 
-def _report_early(study: Study, problem: SimulatedProblem, estimate: samplers.Estimate, seconds: float) -> Report:
+def _report_early(study: Study, evaluator: Evaluator, estimate: samplers.Estimate, seconds: float) -> Report:
     """Return the report of an estimate whose failures were not driven again."""
     kinds = CrashKinds(unknown="the run was interrupted")
-    return Report(study, estimate, seconds, tuple(problem.faults), kinds, problem.n_retried)
+    return Report(study, estimate, seconds, tuple(evaluator.faults), kinds, evaluator.n_retried)
 
 
 def settle_chunk(study: Study, executor: Executor | None) -> Study:
@@ -136,25 +145,62 @@ def settle_chunk(study: Study, executor: Executor | None) -> Study:
     return replace(study, question=replace(study.question, chunk=study.problem.chunk_size))
 
 
+def open_evaluator(study: Study, journal: Journal | None = None, executor: Executor | None = None) -> Evaluator:
+    """Return the evaluator of a study; scenarios are simulated in single precision."""
+    question, problem = study.question, study.problem
+    return Evaluator(
+        problem if study.ego_was_given else SentProblem(problem, question),
+        question.gamma,
+        question.on_error,
+        journal=journal,
+        executor=executor,
+        seed=question.seed,
+        size=question.chunk or problem.tile,
+        name="The ego",
+        precision=np.float32,
+    )
+
+
+class SentProblem:
+    """The problem of a study, which workers load for themselves from its question."""
+
+    def __init__(self, problem: DrivingProblem, question: Question) -> None:
+        self._problem, self._question = problem, question
+
+    def __getattr__(self, name: str) -> Any:
+        """Return what the problem has."""
+        return getattr(self._problem, name)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Return what is sent."""
+        return _load_problem, (self._question, digest_files(self._question))
+
+
+def _load_problem(question: Question, files: dict[str, str]) -> DrivingProblem:
+    """Return the problem of a question.
+
+    Raises:
+        BadInput: A file that it names is not the one that the driver has.
+        ValueError: Something cannot be loaded.
+    """
+    changed = find_changed_files(files, digest_files(question))
+    if changed:
+        raise BadInput(f"{', '.join(changed)} is not here, or not the file with which the run was begun")
+    ego = agents.load_ego(question.ego, algo=question.algo, trust=question.trust, stats=question.stats)
+    return build_problem(question, ego)
+
+
 def _estimate(
-    study: Study,
-    keeper: RowKeeper,
-    problem: SimulatedProblem,
-    progress: bool | Callable[[samplers.Progress], None],
+    study: Study, evaluator: Evaluator, progress: bool | Callable[[samplers.Progress], None]
 ) -> samplers.Estimate:
-    """Run the method of a study; with workers progress is told chunk by chunk."""
-    question = study.question
-    with open_listener(progress, question.max_sim) as listener:
-        if problem.workers and listener is not None:
-            pace = Pace(listener, problem.workers, problem.evaluation)
-            problem.evaluation.on_chunk, listener = pace.on_chunk, pace.on_progress
-        return samplers.estimate(
-            keeper,
-            study.method,
-            **asdict(question.run_arguments),
-            progress=listener or False,
-            ensemble_run=question.ensemble_run,
-        )
+    """Run the method of a study, and the further run under the refits."""
+    check_base(study.problem)
+    simulation, arguments = Simulation(evaluator, progress), study.question.run_arguments
+    with evaluator:
+        estimate = simulation.run(study.problem, study.method, arguments)
+        if study.question.ensemble_run:
+            estimate = simulation.add_ensemble_run(estimate, study.method, arguments)
+    return estimate
 
 
 def recheck(study: Study, keeper: RowKeeper) -> Repeatability | None:
@@ -259,7 +305,7 @@ def resume(
         return _run(folder, study, journal, progress, executor)
 
 
-def _run(folder: Path, study: Study, journal: JournalFile, progress: bool, executor: Executor | None = None) -> Report:
+def _run(folder: Path, study: Study, journal: Journal, progress: bool, executor: Executor | None = None) -> Report:
     target, earlier = folder.absolute(), journal.earlier_seconds  # an ego may change the working directory
 
     def kept(report: Report | None = None) -> str:

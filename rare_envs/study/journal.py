@@ -1,6 +1,6 @@
 """Journal: the finished simulations of a run, so that one that was interrupted can be continued.
 
-The journal lies in the run's folder until the run is done; `samplers.execution.journal` has its form and its promises.
+The journal lies in the run's folder until the run is done; `samplers.journal` has its form and its promises.
 Here it gets the question of the run, digests of the files that the question names, and what is known of faults.
 """
 
@@ -20,8 +20,7 @@ from rare_envs.study.arguments import Question, read_question
 from rare_envs.study.errors import BadInput
 from rare_envs.study.run_folder import RESULT
 from rare_envs.version import __version__
-from samplers.execution.journal import JournalFile
-from samplers.execution.record_file import JournalError, NothingRecorded
+from samplers.journal import Journal, JournalError, NothingRecorded
 
 JOURNAL = "journal.bin"
 """Name of the file in the folder of a run."""
@@ -29,7 +28,7 @@ BEGIN_AGAIN = "give the command again."
 """Advice where there is nothing to continue."""
 
 
-def begin_journal(folder: Path, question: Question, force: bool = False) -> JournalFile:
+def begin_journal(folder: Path, question: Question, force: bool = False) -> Journal:
     """Return the journal of a new run.
 
     Args:
@@ -43,7 +42,7 @@ def begin_journal(folder: Path, question: Question, force: bool = False) -> Jour
     path = folder / JOURNAL
     head = {"version": __version__, "question": asdict(question), "files": digest_files(question)}
     try:
-        return JournalFile.create(path, head, replace=force)
+        return Journal.create(path, head, replace=force)
     except JournalError as error:
         if "already" not in str(error):
             raise BadInput(error) from error
@@ -63,7 +62,7 @@ def refuse_unfinished(folder: Path) -> None:
         )
 
 
-def continue_journal(folder: Path, mend: bool = False) -> tuple[JournalFile, Question]:
+def continue_journal(folder: Path, mend: bool = False) -> tuple[Journal, Question]:
     """Return the journal of an unfinished run, and its question.
 
     Args:
@@ -75,7 +74,7 @@ def continue_journal(folder: Path, mend: bool = False) -> tuple[JournalFile, Que
     """
     path = folder / JOURNAL
     try:
-        journal = JournalFile.open(path, mend)
+        journal = Journal.open(path, mend)
     except FileNotFoundError as error:
         raise BadInput(f"There is no unfinished run in {str(folder)!r}: {_explain_no_journal(folder)}") from error
     except NothingRecorded as error:
@@ -109,14 +108,14 @@ def _explain_no_journal(folder: Path) -> str:
     return f"it has no {JOURNAL}. Of one that was stopped before its first simulations, {BEGIN_AGAIN}"
 
 
-def _read_question(journal: JournalFile) -> Question:
+def _read_question(journal: Journal) -> Question:
     version = journal.head.get("version")
     if version != __version__:
         raise BadInput(f"it was begun by version {version}, this is {__version__}.")
     return read_question(journal.head.get("question"))
 
 
-def check_same_files(journal: JournalFile, question: Question) -> None:
+def check_same_files(journal: Journal, question: Question) -> None:
     """Raise a BadInput if a file that the question names has changed since the run was begun, wherever it lies now."""
     changed = find_changed_files(journal.head.get("files") or {}, digest_files(question))
     if changed:

@@ -23,8 +23,8 @@ from rare_envs.distributions.space import ScenarioSpace
 from rare_envs.egos.errors import EgoGone
 from rare_envs.problem import DrivingProblem
 from rare_envs.study.columns import list_columns
+from rare_envs.study.episodes import digest_scenario
 from rare_envs.study.severity import MAX_REPLAYED, Severity, compute_severity, replay_failures, replay_further_failures
-from rare_envs.study.storage.episode_file import digest_scenario
 from rare_envs.traffic.crash import CRASH_KINDS, Crash, describe_crash
 from samplers.analysis import NO_OUTCOME_LABEL, sum_by_label
 from samplers.analysis.weighted import choose_failures, require_sample

@@ -11,9 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rare_envs.egos.faults import FaultTolerant
-from rare_envs.egos.wrapped_problem import WrappedProblem
-from samplers.execution.journaled_evaluation import find_changed
+from samplers.evaluate import Evaluator, Simulated, find_changed
 from samplers.problem import FloatArray
 
 KEPT_ROWS, COMPANY, ROWS_ALONE = 64, 16, 2
@@ -44,18 +42,21 @@ class Repeatability(NamedTuple):
         )
 
 
-class RowKeeper(WrappedProblem):
-    """A problem that keeps some scenarios that it evaluates, with their f; see `samplers.Problem`.
+class RowKeeper:
+    """Keeps some scenarios that are simulated, with their f.
 
     Half of them are a uniform sample, half those with f nearest to the threshold, which decide p: in ordinary traffic
     most scenarios have the largest f there is, whatever the ego does.
+
+    Args:
+        dim: Number of dimensions of x.
+        gamma: Threshold of f.
+        size: Scenarios to keep.
     """
 
-    def __init__(self, problem: Any, gamma: float, size: int = KEPT_ROWS) -> None:
-        """Wrap a problem."""
-        super().__init__(problem)
+    def __init__(self, dim: int, gamma: float, size: int = KEPT_ROWS) -> None:
         self._gamma, self._size, self._seen = gamma, size // 2, 0
-        self._sample = (np.empty((0, problem.dim)), np.empty(0))
+        self._sample = (np.empty((0, dim)), np.empty(0))
         self._near = self._sample
         self._rng = np.random.default_rng(0)  # of its own, so that the run draws what it would draw without
 
@@ -69,20 +70,9 @@ class RowKeeper(WrappedProblem):
         """Their f, shape (n,)."""
         return np.concatenate((self._sample[1], self._near[1]))
 
-    def evaluate(self, x: FloatArray) -> FloatArray:
-        """Return f of the problem: (n, d) -> (n,)."""
-        f: FloatArray = self.problem.evaluate(x)
-        self._keep(x, f)
-        return f
-
-    def _terms(self, x: FloatArray, gamma: float = 0.0) -> Any:
-        """Return the terms of the problem at x (n, d)."""
-        terms = self.problem.terms(x, gamma)
-        self._keep(x, terms.f)
-        return terms
-
-    def _keep(self, x: FloatArray, f: FloatArray) -> None:
-        """Keep some of the scenarios x (n, d) with f (n,)."""
+    def keep(self, seen: Simulated) -> None:
+        """Keep some of the scenarios that were simulated."""
+        x, f = seen.x, seen.f
         good = ~np.isnan(f)
         self._keep_sample(x[good], f[good])
         xs, fs = np.vstack((self._near[0], x[good])), np.concatenate((self._near[1], f[good]))
@@ -102,14 +92,22 @@ class RowKeeper(WrappedProblem):
 
 
 def check_repeatability(problem: Any, kept: RowKeeper) -> Repeatability:
-    """Simulate the kept scenarios again: in another order and in small batches, and a few each alone."""
-    tolerant = FaultTolerant(problem)
+    """Simulate the kept scenarios again: in another order and in small batches, and a few each alone.
+
+    Args:
+        problem: A `DrivingProblem`.
+        kept: After a run.
+
+    Raises:
+        EgoGone: The ego cannot be queried any more.
+    """
+    evaluator = Evaluator(problem, on_error="failure")
     order = np.random.default_rng(1).permutation(len(kept.f))
     batches = [order[first : first + COMPANY] for first in range(0, len(order), COMPANY)]
     batches += [order[row : row + 1] for row in range(min(ROWS_ALONE, len(order)))]
     if not batches:
         return Repeatability(0, 0, 0.0)
-    again = np.concatenate([tolerant.evaluate(kept.x[rows]) for rows in batches])
+    again = np.concatenate([evaluator.evaluate(kept.x[rows]) for rows in batches])
     before = kept.f[np.concatenate(batches)]
     changed = find_changed(again, before)
     apart = np.nan_to_num(np.abs(again[changed] - before[changed]), nan=np.inf)

@@ -15,7 +15,6 @@ import samplers
 from agents.sb3.saved_ego import SavedEgo
 from rare_envs.distributions.fitted import EventFrequency, FittedDistribution
 from rare_envs.distributions.space import Distribution
-from rare_envs.egos.faults import Fault
 from rare_envs.egos.wrappers import describe_missing_normalisation
 from rare_envs.exposure import HUMAN_BENCHMARKS
 from rare_envs.exposure.rate import CollisionProbability, CollisionRate, explain_no_frequency, read_source
@@ -30,6 +29,7 @@ from rare_envs.study.severity import Severity
 from rare_envs.version import __version__
 from samplers.analysis.base_error import FIT_BIAS
 from samplers.analysis.refits import refit_quantile
+from samplers.evaluate import Fault
 from samplers.sample import Sample
 from samplers.statistics import Interval
 

@@ -24,7 +24,7 @@ from rare_envs.scenarios.registry import env_id_of, scenario_named
 from rare_envs.study.arguments import Question
 from rare_envs.study.errors import BadInput, as_bad_input
 from rare_envs.study.evaluate import run, run_into
-from rare_envs.study.execution.interruption import RunInterrupted, keep_answer
+from rare_envs.study.interruption import RunInterrupted, keep_answer
 from rare_envs.study.plots import save_risk_plot
 from rare_envs.study.question import Study, prepare
 from rare_envs.study.report import Report, find_frequency

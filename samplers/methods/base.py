@@ -2,11 +2,11 @@
 
 from typing import Protocol, runtime_checkable
 
+from samplers.arguments import RunArguments
 from samplers.errors import OnError
-from samplers.execution.arguments import RunArguments
-from samplers.execution.run import Run
 from samplers.method import Stepping
 from samplers.problem import Inputs
+from samplers.run import Run
 
 
 @runtime_checkable

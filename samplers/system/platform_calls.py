@@ -1,62 +1,62 @@
-"""Platform calls: locks, ends of processes, limits and folders, in one place for the systems that differ in them.
+"""Platform calls: signals and limits, in one place for the systems that differ in them.
 
 A function of this module looks for what the system offers when it is called, and does without where it can. No other
-module of `samplers` imports `fcntl`, `resource` or `msvcrt`, or calls what only POSIX has.
+module of `samplers` imports `resource`, or calls what only POSIX has.
 """
 
 from __future__ import annotations
 
-import importlib
 import os
 import signal
-import subprocess
-from contextlib import suppress
-from pathlib import Path
-from typing import IO, Any
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from types import FrameType
+from typing import Any
 
-BEYOND = 1 << 40
-"""Position of the byte that is locked on Windows: beyond the content (1 TiB), which others may then still read."""
+DEFERRED_SIGNALS = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name))
 
 
-def lock_file(file: IO[bytes]) -> bool:
-    """Lock an open file for this process until it is closed; return False if another process has it.
+@contextmanager
+def defer_signals() -> Iterator[None]:
+    """Let SIGINT, SIGTERM and SIGHUP wait for the end of the block; the second one does not wait.
 
-    The system lets go of the lock when the process ends, however. File systems that know no locks (some network
-    drives) grant every lock.
+    Only those with a handler in Python, and in the main thread, as others do not interrupt Python code.
+
+    Example:
+        >>> import os, signal
+        >>> before = signal.signal(signal.SIGINT, signal.default_int_handler)
+        >>> try:
+        ...     with defer_signals():
+        ...         os.kill(os.getpid(), signal.SIGINT)
+        ...         print("complete")
+        ... except KeyboardInterrupt:
+        ...     print("interrupted")
+        complete
+        interrupted
+        >>> before = signal.signal(signal.SIGINT, before)
     """
+    handlers: dict[int, Callable[[int, FrameType | None], Any]] = {}
+    received: list[int] = []
+
+    def note(number: int, frame: FrameType | None) -> None:
+        received.append(number)
+        if len(received) > 1:
+            handlers[number](number, frame)
+
+    if threading.current_thread() is threading.main_thread():
+        for number in DEFERRED_SIGNALS:
+            handler = signal.getsignal(number)
+            if callable(handler):
+                handlers[number] = handler
+                signal.signal(number, note)
     try:
-        import fcntl
-    except ImportError:
-        return _lock_byte(file)
-    try:
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return False
-    except OSError:  # no locks here
-        return True
-    return True
-
-
-def _lock_byte(file: IO[bytes]) -> bool:
-    """Do what `lock_file` does on Windows."""
-    msvcrt: Any = importlib.import_module("msvcrt")
-    file.seek(BEYOND)
-    try:
-        msvcrt.locking(file.fileno(), msvcrt.LK_NBLCK, 1)
-    except OSError:
-        return False
-    return True
-
-
-def end_process(child: subprocess.Popen[bytes]) -> None:
-    """End a process at once, and what it has started where it leads a group of processes."""
-    with suppress(OSError):
-        if child.returncode is not None:  # its number may be that of another process by now
-            return
-        if hasattr(os, "killpg"):
-            os.killpg(child.pid, signal.SIGKILL)
-        else:
-            child.kill()
+        yield
+    finally:
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
+        if len(received) == 1:
+            handlers[received[0]](received[0], None)
 
 
 def limit_memory(n_bytes: int | None) -> None:
@@ -74,15 +74,3 @@ def limit_memory(n_bytes: int | None) -> None:
     hard = resource.getrlimit(resource.RLIMIT_DATA)[1]  # which only root may raise
     soft = data + n_bytes if hard == resource.RLIM_INFINITY else min(data + n_bytes, hard)
     resource.setrlimit(resource.RLIMIT_DATA, (soft, hard))
-
-
-def sync_folder(folder: Path) -> None:
-    """Return when the name of a new file is on the disk, where folders can be opened."""
-    try:
-        descriptor = os.open(folder, os.O_RDONLY)
-    except PermissionError:  # Windows opens no folder
-        return
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)

@@ -343,7 +343,7 @@ def estimate_highway_env(
     import agents
     import rare_envs
     import samplers
-    from rare_envs.study.execution.interruption import FIRST_BATCH, RunInterrupted, describe_stop
+    from rare_envs.study.interruption import FIRST_BATCH, RunInterrupted, describe_stop
 
     refused = sorted(typed - OPTIONS)
     if refused:

@@ -19,7 +19,6 @@ from agents.sb3.saved_ego import SavedEgo
 from rare_envs.arrays import AnyArray
 from rare_envs.devices.batch_sizes import CAMERA_TILE
 from rare_envs.egos.errors import reason_of
-from rare_envs.egos.faults import FaultTolerant
 from rare_envs.egos.policy import PolicyDriver
 from rare_envs.egos.wrappers import find_frame_stacking
 from rare_envs.problem import DrivingProblem
@@ -27,6 +26,7 @@ from rare_envs.sensors.kinds import batch_size, kinds_of, map_kinds
 from rare_envs.simulation.observation import observe
 from rare_envs.simulation.rollout import drive
 from rare_envs.study.ego_check.findings import Finding, report_failure, report_pass, report_warning
+from samplers.evaluate import Evaluator
 
 BATCH_ROWS = 32
 """Observations in a query."""
@@ -370,12 +370,12 @@ def check_memory_growth(probe: Probe) -> Iterator[Finding]:
 
 def check_driving(probe: Probe) -> Iterator[Finding]:
     """Drive a few ordinary scenarios."""
-    tolerant = FaultTolerant(probe.problem)
-    f = tolerant.evaluate(probe.problem.base.sample(BATCH_ROWS, np.random.default_rng(2)))
-    if tolerant.faults:
+    evaluator = Evaluator(probe.problem, on_error="failure")
+    f = evaluator.evaluate(probe.problem.base.sample(BATCH_ROWS, np.random.default_rng(2)))
+    if evaluator.faults:
         yield report_failure(
             "driving",
-            f"fails on {len(tolerant.faults)} of {BATCH_ROWS} ordinary scenarios: {tolerant.faults[0].reason}",
+            f"fails on {len(evaluator.faults)} of {BATCH_ROWS} ordinary scenarios: {evaluator.faults[0].reason}",
             "mend it, or count such scenarios with --on-error failure or bound",
         )
         return

@@ -98,8 +98,8 @@ def run_command(
     from rare_envs.problem import DrivingProblem
     from rare_envs.study import cli, writing
     from rare_envs.study.cli.options import ExecutorOptions
-    from samplers.execution.journal import JournalFile
-    from tests.samplers.execution.executors.real_executors import open_executor
+    from samplers.journal import JournalFile
+    from tests.samplers.real_executors import open_executor
 
     os.chdir(folder)
     for number, path in enumerate(outputs, 1):

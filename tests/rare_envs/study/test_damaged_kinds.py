@@ -25,7 +25,7 @@ from rare_envs.study.cli.app import app
 from rare_envs.study.html_report import atlas
 from rare_envs.study.html_report.figures import FigureOfPage
 from rare_envs.study.journal import JOURNAL, begin_journal
-from samplers.execution.journal import JournalRecord
+from samplers.journal import JournalRecord
 from tests.rare_envs.study.conftest import write_base
 
 FOLLOWING = "rare_envs/CarFollowing-v0"

@@ -25,8 +25,8 @@ from rare_envs.study.arguments import Question
 from rare_envs.study.errors import BadInput
 from rare_envs.study.journal import JOURNAL, begin_journal, continue_journal, digest_files
 from rare_envs.study.question import prepare
-from samplers.execution.executors import ExecutorError
-from samplers.execution.record_file import RecordFile
+from samplers.executors import ExecutorError
+from samplers.journal import RecordFile
 from tests.rare_envs.study.refusals import FOLLOWING, assert_refused
 
 Cli = Callable[..., Result]

@@ -24,11 +24,11 @@ from rare_envs.study.errors import BadInput
 from rare_envs.study.journal import JOURNAL, continue_journal
 from rare_envs.study.question import prepare
 from rare_envs.study.run_folder import RESULT_FILES
-from samplers.execution.record_file import RecordFile
+from samplers.journal import RecordFile
 from tests.rare_envs.study.conftest import write_base
 from tests.rare_envs.study.forked_command import TILE, ForkedCommand
 from tests.rare_envs.study.refusals import FOLLOWING, SMALL, assert_refused
-from tests.samplers.execution.executors.real_executors import case
+from tests.samplers.real_executors import case
 
 Cli = Callable[..., Result]
 NO_SPACE = OSError(28, "No space left on device")

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import samplers
-from samplers.execution.arguments import InputsOnly
+from samplers.arguments import InputsOnly
 from samplers.limit_states import half_space
 from samplers.method import Goal, TermsOffer
 

@@ -10,7 +10,6 @@ import signal
 import subprocess  # noqa: F401  (the standard library makes itself at home on this system first)
 import sys
 import tempfile  # noqa: F401
-import types
 
 POSIX_ONLY = {"fcntl", "resource", "pwd", "grp", "termios", "syslog"}
 """Modules that Windows does not have."""
@@ -36,8 +35,6 @@ for name in ("fork", "forkpty", "killpg", "getuid", "geteuid", "getpgid", "setsi
 for name in ("SIGHUP", "SIGPIPE", "SIGALRM", "SIGUSR1", "pthread_sigmask"):
     if hasattr(signal, name):
         delattr(signal, name)
-locked = []
-sys.modules["msvcrt"] = types.SimpleNamespace(LK_NBLCK=2, locking=lambda *words: locked.append(words))
 
 if words:
     from rare_envs.study.cli import main
@@ -52,5 +49,4 @@ else:
     arguments = {"seed": 0, "max_sim": 2000, "journal": os.path.join(folder, "run.journal")}
     first = samplers.estimate(problem, "mc", **arguments)
     again = samplers.estimate(problem, "mc", **arguments)
-    print(len(locked), first.p == again.p, os.path.exists(arguments["journal"]))
-    print(samplers.estimate(problem, "mc", seed=0, max_sim=2000, workers=1).p == first.p)
+    print(first.p == again.p, os.path.exists(arguments["journal"]))

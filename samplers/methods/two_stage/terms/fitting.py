@@ -16,7 +16,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from samplers.components import SubspaceGaussian, draw_counts, log_ratios, mixture_log_ratio
-from samplers.execution.executors.packing import join_terms
 from samplers.methods.two_stage.mixture import (
     LEAST_VARIANCE_OF_COMPONENT,
     GroupedPoints,
@@ -154,7 +153,7 @@ class TermHistory:
             new = np.logaddexp(new, np.log(n) + earlier.log_ratio(u))
         return TermHistory(
             np.concatenate([self.u, u]),
-            join_terms([self.terms, terms]),
+            _join_terms(self.terms, terms),
             np.concatenate([old, new]),
             (*self.proposals, (len(u), proposal)),
             self.n_base,
@@ -350,3 +349,10 @@ def near_points(history: TermHistory, term: int, gamma: float) -> NearPoints:
     rows = rows[: max(count, int(np.flatnonzero(under)[-1]) + 1 if under.any() else 0)]
     likely = fails[rows] if enough else np.ones(len(rows), dtype=bool)
     return NearPoints(rows, likely, enough and effective_sample_size(log_weights[fails]) >= ROUNDS.ready_ess)
+
+
+def _join_terms(first: Terms, second: Terms) -> Terms:
+    """Return the terms of two batches as those of one."""
+    parts = zip((first.f, first.values, first.ticks), (second.f, second.values, second.ticks), strict=True)
+    f, values, ticks = (np.concatenate(pair) for pair in parts)
+    return Terms(f, values, ticks, first.threshold, first.names or second.names)

@@ -16,8 +16,8 @@ from rare_envs.problem import DrivingProblem
 from rare_envs.study import evaluate, question
 from rare_envs.study import risk as total_risk
 from samplers import estimation
-from samplers.execution.journal import JournalFile, JournalRecord
-from samplers.execution.record_file import RecordFile
+from samplers.journal import JournalFile, JournalRecord
+from samplers.journal import RecordFile
 from tests.rare_envs.study.fitted_files import write_fitted
 from tests.rare_envs.study.refusals import FOLLOWING, Cli
 

@@ -13,7 +13,7 @@ import rare_envs
 from rare_envs.study import Question, prepare, resume, run_into
 from rare_envs.study.storage import episode_file
 from rare_envs.study.storage.episode_file import EpisodeBatch, EpisodeDraft, digest_scenario, name_columns
-from samplers.execution.journal import JournalFile
+from samplers.journal import JournalFile
 
 FOLLOWING = "rare_envs/CarFollowing-v0"
 

@@ -1,0 +1,226 @@
+"""Table of all simulations of a run: a draft grows while it runs, and becomes episodes.parquet when it is done.
+
+What a simulation weighs in p is known only at the end. So each batch goes into the draft, a stream of Arrow's, and the
+draft is read once more, part by part, when the run is done. Neither step holds more than `ROWS_AT_ONCE` simulations,
+or `BYTES_AT_ONCE` of them where they are large.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from tempfile import TemporaryFile
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+from numpy.typing import NDArray
+
+from rare_envs.distributions.space import ScenarioSpace
+from rare_envs.files import replace_file
+from rare_envs.study.columns import MAX_SHOWN
+from rare_envs.study.run_folder import EPISODES
+from samplers.evaluate import Simulated
+from samplers.journal import digest_points
+from samplers.problem import FloatArray
+from samplers.result import Estimate
+from samplers.sample import SimulationRows
+
+EPISODE_FORMAT = 1
+"""Version of the columns, in the metadata of the file; see docs/run_folder.md."""
+ROWS_AT_ONCE, BYTES_AT_ONCE = 2**16, 2**25
+"""Simulations of a row group, at most so many and so large."""
+BEFORE_X = {"simulation": pa.int64(), "run": pa.int32(), "stage": pa.int32()}
+BEHIND_X = {
+    "f": pa.float64(),
+    "failed": pa.bool_(),
+    "log_weight": pa.float64(),
+    "crash": pa.string(),
+    "error": pa.string(),
+    "seconds": pa.float32(),
+}
+DRAFTED = ("f", "error", "seconds")
+"""Columns beside x that are known while the run goes on."""
+
+
+def digest_scenario(x: NDArray[Any]) -> str:
+    """Return the digest of a scenario x (d,), in single precision, in which it is simulated."""
+    return digest_points(x.astype(np.float32))
+
+
+def name_columns(space: ScenarioSpace) -> dict[str, pa.DataType]:
+    """Return the columns of x and their types: numbers by name, and blocks of many values as lists."""
+    types: dict[str, pa.DataType] = {}
+    for name, size in zip(space.names, space.sizes, strict=True):
+        if size > MAX_SHOWN:  # in single precision, in which they are simulated
+            types[name] = pa.list_(pa.float32(), size)
+        else:
+            types |= dict.fromkeys([name] if size == 1 else [f"{name}[{k}]" for k in range(size)], pa.float64())
+    own = {*BEFORE_X, *BEHIND_X}
+    return {f"x.{name}" if name in own else name: kind for name, kind in types.items()}
+
+
+class EpisodeTable:
+    """The table of a run. It is no part of the answer: where it cannot be written, the run goes on without it.
+
+    The draft is a file without a name, which is gone when the process is.
+
+    Args:
+        folder: Of the run.
+        space: Of x.
+
+    Attributes:
+        lost: Why there is no table; "" as long as all is well.
+    """
+
+    def __init__(self, folder: Path, space: ScenarioSpace) -> None:
+        self.lost = ""
+        self._folder, self._columns = folder, name_columns(space)
+        self._waiting: list[Simulated] = []
+        self._rows = max(min(ROWS_AT_ONCE, BYTES_AT_ONCE // (8 * max(sum(space.sizes), 1))), 1)
+        self._schema = pa.schema([*self._columns.items(), *((name, BEHIND_X[name]) for name in DRAFTED)])
+        self._file: Any = None
+        with self._giving_up():
+            self._file = TemporaryFile(dir=folder)
+            self._writer = pa.ipc.new_stream(self._file, self._schema)
+
+    def add(self, seen: Simulated) -> None:
+        """Add simulations."""
+        if self._file is None:
+            return
+        self._waiting.append(seen)
+        if sum(len(each.f) for each in self._waiting) >= self._rows:
+            with self._giving_up():
+                self._write_draft()
+
+    def write(self, estimate: Estimate, crashes: Mapping[str, str]) -> None:
+        """Write the table of a run that is done.
+
+        Args:
+            estimate: Its result.
+            crashes: Kinds of crash of failures that were driven again, by `digest_scenario`.
+        """
+        if self._file is None:
+            return
+        schema = pa.schema(
+            [*BEFORE_X.items(), *self._columns.items(), *BEHIND_X.items()],
+            metadata={"rare_envs.format": str(EPISODE_FORMAT)},
+        )
+        with self._giving_up():
+            self._folder.mkdir(parents=True, exist_ok=True)  # somebody may have removed it
+            with (
+                replace_file(self._folder / EPISODES) as path,
+                pq.ParquetWriter(path, schema, compression="zstd") as file,
+            ):
+                first = 0
+                for batch in self._read_draft():
+                    known = {**_describe(batch, estimate, first), **self._find_crashes(batch, estimate.gamma, crashes)}
+                    columns = [known[name] if name in known else batch.column(name) for name in schema.names]
+                    file.write_batch(pa.record_batch(columns, schema=schema))
+                    first += batch.num_rows
+
+    def close(self) -> None:
+        """Drop the draft: after an interruption the journal has what is needed to make it again."""
+        if self._file is not None:
+            with contextlib.suppress(OSError):
+                self._file.close()
+            self._file = None
+            self._waiting.clear()
+
+    @contextlib.contextmanager
+    def _giving_up(self) -> Iterator[None]:
+        """Go on without a table after an error of the disk."""
+        try:
+            yield
+        except OSError as error:
+            self.lost = f"{EPISODES} could not be written: {error.strerror or error}"
+            self.close()
+
+    def _write_draft(self) -> None:
+        """Write what waits."""
+        if not self._waiting:
+            return
+        rows = [(each.x, each.f, each.seconds) for each in self._waiting]
+        x, f, seconds = (np.concatenate(parts) for parts in zip(*rows, strict=True))
+        errors = np.full(len(f), None, dtype=object)
+        errors[np.isnan(f)] = [reason for each in self._waiting for reason in each.reasons]
+        self._waiting.clear()
+        for first in range(0, len(f), self._rows):
+            part = slice(first, first + self._rows)
+            own = (f[part], errors[part], seconds[part].astype(np.float32))
+            arrays = [*self._split(x[part]), *(pa.array(v, BEHIND_X[n]) for n, v in zip(DRAFTED, own, strict=True))]
+            self._writer.write_batch(pa.record_batch(arrays, schema=self._schema))
+
+    def _split(self, x: FloatArray) -> Iterator[Any]:
+        """Yield the columns of x (n, d) as Arrow's."""
+        ends = np.cumsum([kind.list_size if _is_list(kind) else 1 for kind in self._columns.values()])
+        for kind, part in zip(self._columns.values(), np.split(x, ends[:-1], axis=1), strict=True):
+            if _is_list(kind):
+                values = pa.array(np.ascontiguousarray(part, dtype=np.float32).ravel())
+                yield pa.FixedSizeListArray.from_arrays(values, kind.list_size)
+            else:
+                yield pa.array(part[:, 0], kind)
+
+    def _read_draft(self) -> Iterator[pa.RecordBatch]:
+        """Go through all simulations, part by part; there will be no more of them."""
+        self._write_draft()
+        self._writer.close()
+        self._file.seek(0)
+        with pa.ipc.open_stream(self._file) as reader:
+            yield from reader
+
+    def _find_crashes(self, batch: pa.RecordBatch, gamma: float, crashes: Mapping[str, str]) -> dict[str, Any]:
+        """Return the columns on failures: the kind of crash is null where a failure was not driven again."""
+        f = batch.column("f").to_numpy()
+        failed = np.isnan(f) | (f <= gamma)
+        found, rows = np.full(len(f), None, dtype=object), np.flatnonzero(failed)
+        if len(rows) and crashes:
+            failing = batch.take(pa.array(rows))
+            x = np.hstack([_as_table(failing.column(name)) for name in self._columns])
+            found[rows] = [crashes.get(digest_scenario(row)) for row in x]
+        return {"failed": pa.array(failed), "crash": pa.array(found, pa.string())}
+
+
+def _describe(batch: pa.RecordBatch, estimate: Estimate, first: int) -> dict[str, Any]:
+    """Return the columns on what simulations were made for, from number `first` on."""
+    about, f = describe_simulations(estimate, first, batch.num_rows), batch.column("f").to_numpy()
+    return {
+        "simulation": pa.array(np.arange(first, first + batch.num_rows)),
+        "run": pa.array(about.run, type=pa.int32()),
+        "stage": pa.array(about.stage, type=pa.int32(), mask=about.stage < 0),
+        "f": pa.array(f, mask=np.isnan(f)),
+        "log_weight": pa.array(about.log_weight, mask=np.isnan(about.log_weight)),
+    }
+
+
+def describe_simulations(estimate: Estimate, first: int, n: int) -> SimulationRows:
+    """Return what simulations were made for, those of the further run under the refits included.
+
+    The further run has the number after the last replicate, and its simulations have no weight in p.
+    """
+    index, further = estimate.simulations, estimate.ensemble_run
+    run, stage, log_weight = np.full(n, -1), np.full(n, -1), np.full(n, np.nan)
+    n_first = 0 if index is None else index.n
+    inside = max(min(n_first - first, n), 0)
+    if index is not None and inside:
+        run[:inside], stage[:inside], log_weight[:inside] = index.describe(first, inside)
+    more = None if further is None else further.simulations
+    start = first + inside - n_first
+    rest = 0 if more is None else max(min(more.n - start, n - inside), 0)
+    if index is not None and more is not None and rest:
+        rows = slice(inside, inside + rest)
+        run[rows] = 1 + max(number for number, _, _ in index.spans)
+        stage[rows] = more.describe(start, rest).stage
+    return SimulationRows(run, stage, log_weight)
+
+
+def _is_list(kind: pa.DataType) -> bool:
+    return bool(pa.types.is_fixed_size_list(kind))
+
+
+def _as_table(column: pa.Array) -> NDArray[np.float32]:
+    """Return a column of x, numbers or lists, as an array of shape (n, k)."""
+    values: NDArray[np.float32] = (column.flatten() if _is_list(column.type) else column).to_numpy().astype(np.float32)
+    return values.reshape(len(column), -1)

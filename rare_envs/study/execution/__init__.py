@@ -1,1 +1,0 @@
-"""Simulations of a study: in chunks, from a journal, here or by workers."""

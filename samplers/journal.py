@@ -1,0 +1,405 @@
+"""Journal: the finished simulations of a run in a file, so that one that was interrupted can be continued.
+
+Methods draw by their seed alone. A continued run therefore asks for the same points in the same order, takes their
+outcomes from the journal for as long as it has any, and comes to the result of an undisturbed run.
+
+The file is a database of SQLite in WAL mode, which one process alone has open. A chunk of finished simulations is a row
+of its own transaction, under a digest of its points. What was written is on the disk after `SYNC_SECONDS`, or after the
+chunk if that takes longer.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import hashlib
+import json
+import os
+import sqlite3
+import stat
+import time
+import warnings
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+from urllib.parse import quote
+
+import numpy as np
+from numpy.typing import NDArray
+
+from samplers.chunks import Result
+
+SYNC_SECONDS = 1.0
+"""Longest time for which finished simulations are not on the disk yet: what a power cut loses, beside the chunk."""
+FORMAT = 0x72656A31
+"""Application id of the file."""
+TABLES = (
+    f"PRAGMA application_id = {FORMAT}",
+    "CREATE TABLE chunks (id INTEGER PRIMARY KEY, points TEXT UNIQUE, width INTEGER, n_sim INTEGER, seconds REAL, "
+    "notes TEXT, numbers BLOB, digest BLOB)",
+)
+COLUMNS = "id, points, width, n_sim, seconds, notes, numbers"
+INSERT = f"INSERT OR IGNORE INTO chunks ({COLUMNS}, digest) VALUES (?, ?, ?, ?, ?, ?, ?, ?)"
+HEAD = 0
+"""Number of the record that says what the run is, in its notes; chunks have 1 and more."""
+
+
+class JournalError(ValueError):
+    """A journal cannot be used: it is damaged, in use, or of another run."""
+
+    final = True
+    """Simulating again would not help."""
+
+
+class NothingRecorded(JournalError):
+    """A journal was cut before its first record was written, so that nothing is lost by beginning it anew."""
+
+
+class JournalInUse(JournalError):
+    """Another process has the journal open."""
+
+
+class _Row(NamedTuple):
+    """A record as it is stored, but for its digest."""
+
+    id: int
+    points: str
+    width: int
+    n_sim: int
+    seconds: float
+    notes: str
+    numbers: bytes
+
+    @property
+    def digest(self) -> bytes:
+        return hashlib.blake2b(repr(self[:6]).encode() + self.numbers, digest_size=16).digest()
+
+
+def digest_points(x: NDArray[Any]) -> str:
+    """Return the digest of points x, by which a record knows them again."""
+    return hashlib.blake2b(repr(x.shape).encode() + np.ascontiguousarray(x).tobytes(), digest_size=16).hexdigest()
+
+
+class Journal:
+    """Finished simulations of a run.
+
+    An interruption of a call leaves the file as it was before the call, or as it is after it.
+
+    Attributes:
+        path: Of the file.
+        head: What the run is, JSON-ready.
+        earlier_seconds: Wall time of the run before this journal was opened, up to its last record [s].
+
+    Example:
+        >>> from tempfile import TemporaryDirectory
+        >>> with TemporaryDirectory() as folder:
+        ...     journal = Journal.create(Path(folder) / "journal.bin", {"seed": 1})
+        ...     journal.append("of x", Result(np.array([[2.0], [-1.0]]), {}), 2)
+        ...     journal.close()
+        ...     journal = Journal.open(Path(folder) / "journal.bin")
+        ...     print(journal.head, journal.find("of x").table.ravel(), journal.find("of others"))
+        ...     journal.close()
+        {'seed': 1} [ 2. -1.] None
+    """
+
+    def __init__(self, path: Path, connection: sqlite3.Connection, head: dict[str, Any]) -> None:
+        """Use an open file; see `create` and `open`."""
+        self.path, self.head, self._absolute = path, head, path.absolute()  # the working directory may change
+        self._connection, self._file = connection, os.stat(path)
+        self._waiting: list[_Row] = []  # not yet written
+        self._opened = self._synced = time.monotonic()
+        self._earlier, self._last_taken, self._warned = self._number_of_last(), HEAD, False
+        last = connection.execute("SELECT seconds FROM chunks ORDER BY id DESC LIMIT 1").fetchone()
+        self.earlier_seconds: float = last[0]
+
+    @classmethod
+    def create(cls, path: Path, head: dict[str, Any], replace: bool = False) -> Journal:
+        """Begin a journal.
+
+        Args:
+            path: Of the file; one without any finished simulations is replaced.
+            head: What the run is, JSON-ready.
+            replace: Replace a journal with finished simulations too.
+
+        Raises:
+            JournalError: There is one already, or another process has it open.
+            OSError: It cannot be written.
+        """
+        if _has_simulations(path) and not replace:
+            raise JournalError(f"There is a journal already, {str(path)!r}: remove it, or choose another file.")
+        for name in (path, _wal(path)):
+            name.unlink(missing_ok=True)
+        os.close(os.open(path, os.O_CREAT | os.O_EXCL, 0o666))  # raises what is wrong with the place
+        connection = _connect(path)
+        try:
+            connection.execute("BEGIN")
+            for statement in TABLES:
+                connection.execute(statement)
+            row = _Row(HEAD, "", 0, 0, 0.0, json.dumps(head), b"")
+            connection.execute(INSERT, (*row, row.digest))
+            connection.execute("COMMIT")
+            connection.execute("PRAGMA wal_checkpoint")
+        except sqlite3.Error as error:
+            connection.close()
+            raise OSError(errno.EIO, str(error)) from error
+        return cls(path, connection, head)
+
+    @classmethod
+    def open(cls, path: Path, mend: bool = False) -> Journal:
+        """Continue a journal, all of whose digests are verified.
+
+        Args:
+            path: Of the file.
+            mend: Of a damaged journal, keep what stands before the damage; one whose first record is damaged is left
+                as it is.
+
+        Raises:
+            NothingRecorded: It was cut before its first record.
+            JournalError: It is damaged, with `mend` in its first record, or another process has it open.
+            OSError: It cannot be read.
+        """
+        _check_file(path)
+        connection = _connect(path)
+        try:
+            head = _verify(path, connection)
+        except _Damaged as damage:
+            connection.close()
+            if not (mend and damage.number > HEAD):
+                raise
+            _keep_before(path, damage.number)
+            return cls.open(path)
+        except sqlite3.DatabaseError as error:
+            connection.close()
+            raise _Damaged(path, HEAD) from error
+        except BaseException:
+            connection.close()
+            raise
+        return cls(path, connection, head)
+
+    @property
+    def n(self) -> int:
+        """Simulations in the file."""
+        return int(self._connection.execute("SELECT coalesce(sum(n_sim), 0) FROM chunks").fetchone()[0])
+
+    @property
+    def has_simulations(self) -> bool:
+        """Whether there are finished simulations."""
+        return bool(self._waiting) or self._number_of_last() > HEAD
+
+    @property
+    def has_others(self) -> bool:
+        """Whether an earlier run has recorded something after the last chunk that this one has found."""
+        return self._last_taken < self._earlier
+
+    def find(self, points: str) -> Result | None:
+        """Return the result of some points by their digest; None where they are not recorded.
+
+        Raises:
+            JournalError: It is none.
+        """
+        found = self._connection.execute(f"SELECT {COLUMNS} FROM chunks WHERE points = ?", (points,)).fetchone()
+        if found is None:
+            return None
+        row = _Row(*found)
+        self._last_taken = max(self._last_taken, row.id)
+        try:
+            numbers = np.frombuffer(row.numbers, "<f8").astype(np.float64)
+            return Result(numbers.reshape(-1, row.width), dict(json.loads(row.notes)))
+        except (ValueError, TypeError, RecursionError) as error:
+            raise JournalError(f"{str(self.path)!r} is no journal of this version: {error}.") from error
+
+    def append(self, points: str, result: Result, n_sim: int) -> None:
+        """Write finished simulations; those that cannot be written now are tried again with the next ones.
+
+        Args:
+            points: Digest of the points.
+            result: Of the points.
+            n_sim: Number of simulations.
+
+        Warns:
+            UserWarning: They cannot be written; once.
+        """
+        numbers = np.ascontiguousarray(result.table, dtype="<f8").tobytes()
+        seconds, notes = round(self._elapsed(), 3), json.dumps(result.notes)
+        self._waiting.append(_Row(-1, points, result.table.shape[1], n_sim, seconds, notes, numbers))
+        self._write_waiting()
+
+    def flush(self) -> bool:
+        """Write what is left, and return whether all simulations so far are in a file that is still there."""
+        self._write_waiting()
+        return not self._waiting and self._exists
+
+    def close(self) -> None:
+        """Leave the journal for later."""
+        with contextlib.suppress(sqlite3.ProgrammingError):  # closed before
+            self._write_waiting()
+        self._connection.close()
+
+    def remove(self) -> None:
+        """Remove the journal of a run that is done."""
+        there = self._exists
+        self._connection.close()
+        if there:
+            self._absolute.unlink()
+            _wal(self._absolute).unlink(missing_ok=True)
+
+    @property
+    def _exists(self) -> bool:
+        """Whether the path still names this file."""
+        try:
+            return os.path.samestat(self._file, self._absolute.stat())
+        except OSError:
+            return False
+
+    def _elapsed(self) -> float:
+        """Return the wall time of the run so far, without that between an interruption and its resumption [s]."""
+        return self.earlier_seconds + time.monotonic() - self._opened
+
+    def _number_of_last(self) -> int:
+        return int(self._connection.execute("SELECT max(id) FROM chunks").fetchone()[0])
+
+    def _write_waiting(self) -> None:
+        try:
+            while self._waiting:  # a record that was written before an interruption is ignored: its points are there
+                row = self._waiting[0]._replace(id=self._number_of_last() + 1)
+                self._insert(row)
+                del self._waiting[0]
+            if time.monotonic() - self._synced >= SYNC_SECONDS:
+                self._connection.execute("PRAGMA wal_checkpoint")
+                self._synced = time.monotonic()
+        except sqlite3.OperationalError as error:
+            if not self._warned:
+                self._warned = True
+                warnings.warn(
+                    f"Cannot write {str(self.path)!r}: {error}. The run goes on, but if it is interrupted now the "
+                    "simulations from here on are lost.",
+                    stacklevel=4,
+                )
+
+    def _insert(self, row: _Row) -> None:
+        self._connection.execute(INSERT, (*row, row.digest))
+
+
+class _Damaged(JournalError):
+    """A record does not match its digest."""
+
+    def __init__(self, path: Path, number: int) -> None:
+        self.number = number
+        where = f": record {number + 1} does" if number > HEAD else " from its first record on, which does"
+        super().__init__(f"{str(path)!r} is damaged{where} not match its checksum.")
+
+
+def _connect(path: Path) -> sqlite3.Connection:
+    """Return a connection to a file that nobody else has.
+
+    Raises:
+        JournalError: Another process has it, or it is no journal.
+    """
+    uri = f"file:{quote(str(path.absolute()))}?mode=rw"
+    connection = sqlite3.connect(uri, uri=True, timeout=0.0, isolation_level=None)
+    try:
+        for statement in ("locking_mode = EXCLUSIVE", "trusted_schema = OFF", "journal_mode = WAL"):
+            connection.execute(f"PRAGMA {statement}")
+        connection.execute("PRAGMA synchronous = NORMAL")
+        connection.execute("BEGIN IMMEDIATE")  # takes the lock, which stays
+        connection.execute("COMMIT")
+    except sqlite3.DatabaseError as error:
+        connection.close()
+        if "locked" in str(error):
+            words = f"Another process is writing {str(path)!r}: wait for it to end, or choose another file."
+            raise JournalInUse(words) from error
+        if "malformed" in str(error):
+            raise _Damaged(path, HEAD) from error
+        raise JournalError(f"{str(path)!r} is of another kind or version: remove it to begin anew.") from error
+    return connection
+
+
+def _check_file(path: Path) -> None:
+    """Raise unless there is an ordinary file; a pipe would be waited for."""
+    found = os.stat(path)
+    if not stat.S_ISREG(found.st_mode):
+        raise JournalError(f"{str(path)!r} is no ordinary file.")
+    if found.st_size == 0 and not _wal(path).exists():
+        raise NothingRecorded(f"{str(path)!r} was cut at its beginning; nothing is recorded in it.")
+
+
+def _verify(path: Path, connection: sqlite3.Connection) -> dict[str, Any]:
+    """Return the head of a journal all of whose records match their digests."""
+    if not connection.execute("SELECT 1 FROM sqlite_master").fetchall():
+        raise NothingRecorded(f"{str(path)!r} was cut before its first record; nothing is recorded in it.")
+    if connection.execute("PRAGMA application_id").fetchone()[0] != FORMAT:
+        raise JournalError(f"{str(path)!r} is of another kind or version: remove it to begin anew.")
+    head: dict[str, Any] = {}
+    for row in _good_rows(path, connection):
+        if row.id == HEAD:
+            head = _read_head(path, row.notes)
+    return head
+
+
+def _read_head(path: Path, text: str) -> dict[str, Any]:
+    try:
+        head = json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise JournalError(f"{str(path)!r} is no journal: {error}.") from error
+    if not isinstance(head, dict):
+        raise JournalError(f"{str(path)!r} is no journal: its head is no object.")
+    return head
+
+
+def _good_rows(path: Path, connection: sqlite3.Connection) -> Iterator[_Row]:
+    """Yield the records in their order.
+
+    Raises:
+        JournalError: The next one is damaged.
+    """
+    number = HEAD
+    try:
+        for *fields, digest in connection.execute(f"SELECT {COLUMNS}, digest FROM chunks ORDER BY id"):
+            row = _Row(*fields)
+            if row.id != number or not isinstance(row.numbers, bytes) or row.digest != digest:
+                raise _Damaged(path, number)
+            yield row
+            number += 1
+    except sqlite3.DatabaseError as error:
+        raise _Damaged(path, number) from error
+    if number == HEAD:
+        raise _Damaged(path, HEAD)
+
+
+def _keep_before(path: Path, number: int) -> None:
+    """Replace a journal by one of its records before a damaged one."""
+    new = path.with_name(f"{path.name}.mended")
+    for name in (new, _wal(new)):
+        name.unlink(missing_ok=True)
+    new.touch()
+    with contextlib.closing(_connect(path)) as damaged, contextlib.closing(_connect(new)) as mended:
+        for statement in TABLES:
+            mended.execute(statement)
+        rows = _good_rows(path, damaged)
+        for _ in range(number):
+            row = next(rows)
+            mended.execute(INSERT, (*row, row.digest))
+    _wal(path).unlink(missing_ok=True)
+    os.replace(new, path)
+
+
+def _has_simulations(path: Path) -> bool:
+    """Return whether a file has chunks, or is damaged or of another kind, so that somebody may want to keep it.
+
+    Raises:
+        JournalInUse: Another process has it open.
+    """
+    try:
+        with contextlib.closing(Journal.open(path)) as journal:
+            return journal.has_simulations
+    except (FileNotFoundError, NothingRecorded):
+        return False
+    except JournalInUse:
+        raise
+    except JournalError:
+        return True
+
+
+def _wal(path: Path) -> Path:
+    """Return the file that SQLite keeps beside a database for what is not yet in it."""
+    return path.with_name(f"{path.name}-wal")

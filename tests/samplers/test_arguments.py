@@ -1,0 +1,183 @@
+"""Arguments of a run are checked where they are given; a base whose map does not fit its draws is refused."""
+
+import inspect
+from collections.abc import Callable
+from dataclasses import fields
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy import stats
+
+import samplers
+from samplers import testing
+from samplers.arguments import (
+    FALSE_ALARM,
+    N_DRAWS,
+    RunArguments,
+    _find_other_law,
+    check_arguments,
+    check_problem,
+    choose_seed,
+    find_base_fault,
+)
+from samplers.problem import FloatArray, StandardNormal
+
+PROBLEM = samplers.FunctionProblem(lambda x: x[:, 0], 2)
+
+
+@pytest.mark.parametrize("door", [samplers.estimate, samplers.Method.start])
+def test_the_defaults_of_the_front_doors_are_these(door):
+    defaults = {name: each.default for name, each in inspect.signature(door).parameters.items()}
+    assert {each.name: defaults[each.name] for each in fields(RunArguments)} == vars(RunArguments())
+
+
+def test_goal_has_numbers_of_python():
+    arguments = RunArguments(gamma=np.float32(0.5), max_sim=np.int16(900), target_cov=np.float32(0.25), confidence=0.9)
+    goal = arguments.goal
+    assert (goal.gamma, goal.max_sim, goal.target_cov, goal.confidence) == (0.5, 900, 0.25, 0.9)
+    assert [type(value) for value in (goal.gamma, goal.max_sim, goal.target_cov)] == [float, int, float]
+
+
+def test_goal_without_limits():
+    goal = RunArguments().goal
+    assert (goal.max_sim, goal.target_cov) == (None, None)
+
+
+@pytest.mark.parametrize(
+    ("options", "expected"),
+    [
+        ({"gamma": np.nan}, "gamma to be a finite number, got nan"),
+        ({"confidence": 1.0}, "confidence to be a number between 0 and 1, got 1.0"),
+        ({"target_cov": 0}, "target_cov to be a number above 0, got 0"),
+        ({"max_sim": 10**99}, "max_sim to be at most 1,000,000,000,000, got 1.00e"),
+        ({"replicates": 4, "max_sim": 3}, "max_sim to be a whole number of at least 4, got 3"),
+        ({"seed": -1}, "seed to be a whole number of at least 0, got -1"),
+        ({"on_error": "fail"}, "Unknown on_error 'fail'. Did you mean 'failure'"),
+    ],
+)
+def test_a_value_out_of_range_is_refused_where_it_is_given(options, expected):
+    with pytest.raises(ValueError, match=expected):
+        RunArguments(**options)
+
+
+def test_a_seed_is_kept_or_drawn():
+    assert choose_seed(np.int64(7)) == 7
+    assert type(choose_seed(np.int64(7))) is int
+    drawn = {choose_seed(None) for _ in range(8)}
+    assert len(drawn) == 8  # equal by chance once in 1.5e8 times
+    assert all(0 <= seed < 2**32 for seed in drawn)
+
+
+def test_what_a_run_needs():
+    check_arguments(SimpleNamespace(dim=2, base=samplers.StandardNormal(2)), samplers.MonteCarlo())
+    for method, expected in [(samplers.MonteCarlo, "add brackets"), ("mc", "such as MonteCarlo"), (None, "got None")]:
+        with pytest.raises(ValueError, match=expected):
+            check_arguments(PROBLEM, method)
+
+
+@pytest.mark.parametrize(
+    ("problem", "expected"),
+    [
+        (
+            SimpleNamespace(dim=2, base=samplers.StandardNormal(2)),
+            "dim, base and evaluate, got SimpleNamespace without ev",
+        ),
+        (
+            SimpleNamespace(dim=0, base=samplers.StandardNormal(2), evaluate=len),
+            "dim to be a whole number of at least 1",
+        ),
+        (SimpleNamespace(dim=2, base=np.random, evaluate=len), "problem.base to have sample, log_prob, .* got module"),
+    ],
+    ids=["no f", "no dimension", "no distribution"],
+)
+def test_a_problem_that_is_none_is_named(problem, expected):
+    with pytest.raises(ValueError, match=expected):
+        check_problem(problem, ("dim", "base", "evaluate"))
+
+
+class Exponential:
+    """Independent exponential coordinates; the parts can be replaced by others that do not fit."""
+
+    def __init__(self, dim: int = 2, **parts: Callable[..., Any]) -> None:
+        self.dim, self.parts = dim, parts
+
+    def sample(self, n: int, rng: np.random.Generator) -> FloatArray:
+        return self._part("sample", lambda n, rng: rng.exponential(size=(n, self.dim)))(n, rng)
+
+    def log_prob(self, x: FloatArray) -> FloatArray:
+        return self._part("log_prob", lambda x: stats.expon.logpdf(x).sum(axis=1))(x)
+
+    def to_standard_normal(self, x: FloatArray) -> FloatArray:
+        return self._part("to_standard_normal", lambda x: stats.norm.isf(stats.expon.sf(x)))(x)
+
+    def from_standard_normal(self, u: FloatArray) -> FloatArray:
+        return self._part("from_standard_normal", lambda u: stats.expon.isf(stats.norm.sf(u)))(u)
+
+    def _part(self, name: str, usual: Callable[..., Any]) -> Callable[..., Any]:
+        return self.parts.get(name, usual)
+
+
+def correlated(n: int, rng: np.random.Generator) -> FloatArray:
+    first = rng.standard_normal(n)
+    both = np.column_stack([first, 0.8 * first + 0.6 * rng.standard_normal(n)])
+    return np.asarray(stats.expon.isf(stats.norm.sf(both)))
+
+
+WRONG: dict[str, tuple[dict[str, Callable[..., Any]], str]] = {
+    "another scale": ({"sample": lambda n, rng: 3.0 * rng.exponential(size=(n, 2))}, "mean|standard deviation"),
+    "another spread": (
+        {"sample": lambda n, rng: stats.expon.isf(stats.norm.sf(1.5 * rng.standard_normal((n, 2))))},
+        "standard deviation 1",
+    ),
+    "another shape": (
+        {"sample": lambda n, rng: stats.expon.isf(stats.norm.sf(np.sign(rng.standard_normal((n, 2)))))},
+        "is not normal",
+    ),
+    "correlated": ({"sample": correlated}, r"correlation 0\.[78]\d? between coordinates 0 and 1"),
+    "no inverse": ({"from_standard_normal": lambda u: stats.norm.cdf(u)}, "where x is"),
+    "NaN": ({"to_standard_normal": lambda x: np.log(x - 1)}, "NaN or infinity"),
+    "transposed": ({"sample": lambda n, rng: rng.exponential(size=(2, n))}, r"shape \(2, 200\)"),
+    "infinite draws": ({"sample": lambda n, rng: np.full((n, 2), np.inf)}, "sample.* gave NaN or infinity"),
+    "no density": ({"log_prob": lambda x: np.full(len(x), -np.inf)}, "200 finite numbers"),
+    "a column too few": ({"to_standard_normal": lambda x: x[:, :1]}, r"shapes \(200, 1\)"),
+}
+
+
+@pytest.mark.filterwarnings("ignore:invalid value")
+@pytest.mark.parametrize("name", WRONG)
+def test_what_does_not_fit_is_refused_by_estimate_and_by_the_check(name: str) -> None:
+    parts, words = WRONG[name]
+
+    class Problem:
+        dim, base = 2, Exponential(2, **parts)
+
+        def evaluate(self, x: FloatArray) -> FloatArray:
+            raise AssertionError("nothing is to be simulated")
+
+    with pytest.raises(ValueError, match=rf"problem\.base.*({words})"):
+        samplers.estimate(Problem(), seed=0, max_sim=1000)
+    with pytest.raises(AssertionError, match=words):
+        testing.check_base(Problem.base, 2)
+
+
+def test_what_fits_is_not_refused() -> None:
+    for dim in (1, 2, 40, 400):
+        testing.check_base(Exponential(dim), dim)
+        testing.check_base(StandardNormal(dim), dim)
+
+    def missing(x: FloatArray) -> FloatArray:
+        raise NotImplementedError  # as a base says that it has no map, which plain Monte Carlo does not need
+
+    testing.check_base(Exponential(2, to_standard_normal=missing), 2)
+
+
+def test_statistics_of_standard_normal_draws_stay_within_the_level(monkeypatch: pytest.MonkeyPatch) -> None:
+    """With a level of 0.2 at most a fifth of 2,000 sets may be refused, and not none of them: 4 binomial deviations."""
+    monkeypatch.setattr("samplers.arguments.FALSE_ALARM", 0.2)
+    rng = np.random.default_rng(3)
+    refused = sum(_find_other_law(rng.standard_normal((N_DRAWS, 3))) is not None for _ in range(2000))
+    assert 0.05 * 2000 < refused < 0.2 * 2000 + 4 * (2000 * 0.2 * 0.8) ** 0.5
+    assert FALSE_ALARM == 1e-6
+    assert find_base_fault(StandardNormal(3), 3) is None

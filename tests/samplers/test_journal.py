@@ -1,0 +1,418 @@
+"""A run that is killed, or cannot write, comes to the result of an undisturbed one; nobody else's journal is taken."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import signal
+import sqlite3
+import subprocess
+import sys
+import time
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+import numpy as np
+import pytest
+
+import samplers
+from samplers import journal as journals
+from samplers.chunks import Result
+from samplers.journal import Journal, JournalError, NothingRecorded, digest_points
+from samplers.problem import FloatArray, TermGradients, Terms
+
+F = Callable[[FloatArray], FloatArray]
+ONE = Result(np.ones((3, 1)), {})
+
+
+def half_space(x: FloatArray) -> FloatArray:
+    return 3.0 - x.sum(axis=1) / x.shape[1] ** 0.5
+
+
+def raising(x: FloatArray) -> FloatArray:
+    if (x[:, 0] > 2.5).any():
+        raise ArithmeticError("off the map")
+    return half_space(x)
+
+
+def run(path: Path | None, f: F = half_space, method: str = "two-stage", **more: object) -> samplers.Estimate:
+    arguments = {"seed": 4, "max_sim": 3000, "on_error": "bound", "journal": path, **more}
+    return samplers.estimate(samplers.FunctionProblem(f, 4), method, **arguments)  # type: ignore[arg-type]
+
+
+class Counted:
+    """Counts the points of each call, and is interrupted at one of them."""
+
+    def __init__(self, f: F = half_space, stop_at: int | None = None) -> None:
+        self.f, self.stop_at = f, stop_at
+        self.sizes: list[int] = []
+
+    def __call__(self, x: FloatArray) -> FloatArray:
+        if len(self.sizes) == self.stop_at:
+            raise KeyboardInterrupt
+        self.sizes.append(len(x))
+        return self.f(x)
+
+
+@pytest.mark.parametrize(("method", "f"), [("two-stage", raising), ("adss", half_space), ("mc", raising)])
+def test_interrupted_anywhere_it_comes_to_the_same_result(method: str, f: F, tmp_path: Path) -> None:
+    whole, counted = run(None, f, method), Counted(f)
+    run(None, counted, method)
+    for number, stop_at in enumerate((1, len(counted.sizes) // 2, len(counted.sizes) - 1)):
+        path = tmp_path / str(number)
+        with pytest.raises(KeyboardInterrupt):
+            run(path, Counted(f, stop_at), method)
+        assert run(path, f, method) == whole
+
+
+def test_a_finished_run_takes_no_simulations_but_those_that_check_f(tmp_path: Path) -> None:
+    first = run(tmp_path / "j", method="mc", seed=None)
+    counted = Counted()
+    assert run(tmp_path / "j", counted, "mc", seed=None) == first  # of the seed that was drawn
+    assert counted.sizes == [8]
+    assert run(tmp_path / "j", method="mc", seed=first.seed) == first
+
+
+def test_a_longer_run_of_plain_monte_carlo_continues(tmp_path: Path) -> None:
+    short = samplers.MonteCarlo(batch=500)
+    problem = samplers.FunctionProblem(half_space, 4)
+    samplers.estimate(problem, short, seed=1, max_sim=2000, journal=tmp_path / "j")
+    counted = Counted()
+    longer = samplers.estimate(
+        samplers.FunctionProblem(counted, 4), short, seed=1, max_sim=3000, journal=tmp_path / "j"
+    )
+    assert longer == samplers.estimate(problem, short, seed=1, max_sim=3000)
+    assert counted.sizes == [8, 500, 500]
+
+
+@pytest.mark.parametrize("begun_by_executor", [False, True])
+def test_what_is_begun_with_or_without_an_executor_continues_the_other_way(
+    begun_by_executor: bool, tmp_path: Path
+) -> None:
+    here = [samplers.InProcess(), None] if begun_by_executor else [None, samplers.InProcess()]
+    method = samplers.MonteCarlo(batch=100)
+    stops = Counted(stop_at=20 if begun_by_executor else 3)
+    for f, executor in zip((stops, half_space), here, strict=True):
+        problem = samplers.FunctionProblem(f, 4)
+        arguments = {"seed": 1, "max_sim": 600, "journal": tmp_path / "j", "executor": executor}
+        if f is stops:
+            with pytest.raises(KeyboardInterrupt):
+                samplers.estimate(problem, method, **arguments)
+    result = samplers.estimate(problem, method, **arguments)
+    whole = samplers.estimate(samplers.FunctionProblem(half_space, 4), method, seed=1, max_sim=600)
+    assert (result.p, result.n_sim, result.failures.total) == (whole.p, 600, whole.failures.total)
+
+
+def test_what_does_not_belong_to_the_journal_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "j"
+    run(path)
+    cases: list[tuple[str, dict[str, object]]] = [
+        ("begun with seed 4, and this run has 5", {"seed": 5}),
+        ("asks for other points", {"method": "ce"}),
+        ("asks for other points", {"max_sim": 2999}),
+        ("it has changed since", {"f": lambda x: half_space(x) + 0.1}),
+    ]
+    for words, change in cases:
+        with pytest.raises(JournalError, match=words):
+            run(path, **change)  # type: ignore[arg-type]
+    with pytest.raises(JournalError, match="begun with dim 4, and this run has 3"):
+        samplers.estimate(samplers.FunctionProblem(half_space, 3), seed=4, journal=path)
+    assert run(path) == run(None)
+
+
+def test_f_that_is_random_or_differs_by_rounding_can_be_continued(tmp_path: Path) -> None:
+    rng = np.random.default_rng(1)
+
+    def noisy(x: FloatArray) -> FloatArray:
+        return half_space(x) + 0.3 * rng.standard_normal(len(x))
+
+    first = run(tmp_path / "j", noisy, "mc")
+    assert run(tmp_path / "j", noisy, "mc") == first
+    exact = run(tmp_path / "k", method="mc")
+    assert run(tmp_path / "k", lambda x: half_space(x) * (1 + 1e-4), "mc") == exact
+
+
+def damage(path: Path, statement: str) -> None:
+    """Change a journal that is closed."""
+    connection = sqlite3.connect(path)
+    connection.execute(statement)
+    connection.commit()
+    connection.close()
+
+
+@pytest.mark.parametrize(
+    "statement",
+    [
+        "UPDATE chunks SET numbers = zeroblob(length(numbers)) WHERE id = 3",
+        "UPDATE chunks SET notes = '{}' WHERE id = 3",
+        "UPDATE chunks SET numbers = 'text' WHERE id = 3",
+        "DELETE FROM chunks WHERE id = 3",
+    ],
+)
+def test_a_damaged_record_is_refused_and_those_before_it_can_be_kept(statement: str, tmp_path: Path) -> None:
+    path, method = tmp_path / "j", samplers.MonteCarlo(batch=500)
+    problem = samplers.FunctionProblem(half_space, 4)
+    whole = samplers.estimate(problem, method, seed=1, max_sim=3000, journal=path)
+    damage(path, statement)
+    with pytest.raises(JournalError, match="is damaged: record 4 does not match its checksum"):
+        samplers.estimate(problem, method, seed=1, max_sim=3000, journal=path)
+    journal = Journal.open(path, mend=True)
+    assert journal.n == 1000
+    journal.close()
+    assert [file.name for file in tmp_path.iterdir()] == ["j"]
+    assert samplers.estimate(problem, method, seed=1, max_sim=3000, journal=path) == whole
+
+
+def test_a_page_that_is_lost_costs_what_stands_behind_it(tmp_path: Path) -> None:
+    path = tmp_path / "j"
+    journal = Journal.create(path, {"seed": 1})
+    for k in range(40):
+        journal.append(str(k), Result(np.full((300, 1), float(k)), {}), 300)
+    journal.close()
+    content = bytearray(path.read_bytes())
+    content[len(content) // 2 : len(content) // 2 + 4096] = bytes(4096)
+    path.write_bytes(content)
+    with pytest.raises(JournalError, match="is damaged"):
+        Journal.open(path)
+    journal = Journal.open(path, mend=True)
+    assert 300 <= journal.n < 12_000 and journal.head == {"seed": 1}
+    assert journal.find("0") is not None
+    journal.close()
+
+
+@pytest.mark.parametrize("mend", [False, True])
+def test_a_journal_whose_head_is_damaged_is_left_as_it_is(mend: bool, tmp_path: Path) -> None:
+    path = tmp_path / "j"
+    run(path, method="mc")
+    damage(path, "UPDATE chunks SET notes = '{}' WHERE id = 0")
+    content = path.read_bytes()
+    with pytest.raises(JournalError, match="damaged from its first record on") as caught:
+        Journal.open(path, mend)
+    assert not isinstance(caught.value, NothingRecorded)
+    assert path.read_bytes() == content
+
+
+def test_no_journal_is_taken_for_one(tmp_path: Path) -> None:
+    (tmp_path / "text").write_bytes(b"x" * 5000)
+    sqlite3.connect(tmp_path / "other").execute("CREATE TABLE chunks (id)").connection.close()
+    for name in ("text", "other"):
+        with pytest.raises(JournalError, match="of another kind"):
+            run(tmp_path / name)
+    (tmp_path / "empty").touch()
+    assert run(tmp_path / "empty", method="mc").n_sim == 3000
+    for head in ("[1]", "{", "[" * 100_000):
+        Journal.create(tmp_path / "k", {}, replace=True).close()
+        row = journals._Row(0, "", 0, 0, 0.0, head, b"")
+        connection = sqlite3.connect(tmp_path / "k")
+        connection.execute("UPDATE chunks SET notes = ?, digest = ?", (head, row.digest))
+        connection.commit()
+        connection.close()
+        with pytest.raises(JournalError, match="is no journal"):
+            Journal.open(tmp_path / "k")
+
+
+def test_creating_replaces_an_empty_journal_alone_and_one_process_has_it(tmp_path: Path) -> None:
+    path = tmp_path / "j"
+    Journal.create(path, {"seed": 1}).close()
+    journal = Journal.create(path, {"seed": 2})
+    journal.append("points", ONE, 3)
+    for attempt in (lambda: Journal.create(path, {}, replace=True), lambda: Journal.open(path)):
+        with pytest.raises(JournalError, match="Another process"):
+            attempt()
+    journal.close()
+    with pytest.raises(JournalError, match="a journal already"):
+        Journal.create(path, {"seed": 3})
+    replaced = Journal.create(path, {"seed": 3}, replace=True)
+    assert (replaced.n, replaced.head) == (0, {"seed": 3})
+    replaced.remove()
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_full_disk_ends_nothing_and_what_waits_is_written_later(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    full = [False]
+    insert = Journal._insert
+
+    def limited(self: Journal, row: Any) -> None:
+        if full[0]:
+            raise sqlite3.OperationalError("database or disk is full")
+        insert(self, row)
+
+    monkeypatch.setattr(Journal, "_insert", limited)
+    calls: list[int] = []
+
+    def f(x: FloatArray) -> FloatArray:
+        calls.append(len(x))
+        full[0] = 2 <= len(calls) < 5
+        return half_space(x)
+
+    method = samplers.MonteCarlo(batch=300)
+    with pytest.warns(UserWarning, match=r"Cannot write .*: database or disk is full\. .* are lost") as seen:
+        result = samplers.estimate(samplers.FunctionProblem(f, 4), method, seed=1, max_sim=3000, journal=tmp_path / "j")
+    assert len(seen) == 1
+    assert result == samplers.estimate(samplers.FunctionProblem(half_space, 4), method, seed=1, max_sim=3000)
+    calls.clear()
+    full[0] = False
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        again = samplers.estimate(samplers.FunctionProblem(f, 4), method, seed=1, max_sim=3000, journal=tmp_path / "j")
+    assert again == result
+    assert calls == [8]
+
+
+def interrupt_at(line: int, call: Callable[[], None]) -> bool:
+    """Call, with an interruption before the n-th line that it runs of journals; return whether there was one."""
+    left = [line]
+
+    def trace(frame: FrameType, event: str, _: Any) -> Any:
+        if Path(frame.f_code.co_filename) != Path(journals.__file__):
+            return None
+        left[0] -= event == "line"
+        if event == "line" and left[0] == 0:
+            sys.settrace(None)
+            raise KeyboardInterrupt
+        return trace
+
+    before = sys.gettrace()
+    sys.settrace(trace)
+    try:
+        call()
+    except KeyboardInterrupt:
+        return True
+    finally:
+        sys.settrace(before)
+    return False
+
+
+def test_interrupted_anywhere_in_a_write_each_record_stands_there_once(tmp_path: Path) -> None:
+    """A signal that comes while a journal is written is the most likely one: a run writes after each chunk."""
+    path = tmp_path / "journal.bin"
+    for line in itertools.count(1):
+        journal = Journal.create(path, {}, replace=True)
+        journal.append("0", ONE, 3)
+        interrupted = interrupt_at(line, lambda journal=journal: journal.append("1", ONE, 3))  # type: ignore[misc]
+        for points in "23":
+            journal.append(points, ONE, 3)
+        journal.close()
+        journal = Journal.open(path)
+        found = [points for points in "0123" if journal.find(points) is not None]
+        assert journal.n == 3 * len(found)
+        journal.close()
+        assert set("023") <= set(found), line
+        if not interrupted:
+            break
+    assert line > 8
+
+
+def test_the_wall_time_of_all_parts_adds_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Records 25 and 60 s after the begin; a part without any; after another boot one 20 s after the resumption."""
+    clock, number = [0.0], itertools.count()
+    monkeypatch.setattr(time, "monotonic", lambda: clock[0])
+
+    def go_on(journal: Journal, *times: float) -> float:
+        for seconds in times:
+            clock[0] += seconds
+            journal.append(str(next(number)), ONE, 3)
+        clock[0] += 40.0
+        journal.close()
+        return journal.earlier_seconds
+
+    path = tmp_path / "j"
+    assert go_on(Journal.create(path, {}), 25.0, 35.0) == 0.0
+    clock[0] += 30.0
+    assert go_on(Journal.open(path)) == 60.0
+    clock[0] = 5.0  # another boot
+    assert go_on(Journal.open(path), 20.0) == 60.0
+    assert go_on(Journal.open(path)) == 80.0
+
+
+def test_points_are_known_by_value_and_shape() -> None:
+    x = np.arange(6.0).reshape(3, 2)
+    assert digest_points(x) == digest_points(x.copy())
+    assert len({digest_points(each) for each in (x, x.reshape(2, 3), x + 1e-15, x[::-1], x.astype("f4"))}) == 5
+
+
+class Series:
+    """Two half-spaces in 40 dimensions; it counts what it is asked for, and is interrupted at a certain request."""
+
+    dim, gradient_cost, base = 40, 3.0, samplers.StandardNormal(40)
+    normals = np.linalg.qr(np.random.default_rng(0).standard_normal((40, 2)))[0].T
+
+    def __init__(self, last: int = 10**6, shift: float = 0.0) -> None:
+        self.requests, self.last, self.shift = 0, last, shift
+
+    def _count(self) -> None:
+        self.requests += 1
+        if self.requests > self.last:
+            raise KeyboardInterrupt
+
+    def evaluate(self, x: FloatArray) -> FloatArray:
+        return self.terms(x).f
+
+    def terms(self, x: FloatArray, gamma: float = 0.0) -> Terms:
+        self._count()
+        values = 3.5 - x @ self.normals.T - self.shift
+        return Terms(values.min(axis=1), values, np.zeros(values.shape, dtype=int), gamma, ("left", "right"))
+
+    def gradient(self, x: FloatArray, term: Any, ticks: Any, gamma: float = 0.0) -> TermGradients:
+        self._count()
+        return TermGradients(-self.normals[term], 2.5 * len(x))
+
+
+@pytest.mark.parametrize("last", [1, 5, 11])
+def test_a_search_by_terms_is_continued_from_its_journal(last: int, tmp_path: Path) -> None:
+    """Interrupted at the walks, in a round or at the end; the rest alone is computed, and the result is the same."""
+    undisturbed, path = Series(), tmp_path / "j"
+    expected = samplers.estimate(undisturbed, seed=1, max_sim=2000)
+    assert undisturbed.requests > 11
+    with pytest.raises(KeyboardInterrupt):
+        samplers.estimate(Series(last), seed=1, max_sim=2000, journal=path)
+    for problem, max_sim, words in ((Series(shift=1.0), 2000, "has changed since"), (Series(), 3000, "other points")):
+        if last == 5:
+            with pytest.raises(JournalError, match=words):
+                samplers.estimate(problem, seed=1, max_sim=max_sim, journal=path)
+    rest = Series()
+    assert samplers.estimate(rest, seed=1, max_sim=2000, journal=path) == expected
+    assert rest.requests == undisturbed.requests - last + 1  # f is called once more, to see that it is the same
+
+
+def test_a_journal_counts_simulations_not_numbers(tmp_path: Path) -> None:
+    """Base draws are 200 simulations, of which the journal has 1 + 2 * 2 numbers each; 24 gradients of 2.5 are 60."""
+    with pytest.raises(KeyboardInterrupt):
+        samplers.estimate(Series(2), seed=1, max_sim=2000, journal=tmp_path / "j")
+    journal = Journal.open(tmp_path / "j")
+    assert journal.n == 260
+    journal.close()
+
+
+CHILD = """
+import sys, time
+import samplers
+def f(x):
+    time.sleep(0.002)
+    return 3.0 - x.sum(axis=1) / x.shape[1] ** 0.5
+result = samplers.estimate(samplers.FunctionProblem(f, 4), sys.argv[2], seed=4, max_sim=3000, on_error="bound",
+                           journal=sys.argv[1])
+print(result.to_json())
+"""
+
+
+@pytest.mark.parametrize("kills", [2, pytest.param(21, marks=pytest.mark.slow)])
+def test_killed_at_random_times_it_comes_to_the_same_result(kills: int, tmp_path: Path) -> None:
+    """It is killed with SIGKILL once there is a journal and a random time after."""
+    path, rng = tmp_path / "j", np.random.default_rng(kills)
+    words = [sys.executable, "-c", CHILD, str(path), "two-stage"]
+    for _ in range(kills):
+        process = subprocess.Popen(words, stdout=subprocess.DEVNULL)
+        deadline = time.monotonic() + 60
+        while not path.exists() and process.poll() is None and time.monotonic() < deadline:
+            time.sleep(0.001)
+        time.sleep(float(rng.uniform(0, 0.1 if path.exists() else 0.02)))
+        process.send_signal(signal.SIGKILL)
+        process.wait()
+    found = subprocess.run(words, capture_output=True, text=True, check=True).stdout
+    assert json.loads(found) == json.loads(run(None).to_json())
