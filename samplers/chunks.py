@@ -91,9 +91,7 @@ Attempt = Callable[[Chunk], Attempted]
 Fail = Callable[[int, str, BaseException | None], None]
 
 
-def isolate(
-    attempt: Attempt, chunk: Chunk, first: Attempted | BaseException, fail: Fail
-) -> tuple[Attempted, int]:
+def isolate(attempt: Attempt, chunk: Chunk, first: Attempted | BaseException, fail: Fail) -> tuple[Attempted, int]:
     """Find the rows of a chunk that fail, after a first attempt at all of it.
 
     Where an attempt raises, its parts are attempted (`split_rows`), until the rows that raise stand alone. A row that

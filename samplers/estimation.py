@@ -305,6 +305,8 @@ def _add_remarks(result: Estimate, evaluator: Evaluator) -> Estimate:
     remarks = []
     if evaluator.n_retried:
         remarks.append(f"{evaluator.n_retried} rows were simulated again to find those on which f raises.")
+    if evaluator.faults and not evaluator.lost:
+        remarks.append(f"Of the first simulation without an outcome: {evaluator.faults[0].reason}.")
     if evaluator.lost:
         remarks.append(f"No worker survived {len(evaluator.lost)} rows; of the first: {evaluator.lost[0]}.")
     return replace(result, remarks=(*result.remarks, *remarks)) if remarks else result

@@ -303,11 +303,14 @@ def _connect(path: Path) -> sqlite3.Connection:
         connection.execute("PRAGMA synchronous = NORMAL")
         connection.execute("BEGIN IMMEDIATE")  # takes the lock, which stays
         connection.execute("COMMIT")
-    except sqlite3.DatabaseError as error:
+    except sqlite3.OperationalError as error:
         connection.close()
         if "locked" in str(error):
             words = f"Another process is writing {str(path)!r}: wait for it to end, or choose another file."
             raise JournalInUse(words) from error
+        raise OSError(errno.EIO, str(error)) from error
+    except sqlite3.DatabaseError as error:
+        connection.close()
         if "malformed" in str(error):
             raise _Damaged(path, HEAD) from error
         raise JournalError(f"{str(path)!r} is of another kind or version: remove it to begin anew.") from error

@@ -319,10 +319,11 @@ def _run(folder: Path, study: Study, journal: Journal, progress: bool, executor:
     except UnwrittenResults as error:
         raise UnwrittenResults(f"{error}{kept(error.report)}", error.report) from error
     except BadInput as error:
-        if not journal.has_simulations:
-            journal.remove()
-            (target / STUDY).unlink(missing_ok=True)
-        raise BadInput(f"{error}{kept()}") from error
+        if journal.has_simulations:
+            raise BadInput(f"{error}{kept()}") from error
+        journal.remove()
+        (target / STUDY).unlink(missing_ok=True)
+        raise
     except KeyboardInterrupt as error:
         known = error if isinstance(error, RunInterrupted) else RunInterrupted("Stopped.")
         raise RunInterrupted(f"{known}{kept(known.report)}", known.report) from None

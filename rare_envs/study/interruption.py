@@ -86,8 +86,7 @@ def describe_kept(journal: Journal, folder: Path, trust: bool, report: Report | 
     """
     if not journal.has_simulations or not journal.flush():
         return ""
-    kept = f"{_count_kept(journal, report)} are" if journal.n else "What was simulated is"
-    return f" {kept} kept; go on with: rare-envs resume {shlex.quote(str(folder))}{' --trust' if trust else ''}"
+    return f" {_count_kept(journal, report)} are kept; go on with: rare-envs resume {shlex.quote(str(folder))}{' --trust' if trust else ''}"
 
 
 def _count_kept(journal: Journal, report: Report | None) -> str:

@@ -194,7 +194,7 @@ def test_repr_is_one_line_and_html_has_the_parameters() -> None:
 
 def test_tables_of_a_result_name_the_parameters() -> None:
     problem = rare_envs.DrivingProblem("rare_envs/CutIn-v0")
-    result = samplers.estimate(rare_envs.FaultTolerant(problem), "mc", gamma=2.0, seed=0, max_sim=300)
+    result = samplers.estimate(problem, "mc", gamma=2.0, seed=0, max_sim=300)
     assert tuple(result.to_pandas().columns[-6:]) == problem.space.names
     highway = rare_envs.DrivingProblem("rare_envs/Highway-v0", noise=False)
     assert len(highway.column_names) == highway.dim

@@ -140,9 +140,9 @@ def wait_until(happened: Any, seconds: float = 60.0) -> bool:
     return bool(happened())
 
 
-def size_of(folder: Path) -> int:
-    """Return the bytes of a journal, and of what is not yet in it."""
-    return sum(path.stat().st_size for path in folder.glob("journal.bin*"))
+def last_write(folder: Path) -> int:
+    """Return the time of the last write to a journal."""
+    return max((path.stat().st_mtime_ns for path in folder.glob("journal.bin*")), default=0)
 
 
 def is_running(status: Path) -> bool:
@@ -156,8 +156,8 @@ def is_running(status: Path) -> bool:
 def kill_in_mid_run(driver: subprocess.Popen[bytes], folder: Path) -> None:
     """Kill a driver once it has added to its journal; its workers end by themselves."""
     wait_until(lambda: driver.poll() is not None or any((folder / "workers").iterdir()), 120)
-    before = size_of(folder)
-    wait_until(lambda: driver.poll() is not None or size_of(folder) > before, 120)
+    before = last_write(folder)
+    wait_until(lambda: driver.poll() is not None or last_write(folder) > before, 120)
     driver.kill()
     assert driver.wait() == -signal.SIGKILL, (folder / "said").read_text()
     workers = [Path("/proc") / path.name / "stat" for path in (folder / "workers").iterdir()]

@@ -11,7 +11,7 @@ from samplers.limit_states import half_space
 from samplers.method import Goal, GradientRequest, Interrupted, Outcome, TermsOffer, TermsRequest
 from samplers.problem import StandardNormal
 from samplers.run import NOT_KNOWN, SMALLEST_F, EvaluationLog, Replicate, Run, split_budget
-from samplers.statistics.intervals import binomial_cov, clopper_pearson
+from samplers.statistics import binomial_cov, clopper_pearson
 from samplers.trace import Status
 
 EASY = half_space(2, 2.0).problem

@@ -18,7 +18,7 @@ from agents.remote import protocol
 from agents.remote.client import NoReply, RemoteEgo, RemoteError, parse_address
 from agents.remote.request_handler import RequestHandler
 from rare_envs.egos.errors import EgoGone, NoAnswer
-from rare_envs.egos.faults import FaultTolerant
+from samplers.evaluate import Evaluator
 from tests.agents.remote.egos import Averaging, Braking, problem
 
 
@@ -98,7 +98,7 @@ def test_an_ego_that_does_not_come_back_is_gone(serve: Any, connect_ego: Any, x:
     there = connect_ego(server.address, patience=0.3)
     server.end()
     with pytest.raises(EgoGone, match=r"No ego at tcp://.* within 0\.3 s"):
-        FaultTolerant(problem(there), "bound").evaluate(x)
+        Evaluator(problem(there), on_error="bound").evaluate(x)
     with pytest.raises(ValueError, match=r"No ego at tcp://.* within 0\.2 s"):
         load_ego(f"{server.address}?patience=0.2")
 
@@ -112,7 +112,7 @@ def test_another_ego_that_comes_back_is_not_taken_for_the_first(serve: Any, conn
     first.end()
     serve(Other(), first.address)
     with pytest.raises(EgoGone, match="one with other spaces is there now"):
-        FaultTolerant(problem(there), "bound").evaluate(x)
+        Evaluator(problem(there), on_error="bound").evaluate(x)
 
 
 def test_an_ego_that_answers_too_late_is_a_fault_of_its_scenarios(serve: Any, connect_ego: Any, x: np.ndarray) -> None:
@@ -125,7 +125,7 @@ def test_an_ego_that_answers_too_late_is_a_fault_of_its_scenarios(serve: Any, co
     x = x[:4].copy()
     x[:, 2] = [60.0, 20.0, 70.0, 80.0]
     there = connect_ego(serve(Slow()).address, timeout=0.25)
-    tolerant = FaultTolerant(problem(there))
+    tolerant = Evaluator(problem(there), on_error="bound")
     f = tolerant.evaluate(x)
     np.testing.assert_array_equal(np.isnan(f), x[:, 2] < 21.0)
     assert "no answer within 0.25 s" in tolerant.faults[0].reason
@@ -141,7 +141,7 @@ def test_what_the_ego_raises_arrives_as_the_reason(memory: bool, serve: Any, con
 
     x = x.copy()
     x[:, 2] = np.where(np.arange(40) % 20 == 3, 20.0, 70.0)
-    tolerant = FaultTolerant(problem(connect_ego(serve(Raising()).address)))
+    tolerant = Evaluator(problem(connect_ego(serve(Raising()).address)), on_error="bound")
     np.testing.assert_array_equal(np.isnan(tolerant.evaluate(x)), x[:, 2] == 20.0)
     assert {fault.reason for fault in tolerant.faults} == {"RemoteError: RuntimeError: no road"}
 
@@ -210,7 +210,7 @@ def test_rows_that_hang_are_found_at_little_cost_and_slow_ones_not_accused(memor
     world.evaluate(x[:5])  # it has answered before
     hanging, slow = [123, 300], [5, 6, 133, 399]
     x[hanging, 2], x[slow, 2] = 31.0, 41.0
-    tolerant, link.questions = FaultTolerant(world), 0
+    tolerant, link.questions = Evaluator(world, on_error="bound"), 0
     np.testing.assert_array_equal(np.flatnonzero(np.isnan(tolerant.evaluate(x))), hanging)
     assert {fault.reason for fault in tolerant.faults} == {"NoAnswer: The ego at virtual: no answer within 10 s."}
     # once for all, once for each row alone, once for both when they are tried again, and once more for each

@@ -13,7 +13,7 @@ import pytest
 import rare_envs
 from agents import load_ego
 from rare_envs.egos.errors import NoAnswer
-from rare_envs.egos.faults import FaultTolerant
+from samplers.evaluate import Evaluator
 from tests.agents.remote.egos import problem
 
 DANGEROUS = """
@@ -67,7 +67,7 @@ def test_scenarios_on_which_a_process_hangs_or_dies_are_found(dangerous: Any, x:
     x = np.repeat(x, 6, axis=0)
     x[:, 2] = 60.0
     x[[100, 200], 2] = 31.0, 21.0
-    tolerant = FaultTolerant(problem(dangerous))
+    tolerant = Evaluator(problem(dangerous), on_error="bound")
     np.testing.assert_array_equal(np.flatnonzero(np.isnan(tolerant.evaluate(x))), [100, 200])
     assert [fault.reason.partition(": ")[2].rpartition(": ")[2] for fault in tolerant.faults] == [
         "no answer within 1.5 s.",

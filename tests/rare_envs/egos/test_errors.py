@@ -2,7 +2,7 @@
 
 import pytest
 
-from rare_envs.egos.errors import EgoFault, EgoGone, NoAnswer, reason_of
+from rare_envs.egos.errors import EgoGone, NoAnswer, reason_of
 
 
 @pytest.mark.parametrize(
@@ -21,5 +21,3 @@ def test_reasons_are_one_line(error: BaseException, reason: str) -> None:
 
 def test_who_survives_exceptions_does_not_survive_an_ego_that_is_gone() -> None:
     assert not issubclass(EgoGone, Exception)
-    assert issubclass(EgoFault, ValueError)
-    assert EgoFault.final

@@ -60,12 +60,17 @@ class ForkedCommand:
     def running(self) -> bool:
         return self._process.is_alive()
 
-    def wait_for_more(self, path: Path, n_bytes: int = 200) -> None:
-        """Wait until a file has grown, or the process has ended."""
-        before = path.stat().st_size if path.exists() else 0
+    def wait_for_more(self, path: Path) -> None:
+        """Wait until something is written to a journal, or the process has ended."""
+
+        def last_write() -> int:
+            found = (path, path.with_name(f"{path.name}-wal"))
+            return max((each.stat().st_mtime_ns for each in found if each.exists()), default=0)
+
+        before = last_write()
         deadline = time.monotonic() + END_SECONDS
         while self.running and time.monotonic() < deadline:
-            if path.exists() and path.stat().st_size > before + n_bytes:
+            if last_write() > before:
                 return
             time.sleep(0.001)
 
@@ -98,7 +103,7 @@ def run_command(
     from rare_envs.problem import DrivingProblem
     from rare_envs.study import cli, writing
     from rare_envs.study.cli.options import ExecutorOptions
-    from samplers.journal import JournalFile
+    from samplers.journal import Journal
     from tests.samplers.real_executors import open_executor
 
     os.chdir(folder)
@@ -107,8 +112,8 @@ def run_command(
     sys.argv = ["rare-envs", *words]
     DrivingProblem.tile = TILE
     writing.save_plot = lambda path, report: None
-    append = JournalFile.append
-    JournalFile.append = lambda *words: (append(*words), time.sleep(pause))[0]  # type: ignore[method-assign]
+    append = Journal.append
+    Journal.append = lambda *words: (append(*words), time.sleep(pause))[0]  # type: ignore[method-assign]
     if kill_at:
         _kill_at_change(kill_at)
     with ExitStack() as stack:

@@ -24,7 +24,7 @@ from rare_envs.study.errors import BadInput
 from rare_envs.study.journal import JOURNAL, continue_journal
 from rare_envs.study.question import prepare
 from rare_envs.study.run_folder import RESULT_FILES
-from samplers.journal import RecordFile
+from samplers import journal as journals
 from tests.rare_envs.study.conftest import write_base
 from tests.rare_envs.study.forked_command import TILE, ForkedCommand
 from tests.rare_envs.study.refusals import FOLLOWING, SMALL, assert_refused
@@ -110,7 +110,7 @@ def has_simulations(folder: Path) -> bool:
     except BadInput:  # killed before its head was written
         return False
     with closing(journal):
-        return journal.read_next() is not None
+        return journal.has_simulations
 
 
 def kill_and_resume(
@@ -228,10 +228,10 @@ def test_without_out_an_interrupted_run_prints_what_it_knows(
 
 
 def test_a_full_disk_at_the_start_is_one_line(cli: Cli, here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def full(self: RecordFile, payload: bytes) -> None:
+    def full(path: Path) -> Any:
         raise NO_SPACE
 
-    monkeypatch.setattr(RecordFile, "write", full)
+    monkeypatch.setattr(journals, "_connect", full)
     assert_refused(cli(*SMALL, "--out", here / "new" / "run"), "Cannot write", "No space left on device")
 
 

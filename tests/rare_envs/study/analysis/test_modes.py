@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 import samplers
+from rare_envs.study.episodes import digest_scenario
 from rare_envs.study.modes import cluster_points, find_modes, label_modes
-from rare_envs.study.storage.episode_file import digest_scenario
 from rare_envs.traffic.crash import CRASH_KINDS
 from samplers.analysis import NO_OUTCOME_LABEL
 from samplers.problem import FloatArray

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import samplers
+from rare_envs.study.episodes import digest_scenario
 from rare_envs.study.modes import find_modes, list_every_mode
-from rare_envs.study.storage.episode_file import digest_scenario
 from samplers.problem import FloatArray
 
 

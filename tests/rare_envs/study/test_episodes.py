@@ -10,10 +10,10 @@ import pyarrow.parquet as pq
 import pytest
 
 import rare_envs
-from rare_envs.study import Question, prepare, resume, run_into
-from rare_envs.study.storage import episode_file
-from rare_envs.study.storage.episode_file import EpisodeBatch, EpisodeDraft, digest_scenario, name_columns
-from samplers.journal import JournalFile
+from rare_envs.study import Question, episodes, prepare, resume, run_into
+from rare_envs.study.episodes import EpisodeTable, digest_scenario, name_columns
+from samplers.evaluate import Simulated
+from samplers.journal import Journal
 
 FOLLOWING = "rare_envs/CarFollowing-v0"
 
@@ -67,8 +67,8 @@ def test_a_resumed_run_has_the_same_table_but_for_times(
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr("rare_envs.study.storage.episode_recorder.EpisodeRecorder.write", interrupt)
-        patch.setattr(JournalFile, "_elapsed", lambda self: 3600.0)
+        patch.setattr(EpisodeTable, "write", interrupt)
+        patch.setattr(Journal, "_elapsed", lambda self: 3600.0)
         with pytest.raises(KeyboardInterrupt):
             run_into(tmp_path / "cut", prepare(question))
     assert sorted(path.name for path in (tmp_path / "cut").iterdir()) == ["journal.bin", "study.json"]
@@ -87,29 +87,59 @@ def test_a_resumed_run_has_the_same_table_but_for_times(
 
 
 def test_large_blocks_are_lists_in_single_precision(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(episode_file, "ROWS_AT_ONCE", 8)
+    monkeypatch.setattr(episodes, "ROWS_AT_ONCE", 8)
     space = rare_envs.DrivingProblem("rare_envs/Highway-v0", noise=False).space
     kinds = name_columns(space)
     assert kinds["weights"].list_size == 404 and str(kinds["speed[5]"]) == "double"
     x = space.sample(20, np.random.default_rng(0))
-    draft = EpisodeDraft(tmp_path, space)
+    table = EpisodeTable(tmp_path, space)
     for part in np.split(x, 4):
-        draft.add(EpisodeBatch(part, np.zeros(5), [None] * 5, np.ones(5)))
-    batches = list(draft.read())
-    draft.close()
+        table.add(Simulated(part, np.zeros(5), [], np.ones(5)))
+    batches = list(table._read_draft())
+    table.close()
     assert [batch.num_rows for batch in batches] == [8, 2, 8, 2]
     values = np.concatenate([batch.column("weights").flatten().to_numpy().reshape(-1, 404) for batch in batches])
     np.testing.assert_array_equal(values, space.columns(x)["weights"].astype(np.float32))
-    rows = [episode_file._as_table(batch.column(name)) for batch in batches[:1] for name in draft.columns]
+    rows = [episodes._as_table(batch.column(name)) for batch in batches[:1] for name in kinds]
     assert [digest_scenario(row) for row in np.hstack(rows)] == [digest_scenario(row) for row in x[:8]]
 
 
 def test_row_groups_are_bounded_and_the_schema_says_its_version(
     risky: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(episode_file, "ROWS_AT_ONCE", 128)
+    monkeypatch.setattr(episodes, "ROWS_AT_ONCE", 128)
     run_into(tmp_path / "run", prepare(ask(risky, "mc", max_sim=500)))
     file = pq.ParquetFile(tmp_path / "run" / "episodes.parquet")
     sizes = [file.metadata.row_group(k).num_rows for k in range(file.num_row_groups)]
     assert sum(sizes) == 500 and max(sizes) <= 128
     assert file.schema_arrow.metadata[b"rare_envs.format"] == b"1"
+
+
+@pytest.mark.parametrize("on_error", ["failure", "bound"])
+def test_faults_have_their_reason_and_count_as_failures(here: Path, risky: str, on_error: str) -> None:
+    question = ask(risky, "mc", max_sim=300, ego="egos_here:nan_when_close", on_error=on_error)
+    report = run_into(here / "run", prepare(question))
+    table = rare_envs.load_study(here / "run").episodes()
+    lost = table["f"].is_null().to_numpy()
+    assert lost.sum() == len(report.faults) > 0
+    reasons = [fault.reason for fault in report.faults]
+    assert [text for text in table["error"].to_pylist() if text] == reasons
+    assert table["failed"].to_numpy()[lost].all() and table["crash"].filter(lost).null_count == lost.sum()
+    assert np.exp(table["log_weight"].to_numpy())[table["failed"].to_numpy()].sum() == pytest.approx(report.estimate.p)
+
+
+def test_a_table_that_cannot_be_written_does_not_end_the_run(
+    risky: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(self: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(EpisodeTable, "_write_draft", refuse)
+    report = run_into(tmp_path / "run", prepare(ask(risky, "mc", max_sim=300)))
+    assert report.estimate.n_sim == 300
+    assert "episodes.parquet could not be written: No space left on device" in report.notes
+    assert sorted(path.name for path in (tmp_path / "run").glob("*episodes*")) == []
+    study = rare_envs.load_study(tmp_path / "run")
+    assert study.p == report.estimate.p
+    with pytest.raises(FileNotFoundError, match=r"no episodes\.parquet"):
+        study.episodes()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import signal
+import sqlite3
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
@@ -16,8 +17,7 @@ from rare_envs.problem import DrivingProblem
 from rare_envs.study import evaluate, question
 from rare_envs.study import risk as total_risk
 from samplers import estimation
-from samplers.journal import JournalFile, JournalRecord
-from samplers.journal import RecordFile
+from samplers.journal import Journal
 from tests.rare_envs.study.fitted_files import write_fitted
 from tests.rare_envs.study.refusals import FOLLOWING, Cli
 
@@ -194,15 +194,15 @@ def test_in_an_environment_of_highway_env(cli: Cli, monkeypatch: pytest.MonkeyPa
 def test_a_full_disk_in_mid_run_counts_each_simulation_once(
     cli: Cli, here: Path, risky: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    append, write, calls = JournalFile.append, RecordFile.write, []
+    insert, calls = Journal._insert, []
 
-    def full_for_the_first(self: JournalFile, record: JournalRecord) -> None:
-        calls.append(record)
-        with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(RecordFile, "write", full if len(calls) == 1 else write)
-            append(self, record)
+    def full_for_the_first(self: Journal, row: Any) -> None:
+        calls.append(row)
+        if len(calls) == 1:
+            raise sqlite3.OperationalError("database or disk is full")
+        insert(self, row)
 
-    monkeypatch.setattr(JournalFile, "append", full_for_the_first)
+    monkeypatch.setattr(Journal, "_insert", full_for_the_first)
     stop_after(400, "SIGTERM", monkeypatch)
     with warnings.catch_warnings():
         warnings.simplefilter("default")

@@ -17,7 +17,7 @@ from rare_envs.study.journal import JOURNAL
 from rare_envs.study.question import prepare
 from rare_envs.study.report import Report
 from samplers.progress import Progress
-from tests.rare_envs.study.execution.faulty import FAULTY
+from tests.rare_envs.study.faulty_egos import FAULTY
 
 ASKED = Question(
     env_id="rare_envs/CarFollowing-v0",
@@ -104,9 +104,9 @@ def test_a_worker_that_cannot_load_the_ego_is_one_line(faulty: Path, risky: str)
     class Later:
         """The file changes after the driver has loaded it and before a worker does."""
 
-        def open(self, work: Any, seed: int) -> Any:
+        def open(self, compute: Any) -> Any:
             (faulty / "faulty.py").write_text(FAULTY + "# changed")
-            return samplers.LocalProcesses(1).open(work, seed)
+            return samplers.LocalProcesses(1).open(compute)
 
     with pytest.raises(BadInput, match=r"A worker process cannot load the problem .* not the file"):
         evaluate.run(prepare(ask("nan", risky)), executor=Later())
