@@ -86,7 +86,8 @@ def describe_kept(journal: Journal, folder: Path, trust: bool, report: Report | 
     """
     if not journal.has_simulations or not journal.flush():
         return ""
-    return f" {_count_kept(journal, report)} are kept; go on with: rare-envs resume {shlex.quote(str(folder))}{' --trust' if trust else ''}"
+    command = f"rare-envs resume {shlex.quote(str(folder))}{' --trust' if trust else ''}"
+    return f" {_count_kept(journal, report)} are kept; go on with: {command}"
 
 
 def _count_kept(journal: Journal, report: Report | None) -> str:

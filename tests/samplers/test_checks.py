@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from samplers.errors import EvaluationError, FinalError, describe_row, one_per_row
+from samplers.errors import EvaluationError, FinalError, describe_point, one_per_row
 from samplers.validation import (
     check_choice,
     check_count,
@@ -94,8 +94,7 @@ def test_anything_else_is_refused_with_the_shape_expected(values):
 
 
 def test_a_row_is_described_by_its_number_and_its_first_and_last_coordinates():
-    x = np.arange(40.0).reshape(2, 20)
-    assert describe_row(x, 1) == "row 1 of a batch of 2, x = [20., 21., 22., ..., 37., 38., 39.]"
+    assert describe_point(np.arange(20.0, 40.0)) == "[20., 21., 22., ..., 37., 38., 39.]"
 
 
 def test_calling_f_again_does_not_help_against_an_evaluation_error():

@@ -7,7 +7,6 @@ import pytest
 from scipy import stats
 
 import samplers
-from samplers.arguments import find_base_fault
 from samplers.distributions import OpenTurnsDistribution
 
 openturns = pytest.importorskip("openturns")
