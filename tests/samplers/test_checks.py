@@ -93,7 +93,7 @@ def test_anything_else_is_refused_with_the_shape_expected(values):
         one_per_row(values, 5)
 
 
-def test_a_row_is_described_by_its_number_and_its_first_and_last_coordinates():
+def test_a_point_is_described_by_its_first_and_last_coordinates():
     assert describe_point(np.arange(20.0, 40.0)) == "[20., 21., 22., ..., 37., 38., 39.]"
 
 
