@@ -65,7 +65,8 @@ def check_sites(scenarios: Sequence[Scenario], sites: Sequence[str]) -> None:
             hint = did_you_mean(site, known)
             raise ValueError(f"No base of {names} is of a site {site!r}{hint}; there are {', '.join(sorted(known))}.")
         place = _read_site_of(load_base(owner, site))
-        further = f"is a further base of the site {_name_of(owner, place)!r}" if place else "has no site"
+        first = next((name for name, each in list_sites(owner).items() if each == place), "")
+        further = f"is a further base of the site {first!r}" if first else "has no site"
         raise ValueError(
             f"{site!r} is no site: this base of {owner.name} {further}. The sites are {', '.join(sorted(known))}; "
             f"--base {owner.name}={site} takes it as the base."
@@ -128,11 +129,6 @@ def _other_frequencies(study: Study) -> dict[str, EventFrequency]:
 def _read_site_of(base: Distribution) -> str:
     """Return the site of a base distribution in words; empty where it was not fitted to events of one."""
     return read_site(base.record) if isinstance(base, FittedDistribution) else ""
-
-
-def _name_of(scenario: Scenario, place: str) -> str:
-    """Return the name of a site of a scenario."""
-    return next(name for name, site in list_sites(scenario).items() if site == place)
 
 
 def _estimate_under(report: Report, name: str, asked: bool, progress: bool) -> float:
@@ -388,8 +384,6 @@ def _check_scenarios(scenarios: Sequence[str], sites: Sequence[str], bases: Mapp
         raise BadInput(f"Expected one or more different scenarios, got {', '.join(scenarios) or 'none'}.")
     if set(TWICE) <= set(scenarios):
         raise BadInput(f"Expected one of {', '.join(TWICE)}: a cut-in is a new leader, and would count twice.")
-    if not sites:
-        raise BadInput("Expected one site or more, such as us101.")
     with as_bad_input(ValueError):
         check_sites(known, sites)
     for name in bases:

@@ -31,7 +31,7 @@ def report_command(
     as_json: JsonOption = False,
 ) -> None:
     """Write the report of a run as one HTML file, with its failures by mode, driven again and filmed."""
-    from rare_envs.study.html_report.page import write_html_report
+    from rare_envs.study.html_report import write_html_report
 
     with keep_stdout_for_the_answer():
         written = write_html_report(run, trust, events, out, figures)
@@ -209,8 +209,7 @@ def export_command(
     as_json: JsonOption = False,
 ) -> None:
     """Write a failure as OpenSCENARIO and OpenDRIVE, for CARLA's scenario_runner, or as CommonRoad XML."""
-    from rare_envs.study.export import export_scenario
-    from rare_envs.study.export.writing import check_export
+    from rare_envs.study.export import check_export, export_scenario
     from rare_envs.study.video import find_failure
 
     with keep_stdout_for_the_answer(), as_bad_input(ValueError):

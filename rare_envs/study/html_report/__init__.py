@@ -1,14 +1,220 @@
-"""Report of a run as one HTML file, which needs nothing else: no network, no other file, no script."""
+"""Page: the report of a run, from its folder to one HTML file."""
 
-from typing import TYPE_CHECKING
+from __future__ import annotations
 
-from rare_envs.plugins import make_lazy_getattr
+import contextlib
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
 
-if TYPE_CHECKING:
-    from rare_envs.study.html_report.page import write_html_report
+import jinja2
+import numpy as np
+from markupsafe import Markup
+
+from rare_envs.files import replace_text
+from rare_envs.plugins import one_line
+from rare_envs.study.columns import draw_ordinary, list_columns
+from rare_envs.study.errors import BadInput, as_bad_input, output_file, output_folder
+from rare_envs.study.html_report.atlas import AtlasEntry, AtlasSource, build_atlas, read_recorded_events
+from rare_envs.study.html_report.figures import (
+    FORMATS,
+    MAX_HISTOGRAMS,
+    FigureOfPage,
+    figure_of_parameters,
+    figures_of_result,
+    passes_levels,
+)
+from rare_envs.study.question import prepare
+from rare_envs.study.recorded_question import load_finished, open_run, warn_of_changed_files
+from rare_envs.study.run_folder import EPISODES, REPORT, RESULT, STUDY, LoadedStudy
+from rare_envs.study.text import (
+    describe_intervals,
+    describe_kind,
+    describe_method,
+    describe_rate,
+    describe_validity,
+    describe_wide_base,
+    explain_no_gain,
+    format_probability,
+    name_measure,
+    summarise_answer,
+)
+from rare_envs.traffic.palette import CRASH_COLOUR, ROLE_COLOURS
+from samplers.problem import FloatArray
+from samplers.trace import describe_outcome
 
 __all__ = ["write_html_report"]
 
-_LAZY = {"write_html_report": "rare_envs.study.html_report.page"}
+_BROKEN_NUMBER = re.compile(r"(?<=\d) (?=%|× 10)|(?<=×) (?=10)")
+"""Spaces within a number: "0.12 %", "3.1 × 10⁻⁵"."""
 
-__getattr__ = make_lazy_getattr(__name__, _LAZY)
+
+def keep_numbers_whole(value: object) -> object:
+    """Return text without line breaks within its numbers; anything else, pictures and styles too, as it is."""
+    if not isinstance(value, str) or isinstance(value, Markup):
+        return value
+    return _BROKEN_NUMBER.sub("\xa0", value)
+
+
+def render_template(name: str, **values: Any) -> str:
+    """Return a page."""
+    environment = jinja2.Environment(
+        loader=jinja2.PackageLoader("rare_envs.study.html_report"),
+        autoescape=True,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        finalize=keep_numbers_whole,
+    )
+    return environment.get_template(name).render(**values)
+
+
+SECTIONS = ("warnings", "answer", "convergence", "levels", "weights", "curve", "parameters", "kinds", "atlas", "made")
+"""Ids of the sections of the page, in their order."""
+
+
+def write_html_report(
+    folder: Path, trust: bool = False, events: Path | None = None, out: Path | None = None, figures: str | None = None
+) -> list[Path]:
+    """Write the report of a finished run.
+
+    Args:
+        folder: Of the run.
+        trust: Let the ego's file run code, and code that a run from elsewhere names: failures are driven again.
+        events: CSV file of recorded events with a column for each parameter; None without.
+        out: The file; report.html in the folder by default.
+        figures: "svg", "pdf" or "png" for the figures as files too, in a folder `figures` beside the page.
+
+    Returns:
+        The files that were written, the page first.
+
+    Raises:
+        BadInput: There is no finished run, what it was about cannot be loaded any longer, or nothing can be written.
+
+    Example:
+        >>> import tempfile
+        >>> from rare_envs.study import Question, prepare, run_into
+        >>> question = Question(env_id="rare_envs/CarFollowing-v0", gamma=3.0, method="mc", max_sim=200)
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     report = run_into(Path(folder), prepare(question))
+        ...     [page.name for page in write_html_report(Path(folder))]
+        ['report.html']
+    """
+    if figures is not None and figures not in FORMATS:
+        raise BadInput(f"Expected --figures {', '.join(FORMATS)}, got {figures!r}.")
+    study, page = load_finished(folder), out or folder / REPORT
+    with output_file(page):
+        return _write(study, page, trust, events, figures)
+
+
+def _write(study: LoadedStudy, page: Path, trust: bool, events: Path | None, kind: str | None) -> list[Path]:
+    """Write the page of a run, and its figures where their kind is given; return the files."""
+    folder, failures, question = study.folder, study.failures, open_run(study, trust)
+    warn_of_changed_files(question, folder)
+    problem = prepare(question).problem
+    columns = [column for column in list_columns(problem.space) if column.shown]
+    known = None if events is None else read_recorded_events(events, [column.name for column in columns])
+    ordinary = draw_ordinary(problem.space)
+    source = AtlasSource(folder, problem, failures, ordinary, known)
+    with _damage_as_bad_input(folder):
+        atlas = build_atlas(source, list(study.result.get("modes") or []))
+        drawn = _make_figures(study, source)
+        text = render_page(study, drawn, atlas)
+    with as_bad_input(OSError):
+        replace_text(page, text)
+        saved = [] if kind is None else _save_figures(page.parent / "figures", kind, drawn, atlas)
+    return [page, *saved]
+
+
+def render_page(study: LoadedStudy, figures: Mapping[str, FigureOfPage], atlas: Sequence[AtlasEntry]) -> str:
+    """Return the page as text; everything that files say is escaped."""
+    result, doubts = study.result, _list_texts(study.result, "doubts")
+    return render_template(
+        "report.html.j2",
+        result=result,
+        about=study.about,
+        folder=str(study.folder),
+        summary=summarise_answer(result, str((study.about.get("base") or {}).get("name") or "its default base")),
+        doubts=[*_describe_changes(study), *doubts, *filter(None, [describe_wide_base(result)])],
+        remarks=[text for text in _list_texts(result, "warnings", "remarks", "notes") if text not in doubts],
+        intervals=describe_intervals(result),
+        validity=describe_validity(result),
+        end=describe_outcome(str(result.get("status")), doubts),
+        no_gain=explain_no_gain(float(result["p"])),
+        rate=describe_rate(result),
+        method=describe_method(result),
+        figures={name: figure.to_svg() for name, figure in figures.items()},
+        captions={name: figure.caption for name, figure in figures.items()},
+        passes_levels=passes_levels(result),
+        atlas=atlas,
+        svgs={figure.name: figure.to_svg() for entry in atlas for figure in entry.figures},
+        kinds=[(describe_kind(kind), share) for kind, share in (result.get("kinds") or {}).items()],
+        probability=format_probability,
+        roles={**ROLE_COLOURS, "outline: crashed": CRASH_COLOUR},
+    )
+
+
+@contextlib.contextmanager
+def _damage_as_bad_input(folder: Path) -> Iterator[None]:
+    """Raise what a result.json or study.json of somebody else's making leads to as a BadInput."""
+    try:
+        yield
+    except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError, jinja2.TemplateError) as error:
+        raise BadInput(f"{RESULT} or {STUDY} in {str(folder)!r} is damaged: {one_line(error)}.") from error
+
+
+def _describe_changes(study: LoadedStudy) -> list[str]:
+    """Return a warning of files that are not what the run wrote, if there are any."""
+    with as_bad_input(OSError):
+        changed = study.changed_files
+    return [f"not what the run wrote, by the digests in its {STUDY}: {', '.join(changed)}"] if changed else []
+
+
+def _list_texts(result: Mapping[str, Any], *names: str) -> list[str]:
+    """Return the texts that some entries of a result list."""
+    return [str(text) for name in names for text in result.get(name) or []]
+
+
+def _make_figures(study: LoadedStudy, source: AtlasSource) -> dict[str, FigureOfPage]:
+    """Return the figures of the run by name."""
+    space = source.problem.space
+    shown = [j for j, column in enumerate(list_columns(space)) if column.shown]
+    columns = [list_columns(space)[j] for j in shown]
+    failing, log_weights = _read_failing(study, [column.name for column in columns])
+    known = log_weights[~np.isnan(log_weights)]
+    figures = figures_of_result(study.result, known, name_measure(str(study.question.get("measure", ""))))
+    ordinary = source.ordinary[:, shown]
+    if len(failing) and columns:
+        weighted = ~np.isnan(log_weights) if len(known) else np.ones(len(failing), dtype=bool)
+        weights = np.exp(log_weights[weighted]) if len(known) else np.ones(len(failing))
+        order = _rank_shifts(ordinary, failing[weighted], weights)[:MAX_HISTOGRAMS]
+        labels = [columns[j].label for j in order]
+        chosen = failing[weighted][:, order]
+        figures["parameters"] = figure_of_parameters(ordinary[:, order], chosen, weights, labels)
+    return figures
+
+
+def _read_failing(study: LoadedStudy, names: list[str]) -> tuple[FloatArray, FloatArray]:
+    """Return the failing simulations, the columns asked for (k, m) and log weights (k,), NaN where there is none."""
+    if not (study.folder / EPISODES).exists():
+        table = [np.asarray(study.failures[name], dtype=float) for name in names if name in study.failures]
+        x = np.column_stack(table) if len(table) == len(names) else np.empty((0, len(names)))
+        return x, np.full(len(x), np.nan)
+    with as_bad_input(ValueError, OSError):
+        found = study.episodes([*names, "log_weight"], failed=True)
+    x = np.column_stack([found[name].to_numpy() for name in names]) if names else np.empty((found.num_rows, 0))
+    return x, found["log_weight"].to_numpy().astype(float)
+
+
+def _rank_shifts(ordinary: FloatArray, failing: FloatArray, weights: FloatArray) -> list[int]:
+    """Return the columns in which failures differ most from ordinary traffic, by |mean shift| / deviation."""
+    shift = np.average(failing, axis=0, weights=weights) - ordinary.mean(axis=0)
+    return [int(j) for j in np.argsort(-np.abs(shift) / np.maximum(ordinary.std(axis=0), 1e-12), kind="stable")]
+
+
+def _save_figures(
+    folder: Path, kind: str, figures: Mapping[str, FigureOfPage], atlas: Sequence[AtlasEntry]
+) -> list[Path]:
+    with output_folder(folder):
+        every = [*figures.values(), *(figure for entry in atlas for figure in entry.figures)]
+        return [figure.save(folder, kind) for figure in every]

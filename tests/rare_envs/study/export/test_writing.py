@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from rare_envs import DrivingProblem
-from rare_envs.study.export import export_scenario
-from rare_envs.study.export.writing import check_export
+from rare_envs.study.export import check_export, export_scenario
 
 X = [20.0, 5.0, 10.0]
 

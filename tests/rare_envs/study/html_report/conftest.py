@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from rare_envs.study import Question, prepare, run_into
-from rare_envs.study.html_report.page import write_html_report
+from rare_envs.study.html_report import write_html_report
 from tests.rare_envs.study.conftest import write_base
 
 

@@ -14,8 +14,8 @@ import pytest
 from typer.testing import Result
 
 from rare_envs.study import BadInput, Question, prepare, run_into
+from rare_envs.study.html_report import SECTIONS, write_html_report
 from rare_envs.study.html_report.figures import FigureOfPage
-from rare_envs.study.html_report.page import SECTIONS, write_html_report
 
 VOID = {"meta", "br", "img", "link", "path", "use", "rect", "circle", "line", "polygon"}
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from typer.testing import Result
 
-from rare_envs.study.html_report import page
+from rare_envs.study import html_report as page
 
 Cli = Callable[..., Result]
 
