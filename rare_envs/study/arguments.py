@@ -5,6 +5,7 @@ Importing this takes milliseconds, so that the command line starts without torch
 
 from __future__ import annotations
 
+import inspect
 import reprlib
 from collections.abc import Mapping
 from dataclasses import Field, dataclass, field, fields
@@ -187,6 +188,11 @@ class ExecutorOptions:
         if self.executor == "ray":
             return samplers.RayCluster(self.address, self.workers, self.time_limit, memory_limit=memory)
         return samplers.LocalProcesses(self.workers, self.time_limit, memory)
+
+
+for _kind in (Question, ExecutorOptions):
+    _lines = [f"    {each.name}: {each.metadata['help']}" for each in fields(_kind)]
+    _kind.__doc__ = "\n".join([inspect.cleandoc(_kind.__doc__ or ""), "", "Attributes:", *_lines])
 
 
 def option_name(argument: Field[Any]) -> str:
