@@ -135,43 +135,24 @@ def check_normalisation(probe: Probe) -> Iterator[Finding]:
     """Check whether the VecNormalize statistics of a saved ego suit the observations here."""
     if not isinstance(probe.ego, SavedEgo):
         return
+    name, statistics, path = "normalisation", probe.ego.statistics, probe.ego.statistics_path
     missing = probe.ego.find_missing_statistics(probe.space)
     if missing:
-        yield report_warning(
-            "normalisation", f"no VecNormalize statistics, but {missing}", "name their file with --stats"
-        )
-        return
-    if probe.ego.statistics is None:
-        yield Finding(
-            "normalisation",
-            "pass",
-            "no VecNormalize statistics beside the file",
-            "if it was trained behind VecNormalize, put vecnormalize.pkl there, or name it with --stats",
-        )
-        return
-    statistics = probe.ego.statistics
-    if not statistics.norm_obs:
-        yield report_pass("normalisation", f"{probe.ego.statistics_path} does not normalise observations")
-        return
-    if isinstance(probe.seen, dict) or probe.seen.ndim > 2:
-        yield report_pass(
-            "normalisation", f"{probe.ego.statistics_path}; of such observations their fit is not checked"
-        )
-        return
-    single = statistics.observation_space.shape == probe.seen.shape[1:]
-    seen = (
-        probe.seen if single else np.repeat(probe.seen, statistics.observation_space.shape[0] // probe.seen.shape[1], 1)
-    )
-    beyond = float((np.abs(statistics.normalize_obs(seen)) > OUTLYING).any(axis=1).mean())
-    result = (
-        f"{probe.ego.statistics_path}: {beyond:.0%} of ordinary scenarios are over {OUTLYING:g} standard deviations off"
-    )
-    if beyond > MANY_OUTLYING:
-        yield report_warning(
-            "normalisation", result, "are these the statistics of this policy, and of this environment?"
-        )
+        yield report_warning(name, f"no VecNormalize statistics, but {missing}", "name their file with --stats")
+    elif statistics is None:
+        advice = "if it was trained behind VecNormalize, put vecnormalize.pkl there, or name it with --stats"
+        yield Finding(name, "pass", "no VecNormalize statistics beside the file", advice)
+    elif not statistics.norm_obs:
+        yield report_pass(name, f"{path} does not normalise observations")
+    elif isinstance(probe.seen, dict) or probe.seen.ndim > 2:
+        yield report_pass(name, f"{path}; of such observations their fit is not checked")
     else:
-        yield report_pass("normalisation", result)
+        size = statistics.observation_space.shape[0]
+        seen = np.repeat(probe.seen, size // probe.seen.shape[1], 1)  # frames of a stack are alike at time 0
+        beyond = float((np.abs(statistics.normalize_obs(seen)) > OUTLYING).any(axis=1).mean())
+        result = f"{path}: {beyond:.0%} of ordinary scenarios are over {OUTLYING:g} standard deviations off"
+        advice = "are these the statistics of this policy, and of this environment?"
+        yield report_warning(name, result, advice) if beyond > MANY_OUTLYING else report_pass(name, result)
 
 
 def check_actions(probe: Probe) -> Iterator[Finding]:
@@ -179,34 +160,25 @@ def check_actions(probe: Probe) -> Iterator[Finding]:
     action, _ = probe.query(probe.seen)
     declared = getattr(probe.ego, "action_space", None)  # likewise
     whole = np.issubdtype(action.dtype, np.integer)
-    expected = (BATCH_ROWS,) if whole else (BATCH_ROWS, 2)
-    if action.shape != expected or action.dtype == object:
-        yield report_failure(
-            "actions",
-            f"{action.dtype} of shape {action.shape}",
-            f"return shape {(BATCH_ROWS, 2)}, or {BATCH_ROWS} whole numbers",
-        )
+    what = f"{action.dtype} of shape {action.shape}"
+    if action.shape != ((BATCH_ROWS,) if whole else (BATCH_ROWS, 2)) or action.dtype == object:
+        yield report_failure("actions", what, f"return shape {(BATCH_ROWS, 2)}, or {BATCH_ROWS} whole numbers")
         return
-    if not np.isfinite(action).all():
-        bad = int((~np.isfinite(action)).reshape(BATCH_ROWS, -1).any(axis=1).sum())
-        yield report_failure(
-            "actions", f"NaN or infinite for {bad} of {BATCH_ROWS} observations", "check weights and normalisation"
-        )
+    finite = np.isfinite(action).reshape(BATCH_ROWS, -1).all(axis=1)
+    if not finite.all():
+        bad = f"NaN or infinite for {int((~finite).sum())} of {BATCH_ROWS} observations"
+        yield report_failure("actions", bad, "check weights and normalisation")
         return
-    if isinstance(declared, spaces.Discrete) != whole and declared is not None:
-        yield report_failure(
-            "actions", f"{action.dtype} of shape {action.shape}, but it says {declared}", "make both agree"
-        )
+    if declared is not None and isinstance(declared, spaces.Discrete) != whole:
+        yield report_failure("actions", f"{what}, but it says {declared}", "make both agree")
         return
     beyond = 0.0 if whole else float((np.abs(action) > 1.0 + 1e-6).mean())
     if beyond:
-        yield report_warning(
-            "actions", f"{beyond:.0%} beyond [-1, 1], up to {np.abs(action).max():.3g}", "they are clipped", False
-        )
+        far = f"{beyond:.0%} beyond [-1, 1], up to {np.abs(action).max():.3g}"
+        yield report_warning("actions", far, "they are clipped", False)
     if len(np.unique(action.round(6), axis=0)) == 1:
-        yield report_warning(
-            "actions", f"the same for all {BATCH_ROWS} observations: {action[0].tolist()}", "does it look at all?"
-        )
+        same = f"the same for all {BATCH_ROWS} observations: {action[0].tolist()}"
+        yield report_warning("actions", same, "does it look at all?")
     else:
         yield report_pass("actions", f"{action.dtype} of shape (B{', 2' if not whole else ''}), finite")
 

@@ -12,7 +12,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from typer.testing import CliRunner, Result
 
 from rare_envs.scenarios.registry import scenario_named
-from rare_envs.study import plots
+from rare_envs.study import Question, plots, prepare, run_into
 from rare_envs.study.cli.app import app
 
 EGOS = """
@@ -121,6 +121,18 @@ def risky(tmp_path: Path) -> str:
 @pytest.fixture
 def safe(tmp_path: Path) -> str:
     return str(write_base(tmp_path / "safe.json", gap=100.0))
+
+
+@pytest.fixture(scope="session")
+def finished_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Folder of a run of 2,000 simulations by plain Monte Carlo with some 30 collisions, to be copied."""
+    folder = tmp_path_factory.mktemp("finished")
+    base = str(write_base(folder / "risky.json", gap=30.0))
+    asked = Question(env_id="rare_envs/CarFollowing-v0", base=base, method="mc", max_sim=2000, horizon=4.0)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(plots, "FigureCanvasAgg", QuickCanvas)
+        run_into(folder / "run", prepare(asked))
+    return folder / "run"
 
 
 @pytest.fixture

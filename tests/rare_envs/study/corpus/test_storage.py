@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import pytest
 
-from rare_envs.study import Question, prepare, run_into
 from rare_envs.study.corpus import add_run, read_corpus, read_run
 from rare_envs.study.errors import BadInput
 
 
 @pytest.fixture
-def run(tmp_path: Path, risky: str) -> Path:
-    question = Question(env_id="rare_envs/CarFollowing-v0", base=risky, method="mc", max_sim=2000, horizon=4.0)
-    run_into(tmp_path / "run", prepare(question))
-    return tmp_path / "run"
+def run(finished_run: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(finished_run, tmp_path / "run"))
 
 
 def test_failures_of_a_run_are_added_once(run: Path, tmp_path: Path) -> None:

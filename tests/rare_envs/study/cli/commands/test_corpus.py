@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 import json
+import shutil
 import xml.etree.ElementTree as ET
 from pathlib import Path
 
 import pytest
 
 from rare_envs.study.cli.runs import FAILS
-from tests.rare_envs.study.refusals import SMALL, Cli, assert_refused
+from tests.rare_envs.study.refusals import Cli, assert_refused
 
 
 @pytest.fixture
-def run(cli: Cli, risky: str, here: Path) -> Path:
-    assert cli(*SMALL, "--base", risky, "--horizon", 4, "--out", "run").exit_code == 0
-    return here / "run"
+def run(finished_run: Path, here: Path) -> Path:
+    return Path(shutil.copytree(finished_run, here / "run"))
 
 
 def test_from_a_run_to_a_regression_test(cli: Cli, run: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 
 import pytest
@@ -11,11 +12,8 @@ from tests.rare_envs.study.refusals import Cli, assert_refused
 
 
 @pytest.fixture
-def run(cli: Cli, risky: str, tmp_path: Path) -> Path:
-    folder = tmp_path / "run"
-    options = ("--base", risky, "--method", "mc", "--max-sim", 2000, "--horizon", 4, "--out", folder, "--force")
-    assert cli("estimate", "rare_envs/CarFollowing-v0", *options).exit_code == 0
-    return folder
+def run(finished_run: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(finished_run, tmp_path / "run"))
 
 
 def test_a_failure_becomes_files(cli: Cli, run: Path, tmp_path: Path) -> None:

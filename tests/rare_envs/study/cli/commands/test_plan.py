@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 
-from tests.rare_envs.study.refusals import FOLLOWING, SMALL, Cli, assert_refused
+from tests.rare_envs.study.refusals import FOLLOWING, Cli, assert_refused
 
 
-def test_a_plan_from_pilots_and_one_from_a_folder(cli: Cli, risky: str, safe: str, tmp_path: Path) -> None:
+def test_a_plan_from_pilots_and_one_from_a_folder(
+    cli: Cli, risky: str, safe: str, finished_run: Path, tmp_path: Path
+) -> None:
     options = ("--base", risky, "--method", "mc", "--horizon", 4)
     answer = json.loads(cli("plan", FOLLOWING, *options, "--pilot", 2000, "--cov", 0.05, "--json").stdout)
     (planned,) = answer["runs"]
     assert planned["method"] == "mc" and planned["n_sim"] > 2000 and planned["seconds"] > 0.0
-    assert cli(*SMALL, "--base", risky, "--horizon", 4, "--out", tmp_path / "run").exit_code == 0
+    shutil.copytree(finished_run, tmp_path / "run")
     text = cli("plan", tmp_path / "run", "--cov", 0.05).stdout
     assert cli("plan", tmp_path / "run", "--target-cov", 0.05).stdout == text  # as `estimate` names it
     assert f"{planned['n_sim']:,} simulations" in text and "--target-cov 0.05" in text  # the same seed, the same pilot

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 
 import pytest
@@ -11,15 +12,12 @@ from PIL import Image
 from rare_envs.study.cli.runs import FAILS
 from rare_envs.study.run_folder import read_failures
 from rare_envs.study.video import CURVES_HEIGHT, LAST_FRAME_TICKS
-from tests.rare_envs.study.refusals import FOLLOWING, SMALL, Cli, assert_refused
+from tests.rare_envs.study.refusals import Cli, assert_refused
 
 
 @pytest.fixture
-def run(cli: Cli, risky: str, tmp_path: Path) -> Path:
-    folder = tmp_path / "run"
-    result = cli("estimate", FOLLOWING, "--base", risky, "--method", "mc", "--max-sim", 400, "--out", folder)
-    assert result.exit_code in (0, 3)
-    return folder
+def run(finished_run: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(finished_run, tmp_path / "run"))
 
 
 def test_a_failure_of_a_run_is_shown(cli: Cli, run: Path, tmp_path: Path) -> None:
@@ -71,9 +69,9 @@ def test_another_f_than_recorded_is_a_warning(cli: Cli, run: Path) -> None:
 
 
 @pytest.fixture
-def short_run(cli: Cli, risky: str, here: Path) -> Path:
-    assert cli(*SMALL, "--base", risky, "--horizon", 4, "--out", "run").exit_code == 0
-    return here / "run"
+def short_run(finished_run: Path, here: Path) -> Path:
+    """The same in a working directory with egos."""
+    return Path(shutil.copytree(finished_run, here / "run"))
 
 
 def test_all_failures_replay(cli: Cli, short_run: Path) -> None:
