@@ -2,6 +2,18 @@
 
 Where a component is N(0, I) in most directions, its ratio depends on the few others only, which keeps weights exact
 and cheap in hundreds of dimensions.
+
+The von Mises-Fisher-Nakagami distribution: a direction and, independent of it, a radius.
+
+N(0, I) is one, with uniform directions and a chi-squared square of the radius. d + 3 parameters describe
+a component where a Gaussian needs d (d + 3) / 2.
+
+References:
+    Papaioannou, Geyer and Straub, "Improved cross entropy-based importance sampling with a flexible mixture
+    model", Reliability Engineering and System Safety 191, 2019.
+    Banerjee, Dhillon, Ghosh and Sra, "Clustering on the unit hypersphere using von Mises-Fisher distributions",
+    JMLR 6, 2005 (the concentration, equation 4.4).
+    NIST Digital Library of Mathematical Functions, 10.41.3 (Bessel functions of large order).
 """
 
 import math

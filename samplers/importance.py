@@ -1,4 +1,36 @@
-"""Importance sampling: weighted draws from a fixed proposal, and the search for a proposal."""
+"""Importance sampling: weighted draws, their calibration, final draws from a fixed proposal, the search for one.
+
+Calibration: weights of draws from a mixture, changed so that its components keep their known mass.
+
+Draws u_i of q = sum_k a_k q_k, a fixed number n_k = n a_k from each component (a stratum), estimate the mass of each
+component, which is 1, by the mean of h_ij = q_j(u_i) / q(u_i). How far these means are off tells how far p-hat =
+mean(y), y = weight times indicator of failure, is off: they are control variates,
+
+    p = mean(y) - b . (mean(h) - 1),    b = (H'H + r n I)^-1 H'y,    H_i = h_i less the mean of h in its stratum
+
+b minimises the variance within the strata. p is linear in y, so that it is also the mean of y with calibrated weights,
+
+    p = mean(c y),    c_i = 1 - n H_i . (H'H + r n I)^-1 (mean(h) - 1)
+
+c knows nothing of y, and so serves any threshold and any other base distribution too. That b is estimated from the same
+draws biases p by the order of 1 / n, where its standard error is of the order of 1 / sqrt(n).
+
+Draws: importance-weighted points from one proposal, with their spread, interval and doubts.
+
+Search for a proposal: its rounds of draws, its end, and the final draws that follow it.
+
+Shared by the methods that search a proposal by iteration: `ImportanceSampling`, `CrossEntropy` and
+`ImprovedCrossEntropy`. Only the final draws count, unless the run is stopped before them: then the draws of the
+search are weighted as draws from the mixture of its proposals.
+
+Importance sampling with fresh draws from a fixed proposal.
+
+References:
+    Owen and Zhou, "Safe and effective importance sampling", JASA 95, 2000 (components as control variates).
+    Deville and Särndal, "Calibration estimators in survey sampling", JASA 87, 1992 (regression as weights).
+    Owen and Zhou, "Safe and effective importance sampling", JASA 95, 2000 (defensive mixtures).
+    Maurer and Pontil, "Empirical Bernstein bounds and sample-variance penalization", COLT 2009.
+"""
 
 from __future__ import annotations
 

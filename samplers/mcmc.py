@@ -1,4 +1,22 @@
-"""Markov chains: kernels that leave a conditioned distribution invariant, and the chains that they move."""
+"""Markov chains: kernels that leave a conditioned distribution invariant, chains, and the descent through levels.
+
+Markov kernels in standard normal space that stay inside {f <= level}.
+
+A kernel proposes candidates that leave N(0, I) invariant; a candidate is taken if its outcome is <= level
+(`accept_candidates`), which makes N(0, I) given f <= level the invariant distribution.
+
+Descent through the levels of subset simulation: the loop, whatever the seeds, the chain lengths and the end.
+
+The points of level j + 1 are chains inside {f <= b_(j+1)}, grown from seeds among the points of level j (Au and Beck,
+2001). A `LevelPlanner` chooses threshold, seeds and lengths; the loop grows the chains and hands the kernel on.
+
+References:
+    Au and Beck, "Estimation of small failure probabilities in high dimensions by subset simulation",
+    Probabilistic Engineering Mechanics 16, 2001 (modified Metropolis, section 4).
+    Papaioannou, Betz, Zwirglmaier and Straub, "MCMC algorithms for subset simulation",
+    Probabilistic Engineering Mechanics 41, 2015 (conditional sampling, section 3.3; its
+    adaptation, section 3.4).
+"""
 
 import math
 from collections.abc import Callable, Generator

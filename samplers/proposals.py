@@ -1,4 +1,26 @@
-"""Gaussians with their densities and moments."""
+"""Proposals: Gaussians and mixtures, fitted to weighted points by expectation-maximisation with shrunk covariances.
+
+Shrinkage of a covariance that is estimated from few weighted points.
+
+Two targets: N(0, I) with one special direction, for points of one failure region, and the present Gaussian of a
+search, for a step of it. Without a target: the eigenvalues alone, by factors (Stein).
+
+Expectation-maximisation for mixtures of any family.
+
+k-means: clusters of weighted points, for the first responsibilities of expectation-maximisation.
+
+References:
+    Stein, "Lectures on the theory of estimation of many parameters", Journal of Soviet Mathematics 34, 1986
+    (eigenvalues; put into order again as by Lin and Perlman, "A Monte Carlo comparison of four estimators of a
+    covariance matrix", 1985).
+    Ledoit and Wolf, "A well-conditioned estimator for large-dimensional covariance matrices",
+    Journal of Multivariate Analysis 88, 2004 (the share of the target).
+    Dempster, Laird and Rubin, "Maximum likelihood from incomplete data via the EM algorithm", JRSS B 39, 1977.
+    Geyer, Papaioannou and Straub, "Cross entropy-based importance sampling using Gaussian densities revisited",
+    Structural Safety 76, 2019 (weighted points).
+    Arthur and Vassilvitskii, "k-means++: the advantages of careful seeding", SODA 2007.
+    Lloyd, "Least squares quantization in PCM", IEEE Transactions on Information Theory 28, 1982.
+"""
 
 from __future__ import annotations
 

@@ -1,5 +1,14 @@
 """Statistics: importance weights, intervals, the next threshold of a search, the share of p that was not found.
 
+The share of p in regions of failure that were not found, and the upper end of p that holds it.
+
+Let nu independent lineages have reached failure, all of them in the regions that are known. The share M of p in other
+regions has then the distribution Beta(1/10, nu): each lineage is a trial that a region of share M is missed with
+probability 1 - M; the first parameter is small because most problems have no other region. With p-hat exp(s Z) the
+probability of the regions known, Z ~ N(0, 1), the upper end is the quantile of p-hat exp(s Z) / (1 - M).
+
+Coefficients of variation and confidence intervals.
+
 References:
     Clopper and Pearson, "The use of confidence or fiducial limits", Biometrika 26, 1934.
     Au and Beck, "Estimation of small failure probabilities in high dimensions by subset

@@ -1,4 +1,11 @@
-"""Serialization: values as JSON has them."""
+"""Results in files and as tables of points; reading a file runs no code of it.
+
+Results in files: safetensors for arrays, JSON for the rest; reading a file runs no code of it.
+
+A file holds one object of the classes that `register_stored` names, with objects of these classes inside. A value is
+written as JSON writes it; numbers that JSON has not, arrays, tuples and objects are written as {kind: content} with one
+of the kinds below.
+"""
 
 from __future__ import annotations
 

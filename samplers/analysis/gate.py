@@ -6,7 +6,20 @@ the ends of a 90 % interval. Where nothing failed, the upper end is the bound th
 themselves, whatever the method.
 
 Where the base distribution was fitted, p is that of the true distribution, and the limits are those that the events
-behind the base leave (`samplers.analysis.base_error`), unless the base is taken as given.
+behind the base leave (`samplers.analysis.base_uncertainty`), unless the base is taken as given.
+
+Budget: simulations for a wished coefficient of variation, from a pilot.
+
+A method that goes on drawing until it meets a target (two-stage, cross-entropy, importance sampling, Monte Carlo) has
+made a search of S simulations and then n draws with the c.o.v. c0. The variance of these falls as 1 / n, so that
+
+    N(c) = S + n (c0 / c)^2
+
+is its cost with `target_cov=c`, if the pilot had the method's own budget and so the same search. A method of single
+runs (subset simulation) is repeated: N(c) = N0 (c0 / c)^2, but at least 5 runs. Plain Monte Carlo needs
+(1 - p) / (p c^2).
+
+The pilot knows its own c.o.v. to a few ten per cent, and another seed finds another proposal.
 """
 
 from __future__ import annotations

@@ -3,6 +3,13 @@
 A base distribution that was fitted to events has an error of its own. Its refits are the same recipe applied to
 resampled events (whole clusters of them, where events come in clusters): the spread of p over the refits is the
 spread that p owes to the events.
+
+Families of refits: where refits choose the family of distributions anew, p spreads within each and between them.
+
+Refits of one family spread around a value of their own. One standard deviation over all would take the distance between
+two families for a spread to both sides: where some refits lie far below p, the upper end would rise as well. Here each
+family has an interval around its own centre, and the whole reaches from the lowest end to the highest; what is expected
+for the next event is the sum of what each family expects, by its share of the refits.
 """
 
 from __future__ import annotations

@@ -1,4 +1,43 @@
-"""Sensitivity of p to its base distribution: derivatives by its parameters, and importance of each column of x."""
+"""Sensitivity: importance of each column of x, derivatives by parameters of the base, shares of the spread of refits.
+
+Importance of each column of x for failure: how far the failing points are from ordinary ones in its direction.
+
+The measure is the relative entropy of u_j given failure against its base distribution N(0, 1), in standard normal
+space, as a share of -log p:
+
+    I_j = D_j / (-log p),    D_j = KL(u_j | failure || N(0, 1)).
+
+The joint relative entropy of u given failure is exactly -log p, and the base of u is a product, so that the I_j add up
+to at most 1; the rest is what the columns do together. For a half-space {alpha . u >= beta} I_j tends to alpha_j^2, the
+importance factor of first-order reliability analysis, as beta grows. First-order Sobol indices of the indicator of
+failure, in contrast, are small wherever failure needs several columns at once.
+
+D_j is computed from mean m and variance s^2 of u_j given failure as (m^2 + s^2 - 1 - log s^2) / 2: exact where u_j
+given failure is normal, and else a lower bound, since of all distributions with these moments the normal has most
+entropy.
+
+Parameter scores: d log p / d theta for parameters theta of the base distribution, from failing points of a run.
+
+With p = E[1{f(X) <= gamma}] and X ~ p0(x; theta),
+
+    d log p / d theta = E[d log p0(X; theta) / d theta | f(X) <= gamma],
+
+the score function averaged over the failures. The simulations do not depend on theta, so none is made. The score is
+the central difference of log_prob at the failing points.
+
+Spread shares: which parameters of a fitted base distribution the spread of log p over its refits comes from.
+
+To first order log p under refit b is log p + L_b, L_b = sum_i g_i delta_bi, with g_i = d log p / d theta_i and delta_bi
+the displacement of parameter i. Parameter i has the share cov(g_i delta_i, L) / var(L): all add up to 1.
+
+References:
+    Liu, Chen and Sudjianto, "Relative entropy based method for probabilistic sensitivity analysis in engineering
+    design", Journal of Mechanical Design 128, 2006.
+    Li, Papaioannou and Straub, "Global reliability sensitivity estimation based on failure samples", Structural
+    Safety 81, 2019 (sensitivities from failing samples).
+    Rubinstein and Kroese, "Simulation and the Monte Carlo Method", chapter on sensitivity analysis (the score
+    function method).
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,12 @@
-"""Kullback-Leibler projections onto exponential families whose parameters lie in a box.
+"""Blocks of coordinates, each with the family that cross-entropy searches, the projections on it, and their product.
+
+Blocks of coordinates, each with the family of distributions that cross-entropy searches, and their product.
+
+Equation 2 of O'Kelly et al. (2018) separates by block: the Kullback-Leibler projection of a distribution on
+a product of families is the product of the projections of its marginals. A block is one factor of the
+base distribution; its family limits how far a search may move it.
+
+Kullback-Leibler projections onto exponential families whose parameters lie in a box.
 
 The projection of any distribution P on a family with sufficient statistic Gamma and log partition
 function A maximises theta' E_P[Gamma] - A(theta): it depends on P through E_P[Gamma] alone
@@ -21,7 +29,8 @@ from typing import Any, Protocol, TypeVar, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
-from scipy.special import betainc, betaincc, betainccinv, betaincinv, betaln, digamma, ndtr, ndtri, polygamma
+from scipy.optimize import minimize
+from scipy.special import betainc, betaincc, betainccinv, betaincinv, betaln, digamma, ndtr, ndtri
 
 from samplers.distributions import SizedDistribution, as_distribution, can_convert
 from samplers.problem import FloatArray, Inputs
@@ -36,17 +45,6 @@ from samplers.proposals import (
 )
 from samplers.system.optional_libraries import needs_library
 
-NEWTON_STEPS = 100
-"""Far more than a concave function of two variables takes (about 10)."""
-GRADIENT = 1e-10
-"""Largest entry of the free gradient at which Newton's iteration ends."""
-HALVINGS = 40
-"""Of a step at most; 2^-40 of a step is rounding."""
-ARMIJO = 1e-4
-"""Share of the promised rise that a step must reach (Nocedal and Wright, "Numerical Optimization", section 3.1)."""
-RELATIVE_ROUNDING = 1e-14
-"""Relative error of the likelihood, in which a rise near the top is lost."""
-
 
 def beta_statistics(alpha: FloatArray, beta: FloatArray) -> FloatArray:
     """Return E[log y] and E[log(1 - y)] for y ~ Beta(alpha, beta), each (m,), as (m, 2): the gradient of log B."""
@@ -57,10 +55,7 @@ def beta_statistics(alpha: FloatArray, beta: FloatArray) -> FloatArray:
 def project_beta(statistics: FloatArray, low: float, high: float) -> FloatArray:
     """Return the Beta distributions in a box whose likelihood for the given statistics is largest.
 
-    Maximises (alpha, beta) . statistics - log B(alpha, beta) over low <= alpha, beta <= high, for
-    each row on its own, by Newton's method with the exact Hessian: coordinates at a bound whose
-    gradient points outwards are held, the others take a Newton step, projected on the box and
-    halved until it ascends (Bertsekas 1982).
+    Maximises (alpha, beta) . statistics - log B(alpha, beta) over low <= alpha, beta <= high, for each row.
 
     Args:
         statistics: E[log y] and E[log(1 - y)], negative and finite, shape (m, 2).
@@ -70,46 +65,17 @@ def project_beta(statistics: FloatArray, low: float, high: float) -> FloatArray:
     Returns:
         alpha and beta, shape (m, 2).
     """
-    theta = np.full(statistics.shape, np.clip(2.0, low, high))
-    for _ in range(NEWTON_STEPS):
-        gradient = statistics - beta_statistics(theta[:, 0], theta[:, 1])
-        held = ((theta <= low) & (gradient < 0)) | ((theta >= high) & (gradient > 0))
-        gradient = np.where(held, 0.0, gradient)
-        if np.abs(gradient).max() <= GRADIENT:
-            break
-        step = np.asarray(np.linalg.solve(_beta_curvature(theta, held), gradient[..., None])[..., 0], np.float64)
-        theta = _line_search(theta, step, gradient, statistics, low, high)
-    return theta
 
+    def loss(parameters: FloatArray) -> tuple[float, FloatArray]:
+        theta = parameters.reshape(statistics.shape)
+        alpha, beta = theta.T
+        slope = beta_statistics(alpha, beta) - statistics
+        return float((betaln(alpha, beta) - (theta * statistics).sum(axis=1)).sum()), slope.ravel()
 
-def _beta_curvature(theta: FloatArray, held: np.ndarray) -> FloatArray:
-    """Return the Hessian of log B at theta (m, 2), shape (m, 2, 2), with unit rows and columns where held."""
-    coupling = np.where(held.any(axis=1), 0.0, -polygamma(1, theta.sum(axis=1)))
-    diagonal = np.where(held, 1.0, polygamma(1, theta) - polygamma(1, theta.sum(axis=1))[:, None])
-    hessian = np.empty((len(theta), 2, 2))
-    hessian[:, 0, 0], hessian[:, 1, 1] = diagonal.T
-    hessian[:, 0, 1] = hessian[:, 1, 0] = coupling
-    return hessian
-
-
-def _line_search(
-    theta: FloatArray, step: FloatArray, gradient: FloatArray, statistics: FloatArray, low: float, high: float
-) -> FloatArray:
-    """Return theta + size * step, projected on the box, with size 1, 1/2, ... until the likelihood rises enough."""
-
-    def likelihood(at: FloatArray) -> FloatArray:
-        return np.asarray((at * statistics).sum(axis=1) - betaln(at[:, 0], at[:, 1]))
-
-    start = likelihood(theta)
-    size = np.ones(len(theta))
-    for _ in range(HALVINGS):
-        trial = np.clip(theta + size[:, None] * step, low, high)
-        promised = (gradient * (trial - theta)).sum(axis=1)
-        risen = likelihood(trial) - start >= ARMIJO * promised - RELATIVE_ROUNDING * np.abs(start)
-        if risen.all():
-            break
-        size = np.where(risen, size, size / 2)
-    return trial
+    start = np.full(statistics.size, np.clip(2.0, low, high))
+    options: Any = {"maxiter": 1000, "ftol": 1e-15, "gtol": 1e-10}
+    found = minimize(loss, start, jac=True, method="L-BFGS-B", bounds=[(low, high)] * len(start), options=options)
+    return np.asarray(found.x.reshape(statistics.shape))
 
 
 def project_mean(target: FloatArray, centre: FloatArray, cholesky: FloatArray, radius: float) -> FloatArray:

@@ -1,4 +1,4 @@
-"""Iterates of the cross-entropy search, and the choice among them."""
+"""The cross-entropy method (O'Kelly et al. 2018, algorithm 1)."""
 
 import math
 from collections.abc import Generator, Sequence

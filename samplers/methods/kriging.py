@@ -1,7 +1,17 @@
-"""Surrogate: kriging of f learns where it fails, and importance sampling on the simulator gives the estimate.
+"""Kriging of f: a Gaussian process that gives every point a probability of failure.
 
-`method` has the class, `kriging` the regression of f, `learning` the points that it is learned from, `pool` the draws
-that both are chosen from, `estimate` what those for the estimate say, `settings` the numbers.
+Made robust against what simulators return:
+
+- *Scale.* Outcomes y = f - gamma are compressed, z = arcsinh(y / c): what is far from gamma matters little.
+- *Caps.* Where many outcomes equal the largest (a capped time to collision) or the least one (-1 on collision), the
+  process need not pass through them. They are censored: known to be at least the cap, or at most 0, and replaced
+  within these bounds by what the others predict there, then by their leave-one-out predictions.
+- *A jump to failure* (0.5 s, then a collision) moves the limit to where points begin to fail.
+- *Noise and jumps* are a nugget whose size is found with the other covariance parameters.
+- *Overconfidence.* Standard deviations are inflated by the standardised residuals of leaving each point out.
+
+References:
+    Rasmussen and Williams, "Gaussian Processes for Machine Learning", MIT Press, 2006 (5.10 to 5.12: leave-one-out).
 """
 
 import math

@@ -1,10 +1,11 @@
-"""Levels of subset simulation with any kernel: how many points each has, and when the run ends.
+"""Subset simulation (Au and Beck 2001) and adaptive subset simulation (Tian et al. 2024): levels, estimate, methods.
 
-The loop is `samplers.mcmc`, the estimate from all levels `subset_estimate`.
+Estimate of subset simulation: p, c.o.v., interval and weighted points from the levels of a descent.
 
 References:
     Au and Beck, "Estimation of small failure probabilities in high dimensions by subset simulation",
     Probabilistic Engineering Mechanics 16, 2001.
+    Lee and Whiteley, "Variance estimation in the particle filter", Biometrika 105, 2018.
 """
 
 import math

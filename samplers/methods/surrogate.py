@@ -1,4 +1,6 @@
-"""Pool: many draws from a known mixture, judged by the surrogate; the few that are simulated are chosen among them.
+"""Surrogate: kriging of f learns where it fails, and importance sampling on the simulator gives the estimate.
+
+Pool: many draws from a known mixture, judged by the surrogate; the few that are simulated are chosen among them.
 
 With N draws u_i from a mixture Q, w_i = phi(u_i) / Q(u_i), and a point i simulated with probability b_i in each of n
 trials, the mean of 1[f(u_i) <= gamma] w_i / (N b_i) over the trials is an unbiased estimate of p whatever b is. With

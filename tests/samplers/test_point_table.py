@@ -19,7 +19,7 @@ def test_weights_of_failing_simulations_add_up_to_p(method):
     assert set(table.run) == {0, 1}
 
 
-@pytest.mark.parametrize("method", samplers.METHODS)
+@pytest.mark.parametrize("method", ["adss", "ce", "mc", "two-stage"])
 def test_every_simulated_point_is_there_with_its_outcome(method):
     result = samplers.estimate(PROBLEM, method, seed=0, max_sim=300, keep_points=True)
     x = result.to_pandas()[["x1", "x2"]].to_numpy()

@@ -1,4 +1,24 @@
-"""Joint batches: searches that use nothing of each other ask for their simulations together, in one batch."""
+"""Exploration: the search for every region of failure, the first stage of `TwoStage`.
+
+Five sources. Subset simulation and lines of descent follow f downhill; the others use no more than whether a point
+fails, so that plateaus, ties, jumps and misleading level sets do not matter to them:
+
+1. Draws from the base distribution, and wide ones from N(0, s^2 I): a half-space at distance beta fails with
+   probability Phi(-beta / s), whatever the dimension (`find_wide_failures`).
+2. Subset simulation from the base draws, for regions too small to be hit by wide draws (`descend_levels`).
+3. Lines of descent from low base draws, each a trial of its own of which region is found (`walk_lines`). They
+   use nothing of the subset simulation, and are walked in the same batches (`join_batches`).
+4. Chains inside the region of failure (pCN), started from all of these, so that wide failures become likely ones
+   (`regions.py`).
+5. The points half way between two failing points: if one fails, the two belong to one region (`regions.py`).
+
+Lines of descent: points that walk downhill, each alone, until they fail.
+
+In subset simulation points descend from the few that were lowest at first: of 500 base draws three to five effectively
+have descendants among the failures, and a region that none of these leads to is not found. Here no line ends because
+another one is lower: each moves where f is no larger than at its own point. So each is a trial of its own of which
+region is found, and nothing else: its end is no draw given failure.
+"""
 
 import math
 from contextlib import suppress

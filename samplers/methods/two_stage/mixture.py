@@ -1,4 +1,15 @@
-"""The mixture proposal of two-stage: its components and their weights."""
+"""The mixture proposal of two-stage: its components, fitted to weighted points, and their weights.
+
+Mixtures of `SubspaceGaussian` components, fitted to weighted points with cautious covariances.
+
+Mixture weights that minimise the variance of importance sampling, with lower limits for groups of components.
+
+References:
+    Schwarz, "Estimating the dimension of a model", Annals of Statistics 6, 1978 (BIC).
+    Ionides, "Truncated importance sampling", Journal of Computational and Graphical Statistics 17, 2008.
+    Cappé, Douc, Guillin, Marin and Robert, "Adaptive importance sampling in general mixture classes", Statistics and
+    Computing 18, 2008 (adapts the weights by EM, to the Kullback-Leibler divergence; here the second moment itself).
+"""
 
 import math
 from collections.abc import Sequence

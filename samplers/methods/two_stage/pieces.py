@@ -1,7 +1,22 @@
-"""Regression of f by pieces: f as the least of several linear functions.
+"""Regression of f by pieces: f as the least, or the greatest, of several linear functions.
+
+Regression of f by pieces: f as the least of several linear functions.
 
 Each point belongs to the piece that is the least there, and each piece is fitted anew to its points, until hardly a
 point changes its piece.
+
+Series systems by regression: f as the least of several linear functions, and the half-spaces where these fail.
+
+Where failure has no regions of its own but dozens of planes that pass into each other, as in the first passage of a
+vibration, neither Gaussians nor one plane a region describe it. The pieces of f do. They are only the source of a
+proposal: how well they fit decides how good it is, not whether the estimate is right.
+
+Parallel systems by regression: f as the greatest of several linear functions, and the corner where all of them fail.
+
+A failure region that several conditions bound, each of which must hold, is a corner; a convex one with a curved edge
+is nearly one. One plane describes it as badly as one Gaussian. The pieces of f do: f is the greatest of them where -f
+is the least. They are only the source of a proposal: how well they fit decides how good it is, not whether the
+estimate is right.
 
 References:
     Magnani and Boyd, "Convex piecewise-linear fitting", Optimization and Engineering 10, 2009 (there the largest).

@@ -1,6 +1,7 @@
-"""The share of p that was not found, and the interval that holds it.
+"""Failure regions: chains grow inside them, and the points half way between failing points separate them.
 
-`samplers/statistics.py` has the equations; here lineages are counted.
+A half way point uses f by its sign only: if it fails, the two points are of one region. Near convex regions are
+separated by this in any dimension, however alike they look.
 """
 
 import math

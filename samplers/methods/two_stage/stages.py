@@ -1,4 +1,8 @@
-"""The state of a run of two-stage, frozen, and what is fixed for the run."""
+"""Stages of two-stage: the steps of a run from one state to the next.
+
+A step that needs simulations is a generator: `state = yield from draw_first(context, state)`. Where `Interrupted`
+ends it, the caller goes on with the state before the step.
+"""
 
 import math
 from dataclasses import dataclass, replace

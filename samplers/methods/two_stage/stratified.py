@@ -1,7 +1,16 @@
-"""Multiple importance sampling: draws of several proposals, weighted as draws from the mixture of all of them.
+"""Samples of two-stage and what is doubted in them: all draws by multiple importance sampling, the estimate stratified.
+
+Multiple importance sampling: draws of several proposals, weighted as draws from the mixture of all of them.
 
 With n_k draws from component q_k and n in all, every draw has the weight phi / sum_k (n_k / n) q_k (deterministic
 mixture weights, the balance heuristic): no weight is larger than n / n_0 where n_0 draws are from phi itself.
+
+Stratified samples: draws from mixtures, a fixed number from each component, and p with its error.
+
+With n_k of n draws from component k and y = weight times indicator of failure, p-hat = sum(y) / n, and its variance is
+sum_k n_k var_k(y) / n^2: that between the components, which independent draws of the mixture would add, is none. The
+weights are calibrated (`samplers/importance.py`): what the known mass of each kind of component explains of
+y counts no more.
 
 References:
     Veach and Guibas, "Optimally combining sampling techniques for Monte Carlo rendering", SIGGRAPH 1995.

@@ -188,6 +188,7 @@ def test_points_without_an_outcome_are_not_in_the_lower_end_where_they_only_boun
     assert one.interval == (pytest.approx((1 - share) * two.interval[0]), two.interval[1])
 
 
+@pytest.mark.slow
 def test_replicates_are_reweighted_together():
     result = run(BASE, replicates=4, max_sim=8000)
     found = result.base_uncertainty

@@ -26,7 +26,7 @@ def curve_of(result, thresholds, most=None):
     return compute_exceedance(result, failures, failures.x[:, 0], thresholds)
 
 
-@pytest.mark.parametrize("method", sorted(samplers.METHODS))
+@pytest.mark.parametrize("method", ["adss", "ce", "mc", "two-stage"])
 def test_the_curve_falls_from_p(method):
     result = run(method, max_sim=8_000)
     curve = curve_of(result, [3.0, 0.0, 3.5])  # every failing point lies beyond 2.5

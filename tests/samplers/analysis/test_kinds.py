@@ -25,7 +25,7 @@ def run(method, seed=1, **options):
     return samplers.estimate(samplers.FunctionProblem(f, 2), method, seed=seed, **options)
 
 
-@pytest.mark.parametrize("method", sorted(samplers.METHODS))
+@pytest.mark.parametrize("method", ["adss", "ce", "mc", "two-stage"])
 def test_shares_add_up_to_p(method):
     result = run(method, max_sim=8_000)
     shares = result.shares(side)

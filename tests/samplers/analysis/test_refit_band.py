@@ -37,6 +37,7 @@ def band_of_events(rng, thresholds):
     return band_of(log_p[:, 0], log_p[:, 1:], thresholds)
 
 
+@pytest.mark.slow
 def test_the_band_holds_all_thresholds_together_where_intervals_of_each_do_not(monkeypatch):
     """Of 300 draws of the events 95 % are wanted: under 273 has a probability of 0.1 %.
 

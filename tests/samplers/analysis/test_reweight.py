@@ -75,7 +75,7 @@ def test_what_the_estimate_knows_beyond_its_units_widens_the_answer():
     assert smaller == replace(result, cov=2e-3).reweight(Normal(0.1)).cov > 0.05  # but no less than that of the units
 
 
-@pytest.mark.parametrize("method", sorted(samplers.METHODS))
+@pytest.mark.parametrize("method", ["adss", "ce", "mc", "two-stage"])
 def test_the_same_base_gives_the_same_p(method):
     result = run(method)
     again = result.reweight(samplers.StandardNormal(2))

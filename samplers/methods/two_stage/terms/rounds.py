@@ -1,4 +1,4 @@
-"""Rounds of a search by terms: pursue terms from the ends of walks, refit their proposals to all draws so far."""
+"""Rounds of a search by terms: terms pursued from the ends of walks, proposals refitted, final rounds combined."""
 
 import math
 from dataclasses import dataclass, replace

@@ -1,4 +1,17 @@
-"""Order of the terms: any method follows the least term in place of f where it asks for f."""
+"""Search by terms: failures of a least over terms, in tens to thousands of dimensions.
+
+f is a least over terms (which car is hit, ahead or behind, early or late), and each term's failures are nearly one
+half-space. In standard normal space:
+
+1. *Walks* (`walks.py`): from low base draws of every term that matters downhill along its gradient to its failures.
+2. *Rounds* (`rounds.py`, `fitting.py`): for each term Gaussians in the subspace of its gradients, N(0, I)
+   across it; fitted anew after every round to all draws so far, weighted by the balance heuristic.
+3. *Estimate* (`rounds.py`): three final rounds, each from a proposal fitted to what came before, with exact weights
+   and shares in p that were fixed beforehand: p = sum_r c_r mean(w_r 1{f <= gamma}) counts failures of any term.
+
+Each p_r is unbiased given the past: subspaces, terms and Gaussians may be wrong and p stays right; only its c.o.v.
+suffers. Where the rounds show that they are wrong, adaptive subset simulation takes over, on the order of the terms.
+"""
 
 import math
 from collections.abc import Callable, Generator, Sequence

@@ -1,4 +1,4 @@
-"""Terms and their gradients in standard normal space, and the count of what they cost."""
+"""Gradient walks, and terms with their gradients in standard normal space, where what they cost is counted."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
