@@ -9,9 +9,9 @@ from importlib import import_module
 from os import PathLike
 from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
+from samplers.errors import needs_library
 from samplers.problem import FloatArray
 from samplers.stored import read_object, write_object
-from samplers.system.optional_libraries import needs_library
 
 
 def html_table(title: str, rows: Iterable[Sequence[str]], header: Sequence[str] = (), notes: Iterable[str] = ()) -> str:

@@ -1,5 +1,9 @@
-"""Errors of evaluations: what is wrong with the values that f returned, and the rules for rows on which it fails."""
+"""Errors: what is wrong with values that f returned, rules for rows on which it fails, libraries that are missing."""
 
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Literal, Protocol, get_args, runtime_checkable
 
 import numpy as np
@@ -63,3 +67,18 @@ def one_per_row(outcomes: ArrayLike, n: int) -> NDArray[np.float64]:
 def describe_point(x: NDArray[np.float64]) -> str:
     """Return a point x (d,) in one line."""
     return np.array2string(x, precision=6, threshold=8, separator=", ", max_line_width=10**6)
+
+
+@contextmanager
+def needs_library(library: str, purpose: str) -> Iterator[None]:
+    """Raise an error that says what to install if an import in the block fails because a library is missing.
+
+    Raises:
+        ImportError: If the library, or a part of it, cannot be found.
+    """
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        if (error.name or "").partition(".")[0] != library:
+            raise
+        raise ImportError(f"{purpose} needs {library}: pip install {library}.", name=library) from None

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 from os import PathLike
 from pathlib import Path
 
-from samplers.analysis.refits import HasEnsemble, HasParts, needs_ensemble_run, pool_refits
+from samplers.analysis.refits import needs_ensemble_run, pool_refits
 from samplers.arguments import InputsOnly, RunArguments, check_attributes, check_problem, choose_seed, find_base_fault
 from samplers.errors import OnError
 from samplers.evaluate import Evaluator
@@ -17,12 +17,12 @@ from samplers.journal import Journal, JournalError, NothingRecorded
 from samplers.method import Stepping
 from samplers.methods.auto import Auto
 from samplers.methods.two_stage.method import TwoStage
+from samplers.platform_calls import defer_signals
 from samplers.problem import Inputs, Problem, StandardNormal
 from samplers.progress import Listener, Pace, Progress, open_listener
 from samplers.registry import get_method
 from samplers.result import Estimate
 from samplers.run import Run
-from samplers.system import defer_signals
 from samplers.trace import Status
 from samplers.validation import check_number
 
@@ -280,10 +280,10 @@ class Simulation:
             EstimationInterrupted: If it is interrupted; what is known is the first run.
         """
         problem = self.evaluator.problem
-        split = problem.failing_parts if isinstance(problem, HasParts) else None
+        split = getattr(problem, "failing_parts", None)  # shares (m, k) of failing points (k, d) in m parts
         if first.status is Status.STOPPED or not needs_ensemble_run(first, split):
             return first
-        if not isinstance(problem.base, HasEnsemble):
+        if not hasattr(problem.base, "ensemble"):
             return first
         further = replace(arguments, seed=first.seed, target_cov=None, replicates=1)
         try:

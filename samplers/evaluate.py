@@ -458,8 +458,9 @@ def _find_offer(problem: Any) -> TermsOffer | None:
     """Return what a problem can answer beside f."""
     if not offers_terms(problem):
         return None
+    known: Any = problem
     gradient: Any = getattr(problem, "gradient", None)  # a property may have to find out whether there is one
-    cost = float(problem.gradient_cost) if callable(gradient) else None
+    cost = float(known.gradient_cost) if callable(gradient) else None
     if cost is not None:
         check_number("gradient_cost", cost, 0.0, np.inf)
     return TermsOffer(cost, bool(getattr(problem, "terms_with_f", True)))

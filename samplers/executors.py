@@ -34,7 +34,7 @@ from uuid import uuid4
 import numpy as np
 
 from samplers.chunks import Chunk, Index, Result, join_results
-from samplers.system import limit_memory
+from samplers.platform_calls import limit_memory
 from samplers.validation import check_number, check_whole
 
 ATTEMPTS = 3

@@ -246,14 +246,6 @@ class Stepping(Protocol):
         """Estimate P[f(X) <= goal.gamma], X ~ inputs.base."""
 
 
-@runtime_checkable
-class Choosing(Protocol):
-    """A method that leaves the run to another one, chosen before any simulation."""
-
-    def choose(self, inputs: Inputs, goal: Goal) -> "Choice":
-        """Return the method for one run."""
-
-
 class Choice(NamedTuple):
     """A method for one run, and why it was chosen."""
 

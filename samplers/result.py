@@ -20,6 +20,7 @@ from samplers.analysis.reweight import Reweighted, find_sibling, reweight_estima
 from samplers.analysis.sensitivity import Sensitivity, compute_sensitivity
 from samplers.analysis.weighted import require_sample
 from samplers.display import drawing_axes, html_table, indent_lines
+from samplers.errors import needs_library
 from samplers.estimate_data import EstimateData
 from samplers.method import Stepping
 from samplers.problem import Distribution, FloatArray
@@ -37,7 +38,6 @@ from samplers.stored import (
     to_json_value,
     write_object,
 )
-from samplers.system.optional_libraries import needs_library
 from samplers.trace import Level, Status, describe_outcome
 
 if TYPE_CHECKING:

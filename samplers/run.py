@@ -16,7 +16,6 @@ from samplers.errors import EvaluationError, OnError, describe_point, one_per_ro
 from samplers.method import (
     Answer,
     Choice,
-    Choosing,
     Goal,
     GradientRequest,
     Interrupted,
@@ -315,9 +314,11 @@ class Run:
 
 def choose_method(method: Stepping, inputs: Inputs, goal: Goal, replicates: int) -> Choice:
     """Return the method that runs, and why where another one has chosen it: by the smallest share of the budget."""
-    if not isinstance(method, Choosing):
+    choose = getattr(method, "choose", None)  # of `Auto`, or of a method of one's own
+    if choose is None:
         return Choice(method)
-    return method.choose(inputs, replace(goal, max_sim=split_budget(goal.max_sim, replicates)[0]))
+    chosen: Choice = choose(inputs, replace(goal, max_sim=split_budget(goal.max_sim, replicates)[0]))
+    return chosen
 
 
 def split_budget(max_sim: int | None, replicates: int) -> list[int | None]:

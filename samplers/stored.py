@@ -22,9 +22,9 @@ from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from samplers.errors import needs_library
 from samplers.problem import FloatArray
 from samplers.sample import Sample, SimulatedPoints, SimulationIndex
-from samplers.system.optional_libraries import needs_library
 
 
 def to_json_value(value: Any) -> Any:

@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Sequence
-from typing import NamedTuple, Protocol, runtime_checkable
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -51,8 +51,10 @@ REFIT_CHECK_DRAWS = 100
 class FittedBase(Distribution, Protocol):
     """A base distribution that was fitted to events, with its bootstrap refits; without refits it is like any other.
 
-    One that is also `HasEnsemble` lets `estimate` make a further run where the points of the first do not reach the
-    refits.
+    With `ensemble()`, the mixture of the refits with equal weights (a ValueError where they cannot be mixed), it lets
+    `estimate` make a further run where the points of the first do not reach the refits; `covering_ensemble()` is the
+    mixture of a few of many refits that reach as far. `refits.log_probs(x)` may give the log densities of all R refits
+    at x (k, d) at once, shape (R, k); `refit_families` the number of the family of each, 0 for that of the base.
 
     Example:
         >>> import samplers
@@ -79,42 +81,6 @@ class FittedBase(Distribution, Protocol):
     @property
     def family(self) -> str:
         """The family of distributions in words, such as "1 component, log gaps"."""
-
-
-@runtime_checkable
-class HasEnsemble(Protocol):
-    """A fitted base distribution that knows the mixture of its refits."""
-
-    def ensemble(self) -> Distribution:
-        """Return the mixture of the refits with equal weights: the predictive distribution of the next event.
-
-        Raises:
-            ValueError: If they are of a kind that it cannot mix.
-        """
-
-
-@runtime_checkable
-class HasCoveringEnsemble(HasEnsemble, Protocol):
-    """A fitted base distribution of many refits, of which a few reach where failures under any of them lie."""
-
-    def covering_ensemble(self) -> Distribution:
-        """Return the mixture of these few, to simulate under; the rest as of `ensemble`."""
-
-
-@runtime_checkable
-class HasLogProbs(Protocol):
-    """A sequence of refits whose densities can be computed together, in less time than one by one."""
-
-    def log_probs(self, x: FloatArray, /) -> FloatArray:
-        """Return the log density of each of R refits at x (k, d), shape (R, k)."""
-
-
-@runtime_checkable
-class HasParts(Protocol):
-    """A problem whose failures have parts, each with a probability of its own that is wanted under the refits."""
-
-    def failing_parts(self, x: FloatArray) -> FloatArray:
-        """Return what share of failing points x (k, d) belongs to each of m parts, shape (m, k)."""
 
 
 class RefitSums(NamedTuple):
@@ -189,13 +155,15 @@ def refit_log_ratios(estimate: EstimateData, refits: Sequence[HasLogProb]) -> Fl
         if all(a is b for a, b in zip(kept, of, strict=True)):
             return ratios
     old = log_density(base, sample.x)
-    new = refits.log_probs(sample.x) if isinstance(refits, HasLogProbs) else _log_densities(refits, sample.x)
+    new = _log_densities(refits, sample.x)
     estimate.refit_ratios[:] = [(of, subtract_log_densities(new, old, sample.x))]
     return estimate.refit_ratios[0][1]
 
 
 def _log_densities(refits: Sequence[HasLogProb], x: FloatArray) -> FloatArray:
     """Return the log density of each refit at x (k, d), shape (R, k)."""
+    if hasattr(refits, "log_probs"):  # a user's sequence
+        return np.asarray(refits.log_probs(x))
     return np.array([log_density(refit, x) for refit in refits], dtype=np.float64).reshape(len(refits), len(x))
 
 
@@ -293,13 +261,15 @@ def count_uncovered(ess: Iterable[float]) -> int:
     return sum(each < MIN_REFIT_ESS for each in ess)
 
 
-def pool_refits(base: HasEnsemble) -> Distribution:
+def pool_refits(base: Any) -> Distribution:
     """Return the mixture of refits that a further run simulates under.
 
     Raises:
         ValueError: The refits are of a kind that the base cannot mix.
     """
-    return base.covering_ensemble() if isinstance(base, HasCoveringEnsemble) else base.ensemble()
+    mix = base.covering_ensemble if hasattr(base, "covering_ensemble") else base.ensemble
+    mixture: Distribution = mix()
+    return mixture
 
 
 def needs_ensemble_run(estimate: EstimateData, split: Callable[[FloatArray], FloatArray] | None = None) -> bool:
@@ -309,7 +279,7 @@ def needs_ensemble_run(estimate: EstimateData, split: Callable[[FloatArray], Flo
     points under its own base: another of that size would have as few.
     """
     fitted = find_fitted_base(estimate.base)
-    if fitted is None or not isinstance(fitted, HasEnsemble):
+    if fitted is None or not hasattr(fitted, "ensemble"):
         return False
     if estimate.sample is None or len(estimate.sample.x) == 0 or estimate.p <= 0:
         return False
@@ -327,15 +297,6 @@ MIN_FAMILY = 10
 """Refits from which a family has a spread of its own; smaller families take the pooled one."""
 
 
-@runtime_checkable
-class HasRefitFamilies(Protocol):
-    """A fitted base distribution whose refits may be of other families."""
-
-    @property
-    def refit_families(self) -> Sequence[int]:
-        """Number of the family of each refit; 0 is that of the base distribution itself."""
-
-
 class RefitFamily(NamedTuple):
     """Refits of one family: log p is about normal around the centre."""
 
@@ -351,9 +312,8 @@ class RefitFamily(NamedTuple):
 
 def read_refit_families(fitted: object, n_refits: int) -> NDArray[np.int64]:
     """Return the family of each refit, shape (n_refits,); all 0 where the base knows no families."""
-    family_of = np.array(
-        fitted.refit_families if isinstance(fitted, HasRefitFamilies) else [0] * n_refits, dtype=np.int64
-    )
+    known = getattr(fitted, "refit_families", [0] * n_refits)  # a user's base
+    family_of = np.array(known, dtype=np.int64)
     if family_of.shape != (n_refits,):
         raise ValueError(f"Expected one family for each of {n_refits} refits, got {family_of.shape}.")
     return family_of

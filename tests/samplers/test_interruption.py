@@ -13,8 +13,8 @@ import pytest
 import samplers
 from samplers.estimation import EstimationInterrupted
 from samplers.method import Answer
+from samplers.platform_calls import defer_signals
 from samplers.problem import FloatArray
-from samplers.system import defer_signals
 from samplers.trace import Status
 
 
