@@ -376,6 +376,7 @@ class Report:
             **self.estimate.to_dict(),
             "question": asdict(self.study.question),
             "average": self.average,
+            "valid": self.estimate.proviso,
             "gate": None if self.verdict is None else self.verdict.to_dict(),
             "doubtful": self.doubtful,
             "doubts": self.warnings,

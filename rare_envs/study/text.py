@@ -187,23 +187,6 @@ def summarise_answer(result: Result, base: str) -> str:
     return f"{seen}; with {percent} confidence fewer than 1 in {rare:,.0f} do. {where}"
 
 
-def describe_validity(result: Result) -> str:
-    """Return what the answer rests on, in the words of `samplers.Estimate.proviso`."""
-    draws = int(result.get("base_draws") or 0)
-    if draws == 0:
-        return "valid if no failure region was missed (no draws of ordinary traffic limit its probability)"
-    unseen, confidence = format_probability(result.get("unseen")), float(result["confidence"])
-    if float(result["p"]) == 0 and not result.get("n_failures"):
-        return (
-            f"none of {draws:,} draws of ordinary traffic failed, so p is below {unseen} with {100 * confidence:g} % "
-            f"confidence (the upper end of the interval has {50 + 50 * confidence:g} % or more)"
-        )
-    return (
-        f"valid if no failure region was missed; {draws:,} draws of ordinary traffic would have met one with "
-        f"probability above {unseen} ({100 * confidence:g} % confidence)"
-    )
-
-
 def _describe_ends(result: Result) -> str:
     """Return why the interval has another confidence than usual; empty where it has not."""
     if not isinstance(result.get("gate"), dict):

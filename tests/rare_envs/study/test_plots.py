@@ -14,7 +14,6 @@ from rare_envs.study.plots import (
     draw_convergence,
     draw_drive,
     explain_no_failure,
-    rank_shifted_parameters,
     save_plot,
 )
 from rare_envs.study.question import prepare
@@ -34,17 +33,6 @@ def test_the_legend_says_which_vehicle_is_which(env_id: str) -> None:
     assert legend is not None
     speeds = [f"speed of {label}" for label in problem.world.scenario.labels]
     assert [text.get_text() for text in legend.get_texts()] == [*speeds, "gap to the vehicle ahead"]
-
-
-def test_weights_and_noise_are_never_the_most_shifted() -> None:
-    space = rare_envs.DrivingProblem("rare_envs/Highway-v0", horizon=2.0).space
-    ordinary = space.sample(500, np.random.default_rng(0))
-    failures = space.sample(50, np.random.default_rng(1))
-    failures[:, 24:] += 100.0
-    failures[:, 18:20] += (10.0, -20.0)
-    order = rank_shifted_parameters(space, ordinary, failures)
-    assert order[:2] == [19, 18]
-    assert sorted(order) == list(range(24))
 
 
 def test_a_run_without_a_failure_shows_how_its_bound_falls(tmp_path: Path) -> None:

@@ -16,7 +16,6 @@ import rare_envs
 from rare_envs.study.run_folder import CRASH, read_failures
 
 Cli = Callable[..., Result]
-FOLLOWING = "rare_envs/CarFollowing-v0"
 HIGHWAY = ("estimate", "rare_envs/Highway-v0", "--measure", "lidar_ttc", "--gamma", 1.0, "--horizon", 2)
 
 
@@ -62,21 +61,3 @@ def test_the_highway_end_to_end(cli: Cli, tmp_path: Path) -> None:
     np.testing.assert_allclose(problem.evaluate(x), found["f"], atol=1e-3)  # products round by batch size
     np.testing.assert_allclose(problem.base.log_prob(x), found["log_p0"], atol=0.1)
     assert (tmp_path / "plot.png").stat().st_size > 50_000
-
-
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [
-        (("--drivers", "mgial"), "did you mean 'mgail'"),
-        (("--base", "us102"), "'us101'"),
-        (("--observation", "sonar"), "'features', 'lidar'"),
-        (("--horizon", 0), "horizon"),
-        (("--noise", "loud"), "'fixed'"),
-    ],
-)
-def test_a_world_that_does_not_exist_is_refused_in_one_line(cli: Cli, tmp_path: Path, words, said: str) -> None:
-    result = cli("train-ego", FOLLOWING, "--out", tmp_path / "ego.zip", *words)
-    assert result.exit_code == 2
-    assert said in result.stderr
-    assert result.stderr.count("\n") == 1
-    assert not (tmp_path / "ego.zip").exists()
