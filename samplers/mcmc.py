@@ -147,11 +147,7 @@ def accept_candidates(u: FloatArray, f: FloatArray, proposal: FloatArray, f_prop
     its own: on (point, noise) together it is exact.
     """
     accepted = f_proposal <= level
-    return Step(
-        u=np.where(accepted[:, None], proposal, u),
-        f=np.where(accepted, f_proposal, f),
-        accepted=accepted,
-    )
+    return Step(u=np.where(accepted[:, None], proposal, u), f=np.where(accepted, f_proposal, f), accepted=accepted)
 
 
 def deviations(u: FloatArray) -> FloatArray:

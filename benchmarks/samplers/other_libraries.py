@@ -148,9 +148,7 @@ OTHER_SOLVERS: dict[str, Solver] = {
     "openturns-ss": partial(solve_with_openturns, partial(_make_by_name, "SubsetSampling"), LEVELS_OF_A_BUDGET),
     "openturns-nais": partial(solve_with_openturns, partial(_make_by_name, "NAIS"), LEVELS_OF_A_BUDGET),
     "openturns-ce": partial(
-        solve_with_openturns,
-        partial(_make_by_name, "StandardSpaceCrossEntropyImportanceSampling"),
-        LEVELS_OF_A_BUDGET,
+        solve_with_openturns, partial(_make_by_name, "StandardSpaceCrossEntropyImportanceSampling"), LEVELS_OF_A_BUDGET
     ),
     "openturns-form": partial(solve_with_openturns, _make_form_sampling, 2),
     "uqpy-ss": solve_with_uqpy,

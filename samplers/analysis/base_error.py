@@ -53,12 +53,7 @@ from samplers.analysis.refits import (
     reweight_runs_to_refits,
     split_families,
 )
-from samplers.analysis.weighted import (
-    band_generator,
-    no_outcome_weight,
-    require_sample,
-    simultaneous_level,
-)
+from samplers.analysis.weighted import band_generator, no_outcome_weight, require_sample, simultaneous_level
 from samplers.estimate_data import EstimateData
 from samplers.problem import FloatArray
 from samplers.statistics import Interval

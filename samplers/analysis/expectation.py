@@ -11,13 +11,7 @@ from numpy.typing import ArrayLike
 
 from samplers.analysis.base_error import BaseUncertainty, RefitBand, compute_refit_band, read_lineages, summarise_refits
 from samplers.analysis.curve import ProbabilityCurve, as_thresholds
-from samplers.analysis.refits import (
-    FittedBase,
-    RefitSums,
-    choose_better_run,
-    find_fitted_base,
-    reweight_to_refits,
-)
+from samplers.analysis.refits import FittedBase, RefitSums, choose_better_run, find_fitted_base, reweight_to_refits
 from samplers.analysis.weighted import (
     MIN_UNITS,
     UnitSums,

@@ -205,9 +205,7 @@ def _sum_parts(estimate: EstimateData, log_ratios: FloatArray, parts: FloatArray
 
 
 def reweight_runs_to_refits(
-    estimate: EstimateData,
-    refits: Sequence[HasLogProb],
-    split: Callable[[FloatArray], FloatArray] | None = None,
+    estimate: EstimateData, refits: Sequence[HasLogProb], split: Callable[[FloatArray], FloatArray] | None = None
 ) -> RefitSums:
     """Return p under each refit from the run or its further run, whichever has more effective points under that refit.
 
@@ -354,11 +352,7 @@ def _merge_single_members(family_of: NDArray[np.int64]) -> NDArray[np.int64]:
 
 
 def find_log_ends(
-    families: Sequence[RefitFamily],
-    other_variance: float,
-    confidence: float,
-    clusters: int,
-    lineages: float = math.inf,
+    families: Sequence[RefitFamily], other_variance: float, confidence: float, clusters: int, lineages: float = math.inf
 ) -> tuple[float, float]:
     """Return the lowest and the highest end of log p over the families.
 

@@ -6,13 +6,7 @@ from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
-from samplers.analysis.weighted import (
-    MIN_UNITS,
-    cov_inflation,
-    has_independent_points,
-    interval_of_sum,
-    require_sample,
-)
+from samplers.analysis.weighted import MIN_UNITS, cov_inflation, has_independent_points, interval_of_sum, require_sample
 from samplers.distributions import as_distribution, can_convert
 from samplers.estimate_data import EstimateData
 from samplers.problem import Distribution, FloatArray

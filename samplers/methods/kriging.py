@@ -226,11 +226,7 @@ class _Outcomes(NamedTuple):
     floored: NDArray[np.bool_]
 
 
-def fit_kriging(
-    u: FloatArray,
-    y: FloatArray,
-    before: Kriging | None = None,
-) -> Kriging:
+def fit_kriging(u: FloatArray, y: FloatArray, before: Kriging | None = None) -> Kriging:
     """Fit a process to outcomes.
 
     Args:

@@ -160,14 +160,7 @@ class MonteCarlo(Method):
             cov = binomial_cov(hits / n, n)
             met = goal.target_cov is not None and hits > 0 and cov <= goal.target_cov
             trace.append(
-                Level(
-                    gamma=goal.gamma,
-                    p=failing / size,
-                    estimate=hits / n,
-                    n_sim=size,
-                    n_points=size,
-                    cov=cov,
-                )
+                Level(gamma=goal.gamma, p=failing / size, estimate=hits / n, n_sim=size, n_points=size, cov=cov)
             )
             goal.on_level(trace[-1])
         outcome = Outcome.of_counts(hits, n, goal.confidence, trace, draws.no_outcome_share)

@@ -101,12 +101,7 @@ class SubsetLevels:
     """Levels after which the method gives up."""
 
     def steps(
-        self,
-        inputs: Inputs,
-        goal: Goal,
-        rng: np.random.Generator,
-        kernel: Kernel,
-        known: RootedPoints | None = None,
+        self, inputs: Inputs, goal: Goal, rng: np.random.Generator, kernel: Kernel, known: RootedPoints | None = None
     ) -> Steps:
         """Go from level to level until the share of failures among its points is p0 or more."""
         n_known = 0 if known is None else len(known.f)

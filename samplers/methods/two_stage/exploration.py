@@ -43,11 +43,7 @@ from samplers.methods.two_stage.regions import (
     grow_regions,
     label_regions,
 )
-from samplers.methods.two_stage.settings import (
-    EXPLORATION,
-    LINES,
-    SUBSPACE,
-)
+from samplers.methods.two_stage.settings import EXPLORATION, LINES, SUBSPACE
 from samplers.methods.two_stage.simulator import ComponentDraws, SimulationSteps, Simulator
 from samplers.problem import FloatArray
 from samplers.statistics import next_level
@@ -140,13 +136,7 @@ class ExplorationPlanner:
 
 
 def descend_levels(
-    simulator: Simulator,
-    u: FloatArray,
-    f: FloatArray,
-    goal: Goal,
-    n: int,
-    most: int,
-    rng: np.random.Generator,
+    simulator: Simulator, u: FloatArray, f: FloatArray, goal: Goal, n: int, most: int, rng: np.random.Generator
 ) -> SimulationSteps[SubsetPoints]:
     """Run subset simulation from base draws u (n, d), f (n,), until a tenth of a level fails or the budget is used.
 
@@ -331,12 +321,7 @@ def draw_wide(
 
 
 def find_wide_failures(
-    simulator: Simulator,
-    first: ComponentDraws,
-    gamma: float,
-    levels: int,
-    n: int,
-    rng: np.random.Generator,
+    simulator: Simulator, first: ComponentDraws, gamma: float, levels: int, n: int, rng: np.random.Generator
 ) -> SimulationSteps[WideFailures]:
     """Return the failures among wide draws, and among wider ones if the levels went deep."""
     scale = -float(ndtri(10 ** -(levels + 0.5))) / EXPLORATION.depth_ratio
@@ -413,11 +398,7 @@ def first_draws(simulator: Simulator, sizes: Sizes, rng: np.random.Generator) ->
 
 
 def find_regions(
-    simulator: Simulator,
-    first: ComponentDraws,
-    goal: Goal,
-    sizes: Sizes,
-    rng: np.random.Generator,
+    simulator: Simulator, first: ComponentDraws, goal: Goal, sizes: Sizes, rng: np.random.Generator
 ) -> SimulationSteps[ExplorationResult]:
     """Find the regions of failure, starting from the first draws; none if nothing fails."""
     n_base, gamma = int(first.counts[0]), goal.gamma
@@ -464,12 +445,7 @@ def _pass_levels(
 
 
 def _find_lines(
-    simulator: Simulator,
-    u: FloatArray,
-    f: FloatArray,
-    gamma: float,
-    scale: float,
-    rng: np.random.Generator,
+    simulator: Simulator, u: FloatArray, f: FloatArray, gamma: float, scale: float, rng: np.random.Generator
 ) -> SimulationSteps[LineEnds]:
     """Walk lines of descent from base draws u (n, d) with outcomes f (n,), and their ends towards the origin."""
     roots = choose_roots(f, max(1, round(scale * LINES.n)), rng)

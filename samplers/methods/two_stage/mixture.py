@@ -29,26 +29,13 @@ from samplers.components import (
     mixture_log_ratio,
 )
 from samplers.methods.two_stage.planes import weighted_quantile
-from samplers.methods.two_stage.settings import (
-    EDGES,
-    SUBSPACE,
-    WEIGHTS,
-)
+from samplers.methods.two_stage.settings import EDGES, SUBSPACE, WEIGHTS
 from samplers.problem import FloatArray
 from samplers.proposals import expectation_maximisation, posterior, shrink_covariance, start_from_centres
 from samplers.statistics import normalise_weights
 
 Kind = Literal[
-    "base",
-    "wide",
-    "radial",
-    "gaussian",
-    "linear",
-    "corner",
-    "explored",
-    "tempered",
-    "spread",
-    "directional",
+    "base", "wide", "radial", "gaussian", "linear", "corner", "explored", "tempered", "spread", "directional"
 ]
 """Where a component of a proposal comes from:
 
@@ -197,11 +184,7 @@ def inflate_variances(variance: FloatArray, ess: float) -> FloatArray:
     return np.where(variance < 1, raised, variance)
 
 
-def fit_subspace_mixture(
-    points: GroupedPoints,
-    most: int,
-    rng: np.random.Generator,
-) -> SubspaceMixture:
+def fit_subspace_mixture(points: GroupedPoints, most: int, rng: np.random.Generator) -> SubspaceMixture:
     """Return a mixture of at most `most` components, their number chosen by BIC."""
     best = None
     worse = 0
@@ -280,9 +263,7 @@ def _fit_from(points: GroupedPoints, start: FloatArray) -> SubspaceMixture:
 
 
 def refit_components(
-    components: list[SubspaceGaussian],
-    u: FloatArray,
-    log_weights: FloatArray,
+    components: list[SubspaceGaussian], u: FloatArray, log_weights: FloatArray
 ) -> list[SubspaceGaussian]:
     """Return components moved to weighted points u (n, d), each by those that are its own.
 
@@ -364,10 +345,7 @@ class Floor:
 
 
 def minimise_second_moment(
-    log_r: FloatArray,
-    log_weights: FloatArray,
-    start: FloatArray,
-    floors: Sequence[Floor],
+    log_r: FloatArray, log_weights: FloatArray, start: FloatArray, floors: Sequence[Floor]
 ) -> FloatArray:
     """Return weights a (k,) of a mixture q_a = sum_k a_k q_k that minimise the second moment of its estimate.
 

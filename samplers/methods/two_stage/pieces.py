@@ -31,12 +31,7 @@ from numpy.typing import NDArray
 
 from samplers.components import HalfSpaceIntersection, HalfSpaceUnion
 from samplers.methods.two_stage.planes import INLIER_ROUNDING, LARGEST_OUTCOME, MAD_TO_SIGMA, failure_edge, median
-from samplers.methods.two_stage.settings import (
-    CORNER,
-    EDGES,
-    LINEAR_MODEL,
-    PIECES,
-)
+from samplers.methods.two_stage.settings import CORNER, EDGES, LINEAR_MODEL, PIECES
 from samplers.problem import FloatArray
 
 LEAST_GAIN = 0.01
@@ -81,11 +76,7 @@ def fit_plane(u: FloatArray, y: FloatArray) -> LinearPieces:
 
 
 def fit_pieces(
-    pieces: LinearPieces,
-    u: FloatArray,
-    y: FloatArray,
-    inlier_sigmas: float = math.inf,
-    patience: int | None = None,
+    pieces: LinearPieces, u: FloatArray, y: FloatArray, inlier_sigmas: float = math.inf, patience: int | None = None
 ) -> LinearPieces | None:
     """Return the pieces after regressions, each on the points at which it is the least one, until no point moves.
 
@@ -161,12 +152,7 @@ def _regress(design: FloatArray, y: FloatArray, groups: Iterable[NDArray[np.int6
     return LinearPieces(coefficients[:, dim], coefficients[:, :dim])
 
 
-def union_of_half_spaces(
-    u: FloatArray,
-    f: FloatArray,
-    gamma: float,
-    rng: np.random.Generator,
-) -> HalfSpaceUnion | None:
+def union_of_half_spaces(u: FloatArray, f: FloatArray, gamma: float, rng: np.random.Generator) -> HalfSpaceUnion | None:
     """Return the half-spaces in which the pieces of f fail, or None where pieces do not explain f.
 
     Each begins before its plane by `PieceSettings.crossing_errors` standard deviations of its residuals and by `slack`;
@@ -252,11 +238,7 @@ class PiecewiseSample(NamedTuple):
     """gamma - f there, in units of its spread, shape (n,)."""
 
 
-def intersection_of_half_spaces(
-    u: FloatArray,
-    f: FloatArray,
-    gamma: float,
-) -> HalfSpaceIntersection | None:
+def intersection_of_half_spaces(u: FloatArray, f: FloatArray, gamma: float) -> HalfSpaceIntersection | None:
     """Return the corner in which all pieces of f fail, or None where no two or more pieces explain f.
 
     The pieces are fitted to all points, to the failing ones and to those that do not fail: another region may be the

@@ -17,10 +17,7 @@ from numpy.typing import NDArray
 from scipy.special import log_ndtr
 
 from samplers.components import HalfSpaceNormal, MixtureComponent, SubspaceGaussian
-from samplers.methods.two_stage.settings import (
-    EDGES,
-    LINEAR_MODEL,
-)
+from samplers.methods.two_stage.settings import EDGES, LINEAR_MODEL
 from samplers.problem import LOG_TWO_PI, FloatArray
 
 LAD_MIN_DEVIATION = 1e-12
@@ -110,10 +107,7 @@ def descent_direction(u: FloatArray, f: FloatArray) -> tuple[FloatArray, float]:
 
 
 def half_space_proposals(
-    failures: FloatArray,
-    u: FloatArray,
-    f: FloatArray,
-    gamma: float = 0.0,
+    failures: FloatArray, u: FloatArray, f: FloatArray, gamma: float = 0.0
 ) -> list[MixtureComponent]:
     """Return proposals for a failure region that a hyperplane bounds, or [] if f is not nearly linear there.
 
@@ -161,12 +155,7 @@ def _find_boundary(hyperplane: Hyperplane, along: FloatArray, gamma: float) -> f
     return failure_edge(along, np.ones(len(along)), len(np.unique(along)), LINEAR_MODEL.nearest_share)
 
 
-def failure_edge(
-    along: FloatArray,
-    weights: FloatArray,
-    ess: float,
-    share: float,
-) -> float:
+def failure_edge(along: FloatArray, weights: FloatArray, ess: float, share: float) -> float:
     """Return where weighted failures begin, given how far along a direction they lie, shape (n,).
 
     Their quantile at `share`, less `mean_excesses` times the mean excess over it, divided by how many they are worth:

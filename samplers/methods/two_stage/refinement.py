@@ -35,10 +35,7 @@ from samplers.methods.two_stage.mixture import (
 from samplers.methods.two_stage.pieces import intersection_of_half_spaces, union_of_half_spaces
 from samplers.methods.two_stage.planes import half_space_proposals
 from samplers.methods.two_stage.regions import ExplorationResult, Region
-from samplers.methods.two_stage.settings import (
-    REFINEMENT,
-    SUBSPACE,
-)
+from samplers.methods.two_stage.settings import REFINEMENT, SUBSPACE
 from samplers.methods.two_stage.simulator import ComponentDraws
 from samplers.methods.two_stage.stratified import MultipleImportanceSample
 from samplers.problem import FloatArray
@@ -117,11 +114,7 @@ class RefinementState:
         return np.concatenate([region.points for region in self.regions])
 
 
-def start_refinement(
-    exploration: ExplorationResult,
-    gamma: float,
-    rng: np.random.Generator,
-) -> RefinementState:
+def start_refinement(exploration: ExplorationResult, gamma: float, rng: np.random.Generator) -> RefinementState:
     """Return the initial state, from the exploration alone; also in the coordinates of its slopes."""
     state = _describe_regions(exploration, gamma, rng)
     axes = exploration.slopes
@@ -131,11 +124,7 @@ def start_refinement(
     return replace(state, within=_add_pieces(within, rng))
 
 
-def _describe_regions(
-    exploration: ExplorationResult,
-    gamma: float,
-    rng: np.random.Generator,
-) -> RefinementState:
+def _describe_regions(exploration: ExplorationResult, gamma: float, rng: np.random.Generator) -> RefinementState:
     """Return the initial state in the coordinates of the exploration."""
     most = REFINEMENT.noisy_gaussians if exploration.noisy else REFINEMENT.gaussians_per_region
     explored = tuple(
@@ -184,9 +173,7 @@ def _learn(
     if len(history.u) < REFINEMENT.min_refit_failures:
         return state
     return replace(
-        state,
-        gaussians=refit_components(state.gaussians, history.u, history.log_weights),
-        linear=_fit_linear(state),
+        state, gaussians=refit_components(state.gaussians, history.u, history.log_weights), linear=_fit_linear(state)
     )
 
 
@@ -243,11 +230,7 @@ def _fit_linear(state: RefinementState) -> tuple[ProposalComponent, ...]:
 
 
 def _propose_edges(
-    region: int,
-    failures: FloatArray,
-    u: FloatArray,
-    f: FloatArray,
-    gamma: float,
+    region: int, failures: FloatArray, u: FloatArray, f: FloatArray, gamma: float
 ) -> list[ProposalComponent]:
     """Return proposals from regression of f (n,) at u (n, d) around a region: a half-space, and a corner of several."""
     half_spaces = half_space_proposals(failures, u, f, gamma)
@@ -257,10 +240,7 @@ def _propose_edges(
 
 
 def build_proposal(
-    state: RefinementState,
-    history: MultipleImportanceSample,
-    *,
-    final: bool = False,
+    state: RefinementState, history: MultipleImportanceSample, *, final: bool = False
 ) -> MixtureProposal:
     """Return the mixture for the next draws.
 
@@ -288,10 +268,7 @@ def build_proposal(
     return MixtureProposal(candidates, raise_to_floors(weights / weights.sum(), floors))
 
 
-def list_candidates(
-    state: RefinementState,
-    history: MultipleImportanceSample,
-) -> list[ProposalComponent]:
+def list_candidates(state: RefinementState, history: MultipleImportanceSample) -> list[ProposalComponent]:
     """Return the components that the next proposal may have; the first is the base distribution."""
     gaussians = [
         ProposalComponent(gaussian, "gaussian", explored.region)

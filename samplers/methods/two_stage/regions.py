@@ -13,10 +13,7 @@ from scipy.special import betaincinv
 
 from samplers.importance import Draws, weighted_interval
 from samplers.methods.two_stage.planes import descent_direction
-from samplers.methods.two_stage.settings import (
-    REGIONS,
-    SUBSPACE,
-)
+from samplers.methods.two_stage.settings import REGIONS, SUBSPACE
 from samplers.methods.two_stage.simulator import SimulationSteps, Simulator
 from samplers.problem import FloatArray
 from samplers.statistics import PRIOR_SHARE, Interval, add_unseen, effective_sample_size, skewed_upper_end
@@ -148,12 +145,7 @@ class ExplorationResult(NamedTuple):
 
 
 def grow_regions(
-    simulator: Simulator,
-    starts: FloatArray,
-    descent: SubsetPoints,
-    gamma: float,
-    limit: int,
-    rng: np.random.Generator,
+    simulator: Simulator, starts: FloatArray, descent: SubsetPoints, gamma: float, limit: int, rng: np.random.Generator
 ) -> SimulationSteps[ExplorationResult]:
     """Run chains from failing points, twice; sort them into regions after each time.
 
@@ -247,12 +239,7 @@ def _pcn_chains(
     return ChainPaths(np.stack(states, axis=1), np.stack(proposals, axis=1), np.stack(outcomes, axis=1), sigma)
 
 
-def _is_noisy(
-    simulator: Simulator,
-    u: FloatArray,
-    gamma: float,
-    rng: np.random.Generator,
-) -> SimulationSteps[bool]:
+def _is_noisy(simulator: Simulator, u: FloatArray, gamma: float, rng: np.random.Generator) -> SimulationSteps[bool]:
     """Return whether points right beside failing ones (n, d) do not always fail."""
     u = rng.permutation(u)[: REGIONS.probes]
     f = yield from simulator.evaluate(u + REGIONS.probe_distance * rng.standard_normal(u.shape))
@@ -312,21 +299,14 @@ def _replicate_seeds(labels: Labels, wanted: int, room: int, rng: np.random.Gene
     return np.concatenate([np.arange(len(labels)), np.concatenate(more)[:room]])
 
 
-def _estimate_directions(
-    paths: ChainPaths,
-    labels: Labels,
-    descent: SubsetPoints,
-) -> FloatArray:
+def _estimate_directions(paths: ChainPaths, labels: Labels, descent: SubsetPoints) -> FloatArray:
     """Return the direction of each region, shape (m, d); the points of subset simulation belong to the only one."""
     n = labels.max() + 1
     only = descent if n == 1 else None
     return np.array([_estimate_direction(paths.select(labels == k), only) for k in range(n)])
 
 
-def _estimate_direction(
-    paths: ChainPaths,
-    descent: SubsetPoints | None,
-) -> FloatArray:
+def _estimate_direction(paths: ChainPaths, descent: SubsetPoints | None) -> FloatArray:
     """Return the direction in which a region lies, shape (d,): where f falls if it does so linearly, else its mean."""
     region = paths.to_region()
     if descent is not None:

@@ -26,20 +26,8 @@ from samplers.methods.two_stage.refinement import (
     typical_weights,
 )
 from samplers.methods.two_stage.regions import ExplorationResult, discovery_interval
-from samplers.methods.two_stage.settings import (
-    EXPLORATION,
-    FALLBACK,
-    REFINEMENT,
-    SUBSPACE,
-    TWO_STAGE,
-)
-from samplers.methods.two_stage.simulator import (
-    ComponentDraws,
-    SimulationSteps,
-    Simulator,
-    close_trace,
-    extend_trace,
-)
+from samplers.methods.two_stage.settings import EXPLORATION, FALLBACK, REFINEMENT, SUBSPACE, TWO_STAGE
+from samplers.methods.two_stage.simulator import ComponentDraws, SimulationSteps, Simulator, close_trace, extend_trace
 from samplers.methods.two_stage.slopes import find_slopes
 from samplers.methods.two_stage.stratified import (
     MultipleImportanceSample,
@@ -137,13 +125,7 @@ def start_run(inputs: Inputs, goal: Goal, budget: int, rng: np.random.Generator)
     return context, RunState(history=empty, base_u=np.empty((0, searched.dim)), base_f=np.empty(0))
 
 
-def meets_too_few(
-    draws: Draws,
-    number: int,
-    levels: int,
-    *,
-    share: float = 1.0,
-) -> bool:
+def meets_too_few(draws: Draws, number: int, levels: int, *, share: float = 1.0) -> bool:
     """Return whether the draws of a round meet so few failures that subset simulation does better with the rest."""
     early = FALLBACK.early_rates
     rate = early[number - 1] if number <= len(early) else FALLBACK.relative_rate / max(levels, FALLBACK.min_levels)
@@ -179,12 +161,7 @@ def reconcile(subset_outcome: Outcome, earlier: Outcome) -> Outcome:
 
 
 def run_subset_simulation(
-    inputs: Inputs,
-    goal: Goal,
-    levels: int,
-    budget: int,
-    known: RootedPoints | None,
-    rng: np.random.Generator,
+    inputs: Inputs, goal: Goal, levels: int, budget: int, known: RootedPoints | None, rng: np.random.Generator
 ) -> Steps:
     """Run adaptive subset simulation with the points per level that a budget or a target c.o.v. asks for."""
     levels = max(levels, FALLBACK.min_levels)
@@ -413,11 +390,7 @@ def _draw(
 
 
 def _check(
-    context: RunContext,
-    state: RunState,
-    refinement: RefinementState,
-    sample: StratifiedSample,
-    whole: StratifiedSample,
+    context: RunContext, state: RunState, refinement: RefinementState, sample: StratifiedSample, whole: StratifiedSample
 ) -> list[str]:
     """Return the warnings of all checks of an estimate."""
     hits = int((state.base_f <= context.goal.gamma).sum())

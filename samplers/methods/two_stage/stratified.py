@@ -28,10 +28,7 @@ from samplers.components import MixtureComponent, log_ratios, mixture_log_ratio
 from samplers.importance import Draws, calibrate
 from samplers.methods.two_stage.mixture import MixtureProposal
 from samplers.methods.two_stage.regions import Discovery
-from samplers.methods.two_stage.settings import (
-    DIAGNOSTICS,
-    TWO_STAGE,
-)
+from samplers.methods.two_stage.settings import DIAGNOSTICS, TWO_STAGE
 from samplers.methods.two_stage.simulator import ComponentDraws
 from samplers.problem import FloatArray, Inputs
 from samplers.sample import Sample
@@ -75,11 +72,7 @@ class MultipleImportanceSample:
         known = np.logaddexp(-self.log_weights, mixture_log_ratio(log_ratios(used, self.u), used_counts))
         added = mixture_log_ratio(log_ratios(components, failing), counts)
         return MultipleImportanceSample(
-            np.concatenate([self.u, failing]),
-            -np.append(known, added),
-            (*self.batches, batch),
-            components,
-            counts,
+            np.concatenate([self.u, failing]), -np.append(known, added), (*self.batches, batch), components, counts
         )
 
     def within(self, axes: FloatArray) -> "MultipleImportanceSample":

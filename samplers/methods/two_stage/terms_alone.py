@@ -19,10 +19,7 @@ from samplers.components import IsotropicNormal
 from samplers.method import request_terms
 from samplers.methods.two_stage.exploration import bisect_towards_origin, choose_roots, walk_lines
 from samplers.methods.two_stage.regions import ExplorationResult, SubsetPoints, grow_regions
-from samplers.methods.two_stage.settings import (
-    EXPLORATION,
-    TERMS_ALONE,
-)
+from samplers.methods.two_stage.settings import EXPLORATION, TERMS_ALONE
 from samplers.methods.two_stage.simulator import ComponentDraws, SimulationSteps, Simulator
 from samplers.methods.two_stage.terms.search import answer_by_terms
 from samplers.problem import FloatArray, FunctionProblem, Terms

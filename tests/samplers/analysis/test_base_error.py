@@ -10,14 +10,7 @@ from scipy import stats
 
 import samplers
 from samplers.analysis.refits import reweight_runs_to_refits
-from tests.samplers.fitted_bases import (
-    BETA,
-    FittedWithEnsemble,
-    HalfSpace,
-    fitted,
-    normal,
-    run,
-)
+from tests.samplers.fitted_bases import BETA, FittedWithEnsemble, HalfSpace, fitted, normal, run
 
 WIDE = [normal(mean, sd) for mean in np.linspace(-2.0, 2.0, 6) for sd in (0.5, 0.75, 1.0, 1.5, 2.0)]
 """30 refits so far apart that the events determine nothing."""

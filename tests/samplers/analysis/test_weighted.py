@@ -3,10 +3,7 @@
 import numpy as np
 import pytest
 
-from samplers.analysis.weighted import (
-    mean_over_failures,
-    weigh_failures,
-)
+from samplers.analysis.weighted import mean_over_failures, weigh_failures
 from tests.samplers.analysis.half_space_tail import METHODS, PHI, P, estimate_half_space
 
 

@@ -7,13 +7,7 @@ import pytest
 from scipy import stats
 
 import samplers
-from samplers.importance import (
-    Draws,
-    defensive_mixture,
-    simulate_draws,
-    weight_warnings,
-    weighted_interval,
-)
+from samplers.importance import Draws, defensive_mixture, simulate_draws, weight_warnings, weighted_interval
 from samplers.limit_states import four_branches, half_space, parabola, plateau, two_modes
 from samplers.methods.blocks import GaussianBlock, MixtureBlock, Product
 from samplers.problem import FunctionProblem

@@ -43,10 +43,7 @@ PROBLEMS = {
     "noise beside a parameter": (lambda u: 3.5 - u[:, 0] - 0.3 * sum_of(u), PHI(-3.5 / np.sqrt(1.09))),
     "two regions": (
         lambda u: np.minimum(3.4 - u[:, 0], 3.5 + u[:, 1]) - 0.2 * sum_of(u),
-        1
-        - stats.norm.expect(
-            lambda z: stats.norm.cdf(3.4 - 0.2 * z) * stats.norm.cdf(3.5 - 0.2 * z),
-        ),
+        1 - stats.norm.expect(lambda z: stats.norm.cdf(3.4 - 0.2 * z) * stats.norm.cdf(3.5 - 0.2 * z)),
     ),
     "noise alone": (lambda u: 3.2 - sum_of(u), PHI(-3.2)),
 }

@@ -10,13 +10,7 @@ import samplers
 from samplers.limit_states import half_space
 from samplers.mcmc import Chains
 from samplers.method import Goal
-from samplers.methods.subset import (
-    LevelProduct,
-    descent_cov,
-    level_record,
-    multiply_levels,
-    summarise,
-)
+from samplers.methods.subset import LevelProduct, descent_cov, level_record, multiply_levels, summarise
 from samplers.problem import FunctionProblem
 from samplers.statistics import log_normal_interval
 from samplers.trace import Status

@@ -272,11 +272,7 @@ def _shape(component: SubspaceGaussian, z: FloatArray, weights: FloatArray) -> S
 
 
 def build_law(
-    axes: FloatArray,
-    bumps: list[SubspaceGaussian],
-    weights: FloatArray,
-    ends: FloatArray,
-    guards: FloatArray,
+    axes: FloatArray, bumps: list[SubspaceGaussian], weights: FloatArray, ends: FloatArray, guards: FloatArray
 ) -> TermLaw:
     """Return bumps, the same tempered, and Gaussians around ends and design points z (m, r), as one proposal."""
     tempered = tuple(

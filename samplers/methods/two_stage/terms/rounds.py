@@ -9,12 +9,7 @@ from numpy.typing import NDArray
 from scipy.special import ndtr
 
 from samplers.importance import Draws, weight_warnings, weighted_interval
-from samplers.methods.two_stage.settings import (
-    DOUBTS,
-    LAW,
-    ROUNDS,
-    WALKS,
-)
+from samplers.methods.two_stage.settings import DOUBTS, LAW, ROUNDS, WALKS
 from samplers.methods.two_stage.simulator import SimulationSteps
 from samplers.methods.two_stage.terms.fitting import (
     NearPoints,
@@ -125,11 +120,7 @@ def refit_terms(
 
 
 def _refit_term(
-    term: PursuedTerm,
-    history: TermHistory,
-    directions: Directions,
-    points: NearPoints,
-    rng: np.random.Generator,
+    term: PursuedTerm, history: TermHistory, directions: Directions, points: NearPoints, rng: np.random.Generator
 ) -> PursuedTerm:
     """Return a term with further gradients, fitted to some points of the history."""
     later = float(term.direction_weights.max()) * ROUNDS.later_weight

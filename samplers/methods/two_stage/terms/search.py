@@ -162,13 +162,7 @@ class SearchState:
         return self.base_failures / max(self.base_draws, 1)
 
 
-def search_terms(
-    inputs: Inputs,
-    offer: TermsOffer,
-    goal: Goal,
-    budget: int,
-    rng: np.random.Generator,
-) -> Steps:
+def search_terms(inputs: Inputs, offer: TermsOffer, goal: Goal, budget: int, rng: np.random.Generator) -> Steps:
     """Estimate P[f(X) <= goal.gamma] by terms and their gradients."""
     open_ended = goal.max_sim is None and goal.target_cov is not None
     end = budget + ROUNDS.max_batches * ROUNDS.target_batch if open_ended else budget
@@ -258,12 +252,7 @@ def _draw_round(
 def _refit(search: TermSearch, state: SearchState, reserve: int) -> SimulationSteps[SearchState]:
     """Fit the proposals anew, leaving `reserve` simulations."""
     pursued = yield from refit_terms(
-        search.simulator,
-        state.history,
-        list(state.pursued),
-        search.goal.gamma,
-        search.budget - reserve,
-        search.rng,
+        search.simulator, state.history, list(state.pursued), search.goal.gamma, search.budget - reserve, search.rng
     )
     return replace(state, pursued=tuple(pursued))
 

@@ -11,13 +11,7 @@ from samplers.method import TermsOffer, request_gradients, request_terms, whole_
 from samplers.methods.noise_coordinates import noise_mask
 from samplers.methods.two_stage.settings import WALKS
 from samplers.methods.two_stage.simulator import SimulationSteps
-from samplers.problem import (
-    Distribution,
-    FloatArray,
-    Inputs,
-    StandardNormal,
-    Terms,
-)
+from samplers.problem import Distribution, FloatArray, Inputs, StandardNormal, Terms
 
 DIFFERENCE = 1e-4
 """Standard deviations of a central difference: its error is 1e-8, that of rounding 1e-12."""
@@ -274,12 +268,7 @@ def choose_starts(terms: Terms, term: int, n: int) -> NDArray[np.int64]:
 
 
 def walk_downhill(
-    simulator: TermSimulator,
-    u: FloatArray,
-    terms: Terms,
-    term: NDArray[np.int64],
-    gamma: float,
-    limit: int,
+    simulator: TermSimulator, u: FloatArray, terms: Terms, term: NDArray[np.int64], gamma: float, limit: int
 ) -> SimulationSteps[Walks]:
     """Walk from points u (m, d) with known terms down one term each, until it fails or the steps are used up.
 
