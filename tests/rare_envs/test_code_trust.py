@@ -34,10 +34,6 @@ def test_a_run_from_elsewhere_is_refused_and_names_its_code(place: Path) -> None
     assert not find_notes().exists()
 
 
-def test_no_code_needs_no_trust() -> None:
-    check_code_trust({"ego": "idm"}, [], FOLDER, trust=False)
-
-
 def test_trust_is_asked_for_once_and_again_after_a_change(place: Path) -> None:
     check_code_trust(QUESTION, CODE, FOLDER, trust=True)
     assert is_trusted()
@@ -61,13 +57,6 @@ def test_code_of_ones_own_may_change_but_not_its_place(place: Path, monkeypatch:
     assert not is_trusted()
 
 
-def test_a_state_folder_that_cannot_be_written_asks_again(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (place / "file").touch()
-    monkeypatch.setenv("XDG_STATE_HOME", str(place / "file"))
-    note_own_run(QUESTION, CODE)
-    assert not is_trusted()
-
-
 def test_modules_are_found_without_running_them(place: Path) -> None:
     (place / "pack" / "inner").mkdir(parents=True)
     (place / "pack" / "__init__.py").write_text("raise SystemExit")
@@ -87,10 +76,3 @@ def test_trust_holds_for_the_packages_on_the_way_too(place: Path) -> None:
     (place / "outer" / "__init__.py").write_text("runs = 'on import'")
     with pytest.raises(ValueError, match="add --trust"):
         check_code_trust(question, ["outer.inner:make"], FOLDER, trust=False)
-
-
-def test_trust_in_a_module_that_cannot_be_read_is_not_remembered(place: Path) -> None:
-    question = {"ego": "compiled:make"}
-    check_code_trust(question, ["compiled:make"], FOLDER, trust=True)
-    with pytest.raises(ValueError, match="add --trust"):
-        check_code_trust(question, ["compiled:make"], FOLDER, trust=False)

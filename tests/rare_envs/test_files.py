@@ -38,25 +38,6 @@ def test_an_error_leaves_the_earlier_file_and_no_draft(error: type[BaseException
     assert names(tmp_path) == ["ego.zip"]
 
 
-def test_the_draft_keeps_the_ending_and_the_file_its_rights(tmp_path: Path) -> None:
-    path = tmp_path / "plot.png"
-    path.write_bytes(b"earlier")
-    path.chmod(0o640)
-    with replace_file(path) as draft:
-        assert (draft.suffix, draft.parent) == (".png", tmp_path)
-        draft.write_bytes(b"new")
-    assert path.stat().st_mode & 0o777 == 0o640
-
-
-def test_a_link_stays_one(tmp_path: Path) -> None:
-    target, link = tmp_path / "target.txt", tmp_path / "link.txt"
-    target.write_text("earlier")
-    link.symlink_to(target)
-    replace_text(link, "new")
-    assert link.is_symlink()
-    assert target.read_text() == "new"
-
-
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs a device that is always full")
 def test_a_full_disk_leaves_the_earlier_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "result.json"
@@ -92,6 +73,7 @@ def direct_writes() -> list[str]:
     return found
 
 
+@pytest.mark.slow
 def test_every_file_of_the_packages_is_replaced_whole() -> None:
     assert not direct_writes()
 

@@ -55,7 +55,7 @@ def test_samplers_imports_nothing_that_is_not_installed_with_it_unless_it_says_s
     where = packages_distributions()
     libraries = imported("samplers") - OPTIONAL
     outside = {name for name in libraries if where[name][0].lower() not in declared("dependencies")}
-    assert outside == {"matplotlib", "pyarrow", "threadpoolctl"}  # threadpoolctl comes with scikit-learn
+    assert outside == {"matplotlib", "pyarrow"}
     assert declared("dependencies") & declared("driving") == set()
 
 

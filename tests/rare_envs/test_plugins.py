@@ -1,8 +1,6 @@
 """Modules of a user by name: found in the working directory, and every way to fail is one line."""
 
-import importlib.util
 import sys
-import warnings
 from pathlib import Path
 
 import pytest
@@ -13,7 +11,6 @@ from rare_envs.plugins import (
     import_module,
     import_object,
     make_lazy_getattr,
-    one_line,
     warn_of_namesakes,
 )
 
@@ -71,13 +68,6 @@ def test_names_are_suggested_without_their_namespace() -> None:
     assert did_you_mean("zzz", ids) == ""
 
 
-def test_an_exception_is_cut_to_one_line() -> None:
-    assert one_line(KeyError()) == "KeyError"
-    assert one_line(ValueError(" a\n\tb. ")) == "ValueError: a b"
-    assert one_line(ValueError("\x1b[1mNo\x1b[0m\x1b[31;1m type\x1b[0m.")) == "ValueError: No type"
-    assert one_line(ValueError("x" * 1000)) == "ValueError: " + "x" * 200
-
-
 def test_a_name_is_imported_from_its_module_when_it_is_used(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     (tmp_path / "late_module.py").write_text("answer = 42")
     monkeypatch.syspath_prepend(tmp_path)
@@ -87,14 +77,6 @@ def test_a_name_is_imported_from_its_module_when_it_is_used(monkeypatch: pytest.
     with pytest.raises(AttributeError, match="module 'package' has no attribute 'question'"):
         get("question")
     del sys.modules["late_module"]
-
-
-def test_our_own_packages_are_known_as_such() -> None:
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        warn_of_namesakes()
-    for name, part in SIBLINGS.items():
-        assert importlib.util.find_spec(part) is not None, name
 
 
 @pytest.mark.parametrize("name", SIBLINGS)
@@ -108,8 +90,3 @@ def test_a_package_of_the_same_name_is_noticed(name: str, tmp_path: Path, monkey
     assert len(caught) == 1
     assert str(tmp_path) in str(caught[0].message)
     assert "\n" not in str(caught[0].message)
-
-
-def test_a_package_that_is_not_there_or_made_by_hand_is_passed_over(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "training", type(sys)("training"))  # without a spec
-    warn_of_namesakes()

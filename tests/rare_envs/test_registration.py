@@ -4,9 +4,10 @@ import subprocess
 import sys
 
 import gymnasium as gym
+import pytest
 
 from rare_envs import ENV_IDS
-from rare_envs.scenarios.registry import SCENARIOS, kinematics_id, split_version
+from rare_envs.scenarios.registry import SCENARIOS, split_version
 
 
 def test_registered_ids_are_the_scenarios() -> None:
@@ -16,13 +17,7 @@ def test_registered_ids_are_the_scenarios() -> None:
     assert set(SCENARIOS) <= set(gym.registry)
 
 
-def test_every_id_has_one_with_the_layout_of_highway_env() -> None:
-    for env_id in ENV_IDS:
-        env = gym.make(kinematics_id(env_id))
-        assert env.observation_space.shape == (5, 5)
-        assert env.action_space == gym.spaces.Discrete(5)
-
-
+@pytest.mark.slow
 def test_entries_say_their_version_and_no_version_of_the_package_is_called_out_of_date() -> None:
     """In a process of its own, with the warnings of a user's script: pytest has filters of its own."""
     assert {gym.registry[env_id].version for env_id in ("rare_envs/CutIn-v0", "rare_envs/CutIn-v1")} == {0, 1}

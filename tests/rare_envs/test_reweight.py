@@ -5,7 +5,6 @@ import dataclasses
 import numpy as np
 import pytest
 
-import agents
 import rare_envs
 import samplers
 from rare_envs.distributions.fitted import EventCounts, FittedDistribution
@@ -31,13 +30,6 @@ def test_wider_traffic_against_simulating_it():
     assert result.reweight(changed.space).p == found.p
 
 
-@pytest.mark.parametrize(("old", "new"), [("us101-gap", "highway"), ("highway", "us101-gap")])
-def test_the_two_shipped_bases_are_too_far_apart(old, new):
-    result = samplers.estimate(problem(old), "ce", seed=1)
-    with pytest.raises(ValueError, match="Estimate again with the new base"):
-        result.reweight(problem(new).base)
-
-
 def fitted_us101(number=30):
     """Return the base distribution of car-following with refits a few per cent wider and narrower."""
     us101 = problem("us101-gap").base
@@ -50,6 +42,7 @@ def fitted_us101(number=30):
     )
 
 
+@pytest.mark.slow
 def test_p_under_refits_against_simulating_them():
     base = fitted_us101(4)
     found = samplers.estimate(problem(base), seed=1, max_sim=3000).base_uncertainty
@@ -73,22 +66,3 @@ def test_a_safer_ego_is_safer_under_every_refit_and_the_ratio_is_known_better_th
 
 def _p_interval(found):
     return found.either.base_uncertainty.interval
-
-
-def test_noise_beside_a_fitted_base_changes_nothing_of_the_refits():
-    env_id, base = "rare_envs/CarFollowing-v0", fitted_us101(4)
-    noisy = rare_envs.DrivingProblem(env_id, ego=agents.load_ego("noisy:idm"), base=base, horizon=2.0)
-    result = samplers.estimate(noisy, "mc", gamma=3.0, seed=1, max_sim=1000)
-    x = result.sample.x
-    found = result.base_uncertainty
-    assert x.shape[1] == noisy.dim > 3
-    own = base.distribution.log_prob(x[:, :3])
-    by_hand = [np.exp(refit.log_prob(x[:, :3]) - own).sum() / 1000 for refit in base.refits]
-    assert found.p_refits == pytest.approx(by_hand)
-
-
-def test_another_base_by_its_name():
-    result = samplers.estimate(problem(fitted_us101()), "ce", seed=1)
-    assert result.under("us101-gap").ratio == pytest.approx(1.0)
-    with pytest.raises(ValueError, match="Estimate again with the new base"):
-        result.under("highway")

@@ -1,24 +1,31 @@
-"""The human driver model by pencil and paper."""
+"""The human driver model and its glances."""
 
 import math
 
+import numpy as np
 import pytest
 import torch
 
 from rare_envs.control.human_driver import (
+    GLANCE_CDF,
+    MEAN_GLANCE,
+    MEAN_ON_ROAD,
+    OFF_ROAD_SHARE,
+    Glances,
     HumanDriverModel,
     Percept,
     anticipate,
+    count_glance_draws,
+    draw_glances,
     estimate_leads,
-    in_wandering_zone,
-    inverse_tau,
+    glance_duration,
+    remaining_duration,
     respond,
     step_errors,
 )
 from rare_envs.control.idm import IDM
 from rare_envs.traffic.neighbours import Lead
-from rare_envs.traffic.road import straight
-from tests.rare_envs.traffic_states import F64, tensor, traffic
+from tests.rare_envs.traffic_states import F64, tensor
 
 MODEL = HumanDriverModel()
 NO_ERRORS = torch.zeros(1, 2, dtype=F64)
@@ -88,19 +95,43 @@ def test_the_cut_off_keeps_a_driver_from_braking_for_a_lead_that_pulls_away() ->
     assert IDM().acceleration(tensor(20.0), away).item() == -5.0
 
 
-def test_a_cutter_is_noticed_beyond_the_wandering_zone_of_its_lane() -> None:
-    """Lanes of 4 m: the next centre is at 4, and 0.375 m from it towards the driver is 3.625."""
-    vehicles = ((0.0, 0.0, 0.0, 20.0), *((30.0, y, 0.0, 20.0) for y in (0.5, 3.62, 3.63, 4.0, -3.62)))
-    zone = in_wandering_zone(traffic(*vehicles), straight(2), MODEL.wandering)
-    assert zone.tolist() == [[True, True, False, False, True]]
+N, HORIZON = 40_000, 10.0
 
 
-def test_urgency_is_that_of_the_most_urgent_leader() -> None:
-    others = percept((25.0, 13.0, True), (45.0, 5.0, True), (15.0, 0.0, False), (-15.0, 0.0, True))
-    assert inverse_tau(others, tensor(15.0)).item() == pytest.approx(10.0 / 40.0)
-    assert inverse_tau(percept((25.0, 16.0, True)), tensor(15.0)).item() == 0.0
+@pytest.fixture(scope="module")
+def glances() -> Glances:
+    generator = torch.Generator().manual_seed(0)
+    return draw_glances(torch.randn(N, count_glance_draws(HORIZON), generator=generator, dtype=torch.float64))
 
 
-def test_negative_parameters_are_refused() -> None:
-    with pytest.raises(ValueError, match="Expected reaction_time to be a number of at least 0, got -1"):
-        HumanDriverModel(reaction_time=-1.0)
+def test_the_quantiles_are_the_published_ones() -> None:
+    duration, share = (torch.tensor(column, dtype=torch.float64) for column in zip(*GLANCE_CDF, strict=True))
+    torch.testing.assert_close(glance_duration(share), duration)
+    halfway = (share[:-1] + share[1:]) / 2
+    torch.testing.assert_close(glance_duration(halfway), (duration[:-1] + duration[1:]) / 2)
+
+
+def test_durations_have_the_published_distribution(glances: Glances) -> None:
+    lasting = (glances.end - glances.start)[:, 1]
+    for duration, share in GLANCE_CDF:
+        found = float((lasting <= duration).double().mean())
+        assert abs(found - share) < 5 * math.sqrt(share * (1 - share) / N) + 1e-12
+    assert float(lasting.mean()) == pytest.approx(MEAN_GLANCE, rel=0.02)
+    assert pytest.approx(0.863, abs=0.005) == MEAN_GLANCE  # of the counts, without interpolation
+
+
+def test_the_eyes_are_off_the_road_for_the_published_share_at_all_times(glances: Glances) -> None:
+    for time in (0.0, 0.5, 3.0, 9.9):
+        share = float(glances.off_road(time).double().mean())
+        assert abs(share - OFF_ROAD_SHARE) < 5 * math.sqrt(OFF_ROAD_SHARE / N)
+    assert MEAN_GLANCE / (MEAN_GLANCE + MEAN_ON_ROAD) == pytest.approx(OFF_ROAD_SHARE)
+
+
+def test_what_is_left_of_a_glance_is_that_of_a_stationary_sequence(glances: Glances) -> None:
+    """By the sequence itself: at 5 s, long after its beginning, the rest of a glance that is under way."""
+    under_way = (glances.start <= 5.0) & (5.0 < glances.end) & (glances.start > 0.0)
+    left = (glances.end - 5.0)[under_way].numpy()
+    shares = np.array([0.1, 0.5, 0.9])
+    expected = remaining_duration(torch.from_numpy(shares)).numpy()
+    found = np.array([(left <= each).mean() for each in expected])
+    assert (np.abs(found - shares) < 5 * np.sqrt(shares * (1 - shares) / len(left))).all()

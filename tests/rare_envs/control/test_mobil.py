@@ -30,13 +30,6 @@ def interaction(speed, gap, closing):
     return 2.22 * (wanted / gap) ** 2
 
 
-def test_a_slow_lead_and_a_free_left_lane():
-    found = choice(EGO, SLOW_LEAD)
-    # the free lane saves the interaction with a lead 25 m ahead, bumper to bumper, that is 10 m/s slower
-    assert found.incentive[0, 0, 0].item() == pytest.approx(interaction(20.0, 25.0, 10.0))
-    assert found.wanted.tolist() == [[[True, False]]]
-
-
 def test_no_change_that_makes_the_new_follower_brake_too_hard():
     for x, speed, safe in ((-20.0, 25.0, False), (-60.0, 20.0, True)):
         found = choice(EGO, SLOW_LEAD, (x, 0.0, 0.0, speed))
@@ -65,18 +58,6 @@ def test_the_old_follower_gains():
     gain = interaction(20.0, 15.0, 0.0) - interaction(20.0, 45.0, 10.0)
     selfish, polite = choice(*scene, politeness=0.0), choice(*scene, politeness=1.0)
     assert (polite.incentive - selfish.incentive)[0, 0, 0].item() == pytest.approx(gain)
-
-
-def test_where_there_is_no_lane_nobody_wants_to_go():
-    found = choice((0.0, 0.0, 0.0, 20.0), (30.0, 0.0, 0.0, 10.0), lanes=1)
-    assert found.incentive.tolist() == [[[-math.inf, -math.inf]]]
-    assert not found.safe.any() and not found.wanted.any()
-
-
-def test_a_vehicle_abreast_whose_centre_is_ahead_is_in_the_way_too():
-    abreast = (2.0, 0.0, 0.0, 20.0)
-    assert choice(EGO, SLOW_LEAD, abreast, own_safety=False).safe[0, 0, 0]
-    assert not choice(EGO, SLOW_LEAD, abreast).safe[0, 0, 0]
 
 
 def test_wrong_parameters_are_refused():

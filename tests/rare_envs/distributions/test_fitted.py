@@ -17,7 +17,6 @@ from rare_envs.distributions.fitted import (
     read_record,
 )
 from rare_envs.distributions.mixture import CoordinateMixture, TruncatedGaussianMixture
-from rare_envs.distributions.space import Distribution
 
 NAMES = ["speed", "lead_speed", "gap"]
 ORDER = ["speed", "gap", "lead_speed"]
@@ -104,18 +103,6 @@ def test_keys_of_a_file_tell_the_kind(content: dict[str, Any], kind: type) -> No
     read = read_distribution(content)
     assert type(read) is kind
     assert type(read_distribution(read.to_dict())) is kind
-
-
-def test_the_methods_are_those_of_the_fit() -> None:
-    fit = CoordinateMixture.from_dict(CONTENT)
-    assert isinstance(BASE, Distribution)
-    assert (BASE.dim, BASE.low.tolist(), BASE.high.tolist()) == (3, CONTENT["low"], CONTENT["high"])
-    x = BASE.sample(100, np.random.default_rng(0))
-    assert (x == fit.sample(100, np.random.default_rng(0))).all()
-    assert (BASE.log_prob(x) == fit.log_prob(x)).all()
-    u = BASE.to_standard_normal(x)
-    assert (u == fit.to_standard_normal(x)).all()
-    assert (BASE.from_standard_normal(u) == fit.from_standard_normal(u)).all()
 
 
 def test_what_it_was_fitted_to() -> None:
@@ -245,12 +232,6 @@ def test_beta_variables_may_have_refits() -> None:
     base = FittedDistribution.from_dict({**content, "events": {"used": [9], "clusters": 9}, "family": "Beta"})
     assert base.to_dict()["refits"] == shapes
     assert isinstance(base.distribution, BetaDistribution)
-
-
-def test_few_entries_are_enough() -> None:
-    optional = ("refits", "frequency", "checks", "provenance")
-    base = FittedDistribution.from_dict({key: value for key, value in CONTENT.items() if key not in optional})
-    assert (base.refits, base.frequency, base.checks, dict(base.record)) == ((), None, (), {})
 
 
 def test_what_a_file_cannot_hold() -> None:

@@ -70,12 +70,6 @@ def test_draws_follow_the_density() -> None:
     assert stats.kstest(x, lambda values: np.interp(values, grid, cdf)).pvalue > 1e-4
 
 
-def test_mixtures_of_the_same_coordinates_are_one_mixture() -> None:
-    pool = pool_mixtures([IN_LOG_GAP, IN_LOG_GAP])
-    assert isinstance(pool, CoordinateMixture)
-    np.testing.assert_allclose(pool.weights, [0.35, 0.15, 0.35, 0.15])
-
-
 def test_pools_that_cannot_be_are_refused() -> None:
     other = TruncatedGaussianMixture([1.0], [[0.0] * 3], [np.eye(3)], [-1.0] * 3, [1.0] * 3)
     with pytest.raises(ValueError, match="same box, but mixtures 0 and 1 differ"):

@@ -30,21 +30,6 @@ def test_densities_add_up_and_maps_go_block_by_block() -> None:
     np.testing.assert_allclose(both.from_standard_normal(u), x, rtol=1e-9)
 
 
-def test_blocks_of_products_stand_side_by_side() -> None:
-    inner = join_independent(BETA, NoiseDistribution(2))
-    outer = join_independent(inner, NoiseDistribution(1))
-    assert isinstance(outer, BlockDistribution)
-    assert [block.dim for block in outer.blocks] == [1, 2, 1]
-    assert join_independent(BETA) is BETA
-
-
-def test_noise_does_not_move() -> None:
-    noise, rng = NoiseDistribution(3), np.random.default_rng(0)
-    assert noise.project(rng.standard_normal((5, 3)), np.ones(5), 0.5) is noise
-    assert noise.widen(2.0) is noise
-    assert noise.log_prob(np.zeros((1, 3))).item() == pytest.approx(-1.5 * np.log(2.0 * np.pi))
-
-
 # --- with a fitted block ------------------------------------------------------------------------------
 
 
@@ -56,18 +41,6 @@ def test_a_product_with_one_fitted_block_is_fitted_too() -> None:
     assert [type(block) for block in whole.blocks] == [type(BASE.distribution), BetaDistribution, NoiseDistribution]
     assert (whole.fitted_to, whole.clusters, whole.family) == (BASE.fitted_to, BASE.clusters, BASE.family)
     assert (whole.frequency, whole.checks, whole.record) == (BASE.frequency, BASE.checks, BASE.record)
-
-
-def test_densities_draws_and_maps_are_those_without_refits() -> None:
-    whole = join_independent(BASE, BETA, NoiseDistribution(2))
-    plain = join_independent(BASE.distribution, BETA, NoiseDistribution(2))
-    assert isinstance(plain, ProductDistribution)
-    x = whole.sample(50, np.random.default_rng(0))
-    assert (x == plain.sample(50, np.random.default_rng(0))).all()
-    assert (whole.log_prob(x) == plain.log_prob(x)).all()
-    u = whole.to_standard_normal(x)
-    assert (u == plain.to_standard_normal(x)).all()
-    assert (whole.from_standard_normal(u) == plain.from_standard_normal(u)).all()
 
 
 @pytest.mark.parametrize("first", [True, False])

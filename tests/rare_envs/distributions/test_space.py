@@ -28,13 +28,6 @@ def rng():
     return np.random.default_rng(0)
 
 
-def test_named():
-    scenario_named = make_space().named([20, 18, 19, 15, 30, 3.5])
-    assert scenario_named == dict(zip(NAMES, [20.0, 18.0, 19.0, 15.0, 30.0, 3.5], strict=True))
-    with pytest.raises(ValueError, match=r"one scenario of shape \(6,\), got \(2, 6\)"):
-        make_space().named(np.zeros((2, 6)))
-
-
 def test_given_parameters_replace_drawn_ones():
     space = make_space()
     drawn = space.scenario_x(None, 5, rng())
@@ -52,11 +45,6 @@ def test_x_gives_everything():
     assert (space.scenario_x({"x": rows}, 4, rng()) == rows).all()
     assert (space.scenario_x({"x": rows[1]}, 4, rng()) == rows[[1, 1, 1, 1]]).all()
     assert space.validate(rows[0].tolist()).shape == (1, 6)
-
-
-def test_the_ends_of_the_range_are_allowed():
-    space = make_space()
-    assert (space.validate(np.stack([space.low, space.high])) == [space.low, space.high]).all()
 
 
 @pytest.mark.parametrize(

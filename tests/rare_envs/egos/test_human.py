@@ -66,21 +66,6 @@ def test_a_braking_lead_is_answered_one_reaction_time_later(late: float) -> None
     assert differ.index(True) == round(late / 0.1) + 1
 
 
-def test_until_it_can_know_better_it_drives_as_if_all_had_kept_their_speeds() -> None:
-    world = problem("CarFollowing").world
-    late, prompt = (
-        accelerations(HumanDriver(replace(SURE, reaction_time=t), world), world, [15.0, 12.0, 60.0]) for t in (0.6, 0.0)
-    )
-    assert late[0] == pytest.approx(prompt[0], rel=1e-12)
-
-
-def test_a_queue_in_equilibrium_stays_there() -> None:
-    speed, v0 = 15.0, 120 / 3.6
-    gap = (2.0 + speed) / math.sqrt(1 - (speed / v0) ** 4)
-    world = problem("CarFollowing").world
-    assert max(map(abs, accelerations(HumanDriver(SURE, world), world, [speed, speed, gap]))) < 1e-9
-
-
 def test_a_cutter_is_answered_after_noticing_and_reacting() -> None:
     """It begins outside of the zone in which it counts and enters it in tick k: 0.4 s to notice, 0.6 s to react."""
     world = problem("CutIn").world
@@ -99,17 +84,6 @@ def test_braking_builds_up_at_the_published_rate_to_the_published_maximum() -> N
     decided = accelerations(HumanDriver(SURE, world), world, [30.0, 5.0, 30.0])
     assert decided[:3] == pytest.approx([-1.265, -2.53, -3.795])
     assert min(decided) == pytest.approx(-0.774 * 9.80665)
-
-
-def test_braking_that_follows_acceleration_builds_up_from_none() -> None:
-    """The foot leaves the accelerator at once: the first tick of braking is that of the jerk, whatever went before."""
-    world = problem("CarFollowing").world
-    decided = accelerations(HumanDriver(replace(SURE, idm=IDM()), world), world, [10.0, 2.0, 100.0])
-    first = next(tick for tick, a in enumerate(decided) if a < 0.0)
-    assert decided[first - 1] > 0.0
-    model = replace(SURE, idm=IDM(), jerk=math.inf)
-    wanted = accelerations(HumanDriver(model, world), world, [10.0, 2.0, 100.0])
-    assert decided[first] == pytest.approx(max(wanted[first], -SURE.jerk * 0.1), rel=1e-9)
 
 
 def test_what_was_there_at_the_start_does_not_move_before_it_was_seen() -> None:
@@ -179,23 +153,6 @@ def test_noise_can_be_fixed_or_left_out() -> None:
     f = {noise: each.evaluate(x) for noise, each in found.items()}
     assert (f["fixed"] != f[False]).any()
     np.testing.assert_array_equal(f[False], problem("CutIn", HumanEgo(SURE)).evaluate(x))
-
-
-def test_errors_of_an_episode_have_the_published_law() -> None:
-    driver = problem("CarFollowing").driver
-    n = 40_000
-    draws = torch.randn(n, driver.noise_columns, generator=torch.Generator().manual_seed(0))
-    errors = driver.with_draws(draws).errors
-    assert errors is not None and errors.shape == (n, 20, 2)
-    np.testing.assert_allclose(errors.std(dim=0), 1.0, atol=0.02)
-    kept = (errors[:, 4] * errors[:, 16]).mean(dim=0)  # 6 s apart
-    np.testing.assert_allclose(kept, math.exp(-6.0 / 20.0), atol=0.03)
-
-
-def test_it_has_a_name_wherever_egos_have() -> None:
-    assert agents.load_ego("human") == "human"
-    with pytest.raises(ValueError, match="did you mean 'human'"):
-        agents.load_ego("humna")
 
 
 def test_worlds_and_stacks_that_it_does_not_fit_are_refused() -> None:

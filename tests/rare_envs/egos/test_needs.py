@@ -1,14 +1,35 @@
-"""Needs of an ego: read from what it declares, once."""
+"""Needs of egos: what an ego is, what it observes and how its actions are taken."""
+
+from __future__ import annotations
 
 from typing import Any, ClassVar
 
 import numpy as np
 import pytest
+import torch
 from gymnasium import spaces
+from stable_baselines3 import PPO
 
 import agents
 import rare_envs
-from rare_envs.egos.needs import PerceivingDriver, WrappedEgo, resolve
+import training
+from rare_envs.egos.needs import (
+    AMBIGUOUS,
+    TAKEN_AS_ACCELERATIONS,
+    AmbiguousActions,
+    FunctionEgo,
+    ModuleEgo,
+    PerceivingDriver,
+    WrappedEgo,
+    choose_action,
+    choose_observation,
+    find_fitting_kinds,
+    load_named_ego,
+    name_ambiguities,
+    resolve,
+    takes_indices,
+    wrap_callable,
+)
 from rare_envs.simulation.ego_interface import EgoNeeds
 from rare_envs.simulation.observation import observation_space
 
@@ -25,11 +46,6 @@ class Declared:
         return np.zeros((len(observation), 2)), None
 
 
-def test_an_ego_that_declares_nothing_needs_nothing() -> None:
-    assert resolve("idm") == EgoNeeds()
-    assert resolve(Declared()) == EgoNeeds(queries_policy=True)
-
-
 @pytest.mark.parametrize(
     ("space", "vehicles", "fitting"),
     [
@@ -41,11 +57,6 @@ def test_an_ego_that_declares_nothing_needs_nothing() -> None:
 )
 def test_what_it_observes_is_read_from_its_space(space: Any, vehicles: int, fitting: tuple[str, ...]) -> None:
     assert resolve(Declared(observation_space=space), vehicles).observations == fitting
-
-
-def test_only_a_plain_no_says_that_answers_vary() -> None:
-    for declared, varies in ((False, True), (True, False), (None, False), (0, False)):
-        assert resolve(Declared(deterministic=declared)).varies is varies
 
 
 def test_a_driver_that_perceives_needs_the_lidar_and_queries_no_policy() -> None:
@@ -73,8 +84,189 @@ def test_a_wrapped_ego_needs_what_the_one_behind_it_needs_and_its_own_noise() ->
     assert needs.noise_columns(rare_envs.DrivingProblem(CUT_IN, horizon=0.5).world) == 35
 
 
-def test_the_noise_of_a_stack_stands_behind_all_other_columns() -> None:
-    problem = rare_envs.DrivingProblem(CUT_IN, ego=agents.load_ego("noisy:idm"), horizon=1.0)
-    assert problem.space.names[-1] == "ego_noise"
-    assert problem.dim == 6 + problem.needs.noise_columns(problem.world)
-    assert rare_envs.DrivingProblem(CUT_IN, ego=agents.load_ego("noisy:idm"), horizon=1.0, noise=False).dim == 6
+CUT_IN, KINEMATICS = "rare_envs/CutIn-v0", "rare_envs/CutIn-kinematics-v0"
+
+
+class Idle:
+    """A policy with the spaces that it is given."""
+
+    def __init__(self, observed: Any = None, acted: Any = None) -> None:
+        self.observation_space, self.action_space = observed, acted
+
+    def predict(self, observation: Any, **_: Any) -> Any:
+        return np.ones(len(observation), np.int64), None
+
+
+@pytest.mark.parametrize(
+    ("space", "fitting"),
+    [
+        (spaces.Box(-5, 5, (44,)), ("features",)),  # four frames side by side
+        (spaces.Box(-5, 5, (4, 51)), ("lidar",)),
+        (spaces.Box(0, 255, (12, 40, 80), np.uint8), ("camera",)),  # four frames of another size, channels first
+        (spaces.Box(0, 255, (84, 84, 12), np.uint8), ("camera",)),
+        (spaces.Box(0, 255, (4, 3, 84, 84), np.uint8), ("camera",)),  # four frames on an axis of their own
+        (spaces.Box(0, 255, (4, 128, 64), np.uint8), ()),  # HighwayEnv's grayscale
+        (spaces.Box(0, 255, (1, 84, 84), np.uint8), ()),
+        (spaces.Box(0, 255, (4, 84, 84), np.uint8), ()),
+        (spaces.Box(0, 255, (84, 84, 4), np.uint8), ()),
+        (spaces.Box(-1, 1, (7, 11, 11)), ()),  # its occupancy grid
+        (spaces.Box(-1, 1, (15, 7)), ()),
+        (spaces.Box(-1, 1, (97,)), ()),
+        (spaces.Dict({"radar": spaces.Box(0, 1, (3,))}), ()),
+        (spaces.Dict({}), ()),
+        ("Box", ()),
+    ],
+)
+def test_what_else_fits(space: Any, fitting: tuple[str, ...]) -> None:
+    assert find_fitting_kinds(space, vehicles=3) == fitting
+
+
+def test_several_or_none_are_refused_in_a_line() -> None:
+    both = find_fitting_kinds(observation_space(13, "lidar"), vehicles=13)
+    with pytest.raises(ValueError, match="fit features and lidar: say which"):
+        choose_observation(EgoNeeds(observations=both), vehicles=13)
+    grayscale = [spaces.Box(0, 255, shape, np.uint8) for shape in ((1, 84, 84), (4, 84, 84), (84, 84, 4))]
+    others = [spaces.Box(-1, 1, shape) for shape in ((15, 7), (4, 128, 64), (7, 11, 11))]
+    for space, elsewhere in ((spaces.Box(-1, 1, (97,)), False), *((each, True) for each in (*grayscale, *others))):
+        with pytest.raises(ValueError, match=r"features \(11,\), lidar \(51,\), kinematics \(5, 5\)") as refused:
+            rare_envs.DrivingProblem(CUT_IN, ego=Idle(space))
+        assert ("rare_envs.highway_env_problem" in str(refused.value)) == elsewhere
+        assert "\n" not in str(refused.value)
+
+
+def test_a_policy_of_highway_env_says_by_its_id_or_by_hand_what_its_actions_are() -> None:
+    ego = Idle(observation_space(3, "kinematics"), spaces.Discrete(5))
+    with pytest.raises(ValueError, match=r"fit two kinds.*--action meta.*--action discrete"):
+        rare_envs.DrivingProblem(CUT_IN, ego=ego)
+    for env_id, asked, action in (
+        (KINEMATICS, {}, "meta"),
+        (KINEMATICS, {"observation": None, "action": None}, "meta"),
+        (CUT_IN, {"action": "meta"}, "meta"),
+        (CUT_IN, {"action": "discrete"}, "discrete"),
+    ):
+        problem = rare_envs.DrivingProblem(env_id, ego=ego, **asked)
+        assert (problem.world.sensing.observation, problem.world.clock.action) == ("kinematics", action)
+        assert problem.notes == ()
+
+
+def test_other_policies_are_taken_to_accelerate() -> None:
+    for acted, indices in ((spaces.Discrete(5), True), (spaces.Discrete(3), False), (None, False)):
+        assert takes_indices(acted) is indices
+        assert choose_action(acted, "lidar") == "continuous"
+    problem = rare_envs.DrivingProblem(CUT_IN, ego=Idle(observation_space(3, "features"), spaces.Discrete(5)))
+    assert len(problem.notes) == 1 and "--action meta" in problem.notes[0]  # and no warning
+    x = problem.base.sample(4, np.random.default_rng(0))
+    said = rare_envs.DrivingProblem(CUT_IN, ego=problem.ego, action="discrete")
+    np.testing.assert_array_equal(problem.evaluate(x), said.evaluate(x))
+
+
+@pytest.mark.parametrize("action", ["meta", "discrete"])
+def test_an_ego_that_drives_itself_says_that_named_actions_change_nothing(action: str) -> None:
+    told = f"the ego accelerates and steers by itself: action='{action}' (--action {action}) changes nothing for it"
+    plain = rare_envs.DrivingProblem(CUT_IN, ego="imitation")
+    assert plain.notes == ()
+    with pytest.warns(AmbiguousActions) as warned:
+        named = rare_envs.DrivingProblem(CUT_IN, ego="imitation", action=action)
+    assert [str(each.message) for each in warned] == [told]
+    assert named.notes == (told,)
+    x = plain.base.sample(4, np.random.default_rng(0))
+    np.testing.assert_array_equal(named.evaluate(x), plain.evaluate(x))
+    rare_envs.DrivingProblem(KINEMATICS, ego="idm")  # the id's own actions need no warning
+
+
+@pytest.mark.parametrize(
+    ("space", "kinds", "notes"),
+    [
+        (None, ("features",), ()),
+        (spaces.Box(-1.0, 1.0, (2,)), ("features",), ()),
+        (spaces.Discrete(5), ("kinematics",), (AMBIGUOUS,)),
+        (spaces.Discrete(5), ("camera", "lidar"), (TAKEN_AS_ACCELERATIONS,)),
+    ],
+)
+def test_only_five_numbers_can_be_two_things(space, kinds, notes):
+    assert name_ambiguities(space, kinds) == notes
+
+
+def test_other_bounds_are_told_as_people_write_them():
+    (note,) = name_ambiguities(spaces.Box(np.float32([-0.3, -4.0]), np.float32([0.1, 2.0])), ("features",))
+    assert note.startswith("the ego's actions, between [-0.3, -4.0] and [0.1, 2.0], are mapped to [-1, 1]")
+
+
+X = [[20.0, 15.0, 30.0], [30.0, 5.0, 20.0], [25.0, 24.0, 60.0]]
+
+
+class Brake:
+    """The same as a policy of Stable-Baselines3's form."""
+
+    def predict(self, observation, state=None, episode_start=None, deterministic=True):
+        return brake(observation), state
+
+
+def brake(observation):
+    return np.tile(np.array([-0.4, 0.0], dtype=np.float32), (len(observation), 1))
+
+
+class BrakingNetwork(torch.nn.Module):
+    def __init__(self) -> None:
+        super().__init__()
+        self.bias = torch.nn.Parameter(torch.tensor([-0.4, 0.0], dtype=torch.float64))
+        self.dropout = torch.nn.Dropout(0.5)
+
+    def forward(self, observation):
+        assert observation.dtype == self.bias.dtype
+        return self.dropout(self.bias.expand(len(observation), 2))
+
+
+@pytest.mark.parametrize("ego", [brake, BrakingNetwork(), lambda observation: brake(observation).tolist()])
+def test_they_drive_as_the_policy_does(ego):
+    wanted = rare_envs.DrivingProblem("rare_envs/CarFollowing-v0", ego=Brake()).evaluate(X)
+    np.testing.assert_array_equal(rare_envs.DrivingProblem("rare_envs/CarFollowing-v0", ego=ego).evaluate(X), wanted)
+
+
+def test_a_function_can_choose_whole_numbers():
+    ego = FunctionEgo(lambda observation: np.full(len(observation), 1))  # -2 m/s^2, as `brake`
+    found = rare_envs.DrivingProblem("rare_envs/CarFollowing-v0", ego=ego).evaluate(X)
+    np.testing.assert_array_equal(found, rare_envs.DrivingProblem("rare_envs/CarFollowing-v0", ego=brake).evaluate(X))
+
+
+def test_other_egos_stay_as_they_are():
+    policy = Brake()
+    for ego in (policy, "idm", Brake, 3, None):
+        assert wrap_callable(ego) is ego
+    assert isinstance(wrap_callable(torch.nn.Linear(11, 2)), ModuleEgo)
+    with pytest.raises(ValueError, match="got the class Brake"):
+        rare_envs.DrivingProblem("rare_envs/CarFollowing-v0", ego=Brake)
+
+
+PAIR = [[20.0, 15.0, 30.0], [30.0, 5.0, 20.0]]
+ENV_ID = "rare_envs/CarFollowing-v0"
+
+
+@pytest.fixture(scope="module")
+def saved(tmp_path_factory):
+    path = tmp_path_factory.mktemp("egos") / "ppo.zip"
+    PPO("MlpPolicy", training.sb3_vec_env(ENV_ID, num_envs=2), n_steps=8, batch_size=16, seed=0, device="cpu").save(
+        path
+    )
+    return path
+
+
+def test_a_file_is_loaded(saved):
+    wanted = rare_envs.DrivingProblem(ENV_ID, ego=agents.load_ego(saved)).evaluate(PAIR)
+    for ego in (saved, str(saved)):
+        problem = rare_envs.DrivingProblem(ENV_ID, ego=ego)
+        np.testing.assert_array_equal(problem.evaluate(PAIR), wanted)
+        assert problem.ego == ego
+
+
+def test_what_cannot_be_loaded_is_refused_in_one_line(tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"nothing\.zip"):
+        rare_envs.DrivingProblem(ENV_ID, ego=tmp_path / "nothing.zip")
+    with pytest.raises(ValueError, match=r"Unknown ego 'imd' \(did you mean 'idm'\?\)"):
+        rare_envs.DrivingProblem(ENV_ID, ego="imd")
+
+
+def test_other_egos_are_not_loaded():
+    ego = object()
+    assert load_named_ego(ego) is ego
+    assert load_named_ego("human") == "human"

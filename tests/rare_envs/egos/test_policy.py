@@ -80,12 +80,6 @@ def test_rows_after_a_collision_and_rows_that_failed_are_shown_what_another_row_
     assert not goes_on.any()
 
 
-def test_where_no_row_is_left_zeros_are_shown() -> None:
-    policy = Recorder()
-    PolicyDriver(policy).act(WORLD.start(X)._replace(collided=torch.ones(3, dtype=torch.bool)), None)
-    assert (policy.shown[0][0] == 0.0).all()
-
-
 def test_a_policy_with_meta_actions_is_queried_once_a_second() -> None:
     class Meta(Recorder):
         def predict(self, *args: Any, **kwargs: Any) -> Any:

@@ -7,7 +7,6 @@ from gymnasium import spaces
 
 from rare_envs.egos.wrappers import (
     FrameStackedPolicy,
-    NormalisedPolicy,
     describe_missing_normalisation,
     find_frame_stacking,
     find_stacking,
@@ -27,12 +26,6 @@ def test_frames_of_spaces() -> None:
     assert find_frame_stacking(both, spaces.Dict({"camera": first, "lidar": row})) is None  # not the same number
     assert find_frame_stacking(both, spaces.Dict({"camera": image})) is None
     assert find_frame_stacking(both, image) is None
-
-
-def test_a_network_that_does_not_transpose_is_not_taken_for_one_that_does() -> None:
-    image = spaces.Box(0, 255, (*SMALL, 3), np.uint8)
-    assert find_frame_stacking(image, spaces.Box(-np.inf, np.inf, (3, *SMALL))) is None  # an .onnx file's
-    assert find_frame_stacking(image, spaces.Box(-np.inf, np.inf, (*SMALL, 3))) == (1, False)
 
 
 class Echo:
@@ -63,11 +56,6 @@ def test_frames_side_by_side_begin_with_zeros_and_along_an_axis_with_copies() ->
         np.testing.assert_array_equal(shown, first)
         shown, _ = policy.predict(two, state, episode_start=np.array([False, True]))  # the second row begins anew
         np.testing.assert_array_equal(shown, second)
-
-
-def test_a_normalised_policy_is_shown_normalised_observations() -> None:
-    shown, _ = NormalisedPolicy(Echo(), lambda seen: (seen - 1.0) / 2.0).predict(np.array([[3.0]]))
-    assert shown == 1.0
 
 
 class Model:

@@ -7,16 +7,13 @@ import numpy as np
 import pytest
 import torch
 from gymnasium import spaces
-from gymnasium.utils.env_checker import check_env
 from numpy.typing import NDArray
 from stable_baselines3 import PPO
-from stable_baselines3.common.env_checker import check_env as sb3_check_env
 from stable_baselines3.common.vec_env import VecFrameStack
 
 import rare_envs
-from rare_envs.devices.batch_sizes import CAMERA_TILE
 from rare_envs.sensors.camera import Camera
-from rare_envs.sensors.kinds import map_kinds, read_kinds
+from rare_envs.sensors.kinds import map_kinds
 from training import sb3_vec_env
 
 CUT_IN = "rare_envs/CutIn-v0"
@@ -43,13 +40,6 @@ class Daredevil:
 
 
 @ids
-@pytest.mark.parametrize("observation", ["camera", "camera+lidar"])
-def test_checkers(env_id: str, observation: str) -> None:
-    check_env(gym.make(env_id, observation=observation, weather=True).unwrapped, skip_render_check=True)
-    sb3_check_env(gym.make(env_id, observation=observation))
-
-
-@ids
 def test_env_and_batch_see_the_same(env_id: str) -> None:
     settings: dict[str, Any] = {"observation": ("lidar", "camera"), "weather": True, "camera": SMALL}
     env, batch = gym.make(env_id, **settings), rare_envs.make_batch(env_id, 3, **settings)
@@ -64,20 +54,6 @@ def test_env_and_batch_see_the_same(env_id: str) -> None:
         one, *_ = env.step(action)
         many, *_ = batch.step(np.repeat(action[None], 3, axis=0))
         np.testing.assert_array_equal(one["camera"], many["camera"][1])
-
-
-def test_the_last_picture_of_an_episode_and_the_first_of_the_next() -> None:
-    batch = rare_envs.make_batch(CUT_IN, 2, observation="camera+features", camera=SMALL, horizon=0.2)
-    batch.reset(seed=0)
-    batch.step(np.zeros((2, 2)))
-    observation, _, _, truncated, infos = batch.step(np.zeros((2, 2)))
-    assert truncated.all()
-    assert set(infos["final_obs"][0]) == set(observation) == {"camera", "features"}
-    assert infos["final_obs"][0]["camera"].shape == (*SMALL, 3)
-    env = gym.make(CUT_IN, observation="camera", camera=SMALL)
-    for row in range(2):
-        first, _ = env.reset(options={"x": infos["x"][row]})
-        np.testing.assert_array_equal(first, observation["camera"][row])
 
 
 def test_a_problem_and_an_environment_lead_to_the_same_end() -> None:
@@ -101,22 +77,7 @@ def test_a_problem_and_an_environment_lead_to_the_same_end() -> None:
         assert info["measure"] == f[row]
 
 
-def test_pictures_are_taken_only_where_they_are_observed(monkeypatch: pytest.MonkeyPatch) -> None:
-    def fail(*_: Any) -> None:
-        raise AssertionError
-
-    monkeypatch.setattr("rare_envs.simulation.observation.take_picture", fail)
-    problem = rare_envs.DrivingProblem(CUT_IN, observation="camera", weather=True)  # driven by IDM
-    problem.evaluate(problem.base.sample(8, np.random.default_rng(0)))
-
-
-def test_batches_of_pictures_are_small() -> None:
-    ego = Daredevil()
-    problem = rare_envs.DrivingProblem(CUT_IN, ego=ego, observation="camera", horizon=0.1)
-    problem.evaluate(problem.base.sample(CAMERA_TILE + 2, np.random.default_rng(0)))
-    assert ego.batches == [CAMERA_TILE, 2]
-
-
+@pytest.mark.slow
 @pytest.mark.parametrize(("observation", "policy"), [("camera", "CnnPolicy"), ("camera+lidar", "MultiInputPolicy")])
 def test_stable_baselines3_learns_and_drives(observation: str, policy: str) -> None:
     settings: dict[str, Any] = {"observation": observation, "camera": SMALL, "horizon": 1.0}
@@ -144,17 +105,6 @@ def test_stacked_frames_of_a_camera() -> None:
     assert infos[0]["measure"] == pytest.approx(f[0], abs=1e-5)
 
 
-def test_a_camera_on_every_agent() -> None:
-    env = rare_envs.parallel_env(CUT_IN, observation="camera", weather=True)
-    pictures, infos = env.reset(seed=1, options={"sensor_noise": 0.0, "fog": 1e-4})
-    assert all(env.observation_space(agent).contains(picture) for agent, picture in pictures.items())
-    alone, _ = gym.make(CUT_IN, observation="camera", weather=True).reset(options={"x": infos["ego"]["x"]})
-    np.testing.assert_array_equal(pictures["ego"], alone)
-    red = {agent: (p[:, :, 0] > 2.5 * p[:, :, 1].astype(float)).sum() for agent, p in pictures.items()}
-    assert red["ego"] > 20  # the cutter, vehicle 1, is red for everybody else
-    assert red["cutter"] == red["lead"] == 0
-
-
 def test_an_ego_for_other_pictures_is_refused() -> None:
     with pytest.raises(ValueError, match="66, 200, 3"):
         rare_envs.DrivingProblem(CUT_IN, ego=Daredevil(), observation="camera", camera=(32, 64))
@@ -166,24 +116,6 @@ def test_an_ego_for_other_pictures_is_refused() -> None:
 def test_unknown_observations_are_refused(wrong: Any) -> None:
     with pytest.raises(ValueError, match="observation"):
         gym.make(CUT_IN, observation=wrong)
-
-
-def test_names_of_several_observations_in_any_order() -> None:
-    assert read_kinds("lidar+camera") == read_kinds(("camera", "lidar")) == read_kinds(["lidar", "camera"])
-
-
-def test_meta_actions_and_a_camera() -> None:
-    settings: dict[str, Any] = {"observation": "camera", "action": "meta", "weather": True, "camera": SMALL}
-    env, batch = gym.make(CUT_IN, **settings), rare_envs.make_batch(CUT_IN, 2, **settings)
-    _, infos = batch.reset(seed=0)
-    env.reset(options={"x": infos["x"][1]})
-    for action in (1, 4, 0):
-        one, _, terminated, truncated, _ = env.step(action)
-        many, _, _, _, infos = batch.step(np.array([action, action]))
-        over = terminated or truncated
-        np.testing.assert_array_equal(one, infos["final_obs"][1] if over else many[1])
-        if over:
-            break
 
 
 @pytest.mark.gpu

@@ -1,4 +1,6 @@
-"""Pictures: who is painted how, the numbers above, windows and videos."""
+"""Pictures and HighwayEnv's objects: who is painted how, the numbers above, windows and videos."""
+
+from __future__ import annotations
 
 import importlib.util
 
@@ -8,10 +10,24 @@ import pytest
 import torch
 
 import rare_envs
-from rare_envs.envs.rendering import AGENT, FRAME_WIDTH, TEXT_HEIGHT, Renderer, caption
+from rare_envs.envs.rendering import (
+    AGENT,
+    FRAME_WIDTH,
+    TEXT_HEIGHT,
+    Display,
+    Renderer,
+    caption,
+    make_network,
+    make_scene,
+    make_traffic,
+    world_places,
+    world_point,
+)
 from rare_envs.make import set_up
 from rare_envs.scenarios.registry import SCENARIOS
 from rare_envs.traffic.palette import CRASH_COLOUR, ROLE_COLOURS, as_rgb
+from rare_envs.traffic.road import i80, straight
+from rare_envs.traffic.state import State
 
 every = pytest.mark.parametrize("env_id", rare_envs.ENV_IDS)
 CUT_IN = "rare_envs/CutIn-v0"
@@ -89,14 +105,6 @@ def test_a_window(env_id, monkeypatch):
     env.close()
 
 
-def test_pictures_of_a_batch():
-    batch = gym.make_vec(CUT_IN, num_envs=3, render_mode="rgb_array")
-    batch.reset(options={"cut_in_gap": np.array([5.0, 20.0, 40.0])})
-    images = batch.render()
-    assert len(images) == 3
-    assert not np.array_equal(images[0], images[1])
-
-
 @pytest.mark.skipif(importlib.util.find_spec("moviepy") is None, reason="Gymnasium's RecordVideo needs moviepy")
 @pytest.mark.filterwarnings("ignore:invalid escape sequence")  # in moviepy 1's own text, when it is first compiled
 def test_gymnasium_records_a_video(tmp_path):
@@ -107,3 +115,71 @@ def test_gymnasium_records_a_video(tmp_path):
     env.close()
     (film,) = tmp_path.glob("films/*.mp4")
     assert film.stat().st_size > 1000
+
+
+@pytest.fixture(scope="module")
+def world():
+    return rare_envs.DrivingProblem("rare_envs/CarFollowing-v0").world
+
+
+@pytest.fixture(scope="module")
+def episode(world):
+    return world.start(torch.tensor([[20.0, 20.0, 30.0]]))
+
+
+@pytest.mark.parametrize("mode", [None, "rgb_array", "human"])
+def test_nothing_to_render_is_a_warning(world, episode, mode, monkeypatch):
+    warned = []
+    monkeypatch.setattr(gym.logger, "warn", warned.append)
+    assert Display(world, mode).draw(episode if mode is None else None, 0.0) is None
+    assert len(warned) == 1 and "Nothing to render" in warned[0]
+
+
+def test_a_window_gives_no_image(world, episode, monkeypatch):
+    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
+    display = Display(world, "human")
+    assert display.is_window and display.draw(episode, 0.0) is None
+    display.close()
+
+
+def test_an_unknown_mode_is_refused(world):
+    with pytest.raises(ValueError, match="Expected render_mode None, 'rgb_array' or 'human', got 'ansi'"):
+        Display(world, "ansi")
+
+
+def test_vehicles_are_where_the_state_has_them() -> None:
+    x = torch.tensor([[0.0, 30.0], [5.0, 50.0]])
+    state = State(x, y=torch.tensor([[0.0, 4.0], [8.0, 0.0]]), heading=0.1 * x, speed=x + 1.0, theta=x[:, :0])
+    traffic = make_traffic(state, straight(3), row=1)
+    ego, other = traffic.vehicles
+    np.testing.assert_allclose([ego.position, other.position], [[5.0, 8.0], [50.0, 0.0]])
+    assert (ego.lane_index[2], other.lane_index[2]) == (2, 0)
+    assert (ego.speed, other.heading) == (6.0, pytest.approx(5.0))
+    assert traffic.neighbour_vehicles(ego, ("0", "1", 0))[0] is other  # HighwayEnv's own methods work on it
+
+
+def test_a_curved_road_has_a_lane_for_each_lane_along_its_pieces() -> None:
+    road = i80()
+    network = make_network(road, 300.0)
+    pieces = {index[:2] for index in network.lanes_dict()}
+    assert len(pieces) == 7 and len(network.lanes_list()) == 7 * road.lanes
+    for lane in range(road.lanes):
+        point = world_point(road, 310.0, road.centre(lane))
+        assert network.get_closest_lane_index(point)[2] == lane
+    zero = torch.zeros(1, 1)
+    state = State(zero + 310.0, zero + road.centre(2), zero, zero, zero[:, :0])
+    np.testing.assert_allclose(world_places(state, road)[0][:2], world_point(road, 310.0, road.centre(2)), atol=1e-3)
+
+
+def test_who_touches_the_ego_has_crashed_and_targets_are_those_of_its_controller() -> None:
+    world, _ = set_up("rare_envs/CarFollowing-v0", action="meta")
+    apart, touching = torch.tensor([[21.0, 15.0, 30.0]]), torch.tensor([[38.0, 2.0, 1.0]])
+    scene = make_scene(world.start(apart))
+    assert [vehicle.crashed for vehicle in scene.vehicles] == [False, False]
+    assert (scene.vehicles[0].target_speed, scene.vehicles[0].target_lane_index) == (20.0, ("0", "1", 0))
+    episode = world.start(touching)
+    for _ in range(3):
+        episode = world.step(episode, torch.zeros(1, 2))
+    assert bool(episode.collided)
+    assert [vehicle.crashed for vehicle in make_scene(episode).vehicles] == [True, True]
+    assert [vehicle.crashed for vehicle in make_scene(episode, crashed=[1]).vehicles] == [False, True]

@@ -1,89 +1,17 @@
 """The batched environment: agreement with the environment of one and with rollout, and its autoreset."""
 
-from typing import Any
-
 import gymnasium as gym
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 import rare_envs
 from rare_envs.envs.rows_and_infos import DRAWS_IN_A_ROW
-from rare_envs.envs.vector import DrivingVectorEnv, read_autoreset_mode
+from rare_envs.envs.vector import DrivingVectorEnv
 from rare_envs.scenarios.registry import SCENARIOS
 
 ids = pytest.mark.parametrize("env_id", rare_envs.ENV_IDS)
 SCRIPTED_IDS = [env_id for env_id, scenario in SCENARIOS.items() if scenario.drivers is None]
 scripted = pytest.mark.parametrize("env_id", SCRIPTED_IDS)  # no network, so batch sizes change no bit
-
-
-class Scripted:
-    """An ego with SB3's `predict`: a fixed sequence of actions, then the last one for ever."""
-
-    def __init__(self, actions: NDArray[np.float64]) -> None:
-        self.actions = actions
-
-    def predict(
-        self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = False
-    ) -> Any:
-        tick = 0 if state is None else state[0]
-        action = self.actions[min(tick, len(self.actions) - 1)]
-        return np.repeat(action[None], len(observation), axis=0), (tick + 1,)
-
-
-def scripted_actions(seed: int = 0) -> NDArray[np.float64]:
-    rng = np.random.default_rng(seed)
-    return np.stack([rng.uniform(-0.7, 1.0, 100), rng.uniform(-0.05, 0.05, 100)], axis=1)
-
-
-@scripted
-def test_env_vector_env_and_rollout_agree_on_the_same_x_and_actions(env_id: str) -> None:
-    actions = scripted_actions()
-    base = "us101-all-brakings" if "HardBrake" in env_id else None  # brakings to a standstill all end in a collision
-    problem = rare_envs.DrivingProblem(env_id, ego=Scripted(actions), horizon=5.0, base=base)
-    x = problem.base.sample(64, np.random.default_rng(1))
-    f = problem.evaluate(x)
-    assert (f == -1.0).any()
-    assert (f > 0.0).any()
-
-    batch = rare_envs.make_batch(env_id, len(x), horizon=5.0, core="torch")  # the compiled core rounds otherwise
-    batch.reset(options={"x": x})
-    measured = np.full(len(x), np.nan)
-    observations = []
-    for action in actions:
-        observation, reward, terminated, truncated, infos = batch.step(np.repeat(action[None], len(x), axis=0))
-        observations.append((observation, reward, infos))
-        first = (terminated | truncated) & np.isnan(measured)
-        measured[first] = infos["final_info"]["measure"][first] if first.any() else np.nan
-    np.testing.assert_array_equal(measured, f)
-
-    env = gym.make(env_id, horizon=5.0, core="torch")
-    for row in range(8):
-        env.reset(options={"x": x[row]})
-        for tick, action in enumerate(actions):
-            observation, reward, terminated, truncated, info = env.step(action)
-            if terminated or truncated:
-                assert info["measure"] == f[row]
-                assert info["collision"] == (f[row] == -1.0) == terminated
-                np.testing.assert_array_equal(observation, observations[tick][2]["final_obs"][row])
-                break
-            np.testing.assert_array_equal(observation, observations[tick][0][row])
-            assert reward == pytest.approx(observations[tick][1][row], rel=1e-6)
-            assert info["min_ttc"] == observations[tick][2]["min_ttc"][row]
-
-
-@ids
-def test_same_seed_same_episodes(env_id: str) -> None:
-    runs = []
-    for _ in range(2):
-        batch = rare_envs.make_batch(env_id, 16, horizon=3.0)
-        observation, _ = batch.reset(seed=4)
-        rows = [observation]
-        batch.action_space.seed(0)
-        for _ in range(50):
-            rows.append(batch.step(batch.action_space.sample())[0])
-        runs.append(np.array(rows))
-    np.testing.assert_array_equal(*runs)
 
 
 @ids
@@ -217,14 +145,6 @@ def test_without_autoreset_the_caller_resets_the_rows_that_ended() -> None:
     batch.reset(options={"reset_mask": ~mask})
     *_, truncated, _ = batch.step(still)
     assert not truncated.any()
-
-
-@pytest.mark.parametrize("mode", gym.vector.AutoresetMode)
-def test_a_mode_is_read_by_itself_and_by_gymnasiums_word(mode: gym.vector.AutoresetMode) -> None:
-    assert read_autoreset_mode(mode) is read_autoreset_mode(mode.value) is mode
-    for other in (mode.name, mode.value.lower(), None):
-        with pytest.raises(ValueError, match=f"autoreset_mode {other!r}; expected one of 'NextStep', 'SameStep', 'Dis"):
-            read_autoreset_mode(other)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("mask", [np.zeros(2, bool), np.ones(3, bool), np.array([1, 0])])

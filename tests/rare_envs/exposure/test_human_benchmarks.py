@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from rare_envs.exposure import HUMAN_BENCHMARKS, describe_human_contacts
+from rare_envs.exposure import HUMAN_BENCHMARKS
 
 TABLE = {
     ("100-Car", "contacts of all kinds"): (21, 16, 27, 1.6e-3),
@@ -19,10 +19,6 @@ TABLE = {
 """Per million km with its interval, and per hour."""
 
 
-def test_every_figure_is_in_the_table() -> None:
-    assert {(each.study, each.kind) for each in HUMAN_BENCHMARKS} == set(TABLE)
-
-
 @pytest.mark.parametrize("benchmark", HUMAN_BENCHMARKS, ids=lambda each: f"{each.study} {each.kind}")
 def test_rates(benchmark) -> None:
     rate, low, high, per_hour = TABLE[benchmark.study, benchmark.kind]
@@ -33,8 +29,3 @@ def test_rates(benchmark) -> None:
     assert benchmark.source
     assert benchmark.words
     assert benchmark.to_dict()["per_million_km"] == benchmark.per_million_km
-
-
-def test_the_line_beside_a_rate() -> None:
-    people = "people: 21 contacts of all kinds, 4.3 into a vehicle ahead (100-Car)"
-    assert describe_human_contacts() == f"{people}, 15 crashes without tyre strikes (SHRP 2)"

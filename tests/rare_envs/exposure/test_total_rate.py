@@ -22,12 +22,6 @@ def test_the_worked_example_adds_up() -> None:
     assert total.per_million_km == pytest.approx(200, rel=0.04)
 
 
-def test_one_scenario_is_its_own_total() -> None:
-    one = rate(spread=1.4)
-    assert TotalRate((one,)).interval_per_hour == one.interval_per_hour
-    assert TotalRate((one,)).interval_per_million_km == one.interval_per_million_km
-
-
 def test_small_independent_errors_add_as_variances_of_the_rates() -> None:
     """3 and 1 with 4 % and 8 %: sd = sqrt(.12^2 + .08^2) of 4; ends of 200,000 draws are good to 1 % of it."""
     total = TotalRate((rate(0.3, 0.04, SURE), rate(0.1, 0.08, SURE, scenario="b")))
@@ -56,13 +50,6 @@ def test_a_scenario_that_is_not_determined_raises_the_upper_end_alone() -> None:
     assert low == pytest.approx(known.interval_per_hour[0], rel=0.01)
     assert high == pytest.approx(known.interval_per_hour[1] + 1e-5, rel=0.01)
     assert {each.scenario for each in total.shares} <= {"cut_in", ""}
-
-
-def test_nothing_is_determined() -> None:
-    total = TotalRate((rate(0.0, math.inf, SURE, upper=1e-4), rate(0.0, math.inf, SURE, upper=2e-4, scenario="b")))
-    assert total.interval_per_hour == pytest.approx((0.0, 3e-3), rel=1e-4)
-    assert total.shares == ()
-    assert total.further_events({"cut_in": 38, "b": 20}) is None
 
 
 def test_shares_of_the_variance_by_hand() -> None:
@@ -104,8 +91,3 @@ def test_no_further_events_halve_a_width_that_a_bound_is_part_of() -> None:
     known, unknown = rate(3e-4, 0.0, SURE, spread=1.4), rate(0.0, math.inf, SURE, upper=1e-3, scenario="b")
     assert TotalRate((known,)).further_events({"cut_in": 38}) is not None
     assert TotalRate((known, unknown)).further_events({"cut_in": 38, "b": 20}) is None
-
-
-def test_rates_of_different_confidence_do_not_add() -> None:
-    with pytest.raises(ValueError, match="one confidence"):
-        TotalRate(())

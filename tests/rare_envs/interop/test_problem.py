@@ -1,4 +1,4 @@
-"""HighwayEnv's environments as problems: f is what the drive shows, p is the truth, workers change nothing."""
+"""The problem of HighwayEnv's environments: f, workers, egos, and p against an integral."""
 
 import pickle
 import threading
@@ -8,11 +8,13 @@ import numpy as np
 import pytest
 from scipy import integrate
 from stable_baselines3 import DQN
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 import rare_envs
 import samplers
-from rare_envs.interop.problem import make_highway_env
-from tests.rare_envs.interop.egos import Always
+from rare_envs.egos.wrappers import wrap_policy
+from rare_envs.interop.problem import make_highway_env, strip_ego
+from tests.rare_envs.interop.egos import Always, faster
 
 FAST = {"vehicles_count": 3, "duration": 4}
 
@@ -43,16 +45,6 @@ def test_f_is_the_measure_of_the_drive_that_the_wrapper_shows() -> None:
     np.testing.assert_array_equal(pickle.loads(pickle.dumps(problem)).evaluate(x[:2]), f[:2])
 
 
-@pytest.mark.parametrize("env_id", ["merge-v1", "roundabout-v1", "intersection-v2"])
-def test_the_other_environments_are_functions_of_x(env_id: str) -> None:
-    config = {"initial_vehicle_count": 3, "duration": 4} if env_id.startswith("inter") else None
-    problem = rare_envs.highway_env_problem(env_id, ego="idm", config=config, horizon=4.0)
-    x = problem.base.sample(2, np.random.default_rng(3))
-    f = problem.evaluate(x)
-    assert ((f == -1.0) | ((f > 0.0) & (f <= 10.0))).all()
-    np.testing.assert_array_equal(problem.evaluate(x[:1]), f[:1])
-
-
 # One lane, one vehicle ahead that keeps its speed v, an ego that keeps 25 m/s: after 3 s they have met exactly if the
 # gap was less than 3 s x (25 m/s - v). Speed and gap have HighwayEnv's law, so p is an integral.
 TRUTH_CONFIG = {
@@ -79,17 +71,7 @@ def truth() -> float:
     return float(integrate.quad(below, 21.0, 24.0, limit=500, points=[21.1, 21.3])[0] / 3.0)
 
 
-def test_collisions_are_those_of_the_formula() -> None:
-    problem = truth_problem()
-    assert problem.space.names == ("ego_lane", "speed", "gap", "lane", "noise")
-    x = problem.base.sample(4000, np.random.default_rng(4))
-    slack = x[:, 2] - 3.0 * (25.0 - x[:, 1])
-    x, slack = x[np.argsort(abs(slack))[20:40]], np.sort(abs(slack))[20:40]
-    hit = x[:, 2] < 3.0 * (25.0 - x[:, 1])
-    assert 3 < hit.sum() < 17
-    np.testing.assert_array_equal(problem.evaluate(x) == -1.0, hit)
-
-
+@pytest.mark.slow
 def test_the_samplers_p_is_the_integral() -> None:
     p = truth()
     assert 0.005 < p < 0.03
@@ -97,13 +79,6 @@ def test_the_samplers_p_is_the_integral() -> None:
     assert result.interval[0] <= p <= result.interval[1]
     assert result.p == pytest.approx(p, rel=4 * result.cov)
     assert result.cov < 0.2
-
-
-@pytest.mark.slow
-def test_long_monte_carlo_agrees_with_the_integral_and_the_sampler() -> None:
-    p, n = truth(), 6000
-    f = truth_problem(workers=2).evaluate(truth_problem().base.sample(n, np.random.default_rng(5)))
-    assert abs((f <= 0.0).mean() - p) < 4.0 * (p * (1.0 - p) / n) ** 0.5
 
 
 def test_what_p_is_conditional_on() -> None:
@@ -147,3 +122,44 @@ def test_bad_input_is_refused_at_the_door() -> None:
         x = problem.base.sample(1, np.random.default_rng(0))
         x[0, 4] = 400.0
         problem.evaluate(x)
+
+
+@pytest.mark.slow
+def test_workers_and_their_number_change_no_bit() -> None:
+    x = fast().base.sample(5, np.random.default_rng(1))
+    expected = fast(Always(3)).evaluate(x)
+    with fast(faster, workers=2) as problem:
+        np.testing.assert_array_equal(problem.evaluate(x), expected)
+        np.testing.assert_array_equal(problem.evaluate(x[::-1])[::-1], expected)
+
+
+def test_a_model_of_stable_baselines3_is_an_ego() -> None:
+    env = make_highway_env("highway-fast-v0", FAST)
+    model = DQN("MlpPolicy", env, seed=0, buffer_size=10, policy_kwargs={"net_arch": [8]})
+    problem = fast(model)
+    x = problem.base.sample(2, np.random.default_rng(2))
+    f = problem.evaluate(x)
+    assert np.isfinite(f).all()
+    scenario = rare_envs.HighwayEnvScenario(make_highway_env("highway-fast-v0", FAST), vehicles=2)
+    observation, _ = scenario.reset(options={"x": x[0]})
+    over = False
+    while not over:
+        observation, _, terminated, truncated, info = scenario.step(model.predict(observation, deterministic=True)[0])
+        over = terminated or truncated
+    assert info["measure"] == f[0]
+
+
+def test_statistics_of_a_model_travel_without_its_environment() -> None:
+    vec_env = VecNormalize(DummyVecEnv([lambda: make_highway_env("highway-fast-v0", FAST)]))
+    model = DQN("MlpPolicy", vec_env, seed=0, buffer_size=10, policy_kwargs={"net_arch": [8]})
+    vec_env.obs_rms.mean[...] = 0.5  # type: ignore[union-attr]
+    seen = np.random.default_rng(0).uniform(-1.0, 1.0, (1, 5, 5)).astype(np.float32)
+    expected = model.predict(np.asarray(vec_env.normalize_obs(seen)), deterministic=True)[0]
+    there = wrap_policy(pickle.loads(pickle.dumps(strip_ego(model))), vec_env.observation_space)
+    assert there.normalise(seen)[0, 0, 0] == pytest.approx(vec_env.normalize_obs(seen)[0, 0, 0])  # type: ignore[call-overload]
+    np.testing.assert_array_equal(there.predict(seen)[0], expected)
+
+
+def test_a_maker_that_fails_is_told_in_one_line() -> None:
+    with pytest.raises(ValueError, match=r"a function without arguments that makes one, got .* which fails: TypeError"):
+        fast(lambda observation: 1)

@@ -1,16 +1,25 @@
-"""HighwayEnv's environments with parameters: set as said, drawn as HighwayEnv draws, and nothing else changes."""
+"""HighwayEnv's environments as scenarios: options, scenes, measures and distributions."""
 
+from types import SimpleNamespace
 from typing import Any
 
 import gymnasium as gym
 import highway_env  # noqa: F401  (registers the ids)
 import numpy as np
 import pytest
+import torch
 from highway_env.vehicle.behavior import IDMVehicle
+from highway_env.vehicle.kinematics import Vehicle
+from numpy.typing import NDArray
+from scipy import stats
 
+import rare_envs
 from rare_envs import HighwayEnvScenario
 from rare_envs.interop.problem import make_highway_env
-from tests.rare_envs.interop.scenes import CONFIGS, SMALL, scenario
+from rare_envs.interop.scene import HIGHWAY_ENV_MEASURES, contact_time, install_fast_observation
+from rare_envs.traffic.bodies import axes_of, project_on_axes, time_to_contact
+from tests.rare_envs.interop.egos import Always
+from tests.rare_envs.interop.scenes import CONFIGS, SMALL, others, scenario
 
 
 @pytest.mark.parametrize("env_id", list(CONFIGS))
@@ -69,9 +78,249 @@ def test_wrong_environments_and_settings_are_refused() -> None:
         make_highway_env("highway-fst-v0", None)
 
 
-def test_equal_seeds_draw_equal_scenarios() -> None:
-    env = scenario("highway-fast-v0")
-    observation, info = env.reset(seed=0)
-    assert env.observation_space.contains(observation)
-    np.testing.assert_array_equal(observation, env.reset(seed=0)[0])
-    assert not np.array_equal(info["x"], env.reset()[1]["x"])
+def read_back(env: Any, env_id: str) -> dict[str, Any]:
+    """The parameters of a scene that HighwayEnv made by itself."""
+    ego, rest = env.unwrapped.vehicle, others(env)
+    if env_id.startswith("highway"):
+        x = np.array([v.position[0] for v in (ego, *rest)])
+        return {
+            "ego_lane": ego.lane_index[2],
+            "speed": [v.speed for v in rest[:4]],
+            "gap": np.diff(x)[:4] - 5.0,
+            "lane": [v.lane_index[2] for v in rest[:4]],
+        }
+    if env_id.startswith("merge"):
+        second, first, behind, _ = rest
+        gap = [abs(v.position[0] - ego.position[0]) - 5.0 for v in (first, second, behind)]
+        ranked = (first, second, behind)
+        return {
+            **dict(zip(("gap_ahead", "gap_second", "gap_behind"), gap, strict=True)),
+            "speed": [v.speed for v in ranked],
+            "lane": [v.lane_index[2] for v in ranked],
+        }
+    lanes = [("we", "sx", 1), ("we", "sx", 0), ("we", "sx", 0), ("eer", "ees", 0)]
+    network = env.unwrapped.road.network
+    places = [network.get_lane(i).local_coordinates(v.position)[0] for i, v in zip(lanes, rest, strict=True)]
+    return {"speed": [v.speed for v in rest], "place": places}
+
+
+def draws(env_id: str, n: int) -> NDArray[np.float64]:
+    plain, rows = make_highway_env(env_id, CONFIGS[env_id]), []
+    for seed in range(n):
+        plain.reset(seed=seed)
+        given = read_back(plain, env_id)
+        rows.append(np.concatenate([np.atleast_1d(given[name]) for name in given]))
+    return np.array(rows)
+
+
+def read_back_names(env_id: str) -> list[str]:
+    if env_id.startswith("highway"):
+        return ["ego_lane", "speed", "gap", "lane"]
+    return ["gap_ahead", "gap_second", "gap_behind", "speed", "lane"] if "merge" in env_id else ["speed", "place"]
+
+
+def test_highway_options_are_what_the_scene_then_has() -> None:
+    env = scenario("highway-fast-v0", vehicles=3)
+    lanes = [2, 0, 1]
+    _, info = env.reset(
+        seed=0,
+        options={"ego_lane": 1, "ego_speed": 28.0, "speed": [10.0, 20.0, 30.0], "gap": [7.0, 50.0, 1.0], "lane": lanes},
+    )
+    ego, ahead = env.unwrapped.vehicle, others(env)
+    assert (ego.speed, ego.lane_index[2], ego.position[1], ego.target_speed) == (28.0, 1, 4.0, 30.0)
+    assert [v.speed for v in ahead[:3]] == [10.0, 20.0, 30.0] == [v.target_speed for v in ahead[:3]]
+    assert [v.lane_index[2] for v in ahead[:3]] == lanes == [v.target_lane_index[2] for v in ahead[:3]]
+    x = np.array([v.position[0] for v in (ego, *ahead)])
+    np.testing.assert_allclose(np.diff(x)[:3] - 5.0, [7.0, 50.0, 1.0], atol=1e-9)
+    assert (np.diff(x) > 5.0).all()  # those beyond are ahead of the last one
+    assert info["scenario"]["gap"].tolist() == [7.0, 50.0, 1.0]
+    np.testing.assert_array_equal(env.reset(options={"x": info["x"]})[1]["x"], info["x"])
+
+
+def test_intersection_and_roundabout_options_are_what_the_scene_then_has() -> None:
+    env = scenario("intersection-v2")
+    env.reset(seed=1, options={"ego_gap": 40.0, "ego_speed": 6.0, "gap": 20.0, "speed": 9.0, "approach": 3})
+    ego = env.unwrapped.vehicle
+    challenger = env.unwrapped.road.vehicles[env.unwrapped.road.vehicles.index(ego) - 1]
+    for vehicle, lane, gap, speed in ((ego, "o0", 40.0, 6.0), (challenger, "o3", 20.0, 9.0)):
+        assert vehicle.lane_index[0] == lane
+        assert vehicle.speed == speed
+        assert vehicle.lane.length - vehicle.lane_offset[0] - 2.5 == pytest.approx(gap)
+    assert challenger.route[-1][1] == "o1"  # straight on
+    assert min(np.linalg.norm(v.position - ego.position) for v in others(env)) > 20.0
+
+    env = scenario("roundabout-v1")
+    env.reset(seed=1, options={"ego_gap": 8.0, "ego_speed": 5.0, "speed": [10.0, 11.0, 12.0, 13.0]})
+    assert [v.speed for v in others(env)] == [10.0, 11.0, 12.0, 13.0]
+    assert env.unwrapped.vehicle.lane.length - env.unwrapped.vehicle.lane_offset[0] - 2.5 == pytest.approx(8.0)
+
+
+@pytest.mark.parametrize("env_id", ["highway-fast-v0", "merge-v1", "roundabout-v1"])
+def test_a_scene_of_highway_env_put_back_by_its_parameters_drives_the_same(env_id: str) -> None:
+    plain, env = make_highway_env(env_id, CONFIGS[env_id]), scenario(env_id, fixed="highway_env")
+    for seed in (3, 4):
+        observation, _ = plain.reset(seed=seed)
+        given = read_back(plain, env_id)
+        if "noise" in env.space.names:
+            given["noise"] = np.uint64(seed).view(np.float64)  # the number whose bits are this seed
+        again, _ = env.reset(options=given)
+        assert set(env.space.names) == set(given)
+        np.testing.assert_allclose(again, observation, atol=1e-6)
+        for action in (1, 3, 2, 0):
+            observation, reward, terminated, truncated, _ = plain.step(action)
+            again, reward_again, *ended, _ = env.step(action)
+            np.testing.assert_allclose(again, observation, atol=1e-6)
+            assert reward_again == pytest.approx(reward, abs=1e-6)
+            assert ended == [terminated, truncated]
+            if terminated or truncated:
+                break
+
+
+@pytest.mark.parametrize("env_id", ["highway-fast-v0", "merge-v1", "roundabout-v1"])
+def test_the_base_distribution_is_the_one_from_which_highway_env_draws(env_id: str) -> None:
+    env = scenario(env_id, fixed="highway_env")
+    theirs = draws(env_id, 40)
+    x = env.space.sample(2000, np.random.default_rng(0))
+    columns = env.space.columns(x)
+    ours = np.hstack([columns[name].reshape(len(x), -1) for name in env.space.names if name != "noise"])
+    whole = {"ego_lane", "lane"}
+    names = [n for n in env.space.names if n != "noise"]
+    sizes = dict(zip(env.space.names, env.space.sizes, strict=True))
+    discrete = np.repeat([n in whole for n in names], [sizes[n] for n in names])
+    order = {n: k for k, n in enumerate(read_back_names(env_id))}
+    theirs = np.hstack([np.split(theirs, np.cumsum([sizes[n] for n in order])[:-1], axis=1)[order[n]] for n in names])
+    p = [
+        stats.ks_2samp(np.floor(ours[:, j]) if discrete[j] else ours[:, j], theirs[:, j]).pvalue
+        for j in range(ours.shape[1])
+    ]
+    assert min(p) > 1e-4
+    u = env.space.to_standard_normal(x)
+    np.testing.assert_allclose(env.space.from_standard_normal(u), x, atol=1e-8)
+
+
+def test_idm_options_are_the_vehicles_own_and_those_of_vehicles_that_come_later() -> None:
+    env = scenario("intersection-v2")
+    idm = {"time_headway": 0.7, "jam_distance": 3.0, "max_acceleration": 4.0, "comfortable_deceleration": 2.0}
+    env.unwrapped.config["spawn_probability"] = 1.0
+    env.reset(seed=0, options=idm)
+    env.step(1)
+    for vehicle in others(env):
+        assert (vehicle.TIME_WANTED, vehicle.DISTANCE_WANTED) == (0.7, 8.0)
+        assert (vehicle.COMFORT_ACC_MAX, vehicle.COMFORT_ACC_MIN) == (4.0, -2.0)
+    assert (IDMVehicle.TIME_WANTED, IDMVehicle.DISTANCE_WANTED, IDMVehicle.COMFORT_ACC_MIN) == (1.5, 10.0, -5.0)
+    assert "TIME_WANTED" not in vars(env.unwrapped.vehicle)
+
+
+def test_density_of_the_spacing_is_the_jacobian_of_its_map() -> None:
+    spacing = scenario("highway-fast-v0", vehicles=2).space.base.blocks[2]
+    x = spacing.sample(5, np.random.default_rng(1))
+    u = spacing.to_standard_normal(x)
+    steps = 1e-6 * np.eye(spacing.dim)
+    for row, point in enumerate(u):
+        jacobian = np.stack(
+            [
+                (spacing.from_standard_normal((point + h)[None]) - spacing.from_standard_normal((point - h)[None]))[0]
+                / 2e-6
+                for h in steps
+            ]
+        )
+        expected = stats.norm.logpdf(point).sum() - np.log(abs(np.linalg.det(jacobian)))
+        assert spacing.log_prob(x[row : row + 1])[0] == pytest.approx(expected, abs=1e-5)
+
+
+FAST = {"vehicles_count": 3, "duration": 4}
+
+IDLE = Always(1)
+
+
+def fast(ego: Any = IDLE, **kwargs: Any) -> rare_envs.HighwayEnvProblem:
+    return rare_envs.highway_env_problem("highway-fast-v0", ego=ego, config=FAST, vehicles=2, **kwargs)
+
+
+def body(rng: np.random.Generator) -> SimpleNamespace:
+    heading, speed = rng.uniform(-np.pi, np.pi), rng.uniform(0.0, 30.0)
+    return SimpleNamespace(
+        position=rng.uniform(-8.0, 8.0, 2),
+        heading=heading,
+        velocity=speed * np.array([np.cos(heading), np.sin(heading)]),
+        LENGTH=Vehicle.LENGTH,
+        WIDTH=Vehicle.WIDTH,
+    )
+
+
+def test_contact_time_is_that_of_the_tensor_implementation() -> None:
+    rng = np.random.default_rng(6)
+    pairs = [(body(rng), body(rng)) for _ in range(300)]
+    ours = np.array([contact_time(one, other) for one, other in pairs])
+
+    def column(values: list[Any]) -> torch.Tensor:
+        return torch.tensor(np.array(values), dtype=torch.float64)
+
+    way: NDArray[np.float64] = np.array([other.position - one.position for one, other in pairs])
+    drift: NDArray[np.float64] = np.array([other.velocity - one.velocity for one, other in pairs])
+    headings = column([one.heading for one, _ in pairs]), column([other.heading for _, other in pairs])
+    axes = axes_of(column(way[:, 0]), column(way[:, 1]), *headings)  # type: ignore[arg-type]
+    rate = project_on_axes(column(drift[:, 0]), column(drift[:, 1]), *headings)  # type: ignore[arg-type]
+    theirs = time_to_contact(axes, rate).numpy()
+    meet = ours < 10.0
+    assert 20 < meet.sum() < 280
+    np.testing.assert_allclose(ours[meet], theirs[meet], atol=1e-9)
+    assert (theirs[~meet] >= 10.0).all()
+
+
+def test_measures_by_hand() -> None:
+    env = rare_envs.HighwayEnvScenario(make_highway_env("highway-fast-v0", {**FAST, "vehicles_count": 2}), vehicles=2)
+    env.reset(options={"ego_lane": 0, "ego_speed": 30.0, "speed": [20.0, 10.0], "gap": [30.0, 2.0], "lane": [1, 0]})
+    assert HIGHWAY_ENV_MEASURES["front_ttc"](env.scene) == pytest.approx(
+        37.0 / 20.0
+    )  # the second one: 30 + 5 + 2 m ahead
+    assert HIGHWAY_ENV_MEASURES["ttc"](env.scene) == pytest.approx(37.0 / 20.0)  # the other lane's is passed by
+    env.reset(options={"ego_lane": 0, "ego_speed": 30.0, "speed": [20.0, 10.0], "gap": [30.0, 2.0], "lane": [1, 1]})
+    assert (HIGHWAY_ENV_MEASURES["front_ttc"](env.scene), HIGHWAY_ENV_MEASURES["ttc"](env.scene)) == (10.0, 10.0)
+
+
+def test_a_measure_of_ones_own() -> None:
+    problem = fast(measure=lambda env: 40.0 - env.vehicle.speed)
+    assert (problem.evaluate(problem.base.sample(1, np.random.default_rng(0))) >= 10.0 - 1e-9).all()
+    with pytest.raises(ValueError, match="gave NaN"):
+        fast(measure=lambda env: np.nan).evaluate(problem.base.sample(1, np.random.default_rng(0)))
+
+
+FEATURES = ["presence", "x", "y", "vx", "vy", "heading", "cos_h", "sin_h", "long_off", "cos_d"]
+KINDS: dict[str, tuple[str, dict[str, Any]]] = {
+    "highway": ("highway-fast-v0", {"vehicles_count": 8}),
+    "one vehicle": ("highway-fast-v0", {"vehicles_count": 1}),
+    "behind, unclipped": (
+        "highway-fast-v0",
+        {"observation": {"type": "Kinematics", "see_behind": True, "clip": False, "vehicles_count": 3}},
+    ),
+    "shuffled, as it is": (
+        "highway-fast-v0",
+        {"observation": {"type": "Kinematics", "order": "shuffled", "normalize": False, "features": FEATURES}},
+    ),
+    "merge, with its obstacle": ("merge-v1", {}),
+    "intersection": ("intersection-v2", {"initial_vehicle_count": 5}),
+    "roundabout": ("roundabout-v1", {}),
+}
+
+
+@pytest.mark.parametrize("kind", list(KINDS))
+def test_same_bits(kind: str) -> None:
+    env_id, config = KINDS[kind]
+    slow, fast = make_highway_env(env_id, config), make_highway_env(env_id, config)
+    install_fast_observation(fast.unwrapped)
+    np.testing.assert_array_equal(slow.reset(seed=3)[0], fast.reset(seed=3)[0])
+    for action in (1, 0, 2, 1):
+        one, other = slow.step(action), fast.step(action)
+        np.testing.assert_array_equal(one[0], other[0])
+        assert one[0].dtype == other[0].dtype
+        if one[2] or one[3]:
+            break
+
+
+def test_blind_egos_see_zeros() -> None:
+    env = make_highway_env("highway-fast-v0", {"vehicles_count": 2})
+    install_fast_observation(env.unwrapped, blind=True)
+    observation = env.reset(seed=0)[0]
+    assert observation.shape == (5, 5)
+    assert not observation.any()

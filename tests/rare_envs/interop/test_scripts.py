@@ -10,7 +10,6 @@ import pytest
 import agents
 import rare_envs
 from examples.highway_env_scripts import LAYOUT, train
-from training import sb3_vec_env
 
 FEW: dict[str, Any] = {
     "dqn": {"learning_starts": 4, "policy_kwargs": {"net_arch": [8]}},
@@ -18,6 +17,7 @@ FEW: dict[str, Any] = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("algo", "env_id"),
     [("dqn", "highway-fast-v0"), ("ppo", "rare_envs/CutIn-v0")],  # DQN on ours is in docs/highway_env.md
@@ -38,19 +38,3 @@ def test_the_scripts_train_policies_that_drive_here(algo: str, env_id: str, tmp_
                 action, _ = model.predict(observation, deterministic=True)
                 observation, _, done, truncated, info = env.step(action)
             assert info["measure"] == value
-
-
-def test_the_batched_simulation_trains_on_meta_actions() -> None:
-    vec_env = sb3_vec_env("rare_envs/CutIn-v0", 8, discrete=True, **LAYOUT)
-    assert vec_env.action_space == gym.spaces.Discrete(5)
-    assert vec_env.observation_space.shape == (5, 5)
-    vec_env.seed(0)
-    vec_env.reset()
-    ended = 0
-    for _ in range(12):
-        observation, reward, done, infos = vec_env.step(np.array([vec_env.action_space.sample() for _ in range(8)]))
-        ended += done.sum()
-        assert all("terminal_observation" in infos[row] for row in np.flatnonzero(done))
-    assert observation.shape == (8, 5, 5)
-    assert np.isfinite(reward).all()
-    assert ended >= 8

@@ -140,11 +140,6 @@ def test_values_are_finite_and_keep_their_dtype_anywhere(name: str, dtype: torch
             assert (f > MEASURES[name].collision).all() if name != "margin" else (f > 0).all()  # type: ignore[attr-defined]
 
 
-def test_thresholds_in_the_measures_own_unit() -> None:
-    for name, value, gamma in (("ttc", 1.5, 1.5), ("drac", 5.0, -1.6), ("btn", 1.0, 0.0), ("tet", 2.0, -1.0)):
-        assert MEASURES[name].gamma(value) == pytest.approx(gamma)  # type: ignore[attr-defined]
-
-
 class Steps(EpisodeMeasure):
     """Counts moments after the first."""
 

@@ -1,23 +1,43 @@
-"""From moments to f: what is kept of an episode, wherever it is driven, and what is refused."""
+"""Measures of whole episodes: traces, post-encroachment time, combinations, and the same value wherever it is asked."""
 
+import math
 from collections.abc import Callable
 
 import gymnasium as gym
 import numpy as np
 import pytest
 import torch
+from torch import Tensor
 
 import rare_envs
 from rare_envs.measures import (
+    PET_MAX,
+    Measure,
+    Moment,
+    Trace,
+    TraceMeasure,
     minimum,
+    pet,
     stl,
+    ttc,
+    weighted,
     with_collision,
 )
-from rare_envs.measures.registry import MEASURES
-from rare_envs.simulation.clock import Clock
-from rare_envs.simulation.measurement import Measurement
-from rare_envs.simulation.world import World
-from tests.rare_envs.measures.moments import AWAY, CLOSE, CUT_IN, FOLLOWING, HIT, problem
+from rare_envs.simulation.rollout import drive
+from rare_envs.traffic.neighbours import lead_of
+from rare_envs.traffic.road import straight
+from rare_envs.traffic.state import State
+from tests.rare_envs.measures.moments import (
+    AWAY,
+    CLOSE,
+    CUT_IN,
+    F64,
+    FOLLOWING,
+    HIT,
+    f,
+    problem,
+)
+from tests.rare_envs.traffic.slow_boxes import corners
 
 
 @pytest.mark.parametrize(
@@ -89,22 +109,113 @@ def test_same_value_alone_in_a_batch_and_in_a_problem(name: str) -> None:
         assert info["measure"] == value
 
 
-def test_min_ttc_is_one_whatever_the_measure() -> None:
-    found = []
-    for measure in ("ttc", "drac"):
-        env = gym.make(FOLLOWING, measure=measure)
-        env.reset(options=dict(zip(("ego_speed", "lead_speed", "gap"), CLOSE, strict=True)))
-        found.append([env.step(np.zeros(2, dtype=np.float32))[4]["min_ttc"] for _ in range(20)])
-    assert found[0] == found[1]
-    assert found[0][-1] == pytest.approx(8.05, abs=1e-3)
+def test_functions_of_a_moment_and_of_an_episode() -> None:
+    def gap(moment: Moment) -> Tensor:
+        return moment.lead.gap
+
+    def mean_speed(trace: Trace) -> Tensor:
+        speed, valid = trace.state.speed[:, :, 0], trace.valid
+        return (speed * valid).sum(0) / valid.sum(0)
+
+    assert f(gap, *CLOSE) == pytest.approx(0.5, abs=1e-4)
+    assert f(gap, *HIT) == -1.0
+    assert f(Measure(gap, collision=None), *HIT) == pytest.approx(0.5, abs=1e-4)  # the last moment before
+    assert f(TraceMeasure(mean_speed), *CLOSE) == pytest.approx(20.0)
+    assert f(TraceMeasure(mean_speed, critical=30.0), *CLOSE) == pytest.approx(10.0)
+    assert f(TraceMeasure(mean_speed), *HIT) == -1.0
 
 
-def test_every_measure_serves_a_world() -> None:
-    x = torch.tensor([HIT, CLOSE, AWAY])
-    for name in MEASURES:
-        world = World(problem("ttc").world.scenario, measurement=Measurement(name), clock=Clock(horizon=1.0))
-        episode = world.start(x)
-        for _ in range(world.clock.ticks):
-            episode = world.step(episode, torch.zeros(3, 2))
-        assert episode.f.shape == (3,)
-        assert torch.isfinite(episode.f).all()
+def test_a_trace_has_the_moments_of_the_drive() -> None:
+    seen: list[Trace] = []
+
+    def keep(trace: Trace) -> Tensor:
+        seen.append(trace)
+        return trace.of(ttc).amin(0)
+
+    world = problem(TraceMeasure(keep, collision=None)).world
+    x = torch.tensor([HIT, CLOSE])
+    episodes = list(drive(world, problem("ttc").driver, x))
+    values = episodes[-1].f
+    last = seen[-1]
+    assert last.state.x.shape == (101, 2, 2)
+    assert last.valid.sum(0).tolist() == [62, 101]  # contact at 6.05 s
+    assert last.collided.tolist() == [True, False]
+    for k, episode in enumerate(episodes):
+        torch.testing.assert_close(last.state.x[k, 1], episode.state.x[1], rtol=0, atol=0)
+        torch.testing.assert_close(last.of(ttc)[k, 1], ttc(Moment(*episode[:2], episode.road, None))[1], rtol=0, atol=0)
+    assert (last.state.x[62:, 0] == last.state.x[61, 0]).all()  # what came after the collision is not shown
+    assert values[1] == pytest.approx(f("ttc", *CLOSE))
+    assert last.time[-1].item() == pytest.approx(10.0)
+
+
+def trace(*paths: tuple[np.ndarray, np.ndarray, np.ndarray], dt: float = 0.1) -> Trace:
+    """One episode on a wide road: x, y and heading over time of each vehicle, the ego first."""
+    x, y, heading = (torch.from_numpy(np.stack(each, axis=1)[:, None]) for each in zip(*paths, strict=True))
+    state = State(x, y, heading, torch.zeros_like(x), torch.zeros(len(x), 1, 0, dtype=F64))
+    lead = lead_of(State(*(each[:, 0] for each in state)), straight(9))
+    valid = torch.ones(len(x), 1, dtype=torch.bool)
+    shaped = lead._replace(gap=lead.gap[:, None], closing_speed=lead.closing_speed[:, None])
+    return Trace(state, shaped, straight(9), None, valid, torch.zeros(1, dtype=torch.bool), dt)
+
+
+def line(x: float, y: float, heading: float, speed: float, dt: float = 0.1) -> tuple[np.ndarray, ...]:
+    time = np.arange(round(4.0 / dt) + 1) * dt
+    return x + speed * math.cos(heading) * time, y + speed * math.sin(heading) * time, np.full_like(time, heading)
+
+
+def inside(points: np.ndarray, x: np.ndarray, y: np.ndarray, heading: np.ndarray) -> np.ndarray:
+    dx, dy = points[..., 0] - x, points[..., 1] - y
+    along, across = dx * np.cos(heading) + dy * np.sin(heading), dy * np.cos(heading) - dx * np.sin(heading)
+    return (np.abs(along) < 2.5) & (np.abs(across) < 1.0)
+
+
+def outline(x: float, y: float, heading: float) -> np.ndarray:
+    a = corners(x, y, heading)
+    share = np.linspace(0.0, 1.0, 15)[:, None]
+    return np.concatenate([p + share * (q - p) for p, q in zip(a, np.roll(a, -1, axis=0), strict=True)])
+
+
+def test_post_encroachment_time_by_hand() -> None:
+    # in the lead's place gap / speed later, whatever the lead's speed
+    assert pet(trace(line(0.0, 0.0, 0.0, 20.0), line(17.3, 0.0, 0.0, 20.0))).item() == pytest.approx(12.3 / 20.0)
+    # the same with the ego in front, and another vehicle far away
+    behind, far = line(-17.3, 0.0, 0.0, 20.0), line(0.0, 100.0, 0.0, 20.0)
+    assert pet(trace(line(0.0, 0.0, 0.0, 20.0), behind, far)).item() == pytest.approx(12.3 / 20.0)
+    assert pet(trace(line(0.0, 0.0, 0.0, 20.0), far)).item() == PET_MAX
+    # at right angles: the other has left the ego's lane after (1 + 2.5) m / 10 m/s, the ego's front reaches it after
+    # (20 - 1 - 2.5) m / 10 m/s
+    across = line(20.0, 0.0, math.pi / 2, 10.0)
+    assert pet(trace(line(0.0, 0.0, 0.0, 10.0), across)).item() == pytest.approx(1.65 - 0.35, abs=1e-4)
+    assert pet(trace(across, line(0.0, 0.0, 0.0, 10.0))).item() == pytest.approx(1.65 - 0.35, abs=1e-4)
+
+
+def test_post_encroachment_time_is_the_least_delay_with_an_overlap() -> None:
+    """Against every pair of moments on a grid of 0.02 s, and points on the bodies' outlines."""
+    rng = np.random.default_rng(4)
+    for _ in range(8):
+        speeds, angle = rng.uniform(6.0, 12.0, 2), rng.uniform(0.3, 2.8)
+        start = (20.0 + rng.uniform(-8, 8), -15.0 * math.sin(angle) + rng.uniform(-3, 3))
+        fast = [line(0.0, 0.0, 0.0, speeds[0], 0.02), line(*start, angle, speeds[1], 0.02)]
+        bodies = [np.stack([outline(*pose) for pose in zip(*each, strict=True)]) for each in fast]
+        touch = np.zeros((len(fast[0][0]),) * 2, dtype=bool)
+        for k in range(len(touch)):
+            touch[k] = inside(bodies[1], *(each[k] for each in fast[0])).any(1)
+            touch[:, k] |= inside(bodies[0], *(each[k] for each in fast[1])).any(1)
+        ego, other = np.nonzero(touch)
+        slow = np.abs(ego - other).min() * 0.02 if len(ego) else PET_MAX
+        found = pet(trace(line(0.0, 0.0, 0.0, speeds[0]), line(*start, angle, speeds[1]))).item()
+        if slow > 0.02:
+            assert found == pytest.approx(slow, abs=0.04)
+
+
+def test_combinations() -> None:
+    x = np.array([HIT, CLOSE, AWAY, (15.0, 14.0, 13.0)])
+    of = {name: problem(name).evaluate(x) for name in ("ttc", "drac", "thw", "tet", "pet")}
+    both = problem(minimum("ttc", "drac", "pet")).evaluate(x)
+    np.testing.assert_array_equal(both, np.min([of["ttc"], of["drac"], of["pet"]], axis=0))
+    added = problem(weighted(("ttc", 0.5), ("thw", 2.0), ("tet", 1.0))).evaluate(x)
+    np.testing.assert_allclose(added, 0.5 * of["ttc"] + 2.0 * of["thw"] + of["tet"], rtol=1e-6)
+    on_top = problem(with_collision(weighted(("thw", 2.0)))).evaluate(x)
+    np.testing.assert_allclose(on_top, [-1.0, *(2.0 * of["thw"][1:])], rtol=1e-6)
+    nested = problem(minimum(weighted(("ttc", 1.0)), with_collision("drac", -7.0))).evaluate(x)
+    assert nested[0] == -7.0

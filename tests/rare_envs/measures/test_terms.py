@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from rare_envs.measures import MEASURES, Measure, MeasureTerms, Moment
+from rare_envs.measures import MEASURES, Moment
 from rare_envs.measures.registry import PAIR_CLEARANCE
 from rare_envs.measures.terms import TermMeasure, TermState, TermTracker, find_order
 from tests.rare_envs.measures.moments import moment
@@ -56,18 +56,6 @@ def test_off_the_road_a_collision_belongs_to_the_nearest_or_to_the_edge() -> Non
     hit = moment((0.0, -2.5, 0.0, 20.0), (1.0, -2.0, 0.0, 20.0))  # it is off the road, but it has hit somebody
     state = track(MEASURES["ttc_2d"], [beside((30.0, 0.0)), hit], [False, True])
     assert (state.values <= 0.0).nonzero()[:, 1].tolist() == [0]
-
-
-def test_a_collision_is_the_least_term_even_where_it_is_worth_more_than_the_moments_before() -> None:
-    kind = Measure(lambda at: at.state.x[:, 1], collision=5.0, terms=MeasureTerms(lambda at: at.state.x[:, 1:]))
-    state = track(kind, [beside((4.0, 0.0), (9.0, 0.0)), beside((1.0, 0.0), (9.0, 0.0))], [False, True])
-    assert state.values.tolist() == [[5.0, 9.0]]
-
-
-def test_terms_of_a_dangerous_quantity_are_what_is_left_to_its_critical_value() -> None:
-    speeds = MeasureTerms(lambda at: at.state.speed)
-    fast = Measure(lambda at: at.state.speed.amax(1), critical=30.0, terms=speeds)
-    assert fast.term_values(moment(EGO, (9.0, 0.0, 0.0, 25.0))).tolist() == [[10.0, 5.0]]
 
 
 def test_pairs_and_their_names() -> None:

@@ -9,9 +9,7 @@ import torch
 from torch import Tensor
 
 from rare_envs.distributions.space import Parameter
-from rare_envs.scenarios.base import columns, drive_points, keep_straight
-from rare_envs.scenarios.cut_in import CUT_IN
-from rare_envs.scenarios.highway import HIGHWAY
+from rare_envs.scenarios.base import drive_points, keep_straight
 from rare_envs.traffic.road import ReferenceLine, Road, straight
 from rare_envs.traffic.state import State
 from tests.rare_envs.scenarios.standing import STANDING
@@ -49,28 +47,12 @@ def test_a_scenario_that_contradicts_itself_is_refused(change: dict[str, Any], e
     assert expected in str(caught.value)
 
 
-def test_vehicles_without_labels_get_them_from_their_names() -> None:
-    assert CUT_IN.labels == ("the ego", "the cutter", "the lead")
-    numbered = replace(CUT_IN, vehicle_names=("ego", "vehicle_1", "slow_truck"), labels=())
-    assert numbered.labels == ("the ego", "vehicle 1", "the slow truck")
-    assert HIGHWAY.labels == ("the ego", *(f"lane {number}'s car" for number in (1, 2, 4, 5, 6)))
-
-
 def test_a_block_takes_as_many_columns_as_its_size() -> None:
     gaps = Parameter("gap", "m", 1.0, 50.0, "", size=3)
     scenario = replace(STANDING, parameters=(SPEED, gaps))
     assert scenario.size == 4
     assert scenario.column_parameters == [SPEED, gaps, gaps, gaps]
     assert (STANDING.size, STANDING.vehicles) == (2, 2)
-
-
-def test_columns_are_side_by_side_and_each_is_contiguous() -> None:
-    values = [torch.arange(4.0) + 10 * j for j in range(3)]
-    side_by_side = columns(*values)
-    assert side_by_side.shape == (4, 3)
-    for j, value in enumerate(values):
-        assert torch.equal(side_by_side[:, j], value)
-        assert side_by_side[:, j].is_contiguous()
 
 
 def traffic(rows: list[list[tuple[float, float, float, float]]]) -> State:

@@ -39,13 +39,6 @@ def test_shipped_bases_fit_their_scenario(scenario: Scenario, base: str) -> None
     np.testing.assert_allclose(back, x, atol=1e-8)
 
 
-def test_the_default_is_the_first() -> None:
-    x = load_base(FOLLOWING).sample(10, rng())
-    assert (x == load_base(FOLLOWING, next(iter(FOLLOWING.bases))).sample(10, rng())).all()
-    highway_first = replace(FOLLOWING, bases=dict(reversed(list(FOLLOWING.bases.items()))))
-    assert (load_base(highway_first).sample(10, rng()) == load_base(FOLLOWING, "highway").sample(10, rng())).all()
-
-
 def test_a_file_is_read_once_until_it_changes_and_knows_the_bases_of_its_own_scenario(tmp_path: Path) -> None:
     one, again = (load_base(FOLLOWING) for _ in range(2))
     assert isinstance(one, FittedDistribution) and isinstance(again, FittedDistribution)
@@ -87,16 +80,6 @@ def test_a_dictionary_has_the_names_and_the_box_of_its_scenario(
     np.testing.assert_allclose(base.from_standard_normal(np.zeros((1, 2)))[0], median, atol=1e-4)
 
 
-def test_a_dictionary_may_have_a_narrower_box_but_no_wider_one() -> None:
-    even = {"alpha": [1.0, 1.0], "beta": [1.0, 1.0]}
-    narrow = replace(STANDING, bases={"mine": {**even, "high": [20.0, 150.0]}})
-    assert load_base(narrow).sample(1000, rng())[:, 0].max() <= 20.0
-    for box, words in [({"low": [5.0, 1.0]}, "[1, 150] m"), ({"high": [30.0, 151.0]}, "[10, 151] m")]:
-        with pytest.raises(ValueError, match=r"^Base distribution mine gives distance the range") as caught:
-            load_base(replace(STANDING, bases={"mine": {**even, **box}}))
-        assert str(caught.value).endswith(f" the range {words}; standing allows [10, 150].")
-
-
 # --- files --------------------------------------------------------------------------------------
 
 
@@ -136,13 +119,6 @@ def test_json_that_does_not_fit(tmp_path: Path, change: dict[str, Any], message:
         load_base(FOLLOWING, path)
     assert str(path) in str(caught.value)
     assert "\n" not in str(caught.value)
-
-
-def test_json_with_the_wrong_dimension(tmp_path: Path) -> None:
-    content = {**shipped_dict(CUT_IN), "names": shipped_dict()["names"]}
-    path = write(tmp_path / "mine.json", content)
-    with pytest.raises(ValueError, match="does not fit car_following: expected 3 columns, got 7"):
-        load_base(FOLLOWING, path)
 
 
 def test_files_that_are_no_base(tmp_path: Path) -> None:
@@ -223,12 +199,6 @@ def test_a_damaged_fitted_file_is_named(tmp_path: Path, change: dict[str, Any], 
 
 
 # --- objects --------------------------------------------------------------------------------------
-
-
-def test_an_object_is_taken_as_it_is() -> None:
-    given = load_base(FOLLOWING, "highway")
-    assert load_base(FOLLOWING, given) is given
-    assert load_base(replace(FOLLOWING, bases={"mine": given})) is given
 
 
 class Draws:

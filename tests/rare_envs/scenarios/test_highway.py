@@ -9,9 +9,6 @@ from scipy import stats
 import agents
 import rare_envs
 import samplers
-from rare_envs.control.idm import IDM
-from rare_envs.distributions.beta import BetaDistribution
-from rare_envs.distributions.product import NoiseDistribution, ProductDistribution
 from rare_envs.measures import TTC_MAX, Moment, lidar_ttc
 from rare_envs.scenarios.highway import START_LANES
 from rare_envs.sensors.lidar import perceive_traffic
@@ -47,15 +44,6 @@ def test_the_ego_starts_in_the_third_lane_and_everybody_has_one():
     assert state.heading.abs().max() <= np.deg2rad(3.6)
 
 
-def test_to_standard_normal_and_back():
-    space = rare_envs.DrivingProblem(HIGHWAY, **SHORT).space
-    x = space.sample(50, np.random.default_rng(0))
-    np.testing.assert_allclose(space.from_standard_normal(space.to_standard_normal(x)), x, atol=1e-9)
-    far = space.from_standard_normal(6.0 * np.sign(space.to_standard_normal(x)))
-    space.validate(far)
-    np.testing.assert_allclose(space.to_standard_normal(far)[:, :24], 6.0 * np.sign(far[:, :24] - x[:, :24]), rtol=1e-6)
-
-
 def test_cross_entropy_finds_the_blocks():
     """24 Beta, 404 Normal in the box, and noise that stays: 428 and more dimensions."""
     from samplers.methods.blocks import announced_blocks
@@ -72,33 +60,6 @@ def test_cross_entropy_finds_the_blocks():
     method = samplers.CrossEntropy(family="blocks", n_iteration=100, max_iterations=2, n_final=100)
     result = samplers.estimate(problem, method, gamma=0.6, seed=0)
     assert result.n_sim == 300
-
-
-def test_environment_and_rollout_agree_and_x_replays():
-    problem = rare_envs.DrivingProblem(HIGHWAY, measure="lidar_ttc", **SHORT)
-    x = draw(problem, 4)
-    f = problem.evaluate(x)
-    env = gym.make(HIGHWAY, measure="lidar_ttc", **SHORT).unwrapped
-    for row in range(4):
-        env.reset(options={"x": x[row]})
-        done = False
-        while not done:
-            episode = env._episode
-            env._episode = env.world.step(episode, IDM().act(episode, None)[0])
-            env._tick += 1
-            done = bool(env._episode.collided) or env._tick == env.world.clock.ticks
-        assert float(env._episode.f) == pytest.approx(f[row], abs=1e-3)  # products round differently by batch size
-
-
-def test_named_parameters_in_and_out():
-    env = gym.make(HIGHWAY, **SHORT)
-    _, info = env.reset(seed=1, options={"speed": [12, 13, 14, 15, 16, 17]})
-    assert info["scenario"]["speed"].tolist() == [12, 13, 14, 15, 16, 17]
-    assert info["scenario"]["weights"].shape == (404,)
-    with pytest.raises(ValueError, match=r"speed\[2\] = 25.* is outside its range \[10, 20\] m/s"):
-        env.reset(options={"speed": [12, 13, 25, 15, 16, 17]})
-    with pytest.raises(ValueError, match=r"Expected speed of shape \(6,\)"):
-        env.reset(options={"speed": 12.0})
 
 
 def test_noise_and_weights_matter_and_nothing_else_is_random():
@@ -153,16 +114,6 @@ def test_drivers_are_no_egos(name):
         rare_envs.DrivingProblem(HIGHWAY, ego=agents.load_driver(name))
 
 
-def test_lidar_observation():
-    env = gym.make("rare_envs/CarFollowing-v0", observation="lidar")
-    observation, _ = env.reset(options={"x": [20.0, 15.0, 30.0]})
-    assert observation.shape == (51,)
-    ahead = 11 + 9
-    assert observation[ahead] == pytest.approx(32.5 / 100)  # from the ego's middle
-    assert observation[ahead + 20] == pytest.approx(-5.0 / 10)
-    assert env.step(env.action_space.sample())[0] in env.observation_space
-
-
 def test_lidar_ttc_on_paper():
     world = rare_envs.DrivingProblem("rare_envs/CarFollowing-v0", measure="lidar_ttc").world
     episode = world.start(torch.tensor([[20.0, 15.0, 30.0], [15.0, 20.0, 30.0]]))
@@ -200,58 +151,3 @@ def problem_with_ttc():
 def test_wrong_arguments_are_refused(kwargs, message):
     with pytest.raises(ValueError, match=message):
         gym.make(HIGHWAY, **kwargs)
-
-
-@pytest.mark.parametrize(
-    ("name", "message"),
-    [
-        (
-            "measur",
-            r"Highway-v0 takes no .* 'measur' \(did you mean 'measure'\?\); "
-            r"it takes (ego, core, chunk_size, device, )?observation,",
-        ),
-        ("speed", r"'speed' \(reset takes it as an option\)"),
-        ("wheels", r"'wheels'; it takes"),
-    ],
-)
-def test_unknown_arguments_are_named_with_the_environment(name, message):
-    for make in (gym.make, rare_envs.DrivingProblem):
-        with pytest.raises(TypeError, match=message):
-            make(HIGHWAY, **{name: 1})
-
-
-def test_beta_law_against_scipy():
-    law = BetaDistribution([2.0, 5.0], [2.0, 1.5], [80.0, -1.0], [120.0, 1.0])
-    x = law.sample(2000, np.random.default_rng(0))
-    marginals = [stats.beta(2, 2, 80, 40), stats.beta(5, 1.5, -1, 2)]
-    np.testing.assert_allclose(law.log_prob(x), sum(m.logpdf(x[:, j]) for j, m in enumerate(marginals)))
-    for j, marginal in enumerate(marginals):
-        assert stats.kstest(x[:, j], marginal.cdf).pvalue > 1e-3
-        np.testing.assert_allclose(law.to_standard_normal(x)[:, j], stats.norm.ppf(marginal.cdf(x[:, j])), atol=1e-6)
-    assert law.log_prob(np.array([[79.0, 0.0]])) == -np.inf
-    u = np.random.default_rng(1).standard_normal((1000, 2)) * 1.5
-    np.testing.assert_allclose(law.to_standard_normal(law.from_standard_normal(u)), u, atol=1e-6)
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"alpha": [0.0, 2.0]}, "positive alpha"),
-        ({"high": [80.0, 1.0]}, "low < high"),
-        ({"low": [80.0]}, "one shape"),
-    ],
-)
-def test_beta_laws_that_are_none(change, message):
-    law = {"alpha": [2.0, 2.0], "beta": [2.0, 2.0], "low": [80.0, -1.0], "high": [120.0, 1.0]}
-    with pytest.raises(ValueError, match=message):
-        BetaDistribution.from_dict({**law, **change})
-    with pytest.raises(ValueError, match="no alpha, beta"):
-        BetaDistribution.from_dict({"low": [0.0], "high": [1.0]})
-
-
-def test_product_of_blocks():
-    law = ProductDistribution((BetaDistribution([2.0], [3.0], [0.0], [1.0]), NoiseDistribution(2)))
-    x = law.sample(500, np.random.default_rng(0))
-    expected = stats.beta(2, 3).logpdf(x[:, 0]) + stats.norm.logpdf(x[:, 1:]).sum(axis=1)
-    np.testing.assert_allclose(law.log_prob(x), expected)
-    np.testing.assert_allclose(law.from_standard_normal(law.to_standard_normal(x)), x, atol=1e-9)

@@ -45,28 +45,6 @@ def test_it_is_known_everywhere(registered):
         rare_envs.make_batch("tests/Standin-v0", 2)
 
 
-@pytest.mark.parametrize(
-    "later", [("tests/Standing-v2", "tests/Standing-v10"), ("tests/Standing-v10", "tests/Standing-v2")]
-)
-def test_versions_stand_beside_each_other(registered, later):
-    """The short name means the newest; of other namespaces Gymnasium says which versions are out of date."""
-    try:
-        for env_id in later:
-            rare_envs.register_scenario(env_id, replace(STANDING, horizon=float(env_id.partition("-v")[2])))
-        for env_id in (registered, "tests/Standing-v2"):
-            with pytest.warns(DeprecationWarning, match=f"{env_id} is out of date"):
-                assert gym.make(env_id).spec.id == env_id
-        assert gym.make("tests/Standing-v10").spec.id == "tests/Standing-v10"
-        assert scenario_named("standing").horizon == 10.0
-        assert scenario_named(registered) is STANDING
-        rare_envs.register_scenario("tests/Other-v11", STANDING)
-        assert scenario_named("standing").horizon == 10.0  # a name stays with the ids that had it first
-    finally:
-        for env_id in (*later, "tests/Other-v11"):
-            SCENARIOS.remove(env_id)
-            del gym.registry[env_id]
-
-
 def test_it_passes_the_suites(registered):
     check_env(gym.make(registered).unwrapped, skip_render_check=True)
     sb3_check_env(gym.make(registered))
@@ -110,6 +88,7 @@ def test_an_id_is_taken_once():
         rare_envs.register_scenario("rare_envs/CutIn-v0", STANDING)
 
 
+@pytest.mark.slow
 def test_a_command_imports_the_module_that_registers_it(tmp_path, monkeypatch):
     """Under the id that `gym.make` takes, from the working directory; a run of it replays."""
     (tmp_path / "crests.py").write_text(

@@ -6,12 +6,10 @@ from typing import Any
 
 import pytest
 import torch
-from torch import Tensor
 
 from rare_envs.scenarios.base import Others, Scenario
 from rare_envs.scenarios.base_distributions import try_scenario
 from rare_envs.scenarios.registry import SCENARIOS
-from rare_envs.traffic.state import State
 from tests.rare_envs.scenarios.standing import STANDING, driven, initial, others
 
 
@@ -30,33 +28,6 @@ def without_a_value(function: Callable[..., Any], field: str) -> Callable[..., A
 @pytest.mark.parametrize("env_id", SCENARIOS)
 def test_the_shipped_scenarios_pass(env_id: str) -> None:
     try_scenario(SCENARIOS[env_id])
-
-
-def test_each_function_is_given_what_an_episode_would_give_it() -> None:
-    given: dict[str, Any] = {}
-
-    def start(x: Tensor) -> State:
-        given["x"] = x
-        return initial(x)
-
-    def by_script(state: State, dt: float) -> Others:
-        given["script"] = state, dt
-        return others(state, dt)
-
-    def by_drivers(state: State, action: Tensor, dt: float) -> Others:
-        given["drivers"] = state, action, dt
-        return driven(state, action, dt)
-
-    try_scenario(replace(STANDING, initial=start, others=by_script, driven=by_drivers))
-    x = given["x"]
-    assert (x.shape, x.dtype) == ((8, 2), torch.float32)
-    assert ((x >= torch.tensor([5.0, 10.0])) & (x <= torch.tensor([30.0, 150.0]))).all()
-    assert len(x.unique(dim=0)) == 8
-    state, action, dt = given["drivers"]
-    assert torch.equal(state.x, initial(x).x)
-    assert torch.equal(action, torch.zeros(8, 1, 2))
-    assert given["script"][0] is state
-    assert given["script"][1] == dt == 0.1
 
 
 GOOD_BASE = STANDING.bases["even"]

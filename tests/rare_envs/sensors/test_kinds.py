@@ -1,19 +1,27 @@
-"""Kinds of observation: how they may be written, and functions of one or several."""
+"""Kinds of observation, and HighwayEnv's kinematics."""
 
-import numpy as np
+import math
+
 import pytest
+import torch
 
-from rare_envs.sensors.kinds import OBSERVATIONS, batch_size, kinds_of, map_kinds, read_kinds
+from rare_envs.sensors.kinds import (
+    KINEMATICS_FEATURES,
+    KINEMATICS_ROWS,
+    kinds_of,
+    kinematics_space,
+    observe_kinematics,
+    read_kinds,
+)
+from rare_envs.traffic.road import straight
+from rare_envs.traffic.state import State
+from tests.rare_envs.traffic_states import ARC, traffic
 
 
 @pytest.mark.parametrize("observation", ["camera+speed", "speed+camera", ["speed", "camera"], ("camera", "speed")])
 def test_kinds_have_one_spelling(observation: object) -> None:
     assert read_kinds(observation) == "camera+speed"
     assert kinds_of(read_kinds(observation)) == ("camera", "speed")
-
-
-def test_each_kind_alone_is_itself() -> None:
-    assert [read_kinds(name) for name in OBSERVATIONS] == list(OBSERVATIONS)
 
 
 @pytest.mark.parametrize("observation", ["", "radar", "camera+", [], 3, None, ["camera", 3], "lidar+lidar"])
@@ -28,11 +36,63 @@ def test_those_of_highway_env_have_another_place(observation: object) -> None:
         read_kinds(observation)
 
 
-def test_functions_go_to_one_or_to_each() -> None:
-    one = np.arange(3.0)
-    several = {"a": one, "b": np.ones((3, 2))}
-    np.testing.assert_array_equal(map_kinds(np.add, one, one), 2 * one)
-    doubled = map_kinds(np.add, several, several)
-    assert list(doubled) == ["a", "b"]
-    np.testing.assert_array_equal(doubled["b"], np.full((3, 2), 2.0))
-    assert (batch_size(one), batch_size(several)) == (3, 3)
+EGO = (0.0, 0.0, 0.0, 20.0)
+Vehicle = tuple[float, float, float, float]
+
+
+def still(x: float, y: float = 0.0) -> Vehicle:
+    """A vehicle as fast as the ego."""
+    return x, y, 0.0, 20.0
+
+
+def places(state: State, vehicle: int = 0) -> list[float]:
+    """How far ahead [m] the observed others are, in the order of their rows."""
+    rows = observe_kinematics(state, straight(2), vehicle)[0, 1:]
+    assert not rows[rows[:, 0] == 0].any()  # who is missing is all zeros
+    return (200.0 * rows[rows[:, 0] == 1, 1]).tolist()
+
+
+def test_features_are_scaled_and_those_of_others_relative() -> None:
+    """Three lanes of 4 m; the other's velocity is 8 m/s along and 6 m/s across."""
+    other = (50.0, 8.0, math.atan2(6.0, 8.0), 10.0)
+    rows = observe_kinematics(traffic((20.0, 4.0, 0.0, 30.0), other), straight(3))[0]
+    assert KINEMATICS_FEATURES == ("presence", "x", "y", "vx", "vy")
+    assert rows[0].tolist() == pytest.approx([1.0, 20 / 200, 4 / 12, 30 / 80, 0.0])
+    assert rows[1].tolist() == pytest.approx([1.0, 30 / 200, 4 / 12, (8 - 30) / 80, 6 / 80])
+    assert not rows[2:].any()
+    assert (rows.shape, rows.dtype) == ((KINEMATICS_ROWS, 5), torch.float32)
+    assert kinematics_space().contains(rows.numpy())
+
+
+def test_what_is_out_of_scale_is_clipped() -> None:
+    rows = observe_kinematics(traffic((900.0, -9.0, 0.0, 0.0), (910.0, 9.0, 0.0, 95.0)), straight(1))[0]
+    assert rows[0].tolist() == [1.0, 1.0, -1.0, 0.0, 0.0]
+    assert rows[1].tolist() == pytest.approx([1.0, 10 / 200, 1.0, 1.0, 0.0])
+
+
+def test_vehicles_are_seen_200_m_around_and_10_m_behind() -> None:
+    for x, y, seen in [
+        (199.9, 0.0, True),
+        (200.0, 0.0, False),
+        (199.0, 19.0, True),  # 199.9 m away
+        (199.0, 21.0, False),  # 200.1 m
+        (-9.9, 4.0, True),
+        (-10.0, 4.0, False),
+        (0.0, -30.0, True),
+    ]:
+        assert len(places(traffic(EGO, still(x, y)))) == seen, (x, y)
+
+
+def test_the_nearest_four_along_the_road_come_first_and_in_the_order_of_the_state_if_level() -> None:
+    state = traffic(EGO, still(70.0), still(-5.0, 4.0), still(30.0), still(110.0), still(8.0, 4.0), still(20.0))
+    assert places(state) == pytest.approx([-5.0, 8.0, 20.0, 30.0])
+    beside = traffic(EGO, still(0.1, 40.0), still(9.0))
+    assert places(beside) == pytest.approx([0.1, 9.0])  # 40 m away, but not along the road
+    level = traffic(EGO, still(30.0, 4.0), still(6.0, 4.0), still(-6.0, -4.0), still(6.0, 0.0))
+    rows = observe_kinematics(level, straight(2))[0, 1:]
+    assert (8.0 * rows[:, 2]).tolist() == pytest.approx([4.0, -4.0, 0.0, 4.0])
+
+
+def test_on_a_curved_road_ways_and_headings_are_those_along_it() -> None:
+    state = traffic((55.0, 0.0, 0.0, 20.0), (95.0, 4.0, 0.0, 15.0))
+    assert torch.equal(observe_kinematics(state, ARC), observe_kinematics(state, straight(2)))

@@ -1,11 +1,25 @@
-"""Lidar against pencil and paper, against a slow implementation, and its gradient against finite differences."""
+"""Lidar and perception."""
 
 import math
 
 import pytest
 import torch
+from torch import Tensor
 
-from rare_envs.sensors.lidar import AHEAD_BEAM, BEAMS, MAX_RANGE, Bodies, sense
+from rare_envs.sensors.lidar import (
+    AHEAD_BEAM,
+    BEAMS,
+    FEATURES,
+    MAX_RANGE,
+    Bodies,
+    OnRoad,
+    perceive,
+    perceive_traffic,
+    sense,
+)
+from rare_envs.traffic.road import Road, straight
+from rare_envs.traffic.state import State
+from tests.rare_envs.traffic_states import ARC, RADIUS, traffic
 
 
 def bodies(*rows, dtype=torch.float64):
@@ -63,20 +77,6 @@ def test_a_car_ahead_is_seen_by_the_beam_ahead():
     assert readings.rate[0, 1, 19] == pytest.approx(-5.0)
 
 
-def test_a_beam_that_meets_nothing_reads_the_full_range_and_no_rate():
-    readings = sense(bodies((0, 0, 0, 20, 5, 2), (150, 0, 0, 15, 5, 2)))
-    assert (readings.range == MAX_RANGE).all()
-    assert (readings.rate == 0).all()
-
-
-def test_beams_turn_with_the_heading():
-    level = sense(bodies((0, 0, 0.0, 10, 5, 2), (20, 3, 0.0, 10, 5, 2)))
-    turn = 0.7
-    x, y = 20 * math.cos(turn) - 3 * math.sin(turn), 20 * math.sin(turn) + 3 * math.cos(turn)
-    turned = sense(bodies((0, 0, turn, 10, 5, 2), (x, y, turn, 10, 5, 2)))
-    torch.testing.assert_close(turned, level)
-
-
 def test_the_side_of_a_neighbour_is_seen_to_the_right_of_the_heading():
     readings = sense(bodies((0, 0, 0, 10, 5, 2), (0, 3.7, 0, 12, 5, 2)))
     right = AHEAD_BEAM + 5  # 90 degrees
@@ -117,8 +117,72 @@ def test_the_gradient_is_that_of_finite_differences():
     assert torch.autograd.gradcheck(read, inputs, eps=1e-7, atol=1e-5)
 
 
-def test_vehicles_that_are_parked_far_away_are_not_seen():
-    scene = drawn(3, 4, seed=0)
-    far = Bodies(*(torch.cat((field, field[:, :1]), dim=1) for field in scene))
-    far.x[:, -1] = -1e4
-    torch.testing.assert_close(sense(far, 4), sense(scene))
+EGO = (0.0, 0.0, 0.0, 20.0)
+
+
+def perceived(state: State, road: Road, vehicle: int = 0) -> dict[str, float]:
+    """Features of one vehicle by their names."""
+    return dict(zip(FEATURES, perceive_traffic(state, road)[0, vehicle].tolist(), strict=True))
+
+
+def test_a_vehicles_own_state_and_place_in_its_lane() -> None:
+    """Lanes from -2 to 2 and from 2 to 6 m: 4.5 m is half a metre to the right of the middle of the second."""
+    own = perceived(traffic(EGO, (70.0, 4.5, -0.1, 25.0)), straight(2), vehicle=1)
+    expected = {"lane_offset": 0.5, "heading": -0.1, "speed": 25.0, "length": 5.0, "width": 2.0, "curvature": 0.0}
+    expected |= {"left_marker": 2.5, "right_marker": 1.5}
+    assert {name: own[name] for name in expected} == pytest.approx(expected)
+
+
+@pytest.mark.parametrize(
+    ("other", "angle", "distance", "rate"),
+    [
+        ((30.0, 0.0, 0.0, 15.0), 0, 27.5, -5.0),
+        ((-30.0, 0.0, 0.0, 15.0), 180, 27.5, 5.0),  # falls back
+        ((0.0, 4.0, 0.0, 15.0), 90, 3.0, 0.0),  # positive is to the right
+        ((0.0, -4.0, -0.0, 15.0), -90, 3.0, 0.0),
+        ((0.0, -8.0, math.pi / 2, 5.0), -90, 5.5, -5.0),  # comes from the left
+    ],
+)
+def test_beams_are_named_by_their_angle(
+    other: tuple[float, float, float, float], angle: int, distance: float, rate: float
+) -> None:
+    seen = perceived(traffic(EGO, other), straight(3))
+    assert (seen[f"range_{angle}"], seen[f"rate_{angle}"]) == pytest.approx((distance, rate))
+    opposite = angle + 180 if angle <= 0 else angle - 180
+    assert (seen[f"range_{opposite}"], seen[f"rate_{opposite}"]) == (MAX_RANGE, 0.0)
+
+
+def test_on_a_bend_the_lane_is_along_the_road_and_bodies_are_in_the_world() -> None:
+    """On a circle of 250 m the rear of a lead 15 m ahead is nearer than 12.5 m along the beam, and turned by 0.06."""
+    angle = 15.0 / RADIUS
+    seen = perceived(traffic((60.0, 0.0, 0.0, 20.0), (75.0, 0.0, 0.0, 15.0)), ARC)
+    straight_on = perceived(traffic((60.0, 0.0, 0.0, 20.0), (75.0, 0.0, 0.0, 15.0)), straight(2))
+    for name in ("lane_offset", "heading", "left_marker", "right_marker"):
+        assert seen[name] == pytest.approx(straight_on[name], abs=1e-9)
+    assert seen["curvature"] == pytest.approx(1 / RADIUS)
+    assert seen["range_0"] == pytest.approx((RADIUS * math.sin(angle) - 2.5) / math.cos(angle), abs=5e-4)
+    assert seen["rate_0"] == pytest.approx(15.0 * math.cos(angle) - 20.0, abs=1e-6)
+
+
+def columns(*values: float) -> Tensor:
+    return torch.tensor([values])
+
+
+def test_bodies_have_sizes_of_their_own_and_some_may_be_seen_without_looking() -> None:
+    """A car behind a lorry of 16 m: one looks, the other is only seen."""
+    bodies = Bodies(
+        columns(0.0, 40.0),
+        columns(0.0, 0.0),
+        columns(0.0, 0.0),
+        columns(20.0, 15.0),
+        columns(4.0, 16.0),
+        columns(1.8, 2.5),
+    )
+    on_road = OnRoad(columns(0.1, 0.2), columns(0.01, 0.02), columns(1e-3, 2e-3), columns(1.9, 2.1), columns(1.7, 1.3))
+    both, first = perceive(bodies, on_road), perceive(bodies, on_road, observers=1)
+    assert both.shape == (1, 2, 51)
+    assert torch.equal(first, both[:, :1])
+    core = torch.tensor([[0.1, 0.01, 20.0, 4.0, 1.8, 1e-3, 1.9, 1.7], [0.2, 0.02, 15.0, 16.0, 2.5, 2e-3, 2.1, 1.3]])
+    torch.testing.assert_close(both[0, :, :8], core)
+    assert both[0, 0, FEATURES.index("range_0")].item() == pytest.approx(32.0)
+    assert both[0, 1, FEATURES.index("range_180")].item() == pytest.approx(38.0)

@@ -9,11 +9,9 @@ import pytest
 import torch
 
 import rare_envs
-import samplers
 from rare_envs.traffic.bodies import others_overlap
 from rare_envs.traffic.crash import (
     CRASH_KINDS,
-    Crash,
     crash_of,
     crash_of_others,
     describe_crash,
@@ -62,11 +60,6 @@ def test_flank_against_flank() -> None:
     assert tick((0.0, 0.0, 0.05, 20.0), (-1.0, 1.95, 0.0, 20.0))["vehicles"] == [0, 1]
 
 
-def test_a_corner_that_is_hit_from_behind_is_no_side_swipe() -> None:
-    # 10 cm of the widths overlap, which is less than the 1 m of the lengths; but only the lengths began to in this tick
-    assert tick((0.0, 0.0, 0.0, 30.0), (4.0, 1.9, 0.0, 18.0))["kind"] == "rear_end"
-
-
 LONGWAYS = math.pi / 2 - 0.17
 """Heading of a vehicle that crosses the road, askew, so that its axes are not the ego's."""
 
@@ -83,29 +76,6 @@ def test_vehicles_that_cross_meet_front_or_flank(other: Vehicle, kind: str, vehi
     assert (crash["kind"], crash["vehicles"]) == (kind, vehicles)
 
 
-def test_at_rest_the_way_out_is_the_shortest() -> None:
-    """Nothing moves: bodies that overlap by 10 cm of their widths and a metre of their lengths are flank to flank."""
-    assert tick((0.0, 0.0, 0.0, 0.0), (4.0, 1.9, 0.0, 0.0))["kind"] == "side"
-    assert tick((0.0, 0.0, 0.0, 0.0), (4.9, 1.0, 0.0, 0.0))["kind"] == "rear_end"
-    # who has touched all along comes before who comes in this tick
-    assert tick((0.0, 0.0, 0.0, 0.0), (-4.5, 0.0, 0.0, 30.0), (4.9, 1.0, 0.0, 0.0))["vehicles"] == [0, 2]
-
-
-def test_without_the_tick_before_speeds_and_headings_tell() -> None:
-    road = straight(1)
-    for vehicles in (
-        ((0.0, 0.0, 0.0, 30.0), (4.5, 0.8, 0.0, 20.0)),
-        ((0.0, 0.0, 0.0, 12.0), (-4.7, -0.5, 0.0, 20.0)),
-        ((0.0, 0.0, 0.0, 20.0), (1.0, 1.95, -0.05, 20.0)),
-        ((0.0, 2.1, 0.2, 15.0), (60.0, 0.0, 0.0, 20.0)),
-    ):
-        found, expected = describe_crash(crash_of(traffic(*vehicles), road)), tick(*vehicles, lanes=1)
-        assert found is not None
-        assert found.pop("kind") == expected.pop("kind")
-        for name, value in found.items():
-            assert value == pytest.approx(expected[name]), name
-
-
 def test_a_crash_of_others_is_without_the_ego() -> None:
     state = traffic((0.0, 0.0, 0.0, 20.0), (4.5, 0.0, 0.0, 10.0), (-4.5, 0.0, 0.0, 30.0))
     assert describe_crash(crash_of_others(state, straight(1))) is None
@@ -119,15 +89,6 @@ def test_the_edge_is_a_wall() -> None:
     assert (crash["kind"], crash["vehicles"], crash["impact_speed"]) == ("road_edge", [0, -1], 15.0)
     assert crash["delta_v"] == pytest.approx([across, 0.0])
     assert crash["injury_risk"] == pytest.approx([logistic(-6.9540, 0.1637, across), 0.0])
-
-
-def test_no_crash_no_description() -> None:
-    state = traffic((0.0, 0.0, 0.0, 20.0), (30.0, 0.0, 0.0, 20.0), (31.0, 1.0, 0.0, 20.0))
-    assert describe_crash(crash_of(state, straight(1))) is None
-    others = describe_crash(crash_of_others(state, straight(1)))
-    assert others is not None
-    assert (others["kind"], sorted(others["vehicles"])) == ("others", [1, 2])
-    assert others_overlap(state, straight(1)).tolist() == [True]
 
 
 def test_injury_risk_is_the_published_curve() -> None:
@@ -191,23 +152,6 @@ OTHERS_ONLY = (6.0, 30.0, 5.0, 60.0, 30.0, 2.3)
 INTO_CUTTER = (35.0, 15.0, 20.0, 60.0, 40.0, 2.3)
 
 
-def crashed(crash: Crash, row: int) -> tuple[str, list[int]]:
-    found = describe_crash(crash, row)
-    assert found is not None
-    return found["kind"], found["vehicles"]
-
-
-def test_a_problem_tells_the_kinds_of_crash() -> None:
-    problem = rare_envs.DrivingProblem(CUT_IN, ego=Coasting())
-    x = np.array([OTHERS_ONLY, INTO_CUTTER])
-    assert (problem.evaluate(x) < 0).tolist() == [False, True]
-    crashes = problem.crashes(x)
-    assert crashed(crashes, 0) == ("others", [1, 2])
-    assert crashed(crashes, 1) == ("rear_end", [0, 1])
-    assert problem.crash_kinds(x) == ["others", "rear_end"]
-    assert crashes.impact_speed[1].item() == pytest.approx(20.0, abs=0.5)
-
-
 def test_collisions_between_others_count_if_asked_for() -> None:
     x = np.array([OTHERS_ONLY, INTO_CUTTER])
     assert (rare_envs.DrivingProblem(CUT_IN, ego=Coasting(), collisions="any").evaluate(x) == -1).all()
@@ -252,17 +196,3 @@ def test_info_says_the_same_alone_in_a_batch_and_in_a_problem() -> None:
             if terminated or truncated:
                 break
         assert info["crash"] == expected[row]
-
-
-@pytest.mark.parametrize("method", ["mc", "adss"])
-def test_shares_of_the_kinds_add_up_to_p(method: str) -> None:
-    problem = rare_envs.DrivingProblem("rare_envs/CarFollowing-v0", ego=Coasting())
-    result = samplers.estimate(problem, method, gamma=1.0, seed=0, max_sim=3000)
-    kinds = result.shares(problem.crash_kinds)
-    assert {"rear_end", "none"} == set(kinds)  # not every time to collision under 1 s ends in a collision
-    assert sum(share.p for share in kinds.values()) == pytest.approx(result.p, rel=1e-12)
-    hits = samplers.estimate(problem, method, gamma=0.0, seed=0, max_sim=3000)
-    low, high = hits.interval
-    assert kinds["rear_end"].p == pytest.approx(hits.p, rel=0.2)
-    assert set(hits.shares(problem.crash_kinds)) == {"rear_end"}
-    assert low < kinds["rear_end"].p < high

@@ -4,10 +4,8 @@ import copy
 import pickle
 
 import torch
-from highway_env.road.lane import AbstractLane
-from highway_env.vehicle.kinematics import Vehicle
 
-from rare_envs.traffic.state import LANE_WIDTH, VEHICLE_LENGTH, VEHICLE_WIDTH, State
+from rare_envs.traffic.state import State
 
 
 def numbered(vehicles: int) -> State:
@@ -15,11 +13,6 @@ def numbered(vehicles: int) -> State:
     own = torch.arange(vehicles)
     fields = [100 * field + torch.stack((own, 1000 + own)) for field in range(1, 5)]
     return State(*fields, theta=torch.tensor([[7.0], [8.0]]))
-
-
-def test_sizes_are_highway_envs() -> None:
-    assert (VEHICLE_LENGTH, VEHICLE_WIDTH) == (Vehicle.LENGTH, Vehicle.WIDTH)
-    assert LANE_WIDTH == AbstractLane.DEFAULT_WIDTH
 
 
 def test_another_vehicle_takes_the_place_of_the_ego_and_the_rest_keep_their_order() -> None:
@@ -30,12 +23,6 @@ def test_another_vehicle_takes_the_place_of_the_ego_and_the_rest_keep_their_orde
             assert (field % 100).tolist() == [order, order]
             assert torch.equal(field - field % 100, before - before % 100)  # no mixture of fields or scenarios
         assert seen.theta is state.theta
-
-
-def test_the_second_vehicle_and_the_ego_change_places_and_back() -> None:
-    state = numbered(3)
-    assert all(map(torch.equal, state.seen_by(1).seen_by(1), state))
-    assert state.seen_by(0) is state
 
 
 def test_vehicles_and_fields_are_the_same_numbers_however_the_state_was_made() -> None:
@@ -56,13 +43,6 @@ def test_a_changed_or_copied_state_has_its_own_vehicles() -> None:
     copied.x.zero_()
     assert copied.vehicles[1].x.eq(0).all()
     assert state.vehicles[1].x.ne(0).all()
-
-
-def test_what_is_differentiated_goes_through_vehicles_and_fields_alike() -> None:
-    x = torch.ones(2, requires_grad=True)
-    state = State.of_vehicles([(x, 2 * x, x, x)], x[:, None])
-    (slope,) = torch.autograd.grad((state.y[:, 0] + state.vehicles[0].y).sum(), x)
-    assert slope.tolist() == [4.0, 4.0]
 
 
 def test_pickled_as_its_fields_alone() -> None:

@@ -5,11 +5,10 @@ from collections.abc import Callable
 
 import pytest
 import torch
-from highway_env.utils import not_zero
 from torch import Tensor
 
-from rare_envs.traffic.vehicle_models import NEAR_ZERO, STEERING_LIMIT, bicycle, point_mass, steering_for
-from tests.rare_envs.traffic_states import F64, tensor
+from rare_envs.traffic.vehicle_models import STEERING_LIMIT, bicycle, point_mass, steering_for
+from tests.rare_envs.traffic_states import tensor
 
 
 def test_bicycle_straight_line_is_uniform_acceleration() -> None:
@@ -51,12 +50,6 @@ def test_straight_on_is_the_same_bits_beside_vehicles_that_turn_and_alone() -> N
     assert alone[2][-1] != beside[2][-1]
 
 
-def test_bicycle_gradient() -> None:
-    inputs = [torch.rand(4, dtype=F64, requires_grad=True) for _ in range(6)]
-    inputs[3] = (inputs[3] + 5).detach().requires_grad_()
-    assert torch.autograd.gradcheck(lambda *a: bicycle(*a, 0.1), inputs)
-
-
 def test_steering_for_a_yaw_rate_is_how_the_bicycle_turns_at_it() -> None:
     speed, rate = tensor(0.02, 3.0, 20.0, 20.0), tensor(0.004, -0.5, 0.3, 0.0)
     zero = torch.zeros_like(speed)
@@ -65,10 +58,6 @@ def test_steering_for_a_yaw_rate_is_how_the_bicycle_turns_at_it() -> None:
     # whoever is too slow for it, a vehicle at rest for one, steers as far as it goes
     largest = steering_for(tensor(0.5, -0.5, 0.5), tensor(1.0, 0.0, 0.0))
     torch.testing.assert_close(largest, STEERING_LIMIT * tensor(1.0, -1.0, 1.0))
-
-
-def test_nothing_is_divided_by_less_than_in_highway_env() -> None:
-    assert NEAR_ZERO == not_zero(0.0)
 
 
 def test_a_point_mass_turns_at_its_yaw_rate() -> None:

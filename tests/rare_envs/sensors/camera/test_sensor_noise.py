@@ -49,12 +49,6 @@ def test_equal_to_the_hash_in_plain_integers(tick: int, viewer: int) -> None:
             assert row[place].item() == pytest.approx(slow_noise(key, tick, viewer, place), abs=1e-6)
 
 
-def test_a_camera_that_is_alone_or_has_fewer_pixels_has_the_same_noise() -> None:
-    together = draw_pixel_noise(cameras(*KEYS), 500)
-    for row, key in zip(together, KEYS, strict=True):
-        assert torch.equal(draw_pixel_noise(cameras(key), 100)[0], row[:100])
-
-
 def test_values_are_distributed_as_the_sum_of_four_bytes() -> None:
     """The exact distribution by convolution, the ends of which lie 3.45 standard deviations away."""
     exact = np.ones(1)

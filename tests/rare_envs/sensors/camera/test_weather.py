@@ -33,8 +33,6 @@ from rare_envs.traffic.state import State
 
 CUT_IN, HIGHWAY = "rare_envs/CutIn-v0", "rare_envs/Highway-v0"
 DISTRIBUTIONS = [FOG_DISTRIBUTION, SUN_DISTRIBUTION, SENSOR_NOISE_DISTRIBUTION]
-VISIBILITY = 2.996
-"""Visibility times extinction coefficient: 5 % of the contrast is left (WMO's meteorological optical range)."""
 
 
 def shots(**sky: Any) -> Tensor:
@@ -81,27 +79,6 @@ def test_distributions_and_their_maps(distribution: Any) -> None:
     np.testing.assert_allclose(distribution.log_prob(x)[inner], expected[inner], atol=1e-3)
 
 
-def test_fog_is_as_frequent_as_said() -> None:
-    extinction = VISIBILITY / np.array([[16_000.0], [1_000.0]])
-    above = stats.norm.sf(FOG_DISTRIBUTION.to_standard_normal(extinction)[:, 0])
-    np.testing.assert_allclose(above, [0.5, 0.01], rtol=0.1)
-
-
-def test_sun_elevations_are_those_of_a_year_of_days() -> None:
-    """From the Sun's declination and hour angle at 37.84 degrees north (Emeryville), above 5 degrees."""
-    day, hour = np.meshgrid(np.arange(365), np.linspace(-180, 180, 720))
-    declination = np.radians(-23.44 * np.cos(2 * np.pi * (day + 10) / 365))
-    latitude = np.radians(37.84)
-    sine = np.sin(latitude) * np.sin(declination)
-    sine = sine + np.cos(latitude) * np.cos(declination) * np.cos(np.radians(hour))
-    elevation = np.degrees(np.arcsin(sine))
-    elevation = elevation[elevation > 5.0]
-    levels = np.array([0.1, 0.25, 0.5, 0.75, 0.9])
-    found = SUN_DISTRIBUTION.from_standard_normal(np.column_stack((stats.norm.ppf(levels), np.zeros(5))))
-    np.testing.assert_allclose(found[:, 0], np.quantile(elevation, levels), atol=1.5)
-    assert elevation.max() < CONDITIONS[1].high
-
-
 def test_a_search_by_blocks_moves_the_weather() -> None:
     """Cross-entropy in physical space finds fog and low sun; p is known."""
 
@@ -118,16 +95,6 @@ def test_a_search_by_blocks_moves_the_weather() -> None:
     assert result.p == pytest.approx(stats.norm.sf(3.5), rel=4 * result.cov)
     assert result.cov < 0.15
     assert result.interval[0] < stats.norm.sf(3.5) < result.interval[1]
-
-
-@pytest.mark.parametrize(
-    ("noise", "names"), [(True, ["sensor_noise", "camera_noise"]), ("fixed", ["sensor_noise"]), (False, [])]
-)
-def test_weather_joins_x_behind_the_scenario(noise: bool | str, names: list[str]) -> None:
-    problem = rare_envs.DrivingProblem(CUT_IN, weather=True, noise=noise)
-    own = rare_envs.DrivingProblem(CUT_IN).space.names
-    assert problem.space.names == (*own, *(p.name for p in CONDITIONS), *names)
-    assert ("fixed pattern" in problem.given) == (noise == "fixed")
 
 
 def test_on_the_highway_weather_stands_before_the_drivers_and_all_noise_behind() -> None:

@@ -1,3 +1,5 @@
+"""Bodies of vehicles: overlap, distance, time to contact, pairs."""
+
 import math
 
 import numpy as np
@@ -10,12 +12,18 @@ from rare_envs.traffic.bodies import (
     axes_of,
     box_distance,
     boxes_overlap,
+    ego_overlaps,
+    encounter,
+    others_overlap,
+    pairwise_overlaps,
     project_on_axes,
     separation,
     time_to_contact,
 )
+from rare_envs.traffic.road import ReferenceLine, Road, i80, straight
+from rare_envs.traffic.state import State
 from tests.rare_envs.traffic.slow_boxes import corners, nearest, overlap
-from tests.rare_envs.traffic_states import F64, tensor
+from tests.rare_envs.traffic_states import ARC, F64, RADIUS, tensor, traffic
 
 
 def tensors(values: np.ndarray) -> tuple[Tensor, ...]:
@@ -38,21 +46,6 @@ def scenes() -> np.ndarray:
 def bodies(scene: np.ndarray, time: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
     dx, dy, heading, other, vx, vy = scene
     return corners(0.0, 0.0, heading), corners(dx + vx * time, dy + vy * time, other)
-
-
-@pytest.mark.parametrize(
-    ("place", "gap"),
-    [
-        ((8.0, 0.0, 0.0, 0.0), 3.0),  # bumper to bumper
-        ((0.0, 3.5, 0.0, math.pi), 1.5),  # flank to flank
-        ((8.0, 6.0, 0.0, 0.0), 5.0),  # corner to corner: 3 m and 4 m
-        ((8.0, 0.0, 0.0, math.pi / 2), 4.5),  # broadside
-        ((4.0, 0.0, 0.0, 0.0), -1.0),  # 1 m deep lengthwise, 2 m sideways
-        ((0.0, 0.0, 0.0, math.pi / 2), -3.5),  # a cross, in which no corner lies inside
-    ],
-)
-def test_clearance_by_hand(place: tuple[float, ...], gap: float) -> None:
-    assert box_distance(axes(*place), torch.tensor(place[3] - place[2], dtype=F64)).item() == pytest.approx(gap)
 
 
 def test_clearance_is_the_distance_of_the_nearest_corner_and_side(scenes: np.ndarray) -> None:
@@ -119,25 +112,6 @@ def separation_at(scene: np.ndarray, time: float) -> float:
     return nearest(*bodies(scene, time))[0]
 
 
-def test_gradients_are_those_of_finite_differences(scenes: np.ndarray) -> None:
-    dx, dy, heading, other, vx, vy = (values.requires_grad_() for values in tensors(scenes[:25]))
-
-    def apart(*values: Tensor) -> Tensor:
-        return box_distance(axes_of(*values), values[3] - values[2])
-
-    assert torch.autograd.gradcheck(apart, (dx, dy, heading, other))
-    with torch.no_grad():
-        times = time_to_contact(axes_of(dx, dy, heading, other), project_on_axes(vx, vy, heading, other))
-    meeting = torch.isfinite(times) & (times > 0.01)
-    inputs = tuple(v.detach()[meeting].requires_grad_() for v in (dx, dy, heading, other, vx, vy))
-
-    def meet(*values: Tensor) -> Tensor:
-        return time_to_contact(axes_of(*values[:4]), project_on_axes(*values[4:], values[2], values[3]))
-
-    assert len(inputs[0]) > 5
-    assert torch.autograd.gradcheck(meet, inputs)
-
-
 @pytest.mark.parametrize(
     ("dx", "dy", "turn", "overlap"),
     [
@@ -176,9 +150,63 @@ def test_overlap_is_a_negative_separation() -> None:
         assert 0.1 < overlapping.double().mean() < 0.5
 
 
-def test_boxes_may_have_sizes_of_their_own() -> None:
-    """A lorry of 16 m and a motorcycle of 2 m: apart from 9 m on along, from 1.75 m on across."""
-    zero, lorry, motorcycle = tensor(0.0), (16.0, 2.5), (2.0, 1.0)
-    for dx, dy, overlapping in ((8.99, 0.0, True), (9.01, 0.0, False), (0.0, 1.74, True), (0.0, 1.76, False)):
-        assert boxes_overlap(tensor(dx), tensor(dy), zero, zero, lorry, motorcycle).item() is overlapping
-        assert boxes_overlap(tensor(-dx), tensor(-dy), zero, zero, motorcycle, lorry).item() is overlapping
+def test_contacts_of_all_pairs_are_those_of_each_vehicle_as_ego() -> None:
+    rng = np.random.default_rng(0)
+    fields = [rng.uniform(low, high, (500, 6)) for low, high in ((0, 25), (0, 12), (-0.5, 0.5), (0, 20))]
+    state = State(*map(torch.from_numpy, fields), theta=torch.zeros(500, 0))
+    road = i80()
+    both = pairwise_overlaps(state, road)
+    assert torch.equal(both, both.mT)
+    assert not both.diagonal(dim1=1, dim2=2).any()
+    assert 0.05 < both.double().mean() < 0.5
+    assert torch.equal(both[:, 0, 1:], ego_overlaps(state, road))
+    for vehicle in range(1, 6):
+        others = [j for j in range(6) if j != vehicle]
+        expected = ego_overlaps(state.seen_by(vehicle), road)
+        assert torch.equal(both[:, vehicle][:, others], expected)
+
+
+def test_others_overlap_where_their_bodies_overlap() -> None:
+    rng, batch = np.random.default_rng(4), 300
+    x, y = rng.uniform(-8.0, 8.0, (batch, 4)), rng.uniform(10.0, 18.0, (batch, 4))
+    heading = rng.uniform(-0.6, 0.6, (batch, 4))
+    state = State(*(torch.from_numpy(each) for each in (x, y, heading, np.ones((batch, 4)), x[:, :0])))
+    bodies = [[corners(*pose) for pose in zip(*row, strict=True)] for row in zip(x, y, heading, strict=True)]
+    expected = [any(overlap(row[i], row[j]) for i, j in ((1, 2), (1, 3), (2, 3))) for row in bodies]
+    assert others_overlap(state, straight(9)).tolist() == expected
+    assert 60 < sum(expected) < 240
+
+
+def test_bodies_overlap_in_the_world_not_along_the_road() -> None:
+    """Where 5 m of the road's line are 5 (1 - k y) m at y."""
+    road = Road((-30.0, 0.0, 30.0), ReferenceLine(50.0, (0.0, 0.004, 0.004, 0.0)))
+    for y, other_x, touch in [(20.0, 5.3, True), (20.0, 5.5, False), (-20.0, 4.7, False), (-20.0, 4.55, True)]:
+        assert ego_overlaps(traffic((75.0, y, 0.0, 0.0), (75.0 + other_x, y, 0.0, 0.0)), road).item() is touch
+    state = traffic((75.0, 20.0, 0.0, 0.0), (75.0, 21.9, 0.0, 0.0))
+    assert ego_overlaps(state, road).item() is True
+    assert ego_overlaps(state._replace(y=torch.tensor([[20.0, 22.1]], dtype=F64)), road).item() is False
+
+
+def test_a_vehicle_that_crosses_in_front_of_the_ego() -> None:
+    """20 m ahead and 3 m to the right, going to the right at 5 m/s: its axes are the ego's, turned by 90 degrees."""
+    far_behind = (-50.0, 0.0, 0.0, 20.0)
+    met = encounter(traffic((0.0, 0.0, 0.0, 20.0), (20.0, 3.0, math.pi / 2, 5.0), far_behind), straight(2))
+    torch.testing.assert_close(met.axes.offset[0], torch.stack((tensor(20, 3, 3, -20), tensor(-50, 0, -50, 0))))
+    torch.testing.assert_close(met.axes.reach[0], torch.stack((tensor(3.5, 3.5, 3.5, 3.5), tensor(5, 2, 5, 2))))
+    torch.testing.assert_close(met.rate[0], torch.stack((tensor(-20, 5, 5, 20), tensor(0, 0, 0, 0))))
+    torch.testing.assert_close(met.turn[0], tensor(math.pi / 2, 0.0))
+
+
+def test_vehicles_on_a_bend_meet_along_the_chord() -> None:
+    """Both on a circle of radius R - y, their headings an angle of ds / R apart, however long the way between them."""
+    y, ahead, speed, lead_speed = 4.0, 40.0, 20.0, 15.0
+    met = encounter(traffic((55.0, y, 0.0, speed), (55.0 + ahead, y, 0.0, lead_speed)), ARC)
+    angle, radius = ahead / RADIUS, RADIUS - y
+    along, across = radius * math.sin(angle), radius * (1.0 - math.cos(angle))
+    other = along, -across  # as seen from the lead, which has turned by the angle
+    assert met.axes.offset[0, 0].tolist() == pytest.approx([along, across, *other], abs=5e-4)
+    assert math.hypot(along, across) == pytest.approx(2.0 * radius * math.sin(angle / 2))
+    rates = [lead_speed * math.cos(angle) - speed, lead_speed * math.sin(angle)]
+    rates += [lead_speed - speed * math.cos(angle), speed * math.sin(angle)]
+    assert met.rate[0, 0].tolist() == pytest.approx(rates, abs=1e-6)
+    assert met.turn.item() == pytest.approx(angle, abs=1e-12)

@@ -1,28 +1,100 @@
-"""Layers of SB3's policies queried alone give the actions of `predict`, and everything else is left to it."""
+"""Dense policies of Stable-Baselines3: read from models, and queried layer by layer."""
+
+import functools
 
 import gymnasium as gym
 import numpy as np
 import pytest
 import torch
-from stable_baselines3 import A2C, DQN, PPO
+from stable_baselines3 import A2C, DQN, PPO, SAC
 from stable_baselines3.common.vec_env import VecNormalize
 
+import agents
 import rare_envs
 import training
-from rare_envs.egos.dense_policies import DenseInference, find_inference
+from rare_envs.egos.dense_policies import DenseInference, find_inference, read_dense_policy
 from rare_envs.egos.wrappers import NormalisedPolicy, RescaledPolicy, wrap_policy
+
+CAR_FOLLOWING = "rare_envs/CarFollowing-v0"
+
+
+class Careful(PPO):
+    """A PPO that brakes whatever its network says."""
+
+    def predict(self, observation, state=None, episode_start=None, deterministic=False):
+        action, state = super().predict(observation, state, episode_start, deterministic)
+        return np.full_like(action, -1.0), state
+
+
+@functools.cache
+def make(algorithm=PPO, **policy_kwargs):
+    return algorithm("MlpPolicy", gym.make(CAR_FOLLOWING), device="cpu", seed=0, policy_kwargs=policy_kwargs or None)
+
+
+def hooked():
+    model = PPO("MlpPolicy", gym.make(CAR_FOLLOWING), device="cpu")
+    model.policy.action_net.register_forward_hook(lambda *_: None)
+    return model
+
+
+def replaced():
+    model = PPO("MlpPolicy", gym.make(CAR_FOLLOWING), device="cpu")
+    model.predict = lambda *_, **__: None
+    return model
+
+
+@pytest.mark.parametrize(
+    ("ego", "reason"),
+    [
+        (lambda: make(Careful), "a Careful"),
+        (lambda: make(SAC), "a SAC"),
+        (lambda: make(activation_fn=torch.nn.ELU), "the layers Linear, ELU"),
+        (lambda: make(net_arch=(256, 256)), "256 units"),
+        (lambda: make(features_extractor_class=type("Own", (_flatten(),), {})), "other parts than dense layers"),
+        (hooked, "a Linear that was changed"),
+        (replaced, "a PPO that was changed"),
+    ],
+)
+def test_other_policies_are_simulated_by_torch(ego, reason):
+    model = ego()
+    assert rare_envs.DrivingProblem(CAR_FOLLOWING, ego=model).core == "torch"
+    with pytest.raises(ValueError, match=f"core='numba' cannot simulate this: .*{reason}"):
+        rare_envs.DrivingProblem(CAR_FOLLOWING, ego=model, core="numba")
+
+
+def _flatten():
+    from stable_baselines3.common.torch_layers import FlattenExtractor
+
+    return FlattenExtractor
+
+
+@pytest.mark.slow
+def test_a_saved_policy_is_read(tmp_path):
+    make().save(tmp_path / "ego.zip")
+    saved = agents.load_ego(tmp_path / "ego.zip")
+    assert rare_envs.DrivingProblem(CAR_FOLLOWING, ego=saved).core == "numba"
+    for one, other in zip(read_dense_policy(saved).layers, read_dense_policy(make().policy).layers, strict=True):
+        assert np.array_equal(one[0], other[0]) and np.array_equal(one[1], other[1])
+
+
+def test_what_is_read_of_an_algorithm():
+    policy = read_dense_policy(make(A2C, net_arch=(32,), activation_fn=torch.nn.ReLU))
+    assert policy.activation == "relu" and not policy.chooses and policy.normalisation is None
+    assert [weight.shape for weight, _ in policy.layers] == [(32, 7), (2, 32)]
+    assert policy.clip is not None and policy.clip[0].tolist() == [-1.0, -1.0]
+
 
 CUT_IN = "rare_envs/CutIn-v0"
 
 
-def make(algorithm=PPO, **policy_kwargs):
+def make_cut_in(algorithm=PPO, **policy_kwargs):
     return algorithm("MlpPolicy", gym.make(CUT_IN), device="cpu", seed=0, policy_kwargs=policy_kwargs or None)
 
 
 @pytest.mark.parametrize("size", [1, 7, 25, 1000, 4096])
 @pytest.mark.parametrize("net_arch", [[64, 64], [256, 128, 32], []])
 def test_actions_between_rectifiers_are_those_of_predict_to_the_last_bit(net_arch, size):
-    model = make(A2C, activation_fn=torch.nn.ReLU, net_arch=net_arch)
+    model = make_cut_in(A2C, activation_fn=torch.nn.ReLU, net_arch=net_arch)
     seen = np.random.default_rng(1).uniform(-5, 5, (size, 11)).astype(np.float32)
     found = find_inference(model)
     assert isinstance(found, DenseInference)
@@ -32,7 +104,7 @@ def test_actions_between_rectifiers_are_those_of_predict_to_the_last_bit(net_arc
 @pytest.mark.parametrize("gain", [0.3, 1.0, 5.0])
 @pytest.mark.parametrize("net_arch", [[64, 64], [256, 128, 32], [16], []])
 def test_actions_between_tangents_are_as_near_to_exact_ones_as_those_of_predict(net_arch, gain):
-    model = make(net_arch=net_arch)
+    model = make_cut_in(net_arch=net_arch)
     with torch.no_grad():
         for weights in model.policy.parameters():  # from nearly linear units to nearly all at their bounds
             weights.copy_(gain * torch.randn(weights.shape, generator=torch.Generator().manual_seed(weights.numel())))
@@ -49,14 +121,6 @@ def test_actions_between_tangents_are_as_near_to_exact_ones_as_those_of_predict(
     ours, theirs = (np.abs(actions - exact).mean() for actions in (found.predict(seen)[0], single))
     assert np.mean(exact == means.numpy()) > 0.3
     assert ours < 1.5 * theirs + 2**-24  # a unit near 0 has the rounding of a number near 1/2
-
-
-def test_observations_may_stand_in_memory_backwards_or_apart():
-    model = make()
-    seen = np.random.default_rng(1).uniform(-5, 5, (8, 22)).astype(np.float32)[::-1, ::-2]
-    assert min(seen.strides) < 0
-    found = find_inference(model).predict(seen)[0]
-    np.testing.assert_array_equal(found, find_inference(model).predict(seen.copy())[0])
 
 
 def test_wrappers_stay_around_the_layers():
@@ -76,20 +140,12 @@ def test_other_policies_are_asked_by_predict():
         """A PPO that may predict in another way."""
 
     chooses = DQN("MlpPolicy", gym.make(CUT_IN, action="discrete"), device="cpu", buffer_size=10)
-    for policy in (chooses, make(Own), make(activation_fn=torch.nn.ELU), object()):
+    for policy in (chooses, make_cut_in(Own), make_cut_in(activation_fn=torch.nn.ELU), object()):
         assert find_inference(policy) is policy
 
 
-def test_a_network_without_finite_outputs_fails_as_predict_does():
-    model = make()
-    with torch.no_grad():
-        model.policy.action_net.bias[0] = torch.nan
-    with pytest.raises(ValueError, match="invalid values"):
-        find_inference(model).predict(np.random.default_rng(1).normal(size=(3, 11)).astype(np.float32))
-
-
 def test_rollouts_are_those_of_predict_and_weights_are_read_for_each(monkeypatch):
-    model = make()
+    model = make_cut_in()
     problem = rare_envs.DrivingProblem(CUT_IN, ego=model, core="torch", horizon=3.0)
     x = problem.base.sample(40, np.random.default_rng(0))
     first = problem.evaluate(x)

@@ -1,4 +1,4 @@
-"""Vehicles by hand: projected points, rectangles of candidates, lit faces and shadows on the ground."""
+"""What a camera sees, by pencil and paper: lane lines and shadows, sides and windows."""
 
 import math
 
@@ -7,26 +7,123 @@ import torch
 from torch import Tensor
 
 from rare_envs.sensors.camera import Camera
-from rare_envs.sensors.camera.context import pixels
+from rare_envs.sensors.camera.context import Pixels, pixels
 from rare_envs.sensors.camera.surfaces import (
-    AIR,
     BODY_HEIGHT,
+    DASH,
     DIFFUSE,
     DIRECT,
     GLASS,
+    LINE_WIDTH,
     PAINT,
+    PERIOD,
     WINDOWS,
     Boxes,
+    Cover,
     Light,
+    Lines,
+    View,
     cast_shadows,
+    cover_of,
     draw_boxes,
     find_candidates,
     light_of,
-    project_points,
+    road_lines,
 )
-from tests.rare_envs.sensors.camera.scenes import weather
+from rare_envs.traffic.road import Road, i80, straight
+from tests.rare_envs.sensors.camera.scenes import SHARPEST, weather
 
 CPU = torch.device("cpu")
+
+
+def coordinates(lines: Lines, seen: Pixels) -> tuple[Tensor, Tensor]:
+    """s and t of every ground pixel, shapes (T, R, W)."""
+    s, t = (one + (linear + square * seen.right) * seen.right for one, linear, square in (lines.s, lines.t))
+    return s, t
+
+
+def periodic(way: Tensor) -> Tensor:
+    """Ways along the road less whole periods of dashes, within half a period of 0."""
+    return (way + PERIOD / 2).remainder(PERIOD) - PERIOD / 2
+
+
+def footprints(s: float, t: float, length: float, width: float, turn: float = 0.0, aside: float = 0.0) -> Cover:
+    """What covers one pixel, so long in the camera's heading and so wide across, of a road with edges at -2, 2, 6.
+
+    `aside` is how far to the right of it the pixel above lies.
+    """
+    single, none = torch.ones(1, 1), torch.zeros(1, 1)
+    place = [(torch.full((1, 1, 1), value), none[None], none[None]) for value in (s, t)]
+    across = torch.full((1, 1, 1), math.cos(turn))
+    lines = Lines(place[0], (place[1][0], across, none[None]), torch.full((1, 1, 1), math.sin(turn)))
+    seen = Pixels(none, none, 0, none, none, single, -length * single, -aside * single, width * single)
+    return cover_of(lines, straight(2), seen)
+
+
+def shares(cover: Cover) -> list[float]:
+    return [part.item() for part in cover]
+
+
+@pytest.mark.parametrize(("road", "within"), [(i80(), 0.002), (SHARPEST, 0.05)], ids=["i80", "sharpest"])
+def test_road_coordinates_of_ground_pixels_are_those_of_the_road(road: Road, within: float) -> None:
+    seen = pixels(Camera(), CPU)
+    s = torch.linspace(10.0, 700.0, 24, dtype=torch.float64)
+    order = torch.randperm(24, generator=torch.Generator().manual_seed(0))
+    t = torch.linspace(road.edges[0], road.edges[-1], 24, dtype=torch.float64)[order]
+    x, y, heading = road.to_world(s, t, torch.linspace(-0.1, 0.1, 24, dtype=torch.float64))
+    found_s, found_t = coordinates(road_lines(View(x, y, heading), road, seen), seen)
+    cos, sin = torch.cos(heading)[:, None, None], torch.sin(heading)[:, None, None]
+    forward, right = seen.forward.double(), seen.right.double()
+    exact_s, exact_t, _ = road.from_world(
+        x[:, None, None] + forward * cos - right * sin,
+        y[:, None, None] + forward * sin + right * cos,
+        torch.zeros(()),
+    )
+    near = (forward < 60.0) & (exact_t > road.edges[0] - 2.0) & (exact_t < road.edges[-1] + 2.0)
+    assert float((found_t - exact_t).abs()[near].max()) < within
+    assert float(periodic(found_s - exact_s).abs()[near].max()) < within
+
+
+@pytest.mark.parametrize(
+    ("t", "width", "road", "white", "yellow"),
+    [
+        (0.0, 0.1, 1.0, 0.0, 0.0),  # the middle of a lane
+        (-3.0, 0.1, 0.0, 0.0, 0.0),  # off the road
+        (-2.0, 0.1, 1.0, 0.0, 1.0),  # on the left line, which is wider than the pixel
+        (6.0, 0.1, 1.0, 1.0, 0.0),  # on the right one
+        (-2.0 + LINE_WIDTH / 2, 0.1, 1.0, 0.0, 0.5),  # on the line's inner edge
+        (-2.0 - LINE_WIDTH / 2, 0.1, 0.5, 0.0, 0.5),  # on its outer edge, which is the road's
+        (-2.0, 0.6, (0.3 + LINE_WIDTH / 2) / 0.6, 0.0, LINE_WIDTH / 0.6),  # much wider than the line
+        (2.0, 20.0, (8.0 + LINE_WIDTH) / 20.0, LINE_WIDTH / 20.0, LINE_WIDTH / 20.0),  # wider than the road
+    ],
+)
+def test_a_line_covers_its_part_of_the_pixels_width(
+    t: float, width: float, road: float, white: float, yellow: float
+) -> None:
+    in_a_gap = (DASH + PERIOD) / 2
+    cover = footprints(in_a_gap, t, 0.5, width)
+    assert shares(cover) == pytest.approx([road, white, yellow], abs=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("s", "length", "white"),
+    [
+        (DASH / 2, 0.5, 1.0),
+        (DASH / 2 + 7 * PERIOD, 0.5, 1.0),
+        (DASH / 2 - 2 * PERIOD, 0.5, 1.0),  # behind the start of the road
+        ((DASH + PERIOD) / 2, 0.5, 0.0),
+        (DASH, 1.0, 0.5),  # across the end of a dash
+        (0.0, 1.0, 0.5),  # across the start of one
+        (DASH + 0.1, 1.0, 0.4),
+        (5.0, PERIOD, DASH / PERIOD),  # a whole period, wherever it begins
+        (8.0, 3 * PERIOD, DASH / PERIOD),
+    ],
+)
+def test_dashes_cover_their_part_of_the_pixels_length(s: float, length: float, white: float) -> None:
+    assert footprints(s, 2.0, length, 0.1).white.item() == pytest.approx(white, abs=1e-5)
+    assert footprints(s, 6.0, length, 0.1).white.item() == pytest.approx(1.0)  # the right edge has none
+
+
 LEVEL = Camera(41, 61, math.pi / 2, pitch=0.0, mount_height=0.5)
 """Of odd size, so that the middle pixel looks straight ahead; focal length 30.5 pixels."""
 STEEP = Camera(60, 80, pitch=0.4, mount_height=4.0)
@@ -64,24 +161,6 @@ def dark(camera: Camera, light: Light, *placed: tuple[float, float, float]) -> t
     return shade[0], seen.forward.expand_as(seen.right), seen.right
 
 
-def test_corners_are_half_a_body_from_the_middle() -> None:
-    for turn, half_ahead, half_aside in ((0.0, 2.5, 1.0), (math.pi / 2, 1.0, 2.5)):
-        forward, right = boxes((10.0, 3.0, turn)).corners()
-        found = {(round(f, 4), round(r, 4)) for f, r in zip(forward[0, 0].tolist(), right[0, 0].tolist(), strict=True)}
-        assert found == {(10.0 + a * half_ahead, 3.0 + b * half_aside) for a in (-1, 1) for b in (-1, 1)}
-
-
-def test_a_level_camera_sees_a_point_as_far_below_its_axis_as_it_is_above_the_ground() -> None:
-    found = project_points(Camera(pitch=0.0, mount_height=1.4), *(torch.tensor(v) for v in (10.0, 2.0, 0.3)))
-    assert [part.item() for part in found] == pytest.approx([2.0, 1.1, 10.0])
-
-
-def test_a_point_on_the_axis_of_a_camera_that_looks_down() -> None:
-    camera = Camera(pitch=math.atan2(3.0, 4.0), mount_height=3.0)
-    found = project_points(camera, *(torch.tensor(v) for v in (4.0, 0.0, 0.0)))  # 5 m from it: 3, 4, 5
-    assert [part.item() for part in found] == pytest.approx([0.0, 0.0, 5.0], abs=1e-6)
-
-
 def candidates(camera: Camera, points: list[list[tuple[float, float, float]]], first_row: int = 0) -> dict[int, set]:
     """Row and column of the candidates of each box; each box is a list of points (forward, right, up)."""
     forward, right, up = torch.tensor(points).unbind(-1)
@@ -95,41 +174,10 @@ def candidates(camera: Camera, points: list[list[tuple[float, float, float]]], f
     return found
 
 
-def rectangle(rows: range, columns: range) -> set[tuple[int, int]]:
-    return {(row, column) for row in rows for column in columns}
-
-
-def test_candidates_are_the_rectangle_around_projected_points() -> None:
-    """Focal length 30, camera 1.4 m high: 10 m ahead, a metre is three pixels."""
-    camera = Camera(40, 60, math.pi / 2, pitch=0.0, mount_height=1.4)
-    plate = [(10.0, -0.9, 0.1), (10.0, 0.9, 1.5)]  # columns 27.3 to 32.7, rows 19.7 to 23.9
-    small = [(10.0, 4.1, 0.1), (10.0, 4.2, 0.2)]  # columns 42.3 to 42.6, rows 23.6 to 23.9
-    behind = [(-10.0, 0.9, 0.1), (-10.0, -0.9, 1.5)]
-    beside = [(10.0, 10.5, 0.1), (10.0, 20.0, 1.5)]  # columns 61.5 and more
-    found = candidates(camera, [plate, behind, small, beside])
-    assert found == {0: rectangle(range(19, 24), range(27, 33)), 2: {(23, 42)}}
-    assert candidates(camera, [plate], first_row=22) == {0: rectangle(range(22, 24), range(27, 33))}
-
-
-def test_what_reaches_behind_the_camera_is_a_candidate_to_the_edge_of_the_picture() -> None:
-    """A line on the ground 1 m to the right, from behind the camera to 5 m ahead: there in column 36 and row 28.4."""
-    camera = Camera(40, 60, math.pi / 2, pitch=0.0, mount_height=1.4)
-    line = [(-5.0, 1.05, 0.0), (5.0, 1.05, 0.0)]
-    assert candidates(camera, [line]) == {0: rectangle(range(28, 40), range(36, 60))}
-
-
 @pytest.mark.parametrize(("azimuth", "lit"), [(BEHIND, math.cos(LOW)), (AHEAD, 0.0), (RIGHT, 0.0)])
 def test_a_rear_is_lit_by_the_cosine_of_the_sun_to_it(azimuth: float, lit: float) -> None:
     image = draw(LEVEL, sunlight(azimuth), (12.5, 0.0, 0.0))
     torch.testing.assert_close(middle(image), (DIFFUSE + DIRECT * lit) * torch.tensor(PAINT[0]))
-
-
-def test_a_body_that_turns_away_from_the_sun_gets_darker() -> None:
-    """Its rear by the cosine of its turn; broadside it shows a flank, which faces the sun as the rear did."""
-    light, paint = sunlight(BEHIND), torch.tensor(PAINT[0])
-    for turn, cosine in ((0.3, math.cos(0.3)), (-0.3, math.cos(0.3)), (math.pi / 2, 1.0), (math.pi, 1.0)):
-        image = draw(LEVEL, light, (12.5, 0.0, turn))
-        torch.testing.assert_close(middle(image), (DIFFUSE + DIRECT * math.cos(LOW) * cosine) * paint)
 
 
 def test_windows_are_a_band_of_the_sides() -> None:
@@ -145,16 +193,6 @@ def test_windows_are_a_band_of_the_sides() -> None:
     assert image[~(pane | body)].isnan().all()
 
 
-def test_a_roof_is_seen_from_above_through_the_air() -> None:
-    """A camera 10 m up that looks down by 45 degrees meets the roof 8.5 m ahead and 8.5 m below itself."""
-    camera = Camera(41, 61, pitch=math.pi / 4, mount_height=10.0)
-    light = sunlight(RIGHT, fog=0.03)
-    own = (light.diffuse + light.direct * math.sin(LOW)) * torch.tensor(PAINT[0])
-    air = light.brightness * torch.tensor(AIR)
-    expected = air + math.exp(-0.03 * 8.5 * math.sqrt(2.0)) * (own - air)
-    torch.testing.assert_close(middle(draw(camera, light, (8.5, 0.0, 0.0))), expected)
-
-
 def test_the_nearer_body_hides_the_farther_one_in_any_order() -> None:
     light, near, far = sunlight(BEHIND), (12.0, 0.5, 0.2), (20.0, -1.0, -0.4)
     alone = [draw(LEVEL, light, near, paint=[0]), draw(LEVEL, light, far, paint=[1])]
@@ -165,13 +203,6 @@ def test_the_nearer_body_hides_the_farther_one_in_any_order() -> None:
         torch.testing.assert_close(
             draw(LEVEL, light, *placed, paint=paint), expected, equal_nan=True, rtol=0.0, atol=0.0
         )
-
-
-def test_a_body_around_or_behind_the_camera_is_not_drawn() -> None:
-    light = sunlight(BEHIND)
-    assert draw(LEVEL, light, (0.5, 0.3, 0.1)).isnan().all()
-    assert draw(LEVEL, light, (-12.0, 0.0, 0.0)).isnan().all()
-    assert not draw(LEVEL, light, (12.0, 0.0, 0.0)).isnan().all()
 
 
 @pytest.mark.parametrize(
@@ -200,13 +231,3 @@ def test_a_shadow_is_the_body_moved_away_from_the_sun(
     assert (inside > 1e-4).sum() > 30
     assert shade[inside > 1e-4].all()
     assert not shade[inside < -1e-4].any()
-
-
-def test_shadows_of_several_bodies_add_up() -> None:
-    light, one, other = sunlight(0.7, 0.6), (9.0, -1.0, 0.2), (12.0, 3.0, -0.5)
-    both, *_ = dark(STEEP, light, one, other)
-    assert torch.equal(both, dark(STEEP, light, one)[0] | dark(STEEP, light, other)[0])
-
-
-def test_without_a_shadow_in_sight_there_is_none_to_draw() -> None:
-    assert cast_shadows(boxes((-60.0, 0.0, 0.0)), sunlight(AHEAD), STEEP, pixels(STEEP, CPU)) is None
