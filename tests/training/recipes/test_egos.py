@@ -1,0 +1,316 @@
+"""Recipes of the egos: the judge of ordinary traffic, the labels of the corrections, and that the trainings run."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass, replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+import agents
+import rare_envs
+from agents import LearnedDriver, LearnedEgo
+from agents.learned.driver import replace_head
+from agents.learned.networks import HEAD_SIZE
+from agents.vision import to_actions
+from rare_envs.control.actions import to_physical
+from rare_envs.control.idm import IDM
+from rare_envs.scenarios.registry import find_scenario
+from rare_envs.simulation.observation import observation_space
+from rare_envs.simulation.sensing import Sensing
+from rare_envs.simulation.world import World
+from rare_envs.traffic.state import VEHICLE_LENGTH, State
+from tests.training.imitation.synthetic_scenes import scene
+from training.imitation.config import Config
+from training.imitation.traffic import stack_scenes, start_replay, step_replay
+from training.imitation.train import train_learner
+from training.recipes import imitation, vision
+from training.recipes.imitation import EXPERT, FREE, EncounterSpec, expert_acceleration, make_scenes, record_drive
+from training.recipes.ordinary_traffic import CASES, FLOOR_HEADWAY, VERDICT_NAMES, OrdinaryDrivers, draw_starts, judge
+from training.recipes.situations import make_situations, start_situation
+
+CUT_IN = World(find_scenario("rare_envs/CutIn-v0"), Sensing("features", lidar=True))
+CUT_INS = np.array([[25.0, 12.0, 20.0, 15.0, 40.0, 3.5], [20.0, 20.0, 20.0, 60.0, 60.0, 3.5]])
+
+
+@dataclass(frozen=True)
+class Flawed:
+    """IDM with lane keeping, and something wrong with its actions."""
+
+    steering: float | None = None
+    brakes: bool = True
+    acceleration: float | None = None
+
+    def act(self, episode: Any, memory: Any) -> tuple[torch.Tensor, Any]:
+        action, memory = IDM().act(episode, memory)
+        acceleration, steering = action.unbind(1)
+        if self.acceleration is not None:
+            acceleration = torch.full_like(acceleration, self.acceleration)
+        if self.steering is not None:
+            steering = torch.full_like(steering, self.steering)
+        if not self.brakes:
+            acceleration = acceleration.clamp(min=0.0)
+        return torch.stack((acceleration, steering), 1), memory
+
+
+def reasons(found: Any) -> Counter[str]:
+    return Counter(VERDICT_NAMES[k] for k in found.reason.tolist())
+
+
+@pytest.mark.parametrize("case", ["straight", "i80", "bends"])
+def test_a_driver_by_rule_is_nominal(case: str) -> None:
+    found = judge(agents.load_ego("idm"), case, rollouts=12, seed=3, seconds=30.0)
+    assert reasons(found) == {"passed": 12}
+    assert found.headway.min() > FLOOR_HEADWAY and found.margin.min() > 0.4
+
+
+@pytest.mark.parametrize(
+    ("ego", "reason"),
+    [
+        (Flawed(steering=0.005), "left its lane"),
+        (Flawed(brakes=False), "too close"),
+        (Flawed(acceleration=-1.0), "left behind"),
+    ],
+)
+def test_a_flawed_driver_is_caught_and_the_reason_is_told(ego: Any, reason: str) -> None:
+    found = reasons(judge(ego, "straight", rollouts=16, seed=1, seconds=30.0))
+    assert found.keys() <= {reason, "passed"} and found["passed"] < 8  # some leads only ever drive away
+
+
+def _near(n: int, rng: np.random.Generator) -> Any:
+    x = draw_starts(n, rng)
+    x[:, 0], x[:, 2] = 20.0, 6.0
+    return x
+
+
+@pytest.mark.parametrize(
+    ("others", "starts", "own", "reason"), [(0.0, draw_starts, -1.0, "hit by others"), (-1e4, _near, 0.0, "collided")]
+)
+def test_who_runs_into_another_is_to_blame(others: float, starts: Any, own: float, reason: str) -> None:
+    """In one world the follower does not brake and the ego does; in the other the lead stops at once."""
+
+    @dataclass(frozen=True)
+    class Reckless(OrdinaryDrivers):
+        def act(self, features: Any, weights: Any, innovations: Any, memory: Any) -> Any:
+            action, memory = super().act(features, weights, innovations, memory)
+            return torch.full_like(action, others), memory
+
+    case = replace(CASES["straight"], drivers=Reckless, starts=starts)
+    assert reasons(judge(Flawed(acceleration=own), case, rollouts=4, seconds=20.0)) == {reason: 4}
+
+
+def test_an_unknown_case_is_refused() -> None:
+    with pytest.raises(ValueError, match="Unknown case 'straightt'; expected one of straight"):
+        judge("idm", "straightt")
+
+
+def test_an_encounter_is_the_scenario_with_its_ego_free() -> None:
+    """Others move as recorded whatever the ego does; only egos are driven; every other scene is mirrored."""
+    plain, mirrored = make_scenes([EncounterSpec("rare_envs/CutIn-v0", "us101", 2, 4.0)], np.random.default_rng(3))
+    assert plain.edges == (-2.0, 2.0, 6.0) and mirrored.edges == (-6.0, -2.0, 2.0)
+    assert (mirrored.y[:, 1::3] <= 0.0).all()
+    recording = stack_scenes([plain])
+    traffic = start_replay(recording, torch.tensor([0]), torch.tensor([0]))
+    assert traffic.driven.sum() == 13
+    braking = torch.zeros(1, 39, 2)
+    braking[..., 0] = -2.0
+    for _ in range(30):
+        traffic = step_replay(recording, traffic, braking)
+    x, others = traffic.x[0, traffic.vehicle[0].argsort()].numpy(), np.arange(39) % 3 != 0
+    np.testing.assert_allclose(x[others], plain.x[30][others], atol=0.01)
+    assert (x[~others] < plain.x[30][~others]).any()
+
+
+def test_parameters_of_encounters_may_be_given() -> None:
+    (one,) = make_scenes([EncounterSpec("straight", None, 1, 1.0, {"gap": 140.0})], np.random.default_rng(0))
+    np.testing.assert_allclose(one.x[0, 1::5] - one.x[0, ::5], 145.0, atol=1e-3)
+
+
+def test_the_training_among_encounters_repeats_and_learns_from_people_only() -> None:
+    config = Config(
+        updates=1, pools=1, scenes=3, horizon=(4, 4), epochs=1, warm_up=1, headway_weight=8.0, lane_weight=8.0
+    )
+    kinds = [EncounterSpec("rare_envs/CutIn-v0", "us101", 1, 2.0), EncounterSpec("hard_brake", None, 1, 2.0)]
+    scenes = [scene(vehicles=8, ticks=30, name=name) for name in "ab"]
+    learners = [imitation.prepare_learner(scenes, kinds, config) for _ in range(2)]
+    assert learners[0].pairs.scene.max() < len(scenes)
+    assert set(learners[0].among.tolist()) == {0, 1, 2, 3}
+    one, other = (train_learner(learner).state_dict() for learner in learners)
+    assert all(torch.equal(one[name], other[name]) for name in one)
+
+
+def traffic(gap: float, aside: float, heading: float = 0.0) -> State:
+    x, y = torch.tensor([[0.0, gap + VEHICLE_LENGTH]]), torch.tensor([[0.0, aside]])
+    return State(x, y, torch.tensor([[0.0, heading]]), torch.tensor([[20.0, 15.0]]), theta=x[:, :0])
+
+
+def test_the_expert_brakes_as_hard_as_idm_behind_a_lead() -> None:
+    root = 2.0 * np.sqrt(EXPERT.max_acceleration * EXPERT.comfortable_deceleration)
+    desired_gap = EXPERT.jam_distance + 20.0 * EXPERT.time_headway + 20.0 * 5.0 / root
+    expected = EXPERT.max_acceleration * (1.0 - (20.0 / 40.0) ** 4 - (desired_gap / 15.0) ** 2)
+    assert expert_acceleration(traffic(15.0, 0.0)).item() == pytest.approx(expected, rel=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("state", "brakes"),
+    [
+        (traffic(10.0, 3.5), False),  # beside
+        (traffic(10.0, 2.4), True),  # within the margin
+        (traffic(10.0, 3.5, heading=-0.08), True),  # comes 1.2 m nearer within 1 s
+        (traffic(10.0, 2.6, heading=-0.01), False),  # sways
+        (traffic(10.0, 3.5, heading=0.08), False),  # goes away
+        (traffic(10.0, 3.0, heading=-0.5), True),  # will be on the other side by then
+        (traffic(-12.0, 0.0), False),  # behind
+        (traffic(-2.0, 2.1), True),  # overlaps along the road and across it nearly
+    ],
+)
+def test_the_expert_brakes_for_those_in_its_path_and_coming_into_it(state: State, brakes: bool) -> None:
+    wanted = expert_acceleration(state).item()
+    assert (wanted < -1.0) if brakes else (wanted == FREE)
+
+
+@pytest.fixture
+def ego() -> LearnedDriver:
+    driver = agents.load_driver("imitation")
+    assert isinstance(driver, LearnedDriver)
+    return driver
+
+
+@pytest.fixture
+def coasting(ego: LearnedDriver) -> LearnedDriver:
+    """An ego that hardly accelerates, brakes or steers, whatever it sees."""
+    return replace(ego, policy=replace_head(ego.policy, torch.zeros(HEAD_SIZE)))
+
+
+def test_labels_are_the_teachers_but_for_harder_braking(coasting: LearnedDriver) -> None:
+    plain, right = (record_drive(coasting, coasting.policy, CUT_IN, CUT_INS, 10, corrected=c) for c in (False, True))
+    assert torch.equal(plain[0], right[0])
+    assert torch.equal(plain[1][:, :2], torch.zeros_like(plain[1][:, :2]))
+    assert torch.equal(right[1][:, 1:], plain[1][:, 1:])
+    assert (right[1][:, 0] <= 0.0).all() and (right[1][:, 0] == 0.0).sum() > 5
+    hardest = EXPERT.max_deceleration / coasting.policy.scaling.action_std[0].item()
+    assert right[1][:, 0].min().item() == pytest.approx(-hardest, rel=0.05)
+
+
+def test_nothing_is_recorded_after_a_collision(coasting: LearnedDriver) -> None:
+    one, other, both = (
+        len(record_drive(coasting, coasting.policy, CUT_IN, x, 1, corrected=False)[0])
+        for x in (CUT_INS[:1], CUT_INS[1:], CUT_INS)
+    )
+    assert 0 < one < other == 101 and both == one + other
+
+
+@pytest.mark.slow
+def test_corrections_change_a_copy_and_hold_half_of_the_failures_out(
+    coasting: LearnedDriver, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(imitation, "CASES", {})
+    plan = imitation.Corrections(draws=4, simulations=600, steps=60, batch=64, recorded=30)
+    before = coasting.policy.head.weight.clone()
+    corrected, records = imitation.correct_ego(coasting, plan, torch.rand(50, 51) * 20.0)
+    assert torch.equal(coasting.policy.head.weight, before)
+    assert not torch.equal(corrected.policy.head.weight, before)
+    for record in records:
+        assert record["found"] == record["driven"] + record["held_out"] > 0 and 0.0 < record["p"] < 1.0
+
+
+def test_it_is_found_by_name_and_is_no_driver_of_the_traffic() -> None:
+    ego = agents.load_ego("imitation")
+    assert isinstance(ego, LearnedEgo) and ego.driver.name == "imitation"
+    told = agents.read_provenance(Path(agents.__file__).parent / "data" / "imitation.safetensors")
+    assert set(told.metrics["ordinary"]) == set(CASES)
+    with pytest.raises(ValueError, match=r"expected one of 'gail', 'idm', 'idm\+mobil', 'mgail'"):
+        rare_envs.DrivingProblem("rare_envs/CarFollowing-v0", drivers="imitation")
+
+
+def test_it_drives_the_same_as_an_ego_that_predicts() -> None:
+    away = SimpleNamespace(
+        predict=agents.load_ego("imitation").predict, observation_space=observation_space(1, "lidar")
+    )
+    problem, here = (
+        rare_envs.DrivingProblem("rare_envs/CutIn-v0", ego=one) for one in (away, agents.load_ego("imitation"))
+    )
+    x = here.base.sample(32, np.random.default_rng(0))
+    gentle = here.evaluate(x) > 2.0  # where no more than the environment's 5 m/s^2 is needed
+    np.testing.assert_allclose(problem.evaluate(x)[gentle], here.evaluate(x)[gentle], atol=0.05)
+
+
+def test_it_brakes_for_those_who_cut_in() -> None:
+    """The driver of the traffic, which never met encounters, collides in one of seven."""
+    collided = {}
+    for name in ("imitation", "mgail?rules=0"):
+        problem = rare_envs.DrivingProblem("rare_envs/CutIn-v0", ego=agents.load_ego(name))
+        collided[name] = (problem.evaluate(problem.base.sample(256, np.random.default_rng(2026))) < 0.0).mean()
+    assert collided["imitation"] == 0.0 < 0.1 < collided["mgail?rules=0"]
+
+
+@pytest.mark.parametrize(
+    ("name", "case", "seconds"),
+    [
+        ("imitation", "straight", 20.0),
+        ("vision", "bends", 4.0),
+        pytest.param("imitation", "bends", 60.0, marks=pytest.mark.slow),
+        pytest.param("vision", "straight", 60.0, marks=pytest.mark.slow),
+        pytest.param("vision", "i80", 60.0, marks=pytest.mark.slow),
+    ],
+)
+def test_shipped_egos_keep_lane_and_distance(name: str, case: str, seconds: float) -> None:
+    rollouts = 4 if seconds < 10.0 else 16
+    found = judge(agents.load_ego(name), case, rollouts=rollouts, seed=2026, seconds=seconds)
+    assert reasons(found)["passed"] >= rollouts - (rollouts > 4)
+    assert found.margin.min() > 0.3
+
+
+def test_the_expert_of_vision_keeps_lane_and_distance_from_wherever_situations_begin() -> None:
+    """It does not run wide on curves either: its yaw rate is speed times curvature."""
+    for number, situation in enumerate(make_situations()[:3]):
+        world, episode = start_situation(situation, 8, 12.0, np.random.default_rng(number))
+        with torch.inference_mode():
+            for _ in range(world.clock.ticks):
+                output, speed = vision.expert_outputs(episode), episode.state.speed[:, 0]
+                episode = world.step(episode, to_physical(to_actions(output, speed), 8, episode.collided))
+            offset = 0.5 * vision.auxiliary_targets(episode)[:, 0].abs()
+        assert int(episode.collided.sum()) <= 1  # some situations begin too fast and too close
+        assert float(offset[~episode.collided].max()) < 0.1
+
+
+def test_labels_that_ask_for_more_than_the_brakes_differ_only_where_they_are_the_limit() -> None:
+    _, episode = start_situation(make_situations()[1], 256, 1.0, np.random.default_rng(1))
+    usual, more = vision.expert_outputs(episode), vision.expert_outputs(episode, brakes=10.0)
+    at_limit = usual[:, 0] == usual[:, 0].min()
+    assert 0 < int(at_limit.sum()) < 256 and torch.equal(more[~at_limit], usual[~at_limit])
+    assert bool((more[at_limit, 0] <= usual[at_limit, 0]).all()) and float(more[:, 0].min()) == -5.0
+    speed = episode.state.speed[:, 0]
+    assert torch.equal(to_actions(more, speed), to_actions(usual, speed))  # the same is done
+
+
+def test_pictures_carry_the_outputs_of_the_expert_mirrored_with_the_picture() -> None:
+    rng = np.random.default_rng(4)
+    some = vision.concatenate(list(vision.drive_situations(None, 0.0, 1, 4, 2, rng, recorded_share=1.0, noise=1.0)))
+    assert some.picture.shape == (8, 66, 200, 3) and some.expert.shape == (8, 2) and some.truth.shape == (8, 5)
+    turned = vision.mirror(some, torch.tensor([True, False] * 4))
+    assert torch.equal(turned.picture[0], some.picture[0].flip(1))
+    assert torch.equal(turned.expert[0], some.expert[0] * torch.tensor([1.0, -1.0]))
+    assert torch.equal(turned.truth[2], some.truth[2] * torch.tensor([-1.0, -1.0, -1.0, 1.0, 1.0]))
+    assert all(torch.equal(a[1::2], b[1::2]) for a, b in zip(turned, some, strict=True))
+
+
+@pytest.mark.slow
+def test_a_tiny_training_of_vision_runs_and_repeats(monkeypatch: pytest.MonkeyPatch) -> None:
+    plan = vision.VisionPlan(
+        rounds=1, drives=(7, 4), rows=2, ticks=(6, 6), recorded=(0.5, 0.5), visits=(40, 30), batch=8
+    )
+    network, other = vision.train_vision(plan), vision.train_vision(plan)
+    assert all(torch.equal(a, b) for a, b in zip(network.parameters(), other.parameters(), strict=True))
+    monkeypatch.setattr(vision, "DRAWN", ())
+    small = vision.CorrectionPlan(
+        rounds=1, simulations=60, driven=2, drives=(1, 1), rows=2, seconds=0.5, visits=8, batch=4
+    )
+    (record,) = vision.correct_vision(network, small)
+    assert record["driven_failing"] <= record["driven"] <= 2
+    assert not all(torch.equal(a, b) for a, b in zip(network.parameters(), other.parameters(), strict=True))

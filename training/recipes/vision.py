@@ -1,0 +1,387 @@
+"""The ego `vision`: imitation of a driver by rule, with corrections where the network itself drives.
+
+    python -m training.recipes.vision --out runs/vision
+
+Round 0 imitates the expert in its own drives. In each later round the network drives, mixed with the expert less and
+less, the expert labels the pictures, and the network learns from those of all rounds: DAgger (Ross, Gordon and Bagnell,
+AISTATS 2011). Then rounds of corrections: a search finds failures in hard brakes, half of which are held out; the ego
+drives the other half, draws of the scenarios and the situations of before, and learns labels that ask for harder
+braking than the vehicle's, so that an error of regression about them still brakes fully. At test time there is the
+network alone, which sees pictures and its own speed. The shipped file is one of `--seed 0`, corrected in two rounds of
+seed 0 and one of seed 1.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections import deque
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import Annotated, Any, NamedTuple
+
+import numpy as np
+import torch
+import typer
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+import rare_envs
+import samplers
+from agents import Provenance
+from agents.learned.rule_driver import HEADING_TIME, OFFSET_TIME
+from agents.vision import (
+    ACCELERATION_UNIT,
+    LAG,
+    MIN_STEERING_SPEED,
+    OBSERVATION,
+    PILOTNET_HIDDEN_UNITS,
+    TURN_UNIT,
+    PilotNet,
+    VisionEgo,
+    luma,
+    save_vision,
+    to_actions,
+    update_memory,
+)
+from rare_envs.control.actions import MAX_STEERING, to_physical
+from rare_envs.control.idm import IDM
+from rare_envs.files import replace_text
+from rare_envs.scenarios.base_distributions import load_base
+from rare_envs.scenarios.registry import find_scenario
+from rare_envs.sensors.camera import Weather, take_picture
+from rare_envs.simulation.clock import Clock
+from rare_envs.simulation.episode import Episode
+from rare_envs.simulation.sensing import Sensing
+from rare_envs.simulation.world import World
+from rare_envs.threads import use_one_thread
+from rare_envs.traffic.state import VEHICLE_LENGTH, State
+from training.command_line import RunFolderOption, run_command
+from training.recipes.ordinary_traffic import judge_all_cases
+from training.recipes.situations import make_situations, start_situation
+
+VISION_EXPERT = IDM(jam_distance=2.0)
+"""Treiber, Hennecke and Helbing's (2000) distance at standstill: 1 m, the suite's, leaves nothing to an imitator."""
+DEMANDED_BRAKING = 10.0
+"""Hardest braking that the labels of the corrections ask for [m/s^2]; the vehicle's is 5."""
+SEARCHED = ("rare_envs/HardBrake-v0", "us101")
+DRAWN = (
+    SEARCHED,
+    ("rare_envs/CutIn-v0", "us101"),
+    ("rare_envs/CutIn-v1", "us101"),
+    ("rare_envs/CarFollowing-v0", "us101-gap"),
+)
+"""Scenarios and bases in which failures are searched, and that are driven by draws."""
+FIRST_TICKS, CAMERA_ROWS = 10, 64
+"""Ticks at the start that are all recorded, because a short gap is braked for then or never; rows driven at once."""
+JUDGE_SEED = 2026
+"""Seed of the drives that evaluate the result, which no training uses."""
+
+
+@dataclass(frozen=True)
+class VisionPlan:
+    """Amounts of the training: pairs are those of round 0 and of each later round of DAgger."""
+
+    seed: int = 0
+    rounds: int = 5
+    drives: tuple[int, int] = (56, 7)
+    """Situations."""
+    rows: int = 24
+    """Scenarios of a situation."""
+    ticks: tuple[int, int] = (100, 120)
+    """Length of a scenario."""
+    recorded: tuple[float, float] = (0.1, 0.2)
+    """Share of the moments that are recorded."""
+    mixing: float = 0.5
+    """In round k the expert decides at a share `mixing`^k of the ticks."""
+    visits: tuple[int, int] = (40_000, 20_000)
+    """Pictures that are learned from, with repetition."""
+    batch: int = 32
+    rate: float = 1e-3
+    """Of Adam, falling as a cosine to a hundredth."""
+    truth_weight: float = 0.5
+    """Of the second task, see `auxiliary_targets`."""
+
+
+@dataclass(frozen=True)
+class CorrectionPlan:
+    """Amounts of the corrections."""
+
+    seed: int = 0
+    rounds: int = 3
+    simulations: int = 600
+    """Of each search for failures."""
+    driven: int = 192
+    """Most failures of each search that are driven."""
+    draws: int = 64
+    """Draws of each scenario in a round."""
+    drives: tuple[int, int] = (28, 14)
+    """Situations of the first training that the expert drives before the first round, and the network in each."""
+    rows: int = 24
+    seconds: float = 10.0
+    """Length of a drive."""
+    visits: int = 30_000
+    batch: int = 32
+    rate: float = 3e-4
+    """Of Adam, falling to zero as a cosine in each round."""
+
+
+def expert_outputs(episode: Episode, brakes: float = VISION_EXPERT.max_deceleration) -> Tensor:
+    """Return the outputs that the network should give, in units of `ACCELERATION_UNIT` and `TURN_UNIT`, shape (B, 2).
+
+    Acceleration is IDM's behind the lead, with braking of up to `brakes` [m/s^2]. The yaw rate is that of
+    `rare_envs.control.idm` with the road's curvature fed forward, so that it does not run wide, and with a sine of
+    the heading towards the lane of at most 0.3. Below `MIN_STEERING_SPEED` it uses that speed for the curvature.
+    """
+    state, road = episode.state, episode.road
+    speed, heading = state.speed[:, 0].clamp(min=MIN_STEERING_SPEED), state.heading[:, 0]
+    offset = state.y[:, 0] - road.centre_of(state.y[:, 0])
+    wanted = torch.asin((-offset / (OFFSET_TIME * speed)).clamp(-0.3, 0.3))
+    turn = (wanted - heading) / HEADING_TIME + speed * road.curvature(state.x[:, 0])
+    slip = torch.atan(0.5 * torch.tan(torch.tensor(MAX_STEERING)))  # of the bicycle model at full steering
+    limit = speed * torch.sin(slip) / (0.5 * VEHICLE_LENGTH)
+    acceleration = replace(VISION_EXPERT, max_deceleration=brakes).acceleration(state.speed[:, 0], episode.lead)
+    turn = torch.maximum(torch.minimum(turn, limit), -limit)
+    return torch.stack((acceleration / ACCELERATION_UNIT, turn / TURN_UNIT), dim=1)
+
+
+def auxiliary_targets(episode: Episode) -> Tensor:
+    """Return what the expert decides by, as far as a picture shows it, in units of about 1, shape (B, 5).
+
+    Offset from the lane's middle, heading, curvature of the road, nearness of the lead and its rate of approach.
+    """
+    state, road, lead = episode.state, episode.road, episode.lead
+    near = (10.0 / lead.gap.clamp(min=2.0)).clamp(max=3.0)
+    offset = (state.y[:, 0] - road.centre_of(state.y[:, 0])) / 0.5
+    curvature, approach = road.curvature(state.x[:, 0]) / 0.001, (lead.closing_speed / 5.0).clamp(-2.0, 2.0)
+    return torch.stack((offset, state.heading[:, 0] / 0.05, curvature, near, near * approach), dim=1)
+
+
+class LabelledPictures(NamedTuple):
+    """Pictures and labels of n moments."""
+
+    picture: Tensor
+    """uint8, shape (n, 66, 200, 3)."""
+    earlier: Tensor
+    """Luma of the picture before it, uint8, shape (n, 66, 200)."""
+    speed: Tensor
+    """Own speed [m/s], shape (n,)."""
+    expert: Tensor
+    """Outputs of the expert, shape (n, 2)."""
+    truth: Tensor
+    """Auxiliary targets, shape (n, 5)."""
+
+
+def concatenate(parts: list[LabelledPictures]) -> LabelledPictures:
+    """Return all moments of several parts."""
+    return LabelledPictures(*(torch.cat(fields) for fields in zip(*parts, strict=True)))
+
+
+def drive_situations(
+    network: PilotNet | None, share: float, drives: int, rows: int, ticks: int, rng: np.random.Generator, **how: Any
+) -> Iterator[LabelledPictures]:
+    """Yield the moments of situations, taken in turn; `network`, `share` and `how` as in `drive_and_label`."""
+    situations = make_situations()
+    for number in range(drives):
+        start = start_situation(situations[number % len(situations)], rows, ticks * VisionEgo.dt, rng)
+        yield concatenate(list(drive_and_label(*start, network, share, ticks, rng, **how)))
+
+
+@torch.inference_mode()
+def drive_and_label(
+    world: World,
+    episode: Episode,
+    network: PilotNet | None,
+    share: float,
+    ticks: int,
+    rng: np.random.Generator,
+    *,
+    recorded_share: float,
+    noise: float = 0.0,
+    brakes: float = VISION_EXPERT.max_deceleration,
+    first_ticks: int = 0,
+) -> Iterator[LabelledPictures]:
+    """Drive, and yield pictures with the outputs of the expert, until egos collide.
+
+    Args:
+        world: Where they drive.
+        episode: Its first moment.
+        network: Decides at a share of the ticks, the expert at the others; with None the expert drives alone.
+        share: That share.
+        ticks: Length of the drive.
+        rng: Source of everything that is random.
+        recorded_share: Share of the ticks that are recorded.
+        noise: Factor of a noise of the actions, 0.5 m/s^2 and 0.05 rad/s for about half a second, so that places off
+            the expert's path are seen.
+        brakes: Hardest braking that the labels ask for [m/s^2].
+        first_ticks: Ticks at the start that are all recorded.
+    """
+    state, swing, before = None, np.zeros((len(episode.collided), 2)), deque([episode], LAG)
+    for tick in range(ticks):
+        speed, expert = episode.state.speed[:, 0], expert_outputs(episode, brakes)
+        recorded = ~episode.collided & (bool(rng.random() < recorded_share) | (tick < first_ticks))
+        swing = 0.8 * swing + 0.6 * rng.standard_normal(swing.shape)
+        output = expert + noise * torch.from_numpy(swing * (0.25, 0.5)).float()
+        if network is None:  # the expert needs no pictures: only recorded ones are taken
+            if bool(recorded.any()):
+                seen = _take_pictures(episode, recorded), luma(_take_pictures(before[0], recorded)), speed[recorded]
+        else:
+            picture = _take_pictures(episode, torch.ones_like(recorded))
+            past, state = update_memory(picture, state)
+            decides = torch.from_numpy(rng.random(len(speed)) < share)[:, None]
+            output = torch.where(decides, network(picture, torch.from_numpy(past), speed), output)
+            seen = picture[recorded], torch.from_numpy(past)[recorded.numpy()], speed[recorded]
+        if bool(recorded.any()):
+            yield LabelledPictures(*seen, expert[recorded], auxiliary_targets(episode)[recorded])
+        before.append(episode)
+        episode = world.step(episode, to_physical(to_actions(output, speed), len(speed), episode.collided))
+
+
+def _take_pictures(episode: Episode, rows: Tensor) -> Tensor:
+    """Take the pictures of some rows, boolean, shape (B,)."""
+    assert episode.camera_context is not None
+    state, context = episode.state, episode.camera_context
+    weather = Weather(*(field[rows] for field in context.weather))
+    context = context._replace(weather=weather, tick=context.tick[rows])
+    return take_picture(State(*(field[rows] for field in state)), episode.road, context)
+
+
+def draw_batch(data: LabelledPictures, size: int, rng: np.random.Generator) -> LabelledPictures:
+    """Return some of the moments, left and right exchanged in half of them."""
+    some = torch.from_numpy(rng.integers(0, len(data.speed), size))
+    return mirror(LabelledPictures(*(field[some] for field in data)), torch.from_numpy(rng.random(size) < 0.5))
+
+
+def mirror(pictures: LabelledPictures, rows: Tensor) -> LabelledPictures:
+    """Exchange left and right in some rows, boolean, shape (n,)."""
+    sign = torch.where(rows, -1.0, 1.0)[:, None]
+    one = torch.ones_like(sign)
+    picture, earlier = pictures.picture.clone(), pictures.earlier.clone()
+    picture[rows], earlier[rows] = picture[rows].flip(2), earlier[rows].flip(2)
+    expert = pictures.expert * torch.cat((one, sign), dim=1)
+    return LabelledPictures(
+        picture, earlier, pictures.speed, expert, pictures.truth * torch.cat((sign, sign, sign, one, one), dim=1)
+    )
+
+
+def train_vision(plan: VisionPlan) -> PilotNet:
+    """Return a network after all rounds of DAgger."""
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(plan.seed)
+        network, probe = PilotNet(), nn.Linear(PILOTNET_HIDDEN_UNITS, 5)
+    parameters = [*network.parameters(), *probe.parameters()]
+    optimiser = torch.optim.Adam(parameters, plan.rate)
+    all_visits, visited = plan.visits[0] + plan.rounds * plan.visits[1], 0
+    recorded: list[LabelledPictures] = []
+    for number in range(plan.rounds + 1):
+        rng, later = np.random.default_rng((plan.seed, number)), int(number > 0)
+        recorded += drive_situations(
+            network if later else None,
+            1.0 - plan.mixing**number,
+            plan.drives[later],
+            plan.rows,
+            plan.ticks[later],
+            rng,
+            recorded_share=plan.recorded[later],
+            noise=0.0 if later else 1.0,
+        )
+        data, left = concatenate(recorded), plan.visits[later]
+        while left > 0:
+            for group in optimiser.param_groups:
+                group["lr"] = plan.rate * (0.505 + 0.495 * math.cos(math.pi * visited / all_visits))
+            some = draw_batch(data, min(plan.batch, left), rng)
+            hidden = network.hidden(some.picture, some.earlier, some.speed)
+            error = nn.functional.smooth_l1_loss(network.out(hidden), some.expert, beta=0.5)
+            truth = nn.functional.smooth_l1_loss(probe(hidden), some.truth)
+            _step(optimiser, error + plan.truth_weight * truth, parameters)
+            left, visited = left - len(some.speed), visited + len(some.speed)
+        typer.echo(f"round {number}: {len(data.speed):,} pictures, loss {error.item():.4f}", err=True)
+    return network.eval().requires_grad_(False)
+
+
+def _step(optimiser: torch.optim.Optimizer, loss: Tensor, parameters: list[nn.Parameter]) -> None:
+    """Make one step down a loss, with a clipped gradient."""
+    optimiser.zero_grad()
+    torch.autograd.backward(loss)
+    nn.utils.clip_grad_norm_(parameters, 5.0)
+    optimiser.step()
+
+
+def correct_vision(network: PilotNet, plan: CorrectionPlan) -> list[dict[str, Any]]:
+    """Correct a network in place.
+
+    Returns:
+        For each round: p of the ego at its beginning, failures driven in training and held out, and how many of each
+        the corrected ego fails.
+    """
+    rng, ticks = np.random.default_rng(plan.seed), round(plan.seconds / VisionEgo.dt)
+    how: dict[str, Any] = {"brakes": DEMANDED_BRAKING}
+
+    def situations(by: PilotNet | None, drives: int, recorded: float, noise: float) -> Iterator[LabelledPictures]:
+        return drive_situations(by, 1.0, drives, plan.rows, ticks, rng, recorded_share=recorded, noise=noise, **how)
+
+    def scenarios(env_id: str, x: NDArray[np.float64], recorded: float) -> Iterator[LabelledPictures]:
+        world = World(find_scenario(env_id), Sensing(OBSERVATION), clock=Clock(horizon=plan.seconds))
+        for rows in torch.split(torch.from_numpy(x).float(), CAMERA_ROWS) if len(x) else ():
+            start = world.start(rows)
+            yield from drive_and_label(
+                world, start, network, 1.0, ticks, rng, recorded_share=recorded, first_ticks=FIRST_TICKS, **how
+            )
+
+    data = list(situations(None, plan.drives[0], 0.06, 1.0))
+    records, parts = list[dict[str, Any]](), []
+    for number in range(plan.rounds):
+        problem = rare_envs.DrivingProblem(SEARCHED[0], ego=VisionEgo(network), base=SEARCHED[1])
+        seed, budget = 1000 * plan.seed + 10 * number, plan.simulations
+        estimate = samplers.estimate(problem, samplers.TwoStage(), seed=seed, max_sim=budget, ensemble_run=False)
+        x = rng.permutation(np.asarray(estimate.failures.x))
+        parts.append({"driven": x[::2][: plan.driven], "held_out": x[1::2][: plan.driven]})
+        records.append({"round": number, "env_id": SEARCHED[0], "p": estimate.p, "found": len(x)})
+        data += scenarios(SEARCHED[0], parts[-1]["driven"], 0.3)
+        data += situations(network, plan.drives[1], 0.15, 0.0)
+        for env_id, base in DRAWN:
+            drawn = np.asarray(load_base(find_scenario(env_id), base).sample(plan.draws, rng))
+            data += scenarios(env_id, drawn, 0.15)
+        pictures = concatenate(data)
+        network.train().requires_grad_(True)
+        optimiser = torch.optim.Adam(network.parameters(), plan.rate)
+        steps = math.ceil(plan.visits / plan.batch)
+        for step in range(steps):
+            for group in optimiser.param_groups:
+                group["lr"] = 0.5 * plan.rate * (1.0 + math.cos(math.pi * step / steps))
+            some = draw_batch(pictures, plan.batch, rng)
+            given = network(some.picture, some.earlier, some.speed)
+            _step(optimiser, nn.functional.smooth_l1_loss(given, some.expert, beta=0.5), list(network.parameters()))
+        network.eval().requires_grad_(False)
+        typer.echo(f"correction {number}: p = {estimate.p:.2g}, {len(x)} failures found", err=True)
+    problem = rare_envs.DrivingProblem(SEARCHED[0], ego=VisionEgo(network))
+    for record, each in zip(records, parts, strict=True):
+        for name, x in each.items():
+            failing = int((problem.evaluate(x) <= 0.0).sum()) if len(x) else 0
+            record |= {name: len(x), f"{name}_failing": failing}
+    return records
+
+
+@use_one_thread()
+def main(
+    out: RunFolderOption,
+    seed: Annotated[int, typer.Option(help="Of everything that is random.")] = 0,
+    judged: Annotated[int, typer.Option(help="Minutes of driving in each kind of ordinary traffic to judge it.")] = 30,
+) -> None:
+    """Train and correct the ego `vision`; write it to OUT/vision.safetensors, with the counts in OUT/rounds.json."""
+    out.mkdir(parents=True, exist_ok=True)
+    network = train_vision(VisionPlan(seed=seed))
+    records = correct_vision(network, CorrectionPlan(seed=seed))
+    replace_text(out / "rounds.json", json.dumps(records, indent=1) + "\n")
+    provenance = Provenance(
+        kind="imitation of a driver by rule with on-policy corrections (DAgger), corrected",
+        command=f"python -m training.recipes.vision --seed {seed} --judged {judged}",
+        data="Pictures of this project's own simulations; nothing was recorded on a road.",
+        data_licence="that of the project",
+        metrics=judge_all_cases(VisionEgo(network), judged, JUDGE_SEED) if judged else {},
+    )
+    print(f"Wrote {save_vision(network, provenance, out / 'vision.safetensors')}.")
+
+
+if __name__ == "__main__":
+    run_command(main)
