@@ -62,7 +62,7 @@ def reasons(found: Any) -> Counter[str]:
     return Counter(VERDICT_NAMES[k] for k in found.reason.tolist())
 
 
-@pytest.mark.parametrize("case", ["straight", "i80", "bends"])
+@pytest.mark.parametrize("case", ["straight", pytest.param("i80", marks=pytest.mark.slow), "bends"])
 def test_a_driver_by_rule_is_nominal(case: str) -> None:
     found = judge(agents.load_ego("idm"), case, rollouts=12, seed=3, seconds=30.0)
     assert reasons(found) == {"passed": 12}
@@ -131,6 +131,7 @@ def test_parameters_of_encounters_may_be_given() -> None:
     np.testing.assert_allclose(one.x[0, 1::5] - one.x[0, ::5], 145.0, atol=1e-3)
 
 
+@pytest.mark.slow
 def test_the_training_among_encounters_repeats_and_learns_from_people_only() -> None:
     config = Config(
         updates=1, pools=1, scenes=3, horizon=(4, 4), epochs=1, warm_up=1, headway_weight=8.0, lane_weight=8.0
