@@ -78,7 +78,7 @@ def load_ego(
             `.zip` saved by Stable-Baselines3; "hf:USER/REPOSITORY", such a `.zip` of the Hugging Face Hub
             (`agents.sb3.hub`); a path to an `.onnx` file (see `agents.onnx.OnnxEgo` for its form);
             `module:function`, a function without arguments that returns an ego (modules in the working directory are
-            found); `tcp://host:port` for an ego in another program (docs/remote.md); or `process:EGO` or `noisy:EGO`.
+            found); `tcp://host:port` for an ego in another program (docs/egos.md); or `process:EGO` or `noisy:EGO`.
             `process:EGO` is any of these files and functions in a process of its own, which is ended and started anew
             where the ego hangs or dies. `noisy:EGO` is any ego behind the imperfections of a full stack
             (`agents.imperfect_stack.Stack`).
@@ -201,10 +201,10 @@ def _load_elsewhere(kind: EgoKind, text: str, algo: str | None, trust: bool, sta
     try:
         if kind == "process":
             _require_inner_ego(text)
-            from agents.remote.subprocess_link import isolate
+            from agents.remote.client import isolate
 
             return isolate(text.removeprefix("process:"), algo, trust, stats)
-        from agents.remote.zmq_link import connect
+        from agents.remote.client import connect
 
         return connect(text)
     except EgoGone as error:

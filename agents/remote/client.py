@@ -1,4 +1,4 @@
-"""Client of a remote ego: in another program, another language or a process of its own. See docs/remote.md."""
+"""Client of a remote ego: in another program, another language or a process of its own. See docs/egos.md."""
 
 from __future__ import annotations
 
@@ -6,15 +6,17 @@ import itertools
 import time
 import warnings
 import weakref
-from typing import Any, Protocol
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
 from urllib.parse import parse_qsl
 
 import numpy as np
 from numpy.typing import NDArray
 
 from agents.remote import protocol
+from agents.remote.link import HandshakeError, LinkError, NoReply, ProcessLink, ServerLink, read_secret
 from agents.remote.protocol import MalformedMessage, Message
-from agents.remote.space_encoding import decode_space
 from rare_envs.egos.errors import EgoGone, NoAnswer
 from rare_envs.sensors.kinds import batch_size
 
@@ -32,18 +34,6 @@ _PART_FACTOR, _MIN_PART_TIMEOUT = 10.0, 0.5
 """A part of a batch that was not answered gets this multiple of the longest answer so far, and at least so long [s]."""
 
 
-class LinkError(Exception):
-    """A request without an answer: the server is silent, or the connection broke."""
-
-
-class NoReply(LinkError):
-    """A request that was not answered in time, or at which the ego's process ended: perhaps the request caused it."""
-
-
-class HandshakeError(LinkError):
-    """A connection that the server will never accept: one side has a secret and the other none, say."""
-
-
 class WaitingForEgo(UserWarning):
     """No server answers yet, and the client waits for one."""
 
@@ -51,44 +41,15 @@ class WaitingForEgo(UserWarning):
 class RemoteError(RuntimeError):
     """A request that was answered with an error, or twice not at all.
 
-    Attributes:
-        code: Code of the error, see docs/remote.md; "" without one.
-
     Example:
         >>> RemoteError("no road", "ego").code
         'ego'
     """
 
     def __init__(self, reason: str, code: str = "") -> None:
-        """Make an error."""
+        """Make an error, of a code that docs/egos.md has; "" without one."""
         super().__init__(reason)
         self.code = code
-
-
-class Link(Protocol):
-    """A connection that carries requests and answers."""
-
-    @property
-    def address(self) -> str:
-        """Address of the server, for messages."""
-
-    @property
-    def load_timeout(self) -> float:
-        """Least time [s] to wait for the first answer, in which an ego may have to be loaded."""
-
-    def open(self) -> None:
-        """Begin anew; a request under way is dropped."""
-
-    def request(self, content: bytes, timeout: float) -> bytes:
-        """Send a message and return its answer.
-
-        Raises:
-            NoReply: There is none within the time [s], or the ego's process has ended.
-            LinkError: The connection broke, or was refused.
-        """
-
-    def close(self) -> None:
-        """End it."""
 
 
 def parse_address(spec: str) -> tuple[str, dict[str, float]]:
@@ -96,10 +57,6 @@ def parse_address(spec: str) -> tuple[str, dict[str, float]]:
 
     Raises:
         ValueError: The part after "?" has other settings.
-
-    Example:
-        >>> parse_address("tcp://127.0.0.1:5555?timeout=10")
-        ('tcp://127.0.0.1:5555', {'timeout': 10.0})
     """
     address, mark, query = spec.partition("?")
     try:
@@ -111,18 +68,18 @@ def parse_address(spec: str) -> tuple[str, dict[str, float]]:
     return address, settings
 
 
-class _ClientSession:
+@dataclass(eq=False)
+class _Session:
     """One batch of episodes on the server, with the history that restores it there."""
 
-    def __init__(self, number: int, batch: int) -> None:
-        self.number = number
-        self.batch = batch
-        self.step = 0
-        self.epoch = -1
-        """Connection on which the server knows it."""
-        self.memory = False
-        self.history: list[tuple[Any, NDArray[np.bool_] | None]] = []
-        """Observations and starts of the episode up to now, if the session has a memory."""
+    number: int
+    batch: int
+    step: int = 0
+    epoch: int = -1
+    """Connection on which the server knows it."""
+    memory: bool = False
+    history: list[tuple[Any, NDArray[np.bool_] | None]] = field(default_factory=list)
+    """Observations and starts of the episode up to now, if the session has a memory."""
 
 
 class RemoteEgo:
@@ -148,7 +105,7 @@ class RemoteEgo:
         >>> with_ego.close()
     """
 
-    def __init__(self, link: Link, timeout: float = TIMEOUT, patience: float = PATIENCE) -> None:
+    def __init__(self, link: ServerLink, timeout: float = TIMEOUT, patience: float = PATIENCE) -> None:
         """Connect.
 
         Args:
@@ -168,12 +125,12 @@ class RemoteEgo:
         self._longest_answer = 0.0
         self._warm = False
         self._connected = False
-        self._reusable: dict[int, _ClientSession] = {}
+        self._reusable: dict[int, _Session] = {}
         self._ended: list[int] = []
         try:
             hello = self._connect()
-            self.observation_space = decode_space(hello.get("observation"))
-            self.action_space = decode_space(hello.get("action"))
+            self.observation_space = protocol.decode_space(hello.get("observation"))
+            self.action_space = protocol.decode_space(hello.get("action"))
         except RemoteError as error:
             link.close()
             raise ValueError(f"The ego at {link.address} refuses: {error}") from error
@@ -210,7 +167,7 @@ class RemoteEgo:
         session.history.clear()
         return action, None
 
-    def _find_session(self, batch: int) -> _ClientSession:
+    def _find_session(self, batch: int) -> _Session:
         """Return a session without a memory, if there is one of this size, else a new one."""
         while self._ended and self._connected:  # batches with a memory that nobody refers to any more
             try:
@@ -219,11 +176,11 @@ class RemoteEgo:
                 self._connected = False
         if batch in self._reusable:
             return self._reusable[batch]
-        session = _ClientSession(next(self._numbers), batch)
+        session = _Session(next(self._numbers), batch)
         weakref.finalize(session, self._ended.append, session.number)
         return session
 
-    def _act(self, session: _ClientSession, observation: Any, start: NDArray[np.bool_] | None) -> NDArray[Any]:
+    def _act(self, session: _Session, observation: Any, start: NDArray[np.bool_] | None) -> NDArray[Any]:
         """Return the actions for one tick of a session; try again on a new connection where that may help."""
         reason = ""
         if session.batch >= self._smallest_unanswered:
@@ -253,7 +210,7 @@ class RemoteEgo:
             return action
         raise RemoteError(f"The ego at {self._link.address} failed twice on this batch: {reason}")
 
-    def _restore(self, session: _ClientSession) -> None:
+    def _restore(self, session: _Session) -> None:
         """Begin a session on the server if it does not know it, and bring it to the present tick."""
         if session.epoch == self._epoch:
             return
@@ -264,9 +221,7 @@ class RemoteEgo:
             self._send_act(session, step, observation, start)
         session.epoch = self._epoch
 
-    def _send_act(
-        self, session: _ClientSession, step: int, observation: Any, start: NDArray[np.bool_] | None
-    ) -> Message:
+    def _send_act(self, session: _Session, step: int, observation: Any, start: NDArray[np.bool_] | None) -> Message:
         """Return the answer for one tick of a session."""
         message: Message = {
             "type": "act",
@@ -290,16 +245,6 @@ class RemoteEgo:
         if not (self._warm and 1 < batch < self._smallest_unanswered):
             return self._timeout
         return min(self._timeout, max(_MIN_PART_TIMEOUT, _PART_FACTOR * self._longest_answer))
-
-    def ping(self) -> float:
-        """Return the seconds that the server takes to answer a ping.
-
-        Raises:
-            LinkError: It does not answer.
-        """
-        sent = time.perf_counter()
-        self._request({"type": "ping"})
-        return time.perf_counter() - sent
 
     def _request(self, message: Message, timeout: float | None = None) -> Message:
         """Send a message and return its answer.
@@ -374,3 +319,27 @@ class RemoteEgo:
 def _declared_spaces(hello: Message) -> tuple[Any, Any]:
     """Return the spaces that a hello declares, as maps."""
     return hello.get("observation"), hello.get("action")
+
+
+def connect(spec: str) -> RemoteEgo:
+    """Connect to the ego at an address.
+
+    Args:
+        spec: "tcp://host:port"; "?timeout=10&patience=30" behind it sets how many seconds to wait for an answer, and
+            for the ego to come back. The shared secret, if there is one, is in the environment: RARE_ENVS_SECRET.
+
+    Raises:
+        EgoGone: No server answers.
+        ValueError: The address is malformed, or something else than an ego answers.
+    """
+    address, settings = parse_address(spec)
+    return RemoteEgo(ServerLink(address, read_secret()), **settings)
+
+
+def isolate(spec: str, algo: str | None = None, trust: bool = False, stats: str | Path | None = None) -> RemoteEgo:
+    """Load an ego in a process of its own; arguments and errors are those of `agents.load_ego`.
+
+    "?timeout=10" behind its name sets how many seconds an answer may take.
+    """
+    address, settings = parse_address(spec)
+    return RemoteEgo(ProcessLink(address, algo, trust, stats), **settings)

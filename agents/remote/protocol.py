@@ -1,4 +1,4 @@
-"""Messages between the simulation and a remote ego: msgpack maps, with arrays as bytes. See docs/remote.md."""
+"""Messages between the simulation and a remote ego: msgpack maps, arrays as bytes, spaces. See docs/egos.md."""
 
 from __future__ import annotations
 
@@ -7,7 +7,10 @@ from typing import Any, TypeGuard
 
 import msgpack
 import numpy as np
+from gymnasium import spaces
 from numpy.typing import NDArray
+
+from rare_envs.egos.errors import reason_of
 
 PROTOCOL = 1
 """Version of the protocol; both sides must speak the same."""
@@ -21,6 +24,10 @@ DTYPES = ("<f4", "<f8", "<i4", "<i8", "|u1")
 """Types of arrays, by NumPy's names."""
 _LIMITS = {"max_array_len": 4096, "max_map_len": 64, "max_str_len": 2**16, "max_ext_len": 0}
 _MAX_AXES = 5
+MAX_BOUNDS = 1024
+"""Entries of a space's bound that are sent."""
+MAX_ENTRIES = 2**23
+"""Entries of one observation, in a space that a client accepts."""
 
 Message = dict[str, Any]
 
@@ -39,7 +46,7 @@ def unpack(content: bytes) -> Message:
     """Return the message in some bytes, whoever wrote them.
 
     Raises:
-        Malformed: They are no msgpack map with text for keys, or too many.
+        MalformedMessage: They are no msgpack map with text for keys, or too many.
     """
     if len(content) > MAX_BYTES:
         raise MalformedMessage(f"a message of {len(content)} bytes, more than {MAX_BYTES}")
@@ -56,7 +63,7 @@ def pack_array(values: NDArray[Any]) -> Message:
     """Return an array as a map of dtype, shape and little-endian bytes in C order.
 
     Raises:
-        Malformed: It holds something else than numbers.
+        MalformedMessage: It holds something else than numbers.
     """
     if values.dtype == bool:
         values = values.astype(np.uint8)
@@ -73,7 +80,7 @@ def unpack_array(given: Any) -> NDArray[Any]:
     """Return the array in a map that `pack_array` made.
 
     Raises:
-        Malformed: It is not of that form, or dtype, shape and bytes do not go together.
+        MalformedMessage: It is not of that form, or dtype, shape and bytes do not go together.
     """
     if not isinstance(given, dict) or set(given) != {"dtype", "shape", "data"}:
         raise MalformedMessage("an array is a map of dtype, shape and data")
@@ -98,7 +105,7 @@ def unpack_observation(given: Any, batch: int) -> Any:
     """Return the observations in a map that `pack_observation` made.
 
     Raises:
-        Malformed: It is not of that form, or has another number of rows.
+        MalformedMessage: It is not of that form, or has another number of rows.
     """
     named = isinstance(given, dict) and set(given) == {"parts"}
     parts = given["parts"] if named else {"": given}
@@ -121,3 +128,68 @@ def is_shape(value: object, most: int = MAX_BYTES) -> TypeGuard[list[int]]:
     if not isinstance(value, list) or len(value) > _MAX_AXES or not all(is_count(size, most) for size in value):
         return False
     return math.prod(value) <= most
+
+
+def encode_space(space: Any) -> Message | None:
+    """Return a space as a map; None for a space that the protocol cannot express."""
+    if isinstance(space, spaces.Discrete):
+        return {"n": int(space.n)}
+    if isinstance(space, spaces.Dict):
+        return {"parts": {name: encode_space(part) for name, part in space.items()}}
+    if isinstance(space, spaces.Box):
+        whole = {"dtype": "|u1"} if space.dtype == np.uint8 else {}
+        return {"shape": list(space.shape), **whole, "low": _encode_bound(space.low), "high": _encode_bound(space.high)}
+    return None
+
+
+def _encode_bound(values: NDArray[Any]) -> Any:
+    """Return a bound as one number if all entries are equal, as a list, or as None if there are too many entries."""
+    if values.size and (values == values.flat[0]).all():
+        return float(values.flat[0])
+    return values.ravel().tolist() if values.size <= MAX_BOUNDS else None
+
+
+def decode_space(given: Any) -> spaces.Space[Any] | None:
+    """Return the space in a map that `encode_space` made; None if there is none.
+
+    Raises:
+        MalformedMessage: It is not of that form.
+    """
+    try:
+        return _decode_space(given, nested=False)
+    except Exception as error:  # the server may have sent anything
+        raise MalformedMessage(f"a space {given!r:.100}: {reason_of(error)}") from error
+
+
+def _decode_space(given: Any, nested: bool) -> spaces.Space[Any] | None:
+    """Return the space in a map; parts may not have parts of their own."""
+    if given is None:
+        return None
+    if "parts" in given:
+        if nested:
+            raise MalformedMessage("parts of parts")
+        parts = {name: _decode_space(part, nested=True) for name, part in given["parts"].items()}
+        if not parts or None in parts.values():
+            return None
+        return spaces.Dict({name: part for name, part in parts.items() if part is not None})
+    if "n" in given:
+        if not is_count(given["n"]):
+            raise MalformedMessage("n is a whole number")
+        return spaces.Discrete(given["n"])
+    shape = given["shape"]
+    if not is_shape(shape, MAX_ENTRIES):
+        raise MalformedMessage(f"shape {shape!r:.50}")
+    dtype: Any = np.uint8 if given.get("dtype") == "|u1" else np.float32
+    widest = (0, 255) if dtype == np.uint8 else (-np.inf, np.inf)
+    low, high = (
+        _decode_bound(given.get(end), shape, limit) for end, limit in zip(("low", "high"), widest, strict=True)
+    )
+    return spaces.Box(low.clip(*widest).astype(dtype), high.clip(*widest).astype(dtype), dtype=dtype)
+
+
+def _decode_bound(given: Any, shape: list[int], limit: float) -> NDArray[np.float64]:
+    """Return a bound for every entry, shape `shape`."""
+    bound = np.asarray(limit if given is None else given, dtype=np.float64)
+    if np.isnan(bound).any():
+        raise MalformedMessage("a bound is NaN")
+    return bound.reshape(shape) if bound.ndim else np.full(shape, bound)

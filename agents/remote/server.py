@@ -1,30 +1,216 @@
-"""A server that serves an ego to simulations elsewhere, over ZeroMQ."""
+"""Server of an ego: a request in, an answer out, over ZeroMQ. See docs/egos.md.
+
+    python -m agents.remote.server ADDRESS ARGUMENTS
+
+is the program of the process in which `process:EGO` answers: it connects to ADDRESS; ARGUMENTS are those of
+`agents.load_ego` as JSON.
+"""
 
 from __future__ import annotations
 
 import ipaddress
+import json
 import os
 import shutil
-import tempfile
+import sys
 import threading
+from collections import OrderedDict
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import zmq
 
-from agents.remote.curve import SECRET_VARIABLE, secure_server
-from agents.remote.protocol import MAX_BYTES
-from agents.remote.relay import BoundedRelay
-from agents.remote.request_handler import RequestHandler
+from agents.remote import protocol
+from agents.remote.link import SECRET_VARIABLE, Socket, derive_server_keys
+from agents.remote.protocol import MalformedMessage, Message
+from rare_envs.egos.errors import EgoGone, is_policy, reason_of
+from rare_envs.threads import use_one_thread
 
+MAX_CLIENTS, MAX_SESSIONS = 64, 1024
+"""Connections, and sessions of all of them, that are remembered; the least recently used makes room."""
+MAX_MEMORY = 2**28
+"""Bytes of the memory of the ego that are kept for all sessions; the least recently used ones make room."""
 QUEUED_MESSAGES = 4
 """Messages of a connection that ZeroMQ keeps in each direction; a client has one request under way."""
 POLL_INTERVAL = 100
 """Time after which the server looks whether it is to stop [ms]."""
 
 
+class RequestRefused(Exception):
+    """A request that is answered with an error, by its code; docs/egos.md has the codes."""
+
+    def __init__(self, code: str, reason: str) -> None:
+        super().__init__(reason)
+        self.code = code
+
+
+@dataclass
+class _Session:
+    """One batch of episodes."""
+
+    batch: int
+    """Number of rows."""
+    step: int = 0
+    """Next tick."""
+    memory: Any = None
+    """State of the ego after the last tick."""
+    size: int = 0
+    """Bytes of the memory."""
+
+
+class RequestHandler:
+    """Answers requests for an ego, whatever they contain."""
+
+    def __init__(self, ego: Any, name: str = "ego") -> None:
+        """Make a handler.
+
+        Args:
+            ego: Has `predict`; its `observation_space`, `action_space` and `deterministic` are sent if it has them.
+            name: Name of the ego, which clients are told.
+        """
+        self._ego, self._name = ego, name
+        self._last_ids: OrderedDict[bytes, int] = OrderedDict()
+        self._sessions: OrderedDict[tuple[bytes, int], _Session] = OrderedDict()
+        self._actions: dict[str, Callable[[bytes, Message], Message]] = {
+            "reset": self._reset,
+            "act": self._act,
+            "end": self._end,
+            "ping": lambda connection, message: {"type": "pong"},
+        }
+
+    def handle(self, connection: bytes, content: bytes) -> bytes:
+        """Return the answer to a request; there always is one, if only an error.
+
+        Args:
+            connection: Identifies the connection that the request came on.
+            content: The request.
+        """
+        number = None
+        try:
+            message = protocol.unpack(content)
+            number = message.get("id") if protocol.is_count(message.get("id")) else None
+            if number is None:
+                raise MalformedMessage("id is a whole number")
+            answer = self._hello if message.get("type") == "hello" else self._answer
+            reply = answer(connection, message)
+        except RequestRefused as error:
+            reply = {"type": "error", "code": error.code, "reason": str(error)}
+        except MalformedMessage as error:
+            reply = {"type": "error", "code": "malformed", "reason": f"Malformed message: {error}."}
+        except Exception as error:  # no request may end the server
+            reply = {"type": "error", "code": "internal", "reason": reason_of(error)}
+        return protocol.pack({**reply, "id": number})
+
+    def _hello(self, connection: bytes, message: Message) -> Message:
+        """Begin a connection, and describe the ego."""
+        version = message.get("protocol")
+        if not protocol.is_count(version) or version != protocol.PROTOCOL:
+            raise RequestRefused("version", f"This server speaks protocol {protocol.PROTOCOL}, not {version!r:.50}.")
+        self._forget(connection)
+        self._last_ids[connection] = message["id"]
+        while len(self._last_ids) > MAX_CLIENTS:
+            self._forget(next(iter(self._last_ids)))
+        # the ego is the user's: nothing but predict is asked of it
+        deterministic = getattr(self._ego, "deterministic", None)
+        return {
+            "type": "hello",
+            "protocol": protocol.PROTOCOL,
+            "name": self._name,
+            "observation": protocol.encode_space(getattr(self._ego, "observation_space", None)),
+            "action": protocol.encode_space(getattr(self._ego, "action_space", None)),
+            "deterministic": deterministic if isinstance(deterministic, bool) else None,
+            "max_batch": protocol.MAX_BATCH,
+        }
+
+    def _forget(self, connection: bytes) -> None:
+        """Forget a connection and its sessions."""
+        self._last_ids.pop(connection, None)
+        for key in [key for key in self._sessions if key[0] == connection]:
+            del self._sessions[key]
+
+    def _answer(self, connection: bytes, message: Message) -> Message:
+        """Answer a request that comes after the hello."""
+        last = self._last_ids.get(connection)
+        if last is None:
+            raise RequestRefused("hello", "Expected a hello first.")
+        if message["id"] <= last:
+            raise RequestRefused("malformed", f"Expected an id above {last}, got {message['id']}.")
+        self._last_ids[connection] = message["id"]
+        kind = message.get("type")
+        if not isinstance(kind, str) or kind not in self._actions:
+            raise RequestRefused("unknown", f"Unknown type {kind!r:.50}; expected hello, {', '.join(self._actions)}.")
+        return self._actions[kind](connection, message)
+
+    def _reset(self, connection: bytes, message: Message) -> Message:
+        """Begin a session."""
+        batch, number = message.get("batch"), message.get("session")
+        if not protocol.is_count(batch, protocol.MAX_BATCH) or not batch or not protocol.is_count(number):
+            raise MalformedMessage(f"reset has a session (a number) and a batch from 1 to {protocol.MAX_BATCH}")
+        self._sessions.pop((connection, number), None)
+        self._sessions[connection, number] = _Session(batch)
+        self._make_room()
+        return {"type": "ready"}
+
+    def _act(self, connection: bytes, message: Message) -> Message:
+        """Query the ego for one tick of a session."""
+        number, step = message.get("session"), message.get("step")
+        session = self._sessions.get((connection, number)) if protocol.is_count(number) else None
+        if number is None or session is None or step != session.step or isinstance(step, bool):
+            reason = "Unknown session or another step; reset it and send its observations again."
+            raise RequestRefused("session", reason)
+        observation = protocol.unpack_observation(message.get("observation"), session.batch)
+        start = np.full(session.batch, session.step == 0)
+        if message.get("start") is not None:
+            given = protocol.unpack_array(message["start"])
+            if given.shape != (session.batch,):
+                raise MalformedMessage(f"start has one number for each of {session.batch} rows")
+            start |= given.astype(bool)
+        try:
+            action, memory = self._ego.predict(
+                observation, state=session.memory, episode_start=start, deterministic=True
+            )
+            action = np.asarray(action)
+            if action.shape[:1] != (session.batch,):
+                raise ValueError(f"Expected actions for {session.batch} rows, got shape {action.shape}.")
+            packed = protocol.pack_array(action)
+        except (Exception, SystemExit, EgoGone) as error:  # the ego is the user's: anything may happen in it
+            del self._sessions[connection, number]
+            raise RequestRefused("ego", reason_of(error)) from error
+        session.memory, session.step, session.size = memory, session.step + 1, measure_bytes(memory)
+        self._sessions.move_to_end((connection, number))
+        self._make_room()
+        return {"type": "action", "action": packed, "memory": memory is not None}
+
+    def _make_room(self) -> None:
+        """Forget sessions, but for the one used last, until there are few enough; their clients send them again."""
+        total = sum(session.size for session in self._sessions.values())
+        while len(self._sessions) > 1 and (total > MAX_MEMORY or len(self._sessions) > MAX_SESSIONS):
+            total -= self._sessions.popitem(last=False)[1].size
+
+    def _end(self, connection: bytes, message: Message) -> Message:
+        """Forget a session."""
+        number = message.get("session")
+        if protocol.is_count(number):
+            self._sessions.pop((connection, number), None)
+        return {"type": "ended"}
+
+
+def measure_bytes(memory: Any) -> int:
+    """Return the bytes of the arrays in what an ego remembers, and about those of other objects."""
+    own = sys.getsizeof(memory)
+    if isinstance(memory, dict):
+        return own + sum(measure_bytes(value) for value in memory.values())
+    if isinstance(memory, tuple | list):
+        return own + sum(map(measure_bytes, memory))
+    n_bytes = getattr(memory, "nbytes", 0)  # of NumPy and torch; the memory is the ego's
+    return max(own, n_bytes) if isinstance(n_bytes, int) else own
+
+
 class EgoServer:
-    """Answers requests for an ego, one after the other; docs/remote.md has the messages.
+    """Answers requests for an ego, one after the other; docs/egos.md has the messages.
 
     Attributes:
         address: Where it listens, the port filled in.
@@ -63,58 +249,25 @@ class EgoServer:
             )
         self._handler = RequestHandler(ego, name)
         self._stop = threading.Event()
-        self._context = zmq.Context()
-        self._socket = self._context.socket(zmq.ROUTER)
-        self._socket.setsockopt(zmq.MAXMSGSIZE, MAX_BYTES)
-        self._socket.setsockopt(zmq.LINGER, 0)
-        self._socket.setsockopt(zmq.RCVHWM, QUEUED_MESSAGES)
-        self._socket.setsockopt(zmq.SNDHWM, QUEUED_MESSAGES)
-        self._folder: str | None = None
-        self._relay: BoundedRelay | None = None
+        self._context: zmq.Context[Socket] = zmq.Context()
+        self._socket = make_router(self._context)
         try:
             if secret:
-                secure_server(self._socket, secret)
-            self.address = self._listen(bind)
-        except (zmq.ZMQError, OSError, OverflowError) as error:
+                self._socket.curve_publickey, self._socket.curve_secretkey = derive_server_keys(secret)
+                self._socket.curve_server = True
+            self._socket.setsockopt(zmq.IPV6, "[" in bind)
+            self._socket.bind(bind.replace("tcp://localhost:", "tcp://127.0.0.1:"))
+        except (zmq.ZMQError, ValueError) as error:
             self.close()
             hint = "" if bind.startswith("tcp://") else "; expected tcp://host:port"
-            number = error.errno if isinstance(error, OSError) else None  # that of a failed look-up is negative
-            reason = os.strerror(number) if number and number > 0 else error
+            reason = error.strerror if isinstance(error, zmq.ZMQError) else error
             raise ValueError(f"Cannot listen on {bind!r}: {reason}{hint}.") from error
-        except ValueError:
-            self.close()
-            raise
-
-    def _listen(self, bind: str) -> str:
-        """Return where the server listens: TCP by a relay that bounds what clients send, where there are Unix sockets.
-
-        Raises:
-            zmq.ZMQError: The address is malformed.
-            OSError: It cannot be used.
-        """
-        place = parse_tcp(bind)
-        if place is None or os.name != "posix":
-            self._socket.bind(bind)
-            return str(self._socket.getsockopt_string(zmq.LAST_ENDPOINT))
-        self._folder = tempfile.mkdtemp(prefix="rare-envs-")  # which others cannot enter
-        path = str(Path(self._folder) / "ego")
-        self._socket.bind(f"ipc://{path}")
-        self._relay = BoundedRelay(*place, path)
-        return self._relay.address
+        self.address = str(self._socket.getsockopt_string(zmq.LAST_ENDPOINT))
 
     def run(self) -> None:
         """Answer until `stop` is called."""
         while not self._stop.is_set():
-            if self._socket.poll(POLL_INTERVAL):
-                self._handle_one()
-
-    def _handle_one(self) -> None:
-        """Answer one request."""
-        connection, *frames = self._socket.recv_multipart()
-        envelope = [b""] if len(frames) > 1 and frames[0] == b"" else []  # of REQ, which DEALER may leave out
-        content = frames[-1] if len(frames) == len(envelope) + 1 else b""  # several frames are no message
-        answer = self._handler.handle(connection, content)
-        self._socket.send_multipart([connection, *envelope, answer])  # to nobody, if the client has gone
+            answer_next(self._socket, self._handler.handle)
 
     def stop(self) -> None:
         """End `run` from another thread."""
@@ -122,12 +275,7 @@ class EgoServer:
 
     def close(self) -> None:
         """Stop listening."""
-        if self._relay is not None:
-            self._relay.close()
         self._context.destroy(0)
-        if self._folder is not None:
-            shutil.rmtree(self._folder, ignore_errors=True)
-        self._relay = self._folder = None
 
     def __enter__(self) -> EgoServer:
         """Return the server."""
@@ -138,27 +286,28 @@ class EgoServer:
         self.close()
 
 
-def parse_tcp(address: str) -> tuple[str, int] | None:
-    """Return host and port of an address; None if it is none of TCP, which ZeroMQ may know.
+def make_router(context: zmq.Context[Socket]) -> Socket:
+    """Return a socket for requests, of bounded messages and queues."""
+    router = context.socket(zmq.ROUTER)
+    router.setsockopt(zmq.MAXMSGSIZE, protocol.MAX_BYTES)
+    router.setsockopt(zmq.LINGER, 0)
+    router.setsockopt(zmq.RCVHWM, QUEUED_MESSAGES)
+    router.setsockopt(zmq.SNDHWM, QUEUED_MESSAGES)
+    return router
 
-    Example:
-        >>> parse_tcp("tcp://*:5555"), parse_tcp("tcp://[::1]:*"), parse_tcp("ipc:///tmp/ego")
-        (('0.0.0.0', 5555), ('::1', 0), None)
-    """
-    host, _, port = address.removeprefix("tcp://").rpartition(":")
-    if not address.startswith("tcp://") or not (port == "*" or (port.isascii() and port.isdigit())):
-        return None
-    host = {"*": "0.0.0.0", "localhost": "127.0.0.1"}.get(host, host.strip("[]"))
-    return (host, 0 if port == "*" else int(port)) if host else None
+
+def answer_next(router: Socket, handle: Callable[[bytes, bytes], bytes]) -> None:
+    """Answer one request, if one comes soon."""
+    if not router.poll(POLL_INTERVAL):
+        return
+    connection, *frames = router.recv_multipart()
+    envelope = [b""] if len(frames) > 1 and frames[0] == b"" else []  # of REQ, which DEALER may leave out
+    content = frames[-1] if len(frames) == len(envelope) + 1 else b""  # several frames are no message
+    router.send_multipart([connection, *envelope, handle(connection, content)])  # to nobody, if the client has gone
 
 
 def is_loopback(address: str) -> bool:
-    """Return whether only programs on this machine can reach an address.
-
-    Example:
-        >>> is_loopback("tcp://127.0.0.1:5555"), is_loopback("tcp://*:5555")
-        (True, False)
-    """
+    """Return whether only programs on this machine can reach an address."""
     if address.startswith(("ipc://", "inproc://")):
         return True
     host = address.removeprefix("tcp://").rpartition(":")[0].strip("[]")
@@ -168,3 +317,41 @@ def is_loopback(address: str) -> bool:
         return ipaddress.ip_address(host).is_loopback
     except ValueError:
         return False
+
+
+# --- the process of an ego ------------------------------------------------------------------------
+
+
+def main(address: str, arguments: str) -> None:
+    """Load an ego and answer for it, as long as the process that started this one is there.
+
+    Args:
+        address: Of the socket to connect to.
+        arguments: Of `agents.load_ego`, as JSON.
+    """
+    parent = os.getppid()
+    with use_one_thread():
+        handle = _load_handler(arguments)
+        router = make_router(zmq.Context.instance())
+        router.connect(address)
+        while os.getppid() == parent:
+            answer_next(router, handle)
+    shutil.rmtree(Path(address.removeprefix("ipc://")).parent, ignore_errors=True)  # which nobody else will remove
+
+
+def _load_handler(arguments: str) -> Callable[[bytes, bytes], bytes]:
+    """Return what answers for an ego; where it cannot be loaded, every answer is the reason."""
+    from agents.loading import load_ego
+
+    try:
+        ego = load_ego(**json.loads(arguments))
+        if not is_policy(ego):
+            raise ValueError(f"Expected an ego with predict for a process of its own, got {ego!r}.")
+    except (ValueError, OSError) as error:
+        refusal = {"type": "error", "code": "ego", "reason": str(error), "id": None}
+        return lambda connection, content: protocol.pack(refusal)
+    return RequestHandler(ego).handle
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])

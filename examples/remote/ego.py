@@ -11,7 +11,7 @@ REPLIES = {"hello": HELLO, "ping": {"type": "pong"}, "reset": {"type": "ready"},
 
 
 def answer(message: dict, sessions: dict) -> dict:
-    """Answer a message of docs/remote.md: keep 1.5 s behind the vehicle ahead, by docs/environments.md's features."""
+    """Answer a message of docs/egos.md: keep 1.5 s behind the vehicle ahead, by docs/environments.md's features."""
     if message["type"] != "act":
         sessions[message.get("session")] = (message.get("batch"), 0)
         return REPLIES[message["type"]]

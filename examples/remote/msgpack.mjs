@@ -1,4 +1,4 @@
-// The part of msgpack (https://msgpack.org) that docs/remote.md uses: null, booleans, numbers, text, bytes, lists, maps.
+// The part of msgpack (https://msgpack.org) that docs/egos.md uses: null, booleans, numbers, text, bytes, lists, maps.
 
 export class Malformed extends Error {}
 

@@ -1,4 +1,4 @@
-// A server of an ego on msgpack.mjs and zmtp.mjs: the protocol of docs/remote.md, apart from what the ego decides.
+// A server of an ego on msgpack.mjs and zmtp.mjs: the protocol of docs/egos.md, apart from what the ego decides.
 import net from "node:net";
 import { Malformed, pack, unpack } from "./msgpack.mjs";
 import { send, speak } from "./zmtp.mjs";

@@ -224,8 +224,8 @@ def serve_ego_command(
     from rare_envs.egos.errors import is_policy
 
     try:
+        from agents.remote.link import read_secret
         from agents.remote.server import EgoServer
-        from agents.remote.zmq_link import read_secret
     except ImportError as error:
         raise BadInput("Serving needs pyzmq and msgpack: pip install 'rare-envs[remote]'.") from error
     try:

@@ -19,14 +19,14 @@ def check_protocol(spec: str) -> Iterator[Finding]:
     """Check a server."""
     try:
         from agents.remote import protocol
-        from agents.remote.client import TIMEOUT, LinkError, parse_address
-        from agents.remote.zmq_link import ZmqLink, read_secret
+        from agents.remote.client import TIMEOUT, parse_address
+        from agents.remote.link import LinkError, ServerLink, read_secret
     except ImportError:
         yield report_failure("protocol", "pyzmq and msgpack are not installed", "pip install 'rare-envs[remote]'")
         return
     address, settings = parse_address(spec)
     timeout = settings.get("timeout", TIMEOUT)
-    link = ZmqLink(address, read_secret())
+    link = ServerLink(address, read_secret())
     numbers = iter(range(1, 10**6))
 
     def ask(message: Any) -> Any:
@@ -53,7 +53,7 @@ def check_protocol(spec: str) -> Iterator[Finding]:
 
 def _protocol_cases(hello: Any) -> dict[str, Callable[[str, Any], Iterator[Finding]]]:
     """Return the cases after the handshake, name to test."""
-    from agents.remote.space_encoding import decode_space
+    from agents.remote.protocol import decode_space
 
     space = decode_space(hello.get("observation")) or spaces.Box(-5.0, 5.0, (7,), np.float32)
 

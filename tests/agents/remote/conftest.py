@@ -12,8 +12,8 @@ import pytest
 pytest.importorskip("zmq", reason="the extra remote is optional")
 pytest.importorskip("msgpack", reason="the extra remote is optional")
 from agents.remote.client import RemoteEgo
+from agents.remote.link import ServerLink
 from agents.remote.server import EgoServer
-from agents.remote.zmq_link import ZmqLink
 from tests.agents.remote.egos import Braking, problem
 
 
@@ -47,7 +47,7 @@ def connect_ego() -> Iterator[Callable[..., RemoteEgo]]:
     made: list[RemoteEgo] = []
 
     def one(address: str, secret: bytes | None = None, timeout: float = 20.0, patience: float = 20.0) -> RemoteEgo:
-        made.append(RemoteEgo(ZmqLink(address, secret), timeout, patience))
+        made.append(RemoteEgo(ServerLink(address, secret), timeout, patience))
         return made[-1]
 
     yield one

@@ -1,25 +1,36 @@
-"""A remote ego drives as a local one, outlives a lost connection, and its failures are told apart."""
+"""Egos elsewhere: in servers, with and without a secret, and in processes of their own."""
 
 from __future__ import annotations
 
+import hashlib
 import itertools
+import os
 import pickle
+import select
+import socket
+import subprocess
+import sys
 import threading
 import time
+from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import msgpack
 import numpy as np
 import pytest
+import zmq
 from gymnasium import spaces
 
+import rare_envs
 from agents import load_ego
 from agents.remote import protocol
-from agents.remote.client import NoReply, RemoteEgo, RemoteError, parse_address
-from agents.remote.request_handler import RequestHandler
+from agents.remote.client import RemoteEgo, RemoteError, WaitingForEgo, connect, parse_address
+from agents.remote.link import LinkError, NoReply, ServerLink, derive_server_keys
+from agents.remote.server import EgoServer, RequestHandler, is_loopback
 from rare_envs.egos.errors import EgoGone, NoAnswer
 from samplers.evaluate import Evaluator
-from tests.agents.remote.egos import Averaging, Braking, problem
+from tests.agents.remote.egos import ENV, Averaging, Braking, problem
 
 
 @pytest.mark.parametrize("ego", [Braking(), Averaging()])
@@ -29,7 +40,6 @@ def test_an_ego_elsewhere_drives_as_at_home(ego: Any, serve: Any, connect_ego: A
     assert there.action_space == ego.action_space
     for rows in (x, x[:7], x[:1], x):
         np.testing.assert_array_equal(problem(there).evaluate(rows), problem(ego).evaluate(rows))
-    assert there.ping() < 20.0
 
 
 def test_discrete_actions_and_wide_ones_arrive(serve: Any, connect_ego: Any) -> None:
@@ -89,8 +99,7 @@ def test_many_batches_with_a_memory_are_forgotten_in_time(serve: Any, connect_eg
     there = connect_ego(server.address)
     for _ in range(10):
         problem(there).evaluate(x[:2])
-    (peer,) = server._handler._clients.values()
-    assert len(peer.sessions) <= 2
+    assert len(server._handler._sessions) <= 2
 
 
 def test_an_ego_that_does_not_come_back_is_gone(serve: Any, connect_ego: Any, x: np.ndarray) -> None:
@@ -236,3 +245,332 @@ def test_time_outs_stand_behind_an_address() -> None:
     for wrong in ("?timeuot=3", "?timeout=0", "?timeout=-1", "?timeout=x", "?timeout", "?timeout=nan", "?patience=1e7"):
         with pytest.raises(ValueError, match="timeout=SECONDS"):
             parse_address(f"tcp://host:1{wrong}")
+
+
+# --- links and servers -------------------------------------------------------------------------
+
+
+OBSERVATION = np.ones((2, 7), np.float32)
+
+
+def test_only_those_with_the_secret_are_answered(serve: Any, connect_ego: Any, monkeypatch: Any) -> None:
+    address = serve(Braking(), secret=b"open sesame").address
+    assert connect_ego(address, b"open sesame").predict(OBSERVATION)[0].shape == (2, 2)
+    for secret in (None, b"open barley", b"open sesame "):
+        with pytest.raises((ValueError, EgoGone), match="the handshake failed; both sides need the same secret"):
+            connect_ego(address, secret, patience=0.3)
+    monkeypatch.setenv("RARE_ENVS_SECRET", "open sesame")
+    again = connect(f"{address}?timeout=5&patience=5")
+    assert again.predict(OBSERVATION)[0].shape == (2, 2)
+    again.close()
+
+
+def test_a_client_with_a_secret_trusts_no_server_without_it(serve: Any, connect_ego: Any) -> None:
+    with pytest.raises((ValueError, EgoGone), match="both sides need the same secret"):
+        connect_ego(serve(Braking()).address, b"open sesame", patience=0.3)
+
+
+def test_clients_without_the_secret_reach_no_code_of_ours(serve: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Neither a request without CURVE nor one under another secret arrives at the handler, and others are served."""
+    arrived, handle = list[bytes](), RequestHandler.handle
+    monkeypatch.setattr(
+        RequestHandler, "handle", lambda self, who, content: (arrived.append(content), handle(self, who, content))[1]
+    )
+    server = serve(Braking(), secret=b"open sesame")
+    hello = protocol.pack({"type": "hello", "protocol": 1, "id": 1})
+    for secret in (None, b"open barley"):
+        link = ServerLink(server.address, secret)
+        link.open()
+        with pytest.raises(LinkError, match="the handshake failed"):
+            link.request(hello, 10.0)
+        link.close()
+    assert arrived == []
+    link = ServerLink(server.address, b"open sesame")
+    link.open()
+    assert protocol.unpack(link.request(hello, 10.0))["type"] == "hello"
+    link.close()
+    assert arrived == [hello]
+
+
+@pytest.mark.parametrize("secret", [None, b"open sesame"])
+def test_with_a_secret_nothing_can_be_read_on_the_way(secret: bytes | None, serve: Any) -> None:
+    """All bytes between the two pass through a relay that keeps them."""
+    server = serve(Braking(), secret=secret, name="a name that is looked for")
+    seen: list[bytes] = []
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        thread = threading.Thread(target=relay, args=(listener, int(server.address.rpartition(":")[2]), seen))
+        thread.start()
+        link = ServerLink(f"tcp://127.0.0.1:{listener.getsockname()[1]}", secret)
+        link.open()
+        reply = protocol.unpack(link.request(protocol.pack({"type": "hello", "protocol": 1, "id": 1}), 10.0))
+        link.close()
+        thread.join()
+    assert reply["name"] == "a name that is looked for"
+    assert (b"a name that is looked for" in b"".join(seen)) == (secret is None)
+
+
+def relay(listener: socket.socket, port: int, seen: list[bytes]) -> None:
+    """Carry one connection to a port, until one side closes it."""
+    client, _ = listener.accept()
+    with client, socket.create_connection(("127.0.0.1", port)) as server:
+        while True:
+            for here in select.select([client, server], [], [], 10.0)[0]:
+                content = here.recv(65536)
+                if not content:
+                    return
+                seen.append(content)
+                (server if here is client else client).sendall(content)
+
+
+def test_a_broken_connection_and_silence_are_told_apart(serve: Any) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        link = ServerLink(f"tcp://127.0.0.1:{listener.getsockname()[1]}")
+        link.open()
+        with pytest.raises(NoReply, match=r"no answer within 0\.1 s"):
+            link.request(b"", 0.1)
+        link.close()
+    server = serve(Braking())
+    link = ServerLink(server.address)
+    link.open()
+    link.request(b"", 10.0)
+    server.end()
+    with pytest.raises(LinkError, match="the connection broke"):
+        link.request(b"", 10.0)
+    link.close()
+
+
+def test_a_port_at_which_nothing_listens_is_said_in_a_second_and_waited_for(serve: Any) -> None:
+    """Its server may still be starting: what is found then is found without a fault."""
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        address = f"tcp://127.0.0.1:{listener.getsockname()[1]}"
+    link, began = ServerLink(address), time.monotonic()
+    link.open()
+    with pytest.raises(LinkError, match="nothing listens there"):
+        link.request(b"", 20.0)
+    assert time.monotonic() - began < 10.0
+    link.close()
+    with pytest.raises(EgoGone, match=r"No ego at tcp://\S+ within 0\.2 s: nothing listens there\."):  # and no warning
+        connect(f"{address}?patience=0.2")
+    late = threading.Timer(2.0, serve, (Braking(), address))
+    late.start()
+    told = r"^no ego at tcp://\S+ yet: nothing listens there; waiting for one, 30 s at most \(\?patience=SECONDS"
+    with pytest.warns(WaitingForEgo, match=told) as warned:
+        there = connect(address)
+    assert len(warned) == 1
+    assert there.predict(OBSERVATION)[0].shape == (2, 2)
+    there.close()
+    late.join()
+
+
+def test_a_wrong_address_is_refused() -> None:
+    with pytest.raises(ValueError, match="expected tcp://host:port"):
+        ServerLink("tcp://no port").open()
+    for port in (0, 99999):  # which ZeroMQ would try for as long as it may
+        with pytest.raises(ValueError, match=rf"Cannot connect to 'tcp://localhost:{port}': expected a port from 1"):
+            ServerLink(f"tcp://localhost:{port}").open()
+
+
+@pytest.mark.parametrize("where", ["tcp", pytest.param("process", marks=pytest.mark.slow)])
+def test_an_ego_elsewhere_sees_camera_and_lidar_as_at_home(where: str, serve: Any, tmp_path: Path) -> None:
+    """Pictures, whose channels come first in the space of the policy, and numbers."""
+    from stable_baselines3 import PPO
+
+    from training import sb3_vec_env
+
+    world: dict[str, Any] = {"observation": "camera+lidar", "camera": (36, 64), "horizon": 0.5}
+    env = sb3_vec_env(ENV, num_envs=1, seed=0, **world)
+    PPO("MultiInputPolicy", env, seed=0, device="cpu").save(tmp_path / "ego.zip")
+    home = load_ego(tmp_path / "ego.zip")
+    assert home.observation_space["camera"].shape == (3, 36, 64)
+    there = load_ego(f"process:{tmp_path}/ego.zip" if where == "process" else serve(home).address)
+    assert there.observation_space == home.observation_space
+    problems = [rare_envs.DrivingProblem(ENV, ego=ego, measure="clearance", **world) for ego in (home, there)]
+    x = problems[0].base.sample(3, np.random.default_rng(0))
+    np.testing.assert_array_equal(problems[1].evaluate(x), problems[0].evaluate(x))
+    there.close()
+
+
+def test_a_secret_is_needed_beyond_this_machine() -> None:
+    for address in ("tcp://*:5555", "tcp://0.0.0.0:5555", "tcp://192.168.1.2:5555", "tcp://[::]:5555", "tcp://lo:1"):
+        assert not is_loopback(address)
+        with pytest.raises(ValueError, match="set a shared secret"):
+            EgoServer(Braking(), address)
+    for address in ("tcp://127.0.0.1:*", "tcp://localhost:1", "tcp://[::1]:1", "ipc:///tmp/ego"):
+        assert is_loopback(address)
+
+
+def test_noise_on_the_socket_does_not_end_the_server(serve: Any, connect_ego: Any) -> None:
+    """Bytes that are no ZeroMQ, greetings cut short, frames that claim to be enormous: that peer alone is dropped."""
+    server = serve(Braking())
+    host, port = server.address.removeprefix("tcp://").split(":")
+    greeting = b"\xff" + bytes(8) + b"\x7f\x03\x00NULL" + bytes(16) + b"\x00" + bytes(31)
+    ready = b"\x04\x19\x05READY\x0bSocket-Type\x00\x00\x00\x03REQ"
+    enormous = b"\x02" + (2**62).to_bytes(8, "big") + b"x" * 1000
+    noise = np.random.default_rng(0).bytes(3000)
+    for content in (
+        noise,
+        greeting[:20],
+        greeting,
+        greeting + noise,
+        greeting + ready + enormous,
+        b"GET / HTTP/1.1\r\n\r\n",
+    ):
+        with socket.create_connection((host, int(port)), timeout=5.0) as raw:
+            raw.sendall(content)
+            time.sleep(0.02)
+    assert connect_ego(server.address).predict(np.ones((2, 7), np.float32))[0].shape == (2, 2)
+
+
+@pytest.mark.slow
+def test_a_served_ego_that_is_killed_and_started_again_loses_nothing(tmp_path: Path) -> None:
+    """With the real command and a real kill, in the middle of a drive."""
+    (tmp_path / "served_for_test.py").write_text(
+        "import numpy as np\n"
+        "class Least:\n"
+        "    def predict(self, observation, state=None, episode_start=None, deterministic=True):\n"
+        "        gap = observation[:, 3]\n"
+        "        least = gap if state is None else np.minimum(gap, np.where(episode_start, gap, state))\n"
+        "        return np.stack((least - 0.4, 0 * gap), axis=1).astype(np.float32), least\n"
+        "def make():\n"
+        "    return Least()\n"
+    )
+    command = [
+        sys.executable,
+        "-c",
+        "from rare_envs.study.cli import main; main()",
+        "serve-ego",
+        "served_for_test:make",
+    ]
+    paths = os.pathsep.join([str(Path(rare_envs.__file__).parents[1]), str(tmp_path)])
+
+    def served(bind: str) -> tuple[subprocess.Popen[str], str]:
+        environment = {**os.environ, "PYTHONPATH": paths}
+        words = [*command, "--bind", bind]
+        process = subprocess.Popen(words, stderr=subprocess.PIPE, text=True, cwd=tmp_path, env=environment)
+        assert process.stderr is not None
+        return process, process.stderr.readline().split(" at ")[1].split(";")[0]
+
+    first, address = served("tcp://127.0.0.1:*")
+    there, running = connect(f"{address}?patience=60"), [first]
+    x, calls, predict = problem(there).base.sample(50, np.random.default_rng(0)), itertools.count(), there.predict
+    plain = problem(there).evaluate(x)
+
+    def interrupted(*words: Any, **more: Any) -> Any:
+        if next(calls) == 7:
+            first.kill()
+            first.wait()
+            threading.Thread(target=lambda: running.append(served(address)[0])).start()
+        return predict(*words, **more)
+
+    there.predict = interrupted  # type: ignore[method-assign]
+    try:
+        with pytest.warns(WaitingForEgo, match="nothing listens there"):  # Python and its imports take over a second
+            np.testing.assert_array_equal(problem(there).evaluate(x), plain)
+    finally:
+        there.close()
+        for process in running:
+            process.kill()
+            process.communicate()
+    assert len(running) == 2
+
+
+def test_a_used_or_wrong_address_is_refused(serve: Any) -> None:
+    taken = serve(Braking()).address
+    for address, hint in ((taken, "Address already in use"), ("udp://127.0.0.1:1", "expected tcp://host:port")):
+        with pytest.raises(ValueError, match=hint):
+            EgoServer(Braking(), address, secret=b"s")
+
+
+def test_keys_follow_from_the_secret() -> None:
+    public, private = derive_server_keys(b"open sesame")
+    assert zmq.curve_public(private) == public
+    derive_server_keys.cache_clear()
+    assert derive_server_keys(b"open sesame") == (public, private)
+    others = [derive_server_keys(secret) for secret in (b"open sesame ", b"open barley", b"")]
+    assert len({public, *(key for key, _ in others)}) == 4
+
+
+def test_the_secret_key_is_that_of_scrypt() -> None:
+    """So that a client in another language can derive it: scrypt, then Z85 (RFC 32 of ZeroMQ), by its alphabet."""
+    alphabet = "0123456789abcdefghijklmnopqrstuvwxyzABCDEFGHIJKLMNOPQRSTUVWXYZ.-:+=^!/*?&<>()[]{}@%$#"
+    raw = hashlib.scrypt(b"open sesame", salt=b"rare-envs ego server", n=16384, r=8, p=1, dklen=32)
+    words = [int.from_bytes(raw[k : k + 4], "big") for k in range(0, 32, 4)]
+    letters = "".join(alphabet[word // 85**power % 85] for word in words for power in (4, 3, 2, 1, 0))
+    assert derive_server_keys(b"open sesame")[1].decode() == letters
+
+
+def test_a_zeromq_without_curve_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("zmq.has", lambda name: False)
+    derive_server_keys.cache_clear()
+    with pytest.raises(ValueError, match="needs a ZeroMQ with CURVE"):
+        derive_server_keys(b"open sesame")
+
+
+# --- processes ---------------------------------------------------------------------------------
+
+
+DANGEROUS = """
+import os, time
+import numpy as np
+
+class Ego:
+    def predict(self, observation, state=None, episode_start=None, deterministic=True):
+        print("an ego may print")
+        gap = 50 * observation[:, 3]
+        if episode_start[0] and ((gap > 20) & (gap < 22)).any():
+            os._exit(3)
+        if episode_start[0] and ((gap > 30) & (gap < 32)).any():
+            time.sleep(60)
+        return np.full((len(observation), 2), -0.1), None
+
+def make():
+    return Ego()
+"""
+
+
+@pytest.fixture
+def dangerous(tmp_path: Path, monkeypatch: Any) -> Iterator[Any]:
+    (tmp_path / "dangerous_for_test.py").write_text(DANGEROUS)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(Path(rare_envs.__file__).parents[1]), str(tmp_path)]))
+    ego = load_ego("process:dangerous_for_test:make?timeout=1.5")
+    yield ego
+    ego.close()
+
+
+def one_row(gap: float) -> tuple[np.ndarray, None, np.ndarray]:
+    return np.full((1, 7), gap / 50, np.float32), None, np.ones(1, bool)
+
+
+def test_a_process_of_its_own_holds_an_ego_that_dies(dangerous: Any) -> None:
+    np.testing.assert_array_equal(dangerous.predict(*one_row(60.0))[0], [[-0.1, -0.1]])
+    with pytest.raises(NoAnswer, match=r"its process ended \(exit status 3\)"):
+        dangerous.predict(*one_row(21.0))
+
+
+@pytest.mark.slow
+def test_a_process_of_its_own_holds_an_ego_that_hangs(dangerous: Any) -> None:
+    with pytest.raises(NoAnswer, match=r"no answer within 1\.5 s"):
+        dangerous.predict(*one_row(31.0))
+    np.testing.assert_array_equal(dangerous.predict(*one_row(60.0))[0], [[-0.1, -0.1]])
+
+
+@pytest.mark.slow
+def test_scenarios_on_which_a_process_hangs_or_dies_are_found(dangerous: Any, x: np.ndarray) -> None:
+    x = np.repeat(x, 6, axis=0)
+    x[:, 2] = 60.0
+    x[[100, 200], 2] = 31.0, 21.0
+    tolerant = Evaluator(problem(dangerous), on_error="bound")
+    np.testing.assert_array_equal(np.flatnonzero(np.isnan(tolerant.evaluate(x))), [100, 200])
+    assert [fault.reason.partition(": ")[2].rpartition(": ")[2] for fault in tolerant.faults] == [
+        "no answer within 1.5 s.",
+        "its process ended (exit status 3).",
+    ]
+    assert dangerous._epoch <= 12  # processes, the first one included
+
+
+def test_what_cannot_be_loaded_in_a_process_is_said_here() -> None:
+    with pytest.raises(ValueError, match=r"process:no_such:make refuses: .*Cannot import 'no_such'"):
+        load_ego("process:no_such:make")
+    with pytest.raises(ValueError, match="timeout=SECONDS"):
+        load_ego("process:idm?timeuot=3")

@@ -1,4 +1,4 @@
-"""A request handler answers whatever comes in, and nothing that comes in ends it."""
+"""A request handler answers whatever comes in, and nothing that comes in ends it; messages and spaces survive."""
 
 from __future__ import annotations
 
@@ -13,27 +13,25 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 
-from agents.remote import protocol, request_handler
-from agents.remote.request_handler import MAX_CLIENTS, MAX_SESSIONS, RequestHandler
+from agents.remote import protocol, server
+from agents.remote.server import RequestHandler
 from tests.agents.remote.egos import Averaging, Braking, good_messages
 
 
+def ask(handler: RequestHandler, connection: bytes = b"me", **message: Any) -> dict[str, Any]:
+    return protocol.unpack(handler.handle(connection, protocol.pack(message)))
+
+
 def test_a_conversation() -> None:
-    server = RequestHandler(Braking())
-    answers = [protocol.unpack(server.handle(b"me", protocol.pack(message))) for message in good_messages()]
+    handler = RequestHandler(Braking())
+    answers = [protocol.unpack(handler.handle(b"me", protocol.pack(message))) for message in good_messages()]
     assert [answer["type"] for answer in answers] == ["hello", "ready", "action", "pong", "ended"]
     assert [answer["id"] for answer in answers] == [1, 2, 3, 4, 5]
     assert protocol.unpack_array(answers[2]["action"]).shape == (2, 2)
 
 
-def test_versions_have_to_agree(serve: Any, connect_ego: Any, monkeypatch: Any) -> None:
-    address = serve(Braking()).address
-    with monkeypatch.context() as changed:
-        changed.setattr("agents.remote.protocol.PROTOCOL", 1)
-        connect_ego(address)
-    reply = protocol.unpack(
-        RequestHandler(Braking()).handle(b"", protocol.pack({"type": "hello", "protocol": 2, "id": 1}))
-    )
+def test_versions_have_to_agree() -> None:
+    reply = ask(RequestHandler(Braking()), type="hello", protocol=2, id=1)
     assert (reply["type"], reply["code"]) == ("error", "version")
     assert "speaks protocol 1, not 2" in reply["reason"]
 
@@ -57,14 +55,14 @@ STRANGE = [
 def test_strange_values_get_an_error() -> None:
     for number, message in enumerate(good_messages()):
         for key, value in itertools.product(message, STRANGE):
-            server = RequestHandler(Braking())
+            handler = RequestHandler(Braking())
             for before in good_messages()[:number]:
-                server.handle(b"me", protocol.pack(before))
-            answer = protocol.unpack(server.handle(b"me", msgpack.packb({**message, key: value})))
+                handler.handle(b"me", protocol.pack(before))
+            answer = protocol.unpack(handler.handle(b"me", msgpack.packb({**message, key: value})))
             harmless = (message["type"], key) in {("end", "session"), ("act", "start")}
             assert answer["type"] == "error" or harmless, (message["type"], key, value)
             assert answer["type"] != "error" or answer["code"] != "internal", answer
-            last = protocol.unpack(server.handle(b"me", protocol.pack({**good_messages()[0], "id": 99})))
+            last = protocol.unpack(handler.handle(b"me", protocol.pack({**good_messages()[0], "id": 99})))
             assert last["type"] == "hello"
 
 
@@ -85,18 +83,18 @@ def test_strange_values_get_an_error() -> None:
     ],
 )
 def test_arrays_that_do_not_add_up_get_an_error(name: str, value: Any) -> None:
-    server = RequestHandler(Braking())
+    handler = RequestHandler(Braking())
     hello, reset, act = good_messages()[:3]
     for message in (hello, reset):
-        server.handle(b"me", protocol.pack(message))
+        handler.handle(b"me", protocol.pack(message))
     act["observation"][name] = value
-    assert protocol.unpack(server.handle(b"me", protocol.pack(act)))["code"] == "malformed"
+    assert protocol.unpack(handler.handle(b"me", protocol.pack(act)))["code"] == "malformed"
 
 
 @pytest.mark.parametrize("n", [1500, pytest.param(20_000, marks=pytest.mark.slow)])
 def test_random_bytes_get_an_error_and_are_never_run(n: int, tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
-    server = RequestHandler(Braking())
+    handler = RequestHandler(Braking())
     whole = [protocol.pack(message) for message in good_messages()]
 
     class Run:
@@ -111,7 +109,7 @@ def test_random_bytes_get_an_error_and_are_never_run(n: int, tmp_path: Path) -> 
             content[rng.integers(len(content))] = rng.integers(256)
         inputs.append(bytes(content))
     for content in inputs:
-        assert protocol.unpack(server.handle(b"me", content))["type"] in {
+        assert protocol.unpack(handler.handle(b"me", content))["type"] in {
             "error",
             "hello",
             "ready",
@@ -120,7 +118,7 @@ def test_random_bytes_get_an_error_and_are_never_run(n: int, tmp_path: Path) -> 
             "ended",
         }
     assert not (tmp_path / "was_here").exists()
-    assert protocol.unpack(server.handle(b"you", whole[0]))["type"] == "hello"
+    assert protocol.unpack(handler.handle(b"you", whole[0]))["type"] == "hello"
 
 
 def test_observations_of_several_kinds_travel_by_name(serve: Any, connect_ego: Any) -> None:
@@ -136,16 +134,12 @@ def test_observations_of_several_kinds_travel_by_name(serve: Any, connect_ego: A
     assert {name: part.shape for name, part in there.observation_space.items()} == {"near": (7,), "far": (2, 3)}
     observation = {"near": np.full((2, 7), 0.5, np.float32), "far": np.full((2, 2, 3), 200, np.uint8)}
     np.testing.assert_array_equal(there.predict(observation)[0], [[0.5, 1200.0], [0.5, 1200.0]])
-    server = RequestHandler(Two())
+    handler = RequestHandler(Two())
     for message in good_messages()[:2]:
-        server.handle(b"me", protocol.pack(message))
+        handler.handle(b"me", protocol.pack(message))
     for parts in ({}, [1], {"near": None}, {"near": protocol.pack_array(np.zeros((3, 7)))}):
         bad = {**good_messages()[2], "observation": {"parts": parts}}
-        assert protocol.unpack(server.handle(b"me", protocol.pack(bad)))["type"] == "error"
-
-
-def ask(handler: RequestHandler, connection: bytes = b"me", **message: Any) -> dict[str, Any]:
-    return protocol.unpack(handler.handle(connection, protocol.pack(message)))
+        assert protocol.unpack(handler.handle(b"me", protocol.pack(bad)))["type"] == "error"
 
 
 def test_a_hello_comes_first_and_ids_rise() -> None:
@@ -173,15 +167,16 @@ def test_a_session_counts_its_steps_and_remembers() -> None:
         assert reply["memory"] is True
 
 
-def test_the_least_recently_used_sessions_and_connections_are_forgotten() -> None:
+def test_the_least_recently_used_sessions_and_connections_are_forgotten(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(server, "MAX_SESSIONS", 8)
     handler = RequestHandler(Braking())
     ask(handler, type="hello", protocol=1, id=1)
-    for number in range(MAX_SESSIONS + 2):
+    for number in range(10):
         ask(handler, type="reset", id=number + 2, session=number, batch=1)
     observation = protocol.pack_array(np.zeros((1, 7), np.float32))
     replies = [ask(handler, type="act", id=1000 + k, session=k, step=0, observation=observation) for k in (1, 2)]
     assert [reply["type"] for reply in replies] == ["error", "action"]
-    for number in range(MAX_CLIENTS):
+    for number in range(server.MAX_CLIENTS):
         ask(handler, str(number).encode(), type="hello", protocol=1, id=1)
     assert ask(handler, type="ping", id=2000)["code"] == "hello"
 
@@ -210,7 +205,7 @@ def test_memories_are_kept_up_to_a_size_the_least_used_make_room(monkeypatch: py
         ) -> Any:
             return np.zeros((len(observation), 2), np.float32), np.zeros(1000)  # 8,000 bytes
 
-    monkeypatch.setattr(request_handler, "MAX_MEMORY", 30_000)
+    monkeypatch.setattr(server, "MAX_MEMORY", 30_000)
     handler, number = RequestHandler(Remembering()), 0
 
     def ask(connection: bytes, **message: Any) -> Any:
@@ -227,3 +222,81 @@ def test_memories_are_kept_up_to_a_size_the_least_used_make_room(monkeypatch: py
         assert ask(client, type="act", session=session, step=0, observation=seen)["type"] == "action"
     kept = [ask(client, type="act", session=session, step=1, observation=seen)["type"] for client, session in sessions]
     assert kept == ["error"] * 3 + ["action"] * 3
+
+
+# --- messages -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("values", "dtype"),
+    [
+        (np.arange(6.0).reshape(2, 3), "<f8"),
+        (np.arange(6, dtype=np.float32).reshape(3, 2).T, "<f4"),
+        (np.arange(4, dtype=np.float16), "<f4"),
+        (np.arange(3, dtype=np.int32), "<i8"),
+        (np.array([1, 2], ">i4"), "<i8"),
+        (np.array([True, False]), "|u1"),
+        (np.zeros((0, 7), np.uint8), "|u1"),
+        (np.array([np.nan, np.inf, -0.0]), "<f8"),
+    ],
+)
+def test_arrays_survive_in_a_type_that_holds_them(values: np.ndarray, dtype: str) -> None:
+    packed = protocol.unpack(protocol.pack({"array": protocol.pack_array(values)}))["array"]
+    assert packed["dtype"] == dtype
+    np.testing.assert_array_equal(protocol.unpack_array(packed), values)
+
+
+@pytest.mark.parametrize("values", [np.array(["a"]), np.array([None]), np.array([1j]), np.array(["2020"], "M8[Y]")])
+def test_other_arrays_are_refused(values: np.ndarray) -> None:
+    with pytest.raises(protocol.MalformedMessage, match="expected numbers"):
+        protocol.pack_array(values)
+
+
+def test_observations_of_one_and_of_several_kinds_survive() -> None:
+    one, parts = np.ones((2, 7), np.float32), {"a": np.zeros((2, 1)), "b": np.full((2, 3, 3), 7, np.uint8)}
+    np.testing.assert_array_equal(protocol.unpack_observation(protocol.pack_observation(one), 2), one)
+    again = protocol.unpack_observation(protocol.pack_observation(parts), 2)
+    assert set(again) == {"a", "b"}
+    np.testing.assert_array_equal(again["b"], parts["b"])
+    for wrong in (
+        protocol.pack_observation(one[:1]),
+        protocol.pack_array(np.ones(2)),
+        {"parts": {}},
+        {"parts": 3},
+        None,
+    ):
+        with pytest.raises(protocol.MalformedMessage):
+            protocol.unpack_observation(wrong, 2)
+
+
+@pytest.mark.parametrize(
+    "content", [b"", b"\xc1", msgpack.packb(3), msgpack.packb([1]), msgpack.packb({1: 2}), b"\x81\xa1a"]
+)
+def test_bytes_that_are_no_map_from_text_are_refused(content: bytes) -> None:
+    with pytest.raises(protocol.MalformedMessage):
+        protocol.unpack(content)
+
+
+def test_a_message_that_is_too_large_is_refused_unread(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("agents.remote.protocol.MAX_BYTES", 10)
+    with pytest.raises(protocol.MalformedMessage, match="a message of 11 bytes, more than 10"):
+        protocol.unpack(b"x" * 11)
+
+
+def test_spaces_survive_the_journey_and_lies_do_not() -> None:
+    uneven = spaces.Box(np.array([0.0, -np.inf], np.float32), np.array([1.0, 2.0], np.float32))
+    shapes = spaces.Box(-5.0, 5.0, (3, 3)), uneven
+    image = spaces.Box(0, 255, (36, 64, 3), np.uint8)
+    for space in (*shapes, image, spaces.Discrete(5), spaces.Dict({"camera": image, "lidar": shapes[0]})):
+        described = protocol.unpack(protocol.pack({"space": protocol.encode_space(space)}))["space"]
+        assert protocol.decode_space(described) == space
+        assert len(str(described)) < 300
+    assert protocol.decode_space({"shape": [2]}) == spaces.Box(-np.inf, np.inf, (2,))
+    box: dict[str, Any] = {"shape": [2], "low": [0.0, 0.0], "high": 1.0}
+    wrong: list[Any] = [7, "box", [], {}, {"n": 0}, {"n": -1}, {"n": True}, {"n": 1e9}, {"parts": []}]
+    wrong += [{"parts": {"a": {"parts": {"b": {"n": 2}}}}}, {"parts": {"a": 3}}]
+    wrong += [{**box, "shape": shape} for shape in ([-2], [2**40], [2**12, 2**12], "2", [[2]], [1.5])]
+    wrong += [{**box, "low": low} for low in ([0.0] * 3, "zero", float("nan"), 2.0, {}, [[0.0], [0.0, 1.0]])]
+    for given in wrong:
+        with pytest.raises(protocol.MalformedMessage, match="a space"):
+            protocol.decode_space(given)
