@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -65,7 +66,7 @@ def save_plot(path: Path, report: Report) -> None:
         columns = figure.subfigures(1, 3, squeeze=False, width_ratios=(1.0, 1.05, 1.25), wspace=0.03)
         left, middle, right = columns[0]
         figure.suptitle(_format_title(report), fontsize=12, fontweight="bold")
-        draw_convergence(left.subplots(), report)
+        draw_convergence(left.subplots(), report.to_dict())
         draw_failures(middle.subplots(), report.study.problem.space, report.estimate.failures)
         drive = _replay_likeliest_failure(report)
         if isinstance(drive, str):
@@ -121,36 +122,41 @@ def _format_title(report: Report) -> str:
     )
 
 
-def draw_convergence(axes: Axes, report: Report) -> None:
-    """Draw the estimate against the simulations spent, level by level, and the interval at the end."""
-    estimate = report.estimate
-    runs = sorted({level.run for level in estimate.trace})
-    by_levels = any(level.gamma != estimate.gamma for level in estimate.trace)
-    seen = []
+def draw_convergence(axes: Axes, result: Mapping[str, Any]) -> None:
+    """Draw the estimate against the simulations spent, level by level, and the interval at the end.
+
+    `result` is what result.json holds.
+    """
+    trace, gamma, p = result.get("trace") or [], float(result["gamma"]), float(result["p"])
+    low, high = (float(end) for end in result["interval"])
+    runs = sorted({level["run"] for level in trace})
+    by_levels = any(level["gamma"] != gamma for level in trace)
+    seen: list[float] = []
     for run in runs:
-        levels = [level for level in estimate.trace if level.run == run]
-        spent = np.cumsum([level.n_sim for level in levels])
-        values = np.array([level.estimate if level.estimate > 0 else np.nan for level in levels])
+        levels = [level for level in trace if level["run"] == run]
+        spent = np.cumsum([level["n_sim"] for level in levels])
+        values = np.array([level["estimate"] or np.nan for level in levels])
         seen += [value for value in values if value > 0]
         axes.plot(spent, values, "o-", color=LINE_COLOUR, alpha=max(0.25, 1 / len(runs)), markersize=4)
         if len(runs) == 1 and by_levels:
-            _label_thresholds(axes, spent, values, [level.gamma for level in levels])
+            _label_thresholds(axes, spent, values, [_as_float(level["gamma"]) for level in levels])
         elif len(runs) == 1:
-            spread = np.exp(NORMAL_QUANTILE * np.minimum([level.cov for level in levels], WIDEST_COV))
+            cov = np.nan_to_num([_as_float(level["cov"]) for level in levels], nan=np.inf)
+            spread = np.exp(NORMAL_QUANTILE * np.minimum(cov, WIDEST_COV))
             axes.fill_between(spent, values / spread, values * spread, color=LINE_COLOUR, alpha=0.15, linewidth=0)
-    low, high = estimate.interval
     axes.axhspan(max(low, 1e-300), high, color=HIT_COLOUR, alpha=0.12, linewidth=0)
-    if estimate.p == 0 and not estimate.failures.total:
-        spent = np.geomspace(1.0, max(estimate.n_sim, 2), 100)
-        bound = np.minimum(high * estimate.n_sim / spent, 1.0)
+    if p == 0 and not result.get("n_failures"):
+        n_sim = int(result["n_sim"])
+        spent = np.geomspace(1.0, max(n_sim, 2), 100)
+        bound = np.minimum(high * n_sim / spent, 1.0)
         axes.plot(spent, bound, color=HIT_COLOUR, linewidth=1, label="upper end without a failure: as 1 / simulations")
-    label = f"{100 * estimate.confidence:g} % interval"
-    if estimate.p > 0:
-        axes.axhline(estimate.p, color=HIT_COLOUR, linewidth=1, label="result")
+    if p > 0:
+        axes.axhline(p, color=HIT_COLOUR, linewidth=1, label="result")
+    label = f"{100 * float(result['confidence']):g} % interval"
     axes.plot([], [], color=HIT_COLOUR, alpha=0.25, linewidth=8, label=label)
     axes.set_yscale("log")
     if by_levels or not seen:
-        smallest = min([v for v in (low, estimate.p, high / 30) if v > 0], default=1e-9)
+        smallest = min([v for v in (low, p, high / 30) if v > 0], default=1e-9)
         axes.set_ylim(smallest / 3, 1.5)
     else:  # nothing but P[f <= gamma] is estimated on the way
         least, most = min(*seen, max(low, high / 30)), max(*seen, high)
@@ -158,9 +164,14 @@ def draw_convergence(axes: Axes, report: Report) -> None:
     axes.set_xlim(left=0)
     axes.set_xlabel("simulations" if len(runs) == 1 else f"simulations, each of {len(runs)} runs")
     way = "From ordinary traffic to the failures, level by level" if by_levels else "The estimate, batch by batch"
-    axes.set_ylabel("P[f ≤ threshold of the level]" if by_levels else f"P[f ≤ {estimate.gamma:g}]")
+    axes.set_ylabel("P[f ≤ threshold of the level]" if by_levels else f"P[f ≤ {gamma:g}]")
     axes.set_title(way, fontsize=10)
     axes.legend(loc="upper right", frameon=False)
+
+
+def _as_float(value: float | None) -> float:
+    """Return a number of a JSON file, where NaN and infinities are null."""
+    return np.nan if value is None else float(value)
 
 
 def _label_thresholds(axes: Axes, spent: NDArray[np.int64], values: NDArray[np.float64], gammas: list[float]) -> None:

@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from rare_envs.files import replace_file
-from rare_envs.study.plots import HIT_COLOUR, LINE_COLOUR, ORDINARY_COLOUR, STYLE
+from rare_envs.study.plots import HIT_COLOUR, LINE_COLOUR, ORDINARY_COLOUR, STYLE, draw_convergence
 from rare_envs.study.text import Result
 from samplers.problem import FloatArray
 
@@ -97,27 +97,6 @@ STACKED_SIZE = (4.2, 5.4)
 """Size of two panels one below the other, for a narrow screen [inch]."""
 MAX_HISTOGRAMS = 12
 """Parameters that are shown, those that failures shift most."""
-
-
-def draw_estimate_over_simulations(figure: Figure, result: Result) -> None:
-    """Draw the estimate over the simulations spent, each replicate by itself, and the result with its interval."""
-    axes = figure.subplots()
-    trace = result.get("trace") or []
-    for run in sorted({level["run"] for level in trace}):
-        levels = [level for level in trace if level["run"] == run]
-        spent = np.cumsum([level["n_sim"] for level in levels])
-        values = [_positive(level["estimate"]) for level in levels]
-        axes.plot(spent, values, "o-", color=LINE_COLOUR, markersize=4, label="on the way" if run == 0 else None)
-    low, high = result["interval"]
-    axes.axhspan(max(low, 1e-300), high, color=HIT_COLOUR, alpha=0.15, linewidth=0, label="interval of the sampling")
-    if result["p"] > 0:
-        axes.axhline(result["p"], color=HIT_COLOUR, linewidth=1.2, label="result")
-    seen = [level["estimate"] for level in trace if level["estimate"]]
-    _log_scale(axes, [value for value in (low, high, result["p"], *seen) if value > 0])
-    axes.set_xlim(left=0)
-    axes.set_xlabel("simulations")
-    axes.set_ylabel("P[f ≤ threshold of the level]")
-    axes.legend(frameon=False, fontsize=8)
 
 
 def draw_levels(figure: Figure, result: Result, stacked: bool = False) -> None:
@@ -237,7 +216,7 @@ def figures_of_result(result: Result, log_weights: FloatArray, measure: str) -> 
     room = TWO_PANELS_SIZE if passes else PANEL_SIZE
     narrow = (lambda f: draw_levels(f, result, stacked=True), STACKED_SIZE) if passes else None
     made = [
-        FigureOfPage("convergence", way, lambda f: draw_estimate_over_simulations(f, result), PANEL_SIZE),
+        FigureOfPage("convergence", way, lambda f: draw_convergence(f.subplots(), result), PANEL_SIZE),
         FigureOfPage("levels", levels, lambda f: draw_levels(f, result), room, narrow),
     ]
     if len(log_weights):
@@ -284,14 +263,3 @@ def figure_of_parameters(
 def _make_panels(figure: Figure, n: int, stacked: bool) -> list[Axes]:
     """Return n panels of a figure, side by side or one below the other."""
     return list(figure.subplots(n if stacked else 1, 1 if stacked else n, squeeze=False).ravel())
-
-
-def _positive(value: float | None) -> float:
-    return value if value is not None and value > 0 else math.nan
-
-
-def _log_scale(axes: Axes, values: list[float]) -> None:
-    """Set a log scale, where there is anything to show on it."""
-    if values:
-        axes.set_yscale("log")
-        axes.set_ylim(min(values) / 1.6, max(values) * 1.6)

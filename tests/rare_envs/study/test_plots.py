@@ -40,7 +40,7 @@ def test_a_run_without_a_failure_shows_how_its_bound_falls(tmp_path: Path) -> No
     high = report.estimate.interval[1]
     assert (report.estimate.p, report.estimate.n_sim) == (0.0, 200)
     axes = Figure().subplots()
-    draw_convergence(axes, report)
+    draw_convergence(axes, report.to_dict())
     spent, bound = next(line for line in axes.get_lines() if "without a failure" in str(line.get_label())).get_data()
     np.testing.assert_allclose([spent[0], bound[0], spent[-1], bound[-1]], [1.0, 1.0, 200.0, high], rtol=1e-6)
     np.testing.assert_allclose(bound[bound < 1.0] * spent[bound < 1.0], 200.0 * high, rtol=1e-6)
