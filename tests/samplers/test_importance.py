@@ -16,7 +16,6 @@ from samplers.importance import (
     draw_after_search,
     pool_rounds,
     round_record,
-    search_warnings,
     simulate_until,
     weight_warnings,
     weighted_interval,
@@ -29,8 +28,8 @@ from samplers.trace import Status
 
 BETA = 1.7
 P = stats.norm.sf(BETA)
-BASE, SHIFTED, BEYOND = stats.norm(0, 1), stats.norm(2.3, 1.0), stats.truncnorm(1.5, np.inf)
-PARTS = (BASE, SHIFTED, BEYOND)
+NORMAL, SHIFTED, BEYOND = stats.norm(0, 1), stats.norm(2.3, 1.0), stats.truncnorm(1.5, np.inf)
+PARTS = (NORMAL, SHIFTED, BEYOND)
 
 
 def draw(counts, rng):
@@ -71,15 +70,6 @@ def test_known_masses_come_out_but_for_the_ridge(rng):
     assert varied.any() and (left < off)[varied].all()
 
 
-def test_few_draws_keep_their_weights(rng):
-    few = 30 * 3 - 1
-    u, strata, h = draw([few - 60, 30, 30], rng)
-    calibrated = calibrate(h, strata, 30)
-    np.testing.assert_array_equal(calibrated.factors, 1.0)
-    y = h[:, 0] * (u > BETA)
-    np.testing.assert_array_equal(calibrated.residuals(y), y)
-
-
 def weighing(*weights, n=1000):
     """n draws of which those with these weights fail."""
     return Draws(n, np.zeros(len(weights)), np.log(weights))
@@ -101,18 +91,6 @@ def test_p_and_cov_by_hand():
     # the variance of a mean, and (largest term / n)^2
     assert draws.cov == pytest.approx(math.sqrt(terms.var(ddof=1) / 8 + (3 / 8) ** 2) / terms.mean())
     assert draws.ess == pytest.approx(16 / 10)
-
-
-def test_outcomes_at_gamma_fail_and_draws_join():
-    f, log_weights, x = np.array([2.0, 1.0, 0.0]), np.log([1.0, 2.0, 3.0]), np.arange(6.0).reshape(3, 2)
-    draws = Draws.from_outcomes(f, log_weights, x, gamma=1.0)
-    np.testing.assert_array_equal(draws.x, x[1:])
-    both = draws.join(draws)
-    assert (both.n, both.p) == (6, pytest.approx(5 / 3))
-    sample = both.sample
-    np.testing.assert_array_equal(sample.f, [1.0, 0.0, 1.0, 0.0, 2.0, 2.0])
-    np.testing.assert_allclose(sample.weights, np.array([2.0, 3.0, 2.0, 3.0, 1.0, 1.0]) / 6)
-    assert Draws(0, np.empty(0), np.empty(0)).join(draws) is draws
 
 
 def test_of_few_draws_the_upper_end_is_guaranteed():
@@ -208,17 +186,6 @@ def test_rounds_pool_into_one_sample(rng):
         estimates.append(draws.p)
     error = np.std(estimates, ddof=1) / math.sqrt(200)
     assert abs(np.mean(estimates) - inputs.p) < 4 * error
-
-
-def test_warnings_name_the_reason_and_the_level_reached():
-    reached = round_record(1.25, 10, np.zeros(3))
-    assert search_warnings(Search([], [reached], Status.CONVERGED), 0.0) == []
-    (text,) = search_warnings(Search([], [reached], Status.BUDGET), 0.0)
-    assert text == "The search for a proposal ended at f <= 1.25, before gamma: its share of max_sim was used up."
-    (text,) = search_warnings(Search([], [reached], Status.STALLED), 1.25)
-    assert text == "The search for a proposal ended before gamma: it came no closer."
-    (text,) = search_warnings(Search([], [], Status.BUDGET), 0.0)
-    assert "under 100, too little for a search" in text
 
 
 def test_a_stopped_search_is_its_own_estimate(drive, rng):

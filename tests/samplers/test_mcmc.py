@@ -70,17 +70,6 @@ def test_the_printed_ratio_is_wrong_for_the_conditional_proposal(rng):
     assert stats.kstest(u[:, 0], stats.norm.cdf).pvalue < 1e-12
 
 
-def test_only_the_adaptive_kernel_changes(rng):
-    fixed, kernel = FixedMetropolis(1.0, "uniform"), scaled("conditional", 0.6)
-    assert fixed.adapt(1.0, 1) == fixed == fixed.start_level(np.ones((4, 2)))
-    assert kernel.adapt(0.64, 4).scale == pytest.approx(0.6 * np.exp(0.1))
-    assert kernel.adapt(1.0, 1).scale == 1.0
-    seeds = rng.standard_normal((50, 2)) * [0.2, 3.0]
-    np.testing.assert_array_equal(kernel.start_level(seeds).deviations, [1, 1])
-    own = ScaledKernel("conditional", "seeds", 0.6, 0.44, np.ones(2)).start_level(seeds).deviations
-    np.testing.assert_allclose(own, seeds.std(axis=0, ddof=1))
-
-
 def test_scale_follows_the_acceptance():
     assert adapted_scale(0.6, 0.44, 1, 0.44, 1.0) == pytest.approx(0.6)
     assert adapted_scale(0.6, 0.64, 4, 0.44, 1.0) == pytest.approx(0.6 * np.exp(0.1))
@@ -97,13 +86,6 @@ def seeds_beyond(level, n, rng):
     u = rng.standard_normal((n, 2))
     u[:, 0] = stats.norm.isf(rng.random(n) * stats.norm.sf(-level))
     return RootedPoints(u, PROBLEM.evaluate(u), 100 + np.arange(n))
-
-
-def test_lengths_add_up_and_differ_by_one(rng):
-    lengths = chain_lengths(23, 5, rng)
-    assert lengths.sum() == 23
-    assert sorted(lengths) == [4, 4, 5, 5, 5]
-    assert len({tuple(chain_lengths(23, 5, rng)) for _ in range(50)}) > 3  # which ones is random
 
 
 @pytest.mark.parametrize("kernel", [PCN, FixedMetropolis(1.0, "uniform")])
@@ -228,14 +210,6 @@ def test_an_interrupted_level_comes_last(batch, drive, rng):
     assert last.chains.u.shape == (5, 1 + batch % 2, 2)
     assert len(planner.told) == 1 + batch // 2  # it is not asked about an unfinished level
     assert len(levels) == 2 + batch // 2
-
-
-def test_a_budget_ends_it_before_the_level_that_does_not_fit(drive, rng):
-    """Levels of 101 points from 11 seeds take 90 simulations: 300 are enough for three of them."""
-    levels, status, f = reported(drive, Quantiles(0.1, 9, budget=300), rng, n=101)
-    assert status is Status.BUDGET
-    assert [growth.chains.n_new for growth, _ in levels[1:]] == [90, 90, 90]
-    assert len(f) == 270
 
 
 def product_of_shares(drive, beta, rng):

@@ -1,7 +1,6 @@
 """What an estimate says and keeps."""
 
 import json
-import math
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -11,7 +10,6 @@ import pytest
 import samplers
 from samplers.limit_states import half_space
 from samplers.sample import Failures
-from samplers.stored import to_json_value
 from samplers.trace import Status, describe_outcome
 from tests.samplers.fitted_bases import fitted, resampled, run
 
@@ -111,13 +109,6 @@ def test_failures_are_equal_value_by_value():
     assert some != "failures"
 
 
-def test_plain_values_keep_their_shape():
-    value = {"a": (np.float64(1.5), np.int64(2), math.inf, -math.inf, math.nan), "b": [{"c": True}, None, "word"]}
-    assert to_json_value(value) == {"a": [1.5, 2, None, None, None], "b": [{"c": True}, None, "word"]}
-    assert type(to_json_value(np.float64(1.5))) is float
-    assert type(to_json_value(np.int64(2))) is int
-
-
 @pytest.mark.parametrize(
     ("method", "expected"),
     [
@@ -169,11 +160,6 @@ def test_failures_kept_do_not_grow_without_end():
     failures = samplers.estimate(always, "mc", seed=1, max_sim=5000).failures
     assert len(failures) == 1000
     assert failures.total == 5000
-
-
-def test_status_prints_as_its_value():
-    assert f"{samplers.Status.NO_HITS}" == str(samplers.Status.NO_HITS) == "no_hits"
-    assert math.isfinite(result().cov)
 
 
 def test_an_estimate_comes_back_from_its_file(tmp_path):

@@ -44,12 +44,6 @@ def test_log_normal_covers_a_log_normal_estimate(rng):
     assert abs(np.mean(inside) - 0.95) < 4 * math.sqrt(0.95 * 0.05 / runs)
 
 
-def test_log_normal_is_cut_at_one_and_wider_with_few_degrees_of_freedom():
-    assert log_normal_interval(0.9, 0.5, 0.95)[1] == 1.0
-    narrow, wide = log_normal_interval(1e-3, 0.2, 0.95), log_normal_interval(1e-3, 0.2, 0.95, df=4)
-    assert wide[0] < narrow[0] < 1e-3 < narrow[1] < wide[1]
-
-
 def lengths_of(inside):
     return np.full(len(inside), inside.shape[1])
 
@@ -77,19 +71,6 @@ def test_correlation_factor_predicts_the_variance_of_a_share(rng):
     assert np.mean(predicted) == pytest.approx(shares.var(), rel=0.15)
 
 
-def test_correlation_factor_with_unequal_lengths(rng):
-    """Against the sum over all pairs inside a chain, written out."""
-    inside = markov_chains(rng, 30, 6, 0.3, 0.7)
-    lengths = rng.integers(1, 7, size=30)
-    used = [row[:length].astype(float) for row, length in zip(inside, lengths, strict=True)]
-    n = sum(len(row) for row in used)
-    p = sum(row.sum() for row in used) / n
-    pairs = sum(2 * (row[i] * row[j] - p * p) for row in used for i in range(len(row)) for j in range(i + 1, len(row)))
-    expected = pairs / (n * p * (1 - p))
-    assert expected > 0
-    assert correlation_factor(inside, lengths) == pytest.approx(expected)
-
-
 def test_distinct_outcomes_give_the_quantile_with_its_true_share(rng):
     f = rng.permutation(np.arange(1, 1001)) / 10
     assert next_level(f, 0.1, -1.0) == 10.0
@@ -107,12 +88,6 @@ def test_ties_at_a_cap_give_the_largest_value_below():
     f = np.concatenate([np.full(930, 10.0), np.linspace(1, 9, 70)])
     assert next_level(f, 0.1, 0.0) == 9.0
     assert next_level(np.array([10.0] * 95 + [-1.0] * 5), 0.1, 0.0) == 0.0  # never past gamma
-
-
-def test_no_way_on_where_all_or_most_outcomes_tie():
-    assert next_level(np.full(100, 10.0), 0.1, 0.0) is None
-    assert next_level(np.array([10.0] * 80 + [20.0] * 20), 0.1, 0.0) is None
-    assert next_level(np.full(100, np.inf), 0.1, 0.0) is None
 
 
 def test_the_upper_end_is_the_quantile_of_both_errors_together():

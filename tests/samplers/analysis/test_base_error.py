@@ -9,7 +9,6 @@ import pytest
 from scipy import stats
 
 import samplers
-from samplers.analysis.refits import reweight_runs_to_refits
 from tests.samplers.fitted_bases import BETA, FittedWithEnsemble, HalfSpace, fitted, normal, run
 
 WIDE = [normal(mean, sd) for mean in np.linspace(-2.0, 2.0, 6) for sd in (0.5, 0.75, 1.0, 1.5, 2.0)]
@@ -62,14 +61,6 @@ def test_events_that_do_not_determine_p_give_a_bound_and_no_interval():
     assert "the events do not determine p; nor an upper end in this family" in str(result)
     assert "predictive mean" not in str(result)
     assert "do not determine p; below 1.0e-02 in this family" in str(replace(found, bound=0.01))
-
-
-def test_the_upper_end_stays_below_one():
-    base = fitted([normal(mean) for mean in np.linspace(-2.0, 2.0, 30)])
-    found = samplers.estimate(HalfSpace(base, 1.0), "mc", seed=0, max_sim=20_000).base_uncertainty
-    assert found.interval[1] == 1.0
-    assert max(found.p_refits) <= 1.0
-    assert found.expected <= 1.0
 
 
 def test_a_base_without_refits_prints_what_it_did():
@@ -164,23 +155,6 @@ class Impossible:
         return np.where(x[:, 0] < 2.99, normal().log_prob(x), -np.inf)
 
 
-def test_points_without_an_outcome_are_not_in_the_lower_end_where_they_only_bound():
-    class Failing(HalfSpace):
-        def evaluate(self, x):
-            return np.where((x[:, 1] > 0.5) & (x[:, 0] > 2.0), np.nan, super().evaluate(x))
-
-    bound, counted = (
-        samplers.estimate(Failing(BASE), "mc", seed=1, max_sim=20_000, on_error=on_error)
-        for on_error in ("bound", "failure")
-    )
-    failing = bound.sample.f <= 0
-    share = bound.sample.weights[np.isneginf(bound.sample.f)].sum() / bound.sample.weights[failing].sum()
-    assert 0.5 < share < 1
-    one, two = bound.base_uncertainty, counted.base_uncertainty
-    assert one.p_refits == two.p_refits
-    assert one.interval == (pytest.approx((1 - share) * two.interval[0]), two.interval[1])
-
-
 @pytest.mark.slow
 def test_replicates_are_reweighted_together():
     result = run(BASE, replicates=4, max_sim=8000)
@@ -216,16 +190,3 @@ def test_the_further_run_knows_p_of_the_refits_and_leaves_p_as_it_is():
     )
     assert "warning: 4 of 30 refits" in str(without)
     assert result.ensemble_run.p == pytest.approx(np.mean([refit.p for refit in FAR]), rel=0.1)
-
-
-def test_each_refit_takes_the_run_that_knows_it_better():
-    result = run(FAR_BASE)
-    refits = result.base.refits
-    own, further, both = (
-        reweight_runs_to_refits(each, refits)
-        for each in (replace(result, ensemble_run=None), result.ensemble_run, result)
-    )
-    assert both.ess.tolist() == np.maximum(own.ess, further.ess).tolist()
-    assert (own.ess > further.ess).any() and (own.ess < further.ess).any()
-    chosen = np.where(own.ess > further.ess, own.log_p, further.log_p)
-    assert both.log_p.tolist() == chosen.tolist()

@@ -11,7 +11,6 @@ from scipy.special import ndtr, ndtri
 
 import samplers
 from samplers.analysis.curve import lowest_known_threshold
-from samplers.analysis.weighted import unit_sums
 from samplers.limit_states import half_space, parabola, plateau
 from samplers.statistics import clopper_pearson
 
@@ -58,17 +57,6 @@ def test_one_threshold_has_the_interval_of_the_estimate(method):
     assert (curve.low[0], curve.high[0]) == pytest.approx(result.interval, rel=0.01)
 
 
-def test_the_same_result_gives_the_same_band_in_any_order():
-    result = run("adss")
-    curve, again = result.curve(GRID), run("adss").curve(GRID)
-    np.testing.assert_array_equal(curve.high, again.high)
-    mixed = result.curve([*GRID[::-1], 0.0])
-    np.testing.assert_array_equal(mixed.gammas, [*GRID[::-1], 0.0])
-    np.testing.assert_array_equal(mixed.p, [*curve.p[::-1], curve.p[1]])
-    np.testing.assert_array_equal(mixed.low, [*curve.low[::-1], curve.low[1]])
-    assert run("adss", seed=2).curve(GRID).p[0] != curve.p[0]
-
-
 @pytest.mark.parametrize("method", ["ss", "adss"])
 def test_thresholds_passed_early_rest_on_all_points_of_their_level(method):
     result = run(method, beta=3.5)
@@ -81,15 +69,6 @@ def test_thresholds_passed_early_rest_on_all_points_of_their_level(method):
     assert 40 < result.curve([second]).ess[0] <= 100
 
 
-@pytest.mark.parametrize("method", ["ss", "adss"])
-def test_layers_and_points_give_the_same_sums(method):
-    points = run(method, beta=3.5, replicates=2).sample
-    grid = np.sort(points.f)[::50]
-    sums = unit_sums(points, grid).p
-    np.testing.assert_allclose(sums, [points.weights[points.f <= g].sum() for g in grid])
-    np.testing.assert_allclose(unit_sums(replace(points, layers=()), grid).p, sums)
-
-
 @pytest.mark.parametrize("method", ["mc", "ce", "adss"])
 def test_too_low_a_threshold_is_refused_with_what_is_known(method):
     result = run(method, max_sim=3000)
@@ -99,28 +78,12 @@ def test_too_low_a_threshold_is_refused_with_what_is_known(method):
         result.curve([0.0, -9.0])
 
 
-def test_gamma_itself_is_known_however_few_points_failed():
-    result = run(beta=3.0, max_sim=1000)
-    assert 0 < result.failures.total < 5
-    assert result.curve([0.0, 0.5]).p[0] == result.p
-
-
 def test_where_nothing_failed_the_thresholds_passed_are_known():
     result = run(beta=6.0, max_sim=1000)
     assert result.p == 0
     with pytest.raises(ValueError, match="known from"):
         result.curve([0.0])
     assert result.curve([6.0]).p[0] == pytest.approx(0.5, abs=0.1)
-
-
-def test_where_everything_fails():
-    for method in ("mc", "adss", "ce"):
-        always = samplers.estimate(samplers.FunctionProblem(lambda x: -np.ones(len(x)), 1), method, seed=1)
-        curve = always.curve([-1.0, 0.0, 3.0])
-        np.testing.assert_allclose(curve.p, 1)
-        np.testing.assert_array_equal(curve.high, 1)
-        assert (curve.low > 0.99).all()
-        assert (curve.low < 1).all()
 
 
 @pytest.mark.parametrize("gammas", [[], [np.nan], [np.inf], [[0.0, 1.0]]])

@@ -12,23 +12,14 @@ import samplers
 from samplers.analysis.refits import (
     check_refits,
     expect_over_families,
-    find_fitted_base,
     find_log_ends,
     needs_ensemble_run,
-    pool_refits,
     read_refit_families,
     refit_log_ratios,
     reweight_to_refits,
     split_families,
 )
 from tests.samplers.fitted_bases import FittedWithEnsemble, HalfSpace, fitted, normal, resampled, run
-
-
-def test_only_a_base_with_refits_is_fitted():
-    with_refits = fitted(resampled(400, 3))
-    assert find_fitted_base(with_refits) is with_refits
-    assert find_fitted_base(fitted()) is None
-    assert find_fitted_base(samplers.StandardNormal(2)) is None
 
 
 @pytest.mark.parametrize("method", ["mc", "two-stage", "ce", "adss"])
@@ -73,17 +64,6 @@ def test_a_path_of_a_chain_counts_once():
     assert ess <= len(np.unique(result.sample.units[failing])) < failing.sum()
 
 
-def test_densities_far_below_the_smallest_float_keep_their_logarithm():
-    far = normal(-60.0, 1.0)
-    result = run(fitted([far]), "mc", max_sim=20_000)
-    log_p = reweight_to_refits(result, [far]).log_p[0, 0]
-    assert math.isfinite(log_p)
-    assert log_p < -1000 + 745  # no float would hold it by much more
-    x = result.sample.x
-    terms = far.log_prob(x) - normal().log_prob(x)
-    assert log_p == pytest.approx(terms.max() + np.log(np.exp(terms - terms.max()).sum()) - math.log(20_000))
-
-
 def test_the_decision_needs_points_and_an_ensemble():
     covered, far = resampled(400), [normal(7.0, 0.3)] * 30
     assert not needs_ensemble_run(run(fitted(covered, FittedWithEnsemble)))
@@ -94,15 +74,6 @@ def test_the_decision_needs_points_and_an_ensemble():
     assert not needs_ensemble_run(run(samplers.StandardNormal(2)))
     nothing_failed = samplers.estimate(HalfSpace(fitted(far, FittedWithEnsemble), 9.0), "mc", seed=1, max_sim=100)
     assert not needs_ensemble_run(nothing_failed)
-
-
-def test_a_further_run_takes_the_mixture_that_a_base_of_many_refits_has_for_it():
-    class FewOfMany(FittedWithEnsemble):
-        def covering_ensemble(self):
-            return replace(self, refits=self.refits[:2]).ensemble()
-
-    few, all_of_them = (fitted(resampled(40, 5), kind) for kind in (FewOfMany, FittedWithEnsemble))
-    assert [len(pool_refits(base).means) for base in (few, all_of_them)] == [2, 5]
 
 
 def test_a_part_that_the_points_do_not_reach_asks_for_a_further_run():
@@ -174,20 +145,6 @@ def test_a_refit_that_does_not_fit_is_refused_before_the_first_simulation(refit,
     with pytest.raises(ValueError, match=text):
         samplers.estimate(Never(base), seed=0)
     check_refits(fitted([normal(), normal()]), 2)
-
-
-def test_refits_of_a_base_are_checked_once_and_other_refits_again(monkeypatch):
-    base, draws = fitted([normal(), normal()]), []
-    sample = type(base).sample
-    monkeypatch.setattr(type(base), "sample", lambda self, n, rng: draws.append(n) or sample(self, n, rng))
-    check_refits(base, 2)
-    assert len(draws) > 0
-    seen = len(draws)
-    check_refits(base, 2)
-    assert len(draws) == seen
-    object.__setattr__(base, "refits", (normal(), Cut()))
-    with pytest.raises(ValueError, match="Refit 2 of 2 has another support"):
-        check_refits(base, 2)
 
 
 def test_what_cannot_be_reweighted_says_so():

@@ -10,7 +10,6 @@ import samplers
 from samplers.importance import Draws, defensive_mixture, simulate_draws, weight_warnings, weighted_interval
 from samplers.limit_states import four_branches, half_space, parabola, plateau, two_modes
 from samplers.methods.blocks import GaussianBlock, MixtureBlock, Product
-from samplers.problem import FunctionProblem
 from samplers.proposals import Gaussian
 
 CE = samplers.CrossEntropy
@@ -30,13 +29,6 @@ def test_search_goes_down_to_gamma_and_is_counted():
     assert result.p == result.trace[-1].estimate  # the fresh draws alone
 
 
-def test_final_draws_are_independent_of_the_search(recorder):
-    f = recorder(half_space().problem.f)
-    samplers.estimate(FunctionProblem(f, 2), CE(), seed=1)
-    assert len(np.unique(f.points, axis=0)) == f.rows
-    assert len(f.batches[-1]) == 4000
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("tied", [0.6, 0.85, 0.95])
 def test_ties_at_a_cap(study, tied):
@@ -44,13 +36,6 @@ def test_ties_at_a_cap(study, tied):
     assert abs(found.ratios.mean() - 1) < 4 * mean_error(found) + 0.01
     assert found.covered >= stats.binom.ppf(1e-3, 60, 0.90)
     assert {str(result.status) for result in found.results} == {"converged"}
-
-
-@pytest.mark.parametrize("dim", [2, 6])
-def test_mean_family(study, dim):
-    found = study(half_space(dim), CE(family="mean"), 60)
-    assert abs(found.ratios.mean() - 1) < 4 * mean_error(found) + 0.02
-    assert found.covered >= stats.binom.ppf(1e-3, 60, 0.88)
 
 
 @pytest.mark.parametrize(
@@ -128,14 +113,6 @@ def test_a_step_of_the_search_uses_the_likelihood_ratio(rng):
     log_ratios = (Gaussian.standard(2).log_prob(u) - proposal.log_prob(u))[None]
     moved = CE()._project(Product((GaussianBlock(proposal),)), u, log_ratios, 1.0)
     np.testing.assert_allclose(moved.blocks[0].gaussian.mean, [stats.norm.pdf(2) / stats.norm.sf(2), 0.0], atol=0.02)
-
-
-def test_a_common_event_is_left_to_plain_draws():
-    reference = half_space(2, 1.0)
-    result = samplers.estimate(reference.problem, CE(), seed=1)
-    assert result.n_sim == 5000
-    assert result.p == result.trace[-1].p
-    assert result.interval == samplers.statistics.clopper_pearson(round(4000 * result.p), 4000, 0.95)
 
 
 def test_target_cov_is_met_by_more_final_draws():

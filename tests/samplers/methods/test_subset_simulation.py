@@ -40,14 +40,6 @@ def test_seeds_are_never_simulated_again(recorder):
     assert result.n_sim == 1000 + sum(1000 - seeds for seeds in seeds_of(result.trace))
 
 
-def test_calls_of_f_are_few_and_large(recorder):
-    f = recorder(half_space().problem.f)
-    result = run(FunctionProblem(f, 2))
-    assert len(f.batches) <= 1 + 10 * (len(result.trace) - 1)
-    assert min(len(batch) for batch in f.batches[1:]) >= 90 or len(f.batches[-1]) >= 1
-    assert np.median([len(batch) for batch in f.batches[1:]]) >= 100
-
-
 def test_no_level_after_the_answer_is_known(recorder):
     """p = 0.3 is known at level 0, p = 0.02 at level 1."""
     f = recorder(half_space(2, -stats.norm.ppf(0.3)).problem.f)
@@ -80,14 +72,6 @@ def test_ties_at_a_cap(study, tied):
         shares = [result.trace[0].p for result in found.results]
         assert np.mean(shares) == pytest.approx(0.05, abs=0.005)
         assert len(set(shares)) > 10
-
-
-def test_a_budget_in_the_middle_of_a_level_is_used_and_said():
-    result = samplers.estimate(half_space(2, 4.5).problem, ADSS(n=500), seed=1, max_sim=2150)
-    assert result.n_sim == 2150
-    assert [level.n_sim for level in result.trace] == [500, 450, 450, 450, 300]
-    assert result.trace[-1].n_points == 300 + seeds_of(result.trace)[-1]
-    assert any("max_sim was used up at level 4" in text for text in result.warnings)
 
 
 @pytest.mark.slow

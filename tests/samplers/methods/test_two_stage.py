@@ -87,10 +87,6 @@ def test_no_budget_is_exceeded_whatever_the_regions(recorder):
                 assert result.n_sim == max_sim or taken_over
 
 
-def test_without_max_sim_it_makes_n():
-    assert samplers.estimate(half_space(100).problem, TS(n=2000), seed=1).n_sim == 2000
-
-
 def test_too_small_a_budget_is_plain_monte_carlo_and_says_so():
     result = samplers.estimate(half_space(2, 1.0).problem, TS(), seed=1, max_sim=300)
     assert result.p * 300 == pytest.approx(round(result.p * 300))
@@ -126,23 +122,12 @@ def test_target_that_max_sim_does_not_allow():
     assert result.status == "budget"
 
 
-def test_target_where_failure_is_common():
-    result = samplers.estimate(linear(0.524), TS(), seed=1, target_cov=0.04)
-    assert result.cov <= 0.04
-    assert near(result, PHI(-0.524))
-
-
 def test_failure_is_common(recorder):
     """Plain Monte Carlo from then on, with a binomial error."""
     result = counted(recorder, linear(0.524), seed=1)
     n = 6000 - sum(level.n_sim - level.n_points for level in result.trace[:1])
     assert result.cov == pytest.approx(math.sqrt(0.7 / 0.3 / n), rel=0.1)
     assert near(result, PHI(-0.524))
-
-
-@pytest.mark.parametrize("beta", [2.0, 5.0])
-def test_one_dimension(beta):
-    assert near(samplers.estimate(half_space(1, beta).problem, TS(), seed=1, max_sim=2000), PHI(-beta))
 
 
 @pytest.mark.parametrize(
@@ -234,21 +219,6 @@ def test_stopped_in_any_phase(reference, after):
         assert result.sample.weights[result.sample.f <= 0].sum() == pytest.approx(result.p)
 
 
-@pytest.mark.parametrize("collision", [False, True], ids=["f falls on", "f is -1 on failure"])
-def test_a_corner_takes_few_simulations(collision):
-    """Three conditions must all hold, p = 1.4e-4: plain Monte Carlo takes 7.7e6 simulations for a c.o.v. of 3 %."""
-    betas = np.array([2.0, 1.6, 1.2])
-    p = PHI(-betas).prod()
-
-    def f(u):
-        excess = (betas - u[:, :3]).max(axis=1)
-        return np.where(excess <= 0, -1.0, excess + 0.4) if collision else excess
-
-    result = samplers.estimate(samplers.FunctionProblem(f, 8), TS(), seed=0, max_sim=6000)
-    assert near(result, p)
-    assert result.cov < 0.03
-
-
 def case(name):
     """A problem of the benchmark for which no proposal is to be found."""
     state = PROBLEMS[name].make()
@@ -335,14 +305,3 @@ def test_hardly_any_bias_where_plain_draws_take_over(study, p):
     """Whether a tenth of the base draws fails decides on the rest, and they count: 0.8 % too high at p = 0.1."""
     beta = -stats.norm.ppf(p)
     judge(study(reference("common", lambda u: beta - u[:, 0], 2, p), TS(), 100, max_sim=2000), 0.008)
-
-
-@pytest.mark.parametrize("regions", [4])
-def test_ten_replicates_share_a_small_budget(recorder, regions):
-    def f(u):
-        return 3.5 - u[:, :regions].max(axis=1)
-
-    result = counted(recorder, FunctionProblem(f, 8), seed=1, max_sim=6000, replicates=10)
-    assert result.n_sim <= 6000
-    low, high = result.interval
-    assert low / 3 < regions * PHI(-3.5) < 3 * high
