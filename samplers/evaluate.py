@@ -201,10 +201,10 @@ class Evaluator:
         """Wrap a problem.
 
         Args:
-            problem: Has `dim`, `base` and `evaluate`; what else it has makes the offer.
-            gamma: Threshold of failure.
-            on_error: Rule for rows that fail, see `Work`.
-            journal: Keeps what has been computed, and may have some from before; None keeps nothing.
+            problem: As of `Work`.
+            gamma: As of `Work`.
+            on_error: As of `Work`.
+            journal: Keeps what has been computed, and may have some from before.
             executor: Where chunks are computed; None for here.
             seed: Of the run, for what simulations draw in workers.
             size: Rows of a chunk; None for `chunk_size` of the problem with an executor, and to leave requests whole
@@ -420,11 +420,7 @@ class Evaluator:
 def find_chunk_size(problem: object, size: int | None = None) -> int:
     """Return how many rows are computed together: a size, that of the problem, or `CHUNK_SIZE`.
 
-    It must not depend on the number of workers: products of networks round differently by batch, so that another size
-    gives other bits.
-
-    Raises:
-        ValueError: If it is no whole number of at least 1.
+    It must not depend on the number of workers: products of networks round differently by batch.
     """
     if size is None:
         size = getattr(problem, "chunk_size", None)  # anybody's problem

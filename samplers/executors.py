@@ -283,11 +283,7 @@ class RayCluster(_Limited):
                 ray.shutdown()
 
     def _start(self, ray: Any) -> None:
-        """Connect to the cluster at the address, or start one here.
-
-        Raises:
-            ExecutorError: That fails, for whatever reason.
-        """
+        """Connect to the cluster at the address, or start one here."""
         words: dict[str, Any] = {"include_dashboard": False} if self.address is None else {}
         if self.address is None and self.workers is not None:
             words["num_cpus"] = self.workers
@@ -304,15 +300,7 @@ AnyExecutor: TypeAlias = Executor | FuturesExecutor | Callable[[], FuturesExecut
 
 
 def find_executor(workers: int | None, executor: Any) -> Executor | None:
-    """Return the executor of a run; None where neither is given.
-
-    Args:
-        workers: Number of local processes.
-        executor: See `AnyExecutor`.
-
-    Raises:
-        ValueError: If both are given, or the executor is none.
-    """
+    """Return the executor of a run, see `AnyExecutor`; None where neither is given."""
     if executor is None:
         return None if workers is None else LocalProcesses(workers)
     if workers is not None:
@@ -363,16 +351,7 @@ class _SubmitPool:
         workers: int | None,
         blames: bool = False,
     ) -> None:
-        """Make the object.
-
-        Args:
-            make: Makes it.
-            made: Whether it is ours: shut down at the end, and made again where it is broken.
-            packed: The work.
-            limits: Of a chunk.
-            workers: Number of its workers; None to find out.
-            blames: As of `Pool`.
-        """
+        """Make the object by `make`; one that is ours (`made`) is shut down at the end, and made again if broken."""
         self._make, self._made, self._packed, self.limits = make, made, packed, limits
         self._key = blake2b(packed, digest_size=16).hexdigest()
         self._pool: Any = make()
@@ -556,27 +535,21 @@ class ProcessName(NamedTuple):
     """A process among those of all machines: numbers of processes repeat from one machine to the next."""
 
     program: str
-    """Drawn when this module is imported; a forked process has that of its parent."""
     number: int
-    """Of the process on its machine."""
 
 
 class Limits(NamedTuple):
-    """What a chunk may take of a worker process."""
+    """What a chunk may take of a worker process: time [s], after which that ends itself, and memory [bytes]."""
 
     seconds: float | None = None
-    """Longest time [s], after which the process ends itself."""
     n_bytes: float | None = None
-    """Memory of the simulations of the process."""
 
 
 class Reply(NamedTuple):
     """What comes back for a chunk."""
 
     result: Result | None
-    """The result."""
     error: BaseException | None
-    """What the work raised instead."""
     call: int
     """Number of the call that it answers: dask takes a call with the arguments of an earlier one for that one, and
     would answer that its worker died."""
@@ -596,17 +569,7 @@ def name_process() -> ProcessName:
 def compute_in_worker(
     key: str, packed: bytes, driver: ProcessName, limits: Limits, index: Index, chunk: Chunk, call: int
 ) -> Reply:
-    """Compute a chunk in a worker of any kind, which keeps the last work that it was sent.
-
-    Args:
-        key: Digest of the work.
-        packed: The work.
-        driver: The process that is neither ended nor limited.
-        limits: Of another process.
-        index: Of the chunk.
-        chunk: The chunk.
-        call: Number of this call.
-    """
+    """Compute a chunk in a worker of any kind; the driver, which may be one, is neither ended nor limited."""
     in_driver = name_process() == driver
     try:
         compute = _load(key, packed, driver, limits)
@@ -641,10 +604,7 @@ def _load(key: str, packed: bytes, driver: ProcessName, limits: Limits) -> Compu
 
 
 def _end_with(driver: int) -> None:
-    """Let this process end with the driver that is its parent: the workers of most pools would wait for it for ever.
-
-    The parent of a worker that somebody else has started, a shell perhaps, may end before it.
-    """
+    """Let this process end with the driver that is its parent: the workers of most pools would wait for it for ever."""
 
     def watch() -> None:
         while os.getppid() == driver:
@@ -656,11 +616,7 @@ def _end_with(driver: int) -> None:
 
 
 def pack(work: Any) -> bytes:
-    """Return work as bytes; functions of a script or a notebook, closures and lambdas go with it.
-
-    Raises:
-        ValueError: Something in it cannot be sent.
-    """
+    """Return work as bytes; functions of a script or a notebook, closures and lambdas go with it."""
     import cloudpickle
 
     try:
@@ -689,13 +645,7 @@ def describe(error: BaseException) -> str:
 
 
 def describe_loss(error: BaseException, seconds: float, limit: float | None) -> str:
-    """Return why a worker was lost, in one line; loky knows how its process ended.
-
-    Args:
-        error: What the pool raised.
-        seconds: Since the chunk was submitted.
-        limit: Time limit of a chunk [s].
-    """
+    """Return why a worker was lost `seconds` after its chunk was submitted; loky knows how its process ended."""
     ended = re.search(r"exit codes of the workers are \{(?:EXIT|(\w+))\((-?\d+)\)", str(error))
     if ended is not None and ended[1]:
         return f"the process of the simulation was ended by {ended[1]}"
@@ -791,14 +741,10 @@ class _Task:
 
 
 class Dispatcher:
-    """Computes chunks by a pool of workers.
-
-    Args:
-        pool: The workers.
-        lose: Returns the result of a row that no worker survives, with the reason; it may raise.
+    """Computes chunks by a pool of workers; `lose` gives the result of a row that none survives, or raises.
 
     Attributes:
-        n_retries: Chunks and parts of them that were computed again because a worker was lost.
+        n_retries: Chunks and rows of them that were computed again because a worker was lost.
     """
 
     def __init__(self, pool: Pool, lose: Callable[[Chunk, str], Result]) -> None:
@@ -808,12 +754,7 @@ class Dispatcher:
         self.n_retries = 0
 
     def run(self, chunks: Iterable[tuple[int, Chunk]]) -> Iterator[tuple[int, Result]]:
-        """Yield the results of chunks with their numbers, in any order, each as soon as it is known.
-
-        Raises:
-            Exception: What the work raises.
-            ExecutorError: No worker can be had.
-        """
+        """Yield the results of chunks with their numbers, in any order; what the work raises is raised here."""
         waiting = deque(_Task((number,), chunk) for number, chunk in chunks)
         running: dict[Future[Result], _Task] = {}
         try:

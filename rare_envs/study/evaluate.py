@@ -7,7 +7,7 @@ from collections.abc import Callable
 from contextlib import ExitStack, closing
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -16,6 +16,7 @@ import samplers
 from agents.loading import find_ego_kind
 from rare_envs.egos.errors import EgoGone
 from rare_envs.problem import DrivingProblem
+from rare_envs.study.arguments import Question
 from rare_envs.study.episodes import EpisodeTable
 from rare_envs.study.errors import BadInput, output_folder
 from rare_envs.study.interruption import (
@@ -35,7 +36,7 @@ from rare_envs.study.journal import (
     find_changed_files,
 )
 from rare_envs.study.modes import CrashKinds, classify_failures, list_all_kinds
-from rare_envs.study.question import Question, Study, build_problem, prepare
+from rare_envs.study.question import Study, build_problem, prepare
 from rare_envs.study.recorded_question import note_question, open_question
 from rare_envs.study.repeatability import Repeatability, RowKeeper, check_repeatability
 from rare_envs.study.report import Report
@@ -49,6 +50,7 @@ from rare_envs.study.writing import (
     remove_results,
     write_run,
 )
+from samplers.errors import OnError
 from samplers.estimation import Simulation, check_base
 from samplers.evaluate import Evaluator
 from samplers.executors import Executor, ExecutorError
@@ -151,7 +153,7 @@ def open_evaluator(study: Study, journal: Journal | None = None, executor: Execu
     return Evaluator(
         problem if study.ego_was_given else SentProblem(problem, question),
         question.gamma,
-        question.on_error,
+        cast(OnError, question.on_error),
         journal=journal,
         executor=executor,
         seed=question.seed,
@@ -165,7 +167,7 @@ class SentProblem:
     """The problem of a study, which workers load for themselves from its question."""
 
     def __init__(self, problem: DrivingProblem, question: Question) -> None:
-        self._problem, self._question = problem, question
+        self._problem, self._question, self._files = problem, question, digest_files(question)
 
     def __getattr__(self, name: str) -> Any:
         """Return what the problem has."""
@@ -173,7 +175,7 @@ class SentProblem:
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Return what is sent."""
-        return _load_problem, (self._question, digest_files(self._question))
+        return _load_problem, (self._question, self._files)
 
 
 def _load_problem(question: Question, files: dict[str, str]) -> DrivingProblem:

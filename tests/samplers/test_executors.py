@@ -171,7 +171,7 @@ def kill_in_mid_run(driver: subprocess.Popen[bytes], folder: Path) -> None:
 @pytest.mark.parametrize(
     ("name", "others"),
     [
-        case("local", ("here",), quick=True),
+        case("local", ("here",)),
         *(case(name, EXECUTORS[k + 1 :] + EXECUTORS[:k]) for k, name in enumerate(EXECUTORS)),
     ],
 )

@@ -50,9 +50,9 @@ def stop(name: str) -> None:
     os.kill(os.getpid(), getattr(signal, name))
 
 
-def stop_after(rows: int, name: str, monkeypatch: pytest.MonkeyPatch, method: str = "attempt") -> None:
-    """Send a signal when more than some rows have been simulated by a method of the problem."""
-    attempt, made = getattr(DrivingProblem, method), [0]
+def stop_after(rows: int, name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Send a signal when more than some rows have been simulated."""
+    attempt, made = DrivingProblem.attempt, [0]
 
     def stopping(self: DrivingProblem, x: Any) -> Any:
         made[0] += len(x)
@@ -60,7 +60,7 @@ def stop_after(rows: int, name: str, monkeypatch: pytest.MonkeyPatch, method: st
             stop(name)
         return attempt(self, x)
 
-    monkeypatch.setattr(DrivingProblem, method, stopping)
+    monkeypatch.setattr(DrivingProblem, "attempt", stopping)
 
 
 def assert_stopped(result: Any, name: str, line: str) -> None:
@@ -143,11 +143,11 @@ def test_simulations_of_the_further_run_are_not_those_of_the_run(
 
 def test_a_comparison_says_what_is_known(cli: Cli, here: Path, risky: str, monkeypatch: pytest.MonkeyPatch) -> None:
     words = ("compare", "egos_here:coasting", "idm", *WORDS[1:-4], "--base", risky, "--max-sim", "60000")
-    stop_after(25_000, "SIGTERM", monkeypatch, "evaluate")
+    stop_after(25_000, "SIGTERM", monkeypatch)
     result = cli(*words)
     assert result.exit_code == 143
     assert result.stderr.startswith("Stopped after 10,000 simulations: P[A or B fails] so far ")
-    stop_after(300, "SIGTERM", monkeypatch, "evaluate")
+    stop_after(300, "SIGTERM", monkeypatch)
     batch = "Stopped: no estimate yet, the first batch of simulations was not complete."
     assert_stopped(cli(*words), "SIGTERM", batch)
 
