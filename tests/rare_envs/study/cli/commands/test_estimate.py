@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -59,3 +60,21 @@ def test_an_ego_that_fails_on_the_way_is_one_line(cli: Cli, here: Path, risky: s
     (here / "old").mkdir()
     assert_refused(cli(*words, here / "old"), "NaN")
     assert (here / "old").exists()
+
+
+def test_weather_on_the_command_line(cli: Cli, tmp_path: Path) -> None:
+    out = tmp_path / "run"
+    words = [
+        "estimate",
+        "rare_envs/CutIn-v0",
+        "--weather",
+        "--observation",
+        "camera+lidar",
+        "--method",
+        "mc",
+        "--max-sim",
+        "40",
+    ]
+    found = json.loads(cli(*words, "--horizon", "1", "--out", str(out), "--json").stdout)
+    assert found["question"]["weather"] is True
+    assert found["question"]["observation"] == "camera+lidar"
