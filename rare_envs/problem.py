@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
-from rare_envs.core_choice import CoreChoice, is_compiled_script
 from rare_envs.devices import find_device, move_to
 from rare_envs.devices.batch_sizes import chunk_size, tile_size
 from rare_envs.distributions.space import Distribution, ScenarioSpace
@@ -28,11 +28,14 @@ from rare_envs.egos.needs import (
     name_ambiguities,
     resolve,
 )
-from rare_envs.egos.policy import PolicyDriver, as_driver
+from rare_envs.egos.policy import PolicyDriver, as_driver, find_device_driver
 from rare_envs.egos.wrappers import describe_missing_normalisation
+from rare_envs.fast.choice import CompilerFails, check_core, is_compiled, simulate
+from rare_envs.fast.dense_policy import NotCompiled
 from rare_envs.make import refuse_unknown, set_up
 from rare_envs.scenarios.registry import find_scenario, split_layout
 from rare_envs.sensors.kinds import read_kinds
+from rare_envs.simulation.cuda_graphs import RecordedRollouts
 from rare_envs.simulation.episode import Episode
 from rare_envs.simulation.measurement import Measurement
 from rare_envs.simulation.rollout import Driver, StochasticDriver, rollout
@@ -138,7 +141,11 @@ class DrivingProblem:
             self.world = replace(self.world, background=move_to(self.device, self.world.background))
             self.driver = move_to(self.device, self.driver)
         self.varies = self.needs.varies
-        self._core = CoreChoice(core, self.world, self.driver, self.device, self.tile)
+        check_core(core)
+        self._core = core
+        self._recorded: RecordedRollouts | None = None
+        if core == "numba":
+            self._simulate_compiled(np.empty((0, self.dim)))
         said_by_id = bool(layout) and not self.needs.queries_policy  # nobody named its actions
         for note in self.notes:
             if note != TAKEN_AS_ACCELERATIONS and not said_by_id:
@@ -149,13 +156,6 @@ class DrivingProblem:
             warnings.warn(
                 f"the ego has no VecNormalize statistics, but {missing}; {advice}", MissingStatistics, stacklevel=2
             )
-
-    def __setattr__(self, name: str, value: Any) -> None:
-        """Set an attribute; another world or driver has another compiled rollout, or none, and other gradients."""
-        super().__setattr__(name, value)
-        if name in ("world", "driver") and "_core" in vars(self):
-            self._core = CoreChoice(self._core.wanted, self.world, self.driver, self.device, self.tile)
-            vars(self).pop("gradient", None)
 
     def __repr__(self) -> str:
         """Return one line."""
@@ -171,8 +171,7 @@ class DrivingProblem:
     @property
     def core(self) -> str:
         """What simulates `evaluate`: "torch" or "numba", which compiles now what it has not yet."""
-        nothing = np.empty((0, self.dim))
-        return "torch" if self._core.run(nothing) is None else "numba"
+        return "torch" if self._simulate_compiled(np.empty((0, self.dim))) is None else "numba"
 
     @property
     def terms_with_f(self) -> bool:
@@ -181,7 +180,7 @@ class DrivingProblem:
         Not in scripts that have compiled rollouts: these have no terms. Nor do methods ask torch for them there, so
         that both cores are asked the same questions, and give the same answers but for rounding.
         """
-        return not is_compiled_script(self.world, self.driver)
+        return not is_compiled(self.world, self.driver)
 
     @property
     def dim(self) -> int:
@@ -364,7 +363,7 @@ class DrivingProblem:
 
     def _simulate(self, x: NDArray[np.float64], failed_rows: dict[int, str] | None) -> NDArray[np.float64]:
         x = self.space.validate(np.atleast_2d(x))
-        f = self._core.run(x)
+        f = self._simulate_compiled(x)
         if f is None:
             f = self._simulate_by_torch(x, failed_rows)
         elif self.needs.queries_policy and np.isnan(f).any():  # torch tells what fails there, and how
@@ -374,6 +373,22 @@ class DrivingProblem:
                 failed_rows.update({int(rows[row]): reason for row, reason in failed.items()})
         self._check_known(x, f, failed_rows)
         return f
+
+    def _simulate_compiled(self, x: NDArray[np.float64]) -> NDArray[np.float64] | None:
+        """Return f of scenarios x (n, d), NaN where it is not known; None where torch has to simulate."""
+        if self._core == "torch":
+            return None
+        try:
+            if self.device.type != "cpu":
+                raise NotCompiled(f"compiled rollouts are for the CPU, and device={str(self.device)!r} was asked for")
+            return simulate(self.world, self.driver, x)
+        except NotCompiled as reason:
+            if self._core == "numba":
+                raise ValueError(f"core='numba' cannot simulate this: {reason}.") from reason
+            if isinstance(reason, CompilerFails):
+                self._core = "torch"
+                warnings.warn(f"{reason}; torch simulates, which is slower.", stacklevel=4)
+            return None
 
     def _simulate_by_torch(self, x: NDArray[np.float64], failed_rows: dict[int, str] | None) -> NDArray[np.float64]:
         parts = [end.f.numpy(force=True) for end in self._roll_out(self.world, x, failed_rows)]
@@ -399,12 +414,33 @@ class DrivingProblem:
             if failed_rows is not None and isinstance(driver, PolicyDriver):
                 driver = replace(driver, failed_rows=mine)
             with torch.inference_mode():
-                end = self._core.roll_out(world, rows)
+                end = None if self.device.type == "cpu" else self._replay(world, rows)
                 if end is None:
                     end = rollout(world, driver, rows)
             if failed_rows is not None:
                 failed_rows.update({first + row: reason for row, reason in mine.items()})
             yield end
+
+    def _replay(self, world: World, rows: Tensor) -> Episode | None:
+        """Return the episodes of scenarios (B, d) on a GPU, recorded when there were as many before.
+
+        Returns:
+            None where a policy has to be asked on the CPU: one that cannot decide elsewhere, or one that fails, for
+            then it is told on which rows, and how.
+        """
+        known = self._recorded
+        driver = find_device_driver(self.driver, self.device, None if known is None else known.driver)
+        if driver is None:
+            return None
+        if known is None or known.driver is not driver:
+            known = self._recorded = RecordedRollouts(driver, self.tile)
+        if not isinstance(self.driver, PolicyDriver):
+            return known(world, rows)
+        try:
+            end = known(world, rows)
+        except (Exception, SystemExit):  # the policy is the user's: anything may happen in it
+            return None
+        return None if has_nan(end) else end
 
     def _check_known(self, x: NDArray[np.float64], f: NDArray[np.float64], failed_rows: dict[int, str] | None) -> None:
         """Raise a ValueError where f is NaN, or add the row to those that failed."""
@@ -416,6 +452,15 @@ class DrivingProblem:
     def _nan_error(self, x_row: NDArray[np.float64], row: int | np.signedinteger[Any]) -> ValueError:
         named = {name: value for name, value in self.space.named(x_row).items() if np.size(value) == 1}
         return ValueError(f"The measure {self.world.measurement.measure!r} gave NaN, first at row {row}: {named}.")
+
+
+def has_nan(end: Episode) -> bool:
+    """Return whether f or an ego is NaN at the horizon of any episode.
+
+    An action that is NaN leaves the ego so for good; f need not notice, since nobody is seen by or near such an ego.
+    """
+    own = (values[:, 0] for values in end.state[:4])
+    return bool(torch.stack([end.f.isnan(), *(values.isnan() for values in own)]).any())
 
 
 @contextmanager

@@ -20,8 +20,7 @@ from torch import Tensor, nn
 from torch.nn.functional import linear
 
 from rare_envs.egos.wrappers import NormalisedPolicy, RescaledPolicy
-from rare_envs.simulation.compiled.dense_policy import Activation, DensePolicy
-from rare_envs.simulation.compiled.failures import NotCompiled
+from rare_envs.fast.dense_policy import Activation, DensePolicy, NotCompiled
 
 ACTIVATIONS: dict[type[nn.Module], Activation] = {nn.Tanh: "tanh", nn.ReLU: "relu"}
 SB3 = "stable_baselines3"

@@ -11,9 +11,9 @@ from rare_envs.control.actions import read_actions
 from rare_envs.envs.highway_env_interface import HighwayEnvInterface
 from rare_envs.envs.rendering import RENDER_MODES, Display
 from rare_envs.envs.rows_and_infos import SingleObservation, episode_info, step_info
+from rare_envs.fast.environments import find_scripted_step
 from rare_envs.make import set_up
 from rare_envs.sensors.kinds import map_kinds
-from rare_envs.simulation.compiled.scripted_step import find_scripted_step
 from rare_envs.simulation.decision import StepResult, advance
 from rare_envs.simulation.episode import Episode
 from rare_envs.simulation.observation import observe

@@ -25,9 +25,9 @@ from rare_envs.envs.rows_and_infos import (
     replace_rows,
     to_object_rows,
 )
+from rare_envs.fast.environments import find_scripted_step
 from rare_envs.make import set_up
 from rare_envs.sensors.kinds import map_kinds
-from rare_envs.simulation.compiled.scripted_step import find_scripted_step
 from rare_envs.simulation.decision import advance
 from rare_envs.simulation.episode import Episode
 from rare_envs.simulation.observation import observe

@@ -5,6 +5,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
+import torch
 from gymnasium import spaces
 from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import VecNormalize
@@ -199,3 +200,45 @@ def test_tables_of_a_result_name_the_parameters() -> None:
     highway = rare_envs.DrivingProblem("rare_envs/Highway-v0", noise=False)
     assert len(highway.column_names) == highway.dim
     assert highway.column_names[:2] == ("s[0]", "s[1]")
+
+
+class Fails(torch.nn.Module):
+    """Goes straight on, but for the first row after some queries."""
+
+    def __init__(self, answer: float, after: int) -> None:
+        super().__init__()
+        self.answer, self.left = answer, after
+
+    def forward(self, seen: torch.Tensor) -> torch.Tensor:
+        actions = torch.zeros(len(seen), 2)
+        self.left -= 1
+        if self.left < 0:
+            if self.answer == 0.0:
+                raise SystemExit(3)
+            actions[0, 1] = self.answer
+        return actions
+
+
+def replay_as_on_a_gpu(ego: Any, monkeypatch: pytest.MonkeyPatch) -> Any:
+    """Return what a problem on a GPU makes of two scenarios; the numbers stay here."""
+    monkeypatch.setattr("rare_envs.control.actions.can_look", lambda _: False)
+    problem = rare_envs.DrivingProblem("rare_envs/CarFollowing-v0", ego=ego, core="torch")
+    problem.device = torch.device("cuda")
+    with torch.inference_mode():
+        return problem._replay(problem.world, torch.tensor([[20.0, 25.0, 30.0], [20.0, 25.0, 40.0]]))
+
+
+@pytest.mark.parametrize("answer", [0.0, np.nan, np.inf], ids=["error", "nan", "infinite"])
+@pytest.mark.parametrize("after", [0, 99])
+def test_a_policy_that_fails_on_a_gpu_is_queried_again(
+    answer: float, after: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert replay_as_on_a_gpu(Fails(answer, after), monkeypatch) is None
+
+
+def test_one_that_does_not_fail_is_not(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert replay_as_on_a_gpu(Fails(np.nan, after=100), monkeypatch).f.isfinite().all()
+
+
+def test_a_policy_of_anybody_is_queried_through_the_cpu(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert replay_as_on_a_gpu(Constant([0.0, 0.0]), monkeypatch) is None

@@ -1,35 +1,29 @@
-"""Equations of motion, of the IDM and of the time to collision for one scenario at a time, compiled by numba.
+"""Equations of one vehicle or two, in single precision, compiled by numba.
 
 Each function is the scalar twin of the torch function that its docstring names, which has the sources and the
-explanations. Operations are in the same order and in single precision, so that the two differ by the rounding of
-transcendental functions alone. Importing this module needs numba.
+explanations. Operations are in the same order, so that the two differ by the rounding of sines and the like alone.
 """
 
 import math
-from typing import Any, NamedTuple, Protocol, TypeAlias
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from rare_envs.compilation import compiled, single
 from rare_envs.control.idm import IDM, MAX_HEADING_COMMAND, MIN_RATIO, TAU_HEADING, TAU_LATERAL
+from rare_envs.fast.compilation import compiled, single
 from rare_envs.measures.base import GAP_MIN, STILL
-from rare_envs.measures.longitudinal import TTC_MAX
 from rare_envs.traffic import vehicle_models
 from rare_envs.traffic.bodies import DIAGONAL
 from rare_envs.traffic.road import Road
 from rare_envs.traffic.state import VEHICLE_LENGTH, VEHICLE_WIDTH
 
-PerVehicle: TypeAlias = NDArray[np.float32] | tuple[Any, ...]
-"""One number of each vehicle, the ego first; those of a tuple stay in registers."""
-ZERO, _HALF, ONE, TWO, _FOUR = single(0.0, 0.5, 1.0, 2.0, 4.0)
+ZERO, HALF, ONE, TWO, THREE, FOUR, SIX = single(0.0, 0.5, 1.0, 2.0, 3.0, 4.0, 6.0)
 BODY_LENGTH, _HALF_LENGTH, _HALF_WIDTH = single(VEHICLE_LENGTH, VEHICLE_LENGTH / 2, VEHICLE_WIDTH / 2)
 _NEAREST, _MAX_SINE, _MAX_STEERING = single(
     vehicle_models.NEAR_ZERO, vehicle_models.MAX_SLIP_SINE, vehicle_models.STEERING_LIMIT
 )
 _MAX_HEADING, _HEADING_GAIN, _LATERAL_GAIN = single(MAX_HEADING_COMMAND, 1.0 / TAU_HEADING, -TAU_LATERAL)
-_LEAST_GAP, _LEAST_SPEED, _LARGEST_TTC = single(GAP_MIN, STILL, TTC_MAX)
-_LEAST_RATIO, _FAR, _NOWHERE = single(MIN_RATIO, DIAGONAL, np.inf)
+_LEAST_GAP, _LEAST_SPEED, _LEAST_RATIO, _FAR = single(GAP_MIN, STILL, MIN_RATIO, DIAGONAL)
 
 
 class IDMNumbers(NamedTuple):
@@ -52,18 +46,6 @@ class IDMNumbers(NamedTuple):
     def of(cls, idm: IDM) -> "IDMNumbers":
         """Return the parameters of an IDM."""
         return cls(*single(*(getattr(idm, name) for name in cls._fields)))
-
-
-class RoadWidth(Protocol):
-    """The part of a road's numbers that tells how far its edges are [m]."""
-
-    @property
-    def middle(self) -> float:
-        """Middle of the whole road, its y."""
-
-    @property
-    def half(self) -> float:
-        """Half the width of the whole road."""
 
 
 class RoadNumbers(NamedTuple):
@@ -120,9 +102,9 @@ def cosine(angle: float) -> float:
 
 
 @compiled
-def slip_of(steering: float) -> float:
-    """Return the slip angle of the bicycle model [rad]."""
-    return math.atan(math.tan(steering) * _HALF)
+def keep_straight(x: float, speed: float, acceleration: float, dt: float) -> tuple[float, float]:
+    """Return x and speed after a tick: `rare_envs.scenarios.base.keep_straight`."""
+    return x + speed * dt, at_least(speed + acceleration * dt, ZERO)
 
 
 @compiled
@@ -130,9 +112,8 @@ def bicycle(
     x: float, y: float, heading: float, speed: float, acceleration: float, steering: float, dt: float
 ) -> tuple[float, float, float, float]:
     """Return x, y, heading and speed after a tick: `rare_envs.traffic.vehicle_models.bicycle`."""
-    slip = slip_of(steering)
-    course = heading + slip
-    distance = speed * dt
+    slip = math.atan(math.tan(steering) * HALF)
+    course, distance = heading + slip, speed * dt
     turn = distance * math.sin(slip) / _HALF_LENGTH
     after = at_least(speed + acceleration * dt, ZERO)
     return x + distance * math.cos(course), y + distance * math.sin(course), heading + turn, after
@@ -141,8 +122,7 @@ def bicycle(
 @compiled
 def steering_for(yaw_rate: float, speed: float) -> float:
     """Return the steering angle [rad]: `rare_envs.traffic.vehicle_models.steering_for`."""
-    sine = _HALF_LENGTH / max(speed, _NEAREST) * yaw_rate
-    slip = math.asin(clip(sine, -_MAX_SINE, _MAX_SINE))
+    slip = math.asin(clip(_HALF_LENGTH / max(speed, _NEAREST) * yaw_rate, -_MAX_SINE, _MAX_SINE))
     return clip(math.atan(TWO * math.tan(slip)), -_MAX_STEERING, _MAX_STEERING)
 
 
@@ -154,9 +134,9 @@ def centre_of(y: float, road: RoadNumbers) -> float:
 
 
 @compiled
-def lane_keeping(y: float, heading: float, speed: float, road: RoadNumbers) -> float:
-    """Return the steering angle [rad]: `rare_envs.control.idm.lane_keeping`."""
-    return steer_to_line(y - centre_of(y, road), heading, speed)
+def off_road(y: float, road: RoadNumbers) -> bool:
+    """Return whether y is beyond an outer edge: `Road.off_road`."""
+    return abs(y - road.middle) > road.half
 
 
 @compiled
@@ -169,20 +149,16 @@ def steer_to_line(offset: float, heading: float, speed: float) -> float:
 
 
 @compiled
-def idm_acceleration(idm: IDMNumbers, speed: float, gap: float, closing_speed: float, desired_speed: float) -> float:
-    """Return the acceleration [m/s^2]: `rare_envs.control.idm.IDM.acceleration`."""
-    ratio = speed / desired_speed
+def fourth_power(ratio: float) -> float:
+    """Return a number to the fourth, by two products."""
     square = ratio * ratio
-    free = square * square if idm.exponent == _FOUR else ratio**idm.exponent
-    return idm_interaction(idm, speed, gap, closing_speed, ratio, free)
+    return square * square
 
 
 @compiled
-def idm_interaction(
-    idm: IDMNumbers, speed: float, gap: float, closing_speed: float, ratio: float, free: float
-) -> float:
-    """Return the acceleration [m/s^2] from the speed's ratio to the desired one and that to the power `exponent`."""
-    headway = idm.time_headway + closing_speed * idm.closing_gain
+def idm_acceleration(idm: IDMNumbers, speed: float, gap: float, closing: float, ratio: float, free: float) -> float:
+    """Return the acceleration [m/s^2], of speed / desired speed and its power `free`: `IDM.acceleration`."""
+    headway = idm.time_headway + closing * idm.closing_gain
     if idm.cut_off > ZERO:
         headway = max(headway, ZERO)
     desired_gap = idm.jam_distance + speed * headway
@@ -195,7 +171,7 @@ def idm_interaction(
 @compiled
 def are_near(dx: float, dy: float) -> bool:
     """Return whether centres are so near that bodies may overlap."""
-    return abs(dx) < _FAR and abs(dy) < _FAR
+    return (abs(dx) < _FAR) & (abs(dy) < _FAR)
 
 
 @compiled
@@ -203,72 +179,26 @@ def boxes_overlap(dx: float, dy: float, heading: float, other_heading: float) ->
     """Return whether two bodies overlap: `rare_envs.traffic.bodies.boxes_overlap`, where centres are near."""
     if not are_near(dx, dy):
         return False
-    cos, sin = math.cos(heading), math.sin(heading)
-    turn = other_heading - heading
+    cos, sin = cosine(heading), sine(heading)
     along, across = dx * cos + dy * sin, dy * cos - dx * sin
-    cos, sin = math.cos(turn), math.sin(turn)
+    cos, sin = cosine(other_heading - heading), sine(other_heading - heading)
     other_along, other_across = along * cos + across * sin, across * cos - along * sin
     cos, sin = abs(cos), abs(sin)
-    long, wide = (
-        _HALF_LENGTH + _HALF_LENGTH * cos + _HALF_WIDTH * sin,
-        _HALF_WIDTH + _HALF_LENGTH * sin + _HALF_WIDTH * cos,
-    )
+    long = _HALF_LENGTH + _HALF_LENGTH * cos + _HALF_WIDTH * sin
+    wide = _HALF_WIDTH + _HALF_LENGTH * sin + _HALF_WIDTH * cos
     return abs(along) < long and abs(across) < wide and abs(other_along) < long and abs(other_across) < wide
 
 
 @compiled
-def off_road(y: float, road: RoadWidth) -> bool:
-    """Return whether y is beyond an outer edge: `Road.off_road`."""
-    return abs(y - road.middle) > road.half
+def time_to_lead(gap: float, closing: float) -> float:
+    """Return the time to collision with the lead [s], without a cap: `longitudinal._time_to_lead`."""
+    return max(gap, _LEAST_GAP) / at_least(closing, _LEAST_SPEED)
 
 
 @compiled
-def lead_of(
-    x: PerVehicle,
-    y: PerVehicle,
-    heading: PerVehicle,
-    speed: PerVehicle,
-    road: RoadNumbers,
-) -> tuple[float, float]:
-    """Return gap [m] and closing speed [m/s] of vehicle 0's lead: `traffic.neighbours.lead_of`; arguments (N,)."""
-    return lead_in_lane(x, y, heading, speed, centre_of(y[0], road), road.reach)
-
-
-@compiled
-def lead_in_lane(
-    x: PerVehicle,
-    y: PerVehicle,
-    heading: PerVehicle,
-    speed: PerVehicle,
-    lane: float,
-    reach: float,
-) -> tuple[float, float]:
-    """Return `lead_of` for a lane [m] and the distance from it within which vehicles reach into it [m]."""
-    nearest, lead_speed = _NOWHERE, speed[0]
-    for other in range(1, len(x)):
-        ahead = x[other] - x[0]
-        if ahead >= ZERO and abs(y[other] - lane) <= reach and ahead <= nearest:
-            nearest, lead_speed = ahead, speed[other] * cosine(heading[other] - heading[0])
-    return nearest - BODY_LENGTH, speed[0] - lead_speed
-
-
-@compiled
-def ttc(gap: float, closing_speed: float, y: float, heading: float, speed: float, road: RoadWidth) -> float:
-    """Return the time to collision [s]: `rare_envs.measures.longitudinal.ttc`."""
+def time_to_edge(y: float, heading: float, speed: float, road: RoadNumbers) -> float:
+    """Return the time until the centre leaves the road [s]: `longitudinal.time_to_edge`."""
     across = speed * sine(heading)
     sign: float = np.sign(across)
     room = road.half - (y - road.middle) * sign
-    to_edge = max(room, _LEAST_GAP) / max(abs(across), _LEAST_SPEED)
-    return at_most(at_most(time_to_lead(gap, closing_speed), to_edge), _LARGEST_TTC)
-
-
-@compiled
-def straight_ttc(gap: float, closing_speed: float) -> float:
-    """Return `ttc` of a vehicle that drives straight on, which meets no edge."""
-    return at_most(time_to_lead(gap, closing_speed), _LARGEST_TTC)
-
-
-@compiled
-def time_to_lead(gap: float, closing_speed: float) -> float:
-    """Return the time to collision with the lead [s], without a cap: `time_to_collision._time_to_lead`."""
-    return max(gap, _LEAST_GAP) / at_least(closing_speed, _LEAST_SPEED)
+    return max(room, _LEAST_GAP) / max(abs(across), _LEAST_SPEED)

@@ -13,15 +13,13 @@ MAX_UNITS = 128
 """Widest layer: beyond it torch's matrix products are faster than the compiled ones, which are made for few units."""
 
 
+class NotCompiled(ValueError):
+    """There is no compiled rollout; the message says why."""
+
+
 @dataclass(frozen=True, eq=False)
 class DensePolicy:
-    """A policy that is a network of dense layers on the `features` observation, without memory or noise.
-
-    Example:
-        >>> layers = ((np.zeros((64, 7)), np.zeros(64)), (np.zeros((2, 64)), np.ones(2)))
-        >>> DensePolicy(layers, "tanh").describe_obstacle(), DensePolicy(layers[:1], "tanh").describe_obstacle()
-        ('', 'a network of 64 outputs')
-    """
+    """A policy that is a network of dense layers on the `features` observation, without memory or noise."""
 
     layers: tuple[tuple[NDArray[np.floating], NDArray[np.floating]], ...]
     """Weights, shape (outputs, inputs), and biases, shape (outputs,), of each layer, first to last."""
@@ -38,16 +36,12 @@ class DensePolicy:
     """Mean and standard deviation of the observations, shape (F,) each, by which they are normalised before they are
     clipped to plus or minus the last; None for observations as they are."""
 
-    def describe_obstacle(self, observed: int | None = None) -> str:
-        """Return why no compiled rollout carries it out; empty if one does.
-
-        Args:
-            observed: Numbers of an observation, F; None not to compare.
-        """
+    def describe_obstacle(self, observed: int) -> str:
+        """Return why no compiled rollout carries it out with F observed numbers; empty if one does."""
         widths = [len(self.layers[0][0][0]), *(len(bias) for _, bias in self.layers)]
         if widths[-1] != (5 if self.chooses else 2):
             return f"a network of {widths[-1]} outputs"
-        if observed is not None and widths[0] != observed:
+        if widths[0] != observed:
             return f"a network of {widths[0]} inputs"
         if max(widths) > MAX_UNITS:
             return f"a network of {max(widths)} units in a layer, which torch computes about as fast"

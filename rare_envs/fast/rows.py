@@ -1,0 +1,251 @@
+"""Rows of traffic side by side, and their tick, compiled by numba.
+
+A tick is a few loops over rows that do the same arithmetic for each, so that the compiler computes some at once (SIMD).
+Sines and the like, which it cannot, stand in loops of their own, for blocks in which any vehicle is off its line. A row
+has the same bits in any block.
+"""
+
+from typing import NamedTuple, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rare_envs.fast.compilation import compiled, inlined, single
+from rare_envs.fast.equations import (
+    BODY_LENGTH,
+    FOUR,
+    ZERO,
+    IDMNumbers,
+    RoadNumbers,
+    are_near,
+    at_most,
+    bicycle,
+    boxes_overlap,
+    centre_of,
+    cosine,
+    fourth_power,
+    idm_acceleration,
+    keep_straight,
+    off_road,
+    steer_to_line,
+    time_to_edge,
+    time_to_lead,
+)
+from rare_envs.fast.scripts import move_others
+from rare_envs.measures.base import COLLISION
+from rare_envs.measures.longitudinal import TTC_MAX
+from rare_envs.traffic.state import State
+
+SingleArray: TypeAlias = NDArray[np.float32]
+OWN = 8
+"""Numbers of a row beside those of its vehicles and theta."""
+HIT, UNKNOWN, _LARGEST, _NOWHERE = single(COLLISION, -np.inf, TTC_MAX, np.inf)
+
+
+class Rows(NamedTuple):
+    """B rows of N vehicles, the ego first, in single precision; `rare_envs.simulation.episode.Episode`."""
+
+    x: SingleArray
+    """Shape (N, B), likewise the next four."""
+    y: SingleArray
+    heading: SingleArray
+    speed: SingleArray
+    cosine: SingleArray
+    """Of the heading; of the ego without meaning."""
+    theta: SingleArray
+    """Of the state, shape (P, B)."""
+    acceleration: SingleArray
+    """Of the ego [m/s^2], shape (B,), likewise the next five."""
+    steering: SingleArray
+    """Its steering angle [rad]."""
+    gap: SingleArray
+    """To its lead [m]."""
+    closing: SingleArray
+    """Closing speed [m/s]."""
+    lane: SingleArray
+    """Middle of its lane, y [m]."""
+    f: SingleArray
+    """The measure so far, `HIT` from a collision on, `UNKNOWN` from an action on that is not finite."""
+    spare: SingleArray
+    """Written over, shape (2, B)."""
+    size: int
+    """Rows that are driven, the first ones."""
+
+
+def stack_state(state: State) -> SingleArray:
+    """Return x, y, heading and speed of the N vehicles and theta side by side, shape (4 N + P, B)."""
+    return np.concatenate([field.numpy().T for field in state])
+
+
+def make_table(start: SingleArray, vehicles: int, size: int) -> SingleArray:
+    """Return the memory of so many rows, which begin as the first columns of `stack_state`."""
+    table = np.zeros((len(start) + vehicles + OWN, size), dtype=np.float32)
+    first = start[:, :size]
+    table[: len(start), : first.shape[1]] = first
+    return table
+
+
+@inlined
+def rows_of(table: SingleArray, vehicles: int, size: int) -> Rows:
+    """Return the rows in a table of `make_table`, of which the first `size` are driven."""
+    end = 4 * vehicles
+    own = len(table) - OWN
+    return Rows(
+        table[:vehicles],
+        table[vehicles : 2 * vehicles],
+        table[2 * vehicles : 3 * vehicles],
+        table[3 * vehicles : end],
+        table[own - vehicles : own],
+        table[end : own - vehicles],
+        table[own],
+        table[own + 1],
+        table[own + 2],
+        table[own + 3],
+        table[own + 4],
+        table[own + 5],
+        table[own + 6 :],
+        size,
+    )
+
+
+@compiled
+def begin(rows: Rows, road: RoadNumbers) -> bool:
+    """Take the moment at time 0; return whether any ego is off its line, as `look` does."""
+    find_cosines(rows)
+    rows.f[:] = _NOWHERE
+    return look(rows, True, road)
+
+
+@compiled
+def begin_step(rows: Rows, f: SingleArray) -> None:
+    """Go on from a moment with the measure (B,) that it has had so far."""
+    find_cosines(rows)
+    for row in range(rows.size):
+        rows.f[row] = f[row]
+
+
+@compiled
+def find_cosines(rows: Rows) -> None:
+    """Find the cosines of the headings."""
+    for vehicle in range(len(rows.x)):
+        for row in range(rows.size):
+            rows.cosine[vehicle, row] = cosine(rows.heading[vehicle, row])
+
+
+@inlined
+def tick(script: int, rows: Rows, turns: bool, cutter_idm: IDMNumbers, road: RoadNumbers, dt: float) -> bool:
+    """Move all by a tick, and take the moment after it.
+
+    Args:
+        script: A number of `rare_envs.fast.scripts`.
+        rows: The traffic; egos move by their `acceleration`, and by their `steering` if any `turns`.
+        turns: Whether any ego steers or is off its line.
+        cutter_idm: Of a cutter behind its lead.
+        road: The road.
+        dt: Tick [s].
+
+    Returns:
+        Whether any ego is off its line.
+    """
+    move_others(script, rows, cutter_idm, dt)
+    move_egos(rows, turns, dt)
+    mark_hits(rows, turns, road)
+    return look(rows, turns, road)
+
+
+@inlined
+def decide_by_idm(rows: Rows, turns: bool, idm: IDMNumbers) -> None:
+    """Decide for the egos: `rare_envs.control.idm.IDM.act`."""
+    speed, gap, closing, acceleration = rows.speed[0], rows.gap, rows.closing, rows.acceleration
+    if idm.exponent == FOUR:
+        for row in range(rows.size):
+            ratio = speed[row] / idm.desired_speed
+            acceleration[row] = idm_acceleration(idm, speed[row], gap[row], closing[row], ratio, fourth_power(ratio))
+    else:
+        for row in range(rows.size):
+            ratio = speed[row] / idm.desired_speed
+            free = ratio**idm.exponent
+            acceleration[row] = idm_acceleration(idm, speed[row], gap[row], closing[row], ratio, free)
+    if turns:
+        for row in range(rows.size):
+            rows.steering[row] = steer_to_line(rows.y[0, row] - rows.lane[row], rows.heading[0, row], speed[row])
+
+
+@inlined
+def move_egos(rows: Rows, turns: bool, dt: float) -> None:
+    """Move the egos by the bicycle model."""
+    x, y, heading, speed, acceleration = rows.x[0], rows.y[0], rows.heading[0], rows.speed[0], rows.acceleration
+    if turns:
+        for row in range(rows.size):
+            x[row], y[row], heading[row], speed[row] = bicycle(
+                x[row], y[row], heading[row], speed[row], acceleration[row], rows.steering[row], dt
+            )
+        return
+    for row in range(rows.size):
+        x[row], speed[row] = keep_straight(x[row], speed[row], acceleration[row], dt)
+
+
+@inlined
+def mark_hits(rows: Rows, turns: bool, road: RoadNumbers) -> None:
+    """Set f of the egos that touch another vehicle or are off the road."""
+    x, y, heading, f = rows.x[0], rows.y[0], rows.heading[0], rows.f
+    for other in range(1, len(rows.x)):
+        other_x, other_y, other_heading = rows.x[other], rows.y[other], rows.heading[other]
+        near = False
+        for row in range(rows.size):
+            near |= are_near(other_x[row] - x[row], other_y[row] - y[row])
+        if near:
+            for row in range(rows.size):
+                dx, dy = other_x[row] - x[row], other_y[row] - y[row]
+                if f[row] > HIT and boxes_overlap(dx, dy, heading[row], other_heading[row]):
+                    f[row] = HIT
+    if turns:
+        for row in range(rows.size):
+            f[row] = HIT if f[row] > HIT and off_road(y[row], road) else f[row]
+
+
+@inlined
+def look(rows: Rows, turns: bool, road: RoadNumbers) -> bool:
+    """Find the egos' leads, `rare_envs.traffic.neighbours.lead_of`, and let f be the least time to collision so far.
+
+    Args:
+        rows: The traffic.
+        turns: Whether any ego may have left its line.
+        road: The road.
+
+    Returns:
+        Whether any is off its line: not in the middle of a lane, or not along it.
+    """
+    x, speed, f, gap, closing, lane = rows.x[0], rows.speed[0], rows.f, rows.gap, rows.closing, rows.lane
+    off_line = turns and find_lanes(rows, road)
+    for row in range(rows.size):
+        gap[row], closing[row] = _NOWHERE, speed[row]
+    for other in range(1, len(rows.x)):
+        other_x, other_y, other_speed, cosines = rows.x[other], rows.y[other], rows.speed[other], rows.cosine[other]
+        if off_line:
+            cosines = rows.spare[0]
+            for row in range(rows.size):
+                cosines[row] = cosine(rows.heading[other, row] - rows.heading[0, row])
+        for row in range(rows.size):
+            ahead = other_x[row] - x[row]
+            nearer = (ahead >= ZERO) & (abs(other_y[row] - lane[row]) <= road.reach) & (ahead <= gap[row])
+            gap[row] = ahead if nearer else gap[row]
+            closing[row] = other_speed[row] * cosines[row] if nearer else closing[row]
+    for row in range(rows.size):
+        gap[row], closing[row] = gap[row] - BODY_LENGTH, speed[row] - closing[row]
+        time = at_most(time_to_lead(gap[row], closing[row]), _LARGEST)
+        f[row] = at_most(time, f[row])
+    if off_line:
+        for row in range(rows.size):
+            f[row] = at_most(time_to_edge(rows.y[0, row], rows.heading[0, row], speed[row], road), f[row])
+    return off_line
+
+
+@compiled
+def find_lanes(rows: Rows, road: RoadNumbers) -> bool:
+    """Find the egos' lanes; return whether any is off its line."""
+    y, heading, lane, off_line = rows.y[0], rows.heading[0], rows.lane, False
+    for row in range(rows.size):
+        lane[row] = centre_of(y[row], road)
+        off_line |= (heading[row] != ZERO) | (y[row] != lane[row])
+    return off_line

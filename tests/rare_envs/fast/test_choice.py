@@ -1,0 +1,118 @@
+"""What is compiled; what is not falls back to torch, or is refused with the reason."""
+
+import pickle
+import warnings
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+import agents
+import rare_envs
+import samplers
+from rare_envs.control import IDM
+from rare_envs.fast import choice, rollouts
+from rare_envs.scenarios import car_following
+from rare_envs.simulation.measurement import Measurement
+
+CAR_FOLLOWING = "rare_envs/CarFollowing-v0"
+X = np.array([[20.0, 15.0, 30.0]])
+
+
+@pytest.mark.parametrize(
+    ("env_id", "arguments", "reason"),
+    [
+        (CAR_FOLLOWING, {"measure": "thw"}, "measure 'thw'"),
+        (CAR_FOLLOWING, {"ego": "human"}, "HumanDriver"),
+        (CAR_FOLLOWING, {"drivers": "mgail"}, "worlds with drivers"),
+        ("rare_envs/CutIn-v0", {"collisions": "any"}, "collisions of other vehicles"),
+        (CAR_FOLLOWING, {"ego": "imitation"}, "a LearnedEgo, is not compiled"),
+        ("rare_envs/Highway-v0", {}, "worlds with drivers are not compiled"),
+    ],
+)
+def test_what_is_not_compiled_is_simulated_by_torch(env_id: str, arguments: dict[str, Any], reason: str) -> None:
+    arguments = {**arguments, "ego": agents.load_ego(arguments.get("ego", "idm"))}
+    problem = rare_envs.DrivingProblem(env_id, **arguments)
+    assert problem.core == "torch"
+    assert problem.terms_with_f
+    with pytest.raises(ValueError, match=f"core='numba' cannot simulate this: .*{reason}"):
+        rare_envs.DrivingProblem(env_id, core="numba", **arguments)
+
+
+def test_a_core_that_does_not_exist_is_refused() -> None:
+    with pytest.raises(ValueError, match="Expected core to be one of 'auto', 'torch', 'numba', got 'jax'"):
+        rare_envs.DrivingProblem(CAR_FOLLOWING, core="jax")
+
+
+def test_an_own_measure_of_the_same_name_is_not_compiled() -> None:
+    measure = rare_envs.measures.Measure(rare_envs.measures.ttc)
+    assert rare_envs.DrivingProblem(CAR_FOLLOWING, measure=measure).core == "torch"
+
+
+def test_another_world_or_driver_is_what_is_simulated() -> None:
+    problem = rare_envs.DrivingProblem(CAR_FOLLOWING)
+    assert (problem.core, problem.terms_with_f, problem.evaluate(X)) == ("numba", False, [6.0])
+    problem.driver = IDM(max_deceleration=0.1)
+    assert (problem.core, problem.evaluate(X)) == ("numba", [-1.0])
+    problem.world = replace(problem.world, measurement=Measurement("thw"))
+    expected = rare_envs.DrivingProblem(CAR_FOLLOWING, problem.driver, measure="thw", core="torch").evaluate(X)
+    assert (problem.core, problem.evaluate(X)) == ("torch", expected)
+
+
+def test_where_numba_fails_torch_simulates_and_one_line_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(*_: Any) -> None:
+        raise RuntimeError("No implementation of\nfunction")
+
+    monkeypatch.setattr(rollouts, "drive_by_idm", fail)
+    line = "numba fails here: RuntimeError: No implementation of function"
+    problem = rare_envs.DrivingProblem(CAR_FOLLOWING)
+    with pytest.warns(UserWarning, match=f"^{line}; torch simulates, which is slower\\.$"):
+        assert problem.evaluate(X) == pytest.approx(6.0)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert (problem.core, problem.evaluate(X)) == ("torch", pytest.approx(6.0))
+    with pytest.raises(ValueError, match=f"core='numba' cannot simulate this: {line}"):
+        rare_envs.DrivingProblem(CAR_FOLLOWING, core="numba")
+
+
+def test_where_numba_cannot_be_imported_torch_simulates(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail() -> None:
+        raise choice.CompilerFails("numba fails here: ImportError: Numba needs NumPy 2.5 or less")
+
+    monkeypatch.setattr(choice, "import_compiler", fail)
+    problem = rare_envs.DrivingProblem(CAR_FOLLOWING)
+    with pytest.warns(UserWarning, match=r"NumPy 2\.5 or less; torch simulates, which is slower\.$"):
+        assert problem.core == "torch"
+
+
+def test_a_problem_is_sent_to_other_processes_with_its_core() -> None:
+    problem = pickle.loads(pickle.dumps(rare_envs.DrivingProblem(CAR_FOLLOWING)))
+    assert (problem.core, problem.evaluate(X)) == ("numba", pytest.approx(6.0))
+
+
+def test_a_scenario_that_places_the_vehicles_otherwise_is_compiled_and_a_script_of_ones_own_is_not() -> None:
+    @dataclass
+    class Place:  # without a hash
+        shift: float
+
+        def __call__(self, x: Any) -> Any:
+            return car_following.initial(x + self.shift)
+
+    compiled, own = (rare_envs.DrivingProblem(CAR_FOLLOWING) for _ in range(2))
+    scenario = compiled.world.scenario
+    compiled.world = replace(compiled.world, scenario=replace(scenario, initial=Place(1.0)))
+    assert (compiled.core, compiled.evaluate(X)) == ("numba", pytest.approx(31.0 / 5.0))
+    own.world = replace(own.world, scenario=replace(scenario, others=lambda state, dt: scenario.others(state, dt)))
+    assert (own.core, own.evaluate(X)) == ("torch", pytest.approx(6.0))
+
+
+def test_both_cores_are_asked_the_same_and_give_the_same_estimate() -> None:
+    """Rounding of f moves weights by a millionth; another sequence of points would move p by tenths."""
+    compiled, reference = (
+        samplers.estimate(rare_envs.DrivingProblem(CAR_FOLLOWING, core=core), samplers.TwoStage(), seed=0, max_sim=1000)
+        for core in ("numba", "torch")
+    )
+    assert compiled.p > 0
+    assert compiled.p == pytest.approx(reference.p, rel=1e-5)
+    assert compiled.failures.total == reference.failures.total
