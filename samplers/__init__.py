@@ -12,10 +12,11 @@ from samplers.analysis.reweight import Reweighted
 from samplers.analysis.sensitivity import Sensitivity
 from samplers.arguments import RunArguments
 from samplers.comparison import Comparison, compare
+from samplers.dispatch import ExecutorError
 from samplers.distributions import as_distribution
 from samplers.errors import EvaluationError
 from samplers.estimation import EstimationInterrupted, estimate
-from samplers.executors import Executor, ExecutorError, FuturesPool, InProcess, LocalProcesses, RayCluster
+from samplers.executors import Executor, FuturesPool, InProcess, LocalProcesses, RayCluster
 from samplers.method import Goal, Interrupted, Outcome, Stepping, Steps
 from samplers.methods.auto import Auto
 from samplers.methods.base import Method

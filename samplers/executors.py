@@ -1,53 +1,34 @@
 """Executors: where chunks are computed. In this process, in local ones, on a cluster; the bits are the same.
 
 Each makes a pool for the length of a run. A pool passes chunks to objects with the `submit` of
-`concurrent.futures.Executor`, which run `compute_in_worker`; `dispatch` keeps it busy, and computes again what was lost
-with its worker.
+`concurrent.futures.Executor`, which run `samplers.workers.compute_in_worker`; `samplers.dispatch` keeps it busy.
 """
 
 from __future__ import annotations
 
-import faulthandler
 import itertools
 import math
 import os
-import pickle
 import queue
-import random
-import re
 import reprlib
 import signal
-import sys
 import threading
 import time
-import warnings
-from collections import OrderedDict, deque
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, CancelledError, Future, wait
+from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import BrokenExecutor, CancelledError, Future
 from concurrent.futures import Executor as FuturesExecutor
 from contextlib import AbstractContextManager, closing, contextmanager, suppress
 from dataclasses import dataclass, field
 from hashlib import blake2b
-from typing import Any, NamedTuple, Protocol, TypeAlias, runtime_checkable
-from uuid import uuid4
+from typing import Any, Protocol, TypeAlias, runtime_checkable
 
-import numpy as np
-
-from samplers.chunks import Chunk, Index, Result, join_results
-from samplers.platform_calls import limit_memory
+from samplers.chunks import Chunk, Index, Result
+from samplers.dispatch import Compute, ExecutorError, Limits, Pool, WorkerLost
 from samplers.validation import check_number, check_whole
+from samplers.workers import Reply, compute_in_worker, describe, describe_loss, name_process, pack
 
-ATTEMPTS = 3
-"""Times that a chunk is computed before it is taken apart, and a row before it counts as lost: where 1 worker in 20 is
-killed by chance, a good row of a chunk of several is lost once in 20^6 = 6e7, and a chunk of one row once in 8,000."""
-QUIET_SECONDS = 180.0
-"""Time [s] without a result after which a warning says so: a chunk is meant to take seconds."""
-START_SECONDS = 300.0
-"""Time [s] beyond the limit of a chunk in which its process may start and load the problem; then it is given up."""
 POLL_SECONDS = 0.05
 """Time [s] between two looks at jobs that cannot tell when they are done, such as those of submitit."""
-PARENT_SECONDS = 1.0
-"""Time [s] between two looks of a worker whether its driver is still there."""
 MOST_RESTARTS = 1000
 """Broken pools that are replaced in one run."""
 ENVIRONMENT = {
@@ -55,40 +36,6 @@ ENVIRONMENT = {
     "PYTHONFAULTHANDLER": "",  # set to nothing, loky leaves the handler off: what ended a process is said by the driver
 }
 """Of local processes."""
-
-Compute = Callable[[Index, Chunk], Result]
-"""What computes a chunk."""
-
-
-class WorkerLost(Exception):
-    """A worker ended, or did not answer in time: perhaps because of a row of its chunk, perhaps not."""
-
-
-class ExecutorError(RuntimeError):
-    """An executor cannot work at all; calling it again would not help.
-
-    Example:
-        An executor of your own raises it where waiting and trying again are of no use.
-
-        >>> from samplers import ExecutorError
-        >>> ExecutorError("The queue of the cluster is closed.").final
-        True
-    """
-
-    final = True
-
-
-class Pool(Protocol):
-    """Workers that are ready to compute chunks of one run."""
-
-    workers: int
-    window: int
-    """Chunks that may be submitted and not done."""
-    blames: bool
-    """Whether `WorkerLost` concerns the worker of that chunk alone; if not, all chunks in flight get it."""
-
-    def submit(self, index: Index, chunk: Chunk) -> Future[Result]:
-        """Begin to compute a chunk; the future has its result, what the work raised, or `WorkerLost`."""
 
 
 @runtime_checkable
@@ -526,302 +473,3 @@ def _count_workers(pool: Any) -> int:
         with suppress(Exception):
             return max(1, int(sum(client.nthreads().values())))
     return os.cpu_count() or 1
-
-
-# Workers
-
-
-class ProcessName(NamedTuple):
-    """A process among those of all machines: numbers of processes repeat from one machine to the next."""
-
-    program: str
-    number: int
-
-
-class Limits(NamedTuple):
-    """What a chunk may take of a worker process: time [s], after which that ends itself, and memory [bytes]."""
-
-    seconds: float | None = None
-    n_bytes: float | None = None
-
-
-class Reply(NamedTuple):
-    """What comes back for a chunk."""
-
-    result: Result | None
-    error: BaseException | None
-    call: int
-    """Number of the call that it answers: dask takes a call with the arguments of an earlier one for that one, and
-    would answer that its worker died."""
-
-
-_PROGRAM = uuid4().hex
-_WATCH = "watches the driver"
-_loaded: OrderedDict[str, Compute] = OrderedDict()
-"""Work of this process by its digest."""
-
-
-def name_process() -> ProcessName:
-    """Return the name of this process."""
-    return ProcessName(_PROGRAM, os.getpid())
-
-
-def compute_in_worker(
-    key: str, packed: bytes, driver: ProcessName, limits: Limits, index: Index, chunk: Chunk, call: int
-) -> Reply:
-    """Compute a chunk in a worker of any kind; the driver, which may be one, is neither ended nor limited."""
-    in_driver = name_process() == driver
-    try:
-        compute = _load(key, packed, driver, limits)
-    except BaseException as error:
-        words = f"A worker process cannot load the problem ({describe(error)})."
-        return Reply(None, ExecutorError(words), call)
-    seconds = None if in_driver else limits.seconds
-    with open(os.devnull, "w", encoding="utf-8") as nothing:
-        if seconds is not None:
-            faulthandler.dump_traceback_later(seconds, exit=True, file=nothing)
-        try:
-            return Reply(compute(index, chunk), None, call)
-        except BaseException as error:
-            return Reply(None, make_portable(error), call)
-        finally:
-            if seconds is not None:
-                faulthandler.cancel_dump_traceback_later()
-
-
-def _load(key: str, packed: bytes, driver: ProcessName, limits: Limits) -> Compute:
-    """Return the work, and limit the process when it is new."""
-    if key not in _loaded:
-        import cloudpickle  # only workers need it
-
-        _loaded[key] = cloudpickle.loads(packed)
-        while len(_loaded) > 2:
-            _loaded.popitem(last=False)
-        if name_process() != driver:
-            _end_with(driver.number)
-            limit_memory(None if limits.n_bytes is None else int(limits.n_bytes))
-    return _loaded[key]
-
-
-def _end_with(driver: int) -> None:
-    """Let this process end with the driver that is its parent: the workers of most pools would wait for it for ever."""
-
-    def watch() -> None:
-        while os.getppid() == driver:
-            time.sleep(PARENT_SECONDS)
-        os._exit(1)
-
-    if os.getppid() == driver and not any(thread.name == _WATCH for thread in threading.enumerate()):
-        threading.Thread(target=watch, name=_WATCH, daemon=True).start()
-
-
-def pack(work: Any) -> bytes:
-    """Return work as bytes; functions of a script or a notebook, closures and lambdas go with it."""
-    import cloudpickle
-
-    try:
-        packed: bytes = cloudpickle.dumps(work)
-    except Exception as error:  # the problem is the user's: anything may happen in it
-        raise ValueError(
-            f"The problem cannot be sent to other processes ({type(error).__name__}: {error}); let f make in its first "
-            "call what cannot be sent."
-        ) from error
-    return packed
-
-
-def make_portable(error: BaseException) -> BaseException:
-    """Return an error that can be sent: itself if it survives that, else its words."""
-    try:
-        if str(pickle.loads(pickle.dumps(error))) == str(error):
-            return error
-    except Exception:  # its class is the user's: anything may happen in it
-        pass
-    return RuntimeError(describe(error))
-
-
-def describe(error: BaseException) -> str:
-    """Return the type and the text of an error."""
-    return f"{type(error).__name__}: {error}".removesuffix(": ")
-
-
-def describe_loss(error: BaseException, seconds: float, limit: float | None) -> str:
-    """Return why a worker was lost `seconds` after its chunk was submitted; loky knows how its process ended."""
-    ended = re.search(r"exit codes of the workers are \{(?:EXIT|(\w+))\((-?\d+)\)", str(error))
-    if ended is not None and ended[1]:
-        return f"the process of the simulation was ended by {ended[1]}"
-    if limit is not None and seconds >= limit:
-        return f"no answer within {limit:g} s"
-    if ended is not None:
-        return f"the process of the simulation ended with exit code {ended[2]}"
-    return describe(error).split("\n", 1)[0]
-
-
-@dataclass(frozen=True)
-class SeededWork:
-    """Work with the global random generators of its chunk, keyed by the seed of the run and the index of the chunk.
-
-    A simulation is to draw nothing itself. One that does (a policy that samples its actions) draws the same again when
-    its chunk is computed again, on whichever worker, as long as it uses the generators of `random`, `numpy.random` or,
-    on the CPU, torch.
-    """
-
-    work: Callable[[Chunk], Result]
-    seed: int
-
-    def __call__(self, index: Index, chunk: Chunk) -> Result:
-        """Compute a chunk; the generators are then as before.
-
-        A chunk that imports torch, and draws by its generator before that could be seeded, is computed once more.
-        """
-        torch_is_new = "torch" not in sys.modules
-        with seed_generators(self.seed, index):
-            result = self.work(chunk)
-        if not (torch_is_new and _torch_has_drawn()):
-            return result
-        with seed_generators(self.seed, index):
-            return self.work(chunk)
-
-
-def _torch_has_drawn() -> bool:
-    """Return whether torch's generator, which begins in each process with a seed of its own, has left its beginning."""
-    torch: Any = sys.modules.get("torch")
-    if torch is None:
-        return False
-    fresh = torch.Generator().manual_seed(torch.initial_seed())
-    return not torch.equal(fresh.get_state(), torch.random.get_rng_state())
-
-
-@contextmanager
-def seed_generators(seed: int, index: Index) -> Iterator[None]:
-    """Let the global generators begin anew for the length of a block."""
-    state = int(np.random.SeedSequence(seed, spawn_key=index).generate_state(1)[0])
-    torch: Any = sys.modules.get("torch")  # not imported for this
-    before = random.getstate(), np.random.get_state(), None if torch is None else torch.random.get_rng_state()  # noqa: NPY002
-    random.seed(state)
-    np.random.seed(state)  # noqa: NPY002  (the global generator, which foreign code uses)
-    if torch is not None:
-        torch.random.default_generator.manual_seed(state)
-    try:
-        yield
-    finally:
-        random.setstate(before[0])
-        np.random.set_state(before[1])  # noqa: NPY002
-        if torch is not None:
-            torch.random.set_rng_state(before[2])
-
-
-# Dispatch
-
-
-@dataclass(eq=False)
-class _Task:
-    """A chunk on its way, or a row of one."""
-
-    index: Index
-    chunk: Chunk
-    parent: _Task | None = None
-    attempts: int = 0
-    begun: float = 0.0
-    parts: list[Result | None] = field(default_factory=list)
-    """Results of its rows, once it is taken apart."""
-
-    def take_apart(self) -> list[_Task]:
-        """Return its rows as tasks: an attempt that costs a process is dear, and many at once are not."""
-        rows = self.chunk.split(1)
-        self.parts = [None] * len(rows)
-        return [_Task((*self.index, number), row, self) for number, row in enumerate(rows)]
-
-    def put(self, result: Result) -> tuple[int, Result] | None:
-        """Take a result; return it with the number of the chunk where the whole chunk is done."""
-        if self.parent is None:
-            return self.index[0], result
-        self.parent.parts[self.index[-1]] = result
-        parts = [part for part in self.parent.parts if part is not None]
-        return self.parent.put(join_results(parts)) if len(parts) == len(self.parent.parts) else None
-
-
-class Dispatcher:
-    """Computes chunks by a pool of workers; `lose` gives the result of a row that none survives, or raises.
-
-    Attributes:
-        n_retries: Chunks and rows of them that were computed again because a worker was lost.
-    """
-
-    def __init__(self, pool: Pool, lose: Callable[[Chunk, str], Result]) -> None:
-        self._pool, self._lose = pool, lose
-        self._limit: float | None = getattr(pool, "limits", Limits()).seconds
-        self._proven = self._warned = False  # a chunk has been computed; a silence has been told
-        self.n_retries = 0
-
-    def run(self, chunks: Iterable[tuple[int, Chunk]]) -> Iterator[tuple[int, Result]]:
-        """Yield the results of chunks with their numbers, in any order; what the work raises is raised here."""
-        waiting = deque(_Task((number,), chunk) for number, chunk in chunks)
-        running: dict[Future[Result], _Task] = {}
-        try:
-            while waiting or running:
-                self._submit(waiting, running)
-                for future in self._wait(running):
-                    task = running.pop(future)
-                    try:
-                        done = task.put(self._take(future))
-                    except WorkerLost as error:
-                        done = self._again(task, error, waiting)
-                    if done is not None:
-                        yield done
-        finally:
-            for future in running:
-                future.cancel()
-
-    def _take(self, future: Future[Result]) -> Result:
-        if future.cancelled():
-            raise WorkerLost(f"no answer within {self._limit:g} s")
-        result = future.result()
-        self._proven = True
-        return result
-
-    def _submit(self, waiting: deque[_Task], running: dict[Future[Result], _Task]) -> None:
-        """Submit what the window has room for; a suspect goes alone where its neighbours would share its fate."""
-        while waiting and len(running) < self._pool.window:
-            suspect = not self._pool.blames and waiting[0].attempts > 0
-            if running and (suspect or (not self._pool.blames and any(task.attempts for task in running.values()))):
-                return
-            task = waiting.popleft()
-            task.begun = time.monotonic()
-            running[self._pool.submit(task.index, task.chunk)] = task
-
-    def _wait(self, running: dict[Future[Result], _Task]) -> set[Future[Result]]:
-        """Return futures that are done; give up those far beyond their time, and warn once if none is for long."""
-        silent = 0.0
-        while not (done := wait(running, QUIET_SECONDS, FIRST_COMPLETED).done):
-            silent += QUIET_SECONDS
-            if not self._warned:
-                self._warned = True
-                message = (
-                    f"None of {len(running)} chunks has come back in {silent:g} s, and the run waits: a pool without "
-                    "workers (dask, Ray) never answers, nor does a hung ego without a time limit (time_limit=)."
-                )
-                warnings.warn(message, RuntimeWarning, stacklevel=2)
-            latest = time.monotonic() - (math.inf if self._limit is None else self._limit + START_SECONDS)
-            late = {future for future, task in running.items() if task.begun < latest and future.cancel()}
-            if late:
-                return late
-        return done
-
-    def _again(self, task: _Task, error: WorkerLost, waiting: deque[_Task]) -> tuple[int, Result] | None:
-        """Put what is to be computed in the place of a task whose worker was lost among those that wait."""
-        task.attempts += 1
-        if task.attempts < ATTEMPTS:
-            self.n_retries += 1
-            waiting.appendleft(task)
-        elif len(task.chunk) > 1:
-            rows = task.take_apart()
-            self.n_retries += len(rows)
-            waiting.extendleft(reversed(rows))
-        elif self._proven:
-            return task.put(self._lose(task.chunk, str(error)))
-        elif task.attempts < 2 * ATTEMPTS and waiting:  # after the others, which show whether workers work at all
-            self.n_retries += 1
-            waiting.append(task)
-        else:
-            raise ExecutorError(f"No worker has computed anything: {error}.") from error
-        return None

@@ -50,10 +50,11 @@ from rare_envs.study.writing import (
     remove_results,
     write_run,
 )
+from samplers.dispatch import ExecutorError
 from samplers.errors import OnError
 from samplers.estimation import Simulation, check_base
 from samplers.evaluate import Evaluator
-from samplers.executors import Executor, ExecutorError
+from samplers.executors import Executor
 from samplers.journal import Journal
 
 
