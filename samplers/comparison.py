@@ -3,7 +3,6 @@
 import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
-from importlib import import_module
 from os import PathLike
 from typing import TYPE_CHECKING, Any
 
@@ -16,8 +15,7 @@ from samplers.analysis.refits import find_fitted_base, reweight_runs_to_refits
 from samplers.analysis.reweight import MAX_LOG
 from samplers.analysis.weighted import cov_inflation, has_independent_points, interval_of_sum, require_sample
 from samplers.arguments import RunArguments, check_problem
-from samplers.display import drawing_axes, html_table, indent_lines
-from samplers.errors import needs_library
+from samplers.display import drawing_axes, html_table, indent_lines, require_pandas
 from samplers.estimation import estimate
 from samplers.method import Stepping
 from samplers.methods.auto import Auto
@@ -127,8 +125,7 @@ class Comparison:
 
     def to_pandas(self, names: Sequence[str] = ()) -> "pandas.DataFrame":
         """Return `to_arrow` as a pandas table; needs pandas."""
-        with needs_library("pandas", "A pandas table"):
-            import_module("pandas")  # PyArrow imports it later, and its error names no command
+        require_pandas()
         return self.to_arrow(names).to_pandas()
 
     def save(self, path: str | PathLike[str]) -> None:

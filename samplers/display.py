@@ -1,4 +1,4 @@
-"""Display: curves as text, tables and files, HTML for notebooks, axes to draw in."""
+"""Display: HTML for notebooks, tables of pandas, axes to draw in, lines of text."""
 
 from __future__ import annotations
 
@@ -7,11 +7,12 @@ from contextlib import contextmanager
 from html import escape
 from importlib import import_module
 from os import PathLike
-from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
+from typing import TYPE_CHECKING
 
 from samplers.errors import needs_library
-from samplers.problem import FloatArray
-from samplers.stored import read_object, write_object
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 
 def html_table(title: str, rows: Iterable[Sequence[str]], header: Sequence[str] = (), notes: Iterable[str] = ()) -> str:
@@ -27,10 +28,6 @@ def _cells(row: Sequence[str]) -> str:
     """Return the cells of a row; the first one is its name."""
     first, *others = row
     return f"<th>{escape(first)}</th>" + "".join(f"<td>{escape(cell)}</td>" for cell in others)
-
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
 
 
 @contextmanager
@@ -61,73 +58,10 @@ def drawing_axes(ax: Axes | str | PathLike[str] | None) -> Iterator[Axes]:
         )
 
 
-if TYPE_CHECKING:
-    import pandas
-    import pyarrow
-_Curve = TypeVar("_Curve", bound="CurveDisplay")
-
-
-class CurveDisplay:
-    """What a curve of probabilities with a band offers beside its text; `samplers.Curve` has it."""
-
-    axis: ClassVar[str]
-    event: ClassVar[str]
-    p: FloatArray
-    low: FloatArray
-    high: FloatArray
-    confidence: float
-
-    def _columns(self) -> dict[str, FloatArray]:
-        """Return the arrays by name, shape (k,) each."""
-        return {name: getattr(self, name) for name in (self.axis, "p", "low", "high", "cov", "ess")}  # fields by name
-
-    def to_arrow(self) -> pyarrow.Table:
-        """Return the curve as an Arrow table, a row for each threshold."""
-        with needs_library("pyarrow", "A table"):
-            import pyarrow as pa
-
-        return pa.table(self._columns())
-
-    def to_pandas(self) -> pandas.DataFrame:
-        """Return `to_arrow` as a pandas table; needs pandas."""
-        with needs_library("pandas", "A pandas table"):
-            import_module("pandas")  # PyArrow imports it later, and its error names no command
-        return self.to_arrow().to_pandas()
-
-    def save(self, path: str | PathLike[str]) -> None:
-        """Write the curve to a file that `load` reads, of the format safetensors.
-
-        Raises:
-            OSError: If it cannot be written.
-        """
-        write_object(path, self)
-
-    @classmethod
-    def load(cls: type[_Curve], path: str | PathLike[str]) -> _Curve:
-        """Return the curve that `save` has written.
-
-        Raises:
-            FileNotFoundError: If there is no such file.
-            ValueError: If the file is damaged, or of something else.
-        """
-        return read_object(path, cls)
-
-    def __repr__(self) -> str:
-        """Return one line; `str` has the table."""
-        over, n = self._columns()[self.axis], len(self.p)
-        return (
-            f"<{type(self).__name__} P[{self.event}] at {n} threshold{'s' * (n != 1)}, {over.min():g} to "
-            f"{over.max():g}: {self.p.min():.3e} to {self.p.max():.3e}, {100 * self.confidence:g} % band>"
-        )
-
-    def _repr_html_(self) -> str:
-        """Return a table for notebooks."""
-        rows: list[tuple[Any, ...]] = [
-            (f"{t:g}", f"{p:.3e}", f"{low:.3e} to {high:.3e}")
-            for t, p, low, high in zip(self._columns()[self.axis], self.p, self.low, self.high, strict=True)
-        ]
-        header = ("threshold", f"P[{self.event}]", f"{100 * self.confidence:g} % band")
-        return html_table("", rows, header)
+def require_pandas() -> None:
+    """Raise an ImportError that says what to install where pandas is missing; PyArrow's own names no command."""
+    with needs_library("pandas", "A pandas table"):
+        import_module("pandas")
 
 
 def indent_lines(value: object | None) -> list[str]:

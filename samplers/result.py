@@ -5,7 +5,6 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, fields, is_dataclass, replace
 from functools import cached_property
-from importlib import import_module
 from os import PathLike
 from typing import TYPE_CHECKING, Any, TypeVar, cast
 
@@ -19,8 +18,7 @@ from samplers.analysis.kinds import Share, split_by_kind
 from samplers.analysis.reweight import Reweighted, find_sibling, reweight_estimate
 from samplers.analysis.sensitivity import Sensitivity, compute_sensitivity
 from samplers.analysis.weighted import require_sample
-from samplers.display import drawing_axes, html_table, indent_lines
-from samplers.errors import needs_library
+from samplers.display import drawing_axes, html_table, indent_lines, require_pandas
 from samplers.estimate_data import EstimateData
 from samplers.method import Stepping
 from samplers.problem import Distribution, FloatArray
@@ -350,8 +348,7 @@ class Estimate(EstimateData):
 
     def to_pandas(self, names: Sequence[str] = ()) -> "pandas.DataFrame":
         """Return `to_arrow` as a pandas table; needs pandas."""
-        with needs_library("pandas", "A pandas table"):
-            import_module("pandas")  # PyArrow imports it later, and its error names no command
+        require_pandas()
         return self.to_arrow(names).to_pandas()
 
     def save(self, path: str | PathLike[str]) -> None:

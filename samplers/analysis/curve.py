@@ -3,7 +3,7 @@
 import math
 from dataclasses import dataclass
 from os import PathLike
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -16,19 +16,24 @@ from samplers.analysis.weighted import (
     simultaneous_intervals,
     unit_sums,
 )
-from samplers.display import CurveDisplay, drawing_axes
+from samplers.display import drawing_axes, html_table, require_pandas
+from samplers.errors import needs_library
 from samplers.estimate_data import EstimateData
 from samplers.problem import FloatArray
 from samplers.sample import Sample
 from samplers.statistics import add_unseen
-from samplers.stored import register_stored, to_json_value
+from samplers.stored import read_object, register_stored, to_json_value, write_object
 
 if TYPE_CHECKING:
+    import pandas
+    import pyarrow
     from matplotlib.axes import Axes
+
+_Curve = TypeVar("_Curve", bound="ProbabilityCurve")
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, repr=False)
-class ProbabilityCurve(CurveDisplay):
+class ProbabilityCurve:
     """Probabilities over thresholds, with a band that should hold all of them at once; `Curve` and `Exceedance` are.
 
     A subclass has the thresholds as a further field.
@@ -69,11 +74,61 @@ class ProbabilityCurve(CurveDisplay):
         rows = zip(self._over, self.p, self.low, self.high, strict=True)
         return "\n".join([head, *(f"{g:12.5g} {p:10.3e}   [{low:.3e}, {high:.3e}]" for g, p, low, high in rows)])
 
+    def _columns(self) -> dict[str, FloatArray]:
+        """Return the arrays by name, shape (k,) each."""
+        return {name: getattr(self, name) for name in (self.axis, "p", "low", "high", "cov", "ess")}  # fields by name
+
     def to_dict(self) -> dict[str, Any]:
         """Return plain lists and numbers for JSON; infinities become None."""
-        arrays = (self.axis, "p", "low", "high", "cov", "ess")
-        data = {key: to_json_value(getattr(self, key).tolist()) for key in arrays}  # a field by its name
+        data = {name: to_json_value(values.tolist()) for name, values in self._columns().items()}
         return {**data, "confidence": self.confidence}
+
+    def to_arrow(self) -> "pyarrow.Table":
+        """Return the curve as an Arrow table, a row for each threshold."""
+        with needs_library("pyarrow", "A table"):
+            import pyarrow as pa
+
+        return pa.table(self._columns())
+
+    def to_pandas(self) -> "pandas.DataFrame":
+        """Return `to_arrow` as a pandas table; needs pandas."""
+        require_pandas()
+        return self.to_arrow().to_pandas()
+
+    def save(self, path: str | PathLike[str]) -> None:
+        """Write the curve to a file that `load` reads, of the format safetensors.
+
+        Raises:
+            OSError: If it cannot be written.
+        """
+        write_object(path, self)
+
+    @classmethod
+    def load(cls: type[_Curve], path: str | PathLike[str]) -> _Curve:
+        """Return the curve that `save` has written.
+
+        Raises:
+            FileNotFoundError: If there is no such file.
+            ValueError: If the file is damaged, or of something else.
+        """
+        return read_object(path, cls)
+
+    def __repr__(self) -> str:
+        """Return one line; `str` has the table."""
+        over, n = self._over, len(self.p)
+        return (
+            f"<{type(self).__name__} P[{self.event}] at {n} threshold{'s' * (n != 1)}, {over.min():g} to "
+            f"{over.max():g}: {self.p.min():.3e} to {self.p.max():.3e}, {100 * self.confidence:g} % band>"
+        )
+
+    def _repr_html_(self) -> str:
+        """Return a table for notebooks."""
+        rows: list[tuple[Any, ...]] = [
+            (f"{t:g}", f"{p:.3e}", f"{low:.3e} to {high:.3e}")
+            for t, p, low, high in zip(self._over, self.p, self.low, self.high, strict=True)
+        ]
+        header = ("threshold", f"P[{self.event}]", f"{100 * self.confidence:g} % band")
+        return html_table("", rows, header)
 
     def plot(self, ax: "Axes | str | PathLike[str] | None" = None) -> "Axes":
         """Draw the curve and its band over the thresholds, p on a log scale; needs matplotlib."""

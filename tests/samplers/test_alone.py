@@ -24,7 +24,8 @@ def estimate_without(packages: str, methods: str) -> subprocess.CompletedProcess
 
 
 @pytest.mark.parametrize(
-    ("packages", "methods"), [("numpy,scipy", "mc,is,ce,ice,ss,adss"), (LEARNING, "two-stage,surrogate")]
+    ("packages", "methods"),
+    [("numpy,scipy", "mc,is,ce,ice,ss,adss"), pytest.param(LEARNING, "two-stage,surrogate", marks=pytest.mark.slow)],
 )
 def test_estimates_where_nothing_else_is_installed(packages: str, methods: str) -> None:
     done = estimate_without(packages, methods)

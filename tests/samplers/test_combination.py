@@ -116,6 +116,7 @@ def test_coverage_of_two_pooled_runs(study):
     assert np.mean(high_over_low) < 2.5  # about 45 hits: exp(2 x 1.96 / sqrt(45)) = 1.8
 
 
+@pytest.mark.slow
 def test_coverage_of_replicated_runs(study):
     runs = 60
     found = study(half_space(2, 3.0), samplers.AdaptiveSubsetSimulation(n=500), runs, replicates=6)

@@ -6,9 +6,10 @@ import pytest
 import samplers
 from samplers.limit_states import half_space
 from samplers.progress import Progress, open_listener
+from tests.samplers.conftest import QUICK_METHODS
 
 
-@pytest.mark.parametrize("method", sorted(samplers.METHODS))
+@pytest.mark.parametrize("method", QUICK_METHODS)
 def test_listener_is_told_of_simulations_levels_and_p(method):
     seen = []
     problem = half_space().problem

@@ -128,6 +128,7 @@ def command_line(*words):
     return CliRunner().invoke(app, words)
 
 
+@pytest.mark.slow
 def test_the_command_line_knows_it(installed):
     installed(lattice="lattice_methods:Lattice", broken="lattice_methods:Lettuce")
     env = "rare_envs/CarFollowing-v0"

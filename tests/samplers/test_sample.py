@@ -48,7 +48,9 @@ def of_simulations(method: str, replicates: int, gamma: float) -> tuple[samplers
 
 @pytest.mark.parametrize("gamma", [0.0, 1.5])
 @pytest.mark.parametrize("replicates", [1, 2])
-@pytest.mark.parametrize("method", ["mc", "is", "ce", "ice", "two-stage", "surrogate"])
+@pytest.mark.parametrize(
+    "method", ["mc", "is", "ce", "ice", "two-stage", pytest.param("surrogate", marks=pytest.mark.slow)]
+)
 def test_weights_of_single_simulations_add_up_to_p(method: str, replicates: int, gamma: float) -> None:
     result, f = of_simulations(method, replicates, gamma)
     index = result.simulations
@@ -64,7 +66,7 @@ def test_weights_of_single_simulations_add_up_to_p(method: str, replicates: int,
 
 
 @pytest.mark.parametrize("after", [100, 700, 1500])
-@pytest.mark.parametrize("method", ["is", "ce", "ice", "two-stage", "surrogate"])
+@pytest.mark.parametrize("method", ["is", "ce", "ice", "two-stage", pytest.param("surrogate", marks=pytest.mark.slow)])
 def test_weights_of_a_run_that_is_stopped_add_up_to_p(method: str, after: int) -> None:
     """p is that of the draws of the search then, of which cross-entropy keeps the first round and the last."""
     problem = samplers.FunctionProblem(lambda x: 3.0 - np.abs(x[:, 0]), dim=4)

@@ -75,6 +75,7 @@ assert "sklearn" in sys.modules
 """
 
 
+@pytest.mark.slow
 def test_imports_inside_a_run_are_no_draws():
     """The import of scikit-learn draws from Python's global generator; the method that needs it does not."""
     shown = subprocess.run([sys.executable, "-c", SEEDS], capture_output=True, text=True, timeout=120)
