@@ -40,6 +40,9 @@ TABLES = (
 )
 COLUMNS = "id, points, width, n_sim, seconds, notes, numbers"
 INSERT = f"INSERT OR IGNORE INTO chunks ({COLUMNS}, digest) VALUES (?, ?, ?, ?, ?, ?, ?, ?)"
+MAGIC, HEADER_SIZE = b"SQLite format 3\0", 100
+MOST_MISSING = 2**30
+"""Bytes that are put in the place of a missing end at most: a header may be damaged too."""
 HEAD = 0
 """Number of the record that says what the run is, in its notes; chunks have 1 and more."""
 
@@ -158,7 +161,10 @@ class Journal:
             JournalError: It is damaged, with `mend` in its first record, or another process has it open.
             OSError: It cannot be read.
         """
-        _check_file(path)
+        if (missing := _check_file(path)) and not mend:
+            raise JournalError(f"{str(path)!r} is damaged: its end is missing.")
+        if missing:  # zeros, which no record consists of
+            os.truncate(path, os.stat(path).st_size + missing)
         connection = _connect(path)
         try:
             head = _verify(path, connection)
@@ -317,13 +323,19 @@ def _connect(path: Path) -> sqlite3.Connection:
     return connection
 
 
-def _check_file(path: Path) -> None:
-    """Raise unless there is an ordinary file; a pipe would be waited for."""
+def _check_file(path: Path) -> int:
+    """Return how many bytes are missing at the end of a file by its header; raise unless it is an ordinary one."""
     found = os.stat(path)
-    if not stat.S_ISREG(found.st_mode):
+    if not stat.S_ISREG(found.st_mode):  # a pipe would be waited for
         raise JournalError(f"{str(path)!r} is no ordinary file.")
-    if found.st_size == 0 and not _wal(path).exists():
+    with path.open("rb") as file:
+        header = file.read(HEADER_SIZE)
+    if len(header) < HEADER_SIZE and MAGIC.startswith(header[: len(MAGIC)]) and not _wal(path).exists():
         raise NothingRecorded(f"{str(path)!r} was cut at its beginning; nothing is recorded in it.")
+    if len(header) < HEADER_SIZE or not header.startswith(MAGIC):
+        return 0
+    page_size, n_pages = int.from_bytes(header[16:18], "big"), int.from_bytes(header[28:32], "big")
+    return max(min(page_size * n_pages, MOST_MISSING + found.st_size) - found.st_size, 0)
 
 
 def _verify(path: Path, connection: sqlite3.Connection) -> dict[str, Any]:
