@@ -10,6 +10,7 @@ import torch
 from rare_envs.control.actions import ACTIONS
 from rare_envs.distributions.product import NoiseDistribution, join_independent
 from rare_envs.distributions.space import Distribution, Parameter, ScenarioSpace
+from rare_envs.egos.needs import EgoNeeds
 from rare_envs.measures.registry import load_measure
 from rare_envs.plugins import did_you_mean
 from rare_envs.scenarios.base import Scenario
@@ -19,9 +20,8 @@ from rare_envs.sensors.camera import find_camera
 from rare_envs.sensors.kinds import read_kinds
 from rare_envs.simulation.background import find_drivers
 from rare_envs.simulation.clock import Clock
-from rare_envs.simulation.ego_interface import EgoNeeds
 from rare_envs.simulation.measurement import Measurement
-from rare_envs.simulation.sensing import Sensing
+from rare_envs.simulation.observation import Sensing
 from rare_envs.simulation.world import World
 
 NO_NEEDS = EgoNeeds()

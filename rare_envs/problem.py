@@ -13,8 +13,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from rare_envs.devices import find_device, move_to
-from rare_envs.devices.batch_sizes import chunk_size, tile_size
+from rare_envs.devices import chunk_size, find_device, move_to, tile_size
 from rare_envs.distributions.space import Distribution, ScenarioSpace
 from rare_envs.egos.errors import reason_of
 from rare_envs.egos.needs import (
@@ -37,11 +36,11 @@ from rare_envs.scenarios.registry import find_scenario, split_layout
 from rare_envs.sensors.kinds import read_kinds
 from rare_envs.simulation.cuda_graphs import RecordedRollouts
 from rare_envs.simulation.episode import Episode
+from rare_envs.simulation.gradients import ROLLOUTS_PER_GRADIENT, TermDifferentiator, find_differentiator
 from rare_envs.simulation.measurement import Measurement
 from rare_envs.simulation.rollout import Driver, StochasticDriver, rollout
+from rare_envs.simulation.terms import EpisodeTerms, simulate_terms
 from rare_envs.simulation.world import World
-from rare_envs.terms.episode_terms import EpisodeTerms, simulate_terms
-from rare_envs.terms.gradients import ROLLOUTS_PER_GRADIENT, TermDifferentiator, find_differentiator
 from rare_envs.traffic.crash import CRASH_KINDS, Crash
 
 

@@ -15,11 +15,10 @@ from rare_envs.devices import move_to
 from rare_envs.egos.dense_policies import DenseInference, find_inference
 from rare_envs.egos.errors import refuse_ego
 from rare_envs.egos.inference import PolicyQuery, query_policy
-from rare_envs.egos.needs import RULE_BASED_EGOS, ModuleEgo, WorldEgo, find_rule_based, resolve
+from rare_envs.egos.needs import RULE_BASED_EGOS, EgoNeeds, ModuleEgo, WorldEgo, find_rule_based, resolve
 from rare_envs.egos.wrappers import find_frame_stacking, wrap_policy
 from rare_envs.sensors.kinds import map_kinds
 from rare_envs.simulation.background import Background, TrafficBackground
-from rare_envs.simulation.ego_interface import EgoNeeds
 from rare_envs.simulation.observation import observe
 from rare_envs.simulation.rollout import Driver
 from rare_envs.simulation.world import World

@@ -11,14 +11,13 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from rare_envs.control.actions import IDLE, read_actions
-from rare_envs.egos.needs import load_named_ego, resolve
+from rare_envs.egos.needs import EgoNeeds, load_named_ego, resolve
 from rare_envs.egos.policy import as_driver
 from rare_envs.envs.parallel import select_agents, select_rewards
 from rare_envs.envs.rows_and_infos import merge_rows, put_masked, to_object_rows
 from rare_envs.make import set_up
 from rare_envs.multi_agent import MultiAgentEpisode, Reward, start, step_agents, total_of
 from rare_envs.sensors.kinds import map_kinds
-from rare_envs.simulation.ego_interface import EgoNeeds
 from rare_envs.simulation.observation import observe
 
 

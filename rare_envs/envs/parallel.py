@@ -12,7 +12,7 @@ from pettingzoo import ParallelEnv
 from torch import Tensor
 
 from rare_envs.control.actions import IDLE, read_actions
-from rare_envs.egos.needs import load_named_ego, resolve
+from rare_envs.egos.needs import EgoNeeds, load_named_ego, resolve
 from rare_envs.egos.policy import as_driver
 from rare_envs.envs.rendering import RENDER_MODES, Display
 from rare_envs.envs.rows_and_infos import Info, SingleObservation, episode_info, step_info
@@ -21,7 +21,6 @@ from rare_envs.multi_agent import MultiAgentEpisode, Reward, own_reward, start, 
 from rare_envs.plugins import did_you_mean
 from rare_envs.scenarios.base import Scenario
 from rare_envs.sensors.kinds import map_kinds
-from rare_envs.simulation.ego_interface import EgoNeeds
 from rare_envs.simulation.observation import observe
 
 Actions = Mapping[str, Any]

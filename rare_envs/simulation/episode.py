@@ -11,7 +11,7 @@ from rare_envs.measures import EpisodeMeasure
 from rare_envs.measures.registry import MEASURES
 from rare_envs.sensors.camera import CameraContext
 from rare_envs.simulation.background import BackgroundState
-from rare_envs.simulation.episode_statistics import EpisodeStatistics
+from rare_envs.simulation.measurement import EpisodeStatistics
 from rare_envs.traffic.neighbours import Lead
 from rare_envs.traffic.road import Road
 from rare_envs.traffic.state import State

@@ -1,4 +1,6 @@
-"""Observations of an ego: `features`, its own state and the others' relative to it, `lidar`, `camera` and others."""
+"""What an ego observes: `features`, its own state and the others' relative to it, `lidar`, `camera` and others."""
+
+from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cache
@@ -10,7 +12,9 @@ from gymnasium import spaces
 from torch import Tensor
 
 from rare_envs.devices import constant, scalars
-from rare_envs.sensors.camera import Camera, take_picture
+from rare_envs.distributions.space import Distribution, Parameter
+from rare_envs.sensors.camera import Camera, CameraContext, clear_day, take_picture
+from rare_envs.sensors.camera.context import read_weather, weather_parameters
 from rare_envs.sensors.kinds import kinds_of, kinematics_space, observe_kinematics
 from rare_envs.sensors.lidar import BEAMS, MAX_RANGE
 from rare_envs.traffic.state import LANE_WIDTH, VEHICLE_LENGTH, State
@@ -78,7 +82,7 @@ def observation_space(vehicles: int, observation: str = "features", camera: Came
     return spaces.Box(-CLIP, CLIP, (len(LIDAR_SCALES) if observation == "lidar" else size,), np.float32)
 
 
-def observe(episode: "Episode", observation: str, vehicle: int = 0) -> Any:
+def observe(episode: Episode, observation: str, vehicle: int = 0) -> Any:
     """Return what one vehicle observes in each of B episodes: the ego, or another one as if it were the ego.
 
     Args:
@@ -144,3 +148,61 @@ def _scales(vehicles: int, dtype: torch.dtype, device: torch.device) -> Tensor:
     features = EGO_FEATURES + OTHER_FEATURES * (vehicles - 1)
     with torch.inference_mode(False):  # made under it they could not be used for gradients later
         return torch.tensor([feature.scale for feature in features], dtype=dtype, device=device)
+
+
+WeatherDistributions = tuple[tuple[tuple[Parameter, ...], Distribution], ...]
+"""Parameters of the weather with their distributions, in the order of x."""
+
+
+@dataclass(frozen=True)
+class Sensing:
+    """Sensors of the ego.
+
+    Example:
+        >>> Sensing("camera+speed").kinds
+        ('camera', 'speed')
+        >>> Sensing().space(vehicles=3).shape
+        (11,)
+    """
+
+    observation: str = "features"
+    """One of `rare_envs.sensors.kinds.OBSERVATIONS`, or several joined by "+"."""
+    camera: Camera = Camera()  # noqa: RUF009  (frozen)
+    """The camera that takes the pictures where "camera" is observed."""
+    weather: bool = False
+    """Whether weather is part of x; a camera sees it."""
+    lidar: bool = False
+    """Whether all vehicles' lidar features are computed even if neither observation, drivers nor measure need them."""
+
+    @property
+    def kinds(self) -> tuple[str, ...]:
+        """Kinds of observation by name."""
+        return kinds_of(self.observation)
+
+    @property
+    def uses_lidar(self) -> bool:
+        """Whether lidar features are computed for the ego."""
+        return self.lidar or "lidar" in self.kinds
+
+    def space(self, vehicles: int) -> spaces.Space[Any]:
+        """Return the space of the ego's observations among so many vehicles."""
+        return observation_space(vehicles, self.observation, self.camera)
+
+    def weather_distributions(self, noisy: bool) -> WeatherDistributions:
+        """Return the weather's parameters with their distributions; none on a clear day.
+
+        Args:
+            noisy: Whether the camera has noise.
+        """
+        return tuple(weather_parameters(noisy)) if self.weather else ()
+
+    def start_camera(self, weather: Tensor, key: Tensor) -> CameraContext | None:
+        """Return what the camera's pictures depend on beside the traffic, at time 0; None without a camera.
+
+        Args:
+            weather: Columns of x, shape (B, 0) on a clear day.
+            key: The column from which the camera's noise follows, shape (B, 1) or (B, 0).
+        """
+        if "camera" not in self.kinds:
+            return None
+        return CameraContext.at_start(self.camera, read_weather(weather, key) if self.weather else clear_day(weather))

@@ -11,9 +11,10 @@ from gymnasium import spaces
 from torch import Tensor
 
 from rare_envs.control.actions import follow_meta_actions, initial_aim, space_of_actions
+from rare_envs.control.idm import IDM
 from rare_envs.devices import fixed_draws
 from rare_envs.measures import Moment
-from rare_envs.scenarios.base import Scenario
+from rare_envs.scenarios.base import Others, Scenario, drive_points
 from rare_envs.sensors.camera import CameraContext
 from rare_envs.sensors.lidar import perceive_traffic
 from rare_envs.simulation.background import (
@@ -28,10 +29,8 @@ from rare_envs.simulation.background import (
 )
 from rare_envs.simulation.clock import LEARNED_TICK, Clock
 from rare_envs.simulation.episode import Episode
-from rare_envs.simulation.episode_statistics import EpisodeStatistics
-from rare_envs.simulation.measurement import Measurement
-from rare_envs.simulation.overrides import apply_overrides
-from rare_envs.simulation.sensing import Sensing, WeatherDistributions
+from rare_envs.simulation.measurement import EpisodeStatistics, Measurement
+from rare_envs.simulation.observation import Sensing, WeatherDistributions
 from rare_envs.traffic.bodies import ego_overlaps, others_overlap
 from rare_envs.traffic.neighbours import lead_of
 from rare_envs.traffic.road import WorldPose
@@ -308,3 +307,67 @@ class World:
     def _perceive(self, state: State, place: WorldPose | None) -> Tensor | None:
         """Return the lidar features of the vehicles; None in a world without lidar."""
         return perceive_traffic(state, self.scenario.road, place) if self.uses_lidar else None
+
+
+_RULE = IDM()
+
+
+def apply_overrides(
+    episode: Episode,
+    action: Tensor,
+    commanded: Tensor | None,
+    scripted: Others,
+    driver_actions: Tensor | None,
+    dt: float,
+) -> tuple[Others, Tensor]:
+    """Return the other vehicles after a tick in which some of them take an agent's actions.
+
+    Args:
+        episode: B episodes before the tick.
+        action: Acceleration [m/s^2] and steering angle [rad] of all vehicles, shape (B, N, 2).
+        commanded: Which of them take it, boolean, shape (B, N); None for none.
+        scripted: Where the script or the drivers take vehicles that were never commanded.
+        driver_actions: Accelerations and yaw rates by the world's drivers, shape (B, N - 1, 2); None if it has none.
+        dt: Tick [s].
+
+    Returns:
+        The others, and who has been commanded by now, boolean, shape (B, N).
+    """
+    state, road = episode.state, episode.road
+    if commanded is None:
+        commanded = torch.zeros_like(state.x, dtype=torch.bool)
+        action = torch.zeros_like(state.x)[..., None].expand(-1, -1, 2)
+    overridden = commanded if episode.overridden is None else commanded | episode.overridden
+    released = (overridden & ~commanded)[:, 1:]
+    if bool(released.any()):
+        if driver_actions is None:
+            action = torch.where((overridden & ~commanded)[..., None], rule_based_actions(episode), action)
+            commanded = overridden
+        else:
+            scripted = _choose(released, drive_points(state, driver_actions, dt, road), scripted)
+    x, y, heading, speed = (field[:, 1:] for field in state[:4])
+    curvature = None if road.reference_line is None else road.curvature(x)
+    moved = Others(*bicycle(x, y, heading, speed, action[:, 1:, 0], action[:, 1:, 1], dt, curvature))
+    return _choose(commanded[:, 1:], moved, scripted), overridden
+
+
+def rule_based_actions(episode: Episode) -> Tensor:
+    """Return what IDM and lane keeping do in each vehicle's place.
+
+    Args:
+        episode: B episodes.
+
+    Returns:
+        Acceleration [m/s^2] and steering angle [rad], shape (B, N, 2).
+    """
+    actions = []
+    for vehicle in range(episode.state.x.shape[1]):
+        state = episode.state.seen_by(vehicle)
+        view = episode._replace(state=state, lead=lead_of(state, episode.road))
+        actions.append(_RULE.act(view, None)[0])
+    return torch.stack(actions, dim=1)
+
+
+def _choose(which: Tensor, one: Others, other: Others) -> Others:
+    """Return one where `which` is set, boolean, shape (B, N - 1), and the other elsewhere."""
+    return Others(*(torch.where(which, a, b) for a, b in zip(one, other, strict=True)))

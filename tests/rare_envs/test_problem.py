@@ -14,7 +14,7 @@ import agents
 import rare_envs
 import samplers
 import training
-from rare_envs.devices.batch_sizes import POLICY_TILE
+from rare_envs.devices import POLICY_TILE
 from rare_envs.scenarios.registry import SCENARIOS
 
 

@@ -44,8 +44,8 @@ from rare_envs.simulation.background import Background, DriverWeights, TrafficBa
 from rare_envs.simulation.clock import Clock
 from rare_envs.simulation.episode import Episode
 from rare_envs.simulation.measurement import Measurement
+from rare_envs.simulation.observation import Sensing
 from rare_envs.simulation.rollout import Driver, drive
-from rare_envs.simulation.sensing import Sensing
 from rare_envs.simulation.world import World
 from rare_envs.traffic.crash import NONE, ROAD_EDGE
 from rare_envs.traffic.neighbours import lead_index

@@ -26,7 +26,7 @@ from rare_envs.sensors.lidar import perceive_traffic
 from rare_envs.simulation.background import Background, TrafficBackground, find_drivers
 from rare_envs.simulation.clock import Clock
 from rare_envs.simulation.episode import Episode
-from rare_envs.simulation.sensing import Sensing
+from rare_envs.simulation.observation import Sensing
 from rare_envs.simulation.world import World
 from rare_envs.traffic.road import ReferenceLine, Road, i80
 from rare_envs.traffic.state import VEHICLE_LENGTH, State

@@ -52,7 +52,7 @@ from rare_envs.scenarios.registry import find_scenario
 from rare_envs.sensors.camera import Weather, take_picture
 from rare_envs.simulation.clock import Clock
 from rare_envs.simulation.episode import Episode
-from rare_envs.simulation.sensing import Sensing
+from rare_envs.simulation.observation import Sensing
 from rare_envs.simulation.world import World
 from rare_envs.threads import use_one_thread
 from rare_envs.traffic.state import VEHICLE_LENGTH, State

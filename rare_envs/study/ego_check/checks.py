@@ -17,7 +17,7 @@ from gymnasium import spaces
 
 from agents.sb3.saved_ego import SavedEgo
 from rare_envs.arrays import AnyArray
-from rare_envs.devices.batch_sizes import CAMERA_TILE
+from rare_envs.devices import CAMERA_TILE
 from rare_envs.egos.errors import reason_of
 from rare_envs.egos.policy import PolicyDriver
 from rare_envs.egos.wrappers import find_frame_stacking

@@ -17,6 +17,7 @@ from rare_envs.egos.needs import (
     AMBIGUOUS,
     TAKEN_AS_ACCELERATIONS,
     AmbiguousActions,
+    EgoNeeds,
     FunctionEgo,
     ModuleEgo,
     PerceivingDriver,
@@ -30,7 +31,6 @@ from rare_envs.egos.needs import (
     takes_indices,
     wrap_callable,
 )
-from rare_envs.simulation.ego_interface import EgoNeeds
 from rare_envs.simulation.observation import observation_space
 
 CUT_IN = "rare_envs/CutIn-v0"

@@ -1,9 +1,14 @@
-"""Measurement of an episode: wrong measures and collisions are refused, and a trace is known to be kept."""
+"""Measurement of episodes, and their statistics."""
 
 import pytest
+import torch
 
 from rare_envs.measures import MEASURES
+from rare_envs.scenarios.car_following import CAR_FOLLOWING
+from rare_envs.scenarios.cut_in import CUT_IN
 from rare_envs.simulation.measurement import Measurement
+from rare_envs.simulation.world import World
+from rare_envs.traffic.crash import CRASH_KINDS, NONE
 
 
 def test_unknown_measures_and_collisions_are_refused() -> None:
@@ -17,3 +22,48 @@ def test_only_measures_of_whole_episodes_record() -> None:
     assert Measurement("pet").records
     assert not Measurement("ttc").records
     assert Measurement(lambda moment: moment.state.x[:, 0]).episode_measure not in MEASURES.values()
+
+
+def test_the_least_time_to_collision_is_kept_whatever_the_measure() -> None:
+    """Closing at 5 m/s from 30 m, then the ego brakes: least at the start; a lead that brakes: it falls."""
+    for measure in ("ttc", "thw"):
+        world = World(CAR_FOLLOWING, measurement=Measurement(measure, statistics=True))
+        episode = world.start(torch.tensor([[20.0, 15.0, 30.0]], dtype=torch.float64))
+        assert episode.statistics is not None
+        assert float(episode.statistics.least_ttc) == pytest.approx(6.0)
+        for tick in range(1, 11):
+            episode = world.step(episode, torch.zeros(1, 2, dtype=torch.float64))
+            assert episode.statistics is not None
+            assert float(episode.statistics.least_ttc) == pytest.approx((30.0 - 0.5 * tick) / 5.0)
+        for _ in range(20):
+            episode = world.step(episode, torch.tensor([[-5.0, 0.0]], dtype=torch.float64))
+        assert episode.statistics is not None
+        # after 2 s of closing the ego brakes by 0.5 m/s a tick: the gap divided by what is left of 5 m/s
+        expected = min((25.0 - sum(0.5 - 0.05 * k for k in range(n))) / (5.0 - 0.5 * n) for n in range(10))
+        assert float(episode.statistics.least_ttc) == pytest.approx(min(expected, 5.0))
+
+
+def test_a_crash_is_recorded_once_with_its_speed() -> None:
+    world = World(CAR_FOLLOWING).with_statistics()
+    episode = world.start(torch.tensor([[20.0, 10.0, 1.5], [20.0, 20.0, 50.0]]))
+    crashes = []
+    for _ in range(5):
+        episode = world.step(episode, torch.zeros(2, 2))
+        assert episode.statistics is not None
+        crashes.append(episode.statistics.crash)
+    assert [CRASH_KINDS[int(crash.kind[0])] for crash in crashes[1:]] == ["rear_end"] * 4
+    assert all(int(crash.kind[1]) == NONE for crash in crashes)
+    for crash in crashes[2:]:
+        for first, later in zip(crashes[1], crash, strict=True):
+            assert torch.equal(first, later)
+
+
+def test_a_crash_of_others_does_not_hide_that_of_the_ego() -> None:
+    """A cutter much faster than the lead runs into it while the ego is far behind."""
+    world = World(CUT_IN).with_statistics()
+    episode = world.start(torch.tensor([[5.0, 40.0, 5.0, 60.0, 60.0, 2.2]]))
+    for _ in range(60):
+        episode = world.step(episode, torch.zeros(1, 2))
+    assert episode.statistics is not None
+    assert int(episode.statistics.own.kind) == NONE
+    assert CRASH_KINDS[int(episode.statistics.crash.kind)] == "others"

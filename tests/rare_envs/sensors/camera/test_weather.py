@@ -26,7 +26,7 @@ from rare_envs.sensors.camera.context import (
     SENSOR_NOISE_DISTRIBUTION,
     SUN_DISTRIBUTION,
 )
-from rare_envs.simulation.sensing import Sensing
+from rare_envs.simulation.observation import Sensing
 from rare_envs.simulation.world import World
 from rare_envs.traffic.road import straight
 from rare_envs.traffic.state import State

@@ -1,4 +1,4 @@
-"""Values on their devices: constants that are copied there once, and branches on values where to look costs nothing.
+"""Devices: where torch simulates, how much at once, and what values there cost to make and to look at.
 
 A processor's values are at hand. To look at one of a GPU is to wait until everything before it is computed, and no
 recorded rollout can do it (`rare_envs.simulation.cuda_graphs`), so there both ways of a branch are computed.
@@ -12,6 +12,35 @@ from typing import Any
 
 import torch
 from torch import Tensor
+
+
+def find_device(name: str) -> torch.device:
+    """Return a device by its name, if it is there.
+
+    Args:
+        name: "cpu", "cuda" or "cuda:1".
+
+    Raises:
+        ValueError: There is no such device here.
+
+    Example:
+        >>> find_device("cpu")
+        device(type='cpu')
+        >>> find_device("gpu")
+        Traceback (most recent call last):
+            ...
+        ValueError: Expected device 'cpu', 'cuda' or 'cuda:1', got 'gpu'.
+    """
+    try:
+        device = torch.device(name)
+    except (RuntimeError, TypeError):
+        device = None
+    if device is None or device.type not in ("cpu", "cuda"):
+        raise ValueError(f"Expected device 'cpu', 'cuda' or 'cuda:1', got {name!r}.")
+    if device.type == "cuda" and (device.index or 0) >= torch.cuda.device_count():
+        found = torch.cuda.device_count()
+        raise ValueError(f"device={name!r} is not here: torch {torch.__version__} sees {found} GPUs; take 'cpu'.")
+    return device
 
 
 def constant(values: Any, like: Tensor) -> Tensor:
@@ -128,3 +157,52 @@ def are_zero(*values: Tensor) -> bool:
     if torch.is_grad_enabled() or not can_look(values[0]):
         return False
     return not any(value.count_nonzero() for value in values)  # of a tensor sooner than `any`
+
+
+RULE_TILE = 16384
+"""Rollouts that a rule-based ego drives at once: the number at which eager torch is fastest."""
+POLICY_TILE = 4096
+"""Likewise with a policy; fixed, because matrix products round differently by batch size."""
+LIDAR_TILE = 512
+"""Likewise with lidar, or a measure that keeps whole episodes: small enough for all of it to stay in the cache."""
+CAMERA_TILE = 128
+"""Likewise with a policy that takes pictures: its layers' values for all of them have to fit into memory."""
+
+GPU_TILES = 16
+"""Times as many rollouts at once on a GPU, which takes about as long for few as for thousands."""
+
+RULE_CHUNK = 4096
+"""Rollouts of a rule-based ego that a worker makes at once: enough for torch, and some for each of several workers."""
+POLICY_CHUNK = 256
+"""Likewise with a policy, which is slower."""
+
+
+def tile_size(device: torch.device, *, by_policy: bool, takes_pictures: bool, keeps_much: bool) -> int:
+    """Return the number of rollouts that torch simulates at once.
+
+    Args:
+        device: Where torch simulates.
+        by_policy: Whether the ego is a policy.
+        takes_pictures: Whether this takes pictures.
+        keeps_much: Whether there is lidar, or a measure that keeps whole episodes.
+
+    Example:
+        >>> tile_size(torch.device("cpu"), by_policy=False, takes_pictures=False, keeps_much=False)
+        16384
+    """
+    factor = 1 if device.type == "cpu" else GPU_TILES
+    if takes_pictures:
+        return factor * CAMERA_TILE
+    if keeps_much:
+        return factor * LIDAR_TILE
+    return factor * (POLICY_TILE if by_policy else RULE_TILE)
+
+
+def chunk_size(tile: int, *, by_policy: bool) -> int:
+    """Return the number of rollouts that a worker makes at once, a tile at most.
+
+    Example:
+        >>> chunk_size(128, by_policy=True), chunk_size(4096, by_policy=True)
+        (128, 256)
+    """
+    return min(tile, POLICY_CHUNK if by_policy else RULE_CHUNK)

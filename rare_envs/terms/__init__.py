@@ -1,1 +1,0 @@
-"""Terms of which f is the least: simulated, and differentiated."""
