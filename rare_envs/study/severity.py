@@ -25,6 +25,7 @@ from samplers.analysis import (
     weigh_failures,
 )
 from samplers.display import drawing_axes
+from samplers.estimate_data import EstimateData
 from samplers.problem import FloatArray
 
 if TYPE_CHECKING:
@@ -47,7 +48,7 @@ class ReplayedFailures(NamedTuple):
 
 
 def replay_failures(
-    problem: DrivingProblem, estimate: samplers.Estimate, most: int | None = MAX_REPLAYED
+    problem: DrivingProblem, estimate: EstimateData, most: int | None = MAX_REPLAYED
 ) -> ReplayedFailures:
     """Drive failing points of a run once more."""
     if problem.varies:
@@ -57,7 +58,7 @@ def replay_failures(
 
 
 def replay_further_failures(
-    problem: DrivingProblem, estimate: samplers.Estimate, most: int | None = MAX_REPLAYED
+    problem: DrivingProblem, estimate: EstimateData, most: int | None = MAX_REPLAYED
 ) -> ReplayedFailures | None:
     """Drive failing points of the further run under the mixture of the refits once more; None where there is none.
 
