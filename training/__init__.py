@@ -7,14 +7,13 @@ from typing import TYPE_CHECKING
 from rare_envs.plugins import make_lazy_getattr
 
 if TYPE_CHECKING:
-    from training.ego_retraining import Retraining
-    from training.ego_training import train_ego
+    from training.ego_training import Retraining, train_ego
     from training.vec_env import sb3_agents_env, sb3_vec_env
 
 __all__ = ["Retraining", "sb3_agents_env", "sb3_vec_env", "train_ego"]
 
 _LAZY = {
-    "Retraining": "training.ego_retraining",
+    "Retraining": "training.ego_training",
     "sb3_agents_env": "training.vec_env",
     "sb3_vec_env": "training.vec_env",
     "train_ego": "training.ego_training",

@@ -31,15 +31,9 @@ COUNTERS = (
 
 
 def save_checkpoint(path: Path, arguments: Mapping[str, Any], model: Any) -> None:
-    """Write a checkpoint, at the beginning of a rollout.
+    """Write a checkpoint of a model in a `training.sb3_vec_env`, at the beginning of a rollout.
 
-    Args:
-        path: The file; one that is there is replaced.
-        arguments: Of the training, JSON-ready; a resumed one has to have the same.
-        model: Of Stable-Baselines3, whose environment is a `training.sb3_vec_env`.
-
-    Raises:
-        OSError: It cannot be written.
+    The arguments, JSON-ready, are those of the training; a resumed one has to have the same.
     """
     monitor = model.get_env()
     names, variables = model._get_torch_save_params()
@@ -60,11 +54,7 @@ def save_checkpoint(path: Path, arguments: Mapping[str, Any], model: Any) -> Non
 
 
 def load_checkpoint(path: Path, arguments: Mapping[str, Any]) -> dict[str, Any]:
-    """Read a checkpoint.
-
-    Args:
-        path: The file.
-        arguments: Of the training that is to go on.
+    """Read a checkpoint of the training with these arguments.
 
     Raises:
         ValueError: It is no checkpoint, is damaged, or that of a training with other arguments.

@@ -3,21 +3,26 @@
 from __future__ import annotations
 
 import contextlib
+import hashlib
+import math
 import os
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
+from typing import Any, cast
 
+import numpy as np
+
+from rare_envs.arrays import FloatArray
+from rare_envs.distributions.space import Distribution, ScenarioSpace
 from rare_envs.files import replace_file
 from rare_envs.plugins import did_you_mean
 from rare_envs.threads import use_one_thread
 from samplers.progress import NARROW_TERMINAL
 from training.ego_checkpoint import load_checkpoint, restore_model, save_checkpoint
-from training.ego_retraining import Retraining, check_retrainable, continue_settings, restore_parameters
 
 CHECKPOINT_SUFFIX, CHECKPOINT_SECONDS = ".checkpoint", 30.0
 """Ending of the file beside the ego, and the time between checkpoints [s]."""
@@ -85,6 +90,82 @@ HYPERPARAMETERS: Mapping[str, Hyperparameters] = MappingProxyType(
         ),
     }
 )
+
+
+FAILURE_SHARE = 0.25
+"""Share of episodes that begin in a failure."""
+
+
+@dataclass(frozen=True, eq=False)
+class ScenariosWithFailures:
+    """Distribution to train in: it only draws, with probability `share` one of the failures (k, d), else of `base`."""
+
+    base: Distribution
+    failures: FloatArray
+    share: float
+
+    def sample(self, n: int, rng: np.random.Generator) -> FloatArray:
+        """Draw scenarios, shape (n, d)."""
+        x = np.array(self.base.sample(n, rng))
+        chosen = rng.random(n) < self.share
+        x[chosen] = self.failures[rng.integers(0, len(self.failures), int(chosen.sum()))]
+        return x
+
+
+@dataclass(frozen=True, eq=False)
+class Retraining:
+    """What `train_ego` goes on from: an ego that it trained before, and scenarios in which that ego failed.
+
+    Raises:
+        ValueError: There is no failure, they are no table of finite numbers, or the share is not between 0 and 1.
+
+    Example:
+        >>> Retraining(Path("ego.zip"), np.zeros((3, 6)), share=0.25)
+        Retraining(ego=PosixPath('ego.zip'), share=0.25)
+        >>> Retraining(Path("ego.zip"), np.zeros((0, 6)))
+        Traceback (most recent call last):
+        ...
+        ValueError: Expected failures of shape (k, d) with k >= 1 and finite values, got shape (0, 6).
+    """
+
+    ego: Path
+    """The `.zip` of the ego."""
+    failures: FloatArray = field(repr=False)
+    """Scenarios in the order of x of the environment, shape (k, d)."""
+    share: float = FAILURE_SHARE
+    """Share of episodes that begin in one of the failures, drawn uniformly; the others begin in ordinary scenarios."""
+
+    def __post_init__(self) -> None:
+        x = np.asarray(self.failures, dtype=np.float64)
+        if x.ndim != 2 or not len(x) or not np.isfinite(x).all():
+            raise ValueError(
+                f"Expected failures of shape (k, d) with k >= 1 and finite values, got shape {np.shape(self.failures)}."
+            )
+        if not (math.isfinite(self.share) and 0.0 < self.share < 1.0):
+            raise ValueError(f"Expected a share of failures above 0 and below 1, got {self.share!r}.")
+        object.__setattr__(self, "failures", x)
+
+    def arguments(self) -> dict[str, str]:
+        """Return what a checkpoint notes of it: a resumed training has to go on from the same ego and failures.
+
+        Raises:
+            OSError: The ego's file cannot be read.
+        """
+        if not self.ego.is_file():
+            raise FileNotFoundError(f"No ego at {str(self.ego)!r}.")
+        ego, failures = (
+            hashlib.sha256(content).hexdigest() for content in (self.ego.read_bytes(), self.failures.tobytes())
+        )
+        return {"retrained": ego, "failures": failures, "failure_share": str(self.share)}
+
+    def mix(self, space: ScenarioSpace) -> ScenarioSpace:
+        """Return the space of an environment with the failures among its draws.
+
+        Raises:
+            ValueError: The failures are not of this space.
+        """
+        mixed = ScenariosWithFailures(space.base, space.validate(self.failures), self.share)
+        return replace(space, base=cast(Distribution, mixed))  # an environment only draws
 
 
 def train_ego(
@@ -209,6 +290,50 @@ def _continue_model(
     return model
 
 
+def check_retrainable(saved: Any, algo: str, env: Any) -> None:
+    """Raise a ValueError if an ego, an `agents.SavedEgo`, cannot be trained on by an algorithm in an environment."""
+    name = repr(str(saved.path))
+    if saved.algorithm != algo:
+        raise ValueError(f"Expected an ego trained by {algo}, got {name}, trained by {saved.algorithm}.")
+    if saved.statistics is not None:
+        raise ValueError(f"Cannot train {name} on: it was trained behind VecNormalize, train-ego has none.")
+    for what in ("observation_space", "action_space"):
+        own, given = getattr(saved.model, what), getattr(env, what)  # both have these two
+        if own != given:
+            raise ValueError(f"Cannot train {name} on: its {what} is {own}, that of the environment is {given}.")
+
+
+def restore_parameters(model: Any, saved: Any) -> None:
+    """Give a new model of equal networks the networks, optimisers and entropy coefficient of an `agents.SavedEgo`.
+
+    Raises:
+        ValueError: The file has other networks, or nothing of its training.
+    """
+    from stable_baselines3.common.save_util import load_from_zip_file, recursive_getattr
+
+    try:
+        # settings, which hold pickles, are not opened; tensors are read as tensors only
+        _, parameters, variables = load_from_zip_file(saved.path, device="cpu", load_data=False)
+        model.set_parameters(parameters, exact_match=True, device="cpu")
+        for name, value in (variables or {}).items():
+            recursive_getattr(model, name).data.copy_(value)
+    except (KeyError, RuntimeError, ValueError, AttributeError, TypeError) as error:
+        words = str(error).partition("\n")[0]
+        raise ValueError(
+            f"Cannot train {str(saved.path)!r} on: it has not all that a training needs: {words}"
+        ) from error
+
+
+def continue_settings(arguments: Mapping[str, Any]) -> dict[str, Any]:
+    """Return arguments of an algorithm that goes on: it explores as at the end of a training and learns at once."""
+    changed = dict(arguments)
+    if "learning_starts" in changed:
+        changed["learning_starts"] = 0
+    if "exploration_final_eps" in changed:
+        changed["exploration_initial_eps"] = changed["exploration_final_eps"]
+    return changed
+
+
 def _find_checkpoint(path: Path, arguments: Mapping[str, Any], resume: bool) -> dict[str, Any] | None:
     """Return the checkpoint to go on from; None to begin anew.
 
@@ -269,7 +394,6 @@ def _fit_to_run(hyperparameters: Hyperparameters, num_envs: int, steps: int) -> 
     elif "batch_size" in arguments:
         arguments["batch_size"] = min(arguments["batch_size"], arguments["n_steps"] * num_envs)
     if hyperparameters.noise:
-        import numpy as np
         from stable_baselines3.common.noise import NormalActionNoise
 
         arguments["action_noise"] = NormalActionNoise(np.zeros(2), np.full(2, hyperparameters.noise))

@@ -216,16 +216,10 @@ class BatchedVecEnv(VecEnv):
 
 
 def merge_options(options: Sequence[Mapping[str, Any]]) -> dict[str, Any] | None:
-    """Join reset options of single environments into those of a batch.
-
-    Args:
-        options: One mapping for each of B environments; all with the same names.
-
-    Returns:
-        Names with values stacked along a new first axis, shape (B, ...); None without options.
+    """Join reset options of B environments into those of a batch, stacked along a new first axis; None without any.
 
     Raises:
-        ValueError: The number of mappings is wrong or their names differ.
+        ValueError: Their names differ.
     """
     if not any(options):
         return None
@@ -239,16 +233,9 @@ def merge_options(options: Sequence[Mapping[str, Any]]) -> dict[str, Any] | None
 
 
 def info_row(infos: Mapping[str, Any], row: int) -> dict[str, Any]:
-    """Return the info of one environment, taken out of the infos of a batch.
+    """Return the info of one environment, taken out of the infos of a batch, where `_name` masks `name`.
 
-    Gymnasium writes a batch's infos as arrays, with a mask `_name` beside `name` that says whose
-    value is there; nested mappings likewise. `final_obs` and `final_info` belong to the episode
-    before, not to this one.
-
-    Example:
-        >>> infos = {"x": np.array([1.0, 2.0]), "end": np.array(["a", ""]), "_end": np.array([True, False])}
-        >>> {name: str(value) for name, value in info_row(infos, 1).items()}
-        {'x': '2.0'}
+    `final_obs` and `final_info` belong to the episode before, not to this one.
     """
     single: dict[str, Any] = {}
     for name, value in infos.items():

@@ -1,18 +1,79 @@
-"""Training teaches: the ego of the demo's recipe, trained for a quarter as long, against acting at random."""
+"""Egos are trained, taken up where they were stopped, and trained on with the failures that an evaluation found."""
 
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
+import torch
+from gymnasium import spaces
+from stable_baselines3.common.evaluation import evaluate_policy
 
 import agents
 import rare_envs
+import training.ego_training
+from agents import SavedEgo, load_ego
+from agents.sb3.saved_ego import load_saved_ego
 from examples.demo import ENV_ID, random_collision_rate
+from rare_envs import DrivingProblem
+from rare_envs.control.actions import DISCRETE_ACTIONS
 from rare_envs.threads import use_one_thread
-from training import train_ego
+from training import sb3_vec_env, train_ego
+from training.ego_checkpoint import load_checkpoint
+from training.ego_training import (
+    Retraining,
+    ScenariosWithFailures,
+    check_retrainable,
+    continue_settings,
+    restore_parameters,
+)
 
+ENV = "rare_envs/CutIn-v0"
+STEPS, ROWS = 64, 8
+ALGORITHMS = ("ppo", "a2c", "sac", "td3", "dqn")
+OFF_POLICY = ("sac", "td3", "dqn")
 FACTOR = 20.0
 """After 100,000 steps; the demo's 400,000 reach several thousand."""
+FAILURE = np.array([[25.0, 12.0, 20.0, 2.0, 40.0, 3.5]])
+
+
+def weights(path: Path) -> torch.Tensor:
+    ego: Any = load_ego(path)
+    return torch.cat([value.flatten().double() for value in ego.model.policy.state_dict().values()])
+
+
+@pytest.mark.parametrize("algo", ALGORITHMS)
+def test_every_algorithm_trains_saves_and_drives(algo: str, tmp_path: Path) -> None:
+    path = train_ego(
+        ENV,
+        algo,
+        steps=400,
+        num_envs=16,
+        out=tmp_path / "new" / "ego",
+        progress=False,
+    )
+    assert path == tmp_path / "new" / "ego.zip"
+    ego = load_ego(path)
+    assert isinstance(ego, SavedEgo)
+    assert ego.algorithm == algo
+    env = sb3_vec_env(ENV, 4, seed=0, discrete=algo == "dqn")
+    assert ego.observation_space == env.observation_space
+    expected = spaces.Discrete(len(DISCRETE_ACTIONS)) if algo == "dqn" else env.action_space
+    assert ego.action_space == expected
+    returns, lengths = evaluate_policy(ego.model, env, n_eval_episodes=4, return_episode_rewards=True)
+    assert np.isfinite(returns).all()
+    assert min(lengths) > 0  # type: ignore[type-var]
+    problem = DrivingProblem(ENV, ego=ego)
+    f = problem.evaluate(problem.base.sample(8, np.random.default_rng(0)))
+    assert ((f == -1.0) | (f > 0.0)).all()
 
 
 @use_one_thread()
@@ -25,7 +86,264 @@ def test_a_trained_ego_collides_far_less_than_a_random_policy(tmp_path: Path) ->
     assert (collisions + 3.0 * max(collisions, 1) ** 0.5) / len(x) < random_collision_rate() / FACTOR
 
 
+def test_progress_goes_to_standard_error(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    train_ego(ENV, steps=2048, num_envs=16, out=tmp_path / "ego.zip")
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert "steps" in captured.err
+    assert "collisions" in captured.err
+
+
+def test_the_number_of_threads_is_restored(tmp_path: Path) -> None:
+    before = torch.get_num_threads()
+    torch.set_num_threads(2)
+    try:
+        train_ego(ENV, steps=64, num_envs=4, out=tmp_path / "ego.zip", progress=False)
+        assert torch.get_num_threads() == 2
+    finally:
+        torch.set_num_threads(before)
+
+
 def test_an_unknown_environment_leaves_no_folder_behind(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="did you mean 'rare_envs/CutIn-v1'"):
         train_ego("CutIn", steps=1, out=tmp_path / "new" / "ego.zip")
     assert not (tmp_path / "new").exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"steps": 0}, "steps >= 1, got 0"),
+        ({"steps": -5}, "steps >= 1, got -5"),
+        ({"algo": "pp0"}, r"Unknown algorithm 'pp0' \(did you mean 'ppo'\?\)"),
+        ({"num_envs": 0}, "num_envs >= 1, got 0"),
+        ({"out": "."}, "got the folder"),
+        ({"out": "file/ego.zip"}, "Cannot make the folder"),
+    ],
+)
+def test_bad_requests_are_refused_before_work(
+    arguments: dict[str, Any], message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "file").write_text("")
+    with pytest.raises(ValueError, match=message) as caught:
+        train_ego(ENV, **arguments)
+    assert "\n" not in str(caught.value)
+    assert not list(tmp_path.glob("*.zip"))
+
+
+def test_import_training_is_light() -> None:
+    """The command line imports it for its help text."""
+    code = "import sys, training; sys.exit('stable_baselines3' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+class Stopped(Exception):
+    """Stands for whatever ends a training."""
+
+
+def stop_after(monkeypatch: pytest.MonkeyPatch, count: int) -> None:
+    """Let the writing of checkpoint `count` be the last thing that a training does."""
+    written, save = [0], training.ego_training.save_checkpoint
+
+    def save_and_stop(*arguments: Any) -> None:
+        save(*arguments)
+        written[0] += 1
+        if written[0] == count:
+            raise Stopped
+
+    monkeypatch.setattr(training.ego_training, "save_checkpoint", save_and_stop)
+
+
+@pytest.mark.parametrize(("algo", "steps", "checkpoint"), [("ppo", 480, 2), *((a, 160, 11) for a in OFF_POLICY)])
+def test_a_resumed_training_ends_alike(
+    algo: str, steps: int, checkpoint: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Stopped half-way, with updates, and new scenarios for episodes that ended (after 0.8 s), before and after."""
+    common: dict[str, Any] = {"algo": algo, "steps": steps, "num_envs": ROWS, "progress": False, "horizon": 0.8}
+    whole = train_ego(ENV, out=tmp_path / "whole.zip", **common)
+    stop_after(monkeypatch, checkpoint)
+    with pytest.raises(Stopped):
+        train_ego(ENV, out=tmp_path / "ego.zip", checkpoint_interval=0.0, **common)
+    monkeypatch.undo()
+    assert not (tmp_path / "ego.zip").exists()
+    with pytest.raises(ValueError, match=r"There is an unfinished training in .* go on with --resume"):
+        train_ego(ENV, out=tmp_path / "ego.zip", **common)
+    with pytest.raises(ValueError, match=r"with other arguments \(seed=0\)"):
+        train_ego(ENV, out=tmp_path / "ego.zip", resume=True, **{**common, "seed": 1})
+    np.random.seed(5)  # noqa: NPY002  (what another process would have drawn of the global generators)
+    torch.manual_seed(5)
+    resumed = train_ego(ENV, out=tmp_path / "ego.zip", resume=True, **common)
+    assert torch.equal(weights(resumed), weights(whole))
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["ego.zip", "whole.zip"]
+
+
+def test_there_has_to_be_something_to_resume(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="There is no training to resume"):
+        train_ego(ENV, out=tmp_path / "ego.zip", resume=True)
+
+
+@pytest.mark.parametrize("content", [b"", b"noise", b"PK\x03\x04", b"\x80\x02cos\nsystem\n."])
+def test_damaged_checkpoints_are_refused_in_one_line(content: bytes, tmp_path: Path) -> None:
+    (tmp_path / "ego.checkpoint").write_bytes(content)
+    with pytest.raises(ValueError, match="it is damaged or no checkpoint; remove it") as caught:
+        load_checkpoint(tmp_path / "ego.checkpoint", {})
+    assert "\n" not in str(caught.value)
+
+
+def test_an_ego_stays_while_the_next_one_cannot_be_saved(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from stable_baselines3 import PPO
+
+    def fail(self: PPO, path: Path) -> None:
+        Path(path).write_bytes(b"half")
+        raise OSError(28, "No space left on device")
+
+    (tmp_path / "ego.zip").write_bytes(b"earlier")
+    monkeypatch.setattr(PPO, "save", fail)
+    with pytest.raises(OSError, match="No space left"):
+        train_ego(ENV, steps=64, num_envs=4, out=tmp_path / "ego.zip", progress=False)
+    assert (tmp_path / "ego.zip").read_bytes() == b"earlier"
+    assert [path.name for path in tmp_path.iterdir()] == ["ego.zip"]
+
+
+PROGRAM = """
+import sys
+from training import train_ego
+train_ego("rare_envs/CutIn-v0", "a2c", 20_000, num_envs=8, out=sys.argv[1], progress=False, checkpoint_interval=0.0,
+          resume=sys.argv[2] == "resume")
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(os.name != "posix", reason="needs SIGKILL")
+def test_a_killed_training_is_taken_up(tmp_path: Path) -> None:
+    """Killed three times at different moments, one of them perhaps while a checkpoint is written."""
+    whole = train_ego(ENV, "a2c", 20_000, num_envs=8, out=tmp_path / "whole.zip", progress=False)
+    out, checkpoint = tmp_path / "ego.zip", tmp_path / "ego.checkpoint"
+    for delay in (0.1, 0.73, 1.31):
+        how = "resume" if checkpoint.exists() else "begin"
+        with subprocess.Popen([sys.executable, "-c", PROGRAM, str(out), how]) as process:
+            while not checkpoint.exists() and process.poll() is None:
+                time.sleep(0.05)
+            time.sleep(delay + (5.0 if how == "resume" else 0.0))
+            process.send_signal(signal.SIGKILL)
+    assert checkpoint.exists()
+    assert not out.exists()
+    subprocess.run([sys.executable, "-c", PROGRAM, str(out), "resume"], check=True)
+    assert torch.equal(weights(out), weights(whole))
+
+
+@pytest.fixture(scope="module")
+def egos(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("egos")
+    for algo in ALGORITHMS:
+        train_ego(ENV, algo, STEPS, num_envs=ROWS, out=folder / f"{algo}.zip", progress=False)
+    return folder
+
+
+def test_the_share_of_failures_is_drawn_and_the_rest_is_of_the_base() -> None:
+    space = rare_envs.make_batch(ENV, 1).space
+    mixed = ScenariosWithFailures(space.base, np.concatenate((FAILURE, FAILURE + 1.0)), 0.3)
+    x = mixed.sample(20_000, np.random.default_rng(0))
+    first, second = ((x == row).all(axis=1) for row in mixed.failures)
+    assert first.sum() == pytest.approx(3000, abs=4 * np.sqrt(20_000 * 0.15 * 0.85))
+    assert second.sum() == pytest.approx(3000, abs=4 * np.sqrt(20_000 * 0.15 * 0.85))
+    rest = x[~first & ~second]
+    usual = space.sample(20_000, np.random.default_rng(1))
+    spread = np.sqrt(usual.var(axis=0) * (1 / len(rest) + 1 / len(usual)))
+    assert (np.abs(rest.mean(axis=0) - usual.mean(axis=0)) < 4.5 * spread).all()
+
+
+@pytest.mark.parametrize("algo", ALGORITHMS)
+def test_every_algorithm_goes_on_from_the_weights_of_the_ego(
+    algo: str, egos: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    started: list[torch.Tensor] = []
+    restore = training.ego_training.restore_parameters
+
+    def restore_and_look(model: Any, saved: Any) -> None:
+        restore(model, saved)
+        started.append(torch.cat([value.flatten().double() for value in model.policy.state_dict().values()]))
+        assert model.get_env().get_attr("space")[0].base.share == 0.5
+
+    monkeypatch.setattr(training.ego_training, "restore_parameters", restore_and_look)
+    given = Retraining(egos / f"{algo}.zip", FAILURE, share=0.5)
+    path = train_ego(ENV, algo, STEPS, num_envs=ROWS, out=tmp_path / "on.zip", progress=False, retraining=given)
+    before = weights(given.ego)
+    assert torch.equal(started[0], before)
+    assert not torch.equal(weights(path), before)
+
+
+def test_a_resumed_retraining_ends_alike(egos: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    given = Retraining(egos / "sac.zip", FAILURE, share=0.5)
+    common: dict[str, Any] = {"algo": "sac", "steps": STEPS, "num_envs": ROWS, "progress": False}
+    whole = train_ego(ENV, out=tmp_path / "whole.zip", retraining=given, **common)
+    stop_after(monkeypatch, 4)
+    with pytest.raises(Stopped):
+        train_ego(ENV, out=tmp_path / "on.zip", retraining=given, checkpoint_interval=0.0, **common)
+    monkeypatch.undo()
+    for other in (None, Retraining(egos / "sac.zip", FAILURE, 0.4), Retraining(egos / "sac.zip", FAILURE + 0.1, 0.5)):
+        with pytest.raises(ValueError, match="is of a training with other arguments"):
+            train_ego(ENV, out=tmp_path / "on.zip", retraining=other, resume=True, **common)
+    resumed = train_ego(ENV, out=tmp_path / "on.zip", retraining=given, resume=True, **common)
+    assert torch.equal(weights(resumed), weights(whole))
+
+
+def test_sac_keeps_its_entropy_coefficient(egos: Path) -> None:
+    saved = load_saved_ego(egos / "sac.zip", None)
+    from stable_baselines3 import SAC
+
+    model = SAC("MlpPolicy", sb3_vec_env(ENV, 2), policy_kwargs=saved.model.policy_kwargs, device="cpu")
+    fresh = model.log_ent_coef.item()
+    restore_parameters(model, saved)
+    assert model.log_ent_coef.item() != fresh
+
+
+def test_what_does_not_fit_is_refused_before_training(egos: Path, tmp_path: Path) -> None:
+    out = {"out": tmp_path / "on.zip", "progress": False, "steps": STEPS, "num_envs": ROWS}
+    with pytest.raises(ValueError, match=r"Expected an ego trained by ppo, got .*a2c.zip.*, trained by a2c"):
+        train_ego(ENV, "ppo", retraining=Retraining(egos / "a2c.zip", FAILURE), **out)
+    with pytest.raises(ValueError, match=r"Expected x of shape \(n, 6\)"):
+        train_ego(ENV, "ppo", retraining=Retraining(egos / "ppo.zip", FAILURE[:, :3]), **out)
+    with pytest.raises(ValueError, match="ego_speed = 99 is outside its range"):
+        train_ego(ENV, "ppo", retraining=Retraining(egos / "ppo.zip", np.full((1, 6), 99.0)), **out)
+    with pytest.raises(ValueError, match="its observation_space is"):
+        train_ego(ENV, "ppo", retraining=Retraining(egos / "ppo.zip", FAILURE), observation="lidar", **out)
+    with pytest.raises(FileNotFoundError, match=r"No ego at .*pp0\.zip"):
+        train_ego(ENV, "ppo", retraining=Retraining(egos / "pp0.zip", FAILURE), **out)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("changed", "said"),
+    [
+        ({}, None),
+        ({"algorithm": "a2c"}, r"^Expected an ego trained by ppo, got 'ego\.zip', trained by a2c\.$"),
+        ({"statistics": object()}, "trained behind VecNormalize, train-ego has none"),
+        ({"model": SimpleNamespace(observation_space=4, action_space=2)}, "its observation_space is 4, .* is 3"),
+        ({"model": SimpleNamespace(observation_space=3, action_space=5)}, "its action_space is 5, .* is 2"),
+    ],
+)
+def test_an_ego_trained_otherwise_is_refused(changed: dict[str, Any], said: str | None) -> None:
+    env = SimpleNamespace(observation_space=3, action_space=2)  # anything that compares as spaces do
+    usual = {"path": Path("ego.zip"), "algorithm": "ppo", "statistics": None, "model": env}
+    saved = SimpleNamespace(**{**usual, **changed})
+    if said is None:
+        check_retrainable(saved, "ppo", env)
+        return
+    with pytest.raises(ValueError, match=said):
+        check_retrainable(saved, "ppo", env)
+
+
+def test_a_training_that_goes_on_explores_as_at_its_end_and_learns_at_once() -> None:
+    dqn = {"learning_starts": 100, "exploration_initial_eps": 1.0, "exploration_final_eps": 0.05, "gamma": 0.9}
+    before = dict(dqn)
+    assert continue_settings(dqn) == {**dqn, "learning_starts": 0, "exploration_initial_eps": 0.05}
+    assert dqn == before
+    assert continue_settings({"n_steps": 8}) == {"n_steps": 8}  # PPO has none of these arguments
+
+
+@pytest.mark.parametrize("share", [0.0, 1.0, -0.1, float("nan")])
+def test_a_share_keeps_both_kinds(share: float) -> None:
+    with pytest.raises(ValueError, match="share of failures above 0 and below 1"):
+        Retraining(Path("ego.zip"), FAILURE, share)

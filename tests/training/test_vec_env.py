@@ -1,16 +1,12 @@
-"""The batched simulation behind Stable-Baselines3's `VecEnv`, and the training of egos."""
+"""The batched simulation behind Stable-Baselines3's `VecEnv`, with an ego, several agents or an adversary."""
 
 from __future__ import annotations
 
-import subprocess
-import sys
-from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 import pytest
-import torch
 from gymnasium import spaces
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from stable_baselines3 import PPO
@@ -18,14 +14,17 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecMonitor, VecNormalize
 
-from agents import SavedEgo, load_ego
-from rare_envs import DrivingProblem
-from rare_envs.control.actions import DISCRETE_ACTIONS
-from training import sb3_vec_env, train_ego
-from training.ego_training import HYPERPARAMETERS
+import rare_envs
+import training
+from examples import adversary, shared_policy
+from rare_envs.distributions.beta import BetaDistribution
+from rare_envs.envs.multi_agent_vector import AgentsVectorEnv
+from rare_envs.multi_agent import adversary_reward
+from rare_envs.threads import use_one_thread
+from training import sb3_vec_env
 from training.vec_env import BatchedVecEnv, info_row, merge_options
 
-IDS = ("rare_envs/CarFollowing-v0", "rare_envs/CutIn-v0")
+FOLLOWING, CUT_IN = IDS = ("rare_envs/CarFollowing-v0", "rare_envs/CutIn-v0")
 
 
 class Countdown(gym.Env[np.ndarray, np.ndarray]):
@@ -124,14 +123,6 @@ def test_it_agrees_with_the_vec_env_of_stable_baselines() -> None:
             )
             truncated = "TimeLimit.truncated"
             assert mine[3][row][truncated] == reference[3][row][truncated]
-
-
-def test_infos_are_separate_dictionaries() -> None:
-    env = BatchedVecEnv(batch(9, 9))
-    env.reset()
-    infos = steps(env, 1)[3]
-    infos[0]["note"] = 1  # wrappers of Stable-Baselines3 write into them
-    assert infos[1] == {}
 
 
 def test_the_monitor_sees_returns_and_lengths() -> None:
@@ -234,17 +225,6 @@ def test_attributes_and_methods_are_those_of_the_batch() -> None:
         env.env_method("render", indices=0)
 
 
-def test_images_are_tiled() -> None:
-    env = BatchedVecEnv(batch(9, 9))
-    env.reset()
-    steps(env, 2)
-    image = env.render()
-    assert image is not None
-    assert image.shape == (8, 4, 3)
-    assert (image == 2).all()
-    env.close()
-
-
 @pytest.mark.parametrize("mode", [AutoresetMode.NEXT_STEP, AutoresetMode.DISABLED])
 def test_other_autoreset_modes_are_refused(mode: AutoresetMode) -> None:
     with pytest.raises(ValueError, match="same-step autoreset"):
@@ -280,17 +260,6 @@ def test_our_environments_behave_as_a_vec_env(id: str) -> None:
     assert ended > 16
 
 
-@pytest.mark.parametrize("id", IDS)
-def test_equal_seeds_give_equal_runs(id: str) -> None:
-    def run(seed: int) -> Any:
-        env = sb3_vec_env(id, 4, seed=seed)
-        env.reset()
-        return np.stack([steps(env, 1)[0] for _ in range(120)])  # into the second episode
-
-    np.testing.assert_array_equal(run(3), run(3))
-    assert not np.array_equal(run(3), run(4))
-
-
 def test_reset_options_reach_our_environments() -> None:
     env = sb3_vec_env("rare_envs/CutIn-v0", 2)
     env.set_options([{"cut_in_gap": 9.0}, {"cut_in_gap": 12.0}])
@@ -305,105 +274,102 @@ def test_bad_arguments_are_refused() -> None:
         sb3_vec_env("rare_envs/CutIn-v0", 0)
 
 
-# --- training ----------------------------------------------------------------------------------
+# --- several agents ---------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("algo", ["ppo", "a2c", "sac", "td3", "dqn"])
-def test_every_algorithm_trains_saves_and_drives(algo: str, tmp_path: Path) -> None:
-    path = train_ego(
-        "rare_envs/CutIn-v0",
-        algo,
-        steps=400,
-        num_envs=16,
-        out=tmp_path / "new" / "ego",
-        progress=False,
+@pytest.mark.parametrize("env_id", rare_envs.ENV_IDS)
+@pytest.mark.parametrize("kwargs", [{}, {"observation": "kinematics", "action": "meta"}], ids=["continuous", "meta"])
+def test_rows_are_the_agents_of_the_parallel_environment(env_id, kwargs):
+    """The same scenarios and actions give the same observations, rewards and ends, row by row, to the last bit."""
+    batch = AgentsVectorEnv(env_id, 3, horizon=2.0, drivers="idm", **kwargs)
+    batch.action_space.seed(0)
+    observation, _ = batch.reset(seed=0)
+    several = [rare_envs.parallel_env(env_id, horizon=2.0, drivers="idm", **kwargs) for _ in range(3)]
+    names, n = several[0].possible_agents, len(several[0].possible_agents)
+    x = batch._x.copy()
+    for env, row in zip(several, x, strict=True):
+        env.reset(options={"x": row})
+    running = [True] * 3
+    for _ in range(30):
+        actions = batch.action_space.sample()
+        observation, reward, terminated, truncated, infos = batch.step(actions)
+        for b in (b for b in range(3) if running[b]):
+            rows = slice(b * n, b * n + n)
+            seen, earned, ended, cut, info = several[b].step(dict(zip(names, actions[rows], strict=True)))
+            last = infos["final_obs"] if (terminated | truncated)[rows].any() else observation
+            for row, agent in enumerate(names, start=b * n):
+                np.testing.assert_array_equal(last[row], seen[agent])
+                assert reward[row] == pytest.approx(earned[agent], rel=1e-6)
+            running[b] = not (terminated | truncated)[rows].any()
+            if not running[b]:
+                assert (terminated | truncated)[rows].all()  # a scenario ends for all its agents
+                for row, agent in enumerate(names, start=b * n):
+                    assert terminated[row] == (ended[agent] or ended["ego"])
+                    assert infos["final_info"]["collision"][row] == ended[agent]
+                    if ended[agent] or cut[agent]:
+                        assert infos["final_info"]["measure"][row] == info[agent]["measure"]
+    assert not any(running)
+
+
+def test_new_scenarios_follow_those_that_ended():
+    env = training.sb3_agents_env(CUT_IN, 8, agents=["ego", "lead"], horizon=1.0, seed=0)
+    assert isinstance(env, VecEnv)
+    assert env.num_envs == 16
+    env.reset()
+    ended = 0
+    for _ in range(25):
+        observation, _, dones, infos = env.step(np.zeros((16, 2), np.float32))
+        assert np.isfinite(observation).all()
+        for row in np.flatnonzero(dones):
+            assert infos[row]["TimeLimit.truncated"] != infos[row]["collision"]
+            assert infos[row]["terminal_observation"].shape == observation[row].shape
+            ended += 1
+    assert ended == 2 * 16
+
+
+def test_bad_arguments():
+    with pytest.raises(ValueError, match="no vehicle 'leed'"):
+        training.sb3_agents_env(CUT_IN, 4, agents=["leed"])
+    with pytest.raises(ValueError, match="one or more scenarios"):
+        training.sb3_agents_env(CUT_IN, 0)
+    with pytest.raises(ValueError, match="Reward for 'ego'"):
+        training.sb3_agents_env(CUT_IN, 4, agents=["lead"], rewards={"ego": adversary_reward})
+
+    class Recurrent:
+        def predict(self, observation, state=None, episode_start=None, deterministic=True):
+            return np.zeros((len(observation), 2)), (np.zeros(3),)
+
+    env = training.sb3_agents_env(CUT_IN, 4, agents=["lead"], ego=Recurrent())
+    env.reset()
+    with pytest.raises(ValueError, match="ego without memory"):
+        env.step(np.zeros((4, 2)))
+
+
+@use_one_thread()
+def test_an_adversary_raises_the_collision_rate():
+    """Starts side by side, so that little training is enough; from ordinary starts docs/agents.md has the numbers."""
+    low, high = np.array([14.0, 14.0, 14.0, 1.0, 30.0, 3.0]), np.array([16.0, 16.0, 16.0, 4.0, 50.0, 4.0])
+    near = {"base": BetaDistribution(np.full(6, 2.0), np.full(6, 2.0), low, high), "horizon": 5.0}
+    n = 400
+    model = adversary.train(CUT_IN, "cutter", 16_000, num_scenarios=32, n_steps=50, batch_size=400, **near)
+    scripted = adversary.collisions(CUT_IN, {}, n, seed=1, **near)
+    attacked = adversary.collisions(CUT_IN, {"cutter": model}, n, seed=1, **near)
+    # the counts are binomial: a difference of 5 standard deviations, none of which is beyond sqrt(n / 4)
+    assert attacked - scripted > 5 * (2 * n / 4) ** 0.5
+    assert adversary.interval(attacked, n)[0] > adversary.interval(scripted, n)[1]
+
+
+@use_one_thread()
+def test_a_shared_policy_learns():
+    before, after = (
+        shared_policy.mean_return(FOLLOWING, shared_policy.train(FOLLOWING, steps), 512, seed=1)
+        for steps in (0, 25_600)
     )
-    assert path == tmp_path / "new" / "ego.zip"
-    ego = load_ego(path)
-    assert isinstance(ego, SavedEgo)
-    assert ego.algorithm == algo
-    env = sb3_vec_env("rare_envs/CutIn-v0", 4, seed=0, discrete=algo == "dqn")
-    assert ego.observation_space == env.observation_space
-    expected = spaces.Discrete(len(DISCRETE_ACTIONS)) if algo == "dqn" else env.action_space
-    assert ego.action_space == expected
-    returns, lengths = evaluate_policy(ego.model, env, n_eval_episodes=4, return_episode_rewards=True)
-    assert np.isfinite(returns).all()
-    assert min(lengths) > 0  # type: ignore[type-var]
-    problem = DrivingProblem("rare_envs/CutIn-v0", ego=ego)
-    f = problem.evaluate(problem.base.sample(8, np.random.default_rng(0)))
-    assert ((f == -1.0) | (f > 0.0)).all()
+    error = (before[1] ** 2 + after[1] ** 2) ** 0.5
+    assert after[0] - before[0] > 5 * error
 
 
-def test_training_twice_gives_the_same_ego(tmp_path: Path) -> None:
-    def weights(name: str, seed: int) -> torch.Tensor:
-        path = tmp_path / f"{name}.zip"
-        train_ego(IDS[0], steps=2048, seed=seed, num_envs=16, out=path, progress=False)
-        ego: Any = load_ego(path)
-        return torch.cat([value.flatten() for value in ego.model.policy.state_dict().values()])
-
-    first = weights("first", 0)
-    assert torch.equal(weights("again", 0), first)
-    assert not torch.equal(weights("other", 1), first)
-
-
-def test_training_learns(tmp_path: Path) -> None:
-    """Forty rollouts teach far better driving than the untrained policy's, by any measure."""
-    path = train_ego(IDS[0], steps=40_000, num_envs=64, out=tmp_path / "ego.zip", progress=False)
-    ego: Any = load_ego(path)
-    env = sb3_vec_env(IDS[0], 64, seed=0)
-    untrained = PPO("MlpPolicy", env, seed=0, device="cpu")
-    learned, _ = evaluate_policy(ego.model, env, n_eval_episodes=64)
-    before, _ = evaluate_policy(untrained, env, n_eval_episodes=64, deterministic=False)
-    assert learned > before
-
-
-def test_progress_goes_to_standard_error(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    train_ego(IDS[1], steps=2048, num_envs=16, out=tmp_path / "ego.zip")
-    captured = capsys.readouterr()
-    assert captured.out == ""
-    assert "steps" in captured.err
-    assert "collisions" in captured.err
-
-
-def test_the_number_of_threads_is_restored(tmp_path: Path) -> None:
-    before = torch.get_num_threads()
-    torch.set_num_threads(2)
-    try:
-        train_ego(IDS[0], steps=64, num_envs=4, out=tmp_path / "ego.zip", progress=False)
-        assert torch.get_num_threads() == 2
-    finally:
-        torch.set_num_threads(before)
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ({"steps": 0}, "steps >= 1, got 0"),
-        ({"steps": -5}, "steps >= 1, got -5"),
-        ({"algo": "pp0"}, r"Unknown algorithm 'pp0' \(did you mean 'ppo'\?\)"),
-        ({"num_envs": 0}, "num_envs >= 1, got 0"),
-        ({"out": "."}, "got the folder"),
-        ({"out": "file/ego.zip"}, "Cannot make the folder"),
-    ],
-)
-def test_bad_requests_are_refused_before_work(
-    arguments: dict[str, Any], message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "file").write_text("")
-    with pytest.raises(ValueError, match=message) as caught:
-        train_ego(IDS[0], **arguments)
-    assert "\n" not in str(caught.value)
-    assert not list(tmp_path.glob("*.zip"))
-
-
-def test_every_recipe_is_an_algorithm_of_stable_baselines() -> None:
-    import stable_baselines3
-
-    assert all(hasattr(stable_baselines3, name.upper()) for name in HYPERPARAMETERS)
-
-
-def test_import_training_is_light() -> None:
-    """The command line imports it for its help text."""
-    code = "import sys, training; sys.exit('stable_baselines3' in sys.modules)"
-    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+def test_an_interval_by_hand():
+    low, high = adversary.interval(0, 100)
+    assert (low, high) == (0.0, pytest.approx(1 - 0.025 ** (1 / 100)))  # the rule of three and a little
+    assert adversary.interval(100, 100) == (pytest.approx(0.025 ** (1 / 100)), 1.0)
