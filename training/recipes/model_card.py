@@ -60,6 +60,7 @@ def format_model_card(folder: Path) -> str:
         ),
         ATTRIBUTION,
         "## Training",
+        "By commands of the version of that time; those of today are in `training/recipes`.",
         "\n".join(f"- {name}: `{provenance.command}`" for name, (_, provenance) in drivers.items()),
         *(["## Metrics", _table("metric", metrics)] if any(metrics.values()) else []),
         *(["## Distribution of the last layer's weights", _table("", ensembles)] if any(ensembles.values()) else []),
