@@ -22,12 +22,7 @@ LocationOption = Annotated[str | None, typer.Option(help="Location, where an NGS
 
 @dataclass(frozen=True, kw_only=True)
 class RecordingOptions:
-    """Options that name recorded traffic, of which one is given.
-
-    Example:
-        >>> RecordingOptions(ngsim=Path("us101.csv")).kind_and_path()[0]
-        'ngsim'
-    """
+    """Options that name recorded traffic, of which one is given."""
 
     data: Annotated[Path | None, typer.Option(help="Folder with the files of US 101: compact tables, or events.")] = (
         None
@@ -55,12 +50,7 @@ class RecordingOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class EventOptions(RecordingOptions):
-    """Options that name recordings of which events are extracted.
-
-    Example:
-        >>> EventOptions(coifman=Path("i80.mat")).kind_and_path()[0]
-        'coifman'
-    """
+    """Options that name recordings of which events are extracted."""
 
     coifman: Annotated[Path | None, typer.Option(help="Or the I-80 data of Coifman and Li, .mat or text.")] = None
     location: LocationOption = None
@@ -114,16 +104,7 @@ def run_command(command: Callable[..., None]) -> None:
 
 
 def spread_options(command: Callable[..., None]) -> Callable[..., None]:
-    """Return the command with the fields of its option classes as options of its own.
-
-    Example:
-        >>> def command(name: str, options: RecordingOptions) -> None:
-        ...     print(name, options.highd)
-        >>> list(inspect.signature(spread_options(command)).parameters)
-        ['name', 'data', 'ngsim', 'highd', 'tgsim', 'i24']
-        >>> spread_options(command)(name="run", highd="highD/data")
-        run highD/data
-    """
+    """Return the command with the fields of its option classes as options of its own."""
     groups: dict[str, type[Any]] = {}
     parameters: list[inspect.Parameter] = []
     for name, parameter in inspect.signature(command, eval_str=True).parameters.items():

@@ -58,12 +58,6 @@ def find_standstill_brakings(position: FloatArray, gap: FloatArray) -> TrackBrak
 
     Returns:
         Their events, and the tick at which each begins.
-
-    Example:
-        >>> speed = np.concatenate([np.full(60, 12.0), 12.0 - 0.25 * np.arange(48), np.zeros(40)])
-        >>> found = find_standstill_brakings(0.1 * np.cumsum(speed), np.full(148, 20.0))
-        >>> found.events.round(1).tolist()  # 2.5 m/s^2 from 12 m/s
-        [[12.0, 20.0, 2.6]]
     """
     if len(position) < SHORTEST_TRACK:
         return TrackBrakings.none()
@@ -80,12 +74,7 @@ def find_standstill_brakings(position: FloatArray, gap: FloatArray) -> TrackBrak
 
 
 def braking_spans(acceleration: FloatArray) -> list[tuple[int, int]]:
-    """Return the first tick of each time of braking, and the one behind the last.
-
-    Example:
-        >>> braking_spans(np.repeat([0.0, -1.0, 0.0], 20))
-        [(20, 40)]
-    """
+    """Return the first tick of each time of braking, and the one behind the last."""
     braking = acceleration < -BRAKING_ONSET
     braking[:END_TICKS] = braking[len(braking) - END_TICKS :] = False
     edges = np.flatnonzero(np.diff(braking.astype(np.int8))) + 1
@@ -146,10 +135,6 @@ def track_exposure(position: FloatArray) -> tuple[float, float]:
 
     Args:
         position: Position along the road at consecutive ticks [m], shape (T,).
-
-    Example:
-        >>> track_exposure(np.arange(100.0))  # 1 s at each end does not count
-        (8.0, 79.0)
     """
     if len(position) < SHORTEST_TRACK:
         return 0.0, 0.0

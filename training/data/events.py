@@ -257,10 +257,6 @@ def course_durations(above: FloatArray, displacement: FloatArray) -> FloatArray:
 
     Returns:
         T [s], shape (n,); NaN where the time is not known or the vehicle did not move to its new side.
-
-    Example:
-        >>> course_durations(np.array([3.64, 3.0, np.nan]), np.array([3.1, -0.4, 3.1])).round(2).tolist()
-        [4.0, nan, nan]
     """
     known = np.isfinite(above) & (displacement > 0.0)
     time, side = np.where(known, above, 0.0), np.where(known, displacement, 1.0)
@@ -273,12 +269,7 @@ def course_durations(above: FloatArray, displacement: FloatArray) -> FloatArray:
 
 
 def time_around_peak(speed: FloatArray, time: FloatArray) -> float:
-    """Return how long the speed is above `LATERAL_SPEED` around its largest value [s].
-
-    Example:
-        >>> time_around_peak(np.array([0.3, 0.1, 0.5, 0.9, 0.4, 0.1]), 0.1 * np.arange(6.0)).__round__(2)
-        0.3
-    """
+    """Return how long the speed is above `LATERAL_SPEED` around its largest value [s]."""
     slow = np.flatnonzero(speed <= LATERAL_SPEED)
     peak = int(np.argmax(speed))
     first = slow[slow < peak].max(initial=-1) + 1

@@ -212,11 +212,6 @@ def choose_system(bic: Sequence[float], held_out: Sequence[FloatArray], clusters
         bic: Of each system.
         held_out: Log density of each event under each system, shape (n,) each, see `held_out_log_prob`.
         clusters: Of each event, shape (n,).
-
-    Example:
-        >>> close, worse = np.zeros(4), np.array([-1.0, -1.1, -0.9, -1.0])
-        >>> choose_system([10.0, 8.0], [close, worse], np.arange(4))
-        0
     """
     known = np.isfinite(np.stack(held_out)).all(axis=0)
     if not known.any():

@@ -60,12 +60,6 @@ def fit_mixture_of_starts(points: FloatArray, components: int, floor: float, see
         floor: Added to the variances of each component.
         seed: Seed of the starts.
         starts: Number of starts; for one component they are all alike.
-
-    Example:
-        >>> points = np.array([[-1.1], [-1.0], [-0.9], [0.9], [1.0], [1.1]])
-        >>> fit = fit_mixture_of_starts(points, 2, floor=0.01, seed=0, starts=3)
-        >>> fit.weights.round(2).tolist(), sorted(fit.means[:, 0].round(2).tolist())
-        ([0.5, 0.5], [-1.0, 1.0])
     """
     monomials = _expand(points)
     mixtures = _maximise(_start(points, components, seed, starts if components > 1 else 1), monomials, floor)

@@ -47,13 +47,7 @@ class EventRecipe:
 
 @dataclass(frozen=True)
 class EventSet:
-    """Usable events of a scenario, columns in the order of its parameters.
-
-    Example:
-        >>> pairs = EventSet(np.array([[15.0, 14.0, 20.0], [15.0, 16.0, 9.0]]), np.array([0, 0]), cluster="scene")
-        >>> pairs.counts.used, pairs.counts.clusters
-        ((2,), 1)
-    """
+    """Usable events of a scenario, columns in the order of its parameters."""
 
     joint: FloatArray
     """Columns that are fitted together, shape (n, d - a)."""
