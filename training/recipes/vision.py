@@ -184,7 +184,7 @@ def drive_situations(
     situations = make_situations()
     for number in range(drives):
         start = start_situation(situations[number % len(situations)], rows, ticks * VisionEgo.dt, rng)
-        yield concatenate(list(drive_and_label(*start, network, share, ticks, rng, **how)))
+        yield from drive_and_label(*start, network, share, ticks, rng, **how)
 
 
 @torch.inference_mode()
