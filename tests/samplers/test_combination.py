@@ -32,11 +32,6 @@ def test_cov_is_the_larger_of_own_and_seen():
     assert apart == pytest.approx(math.sqrt(2) / 2 / math.sqrt(2))
 
 
-def test_one_run_is_left_alone():
-    only = outcome(1e-4)
-    assert combine([only], 0.95) is only
-
-
 def test_without_any_hit_the_interval_is_one_sided():
     none = [outcome(0.0, math.inf, Status.NO_HITS, interval=(0.0, h)) for h in (0.01, 0.02)]
     result = combine(none, 0.95)
@@ -106,14 +101,6 @@ def test_pooled_runs_without_a_hit():
     none = outcome(0.0, math.inf, Status.NO_HITS, counts=(0, 500))
     result = combine([none, none], 0.95)
     assert (result.p, result.interval, result.status) == (0.0, clopper_pearson(0, 1000, 0.95), Status.NO_HITS)
-
-
-def test_coverage_of_two_pooled_runs(study):
-    runs = 200
-    found = study(half_space(2, 2.0), "mc", runs, replicates=2, max_sim=2000)
-    assert found.covered >= stats.binom.ppf(1e-3, runs, 0.95)
-    high_over_low = [result.interval[1] / result.interval[0] for result in found.results]
-    assert np.mean(high_over_low) < 2.5  # about 45 hits: exp(2 x 1.96 / sqrt(45)) = 1.8
 
 
 @pytest.mark.slow

@@ -6,7 +6,6 @@ Without `-m slow` local processes and fakes stand for all. Executors whose libra
 from __future__ import annotations
 
 import hashlib
-import multiprocessing
 import os
 import random
 import shutil
@@ -15,7 +14,7 @@ import subprocess
 import sys
 import threading
 import time
-from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import SimpleNamespace
@@ -250,10 +249,6 @@ def test_workers_that_always_die_end_the_run() -> None:
 # Pools of others
 
 
-def make_processes() -> Executor:
-    return ProcessPoolExecutor(2, mp_context=multiprocessing.get_context("spawn"))
-
-
 class Job:
     """A job as of submitit: it tells when it is done, and calls nobody back."""
 
@@ -314,13 +309,6 @@ def test_a_pool_that_answers_something_else_ends_the_run_in_one_line(answer: str
     with pytest.raises(samplers.ExecutorError, match=message) as refused:
         by(FuturesPool(Wrong(answer), workers=2), 3000)
     assert "\n" not in str(refused.value)
-
-
-@pytest.mark.slow
-def test_a_broken_pool_of_the_callers_ends_the_run_with_advice() -> None:
-    with make_processes() as processes:
-        with pytest.raises(samplers.ExecutorError, match="give a function that makes the pool"):
-            estimate(problem(FAULTS["crashing"]), processes, 60)
 
 
 class Lossy:

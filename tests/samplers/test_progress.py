@@ -38,16 +38,6 @@ def test_bar_goes_to_standard_error(capsys):
     assert f"P[f <= 0] = {result.p:.2e}" in err
 
 
-def test_a_narrow_terminal_keeps_bar_count_and_time(capsys, monkeypatch):
-    for columns, words in ((40, False), (120, True)):
-        monkeypatch.setenv("COLUMNS", str(columns))
-        result = samplers.estimate(half_space().problem, "mc", seed=1, max_sim=2000, progress=True)
-        last = capsys.readouterr().err.strip("\n").splitlines()[-1]
-        assert len(last) <= columns
-        assert "\u2501" in last and re.search(r"\d:\d\d:\d\d", last) and f"{result.n_sim:,}" in last
-        assert ("P[f <= 0]" in last) == words
-
-
 def test_workers_and_both_times_fit_eighty_columns(capsys, monkeypatch):
     monkeypatch.setenv("COLUMNS", "80")
     with open_listener(True, 10_000) as show:
@@ -99,8 +89,3 @@ def test_bar_of_a_run_that_fails_leaves_nothing(capsys, monkeypatch, terminal):
 
     result = samplers.estimate(half_space().problem, "adss", seed=1, progress=True)
     assert f"{result.n_sim:,} simulations" in on_screen(capsys.readouterr().err)[0]
-
-
-def test_silent_by_default(capsys):
-    samplers.estimate(half_space().problem, "adss", seed=1)
-    assert capsys.readouterr() == ("", "")

@@ -90,27 +90,6 @@ def test_what_is_asked_in_the_wrong_order():
         run.tell([1.0])
 
 
-@pytest.mark.parametrize(
-    ("options", "expected"),
-    [({"gamma": math.nan}, "gamma"), ({"max_sim": 2, "replicates": 3}, "max_sim"), ({"on_error": "no"}, "on_error")],
-)
-def test_bad_arguments(options, expected):
-    with pytest.raises(ValueError, match=expected):
-        samplers.MonteCarlo().start(Places(), **options)
-
-
-@pytest.mark.parametrize("dim", [0, -1, 2.0, None])
-def test_dimension_that_is_none(dim):
-    class Wrong(Places):
-        pass
-
-    Wrong.dim = dim
-    with pytest.raises(ValueError, match="dim to be a whole number of at least 1"):
-        samplers.MonteCarlo().start(Wrong())
-    with pytest.raises(ValueError, match="problem with dim and base, got object"):
-        samplers.MonteCarlo().start(object())
-
-
 def test_progress_and_a_result_at_any_moment():
     run = samplers.MonteCarlo(batch=10).start(Places(), max_sim=100, seed=1)
     assert (run.progress.n_sim, run.progress.max_sim) == (0, 100)
@@ -210,19 +189,6 @@ def test_a_method_that_asks_for_points_of_the_wrong_shape(shape):
         Wrong().start(Places())
 
 
-def test_a_method_without_an_outcome():
-    class Silent(samplers.Method):
-        name, stops_at_target = "silent", False
-
-        def steps(self, inputs, goal, rng):
-            yield np.zeros((1, 2))
-
-    run = Silent().start(Places())
-    run.ask()
-    with pytest.raises(TypeError, match="return an Outcome, got None"):
-        run.tell([1.0])
-
-
 def test_the_budget_is_split_evenly():
     assert split_budget(None, 3) == [None] * 3
     for max_sim, replicates in ((1000, 3), (7, 7), (20, 6), (1, 1)):
@@ -242,14 +208,6 @@ def test_replicates_are_independent_and_all_counted(recorder):
     ends = [level.estimate for level in result.trace if level.gamma == 0.0]
     assert len(set(ends)) == 4
     assert result.p == pytest.approx(np.mean(ends))
-
-
-def test_replicates_share_the_budget(recorder):
-    f = recorder(half_space().problem.f)
-    problem = samplers.FunctionProblem(f, 2)
-    result = samplers.estimate(problem, "mc", seed=1, replicates=3, max_sim=1000)
-    assert f.rows == result.n_sim == 1000
-    assert [level.n_sim for level in result.trace] == [333, 333, 334]
 
 
 def one_after_another(problem, method, seed, replicates, max_sim):
@@ -283,12 +241,6 @@ def test_side_by_side_is_one_after_another_in_fewer_calls(method, max_sim, recor
     np.testing.assert_array_equal(np.unique(together.points, axis=0), np.unique(alone.points, axis=0))
     assert together.rows == alone.rows
     assert len(together.batches) < 0.6 * len(alone.batches)
-
-
-def test_first_replicate_is_the_single_run():
-    single = samplers.estimate(half_space().problem, "adss", seed=1)
-    several = samplers.estimate(half_space().problem, "adss", seed=1, replicates=2)
-    assert several.trace[: len(single.trace)] == single.trace
 
 
 def test_target_cov_adds_runs_until_it_is_met():
@@ -346,43 +298,6 @@ def test_a_rest_of_max_sim_is_used_where_runs_pool(pools, n_sim):
     problem = half_space(2, 1.0).problem
     result = samplers.estimate(problem, Fixed(pools), seed=1, target_cov=0.01, replicates=2, max_sim=1000)
     assert result.n_sim == n_sim
-
-
-def test_runs_that_pool_need_not_be_five():
-    """Hits are binomial: cov^2 = (1 - p) / (p n) is 0.066^2 with 1200 draws, 0.081^2 with 800."""
-    problem = half_space(2, 1.0).problem
-    pooled, mean = (
-        samplers.estimate(problem, Fixed(pools), seed=1, target_cov=0.073, replicates=2) for pools in (True, False)
-    )
-    assert pooled.n_sim == 1200
-    assert mean.n_sim >= 2000
-
-
-def test_one_run_at_the_limit_of_its_method_is_not_the_end():
-    method, target, share = samplers.MonteCarlo(n=1000), 0.12, 0.12 * math.sqrt(3)
-    gone_on = 0
-    for seed in range(20):
-        result = samplers.estimate(half_space(2, 2.0).problem, method, seed=seed, target_cov=target, replicates=3)
-        at_limit = sum(level.cov > share for level in result.trace)
-        assert (result.status == "converged") == (result.cov <= target)
-        assert result.cov <= target or at_limit == 3
-        gone_on += len(result.trace) > 3 and at_limit > 0
-    assert gone_on > 0
-
-
-@pytest.mark.parametrize("method", ["mc", "ce"])
-@pytest.mark.parametrize("replicates", [2, 3])
-def test_target_cov_with_replicates_is_met(method, replicates):
-    """The runs meet target_cov sqrt(R) each; their spread, or where they stopped, may still miss the target."""
-    target = {"mc": 0.2, "ce": 0.02}[method]
-    runs = []
-    for seed in range(12):
-        result = samplers.estimate(half_space().problem, method, seed=seed, target_cov=target, replicates=replicates)
-        assert result.cov <= target, seed
-        assert result.status == "converged"
-        runs.append(max(level.run for level in result.trace) + 1)
-    assert replicates in runs
-    assert max(runs) <= 20
 
 
 def test_a_target_out_of_reach_is_given_up_at_the_limit_of_the_method():
@@ -468,22 +383,6 @@ def test_points_are_requested_batch_by_batch_until_the_outcome():
 def test_steps_that_need_no_simulation_have_their_outcome_at_once():
     run = start_steps(batches())
     assert (run.running, run.n_sim, run.outcome) == (False, 0, DONE)
-
-
-def test_an_interrupted_method_concludes_from_what_it_was_told():
-    run = start_steps(batches(3, 2))
-    run.tell(np.zeros(3))
-    run.interrupt()
-    assert (run.outcome, run.running, run.requested.shape) == (HALTED, False, (0, 2))
-
-
-@pytest.mark.parametrize("what", ["raise", "go on"])
-def test_a_method_that_does_not_conclude_knows_nothing(what):
-    run = start_steps(batches(3, 2, when_interrupted=what))
-    run.tell(np.zeros(3))
-    run.interrupt()
-    assert run.outcome is NOT_KNOWN
-    assert (NOT_KNOWN.p, NOT_KNOWN.interval, NOT_KNOWN.cov) == (0.0, (0.0, 1.0), math.inf)
 
 
 def test_a_method_that_was_told_nothing_is_not_interrupted_but_closed():

@@ -158,24 +158,6 @@ def test_a_search_by_terms_is_continued_like_any_other(frail: Path) -> None:
         assert (frail / "run" / name).read_bytes() == (frail / "whole" / name).read_bytes()
 
 
-def test_what_is_in_the_journal_is_not_simulated_again(
-    frail: Path, risky: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    (frail / "left").write_text("150")
-    with pytest.raises(BadInput, match="600 simulations are kept"):
-        evaluate.run_into(frail / "run", prepare(question(risky, "mc")))
-    simulated: list[int] = []
-    attempt = DrivingProblem.attempt
-
-    def counted(self: DrivingProblem, x: Any) -> Any:
-        simulated.append(len(x))
-        return attempt(self, x)
-
-    monkeypatch.setattr(DrivingProblem, "attempt", counted)
-    assert evaluate.resume(frail / "run").estimate.n_sim == 1200
-    assert sum(size for size in simulated if size == 200) == 600
-
-
 def test_on_the_command_line(cli: Cli, frail: Path, risky: str, monkeypatch: pytest.MonkeyPatch) -> None:
     words = ["estimate", "rare_envs/CarFollowing-v0", "--ego", "frail:make", "--base", risky, "--horizon", 2]
     words += ["--method", "mc", "--max-sim", 600, "--gamma", 2, "--on-error", "failure", "--out", "run"]

@@ -167,16 +167,6 @@ def test_killed_under_every_executor_it_gives_the_same_files(
     assert_same_files(tmp_path / "run", whole_in_chunks, *TABLES)
 
 
-@pytest.mark.parametrize(("name", "kill_at"), [case(name, kill_at) for name in EXECUTORS for kill_at in KILLS[::2]])
-def test_killed_under_every_executor_in_the_final_writes_it_gives_the_same_files(
-    name: str, kill_at: int, tmp_path: Path, base: str, whole_in_chunks: Path
-) -> None:
-    words = ("estimate", FOLLOWING, "--base", base, *WORDS, *CHUNK, "--out", "run")
-    assert kill_in_final_writes(tmp_path, kill_at, *words, executor=name)
-    finish(tmp_path, "resume", "run", executor=name)
-    assert_same_files(tmp_path / "run", whole_in_chunks, *TABLES)
-
-
 @pytest.mark.parametrize("kill_at", [pytest.param(k, marks=[] if k == 3 else pytest.mark.slow) for k in KILLS])
 def test_killed_in_the_final_writes_it_gives_the_same_files(
     kill_at: int, tmp_path: Path, base: str, whole: Path
@@ -206,25 +196,6 @@ def test_a_signal_is_one_line_and_what_is_known(name: str, tmp_path: Path, risky
     assert said.splitlines()[-1] == f"rare-envs: stopped by {name}"
     assert "simulations are kept; go on with: rare-envs resume run" in said
     assert sorted(path.name for path in (tmp_path / "run").iterdir()) == [JOURNAL, "study.json"]
-
-
-def test_without_out_an_interrupted_run_prints_what_it_knows(
-    cli: Cli, risky: str, monkeypatch: pytest.MonkeyPatch, no_pictures: None
-) -> None:
-    attempt, rows = DrivingProblem.attempt, [0]
-
-    def interrupted(self: DrivingProblem, x: Any) -> Any:
-        rows[0] += len(x)
-        if rows[0] > 12_000:
-            raise KeyboardInterrupt
-        return attempt(self, x)
-
-    monkeypatch.setattr(DrivingProblem, "attempt", interrupted)
-    stopped = cli("estimate", FOLLOWING, "--base", risky, "--horizon", 1, "--gamma", 2, "--method", "mc")
-    assert stopped.exit_code == 130
-    assert "10,000 simulations" in stopped.stdout
-    assert "stopped" in stopped.stdout
-    assert "Traceback" not in stopped.stderr
 
 
 def test_a_full_disk_at_the_start_is_one_line(cli: Cli, here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
