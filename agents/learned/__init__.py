@@ -2,10 +2,8 @@
 
 from agents.learned.checkpoints import Provenance, load_driver, read_driver, read_provenance, save_driver
 from agents.learned.collision_avoidance import CollisionAvoidance
-from agents.learned.coloured_noise import AutoregressiveNoise
-from agents.learned.driver import LearnedDriver, LearnedEgo, replace_head
-from agents.learned.networks import Policy, Scaling, head_weights
-from agents.learned.rule_driver import RuleDriver
+from agents.learned.driver import LearnedDriver, LearnedEgo, RuleDriver, replace_head
+from agents.learned.networks import AutoregressiveNoise, Policy, Scaling, head_weights
 from agents.learned.weight_distribution import WeightDistribution
 
 __all__ = [

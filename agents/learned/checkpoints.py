@@ -22,11 +22,17 @@ from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
 from agents.learned.collision_avoidance import CollisionAvoidance
-from agents.learned.coloured_noise import AutoregressiveNoise
-from agents.learned.driver import LearnedDriver
+from agents.learned.driver import LearnedDriver, RuleDriver
 from agents.learned.lane_changes import LaneChanges
-from agents.learned.networks import ACTION_SIZE, FEATURE_CLIP, FEATURE_SIZE, HEAD_SIZE, Policy, Scaling
-from agents.learned.rule_driver import RuleDriver
+from agents.learned.networks import (
+    ACTION_SIZE,
+    FEATURE_CLIP,
+    FEATURE_SIZE,
+    HEAD_SIZE,
+    AutoregressiveNoise,
+    Policy,
+    Scaling,
+)
 from agents.learned.weight_distribution import WeightDistribution
 from agents.names import LANE_CHANGING, RULE_BASED, SHIPPED_DRIVERS, SHIPPED_EGOS, read_settings
 from rare_envs.control.lane_changing import LaneChangingDriver
@@ -187,9 +193,9 @@ def read_driver(path: str | PathLike[str]) -> LearnedDriver:
             acceleration=header["acceleration"],
             yaw_rate=header["yaw_rate"],
             weights=_weights(tensors, header["radius"], path),
-            avoidance=None if rule is None else CollisionAvoidance.from_json(rule),
+            avoidance=None if rule is None else CollisionAvoidance(**rule),
             hard_braking=header.get("hard_braking", 1.0),
-            changes=None if changes is None else LaneChanges.from_json(changes),
+            changes=None if changes is None else LaneChanges(**changes),
             name=header["name"],
         )
     except (AttributeError, TypeError, ValueError) as error:

@@ -10,14 +10,12 @@ References:
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from agents.learned.adjacent_lanes import LEFT_MARKER_COLUMN, RIGHT_MARKER_COLUMN
 from rare_envs.sensors.lidar import (
     FEATURES,
     HEADING_COLUMN,
@@ -28,42 +26,13 @@ from rare_envs.sensors.lidar import (
     beam_angles,
 )
 
+LEFT_MARKER_COLUMN, RIGHT_MARKER_COLUMN = FEATURES.index("left_marker"), FEATURES.index("right_marker")
 _LENGTH, _WIDTH = FEATURES.index("length"), FEATURES.index("width")
 _FORWARD, _SIDEWAYS, _ACROSS = 0.5, 0.3, 0.75
 """Least cosine of beams that look ahead (to 54 degrees), least sine of those that look aside (from 18), and of those
 whose range rate is taken for lateral motion (from 54)."""
 _LEAST_GAP, _LEAST_SPEED = 0.1, 1.0
 """Least divisors [m] and [m/s]."""
-
-
-@dataclass(frozen=True)
-class CloseRange:
-    """What the rule adds where somebody is very near; settings are positive numbers.
-
-    Ahead, nearer than the standstill gap, who comes closer brakes by b + dv / `closing_time`, as if the other braked
-    by b too, which the lidar does not show. Beams are 18 degrees apart, so of who stands on the line the one beside the
-    middle meets the far end first: a point well within the own lane is in the path too.
-
-    Beside, who moves towards a body that is too near is steered back, but never further than along the road. A beam
-    that meets a corner tells nothing of lateral motion; there the own is taken.
-
-    Raises:
-        ValueError: If a setting is not a positive number.
-
-    Example:
-        >>> CloseRange()
-        CloseRange(closing_time=0.3, line_margin=0.4, path_margin=0.9)
-    """
-
-    closing_time: float = 0.3
-    """[s]; of .3 and .5, the one with fewer collisions on rings of 60 vehicles per km and lane."""
-    line_margin: float = 0.4
-    """How far within the own lane a point is at least [m]; with .2 hard brakes are a third more frequent."""
-    path_margin: float = 0.9
-    """A point in the own lane is in the path if it is no further than this beside the own body [m]."""
-
-    def __post_init__(self) -> None:
-        _check_positive(self)
 
 
 @dataclass(frozen=True)
@@ -82,7 +51,13 @@ class CollisionAvoidance:
     at most ((d - d0) / T_y - c) / (T_psi v), HighwayEnv's lateral controller towards a line d0 from it, and never
     less than 0: it is not steered towards, but nobody is steered away. Nor is a curve driven narrower than a car can.
 
-    Both are upper bounds: where nobody is near, actions stay as they are. `CloseRange` adds to both.
+    Near. Ahead, nearer than the standstill gap, who comes closer brakes by b + dv / `closing_time`, as if the other
+    braked by b too, which the lidar does not show. Beams are 18 degrees apart, so of who stands on the line the one
+    beside the middle meets the far end first: a point well within the own lane is in the path too. Beside, who moves
+    towards a body that is too near is steered back, but never further than along the road. A beam that meets a corner
+    tells nothing of lateral motion; there the own is taken.
+
+    Both are upper bounds: where nobody is near, actions stay as they are.
 
     Raises:
         ValueError: If a setting is not a positive number.
@@ -123,17 +98,15 @@ class CollisionAvoidance:
     """T_psi [s], likewise."""
     turning_radius: float = 6.4
     """[m], of the middle of AASHTO's design vehicle P."""
-    close: CloseRange | None = None
-    """What is added where somebody is very near; None for nothing."""
+    closing_time: float = 0.3
+    """[s]; of .3 and .5, the one with fewer collisions on rings of 60 vehicles per km and lane."""
+    line_margin: float = 0.4
+    """How far within the own lane a point is at least [m]; with .2 hard brakes are a third more frequent."""
+    lane_margin: float = 0.9
+    """A point in the own lane is in the path if it is no further than this beside the own body [m]."""
 
     def __post_init__(self) -> None:
-        _check_positive(self)
-
-    @classmethod
-    def from_json(cls, values: Mapping[str, Any]) -> CollisionAvoidance:
-        """Return the rule whose fields were written as JSON; earlier files have no `close`."""
-        close = values.get("close")
-        return cls(**{**values, "close": None if close is None else CloseRange(**close)})
+        check_positive(self, "collision avoidance")
 
     def limit(self, features: Tensor, action: Tensor) -> Tensor:
         """Return actions within the bounds, differentiable in both arguments.
@@ -164,11 +137,9 @@ class CollisionAvoidance:
     def _is_in_path(self, features: Tensor, across: Tensor) -> Tensor:
         """Return whether points at some distances across, to the right positive, are in the path, (B, M, 20)."""
         beside = across.abs() - 0.5 * features[..., _WIDTH, None]
-        if self.close is None:
-            return beside < self.path_margin
         left, right = features[..., LEFT_MARKER_COLUMN, None], features[..., RIGHT_MARKER_COLUMN, None]
         inside = torch.where(across < 0.0, left, right) - across.abs()
-        in_lane = (inside > self.close.line_margin) & (beside < self.close.path_margin)
+        in_lane = (inside > self.line_margin) & (beside < self.lane_margin)
         return (beside < self.path_margin) | in_lane
 
     def greatest_acceleration_behind(self, gap: Tensor, closing: Tensor, speed: Tensor) -> Tensor:
@@ -185,9 +156,7 @@ class CollisionAvoidance:
         needed = closing.clamp(min=0.0).square() / (2.0 * (gap - self.least_gap).clamp(min=_LEAST_GAP))
         urgent = torch.where(needed > b, -needed.clamp(max=self.hardest), torch.inf)
         bound = torch.minimum(comfortable.clamp(min=-b), urgent)
-        if self.close is None:
-            return bound
-        firm = -(b + closing.clamp(min=0.0) / self.close.closing_time).clamp(max=self.hardest)
+        firm = -(b + closing.clamp(min=0.0) / self.closing_time).clamp(max=self.hardest)
         return torch.where((gap < self.standstill_gap) & (closing > 0.0), torch.minimum(bound, firm), bound)
 
     def greatest_yaw_rates(self, features: Tensor) -> tuple[Tensor, Tensor]:
@@ -231,20 +200,16 @@ class CollisionAvoidance:
         return (wanted[..., 0] + across) / lag, (wanted[..., 1] - across) / lag
 
     def _speed_towards(self, features: Tensor, sin: Tensor) -> Tensor:
-        """Return the own speed across towards the side of each beam [m/s], 0 or more, (B, M, 20); 0 without `close`."""
-        if self.close is None:
-            return torch.zeros_like(sin)
+        """Return the own speed across towards the side of each beam [m/s], 0 or more, (B, M, 20)."""
         across = features[..., SPEED_COLUMN, None] * torch.sin(features[..., HEADING_COLUMN, None])
         return (sin.sign() * across).clamp(min=0.0)
 
 
-def _check_positive(settings: CloseRange | CollisionAvoidance) -> None:
-    """Refuse a setting that is not a positive number."""
+def check_positive(settings: Any, of: str, but: tuple[str, ...] = ()) -> None:
+    """Refuse a field that is not a positive number."""
     for each in fields(settings):
         value = getattr(settings, each.name)  # a field by its name
-        if each.name == "close":
-            if not (value is None or isinstance(value, CloseRange)):
-                raise ValueError(f"Expected close of the collision avoidance as a CloseRange or None, got {value!r}.")
+        if each.name in but:
             continue
         if isinstance(value, bool) or not isinstance(value, int | float) or not 0.0 < value < math.inf:
-            raise ValueError(f"Expected {each.name} of the collision avoidance above 0, got {value!r}.")
+            raise ValueError(f"Expected {each.name} of the {of} above 0, got {value!r}.")

@@ -9,25 +9,39 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from agents.learned.collision_avoidance import CloseRange, CollisionAvoidance
-from agents.learned.coloured_noise import HUMAN_NOISE, WHITE_NOISE, AutoregressiveNoise
-from agents.learned.lane_changes import STATE_SIZE, ChangeState, LaneChanges, Waiting
+from agents.learned.collision_avoidance import CollisionAvoidance
+from agents.learned.lane_changes import STATE_SIZE, ChangeState, LaneChanges
 from agents.learned.networks import (
     ACTION_SIZE,
     FEATURE_SIZE,
     HEAD_SIZE,
     HIDDEN_SIZES,
+    HUMAN_NOISE,
+    WHITE_NOISE,
+    AutoregressiveNoise,
     Policy,
     apply_heads,
     is_plain,
 )
 from agents.learned.weight_distribution import WeightDistribution
 from rare_envs.control import actions
+from rare_envs.control.idm import IDM
 from rare_envs.devices import constant
-from rare_envs.sensors.lidar import CURVATURE_COLUMN, SPEED_COLUMN
+from rare_envs.sensors.lidar import (
+    AHEAD_BEAM,
+    CURVATURE_COLUMN,
+    FEATURES,
+    HEADING_COLUMN,
+    LANE_OFFSET_COLUMN,
+    MAX_RANGE,
+    RANGE_COLUMNS,
+    RATE_COLUMNS,
+    SPEED_COLUMN,
+)
 from rare_envs.simulation.cuda_graphs import says_recordable
 from rare_envs.simulation.observation import LIDAR_SCALES, observation_space
-from rare_envs.traffic.vehicle_models import steering_for
+from rare_envs.traffic.neighbours import Lead
+from rare_envs.traffic.vehicle_models import NEAR_ZERO, steering_for
 
 if TYPE_CHECKING:
     from gymnasium import spaces
@@ -36,6 +50,11 @@ if TYPE_CHECKING:
 
 EASED_BEYOND = 2.0
 """Deceleration [m/s^2] that is comfortable, as in `CollisionAvoidance`."""
+OFFSET_TIME = 0.6
+"""The lateral speed that is aimed at is lane offset / this [s], as in `rare_envs.control.idm`."""
+HEADING_TIME = 0.2
+"""The yaw rate is heading error / this [s], as in `rare_envs.control.idm`."""
+_LENGTH = FEATURES.index("length")
 
 
 @dataclass(frozen=True, eq=False)
@@ -188,8 +207,7 @@ class LearnedDriver:
     def _has_known_rules(self) -> bool:
         """Return whether its noise and rules are of this package: subclasses may do anything."""
         rule, changes = self.avoidance, self.changes
-        parts = (self.colour, rule, rule and rule.close, changes, changes and changes.waiting)
-        known = (AutoregressiveNoise, CollisionAvoidance, CloseRange, LaneChanges, Waiting)
+        parts, known = (self.colour, rule, changes), (AutoregressiveNoise, CollisionAvoidance, LaneChanges)
         return all(part is None or type(part) is kind for part, kind in zip(parts, known, strict=True))
 
     def without_rules(self) -> "LearnedDriver":
@@ -347,3 +365,51 @@ class LearnedEgo:
         speed = features[:, SPEED_COLUMN]
         yaw_rate = yaw_rate + speed * features[:, CURVATURE_COLUMN]  # it was trained on a straight road
         return torch.stack((acceleration, steering_for(yaw_rate, speed)), dim=1)
+
+
+@dataclass(frozen=True)
+class RuleDriver:
+    """IDM behind what the beam ahead meets, and the lane keeping of `rare_envs.control.idm` as a yaw rate.
+
+    It has the interface of a `LearnedDriver`, so that one harness measures both; it has no weights and no noise, and
+    knows vehicles in its lane only where the beam meets them.
+    """
+
+    idm: IDM = field(default_factory=IDM)
+    yaw_rate: tuple[float, float] = (-0.3, 0.3)
+    """Limits [rad/s]."""
+    weights: ClassVar[None] = None
+    noisy: ClassVar[bool] = False
+    recordable: ClassVar[bool] = True
+    """Whether its operations may be recorded: nothing about it changes."""
+
+    def begin(self, draws: Tensor) -> Tensor:
+        """Return an empty memory: (B, M, 2, 2) -> (B, M, 0)."""
+        return draws[..., 0, :0]
+
+    def act(
+        self,
+        features: Tensor,
+        weights: Tensor | None = None,
+        innovations: Tensor | None = None,
+        memory: Tensor | None = None,
+    ) -> tuple[Tensor, Tensor | None]:
+        """Decide for one tick.
+
+        Args:
+            features: Shape (B, M, 51).
+            weights: Not used.
+            innovations: Not used.
+            memory: Returned as it is.
+
+        Returns:
+            Accelerations [m/s^2] and yaw rates [rad/s], shape (B, M, 2), and the memory.
+        """
+        ahead, rate = features[..., RANGE_COLUMNS][..., AHEAD_BEAM], features[..., RATE_COLUMNS][..., AHEAD_BEAM]
+        speed = features[..., SPEED_COLUMN]
+        gap = torch.where(ahead < MAX_RANGE, ahead - 0.5 * features[..., _LENGTH], torch.inf)
+        acceleration = self.idm.acceleration(speed, Lead(gap, -rate))
+        across = -features[..., LANE_OFFSET_COLUMN] / (OFFSET_TIME * speed.clamp(min=NEAR_ZERO))
+        wanted = torch.asin(across.clamp(-1.0, 1.0)).clamp(-torch.pi / 4, torch.pi / 4)
+        yaw_rate = ((wanted - features[..., HEADING_COLUMN]) / HEADING_TIME).clamp(*self.yaw_rate)
+        return torch.stack((acceleration, yaw_rate), dim=-1), memory

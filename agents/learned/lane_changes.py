@@ -8,19 +8,13 @@ References:
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass, fields
-from typing import Any, NamedTuple
+from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from agents.learned.adjacent_lanes import (
-    LEFT_MARKER_COLUMN,
-    RIGHT_MARKER_COLUMN,
-    AdjacentLanes,
-    look_aside,
-)
+from agents.learned.collision_avoidance import LEFT_MARKER_COLUMN, RIGHT_MARKER_COLUMN, check_positive
 from rare_envs.devices import constant
 from rare_envs.sensors.lidar import (
     AHEAD_BEAM,
@@ -28,12 +22,20 @@ from rare_envs.sensors.lidar import (
     HEADING_COLUMN,
     LANE_OFFSET_COLUMN,
     MAX_RANGE,
+    RANGE_COLUMNS,
     RATE_COLUMNS,
     SPEED_COLUMN,
+    beam_angles,
 )
 from rare_envs.simulation.clock import LEARNED_TICK
 
-_WIDTH = FEATURES.index("width")
+_LENGTH, _WIDTH = FEATURES.index("length"), FEATURES.index("width")
+LINE_OVERLAP = 0.3
+"""A point counts to the next lane if it is no further than this before its line [m]: bodies stand near the line too."""
+SHOWS_LANE_BEYOND = 0.25
+"""Share of a lane's width by which a point has to be beyond the line to show that there is a lane."""
+LEAST_COSINE_ALONG = 0.25
+"""Least cosine of beams whose range rate is taken for motion along the road."""
 COVARIATES = ("constant", "right", "advantage", "approach", "speed")
 """Of the logarithm of the hazard: 1; 1 for a change to the right; how much faster the next lane is [m/s]; how fast the
 gap ahead closes [m/s]; the own speed less `USUAL_SPEED` [m/s]."""
@@ -57,13 +59,53 @@ STATE_SIZE = 10
 """Numbers that a vehicle keeps in mind."""
 
 
-class ChangeState(NamedTuple):
-    """What M vehicles in B scenarios keep in mind about lane changes; shapes (B, M, 2), for left and right, or (B, M).
+class AdjacentLanes(NamedTuple):
+    """What is seen of the lanes to the left and to the right, shape (..., 2) each.
 
-    Example:
-        >>> ChangeState.unpack(torch.zeros(1, 3, 10)).pack().shape
-        torch.Size([1, 3, 10])
+    Beams are 18 degrees apart, so that in the next lane a body is met for sure if it is within 8 m of the own middle,
+    and its rear or front up to 13 m. What is further along that lane stays unseen. A beam that meets its side finds the
+    gap up to 2 m too long.
     """
+
+    lead_gap: Tensor
+    """Gap to the nearest body ahead in that lane [m], negative beside it, infinite if none is seen."""
+    lead_closing: Tensor
+    """Speed at which it closes [m/s], 0 if none is seen."""
+    lag_gap: Tensor
+    """Likewise of the nearest behind."""
+    lag_closing: Tensor
+    beyond: Tensor
+    """Whether a body is seen beyond the line, so that there is a lane."""
+
+
+def look_aside(features: Tensor) -> AdjacentLanes:
+    """Return what features (..., 51) show of the lanes beside, differentiable."""
+    ranges, beams = features[..., None, RANGE_COLUMNS], beam_angles(features)
+    angle = beams + features[..., HEADING_COLUMN, None, None]
+    side = constant((-1.0, 1.0), features)[:, None]
+    along, across = ranges * torch.cos(angle), side * ranges * torch.sin(angle)
+    line = torch.stack((features[..., LEFT_MARKER_COLUMN], features[..., RIGHT_MARKER_COLUMN]), dim=-1)[..., None]
+    width = (features[..., LEFT_MARKER_COLUMN] + features[..., RIGHT_MARKER_COLUMN])[..., None, None]
+    met = ranges < MAX_RANGE
+    inside = met & (across > line - LINE_OVERLAP) & (across < line + width)
+    cos = torch.cos(beams)
+    known = cos.abs() > LEAST_COSINE_ALONG
+    rate = torch.where(known, features[..., None, RATE_COLUMNS] / torch.where(known, cos, 1.0), 0.0).expand_as(across)
+    half = 0.5 * features[..., _LENGTH, None, None]
+    lead = torch.where(inside & (along > 0.0), along - half, torch.inf).min(dim=-1)
+    lag = torch.where(inside & (along <= 0.0), -along - half, torch.inf).min(dim=-1)
+    lead_rate, lag_rate = (rate.gather(-1, each.indices[..., None])[..., 0] for each in (lead, lag))
+    return AdjacentLanes(
+        lead.values,
+        torch.where(lead.values < torch.inf, -lead_rate, 0.0),
+        lag.values,
+        torch.where(lag.values < torch.inf, lag_rate, 0.0),
+        (met & (across > line + SHOWS_LANE_BEYOND * width)).any(dim=-1),
+    )
+
+
+class ChangeState(NamedTuple):
+    """What M vehicles in B scenarios keep in mind of lane changes; shapes (B, M, 2), for left and right, or (B, M)."""
 
     patience: Tensor
     """Hazard that is left until a change begins, for left and right."""
@@ -110,35 +152,6 @@ class ChangeAction(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Waiting:
-    """What `LaneChanges` has beside for changes that wait for a gap; settings are positive numbers.
-
-    Who at the first moment will be at the line within `foresight` is changing, also where the new lane is not free or
-    nobody shows it. No change is given up for want of a gap: the rule of collision avoidance keeps the vehicle off
-    until there is one, or until the time of its course is over.
-
-    The edge of the road shows in two ways. Whose middle is over the line while the lane is still the old one has no
-    lane there: its change is given up. And who is not changing keeps `margin` inside its line where it knows of no lane
-    beyond, and steers back from further out.
-
-    Raises:
-        ValueError: If a setting is not a positive number.
-
-    Example:
-        >>> Waiting()
-        Waiting(foresight=1.8, margin=0.2)
-    """
-
-    foresight: float = 1.8
-    """[s]; within it 38 of 41 who move towards a lane that is not free are changing, within 2.4 s 41 of 55."""
-    margin: float = 0.2
-    """[m]; with .1 to .3 nobody leaves the road in the scenes learned from, with 0 some do."""
-
-    def __post_init__(self) -> None:
-        _check_positive(self, "waiting")
-
-
-@dataclass(frozen=True)
 class LaneChanges:
     """Lane changes at a hazard rate, on a cubic course.
 
@@ -150,12 +163,17 @@ class LaneChanges:
     be left after `accepted_time` at the present speeds, ahead and behind.
 
     Who at the first moment moves across so that its middle will reach the line within `foresight` is changing already:
-    the course is taken up there.
+    the course is taken up there. So is who will be at the line within `near`, also where the new lane is not free or
+    nobody shows it.
 
     Course. The distance left is D (1 - 3 s^2 + 2 s^3) with s = t / `duration`, and its speed and acceleration; errors
     are corrected as by a critically damped oscillator. Below `slow` time passes slower, so that headings stay small. A
-    change ends with its course, when the vehicle goes along its lane again, and is given up if before the line the gap
-    is no longer `least_gap`; then the network steers again. With `waiting` it waits.
+    change ends with its course, when the vehicle goes along its lane again; then the network steers again. No change is
+    given up for want of a gap: the rule of collision avoidance keeps the vehicle off until there is one.
+
+    The edge of the road shows in two ways. Whose middle is over the line while the lane is still the old one has no
+    lane there: its change is given up. And who is not changing keeps `margin` inside its line where it knows of no lane
+    beyond, and steers back from further out.
 
     Raises:
         ValueError: If there are not 5 coefficients, or another setting is not a positive number.
@@ -192,8 +210,10 @@ class LaneChanges:
     """Natural frequency of the correction [rad/s]."""
     slow: float = 10.0
     """[m/s]."""
-    waiting: Waiting | None = None
-    """None if changes are given up for want of a gap."""
+    near: float = 1.8
+    """[s]; within it 38 of 41 who move towards a lane that is not free are changing, within 2.4 s 41 of 55."""
+    margin: float = 0.2
+    """[m]; with .1 to .3 nobody leaves the road in the scenes learned from, with 0 some do."""
 
     def __post_init__(self) -> None:
         coefficients = tuple(float(value) for value in self.coefficients)
@@ -202,15 +222,7 @@ class LaneChanges:
                 f"Expected {len(COVARIATES)} finite coefficients of the hazard, got {self.coefficients!r}."
             )
         object.__setattr__(self, "coefficients", coefficients)
-        _check_positive(self, "lane changes", but=("coefficients", "waiting"))
-        if not (self.waiting is None or isinstance(self.waiting, Waiting)):
-            raise ValueError(f"Expected waiting of the lane changes as Waiting or None, got {self.waiting!r}.")
-
-    @classmethod
-    def from_json(cls, values: Mapping[str, Any]) -> LaneChanges:
-        """Return the lane changes whose fields were written as JSON; earlier files have no `waiting`."""
-        waiting = values.get("waiting")
-        return cls(**{**values, "waiting": None if waiting is None else Waiting(**waiting)})
+        check_positive(self, "lane changes", but=("coefficients",))
 
     def begin(self, draws: Tensor) -> ChangeState:
         """Return the state before anything was perceived, from standard normal draws (B, M, 2)."""
@@ -239,7 +251,7 @@ class LaneChanges:
         left = _distance_left(features, state)
         across = features[..., SPEED_COLUMN] * torch.sin(features[..., HEADING_COLUMN])
         settled = (across.abs() < _SETTLED) | (state.share >= _LATEST)
-        over = ((state.share >= 1.0) & settled) | self._is_given_up(features, lanes, state)
+        over = ((state.share >= 1.0) & settled) | self._is_given_up(features, state)
         state = state._replace(side=torch.where(over, 0.0, state.side))
         action = self._follow_course(features, lanes, state, left)
         passes = state.pace * self._slowness(features)
@@ -269,26 +281,17 @@ class LaneChanges:
         on_line = offset + 0.5 * features[..., _WIDTH] > 0.5 * width + self.over_line
         free = _of_side(_gap_after(lanes, 0.5 * self.accepted_time), side) > self.least_gap
         changing = crosses & free & (_of_side(lanes.beyond, side) | on_line)
-        if self.waiting is not None:
-            changing = changing | (offset + self.waiting.foresight * across.abs() > 0.5 * width)
+        changing = changing | (offset + self.near * across.abs() > 0.5 * width)
         return torch.where(changing, side, 0.0)
 
-    def _is_given_up(self, features: Tensor, lanes: AdjacentLanes, state: ChangeState) -> Tensor:
-        """Return whether a change ends: no gap is left before the line, or, with `waiting`, it crossed the road's edge.
-
-        Shape (B, M).
-        """
-        if self.waiting is not None:
-            return _of_side(_to_lines(features), state.side) < 0.0
-        gap = _of_side(_gap_after(lanes, 0.5 * self.accepted_time), state.side)
-        return (gap < self.least_gap) & (state.crossed == 0.0)
+    def _is_given_up(self, features: Tensor, state: ChangeState) -> Tensor:
+        """Return whether a change ends because it crossed the edge of the road, shape (B, M)."""
+        return _of_side(_to_lines(features), state.side) < 0.0
 
     def _room(self, features: Tensor, state: ChangeState) -> Tensor:
         """Return how far across the vehicle may go to either side [m]; further than it can see if that is free."""
-        if self.waiting is None:
-            return torch.full_like(state.unseen, MAX_RANGE)
         free = (state.unseen < self.remembered) | (state.side != 0.0)[..., None]
-        return torch.where(free, MAX_RANGE, _to_lines(features) - self.waiting.margin)
+        return torch.where(free, MAX_RANGE, _to_lines(features) - self.margin)
 
     def _remember(self, features: Tensor, lanes: AdjacentLanes, state: ChangeState) -> ChangeState:
         """Return the state with what is known of the lanes beside, also where a line was crossed."""
@@ -357,9 +360,7 @@ class LaneChanges:
         is_across = state.side * speed * torch.sin(features[..., HEADING_COLUMN])
         gain = gain + 2.0 * frequency * (across - is_across) + frequency.square() * (left - wanted)
         changing, gap = state.side != 0.0, _of_side(lanes.lead_gap, state.side)
-        follows = changing & (state.crossed == 0.0) & (gap < torch.inf)
-        if self.waiting is not None:
-            follows = follows & (gap > 0.0)
+        follows = changing & (state.crossed == 0.0) & (gap < torch.inf) & (gap > 0.0)
         return ChangeAction(
             changing,
             state.side * gain / speed.clamp(min=_LEAST_SPEED),
@@ -371,12 +372,7 @@ class LaneChanges:
 
 
 def patience_of(draws: Tensor) -> Tensor:
-    """Return exponentially distributed patiences from standard normal draws of any shape.
-
-    Example:
-        >>> patience_of(torch.tensor([-2.0, 0.0, 2.0]))
-        tensor([3.7832, 0.6931, 0.0230])
-    """
+    """Return exponentially distributed patiences from standard normal draws of any shape."""
     patience: Tensor = -torch.special.log_ndtr(draws)
     return patience
 
@@ -401,13 +397,3 @@ def _gap_after(lanes: AdjacentLanes, seconds: float) -> Tensor:
 def _of_side(values: Tensor, side: Tensor) -> Tensor:
     """Return the values (..., 2) of a side, -1 or 1, shape (...); of the right for 0."""
     return torch.where(side < 0.0, values[..., 0], values[..., 1])
-
-
-def _check_positive(settings: LaneChanges | Waiting, of: str, but: tuple[str, ...] = ()) -> None:
-    """Refuse a setting that is not a positive number."""
-    for each in fields(settings):
-        value = getattr(settings, each.name)  # a field by its name
-        if each.name in but:
-            continue
-        if isinstance(value, bool) or not isinstance(value, int | float) or not 0.0 < value < math.inf:
-            raise ValueError(f"Expected {each.name} of the {of} above 0, got {value!r}.")

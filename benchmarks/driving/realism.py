@@ -26,8 +26,8 @@ import typer
 from torch import Tensor
 
 from agents import LearnedDriver, load_driver, read_driver
+from agents.learned.driver import RuleDriver
 from agents.learned.networks import ACTION_SIZE
-from agents.learned.rule_driver import RuleDriver
 from benchmarks import RESULTS
 from benchmarks.samplers.runs import about
 from rare_envs.threads import use_one_thread

@@ -17,8 +17,7 @@ References:
 import torch
 from torch import Tensor
 
-from agents.learned.coloured_noise import AutoregressiveNoise
-from agents.learned.networks import Policy
+from agents.learned.networks import AutoregressiveNoise, Policy
 from training.imitation.clone import log_likelihood
 from training.imitation.learner import MAX_GRADIENT_NORM, Learner, Log, critic_inputs, policy_cost
 from training.imitation.rollout import Penalties, RolloutSteps, total_cost

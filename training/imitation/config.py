@@ -5,7 +5,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
-from agents.learned.coloured_noise import HUMAN_NOISE, WHITE_NOISE, AutoregressiveNoise
+from agents.learned.networks import HUMAN_NOISE, WHITE_NOISE, AutoregressiveNoise
 
 NOISES = {"human": HUMAN_NOISE, "white": WHITE_NOISE}
 

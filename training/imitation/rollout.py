@@ -15,8 +15,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from agents.learned.coloured_noise import AutoregressiveNoise
-from agents.learned.networks import Policy
+from agents.learned.networks import AutoregressiveNoise, Policy
 from rare_envs.sensors.lidar import AHEAD_BEAM, LANE_OFFSET_COLUMN, RANGE_COLUMNS, RATE_COLUMNS, SPEED_COLUMN
 from training.imitation.clone import denormalise_action
 from training.imitation.config import Config

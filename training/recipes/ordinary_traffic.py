@@ -29,8 +29,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from agents import load_driver, load_ego
-from agents.learned.coloured_noise import HUMAN_NOISE
-from agents.learned.rule_driver import RuleDriver
+from agents.learned.driver import RuleDriver
+from agents.learned.networks import HUMAN_NOISE
 from rare_envs.distributions.space import Parameter
 from rare_envs.egos.needs import resolve
 from rare_envs.egos.policy import as_driver

@@ -29,7 +29,7 @@ from torch import Tensor, nn
 import rare_envs
 import samplers
 from agents import Provenance
-from agents.learned.rule_driver import HEADING_TIME, OFFSET_TIME
+from agents.learned.driver import HEADING_TIME, OFFSET_TIME
 from agents.vision import (
     ACCELERATION_UNIT,
     LAG,

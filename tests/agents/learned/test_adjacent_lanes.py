@@ -3,7 +3,7 @@ import math
 import pytest
 import torch
 
-from agents.learned.adjacent_lanes import LEFT_MARKER_COLUMN, RIGHT_MARKER_COLUMN, look_aside
+from agents.learned.lane_changes import LEFT_MARKER_COLUMN, RIGHT_MARKER_COLUMN, look_aside
 from rare_envs.sensors.lidar import HEADING_COLUMN, LANE_OFFSET_COLUMN, Bodies, OnRoad, perceive
 from tests.agents.learned.test_collision_avoidance import seen
 

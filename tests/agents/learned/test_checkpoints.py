@@ -11,8 +11,8 @@ import torch
 from safetensors import safe_open
 
 from agents import LearnedDriver, Provenance, load_driver, read_driver, read_provenance, save_driver
-from agents.learned.coloured_noise import AutoregressiveNoise
-from agents.learned.rule_driver import RuleDriver
+from agents.learned.driver import RuleDriver
+from agents.learned.networks import AutoregressiveNoise
 from agents.names import SHIPPED_DRIVERS
 
 PROVENANCE = Provenance(

@@ -5,12 +5,10 @@ import pytest
 import torch
 
 from agents import load_driver, read_driver, read_provenance, save_driver
-from agents.learned.adjacent_lanes import LEFT_MARKER_COLUMN, RIGHT_MARKER_COLUMN
-from agents.learned.collision_avoidance import CloseRange, CollisionAvoidance
+from agents.learned.collision_avoidance import LEFT_MARKER_COLUMN, RIGHT_MARKER_COLUMN, CollisionAvoidance
 from rare_envs.sensors.lidar import FEATURES, HEADING_COLUMN, MAX_RANGE
 
 RULE = CollisionAvoidance()
-CLOSE = CollisionAvoidance(close=CloseRange())
 HALF_LENGTH, HALF_WIDTH = 2.5, 1.0
 
 
@@ -22,8 +20,8 @@ def seen(speed=20.0, **beams):
     return torch.tensor([[[values[name] for name in FEATURES]]], dtype=torch.float64)
 
 
-def limited(features, acceleration=1.0, yaw_rate=0.0, rule=RULE):
-    action = rule.limit(features, torch.tensor([[[acceleration, yaw_rate]]], dtype=torch.float64))
+def limited(features, acceleration=1.0, yaw_rate=0.0):
+    action = RULE.limit(features, torch.tensor([[[acceleration, yaw_rate]]], dtype=torch.float64))
     return tuple(action[0, 0].tolist())
 
 
@@ -95,70 +93,59 @@ def test_at_close_range_who_moves_towards_a_body_is_steered_back_but_not_past_th
     for sign, beam in ((1.0, "90"), (-1.0, "m90")):
         near = {f"range_{beam}": HALF_WIDTH + 0.1, f"rate_{beam}": -0.4}
         heading = sign * 0.4 / 20.0
-        assert limited(on_lane(seen(**near), heading), yaw_rate=sign * 0.2)[1] == 0.0
-        back = limited(on_lane(seen(**near), heading), yaw_rate=sign * 0.2, rule=CLOSE)[1]
-        assert back == pytest.approx(-math.sin(heading) / CLOSE.heading_time)  # as much as goes along the road
-        away = limited(on_lane(seen(**near), -heading), yaw_rate=sign * 0.2, rule=CLOSE)[1]
+        back = limited(on_lane(seen(**near), heading), yaw_rate=sign * 0.2)[1]
+        assert back == pytest.approx(-math.sin(heading) / RULE.heading_time)  # as much as goes along the road
+        away = limited(on_lane(seen(**near), -heading), yaw_rate=sign * 0.2)[1]
         assert away == 0.0  # the other comes nearer, and it goes away from it already
-        assert limited(on_lane(seen(**near), heading), yaw_rate=-sign * 0.3, rule=CLOSE)[1] == -sign * 0.3
+        assert limited(on_lane(seen(**near), heading), yaw_rate=-sign * 0.3)[1] == -sign * 0.3
 
 
 def test_at_close_range_a_corner_is_not_steered_into():
     """A beam of 36 degrees, whose range rate tells nothing of lateral motion."""
     across = HALF_WIDTH + RULE.clearance + 0.06
     near, heading = {"range_36": across / math.sin(math.radians(36.0))}, 0.03
-    free = limited(on_lane(seen(**near), heading), yaw_rate=0.1)[1]
-    bound = limited(on_lane(seen(**near), heading), yaw_rate=0.1, rule=CLOSE)[1]
-    assert free == pytest.approx(0.06 / 0.6 / (0.2 * 20.0))
+    bound = limited(on_lane(seen(**near), heading), yaw_rate=0.1)[1]
     assert bound == pytest.approx((0.06 / 0.6 - 20.0 * math.sin(heading)) / (0.2 * 20.0))
 
 
 def test_nearer_than_the_standstill_gap_who_comes_closer_brakes_as_if_the_other_did_too():
     near = on_lane(seen(speed=5.0, range_0=1.0 + HALF_LENGTH, rate_0=-0.6))
-    assert limited(near)[0] == -RULE.deceleration
-    assert limited(near, rule=CLOSE)[0] == pytest.approx(-RULE.deceleration - 0.6 / CloseRange().closing_time)
+    assert limited(near)[0] == pytest.approx(-RULE.deceleration - 0.6 / RULE.closing_time)
     for features in (
         on_lane(seen(speed=5.0, range_0=1.6 + HALF_LENGTH, rate_0=-0.6)),  # further off
         on_lane(seen(speed=5.0, range_0=1.0 + HALF_LENGTH, rate_0=0.2)),  # it draws away
     ):
-        assert limited(features, rule=CLOSE) == limited(features)
+        assert limited(features)[0] >= -RULE.deceleration
 
 
-def test_queues_that_brake_comfortably_are_followed_without_contact_at_close_range_only():
+def test_queues_that_brake_comfortably_are_followed_without_contact():
     """The one ahead brakes by 2 m/s^2 to a stop; the one behind is near and 0.6 m/s faster."""
-    gaps = {}
-    for name, rule in (("far", RULE), ("close", CLOSE)):
-        gap, speed, ahead = 0.5, 8.6, 8.0
-        gaps[name] = gap
-        for _ in range(60):
-            features = on_lane(seen(speed, range_0=gap + HALF_LENGTH, rate_0=ahead - speed))
-            acceleration, _ = limited(features, rule=rule)
-            gap += 0.1 * (ahead - speed)
-            speed, ahead = max(speed + 0.1 * acceleration, 0.0), max(ahead - 0.2, 0.0)
-            gaps[name] = min(gaps[name], gap)
-    assert gaps["far"] < 0.0 < gaps["close"]
+    gap, speed, ahead = 0.5, 8.6, 8.0
+    for _ in range(60):
+        acceleration, _ = limited(on_lane(seen(speed, range_0=gap + HALF_LENGTH, rate_0=ahead - speed)))
+        gap += 0.1 * (ahead - speed)
+        speed, ahead = max(speed + 0.1 * acceleration, 0.0), max(ahead - 0.2, 0.0)
+        assert gap > 0.0
 
 
 def test_a_point_well_within_the_own_lane_is_in_the_path_at_close_range():
     """Of one who stands on the left line a beam of 18 degrees meets the far end of the rear, 1.7 m across."""
     standing = {"range_m18": 1.7 / math.sin(math.radians(18.0)), "rate_m18": -6.0 * math.cos(math.radians(18.0))}
     shifted = on_lane(seen(speed=6.0, **standing), left=2.2, right=1.4)
-    assert limited(shifted)[0] == 1.0
     gap = 1.7 / math.tan(math.radians(18.0)) - HALF_LENGTH
-    assert limited(shifted, rule=CLOSE)[0] == pytest.approx(max(-36.0 / (2.0 * (gap - RULE.least_gap)), -RULE.hardest))
-    assert limited(on_lane(seen(speed=6.0, **standing), left=2.0, right=1.6), rule=CLOSE)[0] == 1.0, "near the line"
+    assert limited(shifted)[0] == pytest.approx(max(-36.0 / (2.0 * (gap - RULE.least_gap)), -RULE.hardest))
+    assert limited(on_lane(seen(speed=6.0, **standing), left=2.0, right=1.6))[0] == 1.0, "near the line"
     mirrored = {name.replace("m", ""): value for name, value in standing.items()}
-    assert limited(on_lane(seen(speed=6.0, **mirrored), left=2.2, right=1.4), rule=CLOSE)[0] == 1.0, "the other side"
+    assert limited(on_lane(seen(speed=6.0, **mirrored), left=2.2, right=1.4))[0] == 1.0, "the other side"
 
 
 def test_free_traffic_is_left_alone_at_close_range_too():
-    assert limited(on_lane(seen()), 1.5, 0.02, CLOSE) == (1.5, 0.02)
+    assert limited(on_lane(seen()), 1.5, 0.02) == (1.5, 0.02)
     beside = on_lane(seen(range_90=3.6, range_m90=3.6), 0.01)
-    assert limited(beside, 1.5, -0.02, CLOSE) == (1.5, -0.02)
+    assert limited(beside, 1.5, -0.02) == (1.5, -0.02)
 
 
-@pytest.mark.parametrize("rule", [RULE, CLOSE])
-def test_gradients_are_those_of_finite_differences(rule):
+def test_gradients_are_those_of_finite_differences():
     features = torch.cat(
         [
             seen(range_0=30.0, rate_0=-15.0),
@@ -169,12 +156,11 @@ def test_gradients_are_those_of_finite_differences(rule):
     ).requires_grad_()
     wanted = [[[1.0, 0.6]], [[0.5, 0.5]], [[0.3, -0.01]], [[0.5, 0.2]]]
     action = torch.tensor(wanted, dtype=torch.float64, requires_grad=True)
-    assert torch.autograd.gradcheck(rule.limit, (features, action))
+    assert torch.autograd.gradcheck(RULE.limit, (features, action))
 
 
-@pytest.mark.parametrize("close", [None, CloseRange(closing_time=0.7)])
-def test_the_rule_is_read_from_the_file(close, tmp_path):
-    rule = CollisionAvoidance(reaction_time=0.9, close=close)
+def test_the_rule_is_read_from_the_file(tmp_path):
+    rule = CollisionAvoidance(reaction_time=0.9, closing_time=0.7)
     origin = read_provenance("agents/data/mgail.safetensors")
     path = save_driver(replace(load_driver("mgail"), avoidance=rule), origin, tmp_path / "mine.safetensors")
     assert read_driver(path).avoidance == rule
@@ -184,15 +170,6 @@ def test_the_rule_is_read_from_the_file(close, tmp_path):
 def test_settings_are_positive_numbers(value):
     with pytest.raises(ValueError, match="Expected deceleration of the collision avoidance above 0"):
         CollisionAvoidance(deceleration=value)
-    with pytest.raises(ValueError, match="Expected line_margin of the collision avoidance above 0"):
-        CloseRange(line_margin=value)
-
-
-def test_what_is_added_at_close_range_has_its_own_settings():
-    with pytest.raises(
-        ValueError, match=r"Expected close of the collision avoidance as a CloseRange or None, got 0\.3"
-    ):
-        CollisionAvoidance(close=0.3)
 
 
 @pytest.mark.parametrize("side", [0, 1])

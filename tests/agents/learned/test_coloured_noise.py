@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from agents.learned.coloured_noise import AutoregressiveNoise
+from agents.learned.networks import AutoregressiveNoise
 
 OSCILLATING = AutoregressiveNoise.from_oscillators(frequency=(1.70, 1.57), damping=(0.845, 0.40))
 

@@ -5,9 +5,8 @@ import pytest
 import torch
 
 from agents import LearnedDriver
-from agents.learned.coloured_noise import AutoregressiveNoise
 from agents.learned.driver import replace_head
-from agents.learned.networks import HEAD_SIZE, head_weights
+from agents.learned.networks import HEAD_SIZE, AutoregressiveNoise, head_weights
 from agents.learned.weight_distribution import WeightDistribution
 
 

@@ -6,9 +6,15 @@ import pytest
 import torch
 
 from agents import load_driver, read_driver, read_provenance, save_driver
-from agents.learned.adjacent_lanes import LEFT_MARKER_COLUMN, RIGHT_MARKER_COLUMN
 from agents.learned.driver import EASED_BEYOND
-from agents.learned.lane_changes import STATE_SIZE, ChangeState, LaneChanges, Waiting, patience_of
+from agents.learned.lane_changes import (
+    LEFT_MARKER_COLUMN,
+    RIGHT_MARKER_COLUMN,
+    STATE_SIZE,
+    ChangeState,
+    LaneChanges,
+    patience_of,
+)
 from rare_envs.sensors.lidar import HEADING_COLUMN, LANE_OFFSET_COLUMN, MAX_RANGE
 from tests.agents.learned.test_collision_avoidance import seen
 
@@ -16,7 +22,6 @@ WIDTH = 3.6
 HAZARD = 0.5
 """[1/s], to either side."""
 CHANGES = LaneChanges(coefficients=(math.log(HAZARD), 0.0, 0.0, 0.0, 0.0))
-WAITING = replace(CHANGES, waiting=Waiting())
 BESIDE = {"range_90": 2.6}
 """A car beside on the right, whose lane is not free for that."""
 OTHERS = {"range_36": 11.0, "range_m36": 11.0}
@@ -106,16 +111,6 @@ def test_a_lane_is_remembered_for_a_while():
     assert waited[-1] == pytest.approx(99.0 - HAZARD * CHANGES.remembered, abs=2 * HAZARD * 0.1)
 
 
-def test_a_change_is_given_up_before_the_line_and_not_behind_it():
-    for tick, goes_on in ((8, False), (25, True)):
-        *_, (_, y, heading, state) = list(drive(begin(right=0.0), 0.1 * tick))
-        assert bool(state.crossed) == goes_on
-        lane = round(y / WIDTH)
-        blocked = on_lane(y - lane * WIDTH, heading, range_90=2.6, **OTHERS)
-        _, state = CHANGES.step(blocked, state, None)
-        assert bool(state.side == 1) == goes_on
-
-
 def test_whoever_is_ahead_in_the_new_lane_is_kept_off_until_the_line():
     ahead = {"range_18": 13.0, "rate_18": -1.0} | {"range_m36": 11.0}
     action, state = CHANGES.step(on_lane(**ahead), begin(right=0.0), None)
@@ -137,14 +132,14 @@ def test_a_change_under_way_at_the_first_moment_is_taken_up():
 
 def test_nobody_is_taken_to_change_over_the_edge_of_the_road():
     leftmost = {"range_36": 11.0}
-    _, state = CHANGES.step(on_lane(-0.8, -0.8 / 20.0, **leftmost), begin(), None)
+    _, state = CHANGES.step(on_lane(-0.8, -0.5 / 20.0, **leftmost), begin(), None)
     assert int(state.side) == 0
-    _, state = CHANGES.step(on_lane(-0.8, -0.8 / 20.0, **OTHERS), begin(), None)
+    _, state = CHANGES.step(on_lane(-0.8, -0.5 / 20.0, **OTHERS), begin(), None)
     assert int(state.side) == -1
 
 
 def test_who_is_over_the_line_far_enough_has_a_lane_there_that_nobody_shows():
-    moving = on_lane(1.1, 1.0 / 20.0)  # over the line by 0.3 m
+    moving = on_lane(1.1, 0.36 / 20.0)  # over the line by 0.3 m
     for over_line, side in ((0.4, 0), (0.2, 1)):
         _, state = replace(CHANGES, over_line=over_line).step(moving, begin(), None)
         assert int(state.side) == side
@@ -156,51 +151,47 @@ def test_who_looks_further_ahead_takes_slower_motion_for_a_change():
         assert int(replace(CHANGES, foresight=foresight).step(moving, begin(), None)[1].side) == side
 
 
-def test_with_waiting_whoever_is_nearly_over_the_line_is_changing_into_any_lane():
+def test_whoever_is_nearly_over_the_line_is_changing_into_any_lane():
     """The middle reaches the line in 1.25 and 2.0 s."""
     for offset, across, waits in ((0.8, 0.8, True), (0.8, 0.5, False)):
         for beams in (OTHERS | BESIDE, {}):  # a lane that is not free, and one that nobody shows
             moving = on_lane(offset, math.asin(across / 20.0), **beams)
-            assert int(CHANGES.step(moving, begin(), None)[1].side) == 0
-            assert bool(WAITING.step(moving, begin(), None)[1].side == 1) == waits
+            assert bool(CHANGES.step(moving, begin(), None)[1].side == 1) == waits
     free = on_lane(0.8, math.asin(0.5 / 20.0), **OTHERS)
-    assert int(WAITING.step(free, begin(), None)[1].side) == 1  # within 2.1 s, as without waiting
+    assert int(CHANGES.step(free, begin(), None)[1].side) == 1  # within 2.1 s, as without waiting
 
 
-def test_with_waiting_a_change_goes_on_beside_a_body_until_its_time_is_over():
-    *_, (_, y, heading, state) = list(drive(begin(right=0.0), 0.8, changes=WAITING))
+def test_a_change_goes_on_beside_a_body_until_its_time_is_over():
+    *_, (_, y, heading, state) = list(drive(begin(right=0.0), 0.8, changes=CHANGES))
     assert not bool(state.crossed)
     blocked = on_lane(y, heading, **OTHERS, **BESIDE)
-    assert int(CHANGES.step(blocked, state, None)[1].side) == 0
-    action, after = WAITING.step(blocked, state, None)
+    action, after = CHANGES.step(blocked, state, None)
     assert int(after.side) == 1 and bool(action.changing)
     assert not bool(action.follows)  # nobody brakes for whoever is beside
-    path = list(drive(state, 9.0, changes=WAITING, y=y, beams=OTHERS | BESIDE))
+    path = list(drive(state, 9.0, changes=CHANGES, y=y, beams=OTHERS | BESIDE))
     ahead = OTHERS | {"range_18": 13.0, "rate_18": -1.0}
-    assert bool(WAITING.step(on_lane(y, heading, **ahead), state, None)[0].follows)
+    assert bool(CHANGES.step(on_lane(y, heading, **ahead), state, None)[0].follows)
     assert int(path[-1][3].side) == 0
 
 
-def test_with_waiting_a_change_over_the_edge_of_the_road_is_given_up_behind_it():
+def test_a_change_over_the_edge_of_the_road_is_given_up_behind_it():
     outward = on_lane(1.75, 0.03)
-    _, state = WAITING.step(outward, begin(), None)
+    _, state = CHANGES.step(outward, begin(), None)
     assert int(state.side) == 1
     beyond = on_lane(1.85, 0.03)  # 5 cm over the line, and still in its old lane: there is no other
-    action, state = WAITING.step(beyond, state, None)
+    action, state = CHANGES.step(beyond, state, None)
     assert int(state.side) == 0
-    assert action.room[..., 1].item() == pytest.approx(-0.05 - Waiting.margin)
+    assert action.room[..., 1].item() == pytest.approx(-0.05 - LaneChanges.margin)
 
 
-def test_with_waiting_there_is_room_to_the_line_where_no_lane_is_known():
+def test_there_is_room_to_the_line_where_no_lane_is_known():
     one_side = {"range_36": 11.0}  # a lane to the right
-    action, state = WAITING.step(on_lane(0.5, **one_side), begin(), None)
-    assert action.room.flatten().tolist() == pytest.approx([0.5 * WIDTH + 0.5 - Waiting.margin, MAX_RANGE])
-    action, _ = WAITING.step(on_lane(0.5), state, None)  # it is remembered
+    action, state = CHANGES.step(on_lane(0.5, **one_side), begin(), None)
+    assert action.room.flatten().tolist() == pytest.approx([0.5 * WIDTH + 0.5 - LaneChanges.margin, MAX_RANGE])
+    action, _ = CHANGES.step(on_lane(0.5), state, None)  # it is remembered
     assert action.room[..., 1].item() == MAX_RANGE
-    action, _ = WAITING.step(on_lane(0.5), begin(left=0.0)._replace(side=-torch.ones(1, 1)), None)
+    action, _ = CHANGES.step(on_lane(0.5), begin(left=0.0)._replace(side=-torch.ones(1, 1)), None)
     assert action.room.flatten().tolist() == [MAX_RANGE, MAX_RANGE]  # in a change
-    action, _ = CHANGES.step(on_lane(0.5), begin(), None)
-    assert action.room.flatten().tolist() == [MAX_RANGE, MAX_RANGE]
 
 
 def test_behind_a_line_the_lane_that_was_left_is_known_and_the_other_side_is_not():
@@ -209,9 +200,8 @@ def test_behind_a_line_the_lane_that_was_left_is_known_and_the_other_side_is_not
     assert state.unseen.flatten().tolist() == [0.0, math.inf]
 
 
-@pytest.mark.parametrize("changes", [CHANGES, WAITING])
-def test_gradients_are_those_of_finite_differences(changes):
-    driver = replace(load_driver("mgail"), changes=changes, policy=load_driver("mgail").policy.double())
+def test_gradients_are_those_of_finite_differences():
+    driver = replace(load_driver("mgail"), changes=CHANGES, policy=load_driver("mgail").policy.double())
     state = begin(right=0.0)
     for tick in range(12):
         y = 0.02 * tick
@@ -239,13 +229,6 @@ def test_states_are_packed_and_unpacked():
 def test_settings_are_positive_numbers(value):
     with pytest.raises(ValueError, match="Expected duration of the lane changes above 0"):
         LaneChanges(duration=value)
-
-
-def test_settings_of_waiting_are_positive_numbers_too():
-    with pytest.raises(ValueError, match="Expected margin of the waiting above 0, got 0"):
-        Waiting(margin=0.0)
-    with pytest.raises(ValueError, match="Expected waiting of the lane changes as Waiting or None, got 2"):
-        LaneChanges(waiting=2)
 
 
 @pytest.mark.parametrize("coefficients", [(1.0, 2.0), (0.0, 0.0, 0.0, 0.0, math.nan)])
@@ -284,17 +267,12 @@ def test_a_ripe_driver_steers_into_the_next_lane_and_keeps_off_whoever_is_ahead_
     assert float(action[..., 0]) > -1.0
 
 
-def test_a_driver_that_waits_steers_back_from_the_edge_of_the_road():
-    shipped, none = load_driver("mgail"), torch.zeros(1, 1, 2)
-    driver = replace(shipped, changes=replace(shipped.changes, waiting=None))
-    begins = driver.begin(torch.zeros(1, 1, 2, 2))
-    waits = replace(driver, changes=replace(driver.changes, waiting=Waiting()))
+def test_a_driver_steers_back_from_the_edge_of_the_road():
+    driver, none = load_driver("mgail"), torch.zeros(1, 1, 2)
     outside = on_lane(1.8 + 0.3, 0.0).float()  # 0.3 m over the line at 20 m/s
-    back = -(0.3 + Waiting.margin) / 0.6 / (0.2 * 20.0)
-    assert float(driver.act(outside, None, none, begins)[0][..., 1]) > back + 0.01
-    assert float(waits.act(outside, None, none, begins)[0][..., 1]) == pytest.approx(back)
-    inside = on_lane(0.2, 0.0).float()
-    assert torch.equal(waits.act(inside, None, none, begins)[0], driver.act(inside, None, none, begins)[0])
+    back = -(0.3 + LaneChanges.margin) / 0.6 / (0.2 * 20.0)
+    action, _ = driver.act(outside, None, none, driver.begin(torch.zeros(1, 1, 2, 2)))
+    assert float(action[..., 1]) == pytest.approx(back)
 
 
 def test_hard_braking_is_eased_but_for_the_rule():
@@ -315,12 +293,11 @@ def test_lane_changes_need_the_rule():
         replace(driver, avoidance=None)
 
 
-@pytest.mark.parametrize("changes", [CHANGES, WAITING])
-def test_lane_changes_are_read_from_the_file(tmp_path, changes):
-    driver = replace(load_driver("mgail"), changes=changes, hard_braking=0.9)
+def test_lane_changes_are_read_from_the_file(tmp_path):
+    driver = replace(load_driver("mgail"), changes=CHANGES, hard_braking=0.9)
     path = save_driver(driver, read_provenance("agents/data/mgail.safetensors"), tmp_path / "mine.safetensors")
     read = read_driver(path)
-    assert (read.changes, read.hard_braking, read.colour) == (changes, 0.9, driver.colour)
+    assert (read.changes, read.hard_braking, read.colour) == (CHANGES, 0.9, driver.colour)
     assert read.colour.balanced
 
 

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from agents.learned.rule_driver import RuleDriver
+from agents.learned.driver import RuleDriver
 from rare_envs.control.idm import IDM
 from rare_envs.sensors.lidar import AHEAD_BEAM, RANGE_COLUMNS, RATE_COLUMNS
 from rare_envs.traffic.neighbours import Lead

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from agents import LearnedDriver, Provenance, WeightDistribution, save_driver
-from agents.learned.coloured_noise import HUMAN_NOISE
-from agents.learned.networks import head_weights
+from agents.learned.networks import HUMAN_NOISE, head_weights
 from benchmarks.driving import realism
 from benchmarks.driving.realism import format_table, load_named, measure_all, round_numbers
 from tests.training.imitation.synthetic_scenes import scenes

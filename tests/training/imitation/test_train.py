@@ -12,8 +12,7 @@ import typer
 from typer.testing import CliRunner
 
 from agents import load_driver, read_provenance
-from agents.learned.coloured_noise import WHITE_NOISE
-from agents.learned.networks import head_weights
+from agents.learned.networks import WHITE_NOISE, head_weights
 from tests.training.data.published_files import i24_documents, tgsim_rows, write_i24, write_tgsim
 from tests.training.data.recordings import simulate, write_highd, write_ngsim
 from tests.training.imitation.synthetic_scenes import TINY, scene, scenes, tiny

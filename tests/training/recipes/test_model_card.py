@@ -4,8 +4,7 @@ import pytest
 import torch
 
 from agents import LearnedDriver, Provenance, save_driver
-from agents.learned.coloured_noise import AutoregressiveNoise
-from agents.learned.networks import Policy, Scaling
+from agents.learned.networks import AutoregressiveNoise, Policy, Scaling
 from training.recipes.model_card import format_model_card, main
 
 
