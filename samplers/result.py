@@ -207,7 +207,7 @@ class Estimate(EstimateData):
             >>> shares = result.shares(lambda x: np.where(x[:, 0] > 0, "right", "left").tolist())
             >>> for side in ("left", "right"):
             ...     print(f"{side} {shares[side].p:.5f}, {shares[side].of_failures:.0%} of p")
-            left 0.00133, 50% of p
+            left 0.00135, 50% of p
             right 0.00134, 50% of p
         """
         return split_by_kind(self, label, most)
