@@ -46,9 +46,6 @@ def check_code_trust(question: Mapping[str, Any], code: Sequence[str], folder: P
         code: Names `module:name` in it.
         folder: Where it was recorded, for the message.
         trust: Trust it from now on, for as long as question and code stay what they are.
-
-    Raises:
-        ValueError: It is not trusted.
     """
     if not code:
         return

@@ -29,9 +29,6 @@ def replace_file(path: str | Path) -> Iterator[Path]:
 
     Args:
         path: The file; its folder exists.
-
-    Raises:
-        OSError: The draft cannot be written.
     """
     path = Path(os.path.realpath(path))
     draft = path.with_name(f".{path.stem}.{os.getpid()}.part{path.suffix}")
@@ -47,11 +44,7 @@ def replace_file(path: str | Path) -> Iterator[Path]:
 
 
 def replace_text(path: str | Path, text: str) -> None:
-    """Write text in UTF-8 in place of what a file holds; see `replace_file`.
-
-    Raises:
-        OSError: It cannot be written; the file holds what it held.
-    """
+    """Write text in UTF-8 in place of what a file holds; see `replace_file`."""
     with replace_file(path) as draft:
         draft.write_text(text, encoding="utf-8")
 
@@ -62,10 +55,6 @@ def check_ordinary(path: str | Path, most: int | None = None) -> None:
     Args:
         path: The file.
         most: Bytes that it may have; None for any number.
-
-    Raises:
-        ValueError: It is none, or has more bytes.
-        OSError: There is none, or nobody may look at it.
     """
     found = os.stat(path)
     if not stat.S_ISREG(found.st_mode):
@@ -75,12 +64,7 @@ def check_ordinary(path: str | Path, most: int | None = None) -> None:
 
 
 def read_text_file(path: str | Path) -> str:
-    """Return the text of an ordinary file in UTF-8 of at most `MAX_TEXT_BYTES`.
-
-    Raises:
-        ValueError: It is no such file, or no such text.
-        OSError: It cannot be read.
-    """
+    """Return the text of an ordinary file in UTF-8 of at most `MAX_TEXT_BYTES`."""
     check_ordinary(path, MAX_TEXT_BYTES)
     return Path(path).read_text(encoding="utf-8")
 
@@ -106,9 +90,6 @@ def parse_json_object(text: str, source: str) -> dict[str, Any]:
     Args:
         text: The text.
         source: What it was read from, for the message of an error.
-
-    Raises:
-        ValueError: If it is not valid JSON, or no object.
     """
     try:
         data = json.loads(text, parse_int=_parse_int)

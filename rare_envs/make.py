@@ -86,10 +86,6 @@ def set_up(
 
     Returns:
         The world and the space of its parameters.
-
-    Raises:
-        TypeError: If there is no such argument; the message suggests the nearest and lists all.
-        ValueError: If an argument is not one of those; the message says what is.
     """
     scenario = find_scenario(scenario) if isinstance(scenario, str) else scenario
     refuse_unknown(scenario, unknown)
@@ -119,9 +115,6 @@ def refuse_unknown(scenario: Scenario, arguments: Mapping[str, Any], more: Seque
         scenario: Of the environment.
         arguments: By name.
         more: Further arguments that whoever asks takes.
-
-    Raises:
-        TypeError: There is such an argument.
     """
     own = [word for word in inspect.signature(set_up).parameters if word not in ("scenario", "needs", "unknown")]
     known = [*more, *own]

@@ -217,9 +217,6 @@ def total_of(reward: Any) -> Tensor:
 
     Args:
         reward: What a reward function returned.
-
-    Raises:
-        ValueError: If it is neither a tensor of shape (B,) nor terms with such a `total`.
     """
     total = reward.total if isinstance(reward, SummedTerms) else reward
     if not isinstance(total, Tensor) or total.ndim != 1:

@@ -46,9 +46,6 @@ def import_module(name: str, purpose: str) -> ModuleType:
     Args:
         name: Dotted name of the module.
         purpose: What needs it, for the message: "the ego 'mine:make'", for example.
-
-    Raises:
-        ValueError: If importing it fails in whatever way, which the message says in one line.
     """
     try:
         with working_directory_first():
@@ -63,9 +60,6 @@ def import_object(spec: str, purpose: str) -> Any:
     Args:
         spec: "module:name"; the module may be dotted.
         purpose: What needs it, as in `import_module`.
-
-    Raises:
-        ValueError: If spec has another form, the module cannot be imported or has nothing of that name.
     """
     module_name, _, name = spec.partition(":")
     if not module_name or not name:

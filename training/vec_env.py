@@ -93,7 +93,7 @@ def sb3_agents_env(
         >>> env.num_envs, len(env.reset())
         (2, 2)
     """
-    from rare_envs.envs.multi_agent_vector import AgentsVectorEnv
+    from rare_envs.envs.parallel import AgentsVectorEnv
 
     env = BatchedVecEnv(AgentsVectorEnv(id, num_scenarios, agents=agents, ego=ego, rewards=rewards, **make_kwargs))
     if seed is not None:

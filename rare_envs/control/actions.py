@@ -72,9 +72,6 @@ def to_meta(action: Tensor, batch: int, ignored: Tensor | None = None) -> Tensor
 
     Returns:
         The indices, int64, shape (B,).
-
-    Raises:
-        ValueError: If shape or values are not those of meta-actions.
     """
     if action.shape != (batch,) or action.is_floating_point() or action.dtype == torch.bool:
         raise ValueError(
@@ -100,9 +97,6 @@ def to_physical(action: Tensor, batch: int, ignored: Tensor | None = None) -> Te
     Returns:
         Acceleration [m/s^2] and steering angle [rad], shape (B, 2). Of actions on a GPU that are not finite they are
         NaN: to raise an error there is to wait for it.
-
-    Raises:
-        ValueError: If shape or values are not those of an action.
     """
     if ignored is not None and action.shape[:1] == (batch,):
         action = torch.where(ignored.reshape(-1, *[1] * (action.ndim - 1)), torch.zeros_like(action), action)

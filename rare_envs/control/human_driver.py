@@ -174,9 +174,6 @@ class HumanDriverModel:
     """Parameters of an attentive human driver; each is published, none is fitted.
 
     Values of the book and of Regulation 157 are as quoted or implemented in public; neither text was consulted.
-
-    Raises:
-        ValueError: If a number is negative.
     """
 
     idm: IDM = field(default_factory=_attentive_idm)

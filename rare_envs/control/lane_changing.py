@@ -49,9 +49,6 @@ class Mobil:
     at what the changing vehicle itself would have to brake. Vehicles count in a lane up to 1 m beyond its edge, so that
     one counts in two lanes. Of two lanes that are worth it HighwayEnv takes the right one, we the better one.
     Accelerations are not limited to what the brakes can do, in both and in the paper.
-
-    Raises:
-        ValueError: If the safe deceleration is not positive, or the threshold or the delay is negative.
     """
 
     politeness: float = 0.25
@@ -163,9 +160,6 @@ class LaneChangingDriver:
     room as for one that signals.
 
     Nothing is random, and nothing of it is part of x: there are no weights and no noise. Decisions jump, so f does too.
-
-    Raises:
-        ValueError: If the lateral speed is not positive.
     """
 
     idm: IDM = field(default_factory=IDM)

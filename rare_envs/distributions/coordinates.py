@@ -249,11 +249,7 @@ class Coordinates:
 
 
 def as_finite(name: str, values: ArrayLike) -> FloatArray:
-    """Return a copy as finite float64.
-
-    Raises:
-        ValueError: Not an array of numbers, or not finite.
-    """
+    """Return a copy as finite float64."""
     try:
         array = np.array(values, dtype=np.float64)
     except (TypeError, ValueError) as error:

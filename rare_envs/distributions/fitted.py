@@ -22,11 +22,7 @@ RecordT = TypeVar("RecordT")
 
 
 def read_distribution(data: Mapping[str, Any]) -> FileDistribution:
-    """Return the distribution of the kind that the keys of a file tell: Beta, a mixture in coordinates, or plain.
-
-    Raises:
-        ValueError: A key is missing or its value is not valid.
-    """
+    """Return the distribution of the kind that the keys of a file tell: Beta, a mixture in coordinates, or plain."""
     if "alpha" in data:
         return BetaDistribution.from_dict(data)
     if "coordinates" in data or data.get("order"):
@@ -41,9 +37,6 @@ def read_record(kind: type[RecordT], what: str, data: object) -> RecordT:
         kind: The dataclass, whose constructor checks the values.
         what: Key of the object, for messages.
         data: The object.
-
-    Raises:
-        ValueError: Not an object, or a name is unknown or missing, or a value is not valid.
     """
     names = [each.name for each in fields(kind)]  # type: ignore[arg-type]  # a dataclass
     if not isinstance(data, Mapping):

@@ -142,11 +142,7 @@ def _list_component(
 
 
 def set_mixture_parameters(mixture: MixtureArrays, values: ArrayLike) -> MixtureArrays:
-    """Return the arrays of a mixture with other values of its parameters; weights are scaled so that they add up to 1.
-
-    Raises:
-        ValueError: If there is not one value for each parameter.
-    """
+    """Return the arrays of a mixture with other values of its parameters; weights are scaled to sum to 1."""
     given = np.asarray(values, dtype=np.float64)
     k, d = mixture.means.shape
     own = d + d + d * (d - 1) // 2

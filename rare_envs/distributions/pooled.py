@@ -45,11 +45,7 @@ class Refits(tuple[Distribution, ...]):
     __slots__ = ()
 
     def log_probs(self, x: FloatArray) -> FloatArray:
-        """Return the log density of each, (n, d) -> (R, n); where points are in equal coordinates is found once.
-
-        Raises:
-            ValueError: Wrong shape, of x or of the densities of a refit of the user's.
-        """
+        """Return the log density of each, (n, d) -> (R, n); where points are in equal coordinates is found once."""
         known: dict[tuple[object, ...], BoxPoints] = {}
         out = np.empty((len(self), len(x)))
         for row, each in zip(out, self, strict=True):
@@ -77,9 +73,6 @@ def pool_mixtures(mixtures: Sequence[CoordinateMixture]) -> CoordinateMixture | 
 
     Args:
         mixtures: In the same box; coordinates and numbers of components may differ.
-
-    Raises:
-        ValueError: The boxes differ, or no order of the columns serves all coordinates.
     """
     for i, each in enumerate(mixtures):
         if not (np.array_equal(each.low, mixtures[0].low) and np.array_equal(each.high, mixtures[0].high)):
@@ -185,9 +178,6 @@ class PooledMixture:
     Args:
         parts: Mixtures in the same box, with the columns in the same order.
         weights: Shares of the parts, shape (G,), sum 1.
-
-    Raises:
-        ValueError: The columns differ in order, or there is not one weight for each part.
     """
 
     parts: tuple[CoordinateMixture, ...]
@@ -225,20 +215,12 @@ class PooledMixture:
         return self.from_standard_normal(rng.standard_normal((n, self.dim)))
 
     def to_standard_normal(self, x: ArrayLike) -> FloatArray:
-        """Map points in the box to standard normal space, (n, d) -> (n, d).
-
-        Raises:
-            ValueError: Wrong shape, or a point outside the box.
-        """
+        """Map points in the box to standard normal space, (n, d) -> (n, d)."""
         points = self.parts[0].coordinates.interior(self.parts[0].rows_in_box(x))
         return apply_by_chunks(self._to_normal, points, self.dim)
 
     def from_standard_normal(self, u: ArrayLike) -> FloatArray:
-        """Map standard normal points to points strictly inside the box, (n, d) -> (n, d).
-
-        Raises:
-            ValueError: Wrong shape, or u is not finite.
-        """
+        """Map standard normal points to points strictly inside the box, (n, d) -> (n, d)."""
         return apply_by_chunks(self._from_normal, self.parts[0].finite_rows(u), self.dim)
 
     @property

@@ -41,9 +41,6 @@ def read_dense_policy(policy: Any) -> DensePolicy:
     Args:
         policy: A `PPO`, `A2C` or `DQN` of Stable-Baselines3 or one of their policies, with dense layers between which
             are hyperbolic tangents or rectifiers, behind `VecNormalize` or not; or a `RenamedPolicy`.
-
-    Raises:
-        NotCompiled: It is none of these; the message says what it is.
     """
     if type(policy) is RescaledPolicy:
         return replace(read_dense_policy(policy.policy), rescale=(policy.low, policy.high))

@@ -49,9 +49,6 @@ def check_predict(ego: Any) -> None:
 
     Args:
         ego: An object with `predict`.
-
-    Raises:
-        ValueError: If it takes fewer, as a `predict(observation)` does.
     """
     try:
         signature = inspect.signature(ego.predict)
@@ -73,9 +70,6 @@ def refuse_ego(ego: object, origin: str = "", known: Sequence[str] = ("idm",)) -
         ego: A name, a class, or an object that is no ego.
         origin: Where it came from, if not from the caller, such as "from make_ego()".
         known: Names of egos that would have been taken.
-
-    Raises:
-        ValueError: Always; it says what was expected.
     """
     origin, names = f" {origin}" if origin else "", ", ".join(map(repr, known))
     if isinstance(ego, str):

@@ -48,11 +48,7 @@ class HumanEgo:
         return self.in_world(world).noise_columns
 
     def in_world(self, world: World) -> HumanDriver:
-        """Return the driver that it is in a world.
-
-        Raises:
-            ValueError: The world takes meta-actions.
-        """
+        """Return the driver that it is in a world."""
         if world.clock.action != "continuous":
             raise ValueError(f'Expected action="continuous" for the ego "human", got {world.clock.action!r}.')
         driver = HumanDriver(self.model, world)

@@ -164,9 +164,6 @@ def choose_observation(needs: EgoNeeds, vehicles: int) -> str:
     Args:
         needs: Of the ego.
         vehicles: Of the scenario.
-
-    Raises:
-        ValueError: Several fit its space, or none does.
     """
     if len(needs.observations) == 1:
         return needs.observations[0]
@@ -191,9 +188,6 @@ def choose_action(action_space: Any, observation: str) -> str:
     Args:
         action_space: The space that a policy declares; None if it does not.
         observation: Its kinds of observation.
-
-    Raises:
-        ValueError: Both fit.
     """
     if takes_indices(action_space) and "kinematics" in observation.split("+"):
         raise ValueError(
@@ -278,11 +272,7 @@ class WorldEgo(Protocol):
         """Return how many standard normal columns of x are its noise in a world."""
 
     def in_world(self, world: World) -> Driver:
-        """Return the driver that it is in a world.
-
-        Raises:
-            ValueError: The ego does not fit the world.
-        """
+        """Return the driver that it is in a world."""
 
 
 @runtime_checkable
@@ -367,12 +357,7 @@ LOADER = "agents.loading"
 
 
 def load_named_ego(ego: Any) -> Any:
-    """Return the ego that a name or file stands for, see `agents.load_ego`, and any other ego as it is.
-
-    Raises:
-        FileNotFoundError: The file does not exist.
-        ValueError: It is none of these, or cannot be loaded.
-    """
+    """Return the ego that a name or file stands for, see `agents.load_ego`, and any other ego as it is."""
     if not isinstance(ego, str | Path) or ego in RULE_BASED_EGOS:
         return ego
     return importlib.import_module(LOADER).load_ego(ego)

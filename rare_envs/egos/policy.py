@@ -46,9 +46,6 @@ class PolicyDriver:
 
         No episode shows a policy what comes after its collision, so those rows are shown what another row sees, and
         their actions are ignored. The same holds for rows on which it failed before.
-
-        Raises:
-            ValueError: If the policy's actions are not finite or have the wrong shape, and `failed_rows` is None.
         """
         state, device = episode.state, episode.state.x.device
         batch = len(state.x)
@@ -168,9 +165,6 @@ def check_spaces(ego: Any, expected: spaces.Space[Any], action: str = "continuou
         expected: The environment's observations.
         action: Kind of the environment's actions.
         declared: Kind of observation that the ego's space tells, for the message.
-
-    Raises:
-        ValueError: If its `observation_space` or `action_space` does not fit.
     """
     observed = getattr(ego, "observation_space", None)  # a Stable-Baselines3 model, or anybody's object
     if observed is not None and find_frame_stacking(expected, observed) is None:

@@ -100,9 +100,6 @@ def find_action_bounds(space: Any) -> tuple[NDArray[Any], NDArray[Any]] | None:
     """Return the bounds of a policy's actions where they are not those of the environment; None where nothing differs.
 
     Actions without bounds are clipped, as `Env.step` does.
-
-    Raises:
-        ValueError: A lower bound is not below the upper one.
     """
     if not isinstance(space, spaces.Box) or space.shape != (2,) or not np.isfinite([space.low, space.high]).all():
         return None

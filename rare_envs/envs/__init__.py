@@ -5,8 +5,7 @@ from typing import TYPE_CHECKING
 from rare_envs.plugins import make_lazy_getattr
 
 if TYPE_CHECKING:
-    from rare_envs.envs.multi_agent_vector import AgentsVectorEnv
-    from rare_envs.envs.parallel import DrivingParallelEnv
+    from rare_envs.envs.parallel import AgentsVectorEnv, DrivingParallelEnv
     from rare_envs.envs.rendering import Renderer
     from rare_envs.envs.single import DrivingEnv
     from rare_envs.envs.vector import DrivingVectorEnv
@@ -14,7 +13,7 @@ if TYPE_CHECKING:
 __all__ = ["AgentsVectorEnv", "DrivingEnv", "DrivingParallelEnv", "DrivingVectorEnv", "Renderer"]
 
 _LAZY = {
-    "AgentsVectorEnv": "rare_envs.envs.multi_agent_vector",
+    "AgentsVectorEnv": "rare_envs.envs.parallel",
     "DrivingEnv": "rare_envs.envs.single",
     "DrivingParallelEnv": "rare_envs.envs.parallel",
     "DrivingVectorEnv": "rare_envs.envs.vector",

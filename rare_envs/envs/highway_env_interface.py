@@ -44,11 +44,7 @@ class FixedConfiguration(UserDict[str, Any]):
         self.data = {k: FixedConfiguration(v) if isinstance(v, dict) else v for k, v in values.items()}
 
     def __setitem__(self, name: str, value: Any) -> None:
-        """Set a key of the picture, or another one to the value that it has.
-
-        Raises:
-            ValueError: If the value would change, of another key than the frame rate.
-        """
+        """Set a key of the picture, or another one to the value that it has."""
         if name in PICTURE_KEYS:
             self.data[name] = value
         elif name not in self:
@@ -113,11 +109,7 @@ class HighwayEnvInterface:
 
     @property
     def vehicle(self) -> Any:
-        """The ego, a `highway_env.vehicle.kinematics.Vehicle` at this moment; its `road` has all vehicles.
-
-        Raises:
-            RuntimeError: Before the first reset.
-        """
+        """The ego, a `highway_env.vehicle.kinematics.Vehicle` at this moment; its `road` has all vehicles."""
         if self._episode is None:
             raise RuntimeError("Expected reset() before vehicle is read.")
         return make_scene(self._episode).vehicles[0]

@@ -289,9 +289,6 @@ class Display:
     Args:
         world: Of the episodes.
         mode: None, "rgb_array" for images, or "human" for a window.
-
-    Raises:
-        ValueError: If the mode is none of these.
     """
 
     def __init__(self, world: World, mode: str | None) -> None:

@@ -98,11 +98,7 @@ def merge_rows(old: _T, rows: Tensor, new: _T) -> _T:
 
 
 def list_tensors(value: Any) -> list[Tensor]:
-    """Return the tensors in nested tuples, in their order; the rest, as the road, stays the same for a whole batch.
-
-    Raises:
-        ValueError: A part keeps its rows in a way of its own.
-    """
+    """Return the tensors in nested tuples, in their order; the rest, as the road, stays the same for a whole batch."""
     found = list[Tensor]()
 
     def collect(leaf: Any) -> None:
@@ -116,11 +112,7 @@ def list_tensors(value: Any) -> list[Tensor]:
 
 
 def put_tensors(value: _T, tensors: Iterator[Tensor]) -> _T:
-    """Return nested tuples with other tensors in the places of `list_tensors`.
-
-    Raises:
-        ValueError: A tensor has another shape or type, or there are too few.
-    """
+    """Return nested tuples with other tensors in the places of `list_tensors`."""
 
     def put(old: Tensor) -> Tensor:
         new = next(tensors, None)

@@ -349,11 +349,7 @@ def clear_rows(actions: Any, rows: NDArray[np.bool_]) -> NDArray[Any]:
 
 
 def read_autoreset_mode(mode: AutoresetMode | str) -> AutoresetMode:
-    """Return Gymnasium's autoreset mode of a value, such as "NextStep".
-
-    Raises:
-        ValueError: There is no such mode.
-    """
+    """Return Gymnasium's autoreset mode of a value, such as "NextStep"."""
     try:
         return AutoresetMode(mode)
     except ValueError:

@@ -22,8 +22,7 @@ from rare_envs.distributions.space import Distribution, ScenarioSpace
 from rare_envs.egos.errors import is_policy, refuse_ego
 from rare_envs.egos.wrappers import wrap_policy
 from rare_envs.interop.layouts import restore_class_parameters, set_idm
-from rare_envs.interop.scenario import HighwayEnvScenario
-from rare_envs.interop.scene import install_fast_observation
+from rare_envs.interop.scenario import HighwayEnvScenario, install_fast_observation
 from rare_envs.plugins import did_you_mean, one_line
 from rare_envs.threads import use_one_thread
 
@@ -45,11 +44,7 @@ class DriveTask:
     """Duration after which drives are cut off [s]."""
 
     def build(self) -> "DriveRunner":
-        """Make the environment and the ego.
-
-        Raises:
-            ValueError: If the environment, the ego or their spaces are not what is expected.
-        """
+        """Make the environment and the ego."""
         env = HighwayEnvScenario(make_highway_env(self.env_id, self.config), **self.settings)
         install_fast_observation(env.scene, blind=self.ego == "idm")
         if self.ego == "idm":
@@ -88,12 +83,7 @@ class BarePolicy:
 
 
 def make_highway_env(env_id: str, config: Mapping[str, Any] | None) -> gym.Env[Any, Any]:
-    """Return a new environment of HighwayEnv.
-
-    Raises:
-        ValueError: If there is none of this name, or the configuration has a key that it does not know, which
-            HighwayEnv itself would ignore.
-    """
+    """Return a new environment of HighwayEnv."""
     known = [name for name, spec in gym.registry.items() if str(spec.entry_point).startswith("highway_env.")]
     if env_id not in known:
         raise ValueError(f"Unknown environment of HighwayEnv {env_id!r}{did_you_mean(str(env_id), known)}.")
@@ -126,9 +116,6 @@ def strip_ego(ego: Any) -> Any:
 
     Args:
         ego: "idm", an object with `predict`, or a function without arguments that makes one.
-
-    Raises:
-        ValueError: If it is none of these.
     """
     if isinstance(ego, str) and ego == "idm":
         return ego
@@ -141,11 +128,7 @@ def strip_ego(ego: Any) -> Any:
 
 
 def check_ego_spaces(ego: Any, env: gym.Env[Any, Any]) -> None:
-    """Refuse an ego that was made for other observations or actions; one that declares no spaces is accepted.
-
-    Raises:
-        ValueError: If its spaces do not fit.
-    """
+    """Refuse an ego that was made for other observations or actions; one that declares no spaces is accepted."""
     for what in ("observation", "action"):  # the ego and its spaces are anybody's objects
         given, expected = getattr(env, f"{what}_space"), getattr(ego, f"{what}_space", None)
         fits = type(expected) is type(given) and getattr(expected, "shape", None) == getattr(given, "shape", None)
@@ -165,11 +148,7 @@ class DriveRunner:
     seconds: float
 
     def measure_drive(self, x: NDArray[np.float64]) -> float:
-        """Return the measure of the drive from x, shape (d,).
-
-        Raises:
-            ValueError: If the ego's action is not finite.
-        """
+        """Return the measure of the drive from x, shape (d,)."""
         env = self.env
         observation, _ = env.reset(options={"x": x})
         if self.ego is None:

@@ -156,9 +156,6 @@ def check_one_each(value: Any, like: Tensor) -> Tensor:
     Args:
         value: What the function returned.
         like: A tensor of shape (B,).
-
-    Raises:
-        ValueError: If it is not a tensor of shape (B,).
     """
     if isinstance(value, Tensor) and value.shape == like.shape:
         return value

@@ -68,9 +68,6 @@ def load_measure(measure: Any) -> Any:
     Args:
         measure: "stl:always (gap > 2)", a formula of signal temporal logic; "module:name", a function of a `Moment` or
             a measure in a module of the user's (those in the working directory are found); all else stays as it is.
-
-    Raises:
-        ValueError: The formula cannot be used, or the module has nothing of that name.
     """
     if not isinstance(measure, str) or ":" not in measure:
         return measure

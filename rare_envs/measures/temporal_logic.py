@@ -81,11 +81,7 @@ class Robustness:
     formula: str
 
     def __call__(self, trace: Trace) -> Tensor:
-        """Return the robustness in B episodes, shape (B,).
-
-        Raises:
-            ValueError: If a time in the formula is no multiple of the tick, or a vehicle in it does not exist.
-        """
+        """Return the robustness in B episodes, shape (B,)."""
         monitor, names = _parse(self.formula, trace.dt)
         columns = {name: _signal(trace, name).T.tolist() for name in names}
         ticks = [trace.dt * k for k in range(len(trace.valid))]

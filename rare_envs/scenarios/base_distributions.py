@@ -174,12 +174,7 @@ _DT = 0.1
 
 
 def try_scenario(scenario: Scenario) -> None:
-    """Start a few episodes and move the vehicles around the ego by one tick, by the script and by commands.
-
-    Raises:
-        ValueError: If a base distribution cannot be loaded, or something has the wrong shape or is not finite; the
-            message says what.
-    """
+    """Start a few episodes and move the vehicles around the ego by one tick, by the script and by commands."""
     import numpy as np
 
     for name in scenario.bases:

@@ -72,11 +72,7 @@ def scenario_named(name: str) -> Scenario:
 
 
 def env_id_of(name: str) -> str:
-    """Return the environment id of a scenario's short name, in its newest version, or of an id itself.
-
-    Raises:
-        ValueError: If there is no such scenario; the message suggests the nearest name and lists all.
-    """
+    """Return the environment id of a scenario's short name, in its newest version, or of an id itself."""
     name = complete_id(name)
     if name in SCENARIOS:
         return name

@@ -10,7 +10,7 @@ from torch import Tensor
 import rare_envs
 from rare_envs.control.actions import IDLE
 from rare_envs.control.idm import IDM
-from rare_envs.envs.multi_agent_vector import AgentsVectorEnv
+from rare_envs.envs.parallel import AgentsVectorEnv
 from rare_envs.make import set_up
 from rare_envs.multi_agent import (
     adversary_reward,

@@ -16,7 +16,7 @@ from scipy import stats
 import rare_envs
 from rare_envs import HighwayEnvScenario
 from rare_envs.interop.problem import make_highway_env
-from rare_envs.interop.scene import HIGHWAY_ENV_MEASURES, contact_time, install_fast_observation
+from rare_envs.interop.scenario import HIGHWAY_ENV_MEASURES, contact_time, install_fast_observation
 from rare_envs.traffic.bodies import axes_of, project_on_axes, time_to_contact
 from tests.rare_envs.interop.egos import Always
 from tests.rare_envs.interop.scenes import CONFIGS, SMALL, others, scenario
