@@ -520,9 +520,11 @@ def go_through(record: Record, only: str) -> int:
             if record.writes:
                 np.savez(path, **answer)
                 verdict = f"recorded {answer.get('error', '')}"
-            else:
+            elif path.exists():
                 with np.load(path) as old:
                     verdict = judge(case, dict(old), answer)
+            else:
+                verdict = "DIFFERENT: not in the record"
             verdicts.setdefault(case.group, {})[case.name] = verdict
         for group, judged in verdicts.items():
             found |= print_group(group, judged)
