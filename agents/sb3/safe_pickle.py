@@ -95,7 +95,8 @@ _PLAIN_DTYPE = (None, None, None, -1, -1, 0)
 
 def _make_dtype(name: Any, *_: Any) -> np.dtype[Any]:
     require(isinstance(name, str) and _NUMBERS.fullmatch(name), f"it holds an array of {name!r:.50}, not of numbers")
-    return np.dtype(name, copy=True)
+    dtype: np.dtype[Any] = np.dtype(name, copy=True)
+    return dtype
 
 
 def _fill_dtype(dtype: np.dtype[Any], state: Any) -> None:
