@@ -14,6 +14,7 @@ import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import typer
@@ -102,7 +103,8 @@ def count_events(scenario: str, events: Events, used: int, traffic: ObservedTraf
         used: Events that the filters keep.
         traffic: Of the recordings.
     """
-    about = {"definition": EVENT_DEFINITIONS[scenario], "source": "counted in the recordings themselves"}
+    about: dict[str, Any] = {"source": "counted in the recordings themselves"}
+    about["definition"] = EVENT_DEFINITIONS[scenario]
     if scenario == "hard_brake":
         hours, km = traffic.braking_hours, traffic.braking_km
         return EventFrequency(count=used, hours=hours, km=km, **about) if used else None
@@ -112,8 +114,8 @@ def count_events(scenario: str, events: Events, used: int, traffic: ObservedTraf
         count = int(((events["phase"] == "start") & (events["ego"] >= 0)).sum())
     if count == 0 or used == 0:
         return None
-    share = {"share": used / count, "share_events": count}
-    return EventFrequency(count=count, hours=traffic.hours, km=traffic.km, **share, **about)
+    about |= {"share": used / count, "share_events": count}
+    return EventFrequency(count=count, hours=traffic.hours, km=traffic.km, **about)
 
 
 def fit_own_bases(

@@ -85,7 +85,8 @@ def clone_policy(pairs: Pairs, config: Config, generator: torch.Generator) -> Po
     action = normalise_action(policy, pairs.action)
     for _ in range(config.epochs):
         for rows in torch.split(torch.randperm(len(action), generator=generator), config.batch):
-            loss = -log_likelihood(*policy(pairs.features[rows]), action[rows]).mean()
+            mean, log_std = policy(pairs.features[rows])
+            loss = -log_likelihood(mean, log_std, action[rows]).mean()
             optimiser.zero_grad()
             torch.autograd.backward(loss)
             optimiser.step()

@@ -173,7 +173,8 @@ class Learner:
         """Return the negative log likelihood of a batch of recorded actions."""
         features, action = self.clone_pairs
         rows = torch.randint(len(features), (self.config.batch,), generator=self.generator)
-        return -log_likelihood(*self.policy(features[rows]), action[rows]).mean()
+        mean, log_std = self.policy(features[rows])
+        return -log_likelihood(mean, log_std, action[rows]).mean()
 
     def save(self, path: Path) -> None:
         """Write the state of the training."""

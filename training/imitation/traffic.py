@@ -79,8 +79,9 @@ def stack_scenes(scenes: Sequence[TrafficScene]) -> Recording:
         whole = np.isfinite(scene.acceleration) & np.isfinite(scene.yaw_rate) & scene.present
         row[: whole.shape[0], : whole.shape[1]] = whole
     edges = [tuple(scene.edges) + (scene.edges[-1],) * (lanes - len(scene.edges)) for scene in scenes]
+    moving = {name: pad(name) for name in ("x", "y", "heading", "speed", "acceleration", "yaw_rate")}
     return Recording(
-        *(pad(name) for name in ("x", "y", "heading", "speed", "acceleration", "yaw_rate")),
+        **moving,
         present=pad("present") > 0,
         acts=torch.from_numpy(known),
         length=sizes("length"),

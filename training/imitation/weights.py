@@ -170,7 +170,7 @@ def measure_spread(members: list[Member], base: FloatArray) -> dict[str, float]:
     weights = np.stack([member.weights for member in members])
     between, within = weights.std(axis=0, ddof=1), np.stack([member.within for member in members]).mean(axis=0)
     bias = np.abs(weights.mean(axis=0) - base)
-    found = {}
+    found = dict[str, float]()
     for name, values in (("between", between), ("within", within), ("bias", bias)):
         found |= {f"{name}_median": float(np.median(values)), f"{name}_max": float(values.max())}
     return {**found, "bias_over_spread": float(np.sqrt(np.square(bias).mean() / np.square(between).mean()))}

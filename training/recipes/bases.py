@@ -380,7 +380,7 @@ def _with_shapes(events: EventSet, shapes: FloatArray, columns: tuple[Parameter,
     rules: list[dict[str, Any]] = []
     keep = np.ones(len(shapes), dtype=bool)
 
-    def apply(rule: str, reason: str, passes: NDArray[np.bool_]) -> None:
+    def apply(rule: str, reason: str, passes: Any) -> None:
         rules.append({"rule": rule, "reason": reason, "dropped": int((keep & ~passes).sum())})
         np.logical_and(keep, passes, out=keep)
 
