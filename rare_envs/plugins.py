@@ -34,7 +34,7 @@ def warn_of_namesakes() -> None:
             if origin and part not in Path(origin).read_text(encoding="utf-8", errors="replace"):
                 warnings.warn(
                     f"Expected {name!r} of Rare Envs, found another package of that name, {origin}; rename or "
-                    "uninstall it, or use an environment of its own (docs/names.md).",
+                    "uninstall it, or use an environment of its own (docs/index.md).",
                     RuntimeWarning,
                     stacklevel=3,
                 )

@@ -47,7 +47,7 @@ class Scenario:
     """A scenario: parameters, initial state, motion of the others, and defaults.
 
     The shipped ones are a file each and a line in `SCENARIOS`; `rare_envs.register_scenario` adds one of your own, and
-    `docs/scenarios.md` shows how to write it.
+    `docs/environments.md` shows how to write it.
 
     Raises:
         ValueError: If it contradicts itself.

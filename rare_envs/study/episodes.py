@@ -29,7 +29,7 @@ from samplers.result import Estimate
 from samplers.sample import SimulationRows
 
 EPISODE_FORMAT = 1
-"""Version of the columns, in the metadata of the file; see docs/run_folder.md."""
+"""Version of the columns, in the metadata of the file; see docs/using_results.md."""
 ROWS_AT_ONCE, BYTES_AT_ONCE = 2**16, 2**25
 """Simulations of a row group, at most so many and so large."""
 BEFORE_X = {"simulation": pa.int64(), "run": pa.int32(), "stage": pa.int32()}

@@ -375,7 +375,7 @@ def straight(lanes: int, width: float = 4.0) -> Road:
 def i80() -> Road:
     """Return Interstate 80 at Emeryville, California: six curved lanes, 700 m, then straight on.
 
-    The reference line is the middle of the leftmost lane; `training.scenario_fitting.i80_road` fitted it to the survey.
+    The reference line is the middle of the leftmost lane; `training.recipes.i80_road` fitted it to the survey.
 
     Example:
         >>> i80().lanes, round(i80().width, 2)
