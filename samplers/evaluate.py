@@ -118,15 +118,15 @@ class Work:
 
 
 def _attempt_f(problem: Any, gamma: float, chunk: Chunk) -> Attempted:
-    x, rowwise = chunk.x.copy(), getattr(problem, "attempt", None)  # a copy, on which it may write
-    f, reasons = rowwise(x) if callable(rowwise) else (problem.evaluate(x), {})
+    x, rowwise = chunk.x.copy(), _find_rowwise(problem, "evaluate", "attempt")  # a copy, on which it may write
+    f, reasons = (problem.evaluate(x), {}) if rowwise is None else rowwise(x)
     f = one_per_row(f, len(x))
     return Attempted(f[:, None], _reasons_of_nan(f) | reasons, {})
 
 
 def _attempt_terms(problem: Any, gamma: float, chunk: Chunk) -> Attempted:
-    x, n, rowwise = chunk.x.copy(), len(chunk), getattr(problem, "attempt_terms", None)
-    terms, reasons = rowwise(x, gamma) if callable(rowwise) else (problem.terms(x, gamma), {})
+    x, n, rowwise = chunk.x.copy(), len(chunk), _find_rowwise(problem, "terms", "attempt_terms")
+    terms, reasons = (problem.terms(x, gamma), {}) if rowwise is None else rowwise(x, gamma)
     f, values, ticks = one_per_row(terms.f, n), np.asarray(terms.values, dtype=np.float64), np.asarray(terms.ticks)
     if values.ndim != 2 or len(values) != n or values.shape[1] == 0 or ticks.shape != values.shape:
         raise EvaluationError(f"Expected values and ticks of shape ({n}, J), got {values.shape} and {ticks.shape}.")
@@ -142,6 +142,19 @@ def _attempt_gradient(problem: Any, gamma: float, chunk: Chunk) -> Attempted:
     if values.shape != x.shape:
         raise EvaluationError(f"Expected gradients of shape {x.shape}, got {values.shape}.")
     return Attempted(values, {}, {"cost": float(found.cost)})
+
+
+def _find_rowwise(problem: Any, whole: str, rowwise: str) -> Callable[..., Any] | None:
+    """Return the method that goes on with the other rows, if it computes what the method `whole` does.
+
+    A subclass, a wrapper or an instance that has `whole` of its own is asked by that.
+    """
+    method = getattr(problem, rowwise, None)
+    owner = getattr(method, "__self__", None)
+    if owner is None or getattr(getattr(problem, whole, None), "__self__", None) is not owner:
+        return None
+    definition = next(vars(kind) for kind in type(owner).__mro__ if {whole, rowwise} & set(vars(kind)))
+    return method if {whole, rowwise} <= set(definition) else None
 
 
 def _reasons_of_nan(f: FloatArray) -> dict[int, str]:

@@ -373,6 +373,12 @@ class RuleDriver:
 
     It has the interface of a `LearnedDriver`, so that one harness measures both; it has no weights and no noise, and
     knows vehicles in its lane only where the beam meets them.
+
+    Example:
+        >>> import torch
+        >>> actions, _ = RuleDriver().act(torch.zeros(1, 1, 51))
+        >>> actions.shape
+        torch.Size([1, 1, 2])
     """
 
     idm: IDM = field(default_factory=IDM)

@@ -347,7 +347,7 @@ def test_bad_arguments():
 
 @use_one_thread()
 def test_an_adversary_raises_the_collision_rate():
-    """Starts side by side, so that little training is enough; from ordinary starts docs/environments.md has the numbers."""
+    """Starts side by side, so that little training is enough; docs/environments.md has ordinary ones."""
     low, high = np.array([14.0, 14.0, 14.0, 1.0, 30.0, 3.0]), np.array([16.0, 16.0, 16.0, 4.0, 50.0, 4.0])
     near = {"base": BetaDistribution(np.full(6, 2.0), np.full(6, 2.0), low, high), "horizon": 5.0}
     n = 400
