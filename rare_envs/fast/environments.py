@@ -12,11 +12,12 @@ from numpy.typing import NDArray
 from rare_envs.control.actions import DISCRETE_ACTIONS, MAX_ACCELERATION, MAX_STEERING
 from rare_envs.fast.choice import CompilerFails, check_core, find_step_script, import_compiler
 from rare_envs.fast.dense_policy import NotCompiled
-from rare_envs.measures import Moment
 from rare_envs.measures.base import COLLISION
 from rare_envs.scenarios.cut_in import CUTTER_IDM
 from rare_envs.simulation.episode import Episode
+from rare_envs.simulation.measurement import EpisodeStatistics
 from rare_envs.simulation.reward import RewardTerms
+from rare_envs.traffic.crash import Crash
 from rare_envs.traffic.neighbours import Lead
 from rare_envs.traffic.state import State
 
@@ -59,7 +60,7 @@ class ScriptedStep:
         (dt,) = single(world.clock.dt)
         road = RoadNumbers.of(world.scenario.road)
         self._numbers = getattr(scripts, script), IDMNumbers.of(CUTTER_IDM), road, dt
-        self._dt, self._required = world.clock.dt, required
+        self._required = required
 
     def advance(self, episode: Episode, action: NDArray[Any]) -> CompiledStep | None:
         """Carry out a decision.
@@ -75,7 +76,8 @@ class ScriptedStep:
         Raises:
             ValueError: The state is in double precision, and compiled steps are required.
         """
-        from rare_envs.fast.rows import make_table, stack_state  # not kept: a step is copied and sent
+        from rare_envs.fast.crashes import CrashRows, record_crashes  # not kept: a step is copied and sent
+        from rare_envs.fast.rows import make_table, stack_state
         from rare_envs.fast.steps import Stepped, step
 
         old, f, vehicles = episode.state, episode.measure_state.numpy(), episode.state.x.shape[1]
@@ -89,17 +91,20 @@ class ScriptedStep:
                     f"{old.x.numpy().dtype}; make the environment with core='torch'."
                 )
             return None
-        table, stepped = make_table(stack_state(old), vehicles, len(f)), Stepped.of(f, vehicles)
+        start, stepped = stack_state(old), Stepped.of(f, vehicles)
+        table = make_table(start, vehicles, len(f))
         script, cutter_idm, road, dt = self._numbers
         eventful = step(table, vehicles, physical, script, cutter_idm, road, dt, stepped)
         tensor = torch.from_numpy
-        x, y, heading, speed = (tensor(field.T) for field in table[: 4 * vehicles].reshape(4, vehicles, len(f)))
+        before, after = (each[: 4 * vehicles].reshape(4, vehicles, len(f)) for each in (start, table))
+        x, y, heading, speed = (tensor(field.T) for field in after)
         state = State(x, y, heading, speed, old.theta)
         lead, now, least = Lead(*map(tensor, stepped.lead)), tensor(stepped.f == COLLISION), tensor(stepped.f)
         statistics = episode.statistics._replace(least_ttc=least)
         if eventful:
-            moment = Moment(state, lead, episode.road, None, old, self._dt)
-            statistics = statistics.update(moment, episode.collided, now, least)
+            own, others = (CrashRows(*(field.numpy().copy() for field in each)) for each in statistics[1:])
+            record_crashes(before, after, episode.collided.numpy(), now.numpy(), road, dt, own, others)
+            statistics = EpisodeStatistics(least, *(Crash(*map(tensor, each)) for each in (own, others)))
         moved = episode._replace(state=state, lead=lead, measure_state=least, collided=now, statistics=statistics)
         return CompiledStep(moved, RewardTerms(*map(tensor, stepped.terms)), np.ascontiguousarray(stepped.features.T))
 
