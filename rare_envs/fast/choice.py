@@ -26,8 +26,9 @@ if TYPE_CHECKING:
 
 CORES = ("auto", "torch", "numba")
 """Choices of what simulates."""
-SCRIPTS = ((car_following.others, "STEADY"), (hard_brake.others, "BRAKING"), (cut_in.others, "CUT_IN"))
-"""Motions of the other vehicles and names of their compiled twins in `rare_envs.fast.scripts`."""
+SCRIPTS = ((car_following.others, "STEADY", 2), (hard_brake.others, "BRAKING", 2), (cut_in.others, "CUT_IN", 3))
+"""Motions of the other vehicles, names of their compiled twins in `rare_envs.fast.scripts`, and how many vehicles these
+are for, the ego included."""
 
 
 class CompilerFails(NotCompiled):
@@ -76,10 +77,12 @@ def find_script(world: World) -> str:
         NotCompiled: It has none, or something in the world is not compiled.
     """
     scenario, measurement = world.scenario, world.measurement
-    names = [name for others, name in SCRIPTS if scenario.others is others]
+    known = [(name, vehicles) for others, name, vehicles in SCRIPTS if scenario.others is others]
+    names = [name for name, vehicles in known if scenario.vehicles == vehicles]
     obstacles = {
         "worlds with drivers are not compiled": world.background is not None,
-        f"the script of the scenario {scenario.name!r} is not compiled": not names,
+        f"the script of the scenario {scenario.name!r} is not compiled": not known,
+        f"the script of {scenario.name!r} is not compiled for {scenario.vehicles} vehicles": not names,
         "curved roads and lanes of different widths are not compiled": scenario.road.reference_line is not None
         or not scenario.road.equal,
         f"the measure {measurement.measure!r} is not compiled": measurement.episode_measure != MEASURES["ttc"],

@@ -49,6 +49,7 @@ def cut_in(rows: Any, idm: IDMNumbers, dt: float) -> None:
     """Move cutter and lead: `rare_envs.scenarios.cut_in.others`."""
     x, y, heading, speed, cos = rows.x[1], rows.y[1], rows.heading[1], rows.speed[1], rows.cosine[1]
     lead_x, lead_speed, slope = rows.x[2], rows.speed[2], rows.spare[0]
+    lead_y, lead_heading, lead_cos = rows.y[2], rows.heading[2], rows.cosine[2]
     start, length, offset, desired_speed = rows.theta[0], rows.theta[1], rows.theta[2], rows.theta[3]
     bends = False
     for row in range(rows.size):
@@ -58,8 +59,9 @@ def cut_in(rows: Any, idm: IDMNumbers, dt: float) -> None:
         x[row] = x[row] + speed[row] * cos[row] * dt
         speed[row] = at_least(speed[row] + acceleration * dt, ZERO)
         lead_x[row] += lead_speed[row] * dt
+        lead_y[row], lead_heading[row], lead_cos[row] = ZERO, ZERO, ONE
         y[row], slope[row] = bezier(x[row] - start[row], length[row], offset[row])
-        bends |= (slope[row] != ZERO) | (cos[row] != ONE)
+        bends |= (slope[row] != ZERO) | (heading[row] != ZERO)
     if bends:
         for row in range(rows.size):
             heading[row] = slope[row] if slope[row] == ZERO else math.atan(slope[row])

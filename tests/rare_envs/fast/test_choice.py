@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 
 import agents
 import rare_envs
@@ -15,6 +16,7 @@ from rare_envs.control import IDM
 from rare_envs.fast import choice, rollouts
 from rare_envs.scenarios import car_following
 from rare_envs.simulation.measurement import Measurement
+from rare_envs.traffic.state import State
 
 CAR_FOLLOWING = "rare_envs/CarFollowing-v0"
 X = np.array([[20.0, 15.0, 30.0]])
@@ -105,6 +107,36 @@ def test_a_scenario_that_places_the_vehicles_otherwise_is_compiled_and_a_script_
     assert (compiled.core, compiled.evaluate(X)) == ("numba", pytest.approx(31.0 / 5.0))
     own.world = replace(own.world, scenario=replace(scenario, others=lambda state, dt: scenario.others(state, dt)))
     assert (own.core, own.evaluate(X)) == ("torch", pytest.approx(6.0))
+
+
+@pytest.mark.parametrize("env_id", [CAR_FOLLOWING, "rare_envs/HardBrake-v0"])
+def test_a_script_with_more_vehicles_than_it_is_compiled_for_is_simulated_by_torch(env_id: str) -> None:
+    def place(x: Any) -> State:
+        *fields, theta = scenario.initial(x)
+        fields = [torch.cat((field, field[:, 1:]), dim=1) for field in fields]
+        fields[0][:, 1] += 50.0  # the nearer one comes last
+        return State(*fields, theta)
+
+    problem = rare_envs.DrivingProblem(env_id)
+    scenario, x = problem.world.scenario, problem.base.sample(20, np.random.default_rng(0))
+    expected = rare_envs.DrivingProblem(env_id, core="torch").evaluate(x)
+    names = ("ego", "lead", "nearer lead")
+    problem.world = replace(problem.world, scenario=replace(scenario, vehicle_names=names, labels=(), initial=place))
+    assert problem.core == "torch"
+    assert problem.evaluate(x) == pytest.approx(expected)
+
+
+def test_the_lead_of_a_cut_in_that_begins_beside_its_line_is_on_it_after_a_tick_as_in_torch() -> None:
+    def place(x: Any) -> State:
+        state = scenario.initial(x)
+        return state._replace(y=state.y + torch.tensor([0.0, 0.0, 3.8]), heading=state.heading + 0.3)
+
+    compiled, reference = (rare_envs.DrivingProblem("rare_envs/CutIn-v0", core=core) for core in ("numba", "torch"))
+    scenario, x = compiled.world.scenario, compiled.base.sample(100, np.random.default_rng(0))
+    for problem in (compiled, reference):
+        problem.world = replace(problem.world, scenario=replace(scenario, initial=place))
+    assert (compiled.core, reference.core) == ("numba", "torch")
+    assert compiled.evaluate(x) == pytest.approx(reference.evaluate(x), abs=1e-4)
 
 
 def test_both_cores_are_asked_the_same_and_give_the_same_estimate() -> None:

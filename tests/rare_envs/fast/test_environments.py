@@ -79,6 +79,17 @@ def test_batches_are_those_of_torch(mode):
     assert ended > 3
 
 
+def test_a_cutter_at_the_end_of_its_path_is_level_whatever_the_rest_of_its_batch_does():
+    """A heading whose cosine rounds to 1 would stay, but for rows beside which another cutter turns."""
+    env = gym.make("rare_envs/CutIn-v0", core="numba").unwrapped
+    env.reset(seed=0)
+    state, far = env._episode.state, torch.tensor([0.0, 500.0, 1000.0])
+    moved = state._replace(x=state.x + far, heading=state.heading + torch.tensor([0.0, 1e-4, 0.0]))
+    env._episode = env._episode._replace(state=moved)
+    env.step(np.zeros(2, np.float32))
+    assert env._episode.state.heading.tolist() == [[0.0, 0.0, 0.0]]
+
+
 @pytest.mark.parametrize("core", ["auto", "numba"])
 def test_states_in_double_precision_are_left_to_torch_or_refused(core):
     env = gym.make("rare_envs/CutIn-v0", core=core).unwrapped
