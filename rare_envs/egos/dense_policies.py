@@ -10,6 +10,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from types import FunctionType
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
@@ -82,6 +83,8 @@ def _read_network(policy: Any) -> DensePolicy:
         raise NotCompiled(f"the ego, with a {type(policy).__name__} of other parts than dense layers, is not compiled")
     for module in policy.modules():
         _refuse_changed(module)
+    if type(policy) is ActorCriticPolicy:
+        _refuse_changed(policy.action_dist)
     layers, activation = _read_layers([module for part in parts for module in _unpack(part)])
     space = policy.action_space
     chooses = isinstance(space, spaces.Discrete) and int(space.start) == 0
@@ -111,19 +114,26 @@ def _read_layers(modules: list[Any]) -> tuple[tuple[Any, ...], Activation]:
 def _refuse_changed(part: Any) -> None:
     """Raise NotCompiled where a method of an object has been replaced, or a module has a hook."""
     own = vars(part)
-    replaced = own.keys() & {"predict", "_predict", "forward", "extract_features", "get_distribution"}
+    replaced = any(isinstance(getattr(type(part), name, None), FunctionType) for name in own)
     if replaced or own.get("_forward_hooks") or own.get("_forward_pre_hooks"):
         raise NotCompiled(f"an ego with a {type(part).__name__} that was changed is not compiled")
 
 
-def _read_statistics(normalise: Any) -> tuple[Any, Any, float]:
-    """Return mean, standard deviation and bound of the observations of `VecNormalize`, from its method."""
+def _read_statistics(normalise: Any) -> tuple[Any, Any, float] | None:
+    """Return mean, standard deviation and bound of the observations of `VecNormalize`, from its method.
+
+    None where it leaves the observations as they are.
+    """
     statistics: Any = getattr(normalise, "__self__", None)  # of a function, none
     module = sys.modules.get(f"{SB3}.common.vec_env.vec_normalize")
     if module is None or type(statistics) is not module.VecNormalize or normalise.__name__ != "normalize_obs":
         raise NotCompiled("an ego behind a normalisation of its own is not compiled")
+    if vars(statistics).keys() & {"normalize_obs", "_normalize_obs"}:
+        raise NotCompiled("an ego behind a VecNormalize that was changed is not compiled")
+    if not statistics.norm_obs:
+        return None
     moments = statistics.obs_rms
-    if vars(statistics).keys() & {"normalize_obs", "_normalize_obs"} or not hasattr(moments, "mean"):
+    if not hasattr(moments, "mean"):
         raise NotCompiled("an ego behind a VecNormalize that was changed is not compiled")
     deviation = np.sqrt(moments.var + statistics.epsilon)
     return moments.mean, deviation, float(statistics.clip_obs)

@@ -43,6 +43,12 @@ def replaced():
     return model
 
 
+def replaced_inside(find_part, name):
+    model = PPO("MlpPolicy", gym.make(CAR_FOLLOWING), device="cpu")
+    setattr(find_part(model.policy), name, lambda *_, **__: None)
+    return model
+
+
 @pytest.mark.parametrize(
     ("ego", "reason"),
     [
@@ -53,6 +59,12 @@ def replaced():
         (lambda: make(features_extractor_class=type("Own", (_flatten(),), {})), "other parts than dense layers"),
         (hooked, "a Linear that was changed"),
         (replaced, "a PPO that was changed"),
+        (lambda: replaced_inside(lambda policy: policy, "obs_to_tensor"), "a ActorCriticPolicy that was changed"),
+        (
+            lambda: replaced_inside(lambda policy: policy.mlp_extractor, "forward_actor"),
+            "a MlpExtractor that was changed",
+        ),
+        (lambda: replaced_inside(lambda policy: policy.action_dist, "mode"), "a DiagGaussianDistribution that was"),
     ],
 )
 def test_other_policies_are_simulated_by_torch(ego, reason):
@@ -133,6 +145,21 @@ def test_wrappers_stay_around_the_layers():
     assert isinstance(found.policy.policy, DenseInference)
     seen = np.random.default_rng(1).uniform(-5, 5, (25, 11)).astype(np.float32)
     np.testing.assert_allclose(found.predict(seen)[0], wrapped.predict(seen, deterministic=True)[0], atol=1e-6)
+
+
+@pytest.mark.parametrize("switched_off", [True, False])
+def test_statistics_that_leave_the_observations_as_they_are_are_not_applied(switched_off):
+    statistics = VecNormalize(training.sb3_vec_env(CUT_IN, num_envs=2), norm_obs=switched_off)
+    statistics.norm_obs = False  # with moments of the time before, or none
+    ego = NormalisedPolicy(make_cut_in(), statistics.normalize_obs)
+    if switched_off:
+        statistics.obs_rms.mean[:] = 5.0
+    assert read_dense_policy(ego).normalisation is None
+    x = rare_envs.DrivingProblem(CUT_IN).base.sample(20, np.random.default_rng(0))
+    f, expected = (
+        rare_envs.DrivingProblem(CUT_IN, ego=each, core="numba").evaluate(x) for each in (ego, make_cut_in())
+    )
+    assert np.array_equal(f, expected)
 
 
 def test_other_policies_are_asked_by_predict():
