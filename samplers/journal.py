@@ -161,10 +161,11 @@ class Journal:
             JournalError: It is damaged, with `mend` in its first record, or another process has it open.
             OSError: It cannot be read.
         """
-        if (missing := _check_file(path)) and not mend:
-            raise JournalError(f"{str(path)!r} is damaged: its end is missing.")
-        if missing:  # zeros, which no record consists of
+        missing = _check_file(path)
+        if missing and mend:  # zeros, which no record consists of
             os.truncate(path, os.stat(path).st_size + missing)
+        elif missing:
+            return cls._open_cut(path)
         connection = _connect(path)
         try:
             head = _verify(path, connection)
@@ -181,6 +182,21 @@ class Journal:
             connection.close()
             raise
         return cls(path, connection, head)
+
+    @classmethod
+    def _open_cut(cls, path: Path) -> Journal:
+        """Continue a journal whose end is missing, which is in SQLite's log if that was being copied from there."""
+        try:
+            if not _wal(path).exists():
+                raise _Damaged(path, HEAD)
+            connection = _connect(path)
+            try:
+                return cls(path, connection, _verify(path, connection))
+            except BaseException:
+                connection.close()
+                raise
+        except (_Damaged, sqlite3.DatabaseError) as error:
+            raise JournalError(f"{str(path)!r} is damaged: its end is missing.") from error
 
     @property
     def n(self) -> int:

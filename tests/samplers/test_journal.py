@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import json
 import signal
@@ -183,6 +184,26 @@ def test_a_page_that_is_lost_costs_what_stands_behind_it(cut: bool, tmp_path: Pa
     assert 300 <= journal.n < 12_000 and journal.head == {"seed": 1}
     assert journal.find("0") is not None
     journal.close()
+
+
+@pytest.mark.parametrize("mend", [False, True])
+@pytest.mark.parametrize("n_bytes", [4096, 8192, 20480])
+def test_killed_while_sqlite_copies_its_log_into_the_file_nothing_is_lost(
+    n_bytes: int, mend: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The first page, which tells the length of the whole file, is copied first."""
+    monkeypatch.setattr(journals, "SYNC_SECONDS", np.inf)
+    path, killed = tmp_path / "journal.bin", tmp_path / "killed.bin"
+    with contextlib.closing(Journal.create(path, {})) as journal:
+        for number in range(20):
+            journal.append(str(number), Result(np.full((200, 1), number), {}), 200)
+        before, log = path.read_bytes(), journals._wal(path).read_bytes()
+    after = path.read_bytes()
+    assert len(after) > 20480 >= len(before)
+    killed.write_bytes(after[:n_bytes] + before[n_bytes:])
+    journals._wal(killed).write_bytes(log)
+    with contextlib.closing(Journal.open(killed, mend)) as journal:
+        assert journal.n == 4000
 
 
 @pytest.mark.parametrize("mend", [False, True])
