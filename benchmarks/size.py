@@ -12,8 +12,10 @@ import tempfile
 import tokenize
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from types import FrameType
+from types import CodeType, FrameType
 from typing import Any
+
+import numpy as np
 
 PACKAGES = ("agents", "rare_envs", "samplers", "training")
 LAYOUT = (tokenize.COMMENT, tokenize.NL, tokenize.NEWLINE, tokenize.INDENT, tokenize.DEDENT, tokenize.ENDMARKER)
@@ -75,6 +77,7 @@ def measure_calls(root: Path) -> dict[str, float]:
     import samplers
 
     problem = rare_envs.DrivingProblem("rare_envs/CutIn-v0")
+    problem.evaluate(problem.base.sample(300, np.random.default_rng(0)))  # compiles what is compiled
     files, depth = trace(root, lambda: samplers.estimate(problem, seed=0))
     of_monte_carlo, _ = trace(root, lambda: samplers.estimate(problem, "mc", seed=0, max_sim=2000))
     with tempfile.TemporaryDirectory() as folder:
@@ -94,16 +97,21 @@ def trace(root: Path, run: Callable[[], Any]) -> tuple[int, int]:
     What a module calls while it is imported does not count.
     """
     files: set[str] = set()
-    depths, importing = [0], [0]
+    depths, importing, known = [0], [0], set[CodeType]()
 
     def note(frame: FrameType, event: str, argument: Any) -> None:
         code = frame.f_code
-        if code.co_name == "<module>" and event in ("call", "return") and not code.co_filename.endswith("__main__.py"):
+        if event not in ("call", "return") or (code in known and not importing[0]):
+            return
+        if code.co_name == "<module>" and not code.co_filename.endswith("__main__.py"):
             importing[0] += 1 if event == "call" else -1
-        if event == "call" and not importing[0] and is_ours(root, code.co_filename):
-            files.add(code.co_filename)
+        elif event == "call" and not importing[0]:
+            if is_ours(root, code.co_filename):
+                files.add(code.co_filename)
             if code.co_name in ("evaluate", "attempt") and code.co_filename.endswith("rare_envs/problem.py"):
                 depths.append(sum(is_ours(root, each.f_code.co_filename) for each in callers(frame)))
+            else:
+                known.add(code)
 
     sys.setprofile(note)
     try:

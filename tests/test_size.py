@@ -11,20 +11,20 @@ from benchmarks.size import BUDGETS, measure_text
 
 ROOT = Path(__file__).parents[1]
 LIMITS = {
-    "package lines": 67_000,
-    "code lines": 38_900,
-    "modules": 300,
-    "functions": 3_760,
-    "classes": 605,
+    "package lines": 66_900,
+    "code lines": 38_950,
+    "modules": 293,
+    "functions": 3_780,
+    "classes": 603,
     "import lines, percent of code": 11.6,
-    "test lines": 43_800,
+    "test lines": 44_200,
     "pages": 18,
-    "words of pages": 45_000,
-    "files entered by an estimate": 85,
-    "files entered by plain Monte Carlo": 42,
-    "files entered by the command": 157,
-    "own frames from estimate to f": 11,
-    "own frames from the command to f": 34,
+    "words of pages": 44_900,
+    "files entered by an estimate": 72,
+    "files entered by plain Monte Carlo": 39,
+    "files entered by the command": 126,
+    "own frames from estimate to f": 6,
+    "own frames from the command to f": 15,
 }
 """What must not grow; the aims are `benchmarks.size.BUDGETS`."""
 

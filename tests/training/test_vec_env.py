@@ -345,6 +345,7 @@ def test_bad_arguments():
         env.step(np.zeros((4, 2)))
 
 
+@pytest.mark.slow
 @use_one_thread()
 def test_an_adversary_raises_the_collision_rate():
     """Starts side by side, so that little training is enough; docs/environments.md has ordinary ones."""
@@ -359,6 +360,7 @@ def test_an_adversary_raises_the_collision_rate():
     assert adversary.interval(attacked, n)[0] > adversary.interval(scripted, n)[1]
 
 
+@pytest.mark.slow
 @use_one_thread()
 def test_a_shared_policy_learns():
     before, after = (

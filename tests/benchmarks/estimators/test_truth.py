@@ -1,8 +1,11 @@
+import pytest
+
 from benchmarks.estimators.truth import ROLLOUT_CHUNK, count_collisions, truth
 
 CAR_FOLLOWING = ("rare_envs/CarFollowing-v0", "highway")
 
 
+@pytest.mark.slow
 def test_counts_are_those_of_the_chunks_whatever_the_processes():
     rest = 5000
     found = truth(*CAR_FOLLOWING, ROLLOUT_CHUNK + rest, seed=7, workers=2)

@@ -1,6 +1,8 @@
 import subprocess
 import sys
 
+import pytest
+
 from benchmarks.simulation import throughput
 
 
@@ -10,6 +12,7 @@ def test_the_highway_is_measured_against_highway_env():
     assert {f"highway_{batch}" for batch in throughput.BATCHES} < set(throughput.FLOORS)
 
 
+@pytest.mark.slow
 def test_the_memory_of_a_highway_is_measured():
     """In a process of its own: the peak is that of the process, tests before this one included."""
     code = "from benchmarks.simulation.throughput import highway_memory; print(highway_memory(rollouts=8)['peak_gib'])"
@@ -17,11 +20,13 @@ def test_the_memory_of_a_highway_is_measured():
     assert 0.1 < float(shown) < throughput.CEILINGS["highway_memory"]
 
 
+@pytest.mark.slow
 def test_the_camera_is_measured_against_lidar():
     row = throughput.measure_camera(batch=2, rounds=1)
     assert row["slow_down"] == row["lidar_per_second"] / row["per_second"] > 0
 
 
+@pytest.mark.slow
 def test_an_answer_is_measured_against_one_call(monkeypatch):
     monkeypatch.setattr(throughput, "ANSWER_SIMULATIONS", 500)
     monkeypatch.setattr(throughput, "LEAST_ESTIMATES", 1)

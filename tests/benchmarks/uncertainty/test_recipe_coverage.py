@@ -40,6 +40,7 @@ def test_a_merged_mixture_has_its_mean_and_covariance():
     np.testing.assert_allclose(scaled, one.covariances[0] / np.outer(deviation, deviation), atol=0.04)
 
 
+@pytest.mark.slow
 def test_intervals_cover_in_a_few_repetitions():
     """Coverage of 92 % leaves 3 of 6 or fewer with probability 1e-2, 2 or fewer with 5e-4."""
     found = [repeat_recipe(RECIPE_WORLDS[0], seed) for seed in range(6)]
