@@ -281,7 +281,8 @@ def resume(
         trust: Let the ego's file run code, as the run was allowed to, and code that a run from elsewhere names.
         progress: Show a bar on standard error.
         mend: Of a damaged journal, keep the simulations before the damage.
-        executor: As in `run`; it need not be that with which the run was begun.
+        executor: As in `run`; it need not be that with which the run was begun. It gets the chunks in which that was
+            begun, so that the answer is the same to the bit.
 
     Raises:
         BadInput: There is no unfinished run, or it cannot be continued: its journal is damaged or in use, or a file
@@ -304,6 +305,8 @@ def resume(
         check_same_files(journal, question)
         remove_drafts(folder)
         study = prepare(question)
+        if question.chunk is None and executor is not None:  # it is continued in the batches in which it was begun
+            study = replace(study, question=replace(question, chunk=study.problem.tile))
         note_resumption(folder, journal.earlier_seconds)
         return _run(folder, study, journal, progress, executor)
 

@@ -72,8 +72,13 @@ def test_whatever_the_ego_does_the_answer_is_that_of_one_that_gives_nan(
     assert seen[-1].workers == 2
 
 
-def test_what_one_executor_began_another_continues(faulty: Path, risky: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    whole = evaluate.run(prepare(ask("nan", risky)))
+@pytest.mark.parametrize("chunk", [50, None])
+def test_what_one_executor_began_another_continues(
+    chunk: int | None, faulty: Path, risky: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(DrivingProblem, "tile", 50)
+    monkeypatch.setattr(DrivingProblem, "chunk_size", 30)
+    whole = evaluate.run(prepare(ask("nan", risky, chunk=chunk)))
     attempt, rows = DrivingProblem.attempt, [0]
 
     def interrupted(self: DrivingProblem, x: Any) -> Any:
@@ -85,7 +90,7 @@ def test_what_one_executor_began_another_continues(faulty: Path, risky: str, mon
     with monkeypatch.context() as patch:
         patch.setattr(DrivingProblem, "attempt", interrupted)
         with pytest.raises(evaluate.RunInterrupted, match="200 simulations are kept"):
-            evaluate.run_into(faulty / "run", prepare(ask("nan", risky)))
+            evaluate.run_into(faulty / "run", prepare(ask("nan", risky, chunk=chunk)))
     assert (faulty / "run" / JOURNAL).exists()
     report = evaluate.resume(faulty / "run", executor=samplers.LocalProcesses(1))
     assert report.estimate == whole.estimate
