@@ -38,8 +38,8 @@ rare_envs/CutIn-v0, us101-15-offsets: p = 7.82e-04 by 300,000,000 rollouts
 rare_envs/CutIn-v0, highway: p = 3.07e-04 by 300,000,000 rollouts
 ```
 
-Two-stage and auto in traffic are by the present code; what other tables have of them was measured at commit 8dec38c6, before the method lost
-components.
+Two-stage and auto in traffic are by the present code; what other tables have of them was measured at commit 8dec38c6,
+before the method lost components.
 
 - *mean / p*: mean of the estimates over the seeds, relative to the exact or reference probability.
 - *coverage*: share of the runs whose 95 % interval covers p.
