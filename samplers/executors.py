@@ -6,6 +6,7 @@ Each makes a pool for the length of a run. A pool passes chunks to objects with 
 
 from __future__ import annotations
 
+import functools
 import itertools
 import math
 import os
@@ -25,7 +26,7 @@ from typing import Any, Protocol, TypeAlias, runtime_checkable
 from samplers.chunks import Chunk, Index, Result
 from samplers.dispatch import Compute, ExecutorError, Limits, Pool, WorkerLost
 from samplers.validation import check_number, check_whole
-from samplers.workers import Reply, compute_in_worker, describe, describe_loss, name_process, pack
+from samplers.workers import Reply, compute_in_worker, describe, describe_loss, end_with, name_process, pack
 
 POLL_SECONDS = 0.05
 """Time [s] between two looks at jobs that cannot tell when they are done, such as those of submitit."""
@@ -411,7 +412,8 @@ class _LocalProcess:
     def __init__(self) -> None:
         import loky
 
-        self._executor = loky.ProcessPoolExecutor(1, initializer=_begin_process, env=ENVIRONMENT)
+        begin = functools.partial(_begin_process, os.getpid())
+        self._executor = loky.ProcessPoolExecutor(1, initializer=begin, env=ENVIRONMENT)
         self._numbers: set[int] = set()
 
     def submit(self, function: Any, *arguments: Any) -> Any:
@@ -428,10 +430,13 @@ class _LocalProcess:
         self._executor.shutdown(wait, kill_workers=True)
 
 
-def _begin_process() -> None:
-    """Make this process the leader of a group, which Ctrl-C does not reach: the driver decides."""
+def _begin_process(driver: int) -> None:
+    """Let this process end with its driver, and lead a group, which Ctrl-C does not reach: the driver decides."""
+    end_with(driver)
     if hasattr(os, "setsid"):
         os.setsid()
+        if os.getppid() != driver:  # it has ended already
+            os._exit(1)
 
 
 class _RayTasks:

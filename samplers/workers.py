@@ -87,12 +87,12 @@ def _load(key: str, packed: bytes, driver: ProcessName, limits: Limits) -> Compu
         while len(_loaded) > 2:
             _loaded.popitem(last=False)
         if name_process() != driver:
-            _end_with(driver.number)
+            end_with(driver.number)
             limit_memory(None if limits.n_bytes is None else int(limits.n_bytes))
     return _loaded[key]
 
 
-def _end_with(driver: int) -> None:
+def end_with(driver: int) -> None:
     """Let this process end with the driver that is its parent: the workers of most pools would wait for it for ever."""
 
     def watch() -> None:

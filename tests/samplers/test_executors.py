@@ -525,3 +525,39 @@ def test_what_a_simulation_draws_follows_from_the_seed_and_its_chunk() -> None:
     np.testing.assert_array_equal(first.points.f, again.points.f)
     noise = first.points.f - first.points.x[:, 0]
     assert len(np.unique(noise.round(9))) == 7  # chunks of 16
+
+
+SLOW_TO_LOAD = """
+import time
+import samplers
+
+class Slow:
+    dim, base = 1, samplers.StandardNormal(1)
+
+    def __reduce__(self):
+        return time.sleep, (600,)
+
+    def evaluate(self, x):
+        return x[:, 0]
+
+print("begun", flush=True)
+samplers.estimate(Slow(), "mc", seed=0, max_sim=100, workers=1)
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not Path("/proc").is_dir(), reason="processes are listed in /proc")
+def test_a_worker_that_has_computed_nothing_ends_with_its_driver() -> None:
+    with subprocess.Popen([sys.executable, "-c", SLOW_TO_LOAD], stdout=subprocess.PIPE) as driver:
+        assert wait_until(lambda: children_of(driver.pid))
+        time.sleep(5.0)  # the worker begins to load
+        workers = children_of(driver.pid)
+        driver.kill()
+        driver.wait()
+    assert workers
+    assert wait_until(lambda: not any(map(is_running, workers)), 20.0)
+
+
+def children_of(number: int) -> list[int]:
+    """Return the processes that a process has started."""
+    return [int(each) for each in Path(f"/proc/{number}/task/{number}/children").read_text().split()]
