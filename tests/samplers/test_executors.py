@@ -179,6 +179,8 @@ def test_a_driver_that_is_killed_goes_on_under_another_executor(
     name: str, others: tuple[str, ...], tmp_path: Path
 ) -> None:
     """It is killed under each executor but for the last one, which brings the run to its end."""
+    for library in {"dask", "ray"} & {name, *others}:
+        pytest.importorskip(library)
     n = 40 + 40 * len(others)
     for each in (name, *others[:-1]):
         kill_in_mid_run(start_driver(tmp_path, each, n), tmp_path)
