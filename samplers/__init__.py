@@ -14,7 +14,6 @@ from samplers.arguments import RunArguments
 from samplers.comparison import Comparison, compare
 from samplers.dispatch import ExecutorError
 from samplers.distributions import as_distribution
-from samplers.errors import EvaluationError
 from samplers.estimation import EstimationInterrupted, estimate
 from samplers.executors import Executor, FuturesPool, InProcess, LocalProcesses, RayCluster
 from samplers.method import Goal, Interrupted, Outcome, Stepping, Steps
@@ -42,8 +41,8 @@ from samplers.progress import Progress
 from samplers.registry import METHODS, get_method
 from samplers.result import Estimate
 from samplers.run import Run
-from samplers.sample import Failure, Failures, Layer, Sample, SimulatedPoints
-from samplers.trace import Level, Status
+from samplers.sample import Failure, Failures, Layer, Level, Sample, SimulatedPoints, Status
+from samplers.validation import EvaluationError
 
 __all__ = [
     "METHODS",

@@ -11,10 +11,9 @@ import numpy as np
 from scipy.special import chdtri, gammaincinv, ndtr, ndtri, stdtrit
 
 from samplers.analysis.refits import check_refits
-from samplers.errors import ON_ERROR, OnError
 from samplers.method import Goal, Stepping, TermsOffer
 from samplers.problem import Distribution, FloatArray, Inputs
-from samplers.validation import check_name, check_number, check_whole
+from samplers.validation import ON_ERROR, OnError, check_name, check_number, check_whole
 
 MOST_SIMULATIONS = 10**12
 """Largest `max_sim`: more is a slip of the keyboard."""

@@ -10,8 +10,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from samplers.errors import FinalError
 from samplers.problem import FloatArray
+from samplers.validation import FinalError
 
 Index = tuple[int, ...]
 """Number of a chunk in its run; of a part that is computed by itself, also its number in the chunk. It keys random

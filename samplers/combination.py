@@ -9,9 +9,8 @@ import numpy as np
 from scipy.special import chdtrc, stdtrit
 
 from samplers.method import Outcome
-from samplers.sample import DrawWeights, Sample
+from samplers.sample import DrawWeights, Level, Sample, Status
 from samplers.statistics import Interval, binomial_cov
-from samplers.trace import Level, Status
 
 OWN_ERROR_FACTOR = 1.5
 """Factor by which runs may understate their own errors before they are said to disagree."""

@@ -15,15 +15,23 @@ from samplers.analysis.refits import find_fitted_base, reweight_runs_to_refits
 from samplers.analysis.reweight import MAX_LOG
 from samplers.analysis.weighted import cov_inflation, has_independent_points, interval_of_sum, require_sample
 from samplers.arguments import RunArguments, check_problem
-from samplers.display import drawing_axes, html_table, indent_lines, require_pandas
 from samplers.estimation import estimate
 from samplers.method import Stepping
 from samplers.methods.auto import Auto
+from samplers.output import (
+    drawing_axes,
+    html_table,
+    indent_lines,
+    read_object,
+    register_stored,
+    require_pandas,
+    to_json_value,
+    write_object,
+)
 from samplers.problem import FloatArray, Problem, condition_of, names_of_columns
 from samplers.progress import Listener
 from samplers.result import Estimate, without_base
 from samplers.statistics import Interval, degrees_of_freedom, effective_number, zero_hit_bound
-from samplers.stored import read_object, register_stored, to_json_value, write_object
 from samplers.validation import check_whole
 
 if TYPE_CHECKING:

@@ -10,7 +10,6 @@ from pathlib import Path
 
 from samplers.analysis.refits import needs_ensemble_run, pool_refits
 from samplers.arguments import InputsOnly, RunArguments, check_attributes, check_problem, choose_seed, find_base_fault
-from samplers.errors import OnError
 from samplers.evaluate import Evaluator
 from samplers.executors import AnyExecutor, find_executor
 from samplers.journal import Journal, JournalError, NothingRecorded
@@ -23,8 +22,8 @@ from samplers.progress import Listener, Pace, Progress, open_listener
 from samplers.registry import get_method
 from samplers.result import Estimate
 from samplers.run import Run
-from samplers.trace import Status
-from samplers.validation import check_number
+from samplers.sample import Status
+from samplers.validation import OnError, check_number
 
 
 class EstimationInterrupted(KeyboardInterrupt):

@@ -20,12 +20,11 @@ from numpy.typing import DTypeLike, NDArray
 
 from samplers.chunks import NAN_REASON, Attempted, Chunk, Result, isolate, join_results
 from samplers.dispatch import Dispatcher
-from samplers.errors import EvaluationError, OnError, describe_point, one_per_row
 from samplers.executors import Executor
 from samplers.journal import Journal, JournalError, digest_points
 from samplers.method import Answer, GradientRequest, Request, TermsOffer, TermsRequest, whole_simulations
 from samplers.problem import FloatArray, TermGradients, Terms, condition_of, names_of_columns, offers_terms
-from samplers.validation import check_number, check_whole
+from samplers.validation import EvaluationError, OnError, check_number, check_whole, describe_point, one_per_row
 from samplers.workers import SeededWork
 
 CHUNK_SIZE = 16

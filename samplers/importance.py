@@ -45,7 +45,7 @@ from numpy.typing import NDArray
 from samplers.method import Goal, Interrupted, Outcome, no_outcome_share
 from samplers.problem import FloatArray, Inputs
 from samplers.proposals import Gaussian, Mixture, ProposalDistribution, SupportsLogProb
-from samplers.sample import DrawWeights, Sample
+from samplers.sample import DrawWeights, Level, Sample, Status
 from samplers.statistics import (
     Interval,
     binomial_cov,
@@ -55,7 +55,6 @@ from samplers.statistics import (
     largest_weight_share,
     log_normal_interval,
 )
-from samplers.trace import Level, Status
 
 RIDGE = 0.1
 """r: a control whose variance within the strata is well below this explains little, and few draws would decide b."""

@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 
 from samplers.method import Interrupted
 from samplers.problem import FloatArray, Inputs
-from samplers.trace import Status
+from samplers.sample import Status
 
 
 class Step(NamedTuple):

@@ -10,8 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from samplers.distributions import as_distribution
-from samplers.errors import EvaluationError, one_per_row
-from samplers.validation import check_number, check_whole
+from samplers.validation import EvaluationError, check_number, check_whole, one_per_row
 
 FloatArray = NDArray[np.float64]
 

@@ -7,7 +7,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import Protocol
 
-from samplers.trace import Level
+from samplers.sample import Level
 
 
 @dataclass(frozen=True, kw_only=True)

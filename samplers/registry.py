@@ -16,7 +16,7 @@ from samplers.methods.monte_carlo import MonteCarlo
 from samplers.methods.subset import AdaptiveSubsetSimulation, SubsetSimulation
 from samplers.methods.surrogate import Surrogate
 from samplers.methods.two_stage.method import TwoStage
-from samplers.stored import register_stored
+from samplers.output import register_stored
 from samplers.validation import check_name
 
 ENTRY_POINT_GROUP = "rare_envs.samplers"

@@ -18,25 +18,36 @@ from samplers.analysis.kinds import Share, split_by_kind
 from samplers.analysis.reweight import Reweighted, find_sibling, reweight_estimate
 from samplers.analysis.sensitivity import Sensitivity, compute_sensitivity
 from samplers.analysis.weighted import require_sample
-from samplers.display import drawing_axes, html_table, indent_lines, require_pandas
-from samplers.estimate_data import EstimateData
-from samplers.method import Stepping
-from samplers.problem import Distribution, FloatArray
-from samplers.sample import DrawWeights, Failures, Layer, Sample, SimulatedPoints, SimulationIndex
-from samplers.statistics import zero_hit_bound
-from samplers.stored import (
+from samplers.method import EstimateData, Stepping
+from samplers.output import (
     StoredMethod,
     arrow_table,
     columns_of_sample,
     columns_of_simulations,
+    drawing_axes,
+    html_table,
+    indent_lines,
     is_stored,
     read_object,
     register_stored,
+    require_pandas,
     set_apart,
     to_json_value,
     write_object,
 )
-from samplers.trace import Level, Status, describe_outcome
+from samplers.problem import Distribution, FloatArray
+from samplers.sample import (
+    DrawWeights,
+    Failures,
+    Layer,
+    Level,
+    Sample,
+    SimulatedPoints,
+    SimulationIndex,
+    Status,
+    describe_outcome,
+)
+from samplers.statistics import zero_hit_bound
 
 if TYPE_CHECKING:
     import pandas

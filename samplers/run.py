@@ -12,7 +12,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from samplers.arguments import InputsOnly, RunArguments, check_arguments, choose_seed
 from samplers.combination import combine, combined_cov, pool_counts
-from samplers.errors import EvaluationError, OnError, describe_point, one_per_row
 from samplers.method import (
     Answer,
     Choice,
@@ -30,9 +29,9 @@ from samplers.method import (
 from samplers.problem import Distribution, FloatArray, Inputs, TermGradients, Terms, condition_of, names_of_columns
 from samplers.progress import Listener, Monitor, Progress
 from samplers.result import Estimate
-from samplers.sample import Failures, SimulatedPoints, SimulationIndex
+from samplers.sample import Failures, SimulatedPoints, SimulationIndex, Status
 from samplers.statistics import gain_over_monte_carlo
-from samplers.trace import Status
+from samplers.validation import EvaluationError, OnError, describe_point, one_per_row
 
 MIN_REPLICATES = 5
 """Runs made at least where those asked for miss target_cov: fewer give a useless t interval."""

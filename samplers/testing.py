@@ -19,7 +19,7 @@ from samplers.method import Stepping
 from samplers.problem import Distribution, FloatArray, FunctionProblem
 from samplers.result import Estimate
 from samplers.run import NOT_KNOWN, Run
-from samplers.trace import Status
+from samplers.sample import Status
 
 F = Callable[[FloatArray], FloatArray]
 

@@ -23,8 +23,8 @@ from threadpoolctl import threadpool_limits
 import samplers
 from benchmarks.samplers.runs import Meter, about
 from samplers.limit_states import half_space
+from samplers.output import to_json_value
 from samplers.problem import FunctionProblem
-from samplers.stored import to_json_value
 
 TARGETS = {6: 0.3, 428: 2.0}
 """Seconds for the default method, by dimension."""

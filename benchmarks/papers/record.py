@@ -16,7 +16,7 @@ from benchmarks.papers.markdown import format_reproduction
 from benchmarks.samplers.runs import about
 from rare_envs.files import format_json
 from rare_envs.study.errors import BadInput
-from samplers.stored import to_json_value
+from samplers.output import to_json_value
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -26,7 +26,7 @@ from benchmarks.papers.tian2024.replications import (
 from benchmarks.papers.tian2024.study import TianPlan, open_replications, record_replications
 from benchmarks.samplers.runs import map_jobs
 from rare_envs.files import format_json
-from samplers.stored import to_json_value
+from samplers.output import to_json_value
 
 FURTHER = tuple(name for name, row in METHOD_ROWS.items() if not row.paper)
 """Methods of Tian et al.'s tables that their paper does not have."""

@@ -16,7 +16,7 @@ from rare_envs.study.errors import BadInput
 
 if TYPE_CHECKING:
     from samplers import Executor, RunArguments, Stepping
-    from samplers.errors import OnError
+    from samplers.validation import OnError
 
 GIB = 2.0**30
 EXECUTORS = ("local", "ray")

@@ -51,11 +51,11 @@ from rare_envs.study.writing import (
     write_run,
 )
 from samplers.dispatch import ExecutorError
-from samplers.errors import OnError
 from samplers.estimation import Simulation, check_base
 from samplers.evaluate import Evaluator
 from samplers.executors import Executor
 from samplers.journal import Journal
+from samplers.validation import OnError
 
 
 class UnwrittenResults(BadInput):

@@ -11,7 +11,7 @@ from typing import Any
 from rare_envs.study.report import Report
 from samplers.journal import Journal
 from samplers.result import Estimate
-from samplers.trace import Status
+from samplers.sample import Status
 
 NOT_KEPT = " With --out finished simulations would have been kept."
 """Advice where simulations are lost."""

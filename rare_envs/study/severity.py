@@ -24,8 +24,8 @@ from samplers.analysis import (
     expect_under_refits,
     weigh_failures,
 )
-from samplers.display import drawing_axes
-from samplers.estimate_data import EstimateData
+from samplers.method import EstimateData
+from samplers.output import drawing_axes
 from samplers.problem import FloatArray
 
 if TYPE_CHECKING:

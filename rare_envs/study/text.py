@@ -18,9 +18,9 @@ from rare_envs.measures import MEASURES
 from rare_envs.study.columns import MAX_SHOWN, draw_ordinary, find_ordinary_range, format_value, list_columns
 from rare_envs.study.modes import KIND_DESCRIPTIONS
 from rare_envs.study.report import Report
-from samplers.display import indent_lines
+from samplers.output import indent_lines
 from samplers.problem import FloatArray
-from samplers.trace import describe_outcome
+from samplers.sample import describe_outcome
 
 EVENT_NOUNS = {"cut_in": "cut-ins", "hard_brake": "brakings", "car_following": "new leaders"}
 """Events of the scenarios, in the plural."""

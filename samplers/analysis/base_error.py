@@ -54,10 +54,10 @@ from samplers.analysis.refits import (
     split_families,
 )
 from samplers.analysis.weighted import band_generator, no_outcome_weight, require_sample, simultaneous_level
-from samplers.estimate_data import EstimateData
+from samplers.method import EstimateData
+from samplers.output import to_json_value
 from samplers.problem import FloatArray
 from samplers.statistics import Interval
-from samplers.stored import to_json_value
 
 FIT_BIAS = 0.2
 """Bias of the fit itself in log p (floor of the covariances, local optima of the mixture), which refits repeat: it

@@ -16,13 +16,20 @@ from samplers.analysis.weighted import (
     simultaneous_intervals,
     unit_sums,
 )
-from samplers.display import drawing_axes, html_table, require_pandas
-from samplers.errors import needs_library
-from samplers.estimate_data import EstimateData
+from samplers.method import EstimateData
+from samplers.output import (
+    drawing_axes,
+    html_table,
+    read_object,
+    register_stored,
+    require_pandas,
+    to_json_value,
+    write_object,
+)
 from samplers.problem import FloatArray
 from samplers.sample import Sample
 from samplers.statistics import add_unseen
-from samplers.stored import read_object, register_stored, to_json_value, write_object
+from samplers.validation import needs_library
 
 if TYPE_CHECKING:
     import pandas

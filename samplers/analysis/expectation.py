@@ -21,12 +21,11 @@ from samplers.analysis.weighted import (
     simultaneous_intervals,
     unit_sums,
 )
-from samplers.display import drawing_axes
-from samplers.estimate_data import EstimateData
+from samplers.method import EstimateData
+from samplers.output import drawing_axes, to_json_value
 from samplers.problem import FloatArray
 from samplers.sample import Sample
 from samplers.statistics import Interval, effective_number
-from samplers.stored import to_json_value
 
 
 @dataclass(frozen=True, kw_only=True)

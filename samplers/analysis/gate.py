@@ -29,10 +29,10 @@ from dataclasses import asdict, dataclass
 from typing import Any, Literal
 
 from samplers.analysis.base_error import BaseUncertainty
-from samplers.estimate_data import EstimateData
+from samplers.method import EstimateData
+from samplers.output import to_json_value
+from samplers.sample import Status
 from samplers.statistics import Interval, zero_hit_bound
-from samplers.stored import to_json_value
-from samplers.trace import Status
 from samplers.validation import check_number
 
 Decision = Literal["passes", "fails", "undecided"]

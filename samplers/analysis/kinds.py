@@ -17,11 +17,11 @@ from samplers.analysis.weighted import (
     require_sample,
     unit_sums,
 )
-from samplers.estimate_data import EstimateData
+from samplers.method import EstimateData
+from samplers.output import to_json_value
 from samplers.problem import FloatArray
 from samplers.sample import Sample
 from samplers.statistics import Interval
-from samplers.stored import to_json_value
 
 NO_OUTCOME_LABEL = "no outcome"
 """Label of points on which f raised or gave NaN and that were counted as failing."""

@@ -32,7 +32,7 @@ from samplers.analysis.reweight import (
     subtract_log_densities,
 )
 from samplers.analysis.weighted import require_sample
-from samplers.estimate_data import EstimateData
+from samplers.method import EstimateData
 from samplers.problem import Distribution, FloatArray
 from samplers.statistics import effective_number, raise_log_end
 

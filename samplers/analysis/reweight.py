@@ -8,10 +8,10 @@ import numpy as np
 
 from samplers.analysis.weighted import MIN_UNITS, cov_inflation, has_independent_points, interval_of_sum, require_sample
 from samplers.distributions import as_distribution, can_convert
-from samplers.estimate_data import EstimateData
+from samplers.method import EstimateData
+from samplers.output import to_json_value
 from samplers.problem import Distribution, FloatArray
 from samplers.statistics import Interval, add_unseen, effective_number
-from samplers.stored import to_json_value
 
 MIN_POINTS = 30.0
 """Effective number of failing points that the estimate must rest on."""

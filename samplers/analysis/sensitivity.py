@@ -52,11 +52,11 @@ import numpy as np
 from samplers.analysis.refits import find_fitted_base, reweight_to_refits
 from samplers.analysis.reweight import HasLogProb, log_density, require_base
 from samplers.analysis.weighted import WeightedFailures, mean_over_failures, weigh_failures
-from samplers.errors import needs_library
-from samplers.estimate_data import EstimateData
+from samplers.method import EstimateData
+from samplers.output import to_json_value
 from samplers.problem import Distribution, FloatArray
 from samplers.statistics import effective_number
-from samplers.stored import to_json_value
+from samplers.validation import needs_library
 
 ROUNDING_VARIANCE = 1e-12
 """Of u_j given failure: below it points are equal but for rounding."""

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 from scipy.special import ndtr
 
-from samplers.estimate_data import EstimateData
+from samplers.method import EstimateData
 from samplers.problem import FloatArray
 from samplers.sample import Sample
 from samplers.statistics import Interval, clopper_pearson, degrees_of_freedom, effective_number, log_normal_interval

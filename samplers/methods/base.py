@@ -3,10 +3,10 @@
 from typing import Protocol, runtime_checkable
 
 from samplers.arguments import RunArguments
-from samplers.errors import OnError
 from samplers.method import Stepping
 from samplers.problem import Inputs
 from samplers.run import Run
+from samplers.validation import OnError
 
 
 @runtime_checkable

@@ -33,7 +33,6 @@ from scipy.optimize import minimize
 from scipy.special import betainc, betaincc, betainccinv, betaincinv, betaln, digamma, ndtr, ndtri
 
 from samplers.distributions import SizedDistribution, as_distribution, can_convert
-from samplers.errors import needs_library
 from samplers.problem import FloatArray, Inputs
 from samplers.proposals import (
     Gaussian,
@@ -44,6 +43,7 @@ from samplers.proposals import (
     shrink_towards_present,
     weighted_moments,
 )
+from samplers.validation import needs_library
 
 
 def beta_statistics(alpha: FloatArray, beta: FloatArray) -> FloatArray:

@@ -25,8 +25,8 @@ from samplers.methods.base import Method
 from samplers.methods.blocks import GaussianBlock, MixtureBlock, NormalBlock, Product, announced_blocks
 from samplers.problem import FloatArray, Inputs
 from samplers.proposals import Gaussian, ProposalDistribution
+from samplers.sample import Level, Status
 from samplers.statistics import next_level, normalise_weights
-from samplers.trace import Level, Status
 from samplers.validation import check_choice, check_count, check_setting, is_number
 
 

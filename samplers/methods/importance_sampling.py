@@ -20,8 +20,8 @@ from samplers.method import Goal, Interrupted, Steps
 from samplers.methods.base import Method
 from samplers.problem import FloatArray, Inputs, StandardNormal
 from samplers.proposals import Mixture, ProposalDistribution, TiltedNormal
+from samplers.sample import Level, Status
 from samplers.statistics import next_level, normalise_weights
-from samplers.trace import Level, Status
 from samplers.validation import check_count, check_setting
 
 QUANTILE = 1.96

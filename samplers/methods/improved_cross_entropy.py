@@ -30,8 +30,8 @@ from samplers.proposals import (
     fit_proposal_mixture,
     fit_shrunk_gaussian,
 )
+from samplers.sample import Level, Status
 from samplers.statistics import normalise_weights
-from samplers.trace import Level, Status
 from samplers.validation import check_choice, check_count, check_setting
 
 WIDEST = 10.0

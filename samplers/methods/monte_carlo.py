@@ -9,9 +9,8 @@ from numpy.typing import NDArray
 from samplers.method import Goal, Interrupted, Outcome, Steps
 from samplers.methods.base import Method
 from samplers.problem import FloatArray, Inputs
-from samplers.sample import DrawWeights, Sample
+from samplers.sample import DrawWeights, Level, Sample, Status
 from samplers.statistics import binomial_cov
-from samplers.trace import Level, Status
 from samplers.validation import check_count
 
 MOST_DRAWS = 2**20

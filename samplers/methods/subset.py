@@ -32,7 +32,7 @@ from samplers.mcmc import (
 from samplers.method import Goal, Outcome, Steps, no_outcome_share
 from samplers.methods.base import Method
 from samplers.problem import FloatArray, Inputs
-from samplers.sample import Layer, Sample
+from samplers.sample import Layer, Level, Sample, Status
 from samplers.statistics import (
     Interval,
     binomial_cov,
@@ -41,7 +41,6 @@ from samplers.statistics import (
     log_normal_interval,
     next_level,
 )
-from samplers.trace import Level, Status
 from samplers.validation import check_choice, check_count, check_setting
 
 LONGEST_CHAIN = 50

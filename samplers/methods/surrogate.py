@@ -35,6 +35,7 @@ from samplers.methods.two_stage.method import run_two_stage
 from samplers.methods.two_stage.regions import count_lineages
 from samplers.problem import FloatArray, Inputs, StandardNormal
 from samplers.proposals import Gaussian, Mixture, TiltedNormal, fit_proposal_mixture, fit_shrunk_gaussian
+from samplers.sample import Level, Status
 from samplers.statistics import (
     Interval,
     add_unseen,
@@ -44,7 +45,6 @@ from samplers.statistics import (
     log_sum_exp,
     normalise_weights,
 )
-from samplers.trace import Level, Status
 from samplers.validation import check_count
 
 

@@ -5,13 +5,15 @@ import math
 import numpy as np
 import pytest
 
-from samplers.errors import EvaluationError, describe_point, one_per_row
 from samplers.validation import (
+    EvaluationError,
     check_choice,
     check_count,
     check_name,
     check_whole,
+    describe_point,
     is_number,
+    one_per_row,
 )
 
 

@@ -9,9 +9,8 @@ import samplers
 from samplers.combination import combine, combined_cov
 from samplers.limit_states import half_space
 from samplers.method import Outcome
-from samplers.sample import Sample
+from samplers.sample import Sample, Status
 from samplers.statistics import binomial_cov, clopper_pearson
-from samplers.trace import Status
 
 
 def outcome(p, cov=0.2, status=Status.CONVERGED, warnings=(), interval=(0.0, 1.0), **more):

@@ -11,8 +11,8 @@ import pytest
 from matplotlib import pyplot
 
 import samplers
-from samplers.display import html_table
 from samplers.limit_states import half_space
+from samplers.output import html_table
 
 matplotlib.use("Agg")
 PNG, PDF = b"\x89PNG", b"%PDF"

@@ -24,7 +24,7 @@ from samplers.limit_states import half_space
 from samplers.method import Goal
 from samplers.problem import StandardNormal
 from samplers.proposals import Gaussian, TiltedNormal
-from samplers.trace import Status
+from samplers.sample import Status
 
 BETA = 1.7
 P = stats.norm.sf(BETA)

@@ -15,7 +15,7 @@ from samplers.estimation import EstimationInterrupted
 from samplers.method import Answer
 from samplers.platform_calls import defer_signals
 from samplers.problem import FloatArray
-from samplers.trace import Status
+from samplers.sample import Status
 
 
 @pytest.fixture(autouse=True)

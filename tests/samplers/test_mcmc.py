@@ -24,7 +24,7 @@ from samplers.mcmc import (
 )
 from samplers.method import Interrupted
 from samplers.problem import FunctionProblem
-from samplers.trace import Status
+from samplers.sample import Status
 
 LEVEL = -1.0
 

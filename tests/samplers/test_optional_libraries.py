@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 import samplers
-from samplers.errors import needs_library
 from samplers.methods.blocks import project_mean
+from samplers.validation import needs_library
 
 
 def test_another_missing_module_is_an_error_of_its_own() -> None:

@@ -9,8 +9,7 @@ import pytest
 
 import samplers
 from samplers.limit_states import half_space
-from samplers.sample import Failures
-from samplers.trace import Status, describe_outcome
+from samplers.sample import Failures, Status, describe_outcome
 from tests.samplers.fitted_bases import fitted, resampled, run
 
 

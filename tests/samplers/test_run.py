@@ -6,13 +6,13 @@ import pytest
 import samplers
 from samplers.arguments import RunArguments
 from samplers.combination import combine
-from samplers.errors import EvaluationError
 from samplers.limit_states import half_space
 from samplers.method import Goal, GradientRequest, Interrupted, Outcome, TermsOffer, TermsRequest
 from samplers.problem import StandardNormal
 from samplers.run import NOT_KNOWN, SMALLEST_F, EvaluationLog, Replicate, Run, split_budget
+from samplers.sample import Status
 from samplers.statistics import binomial_cov, clopper_pearson
-from samplers.trace import Status
+from samplers.validation import EvaluationError
 from tests.samplers.conftest import QUICK_METHODS
 
 EASY = half_space(2, 2.0).problem

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import samplers
-from samplers.stored import StoredMethod, read_object, register_stored, write_object
+from samplers.output import StoredMethod, read_object, register_stored, write_object
 
 
 @dataclass(frozen=True)

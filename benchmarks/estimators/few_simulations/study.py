@@ -29,7 +29,7 @@ from benchmarks.estimators.two_stage.repeated_seeds import (
     summarise_runs,
 )
 from benchmarks.samplers.runs import about
-from samplers.stored import to_json_value
+from samplers.output import to_json_value
 
 
 class Cell(NamedTuple):

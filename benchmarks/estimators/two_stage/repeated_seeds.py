@@ -24,8 +24,8 @@ from threadpoolctl import threadpool_limits
 import samplers
 from benchmarks.samplers.problems import PROBLEMS
 from benchmarks.samplers.runs import about
+from samplers.output import to_json_value
 from samplers.problem import FloatArray, FunctionProblem
-from samplers.stored import to_json_value
 
 FAR_OFF = 4.0
 """A run is far off if its error is more than so many of its own standard errors; a normal one is once in 16,000."""

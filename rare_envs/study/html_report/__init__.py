@@ -41,7 +41,7 @@ from rare_envs.study.text import (
 )
 from rare_envs.traffic.palette import CRASH_COLOUR, ROLE_COLOURS
 from samplers.problem import FloatArray
-from samplers.trace import describe_outcome
+from samplers.sample import describe_outcome
 
 __all__ = ["write_html_report"]
 

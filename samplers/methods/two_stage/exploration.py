@@ -46,8 +46,8 @@ from samplers.methods.two_stage.regions import (
 from samplers.methods.two_stage.settings import EXPLORATION, LINES, SUBSPACE
 from samplers.methods.two_stage.simulator import ComponentDraws, SimulationSteps, Simulator
 from samplers.problem import FloatArray
+from samplers.sample import Level, Status
 from samplers.statistics import next_level
-from samplers.trace import Level, Status
 
 _A = TypeVar("_A")
 _B = TypeVar("_B")

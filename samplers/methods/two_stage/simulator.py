@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from samplers.components import MixtureComponent
 from samplers.method import Goal
 from samplers.problem import FloatArray, Inputs
-from samplers.trace import Level
+from samplers.sample import Level
 
 _T = TypeVar("_T")
 SimulationSteps = Generator[FloatArray, FloatArray, _T]

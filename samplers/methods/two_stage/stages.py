@@ -39,9 +39,8 @@ from samplers.methods.two_stage.stratified import (
     check_rounds,
 )
 from samplers.problem import FloatArray, Inputs
-from samplers.sample import DrawWeights, Sample
+from samplers.sample import DrawWeights, Level, Sample, Status
 from samplers.statistics import Interval, binomial_cov, effective_sample_size
-from samplers.trace import Level, Status
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,7 +8,7 @@ from benchmarks.papers.renew import read_records, read_replications
 from benchmarks.papers.tian2024.replications import ReplicationJob, ReplicationRun, run_replication
 from benchmarks.papers.tian2024.tables import make_method_tables
 from rare_envs.threads import use_one_thread
-from samplers.stored import to_json_value
+from samplers.output import to_json_value
 from tests.benchmarks.papers.same_records import assert_same
 
 

@@ -10,8 +10,8 @@ import pytest
 import rare_envs
 import samplers
 from rare_envs.egos.errors import EgoGone
-from samplers.errors import EvaluationError
 from samplers.evaluate import Evaluator
+from samplers.validation import EvaluationError
 
 ENV = "rare_envs/CarFollowing-v0"
 GAP = 30.0

@@ -11,7 +11,7 @@ from samplers.limit_states import four_branches, half_space, parabola, plateau
 from samplers.method import Goal
 from samplers.problem import StandardNormal
 from samplers.proposals import TiltedNormal
-from samplers.trace import Status
+from samplers.sample import Status
 
 IS = samplers.ImportanceSampling
 

@@ -11,7 +11,7 @@ from samplers.limit_states import four_branches, half_space, parabola, plateau, 
 from samplers.method import Goal
 from samplers.methods.improved_cross_entropy import log_smooth_indicator, next_width, weights_cov
 from samplers.problem import FunctionProblem
-from samplers.trace import Status
+from samplers.sample import Status
 
 ICE = samplers.ImprovedCrossEntropy
 FAMILIES = ("gaussian", "mixture", "vmfn")

@@ -6,7 +6,7 @@ from scipy.stats import chi2, norm
 
 import samplers
 from samplers.problem import TermGradients, Terms
-from samplers.trace import Status
+from samplers.sample import Status
 
 
 def make_half_spaces(dim, p, shares=(0.8, 0.15, 0.05), scale=None, seed=0, **options):

@@ -11,7 +11,7 @@ from samplers.limit_states import half_space, plateau, shell
 from samplers.method import Goal
 from samplers.methods.subset import descent_cov
 from samplers.problem import FunctionProblem
-from samplers.trace import Status
+from samplers.sample import Status
 
 ADSS = samplers.AdaptiveSubsetSimulation
 SS = samplers.SubsetSimulation

@@ -43,8 +43,8 @@ from samplers.methods.two_stage.terms.walks import (
     walk_downhill,
 )
 from samplers.problem import FloatArray, Inputs, Terms
+from samplers.sample import Level, Status
 from samplers.statistics import binomial_cov, clopper_pearson, effective_sample_size
-from samplers.trace import Level, Status
 
 _T = TypeVar("_T")
 
