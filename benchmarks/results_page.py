@@ -47,7 +47,9 @@ before the method lost components.
 - *gain*: simulations that plain Monte Carlo needs for the same mean square error, over those of the method.
 """
 SHOWN_PAPERS = ("tian2024", "okelly2018_full", "okelly2018_vision")
-COMPARED = ("mean of p", "gain over plain Monte Carlo", "p (", "variance, naive / sampler")
+SHOWN_STATES = 28
+"""Limit states with the least gains that the page shows; the records have all."""
+COMPARED = ("mean of p", "gain over plain Monte Carlo", "p (")
 """Quantities of a paper's tables that the page shows, by their beginnings."""
 
 
@@ -109,9 +111,8 @@ def format_known() -> Iterator[str]:
         (row for record in records for row in record["rows"] if row["gain"] is not None),
         key=lambda row: float(row["gain"]),
     )
-    heads = ("problem", "p", "gain", "coverage", "low : high", "c.o.v. (own)", "error / own")
     yield format_table(
-        heads,
+        ("problem", "p", "gain", "coverage", "low : high", "c.o.v. (own)", "error / own"),
         (
             (
                 row["problem"],
@@ -122,16 +123,20 @@ def format_known() -> Iterator[str]:
                 _format_cov(row),
                 f"{row['error_over_own']:.2f}",
             )
-            for row in rows
+            for row in rows[:SHOWN_STATES]
         ),
     )
+    others = rows[SHOWN_STATES:]
+    held = sum(row["coverage"] * row["runs"] for row in others) / sum(row["runs"] for row in others)
+    least = f"{others[0]['gain']:,.2g}"
+    yield f"\nThe other {len(others)} have gains of {least} and more; {held:.1%} of their intervals cover p."
 
 
 def format_few() -> Iterator[str]:
     """Yield the section of small budgets."""
     record = read("few_simulations")
     yield "## The surrogate with 300 simulations\n"
-    rows = [row for row in record["rows"] if row["max_sim"] == 300 and row["runs"] >= 5]
+    rows = [row for row in record["rows"] if (row["method"], row["max_sim"]) == ("surrogate", 300) and row["runs"] >= 5]
     yield format_table(
         ("problem", "d", "p", "runs", "gain", "coverage", "c.o.v. (own)"),
         (
@@ -183,14 +188,13 @@ def format_egos(ids: frozenset[str]) -> Iterator[str]:
     yield f"## Shipped egos\n\n`{record['command']}`: p of a collision within 10 s by two-stage.\n"
     cells = [cell for cell in record["cells"] if cell["method"] == "two-stage" and cell["env_id"] in ids]
     yield format_table(
-        ("scenario", "ego", "p", "95 % interval", "simulations", "warnings", "likeliest crash"),
+        ("scenario", "ego", "p", "95 % interval", "warnings", "likeliest crash"),
         (
             (
                 name_of(cell["env_id"]),
                 f"`{cell['ego']}`" + (f", {cell['steps']:,} steps" if cell["steps"] else ""),
                 f"{cell['p']:.1e}",
                 f"{cell['low']:.1e} to {cell['high']:.1e}",
-                f"{cell['n_sim']:,}",
                 str(len(cell["warnings"])),
                 cell["words"] or "none found",
             )
@@ -201,18 +205,27 @@ def format_egos(ids: frozenset[str]) -> Iterator[str]:
 
 def format_papers() -> Iterator[str]:
     """Yield the section of both papers: p and gains; the records have every row."""
-    yield "## Papers\n\nWhat the papers print beside what this package finds; every row, the released code and the"
-    yield "reasons of differences are in the records, and in `reproduction.md` of `python -m benchmarks.papers`.\n"
+    yield "## Papers\n\nWhat the papers print beside what this package finds; every row and the reasons of differences"
+    yield "are in the records, and in `reproduction.md` of `python -m benchmarks.papers`.\n"
     for name in SHOWN_PAPERS:
         record = read(name)
-        rows = [
-            (*value["labels"], value["quantity"], _number(value["paper"]), _number(value["ours"]))
-            for table in record["tables"]
-            for value in table["values"]
-            if value["quantity"].startswith(COMPARED) and None not in (value["paper"], value["ours"])
-        ]
         yield f"\n`{record['command']}`\n"
-        yield format_table(("row", "of", "quantity", "paper", "ours"), rows)
+        rows = [row for table in record["tables"] for row in _compare(table["values"])]
+        width = max(map(len, rows))
+        yield format_table(
+            ("row", "of", "p, paper", "p, ours", "gain, paper", "gain, ours")[:width],
+            (row + ("",) * (width - len(row)) for row in rows),
+        )
+
+
+def _compare(values: Iterable[Mapping[str, Any]]) -> list[tuple[str, ...]]:
+    """Return a row for each method of a paper's table: labels, p and, where the paper has it, gain."""
+    rows: dict[tuple[str, ...], tuple[str, ...]] = {}
+    for value in values:
+        if value["quantity"].startswith(COMPARED) and None not in (value["paper"], value["ours"]):
+            labels = tuple(value["labels"])
+            rows[labels] = (*rows.get(labels, labels), _number(value["paper"]), _number(value["ours"]))
+    return list(rows.values())
 
 
 def _number(value: float) -> str:
