@@ -6,7 +6,8 @@ Where HighwayEnv draws, the distributions are those from which it draws; docs/hi
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any
+from functools import cached_property
+from typing import Any, NamedTuple
 
 import numpy as np
 from highway_env.envs.highway_env import HighwayEnv
@@ -17,6 +18,7 @@ from highway_env.utils import class_from_path
 from highway_env.vehicle.behavior import IDMVehicle
 from highway_env.vehicle.controller import ControlledVehicle, MDPVehicle
 from highway_env.vehicle.kinematics import Vehicle
+from numpy.typing import ArrayLike
 
 from rare_envs.arrays import FloatArray
 from rare_envs.distributions.beta import BetaDistribution
@@ -29,8 +31,7 @@ HIGHWAY_ENV_LENGTH: float = Vehicle.LENGTH
 """Length of HighwayEnv's vehicles [m]."""
 
 
-@dataclass(frozen=True)
-class Group:
+class Group(NamedTuple):
     """Parameters that are drawn together, independent of all others."""
 
     parameters: tuple[Parameter, ...]
@@ -39,8 +40,7 @@ class Group:
     """HighwayEnv's value; None where it draws."""
 
 
-@dataclass(frozen=True)
-class Layout:
+class Layout(NamedTuple):
     """The parameters of a kind of environment."""
 
     groups: Callable[[Any, int], list[Group]]
@@ -57,14 +57,41 @@ class Layout:
     """Called once on the environment."""
 
 
-@dataclass(frozen=True)
-class _Setting:
+Range = tuple[str, float, float]
+"""Unit and ends of what a parameter may be."""
+SPEED = ("m/s", 0.0, 40.0)
+GAP = ("m", 0.0, 90.0)
+
+
+def uniform(
+    name: str,
+    within: Range,
+    low: ArrayLike,
+    high: ArrayLike,
+    meaning: str,
+    usual: float | None = None,
+    shape: float = 1,
+) -> Group:
+    """Return a parameter that is uniform from low to high, arrays for several vehicles; or Beta(shape, shape) there."""
+    ends = np.atleast_1d(low), np.atleast_1d(high)
+    shapes = np.full(len(ends[0]), float(shape))
+    return Group((Parameter(name, *within, meaning, len(shapes)),), BetaDistribution(shapes, shapes, *ends), usual)
+
+
+def normal(name: str, within: Range, mean: ArrayLike, deviation: float, meaning: str) -> Group:
+    """Return a normal parameter, cut off at four standard deviations, beyond which 6e-5 of the mass is."""
+    centre = np.atleast_1d(np.asarray(mean, dtype=np.float64))
+    covariance = deviation**2 * np.eye(len(centre))
+    ends = centre - 4.0 * deviation, centre + 4.0 * deviation
+    distribution = TruncatedGaussianMixture(np.ones(1), centre[None], covariance[None], *ends)
+    return Group((Parameter(name, *within, meaning, len(centre)),), distribution)
+
+
+class IDMSetting(NamedTuple):
     """A parameter of IDM that is an attribute of HighwayEnv's vehicles, as sign * value + shift."""
 
     attribute: str
-    unit: str
-    low: float
-    high: float
+    within: Range
     spread: float
     meaning: str
     sign: float = 1.0
@@ -72,12 +99,12 @@ class _Setting:
 
 
 IDM_PARAMETERS = {
-    "time_headway": _Setting("TIME_WANTED", "s", 0.1, 5.0, 1.0, "time gap that the others want"),
-    "jam_distance": _Setting(
-        "DISTANCE_WANTED", "m", 0.0, 20.0, 2.0, "bumper gap that they want at standstill", shift=HIGHWAY_ENV_LENGTH
+    "time_headway": IDMSetting("TIME_WANTED", ("s", 0.1, 5.0), 1.0, "time gap that the others want"),
+    "jam_distance": IDMSetting(
+        "DISTANCE_WANTED", ("m", 0.0, 20.0), 2.0, "bumper gap that they want at standstill", shift=HIGHWAY_ENV_LENGTH
     ),
-    "max_acceleration": _Setting("COMFORT_ACC_MAX", "m/s^2", 0.5, 10.0, 1.5, "their largest acceleration"),
-    "comfortable_deceleration": _Setting("COMFORT_ACC_MIN", "m/s^2", 0.5, 10.0, 1.5, "their comfortable one", -1.0),
+    "max_acceleration": IDMSetting("COMFORT_ACC_MAX", ("m/s^2", 0.5, 10.0), 1.5, "their largest acceleration"),
+    "comfortable_deceleration": IDMSetting("COMFORT_ACC_MIN", ("m/s^2", 0.5, 10.0), 1.5, "their comfortable one", -1.0),
 }
 """Parameters of the Intelligent Driver Model that all vehicles but the ego share; each has a Beta(2, 2) distribution
 around HighwayEnv's value."""
@@ -87,9 +114,9 @@ def idm_groups(layout: Layout) -> list[Group]:
     """Return one group for each parameter of IDM."""
     groups = []
     for usual, (name, it) in zip(layout.idm, IDM_PARAMETERS.items(), strict=True):
-        spread = min(it.spread, usual - it.low, it.high - usual)
-        parameter = Parameter(name, it.unit, it.low, it.high, it.meaning)
-        groups.append(Group((parameter,), make_beta(2.0, [usual - spread], [usual + spread]), usual))
+        _, least, most = it.within
+        spread = min(it.spread, usual - least, most - usual)
+        groups.append(uniform(name, it.within, usual - spread, usual + spread, it.meaning, usual, shape=2))
     return groups
 
 
@@ -104,12 +131,8 @@ def set_idm(vehicles: list[Any], values: Values) -> None:
 @contextmanager
 def restore_class_parameters(kind: type) -> Iterator[None]:
     """Put the parameters of IDM of a class back afterwards: HighwayEnv's intersection changes them for good."""
-    before = {
-        # attributes of HighwayEnv's classes, which have some of them each
-        it.attribute: getattr(kind, it.attribute)
-        for it in IDM_PARAMETERS.values()
-        if hasattr(kind, it.attribute)
-    }
+    names = [it.attribute for it in IDM_PARAMETERS.values() if hasattr(kind, it.attribute)]  # not each class has all
+    before = {name: getattr(kind, name) for name in names}
     try:
         yield
     finally:
@@ -117,34 +140,8 @@ def restore_class_parameters(kind: type) -> Iterator[None]:
             setattr(kind, name, value)
 
 
-def make_beta(shape: float, low: list[float], high: list[float]) -> BetaDistribution:
-    """Return independent Beta(shape, shape) distributions on ranges; shape 1 is uniform."""
-    size = len(low)
-    return BetaDistribution(np.full(size, shape), np.full(size, shape), np.array(low), np.array(high))
-
-
-def make_normal(mean: list[float], deviation: list[float], reach: float = 4.0) -> TruncatedGaussianMixture:
-    """Return independent normal distributions, cut off at `reach` standard deviations (6e-5 of the mass at 4)."""
-    centre, sd = np.array(mean), np.array(deviation)
-    return TruncatedGaussianMixture(
-        np.ones(1), centre[None], np.diag(sd**2)[None], centre - reach * sd, centre + reach * sd
-    )
-
-
-def lane_number(coordinate: float, lanes: int) -> int:
-    """Return the lane of a coordinate in [0, lanes]: its whole part, so lanes are equally likely if it is uniform."""
-    return min(int(coordinate), lanes - 1)
-
-
 def move(vehicle: Any, lane_index: tuple[str, str, int], place: float, speed: float) -> None:
-    """Put a vehicle into the middle of a lane, as if HighwayEnv had made it there.
-
-    Args:
-        vehicle: Of HighwayEnv.
-        lane_index: The lane.
-        place: Along the lane [m].
-        speed: [m/s].
-    """
+    """Put a vehicle into the middle of a lane at a place [m] with a speed [m/s], as if HighwayEnv had made it there."""
     lane = vehicle.road.network.get_lane(lane_index)
     vehicle.position = np.array(lane.position(place, 0.0), dtype=np.float64)
     vehicle.heading, vehicle.speed = lane.heading_at(place), float(speed)
@@ -161,27 +158,33 @@ def move(vehicle: Any, lane_index: tuple[str, str, int], place: float, speed: fl
         vehicle.timer = (np.sum(vehicle.position) * np.pi) % vehicle.LANE_CHANGE_DELAY
 
 
+def lane_number(coordinate: float, lanes: int) -> int:
+    """Return the lane of a coordinate in [0, lanes]: its whole part, so lanes are equally likely if it is uniform."""
+    return min(int(coordinate), lanes - 1)
+
+
+def others_of(env: Any) -> list[Any]:
+    """Return all vehicles but the ego, in HighwayEnv's order."""
+    return [vehicle for vehicle in env.road.vehicles if vehicle is not env.vehicle]
+
+
+# --- highway-v0, highway-fast-v0 ----------------------------------------------------------------
+
 STANDSTILL_SPACING, TIME_SPACING, JITTER = 12.0, 1.0, (0.9, 1.1)
 """Spacing of `Vehicle.create_random`: at standstill [m], per speed [s], and the range of its random factor."""
+SPEEDS_DRAWN = 21.0, 24.0
+"""[m/s]: 70 to 80 % of the highway's speed limit."""
 
 
 @dataclass(frozen=True, eq=False)
 class SpacingDistribution:
-    """Speeds and gaps of vehicles as `Vehicle.create_random` draws them, speeds first.
+    """Speeds and gaps of K vehicles as `Vehicle.create_random` draws them, K speeds before K gaps.
 
     Speeds are uniform; a vehicle of speed v is put (12 m + 1 s x v) x factor x U ahead of the one before it, centre to
-    centre, with U uniform on [0.9, 1.1].
-
-    Args:
-        vehicles: K; columns are K speeds and K gaps.
-        low: Lowest speed [m/s].
-        high: Highest speed [m/s].
-        factor: By lanes and density.
+    centre, with U uniform on [0.9, 1.1]. The factor is by lanes and density.
     """
 
     vehicles: int
-    low: float
-    high: float
     factor: float
 
     @property
@@ -189,94 +192,66 @@ class SpacingDistribution:
         """Number of columns."""
         return 2 * self.vehicles
 
-    @property
-    def least(self) -> float:
-        """The shortest gap [m]."""
-        return JITTER[0] * self.factor * (STANDSTILL_SPACING + TIME_SPACING * self.low) - HIGHWAY_ENV_LENGTH
-
+    @cached_property
     def _uniform(self) -> BetaDistribution:
-        k = self.vehicles
-        return make_beta(1.0, [self.low] * k + [JITTER[0]] * k, [self.high] * k + [JITTER[1]] * k)
+        """Speeds, and U."""
+        low, high = np.repeat(np.transpose([SPEEDS_DRAWN, JITTER]), self.vehicles, axis=1)
+        return BetaDistribution(np.ones(self.dim), np.ones(self.dim), low, high)
 
-    def _scale(self, speed: FloatArray) -> FloatArray:
-        return self.factor * (STANDSTILL_SPACING + TIME_SPACING * speed)
-
-    def _gaps(self, points: FloatArray, change: Callable[[FloatArray, FloatArray], FloatArray]) -> FloatArray:
-        """Return points with their second half changed, given the scale that their first half makes."""
+    def _split(self, points: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return the speeds, what follows them, and the spacing by U of the speeds [m], (n, K) each."""
         speed, rest = np.split(np.array(points, dtype=np.float64), 2, axis=1)
-        return np.hstack([speed, change(rest, self._scale(speed))])
+        return speed, rest, self.factor * (STANDSTILL_SPACING + TIME_SPACING * speed)
 
     def _in_metres(self, points: FloatArray) -> FloatArray:
-        return self._gaps(points, lambda u, scale: u * scale - HIGHWAY_ENV_LENGTH)
+        speed, jitter, spacing = self._split(points)
+        return np.hstack([speed, jitter * spacing - HIGHWAY_ENV_LENGTH])
 
-    def _in_spacings(self, points: FloatArray) -> FloatArray:
-        return self._gaps(points, lambda gap, scale: (gap + HIGHWAY_ENV_LENGTH) / scale)
+    def _in_spacings(self, x: FloatArray) -> FloatArray:
+        speed, gap, spacing = self._split(x)
+        return np.hstack([speed, (gap + HIGHWAY_ENV_LENGTH) / spacing])
 
     def sample(self, n: int, rng: np.random.Generator) -> FloatArray:
         """Draw independent points, shape (n, 2 K)."""
-        return self._in_metres(self._uniform().sample(n, rng))
+        return self._in_metres(self._uniform.sample(n, rng))
 
     def log_prob(self, x: FloatArray) -> FloatArray:
         """Return the log density, (n, 2 K) -> (n,)."""
-        scale = self._scale(np.asarray(x)[:, : self.vehicles])
-        return np.asarray(self._uniform().log_prob(self._in_spacings(x)) - np.log(scale).sum(axis=1))
+        return np.asarray(self._uniform.log_prob(self._in_spacings(x)) - np.log(self._split(x)[2]).sum(axis=1))
 
     def to_standard_normal(self, x: FloatArray) -> FloatArray:
         """Map (n, 2 K) -> (n, 2 K)."""
-        return self._uniform().to_standard_normal(self._in_spacings(x))
+        return self._uniform.to_standard_normal(self._in_spacings(x))
 
     def from_standard_normal(self, u: FloatArray) -> FloatArray:
         """Inverse of `to_standard_normal`."""
-        return self._in_metres(self._uniform().from_standard_normal(u))
-
-
-_SPEED = ("m/s", 0.0, 40.0)
-_HIGHEST = 300.0
-"""Longest gap that may be asked for [m]."""
-_SPEED_LIMIT = 30.0
-"""Speed limit of its highway [m/s]; `Vehicle.create_random` draws from 70 to 80 % of it."""
-
-
-def _single(
-    name: str, unit: str, low: float, high: float, distribution: BetaDistribution, usual: float | None, meaning: str
-) -> Group:
-    return Group((Parameter(name, unit, low, high, meaning),), distribution, usual)
-
-
-# --- highway-v0, highway-fast-v0 ----------------------------------------------------------------
+        return self._in_metres(self._uniform.from_standard_normal(u))
 
 
 def _highway_groups(env: Any, vehicles: int) -> list[Group]:
-    config = env.config
-    lanes, limit = config["lanes_count"], _SPEED_LIMIT
-    distribution = SpacingDistribution(
-        vehicles, 0.7 * limit, 0.8 * limit, float(np.exp(-lanes / 8)) / config["vehicles_density"]
-    )
-    if distribution.least < 0.0:
+    lanes, density = env.config["lanes_count"], env.config["vehicles_density"]
+    factor = float(np.exp(-lanes / 8)) / density
+    if JITTER[0] * factor * (STANDSTILL_SPACING + TIME_SPACING * SPEEDS_DRAWN[0]) < HIGHWAY_ENV_LENGTH:
         raise ValueError(
-            f"vehicles_density = {config['vehicles_density']} with {lanes} lanes lets vehicles overlap at the start; "
+            f"vehicles_density = {density} with {lanes} lanes lets vehicles overlap at the start; "
             "expected a lower density."
         )
-    speed = Parameter("speed", *_SPEED, "initial and desired speed, the nearest vehicle first", vehicles)
-    gap = Parameter("gap", "m", 0.0, _HIGHEST, "along the road from the vehicle before, whatever its lane", vehicles)
-    lane = Parameter("lane", "", 0.0, lanes, "the whole part is the lane, 0 the leftmost", vehicles)
-    own = _single("ego_speed", *_SPEED, make_beta(1.0, [20.0], [30.0]), 25.0, "initial speed of the ego")
-    first = config["initial_lane_id"]
-    ego_lane = _single("ego_lane", "", 0.0, lanes, make_beta(1.0, [0.0], [lanes]), first, "lane of the ego, likewise")
+    speed = Parameter("speed", *SPEED, "initial and desired speed, the nearest vehicle first", vehicles)
+    gap = Parameter("gap", "m", 0.0, 300.0, "along the road from the vehicle before, whatever its lane", vehicles)
+    first, lane = env.config["initial_lane_id"], ("", 0.0, lanes)
+    none, every = np.zeros(vehicles), np.full(vehicles, lanes)
     return [
-        ego_lane,
-        own,
-        Group((speed, gap), distribution),
-        Group((lane,), make_beta(1.0, [0.0] * vehicles, [lanes] * vehicles)),
+        uniform("ego_lane", lane, 0.0, lanes, "lane of the ego, likewise", first),
+        uniform("ego_speed", SPEED, 20.0, 30.0, "initial speed of the ego", 25.0),
+        Group((speed, gap), SpacingDistribution(vehicles, factor)),
+        uniform("lane", lane, none, every, "the whole part is the lane, 0 the leftmost"),
     ]
 
 
 def _arrange_highway(env: Any, values: Values) -> None:
     """Put the vehicles ahead of the ego by their gaps; those beyond the last with parameters keep their distances."""
-    road, lanes = env.road, env.config["lanes_count"]
-    ego, others = env.vehicle, [v for v in road.vehicles if v is not env.vehicle]
-    place = float(ego.position[0])
-    move(ego, ("0", "1", lane_number(values["ego_lane"], lanes)), place, values["ego_speed"])
+    lanes, others, place = env.config["lanes_count"], others_of(env), float(env.vehicle.position[0])
+    move(env.vehicle, ("0", "1", lane_number(values["ego_lane"], lanes)), place, values["ego_speed"])
     speeds, gaps, numbers = (np.atleast_1d(values[name]) for name in ("speed", "gap", "lane"))
     last = float(others[len(gaps) - 1].position[0])
     for vehicle, speed, gap, number in zip(others, speeds, gaps, numbers, strict=False):
@@ -288,79 +263,55 @@ def _arrange_highway(env: Any, values: Values) -> None:
 
 # --- merge-v0, merge-v1 -------------------------------------------------------------------------
 
-_MERGE_GAPS = ((30.0, 40.0), (50.0, 60.0), (15.0, 25.0))
-_MERGE_SPEEDS = ((30.0, 32.0), (28.0, 30.0), (30.5, 32.5))
-
 
 def _merge_groups(env: Any, vehicles: int) -> list[Group]:
-    low, high = ([pair[end] for pair in _MERGE_SPEEDS] for end in (0, 1))
-    near, far = ([pair[end] for pair in _MERGE_GAPS] for end in (0, 1))
-    gap = (
-        ("gap_ahead", 1.0, 42.0, "from the ego to the first vehicle ahead, whatever its lane"),
-        ("gap_second", 48.0, 150.0, "from the ego to the second vehicle ahead"),
-        ("gap_behind", 1.0, 25.0, "from the vehicle behind to the ego"),
-    )
+    slowest, fastest = (30.0, 28.0, 30.5), (32.0, 30.0, 32.5)
+    ahead = "from the ego to the first vehicle ahead, whatever its lane"
     return [
-        _single("ego_speed", *_SPEED, make_beta(1.0, [25.0], [35.0]), 30.0, "initial speed of the ego"),
-        Group(
-            (Parameter("speed", *_SPEED, "of the first, the second ahead, and the one behind", 3),),
-            make_beta(1, low, high),
-        ),
-        *(
-            _single(name, "m", least, most, make_beta(1.0, [near[k]], [far[k]]), None, meaning)
-            for k, (name, least, most, meaning) in enumerate(gap)
-        ),
-        Group(
-            (Parameter("lane", "", 0.0, 2.0, "the whole part is their lane, 0 the left", 3),),
-            make_beta(1.0, [0.0] * 3, [2.0] * 3),
-        ),
-        _single(
-            "merging_speed", *_SPEED, make_beta(1.0, [15.0], [25.0]), 20.0, "of the vehicle on the ramp, which wants 30"
-        ),
-        _single(
-            "merging_gap", "m", 0.0, 115.0, make_beta(1.0, [65.0], [85.0]), 75.0, "from the ego to it, along the road"
-        ),
+        uniform("ego_speed", SPEED, 25.0, 35.0, "initial speed of the ego", 30.0),
+        uniform("speed", SPEED, slowest, fastest, "of the first, the second ahead, and the one behind"),
+        uniform("gap_ahead", ("m", 1.0, 42.0), 30.0, 40.0, ahead),
+        uniform("gap_second", ("m", 48.0, 150.0), 50.0, 60.0, "from the ego to the second vehicle ahead"),
+        uniform("gap_behind", ("m", 1.0, 25.0), 15.0, 25.0, "from the vehicle behind to the ego"),
+        uniform("lane", ("", 0.0, 2.0), np.zeros(3), np.full(3, 2.0), "the whole part is their lane, 0 the left"),
+        uniform("merging_speed", SPEED, 15.0, 25.0, "of the vehicle on the ramp, which wants 30", 20.0),
+        uniform("merging_gap", ("m", 0.0, 115.0), 65.0, 85.0, "from the ego to it, along the road", 75.0),
     ]
 
 
 def _arrange_merge(env: Any, values: Values) -> None:
     """Put the vehicles around the ego; HighwayEnv makes them as second ahead, first ahead, behind, merging."""
-    ego, (second, first, behind, merging) = env.vehicle, [v for v in env.road.vehicles if v is not env.vehicle]
+    second, first, behind, merging = others_of(env)
     start = 30.0
-    move(ego, ("a", "b", 1), start, values["ego_speed"])
-    places = (
-        start + HIGHWAY_ENV_LENGTH + values["gap_ahead"],
-        start + HIGHWAY_ENV_LENGTH + values["gap_second"],
-        start - HIGHWAY_ENV_LENGTH - values["gap_behind"],
-    )
+    front, back = start + HIGHWAY_ENV_LENGTH, start - HIGHWAY_ENV_LENGTH
+    move(env.vehicle, ("a", "b", 1), start, values["ego_speed"])
+    places = front + values["gap_ahead"], front + values["gap_second"], back - values["gap_behind"]
     for vehicle, place, speed, number in zip(
         (first, second, behind), places, values["speed"], values["lane"], strict=True
     ):
         move(vehicle, ("a", "b", lane_number(number, 2)), place, speed)
-    move(merging, ("j", "k", 0), start + HIGHWAY_ENV_LENGTH + values["merging_gap"], values["merging_speed"])
+    move(merging, ("j", "k", 0), front + values["merging_gap"], values["merging_speed"])
     merging.target_speed = 30.0
 
 
 # --- intersection-v0 to -v2 ---------------------------------------------------------------------
 
-_APPROACH = 100.0
+APPROACH = 100.0
 """Length of the roads to the intersection [m]."""
-_FREE_OF_EGO, _FREE_OF_OTHERS = 20.0, 15.0
+FREE_OF_EGO, FREE_OF_OTHERS = 20.0, 15.0
 """Distances [m] within which HighwayEnv removes vehicles around the ego, and does not make one near another."""
 
 
 def _intersection_groups(env: Any, vehicles: int) -> list[Group]:
-    gap = ("m", 0.0, 90.0)
+    slow = ("m/s", 0.0, 15.0)
+    where = "the whole part is where the challenger comes from: 1 left, 2 ahead, 3 right"
     return [
-        _single("ego_speed", "m/s", 0.0, 15.0, make_beta(1.0, [7.0], [10.0]), 10.0, "initial speed of the ego"),
-        Group((Parameter("ego_gap", *gap, "from the ego to the intersection"),), make_normal([32.5], [5.0])),
-        Group((Parameter("speed", "m/s", 0.0, 15.0, "initial speed of the challenger"),), make_normal([8.0], [1.0])),
-        Group((Parameter("gap", *gap, "from the challenger to the intersection"),), make_normal([32.5], [5.0])),
-        _single(
-            "approach", "", 1.0, 4.0, make_beta(1.0, [1.0], [4.0]), None,
-            "the whole part is where the challenger comes from: 1 left, 2 ahead, 3 right",
-        ),
-    ]  # fmt: skip
+        uniform("ego_speed", slow, 7.0, 10.0, "initial speed of the ego", 10.0),
+        normal("ego_gap", GAP, 32.5, 5.0, "from the ego to the intersection"),
+        normal("speed", slow, 8.0, 1.0, "initial speed of the challenger"),
+        normal("gap", GAP, 32.5, 5.0, "from the challenger to the intersection"),
+        uniform("approach", ("", 1.0, 4.0), 1.0, 4.0, where),
+    ]
 
 
 def _without_challenger(env: Any) -> None:
@@ -376,7 +327,7 @@ def _without_challenger(env: Any) -> None:
 def _arrange_intersection(env: Any, values: Values) -> None:
     """Place the ego and the challenger; remove vehicles too near to them, by HighwayEnv's rule."""
     road, ego = env.road, env.vehicle
-    front = _APPROACH - HIGHWAY_ENV_LENGTH / 2
+    front = APPROACH - HIGHWAY_ENV_LENGTH / 2
     move(ego, ("o0", "ir0", 0), front - values["ego_gap"], values["ego_speed"])
     arm = min(int(values["approach"]), 3)
     kind = class_from_path(env.config["other_vehicles_type"])
@@ -384,49 +335,38 @@ def _arrange_intersection(env: Any, values: Values) -> None:
     challenger = kind.make_on_lane(road, (f"o{arm}", f"ir{arm}", 0), longitudinal=place, speed=float(values["speed"]))
     challenger.plan_route_to(f"o{(arm + 2) % 4}")
     challenger.randomize_behavior()
-    road.vehicles = [
-        v
-        for v in road.vehicles
-        if v is ego or (_is_apart(v, ego, _FREE_OF_EGO) and _is_apart(v, challenger, _FREE_OF_OTHERS))
-    ]
+
+    def is_free(vehicle: Any) -> bool:
+        limits = (ego, FREE_OF_EGO), (challenger, FREE_OF_OTHERS)
+        return all(np.linalg.norm(vehicle.position - other.position) >= distance for other, distance in limits)
+
+    road.vehicles = [vehicle for vehicle in road.vehicles if vehicle is ego or is_free(vehicle)]
     road.vehicles.insert(road.vehicles.index(ego), challenger)
-
-
-def _is_apart(one: Any, other: Any, distance: float) -> bool:
-    return bool(np.linalg.norm(one.position - other.position) >= distance)
 
 
 # --- roundabout-v0, roundabout-v1 ---------------------------------------------------------------
 
-_ROUNDABOUT = ((("we", "sx", 1), 5.0), (("we", "sx", 0), 20.0), (("we", "sx", 0), -20.0), (("eer", "ees", 0), 50.0))
+ROUNDABOUT = ((("we", "sx", 1), 5.0), (("we", "sx", 0), 20.0), (("we", "sx", 0), -20.0), (("eer", "ees", 0), 50.0))
 """Lane and usual place of the others, in the order in which HighwayEnv makes them."""
 
 
 def _roundabout_groups(env: Any, vehicles: int) -> list[Group]:
-    place = [p for _, p in _ROUNDABOUT]
-    many = len(place)
+    speed, place = np.full(len(ROUNDABOUT), 16.0), [place for _, place in ROUNDABOUT]
+    who = "of the incoming, two on the inner lane and the entering"
     return [
-        _single("ego_speed", "m/s", 0.0, 20.0, make_beta(1.0, [4.0], [12.0]), 8.0, "initial speed of the ego"),
-        _single(
-            "ego_gap", "m", 0.0, 40.0, make_beta(1.0, [0.0], [10.0]), 0.0, "from the ego to the end of the straight"
-        ),
-        Group(
-            (Parameter("speed", "m/s", 0.0, 30.0, "of the incoming, two on the inner lane and the entering", many),),
-            make_normal([16.0] * many, [2.0] * many),
-        ),
-        Group(
-            (Parameter("place", "m", -40.0, 80.0, "along the lanes that they start on", many),),
-            make_normal(place, [2.0] * many),
-        ),
+        uniform("ego_speed", ("m/s", 0.0, 20.0), 4.0, 12.0, "initial speed of the ego", 8.0),
+        uniform("ego_gap", ("m", 0.0, 40.0), 0.0, 10.0, "from the ego to the end of the straight", 0.0),
+        normal("speed", ("m/s", 0.0, 30.0), speed, 2.0, who),
+        normal("place", ("m", -40.0, 80.0), place, 2.0, "along the lanes that they start on"),
     ]
 
 
 def _arrange_roundabout(env: Any, values: Values) -> None:
-    ego, others = env.vehicle, [v for v in env.road.vehicles if v is not env.vehicle]
     lane = env.road.network.get_lane(("ser", "ses", 0))
-    move(ego, ("ser", "ses", 0), lane.length - HIGHWAY_ENV_LENGTH / 2 - values["ego_gap"], values["ego_speed"])
+    place = lane.length - HIGHWAY_ENV_LENGTH / 2 - values["ego_gap"]
+    move(env.vehicle, ("ser", "ses", 0), place, values["ego_speed"])
     for vehicle, (lane_index, _), place, speed in zip(
-        others, _ROUNDABOUT, values["place"], values["speed"], strict=True
+        others_of(env), ROUNDABOUT, values["place"], values["speed"], strict=True
     ):
         move(vehicle, lane_index, place, speed)
 

@@ -7,7 +7,6 @@ import weakref
 from collections.abc import Callable, Mapping
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
-from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
@@ -21,65 +20,15 @@ from rare_envs.arrays import FloatArray
 from rare_envs.distributions.space import Distribution, ScenarioSpace
 from rare_envs.egos.errors import is_policy, refuse_ego
 from rare_envs.egos.wrappers import wrap_policy
-from rare_envs.interop.layouts import restore_class_parameters, set_idm
+from rare_envs.interop.layouts import IDM_PARAMETERS, restore_class_parameters, set_idm
 from rare_envs.interop.scenario import HighwayEnvScenario, install_fast_observation
 from rare_envs.plugins import did_you_mean, one_line
 from rare_envs.threads import use_one_thread
 
 MAX_SECONDS = 100.0
 """Longest drive [s] unless told otherwise: HighwayEnv's merge ends at a place, where not every ego arrives."""
-
-
-@dataclass(frozen=True)
-class DriveTask:
-    """Description of a drive. It can be pickled; the environment is made where it is first needed."""
-
-    env_id: str
-    ego: Any
-    """"idm", an object with `predict`, or a function without arguments that makes one."""
-    config: Mapping[str, Any] | None = None
-    settings: Mapping[str, Any] = field(default_factory=dict)
-    """Keyword arguments of `HighwayEnvScenario`."""
-    seconds: float = MAX_SECONDS
-    """Duration after which drives are cut off [s]."""
-
-    def build(self) -> "DriveRunner":
-        """Make the environment and the ego."""
-        env = HighwayEnvScenario(make_highway_env(self.env_id, self.config), **self.settings)
-        install_fast_observation(env.scene, blind=self.ego == "idm")
-        if self.ego == "idm":
-            return DriveRunner(env, None, self.seconds)
-        ego = self.ego if is_policy(self.ego) else _call_maker(self.ego)
-        if not is_policy(ego):
-            refuse_ego(ego, f"from {self.ego!r}")
-        check_ego_spaces(ego, env)
-        return DriveRunner(env, wrap_policy(ego, env.observation_space), self.seconds)
-
-
-@dataclass(frozen=True)
-class BarePolicy:
-    """The policy of a Stable-Baselines3 model and its `VecNormalize` statistics, without environment and buffers."""
-
-    policy: Any
-    statistics: Any
-
-    @property
-    def observation_space(self) -> Any:
-        """Observations that the policy was trained on."""
-        return self.policy.observation_space
-
-    @property
-    def action_space(self) -> Any:
-        """Actions that the policy was trained on."""
-        return self.policy.action_space
-
-    def get_vec_normalize_env(self) -> Any:
-        """Return the statistics, or None."""
-        return self.statistics
-
-    def predict(self, *args: Any, **kwargs: Any) -> Any:
-        """Return what the policy predicts."""
-        return self.policy.predict(*args, **kwargs)
+DRIVES_AT_ONCE = 4
+"""Drives that a worker of `samplers.estimate(..., workers=2)` makes at once: each takes a good part of a second."""
 
 
 def make_highway_env(env_id: str, config: Mapping[str, Any] | None) -> gym.Env[Any, Any]:
@@ -87,10 +36,8 @@ def make_highway_env(env_id: str, config: Mapping[str, Any] | None) -> gym.Env[A
     known = [name for name, spec in gym.registry.items() if str(spec.entry_point).startswith("highway_env.")]
     if env_id not in known:
         raise ValueError(f"Unknown environment of HighwayEnv {env_id!r}{did_you_mean(str(env_id), known)}.")
-    with (
-        restore_class_parameters(IDMVehicle),
-        warnings.catch_warnings(),
-    ):  # an older version is asked for on purpose: results belong to a version
+    with restore_class_parameters(IDMVehicle), warnings.catch_warnings():
+        # an older version is asked for on purpose: results belong to a version
         warnings.filterwarnings("ignore", message=".*is out of date", category=DeprecationWarning)
         env = gym.make(env_id, config=None if config is None else dict(config))
     words = list(env.unwrapped.default_config())  # type: ignore[attr-defined]
@@ -100,23 +47,20 @@ def make_highway_env(env_id: str, config: Mapping[str, Any] | None) -> gym.Env[A
     return env
 
 
-def _call_maker(maker: Callable[[], Any]) -> Any:
-    """Return what a function of the user's makes, or raise a ValueError if it fails."""
-    try:
-        return maker()
-    except Exception as error:  # the function is the user's
-        raise ValueError(
-            f"Expected an ego with predict, or a function without arguments that makes one, got {maker!r}, which "
-            f"fails: {one_line(error)}."
-        ) from error
+class BarePolicy:
+    """The policy of a Stable-Baselines3 model and its `VecNormalize` statistics, without environment and buffers."""
+
+    def __init__(self, policy: Any, statistics: Any) -> None:
+        self.predict, self.statistics = policy.predict, statistics
+        self.observation_space, self.action_space = policy.observation_space, policy.action_space
+
+    def get_vec_normalize_env(self) -> Any:
+        """Return the statistics, or None."""
+        return self.statistics
 
 
 def strip_ego(ego: Any) -> Any:
-    """Return an ego without the objects of its training: of a Stable-Baselines3 model the policy and its statistics.
-
-    Args:
-        ego: "idm", an object with `predict`, or a function without arguments that makes one.
-    """
+    """Return "idm", a policy without the objects of its training, or a function that makes one; refuse all else."""
     if isinstance(ego, str) and ego == "idm":
         return ego
     if not is_policy(ego):
@@ -127,51 +71,51 @@ def strip_ego(ego: Any) -> Any:
     return ego if statistics is None else BarePolicy(ego.policy, statistics())
 
 
-def check_ego_spaces(ego: Any, env: gym.Env[Any, Any]) -> None:
-    """Refuse an ego that was made for other observations or actions; one that declares no spaces is accepted."""
+def make_policy(ego: Any, env: gym.Env[Any, Any]) -> Any:
+    """Return a policy, or what the user's function makes, with the wrappers of its training, for an environment."""
+    policy = ego
+    if not is_policy(ego):
+        try:
+            policy = ego()
+        except Exception as error:  # the function is the user's
+            raise ValueError(
+                f"Expected an ego with predict, or a function without arguments that makes one, got {ego!r}, which "
+                f"fails: {one_line(error)}."
+            ) from error
+        if not is_policy(policy):
+            refuse_ego(policy, f"from {ego!r}")
     for what in ("observation", "action"):  # the ego and its spaces are anybody's objects
-        given, expected = getattr(env, f"{what}_space"), getattr(ego, f"{what}_space", None)
+        given, expected = getattr(env, f"{what}_space"), getattr(policy, f"{what}_space", None)
         fits = type(expected) is type(given) and getattr(expected, "shape", None) == getattr(given, "shape", None)
         if expected is not None and not (fits and getattr(expected, "n", None) == getattr(given, "n", None)):
             raise ValueError(
                 f"The ego was made for {what}s {expected}, the environment has {given}; "
                 f"give the environment the config that the ego was trained with."
             )
+    return wrap_policy(policy, env.observation_space)
 
 
-@dataclass(frozen=True)
-class DriveRunner:
-    """An environment and its ego, ready to drive."""
-
-    env: HighwayEnvScenario
-    ego: Any
-    seconds: float
-
-    def measure_drive(self, x: NDArray[np.float64]) -> float:
-        """Return the measure of the drive from x, shape (d,)."""
-        env = self.env
-        observation, _ = env.reset(options={"x": x})
-        if self.ego is None:
-            replace_ego_by_idm(env)
-        period, memory = 1.0 / env.scene.config["policy_frequency"], None
-        for step in range(round(self.seconds / period)):
-            action: Any = make_idle_action(env.action_space)
-            if self.ego is not None:
-                action, memory = self.ego.predict(
-                    np.asarray(observation)[None], state=memory, episode_start=np.array([step == 0]), deterministic=True
-                )
-                action = np.asarray(action)[0]
-                if not np.isfinite(action).all():
-                    raise ValueError(f"The ego's action is not finite: {action}.")
-            observation, _, terminated, truncated, _ = env.step(action)
-            if terminated or truncated:
-                break
-        return env.measured
-
-
-def make_idle_action(space: gym.Space[Any]) -> Any:
-    """Return an action for an ego that ignores it because it decides itself."""
-    return 1 if isinstance(space, gym.spaces.Discrete) else np.zeros(space.shape or (), dtype=np.float32)
+def drive(env: HighwayEnvScenario, policy: Any, seconds: float, x: NDArray[np.float64]) -> float:
+    """Return the measure of the drive of a policy, None for HighwayEnv's IDM, from x (d,)."""
+    observation, _ = env.reset(options={"x": x})
+    space = env.action_space
+    idle: Any = 1 if isinstance(space, gym.spaces.Discrete) else np.zeros(space.shape or (), dtype=np.float32)
+    if policy is None:
+        replace_ego_by_idm(env)
+    period, memory = 1.0 / env.scene.config["policy_frequency"], None
+    for step in range(round(seconds / period)):
+        action = idle
+        if policy is not None:
+            actions, memory = policy.predict(
+                np.asarray(observation)[None], state=memory, episode_start=np.array([step == 0]), deterministic=True
+            )
+            action = np.asarray(actions)[0]
+            if not np.isfinite(action).all():
+                raise ValueError(f"The ego's action is not finite: {action}.")
+        observation, _, terminated, truncated, _ = env.step(action)
+        if terminated or truncated:
+            break
+    return env.measured
 
 
 def replace_ego_by_idm(env: HighwayEnvScenario) -> None:
@@ -179,33 +123,10 @@ def replace_ego_by_idm(env: HighwayEnvScenario) -> None:
     inner = env.scene
     old = inner.vehicle
     driver = IDMVehicle.create_from(old)
-    set_idm([driver], env.usual_idm)
+    set_idm([driver], dict(zip(IDM_PARAMETERS, env.layout.idm, strict=True)))
     inner.road.vehicles[inner.road.vehicles.index(old)] = driver
     inner.controlled_vehicles = [driver]
     inner.define_spaces()
-
-
-_worker_runner: DriveRunner | None = None
-"""The environment and ego of a worker process."""
-
-
-def start_worker(blob: bytes) -> None:
-    """Make environment and ego in a worker process, from the bytes of a pickled `DriveTask`."""
-    global _worker_runner
-    import cloudpickle
-
-    _worker_runner = cloudpickle.loads(blob).build()
-
-
-def drive_in_worker(x: NDArray[np.float64]) -> float:
-    """Return f(x) of one drive in a worker process."""
-    assert _worker_runner is not None
-    with use_one_thread():
-        return _worker_runner.measure_drive(x)
-
-
-DRIVES_AT_ONCE = 4
-"""Drives that a worker of `samplers.estimate(..., workers=2)` makes at once: each takes a good part of a second."""
 
 
 class HighwayEnvProblem:
@@ -216,7 +137,7 @@ class HighwayEnvProblem:
 
     Attributes:
         env_id: The environment's id.
-        ego: What was given.
+        ego: What was given; in another process its policy alone.
         workers: Number of processes.
         space: Names, units, bounds and base distribution of x.
         fixed: Parameters that are held, and their values.
@@ -230,28 +151,31 @@ class HighwayEnvProblem:
         25.0
     """
 
-    def __init__(self, task: DriveTask, ego: Any, workers: int) -> None:
-        """Build the environment once, so that errors show before the simulations.
+    def __init__(
+        self,
+        env_id: str,
+        ego: Any,
+        config: Mapping[str, Any] | None,
+        settings: Mapping[str, Any],
+        seconds: float,
+        workers: int,
+    ) -> None:
+        """Build the environment once, so that errors show before the simulations; `highway_env_problem` has the words.
 
-        Args:
-            task: Description of a drive.
-            ego: As the user gave it.
-            workers: Number of processes.
-
-        Raises:
-            ValueError: If the task cannot be made.
+        `settings` are keyword arguments of `HighwayEnvScenario`; drives are cut off after `seconds`.
         """
         if isinstance(workers, bool) or not isinstance(workers, int) or workers < 1:
             raise ValueError(f"Expected workers of at least 1, got {workers!r}.")
-        self.env_id, self.ego, self.workers, self.chunk_size = task.env_id, ego, workers, DRIVES_AT_ONCE
-        self._task = task
+        self.env_id, self.ego, self.workers, self.chunk_size = env_id, ego, workers, DRIVES_AT_ONCE
+        self._stripped, self._config, self._settings, self._seconds = strip_ego(ego), config, settings, seconds
         if workers > 1:
-            _pickle_task(task)
-        self._driven: DriveRunner | None = task.build()
-        self.space: ScenarioSpace = self._driven.env.space
-        self.fixed: dict[str, Any] = self._driven.env.fixed
-        self._noise = task.settings["noise"]
-        self._random = self._driven.env.layout.leftover
+            _ = self._packed
+        env, _ = self._driven
+        self.space: ScenarioSpace = env.space
+        self.fixed: dict[str, Any] = env.fixed
+        held = env.layout.leftover and settings["noise"] == "fixed"
+        self.given = "what HighwayEnv draws beyond x is one fixed draw" if held else ""
+        """Condition of p in words, for `samplers.Estimate.given`; empty if nothing is held fixed."""
 
     @property
     def dim(self) -> int:
@@ -268,12 +192,6 @@ class HighwayEnvProblem:
         """Distribution of x."""
         return self.space.base
 
-    @property
-    def given(self) -> str:
-        """Condition of p in words, for `samplers.Estimate.given`; empty if nothing is held fixed."""
-        fixed = self._random and self._noise == "fixed"
-        return "what HighwayEnv draws beyond x is one fixed draw" if fixed else ""
-
     def evaluate(self, x: FloatArray) -> FloatArray:
         """Return the measure of the drive from each x.
 
@@ -289,9 +207,7 @@ class HighwayEnvProblem:
         """
         x = self.space.validate(np.atleast_2d(x))
         if self.workers == 1 or len(x) == 1:
-            self._driven = self._driven or self._task.build()
-            with use_one_thread():
-                return np.array([self._driven.measure_drive(row) for row in x])
+            return np.array([self._drive(row) for row in x])
         chunk = max(1, min(8, len(x) // (4 * self.workers)))
         try:
             return np.array(list(self._pool.map(drive_in_worker, x, chunksize=chunk)))
@@ -302,14 +218,36 @@ class HighwayEnvProblem:
                 "it, in a module that can be imported), or memory ran out (use fewer workers)."
             ) from error
 
+    @use_one_thread()
+    def _drive(self, x: NDArray[np.float64]) -> float:
+        return drive(*self._driven, self._seconds, x)
+
+    @cached_property
+    def _driven(self) -> tuple[HighwayEnvScenario, Any]:
+        """The environment, made where it is first needed, and the policy."""
+        env = HighwayEnvScenario(make_highway_env(self.env_id, self._config), **self._settings)
+        is_idm = isinstance(self._stripped, str)
+        install_fast_observation(env.scene, blind=is_idm)
+        return env, None if is_idm else make_policy(self._stripped, env)
+
+    @cached_property
+    def _packed(self) -> bytes:
+        """The problem as bytes, as it goes to worker processes."""
+        import cloudpickle
+
+        try:
+            packed: bytes = cloudpickle.dumps(self)
+        except Exception as error:  # the ego is the user's: anything may happen in it
+            raise ValueError(
+                f"The ego cannot be sent to worker processes ({type(error).__name__}: {error}); give a function "
+                "without arguments that makes it, or take workers=1."
+            ) from error
+        return packed
+
     @cached_property
     def _pool(self) -> ProcessPoolExecutor:
-        pool = ProcessPoolExecutor(
-            self.workers,
-            mp_context=multiprocessing.get_context("spawn"),
-            initializer=start_worker,
-            initargs=(_pickle_task(self._task),),
-        )
+        context = multiprocessing.get_context("spawn")
+        pool = ProcessPoolExecutor(self.workers, context, start_worker, (self._packed,))
         self._end = weakref.finalize(self, pool.shutdown, wait=False, cancel_futures=True)
         return pool
 
@@ -326,22 +264,27 @@ class HighwayEnvProblem:
         self.close()
 
     def __getstate__(self) -> dict[str, Any]:
-        """Processes and environments stay where they are."""
-        return {**{k: v for k, v in self.__dict__.items() if k not in ("_pool", "_end")}, "_driven": None}
+        """Processes, environments and the objects of a training stay where they are."""
+        stay = ("_pool", "_end", "_driven", "_packed")
+        return {**{name: value for name, value in self.__dict__.items() if name not in stay}, "ego": self._stripped}
 
 
-def _pickle_task(task: DriveTask) -> bytes:
-    """Return a task as bytes, as it goes to worker processes."""
+_problem: HighwayEnvProblem | None = None
+"""The problem in a worker process."""
+
+
+def start_worker(packed: bytes) -> None:
+    """Unpack the problem in a worker process."""
+    global _problem
     import cloudpickle
 
-    try:
-        packed: bytes = cloudpickle.dumps(task)
-    except Exception as error:  # the ego is the user's: anything may happen in it
-        raise ValueError(
-            f"The ego cannot be sent to worker processes ({type(error).__name__}: {error}); give a function without "
-            "arguments that makes it, or take workers=1."
-        ) from error
-    return packed
+    _problem = cloudpickle.loads(packed)
+
+
+def drive_in_worker(x: NDArray[np.float64]) -> float:
+    """Return f(x) of one drive, x (d,), in a worker process."""
+    assert _problem is not None
+    return _problem._drive(x)
 
 
 def highway_env_problem(
@@ -393,5 +336,5 @@ def highway_env_problem(
     if isinstance(horizon, bool) or not isinstance(horizon, int | float) or not 0.0 < horizon <= 1e4:
         raise ValueError(f"Expected a horizon in seconds, positive and at most 10,000, got {horizon!r}.")
     settings = {"vehicles": vehicles, "measure": measure, "fixed": fixed, "noise": noise, "base": base}
-    task = DriveTask(env_id, strip_ego(ego), config, settings, float(horizon))
-    return HighwayEnvProblem(task, ego, (os.cpu_count() or 1) if workers is None else workers)
+    count = (os.cpu_count() or 1) if workers is None else workers
+    return HighwayEnvProblem(env_id, ego, config, settings, float(horizon), count)

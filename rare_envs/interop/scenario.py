@@ -3,7 +3,6 @@
 import math
 from collections.abc import Callable, Mapping
 from functools import partial
-from types import MappingProxyType
 from typing import Any
 
 import gymnasium as gym
@@ -20,11 +19,11 @@ from rare_envs.arrays import FloatArray
 from rare_envs.distributions.product import NoiseDistribution, join_independent
 from rare_envs.distributions.space import Parameter, ScenarioSpace
 from rare_envs.interop.layouts import (
-    IDM_PARAMETERS,
     LAYOUTS,
     Group,
     Layout,
     idm_groups,
+    others_of,
     restore_class_parameters,
     set_idm,
 )
@@ -39,14 +38,7 @@ _STILL = 1e-9
 
 
 def ttc_to_any(env: Any) -> float:
-    """Return the time until the ego's body would touch any other's at constant speed and heading, over all of them.
-
-    Args:
-        env: An environment of HighwayEnv.
-
-    Returns:
-        Time to collision [s], in [0.01, 10].
-    """
+    """Return the time until the ego's body would touch any other's at constant speed and heading [s], in [0.01, 10]."""
     ego, road = env.vehicle, env.road
     others = [other for other in (*road.vehicles, *road.objects) if other is not ego and other.solid]
     times = [contact_time(ego, other) for other in others if _may_meet(ego, other)]
@@ -54,15 +46,9 @@ def ttc_to_any(env: Any) -> float:
 
 
 def ttc_to_front(env: Any) -> float:
-    """Return the time to collision of the ego with the vehicle that HighwayEnv finds in front of it in its lane.
+    """Return the time to collision with the vehicle that HighwayEnv finds in front of the ego in its lane [s].
 
     Bumper gap along the lane / closing speed along the ego's heading.
-
-    Args:
-        env: An environment of HighwayEnv.
-
-    Returns:
-        Time to collision [s], in [0.01, 10].
     """
     ego = env.vehicle
     front, _ = env.road.neighbour_vehicles(ego, ego.lane_index)
@@ -74,21 +60,15 @@ def ttc_to_front(env: Any) -> float:
 
 
 def contact_time(one: Any, other: Any) -> float:
-    """Return the time at which two bodies that keep their velocities and headings begin to overlap.
+    """Return the time at which two bodies that keep their velocities and headings begin to overlap; inf if never [s].
 
     Two rectangles overlap while their shadows on each of their four axes do (separating axes). Each pair of shadows
     overlaps during one interval of time, so the bodies do during what the four intervals have in common.
-
-    Args:
-        one: An object of HighwayEnv, with position, velocity, heading, length and width.
-        other: Another.
-
-    Returns:
-        Time [s], 0 if they overlap now, inf if they never will.
     """
     away, drift = other.position - one.position, other.velocity - one.velocity
-    sides = np.array([_axis(o.heading + turn) for o in (one, other) for turn in (0.0, np.pi / 2)])
-    halves = np.array([half for o in (one, other) for half in (o.LENGTH / 2, o.WIDTH / 2)])
+    angles = np.array([each.heading + turn for each in (one, other) for turn in (0.0, np.pi / 2)])
+    sides = np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    halves = np.array([half for each in (one, other) for half in (each.LENGTH / 2, each.WIDTH / 2)])
     reach = np.abs(sides @ sides.T) @ halves
     distance, speed = sides @ away, sides @ drift
     still = np.abs(speed) < _STILL
@@ -107,22 +87,14 @@ def _may_meet(one: Any, other: Any) -> bool:
     return bool(way <= TTC_MAX * math.dist(one.velocity, other.velocity))
 
 
-def _axis(angle: float) -> FloatArray:
-    return np.array([np.cos(angle), np.sin(angle)])
-
-
-HIGHWAY_ENV_MEASURES: MappingProxyType[str, Callable[[Any], float]] = MappingProxyType(
-    {"ttc": ttc_to_any, "front_ttc": ttc_to_front}
-)
+HIGHWAY_ENV_MEASURES: dict[str, Callable[[Any], float]] = {"ttc": ttc_to_any, "front_ttc": ttc_to_front}
 """Measures of a moment by name; that of a drive is the least of them, or -1 if the ego crashes."""
 
 
 def install_fast_observation(env: Any, blind: bool = False) -> None:
     """Replace the `Kinematics` observation of a HighwayEnv environment, from its next reset on; other kinds stay.
 
-    Args:
-        env: The environment.
-        blind: Observe zeros, for an ego that uses no observation.
+    A blind ego, which uses no observation, observes zeros.
     """
     define_spaces = env.define_spaces
 
@@ -138,18 +110,13 @@ def install_fast_observation(env: Any, blind: bool = False) -> None:
 
 
 def observe_without_pandas(kind: Any) -> NDArray[np.float32]:
-    """Return what `KinematicObservation.observe` returns.
-
-    Args:
-        kind: A `KinematicObservation`.
-    """
-    space = kind.space()
-    if not kind.env.road:
+    """Return what `KinematicObservation.observe` of this kind returns."""
+    space, env, observer = kind.space(), kind.env, kind.observer_vehicle
+    if not env.road:
         return np.zeros(space.shape, space.dtype)
-    observer = kind.observer_vehicle
-    near = kind.env.road.close_objects_to(
+    near = env.road.close_objects_to(
         observer,
-        kind.env.PERCEPTION_DISTANCE,
+        env.PERCEPTION_DISTANCE,
         count=kind.vehicles_count - 1,
         see_behind=kind.see_behind,
         sort=kind.order == "sorted",
@@ -157,23 +124,19 @@ def observe_without_pandas(kind: Any) -> NDArray[np.float32]:
     )
     origin = None if kind.absolute else observer
     shown = near[-kind.vehicles_count + 1 :]
-    records = [
-        observer.to_dict(),
-        *(v.to_dict(origin, observe_intentions=kind.observe_intentions) for v in shown),
-    ]
+    records = [observer.to_dict(), *(v.to_dict(origin, observe_intentions=kind.observe_intentions) for v in shown)]
     values = np.array([[record.get(name, np.nan) for name in kind.features] for record in records], dtype=np.float64)
     if kind.normalize:
         if not kind.features_range:
             kind.normalize_obs({})  # finds the ranges
         for column, name in enumerate(kind.features):
             if name in kind.features_range:
-                low, high = kind.features_range[name]
-                scaled = lmap(values[:, column], [low, high], [-1, 1])
+                scaled = lmap(values[:, column], kind.features_range[name], [-1, 1])
                 values[:, column] = np.clip(scaled, -1, 1) if kind.clip else scaled
     observation = np.zeros(space.shape)
     observation[: len(values)] = values
     if kind.order == "shuffled":
-        kind.env.np_random.shuffle(observation[1:])
+        env.np_random.shuffle(observation[1:])
     return observation.astype(space.dtype)
 
 
@@ -237,12 +200,12 @@ class HighwayEnvScenario(gym.Wrapper[Any, Any, Any, Any]):
         """
         super().__init__(env)
         self.layout = _find_layout(env)
-        self._measure = _find_measure(measure)
+        self._measure = measure if callable(measure) else _find_measure(measure)
         if noise is not True and noise != "fixed":
             raise ValueError(f"Expected noise True or 'fixed', got {noise!r}.")
         self._rng = np.random.default_rng()
         self.layout.prepare(self.scene)
-        groups = self._groups(vehicles)
+        groups = self.layout.groups(self.scene, self._count_vehicles(vehicles)) + idm_groups(self.layout)
         self.fixed = _hold_parameters(groups, fixed)
         varying = [group for group in groups if group.parameters[0].name not in self.fixed]
         self.space = _make_space(varying, self.layout.leftover and noise is True, base)
@@ -254,14 +217,15 @@ class HighwayEnvScenario(gym.Wrapper[Any, Any, Any, Any]):
         """HighwayEnv's environment itself: its road, vehicles and configuration."""
         return self.env.unwrapped
 
-    def _groups(self, vehicles: int | None) -> list[Group]:
+    def _count_vehicles(self, asked: int | None) -> int:
+        """Return the number of vehicles with parameters."""
         default, most = self.layout.vehicles
         available = most if most is not None else int(self.scene.config["vehicles_count"])
-        count = min(default, available) if vehicles is None else vehicles
+        count = min(default, available) if asked is None else asked
         low = 1 if most is None else most
         if isinstance(count, bool) or not isinstance(count, int) or not low <= count <= available:
-            raise ValueError(f"Expected vehicles from {low} to {available} for this environment, got {vehicles!r}.")
-        return self.layout.groups(self.scene, count) + idm_groups(self.layout)
+            raise ValueError(f"Expected vehicles from {low} to {available} for this environment, got {asked!r}.")
+        return count
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Start an episode.
@@ -279,40 +243,34 @@ class HighwayEnvScenario(gym.Wrapper[Any, Any, Any, Any]):
         if seed is not None:
             self._rng = np.random.default_rng(seed)
         self._x = self.space.scenario_x(options, 1, self._rng)[0]
-        values = {**self.fixed, **self.space.named(self._x)}
-        scene = self.scene
+        scene, values = self.scene, self._values()
+        noise = values.get("noise")
         with restore_class_parameters(class_from_path(scene.config["other_vehicles_type"])):
-            self.env.reset(seed=_seed_from_number(values.pop("noise", None)))
+            self.env.reset(seed=_FIXED_SEED if noise is None else int(np.float64(noise).view(np.uint64)))
         self.layout.arrange(scene, values)
-        self._set_idm(values)
+        set_idm(others_of(scene), values)
         self._measure_every_step()
         scene.define_spaces()  # links observation and action to the scene again, as HighwayEnv's own reset does
         observation = scene.observation_type.observe()
-        info = scene._info(observation, action=scene.action_space.sample())
-        return observation, info | self._info()
+        return observation, scene._info(observation, action=scene.action_space.sample()) | self._info()
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         """Take one decision of the policy, as in HighwayEnv."""
         observation, reward, terminated, truncated, info = self.env.step(action)
-        self._set_idm({**self.fixed, **self.space.named(self._x)})  # of vehicles that came during the step
+        set_idm(others_of(self.scene), self._values())  # of vehicles that came during the step
         info = info | self._info()
         if terminated or truncated:
             info["measure"] = self.measured
         return observation, reward, bool(terminated), bool(truncated), info
 
     @property
-    def usual_idm(self) -> dict[str, float]:
-        """HighwayEnv's own parameters of IDM in this environment."""
-        return dict(zip(IDM_PARAMETERS, self.layout.idm, strict=True))
-
-    @property
     def measured(self) -> float:
         """The measure of the episode so far."""
         return COLLISION if self.scene.vehicle.crashed else self._least
 
-    def _set_idm(self, values: Mapping[str, Any]) -> None:
-        ego = self.scene.vehicle
-        set_idm([vehicle for vehicle in self.scene.road.vehicles if vehicle is not ego], values)
+    def _values(self) -> dict[str, Any]:
+        """Return all parameters, those that are held included."""
+        return {**self.fixed, **self.space.named(self._x)}
 
     def _measure_every_step(self) -> None:
         """Measure now and after every simulation step of this episode."""
@@ -335,8 +293,7 @@ class HighwayEnvScenario(gym.Wrapper[Any, Any, Any, Any]):
 
     def _info(self) -> dict[str, Any]:
         crashed = bool(self.scene.vehicle.crashed)
-        scenario = {**self.fixed, **self.space.named(self._x)}
-        return {"scenario": scenario, "x": self._x.copy(), "min_measure": self.measured, "collision": crashed}
+        return {"scenario": self._values(), "x": self._x.copy(), "min_measure": self.measured, "collision": crashed}
 
 
 def _find_layout(env: gym.Env[Any, Any]) -> Layout:
@@ -357,13 +314,11 @@ def _find_layout(env: gym.Env[Any, Any]) -> Layout:
     return layouts[0]
 
 
-def _find_measure(measure: str | Callable[[Any], float]) -> Callable[[Any], float]:
-    if callable(measure):
-        return measure
-    if measure in HIGHWAY_ENV_MEASURES:
-        return HIGHWAY_ENV_MEASURES[measure]
-    hint = did_you_mean(str(measure), HIGHWAY_ENV_MEASURES)
-    raise ValueError(f"Unknown measure {measure!r}{hint}; expected {', '.join(HIGHWAY_ENV_MEASURES)} or a function.")
+def _find_measure(name: str) -> Callable[[Any], float]:
+    if name in HIGHWAY_ENV_MEASURES:
+        return HIGHWAY_ENV_MEASURES[name]
+    hint = did_you_mean(str(name), HIGHWAY_ENV_MEASURES)
+    raise ValueError(f"Unknown measure {name!r}{hint}; expected {', '.join(HIGHWAY_ENV_MEASURES)} or a function.")
 
 
 def _hold_parameters(groups: list[Group], fixed: Mapping[str, Any] | str | None) -> dict[str, Any]:
@@ -394,8 +349,3 @@ def _make_space(groups: list[Group], noise: bool, base: Any) -> ScenarioSpace:
     if not parameters:
         raise ValueError("Every parameter is held; expected at least one that varies.")
     return ScenarioSpace.of(parameters, join_independent(*distributions))
-
-
-def _seed_from_number(noise: float | None) -> int:
-    """Return a seed made of the bits of a number; one fixed seed for None."""
-    return _FIXED_SEED if noise is None else int(np.float64(noise).view(np.uint64))
