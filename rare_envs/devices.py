@@ -15,22 +15,7 @@ from torch import Tensor
 
 
 def find_device(name: str) -> torch.device:
-    """Return a device by its name, if it is there.
-
-    Args:
-        name: "cpu", "cuda" or "cuda:1".
-
-    Raises:
-        ValueError: There is no such device here.
-
-    Example:
-        >>> find_device("cpu")
-        device(type='cpu')
-        >>> find_device("gpu")
-        Traceback (most recent call last):
-            ...
-        ValueError: Expected device 'cpu', 'cuda' or 'cuda:1', got 'gpu'.
-    """
+    """Return a device by its name, "cpu", "cuda" or "cuda:1"; a ValueError if it is not there."""
     try:
         device = torch.device(name)
     except (RuntimeError, TypeError):
@@ -41,44 +26,6 @@ def find_device(name: str) -> torch.device:
         found = torch.cuda.device_count()
         raise ValueError(f"device={name!r} is not here: torch {torch.__version__} sees {found} GPUs; take 'cpu'.")
     return device
-
-
-def constant(values: Any, like: Tensor) -> Tensor:
-    """Return numbers as a tensor with dtype and device of another, made once; nobody may write to it.
-
-    Args:
-        values: A number, or tuples of them.
-        like: Any tensor.
-
-    Example:
-        >>> constant((1.0, 2.0), torch.zeros(3))
-        tensor([1., 2.])
-    """
-    return _make_constant(values, like.dtype, like.device)
-
-
-def scalars(numbers: tuple[float, ...], like: Tensor) -> tuple[Tensor, ...]:
-    """Return numbers as tensors of shape (), made once, as `constant`; floating-point ones whatever `like` has.
-
-    An operation with a few rows takes half as long with such a tensor as with a number, of which torch makes one.
-
-    Example:
-        >>> half, two = scalars((0.5, 2.0), torch.zeros(3))
-        >>> half * torch.ones(2) + two
-        tensor([2.5000, 2.5000])
-    """
-    dtype = like.dtype if like.is_floating_point() else torch.get_default_dtype()
-    return _make_scalars(numbers, dtype, like.device)
-
-
-def indices(numbers: tuple[int, ...], like: Tensor) -> Tensor:
-    """Return indices, int64, on the device of a tensor, made once, as `constant`.
-
-    Example:
-        >>> torch.zeros(2, 3)[:, indices((0, 2), torch.zeros(1))].shape
-        torch.Size([2, 2])
-    """
-    return _make_constant(numbers, torch.int64, like.device)
 
 
 @cache  # never forgotten: recorded rollouts read it where it is
@@ -92,18 +39,6 @@ def _make_scalars(numbers: tuple[float, ...], dtype: torch.dtype, device: torch.
     return tuple(_make_constant(number, dtype, device) for number in numbers)
 
 
-def fixed_draws(shape: tuple[int, ...], seed: int, like: Tensor) -> Tensor:
-    """Return one sequence of standard normal draws with dtype and device of a tensor, made once, as `constant`.
-
-    They are drawn in double precision on the CPU, so that they are the same numbers on every device.
-
-    Example:
-        >>> fixed_draws((2, 3), seed=1, like=torch.zeros(1)).shape
-        torch.Size([2, 3])
-    """
-    return _draw(shape, seed, like.dtype, like.device)
-
-
 @cache  # likewise
 def _draw(shape: tuple[int, ...], seed: int, dtype: torch.dtype, device: torch.device) -> Tensor:
     with torch.inference_mode(False):
@@ -111,13 +46,35 @@ def _draw(shape: tuple[int, ...], seed: int, dtype: torch.dtype, device: torch.d
         return torch.randn(shape, generator=generator, dtype=torch.float64).to(device, dtype)
 
 
-def move_to(device: torch.device, thing: Any) -> Any:
-    """Return a driver or a policy on a device, if it has anything there (`to`), else itself.
+def constant(values: Any, like: Tensor) -> Tensor:
+    """Return numbers as a tensor with dtype and device of another, made once; nobody may write to it."""
+    return _make_constant(values, like.dtype, like.device)
 
-    Example:
-        >>> move_to(torch.device("meta"), torch.zeros(2)).device.type, move_to(torch.device("meta"), "idm")
-        ('meta', 'idm')
+
+def scalars(numbers: tuple[float, ...], like: Tensor) -> tuple[Tensor, ...]:
+    """Return numbers as tensors of shape (), made once, as `constant`; floating-point ones whatever `like` has.
+
+    An operation with a few rows takes half as long with such a tensor as with a number, of which torch makes one.
     """
+    dtype = like.dtype if like.is_floating_point() else torch.get_default_dtype()
+    return _make_scalars(numbers, dtype, like.device)
+
+
+def indices(numbers: tuple[int, ...], like: Tensor) -> Tensor:
+    """Return indices, int64, on the device of a tensor, made once, as `constant`."""
+    return _make_constant(numbers, torch.int64, like.device)
+
+
+def fixed_draws(shape: tuple[int, ...], seed: int, like: Tensor) -> Tensor:
+    """Return one sequence of standard normal draws with dtype and device of a tensor, made once, as `constant`.
+
+    They are drawn in double precision on the CPU, so that they are the same numbers on every device.
+    """
+    return _draw(shape, seed, like.dtype, like.device)
+
+
+def move_to(device: torch.device, thing: Any) -> Any:
+    """Return a driver or a policy on a device, if it has anything there (`to`), else itself."""
     if isinstance(thing, torch.nn.Module):  # which moves itself: the caller's stays where it is
         thing = copy.deepcopy(thing)
     to = getattr(thing, "to", None)  # anybody's object
@@ -125,22 +82,12 @@ def move_to(device: torch.device, thing: Any) -> Any:
 
 
 def can_look(value: Tensor) -> bool:
-    """Return whether a value is at hand.
-
-    Example:
-        >>> can_look(torch.zeros(2)), can_look(torch.zeros(2, device="meta"))
-        (True, False)
-    """
+    """Return whether a value is at hand."""
     return value.is_cpu
 
 
 def may_hold(condition: Tensor) -> bool:
-    """Return whether a condition may hold anywhere: False only where it is seen that it does not.
-
-    Example:
-        >>> may_hold(torch.tensor([False, True])), may_hold(torch.tensor([False]))
-        (True, False)
-    """
+    """Return whether a condition may hold anywhere: False only where it is seen that it does not."""
     return not can_look(condition) or bool(condition.any())
 
 
@@ -148,11 +95,6 @@ def are_zero(*values: Tensor) -> bool:
     """Return whether all of these are 0, where that is soon known and nothing is differentiated with respect to them.
 
     Cars that go straight on in the middle of a lane then need no trigonometry; the result is the same.
-
-    Example:
-        >>> with torch.no_grad():
-        ...     are_zero(torch.zeros(2)), are_zero(torch.zeros(2), torch.ones(2))
-        (True, False)
     """
     if torch.is_grad_enabled() or not can_look(values[0]):
         return False
@@ -178,31 +120,6 @@ POLICY_CHUNK = 256
 
 
 def tile_size(device: torch.device, *, by_policy: bool, takes_pictures: bool, keeps_much: bool) -> int:
-    """Return the number of rollouts that torch simulates at once.
-
-    Args:
-        device: Where torch simulates.
-        by_policy: Whether the ego is a policy.
-        takes_pictures: Whether this takes pictures.
-        keeps_much: Whether there is lidar, or a measure that keeps whole episodes.
-
-    Example:
-        >>> tile_size(torch.device("cpu"), by_policy=False, takes_pictures=False, keeps_much=False)
-        16384
-    """
-    factor = 1 if device.type == "cpu" else GPU_TILES
-    if takes_pictures:
-        return factor * CAMERA_TILE
-    if keeps_much:
-        return factor * LIDAR_TILE
-    return factor * (POLICY_TILE if by_policy else RULE_TILE)
-
-
-def chunk_size(tile: int, *, by_policy: bool) -> int:
-    """Return the number of rollouts that a worker makes at once, a tile at most.
-
-    Example:
-        >>> chunk_size(128, by_policy=True), chunk_size(4096, by_policy=True)
-        (128, 256)
-    """
-    return min(tile, POLICY_CHUNK if by_policy else RULE_CHUNK)
+    """Return how many rollouts torch simulates at once; lidar, or a measure of whole episodes, keeps much."""
+    size = CAMERA_TILE if takes_pictures else LIDAR_TILE if keeps_much else POLICY_TILE if by_policy else RULE_TILE
+    return size if device.type == "cpu" else GPU_TILES * size

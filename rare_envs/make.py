@@ -19,8 +19,7 @@ from rare_envs.scenarios.registry import SCENARIOS, find_scenario
 from rare_envs.sensors.camera import find_camera
 from rare_envs.sensors.kinds import read_kinds
 from rare_envs.simulation.background import find_drivers
-from rare_envs.simulation.clock import Clock
-from rare_envs.simulation.measurement import Measurement
+from rare_envs.simulation.episode import Clock, Measurement
 from rare_envs.simulation.observation import Sensing
 from rare_envs.simulation.world import World
 

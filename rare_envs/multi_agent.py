@@ -10,9 +10,15 @@ from torch import Tensor
 
 from rare_envs.control.actions import IDLE, initial_aim
 from rare_envs.egos.policy import PolicyDriver
-from rare_envs.simulation.decision import TickReward, hold_finished, run_ticks
+from rare_envs.simulation.decision import (
+    COLLISION_COST,
+    RewardTerms,
+    TickReward,
+    hold_finished,
+    reward_terms,
+    run_ticks,
+)
 from rare_envs.simulation.episode import Episode
-from rare_envs.simulation.reward import COLLISION_COST, RewardTerms, reward_terms
 from rare_envs.simulation.rollout import Driver
 from rare_envs.simulation.world import World
 from rare_envs.traffic.bodies import pairwise_overlaps

@@ -13,8 +13,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from rare_envs.devices import chunk_size, find_device, move_to, tile_size
+from rare_envs.devices import POLICY_CHUNK, RULE_CHUNK, find_device, move_to, tile_size
 from rare_envs.distributions.space import Distribution, ScenarioSpace
+from rare_envs.egos.dense_policies import NotCompiled
 from rare_envs.egos.errors import reason_of
 from rare_envs.egos.needs import (
     DRIVES_ITSELF,
@@ -29,17 +30,20 @@ from rare_envs.egos.needs import (
 )
 from rare_envs.egos.policy import PolicyDriver, as_driver, find_device_driver
 from rare_envs.egos.wrappers import describe_missing_normalisation
-from rare_envs.fast.choice import CompilerFails, check_core, is_compiled, simulate
-from rare_envs.fast.dense_policy import NotCompiled
+from rare_envs.fast.choice import CompilerFails, check_core, is_compiled, leave_to_torch, simulate
 from rare_envs.make import refuse_unknown, set_up
 from rare_envs.scenarios.registry import find_scenario, split_layout
 from rare_envs.sensors.kinds import read_kinds
 from rare_envs.simulation.cuda_graphs import RecordedRollouts
-from rare_envs.simulation.episode import Episode
-from rare_envs.simulation.gradients import ROLLOUTS_PER_GRADIENT, TermDifferentiator, find_differentiator
-from rare_envs.simulation.measurement import Measurement
+from rare_envs.simulation.episode import Episode, Measurement
 from rare_envs.simulation.rollout import Driver, StochasticDriver, rollout
-from rare_envs.simulation.terms import EpisodeTerms, simulate_terms
+from rare_envs.simulation.terms import (
+    ROLLOUTS_PER_GRADIENT,
+    Differentiator,
+    EpisodeTerms,
+    find_differentiator,
+    simulate_terms,
+)
 from rare_envs.simulation.world import World
 from rare_envs.traffic.crash import CRASH_KINDS, Crash
 
@@ -274,15 +278,7 @@ class DrivingProblem:
     def attempt_terms(self, x: NDArray[np.float64], gamma: float = 0.0) -> tuple[EpisodeTerms, dict[int, str]]:
         """Simulate as `terms` does, and go on with the other rows when the policy fails on some, as `attempt` does.
 
-        Args:
-            x: Scenario parameters, shape (n, d).
-            gamma: Threshold of f.
-
-        Returns:
-            f and terms, NaN in rows on which it fails, and the reasons by row.
-
-        Raises:
-            Exception: A policy with a memory has failed on the batch, which may be the fault of any row.
+        f and terms are NaN in rows on which it fails; the reasons come by row.
         """
         failed_rows: dict[int, str] = {}
         terms = self._simulate_terms(x, gamma, failed_rows)
@@ -291,21 +287,15 @@ class DrivingProblem:
         return terms, failed_rows
 
     @cached_property
-    def gradient(self) -> TermDifferentiator | None:
+    def gradient(self) -> Differentiator | None:
         """Gradients of the terms: `gradient(x, term, ticks)`; None where measure or drivers have none."""
         x = self.base.sample(1, np.random.default_rng(0))
         world, driver = self.on_cpu()  # which has gradients of the few rollouts that methods ask for at once sooner
         return find_differentiator(world, driver, self.needs.queries_policy, x)
 
     def on_cpu(self) -> tuple[World, Driver]:
-        """Return the world and the driver as they simulate on the CPU.
-
-        Example:
-            >>> problem = DrivingProblem("rare_envs/CutIn-v0")
-            >>> problem.on_cpu()[0] is problem.world
-            True
-        """
-        cpu = find_device("cpu")
+        """Return the world and the driver as they simulate on the CPU."""
+        cpu = torch.device("cpu")
         if self.device == cpu:
             return self.world, self.driver
         return replace(self.world, background=move_to(cpu, self.world.background)), move_to(cpu, self.driver)
@@ -328,15 +318,9 @@ class DrivingProblem:
         Raises:
             ValueError: If x has the wrong shape, is NaN or outside the physical box, or if the policy returns NaN.
         """
-        x = self.space.validate(np.atleast_2d(x))
         measurement = Measurement("ttc", self.world.measurement.collisions, statistics=True)
-        world, parts = replace(self.world, measurement=measurement), list[Crash]()
-        with torch.inference_mode():
-            for first in range(0, len(x), self.tile):
-                rows = torch.from_numpy(x[first : first + self.tile]).float().to(self.device)
-                seen = rollout(world, self.driver, rows).statistics
-                assert seen is not None
-                parts.append(seen.crash)
+        world, x = replace(self.world, measurement=measurement), self.space.validate(np.atleast_2d(x))
+        parts = [end.statistics.crash for end in self._roll_out(world, x, None) if end.statistics is not None]
         return Crash(*(torch.cat(values).cpu() for values in zip(*parts, strict=True)))
 
     def crash_kinds(self, x: NDArray[np.float64]) -> list[str]:
@@ -350,15 +334,14 @@ class DrivingProblem:
             self.device,
             by_policy=isinstance(self.driver, PolicyDriver),
             takes_pictures=self.needs.queries_policy and "camera" in self.world.sensing.kinds,
-            keeps_much=self.world.uses_lidar or self.world.measurement.records,
+            keeps_much=self.world.uses_lidar or self.world.measurement.episode_measure.records,
         )
 
     @property
     def chunk_size(self) -> int:
-        """Number of rollouts that a worker makes at once."""
-        if self._chunk_size is not None:
-            return self._chunk_size
-        return chunk_size(self.tile, by_policy=isinstance(self.driver, PolicyDriver))
+        """Number of rollouts that a worker makes at once, a tile at most."""
+        usual = POLICY_CHUNK if isinstance(self.driver, PolicyDriver) else RULE_CHUNK
+        return min(self.tile, usual) if self._chunk_size is None else self._chunk_size
 
     def _simulate(self, x: NDArray[np.float64], failed_rows: dict[int, str] | None) -> NDArray[np.float64]:
         x = self.space.validate(np.atleast_2d(x))
@@ -382,11 +365,8 @@ class DrivingProblem:
                 raise NotCompiled(f"compiled rollouts are for the CPU, and device={str(self.device)!r} was asked for")
             return simulate(self.world, self.driver, x)
         except NotCompiled as reason:
-            if self._core == "numba":
-                raise ValueError(f"core='numba' cannot simulate this: {reason}.") from reason
-            if isinstance(reason, CompilerFails):
-                self._core = "torch"
-                warnings.warn(f"{reason}; torch simulates, which is slower.", stacklevel=4)
+            leave_to_torch(reason, self._core, stacklevel=4)
+            self._core = "torch" if isinstance(reason, CompilerFails) else self._core
             return None
 
     def _simulate_by_torch(self, x: NDArray[np.float64], failed_rows: dict[int, str] | None) -> NDArray[np.float64]:
@@ -400,12 +380,9 @@ class DrivingProblem:
         return terms
 
     def _roll_out(self, world: World, x: NDArray[np.float64], failed_rows: dict[int, str] | None) -> Iterator[Episode]:
-        """Yield the episodes of scenarios x (n, d) at the horizon, tile by tile.
+        """Yield the episodes of scenarios x (n, d) in a world at the horizon, tile by tile.
 
-        Args:
-            world: The world, with what is to be measured.
-            x: Scenarios within the physical box.
-            failed_rows: Takes the rows on which a policy fails, with the reason; None if such a failure is raised.
+        `failed_rows` takes the rows on which a policy fails, with the reason; None if such a failure is raised.
         """
         for first in range(0, len(x), self.tile):
             rows = torch.from_numpy(x[first : first + self.tile]).float().to(self.device)
@@ -423,9 +400,8 @@ class DrivingProblem:
     def _replay(self, world: World, rows: Tensor) -> Episode | None:
         """Return the episodes of scenarios (B, d) on a GPU, recorded when there were as many before.
 
-        Returns:
-            None where a policy has to be asked on the CPU: one that cannot decide elsewhere, or one that fails, for
-            then it is told on which rows, and how.
+        None where a policy has to be asked on the CPU: one that cannot decide elsewhere, or one that fails, for then it
+        is told on which rows, and how.
         """
         known = self._recorded
         driver = find_device_driver(self.driver, self.device, None if known is None else known.driver)
@@ -445,12 +421,10 @@ class DrivingProblem:
         """Raise a ValueError where f is NaN, or add the row to those that failed."""
         for row in np.flatnonzero(np.isnan(f)):
             if failed_rows is None:
-                raise self._nan_error(x[row], row)
+                named = {name: value for name, value in self.space.named(x[row]).items() if np.size(value) == 1}
+                measure = self.world.measurement.measure
+                raise ValueError(f"The measure {measure!r} gave NaN, first at row {row}: {named}.")
             failed_rows.setdefault(int(row), "the measure gave NaN")
-
-    def _nan_error(self, x_row: NDArray[np.float64], row: int | np.signedinteger[Any]) -> ValueError:
-        named = {name: value for name, value in self.space.named(x_row).items() if np.size(value) == 1}
-        return ValueError(f"The measure {self.world.measurement.measure!r} gave NaN, first at row {row}: {named}.")
 
 
 def has_nan(end: Episode) -> bool:

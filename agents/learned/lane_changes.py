@@ -27,7 +27,7 @@ from rare_envs.sensors.lidar import (
     SPEED_COLUMN,
     beam_angles,
 )
-from rare_envs.simulation.clock import LEARNED_TICK
+from rare_envs.simulation.episode import LEARNED_TICK
 
 _LENGTH, _WIDTH = FEATURES.index("length"), FEATURES.index("width")
 LINE_OVERLAP = 0.3

@@ -11,7 +11,7 @@ import sys
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from types import FunctionType
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, Literal, Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -21,10 +21,34 @@ from torch import Tensor, nn
 from torch.nn.functional import linear
 
 from rare_envs.egos.wrappers import NormalisedPolicy, RescaledPolicy
-from rare_envs.fast.dense_policy import Activation, DensePolicy, NotCompiled
 
+Activation = Literal["tanh", "relu"]
 ACTIVATIONS: dict[type[nn.Module], Activation] = {nn.Tanh: "tanh", nn.ReLU: "relu"}
 SB3 = "stable_baselines3"
+
+
+class NotCompiled(ValueError):
+    """There is no compiled rollout; the message says why."""
+
+
+@dataclass(frozen=True, eq=False)
+class DensePolicy:
+    """A policy that is a network of dense layers on the `features` observation, without memory or noise."""
+
+    layers: tuple[tuple[NDArray[np.floating], NDArray[np.floating]], ...]
+    """Weights, shape (outputs, inputs), and biases, shape (outputs,), of each layer, first to last."""
+    activation: Activation
+    """Between the layers; there is none behind the last."""
+    chooses: bool = False
+    """Whether the outputs are scores of `rare_envs.control.actions.DISCRETE_ACTIONS`, of which the largest is taken;
+    else they are acceleration and steering."""
+    clip: tuple[NDArray[np.floating], NDArray[np.floating]] | None = None
+    """Bounds to which acceleration and steering are clipped, shape (2,) each."""
+    rescale: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None
+    """Bounds that are then mapped to [-1, 1], shape (2,) each; None for those that are so already."""
+    normalisation: tuple[NDArray[np.float64], NDArray[np.float64], float] | None = None
+    """Mean and standard deviation of the observations, shape (F,) each, by which they are normalised before they are
+    clipped to plus or minus the last; None for observations as they are."""
 
 
 @runtime_checkable

@@ -10,8 +10,8 @@ from rare_envs.control.actions import MAX_ACCELERATION, MAX_STEERING
 from rare_envs.envs.rendering import make_scene
 from rare_envs.make import CONFIGURATION_ARGUMENTS
 from rare_envs.plugins import did_you_mean
+from rare_envs.simulation.decision import COLLISION_COST
 from rare_envs.simulation.episode import Episode
-from rare_envs.simulation.reward import COLLISION_COST
 from rare_envs.simulation.world import World
 
 PICTURE_KEYS = frozenset(

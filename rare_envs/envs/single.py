@@ -11,7 +11,7 @@ from rare_envs.control.actions import read_actions
 from rare_envs.envs.highway_env_interface import HighwayEnvInterface
 from rare_envs.envs.rendering import RENDER_MODES, Display
 from rare_envs.envs.rows_and_infos import SingleObservation, episode_info, step_info
-from rare_envs.fast.environments import find_scripted_step
+from rare_envs.fast.choice import find_scripted_step
 from rare_envs.make import set_up
 from rare_envs.sensors.kinds import map_kinds
 from rare_envs.simulation.decision import StepResult, advance
@@ -24,7 +24,7 @@ class DrivingEnv(HighwayEnvInterface, gym.Env[SingleObservation, Any]):
 
     Observation: `features`, see `rare_envs.simulation.observation`. Action: acceleration and steering in [-1, 1], see
     `rare_envs.control.actions`, for one tick; with `action="meta"` one of HighwayEnv's meta-actions, see
-    `rare_envs.control.actions`, for one second. Reward: see `rare_envs.simulation.reward`. The episode terminates
+    `rare_envs.control.actions`, for one second. Reward: see `rare_envs.simulation.decision`. The episode terminates
     with a collision and is truncated at the horizon. `info` carries `scenario`, `x`, `min_ttc` [s], `collision`,
     `crashed` (the same), `speed` [m/s] and `reward_terms`, and at the end `measure` (f(x)), `collision_type` and
     `crash`, which say who ran into whom and how hard (`rare_envs.traffic.crash`), or None. Scripts for HighwayEnv
@@ -104,14 +104,9 @@ class DrivingEnv(HighwayEnvInterface, gym.Env[SingleObservation, Any]):
             raise ValueError(f"Expected an action {wanted}, got shape {np.shape(action)}.")
         moved = None if self._compiled is None else self._compiled.advance(self._episode, np.asarray(action)[None])
         with torch.inference_mode():
-            if moved is None:
-                episode, terms = self._advance_by_torch(action)
-            else:
-                episode, terms = moved.episode, moved.terms
-            if moved is not None and self.world.sensing.observation == "features":
-                observation: SingleObservation = moved.features[0]
-            else:
-                observation = self._observe(episode)
+            episode, terms, features = moved or self._advance_by_torch(action)
+            known = features is not None and self.world.sensing.observation == "features"
+            observation: SingleObservation = features[0] if known else self._observe(episode)
             reward = float(terms.total)
         self._episode, self._tick = episode, self._tick + self.world.clock.stride
         terminated = bool(episode.collided)

@@ -25,13 +25,12 @@ from rare_envs.envs.rows_and_infos import (
     replace_rows,
     to_object_rows,
 )
-from rare_envs.fast.environments import find_scripted_step
+from rare_envs.fast.choice import find_scripted_step
 from rare_envs.make import set_up
 from rare_envs.sensors.kinds import map_kinds
-from rare_envs.simulation.decision import advance
+from rare_envs.simulation.decision import RewardTerms, advance
 from rare_envs.simulation.episode import Episode
 from rare_envs.simulation.observation import observe
-from rare_envs.simulation.reward import RewardTerms
 from rare_envs.traffic.crash import CRASH_KINDS, NONE
 
 
@@ -193,9 +192,8 @@ class DrivingVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[Any]
             if moved is None:
                 given = torch.as_tensor(np.asarray(actions))
                 given = read_actions(self.world.clock.action, given, self.num_envs, ignored)
-                episode, terms = advance(self.world, self._episode, given.to(self.device))
-            else:
-                episode, terms = moved.episode, moved.terms
+                moved = advance(self.world, self._episode, given.to(self.device))
+            episode, terms, features = moved
             if started is not None:  # which do not move in the step that starts them
                 episode = merge_rows(episode, self._place(np.flatnonzero(fresh)), started)
             reward = terms.total.double().numpy(force=True)
@@ -204,7 +202,7 @@ class DrivingVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[Any]
         self._tick += np.where(fresh, 0, self.world.clock.stride)
         terminated = episode.collided.numpy(force=True) & ~fresh
         truncated = (self._tick >= self.world.clock.ticks) & ~terminated & ~fresh
-        features = None if moved is None or started is not None else moved.features
+        features = None if started is not None else features
         observation, infos = self._finish(terms, terminated | truncated, fresh, features)
         return observation, reward, terminated.copy(), truncated, infos
 

@@ -2,33 +2,38 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+import warnings
 from functools import cache
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from rare_envs.control.actions import DISCRETE_ACTIONS, MAX_ACCELERATION, MAX_STEERING
 from rare_envs.control.idm import IDM
-from rare_envs.egos.dense_policies import read_dense_policy
+from rare_envs.egos.dense_policies import DensePolicy, NotCompiled, read_dense_policy
 from rare_envs.egos.policy import PolicyDriver
-from rare_envs.fast.dense_policy import DensePolicy, NotCompiled
 from rare_envs.measures import MEASURES
 from rare_envs.plugins import one_line
 from rare_envs.scenarios import car_following, cut_in, hard_brake
-from rare_envs.simulation.observation import EGO_FEATURES, OTHER_FEATURES
+from rare_envs.simulation.observation import observation_space
 
 if TYPE_CHECKING:
-    from rare_envs.scenarios.base import Scenario
+    from rare_envs.simulation.decision import StepResult
+    from rare_envs.simulation.episode import Episode
     from rare_envs.simulation.rollout import Driver
     from rare_envs.simulation.world import World
 
 CORES = ("auto", "torch", "numba")
 """Choices of what simulates."""
 SCRIPTS = ((car_following.others, "STEADY", 2), (hard_brake.others, "BRAKING", 2), (cut_in.others, "CUT_IN", 3))
-"""Motions of the other vehicles, names of their compiled twins in `rare_envs.fast.scripts`, and how many vehicles these
+"""Motions of the other vehicles, names of their compiled twins in `rare_envs.fast.rows`, and how many vehicles these
 are for, the ego included."""
+MAX_UNITS = 128
+"""Widest layer: beyond it torch's matrix products are faster than the compiled ones, which are made for few units."""
+ACTION_SCALES = np.array([MAX_ACCELERATION, MAX_STEERING], dtype=np.float32)
+"""Acceleration [m/s^2] and steering angle [rad] of an action of 1."""
 
 
 class CompilerFails(NotCompiled):
@@ -39,6 +44,24 @@ def check_core(core: str) -> None:
     """Raise a ValueError if there is no such core."""
     if core not in CORES:
         raise ValueError(f"Expected core to be one of {', '.join(map(repr, CORES))}, got {core!r}.")
+
+
+def leave_to_torch(reason: NotCompiled, core: str, stacklevel: int) -> None:
+    """Raise a ValueError if the core is to be "numba"; else warn if numba fails."""
+    if core == "numba":
+        raise ValueError(f"core='numba' cannot simulate this: {reason}.") from reason
+    if isinstance(reason, CompilerFails):
+        warnings.warn(f"{reason}; torch simulates, which is slower.", stacklevel=stacklevel + 1)
+
+
+@cache
+def import_compiler() -> Any:
+    """Return the module that needs numba; raise CompilerFails where that is missing, switched off or fails."""
+    try:
+        from rare_envs.fast import rollouts
+    except (ImportError, OSError, RuntimeError) as error:
+        raise CompilerFails(f"numba fails here: {one_line(error)}") from error
+    return rollouts
 
 
 def is_compiled(world: World, driver: Driver) -> bool:
@@ -52,98 +75,128 @@ def is_compiled(world: World, driver: Driver) -> bool:
 
 
 def simulate(world: World, driver: Driver, x: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return f of scenarios x (B, d) within the physical box; NaN where a policy's outputs are not finite.
+    """Return f of scenarios x (B, d) within the physical box, NaN where a policy's outputs are not finite.
 
     Raises:
-        NotCompiled: The world or the ego is not compiled.
-        CompilerFails: numba does not work here.
+        NotCompiled: The world or the ego is not compiled, or numba does not work here (`CompilerFails`).
     """
-    script, ego = find_script(world), read_ego(world, driver)
-    import_compiler()
-    from rare_envs.fast import rollouts
-
+    script, ego, compiled = find_script(world), read_ego(world, driver), import_compiler()
     with torch.inference_mode():
         state = world.scenario.initial(torch.from_numpy(x).float())
     try:
-        return rollouts.drive(script, state, ego, world.scenario.road, world.clock.dt, world.clock.ticks)
+        f: NDArray[np.float64] = compiled.drive(
+            script, state, ego, world.scenario.road, world.clock.dt, world.clock.ticks
+        )
     except Exception as error:  # numba compiles at the first call, where anything may be raised
         raise CompilerFails(f"numba fails here: {one_line(error)}") from error
+    return f
 
 
-def find_script(world: World) -> str:
-    """Return the name of the compiled script of a world.
-
-    Raises:
-        NotCompiled: It has none, or something in the world is not compiled.
-    """
+def find_script(world: World, statistics: bool = False) -> str:
+    """Return the name of the compiled script of a world, with statistics of its episodes or not; else NotCompiled."""
     scenario, measurement = world.scenario, world.measurement
     known = [(name, vehicles) for others, name, vehicles in SCRIPTS if scenario.others is others]
     names = [name for name, vehicles in known if scenario.vehicles == vehicles]
-    obstacles = {
-        "worlds with drivers are not compiled": world.background is not None,
-        f"the script of the scenario {scenario.name!r} is not compiled": not known,
-        f"the script of {scenario.name!r} is not compiled for {scenario.vehicles} vehicles": not names,
-        "curved roads and lanes of different widths are not compiled": scenario.road.reference_line is not None
-        or not scenario.road.equal,
-        f"the measure {measurement.measure!r} is not compiled": measurement.episode_measure != MEASURES["ttc"],
-        "statistics of episodes are not compiled": measurement.statistics,
-        "collisions of other vehicles are not compiled": measurement.collisions != "ego",
-        "parameters of the weather are not compiled": sum(world.columns) != scenario.size,
-    }
-    for words, found in obstacles.items():
-        if found:
-            raise NotCompiled(words)
+    _refuse(
+        {
+            "worlds with drivers are": world.background is not None,
+            f"the script of the scenario {scenario.name!r} is": not known,
+            f"the script of {scenario.name!r} for {scenario.vehicles} vehicles is": not names,
+            "curved roads and lanes of different widths are": scenario.road.reference_line is not None
+            or not scenario.road.equal,
+            f"the measure {measurement.measure!r} is": measurement.episode_measure != MEASURES["ttc"],
+            "statistics of episodes are": measurement.statistics and not statistics,
+            "collisions of other vehicles are": measurement.collisions != "ego",
+            "parameters of the weather are": sum(world.columns) != scenario.size,
+        }
+    )
     return names[0]
 
 
 def read_ego(world: World, driver: Driver) -> IDM | DensePolicy:
-    """Return an ego as it is compiled, a policy with its present weights.
-
-    Raises:
-        NotCompiled: It is not.
-    """
+    """Return an ego as it is compiled, a policy with its present weights; raise NotCompiled if it is not."""
     if type(driver) is IDM:
         return driver
     if type(driver) is not PolicyDriver:
         raise NotCompiled(f"the ego, a {type(driver).__name__}, is not compiled")
-    policy = read_dense_policy(driver.policy)
-    if world.sensing.observation != "features":
-        raise NotCompiled(f"the observation {world.sensing.observation!r} is not compiled")
-    if world.clock.action == "meta":
-        raise NotCompiled(f"the action {world.clock.action!r} is not compiled")
-    obstacle = policy.describe_obstacle(count_features(world.scenario))
-    if obstacle:
-        raise NotCompiled(f"{obstacle} is not compiled")
+    policy, sensing = read_dense_policy(driver.policy), world.sensing
+    widths = [len(policy.layers[0][0][0]), *(len(bias) for _, bias in policy.layers)]
+    _refuse(
+        {
+            f"the observation {sensing.observation!r} is": sensing.observation != "features",
+            f"the action {world.clock.action!r} is": world.clock.action == "meta",
+            f"a network of {widths[-1]} outputs is": widths[-1] != (len(DISCRETE_ACTIONS) if policy.chooses else 2),
+            f"a network of {widths[0]} inputs is": (widths[0],) != observation_space(world.scenario.vehicles).shape,
+            f"a network of {max(widths)} units in a layer, where torch is about as fast, is": max(widths) > MAX_UNITS,
+        }
+    )
     return policy
 
 
-def find_step_script(world: World) -> str:
-    """Return the name of the compiled script that an environment's world follows, with statistics or without.
-
-    Raises:
-        NotCompiled: As `find_script`, or for what is observed or done.
-    """
-    script = find_script(replace(world, measurement=replace(world.measurement, statistics=False)))
-    if world.uses_lidar or "camera" in world.sensing.kinds:
-        raise NotCompiled(f"the observation {world.sensing.observation!r} is not compiled")
-    if world.clock.action == "meta":
-        raise NotCompiled("meta-actions are not compiled")
-    return script
+def _refuse(obstacles: dict[str, bool]) -> None:
+    """Raise NotCompiled for the first of these that was found."""
+    for words, found in obstacles.items():
+        if found:
+            raise NotCompiled(f"{words} not compiled")
 
 
-def count_features(scenario: Scenario) -> int:
-    """Return the number of features that an ego observes."""
-    return len(EGO_FEATURES) + len(OTHER_FEATURES) * (scenario.vehicles - 1)
+class ScriptedStep:
+    """Compiled steps of a world: an episode and actions to the episode a tick later, its reward and its features."""
+
+    def __init__(self, world: World, required: bool = False) -> None:
+        """Take the numbers of a world, or raise NotCompiled; states in double precision are refused if `required`."""
+        script, sensing = find_script(world, statistics=True), world.sensing
+        _refuse(
+            {
+                f"the observation {sensing.observation!r} is": world.uses_lidar or "camera" in sensing.kinds,
+                f"the action {world.clock.action!r} is": world.clock.action == "meta",
+            }
+        )
+        self._numbers = import_compiler().numbers_of(script, world.scenario.road, world.clock.dt)
+        self._required = required
+
+    def advance(self, episode: Episode, action: NDArray[Any]) -> StepResult | None:
+        """Carry out a decision of the ego, in [-1, 1], (B, 2), or numbers of discrete actions, (B,).
+
+        None for an action that has to be refused, for episodes in which vehicles were commanded, and for states in
+        double precision, unless compiled steps are required: then a ValueError.
+        """
+        physical = scale_actions(action, len(episode.collided))
+        if physical is None or episode.overridden is not None or episode.statistics is None:
+            return None
+        if episode.state.x.dtype != torch.float32 or episode.measure_state.dtype != torch.float32:
+            if self._required:
+                raise ValueError(
+                    "core='numba' steps states in single precision, got one in "
+                    f"{episode.state.x.numpy().dtype}; make the environment with core='torch'."
+                )
+            return None
+        # the module is not kept: a step is copied and sent
+        result: StepResult = import_compiler().advance(episode, physical, self._numbers)
+        return result
 
 
-@cache
-def import_compiler() -> None:
-    """Import what needs numba.
-
-    Raises:
-        CompilerFails: numba is missing or fails: with this NumPy, or since it is switched off.
-    """
+def find_scripted_step(world: World, core: str = "auto") -> ScriptedStep | None:
+    """Return the compiled steps of a world; None where torch has to carry them out, a ValueError with "numba"."""
+    check_core(core)
+    if core == "torch":
+        return None
     try:
-        from rare_envs.fast import rollouts, steps  # noqa: F401
-    except (ImportError, OSError, RuntimeError) as error:
-        raise CompilerFails(f"numba fails here: {one_line(error)}") from error
+        return ScriptedStep(world, required=core == "numba")
+    except NotCompiled as reason:
+        leave_to_torch(reason, core, stacklevel=3)
+    return None
+
+
+def scale_actions(action: NDArray[Any], batch: int) -> NDArray[np.float32] | None:
+    """Return accelerations [m/s^2] and steering angles [rad], (B, 2); None for what `to_physical` refuses."""
+    if action.shape == (batch,) and action.dtype.kind in "iu":
+        if action.min() < 0 or action.max() >= len(DISCRETE_ACTIONS):
+            return None
+        action = DISCRETE_ACTIONS[action]
+    if action.shape != (batch, 2) or action.dtype.kind not in "fiu":
+        return None
+    action = action.astype(np.float32)
+    if not np.isfinite(action).all():
+        return None
+    return np.asarray(action.clip(-1.0, 1.0) * ACTION_SCALES, dtype=np.float32)

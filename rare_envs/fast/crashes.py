@@ -9,8 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from rare_envs.fast.compilation import compiled, single
-from rare_envs.fast.equations import ONE, TWO, ZERO, RoadNumbers, boxes_overlap, off_road
+from rare_envs.fast.equations import ONE, TWO, ZERO, RoadNumbers, boxes_overlap, compiled, off_road, single
 from rare_envs.fast.rows import SingleArray
 from rare_envs.traffic import crash
 from rare_envs.traffic.state import VEHICLE_LENGTH, VEHICLE_WIDTH
@@ -63,18 +62,7 @@ def record_crashes(
     own: CrashRows,
     others: CrashRows,
 ) -> None:
-    """Put the crashes of a tick in: `rare_envs.simulation.measurement.EpisodeStatistics.update`.
-
-    Args:
-        before: x, y, heading and speed before the tick, shape (4, N, B), single precision.
-        after: Likewise after it.
-        was_over: Whether the ego had collided before, shape (B,).
-        is_over: Whether it has now, shape (B,).
-        road: A straight road.
-        dt: Tick [s].
-        own: Crashes of the egos, written to.
-        others: First crashes between two other vehicles, written to.
-    """
+    """Put the crashes of a tick in, from x, y, heading and speed (4, N, B): `EpisodeStatistics.update`."""
     vehicles = after.shape[1]
     for row in range(after.shape[2]):
         if was_over[row]:
@@ -98,18 +86,7 @@ def write_crash(
     found: CrashRows,
     row: int,
 ) -> None:
-    """Write the crash of vehicles from `first` up to `last` with those behind them: `rare_envs.traffic.crash.crash_of`.
-
-    Args:
-        old: x, y, heading and speed a tick earlier, shape (4, N).
-        new: Likewise at the moment of the crash.
-        first: Number of a vehicle.
-        last: Number of the vehicle after the last one; with the ego, the edge of the road counts as well.
-        road: A straight road.
-        dt: Tick [s].
-        found: Written to, if there is a crash.
-        row: Where.
-    """
+    """Write the crash of vehicles from `first` to before `last` with those behind them, (4, N): `crash.crash_of`."""
     x, y, heading = new[0], new[1], new[2]
     earliest, pair, contact = _NEVER, (-1, -1), Contact(_NEVER, 0, ZERO, ZERO, ZERO, ZERO)
     for one in range(first, last):

@@ -1,21 +1,91 @@
-"""Equations of one vehicle or two, in single precision, compiled by numba.
+"""Compilation by numba, and the equations of one vehicle or two, in single precision.
 
 Each function is the scalar twin of the torch function that its docstring names, which has the sources and the
 explanations. Operations are in the same order, so that the two differ by the rounding of sines and the like alone.
 """
 
+import hashlib
 import math
-from typing import NamedTuple
+import os
+import shutil
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple, TypeVar, cast
 
+import numba
 import numpy as np
 
 from rare_envs.control.idm import IDM, MAX_HEADING_COMMAND, MIN_RATIO, TAU_HEADING, TAU_LATERAL
-from rare_envs.fast.compilation import compiled, single
 from rare_envs.measures.base import GAP_MIN, STILL
 from rare_envs.traffic import vehicle_models
 from rare_envs.traffic.bodies import DIAGONAL
 from rare_envs.traffic.road import Road
 from rare_envs.traffic.state import VEHICLE_LENGTH, VEHICLE_WIDTH
+
+Function = TypeVar("Function", bound=Callable[..., object])
+PACKAGE = Path(__file__).parents[1]
+COMPILED_IN = ("fast", "control", "measures", "scenarios", "simulation", "traffic")
+"""Folders with functions and constants that are compiled."""
+UNUSED = 7 * 24 * 3600.0
+"""Machine code that no process has used for so long [s] is removed."""
+_CONFIG: Any = numba.config
+_JIT: Any = numba.njit  # its option `_nrt`, memory that numba manages, is not typed
+
+
+def compiled(function: Function, **options: Any) -> Function:
+    """Compile a function when it is first called; division by zero gives inf, as in torch.
+
+    It can make no arrays and return none: it writes into those that it is given. So numba need not count references to
+    arrays, which it does by atomic operations at every slice: two thirds of the time of rollouts with a policy.
+
+    Raises:
+        ImportError: numba is switched off, and would leave the function to Python.
+    """
+    if _CONFIG.DISABLE_JIT:
+        raise ImportError("NUMBA_DISABLE_JIT is set")
+    before, _CONFIG.CACHE_DIR = _CONFIG.CACHE_DIR, _CACHE
+    try:
+        return cast(Function, _JIT(cache=True, error_model="numpy", _nrt=False, **options)(function))
+    finally:
+        _CONFIG.CACHE_DIR = before
+
+
+def inlined(function: Function) -> Function:
+    """Compile as `compiled` does, into its callers: `Rows` are many numbers to hand over."""
+    return compiled(function, inline="always")
+
+
+def compiled_fused(function: Function) -> Function:
+    """Compile as `compiled` does; products that are added are not rounded before, where the processor can do so."""
+    return compiled(function, fastmath={"contract"})
+
+
+def single(*values: float) -> tuple[float, ...]:
+    """Return constants in single precision. To the type checker they are floats; numba infers types by itself."""
+    return tuple(cast(float, np.float32(value)) for value in values)
+
+
+def find_cache() -> str:
+    """Return the folder of machine code of the sources as they are, below `NUMBA_CACHE_DIR` or beside this file.
+
+    numba looks at a function's own file alone to tell whether its kept code is out of date, not at those of the
+    functions and constants that it uses. Folders of other sources are removed when nobody has used them for long.
+    """
+    digest = hashlib.blake2b(digest_size=8)
+    for path in sorted(path for name in COMPILED_IN for path in (PACKAGE / name).glob("*.py")):
+        at = path.stat()
+        digest.update(f"{path} {at.st_mtime_ns} {at.st_size}".encode())
+    place = Path(os.environ.get("NUMBA_CACHE_DIR") or Path(__file__).parent / "__pycache__")
+    folder = place / f"compiled-{digest.hexdigest()}"
+    for other in place.glob("compiled-*"):
+        if time.time() - other.stat().st_mtime > UNUSED:
+            shutil.rmtree(other, ignore_errors=True)
+    return str(folder)
+
+
+_CACHE = find_cache()
+
 
 ZERO, HALF, ONE, TWO, THREE, FOUR, SIX = single(0.0, 0.5, 1.0, 2.0, 3.0, 4.0, 6.0)
 BODY_LENGTH, _HALF_LENGTH, _HALF_WIDTH = single(VEHICLE_LENGTH, VEHICLE_LENGTH / 2, VEHICLE_WIDTH / 2)

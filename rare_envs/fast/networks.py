@@ -10,9 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rare_envs.control.actions import DISCRETE_ACTIONS, MAX_ACCELERATION, MAX_STEERING
-from rare_envs.fast.compilation import compiled, compiled_fused, single
-from rare_envs.fast.dense_policy import DensePolicy
-from rare_envs.fast.equations import BODY_LENGTH, ONE, ZERO, clip, cosine, sine
+from rare_envs.egos.dense_policies import DensePolicy
+from rare_envs.fast.equations import BODY_LENGTH, ONE, ZERO, clip, compiled, compiled_fused, cosine, sine, single
 from rare_envs.fast.rows import UNKNOWN, Rows, SingleArray
 from rare_envs.simulation.observation import CLIP, EGO_FEATURES, OTHER_FEATURES
 
@@ -106,13 +105,9 @@ def pad(width: int) -> int:
 
 @compiled
 def decide_by_policy(rows: Rows, policy: PolicyNumbers, values: SingleArray, spare: SingleArray) -> None:
-    """Decide for the egos; f of a row on which an output is not finite is `UNKNOWN`.
+    """Decide for at most `LANES` egos; f of a row on which an output is not finite is `UNKNOWN`.
 
-    Args:
-        rows: At most `LANES`.
-        policy: The policy.
-        values: Written over, shape (widest layer, `LANES`); likewise the next.
-        spare: See values.
+    `values` and `spare`, (widest layer, `LANES`), are written over.
     """
     values[4 * len(rows.x) - 1 : policy.widths[0]] = ZERO
     observe(rows, values)
@@ -174,10 +169,7 @@ def apply_layers(policy: PolicyNumbers, values: SingleArray, spare: SingleArray)
 
 @compiled_fused
 def apply_layer(weight: SingleArray, bias: SingleArray, before: SingleArray, after: SingleArray) -> None:
-    """Write the outputs of a layer, (at least outputs, `LANES`), for inputs likewise.
-
-    Four outputs and four inputs at once: so sums and values are in registers for four products each.
-    """
+    """Write the outputs of a layer, (at least outputs, `LANES`), for inputs likewise."""
     for unit in range(0, len(weight), AT_ONCE):
         sums_0, sums_1, sums_2, sums_3 = after[unit], after[unit + 1], after[unit + 2], after[unit + 3]
         for lane in range(LANES):
@@ -205,10 +197,7 @@ def apply_layer(weight: SingleArray, bias: SingleArray, before: SingleArray, aft
 
 @compiled_fused
 def activate(values: SingleArray, bounded: bool) -> None:
-    """Write hyperbolic tangents of values (n,) over them, to 3e-7 of their size, or the larger of 0 and the value.
-
-    The rational function of Eigen (`generic_fast_tanh_float`, Mozilla Public License 2.0), which is vectorised.
-    """
+    """Write hyperbolic tangents of values (n,) over them, to 3e-7 of their size, or the larger of 0 and the value."""
     if not bounded:
         for i in range(len(values)):
             values[i] = ZERO if values[i] < ZERO else values[i]

@@ -1,46 +1,83 @@
-"""Rollouts of the scripted scenarios, compiled by numba: from the traffic at time 0 to f, block by block of rows."""
+"""Rollouts and steps of the scripted scenarios, compiled by numba: blocks of rows from time 0 to f, or by a tick."""
 
-from typing import Any
+import math
+from typing import NamedTuple
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
+from rare_envs.control.actions import MAX_ACCELERATION, MAX_STEERING
 from rare_envs.control.idm import IDM
-from rare_envs.fast import scripts
-from rare_envs.fast.compilation import compiled, single
-from rare_envs.fast.dense_policy import DensePolicy
-from rare_envs.fast.equations import IDMNumbers, RoadNumbers
-from rare_envs.fast.networks import LANES, PolicyNumbers, decide_by_policy
-from rare_envs.fast.rows import UNKNOWN, SingleArray, begin, decide_by_idm, make_table, rows_of, stack_state, tick
+from rare_envs.egos.dense_policies import DensePolicy
+from rare_envs.fast import rows as fast_rows
+from rare_envs.fast.crashes import CrashRows, record_crashes
+from rare_envs.fast.equations import (
+    ONE,
+    TWO,
+    ZERO,
+    IDMNumbers,
+    RoadNumbers,
+    at_least,
+    boxes_overlap,
+    centre_of,
+    clip,
+    compiled,
+    single,
+)
+from rare_envs.fast.networks import LANES, PolicyNumbers, decide_by_policy, observe
+from rare_envs.fast.rows import (
+    HIT,
+    UNKNOWN,
+    Rows,
+    ScriptNumbers,
+    SingleArray,
+    begin,
+    begin_step,
+    decide_by_idm,
+    make_table,
+    rows_of,
+    stack_state,
+    tick,
+)
+from rare_envs.measures.base import COLLISION
 from rare_envs.scenarios.cut_in import CUTTER_IDM
+from rare_envs.simulation import decision as reward
+from rare_envs.simulation.decision import RewardTerms, StepResult
+from rare_envs.simulation.episode import Episode, EpisodeStatistics
+from rare_envs.traffic.crash import Crash
+from rare_envs.traffic.neighbours import Lead
 from rare_envs.traffic.road import Road
 from rare_envs.traffic.state import State
 
 ROWS = 256
 """Rows in a block with the IDM as ego: enough that starting a loop costs little, and in the processor's first cache."""
+_ACCELERATION, _STEERING = single(MAX_ACCELERATION, MAX_STEERING)
+_TARGET_SPEED, _COMFORT, _EFFORT, _LANE, _HEADWAY = single(
+    reward.TARGET_SPEED, reward.TTC_COMFORT, -reward.EFFORT_WEIGHT, -reward.LANE_WEIGHT, -reward.HEADWAY_WEIGHT
+)
+_STANDING_GAP, _TIME_GAP, _COST, _LEAST_CLOSING = single(
+    reward.STANDING_GAP, reward.TIME_GAP, -reward.COLLISION_COST, reward.LEAST_CLOSING
+)
+
+
+def numbers_of(script: str, road: Road, dt: float) -> ScriptNumbers:
+    """Return the numbers of a script, named as in `rare_envs.fast.rows`, on a straight road with equal lanes."""
+    number: int = getattr(fast_rows, script)
+    return ScriptNumbers(number, IDMNumbers.of(CUTTER_IDM), RoadNumbers.of(road), *single(dt))
 
 
 def drive(script: str, state: State, ego: IDM | DensePolicy, road: Road, dt: float, ticks: int) -> NDArray[np.float64]:
-    """Return f of B scenarios, NaN where a policy's outputs are not finite.
-
-    Args:
-        script: A name in `rare_envs.fast.scripts`.
-        state: At time 0.
-        ego: The ego.
-        road: A straight road with equal lanes.
-        dt: Tick [s].
-        ticks: Length of an episode.
-    """
+    """Return f (B,) of scenarios from their state at time 0, NaN where a policy's outputs are not finite."""
     start, vehicles, f = stack_state(state), state.x.shape[1], np.empty(len(state.x), dtype=np.float32)
-    (tick_length,) = single(dt)
     table = make_table(start, vehicles, min(ROWS, max(len(f), 1)) if isinstance(ego, IDM) else LANES)
-    world = (getattr(scripts, script), IDMNumbers.of(CUTTER_IDM), RoadNumbers.of(road), tick_length, ticks)
+    numbers = numbers_of(script, road, dt)
     if isinstance(ego, IDM):
-        drive_by_idm(start, table, vehicles, IDMNumbers.of(ego), *world, f)
+        drive_by_idm(start, table, vehicles, IDMNumbers.of(ego), numbers, ticks, f)
     else:
         policy = PolicyNumbers.of(ego)
         values, spare = np.zeros((2, policy.widths.max(), LANES), dtype=np.float32)
-        drive_by_policy(start, table, vehicles, policy, values, spare, *world, f)
+        drive_by_policy(start, table, vehicles, policy, values, spare, numbers, ticks, f)
     return np.where(f == UNKNOWN, np.nan, f.astype(np.float64))
 
 
@@ -50,33 +87,17 @@ def drive_by_idm(
     table: SingleArray,
     vehicles: int,
     idm: IDMNumbers,
-    script: int,
-    cutter_idm: IDMNumbers,
-    road: RoadNumbers,
-    dt: float,
+    script: ScriptNumbers,
     ticks: int,
     f: SingleArray,
 ) -> None:
-    """Write f of each row.
-
-    Args:
-        start: The traffic at time 0, by `stack_state`.
-        table: Room for a block of rows, by `make_table`.
-        vehicles: N.
-        idm: Of the ego.
-        script: A number of `rare_envs.fast.scripts`.
-        cutter_idm: Of a cutter behind its lead.
-        road: The road.
-        dt: Tick [s].
-        ticks: Length of an episode.
-        f: Shape (B,), written to.
-    """
+    """Write f (B,) of each row of `stack_state`, block by block in a table of `make_table`."""
     for first in range(0, len(f), table.shape[1]):
         rows = rows_of(table, vehicles, load(start, table, first))
-        turns = begin(rows, road)
+        turns = begin(rows, script.road)
         for _ in range(ticks):
             decide_by_idm(rows, turns, idm)
-            turns = tick(script, rows, turns, cutter_idm, road, dt)
+            turns = tick(rows, turns, script)
         for row in range(rows.size):
             f[first + row] = rows.f[row]
 
@@ -89,29 +110,116 @@ def drive_by_policy(
     policy: PolicyNumbers,
     values: SingleArray,
     spare: SingleArray,
-    script: int,
-    cutter_idm: IDMNumbers,
-    road: RoadNumbers,
-    dt: float,
+    script: ScriptNumbers,
     ticks: int,
     f: SingleArray,
 ) -> None:
-    """Write f of each row; arguments as of `drive_by_idm` and `decide_by_policy`."""
+    """Write f (B,) of each row, as `drive_by_idm`; `values` and `spare` as of `decide_by_policy`."""
     for first in range(0, len(f), table.shape[1]):
         rows = rows_of(table, vehicles, load(start, table, first))
-        begin(rows, road)
+        begin(rows, script.road)
         for _ in range(ticks):
             decide_by_policy(rows, policy, values, spare)
-            tick(script, rows, True, cutter_idm, road, dt)
+            tick(rows, True, script)
         for row in range(rows.size):
             f[first + row] = rows.f[row]
 
 
 @compiled
-def load(start: Any, table: Any, first: int) -> int:
+def load(start: SingleArray, table: SingleArray, first: int) -> int:
     """Copy rows from number `first` on into a table; return how many."""
     size: int = min(table.shape[1], start.shape[1] - first)
     for number in range(len(start)):
         for row in range(size):
             table[number, row] = start[number, first + row]
     return size
+
+
+class Stepped(NamedTuple):
+    """What a step writes for B episodes beside the traffic."""
+
+    f: SingleArray
+    """Measure before and after, shape (B,)."""
+    lead: SingleArray
+    """Gap [m] and closing speed [m/s], shape (2, B)."""
+    terms: SingleArray
+    """Of the reward, in the order of `RewardTerms`, shape (6, B)."""
+    features: SingleArray
+    """The observation `features`, shape (F, B)."""
+
+
+def advance(episode: Episode, action: SingleArray, script: ScriptNumbers) -> StepResult:
+    """Carry out accelerations [m/s^2] and steering angles [rad] of the egos (B, 2) for a tick of B episodes."""
+    old, f, vehicles = episode.state, episode.measure_state.numpy(), episode.state.x.shape[1]
+    start, rooms = stack_state(old), (np.empty((n, len(f)), dtype=np.float32) for n in (2, 6, 4 * vehicles - 1))
+    table, stepped, tensor = make_table(start, vehicles, len(f)), Stepped(f.copy(), *rooms), torch.from_numpy
+    eventful = step(table, vehicles, action, script, stepped)
+    before, after = (each[: 4 * vehicles].reshape(4, vehicles, len(f)) for each in (start, table))
+    x, y, heading, speed = (tensor(field.T) for field in after)
+    lead, now, least = Lead(*map(tensor, stepped.lead)), tensor(stepped.f == COLLISION), tensor(stepped.f)
+    statistics = episode.statistics
+    assert statistics is not None
+    statistics = statistics._replace(least_ttc=least)
+    if eventful:
+        own, others = (CrashRows(*(field.numpy().copy() for field in each)) for each in statistics[1:])
+        record_crashes(before, after, episode.collided.numpy(), now.numpy(), script.road, script.dt, own, others)
+        statistics = EpisodeStatistics(least, *(Crash(*map(tensor, each)) for each in (own, others)))
+    moved = episode._replace(
+        state=State(x, y, heading, speed, old.theta),
+        lead=lead,
+        measure_state=least,
+        collided=now,
+        statistics=statistics,
+    )
+    return StepResult(moved, RewardTerms(*map(tensor, stepped.terms)), np.ascontiguousarray(stepped.features.T))
+
+
+@compiled
+def step(table: SingleArray, vehicles: int, action: SingleArray, script: ScriptNumbers, stepped: Stepped) -> bool:
+    """Move all vehicles of a table of `make_table` by a tick: `rare_envs.simulation.decision.advance`.
+
+    Return whether an ego has collided in this tick, or two other vehicles touch.
+    """
+    rows, f = rows_of(table, vehicles, len(action)), stepped.f
+    begin_step(rows, f)
+    for row in range(len(f)):
+        rows.acceleration[row], rows.steering[row] = action[row, 0], action[row, 1]
+    tick(rows, True, script)
+    eventful = others_touch(rows)
+    for row in range(len(f)):
+        eventful |= rows.f[row] == HIT and f[row] != HIT
+        f[row], stepped.lead[0, row], stepped.lead[1, row] = rows.f[row], rows.gap[row], rows.closing[row]
+        write_reward(stepped.terms[:, row], rows, row, script.road)
+    observe(rows, stepped.features)
+    return eventful
+
+
+@compiled
+def others_touch(rows: Rows) -> bool:
+    """Return whether two vehicles other than an ego overlap: `rare_envs.traffic.bodies.others_overlap`."""
+    x, y, heading = rows.x, rows.y, rows.heading
+    for one in range(1, len(x)):
+        for other in range(one + 1, len(x)):
+            for row in range(rows.size):
+                dx, dy = x[other, row] - x[one, row], y[other, row] - y[one, row]
+                if boxes_overlap(dx, dy, heading[one, row], heading[other, row]):
+                    return True
+    return False
+
+
+@compiled
+def write_reward(terms: SingleArray, rows: Rows, row: int, road: RoadNumbers) -> None:
+    """Write the terms of the reward (6,): `rare_envs.simulation.decision.reward_terms`."""
+    y, speed = rows.y[0, row], rows.speed[0, row]
+    offset = y - centre_of(y, road)
+    offset -= np.rint(offset / road.width) * road.width
+    effort, turn = rows.acceleration[row] / _ACCELERATION, rows.steering[row] / _STEERING
+    share = offset / (road.width / TWO)
+    gap = at_least(rows.gap[row], ZERO)
+    time = gap / at_least(rows.closing[row], _LEAST_CLOSING)
+    terms[0] = clip(speed * math.cos(rows.heading[0, row]) / _TARGET_SPEED, ZERO, ONE)
+    terms[1] = _EFFORT * (effort * effort + turn * turn)
+    terms[2] = _LANE * (share * share)
+    terms[3] = -at_least(ONE - time / _COMFORT, ZERO)
+    terms[4] = _HEADWAY * at_least(ONE - gap / (_STANDING_GAP + _TIME_GAP * speed), ZERO)
+    terms[5] = _COST if rows.f[row] == HIT else ZERO

@@ -5,33 +5,41 @@ Sines and the like, which it cannot, stand in loops of their own, for blocks in 
 has the same bits in any block.
 """
 
+import math
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
-from rare_envs.fast.compilation import compiled, inlined, single
 from rare_envs.fast.equations import (
     BODY_LENGTH,
     FOUR,
+    ONE,
+    SIX,
+    THREE,
+    TWO,
     ZERO,
     IDMNumbers,
     RoadNumbers,
     are_near,
+    at_least,
     at_most,
     bicycle,
     boxes_overlap,
     centre_of,
+    clip,
+    compiled,
     cosine,
     fourth_power,
     idm_acceleration,
+    inlined,
     keep_straight,
     off_road,
+    single,
     steer_to_line,
     time_to_edge,
     time_to_lead,
 )
-from rare_envs.fast.scripts import move_others
 from rare_envs.measures.base import COLLISION
 from rare_envs.measures.longitudinal import TTC_MAX
 from rare_envs.traffic.state import State
@@ -40,6 +48,18 @@ SingleArray: TypeAlias = NDArray[np.float32]
 OWN = 8
 """Numbers of a row beside those of its vehicles and theta."""
 HIT, UNKNOWN, _LARGEST, _NOWHERE = single(COLLISION, -np.inf, TTC_MAX, np.inf)
+
+
+class ScriptNumbers(NamedTuple):
+    """How the vehicles around the ego move, and where."""
+
+    number: int
+    """`STEADY`, `BRAKING` or `CUT_IN`."""
+    cutter_idm: IDMNumbers
+    """Of a cutter behind its lead."""
+    road: RoadNumbers
+    dt: float
+    """Tick [s]."""
 
 
 class Rows(NamedTuple):
@@ -108,6 +128,55 @@ def rows_of(table: SingleArray, vehicles: int, size: int) -> Rows:
     )
 
 
+STEADY, BRAKING, CUT_IN = range(3)
+"""Numbers of scripts: a lead that keeps its speed, one that brakes, and a cutter in front of a lead."""
+
+
+@inlined
+def move_others(rows: Rows, script: ScriptNumbers) -> None:
+    """Move the vehicles around the ego by a tick, in the place of `Scenario.others`; a scenario has a branch here."""
+    x, speed, dt = rows.x[1], rows.speed[1], script.dt
+    if script.number == CUT_IN:
+        cut_in(rows, script.cutter_idm, dt)
+    elif script.number == BRAKING:
+        for row in range(rows.size):
+            x[row], speed[row] = keep_straight(x[row], speed[row], -rows.theta[0, row], dt)
+    else:
+        for row in range(rows.size):
+            x[row] += speed[row] * dt
+
+
+@inlined
+def cut_in(rows: Rows, idm: IDMNumbers, dt: float) -> None:
+    """Move cutter and lead: `rare_envs.scenarios.cut_in.others`."""
+    x, y, heading, speed, cos = rows.x[1], rows.y[1], rows.heading[1], rows.speed[1], rows.cosine[1]
+    lead_x, lead_speed, slope = rows.x[2], rows.speed[2], rows.spare[0]
+    lead_y, lead_heading, lead_cos = rows.y[2], rows.heading[2], rows.cosine[2]
+    start, length, offset, desired_speed = rows.theta[0], rows.theta[1], rows.theta[2], rows.theta[3]
+    bends = False
+    for row in range(rows.size):
+        gap, closing = lead_x[row] - x[row] - BODY_LENGTH, speed[row] - lead_speed[row] * cos[row]
+        ratio = speed[row] / desired_speed[row]
+        acceleration = idm_acceleration(idm, speed[row], gap, closing, ratio, fourth_power(ratio))
+        x[row] = x[row] + speed[row] * cos[row] * dt
+        speed[row] = at_least(speed[row] + acceleration * dt, ZERO)
+        lead_x[row] += lead_speed[row] * dt
+        lead_y[row], lead_heading[row], lead_cos[row] = ZERO, ZERO, ONE
+        y[row], slope[row] = bezier(x[row] - start[row], length[row], offset[row])
+        bends |= (slope[row] != ZERO) | (heading[row] != ZERO)
+    if bends:
+        for row in range(rows.size):
+            heading[row] = slope[row] if slope[row] == ZERO else math.atan(slope[row])
+            cos[row] = cosine(heading[row])
+
+
+@compiled
+def bezier(progress: float, length: float, offset: float) -> tuple[float, float]:
+    """Return y and slope of the path: `rare_envs.scenarios.cut_in.bezier`."""
+    t = clip(progress / length, ZERO, ONE)
+    return offset * (ONE + t * t * (TWO * t - THREE)), offset * (SIX * t * (t - ONE)) / length
+
+
 @compiled
 def begin(rows: Rows, road: RoadNumbers) -> bool:
     """Take the moment at time 0; return whether any ego is off its line, as `look` does."""
@@ -133,24 +202,15 @@ def find_cosines(rows: Rows) -> None:
 
 
 @inlined
-def tick(script: int, rows: Rows, turns: bool, cutter_idm: IDMNumbers, road: RoadNumbers, dt: float) -> bool:
-    """Move all by a tick, and take the moment after it.
+def tick(rows: Rows, turns: bool, script: ScriptNumbers) -> bool:
+    """Move all by a tick, and take the moment after it; return whether any ego is off its line.
 
-    Args:
-        script: A number of `rare_envs.fast.scripts`.
-        rows: The traffic; egos move by their `acceleration`, and by their `steering` if any `turns`.
-        turns: Whether any ego steers or is off its line.
-        cutter_idm: Of a cutter behind its lead.
-        road: The road.
-        dt: Tick [s].
-
-    Returns:
-        Whether any ego is off its line.
+    Egos move by their `acceleration`, and by their `steering` if any `turns`: steers or is off its line.
     """
-    move_others(script, rows, cutter_idm, dt)
-    move_egos(rows, turns, dt)
-    mark_hits(rows, turns, road)
-    return look(rows, turns, road)
+    move_others(rows, script)
+    move_egos(rows, turns, script.dt)
+    mark_hits(rows, turns, script.road)
+    return look(rows, turns, script.road)
 
 
 @inlined
@@ -208,13 +268,7 @@ def mark_hits(rows: Rows, turns: bool, road: RoadNumbers) -> None:
 def look(rows: Rows, turns: bool, road: RoadNumbers) -> bool:
     """Find the egos' leads, `rare_envs.traffic.neighbours.lead_of`, and let f be the least time to collision so far.
 
-    Args:
-        rows: The traffic.
-        turns: Whether any ego may have left its line.
-        road: The road.
-
-    Returns:
-        Whether any is off its line: not in the middle of a lane, or not along it.
+    Return whether any ego, of which any may have left its line if one `turns`, is not in the middle of a lane along it.
     """
     x, speed, f, gap, closing, lane = rows.x[0], rows.speed[0], rows.f, rows.gap, rows.closing, rows.lane
     off_line = turns and find_lanes(rows, road)

@@ -9,7 +9,6 @@ from typing import Any, NamedTuple, Protocol, runtime_checkable
 import torch
 from torch import Tensor
 
-from rare_envs.distributions.space import Distribution
 from rare_envs.plugins import did_you_mean
 from rare_envs.traffic.neighbours import LaneTraffic
 from rare_envs.traffic.road import Road
@@ -23,16 +22,23 @@ FIXED_SEED = 12345
 """Seed of the one sequence of `noise="fixed"`; arbitrary, but results depend on it."""
 
 
-class DriverWeights(Distribution, Protocol):
-    """Distribution of the weights that tell one driver from another."""
+class _Drivers(Protocol):
+    """What all drivers of M vehicles in B scenarios have."""
 
     @property
-    def dim(self) -> int:
-        """Number of weights."""
+    def weights(self) -> Any:
+        """Distribution of the weights that tell drivers apart, with their number `dim`; None if all are alike."""
+
+    @property
+    def noisy(self) -> bool:
+        """Whether they act with noise if they are given draws."""
+
+    def begin(self, draws: Tensor) -> Tensor:
+        """Return the memory at the start, (B, M, ...), from standard normal draws of shape (B, M, 2, 2)."""
 
 
 @runtime_checkable
-class Background(Protocol):
+class Background(_Drivers, Protocol):
     """Drivers of M vehicles in B scenarios, which act by the lidar features of each. Nothing in it is random.
 
     Example:
@@ -45,17 +51,6 @@ class Background(Protocol):
         >>> isinstance(Coasting(), Background)
         True
     """
-
-    @property
-    def weights(self) -> DriverWeights | None:
-        """Distribution of the weights that tell one driver from another; None if all are alike."""
-
-    @property
-    def noisy(self) -> bool:
-        """Whether they act with noise if they are given draws."""
-
-    def begin(self, draws: Tensor) -> Tensor:
-        """Return the memory at the start, (B, M, ...), from standard normal draws of shape (B, M, 2, 2)."""
 
     def act(
         self, features: Tensor, weights: Tensor | None, innovations: Tensor | None, memory: Tensor | None
@@ -74,7 +69,7 @@ class Background(Protocol):
 
 
 @runtime_checkable
-class TrafficBackground(Protocol):
+class TrafficBackground(_Drivers, Protocol):
     """Drivers that act by where everybody is, not by what a lidar shows. Nothing in it is random.
 
     Example:
@@ -82,17 +77,6 @@ class TrafficBackground(Protocol):
         >>> isinstance(LaneChangingDriver(), TrafficBackground)
         True
     """
-
-    @property
-    def weights(self) -> DriverWeights | None:
-        """As of `Background`."""
-
-    @property
-    def noisy(self) -> bool:
-        """As of `Background`."""
-
-    def begin(self, draws: Tensor) -> Tensor:
-        """As of `Background`."""
 
     def decide(self, traffic: LaneTraffic, who: slice, memory: Tensor, dt: float) -> tuple[Tensor, Tensor]:
         """Decide for one tick of dt [s].
@@ -128,62 +112,36 @@ class BackgroundState(NamedTuple):
         memory = drivers.begin(first.movedim(1, -1))
         return cls(weights, draws, memory, torch.zeros(batch, dtype=torch.int64, device=draws.device))
 
-
-def step_background(drivers: Background, state: BackgroundState, features: Tensor) -> tuple[Tensor, BackgroundState]:
-    """Query the drivers for one tick.
-
-    Args:
-        drivers: Of the M vehicles.
-        state: Theirs.
-        features: `rare_envs.sensors.lidar.FEATURES` of each vehicle, shape (B, M, 51).
-
-    Returns:
-        Accelerations [m/s^2] and yaw rates [rad/s], shape (B, M, 2), and the state one tick later. Beyond the last
-        draw, where no episode goes, draws are repeated.
-    """
-    innovations = None
-    if state.draws.shape[1]:
-        row = torch.arange(len(state.tick), device=state.tick.device)
-        at = (state.tick + FIRST_DRAWS).clamp(max=state.draws.shape[1] - 1)
-        innovations = state.draws[row, at]
-    weights = state.weights if state.weights.shape[1] else None
-    action, memory = drivers.act(features, weights, innovations, state.memory)
-    memory = state.memory if memory is None else memory
-    return action, state._replace(memory=memory, tick=state.tick + 1)
-
-
-def needs_lidar(drivers: Background | TrafficBackground | None) -> bool:
-    """Return whether drivers act by lidar features."""
-    return drivers is not None and not isinstance(drivers, TrafficBackground)
+    @property
+    def innovations(self) -> Tensor | None:
+        """The draws of this tick, shape (B, M, 2), those of the last where no episode goes; None without noise."""
+        if not self.draws.shape[1]:
+            return None
+        row = torch.arange(len(self.tick), device=self.tick.device)
+        return self.draws[row, (self.tick + FIRST_DRAWS).clamp(max=self.draws.shape[1] - 1)]
 
 
 def query_background(
     drivers: Background | TrafficBackground,
-    background_state: BackgroundState,
+    background: BackgroundState,
     state: State,
     road: Road,
     perception: Tensor | None,
     dt: float,
 ) -> tuple[Tensor, BackgroundState]:
-    """Query the drivers of all vehicles but the ego for one tick, by lidar or by where everybody is.
+    """Query the drivers of vehicles 1 to N - 1 for one tick, by lidar features (B, N, 51) or by where everybody is.
 
-    Args:
-        drivers: Of the N - 1 vehicles.
-        background_state: Theirs.
-        state: Traffic of B scenarios.
-        road: Their road.
-        perception: Lidar features, shape (B, N, 51); None for drivers that do not need them.
-        dt: Tick [s].
-
-    Returns:
-        Accelerations [m/s^2] and yaw rates [rad/s], shape (B, N - 1, 2), and the drivers' state one tick later.
+    Return accelerations [m/s^2] and yaw rates [rad/s], (B, N - 1, 2), and the drivers' state one tick later.
     """
-    others = slice(1, None)
+    others, memory = slice(1, None), background.memory
     if isinstance(drivers, TrafficBackground):
-        action, memory = drivers.decide(LaneTraffic.of(state, road), others, background_state.memory, dt)
-        return action, background_state._replace(memory=memory, tick=background_state.tick + 1)
-    assert perception is not None
-    return step_background(drivers, background_state, perception[:, others])
+        action, later = drivers.decide(LaneTraffic.of(state, road), others, memory, dt)
+    else:
+        assert perception is not None
+        weights = background.weights if background.weights.shape[1] else None
+        action, kept = drivers.act(perception[:, others], weights, background.innovations, memory)
+        later = memory if kept is None else kept
+    return action, background._replace(memory=later, tick=background.tick + 1)
 
 
 def noise_size(ticks: int, vehicles: int) -> int:
@@ -192,28 +150,20 @@ def noise_size(ticks: int, vehicles: int) -> int:
 
 
 def find_drivers(drivers: Any) -> Background | TrafficBackground | None:
-    """Return the drivers that a keyword argument `drivers` names.
+    """Return the drivers that a keyword argument `drivers` names: None for the scenario's script, or a ValueError.
 
-    Args:
-        drivers: None for the scenario's script, a `Background` or `TrafficBackground`, the name of an installed one
-            ("mgail"; "idm+mobil" and "mgail?rules=0" are looked up as "idm" and "mgail", whose loaders get the whole
-            name), or the path of a file that the package `agents` wrote.
-
-    Raises:
-        ValueError: If it is none of these.
+    A `Background` or `TrafficBackground`, the name of an installed one ("mgail"; "idm+mobil" and "mgail?rules=0" are
+    looked up as "idm" and "mgail", whose loaders get the whole name), or a file that the package `agents` wrote.
     """
-    if drivers is None:
-        return None
+    if drivers is None or isinstance(drivers, Background | TrafficBackground):
+        return drivers
     if not isinstance(drivers, str | Path):
-        if isinstance(drivers, Background | TrafficBackground):
-            return drivers
         raise ValueError(
             f"Expected drivers by name, or an object with weights, begin and act (or decide), got {drivers!r}."
         )
     known = {entry.name: entry for entry in entry_points(group=DRIVERS_GROUP)}
     name = str(drivers)
-    is_file = name.endswith(".safetensors")
-    offered = "file" if is_file else name.partition("?")[0].partition("+")[0]
+    offered = "file" if name.endswith(".safetensors") else name.partition("?")[0].partition("+")[0]
     if offered not in known:
         names = sorted({*known, *(f"{name}+mobil" for name in known if name == "idm")} - {"file"})
         listed = ", ".join(map(repr, names)) or "none is installed: pip install rare-envs"

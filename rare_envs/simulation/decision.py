@@ -1,29 +1,87 @@
-"""A decision of one agent or of several: an action, the ticks until the next, and the mean of their rewards."""
+"""A decision of one agent or of several: an action, the ticks until the next, and the mean of their rewards.
+
+The reward is what egos are trained on; estimates do not depend on it.
+"""
 
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple, Protocol, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
-from rare_envs.control.actions import IDLE
-from rare_envs.simulation.clock import Clock
-from rare_envs.simulation.episode import Episode
-from rare_envs.simulation.reward import RewardTerms, reward_terms
+from rare_envs.control.actions import IDLE, MAX_ACCELERATION, MAX_STEERING
+from rare_envs.devices import constant
+from rare_envs.simulation.episode import Clock, Episode
 from rare_envs.simulation.world import World
 from rare_envs.traffic.neighbours import Lead
 from rare_envs.traffic.state import State
 
+TARGET_SPEED = 21.72
+"""Speed [m/s] beyond which going faster earns nothing more: the desired speed of the reference IDM ego."""
+TTC_COMFORT = 4.0
+"""Times to collision under this [s] cost; critical values in use are 1.5 to 4 s (docs/measures.md)."""
+EFFORT_WEIGHT = 0.1
+"""Cost of full acceleration or full steering; our choice: a tenth of what a tick of full progress earns."""
+LANE_WEIGHT = 0.5
+"""Cost of a place on a marker instead of the middle of a lane; our choice."""
+HEADWAY_WEIGHT = 0.5
+"""Cost of no gap at all; our choice, so that following closely pays less than falling back."""
+STANDING_GAP = 2.0
+"""Gap to the lead [m] under which it costs at a standstill."""
+TIME_GAP = 1.0
+"""To which the way of this time [s] is added; like the other weights our choice."""
+COLLISION_COST = 30.0
+"""Cost of a collision, about what a long undisturbed drive is worth under usual discounting."""
+LEAST_CLOSING = 1e-4
+"""Closing speeds are floored here [m/s], so that the time to collision of who does not close is long and finite."""
 
-class Episodes(Protocol):
-    """B episodes of one agent or of several."""
+
+class RewardTerms(NamedTuple):
+    """Terms of the reward of one tick, shape (B,) each; the reward is their sum."""
+
+    progress: Tensor
+    """Speed along the road over `TARGET_SPEED`, in 0 to 1."""
+    comfort: Tensor
+    """-0.1 (acceleration / 5 m/s^2)^2 - 0.1 (steering / 0.1 rad)^2."""
+    lane: Tensor
+    """-0.5 (offset from the centre of the nearest lane / half a lane)^2."""
+    risk: Tensor
+    """-(1 - TTC / 4 s) where the time to collision is shorter than that."""
+    headway: Tensor
+    """-0.5 (1 - gap / (2 m + 1 s x speed)) where the gap to the lead is shorter than that."""
+    collision: Tensor
+    """-30 in the tick of a collision."""
 
     @property
-    def collided(self) -> Tensor:
-        """Which have collided, boolean, in any shape: of the episodes, or of each agent in each."""
+    def total(self) -> Tensor:
+        """The reward, shape (B,)."""
+        return self.progress + self.comfort + self.lane + self.risk + self.headway + self.collision
 
 
-EpisodesT = TypeVar("EpisodesT", bound=Episodes)
+def reward_terms(episode: Episode, action: Tensor) -> RewardTerms:
+    """Return the terms for arriving in `episode` by accelerations [m/s^2] and steering angles [rad] (B, 2)."""
+    state, lead = episode.state, episode.lead
+    along = state.speed[:, 0] * torch.cos(state.heading[:, 0])
+    width = episode.road.width
+    offset = state.y[:, 0] - episode.road.centre_of(state.y[:, 0])
+    offset = offset - torch.round(offset / width) * width  # off the road, as if lanes went on
+    effort = action / constant((MAX_ACCELERATION, MAX_STEERING), action)
+    gap = lead.gap.clamp(min=0.0)
+    ttc = gap / lead.closing_speed.clamp(min=LEAST_CLOSING)
+    return RewardTerms(
+        progress=(along / TARGET_SPEED).clamp(0.0, 1.0),
+        comfort=-EFFORT_WEIGHT * effort.square().sum(dim=1),
+        lane=-LANE_WEIGHT * (offset / (width / 2)).square(),
+        risk=-(1.0 - ttc / TTC_COMFORT).clamp(min=0.0),
+        headway=-HEADWAY_WEIGHT * (1.0 - gap / (STANDING_GAP + TIME_GAP * state.speed[:, 0])).clamp(min=0.0),
+        collision=-COLLISION_COST * episode.collided.to(along.dtype),
+    )
+
+
+EpisodesT = TypeVar("EpisodesT", bound=Any)
+"""B episodes of one agent or of several; `collided` says of which episodes, or of which agents in each."""
 
 
 class TickReward(NamedTuple):
@@ -44,16 +102,8 @@ def run_ticks(
 ) -> tuple[EpisodesT, tuple[Any, ...]]:
     """Carry out the ticks of a decision; no further ones once all have collided.
 
-    Args:
-        clock: Says how many they are.
-        episodes: B episodes at the decision.
-        action: What is decided. Meta-actions are given in the first tick, `IDLE` in those after it; a physical action
-            in all of them.
-        tick: Carries out one.
-
-    Returns:
-        The episodes at the time of the next decision, and the agents' rewards: the means over the ticks, where ticks
-        after a collision count as 0.
+    Meta-actions are given in the first tick, `IDLE` in those after it; a physical action in all of them. Return the
+    episodes at the next decision and the agents' rewards: the means over the ticks, those after a collision being 0.
     """
     stride, sums = clock.stride, tuple[Any, ...]()
     for index in range(stride):
@@ -77,7 +127,7 @@ def _map_terms(function: Callable[..., Tensor], *terms: Any) -> Any:
     """Apply a function term by term."""
     if isinstance(terms[0], Tensor):
         return function(*terms)
-    return type(terms[0])(*(function(*each) for each in zip(*terms, strict=True)))
+    return type(terms[0])(*map(function, *terms))
 
 
 class StepResult(NamedTuple):
@@ -87,24 +137,17 @@ class StepResult(NamedTuple):
     """After it; those with a collision stay as they were in its tick."""
     terms: RewardTerms
     """Terms of the reward, shape (B,) each: their mean over the ticks, where ticks after a collision count as 0."""
+    features: NDArray[np.float32] | None = None
+    """The observation `features`, shape (B, F), where it is known already."""
 
 
 def advance(
     world: World, episode: Episode, action: Tensor, watch: Callable[[Episode], None] | None = None
 ) -> StepResult:
-    """Carry out a decision.
+    """Carry out a decision of the ego, as of `World.decode_meta_actions`; `watch` gets the episodes after each tick.
 
     A continuous action lasts one tick. A meta-action lasts a second: it is given to the controllers once, which then
     act at every tick, and the measure is updated at every tick too.
-
-    Args:
-        world: The world.
-        episode: B episodes, none of which has collided.
-        action: Of the ego, as in `World.decode_meta_actions`.
-        watch: Called with the episodes after each tick.
-
-    Returns:
-        The episodes at the time of the next decision, and the reward.
     """
 
     def tick(old: Episode, chosen: Tensor, first: bool) -> tuple[Episode, tuple[TickReward]]:
@@ -121,13 +164,7 @@ def advance(
 
 
 def hold_finished(over: Tensor, old: Episode, new: Episode) -> Episode:
-    """Return the new episodes, with the traffic of those that are over as it was.
-
-    Args:
-        over: Which are over, boolean, shape (B,).
-        old: Before the tick.
-        new: After it.
-    """
+    """Return the new episodes, with the traffic of those that are over, boolean (B,), as it was in the old ones."""
 
     def hold(before: Tensor, after: Tensor) -> Tensor:
         return torch.where(over.view(-1, *[1] * (after.ndim - 1)), before, after)

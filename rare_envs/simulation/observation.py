@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -47,7 +46,7 @@ OTHER_FEATURES = (
 )
 """Of each other vehicle: bumper gap along the road (negative beside or behind), its speed along the road less the
 ego's, its position across the road less the ego's, its speed across the road."""
-
+_EGO_SCALES, _OTHER_SCALES = (tuple(each.scale for each in features) for features in (EGO_FEATURES, OTHER_FEATURES))
 
 _CORE_SCALES = (LANE_WIDTH, 0.1, 30.0, VEHICLE_LENGTH, 2.0, 0.01, LANE_WIDTH, LANE_WIDTH, 1.0, 1.0, 1.0)
 LIDAR_SCALES = (*_CORE_SCALES, *(MAX_RANGE,) * BEAMS, *(10.0,) * BEAMS)
@@ -55,18 +54,10 @@ LIDAR_SCALES = (*_CORE_SCALES, *(MAX_RANGE,) * BEAMS, *(10.0,) * BEAMS)
 
 
 def observation_space(vehicles: int, observation: str = "features", camera: Camera | None = None) -> spaces.Space[Any]:
-    """Return the space of an observation.
+    """Return the space of an observation among N vehicles; of several joined by "+" a `Dict`.
 
-    Args:
-        vehicles: N.
-        observation: "features": 3 of the ego, then 4 of each other vehicle; "lidar": the ego's 51; "kinematics":
-            HighwayEnv's 5 x 5; "camera": an image, uint8, H x W x 3; "speed": the ego's own, all that a camera does
-            not show of it. Several joined by "+" make a `Dict`.
-        camera: Says how large the image is; None for the usual one.
-
-    Example:
-        >>> observation_space(3).shape, observation_space(3, "camera").shape
-        ((11,), (66, 200, 3))
+    "features": 3 of the ego, then 4 of each other vehicle; "lidar": the ego's 51; "kinematics": HighwayEnv's 5 x 5;
+    "camera": an image, uint8, H x W x 3, as large as the camera says; "speed": all that a camera does not show of it.
     """
     kinds = kinds_of(observation)
     if len(kinds) > 1:
@@ -85,22 +76,8 @@ def observation_space(vehicles: int, observation: str = "features", camera: Came
 def observe(episode: Episode, observation: str, vehicle: int = 0) -> Any:
     """Return what one vehicle observes in each of B episodes: the ego, or another one as if it were the ego.
 
-    Args:
-        episode: B episodes.
-        observation: A kind of observation, or several joined by "+", see `rare_envs.sensors.kinds.OBSERVATIONS`.
-        vehicle: Index of the observing vehicle.
-
-    Returns:
-        Shape (B, F), float32, within +-`CLIP`; (B, 5, 5) for "kinematics"; (B, H, W, 3), uint8, red, green and blue,
-        for "camera". Of several a mapping from their names.
-
-    Example:
-        >>> import torch
-        >>> from rare_envs.scenarios.car_following import CAR_FOLLOWING
-        >>> from rare_envs.simulation.world import World
-        >>> episode = World(CAR_FOLLOWING).start(torch.tensor([[15.0, 20.0, 25.0]]))  # speeds [m/s] and gap [m]
-        >>> observe(episode, "features")  # 15/30, 0, 0, then 25/50, (20 - 15)/10, 0, 0
-        tensor([[0.5000, 0.0000, 0.0000, 0.5000, 0.5000, 0.0000, 0.0000]])
+    Shape (B, F), float32, within +-`CLIP`; (B, 5, 5) for "kinematics"; (B, H, W, 3), uint8, red, green and blue, for
+    "camera". Of several, joined by "+", a mapping from their names.
     """
     kinds = kinds_of(observation)
     if len(kinds) > 1:
@@ -121,14 +98,7 @@ def observe(episode: Episode, observation: str, vehicle: int = 0) -> Any:
 
 
 def observe_features(state: State) -> Tensor:
-    """Return the `features` observation of the ego.
-
-    Args:
-        state: Traffic of B scenarios with N vehicles.
-
-    Returns:
-        Shape (B, 3 + 4 (N - 1)), float32, within +-`CLIP`: the ego's features, then each other vehicle's.
-    """
+    """Return the `features` of the ego, (B, 3 + 4 (N - 1)), float32: its own, then those of each other vehicle."""
     (ego, *others), (length,) = state.vehicles, scalars((VEHICLE_LENGTH,), state.x)
     values, along = [ego.speed, ego.y, ego.heading], ego.speed * torch.cos(ego.heading)
     for other in others:
@@ -138,16 +108,8 @@ def observe_features(state: State) -> Tensor:
             other.y - ego.y,
             other.speed * torch.sin(other.heading),
         ]
-    scales = _scales(state.x.shape[1], state.x.dtype, state.x.device)
+    scales = constant(_EGO_SCALES + _OTHER_SCALES * len(others), state.x)
     return (torch.stack(values, dim=1) / scales).clamp(-CLIP, CLIP).float()
-
-
-@cache  # never forgotten: recorded rollouts read it where it is
-def _scales(vehicles: int, dtype: torch.dtype, device: torch.device) -> Tensor:
-    """Return the scales of the entries of `features`, shape (3 + 4 (N - 1),)."""
-    features = EGO_FEATURES + OTHER_FEATURES * (vehicles - 1)
-    with torch.inference_mode(False):  # made under it they could not be used for gradients later
-        return torch.tensor([feature.scale for feature in features], dtype=dtype, device=device)
 
 
 WeatherDistributions = tuple[tuple[tuple[Parameter, ...], Distribution], ...]
@@ -156,14 +118,7 @@ WeatherDistributions = tuple[tuple[tuple[Parameter, ...], Distribution], ...]
 
 @dataclass(frozen=True)
 class Sensing:
-    """Sensors of the ego.
-
-    Example:
-        >>> Sensing("camera+speed").kinds
-        ('camera', 'speed')
-        >>> Sensing().space(vehicles=3).shape
-        (11,)
-    """
+    """Sensors of the ego."""
 
     observation: str = "features"
     """One of `rare_envs.sensors.kinds.OBSERVATIONS`, or several joined by "+"."""
@@ -189,19 +144,13 @@ class Sensing:
         return observation_space(vehicles, self.observation, self.camera)
 
     def weather_distributions(self, noisy: bool) -> WeatherDistributions:
-        """Return the weather's parameters with their distributions; none on a clear day.
-
-        Args:
-            noisy: Whether the camera has noise.
-        """
+        """Return the weather's parameters with their distributions, with noise if `noisy`; none on a clear day."""
         return tuple(weather_parameters(noisy)) if self.weather else ()
 
     def start_camera(self, weather: Tensor, key: Tensor) -> CameraContext | None:
-        """Return what the camera's pictures depend on beside the traffic, at time 0; None without a camera.
+        """Return what pictures depend on beside the traffic, at time 0; None without a camera.
 
-        Args:
-            weather: Columns of x, shape (B, 0) on a clear day.
-            key: The column from which the camera's noise follows, shape (B, 1) or (B, 0).
+        The weather are columns of x, (B, 0) on a clear day; from the key, (B, 1) or (B, 0), follows the camera's noise.
         """
         if "camera" not in self.kinds:
             return None

@@ -96,16 +96,7 @@ def drive_tick(world: World, driver: Driver, episode: Episode, memory: Any) -> t
 
 
 def rollout(world: World, driver: Driver, x: Tensor) -> Episode:
-    """Drive B scenarios from start to horizon.
-
-    Args:
-        world: The world.
-        driver: The ego.
-        x: Scenario parameters, shape (B, d).
-
-    Returns:
-        The episodes at the horizon; `.f` is the safety measure, shape (B,).
-    """
+    """Return the episodes of `drive` at the horizon; `.f` is the safety measure, shape (B,)."""
     for episode in drive(world, driver, x):
         last = episode
     return last

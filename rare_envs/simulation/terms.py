@@ -1,9 +1,11 @@
-"""Terms of rollouts: what samplers search by, beside f, in scenarios that several vehicles make dangerous."""
+"""Terms of rollouts, what samplers search by beside f, and their gradients with respect to x, by autograd."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -11,10 +13,22 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from rare_envs.arrays import FloatArray
-from rare_envs.measures.terms import TermTracker, find_order
-from rare_envs.simulation.episode import Episode
-from rare_envs.simulation.measurement import Measurement
+from rare_envs.measures.base import Moment
+from rare_envs.measures.terms import TermMeasure, TermTracker, find_order
+from rare_envs.simulation.episode import Episode, Measurement
+from rare_envs.simulation.rollout import Driver, StochasticDriver, begin_drive, drive_tick
 from rare_envs.simulation.world import World
+from rare_envs.traffic.state import map_tensors
+
+GRADIENT_TILE = 256
+"""Rollouts that are differentiated at once, at most."""
+ROLLOUTS_PER_GRADIENT = 6.5
+"""Rollouts that a gradient through a whole episode takes as long as: on the highway with learned drivers (processor
+time), a gradient in a batch of 24, 64, 128 or 256 takes 13.0, 6.5, 4.4 or 3.1 times a rollout in a batch of 512. In
+batches of the same size it is 2.6 to 3.0 throughout."""
+KEPT_SHARE = 0.8
+"""Share of the rollouts up to which those that are finished are left out; to copy the others costs a part of a tick."""
+Integers = NDArray[np.int64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,7 +39,7 @@ class EpisodeTerms:
     """The measure, shape (n,)."""
     values: FloatArray
     """Terms, shape (n, J); f <= gamma exactly where the least of them is at or below the threshold."""
-    ticks: NDArray[np.int64]
+    ticks: Integers
     """Tick at which each term is attained, shape (n, J)."""
     threshold: float
     """Terms fail at or below it."""
@@ -33,7 +47,7 @@ class EpisodeTerms:
     """Of the J terms."""
 
     @property
-    def least(self) -> NDArray[np.int64]:
+    def least(self) -> Integers:
         """Number of the least term, shape (n,)."""
         return np.asarray(self.values.argmin(axis=1), dtype=np.int64)
 
@@ -44,29 +58,204 @@ class EpisodeTerms:
 
 
 def simulate_terms(world: World, gamma: float, simulate: Callable[[World], Iterable[Episode]]) -> EpisodeTerms:
-    """Drive scenarios from start to horizon, and tell the terms of their measure apart.
+    """Drive scenarios to the horizon, tile by tile by `simulate`, and tell the terms of their measure apart.
 
-    Args:
-        world: The world, with its measure.
-        gamma: Threshold of f.
-        simulate: Drives the scenarios in a world and gives the episodes at the horizon, tile by tile.
-
-    Returns:
-        f and its terms. A measure that is no least over moments has one term, f itself, known at the horizon.
+    A measure that is no least over moments has one term, f itself, known at the horizon.
     """
     own, collisions = world.measurement.episode_measure, world.measurement.collisions
     order, threshold = find_order(own, collisions, gamma)
     tracker = None if order is None else TermTracker(own, order)
-    if tracker is not None:
-        world = replace(world, measurement=Measurement(tracker, collisions))
-    f, values, ticks = [], [], []
-    for end in simulate(world):
-        f.append(end.f)
-        values.append(end.f[:, None] if tracker is None else end.measure_state.values)
-        ticks.append(torch.full((len(end.f), 1), world.clock.ticks) if tracker is None else end.measure_state.ticks)
-    names = ("f",) if tracker is None else tracker.names(world.scenario.vehicle_names)
-    return EpisodeTerms(_join(f), _join(values), torch.cat(ticks).numpy(force=True), threshold, names)
+    if tracker is None:
+        f = torch.cat([end.f for end in simulate(world)]).double().numpy(force=True)
+        return EpisodeTerms(f, f[:, None], np.full((len(f), 1), world.clock.ticks), threshold, ("f",))
+    tracked = replace(world, measurement=Measurement(tracker, collisions))
+    parts = [(end.f, end.measure_state.values, end.measure_state.ticks) for end in simulate(tracked)]
+    f, values, ticks = (torch.cat(each).numpy(force=True) for each in zip(*parts, strict=True))
+    names = tracker.names(world.scenario.vehicle_names)
+    return EpisodeTerms(f.astype(np.float64), values.astype(np.float64), ticks, threshold, names)
 
 
-def _join(parts: list[Tensor]) -> FloatArray:
-    return torch.cat(parts).double().numpy(force=True)
+@dataclass(frozen=True, eq=False)
+class EpisodeGradients:
+    """Gradients of one term of each of n rollouts; has what `samplers.TermGradients` has."""
+
+    values: FloatArray
+    """With respect to x, shape (n, d); NaN in rows that have none."""
+    cost: float
+    """Rollouts that they took, all rows together."""
+    through_ego: bool
+    """Whether they know how the ego reacts. If not, its actions were taken as given: it is a black box."""
+
+
+Differentiator = Callable[..., EpisodeGradients]
+"""From x (n, d), the numbers of terms (n,), the ticks (n,) at which `DrivingProblem.terms` found them attained, and
+gamma, on which it depends what the terms are, to gradients."""
+
+
+def find_differentiator(world: World, driver: Driver, black_box: bool, x: FloatArray) -> Differentiator | None:
+    """Return the gradients of a problem; None if its measure has none, or its world, measure or drivers leave torch.
+
+    One tick of any scenario x (1, d) is tried; nothing is differentiated through an ego that is a `black_box`.
+    """
+    order, _ = find_order(world.measurement.episode_measure, world.measurement.collisions, 0.0)
+    if order is None or not _is_differentiable(world, _Coasting(), order, x[:, : sum(world.columns)]):
+        return None
+    through = not black_box and _is_differentiable(world, driver, order, x)
+    return partial(_differentiate, world, driver, through)
+
+
+def _is_differentiable(world: World, driver: Driver, order: TermMeasure, x: FloatArray) -> bool:
+    """Return whether one tick of a rollout can be differentiated."""
+    one = np.ones(1, dtype=np.int64)
+    try:
+        differentiate_terms(world, driver, order, x, 0 * one, one)
+    except Exception:  # whatever a user's measure, driver or world raises here: nobody needs gradients
+        return False
+    return True
+
+
+def _differentiate(
+    world: World, driver: Driver, through_ego: bool, x: FloatArray, term: Integers, ticks: Integers, gamma: float = 0.0
+) -> EpisodeGradients:
+    """Differentiate one term of each rollout, with the ego's reactions or its actions as given: a `Differentiator`."""
+    measurement = world.measurement
+    order, _ = find_order(measurement.episode_measure, measurement.collisions, gamma)
+    if order is None:
+        raise ValueError(f"The measure {measurement.measure!r} has no moments whose gradient could be taken.")
+    x, term, ticks = np.asarray(x, dtype=np.float64), np.asarray(term), np.asarray(ticks)
+    if through_ego:
+        try:
+            return EpisodeGradients(*differentiate_terms(world, driver, order, x, term, ticks), True)
+        except RuntimeError:  # an ego of the user's that leaves torch on the way
+            pass
+    return EpisodeGradients(*differentiate_terms(world, _ActionsAsGiven(driver), order, x, term, ticks), False)
+
+
+def differentiate_terms(
+    world: World,
+    driver: Driver,
+    order: TermMeasure,
+    x: FloatArray,
+    term: Integers,
+    ticks: Integers,
+    dtype: torch.dtype = torch.float32,
+) -> tuple[FloatArray, float]:
+    """Return gradients (n, d) of one term of each rollout at the tick at which it is attained, and what they cost.
+
+    After contact a measure is flat: where a term is attained by a collision, it is differentiated one tick before. NaN
+    where they are not finite. The cost is in rollouts, by the moments simulated. A RuntimeError where something in the
+    way cannot be differentiated.
+    """
+    gradients, moments = np.empty(x.shape), 0
+    rows_by_tick = np.argsort(ticks, kind="stable")
+    for first in range(0, len(x), GRADIENT_TILE):
+        rows = rows_by_tick[first : first + GRADIENT_TILE]
+        leaf = torch.from_numpy(x[rows]).to(dtype).requires_grad_()
+        rollouts = _Unfinished(world, driver, leaf, torch.from_numpy(ticks[rows]))
+        values = rollouts.attained_values(order, torch.from_numpy(term[rows]))
+        (slope,) = torch.autograd.grad(values.sum(), leaf)
+        gradients[rows] = slope.double().numpy()
+        moments += rollouts.moments
+    gradients[~np.isfinite(gradients).all(axis=1)] = np.nan
+    return gradients, ROLLOUTS_PER_GRADIENT * moments / (world.clock.ticks + 1)
+
+
+class _Unfinished:
+    """Rollouts that go on until their ticks, each; those that have got there are left out where that is possible."""
+
+    def __init__(self, world: World, driver: Driver, x: Tensor, ticks: Tensor) -> None:
+        measure = world.measurement.episode_measure
+        self.world = replace(world, measurement=Measurement(_Unmeasured(measure.sees), world.measurement.collisions))
+        self.episode, self.driver = begin_drive(self.world, driver, x)
+        self.memory: Any = None
+        self.before: Moment | None = None
+        self.ticks = ticks
+        self.index = torch.arange(len(ticks))
+        self.moments = len(ticks)
+        """Moments of rollouts so far."""
+
+    def attained_values(self, order: TermMeasure, term: Tensor) -> Tensor:
+        """Return the values of terms (B,) when they are attained, in no order, with their graph."""
+        values, last = [], int(self.ticks.max())
+        for tick in range(last + 1):
+            episode, before = self.episode, None if self.before is None else self.before.state
+            moment = Moment(episode.state, episode.lead, episode.road, episode.perception, before, self.world.clock.dt)
+            due, collided = self.ticks == tick, episode.collided
+            for rows, at in ((due & ~collided, moment), (due & collided, self.before)):
+                chosen = rows.nonzero()[:, 0]
+                if len(chosen) and at is not None:
+                    of_rows = order.term_values(_select(at, chosen))
+                    number = term[self.index[chosen]] % of_rows.shape[1]
+                    values.append(of_rows.gather(1, number[:, None])[:, 0])
+            if tick < last:
+                self._go_on(moment, self.ticks > tick)
+        # where all have collided before the first moment, nothing depends on x
+        return torch.cat(values) if values else self.episode.state.x[:0, 0]
+
+    def _go_on(self, moment: Moment, unfinished: Tensor) -> None:
+        """Move on by one tick."""
+        if self.memory is None and self.episode.camera_context is None and not _noise_columns(self.driver):
+            keep = unfinished.nonzero()[:, 0]
+            if len(keep) <= KEPT_SHARE * len(unfinished):
+                self.episode, moment = _select(self.episode, keep), _select(moment, keep)
+                self.ticks, self.index = self.ticks[keep], self.index[keep]
+        self.before = moment
+        self.episode, self.memory = drive_tick(self.world, self.driver, self.episode, self.memory)
+        self.moments += len(self.index)
+
+
+@dataclass(frozen=True)
+class _Unmeasured:
+    """A measure that measures nothing."""
+
+    sees: bool
+    records: ClassVar[bool] = False
+    unit: ClassVar[str] = ""
+
+    def start(self, moment: Moment, ticks: int) -> None:
+        return None
+
+    def update(self, state: None, moment: Moment, before: Tensor, now: Tensor) -> None:
+        return None
+
+    def f(self, state: None) -> Tensor:
+        raise AssertionError("Gradients are those of the terms: nobody reads f of their rollouts.")
+
+
+class _Coasting:
+    """An ego that does nothing."""
+
+    def act(self, episode: Episode, memory: Any) -> tuple[Tensor, Any]:
+        return torch.zeros_like(episode.state.x[:, :2]), memory
+
+
+@dataclass(frozen=True)
+class _ActionsAsGiven:
+    """An ego whose actions have no gradient: a black box, in a rollout that is differentiated."""
+
+    driver: Any
+    """The ego."""
+
+    @property
+    def noise_columns(self) -> int:
+        """Number of columns of x that are its noise."""
+        return _noise_columns(self.driver)
+
+    def with_draws(self, draws: Tensor) -> Driver:
+        """Return the driver of B episodes with standard normal draws."""
+        return _ActionsAsGiven(self.driver.with_draws(draws.detach()))
+
+    def act(self, episode: Episode, memory: Any) -> tuple[Tensor, Any]:
+        """Return what the ego does in these episodes, as if they were constants."""
+        with torch.no_grad():
+            action, memory = self.driver.act(map_tensors(Tensor.detach, episode), memory)
+        return action.detach(), memory
+
+
+def _noise_columns(driver: Driver) -> int:
+    return driver.noise_columns if isinstance(driver, StochasticDriver) else 0
+
+
+def _select(tree: Any, rows: Tensor) -> Any:
+    """Return some of the episodes of a tree of tensors."""
+    return map_tensors(lambda part: part[rows], tree)

@@ -23,13 +23,10 @@ from rare_envs.simulation.background import (
     Background,
     BackgroundState,
     TrafficBackground,
-    needs_lidar,
     noise_size,
     query_background,
 )
-from rare_envs.simulation.clock import LEARNED_TICK, Clock
-from rare_envs.simulation.episode import Episode
-from rare_envs.simulation.measurement import EpisodeStatistics, Measurement
+from rare_envs.simulation.episode import LEARNED_TICK, Clock, Episode, EpisodeStatistics, Measurement
 from rare_envs.simulation.observation import Sensing, WeatherDistributions
 from rare_envs.traffic.bodies import ego_overlaps, others_overlap
 from rare_envs.traffic.neighbours import lead_of
@@ -92,7 +89,8 @@ class World:
     @cached_property
     def uses_lidar(self) -> bool:
         """Whether the lidar features of all vehicles are computed at every moment."""
-        return self.sensing.uses_lidar or needs_lidar(self.background) or self.measurement.episode_measure.sees
+        by_lidar = self.background is not None and not isinstance(self.background, TrafficBackground)
+        return self.sensing.uses_lidar or by_lidar or self.measurement.episode_measure.sees
 
     @property
     def weather_distributions(self) -> WeatherDistributions:
@@ -103,18 +101,14 @@ class World:
     def columns(self) -> Columns:
         """Numbers of columns of x."""
         weights = None if self.background is None else self.background.weights
-        draws = noise_size(self.clock.ticks, self._others) if self._noisy and self.noise is True else 0
+        others = self.scenario.vehicles - 1
         return Columns(
             scenario=self.scenario.size,
             weather=sum(each.size for parameters, _ in self.weather_distributions for each in parameters),
             weights=0 if weights is None else weights.dim,
-            noise=draws,
+            noise=noise_size(self.clock.ticks, others) if self._noisy and self.noise is True else 0,
             camera_noise=int(self.sensing.weather and self.noise is True),
         )
-
-    @property
-    def _others(self) -> int:
-        return self.scenario.vehicles - 1
 
     @property
     def _noisy(self) -> bool:
@@ -134,10 +128,6 @@ class World:
         """Return the world with statistics of its episodes kept; see `Episode.statistics`."""
         return replace(self, measurement=replace(self.measurement, statistics=True))
 
-    def with_lidar(self) -> World:
-        """Return the world with lidar features at every moment."""
-        return replace(self, sensing=replace(self.sensing, lidar=True))
-
     def start(self, x: Tensor) -> Episode:
         """Begin B episodes.
 
@@ -148,18 +138,12 @@ class World:
         Returns:
             The episodes at time 0.
         """
-        _, weather, _, _, key = torch.split(x, list(self.columns), dim=1)
-        state, background_state = self.start_traffic(x)
+        own, weather, weights, noise, key = torch.split(x, list(self.columns), dim=1)
+        state, background = self.scenario.initial(own), None
+        if self.background is not None:
+            background = BackgroundState.start(self.background, weights.contiguous(), self._draws(noise))
         perception = self._perceive(state, self._place(state))
-        return self.start_from(state, perception, background_state, self.sensing.start_camera(weather, key))
-
-    def start_traffic(self, x: Tensor) -> tuple[State, BackgroundState | None]:
-        """Return the traffic at time 0, and the state of its drivers if it has any; x as of `start`."""
-        own, _, weights, noise, _ = torch.split(x, list(self.columns), dim=1)
-        state = self.scenario.initial(own)
-        if self.background is None:
-            return state, None
-        return state, BackgroundState.start(self.background, weights.contiguous(), self._draws(noise))
+        return self.start_from(state, perception, background, self.sensing.start_camera(weather, key))
 
     def start_from(
         self,
@@ -168,16 +152,13 @@ class World:
         background_state: BackgroundState | None = None,
         camera_context: CameraContext | None = None,
     ) -> Episode:
-        """Begin B episodes from any state.
+        """Begin B episodes of the vehicle in the ego's place from any state.
 
         Args:
-            state: Of B scenarios; the vehicle in the ego's place is the one whose episodes these are.
-            perception: Lidar features of the vehicles, in the same order; None in a world without.
+            state: Of B scenarios.
+            perception: Lidar features of the vehicles, (B, N, 51); None in a world without.
             background_state: Of the drivers around the ego.
             camera_context: Of a camera on the vehicle in the ego's place.
-
-        Returns:
-            The episodes at time 0.
         """
         road, measure = self.scenario.road, self.measurement.episode_measure
         moment = Moment(state, lead_of(state, road), road, perception, None, self.clock.dt)
@@ -293,12 +274,11 @@ class World:
 
     def _draws(self, noise: Tensor) -> Tensor:
         """Return draws of the drivers' noise as a tensor of shape (B, 2 + T, M, 2), or (B, 0, M, 2) without noise."""
+        batch, others = len(noise), self.scenario.vehicles - 1
         if self._noisy and self.noise == "fixed":
-            return fixed_draws((1, FIRST_DRAWS + self.clock.ticks, self._others, 2), FIXED_SEED, noise).expand(
-                len(noise), -1, -1, -1
-            )
-        ticks = noise.shape[1] // (2 * self._others) if self._noisy else 0
-        return noise.reshape(len(noise), ticks, self._others, 2)
+            shape = (1, FIRST_DRAWS + self.clock.ticks, others, 2)
+            return fixed_draws(shape, FIXED_SEED, noise).expand(batch, -1, -1, -1)
+        return noise.reshape(batch, noise.shape[1] // (2 * others) if self._noisy else 0, others, 2)
 
     def _place(self, state: State) -> WorldPose | None:
         """Return where the vehicles are in the flat world; None in a world without lidar."""
@@ -320,7 +300,7 @@ def apply_overrides(
     driver_actions: Tensor | None,
     dt: float,
 ) -> tuple[Others, Tensor]:
-    """Return the other vehicles after a tick in which some of them take an agent's actions.
+    """Return the others after a tick in which some take an agent's actions, and who was commanded by now, (B, N).
 
     Args:
         episode: B episodes before the tick.
@@ -329,9 +309,6 @@ def apply_overrides(
         scripted: Where the script or the drivers take vehicles that were never commanded.
         driver_actions: Accelerations and yaw rates by the world's drivers, shape (B, N - 1, 2); None if it has none.
         dt: Tick [s].
-
-    Returns:
-        The others, and who has been commanded by now, boolean, shape (B, N).
     """
     state, road = episode.state, episode.road
     if commanded is None:
@@ -352,19 +329,11 @@ def apply_overrides(
 
 
 def rule_based_actions(episode: Episode) -> Tensor:
-    """Return what IDM and lane keeping do in each vehicle's place.
-
-    Args:
-        episode: B episodes.
-
-    Returns:
-        Acceleration [m/s^2] and steering angle [rad], shape (B, N, 2).
-    """
+    """Return accelerations [m/s^2] and steering angles [rad] by IDM in each vehicle's place, (B, N, 2)."""
     actions = []
     for vehicle in range(episode.state.x.shape[1]):
         state = episode.state.seen_by(vehicle)
-        view = episode._replace(state=state, lead=lead_of(state, episode.road))
-        actions.append(_RULE.act(view, None)[0])
+        actions.append(_RULE.act(episode._replace(state=state, lead=lead_of(state, episode.road)), None)[0])
     return torch.stack(actions, dim=1)
 
 

@@ -40,7 +40,7 @@ from rare_envs.control.idm import IDM
 from rare_envs.files import replace_text
 from rare_envs.scenarios.base_distributions import load_base
 from rare_envs.scenarios.registry import find_scenario, scenario_named
-from rare_envs.simulation.clock import Clock
+from rare_envs.simulation.episode import Clock
 from rare_envs.simulation.observation import Sensing
 from rare_envs.simulation.rollout import drive
 from rare_envs.simulation.world import World

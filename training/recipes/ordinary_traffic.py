@@ -17,7 +17,7 @@ from __future__ import annotations
 import json
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from types import MappingProxyType
 from typing import Annotated, Any, ClassVar, NamedTuple
@@ -40,10 +40,8 @@ from rare_envs.scenarios.car_following import CAR_FOLLOWING
 from rare_envs.scenarios.highway import HIGHWAY
 from rare_envs.sensors.kinds import kinds_of
 from rare_envs.sensors.lidar import SPEED_COLUMN
-from rare_envs.simulation.background import Background, DriverWeights, TrafficBackground
-from rare_envs.simulation.clock import Clock
-from rare_envs.simulation.episode import Episode
-from rare_envs.simulation.measurement import Measurement
+from rare_envs.simulation.background import Background, TrafficBackground
+from rare_envs.simulation.episode import Clock, Episode, Measurement
 from rare_envs.simulation.observation import Sensing
 from rare_envs.simulation.rollout import Driver, drive
 from rare_envs.simulation.world import World
@@ -78,7 +76,7 @@ _NEIGHBOURS = ("follower", "left", "right")
 class OrdinaryDrivers:
     """Drivers whose speeds vary about those at the start, with IDM behind a lead; steering is the scenario's."""
 
-    weights: ClassVar[DriverWeights | None] = None
+    weights: ClassVar[None] = None
     noisy: ClassVar[bool] = True
 
     def begin(self, draws: Tensor) -> Tensor:
@@ -248,7 +246,7 @@ def judge(
     needs = resolve(ego)
     world = make_world(case, seconds, needs.observation)
     driver = as_driver(ego, world, needs)
-    world = world.with_lidar() if needs.lidar else world
+    world = replace(world, sensing=replace(world.sensing, lidar=True)) if needs.lidar else world
     x = draw_inputs(case, world, rollouts, needs.noise_columns(world), np.random.default_rng(seed))
     tile = 64 if "camera" in kinds_of(needs.observation) else 256
     parts = [_judge_tile(world, driver, part) for part in torch.split(torch.from_numpy(x).float(), tile)]

@@ -50,8 +50,7 @@ from rare_envs.files import replace_text
 from rare_envs.scenarios.base_distributions import load_base
 from rare_envs.scenarios.registry import find_scenario
 from rare_envs.sensors.camera import Weather, take_picture
-from rare_envs.simulation.clock import Clock
-from rare_envs.simulation.episode import Episode
+from rare_envs.simulation.episode import Clock, Episode
 from rare_envs.simulation.observation import Sensing
 from rare_envs.simulation.world import World
 from rare_envs.threads import use_one_thread

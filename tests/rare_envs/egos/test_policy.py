@@ -11,7 +11,7 @@ from rare_envs.control.actions import IDLE
 from rare_envs.control.idm import IDM
 from rare_envs.egos.policy import PolicyDriver, as_driver, check_spaces
 from rare_envs.scenarios.car_following import CAR_FOLLOWING
-from rare_envs.simulation.clock import Clock
+from rare_envs.simulation.episode import Clock
 from rare_envs.simulation.observation import observation_space
 from rare_envs.simulation.world import World
 

@@ -25,8 +25,8 @@ from rare_envs.multi_agent import (
 )
 from rare_envs.scenarios.car_following import CAR_FOLLOWING
 from rare_envs.sensors.kinds import map_kinds
-from rare_envs.simulation.clock import Clock
 from rare_envs.simulation.decision import advance
+from rare_envs.simulation.episode import Clock
 from rare_envs.simulation.rollout import rollout
 from rare_envs.simulation.world import World
 

@@ -11,7 +11,7 @@ from rare_envs.envs.rows_and_infos import episode_info, step_info
 from rare_envs.make import set_up
 from rare_envs.multi_agent import start
 from rare_envs.scenarios.registry import SCENARIOS
-from rare_envs.simulation.reward import reward_terms
+from rare_envs.simulation.decision import reward_terms
 
 SCRIPTED_IDS = [env_id for env_id, scenario in SCENARIOS.items() if scenario.drivers is None]
 scripted = pytest.mark.parametrize("env_id", SCRIPTED_IDS)  # no network, so batch sizes change no bit

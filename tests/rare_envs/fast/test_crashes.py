@@ -6,7 +6,7 @@ import torch
 
 from rare_envs.fast import crashes as fast_crashes
 from rare_envs.fast.equations import RoadNumbers
-from rare_envs.simulation.measurement import EpisodeStatistics
+from rare_envs.simulation.episode import EpisodeStatistics
 from rare_envs.traffic import crash, straight
 from rare_envs.traffic.bodies import ego_overlaps, others_overlap
 from rare_envs.traffic.state import State

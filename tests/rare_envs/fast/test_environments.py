@@ -7,7 +7,7 @@ import torch
 from gymnasium.vector import AutoresetMode
 
 import rare_envs  # noqa: F401  (registers its ids)
-from rare_envs.fast.environments import find_scripted_step, scale_actions
+from rare_envs.fast.choice import find_scripted_step, scale_actions
 
 
 def flat(info, prefix=""):

@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from rare_envs.simulation.clock import Clock
+from rare_envs.simulation.episode import Clock
 
 
 def test_ticks_and_decisions() -> None:

@@ -18,9 +18,8 @@ from rare_envs.measures.terms import TermTracker
 from rare_envs.scenarios.cut_in import CUT_IN
 from rare_envs.scenarios.highway import HIGHWAY
 from rare_envs.simulation import cuda_graphs
-from rare_envs.simulation.clock import Clock
 from rare_envs.simulation.cuda_graphs import RecordedRollouts, is_recordable
-from rare_envs.simulation.measurement import Measurement
+from rare_envs.simulation.episode import Clock, Measurement
 from rare_envs.simulation.rollout import rollout
 from rare_envs.simulation.world import World
 

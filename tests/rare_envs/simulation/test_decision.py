@@ -8,9 +8,8 @@ from torch import Tensor
 
 from rare_envs.control.actions import IDLE
 from rare_envs.scenarios.car_following import CAR_FOLLOWING
-from rare_envs.simulation.clock import Clock
-from rare_envs.simulation.decision import TickReward, advance, hold_finished, run_ticks
-from rare_envs.simulation.reward import reward_terms
+from rare_envs.simulation.decision import TickReward, advance, hold_finished, reward_terms, run_ticks
+from rare_envs.simulation.episode import Clock
 from rare_envs.simulation.world import World
 
 

@@ -10,9 +10,9 @@ import rare_envs
 from rare_envs.control.idm import IDM
 from rare_envs.measures import MEASURES, Measure
 from rare_envs.measures.terms import find_order
-from rare_envs.simulation import gradients as term_gradients
-from rare_envs.simulation.gradients import ROLLOUTS_PER_GRADIENT, differentiate_terms
+from rare_envs.simulation import terms as term_gradients
 from rare_envs.simulation.rollout import drive
+from rare_envs.simulation.terms import ROLLOUTS_PER_GRADIENT, differentiate_terms
 
 FOLLOWING, CUT_IN, HIGHWAY = "rare_envs/CarFollowing-v0", "rare_envs/CutIn-v0", "rare_envs/Highway-v0"
 

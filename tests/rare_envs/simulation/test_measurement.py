@@ -6,7 +6,7 @@ import torch
 from rare_envs.measures import MEASURES
 from rare_envs.scenarios.car_following import CAR_FOLLOWING
 from rare_envs.scenarios.cut_in import CUT_IN
-from rare_envs.simulation.measurement import Measurement
+from rare_envs.simulation.episode import Measurement
 from rare_envs.simulation.world import World
 from rare_envs.traffic.crash import CRASH_KINDS, NONE
 
@@ -19,8 +19,8 @@ def test_unknown_measures_and_collisions_are_refused() -> None:
 
 
 def test_only_measures_of_whole_episodes_record() -> None:
-    assert Measurement("pet").records
-    assert not Measurement("ttc").records
+    assert Measurement("pet").episode_measure.records
+    assert not Measurement("ttc").episode_measure.records
     assert Measurement(lambda moment: moment.state.x[:, 0]).episode_measure not in MEASURES.values()
 
 

@@ -9,8 +9,7 @@ from torch import Tensor
 
 from rare_envs.control.actions import FASTER, IDLE
 from rare_envs.scenarios.car_following import CAR_FOLLOWING
-from rare_envs.simulation.clock import Clock
-from rare_envs.simulation.episode import Episode
+from rare_envs.simulation.episode import Clock, Episode
 from rare_envs.simulation.rollout import drive, rollout
 from rare_envs.simulation.world import World
 

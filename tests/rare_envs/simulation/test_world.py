@@ -3,8 +3,7 @@
 import pytest
 
 from rare_envs.scenarios.car_following import CAR_FOLLOWING
-from rare_envs.simulation.clock import Clock
-from rare_envs.simulation.measurement import Measurement
+from rare_envs.simulation.episode import Clock, Measurement
 from rare_envs.simulation.world import World
 
 
