@@ -4,11 +4,11 @@ from rare_envs.startup import require_libraries
 
 require_libraries()  # before anything that needs them
 
-from agents.learned.checkpoints import Provenance, load_driver, read_driver, read_provenance, save_driver
-from agents.learned.driver import LearnedDriver, LearnedEgo
-from agents.learned.weight_distribution import WeightDistribution
-from agents.loading import Ego, load_ego
-from agents.sb3.saved_ego import SavedEgo
+from agents.files import Provenance, read_provenance
+from agents.learned.driver import LearnedDriver, LearnedEgo, read_driver, save_driver
+from agents.learned.networks import WeightDistribution
+from agents.loading import Ego, load_driver, load_ego
+from agents.saved_ego import SavedEgo
 
 __all__ = [
     "Ego",

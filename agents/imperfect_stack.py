@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from agents.names import read_settings
+from agents.files import read_settings
 from rare_envs.devices import constant, fixed_draws, move_to
 from rare_envs.egos.policy import as_driver
 from rare_envs.sensors.lidar import perceive_traffic

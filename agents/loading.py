@@ -1,31 +1,50 @@
-"""Loading of egos by name, file, address or function."""
+"""Loading of egos by name, file, address or function, and of drivers of the traffic by name or file."""
 
 from __future__ import annotations
 
 import inspect
+from dataclasses import dataclass, replace
+from os import PathLike
 from pathlib import Path
 from typing import Any, Final, Literal, Protocol, cast, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
 
-from agents.learned.checkpoints import SUFFIX, load_driver
-from agents.learned.driver import LearnedDriver, LearnedEgo
-from agents.names import HUMAN, RULE_BASED, SHIPPED_DRIVERS, SHIPPED_EGOS, VISION, read_settings
-from agents.sb3.hub import HUB_PREFIX, find_hub_model
-from agents.sb3.saved_ego import load_saved_ego
-from agents.vision import holds_vision, load_vision
+from agents.files import (
+    HUMAN,
+    LANE_CHANGING,
+    RULE_BASED,
+    SHIPPED,
+    SHIPPED_DRIVERS,
+    SHIPPED_EGOS,
+    SUFFIX,
+    VISION,
+    holds_vision,
+    read_settings,
+)
+from agents.imperfect_stack import NoisyEgo, Stack
+from agents.learned.driver import LearnedDriver, LearnedEgo, RuleDriver, read_driver
+from agents.learned.networks import HUMAN_NOISE
+from agents.saved_ego import HUB_PREFIX, find_hub_model, load_saved_ego
+from agents.vision import load_vision
+from rare_envs.control.human_driver import HumanDriverModel
 from rare_envs.control.idm import IDM
+from rare_envs.control.lane_changing import LaneChangingDriver
 from rare_envs.egos.errors import EgoGone, is_policy, refuse_ego
+from rare_envs.egos.human import HumanEgo
 from rare_envs.egos.needs import wrap_callable
 from rare_envs.plugins import did_you_mean, import_object, one_line
 
+EGO_NAMES = (RULE_BASED, HUMAN, *SHIPPED_EGOS, VISION, *SHIPPED_DRIVERS)
 EXPECTED_EGO: Final = (
-    f"{', '.join(map(repr, (RULE_BASED, HUMAN, *SHIPPED_EGOS, VISION, *SHIPPED_DRIVERS)))}, a path to a {SUFFIX} or "
+    f"{', '.join(map(repr, EGO_NAMES))}, a path to a {SUFFIX} or "
     "Stable-Baselines3 .zip, hf:USER/REPOSITORY, "
     "an .onnx file, module:function, tcp://host:port, or process:EGO for one of these in a process of its own, "
     "noisy:EGO for one behind the imperfections of a full stack"
 )
+EGO_SUFFIXES = (".zip", ".onnx", SUFFIX)
+"""How the files of egos end."""
 EgoKind = Literal[
     "rule", "learned", "vision", "url", "remote", "process", "noisy", "onnx", "zip", "hub", "function", "unknown"
 ]
@@ -76,7 +95,7 @@ def load_ego(
             which as egos act by their mean actions ("mgail?rules=0" by its network alone); a path to a `.safetensors`
             with one of these kinds; a path to a
             `.zip` saved by Stable-Baselines3; "hf:USER/REPOSITORY", such a `.zip` of the Hugging Face Hub
-            (`agents.sb3.hub`); a path to an `.onnx` file (see `agents.onnx.OnnxEgo` for its form);
+            (`agents.saved_ego`); a path to an `.onnx` file (see `agents.onnx.OnnxEgo` for its form);
             `module:function`, a function without arguments that returns an ego (modules in the working directory are
             found); `tcp://host:port` for an ego in another program (docs/egos.md); or `process:EGO` or `noisy:EGO`.
             `process:EGO` is any of these files and functions in a process of its own, which is ended and started anew
@@ -120,19 +139,16 @@ def load_ego(
     if kind in ("zip", "hub"):
         return load_saved_ego(find_hub_model(text) if kind == "hub" else Path(text), algo, trust, stats)
     if kind == "noisy":
-        from agents.imperfect_stack import NoisyEgo, Stack
-
-        _require_inner_ego(text)
-        inner, mark, settings = text.removeprefix("noisy:").rpartition("?")
-        stack = Stack.read(settings if mark else "")
-        return cast(Ego, NoisyEgo(load_ego(inner if mark else settings, algo, trust, stats), stack))
+        inner, mark, settings = _require_inner_ego(text).rpartition("?")
+        ego = load_ego(inner if mark else settings, algo, trust, stats)
+        return cast(Ego, NoisyEgo(ego, Stack(**read_settings(Stack, settings if mark else ""))))
     for name, value in (("algo", algo), ("stats", stats)):
         if value is not None and kind != "process":
             raise ValueError(
                 f"Expected {name} for a Stable-Baselines3 .zip only, got {str(value)!r} for {text!r}; leave it out."
             )
     if kind in ("remote", "process"):
-        return _load_elsewhere(kind, text, algo, trust, stats)
+        return _load_elsewhere(text, algo, trust, stats)
     if kind == "onnx":
         from agents.onnx import OnnxEgo
 
@@ -144,6 +160,53 @@ def load_ego(
     return cast(Ego, _call_factory(text)) if kind == "function" else _load_rule_based(text)
 
 
+def find_ego_kind(spec: str) -> EgoKind:
+    """Return the kind of ego of a name, file, address or function; the header identifies a `.safetensors` file."""
+    name = spec.partition("?")[0]
+    if name in (RULE_BASED, HUMAN):
+        return "rule"
+    if spec == VISION or (spec.endswith(SUFFIX) and holds_vision(spec)):
+        return "vision"
+    if name in (*SHIPPED_DRIVERS, *SHIPPED_EGOS) or spec.endswith(SUFFIX):
+        return "learned"
+    beginnings: dict[str, EgoKind] = {
+        "process:": "process",
+        "noisy:": "noisy",
+        HUB_PREFIX: "hub",
+        "tcp://": "remote",
+        "ipc://": "remote",
+    }
+    for beginning, kind in beginnings.items():
+        if spec.startswith(beginning):
+            return kind
+    if "://" in spec:
+        return "url"
+    if spec.endswith(".onnx"):
+        return "onnx"
+    if spec.endswith(".zip") or Path(spec).is_file():
+        return "zip"
+    return "function" if ":" in spec and "/" not in spec else "unknown"
+
+
+def strip_prefixes(spec: str) -> str:
+    """Return the ego inside `noisy:` and `process:`, without their settings."""
+    while spec.startswith(("noisy:", "process:")):
+        spec = spec.partition(":")[2].rpartition("?")[0] or spec.partition(":")[2]
+    return spec
+
+
+def suggest_ego(text: str) -> str:
+    """Return a hint at the ego that a misspelt name may mean: a known name or a `.zip` saved nearby."""
+    saved = Path(f"{text}.zip")
+    if saved.is_file():
+        return f" (did you mean {str(saved)!r}?)"
+    if text and Path(text).is_dir():
+        files = sorted(path.name for path in Path(text).iterdir() if path.suffix in EGO_SUFFIXES)
+        return f" (a folder; name a file in it: {', '.join(files[:5])})" if files else " (a folder without egos)"
+    missing = " (there is no such file)" if Path(text).suffix or "/" in text else ""
+    return did_you_mean(text, EGO_NAMES) or missing
+
+
 def _load_rule_based(text: str) -> Any:
     """Return a name as it stands; with settings behind it, the driver that has them."""
     name, mark, query = text.partition("?")
@@ -151,9 +214,6 @@ def _load_rule_based(text: str) -> Any:
         return text
     try:
         if name == HUMAN:
-            from rare_envs.control.human_driver import HumanDriverModel
-            from rare_envs.egos.human import HumanEgo
-
             return HumanEgo(HumanDriverModel(**read_settings(HumanDriverModel, query)))
         return IDM(**read_settings(IDM, query))
     except ValueError as error:
@@ -165,7 +225,12 @@ def _call_factory(spec: str) -> Any:
     function = import_object(spec, f"the ego {spec!r}")
     if not callable(function):
         raise ValueError(f"Expected {spec!r} to be a function that returns an ego, got {type(function).__name__}.")
-    needed = _list_needed_arguments(function)
+    try:
+        parameters = list(inspect.signature(function).parameters.values())
+    except (TypeError, ValueError):  # of a function in C
+        parameters = []
+    open_ended = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
+    needed = [each.name for each in parameters if each.default is each.empty and each.kind not in open_ended]
     if needed:
         raise ValueError(
             f"Expected {spec!r} to be a function without arguments that returns the ego, got one that needs "
@@ -181,91 +246,74 @@ def _call_factory(spec: str) -> Any:
     return ego
 
 
-def _list_needed_arguments(function: Any) -> list[str]:
-    """Return the arguments without which a function cannot be called; empty where that cannot be told."""
+def _load_elsewhere(text: str, algo: str | None, trust: bool, stats: str | Path | None) -> Ego:
+    """Connect to an ego in another program, or in a process of its own."""
     try:
-        parameters = inspect.signature(function).parameters.values()
-    except (TypeError, ValueError):  # of a function in C
-        return []
-    open_ended = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
-    return [p.name for p in parameters if p.default is p.empty and p.kind not in open_ended]
-
-
-def _load_elsewhere(kind: EgoKind, text: str, algo: str | None, trust: bool, stats: str | Path | None) -> Ego:
-    """Connect to an ego in another process."""
-    try:
-        import msgpack  # noqa: F401
-        import zmq  # noqa: F401
+        from agents.remote.client import connect, isolate
     except ImportError as error:
         raise ValueError(f"{text!r} needs pyzmq and msgpack: pip install 'rare-envs[remote]'.") from error
     try:
-        if kind == "process":
-            _require_inner_ego(text)
-            from agents.remote.client import isolate
-
-            return isolate(text.removeprefix("process:"), algo, trust, stats)
-        from agents.remote.client import connect
-
+        if text.startswith("process:"):
+            return isolate(_require_inner_ego(text), algo, trust, stats)
         return connect(text)
     except EgoGone as error:
         raise ValueError(str(error)) from error
 
 
-def strip_prefixes(spec: str) -> str:
-    """Return the ego inside `noisy:` and `process:`, without their settings."""
-    while spec.startswith(("noisy:", "process:")):
-        spec = spec.partition(":")[2].rpartition("?")[0] or spec.partition(":")[2]
-    return spec
-
-
-def find_ego_kind(spec: str) -> EgoKind:
-    """Return the kind of ego of a name, file, address or function; the header identifies a `.safetensors` file.
-
-    Example:
-        >>> [find_ego_kind(spec) for spec in ("idm", "gail", "tcp://host:5555", "noisy:idm", "ego.onnx", "file:make")]
-        ['rule', 'learned', 'remote', 'noisy', 'onnx', 'function']
-    """
-    if spec.partition("?")[0] in (RULE_BASED, HUMAN):
-        return "rule"
-    if spec == VISION or (spec.endswith(SUFFIX) and holds_vision(spec)):
-        return "vision"
-    if spec.partition("?")[0] in (*SHIPPED_DRIVERS, *SHIPPED_EGOS) or spec.endswith(SUFFIX):
-        return "learned"
-    if spec.startswith("process:"):
-        return "process"
-    if spec.startswith("noisy:"):
-        return "noisy"
-    if spec.startswith(HUB_PREFIX):
-        return "hub"
-    if spec.startswith(("tcp://", "ipc://")):
-        return "remote"
-    if "://" in spec:
-        return "url"
-    if spec.endswith(".onnx"):
-        return "onnx"
-    if spec.endswith(".zip") or Path(spec).is_file():
-        return "zip"
-    return "function" if ":" in spec and "/" not in spec else "unknown"
-
-
-def _require_inner_ego(text: str) -> None:
-    """Raise a ValueError if "noisy:" or "process:" stands alone."""
+def _require_inner_ego(text: str) -> str:
+    """Return the ego behind "noisy:" or "process:", with settings."""
     kind, _, inner = text.partition(":")
     if not inner.partition("?")[0]:
         raise ValueError(f"Expected an ego behind {kind + ':'!r}, such as {kind}:model.zip, got {text!r}.")
+    return inner
 
 
-EGO_SUFFIXES = (".zip", ".onnx", ".safetensors")
-"""How the files of egos end."""
+@dataclass(frozen=True)
+class DriverSettings:
+    """What can be set in the name of a shipped driver."""
+
+    rules: bool = True
+    """Whether its rules bound its actions and change lanes."""
 
 
-def suggest_ego(text: str) -> str:
-    """Return a hint at the ego that a misspelt name may mean: a known name or a `.zip` saved nearby."""
-    saved = Path(f"{text}.zip")
-    if saved.is_file():
-        return f" (did you mean {str(saved)!r}?)"
-    if text and Path(text).is_dir():
-        files = sorted(path.name for path in Path(text).iterdir() if path.suffix in EGO_SUFFIXES)
-        return f" (a folder; name a file in it: {', '.join(files[:5])})" if files else " (a folder without egos)"
-    hint = did_you_mean(text, [RULE_BASED, HUMAN, *SHIPPED_EGOS, VISION, *SHIPPED_DRIVERS])
-    return hint or (" (there is no such file)" if Path(text).suffix or "/" in text else "")
+def load_driver(name: str | PathLike[str]) -> LearnedDriver | RuleDriver | LaneChangingDriver:
+    """Load a driver by its name or from its file.
+
+    Args:
+        name: "mgail" or "gail", which are shipped, and "imitation", which was trained to be an ego; "mgail?rules=0", it
+            without its rules; "idm", the rule-based driver, and "idm+mobil", which changes lanes too; or the path of a
+            file that `save_driver` wrote.
+
+    Returns:
+        A `LearnedDriver`, or a `RuleDriver` or `LaneChangingDriver` with its default parameters.
+
+    Raises:
+        FileNotFoundError: The file does not exist.
+        ValueError: The name is none of these, or the file is no driver.
+
+    Example:
+        >>> load_driver("gail").name
+        'gail'
+        >>> load_driver("mgail?rules=0").changes is None
+        True
+        >>> load_driver("idm").noisy
+        False
+    """
+    text = str(name)
+    if text == RULE_BASED:
+        return RuleDriver()
+    if text == LANE_CHANGING:
+        return LaneChangingDriver()
+    shipped, _, query = text.partition("?")
+    if shipped in (*SHIPPED_DRIVERS, *SHIPPED_EGOS):
+        settings = DriverSettings(**read_settings(DriverSettings, query))
+        driver = read_driver(SHIPPED / f"{shipped}{SUFFIX}")
+        if settings.rules:
+            return driver
+        return replace(driver, colour=HUMAN_NOISE, avoidance=None, hard_braking=1.0, changes=None)
+    if text.endswith(SUFFIX) or Path(text).is_file():
+        return read_driver(text)
+    names = (*SHIPPED_DRIVERS, *SHIPPED_EGOS, RULE_BASED, LANE_CHANGING)
+    saved = Path(f"{text}{SUFFIX}")
+    hint = f" (did you mean {str(saved)!r}?)" if saved.is_file() else did_you_mean(text, names)
+    raise ValueError(f"Unknown driver {text!r}{hint}; expected {', '.join(map(repr, names))} or a path to a {SUFFIX}.")

@@ -19,8 +19,8 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from agents.names import report_missing_file
-from agents.sb3.saved_ego import SavedEgo
+from agents.files import report_missing_file
+from agents.saved_ego import SavedEgo
 from rare_envs.control.actions import DISCRETE_ACTIONS
 from rare_envs.files import replace_file
 from rare_envs.plugins import one_line

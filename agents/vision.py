@@ -8,9 +8,8 @@ References:
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass
 from functools import cached_property
-from importlib import resources
 from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, cast
@@ -18,11 +17,19 @@ from typing import TYPE_CHECKING, Any, ClassVar, cast
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from safetensors import SafetensorError, safe_open
 from torch import Tensor, nn
 
-from agents.learned.checkpoints import SUFFIX, Provenance, check_finite, check_tensor, read_file, require, write_file
-from agents.names import VISION
+from agents.files import (
+    SHIPPED,
+    SUFFIX,
+    VISION,
+    VISION_ENTRY,
+    Provenance,
+    check_form,
+    read_file,
+    read_network,
+    write_file,
+)
 from rare_envs.control.actions import MAX_ACCELERATION, MAX_STEERING, action_space
 from rare_envs.simulation.observation import EGO_FEATURES, observation_space
 from rare_envs.traffic.vehicle_models import steering_for
@@ -52,25 +59,14 @@ MIN_STEERING_SPEED = 5.0
 """Below this speed [m/s] a yaw rate steers as at it: on a path of given curvature the yaw rate vanishes with speed."""
 SPEED_SCALE = EGO_FEATURES[0].scale
 """Speed [m/s] of an observation of 1."""
-_ENTRY = "vision"
-_FORMAT: Mapping[str, Any] = {"format": 1, "observation": OBSERVATION, "picture": [HEIGHT, WIDTH], "lag": LAG}
+_FORM: Mapping[str, Any] = {"format": 1, "observation": OBSERVATION, "picture": [HEIGHT, WIDTH], "lag": LAG}
 """Observation that a network was trained for; a file with another one is refused."""
 
 
 def luma(picture: Tensor) -> Tensor:
-    """Return the brightness of pictures, computed in integers: the same bits whatever the batch.
+    """Return the brightness (B, H, W) of pictures (B, H, W, 3), uint8: the coefficients of `YUV` times 256, rounded.
 
-    The coefficients are those of `YUV` times 256, rounded.
-
-    Args:
-        picture: uint8, red, green and blue last, shape (B, H, W, 3).
-
-    Returns:
-        uint8, shape (B, H, W).
-
-    Example:
-        >>> luma(torch.tensor([[[[255, 0, 0], [255, 255, 255]]]], dtype=torch.uint8)).tolist()
-        [[[77, 255]]]
+    It is computed in integers, so that the bits are the same whatever the batch.
     """
     red, green, blue = picture.to(torch.int32).unbind(-1)
     return ((77 * red + 150 * green + 29 * blue + 128) >> 8).to(torch.uint8)
@@ -81,11 +77,6 @@ class PilotNet(nn.Module):
 
     Beside the YUV of the picture there is a fourth channel, the change of brightness since an earlier picture, because
     one picture does not tell how fast a gap closes. The ego's own speed joins the units of the first dense layer.
-
-    Example:
-        >>> picture = torch.zeros(2, HEIGHT, WIDTH, 3, dtype=torch.uint8)
-        >>> tuple(PilotNet()(picture, luma(picture), torch.tensor([10.0, 20.0])).shape)
-        (2, 2)
     """
 
     def __init__(self) -> None:
@@ -109,15 +100,7 @@ class PilotNet(nn.Module):
         return self
 
     def channels(self, picture: Tensor, earlier: Tensor) -> Tensor:
-        """Return the four channels of the input, about -1 to 1.
-
-        Args:
-            picture: uint8, red, green and blue last, shape (B, 66, 200, 3).
-            earlier: Luma of an earlier picture, uint8, shape (B, 66, 200).
-
-        Returns:
-            Y, U, V, and Y less the earlier Y, shape (B, 4, 66, 200).
-        """
+        """Return Y, U, V and Y less the earlier Y, uint8 (B, 66, 200): about -1 to 1, (B, 4, 66, 200)."""
         like = self.head.weight
         image = like.new_empty(*picture.shape[:3], 4)
         image[..., :3] = picture.to(like.dtype) @ like.new_tensor(YUV).T
@@ -141,34 +124,16 @@ class PilotNet(nn.Module):
         return outputs
 
     def forward(self, picture: Tensor, earlier: Tensor, speed: Tensor) -> Tensor:
-        """Return acceleration and yaw rate.
+        """Return acceleration and yaw rate (B, 2) in units of `ACCELERATION_UNIT` and `TURN_UNIT`.
 
-        Args:
-            picture: uint8, red, green and blue last, shape (B, 66, 200, 3).
-            earlier: Luma of the picture `agents.vision.LAG` ticks before, uint8, shape (B, 66, 200).
-            speed: Own speed [m/s], shape (B,).
-
-        Returns:
-            Acceleration and yaw rate in units of `ACCELERATION_UNIT` and `TURN_UNIT`, shape (B, 2).
+        Pictures are uint8 (B, 66, 200, 3), the luma of `LAG` ticks before (B, 66, 200), own speeds [m/s] (B,).
         """
         return self.out(self.hidden(picture, earlier, speed))
 
 
-# --- ego ---------------------------------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True, eq=False)
 class VisionEgo:
-    """The ego with a camera: Stable-Baselines3's `predict`, with the luma of the last pictures as its memory.
-
-    Example:
-        >>> from agents import load_ego
-        >>> ego = load_ego("vision")
-        >>> observation = {"camera": np.zeros((2, 66, 200, 3), np.uint8), "speed": np.full((2, 1), 0.5, np.float32)}
-        >>> action, state = ego.predict(observation)
-        >>> action.shape, state.shape
-        ((2, 2), (2, 5, 66, 200))
-    """
+    """The ego with a camera: Stable-Baselines3's `predict`, with the luma of the last pictures as its memory."""
 
     network: PilotNet
     dt: ClassVar[float] = 0.1
@@ -192,19 +157,10 @@ class VisionEgo:
         episode_start: NDArray[np.bool_] | None = None,
         deterministic: bool = True,
     ) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
-        """Choose actions as a Stable-Baselines3 model does.
+        """Return actions in [-1, 1] (B, 2), and the luma of the last pictures (B, 5, 66, 200), the oldest first.
 
-        Args:
-            observation: "camera", uint8 of shape (B, 66, 200, 3), and "speed", shape (B, 1).
-            state: Luma of the last pictures, the oldest first, uint8, shape (B, 5, 66, 200); None at the start.
-            episode_start: Rows that begin an episode, shape (B,); they remember the present picture only.
-            deterministic: Not used; it always is.
-
-        Returns:
-            Actions in [-1, 1], shape (B, 2), and the new state.
-
-        Raises:
-            ValueError: If the observation has another form.
+        The observation has "camera", uint8 (B, 66, 200, 3), and "speed" (B, 1). Rows that begin an episode remember the
+        present picture only. It is always deterministic.
         """
         del deterministic
         picture, speed = _read_observation(observation)
@@ -216,15 +172,9 @@ class VisionEgo:
 def update_memory(
     picture: Tensor, state: NDArray[np.uint8] | None, episode_start: NDArray[np.bool_] | None = None
 ) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
-    """Add a picture to the memory.
+    """Return the luma of `LAG` pictures ago (B, H, W), and the memory (B, LAG, H, W) with a picture (B, H, W, 3) added.
 
-    Args:
-        picture: uint8, shape (B, H, W, 3).
-        state: Luma of the `LAG` pictures before it, the oldest first, shape (B, LAG, H, W); None at the start.
-        episode_start: Rows that begin an episode, shape (B,): their whole memory is this picture.
-
-    Returns:
-        The luma of `LAG` pictures ago, shape (B, H, W), and the state to pass on.
+    The whole memory of rows that begin an episode is this picture.
     """
     now = luma(picture).numpy()
     start = np.full(len(now), state is None)
@@ -243,94 +193,27 @@ def to_actions(outputs: Tensor, speed: Tensor) -> Tensor:
 
 
 def _read_observation(observation: dict[str, NDArray[Any]]) -> tuple[Tensor, Tensor]:
-    """Return pictures, and speeds in m/s."""
+    """Return pictures, and speeds in m/s (B,)."""
     parts = {name: np.asarray(part) for name, part in observation.items()} if isinstance(observation, dict) else {}
-    shapes = {name: (part.shape, str(part.dtype)) for name, part in parts.items()}
-    picture, speed = parts.get("camera"), parts.get("speed")
-    if picture is None or speed is None or picture.shape[1:] != (HEIGHT, WIDTH, 3) or picture.dtype != np.uint8:
+    picture, speed = parts.get("camera", np.empty(0)), parts.get("speed", np.empty(0))
+    if picture.shape[1:] != (HEIGHT, WIDTH, 3) or picture.dtype != np.uint8 or speed.shape != (len(picture), 1):
+        shapes = {name: (part.shape, str(part.dtype)) for name, part in parts.items()}
         raise ValueError(
             f"Expected pictures 'camera', uint8 of shape (B, {HEIGHT}, {WIDTH}, 3), and 'speed', (B, 1), got "
             f'{shapes or type(observation).__name__}; make the environment with observation="{OBSERVATION}".'
         )
-    if speed.shape != (len(picture), 1):
-        raise ValueError(f"Expected 'speed' of shape ({len(picture)}, 1), got {speed.shape}.")
-    return torch.from_numpy(np.ascontiguousarray(picture)), torch.from_numpy(
-        speed[:, 0].astype(np.float32)
-    ) * SPEED_SCALE
-
-
-# --- files -------------------------------------------------------------------------------------------------------
+    scaled = torch.from_numpy(speed[:, 0].astype(np.float32)) * SPEED_SCALE
+    return torch.from_numpy(np.ascontiguousarray(picture)), scaled
 
 
 def load_vision(name: str | PathLike[str] = VISION) -> VisionEgo:
-    """Load the ego `vision`, or one from a file that `save_vision` wrote.
-
-    Raises:
-        FileNotFoundError: The file does not exist.
-        ValueError: It holds something else, or was made for other pictures.
-
-    Example:
-        >>> sorted(load_vision().observation_space)
-        ['camera', 'speed']
-    """
-    if str(name) == VISION:
-        with resources.as_file(resources.files("agents") / "data" / f"{VISION}{SUFFIX}") as path:
-            return VisionEgo(_read_network(path))
-    return VisionEgo(_read_network(Path(name)))
+    """Return the ego `vision`, or one from a file that `save_vision` wrote."""
+    path = SHIPPED / f"{VISION}{SUFFIX}" if str(name) == VISION else Path(name)
+    header, tensors = read_file(path, VISION_ENTRY)
+    check_form(header, _FORM, path)
+    return VisionEgo(read_network(PilotNet, tensors, path).arrange())
 
 
 def save_vision(network: PilotNet, provenance: Provenance, path: str | PathLike[str]) -> Path:
-    """Write a network to one file.
-
-    Raises:
-        ValueError: If the path has another ending than .safetensors, or a weight is NaN or infinite.
-
-    Example:
-        >>> import tempfile
-        >>> with tempfile.TemporaryDirectory() as folder:
-        ...     origin = Provenance(kind="untrained", command="-", data="-", data_licence="CC0")
-        ...     path = save_vision(PilotNet(), origin, Path(folder) / "mine.safetensors")
-        ...     print(read_vision_provenance(path).kind, type(load_vision(path)).__name__)
-        untrained VisionEgo
-    """
-    tensors = {name: value.detach().cpu().contiguous() for name, value in network.state_dict().items()}
-    return write_file(Path(path), tensors, _ENTRY, {**_FORMAT, **asdict(provenance)})
-
-
-def read_vision_provenance(path: str | PathLike[str]) -> Provenance:
-    """Read the origin of a network; raises as `load_vision` does.
-
-    Example:
-        >>> from importlib import resources
-        >>> read_vision_provenance(resources.files("agents") / "data" / "vision.safetensors").kind
-        'imitation of a driver by rule with on-policy corrections (DAgger), corrected'
-    """
-    header, _ = read_file(Path(path), _ENTRY)
-    require(header, (f.name for f in fields(Provenance)), Path(path))
-    return Provenance(**{f.name: header[f.name] for f in fields(Provenance)})
-
-
-def holds_vision(path: str | PathLike[str]) -> bool:
-    """Return whether a file holds a network with a camera; False if it cannot be read."""
-    try:
-        with safe_open(path, framework="pt") as file:
-            return _ENTRY in (file.metadata() or {})
-    except (SafetensorError, OSError):
-        return False
-
-
-def _read_network(path: Path) -> PilotNet:
-    """Read a network onto the CPU, without gradients."""
-    header, tensors = read_file(path, _ENTRY)
-    for name, ours in _FORMAT.items():
-        if header.get(name) != ours:
-            raise ValueError(f"{str(path)!r} has {name} {header.get(name)!r}; this version reads {ours!r}.")
-    check_finite(tensors, path)
-    with torch.device("meta"):  # shapes only: initial weights would be drawn from the global generator
-        network = PilotNet()
-    expected = network.state_dict()
-    require(tensors, expected, path)
-    for name, value in expected.items():
-        check_tensor(name, tensors[name], tuple(value.shape), torch.float32, path)
-    network.load_state_dict({name: tensors[name] for name in expected}, assign=True)
-    return network.arrange().eval().requires_grad_(False)
+    """Write a network to one .safetensors, and return its path."""
+    return write_file(Path(path), network.state_dict(), VISION_ENTRY, {**_FORM, **asdict(provenance)})

@@ -280,7 +280,7 @@ def _continue_model(
         ValueError: The ego cannot be trained on here, or the failures are not of this environment.
         OSError: The ego's file cannot be read.
     """
-    from agents.sb3.saved_ego import load_saved_ego
+    from agents.saved_ego import load_saved_ego
 
     saved = load_saved_ego(retraining.ego, None)
     check_retrainable(saved, algo, env)

@@ -1,7 +1,11 @@
-"""Learned drivers: 51 features to acceleration and yaw rate, for whole batches of scenarios at once."""
+"""Learned drivers: 51 features to acceleration and yaw rate, for whole batches of scenarios, and their files."""
+
+from __future__ import annotations
 
 import copy
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
+from os import PathLike
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
@@ -9,21 +13,31 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from agents.learned.collision_avoidance import CollisionAvoidance
-from agents.learned.lane_changes import STATE_SIZE, ChangeState, LaneChanges
+from agents.files import (
+    DRIVER_ENTRY,
+    Provenance,
+    check_form,
+    check_tensor,
+    read_file,
+    read_network,
+    require,
+    write_file,
+)
 from agents.learned.networks import (
     ACTION_SIZE,
+    FEATURE_CLIP,
     FEATURE_SIZE,
     HEAD_SIZE,
     HIDDEN_SIZES,
-    HUMAN_NOISE,
     WHITE_NOISE,
     AutoregressiveNoise,
     Policy,
+    Scaling,
+    WeightDistribution,
     apply_heads,
     is_plain,
 )
-from agents.learned.weight_distribution import WeightDistribution
+from agents.learned.rules import STATE_SIZE, ChangeState, CollisionAvoidance, LaneChanges
 from rare_envs.control import actions
 from rare_envs.control.idm import IDM
 from rare_envs.devices import constant
@@ -55,6 +69,11 @@ OFFSET_TIME = 0.6
 HEADING_TIME = 0.2
 """The yaw rate is heading error / this [s], as in `rare_envs.control.idm`."""
 _LENGTH = FEATURES.index("length")
+_NOISE_SIZE = 2 * ACTION_SIZE
+"""Numbers that a vehicle keeps in mind of its noise."""
+_POLICY, _WEIGHTS = "policy.", "weights."
+"""Beginnings of the names of tensors in files."""
+_FORM = {"format": 1, "features": list(FEATURES), "feature_clip": FEATURE_CLIP}
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,11 +124,9 @@ class LearnedDriver:
             pair = tuple(float(value) for value in getattr(self, name))  # a field by its name
             if len(pair) != ACTION_SIZE:
                 raise ValueError(f"Expected {name} as two numbers, got {pair}.")
+            if not pair[0] < pair[1]:
+                raise ValueError(f"Expected limits of {name} in ascending order, got {pair}.")
             object.__setattr__(self, name, pair)
-        for name in ("acceleration", "yaw_rate"):
-            low, high = getattr(self, name)  # a field by its name
-            if not low < high:
-                raise ValueError(f"Expected limits of {name} in ascending order, got {(low, high)}.")
         if not 0.0 < self.hard_braking <= 1.0:
             raise ValueError(f"Expected a share of hard braking in (0, 1], got {self.hard_braking!r}.")
         if self.changes is not None and self.avoidance is None:
@@ -140,7 +157,7 @@ class LearnedDriver:
             TypeError: If something is no tensor.
             ValueError: If a shape is wrong, or innovations come without a memory.
         """
-        batch, vehicles = _check_shapes(features, weights, innovations, memory, self._memory_shape)
+        batch, vehicles = self._check(features=features, weights=weights, innovations=innovations, memory=memory)
         policy = self.policy
         hidden = policy.trunk(features.to(policy.head.weight.dtype).reshape(batch * vehicles, FEATURE_SIZE))
         if weights is None:
@@ -148,33 +165,47 @@ class LearnedDriver:
         else:
             output = apply_heads(hidden.view(batch, vehicles, HIDDEN_SIZES[-1]), weights.to(hidden.dtype).contiguous())
         normal, log_std = policy.split(output)
-        swings, state = self._split(memory)
+        swings = None
+        if memory is not None:
+            swings = memory.flatten(2)[..., :_NOISE_SIZE].reshape(batch, vehicles, ACTION_SIZE, 2)
         if innovations is not None and swings is not None:
             noise, swings = self.colour.step(swings.to(hidden.dtype), innovations.to(hidden.dtype))
             normal = normal + log_std.exp() * noise
-        scaling = policy.scaling
-        action = scaling.action_mean + scaling.action_std * normal
+        action = self._limit(features, policy.scaling.action_mean + policy.scaling.action_std * normal)
+        if self.changes is None or memory is None or swings is None:
+            return self._avoid(features, action), swings
+        state = ChangeState.unpack(memory[..., _NOISE_SIZE:])
+        action, state = self._change_lanes(self.changes, features, action, state, innovations)
+        return self._avoid(features, action), torch.cat((swings.flatten(-2), state.pack().to(swings.dtype)), dim=-1)
+
+    def _check(self, **given: Tensor | None) -> tuple[int, int]:
+        """Return B and M; refuse other arguments of `act` than tensors of the right shapes."""
+        for name, value in given.items():
+            if not isinstance(value, Tensor) and (value is not None or name == "features"):
+                raise TypeError(f"Expected {name} as a torch.Tensor, got {type(value).__name__}; use torch.as_tensor.")
+        features = given["features"]
+        assert features is not None
+        if features.ndim != 3 or features.shape[-1] != FEATURE_SIZE:
+            raise ValueError(f"Expected features of shape (B, M, {FEATURE_SIZE}), got {tuple(features.shape)}.")
+        batch, vehicles, _ = features.shape
+        each = (ACTION_SIZE, 2) if self.changes is None else (_NOISE_SIZE + STATE_SIZE,)
+        shapes = {
+            "weights": (batch, HEAD_SIZE),
+            "innovations": (batch, vehicles, ACTION_SIZE),
+            "memory": (batch, vehicles, *each),
+        }
+        for name, shape in shapes.items():
+            value = given[name]
+            if value is not None and value.shape != shape:
+                raise ValueError(f"Expected {name} of shape {shape}, got {tuple(value.shape)}.")
+        if given["innovations"] is not None and given["memory"] is None:
+            raise ValueError("Expected a memory beside the innovations; at the start it is driver.begin(draws).")
+        return batch, vehicles
+
+    def _limit(self, features: Tensor, action: Tensor) -> Tensor:
+        """Return actions (B, M, 2) within the limits, with a share of the braking beyond `EASED_BEYOND`."""
         low, high = constant(tuple(zip(self.acceleration, self.yaw_rate, strict=True)), action)
-        action = self._ease_braking(action.clamp(low, high).to(features.dtype))
-        if state is None or swings is None:
-            return self._bound(features, action), memory if swings is None else swings
-        action, state = self._change_lanes(features, action, state, innovations)
-        return self._bound(features, action), torch.cat((swings.flatten(-2), state.pack().to(swings.dtype)), dim=-1)
-
-    @property
-    def _memory_shape(self) -> tuple[int, ...]:
-        """Shape of the memory of one vehicle."""
-        return (ACTION_SIZE, 2) if self.changes is None else (2 * ACTION_SIZE + STATE_SIZE,)
-
-    def _split(self, memory: Tensor | None) -> tuple[Tensor | None, ChangeState | None]:
-        """Return the memory of the noise, (B, M, 2, 2), and that of the lane changes."""
-        if memory is None or self.changes is None:
-            return memory, None
-        swings = memory[..., : 2 * ACTION_SIZE].reshape(*memory.shape[:-1], ACTION_SIZE, 2)
-        return swings, ChangeState.unpack(memory[..., 2 * ACTION_SIZE :])
-
-    def _ease_braking(self, action: Tensor) -> Tensor:
-        """Return actions with a share of the braking beyond `EASED_BEYOND`."""
+        action = action.clamp(low, high).to(features.dtype)
         if self.hard_braking == 1.0:
             return action
         acceleration, yaw_rate = action.unbind(dim=-1)
@@ -182,39 +213,31 @@ class LearnedDriver:
         return torch.stack((eased, yaw_rate), dim=-1)
 
     def _change_lanes(
-        self, features: Tensor, action: Tensor, state: ChangeState, innovations: Tensor | None
+        self, changes: LaneChanges, features: Tensor, action: Tensor, state: ChangeState, innovations: Tensor | None
     ) -> tuple[Tensor, ChangeState]:
-        """Return actions with the course of a lane change for the steering of those who are in one."""
-        assert self.changes is not None
+        """Return actions (B, M, 2) with the course of a lane change for the steering of those who are in one."""
         assert self.avoidance is not None
-        change, state = self.changes.step(features, state, innovations)
-        bound = self.avoidance.greatest_acceleration_behind(change.gap, change.closing, features[..., SPEED_COLUMN])
+        change, state = changes.step(features, state, innovations)
+        bound = self.avoidance.bound_acceleration_behind(change.gap, change.closing, features[..., SPEED_COLUMN])
         acceleration = torch.where(change.follows, torch.minimum(action[..., 0], bound), action[..., 0])
-        left, right = self.avoidance.greatest_yaw_rates_within(features, change.room)
+        left, right = self.avoidance.bound_yaw_rates_within(features, change.room)
         inside = torch.minimum(torch.maximum(action[..., 1], -left), right)
         yaw_rate = torch.where(change.changing, change.yaw_rate, inside).clamp(*self.yaw_rate)
         return torch.stack((acceleration, yaw_rate), dim=-1), state
 
-    def _bound(self, features: Tensor, action: Tensor) -> Tensor:
-        """Return actions within the bounds of the rule, if there is one."""
+    def _avoid(self, features: Tensor, action: Tensor) -> Tensor:
+        """Return actions (B, M, 2) within the bounds of the rule, if there is one."""
         return action if self.avoidance is None else self.avoidance.limit(features, action)
 
     @property
     def recordable(self) -> bool:
-        """Whether its operations may be recorded: network, noise and rules are of this package."""
-        return is_plain(self.policy) and self._has_known_rules()
+        """Whether its operations may be recorded: network, noise and rules are of this package, not of subclasses."""
+        parts = (self.colour, self.avoidance, self.changes)
+        known = (AutoregressiveNoise, CollisionAvoidance, LaneChanges)
+        ours = all(part is None or type(part) is kind for part, kind in zip(parts, known, strict=True))
+        return ours and is_plain(self.policy)
 
-    def _has_known_rules(self) -> bool:
-        """Return whether its noise and rules are of this package: subclasses may do anything."""
-        rule, changes = self.avoidance, self.changes
-        parts, known = (self.colour, rule, changes), (AutoregressiveNoise, CollisionAvoidance, LaneChanges)
-        return all(part is None or type(part) is kind for part, kind in zip(parts, known, strict=True))
-
-    def without_rules(self) -> "LearnedDriver":
-        """Return the network alone, with the noise of recorded driving: no bounds and no lane changes by rule."""
-        return replace(self, colour=HUMAN_NOISE, avoidance=None, hard_braking=1.0, changes=None)
-
-    def to(self, device: torch.device) -> "LearnedDriver":
+    def to(self, device: torch.device) -> LearnedDriver:
         """Return the driver with a copy of its network on a device."""
         return replace(self, policy=copy.deepcopy(self.policy).to(device))
 
@@ -227,55 +250,6 @@ class LearnedDriver:
         if self.changes is None:
             return swings
         return torch.cat((swings.flatten(-2), self.changes.begin(draws[..., 1]).pack()), dim=-1)
-
-
-def _check_shapes(
-    features: Tensor,
-    weights: Tensor | None,
-    innovations: Tensor | None,
-    memory: Tensor | None,
-    each: tuple[int, ...],
-) -> tuple[int, int]:
-    """Return B and M; `each` is the shape of the memory of one vehicle."""
-    named = {"features": features, "weights": weights, "innovations": innovations, "memory": memory}
-    for name, value in named.items():
-        if not isinstance(value, Tensor) and (value is not None or name == "features"):
-            raise TypeError(f"Expected {name} as a torch.Tensor, got {type(value).__name__}; use torch.as_tensor.")
-    if features.ndim != 3 or features.shape[-1] != FEATURE_SIZE:
-        raise ValueError(f"Expected features of shape (B, M, {FEATURE_SIZE}), got {tuple(features.shape)}.")
-    batch, vehicles, _ = features.shape
-    if weights is not None and weights.shape != (batch, HEAD_SIZE):
-        raise ValueError(f"Expected weights of shape ({batch}, {HEAD_SIZE}), got {tuple(weights.shape)}.")
-    expected = (batch, vehicles, ACTION_SIZE)
-    if innovations is not None and innovations.shape != expected:
-        raise ValueError(f"Expected innovations of shape {expected}, got {tuple(innovations.shape)}.")
-    if innovations is not None and memory is None:
-        raise ValueError("Expected a memory beside the innovations; at the start it is driver.begin(draws).")
-    if memory is not None and memory.shape != (batch, vehicles, *each):
-        raise ValueError(f"Expected memory of shape {(batch, vehicles, *each)}, got {tuple(memory.shape)}.")
-    return batch, vehicles
-
-
-def replace_head(policy: Policy, weights: Tensor) -> Policy:
-    """Return a copy of a network with other weights (404,) in its last layer, as `head_weights` has them.
-
-    Raises:
-        ValueError: If there are not 404 weights.
-
-    Example:
-        >>> from agents import load_driver
-        >>> changed = replace_head(load_driver("gail").policy, torch.zeros(404))
-        >>> changed(torch.zeros(1, 51))[0].tolist()
-        [[0.0, 0.0]]
-    """
-    if weights.shape != (HEAD_SIZE,):
-        raise ValueError(f"Expected weights of shape ({HEAD_SIZE},), got {tuple(weights.shape)}.")
-    changed = copy.deepcopy(policy)
-    layer = weights.detach().view(2 * ACTION_SIZE, HIDDEN_SIZES[-1] + 1)
-    with torch.no_grad():
-        changed.head.weight.copy_(layer[:, :-1])
-        changed.head.bias.copy_(layer[:, -1])
-    return changed
 
 
 @dataclass(frozen=True, eq=False)
@@ -303,22 +277,22 @@ class LearnedEgo:
         return says_recordable(self.driver)
 
     @property
-    def observation_space(self) -> "spaces.Space[Any]":
+    def observation_space(self) -> spaces.Space[Any]:
         """Space of the observations of `predict`: "lidar"."""
         return observation_space(1, "lidar")
 
     @property
-    def action_space(self) -> "spaces.Box[np.float32]":
+    def action_space(self) -> spaces.Box[np.float32]:
         """Space of the actions of `predict`: acceleration and steering in [-1, 1]."""
         return actions.action_space()
 
-    def act(self, episode: "Episode", memory: Any) -> tuple[Tensor, Any]:
+    def act(self, episode: Episode, memory: Any) -> tuple[Tensor, Any]:
         """Perceive and decide for one tick; see `rare_envs.simulation.rollout.Driver`."""
         if episode.perception is None:
             raise ValueError('Expected a world in which vehicles look: make it with observation="lidar".')
         return self._decide(episode.perception[:, 0]), memory
 
-    def to(self, device: torch.device) -> "LearnedEgo":
+    def to(self, device: torch.device) -> LearnedEgo:
         """Return the ego with a copy of its network on a device."""
         return replace(self, driver=self.driver.to(device))
 
@@ -373,12 +347,6 @@ class RuleDriver:
 
     It has the interface of a `LearnedDriver`, so that one harness measures both; it has no weights and no noise, and
     knows vehicles in its lane only where the beam meets them.
-
-    Example:
-        >>> import torch
-        >>> actions, _ = RuleDriver().act(torch.zeros(1, 1, 51))
-        >>> actions.shape
-        torch.Size([1, 1, 2])
     """
 
     idm: IDM = field(default_factory=IDM)
@@ -400,17 +368,7 @@ class RuleDriver:
         innovations: Tensor | None = None,
         memory: Tensor | None = None,
     ) -> tuple[Tensor, Tensor | None]:
-        """Decide for one tick.
-
-        Args:
-            features: Shape (B, M, 51).
-            weights: Not used.
-            innovations: Not used.
-            memory: Returned as it is.
-
-        Returns:
-            Accelerations [m/s^2] and yaw rates [rad/s], shape (B, M, 2), and the memory.
-        """
+        """Return accelerations [m/s^2] and yaw rates [rad/s] (B, M, 2) for features (B, M, 51), and the memory."""
         ahead, rate = features[..., RANGE_COLUMNS][..., AHEAD_BEAM], features[..., RATE_COLUMNS][..., AHEAD_BEAM]
         speed = features[..., SPEED_COLUMN]
         gap = torch.where(ahead < MAX_RANGE, ahead - 0.5 * features[..., _LENGTH], torch.inf)
@@ -419,3 +377,91 @@ class RuleDriver:
         wanted = torch.asin(across.clamp(-1.0, 1.0)).clamp(-torch.pi / 4, torch.pi / 4)
         yaw_rate = ((wanted - features[..., HEADING_COLUMN]) / HEADING_TIME).clamp(*self.yaw_rate)
         return torch.stack((acceleration, yaw_rate), dim=-1), memory
+
+
+# --- files --------------------------------------------------------------------------------------
+
+
+def save_driver(driver: LearnedDriver, provenance: Provenance, path: str | PathLike[str]) -> Path:
+    """Write a driver to one file; an interrupted call leaves no partial file.
+
+    Args:
+        driver: The driver.
+        provenance: Its origin; numbers, strings, lists and mappings only.
+        path: Ends with .safetensors.
+
+    Returns:
+        The path.
+
+    Raises:
+        ValueError: If the path has another ending, or something is NaN or infinite.
+
+    Example:
+        >>> import tempfile
+        >>> from agents import load_driver, read_provenance
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     origin = Provenance(kind="gail", command="-", data="-", data_licence="CC0")
+        ...     path = save_driver(load_driver("gail"), origin, Path(folder) / "mine.safetensors")
+        ...     print(read_driver(path).name, read_provenance(path).data_licence)
+        gail CC0
+    """
+    tensors = {_POLICY + name: value for name, value in driver.policy.state_dict().items()}
+    if driver.weights is not None:
+        arrays = driver.weights.to_arrays()
+        tensors |= {_WEIGHTS + name: torch.from_numpy(np.array(value)) for name, value in arrays.items()}
+    header = {
+        "name": driver.name,
+        "log_std_cap": float(driver.policy.log_std_cap),
+        "colour": asdict(driver.colour),
+        "acceleration": driver.acceleration,
+        "yaw_rate": driver.yaw_rate,
+        "avoidance": None if driver.avoidance is None else asdict(driver.avoidance),
+        "hard_braking": driver.hard_braking,
+        "changes": None if driver.changes is None else asdict(driver.changes),
+        "radius": None if driver.weights is None else driver.weights.radius,
+    }
+    return write_file(Path(path), tensors, DRIVER_ENTRY, {**_FORM, **header, **asdict(provenance)})
+
+
+def read_driver(path: str | PathLike[str]) -> LearnedDriver:
+    """Read a driver that `save_driver` wrote, onto the CPU and without gradients.
+
+    Raises:
+        FileNotFoundError: There is no such file.
+        ValueError: It is not a safetensors file, lacks something, has a tensor of the wrong shape or type, or was made
+            for other features; the message says which.
+
+    Example:
+        >>> from importlib import resources
+        >>> read_driver(resources.files("agents") / "data" / "gail.safetensors").acceleration
+        (-8.0, 4.0)
+    """
+    path = Path(path)
+    header, tensors = read_file(path, DRIVER_ENTRY)
+    check_form(header, _FORM, path)
+    require(header, ("name", "colour", "acceleration", "yaw_rate", "radius"), path)
+    sizes = (FEATURE_SIZE, FEATURE_SIZE, ACTION_SIZE, ACTION_SIZE)
+    policy = read_network(lambda: Policy(Scaling(*map(torch.empty, sizes))), tensors, path, _POLICY)
+    rule, changes = header.get("avoidance"), header.get("changes")  # earlier files have none
+    try:
+        return LearnedDriver(
+            policy,
+            colour=AutoregressiveNoise(**header["colour"]),
+            acceleration=header["acceleration"],
+            yaw_rate=header["yaw_rate"],
+            weights=None if header["radius"] is None else _read_weights(tensors, header["radius"], path),
+            avoidance=None if rule is None else CollisionAvoidance(**rule),
+            hard_braking=header.get("hard_braking", 1.0),
+            changes=None if changes is None else LaneChanges(**changes),
+            name=header["name"],
+        )
+    except (AttributeError, TypeError, ValueError) as error:
+        raise ValueError(f"{str(path)!r} is no usable driver: {error}") from None
+
+
+def _read_weights(tensors: dict[str, Tensor], radius: float, path: Path) -> WeightDistribution:
+    """Return the distribution of the last layer's weights in a file's tensors."""
+    names = ("mean", "rows", "columns", "precision")
+    require(tensors, [_WEIGHTS + name for name in names], path)
+    check_tensor(f"{_WEIGHTS}mean", tensors[f"{_WEIGHTS}mean"], (HEAD_SIZE,), torch.float64, path)
+    return WeightDistribution.from_arrays({name: tensors[_WEIGHTS + name].numpy() for name in names}, radius)

@@ -1,46 +1,56 @@
-"""The network of a learned driver, from features to a Gaussian over acceleration and yaw rate, and its noise.
+"""The network of a learned driver, its noise, and the distribution of the weights of its last layer.
 
 Recorded accelerations and yaw rates, less what 51 features explain, oscillate: their autocorrelation is 0.98 after
 0.1 s, 0.7 after 0.5 s, and negative between 1.1 and 3 s. White noise (O'Kelly et al.'s) has none of this, and a
 first-order noise of the same smoothness makes a car wander off, because nothing brings it back.
+
+References:
+    O'Kelly, Sinha, Namkoong, Duchi and Tedrake, "Scalable end-to-end autonomous vehicle testing via rare-event
+    simulation", NeurIPS 2018, section 4: the layers; xi ~ N(mu0, Sigma0) from an ensemble of drivers, the inverse of
+    Sigma0 sparse; the search moves the mean within |mu - mu0|_inf <= 0.01 and leaves Sigma0 as it is.
 """
+
+from __future__ import annotations
 
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from functools import cached_property
+from typing import NamedTuple
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
+from scipy.linalg import solve_triangular
 from torch import Tensor, nn
 
+from rare_envs.arrays import FloatArray
 from rare_envs.devices import constant
 
 FEATURE_SIZE = 51
 """Features of `rare_envs.sensors.lidar.FEATURES`."""
 HIDDEN_SIZES = (200, 100)
-"""Units of the two hidden layers (O'Kelly et al. 2018, section 4)."""
+"""Units of the two hidden layers."""
 ACTION_SIZE = 2
 """Acceleration and yaw rate."""
 HEAD_SIZE = (HIDDEN_SIZES[-1] + 1) * 2 * ACTION_SIZE
-"""Weights of the last layer, 404: what a search over drivers perturbs (O'Kelly et al. 2018, section 4)."""
+"""Weights of the last layer, 404: what a search over drivers perturbs."""
 FEATURE_CLIP = 8.0
 """Normalised features are clipped to +-this, so that a scene far from the record cannot saturate every unit."""
-
 HEAD_GAIN, LOG_STD_BIAS = 0.1, -1.0
 """Factor on the first weights of the last layer, and its first biases of log standard deviations: a new network acts
 almost alike everywhere, with noise of about a quarter of the recorded spread, from which cloning starts smoothly."""
-
-"""Weights, shape (outputs, inputs), and biases, shape (outputs,)."""
+RADIUS = 0.01
+"""Largest shift of each mean in a search."""
+SYMMETRY = 1e-9
+"""Relative difference of mirrored entries that rounding may leave in a precision."""
+HEAD_OUTPUTS = ("mean_acceleration", "mean_yaw_rate", "log_std_acceleration", "log_std_yaw_rate")
+WEIGHT_NAMES = tuple(f"{output}_{unit}" for output in HEAD_OUTPUTS for unit in (*range(HIDDEN_SIZES[-1]), "bias"))
+"""Names of the 404 weights, in the order of `head_weights`: each output's 100 weights, then its bias."""
 
 
 class Scaling(NamedTuple):
-    """Means and spreads of recorded driving, by which features and actions are normalised.
-
-    Example:
-        >>> scaling = Scaling(torch.zeros(51), torch.ones(51), torch.zeros(2), torch.ones(2))
-        >>> Policy(scaling).normalise(torch.full((1, 51), 20.0)).max().item()
-        8.0
-    """
+    """Means and spreads of recorded driving, by which features and actions are normalised."""
 
     feature_mean: Tensor
     """Shape (51,)."""
@@ -57,21 +67,13 @@ class Policy(nn.Module):
 
     O'Kelly et al. have the same sizes with ReLU; on the data that the shipped drivers learned from, tanh overfits less.
     Everything is in normalised units, see `Scaling`.
-
-    Example:
-        >>> scaling = Scaling(torch.zeros(51), torch.ones(51), torch.zeros(2), torch.ones(2))
-        >>> mean, log_std = Policy(scaling)(torch.zeros(4, 51))
-        >>> tuple(mean.shape), bool((log_std < 0.0).all())
-        ((4, 2), True)
     """
 
     def __init__(self, scaling: Scaling, log_std_cap: float = 0.0) -> None:
         """Start with small heads, and a log standard deviation of about -1.3.
 
-        Args:
-            scaling: Of features and actions.
-            log_std_cap: The log standard deviations approach this smoothly from below. A hard cap would have no
-                gradient beyond it, and leave half of the last layer's weights without effect.
+        Log standard deviations approach their cap smoothly from below: a hard cap would have no gradient beyond it,
+        and leave half of the last layer's weights without effect.
         """
         super().__init__()
         self.log_std_cap: Tensor
@@ -111,39 +113,18 @@ class Policy(nn.Module):
 
 
 def head_weights(policy: Policy) -> Tensor:
-    """Return the 404 weights of the last layer: for each of the four outputs its 100 weights and its bias.
-
-    Example:
-        >>> scaling = Scaling(torch.zeros(51), torch.ones(51), torch.zeros(2), torch.ones(2))
-        >>> tuple(head_weights(Policy(scaling)).shape)
-        (404,)
-    """
+    """Return the 404 weights of the last layer: for each of the four outputs its 100 weights and its bias."""
     return torch.cat((policy.head.weight, policy.head.bias[:, None]), dim=1).flatten()
 
 
 def apply_heads(hidden: Tensor, weights: Tensor) -> Tensor:
-    """Apply the last layer, with weights of its own for every scenario.
-
-    Args:
-        hidden: Hidden units of M vehicles in B scenarios, shape (B, M, 100).
-        weights: As `head_weights` has them, shape (B, 404).
-
-    Returns:
-        Outputs, shape (B, M, 4).
-    """
+    """Return the outputs (B, M, 4) of hidden units (B, M, 100) by last layers of each scenario, weights (B, 404)."""
     layer = weights.view(len(weights), 2 * ACTION_SIZE, HIDDEN_SIZES[-1] + 1)
     return torch.baddbmm(layer[:, None, :, -1], hidden, layer[:, :, :-1].mT)
 
 
 def is_plain(policy: Policy) -> bool:
-    """Return whether a network does what a `Policy` does: its class and layers, nothing put in their place.
-
-    Example:
-        >>> policy = Policy(Scaling(torch.zeros(51), torch.ones(51), torch.zeros(2), torch.ones(2)))
-        >>> plain = is_plain(policy)
-        >>> policy.head.register_forward_hook(print) and plain, is_plain(policy)
-        (True, False)
-    """
+    """Return whether a network does what a `Policy` does: its class and layers, nothing put in their place."""
     if type(policy) is not Policy:
         return False
     modules = (policy, policy.first, policy.second, policy.head)
@@ -157,16 +138,6 @@ class AutoregressiveNoise:
     """Stationary noise with variance 1: noise_t = first noise_{t-1} + second noise_{t-2} + scale fresh_t.
 
     There is one pair of coefficients for each of the two actions.
-
-    Raises:
-        ValueError: If a noise is not stationary.
-
-    Example:
-        >>> noise = AutoregressiveNoise.from_oscillators(frequency=(1.70, 1.57), damping=(0.845, 0.40))
-        >>> [round(value, 4) for value in noise.first]
-        [1.8114, 1.8979]
-        >>> [round(value, 4) for value in noise.scale]
-        [0.1009, 0.062]
     """
 
     first: tuple[float, float] = (0.0, 0.0)
@@ -178,33 +149,13 @@ class AutoregressiveNoise:
     before, which would shift speed and heading for good."""
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "first", tuple(self.first))  # JSON has lists
+        object.__setattr__(self, "second", tuple(self.second))
         if self.balanced and 0.0 in self.second:
             raise ValueError(f"Expected coefficients of lag 2 of a noise that begins balanced, got {self.second}.")
         for a, b in zip(self.first, self.second, strict=True):
             if not (abs(b) < 1.0 and abs(a) < 1.0 - b):
                 raise ValueError(f"Expected the coefficients of a stationary noise, got {a} and {b}.")
-
-    @classmethod
-    def from_oscillators(
-        cls, frequency: tuple[float, float], damping: tuple[float, float], dt: float = 0.1
-    ) -> "AutoregressiveNoise":
-        """Return the noise with the poles of damped oscillators.
-
-        Args:
-            frequency: Of the damped oscillation [rad/s], for acceleration and yaw rate.
-            damping: Rate of decay [1/s].
-            dt: Tick [s].
-        """
-        decay = [math.exp(-rate * dt) for rate in damping]
-        first = tuple(2.0 * r * math.cos(w * dt) for r, w in zip(decay, frequency, strict=True))
-        second = tuple(-r * r for r in decay)
-        return cls((first[0], first[1]), (second[0], second[1]))
-
-    @classmethod
-    def from_json(cls, values: Mapping[str, Any]) -> "AutoregressiveNoise":
-        """Return the noise whose fields were written as JSON, which has lists for tuples."""
-        fields: dict[str, Any] = {name: tuple(v) if isinstance(v, list) else v for name, v in values.items()}
-        return cls(**fields)
 
     @property
     def scale(self) -> tuple[float, float]:
@@ -215,13 +166,9 @@ class AutoregressiveNoise:
         return a, b
 
     def begin(self, fresh: Tensor) -> Tensor:
-        """Return two consecutive values made of independent standard normal ones: stationary, or balanced ones.
+        """Return the values one and two ticks ago (..., 2, 2), stationary or balanced, made of standard normal draws.
 
-        Args:
-            fresh: Shape (..., 2, 2): action, then draw; balanced noise does not use the second draw.
-
-        Returns:
-            Memory, shape (..., 2, 2): action, then the values one and two ticks ago.
+        Both have the action first, then two values or draws; balanced noise does not use the second draw.
         """
         if self.balanced:  # E[sum of all that follow] = (earlier second + last (first + second)) / (1 - first - second)
             last, (first, second) = fresh[..., 0], (constant(pair, fresh) for pair in (self.first, self.second))
@@ -242,5 +189,134 @@ class AutoregressiveNoise:
 
 WHITE_NOISE = AutoregressiveNoise()
 """Independent from tick to tick."""
-HUMAN_NOISE = AutoregressiveNoise.from_oscillators(frequency=(1.70, 1.57), damping=(0.845, 0.40))
-"""With the autocorrelation of what cloning leaves unexplained in the record, within 0.03 up to 1 s."""
+HUMAN_NOISE = AutoregressiveNoise((1.8114489295221357, 1.897944985293789), (-0.8445089033860342, -0.9231163463866358))
+"""With the autocorrelation of what cloning leaves unexplained in the record, within 0.03 up to 1 s: first is
+2 r cos(w dt), second -r^2, with r = exp(-d dt), w = 1.70 and 1.57 rad/s and decays d = 0.845 and 0.40 /s."""
+
+
+@dataclass(frozen=True, eq=False)
+class WeightDistribution:
+    """Normal distribution N(mean, precision^-1), and how far its mean may be moved.
+
+    Cross-entropy takes it as a block as it is: `mean`, `covariance` and `radius` say what it is and how it may move.
+
+    Raises:
+        ValueError: If the mean is not finite, the precision not symmetric positive definite, or the radius negative.
+
+    Example:
+        >>> weights = WeightDistribution(np.zeros(2), np.array([[2.0, 1.0], [1.0, 2.0]]))
+        >>> weights.covariance.round(4)
+        array([[ 0.6667, -0.3333],
+               [-0.3333,  0.6667]])
+        >>> weights.sample(3, np.random.default_rng(0)).shape
+        (3, 2)
+        >>> weights.log_prob(np.zeros((1, 2))).round(4)
+        array([-1.2886])
+    """
+
+    mean: FloatArray
+    """Shape (d,)."""
+    precision: FloatArray
+    """Inverse covariance, shape (d, d); mostly zeros when a graphical lasso made it."""
+    radius: float = RADIUS
+    """A search keeps |mu - mean|_inf within this."""
+
+    def __post_init__(self) -> None:
+        mean, precision = np.array(self.mean, dtype=np.float64), np.array(self.precision, dtype=np.float64)
+        if mean.ndim != 1 or precision.shape != 2 * mean.shape:
+            raise ValueError(f"Expected mean (d,) and precision (d, d), got {mean.shape} and {precision.shape}.")
+        if not (np.isfinite(mean).all() and np.isfinite(precision).all()):
+            raise ValueError("Expected a finite mean and precision, got inf or NaN.")
+        if not np.allclose(precision, precision.T, rtol=SYMMETRY, atol=0.0):
+            raise ValueError("Expected a symmetric precision, got another one; (precision + precision.T) / 2 is one.")
+        if not self.radius >= 0.0:
+            raise ValueError(f"Expected radius >= 0, got {self.radius!r}.")
+        for name, value in (("mean", mean), ("precision", 0.5 * (precision + precision.T))):
+            value.setflags(write=False)
+            object.__setattr__(self, name, value)
+        self._whitening  # noqa: B018 - positive definite, or an error now rather than at the first draw
+
+    def __repr__(self) -> str:
+        return f"WeightDistribution({self.dim} weights, radius={self.radius:g})"
+
+    @property
+    def dim(self) -> int:
+        """Number of weights d."""
+        return len(self.mean)
+
+    @cached_property
+    def _whitening(self) -> FloatArray:
+        """Lower triangular A with A' A = precision: the inverse of the covariance's Cholesky factor.
+
+        It is the Cholesky factor of the precision with rows and columns in reverse order, transposed and reversed back,
+        so neither matrix has to be inverted to get at it.
+        """
+        try:
+            reversed_factor = np.linalg.cholesky(self.precision[::-1, ::-1])
+        except np.linalg.LinAlgError:
+            raise ValueError(
+                "Expected a positive definite precision, got one with an eigenvalue of "
+                f"{np.linalg.eigvalsh(self.precision)[0]:.3g}; add a small multiple of the unit matrix."
+            ) from None
+        return np.ascontiguousarray(reversed_factor.T[::-1, ::-1])
+
+    @cached_property
+    def cholesky(self) -> FloatArray:
+        """Lower triangular L with L L' = covariance, shape (d, d)."""
+        return np.asarray(solve_triangular(self._whitening, np.eye(self.dim), lower=True))
+
+    @cached_property
+    def covariance(self) -> FloatArray:
+        """Shape (d, d)."""
+        return np.asarray(self.cholesky @ self.cholesky.T)
+
+    def sample(self, n: int, rng: np.random.Generator) -> FloatArray:
+        """Draw n independent points, shape (n, d)."""
+        if not isinstance(rng, np.random.Generator):
+            raise TypeError(f"Expected rng as a numpy.random.Generator, got {rng!r}; see np.random.default_rng.")
+        return self.from_standard_normal(rng.standard_normal((n, self.dim)))
+
+    def log_prob(self, x: FloatArray, /) -> FloatArray:
+        """Log density at x (n, d), shape (n,)."""
+        u = self.to_standard_normal(x)
+        log_det = float(np.log(np.diag(self._whitening)).sum())
+        return np.asarray(log_det - 0.5 * (np.square(u).sum(axis=1) + self.dim * math.log(2.0 * math.pi)))
+
+    def to_standard_normal(self, x: FloatArray, /) -> FloatArray:
+        """Return L^-1 (x - mean) of the rows of x (n, d)."""
+        return np.asarray((self._rows(x) - self.mean) @ self._whitening.T)
+
+    def from_standard_normal(self, u: FloatArray, /) -> FloatArray:
+        """Return mean + L u of the rows of u (n, d)."""
+        return np.asarray(self.mean + self._rows(u) @ self.cholesky.T)
+
+    def pull_back(self, u: FloatArray, gradients: FloatArray, /) -> FloatArray:
+        """Return gradients L' g with respect to u of gradients g with respect to the weights, (n, d)."""
+        return np.asarray(self._rows(gradients) @ self.cholesky)
+
+    def _rows(self, x: FloatArray) -> FloatArray:
+        """Return points (n, d) as numbers of double precision."""
+        x = np.asarray(x, dtype=np.float64)
+        if x.ndim != 2 or x.shape[1] != self.dim:
+            raise ValueError(f"Expected points of shape (n, {self.dim}), got {x.shape}.")
+        return x
+
+    def to_arrays(self) -> dict[str, NDArray[np.generic]]:
+        """Return the mean, and rows, columns and values of the non-zero entries of the precision's upper triangle."""
+        rows, columns = np.nonzero(np.triu(self.precision))
+        index = np.int16 if self.dim <= np.iinfo(np.int16).max else np.int64
+        values = self.precision[rows, columns]
+        return {"mean": self.mean, "rows": rows.astype(index), "columns": columns.astype(index), "precision": values}
+
+    @classmethod
+    def from_arrays(cls, arrays: Mapping[str, NDArray[np.generic]], radius: float = RADIUS) -> WeightDistribution:
+        """Return the distribution of which `to_arrays` gave the arrays."""
+        mean, values = arrays["mean"].astype(np.float64), arrays["precision"].astype(np.float64)
+        rows, columns = arrays["rows"].astype(np.int64), arrays["columns"].astype(np.int64)
+        if not (mean.ndim == rows.ndim == 1 and rows.shape == columns.shape == values.shape):
+            raise ValueError(f"Expected triplets of one length, got {rows.shape}, {columns.shape}, {values.shape}.")
+        if ((rows < 0) | (rows > columns) | (columns >= len(mean))).any():
+            raise ValueError(f"Expected triplets of the upper triangle of a {len(mean)} x {len(mean)} matrix.")
+        precision = np.zeros((len(mean), len(mean)))
+        precision[rows, columns] = precision[columns, rows] = values
+        return cls(mean, precision, radius)

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 import agents
 from agents.loading import find_ego_kind
-from agents.sb3.saved_ego import load_saved_ego
+from agents.saved_ego import load_saved_ego
 from rare_envs.files import check_ordinary, parse_json_object, replace_file, replace_text
 from rare_envs.make import set_up
 from rare_envs.problem import DrivingProblem

@@ -14,8 +14,7 @@ from dataclasses import asdict
 from pathlib import Path
 
 from agents.loading import find_ego_kind, strip_prefixes
-from agents.sb3.hub import HUB_PREFIX, find_cached_model
-from agents.sb3.statistics import find_statistics
+from agents.saved_ego import HUB_PREFIX, find_cached_model, find_statistics
 from rare_envs.study.arguments import Question, read_question
 from rare_envs.study.errors import BadInput
 from rare_envs.study.run_folder import RESULT

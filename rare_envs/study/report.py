@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import samplers
-from agents.sb3.saved_ego import SavedEgo
+from agents.saved_ego import SavedEgo
 from rare_envs.distributions.fitted import EventFrequency, FittedDistribution
 from rare_envs.distributions.space import Distribution
 from rare_envs.egos.wrappers import describe_missing_normalisation

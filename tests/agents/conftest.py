@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from agents.learned.networks import FEATURE_SIZE, HEAD_SIZE, Policy, Scaling
-from agents.learned.weight_distribution import WeightDistribution
+from agents.learned.networks import FEATURE_SIZE, HEAD_SIZE, Policy, Scaling, WeightDistribution
 
 
 @pytest.fixture

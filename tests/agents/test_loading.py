@@ -38,7 +38,7 @@ def test_learned_drivers_are_egos_by_name_and_by_file(tmp_path: Path, monkeypatc
     assert isinstance(by_file, LearnedEgo)
     features = torch.randn(3, 2, 51)
     torch.testing.assert_close(by_file.driver.act(features)[0], by_name.driver.act(features)[0])
-    with pytest.raises(FileNotFoundError, match=r"there are own\.safetensors"):
+    with pytest.raises(FileNotFoundError, match=r"in that folder: own\.safetensors"):
         load_ego("owm.safetensors")
     with pytest.raises(ValueError, match=r"algo for a Stable-Baselines3 \.zip only, got 'ppo' for 'mgail'"):
         load_ego("mgail", algo="ppo")
@@ -78,7 +78,7 @@ def test_an_unknown_spec_is_refused(spec: str, message: str) -> None:
         ("eg.zip", "; in that folder: ego.zip."),
         ("policy_of_the_third_training.onnx", "; in that folder: a.onnx, b.onnx, c.onnx."),
         ("there/ego.zip", "there' does not exist."),
-        ("ego.safetensors", "No driver at '{}'."),
+        ("ego.safetensors", "has no .safetensors."),
     ],
 )
 def test_what_stands_beside_a_missing_file_is_named(name: str, hint: str, tmp_path: Path) -> None:

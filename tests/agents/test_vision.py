@@ -9,8 +9,8 @@ import pytest
 import torch
 
 import rare_envs
-from agents import Provenance, load_ego
-from agents.learned.checkpoints import write_file
+from agents import Provenance, load_ego, read_provenance
+from agents.files import write_file
 from agents.vision import (
     HEIGHT,
     LAG,
@@ -20,7 +20,6 @@ from agents.vision import (
     VisionEgo,
     load_vision,
     luma,
-    read_vision_provenance,
     save_vision,
     to_actions,
     update_memory,
@@ -176,7 +175,7 @@ def test_a_network_of_ones_own_is_kept_in_a_file(tmp_path: Path) -> None:
         picture = torch.randint(0, 256, (2, 66, 200, 3), dtype=torch.uint8, generator=torch.Generator().manual_seed(0))
         arguments = picture, luma(picture), torch.tensor([3.0, 20.0])
         torch.testing.assert_close(loaded.network(*arguments), network(*arguments), atol=1e-5, rtol=0.0)
-    assert read_vision_provenance(path) == provenance
+    assert read_provenance(path) == provenance
 
 
 def test_files_of_another_kind_are_refused() -> None:
@@ -197,7 +196,7 @@ def test_a_damaged_or_foreign_network_is_refused(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
     tensors = {name: value.contiguous() for name, value in PilotNet().state_dict().items()}
     form = {"format": 1, "observation": "camera+speed", "picture": [66, 200], "lag": 5}
-    for change, reason in (({"lag": 3}, "has lag 3; this version reads 5"), ({"format": 2}, "has format 2")):
+    for change, reason in (({"lag": 3}, "has lag 3 where this version reads 5"), ({"format": 2}, "has format 2")):
         path = write_file(tmp_path / "other.safetensors", tensors, "vision", {**form, **change})
         with pytest.raises(ValueError, match=reason):
             load_vision(path)

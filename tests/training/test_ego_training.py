@@ -21,7 +21,7 @@ import agents
 import rare_envs
 import training.ego_training
 from agents import SavedEgo, load_ego
-from agents.sb3.saved_ego import load_saved_ego
+from agents.saved_ego import load_saved_ego
 from examples.demo import ENV_ID, random_collision_rate
 from rare_envs import DrivingProblem
 from rare_envs.control.actions import DISCRETE_ACTIONS

@@ -39,8 +39,7 @@ from sklearn.exceptions import ConvergenceWarning
 from torch import Tensor
 
 from agents import LearnedDriver, read_driver, read_provenance, save_driver
-from agents.learned.networks import head_weights
-from agents.learned.weight_distribution import RADIUS, WEIGHT_NAMES, WeightDistribution
+from agents.learned.networks import RADIUS, WEIGHT_NAMES, WeightDistribution, head_weights
 from rare_envs.files import replace_file
 from rare_envs.threads import use_one_thread
 from samplers.problem import FloatArray

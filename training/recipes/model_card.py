@@ -12,7 +12,7 @@ from typing import Annotated, Any
 import typer
 
 from agents import LearnedDriver, Provenance, read_driver, read_provenance
-from agents.vision import holds_vision, read_vision_provenance
+from agents.files import holds_vision
 from rare_envs.files import replace_text
 from training.command_line import run_command
 
@@ -71,7 +71,7 @@ def format_model_card(folder: Path) -> str:
 
 def _vision_sections(path: Path) -> Iterator[str]:
     """Yield the sections on a network that drives by pictures."""
-    provenance = read_vision_provenance(path)
+    provenance = read_provenance(path)
     yield f"## {path.stem}, an ego that sees"
     yield f'{VISION_USE} Load it with `agents.load_ego("{path.stem}")`.'
     yield f"**Data.** {provenance.data} Licence of the file: {provenance.data_licence}."

@@ -271,7 +271,7 @@ def export_ego(
         raise BadInput(f"Expected a file that ends in .onnx, got {str(out)!r}.")
     with output_file(out), as_bad_input(ValueError, OSError):
         from agents.onnx import ACTION_TOLERANCE, export_onnx
-        from agents.sb3.saved_ego import load_saved_ego
+        from agents.saved_ego import load_saved_ego
 
         ego = load_saved_ego(model, algo, trust, stats)
         exported = export_onnx(ego, out)

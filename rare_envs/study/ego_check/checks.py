@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from gymnasium import spaces
 
-from agents.sb3.saved_ego import SavedEgo
+from agents.saved_ego import SavedEgo
 from rare_envs.arrays import AnyArray
 from rare_envs.devices import CAMERA_TILE
 from rare_envs.egos.errors import reason_of

@@ -45,10 +45,10 @@ def check_ego(question: Question, time_limit: float = 30.0) -> list[Finding]:
         ...     print(finding.check, finding.status, finding.found)
         origin fail 'https://example.org/ego.zip' is a remote place
     """
+    from agents.files import report_missing_file
     from agents.loading import EGO_SUFFIXES, EXPECTED_EGO, find_ego_kind, strip_prefixes, suggest_ego
-    from agents.names import report_missing_file
-    from agents.sb3.safe_pickle import TRUST_ADVICE, TRUST_CONSEQUENCE, find_origin_risks
-    from agents.sb3.statistics import find_statistics
+    from agents.safe_pickle import TRUST_ADVICE, TRUST_CONSEQUENCE, find_origin_risks
+    from agents.saved_ego import find_statistics
 
     try:
         find_scenario(question.env_id)

@@ -11,9 +11,9 @@ import torch
 from safetensors import safe_open
 
 from agents import LearnedDriver, Provenance, load_driver, read_driver, read_provenance, save_driver
+from agents.files import SHIPPED_DRIVERS
 from agents.learned.driver import RuleDriver
 from agents.learned.networks import AutoregressiveNoise
-from agents.names import SHIPPED_DRIVERS
 
 PROVENANCE = Provenance(
     kind="mgail",
@@ -120,7 +120,7 @@ def test_a_damaged_file_is_refused(file):
 
 
 def test_a_missing_file_is_named_with_its_neighbours(file):
-    with pytest.raises(FileNotFoundError, match=r"drives\.safetensors.*there are driver\.safetensors"):
+    with pytest.raises(FileNotFoundError, match=r"drives\.safetensors.*in that folder: driver\.safetensors"):
         read_driver(file.with_name("drives.safetensors"))
     with pytest.raises(FileNotFoundError, match="nowhere"):
         read_driver(file.parent / "nowhere" / "driver.safetensors")
@@ -140,10 +140,10 @@ def test_a_missing_file_is_named_with_its_neighbours(file):
         ({"header": {"colour": {"first": [0.9, 1.5], "second": [0.0, 0.0]}}}, "no usable driver.*stationary"),
         ({"header": {"colour": ...}}, "lacks colour"),
         ({"header": {"colour": 0.9}}, "no usable driver"),
-        ({"header": {"format": 2}}, "format 2; this version reads format 1"),
-        ({"header": {"feature_clip": 10.0}}, r"clips features at 10\.0"),
-        ({"header": {"features": ["lane_offset", "speed"]}}, "2 other features.*difference is 'speed' for 'heading'"),
-        ({"header": {"features": None}}, "0 other features"),
+        ({"header": {"format": 2}}, "format 2 where this version reads 1"),
+        ({"header": {"feature_clip": 10.0}}, r"feature_clip 10\.0 where"),
+        ({"header": {"features": ["lane_offset", "speed"]}}, "features 'speed' where this version reads 'heading'"),
+        ({"header": {"features": None}}, "features None where"),
     ],
 )
 def test_what_is_wrong_with_a_file_is_said(file, changes, message):

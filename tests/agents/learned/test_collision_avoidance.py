@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from agents import load_driver, read_driver, read_provenance, save_driver
-from agents.learned.collision_avoidance import LEFT_MARKER_COLUMN, RIGHT_MARKER_COLUMN, CollisionAvoidance
+from agents.learned.rules import LEFT_MARKER_COLUMN, RIGHT_MARKER_COLUMN, CollisionAvoidance
 from rare_envs.sensors.lidar import FEATURES, HEADING_COLUMN, MAX_RANGE
 
 RULE = CollisionAvoidance()
@@ -181,7 +181,7 @@ def test_within_some_room_steering_is_bounded_by_the_way_that_is_left_and_leads_
         features[..., HEADING_COLUMN] = towards * math.asin(across / 20.0)
         room = torch.full((1, 1, 2), MAX_RANGE, dtype=torch.float64)
         room[..., side] = distance
-        bounds = RULE.greatest_yaw_rates_within(features, room)
+        bounds = RULE.bound_yaw_rates_within(features, room)
         assert bounds[side].item() == pytest.approx((distance / 0.6 - across) / (0.2 * 20.0))
         assert bounds[1 - side].item() > 40.0  # no bound
-    assert RULE.greatest_yaw_rates_within(seen(speed=0.0), torch.zeros(1, 1, 2))[0].item() == 0.0
+    assert RULE.bound_yaw_rates_within(seen(speed=0.0), torch.zeros(1, 1, 2))[0].item() == 0.0

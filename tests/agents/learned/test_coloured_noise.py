@@ -5,9 +5,9 @@ import math
 import pytest
 import torch
 
-from agents.learned.networks import AutoregressiveNoise
+from agents.learned.networks import HUMAN_NOISE, AutoregressiveNoise
 
-OSCILLATING = AutoregressiveNoise.from_oscillators(frequency=(1.70, 1.57), damping=(0.845, 0.40))
+OSCILLATING = HUMAN_NOISE
 
 
 def sequence(colour, ticks, n=100_000, seed=0):

@@ -5,9 +5,8 @@ import pytest
 import torch
 
 from agents import LearnedDriver
-from agents.learned.driver import replace_head
-from agents.learned.networks import HEAD_SIZE, AutoregressiveNoise, head_weights
-from agents.learned.weight_distribution import WeightDistribution
+from agents.learned.networks import HEAD_SIZE, AutoregressiveNoise, WeightDistribution, head_weights
+from tests.agents.learned.heads import replace_head
 
 
 @pytest.fixture
@@ -132,12 +131,3 @@ def test_arrays_in_place_of_tensors_are_refused(driver, name):
 def test_impossible_drivers_are_refused(policy, change, message):
     with pytest.raises(ValueError, match=message):
         LearnedDriver(policy, **change)
-
-
-def test_other_weights_leave_the_network_as_it_was(policy):
-    before = head_weights(policy)
-    changed = replace_head(policy, before + 1.0)
-    torch.testing.assert_close(head_weights(policy), before, atol=0.0, rtol=0.0)
-    torch.testing.assert_close(head_weights(changed), before + 1.0, atol=0.0, rtol=0.0)
-    with pytest.raises(ValueError, match="404"):
-        replace_head(policy, before[:-1])

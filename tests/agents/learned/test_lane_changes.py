@@ -7,7 +7,7 @@ import torch
 
 from agents import load_driver, read_driver, read_provenance, save_driver
 from agents.learned.driver import EASED_BEYOND
-from agents.learned.lane_changes import (
+from agents.learned.rules import (
     LEFT_MARKER_COLUMN,
     RIGHT_MARKER_COLUMN,
     STATE_SIZE,

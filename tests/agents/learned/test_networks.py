@@ -4,18 +4,18 @@ import numpy as np
 import pytest
 import torch
 
-from agents.learned.driver import replace_head
 from agents.learned.networks import (
     ACTION_SIZE,
     FEATURE_CLIP,
     FEATURE_SIZE,
     HEAD_SIZE,
     HIDDEN_SIZES,
+    WEIGHT_NAMES,
     Policy,
     apply_heads,
     head_weights,
 )
-from agents.learned.weight_distribution import WEIGHT_NAMES
+from tests.agents.learned.heads import replace_head
 
 
 def test_the_last_layer_has_404_weights(policy):

@@ -15,8 +15,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from agents import load_ego
 from agents.loading import find_ego_kind
-from agents.sb3.hub import HubName, find_cached_model, find_hub_cache, find_hub_model
-from agents.sb3.saved_ego import SavedEgo
+from agents.saved_ego import SavedEgo, find_cached_model, find_hub_cache, find_hub_model
 from rare_envs.study.journal import find_named_files
 
 NAME, COMMIT = "hf:somebody/ppo-Pendulum-v1", "0123abc"
@@ -153,7 +152,7 @@ def test_a_download_that_fails_is_one_line(monkeypatch: pytest.MonkeyPatch) -> N
 @pytest.mark.parametrize("text", ["hf:somebody", "hf:../x/y", "hf:a/b/../c.zip", "hf:a/b@../c", "hf:a/b/c.pkl"])
 def test_a_name_of_another_form_is_refused(text: str) -> None:
     with pytest.raises(ValueError, match="Expected hf:USER/REPOSITORY"):
-        HubName.read(text)
+        find_cached_model(text)
 
 
 def test_several_models_need_a_file(cache: Path, files: Path) -> None:

@@ -18,7 +18,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 import rare_envs
 from agents import SavedEgo, load_ego
-from agents.sb3.statistics import describe_missing_statistics, find_statistics
+from agents.saved_ego import describe_missing_statistics, find_statistics
 from rare_envs.egos.needs import MissingStatistics
 
 ENV = "rare_envs/CarFollowing-v0"

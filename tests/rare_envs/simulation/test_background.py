@@ -4,7 +4,7 @@ import pytest
 import torch
 
 import agents
-from agents.names import LANE_CHANGING, RULE_BASED, SHIPPED_DRIVERS
+from agents.files import LANE_CHANGING, RULE_BASED, SHIPPED_DRIVERS
 from rare_envs.control.lane_changing import LaneChangingDriver
 from rare_envs.devices import fixed_draws
 from rare_envs.simulation.background import (

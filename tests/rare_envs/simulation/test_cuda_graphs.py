@@ -8,7 +8,7 @@ import pytest
 import torch
 
 import agents
-from agents.learned import CollisionAvoidance
+from agents.learned.rules import CollisionAvoidance
 from rare_envs.control.idm import IDM
 from rare_envs.control.lane_changing import LaneChangingDriver
 from rare_envs.egos.policy import as_driver

@@ -7,8 +7,7 @@ import pytest
 import torch
 
 from agents import read_driver, read_provenance
-from agents.learned.networks import HEAD_SIZE, head_weights
-from agents.learned.weight_distribution import WEIGHT_NAMES, WeightDistribution
+from agents.learned.networks import HEAD_SIZE, WEIGHT_NAMES, WeightDistribution, head_weights
 from tests.training.imitation.synthetic_scenes import scenes, tiny
 from training.imitation import weights as module
 from training.imitation.config import Config
@@ -134,7 +133,7 @@ def test_it_finds_the_dependences_and_predicts_new_members(truth, rng):
     assert (beside > 0.05).all()
     assert 0.0 < fit.metadata["nonzeros"] < 0.8
     new = truth.sample(2_000, rng)
-    alone = WeightDistribution(fit.distribution.mean, np.diag(1 / fit.distribution.std**2))
+    alone = WeightDistribution(fit.distribution.mean, np.diag(1 / np.diag(fit.distribution.covariance)))
     gain = fit.distribution.log_prob(new) - alone.log_prob(new)
     assert gain.mean() > 5 * gain.std() / np.sqrt(len(new))
 
@@ -143,7 +142,7 @@ def test_means_and_spreads_are_those_of_the_members(truth, rng):
     members = truth.sample(40, rng)
     fit = fit_weights(members, names=NAMES, radius=0.02)
     np.testing.assert_allclose(fit.distribution.mean, members.mean(axis=0), rtol=1e-12)
-    np.testing.assert_allclose(fit.distribution.std, members.std(axis=0, ddof=1), rtol=0.02)
+    np.testing.assert_allclose(np.sqrt(np.diag(fit.distribution.covariance)), members.std(axis=0, ddof=1), rtol=0.02)
     assert fit.distribution.radius == 0.02
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections import Counter
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -15,8 +16,6 @@ import torch
 import agents
 import rare_envs
 from agents import LearnedDriver, LearnedEgo
-from agents.learned.driver import replace_head
-from agents.learned.networks import HEAD_SIZE
 from agents.vision import to_actions
 from rare_envs.control.actions import to_physical
 from rare_envs.control.idm import IDM
@@ -184,7 +183,10 @@ def ego() -> LearnedDriver:
 @pytest.fixture
 def coasting(ego: LearnedDriver) -> LearnedDriver:
     """An ego that hardly accelerates, brakes or steers, whatever it sees."""
-    return replace(ego, policy=replace_head(ego.policy, torch.zeros(HEAD_SIZE)))
+    policy = copy.deepcopy(ego.policy)
+    for weights in policy.head.parameters():
+        weights.data.zero_()
+    return replace(ego, policy=policy)
 
 
 def test_labels_are_the_teachers_but_for_harder_braking(coasting: LearnedDriver) -> None:

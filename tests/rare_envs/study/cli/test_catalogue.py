@@ -46,5 +46,5 @@ def test_list_shows_what_there_is(cli: Cli) -> None:
     assert {"highway-v0", "merge-v0", "intersection-v0", "roundabout-v0"} <= set(entries["highway_env"])
     assert "speed (6 values)" in shown
     assert "weights (404 values), noise (1,020 values)" in " ".join(shown.split())
-    for name in (*agents.names.SHIPPED_DRIVERS, "okelly2018", "lidar_ttc"):
+    for name in (*agents.files.SHIPPED_DRIVERS, "okelly2018", "lidar_ttc"):
         assert name in shown

@@ -2,7 +2,7 @@
 
 The archive has a member `data`: JSON with simple values as they are and other values as
 `{":type:": ..., "__module__": ..., ":serialized:": <pickle>}`, and members `*.pth` with tensors. Names of settings and
-the policy's module are enough to tell the algorithms apart. The pickles are opened by `agents.sb3.safe_pickle`, the
+the policy's module are enough to tell the algorithms apart. The pickles are opened by `agents.safe_pickle`, the
 tensors by torch's own reader of weights; what they hold goes to Stable-Baselines3 in a new archive of our own. The file
 also says how large the networks are, and Stable-Baselines3 builds them before it compares them with the tensors, so a
 network of more numbers than the file holds is refused as it is built.
@@ -28,18 +28,18 @@ from gymnasium import spaces
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from agents.sb3.safe_pickle import ForbiddenObject, open_pickle, require
+from agents.safe_pickle import ForbiddenObject, open_pickle, require
 from rare_envs.plugins import did_you_mean
 
-CORE_ALGORITHMS = ("ppo", "a2c", "sac", "td3", "ddpg", "dqn")  # in stable_baselines3
-CONTRIB_CLASSES = {  # in sb3_contrib, an optional package: name -> class
-    "recurrent_ppo": "RecurrentPPO",
-    "maskable_ppo": "MaskablePPO",
-    "trpo": "TRPO",
-    "tqc": "TQC",
-    "qrdqn": "QRDQN",
-    "crossq": "CrossQ",
-    "ars": "ARS",
+ALGORITHMS = {  # name -> package and class; sb3_contrib is optional
+    **{name: ("stable_baselines3", name.upper()) for name in ("ppo", "a2c", "sac", "td3", "ddpg", "dqn")},
+    "recurrent_ppo": ("sb3_contrib", "RecurrentPPO"),
+    "maskable_ppo": ("sb3_contrib", "MaskablePPO"),
+    "trpo": ("sb3_contrib", "TRPO"),
+    "tqc": ("sb3_contrib", "TQC"),
+    "qrdqn": ("sb3_contrib", "QRDQN"),
+    "crossq": ("sb3_contrib", "CrossQ"),
+    "ars": ("sb3_contrib", "ARS"),
 }
 POLICY_MODULES = {  # start of the policy's module -> algorithm; "common" policies serve several
     "stable_baselines3.sac.": "sac",
@@ -64,21 +64,6 @@ SETTINGS_OF_ALGORITHM = {  # a setting that only this algorithm has; the first t
     "exploration_initial_eps": "dqn",
     "gae_lambda": "a2c",  # on-policy, and none of the above: A2C with RMSprop or Adam
 }
-TRAINING_STUBS: Mapping[str, Any] = {
-    **dict.fromkeys(("seed", "lr_schedule", "clip_range_vf", "exploration_schedule", "delta_std_schedule", "weights")),
-    **dict.fromkeys(("action_noise", "replay_buffer_class", "rollout_buffer_class", "ep_info_buffer")),
-    **dict.fromkeys(("ep_success_buffer", "_last_obs", "_last_episode_starts", "_last_original_obs")),
-    "_last_lstm_states": None,
-    "learning_rate": 0.0,
-    "clip_range": 0.0,
-    "n_envs": 1,
-    "n_steps": 1,
-    "train_freq": 1,
-    "buffer_size": 1,
-    "optimize_memory_usage": False,
-}
-"""Stand-ins for the entries that only training needs: those pickles break between versions of Python, a replay buffer
-would allocate its full memory, and a seed would reset the global generators. Entries that a model lacks are ignored."""
 MAX_UNPACKED, MAX_RATIO = 64 * 2**20, 20
 """Bytes that any archive may unpack to, and the factor by which a larger one may grow: Stable-Baselines3 stores its
 members uncompressed, so 20 refuses no policy."""
@@ -104,17 +89,9 @@ class ArchiveTooLarge(ValueError):
 
 
 def read_header(file: Path | BinaryIO, name: str | None = None) -> dict[str, Any]:
-    """Read the settings of a saved model without opening its pickles.
+    """Return the settings of a saved model, their pickles closed, and "version" (of Stable-Baselines3).
 
-    Args:
-        file: A file that exists, or its content.
-        name: Its name in messages; the path when None.
-
-    Returns:
-        The entries of the member `data`, and "version" (of Stable-Baselines3).
-
-    Raises:
-        ValueError: The file is not a zip, is damaged, or is not a model of Stable-Baselines3.
+    The file exists, or is its content; its name in messages is the path when None.
     """
     name = str(file) if name is None else name
     if not zipfile.is_zipfile(file):
@@ -157,18 +134,7 @@ def _parse_settings(content: bytes, name: str) -> Any:
 
 
 def find_algorithm(header: Mapping[str, Any], path: Path) -> str:
-    """Return the name of the algorithm of a saved model.
-
-    Args:
-        header: From `read_header`.
-        path: The file, for messages.
-
-    Returns:
-        One of `CORE_ALGORITHMS` or `CONTRIB_CLASSES`.
-
-    Raises:
-        ValueError: No algorithm fits.
-    """
+    """Return the name of the algorithm of a saved model, one of `ALGORITHMS`, from its settings."""
     policy = header.get("policy_class")
     module = str(policy.get("__module__", "")) if isinstance(policy, dict) else ""
     by_module = [name for start, name in POLICY_MODULES.items() if module.startswith(start)]
@@ -177,50 +143,52 @@ def find_algorithm(header: Mapping[str, Any], path: Path) -> str:
         return name
     raise ValueError(
         f"Cannot tell which algorithm saved {str(path)!r} (policy from {module or 'unknown'!r}); "
-        f"name it with algo: {', '.join((*CORE_ALGORITHMS, *CONTRIB_CLASSES))}."
+        f"name it with algo: {', '.join(ALGORITHMS)}."
     )
 
 
 def find_algorithm_class(name: str, path: Path) -> Any:
-    """Return the class of an algorithm, with its `load`.
-
-    Args:
-        name: One of `CORE_ALGORITHMS` or `CONTRIB_CLASSES`.
-        path: The file that needs it, for messages.
-
-    Raises:
-        ValueError: The name is unknown, or its package is not installed.
-    """
-    if name in CORE_ALGORITHMS:
-        return getattr(importlib.import_module("stable_baselines3"), name.upper())  # a class by its name
-    if name in CONTRIB_CLASSES:
-        try:
-            return getattr(importlib.import_module("sb3_contrib"), CONTRIB_CLASSES[name])  # likewise
-        except ImportError as error:
-            raise ValueError(
-                f"{str(path)!r} holds {CONTRIB_CLASSES[name]}, which needs a package that is not "
-                "installed: pip install sb3-contrib."
-            ) from error
-    known = (*CORE_ALGORITHMS, *CONTRIB_CLASSES)
-    raise ValueError(f"Unknown algorithm {name!r}{did_you_mean(name, known)}; expected one of {', '.join(known)}.")
+    """Return the class of an algorithm, with its `load`, for a file."""
+    if name not in ALGORITHMS:
+        hint = did_you_mean(name, ALGORITHMS)
+        raise ValueError(f"Unknown algorithm {name!r}{hint}; expected one of {', '.join(ALGORITHMS)}.")
+    package, kind = ALGORITHMS[name]
+    try:
+        return getattr(importlib.import_module(package), kind)  # a class by its name
+    except ImportError as error:
+        raise ValueError(
+            f"{str(path)!r} holds {kind}, which needs a package that is not installed: pip install sb3-contrib."
+        ) from error
 
 
 def make_training_stubs() -> dict[str, Any]:
-    """Return stand-ins for the entries that only training needs, as `custom_objects` of `load`."""
-    return {**TRAINING_STUBS, "replay_buffer_kwargs": {}, "rollout_buffer_kwargs": {}}
+    """Return stand-ins for the entries that only training needs, as `custom_objects` of `load`.
+
+    Those pickles break between versions of Python, a replay buffer would allocate its full memory, and a seed would
+    reset the global generators. Entries that a model lacks are ignored.
+    """
+    schedules = ("lr_schedule", "clip_range_vf", "exploration_schedule", "delta_std_schedule")
+    buffers = ("replay_buffer_class", "rollout_buffer_class", "ep_info_buffer", "ep_success_buffer")
+    last = ("_last_obs", "_last_episode_starts", "_last_original_obs", "_last_lstm_states")
+    return {
+        **dict.fromkeys(("seed", "action_noise", "weights", *schedules, *buffers, *last)),
+        "learning_rate": 0.0,
+        "clip_range": 0.0,
+        "n_envs": 1,
+        "n_steps": 1,
+        "train_freq": 1,
+        "buffer_size": 1,
+        "optimize_memory_usage": False,
+        "replay_buffer_kwargs": {},
+        "rollout_buffer_kwargs": {},
+    }
 
 
 def build_model(algorithm: Any, content: bytes, name: str) -> Any:
-    """Return the model in a `.zip`, on the CPU.
+    """Return the model of a class in the content of a `.zip`, on the CPU; its name is for messages.
 
-    Args:
-        algorithm: Its class in Stable-Baselines3.
-        content: The file's.
-        name: The file's, for messages.
-
-    Raises:
-        ForbiddenObject: It holds something that may run code, or builds more than it holds.
-        Exception: It is damaged; anything may be raised.
+    `ForbiddenObject` is raised if it holds something that may run code, or builds more than it holds; anything if it is
+    damaged.
     """
     given = make_training_stubs()
     given = {**_open_objects(read_header(io.BytesIO(content), name), set(given)), **given}
@@ -265,12 +233,7 @@ def _rewrite(content: bytes) -> tuple[io.BytesIO, list[Tensor]]:
 
 
 def _read_tensors(content: bytes) -> Any:
-    """Return what a `.pth` member holds: mappings, lists, plain values and tensors that fit into it, on the CPU.
-
-    Raises:
-        ForbiddenObject: It would fill the memory.
-        Exception: It holds something else, or is damaged.
-    """
+    """Return what a `.pth` member holds: mappings, lists, plain values and tensors that fit into it, on the CPU."""
     if not zipfile.is_zipfile(io.BytesIO(content)):
         raise ValueError("its tensors are not in the format of torch 1.6 and later")
     with zipfile.ZipFile(io.BytesIO(content)) as archive:

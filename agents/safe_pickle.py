@@ -14,6 +14,7 @@ import io
 import math
 import os
 import pickle
+import pkgutil
 import re
 import stat
 from collections import OrderedDict
@@ -44,22 +45,18 @@ def find_origin_risks(*files: Path | None) -> list[str]:
     """
     if os.name != "posix":  # others' rights are not in the mode
         return []
-    risks = [risk for file in files if file is not None and file.exists() for risk in _find_risks(file.resolve())]
+    risks = list[str]()
+    for path in (file.resolve() for file in files if file is not None and file.exists()):
+        status = path.stat()
+        if status.st_mode & stat.S_IWOTH:
+            risks.append(f"{str(path)!r} is writable by everybody")
+        for folder in path.parents:
+            mode = folder.stat().st_mode
+            if mode & stat.S_IWOTH and not mode & stat.S_ISVTX:
+                risks.append(f"the folder {str(folder)!r} is writable by everybody")
+            elif mode & stat.S_IWOTH and folder == path.parent and status.st_uid not in (0, os.getuid()):
+                risks.append(f"{str(path)!r} belongs to another user, in a folder to which everybody may add")
     return list(dict.fromkeys(risks))
-
-
-def _find_risks(path: Path) -> list[str]:
-    status = path.stat()
-    risks = [f"{str(path)!r} is writable by everybody"] if status.st_mode & stat.S_IWOTH else []
-    for folder in path.parents:
-        mode = folder.stat().st_mode
-        if not mode & stat.S_IWOTH:
-            continue
-        if not mode & stat.S_ISVTX:
-            risks.append(f"the folder {str(folder)!r} is writable by everybody")
-        elif folder == path.parent and status.st_uid not in (0, os.getuid()):
-            risks.append(f"{str(path)!r} belongs to another user, in a folder to which everybody may add")
-    return risks
 
 
 class ForbiddenObject(pickle.UnpicklingError):
@@ -73,13 +70,7 @@ def require(holds: object, what: str) -> None:
 
 
 def open_pickle(content: bytes) -> Any:
-    """Return the object in a pickle.
-
-    Raises:
-        ForbiddenObject: It names a class or function that is not listed, or takes another step that is not; nothing has
-            been called then.
-        Exception: The pickle is damaged; anything may be raised.
-    """
+    """Return the object in a pickle; raise `ForbiddenObject` before anything unlisted is called."""
     return _RestrictedUnpickler(io.BytesIO(content)).load()
 
 
@@ -94,22 +85,26 @@ _PLAIN_DTYPE = (None, None, None, -1, -1, 0)
 
 
 def _make_dtype(name: Any, *_: Any) -> np.dtype[Any]:
+    """Return the dtype of a name, of numbers."""
     require(isinstance(name, str) and _NUMBERS.fullmatch(name), f"it holds an array of {name!r:.50}, not of numbers")
     dtype: np.dtype[Any] = np.dtype(name, copy=True)
     return dtype
 
 
 def _fill_dtype(dtype: np.dtype[Any], state: Any) -> None:
+    """Give a dtype its byte order."""
     plain = type(state) is tuple and len(state) >= 8 and state[1] in ("<", ">", "=", "|") and state[2:8] == _PLAIN_DTYPE
     require(plain, "it holds a dtype that is not one of numbers")
     dtype.__setstate__((3, state[1], *_PLAIN_DTYPE))  # type: ignore[attr-defined]
 
 
 def _make_array(*_: Any) -> NDArray[Any]:
+    """Return an array that is filled later."""
     return np.empty(0, np.uint8)
 
 
 def _fill_array(array: NDArray[Any], state: Any) -> None:
+    """Fill an empty array with as many bytes as it has."""
     once = not array.size and array.base is None and type(state) is tuple and len(state) == 5
     require(once, "it holds an array twice")
     _, shape, dtype, fortran, content = state
@@ -125,6 +120,7 @@ def _read_buffer(content: Any, dtype: Any, shape: Any, order: Any = "C", axes: A
 
 
 def _make_scalar(dtype: Any, content: Any = None) -> Any:
+    """Return the number in some bytes."""
     require(_fits((), dtype, content), "it holds a strange number")
     return np.frombuffer(content, dtype=dtype)[0]
 
@@ -140,6 +136,7 @@ def _fits(shape: Any, dtype: Any, content: Any) -> bool:
 
 
 def _make_ordered(items: Any = ()) -> OrderedDict[Any, Any]:
+    """Return a mapping of pairs."""
     pairs = isinstance(items, list | tuple) and all(isinstance(one, list | tuple) and len(one) == 2 for one in items)
     require(pairs and all(_is_key(key) for key, _ in items), "it has keys that are no text or numbers")
     return OrderedDict((key, value) for key, value in items)
@@ -202,12 +199,11 @@ class _RestrictedUnpickler(_PythonUnpickler):  # type: ignore[misc]
         module = re.sub(r"^numpy\.core\.", "numpy._core.", module)  # what NumPy 1 called it
         if f"{module}.{name}" in CALLED:
             return CALLED[f"{module}.{name}"]
-        for table in (REFERRED_BASES, MADE_BASES):
-            for package, bases in table.items():
-                if "." not in name and f"{module}.".startswith(f"{package}."):
-                    named = getattr(importlib.import_module(module), name, None)  # pickles name what they need
-                    if _is_subclass(named, bases):
-                        return named
+        for package, bases in (*REFERRED_BASES.items(), *MADE_BASES.items()):
+            if "." not in name and f"{module}.".startswith(f"{package}."):
+                named = getattr(importlib.import_module(module), name, None)  # pickles name what they need
+                if _is_subclass(named, bases):
+                    return named
         raise ForbiddenObject(f"it asks for {module}.{name}, which may run code")
 
     def load_reduce(self) -> None:
@@ -220,8 +216,7 @@ class _RestrictedUnpickler(_PythonUnpickler):  # type: ignore[misc]
     def load_newobj(self) -> None:
         """NEWOBJ: make an empty object."""
         arguments, cls = self.stack.pop(), self.stack[-1]
-        listed = any(_is_subclass(cls, bases) for bases in MADE_BASES.values())
-        if listed and arguments == ():
+        if arguments == () and any(_is_subclass(cls, bases) for bases in MADE_BASES.values()):
             self.stack[-1] = cls.__new__(cls)
         else:
             self.stack.append(arguments)
@@ -250,9 +245,8 @@ def _check_keys(load: Callable[..., None], keys: slice) -> Callable[..., None]:
 def _is_key(value: object) -> bool:
     """Return whether a value is a text, a number, or a short tuple of such, which are quick to hash."""
     plain = str | bytes | int | float | None
-    return isinstance(value, plain) or (
-        type(value) is tuple and len(value) <= MAX_AXES and all(isinstance(one, plain) for one in value)
-    )
+    short = type(value) is tuple and len(value) <= MAX_AXES and all(isinstance(one, plain) for one in value)
+    return isinstance(value, plain) or short
 
 
 _STEPS = _RestrictedUnpickler.dispatch
@@ -291,10 +285,5 @@ def _fill(value: Any, state: Any) -> None:
 
 
 def _is_subclass(value: Any, bases: tuple[str, ...]) -> bool:
-    return isinstance(value, type) and issubclass(value, tuple(map(_import_class, bases)))
-
-
-def _import_class(path: str) -> type:
-    module, _, name = path.rpartition(".")
-    imported: type = getattr(importlib.import_module(module), name)  # of the tables, imported when needed
-    return imported
+    """Return whether a value is a class below one of some classes, which are imported when needed."""
+    return isinstance(value, type) and issubclass(value, tuple(map(pkgutil.resolve_name, bases)))

@@ -1,0 +1,218 @@
+"""Egos and drivers by name: the names, settings in them, and safetensors files with a header of JSON.
+
+A file holds the tensors of a network, and in its header one entry, "driver" or "vision", with everything else that
+decides how it drives and where it comes from. Reading a file runs no code in it.
+"""
+
+from __future__ import annotations
+
+import difflib
+import json
+import math
+import reprlib
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field, fields
+from itertools import zip_longest
+from os import PathLike
+from pathlib import Path
+from typing import Any, TypeVar
+from urllib.parse import parse_qsl
+
+import safetensors.torch
+import torch
+from safetensors import SafetensorError, safe_open
+from torch import Tensor, nn
+
+from rare_envs.files import parse_json_object, replace_file
+from rare_envs.plugins import did_you_mean
+
+RULE_BASED = "idm"
+"""The Intelligent Driver Model with lane keeping."""
+LANE_CHANGING = "idm+mobil"
+"""The same with lane changes by MOBIL; a driver of the traffic."""
+HUMAN = "human"
+"""An attentive human driver by a published model."""
+VISION = "vision"
+"""The shipped ego with a camera."""
+SHIPPED_EGOS = ("imitation",)
+"""Shipped drivers that were trained to be egos: by their mean actions they keep lane and distance, see docs/egos.md."""
+SHIPPED_DRIVERS = ("mgail", "gail")
+"""Shipped drivers of the traffic."""
+SHIPPED = Path(__file__).parent / "data"
+"""Folder of the shipped files."""
+SUFFIX = ".safetensors"
+DRIVER_ENTRY, VISION_ENTRY = "driver", "vision"
+"""A header's one entry: several would be written in no fixed order, and equal drivers not as equal bytes."""
+
+Network = TypeVar("Network", bound=nn.Module)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Provenance:
+    """Origin of a driver: data, training and measured quality.
+
+    Example:
+        >>> Provenance(kind="gail", command="python train.py", data="own recordings", data_licence="CC0").metrics
+        {}
+    """
+
+    kind: str
+    """Training method, such as "mgail"."""
+    command: str
+    """Command that repeats the training."""
+    data: str
+    """Recordings that it was trained on."""
+    data_licence: str
+    """Of the data; the driver is passed on under its terms."""
+    metrics: Mapping[str, Any] = field(default_factory=dict)
+    """Measured quality: names to numbers, or to names and numbers."""
+    ensemble: Mapping[str, Any] = field(default_factory=dict)
+    """Settings of the fit of the distribution of its weights."""
+
+
+def read_settings(kind: type, query: str) -> dict[str, Any]:
+    """Return numbers for fields of a dataclass from "name=value&name=value"; of true or false, from 1 or 0."""
+    known = {each.name: type(each.default) for each in fields(kind) if isinstance(each.default, int | float)}
+    given: dict[str, Any] = {}
+    for name, text in parse_qsl(query, keep_blank_values=True):
+        if name not in known:
+            raise ValueError(f"Unknown setting {name!r}{did_you_mean(name, known)}; expected {', '.join(known)}.")
+        if name in given:
+            raise ValueError(f"Expected {name} once, got it again as {text!r}.")
+        given[name] = _read_number(name, text, known[name])
+    return given
+
+
+def _read_number(name: str, text: str, kind: type) -> Any:
+    """Return a value of a field as what its default is: a float, a whole number, true or false."""
+    try:
+        value = float(text)
+    except ValueError:
+        raise ValueError(f"Expected {name} to be a number, got {text!r}.") from None
+    if not math.isfinite(value) or value < 0 or (kind is not float and value != int(value)):
+        raise ValueError(f"Expected {name} to be a {'finite' if kind is float else 'whole'} number >= 0, got {text!r}.")
+    if kind is bool and value not in (0.0, 1.0):
+        raise ValueError(f"Expected {name} to be 1 (yes) or 0 (no), got {text!r}.")
+    return kind(value)
+
+
+def report_missing_file(path: Path, what: str = "ego") -> FileNotFoundError:
+    """Return the error for a file that does not exist, with files that a mistyped path may have meant."""
+    names = sorted(entry.name for entry in path.parent.glob(f"*{path.suffix}"))
+    near = difflib.get_close_matches(path.name, names, n=3, cutoff=0.5) or names[:3]
+    if not path.parent.is_dir():
+        hint = f": the folder {str(path.parent)!r} does not exist"
+    elif not near:
+        hint = f": the folder {str(path.parent)!r} has no {path.suffix}"
+    else:
+        hint = f"; in that folder: {', '.join(near)}"
+    return FileNotFoundError(f"No {what} at {str(path)!r}{hint}.")
+
+
+# --- safetensors ---------------------------------------------------------------------------------
+
+
+def write_file(path: Path, tensors: Mapping[str, Tensor], entry: str, header: Mapping[str, Any]) -> Path:
+    """Write tensors and a header of an entry to a .safetensors; an interrupted call leaves no partial file."""
+    if path.suffix != SUFFIX:
+        raise ValueError(f"Expected a path that ends with {SUFFIX}, got {str(path)!r}.")
+    _check_finite(tensors, path)
+    kept = {name: value.detach().cpu().contiguous() for name, value in tensors.items()}
+    content = safetensors.torch.save(kept, {entry: json.dumps(header, allow_nan=False)})
+    with replace_file(path) as draft:
+        draft.write_bytes(content)
+    return path
+
+
+def read_file(path: Path, *entries: str) -> tuple[dict[str, Any], dict[str, Tensor]]:
+    """Return the header of the first of some entries that a file has, and its tensors."""
+    if not path.is_file():
+        raise report_missing_file(path, entries[0])
+    try:
+        with safe_open(path, framework="pt") as file:
+            header = file.metadata() or {}
+            tensors = {name: file.get_tensor(name) for name in file.keys()}
+    except (SafetensorError, OSError) as error:
+        with path.open("rb") as raw:
+            zipped = raw.read(2) == b"PK"
+        pickled = " It looks like a file of torch.save; such files can run code and are not read." * zipped
+        raise ValueError(f"{str(path)!r} is not a safetensors file, or is damaged: {error}.{pickled}") from None
+    texts = [header[entry] for entry in entries if entry in header]
+    if not texts:
+        raise ValueError(f"{str(path)!r} holds tensors but no {entries[0]}: save drivers with agents.save_driver.")
+    _check_finite(tensors, path)
+    return parse_json_object(texts[0], f"The header of {str(path)!r}"), tensors
+
+
+def holds_vision(path: str | PathLike[str]) -> bool:
+    """Return whether a file holds a network with a camera; False if it cannot be read."""
+    try:
+        with safe_open(path, framework="pt") as file:
+            return VISION_ENTRY in (file.metadata() or {})
+    except (SafetensorError, OSError):
+        return False
+
+
+def read_provenance(path: str | PathLike[str]) -> Provenance:
+    """Read the origin of a driver, or of a network with a camera.
+
+    Raises:
+        FileNotFoundError: There is no such file.
+        ValueError: It holds neither, or does not say.
+
+    Example:
+        >>> from importlib import resources
+        >>> read_provenance(resources.files("agents") / "data" / "gail.safetensors").kind
+        'gail'
+    """
+    path = Path(path)
+    header, _ = read_file(path, DRIVER_ENTRY, VISION_ENTRY)
+    names = [each.name for each in fields(Provenance)]
+    require(header, names, path)
+    return Provenance(**{name: header[name] for name in names})
+
+
+def check_form(header: Mapping[str, Any], form: Mapping[str, Any], path: Path) -> None:
+    """Refuse a file that was made for another form: other features, other pictures, a later version."""
+    require(header, form, path)
+    for name, ours in form.items():
+        theirs = header[name]
+        if theirs != ours:
+            if isinstance(theirs, list) and isinstance(ours, list):
+                theirs, ours = next((a, b) for a, b in zip_longest(theirs, ours) if a != b)
+            told = f"{name} {reprlib.repr(theirs)} where this version reads {reprlib.repr(ours)}"
+            raise ValueError(f"{str(path)!r} has {told}.")
+
+
+def read_network(make: Callable[[], Network], tensors: Mapping[str, Tensor], path: Path, prefix: str = "") -> Network:
+    """Return a network with the tensors of a file that begin with a prefix, on the CPU and without gradients."""
+    with torch.device("meta"):  # shapes only: initial weights would be drawn from the global generator
+        network = make()
+    expected = {prefix + name: value for name, value in network.state_dict().items()}
+    require(tensors, expected, path)
+    for name, value in expected.items():
+        check_tensor(name, tensors[name], tuple(value.shape), torch.float32, path)
+    network.load_state_dict({name.removeprefix(prefix): tensors[name] for name in expected}, assign=True)
+    return network.eval().requires_grad_(False)
+
+
+def require(present: Mapping[str, Any], names: Iterable[str], path: Path) -> None:
+    """Refuse a file that lacks one of the names."""
+    missing = [name for name in names if name not in present]
+    if missing:
+        raise ValueError(f"{str(path)!r} lacks {', '.join(missing)}; save the driver again with agents.save_driver.")
+
+
+def check_tensor(name: str, value: Tensor, shape: tuple[int, ...], dtype: torch.dtype, path: Path) -> None:
+    """Refuse a tensor of another shape or type."""
+    if tuple(value.shape) != shape or value.dtype != dtype:
+        raise ValueError(
+            f"{str(path)!r}: expected {name} of shape {shape} and {dtype}, got {tuple(value.shape)} and {value.dtype}."
+        )
+
+
+def _check_finite(tensors: Mapping[str, Tensor], path: Path) -> None:
+    """Refuse tensors with NaN or infinite entries."""
+    wrong = [name for name, value in tensors.items() if not bool(torch.isfinite(value).all())]
+    if wrong:
+        raise ValueError(f"{str(path)!r}: expected finite numbers, got inf or NaN in {', '.join(wrong)}.")

@@ -1,0 +1,418 @@
+"""Policies saved by Stable-Baselines3: a `.zip`, in a folder or on the Hugging Face Hub, and the statistics beside it.
+
+Both hold pickles. They are opened by `agents.safe_pickle`, so that a file from somewhere else cannot run code. One
+that needs classes of its author's own is opened as Stable-Baselines3 does, and only if the caller trusts it.
+"""
+
+from __future__ import annotations
+
+import base64
+import io
+import os
+import pickle
+import re
+import warnings
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from agents.files import report_missing_file
+from agents.safe_pickle import TRUST, TRUST_ADVICE, ForbiddenObject, find_origin_risks, open_pickle
+from agents.sb3_archive import build_model, find_algorithm, find_algorithm_class, make_training_stubs, read_header
+from rare_envs.egos.wrappers import UNBOUNDED, FrameStackedPolicy, NormalisedPolicy, find_stacking
+from rare_envs.plugins import one_line
+
+HUB_PREFIX = "hf:"
+"""Beginning of the names of policies of the Hub."""
+_HUB_NAME = re.compile(r"hf:([\w-][\w.-]*)/([\w-][\w.-]*)(?:/([\w-][\w.-]*\.zip))?(?:@([\w-][\w.-]*))?")
+_NOT_MODELS = ("train_eval_metrics.zip", "replay.zip")
+"""Files that RL Zoo puts beside a model."""
+_MAX_STATISTICS = 64 * 2**20
+"""Largest file of statistics [bytes]."""
+_NAMES = ("vecnormalize", "vec_normalize")
+"""Names of files of statistics: Stable-Baselines3's callbacks and RL Zoo write the first, its examples the second."""
+_BEYOND = 1e-3
+"""Observations beyond the bounds by less are rounding."""
+_STEP = 0.5
+"""A change of the observations of ordinary environments in one step is smaller; `VecNormalize` moves some by more."""
+_MIN_ROWS, _SPREAD, _CENTRE = 16, (0.3, 3.0), 1.5
+"""From so many rows on, a standard deviation in this range and a mean of at most so much in every column are those of
+normalised observations: some of the environment's own vary by far less."""
+
+
+@dataclass(frozen=True)
+class SavedEgo:
+    """A Stable-Baselines3 policy read from a file, with its observation statistics if it has any.
+
+    Example:
+        >>> import tempfile
+        >>> from stable_baselines3 import PPO
+        >>> from agents import load_ego
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     PPO("MlpPolicy", "Pendulum-v1", n_steps=8, batch_size=8, device="cpu").save(f"{folder}/ego.zip")
+        ...     ego = load_ego(f"{folder}/ego.zip")
+        >>> ego.algorithm, ego.observation_space.shape, ego.statistics
+        ('ppo', (3,), None)
+        >>> ego.predict(np.zeros((5, 3), np.float32))[0].shape
+        (5, 1)
+    """
+
+    model: Any
+    """The Stable-Baselines3 algorithm, on the CPU."""
+    algorithm: str
+    """Its name, such as "ppo"."""
+    path: Path
+    """The `.zip`."""
+    statistics: Any = None
+    """Its `VecNormalize` statistics, or None; observations pass through them first."""
+    statistics_path: Path | None = None
+    """The file of the statistics, or None."""
+    header: Mapping[str, Any] = field(default_factory=dict, repr=False)
+    """Settings of the file, their pickles closed."""
+
+    @property
+    def observation_space(self) -> Any:
+        """Observations of the policy; those of single frames if they were normalised one by one."""
+        return self.model.observation_space if self.frames is None else self.statistics.observation_space
+
+    @property
+    def action_space(self) -> Any:
+        """The action space that the policy was trained on."""
+        return self.model.action_space
+
+    @property
+    def frames(self) -> tuple[int, bool] | None:
+        """Frames stacked behind `VecNormalize`, as `rare_envs.egos.wrappers.find_stacking` says; None without."""
+        if self.statistics is None or self.statistics.observation_space.shape == self.model.observation_space.shape:
+            return None
+        return find_stacking(self.statistics.observation_space.shape, self.model.observation_space.shape)
+
+    @cached_property
+    def policy(self) -> Any:
+        """The model behind its statistics and stacks."""
+        policy = self.model if self.frames is None else FrameStackedPolicy(self.model, *self.frames)
+        return policy if self.statistics is None else NormalisedPolicy(policy, self.statistics.normalize_obs)
+
+    @property
+    def same_as(self) -> Any:
+        """A policy that acts as it does; compiled rollouts read its network."""
+        return self.policy
+
+    def find_missing_statistics(self, expected: Any) -> str:
+        """Return why it seems to have been trained on normalised observations, if it has no statistics; "" if not.
+
+        Args:
+            expected: Space of the environment's observations.
+        """
+        if self.statistics is not None:
+            return ""
+        last = _open_observation(self.header, "_last_obs")
+        return describe_missing_statistics(self.header, last, self.model.observation_space, expected)
+
+    def predict(
+        self,
+        observation: Any,
+        state: Any = None,
+        episode_start: NDArray[np.bool_] | None = None,
+        deterministic: bool = True,
+    ) -> tuple[NDArray[Any], Any]:
+        """Choose an action for each row of a batch; see `agents.Ego.predict`."""
+        actions, state = self.policy.predict(observation, state, episode_start, deterministic)
+        return actions, state
+
+
+def load_saved_ego(path: Path, algo: str | None, trust: bool = False, stats: str | Path | None = None) -> SavedEgo:
+    """Return the policy of a `.zip`; arguments as of `agents.load_ego`.
+
+    Without trust it is refused because of its content, or because other users may write to it or its statistics.
+    """
+    if not path.exists():
+        raise report_missing_file(path)
+    if not path.is_file():
+        raise ValueError(f"Expected a Stable-Baselines3 .zip, got the folder {str(path)!r}.")
+    statistics_path = find_statistics(path) if stats is None else Path(stats)
+    if statistics_path is not None and not statistics_path.is_file():
+        raise FileNotFoundError(f"No VecNormalize statistics at {str(statistics_path)!r}.")
+    if not trust and (risks := find_origin_risks(path, statistics_path)):
+        raise ValueError(f"Will not open it: {'; '.join(risks)}; {TRUST_ADVICE}.")
+    header = read_header(path)
+    name = algo.lower() if algo is not None else find_algorithm(header, path)
+    model = _load_model(name, header, path, trust)
+    statistics = None if statistics_path is None else load_statistics(statistics_path, model.observation_space, trust)
+    return SavedEgo(model, name, path, statistics, statistics_path, header)
+
+
+def _load_model(name: str, header: Mapping[str, Any], path: Path, trust: bool) -> Any:
+    """Return the model of an algorithm with the weights of a file."""
+    algorithm = find_algorithm_class(name, path)
+    try:
+        content = path.read_bytes()  # once, so that what is loaded is what was looked at
+        if not trust:
+            return build_model(algorithm, content, str(path))
+        return algorithm.load(io.BytesIO(content), device="cpu", custom_objects=make_training_stubs())
+    except ForbiddenObject as error:
+        raise ValueError(f"Will not load {str(path)!r}: {error}; {TRUST}.") from error
+    except Exception as error:  # a damaged or foreign pickle can raise anything at all
+        raise ValueError(
+            f"Cannot load {str(path)!r} as {name.upper()} (saved by Stable-Baselines3 {header['version']}): "
+            f"{one_line(error)}. The file is damaged, needs a package that is not installed, or "
+            "holds another algorithm (name it with algo)."
+        ) from error
+
+
+# --- statistics of VecNormalize -------------------------------------------------------------------
+
+
+def find_statistics(path: Path) -> Path | None:
+    """Return the file of the `VecNormalize` statistics of a model, or None."""
+    return next((file for file in _list_places(path) if file.is_file()), None)
+
+
+def _list_places(path: Path) -> Iterator[Path]:
+    """Yield the places where `VecNormalize` statistics of a model are kept, most specific first."""
+    folder, stem = path.parent, path.stem
+    checkpoint = re.fullmatch(r"(.+)_(\d+_steps)", stem)  # Stable-Baselines3's CheckpointCallback
+    run = re.fullmatch(r"(.+)_\d+", folder.resolve().name)  # RL Zoo: Env-v0_1/best_model.zip
+    for name in _NAMES:
+        yield folder / f"{stem}_{name}.pkl"
+        if checkpoint:
+            yield folder / f"{checkpoint[1]}_{name}_{checkpoint[2]}.pkl"
+        yield folder / stem / f"{name}.pkl"  # RL Zoo: Env-v0_1/Env-v0.zip, Env-v0_1/Env-v0/
+        if run:
+            yield folder / run[1] / f"{name}.pkl"
+    for name in _NAMES:
+        yield folder / f"{name}.pkl"
+
+
+def load_statistics(path: Path, observation_space: Any, trust: bool) -> Any:
+    """Return the `VecNormalize` statistics of a file; trust runs whatever code is in it."""
+    from stable_baselines3.common.vec_env import VecNormalize
+
+    what = f"VecNormalize statistics {str(path)!r}"
+    elsewhere = "move the file away if it does not belong to this ego"
+    if path.stat().st_size > _MAX_STATISTICS:
+        raise ValueError(f"{what} are larger than {_MAX_STATISTICS / 2**20:.0f} MiB.")
+    try:
+        content = path.read_bytes()
+        statistics = pickle.loads(content) if trust else open_pickle(content)
+    except ForbiddenObject as error:
+        raise ValueError(f"Will not read the {what}: {error}; {TRUST}.") from error
+    except Exception as error:  # a damaged pickle can raise anything at all
+        raise ValueError(f"Cannot read the {what}: {one_line(error)}. Save them again, or {elsewhere}.") from error
+    if not isinstance(statistics, VecNormalize):
+        kind = type(statistics).__name__
+        raise ValueError(f"Expected VecNormalize statistics in {str(path)!r}, got {kind}; {elsewhere}.")
+    if not _is_whole(vars(statistics)):
+        raise ValueError(f"{what} are damaged; save them again.")
+    theirs, ours = statistics.observation_space.shape or (), observation_space.shape or ()
+    if find_stacking(theirs, ours) is None:
+        raise ValueError(f"{what} are for observations of shape {theirs}, the ego's have {ours}; {elsewhere}.")
+    statistics.training = False
+    return statistics
+
+
+def _is_whole(values: Mapping[str, Any]) -> bool:
+    """Return whether statistics have everything that normalising an observation reads, in the right shapes."""
+    space, normalise, moments = (values.get(name) for name in ("observation_space", "norm_obs", "obs_rms"))
+    numbers = all(isinstance(values.get(name), int | float | np.floating) for name in ("clip_obs", "epsilon"))
+    if not isinstance(space, spaces.Space) or not isinstance(normalise, bool) or not numbers:
+        return False
+    if not normalise:
+        return True
+    if isinstance(space, spaces.Dict):
+        keys = values.get("norm_obs_keys")
+        if not isinstance(moments, dict) or not isinstance(keys, list):
+            return False
+        known = set(keys) <= set(moments) & set(space.spaces)
+        return known and all(_has_moments(moments[key], space[key].shape) for key in keys)
+    return _has_moments(moments, space.shape)
+
+
+def _has_moments(moments: Any, shape: Any) -> bool:
+    """Return whether there are a mean and a variance, not negative, of a shape."""
+    mean, variance = (getattr(moments, name, None) for name in ("mean", "var"))
+    if not isinstance(mean, np.ndarray) or not isinstance(variance, np.ndarray):
+        return False
+    return mean.shape == variance.shape == shape and bool((variance >= 0.0).all())
+
+
+def describe_missing_statistics(header: Mapping[str, Any], last: Any, own: Any, expected: Any) -> str:
+    """Return why a policy without statistics seems to have been trained on normalised observations; "" if nothing does.
+
+    The last observations of its training and the space that it declares are compared with that of its environment.
+    """
+    if _has_original_observations(header, last):
+        return "its file says that it was trained behind VecNormalize"
+    if not isinstance(expected, spaces.Box) or expected.dtype != np.float32 or len(expected.shape) != 1:
+        return ""
+    if isinstance(own, spaces.Box) and np.isinf(own.high).all() and not np.isinf(expected.high).any():
+        return UNBOUNDED
+    if not isinstance(last, np.ndarray) or last.dtype.kind != "f" or last.ndim != 2 or not last.size:
+        return ""
+    furthest = float(last.flat[np.abs(last).argmax()])
+    if not expected.low.min() - _BEYOND <= furthest <= expected.high.max() + _BEYOND:
+        return f"the last observations of its training reach {furthest:.3g}, beyond the bounds of those here"
+    spread, centre = last.std(axis=0), np.abs(last.mean(axis=0))
+    normal = bool(((_SPREAD[0] < spread) & (spread < _SPREAD[1]) & (centre < _CENTRE)).all())
+    if len(last) >= _MIN_ROWS and last.shape[1] > 1 and normal:
+        return "the last observations of its training have mean 0 and spread 1 in every column, or nearly so"
+    return ""
+
+
+def _has_original_observations(header: Mapping[str, Any], last: Any) -> bool:
+    """Return whether a file keeps observations as they were before `VecNormalize`, beside the last ones.
+
+    Algorithms with a replay buffer fill that entry without `VecNormalize` too, by the observations one step earlier,
+    which are of the same scale as the last ones.
+    """
+    name = "_last_original_obs"
+    if header.get(name) is None or "learning_starts" not in header:
+        return header.get(name) is not None
+    original = _open_observation(header, name)
+    if isinstance(original, dict) and isinstance(last, dict):
+        return any(_is_rescaled(last[key], original[key]) for key in original.keys() & last.keys())
+    return _is_rescaled(last, original)
+
+
+def _is_rescaled(last: Any, original: Any) -> bool:
+    """Return whether most rows of `last` are far from those of `original`, in no column equal and other than 0."""
+    if not isinstance(last, np.ndarray) or not isinstance(original, np.ndarray) or last.shape != original.shape:
+        return False
+    if not last.size or last.dtype.kind != "f" or original.dtype.kind != "f":
+        return False
+    before, after = original.reshape(len(original), -1), last.reshape(len(last), -1)
+    kept = ((before == after) & (before != 0.0)).any(axis=1)
+    return bool(np.median(~kept & (np.abs(after - before).max(axis=1) > _STEP)) > 0.5)
+
+
+def _open_observation(header: Mapping[str, Any], name: str) -> Any:
+    """Return the observations in an entry of a file's settings; None where there are none."""
+    entry = header.get(name)
+    try:
+        return open_pickle(base64.b64decode(str(entry[":serialized:"]))) if isinstance(entry, dict) else None
+    except Exception:  # nothing depends on it but a warning
+        return None
+
+
+# --- the Hugging Face Hub -------------------------------------------------------------------------
+#
+# A model with its statistics in the Hub's cache on this machine is taken as it is, without a connection. Whatever else
+# is there may be part of a repository (huggingface_sb3's `load_from_hub` keeps the `.zip` alone): the library
+# huggingface_hub completes it, at the commit that is there, so that a resumed run keeps its ego.
+
+
+class _HubName(NamedTuple):
+    """Place of a policy on the Hub."""
+
+    text: str
+    user: str
+    repository: str
+    file: str | None
+    revision: str
+
+    @classmethod
+    def read(cls, text: str) -> _HubName:
+        """Return the place that "hf:USER/REPOSITORY" stands for."""
+        found = _HUB_NAME.fullmatch(text)
+        if found is None:
+            raise ValueError(
+                f"Expected hf:USER/REPOSITORY, and /FILE.zip or @REVISION behind it if need be, got {text!r}."
+            )
+        user, repository, file, revision = found.groups()
+        return cls(text, user, repository, file, revision or "main")
+
+    def find_snapshot(self) -> Path:
+        """Return the folder of its files in the cache, named by their commit; it need not be there."""
+        folder = find_hub_cache() / f"models--{self.user}--{self.repository}"
+        pointer = folder / "refs" / self.revision
+        commit = pointer.read_text(encoding="utf-8").strip() if pointer.is_file() else self.revision
+        return folder / "snapshots" / commit
+
+    def choose_model(self, snapshot: Path) -> Path:
+        """Return the model of a snapshot: the one that is named, or that has the repository's name, or the only one."""
+        models = _list_models(snapshot)
+        wanted = self.file or f"{self.repository}.zip"
+        if wanted in models:
+            return snapshot / wanted
+        if self.file is None and len(models) == 1:
+            return snapshot / models[0]
+        raise ValueError(
+            f"Expected a model as hf:{self.user}/{self.repository}/FILE.zip for {self.text!r}; its files are "
+            f"{', '.join(models) or 'none'}."
+        )
+
+
+def find_hub_cache() -> Path:
+    """Return the folder of the Hub's cache, which its environment variables name as the library reads them."""
+    if "HF_HUB_CACHE" in os.environ:
+        return Path(os.environ["HF_HUB_CACHE"])
+    home = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "huggingface"
+    return Path(os.environ.get("HF_HOME", home)) / "hub"
+
+
+def _list_models(snapshot: Path) -> list[str]:
+    """Return the names of the models in a folder."""
+    return sorted(path.name for path in snapshot.glob("*.zip") if path.name not in _NOT_MODELS)
+
+
+def find_cached_model(text: str) -> Path | None:
+    """Return the file of a policy "hf:USER/REPOSITORY" in the cache; None if it is not there. Nothing is downloaded."""
+    name = _HubName.read(text)
+    snapshot = name.find_snapshot()
+    models = _list_models(snapshot)
+    there = name.file in models if name.file else bool(models)
+    return name.choose_model(snapshot) if there else None
+
+
+def find_hub_model(text: str) -> Path:
+    """Return the file of a policy "hf:USER/REPOSITORY", downloaded if it or its statistics are not in the cache.
+
+    Without a connection or the library, a model in the cache is taken, with a warning if it has no statistics there.
+    """
+    name = _HubName.read(text)
+    cached = name.find_snapshot()
+    wanted, known = cached / (name.file or f"{name.repository}.zip"), cached.is_dir()
+    if wanted.is_file() and find_statistics(wanted) is not None:
+        return wanted
+    try:
+        import huggingface_hub
+    except ImportError as error:
+        if (model := find_cached_model(text)) is not None:
+            return _doubt_statistics(model, text, "huggingface_hub is not installed (pip install 'rare-envs[hub]')")
+        raise ValueError(
+            f"{text!r} is not in the cache {str(find_hub_cache())!r}; to download it pip install 'rare-envs[hub]', or "
+            "download the .zip yourself and name its path."
+        ) from error
+    place = {"repo_id": f"{name.user}/{name.repository}", "revision": cached.name if known else name.revision}
+    try:
+        kinds = ["*.zip", "*.pkl"]
+        snapshot = huggingface_hub.snapshot_download(**place, allow_patterns=kinds, cache_dir=str(find_hub_cache()))
+    except Exception as error:  # of the connection, of the library, or there is no such repository
+        incomplete = type(error).__name__ == "IncompleteSnapshotError"  # the library knows which files are missing
+        if known and not incomplete and (model := find_cached_model(text)) is not None:
+            return _doubt_statistics(model, text, one_line(error))
+        raise ValueError(f"Cannot download {text!r}: {one_line(error)}") from error
+    model = name.choose_model(Path(snapshot))
+    if known and find_statistics(model) is None:
+        try:  # without a connection the library returns what is there, and does not tell
+            huggingface_hub.file_exists(place["repo_id"], "vec_normalize.pkl", revision=place["revision"])
+        except Exception as error:
+            return _doubt_statistics(model, text, one_line(error))
+    return model
+
+
+def _doubt_statistics(model: Path, text: str, reason: str) -> Path:
+    """Return a model of the cache; warn if it has no statistics, of which the Hub cannot tell for a reason."""
+    if find_statistics(model) is None:
+        warnings.warn(
+            f"{text!r} is taken from the cache, which has no VecNormalize statistics of it, and the Hub cannot tell "
+            f"whether it has any: {reason}. If it was trained behind VecNormalize, its results here are wrong.",
+            stacklevel=3,
+        )
+    return model

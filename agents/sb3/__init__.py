@@ -1,1 +1,0 @@
-"""Saved Stable-Baselines3 policies, and how their files are opened safely."""
