@@ -15,17 +15,8 @@ from rare_envs.simulation.episode import Episode
 from rare_envs.simulation.world import World
 
 PICTURE_KEYS = frozenset(
-    {
-        "screen_width",
-        "screen_height",
-        "centering_position",
-        "scaling",
-        "show_trajectories",
-        "render_agent",
-        "offscreen_rendering",
-        "manual_control",
-        "real_time_rendering",
-    }
+    "screen_width screen_height centering_position scaling show_trajectories render_agent offscreen_rendering "
+    "manual_control real_time_rendering".split()
 )
 """Keys of HighwayEnv's configuration that change neither traffic nor spaces; they are kept, and the picture is ours."""
 FRAME_RATE = "simulation_frequency"

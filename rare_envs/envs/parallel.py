@@ -21,22 +21,81 @@ from rare_envs.envs.rows_and_infos import (
     Info,
     SingleObservation,
     episode_info,
+    mask_infos,
     merge_rows,
-    put_masked,
     step_info,
     to_object_rows,
 )
 from rare_envs.make import set_up
 from rare_envs.multi_agent import MultiAgentEpisode, Reward, own_reward, start, step_agents, total_of
 from rare_envs.plugins import did_you_mean
-from rare_envs.scenarios.base import Scenario
 from rare_envs.sensors.kinds import map_kinds
 from rare_envs.simulation.observation import observe
 
 Actions = Mapping[str, Any]
+FloatArray = NDArray[np.float32]
 
 
-class DrivingParallelEnv(ParallelEnv[str, SingleObservation, NDArray[np.float32]]):  # type: ignore[misc]
+class _SeveralAgents:
+    """World, agents with their rewards, and the ego's driver of an environment of several agents."""
+
+    def _set_up(
+        self, env_id: str, agents: Sequence[str] | None, ego: Any, rewards: Mapping[str, Reward] | None, settings: Any
+    ) -> list[str]:
+        """Take the arguments of an environment, and return the names of its agents."""
+        ego = load_named_ego(ego)
+        needs = resolve(ego)
+        world, self.space = set_up(env_id, EgoNeeds(lidar=needs.lidar), **settings)
+        self.world = world.with_statistics()
+        vehicles = self.world.scenario.vehicle_names
+        names = _select_agents(vehicles, agents)
+        self.rewards = _select_rewards(names, rewards)
+        self._vehicles = {agent: vehicles.index(agent) for agent in names}
+        self._driver = as_driver(ego, self.world, needs)
+        self._episode: MultiAgentEpisode | None = None
+        return names
+
+    def _start(self, x: NDArray[np.float64]) -> MultiAgentEpisode:
+        with torch.inference_mode():
+            return start(self.world, torch.from_numpy(x).float())
+
+    def _nobody(self, batch: int) -> tuple[Tensor, Tensor]:
+        """Return actions of all vehicles, (B, N, 2) or (B, N), and which are commanded, (B, N): none yet."""
+        shape = (batch, self.world.scenario.vehicles)
+        chosen = torch.full(shape, IDLE) if self.world.clock.action == "meta" else torch.zeros(*shape, 2)
+        return chosen, torch.zeros(shape, dtype=torch.bool)
+
+
+def _select_agents(names: tuple[str, ...], agents: Sequence[str] | None) -> list[str]:
+    """Return the agents that an argument `agents` names."""
+    if agents is None:
+        return list(names)
+    if isinstance(agents, str) or not isinstance(agents, Sequence):
+        raise ValueError(f"Expected agents as a list of names, such as ['{names[-1]}'], got {agents!r}.")
+    for agent in agents:
+        if agent not in names:
+            hint = did_you_mean(str(agent), names)
+            raise ValueError(f"There is no vehicle {agent!r}{hint}; the vehicles are {', '.join(names)}.")
+    if not agents or len(set(agents)) < len(agents):
+        raise ValueError(f"Expected one or more different agents, got {list(agents)}.")
+    return list(agents)
+
+
+def _select_rewards(agents: Sequence[str], rewards: Mapping[str, Reward] | None) -> dict[str, Reward]:
+    """Return the reward of each agent."""
+    rewards = {} if rewards is None else rewards
+    if not isinstance(rewards, Mapping):
+        raise ValueError(f"Expected rewards as a mapping of agents to functions of a Transition, got {rewards!r}.")
+    for agent, reward in rewards.items():
+        if agent not in agents:
+            hint = did_you_mean(str(agent), agents)
+            raise ValueError(f"Reward for {agent!r}{hint}, but the agents are {', '.join(agents)}.")
+        if not callable(reward):
+            raise ValueError(f"Expected the reward of {agent!r} as a function of a Transition, got {reward!r}.")
+    return {agent: rewards.get(agent, own_reward) for agent in agents}
+
+
+class DrivingParallelEnv(_SeveralAgents, ParallelEnv[str, SingleObservation, FloatArray]):  # type: ignore[misc]
     """Every vehicle is an agent, or those named; each observes, acts, is rewarded and ends as an ego in its place.
 
     A vehicle without an action keeps its driver: the scenario's script or learned drivers, and for the ego the driver
@@ -80,28 +139,15 @@ class DrivingParallelEnv(ParallelEnv[str, SingleObservation, NDArray[np.float32]
         Raises:
             ValueError: If an argument is invalid.
         """
-        ego = load_named_ego(ego)
-        needs = resolve(ego)
-        world, self.space = set_up(env_id, EgoNeeds(lidar=needs.lidar), **kwargs)
-        self.world = world.with_statistics()
-        scenario = self.world.scenario
-        self.possible_agents = select_agents(scenario, agents)
-        self.rewards = select_rewards(self.possible_agents, rewards)
-        self._driver = as_driver(ego, self.world, needs)
-        self.metadata = {
-            **self.metadata,
-            "name": env_id,
-            "render_fps": self.world.clock.decisions_per_second,
-        }
+        self.possible_agents = self._set_up(env_id, agents, ego, rewards, kwargs)
+        self.metadata = {**self.metadata, "name": env_id, "render_fps": self.world.clock.decisions_per_second}
         self.render_mode = render_mode
         self._display = Display(self.world, render_mode)
         self.agents: list[str] = []
         self.observation_spaces = {agent: self.world.observation_space for agent in self.possible_agents}
         self.action_spaces = {agent: self.world.action_space for agent in self.possible_agents}
-        self._vehicles = {agent: scenario.vehicle_names.index(agent) for agent in self.possible_agents}
         self._np_random: np.random.Generator | None = None
         self._x = np.full(self.space.dim, np.nan)
-        self._episode: MultiAgentEpisode | None = None
         self._memory: Any = None
         self._tick = 0
 
@@ -142,12 +188,10 @@ class DrivingParallelEnv(ParallelEnv[str, SingleObservation, NDArray[np.float32]
             options = None  # what PettingZoo's conformance test asks for, to see that options are taken at all
         self._x = self.space.scenario_x(options, 1, self._np_random)[0]
         self._tick, self._memory, self.agents = 0, None, list(self.possible_agents)
-        with torch.inference_mode():
-            self._episode = start(self.world, torch.from_numpy(self._x[None]).float())
-            observations = {agent: self._observe(self._episode, agent) for agent in self.agents}
-        infos = {agent: episode_info(self.space, self._x, self._view(self._episode, agent)) for agent in self.agents}
+        self._episode = episode = self._start(self._x[None])
+        infos = {agent: episode_info(self.space, self._x, self._view(episode, agent)) for agent in self.agents}
         self._show()
-        return observations, infos
+        return self._observe(episode), infos
 
     def step(
         self, actions: Actions
@@ -169,21 +213,16 @@ class DrivingParallelEnv(ParallelEnv[str, SingleObservation, NDArray[np.float32]
             raise RuntimeError("Expected reset() before step(): no agent is there.")
         if not isinstance(actions, Mapping):
             raise ValueError(f"Expected actions as a mapping of agents to actions, got {type(actions).__name__}.")
-        given = {agent: action for agent, action in actions.items() if action is not None}
-        for agent in given:
-            self._check_agent(agent)
+        rewards_of = {self._vehicles[agent]: self.rewards[agent] for agent in self.agents}
         with torch.inference_mode():
-            chosen, commanded = self._read(given)
-            rewards_of = {self._vehicles[agent]: self.rewards[agent] for agent in self.agents}
-            after, earned, self._memory = step_agents(
+            chosen, commanded = self._read(actions)
+            episode, earned, self._memory = step_agents(
                 self.world, self._episode, chosen, commanded, rewards_of, self._driver, self._memory
             )
-            self._episode = after
-            self._tick += self.world.clock.stride
             terms = {agent: earned[self._vehicles[agent]] for agent in self.agents}
             rewards = {agent: float(total_of(reward)) for agent, reward in terms.items()}
-            observations = {agent: self._observe(after, agent) for agent in self.agents}
-        views = {agent: self._view(after, agent) for agent in self.agents}
+        self._episode, self._tick = episode, self._tick + self.world.clock.stride
+        observations, views = self._observe(episode), {agent: self._view(episode, agent) for agent in self.agents}
         terminated = {agent: bool(view.collided) for agent, view in views.items()}
         over = self._tick >= self.world.clock.ticks
         truncated = {agent: over and not terminated[agent] for agent in self.agents}
@@ -195,16 +234,18 @@ class DrivingParallelEnv(ParallelEnv[str, SingleObservation, NDArray[np.float32]
         self._show()
         return observations, rewards, terminated, truncated, infos
 
-    def _read(self, given: Actions) -> tuple[Tensor, Tensor]:
-        """Return actions of all vehicles, (1, N, 2) or (1, N), and which are commanded (1, N)."""
-        n, kind = self.world.scenario.vehicles, self.world.clock.action
-        chosen = torch.full((1, n), IDLE) if kind == "meta" else torch.zeros(1, n, 2)
-        commanded = torch.zeros(1, n, dtype=torch.bool)
-        for agent, action in given.items():
+    def _read(self, actions: Actions) -> tuple[Tensor, Tensor]:
+        """Return actions of all vehicles, (1, N, 2) or (1, N), and which are commanded, (1, N)."""
+        chosen, commanded = self._nobody(1)
+        for agent, action in actions.items():
+            if action is None:
+                continue
+            self._check_agent(agent)
             shape = self.action_spaces[agent].shape
             if np.shape(action) != shape:
                 raise ValueError(f"Expected an action of shape {shape} for {agent!r}, got {np.shape(action)}.")
-            chosen[:, self._vehicles[agent]] = read_actions(kind, torch.as_tensor(np.asarray(action))[None], 1)
+            given = torch.as_tensor(np.asarray(action))[None]
+            chosen[:, self._vehicles[agent]] = read_actions(self.world.clock.action, given, 1)
             commanded[:, self._vehicles[agent]] = True
         return chosen, commanded
 
@@ -212,7 +253,6 @@ class DrivingParallelEnv(ParallelEnv[str, SingleObservation, NDArray[np.float32]
         if agent in self.agents:
             return
         if agent in self.possible_agents:
-            assert self._episode is not None
             raise ValueError(
                 f"Expected actions of {', '.join(self.agents)} only: {agent!r} has left, because its vehicle collided."
             )
@@ -222,11 +262,11 @@ class DrivingParallelEnv(ParallelEnv[str, SingleObservation, NDArray[np.float32]
     def _view(self, episode: MultiAgentEpisode, agent: str) -> Any:
         return episode.views[self._vehicles[agent]]
 
-    def _observe(self, episode: MultiAgentEpisode, agent: str) -> SingleObservation:
-        observation: SingleObservation = map_kinds(
-            lambda part: part[0].numpy(), observe(self._view(episode, agent), self.world.sensing.observation)
-        )
-        return observation
+    @torch.inference_mode()
+    def _observe(self, episode: MultiAgentEpisode) -> dict[str, SingleObservation]:
+        kinds = self.world.sensing.observation
+        seen = {agent: observe(self._view(episode, agent), kinds) for agent in self.agents}
+        return {agent: map_kinds(lambda part: part[0].numpy(), each) for agent, each in seen.items()}
 
     def _show(self) -> None:
         if self._display.is_window:
@@ -238,7 +278,7 @@ class DrivingParallelEnv(ParallelEnv[str, SingleObservation, NDArray[np.float32]
         return self._display.draw(
             None if episode is None else episode.traffic,
             self._tick * self.world.clock.dt,
-            agents=[self._vehicles[agent] for agent in self.possible_agents],
+            agents=list(self._vehicles.values()),
             crashed=[] if episode is None else (episode.collided | episode.disabled)[0].nonzero().flatten().tolist(),
         )
 
@@ -246,8 +286,7 @@ class DrivingParallelEnv(ParallelEnv[str, SingleObservation, NDArray[np.float32]
         """Return x, y [m], heading [rad] and speed [m/s] of all vehicles, for a central critic; shape (N, 4)."""
         if self._episode is None:
             raise RuntimeError("Expected reset() before state().")
-        traffic = torch.stack(self._episode.traffic.state[:4], dim=-1)[0]
-        whole: NDArray[np.float32] = traffic.float().numpy()
+        whole: NDArray[np.float32] = torch.stack(self._episode.traffic.state[:4], dim=-1)[0].float().numpy()
         return whole
 
     def close(self) -> None:
@@ -255,37 +294,7 @@ class DrivingParallelEnv(ParallelEnv[str, SingleObservation, NDArray[np.float32]
         self._display.close()
 
 
-def select_agents(scenario: Scenario, agents: Sequence[str] | None) -> list[str]:
-    """Return the agents that an argument `agents` names."""
-    names = scenario.vehicle_names
-    if agents is None:
-        return list(names)
-    if isinstance(agents, str) or not isinstance(agents, Sequence):
-        raise ValueError(f"Expected agents as a list of names, such as ['{names[-1]}'], got {agents!r}.")
-    for agent in agents:
-        if agent not in names:
-            hint = did_you_mean(str(agent), names)
-            raise ValueError(f"There is no vehicle {agent!r}{hint}; the vehicles are {', '.join(names)}.")
-    if not agents or len(set(agents)) < len(agents):
-        raise ValueError(f"Expected one or more different agents, got {list(agents)}.")
-    return list(agents)
-
-
-def select_rewards(agents: Sequence[str], rewards: Mapping[str, Reward] | None) -> dict[str, Reward]:
-    """Return the reward of each agent."""
-    rewards = {} if rewards is None else rewards
-    if not isinstance(rewards, Mapping):
-        raise ValueError(f"Expected rewards as a mapping of agents to functions of a Transition, got {rewards!r}.")
-    for agent, reward in rewards.items():
-        if agent not in agents:
-            hint = did_you_mean(str(agent), agents)
-            raise ValueError(f"Reward for {agent!r}{hint}, but the agents are {', '.join(agents)}.")
-        if not callable(reward):
-            raise ValueError(f"Expected the reward of {agent!r} as a function of a Transition, got {reward!r}.")
-    return {agent: rewards.get(agent, own_reward) for agent in agents}
-
-
-class AgentsVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[Any]]):
+class AgentsVectorEnv(_SeveralAgents, VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[Any]]):
     """`DrivingParallelEnv` for a batch of B scenarios with A agents each, with Gymnasium's SAME_STEP autoreset.
 
     Row b A + a is agent a of scenario b. A scenario is replaced within the step when the ego or an agent collides, or
@@ -328,25 +337,16 @@ class AgentsVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[Any]]
         """
         if not isinstance(scenarios, (int, np.integer)) or isinstance(scenarios, bool) or scenarios < 1:
             raise ValueError(f"Expected one or more scenarios, got {scenarios!r}.")
-        ego = load_named_ego(ego)
-        needs = resolve(ego)
-        world, self.space = set_up(env_id, EgoNeeds(lidar=needs.lidar), **kwargs)
-        self.world = world.with_statistics()
-        scenario = self.world.scenario
-        self.agents = select_agents(scenario, agents)
+        self.agents = self._set_up(env_id, agents, ego, rewards, kwargs)
+        self._of_agents = list(self._vehicles.values())
         self.scenarios = int(scenarios)
         self.num_envs = self.scenarios * len(self.agents)
-        self._vehicles = [scenario.vehicle_names.index(agent) for agent in self.agents]
-        by_name = select_rewards(self.agents, rewards)
-        self._rewards = {vehicle: by_name[agent] for vehicle, agent in zip(self._vehicles, self.agents, strict=True)}
-        self._driver = as_driver(ego, self.world, needs)
         self.single_observation_space = self.world.observation_space
         self.single_action_space = self.world.action_space
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self._tick = np.zeros(self.scenarios, dtype=np.int64)
         self._x = np.full((self.scenarios, self.space.dim), np.nan)
-        self._episode: MultiAgentEpisode | None = None
 
     def reset(
         self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
@@ -363,9 +363,8 @@ class AgentsVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[Any]]
         super().reset(seed=seed[0] if isinstance(seed, list) else seed)
         self._x = self.space.scenario_x(options, self.scenarios, self.np_random)
         self._tick[:] = 0
-        with torch.inference_mode():
-            self._episode = start(self.world, torch.from_numpy(self._x).float())
-            return self._observe(self._episode), {}
+        self._episode = self._start(self._x)
+        return self._observe(self._episode), {}
 
     def step(
         self, actions: NDArray[Any]
@@ -377,67 +376,49 @@ class AgentsVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[Any]]
         """
         if self._episode is None:
             raise RuntimeError("Expected reset() before step().")
+        rewards_of = {self._vehicles[agent]: self.rewards[agent] for agent in self.agents}
         with torch.inference_mode():
-            chosen, commanded = self._read(torch.as_tensor(np.asarray(actions)))
+            chosen, commanded = self._nobody(self.scenarios)
+            given = read_actions(self.world.clock.action, torch.as_tensor(np.asarray(actions)), self.num_envs)
+            chosen[:, self._of_agents] = given.view(self.scenarios, len(self.agents), *given.shape[1:])
+            commanded[:, self._of_agents] = True
             episode, earned, memory = step_agents(
-                self.world, self._episode, chosen, commanded, self._rewards, self._driver, None
+                self.world, self._episode, chosen, commanded, rewards_of, self._driver, None
             )
             _refuse_memory(memory)
-            observation = self._observe(episode)
-            reward = self._by_row([total_of(earned[vehicle]) for vehicle in self._vehicles]).double().numpy()
+            reward = self._by_row([total_of(earned[vehicle]) for vehicle in self._of_agents]).double().numpy()
         self._tick += self.world.clock.stride
-        collided, ego = episode.collided, episode.views[0].collided
-        own = self._by_row([collided[:, vehicle] for vehicle in self._vehicles]).numpy()
-        crash = ego.numpy() | own.reshape(self.scenarios, -1).any(axis=1)
-        done = crash | (self._tick >= self.world.clock.ticks)
-        done_rows, ego_rows = (map_kinds.repeat(len(self.agents)) for map_kinds in (done, ego.numpy()))
-        terminated = own | ego_rows
+        observation = self._observe(episode)
+        own = self._by_row([episode.collided[:, vehicle] for vehicle in self._of_agents]).numpy()
+        ego = episode.views[0].collided.numpy()
+        done = ego | own.reshape(self.scenarios, -1).any(axis=1) | (self._tick >= self.world.clock.ticks)
+        done_rows, ego_rows = (rows.repeat(len(self.agents)) for rows in (done, ego))
         infos: dict[str, Any] = {}
         if done.any():
-            infos["final_obs"], infos["_final_obs"] = to_object_rows(observation, done_rows), done_rows.copy()
-            final: dict[str, Any] = {}
-            put_masked(final, "collision", own, done_rows)
-            put_masked(final, "ego_collision", ego_rows, done_rows)
-            measures = self._by_row([episode.views[vehicle].f for vehicle in self._vehicles])
-            put_masked(final, "measure", measures.double().numpy(), done_rows)
-            infos["final_info"], infos["_final_info"] = final, done_rows.copy()
-            episode = self._replace_scenarios(episode, np.flatnonzero(done))
+            measures = self._by_row([episode.views[vehicle].f for vehicle in self._of_agents]).double().numpy()
+            final = {"collision": own, "ego_collision": ego_rows, "measure": measures}
+            infos = mask_infos({"final_obs": to_object_rows(observation, done_rows), "final_info": final}, done_rows)
+            rows = np.flatnonzero(done)
+            self._x[rows], self._tick[rows] = self.space.scenario_x(None, len(rows), self.np_random), 0
             with torch.inference_mode():
-                observation = self._observe(episode)
-        self._episode = episode
+                episode = merge_rows(episode, torch.from_numpy(rows), self._start(self._x[rows]))
+            observation = self._observe(episode)
+        self._episode, terminated = episode, own | ego_rows
         return observation, reward, terminated, done_rows & ~terminated, infos
-
-    def _read(self, actions: Tensor) -> tuple[Tensor, Tensor]:
-        """Return actions of all vehicles, (B, N, 2) or (B, N), and which are commanded (B, N)."""
-        given = read_actions(self.world.clock.action, actions, self.num_envs)
-        given = given.view(self.scenarios, len(self.agents), *given.shape[1:])
-        shape = (self.scenarios, self.world.scenario.vehicles)
-        chosen = torch.full(shape, IDLE) if self.world.clock.action == "meta" else torch.zeros(*shape, 2)
-        chosen[:, self._vehicles] = given
-        commanded = torch.zeros(shape, dtype=torch.bool)
-        commanded[:, self._vehicles] = True
-        return chosen, commanded
 
     def _by_row(self, columns: list[Tensor]) -> Tensor:
         """Return values of the agents, (B, ...) each, as (B A, ...)."""
         return torch.stack(columns, dim=1).flatten(0, 1)
 
+    @torch.inference_mode()
     def _observe(self, episode: MultiAgentEpisode) -> Any:
-        views = [observe(episode.views[vehicle], self.world.sensing.observation) for vehicle in self._vehicles]
+        views = [observe(episode.views[vehicle], self.world.sensing.observation) for vehicle in self._of_agents]
         return map_kinds(lambda *parts: self._by_row(list(parts)).numpy(), *views)
-
-    def _replace_scenarios(self, episode: MultiAgentEpisode, rows: NDArray[np.intp]) -> MultiAgentEpisode:
-        x = self.space.scenario_x(None, len(rows), self.np_random)
-        self._x[rows], self._tick[rows] = x, 0
-        with torch.inference_mode():
-            fresh = start(self.world, torch.from_numpy(x).float())
-            return merge_rows(episode, torch.from_numpy(rows), fresh)
 
 
 def _refuse_memory(memory: Any) -> None:
     """Raise a ValueError if the ego's driver has a memory."""
-    kept = memory[0] if isinstance(memory, tuple) else memory
-    if kept is not None:
+    if (memory[0] if isinstance(memory, tuple) else memory) is not None:
         raise ValueError(
             "Expected an ego without memory: scenarios of a batch begin at different times, and a recurrent or stacked "
             "policy would remember another one's. rare_envs.parallel_env takes such egos."

@@ -2,7 +2,7 @@
 
 from collections.abc import Collection
 from itertools import pairwise
-from typing import Any, NamedTuple
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -10,7 +10,6 @@ import torch
 from numpy.typing import NDArray
 
 from rare_envs.control.actions import TARGET_SPEEDS
-from rare_envs.scenarios.base import Scenario
 from rare_envs.simulation.episode import Episode
 from rare_envs.simulation.world import World
 from rare_envs.traffic.bodies import pairwise_overlaps
@@ -25,16 +24,7 @@ _AHEAD, _BEHIND = 4, 2
 
 
 def make_traffic(state: State, road: Road, row: int = 0) -> Any:
-    """Return HighwayEnv's road around the ego, with the vehicles where they are.
-
-    Args:
-        state: Traffic of B scenarios.
-        road: Their road.
-        row: Which one.
-
-    Returns:
-        A `highway_env.road.road.Road`; its `vehicles` are `highway_env.vehicle.kinematics.Vehicle`, the ego first.
-    """
+    """Return HighwayEnv's road around the ego of a row with the vehicles, `Vehicle`s of HighwayEnv, the ego first."""
     from highway_env.road.road import Road as Traffic
     from highway_env.vehicle.kinematics import Vehicle
 
@@ -45,20 +35,15 @@ def make_traffic(state: State, road: Road, row: int = 0) -> Any:
 
 
 def make_scene(episode: Episode, crashed: Collection[int] | None = None) -> Any:
-    """Return HighwayEnv's road of an episode as code of its users reads it: who has crashed, and the ego's targets.
+    """Return HighwayEnv's road of an episode, a batch of one, as code of its users reads it: crashes and targets.
 
-    Args:
-        episode: A batch of one.
-        crashed: Indices of the vehicles that have crashed; None for the ego, if it has, and whom it touches.
-
-    Returns:
-        As `make_traffic`; with meta-actions the ego is a `highway_env.vehicle.controller.MDPVehicle`.
+    The numbers of the vehicles that have `crashed` may be given. With meta-actions the ego is an `MDPVehicle`.
     """
     from highway_env.vehicle.controller import MDPVehicle
 
     traffic = make_traffic(episode.state, episode.road)
     if crashed is None:
-        crashed = find_crashed(episode.state, episode.road) if bool(episode.collided) else ()
+        crashed = find_crashed(episode)
     if episode.aim is not None:
         seen = traffic.vehicles[0]
         target = (*seen.lane_index[:2], int(episode.aim.lane[0, 0]))
@@ -70,16 +55,18 @@ def make_scene(episode: Episode, crashed: Collection[int] | None = None) -> Any:
     return traffic
 
 
-def find_crashed(state: State, road: Road) -> set[int]:
-    """Return the ego and the vehicles that it touches, in a batch of one."""
-    return {0, *pairwise_overlaps(state, road)[0, 0].nonzero().flatten().tolist()}
+def find_crashed(episode: Episode, row: int = 0) -> Collection[int]:
+    """Return the ego and the vehicles that it touches, in a row; nobody where it has not collided."""
+    if not bool(episode.collided[row]):
+        return ()
+    state = State(*(field[row : row + 1] for field in episode.state))
+    return {0, *pairwise_overlaps(state, episode.road)[0, 0].nonzero().flatten().tolist()}
 
 
 def world_places(state: State, road: Road, row: int = 0) -> list[list[float]]:
     """Return X, Y [m] and heading [rad] in the world of each vehicle of a row, shape (N, 3)."""
-    places: list[list[float]] = torch.stack(
-        road.to_world(state.x[row], state.y[row], state.heading[row]), dim=1
-    ).tolist()
+    x, y, heading = road.to_world(state.x[row], state.y[row], state.heading[row])
+    places: list[list[float]] = torch.stack((x, y, heading), dim=1).tolist()
     return places
 
 
@@ -122,17 +109,8 @@ AGENT: Colour = (200, 0, 150)
 """Outline of vehicles other than the ego that an agent drives, HighwayEnv's purple."""
 _PAPER: Colour = (255, 255, 255)
 _INK: Colour = (30, 30, 30)
-
-
-class Roles(NamedTuple):
-    """Roles of the vehicles of a picture."""
-
-    names: tuple[str, ...]
-    """A key of `palette.ROLE_COLOURS` for each vehicle."""
-    crashed: frozenset[int]
-    """Vehicles that have crashed; they are outlined."""
-    agents: frozenset[int]
-    """Vehicles other than the ego that agents drive."""
+_Outlines = dict[str, tuple[Colour, Collection[int]]]
+"""Colours of the outlines of vehicles, and whose, by what they mean."""
 
 
 class Renderer:
@@ -160,8 +138,8 @@ class Renderer:
 
         self._pygame: Any = pygame
         self._world = world
-        self._scenario: Scenario = world.scenario
         self._road: Road = world.scenario.road
+        self._roles = [name if name in ROLE_COLOURS else "others" for name in world.scenario.vehicle_names]
         height = max(FRAME_HEIGHT, 16 * round((self._road.lanes * self._road.width + 2 * _MARGIN) * _SCALING / 16))
         self._surface = WorldSurface((FRAME_WIDTH, height), 0, pygame.Surface((FRAME_WIDTH, height)))
         self._surface.scaling = _SCALING
@@ -197,15 +175,15 @@ class Renderer:
         Returns:
             The image, shape (H, FRAME_WIDTH, 3).
         """
-        state = State(*(field[row : row + 1] for field in episode.state))
-        if crashed is None:
-            crashed = find_crashed(state, self._road) if bool(episode.collided[row]) else ()
-        roles = self._assign_roles(agents, crashed)
-        self._draw_road(state, roles)
+        outlines: _Outlines = {
+            "driven by an agent": (AGENT, set(agents) - {0}),
+            "crashed": (as_rgb(CRASH_COLOUR), find_crashed(episode, row) if crashed is None else crashed),
+        }
+        self._draw_road(episode.state, row, outlines)
         self._canvas.fill(_PAPER)
         self._canvas.blit(self._surface, (0, TEXT_HEIGHT))
         self._write(8, 17, caption(self._world, episode, time, row))
-        self._draw_legend(roles)
+        self._draw_legend(outlines)
         if self._screen is not None:
             self._screen.blit(self._canvas, (0, 0))
             self._pygame.event.pump()
@@ -214,38 +192,28 @@ class Renderer:
         image: NDArray[np.uint8] = np.moveaxis(self._pygame.surfarray.array3d(self._canvas), 0, 1)
         return image
 
-    def _assign_roles(self, agents: Collection[int], crashed: Collection[int]) -> Roles:
-        names = tuple(name if name in ROLE_COLOURS else "others" for name in self._scenario.vehicle_names)
-        return Roles(names, frozenset(crashed), frozenset(agents) - {0})
-
-    def _draw_road(self, state: State, roles: Roles) -> None:
+    def _draw_road(self, state: State, row: int, outlines: _Outlines) -> None:
         from highway_env.road.graphics import RoadGraphics
 
-        traffic, places = make_traffic(state, self._road), world_places(state, self._road)
-        for vehicle, name in zip(traffic.vehicles, roles.names, strict=True):
-            vehicle.color = as_rgb(ROLE_COLOURS[name])
-        self._surface.move_display_window_to(world_point(self._road, float(state.x[0, 0]), self._road.middle))
+        traffic, places = make_traffic(state, self._road, row), world_places(state, self._road, row)
+        for vehicle, role in zip(traffic.vehicles, self._roles, strict=True):
+            vehicle.color = as_rgb(ROLE_COLOURS[role])
+        self._surface.move_display_window_to(world_point(self._road, float(state.x[row, 0]), self._road.middle))
         RoadGraphics.display(traffic, self._surface)
         RoadGraphics.display_traffic(traffic, self._surface, offscreen=True)
-        outlines = [(j, AGENT) for j in roles.agents] + [(j, as_rgb(CRASH_COLOUR)) for j in sorted(roles.crashed)]
-        for j, colour in outlines:
-            corners = [self._surface.pos2pix(x, y) for x, y in _corners(*places[j])]
-            self._pygame.draw.polygon(self._surface, colour, corners, width=3)
+        for colour, vehicles in outlines.values():
+            for j in sorted(vehicles):
+                corners = [self._surface.pos2pix(x, y) for x, y in _corners(*places[j])]
+                self._pygame.draw.polygon(self._surface, colour, corners, width=3)
 
-    def _draw_legend(self, roles: Roles) -> None:
+    def _draw_legend(self, outlines: _Outlines) -> None:
         """Draw colours and what they mean, in a line below the road."""
+        shown = [(role, as_rgb(ROLE_COLOURS[role]), 0) for role in ROLE_COLOURS if role in self._roles]
+        shown += [(text, colour, 3) for text, (colour, vehicles) in outlines.items() if vehicles]
         x, y = 8, self._canvas.get_height() - TEXT_HEIGHT + 6
-        for role in ROLE_COLOURS:
-            if role in roles.names:
-                self._pygame.draw.rect(self._canvas, as_rgb(ROLE_COLOURS[role]), (x, y, 20, 11))
-                x += 26 + self._write(x + 26, y + 10, role) + 18
-        for shown, colour, text in (
-            (roles.agents, AGENT, "driven by an agent"),
-            (roles.crashed, as_rgb(CRASH_COLOUR), "crashed"),
-        ):
-            if shown:
-                self._pygame.draw.rect(self._canvas, colour, (x, y, 20, 11), width=3)
-                x += 26 + self._write(x + 26, y + 10, text) + 18
+        for text, colour, line in shown:
+            self._pygame.draw.rect(self._canvas, colour, (x, y, 20, 11), width=line)
+            x += 26 + self._write(x + 26, y + 10, text) + 18
 
     def _write(self, x: int, y: int, text: str) -> int:
         """Write a line, and return how long it is."""
@@ -284,24 +252,14 @@ RENDER_MODES = ("rgb_array", "human")
 
 
 class Display:
-    """The picture of an environment in its render mode; HighwayEnv's graphics are loaded for the first one.
-
-    Args:
-        world: Of the episodes.
-        mode: None, "rgb_array" for images, or "human" for a window.
-    """
+    """The picture of an environment in its render mode; HighwayEnv's graphics are loaded for the first one."""
 
     def __init__(self, world: World, mode: str | None) -> None:
         if mode is not None and mode not in RENDER_MODES:
             raise ValueError(f"Expected render_mode None, 'rgb_array' or 'human', got {mode!r}.")
-        self._world = world
-        self._mode = mode
+        self._world, self._mode = world, mode
+        self.is_window = mode == "human"
         self._renderer: Renderer | None = None
-
-    @property
-    def is_window(self) -> bool:
-        """Whether pictures are shown in a window."""
-        return self._mode == "human"
 
     def draw(
         self,
@@ -310,14 +268,7 @@ class Display:
         agents: Collection[int] = (),
         crashed: Collection[int] | None = None,
     ) -> NDArray[np.uint8] | None:
-        """Return the picture of an episode, or show it in the window; a warning where there is none to draw.
-
-        Args:
-            episode: A batch of one; None before the first.
-            time: Since its start [s].
-            agents: Vehicles that agents drive.
-            crashed: Vehicles that have crashed; None for the ego, if it has, and those that it touches.
-        """
+        """Return the picture of a batch of one, or show it in the window, as `Renderer.draw`; warn if there is none."""
         if self._mode is None or episode is None:
             gym.logger.warn(
                 "Nothing to render: make the environment with render_mode='rgb_array' or 'human', and reset it first."

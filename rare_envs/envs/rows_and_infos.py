@@ -77,12 +77,9 @@ def _freeze_state(rng: np.random.Generator) -> bytes:
 
 
 def merge_rows(old: _T, rows: Tensor, new: _T) -> _T:
-    """Return tensors, tuples of such or `RowsReplaceable` with some rows replaced; the rest, as the road, is common.
+    """Return tensors, tuples of such or `RowsReplaceable` of B scenarios with the rows (R,) replaced.
 
-    Args:
-        old: Of B scenarios.
-        rows: Indices of R of them, shape (R,).
-        new: Of R scenarios.
+    The rest, as the road, is common to all.
     """
 
     def merge(old: Any, new: Any) -> Any:
@@ -125,12 +122,7 @@ def put_tensors(value: _T, tensors: Iterator[Tensor]) -> _T:
 
 
 def to_object_rows(observation: Any, mask: NDArray[np.bool_]) -> NDArray[Any]:
-    """Return rows of an observation as objects, None where the mask is not set: Gymnasium's form of `final_obs`.
-
-    Args:
-        observation: Of B environments.
-        mask: Boolean, shape (B,).
-    """
+    """Return rows of an observation as objects, None where the mask (B,) is not set: `final_obs` of Gymnasium."""
     rows = np.full(len(mask), None, dtype=object)
     for row in np.flatnonzero(mask):
         rows[row] = map_kinds(lambda part, row=row: part[row].copy(), observation)
@@ -138,13 +130,7 @@ def to_object_rows(observation: Any, mask: NDArray[np.bool_]) -> NDArray[Any]:
 
 
 def replace_rows(observation: Any, rows: NDArray[np.intp], fresh: Any) -> Any:
-    """Return an observation with R of its rows replaced.
-
-    Args:
-        observation: Of B environments.
-        rows: Indices, shape (R,).
-        fresh: Of R environments.
-    """
+    """Return an observation of B environments with R rows, (R,), replaced by those of another."""
 
     def replace(old: NDArray[Any], new: NDArray[Any]) -> NDArray[Any]:
         old = old.copy()
@@ -154,10 +140,13 @@ def replace_rows(observation: Any, rows: NDArray[np.intp], fresh: Any) -> Any:
     return map_kinds(replace, observation, fresh)
 
 
-def put_masked(infos: dict[str, Any], key: str, value: Any, mask: NDArray[np.bool_]) -> None:
-    """Put an entry with its mask into infos, in Gymnasium's vector form."""
-    infos[key] = value
-    infos[f"_{key}"] = mask.copy()
+def mask_infos(values: dict[str, Any], mask: NDArray[np.bool_]) -> dict[str, Any]:
+    """Return entries, also those of mappings in them, each with its mask, in Gymnasium's vector form."""
+    infos: dict[str, Any] = {}
+    for key, value in values.items():
+        infos[key] = mask_infos(value, mask) if isinstance(value, dict) else value
+        infos[f"_{key}"] = mask.copy()
+    return infos
 
 
 Info = dict[str, Any]
@@ -166,13 +155,7 @@ SingleObservation = NDArray[np.float32]
 
 
 def episode_info(space: ScenarioSpace, x: NDArray[Any], episode: Episode) -> Info:
-    """Return the info of one episode: `scenario`, `x`, `min_ttc` [s], `collision`, `crashed` (the same), `speed` [m/s].
-
-    Args:
-        space: Of its parameters.
-        x: Their values, shape (d,).
-        episode: A batch of one, in a world with statistics.
-    """
+    """Return `scenario`, `x`, `min_ttc` [s], `collision`, `crashed` (the same) and `speed` [m/s] of a batch of one."""
     assert episode.statistics is not None
     collided = bool(episode.collided)
     return {
@@ -188,18 +171,9 @@ def episode_info(space: ScenarioSpace, x: NDArray[Any], episode: Episode) -> Inf
 def step_info(
     space: ScenarioSpace, x: NDArray[Any], episode: Episode, reward: Any, over: bool, vehicle: int = 0
 ) -> Info:
-    """Return the info after a step.
+    """Return the info after a step, of an episode as a vehicle sees it.
 
-    It adds `reward_terms` to that of `episode_info`, and at the end of an episode `measure`, `crash` and
-    `collision_type`.
-
-    Args:
-        space: Of the scenario's parameters.
-        x: Their values, shape (d,).
-        episode: A batch of one, as a vehicle sees it.
-        reward: Of the step, with its terms.
-        over: Whether this is the end.
-        vehicle: Whose episode it is.
+    It adds `reward_terms` to that of `episode_info`, and at the end (`over`) `measure`, `crash` and `collision_type`.
     """
     info = episode_info(space, x, episode)
     info["reward_terms"] = {name: float(value) for name, value in terms_of(reward).items()}

@@ -105,8 +105,10 @@ class DrivingEnv(HighwayEnvInterface, gym.Env[SingleObservation, Any]):
         moved = None if self._compiled is None else self._compiled.advance(self._episode, np.asarray(action)[None])
         with torch.inference_mode():
             episode, terms, features = moved or self._advance_by_torch(action)
-            known = features is not None and self.world.sensing.observation == "features"
-            observation: SingleObservation = features[0] if known else self._observe(episode)
+            if features is not None and self.world.sensing.observation == "features":
+                observation: SingleObservation = features[0]
+            else:
+                observation = self._observe(episode)
             reward = float(terms.total)
         self._episode, self._tick = episode, self._tick + self.world.clock.stride
         terminated = bool(episode.collided)
@@ -122,7 +124,6 @@ class DrivingEnv(HighwayEnvInterface, gym.Env[SingleObservation, Any]):
         return cast("SingleObservation", map_kinds(lambda part: part[0].numpy(), observed))
 
     def _advance_by_torch(self, action: Any) -> StepResult:
-        """Carry out a decision in the simulation of which the compiled steps are a copy."""
         assert self._episode is not None
         given = read_actions(self.world.clock.action, torch.as_tensor(np.asarray(action))[None], 1)
         self._between = False

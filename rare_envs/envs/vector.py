@@ -19,8 +19,8 @@ from rare_envs.envs.rows_and_infos import (
     DrawsAhead,
     Info,
     list_tensors,
+    mask_infos,
     merge_rows,
-    put_masked,
     put_tensors,
     replace_rows,
     to_object_rows,
@@ -28,7 +28,7 @@ from rare_envs.envs.rows_and_infos import (
 from rare_envs.fast.choice import find_scripted_step
 from rare_envs.make import set_up
 from rare_envs.sensors.kinds import map_kinds
-from rare_envs.simulation.decision import RewardTerms, advance
+from rare_envs.simulation.decision import RewardTerms, StepResult, advance
 from rare_envs.simulation.episode import Episode
 from rare_envs.simulation.observation import observe
 from rare_envs.traffic.crash import CRASH_KINDS, NONE
@@ -185,56 +185,49 @@ class DrivingVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[Any]
             )
         started = self._replace(np.flatnonzero(fresh)) if fresh.any() else None
         with torch.inference_mode():
-            ignored = torch.from_numpy(fresh) if fresh.any() else None
-            moved = (
-                None if self._compiled is None else self._compiled.advance(self._episode, clear_rows(actions, fresh))
-            )
-            if moved is None:
-                given = torch.as_tensor(np.asarray(actions))
-                given = read_actions(self.world.clock.action, given, self.num_envs, ignored)
-                moved = advance(self.world, self._episode, given.to(self.device))
-            episode, terms, features = moved
+            episode, terms, features = self._advance(actions, fresh)
             if started is not None:  # which do not move in the step that starts them
-                episode = merge_rows(episode, self._place(np.flatnonzero(fresh)), started)
+                episode, features = merge_rows(episode, self._place(np.flatnonzero(fresh)), started), None
             reward = terms.total.double().numpy(force=True)
         reward[fresh] = 0.0
         self._episode = episode
         self._tick += np.where(fresh, 0, self.world.clock.stride)
         terminated = episode.collided.numpy(force=True) & ~fresh
         truncated = (self._tick >= self.world.clock.ticks) & ~terminated & ~fresh
-        features = None if started is not None else features
-        observation, infos = self._finish(terms, terminated | truncated, fresh, features)
+        known = features is not None and self.world.sensing.observation == "features"
+        observation = features if known else self._observe(episode)
+        observation, infos = self._finish(observation, terms, terminated | truncated, fresh)
         return observation, reward, terminated.copy(), truncated, infos
 
+    def _advance(self, actions: NDArray[Any], fresh: NDArray[np.bool_]) -> StepResult:
+        """Carry out a decision, in which the actions of `fresh` rows (B,) do not count."""
+        assert self._episode is not None
+        if self._compiled is not None:
+            moved = self._compiled.advance(self._episode, clear_rows(actions, fresh))
+            if moved is not None:
+                return moved
+        ignored = torch.from_numpy(fresh) if fresh.any() else None
+        given = read_actions(self.world.clock.action, torch.as_tensor(np.asarray(actions)), self.num_envs, ignored)
+        return advance(self.world, self._episode, given.to(self.device))
+
     def _finish(
-        self,
-        terms: RewardTerms,
-        done: NDArray[np.bool_],
-        fresh: NDArray[np.bool_],
-        features: NDArray[np.float32] | None,
-    ) -> tuple[NDArray[np.float32], Info]:
+        self, observation: Any, terms: RewardTerms, done: NDArray[np.bool_], fresh: NDArray[np.bool_]
+    ) -> tuple[Any, Info]:
         """Return observations and infos after a step, and replace what ended if that is to be in the same step."""
         assert self._episode is not None
         episode, infos, everyone = self._episode, Info(), np.ones(self.num_envs, dtype=bool)
-        known: Any = features if self.world.sensing.observation == "features" else None
-        observation = self._observe(episode) if known is None else known
+        earned = {"reward_terms": {name: each.double().numpy(force=True) for name, each in terms._asdict().items()}}
         if self._mode != AutoresetMode.SAME_STEP:
             self._ended = done.copy()
-            infos.update(self._info(episode, everyone))
-            put_masked(infos, "reward_terms", _terms(terms, ~fresh), ~fresh)
-            if done.any():
-                infos.update(self._end_info(episode, done))
-            return observation, infos
+            end = self._end_info(episode, done) if done.any() else {}
+            return observation, self._info(episode, everyone) | mask_infos(earned, ~fresh) | end
         if done.any():
-            infos["final_obs"], infos["_final_obs"] = to_object_rows(observation, done), done.copy()
-            infos["final_info"], infos["_final_info"] = self._info(episode, done), done.copy()
-            put_masked(infos["final_info"], "reward_terms", _terms(terms, done), done)
-            infos["final_info"].update(self._end_info(episode, done))
+            final = self._info(episode, done) | mask_infos(earned, done) | self._end_info(episode, done)
+            infos = {"final_obs": to_object_rows(observation, done), "_final_obs": done.copy()}
+            infos |= {"final_info": final, "_final_info": done.copy()}
             rows = np.flatnonzero(done)
             observation = replace_rows(observation, rows, self._observe(self._replace(rows)))
-        infos.update(self._info(self._episode, everyone))
-        put_masked(infos, "reward_terms", _terms(terms, ~done), ~done)
-        return observation, infos
+        return observation, infos | self._info(self._episode, everyone) | mask_infos(earned, ~done)
 
     def _observe(self, episode: Episode) -> Any:
         with torch.inference_mode():
@@ -264,34 +257,26 @@ class DrivingVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[Any]
     def _info(self, episode: Episode, mask: NDArray[np.bool_]) -> Info:
         assert episode.statistics is not None
         collided = episode.collided.numpy(force=True)
-        infos: Info = {}
-        scenario: Info = {}
-        for name, column in self.space.columns(self._x).items():
-            put_masked(scenario, name, column, mask)
-        put_masked(infos, "scenario", scenario, mask)
-        put_masked(infos, "x", self._x.copy(), mask)
         least = episode.statistics.least_ttc.double().numpy(force=True)
-        put_masked(infos, "min_ttc", np.where(collided, 0.0, least), mask)
-        put_masked(infos, "collision", collided.copy(), mask)
-        put_masked(infos, "crashed", collided.copy(), mask)  # HighwayEnv's name of it
-        put_masked(infos, "speed", episode.state.speed[:, 0].double().numpy(force=True), mask)
-        return infos
+        info = {
+            "scenario": self.space.columns(self._x),
+            "x": self._x.copy(),
+            "min_ttc": np.where(collided, 0.0, least),
+            "collision": collided.copy(),
+            "crashed": collided.copy(),  # HighwayEnv's name of it
+            "speed": episode.state.speed[:, 0].double().numpy(force=True),
+        }
+        return mask_infos(info, mask)
 
     def _end_info(self, episode: Episode, done: NDArray[np.bool_]) -> Info:
         """Return what is known at the end of episodes: `measure`, `collision_type` and `crash`."""
-        infos: Info = {}
         assert episode.statistics is not None
-        crash = episode.statistics.crash
-        kind = crash.kind.numpy(force=True)
-        crashed, kinds = done & (kind != NONE), np.array(CRASH_KINDS, dtype=object)[kind]
+        crash = {name: each.numpy(force=True) for name, each in episode.statistics.crash._asdict().items()}
+        kinds = np.array(CRASH_KINDS, dtype=object)[crash["kind"]]
+        crashed = done & (crash["kind"] != NONE)
         kinds[~crashed] = None
-        put_masked(infos, "measure", episode.f.double().numpy(force=True), done)
-        put_masked(infos, "collision_type", kinds, crashed)
-        details: Info = {}
-        for name, values in {**crash._asdict(), "kind": kinds}.items():
-            put_masked(details, name, values if name == "kind" else values.numpy(force=True), crashed)
-        put_masked(infos, "crash", details, crashed)
-        return infos
+        measure = mask_infos({"measure": episode.f.double().numpy(force=True)}, done)
+        return measure | mask_infos({"collision_type": kinds, "crash": crash | {"kind": kinds}}, crashed)
 
     def export_state(self) -> dict[str, Any]:
         """Return the episodes under way and the generator, to go on with them in another process: `restore_state`.
@@ -353,11 +338,3 @@ def read_autoreset_mode(mode: AutoresetMode | str) -> AutoresetMode:
     except ValueError:
         known = ", ".join(repr(each.value) for each in AutoresetMode)
         raise ValueError(f"Unknown autoreset_mode {mode!r}; expected one of {known}.") from None
-
-
-def _terms(terms: RewardTerms, mask: NDArray[np.bool_]) -> Info:
-    """Return the terms of the reward in Gymnasium's vector form."""
-    infos: Info = {}
-    for name, value in terms._asdict().items():
-        put_masked(infos, name, value.double().numpy(force=True), mask)
-    return infos
