@@ -14,16 +14,11 @@ from typing import Any
 
 from benchmarks import RESULTS
 from benchmarks.papers.okelly2018.estimates import ThresholdEstimate
-from benchmarks.papers.okelly2018.reproduction import make_okelly_record
+from benchmarks.papers.okelly2018.reproduction import compare_own, make_okelly_record
 from benchmarks.papers.okelly2018.study import HighwayStudy, estimate_own
-from benchmarks.papers.okelly2018.summary import compare_own
-from benchmarks.papers.tian2024.catalogue import METHOD_ROWS
 from benchmarks.papers.tian2024.figures import collect_figures
-from benchmarks.papers.tian2024.replications import (
-    ReplicationRun,
-    run_replication,
-)
-from benchmarks.papers.tian2024.study import TianPlan, open_replications, record_replications
+from benchmarks.papers.tian2024.replications import METHOD_ROWS, ReplicationRun, run_replication
+from benchmarks.papers.tian2024.study import RUN_COLUMNS, TianPlan, open_replications, record_replications
 from benchmarks.samplers.runs import map_jobs
 from rare_envs.files import format_json
 from samplers.output import to_json_value
@@ -34,7 +29,6 @@ PAPERS = ("tian2024", "okelly2018", "okelly2018_full", "okelly2018_vision")
 """Committed records: the `reproduction.json` of a run."""
 OWN_METHOD = "two-stage"
 """The default method, whose rows O'Kelly et al.'s tables have."""
-_NUMBERS = ("seed", "p", "low", "high", "cov", "n_sim", "simulated", "final", "levels")
 
 
 def read_records() -> dict[str, dict[str, Any]]:
@@ -48,18 +42,13 @@ def read_replications(record: dict[str, Any]) -> list[ReplicationRun]:
     for group in record["runs"]:
         names = {name: group[name] for name in ("scenario", "system", "method")}
         for place, count in enumerate(group["warnings"]):
-            values = {name: math.nan if group[name][place] is None else group[name][place] for name in _NUMBERS}
+            values = {name: math.nan if group[name][place] is None else group[name][place] for name in RUN_COLUMNS}
             runs.append(ReplicationRun(**names, **values, warnings=("",) * count, trace=()))
     return runs
 
 
 def renew_tian(record: dict[str, Any], folder: Path, methods: Sequence[str] = ()) -> dict[str, Any]:
     """Return a record with rows of further methods made anew.
-
-    Args:
-        record: As committed.
-        folder: Of the new replications.
-        methods: Some of `FURTHER`; none makes no row.
 
     Raises:
         ValueError: A method is none of them: its traces are in the figures, which only a whole run draws.
@@ -75,8 +64,8 @@ def renew_tian(record: dict[str, Any], folder: Path, methods: Sequence[str] = ()
         jobs = [job for job in plan.jobs() if job.method in methods]
         lines = open_replications(folder, plan)
         made = lines.complete(jobs, lambda missing: map_jobs(run_replication, missing), True, "replications")
-        new = {run.key: run for run in made}
-        runs = [new.get(run.key, run) for run in runs]
+        new = {(run.row, run.seed): run for run in made}
+        runs = [new.get((run.row, run.seed), run) for run in runs]
     anew = record_replications(plan, runs, record["command"])
     figures = {**record["figures"]}
     figures["figure8"] = {**figures["figure8"], "ends": to_json_value(collect_figures(runs))["figure8"]["ends"]}
@@ -85,13 +74,7 @@ def renew_tian(record: dict[str, Any], folder: Path, methods: Sequence[str] = ()
 
 
 def renew_okelly(record: dict[str, Any], folder: Path, own: bool = True) -> dict[str, Any]:
-    """Return a record with the rows of our default method made anew.
-
-    Args:
-        record: As committed.
-        folder: Of the new estimates.
-        own: Whether to make them.
-    """
+    """Return a record with the rows of our default method made anew."""
     about, (details,) = record["about"], record["runs"]
     study = HighwayStudy(about["ego"], about["scale"], about["seed"])
     found = {**details, "findings": []}
@@ -105,13 +88,7 @@ def renew_okelly(record: dict[str, Any], folder: Path, own: bool = True) -> dict
 
 
 def renew(folder: Path, papers: Sequence[str] = PAPERS, methods: Sequence[str] = (OWN_METHOD,)) -> None:
-    """Put rows of our own methods, made anew, into committed records.
-
-    Args:
-        folder: Of the new runs.
-        papers: Records, by name.
-        methods: Whose rows are made; none makes no row: tables and texts follow from the committed runs alone.
-    """
+    """Put rows of our own methods, made anew, into committed records."""
     for paper, record in read_records().items():
         if paper not in papers:
             continue

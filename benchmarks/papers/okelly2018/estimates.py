@@ -67,11 +67,6 @@ def estimate_naive(f: FloatArray, gamma: float) -> ThresholdEstimate:
 def estimate_weighted(f: FloatArray, log_ratios: FloatArray, gamma: float) -> ThresholdEstimate:
     """Return the mean of likelihood ratio times indicator of failure.
 
-    Args:
-        f: Outcomes of draws from a sampler, shape (n,).
-        log_ratios: log(p_0 / p_theta) of the draws, shape (n,).
-        gamma: Threshold.
-
     Example:
         >>> found = estimate_weighted(np.array([0.1, 0.9]), np.log([0.5, 2.0]), gamma=0.5)
         >>> found.events, found.p
@@ -96,11 +91,6 @@ def mean_ratio(log_ratios: FloatArray) -> float:
 
 def compare_with_naive(found: ThresholdEstimate, reference: ThresholdEstimate, search: int) -> ThresholdComparison:
     """Compare an estimate from a sampler with the longest naive one at the same threshold.
-
-    Args:
-        found: By importance sampling.
-        reference: By naive Monte Carlo.
-        search: Rollouts of the search for the sampler.
 
     Raises:
         ValueError: The thresholds differ.

@@ -1,15 +1,22 @@
-"""Statements of the paper about failures, tested: failing runs against ordinary ones, run by run."""
+"""Statements of the paper about failures, tested: starts and behaviour of failing runs against ordinary ones."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import numpy as np
+import torch
 from scipy import stats
+from torch import Tensor
 
-from benchmarks.papers.record import TestedClaim
+from benchmarks.papers.record import Finding
+from rare_envs.measures.longitudinal import TTC_MAX
+from rare_envs.sensors.lidar import RANGE_COLUMNS, RATE_COLUMNS, beam_angles
+from rare_envs.simulation.episode import Episode
+from rare_envs.simulation.rollout import drive
 from samplers.problem import FloatArray
 from samplers.statistics import Interval
 
@@ -80,10 +87,6 @@ def spread_of_starts(columns: StartColumns, base: StartColumns) -> FloatArray:
     """Return the squared distance of the starts from their own mean, in variances of a base sample, shape (n,).
 
     Its mean is the ratio of variances to those of the base, averaged over all 24 variables.
-
-    Args:
-        columns: Of runs.
-        base: Of ordinary ones, whose variances are the units.
     """
     parts = [
         (columns[name] - columns[name].mean(axis=0)) ** 2 / base[name].var(axis=0, ddof=1) * _unbias(columns[name])
@@ -98,15 +101,8 @@ def _unbias(values: FloatArray) -> float:
 
 def compare_means(
     claim: PaperClaim, quantity: str, failing: FloatArray, ordinary: FloatArray, groups: str = "failing / ordinary"
-) -> TestedClaim:
+) -> Finding:
     """Test a claim on the ratio of two means, a value of each run: Welch's t, and a bootstrap interval of the ratio.
-
-    Args:
-        claim: What the paper says.
-        quantity: What the values are, in words.
-        failing: Values of failing runs, shape (n,); NaN ones are left out.
-        ordinary: Values of ordinary runs, shape (m,).
-        groups: What the two are.
 
     Example:
         >>> rng = np.random.default_rng(0)
@@ -121,7 +117,7 @@ def compare_means(
         return _compare_shares(claim, f"{quantity}, {groups}", failing, ordinary)
     if len(failing) < 2 or len(ordinary) < 2 or ordinary.mean() == 0.0:
         known = [f"{values.mean():.3g}" if len(values) else "none" for values in (failing, ordinary)]
-        return TestedClaim(
+        return Finding(
             claim=claim.text,
             statistic=f"{quantity}, {groups}: {' and '.join(known)}, {sizes}",
             value=None,
@@ -136,7 +132,7 @@ def compare_means(
         found = stats.ttest_ind(failing, ordinary, equal_var=False)
         test = f"Welch's t = {float(found.statistic):.1f}, p = {max(float(found.pvalue), LEAST_P):.1g}"
     means = f"{failing.mean():.3g} / {ordinary.mean():.3g}"
-    return TestedClaim(
+    return Finding(
         claim=claim.text,
         statistic=f"{quantity}, {groups}: {means}; {test}; {sizes}",
         value=float(failing.mean() / ordinary.mean()),
@@ -145,14 +141,14 @@ def compare_means(
     )
 
 
-def _compare_shares(claim: PaperClaim, quantity: str, failing: FloatArray, ordinary: FloatArray) -> TestedClaim:
+def _compare_shares(claim: PaperClaim, quantity: str, failing: FloatArray, ordinary: FloatArray) -> Finding:
     """Test a claim by the shares of runs that have any of it, where no ordinary run has: there is no ratio of means."""
     counts = [(int(np.count_nonzero(values)), len(values)) for values in (failing, ordinary)]
     low, high = difference_interval(*counts)
     found = stats.fisher_exact(np.array([[k, n - k] for k, n in counts]))
     shares = " and ".join(f"{k:,} of {n:,}" for k, n in counts)
     seen = "holds" if (low > 0.0) == claim.above else "the opposite here"
-    return TestedClaim(
+    return Finding(
         claim=claim.text,
         statistic=f"{quantity}: difference of the shares of runs with any, {shares}; "
         f"Fisher's exact test, p = {float(found.pvalue):.1g}",
@@ -164,10 +160,6 @@ def _compare_shares(claim: PaperClaim, quantity: str, failing: FloatArray, ordin
 
 def difference_interval(first: tuple[int, int], second: tuple[int, int]) -> Interval:
     """Return the 95 % interval of a difference of two shares (Newcombe 1998, method 10).
-
-    Args:
-        first: Events, and runs.
-        second: Those that are taken off.
 
     Example:
         >>> low, high = difference_interval((56, 70), (48, 80))  # the example of the paper
@@ -208,15 +200,104 @@ _OF_STARTS: tuple[tuple[PaperClaim, str, Callable[[StartColumns], FloatArray]], 
 )
 
 
-def compare_starts(failing: StartColumns, ordinary: StartColumns, groups: str) -> list[TestedClaim]:
-    """Test what the paper says of initial conditions.
-
-    Args:
-        failing: Parameters of failing runs, or of draws from the sampler that was found.
-        ordinary: Of ordinary runs.
-        groups: What the two are, "failing / ordinary".
-    """
+def compare_starts(failing: StartColumns, ordinary: StartColumns, groups: str) -> list[Finding]:
+    """Test what the paper says of initial conditions."""
     found = [compare_means(claim, words, value(failing), value(ordinary), groups) for claim, words, value in _OF_STARTS]
     spreads = [spread_of_starts(columns, ordinary) for columns in (failing, ordinary)]
     words = "variance of the 24 initial values, mean over them, in units of the base's"
     return [*found, compare_means(LESS_VARIANCE, words, spreads[0], spreads[1], groups)]
+
+
+HARD_BRAKE_LIMIT = -3.0
+"""Acceleration that counts as a hard brake [m/s^2]."""
+SIDEWAYS_ANGLES = (math.radians(45.0), math.radians(135.0))
+"""Angles to the heading between which a beam looks sideways."""
+
+
+class RunBehaviour(NamedTuple):
+    """Each of n runs, (n,) each."""
+
+    hard_brakes: FloatArray
+    """Share of the steps of the five other vehicles."""
+    lane_changes: FloatArray
+    """Of the five other vehicles, for each of them in 10 s."""
+    sideways: FloatArray
+    """1 where the least time to collision was along a beam to the side, else 0."""
+    collided: FloatArray
+    """1 where the ego has collided, else 0."""
+
+
+def measure_behaviour(problem: Any, x: FloatArray) -> RunBehaviour:
+    """Drive scenarios again."""
+    parts = [_measure_tile(problem, rows) for rows in np.array_split(x, max(1, math.ceil(len(x) / problem.tile)))]
+    return RunBehaviour(*(np.concatenate(values) for values in zip(*parts, strict=True)))
+
+
+def _measure_tile(problem: Any, x: FloatArray) -> RunBehaviour:
+    clock = problem.world.clock
+    with torch.inference_mode():
+        episodes = drive(problem.world, problem.driver, torch.from_numpy(x).float())
+        before = next(episodes)
+        least, side = find_least_time(before)
+        brakes, changes = torch.zeros(len(x)), torch.zeros(len(x))
+        for episode in episodes:
+            slowing = (episode.state.speed - before.state.speed)[:, 1:] / clock.dt
+            brakes += (slowing <= HARD_BRAKE_LIMIT).float().mean(dim=1)
+            lane, lane_before = (each.road.lane_of(each.state.y[:, 1:]) for each in (episode, before))
+            changes += (lane != lane_before).float().mean(dim=1)
+            now, here = find_least_time(episode)
+            nearer = (now < least) & ~episode.collided
+            least, side = torch.where(nearer, now, least), torch.where(nearer, here, side)
+            before = episode
+    values = (brakes / clock.ticks, changes * 10.0 / clock.seconds, side.float(), before.collided.float())
+    return RunBehaviour(*(value.double().numpy() for value in values))
+
+
+def find_least_time(episode: Episode) -> tuple[Tensor, Tensor]:
+    """Return the least time to collision along the ego's beams [s], and whether that beam looks sideways, (B,) each."""
+    assert episode.perception is not None
+    ego = episode.perception[:, 0]
+    closing = -ego[:, RATE_COLUMNS]
+    times = torch.where(closing > 0.0, ego[:, RANGE_COLUMNS] / closing.clamp(min=1e-4), TTC_MAX)
+    least, beam = times.min(dim=1)
+    angle = beam_angles(times).abs()[beam]
+    return least, (angle >= SIDEWAYS_ANGLES[0]) & (angle <= SIDEWAYS_ANGLES[1])
+
+
+MORE_LANE_CHANGES = PaperClaim("perturbed weights make lane changes more frequent", above=True)
+MORE_HARD_BRAKES = PaperClaim("perturbed weights make hard brakes more frequent", above=True)
+MORE_SIDESWIPES = PaperClaim("dangerous events include frequent sideswipes", above=True)
+
+
+def compare_behaviour(
+    failing: RunBehaviour, ordinary: RunBehaviour, with_their_weights: RunBehaviour, all_failing: int
+) -> list[Finding]:
+    """Test what the paper says of behaviour."""
+    groups = "ordinary starts with weights of failing runs / with their own"
+    found = [
+        compare_means(
+            MORE_LANE_CHANGES,
+            "lane changes of a vehicle in 10 s",
+            with_their_weights.lane_changes,
+            ordinary.lane_changes,
+            groups,
+        ),
+        compare_means(
+            MORE_HARD_BRAKES,
+            "share of steps that brake at 3 m/s^2 or more",
+            with_their_weights.hard_brakes,
+            ordinary.hard_brakes,
+            groups,
+        ),
+    ]
+    words = "share of runs whose least time to collision is along a beam to the side (45 to 135 degrees)"
+    collided = f"the ego collides in {failing.collided.mean():.0%} of the failing runs"
+    return [
+        *found,
+        compare_means(
+            MORE_SIDESWIPES,
+            f"{words}; {collided}, {len(failing.collided):,} of {all_failing:,} driven again",
+            failing.sideways,
+            ordinary.sideways,
+        ),
+    ]

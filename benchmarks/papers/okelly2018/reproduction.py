@@ -1,20 +1,46 @@
-"""Reproduction of O'Kelly et al. 2018: rollouts made, record and figures written."""
+"""Reproduction of O'Kelly et al. 2018: rollouts made, summed up, record and figures written."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from benchmarks.papers.okelly2018.figures import describe_figures, make_figures
+import numpy as np
+
+from benchmarks.papers.okelly2018.estimates import (
+    ThresholdEstimate,
+    compare_with_naive,
+    estimate_naive,
+    estimate_weighted,
+    mean_ratio,
+)
+from benchmarks.papers.okelly2018.findings import compare_behaviour, compare_starts, measure_behaviour
 from benchmarks.papers.okelly2018.printed import describe_printed
-from benchmarks.papers.okelly2018.scales import CORE_SPEEDS, EGO_NAMES, STUDY_SCALES
-from benchmarks.papers.okelly2018.study import HighwayStudy, measure_highway
-from benchmarks.papers.okelly2018.summary import summarise_highway
-from benchmarks.papers.okelly2018.tables import make_tables
-from benchmarks.papers.record import check_reproduction_folder, make_record, write_record
+from benchmarks.papers.okelly2018.search import (
+    CORE_SPEEDS,
+    EGO_NAMES,
+    PRINTED_SEARCH,
+    SEARCHES,
+    STUDY_SCALES,
+    SearchSettings,
+    choose_sampler,
+    describe_sampler,
+    draw_chunk,
+    find_log_ratios,
+)
+from benchmarks.papers.okelly2018.study import (
+    ChunkJob,
+    HighwayStudy,
+    MeasuredHighway,
+    SearchRun,
+    measure_highway,
+)
+from benchmarks.papers.okelly2018.tables import describe_figures, list_thresholds, make_figures, make_tables
+from benchmarks.papers.record import Finding, check_folder, make_record, write_record
+from samplers.problem import FloatArray
 
 SOURCE = (
     "O'Kelly, Sinha, Namkoong, Duchi and Tedrake, Scalable end-to-end autonomous vehicle testing via rare-event "
@@ -32,18 +58,10 @@ def reproduce_okelly2018(
 ) -> dict[str, Any]:
     """Make the rollouts that a folder does not have yet, and write record and figures of what there is.
 
-    Args:
-        study: Ego, scale and seed.
-        out: Folder of rollouts, record and figures.
-        command: As typed.
-        executor: Where rollouts are made; None for this process.
-        limit: Rollouts to make now at most; the page says what is not run.
-        progress: Whether to show bars.
-
     Raises:
         BadInput: The folder has rollouts of something else, or damaged ones.
     """
-    check_reproduction_folder(out, study.identity)
+    check_folder(out, study.identity)
     problem = study.make_problem()
     measured = measure_highway(study, out, problem, executor, limit, progress)
     record = make_okelly_record(study, command, summarise_highway(study, problem, measured))
@@ -52,13 +70,7 @@ def reproduce_okelly2018(
 
 
 def make_okelly_record(study: HighwayStudy, command: str, found: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the record of a study.
-
-    Args:
-        study: What was measured.
-        command: As typed.
-        found: As `benchmarks.papers.okelly2018.summary.summarise_highway` returns it.
-    """
+    """Return the record of a study."""
     details = {name: value for name, value in found.items() if name != "findings"}
     return make_record(
         title=f"O'Kelly et al. 2018 with the {study.ego} ego, {study.scale} scale",
@@ -108,3 +120,148 @@ def write_notes(study: HighwayStudy, found: Mapping[str, Any]) -> list[str]:
 def _say_speed(speed: float) -> str:
     """Return the beginning of a sentence: not the speed of this run, so that equal seeds give equal notes."""
     return f"At {speed:,.4g} rollouts a second, about what a core of an AMD EPYC makes by its processor time,"
+
+
+FAILING_DRIVEN, ORDINARY_COMPARED = 256, 4000
+"""Failing runs that are driven again for their behaviour, and ordinary starts that are compared."""
+ORDINARY_DRIVEN = {"lidar": 512, "vision": 64}
+"""Ordinary runs that are driven again, by ego: one with a camera takes 70 times as long."""
+WEIGHT_COUNT = 404
+FIRST = 8
+"""Outcomes that a record has, so that others can see whether they get the same."""
+
+
+def summarise_highway(study: HighwayStudy, problem: Any, measured: MeasuredHighway) -> dict[str, Any]:
+    """Return the figures of what was measured, as plain values but for the findings.
+
+    Returns:
+        naive, naive_equal: Estimates of the thresholds, and of as many draws as a final sample has; empty if none.
+        searches: By name: settings, iterations made, sampler, estimates and comparisons with naive Monte Carlo.
+        own: Estimates of our default method.
+        findings: Tested statements.
+        first: Outcomes of the first naive rollouts.
+        rollouts: All of them but those of our own method.
+        rollouts_per_second: Of the fastest chunk of naive Monte Carlo, wall time; None if there is none.
+    """
+    scale, f = study.settings, _join([each.f for each in measured.naive])
+    references = [estimate_naive(f, gamma) for gamma in study.gammas] if len(f) else []
+    equal = [estimate_naive(f[: scale.final], gamma) for gamma in study.gammas] if len(f) >= scale.final else []
+    searches = {name: _summarise_search(study, run, f, SEARCHES[name]) for name, run in measured.searches.items()}
+    return {
+        "naive": [asdict(each) for each in references],
+        "naive_equal": [asdict(each) for each in equal],
+        "searches": searches,
+        "own": [compare_own(each, references) for each in measured.own],
+        "findings": _find(study, problem, measured, f) if len(f) else [],
+        "rollouts": len(f) + sum(each["search"] + each["final"] for each in searches.values()),
+        "first": f[:FIRST].tolist(),
+        "rollouts_per_second": max(
+            (len(each.f) / each.seconds for each in measured.naive if each.seconds), default=None
+        ),
+    }
+
+
+def _summarise_search(
+    study: HighwayStudy, run: SearchRun, naive: FloatArray, settings: SearchSettings
+) -> dict[str, Any]:
+    scale = study.settings
+    n_search = len(run.steps) * scale.draws
+    found: dict[str, Any] = {
+        **asdict(settings),
+        "iterations": len(run.steps),
+        "of": scale.iterations,
+        "search": n_search,
+        "final": sum(len(each.f) for each in run.final),
+        "steps": [{"quantile": s.quantile, "level": s.level, "elite": s.elite, "ess": s.ess} for s in run.steps],
+        "estimates": [],
+        "comparisons": [],
+    }
+    if not run.final or not len(naive):
+        return found
+    references = [estimate_naive(naive, gamma) for gamma in study.gammas]
+    jobs = run.jobs[: len(run.final)]
+    f = _join([each.f for each in run.final])
+    ratios = _join(
+        [find_log_ratios(run.base, run.chosen, draw_chunk(job.sampler, job.n, study.seed, job.key)) for job in jobs]
+    )
+    estimates = [estimate_weighted(f, ratios, gamma) for gamma in study.gammas]
+    comparisons = [
+        compare_with_naive(each, reference, n_search) for each, reference in zip(estimates, references, strict=True)
+    ]
+    return found | {
+        "chosen": choose_sampler(run.steps),
+        "sampler": describe_sampler(run.base, run.chosen),
+        "mean_ratio": mean_ratio(ratios),
+        "estimates": [asdict(each) for each in estimates],
+        "comparisons": [asdict(each) for each in comparisons],
+        "curve": _trace_curve(study, f, ratios, naive, n_search),
+    }
+
+
+def _trace_curve(
+    study: HighwayStudy, f: FloatArray, ratios: FloatArray, naive: FloatArray, n_search: int
+) -> list[dict[str, Any]]:
+    """Return the comparisons with naive Monte Carlo over the thresholds of the figures."""
+    return [
+        asdict(compare_with_naive(estimate_weighted(f, ratios, gamma), estimate_naive(naive, gamma), n_search))
+        for gamma in list_thresholds(study.gammas)
+    ]
+
+
+def compare_own(own: dict[str, Any], references: Sequence[ThresholdEstimate]) -> dict[str, Any]:
+    """Add the gain over naive Monte Carlo at as many simulations, by the method's own c.o.v.
+
+    Example:
+        >>> own = {"gamma": 0.5, "p": 1e-3, "cov": 0.1, "n_sim": 1000}
+        >>> naive = ThresholdEstimate(0.5, n=10_000, events=10, p=1e-3, standard_error=3.2e-4)
+        >>> round(compare_own(own, [naive])["gain"], 1)
+        99.9
+    """
+    p = next((each.p for each in references if each.gamma == own["gamma"]), 0.0)
+    error = own["p"] * own["cov"]
+    gain = p * (1.0 - p) / own["n_sim"] / error**2 if p > 0.0 and 0.0 < error < float("inf") else None
+    return {**own, "gain": gain}
+
+
+def _find(study: HighwayStudy, problem: Any, measured: MeasuredHighway, f: FloatArray) -> list[Finding]:
+    """Test what the paper says on the naive runs, and on the sampler of the search as printed."""
+    fails = f <= study.gammas[-1]
+    failing = _draw_rows(study, measured.naive_jobs, np.flatnonzero(fails))
+    ordinary = _draw_rows(study, measured.naive_jobs, np.flatnonzero(~fails)[:ORDINARY_COMPARED])
+    found: list[Finding] = []
+    if len(failing) > 1:
+        columns, usual = problem.space.columns(failing), problem.space.columns(ordinary)
+        found += compare_starts(columns, usual, "failing / ordinary")
+    run = measured.searches[PRINTED_SEARCH]
+    if run.final:
+        drawn = draw_chunk(run.chosen, ORDINARY_COMPARED, study.seed, "starts of the sampler")
+        found += compare_starts(
+            problem.space.columns(drawn), problem.space.columns(ordinary), "sampler of the search as printed / ordinary"
+        )
+    if len(failing) > 1:
+        again, usual_x = failing[:FAILING_DRIVEN], ordinary[: ORDINARY_DRIVEN[study.ego]]
+        mixed = usual_x.copy()
+        weights = slice(problem.space.dim - WEIGHT_COUNT, problem.space.dim)
+        mixed[:, weights] = again[np.arange(len(mixed)) % len(again)][:, weights]
+        found += compare_behaviour(
+            measure_behaviour(problem, again),
+            measure_behaviour(problem, usual_x),
+            measure_behaviour(problem, mixed),
+            all_failing=len(failing),
+        )
+    return found
+
+
+def _draw_rows(study: HighwayStudy, jobs: Sequence[ChunkJob], rows: Any) -> FloatArray:
+    """Return some rows of a stage, drawn again, shape (n, d)."""
+    size = study.settings.chunk
+    parts = [
+        draw_chunk(job.sampler, job.n, study.seed, job.key)[rows[rows // size == number] % size]
+        for number, job in enumerate(jobs)
+        if (rows // size == number).any()
+    ]
+    return _join(parts)
+
+
+def _join(parts: Sequence[FloatArray]) -> FloatArray:
+    return np.concatenate(parts) if parts else np.empty(0)

@@ -1,43 +1,43 @@
-"""The study: naive Monte Carlo, four searches and our own method, made as far as they are not there yet."""
+"""The study: naive Monte Carlo, four searches and our own method, made as far as they are not there yet.
+
+Rollouts are made in chunks, each a line of a file: a run goes on where it ended, days later or elsewhere.
+"""
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Executor
 from dataclasses import asdict, dataclass, field
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 import rare_envs
 import samplers
-from benchmarks.papers.okelly2018.rollouts import (
-    ChunkJob,
-    ChunkOutcomes,
-    RolloutFolder,
-    split_jobs,
-)
-from benchmarks.papers.okelly2018.scales import (
+from benchmarks.papers.okelly2018.search import (
     EGO_NAMES,
     PRINTED_SEARCH,
     SEARCHES,
     STUDY_SCALES,
     THRESHOLDS,
     SearchSettings,
-    StudyScale,
-)
-from benchmarks.papers.okelly2018.search import (
     SearchStep,
+    StudyScale,
     choose_sampler,
     draw_chunk,
     make_base,
     take_step,
 )
 from benchmarks.run_lines import RunLines, drop_torn_line
-from samplers.methods.cross_entropy import Product
+from benchmarks.samplers.runs import map_jobs
+from samplers.methods.blocks import Product
+from samplers.problem import FloatArray
 
-HIGHWAY_ENV_ID = "rare_envs/Highway-v0"
+WAITING = 64
+"""Chunks that an executor has at a time: a sampler of 428 dimensions takes a megabyte."""
 
 
 @dataclass(frozen=True)
@@ -73,7 +73,9 @@ class HighwayStudy:
 
     def make_problem(self) -> rare_envs.DrivingProblem:
         """Return the highway with the ego; noise is one sequence, as in the released code: 428 dimensions."""
-        return rare_envs.DrivingProblem(HIGHWAY_ENV_ID, ego=EGO_NAMES[self.ego], measure="lidar_ttc", noise="fixed")
+        return rare_envs.DrivingProblem(
+            "rare_envs/Highway-v0", ego=EGO_NAMES[self.ego], measure="lidar_ttc", noise="fixed"
+        )
 
     @property
     def identity(self) -> dict[str, Any]:
@@ -89,6 +91,104 @@ class HighwayStudy:
             "settings": asdict(self.settings),
             "gammas": list(self.gammas),
         }
+
+
+class ChunkJob(NamedTuple):
+    """Scenarios that are to be simulated."""
+
+    key: str
+    """Unique in the study, `naive/3`; with the seed it determines the draws."""
+    n: int
+    sampler: Product
+    """Where they are drawn from."""
+
+
+@dataclass(frozen=True, eq=False)
+class ChunkOutcomes:
+    """What came of them: a line of a file."""
+
+    key: str
+    seed: int
+    seconds: float
+    """Wall time of its simulations."""
+    f: FloatArray
+    """Outcomes, rounded to single precision, in which the simulator computes."""
+
+    @classmethod
+    def from_line(cls, line: dict[str, Any]) -> ChunkOutcomes:
+        """Return the content of a line."""
+        f = np.array(line["f"], dtype=np.float32).astype(np.float64)
+        return cls(str(line["key"]), int(line["seed"]), float(line["seconds"]), f)
+
+    def to_line(self) -> dict[str, Any]:
+        """Return the content of the line, with as few digits as give the same numbers."""
+        f = [float(str(value)) for value in self.f.astype(np.float32)]
+        return {"key": self.key, "seed": self.seed, "seconds": round(self.seconds, 3), "f": f}
+
+
+def split_jobs(stage: str, n: int, size: int, sampler: Product) -> list[ChunkJob]:
+    """Return the chunks of a stage with n rollouts, of `size` at most."""
+    starts = range(0, n, size)
+    return [ChunkJob(f"{stage}/{number}", min(size, n - start), sampler) for number, start in enumerate(starts)]
+
+
+def simulate_chunk(job: ChunkJob, problem: Any, seed: int) -> ChunkOutcomes:
+    """Draw the scenarios of a chunk and simulate them."""
+    x = draw_chunk(job.sampler, job.n, seed, job.key)
+    start = time.perf_counter()
+    f = np.asarray(problem.evaluate(x)).astype(np.float32).astype(np.float64)
+    return ChunkOutcomes(job.key, seed, time.perf_counter() - start, f)
+
+
+@dataclass
+class RolloutFolder:
+    """Makes rollouts and keeps their outcomes in files of a folder, one for each stage."""
+
+    folder: Path
+    problem: Any
+    """What simulates; has `evaluate`."""
+    header: dict[str, Any]
+    """What all lines have in common."""
+    seed: int
+    executor: Executor | None = None
+    """Where the simulations are made; None for this process."""
+    limit: int | None = None
+    """Rollouts to make now at most; None for all."""
+    progress: bool = False
+    made: int = 0
+    """Rollouts that were made now."""
+
+    def outcomes(self, jobs: Sequence[ChunkJob], description: str = "") -> list[ChunkOutcomes]:
+        """Return the outcomes of the chunks of one stage, the missing ones made as far as the limit allows."""
+        stage = jobs[0].key.partition("/")[0]
+        lines = RunLines(
+            self.folder / f"{stage}.jsonl",
+            self.header,
+            ChunkOutcomes.from_line,
+            ChunkOutcomes.to_line,
+            key_of_job=lambda job: job.key,
+            key_of_run=lambda run: run.key,
+        )
+        drop_torn_line(lines.file)
+        known = {run.key for run in lines.read()}
+        wanted: list[ChunkJob] = []
+        for job in jobs:
+            if job.key not in known and not self.spend(job.n):
+                break
+            wanted.append(job)
+        progress = self.progress and any(job.key not in known for job in wanted)
+        return lines.complete(wanted, self._make, progress, description)
+
+    def spend(self, n: int) -> bool:
+        """Return whether n more rollouts may be made now; they are counted then."""
+        allowed = self.limit is None or self.made + n <= self.limit
+        self.made += n if allowed else 0
+        return allowed
+
+    def _make(self, jobs: list[ChunkJob]) -> Iterator[ChunkOutcomes]:
+        once = partial(simulate_chunk, problem=self.problem, seed=self.seed)
+        for first in range(0, len(jobs), WAITING):
+            yield from map_jobs(once, jobs[first : first + WAITING], executor=self.executor)
 
 
 @dataclass
@@ -107,8 +207,7 @@ class SearchRun:
         return self.steps[choose_sampler(self.steps)].sampler
 
 
-@dataclass
-class MeasuredHighway:
+class MeasuredHighway(NamedTuple):
     """Outcomes of all stages, as far as they were made."""
 
     naive: list[ChunkOutcomes]
@@ -125,15 +224,7 @@ def measure_highway(
     limit: int | None = None,
     progress: bool = False,
 ) -> MeasuredHighway:
-    """Make the rollouts that a folder does not have yet.
-
-    Args:
-        study: What is to be measured.
-        out: Folder of the files.
-        problem: What simulates.
-        executor: Where; None for this process.
-        limit: Rollouts to make now at most.
-        progress: Whether to show bars.
+    """Make the rollouts that a folder does not have yet, `limit` of them at most.
 
     Raises:
         BadInput: The folder has rollouts of something else, or damaged ones.
@@ -141,34 +232,28 @@ def measure_highway(
     scale = study.settings
     out.mkdir(parents=True, exist_ok=True)
     rollouts = RolloutFolder(out, problem, study.header, study.seed, executor, limit, progress)
-    base = make_base(problem, SEARCHES[PRINTED_SEARCH])
-    jobs = split_jobs("naive", scale.naive, scale.chunk, base)
+    jobs = split_jobs("naive", scale.naive, scale.chunk, make_base(problem, SEARCHES[PRINTED_SEARCH]))
     naive = rollouts.outcomes(jobs, "naive Monte Carlo")
     searches = {
-        name: run_search(rollouts, problem, number, settings, study)
+        name: run_search(rollouts, number, settings, study)
         for number, (name, settings) in enumerate(SEARCHES.items(), 1)
     }
-    own = _run_own(rollouts, study, out, problem, progress)
+    known = read_own(study, out)
+    wanted = [gamma for gamma in study.gammas if scale.own and (gamma in known or rollouts.spend(scale.own))]
+    own = estimate_own(study, out, problem, wanted, progress and not known.issuperset(wanted)) if wanted else []
     return MeasuredHighway(naive, jobs[: len(naive)], searches, own)
 
 
-def run_search(
-    rollouts: RolloutFolder, problem: Any, number: int, settings: SearchSettings, study: HighwayStudy
-) -> SearchRun:
+def run_search(rollouts: RolloutFolder, number: int, settings: SearchSettings, study: HighwayStudy) -> SearchRun:
     """Run algorithm 1 and draw from the sampler that it chooses, as far as rollouts may be made.
 
-    Args:
-        rollouts: Makes and keeps them.
-        problem: What they are of.
-        number: Of the search; its files are `search_NUMBER.jsonl` and `final_NUMBER.jsonl`.
-        settings: Of the search.
-        study: Numbers, seed and threshold.
+    Its files are `search_NUMBER.jsonl` and `final_NUMBER.jsonl`.
     """
-    scale, base = study.settings, make_base(problem, settings)
-    run, sampler = SearchRun(base), base
+    scale, base = study.settings, make_base(rollouts.problem, settings)
+    run, sampler, title = SearchRun(base), base, f"search {number} of {len(SEARCHES)}"
     for k in range(scale.iterations):
         jobs = split_jobs(f"search_{number}/{k}", scale.draws, scale.chunk, sampler)
-        found = rollouts.outcomes(jobs, f"search {number} of {len(SEARCHES)}, iteration {k + 1}")
+        found = rollouts.outcomes(jobs, f"{title}, iteration {k + 1}")
         if len(found) < len(jobs):
             return run
         x = np.concatenate([draw_chunk(sampler, job.n, study.seed, job.key) for job in jobs])
@@ -176,34 +261,21 @@ def run_search(
         step, sampler = take_step(base, sampler, x, f, settings, study.gammas[0])
         run.steps.append(step)
     run.jobs = split_jobs(f"final_{number}", scale.final, scale.chunk, run.chosen)
-    run.final = rollouts.outcomes(run.jobs, f"search {number} of {len(SEARCHES)}, final sample")
+    run.final = rollouts.outcomes(run.jobs, f"{title}, final sample")
     return run
 
 
-def _run_own(
-    rollouts: RolloutFolder, study: HighwayStudy, out: Path, problem: Any, progress: bool
-) -> list[dict[str, Any]]:
-    """Estimate every threshold by the package's default method, as far as simulations may be made."""
-    if study.settings.own == 0:
-        return []
+def read_own(study: HighwayStudy, out: Path) -> set[float]:
+    """Return the thresholds of which a folder has an estimate by our default method."""
     lines = _open_own(study, out)
     drop_torn_line(lines.file)
-    known = {run["gamma"] for run in lines.read()}
-    wanted = [gamma for gamma in study.gammas if gamma in known or rollouts.spend(study.settings.own)]
-    return estimate_own(study, out, problem, wanted, progress and not known.issuperset(wanted))
+    return {run["gamma"] for run in lines.read()}
 
 
 def estimate_own(
     study: HighwayStudy, out: Path, problem: Any, gammas: Sequence[float], progress: bool = False
 ) -> list[dict[str, Any]]:
-    """Estimate thresholds by the package's default method, but those that the folder has.
-
-    Args:
-        study: Budget and seed.
-        out: Folder of the file.
-        problem: What simulates.
-        gammas: Thresholds [s].
-        progress: Whether to show a bar.
+    """Estimate thresholds [s] by the package's default method, but those that the folder has.
 
     Raises:
         BadInput: The folder has estimates of something else or of other code, or damaged ones.
@@ -212,12 +284,10 @@ def estimate_own(
     def make(missing: list[float]) -> Iterator[dict[str, Any]]:
         for gamma in missing:
             found = samplers.estimate(problem, gamma=gamma, seed=study.seed, max_sim=study.settings.own)
-            low, high = found.interval
             yield {
                 "gamma": gamma,
                 "p": found.p,
-                "low": low,
-                "high": high,
+                **dict(zip(("low", "high"), found.interval, strict=True)),
                 "cov": found.cov,
                 "n_sim": found.n_sim,
                 "method": found.method.name,
@@ -228,7 +298,6 @@ def estimate_own(
 
 
 def _open_own(study: HighwayStudy, out: Path) -> RunLines[float, dict[str, Any]]:
-    """Return the estimates of our default method in a folder."""
     return RunLines(
         out / "own.jsonl", study.header, dict, dict, key_of_job=lambda gamma: gamma, key_of_run=lambda run: run["gamma"]
     )

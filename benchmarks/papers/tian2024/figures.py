@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import partial
 from typing import Any
 
+import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator, StrMethodFormatter
 
 from benchmarks.papers.record import DrawnFigure
-from benchmarks.papers.tian2024.catalogue import SCENARIO_ROWS, SYSTEMS
-from benchmarks.papers.tian2024.replications import FIGURE7_METHOD, ReplicationRun
+from benchmarks.papers.tian2024.replications import FIGURE7_METHOD, SCENARIO_ROWS, SYSTEMS, ReplicationRun
 from rare_envs.study.plots import HIT_COLOUR, LINE_COLOUR, ORDINARY_COLOUR
 
 _ROMAN = ("I", "II", "III", "IV", "V", "VI", "VII", "VIII")
@@ -67,22 +68,16 @@ def collect_figures(runs: Sequence[ReplicationRun]) -> dict[str, dict[str, Any]]
 
 def draw_figures(figures: Mapping[str, Mapping[str, Any]]) -> list[DrawnFigure]:
     """Return the drawings of what `collect_figures` returns; none of a figure without data."""
+    rates, subsets, comparison = (figures[f"figure{number}"] for number in (6, 7, 8))
+    rows = -(-len(subsets["levels"]) // _PANELS_IN_A_ROW)
     drawn = []
-    if figures["figure6"]["lines"]:
-        drawn.append(_page_figure("figure6", figures, _draw_rates, (8.0, 3.2)))
-    if figures["figure7"]["levels"]:
-        rows = -(-len(figures["figure7"]["levels"]) // _PANELS_IN_A_ROW)
-        drawn.append(_page_figure("figure7", figures, _draw_subsets, (7.2, 3.4 * rows)))
-    if figures["figure8"]["lines"] or any(figures["figure8"]["ends"].values()):
-        drawn.append(_page_figure("figure8", figures, _draw_comparison, (6.4, 3.8)))
+    if rates["lines"]:
+        drawn.append(DrawnFigure("figure6", partial(_draw_rates, data=rates), (8.0, 3.2)))
+    if subsets["levels"]:
+        drawn.append(DrawnFigure("figure7", partial(_draw_subsets, data=subsets), (7.2, 3.4 * rows)))
+    if comparison["lines"] or any(comparison["ends"].values()):
+        drawn.append(DrawnFigure("figure8", partial(_draw_comparison, data=comparison), (6.4, 3.8)))
     return drawn
-
-
-def _page_figure(
-    name: str, figures: Mapping[str, Mapping[str, Any]], draw: Any, size: tuple[float, float]
-) -> DrawnFigure:
-    data = figures[name]
-    return DrawnFigure(name, lambda figure: draw(figure, data), size)
 
 
 def _line(run: ReplicationRun) -> dict[str, list[float]]:
@@ -109,11 +104,10 @@ def _draw_rates(figure: Figure, data: Mapping[str, Any]) -> None:
             for line in data["lines"]:
                 if (line["scenario"], line["system"]) != (scenario, system):
                     continue
-                half = [1.96 * (p * (1.0 - p) / n) ** 0.5 for n, p in zip(line["n"], line["p"], strict=True)]
-                low = [p - each for p, each in zip(line["p"], half, strict=True)]
-                high = [p + each for p, each in zip(line["p"], half, strict=True)]
-                axes.plot(line["n"], line["p"], color=colour, label=system)
-                axes.fill_between(line["n"], low, high, color=colour, alpha=0.15, linewidth=0)
+                n, p = np.array(line["n"]), np.array(line["p"])
+                half = 1.96 * np.sqrt(p * (1.0 - p) / n)
+                axes.plot(n, p, color=colour, label=system)
+                axes.fill_between(n, p - half, p + half, color=colour, alpha=0.15, linewidth=0)
         axes.set_title(scenario, fontsize=9)
         axes.xaxis.set_major_locator(MaxNLocator(4))
         axes.xaxis.set_major_formatter(StrMethodFormatter("{x:,.0f}"))
@@ -126,14 +120,14 @@ def _draw_rates(figure: Figure, data: Mapping[str, Any]) -> None:
 def _draw_subsets(figure: Figure, data: Mapping[str, Any]) -> None:
     levels = data["levels"]
     rows = -(-len(levels) // _PANELS_IN_A_ROW)
-    everything = [row for level in levels for row in level]
-    limits = [_pad(min(column), max(column)) for column in zip(*everything, strict=True)]
+    everything = np.array([row for level in levels for row in level])
+    low, high = everything.min(axis=0), everything.max(axis=0)
+    margin = np.where(high > low, 0.02 * (high - low), 0.5)
     for number, level in enumerate(levels):
         axes: Any = figure.add_subplot(rows, _PANELS_IN_A_ROW, number + 1, projection="3d")
         v1, v2, dis1y = zip(*level, strict=True) if level else ((), (), ())
         axes.scatter(v1, v2, dis1y, s=4, color=HIT_COLOUR if number == len(levels) - 1 else ORDINARY_COLOUR)
-        for set_limits, ends in zip((axes.set_xlim, axes.set_ylim, axes.set_zlim), limits, strict=True):
-            set_limits(*ends)
+        axes.set(**dict(zip(("xlim", "ylim", "zlim"), zip(low - margin, high + margin, strict=True), strict=True)))
         axes.set_title(f"subset {_ROMAN[number] if number < len(_ROMAN) else number + 1}", fontsize=9)
         axes.tick_params(labelsize=6)
         for axis in (axes.xaxis, axes.yaxis, axes.zaxis):
@@ -142,11 +136,6 @@ def _draw_subsets(figure: Figure, data: Mapping[str, Any]) -> None:
         axes.set_xlabel("v1 [m/s]", fontsize=7)
         axes.set_ylabel("v2 [m/s]", fontsize=7)
         axes.set_zlabel("dis1y [m]", fontsize=7)
-
-
-def _pad(low: float, high: float) -> tuple[float, float]:
-    margin = 0.02 * (high - low) or 0.5
-    return low - margin, high + margin
 
 
 def _draw_comparison(figure: Figure, data: Mapping[str, Any]) -> None:

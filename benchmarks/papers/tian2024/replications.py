@@ -1,28 +1,38 @@
-"""Replications: one run of a method on a system in a scenario, with every simulation counted."""
+"""Replications of Tables II and III: one run of a method on a system in a scenario, with every simulation counted."""
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from functools import cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.papers.tian2024.catalogue import (
-    EPISODE_SECONDS,
-    METHOD_ROWS,
-    SCENARIO_ROWS,
-    SYSTEMS,
-    TRAFFIC_BASE,
-)
 from benchmarks.samplers.runs import SeededEstimate, use_one_core
 from rare_envs.problem import DrivingProblem
 from samplers.estimation import estimate
-from samplers.method import whole_simulations
+from samplers.method import Stepping, whole_simulations
+from samplers.methods.cross_entropy import CrossEntropy
+from samplers.methods.importance_sampling import ImportanceSampling
+from samplers.methods.improved_cross_entropy import ImprovedCrossEntropy
+from samplers.methods.monte_carlo import MonteCarlo
+from samplers.methods.subset import AdaptiveSubsetSimulation, SubsetSimulation
 from samplers.methods.two_stage.method import TwoStage
 from samplers.result import Estimate
 
+TRAFFIC_BASE = "highway"
+"""Base distribution: assembled from published statistics of German motorways; the paper's mixtures are not public."""
+EPISODE_SECONDS = 5.0
+"""Of an episode [s]: 50 steps of 0.1 s in the released code."""
+HALF_WIDTH = 0.2
+"""Relative half-width of the 95 % interval at which Monte Carlo and importance sampling stop."""
+POINTS_OF_A_LEVEL = 500
+"""Of subset simulation, as the text says."""
+ADSS_SIMULATIONS = 2681
+"""What Table II prints for ADSS with Apollo: our methods get as many in all, their search included."""
+DRAWS_AT_MOST = 2_000_000
+"""Of Monte Carlo and importance sampling, should they not stop before."""
 MOST_TRACE_POINTS = 60
 """Of a run's estimate on its way."""
 SHOWN_POINTS = 150
@@ -30,15 +40,55 @@ SHOWN_POINTS = 150
 FIGURE7_METHOD = "SS"
 
 
-@dataclass(frozen=True)
-class ReplicationJob:
-    """A replication that is to be made; the name of each part is one of the catalogue.
+class ScenarioRow(NamedTuple):
+    """A scenario and its table."""
 
-    Example:
-        >>> run = run_replication(ReplicationJob("car-following", "IDM", "ADSS", seed=0))
-        >>> run.simulated == run.n_sim, run.final <= run.n_sim
-        (True, True)
-    """
+    env_id: str
+    table: str
+    title: str
+
+
+class MethodRow(NamedTuple):
+    """A method as it is run in the tables."""
+
+    method: Stepping
+    max_sim: int | None = None
+    target_cov: float | None = None
+    paper: str = ""
+    """The paper's name of the method whose printed numbers stand beside it; empty for none."""
+    on_stack: Stepping | None = None
+    """The method with other settings for the stack, whose rollouts are not compiled: few large batches."""
+
+
+SCENARIO_ROWS = {
+    "car-following": ScenarioRow("rare_envs/CarFollowing-v0", "table2", "Table II: 3-D car-following"),
+    "cut-in": ScenarioRow("rare_envs/CutIn-v0", "table3", "Table III: 6-D cut-in"),
+}
+SYSTEMS = {"IDM": "idm", "stack": "noisy:idm"}
+"""Systems under test: the paper's IDM, and an imperfect stack around it in the place of Apollo."""
+_N = POINTS_OF_A_LEVEL
+METHOD_ROWS = {
+    "MC": MethodRow(MonteCarlo(), DRAWS_AT_MOST, HALF_WIDTH / 1.96, "MCS"),
+    "IS": MethodRow(
+        ImportanceSampling(half_width=HALF_WIDTH, n=DRAWS_AT_MOST),
+        paper="IS",
+        on_stack=ImportanceSampling(half_width=HALF_WIDTH, n=DRAWS_AT_MOST, batch=10_000),
+    ),
+    "SS": MethodRow(SubsetSimulation(n=_N, distribution="normal"), paper="SS"),
+    "ADSS": MethodRow(AdaptiveSubsetSimulation(n=_N), paper="ADSS"),
+    "ADSS as printed": MethodRow(AdaptiveSubsetSimulation(n=_N, proposal="metropolis", sigma0="seeds")),
+    "two-stage": MethodRow(TwoStage(), ADSS_SIMULATIONS),
+    "cross-entropy": MethodRow(CrossEntropy(), ADSS_SIMULATIONS),
+    "improved cross-entropy": MethodRow(ImprovedCrossEntropy(), ADSS_SIMULATIONS),
+}
+"""The paper's methods with its settings, then ours."""
+Key = tuple[str, str, str]
+"""Scenario, system and method."""
+Levels = tuple[tuple[float, ...], ...]
+
+
+class ReplicationJob(NamedTuple):
+    """A replication that is to be made."""
 
     scenario: str
     system: str
@@ -65,14 +115,12 @@ class ReplicationRun(SeededEstimate):
     warnings: tuple[str, ...]
     trace: tuple[tuple[int, float, float], ...]
     """Simulations so far, estimate and threshold on the way."""
-    level_means: tuple[tuple[float, ...], ...] = ()
+    level_means: Levels = ()
     """Subset simulation: means of the parameters among the points of each level that are in its subset."""
-    level_points: tuple[tuple[tuple[float, ...], ...], ...] = ()
+    level_points: tuple[Levels, ...] = field(default=())
     """Subset simulation: some of these points, in the order of the scenario's parameters."""
 
-    def to_line(self) -> dict[str, Any]:
-        """Return the run as a line of a file has it."""
-        return asdict(self)
+    to_line = asdict
 
     @classmethod
     def from_line(cls, content: dict[str, Any]) -> ReplicationRun:
@@ -82,9 +130,13 @@ class ReplicationRun(SeededEstimate):
         return cls(**{**content, **nested, "trace": trace, "warnings": tuple(content["warnings"])})
 
     @property
-    def key(self) -> tuple[str, str, str, int]:
-        """What tells runs apart."""
-        return self.scenario, self.system, self.method, self.seed
+    def row(self) -> Key:
+        """Where the run stands in the tables."""
+        return self.scenario, self.system, self.method
+
+
+def _as_tuples(value: Any) -> Any:
+    return tuple(_as_tuples(each) for each in value) if isinstance(value, list | tuple) else value
 
 
 class CountedSimulations:
@@ -99,7 +151,7 @@ class CountedSimulations:
         return getattr(self.problem, name)
 
     def evaluate(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return f of scenarios x (n, d), shape (n,)."""
+        """Return f (n,) of scenarios x (n, d)."""
         self.simulated += len(x)
         f: NDArray[np.float64] = self.problem.evaluate(x)
         return f
@@ -131,7 +183,7 @@ def run_replication(job: ReplicationJob) -> ReplicationRun:
     with use_one_core():
         result = estimate(
             problem,
-            row.find_method(job.system),
+            row.on_stack if job.system == "stack" and row.on_stack else row.method,
             seed=job.seed,
             max_sim=row.max_sim,
             target_cov=row.target_cov,
@@ -175,15 +227,10 @@ def _thin_trace(result: Estimate) -> tuple[tuple[int, float, float], ...]:
     return tuple((int(spent[k]), result.trace[k].estimate, result.trace[k].gamma) for k in chosen)
 
 
-Levels = tuple[tuple[float, ...], ...]
-
-
 def _subsets(result: Estimate, dim: int) -> tuple[Levels, tuple[Levels, ...]]:
     """Return, of the points that each level of subset simulation found in its subset, the means and some of them.
 
-    Args:
-        result: With all its points.
-        dim: Parameters that are not noise, the first of x.
+    `dim` is the number of parameters that are not noise, the first of x.
     """
     assert result.points is not None
     assert result.simulations is not None
@@ -191,14 +238,5 @@ def _subsets(result: Estimate, dim: int) -> tuple[Levels, tuple[Levels, ...]]:
     stage = result.simulations.describe(0, result.n_sim).stage
     bounds = [np.inf, *(level.gamma for level in result.trace[:-1])]
     subsets = [x[(stage == level) & (f <= bound)] for level, bound in enumerate(bounds)]
-    means = tuple(tuple(float(value) for value in subset.mean(axis=0)) for subset in subsets if len(subset))
-    points = tuple(_round_rows(subset[:SHOWN_POINTS]) for subset in subsets)
-    return means, points
-
-
-def _round_rows(x: NDArray[np.float64]) -> Levels:
-    return tuple(tuple(round(float(value), 3) for value in row) for row in x)
-
-
-def _as_tuples(value: Any) -> Any:
-    return tuple(_as_tuples(each) for each in value) if isinstance(value, list | tuple) else value
+    means = tuple(tuple(subset.mean(axis=0).tolist()) for subset in subsets if len(subset))
+    return means, _as_tuples([np.round(subset[:SHOWN_POINTS], 3).tolist() for subset in subsets])

@@ -3,31 +3,28 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from concurrent.futures import Executor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import rare_envs
-from benchmarks.papers.record import check_reproduction_folder, make_record, write_record
-from benchmarks.papers.tian2024.catalogue import (
+from benchmarks.papers.record import check_folder, make_record, write_record
+from benchmarks.papers.tian2024.figures import collect_figures, draw_figures
+from benchmarks.papers.tian2024.printed import TIAN_SOURCE
+from benchmarks.papers.tian2024.replications import (
     ADSS_SIMULATIONS,
     EPISODE_SECONDS,
+    FIGURE7_METHOD,
     METHOD_ROWS,
     POINTS_OF_A_LEVEL,
     SCENARIO_ROWS,
     SYSTEMS,
     TRAFFIC_BASE,
-)
-from benchmarks.papers.tian2024.claims import assess_claims
-from benchmarks.papers.tian2024.figures import collect_figures, draw_figures
-from benchmarks.papers.tian2024.printed import TIAN_SOURCE
-from benchmarks.papers.tian2024.replications import (
-    FIGURE7_METHOD,
     ReplicationJob,
     ReplicationRun,
     run_replication,
 )
+from benchmarks.papers.tian2024.summary import assess_claims, group_runs
 from benchmarks.papers.tian2024.tables import make_method_tables
 from benchmarks.run_lines import RunLines
 from benchmarks.samplers.runs import map_jobs
@@ -54,9 +51,6 @@ class TianPlan:
     """Replications of Monte Carlo, which take most of the time; None for as many as of the others."""
     further: int | None = None
     """Replications of the methods that the paper does not have; None for as many as of those that it has."""
-    scenarios: tuple[str, ...] = tuple(SCENARIO_ROWS)
-    systems: tuple[str, ...] = tuple(SYSTEMS)
-    methods: tuple[str, ...] = tuple(METHOD_ROWS)
 
     def __post_init__(self) -> None:
         if self.replications < 2:
@@ -66,17 +60,6 @@ class TianPlan:
                 raise ValueError(f"Expected 2 to {self.replications} replications of {what}, got {number}.")
         if self.seed < 0:
             raise ValueError(f"Expected a seed of at least 0, got {self.seed}.")
-        for name, chosen, known in (
-            ("scenario", self.scenarios, SCENARIO_ROWS),
-            ("system", self.systems, SYSTEMS),
-            ("method", self.methods, METHOD_ROWS),
-        ):
-            unknown = [each for each in chosen if each not in known]
-            if unknown or not chosen:
-                got = repr(unknown[0]) if unknown else "none"
-                raise ValueError(f"Expected a {name} of {', '.join(known)}, got {got}.")
-        if "MC" not in self.methods:
-            raise ValueError("Expected MC among the methods: the others are compared with it.")
 
     @property
     def identity(self) -> dict[str, Any]:
@@ -87,52 +70,34 @@ class TianPlan:
 
     def jobs(self) -> list[ReplicationJob]:
         """Return the replications: the paper's methods, then further ones, Monte Carlo at the end."""
-        others = [method for method in self.methods if method != "MC"]
-        parts = [
-            {method: self.replications for method in others if METHOD_ROWS[method].paper},
-            {method: self.further or self.replications for method in others if not METHOD_ROWS[method].paper},
-            {"MC": self.monte_carlo or self.replications},
-        ]
-        return [job for counts in parts for job in self._list_jobs(counts)]
-
-    def _list_jobs(self, counts: dict[str, int]) -> list[ReplicationJob]:
-        """Return the replications of methods, as many of each as is said."""
+        own = {name: self.replications for name, row in METHOD_ROWS.items() if row.paper and name != "MC"}
+        further = {name: self.further or self.replications for name, row in METHOD_ROWS.items() if not row.paper}
         return [
             ReplicationJob(
                 scenario, system, method, self.seed + k, points=method == FIGURE7_METHOD and scenario == "cut-in"
             )
-            for k in range(max(counts.values(), default=0))
-            for scenario in self.scenarios
-            for system in self.systems
+            for counts in (own, further, {"MC": self.monte_carlo or self.replications})
+            for k in range(self.replications)
+            for scenario in SCENARIO_ROWS
+            for system in SYSTEMS
             for method, count in counts.items()
             if k < count
         ]
 
 
 def reproduce_tian2024(
-    plan: TianPlan, out: Path, command: str, workers: int = 1, executor: Executor | None = None, progress: bool = False
+    plan: TianPlan, out: Path, command: str, workers: int = 1, progress: bool = False
 ) -> dict[str, Any]:
-    """Make the replications that a folder does not have yet, and write record and figures.
-
-    Args:
-        plan: What is to be run.
-        out: Folder of the files.
-        command: As typed, for the record.
-        workers: Processes.
-        executor: Where replications are made instead, any `concurrent.futures.Executor`.
-        progress: Whether to show a bar.
-
-    Returns:
-        The record.
+    """Make the replications that a folder does not have yet, write record and figures, and return the record.
 
     Raises:
         BadInput: The folder has runs of something else or of other code, or damaged ones.
     """
-    check_reproduction_folder(out, plan.identity)
+    check_folder(out, plan.identity)
     out.mkdir(parents=True, exist_ok=True)
     lines = open_replications(out, plan)
     runs = lines.complete(
-        plan.jobs(), lambda missing: map_jobs(run_replication, missing, workers, executor), progress, "replications"
+        plan.jobs(), lambda missing: map_jobs(run_replication, missing, workers), progress, "replications"
     )
     record = record_replications(plan, runs, command)
     write_record(out, record, draw_figures(record["figures"]))
@@ -146,8 +111,8 @@ def open_replications(out: Path, plan: TianPlan) -> RunLines[ReplicationJob, Rep
         {"study": plan.identity, "rare_envs": rare_envs.__version__},
         ReplicationRun.from_line,
         ReplicationRun.to_line,
-        key_of_job=lambda job: (job.scenario, job.system, job.method, job.seed),
-        key_of_run=lambda run: run.key,
+        key_of_job=lambda job: job[:4],
+        key_of_run=lambda run: (*run.row, run.seed),
     )
 
 
@@ -192,22 +157,17 @@ def _describe_setting(plan: TianPlan) -> list[str]:
     ]
 
 
-_COLUMNS = ("seed", "p", "low", "high", "cov", "n_sim", "simulated", "final", "levels")
+RUN_COLUMNS = ("seed", "p", "low", "high", "cov", "n_sim", "simulated", "final", "levels")
 """Of the single runs in the record."""
 
 
 def _list_runs(runs: Sequence[ReplicationRun]) -> list[dict[str, Any]]:
     """Return the runs of each method on each system in each scenario, a list for each of their figures."""
-    groups: dict[tuple[str, str, str], list[dict[str, Any]]] = {}
-    for run in runs:
-        groups.setdefault((run.scenario, run.system, run.method), []).append(run.to_line())
     return [
         {
-            "scenario": scenario,
-            "system": system,
-            "method": method,
-            **{name: [line[name] for line in lines] for name in _COLUMNS},
-            "warnings": [len(line["warnings"]) for line in lines],
+            **dict(zip(("scenario", "system", "method"), key, strict=True)),
+            **{name: [getattr(run, name) for run in group] for name in RUN_COLUMNS},
+            "warnings": [len(run.warnings) for run in group],
         }
-        for (scenario, system, method), lines in groups.items()
+        for key, group in group_runs(runs).items()
     ]

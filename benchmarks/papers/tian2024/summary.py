@@ -1,18 +1,21 @@
-"""Figures over the replications of a method: mean, c.o.v., its square, error, simulations and gain, with intervals."""
+"""Figures over the replications of a method, with intervals, and what they say of the paper's statements."""
 
 from __future__ import annotations
 
 import math
-from collections import defaultdict
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import groupby
 
 import numpy as np
 from scipy import stats
 
-from benchmarks.papers.tian2024.replications import ReplicationRun
+from benchmarks.papers.record import Finding
+from benchmarks.papers.tian2024.replications import FIGURE7_METHOD, Key, ReplicationRun
 
 INTERVAL_CONFIDENCE = 0.95
+_UPPER = 0.5 + INTERVAL_CONFIDENCE / 2
+_LOWER = 0.5 - INTERVAL_CONFIDENCE / 2
 Ends = tuple[float, float]
 
 
@@ -39,28 +42,10 @@ class ReplicationSummary:
     """p by Monte Carlo; its own error is left out."""
 
     @classmethod
-    def of_runs(cls, runs: Sequence[ReplicationRun], truth: float | None = None) -> ReplicationSummary:
-        """Return the summary of runs of one method on one system in one scenario."""
-        return cls.of_estimates(
-            [run.p for run in runs],
-            float(np.mean([run.final for run in runs])),
-            float(np.mean([run.simulated for run in runs])),
-            truth,
-        )
-
-    @classmethod
     def of_estimates(
-        cls,
-        p: Sequence[float],
-        simulations: float,
-        all_simulations: float | None = None,
-        truth: float | None = None,
+        cls, p: Sequence[float], simulations: float, all_simulations: float | None = None, truth: float | None = None
     ) -> ReplicationSummary:
-        """Return the summary of two estimates or more; p is their mean where no truth is given.
-
-        Raises:
-            ValueError: There are fewer.
-        """
+        """Return the summary of two estimates or more; p is their mean where no truth is given."""
         if len(p) < 2:
             raise ValueError(f"Expected 2 replications at least, got {len(p)}.")
         mean, spread = float(np.mean(p)), float(np.std(p, ddof=1))
@@ -76,15 +61,14 @@ class ReplicationSummary:
     @property
     def mean_interval(self) -> Ends:
         """Interval of the mean by Student's distribution."""
-        half = float(stats.t.ppf(0.5 + INTERVAL_CONFIDENCE / 2, self.replications - 1)) * self.cov * self.mean
-        half /= self.replications**0.5
+        half = float(stats.t.ppf(_UPPER, self.replications - 1)) * self.cov * self.mean / self.replications**0.5
         return max(self.mean - half, 0.0), self.mean + half
 
     @property
     def cov_interval(self) -> Ends:
         """Interval of the c.o.v. by the chi-square distribution of the variance of normal estimates."""
         df = self.replications - 1
-        low, high = (float(stats.chi2.ppf(0.5 + side * INTERVAL_CONFIDENCE / 2, df)) for side in (1, -1))
+        low, high = (float(stats.chi2.ppf(share, df)) for share in (_UPPER, _LOWER))
         return self.cov * (df / low) ** 0.5, self.cov * (df / high) ** 0.5
 
     @property
@@ -99,10 +83,10 @@ class ReplicationSummary:
         return self.mean / self.truth - 1.0
 
     @property
-    def square_error(self) -> float:
-        """Mean square error of the estimates over p², p by Monte Carlo."""
+    def work(self) -> float:
+        """All simulations times the mean square error over p², p by Monte Carlo; less is better."""
         spread = 0.0 if self.mean == 0.0 else (self.cov * self.mean / self.truth) ** 2
-        return spread + self.error**2
+        return self.all_simulations * (spread + self.error**2)
 
     @property
     def gain(self) -> float:
@@ -117,26 +101,34 @@ class ReplicationSummary:
     def gain_interval(self) -> Ends:
         """Interval of the gain by the chi-square distribution of the mean square error of normal estimates."""
         df = self.replications - 1
-        low, high = (float(stats.chi2.ppf(0.5 + side * INTERVAL_CONFIDENCE / 2, df)) for side in (-1, 1))
+        low, high = (float(stats.chi2.ppf(share, df)) for share in (_LOWER, _UPPER))
         return self.gain * low / df, self.gain * high / df
 
-    @property
-    def work(self) -> float:
-        """All simulations times the mean square error over p²; less is better."""
-        return self.all_simulations * self.square_error
+
+Summaries = Mapping[Key, ReplicationSummary]
 
 
-def summarise_runs(runs: Iterable[ReplicationRun]) -> dict[tuple[str, str, str], ReplicationSummary]:
-    """Return the summaries by scenario, system and method."""
-    groups: Mapping[tuple[str, str, str], list[ReplicationRun]] = defaultdict(list)
+def group_runs(runs: Iterable[ReplicationRun]) -> dict[Key, list[ReplicationRun]]:
+    """Return the runs by scenario, system and method."""
+    groups: dict[Key, list[ReplicationRun]] = {}
     for run in runs:
-        groups[run.scenario, run.system, run.method].append(run)
-    truths = {
-        (scenario, system): ReplicationSummary.of_runs(group).mean
-        for (scenario, system, method), group in groups.items()
-        if method == "MC"
+        groups.setdefault(run.row, []).append(run)
+    return groups
+
+
+def summarise_runs(runs: Iterable[ReplicationRun]) -> dict[Key, ReplicationSummary]:
+    """Return the summaries by scenario, system and method; the truth of a system is its Monte Carlo."""
+    groups = group_runs(runs)
+    truths = {key[:2]: float(np.mean([run.p for run in group])) for key, group in groups.items() if key[2] == "MC"}
+    return {
+        key: ReplicationSummary.of_estimates(
+            [run.p for run in group],
+            float(np.mean([run.final for run in group])),
+            float(np.mean([run.simulated for run in group])),
+            truths.get(key[:2]),
+        )
+        for key, group in groups.items()
     }
-    return {key: ReplicationSummary.of_runs(group, truths.get(key[:2])) for key, group in groups.items()}
 
 
 def ratio_of_work(one: ReplicationSummary, other: ReplicationSummary) -> tuple[float, Ends]:
@@ -151,5 +143,77 @@ def ratio_of_work(one: ReplicationSummary, other: ReplicationSummary) -> tuple[f
     """
     ratio = one.work / other.work
     df = one.replications - 1, other.replications - 1
-    low, high = (float(stats.f.ppf(0.5 + side * INTERVAL_CONFIDENCE / 2, *df)) for side in (1, -1))
+    low, high = (float(stats.f.ppf(share, *df)) for share in (_UPPER, _LOWER))
     return ratio, (ratio / low, ratio / high)
+
+
+def assess_claims(runs: Sequence[ReplicationRun]) -> list[Finding]:
+    """Return the paper's statements with what the replications say about them, as far as there are runs."""
+    found = summarise_runs(runs)
+    return [*_efficiency(found, "SS"), *_efficiency(found, "IS"), *_accuracy(found), *_moves(runs)]
+
+
+def _efficiency(found: Summaries, other: str) -> Iterator[Finding]:
+    for scenario, system, method in found:
+        if method == "ADSS" and (scenario, system, other) in found:
+            ratio, ends = ratio_of_work(found[scenario, system, other], found[scenario, system, "ADSS"])
+            yield Finding(
+                claim=f"ADSS needs fewer simulations than {other} ({scenario}, {system})",
+                statistic=f"all simulations times mean square error of {other} over that of ADSS",
+                value=ratio,
+                interval=ends,
+                verdict=_judge(ends, 1.0),
+            )
+
+
+def _accuracy(found: Summaries) -> Iterator[Finding]:
+    for (scenario, system, method), ours in found.items():
+        if method != "IS" or (scenario, system, "MC") not in found:
+            continue
+        truth = found[scenario, system, "MC"]
+        ratio = 1.0 + ours.error
+        error = ratio * (ours.cov**2 / ours.replications + truth.cov**2 / truth.replications) ** 0.5
+        half = float(stats.t.ppf(_UPPER, ours.replications - 1)) * error
+        ends = ratio - half, ratio + half
+        yield Finding(
+            claim=f"IS is off by 2 to 17 % ({scenario}, {system})",
+            statistic="mean of p by IS over that by Monte Carlo",
+            value=ratio,
+            interval=ends,
+            verdict="no error to be seen" if ends[0] <= 1.0 <= ends[1] else f"off by {100 * (ratio - 1):+.0f} %",
+        )
+
+
+_MOVES = (
+    (1, 1.0, "the cutter's speed v2 increases from subset to subset", "m/s"),
+    (3, -1.0, "the gap dis1x to it decreases from subset to subset", "m"),
+)
+"""Columns of the cut-in, the signs of their moves, the paper's statements and units."""
+
+
+def _moves(runs: Sequence[ReplicationRun]) -> Iterator[Finding]:
+    for system, group in groupby(sorted(runs, key=lambda run: run.system), lambda run: run.system):
+        means = [
+            run.level_means
+            for run in group
+            if (run.scenario, run.method) == ("cut-in", FIGURE7_METHOD) and len(run.level_means) > 1
+        ]
+        for column, sign, claim, unit in _MOVES if len(means) > 1 else ():
+            moved = np.array([levels[-1][column] - levels[0][column] for levels in means])
+            error = moved.std(ddof=1) / len(moved) ** 0.5
+            half = float(stats.t.ppf(_UPPER, len(moved) - 1)) * error
+            ends = float(moved.mean() - half), float(moved.mean() + half)
+            yield Finding(
+                claim=f"{claim} (cut-in, {system})",
+                statistic=f"mean in the last subset less that in the first [{unit}]",
+                value=float(moved.mean()),
+                interval=ends,
+                verdict=_judge(ends if sign > 0 else (-ends[1], -ends[0]), 0.0),
+            )
+
+
+def _judge(ends: Ends, bound: float) -> str:
+    """Return whether a statistic that the statement has above a bound is so."""
+    if ends[0] > bound:
+        return "holds"
+    return "the opposite holds" if ends[1] < bound else "cannot be told from these replications"

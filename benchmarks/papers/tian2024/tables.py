@@ -3,56 +3,40 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
+from typing import Any
 
-from benchmarks.papers.record import ComparedValue, ComparisonTable, MeasuredRow
-from benchmarks.papers.tian2024.catalogue import (
+from benchmarks.papers.record import ComparedValue, ComparisonTable
+from benchmarks.papers.tian2024.printed import EXPLANATIONS, MOST_HALF_WIDTH_DRAWS, PRINTED, RELEASED, PrintedRow
+from benchmarks.papers.tian2024.replications import (
     ADSS_SIMULATIONS,
     METHOD_ROWS,
     POINTS_OF_A_LEVEL,
     SCENARIO_ROWS,
     SYSTEMS,
+    Key,
+    ReplicationRun,
 )
-from benchmarks.papers.tian2024.printed import (
-    EXPLANATIONS,
-    MOST_HALF_WIDTH_DRAWS,
-    PRINTED,
-    RELEASED,
-    PrintedRow,
-)
-from benchmarks.papers.tian2024.replications import ReplicationRun
-from benchmarks.papers.tian2024.summary import Ends, ReplicationSummary, summarise_runs
+from benchmarks.papers.tian2024.summary import ReplicationSummary, Summaries, group_runs, summarise_runs
 
 SYSTEM_LABELS = {"IDM": "IDM", "stack": "stack (paper: Apollo)"}
-METHOD_LABELS = {"MCS": "Monte Carlo", "IS": "IS", "SS": "SS", "ADSS": "ADSS"}
-Summaries = Mapping[tuple[str, str, str], ReplicationSummary]
 
 
 def make_method_tables(runs: Sequence[ReplicationRun]) -> list[ComparisonTable]:
-    """Return Tables II and III, as far as there are runs.
-
-    Args:
-        runs: Of the methods, Monte Carlo among them wherever another one is.
-    """
+    """Return Tables II and III, as far as there are runs; Monte Carlo is among them wherever another method is."""
     found = summarise_runs(runs)
-    levels = _mean_levels(runs)
-    return [
-        _make_table(scenario, found, levels) for scenario in SCENARIO_ROWS if any(key[0] == scenario for key in found)
+    levels = {key: sum(run.levels for run in group) / len(group) for key, group in group_runs(runs).items()}
+    return [_make_table(scenario, found, levels) for scenario in SCENARIO_ROWS if scenario in {key[0] for key in found}]
+
+
+def _make_table(scenario: str, found: Summaries, levels: dict[Key, float]) -> ComparisonTable:
+    keys = [(scenario, system, method) for system in SYSTEMS for method in METHOD_ROWS]
+    values = [
+        value
+        for key in keys
+        if key in found and METHOD_ROWS[key[2]].paper
+        for value in _compare(key, METHOD_ROWS[key[2]].paper, found[key], levels[key])
     ]
-
-
-def _make_table(scenario: str, found: Summaries, levels: Mapping[tuple[str, str, str], float]) -> ComparisonTable:
-    values: list[ComparedValue] = []
-    measured: list[MeasuredRow] = []
-    for system in SYSTEMS:
-        for method, row in METHOD_ROWS.items():
-            key = (scenario, system, method)
-            if key not in found:
-                continue
-            if row.paper:
-                values += _compare(key, row.paper, found[key], levels[key])
-            else:
-                measured.append(_measure(key, found[key]))
     used = {reason for value in values for reason in value.reasons}
     return ComparisonTable(
         name=SCENARIO_ROWS[scenario].table,
@@ -60,58 +44,66 @@ def _make_table(scenario: str, found: Summaries, levels: Mapping[tuple[str, str,
         keys=("method", "system under test"),
         values=tuple(values),
         explanations={name: text for name, text in EXPLANATIONS.items() if name in used},
-        measured=tuple(measured),
+        measured=tuple(_measure(key, found[key]) for key in keys if key in found and not METHOD_ROWS[key[2]].paper),
         measured_title=f"Our methods with {ADSS_SIMULATIONS:,} simulations, and ADSS in its other reading",
     )
 
 
-def _compare(key: tuple[str, str, str], paper: str, ours: ReplicationSummary, levels: float) -> Iterator[ComparedValue]:
+def _compare(key: Key, paper: str, ours: ReplicationSummary, levels: float) -> Iterator[ComparedValue]:
     """Yield the numbers of a method that the paper has beside ours."""
     scenario, system, _ = key
     printed = PRINTED.get((scenario, system, paper), PrintedRow())
-    only_text = ("text",) if scenario == "cut-in" else ()
-
-    def value(
-        quantity: str,
-        theirs: float | None,
-        mine: float | None,
-        reasons: tuple[str, ...],
-        interval: Ends | None = None,
-        released: str = "",
-        all_in: float | None = None,
-    ) -> ComparedValue:
-        known = _finite(mine)
-        return ComparedValue(
-            labels=(METHOD_LABELS[paper], SYSTEM_LABELS[system]),
-            quantity=quantity,
-            paper=theirs,
-            ours=known,
-            interval=interval if known is not None and interval is not None else None,
-            ours_all_in=all_in,
-            released=released,
-            reasons=(*reasons, *(only_text if theirs is not None else ())),
-        )
-
     stacked = ("system",) if system == "stack" else ()
-    level_methods = paper in ("SS", "ADSS")
     spread = {"IS": ("squared", "weights"), "MCS": ("squared", "chance")}.get(
         paper, ("squared", "settings", "limit state", *stacked)
     )
     cost = {"IS": ("weights",), "MCS": ("stop rule", "traffic")}.get(paper, ("traffic", "settings"))
-    yield value("mean of p", printed.p, ours.mean, ("traffic", *stacked), ours.mean_interval, RELEASED[paper])
-    if paper != "MCS":
-        reasons = ("chance", *stacked) if level_methods else ("weights", "chance")
-        yield value("error of the mean against Monte Carlo", printed.error, abs(ours.error), reasons)
-    yield value("c.o.v. of p", printed.cov, ours.cov, spread, ours.cov_interval)
-    yield value(
-        'square of the c.o.v. (printed as "COV")', printed.squared_cov, ours.squared_cov, spread,
-        ours.squared_cov_interval,
-    )  # fmt: skip
-    yield value(
-        "simulations, as the paper counts", printed.n_sim, ours.simulations, (*cost, "counting"),
-        released=_released_cost(paper, printed.p, ours, levels), all_in=ours.all_simulations,
-    )  # fmt: skip
-    yield value("gain over plain Monte Carlo", printed.gain, ours.gain, (*cost, "counting"), ours.gain_interval)
+    off = ("weights", "chance") if paper == "IS" else ("chance", *stacked)
+    rows: list[tuple[str, float | None, float, tuple[str, ...], dict[str, Any]]] = [
+        (
+            "mean of p",
+            printed.p,
+            ours.mean,
+            ("traffic", *stacked),
+            {"interval": ours.mean_interval, "released": RELEASED[paper]},
+        ),
+        ("error of the mean against Monte Carlo", printed.error, abs(ours.error), off, {}),
+        ("c.o.v. of p", printed.cov, ours.cov, spread, {"interval": ours.cov_interval}),
+        (
+            'square of the c.o.v. (printed as "COV")',
+            printed.squared_cov,
+            ours.squared_cov,
+            spread,
+            {"interval": ours.squared_cov_interval},
+        ),
+        (
+            "simulations, as the paper counts",
+            printed.n_sim,
+            ours.simulations,
+            (*cost, "counting"),
+            {"released": _released_cost(paper, printed.p, ours, levels), "ours_all_in": ours.all_simulations},
+        ),
+        (
+            "gain over plain Monte Carlo",
+            printed.gain,
+            ours.gain,
+            (*cost, "counting"),
+            {"interval": ours.gain_interval},
+        ),
+    ]
+    for quantity, theirs, mine, reasons, further in rows:
+        if paper == "MCS" and quantity.startswith("error"):
+            continue  # it is compared with itself
+        if not math.isfinite(mine):
+            further = {name: value for name, value in further.items() if name != "interval"}
+        yield ComparedValue(
+            labels=("Monte Carlo" if paper == "MCS" else paper, SYSTEM_LABELS[system]),
+            quantity=quantity,
+            paper=theirs,
+            ours=_finite(mine),
+            reasons=(*reasons, "text") if scenario == "cut-in" and theirs is not None else reasons,
+            **further,
+        )
 
 
 def _released_cost(paper: str, p: float | None, ours: ReplicationSummary, levels: float) -> str:
@@ -126,7 +118,7 @@ def _released_cost(paper: str, p: float | None, ours: ReplicationSummary, levels
     return ""
 
 
-def _measure(key: tuple[str, str, str], ours: ReplicationSummary) -> MeasuredRow:
+def _measure(key: Key, ours: ReplicationSummary) -> dict[str, Any]:
     values = {
         "mean of p": ours.mean,
         "error of the mean": abs(ours.error),
@@ -138,17 +130,9 @@ def _measure(key: tuple[str, str, str], ours: ReplicationSummary) -> MeasuredRow
         "gain, from": ours.gain_interval[0],
         "to": ours.gain_interval[1],
     }
-    return MeasuredRow(
-        labels=(key[2], SYSTEM_LABELS[key[1]]), values={name: _finite(value) for name, value in values.items()}
-    )
+    labels = (key[2], SYSTEM_LABELS[key[1]])
+    return {"labels": labels, "values": {name: _finite(value) for name, value in values.items()}}
 
 
-def _mean_levels(runs: Sequence[ReplicationRun]) -> dict[tuple[str, str, str], float]:
-    groups: dict[tuple[str, str, str], list[int]] = {}
-    for run in runs:
-        groups.setdefault((run.scenario, run.system, run.method), []).append(run.levels)
-    return {key: sum(group) / len(group) for key, group in groups.items()}
-
-
-def _finite(value: float | None) -> float | None:
-    return None if value is None or not math.isfinite(value) else value
+def _finite(value: float) -> float | None:
+    return value if math.isfinite(value) else None

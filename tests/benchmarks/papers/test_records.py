@@ -1,0 +1,308 @@
+"""Records of both papers: what the command writes and refuses; the committed ones follow from their runs."""
+
+from __future__ import annotations
+
+import copy
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import rare_envs
+from benchmarks.papers import renew
+from benchmarks.papers.__main__ import main
+from benchmarks.papers.okelly2018.study import HighwayStudy
+from benchmarks.papers.record import (
+    ComparedValue,
+    ComparisonTable,
+    DrawnFigure,
+    Finding,
+    check_folder,
+    discard_runs,
+    format_record,
+    make_record,
+    write_record,
+)
+from benchmarks.papers.renew import read_records, read_replications, renew_okelly, renew_tian
+from benchmarks.papers.tian2024 import study
+from benchmarks.papers.tian2024.replications import ReplicationJob, run_replication
+from benchmarks.papers.tian2024.study import TianPlan
+from benchmarks.papers.tian2024.tables import make_method_tables
+from rare_envs.study.errors import BadInput
+from rare_envs.threads import use_one_thread
+from samplers.output import to_json_value
+from tests.benchmarks.papers.made_runs import made_run
+
+OKELLY, TIAN = "okelly2018", "tian2024"
+TIAN_RUNS, HIGHWAY_RUNS = TianPlan(5).identity, HighwayStudy().identity
+
+
+def assert_same(one: Any, other: Any, place: str = "") -> None:
+    """Compare two records; numbers may differ by rounding, as another SciPy rounds a quantile otherwise."""
+    if isinstance(one, dict) and isinstance(other, dict):
+        assert set(one) == set(other), place
+        for name, value in one.items():
+            assert_same(value, other[name], f"{place}/{name}")
+    elif isinstance(one, list) and isinstance(other, list):
+        assert len(one) == len(other), place
+        for at, (value, shown) in enumerate(zip(one, other, strict=True)):
+            assert_same(value, shown, f"{place}/{at}")
+    elif isinstance(one, float) and isinstance(other, float):
+        assert one == pytest.approx(other, rel=1e-9, nan_ok=True), place
+    else:
+        assert one == other, place
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ([OKELLY, "--scale", "huge"], "a scale of small, full"),
+        ([OKELLY, "--ego", "radar"], "an ego of lidar, vision"),
+        ([OKELLY, "--seed", "-1"], "a seed of 0 or more"),
+        ([OKELLY, "--at-most", "-1"], "--at-most to be 0 or more"),
+        ([OKELLY, "--workers", "0"], "--workers to be 1 or more"),
+        ([TIAN, "--replications", "1"], "2 replications at least"),
+        ([TIAN, "--seed", "-1"], "a seed of at least 0"),
+        ([TIAN, "--monte-carlo-replications", "21"], "2 to 20 replications of Monte Carlo"),
+        ([TIAN, "--further-replications", "1"], "2 to 20 replications of further methods"),
+    ],
+)
+def test_bad_options_are_one_line(tmp_path: Path, words: list[str], message: str, capsys) -> None:
+    assert main([*words, "--out", str(tmp_path)]) == 2
+    told = capsys.readouterr().err
+    assert len(told.strip().splitlines()) == 1
+    assert message in told
+
+
+def test_nothing_run_is_said_to_be_so(tmp_path: Path, capsys) -> None:
+    assert main([OKELLY, "--at-most", "0", "--out", str(tmp_path), "--json"]) == 0
+    record = json.loads(capsys.readouterr().out)
+    assert record["findings"] == []
+    assert all(value["ours"] is None for table in record["tables"] for value in table["values"])
+    assert "Made: 0 of" in record["notes"][1]
+    assert "not run" in (tmp_path / "reproduction.md").read_text()
+
+
+def test_it_goes_on_unless_told_otherwise(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys) -> None:
+    seeds: list[int] = []
+    monkeypatch.setattr(study, "run_replication", lambda job: (seeds.append(job.seed), made_run(job))[1])
+    few = [TIAN, "--out", str(tmp_path), "--replications", "2"]
+    assert main(few) == 0
+    assert "IS is off by 2 to 17 %" in capsys.readouterr().out
+    first = len(seeds)
+    main(few)
+    assert len(seeds) == first
+    main([*few, "--afresh"])
+    assert len(seeds) == 2 * first
+    assert main([*few, "--seed", "1"]) == 2
+    assert "choose another --out" in capsys.readouterr().err
+
+
+def write_runs(folder: Path, study: dict, name: str = "runs.jsonl") -> Path:
+    file = folder / name
+    file.write_text(json.dumps({"study": study}) + '\n{"p": 1e-3}\n')
+    return file
+
+
+@pytest.mark.parametrize(
+    ("held", "new", "said"),
+    [
+        (TIAN_RUNS, HIGHWAY_RUNS, "holds tian2024, replications 5, seed 0; this is okelly2018, ego lidar, scale small"),
+        (
+            HIGHWAY_RUNS,
+            TIAN_RUNS,
+            "holds okelly2018, ego lidar, scale small, seed 2018; this is tian2024,",
+        ),
+        (TIAN_RUNS, TianPlan(5, seed=1).identity, "this is tian2024, replications 5, seed 1: choose another --out"),
+        (TIAN_RUNS, TianPlan(5, monte_carlo=2).identity, "this is tian2024, replications 5, of Monte Carlo 2, seed 0"),
+        (HIGHWAY_RUNS, HighwayStudy("vision").identity, "this is okelly2018, ego vision,"),
+        (HIGHWAY_RUNS, HighwayStudy(scale="full").identity, "scale full"),
+    ],
+)
+def test_another_paper_seed_scale_or_ego_is_refused(tmp_path: Path, held: dict, new: dict, said: str) -> None:
+    write_runs(tmp_path, held)
+    check_folder(tmp_path, held)
+    with pytest.raises(BadInput, match=said) as caught:
+        check_folder(tmp_path, new)
+    assert str(tmp_path) in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("line", ['{"rare_envs": "0.1.0"}\n', "[1]\n", "no JSON\n", "{}\n"])
+def test_files_of_other_commands_are_refused(tmp_path: Path, line: str) -> None:
+    (tmp_path / "own.jsonl").write_text(line)
+    with pytest.raises(BadInput, match="holds runs of another command or version; this is tian2024"):
+        check_folder(tmp_path, TIAN_RUNS)
+
+
+def test_folders_without_runs_are_taken(tmp_path: Path) -> None:
+    """None, an empty one, and one whose first line a stop has cut off."""
+    check_folder(tmp_path / "none", TIAN_RUNS)
+    check_folder(tmp_path, TIAN_RUNS)
+    (tmp_path / "runs.jsonl").write_text('{"study": {"paper": "okel')
+    check_folder(tmp_path, TIAN_RUNS)
+
+
+def test_runs_of_another_paper_are_not_deleted(tmp_path: Path) -> None:
+    others = [write_runs(tmp_path, HIGHWAY_RUNS, "a.jsonl"), tmp_path / "b.jsonl"]
+    others[1].write_text('{"rare_envs": "0.1.0"}\n')
+    for file in others:
+        discard_runs(file, "tian2024")
+        assert file.exists()
+    own = write_runs(tmp_path, TIAN_RUNS)
+    discard_runs(own, "tian2024")
+    discard_runs(own, "tian2024")
+    assert not own.exists()
+
+
+def record_by_hand() -> dict[str, Any]:
+    p = ComparedValue(labels=("SS", "IDM"), quantity="mean of p", paper=8e-4, ours=6e-4, reasons=("traffic",))
+    cost = ComparedValue(
+        labels=("SS", "IDM"), quantity="simulations", ours=4980, interval=(4900.0, 5100.0), ours_all_in=5500
+    )
+    other = ComparedValue(labels=("MC", "IDM"), quantity="mean of p", paper=8.36e-4, released="does <not> run")
+    return make_record(
+        title="A paper",
+        source="Somebody, 2024.",
+        command="python -m benchmarks.papers paper",
+        settings={"scale": "small", "seed": 3},
+        tables=[
+            ComparisonTable(
+                name="table9",
+                title="Table IX: a table.",
+                keys=("method", "system"),
+                values=(p, cost, other),
+                explanations={"traffic": "Other roads."},
+            )
+        ],
+        figures={"figure9": {"title": "Figure 9.", "caption": "A line.", "paper": "Another line.", "y": [0.0, 1.0]}},
+        findings=[Finding(claim="A < B", statistic="A / B", value=0.5, interval=(0.4, 0.6), verdict="holds")],
+        notes=["Counted."],
+        runs=[{"p": float("nan")}],
+    )
+
+
+def test_a_record_says_what_made_it_and_is_written(tmp_path: Path) -> None:
+    record = record_by_hand()
+    assert record["about"]["rare_envs"] == rare_envs.__version__
+    assert {"torch", "numba", "numpy", "processor", "scale", "seed"} <= set(record["about"])
+    assert record["tables"][0]["values"][0]["difference"] == 6e-4 / 8e-4 - 1
+    write_record(
+        tmp_path, record, [DrawnFigure("figure9", lambda drawing: drawing.subplots().plot([0.0, 1.0]), (3, 2))]
+    )
+    assert json.loads((tmp_path / "reproduction.json").read_text()) == record
+    assert "8.00e-04" in (tmp_path / "reproduction.md").read_text()
+    assert (tmp_path / "figure9.png").stat().st_size > 1000
+
+
+def test_the_markdown_has_tables_findings_and_figures() -> None:
+    lines = format_record(record_by_hand()).splitlines()
+    assert lines[0] == "## A paper"
+    assert "| SS | IDM | mean of p | 8.00e-04 | 6.00e-04 | – | -25 % | – | – | traffic |" in lines
+    assert "|  |  | simulations | – | 4,980 | 4,900 to 5,100 | – | 5,500 | – | – |" in lines
+    assert "| A < B | A / B | 0.5 | 0.4 to 0.6 | holds |" in lines
+    assert "- *traffic*: Other roads." in lines
+    assert "- Figure 9. A line. In the paper: Another line." in lines
+    assert {line.count("|") for line in lines if line.startswith("|")} == {11, 6}
+
+
+def test_a_table_has_the_labels_and_reasons_that_it_names() -> None:
+    value = ComparedValue(labels=("x",), quantity="p", reasons=("traffic",))
+    with pytest.raises(ValueError, match="Expected 2 labels"):
+        ComparisonTable(name="t", title="t", keys=("a", "b"), values=(value,))
+    with pytest.raises(ValueError, match="No explanation 'traffic'"):
+        ComparisonTable(name="t", title="t", keys=("a",), values=(value,))
+
+
+@pytest.fixture(scope="module")
+def tian() -> dict[str, Any]:
+    return read_records()["tian2024"]
+
+
+def runs_of(record: dict[str, Any], *row: str) -> dict[str, Any]:
+    (found,) = (runs for runs in record["runs"] if (runs["scenario"], runs["system"], runs["method"]) == row)
+    return found
+
+
+def test_committed_records_follow_from_their_own_runs(tmp_path: Path) -> None:
+    for paper, record in read_records().items():
+        anew = renew_tian(record, tmp_path) if paper == "tian2024" else renew_okelly(record, tmp_path, own=False)
+        assert_same(anew, record, paper)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("scenario", "method", "place"),
+    [("car-following", "IS", 0), ("car-following", "SS", 7), ("cut-in", "ADSS", 19), ("cut-in", "cross-entropy", 3)],
+)
+def test_a_cheap_run_made_again_gives_the_committed_value(tian, scenario: str, method: str, place: int) -> None:
+    runs = runs_of(tian, scenario, "IDM", method)
+    with use_one_thread():
+        again = run_replication(ReplicationJob(scenario, "IDM", method, runs["seed"][place]))
+    assert again.p == pytest.approx(runs["p"][place], rel=1e-6)
+    assert (again.n_sim, again.simulated) == (runs["n_sim"][place], runs["simulated"][place])
+
+
+def test_the_committed_record_has_the_replications_that_it_says(tian) -> None:
+    counts = {runs["method"]: len(runs["p"]) for runs in tian["runs"]}
+    assert counts.pop("MC") == tian["about"]["replications_of_monte_carlo"]
+    assert {counts.pop(method) for method in ("IS", "SS", "ADSS")} == {tian["about"]["replications"]}
+    assert set(counts.values()) == {tian["about"]["replications_of_further_methods"]}
+    assert tian["about"]["replications"] >= 20
+    for runs in tian["runs"]:
+        assert all(made >= stated for made, stated in zip(runs["simulated"], runs["n_sim"], strict=True))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("scenario", "method"), [("car-following", "ADSS"), ("cut-in", "two-stage")])
+def test_a_row_of_the_committed_tables_made_again_is_the_committed_one(tian, scenario: str, method: str) -> None:
+    with use_one_thread():
+        runs = [
+            run_replication(ReplicationJob(*run.row, run.seed)) if run.row == (scenario, "IDM", method) else run
+            for run in read_replications(tian)
+        ]
+    again = to_json_value([table.to_dict() for table in make_method_tables(runs)])
+    for one, other in zip(again, tian["tables"], strict=True):
+        for value, shown in zip(one["values"], other["values"], strict=True):
+            assert value["ours"] == pytest.approx(shown["ours"], rel=1e-6)
+        for row, shown in zip(one["measured"], other["measured"], strict=True):
+            assert row["labels"] == shown["labels"]
+            assert row["values"] == pytest.approx(shown["values"], rel=1e-6)
+
+
+def test_a_row_of_tian_that_is_wrong_is_put_right_and_the_others_stay(tian, tmp_path, monkeypatch) -> None:
+    """Replications are made and give what is committed; the others are taken from there."""
+    wrong = copy.deepcopy(tian)
+    runs_of(wrong, "cut-in", "IDM", "cross-entropy")["p"][0] *= 2
+    known = {(*run.row, run.seed): run for run in read_replications(tian)}
+    made: list[ReplicationJob] = []
+
+    def make(job: ReplicationJob):
+        made.append(job)
+        return known[job[:4]]
+
+    monkeypatch.setattr(renew, "run_replication", make)
+    assert_same(renew_tian(wrong, tmp_path, ["cross-entropy"]), tian)
+    renew_tian(wrong, tmp_path, ["cross-entropy"])
+    assert len(made) == 4 * tian["about"]["replications"]  # none is made twice
+
+
+def test_rows_of_the_papers_methods_take_a_whole_run(tian, tmp_path) -> None:
+    with pytest.raises(ValueError, match="Expected methods of ADSS as printed, two-stage"):
+        renew_tian(tian, tmp_path, ["SS"])
+
+
+def test_our_rows_of_okelly_are_put_right(tmp_path, monkeypatch) -> None:
+    record = read_records()["okelly2018"]
+    shown = record["runs"][0]["own"]
+    wrong = copy.deepcopy(record)
+    for own in wrong["runs"][0]["own"]:
+        own.update(p=1.0, gain=1.0)
+
+    def estimate(study, folder, problem, gammas, progress):
+        assert gammas == list(study.gammas)
+        return [{name: value for name, value in own.items() if name != "gain"} for own in shown]
+
+    monkeypatch.setattr(renew, "estimate_own", estimate)
+    assert_same(renew_okelly(wrong, tmp_path), record)

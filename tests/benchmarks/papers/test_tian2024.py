@@ -1,0 +1,257 @@
+"""Tian et al. 2024: replications are counted, summaries and verdicts are right, tables stand beside what is printed."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from benchmarks.papers.tian2024 import study
+from benchmarks.papers.tian2024.printed import EXPLANATIONS, PRINTED, PrintedRow
+from benchmarks.papers.tian2024.replications import (
+    CountedSimulations,
+    ReplicationJob,
+    ReplicationRun,
+    driving_problem,
+    run_replication,
+)
+from benchmarks.papers.tian2024.study import TianPlan, reproduce_tian2024
+from benchmarks.papers.tian2024.summary import ReplicationSummary, assess_claims, ratio_of_work, summarise_runs
+from benchmarks.papers.tian2024.tables import make_method_tables
+from rare_envs.study.errors import BadInput
+from rare_envs.threads import use_one_thread
+from tests.benchmarks.papers.made_runs import made_run
+
+COMMAND = "python -m benchmarks.papers tian2024 --replications 2 --seed 0"
+
+
+@pytest.mark.parametrize("system", ["stack", "IDM"])
+@pytest.mark.parametrize("method", ["MCS", "IS"])
+def test_the_printed_column_is_the_square_of_plain_monte_carlo(system: str, method: str) -> None:
+    row = PRINTED["car-following", system, method]
+    square = (1 - row.p) / (row.p * row.n_sim)
+    assert row.squared_cov == pytest.approx(square, rel=0.25)
+    assert row.cov != pytest.approx(square, rel=0.5)
+    assert f"{square:.4f}" in EXPLANATIONS["squared"]
+    assert f"{row.squared_cov:.3f}" in EXPLANATIONS["squared"]
+
+
+def test_root_error_and_gain_of_printed_rows() -> None:
+    row = PRINTED["car-following", "stack", "SS"]
+    assert row.cov == pytest.approx(0.4615, abs=1e-4)
+    assert row.error == pytest.approx(0.017, abs=5e-4)
+    assert row.gain == pytest.approx((1 / 2.392e-4 - 1) / 4980 / (0.213 * 0.98286**2 + 0.01714**2), rel=1e-3)
+    assert (PrintedRow().gain, PrintedRow().cov) == (None, None)
+
+
+@pytest.fixture(scope="module")
+def subset_run() -> ReplicationRun:
+    with use_one_thread():
+        return run_replication(ReplicationJob("cut-in", "IDM", "SS", seed=3, points=True))
+
+
+def test_all_simulations_are_counted_and_subsets_have_ever_smaller_gaps(subset_run: ReplicationRun) -> None:
+    assert subset_run.simulated == subset_run.n_sim == subset_run.final == subset_run.trace[-1][0]
+    assert 500 + 400 * (subset_run.levels - 1) <= subset_run.n_sim <= 500 * subset_run.levels
+    assert len(subset_run.level_means) == len(subset_run.level_points) == subset_run.levels
+    assert {len(row) for level in subset_run.level_points for row in level} == {6}
+    gaps = [means[3] for means in subset_run.level_means]
+    assert gaps[-1] < 0.5 * gaps[0]
+    offsets = np.array(subset_run.level_points[0])[:, 5]
+    assert 2.2 <= offsets.min() <= offsets.max() <= 5.0
+    assert ReplicationRun.from_line(json.loads(json.dumps(subset_run.to_line()))) == subset_run
+
+
+def test_the_search_of_importance_sampling_is_told_from_its_estimate() -> None:
+    with use_one_thread():
+        run = run_replication(ReplicationJob("car-following", "IDM", "IS", seed=0))
+    assert run.simulated == run.n_sim > run.final >= 1000
+    assert run.level_points == ()
+
+
+@pytest.mark.parametrize(
+    "content", [{}, {"trace": 1}, {**made_run(ReplicationJob("a", "b", "c", 0)).to_line(), "x": 1}]
+)
+def test_a_line_of_something_else_is_no_run(content) -> None:
+    with pytest.raises((KeyError, TypeError, ValueError)):
+        ReplicationRun.from_line(content)
+
+
+def test_the_counter_counts_rows_whatever_asks() -> None:
+    problem = CountedSimulations(driving_problem("car-following", "IDM"))
+    x = problem.base.sample(5, np.random.default_rng(0))
+    assert problem.evaluate(x).shape == (5,)
+    terms = problem.terms(x[:2])
+    assert problem.simulated == 7
+    cost = problem.gradient(x[:2], terms.least[:2], terms.ticks[[0, 1], terms.least[:2]]).cost
+    assert problem.simulated == 7 + np.ceil(cost)
+
+
+def test_noise_of_the_stack_is_part_of_x() -> None:
+    assert [driving_problem("car-following", system).dim for system in ("IDM", "stack")] == [3, 178]
+    assert [driving_problem("cut-in", system).dim for system in ("IDM", "stack")] == [6, 281]
+
+
+def test_a_method_that_misses_most_of_p_has_no_gain() -> None:
+    """Its c.o.v. is small, its error is not."""
+    blind = ReplicationSummary.of_estimates([1e-9, 1.1e-9], 1000.0, 1000.0, truth=1e-3)
+    assert blind.cov < 0.1
+    assert blind.error == pytest.approx(-1.0, abs=1e-5)
+    assert blind.gain == pytest.approx(0.999, rel=1e-3)
+    nothing = ReplicationSummary.of_estimates([0.0, 0.0], 1000.0, 1000.0, truth=1e-3)
+    assert math.isnan(nothing.cov)
+    assert nothing.gain == pytest.approx(0.999)
+    with pytest.raises(ValueError, match="2 replications at least, got 1"):
+        ReplicationSummary.of_estimates([1e-4], 10.0)
+
+
+def test_intervals_cover_in_95_percent() -> None:
+    rng = np.random.default_rng(1)
+    gain = (1 - 1e-3) / (1e-3 * 1000 * 0.1**2)
+    held = np.zeros(3)
+    for _ in range(1000):
+        draws = list(1e-3 * rng.normal(1.0, 0.1, 20))
+        summary = ReplicationSummary.of_estimates(draws, 1000.0, truth=1e-3)
+        ends = (summary.mean_interval, summary.cov_interval, summary.gain_interval)
+        held += [low <= known <= high for (low, high), known in zip(ends, (1e-3, 0.1, gain), strict=True)]
+    low, high = stats.binom.ppf([1e-4, 1 - 1e-4], 1000, 0.95)
+    assert low <= held[0] <= high
+    assert low - 20 <= held[1] <= high + 20  # the mean that divides is estimated, too
+    assert low - 20 <= held[2] <= high + 20
+
+
+def test_plain_monte_carlo_has_a_gain_of_one_and_the_work_of_itself() -> None:
+    p, n, rng = 0.01, 2000, np.random.default_rng(0)
+    summary = ReplicationSummary.of_estimates(list(rng.binomial(n, p, 4000) / n), float(n), truth=p)
+    assert summary.gain == pytest.approx(1.0, rel=0.1)
+    ratio, (low, high) = ratio_of_work(summary, summary)
+    assert (ratio, low) == (1.0, pytest.approx(1 / high))
+
+
+def test_runs_are_compared_with_monte_carlo_of_their_cell() -> None:
+    jobs = [ReplicationJob("cut-in", "IDM", method, seed) for method in ("MC", "IS") for seed in (0, 1)]
+    found = summarise_runs([made_run(job, 2e-4 if job.method == "MC" else 1e-4) for job in jobs])
+    assert found["cut-in", "IDM", "IS"].error == pytest.approx(-0.5)
+    assert found["cut-in", "IDM", "IS"].simulations == 1500
+    assert found["cut-in", "IDM", "IS"].all_simulations == 3000
+
+
+def claims_of(spreads: dict[str, float], points: bool = False, shift: float = 0.0):
+    jobs = [
+        ReplicationJob("cut-in", "IDM", name, seed, points and name == "SS") for name in spreads for seed in range(20)
+    ]
+    factors = [1 + spreads[job.method] * (-1) ** job.seed + (shift if job.method == "IS" else 0.0) for job in jobs]
+    runs = [made_run(job, 2e-4 * factor) for job, factor in zip(jobs, factors, strict=True)]
+    return {claim.claim.partition(" (")[0]: claim for claim in assess_claims(runs)}
+
+
+def test_verdicts_on_runs_made_by_hand() -> None:
+    found = claims_of({"MC": 0.1, "ADSS": 0.2, "SS": 0.6, "IS": 0.05})
+    assert found["ADSS needs fewer simulations than SS"].verdict == "holds"
+    assert found["ADSS needs fewer simulations than IS"].verdict == "the opposite holds"
+    equal = claims_of({"MC": 0.1, "ADSS": 0.3, "SS": 0.3})
+    assert equal["ADSS needs fewer simulations than SS"].verdict == "cannot be told from these replications"
+    name = "IS is off by 2 to 17 %"
+    assert claims_of({"MC": 0.1, "IS": 0.1})[name].verdict == "no error to be seen"
+    assert claims_of({"MC": 0.1, "IS": 0.1}, shift=0.2)[name].verdict == "off by +20 %"
+    moved = claims_of({"MC": 0.1, "SS": 0.3}, points=True)
+    assert moved["the cutter's speed v2 increases from subset to subset"].verdict == "the opposite holds"
+    gap = moved["the gap dis1x to it decreases from subset to subset"]
+    assert (gap.value, gap.verdict) == (-30.0, "holds")
+    assert assess_claims([]) == []
+
+
+def tables_of(*methods: str, scenarios=("car-following", "cut-in")):
+    return make_method_tables(
+        [
+            made_run(ReplicationJob(scenario, system, method, seed))
+            for scenario in scenarios
+            for system in ("IDM", "stack")
+            for method in methods
+            for seed in (0, 1)
+        ]
+    )
+
+
+def find(table, method: str, system: str, quantity: str):
+    (found,) = (
+        value
+        for value in table.values
+        if value.labels[0] == method and value.labels[1].startswith(system) and value.quantity.startswith(quantity)
+    )
+    return found
+
+
+def test_paper_ours_and_difference() -> None:
+    table2, table3 = tables_of("MC", "SS", "IS", "ADSS", "two-stage")
+    assert (table2.name, table3.name) == ("table2", "table3")
+    p = find(table2, "SS", "IDM", "mean of p")
+    assert (p.paper, p.ours, p.difference) == (8.03e-4, pytest.approx(2e-4), pytest.approx(2 / 8.03 - 1))
+    squared = find(table2, "SS", "IDM", "square of the c.o.v.")
+    assert (squared.paper, squared.ours) == (0.152, pytest.approx(0.125))
+    assert find(table2, "SS", "IDM", "c.o.v.").paper == pytest.approx(0.152**0.5)
+    assert [find(table2, "SS", "stack", "simulations").paper, find(table2, "SS", "stack", "simulations").ours] == [
+        4980,
+        1800,
+    ]
+    assert find(table3, "SS", "stack", "mean of p").paper == 2.49e-4
+    assert "text" in find(table3, "SS", "stack", "mean of p").reasons
+    searched = find(table2, "IS", "IDM", "simulations")
+    assert (searched.ours, searched.ours_all_in) == (1500, 3000)
+    assert "does not run as released" in find(table2, "IS", "IDM", "mean of p").released
+    assert find(table2, "SS", "IDM", "simulations").released == "N in every level: 2,000 for the same levels"
+    assert find(table2, "ADSS", "IDM", "simulations").released.endswith("at the end: 2,500 for the same levels")
+    assert "114,784" in find(table2, "Monte Carlo", "IDM", "simulations").released
+    assert all(value.reasons for table in (table2, table3) for value in table.values)
+    assert [row["labels"][0] for row in table2.measured] == ["two-stage"] * 2
+    assert table2.measured[0]["values"]["all simulations"] == 2681
+    assert [table.name for table in tables_of("MC", scenarios=("cut-in",))] == ["table3"]
+
+
+@pytest.fixture
+def made(monkeypatch: pytest.MonkeyPatch) -> list[tuple]:
+    """Replications made by hand; those that were asked for are listed."""
+    asked: list[tuple] = []
+
+    def make(job):
+        asked.append(job[:4])
+        return made_run(job)
+
+    monkeypatch.setattr(study, "run_replication", make)
+    return asked
+
+
+def test_a_folder_has_lines_record_and_page_and_goes_on_to_the_same(made, tmp_path: Path) -> None:
+    plan = TianPlan(replications=2)
+    record = reproduce_tian2024(plan, tmp_path, COMMAND)
+    file = tmp_path / "runs.jsonl"
+    text = file.read_text()
+    assert len(made) == len(text.splitlines()) - 1 == 64
+    assert json.loads((tmp_path / "reproduction.json").read_text()) == record
+    assert (record["about"]["seeds"], record["command"]) == ("0 to 1", COMMAND)
+    first = record["runs"][0]
+    assert (first["scenario"], first["system"], first["method"]) == ("car-following", "IDM", "IS")
+    assert (first["seed"], first["p"], first["warnings"]) == ([0, 1], [1.5e-4, 2.5e-4], [1, 1])
+    assert first["high"] == [None, None]
+    page = (tmp_path / "reproduction.md").read_text()
+    assert all(words in page for words in ("Table II", "Table III", "### Findings", "### Figures"))
+    assert {path.stem for path in tmp_path.glob("*.png")} == {"figure6", "figure7", "figure8"}
+    file.write_text(text[:-30])  # a torn line alone is made again
+    made.clear()
+    assert reproduce_tian2024(plan, tmp_path, COMMAND) == record
+    assert (made, file.read_text()) == ([("cut-in", "stack", "MC", 1)], text)
+    made.clear()
+    with pytest.raises(BadInput, match="holds tian2024, replications 2, seed 0; this is tian2024, replications 3"):
+        reproduce_tian2024(TianPlan(replications=3), tmp_path, COMMAND)
+    assert (made, file.read_text()) == ([], text)
+
+
+def test_monte_carlo_and_further_methods_may_have_fewer_replications(made, tmp_path: Path) -> None:
+    record = reproduce_tian2024(TianPlan(replications=4, monte_carlo=2, further=3), tmp_path, COMMAND)
+    counts = {runs["method"]: len(runs["p"]) for runs in record["runs"]}
+    assert (counts["MC"], counts["SS"], counts["two-stage"]) == (2, 4, 3)
+    assert "over 4 replications (Monte Carlo 2, methods that the paper does not have 3;" in record["notes"][0]
