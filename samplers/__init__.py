@@ -10,11 +10,9 @@ from samplers.analysis.kinds import Share
 from samplers.analysis.refits import FittedBase
 from samplers.analysis.reweight import Reweighted
 from samplers.analysis.sensitivity import Sensitivity
-from samplers.arguments import RunArguments
 from samplers.comparison import Comparison, compare
-from samplers.dispatch import ExecutorError
 from samplers.distributions import as_distribution
-from samplers.estimation import EstimationInterrupted, estimate
+from samplers.estimation import METHODS, EstimationInterrupted, estimate, get_method
 from samplers.executors import Executor, FuturesPool, InProcess, LocalProcesses, RayCluster
 from samplers.method import Goal, Interrupted, Outcome, Stepping, Steps
 from samplers.methods.auto import Auto
@@ -37,12 +35,11 @@ from samplers.problem import (
     TermGradients,
     Terms,
 )
-from samplers.progress import Progress
-from samplers.registry import METHODS, get_method
 from samplers.result import Estimate
-from samplers.run import Run
+from samplers.run import Progress, Run, RunArguments
 from samplers.sample import Failure, Failures, Layer, Level, Sample, SimulatedPoints, Status
 from samplers.validation import EvaluationError
+from samplers.workers import ExecutorError
 
 __all__ = [
     "METHODS",

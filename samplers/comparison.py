@@ -14,7 +14,6 @@ from samplers.analysis.base_error import RatioUncertainty, summarise_ratio
 from samplers.analysis.refits import find_fitted_base, reweight_runs_to_refits
 from samplers.analysis.reweight import MAX_LOG
 from samplers.analysis.weighted import cov_inflation, has_independent_points, interval_of_sum, require_sample
-from samplers.arguments import RunArguments, check_problem
 from samplers.estimation import estimate
 from samplers.method import Stepping
 from samplers.methods.auto import Auto
@@ -29,8 +28,8 @@ from samplers.output import (
     write_object,
 )
 from samplers.problem import FloatArray, Problem, condition_of, names_of_columns
-from samplers.progress import Listener
 from samplers.result import Estimate, without_base
+from samplers.run import Listener, RunArguments, check_problem
 from samplers.statistics import Interval, degrees_of_freedom, effective_number, zero_hit_bound
 from samplers.validation import check_whole
 
@@ -327,7 +326,7 @@ def compare(
     if max_sim is not None:
         check_whole("max_sim (of A and B together)", max_sim, 2)
     for problem in (a, b):
-        check_problem(problem, ("dim", "base", "evaluate"))
+        check_problem(problem, "dim", "base", "evaluate")
     _check_same_base(a, b)
     problem = EitherFails(a, b, gamma)
     limit = None if max_sim is None else max_sim // 2

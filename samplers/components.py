@@ -3,10 +3,9 @@
 Where a component is N(0, I) in most directions, its ratio depends on the few others only, which keeps weights exact
 and cheap in hundreds of dimensions.
 
-The von Mises-Fisher-Nakagami distribution: a direction and, independent of it, a radius.
-
-N(0, I) is one, with uniform directions and a chi-squared square of the radius. d + 3 parameters describe
-a component where a Gaussian needs d (d + 3) / 2.
+The von Mises-Fisher-Nakagami distribution is a direction and, independent of it, a radius. N(0, I) is one, with uniform
+directions and a chi-squared square of the radius; d + 3 parameters describe a component where a Gaussian needs
+d (d + 3) / 2.
 
 References:
     Papaioannou, Geyer and Straub, "Improved cross entropy-based importance sampling with a flexible mixture
@@ -61,14 +60,11 @@ class IsotropicNormal:
 
 @dataclass(frozen=True, eq=False)
 class SubspaceGaussian:
-    """Independent Gaussians along some orthonormal axes, N(0, 1) in every direction outside their span."""
+    """Independent Gaussians along r orthonormal axes, columns (d, r), N(0, 1) in every direction outside their span."""
 
     axes: FloatArray
-    """Orthonormal columns, shape (d, r)."""
-    mean: FloatArray
-    """Along the axes, shape (r,)."""
-    variance: FloatArray
-    """Along the axes, shape (r,)."""
+    mean: FloatArray  # along the axes, (r,)
+    variance: FloatArray  # along the axes, (r,)
 
     @property
     def centre(self) -> FloatArray:
@@ -101,12 +97,10 @@ class SubspaceGaussian:
 
 @dataclass(frozen=True, eq=False)
 class LiftedComponent:
-    """A component in the coordinates of some orthonormal axes, N(0, 1) in every direction outside their span."""
+    """A component in the coordinates of r orthonormal axes, columns (d, r), N(0, 1) outside their span."""
 
     within: MixtureComponent
-    """In r dimensions."""
     axes: FloatArray
-    """Orthonormal columns, shape (d, r)."""
 
     def log_ratio(self, u: FloatArray) -> FloatArray:
         """Return the log ratio; it depends on the coordinates along the axes only."""
@@ -120,10 +114,9 @@ class LiftedComponent:
 
 @dataclass(frozen=True, eq=False)
 class HalfSpaceNormal:
-    """N(0, I) beyond a plane, axis . u >= start: the optimal proposal for a failure half-space."""
+    """N(0, I) beyond a plane, axis . u >= start, with a unit vector (d,): best for failure in a half-space."""
 
     axis: FloatArray
-    """Unit vector, shape (d,)."""
     start: float
 
     def log_ratio(self, u: FloatArray) -> FloatArray:
@@ -141,17 +134,13 @@ class HalfSpaceNormal:
 class HalfSpaceUnion:
     """N(0, I) beyond one of several planes, each in proportion to its probability, for a series system of them.
 
-    The density is phi(u) k(u) / sum_j Phi(-start_j), where u is beyond k(u) of the planes.
-
-    References:
-        Au and Beck, "First excursion probabilities for linear systems by very efficient importance sampling",
-        Probabilistic Engineering Mechanics 16, 2001.
+    The density is phi(u) k(u) / sum_j Phi(-start_j), where u is beyond k(u) of the planes (Au and Beck, "First
+    excursion probabilities for linear systems by very efficient importance sampling", Probabilistic Engineering
+    Mechanics 16, 2001). Axes are unit vectors (k, d), starts (k,) the distances of the planes from the origin.
     """
 
     axes: FloatArray
-    """Unit vectors, shape (k, d)."""
     starts: FloatArray
-    """Distances of the planes from the origin, shape (k,)."""
 
     def log_ratio(self, u: FloatArray) -> FloatArray:
         """Return log k(u) less the logarithm of the sum of the half-spaces' probabilities."""
@@ -173,19 +162,15 @@ class HalfSpaceIntersection:
     """A corner, the points beyond all of several planes: N(0, 1) cut to it, one coordinate after the other.
 
     In orthonormal coordinates t, of which the first k span the axes in their order, plane i asks for t_i >= low_i,
-    where low_i depends on the coordinates before it. The density is phi(u) / prod_i Phi(-low_i) within the corner. It
-    is N(0, I) cut to the corner where the axes are orthogonal, and near it elsewhere; 1 / density never exceeds
-    1 / phi(u).
-
-    References:
-        Genz, "Numerical computation of multivariate normal probabilities", Journal of Computational and Graphical
-        Statistics 1, 1992 (the coordinates one after the other).
+    where low_i depends on the coordinates before it (Genz, "Numerical computation of multivariate normal
+    probabilities", Journal of Computational and Graphical Statistics 1, 1992). The density is phi(u) / prod_i
+    Phi(-low_i) within the corner. It is N(0, I) cut to the corner where the axes are orthogonal, and near it elsewhere;
+    1 / density never exceeds 1 / phi(u). Axes are linearly independent unit vectors (k, d), first those that are the
+    least likely to be passed, starts (k,) the distances of the planes from the origin.
     """
 
     axes: FloatArray
-    """Linearly independent unit vectors, shape (k, d); first those that are the least likely to be passed."""
     starts: FloatArray
-    """Distances of the planes from the origin, shape (k,)."""
 
     def log_ratio(self, u: FloatArray) -> FloatArray:
         """Return -sum_i log Phi(-low_i) within the corner, -inf outside."""
@@ -277,16 +262,15 @@ LARGE_ORDER = 50.0
 
 @dataclass(frozen=True, eq=False)
 class VonMisesFisherNakagami:
-    """u = r a with a ~ von Mises-Fisher(mu, kappa) on the unit sphere and r ~ Nakagami(m, omega)."""
+    """u = r a with a ~ von Mises-Fisher(mu, kappa) on the unit sphere and r ~ Nakagami(m, omega).
+
+    mu (d,) is the mean direction, of length 1, kappa the concentration; r^2 ~ Gamma(m, omega / m), omega = E[r^2].
+    """
 
     mu: FloatArray
-    """Mean direction, of length 1, shape (d,)."""
     kappa: float
-    """Concentration."""
     m: float
-    """Shape of the radius: r^2 ~ Gamma(m, omega / m)."""
     omega: float
-    """E[r^2]."""
 
     @classmethod
     def standard(cls, dim: int) -> "VonMisesFisherNakagami":
@@ -327,13 +311,8 @@ class VonMisesFisherNakagami:
         dim = len(self.mu)
         radius = np.maximum(np.linalg.norm(u, axis=1), np.finfo(np.float64).tiny)
         m, omega = self.m, self.omega
-        nakagami = (
-            math.log(2)
-            + m * math.log(m / omega)
-            - float(gammaln(m))
-            + (2 * m - 1) * np.log(radius)
-            - m / omega * radius**2
-        )
+        nakagami = math.log(2) + m * math.log(m / omega) - float(gammaln(m))
+        nakagami = nakagami + (2 * m - 1) * np.log(radius) - m / omega * radius**2
         fisher = log_normaliser(self.kappa, dim) + self.kappa * ((u @ self.mu) / radius)
         return np.asarray(nakagami + fisher - (dim - 1) * np.log(radius))
 

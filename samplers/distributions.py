@@ -1,9 +1,9 @@
-"""Distributions of other libraries as base distributions: SciPy's frozen ones, and those of OpenTURNS."""
+"""Distributions of SciPy and OpenTURNS as base distributions; whether the parts of a base distribution fit together."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Protocol
@@ -11,111 +11,93 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
-from scipy.special import ndtr, ndtri
+from scipy.special import chdtri, gammaincinv, ndtr, ndtri, stdtrit
 
 FloatArray = NDArray[np.float64]
 
 
 class SizedDistribution(Protocol):
-    """A base distribution that knows its number of coordinates."""
+    """A base distribution (`samplers.Distribution`) that knows its number of coordinates d."""
 
     @property
     def dim(self) -> int:
-        """Number of coordinates."""
+        """D."""
 
     def sample(self, n: int, rng: np.random.Generator) -> FloatArray:
-        """Draw n independent points, shape (n, d)."""
+        """Draw n independent points, (n, d)."""
 
     def log_prob(self, x: FloatArray, /) -> FloatArray:
-        """Log density at x (n, d), shape (n,)."""
+        """Return the log density (n,) at x (n, d)."""
 
     def to_standard_normal(self, x: FloatArray, /) -> FloatArray:
-        """Map x of this distribution, shape (n, d), to u ~ N(0, I)."""
+        """Map x (n, d) of this distribution to u ~ N(0, I), (n, d)."""
 
     def from_standard_normal(self, u: FloatArray, /) -> FloatArray:
-        """Inverse of `to_standard_normal`."""
+        """Map u ~ N(0, I), (n, d), to x (n, d) of this distribution."""
 
 
 @dataclass(frozen=True, eq=False)
 class IndependentDistributions:
-    """The product of distributions, each of some consecutive coordinates.
-
-    Args:
-        parts: In the order of the coordinates.
-    """
+    """The product of distributions, each of some consecutive coordinates."""
 
     parts: tuple[SizedDistribution, ...]
 
-    @property
+    @cached_property
     def dim(self) -> int:
         """Number of coordinates d."""
         return sum(part.dim for part in self.parts)
 
-    @cached_property
-    def _ends(self) -> list[int]:
-        return [int(end) for end in np.cumsum([part.dim for part in self.parts])[:-1]]
-
-    def _apply(self, maps: Iterable[Callable[[FloatArray], Any]], x: FloatArray) -> list[FloatArray]:
-        """Return what the map of each part gives for its columns of x (n, d)."""
-        return [one(part) for one, part in zip(maps, np.split(x, self._ends, axis=1), strict=True)]
+    def _split(self, x: FloatArray) -> Iterator[tuple[SizedDistribution, FloatArray]]:
+        """Return each part with its columns of x (n, d)."""
+        ends = np.cumsum([part.dim for part in self.parts])[:-1]
+        return zip(self.parts, np.split(x, ends, axis=1), strict=True)
 
     def sample(self, n: int, rng: np.random.Generator) -> FloatArray:
-        """Draw n independent points, shape (n, d)."""
+        """Draw n independent points, (n, d)."""
         return np.hstack([part.sample(n, rng) for part in self.parts])
 
     def log_prob(self, x: FloatArray, /) -> FloatArray:
-        """Log density at x (n, d), shape (n,)."""
-        return np.asarray(np.sum(self._apply((part.log_prob for part in self.parts), x), axis=0))
+        """Return the log density (n,) at x (n, d)."""
+        return np.asarray(np.sum([part.log_prob(columns) for part, columns in self._split(x)], axis=0))
 
     def to_standard_normal(self, x: FloatArray, /) -> FloatArray:
-        """Map x of this distribution, shape (n, d), to u ~ N(0, I)."""
-        return np.hstack(self._apply((part.to_standard_normal for part in self.parts), x))
+        """Map x (n, d) to u ~ N(0, I)."""
+        return np.hstack([part.to_standard_normal(columns) for part, columns in self._split(x)])
 
     def from_standard_normal(self, u: FloatArray, /) -> FloatArray:
-        """Inverse of `to_standard_normal`."""
-        return np.hstack(self._apply((part.from_standard_normal for part in self.parts), u))
+        """Map u ~ N(0, I), (n, d), to x."""
+        return np.hstack([part.from_standard_normal(columns) for part, columns in self._split(u)])
 
     def __repr__(self) -> str:
-        """Return one line."""
         return f"<IndependentDistributions of {len(self.parts)} parts in {self.dim} dimensions>"
 
 
-def is_scipy_distribution(value: object) -> bool:
-    """Return whether value is a frozen distribution of one coordinate of `scipy.stats`, discrete ones included."""
-    kind = getattr(value, "dist", None)  # of an object of anybody
-    return type(value).__module__.startswith("scipy.stats") and kind is not None and hasattr(value, "ppf")
+class _ByItsMap:
+    """A distribution that is drawn from by its map from standard normal space, by `rng` alone."""
 
+    dim: Any
+    from_standard_normal: Any
 
-def is_scipy_normal(value: object) -> bool:
-    """Return whether value is a frozen `scipy.stats.multivariate_normal`."""
-    return type(value).__module__.startswith("scipy.stats") and hasattr(value, "cov_object")
+    def sample(self, n: int, rng: np.random.Generator) -> FloatArray:
+        """Draw n independent points, (n, d)."""
+        return np.asarray(self.from_standard_normal(rng.standard_normal((n, self.dim))))
 
 
 @dataclass(frozen=True, eq=False)
-class ScipyDistribution:
-    """Independent coordinates, each with a frozen continuous distribution of `scipy.stats`.
-
-    Args:
-        frozen: Such as `scipy.stats.lognorm(0.5)`; parameters that are arrays of shape (k,) make k coordinates.
-
-    Raises:
-        ValueError: If it is discrete, or its parameters are invalid.
-    """
+class ScipyDistribution(_ByItsMap):
+    """Independent coordinates with a frozen continuous distribution of `scipy.stats`, k of them for parameters (k,)."""
 
     frozen: Any
 
     def __post_init__(self) -> None:
-        """Check the distribution."""
+        """Raise a ValueError for a discrete distribution and for invalid parameters."""
         from scipy.stats import rv_continuous  # takes a second to import, and whoever has a frozen one has done so
 
+        name = self.frozen.dist.name
         if not isinstance(self.frozen.dist, rv_continuous):
-            raise ValueError(f"Expected a continuous distribution, got the discrete {self._name} of scipy.stats.")
+            raise ValueError(f"Expected a continuous distribution, got the discrete {name} of scipy.stats.")
         if np.ndim(self._median) > 1 or not np.isfinite(self._median).all():
-            raise ValueError(f"Expected valid parameters of {self._name}, of shape () or (k,), got {self._arguments}.")
-
-    @property
-    def _name(self) -> str:
-        return str(self.frozen.dist.name)
+            raise ValueError(f"Expected valid parameters of {name}, of shape () or (k,), got {self._arguments}.")
 
     @property
     def _arguments(self) -> str:
@@ -131,47 +113,36 @@ class ScipyDistribution:
         """Number of coordinates k."""
         return int(self._median.size)
 
-    def sample(self, n: int, rng: np.random.Generator) -> FloatArray:
-        """Draw n independent points, shape (n, k)."""
-        return self.from_standard_normal(rng.standard_normal((n, self.dim)))
-
     def log_prob(self, x: FloatArray, /) -> FloatArray:
-        """Log density at x (n, k), shape (n,)."""
+        """Return the log density (n,) at x (n, k)."""
         return np.asarray(self.frozen.logpdf(x).sum(axis=1))
 
     def to_standard_normal(self, x: FloatArray, /) -> FloatArray:
-        """Map x of this distribution, shape (n, k), to u ~ N(0, I)."""
+        """Map x (n, k) to u ~ N(0, I)."""
         return np.asarray(np.where(x > self._median, -ndtri(self.frozen.sf(x)), ndtri(self.frozen.cdf(x))))
 
     def from_standard_normal(self, u: FloatArray, /) -> FloatArray:
-        """Inverse of `to_standard_normal`."""
+        """Map u ~ N(0, I), (n, k), to x."""
         tail = ndtr(-np.abs(u))
         return np.asarray(np.where(u > 0, self.frozen.isf(tail), self.frozen.ppf(tail)))
 
     def __repr__(self) -> str:
-        """Return its name and parameters."""
-        return f"<ScipyDistribution {self._name}{self._arguments}>"
+        return f"<ScipyDistribution {self.frozen.dist.name}{self._arguments}>"
 
 
 @dataclass(frozen=True, eq=False)
-class ScipyMultivariateNormal:
-    """A frozen `scipy.stats.multivariate_normal`.
-
-    Args:
-        frozen: The distribution; its covariance must be positive definite.
-
-    Raises:
-        ValueError: If the covariance is singular.
-    """
+class ScipyMultivariateNormal(_ByItsMap):
+    """A frozen `scipy.stats.multivariate_normal`, N(mean, L L')."""
 
     frozen: Any
 
     def __post_init__(self) -> None:
-        """Check the covariance."""
-        if int(self.frozen.cov_object.rank) < self.dim:
+        """Raise a ValueError for a singular covariance."""
+        rank = int(self.frozen.cov_object.rank)
+        if rank < self.dim:
             raise ValueError(
-                f"Expected a multivariate_normal with a covariance of rank {self.dim}, got rank "
-                f"{self.frozen.cov_object.rank}: some coordinates follow from others; leave these out."
+                f"Expected a multivariate_normal with a covariance of rank {self.dim}, got rank {rank}: some "
+                "coordinates follow from others; leave these out."
             )
 
     @cached_property
@@ -184,15 +155,11 @@ class ScipyMultivariateNormal:
 
     @property
     def dim(self) -> int:
-        """Number of coordinates."""
+        """Number of coordinates d."""
         return len(self._mean)
 
-    def sample(self, n: int, rng: np.random.Generator) -> FloatArray:
-        """Draw n independent points, shape (n, d)."""
-        return self.from_standard_normal(rng.standard_normal((n, self.dim)))
-
     def log_prob(self, x: FloatArray, /) -> FloatArray:
-        """Log density at x (n, d), shape (n,)."""
+        """Return the log density (n,) at x (n, d)."""
         return np.asarray(self.frozen.logpdf(x)).reshape(len(x))
 
     def to_standard_normal(self, x: FloatArray, /) -> FloatArray:
@@ -204,7 +171,6 @@ class ScipyMultivariateNormal:
         return np.asarray(self._mean + u @ self._cholesky.T)
 
     def __repr__(self) -> str:
-        """Return one line."""
         return f"<ScipyMultivariateNormal in {self.dim} dimensions>"
 
 
@@ -226,29 +192,19 @@ LARGEST_RETURN_ERROR = 1e-3
 """Distance in u between a point and what it comes back as, at half of the points."""
 
 
-def is_openturns_distribution(value: object) -> bool:
-    """Return whether value is a distribution of OpenTURNS."""
-    return type(value).__module__.startswith("openturns") and hasattr(value, "getIsoProbabilisticTransformation")
-
-
 @dataclass(frozen=True, eq=False)
-class OpenTurnsDistribution:
+class OpenTurnsDistribution(_ByItsMap):
     """A continuous distribution of OpenTURNS, or a copula, which is one with uniform marginals.
 
-    Args:
-        distribution: Such as `openturns.JointDistribution([openturns.Gumbel(), openturns.Normal()], copula)`.
-
-    Raises:
-        ValueError: If it is not continuous, or its iso-probabilistic transformation is of no use here. The
-            transformation of a multivariate Student distribution does not lead to N(0, I). That of a Dirichlet
-            distribution in OpenTURNS 1.27 does not have its density. That of a copula without marginals,
-            `NormalCopula`, in OpenTURNS 1.23 is not undone by its inverse.
+    Refused are those whose iso-probabilistic transformation is of no use here. That of a multivariate Student
+    distribution does not lead to N(0, I). That of a Dirichlet distribution in OpenTURNS 1.27 does not have its density.
+    That of a copula without marginals, `NormalCopula`, in OpenTURNS 1.23 is not undone by its inverse.
     """
 
     distribution: Any
 
     def __post_init__(self) -> None:
-        """Check the distribution."""
+        """Raise a ValueError for a distribution that is not continuous or whose transformation is of no use."""
         name = type(self.distribution).__name__
         if not self.distribution.isContinuous():
             raise ValueError(f"Expected a continuous distribution, got {name} of OpenTURNS, which is not.")
@@ -273,7 +229,7 @@ class OpenTurnsDistribution:
             )
 
     def _return_error(self) -> float:
-        """Return the median distance between points u and what they are after the inverse and the transformation."""
+        """Return the median distance in u between points and what they come back as."""
         u = np.random.default_rng(0).standard_normal((CHECKED_POINTS, self.dim))
         back = self.to_standard_normal(self.from_standard_normal(u))
         return float(np.median(np.abs(back - u).max(axis=1)))
@@ -313,24 +269,20 @@ class OpenTurnsDistribution:
         given = any(name != f"X{i}" for i, name in enumerate(names))
         return names if given and len(set(names)) == self.dim else ()
 
-    def sample(self, n: int, rng: np.random.Generator) -> FloatArray:
-        """Draw n independent points, shape (n, d), by `rng`, not by the generator of OpenTURNS."""
-        return self.from_standard_normal(rng.standard_normal((n, self.dim)))
-
     def log_prob(self, x: FloatArray, /) -> FloatArray:
-        """Log density at x (n, d), shape (n,)."""
+        """Return the log density (n,) at x (n, d)."""
         log_p = np.asarray(self.distribution.computeLogPDF(x), dtype=np.float64).reshape(len(x))
         return np.where(log_p <= np.finfo(np.float64).min, -np.inf, log_p)  # its logarithm of 0
 
     def to_standard_normal(self, x: FloatArray, /) -> FloatArray:
-        """Map x of this distribution, shape (n, d), to u ~ N(0, I)."""
+        """Map x (n, d) to u ~ N(0, I)."""
         if self._is_normal_standard:
             return _map(self.distribution.getIsoProbabilisticTransformation(), x)
         above = np.asarray(self.distribution.computeComplementaryCDF(x))
         return np.where(above < 0.5, -ndtri(above), ndtri(np.asarray(self.distribution.computeCDF(x))))
 
     def from_standard_normal(self, u: FloatArray, /) -> FloatArray:
-        """Inverse of `to_standard_normal`; |u| is cut at `FARTHEST_U` where OpenTURNS finds no points beyond it."""
+        """Map u ~ N(0, I), (n, d), to x; |u| is cut at `FARTHEST_U` where OpenTURNS finds no points beyond it."""
         return self._find_x(np.clip(u, -FARTHEST_U, FARTHEST_U) if self._is_cut else u)
 
     @cached_property
@@ -354,7 +306,6 @@ class OpenTurnsDistribution:
         return np.where(u > 0, high, low)
 
     def __repr__(self) -> str:
-        """Return one line."""
         return f"<OpenTurnsDistribution {type(self.distribution).__name__} in {self.dim} dimensions>"
 
 
@@ -402,16 +353,24 @@ def as_distribution(base: Any, dim: int | None = None) -> Any:
 
 def can_convert(base: object) -> bool:
     """Return whether `as_distribution` knows how to convert a single distribution."""
-    return is_scipy_normal(base) or is_scipy_distribution(base) or is_openturns_distribution(base)
+    return _find_converter(base) is not None
+
+
+def _find_converter(base: object) -> Callable[[Any], SizedDistribution] | None:
+    """Return the class that converts an object of SciPy (discrete ones too, which it refuses) or OpenTURNS, if any."""
+    library = type(base).__module__
+    if library.startswith("scipy.stats"):
+        if hasattr(base, "cov_object"):
+            return ScipyMultivariateNormal
+        return ScipyDistribution if hasattr(base, "ppf") and getattr(base, "dist", None) is not None else None
+    known = library.startswith("openturns") and hasattr(base, "getIsoProbabilisticTransformation")
+    return OpenTurnsDistribution if known else None
 
 
 def _convert(base: Any) -> Any:
-    if is_scipy_normal(base):
-        return ScipyMultivariateNormal(base)
-    if is_scipy_distribution(base):
-        return ScipyDistribution(base)
-    if is_openturns_distribution(base):
-        return OpenTurnsDistribution(base)
+    converter = _find_converter(base)
+    if converter is not None:
+        return converter(base)
     if isinstance(base, list | tuple) and base:
         return IndependentDistributions(tuple(as_distribution(part) for part in base))
     # of a user's class
@@ -421,3 +380,104 @@ def _convert(base: Any) -> Any:
             f"or an object with {', '.join(METHODS_OF_A_BASE)}; got {base!r}."
         )
     return base
+
+
+# Whether the parts of a base distribution fit together
+
+N_DRAWS = 200
+"""Draws that are looked at."""
+FALSE_ALARM = 1e-6
+"""Largest probability that a base whose parts fit is refused."""
+ROUND_TRIP = 1e-3
+"""Largest error of x -> u -> x, as a share of the standard deviation of a coordinate: numerical inverses, float32."""
+MAX_CORRELATED = 300
+"""Coordinates up to which every pair is looked at; of more, neighbours."""
+
+
+def find_base_fault(base: Any, dim: int, n: int = N_DRAWS) -> str | None:
+    """Return what does not fit together in a base distribution of d coordinates, in words; None if nothing is seen.
+
+    n draws must have a density, and `to_standard_normal` must map them to independent standard normal coordinates and
+    `from_standard_normal` back. With u the mapped draws, each of four statistics gets a quarter of `FALSE_ALARM`, which
+    is divided by the number of coordinates or pairs: the mean of a coordinate (normal), its sum of squares (chi-squared
+    with n degrees of freedom), the Kolmogorov distance (bounded by 2 exp(-2 n D^2), Massart 1990) and the
+    correlation of two coordinates (t with n - 2 degrees of freedom). A base whose map is not implemented, which plain
+    Monte Carlo does not need, has only its draws looked at.
+    """
+    x = np.asarray(base.sample(n, np.random.default_rng(0)), dtype=np.float64)
+    if x.shape != (n, dim) or not np.isfinite(x).all():
+        return f"sample({n}) gave shape {x.shape}" if x.shape != (n, dim) else f"sample({n}) gave NaN or infinity"
+    log_p = np.asarray(base.log_prob(x), dtype=np.float64)
+    if log_p.shape != (n,) or not np.isfinite(log_p).all():
+        return f"log_prob of its own draws is not {n} finite numbers"
+    try:
+        u = np.asarray(base.to_standard_normal(x), dtype=np.float64)
+        back = np.asarray(base.from_standard_normal(u), dtype=np.float64)
+    except NotImplementedError:
+        return None
+    if u.shape != x.shape or back.shape != x.shape:
+        return f"to_standard_normal and from_standard_normal gave shapes {u.shape} and {back.shape} for {x.shape}"
+    if not np.isfinite(u).all():
+        return f"to_standard_normal(sample({n})) has NaN or infinity"
+    return _find_wrong_return(x, back) or _find_other_law(u)
+
+
+def _find_wrong_return(x: FloatArray, back: FloatArray) -> str | None:
+    """Return a coordinate that does not come back from standard normal space."""
+    room = ROUND_TRIP * x.std(axis=0) + 1e-6 * np.abs(x).max(axis=0)
+    wrong = ~(np.abs(back - x) <= room)
+    if not wrong.any():
+        return None
+    row, column = np.argwhere(wrong)[0]
+    found = f"{back[row, column]:.6g} in coordinate {column} of a draw, where x is {x[row, column]:.6g}"
+    return f"from_standard_normal(to_standard_normal(x)) is {found}"
+
+
+def _find_other_law(u: FloatArray) -> str | None:
+    """Return what is not standard normal in u (n, d)."""
+    n, dim = u.shape
+    level = FALSE_ALARM / 4 / dim
+    name = f"to_standard_normal(sample({n}))"
+    mean, room = u.mean(axis=0), -float(ndtri(level / 2)) / n**0.5
+    column = int(np.abs(mean).argmax())
+    if abs(mean[column]) > room:
+        return f"{name} has mean {mean[column]:.3g} in coordinate {column}, where 0 +- {room:.2g} fits"
+    squares = (u**2).sum(axis=0)
+    low, high = 2 * float(gammaincinv(n / 2, level / 2)), float(chdtri(n, level / 2))
+    for column in (int(squares.argmin()), int(squares.argmax())):
+        if not low <= squares[column] <= high:
+            spread = (squares[column] / n) ** 0.5
+            ends = f"{(low / n) ** 0.5:.2g} to {(high / n) ** 0.5:.2g}"
+            return f"{name} has standard deviation {spread:.3g} in coordinate {column}, where {ends} fits"
+    reached, steps = ndtr(np.sort(u, axis=0)), np.arange(n + 1)[:, None] / n
+    distance = np.maximum(steps[1:] - reached, reached - steps[:-1]).max(axis=0)  # Kolmogorov's
+    column, room = int(distance.argmax()), float(np.log(2 / level) / (2 * n)) ** 0.5
+    if distance[column] > room:
+        return (
+            f"{name} is not normal in coordinate {column}: Kolmogorov distance {distance[column]:.2g} above {room:.2g}"
+        )
+    return _find_correlation(u, name)
+
+
+def _find_correlation(u: FloatArray, name: str) -> str | None:
+    """Return two coordinates of u (n, d) that are not independent."""
+    n, dim = u.shape
+    if dim == 1:
+        return None
+    centred = u - u.mean(axis=0)
+    centred /= np.sqrt((centred**2).sum(axis=0))
+    if dim <= MAX_CORRELATED:
+        first, second = np.triu_indices(dim, 1)
+        correlation = (centred.T @ centred)[first, second]
+    else:
+        first, second = np.arange(dim - 1), np.arange(1, dim)
+        correlation = np.einsum("ij,ij->j", centred[:, :-1], centred[:, 1:])
+    t = -float(stdtrit(n - 2, FALSE_ALARM / 8 / len(first)))
+    room = t / (n - 2 + t**2) ** 0.5
+    pair = int(np.abs(correlation).argmax())
+    if abs(correlation[pair]) <= room:
+        return None
+    return (
+        f"{name} has correlation {correlation[pair]:.2g} between coordinates {first[pair]} and {second[pair]}, where "
+        f"0 +- {room:.2g} fits"
+    )

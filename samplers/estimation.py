@@ -1,29 +1,160 @@
-"""Estimation: `estimate`, which runs a method on a problem that it can evaluate itself."""
+"""Estimation: `estimate`, which runs a method on a problem that it can evaluate itself, and the methods by name."""
 
-import contextlib
+import inspect
 import math
+import os
+import signal
+import threading
 import time
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field, replace
-from os import PathLike
+import warnings
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import closing, contextmanager, nullcontext
+from dataclasses import replace
+from functools import cached_property
+from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
+from types import FrameType
+from typing import Any, cast
 
 from samplers.analysis.refits import needs_ensemble_run, pool_refits
-from samplers.arguments import InputsOnly, RunArguments, check_attributes, check_problem, choose_seed, find_base_fault
+from samplers.distributions import find_base_fault
 from samplers.evaluate import Evaluator
 from samplers.executors import AnyExecutor, find_executor
 from samplers.journal import Journal, JournalError, NothingRecorded
 from samplers.method import Stepping
 from samplers.methods.auto import Auto
+from samplers.methods.cross_entropy import CrossEntropy
+from samplers.methods.importance_sampling import ImportanceSampling
+from samplers.methods.improved_cross_entropy import ImprovedCrossEntropy
+from samplers.methods.monte_carlo import MonteCarlo
+from samplers.methods.subset import AdaptiveSubsetSimulation, SubsetSimulation
+from samplers.methods.surrogate import Surrogate
 from samplers.methods.two_stage.method import TwoStage
-from samplers.platform_calls import defer_signals
+from samplers.output import register_stored
 from samplers.problem import Inputs, Problem, StandardNormal
-from samplers.progress import Listener, Pace, Progress, open_listener
-from samplers.registry import get_method
 from samplers.result import Estimate
-from samplers.run import Run
+from samplers.run import InputsOnly, Listener, Progress, Run, RunArguments, check_problem, choose_seed
 from samplers.sample import Status
-from samplers.validation import OnError, check_number
+from samplers.validation import OnError, check_name, check_number
+
+ENTRY_POINT_GROUP = "rare_envs.samplers"
+"""Entry points of this group name methods of other packages."""
+DEFERRED_SIGNALS = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name))
+NARROW_TERMINAL = 72
+"""Columns of a terminal below which a bar keeps itself, the count and the time only."""
+WIDE_TERMINAL = 110
+"""Columns of a terminal below which the bar is short where there are workers, so that all of the line is seen."""
+Stop = Callable[[Progress], str | None]
+"""Returns the reason to stop a run, in words, or None."""
+
+
+# Methods by name
+
+
+class Methods(Mapping[str, type[Stepping]]):
+    """Methods by name: our own, then those that installed packages offer.
+
+    A package offers a method by an entry point, here in its `pyproject.toml`:
+
+        [project.entry-points."rare_envs.samplers"]
+        lattice = "their_package:Lattice"
+
+    with the `name` of the class on the left. Other packages are imported when a name that is not
+    ours, or the list of all names, is first requested. An entry point that cannot be used is left
+    out with a `RuntimeWarning` that names it.
+
+    Args:
+        own: Our own methods.
+    """
+
+    def __init__(self, *own: type[Stepping]) -> None:
+        self._own = {method.name: method for method in own}
+
+    @property
+    def own(self) -> list[str]:
+        """The names of our own methods."""
+        return list(self._own)
+
+    @cached_property
+    def _installed(self) -> dict[str, type[Stepping]]:
+        """Methods of other packages by name."""
+        loaded: dict[str, type[Stepping]] = {}
+        for entry in sorted(entry_points(group=ENTRY_POINT_GROUP), key=lambda entry: entry.name):
+            try:
+                if entry.name in self._own or entry.name in loaded:
+                    raise ValueError("that name is taken")
+                loaded[entry.name] = _load_method(entry)
+            except Exception as error:  # an error of another package must not break this one
+                message = f"The method {_describe_entry(entry)} cannot be used: {type(error).__name__}: {error}"
+                warnings.warn(message, RuntimeWarning, stacklevel=2)
+        return loaded
+
+    def __getitem__(self, name: str) -> type[Stepping]:
+        return self._own[name] if name in self._own else self._installed[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter([*self._own, *self._installed])
+
+    def __len__(self) -> int:
+        return len(self._own) + len(self._installed)
+
+
+METHODS = Methods(
+    Auto,
+    TwoStage,
+    Surrogate,
+    MonteCarlo,
+    ImportanceSampling,
+    CrossEntropy,
+    ImprovedCrossEntropy,
+    SubsetSimulation,
+    AdaptiveSubsetSimulation,
+)
+register_stored(*(METHODS[name] for name in METHODS.own))
+
+
+def get_method(name: str, **settings: Any) -> Stepping:
+    """Return the method of that name with the given settings.
+
+    Raises:
+        ValueError: If the name or a setting is not known (the nearest one is suggested) or a
+            setting has a value out of range.
+
+    Example:
+        >>> import samplers
+        >>> samplers.get_method("mc", n=5000)
+        MonteCarlo(n=5000, batch=10000)
+    """
+    if not isinstance(name, str) or name not in METHODS:
+        check_name("method", name, list(METHODS))
+    cls = METHODS[name]
+    for setting in settings:
+        check_name(f"setting of {cls.__name__}", setting, list(inspect.signature(cls).parameters))
+    return cls(**settings)
+
+
+def _load_method(entry: EntryPoint) -> type[Stepping]:
+    """Import the class that an entry point names."""
+    loaded: object = entry.load()
+    if not isinstance(loaded, type):
+        raise TypeError(f"expected a class, got {loaded!r}")
+    # another package's class: the message says which it lacks
+    missing = [name for name in ("name", "stops_at_target", "steps") if not hasattr(loaded, name)]
+    if missing:
+        raise TypeError(f"the class {loaded.__name__} has no {', '.join(missing)}")
+    cls = cast(type[Stepping], loaded)
+    if cls.name != entry.name:
+        raise ValueError(f"the class {cls.__name__} is named {cls.name!r}, its entry point {entry.name!r}")
+    return cls
+
+
+def _describe_entry(entry: EntryPoint) -> str:
+    """Return the name, package and value of an entry point, in words."""
+    package = "" if entry.dist is None else f" of {entry.dist.name}"
+    return f"{entry.name!r}{package} ({entry.value})"
+
+
+# The estimate
 
 
 class EstimationInterrupted(KeyboardInterrupt):
@@ -67,7 +198,7 @@ def estimate(
     time_limit: float | None = None,
     stop: Callable[[Progress], bool] | None = None,
     ensemble_run: bool = True,
-    journal: str | PathLike[str] | None = None,
+    journal: str | os.PathLike[str] | None = None,
     workers: int | None = None,
     executor: AnyExecutor | None = None,
     keep_points: bool = False,
@@ -150,10 +281,10 @@ def estimate(
         >>> [round(end, 6) for end in checked.interval]
         [9.9e-05, 0.000272]
     """
-    check_attributes(problem, ("dim", "base", "evaluate"))
+    check_problem(problem, "dim", "base", "evaluate")
     chosen = get_method(method) if isinstance(method, str) else method
     arguments = RunArguments(gamma, seed, max_sim, target_cov, confidence, replicates, on_error)
-    conditions = StopConditions(time_limit, stop)
+    stops = find_stop(time_limit, stop)
     if not (callable(progress) or isinstance(progress, bool)):
         raise ValueError(f"Expected progress to be True, False or a function, got {progress!r}.")
     check_base(problem)
@@ -162,24 +293,16 @@ def estimate(
         known = choose_seed(seed if kept is None else kept.head["seed"])
         arguments = replace(arguments, seed=known)
         with Evaluator(problem, arguments.gamma, on_error, journal=kept, executor=places, seed=known) as evaluator:
-            simulation = Simulation(evaluator, progress, conditions, keep_points)
             try:
-                result = simulation.run(problem, chosen, arguments)
-                if ensemble_run:
-                    result = simulation.add_ensemble_run(result, chosen, arguments)
+                result = simulate(evaluator, chosen, arguments, progress, stops, ensemble_run, keep_points)
             except EstimationInterrupted as stopped:
                 raise EstimationInterrupted(_add_remarks(stopped.estimate, evaluator)) from None
     return _add_remarks(result, evaluator)
 
 
-@contextlib.contextmanager
-def _open_journal(path: str | PathLike[str] | None, problem: Inputs, seed: int | None) -> Iterator[Journal | None]:
-    """Yield the journal at a path, begun or continued, and close it; None for no path.
-
-    Raises:
-        JournalError: It was begun with another dimension or seed.
-        OSError: It cannot be read or written.
-    """
+@contextmanager
+def _open_journal(path: str | os.PathLike[str] | None, problem: Inputs, seed: int | None) -> Iterator[Journal | None]:
+    """Yield the journal at a path, begun or continued, and close it; None for no path."""
     if path is None:
         yield None
         return
@@ -188,7 +311,7 @@ def _open_journal(path: str | PathLike[str] | None, problem: Inputs, seed: int |
         journal = Journal.open(file)
     except (FileNotFoundError, NothingRecorded):
         journal = Journal.create(file, begun)
-    with contextlib.closing(journal):
+    with closing(journal):
         for name, wanted in (("dim", begun["dim"]), ("seed", seed)):
             had = journal.head.get(name)
             if not isinstance(had, int) or wanted not in (None, had):
@@ -198,7 +321,7 @@ def _open_journal(path: str | PathLike[str] | None, problem: Inputs, seed: int |
 
 def check_base(problem: Problem) -> None:
     """Raise a ValueError if the base distribution's map does not fit its draws: p would be wrong without a warning."""
-    check_problem(problem, ("dim", "base", "evaluate"))
+    check_problem(problem, "dim", "base", "evaluate")
     if type(problem.base) is StandardNormal:
         return
     fault = find_base_fault(problem.base, int(problem.dim))
@@ -206,97 +329,86 @@ def check_base(problem: Problem) -> None:
         raise ValueError(f"The parts of problem.base ({type(problem.base).__name__}) do not fit together: {fault}.")
 
 
-class StopConditions:
-    """Conditions that end a run before its time.
+def find_stop(time_limit: float | None, stop: Callable[[Progress], bool] | None) -> Stop:
+    """Return what ends a run before its time: a function of the user, or so many seconds after this call."""
+    if time_limit is not None:
+        check_number("time_limit", time_limit, 0.0, math.inf)
+    if not (stop is None or callable(stop)):
+        raise ValueError(f"Expected stop to be a function of Progress, got {stop!r}.")
+    end = math.inf if time_limit is None else time.monotonic() + float(time_limit)
 
-    Args:
-        time_limit: Seconds from now on; None for no limit.
-        stop: Returns True to end the run; None for never.
-
-    Raises:
-        ValueError: If time_limit is not a positive number, or stop is not a function.
-    """
-
-    def __init__(self, time_limit: float | None = None, stop: Callable[[Progress], bool] | None = None) -> None:
-        if time_limit is not None:
-            check_number("time_limit", time_limit, 0.0, math.inf)
-        if not (stop is None or callable(stop)):
-            raise ValueError(f"Expected stop to be a function of Progress, got {stop!r}.")
-        self._time_limit = math.inf if time_limit is None else float(time_limit)
-        self._stop = stop
-        self._started = time.monotonic()
-
-    def reason(self, progress: Progress) -> str | None:
-        """Return the reason to stop now, in words, or None."""
-        if self._stop is not None and self._stop(progress):
+    def reason(progress: Progress) -> str | None:
+        if stop is not None and stop(progress):
             return "Stopped by the callback"
-        if time.monotonic() - self._started >= self._time_limit:
-            return f"Stopped by the time limit of {self._time_limit:g} s"
-        return None
+        return f"Stopped by the time limit of {time_limit:g} s" if time.monotonic() >= end else None
+
+    return reason
 
 
-@dataclass(frozen=True)
-class Simulation:
-    """What the runs of one estimation share: how f is called, who is told and when they end."""
+def simulate(
+    evaluator: Evaluator,
+    method: Stepping,
+    arguments: RunArguments,
+    progress: bool | Listener = False,
+    stop: Stop = lambda progress: None,
+    ensemble_run: bool = True,
+    keep_points: bool = False,
+) -> Estimate:
+    """Return the estimate of a method, and of its further run under the mixture of the refits if it needs one.
 
-    evaluator: Evaluator
-    progress: bool | Listener = False
-    conditions: StopConditions = field(default_factory=StopConditions)
-    keep_points: bool = False
+    `TwoStage` makes that where the method cannot search under a mixture. An interruption, if not before the first
+    batch, is an EstimationInterrupted with what is known.
+    """
+    first = _run_method(evaluator, evaluator, method, arguments, progress, stop, keep_points)
+    problem, base = evaluator.problem, evaluator.base
+    split = getattr(problem, "failing_parts", None)  # shares (m, k) of failing points (k, d) in m parts
+    if not ensemble_run or first.status is Status.STOPPED or not needs_ensemble_run(first, split):
+        return first
+    if not hasattr(base, "ensemble"):
+        return first
+    further = replace(arguments, seed=first.seed, target_cov=None, replicates=1)
+    try:
+        inputs = InputsOnly(evaluator.dim, pool_refits(base))
+    except ValueError:  # refits that are no mixtures; the first run stands, with a warning of `BaseUncertainty`
+        return first
+    try:
+        Run(inputs, method, further)
+    except ValueError:  # blocks of a product, which a mixture has none of
+        method = TwoStage()
+    try:
+        return replace(first, ensemble_run=_run_method(evaluator, inputs, method, further, progress, stop, keep_points))
+    except KeyboardInterrupt:
+        raise EstimationInterrupted(first) from None
 
-    def run(self, inputs: Inputs, method: Stepping, arguments: RunArguments) -> Estimate:
-        """Run a method to its end, or to the first condition that stops it.
 
-        Raises:
-            EstimationInterrupted: If it is interrupted after the first batch.
-        """
-        with open_listener(self.progress, arguments.max_sim) as listener:
-            if self.evaluator.workers and listener is not None:
-                pace = Pace(listener, self.evaluator.workers, self.evaluator)
-                self.evaluator.on_chunk, listener = pace.on_chunk, pace.on_progress
-            run = Run(inputs, method, arguments, listener, self.evaluator.offer, self.keep_points)
-            try:
-                while not run.done:
-                    answers = self.evaluator.respond(run.requests)
-                    with defer_signals():  # a method that is interrupted while it computes could not conclude
-                        run.answer(answers)
-                    why = self.conditions.reason(run.progress)
-                    if why is not None:
-                        run.stop(why)
-            except KeyboardInterrupt:
-                if run.progress.n_sim == 0:
-                    raise
-                run.stop("Interrupted")
-                raise EstimationInterrupted(run.result()) from None
-        return run.result()
-
-    def add_ensemble_run(self, first: Estimate, method: Stepping, arguments: RunArguments) -> Estimate:
-        """Return an estimate with the run under the mixture of the refits, where it needs one and there can be one.
-
-        `TwoStage` makes it where the method cannot search under a mixture.
-
-        Raises:
-            EstimationInterrupted: If it is interrupted; what is known is the first run.
-        """
-        problem = self.evaluator.problem
-        split = getattr(problem, "failing_parts", None)  # shares (m, k) of failing points (k, d) in m parts
-        if first.status is Status.STOPPED or not needs_ensemble_run(first, split):
-            return first
-        if not hasattr(problem.base, "ensemble"):
-            return first
-        further = replace(arguments, seed=first.seed, target_cov=None, replicates=1)
+def _run_method(
+    evaluator: Evaluator,
+    inputs: Inputs,
+    method: Stepping,
+    arguments: RunArguments,
+    progress: bool | Listener,
+    stop: Stop,
+    keep_points: bool,
+) -> Estimate:
+    """Run a method to its end, to the first condition that stops it, or to an interruption."""
+    with show_bar(arguments.max_sim) if progress is True else nullcontext(progress or None) as listener:
+        if evaluator.workers and listener is not None:
+            listener = _Pace(listener, evaluator).on_progress
+        run = Run(inputs, method, arguments, listener, evaluator.offer, keep_points)
         try:
-            inputs = InputsOnly(int(problem.dim), pool_refits(problem.base))
-        except ValueError:  # refits that are no mixtures; the first run stands, with a warning of `BaseUncertainty`
-            return first
-        try:
-            Run(inputs, method, further)
-        except ValueError:  # blocks of a product, which a mixture has none of
-            method = TwoStage()
-        try:
-            return replace(first, ensemble_run=self.run(inputs, method, further))
+            while not run.done:
+                answers = evaluator.respond(run.requests)
+                with defer_signals():  # a method that is interrupted while it computes could not conclude
+                    run.answer(answers)
+                why = stop(run.progress)
+                if why is not None:
+                    run.stop(why)
         except KeyboardInterrupt:
-            raise EstimationInterrupted(first) from None
+            if run.progress.n_sim == 0:
+                raise
+            run.stop("Interrupted")
+            raise EstimationInterrupted(run.result()) from None
+    return run.result()
 
 
 def _add_remarks(result: Estimate, evaluator: Evaluator) -> Estimate:
@@ -309,3 +421,117 @@ def _add_remarks(result: Estimate, evaluator: Evaluator) -> Estimate:
     if evaluator.lost:
         remarks.append(f"No worker survived {len(evaluator.lost)} rows; of the first: {evaluator.lost[0]}.")
     return replace(result, remarks=(*result.remarks, *remarks)) if remarks else result
+
+
+# Progress
+
+
+class _Pace:
+    """Tells a listener of every chunk that the workers of an evaluator have done, and how long the rest takes."""
+
+    def __init__(self, listener: Listener, evaluator: Evaluator) -> None:
+        self._listener, self._evaluator = listener, evaluator
+        self._started = time.monotonic()
+        self._latest: Progress | None = None
+        self._shown = 0
+        evaluator.on_chunk = self.on_chunk
+
+    def on_progress(self, progress: Progress) -> None:
+        """Take the progress of the run, after a batch or a level."""
+        self._latest = progress
+        self._show(progress)
+
+    def on_chunk(self, n_done: int) -> None:
+        """Take the number of simulations of the present batch that are done."""
+        latest = self._latest
+        if latest is not None and latest.n_sim + n_done > self._shown:
+            self._show(replace(latest, n_sim=latest.n_sim + n_done))
+
+    def _show(self, progress: Progress) -> None:
+        self._shown, counts = progress.n_sim, self._evaluator
+        n_made, seconds = progress.n_sim - counts.n_restored, time.monotonic() - self._started
+        left = None
+        if progress.max_sim is not None and n_made > 0:
+            left = (progress.max_sim - progress.n_sim) * seconds / n_made
+        self._listener(replace(progress, workers=counts.workers, n_retries=counts.n_retries, seconds_left=left))
+
+
+def describe_workers(progress: Progress) -> str:
+    """Return words for the workers, what they lost, and the time left; empty without workers."""
+    if not progress.workers:
+        return ""
+    words = f", {progress.workers} workers{f', {progress.n_retries} retries' if progress.n_retries else ''}"
+    if progress.seconds_left is None:
+        return words
+    for unit, seconds in (("d", 86400.0), ("h", 3600.0), ("min", 60.0)):
+        if progress.seconds_left >= 2 * seconds:
+            return f"{words}, {progress.seconds_left / seconds:.0f} {unit} left"
+    return f"{words}, {progress.seconds_left:.0f} s left"
+
+
+@contextmanager
+def show_bar(max_sim: int | None) -> Iterator[Listener]:
+    """Show a bar on standard error while the run lasts; one that fails leaves nothing of it."""
+    from rich.console import Console  # optional, and slow to import
+    from rich.progress import BarColumn, ProgressColumn, TextColumn, TimeElapsedColumn
+    from rich.progress import Progress as Bar
+
+    console, length = Console(stderr=True), BarColumn(bar_width=20)
+    columns: tuple[ProgressColumn, ...] = (
+        TextColumn("[bold]{task.description}"),
+        length,
+        TextColumn("{task.completed:,.0f} {task.fields[unit]}"),
+        TextColumn("{task.fields[state]}", markup=False),
+        TimeElapsedColumn(),
+    )
+    narrow = (BarColumn(bar_width=10), TextColumn("{task.completed:,.0f} done"), TimeElapsedColumn())
+    bar = Bar(*(columns if console.width >= NARROW_TERMINAL else narrow), console=console)
+    task = bar.add_task("estimate", total=max_sim, state="", unit="simulations")
+
+    def show(progress: Progress) -> None:
+        state = f"run {progress.run + 1} " if progress.run else ""
+        if not math.isnan(progress.p):
+            state += f"P[f <= {progress.level:.3g}] = {progress.p:.2e}"
+        state += describe_workers(progress)
+        if progress.workers and console.width < WIDE_TERMINAL:  # the rest of the line needs the room
+            length.bar_width = 10
+            bar.update(task, description="", unit="done")
+        bar.update(task, completed=progress.n_sim, state=state)
+
+    bar.start()
+    try:
+        yield show
+    except BaseException:
+        bar.live.transient = True  # clears the line
+        bar.live.stop()  # bar.stop() would add an empty line where standard error is a file
+        raise
+    bar.stop()
+
+
+@contextmanager
+def defer_signals() -> Iterator[None]:
+    """Let SIGINT, SIGTERM and SIGHUP wait for the end of the block; the second one does not wait.
+
+    Only those with a handler in Python, and in the main thread, as others do not interrupt Python code.
+    """
+    handlers: dict[int, Callable[[int, FrameType | None], Any]] = {}
+    received: list[int] = []
+
+    def note(number: int, frame: FrameType | None) -> None:
+        received.append(number)
+        if len(received) > 1:
+            handlers[number](number, frame)
+
+    if threading.current_thread() is threading.main_thread():
+        for number in DEFERRED_SIGNALS:
+            handler = signal.getsignal(number)
+            if callable(handler):
+                handlers[number] = handler
+                signal.signal(number, note)
+    try:
+        yield
+    finally:
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
+        if len(received) == 1:
+            handlers[received[0]](received[0], None)

@@ -2,30 +2,25 @@
 
     request -> chunks -> journal, or work (here or by a worker) -> journal -> answer
 
-What comes back is checked. Where the problem raises or gives NaN, the rows that fail are found (`samplers.chunks`), and
-each simulation is counted.
+What comes back is checked. Where the problem raises or gives NaN, the rows that fail are found (`samplers.workers`),
+and each simulation is counted.
 """
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
-from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from samplers.chunks import NAN_REASON, Attempted, Chunk, Result, isolate, join_results
-from samplers.dispatch import Dispatcher
-from samplers.executors import Executor
+from samplers.executors import Dispatcher, Executor
 from samplers.journal import Journal, JournalError, digest_points
 from samplers.method import Answer, GradientRequest, Request, TermsOffer, TermsRequest, whole_simulations
 from samplers.problem import FloatArray, TermGradients, Terms, condition_of, names_of_columns, offers_terms
-from samplers.validation import EvaluationError, OnError, check_number, check_whole, describe_point, one_per_row
-from samplers.workers import SeededWork
+from samplers.validation import EvaluationError, OnError, check_number, check_whole
+from samplers.workers import Chunk, Result, SeededWork, Work, join_results
 
 CHUNK_SIZE = 16
 """Rows of a chunk of workers where the problem has no `chunk_size`."""
@@ -36,12 +31,10 @@ F_TOLERANCE = 1e-3
 
 
 class Fault(NamedTuple):
-    """A point without an outcome."""
+    """A point x (d,) without an outcome, and why, in one line."""
 
     x: FloatArray
-    """Shape (d,)."""
     reason: str
-    """Why, in one line."""
 
 
 class Simulated(NamedTuple):
@@ -57,116 +50,6 @@ class Simulated(NamedTuple):
     """Wall time of each [s], that of its chunk shared equally, shape (n,)."""
 
 
-@dataclass(frozen=True)
-class Work:
-    """Computes a chunk, here or in a worker."""
-
-    problem: Any
-    """Has `evaluate`, and `terms` and `gradient` if they are asked for. Where it goes on by itself with the rows on
-    which it does not fail, it has `attempt(x)` and `attempt_terms(x, gamma)`, which also give the reasons by row."""
-    gamma: float
-    """Threshold of failure."""
-    on_error: OnError
-    """Rule for rows that fail: "raise" ends the run; with "failure" and "bound" f and terms are NaN. A row that has an
-    outcome and no gradient has NaN there."""
-    name: str = "f"
-    """Of what fails, for messages."""
-
-    def __call__(self, chunk: Chunk) -> Result:
-        """Compute a chunk.
-
-        Raises:
-            EvaluationError: A row fails (on_error "raise"), or the problem gives what is not of the right form.
-        """
-        start, n_retried = time.perf_counter(), 0
-        attempt = partial(_ATTEMPTS[chunk.kind], self.problem, self.gamma)
-        with np.errstate():  # a problem that sets NumPy's errors sets them for itself
-            try:
-                found: Any = attempt(chunk)
-            except (Exception, SystemExit) as error:  # the problem is the user's: anything may happen in it
-                found = error
-            if not isinstance(found, Attempted) or found.reasons:
-                found, n_retried = isolate(attempt, chunk, found, partial(self.refuse, chunk))
-        notes = {**found.notes, "n_retried": n_retried, "seconds": time.perf_counter() - start}
-        if chunk.kind == "gradient":
-            notes["cost"] = notes.get("cost", 0.0) + float(self.problem.gradient_cost) * len(found.reasons)
-        else:
-            notes["reasons"] = [found.reasons[row] for row in sorted(found.reasons)]
-        return Result(found.table, notes)
-
-    def lose(self, chunk: Chunk, reason: str) -> Result:
-        """Return the result of a row that no worker survives.
-
-        Raises:
-            EvaluationError: on_error is "raise".
-        """
-        self.refuse(chunk, 0, reason)
-        notes: dict[str, Any] = {"n_retried": 0, "lost": [reason]}
-        if chunk.kind == "gradient":
-            return Result(np.full((1, 1), np.nan), {**notes, "cost": float(self.problem.gradient_cost)})
-        return Result(np.full((1, 1), np.nan), {**notes, "reasons": [reason]})
-
-    def refuse(self, chunk: Chunk, row: int, reason: str, cause: BaseException | None = None) -> None:
-        """Raise an EvaluationError for a row of a chunk that has failed for good, if on_error is "raise"."""
-        if self.on_error == "raise":
-            what = "The gradient" if chunk.kind == "gradient" else self.name
-            raise EvaluationError(
-                f'{what} failed twice on x = {describe_point(chunk.x[row])}: {reason}; on_error "failure" or "bound" '
-                "would count it instead."
-            ) from cause
-
-
-def _attempt_f(problem: Any, gamma: float, chunk: Chunk) -> Attempted:
-    x, rowwise = chunk.x.copy(), _find_rowwise(problem, "evaluate", "attempt")  # a copy, on which it may write
-    f, reasons = (problem.evaluate(x), {}) if rowwise is None else rowwise(x)
-    f = one_per_row(f, len(x))
-    return Attempted(f[:, None], _reasons_of_nan(f) | reasons, {})
-
-
-def _attempt_terms(problem: Any, gamma: float, chunk: Chunk) -> Attempted:
-    x, n, rowwise = chunk.x.copy(), len(chunk), _find_rowwise(problem, "terms", "attempt_terms")
-    terms, reasons = (problem.terms(x, gamma), {}) if rowwise is None else rowwise(x, gamma)
-    f, values, ticks = one_per_row(terms.f, n), np.asarray(terms.values, dtype=np.float64), np.asarray(terms.ticks)
-    if values.ndim != 2 or len(values) != n or values.shape[1] == 0 or ticks.shape != values.shape:
-        raise EvaluationError(f"Expected values and ticks of shape ({n}, J), got {values.shape} and {ticks.shape}.")
-    f = np.where(np.isnan(values).any(axis=1), np.nan, f)
-    notes = {"threshold": float(terms.threshold), "names": list(getattr(terms, "names", ()))}
-    return Attempted(np.column_stack((f, values, ticks)), _reasons_of_nan(f) | reasons, notes)
-
-
-def _attempt_gradient(problem: Any, gamma: float, chunk: Chunk) -> Attempted:
-    x, term, ticks = (array.copy() for array in chunk.arrays)
-    found = problem.gradient(x, term, ticks, gamma)
-    values = np.asarray(found.values, dtype=np.float64)
-    if values.shape != x.shape:
-        raise EvaluationError(f"Expected gradients of shape {x.shape}, got {values.shape}.")
-    return Attempted(values, {}, {"cost": float(found.cost)})
-
-
-def _find_rowwise(problem: Any, whole: str, rowwise: str) -> Callable[..., Any] | None:
-    """Return the method that goes on with the other rows, if it computes what the method `whole` does.
-
-    A subclass, a wrapper or an instance that has `whole` of its own is asked by that.
-    """
-    method = getattr(problem, rowwise, None)
-    owner = getattr(method, "__self__", None)
-    if owner is None or getattr(getattr(problem, whole, None), "__self__", None) is not owner:
-        return None
-    definition = next(vars(kind) for kind in type(owner).__mro__ if {whole, rowwise} & set(vars(kind)))
-    return method if {whole, rowwise} <= set(definition) else None
-
-
-def _reasons_of_nan(f: FloatArray) -> dict[int, str]:
-    return dict.fromkeys(np.flatnonzero(np.isnan(f)).tolist(), NAN_REASON)
-
-
-_ATTEMPTS: dict[str, Callable[..., Attempted]] = {
-    "f": _attempt_f,
-    "terms": _attempt_terms,
-    "gradient": _attempt_gradient,
-}
-
-
 class Evaluator:
     """A problem as the source of answers, for the length of a run.
 
@@ -174,7 +57,7 @@ class Evaluator:
     computed for one replicate after the other, so that what they cost it does not depend on the others.
 
     Attributes:
-        problem: What is evaluated.
+        problem: What is evaluated, with its `dim`, `base`, `given` and `column_names`.
         offer: What it can answer beside f; None for f alone.
         faults: Points without an outcome, in the order in which they were asked for.
         lost: Why rows have nothing that no worker survived.
@@ -216,7 +99,7 @@ class Evaluator:
 
         Args:
             problem: As of `Work`.
-            gamma: As of `Work`.
+            gamma: Threshold of failure.
             on_error: As of `Work`.
             journal: Keeps what has been computed, and may have some from before.
             executor: Where chunks are computed; None for here.
@@ -230,7 +113,9 @@ class Evaluator:
             ValueError: If the problem has gradients and its gradient_cost is no positive number, or a size is none.
         """
         self.problem, self._journal, self._executor, self._seed = problem, journal, executor, seed
-        self._work = Work(problem, gamma, on_error, name)
+        self.dim, self.base = int(problem.dim), problem.base
+        self.given, self.column_names = condition_of(problem), names_of_columns(problem)
+        self._gamma, self._work = gamma, Work(problem, gamma, on_error, name)
         self._split = find_chunk_size(problem, size)
         self._size = None if size is None and executor is None else self._split
         self._precision, self._n_chunks, self._checked = precision, 0, False
@@ -255,26 +140,6 @@ class Evaluator:
         self._stack.close()
 
     @property
-    def dim(self) -> int:
-        """Number of dimensions of x."""
-        return int(self.problem.dim)
-
-    @property
-    def base(self) -> Any:
-        """Distribution of X."""
-        return self.problem.base
-
-    @property
-    def given(self) -> str:
-        """Condition of p, in words; empty without one."""
-        return condition_of(self.problem)
-
-    @property
-    def column_names(self) -> tuple[str, ...]:
-        """Names of the columns of x; empty where the problem has none."""
-        return names_of_columns(self.problem)
-
-    @property
     def n_retries(self) -> int:
         """Chunks that were computed again because a worker was lost."""
         return 0 if self._dispatcher is None else self._dispatcher.n_retries
@@ -287,11 +152,11 @@ class Evaluator:
             JournalError: The journal has other points, or f had other values at them than it has now.
         """
         answers: dict[int, Answer] = {}
-        points = {i: one for i, one in enumerate(requests) if isinstance(one, np.ndarray)}
-        if points:
-            f = self._compute(Chunk("f", (np.concatenate(list(points.values())),))).table[:, 0]
-            answers.update(zip(points, _split(f, list(points.values())), strict=True))
+        plain = {i: one for i, one in enumerate(requests) if isinstance(one, np.ndarray)}
         wanted = {i: one.x for i, one in enumerate(requests) if isinstance(one, TermsRequest)}
+        if plain:
+            f = self.evaluate(np.concatenate(list(plain.values())))
+            answers.update(zip(plain, _split(f, list(plain.values())), strict=True))
         if wanted:
             terms = self.terms(np.concatenate(list(wanted.values())))
             rows = _split(np.arange(len(terms.f)), list(wanted.values()))
@@ -303,51 +168,46 @@ class Evaluator:
 
     def evaluate(self, x: FloatArray) -> FloatArray:
         """Return f of points x (n, d), shape (n,); NaN where there is no outcome."""
-        return self._compute(Chunk("f", (np.asarray(x, dtype=np.float64),))).table[:, 0]
+        return self._compute("f", x).table[:, 0]
 
     def terms(self, x: FloatArray) -> Terms:
         """Return the terms of points x (n, d); NaN where there is no outcome."""
-        table, notes = self._compute(Chunk("terms", (np.asarray(x, dtype=np.float64),)))
+        table, notes = self._compute("terms", x)
         n, n_found = len(table), (table.shape[1] - 1) // 2
         if n_found and self._n_terms not in (None, n_found):
-            counts = sorted({n_found, self._n_terms or 0})
-            raise EvaluationError(f"Expected the same number of terms in every batch, got {counts}.")
+            raise _other_number_of_terms({n_found, self._n_terms or 0})
         self._n_terms = n_found or self._n_terms
         if not n_found:  # no row has an outcome
             table = np.full((n, 1 + 2 * (self._n_terms or 1)), np.nan)
         f, values, ticks = np.split(table, [1, 1 + (table.shape[1] - 1) // 2], axis=1)
-        threshold, names = notes.get("threshold", self._work.gamma), notes.get("names", ())
+        threshold, names = notes.get("threshold", self._gamma), notes.get("names", ())
         return Terms(f[:, 0], values, np.nan_to_num(ticks).astype(np.int64), threshold, tuple(names))
 
     def gradient(self, x: FloatArray, term: NDArray[np.int64], ticks: NDArray[np.int64]) -> TermGradients:
         """Return the gradients of one term of each of the points x (n, d); NaN in rows that have none."""
-        table, notes = self._compute(Chunk("gradient", (np.asarray(x, dtype=np.float64), term, ticks)))
+        table, notes = self._compute("gradient", x, term, ticks)
         if table.shape[1] != x.shape[1]:  # no row has one
             table = np.full(x.shape, np.nan)
         return TermGradients(table, float(notes["cost"]))
 
-    def _compute(self, request: Chunk) -> Result:
-        """Return the result of a request, from the journal as far as that has it."""
+    def _compute(self, kind: str, x: FloatArray, *others: NDArray[np.int64]) -> Result:
+        """Return the result of a request for f, terms or gradients at x (n, d), as far as it goes from the journal."""
+        request = Chunk(kind, (np.asarray(x, dtype=np.float64), *others))
         chunks, results = self._restore(request)
         first, self._n_chunks = self._n_chunks, self._n_chunks + len(request.split(self._size))
         left = {number: chunk for number, chunk in enumerate(chunks) if number not in results}
         n_done = sum(len(chunks[number]) for number in results)
         for number, result in self._map(first, left):
             if self._journal is not None:
-                n_sim = whole_simulations(result.notes["cost"]) if request.kind == "gradient" else len(chunks[number])
+                n_sim = whole_simulations(result.notes["cost"]) if kind == "gradient" else len(chunks[number])
                 self._journal.append(self._digest(chunks[number]), result, n_sim)
             results[number] = result
-            self._count(chunks[number], result)
             n_done += len(chunks[number])
-            if self.on_chunk is not None and request.kind != "gradient":  # whose rows count as what they cost
-                self.on_chunk(n_done)
-        ordered = [results[number] for number in range(len(chunks))]
-        if request.kind != "gradient":
-            self._note(request, ordered)
-        for result in ordered:
-            self.n_retried += int(result.notes["n_retried"])
-            self.lost += result.notes.get("lost", [])
-        return _join_checked(ordered)
+            if kind != "gradient":  # whose rows count as what they cost
+                self._count(result)
+                if self.on_chunk is not None:
+                    self.on_chunk(n_done)
+        return self._conclude(request, [results[number] for number in range(len(chunks))])
 
     def _map(self, first: int, chunks: dict[int, Chunk]) -> Iterable[tuple[int, Result]]:
         """Return the results of chunks with their numbers in the request, the first of which has a number in the run.
@@ -381,9 +241,10 @@ class Evaluator:
                 "begun. Remove the file to begin anew."
             )
         for number, result in known.items():
-            self._check_same_f(chunks[number], result)
             self.n_restored += len(chunks[number])
-            self._count(chunks[number], result)
+            if request.kind != "gradient":
+                self._check_same_f(self._journal, chunks[number], result.table[:, 0])
+                self._count(result)
         return chunks, known
 
     def _digest(self, chunk: Chunk) -> str:
@@ -391,32 +252,39 @@ class Evaluator:
         x = digest_points(chunk.x.astype(self._precision))
         if chunk.kind == "f":
             return x
-        return " ".join((chunk.kind, repr(self._work.gamma), x, *map(digest_points, chunk.arrays[1:])))
+        return " ".join((chunk.kind, repr(self._gamma), x, *map(digest_points, chunk.arrays[1:])))
 
-    def _count(self, chunk: Chunk, result: Result) -> None:
-        if chunk.kind != "gradient":
-            f = result.table[:, 0]
-            self.n_made += len(f)
-            self.n_failed += int((np.isnan(f) | (f <= self._work.gamma)).sum())
+    def _count(self, result: Result) -> None:
+        f = result.table[:, 0]
+        self.n_made += len(f)
+        self.n_failed += int((np.isnan(f) | (f <= self._gamma)).sum())
 
-    def _note(self, request: Chunk, results: Sequence[Result]) -> None:
-        """Note the faults of a request, and tell the watchers."""
-        f = np.concatenate([result.table[:, 0] for result in results])
-        reasons = [reason for result in results for reason in result.notes["reasons"]]
+    def _conclude(self, request: Chunk, results: list[Result]) -> Result:
+        """Return the results of a request as one; note its faults and what it took, and tell the watchers."""
+        widths = {result.table.shape[1] for result in results} - {1}
+        if len(widths) > 1:
+            raise _other_number_of_terms({(width - 1) // 2 for width in widths})
+        whole = join_results(results)
+        self.n_retried += int(whole.notes["n_retried"])
+        self.lost += whole.notes.get("lost", [])
+        if request.kind == "gradient":
+            return whole
+        f, reasons = whole.table[:, 0], whole.notes["reasons"]
         self.faults += [Fault(x.copy(), why) for x, why in zip(request.x[np.isnan(f)], reasons, strict=True)]
         if self.watchers:
             parts = [(len(each.table), each.notes.get("seconds", np.nan)) for each in results]
-            seconds = np.concatenate([np.full(n, whole / max(n, 1)) for n, whole in parts])
+            seconds = np.concatenate([np.full(n, total / max(n, 1)) for n, total in parts])
             for watch in self.watchers:
                 watch(Simulated(request.x, f, reasons, seconds))
+        return whole
 
-    def _check_same_f(self, chunk: Chunk, result: Result) -> None:
+    def _check_same_f(self, journal: Journal, chunk: Chunk, known: FloatArray) -> None:
         """Raise a JournalError if f has other values now at some points of the first chunk, the same ones twice."""
-        if self._checked or chunk.kind == "gradient":
+        if self._checked:
             return
         self._checked = True
-        rows = np.argsort(result.table[:, 0])[np.unique(np.linspace(0, len(chunk) - 1, N_CHECKED).astype(int))]
-        f, part = result.table[rows, 0], {0: Chunk("f", (chunk.x[rows],))}
+        rows = np.argsort(known)[np.unique(np.linspace(0, len(chunk) - 1, N_CHECKED).astype(int))]
+        f, part = known[rows], {0: Chunk("f", (chunk.x[rows],))}
         ((_, again),) = self._map(0, part)
         changed = find_changed(again.table[:, 0], f)
         if not changed.any():
@@ -424,9 +292,8 @@ class Evaluator:
         ((_, third),) = self._map(0, part)
         if np.array_equal(again.table[:, 0], third.table[:, 0], equal_nan=True):
             row = int(np.argmax(changed))
-            assert self._journal is not None
             raise JournalError(
-                f"f is {again.table[row, 0]:.6g} at a point where {str(self._journal.path)!r} has {f[row]:.6g}: it has "
+                f"f is {again.table[row, 0]:.6g} at a point where {str(journal.path)!r} has {f[row]:.6g}: it has "
                 "changed since the journal was begun. Remove the file to begin anew."
             )
 
@@ -455,13 +322,8 @@ def select_rows(terms: Terms, rows: Any) -> Terms:
     return Terms(terms.f[rows], terms.values[rows], terms.ticks[rows], terms.threshold, terms.names)
 
 
-def _join_checked(results: Sequence[Result]) -> Result:
-    """Return the results of chunks as one; those that know their numbers of terms must agree."""
-    widths = {result.table.shape[1] for result in results} - {1}
-    if len(widths) > 1:
-        counts = sorted((width - 1) // 2 for width in widths)
-        raise EvaluationError(f"Expected the same number of terms in every batch, got {counts}.")
-    return join_results(results)
+def _other_number_of_terms(counts: set[int]) -> EvaluationError:
+    return EvaluationError(f"Expected the same number of terms in every batch, got {sorted(counts)}.")
 
 
 def _find_offer(problem: Any) -> TermsOffer | None:

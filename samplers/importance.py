@@ -1,6 +1,4 @@
-"""Importance sampling: weighted draws, their calibration, final draws from a fixed proposal, the search for one.
-
-Calibration: weights of draws from a mixture, changed so that its components keep their known mass.
+"""Importance sampling: weighted draws and their calibration, and the search for a proposal with final draws after it.
 
 Draws u_i of q = sum_k a_k q_k, a fixed number n_k = n a_k from each component (a stratum), estimate the mass of each
 component, which is 1, by the mean of h_ij = q_j(u_i) / q(u_i). How far these means are off tells how far p-hat =
@@ -15,20 +13,14 @@ b minimises the variance within the strata. p is linear in y, so that it is also
 c knows nothing of y, and so serves any threshold and any other base distribution too. That b is estimated from the same
 draws biases p by the order of 1 / n, where its standard error is of the order of 1 / sqrt(n).
 
-Draws: importance-weighted points from one proposal, with their spread, interval and doubts.
-
-Search for a proposal: its rounds of draws, its end, and the final draws that follow it.
-
-Shared by the methods that search a proposal by iteration: `ImportanceSampling`, `CrossEntropy` and
-`ImprovedCrossEntropy`. Only the final draws count, unless the run is stopped before them: then the draws of the
-search are weighted as draws from the mixture of its proposals.
-
-Importance sampling with fresh draws from a fixed proposal.
+Methods that search a proposal by iteration share the rounds of draws, the end of the search and the final draws. Only
+these count, unless the run is stopped before them: then the draws of the search are weighted as draws from the mixture
+of its proposals.
 
 References:
-    Owen and Zhou, "Safe and effective importance sampling", JASA 95, 2000 (components as control variates).
+    Owen and Zhou, "Safe and effective importance sampling", JASA 95, 2000 (components as control variates, defensive
+    mixtures).
     Deville and Särndal, "Calibration estimators in survey sampling", JASA 87, 1992 (regression as weights).
-    Owen and Zhou, "Safe and effective importance sampling", JASA 95, 2000 (defensive mixtures).
     Maurer and Pontil, "Empirical Bernstein bounds and sample-variance penalization", COLT 2009.
 """
 
@@ -36,7 +28,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Generator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -63,16 +55,12 @@ LEAST_FACTOR = 0.1
 
 
 class Calibration(NamedTuple):
-    """Calibrated weights of n draws, as factors of their own weights."""
+    """Calibrated weights of n draws, as factors c (n,) of their own; m = 0 where the weights stay as they are."""
 
     factors: FloatArray
-    """c, shape (n,)."""
-    controls: FloatArray
-    """H, shape (n, m); m = 0 where the weights stay as they are."""
-    slopes: FloatArray
-    """S with b = S'y, shape (n, m)."""
-    strata: NDArray[np.int64]
-    """Of each draw, shape (n,)."""
+    controls: FloatArray  # H (n, m)
+    slopes: FloatArray  # S (n, m) with b = S'y
+    strata: NDArray[np.int64]  # of each draw, (n,)
 
     def residuals(self, y: FloatArray) -> FloatArray:
         """Return y (n,) less what the controls explain of how it deviates from its mean in each stratum, shape (n,).
@@ -88,12 +76,10 @@ class Calibration(NamedTuple):
 
 
 def calibrate(ratios: FloatArray, strata: NDArray[np.int64], draws_per_control: int) -> Calibration:
-    """Return calibrated weights of draws from a mixture q.
+    """Return calibrated weights of draws from a mixture q; those of fewer draws for each control stay as they are.
 
-    Args:
-        ratios: h, densities of mass 1 over q at each draw, shape (n, m): its components, or mixtures of some of them.
-        strata: The component that each draw is from, shape (n,).
-        draws_per_control: Weights of fewer draws for each control stay as they are.
+    `ratios` (n, m) is h, densities of mass 1 over q at each draw: its components, or mixtures of some of them. `strata`
+    (n,) is the component that each draw is from.
     """
     n, m = ratios.shape
     if n < draws_per_control * m:
@@ -120,24 +106,25 @@ LARGE_SHARE = 0.15
 """Share of p in one draw that is worth a warning; with 30 equal draws it is 0.03."""
 
 
+def _none() -> FloatArray:
+    return np.empty(0)
+
+
 @dataclass(frozen=True, eq=False)
 class Draws:
-    """Independent draws from one proposal; p rests on the failing ones."""
+    """n independent draws from one proposal, of which k fail; p rests on these.
+
+    `log_weights` are log(p0 / q), calibrated or not. `fails` says which draws fail, in the order in which they were
+    simulated, (n,); empty where that is not known.
+    """
 
     n: int
-    """Number of draws."""
-    f: FloatArray
-    """Outcomes of the k failing ones, shape (k,)."""
-    log_weights: FloatArray
-    """log(p0 / q) at the failing ones, calibrated or not, shape (k,)."""
-    x: FloatArray = field(default_factory=lambda: np.empty((0, 0)))
-    """The failing ones in physical space, shape (k, d)."""
-    f_safe: FloatArray = field(default_factory=lambda: np.empty(0))
-    """Outcomes of the others, shape (n - k,)."""
-    log_weights_safe: FloatArray = field(default_factory=lambda: np.empty(0))
-    """log(p0 / q) at the others, shape (n - k,)."""
+    f: FloatArray  # of the failing ones, (k,)
+    log_weights: FloatArray  # (k,)
+    x: FloatArray = field(default_factory=lambda: np.empty((0, 0)))  # in physical space, (k, d)
+    f_safe: FloatArray = field(default_factory=_none)  # of the others, (n - k,)
+    log_weights_safe: FloatArray = field(default_factory=_none)  # (n - k,)
     fails: NDArray[np.bool_] = field(default_factory=lambda: np.empty(0, dtype=bool))
-    """Which draws fail, in the order in which they were simulated, shape (n,); empty where that is not known."""
 
     @classmethod
     def from_outcomes(cls, f: FloatArray, log_weights: FloatArray, x: FloatArray, gamma: float) -> Draws:
@@ -184,11 +171,7 @@ class Draws:
 
     @property
     def cov(self) -> float:
-        """Coefficient of variation of `p`; inf without a failing draw.
-
-        Standard error of the mean, with (largest term / n)^2 added to its square: where one
-        weight dominates, the sample variance alone is too small most of the time.
-        """
+        """Coefficient of variation of `p`; inf without a failing draw."""
         return weighted_cov(self.n, self.log_weights)
 
     @property
@@ -204,7 +187,11 @@ class Draws:
 
 
 def weighted_cov(n: int, log_weights: FloatArray) -> float:
-    """Return the c.o.v. of sum(w) / n over n draws whose nonzero terms have these log weights."""
+    """Return the c.o.v. of sum(w) / n over n draws whose nonzero terms have these log weights; inf without one.
+
+    Standard error of the mean, with (largest term / n)^2 added to its square: where one weight dominates, the sample
+    variance alone is too small most of the time.
+    """
     if log_weights.size == 0:
         return math.inf
     w = np.exp(log_weights - log_weights.max())
@@ -277,12 +264,10 @@ MOST_FINAL_BATCHES = 100
 
 @dataclass(frozen=True, eq=False)
 class Space:
-    """The space of a proposal, and the base distribution there."""
+    """The space of a proposal: the base distribution there, and the map of its points (n, d) to physical space."""
 
     base: ProposalDistribution
-    """p0."""
     to_x: Callable[[FloatArray], FloatArray]
-    """Maps points of this space, shape (n, d), to physical space."""
 
     @classmethod
     def standard_normal(cls, inputs: Inputs) -> Space:
@@ -322,7 +307,7 @@ def simulate_until(
 ) -> Generator[FloatArray, FloatArray, tuple[Draws, list[Level], bool]]:
     """Simulate batches until `limit` draws are made or goal.target_cov is met.
 
-    Returns the draws, a record of every batch and whether the run was interrupted.
+    Return the draws, a record of every batch and whether the run was interrupted.
     """
     draws = Draws(0, np.empty(0), np.empty(0))
     trace: list[Level] = []
@@ -332,17 +317,8 @@ def simulate_until(
         except Interrupted:
             return draws, trace, True
         draws = draws.join(new)
-        trace.append(
-            Level(
-                gamma=goal.gamma,
-                p=len(new.f) / new.n,
-                estimate=draws.p,
-                n_sim=new.n,
-                n_points=new.n,
-                cov=draws.cov,
-                ess=draws.ess,
-            )
-        )
+        record = round_record(goal.gamma, new.n, new.log_weights)
+        trace.append(replace(record, estimate=draws.p, cov=draws.cov, ess=draws.ess))  # of all so far
         goal.on_level(trace[-1])
         if goal.target_cov is not None and draws.cov <= goal.target_cov:
             break
@@ -381,16 +357,12 @@ LEAST_ROUNDS = 10
 
 
 class Round(NamedTuple):
-    """Simulated draws from one proposal."""
+    """Simulated draws u (n, d), with outcomes f (n,), from a proposal q in the space where p0 is the base."""
 
     base: SupportsLogProb
-    """The base distribution p0 in the space of the search."""
     proposal: ProposalDistribution
-    """q, in the same space."""
     u: FloatArray
-    """Draws, shape (n, d)."""
     f: FloatArray
-    """Their outcomes, shape (n,)."""
 
     @property
     def log_weights(self) -> FloatArray:
@@ -399,14 +371,14 @@ class Round(NamedTuple):
 
 
 class Search(NamedTuple):
-    """The rounds of a finished search."""
+    """A finished search: the rounds whose draws are kept, the first from the base, and a record of every round.
+
+    Its status is CONVERGED where it reached gamma.
+    """
 
     rounds: Sequence[Round]
-    """Those whose draws are kept; the first is from the base distribution."""
     trace: Sequence[Level]
-    """A record of every round."""
     status: Status
-    """CONVERGED: it reached gamma."""
 
     @property
     def n_sim(self) -> int:
@@ -425,20 +397,18 @@ class Search(NamedTuple):
 
 
 class FinalDraws(NamedTuple):
-    """The draws that p rests on, after a search."""
+    """The draws that p rests on, after a search, and the records of the search and of the final batches.
+
+    No weight exceeds `largest_weight`, 1 for draws from the base distribution. `n_first` is 0 but where there are only
+    the draws of the search: then the number in its first round, which other rounds may follow before the rest of these.
+    """
 
     draws: Draws
     trace: tuple[Level, ...]
-    """Records of the search and of the final batches."""
     largest_weight: float
-    """Upper bound of the weights; 1 for draws from the base distribution."""
-    base_draws: int
-    """Draws from the base distribution among all simulations, see `Outcome.base_draws`."""
+    base_draws: int  # see `Outcome.base_draws`
     stopped: bool
-    """Whether the run was interrupted."""
     n_first: int = 0
-    """Where there are none but those of the search: draws of its first round, which other rounds may follow before the
-    rest of these; otherwise 0."""
 
     @property
     def cov(self) -> float:
@@ -484,13 +454,7 @@ def plan_rounds(goal: Goal, n_round: int, max_rounds: int) -> tuple[int, int]:
 
 
 def round_record(level: float, n: int, log_weights: FloatArray) -> Level:
-    """Return the record of a round: the estimate of P[f <= level] by its draws.
-
-    Args:
-        level: Threshold.
-        n: Draws of the round.
-        log_weights: log(p0 / q) of those with f <= level, shape (k,).
-    """
+    """Return the record of a round of n draws: P[f <= level] by log(p0 / q) (k,) of those with f <= level."""
     return Level(
         gamma=level,
         p=len(log_weights) / n,
@@ -503,16 +467,11 @@ def round_record(level: float, n: int, log_weights: FloatArray) -> Level:
 
 
 def pool_rounds(rounds: Sequence[Round], to_x: Callable[[FloatArray], FloatArray], gamma: float) -> Draws:
-    """Return the draws of some rounds as if drawn from the mixture of their proposals.
+    """Return the draws of one or more rounds as if drawn from the mixture of their proposals.
 
     For a run that is stopped during its search. The first round being base draws, no weight exceeds N / n_0.
     Later proposals were fitted to earlier draws, so that this is not unbiased as fresh draws would be: low by 1 to
     4 %, by 9 % after two rounds of a mixture with several regions; its interval covers p in 92 to 100 % of runs.
-
-    Args:
-        rounds: One or more.
-        to_x: Maps points of their space, shape (n, d), to physical space.
-        gamma: Threshold of failure.
     """
     n = np.array([len(one.f) for one in rounds])
     u, f = (np.concatenate(parts) for parts in zip(*((one.u, one.f) for one in rounds), strict=True))

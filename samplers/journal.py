@@ -27,7 +27,7 @@ from urllib.parse import quote
 import numpy as np
 from numpy.typing import NDArray
 
-from samplers.chunks import Result
+from samplers.workers import Result
 
 SYNC_SECONDS = 1.0
 """Longest time for which finished simulations are not on the disk yet: what a power cut loses, beside the chunk."""
@@ -48,10 +48,9 @@ HEAD = 0
 
 
 class JournalError(ValueError):
-    """A journal cannot be used: it is damaged, in use, or of another run."""
+    """A journal cannot be used: it is damaged, in use, or of another run; simulating again would not help."""
 
     final = True
-    """Simulating again would not help."""
 
 
 class NothingRecorded(JournalError):
@@ -60,6 +59,15 @@ class NothingRecorded(JournalError):
 
 class JournalInUse(JournalError):
     """Another process has the journal open."""
+
+
+class _Damaged(JournalError):
+    """A record does not match its digest."""
+
+    def __init__(self, path: Path, number: int) -> None:
+        self.number = number
+        where = f": record {number + 1} does" if number > HEAD else " from its first record on, which does"
+        super().__init__(f"{str(path)!r} is damaged{where} not match its checksum.")
 
 
 class _Row(NamedTuple):
@@ -84,9 +92,7 @@ def digest_points(x: NDArray[Any]) -> str:
 
 
 class Journal:
-    """Finished simulations of a run.
-
-    An interruption of a call leaves the file as it was before the call, or as it is after it.
+    """Finished simulations of a run; an interruption of a call leaves the file as before the call, or as after it.
 
     Attributes:
         path: Of the file.
@@ -117,12 +123,7 @@ class Journal:
 
     @classmethod
     def create(cls, path: Path, head: dict[str, Any], replace: bool = False) -> Journal:
-        """Begin a journal.
-
-        Args:
-            path: Of the file; one without any finished simulations is replaced.
-            head: What the run is, JSON-ready.
-            replace: Replace a journal with finished simulations too.
+        """Begin a journal in the place of one without finished simulations, or of any (`replace`).
 
         Raises:
             JournalError: There is one already, or another process has it open.
@@ -151,52 +152,39 @@ class Journal:
     def open(cls, path: Path, mend: bool = False) -> Journal:
         """Continue a journal, all of whose digests are verified.
 
-        Args:
-            path: Of the file.
-            mend: Of a damaged journal, keep what stands before the damage; one whose first record is damaged is left
-                as it is.
+        Of a damaged one, `mend` keeps what stands before the damage; if that is its first record it is left as it is.
 
         Raises:
             NothingRecorded: It was cut before its first record.
             JournalError: It is damaged, with `mend` in its first record, or another process has it open.
             OSError: It cannot be read.
         """
-        missing = _check_file(path)
-        if missing and mend:  # zeros, which no record consists of
-            os.truncate(path, os.stat(path).st_size + missing)
-        elif missing:
-            return cls._open_cut(path)
-        connection = _connect(path)
+        missing = _count_missing(path)
         try:
-            head = _verify(path, connection)
+            if missing and mend:  # zeros, which no record consists of
+                os.truncate(path, os.stat(path).st_size + missing)
+            elif missing and not _wal(path).exists():  # where the end is if it was being copied from there
+                raise _Damaged(path, HEAD)
+            return cls._take_up(path)
         except _Damaged as damage:
-            connection.close()
+            if missing and not mend:
+                raise JournalError(f"{str(path)!r} is damaged: its end is missing.") from damage
             if not (mend and damage.number > HEAD):
                 raise
             _keep_before(path, damage.number)
             return cls.open(path)
-        except sqlite3.DatabaseError as error:
-            connection.close()
-            raise _Damaged(path, HEAD) from error
-        except BaseException:
-            connection.close()
-            raise
-        return cls(path, connection, head)
 
     @classmethod
-    def _open_cut(cls, path: Path) -> Journal:
-        """Continue a journal whose end is missing, which is in SQLite's log if that was being copied from there."""
+    def _take_up(cls, path: Path) -> Journal:
+        """Return the journal of a file that is there to its end."""
+        connection = _connect(path)
         try:
-            if not _wal(path).exists():
-                raise _Damaged(path, HEAD)
-            connection = _connect(path)
-            try:
-                return cls(path, connection, _verify(path, connection))
-            except BaseException:
-                connection.close()
-                raise
-        except (_Damaged, sqlite3.DatabaseError) as error:
-            raise JournalError(f"{str(path)!r} is damaged: its end is missing.") from error
+            return cls(path, connection, _verify(path, connection))
+        except BaseException as error:
+            connection.close()
+            if isinstance(error, sqlite3.DatabaseError):
+                raise _Damaged(path, HEAD) from error
+            raise
 
     @property
     def n(self) -> int:
@@ -214,11 +202,7 @@ class Journal:
         return self._last_taken < self._earlier
 
     def find(self, points: str) -> Result | None:
-        """Return the result of some points by their digest; None where they are not recorded.
-
-        Raises:
-            JournalError: It is none.
-        """
+        """Return the result of some points by their digest; None where they are not recorded."""
         found = self._connection.execute(f"SELECT {COLUMNS} FROM chunks WHERE points = ?", (points,)).fetchone()
         if found is None:
             return None
@@ -231,18 +215,13 @@ class Journal:
             raise JournalError(f"{str(self.path)!r} is no journal of this version: {error}.") from error
 
     def append(self, points: str, result: Result, n_sim: int) -> None:
-        """Write finished simulations; those that cannot be written now are tried again with the next ones.
+        """Write n_sim finished simulations under the digest of their points.
 
-        Args:
-            points: Digest of the points.
-            result: Of the points.
-            n_sim: Number of simulations.
-
-        Warns:
-            UserWarning: They cannot be written; once.
+        Those that cannot be written are tried again with the next ones; a UserWarning says so once.
         """
         numbers = np.ascontiguousarray(result.table, dtype="<f8").tobytes()
-        seconds, notes = round(self._elapsed(), 3), json.dumps(result.notes)
+        elapsed = self.earlier_seconds + time.monotonic() - self._opened  # without that between two parts of the run
+        seconds, notes = round(elapsed, 3), json.dumps(result.notes)
         self._waiting.append(_Row(-1, points, result.table.shape[1], n_sim, seconds, notes, numbers))
         self._write_waiting()
 
@@ -273,10 +252,6 @@ class Journal:
         except OSError:
             return False
 
-    def _elapsed(self) -> float:
-        """Return the wall time of the run so far, without that between an interruption and its resumption [s]."""
-        return self.earlier_seconds + time.monotonic() - self._opened
-
     def _number_of_last(self) -> int:
         return int(self._connection.execute("SELECT max(id) FROM chunks").fetchone()[0])
 
@@ -302,21 +277,8 @@ class Journal:
         self._connection.execute(INSERT, (*row, row.digest))
 
 
-class _Damaged(JournalError):
-    """A record does not match its digest."""
-
-    def __init__(self, path: Path, number: int) -> None:
-        self.number = number
-        where = f": record {number + 1} does" if number > HEAD else " from its first record on, which does"
-        super().__init__(f"{str(path)!r} is damaged{where} not match its checksum.")
-
-
 def _connect(path: Path) -> sqlite3.Connection:
-    """Return a connection to a file that nobody else has.
-
-    Raises:
-        JournalError: Another process has it, or it is no journal.
-    """
+    """Return a connection to a file that nobody else has; raise a JournalError for one in use and for no journal."""
     uri = f"file:{quote(str(path.absolute()))}?mode=rw"
     connection = sqlite3.connect(uri, uri=True, timeout=0.0, isolation_level=None)
     try:
@@ -339,7 +301,7 @@ def _connect(path: Path) -> sqlite3.Connection:
     return connection
 
 
-def _check_file(path: Path) -> int:
+def _count_missing(path: Path) -> int:
     """Return how many bytes are missing at the end of a file by its header; raise unless it is an ordinary one."""
     found = os.stat(path)
     if not stat.S_ISREG(found.st_mode):  # a pipe would be waited for
@@ -360,16 +322,9 @@ def _verify(path: Path, connection: sqlite3.Connection) -> dict[str, Any]:
         raise NothingRecorded(f"{str(path)!r} was cut before its first record; nothing is recorded in it.")
     if connection.execute("PRAGMA application_id").fetchone()[0] != FORMAT:
         raise JournalError(f"{str(path)!r} is of another kind or version: remove it to begin anew.")
-    head: dict[str, Any] = {}
-    for row in _good_rows(path, connection):
-        if row.id == HEAD:
-            head = _read_head(path, row.notes)
-    return head
-
-
-def _read_head(path: Path, text: str) -> dict[str, Any]:
+    notes = [row.notes for row in _good_rows(path, connection) if row.id == HEAD]
     try:
-        head = json.loads(text)
+        head = json.loads(notes[0])
     except (ValueError, RecursionError) as error:
         raise JournalError(f"{str(path)!r} is no journal: {error}.") from error
     if not isinstance(head, dict):
@@ -378,11 +333,7 @@ def _read_head(path: Path, text: str) -> dict[str, Any]:
 
 
 def _good_rows(path: Path, connection: sqlite3.Connection) -> Iterator[_Row]:
-    """Yield the records in their order.
-
-    Raises:
-        JournalError: The next one is damaged.
-    """
+    """Yield the records in their order; raise `_Damaged` at one that is."""
     number = HEAD
     try:
         for *fields, digest in connection.execute(f"SELECT {COLUMNS}, digest FROM chunks ORDER BY id"):
@@ -415,11 +366,7 @@ def _keep_before(path: Path, number: int) -> None:
 
 
 def _has_simulations(path: Path) -> bool:
-    """Return whether a file has chunks, or is damaged or of another kind, so that somebody may want to keep it.
-
-    Raises:
-        JournalInUse: Another process has it open.
-    """
+    """Return whether a file has chunks, or is damaged or of another kind, so that somebody may want to keep it."""
     try:
         with contextlib.closing(Journal.open(path)) as journal:
             return journal.has_simulations

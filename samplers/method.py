@@ -1,21 +1,19 @@
-"""Contract of a method (`Stepping`) and its terms; the base class `Method` stands in `samplers.methods.base`."""
+"""Contract of a method (`Stepping`), its goal and outcome, independent outcomes as one, what a whole run has found."""
 
 import math
 import sys
+from collections import Counter
 from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass, field, replace
 from typing import ClassVar, NamedTuple, Protocol, cast, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import chdtrc, stdtrit
 
 from samplers.problem import Distribution, FloatArray, Inputs, TermGradients, Terms
 from samplers.sample import DrawWeights, Failures, Level, Sample, SimulatedPoints, SimulationIndex, Status
-from samplers.statistics import binomial_cov, clopper_pearson, normalise_weights
-
-
-def ignore_level(level: Level) -> None:
-    """Do nothing with a finished level."""
+from samplers.statistics import Interval, binomial_cov, clopper_pearson, normalise_weights
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,7 +35,7 @@ class Goal:
     """Simulations that the run may use; None leaves it to the method."""
     target_cov: float | None = None
     """Coefficient of variation to stop at, for methods with `stops_at_target`; the run decides whether it is met."""
-    on_level: Callable[[Level], None] = ignore_level
+    on_level: Callable[[Level], None] = lambda level: None
     """Called with every finished level."""
 
     @property
@@ -146,12 +144,14 @@ Where its inputs offer them (`offer_of`), it may also ask for terms and gradient
 
 @dataclass(frozen=True)
 class TermsOffer:
-    """What a run can answer beside f: the terms of points and, unless `gradient_cost` is None, their gradients."""
+    """What a run can answer beside f: the terms of points and, unless `gradient_cost` is None, their gradients.
+
+    A row of a gradient takes at most `gradient_cost` simulations; `with_f` says whether terms come with the rollout
+    that gives f, see `samplers.problem.HasTerms`.
+    """
 
     gradient_cost: float | None = None
-    """Simulations that a row of a gradient takes at most."""
     with_f: bool = True
-    """Whether terms come with the rollout that gives f; see `samplers.problem.HasTerms`."""
 
     def count_gradients(self, n: int) -> int:
         """Return the simulations that n gradients take at most."""
@@ -159,38 +159,26 @@ class TermsOffer:
         return whole_simulations(self.gradient_cost * n)
 
 
-@runtime_checkable
-class OffersTerms(Protocol):
-    """Inputs that say whether the run answers requests for terms."""
-
-    @property
-    def offer(self) -> TermsOffer | None:
-        """What it answers; None for f alone."""
-
-
 def offer_of(inputs: Inputs) -> TermsOffer | None:
     """Return what a run answers beside f; None where it has only f, as with simulations that the user makes."""
-    return inputs.offer if isinstance(inputs, OffersTerms) else None
+    offer: TermsOffer | None = getattr(inputs, "offer", None)  # of the inputs of a run
+    return offer
 
 
 @dataclass(frozen=True, eq=False)
 class TermsRequest:
-    """Points to be simulated whose terms are wanted too; a row counts as one simulation."""
+    """Points x (n, d), n > 0, to be simulated whose terms are wanted too; a row counts as one simulation."""
 
     x: FloatArray
-    """Shape (n, d), n > 0."""
 
 
 @dataclass(frozen=True, eq=False)
 class GradientRequest:
-    """Points with one term each whose gradient is wanted."""
+    """Points x (n, d), n > 0, with the number (n,) and ticks (n,) of one term each whose gradient is wanted."""
 
     x: FloatArray
-    """Shape (n, d), n > 0."""
     term: NDArray[np.int64]
-    """Number of the term, shape (n,)."""
     ticks: NDArray[np.int64]
-    """Index of the time at which it was attained, shape (n,)."""
 
 
 Request = FloatArray | TermsRequest | GradientRequest
@@ -246,13 +234,14 @@ class Stepping(Protocol):
 
 
 class Choice(NamedTuple):
-    """A method for one run, and why it was chosen."""
+    """A method for one run, and why it was chosen, its name first; empty where nothing was chosen.
+
+    The text of the result says it where it is `unusual`: another method than most runs have.
+    """
 
     method: Stepping
     why: str = ""
-    """In words, the name of the method first; empty where it was named and nothing was chosen."""
     unusual: bool = False
-    """Whether it is another one than most runs have, so that the text of the result says it."""
 
 
 def no_outcome_share(f: FloatArray, log_weights: FloatArray | None = None) -> float:
@@ -332,3 +321,166 @@ class EstimateData:
     """All simulations, where `estimate` was told to keep them (`keep_points=True`)."""
     refit_ratios: list[tuple[tuple[object, ...], FloatArray]] = field(default_factory=list, compare=False, repr=False)
     """Density ratios of the refits at the failing points with what they are of, once they were asked for."""
+
+
+# Independent outcomes as one
+
+OWN_ERROR_FACTOR = 1.5
+"""Factor by which runs may understate their own errors before they are said to disagree."""
+MIN_SPREAD = 1 / 3
+"""Least spread of runs, as a share of their own errors: they are closer together by chance, such as counts that tie."""
+UNINFORMATIVE_COV = 1.0
+"""From this c.o.v. on the p of a run adds nothing to its interval."""
+DISAGREEMENT_LEVEL = 1e-4
+"""Probability that runs whose errors are right are said to disagree."""
+STATUS_PRIORITY = (Status.STOPPED, Status.STALLED, Status.BUDGET, Status.CONVERGED)
+"""The status of the combined runs is the first of these that one of them has."""
+
+
+def combine(outcomes: Sequence[Outcome], confidence: float) -> Outcome:
+    """Return R independent runs as one: pooled counts, or their mean with a t interval.
+
+    Where every run is a share k_i / n_i of independent draws, the draws are those of one longer
+    run: p = sum k_i / sum n_i with the Clopper-Pearson interval. (A t interval would ignore that the
+    spread of binomial counts is known; with R = 2 its quantile is 12.7.)
+
+    Otherwise p is the arithmetic mean p_bar (each run's p-hat is unbiased, its logarithm is not), with the c.o.v. of
+    `combined_cov` and the interval of `_mean_interval`. Runs that were stopped before their end are left out of the
+    mean if any run came to its end: one that has not reached the failures has p-hat = 0, which is no estimate. Their
+    levels stay in the trace.
+    """
+    if len(outcomes) == 1:
+        return outcomes[0]
+    trace = tuple(replace(level, run=i) for i, outcome in enumerate(outcomes) for level in outcome.trace)
+    counts = pool_counts(outcomes)
+    if counts is not None:
+        hits, n = counts
+        no_outcome = sum(o.no_outcome_share * o.counts[0] for o in outcomes if o.counts)
+        whole = Outcome.of_counts(hits, n, confidence, trace, no_outcome / hits if hits else 0.0)
+        shares = [o.counts[1] / n for o in outcomes if o.counts]
+        remarks = _collect_texts([outcome.remarks for outcome in outcomes])
+        weights = _share_weights(outcomes, outcomes, shares)
+        return replace(whole, sample=_merge_samples(outcomes, shares), draw_weights=weights, remarks=remarks)
+    used = [outcome for outcome in outcomes if outcome.status is not Status.STOPPED] or outcomes
+    shares = [1 / len(used)] * len(used)
+    weights = _share_weights(outcomes, used, shares)
+    left_out = len(outcomes) - len(used)
+    about = (f"{left_out} of {len(outcomes)} runs were stopped before their end and left out.",) if left_out else ()
+    if len(used) == 1:
+        return replace(used[0], trace=trace, warnings=(*used[0].warnings, *about), draw_weights=weights)
+    p = np.array([outcome.p for outcome in used])
+    mean = float(p.mean())
+    present = {outcome.status for outcome in used}
+    status = next((each for each in STATUS_PRIORITY if each in present), Status.BUDGET)
+    return Outcome(
+        p=mean,
+        interval=_mean_interval(used, p, confidence),
+        cov=combined_cov(used),
+        status=status if mean > 0 else Status.NO_HITS,
+        warnings=(*_collect_texts([outcome.warnings for outcome in used]), *about, *_warn_of_disagreement(used, p)),
+        remarks=_collect_texts([outcome.remarks for outcome in used]),
+        trace=trace,
+        no_outcome_share=(float(np.average([o.no_outcome_share for o in used], weights=p)) if mean else 0.0),
+        sample=_merge_samples(used, shares),
+        base_draws=sum(outcome.base_draws for outcome in used),
+        draw_weights=weights,
+    )
+
+
+def pool_counts(outcomes: Sequence[Outcome]) -> tuple[int, int] | None:
+    """Return failing and all draws of the runs together; None if a run is no share of plain draws."""
+    counts = [outcome.counts for outcome in outcomes if outcome.counts is not None]
+    if len(counts) < len(outcomes):
+        return None
+    return sum(hits for hits, _ in counts), sum(n for _, n in counts)
+
+
+def combined_cov(outcomes: Sequence[Outcome]) -> float:
+    """Return the c.o.v. of the combined runs: of pooled counts or, for a mean, the larger of the own and that seen."""
+    counts = pool_counts(outcomes)
+    if counts is not None:
+        hits, n = counts
+        return binomial_cov(hits / n, n)
+    p = np.array([outcome.p for outcome in outcomes])
+    if not p.any():
+        return math.inf
+    seen = float((p / p.mean()).std(ddof=1)) if len(p) > 1 else 0.0
+    return max(_own_error(outcomes), seen) / math.sqrt(len(p))
+
+
+def _own_error(outcomes: Sequence[Outcome]) -> float:
+    """Return the root mean square of the errors that the runs state, relative to the mean of their p."""
+    mean = float(np.mean([outcome.p for outcome in outcomes]))
+    errors = [outcome.p / mean * outcome.cov for outcome in outcomes if outcome.p > 0]  # p squared might underflow
+    return math.hypot(*errors) / math.sqrt(len(outcomes))
+
+
+def _mean_interval(outcomes: Sequence[Outcome], p: FloatArray, confidence: float) -> Interval:
+    """Return the interval p_bar exp(-+ t s / sqrt(R)) of the mean of p (R,), t with R - 1 degrees of freedom.
+
+    s is the standard deviation of log p-hat (of p-hat / p_bar, where a run has p-hat = 0), but at least a third of the
+    runs' own c.o.v. Where no run has a c.o.v. under 1 their spread is not known either: the interval then covers the
+    intervals of all runs.
+    """
+    mean, runs = float(p.mean()), len(p)
+    if np.ptp(p) == 0 or min(outcome.cov for outcome in outcomes) >= UNINFORMATIVE_COV:
+        return min(o.interval[0] for o in outcomes), max(o.interval[1] for o in outcomes)
+    spread = float(np.log(p).std(ddof=1)) if p.all() else float((p / mean).std(ddof=1))
+    spread = max(spread, MIN_SPREAD * _own_error(outcomes))
+    half = float(stdtrit(runs - 1, 0.5 + confidence / 2)) * spread / math.sqrt(runs)
+    return mean * math.exp(-half), min(1.0, mean * math.exp(half))
+
+
+def _warn_of_disagreement(outcomes: Sequence[Outcome], p: FloatArray) -> list[str]:
+    """Return a warning if runs with p (R,) lie further apart than their errors allow: some of them missed a region."""
+    error = OWN_ERROR_FACTOR * np.array([outcome.p * outcome.cov if outcome.p > 0 else 0.0 for outcome in outcomes])
+    if len(p) < 3 or not (error > 0).all():
+        return []
+    with np.errstate(over="ignore"):  # inf is far enough apart
+        apart = float((((p - p.mean()) / error) ** 2).sum())
+    if chdtrc(len(p) - 1, apart) > DISAGREEMENT_LEVEL:
+        return []
+    return [f"The runs disagree ({p.min():.2e} to {p.max():.2e}): some of them may have missed a region of failure."]
+
+
+def _merge_samples(outcomes: Sequence[Outcome], shares: Sequence[float]) -> Sample | None:
+    """Return the points behind a mean of R runs with these shares, or None if a run does not give its own."""
+    samples = [outcome.sample for outcome in outcomes if outcome.sample is not None]
+    if len(samples) < len(outcomes):
+        return None
+    first_units = np.cumsum([0, *(sample.n_units for sample in samples)])
+    parts = list(zip(first_units, shares, samples, strict=False))
+    layers = tuple(
+        replace(layer, weights=share * layer.weights, units=first + layer.units)
+        for first, share, sample in parts
+        for layer in sample.all_layers
+    )
+    return Sample(
+        f=np.concatenate([sample.f for sample in samples]),
+        weights=np.concatenate([share * sample.weights for _, share, sample in parts]),
+        units=np.concatenate([first + sample.units for first, _, sample in parts]),
+        n_units=int(first_units[-1]),
+        x=np.concatenate([sample.x for sample in samples]),
+        layers=layers if any(sample.layers for sample in samples) else (),
+        lineages=sum(sample.lineages for sample in samples),
+    )
+
+
+def _share_weights(
+    outcomes: Sequence[Outcome], used: Sequence[Outcome], shares: Sequence[float]
+) -> tuple[DrawWeights, ...]:
+    """Return the weights of single simulations in a mean of the runs used, by share; none where a run gives none."""
+    if not all(outcome.draw_weights for outcome in used):
+        return ()
+    number = {id(outcome): run for run, outcome in enumerate(outcomes)}
+    return tuple(
+        replace(weights, run=number[id(outcome)], log_share=math.log(share))
+        for outcome, share in zip(used, shares, strict=True)
+        for weights in outcome.draw_weights
+    )
+
+
+def _collect_texts(of_runs: Sequence[tuple[str, ...]]) -> tuple[str, ...]:
+    """Return the warnings or remarks of runs, each once, with the number of runs that have it."""
+    texts = Counter(text for run in of_runs for text in run)
+    return tuple(f"In {count} of {len(of_runs)} runs: {text}" for text, count in texts.items())

@@ -1,10 +1,8 @@
-"""Results in files and as tables of points; reading a file runs no code of it.
+"""Output: results as values of JSON, in files and as tables, for notebooks and drawings; reading a file runs no code.
 
-Results in files: safetensors for arrays, JSON for the rest; reading a file runs no code of it.
-
-A file holds one object of the classes that `register_stored` names, with objects of these classes inside. A value is
-written as JSON writes it; numbers that JSON has not, arrays, tuples and objects are written as {kind: content} with one
-of the kinds below.
+A file (safetensors for arrays, JSON for the rest) holds one object of the classes that `register_stored` names, with
+objects of these classes inside. A value is written as JSON writes it; numbers that JSON has not, arrays, tuples and
+objects are written as {kind: content} with one of the kinds of `_encode`.
 """
 
 from __future__ import annotations
@@ -26,8 +24,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from samplers.problem import FloatArray
-from samplers.sample import Sample, SimulatedPoints, SimulationIndex
 from samplers.validation import needs_library
+
+if TYPE_CHECKING:
+    import pyarrow
+    from matplotlib.axes import Axes
+
+FILE_FORMAT = "samplers 1"
+"""First word of the metadata; another one is of another version."""
+_KEY = "samplers"
+_Stored = TypeVar("_Stored")
+_CLASSES: dict[str, type] = {}
 
 
 def to_json_value(value: Any) -> Any:
@@ -43,19 +50,11 @@ def to_json_value(value: Any) -> Any:
     return value
 
 
-FILE_FORMAT = "samplers 1"
-"""First word of the metadata; another one is of another version."""
-_KEY = "samplers"
-_Stored = TypeVar("_Stored")
-_CLASSES: dict[str, type] = {}
+# Files
 
 
 def register_stored(*classes: type) -> None:
-    """Name dataclasses and enumerations that files may hold; they are known by their name.
-
-    Raises:
-        ValueError: If another class has the name.
-    """
+    """Name dataclasses and enumerations that files may hold; a ValueError where another class has the name."""
     for cls in classes:
         if _CLASSES.setdefault(cls.__name__, cls) is not cls:
             raise ValueError(f"Another class named {cls.__name__} is stored in files already.")
@@ -117,9 +116,7 @@ def _encode(value: Any, arrays: dict[str, NDArray[Any]]) -> Any:
     """Return value as JSON has it; its arrays are added to `arrays`."""
     if isinstance(value, np.generic):
         value = value.item()
-    if isinstance(value, Enum):
-        return {"enum": [_name_of(value), value.value]}
-    if value is None or isinstance(value, bool | int | str):
+    if value is None or (isinstance(value, bool | int | str) and not isinstance(value, Enum)):
         return value
     if isinstance(value, float):
         return value if math.isfinite(value) else {"float": repr(value)}
@@ -131,21 +128,13 @@ def _encode(value: Any, arrays: dict[str, NDArray[Any]]) -> Any:
         return {"tuple" if isinstance(value, tuple) else "list": [_encode(item, arrays) for item in value]}
     if isinstance(value, Mapping):
         return {"dict": [[_encode(key, arrays), _encode(item, arrays)] for key, item in value.items()]}
-    if not dataclasses.is_dataclass(value):
-        raise TypeError(
-            f"A value of class {type(value).__name__} cannot be written to a file; to_dict() has plain values."
-        )
-    fields = {f.name: getattr(value, f.name) for f in dataclasses.fields(value) if f.init}  # fields by name
-    return {"object": [_name_of(value), {name: _encode(item, arrays) for name, item in fields.items()}]}
-
-
-def _name_of(value: object) -> str:
-    """Return the name of a value's class, which must be registered."""
+    name = type(value).__name__
     if not is_stored(value):
-        raise TypeError(
-            f"An object of class {type(value).__name__} cannot be written to a file; to_dict() has plain values."
-        )
-    return type(value).__name__
+        raise TypeError(f"An object of class {name} cannot be written to a file; to_dict() has plain values.")
+    if isinstance(value, Enum):
+        return {"enum": [name, value.value]}
+    fields = {f.name: getattr(value, f.name) for f in dataclasses.fields(value) if f.init}  # fields by name
+    return {"object": [name, {key: _encode(item, arrays) for key, item in fields.items()}]}
 
 
 def _decode(data: Any, arrays: Mapping[str, NDArray[Any]]) -> Any:
@@ -157,10 +146,9 @@ def _decode(data: Any, arrays: Mapping[str, NDArray[Any]]) -> Any:
         return float(content)
     if kind == "array":
         return arrays[content]
-    if kind == "list":
-        return [_decode(item, arrays) for item in content]
-    if kind == "tuple":
-        return tuple(_decode(item, arrays) for item in content)
+    if kind in ("list", "tuple"):
+        items = [_decode(item, arrays) for item in content]
+        return items if kind == "list" else tuple(items)
     if kind == "dict":
         return {_decode(key, arrays): _decode(item, arrays) for key, item in content}
     if kind not in ("enum", "object"):
@@ -175,40 +163,31 @@ def _decode(data: Any, arrays: Mapping[str, NDArray[Any]]) -> Any:
 
 @dataclass(frozen=True)
 class StoredMethod:
-    """A method of another package in a result that was read from a file; it cannot run."""
+    """A method of another package in a result that was read from a file, its settings as text; it cannot run."""
 
     name: str
-    """Name on the command line."""
     stops_at_target: bool
-    """As in `samplers.Stepping`."""
     settings: dict[str, str] = field(default_factory=dict)
-    """Settings as text, by name."""
 
     def steps(self, inputs: Any, goal: Any, rng: Any) -> NoReturn:
         """Raise a ValueError: the code of the method is not known."""
         raise ValueError(f"The method {self.name!r} was read from a file and cannot run; make one of its class.")
 
 
-if TYPE_CHECKING:
-    import pyarrow
+# Tables
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class PointColumns:
-    """Columns of a table of n points."""
+def arrow_table(
+    columns: dict[str, NDArray[Any]],
+    missing: dict[str, NDArray[np.bool_]],
+    x: FloatArray,
+    rows: NDArray[np.int64],
+    names: Sequence[str],
+) -> pyarrow.Table:
+    """Return n points as an Arrow table: the columns (n,) by name, then one for each coordinate of x.
 
-    x: FloatArray
-    """Points that are known, shape (k, d)."""
-    rows: NDArray[np.int64]
-    """Their rows in the table, shape (k,)."""
-    columns: dict[str, NDArray[Any]]
-    """The other columns by name, shape (n,) each."""
-    missing: dict[str, NDArray[np.bool_]]
-    """Rows of some of these columns that have no value, shape (n,) each."""
-
-
-def arrow_table(points: PointColumns, names: Sequence[str]) -> pyarrow.Table:
-    """Return points as an Arrow table: the columns by name, then one for each coordinate of x.
+    `missing` has the rows (n,) of some columns that have no value. x (k, d) are the points known, in these rows (k,),
+    and `names` those of their coordinates; none for x1, x2, ...
 
     Raises:
         ValueError: If names are not d different ones, or one is that of another column.
@@ -216,68 +195,42 @@ def arrow_table(points: PointColumns, names: Sequence[str]) -> pyarrow.Table:
     with needs_library("pyarrow", "A table"):
         import pyarrow as pa
 
-    dim = points.x.shape[1]
+    dim, n = x.shape[1], len(next(iter(columns.values())))
     chosen = list(names) or [f"x{i + 1}" for i in range(dim)]
-    if len(chosen) != dim or len({*chosen, *points.columns}) != dim + len(points.columns):
+    if len(chosen) != dim or len({*chosen, *columns}) != dim + len(columns):
         raise ValueError(
-            f"Expected {dim} different names of the columns of x, none of them {', '.join(points.columns)}; "
+            f"Expected {dim} different names of the columns of x, none of them {', '.join(columns)}; "
             f"got {list(names)!r}."
         )
-    n = len(next(iter(points.columns.values())))
     unknown = np.ones(n, dtype=bool)
-    unknown[points.rows] = False
-    table = {name: pa.array(column, mask=points.missing.get(name)) for name, column in points.columns.items()}
-    for name, values in zip(chosen, points.x.T, strict=True):
+    unknown[rows] = False
+    table = {name: pa.array(column, mask=missing.get(name)) for name, column in columns.items()}
+    for name, values in zip(chosen, x.T, strict=True):
         column = np.full(n, np.nan)
-        column[points.rows] = values
+        column[rows] = values
         table[name] = pa.array(column, mask=unknown)
     return pa.table(table)
 
 
-def set_apart(names: Sequence[str], points: PointColumns) -> list[str]:
-    """Return names of coordinates with "x." before those that are the name of another column."""
-    return [f"x.{name}" if name in points.columns else name for name in names]
+def require_pandas() -> None:
+    """Raise an ImportError that says what to install where pandas is missing; PyArrow's own names no command."""
+    with needs_library("pandas", "A pandas table"):
+        import_module("pandas")
 
 
-def columns_of_sample(sample: Sample, gamma: float) -> PointColumns:
-    """Return the weighted points behind an estimate: f, weight, unit, failed; x of the failing ones."""
-    failed = sample.f <= gamma
-    columns = {"f": sample.f, "weight": sample.weights, "unit": sample.units, "failed": failed}
-    return PointColumns(x=sample.x, rows=np.flatnonzero(failed), columns=columns, missing={"f": np.isneginf(sample.f)})
-
-
-def columns_of_simulations(points: SimulatedPoints, index: SimulationIndex, gamma: float) -> PointColumns:
-    """Return all simulations of a run in their order: f, weight, run, stage, failed, and x."""
-    about, lost = index.describe(0, len(points.f)), np.isnan(points.f)
-    weight = np.exp(about.log_weight)
-    columns = {
-        "f": points.f,
-        "weight": weight,
-        "run": about.run,
-        "stage": about.stage,
-        "failed": lost | (points.f <= gamma),
-    }
-    missing = {"f": lost, "weight": np.isnan(weight), "stage": about.stage < 0}
-    return PointColumns(x=points.x, rows=np.arange(len(points.f)), columns=columns, missing=missing)
-
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
+# For people
 
 
 def html_table(title: str, rows: Iterable[Sequence[str]], header: Sequence[str] = (), notes: Iterable[str] = ()) -> str:
-    """Return a table as HTML, with a caption and a list of notes below it."""
+    """Return a table as HTML, the first cell of a row as its name, with a caption and a list of notes below it."""
     caption = f"<caption>{escape(title)}</caption>" if title else ""
     head = "".join(f"<th>{escape(name)}</th>" for name in header)
-    body = "".join(f"<tr>{_cells(row)}</tr>" for row in rows)
+    body = "".join(
+        f"<tr><th>{escape(first)}</th>{''.join(f'<td>{escape(cell)}</td>' for cell in others)}</tr>"
+        for first, *others in rows
+    )
     below = "".join(f"<li>{escape(note)}</li>" for note in notes)
     return f"<table>{caption}{f'<tr>{head}</tr>' if head else ''}{body}</table>{f'<ul>{below}</ul>' if below else ''}"
-
-
-def _cells(row: Sequence[str]) -> str:
-    """Return the cells of a row; the first one is its name."""
-    first, *others = row
-    return f"<th>{escape(first)}</th>" + "".join(f"<td>{escape(cell)}</td>" for cell in others)
 
 
 @contextmanager
@@ -306,12 +259,6 @@ def drawing_axes(ax: Axes | str | PathLike[str] | None) -> Iterator[Axes]:
         raise TypeError(
             f'Expected axes of matplotlib or the path of an image, such as "p.png", got {type(ax).__name__}.'
         )
-
-
-def require_pandas() -> None:
-    """Raise an ImportError that says what to install where pandas is missing; PyArrow's own names no command."""
-    with needs_library("pandas", "A pandas table"):
-        import_module("pandas")
 
 
 def indent_lines(value: object | None) -> list[str]:

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from html import escape
 from typing import Any, Protocol, TypeGuard, runtime_checkable
 
@@ -219,11 +220,7 @@ def condition_of(problem: Inputs) -> str:
 
 
 def names_of_columns(problem: Inputs) -> tuple[str, ...]:
-    """Return the names of the columns of x of a problem; empty where it has none.
-
-    Raises:
-        ValueError: If they are not as many different names as it has dimensions.
-    """
+    """Return the names of the d columns of x, empty for none; raise a ValueError unless they are d different ones."""
     names = tuple(getattr(problem, "column_names", ()))  # a user's object
     if names and (len(set(names)) != int(problem.dim) or not all(isinstance(name, str) for name in names)):
         raise ValueError(f"Expected column_names of a problem to be {int(problem.dim)} different names, got {names!r}.")
@@ -344,41 +341,32 @@ class FunctionProblem:
         names = self.column_names or getattr(self.base, "column_names", ())
         object.__setattr__(self, "column_names", tuple(names))
         names_of_columns(self)
-        for name, wrap in (("terms", _FunctionTerms), ("gradient", _FunctionGradients)):
+        for name, call, more in (("terms", _call_terms, ()), ("gradient", _call_gradient, (self.gradient_cost,))):
             function = getattr(self, name)  # terms, gradient
-            if function is None or isinstance(function, wrap):
-                continue
-            if not callable(function):
+            if function is not None and not callable(function):
                 raise ValueError(f"Expected {name} to be a function of an (n, d) array, got {function!r}.")
-            object.__setattr__(self, name, wrap(function, self.dim, self.gradient_cost))
+            if function is not None and getattr(function, "func", None) is not call:  # of a copy they are wrapped
+                object.__setattr__(self, name, partial(call, function, self.dim, *more))
         check_number("gradient_cost", self.gradient_cost, 0.0, math.inf)
         if self.chunk_size is not None:
             check_whole("chunk_size", self.chunk_size, 1)
 
     def _set_base(self) -> None:
         """Set the base distribution and the dimension, each of which may follow from the other."""
-        if self.base is None:
-            if self.dim == 0:  # as it is where it was not given
-                raise ValueError(
-                    "Expected dim, a whole number of at least 1, or base, the distribution of x; got neither."
-                )
-            check_whole("dim", self.dim, 1)
-            object.__setattr__(self, "base", StandardNormal(self.dim))
-            return
-        base = as_distribution(self.base, self.dim or None)
+        if self.base is None and self.dim == 0:  # as it is where it was not given
+            raise ValueError("Expected dim, a whole number of at least 1, or base, the distribution of x; got neither.")
+        base = StandardNormal(self.dim) if self.base is None else as_distribution(self.base, self.dim or None)
         object.__setattr__(self, "base", base)
         if self.dim == 0 and hasattr(base, "dim"):  # a user's distribution need not have it
             object.__setattr__(self, "dim", int(base.dim))
         check_whole("dim", self.dim, 1)
 
     def __repr__(self) -> str:
-        """Return one line."""
         what = "terms" if self.f is None else getattr(self.f, "__name__", type(self.f).__name__)  # a user's function
         base = "" if isinstance(self.base, StandardNormal) else f", base {type(self.base).__name__}"
         return f"<FunctionProblem of {what}, {self.dim} dimension{'s' * (self.dim != 1)}{base}>"
 
     def _repr_html_(self) -> str:
-        """Return the problem and its base distribution for notebooks."""
         return f"<p>{escape(repr(self)[1:-1])}</p><p>base: {escape(repr(self.base))}</p>"
 
     def evaluate(self, x: FloatArray) -> FloatArray:
@@ -421,37 +409,27 @@ def _takes_one_point(f: Callable[[FloatArray], Any], x: FloatArray) -> bool:
         return False
 
 
-@dataclass(frozen=True)
-class _FunctionTerms:
-    """`HasTerms.terms` by a function from points (n, d) to terms (n, J)."""
-
-    function: Callable[[FloatArray], ArrayLike]
-    dim: int
-    gradient_cost: float
-
-    def __call__(self, x: FloatArray, gamma: float = 0.0) -> Terms:
-        """Return the terms at x (n, d); f is their least."""
-        _check_points(x, self.dim)
-        values = np.asarray(self.function(x), dtype=np.float64)
-        if values.ndim != 2 or len(values) != len(x) or values.shape[1] == 0:
-            raise EvaluationError(f"Expected terms of shape ({len(x)}, J), one row per row of x, got {values.shape}.")
-        return Terms(values.min(axis=1), values, np.zeros(values.shape, dtype=np.int64), gamma)
+def _call_terms(function: Callable[..., ArrayLike], dim: int, x: FloatArray, gamma: float = 0.0) -> Terms:
+    """Return `HasTerms.terms` by a function from points (n, d) to terms (n, J); f is their least."""
+    _check_points(x, dim)
+    values = np.asarray(function(x), dtype=np.float64)
+    if values.ndim != 2 or len(values) != len(x) or values.shape[1] == 0:
+        raise EvaluationError(f"Expected terms of shape ({len(x)}, J), one row per row of x, got {values.shape}.")
+    return Terms(values.min(axis=1), values, np.zeros(values.shape, dtype=np.int64), gamma)
 
 
-@dataclass(frozen=True)
-class _FunctionGradients:
-    """`HasTermGradients.gradient` by a function from points (n, d) and terms (n,) to gradients (n, d)."""
-
-    function: Callable[[FloatArray, NDArray[np.int64]], ArrayLike]
-    dim: int
-    gradient_cost: float
-
-    def __call__(
-        self, x: FloatArray, term: NDArray[np.int64], ticks: NDArray[np.int64], gamma: float = 0.0
-    ) -> TermGradients:
-        """Return the gradients; time means nothing to a function, and its terms are the same for every gamma."""
-        _check_points(x, self.dim)
-        return TermGradients(np.asarray(self.function(x, term), dtype=np.float64), self.gradient_cost * len(x))
+def _call_gradient(
+    function: Callable[..., ArrayLike],
+    dim: int,
+    cost: float,
+    x: FloatArray,
+    term: NDArray[np.int64],
+    ticks: NDArray[np.int64],
+    gamma: float = 0.0,
+) -> TermGradients:
+    """Return `HasTermGradients.gradient` by a function from points (n, d) and terms (n,), the same for every gamma."""
+    _check_points(x, dim)
+    return TermGradients(np.asarray(function(x, term), dtype=np.float64), cost * len(x))
 
 
 def _check_points(x: FloatArray, dim: int) -> None:

@@ -1,13 +1,8 @@
 """Proposals: Gaussians and mixtures, fitted to weighted points by expectation-maximisation with shrunk covariances.
 
-Shrinkage of a covariance that is estimated from few weighted points.
-
-Two targets: N(0, I) with one special direction, for points of one failure region, and the present Gaussian of a
-search, for a step of it. Without a target: the eigenvalues alone, by factors (Stein).
-
-Expectation-maximisation for mixtures of any family.
-
-k-means: clusters of weighted points, for the first responsibilities of expectation-maximisation.
+A covariance that is estimated from few weighted points is drawn towards N(0, I) with one special direction, for points
+of one failure region, or towards the present Gaussian of a search, for a step of it. Without a target its eigenvalues
+are corrected by factors (Stein).
 
 References:
     Stein, "Lectures on the theory of estimation of many parameters", Journal of Soviet Mathematics 34, 1986
@@ -26,7 +21,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol, TypeVar
+from typing import Any, NamedTuple, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,12 +33,10 @@ from samplers.statistics import log_sum_exp
 
 
 class Moments(NamedTuple):
-    """Mean parameters of a Gaussian: E[u] and E[u u']."""
+    """Mean parameters of a Gaussian: E[u] (d,) and E[u u'] (d, d)."""
 
     first: FloatArray
-    """Shape (d,)."""
     second: FloatArray
-    """Shape (d, d)."""
 
     @property
     def covariance(self) -> FloatArray:
@@ -57,12 +50,10 @@ class Moments(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Gaussian:
-    """N(mean, L L') with lower triangular L."""
+    """N(mean, L L') with a mean (d,) and lower triangular L (d, d)."""
 
     mean: FloatArray
-    """Shape (d,)."""
     cholesky: FloatArray
-    """L, shape (d, d)."""
 
     @classmethod
     def standard(cls, dim: int) -> Gaussian:
@@ -149,12 +140,10 @@ class ProposalDistribution(SupportsLogProb, Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Mixture:
-    """A mixture of distributions."""
+    """A mixture of k distributions with weights (k,) that add up to 1; those that are widened can `widen`."""
 
     weights: FloatArray
-    """Shape (k,), adding up to 1."""
-    components: Sequence[ProposalDistribution]
-    """k of them."""
+    components: Sequence[Any]  # each a ProposalDistribution
 
     def sample(self, n: int, rng: np.random.Generator) -> FloatArray:
         """Draw n independent points, shape (n, d)."""
@@ -170,16 +159,9 @@ class Mixture:
         """Return log(weight_j q_j) of the components at u (n, d), shape (k, n)."""
         return np.stack([np.log(w) + c.log_prob(u) for w, c in zip(self.weights, self.components, strict=True)])
 
-
-@dataclass(frozen=True, eq=False)
-class GaussianMixture(Mixture):
-    """A mixture of Gaussians."""
-
-    components: Sequence[Gaussian]
-
-    def widen(self, factor: float) -> GaussianMixture:
-        """Return the same with the standard deviations of all components multiplied by factor."""
-        return GaussianMixture(self.weights, [component.widen(factor) for component in self.components])
+    def widen(self, factor: float) -> Mixture:
+        """Return the mixture with every component more spread out by about this factor."""
+        return Mixture(self.weights, [component.widen(factor) for component in self.components])
 
 
 LEAST_VARIANCE = 1e-8
@@ -191,17 +173,12 @@ PRIOR_DIM = 10
 def shrink_covariance(
     covariance: FloatArray, direction: FloatArray, along: float, n: float
 ) -> tuple[FloatArray, float]:
-    """Return the covariance S drawn towards T = I + (along - 1) v v', and the share of T.
+    """Return the covariance S (d, d) drawn towards T = I + (along - 1) v v', and the share of T.
 
-    T is the covariance of N(0, I) beyond a plane with normal v. Its share is the expected square error of S over the
-    square distance between S and T (Ledoit and Wolf), but at least that of (d + 1) / 2 points, counted beside n of S:
-    T where n is small for d, S where n is large.
-
-    Args:
-        covariance: S, of weighted points, shape (d, d).
-        direction: v, the unit vector of their mean, shape (d,).
-        along: Their variance along v.
-        n: Number of independent points that they are worth.
+    T is the covariance of N(0, I) beyond a plane with normal v (d,), the direction of the mean. Its share is the
+    expected square error of S, which n independent points are worth, over the square distance between S and T (Ledoit
+    and Wolf), but at least that of (d + 1) / 2 points, counted beside n of S: T where n is small for d, S where n is
+    large.
     """
     dim = len(direction)
     target = np.eye(dim) + (along - 1) * np.outer(direction, direction)
@@ -212,15 +189,11 @@ def shrink_covariance(
 
 
 def correct_eigenvalues(values: FloatArray, n: float) -> FloatArray:
-    """Return the eigenvalues of a covariance without their bias, by Stein's estimator.
+    """Return the eigenvalues l (d,) of a covariance of n > d points, increasing, without their bias, by Stein.
 
     Of few points the small eigenvalues are too small and the large ones too large. Each is divided by
     1 - (d - 1) / n + (2 / n) sum_j l_i / (l_i - l_j): small ones change by a factor, where a target of variance 1 would
     add to them. Failures between two planes have a variance of 0.05 across, which a tenth of I triples.
-
-    Args:
-        values: l, in increasing order, positive, shape (d,).
-        n: Independent points that they are estimated from, more than d.
     """
     gaps = values[:, None] - values
     gaps[gaps == 0] = np.inf  # its own, and equal ones
@@ -230,12 +203,7 @@ def correct_eigenvalues(values: FloatArray, n: float) -> FloatArray:
 
 
 def fit_shrunk_gaussian(u: FloatArray, weights: FloatArray) -> Gaussian:
-    """Return the Gaussian of weighted points with its covariance shrunk, see `shrink_covariance`.
-
-    Args:
-        u: Points, shape (n, d).
-        weights: Adding up to 1, shape (n,).
-    """
+    """Return the Gaussian of points u (n, d) with weights (n,), its covariance shrunk by `shrink_covariance`."""
     moments = weighted_moments(u, weights)
     mean, s = moments.first, moments.covariance
     v = mean / max(float(np.linalg.norm(mean)), np.finfo(np.float64).tiny)
@@ -255,24 +223,19 @@ def shrink_towards_present(target: Moments, present: Gaussian, n: float) -> Gaus
     return Gaussian.from_covariance(target.first, (1 - share) * target.covariance + share * present.covariance)
 
 
-def choose_centres(x: FloatArray, weights: FloatArray, k: int, rng: np.random.Generator) -> FloatArray:
-    """Return at most k of the points x (n, d) as centres (k, d), drawn far from one another (k-means++).
-
-    Each is drawn with a probability proportional to weight times squared distance from those before. There are fewer
-    where the points with a weight have fewer distinct places.
-    """
-    odds, chosen, nearest = weights, list[int](), np.full(len(x), np.inf)
-    while len(chosen) < k and odds.sum() > 0:
-        chosen.append(int(rng.choice(len(x), p=odds / odds.sum())))
-        nearest = np.minimum(nearest, ((x - x[chosen[-1]]) ** 2).sum(axis=1))
-        odds = weights * nearest
-    return np.asarray(x[chosen])
-
-
 def start_from_centres(x: FloatArray, weights: FloatArray, k: int, rng: np.random.Generator) -> FloatArray:
-    """Return to which of k distant centres each of the points x (n, d) is nearest, as zeros and ones (k, n)."""
-    centres = choose_centres(x, weights, k, rng)
-    return one_hot(np.stack([((x - centre) ** 2).sum(axis=1) for centre in centres]).argmin(axis=0), k)
+    """Return to which of k distant centres each of the points x (n, d) is nearest, as zeros and ones (k, n).
+
+    Centres are points, each drawn with a probability proportional to weight times squared distance from those before
+    (k-means++). There are fewer where the points with a weight have fewer distinct places.
+    """
+    odds, distances, nearest = weights, list[FloatArray](), np.full(len(x), np.inf)
+    while len(distances) < k and odds.sum() > 0:
+        centre = x[int(rng.choice(len(x), p=odds / odds.sum()))]
+        distances.append(((x - centre) ** 2).sum(axis=1))
+        nearest = np.minimum(nearest, distances[-1])
+        odds = weights * nearest
+    return one_hot(np.stack(distances).argmin(axis=0), k)
 
 
 MixtureT = TypeVar("MixtureT")
@@ -286,16 +249,11 @@ def expectation_maximisation(
     max_steps: int,
     least_gain: Callable[[float], float],
 ) -> tuple[MixtureT, float]:
-    """Return the mixture reached from some responsibilities, and its weighted log likelihood.
+    """Return the mixture reached from some responsibilities (k, n), and its weighted log likelihood.
 
-    Args:
-        maximise: Returns the likeliest mixture (M-step) given how far each component explains each point, shape (k, n);
-            it may drop components.
-        log_terms: Returns log(weight_j q_j) of the components of a mixture at the points, shape (k, n).
-        responsibilities: To start from, shape (k, n), columns that add up to 1.
-        weights: Of the points, shape (n,).
-        max_steps: M-steps at most.
-        least_gain: Given the log likelihood, the rise of it with which to go on.
+    `maximise` returns the likeliest mixture (M-step) given how far each component explains each point, (k, n); it may
+    drop components. `log_terms` returns log(weight_j q_j) of a mixture at the points, (k, n), which have weights (n,).
+    There are `max_steps` M-steps at most; `least_gain` of the log likelihood is the rise of it with which to go on.
     """
     reached = -np.inf
     for _ in range(max_steps):
@@ -319,26 +277,8 @@ def one_hot(labels: NDArray[np.int64], k: int) -> FloatArray:
     return np.equal(labels, np.arange(k)[:, None]).astype(np.float64)
 
 
-class WidenableDistribution(ProposalDistribution, Protocol):
-    """A component of a mixture that can be widened."""
-
-    def widen(self, factor: float) -> WidenableDistribution:
-        """Return the same, more spread out by about this factor."""
-
-
-@dataclass(frozen=True, eq=False)
-class WidenableMixture(Mixture):
-    """A mixture of distributions that can be widened."""
-
-    components: Sequence[WidenableDistribution]
-
-    def widen(self, factor: float) -> WidenableMixture:
-        """Return the mixture with every component more spread out by about this factor."""
-        return WidenableMixture(self.weights, [component.widen(factor) for component in self.components])
-
-
-Fit = Callable[[FloatArray, FloatArray], WidenableDistribution]
-"""Fits one component to points (n, d) with weights (n,) that add up to 1."""
+Fit = Callable[[FloatArray, FloatArray], Any]
+"""Fits one component, which can `widen`, to points (n, d) with weights (n,) that add up to 1."""
 MAX_EM_STEPS = 50
 """M-steps at most."""
 LEAST_EM_GAIN = 1e-3
@@ -351,22 +291,14 @@ LEAST_OF_EVEN_SHARE = 0.5
 
 def fit_proposal_mixture(
     fit: Fit, u: FloatArray, weights: FloatArray, most: int, size: int, rng: np.random.Generator
-) -> WidenableMixture:
-    """Return the mixture of 1 to `most` components with the best Bayesian information criterion.
+) -> Mixture:
+    """Return the mixture of 1 to `most` components, fitted to points u (n, d) with weights (n,), with the best BIC.
 
-    The criterion counts the effective number of points, (sum w)^2 / sum w^2. More components are tried for
-    as long as they raise it.
-
-    Args:
-        fit: Fits one component.
-        u: Points, shape (n, d).
-        weights: Adding up to 1, shape (n,).
-        most: Components at most.
-        size: Parameters of one component.
-        rng: Source of randomness, for the first centres.
+    The criterion counts the effective number of points, (sum w)^2 / sum w^2, and `size` parameters a component. More
+    components are tried for as long as they raise it.
     """
     points = 1 / float(weights @ weights)
-    best, highest = WidenableMixture(np.ones(1), [fit(u, weights)]), -np.inf
+    best, highest = Mixture(np.ones(1), [fit(u, weights)]), -np.inf
     for k in range(1, most + 1):
         if k * size >= points:  # the criterion means nothing there
             break
@@ -378,18 +310,15 @@ def fit_proposal_mixture(
     return best
 
 
-def fit_mixture_of_size(
-    fit: Fit, u: FloatArray, weights: FloatArray, k: int, rng: np.random.Generator
-) -> WidenableMixture:
+def fit_mixture_of_size(fit: Fit, u: FloatArray, weights: FloatArray, k: int, rng: np.random.Generator) -> Mixture:
     """Return a mixture of at most k components by expectation-maximisation, from distant first centres."""
 
-    def maximise(responsibilities: FloatArray) -> WidenableMixture:
-        """Return the mixture of the components that have weight enough."""
+    def maximise(responsibilities: FloatArray) -> Mixture:
         mass = weights * responsibilities
         totals = mass.sum(axis=1)
         kept = totals > min(LEAST_WEIGHT, LEAST_OF_EVEN_SHARE / k)
         components = [fit(u, part / part.sum()) for part in mass[kept]]
-        return WidenableMixture(totals[kept] / totals[kept].sum(), components)
+        return Mixture(totals[kept] / totals[kept].sum(), components)
 
     # Separate regions of failure lie in separate directions from the origin.
     directions = u / np.maximum(np.linalg.norm(u, axis=1, keepdims=True), np.finfo(np.float64).tiny)

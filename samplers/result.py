@@ -22,8 +22,6 @@ from samplers.method import EstimateData, Stepping
 from samplers.output import (
     StoredMethod,
     arrow_table,
-    columns_of_sample,
-    columns_of_simulations,
     drawing_axes,
     html_table,
     indent_lines,
@@ -31,7 +29,6 @@ from samplers.output import (
     read_object,
     register_stored,
     require_pandas,
-    set_apart,
     to_json_value,
     write_object,
 )
@@ -283,7 +280,6 @@ class Estimate(EstimateData):
         return axes
 
     def __repr__(self) -> str:
-        """Return one line; `str` has all of it."""
         low, high = self.interval
         doubts = f", {len(self.warnings)} warning{'s' * (len(self.warnings) != 1)}" if self.warnings else ""
         return (
@@ -292,7 +288,6 @@ class Estimate(EstimateData):
         )
 
     def _repr_html_(self) -> str:
-        """Return a table for notebooks."""
         low, high = self.interval
         rows = [
             (f"{100 * self.confidence:g} % interval", f"{low:.3e} to {high:.3e}"),
@@ -308,7 +303,6 @@ class Estimate(EstimateData):
         return html_table(f"P[f <= {self.gamma:g}] = {self.p:.3e}", rows, notes=notes)
 
     def __str__(self) -> str:
-        """Return a few lines for people."""
         low, high = self.interval
         gain = "" if math.isnan(self.gain) else f", gain over Monte Carlo {self.gain:.3g}"
         cov = "not known" if math.isinf(self.cov) else f"{self.cov:.3g}"
@@ -351,11 +345,20 @@ class Estimate(EstimateData):
             >>> round(sum(table.filter(table["failed"])["weight"].to_pylist()), 6), result.p
             (0.0016, 0.0016)
         """
+        columns: dict[str, Any]
         if self.points is None or self.simulations is None:
-            columns = columns_of_sample(require_sample(self), self.gamma)
+            sample = require_sample(self)
+            f, x, failed = sample.f, sample.x, sample.f <= self.gamma
+            columns = {"f": f, "weight": sample.weights, "unit": sample.units, "failed": failed}
+            rows, missing = np.flatnonzero(failed), {"f": np.isneginf(f)}
         else:
-            columns = columns_of_simulations(self.points, self.simulations, self.gamma)
-        return arrow_table(columns, names or set_apart(self.column_names, columns))
+            f, x, lost = self.points.f, self.points.x, np.isnan(self.points.f)
+            about = self.simulations.describe(0, len(f))
+            weight, failed = np.exp(about.log_weight), lost | (f <= self.gamma)
+            columns = {"f": f, "weight": weight, "run": about.run, "stage": about.stage, "failed": failed}
+            rows, missing = np.arange(len(f)), {"f": lost, "weight": np.isnan(weight), "stage": about.stage < 0}
+        own = [f"x.{name}" if name in columns else name for name in self.column_names]
+        return arrow_table(columns, missing, x, rows, names or own)
 
     def to_pandas(self, names: Sequence[str] = ()) -> "pandas.DataFrame":
         """Return `to_arrow` as a pandas table; needs pandas."""
@@ -424,9 +427,7 @@ class Estimate(EstimateData):
             "remarks": list(self.remarks),
             "trace": [asdict(level) for level in self.trace],
             "failures": {
-                "x": self.failures.x.tolist(),
-                "f": self.failures.f.tolist(),
-                "log_p0": self.failures.log_p0.tolist(),
+                **{name: getattr(self.failures, name).tolist() for name in ("x", "f", "log_p0")},
                 "total": self.failures.total,
             },
             "method": {"name": self.method.name, "settings": method_settings(self.method)},

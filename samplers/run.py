@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from decimal import Decimal
 from typing import cast
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from samplers.arguments import InputsOnly, RunArguments, check_arguments, choose_seed
-from samplers.combination import combine, combined_cov, pool_counts
+from samplers.analysis.refits import check_refits
 from samplers.method import (
     Answer,
     Choice,
@@ -24,19 +24,172 @@ from samplers.method import (
     Steps,
     TermsOffer,
     TermsRequest,
+    combine,
+    combined_cov,
+    pool_counts,
     whole_simulations,
 )
 from samplers.problem import Distribution, FloatArray, Inputs, TermGradients, Terms, condition_of, names_of_columns
-from samplers.progress import Listener, Monitor, Progress
 from samplers.result import Estimate
 from samplers.sample import Failures, SimulatedPoints, SimulationIndex, Status
 from samplers.statistics import gain_over_monte_carlo
-from samplers.validation import EvaluationError, OnError, describe_point, one_per_row
+from samplers.validation import (
+    ON_ERROR,
+    EvaluationError,
+    OnError,
+    check_name,
+    check_number,
+    check_whole,
+    describe_point,
+    one_per_row,
+)
 
+MOST_SIMULATIONS = 10**12
+"""Largest `max_sim`: more is a slip of the keyboard."""
 MIN_REPLICATES = 5
 """Runs made at least where those asked for miss target_cov: fewer give a useless t interval."""
 MAX_REPLICATES = 200
 """Runs made at most for target_cov: if they miss it, each run is too small."""
+NO_OUTCOME = -np.inf
+"""f as methods see it for a row without an outcome (counted as failing, on_error not "raise")."""
+SMALLEST_F = float(np.finfo(np.float64).min)
+"""f as methods see it where f is -inf, so that NO_OUTCOME keeps its meaning."""
+KEEP_FAILURES = 1000
+"""Failing points kept: enough for every listing, little memory in hundreds of dimensions."""
+NOT_KNOWN = Outcome(
+    p=0.0,
+    interval=(0.0, 1.0),
+    cov=math.inf,
+    status=Status.STOPPED,
+    warnings=("The run was stopped before its method could say anything: p = 0 stands for not known.",),
+)
+"""Outcome of a run that was stopped before its first values of f, or whose method does not handle `Interrupted`."""
+
+
+@dataclass(frozen=True)
+class RunArguments:
+    """Arguments of one run; their defaults are those of `estimate`, `Method.start` and the command line.
+
+    Raises:
+        ValueError: If an argument is out of range; the text says what was expected.
+
+    Example:
+        >>> from samplers import RunArguments
+        >>> arguments = RunArguments(max_sim=6000, seed=1)
+        >>> arguments.gamma, arguments.confidence, arguments.replicates
+        (0.0, 0.95, 1)
+        >>> RunArguments(confidence=95)
+        Traceback (most recent call last):
+            ...
+        ValueError: Expected confidence to be a number between 0 and 1, got 95.
+    """
+
+    gamma: float = 0.0
+    """Threshold of failure, f <= gamma."""
+    seed: int | None = None
+    """Same seed, same answer; None draws one."""
+    max_sim: int | None = None
+    """Simulations that are never exceeded, over all replicates; None leaves it to the method."""
+    target_cov: float | None = None
+    """Coefficient of variation to stop at; None leaves it to the method."""
+    confidence: float = Goal.confidence
+    """Nominal coverage of the interval."""
+    replicates: int = 1
+    """Independent runs, side by side."""
+    on_error: OnError = "raise"
+    """Rows on which f raises or gives NaN: stop, count as failing, or count as failing in p and the upper end only."""
+
+    def __post_init__(self) -> None:
+        """Check the values."""
+        check_number("gamma", self.gamma, -math.inf, math.inf)
+        check_number("confidence", self.confidence, 0.0, 1.0)
+        if self.target_cov is not None:
+            check_number("target_cov", self.target_cov, 0.0, math.inf)
+        check_whole("replicates", self.replicates, 1)
+        if self.max_sim is not None:
+            check_whole("max_sim", self.max_sim, self.replicates)
+            if self.max_sim > MOST_SIMULATIONS:
+                raise ValueError(
+                    f"Expected max_sim to be at most {MOST_SIMULATIONS:,}, got {Decimal(self.max_sim):.3g}."
+                )
+        if self.seed is not None:
+            check_whole("seed", self.seed, 0)
+        check_name("on_error", self.on_error, list(ON_ERROR))
+
+    @property
+    def goal(self) -> Goal:
+        """The goal of all replicates together."""
+        return Goal(
+            gamma=float(self.gamma),
+            confidence=float(self.confidence),
+            max_sim=None if self.max_sim is None else int(self.max_sim),
+            target_cov=None if self.target_cov is None else float(self.target_cov),
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Progress:
+    """Progress of a run.
+
+    Example:
+        >>> import samplers
+        >>> problem = samplers.FunctionProblem(lambda x: 2.0 - x[:, 0], dim=2)
+        >>> seen = []
+        >>> result = samplers.estimate(problem, "mc", seed=0, max_sim=2000, progress=seen.append)
+        >>> seen[-1].n_sim, seen[-1].max_sim, seen[-1].p == result.p
+        (2000, 2000, True)
+    """
+
+    n_sim: int
+    """Simulations done."""
+    max_sim: int | None
+    """Simulations allowed; None for no limit."""
+    level: float = math.inf
+    """Threshold of the last finished level; inf before the first."""
+    p: float = math.nan
+    """Running estimate of P[f(X) <= level]; NaN before the first level."""
+    run: int = 0
+    """Replicate that finished this level, counted from 0 (they run side by side)."""
+    workers: int = 0
+    """Workers of the executor; 0 without one."""
+    n_retries: int = 0
+    """Chunks that were computed again because a worker was lost."""
+    seconds_left: float | None = None
+    """Time that the rest of max_sim takes at the pace so far [s]; None where that is not known."""
+
+
+Listener = Callable[[Progress], None]
+
+
+@dataclass(frozen=True)
+class InputsOnly:
+    """dim, base and offer of a problem: all that a method is shown, so that it cannot call f itself."""
+
+    dim: int
+    base: Distribution
+    offer: TermsOffer | None = None
+
+
+def check_problem(problem: Inputs, *needed: str) -> None:
+    """Raise a ValueError unless a problem has the attributes needed, a dimension and a base whose refits fit it."""
+    for name in needed:
+        if not hasattr(problem, name):  # a user's object: say which attribute it lacks
+            raise ValueError(
+                f"Expected a problem with {', '.join(needed[:-1])} and {needed[-1]}, got {type(problem).__name__} "
+                f"without {name}; FunctionProblem(f, dim) wraps a function."
+            )
+    check_whole("dim", problem.dim, 1)
+    if not isinstance(problem.base, Distribution):
+        raise ValueError(
+            "Expected problem.base to have sample, log_prob, to_standard_normal and "
+            f"from_standard_normal, got {type(problem.base).__name__}."
+        )
+    check_refits(problem.base, int(problem.dim))
+
+
+def choose_seed(seed: int | None) -> int:
+    """Return the seed, or a random one where there is none, short enough to type."""
+    return int(np.random.SeedSequence().generate_state(1)[0]) if seed is None else int(seed)
 
 
 class Run:
@@ -53,6 +206,9 @@ class Run:
         listener: Given `Progress` after every batch and every level.
         offer: What `answer` will be given beside f; None for f alone, as `tell` takes no more.
         keep_points: Whether the result shall hold all simulations (`Estimate.points`).
+
+    Attributes:
+        progress: Progress of the run.
 
     Raises:
         ValueError: If the problem has no `dim` or `base`, or method is not a method.
@@ -77,39 +233,41 @@ class Run:
         offer: TermsOffer | None = None,
         keep_points: bool = False,
     ) -> None:
-        check_arguments(problem, method)
+        check_problem(problem, "dim", "base")
+        if isinstance(method, type):
+            raise ValueError(f"Expected a method, got the class {method.__name__}; add brackets: ().")
+        if not isinstance(method, Stepping):
+            raise ValueError(f"Expected a method such as MonteCarlo(), got {method!r}.")
         self._inputs = InputsOnly(int(problem.dim), problem.base, offer)
         self._given, self._column_names = condition_of(problem), names_of_columns(problem)
         self._goal, self._on_error = arguments.goal, arguments.on_error
-        self._seed = choose_seed(arguments.seed)
-        self._n_wanted = int(arguments.replicates)
-        self._choice = choose_method(method, self._inputs, self._goal, self._n_wanted)
-        self._method = self._choice.method
-        self._log = EvaluationLog(self._inputs.dim, self._inputs.base, self._goal.gamma, self._on_error)
-        self._monitor = Monitor(listener, self._goal.max_sim)
+        self._seed, self._n_wanted = choose_seed(arguments.seed), int(arguments.replicates)
+        shares = split_budget(self._goal.max_sim, self._n_wanted)
+        choose = getattr(method, "choose", None)  # of `Auto`, or of a method of one's own; by the smallest share
+        goal = replace(self._goal, max_sim=shares[0])
+        self._choice: Choice = Choice(method) if choose is None else choose(self._inputs, goal)
+        self._log = EvaluationLog(self._inputs, self._goal.gamma, self._on_error, keep_points)
+        self.progress, self._listener = Progress(n_sim=0, max_sim=self._goal.max_sim), listener
         self._asked = False
         self._stopped: str | None = None
         self._replicates: list[Replicate] = []
-        self._spans: list[tuple[Replicate, int, int]] = []
-        self._kept_points: list[SimulatedPoints] | None = [] if keep_points else None
-        for max_sim in split_budget(self._goal.max_sim, self._n_wanted):
+        for max_sim in shares:
             self._start_replicate(max_sim)
         self._start_more_for_target()
 
     @property
     def done(self) -> bool:
         """Whether there is nothing more to simulate."""
-        return not any(replicate.running for replicate in self._replicates)
-
-    @property
-    def progress(self) -> Progress:
-        """Progress of the run."""
-        return self._monitor.progress
+        return not self._running
 
     @property
     def requests(self) -> list[Request]:
         """What the replicates that still run wait for, in their order."""
         return [replicate.requested for replicate in self._running]
+
+    @property
+    def _running(self) -> list[Replicate]:
+        return [replicate for replicate in self._replicates if replicate.outcome is None]
 
     def ask(self) -> FloatArray:
         """Return the points to simulate next, shape (n, d); the same ones until their outcomes are told.
@@ -120,7 +278,7 @@ class Run:
         if self.done:
             raise RuntimeError("The run is done: nothing more to simulate; see result().")
         self._asked = True
-        return np.concatenate(self._points)
+        return np.concatenate(cast(list[FloatArray], self.requests))
 
     def tell(self, f: ArrayLike) -> None:
         """Take the outcomes f, shape (n,), of the points that `ask` returned, in their order.
@@ -133,7 +291,7 @@ class Run:
         """
         if not self._asked:
             raise RuntimeError("Nothing has been asked for: call ask() for points, then tell() their outcomes.")
-        ends = np.cumsum([len(points) for points in self._points])
+        ends = np.cumsum([len(cast(FloatArray, points)) for points in self.requests])
         self.answer(np.split(one_per_row(f, int(ends[-1])), ends[:-1]))
 
     def answer(self, answers: Sequence[Answer]) -> None:
@@ -144,45 +302,18 @@ class Run:
             RuntimeError: If the method asks for more than max_sim.
         """
         running = self._running
-        for answer in answers:
-            if isinstance(answer, TermGradients):
-                check_cost(answer, self._inputs.offer)
-        seen = self._record([replicate.requested for replicate in running], answers)
+        seen = self._log.record(running, answers)
         self._asked = False
-        self._note_spans(running, answers)
-        self._monitor.on_batch(self._log.n_sim)
+        self._update(n_sim=self._log.n_sim)
         for replicate, answer in zip(running, seen, strict=True):
             replicate.tell(answer)
         self._start_more_for_target()
 
-    def _record(self, requests: Sequence[Request], answers: Sequence[Answer]) -> list[Answer]:
-        """Record what was simulated; return the answers as methods see them."""
-        pairs = [(request, one) for request, one in zip(requests, answers, strict=True)]
-        simulated = [(r if isinstance(r, np.ndarray) else r.x, a) for r, a in pairs if not isinstance(a, TermGradients)]
-        f = [answer.f if isinstance(answer, Terms) else answer for _, answer in simulated]
-        seen = iter(list[FloatArray]())
-        if simulated:
-            whole = self._log.record(np.concatenate([x for x, _ in simulated]), np.concatenate(f))
-            seen = iter(np.split(whole, np.cumsum([len(part) for part in f])[:-1]))
-        self._log.add_cost(sum(count_simulations(one) for one in answers if isinstance(one, TermGradients)))
-        return [
-            one
-            if isinstance(one, TermGradients)
-            else hide_missing(one, next(seen))
-            if isinstance(one, Terms)
-            else next(seen)
-            for one in answers
-        ]
-
-    @property
-    def _running(self) -> list[Replicate]:
-        """Replicates without an outcome."""
-        return [replicate for replicate in self._replicates if replicate.running]
-
-    @property
-    def _points(self) -> list[FloatArray]:
-        """Points that the replicates wait for, where they wait for nothing else."""
-        return [cast(FloatArray, request) for request in self.requests]
+    def _update(self, **changes: float) -> None:
+        """Change the progress and tell the listener."""
+        self.progress = replace(self.progress, **changes)  # type: ignore[arg-type]
+        if self._listener is not None:
+            self._listener(self.progress)
 
     def stop(self, why: str = "Stopped") -> None:
         """End the run here; the result is what has been told so far. Nothing happens to a run that is done.
@@ -195,33 +326,42 @@ class Run:
         self._stopped = f"{why} after {self._log.n_sim:,} simulations, before the method had finished."
         self._asked = False
         self._replicates = [replicate for replicate in self._replicates if replicate.n_sim] or self._replicates[:1]
-        for replicate in self._replicates:
-            if replicate.running:
-                replicate.interrupt()
+        for replicate in self._running:
+            replicate.interrupt()
 
     def result(self) -> Estimate:
         """Return the estimate; a run that is not done is stopped."""
         self.stop()
-        goal, outcomes = self._goal, self._outcomes()
-        whole = combine(outcomes, goal.confidence)
+        goal, log = self._goal, self._log
+        outcomes = [replicate.outcome for replicate in self._replicates if replicate.outcome is not None]
+        whole, met = combine(outcomes, goal.confidence), meets_target(outcomes, goal.target_cov, self._n_wanted)
         low, high = whole.interval
+        status, warnings, remarks = whole.status, [*whole.warnings], [*whole.remarks]
         if self._on_error == "bound":
             low *= 1 - whole.no_outcome_share
-        met = meets_target(outcomes, goal.target_cov, self._n_wanted)
+        if log.n_errors:
+            where = " (not in the lower end of the interval)" if self._on_error == "bound" else ""
+            warnings.append(f"{log.n_errors} simulations gave no outcome and were counted as failing{where}.")
+        if self._stopped is not None:
+            status = Status.STOPPED
+            warnings.append(self._stopped)
+        elif not met:  # the interval holds, and is wider than was wished
+            status = Status.BUDGET if status is Status.CONVERGED else status
+            remarks.append(f"The target c.o.v. {goal.target_cov:g} was not met: {whole.cov:.3g}.")
         return Estimate(
             p=whole.p,
             interval=(low, high),
             confidence=goal.confidence,
             cov=whole.cov,
             gamma=goal.gamma,
-            n_sim=self._log.n_sim,
-            gain=gain_over_monte_carlo(whole.p, whole.cov, self._log.n_sim),
-            status=self._final_status(whole, met),
-            warnings=(*whole.warnings, *self._error_warnings(), *([] if self._stopped is None else [self._stopped])),
-            remarks=(*whole.remarks, *self._precision_remarks(whole, met)),
+            n_sim=log.n_sim,
+            gain=gain_over_monte_carlo(whole.p, whole.cov, log.n_sim),
+            status=status,
+            warnings=tuple(warnings),
+            remarks=tuple(remarks),
             trace=whole.trace,
-            failures=self._log.failures,
-            method=self._method,
+            failures=log.failures,
+            method=self._choice.method,
             seed=self._seed,
             sample=whole.sample,
             base=self._inputs.base,
@@ -231,65 +371,9 @@ class Run:
             column_names=self._column_names,
             choice=self._choice.why,
             chose_another=self._choice.unusual,
-            simulations=self._index_simulations(whole),
-            points=self._join_points(),
+            simulations=log.index(self._replicates, whole),
+            points=log.join_points(),
         )
-
-    def _note_spans(self, running: Sequence[Replicate], answers: Sequence[Answer]) -> None:
-        """Note which replicate made the simulations of some answers: points first, then terms, then gradients."""
-        order = sorted(range(len(answers)), key=lambda i: isinstance(answers[i], Terms | TermGradients))
-        for i in order:
-            replicate, cost = running[i], count_simulations(answers[i])
-            n = 0 if isinstance(answers[i], TermGradients) else cost
-            self._keep_points(replicate.requested, answers[i])
-            if self._spans and self._spans[-1][0] is replicate and self._spans[-1][1] == self._spans[-1][2]:
-                _, n_before, cost_before = self._spans.pop()
-                n, cost = n + n_before, cost + cost_before
-            self._spans.append((replicate, n, cost))
-
-    def _keep_points(self, request: Request, answer: Answer) -> None:
-        """Keep the simulations of an answer, where they are wanted; gradients have no outcomes."""
-        if self._kept_points is None or isinstance(answer, TermGradients):
-            return
-        x = request if isinstance(request, np.ndarray) else request.x
-        self._kept_points.append(SimulatedPoints(x, answer.f if isinstance(answer, Terms) else answer))
-
-    def _join_points(self) -> SimulatedPoints | None:
-        """Return all simulations in the order of the spans; None where they were not kept."""
-        if self._kept_points is None:
-            return None
-        x = [np.empty((0, self._inputs.dim)), *(part.x for part in self._kept_points)]
-        return SimulatedPoints(np.concatenate(x), np.concatenate([np.empty(0), *(p.f for p in self._kept_points)]))
-
-    def _index_simulations(self, whole: Outcome) -> SimulationIndex:
-        """Return what the simulations were made for."""
-        number = {id(replicate): run for run, replicate in enumerate(self._replicates)}
-        spans = tuple((number[id(replicate)], n, cost) for replicate, n, cost in self._spans if id(replicate) in number)
-        return SimulationIndex(spans=spans, trace=whole.trace, weights=whole.draw_weights)
-
-    def _outcomes(self) -> list[Outcome]:
-        """Return the outcomes of the replicates that have one."""
-        return [replicate.outcome for replicate in self._replicates if replicate.outcome is not None]
-
-    def _final_status(self, whole: Outcome, met: bool) -> Status:
-        """Return the status of the whole."""
-        if self._stopped is not None:
-            return Status.STOPPED
-        return Status.BUDGET if whole.status is Status.CONVERGED and not met else whole.status
-
-    def _precision_remarks(self, whole: Outcome, met: bool) -> list[str]:
-        """Return the remark of a target that was not met: the interval holds, and is wider than was wished."""
-        if met or self._stopped is not None:
-            return []
-        return [f"The target c.o.v. {self._goal.target_cov:g} was not met: {whole.cov:.3g}."]
-
-    def _error_warnings(self) -> list[str]:
-        """Return the warning of simulations without an outcome, if there were any."""
-        if self._log.n_errors == 0:
-            return []
-        text = f"{self._log.n_errors} simulations gave no outcome and were counted as failing"
-        bounded = self._on_error == "bound"
-        return [f"{text} (not in the lower end of the interval)." if bounded else f"{text}."]
 
     def _start_replicate(self, max_sim: int | None) -> None:
         """Start one more run of the method, with a generator of its own."""
@@ -298,26 +382,17 @@ class Run:
             self._goal,
             max_sim=max_sim,
             target_cov=None if target is None else target * math.sqrt(self._n_wanted),
-            on_level=lambda level: self._monitor.on_level(replace(level, run=number)),
+            on_level=lambda level: self._update(level=level.gamma, p=level.estimate, run=number),
         )
         rng = np.random.default_rng(np.random.SeedSequence(self._seed, spawn_key=(number,)))
-        steps = self._method.steps(self._inputs, goal, rng)
+        steps = self._choice.method.steps(self._inputs, goal, rng)
         self._replicates.append(Replicate(steps, goal, self._inputs.dim, self._inputs.offer))
 
     def _start_more_for_target(self) -> None:
         """Start one more run where all are done, the target is missed and the budget allows it."""
-        while self.done and needs_another(self._replicates, self._method, self._goal, self._n_wanted):
+        while self.done and needs_another(self._replicates, self._choice.method, self._goal, self._n_wanted):
             max_sim = self._goal.max_sim
             self._start_replicate(None if max_sim is None else max_sim - self._log.n_sim)
-
-
-def choose_method(method: Stepping, inputs: Inputs, goal: Goal, replicates: int) -> Choice:
-    """Return the method that runs, and why where another one has chosen it: by the smallest share of the budget."""
-    choose = getattr(method, "choose", None)  # of `Auto`, or of a method of one's own
-    if choose is None:
-        return Choice(method)
-    chosen: Choice = choose(inputs, replace(goal, max_sim=split_budget(goal.max_sim, replicates)[0]))
-    return chosen
 
 
 def split_budget(max_sim: int | None, replicates: int) -> list[int | None]:
@@ -330,10 +405,7 @@ def split_budget(max_sim: int | None, replicates: int) -> list[int | None]:
 def meets_target(outcomes: Sequence[Outcome], target_cov: float | None, replicates: int) -> bool:
     """Return whether these runs together meet target_cov (as they do where there is none).
 
-    Args:
-        outcomes: Of the runs made so far.
-        target_cov: Coefficient of variation to stop at.
-        replicates: Runs asked for; with more than these, at least MIN_REPLICATES are made unless their counts pool.
+    With more of them than `replicates`, at least MIN_REPLICATES are made unless their counts pool.
     """
     if target_cov is None:
         return True
@@ -351,97 +423,49 @@ def needs_another(runs: Sequence[Replicate], method: Stepping, goal: Goal, repli
     outcomes = [run.outcome for run in runs if run.outcome is not None]
     if meets_target(outcomes, goal.target_cov, replicates) or len(runs) >= MAX_REPLICATES:
         return False
-    if sum(ended_without_target(method, run.goal, run.outcome) for run in runs) >= replicates:
+    targets = [run.goal.target_cov for run in runs]
+    missed = [t is not None and outcome.cov > t for t, outcome in zip(targets, outcomes, strict=True)]
+    if method.stops_at_target and sum(missed) >= replicates:
         return False
     left = goal.budget - sum(run.n_sim for run in runs)
     return left >= (1 if pool_counts(outcomes) is not None else max(run.n_sim for run in runs))
 
 
-def ended_without_target(method: Stepping, goal: Goal, outcome: Outcome | None) -> bool:
-    """Return whether a run that goes on until its target ended without it."""
-    target = goal.target_cov
-    return method.stops_at_target and target is not None and outcome is not None and outcome.cov > target
-
-
-def hide_missing(terms: Terms, f: FloatArray) -> Terms:
-    """Return the terms with f as methods see it; points without an outcome, f = -inf, fail in every term."""
-    values = np.where(np.isneginf(f)[:, None], -np.inf, terms.values)
-    return Terms(f, values, terms.ticks, terms.threshold, terms.names)
-
-
-NOT_KNOWN = Outcome(
-    p=0.0,
-    interval=(0.0, 1.0),
-    cov=math.inf,
-    status=Status.STOPPED,
-    warnings=("The run was stopped before its method could say anything: p = 0 stands for not known.",),
-)
-"""Outcome of a run that was stopped before its first values of f, or whose method does not handle `Interrupted`."""
-
-
 class Replicate:
     """The steps of one run of a method: the points it requests next and, at the end, its outcome.
 
-    Args:
-        steps: What `Method.steps` returned.
-        goal: The goal it was given; more than goal.max_sim points are refused.
-        dim: Number of dimensions of x.
-        offer: What the run answers beside f; None for f alone.
-
     Attributes:
-        goal: As given.
+        goal: The goal it was given; more than goal.max_sim points are refused.
         requested: What the method waits for: points x (n, d) whose f it wants, or a request for terms or gradients; no
             points once it has its outcome.
         n_sim: Simulations made for it so far.
         outcome: Its outcome; None while it runs.
-
-    Raises:
-        ValueError: If the method requests points that are not of shape (n, dim).
-        RuntimeError: If it requests more points than goal.max_sim leaves.
     """
 
     def __init__(self, steps: Steps, goal: Goal, dim: int, offer: TermsOffer | None = None) -> None:
-        self.goal = goal
+        self.goal, self.offer = goal, offer
         self.n_sim = 0
         self.outcome: Outcome | None = None
         self.requested: Request = np.empty((0, dim))
-        self._dim, self._offer = dim, offer
-        self._steps = steps
+        self._dim, self._steps = dim, steps
         self._advance(lambda: next(steps))
 
-    @property
-    def running(self) -> bool:
-        """Whether the method waits for values of f."""
-        return self.outcome is None
-
     def tell(self, answer: Answer) -> None:
-        """Give the method what it requested, and let it run to its next request or its end.
-
-        Args:
-            answer: f (n,) of points, `Terms` or `TermGradients`.
-
-        Raises:
-            ValueError: If it requests points that are not of shape (n, dim).
-            RuntimeError: If it requests more points than goal.max_sim leaves, or what the run does not offer.
-        """
+        """Give the method what it requested, and let it run to its next request or its end."""
         self.n_sim += count_simulations(answer)
         self._advance(lambda: self._steps.send(cast(FloatArray, answer)))  # see `samplers.method.request_terms`
 
     def interrupt(self) -> None:
         """End the run: its outcome is what the method concludes from the values of f so far."""
-        self.outcome = self._conclude() if self.n_sim else NOT_KNOWN
+        self.outcome, self.requested = NOT_KNOWN, np.empty((0, self._dim))
+        if self.n_sim:
+            try:
+                self._steps.throw(Interrupted())
+            except StopIteration as end:
+                self.outcome = _check_outcome(end.value)
+            except Interrupted:
+                pass
         self._steps.close()
-        self.requested = np.empty((0, self._dim))
-
-    def _conclude(self) -> Outcome:
-        """Return the outcome of the interrupted method, NOT_KNOWN if it gives none."""
-        try:
-            self._steps.throw(Interrupted())
-        except StopIteration as end:
-            return _check_outcome(end.value)
-        except Interrupted:
-            pass
-        return NOT_KNOWN
 
     def _advance(self, resume: Callable[[], Request]) -> None:
         """Resume the method until it requests at least one point or returns its outcome."""
@@ -451,36 +475,28 @@ class Replicate:
                 request = self._check_request(self._steps.send(np.empty(0)))
             self.requested = request
         except StopIteration as end:
-            self.outcome = _check_outcome(end.value)
-            self.requested = np.empty((0, self._dim))
+            self.outcome, self.requested = _check_outcome(end.value), np.empty((0, self._dim))
 
     def _check_request(self, request: Request) -> Request:
         """Return the request, points as float64; raise unless it is offered, of a right shape and within the budget."""
-        if isinstance(request, TermsRequest | GradientRequest):
-            gradients = isinstance(request, GradientRequest)
-            if self._offer is None or (gradients and self._offer.gradient_cost is None) or len(request.x) == 0:
-                raise RuntimeError(f"The method made a {type(request).__name__} that the run cannot answer.")
-            self._check_points(request.x)
-            self._check_budget(self._offer.count_gradients(len(request.x)) if gradients else len(request.x))
-            return request
-        x = self._check_points(request)
-        self._check_budget(len(x))
-        return x
-
-    def _check_points(self, x: FloatArray) -> FloatArray:
-        """Return x as float64; raise unless its shape is (n, dim)."""
-        x = np.asarray(x, dtype=np.float64)
+        about, gradients = isinstance(request, TermsRequest | GradientRequest), isinstance(request, GradientRequest)
+        x = np.asarray(points_of(request), dtype=np.float64)
+        if about and (self.offer is None or (gradients and self.offer.gradient_cost is None) or len(x) == 0):
+            raise RuntimeError(f"The method made a {type(request).__name__} that the run cannot answer.")
         if x.ndim != 2 or x.shape[1] != self._dim:
             raise ValueError(f"Expected x of shape (n, {self._dim}), got {x.shape}.")
-        return x
-
-    def _check_budget(self, n: int) -> None:
-        """Raise unless the budget allows n more simulations."""
+        n = self.offer.count_gradients(len(x)) if gradients and self.offer is not None else len(x)
         if self.n_sim + n > self.goal.budget:
             raise RuntimeError(
                 f"The method asked for {n} simulations with {self.goal.budget - self.n_sim} of "
                 f"max_sim={self.goal.max_sim} left; a method must keep to goal.max_sim."
             )
+        return request if about else x
+
+
+def points_of(request: Request) -> FloatArray:
+    """Return the points x (n, d) of a request."""
+    return request.x if isinstance(request, TermsRequest | GradientRequest) else request
 
 
 def count_simulations(answer: Answer) -> int:
@@ -490,13 +506,6 @@ def count_simulations(answer: Answer) -> int:
     return len(answer.f) if isinstance(answer, Terms) else len(answer)
 
 
-def check_cost(gradients: TermGradients, offer: TermsOffer | None) -> None:
-    """Raise an EvaluationError unless the cost of some gradients is one that `gradient_cost` allows."""
-    n, cost = len(gradients.values), gradients.cost
-    if offer is None or offer.gradient_cost is None or not 0 <= cost <= offer.gradient_cost * n * (1 + 1e-9):
-        raise EvaluationError(f"Expected {n} gradients to cost at most gradient_cost for each, got {cost} simulations.")
-
-
 def _check_outcome(value: object) -> Outcome:
     """Return the value; raise a TypeError unless it is an Outcome."""
     if not isinstance(value, Outcome):
@@ -504,47 +513,56 @@ def _check_outcome(value: object) -> Outcome:
     return value
 
 
-NO_OUTCOME = -np.inf
-"""f as methods see it for a row without an outcome (counted as failing, on_error not "raise")."""
-SMALLEST_F = float(np.finfo(np.float64).min)
-"""f as methods see it where f is -inf, so that NO_OUTCOME keeps its meaning."""
-KEEP_FAILURES = 1000
-"""Failing points kept: enough for every listing, little memory in hundreds of dimensions."""
-
-
 class EvaluationLog:
-    """Counts every row, decides what NaN means and keeps the most likely failing points.
-
-    Args:
-        dim: Number of dimensions of x.
-        base: Distribution of X.
-        gamma: Threshold of failure, f <= gamma.
-        on_error: "raise" refuses NaN; "failure" and "bound" pass it on as NO_OUTCOME.
-        keep: How many failing points are kept, the most likely ones.
+    """Counts every simulation, says for whom it was made, decides what NaN means, keeps the likeliest failing points.
 
     Attributes:
-        n_sim: Rows recorded, and what gradients cost.
-        n_errors: Rows without an outcome.
+        n_sim: Simulations, and what gradients cost.
+        n_errors: Those without an outcome.
     """
 
     def __init__(
-        self, dim: int, base: Distribution, gamma: float, on_error: OnError = "raise", keep: int = KEEP_FAILURES
+        self,
+        inputs: Inputs,
+        gamma: float,
+        on_error: OnError = "raise",
+        keep_points: bool = False,
+        keep: int = KEEP_FAILURES,
     ) -> None:
-        self.n_sim = 0
-        self.n_errors = 0
-        self._failures = Failures.empty(dim)
+        self.n_sim = self.n_errors = 0
+        self._inputs, self._gamma, self._on_error, self._keep = inputs, gamma, on_error, keep
+        self._failures = Failures.empty(inputs.dim)
         self._new: list[tuple[FloatArray, FloatArray]] = []
-        self._base = base
-        self._gamma = gamma
-        self._on_error = on_error
-        self._keep = keep
+        self._spans: list[tuple[Replicate, int, int]] = []
+        self._points: list[tuple[FloatArray, FloatArray]] | None = [] if keep_points else None
 
-    def record(self, x: FloatArray, f: FloatArray) -> FloatArray:
-        """Record f (n,) of the rows of x (n, d); return f as methods see it, shape (n,), never NaN.
+    def record(self, replicates: Sequence[Replicate], answers: Sequence[Answer]) -> list[Answer]:
+        """Record the answers to what replicates have requested; return them as methods see them.
 
         Raises:
-            EvaluationError: If one is NaN and on_error is "raise"; nothing is recorded then.
+            EvaluationError: If an f is NaN and on_error is "raise", or gradients cost too much; nothing is recorded.
         """
+        for replicate, answer in zip(replicates, answers, strict=True):
+            if isinstance(answer, TermGradients):
+                check_cost(answer, replicate.offer)
+        seen, costs = list(answers), [count_simulations(answer) for answer in answers]
+        simulated = [i for i, answer in enumerate(answers) if not isinstance(answer, TermGradients)]
+        f = [outcomes_of(answers[i]) for i in simulated]
+        if simulated:
+            x = np.concatenate([points_of(replicates[i].requested) for i in simulated])
+            whole = self.record_f(x, np.concatenate(f))
+            for i, part in zip(simulated, np.split(whole, np.cumsum([len(each) for each in f])[:-1]), strict=True):
+                seen[i] = hide_missing(answers[i], part)
+        for i in sorted(range(len(answers)), key=lambda i: not isinstance(answers[i], np.ndarray)):  # as simulated
+            n = costs[i] if i in simulated else 0
+            self.n_sim += costs[i] - n
+            self._add_span(replicates[i], n, costs[i])
+            if self._points is not None and i in simulated:
+                self._points.append((points_of(replicates[i].requested), outcomes_of(answers[i])))
+        return seen
+
+    def record_f(self, x: FloatArray, f: FloatArray) -> FloatArray:
+        """Record f (n,) of the rows of x (n, d); return f as methods see it, shape (n,), never NaN."""
         missing = np.isnan(f)
         if missing.any() and self._on_error == "raise":
             row = int(np.argmax(missing))
@@ -554,7 +572,11 @@ class EvaluationLog:
             )
         self.n_sim += len(x)
         self.n_errors += int(missing.sum())
-        self._keep_failures(x, f, missing | (f <= self._gamma))
+        failing = missing | (f <= self._gamma)
+        if failing.any():
+            self._new.append((x[failing], f[failing]))
+            if sum(len(rows) for _, rows in self._new) >= self._keep:
+                self._merge_new()
         return np.where(missing, NO_OUTCOME, np.maximum(f, SMALLEST_F))
 
     @property
@@ -563,20 +585,49 @@ class EvaluationLog:
         self._merge_new()
         return self._failures
 
-    def add_cost(self, n: int) -> None:
-        """Count n simulations that gave gradients and no outcomes."""
-        self.n_sim += n
-
-    def _keep_failures(self, x: FloatArray, f: FloatArray, failing: NDArray[np.bool_]) -> None:
-        """Keep the failing ones of the rows of x (n, d)."""
-        if failing.any():
-            self._new.append((x[failing], f[failing]))
-            if sum(len(rows) for _, rows in self._new) >= self._keep:
-                self._merge_new()
-
     def _merge_new(self) -> None:
         """Merge the new failing points into the most likely ones: the density of many costs little more than of one."""
         if self._new:
             x, f = (np.concatenate(parts) for parts in zip(*self._new, strict=True))
-            log_p0 = np.asarray(self._base.log_prob(x), dtype=np.float64)
+            log_p0 = np.asarray(self._inputs.base.log_prob(x), dtype=np.float64)
             self._failures, self._new = self._failures.merge(x, f, log_p0, keep=self._keep), []
+
+    def _add_span(self, replicate: Replicate, n: int, cost: int) -> None:
+        """Note n simulations of a replicate and what they cost, together with its last ones if nothing lies between."""
+        if self._spans and self._spans[-1][0] is replicate and self._spans[-1][1] == self._spans[-1][2]:
+            _, n_before, cost_before = self._spans.pop()
+            n, cost = n + n_before, cost + cost_before
+        self._spans.append((replicate, n, cost))
+
+    def index(self, replicates: Sequence[Replicate], whole: Outcome) -> SimulationIndex:
+        """Return what the simulations of these replicates were made for."""
+        number = {id(replicate): run for run, replicate in enumerate(replicates)}
+        spans = tuple((number[id(replicate)], n, cost) for replicate, n, cost in self._spans if id(replicate) in number)
+        return SimulationIndex(spans=spans, trace=whole.trace, weights=whole.draw_weights)
+
+    def join_points(self) -> SimulatedPoints | None:
+        """Return all simulations in the order of the spans; None where they were not kept."""
+        if self._points is None:
+            return None
+        x, f = zip((np.empty((0, self._inputs.dim)), np.empty(0)), *self._points, strict=True)
+        return SimulatedPoints(np.concatenate(x), np.concatenate(f))
+
+
+def outcomes_of(answer: Answer) -> FloatArray:
+    """Return the outcomes f (n,) of an answer that has some."""
+    return answer.f if isinstance(answer, Terms) else cast(FloatArray, answer)
+
+
+def hide_missing(answer: Answer, f: FloatArray) -> Answer:
+    """Return an answer with f as methods see it; points without an outcome, f = -inf, fail in every term."""
+    if not isinstance(answer, Terms):
+        return f
+    values = np.where(np.isneginf(f)[:, None], -np.inf, answer.values)
+    return Terms(f, values, answer.ticks, answer.threshold, answer.names)
+
+
+def check_cost(gradients: TermGradients, offer: TermsOffer | None) -> None:
+    """Raise an EvaluationError unless the cost of some gradients is one that `gradient_cost` allows."""
+    n, cost = len(gradients.values), gradients.cost
+    if offer is None or offer.gradient_cost is None or not 0 <= cost <= offer.gradient_cost * n * (1 + 1e-9):
+        raise EvaluationError(f"Expected {n} gradients to cost at most gradient_cost for each, got {cost} simulations.")

@@ -1,4 +1,4 @@
-"""Sample: the weighted points behind an estimate, layers of methods with levels, simulations and failing points."""
+"""Sample: how a run ended and its levels, the weighted points behind an estimate, simulations and failing points."""
 
 from __future__ import annotations
 
@@ -12,6 +12,76 @@ import numpy as np
 from numpy.typing import NDArray
 
 from samplers.problem import FloatArray
+
+
+class Status(str, Enum):
+    """End of a run; prints as its value.
+
+    Example:
+        >>> import samplers
+        >>> problem = samplers.FunctionProblem(lambda x: 9.0 - x[:, 0], dim=1)
+        >>> print(samplers.estimate(problem, "mc", seed=0, max_sim=100).status)
+        no_hits
+        >>> samplers.Status.NO_HITS == "no_hits"
+        True
+    """
+
+    CONVERGED = "converged"
+    """The method came to its own end (and met target_cov, if one was given); whether p can be trusted then is told by
+    the warnings."""
+    NO_HITS = "no_hits"
+    """It came to its end without seeing a failure: p = 0, one-sided interval."""
+    BUDGET = "budget"
+    """max_sim (or the limit of runs, see `estimate`) was used up before the end or before target_cov was met."""
+    STOPPED = "stopped"
+    """Someone stopped it: the time limit or a callback."""
+    STALLED = "stalled"
+    """It could not get closer to the failures: ties in f, or too many levels."""
+
+    def __str__(self) -> str:
+        return str(self.value)
+
+
+def describe_outcome(status: Status | str, warnings: Sequence[str]) -> str:
+    """Return how a run ended, in words: "converged" stands alone only where there is no warning."""
+    if status != Status.CONVERGED or not warnings:
+        return str(status)
+    return f"came to its end with {len(warnings)} warning{'s' * (len(warnings) != 1)}"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Level:
+    """One level of subset simulation, one iteration of cross-entropy, one batch of Monte Carlo.
+
+    Example:
+        >>> import samplers
+        >>> problem = samplers.FunctionProblem(lambda x: 3.0 - x[:, 0], dim=1)
+        >>> result = samplers.estimate(problem, samplers.AdaptiveSubsetSimulation(n=1000), seed=0)
+        >>> for level in result.trace:
+        ...     print(f"P[f <= {level.gamma:.1f}] = {level.estimate:.4f} after {level.n_sim} more simulations")
+        P[f <= 1.8] = 0.1000 after 1000 more simulations
+        P[f <= 0.7] = 0.0101 after 900 more simulations
+        P[f <= 0.0] = 0.0010 after 899 more simulations
+    """
+
+    gamma: float
+    """Threshold of this level."""
+    p: float
+    """Share of this level's points with f <= gamma."""
+    estimate: float
+    """P[f(X) <= gamma of this level] as estimated so far."""
+    n_sim: int
+    """Simulations made for this level."""
+    n_points: int
+    """Points behind `p`: those simulated and, in subset simulation, the seeds."""
+    cov: float
+    """Coefficient of variation of this level's own share in the estimate."""
+    acceptance: float | None = None
+    """Share of accepted moves (Markov chains)."""
+    ess: float | None = None
+    """Effective number of points behind `p` (chains) or of failing points (weights)."""
+    run: int = 0
+    """Number of the replicate that the level belongs to."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -43,16 +113,16 @@ class Layer:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class DrawWeights:
-    """Weights of simulations that follow each other: p is the sum of those of the failing ones."""
+    """Weights of n simulations that follow each other: p is the sum of those of the failing ones.
+
+    `log_weights` (n,) are log(p0 / q) - log(N) for N draws in all, calibrated or not; to be added is `log_share`, that
+    of the share that their replicate `run` has in the result. `first` simulations of that came before.
+    """
 
     first: int
-    """Simulations that its run had spent before the first of them."""
     log_weights: FloatArray
-    """log(p0 / q) - log(N) for N draws in all, calibrated or not, in the order of the simulations, shape (n,)."""
     run: int = 0
-    """Replicate that made them."""
     log_share: float = 0.0
-    """Logarithm of the share that this replicate has in the result; to be added to the weights."""
 
     @classmethod
     def of_equal_draws(cls, total: int, first: int, n: int) -> DrawWeights:
@@ -107,11 +177,7 @@ class Sample:
 
     @classmethod
     def of_equal_draws(cls, f: FloatArray, x: FloatArray) -> Sample:
-        """Return n independent draws of equal weight, each a unit of its own.
-
-        Args:
-            f: Outcomes of all draws, shape (n,).
-            x: The failing ones of them, shape (k, d).
+        """Return n independent draws of equal weight, outcomes f (n,), of which x (k, d) are the failing ones.
 
         Example:
             >>> import numpy as np, samplers
@@ -123,27 +189,24 @@ class Sample:
 
 
 class SimulationRows(NamedTuple):
-    """What is known of simulations that follow each other, from a `SimulationIndex`."""
+    """What is known of n simulations that follow each other, from a `SimulationIndex`; (n,) each."""
 
-    run: NDArray[np.int64]
-    """Replicate that made each, shape (n,)."""
-    stage: NDArray[np.int64]
-    """Its level in the trace of that replicate, shape (n,); -1 for none."""
-    log_weight: FloatArray
-    """Logarithm of its weight in p, shape (n,); NaN where it has none."""
+    run: NDArray[np.int64]  # replicate
+    stage: NDArray[np.int64]  # level in the trace of that replicate; -1 for none
+    log_weight: FloatArray  # logarithm of the weight in p; NaN for none
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class SimulationIndex:
-    """Tells of each simulation of an estimate, numbered in the order of their making, what it was made for."""
+    """Tells of each simulation of an estimate, numbered in the order of their making, what it was made for.
+
+    A span is a replicate, the number of its simulations that follow each other, and what they cost: more than their
+    number where gradients follow them, which cost simulations and give none. There are no weights where p is no sum.
+    """
 
     spans: tuple[tuple[int, int, int], ...]
-    """Replicate, number of its simulations that follow each other, and what they cost: more than their number where
-    gradients follow them, which cost simulations and give none; in order."""
     trace: tuple[Level, ...]
-    """Levels of all replicates."""
     weights: tuple[DrawWeights, ...]
-    """Weights of single simulations; empty where p is no sum over them."""
 
     @property
     def n(self) -> int:
@@ -257,7 +320,6 @@ class Failures:
         )
 
     def __len__(self) -> int:
-        """Return how many points are kept."""
         return len(self.f)
 
     def __getitem__(self, index: int) -> Failure:
@@ -265,7 +327,6 @@ class Failures:
         return Failure(self.x[index], float(self.f[index]), float(self.log_p0[index]))
 
     def __iter__(self) -> Iterator[Failure]:
-        """Go through the failures, most likely first."""
         return (self[index] for index in range(len(self)))
 
     def __eq__(self, other: object) -> bool:
@@ -280,73 +341,3 @@ class Failures:
         )
 
     __hash__ = None  # type: ignore[assignment]  # arrays have no hash
-
-
-class Status(str, Enum):
-    """End of a run; prints as its value.
-
-    Example:
-        >>> import samplers
-        >>> problem = samplers.FunctionProblem(lambda x: 9.0 - x[:, 0], dim=1)
-        >>> print(samplers.estimate(problem, "mc", seed=0, max_sim=100).status)
-        no_hits
-        >>> samplers.Status.NO_HITS == "no_hits"
-        True
-    """
-
-    CONVERGED = "converged"
-    """The method came to its own end (and met target_cov, if one was given); whether p can be trusted then is told by
-    the warnings."""
-    NO_HITS = "no_hits"
-    """It came to its end without seeing a failure: p = 0, one-sided interval."""
-    BUDGET = "budget"
-    """max_sim (or the limit of runs, see `estimate`) was used up before the end or before target_cov was met."""
-    STOPPED = "stopped"
-    """Someone stopped it: the time limit or a callback."""
-    STALLED = "stalled"
-    """It could not get closer to the failures: ties in f, or too many levels."""
-
-    def __str__(self) -> str:
-        return str(self.value)
-
-
-def describe_outcome(status: Status | str, warnings: Sequence[str]) -> str:
-    """Return how a run ended, in words: "converged" stands alone only where there is no warning."""
-    if status != Status.CONVERGED or not warnings:
-        return str(status)
-    return f"came to its end with {len(warnings)} warning{'s' * (len(warnings) != 1)}"
-
-
-@dataclass(frozen=True, kw_only=True)
-class Level:
-    """One level of subset simulation, one iteration of cross-entropy, one batch of Monte Carlo.
-
-    Example:
-        >>> import samplers
-        >>> problem = samplers.FunctionProblem(lambda x: 3.0 - x[:, 0], dim=1)
-        >>> result = samplers.estimate(problem, samplers.AdaptiveSubsetSimulation(n=1000), seed=0)
-        >>> for level in result.trace:
-        ...     print(f"P[f <= {level.gamma:.1f}] = {level.estimate:.4f} after {level.n_sim} more simulations")
-        P[f <= 1.8] = 0.1000 after 1000 more simulations
-        P[f <= 0.7] = 0.0101 after 900 more simulations
-        P[f <= 0.0] = 0.0010 after 899 more simulations
-    """
-
-    gamma: float
-    """Threshold of this level."""
-    p: float
-    """Share of this level's points with f <= gamma."""
-    estimate: float
-    """P[f(X) <= gamma of this level] as estimated so far."""
-    n_sim: int
-    """Simulations made for this level."""
-    n_points: int
-    """Points behind `p`: those simulated and, in subset simulation, the seeds."""
-    cov: float
-    """Coefficient of variation of this level's own share in the estimate."""
-    acceptance: float | None = None
-    """Share of accepted moves (Markov chains)."""
-    ess: float | None = None
-    """Effective number of points behind `p` (chains) or of failing points (weights)."""
-    run: int = 0
-    """Number of the replicate that the level belongs to."""

@@ -1,14 +1,5 @@
 """Statistics: importance weights, intervals, the next threshold of a search, the share of p that was not found.
 
-The share of p in regions of failure that were not found, and the upper end of p that holds it.
-
-Let nu independent lineages have reached failure, all of them in the regions that are known. The share M of p in other
-regions has then the distribution Beta(1/10, nu): each lineage is a trial that a region of share M is missed with
-probability 1 - M; the first parameter is small because most problems have no other region. With p-hat exp(s Z) the
-probability of the regions known, Z ~ N(0, 1), the upper end is the quantile of p-hat exp(s Z) / (1 - M).
-
-Coefficients of variation and confidence intervals.
-
 References:
     Clopper and Pearson, "The use of confidence or fiducial limits", Biometrika 26, 1934.
     Au and Beck, "Estimation of small failure probabilities in high dimensions by subset
@@ -29,15 +20,11 @@ from samplers.problem import FloatArray
 
 
 def log_sum_exp(a: FloatArray, axis: int | None = None, weights: FloatArray | None = None) -> Any:
-    """Return log(sum of weights * exp(a)) along an axis, of all numbers where it is None; -inf for a sum of nothing.
+    """Return log(sum of weights * exp(a)) along an axis, which is dropped, or of all numbers; -inf for no numbers.
 
-    The bits are those of `scipy.special.logsumexp`, in a third of its time for the arrays of an estimate, most of
-    which have some thousand numbers: the largest number is left out of the sum and its share is added by log1p.
-
-    Args:
-        a: Logarithms, any shape.
-        axis: Along which the sum is taken; it is dropped.
-        weights: Not negative, of a shape that goes with that of `a`; all 1 where they are None.
+    Weights are not negative, and all 1 where there are none. The bits are those of `scipy.special.logsumexp`, in a
+    third of its time for the arrays of an estimate, most of which have some thousand numbers: the largest number is
+    left out of the sum and its share is added by log1p.
     """
     if weights is not None:
         a = np.where(weights == 0, -np.inf, a)
@@ -151,16 +138,12 @@ def gain_over_monte_carlo(p: float, cov: float, n_sim: int) -> float:
 
 
 def correlation_factor(inside: NDArray[np.bool_], lengths: NDArray[np.int64]) -> float:
-    """Return Au and Beck's gamma: correlation in the chains raises a variance by 1 + gamma.
+    """Return Au and Beck's gamma of an indicator (chains, steps), row i chain i in time order.
 
-    gamma = 2 sum_k (M_k / N) rho(k), with M_k the number of pairs at lag k inside the chains,
-    N the number of points and rho(k) the correlation of the indicator at lag k. With chains of
-    equal length L this is the paper's 2 sum_k (1 - k / L) rho(k). Negative sums, which are
-    sampling noise, count as 0.
-
-    Args:
-        inside: Indicator, shape (chains, steps): row i is chain i in time order.
-        lengths: How many of the steps of each chain count, shape (chains,).
+    Correlation in the chains raises a variance by 1 + gamma,
+    gamma = 2 sum_k (M_k / N) rho(k), with M_k the number of pairs at lag k inside the chains, whose `lengths` (chains,)
+    count, N the number of points and rho(k) the correlation of the indicator at lag k. With chains of equal length L
+    this is the paper's 2 sum_k (1 - k / L) rho(k). Negative sums, which are sampling noise, count as 0.
     """
     used = np.arange(inside.shape[1]) < lengths[:, None]
     total = int(used.sum())
@@ -208,7 +191,14 @@ QUANTILES = 400
 
 
 def add_unseen(p: float, high: float, lineages: float, confidence: float) -> float:
-    """Return the upper end of p, `high` for the regions known, with the share that is unseen after some lineages."""
+    """Return the upper end of p, `high` for the regions known, with the share that is unseen after some lineages.
+
+    Let nu independent lineages have reached failure, all of them in the regions that are known. The share M of p in
+    other regions has then the distribution Beta(1/10, nu): each lineage is a trial that a region of share M is missed
+    with probability 1 - M; the first parameter is small because most problems have no other region. With
+    p-hat exp(s Z) the probability of the regions known, Z ~ N(0, 1), the end is the quantile of
+    p-hat exp(s Z) / (1 - M).
+    """
     if not 0 < p < high or np.isinf(lineages):
         return high
     return float(min(1.0, p * np.exp(raise_log_end(float(np.log(high / p)), lineages, confidence))))

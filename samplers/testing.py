@@ -12,13 +12,13 @@ from collections.abc import Callable
 import numpy as np
 from scipy.special import ndtr
 
-from samplers.arguments import RunArguments, find_base_fault
+from samplers.distributions import find_base_fault
 from samplers.estimation import estimate
 from samplers.limit_states import half_space, normal_cdf, two_modes
 from samplers.method import Stepping
 from samplers.problem import Distribution, FloatArray, FunctionProblem
 from samplers.result import Estimate
-from samplers.run import NOT_KNOWN, Run
+from samplers.run import NOT_KNOWN, Run, RunArguments
 from samplers.sample import Status
 
 F = Callable[[FloatArray], FloatArray]
@@ -40,7 +40,7 @@ def check_method(method: Stepping) -> None:
 def check_base(base: Distribution, dim: int) -> None:
     """Check that a base distribution's density and its map to standard normal space fit 200 of its draws.
 
-    `samplers.estimate` makes this check itself; see `samplers.arguments.find_base_fault`.
+    `samplers.estimate` makes this check itself; see `samplers.run.find_base_fault`.
 
     Args:
         base: The distribution.

@@ -1,4 +1,4 @@
-"""Validation: checks of arguments and settings, whose ValueError states what was expected and what was given."""
+"""Validation: checks of arguments, settings and what foreign code returns; errors say what was expected and given."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import math
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Literal, Protocol, TypeGuard, get_args, runtime_checkable
+from typing import Literal, TypeGuard, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -76,14 +76,6 @@ OnError = Literal["raise", "failure", "bound"]
 ON_ERROR: tuple[str, ...] = get_args(OnError)
 
 
-@runtime_checkable
-class FinalError(Protocol):
-    """An exception with an attribute `final`: True if calling f again cannot help."""
-
-    final: bool
-    """Whether f has been called again already, or cannot return a value at all."""
-
-
 class EvaluationError(ValueError):
     """f raised, returned NaN or returned something that is not one number per row.
 
@@ -100,15 +92,7 @@ class EvaluationError(ValueError):
 
 
 def one_per_row(outcomes: ArrayLike, n: int) -> NDArray[np.float64]:
-    """Return the outcomes as float64, shape (n,).
-
-    Called wherever outcomes of foreign code come in, each of which can be used without the others: a function
-    (`FunctionProblem.evaluate`), outcomes told by the user (`Run.tell`), and the halves of a batch that raises, whose
-    lengths must be right before they are joined (`samplers.chunks.isolate`).
-
-    Raises:
-        EvaluationError: If they are not n real numbers.
-    """
+    """Return the outcomes of foreign code as float64, shape (n,); an EvaluationError unless they are n real numbers."""
     if outcomes is None:
         raise EvaluationError(
             f"Expected f to return shape ({n},), one value per row of x, got None: f has no `return`."
@@ -133,11 +117,7 @@ def describe_point(x: NDArray[np.float64]) -> str:
 
 @contextmanager
 def needs_library(library: str, purpose: str) -> Iterator[None]:
-    """Raise an error that says what to install if an import in the block fails because a library is missing.
-
-    Raises:
-        ImportError: If the library, or a part of it, cannot be found.
-    """
+    """Raise an ImportError that says what to install if an import in the block fails because a library is missing."""
     try:
         yield
     except ModuleNotFoundError as error:

@@ -21,7 +21,7 @@ from rare_envs.distributions.space import Distribution, ScenarioSpace
 from rare_envs.files import replace_file
 from rare_envs.plugins import did_you_mean
 from rare_envs.threads import use_one_thread
-from samplers.progress import NARROW_TERMINAL
+from samplers.estimation import NARROW_TERMINAL
 from training.ego_checkpoint import load_checkpoint, restore_model, save_checkpoint
 
 CHECKPOINT_SUFFIX, CHECKPOINT_SECONDS = ".checkpoint", 30.0

@@ -102,7 +102,7 @@ def _isolate_failing_rows(
 ) -> tuple[Tensor, dict[int, str]] | None:
     """Query again, after an error, in parts until the rows that fail stand alone.
 
-    The rule is that of `samplers.chunks.split_rows`, for the rows of one tick: no other tick is driven again.
+    The rule is that of `samplers.workers.split_rows`, for the rows of one tick: no other tick is driven again.
 
     Returns:
         Actions and reasons by row; None if the policy turns out to have a memory.

@@ -122,7 +122,7 @@ class Question:
     @property
     def run_arguments(self) -> RunArguments:
         """The arguments of `samplers.estimate`."""
-        from samplers.arguments import RunArguments
+        from samplers.run import RunArguments
 
         return RunArguments(
             gamma=self.gamma,

@@ -50,12 +50,12 @@ from rare_envs.study.writing import (
     remove_results,
     write_run,
 )
-from samplers.dispatch import ExecutorError
-from samplers.estimation import Simulation, check_base
+from samplers.estimation import check_base, simulate
 from samplers.evaluate import Evaluator
 from samplers.executors import Executor
 from samplers.journal import Journal
 from samplers.validation import OnError
+from samplers.workers import ExecutorError
 
 
 class UnwrittenResults(BadInput):
@@ -198,12 +198,9 @@ def _estimate(
 ) -> samplers.Estimate:
     """Run the method of a study, and the further run under the refits."""
     check_base(study.problem)
-    simulation, arguments = Simulation(evaluator, progress), study.question.run_arguments
+    question = study.question
     with evaluator:
-        estimate = simulation.run(study.problem, study.method, arguments)
-        if study.question.ensemble_run:
-            estimate = simulation.add_ensemble_run(estimate, study.method, arguments)
-    return estimate
+        return simulate(evaluator, study.method, question.run_arguments, progress, ensemble_run=question.ensemble_run)
 
 
 def recheck(study: Study, keeper: RowKeeper) -> Repeatability | None:

@@ -2,10 +2,9 @@
 
 from typing import Protocol, runtime_checkable
 
-from samplers.arguments import RunArguments
 from samplers.method import Stepping
 from samplers.problem import Inputs
-from samplers.run import Run
+from samplers.run import Run, RunArguments
 from samplers.validation import OnError
 
 

@@ -36,7 +36,7 @@ from samplers.distributions import SizedDistribution, as_distribution, can_conve
 from samplers.problem import FloatArray, Inputs
 from samplers.proposals import (
     Gaussian,
-    GaussianMixture,
+    Mixture,
     expectation_maximisation,
     one_hot,
     posterior,
@@ -235,9 +235,7 @@ EMPTY = float(np.finfo(np.float64).eps)
 """A component with less weight has no points left."""
 
 
-def fit_mixture_towards(
-    present: GaussianMixture, k: int, x: FloatArray, weights: FloatArray, alpha: float
-) -> GaussianMixture:
+def fit_mixture_towards(present: Mixture, k: int, x: FloatArray, weights: FloatArray, alpha: float) -> Mixture:
     """Return a mixture of at most k Gaussians nearer to alpha Q + (1 - alpha) P than P, the present one.
 
     Maximises a lower bound of equation 2's objective: the points of Q are shared among the
@@ -255,11 +253,11 @@ def fit_mixture_towards(
     if len(present.components) == 1:
         k = min(k, len(np.unique(x, axis=0)))
         start = one_hot(_cluster(x, weights, k), k)
-        present = GaussianMixture(np.full(k, 1 / k), [present.components[0]] * k)
+        present = Mixture(np.full(k, 1 / k), [present.components[0]] * k)
     else:
         start = posterior(present.log_terms(x))
 
-    def maximise(responsibilities: FloatArray) -> GaussianMixture:
+    def maximise(responsibilities: FloatArray) -> Mixture:
         """Return weights, means and covariances; a component without any weight stays as it is."""
         shares, components = [], []
         parts = zip(present.weights, present.components, weights * responsibilities, strict=True)
@@ -273,14 +271,14 @@ def fit_mixture_towards(
             mass = mass / total if total > 0 else np.full(len(x), 1 / len(x))
             target = weighted_moments(x, mass).mix_with(component.moments, alpha * total / share)
             components.append(shrink_towards_present(target, component, 1 / float(mass @ mass)))
-        return GaussianMixture(np.maximum(shares, np.finfo(np.float64).tiny) / sum(shares), components)
+        return Mixture(np.maximum(shares, np.finfo(np.float64).tiny) / sum(shares), components)
 
     mixture, _ = expectation_maximisation(
         maximise, lambda mixture: mixture.log_terms(x), start, weights, EM_STEPS, lambda _: -np.inf
     )
     used = mixture.weights > EMPTY
     components = [component for component, kept in zip(mixture.components, used, strict=True) if kept]
-    return GaussianMixture(mixture.weights[used] / mixture.weights[used].sum(), components)
+    return Mixture(mixture.weights[used] / mixture.weights[used].sum(), components)
 
 
 def _cluster(x: FloatArray, weights: FloatArray, k: int) -> NDArray[np.int64]:
@@ -468,11 +466,11 @@ class MixtureBlock(_FromGaussian):
     """
 
     k: int
-    mixture: GaussianMixture | None = None
+    mixture: Mixture | None = None
 
     @property
-    def _mixture(self) -> GaussianMixture:
-        return GaussianMixture(np.ones(1), (self.gaussian,)) if self.mixture is None else self.mixture
+    def _mixture(self) -> Mixture:
+        return Mixture(np.ones(1), (self.gaussian,)) if self.mixture is None else self.mixture
 
     def sample(self, n: int, rng: np.random.Generator) -> FloatArray:
         """Draw n independent points, shape (n, b)."""

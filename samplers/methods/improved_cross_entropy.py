@@ -24,9 +24,9 @@ from samplers.method import Goal, Interrupted, Steps
 from samplers.methods.base import Method
 from samplers.problem import FloatArray, Inputs, StandardNormal
 from samplers.proposals import (
+    Mixture,
     ProposalDistribution,
     TiltedNormal,
-    WidenableMixture,
     fit_proposal_mixture,
     fit_shrunk_gaussian,
 )
@@ -147,7 +147,7 @@ class ImprovedCrossEntropy(Method):
 
     def _search(
         self, inputs: Inputs, goal: Goal, rng: np.random.Generator
-    ) -> Generator[FloatArray, FloatArray, tuple[Search, WidenableMixture | None]]:
+    ) -> Generator[FloatArray, FloatArray, tuple[Search, Mixture | None]]:
         """Narrow the target down to failure; return the proposal fitted last, None where base draws serve."""
         rounds, trace = list[Round](), list[Level]()
         size, n_rounds = plan_rounds(goal, self.n_round, self.max_rounds)
@@ -155,7 +155,7 @@ class ImprovedCrossEntropy(Method):
             return Search(rounds, trace, Status.BUDGET), None
         base, to_x = StandardNormal(inputs.dim), inputs.base.from_standard_normal
         sampler: ProposalDistribution = TiltedNormal(np.zeros(inputs.dim))
-        proposal: WidenableMixture | None = None
+        proposal: Mixture | None = None
         width, narrowest = math.inf, 0.0
         for k in range(n_rounds):
             u = sampler.sample(size, rng)
@@ -186,7 +186,7 @@ class ImprovedCrossEntropy(Method):
         ended = Status.BUDGET if n_rounds < self.max_rounds else Status.STALLED
         return Search(rounds, trace, ended), proposal
 
-    def _fit(self, u: FloatArray, log_weights: FloatArray, rng: np.random.Generator) -> WidenableMixture:
+    def _fit(self, u: FloatArray, log_weights: FloatArray, rng: np.random.Generator) -> Mixture:
         """Return the member of the family nearest to points u (n, d) with these weights (n,)."""
         used = np.isfinite(log_weights)
         u, weights = u[used], normalise_weights(log_weights[used])

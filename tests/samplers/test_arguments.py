@@ -12,17 +12,9 @@ from scipy import stats
 
 import samplers
 from samplers import testing
-from samplers.arguments import (
-    FALSE_ALARM,
-    N_DRAWS,
-    RunArguments,
-    _find_other_law,
-    check_arguments,
-    check_problem,
-    choose_seed,
-    find_base_fault,
-)
+from samplers.distributions import FALSE_ALARM, N_DRAWS, _find_other_law, find_base_fault
 from samplers.problem import FloatArray, StandardNormal
+from samplers.run import Run, RunArguments, check_problem, choose_seed
 
 PROBLEM = samplers.FunctionProblem(lambda x: x[:, 0], 2)
 
@@ -71,10 +63,10 @@ def test_a_seed_is_kept_or_drawn():
 
 
 def test_what_a_run_needs():
-    check_arguments(SimpleNamespace(dim=2, base=samplers.StandardNormal(2)), samplers.MonteCarlo())
+    Run(SimpleNamespace(dim=2, base=samplers.StandardNormal(2)), samplers.MonteCarlo(), RunArguments())
     for method, expected in [(samplers.MonteCarlo, "add brackets"), ("mc", "such as MonteCarlo"), (None, "got None")]:
         with pytest.raises(ValueError, match=expected):
-            check_arguments(PROBLEM, method)
+            Run(PROBLEM, method, RunArguments())
 
 
 @pytest.mark.parametrize(
@@ -94,7 +86,7 @@ def test_what_a_run_needs():
 )
 def test_a_problem_that_is_none_is_named(problem, expected):
     with pytest.raises(ValueError, match=expected):
-        check_problem(problem, ("dim", "base", "evaluate"))
+        check_problem(problem, "dim", "base", "evaluate")
 
 
 class Exponential:
@@ -175,7 +167,7 @@ def test_what_fits_is_not_refused() -> None:
 
 def test_statistics_of_standard_normal_draws_stay_within_the_level(monkeypatch: pytest.MonkeyPatch) -> None:
     """With a level of 0.2 at most a fifth of 2,000 sets may be refused, and not none of them: 4 binomial deviations."""
-    monkeypatch.setattr("samplers.arguments.FALSE_ALARM", 0.2)
+    monkeypatch.setattr("samplers.distributions.FALSE_ALARM", 0.2)
     rng = np.random.default_rng(3)
     refused = sum(_find_other_law(rng.standard_normal((N_DRAWS, 3))) is not None for _ in range(2000))
     assert 0.05 * 2000 < refused < 0.2 * 2000 + 4 * (2000 * 0.2 * 0.8) ** 0.5

@@ -24,11 +24,9 @@ import numpy as np
 import pytest
 
 import samplers
-from samplers import dispatch, executors
-from samplers.chunks import Chunk
-from samplers.evaluate import Work
+from samplers import executors, workers
 from samplers.executors import FuturesPool, LocalProcesses, RayCluster
-from samplers.workers import SeededWork
+from samplers.workers import Chunk, SeededWork, Work
 from tests.samplers.faulty_functions import BAD, FAULTS, KillsItself, matrix, problem
 from tests.samplers.real_executors import LIBRARIES, case, open_executor
 
@@ -367,7 +365,7 @@ def test_a_chunk_that_nobody_waits_for_is_cancelled_and_no_two_calls_are_alike()
         assert given_up.cancel()
     assert [job.cancelled() for job in waiting.jobs] == [True, False]
     waiting.jobs[1].set_exception(ArithmeticError("gone"))
-    assert isinstance(wanted.exception(), dispatch.WorkerLost)
+    assert isinstance(wanted.exception(), workers.WorkerLost)
     (*first, call), (*again, other) = waiting.calls
     assert first == again and call != other
 
@@ -432,8 +430,8 @@ def test_tasks_give_the_bits_of_one_process(ray: FakeRay) -> None:
 
 
 def test_a_task_that_does_not_end_is_cancelled_by_force(ray: FakeRay, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(dispatch, "START_SECONDS", 0.0)
-    monkeypatch.setattr(dispatch, "QUIET_SECONDS", 0.05)
+    monkeypatch.setattr(executors, "START_SECONDS", 0.0)
+    monkeypatch.setattr(executors, "QUIET_SECONDS", 0.05)
     monkeypatch.setattr("faulthandler.dump_traceback_later", lambda seconds, exit, file: None)  # it ends this process
     with pytest.warns(RuntimeWarning, match="chunks has come back in"):
         result = estimate(problem(FAULTS["hanging"]), RayCluster(time_limit=0.5), 60)

@@ -11,9 +11,8 @@ import numpy as np
 import pytest
 
 import samplers
-from samplers.estimation import EstimationInterrupted
+from samplers.estimation import EstimationInterrupted, defer_signals
 from samplers.method import Answer
-from samplers.platform_calls import defer_signals
 from samplers.problem import FloatArray
 from samplers.sample import Status
 

@@ -21,9 +21,9 @@ import pytest
 
 import samplers
 from samplers import journal as journals
-from samplers.chunks import Result
 from samplers.journal import Journal, JournalError, NothingRecorded, digest_points
 from samplers.problem import FloatArray, TermGradients, Terms
+from samplers.workers import Result
 
 F = Callable[[FloatArray], FloatArray]
 ONE = Result(np.ones((3, 1)), {})

@@ -4,8 +4,9 @@ import re
 import pytest
 
 import samplers
+from samplers.estimation import show_bar
 from samplers.limit_states import half_space
-from samplers.progress import Progress, open_listener
+from samplers.run import Progress
 from tests.samplers.conftest import QUICK_METHODS
 
 
@@ -40,7 +41,7 @@ def test_bar_goes_to_standard_error(capsys):
 
 def test_workers_and_both_times_fit_eighty_columns(capsys, monkeypatch):
     monkeypatch.setenv("COLUMNS", "80")
-    with open_listener(True, 10_000) as show:
+    with show_bar(10_000) as show:
         show(Progress(n_sim=9_000, max_sim=10_000, level=0.0, p=1.2e-5, run=0, workers=12, seconds_left=70.0))
     last = capsys.readouterr().err.strip("\n").splitlines()[-1]
     assert len(last) <= 80 and re.search(r"\d:\d\d:\d\d$", last.strip())

@@ -4,12 +4,10 @@ import numpy as np
 import pytest
 
 import samplers
-from samplers.arguments import RunArguments
-from samplers.combination import combine
 from samplers.limit_states import half_space
-from samplers.method import Goal, GradientRequest, Interrupted, Outcome, TermsOffer, TermsRequest
+from samplers.method import Goal, GradientRequest, Interrupted, Outcome, TermsOffer, TermsRequest, combine
 from samplers.problem import StandardNormal
-from samplers.run import NOT_KNOWN, SMALLEST_F, EvaluationLog, Replicate, Run, split_budget
+from samplers.run import NOT_KNOWN, SMALLEST_F, EvaluationLog, InputsOnly, Replicate, Run, RunArguments, split_budget
 from samplers.sample import Status
 from samplers.statistics import binomial_cov, clopper_pearson
 from samplers.validation import EvaluationError
@@ -218,7 +216,7 @@ def one_after_another(problem, method, seed, replicates, max_sim):
         goal = Goal(gamma=0.0, max_sim=share)
         rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(i,)))
         run = Replicate(method.steps(problem, goal, rng), goal, problem.dim)
-        while run.running:
+        while run.outcome is None:
             run.tell(problem.evaluate(run.requested))
         outcomes.append(run.outcome)
     return combine(outcomes, 0.95)
@@ -370,19 +368,18 @@ def start_steps(steps, max_sim=None):
 def test_points_are_requested_batch_by_batch_until_the_outcome():
     seen = []
     run = start_steps(batches(3, 2, seen=seen))
-    assert run.running
+    assert run.outcome is None
     assert run.requested.shape == (3, 2)
     run.tell(np.arange(3.0))
     assert (run.requested.shape, run.n_sim) == ((2, 2), 3)
     run.tell(np.arange(2.0))
-    assert not run.running
     assert (run.outcome, run.n_sim, run.requested.shape) == (DONE, 5, (0, 2))
     assert [f.tolist() for f in seen] == [[0.0, 1.0, 2.0], [0.0, 1.0]]
 
 
 def test_steps_that_need_no_simulation_have_their_outcome_at_once():
     run = start_steps(batches())
-    assert (run.running, run.n_sim, run.outcome) == (False, 0, DONE)
+    assert (run.n_sim, run.outcome) == (0, DONE)
 
 
 def test_a_method_that_was_told_nothing_is_not_interrupted_but_closed():
@@ -435,27 +432,27 @@ WITH_NAN = np.where(VALUES == 2, np.nan, VALUES)
 
 
 def make_log(**options):
-    return EvaluationLog(2, StandardNormal(2), 0.0, **options)
+    return EvaluationLog(InputsOnly(2, StandardNormal(2)), 0.0, **options)
 
 
 def test_nan_is_refused_with_row_and_x_and_nothing_is_recorded():
     log = make_log()
     with pytest.raises(EvaluationError, match=r"row 2 of a batch of 5, x = \[2\. , 7\.5\]"):
-        log.record(POINTS, WITH_NAN)
+        log.record_f(POINTS, WITH_NAN)
     assert (log.n_sim, log.failures.total) == (0, 0)
 
 
 @pytest.mark.parametrize("on_error", ["failure", "bound"])
 def test_rows_without_outcome_count_as_failing(on_error):
     log = make_log(on_error=on_error)
-    np.testing.assert_array_equal(log.record(POINTS, WITH_NAN), [1.0, 3.0, -np.inf, 4.0, -1.0])
+    np.testing.assert_array_equal(log.record_f(POINTS, WITH_NAN), [1.0, 3.0, -np.inf, 4.0, -1.0])
     assert (log.n_sim, log.n_errors, log.failures.total) == (5, 1, 2)
     assert np.isnan(log.failures.f).sum() == 1
 
 
 def test_minus_infinity_is_an_outcome():
     log = make_log(on_error="failure")
-    np.testing.assert_array_equal(log.record(POINTS, np.full(5, -np.inf)), SMALLEST_F)
+    np.testing.assert_array_equal(log.record_f(POINTS, np.full(5, -np.inf)), SMALLEST_F)
     assert log.n_errors == 0
 
 
@@ -463,7 +460,7 @@ def test_failures_are_ranked_by_density_and_bounded(rng):
     log = make_log(keep=10)
     x = rng.standard_normal((400, 2))
     for part in np.split(x, 4):
-        log.record(part, part[:, 0])
+        log.record_f(part, part[:, 0])
     failing = x[x[:, 0] <= 0]
     log_prob = StandardNormal(2).log_prob
     expected = np.sort(log_prob(failing))[::-1][:10]
@@ -483,12 +480,12 @@ def test_the_density_of_failures_is_asked_for_many_at_once(rng):
             CountingNormal.asked += 1
             return super().log_prob(x)
 
-    log = EvaluationLog(2, CountingNormal(2), 0.0, keep=10)
+    log = EvaluationLog(InputsOnly(2, CountingNormal(2)), 0.0, keep=10)
     x = -np.abs(rng.standard_normal((24, 2)))
     for part in np.split(x, 8):
-        log.record(part, part[:, 0])
+        log.record_f(part, part[:, 0])
     assert CountingNormal.asked == 2  # after 12 and 24
     assert log.failures.total == 24
     assert log.failures is log.failures
-    log.record(x[:1], x[:1, 0])
+    log.record_f(x[:1], x[:1, 0])
     assert (log.failures.total, CountingNormal.asked) == (25, 3)

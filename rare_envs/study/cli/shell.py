@@ -253,7 +253,7 @@ def show_what_is_known(show: Callable[[Any], None]) -> Iterator[None]:
 
 def print_whole(show: Callable[[], None]) -> None:
     """Print an answer to its end: the first signal meanwhile changes nothing, as the command is about to end."""
-    from samplers.platform_calls import defer_signals  # slow to import, and known by now
+    from samplers.estimation import defer_signals  # slow to import, and known by now
 
     whole = False
     try:

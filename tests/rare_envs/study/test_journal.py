@@ -26,8 +26,8 @@ from rare_envs.study.arguments import Question
 from rare_envs.study.errors import BadInput
 from rare_envs.study.journal import JOURNAL, begin_journal, continue_journal, digest_files
 from rare_envs.study.question import prepare
-from samplers.dispatch import ExecutorError
 from samplers.journal import COLUMNS, _Row
+from samplers.workers import ExecutorError
 from tests.rare_envs.study.refusals import FOLLOWING, assert_refused
 
 Cli = Callable[..., Result]

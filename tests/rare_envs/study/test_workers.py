@@ -16,7 +16,7 @@ from rare_envs.study.errors import BadInput
 from rare_envs.study.journal import JOURNAL
 from rare_envs.study.question import prepare
 from rare_envs.study.report import Report
-from samplers.progress import Progress
+from samplers.run import Progress
 from tests.rare_envs.study.faulty_egos import FAULTY
 
 ASKED = Question(

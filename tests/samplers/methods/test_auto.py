@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 import samplers
-from samplers.arguments import InputsOnly
 from samplers.limit_states import half_space
 from samplers.method import Goal, TermsOffer
+from samplers.run import InputsOnly
 
 
 def choice(dim=2, seconds=None, **goal):

@@ -7,9 +7,9 @@ import pytest
 from scipy import stats
 
 import samplers
+from samplers.estimation import METHODS
 from samplers.limit_states import four_branches, half_space, parabola, plateau, two_modes
 from samplers.problem import FunctionProblem
-from samplers.registry import METHODS
 from samplers.testing import METHOD_CHECKS, check_accuracy, check_budget, check_dimensions, check_interruption
 
 MAX_SIM = {"two-stage": 3000, "surrogate": 150}
