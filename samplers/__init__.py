@@ -6,10 +6,9 @@ It needs NumPy and SciPy, and nothing about driving. Begin with `estimate`.
 from samplers.analysis.base_error import BaseUncertainty, RatioUncertainty, compute_ratio_uncertainty
 from samplers.analysis.curve import Curve
 from samplers.analysis.gate import Pilot, PlannedRun, Verdict, plan_runs
-from samplers.analysis.kinds import Share
-from samplers.analysis.refits import FittedBase
-from samplers.analysis.reweight import Reweighted
+from samplers.analysis.reweight import FittedBase, Reweighted
 from samplers.analysis.sensitivity import Sensitivity
+from samplers.analysis.weighted import Share
 from samplers.comparison import Comparison, compare
 from samplers.distributions import as_distribution
 from samplers.estimation import METHODS, EstimationInterrupted, estimate, get_method

@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 from scipy.special import stdtrit
 
 from samplers.analysis.base_error import RatioUncertainty, summarise_ratio
-from samplers.analysis.refits import find_fitted_base, reweight_runs_to_refits
-from samplers.analysis.reweight import MAX_LOG
+from samplers.analysis.reweight import MAX_LOG, find_fitted_base, reweight_runs_to_refits
 from samplers.analysis.weighted import cov_inflation, has_independent_points, interval_of_sum, require_sample
 from samplers.estimation import estimate
 from samplers.method import Stepping

@@ -16,7 +16,7 @@ from pathlib import Path
 from types import FrameType
 from typing import Any, cast
 
-from samplers.analysis.refits import needs_ensemble_run, pool_refits
+from samplers.analysis.reweight import needs_ensemble_run, pool_refits
 from samplers.distributions import find_base_fault
 from samplers.evaluate import Evaluator
 from samplers.executors import AnyExecutor, find_executor

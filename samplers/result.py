@@ -14,10 +14,9 @@ from numpy.typing import ArrayLike
 from samplers.analysis.base_error import BaseUncertainty, compute_base_uncertainty
 from samplers.analysis.curve import Curve, compute_curve, lowest_known_threshold
 from samplers.analysis.gate import Pilot, Verdict, judge_estimate
-from samplers.analysis.kinds import Share, split_by_kind
 from samplers.analysis.reweight import Reweighted, find_sibling, reweight_estimate
 from samplers.analysis.sensitivity import Sensitivity, compute_sensitivity
-from samplers.analysis.weighted import require_sample
+from samplers.analysis.weighted import Share, require_sample, split_by_kind
 from samplers.method import EstimateData, Stepping
 from samplers.output import (
     StoredMethod,

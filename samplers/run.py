@@ -11,7 +11,7 @@ from typing import cast
 import numpy as np
 from numpy.typing import ArrayLike
 
-from samplers.analysis.refits import check_refits
+from samplers.analysis.reweight import check_refits
 from samplers.method import (
     Answer,
     Choice,

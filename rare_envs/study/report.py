@@ -28,7 +28,7 @@ from rare_envs.study.repeatability import Repeatability
 from rare_envs.study.severity import Severity
 from rare_envs.version import __version__
 from samplers.analysis.base_error import FIT_BIAS
-from samplers.analysis.refits import refit_quantile
+from samplers.analysis.reweight import refit_quantile
 from samplers.evaluate import Fault
 from samplers.sample import Sample
 from samplers.statistics import Interval

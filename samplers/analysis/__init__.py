@@ -10,10 +10,9 @@ from samplers.analysis.expectation import (
     expect_over_failures,
     expect_under_refits,
 )
-from samplers.analysis.kinds import NO_OUTCOME_LABEL, Share, sum_by_label
 from samplers.analysis.reweight import Reweighted
 from samplers.analysis.sensitivity import Sensitivity
-from samplers.analysis.weighted import WeightedFailures, weigh_failures
+from samplers.analysis.weighted import NO_OUTCOME_LABEL, Share, WeightedFailures, sum_by_label, weigh_failures
 
 __all__ = [
     "NO_OUTCOME_LABEL",

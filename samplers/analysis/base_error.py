@@ -1,48 +1,40 @@
-"""Uncertainty of the base distribution: the interval of p that the events behind a fitted base allow.
+"""Uncertainty of the base distribution: intervals of p, of a ratio and of a curve that the events behind a base allow.
 
 With p_b the probability under refit b, s the standard deviation of log p_b and t a quantile of Student's t,
 
     p exp(-t S) to p exp(t S),    S^2 = s^2 + cov^2 + 0.2^2,
 
 the upper end raised by the share of p that a search may have missed, as that of the sampling interval is
-(`samplers.statistics.unseen_share`): S does not hold it, since the refits miss what the run misses. It is nowhere
+(`samplers.statistics`): S does not hold it, since the refits miss what the run misses. It is nowhere
 narrower than the sampling interval, which of few draws is wider than their c.o.v. says.
 
-Where refits choose their family anew, each family has such an interval, and the whole reaches from the lowest end to
-the highest; what is expected for the next event is a sum over the families (`samplers.statistics.refit_families`).
 Percentiles of the p_b are not used: refits repeat the bias of the fit, and 30 of them do not reach the outer 2.5 %, so
 that percentiles cover 76 and 82 % (38 and 400 events) and miss on the unsafe side. This interval covers 93 and 92 %
 where the family of distributions is the true one (`benchmarks/uncertainty/base_coverage.py`). Another family is not
 covered by it.
 
-Uncertainty of a ratio of two probabilities under the same refits of one base distribution.
+Two probabilities under the same refits rise and fall together from refit to refit, so that their ratio is known far
+better than either: with s the standard deviation of log(p_1b / p_2b) the interval is ratio exp(-+ t S). Being a ratio
+protects against few events, not against a wrong family of distributions: in a world with Student t tails it covers 2 to
+42 % at 400 events.
 
-Both probabilities rise and fall together from refit to refit, so that their ratio is known far better than either:
-with s the standard deviation of log(p_1b / p_2b) over refits b the interval is ratio exp(-+ t S), one for each family
-of refits as in `base_uncertainty`. Being a ratio protects against few events, not against a wrong family of
-distributions: in a world with Student t tails it covers 2 to 42 % at 400 events.
-
-Refit band: intervals of a falling curve of probabilities that the events behind a fitted base allow, together.
-
-At each threshold the interval is that of `base_uncertainty`, p exp(-+ t S), at a level higher than that of the band:
-the level at which normal errors with the correlation of the log p over the refits (within a family of them), of the
-sampling and of the bias of the fit stay within their intervals at all thresholds together (sup-t, as in
-`samplers.analysis.weighted`). For Student's t the level is on the safe side: its large values come together.
-As the curve falls, so may both ends.
+The band of a falling curve has at each threshold such an interval, at the level at which normal errors with the
+correlation of the log p over the refits (within a family of them), of the sampling and of the bias of the fit stay
+within their intervals at all thresholds together (sup-t, as in `samplers.analysis.weighted`). For Student's t the level
+is on the safe side: its large values come together.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 
-from samplers.analysis.refits import (
-    MAX_UNCOVERED_SHARE,
+from samplers.analysis.reweight import (
     FittedBase,
+    RefitFamily,
     RefitSums,
     count_uncovered,
     deviate_within_families,
@@ -53,9 +45,14 @@ from samplers.analysis.refits import (
     reweight_runs_to_refits,
     split_families,
 )
-from samplers.analysis.weighted import band_generator, no_outcome_weight, require_sample, simultaneous_level
+from samplers.analysis.weighted import (
+    Reported,
+    band_generator,
+    no_outcome_weight,
+    require_sample,
+    simultaneous_level,
+)
 from samplers.method import EstimateData
-from samplers.output import to_json_value
 from samplers.problem import FloatArray
 from samplers.statistics import Interval
 
@@ -66,10 +63,54 @@ MAX_SPREAD = 2.0
 """Standard deviation of log p_b above which the events do not determine p."""
 MIN_REFITS = 2
 """Refits, and clusters of events, from which there is a spread at all."""
+RATIO_CHECK_DRAWS = 16
+"""Draws at which the refits of two estimates are compared."""
+NO_SUMS = RefitSums(np.empty((1, 0)), np.empty((1, 0)))
+"""Of no refits."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class BaseUncertainty:
+class RefitUncertainty(Reported):
+    """What the spread of a value over the refits of a base says of it."""
+
+    interval: Interval | None
+    """Interval that should hold the value of the true distribution with probability `confidence`, if that is of the
+    fitted family; None where the events do not determine it, or it is not known under the refits."""
+    spread: float
+    """Standard deviation of the value's logarithm over the refits; NaN where it is not known."""
+    confidence: float
+    """Nominal coverage of `interval`."""
+    ess_refits: tuple[float, ...]
+    """Effective number of failing points behind the value under each refit, for a ratio of the side that has fewer; a
+    path of a Markov chain counts as one."""
+    clusters: int
+    """Independent clusters among the events."""
+    fitted_to: str
+    """The events in words."""
+    family: str
+    """The family of distributions in words."""
+    n_sim: int = 0
+    """Simulations of further runs under the mixture of the refits; 0 where none was needed."""
+    reason: str = ""
+    """Why there is no interval, or the value under the refits is not known; empty if there is nothing to say."""
+    warnings: tuple[str, ...] = ()
+    """What makes these numbers doubtful."""
+
+    def _write(self, first: str, values: str) -> str:
+        """Return a few lines for people about `values` under the refits."""
+        if not first:
+            return f"base distribution  no interval: {self.reason}"
+        lines = [
+            f"base distribution {first}",
+            f"  assumes that the fitted family is correct ({self.family}); errors of the family are not included",
+        ]
+        if self.n_sim:
+            lines.append(f"  {values} from a further {self.n_sim:,} simulations under their mixture")
+        return "\n".join(lines + [f"  warning: {text}" for text in self.warnings])
+
+
+@dataclass(frozen=True, kw_only=True)
+class BaseUncertainty(RefitUncertainty):
     """What is known of p, given the events that the base distribution was fitted to.
 
     Example:
@@ -85,38 +126,17 @@ class BaseUncertainty:
 
     p: float
     """Probability under the base distribution itself."""
-    interval: Interval | None
-    """Interval that should hold the p of the true distribution with probability `confidence`, if that is of the fitted
-    family; None where the events do not determine p, or p under the refits is not known."""
     expected: float | None
     """Probability that the next event fails, the error of the fit averaged: p exp(s^2 / 2) with s the standard
     deviation of log p over the refits; over several families of refits the sum of such means, by their shares."""
-    spread: float
-    """Standard deviation of log p over the refits; NaN where it is not known."""
     bound: float | None
     """Upper end in place of an interval, where the events do not determine p (a spread above 2)."""
-    confidence: float
-    """Nominal coverage of `interval`."""
     p_refits: tuple[float, ...]
     """p under each refit; empty where it is not known."""
-    ess_refits: tuple[float, ...]
-    """Effective number of failing points behind each of these; a path of a Markov chain counts as one."""
-    clusters: int
-    """Independent clusters among the events."""
-    fitted_to: str
-    """The events in words."""
-    family: str
-    """The family of distributions in words."""
-    n_sim: int = 0
-    """Simulations of the further run under the mixture of the refits; 0 where none was needed."""
-    reason: str = ""
-    """Why p under the refits, or their spread, is not known; empty if it is."""
-    warnings: tuple[str, ...] = ()
-    """What makes these numbers doubtful."""
 
     def __str__(self) -> str:
         """Return a few lines for people."""
-        behind = f"({self.fitted_to}, {len(self.p_refits)} refits)"
+        behind, first = f"({self.fitted_to}, {len(self.p_refits)} refits)", ""
         if self.interval is not None:
             low, high = self.interval
             first = f"{100 * self.confidence:g} %  {low:.1e} to {high:.1e} {behind}"
@@ -124,19 +144,36 @@ class BaseUncertainty:
         elif self.bound is not None:
             below = f"below {self.bound:.1e} in this family" if self.bound < 1 else "nor an upper end in this family"
             first = f" the events do not determine p; {below} {behind}"
-        else:
-            return f"base distribution  no interval: {self.reason}"
-        lines = [
-            f"base distribution {first}",
-            f"  assumes that the fitted family is correct ({self.family}); errors of the family are not included",
-        ]
-        if self.n_sim:
-            lines.append(f"  p of the refits from a further {self.n_sim:,} simulations under their mixture")
-        return "\n".join(lines + [f"  warning: {text}" for text in self.warnings])
+        return self._write(first, "p of the refits")
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return plain numbers for JSON; NaN becomes None."""
-        return {name: to_json_value(value) for name, value in asdict(self).items()}
+
+@dataclass(frozen=True, kw_only=True)
+class RatioUncertainty(RefitUncertainty):
+    """What is known of the ratio of two probabilities, given the events that their base distribution was fitted to.
+
+    Example:
+        >>> found = RatioUncertainty(
+        ...     ratio=1.8, interval=(1.1, 2.9), spread=0.15, confidence=0.95, ratio_refits=(1.7, 1.9, 2.1),
+        ...     ess_refits=(150.0, 200.0, 90.0), clusters=17, fitted_to="38 + 15 events of 17 scenes",
+        ...     family="1 component, log gaps")
+        >>> print(found)
+        base distribution 95 %  1.1 to 2.9 (38 + 15 events of 17 scenes, 3 refits)
+          assumes that the fitted family is correct (1 component, log gaps); errors of the family are not included
+    """
+
+    ratio: float
+    """p_1 / p_2 under the base distribution itself."""
+    ratio_refits: tuple[float, ...]
+    """The ratio under each refit; empty where it is not known."""
+
+    def __str__(self) -> str:
+        """Return a few lines for people."""
+        first = ""
+        if self.interval is not None:
+            low, high = self.interval
+            behind = f"({self.fitted_to}, {len(self.ratio_refits)} refits)"
+            first = f"{100 * self.confidence:g} %  {low:.2g} to {high:.2g} {behind}"
+        return self._write(first, "under the refits")
 
 
 def compute_base_uncertainty(estimate: EstimateData) -> BaseUncertainty | None:
@@ -149,14 +186,14 @@ def compute_base_uncertainty(estimate: EstimateData) -> BaseUncertainty | None:
     fitted = find_fitted_base(estimate.base)
     if fitted is None:
         return None
-    sums, low_factor, reason = RefitSums(np.empty((1, 0)), np.empty((1, 0))), 1.0, ""
+    sums, low_factor, reason = NO_SUMS, 1.0, ""
     try:
-        sums = reweight_runs_to_refits(estimate, fitted.refits)
-        low_factor = _lower_factor(estimate)
+        sums, sample = reweight_runs_to_refits(estimate, fitted.refits), require_sample(estimate)
+        failing = float(sample.weights[sample.f <= estimate.gamma].sum())
+        low_factor = 1 - no_outcome_weight(estimate, sample) / failing
     except ValueError as error:
         reason = str(error)
     further = estimate.ensemble_run
-    doubts = [] if further is None else [f"in the further run: {text}" for text in further.warnings]
     return summarise_refits(
         estimate.p,
         estimate.cov,
@@ -167,7 +204,7 @@ def compute_base_uncertainty(estimate: EstimateData) -> BaseUncertainty | None:
         lineages=read_lineages(estimate),
         low_factor=low_factor,
         n_sim=0 if further is None else further.n_sim,
-        doubts=doubts,
+        doubts=[] if further is None else [f"in the further run: {text}" for text in further.warnings],
         reason=reason,
     )
 
@@ -189,18 +226,15 @@ def summarise_refits(
 ) -> BaseUncertainty:
     """Return the uncertainty of a probability, or of another mean over failures, from its values under refits."""
     log_values, ess = sums.log_p[0] + math.log(largest), sums.ess[0]
-    reason = reason or explain_missing_spread(log_values, fitted.clusters)
+    reason = reason or _explain_missing_spread(log_values, fitted.clusters)
     interval, expected, spread, bound = None, None, math.nan, None
     if not reason:
-        spread = float(log_values.std(ddof=1))
-        families = split_families(math.log(value), log_values, read_refit_families(fitted, len(log_values)))
-        below, above = find_log_ends(families, cov**2 + FIT_BIAS**2, confidence, fitted.clusters, lineages)
-        low, high = low_factor * scale_by_exp(1.0, below), min(largest, scale_by_exp(1.0, above))
-        low, high = (low, high) if sampling is None else (min(low, sampling[0]), max(high, sampling[1]))
+        spread, families, (low, high) = _spread_to_ends(value, log_values, cov, confidence, fitted, lineages)
+        ends = _hold((low_factor * low, min(largest, high)), sampling)
         if spread <= MAX_SPREAD:
-            interval, expected = (low, high), expect_over_families(families, largest)
+            interval, expected = ends, expect_over_families(families, largest)
         else:
-            bound = high
+            bound = ends[1]
     return BaseUncertainty(
         p=value,
         interval=interval,
@@ -215,11 +249,25 @@ def summarise_refits(
         fitted_to=fitted.fitted_to,
         family=fitted.family,
         n_sim=n_sim,
-        warnings=(*describe_coverage(ess), *doubts),
+        warnings=(*_describe_coverage(ess), *doubts),
     )
 
 
-def explain_missing_spread(log_values: FloatArray, clusters: int) -> str:
+def _spread_to_ends(
+    value: float, log_values: FloatArray, cov: float, confidence: float, fitted: FittedBase, lineages: float = math.inf
+) -> tuple[float, tuple[RefitFamily, ...], Interval]:
+    """Return the spread of values (R,) under refits, as logarithms, their families and the ends of the value."""
+    families = split_families(math.log(value), log_values, read_refit_families(fitted, len(log_values)))
+    low, high = find_log_ends(families, cov**2 + FIT_BIAS**2, confidence, fitted.clusters, lineages)
+    return float(log_values.std(ddof=1)), families, (_exp(low), _exp(high))
+
+
+def _hold(interval: Interval, sampling: Interval | None) -> Interval:
+    """Return an interval, widened to hold that of the sampling if there is one."""
+    return interval if sampling is None else (min(interval[0], sampling[0]), max(interval[1], sampling[1]))
+
+
+def _explain_missing_spread(log_values: FloatArray, clusters: int) -> str:
     """Return why values of the refits (R,), as logarithms, have no spread; empty if they have one."""
     if len(log_values) < MIN_REFITS or clusters < MIN_REFITS:
         return f"a spread needs {MIN_REFITS} refits and {MIN_REFITS} clusters, got {len(log_values)} and {clusters}."
@@ -229,92 +277,21 @@ def explain_missing_spread(log_values: FloatArray, clusters: int) -> str:
     return ""
 
 
-def scale_by_exp(value: float, exponent: float) -> float:
-    """Return value exp(exponent) for value > 0, formed in logarithms; inf where that is no float."""
-    exponent += math.log(value)
+def _exp(exponent: float) -> float:
+    """Return exp(exponent); inf where that is no float."""
     return math.exp(exponent) if exponent < math.log(np.finfo(np.float64).max) else math.inf
 
 
-def describe_coverage(ess: FloatArray) -> tuple[str, ...]:
+def _describe_coverage(ess: FloatArray) -> tuple[str, ...]:
     """Return a warning if more than a tenth of the refits rest on under 10 effective failing points (R,)."""
     few = count_uncovered(ess)
-    if few <= MAX_UNCOVERED_SHARE * len(ess):
-        return ()
-    return (f"{few} of {len(ess)} refits rest on under 10 effective failing points: the spread is coarse.",)
+    text = f"{few} of {len(ess)} refits rest on under 10 effective failing points: the spread is coarse."
+    return (text,) if few else ()
 
 
 def read_lineages(estimate: EstimateData) -> float:
     """Return the independent searches that reached failure behind an estimate; inf without a search or points."""
     return math.inf if estimate.sample is None else estimate.sample.lineages
-
-
-def _lower_factor(estimate: EstimateData) -> float:
-    """Return the share of p from points that have an outcome where the others only bound p; else 1."""
-    sample = require_sample(estimate)
-    return 1 - no_outcome_weight(estimate, sample) / float(sample.weights[sample.f <= estimate.gamma].sum())
-
-
-RATIO_CHECK_DRAWS = 16
-"""Draws at which the refits of two estimates are compared."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class RatioUncertainty:
-    """What is known of the ratio of two probabilities, given the events that their base distribution was fitted to.
-
-    Example:
-        >>> found = RatioUncertainty(
-        ...     ratio=1.8, interval=(1.1, 2.9), spread=0.15, confidence=0.95, ratio_refits=(1.7, 1.9, 2.1),
-        ...     ess_refits=(150.0, 200.0, 90.0), clusters=17, fitted_to="38 + 15 events of 17 scenes",
-        ...     family="1 component, log gaps")
-        >>> print(found)
-        base distribution 95 %  1.1 to 2.9 (38 + 15 events of 17 scenes, 3 refits)
-          assumes that the fitted family is correct (1 component, log gaps); errors of the family are not included
-    """
-
-    ratio: float
-    """p_1 / p_2 under the base distribution itself."""
-    interval: Interval | None
-    """Interval that should hold the ratio under the true distribution with probability `confidence`, if that is of
-    the fitted family; None where the events do not determine it, or it is not known under the refits."""
-    spread: float
-    """Standard deviation of the logarithm of the ratio over the refits; NaN where it is not known."""
-    confidence: float
-    """Nominal coverage of `interval`."""
-    ratio_refits: tuple[float, ...]
-    """The ratio under each refit; empty where it is not known."""
-    ess_refits: tuple[float, ...]
-    """Effective number of failing points behind each of these, of the one of the two that has fewer."""
-    clusters: int
-    """Independent clusters among the events."""
-    fitted_to: str
-    """The events in words."""
-    family: str
-    """The family of distributions in words."""
-    n_sim: int = 0
-    """Simulations of further runs under the mixture of the refits; 0 where none was needed."""
-    reason: str = ""
-    """Why there is no interval; empty if there is one."""
-    warnings: tuple[str, ...] = ()
-    """What makes these numbers doubtful."""
-
-    def __str__(self) -> str:
-        """Return a few lines for people."""
-        if self.interval is None:
-            return f"base distribution  no interval: {self.reason}"
-        low, high = self.interval
-        lines = [
-            f"base distribution {100 * self.confidence:g} %  {low:.2g} to {high:.2g} "
-            f"({self.fitted_to}, {len(self.ratio_refits)} refits)",
-            f"  assumes that the fitted family is correct ({self.family}); errors of the family are not included",
-        ]
-        if self.n_sim:
-            lines.append(f"  under the refits from a further {self.n_sim:,} simulations under their mixture")
-        return "\n".join(lines + [f"  warning: {text}" for text in self.warnings])
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return plain numbers for JSON; NaN and infinities become None."""
-        return {name: to_json_value(value) for name, value in asdict(self).items()}
 
 
 def compute_ratio_uncertainty(first: EstimateData, second: EstimateData) -> RatioUncertainty:
@@ -347,14 +324,13 @@ def compute_ratio_uncertainty(first: EstimateData, second: EstimateData) -> Rati
             "one confidence=..."
         )
     one, two = (reweight_runs_to_refits(each, base.refits) for each, base in zip((first, second), bases, strict=True))
-    further = [each.ensemble_run for each in (first, second) if each.ensemble_run is not None]
     return summarise_ratio(
         first.p / second.p,
         math.hypot(first.cov, second.cov),
         RefitSums(np.concatenate([one.log_p, two.log_p]), np.concatenate([one.ess, two.ess])),
         bases[0],
         first.confidence,
-        sum(run.n_sim for run in further),
+        sum(each.ensemble_run.n_sim for each in (first, second) if each.ensemble_run is not None),
     )
 
 
@@ -367,45 +343,36 @@ def summarise_ratio(
     n_sim: int = 0,
     sampling: Interval | None = None,
 ) -> RatioUncertainty:
-    """Return the uncertainty of a ratio.
+    """Return the uncertainty of a ratio whose logarithm has the standard error `cov`.
 
-    Args:
-        ratio: p_1 / p_2 under the base distribution itself.
-        cov: Standard error of its logarithm.
-        sums: The two probabilities under R refits, shape (2, R); None where one of them is 0 in the run itself.
-        fitted: The base distribution.
-        confidence: Nominal coverage.
-        n_sim: Simulations of further runs.
-        sampling: Interval of the sampling alone, which the interval is to hold; None where it need not.
+    `sums` has the two probabilities under R refits, shape (2, R); None where one of them is 0 in the run itself.
     """
     log_ratios, ess, reason = np.empty(0), np.empty(0), "one of the two never failed."
     if sums is not None:
         known = np.isfinite(sums.log_p).all(axis=0)
         log_ratios = np.where(known, np.subtract(*np.where(known, sums.log_p, 0.0)), -np.inf)
         ess = sums.ess.min(axis=0)
-        reason = explain_missing_spread(log_ratios, fitted.clusters)
-    spread = math.nan if reason else float(log_ratios.std(ddof=1))
-    interval = None
-    if spread > MAX_SPREAD:
-        reason = f"the events do not determine the ratio: the spread of its logarithm is {spread:.1f}."
-    elif not reason:
-        families = split_families(math.log(ratio), log_ratios, read_refit_families(fitted, len(log_ratios)))
-        ends = find_log_ends(families, cov**2 + FIT_BIAS**2, confidence, fitted.clusters)
-        low, high = (scale_by_exp(1.0, end) for end in ends)
-        interval = (low, high) if sampling is None else (min(low, sampling[0]), max(high, sampling[1]))
+        reason = _explain_missing_spread(log_ratios, fitted.clusters)
+    interval, spread = None, math.nan
+    if not reason:
+        spread, _, ends = _spread_to_ends(ratio, log_ratios, cov, confidence, fitted)
+        if spread > MAX_SPREAD:
+            reason = f"the events do not determine the ratio: the spread of its logarithm is {spread:.1f}."
+        else:
+            interval = _hold(ends, sampling)
     return RatioUncertainty(
         ratio=ratio,
         interval=interval,
         spread=spread,
         confidence=confidence,
-        ratio_refits=tuple(scale_by_exp(1.0, float(each)) for each in log_ratios),
+        ratio_refits=tuple(_exp(float(each)) for each in log_ratios),
         ess_refits=tuple(float(each) for each in ess),
         clusters=fitted.clusters,
         fitted_to=fitted.fitted_to,
         family=fitted.family,
         n_sim=n_sim,
         reason=reason,
-        warnings=describe_coverage(ess),
+        warnings=_describe_coverage(ess),
     )
 
 
@@ -436,7 +403,7 @@ def _require_same_refits(first: EstimateData, second: EstimateData) -> tuple[Fit
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class RefitBand:
+class RefitBand(Reported):
     """Band of an exceedance curve that the events behind a fitted base allow, for all thresholds together.
 
     Fields of shape (k,) belong to the thresholds of the curve.
@@ -464,11 +431,6 @@ class RefitBand:
     family: str
     """The family of distributions in words."""
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return plain lists and numbers for JSON; NaN becomes None."""
-        values = asdict(self)
-        return {name: to_json_value(v.tolist() if isinstance(v, np.ndarray) else v) for name, v in values.items()}
-
 
 def compute_refit_band(
     thresholds: FloatArray,
@@ -482,20 +444,12 @@ def compute_refit_band(
     seed: int,
     lineages: float = math.inf,
 ) -> RefitBand:
-    """Return the band for probabilities P[failure and v > t] at k thresholds t.
+    """Return the band for probabilities P[failure and v > t] at k thresholds t (k,), in any order.
 
-    Args:
-        thresholds: t in any order, shape (k,).
-        p: Under the base itself, shape (k,); 0 where it is not known.
-        cov: Their coefficients of variation, shape (k,).
-        correlation: Of their sampling errors, shape (k, k).
-        sums: The same under R refits, k parts.
-        fitted: The base.
-        confidence: Nominal coverage of the band.
-        seed: Of the run.
-        lineages: Independent searches behind p, see `Sample.lineages`.
+    p (k,) is under the base itself, 0 where it is not known, with its c.o.v. (k,) and the correlation (k, k) of the
+    sampling errors; `sums` has the same under R refits. As the curve falls, so do both ends.
     """
-    known = [i for i in range(len(p)) if p[i] > 0 and not explain_missing_spread(sums.log_p[i], fitted.clusters)]
+    known = [i for i in range(len(p)) if p[i] > 0 and not _explain_missing_spread(sums.log_p[i], fitted.clusters)]
     low, high, spread = np.zeros(len(p)), np.ones(len(p)), np.full(len(p), np.nan)
     if known:
         errors = _correlate_errors(cov[known], correlation[np.ix_(known, known)], sums.log_p[known], fitted)

@@ -103,11 +103,7 @@ class ProbabilityCurve:
         return self.to_arrow().to_pandas()
 
     def save(self, path: str | PathLike[str]) -> None:
-        """Write the curve to a file that `load` reads, of the format safetensors.
-
-        Raises:
-            OSError: If it cannot be written.
-        """
+        """Write the curve to a file that `load` reads, of the format safetensors."""
         write_object(path, self)
 
     @classmethod
@@ -194,17 +190,14 @@ def compute_curve(estimate: EstimateData, gammas: ArrayLike) -> Curve:
 
     The units of replicates are taken together: with 2 or 3 runs the band can be narrower at gamma
     than the t interval of their mean.
-
-    Raises:
-        ValueError: As described in `Estimate.curve`.
     """
     sample = require_sample(estimate)
     asked = as_thresholds(gammas)
-    check_known(sample, estimate.gamma, asked)
+    _check_known(sample, estimate.gamma, asked)
     grid, place = np.unique(np.append(asked, estimate.gamma), return_inverse=True)
     sums, at_gamma = unit_sums(sample, grid), int(place[-1])
     use = np.unique(place[:-1])
-    p = anchor_at_estimate(estimate, sums.p, at_gamma)
+    p = _anchor_at_estimate(estimate, sums.p, at_gamma)
     cov = np.where(sums.is_count, 1.0, cov_inflation(estimate, float(sums.cov[at_gamma]))) * sums.cov
     low, high = simultaneous_intervals(sums, use, p, cov, estimate.confidence, estimate.seed)
     low[use] = np.maximum.accumulate(low[use] * (1 - no_outcome_weight(estimate, sample) / sums.p[use]))
@@ -235,7 +228,7 @@ def as_thresholds(gammas: ArrayLike) -> FloatArray:
     return values
 
 
-def check_known(sample: Sample, gamma: float, gammas: FloatArray) -> None:
+def _check_known(sample: Sample, gamma: float, gammas: FloatArray) -> None:
     """Raise a ValueError if a threshold lies below the smallest one that the sample can estimate."""
     start = lowest_known_threshold(sample, gamma)
     lowest = float(gammas.min())
@@ -266,7 +259,7 @@ def lowest_known_threshold(sample: Sample, gamma: float) -> float:
     return min(start, gamma) if (sample.weights[sample.f <= gamma] > 0).any() else start
 
 
-def anchor_at_estimate(estimate: EstimateData, sums: FloatArray, at_gamma: int) -> FloatArray:
+def _anchor_at_estimate(estimate: EstimateData, sums: FloatArray, at_gamma: int) -> FloatArray:
     """Return the sums (G,) at rising thresholds, moved so that they equal the estimate at gamma, and cut at 1."""
     own = float(sums[at_gamma])
     if own == 0 or math.isclose(own, estimate.p, rel_tol=1e-9):

@@ -2,19 +2,26 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass, replace
 from os import PathLike
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from samplers.analysis.base_error import BaseUncertainty, RefitBand, compute_refit_band, read_lineages, summarise_refits
+from samplers.analysis.base_error import (
+    NO_SUMS,
+    BaseUncertainty,
+    RefitBand,
+    compute_refit_band,
+    read_lineages,
+    summarise_refits,
+)
 from samplers.analysis.curve import ProbabilityCurve, as_thresholds
-from samplers.analysis.refits import FittedBase, RefitSums, choose_better_run, find_fitted_base, reweight_to_refits
+from samplers.analysis.reweight import FittedBase, RefitSums, choose_better_run, find_fitted_base, reweight_to_refits
 from samplers.analysis.weighted import (
     MIN_UNITS,
-    UnitSums,
+    Reported,
     WeightedFailures,
     interval_of_sum,
     require_sample,
@@ -22,14 +29,20 @@ from samplers.analysis.weighted import (
     unit_sums,
 )
 from samplers.method import EstimateData
-from samplers.output import drawing_axes, to_json_value
+from samplers.output import drawing_axes
 from samplers.problem import FloatArray
 from samplers.sample import Sample
 from samplers.statistics import Interval, effective_number
 
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+NOWHERE = 1e308
+"""Stands for the f of points that exceed no threshold: above all thresholds, and finite."""
+
 
 @dataclass(frozen=True, kw_only=True)
-class FailureExpectation:
+class FailureExpectation(Reported):
     """E[h(X); failure], the expectation of a quantity h >= 0 that is 0 where nothing fails.
 
     Example:
@@ -51,23 +64,14 @@ class FailureExpectation:
     per_failure: float
     """E[h(X) | failure]."""
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return plain numbers for JSON."""
-        return {name: to_json_value(value) for name, value in asdict(self).items()}
-
 
 def expect_over_failures(
     failures: WeightedFailures, values: FloatArray, confidence: float = 0.95
 ) -> FailureExpectation:
     """Return E[h(X); failure] = sum of w h, with a log-normal interval from the spread over independent units.
 
-    Args:
-        failures: Weighted failing points.
-        values: h >= 0 at these points, shape (k,).
-        confidence: Nominal coverage of the interval.
-
-    Raises:
-        ValueError: If h is not one finite number >= 0 per point, or 0 at all of them.
+    `values` are h >= 0 at the failing points, shape (k,); a ValueError says that h is not one finite number >= 0 per
+    point, or 0 at all of them.
 
     Example:
         h = 1, 1, 3, 3 at 4 failures among 400 plain draws: (1 + 1 + 3 + 3) / 400.
@@ -159,9 +163,9 @@ def expect_under_refits(
         return None
     largest = max(float(np.max(values)), 0.0 if further is None else float(np.max(further.values)))
     more = None if further is None else (further.failures, further.values[None] / largest)
-    sums, reason = RefitSums(np.empty((1, 0)), np.empty((1, 0))), ""
+    sums, reason = NO_SUMS, ""
     try:
-        sums = sum_parts_under_refits(estimate, fitted, (failures, values[None] / largest), more)
+        sums = _sum_parts_under_refits(estimate, fitted, (failures, values[None] / largest), more)
     except ValueError as error:
         reason = str(error)
     return summarise_refits(
@@ -178,7 +182,7 @@ def expect_under_refits(
     )
 
 
-def sum_parts_under_refits(
+def _sum_parts_under_refits(
     estimate: EstimateData,
     fitted: FittedBase,
     own: tuple[WeightedFailures, FloatArray],
@@ -186,14 +190,8 @@ def sum_parts_under_refits(
 ) -> RefitSums:
     """Return m parts of p under R refits, each from the run or its further run, whichever has more points for it.
 
-    Args:
-        estimate: The run.
-        fitted: Its base.
-        own: Its weighted failing points and what share of each belongs to each part, shape (m, k).
-        further: The same of its `ensemble_run`.
-
-    Raises:
-        ValueError: If nothing failed, or a density is not finite.
+    `own` has the weighted failing points of the run and what share of each belongs to each part, shape (m, k),
+    `further` those of its `ensemble_run`.
     """
     found = [reweight_to_refits(estimate, fitted.refits, _spread_over_all(estimate, *own))]
     run = estimate.ensemble_run
@@ -209,12 +207,6 @@ def _spread_over_all(estimate: EstimateData, failures: WeightedFailures, shares:
     parts = np.zeros((len(shares), failures.total))
     parts[:, failures.rows] = shares * (weights.sum() / weights[failures.rows].sum())
     return parts
-
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-NOWHERE = 1e308
-"""Stands for the f of points that exceed no threshold: above all thresholds, and finite."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -288,9 +280,6 @@ def compute_exceedance(
         thresholds: Thresholds t, in any order.
         further: Failing points of the run's `ensemble_run` with v, if it has one; they count for the refits alone.
 
-    Raises:
-        ValueError: If v is not one number per point, or a threshold is not finite.
-
     Example:
         v = x_1 where x_2 > 0, in plain draws from N(0, I): Phi(-1) / 2 = 0.079 and Phi(-2) / 2 = 0.011.
 
@@ -309,7 +298,9 @@ def compute_exceedance(
     asked = as_thresholds(thresholds)
     below = np.nextafter(-asked, -np.inf)  # -v <= below says v > t
     grid, place = np.unique(np.append(below, NOWHERE), return_inverse=True)
-    sums = _sum_by_threshold(failures, np.where(np.isneginf(v), NOWHERE, -v), grid)
+    f = np.where(np.isneginf(v), NOWHERE, -v)
+    sample = Sample(f=f, weights=failures.weights, units=failures.units, n_units=failures.n_units, x=failures.x)
+    sums = replace(unit_sums(sample, grid), independent=failures.independent)
     cov = np.where(sums.is_count, 1.0, failures.inflation) * sums.cov
     use = np.flatnonzero(sums.ess >= MIN_UNITS)
     low, high = simultaneous_intervals(sums, use, sums.p, cov, estimate.confidence, estimate.seed)
@@ -328,13 +319,6 @@ def compute_exceedance(
         confidence=estimate.confidence,
         base=_band_under_refits(estimate, (failures, v), further, asked, sampling),
     )
-
-
-def _sum_by_threshold(failures: WeightedFailures, f: FloatArray, grid: FloatArray) -> UnitSums:
-    """Return the sums of the weights of points with f (k,) up to each of rising thresholds."""
-    sample = Sample(f=f, weights=failures.weights, units=failures.units, n_units=failures.n_units, x=failures.x)
-    sums = unit_sums(sample, grid)
-    return UnitSums(p=sums.p, second=sums.second, n_units=sums.n_units, independent=failures.independent)
 
 
 def _band_under_refits(
@@ -358,7 +342,7 @@ def _band_under_refits(
     ]
     assert beyond[0] is not None
     try:
-        sums = sum_parts_under_refits(estimate, fitted, beyond[0], beyond[1])
+        sums = _sum_parts_under_refits(estimate, fitted, beyond[0], beyond[1])
     except ValueError:  # p itself is not known under the refits, as `BaseUncertainty` says
         return None
     band = compute_refit_band(

@@ -25,12 +25,12 @@ The pilot knows its own c.o.v. to a few ten per cent, and another seed finds ano
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any, Literal
 
 from samplers.analysis.base_error import BaseUncertainty
+from samplers.analysis.weighted import Reported
 from samplers.method import EstimateData
-from samplers.output import to_json_value
 from samplers.sample import Status
 from samplers.statistics import Interval, zero_hit_bound
 from samplers.validation import check_number
@@ -39,7 +39,7 @@ Decision = Literal["passes", "fails", "undecided"]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Verdict:
+class Verdict(Reported):
     """Whether P[f(X) <= gamma] is below a limit.
 
     It passes if the upper end is below the limit, fails if the lower end is above it, and is undecided otherwise, or
@@ -90,15 +90,11 @@ class Verdict:
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain values for JSON."""
-        return {**{name: to_json_value(value) for name, value in asdict(self).items()}, "text": str(self)}
+        return {**super().to_dict(), "text": str(self)}
 
 
 def judge_estimate(estimate: EstimateData, max_p: float, base: BaseUncertainty | None) -> Verdict:
-    """Return whether p is below a limit, under the uncertainty of a fitted base where it is given.
-
-    Raises:
-        ValueError: The limit is no such number.
-    """
+    """Return whether p is below a limit, under the uncertainty of a fitted base where it is given."""
     if not (isinstance(max_p, int | float) and 0.0 < max_p < 1.0):
         raise ValueError(f"Expected max_p above 0 and below 1, got {max_p!r}.")
     confidence = round(0.5 + estimate.confidence / 2, 12)
@@ -176,7 +172,7 @@ class Pilot:
 
 
 @dataclass(frozen=True, kw_only=True)
-class PlannedRun:
+class PlannedRun(Reported):
     """Simulations that a method needs for a coefficient of variation.
 
     Example:
@@ -192,10 +188,6 @@ class PlannedRun:
     """Simulations, those of a search included."""
     seconds: float | None = None
     """Wall time [s], if the pilot's is known."""
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return plain values for JSON."""
-        return {name: to_json_value(value) for name, value in asdict(self).items()}
 
 
 def plan_runs(pilot: Pilot, target_cov: float) -> tuple[PlannedRun, ...]:
@@ -214,18 +206,15 @@ def plan_runs(pilot: Pilot, target_cov: float) -> tuple[PlannedRun, ...]:
         [('two-stage', 12000, 24.0), ('mc', 99990000, 199980.0)]
     """
     check_number("target_cov", target_cov, 0.0, math.inf)
-    needed = {pilot.method: _own_cost(pilot, target_cov), "mc": (1.0 - pilot.p) / (pilot.p * target_cov**2)}
+    factor = (pilot.cov / target_cov) ** 2
+    if pilot.final_draws is not None:
+        own = pilot.n_sim - pilot.final_draws + pilot.final_draws * factor
+    else:
+        own = float(pilot.n_sim) * (1.0 if factor <= 1.0 else max(MIN_RUNS, math.ceil(factor)))
+    needed = {pilot.method: own, "mc": (1.0 - pilot.p) / (pilot.p * target_cov**2)}
     rate = None if pilot.seconds is None else pilot.seconds / pilot.n_sim
     counts = {name: max(1, math.ceil(n * (1.0 - 1e-12))) for name, n in needed.items()}  # rounding of the division
     return tuple(
         PlannedRun(method=name, target_cov=float(target_cov), n_sim=n, seconds=None if rate is None else rate * n)
         for name, n in counts.items()
     )
-
-
-def _own_cost(pilot: Pilot, target_cov: float) -> float:
-    """Return the simulations of the pilot's own method."""
-    factor = (pilot.cov / target_cov) ** 2
-    if pilot.final_draws is not None:
-        return pilot.n_sim - pilot.final_draws + pilot.final_draws * factor
-    return float(pilot.n_sim) * (1.0 if factor <= 1.0 else max(MIN_RUNS, math.ceil(factor)))

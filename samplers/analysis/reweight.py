@@ -1,17 +1,41 @@
-"""Reweighting: the probability of failure under another base distribution, from the same simulations."""
+"""Reweighting: p under another base distribution, and under the refits of a fitted one, from the same simulations.
+
+A base distribution that was fitted to events has an error of its own. Its refits are the same recipe applied to
+resampled events (whole clusters of them, where events come in clusters): the spread of p over the refits is the
+spread that p owes to the events.
+
+Refits may choose the family of distributions anew, and those of one family spread around a value of their own. One
+standard deviation over all would take the distance between two families for a spread to both sides: where some refits
+lie far below p, the upper end would rise as well. So each family has an interval around its own centre, and the whole
+reaches from the lowest end to the highest; what is expected for the next event is the sum of what each family expects,
+by its share of the refits.
+"""
+
+from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass
-from typing import Any, Protocol, runtime_checkable
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple, Protocol, runtime_checkable
+from weakref import WeakKeyDictionary
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.special import stdtrit
 
-from samplers.analysis.weighted import MIN_UNITS, cov_inflation, has_independent_points, interval_of_sum, require_sample
+from samplers.analysis.weighted import (
+    MIN_UNITS,
+    Reported,
+    cov_inflation,
+    has_independent_points,
+    interval_of_sum,
+    require_sample,
+)
 from samplers.distributions import as_distribution, can_convert
 from samplers.method import EstimateData
-from samplers.output import to_json_value
 from samplers.problem import Distribution, FloatArray
-from samplers.statistics import Interval, add_unseen, effective_number
+from samplers.sample import Sample
+from samplers.statistics import Interval, add_unseen, effective_number, raise_log_end
 
 MIN_POINTS = 30.0
 """Effective number of failing points that the estimate must rest on."""
@@ -19,6 +43,19 @@ MAX_LOG = 600.0
 """exp of this, or of its negative, is still a float."""
 SUPPORT_DRAWS = 10_000
 """Draws from the new base that are checked for a density of 0 under the old one."""
+MIN_REFIT_ESS = 10.0
+"""Effective failing points from which p under a refit has an error of about 0.3 in its logarithm: little beside the
+usual spread of the refits, 0.7 to 1.5."""
+MIN_OWN_ESS = 30.0
+"""Effective failing points under the own base from which a lack of points is the refits' and not that of the budget."""
+MAX_UNCOVERED_SHARE = 0.1
+"""Share of the refits that may rest on fewer points than that."""
+REFIT_CHECK_DRAWS = 100
+"""Draws on which a refit is compared with its base before the first simulation."""
+MIN_FAMILY_SHARE = 0.05
+"""Share of the refits from which a family has an interval of its own: one that fewer choose is not plausible."""
+MIN_FAMILY = 10
+"""Refits from which a family has a spread of its own; smaller families take the pooled one."""
 
 
 @runtime_checkable
@@ -42,15 +79,47 @@ class HasSiblings(Protocol):
     """A base distribution that knows others of the same X by name."""
 
     def sibling(self, name: str) -> HasLogProb:
-        """Return the base distribution with this name.
+        """Return the base distribution with this name; a ValueError if there is none."""
 
-        Raises:
-            ValueError: If there is none.
-        """
+
+@runtime_checkable
+class FittedBase(Distribution, Protocol):
+    """A base distribution that was fitted to events, with its bootstrap refits; without refits it is like any other.
+
+    With `ensemble()`, the mixture of the refits with equal weights (a ValueError where they cannot be mixed), it lets
+    `estimate` make a further run where the points of the first do not reach the refits; `covering_ensemble()` is the
+    mixture of a few of many refits that reach as far. `refits.log_probs(x)` may give the log densities of all R refits
+    at x (k, d) at once, shape (R, k); `refit_families` the number of the family of each, 0 for that of the base.
+
+    Example:
+        >>> import samplers
+        >>> from samplers.proposals import Gaussian
+        >>> class FittedNormal(samplers.StandardNormal):
+        ...     refits = [Gaussian(np.array([mean]), np.eye(1)) for mean in (-0.2, 0.0, 0.2)]
+        ...     clusters, fitted_to, family = 17, "40 events of 17 scenes", "normal"
+        >>> [isinstance(base, samplers.FittedBase) for base in (FittedNormal(1), samplers.StandardNormal(1))]
+        [True, False]
+    """
+
+    @property
+    def refits(self) -> Sequence[HasLogProb]:
+        """The same recipe applied to resampled events, R distributions on the same support."""
+
+    @property
+    def clusters(self) -> int:
+        """Number of independent clusters among the events; of events, where each is one."""
+
+    @property
+    def fitted_to(self) -> str:
+        """The events in words, such as "38 + 15 events of 17 scenes"."""
+
+    @property
+    def family(self) -> str:
+        """The family of distributions in words, such as "1 component, log gaps"."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Reweighted:
+class Reweighted(Reported):
     """P[f(X) <= gamma] with X from another base distribution.
 
     Example:
@@ -88,10 +157,6 @@ class Reweighted:
             f"effective sample size {self.ess:.0f} failing points, {self.units:.0f} independent units"
         )
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return plain numbers for JSON."""
-        return {name: to_json_value(value) for name, value in asdict(self).items()}
-
 
 def reweight_estimate(estimate: EstimateData, new_base: Any) -> Reweighted:
     """Return p under another base; see `Estimate.reweight`.
@@ -101,23 +166,24 @@ def reweight_estimate(estimate: EstimateData, new_base: Any) -> Reweighted:
     sample variance is too small most of the time. The interval is log-normal with the t
     quantile of the effective units. Where p rests on a search, the upper end holds the share that it may have missed,
     as that of the estimate does; its lineages count for less as the effective units become fewer.
-
-    Raises:
-        ValueError: As described in `Estimate.reweight`.
     """
     sample = require_sample(estimate)
     if can_convert(new_base) or isinstance(new_base, list | tuple):
         new_base = as_distribution(new_base, sample.x.shape[1])
     failing = sample.f <= estimate.gamma
     f, old, owners = sample.f[failing], sample.weights[failing], sample.units[failing]
-    log_ratios = log_density_ratios(estimate, new_base, sample.x)
+    log_ratios = _log_density_ratios(estimate, new_base, sample.x)
     highest = float(log_ratios.max())
     largest = highest if math.isfinite(highest) else 0.0  # taken out, so that nothing overflows
     terms = old * np.exp(log_ratios - largest)
     totals = np.bincount(owners, weights=terms, minlength=1).astype(np.float64)
-    ess, units = effective_number(terms), effective_number(totals)
-    check_enough(estimate, ess, units)
-    total = float(terms.sum())
+    ess, units, total = effective_number(terms), effective_number(totals), float(terms.sum())
+    if ess < MIN_POINTS or units < MIN_UNITS:
+        raise ValueError(
+            f"Under the new base the failing points have an effective sample size of {ess:.1f}, from {units:.1f} "
+            f"independent units; at least {MIN_POINTS:g} and {MIN_UNITS:g} are needed. Estimate again with the new "
+            f"base, or start from a run with more failing points (it has {estimate.failures.total:,})."
+        )
     square = 1 / units - 1 / sample.n_units + (float(totals.max()) / total) ** 2
     old_units = effective_number(np.bincount(owners, weights=old).astype(np.float64))
     own = 1 / old_units - 1 / sample.n_units
@@ -140,19 +206,11 @@ def reweight_estimate(estimate: EstimateData, new_base: Any) -> Reweighted:
     )
 
 
-def log_density_ratios(estimate: EstimateData, new_base: HasLogProb, x: FloatArray) -> FloatArray:
-    """Return log(p1 / p0) at the failing points x (k, d), shape (k,).
-
-    Raises:
-        ValueError: If the estimate has no base or no failing point, the new base does not fit, or a density is not
-            finite.
-    """
-    base = require_base(estimate)
-    if len(x) == 0:
-        raise ValueError(f"No point failed (f <= {estimate.gamma:g}): there is nothing to reweight.")
-    check_dimensions_fit(new_base, x.shape[1])
-    check_support(base, new_base, x.shape[1], estimate.seed)
-    return subtract_log_densities(log_density(new_base, x), log_density(base, x), x)
+def find_sibling(base: object, name: str) -> HasLogProb:
+    """Return another base distribution of the same X by its name; a ValueError if there is none."""
+    if not isinstance(base, HasSiblings):
+        raise ValueError(f"This base distribution knows no others by name: give a distribution in place of {name!r}.")
+    return base.sibling(name)
 
 
 def require_base(estimate: EstimateData) -> Distribution:
@@ -165,17 +223,46 @@ def require_base(estimate: EstimateData) -> Distribution:
     return estimate.base
 
 
-def subtract_log_densities(new: FloatArray, old: FloatArray, x: FloatArray) -> FloatArray:
-    """Return log p1(x) - log p0(x), shape (k,), or (R, k) for R new bases.
+def log_density(distribution: HasLogProb, x: FloatArray) -> FloatArray:
+    """Return log_prob at x (k, d), shape (k,), or raise a ValueError if it is not one number per point."""
+    values = np.asarray(distribution.log_prob(x), dtype=np.float64)
+    if values.shape != (len(x),):
+        raise ValueError(f"Expected log_prob to give one number per point, shape ({len(x)},), got {values.shape}.")
+    return values
 
-    Args:
-        new: log p1 at x, shape (k,) or (R, k).
-        old: log p0 at x, shape (k,).
-        x: Points, shape (k, d).
 
-    Raises:
-        ValueError: If a density is not finite (p1 may be 0).
-    """
+def _log_density_ratios(estimate: EstimateData, new_base: HasLogProb, x: FloatArray) -> FloatArray:
+    """Return log(p1 / p0) at the failing points x (k, d), shape (k,), after all checks of the new base."""
+    base, dim = require_base(estimate), x.shape[1]
+    if len(x) == 0:
+        raise ValueError(f"No point failed (f <= {estimate.gamma:g}): there is nothing to reweight.")
+    _check_dimensions(new_base, dim)
+    if isinstance(new_base, CanSample):
+        draws = np.asarray(new_base.sample(SUPPORT_DRAWS, np.random.default_rng(estimate.seed)), dtype=np.float64)
+        if draws.shape != (SUPPORT_DRAWS, dim):
+            raise ValueError(
+                f"Expected a distribution in {dim} dimensions; {SUPPORT_DRAWS} draws of this have shape {draws.shape}."
+            )
+        outside = float(np.mean(np.isneginf(base.log_prob(draws))))
+        if outside > 0:
+            raise ValueError(
+                f"The old base has no density at {100 * outside:.2g} % of draws from the new one: failures there were "
+                "never drawn. Estimate again with the new base."
+            )
+    return _subtract_log_densities(log_density(new_base, x), log_density(base, x), x)
+
+
+def _check_dimensions(new_base: object, dim: int) -> None:
+    """Raise a ValueError unless the new base has a log_prob and, if it has an attribute dim, `dim` dimensions."""
+    if not isinstance(new_base, HasLogProb):
+        raise ValueError(f"Expected a distribution with log_prob, got {new_base!r}.")
+    own = getattr(new_base, "dim", dim)  # the user's own class
+    if own != dim:
+        raise ValueError(f"Expected a distribution in {dim} dimensions, got one in {own}.")
+
+
+def _subtract_log_densities(new: FloatArray, old: FloatArray, x: FloatArray) -> FloatArray:
+    """Return log p1 - log p0 at x (k, d), of p1 (k,) or (R, k) for R new bases and p0 (k,); p1 may be 0."""
     wrong = ~((new < np.inf) & np.isfinite(old))  # NaN is not below
     if wrong.any():
         place = np.unravel_index(int(np.argmax(wrong)), wrong.shape)
@@ -186,61 +273,244 @@ def subtract_log_densities(new: FloatArray, old: FloatArray, x: FloatArray) -> F
     return new - old
 
 
-def check_dimensions_fit(new_base: object, dim: int) -> None:
-    """Raise a ValueError unless the new base has a log_prob and, if it has an attribute dim, `dim` dimensions."""
-    if not isinstance(new_base, HasLogProb):
-        raise ValueError(f"Expected a distribution with log_prob, got {new_base!r}.")
-    own = getattr(new_base, "dim", dim)  # the user's own class
-    if own != dim:
-        raise ValueError(f"Expected a distribution in {dim} dimensions, got one in {own}.")
+class RefitSums(NamedTuple):
+    """Sums over the failing points under R refits, for m parts of p."""
+
+    log_p: FloatArray
+    """Logarithm of the probability, shape (m, R); -inf where a refit has no density at any failing point."""
+    ess: FloatArray
+    """Effective number of failing points behind it, shape (m, R); a path of a Markov chain counts as one."""
 
 
-def check_support(base: Distribution, new_base: HasLogProb, dim: int, seed: int) -> None:
-    """Raise a ValueError if the new base has `sample` and draws from it fall outside the old one."""
-    if not isinstance(new_base, CanSample):
-        return
-    x = np.asarray(new_base.sample(SUPPORT_DRAWS, np.random.default_rng(seed)), dtype=np.float64)
-    if x.shape != (SUPPORT_DRAWS, dim):
-        raise ValueError(
-            f"Expected a distribution in {dim} dimensions; {SUPPORT_DRAWS} draws of this have shape {x.shape}."
-        )
-    outside = float(np.mean(np.isneginf(base.log_prob(x))))
-    if outside > 0:
-        raise ValueError(
-            f"The old base has no density at {100 * outside:.2g} % of draws from the new one: failures there were "
-            "never drawn. Estimate again with the new base."
-        )
+def find_fitted_base(base: object) -> FittedBase | None:
+    """Return the base if it has refits; None for any other."""
+    return base if isinstance(base, FittedBase) and len(base.refits) > 0 else None
 
 
-def log_density(distribution: HasLogProb, x: FloatArray) -> FloatArray:
-    """Return log_prob at x (k, d), shape (k,).
+_checked: WeakKeyDictionary[object, tuple[object, ...]] = WeakKeyDictionary()
+"""Bases to the refits and the dimension that were found to fit them; a check takes as long as a thousand rollouts."""
 
-    Raises:
-        ValueError: If it is not one number per point.
+
+def check_refits(base: Distribution, dim: int) -> None:
+    """Raise a ValueError if a refit of a base has other dimensions or another support, or no density.
+
+    A base that can be a key by its identity is checked once.
     """
-    values = np.asarray(distribution.log_prob(x), dtype=np.float64)
-    if values.shape != (len(x),):
-        raise ValueError(f"Expected log_prob to give one number per point, shape ({len(x)},), got {values.shape}.")
-    return values
-
-
-def check_enough(estimate: EstimateData, ess: float, units: float) -> None:
-    """Raise a ValueError where too few points or units carry the new estimate."""
-    if ess >= MIN_POINTS and units >= MIN_UNITS:
+    fitted = find_fitted_base(base)
+    if fitted is None:
         return
-    raise ValueError(
-        f"Under the new base the failing points have an effective sample size of {ess:.1f}, from {units:.1f} "
-        f"independent units; at least {MIN_POINTS:g} and {MIN_UNITS:g} are needed. Estimate again with the new base, "
-        f"or start from a run with more failing points (it has {estimate.failures.total:,})."
-    )
+    known = (dim, *map(id, fitted.refits))
+    remembered = type(base).__hash__ is object.__hash__ and getattr(type(base), "__weakrefoffset__", 0) != 0
+    if remembered and _checked.get(fitted) == known:
+        return
+    x = fitted.sample(REFIT_CHECK_DRAWS, np.random.default_rng(0))
+    for number, refit in enumerate(fitted.refits, start=1):
+        try:
+            _check_dimensions(refit, dim)
+            inside = np.isfinite(log_density(refit, x)).all()
+            if isinstance(refit, CanSample):
+                draws = np.asarray(refit.sample(REFIT_CHECK_DRAWS, np.random.default_rng(0)))
+                inside &= np.isfinite(log_density(fitted, draws)).all()
+        except ValueError as error:
+            raise ValueError(
+                f"Refit {number} of {len(fitted.refits)} does not fit its base distribution: {error}"
+            ) from error
+        if not inside:
+            raise ValueError(
+                f"Refit {number} of {len(fitted.refits)} has another support than its base distribution: some draws "
+                "from the one have no finite density under the other."
+            )
+    if remembered:
+        _checked[fitted] = known
 
 
-def find_sibling(base: object, name: str) -> HasLogProb:
-    """Return another base distribution of the same X by its name.
+def refit_log_ratios(estimate: EstimateData, sample: Sample, refits: Sequence[HasLogProb]) -> FloatArray:
+    """Return log(refit_b(x_i) / base(x_i)) at the failing points, shape (R, k); computed once for an estimate."""
+    base, x = require_base(estimate), sample.x
+    of = (sample, base, refits)
+    for kept, ratios in estimate.refit_ratios:
+        if all(a is b for a, b in zip(kept, of, strict=True)):
+            return ratios
+    old = log_density(base, x)
+    if hasattr(refits, "log_probs"):  # a user's sequence
+        new = np.asarray(refits.log_probs(x))
+    else:
+        new = np.array([log_density(refit, x) for refit in refits], dtype=np.float64).reshape(len(refits), len(x))
+    estimate.refit_ratios[:] = [(of, _subtract_log_densities(new, old, x))]
+    return estimate.refit_ratios[0][1]
 
-    Raises:
-        ValueError: If the base knows no others, or none of that name.
+
+def reweight_to_refits(
+    estimate: EstimateData, refits: Sequence[HasLogProb], parts: FloatArray | None = None
+) -> RefitSums:
+    """Return p under each of R refits, p_b = sum of w_i refit_b(x_i) / base(x_i) over the failing points.
+
+    As `Estimate.reweight`, without its refusal: refits on few points are counted by the caller, since leaving them out
+    would narrow the spread. `parts` (m, k) says what share of each failing point belongs to parts of p; None for p
+    itself. A ValueError says that there are no weighted points, none failed, or a density is not finite.
     """
-    if not isinstance(base, HasSiblings):
-        raise ValueError(f"This base distribution knows no others by name: give a distribution in place of {name!r}.")
-    return base.sibling(name)
+    sample = require_sample(estimate)
+    if len(sample.x) == 0 or estimate.p <= 0:
+        raise ValueError("nothing failed, so that p under the refits is not known.")
+    return _sum_parts(estimate, sample, refit_log_ratios(estimate, sample, refits), parts)
+
+
+def _sum_parts(estimate: EstimateData, sample: Sample, log_ratios: FloatArray, parts: FloatArray | None) -> RefitSums:
+    """Return the sums over the failing points from the density ratios there, shape (R, k)."""
+    failing = sample.f <= estimate.gamma
+    weights = sample.weights[failing]
+    parts = np.ones((1, len(weights))) if parts is None else parts
+    units = np.unique(sample.units[failing], return_inverse=True)[1]
+    with np.errstate(divide="ignore"):  # weights and parts of 0
+        log_weights = np.log(parts * weights)
+    scale = np.log(estimate.p) - np.log(weights.sum())
+    sums = [[_sum_logarithms(row + ratios, units) for row in log_weights] for ratios in log_ratios]
+    log_p, ess = np.asarray(sums, dtype=np.float64).reshape(len(log_ratios), len(log_weights), 2).transpose(2, 1, 0)
+    return RefitSums(np.minimum(log_p + scale, 0.0), ess)
+
+
+def _sum_logarithms(log_terms: FloatArray, units: NDArray[np.intp]) -> tuple[float, float]:
+    """Return the logarithm of the sum of terms (k,) given as logarithms, and the effective number of units in it."""
+    highest = float(log_terms.max())
+    if not np.isfinite(highest):
+        return -np.inf, 0.0
+    totals = np.bincount(units, weights=np.exp(log_terms - highest)).astype(np.float64)
+    return highest + float(np.log(totals.sum())), effective_number(totals)
+
+
+def reweight_runs_to_refits(
+    estimate: EstimateData, refits: Sequence[HasLogProb], split: Callable[[FloatArray], FloatArray] | None = None
+) -> RefitSums:
+    """Return p under each refit from the run or its further run, whichever has more effective points under that refit.
+
+    The mixture of the refits has its failing points where the refits with the largest p have theirs: the others may
+    rest on fewer points than in the first run. `split` gives the parts of p at points, as in `reweight_to_refits`.
+    """
+    runs = [each for each in (estimate, estimate.ensemble_run) if each is not None and each.p > 0 and each.sample]
+    found = [
+        reweight_to_refits(run, refits, None if split is None else split(require_sample(run).x))
+        for run in runs or [estimate]
+    ]
+    return choose_better_run(found, [sums.ess.min(axis=0, keepdims=True) for sums in found])
+
+
+def choose_better_run(found: Sequence[RefitSums], points: Sequence[FloatArray] | None = None) -> RefitSums:
+    """Return for each refit the sums of that run which has most effective points.
+
+    These are those of each of m parts, or `points`, shape (m, R) or (1, R) for each run.
+    """
+    ess = np.stack([sums.ess for sums in found])
+    best = np.broadcast_to(np.argmax(ess if points is None else np.stack(points), axis=0), ess.shape[1:])[None]
+    log_p = np.take_along_axis(np.stack([sums.log_p for sums in found]), best, axis=0)[0]
+    return RefitSums(log_p, np.take_along_axis(ess, best, axis=0)[0])
+
+
+def count_uncovered(ess: FloatArray) -> int:
+    """Return how many of R refits rest on too few effective failing points, ess (R,); 0 where no more than a tenth."""
+    few = int(np.count_nonzero(ess < MIN_REFIT_ESS))
+    return few if few > MAX_UNCOVERED_SHARE * len(ess) else 0
+
+
+def pool_refits(base: Any) -> Distribution:
+    """Return the mixture of refits that a further run simulates under; a ValueError where the base cannot mix them."""
+    mix = base.covering_ensemble if hasattr(base, "covering_ensemble") else base.ensemble
+    mixture: Distribution = mix()
+    return mixture
+
+
+def needs_ensemble_run(estimate: EstimateData, split: Callable[[FloatArray], FloatArray] | None = None) -> bool:
+    """Return whether a further run under the mixture of the refits would tell p, or a part of it, under them.
+
+    It would where more than a tenth of the refits rest on under 10 effective failing points, or one of them on none.
+    False where the base has no refits or no `ensemble`, or where the run, or a part of it, has few effective failing
+    points under its own base: another of that size would have as few.
+    """
+    fitted, sample = find_fitted_base(estimate.base), estimate.sample
+    if fitted is None or not hasattr(fitted, "ensemble") or sample is None or len(sample.x) == 0 or estimate.p <= 0:
+        return False
+    try:
+        parts = None if split is None else split(sample.x)
+        if _sum_parts(estimate, sample, np.zeros((1, len(sample.x))), parts).ess.min() < MIN_OWN_ESS:
+            return False
+        sums = _sum_parts(estimate, sample, refit_log_ratios(estimate, sample, fitted.refits), parts)
+    except ValueError:  # no points to reweight: the mixture of the refits would not mend that
+        return False
+    return count_uncovered(sums.ess.min(axis=0)) > 0 or not np.isfinite(sums.log_p).all()
+
+
+class RefitFamily(NamedTuple):
+    """Refits of one family: log p is about normal around the centre."""
+
+    centre: float
+    """Of log p: that of the base distribution itself in its own family, the mean of the refits in another."""
+    variance: float
+    """Of log p over its refits; pooled over all families where it has few."""
+    freedom: int
+    """Degrees of freedom of `variance`: its refits less 1; of the pooled one all refits less the number of families."""
+    share: float
+    """Of the refits that are of this family; 0 for that of the base where no refit chose it."""
+
+
+def read_refit_families(fitted: object, n_refits: int) -> NDArray[np.int64]:
+    """Return the family of each refit, shape (n_refits,); all 0 where the base knows none, or each has one member.
+
+    Nothing tells a spread within a family from one between them where each has one member.
+    """
+    known = getattr(fitted, "refit_families", [0] * n_refits)  # a user's base
+    family_of = np.array(known, dtype=np.int64)
+    if family_of.shape != (n_refits,):
+        raise ValueError(f"Expected one family for each of {n_refits} refits, got {family_of.shape}.")
+    return np.zeros_like(family_of) if len(np.unique(family_of)) == n_refits else family_of
+
+
+def split_families(log_p: float, log_values: FloatArray, family_of: NDArray[np.int64]) -> tuple[RefitFamily, ...]:
+    """Return the families (R,) of R > 1 refits with log_values (R,), that of the base itself, with log_p, first."""
+    deviations, free = deviate_within_families(log_values[None], family_of)
+    pooled = float((deviations**2).sum() / free)
+    families = []
+    for name in sorted({0, *family_of.tolist()}):
+        own = log_values[family_of == name]
+        centre = log_p if name == 0 else float(own.mean())
+        variance, freedom = (float(own.var(ddof=1)), len(own) - 1) if len(own) >= MIN_FAMILY else (pooled, free)
+        families.append(RefitFamily(centre, variance, freedom, len(own) / len(log_values)))
+    return tuple(families)
+
+
+def deviate_within_families(log_values: FloatArray, family_of: NDArray[np.int64]) -> tuple[FloatArray, int]:
+    """Return deviations of values (k, R) from the mean of their family, shape (k, R), and their degrees of freedom."""
+    names, index = np.unique(family_of, return_inverse=True)
+    means = np.stack([log_values[:, index == i].mean(axis=1) for i in range(len(names))], axis=1)
+    return log_values - means[:, index], len(family_of) - len(names)
+
+
+def find_log_ends(
+    families: Sequence[RefitFamily], other_variance: float, confidence: float, clusters: int, lineages: float = math.inf
+) -> tuple[float, float]:
+    """Return the lowest and the highest end of log p over the families.
+
+    Each has the interval centre -+ t S; S^2 is its variance plus `other_variance`, t the quantile for its degrees of
+    freedom. The upper end holds the share of p in regions of failure that a search may have missed, which is missing
+    under all refits alike. Families that hardly any refits choose are left out, but not that of the base.
+    """
+    ends = []
+    for number, family in enumerate(families):
+        if number == 0 or family.share >= MIN_FAMILY_SHARE:
+            quantile = refit_quantile(confidence, family.freedom, clusters)
+            half = quantile * math.sqrt(family.variance + other_variance)
+            ends.append((family.centre - half, family.centre + raise_log_end(half, lineages, confidence)))
+    return min(low for low, _ in ends), max(high for _, high in ends)
+
+
+def refit_quantile(confidence: float, freedom: int, clusters: int) -> float:
+    """Return t, the quantile of Student's t for a variance over refits."""
+    return float(stdtrit(min(freedom, clusters - 1), 0.5 + confidence / 2))
+
+
+def expect_over_families(families: Sequence[RefitFamily], largest: float = 1.0) -> float:
+    """Return the expectation of p over families and their refits: the probability that the next event fails.
+
+    The sum of share exp(centre + variance / 2), the mean of a log-normal variable, over all families; none counts for
+    more than the largest value possible.
+    """
+    log_largest = math.log(largest)
+    return sum(each.share * math.exp(min(each.centre + each.variance / 2, log_largest)) for each in families)

@@ -1,9 +1,7 @@
 """Sensitivity: importance of each column of x, derivatives by parameters of the base, shares of the spread of refits.
 
-Importance of each column of x for failure: how far the failing points are from ordinary ones in its direction.
-
-The measure is the relative entropy of u_j given failure against its base distribution N(0, 1), in standard normal
-space, as a share of -log p:
+Importance of column j is the relative entropy of u_j given failure against N(0, 1), in standard normal space, as a
+share of -log p:
 
     I_j = D_j / (-log p),    D_j = KL(u_j | failure || N(0, 1)).
 
@@ -16,19 +14,16 @@ D_j is computed from mean m and variance s^2 of u_j given failure as (m^2 + s^2 
 given failure is normal, and else a lower bound, since of all distributions with these moments the normal has most
 entropy.
 
-Parameter scores: d log p / d theta for parameters theta of the base distribution, from failing points of a run.
-
-With p = E[1{f(X) <= gamma}] and X ~ p0(x; theta),
+For parameters theta of the base, p = E[1{f(X) <= gamma}] and X ~ p0(x; theta),
 
     d log p / d theta = E[d log p0(X; theta) / d theta | f(X) <= gamma],
 
 the score function averaged over the failures. The simulations do not depend on theta, so none is made. The score is
 the central difference of log_prob at the failing points.
 
-Spread shares: which parameters of a fitted base distribution the spread of log p over its refits comes from.
-
 To first order log p under refit b is log p + L_b, L_b = sum_i g_i delta_bi, with g_i = d log p / d theta_i and delta_bi
-the displacement of parameter i. Parameter i has the share cov(g_i delta_i, L) / var(L): all add up to 1.
+the displacement of parameter i. Parameter i has the share cov(g_i delta_i, L) / var(L) of the spread of log p over the
+refits: all add up to 1.
 
 References:
     Liu, Chen and Sudjianto, "Relative entropy based method for probabilistic sensitivity analysis in engineering
@@ -43,104 +38,37 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field, replace
 from os import PathLike
 from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 import numpy as np
 
-from samplers.analysis.refits import find_fitted_base, reweight_to_refits
-from samplers.analysis.reweight import HasLogProb, log_density, require_base
-from samplers.analysis.weighted import WeightedFailures, mean_over_failures, weigh_failures
+from samplers.analysis.reweight import HasLogProb, find_fitted_base, log_density, require_base, reweight_to_refits
+from samplers.analysis.weighted import Reported, WeightedFailures, weigh_failures
 from samplers.method import EstimateData
-from samplers.output import to_json_value
 from samplers.problem import Distribution, FloatArray
 from samplers.statistics import effective_number
 from samplers.validation import needs_library
 
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
 ROUNDING_VARIANCE = 1e-12
 """Of u_j given failure: below it points are equal but for rounding."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class ColumnImportance:
-    """Importance of one parameter of x, of one column or of a block of several."""
-
-    name: str
-    """Name of the parameter."""
-    importance: float
-    """D over -log p: the share of how rare failure is that the parameter has by itself, 0 to 1; the estimate from few
-    points, which may be beyond, is cut to that range."""
-    error: float
-    """Standard error of `importance`."""
-    direction: float
-    """Mean of u_j given failure, in standard deviations of ordinary values: negative where failures have small values;
-    the distance from 0 for a block of several columns."""
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return plain numbers for JSON."""
-        return {name: to_json_value(value) for name, value in asdict(self).items()}
-
-
-def rank_columns(
-    failures: WeightedFailures, base: Distribution, names: Sequence[str], sizes: Sequence[int]
-) -> tuple[ColumnImportance, ...]:
-    """Return the importance of each parameter of x, the most important first.
-
-    Raises:
-        ValueError: If a single point failed, which has no spread.
-    """
-    if np.count_nonzero(failures.weights) < 2:
-        raise ValueError("A single point failed: what p is sensitive to needs more of them; give more simulations.")
-    u = np.asarray(base.to_standard_normal(failures.x), dtype=np.float64)
-    entropy, influence, mean = relative_entropies(failures, u)
-    total = -math.log(float(failures.weights.sum()))
-    starts = np.cumsum([0, *sizes])
-    found = []
-    for name, first, last in zip(names, starts[:-1], starts[1:], strict=True):
-        part = slice(int(first), int(last))
-        error = float(mean_over_failures(failures, influence[:, part].sum(axis=1, keepdims=True))[1][0])
-        direction = float(mean[first]) if last - first == 1 else float(np.linalg.norm(mean[part]))
-        value = min(max(float(entropy[part].sum()) / total, 0.0), 1.0) if total > 0 else 0.0
-        found.append(
-            ColumnImportance(
-                name=name, importance=value, error=error / total if total > 0 else math.nan, direction=direction
-            )
-        )
-    return tuple(sorted(found, key=lambda each: -each.importance))
-
-
-def relative_entropies(failures: WeightedFailures, u: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return D_j of each column, its influence function at the points, and the mean of u_j given failure.
-
-    The estimate of D_j from n effective points is too large by 1 / n on average, which is taken off: the mean of u_j^2
-    has no bias, and that of -log(s^2) / 2 is 1 / n for normal u_j, whatever s^2.
-
-    Args:
-        failures: Weighted failing points, k of them.
-        u: The points in standard normal space, shape (k, d).
-
-    Returns:
-        D (d,), influence (k, d) and means (d,).
-    """
-    share = failures.weights / failures.weights.sum()
-    mean = share @ u
-    square = share @ u**2
-    variance = np.maximum(square - mean**2, ROUNDING_VARIANCE)
-    bias = 1 / count_effective_failures(failures)
-    entropy = (square - 1 - np.log(variance)) / 2 - bias
-    influence = (1 - 1 / variance) / 2 * (u**2 - square) + mean / variance * (u - mean)
-    return entropy, influence, mean
-
-
-def count_effective_failures(failures: WeightedFailures) -> float:
-    """Return the effective number of independent units among the failing points."""
-    return effective_number(failures.unit_totals(failures.weights))
-
-
 DIFFERENCE_STEP = 1e-4
 """Step of the central difference over the change for which a sensitivity is stated: its error is of order 1e-8 of the
 third derivative, and rounding of log_prob of order 1e-12."""
+MIN_ALIGNED_REFITS = 10
+"""Refits with the parameters of the base that shares of the spread must rest on."""
+JOINT_GROUP = "weights of components"
+"""Group of parameters that are about all columns."""
+MIN_CORRELATION = 0.8
+"""Correlation of log p to first order with log p over the refits below which no recording is recommended."""
+ENOUGH_POINTS = 30.0
+"""Effective failing points below which importance and derivatives are called not determined."""
+SHOWN_PARAMETERS = 12
+"""Rows of the table for people, and bars of the picture."""
 
 
 class BaseParameter(Protocol):
@@ -181,137 +109,20 @@ class ParametricBase(Protocol):
         """Return the same distribution with other values of the parameters, in the order of `parameters()`."""
 
 
-def parameter_scores(base: ParametricBase, x: FloatArray) -> FloatArray:
-    """Return the score function times the change of each parameter, d log p0(x; theta) / d theta x change.
+@dataclass(frozen=True, kw_only=True)
+class ColumnImportance(Reported):
+    """Importance of one parameter of x, of one column or of a block of several."""
 
-    Args:
-        base: Base distribution with m parameters.
-        x: Points, shape (k, d).
-
-    Returns:
-        Scores, shape (k, m).
-
-    Raises:
-        ValueError: If the density is not finite at a point or beside the values of the parameters.
-    """
-    parameters = base.parameters()
-    values = np.array([each.value for each in parameters])
-    scores = np.empty((len(x), len(parameters)))
-    for i, each in enumerate(parameters):
-        step = np.zeros(len(values))
-        step[i] = DIFFERENCE_STEP * each.change
-        above, below = (log_density(base.with_parameters(values + sign * step), x) for sign in (1.0, -1.0))
-        with np.errstate(invalid="ignore"):  # -inf - -inf: said below
-            scores[:, i] = (above - below) / (2 * DIFFERENCE_STEP)
-    if not np.isfinite(scores).all():
-        worst = parameters[int(np.argmin(np.isfinite(scores).all(axis=0)))]
-        raise ValueError(
-            f"The density has no finite derivative by the {worst.name} at a failing point: it may "
-            "lie at the edge of the support; draw from a base distribution that ends smoothly."
-        )
-    return scores
-
-
-def refit_displacements(
-    base: ParametricBase, refits: Sequence[object], columns: Sequence[str] = ()
-) -> tuple[FloatArray, list[int]]:
-    """Return by how many changes the parameters of refits differ from those of their base.
-
-    Refits that have other parameters (another number of components) are left out.
-
-    Returns:
-        Displacements, shape (R, m), and the indices of the R refits.
-    """
-    own = base.parameters(columns)
-    names = [each.name for each in own]
-    values, changes = np.array([each.value for each in own]), np.array([each.change for each in own])
-    rows, used = [], []
-    for number, refit in enumerate(refits):
-        if not isinstance(refit, ParametricBase):
-            continue
-        theirs = refit.parameters(columns, base)
-        if [each.name for each in theirs] == names:
-            rows.append((np.array([each.value for each in theirs]) - values) / changes)
-            used.append(number)
-    return np.array(rows).reshape(len(rows), len(names)), used
-
-
-MIN_ALIGNED_REFITS = 10
-"""Refits with the parameters of the base that shares of the spread must rest on."""
-JOINT_GROUP = "weights of components"
-"""Group of parameters that are about all columns."""
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class SpreadShares:
-    """Spread of log p over refits, and what each parameter of the base has of it."""
-
-    shares: FloatArray | None = None
-    """Share of each parameter, shape (m,); None where it is not known."""
-    spread: float | None = None
-    """Standard deviation of log p over the refits used."""
-    first_order: float | None = None
-    """The same of log p to first order in the parameters."""
-    correlation: float | None = None
-    """Correlation of the two over the refits."""
-    n_refits: tuple[int, int] = (0, 0)
-    """Refits used, those with the parameters of the base, and refits of the base."""
-    reason: str = ""
-    """Why the shares are not known; empty if they are."""
-
-
-def share_spread(
-    estimate: EstimateData, base: ParametricBase, derivatives: FloatArray, labels: Sequence[str]
-) -> SpreadShares:
-    """Return the shares of the parameters in the spread of log p over the refits of the base.
-
-    Args:
-        estimate: With weighted points.
-        base: Its base, with m parameters.
-        derivatives: d log p per change of each parameter, shape (m,).
-        labels: Names of the columns of x.
-    """
-    fitted = find_fitted_base(base)
-    if fitted is None:
-        return SpreadShares(reason="the base distribution has no refits, so that no share of a spread is known")
-    displacements, used = refit_displacements(base, fitted.refits, labels)
-    counts = (len(used), len(fitted.refits))
-    if len(used) < MIN_ALIGNED_REFITS:
-        reason = f"only {counts[0]} of {counts[1]} refits have the parameters of the base, so that no share is known"
-        return SpreadShares(reason=reason, n_refits=counts)
-    log_p = reweight_to_refits(estimate, fitted.refits).log_p[0, used]
-    parts = derivatives * (displacements - displacements.mean(axis=0))
-    linear = parts.sum(axis=1)
-    variance = float(linear @ linear)
-    if not (variance > 0 and np.isfinite(log_p).all()):
-        reason = "p under the refits is not known, or does not differ, so that no share is known"
-        return SpreadShares(reason=reason, n_refits=counts)
-    return SpreadShares(
-        shares=np.asarray(linear @ parts / variance),
-        spread=float(log_p.std(ddof=1)),
-        first_order=math.sqrt(variance / (len(used) - 1)),
-        correlation=float(np.corrcoef(linear, log_p)[0, 1]),
-        n_refits=counts,
-    )
-
-
-def sum_by_owner(shares: FloatArray, columns: Sequence[tuple[int, ...]], owners: Sequence[str]) -> dict[str, float]:
-    """Return the shares of parameters (m,) summed by the parameter of x that they are about, the largest first."""
-    sums: dict[str, float] = {}
-    for share, about in zip(shares, columns, strict=True):
-        for name in [owners[j] for j in about] or [JOINT_GROUP]:
-            sums[name] = sums.get(name, 0.0) + float(share) / max(len(about), 1)
-    return dict(sorted(sums.items(), key=lambda each: -each[1]))
-
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-MIN_CORRELATION = 0.8
-"""Correlation of log p to first order with log p over the refits below which no recording is recommended."""
-ENOUGH_POINTS = 30.0
-"""Effective failing points below which importance and derivatives are called not determined."""
-SHOWN_PARAMETERS = 12
-"""Rows of the table for people, and bars of the picture."""
+    name: str
+    """Name of the parameter."""
+    importance: float
+    """D over -log p: the share of how rare failure is that the parameter has by itself, 0 to 1; the estimate from few
+    points, which may be beyond, is cut to that range."""
+    error: float
+    """Standard error of `importance`."""
+    direction: float
+    """Mean of u_j given failure, in standard deviations of ordinary values: negative where failures have small values;
+    the distance from 0 for a block of several columns."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -336,7 +147,7 @@ class ParameterSensitivity:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Sensitivity:
+class Sensitivity(Reported):
     """What p is sensitive to.
 
     Example:
@@ -351,7 +162,7 @@ class Sensitivity:
         'the base distribution (StandardNormal) offers no parameters'
     """
 
-    parameters: tuple[ParameterSensitivity, ...]
+    parameters: tuple[ParameterSensitivity, ...] = ()
     """By parameter of the base: those with the largest share of the spread first, or with the largest derivative."""
     columns: tuple[ColumnImportance, ...]
     """By parameter of x, the most important first."""
@@ -413,49 +224,31 @@ class Sensitivity:
             lines.append(f"more recordings of {name} would narrow the interval most")
         return lines
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return plain lists and numbers for JSON."""
-        numbers = ("points", "spread", "first_order_spread", "correlation")
-        return {
-            "columns": [each.to_dict() for each in self.columns],
-            "parameters": [{k: to_json_value(v) for k, v in asdict(each).items()} for each in self.parameters],
-            "shares": dict(self.shares),
-            **{name: to_json_value(getattr(self, name)) for name in numbers},
-            "n_refits": list(self.n_refits),
-            "reason": self.reason,
-        }
-
     def plot(self, axes: Sequence[Axes] | str | PathLike[str] | None = None) -> Sequence[Axes]:
         """Draw importance of the columns and derivatives by the parameters as bars; needs matplotlib.
 
         Args:
             axes: Two axes to draw in, or the path of an image to write; None makes a figure of pyplot.
         """
-        if isinstance(axes, str | PathLike):
-            with needs_library("matplotlib", "A drawing"):
+        size: Any = {"figsize": (12, 4.5), "layout": "constrained"}
+        with needs_library("matplotlib", "A drawing"):
+            if isinstance(axes, str | PathLike):
                 from matplotlib.figure import Figure
 
-            figure = Figure(figsize=(12, 4.5), layout="constrained")
-            drawn = self._draw(*figure.subplots(1, 2))
-            figure.savefig(axes)
-            return drawn
-        if axes is None:
-            with needs_library("matplotlib", "A drawing"):
+                figure = Figure(**size)
+                drawn = self.plot(figure.subplots(1, 2))
+                figure.savefig(axes)
+                return drawn
+            if axes is None:
                 from matplotlib import pyplot
 
-            return self._draw(*pyplot.subplots(1, 2, figsize=(12, 4.5), layout="constrained")[1])
-        return self._draw(*axes)
-
-    def _draw(self, left: Axes, right: Axes) -> tuple[Axes, Axes]:
-        """Draw the columns into the left axes and the parameters into the right ones."""
+                return self.plot(pyplot.subplots(1, 2, **size)[1])
+        left, right = axes
         columns, parameters = self.columns[:SHOWN_PARAMETERS], self.parameters[:SHOWN_PARAMETERS]
         left.barh([c.name for c in columns], [c.importance for c in columns], xerr=[c.error for c in columns])
         left.set_xlabel("importance, share of -log p")
-        right.barh(
-            [f"{p.name}, {p.change_name}" for p in parameters],
-            [p.d_log_p for p in parameters],
-            xerr=[p.error for p in parameters],
-        )
+        names, values = [f"{p.name}, {p.change_name}" for p in parameters], [p.d_log_p for p in parameters]
+        right.barh(names, values, xerr=[p.error for p in parameters])
         right.axvline(0.0, color="black", linewidth=0.8)
         right.set_xlabel("change of log p")
         for each in (left, right):
@@ -466,27 +259,25 @@ class Sensitivity:
 def compute_sensitivity(
     estimate: EstimateData, names: Sequence[str] = (), sizes: Sequence[int] = (), by_parameters: bool = True
 ) -> Sensitivity:
-    """Return the sensitivity of p; see `Estimate.sensitivity`.
-
-    Raises:
-        ValueError: As described there.
-    """
+    """Return the sensitivity of p; see `Estimate.sensitivity`."""
     base, failures = require_base(estimate), weigh_failures(estimate)
     dim = failures.x.shape[1]
-    names, sizes = _check_names(names, sizes, dim)
-    columns, points = rank_columns(failures, base, names, sizes), count_effective_failures(failures)
+    names = tuple(names) or tuple(f"x{j + 1}" for j in range(dim))
+    sizes = tuple(sizes) or (1,) * len(names)
+    if len(names) != len(sizes) or sum(sizes) != dim:
+        raise ValueError(f"Expected names and sizes of {dim} columns, got {len(names)} names and sizes {sizes}.")
+    points = effective_number(failures.unit_totals(failures.weights))
+    found = Sensitivity(columns=_rank_columns(failures, base, names, sizes, points), points=points)
     if not by_parameters:
-        return Sensitivity(parameters=(), columns=columns, points=points)
+        return found
     labels = [
         name if size == 1 else f"{name}[{k}]" for name, size in zip(names, sizes, strict=True) for k in range(size)
     ]
     parameters = base.parameters(labels) if isinstance(base, ParametricBase) else ()
     if not isinstance(base, ParametricBase) or not parameters:
-        kind = type(base).__name__
-        reason = f"the base distribution ({kind}) offers no parameters"
-        return Sensitivity(parameters=(), columns=columns, points=points, reason=reason)
-    derivatives, errors = mean_over_failures(failures, parameter_scores(base, failures.x))
-    spread = share_spread(estimate, base, derivatives, labels)
+        return replace(found, reason=f"the base distribution ({type(base).__name__}) offers no parameters")
+    derivatives, errors = failures.mean_of(_parameter_scores(base, failures.x))
+    shares, about = _share_spread(estimate, base, derivatives, labels)
     rows = [
         ParameterSensitivity(
             name=each.name,
@@ -495,30 +286,120 @@ def compute_sensitivity(
             change_name=each.change_name,
             d_log_p=float(derivative),
             error=float(error),
-            share=None if spread.shares is None else float(spread.shares[i]),
+            share=None if shares is None else float(shares[i]),
         )
         for i, (each, derivative, error) in enumerate(zip(parameters, derivatives, errors, strict=True))
     ]
     rows.sort(key=lambda each: -abs(each.d_log_p if each.share is None else each.share))
     owners = np.repeat(names, sizes).tolist()
-    groups = {} if spread.shares is None else sum_by_owner(spread.shares, [p.columns for p in parameters], owners)
-    return Sensitivity(
-        parameters=tuple(rows),
-        columns=columns,
-        points=points,
-        shares=groups,
-        spread=spread.spread,
-        first_order_spread=spread.first_order,
-        correlation=spread.correlation,
-        n_refits=spread.n_refits,
-        reason=spread.reason,
-    )
+    groups = {} if shares is None else _sum_by_owner(shares, [p.columns for p in parameters], owners)
+    return replace(found, parameters=tuple(rows), shares=groups, **about)
 
 
-def _check_names(names: Sequence[str], sizes: Sequence[int], dim: int) -> tuple[Sequence[str], Sequence[int]]:
-    """Return names and sizes of the parameters of x; x1, x2, ... of one column each by default."""
-    names = tuple(names) or tuple(f"x{j + 1}" for j in range(dim))
-    sizes = tuple(sizes) or (1,) * len(names)
-    if len(names) != len(sizes) or sum(sizes) != dim:
-        raise ValueError(f"Expected names and sizes of {dim} columns, got {len(names)} names and sizes {sizes}.")
-    return names, sizes
+def _rank_columns(
+    failures: WeightedFailures, base: Distribution, names: Sequence[str], sizes: Sequence[int], points: float
+) -> tuple[ColumnImportance, ...]:
+    """Return the importance of each parameter of x, the most important first, from so many effective points.
+
+    The estimate of D_j from n effective points is too large by 1 / n on average, which is taken off: the mean of u_j^2
+    has no bias, and that of -log(s^2) / 2 is 1 / n for normal u_j, whatever s^2.
+    """
+    if np.count_nonzero(failures.weights) < 2:
+        raise ValueError("A single point failed: what p is sensitive to needs more of them; give more simulations.")
+    u = np.asarray(base.to_standard_normal(failures.x), dtype=np.float64)
+    share = failures.weights / failures.weights.sum()
+    mean, square = share @ u, share @ u**2
+    variance = np.maximum(square - mean**2, ROUNDING_VARIANCE)
+    entropy = (square - 1 - np.log(variance)) / 2 - 1 / points
+    influence = (1 - 1 / variance) / 2 * (u**2 - square) + mean / variance * (u - mean)
+    total = -math.log(float(failures.weights.sum()))
+    starts = np.cumsum([0, *sizes])
+    found = []
+    for name, first, last in zip(names, starts[:-1], starts[1:], strict=True):
+        part = slice(int(first), int(last))
+        error = float(failures.mean_of(influence[:, part].sum(axis=1, keepdims=True))[1][0])
+        direction = float(mean[first]) if last - first == 1 else float(np.linalg.norm(mean[part]))
+        value = min(max(float(entropy[part].sum()) / total, 0.0), 1.0) if total > 0 else 0.0
+        error = error / total if total > 0 else math.nan
+        found.append(ColumnImportance(name=name, importance=value, error=error, direction=direction))
+    return tuple(sorted(found, key=lambda each: -each.importance))
+
+
+def _parameter_scores(base: ParametricBase, x: FloatArray) -> FloatArray:
+    """Return d log p0(x; theta) / d theta times the change of each of m parameters at x (k, d), shape (k, m)."""
+    parameters = base.parameters()
+    values = np.array([each.value for each in parameters])
+    scores = np.empty((len(x), len(parameters)))
+    for i, each in enumerate(parameters):
+        step = np.zeros(len(values))
+        step[i] = DIFFERENCE_STEP * each.change
+        above, below = (log_density(base.with_parameters(values + sign * step), x) for sign in (1.0, -1.0))
+        with np.errstate(invalid="ignore"):  # -inf - -inf: said below
+            scores[:, i] = (above - below) / (2 * DIFFERENCE_STEP)
+    if not np.isfinite(scores).all():
+        worst = parameters[int(np.argmin(np.isfinite(scores).all(axis=0)))]
+        raise ValueError(
+            f"The density has no finite derivative by the {worst.name} at a failing point: it may "
+            "lie at the edge of the support; draw from a base distribution that ends smoothly."
+        )
+    return scores
+
+
+def _share_spread(
+    estimate: EstimateData, base: ParametricBase, derivatives: FloatArray, labels: Sequence[str]
+) -> tuple[FloatArray | None, dict[str, Any]]:
+    """Return the shares (m,) of parameters in the spread of log p over the refits, and the fields about the spread.
+
+    None and the reason where they are not known; `derivatives` are d log p per change of each parameter, shape (m,).
+    """
+    fitted = find_fitted_base(base)
+    if fitted is None:
+        return None, {"reason": "the base distribution has no refits, so that no share of a spread is known"}
+    displacements, used = _refit_displacements(base, fitted.refits, labels)
+    about: dict[str, Any] = {"n_refits": (len(used), len(fitted.refits))}
+    if len(used) < MIN_ALIGNED_REFITS:
+        few = f"only {len(used)} of {len(fitted.refits)} refits"
+        return None, {**about, "reason": f"{few} have the parameters of the base, so that no share is known"}
+    log_p = reweight_to_refits(estimate, fitted.refits).log_p[0, used]
+    parts = derivatives * (displacements - displacements.mean(axis=0))
+    linear = parts.sum(axis=1)
+    variance = float(linear @ linear)
+    if not (variance > 0 and np.isfinite(log_p).all()):
+        return None, {
+            **about,
+            "reason": "p under the refits is not known, or does not differ, so that no share is known",
+        }
+    about["spread"] = float(log_p.std(ddof=1))
+    about["first_order_spread"] = math.sqrt(variance / (len(used) - 1))
+    about["correlation"] = float(np.corrcoef(linear, log_p)[0, 1])
+    return np.asarray(linear @ parts / variance), about
+
+
+def _refit_displacements(
+    base: ParametricBase, refits: Sequence[object], columns: Sequence[str]
+) -> tuple[FloatArray, list[int]]:
+    """Return by how many changes the parameters of refits differ from those of their base (R, m), and which refits.
+
+    Refits that have other parameters (another number of components) are left out.
+    """
+    own = base.parameters(columns)
+    names = [each.name for each in own]
+    values, changes = np.array([each.value for each in own]), np.array([each.change for each in own])
+    rows, used = [], []
+    for number, refit in enumerate(refits):
+        if not isinstance(refit, ParametricBase):
+            continue
+        theirs = refit.parameters(columns, base)
+        if [each.name for each in theirs] == names:
+            rows.append((np.array([each.value for each in theirs]) - values) / changes)
+            used.append(number)
+    return np.array(rows).reshape(len(rows), len(names)), used
+
+
+def _sum_by_owner(shares: FloatArray, columns: Sequence[tuple[int, ...]], owners: Sequence[str]) -> dict[str, float]:
+    """Return the shares of parameters (m,) summed by the parameter of x that they are about, the largest first."""
+    sums: dict[str, float] = {}
+    for share, about in zip(shares, columns, strict=True):
+        for name in [owners[j] for j in about] or [JOINT_GROUP]:
+            sums[name] = sums.get(name, 0.0) + float(share) / max(len(about), 1)
+    return dict(sorted(sums.items(), key=lambda each: -each[1]))

@@ -1,4 +1,4 @@
-"""Weighted points behind an estimate: sums over independent units and their intervals, failures and their weights.
+"""Weighted points behind an estimate: sums over independent units and their intervals, failures and kinds of them.
 
 A unit is what was drawn independently: a draw, or a point of level 0 with all that descends from it.
 With T_c the sum of the weights in unit c, p-hat = sum T_c and its variance is sum T_c^2 - p^2 / n.
@@ -12,7 +12,9 @@ References:
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +22,7 @@ from scipy.sparse import csr_array
 from scipy.special import ndtr
 
 from samplers.method import EstimateData
+from samplers.output import to_json_value
 from samplers.problem import FloatArray
 from samplers.sample import Sample
 from samplers.statistics import Interval, clopper_pearson, degrees_of_freedom, effective_number, log_normal_interval
@@ -27,6 +30,24 @@ from samplers.statistics import Interval, clopper_pearson, degrees_of_freedom, e
 MIN_UNITS = 5.0
 """Effective number of independent units (draws; paths of chains) that a result must rest on: fewer give a useless t
 interval."""
+EIGENVALUE_ROUNDING = 1e-10
+"""Eigenvalues of a G x G correlation up to G times this are rounding: its trace is G."""
+BAND_DRAWS = 10_000
+"""Draws of the largest deviation; its 95 % quantile is then good to about 1 %."""
+BAND_STREAM = 2**31
+"""Spawn key of the generator for these draws; the runs have 0, 1, 2, ..."""
+NO_OUTCOME_LABEL = "no outcome"
+"""Label of points on which f raised or gave NaN and that were counted as failing."""
+
+
+@dataclass(frozen=True, eq=False)
+class Reported:
+    """A result whose fields are numbers, texts, tuples and arrays."""
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain lists and numbers for JSON; NaN and infinities become None."""
+        values = asdict(self)
+        return {name: to_json_value(v.tolist() if isinstance(v, np.ndarray) else v) for name, v in values.items()}
 
 
 def require_sample(estimate: EstimateData) -> Sample:
@@ -128,40 +149,18 @@ def interval_of_sum(p: float, cov: float, ess: float, independent: bool, confide
     return log_normal_interval(p, cov, confidence, df=degrees_of_freedom(ess, independent))
 
 
-def interval_of_count(p: float, n: int, confidence: float) -> Interval:
-    """Return the exact binomial interval of a share p of n draws."""
-    return clopper_pearson(round(p * n), n, confidence)
-
-
-EIGENVALUE_ROUNDING = 1e-10
-"""Eigenvalues of a G x G correlation up to G times this are rounding: its trace is G."""
-BAND_DRAWS = 10_000
-"""Draws of the largest deviation; its 95 % quantile is then good to about 1 %."""
-BAND_STREAM = 2**31
-"""Spawn key of the generator for these draws; the runs have 0, 1, 2, ..."""
-
-
 def simultaneous_intervals(
     sums: UnitSums, use: NDArray[np.intp], p: FloatArray, cov: FloatArray, confidence: float, seed: int
 ) -> tuple[FloatArray, FloatArray]:
-    """Return pointwise intervals of p at one level, at which they should hold together; 0 to 1 where they are not used.
+    """Return both ends (G,) of pointwise intervals of p (G,) at the one level at which they should hold together.
 
-    Args:
-        sums: Over units, at G thresholds.
-        use: Indices of the thresholds that count.
-        p: Probabilities, shape (G,).
-        cov: Their coefficients of variation, shape (G,).
-        confidence: Nominal coverage of all.
-        seed: Of the run.
-
-    Returns:
-        Lower and upper ends, shape (G,) each.
+    They are 0 and 1 but at the thresholds with the indices `use`; exact where p is a share of plain draws.
     """
     level = simultaneous_level(sums.correlation[np.ix_(use, use)], confidence, band_generator(seed))
     low, high = np.zeros(len(p)), np.ones(len(p))
     for i in use:
         if sums.is_count[i]:
-            low[i], high[i] = interval_of_count(float(sums.p[i]), sums.n_units, level)
+            low[i], high[i] = clopper_pearson(round(float(sums.p[i]) * sums.n_units), sums.n_units, level)
         else:
             low[i], high[i] = interval_of_sum(float(p[i]), float(cov[i]), float(sums.ess[i]), sums.independent, level)
     return low, high
@@ -175,10 +174,7 @@ def band_generator(seed: int) -> np.random.Generator:
 def simultaneous_level(correlation: NDArray[np.float64], confidence: float, rng: np.random.Generator) -> float:
     """Return the level of pointwise intervals that together hold with probability `confidence`.
 
-    Args:
-        correlation: Of the estimates, shape (G, G); rows of zeros for those that do not vary.
-        confidence: Nominal coverage of all.
-        rng: Generator of the draws.
+    `correlation` is that of the estimates, shape (G, G), with rows of zeros for those that do not vary.
     """
     values, vectors = np.linalg.eigh(correlation)
     some = values > EIGENVALUE_ROUNDING * max(len(values), 1)
@@ -237,6 +233,16 @@ class WeightedFailures:
             return math.inf
         return self.inflation * math.sqrt(max(1 / effective - 1 / self.n_units, 0.0))
 
+    def mean_of(self, values: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return E[h(X) | failure] and its standard error, (m,) each, of m quantities h (k, m) at these points.
+
+        The mean is a ratio of two sums, so its variance is that of the sum of w (h - mean) over independent units.
+        """
+        share = self.weights / self.weights.sum()
+        means = share @ values
+        totals = self.unit_totals(share[:, None] * (values - means))
+        return means, self.inflation * np.sqrt((totals**2).sum(axis=0))
+
 
 def choose_failures(sample: Sample, gamma: float, most: int | None = None) -> NDArray[np.int64]:
     """Return rows of `Sample.x`: all of them, or `most` evenly spaced ones where there are more.
@@ -293,19 +299,96 @@ def weigh_failures(estimate: EstimateData, most: int | None = None) -> WeightedF
     return replace(raw, inflation=cov_inflation(estimate, raw.cov_of_sum(raw.weights)))
 
 
-def mean_over_failures(failures: WeightedFailures, values: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return E[h(X) | failure] and its standard error, for m quantities h at once.
+@dataclass(frozen=True, kw_only=True)
+class Share(Reported):
+    """The part of p that one kind of failure has.
 
-    The mean is a ratio of two sums, so its variance is that of the sum of w (h - mean) over independent units.
+    Example:
+        >>> import numpy as np, samplers
+        >>> problem = samplers.FunctionProblem(lambda x: 3.0 - np.abs(x[:, 0]), dim=2)
+        >>> result = samplers.estimate(problem, "mc", seed=0, max_sim=100_000)
+        >>> left = result.shares(lambda x: np.where(x[:, 0] > 0, "right", "left").tolist())["left"]
+        >>> print(f"{left.p:.4f}, {left.points} points, {left.of_failures:.2f} of all failures")
+        0.0015, 152 points, 0.52 of all failures
+    """
+
+    p: float
+    """Probability of a failure of this kind; those of all kinds add up to the estimate's p."""
+    interval: Interval
+    """Interval that should hold it with probability `confidence` of the estimate, each kind by itself."""
+    cov: float
+    """Coefficient of variation of `p`."""
+    of_failures: float
+    """p over the estimate's p."""
+    points: int
+    """Failing points of this kind that were looked at."""
+
+
+def split_by_kind(
+    estimate: EstimateData, label: Callable[[FloatArray], Sequence[str]], most: int | None = None
+) -> dict[str, Share]:
+    """Return p by kind of failure; see `Estimate.shares`. Points without an outcome are of `NO_OUTCOME_LABEL`."""
+    sample = require_sample(estimate)
+    rows = choose_failures(sample, estimate.gamma, most)
+    labels = np.full(len(rows), NO_OUTCOME_LABEL, dtype=object)
+    known = ~np.isneginf(sample.f[sample.f <= estimate.gamma][rows])
+    if known.any():
+        given = list(label(sample.x[rows][known]))
+        if len(given) != int(known.sum()) or not all(isinstance(each, str) for each in given):
+            raise ValueError(
+                f"Expected a word for each of {int(known.sum())} points, got {len(given)} of them: {given[:3]}."
+            )
+        labels[known] = given
+    return sum_by_label(estimate, rows, labels)
+
+
+def sum_by_label(estimate: EstimateData, rows: NDArray[np.int64], labels: NDArray[np.object_]) -> dict[str, Share]:
+    """Return p by label of failing points, the largest first.
+
+    The p of a kind is the sum of the weights of its points, scaled where p is not the sum of all weights (control
+    variates; only some of the points). Its spread is that of the sums over independent units, times the factor by
+    which the estimate's c.o.v. exceeds that of all failing points.
 
     Args:
-        failures: Weighted failing points.
-        values: h at these points, shape (k, m).
+        estimate: The run.
+        rows: Rows of the points among all failing ones, `Sample.x`, shape (k,).
+        labels: A word for each, shape (k,).
 
-    Returns:
-        Means and standard errors, shape (m,) each.
+    Example:
+        >>> import samplers
+        >>> problem = samplers.FunctionProblem(lambda x: 3.0 - x[:, 0], dim=2)
+        >>> result = samplers.estimate(problem, "mc", seed=0, max_sim=10_000)
+        >>> rows = np.arange(result.failures.total)
+        >>> shares = sum_by_label(result, rows, np.where(rows % 2 == 0, "even", "odd").astype(object))
+        >>> {label: share.points for label, share in shares.items()}
+        {'even': 8, 'odd': 8}
     """
-    share = failures.weights / failures.weights.sum()
-    means = share @ values
-    totals = failures.unit_totals(share[:, None] * (values - means))
-    return means, failures.inflation * np.sqrt((totals**2).sum(axis=0))
+    sample = require_sample(estimate)
+    chosen = np.flatnonzero(sample.f <= estimate.gamma)[rows]
+    everything = _sum_points(sample, chosen, estimate.gamma)
+    total, grow = float(everything.p[0]), cov_inflation(estimate, float(everything.cov[0]))
+    kinds = {kind: chosen[labels == kind] for kind in dict.fromkeys(labels.tolist())}
+    shares = {kind: _share_of(estimate, sample, mine, total, grow) for kind, mine in kinds.items()}
+    if len(shares) == 1 and estimate.p > 0:  # all of p: its interval is that of p
+        shares = {kind: replace(share, interval=estimate.interval, cov=estimate.cov) for kind, share in shares.items()}
+    return dict(sorted(shares.items(), key=lambda each: -each[1].p))
+
+
+def _sum_points(sample: Sample, rows: NDArray[np.int64], gamma: float) -> UnitSums:
+    """Return the sum of the weights of some points with its spread, as if only they had f <= gamma."""
+    f = np.full(len(sample.f), np.inf)
+    f[rows] = gamma
+    return unit_sums(replace(sample, f=f, layers=()), np.array([gamma]))
+
+
+def _share_of(estimate: EstimateData, sample: Sample, rows: NDArray[np.int64], total: float, grow: float) -> Share:
+    """Return the share of the points with these rows; the weights of all failing points add up to `total`."""
+    sums = _sum_points(sample, rows, estimate.gamma)
+    part = float(sums.p[0]) / total if total > 0 else 0.0
+    p, cov = estimate.p * part, float(sums.cov[0])
+    if sums.is_count[0] and np.isclose(total, estimate.p, rtol=1e-9):
+        interval = clopper_pearson(round(p * sums.n_units), sums.n_units, estimate.confidence)
+    else:
+        cov *= grow
+        interval = interval_of_sum(p, cov, float(sums.ess[0]), has_independent_points(sample), estimate.confidence)
+    return Share(p=p, interval=interval, cov=cov, of_failures=part, points=len(rows))

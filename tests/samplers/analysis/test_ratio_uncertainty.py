@@ -11,7 +11,7 @@ from scipy import stats
 
 import samplers
 from samplers.analysis.base_error import summarise_ratio
-from samplers.analysis.refits import RefitSums
+from samplers.analysis.reweight import RefitSums
 from tests.samplers.fitted_bases import FittedWithEnsemble, HalfSpace, fitted, normal, resampled
 
 SHIFTED = [normal(mean) for mean in np.linspace(-0.6, 0.6, 30)]

@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from samplers.analysis import base_error as base_uncertainty
-from samplers.analysis import base_error as refit_band
+from samplers.analysis import base_error
 from samplers.analysis.base_error import compute_refit_band
-from samplers.analysis.refits import RefitSums
+from samplers.analysis.reweight import RefitSums
 from samplers.statistics import raise_log_end
 
 THRESHOLDS = np.array([0.0, 1.0, 2.0, 3.0])
@@ -43,8 +42,7 @@ def test_the_band_holds_all_thresholds_together_where_intervals_of_each_do_not(m
 
     Without the allowance for the bias of a mixture's fit, which the moments of a normal distribution do not have.
     """
-    for module in (base_uncertainty, refit_band):
-        monkeypatch.setattr(module, "FIT_BIAS", 1e-6)
+    monkeypatch.setattr(base_error, "FIT_BIAS", 1e-6)
     truth, rng = stats.norm.sf(THRESHOLDS), np.random.default_rng(1)
     together = each = 0
     for _ in range(300):

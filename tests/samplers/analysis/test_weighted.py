@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from samplers.analysis.weighted import mean_over_failures, weigh_failures
+from samplers.analysis.weighted import weigh_failures
 from tests.samplers.analysis.half_space_tail import METHODS, PHI, P, estimate_half_space
 
 
@@ -24,7 +24,7 @@ def test_the_mean_over_failures_is_that_of_the_truncated_normal():
     means, errors = [], []
     for seed in range(30):
         failures = weigh_failures(estimate_half_space("is", seed=seed, max_sim=1_500))
-        mean, error = mean_over_failures(failures, failures.x)
+        mean, error = failures.mean_of(failures.x)
         means.append(mean)
         errors.append(error)
     z = (np.array(means) - [PHI / P, 0.0]) / errors
@@ -39,5 +39,5 @@ def test_errors_count_paths_of_chains_as_one():
         name: np.repeat(getattr(failures, name), 2, axis=0) for name in ("x", "rows", "has_outcome", "weights", "units")
     }
     again = type(failures)(**{**vars(failures), **double, "weights": double["weights"] / 2})
-    for found, twice in zip(mean_over_failures(failures, failures.x), mean_over_failures(again, again.x), strict=True):
+    for found, twice in zip(failures.mean_of(failures.x), again.mean_of(again.x), strict=True):
         assert np.allclose(found, twice)
