@@ -8,10 +8,9 @@ whose mean it takes: with 25 observations that takes six times as long as the la
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from types import FunctionType
-from typing import Any, Literal, Protocol, runtime_checkable
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -51,21 +50,12 @@ class DensePolicy:
     clipped to plus or minus the last; None for observations as they are."""
 
 
-@runtime_checkable
-class RenamedPolicy(Protocol):
-    """An ego whose `predict` is that of another policy."""
-
-    @property
-    def same_as(self) -> Any:
-        """A policy that gives the same actions for the same observations."""
-
-
 def read_dense_policy(policy: Any) -> DensePolicy:
-    """Return the network of a policy with its present weights.
+    """Return the network of a policy with its present weights, or raise NotCompiled.
 
-    Args:
-        policy: A `PPO`, `A2C` or `DQN` of Stable-Baselines3 or one of their policies, with dense layers between which
-            are hyperbolic tangents or rectifiers, behind `VecNormalize` or not; or a `RenamedPolicy`.
+    A `PPO`, `A2C` or `DQN` of Stable-Baselines3 or one of their policies, with dense layers between which are
+    hyperbolic tangents or rectifiers, behind `VecNormalize` or not; or an ego whose class has `predict` and `same_as`,
+    a policy that gives the same actions for the same observations.
     """
     if type(policy) is RescaledPolicy:
         return replace(read_dense_policy(policy.policy), rescale=(policy.low, policy.high))
@@ -76,24 +66,19 @@ def read_dense_policy(policy: Any) -> DensePolicy:
         return read_dense_policy(policy.same_as)
     if not type(policy).__module__.startswith(f"{SB3}."):
         raise NotCompiled(f"the ego, a {type(policy).__name__}, is not compiled")
-    return _read_network(_read_model(policy))
-
-
-def _read_model(model: Any) -> Any:
-    """Return the policy of an algorithm of Stable-Baselines3; a policy as it is."""
-    from stable_baselines3 import A2C, DQN, PPO
-
-    if type(model) not in (A2C, DQN, PPO):
-        return model
-    _refuse_changed(model)
-    return model.policy
+    return _read_network(policy)
 
 
 def _read_network(policy: Any) -> DensePolicy:
+    """Return the network of an algorithm of Stable-Baselines3, or of its policy."""
+    from stable_baselines3 import A2C, DQN, PPO
     from stable_baselines3.common import distributions, torch_layers
     from stable_baselines3.common.policies import ActorCriticPolicy
     from stable_baselines3.dqn.policies import DQNPolicy, QNetwork
 
+    if type(policy) in (A2C, DQN, PPO):
+        _refuse_changed(policy)
+        policy = policy.policy
     parts: list[Any]
     if type(policy) is ActorCriticPolicy and type(policy.mlp_extractor) is torch_layers.MlpExtractor:
         features, parts = policy.pi_features_extractor, [policy.mlp_extractor.policy_net, policy.action_net]
@@ -109,17 +94,14 @@ def _read_network(policy: Any) -> DensePolicy:
         _refuse_changed(module)
     if type(policy) is ActorCriticPolicy:
         _refuse_changed(policy.action_dist)
-    layers, activation = _read_layers([module for part in parts for module in _unpack(part)])
+    in_turn = [part if type(part) is nn.Sequential else (part,) for part in parts]
+    layers, activation = _read_layers([module for modules in in_turn for module in modules])
     space = policy.action_space
     chooses = isinstance(space, spaces.Discrete) and int(space.start) == 0
     clip = (space.low, space.high) if isinstance(space, spaces.Box) else None
     if clip is None and not chooses:
         raise NotCompiled(f"an ego that acts in {space} is not compiled")
     return DensePolicy(layers, activation, chooses, clip)
-
-
-def _unpack(module: Any) -> Iterator[Any]:
-    yield from module if type(module) is nn.Sequential else (module,)
 
 
 def _read_layers(modules: list[Any]) -> tuple[tuple[Any, ...], Activation]:
@@ -224,11 +206,7 @@ class DenseInference:
 
 
 def find_inference(policy: Any) -> Any:
-    """Return what gives a policy's actions soonest: its layers alone, or the policy itself where it is anything else.
-
-    Args:
-        policy: Has Stable-Baselines3's `predict`; it may stand behind wrappers.
-    """
+    """Return what gives a policy's actions soonest, behind its wrappers: its layers alone, or the policy itself."""
     if type(policy) in (RescaledPolicy, NormalisedPolicy):
         return replace(policy, policy=find_inference(policy.policy))
     try:

@@ -45,11 +45,7 @@ def is_policy(ego: object) -> bool:
 
 
 def check_predict(ego: Any) -> None:
-    """Refuse a policy whose `predict` does not take the arguments that Stable-Baselines3's takes.
-
-    Args:
-        ego: An object with `predict`.
-    """
+    """Refuse a policy whose `predict` does not take the arguments that Stable-Baselines3's takes."""
     try:
         signature = inspect.signature(ego.predict)
     except (TypeError, ValueError):  # of a built-in function it is not known
@@ -64,13 +60,7 @@ def check_predict(ego: Any) -> None:
 
 
 def refuse_ego(ego: object, origin: str = "", known: Sequence[str] = ("idm",)) -> NoReturn:
-    """Refuse what is no ego.
-
-    Args:
-        ego: A name, a class, or an object that is no ego.
-        origin: Where it came from, if not from the caller, such as "from make_ego()".
-        known: Names of egos that would have been taken.
-    """
+    """Refuse what is no ego, from somewhere such as "from make_ego()", where these names would have been taken."""
     origin, names = f" {origin}" if origin else "", ", ".join(map(repr, known))
     if isinstance(ego, str):
         raise ValueError(

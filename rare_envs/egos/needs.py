@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import importlib
 from collections.abc import Callable, Collection, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Protocol, runtime_checkable
@@ -26,233 +26,6 @@ from rare_envs.sensors.kinds import ELSEWHERE, OBSERVATIONS, map_kinds, read_kin
 from rare_envs.simulation.observation import observation_space
 from rare_envs.simulation.rollout import Driver
 from rare_envs.simulation.world import World
-
-
-class NoiseSource(Protocol):
-    """Something with noise of its own, which becomes part of x."""
-
-    def noise_columns(self, world: World) -> int:
-        """Return how many standard normal columns of x are its noise in a world."""
-
-
-@dataclass(frozen=True)
-class EgoNeeds:
-    """Needs of an ego, and its statements about itself; `resolve` finds it out.
-
-    Example:
-        >>> EgoNeeds().observation
-        'features'
-    """
-
-    observations: tuple[str, ...] = ("features",)
-    """Kinds of observation that its space fits, each as `rare_envs.sensors.kinds.read_kinds` writes it; one where it
-    declares none."""
-    lidar: bool = False
-    """Whether it reads `Episode.perception` by itself, whatever is observed."""
-    dt: float | None = None
-    """The tick [s] that it was made for; None for any."""
-    action_space: Any = None
-    """The space of its actions, as it declares it; None if it does not."""
-    queries_policy: bool = False
-    """Whether a policy with `predict` decides, be it behind other parts of the ego."""
-    varies: bool = False
-    """Whether it says that its answers differ from run to run, by randomness that is not part of x."""
-    noise: NoiseSource | None = None
-    """Its part that has noise in x; None without one."""
-    observation_space: Any = None
-    """The space of its observations, as it declares it; None if it does not."""
-
-    @property
-    def observation(self) -> str:
-        """The first kind of observation that fits, "features" if none does."""
-        return self.observations[0] if self.observations else "features"
-
-    def noise_columns(self, world: World) -> int:
-        """Return how many columns of x are its own noise, the last ones."""
-        return 0 if self.noise is None else self.noise.noise_columns(world)
-
-
-@dataclass(frozen=True)
-class FunctionEgo:
-    """A function from observations to actions as an ego."""
-
-    function: Callable[[Any], Any]
-    """Maps observations of B scenarios, (B, ...) or several of that kind by name, to actions, (B, 2) in [-1, 1] or
-    whole numbers (B,)."""
-
-    def predict(
-        self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = True
-    ) -> tuple[NDArray[Any], Any]:
-        """Stable-Baselines3's `predict`; the function has no memory."""
-        return np.asarray(self.function(observation)), state
-
-
-@dataclass(frozen=True)
-class ModuleEgo:
-    """A torch module from observations to actions as an ego: in evaluation mode, without gradients."""
-
-    module: torch.nn.Module
-    """Maps observations of B scenarios to actions, as the function of a `FunctionEgo`; float tensors in its dtype."""
-
-    def predict(
-        self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = True
-    ) -> tuple[NDArray[Any], Any]:
-        """Stable-Baselines3's `predict`; the module has no memory."""
-        self.module.eval()
-        parameter = next(self.module.parameters(), torch.empty(0))
-        shown = map_kinds(lambda part: torch.as_tensor(part).to(parameter), observation)
-        with torch.no_grad():
-            return self.module(shown).numpy(force=True), state
-
-    def decide(self, observation: Any) -> torch.Tensor:
-        """Return actions for observations of B rows, by the module on its own device."""
-        self.module.eval()
-        parameter = next(self.module.parameters(), torch.empty(0))
-        with torch.no_grad():
-            actions: torch.Tensor = self.module(map_kinds(lambda part: part.to(parameter), observation))
-        return actions
-
-
-def wrap_callable(ego: Any) -> Any:
-    """Return a policy for a plain function or a torch module, and any other ego as it is."""
-    if isinstance(ego, type) or not callable(ego) or is_policy(ego):
-        return ego
-    if any(hasattr(ego, name) for name in ("act", "in_world")):  # a driver, or an ego of worlds, that has __call__ too
-        return ego
-    return ModuleEgo(ego) if isinstance(ego, torch.nn.Module) else FunctionEgo(ego)
-
-
-_COLOUR_CHANNELS = (3, 6, 9, 12)
-"""Channels of one to four coloured frames side by side."""
-
-
-def find_fitting_kinds(observed: Any, vehicles: int = 1) -> tuple[str, ...]:
-    """Return the kinds of observation that fit the space of a policy; of several frames only if no single one does.
-
-    Args:
-        observed: The space that a policy declares. A `Dict` names the kinds, such as "camera+speed"; other spaces are
-            known by their shape, and pictures of any size are those of the camera.
-        vehicles: Of the scenario, whose features they are.
-
-    Returns:
-        Kinds as `rare_envs.sensors.kinds.read_kinds` writes them; none if nothing fits.
-    """
-    if isinstance(observed, spaces.Dict):
-        names = set(observed.spaces)
-        return (read_kinds(sorted(names)),) if names and names <= set(OBSERVATIONS) else ()
-    if _shows_pictures(observed):
-        return ("camera",)
-    found = {kind: find_frame_stacking(observation_space(vehicles, kind), observed) for kind in OBSERVATIONS}
-    single = tuple(kind for kind, frames in found.items() if frames == (1, False))
-    return single or tuple(kind for kind, frames in found.items() if frames is not None and kind != "speed")
-
-
-def _shows_pictures(observed: Any) -> bool:
-    """Return whether a space is that of coloured pictures, of one frame or several, channels first or last.
-
-    The channels are the shorter of these two axes; the other one is a side of the picture, of any length.
-    """
-    shape = getattr(observed, "shape", None)  # whatever a user's ego declares
-    if not isinstance(shape, tuple) or getattr(observed, "dtype", None) != np.uint8:
-        return False
-    return len(shape) in (3, 4) and min(shape[-1], shape[-3]) in _COLOUR_CHANNELS
-
-
-def choose_observation(needs: EgoNeeds, vehicles: int) -> str:
-    """Return the kinds of observation of an ego for which nobody names them.
-
-    Args:
-        needs: Of the ego.
-        vehicles: Of the scenario.
-    """
-    if len(needs.observations) == 1:
-        return needs.observations[0]
-    if needs.observations:
-        fitting = " and ".join(needs.observations)
-        raise ValueError(f"The ego's observations fit {fitting}: say which by observation=... (--observation).")
-    known = {kind: observation_space(vehicles, kind).shape for kind in OBSERVATIONS}
-    given = ", ".join(f"{kind} {shape}" for kind, shape in known.items())
-    other = ELSEWHERE if len(getattr(needs.observation_space, "shape", None) or ()) > 1 else ""
-    raise ValueError(
-        f"The ego expects observations {needs.observation_space}, the environment gives one of {given}; train it on "
-        f"one of these{other}."
-    )
-
-
-def choose_action(action_space: Any, observation: str) -> str:
-    """Return the kind of actions of an ego for which nobody names it.
-
-    Numbers from 0 to 4 are taken as five accelerations, but for policies with HighwayEnv's kinematics, which may as
-    well have been trained with its meta-actions.
-
-    Args:
-        action_space: The space that a policy declares; None if it does not.
-        observation: Its kinds of observation.
-    """
-    if takes_indices(action_space) and "kinematics" in observation.split("+"):
-        raise ValueError(
-            "The ego's actions 0 to 4 fit two kinds: HighwayEnv's meta-actions (action='meta', --action meta; or the "
-            "environment's id with -kinematics) and five accelerations (action='discrete', --action discrete); say "
-            "which."
-        )
-    return "continuous"
-
-
-def takes_indices(action_space: Any) -> bool:
-    """Return whether actions are numbers from 0 to 4, which meta-actions are and accelerations by index too."""
-    return isinstance(action_space, spaces.Discrete) and int(action_space.n) == len(DISCRETE_ACTIONS)
-
-
-AMBIGUOUS = (
-    "the ego's actions 0 to 4 were taken as five accelerations; one that was trained in HighwayEnv needs "
-    "action='meta' (--action meta)"
-)
-"""HighwayEnv's meta-actions and our discrete ones are both numbers from 0 to 4, and their spaces are equal."""
-TAKEN_AS_ACCELERATIONS = (
-    "the ego's actions 0 to 4 were taken as five accelerations; --action discrete says so without this note, and one "
-    "that was trained with action='meta' needs --action meta"
-)
-"""Likewise for policies without HighwayEnv's observation, which rarely have its actions."""
-RESCALED = (
-    "the ego's actions, between {low} and {high}, are mapped to [-1, 1] as RescaleAction does; if they are in units of "
-    "their own, put a function of yours around it"
-)
-"""A policy's bounds do not say whether they are those of a wrapper or units."""
-DRIVES_ITSELF = "the ego accelerates and steers by itself: action={action!r} (--action {action}) changes nothing for it"
-"""Scripts and learned drivers have no actions of another kind."""
-
-
-class AmbiguousActions(UserWarning):
-    """An ego's actions can be taken in two ways, or are not of the kind that was named."""
-
-
-class MissingStatistics(UserWarning):
-    """An ego seems to have been trained on normalised observations, and the statistics are not there."""
-
-
-def name_ambiguities(action_space: Any, kinds: Collection[str]) -> tuple[str, ...]:
-    """Return in how many ways the actions of a policy can be taken, where continuous ones are expected.
-
-    Args:
-        action_space: The policy's; None if it has none.
-        kinds: Of observations that it gets.
-    """
-    found = []
-    if takes_indices(action_space):
-        found.append(AMBIGUOUS if "kinematics" in kinds else TAKEN_AS_ACCELERATIONS)
-    bounds = find_action_bounds(action_space)
-    if bounds is not None:
-        found.append(RESCALED.format(low=_round(bounds[0]), high=_round(bounds[1])))
-    return tuple(found)
-
-
-def _round(bounds: NDArray[Any]) -> list[float]:
-    """Return bounds as people write them: float32 makes 0.10000000149011612 of 0.1."""
-    return [float(f"{value:.4g}") for value in bounds]
-
-
-RULE_BASED_EGOS: Mapping[str, Any] = MappingProxyType({"idm": IDM(), "human": HumanEgo()})
-"""Egos that are known by a name."""
 
 
 @runtime_checkable
@@ -296,6 +69,195 @@ class WrappedEgo(WorldEgo, Protocol):
         """The ego behind it."""
 
 
+@dataclass(frozen=True)
+class EgoNeeds:
+    """Needs of an ego, and its statements about itself; `resolve` finds it out."""
+
+    observations: tuple[str, ...] = ("features",)
+    """Kinds of observation that its space fits, each as `rare_envs.sensors.kinds.read_kinds` writes it; one where it
+    declares none."""
+    lidar: bool = False
+    """Whether it reads `Episode.perception` by itself, whatever is observed."""
+    dt: float | None = None
+    """The tick [s] that it was made for; None for any."""
+    action_space: Any = None
+    """The space of its actions, as it declares it; None if it does not."""
+    queries_policy: bool = False
+    """Whether a policy with `predict` decides, be it behind other parts of the ego."""
+    varies: bool = False
+    """Whether it says that its answers differ from run to run, by randomness that is not part of x."""
+    noise: WorldEgo | None = None
+    """Its part that has noise in x; None without one."""
+    observation_space: Any = None
+    """The space of its observations, as it declares it; None if it does not."""
+
+    @property
+    def observation(self) -> str:
+        """The first kind of observation that fits, "features" if none does."""
+        return self.observations[0] if self.observations else "features"
+
+    def noise_columns(self, world: World) -> int:
+        """Return how many columns of x are its own noise, the last ones."""
+        return 0 if self.noise is None else self.noise.noise_columns(world)
+
+
+@dataclass(frozen=True)
+class FunctionEgo:
+    """A function from observations to actions as an ego."""
+
+    function: Callable[[Any], Any]
+    """Maps observations of B scenarios, (B, ...) or several of that kind by name, to actions, (B, 2) in [-1, 1] or
+    whole numbers (B,)."""
+
+    def predict(
+        self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = True
+    ) -> tuple[NDArray[Any], Any]:
+        """Stable-Baselines3's `predict`; the function has no memory."""
+        return np.asarray(self.function(observation)), state
+
+
+@dataclass(frozen=True)
+class ModuleEgo:
+    """A torch module from observations to actions as an ego: in evaluation mode, without gradients."""
+
+    module: torch.nn.Module
+    """Maps observations of B scenarios to actions, as the function of a `FunctionEgo`; float tensors in its dtype."""
+
+    def predict(
+        self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = True
+    ) -> tuple[NDArray[Any], Any]:
+        """Stable-Baselines3's `predict`; the module has no memory."""
+        return self.decide(observation).numpy(force=True), state
+
+    def decide(self, observation: Any) -> torch.Tensor:
+        """Return actions for observations of B rows, arrays or tensors, by the module on its own device."""
+        self.module.eval()
+        parameter = next(self.module.parameters(), torch.empty(0))
+        shown = map_kinds(lambda part: torch.as_tensor(part).to(parameter), observation)
+        with torch.no_grad():
+            actions: torch.Tensor = self.module(shown)
+        return actions
+
+
+def wrap_callable(ego: Any) -> Any:
+    """Return a policy for a plain function or a torch module, and any other ego as it is."""
+    if isinstance(ego, type) or not callable(ego) or is_policy(ego):
+        return ego
+    if any(hasattr(ego, name) for name in ("act", "in_world")):  # a driver, or an ego of worlds, that has __call__ too
+        return ego
+    return ModuleEgo(ego) if isinstance(ego, torch.nn.Module) else FunctionEgo(ego)
+
+
+_COLOUR_CHANNELS = (3, 6, 9, 12)
+"""Channels of one to four coloured frames side by side."""
+
+
+def find_fitting_kinds(observed: Any, vehicles: int = 1) -> tuple[str, ...]:
+    """Return the kinds of observation that fit the space of a policy, among so many vehicles; none if nothing does.
+
+    A `Dict` names the kinds, such as "camera+speed"; other spaces are known by their shape, and pictures of any size
+    are those of the camera. Several frames fit only if no single one does.
+    """
+    if isinstance(observed, spaces.Dict):
+        names = set(observed.spaces)
+        return (read_kinds(sorted(names)),) if names and names <= set(OBSERVATIONS) else ()
+    if _shows_pictures(observed):
+        return ("camera",)
+    found = {kind: find_frame_stacking(observation_space(vehicles, kind), observed) for kind in OBSERVATIONS}
+    single = tuple(kind for kind, frames in found.items() if frames == (1, False))
+    return single or tuple(kind for kind, frames in found.items() if frames is not None and kind != "speed")
+
+
+def _shows_pictures(observed: Any) -> bool:
+    """Return whether a space is that of coloured pictures, of one frame or several, channels first or last.
+
+    The channels are the shorter of these two axes; the other one is a side of the picture, of any length.
+    """
+    shape = getattr(observed, "shape", None)  # whatever a user's ego declares
+    if not isinstance(shape, tuple) or getattr(observed, "dtype", None) != np.uint8:
+        return False
+    return len(shape) in (3, 4) and min(shape[-1], shape[-3]) in _COLOUR_CHANNELS
+
+
+def choose_observation(needs: EgoNeeds, vehicles: int) -> str:
+    """Return the kinds of observation of an ego for which nobody names them, in a scenario with so many vehicles."""
+    if len(needs.observations) == 1:
+        return needs.observations[0]
+    if needs.observations:
+        fitting = " and ".join(needs.observations)
+        raise ValueError(f"The ego's observations fit {fitting}: say which by observation=... (--observation).")
+    known = {kind: observation_space(vehicles, kind).shape for kind in OBSERVATIONS}
+    given = ", ".join(f"{kind} {shape}" for kind, shape in known.items())
+    other = ELSEWHERE if len(getattr(needs.observation_space, "shape", None) or ()) > 1 else ""
+    raise ValueError(
+        f"The ego expects observations {needs.observation_space}, the environment gives one of {given}; train it on "
+        f"one of these{other}."
+    )
+
+
+def choose_action(action_space: Any, observation: str) -> str:
+    """Return the kind of actions of an ego for which nobody names it.
+
+    Numbers from 0 to 4 are taken as five accelerations, but for policies with HighwayEnv's kinematics, which may as
+    well have been trained with its meta-actions.
+    """
+    if takes_indices(action_space) and "kinematics" in observation.split("+"):
+        raise ValueError(
+            "The ego's actions 0 to 4 fit two kinds: HighwayEnv's meta-actions (action='meta', --action meta; or the "
+            "environment's id with -kinematics) and five accelerations (action='discrete', --action discrete); say "
+            "which."
+        )
+    return "continuous"
+
+
+def takes_indices(action_space: Any) -> bool:
+    """Return whether actions are numbers from 0 to 4, which meta-actions are and accelerations by index too."""
+    return isinstance(action_space, spaces.Discrete) and int(action_space.n) == len(DISCRETE_ACTIONS)
+
+
+AMBIGUOUS = (
+    "the ego's actions 0 to 4 were taken as five accelerations; one that was trained in HighwayEnv needs "
+    "action='meta' (--action meta)"
+)
+"""HighwayEnv's meta-actions and our discrete ones are both numbers from 0 to 4, and their spaces are equal."""
+TAKEN_AS_ACCELERATIONS = (
+    "the ego's actions 0 to 4 were taken as five accelerations; --action discrete says so without this note, and one "
+    "that was trained with action='meta' needs --action meta"
+)
+"""Likewise for policies without HighwayEnv's observation, which rarely have its actions."""
+RESCALED = (
+    "the ego's actions, between {low} and {high}, are mapped to [-1, 1] as RescaleAction does; if they are in units of "
+    "their own, put a function of yours around it"
+)
+"""A policy's bounds do not say whether they are those of a wrapper or units."""
+DRIVES_ITSELF = "the ego accelerates and steers by itself: action={action!r} (--action {action}) changes nothing for it"
+"""Scripts and learned drivers have no actions of another kind."""
+
+
+class AmbiguousActions(UserWarning):
+    """An ego's actions can be taken in two ways, or are not of the kind that was named."""
+
+
+class MissingStatistics(UserWarning):
+    """An ego seems to have been trained on normalised observations, and the statistics are not there."""
+
+
+def name_ambiguities(action_space: Any, kinds: Collection[str]) -> tuple[str, ...]:
+    """Return in how many ways a policy's actions can be taken, with these observations and "continuous" actions."""
+    found = []
+    if takes_indices(action_space):
+        found.append(AMBIGUOUS if "kinematics" in kinds else TAKEN_AS_ACCELERATIONS)
+    bounds = find_action_bounds(action_space)
+    if bounds is not None:  # as people write them: float32 makes 0.10000000149011612 of 0.1
+        low, high = ([float(f"{value:.4g}") for value in bound] for bound in bounds)
+        found.append(RESCALED.format(low=low, high=high))
+    return tuple(found)
+
+
+RULE_BASED_EGOS: Mapping[str, Any] = MappingProxyType({"idm": IDM(), "human": HumanEgo()})
+"""Egos that are known by a name."""
+
+
 def resolve(ego: Any, vehicles: int = 1) -> EgoNeeds:
     """Return what an ego needs of its world.
 
@@ -318,17 +280,7 @@ def resolve(ego: Any, vehicles: int = 1) -> EgoNeeds:
     """
     ego = find_rule_based(ego)
     if isinstance(ego, WrappedEgo):
-        inner = resolve(ego.ego, vehicles)
-        return EgoNeeds(
-            inner.observations,
-            inner.lidar,
-            inner.dt,
-            inner.action_space,
-            inner.queries_policy,
-            inner.varies,
-            ego,
-            inner.observation_space,
-        )
+        return replace(resolve(ego.ego, vehicles), noise=ego)
     if isinstance(ego, WorldEgo):
         return EgoNeeds(noise=ego)
     if is_policy(ego):

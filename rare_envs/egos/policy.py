@@ -1,21 +1,23 @@
-"""Policies as drivers: objects with the `predict` of Stable-Baselines3, and the check of their spaces."""
+"""Policies as drivers: the check of their spaces, queries of whole batches, and the rows on which they fail."""
 
 from __future__ import annotations
 
+import math
+import reprlib
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import torch
 from gymnasium import spaces
+from numpy.typing import NDArray
 from torch import Tensor
 
-from rare_envs.control.actions import DISCRETE_ACTIONS, IDLE, META_ACTIONS, to_physical
+from rare_envs.control.actions import DISCRETE_ACTIONS, IDLE, META_ACTIONS, read_actions, to_physical
 from rare_envs.devices import move_to
 from rare_envs.egos.dense_policies import DenseInference, find_inference
-from rare_envs.egos.errors import refuse_ego
-from rare_envs.egos.inference import PolicyQuery, query_policy
-from rare_envs.egos.needs import RULE_BASED_EGOS, EgoNeeds, ModuleEgo, WorldEgo, find_rule_based, resolve
+from rare_envs.egos.errors import NoAnswer, reason_of, refuse_ego
+from rare_envs.egos.needs import RULE_BASED_EGOS, EgoNeeds, ModuleEgo, WorldEgo, find_rule_based, resolve, takes_indices
 from rare_envs.egos.wrappers import find_frame_stacking, wrap_policy
 from rare_envs.sensors.kinds import map_kinds
 from rare_envs.simulation.background import Background, TrafficBackground
@@ -47,23 +49,133 @@ class PolicyDriver:
         No episode shows a policy what comes after its collision, so those rows are shown what another row sees, and
         their actions are ignored. The same holds for rows on which it failed before.
         """
-        state, device = episode.state, episode.state.x.device
-        batch = len(state.x)
+        x = episode.state.x
         hidden, tick, policy = (None, 0, find_inference(self.policy)) if memory is None else memory
         if tick % self.stride:
-            return torch.full((batch,), IDLE, device=device), (hidden, tick + 1, policy)
-        seen = observe(episode, self.observation)
+            return torch.full((len(x),), IDLE, device=x.device), (hidden, tick + 1, policy)
         over = episode.collided.cpu()
         if self.failed_rows:
             over = over.clone()
             over[list(self.failed_rows)] = True
-        observation = map_kinds(lambda part: _replace_rows(part.cpu(), over).numpy(force=True), seen)
-        start = np.full(batch, memory is None)
-        actions, hidden = query_policy(
-            policy, self.action, PolicyQuery(observation, hidden, start, over), self.failed_rows
-        )
-        actions = actions.to(state.x) if actions.is_floating_point() else actions.to(device)
+        seen = observe(episode, self.observation)
+        shown = map_kinds(lambda part: _replace_rows(part.cpu(), over).numpy(force=True), seen)
+        query = PolicyQuery(shown, hidden, np.full(len(x), memory is None), over)
+        actions, hidden = query_policy(policy, self.action, query, self.failed_rows)
+        actions = actions.to(x) if actions.is_floating_point() else actions.to(x.device)
         return actions, (hidden, tick + 1, policy)
+
+
+def _replace_rows(observation: Tensor, rows: Tensor) -> Tensor:
+    """Return an observation in which some rows are replaced by the first other row, or by zeros if there is none."""
+    replaced = rows.numpy(force=True)
+    if not replaced.any():
+        return observation
+    wide = rows.view(-1, *[1] * (observation.ndim - 1))
+    if replaced.all():
+        return observation.masked_fill(wide, 0)
+    return torch.where(wide, observation[int(replaced.argmin())], observation)
+
+
+class PolicyQuery(NamedTuple):
+    """A query of B rows."""
+
+    observation: Any
+    """Shape (B, ...), or several of that kind by name."""
+    hidden: Any
+    """The policy's memory; None at the start, and always if it has none."""
+    start: NDArray[np.bool_]
+    """Rows that begin an episode, shape (B,)."""
+    over: Tensor
+    """Rows whose action does not matter, boolean, shape (B,), on the CPU as all of it."""
+
+    def rows(self, part: slice) -> PolicyQuery:
+        """Return some of the rows, for a policy without a memory."""
+        return PolicyQuery(map_kinds(lambda one: one[part], self.observation), None, self.start[part], self.over[part])
+
+
+def query_policy(
+    policy: Any, kind: str, query: PolicyQuery, failed_rows: dict[int, str] | None = None
+) -> tuple[Tensor, Any]:
+    """Return what `read_actions` makes of a policy's actions, "continuous" or "meta", and its memory.
+
+    `failed_rows` takes the rows on which it fails, with the reason; they get the action of a row that does not matter.
+    An error is raised if it is None, or on a batch that cannot be split because the policy has a memory.
+    """
+    if failed_rows is None:
+        try:
+            action, hidden = _predict(policy, query)
+        except NoAnswer:  # its connection may have been lost
+            action, hidden = _predict(policy, query)
+        return read_actions(kind, action, len(query.start), query.over), hidden
+    try:
+        actions, hidden, reasons = _query_with_reasons(policy, kind, query)
+    except (Exception, SystemExit) as error:  # the policy is the user's: anything may happen in it
+        if query.hidden is not None:
+            raise
+        hidden, (actions, reasons) = None, _isolate_failing_rows(policy, kind, query, error, len(query.start))
+    failed_rows.update(reasons)
+    return actions, hidden
+
+
+def _predict(policy: Any, query: PolicyQuery) -> tuple[Tensor, Any]:
+    with np.errstate():  # a policy that sets NumPy's errors sets them for itself
+        action, hidden = policy.predict(
+            query.observation, state=query.hidden, episode_start=query.start, deterministic=True
+        )
+    actions = np.asarray(action)
+    if actions.dtype.kind not in "biuf":
+        raise ValueError(f"Expected actions as numbers, one or two for each observation, got {reprlib.repr(action)}.")
+    return torch.as_tensor(actions), hidden
+
+
+def _query_with_reasons(policy: Any, kind: str, query: PolicyQuery) -> tuple[Tensor, Any, dict[int, str]]:
+    """Return actions, memory, and the reasons of rows that matter with actions that are not finite."""
+    (action, hidden), over = _predict(policy, query), query.over
+    bad = torch.zeros_like(over)
+    if action.is_floating_point() and action.ndim == 2 and len(action) == len(over):
+        bad = ~torch.isfinite(action).all(dim=1) & ~over
+    reasons = dict.fromkeys(bad.nonzero()[:, 0].tolist(), "NaN or infinite actions")
+    return read_actions(kind, action, len(over), over | bad), hidden, reasons
+
+
+def _isolate_failing_rows(
+    policy: Any, kind: str, query: PolicyQuery, error: BaseException, whole: int
+) -> tuple[Tensor, dict[int, str]]:
+    """Query again after an error, in parts of the `whole` until the rows that fail stand alone.
+
+    The rule is that of `samplers.workers.split_rows`, for the rows of one tick: no other tick is driven again. Halves
+    take the fewest queries. If no answer came, queries are cheap, but waiting for one that does not come, or for a
+    process that starts again, is not: then the root of the whole batch, and after that each row alone. The error is
+    raised if the policy turns out to have a memory.
+    """
+    n = len(query.start)
+    root = math.isqrt(whole) if isinstance(error, NoAnswer) else (n + 1) // 2
+    size = root if 1 < root < n else 1
+    actions, reasons = list[Tensor](), dict[int, str]()
+    for first in range(0, n, size):
+        part = query.rows(slice(first, first + size))
+        try:
+            if n == 1 and isinstance(error, NoAnswer):
+                raise error  # it is not waited for once more
+            found, hidden, why = _query_with_reasons(policy, kind, part)
+        except (Exception, SystemExit) as raised:  # the policy is the user's: anything may happen in it
+            if len(part.start) > 1:
+                found, why = _isolate_failing_rows(policy, kind, part, raised, whole)
+            else:
+                found, why = _ignored_action(kind, part.over), {0: reason_of(raised)}
+        else:
+            if hidden is not None:
+                raise error
+        actions.append(found)
+        reasons.update({first + row: reason for row, reason in why.items()})
+    return torch.cat(actions), reasons
+
+
+def _ignored_action(kind: str, over: Tensor) -> Tensor:
+    """Return the action of rows whose action does not matter, for as many rows as `over` has."""
+    batch = len(over)
+    nothing = torch.zeros(batch, dtype=torch.int64) if kind == "meta" else torch.zeros(batch, 2)
+    return read_actions(kind, nothing, batch, torch.ones_like(over))
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,10 +201,7 @@ class DevicePolicyDriver:
 def find_device_driver(driver: Driver, device: torch.device, before: Driver | None = None) -> Driver | None:
     """Return what decides as a driver does on a GPU, with its present weights; None if only the CPU can query it.
 
-    Args:
-        driver: The ego.
-        device: The GPU.
-        before: What this returned before, to be returned again if nothing has changed.
+    What this returned before is returned again if nothing has changed.
     """
     if not isinstance(driver, PolicyDriver):
         return driver
@@ -103,17 +212,6 @@ def find_device_driver(driver: Driver, device: torch.device, before: Driver | No
     if isinstance(before, DevicePolicyDriver) and isinstance(placed, DenseInference) and placed.equals(before.policy):
         return before
     return DevicePolicyDriver(placed, driver.observation)
-
-
-def _replace_rows(observation: Tensor, rows: Tensor) -> Tensor:
-    """Return an observation in which some rows are replaced by the first other row, or by zeros if there is none."""
-    replaced = rows.numpy(force=True)
-    if not replaced.any():
-        return observation
-    wide = rows.view(-1, *[1] * (observation.ndim - 1))
-    if replaced.all():
-        return observation.masked_fill(wide, 0)
-    return torch.where(wide, observation[int(replaced.argmin())], observation)
 
 
 def as_driver(ego: Any, world: World, needs: EgoNeeds | None = None) -> Driver:
@@ -156,41 +254,27 @@ def as_driver(ego: Any, world: World, needs: EgoNeeds | None = None) -> Driver:
 
 
 def check_spaces(ego: Any, expected: spaces.Space[Any], action: str = "continuous", declared: str = "features") -> None:
-    """Refuse an ego that was made for other observations or actions; one that declares none is accepted.
+    """Refuse an ego that was made for other observations or kinds of actions; one that declares none is accepted.
 
-    Bounds may differ: HighwayEnv declares none for the observations that are clipped here as there.
-
-    Args:
-        ego: The ego.
-        expected: The environment's observations.
-        action: Kind of the environment's actions.
-        declared: Kind of observation that the ego's space tells, for the message.
+    Bounds may differ: HighwayEnv declares none for the observations that are clipped here as there. `declared` is the
+    kind of observation that the ego's space tells, for the message.
     """
-    observed = getattr(ego, "observation_space", None)  # a Stable-Baselines3 model, or anybody's object
+    observed, acted = (getattr(ego, f"{name}_space", None) for name in ("observation", "action"))  # anybody's object
     if observed is not None and find_frame_stacking(expected, observed) is None:
         which = "another observation" if declared == "features" else f"observation={declared!r}"
         raise ValueError(
             f"The ego expects observations {observed}, the environment gives {expected}; "
             f"train it in this environment or choose {which}."
         )
-    acted = getattr(ego, "action_space", None)  # likewise
-    if acted is not None and action == "meta":
-        if not (isinstance(acted, spaces.Discrete) and int(acted.n) == len(META_ACTIONS)):
-            raise ValueError(
-                f"The ego acts in {acted}, the environment takes Discrete({len(META_ACTIONS)}) "
-                f"({', '.join(META_ACTIONS)}); leave action='meta' out for an ego that accelerates and steers."
-            )
-        return
-    discrete = isinstance(acted, spaces.Discrete) and int(acted.n) == len(DISCRETE_ACTIONS)
-    if acted is not None and action == "discrete" and not discrete:
-        raise ValueError(
-            f"The ego acts in {acted}, the environment takes Discrete({len(DISCRETE_ACTIONS)}) (five accelerations); "
-            "leave action='discrete' out for an ego that accelerates and steers."
-        )
     several = isinstance(acted, spaces.MultiDiscrete | spaces.MultiBinary)
-    shape = getattr(acted, "shape", None)  # whatever it declares
-    if acted is not None and not discrete and (several or shape != (2,)):
-        raise ValueError(
-            f"The ego acts in {acted}, the environment takes Box(-1, 1, (2,)) (acceleration, steering) "
-            f"or Discrete({len(DISCRETE_ACTIONS)})."
+    accelerates = action == "continuous" and getattr(acted, "shape", None) == (2,) and not several
+    if acted is None or takes_indices(acted) or accelerates:
+        return
+    wanted = f"Box(-1, 1, (2,)) (acceleration, steering) or Discrete({len(DISCRETE_ACTIONS)})."
+    if action != "continuous":
+        names = ", ".join(META_ACTIONS) if action == "meta" else "five accelerations"
+        wanted = (
+            f"Discrete({len(DISCRETE_ACTIONS)}) ({names}); leave action={action!r} out for an ego that accelerates and "
+            "steers."
         )
+    raise ValueError(f"The ego acts in {acted}, the environment takes {wanted}")

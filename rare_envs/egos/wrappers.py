@@ -111,11 +111,7 @@ def find_action_bounds(space: Any) -> tuple[NDArray[Any], NDArray[Any]] | None:
 
 
 def find_stacking(given: Shape, wanted: Shape) -> tuple[int, bool] | None:
-    """Find how many frames of shape `given` make an observation of shape `wanted`.
-
-    Returns:
-        Their number, and whether they lie along an axis of their own; None if the shapes do not go together.
-    """
+    """Return how many frames of shape `given` make an observation of shape `wanted`, and whether along a new axis."""
     if wanted == given:
         return 1, False
     if len(wanted) == len(given) + 1 and wanted[1:] == given:
@@ -127,11 +123,9 @@ def find_stacking(given: Shape, wanted: Shape) -> tuple[int, bool] | None:
 
 
 def find_frame_stacking(given: spaces.Space[Any], wanted: Any) -> tuple[int, bool] | None:
-    """Find the stacking of spaces: mappings by name, which all have to agree, and images also with channels first.
+    """Return the stacking of an environment's space in a policy's; None if they do not go together.
 
-    Args:
-        given: Space of the environment's observations.
-        wanted: Space of the policy's.
+    Mappings go by name, and all of their parts have to agree; images may also have their channels first.
     """
     if isinstance(given, spaces.Dict):
         if not isinstance(wanted, spaces.Dict) or set(given.spaces) != set(wanted.spaces):
@@ -148,13 +142,11 @@ def find_frame_stacking(given: spaces.Space[Any], wanted: Any) -> tuple[int, boo
 
 
 def wrap_policy(policy: Any, given: spaces.Space[Any]) -> Any:
-    """Return the policy behind the wrappers that it was trained with, so that it takes the environment's observations.
+    """Return the policy behind the wrappers that it was trained with, so that it takes observations of a space.
 
-    Args:
-        policy: Has `predict`. Its `action_space`, if it has one, tells the bounds of its actions, its
-            `observation_space` how many frames it sees. `get_vec_normalize_env`, if it has one, gives SB3's
-            `VecNormalize`, whose space tells whether observations are normalised before or after they are stacked.
-        given: Space of the environment's observations.
+    Its `action_space`, if it has one, tells the bounds of its actions, its `observation_space` how many frames it sees.
+    `get_vec_normalize_env`, if it has one, gives SB3's `VecNormalize`, whose space tells whether observations are
+    normalised before or after they are stacked.
     """
     # A Stable-Baselines3 model has both; anybody else's object need not.
     bounds = find_action_bounds(getattr(policy, "action_space", None))
@@ -173,13 +165,11 @@ def wrap_policy(policy: Any, given: spaces.Space[Any]) -> Any:
 
 
 def describe_missing_normalisation(policy: Any, given: spaces.Space[Any]) -> str:
-    """Return why the statistics of a policy's observations seem to be missing; "" if nothing says so.
+    """Return why the statistics of a policy's observations of a space seem to be missing; "" if nothing says so.
 
-    Args:
-        policy: A saved ego says it by `find_missing_statistics`. A Stable-Baselines3 model in memory brings those
-            of `VecNormalize`; those of Gymnasium's `NormalizeObservation` stay in its training environments, and the
-            bounds of its observations tell. Of any other object nothing is said.
-        given: Space of the environment's observations.
+    A saved ego says it by `find_missing_statistics`. A Stable-Baselines3 model in memory brings those of
+    `VecNormalize`; those of Gymnasium's `NormalizeObservation` stay in its training environments, and the bounds of its
+    observations tell. Of any other object nothing is said.
     """
     if hasattr(policy, "find_missing_statistics"):
         return str(policy.find_missing_statistics(given))

@@ -8,7 +8,7 @@ import torch
 
 from rare_envs.control.actions import IDLE
 from rare_envs.egos.errors import EgoGone, NoAnswer
-from rare_envs.egos.inference import PolicyQuery, query_policy
+from rare_envs.egos.policy import PolicyQuery, query_policy
 
 
 class Picky:
