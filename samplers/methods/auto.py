@@ -8,10 +8,9 @@ import numpy as np
 
 from samplers.method import Choice, Goal, Steps, offer_of
 from samplers.methods.base import Method
-from samplers.methods.noise_coordinates import noise_mask
+from samplers.methods.searched import noise_mask
 from samplers.methods.surrogate import Surrogate
-from samplers.methods.two_stage.method import TwoStage
-from samplers.methods.two_stage.terms.search import suits_terms
+from samplers.methods.two_stage.method import TwoStage, suits_terms
 from samplers.problem import Inputs
 from samplers.validation import check_setting
 

@@ -47,6 +47,12 @@ LONGEST_CHAIN = 50
 """More steps than this from a handful of seeds cost calls of f and add little."""
 FEWEST_SEEDS = 10
 """A level is not made smaller for the sake of the budget than this many seeds allow."""
+FEWEST_LEVELS = 2
+"""Levels to plan the rest of a budget for at least."""
+LEVEL_SHARE = 0.9
+"""Share of a level that is simulated; its seeds, p0 = 0.1 of it, are not simulated again."""
+CHAIN_POINTS = 30.0
+"""Points of a level at p0 = 0.1 for one that is independent: (1 - p0) / p0, and correlation along the chains."""
 USUAL_LEVELS = 4
 """Levels that shall fit into a small budget: down to p = p0^4, 1e-4."""
 
@@ -491,3 +497,22 @@ class AdaptiveSubsetSimulation(Method):
         )
         descent = SubsetLevels(n=self.n, p0=self.p0, max_levels=self.max_levels)
         return (yield from descent.steps(inputs, goal, rng, kernel, known))
+
+
+def spend_on_subset_simulation(
+    inputs: Inputs, goal: Goal, levels: int, budget: int, known: RootedPoints | None, rng: np.random.Generator
+) -> Steps:
+    """Run adaptive subset simulation with the points per level that a budget or a target c.o.v. asks for."""
+    levels = max(levels, FEWEST_LEVELS)
+    n = int((budget + (0 if known is None else len(known.f))) / (1 + LEVEL_SHARE * (levels + 0.5)))
+    if goal.target_cov is not None:
+        n = min(n, math.ceil(CHAIN_POINTS * (levels + 1) / goal.target_cov**2))
+    n = max(n, 10)
+    known = known and known.select(np.arange(min(n, len(known.f))))
+    outcome = yield from AdaptiveSubsetSimulation(n=n).steps(inputs, replace(goal, max_sim=budget), rng, known)
+    about = (
+        "No proposal describes the failures: p is from adaptive subset simulation with the remaining "
+        f"{budget:,} simulations; run by itself (--method adss) it uses all of them."
+    )
+    counted_before = 0 if known is None else len(known.f)
+    return replace(outcome.remark_first(about), base_draws=outcome.base_draws - counted_before)

@@ -30,7 +30,7 @@ from samplers.importance import (
 from samplers.method import Goal, Interrupted, Outcome, Steps, no_outcome_share
 from samplers.methods.base import Method
 from samplers.methods.kriging import LEARNING, POOL, PROPOSAL, RUN, Kriging, Prediction, fit_kriging
-from samplers.methods.noise_coordinates import marginalise_noise
+from samplers.methods.searched import marginalise_noise
 from samplers.methods.two_stage.method import run_two_stage
 from samplers.methods.two_stage.regions import count_lineages
 from samplers.problem import FloatArray, Inputs, StandardNormal

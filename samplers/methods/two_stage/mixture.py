@@ -28,8 +28,8 @@ from samplers.components import (
     log_ratios,
     mixture_log_ratio,
 )
-from samplers.methods.two_stage.planes import weighted_quantile
-from samplers.methods.two_stage.settings import EDGES, SUBSPACE, WEIGHTS
+from samplers.methods.two_stage.edges import weighted_quantile
+from samplers.methods.two_stage.settings import EDGES, SUBSPACE
 from samplers.problem import FloatArray
 from samplers.proposals import expectation_maximisation, posterior, shrink_covariance, start_from_centres
 from samplers.statistics import normalise_weights
@@ -328,6 +328,10 @@ def fit_radial(u: FloatArray, weights: FloatArray) -> RadialLaw:
     return RadialLaw(u.shape[1], start, shape, max(variance / mean, MIN_SCALE))
 
 
+WEIGHT_UPDATES = 60
+"""Multiplicative updates of the weights: they come within 2 % of the least second moment."""
+NEGLIGIBLE = 30.0
+"""Points whose weight is e^-30 of the largest one do not matter."""
 LEAST_DENSITY_RATIO = 1e-150
 """Least ratio of densities to divide by."""
 FLOOR_ROUNDING = 1e-12
@@ -359,13 +363,13 @@ def minimise_second_moment(
         start: First weights, shape (k,).
         floors: Lower limits of disjoint groups, kept in every update.
     """
-    matter = log_weights > log_weights.max() - WEIGHTS.negligible
+    matter = log_weights > log_weights.max() - NEGLIGIBLE
     log_r, log_weights = log_r[:, matter], log_weights[matter]
     largest = log_r.max(axis=0)
     ratio = np.exp(log_r - largest)
     scaled = np.exp(log_weights - largest - (log_weights - largest).max())
     a, limits = start, _FloorIndex.of(floors, len(start))
-    for _ in range(WEIGHTS.updates):
+    for _ in range(WEIGHT_UPDATES):
         q = np.maximum(a @ ratio, LEAST_DENSITY_RATIO)
         a = a * np.sqrt(ratio @ (scaled / (q * q)))
         a = limits.apply(a / a.sum())

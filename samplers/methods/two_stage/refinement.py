@@ -19,6 +19,8 @@ from samplers.components import (
     VonMisesFisherNakagami,
     log_ratios,
 )
+from samplers.methods.searched import ComponentDraws
+from samplers.methods.two_stage.edges import half_space_proposals, intersection_of_half_spaces, union_of_half_spaces
 from samplers.methods.two_stage.mixture import (
     NO_REGION,
     Floor,
@@ -32,11 +34,8 @@ from samplers.methods.two_stage.mixture import (
     refit_components,
     truncate_weights,
 )
-from samplers.methods.two_stage.pieces import intersection_of_half_spaces, union_of_half_spaces
-from samplers.methods.two_stage.planes import half_space_proposals
 from samplers.methods.two_stage.regions import ExplorationResult, Region
-from samplers.methods.two_stage.settings import REFINEMENT, SUBSPACE
-from samplers.methods.two_stage.simulator import ComponentDraws
+from samplers.methods.two_stage.settings import INITIAL_SHARES, REFINEMENT, SUBSPACE
 from samplers.methods.two_stage.stratified import MultipleImportanceSample
 from samplers.problem import FloatArray
 from samplers.statistics import effective_sample_size
@@ -249,7 +248,7 @@ def build_proposal(
     """
     candidates = list_candidates(state, history)
     kinds = np.array([candidate.kind for candidate in candidates])
-    start = np.array([REFINEMENT.initial_shares[c.kind] / np.count_nonzero(kinds == c.kind) for c in candidates])
+    start = np.array([INITIAL_SHARES[c.kind] / np.count_nonzero(kinds == c.kind) for c in candidates])
     weights = start / start.sum()
     if not state.rounds or len(history.u) == 0:
         return MixtureProposal(candidates, weights)
@@ -284,7 +283,7 @@ def list_candidates(state: RefinementState, history: MultipleImportanceSample) -
         *_temper_gaussians(regional, REFINEMENT.noisy_tempering if state.noisy else REFINEMENT.tempering),
     ]
     candidates += _lift_candidates(state, history)
-    return [candidate for candidate in candidates if candidate.kind in REFINEMENT.initial_shares]
+    return [candidate for candidate in candidates if candidate.kind in INITIAL_SHARES]
 
 
 def _lift_candidates(state: RefinementState, history: MultipleImportanceSample) -> list[ProposalComponent]:

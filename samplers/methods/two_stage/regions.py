@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from scipy.special import betaincinv
 
 from samplers.importance import Draws, weighted_interval
-from samplers.methods.two_stage.planes import descent_direction
+from samplers.methods.searched import SimulationSteps, Simulator
+from samplers.methods.two_stage.edges import descent_direction
 from samplers.methods.two_stage.settings import REGIONS, SUBSPACE
-from samplers.methods.two_stage.simulator import SimulationSteps, Simulator
 from samplers.problem import FloatArray
 from samplers.statistics import PRIOR_SHARE, Interval, add_unseen, effective_sample_size, skewed_upper_end
 

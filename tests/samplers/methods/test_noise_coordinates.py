@@ -8,7 +8,7 @@ from scipy import stats
 
 import samplers
 from samplers.limit_states import Reference
-from samplers.methods.noise_coordinates import marginalise_noise
+from samplers.methods.searched import marginalise_noise
 from samplers.problem import FunctionProblem, StandardNormal
 
 PHI = stats.norm.cdf

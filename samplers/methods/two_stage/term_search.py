@@ -14,28 +14,29 @@ suffers. Where the rounds show that they are wrong, adaptive subset simulation t
 """
 
 import math
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable, Generator
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import TypeVar, cast
 
 import numpy as np
+from numpy.typing import NDArray
 
 from samplers.importance import Draws, weight_warnings, weighted_interval
 from samplers.method import Goal, Interrupted, Outcome, Steps, TermsOffer, no_outcome_share, request_terms
 from samplers.methods.monte_carlo import MonteCarlo
-from samplers.methods.two_stage.settings import DOUBTS, ROUNDS, TERMS, WALKS
-from samplers.methods.two_stage.simulator import SimulationSteps, close_trace, extend_trace
-from samplers.methods.two_stage.stages import run_subset_simulation
-from samplers.methods.two_stage.terms.fitting import PursuedTerm, TermHistory
-from samplers.methods.two_stage.terms.rounds import (
-    CombinedRounds,
-    FinalRound,
-    doubt,
-    mix_terms,
-    pursue_walked,
-    refit_terms,
+from samplers.methods.searched import SimulationSteps, close_trace, extend_trace
+from samplers.methods.subset import spend_on_subset_simulation
+from samplers.methods.two_stage.settings import (
+    DIAGNOSTICS,
+    DOUBTS,
+    FALLBACK,
+    ROUNDS,
+    TWO_STAGE,
+    WALKS,
 )
-from samplers.methods.two_stage.terms.walks import (
+from samplers.methods.two_stage.term_fitting import PursuedTerm, TermHistory, mix_terms, pursue_walked, refit_terms
+from samplers.methods.two_stage.term_walks import (
     TermSimulator,
     choose_starts,
     choose_terms,
@@ -43,10 +44,136 @@ from samplers.methods.two_stage.terms.walks import (
     walk_downhill,
 )
 from samplers.problem import FloatArray, Inputs, Terms
-from samplers.sample import Level, Status
-from samplers.statistics import binomial_cov, clopper_pearson, effective_sample_size
+from samplers.sample import DrawWeights, Level, Status
+from samplers.statistics import (
+    binomial_cov,
+    clopper_pearson,
+    effective_number,
+    effective_sample_size,
+    largest_weight_share,
+)
 
 _T = TypeVar("_T")
+
+
+MIN_STRATUM_DRAWS = 5
+"""Of strata with fewer draws the second moment stands in for the variance."""
+
+
+@dataclass(frozen=True, eq=False)
+class FinalRound:
+    """Draws of one proposal that p rests on."""
+
+    x: FloatArray
+    """Shape (n, d)."""
+    terms: Terms
+    log_weights: FloatArray
+    """log(phi / q), shape (n,)."""
+    strata: NDArray[np.int64]
+    """Shape (n,)."""
+    factor: float
+    """Weight of one of its draws in p, relative to other rounds."""
+    first: int
+    """Simulations that the run had spent before its first draw."""
+
+    def y(self, gamma: float) -> FloatArray:
+        """Weight times indicator of failure, shape (n,)."""
+        return np.asarray(np.where(self.terms.f <= gamma, np.exp(self.log_weights), 0.0))
+
+    def variance(self, gamma: float) -> float:
+        """Return the variance of the mean of y, from the variances within the strata."""
+        y = self.y(gamma)
+        n, s1, s2 = (np.bincount(self.strata, weights=w) for w in (np.ones(len(y)), y, y * y))
+        many = n >= MIN_STRATUM_DRAWS
+        within = ((s2[many] - s1[many] ** 2 / n[many]) * n[many] / (n[many] - 1)).sum() + s2[~many].sum()
+        return float(max(within, 0.0) + (y.max() ** 2 if len(y) else 0.0)) / len(y) ** 2
+
+
+@dataclass(frozen=True, eq=False)
+class CombinedRounds:
+    """Final rounds as one estimate: p = sum_r c_r p_r, c_r proportional to the draws times their factor."""
+
+    rounds: tuple[FinalRound, ...]
+    gamma: float
+
+    @cached_property
+    def shares(self) -> FloatArray:
+        """c_r, adding up to 1."""
+        size = np.array([one.factor * len(one.log_weights) for one in self.rounds])
+        return np.asarray(size / size.sum())
+
+    @cached_property
+    def means(self) -> FloatArray:
+        """p_r."""
+        return np.array([one.y(self.gamma).mean() for one in self.rounds])
+
+    @cached_property
+    def p(self) -> float:
+        """The estimate."""
+        return float(self.shares @ self.means)
+
+    @cached_property
+    def cov(self) -> float:
+        """C.o.v. of p, inf where it is 0, from the larger of the variances within the strata and between the rounds."""
+        p, c = self.p, self.shares
+        if p == 0:
+            return math.inf
+        within = float(c**2 @ [one.variance(self.gamma) for one in self.rounds])
+        between = DOUBTS.between_factor * float(c**2 @ (self.means - p) ** 2)
+        return math.sqrt(max(within, between)) / p
+
+    @cached_property
+    def draws(self) -> Draws:
+        """All draws as those from one proposal, with the same p."""
+        n = sum(len(one.log_weights) for one in self.rounds)
+        scaled = [
+            one.log_weights + math.log(c * n / len(one.log_weights))
+            for one, c in zip(self.rounds, self.shares, strict=True)
+        ]
+        f, x = (np.concatenate(parts) for parts in zip(*((one.terms.f, one.x) for one in self.rounds), strict=True))
+        return Draws.from_outcomes(f, np.concatenate(scaled), x, self.gamma)
+
+    @property
+    def draw_weights(self) -> tuple[DrawWeights, ...]:
+        """Weight of every draw in p."""
+        return tuple(
+            DrawWeights(first=one.first, log_weights=one.log_weights + math.log(c / len(one.log_weights)))
+            for one, c in zip(self.rounds, self.shares, strict=True)
+        )
+
+    def interval(self, confidence: float, base_share: float, cov: float, ceiling: float) -> tuple[float, float]:
+        """Return the log-normal interval; with t quantiles and Bernstein's bound where few draws carry p."""
+        factors = self.shares / np.array([len(one.log_weights) for one in self.rounds])
+        largest = float(factors.max() * sum(len(one.log_weights) for one in self.rounds)) / base_share
+        return weighted_interval(self.draws, confidence, largest, cov, ceiling)
+
+    def share_of_others(self, pursued: list[int]) -> float:
+        """Return the share of p in failures whose least term was not pursued, and in points without an outcome."""
+        total = other = 0.0
+        for c, one in zip(self.shares, self.rounds, strict=True):
+            y = c * one.y(self.gamma) / len(one.log_weights)
+            total += float(y.sum())
+            other += float(y[~np.isin(one.terms.least, pursued) | np.isneginf(one.terms.f)].sum())
+        return other / total if total > 0 else 0.0
+
+
+def doubt(combined: CombinedRounds, pursued: list[int]) -> list[str]:
+    """Return the warnings about an estimate."""
+    every = "failing draws of all rounds" if len(combined.rounds) > 1 else "failing draws"
+    warnings = [text.replace("failing draws", every) for text in weight_warnings(combined.draws)]
+    last = combined.rounds[-1].y(combined.gamma)
+    ess = effective_number(last)
+    if 0 < ess < DOUBTS.min_ess:
+        warnings.append(
+            f"Effective sample size of the last round's failing draws: {ess:.0f}; its standard error is unreliable."
+        )
+    failing = last[last > 0]
+    if len(failing) and largest_weight_share(np.log(failing)) > DIAGNOSTICS.max_point_share:
+        warnings.append(f"One draw carries more than {100 * DIAGNOSTICS.max_point_share:.0f} % of the last round.")
+    other = combined.share_of_others(pursued)
+    if other > DOUBTS.max_other_share:
+        warnings.append(f"{100 * other:.0f} % of p comes from terms without a proposal of their own.")
+    return warnings
 
 
 def ordering_values(terms: Terms, gamma: float) -> FloatArray:
@@ -63,12 +190,7 @@ def ordering_values(terms: Terms, gamma: float) -> FloatArray:
 def answer_by_terms(
     steps: Generator[FloatArray, FloatArray, _T], read: Callable[[FloatArray, Terms], FloatArray]
 ) -> Generator[FloatArray, FloatArray, _T]:
-    """Run steps that ask for f, with terms requested in its place; return what they return.
-
-    Args:
-        steps: Yields points x (n, d), is sent numbers (n,).
-        read: Gives these numbers from points and their terms.
-    """
+    """Run steps that ask for f (n,) at points (n, d), with terms requested in its place, from which `read` gives f."""
     answer: FloatArray | None = None
     while True:
         try:
@@ -101,24 +223,11 @@ def order_by_terms(steps: Steps, gamma: float) -> Steps:
         f_of.update(zip(answer.tolist(), terms.f.tolist(), strict=True))
         return answer
 
-    return _with_f((yield from answer_by_terms(steps, read)), f_of)
-
-
-def _with_f(outcome: Outcome, f_of: dict[float, float]) -> Outcome:
-    """Return the outcome with f in place of the order among its points."""
+    outcome = yield from answer_by_terms(steps, read)
     if outcome.sample is None:
         return outcome
-    return replace(outcome, sample=replace(outcome.sample, f=_look_up(outcome.sample.f.tolist(), f_of), layers=()))
-
-
-def _look_up(values: Sequence[float], f_of: dict[float, float]) -> FloatArray:
-    return np.array([f_of.get(value, value) for value in values])
-
-
-def suits_terms(inputs: Inputs, offer: TermsOffer | None, budget: int) -> bool:
-    """Return whether to search by terms: terms and gradients are offered, x is long and the budget holds a search."""
-    offered = offer is not None and offer.gradient_cost is not None
-    return offered and inputs.dim >= TERMS.min_dim and budget >= TERMS.min_budget
+    f = np.array([f_of.get(value, value) for value in outcome.sample.f.tolist()])
+    return replace(outcome, sample=replace(outcome.sample, f=f, layers=()))
 
 
 @dataclass(frozen=True, eq=False)
@@ -165,11 +274,11 @@ class SearchState:
 def search_terms(inputs: Inputs, offer: TermsOffer, goal: Goal, budget: int, rng: np.random.Generator) -> Steps:
     """Estimate P[f(X) <= goal.gamma] by terms and their gradients."""
     open_ended = goal.max_sim is None and goal.target_cov is not None
-    end = budget + ROUNDS.max_batches * ROUNDS.target_batch if open_ended else budget
+    end = budget + TWO_STAGE.max_batches * ROUNDS.target_batch if open_ended else budget
     search = TermSearch(TermSimulator(inputs, offer), goal, budget, end, rng)
     state = yield from _draw_base(search)
     try:
-        if state.base_rate >= ROUNDS.common_share:
+        if state.base_rate >= TWO_STAGE.common_share:
             return (yield from _run_monte_carlo(search, state))
         state = yield from _walk(search, state)
         state = yield from _run_rounds(search, state)
@@ -263,7 +372,7 @@ def _gives_up(search: TermSearch, state: SearchState) -> bool:
     They do not where a draw is worth less than `fallback_rate` failures, or less than a base draw.
     """
     worthless = state.last_rate < max(DOUBTS.fallback_rate, state.base_rate)
-    return worthless and search.left >= DOUBTS.min_fallback_budget
+    return worthless and search.left >= FALLBACK.min_fallback_budget
 
 
 def _estimate(search: TermSearch, state: SearchState) -> Steps:
@@ -274,7 +383,7 @@ def _estimate(search: TermSearch, state: SearchState) -> Steps:
     ceiling = state.ceiling
     while not stopped:
         number = len(state.finals)
-        if number and goal.target_cov is not None and _combine(search, state).cov(_between(search)) <= goal.target_cov:
+        if number and goal.target_cov is not None and _combine(search, state).cov <= goal.target_cov:
             break
         size, factor = plan[number] if number < len(plan) else (ROUNDS.target_batch, 1.0)
         last = number == len(plan) - 1
@@ -292,10 +401,6 @@ def _estimate(search: TermSearch, state: SearchState) -> Steps:
     return _conclude(search, state, stopped) if state.finals else _estimate_early(search, state)
 
 
-def _between(search: TermSearch) -> float:
-    return DOUBTS.between_factor
-
-
 def _combine(search: TermSearch, state: SearchState) -> CombinedRounds:
     return CombinedRounds(state.finals, search.goal.gamma)
 
@@ -303,7 +408,7 @@ def _combine(search: TermSearch, state: SearchState) -> CombinedRounds:
 def _conclude(search: TermSearch, state: SearchState, stopped: bool) -> Outcome:
     """Return the outcome of the final rounds."""
     goal, combined = search.goal, _combine(search, state)
-    cov, draws = combined.cov(_between(search)), combined.draws
+    cov, draws = combined.cov, combined.draws
     state = _close_trace(search, state)
     status = Status.CONVERGED if len(draws.f) else Status.NO_HITS
     return Outcome(
@@ -343,7 +448,7 @@ def _estimate_early(search: TermSearch, state: SearchState) -> Outcome:
 def _run_monte_carlo(search: TermSearch, state: SearchState) -> Steps:
     """Spend the rest on base draws; those made so far decided on this and do not count."""
     left = search.end - search.simulator.n_sim
-    batch = ROUNDS.monte_carlo_batch if search.goal.target_cov is None else ROUNDS.target_batch
+    batch = TWO_STAGE.monte_carlo_batch if search.goal.target_cov is None else ROUNDS.target_batch
     method = MonteCarlo(n=left, batch=batch)
     outcome = yield from method.steps(search.simulator.inputs, replace(search.goal, max_sim=left), search.rng)
     return _after(search, state, outcome)
@@ -353,7 +458,7 @@ def _fall_back(search: TermSearch, state: SearchState) -> Steps:
     """Spend the rest on subset simulation in the order of the terms."""
     left, inputs = search.end - search.simulator.n_sim, search.simulator.inputs
     levels = _expected_levels(state.history, search.goal.gamma)
-    steps = run_subset_simulation(inputs, replace(search.goal, max_sim=left), levels, left, None, search.rng)
+    steps = spend_on_subset_simulation(inputs, replace(search.goal, max_sim=left), levels, left, None, search.rng)
     outcome = yield from order_by_terms(steps, search.goal.gamma)
     return _after(search, state, outcome)
 

@@ -9,25 +9,32 @@ also where the subspaces of the terms differ.
 """
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import ndtr
 
 from samplers.components import SubspaceGaussian, draw_counts, log_ratios, mixture_log_ratio
+from samplers.methods.searched import SimulationSteps
 from samplers.methods.two_stage.mixture import (
     LEAST_VARIANCE_OF_COMPONENT,
     GroupedPoints,
     SubspaceMixture,
     fit_subspace_mixture,
 )
-from samplers.methods.two_stage.settings import LAW, ROUNDS
-from samplers.methods.two_stage.terms.walks import Directions
+from samplers.methods.two_stage.settings import LAW, ROUNDS, WALKS
+from samplers.methods.two_stage.term_walks import Directions, TermSimulator, Walks, describe_half_spaces
 from samplers.problem import FloatArray, Terms
 from samplers.proposals import correct_eigenvalues, posterior
 from samplers.sample import DrawWeights
-from samplers.statistics import effective_number, effective_sample_size, log_sum_exp, normalise_weights
+from samplers.statistics import (
+    effective_number,
+    effective_sample_size,
+    log_sum_exp,
+    normalise_weights,
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -352,3 +359,116 @@ def _join_terms(first: Terms, second: Terms) -> Terms:
     parts = zip((first.f, first.values, first.ticks), (second.f, second.values, second.ticks), strict=True)
     f, values, ticks = (np.concatenate(pair) for pair in parts)
     return Terms(f, values, ticks, first.threshold, first.names or second.names)
+
+
+def pursue_walked(walks: Walks, history: TermHistory) -> list[PursuedTerm]:
+    """Return the terms that walks came near, with proposals around their ends; those that hardly fail are left out."""
+    found, tails = list[PursuedTerm](), list[float]()
+    for term in np.unique(np.concatenate([walks.term, walks.failing_terms])):
+        directions, ends = walks.directions.of(term), _ends(walks, history, int(term))
+        if len(ends) and len(directions.term):
+            found.append(start_term(int(term), directions, ends))
+            arrived = walks.distance[(walks.term == term) & (walks.values <= history.terms.threshold)]
+            arrived = arrived[np.isfinite(arrived)]
+            tails.append(float(ndtr(-np.median(arrived))) if len(arrived) else math.nan)
+    least = WALKS.negligible * max((tail for tail in tails if tail > 0), default=0.0)
+    return [one for one, tail in zip(found, tails, strict=True) if not tail < least]
+
+
+def start_term(number: int, directions: Directions, ends: FloatArray) -> PursuedTerm:
+    """Return a term with a proposal around ends (m, d), from its gradients."""
+    weights = np.ones(len(directions.term))
+    law = first_law(find_axes(directions.values, weights), ends, choose_guards(directions))
+    return PursuedTerm(number, directions, weights, ends, law)
+
+
+def _ends(walks: Walks, history: TermHistory, term: int) -> FloatArray:
+    """Return the ends of a term's walks: those that fail, else the lower half if one came half way."""
+    mine = (walks.term == term) & ~(walks.distance > WALKS.max_distance)
+    failing = mine & (walks.values <= history.terms.threshold)
+    on_the_way = walks.failures[walks.failing_terms == term]
+    ends = np.concatenate([walks.u[failing], on_the_way])[: LAW.max_ends]
+    if len(ends) or not mine.any():
+        return ends
+    values, threshold = walks.values[mine], history.terms.threshold
+    half_way = 0.5 * (float(np.median(walks.start_values[mine])) + threshold)
+    lower = values <= np.median(values)
+    return walks.u[mine][lower] if values.min() <= half_way else ends
+
+
+def mix_terms(pursued: list[PursuedTerm], history: TermHistory, gamma: float, final: bool = False) -> TermProposal:
+    """Return the mixture over the terms.
+
+    With all of them at the threshold pi_j is proportional to sqrt(sum_j W^2), the sum over failures that the term is
+    the least of, with tempered weights, and at least `min_term_share`; until then those that are not come first. In
+    the `final` rounds a term that has not been reached waits no longer.
+    """
+    k = len(pursued)
+    if final or all(one.ready for one in pursued):
+        failing = history.failing(gamma)
+        w, least = temper_weights(history.log_weights[failing], ROUNDS.share_ess), history.terms.least[failing]
+        size = np.array([np.sqrt((w[least == one.number] ** 2).sum()) for one in pursued])
+        shares = size / size.sum() if size.sum() > 0 else np.full(k, 1 / k)
+        shares = np.maximum(shares, min(ROUNDS.min_term_share, 0.7 / k))
+    else:
+        shares = np.array([ROUNDS.waiting_share if one.ready else 1.0 for one in pursued])
+    return TermProposal(history.u.shape[1], ROUNDS.base_share, tuple(one.law for one in pursued), shares / shares.sum())
+
+
+def refit_terms(
+    simulator: TermSimulator,
+    history: TermHistory,
+    pursued: list[PursuedTerm],
+    gamma: float,
+    limit: int,
+    rng: np.random.Generator,
+) -> SimulationSteps[list[PursuedTerm]]:
+    """Return the terms with proposals fitted to all draws, after a few more gradients of each at likely points.
+
+    Terms that failures showed and nobody pursued join them.
+    """
+    known = {one.number for one in pursued}
+    new = [int(j) for j in np.unique(history.terms.least[history.failing(gamma)]) if j not in known]
+    numbers = [one.number for one in pursued] + new
+    near = [near_points(history, j, gamma) for j in numbers]
+    each = max(min(ROUNDS.gradients, ROUNDS.max_gradients // max(len(numbers), 1)), 1)
+    chosen = [_draw_rows(points.rows[points.likely], history.log_weights, each, rng) for points in near]
+    while chosen and simulator.n_sim + simulator.offer.count_gradients(sum(map(len, chosen))) > limit:
+        chosen = [rows[: len(rows) // 2] for rows in chosen]  # count_gradients(0) is 0
+    rows, term = np.concatenate(chosen), np.repeat(numbers, [len(part) for part in chosen])
+    slopes = yield from simulator.gradients(history.u[rows], term, history.terms.ticks[rows, term])
+    excess = history.terms.values[rows, term] - history.terms.threshold
+    found = describe_half_spaces(term, history.u[rows], slopes, excess)
+    result = []
+    for number, points in zip(numbers, near, strict=True):
+        directions = found.of(number)
+        old = next((one for one in pursued if one.number == number), None)
+        if old is not None:
+            result.append(_refit_term(old, history, directions, points, rng))
+        elif len(directions.term):
+            ends = history.u[points.rows[points.likely][: LAW.max_ends]]
+            result.append(start_term(number, directions, ends))
+    return result
+
+
+def _refit_term(
+    term: PursuedTerm, history: TermHistory, directions: Directions, points: NearPoints, rng: np.random.Generator
+) -> PursuedTerm:
+    """Return a term with further gradients, fitted to some points of the history."""
+    later = float(term.direction_weights.max()) * ROUNDS.later_weight
+    weights = np.concatenate([term.direction_weights, np.full(len(directions.term), later)])
+    directions = term.directions.join(directions)
+    axes = find_axes(directions.values, weights)
+    guards = choose_guards(directions)
+    rows, likely, ready = points
+    law = fit_law(axes, history.u[rows], history.log_weights[rows], term.ends, guards, rng, likely)
+    return replace(term, directions=directions, direction_weights=weights, law=law, ready=term.ready or ready)
+
+
+def _draw_rows(rows: NDArray[np.int64], log_weights: FloatArray, n: int, rng: np.random.Generator) -> NDArray[np.int64]:
+    """Return at most n different ones of some rows, drawn by weight."""
+    if len(rows) <= n:
+        return rows
+    weights = normalise_weights(log_weights[rows])
+    possible = min(n, int(np.count_nonzero(weights)))
+    return np.asarray(rng.choice(rows, possible, replace=False, p=weights))

@@ -8,9 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from samplers.method import TermsOffer, request_gradients, request_terms, whole_simulations
-from samplers.methods.noise_coordinates import noise_mask
-from samplers.methods.two_stage.settings import WALKS
-from samplers.methods.two_stage.simulator import SimulationSteps
+from samplers.methods.searched import SimulationSteps, noise_mask
+from samplers.methods.two_stage.settings import EXPLORATION, WALKS
 from samplers.problem import Distribution, FloatArray, Inputs, StandardNormal, Terms
 
 DIFFERENCE = 1e-4
@@ -249,7 +248,7 @@ def choose_terms(terms: Terms) -> tuple[list[int], list[int]]:
 def count_walks(n_main: int, n_others: int, budget: int, step: float) -> tuple[int, int]:
     """Return the walks of each main term, and how many other terms are scouted, so that all can make two steps."""
     affordable = int(WALKS.budget_share * budget / (MIN_WALK_STEPS * step))
-    walkers = WALKS.walkers * min(1.0, budget / WALKS.usual_budget)
+    walkers = WALKS.walkers * min(1.0, budget / EXPLORATION.usual_budget)
     wanted = int(np.clip(walkers / max(n_main, 1), WALKS.min_walkers, WALKS.max_walkers))
     each = min(wanted, max(affordable // max(n_main, 1), 2))
     return each, min(n_others, max(affordable - each * n_main, 0) // WALKS.scouts)

@@ -1,1 +1,0 @@
-"""Search by terms: gradient walks, Gaussians in the gradients' subspaces, exact weights; see `search`."""
