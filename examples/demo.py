@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 import rare_envs
 from rare_envs.study import Question, prepare, run, write_run
-from rare_envs.study.cli import print_report
+from rare_envs.study.text import print_report
 from training import train_ego
 
 ENV_ID = "rare_envs/CutIn-v0"

@@ -21,40 +21,21 @@ MAX_NOTES = 2**24
 """Bytes of the notes that are read, the last ones: 250,000 runs."""
 
 
-def find_notes() -> Path:
-    """Return the file with the notes, in the user's folder for states of programs (XDG_STATE_HOME)."""
-    state = os.environ.get("XDG_STATE_HOME") or str(Path.home() / ".local" / "state")
-    return Path(state) / "rare-envs" / "runs"
-
-
 def note_own_run(question: Mapping[str, Any], code: Sequence[str]) -> None:
-    """Note that a question was asked here; its code may change and is still the user's own.
-
-    Args:
-        question: JSON-ready.
-        code: Names `module:name` in it.
-    """
+    """Note that a question with code `module:name` was asked here; the code may change and is still one's own."""
     if code:
         _append_note(_digest_own(question, code))
 
 
 def check_code_trust(question: Mapping[str, Any], code: Sequence[str], folder: Path, trust: bool) -> None:
-    """Refuse a question that names code, unless it was asked here, or trusted before with the same code.
+    """Refuse a folder's question that names code, unless it was asked here, or trusted before with the same code.
 
-    Args:
-        question: JSON-ready, as recorded in a folder.
-        code: Names `module:name` in it.
-        folder: Where it was recorded, for the message.
-        trust: Trust it from now on, for as long as question and code stay what they are.
+    With `trust` it is trusted from now on, for as long as question and code stay what they are.
     """
-    if not code:
-        return
     trusted = _digest_trusted(question, code)
-    if trust:
-        if trusted is not None:
-            _append_note(trusted)
-        return
-    if not {trusted, _digest_own(question, code)} & _read_notes():
+    if trust and code and trusted is not None:
+        _append_note(trusted)
+    if not trust and code and not {trusted, _digest_own(question, code)} & _read_notes():
         files = {name: find_module_file(name) for name in code}
         named = ", ".join(f"{name!r}{f' ({path})' if path else ''}" for name, path in files.items())
         raise ValueError(
@@ -102,6 +83,12 @@ def _digest_trusted(question: Mapping[str, Any], code: Sequence[str]) -> str | N
 
 def _digest(kind: str, question: Mapping[str, Any], code: list[list[str]]) -> str:
     return hashlib.sha256(json.dumps([kind, dict(question), code], sort_keys=True).encode()).hexdigest()
+
+
+def find_notes() -> Path:
+    """Return the file with the notes, in the user's folder for states of programs (XDG_STATE_HOME)."""
+    state = os.environ.get("XDG_STATE_HOME") or str(Path.home() / ".local" / "state")
+    return Path(state) / "rare-envs" / "runs"
 
 
 def _read_notes() -> set[str]:

@@ -24,11 +24,8 @@ def replace_file(path: str | Path) -> Iterator[Path]:
     """Yield the path of a draft in the same folder; it takes the file's place when the block ends without an error.
 
     The draft is on the disk before it takes the place, and the change of the folder after it: a power cut leaves the
-    earlier file or the new one. After an error the draft is removed. The draft keeps the ending of the name, which
-    libraries read the format from. A link stays one: the file that it leads to is replaced.
-
-    Args:
-        path: The file; its folder exists.
+    earlier file or the new one. It keeps the ending of the name, which libraries read the format from. A link stays
+    one: the file that it leads to is replaced.
     """
     path = Path(os.path.realpath(path))
     draft = path.with_name(f".{path.stem}.{os.getpid()}.part{path.suffix}")
@@ -50,12 +47,7 @@ def replace_text(path: str | Path, text: str) -> None:
 
 
 def check_ordinary(path: str | Path, most: int | None = None) -> None:
-    """Refuse what is no ordinary file: a pipe would be waited for, and a device read without an end.
-
-    Args:
-        path: The file.
-        most: Bytes that it may have; None for any number.
-    """
+    """Refuse what is no ordinary file, such as a pipe or a device without an end, or has more bytes than `most`."""
     found = os.stat(path)
     if not stat.S_ISREG(found.st_mode):
         raise ValueError(f"{str(path)!r} is no ordinary file.")
@@ -80,17 +72,18 @@ def _sync(path: Path) -> None:
         os.close(number)
 
 
-_MAX_DIGITS = 300
-"""Digits of a whole number that is a float still, which ends at 1.8e308."""
+MAX_DIGITS = 300
+"""Digits of a whole number that a float can hold, which ends at 1.8e308."""
+
+
+def _parse_int(digits: str) -> int:
+    if len(digits) > MAX_DIGITS:
+        raise ValueError(f"a whole number of {len(digits)} digits")
+    return int(digits)
 
 
 def parse_json_object(text: str, source: str) -> dict[str, Any]:
-    """Return the JSON object that a text holds.
-
-    Args:
-        text: The text.
-        source: What it was read from, for the message of an error.
-    """
+    """Return the JSON object that a text holds; `source` says in an error what it was read from."""
     try:
         data = json.loads(text, parse_int=_parse_int)
     except RecursionError:
@@ -107,10 +100,3 @@ def format_json(value: dict[str, Any]) -> str:
     text = json.dumps(value, indent=2, allow_nan=False)
     # a line that ends with a bracket is no part of a string, which would have no line breaks
     return re.sub(r"\[\n([^\[\]{}\"]*)\n *\]", lambda match: f"[{' '.join(match[1].split())}]", text)
-
-
-def _parse_int(digits: str) -> int:
-    """Return a whole number that a float can hold."""
-    if len(digits) > _MAX_DIGITS:
-        raise ValueError(f"a whole number of {len(digits)} digits")
-    return int(digits)

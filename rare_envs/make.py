@@ -89,7 +89,8 @@ def set_up(
     scenario = find_scenario(scenario) if isinstance(scenario, str) else scenario
     refuse_unknown(scenario, unknown)
     kinds = read_kinds(observation)
-    _check_one_of("action", action, ACTIONS)
+    if action not in ACTIONS:
+        raise ValueError(f"Unknown action {action!r}; expected one of {', '.join(map(repr, ACTIONS))}.")
     if not isinstance(weather, bool):
         raise ValueError(f"Expected weather True or False, got {weather!r}.")
     background = find_drivers(scenario.drivers if drivers is None else drivers)
@@ -108,13 +109,7 @@ def set_up(
 
 
 def refuse_unknown(scenario: Scenario, arguments: Mapping[str, Any], more: Sequence[str] = ()) -> None:
-    """Raise a TypeError if a keyword argument is neither one of `set_up` nor one of `more`; the message lists both.
-
-    Args:
-        scenario: Of the environment.
-        arguments: By name.
-        more: Further arguments that whoever asks takes.
-    """
+    """Raise a TypeError if a keyword argument is neither one of `set_up` nor one of `more`; the message lists both."""
     own = [word for word in inspect.signature(set_up).parameters if word not in ("scenario", "needs", "unknown")]
     known = [*more, *own]
     for name in (name for name in arguments if name not in known):
@@ -143,27 +138,24 @@ def _try_measure(world: World, space: ScenarioSpace) -> None:
 def build_space(world: World, base: Distribution, ego_noise: int = 0) -> ScenarioSpace:
     """Return the parameters of a world: the scenario's, then the weather's, its drivers' weights and all noise.
 
-    Args:
-        world: The world.
-        base: Distribution of the scenario's own parameters.
-        ego_noise: Number of columns of the ego's own noise, the last ones.
+    `base` is the distribution of the scenario's own; the columns of the ego's own noise are the last ones.
     """
     parameters, distributions, sizes = list(world.scenario.parameters), [base], world.columns
     for weather, distribution in world.weather_distributions:
         parameters += weather
         distributions.append(distribution)
-    if world.background is not None and world.background.weights is not None:
+    background = world.background
+    if background is not None and background.weights is not None:
         parameters.append(Parameter("weights", "", -np.inf, np.inf, "of the drivers' last layer", sizes.weights))
-        distributions.append(world.background.weights)
-    if sizes.noise:
-        parameters.append(Parameter("noise", "", -np.inf, np.inf, "of the drivers, tick by tick", sizes.noise))
-        distributions.append(NoiseDistribution(sizes.noise))
-    if sizes.camera_noise:
-        parameters.append(Parameter("camera_noise", "", -np.inf, np.inf, "from which the noise of all pixels follows"))
-        distributions.append(NoiseDistribution(1))
-    if ego_noise:
-        parameters.append(Parameter("ego_noise", "", -np.inf, np.inf, "of the ego", ego_noise))
-        distributions.append(NoiseDistribution(ego_noise))
+        distributions.append(background.weights)
+    for name, meaning, size in (
+        ("noise", "of the drivers, tick by tick", sizes.noise),
+        ("camera_noise", "from which the noise of all pixels follows", sizes.camera_noise),
+        ("ego_noise", "of the ego", ego_noise),
+    ):
+        if size:
+            parameters.append(Parameter(name, "", -np.inf, np.inf, meaning, size))
+            distributions.append(NoiseDistribution(size))
     names = [p.name for p in parameters]
     twice = {name for name in names if names.count(name) > 1}
     if twice:
@@ -178,19 +170,13 @@ def _describe_configuration(config: Any) -> str:
     """Return what to write in place of HighwayEnv's argument `config`."""
     advice = []
     for name, value in config.items() if isinstance(config, Mapping) else ():
-        argument = CONFIGURATION_ARGUMENTS.get(name)
         if name == "duration":
             advice.append(f"horizon={value!r} in place of 'duration'")
-        elif argument:
-            advice.append(f"the argument {argument} in place of {name!r}")
+        elif name in CONFIGURATION_ARGUMENTS:
+            advice.append(f"the argument {CONFIGURATION_ARGUMENTS[name]} in place of {name!r}")
         else:
             advice.append(f"nothing in place of {name!r}, which belongs to the scenario or its picture")
     what_to_do = "; ".join(advice) or "horizon, dt, observation, action or drivers"
     return (
         f"Expected keyword arguments of their own, not HighwayEnv's config, got config={config!r}; write {what_to_do}."
     )
-
-
-def _check_one_of(what: str, value: object, valid: tuple[str, ...]) -> None:
-    if value not in valid:
-        raise ValueError(f"Unknown {what} {value!r}; expected one of {', '.join(map(repr, valid))}.")

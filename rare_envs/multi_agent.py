@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import Any, NamedTuple, Protocol, TypeAlias, runtime_checkable
+from typing import Any, NamedTuple, TypeAlias
 
 import torch
 from torch import Tensor
@@ -45,12 +45,7 @@ class MultiAgentEpisode(NamedTuple):
 
 
 def start(world: World, x: Tensor) -> MultiAgentEpisode:
-    """Begin B episodes.
-
-    Args:
-        world: The world.
-        x: Scenario parameters, as in `World.start`.
-    """
+    """Begin B episodes of scenarios x (B, d)."""
     traffic = world.start(x)
     none = torch.zeros_like(traffic.state.x, dtype=torch.bool)
     traffic = traffic._replace(overridden=none)
@@ -67,20 +62,11 @@ def start(world: World, x: Tensor) -> MultiAgentEpisode:
 
 
 def step_traffic(world: World, episode: MultiAgentEpisode, action: Tensor, commanded: Tensor) -> MultiAgentEpisode:
-    """Move every vehicle by one tick.
+    """Move every vehicle by one tick, by acceleration [m/s^2] and steering [rad] (B, N, 2) where commanded (B, N).
 
-    Contacts between vehicles that follow script or drivers are recorded, and do not change their motion, as in an
-    environment of one agent. A vehicle is disabled when it touches the ego, a commanded or a disabled vehicle, which is
-    disabled too; so is the ego or a commanded vehicle that leaves the road.
-
-    Args:
-        world: The world.
-        episode: B episodes.
-        action: Acceleration [m/s^2] and steering angle [rad] of the vehicles, shape (B, N, 2); the ego's always counts.
-        commanded: Which vehicles take their action, boolean, shape (B, N).
-
-    Returns:
-        The episodes one tick later.
+    The ego's action always counts. Contacts between vehicles that follow script or drivers are recorded, and do not
+    change their motion, as in an environment of one agent. A vehicle is disabled when it touches the ego, a commanded
+    or a disabled vehicle, which is disabled too; so is the ego or a commanded vehicle that leaves the road.
     """
     traffic, disabled, road = episode.traffic, episode.disabled, world.scenario.road
     active = commanded | disabled
@@ -111,7 +97,7 @@ def view_order(vehicle: int, vehicles: int) -> list[int]:
 
 
 def _view_perception(perception: Tensor | None, vehicle: int) -> Tensor | None:
-    """Return the vehicles' lidar features in the order of `State.seen_by`."""
+    """Return the vehicles' lidar features (B, N, F) in the order of `State.seen_by`."""
     return None if perception is None else perception[:, view_order(vehicle, perception.shape[1])]
 
 
@@ -133,18 +119,6 @@ class Transition(NamedTuple):
 
 Reward: TypeAlias = Callable[[Transition], Any]
 """From a transition to a reward of shape (B,): a tensor, or a named tuple of terms with their sum as `total`."""
-
-
-@runtime_checkable
-class SummedTerms(Protocol):
-    """A reward as a named tuple of terms."""
-
-    @property
-    def total(self) -> Tensor:
-        """The reward, shape (B,)."""
-
-    def _asdict(self) -> dict[str, Tensor]:
-        """Return the terms by name, shape (B,) each."""
 
 
 def own_reward(transition: Transition) -> RewardTerms:
@@ -219,12 +193,8 @@ def adversary_reward(transition: Transition) -> AdversaryTerms:
 
 
 def total_of(reward: Any) -> Tensor:
-    """Return a reward as a tensor of shape (B,).
-
-    Args:
-        reward: What a reward function returned.
-    """
-    total = reward.total if isinstance(reward, SummedTerms) else reward
+    """Return a reward, as a reward function gives it, as a tensor (B,)."""
+    total = getattr(reward, "total", reward)  # of a tuple of terms, which may be the user's
     if not isinstance(total, Tensor) or total.ndim != 1:
         raise ValueError(f"Expected a reward of shape (B,) or terms with a `total`, got {reward!r}.")
     return total
@@ -232,27 +202,14 @@ def total_of(reward: Any) -> Tensor:
 
 def terms_of(reward: Any) -> dict[str, Tensor]:
     """Return the terms of a reward by name; one, "reward", if it has none."""
-    has_terms = type(reward) is RewardTerms or isinstance(reward, SummedTerms)  # the first is usual, and fast
-    return dict(reward._asdict()) if has_terms else {"reward": reward}
-
-
-class JointStepResult(NamedTuple):
-    """Result of the agents' decisions."""
-
-    episode: MultiAgentEpisode
-    rewards: dict[int, Any]
-    """By vehicle, as its reward function gives them: their mean over the ticks, where ticks after its collision count
-    as 0."""
-    memory: Any
-    """Of the ego's driver."""
+    return dict(reward._asdict()) if hasattr(reward, "total") else {"reward": reward}
 
 
 class _Joint(NamedTuple):
-    """What goes on from tick to tick."""
+    """The episodes, and the memory of the ego's driver."""
 
     episode: MultiAgentEpisode
     memory: Any
-    """Of the ego's driver."""
 
     @property
     def collided(self) -> Tensor:
@@ -268,22 +225,15 @@ def step_agents(
     rewards: Mapping[int, Reward],
     ego: Driver,
     memory: Any = None,
-) -> JointStepResult:
-    """Carry out decisions, as `rare_envs.simulation.decision.advance` does for one agent.
+) -> tuple[MultiAgentEpisode, dict[int, Any], Any]:
+    """Carry out decisions (B, N, 2), or meta-actions (B, N), as `rare_envs.simulation.decision.advance` does for one.
 
-    Vehicles that have collided are held by `step_traffic`, because some may have before the decision.
-
-    Args:
-        world: The world.
-        episode: B episodes.
-        action: Of all vehicles: physical, shape (B, N, 2), or meta-actions, shape (B, N).
-        commanded: Which vehicles take their action, boolean, shape (B, N).
-        rewards: Reward functions by vehicle.
-        ego: Drives the ego where it is not commanded.
-        memory: The ego's driver's.
+    The ego's driver, with its memory, drives the ego where it is not commanded (B, N). Vehicles that have collided are
+    held by `step_traffic`, because some may have before the decision.
 
     Returns:
-        The episodes at the time of the next decision, rewards and memory.
+        The episodes at the time of the next decision; rewards by vehicle, as its function gives them: their mean over
+        the ticks, where ticks after its collision count as 0; and the driver's memory.
     """
 
     def tick(old: _Joint, chosen: Tensor, first: bool) -> tuple[_Joint, list[TickReward]]:
@@ -297,7 +247,7 @@ def step_agents(
         return _Joint(after, kept), earned
 
     end, means = run_ticks(world.clock, _Joint(episode, memory), action, tick)
-    return JointStepResult(end.episode, dict(zip(rewards, means, strict=True)), end.memory)
+    return end.episode, dict(zip(rewards, means, strict=True)), end.memory
 
 
 def _combine_actions(

@@ -41,12 +41,7 @@ def warn_of_namesakes() -> None:
 
 
 def import_module(name: str, purpose: str) -> ModuleType:
-    """Return a module that a user names; the working directory is searched first.
-
-    Args:
-        name: Dotted name of the module.
-        purpose: What needs it, for the message: "the ego 'mine:make'", for example.
-    """
+    """Return a module that a user names, for a purpose that errors name; the working directory is searched first."""
     try:
         with working_directory_first():
             return importlib.import_module(name)
@@ -55,12 +50,7 @@ def import_module(name: str, purpose: str) -> ModuleType:
 
 
 def import_object(spec: str, purpose: str) -> Any:
-    """Return what "module:name" stands for: a function, class or other object of a user's module.
-
-    Args:
-        spec: "module:name"; the module may be dotted.
-        purpose: What needs it, as in `import_module`.
-    """
+    """Return what "module:name" stands for: a function, class or other object of a user's module."""
     module_name, _, name = spec.partition(":")
     if not module_name or not name:
         raise ValueError(f"Expected module:name for {purpose}, got {spec!r}.")
@@ -73,12 +63,7 @@ def import_object(spec: str, purpose: str) -> Any:
 
 
 def make_lazy_getattr(package: str, modules: Mapping[str, str]) -> Callable[[str], Any]:
-    """Return the `__getattr__` of a package that imports its names on first use.
-
-    Args:
-        package: Its dotted name.
-        modules: The module that defines each name.
-    """
+    """Return the `__getattr__` of a package that imports its names on first use, each from the module that has it."""
 
     def get(name: str) -> Any:
         if name not in modules:

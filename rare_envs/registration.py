@@ -8,7 +8,14 @@ from typing import TYPE_CHECKING, Any
 import gymnasium as gym
 from gymnasium.vector import VectorEnv
 
-from rare_envs.scenarios.registry import HIGHWAY_ENV_LAYOUT, SCENARIOS, kinematics_id, split_layout
+from rare_envs.scenarios.registry import (
+    HIGHWAY_ENV_LAYOUT,
+    SCENARIOS,
+    complete_id,
+    find_scenario,
+    kinematics_id,
+    split_layout,
+)
 
 if TYPE_CHECKING:
     from pettingzoo import AECEnv
@@ -93,16 +100,11 @@ def parallel_env(env_id: str, **kwargs: Any) -> DrivingParallelEnv:
 def raw_env(env_id: str, **kwargs: Any) -> AECEnv[str, Any, Any]:
     """Return PettingZoo's AEC environment of an id: `parallel_env` with one agent acting after the other.
 
-    Args:
-        env_id: For example "rare_envs/CutIn-v0".
-        **kwargs: As for `parallel_env`.
+    Its arguments are those of `parallel_env`, and so are its errors.
 
     Example:
         >>> raw_env("rare_envs/CutIn-v0").possible_agents
         ['ego', 'cutter', 'lead']
-
-    Raises:
-        ValueError: If the id or an argument is unknown.
     """
     from pettingzoo.utils.conversions import parallel_to_aec_wrapper
 
@@ -112,18 +114,11 @@ def raw_env(env_id: str, **kwargs: Any) -> AECEnv[str, Any, Any]:
 def env(env_id: str, **kwargs: Any) -> AECEnv[str, Any, Any]:
     """Return `raw_env` behind PettingZoo's usual wrapper, which refuses calls in a wrong order.
 
-    Args:
-        env_id: For example "rare_envs/CutIn-v0".
-        **kwargs: As for `parallel_env`.
-
     Example:
         >>> game = env("rare_envs/CutIn-v0")
         >>> game.reset(seed=0)
         >>> game.agent_selection, game.state_space.shape
         ('ego', (3, 4))
-
-    Raises:
-        ValueError: If the id or an argument is unknown.
     """
     from pettingzoo.utils import OrderEnforcingWrapper
 
@@ -150,8 +145,6 @@ def make_batch(env_id: str, num_envs: int, **kwargs: Any) -> VectorEnv[Any, Any,
     Raises:
         ValueError: If the id or an argument is unknown.
     """
-    from rare_envs.scenarios.registry import complete_id, find_scenario
-
     find_scenario(split_layout(env_id)[0])
     if not isinstance(num_envs, int) or num_envs < 1:
         raise ValueError(f"Expected num_envs of at least 1, got {num_envs!r}.")

@@ -61,65 +61,48 @@ class HumanBenchmark:
         return {**asdict(self), **rates, "per_hour": self.per_hour}
 
 
-_MILES_100CAR, _HOURS_100CAR = 2_000_000.0, 43_000.0
-_SOURCE_100CAR = "Virginia Tech Transportation Institute, Researcher Dictionary for Video Reduction Data 1.3, page 4"
-_WORDS_100CAR = '"approximately 2,000,000 vehicles miles and 43,000 hours"'
-
-
 def _count_100car(kind: str, count: int, how: str) -> HumanBenchmark:
     """Return a count of the 100-Car study; all of its roads, since its exposure by type of road is not known."""
     return HumanBenchmark(
         study="100-Car",
         kind=kind,
         count=count,
-        miles=_MILES_100CAR,
-        hours=_HOURS_100CAR,
-        source=_SOURCE_100CAR,
-        words=f"{_WORDS_100CAR}; {how}, counted in the published table of 828 events",
+        miles=2_000_000.0,
+        hours=43_000.0,
+        source="Virginia Tech Transportation Institute, Researcher Dictionary for Video Reduction Data 1.3, page 4",
+        words=f'"approximately 2,000,000 vehicles miles and 43,000 hours"; {how}, counted in the published table '
+        "of 828 events",
+    )
+
+
+def _count_shrp2(kind: str, count: int) -> HumanBenchmark:
+    return HumanBenchmark(
+        study="SHRP 2",
+        kind=kind,
+        count=count,
+        miles=34.5e6,
+        hours=None,
+        source="Kidd and McCartt 2015 (crashes); Ali, dissertation, Virginia Tech, 2023 (miles)",
+        words="\"Of 1,465 crashes ... 248 were severe ...; 597 were 'minor;' and 620 were 'low-risk tire strikes'\"; "
+        '"34.5 million miles"; the two from different papers',
     )
 
 
 CONTACTS_100CAR = _count_100car("contacts of all kinds", 68, "68 crashes, every contact")
 REAR_END_CONTACTS_100CAR = _count_100car("contacts into a vehicle ahead", 14, "rear-end, striking: 14 crashes")
 CUT_IN_CONTACTS_100CAR = _count_100car("contacts begun by another's lane change", 1, "1 crash")
-NEAR_CRASHES_100CAR = _count_100car("near-crashes", 760, "760 near-crashes")
 REAR_END_NEAR_CRASHES_100CAR = _count_100car("near-crashes with a vehicle ahead", 385, "rear-end, striking: 385")
 CUT_IN_NEAR_CRASHES_100CAR = _count_100car("near-crashes begun by another's lane change", 136, "136 near-crashes")
-
-_MILES_SHRP2 = 34.5e6
-_SOURCE_SHRP2 = "Kidd and McCartt 2015 (crashes); Ali, dissertation, Virginia Tech, 2023 (miles)"
-_WORDS_SHRP2 = (
-    "\"Of 1,465 crashes ... 248 were severe ...; 597 were 'minor;' and 620 were 'low-risk tire strikes'\"; "
-    '"34.5 million miles"; the two from different papers'
-)
-CONTACTS_SHRP2 = HumanBenchmark(
-    study="SHRP 2",
-    kind="crashes without tyre strikes",
-    count=248 + 597,
-    miles=_MILES_SHRP2,
-    hours=None,
-    source=_SOURCE_SHRP2,
-    words=_WORDS_SHRP2,
-)
-SEVERE_CRASHES_SHRP2 = HumanBenchmark(
-    study="SHRP 2",
-    kind="severe crashes",
-    count=248,
-    miles=_MILES_SHRP2,
-    hours=None,
-    source=_SOURCE_SHRP2,
-    words=_WORDS_SHRP2,
-)
-
+CONTACTS_SHRP2 = _count_shrp2("crashes without tyre strikes", 248 + 597)
 HUMAN_BENCHMARKS = (
     CONTACTS_100CAR,
     REAR_END_CONTACTS_100CAR,
     CUT_IN_CONTACTS_100CAR,
-    NEAR_CRASHES_100CAR,
+    _count_100car("near-crashes", 760, "760 near-crashes"),
     REAR_END_NEAR_CRASHES_100CAR,
     CUT_IN_NEAR_CRASHES_100CAR,
     CONTACTS_SHRP2,
-    SEVERE_CRASHES_SHRP2,
+    _count_shrp2("severe crashes", 248),
 )
 """All of them."""
 

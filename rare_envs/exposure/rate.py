@@ -32,14 +32,11 @@ from rare_envs.arrays import FloatArray
 from rare_envs.distributions.fitted import EventFrequency
 
 SOURCE_FIELDS = ("site", "date", "data", "licence")
+"""Of a record: its entries, or those of its `source`."""
 
 
 def read_source(record: Mapping[str, Any]) -> dict[str, str]:
-    """Return what a record says of its source, in `SOURCE_FIELDS`; empty texts where it says nothing.
-
-    Args:
-        record: The provenance of a base distribution: its entries, or those of its `source`, are read.
-    """
+    """Return what a record, the provenance of a base, says of its source in `SOURCE_FIELDS`; empty where nothing."""
     source = record.get("source", {})
     inner = source if isinstance(source, Mapping) else {"data": source}
     return {name: str(inner.get(name, record.get(name, "")) or "") for name in SOURCE_FIELDS}

@@ -30,6 +30,7 @@ from rare_envs.interop.layouts import (
 from rare_envs.measures.base import COLLISION
 from rare_envs.measures.longitudinal import TTC_MAX
 from rare_envs.plugins import did_you_mean
+from rare_envs.scenarios.registry import HIGHWAY_ENV_IDS
 
 TTC_MIN = 0.01
 """They are at least this [s], so that only a collision comes to 0 or less."""
@@ -140,11 +141,6 @@ def observe_without_pandas(kind: Any) -> NDArray[np.float32]:
     return observation.astype(space.dtype)
 
 
-SUPPORTED = (
-    *("highway-v0", "highway-fast-v0", "merge-v0", "merge-v1", "roundabout-v0", "roundabout-v1"),
-    *("intersection-v0", "intersection-v1", "intersection-v2"),
-)
-"""Ids of HighwayEnv that have parameters, as far as the installed version has them."""
 _FIXED_SEED = 12345
 
 
@@ -303,13 +299,13 @@ def _find_layout(env: gym.Env[Any, Any]) -> Layout:
     while isinstance(plain, OrderEnforcing | PassiveEnvChecker | TimeLimit):
         plain = plain.env
     if not isinstance(inner, AbstractEnv):
-        raise ValueError(f"Expected an environment of HighwayEnv ({', '.join(SUPPORTED)}), got {env}.")
+        raise ValueError(f"Expected an environment of HighwayEnv ({', '.join(HIGHWAY_ENV_IDS)}), got {env}.")
     if plain is not inner:
         raise ValueError(f"Expected the environment as gym.make gives it, got {plain}; put wrappers around this one.")
     generic = isinstance(inner, MergeGenericEnv | RoundaboutGenericEnv)
     layouts = [layout for kind, layout in LAYOUTS.items() if isinstance(inner, kind) and not generic]
     if not layouts or len(inner.controlled_vehicles) != 1:
-        known = ", ".join(SUPPORTED)
+        known = ", ".join(HIGHWAY_ENV_IDS)
         raise ValueError(f"No parameters are known for {type(inner).__name__}; expected {known}, with one ego.")
     return layouts[0]
 

@@ -135,8 +135,15 @@ def find_scenario(env_id: str) -> Scenario:
     raise ValueError(f"Unknown environment {env_id!r}{hint}; the environments are {', '.join(SCENARIOS)}.")
 
 
+HIGHWAY_ENV_IDS = (
+    *("highway-v0", "highway-fast-v0", "merge-v0", "merge-v1", "roundabout-v0", "roundabout-v1"),
+    *("intersection-v0", "intersection-v1", "intersection-v2"),
+)
+"""Environments of HighwayEnv that `rare_envs.highway_env_problem` takes."""
+
+
 def is_highway_env_id(env_id: object) -> bool:
-    """Return whether an id is that of an environment of HighwayEnv that `rare_envs.highway_env_problem` takes."""
+    """Return whether an id is that of such an environment of HighwayEnv, in any version."""
     return re.match(r"(highway(-fast)?|merge|intersection|roundabout)-v\d", str(env_id)) is not None
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable
+from functools import partial
 from typing import Annotated
 
 import typer
@@ -21,7 +22,7 @@ from rare_envs.study.cli.egos import (
     train_ego_command,
 )
 from rare_envs.study.cli.estimate import compare_command, estimate_command, plan_command, resume_command, risk_command
-from rare_envs.study.cli.options import JsonOption
+from rare_envs.study.cli.options import command
 from rare_envs.study.cli.runs import (
     corpus_add_command,
     corpus_run_command,
@@ -29,7 +30,7 @@ from rare_envs.study.cli.runs import (
     replay_command,
     report_command,
 )
-from rare_envs.study.cli.shell import OneLineErrors, SummarisedCommands, ignore_signals, print_json
+from rare_envs.study.cli.shell import Answer, OneLineErrors, SummarisedCommands, ignore_signals
 from rare_envs.study.errors import as_bad_input
 from rare_envs.version import __version__
 
@@ -101,6 +102,7 @@ def common_options(
     """How often does a driving policy crash? Train one, estimate its rare failures, see the most likely."""
 
 
+@command()
 def list_command(
     what: Annotated[
         str | None,
@@ -108,40 +110,33 @@ def list_command(
             metavar="[WHAT]", help="environments, methods, egos, drivers, measures, weather, all, or an environment."
         ),
     ] = None,
-    as_json: JsonOption = False,
-) -> None:
+) -> Answer:
     """Show the names of environments, methods, egos, drivers and measures; with one of these words, what they mean."""
     from rare_envs.study.cli.listing import check_kind, choose_entries, list_names, print_details, print_overview
 
     entries = list_names()
-    chosen = None if what is None else check_kind(entries, what)
-    if as_json:
-        print_json(entries if chosen is None else choose_entries(entries, chosen))
-    elif chosen is None:
-        print_overview(entries)
-    else:
-        print_details(entries, chosen)
+    if what is None:
+        return Answer(entries, partial(print_overview, entries))
+    chosen = check_kind(entries, what)
+    return Answer(choose_entries(entries, chosen), partial(print_details, entries, chosen))
 
 
+@command()
 def bases_command(
     scenario: Annotated[str, typer.Argument(metavar="SCENARIO", help="Environment, or its short name: cut_in.")],
-    as_json: JsonOption = False,
-) -> None:
+) -> Answer:
     """List the base distributions of a scenario: events, site, family, fit, frequency and predictive checks."""
     from rare_envs.study.cli.listing import list_bases, print_bases, resolve_scenario
 
     with as_bad_input(ValueError):
-        found = list_bases(scenario)
-    if as_json:
-        print_json({"scenario": scenario, "env_id": resolve_scenario(scenario), "bases": found})
-    else:
-        print_bases(resolve_scenario(scenario), found)
+        found, env_id = list_bases(scenario), resolve_scenario(scenario)
+    data = {"scenario": scenario, "env_id": env_id, "bases": found}
+    return Answer(data, partial(print_bases, env_id, found))
 
 
-def format_examples(command: str) -> str:
-    """Return the text below a help page, whose lines are not to be filled; empty where there are no examples."""
-    lines = EXAMPLES.get(command, ())
-    return "\n".join(("\b", "Examples:", *(f"  {line}" for line in lines))) if lines else ""
+def format_examples(name: str) -> str:
+    """Return the text below a help page, whose lines are not to be filled."""
+    return "\n".join(("\b", "Examples:", *(f"  {line}" for line in EXAMPLES[name])))
 
 
 COMMANDS: dict[str, Callable[..., None]] = {
@@ -171,9 +166,9 @@ corpus_app = typer.Typer(
 )
 app.add_typer(corpus_app, name="corpus")
 app.info.epilog = format_examples("")
-for _name, _command in COMMANDS.items():
+for _name, _function in COMMANDS.items():
     _group, _, _word = _name.rpartition(" ")
-    (corpus_app if _group else app).command(_word, epilog=format_examples(_name))(_command)
+    (corpus_app if _group else app).command(_word, epilog=format_examples(_name))(_function)
 
 
 def main() -> None:

@@ -6,6 +6,7 @@ import shlex
 import sys
 from collections.abc import Mapping
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -19,23 +20,22 @@ from rare_envs.study.cli.options import (
     WORLD,
     EgoArgument,
     EnvArgument,
-    JsonOption,
-    count_option,
+    command,
+    read_count,
     read_environment,
-    take_options,
 )
-from rare_envs.study.cli.shell import keep_stdout_for_the_answer, print_json
-from rare_envs.study.errors import BadInput, as_bad_input, output_file
-from rare_envs.threads import use_one_thread
+from rare_envs.study.cli.shell import Answer
+from rare_envs.study.errors import BadInput, as_bad_input, output_file, output_folder
 from training.command_line import DriverTrainingOptions, EventOptions, RecordingOptions, RunFolderOption, spread_options
 
 if TYPE_CHECKING:
     from rare_envs.study.corpus import RetrainingPlan
-    from training import Retraining
+
+USUAL = {"noise": "on", "observation": "features", "action": "continuous", "collisions": "ego"}
+"""Options of `estimate` that need not be typed for an ego that is trained here."""
 
 
-@take_options(*WORLD, "seed", "trust")
-@use_one_thread()
+@command(*WORLD, "seed", "trust")
 def train_ego_command(
     asked: dict[str, Any],
     env: Annotated[
@@ -49,7 +49,9 @@ def train_ego_command(
     algo: Annotated[
         str | None, typer.Option(help="Stable-Baselines3 algorithm; --from-failures tells it.", show_default="ppo")
     ] = None,
-    steps: Annotated[int, count_option("Environment steps to train for.")] = 200_000,
+    steps: Annotated[
+        int, typer.Option(help="Environment steps to train for.", parser=read_count, metavar="INTEGER")
+    ] = 200_000,
     out: Annotated[Path, typer.Option(help="File to save the ego in.")] = Path("ego.zip"),
     num_envs: Annotated[int, typer.Option(help="Episodes that run side by side.")] = 256,
     device: Annotated[str, typer.Option(help="Where to simulate and to train: cpu, or a GPU (cuda, cuda:1).")] = "cpu",
@@ -65,8 +67,7 @@ def train_ego_command(
     failure_share: Annotated[
         float, typer.Option(help="Share of episodes that begin in a failure, with --from-failures.")
     ] = 0.25,
-    as_json: JsonOption = False,
-) -> None:
+) -> Answer:
     """Train an ego on the batched simulation and save it for `rare-envs estimate --ego`.
 
     A new one in ENV, or by --from-failures the ego of a run, in the world of that run.
@@ -75,39 +76,28 @@ def train_ego_command(
     from training.ego_training import HYPERPARAMETERS
 
     seed, trust = asked.pop("seed"), asked.pop("trust")
+    plan = None
     if from_failures:
         plan = _read_plan(from_failures, failure_share, trust, env, algo, asked)
-        env, algo, world, retraining = plan.env_id, plan.algo, dict(plan.world), plan.retraining
-        next_seed: int | None = plan.next_seed
+        env, algo, world = plan.env_id, plan.algo, dict(plan.world)
     elif env is None:
         raise BadInput("Expected an environment, such as rare_envs/CutIn-v0, or --from-failures RUN; rare-envs list.")
     else:
-        algo, retraining, next_seed = algo or "ppo", None, None
-        usual = {"observation": "features", "action": "continuous"}
-        world = {name: usual.get(name) if value is None else value for name, value in asked.items()}
-    place: dict[str, Any] = {} if device == "cpu" else {"device": device}
+        algo = algo or "ppo"
+        world = {**asked, **{name: asked[name] or USUAL[name] for name in ("observation", "action")}}
+    retraining = None if plan is None else plan.retraining
+    settings: dict[str, Any] = {**world, "retraining": retraining, **({} if device == "cpu" else {"device": device})}
     with as_bad_input(ValueError, OSError):
-        path = train_ego(
-            env,
-            algo=algo,
-            steps=steps,
-            out=out,
-            seed=seed,
-            num_envs=num_envs,
-            resume=resume,
-            retraining=retraining,
-            **world,
-            **place,
-        )
-    if as_json:
-        answer = {"ego": str(path), "env_id": env, "algo": algo, "steps": steps, "seed": seed, **world}
-        print_json(answer | ({} if retraining is None else _describe_retraining(retraining)))
-        return
+        path = train_ego(env, algo, steps, out=out, seed=seed, num_envs=num_envs, resume=resume, **settings)
+    data = {"ego": str(path), "env_id": env, "algo": algo, "steps": steps, "seed": seed, **world}
+    if retraining is not None:
+        data |= {"retrained": str(retraining.ego), "failures": len(retraining.failures)}
+        data["failure_share"] = retraining.share
     if HYPERPARAMETERS[algo].discrete and asked["action"] is None:
         world["action"] = "discrete"  # which is what the algorithm made of it
-    seed_words = "" if next_seed is None else f" --seed {next_seed}"
+    seed_words = "" if plan is None else f" --seed {plan.next_seed}"
     words = f"rare-envs estimate {env} --ego {shlex.quote(str(path))}{_estimate_options(world)}{seed_words}"
-    print(f"Saved {path}. Next: {words}")
+    return Answer(data, f"Saved {path}. Next: {words}")
 
 
 def _read_plan(
@@ -116,36 +106,27 @@ def _read_plan(
     """Return how to train on with the failures of runs."""
     from rare_envs.study.corpus import plan_retraining
 
-    if any(value != getattr(Question(env_id=""), name) for name, value in asked.items()):
+    if any(value != getattr(Question, name) for name, value in asked.items()):
         raise BadInput("The world of --from-failures is that of the run: leave --base, --drivers and the like out.")
-    with keep_stdout_for_the_answer():
-        plan = plan_retraining(runs, share, trust)
+    plan = plan_retraining(runs, share, trust)
     for name, given, own in (("ENV", env, plan.env_id), ("--algo", algo, plan.algo)):
         if given not in (None, own):
             raise BadInput(f"Expected {name} {own}, that of the run in {str(runs[-1])!r}, got {given!r}; leave it out.")
     return plan
 
 
-def _describe_retraining(retraining: Retraining) -> dict[str, Any]:
-    failures, share = len(retraining.failures), retraining.share
-    return {"retrained": str(retraining.ego), "failures": failures, "failure_share": share}
-
-
 def _estimate_options(world: Mapping[str, Any]) -> str:
     """Return the options with which `estimate` makes the world that an ego was trained in."""
-    usual = {"noise": "on", "observation": "features", "action": "continuous", "collisions": "ego"}
     noise = next(word for word, argument in NOISE.items() if argument == world["noise"])
     values = {**world, "noise": noise, "weather": None}
-    told = {name: str(value) for name, value in values.items() if value not in (None, usual.get(name))}
+    told = {name: str(value) for name, value in values.items() if value not in (None, USUAL.get(name))}
     words = "".join(f" --{name} {shlex.quote(value)}" for name, value in told.items())
     return words + (" --weather" if world["weather"] else "")
 
 
 @spread_options
-@use_one_thread()
-def train_drivers_command(
-    out: RunFolderOption, recordings: RecordingOptions, options: DriverTrainingOptions, as_json: JsonOption = False
-) -> None:
+@command()
+def train_drivers_command(out: RunFolderOption, recordings: RecordingOptions, options: DriverTrainingOptions) -> Answer:
     """Train background drivers from recorded traffic; `python -m training.imitation` has every setting."""
     from training.imitation.config import Config
     from training.imitation.train import Source, train_driver
@@ -153,14 +134,12 @@ def train_drivers_command(
     with as_bad_input(ValueError):
         config = Config(options.method, options.seed, options.updates)
         path = train_driver(Source(*recordings.kind_and_path()), config, out, progress=True, device=options.device)
-    if as_json:
-        print_json({"driver": str(path), "method": options.method, "seed": options.seed})
-    else:
-        print(f"Saved {path}. Load it with agents.load_driver({str(path)!r}).")
+    data = {"driver": str(path), "method": options.method, "seed": options.seed}
+    return Answer(data, f"Saved {path}. Load it with agents.load_driver({str(path)!r}).")
 
 
 @spread_options
-@use_one_thread()
+@command()
 def fit_command(
     out: Annotated[Path, typer.Option(help="Folder for the JSON files.")],
     recordings: EventOptions,
@@ -171,47 +150,38 @@ def fit_command(
     name: Annotated[str, typer.Option(help="Name of the bases of your own recordings.")] = "own",
     refits: Annotated[int | None, typer.Option(help="Refits: 30, or 100 where their components differ.", min=2)] = None,
     seed: Annotated[int, typer.Option(help="Seed of the fits.", min=0)] = 0,
-    as_json: JsonOption = False,
-) -> None:
+) -> Answer:
     """Fit base distributions to recorded traffic, with refits that say how far the events determine them."""
     from training.fit.recordings import fit_bases
 
-    with keep_stdout_for_the_answer(), as_bad_input(ValueError, OSError):
+    with output_folder(out), as_bad_input(ValueError, OSError):
         files = fit_bases(
             recordings, out, cut_gaps=cut_gaps, scenarios=scenario, name=name, n_refits=refits, seed=seed, progress=True
         )
-    if as_json:
-        print_json({"bases": [str(path) for path in files]})
-    else:
-        print("\n".join(f"{path}: rare-envs estimate ENV --base {path}" for path in files))
+    lines = [f"{path}: rare-envs estimate ENV --base {path}" for path in files]
+    return Answer({"bases": [str(path) for path in files]}, "\n".join(lines))
 
 
-@take_options(*SCENARIO, *EGO_FILE, "trust")
+@command(*SCENARIO, *EGO_FILE, "trust")
 def check_ego_command(
     ego: EgoArgument,
     env: EnvArgument,
     asked: dict[str, Any],
     time_limit: Annotated[float, typer.Option(help="Seconds that one check may take.")] = 30.0,
     show_all: Annotated[bool, typer.Option("--all", help="Show each check that passed in a row of its own.")] = False,
-    as_json: JsonOption = False,
-) -> None:
+) -> Answer:
     """Check in seconds whether an ego fits: spaces, normalisation, determinism, memory, speed. 2: it does not."""
     from rare_envs.study.ego_check.findings import VERDICTS, exit_code, print_findings
     from rare_envs.study.ego_check.subprocess_check import check_ego
 
     findings = check_ego(Question(env_id=env, ego=ego, **asked), time_limit)
     code = exit_code(findings)
-    if as_json:
-        print_json(
-            {"ego": ego, "env_id": env, "verdict": VERDICTS[code], "findings": [asdict(each) for each in findings]}
-        )
-    else:
-        print_findings(findings, f"{ego} in {env}", show_all)
-    raise typer.Exit(code)
+    found = [asdict(each) for each in findings]
+    data = {"ego": ego, "env_id": env, "verdict": VERDICTS[code], "findings": found}
+    return Answer(data, partial(print_findings, findings, f"{ego} in {env}", show_all), code)
 
 
-@take_options(*EGO_FILE, "trust")
-@use_one_thread()
+@command(*EGO_FILE, "trust")
 def serve_ego_command(
     ego: EgoArgument,
     asked: dict[str, Any],
@@ -228,41 +198,23 @@ def serve_ego_command(
         from agents.remote.server import EgoServer
     except ImportError as error:
         raise BadInput("Serving needs pyzmq and msgpack: pip install 'rare-envs[remote]'.") from error
-    try:
+    with as_bad_input(ValueError, OSError):
         loaded = agents.load_ego(ego, **asked)
         if not is_policy(loaded):
             raise ValueError(f"Expected an ego with predict, got {ego!r}, which needs more than observations.")
         server = EgoServer(loaded, bind, read_secret(), name=ego)
-    except (ValueError, OSError) as error:
-        raise BadInput(error) from error
     with server:
         print(f"Serving {ego} at {server.address}; stop with Ctrl-C.", file=sys.stderr, flush=True)
         server.run()
 
 
-@take_options(*EGO_FILE, "trust")
+@command(*EGO_FILE, "trust")
 def export_ego_command(
     asked: dict[str, Any],
     model: Annotated[Path, typer.Argument(metavar="MODEL", help="A .zip saved by Stable-Baselines3.")],
     out: Annotated[Path, typer.Argument(metavar="OUT", help="The .onnx file to write.")],
-    as_json: JsonOption = False,
-) -> None:
+) -> Answer:
     """Write a saved policy as ONNX, normalisation, memory and clipping included, and check that both act alike."""
-    with keep_stdout_for_the_answer():
-        done = export_ego(model, out, **asked)
-    if as_json:
-        print_json(done)
-    else:
-        print(
-            f"Wrote {out}: its actions differ by {done['largest_difference']:.1e} at most "
-            f"on {done['observations_tried']:,} random observations."
-        )
-
-
-def export_ego(
-    model: Path, out: Path, algo: str | None = None, trust: bool = False, stats: str | None = None
-) -> dict[str, Any]:
-    """Write a Stable-Baselines3 `.zip` as ONNX, check that both act alike, and return what was written, JSON-ready."""
     if model.suffix != ".zip":
         raise BadInput(
             f"Only policies saved by Stable-Baselines3, files that end in .zip, are exported; got {str(model)!r}."
@@ -273,9 +225,9 @@ def export_ego(
         from agents.onnx import ACTION_TOLERANCE, export_onnx
         from agents.saved_ego import load_saved_ego
 
-        ego = load_saved_ego(model, algo, trust, stats)
+        ego = load_saved_ego(model, asked["algo"], asked["trust"], asked["stats"])
         exported = export_onnx(ego, out)
-    return {
+    data = {
         "model": str(model),
         "algorithm": ego.algorithm,
         "vec_normalize": None if ego.statistics_path is None else str(ego.statistics_path),
@@ -284,3 +236,5 @@ def export_ego(
         "tolerance": ACTION_TOLERANCE,
         "observations_tried": exported.observations,
     }
+    tried = f"on {exported.observations:,} random observations"
+    return Answer(data, f"Wrote {out}: its actions differ by {exported.difference:.1e} at most {tried}.")

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict
 from typing import Any
 
-import gymnasium as gym
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
@@ -21,7 +20,7 @@ from rare_envs.measures.registry import MEASURES
 from rare_envs.plugins import did_you_mean
 from rare_envs.scenarios.base import Scenario
 from rare_envs.scenarios.base_distributions import TextFile, load_base
-from rare_envs.scenarios.registry import SCENARIOS, env_id_of, find_scenario, kinematics_id
+from rare_envs.scenarios.registry import HIGHWAY_ENV_IDS, SCENARIOS, env_id_of, find_scenario, kinematics_id
 from rare_envs.sensors.camera.context import CONDITIONS, SENSOR_NOISE
 from rare_envs.simulation.background import noise_size
 from rare_envs.study.errors import BadInput
@@ -55,10 +54,6 @@ DRIVERS = {
 
 def list_names() -> dict[str, Any]:
     """Return everything that can be named on the command line, as JSON-ready values."""
-    import highway_env  # noqa: F401  (registers its ids)
-
-    from rare_envs.interop.scenario import SUPPORTED
-
     environments = {
         env_id: {
             "kinematics_id": kinematics_id(env_id),
@@ -75,7 +70,7 @@ def list_names() -> dict[str, Any]:
     }
     return {
         "environments": environments,
-        "highway_env": [name for name in SUPPORTED if name in gym.registry],
+        "highway_env": list(HIGHWAY_ENV_IDS),
         "weather": [asdict(parameter) for parameter in (*CONDITIONS, SENSOR_NOISE)],
         "methods": {name: _first_line(method) for name, method in samplers.METHODS.items()},
         "egos": EGOS,
@@ -108,18 +103,18 @@ KINDS = ("environments", *TITLES, "weather", EVERYTHING)
 def print_overview(entries: dict[str, Any]) -> None:
     """Print all names that `list_names` returns, without their meanings: a screen of 80 columns and 24 lines."""
     console = Console(highlight=False, markup=False)
-    environments = Table.grid(padding=(0, 1))
-    environments.add_row(Text("environments", style="bold"), Text("parameters", style="bold"))
+    environments = {"environments": "parameters"}
     for env_id, environment in entries["environments"].items():
-        own = [each["name"] for each in environment["parameters"]]
-        added = [each["name"] for each in environment["of_learned_drivers"]] if environment["drivers"] else []
-        environments.add_row(f"  {env_id}", ", ".join(own + added))
-    console.print(environments)
-    kinds = {"of HighwayEnv": entries["highway_env"], **{kind: entries[kind] for kind in TITLES}}
-    names = Table.grid(padding=(0, 1))
-    for kind, known in {**kinds, "weather": [each["name"] for each in entries["weather"]]}.items():
-        names.add_row(Text(kind, style="bold"), ", ".join(known))
-    console.print(names)
+        added = environment["of_learned_drivers"] if environment["drivers"] else []
+        environments[f"  {env_id}"] = ", ".join(each["name"] for each in environment["parameters"] + added)
+    weather = [each["name"] for each in entries["weather"]]
+    kinds = {"of HighwayEnv": entries["highway_env"], **{kind: entries[kind] for kind in TITLES}, "weather": weather}
+    for rows, bold in ((environments, 1), ({kind: ", ".join(known) for kind, known in kinds.items()}, len(kinds))):
+        table = Table.grid(padding=(0, 1))
+        for number, (name, text) in enumerate(rows.items()):
+            style = "bold" if number < bold else ""
+            table.add_row(Text(name, style=style), Text(text, style=style if rows is environments else ""))
+        console.print(table)
     console.print(
         "What they mean: rare-envs list egos (or another kind, an environment, all).\n"
         "Base distributions: rare-envs bases cut_in."
@@ -129,8 +124,7 @@ def print_overview(entries: dict[str, Any]) -> None:
 def print_details(entries: dict[str, Any], what: str) -> None:
     """Print the names of one kind with their meanings."""
     console, whole = Console(highlight=False), what == EVERYTHING
-    environments = entries["environments"]
-    for env_id, environment in environments.items():
+    for env_id, environment in entries["environments"].items():
         if whole or what in ("environments", env_id):
             _print_environment(console, env_id, environment)
     if whole or what == "environments":
@@ -142,7 +136,7 @@ def print_details(entries: dict[str, Any], what: str) -> None:
         console.print(_make_parameter_table("Weather, which --weather adds for egos with a camera", entries["weather"]))
     for kind, title in TITLES.items():
         if whole or what == kind:
-            console.print(_make_meaning_table(title, entries[kind]))
+            console.print(_make_table(title, ["name", "what it is"], entries[kind].items()))
 
 
 def choose_entries(entries: dict[str, Any], what: str) -> dict[str, Any]:
@@ -179,18 +173,17 @@ def _print_environment(console: Console, env_id: str, environment: dict[str, Any
 
 def _make_parameter_table(title: str, parameters: list[dict[str, Any]]) -> Table:
     """Return a table of names, units, ranges and meanings."""
-    table = Table("parameter", "unit", "range", "meaning", title=title, title_justify="left", title_style="bold")
+    rows = []
     for each in parameters:
         name = each["name"] if each["size"] == 1 else f"{each['name']} ({each['size']} values)"
-        table.add_row(name, each["unit"], f"{each['low']:g} to {each['high']:g}", each["meaning"])
-    return table
+        rows.append((name, each["unit"], f"{each['low']:g} to {each['high']:g}", each["meaning"]))
+    return _make_table(title, ["parameter", "unit", "range", "meaning"], rows)
 
 
-def _make_meaning_table(title: str, meanings: dict[str, str]) -> Table:
-    """Return a table of names and what each is."""
-    table = Table("name", "what it is", title=title, title_justify="left", title_style="bold")
-    for name, text in meanings.items():
-        table.add_row(name, text)
+def _make_table(title: str, heads: list[str], rows: Iterable[tuple[str, ...]]) -> Table:
+    table = Table(*heads, title=title, title_justify="left", title_style="bold")
+    for row in rows:
+        table.add_row(*row)
     return table
 
 
@@ -217,16 +210,16 @@ def print_bases(env_id: str, bases: Mapping[str, Mapping[str, Any]]) -> None:
 
 
 def _describe_base(scenario: Scenario, name: str) -> dict[str, Any]:
-    base, record = load_base(scenario, name), _read_record(scenario, name)
+    """Return what is known of a base distribution, JSON-ready; None and empty where nothing is."""
+    base, file = load_base(scenario, name), scenario.bases[name]
+    content = json.loads(file.read_text(encoding="utf-8")) if isinstance(file, TextFile) else file
+    record = content.get("provenance") if isinstance(content, Mapping) else None
+    record = record if isinstance(record, Mapping) else {}
     known: dict[str, Any] = {
         "kind": record.get("kind"),
         **{key: text or None for key, text in read_source(record).items()},
-        "coordinates": record.get("coordinates"),
-        "bic": record.get("bic"),
-        "held_out_log_prob": record.get("held_out_log_prob"),
-        "fitted_to": None,
-        "events": None,
-        "family": None,
+        **{key: record.get(key) for key in ("coordinates", "bic", "held_out_log_prob")},
+        **dict.fromkeys(("fitted_to", "events", "family")),
         "refits": 0,
         "frequency": None,
         "no_frequency": explain_no_frequency(record),
@@ -236,62 +229,36 @@ def _describe_base(scenario: Scenario, name: str) -> dict[str, Any]:
     if not isinstance(base, FittedDistribution):
         return known
     frequency = base.frequency
-    return {
-        **known,
-        "no_frequency": known["no_frequency"] if frequency is None else None,
+    if frequency is not None:
+        rates = {"per_hour": frequency.per_hour, "per_km": frequency.per_km}
+        known |= {"frequency": {**frequency.to_dict(), **rates}, "no_frequency": None}
+    return known | {
         "fitted_to": base.fitted_to,
         "events": base.events.to_dict(),
         "family": base.family,
         "refits": len(base.refits),
-        "frequency": frequency and {**frequency.to_dict(), "per_hour": frequency.per_hour, "per_km": frequency.per_km},
-        "checks": [
-            {"name": check.name, "recorded": check.recorded, "expected": check.expected} for check in base.checks
-        ],
+        "checks": [{key: getattr(check, key) for key in ("name", "recorded", "expected")} for check in base.checks],
     }
-
-
-def _read_record(scenario: Scenario, name: str) -> Mapping[str, Any]:
-    """Return the provenance of a base distribution; empty where it has none."""
-    base = scenario.bases[name]
-    content = json.loads(base.read_text(encoding="utf-8")) if isinstance(base, TextFile) else base
-    record = content.get("provenance") if isinstance(content, Mapping) else None
-    return record if isinstance(record, Mapping) else {}
 
 
 def _summarise(base: Mapping[str, Any]) -> dict[str, str]:
     """Return titles and texts of the lines of one base; empty texts where nothing is known."""
-    site = ", ".join(text for text in (base["site"], base["date"]) if text)
-    fit = [
-        f"BIC {base['bic']:,.1f}" if base["bic"] is not None else "",
-        f"held-out log likelihood {base['held_out_log_prob']:.2f} per event"
-        if base["held_out_log_prob"] is not None
-        else "",
-    ]
-    against = f" ({base['checked_against']})" if base["checked_against"] else ""
+    fit = {"BIC {:,.1f}": base["bic"], "held-out log likelihood {:.2f} per event": base["held_out_log_prob"]}
+    family, coordinates = base["family"] or "", base["coordinates"] or ""
     checks = [f"{each['name']} {each['recorded']} / {each['expected']:.3g}" for each in base["checks"]]
+    frequency = base["frequency"]
     return {
         "fitted to": f"{base['fitted_to']}, {base['refits'] or 'no'} refits" if base["fitted_to"] else "",
         "kind": base["kind"] or "",
-        "site": site,
+        "site": ", ".join(text for text in (base["site"], base["date"]) if text),
         "data": base["data"] or "",
         "licence": base["licence"] or "",
-        "family": _join_family(base["family"] or "", base["coordinates"] or ""),
-        "fit": ", ".join(text for text in fit if text),
-        "frequency": _describe_frequency(base["frequency"], base["no_frequency"]),
-        "counted in": (base["frequency"] or {}).get("source", ""),
-        "recorded / expected": ", ".join(checks) + against,
+        "family": family if coordinates in family else ", ".join(text for text in (family, coordinates) if text),
+        "fit": ", ".join(text.format(value) for text, value in fit.items() if value is not None),
+        "frequency": f"not known, no rate per hour or km: {base['no_frequency']}"
+        if frequency is None
+        else f"{format_rate(frequency['per_hour'])} per hour, {format_rate(frequency['per_km'])} per km: "
+        f"{frequency['count']:,} in {frequency['hours']:g} h ({frequency['definition']})",
+        "counted in": (frequency or {}).get("source", ""),
+        "recorded / expected": ", ".join(checks) + (f" ({base['checked_against']})" if base["checked_against"] else ""),
     }
-
-
-def _describe_frequency(frequency: Mapping[str, Any] | None, reason: str) -> str:
-    if frequency is None:
-        return f"not known, no rate per hour or km: {reason}"
-    return (
-        f"{format_rate(frequency['per_hour'])} per hour, {format_rate(frequency['per_km'])} per km: "
-        f"{frequency['count']:,} in {frequency['hours']:g} h ({frequency['definition']})"
-    )
-
-
-def _join_family(family: str, coordinates: str) -> str:
-    """Return the family in words with its coordinates, which it may name already."""
-    return family if coordinates in family else ", ".join(text for text in (family, coordinates) if text)

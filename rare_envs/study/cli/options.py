@@ -1,4 +1,4 @@
-"""Options of the command line: those of `Question` and `ExecutorOptions` follow from their fields."""
+"""Options and answers of commands: options of `Question` and `ExecutorOptions` follow from their fields."""
 
 from __future__ import annotations
 
@@ -6,14 +6,14 @@ import functools
 import inspect
 import math
 from collections.abc import Callable
-from dataclasses import Field, fields
-from enum import Enum
+from dataclasses import fields
 from pathlib import Path
-from typing import Annotated, Any, get_type_hints
+from typing import Annotated, Any, Literal, get_type_hints
 
 import typer
 
 from rare_envs.study.arguments import ExecutorOptions, Question, option_name
+from rare_envs.study.cli.shell import Answer, answering, is_typed
 
 SCENARIO = ("base", "drivers", "observation", "action", "horizon")
 """Fields of `Question` that are options of each command that drives an ego."""
@@ -21,9 +21,11 @@ WORLD = (*SCENARIO, "noise", "weather")
 ASKED = (*WORLD, "method", "measure", "gamma", "seed", "collisions", "device", "ensemble_run", "trust")
 EGO_FILE = ("algo", "stats")
 EVERYTHING = tuple(field.name for field in fields(Question) if field.name != "env_id")
-DEFAULT_BUDGET = "that of the method, 6,000 for two-stage"
+EXECUTOR = tuple(field.name for field in fields(ExecutorOptions))
 NOISE = {"on": True, "fixed": "fixed", "off": False}
 """Words of --noise for the `noise` argument of `DrivingProblem`."""
+KINDS: dict[str, Any] = {"noise": Literal["on", "fixed", "off"], "executor": Literal["local", "ray"] | None}
+"""Types of options of which the fields have another."""
 
 
 def read_count(text: str) -> int:
@@ -48,22 +50,13 @@ def read_environment(text: str | None) -> str | None:
     return None if text is None else complete_id(text)
 
 
-def count_option(help: str, **about: Any) -> Any:
-    """Return an option that takes whole numbers, 1e4 too."""
-    return typer.Option(help=help, parser=read_count, metavar="INTEGER", **about)
-
-
-def option_of(name: str, owner: type[Any] = Question) -> Any:
-    """Return the option of a field."""
-    field = _find_field(owner, name)
-    about = {key: field.metadata[key] for key in ("help", "show_default") if key in field.metadata}
+def option_of(name: str, owner: type[Any] = Question, **changes: Any) -> Any:
+    """Return the option of a field, with changes to what `typer.Option` is told."""
+    field = next(each for each in fields(owner) if each.name == name)
+    about = {key: field.metadata[key] for key in ("help", "show_default") if key in field.metadata} | changes
     if field.metadata.get("count"):
-        return count_option(**about)
+        return typer.Option(parser=read_count, metavar="INTEGER", **about)
     return typer.Option(field.metadata.get("flags", f"--{option_name(field).replace('_', '-')}"), **about)
-
-
-def _find_field(owner: type[Any], name: str) -> Field[Any]:
-    return next(each for each in fields(owner) if each.name == name)
 
 
 EnvArgument = Annotated[
@@ -71,7 +64,6 @@ EnvArgument = Annotated[
 ]
 EgoArgument = Annotated[str, typer.Argument(metavar="EGO", help="An ego, as for estimate --ego.")]
 RunArgument = Annotated[Path, typer.Argument(metavar="RUN", help="Folder that rare-envs estimate --out has written.")]
-TrustOption = Annotated[bool, option_of("trust")]
 ForceOption = Annotated[bool, typer.Option("--force", help="Replace what the folder of --out has of an earlier run.")]
 DetailsOption = Annotated[
     bool, typer.Option("--details", help="Print all intervals, and all parameters of the most likely failure.")
@@ -79,61 +71,53 @@ DetailsOption = Annotated[
 JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object and nothing else.")]
 
 
-class ExecutorKind(str, Enum):
-    """Words of --executor."""
+def command(*names: str, stopped: str = "") -> Callable[[Callable[..., Answer | None]], Callable[..., None]]:
+    """Let a function be a command of Typer: the answer that it returns, if any, is printed, as JSON with --json.
 
-    LOCAL = "local"
-    RAY = "ray"
+    Its parameter `asked` becomes the options of these fields of `Question`, `places` those of `ExecutorOptions`, and it
+    gets a mapping of them; `typed` gets the names of what was typed. `stopped` is said of an early interruption.
+    """
+    groups: dict[str, tuple[type[Any], tuple[str, ...]]] = {
+        "asked": (Question, names),
+        "places": (ExecutorOptions, EXECUTOR),
+    }
 
+    def decorate(function: Callable[..., Answer | None]) -> Callable[..., None]:
+        signature = inspect.signature(function, eval_str=True)
+        taken = signature.parameters
 
-class NoiseKind(str, Enum):
-    """Words of --noise."""
+        @functools.wraps(function)
+        def run(context: typer.Context, as_json: bool = False, **values: Any) -> None:
+            for group in groups.keys() & taken.keys():
+                known = {name: values.pop(name) for name in groups[group][1]}
+                values[group] = {name: NOISE[value] if name == "noise" else value for name, value in known.items()}
+            if "typed" in taken:
+                values["typed"] = {name for name in context.params if is_typed(context, name)}
+            answering(lambda: function(**values), as_json, stopped, values.get("details", False))
 
-    ON = "on"
-    FIXED = "fixed"
-    OFF = "off"
-
-
-_KINDS: dict[str, Any] = {"noise": NoiseKind, "executor": ExecutorKind | None}
-"""Types of options of which the fields have another."""
-
-
-def take_options(*names: str, executor: bool = False) -> Callable[[Callable[..., Any]], Callable[..., None]]:
-    """Let a command take options of `Question`, which it gets as the mapping `asked`."""
-    groups: dict[str, tuple[type[Any], tuple[str, ...]]] = {"asked": (Question, names)}
-    if executor:
-        groups["places"] = (ExecutorOptions, tuple(field.name for field in fields(ExecutorOptions)))
-
-    def decorate(command: Callable[..., Any]) -> Callable[..., None]:
-        @functools.wraps(command)
-        def spread(**values: Any) -> None:
-            for group, (_, known) in groups.items():
-                values[group] = {name: _read_choice(values.pop(name)) for name in known}
-            command(**values)
-
-        parameters: list[inspect.Parameter] = []
-        for name, parameter in inspect.signature(command, eval_str=True).parameters.items():
-            owner, known = groups.get(name, (None, ()))
-            made = [parameter] if owner is None else [_make_parameter(owner, each) for each in known]
-            parameters += [each.replace(kind=inspect.Parameter.KEYWORD_ONLY) for each in made]
-        spread.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
-        spread.__annotations__ = {each.name: each.annotation for each in parameters}
-        del spread.__wrapped__
-        return spread
+        parameters = [_parameter("context", typer.Context)]
+        for name, parameter in taken.items():
+            if name in groups:
+                owner, known = groups[name]
+                parameters += [_parameter_of(owner, each) for each in known]
+            elif name != "typed":
+                parameters.append(parameter.replace(kind=inspect.Parameter.KEYWORD_ONLY))
+        if signature.return_annotation is not None:
+            parameters.append(_parameter("as_json", JsonOption, False))
+        run.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+        run.__annotations__ = {each.name: each.annotation for each in parameters}
+        del run.__wrapped__
+        return run
 
     return decorate
 
 
-def _make_parameter(owner: type[Any], name: str) -> inspect.Parameter:
-    """Return the option of a field, as Typer reads it from a signature."""
-    kind = _KINDS.get(name) or get_type_hints(owner)[name]
-    default = NoiseKind.ON if name == "noise" else _find_field(owner, name).default
-    annotation = Annotated[kind, option_of(name, owner)]  # type: ignore[valid-type]  # known when the command is made
+def _parameter(name: str, annotation: Any, default: Any = inspect.Parameter.empty) -> inspect.Parameter:
     return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=annotation)
 
 
-def _read_choice(value: Any) -> Any:
-    """Return the argument that a word stands for."""
-    if isinstance(value, NoiseKind):
-        return NOISE[value.value]
-    return value.value if isinstance(value, Enum) else value
+def _parameter_of(owner: type[Any], name: str) -> inspect.Parameter:
+    """Return the option of a field, as Typer reads it from a signature."""
+    kind = KINDS.get(name) or get_type_hints(owner)[name]
+    default = "on" if name == "noise" else getattr(owner, name)
+    return _parameter(name, Annotated[kind, option_of(name, owner)], default)

@@ -7,13 +7,15 @@ import ctypes
 import json
 import os
 import re
+import shlex
 import signal
 import sys
 import threading
 import warnings
 from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
 from types import FrameType
-from typing import Any, NoReturn
+from typing import Any, NamedTuple, NoReturn
 
 import typer
 from typer.core import TyperGroup
@@ -21,13 +23,13 @@ from typer.core import TyperGroup
 from rare_envs.egos.errors import EgoGone
 from rare_envs.startup import find_missing_libraries, restore_signals
 from rare_envs.study.errors import BadInput
+from rare_envs.threads import use_one_thread
 
 DOUBTFUL = 3
 """Exit code of a command that is done, with warnings that make its number doubtful."""
 
-NOTHING_MADE = "Stopped: no estimate yet, no simulation made."
-"""What is known of a run that was interrupted before it has begun."""
-
+GATE_CODES = {"passes": 0, "fails": 4, "undecided": 5}
+"""Exit codes of a comparison of p with a limit."""
 WHOLE = 1_000
 """Characters of a summary in a list of commands: more than any has."""
 
@@ -164,11 +166,6 @@ def is_typed(context: typer.Context, name: str) -> bool:
     return source is not None and source.name == "COMMANDLINE"
 
 
-def list_typed(context: typer.Context) -> set[str]:
-    """Return the names of the parameters of a command that were typed."""
-    return {name for name in context.params if is_typed(context, name)}
-
-
 @contextlib.contextmanager
 def signals_as_exceptions(received: list[int]) -> Iterator[None]:
     """Raise `Terminated` on SIGTERM and SIGHUP, where they would end the process without a word."""
@@ -223,32 +220,61 @@ def _fail(message: str) -> NoReturn:
     sys.exit(2)
 
 
-@contextlib.contextmanager
-def say_early_stop(words: str = NOTHING_MADE) -> Iterator[None]:
-    """Print in one line what is known of a run that is interrupted before it has begun; for a command."""
-    try:
-        yield
-    except KeyboardInterrupt as error:
-        if not hasattr(error, "report"):  # unlike `RunInterrupted`
-            _print_stderr(words)
-        raise
+class Answer(NamedTuple):
+    """What a command says at its end."""
+
+    data: Mapping[str, Any]
+    """For --json."""
+    text: str | Callable[[], None]
+    """For people, or what prints it."""
+    code: int = 0
+    """Exit code."""
 
 
-@contextlib.contextmanager
-def show_what_is_known(show: Callable[[Any], None]) -> Iterator[None]:
-    """Print what a run knows that was interrupted, or whose results could not be written.
+def describe_report(report: Any, out: Path | None, details: bool) -> Answer:
+    """Return the answer of a `Report`, of a run in a folder `out` or of none."""
+    from rare_envs.study.text import print_report
 
-    The message of the interruption, one line, comes first: whoever ended the process may not wait for the rest.
+    def show() -> None:
+        print_report(report, out, details)
+        if not details:
+            where = "--details" if out is None else f"rare-envs report {shlex.quote(str(out))}"
+            print(f"all intervals and parameters: {where}")
+
+    doubtful = DOUBTFUL if report.doubtful else 0
+    return Answer(report.to_dict(), show, doubtful if report.verdict is None else GATE_CODES[report.verdict.decision])
+
+
+def answering(work: Callable[[], Answer | None], as_json: bool, stopped: str, details: bool) -> None:
+    """Do the work of a command, print its answer, if any, and exit.
+
+    If it is interrupted, or its results cannot be written, what is known is printed: the message of the interruption,
+    one line, comes first, because whoever ended the process may not wait for the rest. `stopped` is what is known of a
+    run that has not begun.
     """
     try:
-        yield
+        with use_one_thread(), keep_stdout_for_the_answer():
+            answer = work()
     except (KeyboardInterrupt, BadInput) as error:
         report = getattr(error, "report", None)  # of `RunInterrupted` and `UnwrittenResults`, slow to import
-        if isinstance(error, KeyboardInterrupt) and hasattr(error, "report"):
-            _print_stderr(str(error))
+        if isinstance(error, KeyboardInterrupt) and (hasattr(error, "report") or stopped):
+            _print_stderr(str(error) if hasattr(error, "report") else stopped)
         if report is not None:
-            print_whole(lambda: show(report))
+            known = report if isinstance(report, Answer) else describe_report(report, None, details)
+            print_whole(lambda: _print_answer(known, as_json))
         raise
+    if answer is not None:
+        print_whole(lambda: _print_answer(answer, as_json))
+        raise typer.Exit(answer.code)
+
+
+def _print_answer(answer: Answer, as_json: bool) -> None:
+    if as_json:
+        print(json.dumps(answer.data, indent=2, allow_nan=False))
+    elif isinstance(answer.text, str):
+        print(answer.text)
+    else:
+        answer.text()
 
 
 def print_whole(show: Callable[[], None]) -> None:
@@ -293,8 +319,3 @@ def _flush_c() -> None:
     """Write what C's standard library still has to write."""
     with contextlib.suppress(OSError, AttributeError, TypeError):  # there is none by this name on Windows
         ctypes.CDLL(None).fflush(None)
-
-
-def print_json(value: dict[str, Any]) -> None:
-    """Print the answer as one JSON object."""
-    print(json.dumps(value, indent=2, allow_nan=False))

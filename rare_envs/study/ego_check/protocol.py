@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Iterator
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -26,8 +28,7 @@ def check_protocol(spec: str) -> Iterator[Finding]:
         return
     address, settings = parse_address(spec)
     timeout = settings.get("timeout", TIMEOUT)
-    link = ServerLink(address, read_secret())
-    numbers = iter(range(1, 10**6))
+    link, numbers = ServerLink(address, read_secret()), itertools.count(1)
 
     def ask(message: Any) -> Any:
         content = message if isinstance(message, bytes) else protocol.pack({"id": next(numbers), **message})
@@ -43,59 +44,53 @@ def check_protocol(spec: str) -> Iterator[Finding]:
             return
         yield report_pass("handshake", f"protocol {protocol.PROTOCOL}, {hello.get('name', 'no name')!r}")
         yield _compare_reply("before hello", before, "error")
-        for name, act in _protocol_cases(hello).items():
-            yield from act(name, ask)
+        for name, (kind, *messages) in _list_cases(hello).items():
+            replies = [ask(message) for message in messages]
+            yield _compare_reply(name, replies[-1], kind)
+        yield _compare_reply("two sessions", _alternate(hello, ask), "action")
+        yield _compare_reply("end", ask({"type": "end", "session": 1}), "ended")
+        yield _compare_reply("after it all", ask({"type": "ping"}), "pong")
     except (LinkError, EgoGone, ValueError) as error:
         yield report_failure("protocol", reason_of(error), f"is it running at {address}? {PROTOCOL_ADVICE}")
     finally:
         link.close()
 
 
-def _protocol_cases(hello: Any) -> dict[str, Callable[[str, Any], Iterator[Finding]]]:
-    """Return the cases after the handshake, name to test."""
-    from agents.remote.protocol import decode_space
+def _act(hello: Any, session: int, step: int, rows: int = 3) -> dict[str, Any]:
+    """Return a query with blank observations of the space that the server has declared."""
+    from agents.remote import protocol
 
-    space = decode_space(hello.get("observation")) or spaces.Box(-5.0, 5.0, (7,), np.float32)
+    space = protocol.decode_space(hello.get("observation")) or spaces.Box(-5.0, 5.0, (7,), np.float32)
+    parts = dict(space.spaces) if isinstance(space, spaces.Dict) else space
+    blank = map_kinds(lambda part: np.zeros((rows, *part.shape), part.dtype), parts)
+    return {"type": "act", "session": session, "step": step, "observation": protocol.pack_observation(blank)}
 
-    def act(session: int, step: int, rows: int = 3) -> dict[str, Any]:
-        from agents.remote import protocol
 
-        parts = dict(space.spaces) if isinstance(space, spaces.Dict) else space
-        blank = map_kinds(lambda part: np.zeros((rows, *part.shape), part.dtype), parts)
-        return {"type": "act", "session": session, "step": step, "observation": protocol.pack_observation(blank)}
-
-    def expect(kind: str, *messages: Any) -> Callable[[str, Any], Iterator[Finding]]:
-        def run(name: str, ask: Any) -> Iterator[Finding]:
-            for message in messages:
-                reply = ask(message)
-            yield _compare_reply(name, reply, kind)
-
-        return run
-
-    def two_sessions(name: str, ask: Any) -> Iterator[Finding]:
-        for session in (11, 12):
-            ask({"type": "reset", "session": session, "batch": 3})
-        kinds = [ask(act(session, step)).get("type") for step in (0, 1) for session in (11, 12)]
-        yield _compare_reply(name, {"type": kinds[0] if len(set(kinds)) == 1 else kinds}, "action")
-
-    reset = {"type": "reset", "session": 1, "batch": 3}
+def _list_cases(hello: Any) -> dict[str, tuple[Any, ...]]:
+    """Return the cases after the handshake: the reply to the last of some messages."""
+    act, reset = partial(_act, hello), {"type": "reset", "session": 1, "batch": 3}
     empty = {"dtype": "<f4", "shape": [3, 7], "data": b""}
     return {
-        "heartbeat": expect("pong", {"type": "ping"}),
-        "unknown type": expect("error", {"type": "dance"}),
-        "no msgpack": expect("error", b"\xc1 not a message"),
-        "cut short": expect("error", b"\x82\xa4type\xa5res"),
-        "no reset": expect("error", act(99, 0)),
-        "reset": expect("ready", reset),
-        "act": expect("action", act(1, 0)),
-        "act again": expect("action", act(1, 1)),
-        "another step": expect("error", act(1, 7)),
-        "another batch": expect("error", reset, act(1, 0, rows=4)),
-        "data missing": expect("error", reset, {**act(1, 0), "observation": empty}),
-        "two sessions": two_sessions,
-        "end": expect("ended", {"type": "end", "session": 1}),
-        "after it all": expect("pong", {"type": "ping"}),
+        "heartbeat": ("pong", {"type": "ping"}),
+        "unknown type": ("error", {"type": "dance"}),
+        "no msgpack": ("error", b"\xc1 not a message"),
+        "cut short": ("error", b"\x82\xa4type\xa5res"),
+        "no reset": ("error", act(99, 0)),
+        "reset": ("ready", reset),
+        "act": ("action", act(1, 0)),
+        "act again": ("action", act(1, 1)),
+        "another step": ("error", act(1, 7)),
+        "another batch": ("error", reset, act(1, 0, rows=4)),
+        "data missing": ("error", reset, {**act(1, 0), "observation": empty}),
     }
+
+
+def _alternate(hello: Any, ask: Callable[[Any], Any]) -> dict[str, Any]:
+    """Return what a server replies to two sessions that take turns; all kinds of reply where they differ."""
+    for session in (11, 12):
+        ask({"type": "reset", "session": session, "batch": 3})
+    kinds = [ask(_act(hello, session, step)).get("type") for step in (0, 1) for session in (11, 12)]
+    return {"type": kinds[0] if len(set(kinds)) == 1 else kinds}
 
 
 def _compare_reply(name: str, reply: Any, kind: str) -> Finding:

@@ -5,22 +5,16 @@ The ego is loaded and asked in a process of its own, which may hang or die witho
 
 from __future__ import annotations
 
-import json
+import multiprocessing
 import os
-import queue
-import subprocess
-import sys
-import threading
 from collections.abc import Iterator
-from contextlib import suppress
-from dataclasses import asdict
+from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import Any
 
 from rare_envs.scenarios.registry import find_scenario
 from rare_envs.study.arguments import Question
 from rare_envs.study.ego_check.findings import Finding, report_failure, report_pass, report_warning
-from rare_envs.study.errors import BadInput
+from rare_envs.study.errors import BadInput, as_bad_input
 from rare_envs.threads import use_one_thread
 
 START_TIMEOUT = 60.0
@@ -50,73 +44,67 @@ def check_ego(question: Question, time_limit: float = 30.0) -> list[Finding]:
     from agents.safe_pickle import TRUST_ADVICE, TRUST_CONSEQUENCE, find_origin_risks
     from agents.saved_ego import find_statistics
 
-    try:
+    with as_bad_input(ValueError):
         find_scenario(question.env_id)
-    except ValueError as error:
-        raise BadInput(error) from error
     if time_limit <= 0:
         raise BadInput(f"Expected a time limit of some seconds, got {time_limit}.")
     name = strip_prefixes(question.ego)
     findings, kind = [], find_ego_kind(name)
     if kind == "url":
-        return [
-            report_failure(
-                "origin", f"{name!r} is a remote place", "download the file, look where it comes from, name it"
-            )
-        ]
+        advice = "download the file, look where it comes from, name it"
+        return [report_failure("origin", f"{name!r} is a remote place", advice)]
     if kind == "unknown":
         raise BadInput(f"Unknown ego {name!r}{suggest_ego(name)}; expected {EXPECTED_EGO}.")
     if name.endswith(EGO_SUFFIXES) and not Path(name).exists():
         raise BadInput(report_missing_file(Path(name)))
     if kind == "zip":
-        reasons = find_origin_risks(Path(name), find_statistics(Path(name)))
+        reasons = "; ".join(find_origin_risks(Path(name), find_statistics(Path(name))))
         if reasons and not question.trust:
-            return [report_failure("origin", "; ".join(reasons), TRUST_ADVICE)]
-        place = f" ({'; '.join(reasons)})" if reasons else ""
-        held = f"a Stable-Baselines3 .zip can hold code{place}"
-        if question.trust:
-            findings.append(report_warning("origin", held, f"you said --trust: {TRUST_CONSEQUENCE}", False))
-        else:
-            findings.append(report_pass("origin", f"{held}; opened here is only what is known to be harmless"))
+            return [report_failure("origin", reasons, TRUST_ADVICE)]
+        held = f"a Stable-Baselines3 .zip can hold code{f' ({reasons})' if reasons else ''}"
+        findings.append(
+            report_warning("origin", held, f"you said --trust: {TRUST_CONSEQUENCE}", False)
+            if question.trust
+            else report_pass("origin", f"{held}; opened here is only what is known to be harmless")
+        )
     return findings + list(_check_in_subprocess(question, time_limit))
 
 
 def _check_in_subprocess(question: Question, time_limit: float) -> Iterator[Finding]:
-    """Yield the findings of a subprocess, and a failure if it hangs or dies."""
-    words = [sys.executable, "-m", "rare_envs.study.ego_check.subprocess_check", json.dumps(asdict(question))]
-    with subprocess.Popen(words, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, text=True) as process:
-        lines: queue.Queue[str | None] = queue.Queue()
-        threading.Thread(target=_forward_lines, args=(process.stdout, lines), daemon=True).start()
-        doing, limit, done = "loading", max(START_TIMEOUT, time_limit), False
-        while not done:
-            try:
-                line = lines.get(timeout=limit)
-            except queue.Empty:
-                process.kill()
-                advice = "an ego that hangs stops the run; process:EGO?timeout=SECONDS would end it there"
-                yield report_failure(doing, f"no end after {limit:g} s", advice)
+    """Yield the findings of a process that is started anew, and a failure if it hangs or dies."""
+    context = multiprocessing.get_context("spawn")
+    received, sent = context.Pipe(duplex=False)
+    process = context.Process(target=_send_findings, args=(question, sent))
+    process.start()
+    sent.close()  # so that its end is noticed
+    doing, limit = "loading", max(START_TIMEOUT, time_limit)
+    try:
+        while received.poll(limit):
+            event, limit = received.recv(), time_limit
+            if event is None:
                 return
-            if line is None:
-                break
-            with suppress(json.JSONDecodeError):  # other output of libraries
-                event = json.loads(line)
-                doing, limit = event.get("doing", doing), time_limit
-                done = event.get("done", False)
-                if "finding" in event:
-                    yield Finding(**event["finding"])
-        if not done:
-            status = process.wait()
-            advice = "an ego that ends its process ends the run; process:EGO would survive it"
-            yield report_failure(doing, f"the process ended (exit status {status})", advice)
+            if isinstance(event, Finding):
+                yield event
+            else:
+                doing = event
+        advice = "an ego that hangs stops the run; process:EGO?timeout=SECONDS would end it there"
+        yield report_failure(doing, f"no end after {limit:g} s", advice)
+    except EOFError:
+        process.join()
+        advice = "an ego that ends its process ends the run; process:EGO would survive it"
+        yield report_failure(doing, f"the process ended (exit status {process.exitcode})", advice)
+    finally:
+        process.kill()
+        process.join()
 
 
-def _forward_lines(stream: Any, lines: queue.Queue[str | None]) -> None:
-    for line in stream:
-        lines.put(line)
-    lines.put(None)
-
-
-# --- in that process ---------------------------------------------------------------------------
+def _send_findings(question: Question, to: Connection) -> None:
+    """Run the checks in that process: send each finding, before each check its name, and None at the end."""
+    os.dup2(2, 1)  # an ego may print
+    with use_one_thread():
+        for each in run_checks(question):
+            to.send(each)
+    to.send(None)
 
 
 def run_checks(question: Question) -> Iterator[Finding | str]:
@@ -157,16 +145,3 @@ def run_checks(question: Question) -> Iterator[Finding | str]:
             return
         except (Exception, SystemExit) as error:  # likewise
             yield report_failure(name, reason_of(error), "the ego failed in this check")
-
-
-def _main(arguments: str) -> None:
-    out = os.fdopen(os.dup(1), "w", buffering=1)
-    os.dup2(2, 1)  # an ego may print
-    with use_one_thread():
-        for each in run_checks(Question(**json.loads(arguments))):
-            out.write(json.dumps({"doing": each} if isinstance(each, str) else {"finding": asdict(each)}) + "\n")
-    out.write(json.dumps({"done": True}) + "\n")
-
-
-if __name__ == "__main__":
-    _main(sys.argv[1])

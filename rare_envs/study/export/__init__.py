@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from rare_envs.plugins import did_you_mean
 from rare_envs.problem import DrivingProblem
 from rare_envs.study.export.commonroad import write_commonroad
-from rare_envs.study.export.openscenario import StoryOptions, write_road, write_story
+from rare_envs.study.export.openscenario import Story, write_road
 from rare_envs.study.export.trajectories import find_trajectories
 from rare_envs.study.replay import Drive, drive_again
 from rare_envs.version import __version__
@@ -36,14 +36,7 @@ def export_scenario(
     format: str = "openscenario",
     ego: Literal["recorded", "free"] | None = None,
 ) -> tuple[Path, ...]:
-    """Drive a scenario and write it for other simulators; see `export_drive`.
-
-    Args:
-        problem: The world and its ego.
-        x: Scenario parameters, shape (d,).
-        path: The file.
-        format: One of `EXPORT_FORMATS`.
-        ego: "recorded" or "free".
+    """Drive a scenario x (d,) of a problem and write it for other simulators; see `export_drive`.
 
     Returns:
         The files written.
@@ -117,8 +110,7 @@ def export_drive(
     road_path = path.with_suffix(".xodr")
     write_road(road_path, road, start, end, drive.problem.world.scenario.name)
     about = {"env_id": drive.problem.env_id, "rare_envs": __version__, **(properties or {})}
-    options = StoryOptions(title, about, free_ego=free, carla=format == "carla")
-    write_story(path, trajectories, road_path.name, options)
+    Story(trajectories, free, carla=format == "carla").write(path, road_path.name, title, about)
     return path, road_path
 
 

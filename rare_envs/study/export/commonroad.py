@@ -36,16 +36,7 @@ def write_commonroad(
     title: str,
     free_ego: bool = False,
 ) -> None:
-    """Write a CommonRoad XML file.
-
-    Args:
-        path: The file.
-        trajectories: Of the vehicles, from time 0.
-        road: Their road.
-        extent: Begin and end of the road [m].
-        title: Of the scenario, for its source.
-        free_ego: Whether the ego is the planning problem alone, and no obstacle too.
-    """
+    """Write a drive on a road between two places [m]; a free ego is the planning problem alone, and no obstacle too."""
     root = ET.Element(
         "commonRoad",
         commonRoadVersion="2020a",

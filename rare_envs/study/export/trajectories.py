@@ -57,13 +57,7 @@ def find_trajectories(drive: Drive) -> WorldTrajectories:
 
 
 def sample_line(road: Road, y: float, along: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return points of a line along the road in the right-handed world, x and y [m], shape (k,) each.
-
-    Args:
-        road: The road.
-        y: Across the road, positive to the right [m].
-        along: Along the road [m], shape (k,).
-    """
+    """Return points, x and y [m], of a line y [m] to the right of the road's, at places along it (k,)."""
     s = torch.from_numpy(along)
     x, across, _ = road.to_world(s, torch.full_like(s, y), torch.zeros_like(s))
     return x.numpy(), -across.numpy()

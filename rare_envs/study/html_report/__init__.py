@@ -45,29 +45,8 @@ from samplers.sample import describe_outcome
 
 __all__ = ["write_html_report"]
 
-_BROKEN_NUMBER = re.compile(r"(?<=\d) (?=%|× 10)|(?<=×) (?=10)")
+BROKEN_NUMBER = re.compile(r"(?<=\d) (?=%|× 10)|(?<=×) (?=10)")
 """Spaces within a number: "0.12 %", "3.1 × 10⁻⁵"."""
-
-
-def keep_numbers_whole(value: object) -> object:
-    """Return text without line breaks within its numbers; anything else, pictures and styles too, as it is."""
-    if not isinstance(value, str) or isinstance(value, Markup):
-        return value
-    return _BROKEN_NUMBER.sub("\xa0", value)
-
-
-def render_template(name: str, **values: Any) -> str:
-    """Return a page."""
-    environment = jinja2.Environment(
-        loader=jinja2.PackageLoader("rare_envs.study.html_report"),
-        autoescape=True,
-        trim_blocks=True,
-        lstrip_blocks=True,
-        finalize=keep_numbers_whole,
-    )
-    return environment.get_template(name).render(**values)
-
-
 SECTIONS = ("warnings", "answer", "convergence", "levels", "weights", "curve", "parameters", "kinds", "atlas", "made")
 """Ids of the sections of the page, in their order."""
 
@@ -103,33 +82,37 @@ def write_html_report(
         raise BadInput(f"Expected --figures {', '.join(FORMATS)}, got {figures!r}.")
     study, page = load_finished(folder), out or folder / REPORT
     with output_file(page):
-        return _write(study, page, trust, events, figures)
-
-
-def _write(study: LoadedStudy, page: Path, trust: bool, events: Path | None, kind: str | None) -> list[Path]:
-    """Write the page of a run, and its figures where their kind is given; return the files."""
-    folder, failures, question = study.folder, study.failures, open_run(study, trust)
-    warn_of_changed_files(question, folder)
-    problem = prepare(question).problem
-    columns = [column for column in list_columns(problem.space) if column.shown]
-    known = None if events is None else read_recorded_events(events, [column.name for column in columns])
-    ordinary = draw_ordinary(problem.space)
-    source = AtlasSource(folder, problem, failures, ordinary, known)
-    with _damage_as_bad_input(folder):
-        atlas = build_atlas(source, list(study.result.get("modes") or []))
-        drawn = _make_figures(study, source)
-        text = render_page(study, drawn, atlas)
-    with as_bad_input(OSError):
-        replace_text(page, text)
-        saved = [] if kind is None else _save_figures(page.parent / "figures", kind, drawn, atlas)
-    return [page, *saved]
+        question = open_run(study, trust)
+        warn_of_changed_files(question, folder)
+        problem = prepare(question).problem
+        shown = [column.name for column in list_columns(problem.space) if column.shown]
+        known = None if events is None else read_recorded_events(events, shown)
+        source = AtlasSource(folder, problem, study.failures, draw_ordinary(problem.space), known)
+        with _damage_as_bad_input(folder):
+            atlas = build_atlas(source, list(study.result.get("modes") or []))
+            drawn = _make_figures(study, source)
+            text = render_page(study, drawn, atlas)
+        with as_bad_input(OSError):
+            replace_text(page, text)
+            if figures is None:
+                return [page]
+            every = [*drawn.values(), *(figure for entry in atlas for figure in entry.figures)]
+            with output_folder(page.parent / "figures"):
+                return [page, *(figure.save(page.parent / "figures", figures) for figure in every)]
 
 
 def render_page(study: LoadedStudy, figures: Mapping[str, FigureOfPage], atlas: Sequence[AtlasEntry]) -> str:
     """Return the page as text; everything that files say is escaped."""
-    result, doubts = study.result, _list_texts(study.result, "doubts")
-    return render_template(
-        "report.html.j2",
+    result = study.result
+    environment = jinja2.Environment(
+        loader=jinja2.PackageLoader("rare_envs.study.html_report"),
+        autoescape=True,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        finalize=_keep_numbers_whole,
+    )
+    doubts = _list_texts(result, "doubts")
+    return environment.get_template("report.html.j2").render(
         result=result,
         about=study.about,
         folder=str(study.folder),
@@ -143,7 +126,6 @@ def render_page(study: LoadedStudy, figures: Mapping[str, FigureOfPage], atlas: 
         rate=describe_rate(result),
         method=describe_method(result),
         figures={name: figure.to_svg() for name, figure in figures.items()},
-        captions={name: figure.caption for name, figure in figures.items()},
         passes_levels=passes_levels(result),
         atlas=atlas,
         svgs={figure.name: figure.to_svg() for entry in atlas for figure in entry.figures},
@@ -151,6 +133,11 @@ def render_page(study: LoadedStudy, figures: Mapping[str, FigureOfPage], atlas: 
         probability=format_probability,
         roles={**ROLE_COLOURS, "outline: crashed": CRASH_COLOUR},
     )
+
+
+def _keep_numbers_whole(value: object) -> object:
+    """Return text without line breaks within its numbers; anything else, pictures and styles too, as it is."""
+    return BROKEN_NUMBER.sub("\xa0", value) if isinstance(value, str) and not isinstance(value, Markup) else value
 
 
 @contextlib.contextmanager
@@ -176,20 +163,20 @@ def _list_texts(result: Mapping[str, Any], *names: str) -> list[str]:
 
 def _make_figures(study: LoadedStudy, source: AtlasSource) -> dict[str, FigureOfPage]:
     """Return the figures of the run by name."""
-    space = source.problem.space
-    shown = [j for j, column in enumerate(list_columns(space)) if column.shown]
-    columns = [list_columns(space)[j] for j in shown]
+    every = list_columns(source.problem.space)
+    columns, ordinary = [each for each in every if each.shown], source.ordinary[:, [each.shown for each in every]]
     failing, log_weights = _read_failing(study, [column.name for column in columns])
-    known = log_weights[~np.isnan(log_weights)]
-    figures = figures_of_result(study.result, known, name_measure(str(study.question.get("measure", ""))))
-    ordinary = source.ordinary[:, shown]
+    weighted = ~np.isnan(log_weights)
+    measure = name_measure(str(study.question.get("measure", "")))
+    figures = figures_of_result(study.result, log_weights[weighted], measure)
     if len(failing) and columns:
-        weighted = ~np.isnan(log_weights) if len(known) else np.ones(len(failing), dtype=bool)
-        weights = np.exp(log_weights[weighted]) if len(known) else np.ones(len(failing))
-        order = _rank_shifts(ordinary, failing[weighted], weights)[:MAX_HISTOGRAMS]
+        weights = np.ones(len(failing))
+        if weighted.any():
+            failing, weights = failing[weighted], np.exp(log_weights[weighted])
+        shift = np.abs(np.average(failing, axis=0, weights=weights) - ordinary.mean(axis=0))
+        order = np.argsort(-shift / np.maximum(ordinary.std(axis=0), 1e-12), kind="stable")[:MAX_HISTOGRAMS]
         labels = [columns[j].label for j in order]
-        chosen = failing[weighted][:, order]
-        figures["parameters"] = figure_of_parameters(ordinary[:, order], chosen, weights, labels)
+        figures["parameters"] = figure_of_parameters(ordinary[:, order], failing[:, order], weights, labels)
     return figures
 
 
@@ -203,17 +190,3 @@ def _read_failing(study: LoadedStudy, names: list[str]) -> tuple[FloatArray, Flo
         found = study.episodes([*names, "log_weight"], failed=True)
     x = np.column_stack([found[name].to_numpy() for name in names]) if names else np.empty((found.num_rows, 0))
     return x, found["log_weight"].to_numpy().astype(float)
-
-
-def _rank_shifts(ordinary: FloatArray, failing: FloatArray, weights: FloatArray) -> list[int]:
-    """Return the columns in which failures differ most from ordinary traffic, by |mean shift| / deviation."""
-    shift = np.average(failing, axis=0, weights=weights) - ordinary.mean(axis=0)
-    return [int(j) for j in np.argsort(-np.abs(shift) / np.maximum(ordinary.std(axis=0), 1e-12), kind="stable")]
-
-
-def _save_figures(
-    folder: Path, kind: str, figures: Mapping[str, FigureOfPage], atlas: Sequence[AtlasEntry]
-) -> list[Path]:
-    with output_folder(folder):
-        every = [*figures.values(), *(figure for entry in atlas for figure in entry.figures)]
-        return [figure.save(folder, kind) for figure in every]

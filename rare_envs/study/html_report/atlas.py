@@ -6,8 +6,7 @@ import base64
 import csv
 import io
 import shlex
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -90,26 +89,24 @@ CLIP_SECONDS = 5.0
 """Seconds of a clip, the last ones up to the end of the drive."""
 
 
-@dataclass(frozen=True)
-class AtlasEntry:
+class AtlasEntry(NamedTuple):
     """A mode of failure as the page shows it."""
 
     number: int
     title: str
     share: str
-    facts: list[tuple[str, str]]
+    facts: Sequence[tuple[str, str]] = ()
     """Names and values."""
-    parameters: list[tuple[str, str, str, str]]
+    parameters: Sequence[tuple[str, str, str, str]] = ()
     """Name, value at the failure, where nine of ten ordinary scenarios lie, and value of the nearest event."""
-    clip: str
+    clip: str = ""
     """Moving picture as a data URI; "" if there is none."""
-    figures: list[FigureOfPage]
-    missing: str
+    figures: Sequence[FigureOfPage] = ()
+    missing: str = ""
     """Why there are no pictures; "" if there are."""
 
 
-@dataclass(frozen=True)
-class AtlasSource:
+class AtlasSource(NamedTuple):
     """What the atlas of a run is made from."""
 
     folder: Path
@@ -135,34 +132,31 @@ def _build_entry(source: AtlasSource, number: int, mode: Mapping[str, Any]) -> A
         f"({format_probability(low, mode['p'])} to {format_probability(high, mode['p'])})"
     )
     title = f"Mode {number}: {describe_kind(crash)}"
+    entry = AtlasEntry(number, title, share)
     if failure is None:
-        return AtlasEntry(number, title, share, [], [], "", [], "none of its failures is in failures.csv")
+        return entry._replace(missing="none of its failures is in failures.csv")
     x = join_parameters(dict(source.failures), source.problem, int(failure))
-    nearest = _find_nearest(source, x)
-    parameters = _list_parameters(source, x, nearest)
+    nearest = None
+    if source.events is not None:
+        shown = [column.shown for column in list_columns(source.problem.space)]
+        nearest = find_nearest_event(x[shown], source.events, source.ordinary[:, shown])
     facts = _list_facts(source, int(failure), nearest)
+    entry = entry._replace(facts=facts, parameters=_list_parameters(source, x, nearest))
     try:
         drive = drive_again(source.problem, x)
         figures, clip = _draw_drive(drive, number), encode_clip(drive)
     except (Exception, SystemExit, EgoGone) as error:  # the ego is the user's, and need not do again what it did before
-        return AtlasEntry(number, title, share, facts, parameters, "", [], f"it cannot be shown: {reason_of(error)}")
-    return AtlasEntry(number, title, share, _describe_crash(drive) + facts, parameters, clip, figures, "")
+        return entry._replace(missing=f"it cannot be shown: {reason_of(error)}")
+    return entry._replace(facts=_describe_crash(drive) + facts, clip=clip, figures=figures)
 
 
 def _list_facts(source: AtlasSource, failure: int, nearest: NearestEvent | None) -> list[tuple[str, str]]:
-    facts = [
-        ("f", f"{float(source.failures['f'][failure]):.4g}"),
-        (
-            "replay",
-            f"rare-envs replay {shlex.quote(str(source.folder))} --failure {failure} --out failure_{failure}.gif",
-        ),
-    ]
+    run = shlex.quote(str(source.folder))
+    facts = [("f", f"{float(source.failures['f'][failure]):.4g}")]
     if nearest is not None:
-        text = f"{nearest.distance:.2g} standard deviations per parameter away"
-        facts.insert(
-            1, ("nearest recorded", f"{text}; {100 * nearest.rarer:.2g} % of ordinary scenarios are as far from theirs")
-        )
-    return facts
+        rarer = f"{100 * nearest.rarer:.2g} % of ordinary scenarios are as far from theirs"
+        facts.append(("nearest recorded", f"{nearest.distance:.2g} standard deviations per parameter away; {rarer}"))
+    return [*facts, ("replay", f"rare-envs replay {run} --failure {failure} --out failure_{failure}.gif")]
 
 
 def _describe_crash(drive: Drive) -> list[tuple[str, str]]:
@@ -193,13 +187,6 @@ def _list_parameters(
     return rows
 
 
-def _find_nearest(source: AtlasSource, x: FloatArray) -> NearestEvent | None:
-    if source.events is None:
-        return None
-    shown = [column.shown for column in list_columns(source.problem.space)]
-    return find_nearest_event(x[shown], source.events, source.ordinary[:, shown])
-
-
 def _draw_drive(drive: Drive, number: int) -> list[FigureOfPage]:
     """Return the figures of a drive: from above, the measure, and speeds."""
     first = int(np.argmin(np.abs(drive.time - (drive.time[drive.worst] - LAST_SECONDS))))
@@ -209,14 +196,14 @@ def _draw_drive(drive: Drive, number: int) -> list[FigureOfPage]:
         for axes, t in zip(figure.subplots(MOMENTS, 1), moments, strict=True):
             draw_moment(axes, drive, int(t))
 
-    road = drive.road
-    height = 0.25 + MOMENTS * max(0.6, 0.045 * road.lanes * road.width)
+    height = 0.25 + MOMENTS * max(0.6, 0.045 * drive.road.lanes * drive.road.width)
     return [
-        FigureOfPage(f"mode{number}-views", "From above; the ego is green", draw_views, (6.4, height)),
-        FigureOfPage(f"mode{number}-measure", "The measure over time", lambda f: _draw_measure(f, drive), (6.4, 2.2)),
-        FigureOfPage(
-            f"mode{number}-speeds", "Speeds and gap over time", lambda f: draw_speeds(f.subplots(), drive), (6.4, 2.8)
-        ),
+        FigureOfPage(f"mode{number}-{name}", caption, draw, (6.4, tall))
+        for name, caption, draw, tall in (
+            ("views", "From above; the ego is green", draw_views, height),
+            ("measure", "The measure over time", lambda figure: _draw_measure(figure, drive), 2.2),
+            ("speeds", "Speeds and gap over time", lambda figure: draw_speeds(figure.subplots(), drive), 2.8),
+        )
     ]
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import html
 import io
 import math
 import re
@@ -33,13 +34,8 @@ Size = tuple[float, float]
 class FigureOfPage:
     """A figure of the page, drawn once for each format that is asked for.
 
-    Args:
-        name: A word, which is its name as a file.
-        caption: What it shows, in words.
-        draw: Draws it.
-        size: Width and height [inch].
-        narrow: As draw and size, for a narrow screen; None for the same figure, which has to be moved there where it is
-            wide.
+    Its name is that of its file, its size in inch. `narrow` are function and size for a narrow screen; without them the
+    same figure is shown there, and has to be moved where it is wide.
     """
 
     def __init__(
@@ -64,15 +60,15 @@ class FigureOfPage:
             self._make().savefig(buffer, format="svg", metadata={"Date": None})
         text = buffer.getvalue()
         text = re.sub(r"<metadata>.*?</metadata>", "", text[text.index("<svg") :], flags=re.DOTALL)
-        text = re.sub(
-            r'(<svg[^>]*?) width="[^"]*"', r"\1", re.sub(r'(<svg[^>]*?) height="[^"]*"', r"\1", text, count=1), count=1
-        )
+        for name in ("height", "width"):
+            text = re.sub(rf'(<svg[^>]*?) {name}="[^"]*"', r"\1", text, count=1)
         # ids of matplotlib, such as figure_1, are the same in every figure
         text = re.sub(r'\bid="([^"]+)"', rf'id="{self.name}-\1"', text)
         text = re.sub(r'(xlink:href="#|href="#|url\(#)(?=[^)"])', rf"\g<1>{self.name}-", text)
         # no larger than with type of normal size; a phone shows wide ones as large as can be read, and moves them
         size = f"max-width:{110 * self._size[0]:.0f}px;min-width:{WIDE_ON_PHONES if self._size[0] > 7 else 0}px"
-        return text.replace("<svg", f'<svg role="img" aria-label="{_escape(self.caption)}" style="{size}"', 1).strip()
+        label = html.escape(self.caption)
+        return text.replace("<svg", f'<svg role="img" aria-label="{label}" style="{size}"', 1).strip()
 
     def save(self, folder: Path, kind: str) -> Path:
         """Save it as a file of a folder, and return its path."""
@@ -85,10 +81,6 @@ class FigureOfPage:
         figure = Figure(figsize=self._size, layout="constrained")
         self._draw(figure)
         return figure
-
-
-def _escape(text: str) -> str:
-    return text.replace("&", "&amp;").replace("<", "&lt;").replace(">", "&gt;").replace('"', "&quot;")
 
 
 TWO_PANELS_SIZE, PANEL_SIZE = (7.2, 3.2), (5.4, 3.2)
@@ -120,14 +112,7 @@ def draw_levels(figure: Figure, result: Result, stacked: bool = False) -> None:
 
 
 def draw_weights(figure: Figure, log_weights: FloatArray, p: float, stacked: bool = False) -> None:
-    """Draw how much of p each failing simulation carries: a histogram, and p by the heaviest of them.
-
-    Args:
-        figure: To draw into.
-        log_weights: Of the failing simulations, shape (k,).
-        p: Their sum.
-        stacked: Whether the panels stand one below the other.
-    """
+    """Draw how much of p each failing simulation (k,) carries: a histogram, and p by the heaviest of them."""
     histogram, share = _make_panels(figure, 2, stacked)
     parts = np.sort(np.exp(log_weights) / p)[::-1]
     shown = np.log10(parts[parts > 0])
@@ -160,16 +145,7 @@ def draw_curve(figure: Figure, curve: Mapping[str, Any], gamma: float, measure: 
 def draw_parameters(
     figure: Figure, ordinary: FloatArray, failing: FloatArray, weights: FloatArray, labels: list[str], columns: int = 3
 ) -> None:
-    """Draw each parameter in ordinary traffic and among failures.
-
-    Args:
-        figure: To draw into.
-        ordinary: Draws of the base distribution, shape (n, k).
-        failing: Failures, shape (m, k).
-        weights: Of the failures, shape (m,).
-        labels: Name and unit of each, length k.
-        columns: Panels side by side.
-    """
+    """Draw each of k parameters in ordinary traffic (n, k) and among failures (m, k) with weights (m,)."""
     rows = math.ceil(len(labels) / columns)
     panels = np.atleast_1d(figure.subplots(rows, min(columns, len(labels)), squeeze=False)).ravel()
     for j, axes in enumerate(panels):
@@ -206,40 +182,38 @@ def draw_severity(figure: Figure, severity: Mapping[str, Any]) -> None:
 def figures_of_result(result: Result, log_weights: FloatArray, measure: str) -> dict[str, FigureOfPage]:
     """Return the figures that the numbers of a run allow, by name.
 
-    Args:
-        result: Of the run.
-        log_weights: Of its failing simulations, shape (k,); empty where they have none.
-        measure: What f is, with its unit.
+    `log_weights` (k,) are those of its failing simulations, none where they are not known; `measure` is what f is.
     """
-    way, levels = "The estimate on the way, and the result", "Levels of the run: shares and thresholds"
-    passes = passes_levels(result)
-    room = TWO_PANELS_SIZE if passes else PANEL_SIZE
-    narrow = (lambda f: draw_levels(f, result, stacked=True), STACKED_SIZE) if passes else None
-    made = [
-        FigureOfPage("convergence", way, lambda f: draw_convergence(f.subplots(), result), PANEL_SIZE),
-        FigureOfPage("levels", levels, lambda f: draw_levels(f, result), room, narrow),
-    ]
+    two = passes_levels(result)
+    curve, severity = result.get("curve"), result.get("severity")
+    drawn: dict[str, tuple[Any, ...]] = {
+        "convergence": (
+            "The estimate on the way, and the result",
+            lambda figure: draw_convergence(figure.subplots(), result),
+            PANEL_SIZE,
+        ),
+        "levels": (
+            "Levels of the run: shares and thresholds",
+            lambda figure: draw_levels(figure, result),
+            TWO_PANELS_SIZE if two else PANEL_SIZE,
+            (lambda figure: draw_levels(figure, result, stacked=True), STACKED_SIZE) if two else None,
+        ),
+    }
     if len(log_weights):
         p = float(np.exp(log_weights).sum())
-        caption = "Weights of the failing simulations"
-        made.append(
-            FigureOfPage(
-                "weights",
-                caption,
-                lambda f: draw_weights(f, log_weights, p),
-                TWO_PANELS_SIZE,
-                (lambda f: draw_weights(f, log_weights, p, stacked=True), STACKED_SIZE),
-            )
+        drawn["weights"] = (
+            "Weights of the failing simulations",
+            lambda figure: draw_weights(figure, log_weights, p),
+            TWO_PANELS_SIZE,
+            (lambda figure: draw_weights(figure, log_weights, p, stacked=True), STACKED_SIZE),
         )
-    curve, severity = result.get("curve"), result.get("severity")
     if isinstance(curve, dict):
         gamma = float(result["gamma"])
         caption = "Probability over the threshold, with its band"
-        made.append(FigureOfPage("curve", caption, lambda f: draw_curve(f, curve, gamma, measure), PANEL_SIZE))
+        drawn["curve"] = (caption, lambda figure: draw_curve(figure, curve, gamma, measure), PANEL_SIZE)
     if isinstance(severity, dict):
-        caption = "Severity of the collisions"
-        made.append(FigureOfPage("severity", caption, lambda f: draw_severity(f, severity), PANEL_SIZE))
-    return {figure.name: figure for figure in made}
+        drawn["severity"] = ("Severity of the collisions", lambda figure: draw_severity(figure, severity), PANEL_SIZE)
+    return {name: FigureOfPage(name, *about) for name, about in drawn.items()}
 
 
 def passes_levels(result: Result) -> bool:

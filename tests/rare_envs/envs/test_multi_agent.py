@@ -149,10 +149,10 @@ def test_an_ego_alone_is_the_step_of_one(kind: str) -> None:
     alone = advance(world, world.start(X), ego)
     action = torch.stack((ego, torch.zeros_like(ego)), dim=1)
     commanded = torch.tensor([[True, False]]).expand(2, 2)
-    found = step_agents(world, start(world, X), action, commanded, {0: own_reward}, IDM())
-    assert torch.equal(found.episode.views[0].state.x, alone.episode.state.x)
-    assert torch.equal(found.episode.views[0].f, alone.episode.f)
-    for mine, theirs in zip(found.rewards[0], alone.terms, strict=True):
+    episode, earned, _ = step_agents(world, start(world, X), action, commanded, {0: own_reward}, IDM())
+    assert torch.equal(episode.views[0].state.x, alone.episode.state.x)
+    assert torch.equal(episode.views[0].f, alone.episode.f)
+    for mine, theirs in zip(earned[0], alone.terms, strict=True):
         assert torch.equal(mine, theirs)
 
 
@@ -169,8 +169,8 @@ def test_a_reward_may_be_a_tensor() -> None:
     world = World(CAR_FOLLOWING, clock=Clock(horizon=1.0, action="meta"))
     action, commanded = torch.full((2, 2), IDLE), torch.tensor([[True, False]]).expand(2, 2)
     rewards = {0: lambda transition: torch.ones(2)}
-    found = step_agents(world, start(world, X), action, commanded, rewards, IDM())
-    torch.testing.assert_close(found.rewards[0], torch.tensor([1.0, 0.4]))  # 3.5 m at 10 m/s: four ticks
+    _, earned, _ = step_agents(world, start(world, X), action, commanded, rewards, IDM())
+    torch.testing.assert_close(earned[0], torch.tensor([1.0, 0.4]))  # 3.5 m at 10 m/s: four ticks
 
 
 SMALL = (36, 60)

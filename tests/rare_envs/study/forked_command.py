@@ -102,7 +102,7 @@ def run_command(
     """Run a command, without pictures, and exit with its code."""
     from rare_envs.problem import DrivingProblem
     from rare_envs.study import cli, writing
-    from rare_envs.study.cli.options import ExecutorOptions
+    from rare_envs.study.arguments import ExecutorOptions
     from samplers.journal import Journal
     from tests.samplers.real_executors import open_executor
 

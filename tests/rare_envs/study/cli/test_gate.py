@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from rare_envs.study.cli.estimate import GATE_CODES
+from rare_envs.study.cli.shell import GATE_CODES
 from tests.rare_envs.study.refusals import SMALL, Cli, assert_refused
 
 

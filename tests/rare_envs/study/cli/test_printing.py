@@ -4,17 +4,11 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from typer.testing import Result
 
-Cli = Callable[..., Result]
-
-FOLLOWING = "rare_envs/CarFollowing-v0"
-
-SMALL = ("estimate", FOLLOWING, "--method", "mc", "--max-sim", 2000)
+from tests.rare_envs.study.refusals import FOLLOWING, SMALL, Cli
 
 
 def test_the_answer_is_readable(cli: Cli, risky: str) -> None:
