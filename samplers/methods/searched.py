@@ -9,7 +9,7 @@ simulated x replays.
 
 import math
 from collections.abc import Generator
-from typing import NamedTuple, TypeVar, cast
+from typing import Any, NamedTuple, TypeVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -84,19 +84,31 @@ SimulationSteps = Generator[FloatArray, FloatArray, _T]
 
 
 class Simulator:
-    """The way to f from standard normal space, and its count: the only part of a run that is changed in place.
+    """The way to f from standard normal space, its count and trace: the only part of a run that is changed in place.
 
     An `Interrupted` that ends a step midway discards the step's state, not the simulations that it made; so the count
-    stands outside the state.
-
-    Attributes:
-        inputs: Coordinates that are searched, and the map from u to x.
-        n_sim: Simulations made so far.
+    stands outside the state. `inputs` are the coordinates that are searched, with the map from u to x.
     """
 
-    def __init__(self, inputs: Inputs) -> None:
-        self.inputs = inputs
+    def __init__(self, inputs: Inputs, goal: Goal | None = None) -> None:
+        self.inputs, self.goal = inputs, goal
         self.n_sim = 0
+        self.trace = list[Level]()
+
+    def record(self, p: float, estimate: float, n_points: int, cov: float, ess: float | None = None) -> None:
+        """Add a level to the trace, which has all simulations that no earlier one has."""
+        assert self.goal is not None
+        made = self.n_sim - sum(level.n_sim for level in self.trace)
+        found: dict[str, Any] = {"p": p, "estimate": estimate, "n_points": n_points, "cov": cov, "ess": ess}
+        self.trace.append(Level(gamma=self.goal.gamma, n_sim=made, **found))
+        self.goal.on_level(self.trace[-1])
+
+    def close_trace(self) -> tuple[Level, ...]:
+        """Return the trace; the simulations of an interrupted step, if there are any, are a level of their own."""
+        loose = self.n_sim - sum(level.n_sim for level in self.trace)
+        if loose:
+            self.record(math.nan, math.nan, loose, math.inf)
+        return tuple(self.trace)
 
     def evaluate(self, u: FloatArray) -> SimulationSteps[FloatArray]:
         """Return f at u (n, d), shape (n,); no batch is yielded where n = 0."""
@@ -125,26 +137,3 @@ class ComponentDraws(NamedTuple):
     """Simulations that the run had spent before the first of them."""
     x: FloatArray | None = None
     """The points in physical space, shape (n, d), where they are kept: a fitted base takes long to map them again."""
-
-
-def extend_trace(
-    trace: tuple[Level, ...],
-    goal: Goal,
-    n_sim: int,
-    p: float,
-    estimate: float,
-    n_points: int,
-    cov: float,
-    ess: float | None = None,
-) -> tuple[Level, ...]:
-    """Return the trace with one more level, which has all of `n_sim` simulations that no earlier one has."""
-    made = n_sim - sum(level.n_sim for level in trace)
-    level = Level(gamma=goal.gamma, p=p, estimate=estimate, n_sim=made, n_points=n_points, cov=cov, ess=ess)
-    goal.on_level(level)
-    return (*trace, level)
-
-
-def close_trace(trace: tuple[Level, ...], goal: Goal, n_sim: int) -> tuple[Level, ...]:
-    """Return the trace with the simulations of an interrupted step, if there are any, as a level of their own."""
-    loose = n_sim - sum(level.n_sim for level in trace)
-    return extend_trace(trace, goal, n_sim, math.nan, math.nan, loose, math.inf) if loose else trace

@@ -106,34 +106,13 @@ def fit_hyperplane(u: FloatArray, f: FloatArray) -> Hyperplane:
     return Hyperplane(axis, size * norm, at, level, r2, float(near.mean()), spread)
 
 
-def descent_direction(u: FloatArray, f: FloatArray) -> tuple[FloatArray, float]:
-    """Return the unit direction in which f falls, shape (d,), and how much of f it explains.
-
-    That is R^2 (leave-one-out) times the share of the points that agree; direction 0 where there is none.
-
-    Args:
-        u: Points, shape (n, d).
-        f: Their outcomes, shape (n,); infinite ones and the share `trimmed_share` at either end are left out.
-    """
-    hyperplane = fit_hyperplane(u, f)
-    return hyperplane.axis, hyperplane.explained
-
-
-def half_space_proposals(
-    failures: FloatArray, u: FloatArray, f: FloatArray, gamma: float = 0.0
-) -> list[MixtureComponent]:
+def half_space_proposals(failures: FloatArray, u: FloatArray, f: FloatArray, gamma: float) -> list[MixtureComponent]:
     """Return proposals for a failure region that a hyperplane bounds, or [] if f is not nearly linear there.
 
-    Fits f(u) = a + b.u around the failures. With R^2 (leave-one-out, times the share of the points that agree) of at
-    least `min_r2` the region is taken for {u : n.u >= beta}, n = -b / |b|: a Gaussian with the moments of N(0, 1)
-    beyond beta along n (Mills' ratio m: mean m, variance 1 + beta m - m^2, times `widening`), and N(0, I) given
-    n.u >= beta - `slack`.
-
-    Args:
-        failures: Failing points, shape (m, d).
-        u: Points around them, failing or not, shape (n, d).
-        f: Outcomes of these, shape (n,).
-        gamma: Threshold of failure.
+    Fits f(u) = a + b.u to points u (n, d), f (n,) around failures (m, d). With R^2 (leave-one-out, times the share of
+    the points that agree) of at least `min_r2` the region is taken for {u : n.u >= beta}, n = -b / |b|: a Gaussian with
+    the moments of N(0, 1) beyond beta along n (Mills' ratio m: mean m, variance 1 + beta m - m^2, times `widening`),
+    and N(0, I) given n.u >= beta - `slack`.
     """
     hyperplane = fit_hyperplane(u, f)
     if hyperplane.explained < LINEAR_MODEL.exact_r2:  # outside the region, f may be that of another one
@@ -165,24 +144,18 @@ def _find_boundary(hyperplane: Hyperplane, along: FloatArray, gamma: float) -> f
     if hyperplane.locates_boundary():
         return hyperplane.crossing(gamma, LINEAR_MODEL.crossing_errors)
     along = along[along > LINEAR_MODEL.same_region_share * middle]
-    return failure_edge(along, np.ones(len(along)), len(np.unique(along)), LINEAR_MODEL.nearest_share)
+    return failure_edge(along, len(np.unique(along)))
 
 
-def failure_edge(along: FloatArray, weights: FloatArray, ess: float, share: float) -> float:
-    """Return where weighted failures begin, given how far along a direction they lie, shape (n,).
+def failure_edge(along: FloatArray, ess: float) -> float:
+    """Return where failures begin, given how far along a direction they lie (n,) and how many they are worth.
 
-    Their quantile at `share`, less `mean_excesses` times the mean excess over it, divided by how many they are worth:
-    the least of a few lies beyond the edge of many. (Failures before the start of a proposal with an edge are the
-    heavy draws that no estimate of its error knows of.)
-
-    Args:
-        along: Distances along the direction, shape (n,).
-        weights: Importance weights, of any scale, shape (n,).
-        ess: How many independent failures they are worth.
-        share: Share of the weights that may lie before the quantile.
+    Their quantile at `nearest_share`, less `mean_excesses` times the mean excess over it, divided by how many they are
+    worth: the least of a few lies beyond the edge of many. (Failures before the start of a proposal with an edge are
+    the heavy draws that no estimate of its error knows of.)
     """
-    first = weighted_quantile(along, weights, share)
-    excess = max(float(np.average(along, weights=weights)) - first, 0.0)
+    first = weighted_quantile(along, np.ones(len(along)), LINEAR_MODEL.nearest_share)
+    excess = max(float(along.mean()) - first, 0.0)
     return first - EDGES.mean_excesses * excess / max(ess, EDGES.min_ess)
 
 
@@ -309,23 +282,14 @@ def start_pieces(u: FloatArray, y: FloatArray, centres: NDArray[np.int64]) -> Li
     return _regress(_design(u), y, near, PIECES.first_ridge)
 
 
-def fit_plane(u: FloatArray, y: FloatArray) -> LinearPieces:
-    """Return the regression of y (n,) on all points u (n, d) as the only piece."""
-    return _regress(_design(u), y, [np.arange(len(y))], LINEAR_MODEL.ridges[1])
-
-
 def fit_pieces(
     pieces: LinearPieces, u: FloatArray, y: FloatArray, inlier_sigmas: float = math.inf, patience: int | None = None
 ) -> LinearPieces | None:
-    """Return the pieces after regressions, each on the points at which it is the least one, until no point moves.
+    """Return the pieces after regressions of y (n,), each on the points u (n, d) at which it is the least one.
 
-    Args:
-        pieces: To start from.
-        u: Points, shape (n, d).
-        y: Their values, shape (n,).
-        inlier_sigmas: As in `assign_points`: points that do not agree are left out.
-        patience: Steps without a gain, a mean square of residuals that is a `LEAST_GAIN` lower, that end the fit as
-            well: where pieces do not explain y, points move to and fro. None: no number of them does.
+    They end when no point moves, or after `patience` steps without a gain, a mean square of residuals that is a
+    `LEAST_GAIN` lower: where pieces do not explain y, points move to and fro. Points beyond `inlier_sigmas`
+    (`assign_points`) are left out.
     """
     least, design = u.shape[1] + PIECES.least_points, _design(u)
     before, lowest, idle = None, math.inf, 0
@@ -392,17 +356,11 @@ def _regress(design: FloatArray, y: FloatArray, groups: Iterable[NDArray[np.int6
 
 
 def union_of_half_spaces(u: FloatArray, f: FloatArray, gamma: float, rng: np.random.Generator) -> HalfSpaceUnion | None:
-    """Return the half-spaces in which the pieces of f fail, or None where pieces do not explain f.
+    """Return the half-spaces in which the pieces of f (n,) at u (n, d) fail, or None where pieces do not explain f.
 
-    Each begins before its plane by `PieceSettings.crossing_errors` standard deviations of its residuals and by `slack`;
-    those around the origin, nearer than `min_distance`, are left out.
-
-    Args:
-        u: Points, shape (n, d).
-        f: Their outcomes, shape (n,); infinite ones and the share `PieceSettings.highest` at the upper end are left
-            out.
-        gamma: Threshold of failure.
-        rng: Source of randomness: pieces start at failures chosen at random.
+    Pieces start at failures chosen at random. Each half-space begins before its plane by `PIECES.crossing_errors`
+    standard deviations of its residuals and by `slack`; those around the origin, nearer than `min_distance`, are left
+    out, as are infinite outcomes and the share `PIECES.highest` at the upper end.
     """
     dim = u.shape[1]
     finite = np.isfinite(f) & (np.abs(f) < LARGEST_OUTCOME)
@@ -468,26 +426,13 @@ class PiecewiseFit(NamedTuple):
         return self.r2 > LINEAR_MODEL.boundary_r2 and self.share > LINEAR_MODEL.agreeing_share
 
 
-class PiecewiseSample(NamedTuple):
-    """Points that pieces are fitted to."""
-
-    u: FloatArray
-    """Shape (n, d)."""
-    y: FloatArray
-    """gamma - f there, in units of its spread, shape (n,)."""
-
-
 def intersection_of_half_spaces(u: FloatArray, f: FloatArray, gamma: float) -> HalfSpaceIntersection | None:
     """Return the corner in which all pieces of f fail, or None where no two or more pieces explain f.
 
     The pieces are fitted to all points, to the failing ones and to those that do not fail: another region may be the
     lesser one beside the failures, and f may be the same for all failures. Each half-space begins before its plane by
-    `LinearModelSettings.crossing_errors` standard deviations of its residuals and by `slack`.
-
-    Args:
-        u: Points around one failure region, shape (n, d).
-        f: Their outcomes, shape (n,); infinite ones are left out.
-        gamma: Threshold of failure.
+    `LINEAR_MODEL.crossing_errors` standard deviations of its residuals and by `slack`. The points u (n, d), f (n,) are
+    those around one failure region; infinite outcomes are left out.
     """
     finite = np.isfinite(f) & (np.abs(f) < LARGEST_OUTCOME)
     u, f = u[finite], f[finite]
@@ -498,22 +443,23 @@ def intersection_of_half_spaces(u: FloatArray, f: FloatArray, gamma: float) -> H
     if fit is None or not fit.locates_edges():
         return None
     axes, starts = _find_planes(fit)
-    if (fit.y < 0).all():  # f may jump where failure begins
-        starts = np.minimum(starts, _edges_along(axes, u[fails]))
+    if (fit.y < 0).all() and fails.any():  # f may jump where failure begins
+        edges = [failure_edge(u[fails] @ axis, int(fails.sum())) for axis in axes]
+        starts = np.minimum(starts, np.array(edges) - EDGES.slack)
     return _beyond_planes(axes, starts)
 
 
-def _scale_sample(u: FloatArray, y: FloatArray) -> PiecewiseSample | None:
+def _scale_sample(u: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray] | None:
     """Return at most some of the points u (n, d), with y (n,) in units of its spread; None where they are too few."""
     size, dim = float(np.abs(y).max()) if len(y) else 0.0, u.shape[1]
     unit = size * float((y / size).std()) if size > 0 else 0.0  # a square may overflow
     if unit == 0 or len(y) < points_of_piece(dim):
         return None
     rows = _spread(len(y), CORNER.points_per_dim * dim)
-    return PiecewiseSample(u[rows], y[rows] / unit)
+    return u[rows], y[rows] / unit
 
 
-def _find_fit(samples: list[PiecewiseSample]) -> PiecewiseFit | None:
+def _find_fit(samples: list[tuple[FloatArray, FloatArray]]) -> PiecewiseFit | None:
     """Return the best of some fits of pieces, None without one.
 
     One of each sample, until one is exact. Where the best of them has several pieces and is promising, its sample has
@@ -521,7 +467,7 @@ def _find_fit(samples: list[PiecewiseSample]) -> PiecewiseFit | None:
     """
     best, chosen = None, None
     for sample in samples:
-        fit = _fit_from(sample, 0)
+        fit = _fit_from(*sample, 0)
         if fit is not None and (best is None or fit.explained > best.explained):
             best, chosen = fit, sample
         if best is not None and best.is_exact():
@@ -531,33 +477,32 @@ def _find_fit(samples: list[PiecewiseSample]) -> PiecewiseFit | None:
     for start in range(1, CORNER.starts):
         if best.is_whole():
             break
-        fit = _fit_from(chosen, start)
+        fit = _fit_from(*chosen, start)
         if fit is not None and fit.explained > best.explained:
             best = fit
     return best
 
 
-def _fit_from(sample: PiecewiseSample, start: int) -> PiecewiseFit | None:
+def _fit_from(u: FloatArray, y: FloatArray, start: int) -> PiecewiseFit | None:
     """Return the fit of pieces from the points of one of the starts; None where it explains too little of y.
 
     Where one plane explains y, that is the fit. Points that do not agree are left out at last only: before, they may be
     those of a piece that is still to come.
     """
-    (u, y) = sample
-    plane = _judge(fit_plane(u, y), sample, LINEAR_MODEL.inlier_sigmas)
+    whole = _regress(_design(u), y, [np.arange(len(y))], LINEAR_MODEL.ridges[1])
+    plane = _judge(whole, u, y)
     if plane.is_whole():
         return plane
     order = np.argsort(y, kind="stable")
     centres = order[_spread(len(order), CORNER.n, (start + 0.5) / CORNER.starts)]
-    first = start_pieces(u, y, centres)
-    pieces = fit_pieces(first, u, y, patience=CORNER.patience)
+    pieces = fit_pieces(start_pieces(u, y, centres), u, y, patience=CORNER.patience)
     if pieces is None:
         return None
     pieces = _prune(pieces, u, y)
-    if _judge(pieces, sample, LINEAR_MODEL.inlier_sigmas).r2 < PIECES.min_r2:
+    if _judge(pieces, u, y).r2 < PIECES.min_r2:
         return None
     pieces = fit_pieces(pieces, u, y, LINEAR_MODEL.inlier_sigmas, CORNER.patience)
-    return None if pieces is None else _judge(pieces, sample, LINEAR_MODEL.inlier_sigmas)
+    return None if pieces is None else _judge(pieces, u, y)
 
 
 def _spread(n: int, most: int, offset: float = 0.0) -> NDArray[np.int64]:
@@ -566,10 +511,9 @@ def _spread(n: int, most: int, offset: float = 0.0) -> NDArray[np.int64]:
     return ((np.arange(k) + offset) * n / k).astype(np.int64)
 
 
-def _judge(pieces: LinearPieces, sample: PiecewiseSample, inlier_sigmas: float) -> PiecewiseFit:
+def _judge(pieces: LinearPieces, u: FloatArray, y: FloatArray) -> PiecewiseFit:
     """Return pieces with the points that agree with them."""
-    u, y = sample
-    own, agrees, deviation = assign_points(pieces, u, y, inlier_sigmas)
+    own, agrees, deviation = assign_points(pieces, u, y, LINEAR_MODEL.inlier_sigmas)
     u, y, own, share = u[agrees], y[agrees], own[agrees], float(agrees.mean())
     variance = float(y.var())
     square = float((deviation[agrees] ** 2).mean())
@@ -605,15 +549,6 @@ def _find_planes(fit: PiecewiseFit) -> tuple[FloatArray, FloatArray]:
     return pieces.slopes / steepness[:, None], starts
 
 
-def _edges_along(axes: FloatArray, failures: FloatArray) -> FloatArray:
-    """Return where failures (n, d) begin along axes (k, d), shape (k,); infinity where there are none."""
-    n, share = len(failures), LINEAR_MODEL.nearest_share
-    if n == 0:
-        return np.full(len(axes), np.inf)
-    edges = [failure_edge(failures @ axis, np.ones(n), n, share) for axis in axes]
-    return np.array(edges) - EDGES.slack
-
-
 def _beyond_planes(axes: FloatArray, starts: FloatArray) -> HalfSpaceIntersection | None:
     """Return the corner beyond planes, the furthest first; None of fewer than two.
 
@@ -622,13 +557,8 @@ def _beyond_planes(axes: FloatArray, starts: FloatArray) -> HalfSpaceIntersectio
     useful = np.flatnonzero(starts > CORNER.min_start)
     kept: list[int] = []
     for k in useful[np.argsort(-starts[useful])]:
-        across = axes[k] - _project_on(axes[kept], axes[k])
+        q = np.linalg.qr(axes[kept].T)[0]
+        across = axes[k] - q @ (q.T @ axes[k])
         if np.linalg.norm(across) > CORNER.min_turn:
             kept.append(int(k))
     return HalfSpaceIntersection(axes[kept], starts[kept]) if len(kept) > 1 else None
-
-
-def _project_on(axes: FloatArray, axis: FloatArray) -> FloatArray:
-    """Return the part of an axis (d,) in the span of others (k, d)."""
-    q = np.linalg.qr(axes.T)[0]
-    return np.asarray(q @ (q.T @ axis))

@@ -30,6 +30,7 @@ References:
 """
 
 import math
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import Generic, NamedTuple, TypeVar
@@ -69,10 +70,6 @@ def join_batches(first: SimulationSteps[_A], second: SimulationSteps[_B]) -> Sim
     Each batch holds the points that the first one waits for and then those of the second one, so that there are as
     many batches as the longer one alone has. They take turns in this order whatever the simulations take, so that one
     seed gives one answer; each should have a random generator of its own. `Interrupted` ends both.
-
-    Args:
-        first: Yields points (n, d), as all steps of a run do.
-        second: Likewise.
     """
     one, other = _Activity(first), _Activity(second)
     while waiting := [each for each in (one, other) if each.points is not None]:
@@ -192,15 +189,6 @@ def _upper_end(levels: list[Chains], thresholds: list[float], goal: Goal) -> flo
     return subset_interval(levels[-1], goal, trace, cov)[1]
 
 
-class LineEnds(NamedTuple):
-    """The lines that came to a failure."""
-
-    u: FloatArray
-    """Failing points, shape (k, d)."""
-    roots: NDArray[np.int64]
-    """Index of the base draw that each started from, shape (k,)."""
-
-
 def choose_roots(f: FloatArray, n: int, rng: np.random.Generator) -> NDArray[np.int64]:
     """Return the indices of at most n base draws with outcomes f (m,) to start from: a random part of the lowest."""
     lowest = np.lexsort((rng.random(len(f)), f))[: max(int(LINES.root_share * len(f)), n)]
@@ -275,35 +263,17 @@ TINY = 1e-300
 """Least length to divide by."""
 
 
-class WideFailures(NamedTuple):
-    """The wide draws that failed."""
+def _choose_wide(u: FloatArray, scale: FloatArray, n: int, rng: np.random.Generator) -> FloatArray:
+    """Return at most n of failing wide draws u (k, d) of N(0, s^2 I), s = scale (k,): half of them the least wide ones.
 
-    u: FloatArray
-    """Shape (k, d)."""
-    scale: FloatArray
-    """The s that each was drawn with, shape (k,)."""
-    log_weights: FloatArray
-    """log(phi / q), up to a constant, with q the mixture of the wide draws, shape (k,)."""
-
-    @classmethod
-    def among(cls, draws: ComponentDraws, gamma: float) -> "WideFailures":
-        """Return the failing ones of draws from several N(0, s^2 I)."""
-        fails = draws.f <= gamma
-        scales = [component.scale for component in draws.components if isinstance(component, IsotropicNormal)]
-        density = mixture_log_ratio(log_ratios(draws.components, draws.u[fails]), draws.counts.astype(np.float64))
-        return cls(draws.u[fails], np.repeat(scales, draws.counts)[fails], -density)
-
-    def choose(self, n: int, rng: np.random.Generator) -> FloatArray:
-        """Return at most n of them, shape (m, d): half of them the least wide ones, the rest in other directions.
-
-        Each of the rest is the one furthest in direction from all before it: no region that was met is left out by
-        chance, as one in six of six_d8 was in 1 run of 60.
-        """
-        order = np.lexsort((rng.random(len(self.scale)), self.scale))
-        near, rest = order[: n // 2], rng.permutation(order[n // 2 :])
-        if len(order) > n:
-            rest = rest[_spread_directions(self.u[near], self.u[rest], n - len(near))]
-        return np.take(self.u, np.append(near, rest), axis=0)
+    Each of the rest is the one furthest in direction from all before it: no region that was met is left out by
+    chance, as one in six of six_d8 was in 1 run of 60.
+    """
+    order = np.lexsort((rng.random(len(scale)), scale))
+    near, rest = order[: n // 2], rng.permutation(order[n // 2 :])
+    if len(order) > n:
+        rest = rest[_spread_directions(u[near], u[rest], n - len(near))]
+    return np.take(u, np.append(near, rest), axis=0)
 
 
 def _spread_directions(known: FloatArray, u: FloatArray, n: int) -> NDArray[np.intp]:
@@ -318,31 +288,15 @@ def _spread_directions(known: FloatArray, u: FloatArray, n: int) -> NDArray[np.i
     return chosen
 
 
-def draw_wide(
-    simulator: Simulator, wide: tuple[tuple[float, int], ...], rng: np.random.Generator
+def draw_isotropic(
+    simulator: Simulator, sizes: Sequence[tuple[float, int]], rng: np.random.Generator
 ) -> SimulationSteps[ComponentDraws]:
-    """Simulate wide draws: for each (s, n), n of N(0, s^2 I)."""
-    components = [IsotropicNormal(simulator.inputs.dim, scale) for scale, _ in wide]
-    counts = np.array([n for _, n in wide])
+    """Simulate draws: for each (s, n), n of N(0, s^2 I)."""
+    components: list[MixtureComponent] = [IsotropicNormal(simulator.inputs.dim, scale) for scale, _ in sizes]
+    counts = np.array([n for _, n in sizes])
     u = draw_components(components, counts, rng)
     f = yield from simulator.evaluate(u)
-    return ComponentDraws(list(components), counts, u, f)
-
-
-def find_wide_failures(
-    simulator: Simulator, first: ComponentDraws, gamma: float, levels: int, n: int, rng: np.random.Generator
-) -> SimulationSteps[WideFailures]:
-    """Return the failures among wide draws, and among wider ones if the levels went deep."""
-    scale = -float(ndtri(10 ** -(levels + 0.5))) / EXPLORATION.depth_ratio
-    if scale > EXPLORATION.deep_scale:
-        deep = yield from draw_wide(simulator, ((scale, n),), rng)
-        first = ComponentDraws(
-            [*first.components, *deep.components],
-            np.concatenate([first.counts, deep.counts]),
-            np.concatenate([first.u, deep.u]),
-            np.concatenate([first.f, deep.f]),
-        )
-    return WideFailures.among(first, gamma)
+    return ComponentDraws(components, counts, u, f)
 
 
 def bisect_towards_origin(simulator: Simulator, u: FloatArray, gamma: float, steps: int) -> SimulationSteps[FloatArray]:
@@ -355,26 +309,17 @@ def bisect_towards_origin(simulator: Simulator, u: FloatArray, gamma: float, ste
     return u * failing[:, None]
 
 
-@dataclass(frozen=True)
-class Sizes:
+class Sizes(NamedTuple):
     """Simulations for each part of the exploration."""
 
-    scale: float
-    """By what the numbers of the settings are multiplied."""
-    base: int
-    """Base draws."""
-    wide: tuple[tuple[float, int], ...]
-    """(s, draws)."""
-    level: int
-    """Points of each level of subset simulation."""
-    starts: int
-    """Chains from wide failures at most."""
-    level_starts: int
-    """Chains from failures of subset simulation at most, and more of them where wide draws fail less often."""
-    most: int
-    """Simulations after which no further level is begun."""
-    limit: int
-    """Simulations of the whole exploration."""
+    scale: float  # by what the numbers of the settings are multiplied
+    base: int  # base draws
+    wide: tuple[tuple[float, int], ...]  # (s, draws)
+    level: int  # points of each level of subset simulation
+    starts: int  # chains from wide failures at most
+    level_starts: int  # chains from failures of subset simulation at most, more where wide draws fail less often
+    most: int  # simulations after which no further level is begun
+    limit: int  # simulations of the whole exploration
 
     @classmethod
     def within(cls, budget: int) -> "Sizes":
@@ -393,19 +338,6 @@ class Sizes:
         )
 
 
-def first_draws(simulator: Simulator, sizes: Sizes, rng: np.random.Generator) -> SimulationSteps[ComponentDraws]:
-    """Simulate the base and the wide draws."""
-    dim = simulator.inputs.dim
-    components: list[MixtureComponent] = [
-        IsotropicNormal(dim),
-        *(IsotropicNormal(dim, scale) for scale, _ in sizes.wide),
-    ]
-    counts = np.array([sizes.base, *(n for _, n in sizes.wide)])
-    u = draw_components(components, counts, rng)
-    f = yield from simulator.evaluate(u)
-    return ComponentDraws(components, counts, u, f)
-
-
 def find_regions(
     simulator: Simulator, first: ComponentDraws, goal: Goal, sizes: Sizes, rng: np.random.Generator
 ) -> SimulationSteps[ExplorationResult]:
@@ -414,21 +346,26 @@ def find_regions(
     base_u, base_f = first.u[:n_base], first.f[:n_base]
     drawn = ComponentDraws(first.components[1:], first.counts[1:], first.u[n_base:], first.f[n_base:])
     for_levels, for_lines = rng.spawn(2)
-    (descent, wide), lines = yield from join_batches(
+    (descent, wide), (ends, line_roots) = yield from join_batches(
         _pass_levels(simulator, base_u, base_f, drawn, goal, sizes, for_levels),
         _find_lines(simulator, base_u, base_f, gamma, sizes.scale, for_lines),
     )
-    roots = len(np.union1d(descent.roots, lines.roots))
-    discovery = Discovery(count_lineages(roots, wide.log_weights), descent.ceiling)
+    roots = len(np.union1d(descent.roots, line_roots))
+    wide_fails = wide.f <= gamma
+    wide_u = wide.u[wide_fails]
+    density = mixture_log_ratio(log_ratios(wide.components, wide_u), wide.counts.astype(np.float64))
+    discovery = Discovery(count_lineages(roots, -density), descent.ceiling)
     most = max(2, (sizes.limit - simulator.n_sim) // EXPLORATION.chain_cost)
+    scales = [one.scale for one in wide.components if isinstance(one, IsotropicNormal)]
+    chosen = _choose_wide(wide_u, np.repeat(scales, wide.counts)[wide_fails], min(sizes.starts, most), rng)
     far, (labels, _) = yield from join_batches(
-        bisect_towards_origin(simulator, wide.choose(min(sizes.starts, most), rng), gamma, EXPLORATION.bisections),
-        label_regions(simulator, lines.u, gamma, sizes.limit),
+        bisect_towards_origin(simulator, chosen, gamma, EXPLORATION.bisections),
+        label_regions(simulator, ends, gamma, sizes.limit),
     )
-    if _is_scattered(labels, simulator.inputs.dim):
-        region = Region(lines.u[:, None], descent.u, descent.f)
+    if simulator.inputs.dim > SUBSPACE.high_dim and labels.max(initial=-1) + 1 >= LINES.many_regions:
+        region = Region(ends[:, None], descent.u, descent.f)
         return ExplorationResult([region], noisy=False, scattered=True, levels=descent.levels, discovery=discovery)
-    near = _choose_lines(lines.u, labels, rng)
+    near = _choose_lines(ends, labels, rng)
     others = min(max(sizes.level_starts, sizes.starts + sizes.level_starts - len(far)), most - len(far))
     starts = np.concatenate([far, near, rng.permutation(descent.failing)[: max(others - len(near), 0)]])
     if len(starts) == 0:
@@ -445,28 +382,30 @@ def _pass_levels(
     goal: Goal,
     sizes: Sizes,
     rng: np.random.Generator,
-) -> SimulationSteps[tuple[SubsetPoints, WideFailures]]:
-    """Run subset simulation from base draws u (n, d), f (n,), and make the wide draws as wide as it went deep."""
+) -> SimulationSteps[tuple[SubsetPoints, ComponentDraws]]:
+    """Run subset simulation from base draws u (n, d), f (n,); make further wide draws if the levels went deep."""
     descent = yield from descend_levels(simulator, u, f, goal, sizes.level, sizes.most, rng)
-    more = round(EXPLORATION.deep_draws * sizes.scale)
-    wide = yield from find_wide_failures(simulator, drawn, goal.gamma, descent.levels, more, rng)
-    return descent, wide
+    scale = -float(ndtri(10 ** -(descent.levels + 0.5))) / EXPLORATION.depth_ratio
+    if scale > EXPLORATION.deep_scale:
+        n = round(EXPLORATION.deep_draws * sizes.scale)
+        deep = yield from draw_isotropic(simulator, ((scale, n),), rng)
+        drawn = ComponentDraws(
+            [*drawn.components, *deep.components],
+            np.concatenate([drawn.counts, deep.counts]),
+            np.concatenate([drawn.u, deep.u]),
+            np.concatenate([drawn.f, deep.f]),
+        )
+    return descent, drawn
 
 
 def _find_lines(
     simulator: Simulator, u: FloatArray, f: FloatArray, gamma: float, scale: float, rng: np.random.Generator
-) -> SimulationSteps[LineEnds]:
-    """Walk lines of descent from base draws u (n, d) with outcomes f (n,), and their ends towards the origin."""
+) -> SimulationSteps[tuple[FloatArray, NDArray[np.int64]]]:
+    """Walk lines from base draws u (n, d), f (n,); return their failing ends (k, d), moved inwards, and roots (k,)."""
     roots = choose_roots(f, max(1, round(scale * LINES.n)), rng)
     ends, failing = yield from walk_lines(simulator, u[roots], f[roots], gamma, scale, rng)
     near = yield from bisect_towards_origin(simulator, ends[failing], gamma, EXPLORATION.bisections)
-    return LineEnds(near, roots[failing])
-
-
-def _is_scattered(labels: Labels, dim: int) -> bool:
-    """Return whether lines of descent lie in so many regions, in many dimensions, that chains would not relax there."""
-    regions = int(labels.max(initial=-1)) + 1
-    return dim > SUBSPACE.high_dim and regions >= LINES.many_regions
+    return near, roots[failing]
 
 
 def _choose_lines(u: FloatArray, labels: Labels, rng: np.random.Generator) -> FloatArray:
@@ -482,7 +421,6 @@ def find_slopes(
     gamma: float,
     room: int,
     rng: np.random.Generator,
-    high_dim: int,
 ) -> SimulationSteps[FloatArray | None]:
     """Return orthonormal directions in which f changes around the failures, shape (d, r); None where they are not few.
 
@@ -490,7 +428,7 @@ def find_slopes(
     where there are too many directions, or where the batch before was explained by what was known.
     """
     dim = simulator.inputs.dim
-    short = exploration.scattered or dim > high_dim
+    short = exploration.scattered or dim > SUBSPACE.high_dim
     n = min(int((SLOPES.high_dim_share if short else SLOPES.share) * room / (dim + 1)), SLOPES.most)
     if dim < SLOPES.min_dim or n < SLOPES.least or exploration.noisy or not exploration.regions:
         return None

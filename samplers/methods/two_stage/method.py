@@ -3,7 +3,7 @@
 import math
 from dataclasses import dataclass, replace
 from functools import reduce
-from typing import ClassVar, NamedTuple
+from typing import ClassVar
 
 import numpy as np
 
@@ -15,12 +15,10 @@ from samplers.methods.searched import (
     ComponentDraws,
     SimulationSteps,
     Simulator,
-    close_trace,
-    extend_trace,
     marginalise_noise,
 )
 from samplers.methods.subset import FEWEST_LEVELS, spend_on_subset_simulation
-from samplers.methods.two_stage.exploration import Sizes, find_regions, find_slopes, first_draws
+from samplers.methods.two_stage.exploration import Sizes, draw_isotropic, find_regions, find_slopes
 from samplers.methods.two_stage.mixture import MixtureProposal
 from samplers.methods.two_stage.refinement import (
     RefinementState,
@@ -30,7 +28,7 @@ from samplers.methods.two_stage.refinement import (
     typical_weights,
 )
 from samplers.methods.two_stage.regions import ExplorationResult, discovery_interval
-from samplers.methods.two_stage.settings import EXPLORATION, FALLBACK, REFINEMENT, ROUNDS, SUBSPACE, TWO_STAGE
+from samplers.methods.two_stage.settings import EXPLORATION, FALLBACK, REFINEMENT, ROUNDS, TWO_STAGE
 from samplers.methods.two_stage.stratified import (
     MultipleImportanceSample,
     StratifiedSample,
@@ -43,7 +41,7 @@ from samplers.methods.two_stage.stratified import (
 from samplers.methods.two_stage.term_search import search_terms
 from samplers.methods.two_stage.terms_alone import TermRecord, explore_terms
 from samplers.problem import FloatArray, Inputs
-from samplers.sample import DrawWeights, Level, Sample, Status
+from samplers.sample import DrawWeights, Sample, Status
 from samplers.statistics import Interval, binomial_cov, effective_sample_size
 from samplers.validation import check_count
 
@@ -151,50 +149,13 @@ def suits_terms(inputs: Inputs, offer: TermsOffer | None, budget: int) -> bool:
 
 
 def run_two_stage(inputs: Inputs, goal: Goal, budget: int, rng: np.random.Generator) -> Steps:
-    """Estimate P[f(X) <= goal.gamma] with settings that need not be the default ones."""
+    """Estimate P[f(X) <= goal.gamma] with a budget that need not be the goal's."""
     offer = offer_of(inputs)
     if offer is not None and suits_terms(inputs, offer, budget):
         return (yield from search_terms(inputs, offer, goal, budget, rng))
-    record = TermRecord(offered=offer is not None and offer.with_f)
+    record = TermRecord() if offer is not None and offer.with_f else None
     outcome = yield from _explore_and_estimate(inputs, goal, budget, rng, record)
-    return replace(outcome, remarks=(*outcome.remarks, *record.unreached.describe(outcome.p)))
-
-
-def _explore_and_estimate(
-    inputs: Inputs, goal: Goal, budget: int, rng: np.random.Generator, record: TermRecord
-) -> Steps:
-    """Run all stages; `record` takes the terms of what the exploration simulates."""
-    context, state = start_run(inputs, goal, budget, rng)
-    if budget < TWO_STAGE.min_exploration_budget:
-        least = TWO_STAGE.min_exploration_budget
-        about = f"max_sim leaves {budget} simulations, too few for an exploration ({least}): base draws only."
-        return (yield from run_monte_carlo(context, state)).remark_first(about)
-    try:
-        state = yield from record.watch(draw_first(context, state))
-        if state.base_share(goal.gamma) >= TWO_STAGE.common_share:
-            return (yield from run_monte_carlo(context, state, counted=False))
-        state, exploration = yield from record.watch(explore(context, state))
-        room, first = context.left, state.history.batches[0]
-        exploration = yield from explore_terms(context.simulator, exploration, record, first, goal.gamma, room, rng)
-        if not exploration.regions:
-            return (yield from run_monte_carlo(context, state))
-        refinement, proposal = begin_refinement(context, state, exploration)
-        room = context.left
-        number, final = 0, False
-        while not final:
-            number += 1
-            steps = refine(context, state, refinement, number, room, proposal)
-            state, refinement, proposal, final = yield from steps
-            if gives_up(context, state, refinement, proposal, number, final=final):
-                return (yield from fall_back(context, state, exploration.levels))
-    except Interrupted:
-        return estimate_early(context, state)
-    outcome = yield from estimate_afresh(context, state, refinement, proposal)
-    if budget >= TWO_STAGE.sufficient_budget:
-        return outcome
-    enough = TWO_STAGE.sufficient_budget
-    about = f"A search of only {budget:,} simulations may miss failure regions ({enough:,} are recommended)."
-    return replace(outcome, warnings=(*outcome.warnings, about))
+    return outcome if record is None else replace(outcome, remarks=(*outcome.remarks, *record.describe(outcome.p)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -237,17 +198,9 @@ class RunContext:
         return self.goal.target_cov is not None and cov <= self.goal.target_cov
 
 
-class CountedRound(NamedTuple):
-    """Draws of a round that count in p."""
-
-    sample: StratifiedSample
-    first: int
-    """Simulations before them."""
-
-
 @dataclass(frozen=True, eq=False, kw_only=True)
 class RunState:
-    """State of a run: draws so far and their trace."""
+    """Draws of a run so far."""
 
     history: MultipleImportanceSample
     """All draws from known components."""
@@ -259,64 +212,63 @@ class RunState:
     """Base draws in all: of a proposal those of its first component."""
     rounds: tuple[Draws, ...] = ()
     """Draws of the rounds, each weighted as draws of its own proposal."""
-    counted: tuple[CountedRound, ...] = ()
-    """Those of the rounds that count in p."""
-    trace: tuple[Level, ...] = ()
+    counted: tuple[tuple[StratifiedSample, int], ...] = ()
+    """Those of the rounds that count in p, and the simulations before them."""
 
     def base_share(self, gamma: float) -> float:
         """Return the share of the base draws with f <= gamma."""
         return float((self.base_f <= gamma).mean())
 
 
-def start_run(inputs: Inputs, goal: Goal, budget: int, rng: np.random.Generator) -> tuple[RunContext, RunState]:
-    """Return the run and its state before the first simulation; noise that is part of x is left to chance."""
+def _explore_and_estimate(
+    inputs: Inputs, goal: Goal, budget: int, rng: np.random.Generator, record: TermRecord | None
+) -> Steps:
+    """Run all stages; `record` takes the terms of what the exploration simulates."""
     open_ended = goal.max_sim is None and goal.target_cov is not None
     end = budget + TWO_STAGE.max_batches * (budget // TWO_STAGE.target_batches) if open_ended else budget
-    searched = marginalise_noise(inputs, rng)
-    context = RunContext(inputs, Simulator(searched), goal, budget, end, rng)
-    empty = MultipleImportanceSample.empty(searched.dim)
-    return context, RunState(history=empty, base_u=np.empty((0, searched.dim)), base_f=np.empty(0))
+    searched = marginalise_noise(inputs, rng)  # noise that is part of x is left to chance
+    run = RunContext(inputs, Simulator(searched, goal), goal, budget, end, rng)
+    nothing = np.empty((0, searched.dim))
+    state = RunState(history=MultipleImportanceSample.empty(searched.dim), base_u=nothing, base_f=np.empty(0))
+    if budget < TWO_STAGE.min_exploration_budget:
+        least = TWO_STAGE.min_exploration_budget
+        about = f"max_sim leaves {budget} simulations, too few for an exploration ({least}): base draws only."
+        return (yield from _run_monte_carlo(run, state)).remark_first(about)
+    try:
+        first = _draw_first(run, state)
+        state = yield from (first if record is None else record.watch(first))
+        if state.base_share(goal.gamma) >= TWO_STAGE.common_share:
+            return (yield from _run_monte_carlo(run, state, counted=False))
+        search = _explore(run, state)
+        exploration = yield from (search if record is None else record.watch(search))
+        if record is not None:
+            drawn = state.history.batches[0]
+            exploration = yield from explore_terms(run.simulator, exploration, record, drawn, goal.gamma, run.left, rng)
+        if not exploration.regions:
+            return (yield from _run_monte_carlo(run, state))
+        refinement = start_refinement(exploration, goal.gamma, rng)
+        proposal = build_proposal(refinement, state.history)
+        room, number, final = run.left, 0, False
+        while not final:
+            number += 1
+            steps = _refine(run, state, refinement, number, room, proposal)
+            state, refinement, proposal, final = yield from steps
+            if _gives_up(run, state, refinement, proposal, number, final=final):
+                return (yield from _fall_back(run, state, exploration.levels))
+    except Interrupted:
+        return _estimate_early(run, state)
+    outcome = yield from _estimate(run, state, refinement, proposal)
+    if budget >= TWO_STAGE.sufficient_budget:
+        return outcome
+    enough = TWO_STAGE.sufficient_budget
+    about = f"A search of only {budget:,} simulations may miss failure regions ({enough:,} are recommended)."
+    return replace(outcome, warnings=(*outcome.warnings, about))
 
 
-def meets_too_few(draws: Draws, number: int, levels: int, *, share: float = 1.0) -> bool:
-    """Return whether the draws of a round meet so few failures that subset simulation does better with the rest."""
-    early = FALLBACK.early_rates
-    rate = early[number - 1] if number <= len(early) else FALLBACK.relative_rate / max(levels, FEWEST_LEVELS)
-    return draws.ess < share * rate * draws.n
-
-
-def misses_regions(draws: Draws, typical: FloatArray) -> bool:
-    """Return whether a proposal is far from most of the regions found.
-
-    Args:
-        draws: Of the last round.
-        typical: Weights of typical points of the regions as draws of the proposal, shape (m,).
-    """
-    return float(np.median(typical)) > FALLBACK.max_typical * draws.p
-
-
-def reconcile(subset_outcome: Outcome, earlier: Outcome) -> Outcome:
-    """Return the outcome of subset simulation, or the earlier one where its interval lies above it.
-
-    Subset simulation follows f downhill; wide draws also find regions that f does not announce. The interval of the
-    earlier outcome then grows to hold both.
-    """
-    if earlier.interval[0] <= subset_outcome.p:
-        return subset_outcome
-    interval = (
-        min(earlier.interval[0], subset_outcome.interval[0]),
-        max(earlier.interval[1], subset_outcome.interval[1]),
-    )
-    about = f"Subset simulation, which took over, missed failure regions found before; it gives {subset_outcome.p:.1e}."
-    warnings = (*earlier.warnings, *subset_outcome.warnings, about)
-    remarks = (*earlier.remarks, *subset_outcome.remarks)
-    return replace(earlier, interval=interval, status=subset_outcome.status, warnings=warnings, remarks=remarks)
-
-
-def draw_first(context: RunContext, state: RunState) -> SimulationSteps[RunState]:
+def _draw_first(run: RunContext, state: RunState) -> SimulationSteps[RunState]:
     """Make the base draws and the wide draws of the exploration."""
-    gamma, sizes = context.goal.gamma, Sizes.within(context.budget)
-    first = yield from first_draws(context.simulator, sizes, context.rng)
+    gamma, sizes = run.goal.gamma, Sizes.within(run.budget)
+    first = yield from draw_isotropic(run.simulator, ((1.0, sizes.base), *sizes.wide), run.rng)
     state = replace(
         state,
         history=state.history.add(first, gamma),
@@ -325,72 +277,57 @@ def draw_first(context: RunContext, state: RunState) -> SimulationSteps[RunState
         base_draws=sizes.base,
     )
     share = state.base_share(gamma)
-    return _record(context, state, share, share, len(first.f), binomial_cov(share, sizes.base))
+    run.simulator.record(share, share, len(first.f), binomial_cov(share, sizes.base))
+    return state
 
 
-def explore(context: RunContext, state: RunState) -> SimulationSteps[tuple[RunState, ExplorationResult]]:
+def _explore(run: RunContext, state: RunState) -> SimulationSteps[ExplorationResult]:
     """Find the failure regions, starting from the first draws; there are none where nothing fails."""
-    gamma, sizes = context.goal.gamma, Sizes.within(context.budget)
-    exploration = yield from find_regions(context.simulator, state.history.batches[0], context.goal, sizes, context.rng)
-    high_dim = SUBSPACE.high_dim
-    slopes = yield from find_slopes(context.simulator, exploration, gamma, context.left, context.rng, high_dim)
-    exploration = exploration._replace(slopes=slopes)
+    gamma, sizes = run.goal.gamma, Sizes.within(run.budget)
+    exploration = yield from find_regions(run.simulator, state.history.batches[0], run.goal, sizes, run.rng)
+    slopes = yield from find_slopes(run.simulator, exploration, gamma, run.left, run.rng)
     n = sum(len(region.f) for region in exploration.regions)
     fails = sum(int((region.f <= gamma).sum()) for region in exploration.regions)
-    return _record(context, state, fails / max(n, 1), state.base_share(gamma), n, math.inf), exploration
+    run.simulator.record(fails / max(n, 1), state.base_share(gamma), n, math.inf)
+    return exploration._replace(slopes=slopes)
 
 
-def begin_refinement(
-    context: RunContext, state: RunState, exploration: ExplorationResult
-) -> tuple[RefinementState, MixtureProposal]:
-    """Return what the exploration shows of its regions, at least one, and the proposal of the first round."""
-    rng = context.rng
-    refinement = start_refinement(exploration, context.goal.gamma, rng)
-    return refinement, build_proposal(refinement, state.history)
-
-
-def draw_round(
-    context: RunContext, state: RunState, refinement: RefinementState, proposal: MixtureProposal, n: int
-) -> SimulationSteps[tuple[RunState, RefinementState]]:
-    """Draw n points from a proposal and learn from them."""
-    state, batch = yield from _draw(context, state, proposal, n)
-    gamma = context.goal.gamma
-    if len(state.rounds) >= _first_counted(state, gamma):
-        inputs = context.simulator.inputs
-        empty = StratifiedSample.empty(len(proposal.weights), inputs.dim, np.empty(0))
-        counted = CountedRound(empty.add(batch, proposal, inputs, gamma), batch.first)
-        state = replace(state, counted=(*state.counted, counted))
-    draws = Draws.from_outcomes(batch.f, proposal.log_weights(batch.u), batch.u, gamma)
-    history = state.history.add(batch._replace(x=None), gamma)
-    refinement = refine_once(refinement, history, proposal, batch, context.rng)
-    ess = effective_sample_size(history.log_weights)
-    state = replace(state, history=history, rounds=(*state.rounds, draws))
-    p = float(np.exp(history.log_weights).sum())
-    return _record_draws(context, state, batch, p, 1 / math.sqrt(ess) if ess else math.inf, ess), refinement
-
-
-def _first_counted(state: RunState, gamma: float) -> int:
-    """Return the number of rounds that do not count in p; base draws decide, which do not count either."""
-    common = np.count_nonzero(state.base_f <= gamma) >= EXPLORATION.common_failures
-    return REFINEMENT.counted_from - int(common)
-
-
-def refine(
-    context: RunContext, state: RunState, refinement: RefinementState, number: int, room: int, proposal: MixtureProposal
+def _refine(
+    run: RunContext, state: RunState, refinement: RefinementState, number: int, room: int, proposal: MixtureProposal
 ) -> SimulationSteps[tuple[RunState, RefinementState, MixtureProposal, bool]]:
     """Run one round of refinement; return also the proposal that follows from it, and whether that is the last one."""
     shares = (*REFINEMENT.round_shares, *REFINEMENT.further_shares)
     n = int(shares[number - 1] * room)
     if n > 0:
-        state, refinement = yield from draw_round(context, state, refinement, proposal, n)
+        state, refinement = yield from _draw_round(run, state, refinement, proposal, n)
     enough = refinement.noisy or not state.rounds or state.rounds[-1].ess >= REFINEMENT.good_rate * state.rounds[-1].n
     final = number == len(shares) or (enough and number >= len(REFINEMENT.round_shares))
-    proposal = build_proposal(refinement, state.history, final=final)
-    return state, refinement, proposal, final
+    return state, refinement, build_proposal(refinement, state.history, final=final), final
 
 
-def gives_up(
-    context: RunContext,
+def _draw_round(
+    run: RunContext, state: RunState, refinement: RefinementState, proposal: MixtureProposal, n: int
+) -> SimulationSteps[tuple[RunState, RefinementState]]:
+    """Draw n points from a proposal and learn from them."""
+    state, batch = yield from _draw(run, state, proposal, n)
+    gamma = run.goal.gamma
+    common = np.count_nonzero(state.base_f <= gamma) >= EXPLORATION.common_failures  # these draws do not count in p
+    if len(state.rounds) >= REFINEMENT.counted_from - int(common):
+        inputs = run.simulator.inputs
+        empty = StratifiedSample.empty(len(proposal.weights), inputs.dim, np.empty(0))
+        counted = empty.add(batch, proposal, inputs, gamma), batch.first
+        state = replace(state, counted=(*state.counted, counted))
+    draws = Draws.from_outcomes(batch.f, proposal.log_weights(batch.u), batch.u, gamma)
+    history = state.history.add(batch._replace(x=None), gamma)
+    refinement = refine_once(refinement, history, proposal, batch, run.rng)
+    ess = effective_sample_size(history.log_weights)
+    p = float(np.exp(history.log_weights).sum())
+    _record_draws(run, batch, p, 1 / math.sqrt(ess) if ess else math.inf, ess)
+    return replace(state, history=history, rounds=(*state.rounds, draws)), refinement
+
+
+def _gives_up(
+    run: RunContext,
     state: RunState,
     refinement: RefinementState,
     proposal: MixtureProposal,
@@ -398,110 +335,135 @@ def gives_up(
     *,
     final: bool,
 ) -> bool:
-    """Return whether subset simulation does better with the rest, after a round of draws; `final`: after the last."""
-    if context.left_at_all < FALLBACK.min_fallback_budget or not state.rounds:
+    """Return whether subset simulation does better with the rest, after a round of draws; `final`: after the last.
+
+    It does where the draws meet too few failures, or where the proposal is far from most of the regions found.
+    """
+    if run.left_at_all < FALLBACK.min_fallback_budget or not state.rounds:
         return False
-    if refinement.noisy and not (final and context.noise_marginalised):
+    if refinement.noisy and not (final and run.noise_marginalised):
         return False  # a tempered mixture meets few failures but does not miss any: nothing else is better
-    last = state.rounds[-1]
-    share = FALLBACK.sloped_rate if refinement.within is not None else 1.0
-    if meets_too_few(last, number, refinement.exploration.levels, share=share):
+    last, early = state.rounds[-1], FALLBACK.early_rates
+    late = FALLBACK.relative_rate / max(refinement.exploration.levels, FEWEST_LEVELS)
+    rate = early[number - 1] if number <= len(early) else late
+    if last.ess < (FALLBACK.sloped_rate if refinement.within is not None else 1.0) * rate * last.n:
         return True
     described = refinement.noisy or refinement.within is not None  # ends of lines in a ring are no typical failures
     doubtful = final and not described and last.ess < REFINEMENT.good_rate * last.n
-    return doubtful and misses_regions(last, typical_weights(refinement, proposal))
+    return doubtful and float(np.median(typical_weights(refinement, proposal))) > FALLBACK.max_typical * last.p
 
 
-def fall_back(context: RunContext, state: RunState, levels: int) -> Steps:
+def _fall_back(run: RunContext, state: RunState, levels: int) -> Steps:
     """Spend the rest on subset simulation in all coordinates, which needs no proposal."""
     known: RootedPoints | None = RootedPoints(state.base_u, state.base_f, np.arange(len(state.base_f)))
-    if context.noise_marginalised:  # the base draws lack the coordinates of noise
+    if run.noise_marginalised:  # the base draws lack the coordinates of noise
         known = None
-    state = _close_trace(context, state)
-    before = estimate_early(context, state)
-    outcome = yield from spend_on_subset_simulation(
-        context.inputs, context.goal, levels, context.left_at_all, known, context.rng
-    )
+    trace, before = run.simulator.close_trace(), _estimate_early(run, state)
+    outcome = yield from spend_on_subset_simulation(run.inputs, run.goal, levels, run.left_at_all, known, run.rng)
     unfinished = outcome.status is Status.STOPPED and outcome.p == 0  # no estimate, then
-    whole = before if unfinished else reconcile(outcome, before)
-    return replace(whole, trace=state.trace + outcome.trace, base_draws=state.base_draws + outcome.base_draws)
+    whole = before if unfinished else _reconcile(outcome, before)
+    return replace(whole, trace=trace + outcome.trace, base_draws=state.base_draws + outcome.base_draws)
 
 
-def estimate_afresh(
-    context: RunContext, state: RunState, refinement: RefinementState, proposal: MixtureProposal
-) -> Steps:
+def _reconcile(subset_outcome: Outcome, earlier: Outcome) -> Outcome:
+    """Return the outcome of subset simulation, or the earlier one where its interval lies above it.
+
+    Subset simulation follows f downhill; wide draws also find regions that f does not announce. The interval of the
+    earlier outcome then grows to hold both.
+    """
+    if earlier.interval[0] <= subset_outcome.p:
+        return subset_outcome
+    (low, high), (other_low, other_high) = earlier.interval, subset_outcome.interval
+    about = f"Subset simulation, which took over, missed failure regions found before; it gives {subset_outcome.p:.1e}."
+    return replace(
+        earlier,
+        interval=(min(low, other_low), max(high, other_high)),
+        status=subset_outcome.status,
+        warnings=(*earlier.warnings, *subset_outcome.warnings, about),
+        remarks=(*earlier.remarks, *subset_outcome.remarks),
+    )
+
+
+def _estimate(run: RunContext, state: RunState, refinement: RefinementState, proposal: MixtureProposal) -> Steps:
     """Draw from the last proposal until the budget is used or the target is met.
 
     p rests on these draws and on those of the rounds that count, each weighted as a draw of its own proposal.
     """
-    goal, inputs, stopped = context.goal, context.simulator.inputs, False
+    goal, inputs, stopped = run.goal, run.simulator.inputs, False
     typical = typical_weights(refinement, proposal)
     sample = StratifiedSample.empty(len(proposal.weights), inputs.dim, typical)
     whole = sample
-    size = context.left if goal.target_cov is None else context.target_batch
-    while context.left_at_all > 0:
+    size = run.left if goal.target_cov is None else run.target_batch
+    while run.left_at_all > 0:
         try:
-            state, batch = yield from _draw(context, state, proposal, min(size, context.left_at_all))
+            state, batch = yield from _draw(run, state, proposal, min(size, run.left_at_all))
         except Interrupted:
             stopped = True
             break
         sample = sample.add(batch, proposal, inputs, goal.gamma)
-        whole = reduce(StratifiedSample.join, (each.sample for each in state.counted), sample)
-        state = _record_draws(context, state, batch, whole.p, whole.cov, whole.draws.ess)
-        if context.meets_target(whole.cov):
+        whole = reduce(StratifiedSample.join, (each for each, _ in state.counted), sample)
+        _record_draws(run, batch, whole.p, whole.cov, whole.draws.ess)
+        if run.meets_target(whole.cov):
             break
     if sample.draws.n == 0:
-        early = estimate_early(context, state)
+        early = _estimate_early(run, state)
         return early if stopped else replace(early, status=Status.BUDGET)
     discovery = refinement.exploration.discovery
     interval = discovery_interval(whole.draws, whole.cov, goal.confidence, whole.largest_weight, discovery)
-    outcome = _outcome(context, state, whole.draws, whole.cov, interval)
+    outcome = _outcome(run, state, whole.draws, whole.cov, interval)
     points = sample.to_sample(proposal, state.base_f, state.base_u, goal.gamma, whole.draws)
-    last = CountedRound(sample, context.simulator.n_sim - sample.draws.n)
-    parts = [part.sample.draws.weights_after(part.first, whole.draws.n) for part in (*state.counted, last)]
+    parts = (*state.counted, (sample, run.simulator.n_sim - sample.draws.n))
+    hits = int((state.base_f <= goal.gamma).sum())
+    doubts = [
+        *check_base_draws(whole.p, hits, len(state.base_f)),
+        *check_rounds(sample, state.rounds),
+        *check_regions(whole),
+        *check_discovery(whole.p, discovery, goal.confidence),
+        *([] if refinement.noisy else check_efficiency(sample)),
+    ]
     return replace(
         outcome,
-        warnings=(*outcome.warnings, *_check(context, state, refinement, sample, whole)),
+        warnings=(*outcome.warnings, *doubts),
         sample=replace(points, lineages=discovery.lineages),
-        draw_weights=tuple(weights for part in parts for weights in part),
+        draw_weights=tuple(w for part, first in parts for w in part.draws.weights_after(first, whole.draws.n)),
         status=Status.STOPPED if stopped else outcome.status,
     )
 
 
-def estimate_early(context: RunContext, state: RunState) -> Outcome:
+def _estimate_early(run: RunContext, state: RunState) -> Outcome:
     """Return what all draws from known components say, for a run that ends before its estimate."""
-    draws = state.history.to_draws(context.simulator.inputs, context.goal.gamma)
+    draws = state.history.to_draws(run.simulator.inputs, run.goal.gamma)
     largest_weight = draws.n / max(len(state.base_f), 1)
-    interval = weighted_interval(draws, context.goal.confidence, largest_weight, draws.cov)
-    outcome = _outcome(context, state, draws, draws.cov, interval)
+    interval = weighted_interval(draws, run.goal.confidence, largest_weight, draws.cov)
+    outcome = _outcome(run, state, draws, draws.cov, interval)
     parts = [(batch.first, len(batch.f)) for batch in state.history.batches]
     weights = tuple(part for each in draws.weights_after(0) for part in each.split(*parts))
     return replace(outcome, sample=draws.sample, draw_weights=weights, status=Status.STOPPED)
 
 
-def run_monte_carlo(context: RunContext, state: RunState, *, counted: bool = True) -> Steps:
+def _run_monte_carlo(run: RunContext, state: RunState, *, counted: bool = True) -> Steps:
     """Spend the rest on base draws."""
-    goal, inputs, stopped, first = context.goal, context.simulator.inputs, False, context.simulator.n_sim
+    goal, inputs, stopped, first = run.goal, run.simulator.inputs, False, run.simulator.n_sim
     u, f = (state.base_u, state.base_f) if counted else (state.base_u[:0], state.base_f[:0])
-    size = TWO_STAGE.monte_carlo_batch if goal.target_cov is None else context.target_batch
-    while context.left_at_all > 0:
-        new_u = context.rng.standard_normal((min(context.left_at_all, size), inputs.dim))
+    size = TWO_STAGE.monte_carlo_batch if goal.target_cov is None else run.target_batch
+    while run.left_at_all > 0:
+        new_u = run.rng.standard_normal((min(run.left_at_all, size), inputs.dim))
         try:
-            new_f = yield from context.simulator.evaluate(new_u)
+            new_f = yield from run.simulator.evaluate(new_u)
         except Interrupted:
             stopped = True
             break
         u, f = np.concatenate([u, new_u]), np.concatenate([f, new_f])
         share = float((f <= goal.gamma).mean())
         cov = binomial_cov(share, len(f))
-        state = _record(context, state, float((new_f <= goal.gamma).mean()), share, len(new_f), cov)
-        if context.meets_target(cov):
+        run.simulator.record(float((new_f <= goal.gamma).mean()), share, len(new_f), cov)
+        if run.meets_target(cov):
             break
     if len(f) == 0:
         u, f = state.base_u, state.base_f
-    n_before = len(f) - (context.simulator.n_sim - first)  # base draws of the exploration, its first simulations
+    n_before = len(f) - (run.simulator.n_sim - first)  # base draws of the exploration, its first simulations
     fails = f <= goal.gamma
-    trace = _close_trace(context, state).trace
+    trace = run.simulator.close_trace()
     outcome = Outcome.of_counts(int(fails.sum()), len(fails), goal.confidence, trace, no_outcome_share(f[fails]))
     sample = Sample.of_equal_draws(f, inputs.base.from_standard_normal(u[fails]))
     # A share of draws, but only in runs that came to this: it must not be pooled with others.
@@ -513,31 +475,22 @@ def run_monte_carlo(context: RunContext, state: RunState, *, counted: bool = Tru
 
 
 def _draw(
-    context: RunContext, state: RunState, proposal: MixtureProposal, n: int
+    run: RunContext, state: RunState, proposal: MixtureProposal, n: int
 ) -> SimulationSteps[tuple[RunState, ComponentDraws]]:
     """Make n > 0 draws of a proposal; those from its first component, the base distribution, are counted."""
-    u, counts = proposal.draw(n, context.rng)
-    x, first = context.simulator.inputs.base.from_standard_normal(u), context.simulator.n_sim
-    f = yield from context.simulator.simulate(x)
+    u, counts = proposal.draw(n, run.rng)
+    x, first = run.simulator.inputs.base.from_standard_normal(u), run.simulator.n_sim
+    f = yield from run.simulator.simulate(x)
     batch = ComponentDraws(proposal.components, counts, u, f, first, x)
     return replace(state, base_draws=state.base_draws + int(counts[0])), batch
 
 
-def _check(
-    context: RunContext, state: RunState, refinement: RefinementState, sample: StratifiedSample, whole: StratifiedSample
-) -> list[str]:
-    """Return the warnings of all checks of an estimate."""
-    hits = int((state.base_f <= context.goal.gamma).sum())
-    return [
-        *check_base_draws(whole.p, hits, len(state.base_f)),
-        *check_rounds(sample, state.rounds),
-        *check_regions(whole),
-        *check_discovery(whole.p, refinement.exploration.discovery, context.goal.confidence),
-        *([] if refinement.noisy else check_efficiency(sample)),
-    ]
+def _record_draws(run: RunContext, batch: ComponentDraws, estimate: float, cov: float, ess: float) -> None:
+    """Add draws of a proposal to the trace."""
+    run.simulator.record(float((batch.f <= run.goal.gamma).mean()), estimate, len(batch.f), cov, ess)
 
 
-def _outcome(context: RunContext, state: RunState, draws: Draws, cov: float, interval: Interval) -> Outcome:
+def _outcome(run: RunContext, state: RunState, draws: Draws, cov: float, interval: Interval) -> Outcome:
     """Return what weighted draws say of p."""
     return Outcome(
         p=draws.p,
@@ -545,27 +498,7 @@ def _outcome(context: RunContext, state: RunState, draws: Draws, cov: float, int
         cov=cov,
         status=Status.CONVERGED if len(draws.f) else Status.NO_HITS,
         warnings=tuple(weight_warnings(draws)),
-        trace=_close_trace(context, state).trace,
+        trace=run.simulator.close_trace(),
         no_outcome_share=no_outcome_share(draws.f, draws.log_weights),
         base_draws=state.base_draws,
     )
-
-
-def _record_draws(
-    context: RunContext, state: RunState, batch: ComponentDraws, estimate: float, cov: float, ess: float
-) -> RunState:
-    """Return the state with draws of a proposal in its trace."""
-    return _record(context, state, float((batch.f <= context.goal.gamma).mean()), estimate, len(batch.f), cov, ess)
-
-
-def _record(
-    context: RunContext, state: RunState, p: float, estimate: float, n: int, cov: float, ess: float | None = None
-) -> RunState:
-    """Return the state with one more level."""
-    trace = extend_trace(state.trace, context.goal, context.simulator.n_sim, p, estimate, n, cov, ess)
-    return replace(state, trace=trace)
-
-
-def _close_trace(context: RunContext, state: RunState) -> RunState:
-    """Return the state with the simulations of an interrupted step in its trace."""
-    return replace(state, trace=close_trace(state.trace, context.goal, context.simulator.n_sim))

@@ -13,7 +13,7 @@ from scipy.special import betaincinv
 
 from samplers.importance import Draws, weighted_interval
 from samplers.methods.searched import SimulationSteps, Simulator
-from samplers.methods.two_stage.edges import descent_direction
+from samplers.methods.two_stage.edges import fit_hyperplane
 from samplers.methods.two_stage.settings import REGIONS, SUBSPACE
 from samplers.problem import FloatArray
 from samplers.statistics import PRIOR_SHARE, Interval, add_unseen, effective_sample_size, skewed_upper_end
@@ -311,9 +311,9 @@ def _estimate_direction(paths: ChainPaths, descent: SubsetPoints | None) -> Floa
     region = paths.to_region()
     if descent is not None:
         region = _add_subset_points(region, descent)
-    axis, r2 = descent_direction(region.u, region.f)
-    if r2 > REGIONS.direction_r2:
-        return axis
+    plane = fit_hyperplane(region.u, region.f)
+    if plane.explained > REGIONS.direction_r2:
+        return plane.axis
     mean = paths.states[:, -REGIONS.mean_steps :].mean(axis=(0, 1))
     return np.asarray(mean / max(float(np.linalg.norm(mean)), 1e-12))
 

@@ -25,7 +25,7 @@ from samplers.methods.two_stage.mixture import (
     fit_subspace_mixture,
 )
 from samplers.methods.two_stage.settings import LAW, ROUNDS, WALKS
-from samplers.methods.two_stage.term_walks import Directions, TermSimulator, Walks, describe_half_spaces
+from samplers.methods.two_stage.term_walks import Directions, TermSimulator, Walks, describe_half_spaces, join_terms
 from samplers.problem import FloatArray, Terms
 from samplers.proposals import correct_eigenvalues, posterior
 from samplers.sample import DrawWeights
@@ -160,7 +160,7 @@ class TermHistory:
             new = np.logaddexp(new, np.log(n) + earlier.log_ratio(u))
         return TermHistory(
             np.concatenate([self.u, u]),
-            _join_terms(self.terms, terms),
+            join_terms([self.terms, terms]),
             np.concatenate([old, new]),
             (*self.proposals, (len(u), proposal)),
             self.n_base,
@@ -352,13 +352,6 @@ def near_points(history: TermHistory, term: int, gamma: float) -> NearPoints:
     rows = rows[: max(count, int(np.flatnonzero(under)[-1]) + 1 if under.any() else 0)]
     likely = fails[rows] if enough else np.ones(len(rows), dtype=bool)
     return NearPoints(rows, likely, enough and effective_sample_size(log_weights[fails]) >= ROUNDS.ready_ess)
-
-
-def _join_terms(first: Terms, second: Terms) -> Terms:
-    """Return the terms of two batches as those of one."""
-    parts = zip((first.f, first.values, first.ticks), (second.f, second.values, second.ticks), strict=True)
-    f, values, ticks = (np.concatenate(pair) for pair in parts)
-    return Terms(f, values, ticks, first.threshold, first.names or second.names)
 
 
 def pursue_walked(walks: Walks, history: TermHistory) -> list[PursuedTerm]:

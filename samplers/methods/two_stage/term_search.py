@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from samplers.importance import Draws, weight_warnings, weighted_interval
 from samplers.method import Goal, Interrupted, Outcome, Steps, TermsOffer, no_outcome_share, request_terms
 from samplers.methods.monte_carlo import MonteCarlo
-from samplers.methods.searched import SimulationSteps, close_trace, extend_trace
+from samplers.methods.searched import SimulationSteps
 from samplers.methods.subset import spend_on_subset_simulation
 from samplers.methods.two_stage.settings import (
     DIAGNOSTICS,
@@ -44,7 +44,7 @@ from samplers.methods.two_stage.term_walks import (
     walk_downhill,
 )
 from samplers.problem import FloatArray, Inputs, Terms
-from samplers.sample import DrawWeights, Level, Status
+from samplers.sample import DrawWeights, Status
 from samplers.statistics import (
     binomial_cov,
     clopper_pearson,
@@ -250,11 +250,10 @@ class TermSearch:
 
 @dataclass(frozen=True, eq=False)
 class SearchState:
-    """Draws so far, the terms that are pursued and the trace."""
+    """Draws so far, and the terms that are pursued."""
 
     history: TermHistory
     pursued: tuple[PursuedTerm, ...] = ()
-    trace: tuple[Level, ...] = ()
     finals: tuple[FinalRound, ...] = ()
     base_draws: int = 0
     base_failures: int = 0
@@ -275,7 +274,7 @@ def search_terms(inputs: Inputs, offer: TermsOffer, goal: Goal, budget: int, rng
     """Estimate P[f(X) <= goal.gamma] by terms and their gradients."""
     open_ended = goal.max_sim is None and goal.target_cov is not None
     end = budget + TWO_STAGE.max_batches * ROUNDS.target_batch if open_ended else budget
-    search = TermSearch(TermSimulator(inputs, offer), goal, budget, end, rng)
+    search = TermSearch(TermSimulator(inputs, offer, goal), goal, budget, end, rng)
     state = yield from _draw_base(search)
     try:
         if state.base_rate >= TWO_STAGE.common_share:
@@ -298,7 +297,8 @@ def _draw_base(search: TermSearch) -> SimulationSteps[SearchState]:
     share = failures / n
     ceiling = clopper_pearson(failures, n, search.goal.confidence)[1]
     state = SearchState(TermHistory.of_base_draws(u, terms), base_draws=n, base_failures=failures, ceiling=ceiling)
-    return _record(search, state, share, share, n, binomial_cov(share, n))
+    search.simulator.record(share, share, n, binomial_cov(share, n))
+    return state
 
 
 def _walk(search: TermSearch, state: SearchState) -> SimulationSteps[SearchState]:
@@ -314,20 +314,26 @@ def _walk(search: TermSearch, state: SearchState) -> SimulationSteps[SearchState
     chosen = replace(terms, f=terms.f[rows], values=terms.values[rows], ticks=terms.ticks[rows])
     limit = simulator.n_sim + int(WALKS.budget_share * search.budget)
     walks = yield from walk_downhill(simulator, state.history.u[rows], chosen, term, search.goal.gamma, limit)
-    state = replace(state, pursued=tuple(pursue_walked(walks, state.history)))
     reached = float((walks.values <= terms.threshold).mean()) if len(walks.values) else 0.0
-    return _record(search, state, reached, state.trace[-1].estimate, len(rows), math.inf)
+    simulator.record(reached, simulator.trace[-1].estimate, len(rows), math.inf)
+    return replace(state, pursued=tuple(pursue_walked(walks, state.history)))
 
 
 def _run_rounds(search: TermSearch, state: SearchState) -> SimulationSteps[SearchState]:
     """Draw and refit until all terms have been at the threshold twice, or the rest is for the estimate."""
-    ready = 0
+    ready, known, trace = 0, len(search.simulator.trace), search.simulator.trace
     size = int(ROUNDS.size * search.budget)
     reserve = int((ROUNDS.final_share - ROUNDS.refit_share) * search.budget)
-    while state.pursued and ready < ROUNDS.ready_rounds and search.left - size >= ROUNDS.final_share * search.budget:
-        state, _ = yield from _draw_round(search, state, size)
-        state = yield from _refit(search, state, reserve)
-        ready = ready + 1 if all(term.ready for term in state.pursued) else 0
+    try:
+        while (
+            state.pursued and ready < ROUNDS.ready_rounds and search.left - size >= ROUNDS.final_share * search.budget
+        ):
+            state, _ = yield from _draw_round(search, state, size)
+            state = yield from _refit(search, state, reserve)
+            ready = ready + 1 if all(term.ready for term in state.pursued) else 0
+    except Interrupted:
+        del trace[known:]  # rounds that are given up are one level
+        raise
     return state
 
 
@@ -355,7 +361,8 @@ def _draw_round(
         last_rate=ess / n,
     )
     p = float(drawn.y(gamma).mean())
-    return _record(search, state, float(fails.mean()), p, n, 1 / math.sqrt(ess) if ess else math.inf, ess), drawn
+    search.simulator.record(float(fails.mean()), p, n, 1 / math.sqrt(ess) if ess else math.inf, ess)
+    return state, drawn
 
 
 def _refit(search: TermSearch, state: SearchState, reserve: int) -> SimulationSteps[SearchState]:
@@ -409,7 +416,6 @@ def _conclude(search: TermSearch, state: SearchState, stopped: bool) -> Outcome:
     """Return the outcome of the final rounds."""
     goal, combined = search.goal, _combine(search, state)
     cov, draws = combined.cov, combined.draws
-    state = _close_trace(search, state)
     status = Status.CONVERGED if len(draws.f) else Status.NO_HITS
     return Outcome(
         p=combined.p,
@@ -417,7 +423,7 @@ def _conclude(search: TermSearch, state: SearchState, stopped: bool) -> Outcome:
         cov=cov,
         status=Status.STOPPED if stopped else status,
         warnings=tuple(doubt(combined, [one.number for one in state.pursued])),
-        trace=state.trace,
+        trace=search.simulator.close_trace(),
         no_outcome_share=no_outcome_share(draws.f, draws.log_weights),
         sample=draws.sample,
         base_draws=state.base_draws,
@@ -427,7 +433,7 @@ def _conclude(search: TermSearch, state: SearchState, stopped: bool) -> Outcome:
 
 def _estimate_early(search: TermSearch, state: SearchState) -> Outcome:
     """Return what all draws from known proposals say, for a run that ends before its estimate."""
-    state, history = _close_trace(search, state), state.history
+    history = state.history
     x = search.simulator.inputs.base.from_standard_normal(history.u)
     n = len(history.u)
     draws = Draws.from_outcomes(history.terms.f, history.log_weights + np.log(n), x, search.goal.gamma)
@@ -437,7 +443,7 @@ def _estimate_early(search: TermSearch, state: SearchState) -> Outcome:
         cov=draws.cov,
         status=Status.STOPPED,
         warnings=tuple(weight_warnings(draws)),
-        trace=state.trace,
+        trace=search.simulator.close_trace(),
         no_outcome_share=no_outcome_share(draws.f, draws.log_weights),
         sample=draws.sample,
         base_draws=state.base_draws,
@@ -475,7 +481,7 @@ def _expected_levels(history: TermHistory, gamma: float) -> int:
 
 def _after(search: TermSearch, state: SearchState, outcome: Outcome) -> Outcome:
     """Return the outcome of another method that used the rest."""
-    earlier = _close_trace(search, state).trace
+    earlier = search.simulator.close_trace()
     spent = sum(level.n_sim for level in earlier)
     return replace(
         outcome,
@@ -484,16 +490,3 @@ def _after(search: TermSearch, state: SearchState, outcome: Outcome) -> Outcome:
         counts=None,
         draw_weights=tuple(replace(weights, first=weights.first + spent) for weights in outcome.draw_weights),
     )
-
-
-def _record(
-    search: TermSearch, state: SearchState, p: float, estimate: float, n: int, cov: float, ess: float | None = None
-) -> SearchState:
-    """Return the state with one more level."""
-    trace = extend_trace(state.trace, search.goal, search.simulator.n_sim, p, estimate, n, cov, ess)
-    return replace(state, trace=trace)
-
-
-def _close_trace(search: TermSearch, state: SearchState) -> SearchState:
-    """Return the state with the simulations of an interrupted step in its trace."""
-    return replace(state, trace=close_trace(state.trace, search.goal, search.simulator.n_sim))

@@ -7,8 +7,8 @@ from typing import Any, NamedTuple, Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
-from samplers.method import TermsOffer, request_gradients, request_terms, whole_simulations
-from samplers.methods.searched import SimulationSteps, noise_mask
+from samplers.method import Goal, TermsOffer, request_gradients, request_terms, whole_simulations
+from samplers.methods.searched import SimulationSteps, Simulator, noise_mask
 from samplers.methods.two_stage.settings import EXPLORATION, WALKS
 from samplers.problem import Distribution, FloatArray, Inputs, StandardNormal, Terms
 
@@ -20,18 +20,18 @@ PATTERN_POINTS = 3
 """Points at which it is seen which coordinates of u a coordinate of x depends on."""
 
 
-class TermSimulator:
-    """The way from standard normal space to terms and gradients; it counts simulations and is changed in place.
+def join_terms(parts: Sequence[Terms]) -> Terms:
+    """Return the terms of some batches, at least one, as those of one."""
+    f, values, ticks = (np.concatenate([getattr(one, name) for one in parts]) for name in ("f", "values", "ticks"))
+    return Terms(f, values, ticks, parts[0].threshold, next((one.names for one in parts if one.names), ()))
 
-    Attributes:
-        inputs: All of x.
-        offer: What the run answers.
-        n_sim: Simulations made so far, gradients at their cost.
-    """
 
-    def __init__(self, inputs: Inputs, offer: TermsOffer) -> None:
-        self.inputs, self.offer = inputs, offer
-        self.n_sim = 0
+class TermSimulator(Simulator):
+    """The way from standard normal space to terms and gradients, which count at their cost; `offer` is the run's."""
+
+    def __init__(self, inputs: Inputs, offer: TermsOffer, goal: Goal) -> None:
+        super().__init__(inputs, goal)
+        self.offer = offer
         self._slopes: TransformSlopes | None = None
 
     def terms(self, u: FloatArray) -> SimulationSteps[Terms]:
@@ -43,13 +43,7 @@ class TermSimulator:
     def gradients(
         self, u: FloatArray, term: NDArray[np.int64], ticks: NDArray[np.int64]
     ) -> SimulationSteps[FloatArray]:
-        """Return the gradients with respect to u of one term at each of the points u (n, d), shape (n, d).
-
-        Args:
-            u: Points; none give no request.
-            term: Number of the term, shape (n,).
-            ticks: When it is attained, shape (n,).
-        """
+        """Return the gradients (n, d) by u of one term (n,), attained at ticks (n,), at each of the points u (n, d)."""
         if len(u) == 0:
             return np.empty_like(u)
         answer = yield from request_gradients(self.inputs.base.from_standard_normal(u), term, ticks)

@@ -22,55 +22,26 @@ from samplers.methods.two_stage.exploration import bisect_towards_origin, choose
 from samplers.methods.two_stage.regions import ExplorationResult, SubsetPoints, grow_regions
 from samplers.methods.two_stage.settings import EXPLORATION, TERMS_ALONE
 from samplers.methods.two_stage.term_search import answer_by_terms
+from samplers.methods.two_stage.term_walks import join_terms
 from samplers.problem import FloatArray, FunctionProblem, Terms
 
 _T = TypeVar("_T")
 
 
-class UnreachedTerms(NamedTuple):
-    """Terms that were the least somewhere and of which no failure is known."""
-
-    searched: tuple[str, ...] = ()
-    """Names of those that were followed alone."""
-    unsearched: tuple[str, ...] = ()
-    """Names of those for which no simulations were left."""
-    limit: float = 0.0
-    """Probability from which on a half-space would have been hit by the first draws."""
-
-    def describe(self, p: float) -> tuple[str, ...]:
-        """Return remarks on them, for an estimate p."""
-        share = f" ({self.limit / p:.0e} of p)" if p > 0 else ""
-        bound = f"the first draws rule out a half-space with probability above {self.limit:.0e}{share}"
-        parts = (
-            ("searched one by one without reaching failure", self.searched),
-            ("not searched one by one", self.unsearched),
-        )
-        return tuple(
-            f"Terms that were smallest at some points but have no known failure ({how}): {_list_names(names)}; {bound}."
-            for how, names in parts
-            if names
-        )
-
-
 class TermRecord:
-    """Points of the exploration with their terms; it is changed in place, as the count of the simulator is.
+    """Points of the exploration with their terms, and the terms whose failures were searched for and not found.
 
-    Args:
-        offered: Whether the run answers requests for terms; nothing is recorded otherwise.
-
-    Attributes:
-        unreached: Terms whose failures were searched for and not found.
+    It is changed in place, as the count of the simulator is.
     """
 
-    def __init__(self, offered: bool = True) -> None:
-        self._offered = offered
+    def __init__(self) -> None:
         self._x, self._terms = list[FloatArray](), list[Terms]()
-        self.unreached = UnreachedTerms()
+        self._unreached: tuple[tuple[str, ...], tuple[str, ...], float] = (), (), 0.0
 
     @property
     def several(self) -> bool:
         """Whether there is more than one term, as far as is known."""
-        return self._offered and not (self._terms and self._terms[0].values.shape[1] == 1)
+        return not (self._terms and self._terms[0].values.shape[1] == 1)
 
     def watch(self, steps: Generator[FloatArray, FloatArray, _T]) -> Generator[FloatArray, FloatArray, _T]:
         """Run steps that ask for f with terms requested in its place; where there is but one term, f is enough."""
@@ -83,9 +54,27 @@ class TermRecord:
 
     def join(self) -> tuple[FloatArray, Terms]:
         """Return all points (n, d), n > 0, and their terms, in the order in which they were simulated."""
-        parts = self._terms
-        f, values, ticks = (np.concatenate([getattr(one, name) for one in parts]) for name in ("f", "values", "ticks"))
-        return np.concatenate(self._x), Terms(f, values, ticks, parts[0].threshold, parts[0].names)
+        return np.concatenate(self._x), join_terms(self._terms)
+
+    def note_unreached(self, searched: tuple[str, ...], unsearched: tuple[str, ...], limit: float) -> None:
+        """Note the names of terms that were the least somewhere and of which no failure is known.
+
+        Those that were followed alone, those for which no simulations were left, and the probability from which on a
+        half-space would have been hit by the first draws.
+        """
+        self._unreached = searched, unsearched, limit
+
+    def describe(self, p: float) -> tuple[str, ...]:
+        """Return remarks on these, for an estimate p."""
+        searched, unsearched, limit = self._unreached
+        share = f" ({limit / p:.0e} of p)" if p > 0 else ""
+        bound = f"the first draws rule out a half-space with probability above {limit:.0e}{share}"
+        parts = (("searched one by one without reaching failure", searched), ("not searched one by one", unsearched))
+        return tuple(
+            f"Terms that were smallest at some points but have no known failure ({how}): {_list_names(names)}; {bound}."
+            for how, names in parts
+            if names
+        )
 
 
 def explore_terms(
@@ -125,7 +114,7 @@ def explore_terms(
         exploration = exploration._replace(regions=[*exploration.regions, *grown.regions], discovery=discovery)
     names = terms.names or tuple(str(j) for j in range(terms.values.shape[1]))
     arrived = dict(zip(numbers.tolist(), map(len, ends), strict=True))
-    record.unreached = UnreachedTerms(
+    record.note_unreached(
         tuple(names[j] for j in searched if not arrived[j]),
         tuple(names[j] for j in met[len(searched) :]),
         hit_limit(first),
