@@ -45,16 +45,15 @@ BASE_CHECK_DRAWS = 16
 
 @dataclass(frozen=True, kw_only=True)
 class Side:
-    """P[f(X) <= gamma] of one of the two problems."""
+    """P[f(X) <= gamma] of one of the two problems, with its interval at the `confidence` of the comparison.
+
+    `cov` is inf where p = 0; `ess` is the effective number of independent failing units behind p.
+    """
 
     p: float
-    """Estimated probability."""
     interval: Interval
-    """Interval that should hold the true p with probability `confidence` of the comparison."""
     cov: float
-    """Coefficient of variation of p; inf where p = 0."""
     ess: float
-    """Effective number of independent failing units behind p."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -117,16 +116,7 @@ class Comparison:
         return axes
 
     def to_arrow(self, names: Sequence[str] = ()) -> "pyarrow.Table":
-        """Return the simulated points behind both probabilities, as `Estimate.to_arrow` of `either` does.
-
-        f is the smaller outcome of the two.
-
-        Args:
-            names: Names of the coordinates of x; by default those of A's problem, or x1, x2, ...
-
-        Raises:
-            ValueError: If names do not fit.
-        """
+        """Return the simulated points behind both, as `Estimate.to_arrow` of `either`; f is the smaller outcome."""
         return self.either.to_arrow(names)
 
     def to_pandas(self, names: Sequence[str] = ()) -> "pandas.DataFrame":
@@ -135,73 +125,49 @@ class Comparison:
         return self.to_arrow(names).to_pandas()
 
     def save(self, path: str | PathLike[str]) -> None:
-        """Write the comparison to a file that `Comparison.load` reads, as `Estimate.save` does.
-
-        Args:
-            path: Of the file.
-
-        Raises:
-            OSError: If it cannot be written.
-        """
+        """Write the comparison to a file that `Comparison.load` reads, as `Estimate.save` does."""
         write_object(path, replace(self, either=without_base(self.either)))
 
     @classmethod
     def load(cls, path: str | PathLike[str]) -> "Comparison":
-        """Return the comparison that `save` has written.
-
-        Args:
-            path: Of the file.
-
-        Raises:
-            FileNotFoundError: If there is no such file.
-            ValueError: If the file is damaged, or of something else.
-        """
+        """Return the comparison that `save` has written; raises as `Estimate.load` does."""
         return read_object(path, cls)
 
     @property
-    def _has_ratio(self) -> bool:
-        """Whether both failed, so that there is more than a bound."""
+    def _has_ratio(self) -> bool:  # more than a bound: both failed
         return math.isfinite(self.ratio) and self.ratio > 0
 
     @property
     def _ratio_text(self) -> str:
         """The ratio, or its bound where one of the two did not fail."""
         low, high = self.interval
-        if math.isinf(self.ratio):
-            return f"p_A / p_B above {low:.3g} ({100 * self.confidence:g} % one-sided bound; no failure of B was found)"
+        if self._has_ratio:
+            return f"p_A / p_B = {self.ratio:.3g}"
         if math.isnan(self.ratio):
             return "p_A / p_B not known (no failure of A or B was found)"
-        if self.ratio == 0:
-            return (
-                f"p_A / p_B below {high:.3g} ({100 * self.confidence:g} % one-sided bound; no failure of A was found)"
-            )
-        return f"p_A / p_B = {self.ratio:.3g}"
+        bound, name = (f"below {high:.3g}", "A") if self.ratio == 0 else (f"above {low:.3g}", "B")
+        return f"p_A / p_B {bound} ({100 * self.confidence:g} % one-sided bound; no failure of {name} was found)"
 
     def __repr__(self) -> str:
-        """Return one line; `str` has all of it."""
         low, high = self.interval
         ends = f" [{low:.3g}, {high:.3g}]" if self._has_ratio else ""
         return f"<Comparison {self._ratio_text}{ends}, {self.n_sim:,} simulations>"
 
     def _repr_html_(self) -> str:
-        """Return a table for notebooks."""
-        level = f"{100 * self.confidence:g} % interval"
         rows = [
             ("p_A / p_B", f"{self.ratio:.3g}", "{:.3g} to {:.3g}".format(*self.interval))
             if self._has_ratio
             else ("p_A / p_B", self._ratio_text.removeprefix("p_A / p_B "), ""),
-            *(
-                (name, f"{side.p:.3e}", "{:.3e} to {:.3e}".format(*side.interval))
-                for name, side in (("p_A", self.a), ("p_B", self.b))
-            ),
+            ("p_A", f"{self.a.p:.3e}", "{:.3e} to {:.3e}".format(*self.a.interval)),
+            ("p_B", f"{self.b.p:.3e}", "{:.3e} to {:.3e}".format(*self.b.interval)),
             ("both fail", f"{self.both:.3e}", ""),
             ("simulations", f"{self.n_sim:,}", ""),
         ]
         notes = [] if self.base_uncertainty is None else [str(self.base_uncertainty)]
-        return html_table("", rows, ("", "estimate", level), [*notes, *(f"warning: {text}" for text in self.warnings)])
+        header = ("", "estimate", f"{100 * self.confidence:g} % interval")
+        return html_table("", rows, header, [*notes, *(f"warning: {text}" for text in self.warnings)])
 
     def __str__(self) -> str:
-        """Return a few lines for people."""
         lines = [self._ratio_text]
         if self._has_ratio:
             low, high = self.interval
@@ -214,34 +180,22 @@ class Comparison:
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain numbers for JSON; NaN and infinities become None."""
-        sides = {name: to_json_value(asdict(side)) for name, side in (("a", self.a), ("b", self.b))}
+        names = ("ratio", "interval", "confidence", "both", "n_sim", "warnings")
         data = {
-            "ratio": self.ratio,
-            "interval": list(self.interval),
-            "confidence": self.confidence,
-            "both": self.both,
-            "n_sim": self.n_sim,
-            "warnings": list(self.warnings),
+            **{name: getattr(self, name) for name in names},
             "either": self.either.to_dict(),
             "base_uncertainty": None if self.base_uncertainty is None else self.base_uncertainty.to_dict(),
+            "a": asdict(self.a),
+            "b": asdict(self.b),
         }
-        return {**{key: to_json_value(value) for key, value in data.items()}, **sides}
+        return {key: to_json_value(value) for key, value in data.items()}
 
 
 register_stored(Comparison, Side, RatioUncertainty)
 
 
 class EitherFails:
-    """The problem that fails where A or B does, f = min(f_A, f_B); it remembers which of them failed.
-
-    Args:
-        a: Problem A.
-        b: Problem B, with the same base distribution.
-        gamma: Threshold of failure.
-
-    Attributes:
-        n_sim: Simulations of A and of B together.
-    """
+    """The problem that fails where A or B does, f = min(f_A, f_B); it remembers which, and counts simulations."""
 
     def __init__(self, a: Problem, b: Problem, gamma: float) -> None:
         self.dim, self.base = int(a.dim), a.base

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from samplers.executors import Dispatcher, Executor
+from samplers.executors import Executor, Pool
 from samplers.journal import Journal, JournalError, digest_points
 from samplers.method import Answer, GradientRequest, Request, TermsOffer, TermsRequest, whole_simulations
 from samplers.problem import FloatArray, TermGradients, Terms, condition_of, names_of_columns, offers_terms
@@ -120,7 +120,7 @@ class Evaluator:
         self._size = None if size is None and executor is None else self._split
         self._precision, self._n_chunks, self._checked = precision, 0, False
         self._n_terms: int | None = None
-        self._dispatcher: Dispatcher | None = None
+        self._pool: Pool | None = None
         self._stack = ExitStack()
         self.offer = _find_offer(problem)
         self.faults, self.lost = list[Fault](), list[str]()
@@ -131,8 +131,8 @@ class Evaluator:
     def __enter__(self) -> Evaluator:
         """Get workers, if there is an executor."""
         if self._executor is not None:
-            pool = self._stack.enter_context(self._executor.open(SeededWork(self._work, self._seed)))
-            self._dispatcher, self.workers = Dispatcher(pool, self._work.lose), pool.workers
+            self._pool = self._stack.enter_context(self._executor.open(SeededWork(self._work, self._seed)))
+            self.workers = self._pool.workers
         return self
 
     def __exit__(self, *error: object) -> None:
@@ -142,7 +142,7 @@ class Evaluator:
     @property
     def n_retries(self) -> int:
         """Chunks that were computed again because a worker was lost."""
-        return 0 if self._dispatcher is None else self._dispatcher.n_retries
+        return 0 if self._pool is None else self._pool.n_retries
 
     def respond(self, requests: Sequence[Request]) -> list[Answer]:
         """Return the answers to some requests, in their order; f may still be NaN.
@@ -214,9 +214,9 @@ class Evaluator:
 
         Generators of random numbers are keyed by the number in the run.
         """
-        if self._dispatcher is None:
+        if self._pool is None:
             return zip(chunks, map(self._work, chunks.values()), strict=True)
-        done = self._dispatcher.run((first + number, chunk) for number, chunk in chunks.items())
+        done = self._pool.run(((first + number, chunk) for number, chunk in chunks.items()), self._work.lose)
         return ((number - first, result) for number, result in done)
 
     def _restore(self, request: Chunk) -> tuple[list[Chunk], dict[int, Result]]:

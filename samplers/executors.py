@@ -1,8 +1,7 @@
 """Executors: where chunks are computed. In this process, in local ones, on a cluster; the bits are the same.
 
-Each makes a pool for the length of a run. A pool passes chunks to objects with the `submit` of
-`concurrent.futures.Executor`, which run `samplers.workers.compute_in_worker`. A `Dispatcher` keeps it busy: lost chunks
-go again, and those that no worker survives are taken apart.
+Each makes workers for the length of a run: objects with the `submit` of `concurrent.futures.Executor`, which run
+`samplers.workers.compute_in_worker`. Lost chunks go again, and those that no worker survives are taken apart.
 """
 
 from __future__ import annotations
@@ -19,7 +18,7 @@ import time
 import warnings
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, CancelledError, Future, wait
+from concurrent.futures import BrokenExecutor, CancelledError
 from concurrent.futures import Executor as FuturesExecutor
 from contextlib import AbstractContextManager, closing, contextmanager, suppress
 from dataclasses import dataclass, field
@@ -55,7 +54,7 @@ START_SECONDS = 300.0
 POLL_SECONDS = 0.05
 """Time [s] between two looks at jobs that cannot tell when they are done, such as those of submitit."""
 MOST_RESTARTS = 1000
-"""Broken pools that are replaced in one run."""
+"""Broken pools that are replaced in the place of one in one run."""
 ENVIRONMENT = {
     **dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXPR_NUM_THREADS"), "1"),
     "PYTHONFAULTHANDLER": "",  # set to nothing, loky leaves the handler off: what ended a process is said by the driver
@@ -64,21 +63,23 @@ ENVIRONMENT = {
 
 
 class Pool(Protocol):
-    """Workers that are ready to compute chunks of one run."""
+    """Workers for one run: their number, and the chunks and rows that were computed again because one was lost."""
 
     workers: int
-    window: int
-    """Chunks that may be submitted and not done."""
-    blames: bool
-    """Whether `WorkerLost` concerns the worker of that chunk alone; if not, all chunks in flight get it."""
+    n_retries: int
 
-    def submit(self, index: Index, chunk: Chunk) -> Future[Result]:
-        """Begin to compute a chunk; the future has its result, what the work raised, or `WorkerLost`."""
+    def run(
+        self, chunks: Iterable[tuple[int, Chunk]], lose: Callable[[Chunk, str], Result]
+    ) -> Iterator[tuple[int, Result]]:
+        """Yield the results of chunks with their numbers, in any order; what the work raises is raised here.
+
+        `lose` gives the result of a row that no worker survives, and why that was lost, or raises.
+        """
 
 
 @runtime_checkable
 class Executor(Protocol):
-    """Settings from which a pool of workers is made for a run.
+    """Settings from which workers are made for a run.
 
     Example:
         >>> import samplers
@@ -87,14 +88,7 @@ class Executor(Protocol):
     """
 
     def open(self, compute: Compute) -> AbstractContextManager[Pool]:
-        """Return workers for a run, which are gone at the end of the block.
-
-        Args:
-            compute: What they do with a chunk.
-
-        Raises:
-            ValueError: It cannot be sent to workers.
-        """
+        """Return workers for a run, which are gone at the end of the block; a ValueError if work cannot be sent."""
 
 
 @dataclass(frozen=True)
@@ -111,7 +105,7 @@ class InProcess:
     @contextmanager
     def open(self, compute: Compute) -> Iterator[Pool]:
         """Yield this process as a pool of one."""
-        yield _SerialPool(compute)
+        yield _ThisProcess(compute)
 
 
 class _Limited:
@@ -164,9 +158,8 @@ class LocalProcesses(_Limited):
     @contextmanager
     def open(self, compute: Compute) -> Iterator[Pool]:
         """Yield the processes; each starts with its first chunk, and all are killed at the end of the block."""
-        packed, number = pack(compute), self.workers or os.cpu_count() or 1
-        slots = [_SubmitPool(_LocalProcess, True, packed, self.limits, 1, blames=True) for _ in range(number)]
-        with closing(_SlotPool(slots)) as pool:
+        number = self.workers or os.cpu_count() or 1
+        with closing(_Workers(_LocalProcess, True, pack(compute), self.limits, 1, number, blames=True)) as pool:
             yield pool
 
 
@@ -209,7 +202,7 @@ class FuturesPool(_Limited):
         """Yield the pool; one that was made here is shut down at the end of the block."""
         packed, made = pack(compute), not _has_submit(self.executor)
         make = self.executor if made else lambda: self.executor
-        with closing(_SubmitPool(make, made, packed, self.limits, self.workers)) as pool:
+        with closing(_Workers(make, made, packed, self.limits, self.workers)) as pool:
             yield pool
 
 
@@ -244,12 +237,7 @@ class RayCluster(_Limited):
 
     @contextmanager
     def open(self, compute: Compute) -> Iterator[Pool]:
-        """Yield the cluster; one that was started here ends with the block.
-
-        Raises:
-            ValueError: Ray is not installed, or the work cannot be sent.
-            ExecutorError: There is no cluster at the address, or none can be started.
-        """
+        """Yield the cluster; one that was started here ends with the block. An ExecutorError where there is none."""
         try:
             import ray
         except ImportError as error:
@@ -261,7 +249,7 @@ class RayCluster(_Limited):
         workers = self.workers or _count_places(ray, options)
         tasks = _RayTasks(ray, options)
         try:
-            with closing(_SubmitPool(lambda: tasks, False, packed, self.limits, workers, blames=True)) as pool:
+            with closing(_Workers(lambda: tasks, False, packed, self.limits, workers, blames=True)) as pool:
                 yield pool
         finally:
             if started:
@@ -306,26 +294,57 @@ def find_executor(workers: int | None, executor: Any) -> Executor | None:
 # Pools
 
 
-class _SerialPool:
-    """A pool whose chunks are done when `submit` returns."""
+class _ThisProcess:
+    """The pool of one that computes chunks here."""
 
-    workers, window, blames = 1, 1, True
+    workers, n_retries = 1, 0
 
     def __init__(self, compute: Compute) -> None:
         self._compute = compute
 
-    def submit(self, index: Index, chunk: Chunk) -> Future[Result]:
-        """Compute a chunk; what it raises is in the future, an interruption is raised."""
-        future: Future[Result] = Future()
-        try:
-            future.set_result(self._compute(index, chunk))
-        except Exception as error:
-            future.set_exception(error)
-        return future
+    def run(
+        self, chunks: Iterable[tuple[int, Chunk]], lose: Callable[[Chunk, str], Result]
+    ) -> Iterator[tuple[int, Result]]:
+        """Compute one chunk after the other."""
+        for number, chunk in chunks:
+            yield number, self._compute((number,), chunk)
 
 
-class _SubmitPool:
-    """An object with `submit`, and the work to be done; one of ours (`made`) is shut down, and replaced if broken."""
+@dataclass(eq=False)
+class _Task:
+    """A chunk on its way, or a row of one; its rows have results in `parts` once it is taken apart."""
+
+    index: Index
+    chunk: Chunk
+    parent: _Task | None = None
+    attempts: int = 0
+    parts: list[Result | None] = field(default_factory=list)
+    call: int = 0
+    slot: int = 0
+    begun: float = 0.0
+    job: Any = None
+
+    def take_apart(self) -> list[_Task]:
+        """Return its rows as tasks: an attempt that costs a process is dear, and many at once are not."""
+        rows = self.chunk.split(1)
+        self.parts = [None] * len(rows)
+        return [_Task((*self.index, number), row, self) for number, row in enumerate(rows)]
+
+    def put(self, result: Result) -> tuple[int, Result] | None:
+        """Take a result; return it with the number of the chunk where the whole chunk is done."""
+        if self.parent is None:
+            return self.index[0], result
+        self.parent.parts[self.index[-1]] = result
+        parts = [part for part in self.parent.parts if part is not None]
+        return self.parent.put(join_results(parts)) if len(parts) == len(self.parent.parts) else None
+
+
+class _Workers:
+    """Objects with `submit`, in slots, and the work to be done; those of ours (`made`) are replaced where broken.
+
+    Where it `blames`, a worker that is lost costs its own chunk alone, and each worker has one chunk in flight, else
+    two: all in flight are then lost together, and suspects go alone.
+    """
 
     def __init__(
         self,
@@ -333,113 +352,164 @@ class _SubmitPool:
         made: bool,
         packed: bytes,
         limits: Limits,
-        workers: int | None,
+        workers: int | None = None,
+        slots: int = 1,
         blames: bool = False,
     ) -> None:
-        self._make, self._made, self._packed, self.limits = make, made, packed, limits
+        self._make, self._made, self._packed, self._limits, self._blames = make, made, packed, limits, blames
         self._key = blake2b(packed, digest_size=16).hexdigest()
-        self._pool: Any = make()
-        self._restarts, self._calls = 0, itertools.count()
-        self.workers, self.blames = workers or _count_workers(self._pool), blames
-        self.window = self.workers if blames else 2 * self.workers
+        self._pools: list[Any] = [make() for _ in range(slots)]
+        self._restarts, self._calls = [0] * slots, itertools.count()
+        each = workers or _count_workers(self._pools[0])
+        self.workers = slots * each
+        self._idle = deque(list(range(slots)) * (each if blames else 2 * each))
+        self._done: queue.SimpleQueue[tuple[int, float]] = queue.SimpleQueue()
+        self._proven = self._warned = False  # a chunk has been computed; a silence has been told
+        self.n_retries = 0
 
-    def submit(self, index: Index, chunk: Chunk) -> Future[Result]:
-        """Submit a chunk, to a new pool if that is broken."""
-        future: Future[Result] = Future()
-        call = next(self._calls)
-        words = (compute_in_worker, self._key, self._packed, name_process(), self.limits, index, chunk, call)
+    def run(
+        self, chunks: Iterable[tuple[int, Chunk]], lose: Callable[[Chunk, str], Result]
+    ) -> Iterator[tuple[int, Result]]:
+        """Yield the results of chunks, see `Pool`."""
+        waiting = deque(_Task((number,), chunk) for number, chunk in chunks)
+        running: dict[int, _Task] = {}
         try:
-            job = self._pool.submit(*words)
-        except (BrokenExecutor, RuntimeError) as error:
-            self._replace(error)
-            job = self._pool.submit(*words)
-        if not callable(getattr(job, "result", None)):
-            kind = type(self._pool).__name__
-            raise ExecutorError(f"Expected {kind}.submit to return a future, got {reprlib.repr(job)}.")
-        future.add_done_callback(lambda given_up: self._give_up(job) if given_up.cancelled() else None)
-        begun = time.monotonic()
-        if hasattr(job, "add_done_callback"):
-            job.add_done_callback(lambda done: self._pass_on(done, future, call, begun))
-        else:
-            threading.Thread(target=self._watch, args=(job, future, call, begun), daemon=True).start()
-        return future
+            while waiting or running:
+                while waiting and self._idle and self._may_go(waiting[0], running):
+                    self._submit(waiting.popleft(), running)
+                for task, ended in self._wait(running):
+                    self._idle.append(task.slot)
+                    try:
+                        done = task.put(self._take(task, ended))
+                    except WorkerLost as error:
+                        done = self._again(task, error, waiting, lose)
+                    if done is not None:
+                        yield done
+        finally:
+            for task in running.values():
+                self._give_up(task)
+                self._idle.append(task.slot)
 
     def close(self) -> None:
-        """Shut down a pool that was made here."""
-        if self._made:
+        """End what was made here, whatever it is doing."""
+        for pool in self._pools if self._made else ():
             with suppress(Exception):  # foreign, and perhaps broken
-                self._pool.shutdown(wait=False)
+                pool.shutdown(wait=False)
 
-    def _replace(self, error: Exception) -> None:
-        self._restarts += 1
-        if not self._made:
-            raise ExecutorError(
-                f"A worker of {type(self._pool).__name__} died, and with it the pool ({describe(error)}); give a "
-                "function that makes the pool (executor=lambda: ...), and a new one is made."
-            ) from error
-        if self._restarts > MOST_RESTARTS:
-            raise ExecutorError(f"{self._restarts} pools broke one after the other: {describe(error)}.") from error
-        self.close()
-        self._pool = self._make()
+    def _may_go(self, task: _Task, running: dict[int, _Task]) -> bool:
+        """Return whether a task may be submitted: a suspect goes alone where its neighbours would share its fate."""
+        return self._blames or not running or not (task.attempts or any(each.attempts for each in running.values()))
 
-    def _give_up(self, job: Any) -> None:
-        """Cancel a job that nobody waits for, where its pool can do that; a process of our own ends with it."""
-        with suppress(Exception):  # foreign: some have no `cancel`, some raise where it is too late
-            if not job.cancel() and self._made and self.blames:
-                self.close()
-
-    def _pass_on(self, job: Any, future: Future[Result], call: int, begun: float) -> None:
-        """Let a future have what a job has come to; what the pool itself raises means that a worker was lost."""
-        if not future.set_running_or_notify_cancel():  # nobody waits for it any more
-            return
+    def _submit(self, task: _Task, running: dict[int, _Task]) -> None:
+        """Submit a task, to a new pool if that is broken."""
+        task.slot, task.call, task.begun = self._idle.popleft(), next(self._calls), time.monotonic()
+        words = (self._key, self._packed, name_process(), self._limits, task.index, task.chunk, task.call)
         try:
-            reply: Any = job.result()
-        except ConnectionError as error:  # of a cluster that is gone
-            future.set_exception(ExecutorError(f"The executor does not answer any more ({describe(error)})."))
-            return
-        except (Exception, CancelledError) as error:
-            future.set_exception(WorkerLost(describe_loss(error, time.monotonic() - begun, self.limits.seconds)))
-            return
-        if not isinstance(reply, Reply):
-            words = f"Expected what the submitted function returns as result of a future, got {reprlib.repr(reply)}."
-            future.set_exception(ExecutorError(words))
-        elif reply.call != call:
-            future.set_exception(ExecutorError("A future of the executor has the result of another call."))
-        elif reply.result is None:
-            assert reply.error is not None
-            future.set_exception(reply.error)
+            task.job = self._pools[task.slot].submit(compute_in_worker, *words)
+        except (BrokenExecutor, RuntimeError) as error:
+            self._replace(task.slot, error)
+            task.job = self._pools[task.slot].submit(compute_in_worker, *words)
+        if not callable(getattr(task.job, "result", None)):
+            kind = type(self._pools[task.slot]).__name__
+            raise ExecutorError(f"Expected {kind}.submit to return a future, got {reprlib.repr(task.job)}.")
+        running[task.call] = task
+        if hasattr(task.job, "add_done_callback"):
+            task.job.add_done_callback(lambda _, call=task.call: self._done.put((call, time.monotonic())))
         else:
-            future.set_result(reply.result)
+            threading.Thread(target=self._watch, args=(task.job, task.call), daemon=True).start()
 
-    def _watch(self, job: Any, *rest: Any) -> None:
+    def _watch(self, job: Any, call: int) -> None:
         while not job.done():
             time.sleep(POLL_SECONDS)
-        self._pass_on(job, *rest)
+        self._done.put((call, time.monotonic()))
 
+    def _replace(self, slot: int, error: Exception) -> None:
+        """Put a new pool in the place of a broken one."""
+        if not self._made:
+            raise ExecutorError(
+                f"A worker of {type(self._pools[slot]).__name__} died, and with it the pool ({describe(error)}); give "
+                "a function that makes the pool (executor=lambda: ...), and a new one is made."
+            ) from error
+        self._restarts[slot] += 1
+        if self._restarts[slot] > MOST_RESTARTS:
+            words = f"{MOST_RESTARTS} pools broke one after the other: {describe(error)}."
+            raise ExecutorError(words) from error
+        with suppress(Exception):
+            self._pools[slot].shutdown(wait=False)
+        self._pools[slot] = self._make()
 
-class _SlotPool:
-    """Pools of one worker each, of which one that dies concerns no other."""
+    def _give_up(self, task: _Task) -> None:
+        """Cancel a job that nobody waits for, where its pool can do that; a process of our own ends with it."""
+        with suppress(Exception):  # foreign: some have no `cancel`, some raise where it is too late
+            if not task.job.cancel() and self._made and self._blames:
+                self._pools[task.slot].shutdown(wait=False)
 
-    blames = True
+    def _wait(self, running: dict[int, _Task]) -> list[tuple[_Task, float | None]]:
+        """Return a task that is done, and when, or those given up far beyond their time. Warn once of a silence."""
+        silent = 0.0
+        while True:
+            try:
+                call, ended = self._done.get(timeout=QUIET_SECONDS)
+                if call in running:  # somebody waits for it
+                    return [(running.pop(call), ended)]
+                continue
+            except queue.Empty:
+                silent += QUIET_SECONDS
+            if not self._warned:
+                self._warned = True
+                message = (
+                    f"None of {len(running)} chunks has come back in {silent:g} s, and the run waits: a pool without "
+                    "workers (dask, Ray) never answers, nor does a hung ego without a time limit (time_limit=)."
+                )
+                warnings.warn(message, RuntimeWarning, stacklevel=2)
+            limit = math.inf if self._limits.seconds is None else self._limits.seconds + START_SECONDS
+            late = [task for task in running.values() if time.monotonic() - task.begun > limit]
+            for task in late:
+                self._give_up(running.pop(task.call))
+            if late:
+                return [(task, None) for task in late]
 
-    def __init__(self, slots: list[_SubmitPool]) -> None:
-        self._slots, self.limits = slots, slots[0].limits
-        self.workers = self.window = len(slots)
-        self._idle: queue.SimpleQueue[_SubmitPool] = queue.SimpleQueue()
-        for slot in slots:
-            self._idle.put(slot)
+    def _take(self, task: _Task, ended: float | None) -> Result:
+        """Return what a job has come to; what the pool itself raises means that a worker was lost."""
+        if ended is None:
+            raise WorkerLost(f"no answer within {self._limits.seconds:g} s")
+        try:
+            reply: Any = task.job.result()
+        except ConnectionError as error:  # of a cluster that is gone
+            raise ExecutorError(f"The executor does not answer any more ({describe(error)}).") from error
+        except (Exception, CancelledError) as error:
+            raise WorkerLost(describe_loss(error, ended - task.begun, self._limits.seconds)) from error
+        if not isinstance(reply, Reply):
+            words = f"Expected what the submitted function returns as result of a future, got {reprlib.repr(reply)}."
+            raise ExecutorError(words)
+        if reply.call != task.call:
+            raise ExecutorError("A future of the executor has the result of another call.")
+        if reply.result is None:
+            assert reply.error is not None
+            raise reply.error
+        self._proven = True
+        return reply.result
 
-    def submit(self, index: Index, chunk: Chunk) -> Future[Result]:
-        """Submit a chunk to the next slot that is idle."""
-        slot = self._idle.get()
-        future = slot.submit(index, chunk)
-        future.add_done_callback(lambda _: self._idle.put(slot))
-        return future
-
-    def close(self) -> None:
-        """End all processes, whatever these are doing."""
-        for slot in self._slots:
-            slot.close()
+    def _again(
+        self, task: _Task, error: WorkerLost, waiting: deque[_Task], lose: Callable[[Chunk, str], Result]
+    ) -> tuple[int, Result] | None:
+        """Put what is to be computed in the place of a task whose worker was lost among those that wait."""
+        task.attempts += 1
+        if task.attempts < ATTEMPTS:
+            self.n_retries += 1
+            waiting.appendleft(task)
+        elif len(task.chunk) > 1:
+            rows = task.take_apart()
+            self.n_retries += len(rows)
+            waiting.extendleft(reversed(rows))
+        elif self._proven:
+            return task.put(lose(task.chunk, str(error)))
+        elif task.attempts < 2 * ATTEMPTS and waiting:  # after the others, which show whether workers work at all
+            self.n_retries += 1
+            waiting.append(task)
+        else:
+            raise ExecutorError(f"No worker has computed anything: {error}.") from error
+        return None
 
 
 class _LocalProcess:
@@ -514,120 +584,3 @@ def _count_workers(pool: Any) -> int:
         with suppress(Exception):
             return max(1, int(sum(client.nthreads().values())))
     return os.cpu_count() or 1
-
-
-# Dispatch
-
-
-@dataclass(eq=False)
-class _Task:
-    """A chunk on its way, or a row of one."""
-
-    index: Index
-    chunk: Chunk
-    parent: _Task | None = None
-    attempts: int = 0
-    begun: float = 0.0
-    parts: list[Result | None] = field(default_factory=list)
-    """Results of its rows, once it is taken apart."""
-
-    def take_apart(self) -> list[_Task]:
-        """Return its rows as tasks: an attempt that costs a process is dear, and many at once are not."""
-        rows = self.chunk.split(1)
-        self.parts = [None] * len(rows)
-        return [_Task((*self.index, number), row, self) for number, row in enumerate(rows)]
-
-    def put(self, result: Result) -> tuple[int, Result] | None:
-        """Take a result; return it with the number of the chunk where the whole chunk is done."""
-        if self.parent is None:
-            return self.index[0], result
-        self.parent.parts[self.index[-1]] = result
-        parts = [part for part in self.parent.parts if part is not None]
-        return self.parent.put(join_results(parts)) if len(parts) == len(self.parent.parts) else None
-
-
-class Dispatcher:
-    """Computes chunks by a pool of workers; `lose` gives the result of a row that none survives, or raises.
-
-    Attributes:
-        n_retries: Chunks and rows of them that were computed again because a worker was lost.
-    """
-
-    def __init__(self, pool: Pool, lose: Callable[[Chunk, str], Result]) -> None:
-        self._pool, self._lose = pool, lose
-        self._limit: float | None = getattr(pool, "limits", Limits()).seconds
-        self._proven = self._warned = False  # a chunk has been computed; a silence has been told
-        self.n_retries = 0
-
-    def run(self, chunks: Iterable[tuple[int, Chunk]]) -> Iterator[tuple[int, Result]]:
-        """Yield the results of chunks with their numbers, in any order; what the work raises is raised here."""
-        waiting = deque(_Task((number,), chunk) for number, chunk in chunks)
-        running: dict[Future[Result], _Task] = {}
-        try:
-            while waiting or running:
-                self._submit(waiting, running)
-                for future in self._wait(running):
-                    task = running.pop(future)
-                    try:
-                        done = task.put(self._take(future))
-                    except WorkerLost as error:
-                        done = self._again(task, error, waiting)
-                    if done is not None:
-                        yield done
-        finally:
-            for future in running:
-                future.cancel()
-
-    def _take(self, future: Future[Result]) -> Result:
-        if future.cancelled():
-            raise WorkerLost(f"no answer within {self._limit:g} s")
-        result = future.result()
-        self._proven = True
-        return result
-
-    def _submit(self, waiting: deque[_Task], running: dict[Future[Result], _Task]) -> None:
-        """Submit what the window has room for; a suspect goes alone where its neighbours would share its fate."""
-        while waiting and len(running) < self._pool.window:
-            suspect = not self._pool.blames and waiting[0].attempts > 0
-            if running and (suspect or (not self._pool.blames and any(task.attempts for task in running.values()))):
-                return
-            task = waiting.popleft()
-            task.begun = time.monotonic()
-            running[self._pool.submit(task.index, task.chunk)] = task
-
-    def _wait(self, running: dict[Future[Result], _Task]) -> set[Future[Result]]:
-        """Return futures that are done; give up those far beyond their time, and warn once if none is for long."""
-        silent = 0.0
-        while not (done := wait(running, QUIET_SECONDS, FIRST_COMPLETED).done):
-            silent += QUIET_SECONDS
-            if not self._warned:
-                self._warned = True
-                message = (
-                    f"None of {len(running)} chunks has come back in {silent:g} s, and the run waits: a pool without "
-                    "workers (dask, Ray) never answers, nor does a hung ego without a time limit (time_limit=)."
-                )
-                warnings.warn(message, RuntimeWarning, stacklevel=2)
-            latest = time.monotonic() - (math.inf if self._limit is None else self._limit + START_SECONDS)
-            late = {future for future, task in running.items() if task.begun < latest and future.cancel()}
-            if late:
-                return late
-        return done
-
-    def _again(self, task: _Task, error: WorkerLost, waiting: deque[_Task]) -> tuple[int, Result] | None:
-        """Put what is to be computed in the place of a task whose worker was lost among those that wait."""
-        task.attempts += 1
-        if task.attempts < ATTEMPTS:
-            self.n_retries += 1
-            waiting.appendleft(task)
-        elif len(task.chunk) > 1:
-            rows = task.take_apart()
-            self.n_retries += len(rows)
-            waiting.extendleft(reversed(rows))
-        elif self._proven:
-            return task.put(self._lose(task.chunk, str(error)))
-        elif task.attempts < 2 * ATTEMPTS and waiting:  # after the others, which show whether workers work at all
-            self.n_retries += 1
-            waiting.append(task)
-        else:
-            raise ExecutorError(f"No worker has computed anything: {error}.") from error
-        return None
