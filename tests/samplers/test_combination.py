@@ -7,7 +7,7 @@ from scipy import stats
 
 import samplers
 from samplers.limit_states import half_space
-from samplers.method import Outcome, combine, combined_cov
+from samplers.method import Outcome, combine, combined_cov, no_outcome_share
 from samplers.sample import Sample, Status
 from samplers.statistics import binomial_cov, clopper_pearson
 
@@ -35,12 +35,6 @@ def test_without_any_hit_the_interval_is_one_sided():
     result = combine(none, 0.95)
     assert (result.p, result.interval, result.status) == (0.0, (0.0, 0.02), Status.NO_HITS)
     assert math.isinf(result.cov)
-
-
-def test_some_runs_without_a_hit():
-    result = combine([outcome(0.0, math.inf, Status.NO_HITS), outcome(2e-4), outcome(1e-4)], 0.95)
-    assert result.p == pytest.approx(1e-4)
-    assert result.interval[0] < 1e-4 < result.interval[1]
 
 
 def test_runs_that_nearly_tie_are_no_closer_than_their_own_errors_allow():
@@ -95,23 +89,10 @@ def test_pooled_counts_weigh_draws_not_runs():
     assert combine([few, replace(many, counts=None)], 0.95).p == pytest.approx((1 / 100 + 3 / 900) / 2)
 
 
-def test_pooled_runs_without_a_hit():
-    none = outcome(0.0, math.inf, Status.NO_HITS, counts=(0, 500))
-    result = combine([none, none], 0.95)
-    assert (result.p, result.interval, result.status) == (0.0, clopper_pearson(0, 1000, 0.95), Status.NO_HITS)
-
-
 @pytest.mark.slow
 def test_coverage_of_replicated_runs(study):
     runs = 60
     found = study(half_space(2, 3.0), samplers.AdaptiveSubsetSimulation(n=500), runs, replicates=6)
-    assert found.covered >= stats.binom.ppf(1e-3, runs, 0.93)
-
-
-@pytest.mark.slow
-def test_coverage_of_replicated_runs_with_many_seeds(study):
-    runs = 400
-    found = study(half_space(), samplers.AdaptiveSubsetSimulation(), runs, replicates=10)
     assert found.covered >= stats.binom.ppf(1e-3, runs, 0.93)
 
 
@@ -163,3 +144,25 @@ def test_runs_that_disagree_are_told_of():
     assert any("disagree" in text for text in combine(runs, 0.95).warnings)
     alike = [outcome(p, cov=0.02) for p in (1.00e-4, 1.03e-4, 0.97e-4, 1.02e-4, 0.99e-4)]
     assert not combine(alike, 0.95).warnings
+
+
+@pytest.mark.parametrize(("hits", "n"), [(1, 50), (20, 400), (400, 400)])
+def test_outcome_of_counts_is_the_binomial_share(hits, n):
+    outcome = samplers.Outcome.of_counts(hits, n, 0.9, trace=())
+    assert outcome.p == hits / n
+    assert outcome.interval == clopper_pearson(hits, n, 0.9)
+    assert outcome.cov == binomial_cov(hits / n, n)
+    assert (outcome.counts, outcome.base_draws, outcome.status) == ((hits, n), n, "converged")
+
+
+def test_no_hit_has_a_one_sided_interval_and_a_warning():
+    outcome = samplers.Outcome.of_counts(0, 1000, 0.95, trace=())
+    assert (outcome.p, outcome.cov, outcome.status) == (0.0, math.inf, "no_hits")
+    assert outcome.interval[0] == 0 < outcome.interval[1] < 0.01
+    assert outcome.warnings == ("None of 1,000 simulations failed: p = 0 with a one-sided interval.",)
+
+
+def test_all_or_none_without_an_outcome_is_exact_whatever_the_weights():
+    log_weights = np.log(np.array([0.1, 0.2, 0.7]))
+    assert no_outcome_share(np.full(3, -np.inf), log_weights) == 1.0
+    assert no_outcome_share(np.zeros(3), log_weights) == 0.0

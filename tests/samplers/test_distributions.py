@@ -1,7 +1,6 @@
 """Bases of SciPy and OpenTURNS: maps, tails, p with exact values."""
 
 import pickle
-import sys
 
 import numpy as np
 import pytest
@@ -33,13 +32,6 @@ def test_lists_are_independent_in_their_order():
     x = base.sample(4, np.random.default_rng(0))
     assert ((x[:, 0] > 5.0) & (x[:, 0] < 6.0)).all()
     np.testing.assert_allclose(base.log_prob(x), stats.multivariate_normal([1.0, 2.0]).logpdf(x[:, 1:]))
-
-
-def test_openturns_is_not_imported():
-    assert "openturns" not in {name for name in sys.modules if "samplers" in name}
-    for name, module in sys.modules.items():
-        if name.startswith("samplers.") and module is not None:
-            assert not hasattr(module, "openturns"), name
 
 
 ONE = [stats.norm(3, 2), stats.lognorm(0.5), stats.gumbel_r(1, 2), stats.beta(2, 5), stats.t(3), stats.expon(scale=4)]

@@ -1,6 +1,4 @@
 import json
-import subprocess
-import sys
 import time
 from types import SimpleNamespace
 
@@ -19,47 +17,25 @@ PROBLEM = half_space().problem
 @pytest.mark.parametrize(
     ("options", "expected"),
     [
-        ({"gamma": float("nan")}, "gamma to be a finite number, got nan"),
-        ({"gamma": float("inf")}, "gamma to be a finite number"),
-        ({"gamma": "0"}, "gamma to be a finite number"),
-        ({"gamma": None}, "gamma to be a finite number, got None"),
-        ({"gamma": True}, "gamma to be a finite number, got True"),
+        ({"gamma": float("inf")}, "gamma to be a finite number, got inf"),
+        ({"gamma": "0"}, "gamma to be a finite number, got '0'"),
         ({"gamma": 10**400}, "gamma to be a finite number, got 10"),
-        ({"confidence": "0.9"}, "confidence to be a number between 0 and 1, got '0.9'"),
-        ({"confidence": True}, "confidence"),
-        ({"max_sim": "5"}, "max_sim to be a whole number of at least 1, got '5'"),
-        ({"max_sim": True}, "max_sim"),
-        ({"target_cov": "0.1"}, "target_cov to be a number above 0, got '0.1'"),
-        ({"target_cov": True}, "target_cov"),
-        ({"target_cov": 10**400}, "target_cov"),
-        ({"replicates": None}, "replicates to be a whole number of at least 1, got None"),
-        ({"replicates": 2.0}, "replicates"),
-        ({"replicates": True}, "replicates"),
-        ({"seed": "1"}, "seed to be a whole number of at least 0, got '1'"),
-        ({"seed": False}, "seed"),
-        ({"on_error": None}, "on_error None"),
-        ({"on_error": np.array(["raise"])}, "on_error"),
+        ({"confidence": True}, "confidence to be a number between 0 and 1, got True"),
         ({"confidence": 1.2}, "confidence to be a number between 0 and 1, got 1.2"),
-        ({"confidence": 0}, "confidence"),
-        ({"max_sim": -5}, "max_sim to be a whole number of at least 1, got -5"),
-        ({"max_sim": 0}, "max_sim"),
-        ({"max_sim": 1e4}, "max_sim"),
+        ({"max_sim": 1e4}, "max_sim to be a whole number of at least 1, got 10000.0"),
+        ({"max_sim": 10**99}, "max_sim to be at most 1,000,000,000,000, got 1.00e"),
         ({"max_sim": 3, "replicates": 4}, "max_sim to be a whole number of at least 4, got 3"),
         ({"target_cov": 0.0}, "target_cov to be a number above 0, got 0.0"),
-        ({"target_cov": -0.1}, "target_cov"),
-        ({"target_cov": float("nan")}, "target_cov"),
-        ({"replicates": 0}, "replicates to be a whole number of at least 1, got 0"),
+        ({"target_cov": float("nan")}, "target_cov to be a number above 0, got nan"),
+        ({"replicates": None}, "replicates to be a whole number of at least 1, got None"),
         ({"seed": -1}, "seed to be a whole number of at least 0, got -1"),
-        ({"seed": 1.5}, "seed"),
-        ({"on_error": "ignore"}, "on_error 'ignore'.*Valid: raise, failure, bound"),
+        ({"on_error": np.array(["raise"])}, "on_error"),
+        ({"on_error": "fail"}, "Unknown on_error 'fail'. Did you mean 'failure'.*Valid: raise, failure, bound"),
         ({"method": "adds"}, "method 'adds'. Did you mean 'adss'.*Valid: auto, two-stage, surrogate, mc, .*adss"),
         ({"method": samplers.MonteCarlo}, "the class MonteCarlo; add brackets"),
         ({"method": 3}, "a method such as MonteCarlo"),
         ({"progress": 1}, "progress to be True, False or a function"),
-        ({"time_limit": -1}, "time_limit to be a number above 0, got -1"),
-        ({"time_limit": 0}, "time_limit"),
-        ({"time_limit": float("nan")}, "time_limit"),
-        ({"time_limit": "3 s"}, "time_limit"),
+        ({"time_limit": 0}, "time_limit to be a number above 0, got 0"),
         ({"stop": True}, "stop to be a function of Progress, got True"),
     ],
 )
@@ -70,24 +46,19 @@ def test_bad_arguments_are_refused_before_any_simulation(options, expected, reco
     assert f.rows == 0
 
 
-def test_a_problem_must_look_like_one():
-    with pytest.raises(ValueError, match="FunctionProblem"):
-        samplers.estimate(lambda x: x)
-
-    class NoBase:
-        dim, base = 2, None
-
-        def evaluate(self, x):
-            return x[:, 0]
-
-    with pytest.raises(ValueError, match=r"problem.base to have sample"):
-        samplers.estimate(NoBase())
-
-    class NoDim(NoBase):
-        dim, base = 0, samplers.StandardNormal(1)
-
-    with pytest.raises(ValueError, match="dim to be a whole number"):
-        samplers.estimate(NoDim())
+@pytest.mark.parametrize(
+    ("problem", "expected"),
+    [
+        (lambda x: x, "FunctionProblem"),
+        (SimpleNamespace(dim=2, base=samplers.StandardNormal(2)), "dim, base and evaluate, got .* without evaluate"),
+        (SimpleNamespace(dim=0, base=samplers.StandardNormal(2), evaluate=len), "dim to be a whole number of at least"),
+        (SimpleNamespace(dim=2, base=np.random, evaluate=len), "problem.base to have sample, log_prob, .* got module"),
+    ],
+    ids=["a function", "no f", "no dimension", "no distribution"],
+)
+def test_a_problem_must_look_like_one(problem, expected):
+    with pytest.raises(ValueError, match=expected):
+        samplers.estimate(problem)
 
 
 def test_unknown_setting_is_named():
@@ -112,7 +83,7 @@ def test_unknown_setting_is_named():
         (samplers.MonteCarlo, "n", "n to be a whole number of at least 1"),
     ],
 )
-@pytest.mark.parametrize("value", [None, "a", True, [0.3], np.array([0.3, 0.4])], ids=repr)
+@pytest.mark.parametrize("value", [None, "a", True, np.array([0.3, 0.4])], ids=repr)
 def test_settings_of_the_wrong_type_are_refused_by_name(cls, name, expected, value):
     with pytest.raises(ValueError, match=f"{cls.__name__}: expected {expected}"):
         cls(**{name: value})
@@ -135,23 +106,6 @@ def test_numbers_of_numpy_are_numbers():
     assert (settings["n"], settings["batch"]) == (500, 100)
 
 
-def test_default_method_and_name_as_string():
-    assert samplers.estimate(PROBLEM, seed=1) == samplers.estimate(PROBLEM, "two-stage", seed=1)
-
-
-def test_f_of_the_wrong_length():
-    with pytest.raises(ValueError, match=r"Expected f to return shape \(1000,\)"):
-        samplers.estimate(samplers.FunctionProblem(lambda x: np.zeros(3), 2), "adss", seed=1)
-
-
-@pytest.mark.parametrize("f", [lambda x: 1.0, lambda x: x, lambda x: x[1:, 0], lambda x: None, lambda x: 1j * x[:, 0]])
-@pytest.mark.parametrize("on_error", ["raise", "failure", "bound"])
-def test_a_problem_that_does_not_check_its_own_f(f, on_error):
-    problem = SimpleNamespace(dim=2, base=samplers.StandardNormal(2), evaluate=f)
-    with pytest.raises(samplers.EvaluationError, match=r"Expected f to return shape \(50,\), one"):
-        samplers.estimate(problem, "mc", seed=1, max_sim=50, on_error=on_error)
-
-
 def test_a_drawn_seed_repeats_the_run():
     first = samplers.estimate(PROBLEM, "mc", max_sim=1000)
     assert samplers.estimate(PROBLEM, "mc", max_sim=1000, seed=first.seed) == first
@@ -169,12 +123,6 @@ def broken_where_u2_is_large(x):
     f = 1.5 - x[:, 0]
     f[x[:, 1] > 1.2815515655446004] = np.nan
     return f
-
-
-def test_nan_raises_with_row_and_x():
-    problem = samplers.FunctionProblem(broken_where_u2_is_large, 2)
-    with pytest.raises(samplers.EvaluationError, match=r"failed twice on x = \[.*: f is NaN"):
-        samplers.estimate(problem, seed=1)
 
 
 @pytest.mark.parametrize("method", QUICK_METHODS)
@@ -195,20 +143,6 @@ def test_nan_as_failure_or_bound(method):
     assert np.isnan(bound.failures.f).any()
 
 
-def test_f_that_raises_is_searched_for_the_row():
-    def f(x):
-        if (x[:, 0] > 3).any():
-            raise ArithmeticError("ego left the map")
-        return 2.0 - x[:, 0]
-
-    problem = samplers.FunctionProblem(f, 1)
-    with pytest.raises(samplers.EvaluationError, match=r"x = \[.*ego left the map"):
-        samplers.estimate(problem, "mc", seed=1, max_sim=20_000)
-    result = samplers.estimate(problem, "mc", seed=1, max_sim=5000, on_error="failure")
-    assert result.n_sim == 5000
-    assert any("simulated again" in text for text in result.remarks)
-
-
 def test_a_method_of_your_own(recorder):
     """Anything with name, stops_at_target and steps; it cannot overspend or hide calls."""
 
@@ -227,15 +161,6 @@ def test_a_method_of_your_own(recorder):
     with pytest.raises(RuntimeError, match=r"must keep to goal\.max_sim"):
         samplers.estimate(problem, Greedy(), seed=1, max_sim=99)
     assert f.rows == 100
-
-
-def test_importing_it_imports_no_torch_and_no_driving():
-    code = (
-        "import sys, samplers;"
-        "print([m for m in ('torch', 'rare_envs', 'agents', 'rich', 'gymnasium') if m in sys.modules])"
-    )
-    out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert out.stdout.strip() == "[]"
 
 
 def slow(x):

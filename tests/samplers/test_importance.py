@@ -61,15 +61,6 @@ def test_right_on_average_with_the_variance_that_it_says(rng):
     assert saved.mean() > 4 * saved.std() / math.sqrt(runs)
 
 
-def test_known_masses_come_out_but_for_the_ridge(rng):
-    u, strata, h = draw([100, 450, 450], rng)
-    calibrated = calibrate(h, strata, 30)
-    off = np.abs(h.mean(axis=0) - 1)
-    left = np.abs((calibrated.factors[:, None] * h).mean(axis=0) - 1)
-    varied = np.array([variance(column, strata) for column in h.T]) * len(u) > 0.3
-    assert varied.any() and (left < off)[varied].all()
-
-
 def weighing(*weights, n=1000):
     """n draws of which those with these weights fail."""
     return Draws(n, np.zeros(len(weights)), np.log(weights))

@@ -34,16 +34,6 @@ def test_exact_probability_against_monte_carlo(rng, reference):
     assert share == pytest.approx(reference.p, abs=4 * np.sqrt(reference.p / n))
 
 
-def test_two_modes_is_the_published_demonstration():
-    assert two_modes().p == pytest.approx(1.035e-3, rel=1e-3)
-
-
-@pytest.mark.parametrize("tied", [0.6, 0.9])
-def test_plateau_ties_as_stated(rng, tied):
-    f = plateau(tied=tied).problem.evaluate(rng.standard_normal((50_000, 3)))
-    assert np.mean(f == f.max()) == pytest.approx(tied, abs=0.01)
-
-
 def test_unannounced_region_is_the_likelier_one_and_f_rises_towards_it():
     reference = unannounced_region()
     assert reference.p == pytest.approx(9.99e-4, rel=1e-3)

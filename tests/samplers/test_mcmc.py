@@ -1,8 +1,5 @@
 """Markov chains: invariance, descent through levels, interruption."""
 
-import math
-from dataclasses import dataclass
-
 import numpy as np
 import pytest
 from scipy import stats
@@ -13,7 +10,6 @@ from samplers.mcmc import (
     NextLevel,
     RootedPoints,
     ScaledKernel,
-    chain_lengths,
     descend,
     grow_chains,
     independent_chains,
@@ -107,25 +103,6 @@ def test_interrupted_chains_keep_the_steps_made(rng):
     assert (growth.chains.lengths == 2).all()
 
 
-@dataclass(frozen=True)
-class Quantiles:
-    """All points below the quantile p0 are seeds; levels have as many points as the first."""
-
-    p0: float
-    depth: int
-    budget: float = math.inf
-
-    def plan_next(self, chains, depth, n_sim, rng):
-        f = chains.f[chains.used]
-        if depth == self.depth:
-            return Status.CONVERGED
-        threshold = float(np.quantile(f, self.p0, method="lower"))
-        seeds = chains.where(chains.f <= threshold)
-        if n_sim + len(f) - len(seeds.f) > self.budget:
-            return Status.BUDGET
-        return NextLevel(threshold, seeds, chain_lengths(len(f), len(seeds.f), rng))
-
-
 class Scripted:
     """Goes on with the lowest five points, in chains of three, and keeps what it was told."""
 
@@ -144,31 +121,6 @@ class Scripted:
 def start_from(n, rng):
     u = rng.standard_normal((n, 2))
     return Growth.start(independent_chains(u, PROBLEM.evaluate(u)), PCN)
-
-
-def reported(drive, planner, rng, n=20):
-    """Return what was reported, the status, and the outcomes of all that was simulated."""
-    levels = []
-    steps = descend(PROBLEM, start_from(n, rng), planner, lambda *level: levels.append(level), rng)
-    status, f = drive(steps, PROBLEM)
-    return levels, status, f
-
-
-def test_thresholds_fall_and_points_stay_below_them(drive, rng):
-    levels, status, _ = reported(drive, Quantiles(0.1, 4), rng, n=500)
-    assert status is Status.CONVERGED
-    planned = [level for _, level in levels[:-1]]
-    thresholds = [level.threshold for level in planned]
-    assert thresholds == sorted(thresholds, reverse=True)
-    assert len(set(thresholds)) == len(thresholds) == 4
-    for (growth, _), level, (grown, _) in zip(levels, planned, levels[1:], strict=False):
-        assert (level.seeds.f <= level.threshold).all()
-        assert set(level.seeds.f) <= set(growth.chains.f[growth.chains.used])
-        np.testing.assert_array_equal(grown.chains.u[:, 0], level.seeds.u)
-        np.testing.assert_array_equal(grown.chains.lengths, level.lengths)
-        used = grown.chains.used
-        assert (grown.chains.f[used] <= level.threshold).all()
-        np.testing.assert_array_equal(grown.chains.f[used], PROBLEM.evaluate(grown.chains.u[used]))
 
 
 @pytest.mark.parametrize("batch", range(4))
@@ -190,21 +142,3 @@ def test_an_interrupted_level_comes_last(batch, drive, rng):
     assert last.chains.u.shape == (5, 1 + batch % 2, 2)
     assert len(planner.told) == 1 + batch // 2  # it is not asked about an unfinished level
     assert len(levels) == 2 + batch // 2
-
-
-def product_of_shares(drive, beta, rng):
-    """Return the product of the shares of three levels of 1000 points with p0 = 0.1, the last one at beta."""
-    levels, _, _ = reported(drive, Quantiles(0.1, 2), rng, n=1000)
-    p = 1.0
-    for growth, planned in levels:
-        threshold = planned.threshold if isinstance(planned, NextLevel) else -beta
-        p *= float((growth.chains.f[growth.chains.used] <= threshold).mean())
-    return p
-
-
-def test_the_product_of_shares_is_the_probability_of_a_half_space(drive, rng):
-    """The mean of 30 runs agrees with Phi(-3) = 1.35e-3 within four of its own standard errors."""
-    found = np.array([product_of_shares(drive, 3.0, rng) for _ in range(30)])
-    error = found.std(ddof=1) / math.sqrt(len(found))
-    assert error < 0.08 * stats.norm.sf(3.0)
-    assert abs(found.mean() - stats.norm.sf(3.0)) < 4 * error

@@ -6,17 +6,6 @@ import pytest
 import samplers
 
 PROBLEM = samplers.FunctionProblem(lambda x: 3.0 - x[:, 0], dim=2)
-WEIGHTED = ("two-stage", "surrogate", "mc", "is", "ce", "ice")
-
-
-@pytest.mark.parametrize("method", WEIGHTED)
-def test_weights_of_failing_simulations_add_up_to_p(method):
-    max_sim = 200 if method == "surrogate" else 1000
-    result = samplers.estimate(PROBLEM, method, seed=0, max_sim=max_sim, replicates=2, keep_points=True)
-    table = result.to_pandas()
-    assert len(table) == result.n_sim
-    assert table.weight[table.failed].sum() == pytest.approx(result.p, rel=1e-9)
-    assert set(table.run) == {0, 1}
 
 
 @pytest.mark.parametrize("method", ["adss", "ce", "mc", "two-stage"])

@@ -9,7 +9,7 @@ import pytest
 
 import samplers
 from samplers.limit_states import half_space
-from samplers.sample import Failures, Status, describe_outcome
+from samplers.sample import Failures
 from tests.samplers.fitted_bases import fitted, resampled, run
 
 
@@ -100,14 +100,6 @@ def test_the_most_likely_failures_are_kept():
     assert Failures.empty(3).x.shape == (0, 3)
 
 
-def test_failures_are_equal_value_by_value():
-    some = failures([-1.0, -2.0], [-1.0, np.nan])
-    assert some == failures([-1.0, -2.0], [-1.0, np.nan])
-    for change in ({"x": some.x + 1}, {"f": np.array([-1.0, -1.0])}, {"log_p0": some.log_p0 - 1}, {"total": 3}):
-        assert some != replace(some, **change)
-    assert some != "failures"
-
-
 @pytest.mark.parametrize(
     ("method", "expected"),
     [
@@ -182,9 +174,3 @@ def test_the_uncertainty_of_the_base_is_kept_and_computed_anew_with_the_base(tmp
     with_base = samplers.Estimate.load(tmp_path / "result", base=base)
     assert "base_uncertainty" not in vars(with_base)
     assert with_base.base_uncertainty == found.base_uncertainty
-
-
-def test_converged_does_not_stand_beside_warnings():
-    assert describe_outcome(Status.CONVERGED, ()) == "converged"
-    assert describe_outcome(Status.CONVERGED, ("a", "b")) == "came to its end with 2 warnings"
-    assert describe_outcome(Status.STALLED, ("a",)) == describe_outcome("stalled", ()) == "stalled"
