@@ -13,7 +13,7 @@ from typing import Annotated, Any, Literal, get_type_hints
 import typer
 
 from rare_envs.study.arguments import ExecutorOptions, Question, option_name
-from rare_envs.study.cli.shell import Answer, answering, is_typed
+from rare_envs.study.cli.shell import Answer, answering
 
 SCENARIO = ("base", "drivers", "observation", "action", "horizon")
 """Fields of `Question` that are options of each command that drives an ego."""
@@ -92,7 +92,8 @@ def command(*names: str, stopped: str = "") -> Callable[[Callable[..., Answer | 
                 known = {name: values.pop(name) for name in groups[group][1]}
                 values[group] = {name: NOISE[value] if name == "noise" else value for name, value in known.items()}
             if "typed" in taken:
-                values["typed"] = {name for name in context.params if is_typed(context, name)}
+                sources = {name: context.get_parameter_source(name) for name in context.params}
+                values["typed"] = {name for name, source in sources.items() if source and source.name == "COMMANDLINE"}
             answering(lambda: function(**values), as_json, stopped, values.get("details", False))
 
         parameters = [_parameter("context", typer.Context)]

@@ -139,8 +139,7 @@ def find_options(command: Any) -> dict[str, str]:
     found: dict[str, str] = {}
     for each in (command, *getattr(command, "commands", {}).values()):  # of a group
         for parameter in getattr(each, "params", ()):
-            option = next((word for word in getattr(parameter, "opts", ()) if word.startswith("--")), None)
-            if option is not None:
+            for option in [word for word in getattr(parameter, "opts", ()) if word.startswith("--")][:1]:
                 found[parameter.name] = found[option[2:].replace("-", "_")] = option
     return found
 
@@ -158,12 +157,6 @@ def name_options(message: str, options: Mapping[str, str]) -> str:
         after = r"(?![-\w'\"/(=]|\.\w)"
         message = re.sub(f"{before}{name}{after}", option if "_" in name else f"Expected {option}", message)
     return message
-
-
-def is_typed(context: typer.Context, name: str) -> bool:
-    """Return whether an option of a command was typed, not left at its default."""
-    source = context.get_parameter_source(name)
-    return source is not None and source.name == "COMMANDLINE"
 
 
 @contextlib.contextmanager
@@ -294,28 +287,17 @@ def print_whole(show: Callable[[], None]) -> None:
 @contextlib.contextmanager
 def keep_stdout_for_the_answer() -> Iterator[None]:
     """Send what is printed to standard error, what libraries in C and child processes print included."""
-    with contextlib.redirect_stdout(sys.stderr), _redirect_descriptor():
-        yield
-
-
-@contextlib.contextmanager
-def _redirect_descriptor() -> Iterator[None]:
-    """Let file descriptor 1 be file descriptor 2, where both are open."""
-    try:
-        answer = os.dup(1)
-        os.dup2(2, 1)
-    except OSError:
-        yield
-        return
-    try:
-        yield
-    finally:
-        _flush_c()
-        os.dup2(answer, 1)
-        os.close(answer)
-
-
-def _flush_c() -> None:
-    """Write what C's standard library still has to write."""
-    with contextlib.suppress(OSError, AttributeError, TypeError):  # there is none by this name on Windows
-        ctypes.CDLL(None).fflush(None)
+    with contextlib.redirect_stdout(sys.stderr):
+        try:
+            answer = os.dup(1)
+            os.dup2(2, 1)
+        except OSError:  # one of both is closed
+            yield
+            return
+        try:
+            yield
+        finally:
+            with contextlib.suppress(OSError, AttributeError, TypeError):  # there is none by this name on Windows
+                ctypes.CDLL(None).fflush(None)  # what C's standard library still has to write
+            os.dup2(answer, 1)
+            os.close(answer)

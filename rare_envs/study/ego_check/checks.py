@@ -25,7 +25,7 @@ from rare_envs.problem import DrivingProblem
 from rare_envs.sensors.kinds import batch_size, kinds_of, map_kinds
 from rare_envs.simulation.observation import observe
 from rare_envs.simulation.rollout import drive
-from rare_envs.study.ego_check.findings import Finding, report_failure, report_pass, report_warning
+from rare_envs.study.ego_check import FAIL, HINT, Finding, judge, report_failure, report_pass, report_warning
 from samplers.evaluate import Evaluator
 
 BATCH_ROWS = 32
@@ -94,39 +94,32 @@ MANY_OUTLYING = 0.2
 
 def check_declared_spaces(probe: Probe) -> Iterator[Finding]:
     """Compare declared spaces with the environment's; that they fit at all was found when the problem was made."""
-    world = probe.problem.world
-    ours = probe.space, world.action_space
+    ours, ours_to_act = probe.space, probe.problem.world.action_space
     # the ego is the user's: it need not declare anything
-    observed, acted = (getattr(probe.ego, f"{name}_space", None) for name in ("observation", "action"))
-    if observed is None or acted is None:
-        missing = " and ".join(
-            name for name, space in (("observation_space", observed), ("action_space", acted)) if space is None
-        )
-        yield report_warning(
-            "spaces", f"it has no {missing}", "taken at its word; declare them, so that a mix-up is noticed", False
-        )
+    observed, acted = declared = [getattr(probe.ego, f"{name}_space", None) for name in ("observation", "action")]
+    missing = [name for name, space in zip(("observation", "action"), declared, strict=True) if space is None]
+    if missing:
+        found = f"it has no {' and '.join(f'{name}_space' for name in missing)}"
+        yield report_warning("spaces", found, "taken at its word; declare them, so that a mix-up is noticed", False)
     if observed is not None:
-        frames, _ = find_frame_stacking(ours[0], observed) or (1, False)
-        stacked = f", {frames} frames of {ours[0].shape or ours[0]}" if frames > 1 else ""
+        frames, _ = find_frame_stacking(ours, observed) or (1, False)
+        stacked = f", {frames} frames of {ours.shape or ours}" if frames > 1 else ""
         words = f"{observed.shape} {observed.dtype}" if observed.shape is not None else str(observed)
         yield report_pass("observations", f"{words}{stacked}")
-        if observed.dtype is not None and np.issubdtype(observed.dtype, np.floating) != np.issubdtype(
-            ours[0].dtype, np.floating
-        ):
-            yield report_warning(
-                "observations", f"it was made for {observed.dtype}, here they are {ours[0].dtype}", "train it on these"
-            )
-    if isinstance(acted, spaces.Box) and isinstance(ours[1], spaces.Box):
-        same = np.array_equal(acted.low, ours[1].low) and np.array_equal(acted.high, ours[1].high)
+        kinds = [space.dtype is not None and np.issubdtype(space.dtype, np.floating) for space in (observed, ours)]
+        if observed.dtype is not None and kinds[0] != kinds[1]:
+            found = f"it was made for {observed.dtype}, here they are {ours.dtype}"
+            yield report_warning("observations", found, "train it on these")
+    if isinstance(acted, spaces.Box) and isinstance(ours_to_act, spaces.Box):
+        same = np.array_equal(acted.low, ours_to_act.low) and np.array_equal(acted.high, ours_to_act.high)
         unbounded = not (np.isfinite(acted.low).any() or np.isfinite(acted.high).any())
-        if same or unbounded:
-            yield report_pass("action space", "in [-1, 1]" if same else "unbounded; clipped to [-1, 1]")
-        else:
-            yield report_warning(
-                "action space",
-                f"from {acted.low.tolist()} to {acted.high.tolist()}, the environment's from -1 to 1",
-                "they are rescaled, as behind RescaleAction; if its units differ, put a function of yours around it",
-            )
+        yield judge(
+            "action space",
+            not (same or unbounded)
+            and f"from {acted.low.tolist()} to {acted.high.tolist()}, the environment's from -1 to 1",
+            "in [-1, 1]" if same else "unbounded; clipped to [-1, 1]",
+            "they are rescaled, as behind RescaleAction; if its units differ, put a function of yours around it",
+        )
     elif acted is not None:
         yield report_pass("action space", str(acted))
 
@@ -152,7 +145,7 @@ def check_normalisation(probe: Probe) -> Iterator[Finding]:
         beyond = float((np.abs(statistics.normalize_obs(seen)) > OUTLYING).any(axis=1).mean())
         result = f"{path}: {beyond:.0%} of ordinary scenarios are over {OUTLYING:g} standard deviations off"
         advice = "are these the statistics of this policy, and of this environment?"
-        yield report_warning(name, result, advice) if beyond > MANY_OUTLYING else report_pass(name, result)
+        yield judge(name, beyond > MANY_OUTLYING and result, result, advice)
 
 
 def check_actions(probe: Probe) -> Iterator[Finding]:
@@ -160,13 +153,13 @@ def check_actions(probe: Probe) -> Iterator[Finding]:
     action, _ = probe.query(probe.seen)
     declared = getattr(probe.ego, "action_space", None)  # likewise
     whole = np.issubdtype(action.dtype, np.integer)
-    what = f"{action.dtype} of shape {action.shape}"
-    if action.shape != ((BATCH_ROWS,) if whole else (BATCH_ROWS, 2)) or action.dtype == object:
+    what, shape = f"{action.dtype} of shape {action.shape}", (BATCH_ROWS,) if whole else (BATCH_ROWS, 2)
+    if action.shape != shape or action.dtype == object:
         yield report_failure("actions", what, f"return shape {(BATCH_ROWS, 2)}, or {BATCH_ROWS} whole numbers")
         return
-    finite = np.isfinite(action).reshape(BATCH_ROWS, -1).all(axis=1)
-    if not finite.all():
-        bad = f"NaN or infinite for {int((~finite).sum())} of {BATCH_ROWS} observations"
+    n_bad = int((~np.isfinite(action).reshape(BATCH_ROWS, -1).all(axis=1)).sum())
+    if n_bad:
+        bad = f"NaN or infinite for {n_bad} of {BATCH_ROWS} observations"
         yield report_failure("actions", bad, "check weights and normalisation")
         return
     if declared is not None and isinstance(declared, spaces.Discrete) != whole:
@@ -176,11 +169,13 @@ def check_actions(probe: Probe) -> Iterator[Finding]:
     if beyond:
         far = f"{beyond:.0%} beyond [-1, 1], up to {np.abs(action).max():.3g}"
         yield report_warning("actions", far, "they are clipped", False)
-    if len(np.unique(action.round(6), axis=0)) == 1:
-        same = f"the same for all {BATCH_ROWS} observations: {action[0].tolist()}"
-        yield report_warning("actions", same, "does it look at all?")
-    else:
-        yield report_pass("actions", f"{action.dtype} of shape (B{', 2' if not whole else ''}), finite")
+    same = len(np.unique(action.round(6), axis=0)) == 1
+    yield judge(
+        "actions",
+        same and f"the same for all {BATCH_ROWS} observations: {action[0].tolist()}",
+        f"{action.dtype} of shape (B{', 2' if not whole else ''}), finite",
+        "does it look at all?",
+    )
 
 
 def check_extreme_observations(probe: Probe) -> Iterator[Finding]:
@@ -199,18 +194,14 @@ def check_extreme_observations(probe: Probe) -> Iterator[Finding]:
             bad += [] if np.isfinite(action).all() else [f"{name}: NaN or infinite"]
         except (Exception, SystemExit) as error:
             bad.append(f"{name}: {reason_of(error)}")
-    if bad:
-        yield report_failure("range", "; ".join(bad), "such observations come; rows are zeros after a crash")
-    else:
-        yield report_pass("range", "finite at zeros and at both ends of what is observed")
+    advice = "such observations come; rows are zeros after a crash"
+    yield judge("range", "; ".join(bad), "finite at zeros and at both ends of what is observed", advice, FAIL)
     if not isinstance(probe.seen, dict) and probe.seen.dtype == np.uint8:
         return
     try:
         action, _ = probe.query(map_kinds(lambda part: part if part.dtype == np.uint8 else part * np.nan, probe.seen))
-        finite = bool(np.isfinite(action).all())
-        yield report_pass(
-            "NaN", "answered by numbers; the environment never gives NaN" if finite else "answered by NaN"
-        )
+        numbers = "answered by numbers; the environment never gives NaN"
+        yield report_pass("NaN", numbers if np.isfinite(action).all() else "answered by NaN")
     except (Exception, SystemExit) as error:
         yield report_pass("NaN", f"refused: {reason_of(error)}")
 
@@ -241,21 +232,19 @@ def check_determinism(probe: Probe) -> Iterator[Finding]:
     other = probe.transform_seen(lambda part: np.roll(part, 1, axis=0) * 0.5)
     first, second = probe.query(probe.seen)[0], probe.query(probe.seen)[0]
     probe.query(other)
-    third = probe.query(probe.seen)[0]
-    if largest_difference(first, second) == 0.0 and largest_difference(first, third) == 0.0:
-        yield report_pass("determinism", "the same answer to the same observations")
-    elif largest_difference(first, second) == 0.0:
-        yield report_failure(
-            "determinism",
-            "its answers depend on earlier calls",
-            "carry its memory in the state that predict returns: batches of many scenarios take turns",
-        )
-    else:
-        yield report_warning(
-            "determinism",
-            f"its answers vary from call to call, by up to {largest_difference(first, second):.2g}",
-            "random, or a memory not in its state; p is then over this too, and failures may not replay",
-        )
+    third, off = probe.query(probe.seen)[0], largest_difference(first, second)
+    if off:
+        found = f"its answers vary from call to call, by up to {off:.2g}"
+        advice = "random, or a memory not in its state; p is then over this too, and failures may not replay"
+        yield report_warning("determinism", found, advice)
+        return
+    yield judge(
+        "determinism",
+        largest_difference(first, third) > 0.0 and "its answers depend on earlier calls",
+        "the same answer to the same observations",
+        "carry its memory in the state that predict returns: batches of many scenarios take turns",
+        FAIL,
+    )
 
 
 def check_memory(probe: Probe) -> Iterator[Finding]:
@@ -270,15 +259,13 @@ def check_memory(probe: Probe) -> Iterator[Finding]:
     begun[: BATCH_ROWS // 2] = True
     again, _ = probe.query(probe.seen, state, begun)
     off = largest_difference(first[begun], again[begun])
-    if off > ACTION_ROUNDING:
-        yield report_warning(
-            "memory",
-            f"kept in its state, but rows that begin an episode are off by {off:.2g}",
-            "reset the rows of episode_start; here whole batches begin together, so this may not matter",
-            False,
-        )
-    else:
-        yield report_pass("memory", "kept in its state, reset where an episode begins")
+    yield judge(
+        "memory",
+        off > ACTION_ROUNDING and f"kept in its state, but rows that begin an episode are off by {off:.2g}",
+        "kept in its state, reset where an episode begins",
+        "reset the rows of episode_start; here whole batches begin together, so this may not matter",
+        HINT,
+    )
 
 
 def check_row_independence(probe: Probe) -> Iterator[Finding]:
@@ -289,14 +276,9 @@ def check_row_independence(probe: Probe) -> Iterator[Finding]:
     single = [probe.transform_seen(lambda part, row=row: part[row : row + 1]) for row in range(8)]  # type: ignore[misc]
     alone = largest_difference(np.concatenate([probe.query(row)[0] for row in single]), whole[:8])
     for name, off in (("order of the batch", shuffled), ("size of the batch", alone)):
-        if off > ACTION_ROUNDING:
-            yield report_failure(
-                name,
-                f"actions change with it, by up to {off:.2g}",
-                "a row must not depend on the others; is a batch norm in training mode?",
-            )
-        else:
-            yield report_pass(name, "no effect" if off == 0.0 else f"rounding, {off:.1g}")
+        bad = off > ACTION_ROUNDING and f"actions change with it, by up to {off:.2g}"
+        good = "no effect" if off == 0.0 else f"rounding, {off:.1g}"
+        yield judge(name, bad, good, "a row must not depend on the others; is a batch norm in training mode?", FAIL)
 
 
 def check_latency(probe: Probe) -> Iterator[Finding]:
@@ -314,12 +296,9 @@ def check_latency(probe: Probe) -> Iterator[Finding]:
         times[size] = float(np.median(durations))
     calls = ", ".join(f"{1e3 * seconds:.2g} ms for {size}" for size, seconds in times.items())
     needed = TYPICAL_SIMULATIONS / sizes[-1] * times[sizes[-1]] * probe.problem.world.clock.ticks
-    if needed > SLOW_SECONDS:
-        yield report_warning(
-            "latency", f"{calls}: {needed / 3600:.1f} h for {TYPICAL_SIMULATIONS} simulations", "batch its work", False
-        )
-    else:
-        yield report_pass("latency", f"{calls}: {needed:.0f} s for {TYPICAL_SIMULATIONS} simulations")
+    slow = f"{calls}: {needed / 3600:.1f} h for {TYPICAL_SIMULATIONS} simulations"
+    good = f"{calls}: {needed:.0f} s for {TYPICAL_SIMULATIONS} simulations"
+    yield judge("latency", needed > SLOW_SECONDS and slow, good, "batch its work", HINT)
 
 
 def check_memory_growth(probe: Probe) -> Iterator[Finding]:
@@ -332,12 +311,9 @@ def check_memory_growth(probe: Probe) -> Iterator[Finding]:
     for _ in range(100):
         probe.query(observation)
     grown = _read_megabytes() - before
-    if grown > LEAK_MEGABYTES:
-        yield report_warning(
-            "space", f"{grown:.0f} MB more after 100 calls", "it keeps what it has seen; a long run ends early", False
-        )
-    else:
-        yield report_pass("space", f"{before:.0f} MB in all, {max(grown, 0.0):.0f} MB more after 100 calls")
+    bad = grown > LEAK_MEGABYTES and f"{grown:.0f} MB more after 100 calls"
+    good = f"{before:.0f} MB in all, {max(grown, 0.0):.0f} MB more after 100 calls"
+    yield judge("space", bad, good, "it keeps what it has seen; a long run ends early", HINT)
 
 
 def check_driving(probe: Probe) -> Iterator[Finding]:
@@ -345,18 +321,14 @@ def check_driving(probe: Probe) -> Iterator[Finding]:
     evaluator = Evaluator(probe.problem, on_error="failure")
     f = evaluator.evaluate(probe.problem.base.sample(BATCH_ROWS, np.random.default_rng(2)))
     if evaluator.faults:
-        yield report_failure(
-            "driving",
-            f"fails on {len(evaluator.faults)} of {BATCH_ROWS} ordinary scenarios: {evaluator.faults[0].reason}",
-            "mend it, or count such scenarios with --on-error failure or bound",
-        )
+        failed = f"fails on {len(evaluator.faults)} of {BATCH_ROWS} ordinary scenarios: {evaluator.faults[0].reason}"
+        advice = "mend it, or count such scenarios with --on-error failure or bound"
+        yield report_failure("driving", failed, advice)
         return
     crashed = float((f == -1.0).mean())
     result = f"collides in {crashed:.0%} of {BATCH_ROWS} ordinary scenarios"
-    if crashed > MANY_COLLISIONS:
-        yield report_warning("driving", result, "does it see and act as in its training? is it trained?")
-    else:
-        yield report_pass("driving", result)
+    advice = "does it see and act as in its training? is it trained?"
+    yield judge("driving", crashed > MANY_COLLISIONS and result, result, advice)
 
 
 EGO_CHECKS: tuple[Callable[[Probe], Iterator[Finding]], ...] = (

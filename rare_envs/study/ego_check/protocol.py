@@ -12,7 +12,7 @@ from gymnasium import spaces
 
 from rare_envs.egos.errors import EgoGone, reason_of
 from rare_envs.sensors.kinds import map_kinds
-from rare_envs.study.ego_check.findings import Finding, report_failure, report_pass
+from rare_envs.study.ego_check import Finding, report_failure, report_pass
 
 PROTOCOL_ADVICE = "docs/egos.md has the protocol"
 

@@ -13,7 +13,7 @@ from pathlib import Path
 
 from rare_envs.scenarios.registry import find_scenario
 from rare_envs.study.arguments import Question
-from rare_envs.study.ego_check.findings import Finding, report_failure, report_pass, report_warning
+from rare_envs.study.ego_check import Finding, report_failure, report_pass, report_warning
 from rare_envs.study.errors import BadInput, as_bad_input
 from rare_envs.threads import use_one_thread
 

@@ -14,7 +14,7 @@ import agents
 import rare_envs
 from rare_envs.egos.needs import AmbiguousActions
 from rare_envs.study.arguments import Question
-from rare_envs.study.ego_check.findings import Finding
+from rare_envs.study.ego_check import Finding
 from rare_envs.study.ego_check.subprocess_check import run_checks
 from rare_envs.study.errors import BadInput
 from rare_envs.study.question import prepare

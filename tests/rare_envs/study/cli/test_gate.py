@@ -31,14 +31,11 @@ def test_one_sentence_is_printed_and_a_resumed_run_has_it_too(cli: Cli, risky: s
     assert recorded["question"]["max_p"] == 0.2 and recorded["gate"]["decision"] == "passes"
 
 
-@pytest.mark.parametrize(
-    ("options", "word"),
-    [
+def test_refusals(cli: Cli) -> None:
+    for options, word in (
         (("--max-p", 2), "Expected --max-p above 0"),
         (("--max-p", 0.1, "--confidence", 0.4), "0.4"),
         (("--confidence", 0.9), "--confidence together with --max-p"),
         (("--given-base",), "--given-base together with --max-p"),
-    ],
-)
-def test_refusals(cli: Cli, options: tuple[object, ...], word: str) -> None:
-    assert_refused(cli(*SMALL, *options), word)
+    ):
+        assert_refused(cli(*SMALL, *options), word)

@@ -47,18 +47,15 @@ def test_an_upper_bound_by_plain_monte_carlo_is_an_answer(cli: Cli) -> None:
     assert "warning" not in text.stdout and answer["warnings"][0] in text.stdout
 
 
-@pytest.mark.parametrize(
-    ("options", "said"),
-    [
+def test_what_does_not_go_there_is_one_line(cli: Cli) -> None:
+    for words, said in (
         (("--weather",), "has no --weather"),
         (("--method", "addss"), "'adss'"),
         (("--measure", "braking"), "'braking'"),
         (("--ego", "nowhere.zip"), "nowhere.zip"),
         (("--max-sim", 0), "--max-sim"),
-    ],
-)
-def test_what_does_not_go_there_is_one_line(cli: Cli, options: tuple[Any, ...], said: str) -> None:
-    assert_refused(cli("estimate", "highway-fast-v0", *options), said)
+    ):
+        assert_refused(cli("estimate", "highway-fast-v0", *words), said)
 
 
 def test_a_policy_from_there_is_told_here_what_its_actions_are(cli: Cli, saved: Path) -> None:

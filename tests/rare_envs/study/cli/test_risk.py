@@ -30,36 +30,19 @@ def test_the_table_and_the_folder(cli: Cli, bases: list[str], here: Path) -> Non
     assert (here / "out" / "risk.png").exists()
 
 
-BAD = {
-    "misspelt ego": (["imd"], ["idm"]),
-    "unknown leaders": (["idm", "--with", "merge"], ["merge"]),
-    "two bases for one scenario": (
-        ["idm", "--base", "hard_brake=us101", "--base", "hard_brake=mine.json"],
-        ["one --base for each scenario", "several for 'hard_brake'"],
-    ),
-    "uncounted leaders": (
-        ["idm", "--with", "highway"],
-        ["cut-in or --with car-following", "'highway'"],
-    ),
-    "a base that is no site": (
-        ["idm", "--sites", "us101-closing"],
-        ["no site", "'us101'", "cut_in=us101-closing"],
-    ),
-    "a base that is no file": (["idm", "--base", "cut_in=mine.json"], ["mine.json"]),
-    "a damaged base": (["idm", "--base", "cut_in=broken.json"], ["broken.json", "JSON"]),
-    "a base without frequency": (["idm", "--base", "cut_in=highway"], ["'highway'", "nobody counted"]),
-    "no budget": (["idm", "--max-sim", "0"], ["--max-sim"]),
-}
-
-
-@pytest.mark.parametrize(("words", "said"), BAD.values(), ids=BAD.keys())
-def test_bad_input_is_one_line(cli: Cli, here: Path, bases: list[str], words: list[str], said: list[str]) -> None:
-    given = [] if "--base" in words else bases
-    assert_refused(cli("risk", *words[:1], *given, *words[1:]), *said)
-
-
-def test_out_in_a_file_is_refused(cli: Cli, here: Path, bases: list[str]) -> None:
-    assert_refused(cli("risk", "idm", *bases, *FEW, "--out", here / "a_file"), "a_file")
+def test_bad_input_is_one_line(cli: Cli, here: Path, bases: list[str]) -> None:
+    for words, *said in (
+        (["imd", *bases], "idm"),
+        (["idm", *bases, "--with", "merge"], "cut-in or --with car-following", "'merge'"),
+        (["idm", "--base", "hard_brake=us101", "--base", "hard_brake=mine.json"], "several for 'hard_brake'"),
+        (["idm", *bases, "--sites", "us101-closing"], "no site", "'us101'", "cut_in=us101-closing"),
+        (["idm", "--base", "cut_in=mine.json"], "mine.json"),
+        (["idm", "--base", "cut_in=broken.json"], "broken.json", "JSON"),
+        (["idm", "--base", "cut_in=highway"], "'highway'", "nobody counted"),
+        (["idm", *bases, "--max-sim", "0"], "--max-sim"),
+        (["idm", *bases, *FEW, "--out", here / "a_file"], "a_file"),
+    ):
+        assert_refused(cli("risk", *words), *said)
 
 
 def test_estimate_prints_the_rate_beside_people(cli: Cli, here: Path) -> None:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from rare_envs.study.arguments import Question
-from rare_envs.study.ego_check.findings import Finding
+from rare_envs.study.ego_check import Finding
 from rare_envs.study.ego_check.subprocess_check import run_checks
 
 ENV = "rare_envs/CarFollowing-v0"

@@ -14,7 +14,7 @@ from typer.testing import Result
 import agents
 from agents.safe_pickle import find_origin_risks
 from rare_envs.study.arguments import Question
-from rare_envs.study.ego_check.findings import Finding, exit_code
+from rare_envs.study.ego_check import Finding, exit_code
 from rare_envs.study.ego_check.subprocess_check import check_ego, run_checks
 
 Cli = Callable[..., Result]

@@ -2,7 +2,7 @@
 
 import pytest
 
-from rare_envs.study.ego_check.findings import VERDICTS, print_findings, report_failure, report_pass
+from rare_envs.study.ego_check import VERDICTS, print_findings, report_failure, report_pass
 
 
 def test_findings_remedies_and_verdict_are_printed(capsys: pytest.CaptureFixture[str]) -> None:

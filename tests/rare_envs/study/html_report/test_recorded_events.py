@@ -17,16 +17,13 @@ def test_the_nearest_event_is_the_nearest_in_deviations() -> None:
     assert found.rarer == 1.0  # (0, 0) is 3 away from it in one parameter, (2, 20) at least 1 and 2
 
 
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
+def test_files_without_such_events_are_refused(tmp_path: Path) -> None:
+    for text, message in (
         ("", "columns named as the parameters, a, gap; it has no rows"),
         ("gap\n1\n", "columns named as the parameters, a, gap; it has gap"),
         ("a,gap\nx,1\n", "no table"),
         ("a,gap\n,1\n", "no event"),
-    ],
-)
-def test_files_without_such_events_are_refused(tmp_path: Path, text: str, message: str) -> None:
-    (tmp_path / "events.csv").write_text(text)
-    with pytest.raises(BadInput, match=message):
-        read_recorded_events(tmp_path / "events.csv", ["a", "gap"])
+    ):
+        (tmp_path / "events.csv").write_text(text)
+        with pytest.raises(BadInput, match=message):
+            read_recorded_events(tmp_path / "events.csv", ["a", "gap"])

@@ -63,18 +63,7 @@ def test_an_ego_that_fails_on_the_way_is_one_line(cli: Cli, here: Path, risky: s
 
 
 def test_weather_on_the_command_line(cli: Cli, tmp_path: Path) -> None:
-    out = tmp_path / "run"
-    words = [
-        "estimate",
-        "rare_envs/CutIn-v0",
-        "--weather",
-        "--observation",
-        "camera+lidar",
-        "--method",
-        "mc",
-        "--max-sim",
-        "40",
-    ]
-    found = json.loads(cli(*words, "--horizon", "1", "--out", str(out), "--json").stdout)
+    words = ("estimate", "rare_envs/CutIn-v0", "--weather", "--observation", "camera+lidar", "--method", "mc")
+    found = json.loads(cli(*words, "--max-sim", 40, "--horizon", 1, "--out", tmp_path / "run", "--json").stdout)
     assert found["question"]["weather"] is True
     assert found["question"]["observation"] == "camera+lidar"
