@@ -262,38 +262,11 @@ MOST_FINAL_BATCHES = 100
 """Batches of final draws after which a target c.o.v. is given up where max_sim does not say."""
 
 
-@dataclass(frozen=True, eq=False)
-class Space:
+class Space(NamedTuple):
     """The space of a proposal: the base distribution there, and the map of its points (n, d) to physical space."""
 
     base: ProposalDistribution
     to_x: Callable[[FloatArray], FloatArray]
-
-    @classmethod
-    def standard_normal(cls, inputs: Inputs) -> Space:
-        """Return standard normal space of some inputs."""
-        return cls(Gaussian.standard(inputs.dim), inputs.base.from_standard_normal)
-
-    @classmethod
-    def physical(cls, base: ProposalDistribution) -> Space:
-        """Return physical space, where `base` is the distribution of x."""
-        return cls(base, np.asarray)
-
-
-def simulate_draws(
-    inputs: Inputs,
-    sampler: ProposalDistribution,
-    gamma: float,
-    n: int,
-    rng: np.random.Generator,
-    space: Space | None = None,
-) -> Generator[FloatArray, FloatArray, Draws]:
-    """Simulate n draws from `sampler`, a distribution in `space` (None: standard normal space), in one batch."""
-    space = space or Space.standard_normal(inputs)
-    u = sampler.sample(n, rng)
-    x = space.to_x(u)
-    f = yield x
-    return Draws.from_outcomes(f, space.base.log_prob(u) - sampler.log_prob(u), x, gamma)
 
 
 def simulate_until(
@@ -305,17 +278,21 @@ def simulate_until(
     rng: np.random.Generator,
     space: Space | None = None,
 ) -> Generator[FloatArray, FloatArray, tuple[Draws, list[Level], bool]]:
-    """Simulate batches until `limit` draws are made or goal.target_cov is met.
+    """Simulate batches from `sampler`, in `space` (None: standard normal space), until `limit` draws or the target.
 
     Return the draws, a record of every batch and whether the run was interrupted.
     """
+    base, to_x = space or Space(Gaussian.standard(inputs.dim), inputs.base.from_standard_normal)
     draws = Draws(0, np.empty(0), np.empty(0))
     trace: list[Level] = []
     while draws.n < limit:
+        u = sampler.sample(min(batch, limit - draws.n), rng)
+        x = to_x(u)
         try:
-            new = yield from simulate_draws(inputs, sampler, goal.gamma, min(batch, limit - draws.n), rng, space)
+            f = yield x
         except Interrupted:
             return draws, trace, True
+        new = Draws.from_outcomes(f, base.log_prob(u) - sampler.log_prob(u), x, goal.gamma)
         draws = draws.join(new)
         record = round_record(goal.gamma, new.n, new.log_weights)
         trace.append(replace(record, estimate=draws.p, cov=draws.cov, ess=draws.ess))  # of all so far
@@ -390,11 +367,6 @@ class Search(NamedTuple):
         """Draws from the base distribution: the first round."""
         return len(self.rounds[0].f) if self.rounds else 0
 
-    @property
-    def largest_weight(self) -> float:
-        """Upper bound of the weights of `pool_rounds`: all draws over base draws."""
-        return sum(len(one.f) for one in self.rounds) / self.base_draws
-
 
 class FinalDraws(NamedTuple):
     """The draws that p rests on, after a search, and the records of the search and of the final batches.
@@ -417,18 +389,19 @@ class FinalDraws(NamedTuple):
 
     def outcome(self, goal: Goal, status: Status, warnings: Sequence[str]) -> Outcome:
         """Return the outcome of a run with these draws."""
-        ended = status if len(self.draws.f) else Status.NO_HITS
-        from_search = self.n_first > 0
-        early = ["Stopped before the final draws: the estimate rests on those of the search."]
+        draws = self.draws
+        ended = status if len(draws.f) else Status.NO_HITS
+        if self.n_first:
+            warnings = ["Stopped before the final draws: the estimate rests on those of the search."]
         return Outcome(
-            p=self.draws.p,
-            interval=weighted_interval(self.draws, goal.confidence, self.largest_weight),
+            p=draws.p,
+            interval=weighted_interval(draws, goal.confidence, self.largest_weight),
             cov=self.cov,
             status=Status.STOPPED if self.stopped else ended,
-            warnings=(*(early if from_search else warnings), *weight_warnings(self.draws)),
+            warnings=(*warnings, *weight_warnings(draws)),
             trace=self.trace,
-            no_outcome_share=no_outcome_share(self.draws.f, self.draws.log_weights),
-            sample=self.draws.sample,
+            no_outcome_share=no_outcome_share(draws.f, draws.log_weights),
+            sample=draws.sample,
             base_draws=self.base_draws,
             draw_weights=self._draw_weights,
         )
@@ -498,7 +471,8 @@ def draw_after_search(
     if draws.n == 0:
         n_first = search.base_draws
         to_x = inputs.base.from_standard_normal if space is None else space.to_x
-        draws, largest = pool_rounds(search.rounds, to_x, goal.gamma), search.largest_weight
+        draws = pool_rounds(search.rounds, to_x, goal.gamma)
+        largest = draws.n / n_first
     stopped = stopped or search.status is Status.STOPPED
     return FinalDraws(draws, (*search.trace, *trace), largest, n_base, stopped, n_first)
 

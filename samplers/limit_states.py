@@ -26,11 +26,7 @@ class Reference(NamedTuple):
 
 def half_space(dim: int = 2, beta: float = 3.5) -> Reference:
     """Return the half-space f = beta - sum(u) / sqrt(d): p = Phi(-beta) in any dimension."""
-
-    def f(u: FloatArray) -> FloatArray:
-        return np.asarray(beta - u.sum(axis=1) / math.sqrt(dim))
-
-    return _reference(f"half_space_d{dim}", f, dim, normal_cdf(-beta))
+    return _reference(f"half_space_d{dim}", lambda u: beta - u.sum(axis=1) / math.sqrt(dim), dim, normal_cdf(-beta))
 
 
 def two_modes(distance: float = 2.0) -> Reference:
@@ -39,20 +35,14 @@ def two_modes(distance: float = 2.0) -> Reference:
     p = 2 Phi(-distance)^2, 1.035e-3 for distance 2. The demonstration problem of Norden,
     O'Kelly and Sinha, "Efficient black-box assessment of autonomous vehicle safety", 2019.
     """
-
-    def f(u: FloatArray) -> FloatArray:
-        return np.asarray(distance - np.minimum(np.abs(u[:, 0]), u[:, 1]))
-
-    return _reference("two_modes", f, 2, 2 * normal_cdf(-distance) ** 2)
+    p = 2 * normal_cdf(-distance) ** 2
+    return _reference("two_modes", lambda u: distance - np.minimum(np.abs(u[:, 0]), u[:, 1]), 2, p)
 
 
 def parabola(beta: float = 3.3, curvature: float = 0.2) -> Reference:
     """Return one design point with a boundary that curves away: f = beta + curvature u1^2 - u2."""
-
-    def f(u: FloatArray) -> FloatArray:
-        return np.asarray(beta + curvature * u[:, 0] ** 2 - u[:, 1])
-
-    return _reference("parabola", f, 2, normal_mean(lambda s: normal_cdf(-beta - curvature * s * s)))
+    p = normal_mean(lambda s: normal_cdf(-beta - curvature * s * s))
+    return _reference("parabola", lambda u: beta + curvature * u[:, 0] ** 2 - u[:, 1], 2, p)
 
 
 def four_branches(k: float = 3.5) -> Reference:
@@ -82,11 +72,7 @@ def plateau(dim: int = 3, beta: float = 3.5, tied: float = 0.6) -> Reference:
 def shell(dim: int = 20, p: float = 1e-4) -> Reference:
     """Return failure in every direction, beyond a radius: f = r - |u|."""
     radius = math.sqrt(float(chdtri(dim, p)))
-
-    def f(u: FloatArray) -> FloatArray:
-        return np.asarray(radius - np.linalg.norm(u, axis=1))
-
-    return _reference(f"shell_d{dim}", f, dim, p)
+    return _reference(f"shell_d{dim}", lambda u: radius - np.linalg.norm(u, axis=1), dim, p)
 
 
 def unannounced_region(announced: float = 4.0, hidden: float = 3.1) -> Reference:
@@ -98,11 +84,8 @@ def unannounced_region(announced: float = 4.0, hidden: float = 3.1) -> Reference
     narrow interval that does not hold p = 9.99e-4. This problem measures how often a method misses
     such a region and whether it warns of that. No method here is expected to cover p.
     """
-
-    def f(u: FloatArray) -> FloatArray:
-        return np.where(u[:, 0] < -hidden, -1.0, announced - u[:, 0])
-
-    return _reference("unannounced", f, 2, normal_cdf(-announced) + normal_cdf(-hidden))
+    p = normal_cdf(-announced) + normal_cdf(-hidden)
+    return _reference("unannounced", lambda u: np.where(u[:, 0] < -hidden, -1.0, announced - u[:, 0]), 2, p)
 
 
 def references() -> list[Reference]:

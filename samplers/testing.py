@@ -21,33 +21,18 @@ from samplers.result import Estimate
 from samplers.run import NOT_KNOWN, Run, RunArguments
 from samplers.sample import Status
 
-F = Callable[[FloatArray], FloatArray]
-
 
 def check_method(method: Stepping) -> None:
-    """Run all checks on a method.
-
-    Args:
-        method: With the settings to check; `check_counts` also runs it without max_sim.
-
-    Raises:
-        AssertionError: If a check fails; the text says what was expected.
-    """
+    """Run all checks on a method with these settings, and without max_sim too; an AssertionError if one fails."""
     for check in METHOD_CHECKS:
         check(method)
 
 
 def check_base(base: Distribution, dim: int) -> None:
-    """Check that a base distribution's density and its map to standard normal space fit 200 of its draws.
+    """Check that the density of a base distribution of d coordinates and its map fit 200 of its draws.
 
-    `samplers.estimate` makes this check itself; see `samplers.run.find_base_fault`.
-
-    Args:
-        base: The distribution.
-        dim: Its number of dimensions.
-
-    Raises:
-        AssertionError: If something does not fit; the text says what. Probability below 1e-6 if all fits.
+    `samplers.estimate` makes this check itself; see `samplers.distributions.find_base_fault`. An AssertionError says
+    what does not fit, with a probability below 1e-6 if all fits.
     """
     fault = find_base_fault(base, dim)
     if fault is not None:
@@ -117,29 +102,26 @@ def check_failure_everywhere(method: Stepping) -> None:
         _expect(result.status == Status.CONVERGED, method, f"expected converged, got {result.status}")
 
 
-def check_ties(method: Stepping) -> None:
-    """Check that equality with gamma is failure, on an f with few distinct values."""
-    for seed in range(5):
-        problem = FunctionProblem(lambda x: np.floor(x[:, 0] + 4.5), 2)
-        _expect_near(
-            method, estimate(problem, method, gamma=2.0, seed=seed, max_sim=5000), normal_cdf(-1.5), "whole numbers"
-        )
+def check_outcomes(method: Stepping) -> None:
+    """Check p where f ties at gamma, which is failure, where it is infinite, and where rows have no outcome."""
 
+    def ties(x: FloatArray) -> FloatArray:
+        return np.floor(x[:, 0] + 4.5)
 
-def check_infinite(method: Stepping) -> None:
-    """Check that outcomes may be +inf and -inf."""
-    problem = FunctionProblem(lambda x: np.where(x[:, 0] > 1.5, -np.inf, np.inf), 2)
-    _expect_near(method, estimate(problem, method, seed=1, max_sim=5000), normal_cdf(-1.5), "infinite outcomes")
+    def infinite(x: FloatArray) -> FloatArray:
+        return np.where(x[:, 0] > 1.5, -np.inf, np.inf)
 
-
-def check_missing(method: Stepping) -> None:
-    """Check that rows without an outcome count as failing."""
-
-    def f(x: FloatArray) -> FloatArray:
+    def missing(x: FloatArray) -> FloatArray:
         return np.where(x[:, 1] > 1.5, np.nan, 10.0 - x[:, 0])
 
-    result = estimate(FunctionProblem(f, 2), method, seed=1, max_sim=5000, on_error="failure")
-    _expect_near(method, result, normal_cdf(-1.5), "rows without an outcome")
+    for what, f, gamma, seeds in (
+        ("whole numbers", ties, 2.0, range(5)),
+        ("infinite outcomes", infinite, 0.0, (1,)),
+        ("rows without an outcome", missing, 0.0, (1,)),
+    ):
+        for seed in seeds:
+            result = estimate(FunctionProblem(f, 2), method, gamma, seed, max_sim=5000, on_error="failure")
+            _expect_near(method, result, normal_cdf(-1.5), what)
 
 
 def check_dimensions(method: Stepping) -> None:
@@ -207,19 +189,8 @@ def check_accuracy(method: Stepping) -> None:
 
 
 METHOD_CHECKS: tuple[Callable[[Stepping], None], ...] = (
-    check_form,
-    check_counts,
-    check_budget,
-    check_seed,
-    check_no_failure,
-    check_failure_everywhere,
-    check_ties,
-    check_infinite,
-    check_missing,
-    check_dimensions,
-    check_interruption,
-    check_sample,
-    check_accuracy,
+    *(check_form, check_counts, check_budget, check_seed, check_no_failure, check_failure_everywhere),
+    *(check_outcomes, check_dimensions, check_interruption, check_sample, check_accuracy),
 )
 
 

@@ -215,7 +215,7 @@ class CrossEntropy(Method):
         """Return the base distribution by blocks, theta_0, and the space that the search works in."""
         if self.family == "blocks":
             base = announced_blocks(inputs)
-            return base, Space.physical(base)
+            return base, Space(base, np.asarray)
         gaussian = Gaussian.standard(inputs.dim)
         if self.family == "mixture":
             base = Product((MixtureBlock(gaussian, self.components),))

@@ -557,6 +557,7 @@ def test_a_worker_that_has_computed_nothing_ends_with_its_driver() -> None:
     assert wait_until(lambda: not any(map(is_running, workers)), 20.0)
 
 
-def children_of(number: int) -> list[int]:
-    """Return the processes that a process has started."""
-    return [int(each) for each in Path(f"/proc/{number}/task/{number}/children").read_text().split()]
+def children_of(number: int) -> list[Path]:
+    """Return the files in /proc of the processes that a process has started."""
+    numbers = Path(f"/proc/{number}/task/{number}/children").read_text().split()
+    return [Path(f"/proc/{each}/stat") for each in numbers]

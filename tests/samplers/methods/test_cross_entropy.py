@@ -7,8 +7,9 @@ import pytest
 from scipy import stats
 
 import samplers
-from samplers.importance import Draws, defensive_mixture, simulate_draws, weight_warnings, weighted_interval
+from samplers.importance import Draws, defensive_mixture, simulate_until, weight_warnings, weighted_interval
 from samplers.limit_states import four_branches, half_space, parabola, plateau, two_modes
+from samplers.method import Goal
 from samplers.methods.blocks import GaussianBlock, MixtureBlock, Product
 from samplers.proposals import Gaussian
 
@@ -128,7 +129,9 @@ def test_weights_of_the_final_draws_give_p(drive, rng):
     base = Product((GaussianBlock(Gaussian.standard(2)),))
     proposal = Product((GaussianBlock(far),))
     sampler = defensive_mixture(base, proposal.widen(1.5), proposal, 0.1, 0.2)
-    draws = drive(simulate_draws(reference.problem, sampler, 0.0, 50_000, rng), reference.problem).value
+    draws = drive(
+        simulate_until(reference.problem, sampler, Goal(gamma=0.0), 50_000, 50_000, rng), reference.problem
+    ).value[0]
     assert draws.p == pytest.approx(reference.p, rel=4 * draws.cov)
     assert np.exp(draws.log_weights).max() <= 10.0
     assert draws.cov < 0.02
