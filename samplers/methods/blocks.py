@@ -1,16 +1,10 @@
 """Blocks of coordinates, each with the family that cross-entropy searches, the projections on it, and their product.
 
-Blocks of coordinates, each with the family of distributions that cross-entropy searches, and their product.
-
 Equation 2 of O'Kelly et al. (2018) separates by block: the Kullback-Leibler projection of a distribution on
 a product of families is the product of the projections of its marginals. A block is one factor of the
-base distribution; its family limits how far a search may move it.
-
-Kullback-Leibler projections onto exponential families whose parameters lie in a box.
-
-The projection of any distribution P on a family with sufficient statistic Gamma and log partition
-function A maximises theta' E_P[Gamma] - A(theta): it depends on P through E_P[Gamma] alone
-(O'Kelly et al. 2018, equation 2).
+base distribution; its family limits how far a search may move it. The projection of any distribution P on an
+exponential family with sufficient statistic Gamma and log partition function A maximises theta' E_P[Gamma] - A(theta):
+it depends on P through E_P[Gamma] alone.
 
 References:
     O'Kelly, Sinha, Namkoong, Duchi and Tedrake, "Scalable end-to-end autonomous vehicle testing
@@ -20,7 +14,6 @@ References:
 """
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from importlib import import_module
@@ -53,17 +46,9 @@ def beta_statistics(alpha: FloatArray, beta: FloatArray) -> FloatArray:
 
 
 def project_beta(statistics: FloatArray, low: float, high: float) -> FloatArray:
-    """Return the Beta distributions in a box whose likelihood for the given statistics is largest.
+    """Return alpha and beta (m, 2) in a box [low, high], 0 < low, with the largest likelihood for statistics (m, 2).
 
-    Maximises (alpha, beta) . statistics - log B(alpha, beta) over low <= alpha, beta <= high, for each row.
-
-    Args:
-        statistics: E[log y] and E[log(1 - y)], negative and finite, shape (m, 2).
-        low: Lower bound of both parameters, positive.
-        high: Upper bound.
-
-    Returns:
-        alpha and beta, shape (m, 2).
+    Maximises (alpha, beta) . statistics - log B(alpha, beta) for each row; these are E[log y] and E[log(1 - y)].
     """
 
     def loss(parameters: FloatArray) -> tuple[float, FloatArray]:
@@ -79,17 +64,11 @@ def project_beta(statistics: FloatArray, low: float, high: float) -> FloatArray:
 
 
 def project_mean(target: FloatArray, centre: FloatArray, cholesky: FloatArray, radius: float) -> FloatArray:
-    """Return the mean of the Normal with fixed covariance, in a box around `centre`, nearest to a distribution.
+    """Return the mean (d,) of the Normal with fixed covariance, in a box around a centre (d,), nearest to some other.
 
-    Maximises mu' S^-1 m - mu' S^-1 mu / 2 over |mu - centre|_inf <= radius, where m is the distribution's
-    mean and S = L L' the covariance. A mean inside the box is its own projection and a diagonal S
+    Maximises mu' S^-1 m - mu' S^-1 mu / 2 over |mu - centre|_inf <= radius, where m = target (d,) is the distribution's
+    mean and S = L L' the covariance, L = cholesky (d, d). A mean inside the box is its own projection and a diagonal S
     clips each coordinate; otherwise a quadratic programme, solved by OSQP through cvxpy.
-
-    Args:
-        target: m, shape (d,).
-        centre: Shape (d,).
-        cholesky: L, lower triangular, shape (d, d).
-        radius: Half the width of the box; inf for none.
     """
     clipped = np.clip(target, centre - radius, centre + radius)
     diagonal = np.count_nonzero(cholesky) == len(centre)
@@ -238,17 +217,10 @@ EMPTY = float(np.finfo(np.float64).eps)
 def fit_mixture_towards(present: Mixture, k: int, x: FloatArray, weights: FloatArray, alpha: float) -> Mixture:
     """Return a mixture of at most k Gaussians nearer to alpha Q + (1 - alpha) P than P, the present one.
 
-    Maximises a lower bound of equation 2's objective: the points of Q are shared among the
-    components anew in every step, the mass of P stays with the components that it comes from, so
-    that its share in their moments is exact. A mixture of one component becomes one of k: these
-    are copies of it, and the points are first shared by k-means.
-
-    Args:
-        present: P.
-        k: Components at most; fewer where Q has fewer distinct points or alpha = 1 leaves one empty.
-        x: Points of Q, shape (n, d).
-        weights: Their weights, adding up to 1, shape (n,).
-        alpha: Share of Q.
+    Q has the points x (n, d) with weights (n,). Maximises a lower bound of equation 2's objective: the points of Q are
+    shared among the components anew in every step, the mass of P stays with the components that it comes from, so
+    that its share in their moments is exact. A mixture of one component becomes one of k, copies of it, and the points
+    are first shared by k-means; k is less where Q has fewer distinct points or alpha = 1 leaves one empty.
     """
     if len(present.components) == 1:
         k = min(k, len(np.unique(x, axis=0)))
@@ -519,47 +491,6 @@ class Block(Protocol):
         """Return a block whose present distribution has about `factor` times the standard deviations."""
 
 
-@runtime_checkable
-class AnnouncesBlocks(Protocol):
-    """A base distribution made of independent blocks."""
-
-    @property
-    def blocks(self) -> Sequence[object]:
-        """The blocks, in the order of the coordinates: `Block`, `BetaParameters` or `NormalParameters`."""
-
-
-@runtime_checkable
-class BetaParameters(Protocol):
-    """Independent coordinates low + (high - low) Beta(alpha, beta), described by a class of another package."""
-
-    alpha: FloatArray
-    beta: FloatArray
-    low: FloatArray
-    high: FloatArray
-
-
-@runtime_checkable
-class HasBox(Protocol):
-    """Parameters of a Beta block that also bound its family, see `BetaBlock`."""
-
-    box: tuple[float, float]
-
-
-@runtime_checkable
-class NormalParameters(Protocol):
-    """A Normal, described by a class of another package."""
-
-    mean: FloatArray
-    covariance: FloatArray
-
-
-@runtime_checkable
-class HasRadius(Protocol):
-    """Parameters of a Normal block that also bound its mean, see `NormalBlock`."""
-
-    radius: float
-
-
 @dataclass(frozen=True, eq=False)
 class Product:
     """Independent blocks of consecutive coordinates: a base distribution, or a proposal of the search.
@@ -653,12 +584,13 @@ def announced_blocks(inputs: Inputs) -> Product:
     Raises:
         ValueError: If there are no blocks, one is not as described, or their product is not the base distribution.
     """
-    if not isinstance(inputs.base, AnnouncesBlocks):
+    announced = getattr(inputs.base, "blocks", None)  # the user's own class
+    if announced is None:
         raise ValueError(
             f'CrossEntropy: family "blocks" needs a base distribution with an attribute blocks, as Product has; '
             f'{type(inputs.base).__name__} has none. The family "gaussian" works with any.'
         )
-    product = Product(tuple(_as_block(entry) for entry in inputs.base.blocks))
+    product = Product(tuple(_as_block(entry) for entry in announced))
     trial = product.sample(4, np.random.default_rng(0))
     if product.dim != inputs.dim or not np.allclose(product.log_prob(trial), inputs.base.log_prob(trial)):
         raise ValueError(
@@ -668,16 +600,16 @@ def announced_blocks(inputs: Inputs) -> Product:
     return product
 
 
-def _as_block(entry: object) -> Block:
-    """Return the block that an entry describes."""
+def _as_block(entry: Any) -> Block:
+    """Return the block that an entry describes, one of the classes here or of another package."""
     if isinstance(entry, Block):
         return entry
-    if isinstance(entry, BetaParameters):
-        box = entry.box if isinstance(entry, HasBox) else PAPERS_BOX
+    if all(hasattr(entry, name) for name in ("alpha", "beta", "low", "high")):
+        box = getattr(entry, "box", PAPERS_BOX)
         return BetaBlock(alpha=entry.alpha, beta=entry.beta, low=entry.low, high=entry.high, box=box)
-    if isinstance(entry, NormalParameters):
-        radius = entry.radius if isinstance(entry, HasRadius) else math.inf
-        return NormalBlock(Gaussian.from_covariance(entry.mean, entry.covariance), radius)
+    if hasattr(entry, "mean") and hasattr(entry, "covariance"):
+        gaussian = Gaussian.from_covariance(entry.mean, entry.covariance)
+        return NormalBlock(gaussian, getattr(entry, "radius", math.inf))
     raise ValueError(
         "CrossEntropy: expected a block with alpha, beta, low and high or with mean and covariance, "
         f"got {type(entry).__name__}."

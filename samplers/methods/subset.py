@@ -11,8 +11,7 @@ References:
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import reduce
-from typing import ClassVar, Literal, NamedTuple
+from typing import ClassVar, Literal, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -57,20 +56,56 @@ USUAL_LEVELS = 4
 """Levels that shall fit into a small budget: down to p = p0^4, 1e-4."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class SubsetPlanner:
-    """Levels of n points whose seeds are all points below the threshold, as the estimate of the error needs them."""
+class SubsetMethod(Method, Protocol):
+    """What both kinds of subset simulation share: the levels, given a kernel; a subclass has these settings."""
 
     n: int
-    """Points per level, N."""
     p0: float
-    """Wanted conditional probability of each level."""
     max_levels: int
-    """Levels after which the method gives up, level 0 included."""
+    stops_at_target: ClassVar[bool] = False
+
+    def _check_levels(self) -> None:
+        """Check the settings of the levels."""
+        who = type(self).__name__
+        check_count(who, "n", self.n, 10)
+        check_count(who, "max_levels", self.max_levels, 1)
+        check_setting(who, "p0", self.p0, 0.0, 0.5)
+
+    def _descend(
+        self, inputs: Inputs, goal: Goal, rng: np.random.Generator, kernel: Kernel, known: RootedPoints | None = None
+    ) -> Steps:
+        """Go from level to level until the share of failures among its points is p0 or more."""
+        n_known, gamma = 0 if known is None else len(known.f), goal.gamma
+        budget = goal.budget + n_known
+        fitting = int(budget / (1 + (USUAL_LEVELS - 1) * (1 - self.p0)))  # seeds are not simulated again
+        n = min(self.n, max(math.ceil(FEWEST_SEEDS / self.p0), fitting))
+        levels, trace = list[Chains](), list[Level]()
+
+        def record(growth: Growth, planned: NextLevel | Status) -> None:
+            threshold = planned.threshold if isinstance(planned, NextLevel) else gamma
+            levels.append(growth.chains)
+            trace.append(level_record(growth.chains, threshold, multiply_levels(trace)))
+            goal.on_level(trace[-1])
+
+        first = yield from draw_first_level(inputs, max(min(n, budget), n_known), rng, known)
+        planner = SubsetPlanner(n, self.p0, self.max_levels, gamma, goal.budget - first.n_new)
+        status = yield from descend(inputs, Growth.start(first, kernel), planner, record, rng)
+        outcome = summarise(levels[-1], goal, trace, status)
+        doubts = [f"max_sim leaves {budget} simulations: {n} points per level, not {self.n}."] if n < self.n / 2 else []
+        if budget < n:
+            doubts = [f"max_sim leaves {budget} of the {n} simulations that level 0 needs at least: plain draws only."]
+        warnings = (*doubts, *outcome.warnings)
+        return replace(outcome, warnings=warnings, sample=weighted_points(inputs, levels, trace, gamma))
+
+
+class SubsetPlanner(NamedTuple):
+    """Levels of n points whose seeds are all points below the threshold, as the estimate of the error needs them."""
+
+    n: int  # points per level
+    p0: float  # wanted conditional probability of each level
+    max_levels: int  # levels after which the method gives up, level 0 included
     gamma: float
-    """Threshold of failure."""
-    budget: int
-    """Simulations for the levels after level 0."""
+    budget: int  # simulations for the levels after level 0
 
     def plan_next(self, chains: Chains, depth: int, n_sim: int, rng: np.random.Generator) -> NextLevel | Status:
         """Return the next level, or how the run ends: converged once p0 of the present points fail."""
@@ -86,61 +121,9 @@ class SubsetPlanner:
         n_seeds = len(seeds.f)
         if left < n_seeds:
             return Status.BUDGET  # not one step for every chain
-        return NextLevel(threshold, seeds, chain_lengths(self._points_of_level(n_seeds, left), n_seeds, rng))
-
-    def _points_of_level(self, n_seeds: int, left: int) -> int:
-        """Return how many points the next level shall have, its seeds included."""
         longest = max(LONGEST_CHAIN, math.ceil(1 / self.p0))
-        return max(min(self.n, n_seeds + left, n_seeds * longest), n_seeds)
-
-
-@dataclass(frozen=True, kw_only=True)
-class SubsetLevels:
-    """The settings that all kinds of subset simulation share."""
-
-    n: int
-    """Points per level, N."""
-    p0: float
-    """Wanted conditional probability of each level."""
-    max_levels: int
-    """Levels after which the method gives up."""
-
-    def steps(
-        self, inputs: Inputs, goal: Goal, rng: np.random.Generator, kernel: Kernel, known: RootedPoints | None = None
-    ) -> Steps:
-        """Go from level to level until the share of failures among its points is p0 or more."""
-        n_known = 0 if known is None else len(known.f)
-        n, gamma = self._points_per_level(goal.budget + n_known), goal.gamma
-        levels, trace = list[Chains](), list[Level]()
-
-        def record(growth: Growth, planned: NextLevel | Status) -> None:
-            threshold = planned.threshold if isinstance(planned, NextLevel) else gamma
-            levels.append(growth.chains)
-            trace.append(level_record(growth.chains, threshold, multiply_levels(trace)))
-            goal.on_level(trace[-1])
-
-        first = yield from draw_first_level(inputs, max(min(n, goal.budget + n_known), n_known), rng, known)
-        left = goal.budget - first.n_new
-        planner = SubsetPlanner(n=n, p0=self.p0, max_levels=self.max_levels, gamma=gamma, budget=left)
-        status = yield from descend(inputs, Growth.start(first, kernel), planner, record, rng)
-        outcome = summarise(levels[-1], goal, trace, status)
-        return replace(
-            outcome,
-            warnings=(*self._budget_warnings(n, goal.budget + n_known), *outcome.warnings),
-            sample=weighted_points(inputs, levels, trace, gamma),
-        )
-
-    def _points_per_level(self, budget: int) -> int:
-        """Return the points per level: fewer than n where the budget does not hold the usual levels."""
-        fitting = int(budget / (1 + (USUAL_LEVELS - 1) * (1 - self.p0)))  # seeds are not simulated again
-        return min(self.n, max(math.ceil(FEWEST_SEEDS / self.p0), fitting))
-
-    def _budget_warnings(self, n: int, budget: int) -> list[str]:
-        """Return the warning about a budget that is too small for n points per level."""
-        if budget < n:
-            return [f"max_sim leaves {budget} of the {n} simulations that level 0 needs at least: plain draws only."]
-        coarse = n < self.n / 2
-        return [f"max_sim leaves {budget} simulations: {n} points per level, not {self.n}."] if coarse else []
+        n_points = max(min(self.n, n_seeds + left, n_seeds * longest), n_seeds)
+        return NextLevel(threshold, seeds, chain_lengths(n_points, n_seeds, rng))
 
 
 ACCEPTANCE_RANGE = (0.15, 0.85)
@@ -178,15 +161,12 @@ def level_record(chains: Chains, threshold: float, passed: LevelProduct) -> Leve
     )
 
 
-def include_level(passed: LevelProduct, level: Level) -> LevelProduct:
-    """Return the product with one more level, taken as independent of the others."""
-    square = (1 + passed.cov**2) * (1 + level.cov**2) - 1
-    return LevelProduct(p=passed.p * level.p, cov=math.sqrt(square))
-
-
 def multiply_levels(trace: Sequence[Level]) -> LevelProduct:
-    """Return the product over the levels; 1 of none."""
-    return reduce(include_level, trace, LevelProduct())
+    """Return the product over the levels, taken as independent of each other; 1 of none."""
+    p, cov = 1.0, 0.0
+    for level in trace:
+        p, cov = p * level.p, math.sqrt((1 + cov**2) * (1 + level.cov**2) - 1)
+    return LevelProduct(p, cov)
 
 
 def weighted_points(inputs: Inputs, levels: list[Chains], trace: list[Level], gamma: float) -> Sample:
@@ -317,7 +297,7 @@ def _chain_warnings(trace: list[Level]) -> list[str]:
 
 
 @dataclass(frozen=True, kw_only=True)
-class SubsetSimulation(Method):
+class SubsetSimulation(SubsetMethod):
     """Subset simulation with the component-wise modified Metropolis algorithm.
 
     P[f <= gamma] is the product of conditional probabilities P[F_j | F_(j-1)] of nested level
@@ -369,27 +349,21 @@ class SubsetSimulation(Method):
     max_levels: int = 30
 
     name: ClassVar[str] = "ss"
-    stops_at_target: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
         """Check the settings."""
+        self._check_levels()
         who = "SubsetSimulation"
-        check_count(who, "n", self.n, 10)
-        check_count(who, "max_levels", self.max_levels, 1)
-        check_setting(who, "p0", self.p0, 0.0, 0.5)
         check_choice(who, "distribution", self.distribution, ("uniform", "normal"))
         check_setting(who, "spread", self.spread, 0.0, math.inf)
 
     def steps(self, inputs: Inputs, goal: Goal, rng: np.random.Generator) -> Steps:
         """Go from level to level until the share of failures among its points is p0 or more."""
-        descent = SubsetLevels(n=self.n, p0=self.p0, max_levels=self.max_levels)
-        return (
-            yield from descent.steps(inputs, goal, rng, FixedMetropolis(self.spread, distribution=self.distribution))
-        )
+        return self._descend(inputs, goal, rng, FixedMetropolis(self.spread, distribution=self.distribution))
 
 
 @dataclass(frozen=True, kw_only=True)
-class AdaptiveSubsetSimulation(Method):
+class AdaptiveSubsetSimulation(SubsetMethod):
     """Subset simulation whose step adapts to the acceptance rate.
 
     P[f <= gamma] is the product of conditional probabilities P[F_j | F_(j-1)] of nested level
@@ -470,14 +444,11 @@ class AdaptiveSubsetSimulation(Method):
     max_levels: int = 30
 
     name: ClassVar[str] = "adss"
-    stops_at_target: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
         """Check the settings."""
+        self._check_levels()
         who = "AdaptiveSubsetSimulation"
-        check_count(who, "n", self.n, 10)
-        check_count(who, "max_levels", self.max_levels, 1)
-        check_setting(who, "p0", self.p0, 0.0, 0.5)
         check_setting(who, "scale", self.scale, 0.0, math.inf)
         check_setting(who, "target_acceptance", self.target_acceptance, 0.0, 1.0)
         check_choice(who, "proposal", self.proposal, ("conditional", "metropolis"))
@@ -495,8 +466,7 @@ class AdaptiveSubsetSimulation(Method):
         kernel = ScaledKernel(
             self.proposal, self.sigma0, self.scale, self.target_acceptance, deviations=np.ones(inputs.dim)
         )
-        descent = SubsetLevels(n=self.n, p0=self.p0, max_levels=self.max_levels)
-        return (yield from descent.steps(inputs, goal, rng, kernel, known))
+        return self._descend(inputs, goal, rng, kernel, known)
 
 
 def spend_on_subset_simulation(

@@ -9,7 +9,7 @@ and Deheeger 2013, who take P[fail | u] itself).
 """
 
 import math
-from collections.abc import Generator
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import ClassVar, NamedTuple
 
@@ -30,14 +30,13 @@ from samplers.importance import (
 from samplers.method import Goal, Interrupted, Outcome, Steps, no_outcome_share
 from samplers.methods.base import Method
 from samplers.methods.kriging import LEARNING, POOL, PROPOSAL, RUN, Kriging, Prediction, fit_kriging
-from samplers.methods.searched import marginalise_noise
+from samplers.methods.searched import SimulationSteps, Simulator, marginalise_noise
 from samplers.methods.two_stage.method import run_two_stage
 from samplers.methods.two_stage.regions import count_lineages
 from samplers.problem import FloatArray, Inputs, StandardNormal
 from samplers.proposals import Gaussian, Mixture, TiltedNormal, fit_proposal_mixture, fit_shrunk_gaussian
-from samplers.sample import Level, Status
+from samplers.sample import Status
 from samplers.statistics import (
-    Interval,
     add_unseen,
     degrees_of_freedom,
     effective_sample_size,
@@ -86,12 +85,12 @@ class Pool(NamedTuple):
         return float(np.sqrt(np.expm1(min(2 * ratio, 100.0)) / max(n, 1)))
 
 
-def isotropic_normals(dim: int, scales: tuple[float, ...]) -> list[Gaussian]:
+def isotropic_normals(dim: int, scales: Sequence[float]) -> list[Gaussian]:
     """Return N(0, s^2 I) for the scales s."""
     return [Gaussian(np.zeros(dim), scale * np.eye(dim)) for scale in scales]
 
 
-def first_mixture(dim: int, scales: tuple[float, ...]) -> Mixture:
+def first_mixture(dim: int, scales: Sequence[float]) -> Mixture:
     """Return the equal mixture of N(0, s^2 I), from which the first pool is drawn."""
     return Mixture(np.full(len(scales), 1 / len(scales)), isotropic_normals(dim, scales))
 
@@ -102,7 +101,7 @@ def draw_mixture_pool(kriging: Kriging, mixture: Mixture, n: int, rng: np.random
     return Pool(u, StandardNormal(u.shape[1]).log_prob(u) - mixture.log_prob(u), kriging.predict(u))
 
 
-def fit_mixture(pool: Pool, scales: tuple[float, ...], rng: np.random.Generator) -> Mixture:
+def fit_mixture(pool: Pool, scales: Sequence[float], rng: np.random.Generator) -> Mixture:
     """Return base, wide and fitted Gaussians, the last fitted to draws of the pool in proportion to the proposal."""
     chosen = rng.choice(len(pool.u), POOL.fitted_points, p=normalise_weights(pool.log_proposal))
     points, dim = pool.u[chosen], pool.u.shape[1]
@@ -111,19 +110,6 @@ def fit_mixture(pool: Pool, scales: tuple[float, ...], rng: np.random.Generator)
     base, wide, share = POOL.shares
     shares = [base, *np.full(len(scales) - 1, wide / (len(scales) - 1)), share]
     return Mixture(np.array(shares), [*isotropic_normals(dim, scales), fitted.widen(POOL.widening)])
-
-
-class PoolDraws(NamedTuple):
-    """Draws from a pool."""
-
-    u: FloatArray
-    """Shape (n, d)."""
-    log_weights: FloatArray
-    """log(w / (N b)), shape (n,)."""
-    part: NDArray[np.int64]
-    """What each was drawn from: 0 surrogate, 1 base, 2 wide, 3 doubted, shape (n,)."""
-    log_wide_weights: FloatArray
-    """log(phi / wide), shape (n,): the weights as draws of the wide distribution."""
 
 
 class PoolProposal(NamedTuple):
@@ -147,18 +133,18 @@ class PoolProposal(NamedTuple):
         """Squared c.o.v. that the pool itself adds: 1 / its effective number of draws that may fail."""
         return 1 / effective_sample_size(self.pool.log_weights + self.pool.prediction.log_fail)
 
-    def draw(self, n: int, rng: np.random.Generator) -> PoolDraws:
-        """Draw n of the pool."""
+    def draw(self, n: int, rng: np.random.Generator) -> tuple[NDArray[np.int64], FloatArray, NDArray[np.int64]]:
+        """Draw n of the pool: return their rows, log(w / (N b)) and the part that each was drawn from, (n,) each."""
         part = rng.choice(len(self.shares), n, p=self.shares)
         chosen = np.empty(n, dtype=np.int64)
         for k in range(len(self.shares)):
             chosen[part == k] = rng.choice(len(self.pool.u), int((part == k).sum()), p=self.parts[k])
         probability = self.shares @ self.parts[:, chosen]
         log_weights = self.pool.log_weights[chosen] - np.log(len(self.pool.u) * probability)
-        return PoolDraws(self.pool.u[chosen], log_weights, part, self.log_wide_weights[chosen])
+        return chosen, log_weights, part
 
 
-def build_pool_proposal(pool: Pool, scales: tuple[float, ...]) -> PoolProposal:
+def build_pool_proposal(pool: Pool, scales: Sequence[float]) -> PoolProposal:
     """Return the proposal for the estimate."""
     wide = first_mixture(pool.u.shape[1], scales[1:])
     log_wide_weights = StandardNormal(pool.u.shape[1]).log_prob(pool.u) - wide.log_prob(pool.u)
@@ -168,22 +154,11 @@ def build_pool_proposal(pool: Pool, scales: tuple[float, ...]) -> PoolProposal:
     return PoolProposal(pool, shares, np.array([normalise_weights(log) for log in logs]), log_wide_weights)
 
 
-def design_size(budget: int, dim: int) -> int:
-    """Return the number of points of the first design, a multiple of the number of its scales."""
-    size = min(int(LEARNING.design_share * budget), LEARNING.design_least + LEARNING.design_per_dim * dim)
-    return max(size // len(LEARNING.scales), 1) * len(LEARNING.scales)
-
-
-def learning_size(budget: int) -> int:
-    """Return the number of simulations for learning at most, the first design included."""
-    return min(int(LEARNING.share * budget), LEARNING.most)
-
-
-def draw_design(n: int, dim: int, scales: tuple[float, ...], rng: np.random.Generator) -> FloatArray:
+def draw_design(n: int, dim: int, scales: Sequence[float], rng: np.random.Generator) -> FloatArray:
     """Return n points, an equal number of each N(0, s^2 I), as Latin hypercubes, in the order of the scales s."""
-    each = n // len(scales)
     from scipy.stats import qmc  # takes a second to import
 
+    each = n // len(scales)
     cubes = [ndtri(qmc.LatinHypercube(dim, rng=rng).random(each)) for _ in scales]
     return np.concatenate([scale * cube for scale, cube in zip(scales, cubes, strict=True)])
 
@@ -221,119 +196,55 @@ SURROGATE, BASE, WIDE, DOUBTED = range(4)
 """Parts of a proposal."""
 
 
-@dataclass(frozen=True, eq=False)
-class EstimateDraws:
-    """Draws from proposals one after the other, each fixed before its own draws: p is the mean over all of them."""
-
-    draws: Draws
-    kinds: FloatArray
-    """Draws and failing draws by part of the proposal, shape (2, 4)."""
-    log_wide_weights: FloatArray
-    """log(phi / q) of all wide draws that failed, the first design's included, shape (k,)."""
-    pool_variance: float = 0.0
-    """Squared c.o.v. that the last pool adds; that of all pools is less."""
-
-    @classmethod
-    def begin(cls, log_wide_weights: FloatArray) -> "EstimateDraws":
-        """Return no draws.
-
-        Args:
-            log_wide_weights: log(phi / q) of the failing points of the first design, shape (k,).
-        """
-        return cls(Draws(0, np.empty(0), np.empty(0)), np.zeros((2, 4)), log_wide_weights)
-
-    def add(self, new: PoolDraws, f: FloatArray, x: FloatArray, gamma: float, pool_variance: float) -> "EstimateDraws":
-        """Return these and new draws with outcomes f (n,) at x (n, d) in physical space."""
-        fails = f <= gamma
-        draws = self.draws.join(Draws.from_outcomes(f, new.log_weights, x, gamma))
-        counts = [np.bincount(part, minlength=4) for part in (new.part, new.part[fails])]
-        return EstimateDraws(
-            draws,
-            self.kinds + np.array(counts),
-            np.concatenate([self.log_wide_weights, new.log_wide_weights[fails & (new.part == WIDE)]]),
-            pool_variance,
-        )
-
-    @property
-    def cov(self) -> float:
-        """C.o.v. of p, the error of the pools included."""
-        return math.hypot(self.draws.cov, math.sqrt(self.pool_variance))
-
-    def count_lineages(self, failing_batches: int) -> float:
-        """Return the independent lineages that reached failure."""
-        return max(count_lineages(failing_batches, self.log_wide_weights), 1.0)
-
-    def skill_warnings(self, least: float) -> list[str]:
-        """Return the warning that the surrogate leads to few failures, if so."""
-        n, failing = self.kinds[:, SURROGATE]
-        if failing >= least * n:
-            return []
-        return [f"Only {failing:.0f} of {n:.0f} draws proposed by the surrogate failed: it fits f poorly."]
-
-
 class SurrogateRun:
-    """One run: what has been simulated so far.
-
-    Args:
-        inputs: Without coordinates that are noise.
-        goal: Threshold, confidence, target and budget.
-        budget: Simulations to plan for.
-        rng: Source of randomness.
-    """
+    """One run, with what has been simulated so far; `inputs` are without coordinates that are noise."""
 
     def __init__(self, inputs: Inputs, goal: Goal, budget: int, rng: np.random.Generator) -> None:
-        self.inputs, self.goal, self.budget, self.rng = inputs, goal, budget, rng
+        self.goal, self.budget, self.rng = goal, budget, rng
+        self.simulator = Simulator(inputs, goal)
         self.u, self.f = np.empty((0, inputs.dim)), np.empty(0)
-        self.trace: list[Level] = []
         self.n_design, self.failing_batches = 0, 0
 
     def steps(self) -> Steps:
         """Learn; then estimate, or leave it to plain Monte Carlo."""
-        scales = LEARNING.scales
+        scales, dim = LEARNING.scales, self.simulator.inputs.dim
+        size = min(int(LEARNING.design_share * self.budget), LEARNING.design_least + LEARNING.design_per_dim * dim)
+        self.n_design = max(size // len(scales), 1) * len(scales)
         try:
-            self.n_design = design_size(self.budget, self.inputs.dim)
-            yield from self._simulate(draw_design(self.n_design, self.inputs.dim, scales, self.rng))
+            yield from self._simulate(draw_design(self.n_design, dim, scales, self.rng))
             if (self.f[: self.n_design // len(scales)] <= self.goal.gamma).mean() >= LEARNING.common_share:
                 return (yield from self.draw_base())
-            kriging = yield from self._learn()
+            kriging, mixture = yield from self._learn()
         except Interrupted:
             return self._estimate_early(Status.STOPPED)
         if not (self.f <= self.goal.gamma).any():
             about = f"None of {len(self.f):,} simulations for learning failed: base draws take the rest."
             return (yield from self.draw_base()).remark_first(about)
-        return (yield from self._estimate(kriging))
+        return (yield from self._estimate(kriging, mixture))
 
     def draw_base(self) -> Steps:
         """Spend the rest on base draws; those of the design do not count, for they may have decided it."""
-        base = TiltedNormal(np.zeros(self.inputs.dim))
-        limit, batch = self._count_draws(), max(self.budget - len(self.f), 1)
-        draws, trace, stopped = yield from simulate_until(self.inputs, base, self.goal, limit, batch, self.rng)
+        inputs, left = self.simulator.inputs, self.budget - len(self.f)
+        base, limit = TiltedNormal(np.zeros(inputs.dim)), count_final_draws(self.goal, len(self.f), left)
+        draws, trace, stopped = yield from simulate_until(inputs, base, self.goal, limit, max(left, 1), self.rng)
         if draws.n == 0:
             return self._estimate_early(Status.STOPPED if stopped else Status.BUDGET)
-        final = FinalDraws(draws, (*self.trace, *trace), 1.0, draws.n, stopped)
+        final = FinalDraws(draws, (*self.simulator.trace, *trace), 1.0, draws.n, stopped)
         return final.outcome(self.goal, Status.CONVERGED, ())
 
-    def _simulate(self, u: FloatArray) -> Generator[FloatArray, FloatArray, None]:
+    def _simulate(self, u: FloatArray) -> SimulationSteps[None]:
         """Simulate u (n, d) to learn from."""
-        f = yield self.inputs.base.from_standard_normal(u)
+        f = yield from self.simulator.evaluate(u)
         self.u, self.f = np.concatenate([self.u, u]), np.concatenate([self.f, f])
-        failing = float((f <= self.goal.gamma).mean())
-        self._record(
-            Level(gamma=self.goal.gamma, p=failing, estimate=math.nan, n_sim=len(f), n_points=len(f), cov=math.inf)
-        )
+        self.simulator.record(float((f <= self.goal.gamma).mean()), math.nan, len(f), math.inf)
 
-    def _record(self, level: Level) -> None:
-        """Add a level to the trace."""
-        self.trace.append(level)
-        self.goal.on_level(level)
-
-    def _learn(self) -> Generator[FloatArray, FloatArray, Kriging]:
+    def _learn(self) -> SimulationSteps[tuple[Kriging, Mixture]]:
         """Simulate batches where the surrogate is in doubt, until it is good enough or has its share of the budget."""
         scales = LEARNING.scales
-        most = learning_size(self.budget)
+        most = min(int(LEARNING.share * self.budget), LEARNING.most)
         size = max((most - self.n_design) // LEARNING.batches, LEARNING.least_batch)
         kriging = fit_kriging(self.u, self.f - self.goal.gamma, None)
-        mixture, good = first_mixture(self.inputs.dim, scales), 0
+        mixture, good = first_mixture(self.simulator.inputs.dim, scales), 0
         surprises = list[float]()
         while len(self.f) < most and good < 2:
             pool = draw_mixture_pool(kriging, mixture, POOL.learning_size, self.rng)
@@ -350,102 +261,78 @@ class SurrogateRun:
             good = good + 1 if failures and calibrated and forecast < LEARNING.forecast_cov else 0
             mixture = fit_mixture(pool, scales, self.rng)
             kriging = fit_kriging(self.u, self.f - self.goal.gamma, kriging)
-        self._mixture = mixture
-        return kriging
+        return kriging, mixture
 
-    def _build_proposal(self, kriging: Kriging) -> PoolProposal:
-        """Return the proposal for the estimate."""
-        scales = LEARNING.scales
+    def _build_proposal(self, kriging: Kriging, mixture: Mixture) -> tuple[PoolProposal, Mixture]:
+        """Return the proposal for the estimate, and the mixture of its pool."""
         for _ in range(POOL.final_rounds):
-            pool = draw_mixture_pool(kriging, self._mixture, POOL.final_size // 4, self.rng)
-            self._mixture = fit_mixture(pool, scales, self.rng)
-        pool = draw_mixture_pool(kriging, self._mixture, POOL.final_size, self.rng)
-        return build_pool_proposal(pool, scales)
+            pool = draw_mixture_pool(kriging, mixture, POOL.final_size // 4, self.rng)
+            mixture = fit_mixture(pool, LEARNING.scales, self.rng)
+        pool = draw_mixture_pool(kriging, mixture, POOL.final_size, self.rng)
+        return build_pool_proposal(pool, LEARNING.scales), mixture
 
-    def _count_draws(self) -> int:
-        """Return the number of draws of the estimate at most."""
-        return count_final_draws(self.goal, len(self.f), self.budget - len(self.f))
-
-    def _estimate(self, kriging: Kriging) -> Steps:
-        """Draw until the budget is used or the target is met; p rests on these draws alone.
+    def _estimate(self, kriging: Kriging, mixture: Mixture) -> Steps:
+        """Draw until the budget is used or the target is met; p rests on these draws alone, each part's mean unbiased.
 
         The surrogate learns from each part before the next one is drawn. Given what was there before it, each part's
-        mean is unbiased, and so is that of all draws.
+        mean is unbiased, and so is that of all draws. The c.o.v. holds the error of the last pool, the largest one.
         """
-        goal, stopped, made = self.goal, False, EstimateDraws.begin(self._design_log_weights())
-        left, proposal = self._count_draws(), self._build_proposal(kriging)
-        size = self._part_size(left)
-        while left > 0 and not (goal.target_cov is not None and made.draws.n and made.cov <= goal.target_cov):
-            new = proposal.draw(min(size, left), self.rng)
-            x = self.inputs.base.from_standard_normal(new.u)
+        goal, base, cov, stopped = self.goal, self.simulator.inputs.base, math.inf, False
+        draws = Draws(0, np.empty(0), np.empty(0))
+        kinds, wide = np.zeros((2, 4)), self._design_log_weights()  # draws and failing draws by part of the proposal
+        left = count_final_draws(goal, len(self.f), self.budget - len(self.f))
+        proposal, mixture = self._build_proposal(kriging, mixture)
+        size = min(RUN.largest_batch, math.ceil(left / RUN.parts))
+        if goal.target_cov is not None:
+            size = max(int(RUN.target_batch * self.budget), 1)
+        while left > 0 and not (goal.target_cov is not None and draws.n and cov <= goal.target_cov):
+            chosen, log_weights, part = proposal.draw(min(size, left), self.rng)
+            u = proposal.pool.u[chosen]
+            x = base.from_standard_normal(u)
             try:
-                f = yield x
+                f = yield from self.simulator.simulate(x)
             except Interrupted:
                 stopped = True
                 break
-            made = made.add(new, f, x, goal.gamma, proposal.pool_variance)
+            fails = f <= goal.gamma
+            draws = draws.join(Draws.from_outcomes(f, log_weights, x, goal.gamma))
+            kinds += [np.bincount(each, minlength=4) for each in (part, part[fails])]
+            wide = np.concatenate([wide, proposal.log_wide_weights[chosen][fails & (part == WIDE)]])
+            cov = math.hypot(draws.cov, math.sqrt(proposal.pool_variance))
             left -= len(f)
-            self._record_draws(f, made)
-            if left > 0 and made.draws.n < RUN.most_learned:
-                self.u, self.f = np.concatenate([self.u, new.u]), np.concatenate([self.f, f])
+            self.simulator.record(float(fails.mean()), draws.p, len(f), cov, draws.ess)
+            if left > 0 and draws.n < RUN.most_learned:
+                self.u, self.f = np.concatenate([self.u, u]), np.concatenate([self.f, f])
                 kriging = fit_kriging(self.u, self.f - goal.gamma, kriging)
-                proposal = self._build_proposal(kriging)
-        if made.draws.n == 0:
+                proposal, mixture = self._build_proposal(kriging, mixture)
+        if draws.n == 0:
             return self._estimate_early(Status.STOPPED if stopped else Status.BUDGET)
-        return self._conclude(made, proposal.largest_weight, Status.STOPPED if stopped else Status.CONVERGED)
-
-    def _part_size(self, left: int) -> int:
-        """Return the number of draws of one part."""
-        if self.goal.target_cov is not None:
-            return max(int(RUN.target_batch * self.budget), 1)
-        return min(RUN.largest_batch, math.ceil(left / RUN.parts))
-
-    def _record_draws(self, f: FloatArray, made: EstimateDraws) -> None:
-        """Add a part of the estimate, with outcomes f (n,), to the trace."""
-        level = Level(
-            gamma=self.goal.gamma,
-            p=float((f <= self.goal.gamma).mean()),
-            estimate=made.draws.p,
-            n_sim=len(f),
-            n_points=len(f),
-            cov=made.cov,
-            ess=made.draws.ess,
-        )
-        self._record(level)
-
-    def _conclude(self, made: EstimateDraws, largest_weight: float, status: Status) -> Outcome:
-        """Return what the draws of the estimate say, the upper end raised by what was not found."""
-        outcome = self._outcome(made.draws, made.cov, largest_weight, status)
-        lineages = made.count_lineages(self.failing_batches)
-        high = add_unseen(made.draws.p, outcome.interval[1], lineages, self.goal.confidence)
+        outcome = self._outcome(draws, cov, proposal.largest_weight, Status.STOPPED if stopped else Status.CONVERGED)
+        lineages = max(count_lineages(self.failing_batches, wide), 1.0)
+        n, failing = kinds[:, SURROGATE]
+        poor = f"Only {failing:.0f} of {n:.0f} draws proposed by the surrogate failed: it fits f poorly."
         return replace(
             outcome,
-            interval=(outcome.interval[0], high),
-            warnings=(*outcome.warnings, *made.skill_warnings(RUN.least_skill)),
-            base_draws=int(made.kinds[0, BASE]),
-            sample=replace(made.draws.sample, lineages=lineages),
+            interval=(outcome.interval[0], add_unseen(draws.p, outcome.interval[1], lineages, goal.confidence)),
+            warnings=(*outcome.warnings, *([poor] if failing < RUN.least_skill * n else [])),
+            base_draws=int(kinds[0, BASE]),
+            sample=replace(draws.sample, lineages=lineages),
         )
 
     def _design_log_weights(self, *, failing: bool = True) -> FloatArray:
         """Return log(phi / q) of the points of the design, q the equal mixture of its scales; of the failing ones."""
         u, f = self.u[: self.n_design], self.f[: self.n_design]
         u = u[f <= self.goal.gamma] if failing else u
-        design = first_mixture(self.inputs.dim, LEARNING.scales)
-        return StandardNormal(self.inputs.dim).log_prob(u) - design.log_prob(u)
+        dim = u.shape[1]
+        return StandardNormal(dim).log_prob(u) - first_mixture(dim, LEARNING.scales).log_prob(u)
 
     def _estimate_early(self, status: Status) -> Outcome:
         """Return what the first design says, for a run that ends before its estimate."""
         n = self.n_design
-        x = self.inputs.base.from_standard_normal(self.u[:n])
+        x = self.simulator.inputs.base.from_standard_normal(self.u[:n])
         draws = Draws.from_outcomes(self.f[:n], self._design_log_weights(failing=False), x, self.goal.gamma)
         outcome = self._outcome(draws, draws.cov, float(len(LEARNING.scales)), status)
         return replace(outcome, draw_weights=draws.weights_after(0))
-
-    def _interval(self, draws: Draws, cov: float, largest_weight: float) -> Interval:
-        """Return the interval of p from weighted draws, for the regions that they know of."""
-        if draws.ess < RUN.least_ess:
-            return weighted_interval(draws, self.goal.confidence, largest_weight, cov)
-        return log_normal_interval(draws.p, cov, self.goal.confidence, degrees_of_freedom(draws.ess, independent=True))
 
     def _outcome(self, draws: Draws, cov: float, largest_weight: float, status: Status) -> Outcome:
         """Return what weighted draws say of p; no weight exceeds `largest_weight`.
@@ -453,19 +340,23 @@ class SurrogateRun:
         That they are few is a remark here, no warning: with a few hundred simulations it is the rule, and the interval
         knows it (12 of the 40 runs in `benchmarks/results/few_simulations.jsonl`, whose intervals all held p).
         """
-        none = len(draws.f) == 0
-        ended = Status.NO_HITS if status is Status.CONVERGED and none else status
+        none, confidence, trace = len(draws.f) == 0, self.goal.confidence, tuple(self.simulator.trace)
+        if draws.ess < RUN.least_ess:
+            interval = weighted_interval(draws, confidence, largest_weight, cov)
+        else:
+            freedom = degrees_of_freedom(draws.ess, independent=True)
+            interval = log_normal_interval(draws.p, cov, confidence, freedom)
         return Outcome(
             p=min(draws.p, 1.0),
-            interval=self._interval(draws, cov, largest_weight),
+            interval=interval,
             cov=cov,
-            status=ended,
+            status=Status.NO_HITS if status is Status.CONVERGED and none else status,
             warnings=tuple(weight_warnings(draws) if none else heavy_draw_warnings(draws)),
             remarks=() if none else tuple(describe_low_ess(draws)),
-            trace=tuple(self.trace),
+            trace=trace,
             no_outcome_share=no_outcome_share(draws.f, draws.log_weights),
             sample=draws.sample,
-            draw_weights=draws.weights_after(sum(level.n_sim for level in self.trace) - draws.n),
+            draw_weights=draws.weights_after(sum(level.n_sim for level in trace) - draws.n),
         )
 
 

@@ -165,8 +165,9 @@ def test_common_failures_are_left_to_monte_carlo(half_spaces):
 
 
 def test_without_any_failure_p_is_0_with_an_upper_end(half_spaces):
-    problem, _, _ = half_spaces(50, 1e-4, shares=(1.0,))
-    safe = samplers.FunctionProblem(dim=50, terms=lambda x: 9.0 + x[:, :1] ** 2, gradient=problem.gradient.function)
+    _, _, normals = half_spaces(50, 1e-4, shares=(1.0,))
+    options = {"terms": lambda x: 9.0 + x[:, :1] ** 2, "gradient": lambda x, term: -normals[term]}
+    safe = samplers.FunctionProblem(dim=50, **options)
     result = samplers.estimate(safe, seed=1, max_sim=3000)
     assert result.p == 0 < result.interval[1] < 0.05
     assert result.status is Status.NO_HITS
