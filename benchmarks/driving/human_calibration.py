@@ -27,14 +27,14 @@ from benchmarks import RESULTS
 from rare_envs.control.human_driver import MAX_HUMAN_BRAKING, HumanDriverModel
 from rare_envs.distributions import EventFrequency, FittedDistribution
 from rare_envs.egos.human import HumanEgo
-from rare_envs.exposure.human_benchmarks import (
+from rare_envs.exposure import (
     CUT_IN_CONTACTS_100CAR,
     CUT_IN_NEAR_CRASHES_100CAR,
+    MILLION_KM,
     REAR_END_CONTACTS_100CAR,
     REAR_END_NEAR_CRASHES_100CAR,
     HumanBenchmark,
 )
-from rare_envs.exposure.rate import MILLION_KM
 from rare_envs.measures import find_measure
 from rare_envs.measures.longitudinal import MAX_BRAKING, RAPID_BRAKING
 from rare_envs.measures.registry import Combined

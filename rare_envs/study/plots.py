@@ -18,9 +18,7 @@ from numpy.typing import NDArray
 import samplers
 from rare_envs.distributions.space import ScenarioSpace
 from rare_envs.egos.errors import EgoGone, reason_of
-from rare_envs.exposure.human_benchmarks import CONTACTS_100CAR, REAR_END_CONTACTS_100CAR
-from rare_envs.exposure.rate import RateInterval
-from rare_envs.exposure.total_rate import TotalRate
+from rare_envs.exposure import CONTACTS_100CAR, REAR_END_CONTACTS_100CAR, RateInterval, TotalRate
 from rare_envs.files import replace_file
 from rare_envs.study.columns import draw_ordinary, list_columns
 from rare_envs.study.replay import Drive, drive_again

@@ -16,8 +16,7 @@ from agents.saved_ego import SavedEgo
 from rare_envs.distributions.fitted import EventFrequency, FittedDistribution
 from rare_envs.distributions.space import Distribution
 from rare_envs.egos.wrappers import describe_missing_normalisation
-from rare_envs.exposure import HUMAN_BENCHMARKS
-from rare_envs.exposure.rate import CollisionProbability, CollisionRate, explain_no_frequency, read_source
+from rare_envs.exposure import HUMAN_BENCHMARKS, CollisionProbability, CollisionRate, explain_no_frequency, read_source
 from rare_envs.measures.base import Measure
 from rare_envs.measures.registry import MEASURES
 from rare_envs.scenarios.registry import find_scenario

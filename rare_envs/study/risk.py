@@ -14,8 +14,14 @@ import numpy as np
 
 from rare_envs.distributions.fitted import EventFrequency, FittedDistribution
 from rare_envs.distributions.space import Distribution
-from rare_envs.exposure import HUMAN_BENCHMARKS, CollisionRate, TotalRate, describe_human_contacts
-from rare_envs.exposure.rate import MILLION_KM, read_site
+from rare_envs.exposure import (
+    HUMAN_BENCHMARKS,
+    MILLION_KM,
+    CollisionRate,
+    TotalRate,
+    describe_human_contacts,
+    read_site,
+)
 from rare_envs.files import format_json, replace_text
 from rare_envs.plugins import did_you_mean
 from rare_envs.scenarios.base import Scenario

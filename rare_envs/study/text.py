@@ -11,9 +11,15 @@ import numpy as np
 from rich.console import Console
 
 import samplers
-from rare_envs.exposure import describe_human_contacts, summarise_human_contacts
-from rare_envs.exposure.rate import CollisionRate, RateInterval
-from rare_envs.exposure.total_rate import FurtherEvents, TotalRate, VarianceShare
+from rare_envs.exposure import (
+    CollisionRate,
+    FurtherEvents,
+    RateInterval,
+    TotalRate,
+    VarianceShare,
+    describe_human_contacts,
+    summarise_human_contacts,
+)
 from rare_envs.measures import MEASURES
 from rare_envs.study.columns import MAX_SHOWN, draw_ordinary, find_ordinary_range, format_value, list_columns
 from rare_envs.study.modes import KIND_DESCRIPTIONS

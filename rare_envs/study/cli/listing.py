@@ -14,7 +14,7 @@ from rich.text import Text
 import samplers
 from agents.learned.networks import HEAD_SIZE
 from rare_envs.distributions.fitted import FittedDistribution
-from rare_envs.exposure.rate import explain_no_frequency, read_source
+from rare_envs.exposure import explain_no_frequency, read_source
 from rare_envs.measures.base import Measure, TraceMeasure
 from rare_envs.measures.registry import MEASURES
 from rare_envs.plugins import did_you_mean

@@ -6,7 +6,7 @@ import math
 
 import pytest
 
-from rare_envs.exposure.total_rate import TotalRate
+from rare_envs.exposure import TotalRate
 from rare_envs.study.text import (
     describe_uncertainty,
     format_rate,
