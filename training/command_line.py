@@ -36,11 +36,7 @@ class RecordingOptions:
     """Names of the options."""
 
     def kind_and_path(self) -> tuple[str, Path]:
-        """Return the option that is given, such as "highd", and its path.
-
-        Raises:
-            ValueError: None is given, or several are.
-        """
+        """Return the option that is given, such as "highd", and its path; a ValueError without one, or with several."""
         given = [(kind, getattr(self, kind)) for kind in self.KINDS if getattr(self, kind) is not None]
         if len(given) != 1:
             options = [f"--{kind}" for kind in self.KINDS]
@@ -63,11 +59,7 @@ class EventOptions(RecordingOptions):
 
 @dataclass(frozen=True, kw_only=True)
 class DriverTrainingOptions:
-    """Options of each command that trains drivers of the traffic.
-
-    The defaults are those of `training.imitation.config.Config`, written out because importing that takes
-    seconds.
-    """
+    """Options of each command that trains drivers: with the defaults of `Config`, which takes seconds to import."""
 
     method: Annotated[Literal["gail", "mgail"], typer.Option(help="Algorithm.")] = "mgail"
     seed: Annotated[int, typer.Option(help="The same seed gives the same weights.")] = 0
@@ -77,14 +69,7 @@ class DriverTrainingOptions:
 
 @contextlib.contextmanager
 def report_errors(program: str) -> Iterator[None]:
-    """Print an error of the arguments or of a file in one line, and exit with code 2.
-
-    Args:
-        program: Name that the line begins with.
-
-    Raises:
-        typer.Exit: The block raises OSError or ValueError.
-    """
+    """Print an error of the arguments or of a file in one line with the program's name, and exit with code 2."""
     try:
         yield
     except (OSError, ValueError) as error:
@@ -93,11 +78,7 @@ def report_errors(program: str) -> Iterator[None]:
 
 
 def run_command(command: Callable[..., None]) -> None:
-    """Run a function as the program that the command line calls, and end the process.
-
-    Args:
-        command: Function whose parameters are the options; its docstring is the help.
-    """
+    """Run a function as the program, its parameters as options and its docstring as help, and end the process."""
     app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
     app.command()(command)
     app()

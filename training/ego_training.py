@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
 import math
 import os
 import time
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
@@ -22,7 +21,10 @@ from rare_envs.files import replace_file
 from rare_envs.plugins import did_you_mean
 from rare_envs.threads import use_one_thread
 from samplers.estimation import NARROW_TERMINAL
-from training.ego_checkpoint import load_checkpoint, restore_model, save_checkpoint
+from training.checkpoints import load_checkpoint, restore_model, save_checkpoint
+
+if TYPE_CHECKING:
+    from rich.progress import Progress
 
 CHECKPOINT_SUFFIX, CHECKPOINT_SECONDS = ".checkpoint", 30.0
 """Ending of the file beside the ego, and the time between checkpoints [s]."""
@@ -47,53 +49,24 @@ class Hyperparameters:
 # A simulation step of hundreds of environments costs about as much as one of a few, so rollouts are
 # short and wide, batches large and networks small. Returns look about 5 s ahead (gamma = 0.98 at
 # 0.1 s). Exploration starts small: random steering leaves the road before braking is learnt.
-ON_POLICY: Mapping[str, Any] = {"gamma": 0.98, "gae_lambda": 0.95}
-OFF_POLICY: Mapping[str, Any] = {
-    "gamma": 0.98,
-    "batch_size": 1024,
-    "train_freq": 1,  # one step of the whole batch ...
-    "gradient_steps": 8,  # ... then this many updates
-}
-ACTOR_CRITIC: Mapping[str, Any] = {
-    "net_arch": {"pi": [32, 32], "vf": [64, 64]},  # the actor runs in every estimate, the critic not
-    "log_std_init": -1.5,
-}
-OFF_POLICY_NETS: Mapping[str, Any] = {"net_arch": [64, 64]}
+_ON_POLICY = {"gamma": 0.98, "gae_lambda": 0.95}
+# Off-policy: one step of the whole batch, then this many updates.
+_OFF_POLICY = {"gamma": 0.98, "batch_size": 1024, "train_freq": 1, "gradient_steps": 8, "learning_rate": 1e-3}
+# The actor runs in every estimate, the critic not.
+_ACTOR_CRITIC = {"net_arch": {"pi": [32, 32], "vf": [64, 64]}, "log_std_init": -1.5}
+_NETS = {"net_arch": [64, 64]}
+_PPO = {**_ON_POLICY, "n_steps": 32, "batch_size": 2048, "n_epochs": 10, "learning_rate": 1e-3}
+_A2C = {**_ON_POLICY, "n_steps": 5, "learning_rate": 3e-3, "normalize_advantage": True}
+_DQN = {"exploration_fraction": 0.3, "exploration_final_eps": 0.02, "target_update_interval": 4096}
 HYPERPARAMETERS: Mapping[str, Hyperparameters] = MappingProxyType(
     {
-        "ppo": Hyperparameters(
-            {
-                **ON_POLICY,
-                "n_steps": 32,
-                "batch_size": 2048,
-                "n_epochs": 10,
-                "learning_rate": 1e-3,
-            },
-            ACTOR_CRITIC,
-        ),
-        "a2c": Hyperparameters(
-            {**ON_POLICY, "n_steps": 5, "learning_rate": 3e-3, "normalize_advantage": True},
-            ACTOR_CRITIC,
-        ),
-        "sac": Hyperparameters({**OFF_POLICY, "learning_rate": 1e-3}, OFF_POLICY_NETS),
-        "td3": Hyperparameters({**OFF_POLICY, "learning_rate": 1e-3}, OFF_POLICY_NETS, noise=0.2),
-        "dqn": Hyperparameters(
-            {
-                **OFF_POLICY,
-                "learning_rate": 1e-3,
-                "exploration_fraction": 0.3,
-                "exploration_final_eps": 0.02,
-                "target_update_interval": 4096,
-            },
-            OFF_POLICY_NETS,
-            discrete=True,
-        ),
+        "ppo": Hyperparameters(_PPO, _ACTOR_CRITIC),
+        "a2c": Hyperparameters(_A2C, _ACTOR_CRITIC),
+        "sac": Hyperparameters(_OFF_POLICY, _NETS),
+        "td3": Hyperparameters(_OFF_POLICY, _NETS, noise=0.2),
+        "dqn": Hyperparameters({**_OFF_POLICY, **_DQN}, _NETS, discrete=True),
     }
 )
-
-
-FAILURE_SHARE = 0.25
-"""Share of episodes that begin in a failure."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,7 +105,7 @@ class Retraining:
     """The `.zip` of the ego."""
     failures: FloatArray = field(repr=False)
     """Scenarios in the order of x of the environment, shape (k, d)."""
-    share: float = FAILURE_SHARE
+    share: float = 0.25
     """Share of episodes that begin in one of the failures, drawn uniformly; the others begin in ordinary scenarios."""
 
     def __post_init__(self) -> None:
@@ -146,11 +119,7 @@ class Retraining:
         object.__setattr__(self, "failures", x)
 
     def arguments(self) -> dict[str, str]:
-        """Return what a checkpoint notes of it: a resumed training has to go on from the same ego and failures.
-
-        Raises:
-            OSError: The ego's file cannot be read.
-        """
+        """Return what a checkpoint notes of it: a resumed training has to go on from the same ego and failures."""
         if not self.ego.is_file():
             raise FileNotFoundError(f"No ego at {str(self.ego)!r}.")
         ego, failures = (
@@ -159,11 +128,7 @@ class Retraining:
         return {"retrained": ego, "failures": failures, "failure_share": str(self.share)}
 
     def mix(self, space: ScenarioSpace) -> ScenarioSpace:
-        """Return the space of an environment with the failures among its draws.
-
-        Raises:
-            ValueError: The failures are not of this space.
-        """
+        """Return the space of an environment with the failures, which have to be of it, among its draws."""
         mixed = ScenariosWithFailures(space.base, space.validate(self.failures), self.share)
         return replace(space, base=cast(Distribution, mixed))  # an environment only draws
 
@@ -215,7 +180,9 @@ def train_ego(
         ...     print(path.name, load_ego(path).algorithm)
         ego.zip a2c
     """
-    hyperparameters = _find_hyperparameters(algo)
+    if algo not in HYPERPARAMETERS:
+        hint = did_you_mean(algo.lower(), HYPERPARAMETERS)
+        raise ValueError(f"Unknown algorithm {algo!r}{hint}; expected one of {', '.join(HYPERPARAMETERS)}.")
     if steps < 1:
         raise ValueError(f"Expected steps >= 1, got {steps}.")
     if not 0 <= seed < 2**32:
@@ -228,15 +195,18 @@ def train_ego(
     arguments |= {name: str(value) for name, value in make_kwargs.items() if value is not None}
     arguments |= {} if retraining is None else retraining.arguments()
     checkpoint = target.with_suffix(CHECKPOINT_SUFFIX)
-    saved = _find_checkpoint(checkpoint, arguments, resume)
-
-    from stable_baselines3.common.callbacks import ConvertCallback
+    if checkpoint.exists() and not resume:
+        raise ValueError(f"There is an unfinished training in {str(checkpoint)!r}: go on with --resume, or remove it.")
+    if resume and not checkpoint.exists():
+        raise ValueError(f"There is no training to resume: no {str(checkpoint)!r}.")
+    saved = load_checkpoint(checkpoint, arguments) if resume else None
 
     from training.vec_env import sb3_vec_env
 
+    hyperparameters = HYPERPARAMETERS[algo]
     env = sb3_vec_env(env_id, num_envs, discrete=hyperparameters.discrete, **make_kwargs)
     try:
-        with use_one_thread(), _progress_bar(steps, progress) as callback:
+        with use_one_thread(), _progress_bar(progress) as bar:
             settings = _fit_to_run(hyperparameters, num_envs, steps)
             if retraining is None:
                 model = _make_model(algo, env, seed, settings, hyperparameters.policy, device)
@@ -245,10 +215,8 @@ def train_ego(
             if saved is not None:
                 model.get_env().reset()
                 restore_model(model, saved)
-            keep = _make_checkpoints(checkpoint, arguments, checkpoint_interval)
-            callbacks = [keep] if callback is None else [keep, ConvertCallback(callback)]
-            left = steps - model.num_timesteps
-            model.learn(left, callback=callbacks, reset_num_timesteps=saved is None)
+            callback = _make_callback(bar, steps, checkpoint, arguments, checkpoint_interval)
+            model.learn(steps - model.num_timesteps, callback=callback, reset_num_timesteps=saved is None)
         with replace_file(target) as draft:
             model.save(draft)
         checkpoint.unlink(missing_ok=True)
@@ -262,24 +230,22 @@ def _make_model(
 ) -> Any:
     """Return a new model; ReLU is the activation of its networks unless `policy` names another."""
     import stable_baselines3
+    from gymnasium.spaces import Dict
+    from stable_baselines3.common.preprocessing import is_image_space
     from torch import nn
 
+    space = env.observation_space
+    name = "MultiInputPolicy" if isinstance(space, Dict) else "CnnPolicy" if is_image_space(space) else "MlpPolicy"
+    device = device if name != "MlpPolicy" else "cpu"  # on which small networks learn sooner, as SB3 says too
     algorithm = getattr(stable_baselines3, algo.upper())  # its classes are named so
     policy = {"activation_fn": nn.ReLU, **policy}
-    name = _policy_name(env.observation_space)
-    device = device if name != "MlpPolicy" else "cpu"  # on which small networks learn sooner, as SB3 says too
     return algorithm(name, env, policy_kwargs=policy, seed=seed, device=device, **settings)
 
 
 def _continue_model(
     retraining: Retraining, algo: str, env: Any, seed: int, settings: Mapping[str, Any], device: str
 ) -> Any:
-    """Return the model of an ego to train on, in an environment that draws its failures too.
-
-    Raises:
-        ValueError: The ego cannot be trained on here, or the failures are not of this environment.
-        OSError: The ego's file cannot be read.
-    """
+    """Return the model of an ego to train on, in an environment that draws its failures too."""
     from agents.saved_ego import load_saved_ego
 
     saved = load_saved_ego(retraining.ego, None)
@@ -304,11 +270,7 @@ def check_retrainable(saved: Any, algo: str, env: Any) -> None:
 
 
 def restore_parameters(model: Any, saved: Any) -> None:
-    """Give a new model of equal networks the networks, optimisers and entropy coefficient of an `agents.SavedEgo`.
-
-    Raises:
-        ValueError: The file has other networks, or nothing of its training.
-    """
+    """Give a new model of equal networks the networks, optimisers and entropy coefficient of an `agents.SavedEgo`."""
     from stable_baselines3.common.save_util import load_from_zip_file, recursive_getattr
 
     try:
@@ -334,57 +296,6 @@ def continue_settings(arguments: Mapping[str, Any]) -> dict[str, Any]:
     return changed
 
 
-def _find_checkpoint(path: Path, arguments: Mapping[str, Any], resume: bool) -> dict[str, Any] | None:
-    """Return the checkpoint to go on from; None to begin anew.
-
-    Raises:
-        ValueError: There is one and it is not to be resumed, or the other way round, or it does not fit.
-    """
-    if path.exists() and not resume:
-        raise ValueError(f"There is an unfinished training in {str(path)!r}: go on with --resume, or remove it.")
-    if not path.exists() and resume:
-        raise ValueError(f"There is no training to resume: no {str(path)!r}.")
-    return load_checkpoint(path, arguments) if resume else None
-
-
-def _make_checkpoints(path: Path, arguments: Mapping[str, Any], interval: float) -> Any:
-    """Return the callback that writes checkpoints."""
-    from stable_baselines3.common.callbacks import BaseCallback
-
-    class Checkpoints(BaseCallback):
-        """Writes a checkpoint where a rollout begins, when the last one is old enough."""
-
-        written = time.monotonic()
-
-        def _on_rollout_start(self) -> None:
-            if time.monotonic() - self.written >= interval:
-                save_checkpoint(path, arguments, self.model)
-                self.written = time.monotonic()
-
-        def _on_step(self) -> bool:
-            return True
-
-    return Checkpoints()
-
-
-def _policy_name(space: Any) -> str:
-    """Return Stable-Baselines3's name of a policy for such observations."""
-    from gymnasium.spaces import Dict
-    from stable_baselines3.common.preprocessing import is_image_space
-
-    if isinstance(space, Dict):
-        return "MultiInputPolicy"
-    return "CnnPolicy" if is_image_space(space) else "MlpPolicy"
-
-
-def _find_hyperparameters(algo: str) -> Hyperparameters:
-    """Return the hyperparameters of an algorithm."""
-    if algo not in HYPERPARAMETERS:
-        hint = did_you_mean(algo.lower(), HYPERPARAMETERS)
-        raise ValueError(f"Unknown algorithm {algo!r}{hint}; expected one of {', '.join(HYPERPARAMETERS)}.")
-    return HYPERPARAMETERS[algo]
-
-
 def _fit_to_run(hyperparameters: Hyperparameters, num_envs: int, steps: int) -> dict[str, Any]:
     """Return arguments of the algorithm, adapted to a run that may be smaller than the settings assume."""
     arguments = dict(hyperparameters.settings)
@@ -401,11 +312,7 @@ def _fit_to_run(hyperparameters: Hyperparameters, num_envs: int, steps: int) -> 
 
 
 def _prepare_target(out: Path) -> Path:
-    """Return the file to write, with its folder made.
-
-    Raises:
-        ValueError: It cannot be written.
-    """
+    """Return the file to write, with its folder made; a ValueError if it cannot be written."""
     if out.is_dir():
         raise ValueError(f"Expected a file to write, got the folder {str(out)!r}; name a .zip.")
     target = out if out.suffix == ".zip" else out.with_name(f"{out.name}.zip")
@@ -413,21 +320,13 @@ def _prepare_target(out: Path) -> Path:
         target.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise ValueError(f"Cannot make the folder {str(target.parent)!r}: {error}.") from error
-    existing = target if target.exists() else target.parent
-    if not os.access(existing, os.W_OK):
+    if not os.access(target if target.exists() else target.parent, os.W_OK):
         raise ValueError(f"Cannot write {str(target)!r}: no permission.")
     return target
 
 
-Callback = Callable[[dict[str, Any], dict[str, Any]], bool]
-
-
-@contextlib.contextmanager
-def _progress_bar(steps: int, show: bool) -> Iterator[Callback | None]:
-    """Show a bar on standard error; yield the callback that advances it."""
-    if not show:
-        yield None
-        return
+def _progress_bar(show: bool) -> Progress:
+    """Return a bar on standard error, narrow where the terminal is."""
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
@@ -441,18 +340,31 @@ def _progress_bar(steps: int, show: bool) -> Iterator[Callback | None]:
         time_left,
         TextColumn("{task.description}"),
     )
-    crashes: deque[bool] = deque(maxlen=RECENT)
-    with Progress(*(columns if console.width >= NARROW_TERMINAL else narrow), console=console) as bar:
-        task = bar.add_task("", total=steps)
+    return Progress(*(columns if console.width >= NARROW_TERMINAL else narrow), console=console, disable=not show)
 
-        def on_step(local: dict[str, Any], _: dict[str, Any]) -> bool:
-            model = local["self"]
-            crashes.extend(bool(info["collision"]) for info in local["infos"] if "collision" in info)
-            done = min(model.num_timesteps, steps)
-            bar.update(task, completed=done, description=_summary(model.ep_info_buffer, crashes))
+
+def _make_callback(bar: Progress, steps: int, path: Path, arguments: Mapping[str, Any], interval: float) -> Any:
+    """Return the callback that advances the bar, and writes a checkpoint where a rollout begins, after an interval."""
+    from stable_baselines3.common.callbacks import BaseCallback
+
+    task, crashes = bar.add_task("", total=steps), deque[bool](maxlen=RECENT)
+
+    class Callback(BaseCallback):
+        written = time.monotonic()
+
+        def _on_rollout_start(self) -> None:
+            if time.monotonic() - self.written >= interval:
+                save_checkpoint(path, arguments, self.model)
+                self.written = time.monotonic()
+
+        def _on_step(self) -> bool:
+            if not bar.disable:
+                crashes.extend(bool(info["collision"]) for info in self.locals["infos"] if "collision" in info)
+                done = min(self.model.num_timesteps, steps)
+                bar.update(task, completed=done, description=_summary(self.model.ep_info_buffer, crashes))
             return True
 
-        yield on_step
+    return Callback()
 
 
 def _summary(episodes: deque[dict[str, Any]] | None, crashes: deque[bool]) -> str:

@@ -113,15 +113,7 @@ class BatchedVecEnv(VecEnv):
     """
 
     def __init__(self, env: VectorEnv[Any, Any, Any], discrete_actions: NDArray[Any] | None = None) -> None:
-        """Wrap a batch.
-
-        Args:
-            env: The batch; its autoreset mode has to be same-step.
-            discrete_actions: Continuous actions to choose from by index, shape (K, 2), or None.
-
-        Raises:
-            ValueError: The batch resets in another mode, which `VecEnv` cannot express.
-        """
+        """Wrap a batch with same-step autoreset; continuous actions (K, 2) may be chosen from by index."""
         mode = env.metadata.get("autoreset_mode")
         if mode != AutoresetMode.SAME_STEP:
             raise ValueError(f"Expected a VectorEnv with same-step autoreset, got {mode}.")
@@ -173,22 +165,14 @@ class BatchedVecEnv(VecEnv):
         return [value for _ in self._get_indices(indices)]
 
     def set_attr(self, attr_name: str, value: Any, indices: Indices = None) -> None:
-        """Set an attribute of the batch; for all environments or not at all.
-
-        Raises:
-            ValueError: `indices` leaves some out.
-        """
+        """Set an attribute of the batch; for all environments or not at all."""
         self._refuse_part(indices, attr_name)
         setattr(self.env.unwrapped, attr_name, value)
 
     def env_method(
         self, method_name: str, *method_args: Any, indices: Indices = None, **method_kwargs: Any
     ) -> list[Any]:
-        """Call a method of the batch once; its result stands for each environment.
-
-        Raises:
-            ValueError: `indices` leaves some environments out.
-        """
+        """Call a method of the batch once, for all environments; its result stands for each."""
         self._refuse_part(indices, method_name)
         result = self._find(method_name)(*method_args, **method_kwargs)
         return [result for _ in range(self.num_envs)]
@@ -216,11 +200,7 @@ class BatchedVecEnv(VecEnv):
 
 
 def merge_options(options: Sequence[Mapping[str, Any]]) -> dict[str, Any] | None:
-    """Join reset options of B environments into those of a batch, stacked along a new first axis; None without any.
-
-    Raises:
-        ValueError: Their names differ.
-    """
+    """Join reset options of B environments, of the same names, into those of a batch (B, ...); None without any."""
     if not any(options):
         return None
     names = set(options[0])

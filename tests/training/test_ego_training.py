@@ -27,7 +27,7 @@ from rare_envs import DrivingProblem
 from rare_envs.control.actions import DISCRETE_ACTIONS
 from rare_envs.threads import use_one_thread
 from training import sb3_vec_env, train_ego
-from training.ego_checkpoint import load_checkpoint
+from training.checkpoints import load_checkpoint
 from training.ego_training import (
     Retraining,
     ScenariosWithFailures,
@@ -92,16 +92,6 @@ def test_progress_goes_to_standard_error(tmp_path: Path, capsys: pytest.CaptureF
     assert captured.out == ""
     assert "steps" in captured.err
     assert "collisions" in captured.err
-
-
-def test_the_number_of_threads_is_restored(tmp_path: Path) -> None:
-    before = torch.get_num_threads()
-    torch.set_num_threads(2)
-    try:
-        train_ego(ENV, steps=64, num_envs=4, out=tmp_path / "ego.zip", progress=False)
-        assert torch.get_num_threads() == 2
-    finally:
-        torch.set_num_threads(before)
 
 
 def test_an_unknown_environment_leaves_no_folder_behind(tmp_path: Path) -> None:
@@ -289,16 +279,6 @@ def test_a_resumed_retraining_ends_alike(egos: Path, tmp_path: Path, monkeypatch
     assert torch.equal(weights(resumed), weights(whole))
 
 
-def test_sac_keeps_its_entropy_coefficient(egos: Path) -> None:
-    saved = load_saved_ego(egos / "sac.zip", None)
-    from stable_baselines3 import SAC
-
-    model = SAC("MlpPolicy", sb3_vec_env(ENV, 2), policy_kwargs=saved.model.policy_kwargs, device="cpu")
-    fresh = model.log_ent_coef.item()
-    restore_parameters(model, saved)
-    assert model.log_ent_coef.item() != fresh
-
-
 def test_what_does_not_fit_is_refused_before_training(egos: Path, tmp_path: Path) -> None:
     out = {"out": tmp_path / "on.zip", "progress": False, "steps": STEPS, "num_envs": ROWS}
     with pytest.raises(ValueError, match=r"Expected an ego trained by ppo, got .*a2c.zip.*, trained by a2c"):
@@ -343,7 +323,11 @@ def test_a_training_that_goes_on_explores_as_at_its_end_and_learns_at_once() -> 
     assert continue_settings({"n_steps": 8}) == {"n_steps": 8}  # PPO has none of these arguments
 
 
-@pytest.mark.parametrize("share", [0.0, 1.0, -0.1, float("nan")])
-def test_a_share_keeps_both_kinds(share: float) -> None:
-    with pytest.raises(ValueError, match="share of failures above 0 and below 1"):
-        Retraining(Path("ego.zip"), FAILURE, share)
+def test_sac_keeps_its_entropy_coefficient(egos: Path) -> None:
+    saved = load_saved_ego(egos / "sac.zip", None)
+    from stable_baselines3 import SAC
+
+    model = SAC("MlpPolicy", sb3_vec_env(ENV, 2), policy_kwargs=saved.model.policy_kwargs, device="cpu")
+    fresh = model.log_ent_coef.item()
+    restore_parameters(model, saved)
+    assert model.log_ent_coef.item() != fresh

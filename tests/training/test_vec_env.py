@@ -9,10 +9,8 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
-from stable_baselines3 import PPO
-from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.monitor import Monitor
-from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecMonitor, VecNormalize
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecMonitor
 
 import rare_envs
 import training
@@ -22,9 +20,9 @@ from rare_envs.envs.parallel import AgentsVectorEnv
 from rare_envs.multi_agent import adversary_reward
 from rare_envs.threads import use_one_thread
 from training import sb3_vec_env
-from training.vec_env import BatchedVecEnv, info_row, merge_options
+from training.vec_env import BatchedVecEnv
 
-FOLLOWING, CUT_IN = IDS = ("rare_envs/CarFollowing-v0", "rare_envs/CutIn-v0")
+FOLLOWING, CUT_IN = "rare_envs/CarFollowing-v0", "rare_envs/CutIn-v0"
 
 
 class Countdown(gym.Env[np.ndarray, np.ndarray]):
@@ -94,14 +92,6 @@ def test_an_ended_episode_shows_its_end_and_the_next_one_begins() -> None:
     np.testing.assert_array_equal(observation[1], [first[1, 0], 3, 0])
 
 
-def test_a_time_limit_is_told_from_an_end() -> None:
-    env = BatchedVecEnv(batch(9, 4, limit=4))  # the second ends on its own at the same step
-    env.reset()
-    _, _, done, infos = steps(env, 4)
-    assert done.all()
-    assert [info["TimeLimit.truncated"] for info in infos] == [True, False]
-
-
 def test_it_agrees_with_the_vec_env_of_stable_baselines() -> None:
     rng = np.random.default_rng(0)
     lengths = (2, 3, 7)
@@ -125,31 +115,6 @@ def test_it_agrees_with_the_vec_env_of_stable_baselines() -> None:
             assert mine[3][row][truncated] == reference[3][row][truncated]
 
 
-def test_the_monitor_sees_returns_and_lengths() -> None:
-    env = VecMonitor(BatchedVecEnv(batch(3, 4)))
-    env.reset()
-    infos = steps(env, 3)[3]
-    assert infos[0]["episode"]["r"] == 1 + 2 + 3
-    assert infos[0]["episode"]["l"] == 3
-    infos = steps(env, 1)[3]
-    assert infos[1]["episode"]["r"] == 1 + 2 + 3 + 4
-    returns, lengths = evaluate_policy(
-        PPO("MlpPolicy", env, n_steps=8, batch_size=16, device="cpu"),
-        env,
-        n_eval_episodes=4,
-        return_episode_rewards=True,
-    )
-    assert sorted(zip(returns, lengths, strict=True)) == [(6.0, 3)] * 2 + [(10.0, 4)] * 2
-
-
-def test_normalisation_of_stable_baselines_reaches_the_terminal_observation() -> None:
-    env = VecNormalize(BatchedVecEnv(batch(3, 5)))
-    env.reset()
-    infos = steps(env, 3)[3]
-    last = np.array([infos[0]["measure"], 3.0, 0.0])
-    np.testing.assert_allclose(infos[0]["terminal_observation"], env.normalize_obs(last), atol=1e-5)
-
-
 def test_discrete_actions_are_looked_up() -> None:
     table = np.array([[-1.0, 0.0], [0.25, 0.5]], np.float32)
     env = BatchedVecEnv(batch(9, 9), table)
@@ -166,48 +131,6 @@ def test_seeds_and_options_apply_to_one_reset() -> None:
     assert not np.array_equal(env.reset(), first)
     env.seed(7)
     np.testing.assert_array_equal(env.reset(), first)
-
-
-class Recorder(SyncVectorEnv):
-    """Keeps the options of the last reset, which our batches take as arrays."""
-
-    received: Any = None
-
-    def reset(self, *, seed: Any = None, options: Any = None) -> Any:
-        self.received = options
-        return super().reset(seed=seed)
-
-
-def test_options_reach_the_batch_once() -> None:
-    inner = Recorder([lambda: Countdown(9)] * 2, autoreset_mode=AutoresetMode.SAME_STEP)
-    env = VecMonitor(BatchedVecEnv(inner))
-    env.set_options({"start": 3.0})
-    env.reset()
-    np.testing.assert_array_equal(inner.received["start"], [3.0, 3.0])
-    env.reset()
-    assert inner.received is None
-
-
-def test_options_of_single_environments_are_joined() -> None:
-    joined = merge_options([{"gap": 9.0, "x": [1.0, 2.0]}, {"gap": 8.0, "x": [3.0, 4.0]}])
-    assert joined is not None
-    np.testing.assert_array_equal(joined["gap"], [9.0, 8.0])
-    np.testing.assert_array_equal(joined["x"], [[1.0, 2.0], [3.0, 4.0]])
-    assert merge_options([{}, {}]) is None
-    with pytest.raises(ValueError, match=r"same option names .* \['gap'\] on some"):
-        merge_options([{"gap": 9.0}, {}])
-
-
-def test_infos_of_one_row_follow_the_masks() -> None:
-    infos = {
-        "speed": np.array([1.0, 2.0]),
-        "kind": np.array([None, "rear"], dtype=object),
-        "_kind": np.array([False, True]),
-        "scenario": {"gap": np.array([5.0, 6.0]), "_gap": np.array([True, True])},
-        "final_obs": np.zeros((2, 3)),
-    }
-    assert info_row(infos, 0) == {"speed": 1.0, "scenario": {"gap": 5.0}}
-    assert info_row(infos, 1) == {"speed": 2.0, "kind": "rear", "scenario": {"gap": 6.0}}
 
 
 def test_attributes_and_methods_are_those_of_the_batch() -> None:
@@ -234,9 +157,8 @@ def test_other_autoreset_modes_are_refused(mode: AutoresetMode) -> None:
 # --- our environments --------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("id", IDS)
-def test_our_environments_behave_as_a_vec_env(id: str) -> None:
-    env = sb3_vec_env(id, 8, seed=1)
+def test_our_environments_behave_as_a_vec_env() -> None:
+    env = sb3_vec_env(CUT_IN, 8, seed=1)
     rng = np.random.default_rng(0)
     assert isinstance(env, VecMonitor)
     observation: Any = env.reset()
@@ -269,16 +191,14 @@ def test_reset_options_reach_our_environments() -> None:
     assert gaps == pytest.approx([9.0, 12.0])
 
 
-def test_bad_arguments_are_refused() -> None:
-    with pytest.raises(ValueError, match="num_envs >= 1, got 0"):
-        sb3_vec_env("rare_envs/CutIn-v0", 0)
-
-
 # --- several agents ---------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("env_id", rare_envs.ENV_IDS)
-@pytest.mark.parametrize("kwargs", [{}, {"observation": "kinematics", "action": "meta"}], ids=["continuous", "meta"])
+@pytest.mark.parametrize(
+    ("env_id", "kwargs"),
+    [(CUT_IN, {}), ("rare_envs/Highway-v0", {"observation": "kinematics", "action": "meta"})],
+    ids=["continuous", "meta"],
+)
 def test_rows_are_the_agents_of_the_parallel_environment(env_id, kwargs):
     """The same scenarios and actions give the same observations, rewards and ends, row by row, to the last bit."""
     batch = AgentsVectorEnv(env_id, 3, horizon=2.0, drivers="idm", **kwargs)
@@ -369,9 +289,3 @@ def test_a_shared_policy_learns():
     )
     error = (before[1] ** 2 + after[1] ** 2) ** 0.5
     assert after[0] - before[0] > 5 * error
-
-
-def test_an_interval_by_hand():
-    low, high = adversary.interval(0, 100)
-    assert (low, high) == (0.0, pytest.approx(1 - 0.025 ** (1 / 100)))  # the rule of three and a little
-    assert adversary.interval(100, 100) == (pytest.approx(0.025 ** (1 / 100)), 1.0)

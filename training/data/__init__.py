@@ -1,7 +1,6 @@
 """Recorded traffic: trajectory tables, smoothing, scenes and events."""
 
-from training.data.brakings import hard_brake_events
-from training.data.events import car_following_events, cut_in_events
+from training.data.events import car_following_events, cut_in_events, hard_brake_events
 from training.data.formats import (
     find_tgsim_files,
     highd_recordings,

@@ -6,14 +6,14 @@ Errors name the file and the line, counted from 1 as editors do.
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
+import re
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.compute as pc
 from numpy.typing import NDArray
 from pyarrow import csv
 
@@ -45,6 +45,8 @@ class Column(NamedTuple):
     """Its number in files without a header, from 0."""
     text: bool = False
     """Whether it holds words."""
+    optional: bool = False
+    """Whether files may lack it."""
 
 
 ColumnMap = Mapping[str, Column]
@@ -73,17 +75,25 @@ class Rows:
         columns = {name: values[chosen] for name, values in self.columns.items()}
         return Rows(self.path, columns, self.lines[chosen], self.unit)
 
+    def convert(self, columns: ColumnMap) -> Rows:
+        """Return the rows with numbers in the units of the table."""
+        units = {name: column.unit for name, column in columns.items() if not column.text}
+        values = {name: units[name] * array if name in units else array for name, array in self.columns.items()}
+        return Rows(self.path, values, self.lines, self.unit)
+
+    def refuse(self, bad: NDArray[np.bool_], describe: Callable[[int], str]) -> None:
+        """Raise a ValueError that names the file and the line of the first bad row, if any is (rows,)."""
+        if bad.any():
+            row = int(np.argmax(bad))
+            raise self.error(row, describe(row))
+
     def error(self, row: int, text: str) -> ValueError:
         """Return an error that names the file and the line of a row."""
         return ValueError(f"{self.path}, {self.unit} {self.lines[row]}: {text}")
 
 
 def read_header(path: Path) -> list[str]:
-    """Return the fields of the first line.
-
-    Raises:
-        ValueError: The file cannot be read or is empty.
-    """
+    """Return the fields of the first line; a ValueError if the file cannot be read or is empty."""
     try:
         with path.open(encoding="utf-8-sig") as file:
             header = [name.strip().strip('"') for name in file.readline().split(",")]
@@ -97,102 +107,59 @@ def read_header(path: Path) -> list[str]:
 def read_table(path: Path | str, columns: ColumnMap, leave_out_empty: bool = False) -> Rows:
     """Return columns of a CSV file with a header, numbers as float64 in the units of the table.
 
-    Args:
-        path: The file.
-        columns: What is read.
-        leave_out_empty: Leave out rows in which a number is not given, in place of an error.
-
-    Raises:
-        ValueError: The file cannot be read, is empty, lacks a column, or holds something else than a number.
+    Rows in which a number is not given are left out on request. A ValueError says what is wrong: the file cannot be
+    read, is empty, lacks a column, or holds something else than a number.
     """
     path = Path(path)
     header = read_header(path)
     known = {name.lower(): i for i, name in enumerate(header)}
-    indices = {
-        name: next((known[also.lower()] for also in column.names if also.lower() in known), None)
-        for name, column in columns.items()
-    }
-    if missing := [columns[name].names[0] for name, i in indices.items() if i is None]:
+    found = {name: [known[also.lower()] for also in c.names if also.lower() in known] for name, c in columns.items()}
+    if missing := [columns[name].names[0] for name, at in found.items() if not (at or columns[name].optional)]:
         raise ValueError(f"{path} lacks the columns {', '.join(missing)}; it has {', '.join(header)}.")
-    places = {name: f"c{i}" for name, i in indices.items()}
-    table = _read_csv(path, len(header), {places[name]: column.text for name, column in columns.items()})
+    columns = {name: columns[name] for name, at in found.items() if at}
+    places = {name: f"c{found[name][0]}" for name in columns}
+    named = {places[name]: column.names[0] for name, column in columns.items()}
+    types = {places[name]: pa.string() if column.text else pa.float64() for name, column in columns.items()}
+    table = _read_csv(path, len(header), types, named)
     if not table.num_rows:
         raise ValueError(f"{path} has a header and no rows.")
-    values = {name: _to_array(table[place], columns[name].text) for name, place in places.items()}
-    rows = Rows(path, values, np.arange(2, 2 + table.num_rows))
+    rows = Rows(path, {name: table[place].to_numpy() for name, place in places.items()}, 2 + np.arange(table.num_rows))
     given = np.ones(len(rows), dtype=bool)
     for name in (name for name, column in columns.items() if not column.text):
-        bad = ~np.isfinite(rows[name])
+        empty = np.asarray(table[places[name]].is_null().to_numpy(), dtype=bool)
         if leave_out_empty:
-            empty = _is_empty(table[places[name]])
-            given, bad = given & ~empty, bad & ~empty
-        if bad.any():
-            row = int(np.argmax(bad))
-            value = table[places[name]][row].as_py()
-            what = repr(value) if value else "empty"
-            raise rows.error(row, f"{columns[name].names[0]} is {what}, a number was expected.")
+            given &= ~empty
+        else:
+            rows.refuse(empty, lambda _, name=name: f"{columns[name].names[0]} is empty, a number was expected.")  # type: ignore[misc]
+        _refuse_infinite(rows, ~empty & ~np.isfinite(rows[name]), name, columns[name].names[0])
     if not given.any():
         raise ValueError(f"{path} has no row in which every number is given.")
-    return _convert(rows if given.all() else rows.select(given), columns)
+    return (rows if given.all() else rows.select(given)).convert(columns)
 
 
-def _read_csv(path: Path, size: int, words: Mapping[str, bool]) -> pa.Table:
-    """Return columns c0, c1, ... of a file, as numbers if all of them are, otherwise as text."""
+def _refuse_infinite(rows: Rows, bad: NDArray[np.bool_], name: str, header: str) -> None:
+    """Raise a ValueError for bad values (rows,) of a column, which are read but no finite numbers."""
+    rows.refuse(bad, lambda row: f"{header} is {rows[name][row]:g}, a number was expected.")
+
+
+def _read_csv(path: Path, size: int, types: Mapping[str, pa.DataType], names: Mapping[str, str]) -> pa.Table:
+    """Return columns c0, c1, ... of a file behind its header; errors give them their names."""
     reading = csv.ReadOptions(column_names=[f"c{i}" for i in range(size)], skip_rows=1, use_threads=False)
-    parsing = csv.ParseOptions(ignore_empty_lines=False)
-
-    def read(numbers: pa.DataType) -> pa.Table:
-        types = {name: pa.string() if text else numbers for name, text in words.items()}
-        converting = csv.ConvertOptions(include_columns=sorted(types), column_types=types, strings_can_be_null=False)
-        return csv.read_csv(path, reading, parsing, converting)
-
+    converting = csv.ConvertOptions(include_columns=sorted(types), column_types=types, strings_can_be_null=False)
     try:
-        return read(pa.float64())
+        return csv.read_csv(path, reading, csv.ParseOptions(ignore_empty_lines=False), converting)
     except pa.ArrowInvalid as error:
-        try:
-            return read(pa.string())
-        except pa.ArrowInvalid:
+        found = re.search(r"column #(\d+): Row #(\d+): .* invalid value '(.*)'", str(error), re.DOTALL)
+        if found is None:
             raise ValueError(f"Cannot read {path}: {error}") from None
-
-
-def _is_empty(column: pa.ChunkedArray) -> NDArray[np.bool_]:
-    """Return which fields of a column hold nothing, shape (rows,)."""
-    empty = pc.equal(column, "") if pa.types.is_string(column.type) else column.is_null()
-    return np.asarray(empty.to_numpy(), dtype=bool)
-
-
-def _to_array(column: pa.ChunkedArray, text: bool) -> NDArray[Any]:
-    """Return a column, NaN where text is no number."""
-    if text or not pa.types.is_string(column.type):
-        values: NDArray[Any] = column.to_numpy()
-        return values
-
-    def number(value: str) -> float:
-        try:
-            return float(value)
-        except ValueError:
-            return np.nan
-
-    return np.array([number(value) for value in column.to_pylist()], dtype=np.float64)
-
-
-def _convert(rows: Rows, columns: ColumnMap) -> Rows:
-    """Return rows in the units of the table."""
-    values = {name: rows[name] if column.text else column.unit * rows[name] for name, column in columns.items()}
-    return Rows(rows.path, values, rows.lines, rows.unit)
+        name, line, value = names[f"c{found[1]}"], found[2], found[3]
+        raise ValueError(f"{path}, line {line}: {name} is {value!r}, a number was expected.") from None
 
 
 def read_matrix(path: Path, columns: ColumnMap, matrix: FloatArray | None = None, size: int = 18) -> Rows:
-    """Return columns, by their places, of text without a header, separated by blanks or commas, or of a matrix.
+    """Return columns, by their places, of a matrix (rows, size), or of text without a header that holds one.
 
-    Args:
-        path: The file.
-        columns: What is read.
-        matrix: What the file holds, where it is no text, shape (rows, size).
-        size: Number of columns that it is to have.
-
-    Raises:
-        ValueError: The file cannot be read, has another number of columns, or holds what is no finite number.
+    Text is separated by blanks or commas. A ValueError says what is wrong with it.
     """
     if matrix is None:
         try:
@@ -203,13 +170,11 @@ def read_matrix(path: Path, columns: ColumnMap, matrix: FloatArray | None = None
         raise ValueError(f"{path} has no header and {matrix.shape[1]} columns; expected the {size} of NGSIM.")
     if not len(matrix):
         raise ValueError(f"{path} has no rows.")
+    columns = {name: column for name, column in columns.items() if column.place is not None}
     rows = Rows(path, {name: matrix[:, c.place] for name, c in columns.items()}, np.arange(1, 1 + len(matrix)))
-    for name in columns:
-        bad = ~np.isfinite(rows[name])
-        if bad.any():
-            row = int(np.argmax(bad))
-            raise rows.error(row, f"{columns[name].names[0]} is {rows[name][row]:g}, a number was expected.")
-    return _convert(rows, columns)
+    for name, column in columns.items():
+        _refuse_infinite(rows, ~np.isfinite(rows[name]), name, column.names[0])
+    return rows.convert(columns)
 
 
 def read_documents(
@@ -217,41 +182,29 @@ def read_documents(
 ) -> Rows:
     """Return the rows of a JSON array of documents, each with arrays of one length, numbers and an identity `_id`.
 
-    Args:
-        path: The file.
-        columns: Fields that are read; the first has the times.
-        arrays: Which of them hold an array with one value for each row; the others hold a number.
-        between: First and last time to read; everything if None.
-
-    Returns:
-        Rows whose `vehicle` is the number of their document, from 1, as is their line.
-
-    Raises:
-        ValueError: The file cannot be read, lacks a field or holds what is no finite number.
+    The first of the arrays has the times, of which those `between` two are read. `vehicle` is the number of the
+    document, from 1, as is the line of a row. A ValueError says what is wrong with the file.
     """
-    clock = next(iter(columns))
     parts: list[dict[str, FloatArray]] = []
     known: set[str] = set()
-    number = 0
     for number, document in enumerate(_documents(path), start=1):
         place = f"{path}, document {number}"
-        fields = _read_fields(place, document, columns, arrays)
+        values = _read_fields(place, document, columns, arrays)
         identity = document["_id"]
         name = str(identity["$oid"] if isinstance(identity, dict) and "$oid" in identity else identity)
         if name in known:
             raise ValueError(f"{place}: _id {name} was given before.")
         known.add(name)
-        time = fields[clock]
+        time = values[arrays[0]]
         inside = np.ones(len(time), dtype=bool) if between is None else (time >= between[0]) & (time <= between[1])
-        fields["vehicle"] = np.full(1, float(number))
-        parts.append({key: np.broadcast_to(values, len(time))[inside] for key, values in fields.items()})
-    if not number:
+        values["vehicle"] = np.full(1, float(number))
+        parts.append({key: np.broadcast_to(array, len(time))[inside] for key, array in values.items()})
+    if not parts:
         raise ValueError(f"{path} has no documents.")
     joined = {key: np.concatenate([part[key] for part in parts]) for key in parts[0]}
     if not len(joined["vehicle"]):
         raise ValueError(f"{path} has no rows between the times {between}.")
-    rows = Rows(path, joined, joined["vehicle"].astype(np.int64), unit="document")
-    return Rows(path, {**joined, **_convert(rows, columns).columns}, rows.lines, rows.unit)
+    return Rows(path, joined, joined["vehicle"].astype(np.int64), unit="document").convert(columns)
 
 
 def _documents(path: Path) -> Iterator[Mapping[str, Any]]:
@@ -296,20 +249,19 @@ def _read_fields(
         raise ValueError(f"{place} lacks {', '.join(missing)}; it has {', '.join(document)}.")
     numbers = [name for name in columns if name not in arrays]
     try:
-        fields = {name: np.asarray(document[names[name]], dtype=np.float64) for name in arrays}
-        fields |= {name: np.full(1, float(document[names[name]])) for name in numbers}
+        values = {name: np.asarray(document[names[name]], dtype=np.float64) for name in arrays}
+        values |= {name: np.full(1, float(document[names[name]])) for name in numbers}
     except (TypeError, ValueError):
         one, many = (", ".join(names[name] for name in group) for group in (numbers, arrays))
         raise ValueError(f"{place}: expected numbers in {one} and arrays of numbers in {many}.") from None
-    shapes = {names[name]: fields[name].shape for name in arrays}
-    if len(set(shapes.values())) != 1 or fields[arrays[0]].ndim != 1 or not fields[arrays[0]].size:
-        raise ValueError(
-            f"{place}: expected arrays of one length, got {', '.join(f'{n} {s}' for n, s in shapes.items())}."
-        )
-    for name, values in fields.items():
-        if not np.isfinite(values).all():
+    shapes = {names[name]: values[name].shape for name in arrays}
+    if len(set(shapes.values())) != 1 or values[arrays[0]].ndim != 1 or not values[arrays[0]].size:
+        got = ", ".join(f"{name} {shape}" for name, shape in shapes.items())
+        raise ValueError(f"{place}: expected arrays of one length, got {got}.")
+    for name, array in values.items():
+        if not np.isfinite(array).all():
             raise ValueError(f"{place}: {names[name]} has a value that is not finite.")
-    return fields
+    return values
 
 
 def check_tracks(
@@ -317,104 +269,58 @@ def check_tracks(
 ) -> None:
     """Check that no row is given twice, no frame is missing, and positions and speeds are possible and agree.
 
-    Args:
-        rows: The file, for its name and lines.
-        vehicle: Number of the vehicle, shape (rows,), as the next.
-        frame: Number of the time step in the file.
-        x: Position along the road [m], shape (rows,).
-        speed: Recorded speed [m/s], shape (rows,).
-        dt: Time between frames [s].
-        gaps: What is done where a vehicle is missing for some frames: "error" raises, "cut" is allowed.
-
-    Raises:
-        ValueError: A check fails; the message names the line of the first row at fault.
+    Vehicle, frame of the file, position along the road [m] and recorded speed [m/s] have shape (rows,); frames are dt
+    apart [s]. With gaps = "cut" a vehicle may be missing for some frames. A ValueError names the line of the first row
+    at fault.
     """
-    bad = (speed < 0.0) | (speed > FASTEST_SPEED)
-    if bad.any():
-        row = int(np.argmax(bad))
-        raise rows.error(row, f"speed is {speed[row]:.4g} m/s, expected 0 to {FASTEST_SPEED:g}; are the units right?")
-    order = np.lexsort([frame, vehicle])
-    neighbours = _Neighbours(
-        order[1:], order[:-1], np.where(np.diff(vehicle[order]) == 0, np.diff(frame[order]), np.nan)
+    rows.refuse(
+        (speed < 0.0) | (speed > FASTEST_SPEED),
+        lambda row: f"speed is {speed[row]:.4g} m/s, expected 0 to {FASTEST_SPEED:g}; are the units right?",
     )
-    _check_frames(rows, neighbours, vehicle, frame, gaps)
-    _check_motion(rows, neighbours, vehicle, x, speed, dt)
-
-
-class _Neighbours(NamedTuple):
-    """Pairs of rows that follow each other in the file's order of vehicle and time, shape (rows - 1,) each."""
-
-    here: NDArray[np.intp]
-    """Later row."""
-    before: NDArray[np.intp]
-    """Earlier row."""
-    step: FloatArray
-    """Frames between the two, nan where they belong to two vehicles."""
-
-    def first(self, wrong: NDArray[np.bool_]) -> tuple[int, int] | None:
-        """Return the first row of the file at fault and the row before it in its track, if any is."""
-        if not wrong.any():
-            return None
-        place = np.flatnonzero(wrong)[np.argmin(self.here[wrong])]
-        return int(self.here[place]), int(self.before[place])
-
-
-def _check_frames(rows: Rows, neighbours: _Neighbours, vehicle: FloatArray, frame: FloatArray, gaps: Gaps) -> None:
-    """Check that no row is given twice and, unless holes are cut, that no frame is missing."""
-    if pair := neighbours.first(neighbours.step == 0):
-        row, other = pair
-        first = f"{rows.unit} {rows.lines[other]}"
-        raise rows.error(row, f"vehicle {vehicle[row]:g} at frame {frame[row]:g} is given twice, first in {first}.")
-    if gaps == "error" and (pair := neighbours.first(neighbours.step > 1)):
-        row, other = pair
-        missing = frame[row] - frame[other] - 1
-        raise rows.error(
-            row,
-            f"vehicle {vehicle[row]:g} was missing for {missing:g} frames before; "
-            "gaps='cut' goes on with a new track here.",
+    order = np.lexsort([frame, vehicle])
+    before, step = np.empty(len(rows), dtype=np.intp), np.full(len(rows), np.nan)  # of each row in its track, if any
+    before[order] = np.roll(order, 1)
+    step[order[1:]] = np.where(np.diff(vehicle[order]) == 0, np.diff(frame[order]), np.nan)
+    rows.refuse(
+        step == 0,
+        lambda row: (
+            f"vehicle {vehicle[row]:g} at frame {frame[row]:g} is given twice, "
+            f"first in {rows.unit} {rows.lines[before[row]]}."
+        ),
+    )
+    if gaps == "error":
+        rows.refuse(
+            step > 1,
+            lambda row: (
+                f"vehicle {vehicle[row]:g} was missing for {step[row] - 1:g} frames before; "
+                "gaps='cut' goes on with a new track here."
+            ),
         )
-
-
-def _check_motion(
-    rows: Rows, neighbours: _Neighbours, vehicle: FloatArray, x: FloatArray, speed: FloatArray, dt: float
-) -> None:
-    """Check that no vehicle jumps, and that distances agree with the recorded speeds."""
-    here, before, step = neighbours
-    moved, expected = np.abs(x[here] - x[before]), 0.5 * (speed[here] + speed[before]) * dt
-    next_frame = step == 1
-    if pair := neighbours.first(next_frame & (moved > FASTEST_JUMP * dt)):
-        row, other = pair
-        distance = abs(x[row] - x[other])
-        raise rows.error(row, f"vehicle {vehicle[row]:g} moved {distance:.4g} m in {dt:g} s; are the units right?")
-    total = expected[next_frame].sum()
-    ratio = moved[next_frame].sum() / total if total > 0.0 else 1.0
+    moved, expected, following = np.abs(x - x[before]), 0.5 * (speed + speed[before]) * dt, step == 1
+    rows.refuse(
+        following & (moved > FASTEST_JUMP * dt),
+        lambda row: f"vehicle {vehicle[row]:g} moved {moved[row]:.4g} m in {dt:g} s; are the units right?",
+    )
+    total = expected[following].sum()
+    ratio = moved[following].sum() / total if total > 0.0 else 1.0
     if not SPEED_RATIOS[0] <= ratio <= SPEED_RATIOS[1]:
-        pair = neighbours.first(next_frame & (np.abs(moved - ratio * expected) <= 0.5 * ratio * expected + 1e-9))
-        row = pair[0] if pair else 0
-        raise rows.error(
-            row,
-            f"positions move {ratio:.3g} times as fast as the recorded speeds say, here and in the whole file; "
-            "are the units of length, time and speed right?",
+        typical = following & (np.abs(moved - ratio * expected) <= 0.5 * ratio * expected + 1e-9)
+        rows.refuse(
+            typical if typical.any() else np.ones_like(typical),
+            lambda _: (
+                f"positions move {ratio:.3g} times as fast as the recorded speeds say, here and in the whole "
+                "file; are the units of length, time and speed right?"
+            ),
         )
 
 
 def check_lengths(rows: Rows, length: FloatArray, unit: str) -> None:
-    """Check that lengths are those of vehicles.
-
-    Raises:
-        ValueError: A length is not positive, or their median is outside `MEDIAN_LENGTHS`.
-    """
-    if (length <= 0.0).any():
-        row = int(np.argmax(length <= 0.0))
-        raise rows.error(row, f"length of the vehicle is {length[row]:g} m.")
-    median = float(np.median(length))
-    if not MEDIAN_LENGTHS[0] <= median <= MEDIAN_LENGTHS[1]:
-        low, high = MEDIAN_LENGTHS
-        raise rows.error(
-            0,
-            f"the median length of vehicles is {median:.3g} m, expected {low:g} to {high:g}; "
-            f"lengths were taken to be in {unit}.",
-        )
+    """Check that lengths (rows,) are positive, and their median that of vehicles; a ValueError if not."""
+    rows.refuse(length <= 0.0, lambda row: f"length of the vehicle is {length[row]:g} m.")
+    median, (low, high) = float(np.median(length)), MEDIAN_LENGTHS
+    if not low <= median <= high:
+        words = f"the median length of vehicles is {median:.3g} m, expected {low:g} to {high:g}"
+        raise rows.error(0, f"{words}; lengths were taken to be in {unit}.")
 
 
 def check_clock(rows: Rows, steps: FloatArray, expected: float, hint: str = "") -> None:

@@ -1,28 +1,7 @@
 """Recordings in the published formats of NGSIM, highD, TGSIM, I-24 MOTION, and Coifman and Li, as trajectory tables.
 
-Each format is a map of columns, which says their names and units, and what its positions mean:
-
-- **NGSIM**: CSV with a header, or the published text of 18 columns without one. Feet, `Global_Time` in ms; positions
-  are those of the front centre, `Local_Y` along the road and `Local_X` across, to the right of the left edge. Lane 1
-  is the leftmost. U.S. Department of Transportation, record 8ect-6jqj.
-- **highD**: `XX_tracks.csv`, `XX_tracksMeta.csv` and `XX_recordingMeta.csv`, metres, 25 Hz. x runs to the right and y
-  down in the drone's picture; both are those of the upper left corner of a box, whose `width` is its extent along the
-  road. Vehicles of drivingDirection 1 use the upper lanes and move towards -x; they are turned by half a turn.
-  Krajewski, Bock, Kloeker, Eckstein, "The highD dataset", ITSC 2018.
-- **TGSIM**: CSV of motorways, metres, 10 Hz; earlier downloads have hyphens in place of underscores. Positions are
-  those of the reference picture, whose origin is the top left corner (y runs down); which point of a vehicle is meant
-  is not said, and taken to be the centre. There is no axis of the road: that of each direction is fitted to the paths
-  (`fit_road_axis`), lanes are numbered from the left in the direction of travel, and rows whose lane has the other
-  sign than most are outside the lanes (-1 on I-395 is a shoulder). catalog.data.gov, "Third Generation Simulation Data
-  (TGSIM) I-90/I-94 Moving Trajectories"; Ammourah et al., Transportation Research Record, 2025.
-- **I-24 MOTION**, format 1.x: one JSON array with a document for each fragment of a trajectory, feet, 25 Hz, of the
-  back centre. x runs eastward in both directions of travel; y is positive on the westbound side, 0 in the median.
-  Westbound, lane 1 is at 12 to 24 ft and lanes 2 to 4 follow; eastbound is taken to be the mirror image.
-  v1.x_I-24MOTION_data_documentation.pdf as quoted by three public readers; Gloudemans et al., Transportation Research
-  Part C 155, 104311, 2023.
-- **Coifman and Li**: I-80 by hand, a MATLAB file with a matrix `data` of NGSIM's 18 columns, of which seven are
-  filled. `Local_Y` is that of the *rear* bumper; positions across the road and lengths are zeros. Transportation
-  Research Part B 105, 2017, 362-377.
+Each format is a map of columns, which says their names and units; docs/data.md says what its positions mean, where
+it is from, and what its documents leave open.
 """
 
 from __future__ import annotations
@@ -67,14 +46,17 @@ NGSIM = {
     "acceleration": Column(("v_Acc",), FOOT, 12),
     "lane": Column(("Lane_ID",), place=13),
     "leader": Column(("Preceding",), place=14),
+    "location": Column(("Location",), text=True, optional=True),
 }
-NGSIM_LOCATION = {"location": Column(("Location",), text=True)}
+"""Positions are those of the front centre, across from the left edge; lane 1 is the leftmost. U.S. Department of
+Transportation, record 8ect-6jqj."""
 NGSIM_STEP, NGSIM_PAUSE, RENUMBER_OFFSET = 100.0, 60_000.0, 1_000_000
 """Time between frames, and that after which a number that comes back belongs to another vehicle, because each 15
 minutes were numbered anew [ms]; the number is then raised, once for each time that it comes back."""
 COIFMAN_LI = {name: NGSIM[name] for name in ("vehicle", "x", "speed", "acceleration", "lane", "leader")} | {
     "frame": Column(("Frame_ID",), place=1)
 }
+"""`x` is that of the rear bumper. Transportation Research Part B 105, 2017, 362-377."""
 COIFMAN_EMPTY = {name: NGSIM[name] for name in ("y", "length")}
 """Columns that are zero in Coifman and Li's file, and filled in NGSIM's own."""
 MEAN_LENGTH = 4.87
@@ -91,6 +73,8 @@ HIGHD = {
     "acceleration": Column(("xAcceleration",)),
     "leader": Column(("precedingId",)),
 }
+"""Positions are those of the upper left corner of a box in the drone's picture. Krajewski, Bock, Kloeker, Eckstein,
+"The highD dataset", ITSC 2018."""
 HIGHD_VEHICLES = {"vehicle": Column(("id",)), "direction": Column(("drivingDirection",))}
 HIGHD_RECORDING = {
     "rate": Column(("frameRate",)),
@@ -98,7 +82,7 @@ HIGHD_RECORDING = {
     "lower": Column(("lowerLaneMarkings",), text=True),
 }
 HIGHD_SIDES = {1: "upper", 2: "lower"}
-"""Names of the two carriageways by drivingDirection."""
+"""Names of the two carriageways by drivingDirection; those of the upper lanes are turned by half a turn."""
 TGSIM = {"vehicle": Column(("id",)), "time": Column(("time",))} | {
     name: Column((header, header.replace("_", "-")))
     for name, header in {
@@ -111,7 +95,9 @@ TGSIM = {"vehicle": Column(("id",)), "time": Column(("time",))} | {
         "width": "width_smoothed",
     }.items()
 }
-TGSIM_RUN = {"run": Column(("run_index", "run-index"))}
+"""Positions are those of the reference picture, y downwards, taken to be those of the centre. Ammourah et al.,
+Transportation Research Record, 2025."""
+TGSIM["run"] = Column(("run_index", "run-index"), optional=True)
 TGSIM_STREETS = {"speed_kf_x", "speed-kf-x"}
 """Headers of the files of streets, which give two components of the speed."""
 TGSIM_DIRECTIONS = (("right", "down"), ("left", "up"))
@@ -124,6 +110,8 @@ I24 = {
     "width": Column(("width",), FOOT),
     "direction": Column(("direction",)),
 }
+"""Positions are those of the back centre, x eastward, y positive on the westbound side of the median. Gloudemans et
+al., Transportation Research Part C 155, 104311, 2023."""
 I24_ARRAYS = ("time", "x", "y")
 """Fields that hold an array with one value for each frame; the others hold a number."""
 I24_STEP = 0.04
@@ -147,18 +135,9 @@ def load_recordings(
     between: tuple[float, float] | None = None,
     gaps: Gaps = "error",
 ) -> Iterator[Trajectories]:
-    """Yield the tables of files of one kind, each read when it is asked for.
+    """Yield the tables of files of one of `RECORDING_KINDS`, each read when it is asked for.
 
-    Args:
-        kind: One of `RECORDING_KINDS`.
-        path: File, or folder of highD or TGSIM.
-        location: Which of the locations of an NGSIM file to read, where it has several.
-        recordings: Which recordings of highD to read, such as "01"; all if empty.
-        between: First and last moment of I-24 MOTION to read, Unix time [s]; everything if None.
-        gaps: What is done where a vehicle is missing for some frames: "error" raises, "cut" cuts its track.
-
-    Raises:
-        ValueError: The kind is unknown, or a file is missing or broken.
+    Location, numbers of recordings (all if empty) and moments are those of the loaders, for the kinds that have them.
     """
     if kind == "highd":
         yield from (load_highd(path, name, gaps=gaps) for name in recordings or highd_recordings(path))
@@ -177,14 +156,13 @@ def load_recordings(
 def load_ngsim(path: Path | str, *, location: str | None = None, gaps: Gaps = "error") -> Trajectories:
     r"""Return the trajectories of one raw NGSIM file; the recording is named after the file, or after the location.
 
+    Lane boundaries are estimated from the positions of each lane.
+
     Args:
         path: CSV with the published header (the order of columns does not matter, others are ignored), or text with the
             18 published columns and no header, separated by blanks or commas.
         location: Which of the file's locations to read, such as "us-101", where it has several.
         gaps: What is done where a vehicle is missing for some frames: "error" raises, "cut" cuts its track.
-
-    Returns:
-        The table, with lane boundaries estimated by `estimate_lane_edges`.
 
     Raises:
         ValueError: The file cannot be read, lacks a column, holds impossible values, or has several locations.
@@ -201,42 +179,41 @@ def load_ngsim(path: Path | str, *, location: str | None = None, gaps: Gaps = "e
         [15.24, 15.24, 15.24]
     """
     path = Path(path)
-    header = [name.lower() for name in read_header(path)]
-    if not any(character.isalpha() for character in header[0]):
-        rows = read_matrix(path, NGSIM)
+    has_header = any(character.isalpha() for character in read_header(path)[0])
+    rows = (read_table if has_header else read_matrix)(path, NGSIM)
+    if "location" in rows.columns:
+        places = sorted({str(place) for place in rows["location"]})
+        if location is None and len(places) > 1:
+            raise ValueError(f"{path} has the locations {', '.join(places)}; choose one with location=.")
+        if location is not None and location not in places:
+            raise ValueError(f"{path} has the locations {', '.join(places)}, not {location}.")
+        recording = location or places[0]
+        rows = rows.select(rows["location"] == recording)
+    elif location is None:
+        recording = path.stem
     else:
-        rows = read_table(path, NGSIM | NGSIM_LOCATION if "location" in header else NGSIM)
-    if "location" not in rows.columns:
-        if location is not None:
-            raise ValueError(f"{path} has no column Location; leave location out.")
-        return _ngsim_table(rows, path.stem, gaps)
-    places = sorted({str(place) for place in rows["location"]})
-    if location is None and len(places) > 1:
-        raise ValueError(f"{path} has the locations {', '.join(places)}; choose one with location=.")
-    if location is not None and location not in places:
-        raise ValueError(f"{path} has the locations {', '.join(places)}, not {location}.")
-    location = location or places[0]
-    return _ngsim_table(rows.select(rows["location"] == location), location, gaps)
-
-
-def _ngsim_table(rows: Rows, recording: str, gaps: Gaps) -> Trajectories:
-    """Return rows as a table, with centres in place of fronts."""
+        raise ValueError(f"{path} has no column Location; leave location out.")
     frame = np.rint(rows["time"] / NGSIM_STEP)
     check_lengths(rows, rows["length"], "feet")
     vehicle, leader = _renumber(rows["vehicle"], rows["leader"], frame)
     check_tracks(rows, vehicle, frame, rows["x"], rows["speed"], NGSIM_STEP / 1000.0, gaps)
     lane = rows["lane"].astype(np.int64)
     columns = {
+        **_take(rows, "y speed acceleration length width"),
         "recording": recording,
         "vehicle": vehicle,
         "frame": frame,
         "x": rows["x"] - 0.5 * rows["length"],
         "lane": lane,
         "leader": leader,
-        **{name: rows[name] for name in ("y", "speed", "acceleration", "length", "width")},
     }
     edges = estimate_lane_edges(rows["y"], lane)
     return tabulate(columns, {recording: edges} if edges else {})
+
+
+def _take(rows: Rows, names: str) -> dict[str, NDArray[Any]]:
+    """Return columns by their names, separated by blanks."""
+    return {name: rows[name] for name in names.split()}
 
 
 def _renumber(vehicle: FloatArray, leader: FloatArray, frame: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -263,17 +240,15 @@ def load_coifman_li(
 ) -> Trajectories:
     r"""Return the recording of Coifman and Li; it is named after the file.
 
-    A gap is the distance of the rear bumpers less the length of the follower, so an assumed length shifts it.
+    A gap is the distance of the rear bumpers less the length of the follower, so an assumed length shifts it. There
+    are no lane boundaries; y and width are NaN. Lanes are numbered as in the file: 1 the leftmost, 6 the rightmost, 9
+    to the right of that.
 
     Args:
         path: The MATLAB file, or a text file of its 18 columns without a header, separated by blanks or commas.
         ngsim: Raw NGSIM file of the same period, for the lengths of the vehicles that are in both.
         length: Length assumed of all others [m].
-        gaps: What is done where a vehicle is missing for some frames: "error" raises, "cut" cuts its track.
-
-    Returns:
-        The table, without lane boundaries; y and width are NaN. Lanes are numbered as in the file: 1 the leftmost, 6
-        the rightmost, 9 to the right of that.
+        gaps: As of `load_ngsim`.
 
     Raises:
         ValueError: The file cannot be read, is another's, or holds impossible values.
@@ -300,13 +275,13 @@ def load_coifman_li(
     check_tracks(rows, rows["vehicle"], rows["frame"], rows["x"], rows["speed"], DT, gaps)
     lengths = np.full(len(rows), length) if ngsim is None else _known_lengths(rows["vehicle"], Path(ngsim), length)
     columns = {
+        **_take(rows, "vehicle frame speed acceleration lane"),
         "recording": path.stem,
         "x": rows["x"] + 0.5 * lengths,
         "y": np.nan,
         "length": lengths,
         "width": np.nan,
         "leader": np.where(rows["leader"] > 0, rows["leader"], NOBODY),
-        **{name: rows[name] for name in ("vehicle", "frame", "speed", "acceleration", "lane")},
     }
     return tabulate(columns)
 
@@ -366,7 +341,7 @@ def load_highd(folder: Path | str, recording: str, *, gaps: Gaps = "error") -> T
     Args:
         folder: Folder with the three files of the recording.
         recording: Its number, such as "01".
-        gaps: What is done where a vehicle is missing for some frames: "error" raises, "cut" cuts its track.
+        gaps: As of `load_ngsim`.
 
     Raises:
         ValueError: A file cannot be read, lacks a column or holds impossible values.
@@ -378,39 +353,40 @@ def load_highd(folder: Path | str, recording: str, *, gaps: Gaps = "error") -> T
     """
     folder = Path(folder)
     rate, markings = _highd_recording(folder / f"{recording}_recordingMeta.csv")
-    directions = _highd_directions(folder / f"{recording}_tracksMeta.csv")
+    listed = read_table(folder / f"{recording}_tracksMeta.csv", HIGHD_VEHICLES)
+    listed.refuse(
+        ~np.isin(listed["direction"], list(HIGHD_SIDES)),
+        lambda row: f"drivingDirection is {listed['direction'][row]:g}, expected 1 or 2.",
+    )
+    directions = dict(zip(listed["vehicle"].tolist(), listed["direction"].astype(int).tolist(), strict=True))
     rows = read_table(folder / f"{recording}_tracks.csv", HIGHD)
     vehicles, index = np.unique(rows["vehicle"], return_inverse=True)
-    direction = np.array([directions.get(int(vehicle), 0) for vehicle in vehicles])[index.ravel()]
-    if (direction == 0).any():
-        row = int(np.argmax(direction == 0))
-        raise rows.error(row, f"vehicle {rows['vehicle'][row]:g} is not in the file of tracksMeta.")
+    direction = np.array([directions.get(vehicle, 0) for vehicle in vehicles.tolist()])[index.ravel()]
+    rows.refuse(direction == 0, lambda row: f"vehicle {rows['vehicle'][row]:g} is not in the file of tracksMeta.")
     sign = np.where(direction == 1, -1.0, 1.0)
     check_lengths(rows, rows["length"], "metres")
     x, speed = sign * (rows["x"] + 0.5 * rows["length"]), np.hypot(rows["vx"], rows["vy"])
     check_tracks(rows, rows["vehicle"], rows["frame"], x, speed, 1.0 / rate, gaps)
-    if (backwards := sign * rows["vx"] < -REVERSING).any():
-        row = int(np.argmax(backwards))
-        raise rows.error(row, f"vehicle {rows['vehicle'][row]:g} moves against its drivingDirection.")
-    tracks = resample_tracks(
+    rows.refuse(
+        sign * rows["vx"] < -REVERSING,
+        lambda row: f"vehicle {rows['vehicle'][row]:g} moves against its drivingDirection.",
+    )
+    tracks, nearest = resample_tracks(
         rows["vehicle"],
         rows["frame"] / rate,
         1.0 / rate,
-        np.column_stack([x, sign * (rows["y"] + 0.5 * rows["width"])]),
-        np.column_stack([speed, sign * rows["acceleration"], rows["length"], rows["width"]]),
+        {"x": x, "y": sign * (rows["y"] + 0.5 * rows["width"])},
+        {"speed": speed, "acceleration": sign * rows["acceleration"], **_take(rows, "length width")},
     )
-    leader, side = rows["leader"][tracks.nearest], direction[tracks.nearest]
+    leader, side = rows["leader"][nearest], direction[nearest]
     names = {number: f"{recording}-{name}" for number, name in HIGHD_SIDES.items()}
     edges = {names[1]: tuple(-y for y in reversed(markings[0])), names[2]: markings[1]}
     lane = np.zeros(len(side))
     for number in np.unique(side):
-        lane[side == number] = lanes_of(tracks.splined[side == number, 1], edges[names[number]])
+        lane[side == number] = lanes_of(tracks["y"][side == number], edges[names[number]])
     columns = {
+        **tracks,
         "recording": np.array([names[1], names[2]])[side - 1],
-        "vehicle": tracks.vehicle,
-        "frame": tracks.frame,
-        **dict(zip(("x", "y"), tracks.splined.T, strict=True)),
-        **dict(zip(("speed", "acceleration", "length", "width"), tracks.linear.T, strict=True)),
         "lane": lane,
         "leader": np.where(leader > 0, leader, NOBODY),
     }
@@ -430,16 +406,6 @@ def _highd_recording(path: Path) -> tuple[float, tuple[tuple[float, ...], tuple[
     if any(len(side) < 2 or not (np.diff(side) > 0.0).all() for side in (upper, lower)):
         raise rows.error(0, "expected at least two lane markings on each side, increasing.")
     return rate, (upper, lower)
-
-
-def _highd_directions(path: Path) -> dict[int, int]:
-    """Return the driving direction of each vehicle, 1 or 2."""
-    rows = read_table(path, HIGHD_VEHICLES)
-    bad = ~np.isin(rows["direction"], list(HIGHD_SIDES))
-    if bad.any():
-        row = int(np.argmax(bad))
-        raise rows.error(row, f"drivingDirection is {rows['direction'][row]:g}, expected 1 or 2.")
-    return {int(vehicle): int(side) for vehicle, side in zip(rows["vehicle"], rows["direction"], strict=True)}
 
 
 def find_tgsim_files(path: Path | str) -> tuple[Path, ...]:
@@ -472,13 +438,11 @@ def find_tgsim_files(path: Path | str) -> tuple[Path, ...]:
 def load_tgsim(path: Path | str, *, gaps: Gaps = "error") -> Trajectories:
     r"""Return a file of TGSIM as a table of its runs and directions, such as "I395-1-right".
 
+    y is 0 on the axis that is fitted to the paths in each direction; lane boundaries are estimated.
+
     Args:
         path: CSV file of a motorway.
-        gaps: What is done where a vehicle is missing for some frames, or a field is empty: "error" raises, "cut" cuts
-            its track there.
-
-    Returns:
-        The table, with lane boundaries estimated by `estimate_lane_edges`. y is 0 on the fitted axis.
+        gaps: As of `load_ngsim`; "cut" cuts a track where a field is empty, too.
 
     Raises:
         ValueError: The file cannot be read, lacks a column, or holds impossible values.
@@ -498,10 +462,9 @@ def load_tgsim(path: Path | str, *, gaps: Gaps = "error") -> Trajectories:
     header = {name.lower() for name in read_header(path)}
     if header & TGSIM_STREETS:
         raise ValueError(f"{path} is of streets (speed_kf_x); only TGSIM's files of motorways are read.")
-    has_runs = bool(header & set(TGSIM_RUN["run"].names))
-    rows = read_table(path, TGSIM | TGSIM_RUN if has_runs else TGSIM, leave_out_empty=gaps == "cut")
+    rows = read_table(path, TGSIM, leave_out_empty=gaps == "cut")
     check_lengths(rows, rows["length"], "metres")
-    run = rows["run"] if has_runs else np.ones(len(rows))
+    run = rows.columns.get("run", np.ones(len(rows)))
     parts = [
         part
         for number in np.unique(run)
@@ -541,13 +504,13 @@ def _tgsim_columns(
     ahead = find_leaders(frame.astype(np.int64), lane, x + 0.5 * rows["length"])
     along = int(abs(heading[1]) > abs(heading[0]))
     columns = {
+        **_take(rows, "vehicle speed acceleration length width"),
         "recording": np.full(len(rows), f"{name}-{TGSIM_DIRECTIONS[int(heading[along] < 0.0)][along]}"),
         "frame": frame,
         "x": x,
         "y": y,
         "lane": lane,
         "leader": np.where(ahead >= 0, rows["vehicle"][ahead], NOBODY),
-        **{name: rows[name] for name in ("vehicle", "speed", "acceleration", "length", "width")},
     }
     return columns, estimate_lane_edges(y, lane)
 
@@ -565,7 +528,7 @@ def load_i24_motion(
     Args:
         path: The JSON file, unpacked.
         between: First and last moment to read, Unix time [s]; everything if None.
-        gaps: What is done where a vehicle is missing for some frames: "error" raises, "cut" cuts its track.
+        gaps: As of `load_ngsim`.
 
     Raises:
         ValueError: The file cannot be read, lacks a field or holds impossible values; the message counts documents
@@ -586,37 +549,39 @@ def load_i24_motion(
     path = Path(path)
     rows = read_documents(path, I24, I24_ARRAYS, between)
     sign, vehicle, length = rows["direction"], rows["vehicle"], rows["length"]
-    if (wrong := ~np.isin(sign, list(I24_SIDES))).any():
-        row = int(np.argmax(wrong))
-        raise rows.error(row, f"direction is {sign[row]:g}, expected 1 or -1.")
+    rows.refuse(~np.isin(sign, list(I24_SIDES)), lambda row: f"direction is {sign[row]:g}, expected 1 or -1.")
     check_lengths(rows, length, "feet")
     x = sign * rows["x"] + 0.5 * length
     start = np.floor(rows["time"].min())  # differences of Unix times are coarse in double precision
     time = rows["time"] - start
     slope = _slopes(vehicle, time, x)
-    _check_directions(rows, slope)
+    index = np.unique(vehicle, return_inverse=True)[1].ravel()
+    rows.refuse(
+        (np.bincount(index, slope) / np.bincount(index) < -REVERSING)[index],
+        lambda row: f"the vehicle moves against its direction, {sign[row]:g}.",
+    )
     speed = np.maximum(slope, 0.0)
     fresh = np.append(True, np.diff(vehicle) != 0)
     check_clock(rows, np.diff(time)[~fresh[1:]], I24_STEP, "; is it format 1.x?")
     begun = np.minimum.reduceat(time, np.flatnonzero(fresh))[np.cumsum(fresh) - 1]
     check_tracks(rows, vehicle, np.rint((time - begun) / I24_STEP), x, speed, I24_STEP, gaps)
-    splined, linear = np.column_stack([x, -sign * rows["y"]]), np.column_stack([speed, length, rows["width"]])
-    tracks = resample_tracks(vehicle, time, I24_STEP, splined, linear)
-    if not len(tracks.frame):
+    sizes = _take(rows, "length width")
+    tracks, nearest = resample_tracks(
+        vehicle, time, I24_STEP, {"x": x, "y": -sign * rows["y"]}, {"speed": speed, **sizes}
+    )
+    if not len(nearest):
         raise ValueError(f"{path} has no vehicle for {DT:g} s.")
     names = {number: f"{path.stem}-{name}" for number, name in I24_SIDES.items()}
-    recording = np.where(sign[tracks.nearest] < 0, names[-1], names[1])
-    frame, lane = np.rint(tracks.frame).astype(np.int64), lanes_of(tracks.splined[:, 1], I24_EDGES)
-    ahead = find_leaders(frame, lane, tracks.splined[:, 0] + 0.5 * tracks.linear[:, 1], recording)
+    recording = np.where(sign[nearest] < 0, names[-1], names[1])
+    frame, lane = np.rint(tracks["frame"]).astype(np.int64), lanes_of(tracks["y"], I24_EDGES)
+    ahead = find_leaders(frame, lane, tracks["x"] + 0.5 * tracks["length"], recording)
     columns = {
+        **tracks,
         "recording": recording,
-        "vehicle": tracks.vehicle,
         "frame": frame + round(start / DT),
-        **dict(zip(("x", "y"), tracks.splined.T, strict=True)),
-        **dict(zip(("speed", "length", "width"), tracks.linear.T, strict=True)),
         "acceleration": np.nan,
         "lane": lane,
-        "leader": np.where(ahead >= 0, tracks.vehicle[ahead], NOBODY),
+        "leader": np.where(ahead >= 0, tracks["vehicle"][ahead], NOBODY),
     }
     return tabulate(columns, dict.fromkeys(np.unique(recording).tolist(), I24_EDGES))
 
@@ -631,12 +596,3 @@ def _slopes(vehicle: FloatArray, time: FloatArray, x: FloatArray) -> FloatArray:
     result = np.zeros(len(x))
     result[order] = (np.append(move, 0.0) + np.append(0.0, move)) / np.where(duration > 0.0, duration, 1.0)
     return result
-
-
-def _check_directions(rows: Rows, slope: FloatArray) -> None:
-    """Check that no vehicle moves against its direction on average."""
-    numbers, index = np.unique(rows["vehicle"], return_inverse=True)
-    mean = np.bincount(index.ravel(), slope) / np.bincount(index.ravel())
-    if (mean < -REVERSING).any():
-        row = int(np.argmax(rows["vehicle"] == numbers[np.argmax(mean < -REVERSING)]))
-        raise rows.error(row, f"the vehicle moves against its direction, {rows['direction'][row]:g}.")

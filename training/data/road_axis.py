@@ -72,11 +72,7 @@ def fit_road_axis(x: FloatArray, y: FloatArray, lane: NDArray[np.int64], heading
     than a right angle, and lanes must keep their distance from each other; ramps do not, and pull at the axis by
     their share of the traffic.
 
-    Args:
-        x: Positions [m], shape (n,).
-        y: Positions [m], shape (n,).
-        lane: Number of the lane, shape (n,); any numbers.
-        heading: Direction of travel, roughly: a vector of any length, shape (2,).
+    Positions [m] and numbers of lanes have shape (n,); the direction of travel is given roughly, as a vector (2,).
     """
     origin = np.array([x.mean(), y.mean()])
     axis = np.linalg.eigh(np.cov(np.stack([x, y])))[1][:, -1]
@@ -126,28 +122,17 @@ def _fit_spline(u: FloatArray, w: FloatArray, lane: NDArray[np.int64], weight: F
 
 
 def lanes_of(y: FloatArray, edges: tuple[float, ...]) -> NDArray[np.int64]:
-    """Return the lane of each position, 1 the leftmost, 0 outside.
-
-    Args:
-        y: Position across the road [m], shape (n,).
-        edges: Lane boundaries from left to right [m].
-    """
+    """Return the lane of each position across (n,) [m] by boundaries left to right: 1 the leftmost, 0 outside."""
     lane = np.searchsorted(np.array(edges), y, side="right")
     return np.where(lane < len(edges), lane, 0)
 
 
 def estimate_lane_edges(y: FloatArray, lane: NDArray[np.int64]) -> tuple[float, ...]:
-    """Return lane boundaries halfway between the median positions of neighbouring lanes.
+    """Return lane boundaries [m], left to right, halfway between the median positions of neighbouring lanes.
 
-    The outer lanes get the width of the space to their neighbours. Lanes are counted from 1 as long as each lies 2.5 to
-    5 m to the right of the one before it; ramps, which lie beside each other, do not.
-
-    Args:
-        y: Position across the road [m], shape (rows,).
-        lane: Number of the lane, 1 the leftmost, shape (rows,).
-
-    Returns:
-        Boundaries [m], left to right; none if fewer than two lanes are found.
+    The outer lanes get the width of the space to their neighbours. Lanes (rows,) are counted from 1 as long as each
+    lies 2.5 to 5 m to the right of the one before it; ramps, which lie beside each other, do not. Of fewer than two
+    lanes there are none.
     """
     centres: list[float] = []
     for number in range(1, int(lane.max()) + 1):
@@ -164,11 +149,9 @@ def estimate_lane_edges(y: FloatArray, lane: NDArray[np.int64]) -> tuple[float, 
 
 
 def number_lanes(y: FloatArray, lane: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return lanes numbered from the left, 1 the leftmost, by their median positions, shape (rows,).
+    """Return lanes (rows,) numbered from the left, 1 the leftmost, by their median positions [m], to the right.
 
-    Args:
-        y: Position across the road, positive to the right [m], shape (rows,).
-        lane: Number in the file, shape (rows,). Those of the other sign than most, and 0, are outside the lanes: 0.
+    Lanes of the file of the other sign than most, and 0, are outside the lanes: 0.
     """
     inside = lane * (1 if (lane > 0).sum() >= (lane < 0).sum() else -1) > 0
     result = np.zeros(len(lane), dtype=np.int64)

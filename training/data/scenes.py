@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -112,39 +111,6 @@ class TrafficScene:
         return leads
 
 
-def assemble_scene(
-    name: str,
-    start: float,
-    edges: Sequence[float],
-    columns: Mapping[str, NDArray[Any]],
-    length: FloatArray,
-    width: FloatArray,
-) -> TrafficScene:
-    """Return a scene with each row at its `step` and `vehicle` (column of the scene, 0 to V - 1).
-
-    Args:
-        name: Name of the scene.
-        start: Clock at step 0 [s].
-        edges: Lane boundaries [m].
-        columns: `step`, `vehicle`, `x`, `y`, `heading`, `speed`, `acceleration`, `yaw_rate`, each of shape (rows,).
-        length: Length of each vehicle [m], shape (V,).
-        width: Width of each vehicle [m], shape (V,).
-    """
-    known = np.isfinite(columns["speed"])
-    step, vehicle = (columns[key][known].astype(np.int64) for key in ("step", "vehicle"))
-    shape = (int(columns["step"].max()) + 1, len(length))
-
-    def place(key: str) -> FloatArray:
-        values = np.full(shape, np.nan)
-        values[step, vehicle] = columns[key][known]
-        return values
-
-    states = {key: place(key) for key in ("x", "y", "heading", "speed", "acceleration", "yaw_rate")}
-    return TrafficScene(
-        name, start, tuple(edges), **states, present=np.isfinite(states["x"]), length=length.copy(), width=width.copy()
-    )
-
-
 def load_us101_scenes(
     folder: Path | str, along: float = CUTOFF_ALONG, across: float = CUTOFF_ACROSS
 ) -> tuple[TrafficScene, ...]:
@@ -170,32 +136,31 @@ def load_us101_scenes(
     rows = read_columns(Path(folder) / SCENES_FILE, _US101_COLUMNS)
     usable = (rows["scene"] != 1) & (rows["lane"] <= 6)
     rows = {key: values[usable] for key, values in rows.items()}
-    track_rows = np.column_stack([rows["vehicle"], rows["epoch_ms"]])
-    keys, copy = np.unique(track_rows, axis=0, return_inverse=True)
+    keys, copy = np.unique(np.column_stack([rows["vehicle"], rows["epoch_ms"]]), axis=0, return_inverse=True)
     copy = copy.ravel()
     count = np.bincount(copy)
     x, y, length = (np.bincount(copy, rows[key]) / count for key in ("y_along", "d", "length"))
     breaks = 1 + np.flatnonzero((np.diff(keys[:, 0]) != 0) | (np.diff(keys[:, 1]) != 100))
-    smoothed = smooth_tracks(breaks, x - 0.5 * length, y, along, across)
-    for key, values in smoothed.items():
-        rows[key] = values[copy]
-    return tuple(_cut_us101_scene(rows, int(number)) for number in np.unique(rows["scene"]))
+    smooth = _smooth_tracks(breaks, x - 0.5 * length, y, along, across)
+    smooth = {key: values[copy] for key, values in smooth.items()}
+    scenes = []
+    for number in np.unique(rows["scene"]).tolist():
+        chosen = np.flatnonzero(rows["scene"] == number)
+        first = int(rows["epoch_ms"][chosen].min())
+        edges = US101_EDGES if (rows["lane"][chosen] == 6).any() else US101_EDGES[:-1]
+        step = np.rint((rows["epoch_ms"] - first) / 100.0).astype(np.int64)
+        sizes = (rows["length"], rows["width"])
+        start = first / 1000.0 - US101_ZERO
+        scenes.append(_cut_scene(f"us101-{number:02}", start, edges, chosen, step, rows["vehicle"], smooth, sizes))
+    return tuple(scenes)
 
 
-def smooth_tracks(
+def _smooth_tracks(
     breaks: NDArray[np.int64], x: FloatArray, y: FloatArray, along: float = CUTOFF_ALONG, across: float = CUTOFF_ACROSS
 ) -> dict[str, FloatArray]:
-    """Return smooth states and actions for rows of tracks, one track after another.
+    """Return the states and actions of `TrafficScene` (rows,), smoothed, of positions (rows,) of tracks.
 
-    Args:
-        breaks: Rows at which a track begins; the first need not be among them.
-        x: Position along the road [m], shape (rows,).
-        y: Position across the road [m], shape (rows,).
-        along: Cut-off along the road [Hz].
-        across: Cut-off across the road [Hz].
-
-    Returns:
-        `x`, `y`, `heading`, `speed`, `acceleration`, `yaw_rate`, shape (rows,) each.
+    A track begins at each of the breaks, and at the first row; cut-offs are in Hz.
     """
     result = {key: np.empty(len(x)) for key in ("x", "y", "heading", "speed", "acceleration", "yaw_rate")}
     for piece in np.split(np.arange(len(x)), breaks[breaks > 0]):
@@ -205,16 +170,27 @@ def smooth_tracks(
     return result
 
 
-def _cut_us101_scene(rows: Mapping[str, NDArray[Any]], number: int) -> TrafficScene:
-    """Return the scene of a number, cut from smoothed tracks."""
-    inside = rows["scene"] == number
-    scene = {key: values[inside] for key, values in rows.items()}
-    first = scene["epoch_ms"].min()
-    _, first_row, column = np.unique(scene["vehicle"], return_index=True, return_inverse=True)
-    scene["step"], scene["vehicle"] = np.rint((scene["epoch_ms"] - first) / 100.0), column.astype(np.float64)
-    edges = US101_EDGES if (scene["lane"] == 6).any() else US101_EDGES[:-1]
-    length, width = (scene[key][first_row] for key in ("length", "width"))
-    return assemble_scene(f"us101-{number:02}", first / 1000.0 - US101_ZERO, edges, scene, length, width)
+def _cut_scene(
+    name: str,
+    start: float,
+    edges: Sequence[float],
+    chosen: NDArray[np.int64],
+    step: NDArray[np.int64],
+    vehicle: NDArray[np.int64],
+    smooth: Mapping[str, FloatArray],
+    sizes: tuple[FloatArray, FloatArray],
+) -> TrafficScene:
+    """Return the scene of the chosen rows; the others have one value for each row of the table."""
+    _, first, column = np.unique(vehicle[chosen], return_index=True, return_inverse=True)
+    known = np.isfinite(smooth["speed"][chosen])
+    rows, column, at = chosen[known], column.ravel()[known], step[chosen][known]
+    states = {key: np.full((int(step[chosen].max()) + 1, len(first)), np.nan) for key in smooth}
+    for key, values in smooth.items():
+        states[key][at, column] = values[rows]
+    length, width = (values[chosen[first]] for values in sizes)
+    return TrafficScene(
+        name, start, tuple(edges), **states, present=np.isfinite(states["x"]), length=length, width=width
+    )
 
 
 def split_by_clock(
@@ -276,7 +252,8 @@ def scenes_of(trajectories: Trajectories, seconds: float = 10.0) -> tuple[Traffi
     for name in ("y", "length", "width"):
         if np.isnan(t.column(name)).any():
             raise ValueError(f"Scenes need {name} in every row; this table lacks it in some.")
-    smooth = smooth_tracks(t.track_starts(), t.x, t.y)
+    smooth = _smooth_tracks(t.track_starts(), t.x, t.y)
+    window, known = t.frame // steps, np.isfinite(smooth["speed"])
     scenes: list[TrafficScene] = []
     for recording in np.unique(t.recording).tolist():
         own = t.recording == recording
@@ -293,17 +270,10 @@ def scenes_of(trajectories: Trajectories, seconds: float = 10.0) -> tuple[Traffi
                 f"Recording {recording!r} has nobody between its lane boundaries, {edges[0]:g} to {edges[-1]:g} m; "
                 f"{_describe_positions(t, own)}."
             )
-        inside &= np.isfinite(smooth["speed"])
-        window = t.frame // steps
-        for number in np.unique(window[inside]):
-            rows = np.flatnonzero(inside & (window == number))
-            _, first, column = np.unique(t.vehicle[rows], return_index=True, return_inverse=True)
-            columns = {name: values[rows] for name, values in smooth.items()}
-            columns["step"] = (t.frame[rows] - number * steps).astype(np.float64)
-            columns["vehicle"] = column.ravel().astype(np.float64)
-            start = DT * float(number * steps)
-            name = f"{recording}-{start:.0f}"
-            scenes.append(assemble_scene(name, start, edges, columns, t.length[rows[first]], t.width[rows[first]]))
+        for number in np.unique(window[inside & known]):
+            chosen, start = np.flatnonzero(inside & known & (window == number)), DT * float(number * steps)
+            name, step = f"{recording}-{start:.0f}", t.frame - number * steps
+            scenes.append(_cut_scene(name, start, edges, chosen, step, t.vehicle, smooth, (t.length, t.width)))
     return tuple(scenes)
 
 

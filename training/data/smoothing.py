@@ -8,8 +8,8 @@ from next generation simulation trajectory data", 2008), here by penalised least
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from functools import lru_cache
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,47 +20,23 @@ from samplers.problem import FloatArray
 from training.data.table import DT
 
 CUTOFF_ALONG = 0.40
-"""Frequency [Hz] at which the gain along the road is one half; docs/data.md has accelerations by cut-off."""
+"""Frequency [Hz] at which the gain along the road is one half."""
 CUTOFF_ACROSS = 0.35
 """Frequency [Hz] at which the gain across the road is one half."""
 MIN_HEADING_SPEED = 2.0
 """Speed [m/s] along the road below which the heading is computed as at this speed, because it would be noise."""
-
 LARGEST_STEP = 1.5
 """Frames between two rows of a vehicle from which on its track is cut: between 1 (no hole) and 2 (one is missing)."""
 ROUNDING = 1e-6
 """Tolerance [ticks] within which the end of a track counts as a multiple of `DT`: more than times are rounded by."""
 
 
-class Motion(NamedTuple):
-    """Headings, speeds and actions of a track, arrays of shape (T,); NaN where the end of the track leaves no value."""
-
-    heading: FloatArray
-    """Relative to the road [rad], positive towards +y; NaN in the last step."""
-    speed: FloatArray
-    """Along the heading [m/s]; NaN in the last step."""
-    acceleration: FloatArray
-    """[m/s^2]; NaN in the last two steps."""
-    yaw_rate: FloatArray
-    """[rad/s]; NaN in the last two steps."""
-
-
 def smooth_positions(positions: FloatArray, cutoff: float, dt: float) -> FloatArray:
     """Return smooth positions z near the recorded y: the minimiser of |y - z|^2 + lambda |third differences of z|^2.
 
     In the middle of a track this is a filter of gain 1 / (1 + lambda (2 - 2 cos(2 pi f dt))^3) without delay; lambda
-    makes the gain one half (-6 dB) at the cut-off. Parabolas pass unchanged, at the ends too.
-
-    Args:
-        positions: One coordinate of one track without holes [m], shape (T,).
-        cutoff: Frequency at which the gain is one half [Hz], at most half the sampling rate.
-        dt: Time step [s].
-
-    Returns:
-        Smooth positions [m], shape (T,); tracks of fewer than four steps are returned as they are.
-
-    Raises:
-        ValueError: A position is not finite, or the cut-off is not between 0 and 1 / (2 dt).
+    makes the gain one half (-6 dB) at the cut-off [Hz]. Parabolas pass unchanged, at the ends too. Positions (T,) [m]
+    are of one coordinate of one track without holes, dt apart [s]; tracks of fewer than four steps stay as they are.
     """
     positions = np.asarray(positions, dtype=np.float64)
     if positions.ndim != 1 or not np.isfinite(positions).all():
@@ -87,65 +63,47 @@ def _penalty_factor(n: int, cutoff: float, dt: float) -> FloatArray:
     return factor
 
 
-def infer_motion(x: FloatArray, y: FloatArray, dt: float) -> Motion:
-    """Return the headings, speeds and actions that move a point mass through the given positions.
+def infer_motion(x: FloatArray, y: FloatArray, dt: float) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Return headings, speeds, accelerations and yaw rates that move a point mass through positions (T,) [m].
 
     This inverts the simulator's step (explicit Euler, old values): x += v cos(h) dt, y += v sin(h) dt, h += w dt,
     v += a dt. It is exact while the vehicle moves along the road at `MIN_HEADING_SPEED` or more. Below, the heading is
     atan2(vy, MIN_HEADING_SPEED) and the speed the part of (vx, vy) along it, so that a creeping vehicle does not spin.
-
-    Args:
-        x: Smooth positions along the road [m], shape (T,).
-        y: Smooth positions across the road [m], shape (T,).
-        dt: Time step [s].
+    Headings are relative to the road, positive towards +y; values that the end of the track does not determine are NaN:
+    of the states the last one, of the actions the last two.
     """
     vx, vy = np.diff(x) / dt, np.diff(y) / dt
     heading = np.arctan2(vy, np.maximum(vx, MIN_HEADING_SPEED))
     speed = np.maximum(vx * np.cos(heading) + vy * np.sin(heading), 0.0)
-    return Motion(*(_pad(values, len(x)) for values in (heading, speed, np.diff(speed) / dt, np.diff(heading) / dt)))
 
+    def pad(values: FloatArray) -> FloatArray:
+        return np.concatenate([values, np.full(len(x) - len(values), np.nan)])
 
-def _pad(values: FloatArray, n: int) -> FloatArray:
-    """Return the values followed by NaN, shape (n,)."""
-    return np.concatenate([values, np.full(n - len(values), np.nan)])
-
-
-class ResampledTracks(NamedTuple):
-    """Rows at multiples of `DT`."""
-
-    vehicle: FloatArray
-    """Number of the vehicle, shape (rows,)."""
-    frame: FloatArray
-    """Time in units of `DT`, shape (rows,)."""
-    splined: FloatArray
-    """Columns interpolated by cubic splines, shape (rows, a)."""
-    linear: FloatArray
-    """Columns interpolated linearly, shape (rows, b)."""
-    nearest: NDArray[np.intp]
-    """Row of the original that is nearest in time, shape (rows,)."""
+    return pad(heading), pad(speed), pad(np.diff(speed) / dt), pad(np.diff(heading) / dt)
 
 
 def resample_tracks(
-    vehicle: FloatArray, time: FloatArray, dt: float, splined: FloatArray, linear: FloatArray
-) -> ResampledTracks:
-    """Return tracks at multiples of `DT`, cut at their holes.
+    vehicle: FloatArray,
+    time: FloatArray,
+    dt: float,
+    splined: Mapping[str, FloatArray],
+    linear: Mapping[str, FloatArray],
+) -> tuple[dict[str, FloatArray], NDArray[np.intp]]:
+    """Return columns (rows,) of tracks at multiples of `DT`, cut at holes, and the rows nearest in time (rows,).
 
-    Args:
-        vehicle: Number of the vehicle, shape (n,).
-        time: Time of each row [s], shape (n,).
-        dt: Time between the frames of the file [s].
-        splined: Columns to interpolate by cubic splines, such as positions, shape (n, a).
-        linear: Columns to interpolate linearly, shape (n, b).
+    Vehicle, time [s] and the columns, which are interpolated by cubic splines or linearly, have shape (n,); rows of a
+    vehicle are dt apart [s]. The columns have `vehicle` and `frame`, the time in units of `DT`, beside them.
     """
     order = np.lexsort([time, vehicle])
     cuts = 1 + np.flatnonzero((np.diff(vehicle[order]) != 0) | (np.diff(time[order]) > LARGEST_STEP * dt))
-    parts: list[ResampledTracks] = []
+    curved, parts = np.column_stack(list(splined.values())), []
     for piece in np.split(order, cuts):
         t = time[piece]
         frame = np.arange(np.ceil(t[0] / DT - ROUNDING), np.floor(t[-1] / DT + ROUNDING) + 1.0)
         at = np.clip(frame * DT, t[0], t[-1])
-        smooth = CubicSpline(t, splined[piece])(at) if len(t) > 3 else splined[piece][np.searchsorted(t, at)]
-        straight = np.column_stack([np.interp(at, t, column) for column in linear[piece].T])
+        smooth = CubicSpline(t, curved[piece])(at) if len(t) > 3 else curved[piece][np.searchsorted(t, at)]
+        straight = [np.interp(at, t, column[piece]) for column in linear.values()]
         nearest = piece[np.minimum(np.rint((at - t[0]) / dt).astype(np.int64), len(t) - 1)]
-        parts.append(ResampledTracks(np.full(len(frame), vehicle[piece[0]]), frame, smooth, straight, nearest))
-    return ResampledTracks(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
+        parts.append((np.full(len(frame), vehicle[piece[0]]), frame, *smooth.T, *straight, nearest))
+    *columns, nearest = (np.concatenate(column) for column in zip(*parts, strict=True))
+    return dict(zip(("vehicle", "frame", *splined, *linear), columns, strict=True)), nearest

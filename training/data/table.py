@@ -122,11 +122,7 @@ class Trajectories:
         return np.append(0, 1 + np.flatnonzero(~(same & (np.diff(self.frame) == 1))))
 
     def find_rows(self, vehicle: Integers) -> Integers:
-        """Return the rows of other vehicles at the same recording and frame, shape (rows,); -1 where there is none.
-
-        Args:
-            vehicle: Number of the vehicle to find for each row, shape (rows,).
-        """
+        """Return the rows of other vehicles (rows,) at the same recording and frame, shape (rows,); -1: none."""
         recordings = np.unique(self.recording, return_inverse=True)[1].ravel()
         vehicles, frames = np.ptp(self.vehicle) + 1, np.ptp(self.frame) + 1
         frame = self.frame - self.frame.min()
@@ -177,16 +173,9 @@ def tabulate(columns: Mapping[str, Any], edges: Mapping[str, tuple[float, ...]] 
 
 
 def find_leaders(frame: Integers, lane: Integers, x: FloatArray, recording: NDArray[Any] | None = None) -> Integers:
-    """Return the rows of the nearest vehicles ahead in the same lane, shape (rows,).
+    """Return the rows of the nearest vehicles ahead in the same lane, of frames, lanes and positions [m] (rows,).
 
-    Args:
-        frame: Number of the time step, shape (rows,).
-        lane: Number of the lane, shape (rows,); 0 is no lane.
-        x: Position along the road [m], shape (rows,).
-        recording: Name of the recording, shape (rows,); None if all rows are of one.
-
-    Returns:
-        -1 where nobody is ahead, or the vehicle is in no lane.
+    -1 where nobody is ahead, or the lane is 0, which is none. Without names of recordings (rows,) all are of one.
     """
     group = np.zeros(len(x), np.int64) if recording is None else np.unique(recording, return_inverse=True)[1].ravel()
     order = np.lexsort([x, lane, frame, group])
@@ -224,13 +213,7 @@ def read_trajectories(path: Path | str) -> Trajectories:
         Traceback (most recent call last):
         ValueError: Cannot read trajectories from no_such_table.parquet: ...
     """
-    try:
-        table = pq.read_table(path)
-    except (OSError, pa.ArrowInvalid) as error:
-        raise ValueError(f"Cannot read trajectories from {path}: {error}") from None
-    missing = [name for name in COLUMNS if name not in table.column_names]
-    if missing:
-        raise ValueError(f"{path} lacks the columns {', '.join(missing)}.")
+    table = _read_parquet(Path(path), COLUMNS, "trajectories")
     edges = json.loads((table.schema.metadata or {}).get(_METADATA, b"{}"))
     try:
         columns = {name: table[name].to_numpy() for name in COLUMNS}
@@ -240,24 +223,25 @@ def read_trajectories(path: Path | str) -> Trajectories:
 
 
 def read_columns(path: Path, names: tuple[str, ...]) -> dict[str, NDArray[Any]]:
-    """Return columns of a parquet file.
-
-    Raises:
-        ValueError: The file is missing, cannot be read or lacks a column.
-    """
+    """Return columns of one of the compact tables, a parquet file; a ValueError if it is missing or broken."""
     if not path.is_file():
         raise ValueError(
             f"There is no {path.name} in the folder {str(path.parent)!r}. That is one of the compact tables, which are "
             "no part of the package; recordings of your own are read in the formats of docs/data.md."
         )
+    table = _read_parquet(path, names, "recorded traffic")
+    return {name: table[name].to_numpy() for name in names}
+
+
+def _read_parquet(path: Path, names: tuple[str, ...], what: str) -> pa.Table:
+    """Return the table of a parquet file, which is to have these columns."""
     try:
         table = pq.read_table(path)
     except (OSError, pa.ArrowInvalid) as error:
-        raise ValueError(f"Cannot read recorded traffic from {path}: {error}") from None
-    missing = [name for name in names if name not in table.column_names]
-    if missing:
+        raise ValueError(f"Cannot read {what} from {path}: {error}") from None
+    if missing := [name for name in names if name not in table.column_names]:
         raise ValueError(f"{path} lacks the columns {', '.join(missing)}.")
-    return {name: table[name].to_numpy() for name in names}
+    return table
 
 
 def synthetic_traffic(seconds: float = 12.0, lanes: int = 3, per_lane: int = 3) -> Trajectories:

@@ -1,6 +1,6 @@
 """Fit: base distributions of scenarios from recorded traffic."""
 
-from training.fit.filters import EVENT_RECIPES, EventRecipe
-from training.fit.mixture import MixtureFit, select_mixture
+from training.fit.base import FitRequest, fit_base
+from training.fit.filters import EventSet
 
-__all__ = ["EVENT_RECIPES", "EventRecipe", "MixtureFit", "select_mixture"]
+__all__ = ["EventSet", "FitRequest", "fit_base"]

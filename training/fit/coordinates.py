@@ -14,6 +14,7 @@ coordinates of the fit gave intervals that held p in 81 and 74 % of 32 and 31 dr
 
 from __future__ import annotations
 
+import contextlib
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -141,39 +142,31 @@ def fit_system(
     starts: int | None = None,
     most: int = MAX_COMPONENTS,
 ) -> SystemFit:
-    """Fit a Gaussian mixture in one coordinate system; columns apart get one component of their own.
+    """Fit a mixture of `most` components at most in one system; columns apart get one component of their own.
 
-    Args:
-        events: The events.
-        system: The coordinates, those of the columns apart included.
-        parameters: Parameters of the scenario, in the order of x.
-        seed: Seed of the fits.
-        starts: Starts of each fit, see `select_mixture`.
-        most: Largest number of components to try.
-
-    Raises:
-        ValueError: The events are too few, or a parameter does not vary.
+    The parameters are those of the scenario in the order of x, the system has the coordinates of all of them.
     """
-    joint = system.coordinates(parameters[: events.joint.shape[1]])
-    fit = select_mixture(joint.to_coordinates(events.joint), seed, most, starts, _coordinate_names(joint))
+    n = events.joint.shape[1]
+    joint, own = system.coordinates(parameters[:n]), system.coordinates(parameters[n:])
+    fit = _fit_in(joint, events.joint, seed, most, starts)
     components, bic_apart = fit.components, 0.0
     if events.apart.shape[1]:
-        own = system.coordinates(parameters[events.joint.shape[1] :])
-        apart = select_mixture(own.to_coordinates(events.apart), seed, most=1, names=_coordinate_names(own))
+        apart = _fit_in(own, events.apart, seed, 1, None)
         components = append_independent(components, apart.components)
         bic_apart = apart.bic - _log_jacobian(own, events.apart)
     bic = fit.bic - _log_jacobian(joint, events.joint)
     return SystemFit(system, CoordinateMixture(system.coordinates(parameters), *components), fit, bic, bic_apart)
 
 
-def _coordinate_names(coordinates: Coordinates) -> list[str]:
-    """Return the parameter behind each coordinate."""
-    return [coordinates.names[j] for j in coordinates.columns]
+def _fit_in(coordinates: Coordinates, x: FloatArray, seed: int, most: int, starts: int | None) -> MixtureFit:
+    """Return a mixture fitted to the coordinates of events x (n, d)."""
+    names = [coordinates.names[j] for j in coordinates.columns]
+    return select_mixture(coordinates.to_coordinates(x), seed, most, starts, names)
 
 
-def _log_jacobian(coordinates: Coordinates, points: FloatArray) -> float:
-    """Return twice the sum of log |det dy/dx| over points, by which a BIC of y exceeds that of x."""
-    return 2.0 * float(coordinates.log_jacobian(coordinates.interior(points)).sum())
+def _log_jacobian(coordinates: Coordinates, x: FloatArray) -> float:
+    """Return twice the sum of log |det dy/dx| over x (n, d), by which a BIC of y exceeds that of x."""
+    return 2.0 * float(coordinates.log_jacobian(coordinates.interior(x)).sum())
 
 
 def held_out_log_prob(
@@ -192,36 +185,29 @@ def held_out_log_prob(
     scores = np.full(len(events.joint), np.nan)
     for fold in np.array_split(names, min(N_FOLDS, len(names))):
         test = np.isin(events.clusters, fold)
-        try:
-            rest = EventSet(events.joint[~test], events.clusters[~test])
+        rest = EventSet(events.joint[~test], events.clusters[~test])
+        with contextlib.suppress(ValueError):
             fitted = fit_system(rest, system, own, seed, FOLD_STARTS, most)
-        except ValueError:
-            continue
-        scores[test] = fitted.distribution.log_prob(events.joint[test])
+            scores[test] = fitted.distribution.log_prob(events.joint[test])
     return scores
 
 
 def choose_system(bic: Sequence[float], held_out: Sequence[FloatArray], clusters: NDArray[np.int64]) -> int:
-    """Return which coordinate system is supported best.
+    """Return which coordinate system is supported best, of BICs and log densities of held-out events, (n,) each.
 
     The one with the least BIC among those whose held-out log likelihood is not clearly worse than the best one's:
-    by no more than `CLEARLY_WORSE` paired standard errors, of sums over clusters. Where others are within `BIC_TIE` of
-    it, the held-out log likelihood decides between these.
-
-    Args:
-        bic: Of each system.
-        held_out: Log density of each event under each system, shape (n,) each, see `held_out_log_prob`.
-        clusters: Of each event, shape (n,).
+    by no more than `CLEARLY_WORSE` paired standard errors, of sums over clusters (n,). Where others are within
+    `BIC_TIE` of it, the held-out log likelihood decides between these.
     """
     known = np.isfinite(np.stack(held_out)).all(axis=0)
     if not known.any():
         return int(np.argmin(bic))
     totals = [score[known].sum() for score in held_out]
     best = held_out[int(np.argmax(totals))]
+    cluster = np.unique(clusters[known], return_inverse=True)[1].ravel()
     eligible = []
     for i, score in enumerate(held_out):
-        _, cluster = np.unique(clusters[known], return_inverse=True)
-        losses = np.bincount(cluster.ravel(), weights=(best - score)[known])
+        losses = np.bincount(cluster, weights=(best - score)[known])
         error = float(np.sqrt(len(losses)) * losses.std(ddof=1)) if len(losses) > 1 else np.inf
         if losses.sum() <= CLEARLY_WORSE * error:
             eligible.append(i)
@@ -232,19 +218,12 @@ def choose_system(bic: Sequence[float], held_out: Sequence[FloatArray], clusters
 def draw_events(events: EventSet, rng: np.random.Generator) -> EventSet:
     """Return as many clusters as there are, drawn with replacement, and columns apart drawn by themselves."""
     names = np.unique(events.clusters)
-    rows: list[NDArray[np.int64]] = []
-    labels: list[NDArray[np.int64]] = []
-    for number, name in enumerate(rng.choice(names, len(names))):
-        rows.append(np.flatnonzero(events.clusters == name))
-        labels.append(np.full(len(rows[-1]), number))
+    rows = [np.flatnonzero(events.clusters == name) for name in rng.choice(names, len(names))]
+    labels = np.repeat(np.arange(len(rows)), [len(part) for part in rows])
     apart = events.apart
     if len(apart):
         apart = apart[rng.integers(len(apart), size=len(apart))]
-    return EventSet(events.joint[np.concatenate(rows)], np.concatenate(labels), apart, events.cluster)
-
-
-def _ignore(_: str) -> None:
-    """Take a line of progress and print nothing."""
+    return EventSet(events.joint[np.concatenate(rows)], labels, apart, events.cluster)
 
 
 def refit(
@@ -253,24 +232,12 @@ def refit(
     parameters: Sequence[Parameter],
     seed: int = 0,
     n: int | None = None,
-    report: Callable[[str], None] = _ignore,
+    report: Callable[[str], None] = lambda _: None,
 ) -> tuple[SystemFit, ...]:
-    """Return refits, each in the coordinate system that its events support best by the BIC.
+    """Return n refits, each in the coordinate system that its events support best by the BIC.
 
-    Args:
-        events: The recorded events.
-        systems: The coordinate systems to choose from; those that were tried for the base.
-        parameters: Parameters of the scenario, in the order of x.
-        seed: Seed of the draws and the fits.
-        n: Number of refits; None for `N_REFITS`, or `MORE_REFITS` where coordinates or the number of components
-            differ among these.
-        report: Told of each refit.
-
-    Returns:
-        The refits; none where there are fewer than `MIN_CLUSTERS` clusters.
-
-    Raises:
-        ValueError: The events are too few.
+    With None there are `N_REFITS`, or `MORE_REFITS` where coordinates or components differ among these; none where
+    there are fewer than `MIN_CLUSTERS` clusters. `report` is told of each.
     """
     if len(np.unique(events.clusters)) < MIN_CLUSTERS:
         return ()
@@ -288,12 +255,7 @@ def refit(
 
 
 def describe_family(family: str, refits: Sequence[SystemFit]) -> str:
-    """Return the family of a fit in words, with the share of the refits in the same coordinates if others have others.
-
-    Args:
-        family: Components and coordinates of the fit, `SystemFit.family`.
-        refits: Its refits.
-    """
+    """Return the family of a fit in words, with the share of the refits in each coordinates if they differ."""
     systems = Counter(each.system.name for each in refits)
     if len(systems) < 2:
         return family

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -18,12 +18,7 @@ from samplers.problem import FloatArray
 
 @dataclass(frozen=True)
 class EventRecipe:
-    """Columns and filters of the events of a scenario.
-
-    Example:
-        >>> EventRecipe("pairs.csv", ("v_ego", "v_lead", "gap")).apart
-        ()
-    """
+    """Columns and filters of the events of a scenario."""
 
     file: str
     columns: tuple[str, ...]
@@ -34,8 +29,8 @@ class EventRecipe:
     """Columns of truth values that must hold for the columns fitted separately."""
     excluded: tuple[str, ...] = ()
     """Columns of truth values that must not hold for any column."""
-    phase: str | None = None
-    """Value of the column `phase` in the rows that are used; None where the file has no such column."""
+    where: Mapping[str, Any] = field(default_factory=dict)
+    """Values of other columns in the rows that are events, such as phase: start."""
     cluster: tuple[str, ...] = ("recording", "frame")
     """Columns whose values together name the cluster of an event; frames count in windows of `CLUSTER_FRAMES`."""
 
@@ -76,7 +71,7 @@ EVENT_RECIPES = {
         ("v_ego", "v_cutin", "v_lead", "gap_ego_cutin", "gap_cutin_lead", "lateral_offset", "duration"),
         apart=("lateral_offset", "duration"),
         required=("start_seen",),
-        phase="start",
+        where={"phase": "start"},
     ),
     "hard_brake": EventRecipe("hard_brake_events.csv", ("speed", "gap", "deceleration")),
 }
@@ -105,11 +100,7 @@ FILTER_REASONS = {
 
 
 def read_csv_columns(path: Path, names: Sequence[str]) -> dict[str, NDArray[Any]]:
-    """Return columns of a CSV file.
-
-    Raises:
-        ValueError: The file cannot be read or lacks a column.
-    """
+    """Return columns of a CSV file; a ValueError if it cannot be read or lacks one."""
     try:
         table = csv.read_csv(path)
     except (OSError, ArrowInvalid) as error:
@@ -121,67 +112,58 @@ def read_csv_columns(path: Path, names: Sequence[str]) -> dict[str, NDArray[Any]
 
 
 def read_events(path: Path, recipe: EventRecipe) -> dict[str, NDArray[Any]]:
-    """Return the columns of an events file, numbers as float64 with NaN where a value is missing.
-
-    Raises:
-        ValueError: The file cannot be read or lacks a column.
-    """
-    others = (*recipe.required, *recipe.excluded, *(("phase",) if recipe.phase else ()), *recipe.cluster)
+    """Return the columns of an events file, numbers as float64 with NaN where a value is missing."""
+    others = (*recipe.required, *recipe.excluded, *recipe.where, *recipe.cluster)
     events = read_csv_columns(path, (*recipe.columns, *others))
     return events | {name: np.asarray(events[name], dtype=np.float64) for name in recipe.columns}
 
 
+Rule = tuple[str, str, NDArray[np.bool_]]
+"""Words of a filter, its reason, and which events pass, shape (n,)."""
+
+
+def range_rule(column: str, values: FloatArray, p: Parameter, reason: str | None = None) -> Rule:
+    """Return the rule that values (n,) lie within the range of a parameter."""
+    reason = reason or FILTER_REASONS.get(p.name) or FILTER_REASONS[p.unit]
+    return f"{p.low:g} <= {column} <= {p.high:g} {p.unit}", reason, (values >= p.low) & (values <= p.high)
+
+
+def drop_events(keep: NDArray[np.bool_], rules: Iterable[Rule], columns: Sequence[str] = ()) -> list[dict[str, Any]]:
+    """Clear `keep` (n,) where a rule does not pass; return what each dropped of those before it, and how many stay."""
+    log: list[dict[str, Any]] = []
+    for rule, reason, passes in rules:
+        log.append({"rule": rule, "reason": reason, "dropped": int((keep & ~passes).sum())})
+        keep &= passes
+    return [*log, {"rule": "events used", **({"columns": [*columns]} if columns else {}), "events": int(keep.sum())}]
+
+
 def filter_events(events: Mapping[str, NDArray[Any]], recipe: EventRecipe, box: Sequence[Parameter]) -> EventSet:
-    """Return the usable events, with a record of what each filter dropped.
+    """Return the usable events of an events file (columns by name), for parameters in ranges, the box.
 
-    Args:
-        events: Columns of an events file.
-        recipe: Columns and filters.
-        box: Parameters of the scenario with their ranges.
-
-    Returns:
-        The events; `log` has per filter its rule, its reason and the number of events it dropped of those that passed
-        the filters before. The filters of the separate columns come last.
+    `log` has per filter its rule, its reason and the number of events it dropped of those that passed the filters
+    before. The filters of the separate columns come last.
     """
+    limits = dict(zip(recipe.columns, box, strict=False))
+
+    def usual_rules(columns: Sequence[str]) -> Iterator[Rule]:
+        for column in columns:
+            given = f"{column} is given"
+            yield given, FILTER_REASONS.get(given, FILTER_REASONS["missing"]), ~np.isnan(events[column])
+        for column in columns:
+            yield range_rule(column, events[column], limits[column])
+
     keep = np.ones(len(events[recipe.columns[0]]), dtype=bool)
-    if recipe.phase is not None:
-        keep &= events["phase"] == recipe.phase
-    log: list[dict[str, Any]] = [{"rule": "events read", "events": int(keep.sum())}]
-
-    def apply(rule: str, reason: str, passes: NDArray[np.bool_]) -> None:
-        dropped = int((keep & ~passes).sum())
-        log.append({"rule": rule, "reason": reason, "dropped": dropped})
-        np.logical_and(keep, passes, out=keep)
-
-    def apply_given(column: str) -> None:
-        rule = f"{column} is given"
-        apply(rule, FILTER_REASONS.get(rule, FILTER_REASONS["missing"]), ~np.isnan(events[column]))
-
-    def apply_range(column: str, p: Parameter) -> None:
-        inside = (events[column] >= p.low) & (events[column] <= p.high)
-        reason = FILTER_REASONS[p.name if p.name in FILTER_REASONS else p.unit]
-        apply(f"{p.low:g} <= {column} <= {p.high:g} {p.unit}", reason, inside)
-
-    for column in recipe.excluded:
-        apply(f"not {column}", FILTER_REASONS[f"not {column}"], ~events[column].astype(bool))
-    for column in recipe.joint:
-        apply_given(column)
-    for column, p in zip(recipe.joint, box, strict=False):
-        apply_range(column, p)
-    log.append({"rule": "events used", "columns": list(recipe.joint), "events": int(keep.sum())})
-    joint, clusters = (
-        np.column_stack([events[column][keep] for column in recipe.joint]),
-        number_clusters(events, recipe),
-    )
-    clusters = clusters[keep]
-    for column in recipe.required:
-        apply(column, FILTER_REASONS[column], events[column].astype(bool))
-    for column in recipe.apart:
-        apply_given(column)
-    for column, p in zip(recipe.apart, box[len(recipe.joint) :], strict=False):
-        apply_range(column, p)
+    for column, value in recipe.where.items():
+        keep &= events[column] == value
+    log = [{"rule": "events read", "events": int(keep.sum())}]
+    names = ((f"not {column}", ~events[column].astype(bool)) for column in recipe.excluded)
+    excluded = [(name, FILTER_REASONS[name], passes) for name, passes in names]
+    log += drop_events(keep, [*excluded, *usual_rules(recipe.joint)], recipe.joint)
+    joint = np.column_stack([events[column][keep] for column in recipe.joint])
+    clusters = _number_clusters(events, recipe)[keep]
     if recipe.apart:
-        log.append({"rule": "events used", "columns": list(recipe.apart), "events": int(keep.sum())})
+        required = [(column, FILTER_REASONS[column], events[column].astype(bool)) for column in recipe.required]
+        log += drop_events(keep, [*required, *usual_rules(recipe.apart)], recipe.apart)
     apart = np.empty((int(keep.sum()), len(recipe.apart)))
     for j, column in enumerate(recipe.apart):
         apart[:, j] = events[column][keep]
@@ -189,11 +171,8 @@ def filter_events(events: Mapping[str, NDArray[Any]], recipe: EventRecipe, box: 
     return EventSet(joint, clusters, apart, word, tuple(log))
 
 
-def number_clusters(events: Mapping[str, NDArray[Any]], recipe: EventRecipe) -> NDArray[np.int64]:
+def _number_clusters(events: Mapping[str, NDArray[Any]], recipe: EventRecipe) -> NDArray[np.int64]:
     """Return the number of the cluster of each event, shape (n,)."""
-    labels = []
-    for column in recipe.cluster:
-        values = events[column] // CLUSTER_FRAMES if column == "frame" else events[column]
-        labels.append(np.unique(values, return_inverse=True)[1].ravel())
-    clusters: NDArray[np.int64] = np.unique(np.column_stack(labels), axis=0, return_inverse=True)[1].ravel()
-    return clusters
+    values = [events[name] // CLUSTER_FRAMES if name == "frame" else events[name] for name in recipe.cluster]
+    labels = [np.unique(column, return_inverse=True)[1].ravel() for column in values]
+    return np.asarray(np.unique(np.column_stack(labels), axis=0, return_inverse=True)[1].ravel(), dtype=np.int64)

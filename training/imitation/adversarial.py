@@ -18,8 +18,7 @@ import torch
 from torch import Tensor
 
 from agents.learned.networks import AutoregressiveNoise, Policy
-from training.imitation.clone import log_likelihood
-from training.imitation.learner import MAX_GRADIENT_NORM, Learner, Log, critic_inputs, policy_cost
+from training.imitation.learner import Learner, Log, critic_inputs, descend, log_likelihood, policy_cost
 from training.imitation.rollout import Penalties, RolloutSteps, total_cost
 
 LEAST_SPREAD = 1e-6
@@ -34,34 +33,22 @@ def update_mgail(learner: Learner) -> Log:
     costs = Penalties(*(cost.mean() for cost in steps.costs))
     clone = learner.clone_loss()
     loss = total_cost(config, likeness, costs) + config.geometric_schedule(config.clone_weight, learner.update) * clone
-    norm = _descend(learner, loss)
+    norm = descend(learner.policy_optimiser, loss, learner.policy)
     return {
         "loss": float(loss.detach()),
         "likeness": float(likeness.detach()),
         **{name: float(cost.detach()) for name, cost in costs._asdict().items()},
         "clone": float(clone.detach()),
-        "gradient_norm": float(norm),
+        "gradient_norm": norm,
         "critic": learner.learn_critic(steps),
     }
 
 
-def _descend(learner: Learner, loss: Tensor) -> Tensor:
-    """Make one step of the policy, and return the norm of the gradient before it is clipped."""
-    learner.policy_optimiser.zero_grad()
-    torch.autograd.backward(loss)
-    norm = torch.nn.utils.clip_grad_norm_(learner.policy.parameters(), MAX_GRADIENT_NORM)
-    learner.policy_optimiser.step()
-    return norm
-
-
 def advantages(reward: Tensor, value: Tensor, discount: float, gae: float) -> Tensor:
-    """Return generalised advantage estimates of rollouts that continue beyond their last moment, shape (T, n).
+    """Return generalised advantage estimates (T, n) of rollouts that continue beyond their last moment.
 
-    Args:
-        reward: Reward of each moment, shape (T, n).
-        value: Value of each moment and of the one after the last, shape (T + 1, n).
-        discount: Discount per tick.
-        gae: Lambda of the estimates.
+    Of rewards (T, n) and values (T + 1, n), of which the last are those of the moment after; discount per tick, and
+    lambda of the estimates.
     """
     error = reward + discount * value[1:] - value[:-1]
     out = torch.empty_like(error)
@@ -125,11 +112,10 @@ def update_gail(learner: Learner) -> Log:
             moments = conditional_action(policy, steps.features[rows], steps.noise[rows], config.colour)
             ratio = torch.exp(log_likelihood(*moments, steps.action[rows]) - old[rows])
             clone = config.geometric_schedule(config.clone_weight, learner.update) * learner.clone_loss()
-            _descend(learner, clone - clipped_surrogate(ratio, gain[rows], config.clip).mean())
+            surrogate = clipped_surrogate(ratio, gain[rows], config.clip).mean()
+            descend(learner.policy_optimiser, clone - surrogate, policy)
             error = (value(seen[rows])[:, 0] - target[rows]).square().mean()
-            learner.value_optimiser.zero_grad()
-            torch.autograd.backward(error)
-            learner.value_optimiser.step()
+            descend(learner.value_optimiser, error)
     return {
         "reward": float(reward.mean()),
         **{name: float(getattr(steps.costs, name).mean()) for name in ("collision", "edge", "brake")},

@@ -18,6 +18,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+from scipy.special import rel_entr
 from torch import Tensor
 
 from agents import LearnedDriver
@@ -89,18 +90,11 @@ def regular_starts(recording: Recording, seconds: float = 2.0) -> tuple[Tensor, 
     return scene, tick
 
 
-class DrivingStep(NamedTuple):
-    """Traffic at one tick, and the actions taken in it."""
-
-    traffic: Traffic
-    """Traffic before the action."""
-    features: Tensor
-    """Features of the first M vehicles, shape (B, M, 51)."""
-    action: Tensor
-    """Actions of the first M vehicles, shape (B, M, 2)."""
+Moment = tuple[Traffic, Tensor, Tensor]
+"""Traffic at one tick, features (B, M, 51) and actions (B, M, 2) of its first M vehicles."""
 
 
-def drive_traffic(recording: Recording, traffic: Traffic, act: Act, ticks: int) -> Iterator[DrivingStep]:
+def drive_traffic(recording: Recording, traffic: Traffic, act: Act, ticks: int) -> Iterator[Moment]:
     """Yield each tick, before its action, of traffic whose driven vehicles a driver drives."""
     m = traffic.drivers
     unused = torch.zeros(*traffic.x.shape[:1], traffic.x.shape[1] - m, 2)
@@ -108,7 +102,7 @@ def drive_traffic(recording: Recording, traffic: Traffic, act: Act, ticks: int) 
     for _ in range(ticks):
         features = replay_features(traffic, m)
         action, memory = act(features, memory)
-        yield DrivingStep(traffic, features, action)
+        yield traffic, features, action
         traffic = step_replay(recording, traffic, torch.cat((action, unused), dim=1))
 
 
@@ -148,18 +142,18 @@ def find_overlaps(traffic: Traffic, m: int) -> Tensor:
     return touching & ~torch.eye(m, traffic.x.shape[1], dtype=torch.bool)
 
 
-def behaviour_of(moments: Iterator[DrivingStep]) -> Behaviour:
+def behaviour_of(moments: Iterator[Moment]) -> Behaviour:
     """Return the behaviour of driven vehicles from a start on."""
     rows: list[tuple[Tensor, ...]] = []
     scene = driven = overlapping = lane = torch.zeros(0)
     with torch.inference_mode():
-        for moment in moments:
-            traffic, m = moment.traffic, moment.action.shape[1]
+        for traffic, features, action in moments:
+            m = action.shape[1]
             now, touching = lane_of(traffic.y, traffic.edges)[:, :m], find_overlaps(traffic, m)
             if not rows:
                 driven, overlapping, lane = traffic.driven[:, :m], touching, now
                 scene = traffic.scene[:, None].expand_as(driven)[driven]
-            row = _row(moment, (touching & ~overlapping).any(dim=2), now != lane)
+            row = _row(traffic, features, action, (touching & ~overlapping).any(dim=2), now != lane)
             rows.append(tuple(column[driven] for column in row))
             lane = now
     columns = [torch.stack(column) for column in zip(*rows, strict=True)]
@@ -179,10 +173,10 @@ def recorded_behaviour(recording: Recording) -> Behaviour:
         traffic = start_replay(recording, scene, at)
         m = traffic.drivers
         vehicle = traffic.vehicle[:, :m]
-        moment = DrivingStep(traffic, replay_features(traffic, m), recording.actions(scene, at, vehicle))
+        features, action = replay_features(traffic, m), recording.actions(scene, at, vehicle)
         lane, last = lane_of(traffic.y, traffic.edges)[:, :m], before.gather(1, vehicle)
         driven = traffic.driven[:, :m] & (at == tick)[:, None]
-        row = _row(moment, find_overlaps(traffic, m).any(dim=2), (lane != last) & (last >= 0))
+        row = _row(traffic, features, action, find_overlaps(traffic, m).any(dim=2), (lane != last) & (last >= 0))
         known.append(torch.zeros(scenes, vehicles, dtype=torch.bool).scatter(1, vehicle, driven).flatten())
         rows.append([column.new_zeros(scenes, vehicles).scatter(1, vehicle, column).flatten() for column in row])
         before = torch.full_like(before, -1).scatter(1, vehicle, torch.where(driven, lane, -1))
@@ -190,26 +184,18 @@ def recorded_behaviour(recording: Recording) -> Behaviour:
     return Behaviour(scene.repeat_interleave(vehicles), torch.stack(known), *columns)
 
 
-def _row(moment: DrivingStep, contact: Tensor, changed: Tensor) -> tuple[Tensor, ...]:
+def _row(traffic: Traffic, features: Tensor, action: Tensor, contact: Tensor, changed: Tensor) -> tuple[Tensor, ...]:
     """Return the columns of `Behaviour` from `speed` on, shape (B, M) each."""
-    traffic, m = moment.traffic, moment.action.shape[1]
+    m = action.shape[1]
     y = traffic.y[:, :m]
-    ahead, rate = (moment.features[..., columns][..., AHEAD_BEAM] for columns in (RANGE_COLUMNS, RATE_COLUMNS))
+    ahead, rate = (features[..., columns][..., AHEAD_BEAM] for columns in (RANGE_COLUMNS, RATE_COLUMNS))
     off_road = (y < traffic.edges[:, :1]) | (y > traffic.edges[:, -1:])
-    return traffic.speed[:, :m], *moment.action.unbind(dim=-1), ahead, rate, contact, off_road, changed
+    return traffic.speed[:, :m], *action.unbind(dim=-1), ahead, rate, contact, off_road, changed
 
 
-class Errors(NamedTuple):
-    """Differences from the record, of the n vehicles that are still recorded."""
-
-    scene: Tensor
-    """Scene of each vehicle, shape (n,), as the others."""
-    position: Tensor
-    """[m]."""
-    speed: Tensor
-    """[m/s]."""
-    lateral: Tensor
-    """[m]."""
+Errors = dict[str, Tensor]
+"""Differences from the record of the n vehicles that are still recorded: position and lateral [m], speed [m/s], (n,)
+each, and the scene of each vehicle."""
 
 
 def current_errors(recording: Recording, traffic: Traffic) -> Errors:
@@ -217,15 +203,12 @@ def current_errors(recording: Recording, traffic: Traffic) -> Errors:
     at = traffic.tick.minimum(recording.ticks[traffic.scene] - 1)
     recorded = recording.present[traffic.scene, at].gather(1, traffic.vehicle)
     known = recorded & traffic.driven & (traffic.tick == at)[:, None]
-
-    def off(name: str) -> Tensor:
-        record: Tensor = getattr(recording, name)[traffic.scene, at].gather(1, traffic.vehicle)  # a field by its name
-        made: Tensor = getattr(traffic, name)  # likewise
-        return (made - record)[known]
-
-    along, across = off("x"), off("y")
+    fields = ("x", "y", "speed")  # by name
+    records = (getattr(recording, name)[traffic.scene, at].gather(1, traffic.vehicle) for name in fields)
+    along, across, speed = ((getattr(traffic, n) - r)[known] for n, r in zip(fields, records, strict=True))
+    position = (along.square() + across.square()).sqrt()
     scene = traffic.scene[:, None].expand_as(known)[known]
-    return Errors(scene, (along.square() + across.square()).sqrt(), off("speed"), across)
+    return {"scene": scene, "position": position, "speed": speed, "lateral": across}
 
 
 class DrivingStatistics(NamedTuple):
@@ -279,9 +262,8 @@ def sum_by_scene(behaviour: Behaviour, scenes: int, errors: Errors | None = None
         counts[name] = flat.reshape(scenes, bins).astype(np.float64)
     squared = {}
     if errors is not None:
-        # fields by name
-        squared = {name: by_scene(errors.scene, getattr(errors, name).square()) for name in ERROR_NAMES}
-        squared["number"] = by_scene(errors.scene, torch.ones_like(errors.position))
+        squared = {name: by_scene(errors["scene"], errors[name].square()) for name in ERROR_NAMES}
+        squared["number"] = by_scene(errors["scene"], torch.ones_like(errors["position"]))
     return DrivingStatistics(
         steps=steps(known),
         vehicles=by_scene(behaviour.scene, known.any(dim=0)),
@@ -300,13 +282,7 @@ def sum_by_scene(behaviour: Behaviour, scenes: int, errors: Errors | None = None
 
 @dataclass(frozen=True)
 class Realism:
-    """Rates of a driver in recorded scenes, and its differences from people.
-
-    Example:
-        >>> shares = {"hard_brake": 0.0, "collision": 0.01, "ever": 0.05, "off_road": 0.0}
-        >>> Realism(vehicles=20, **shares, lane_changes=0.1, mean_speed=14.0, divergence={}, rmse={}).collision
-        0.01
-    """
+    """Rates of a driver in recorded scenes, and its differences from people."""
 
     vehicles: int
     hard_brake: float
@@ -328,31 +304,15 @@ class Realism:
 
 
 def jensen_shannon(p: FloatArray, q: FloatArray) -> float:
-    """Return the Jensen-Shannon divergence of two distributions on the same bins [nats], 0 to log 2.
-
-    Example:
-        >>> round(jensen_shannon(np.array([1.0, 0.0]), np.array([0.0, 1.0])), 4)
-        0.6931
-    """
+    """Return the Jensen-Shannon divergence of two distributions on the same bins [nats], 0 to log 2."""
     middle = 0.5 * (p + q)
-
-    def kl(a: FloatArray) -> float:
-        inside = a > 0
-        return float((a[inside] * np.log(a[inside] / middle[inside])).sum())
-
-    return 0.5 * kl(p) + 0.5 * kl(q)
+    return float(0.5 * rel_entr(p, middle).sum() + 0.5 * rel_entr(q, middle).sum())
 
 
 def summarise_realism(
     driven: DrivingStatistics, recorded: DrivingStatistics, times: FloatArray | None = None
 ) -> Realism:
-    """Return rates, divergences and errors from the statistics of a driver.
-
-    Args:
-        driven: Statistics of the driver.
-        recorded: Statistics of the record that it is compared with.
-        times: Number of times that each scene counts, shape (S,); None for once.
-    """
+    """Return rates, divergences from a record, and errors of a driver; scenes count so many times (S,), or once."""
     times = np.ones_like(driven.steps) if times is None else times
     steps, vehicles = times @ driven.steps, times @ driven.vehicles
 
@@ -380,21 +340,17 @@ def summarise_realism(
 def collect_statistics(
     recording: Recording, act: Act, seconds: tuple[float, ...], starts: tuple[Tensor, Tensor] | None = None
 ) -> dict[float, DrivingStatistics]:
-    """Drive recorded scenes and return the statistics up to each of some times.
+    """Drive recorded scenes by one driver and return the statistics up to each of some times [s], the longest last.
 
-    Args:
-        recording: Scenes that the driver has not learned from.
-        act: Driver of all vehicles.
-        seconds: Times [s], the longest last.
-        starts: Scenes and ticks to start from; None for every 2 s of every scene.
+    Starts are scenes and ticks, (B,) each; None for every 2 s of every scene.
     """
     met: list[Errors] = []
 
-    def watch() -> Iterator[DrivingStep]:
+    def watch() -> Iterator[Moment]:
         traffic = start_replay(recording, *(regular_starts(recording) if starts is None else starts))
         for tick, moment in enumerate(drive_traffic(recording, traffic, act, round(seconds[-1] / DT))):
             if tick == round(ERROR_TIME / DT):
-                met.append(current_errors(recording, moment.traffic))
+                met.append(current_errors(recording, moment[0]))
             yield moment
 
     whole = behaviour_of(watch())

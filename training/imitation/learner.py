@@ -1,26 +1,27 @@
-"""The learner of GAIL and MGAIL: its critic, the state of a training, its rounds, and how it is saved and resumed.
+"""The learner of GAIL and MGAIL: behaviour cloning, from which both start, the critic, and the state of a training.
 
-The critic is a network that tells recorded driving from a policy's, by the features and the action of one moment.
+Cloning maximises the likelihood of recorded actions. The critic is a network that tells recorded driving from a
+policy's, by the features and the action of one moment.
 """
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor, nn
 
-from agents.learned.networks import ACTION_SIZE, FEATURE_SIZE, Policy
-from rare_envs.files import replace_file
-from training.imitation.clone import Pairs, log_likelihood, make_seeded, normalise_action
+from agents.learned.networks import ACTION_SIZE, FEATURE_SIZE, Policy, Scaling
+from training.checkpoints import read_checkpoint, write_checkpoint
 from training.imitation.config import Config
-from training.imitation.rollout import RolloutSteps, ScenePool, draw_pool, roll_out
-from training.imitation.traffic import Recording, Traffic
+from training.imitation.rollout import RolloutSteps, ScenePool, draw_pool, normalise_action, roll_out
+from training.imitation.traffic import Pairs, Recording, Traffic
 
 Log = dict[str, float]
 POLICY_BETAS, CRITIC_BETAS = (0.9, 0.99), (0.5, 0.9)
@@ -31,6 +32,55 @@ HIDDEN_UNITS, LEAK = 128, 0.2
 """Units of each hidden layer of critic and value, and the slope of the critic's activations below 0."""
 _TRAINED_PARTS = ("policy", "critic", "value", "policy_optimiser", "critic_optimiser", "value_optimiser")
 """Attributes that have weights, or moments of an optimiser."""
+
+
+Module = TypeVar("Module")
+
+
+def log_likelihood(mean: Tensor, log_std: Tensor, action: Tensor) -> Tensor:
+    """Return the log density of normalised actions under independent Gaussians, (..., 2) -> (...,)."""
+    z = (action - mean) * torch.exp(-log_std)
+    return -(0.5 * z.square() + log_std + 0.5 * math.log(2.0 * math.pi)).sum(dim=-1)
+
+
+def scaling_of(pairs: Pairs) -> Scaling:
+    """Return means and spreads of recorded features and actions; the spread of a constant is set to 1."""
+    if len(pairs.features) < 2:
+        raise ValueError(f"Expected two or more recorded pairs, got {len(pairs.features)}; are there any followers?")
+    std = pairs.features.std(dim=0)
+    std = torch.where(std > 1e-6, std, torch.ones_like(std))
+    return Scaling(pairs.features.mean(dim=0), std, pairs.action.mean(dim=0), pairs.action.std(dim=0).clamp(min=1e-6))
+
+
+def make_seeded(make: Callable[[], Module], generator: torch.Generator) -> Module:
+    """Return a network whose initial weights are drawn from a generator; PyTorch draws them from the global one."""
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(int(torch.randint(2**31, (), generator=generator)))
+        return make()
+
+
+def clone_policy(pairs: Pairs, config: Config, generator: torch.Generator) -> Policy:
+    """Return a new policy that maximises the likelihood of recorded actions.
+
+    Few epochs are made: 51 features say little about the next action, and further epochs overfit.
+    """
+    policy = make_seeded(lambda: Policy(scaling_of(pairs), config.log_std_cap), generator).to(pairs.features.device)
+    optimiser = torch.optim.Adam(policy.parameters(), lr=config.clone_rate, weight_decay=config.weight_decay)
+    action = normalise_action(policy, pairs.action)
+    for _ in range(config.epochs):
+        for rows in torch.split(torch.randperm(len(action), generator=generator), config.batch):
+            mean, log_std = policy(pairs.features[rows])
+            descend(optimiser, -log_likelihood(mean, log_std, action[rows]).mean())
+    return policy
+
+
+def descend(optimiser: torch.optim.Optimizer, loss: Tensor, clipped: nn.Module | None = None) -> float:
+    """Make one step down a loss; return the norm of the gradient of a network that is clipped, before it is."""
+    optimiser.zero_grad()
+    torch.autograd.backward(loss)
+    norm = 0.0 if clipped is None else float(nn.utils.clip_grad_norm_(clipped.parameters(), MAX_GRADIENT_NORM))
+    optimiser.step()
+    return norm
 
 
 def _network(activation: Callable[[], nn.Module]) -> nn.Sequential:
@@ -99,8 +149,8 @@ class Learner:
     """Number of vehicle-steps so far."""
 
     def __post_init__(self) -> None:
-        """Make optimisers, pools and the critic's memory."""
-        config = self.config
+        """Make optimisers, pools and the critic's memory; numbers are drawn on the CPU, the same for every device."""
+        config, self.device = self.config, self.recording.x.device
         self.policy_optimiser = torch.optim.Adam(self.policy.parameters(), config.policy_rate, betas=POLICY_BETAS)
         self.critic_optimiser = torch.optim.Adam(self.critic.parameters(), config.critic_rate, betas=CRITIC_BETAS)
         self.value = make_seeded(lambda: _network(nn.Tanh), self.generator).to(self.device)
@@ -109,11 +159,6 @@ class Learner:
         self.rollouts: deque[Tensor] = deque(maxlen=config.memory)
         self.clone_pairs = self.pairs.features, normalise_action(self.policy, self.pairs.action)
         self.recorded = critic_inputs(self.policy, *self.clone_pairs)
-
-    @property
-    def device(self) -> torch.device:
-        """Where traffic and networks are; numbers are drawn on the CPU, so that they are the same everywhere."""
-        return self.recording.x.device
 
     def linear_schedule(self, ends: tuple[int, int]) -> int:
         """Return the value at this update of a linear schedule of whole numbers."""
@@ -129,23 +174,22 @@ class Learner:
 
     def drive(self, credit: float) -> RolloutSteps:
         """Drive the next pool for a horizon; a pool that is too old is restarted from the record."""
-        config = self.config
+        config, horizon = self.config, self.linear_schedule(self.config.horizon)
+        index, oldest = self.update % config.pools, self.linear_schedule(config.age)
+
+        def start() -> ScenePool:
+            most = self.linear_schedule(config.drivers)
+            return draw_pool(self.recording, self.among, config.scenes, most, horizon, config.colour, self.generator)
+
         while len(self.pools) < config.pools:
-            self.pools.append(self._new_pool())
-        index = self.update % config.pools
-        if self.pools[index].age >= self.linear_schedule(config.age):
-            self.pools[index] = self._new_pool()
-        horizon = self.linear_schedule(config.horizon)
+            self.pools.append(start())
+        if self.pools[index].age >= oldest:
+            self.pools[index] = start()
         steps, self.pools[index] = roll_out(
             self.recording, self.policy, self.pools[index], horizon, config.colour, credit, self.generator
         )
         self.simulated += len(steps.features)
         return steps
-
-    def _new_pool(self) -> ScenePool:
-        most, shortest = self.linear_schedule(self.config.drivers), self.linear_schedule(self.config.horizon)
-        scenes, colour = self.config.scenes, self.config.colour
-        return draw_pool(self.recording, self.among, scenes, most, shortest, colour, self.generator)
 
     def learn_critic(self, steps: RolloutSteps) -> float:
         """Make some steps on random pairs of the record, and of this and the last rollouts; return the last loss."""
@@ -157,17 +201,8 @@ class Learner:
             rows = torch.randint(len(self.recorded), (config.critic_batch,), generator=generator)
             other = torch.randint(len(made), (config.critic_batch,), generator=generator)
             loss = critic_loss(self.critic, self.recorded[rows], made[other], config.gradient_penalty, generator)
-            self.critic_optimiser.zero_grad()
-            torch.autograd.backward(loss)
-            self.critic_optimiser.step()
+            descend(self.critic_optimiser, loss)
         return float(loss.detach())
-
-    def warm_up(self) -> None:
-        """Train the critic before the policy moves."""
-        for _ in range(self.config.warm_up):
-            with torch.no_grad():
-                steps = self.drive(1.0)
-            self.learn_critic(steps)
 
     def clone_loss(self) -> Tensor:
         """Return the negative log likelihood of a batch of recorded actions."""
@@ -186,15 +221,10 @@ class Learner:
             "rollouts": list(self.rollouts),
             "pools": [{"traffic": pool.traffic._asdict(), "noise": pool.noise, "age": pool.age} for pool in self.pools],
         }
-        with replace_file(path) as draft:
-            torch.save(state, draft)
+        write_checkpoint(path, state)
 
     def load(self, path: Path) -> None:
-        """Resume a saved training.
-
-        Raises:
-            ValueError: The file is no checkpoint of such a training.
-        """
+        """Resume a saved training."""
         state = self.inherit(path)
         self.update, self.simulated = state["update"], state["simulated"]
         self.generator.set_state(state["generator"].cpu())
@@ -202,34 +232,24 @@ class Learner:
         self.pools = [ScenePool(Traffic(**pool["traffic"]), pool["noise"], pool["age"]) for pool in state["pools"]]
 
     def inherit(self, path: Path) -> dict[str, Any]:
-        """Take over networks and optimisers of a saved training, but neither its progress nor its traffic.
-
-        Returns:
-            Content of the file.
-
-        Raises:
-            ValueError: The file is no checkpoint of such a training.
-        """
-        state: dict[str, Any] = torch.load(path, map_location=self.device, weights_only=True)
-        if not state.keys() >= {"update", "pools", *_TRAINED_PARTS}:
-            raise ValueError(f"Expected a checkpoint of a training in {str(path)!r}.")
+        """Take over networks and optimisers of a saved training, not its progress; return the content of the file."""
+        state = read_checkpoint(path, ("update", "pools", *_TRAINED_PARTS), self.device)
         for name in _TRAINED_PARTS:
             getattr(self, name).load_state_dict(state[name])  # likewise
         return state
 
 
 Update = Callable[[Learner], Log]
+"""One round: drive, train the critic, change the policy; figures of it."""
 
 
 def run_updates(learner: Learner, update: Update) -> Iterator[Log]:
-    """Make the remaining updates of a training, which may have been resumed, one by one; yield figures of each.
-
-    Args:
-        learner: The training.
-        update: One round: drive, train the critic, change the policy.
-    """
+    """Make the remaining updates of a training, which may have been resumed, one by one; yield figures of each."""
     if learner.update == 0:
-        learner.warm_up()
+        for _ in range(learner.config.warm_up):  # the critic learns before the policy moves
+            with torch.no_grad():
+                steps = learner.drive(1.0)
+            learner.learn_critic(steps)
     while learner.update < learner.config.updates:
         learner.set_rates()
         log = update(learner)

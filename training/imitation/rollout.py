@@ -17,7 +17,6 @@ from torch import Tensor
 
 from agents.learned.networks import AutoregressiveNoise, Policy
 from rare_envs.sensors.lidar import AHEAD_BEAM, LANE_OFFSET_COLUMN, RANGE_COLUMNS, RATE_COLUMNS, SPEED_COLUMN
-from training.imitation.clone import denormalise_action
 from training.imitation.config import Config
 from training.imitation.traffic import Recording, Traffic, replay_features, start_replay, step_replay
 
@@ -47,6 +46,22 @@ SPEED_LIMIT, SPEEDING_SCALE = 29.0, 10.0
 """Speed that costs nothing, the limit of US 101 (65 mph), and that above it that costs 1 [m/s]."""
 
 
+ACTION_LOW, ACTION_HIGH = (-8.0, -0.3), (4.0, 0.3)
+"""Bounds of acceleration [m/s^2] and yaw rate [rad/s]."""
+
+
+def denormalise_action(policy: Policy, action: Tensor) -> Tensor:
+    """Return normalised actions (..., 2) in m/s^2 and rad/s, clamped to the bounds."""
+    scaling = policy.scaling
+    low, high = action.new_tensor(ACTION_LOW), action.new_tensor(ACTION_HIGH)
+    return (scaling.action_mean + scaling.action_std * action).clamp(low, high)
+
+
+def normalise_action(policy: Policy, action: Tensor) -> Tensor:
+    """Return actions (..., 2) in m/s^2 and rad/s normalised: the inverse of `denormalise_action` within the bounds."""
+    return (action - policy.scaling.action_mean) / policy.scaling.action_std
+
+
 class Penalties(NamedTuple):
     """Costs of vehicles in one tick, shape (B, M) each, or of n moments, shape (n,)."""
 
@@ -60,25 +75,14 @@ class Penalties(NamedTuple):
 
 def total_cost(config: Config, likeness: Tensor, costs: Penalties) -> Tensor:
     """Return the weighted sum of the critic's cost and the penalties, of each moment or of their means."""
-    return (
-        config.critic_weight * likeness
-        + config.collision_weight * costs.collision
-        + config.edge_weight * costs.edge
-        + config.brake_weight * costs.brake
-        + config.headway_weight * costs.headway
-        + config.lane_weight * costs.lane
-        + config.speed_weight * costs.speed
-    )
+    total = config.critic_weight * likeness
+    for name, cost in costs._asdict().items():
+        total = total + getattr(config, f"{name}_weight") * cost  # settings by name
+    return total
 
 
 def compute_penalties(traffic: Traffic, features: Tensor, action: Tensor) -> Penalties:
-    """Return the costs of a moment and of the actions in it.
-
-    Args:
-        traffic: B scenes.
-        features: Features of the first M vehicles, shape (B, M, 51).
-        action: Their acceleration [m/s^2] and yaw rate [rad/s], shape (B, M, 2).
-    """
+    """Return the costs of a moment of the first M vehicles: features (B, M, 51), action (B, M, 2) [m/s^2, rad/s]."""
     x, y, length, width, edges = traffic.x, traffic.y, traffic.length, traffic.width, traffic.edges
     m = features.shape[1]
     along = (x[:, :m, None] - x[:, None, :]).abs() - 0.5 * (length[:, :m, None] + length[:, None, :])
@@ -131,16 +135,10 @@ def draw_pool(
     colour: AutoregressiveNoise,
     generator: torch.Generator,
 ) -> ScenePool:
-    """Return scenes at random moments of their records.
+    """Return a pool of `size` scenes among some (k,), at random moments of their records.
 
-    Args:
-        recording: The scenes.
-        among: Scenes to choose from, with repetition if they are listed more than once, shape (k,).
-        size: Number of scenes in the pool.
-        most: Largest number of driven vehicles in a scene.
-        shortest: Least number of ticks of record that remain, if the scene is that long.
-        colour: Noise of the drivers.
-        generator: Source of scenes and moments.
+    At most so many vehicles of each, the rearmost, are driven, and at least `shortest` ticks of record remain, if the
+    scene is that long.
     """
     scene = among[torch.randint(len(among), (size,), generator=generator)]
     last = (recording.ticks[scene] - shortest).clamp(min=1)
@@ -172,19 +170,10 @@ def roll_out(
     credit: float,
     generator: torch.Generator,
 ) -> tuple[RolloutSteps, ScenePool]:
-    """Drive a pool for some ticks.
+    """Drive a pool for some ticks by a policy that all driven vehicles share.
 
-    Args:
-        recording: The scenes.
-        policy: Driver of all driven vehicles, which share its parameters.
-        pool: Traffic to start from, without gradient.
-        ticks: Number of ticks.
-        colour: Noise of the actions.
-        credit: Share of the gradient of the state that each tick passes on to the tick before.
-        generator: Source of the noise.
-
-    Returns:
-        The moments, differentiable in the policy's weights, and the pool afterwards, which is not.
+    Each tick passes `credit`, a share, of the gradient of the state on to the tick before. Returns the moments,
+    differentiable in the policy's weights, and the pool afterwards, which is not.
     """
     traffic, memory = pool.traffic, pool.noise
     m = memory.shape[1]
@@ -200,16 +189,12 @@ def roll_out(
         moved = torch.cat((denormalise_action(policy, action), unused), dim=1)
         cost = compute_penalties(traffic, features, moved[:, :m])
         rows.append([part[driven] for part in (features, action, *cost, expected)])
-        traffic = _scale_gradient(step_replay(recording, traffic, moved), credit)
+        traffic = step_replay(recording, traffic, moved)
+        scaled = {
+            name: (value := getattr(traffic, name)) * credit + value.detach() * (1.0 - credit)  # a field by its name
+            for name in ("x", "y", "heading", "speed")
+        }
+        traffic = traffic._replace(**scaled)
     features, action, *costs, expected = (torch.cat(column) for column in zip(*rows, strict=True))
     left = Traffic(*(field.detach() for field in traffic))
     return RolloutSteps(features, action, Penalties(*costs), expected), ScenePool(left, memory, pool.age + ticks)
-
-
-def _scale_gradient(traffic: Traffic, credit: float) -> Traffic:
-    """Return the same traffic, through which gradients are multiplied by `credit`."""
-    moved = {
-        name: (value := getattr(traffic, name)) * credit + value.detach() * (1.0 - credit)  # a field by its name
-        for name in ("x", "y", "heading", "speed")
-    }
-    return traffic._replace(**moved)

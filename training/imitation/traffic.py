@@ -6,10 +6,11 @@ judged. Vehicles that enter the window later are left out.
 """
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from rare_envs.sensors.lidar import Bodies, OnRoad, perceive
@@ -49,43 +50,24 @@ class Recording(NamedTuple):
 
 
 def stack_scenes(scenes: Sequence[TrafficScene]) -> Recording:
-    """Return scenes as one recording.
-
-    Raises:
-        ValueError: There is no scene.
-    """
+    """Return scenes, of which there is one at least, as one recording."""
     if not scenes:
         raise ValueError("Expected at least one scene, got none.")
-    ticks = max(scene.x.shape[0] for scene in scenes)
-    vehicles = max(scene.x.shape[1] for scene in scenes)
+    ticks, vehicles = (max(scene.x.shape[axis] for scene in scenes) for axis in (0, 1))
     lanes = max(len(scene.edges) for scene in scenes)
 
-    def pad(name: str) -> Tensor:
-        out = np.zeros((len(scenes), ticks, vehicles), dtype=np.float32)
-        for row, scene in zip(out, scenes, strict=True):
-            values = getattr(scene, name)  # a field by its name
-            row[: values.shape[0], : values.shape[1]] = np.nan_to_num(values)
+    def pad(parts: Sequence[NDArray[Any]], shape: tuple[int, ...], fill: float = 0.0) -> Tensor:
+        out = np.full((len(parts), *shape), fill, bool if parts[0].dtype == bool else np.float32)
+        for row, values in zip(out, parts, strict=True):
+            row[tuple(slice(n) for n in values.shape)] = np.nan_to_num(values)
         return torch.from_numpy(out)
 
-    def sizes(name: str) -> Tensor:
-        out = np.ones((len(scenes), vehicles), dtype=np.float32)
-        for row, scene in zip(out, scenes, strict=True):
-            values = getattr(scene, name)  # likewise
-            row[: len(values)] = values
-        return torch.from_numpy(out)
-
-    known = np.zeros((len(scenes), ticks, vehicles), dtype=bool)
-    for row, scene in zip(known, scenes, strict=True):
-        whole = np.isfinite(scene.acceleration) & np.isfinite(scene.yaw_rate) & scene.present
-        row[: whole.shape[0], : whole.shape[1]] = whole
+    moving = ("x", "y", "heading", "speed", "acceleration", "yaw_rate", "present")  # fields by name, as the next
     edges = [tuple(scene.edges) + (scene.edges[-1],) * (lanes - len(scene.edges)) for scene in scenes]
-    moving = {name: pad(name) for name in ("x", "y", "heading", "speed", "acceleration", "yaw_rate")}
     return Recording(
-        **moving,
-        present=pad("present") > 0,
-        acts=torch.from_numpy(known),
-        length=sizes("length"),
-        width=sizes("width"),
+        **{name: pad([getattr(scene, name) for scene in scenes], (ticks, vehicles)) for name in moving},
+        acts=pad([scene.acted & np.isfinite(scene.yaw_rate) for scene in scenes], (ticks, vehicles)),
+        **{name: pad([getattr(scene, name) for scene in scenes], (vehicles,), 1.0) for name in ("length", "width")},
         edges=torch.tensor(edges, dtype=torch.float32),
         ticks=torch.tensor([scene.x.shape[0] for scene in scenes]),
     )
@@ -122,13 +104,9 @@ class Traffic(NamedTuple):
 
 
 def start_replay(recording: Recording, scene: Tensor, tick: Tensor, most: int | None = None) -> Traffic:
-    """Return traffic as recorded at a moment of some scenes.
+    """Return traffic as recorded at ticks (B,) of scenes (B,).
 
-    Args:
-        recording: S scenes.
-        scene: Scene of each row, shape (B,).
-        tick: Tick of each row, shape (B,).
-        most: Largest number of driven vehicles in a scene, the rearmost; None for all that can be driven.
+    In each at most so many vehicles are driven, the rearmost; with None all that can be.
     """
     edges = recording.edges[scene]
     there = recording.present[scene, tick]
@@ -144,19 +122,14 @@ def start_replay(recording: Recording, scene: Tensor, tick: Tensor, most: int | 
         return field.gather(1, vehicle)
 
     there, driven = of(there), of(driven)
-    x = torch.where(there, of(x), parking_positions(vehicle.float()))
+    parking = PARKING_X - PARKING_GAP * torch.arange(vehicle.shape[1], dtype=x.dtype, device=x.device)
+    x = torch.where(there, of(x), parking)
     y, heading, speed = (
         torch.where(there, of(field), 0.0)
         for field in (y, recording.heading[scene, tick], recording.speed[scene, tick])
     )
     sizes = of(recording.length[scene]), of(recording.width[scene])
     return Traffic(x, y, heading, speed, *sizes, edges, scene, tick, vehicle, there, driven)
-
-
-def parking_positions(like: Tensor) -> Tensor:
-    """Return x of vehicles that do not exist [m], of the shape of the given tensor, (..., V)."""
-    number = torch.arange(like.shape[-1], dtype=like.dtype, device=like.device)
-    return (PARKING_X - PARKING_GAP * number).expand_as(like)
 
 
 def first_in_lane(x: Tensor, y: Tensor, there: Tensor, edges: Tensor) -> Tensor:
@@ -172,29 +145,20 @@ def lane_of(y: Tensor, edges: Tensor) -> Tensor:
     return (y.detach()[:, :, None] > inner[:, None, :]).sum(dim=2)
 
 
-def on_road(y: Tensor, heading: Tensor, edges: Tensor) -> OnRoad:
-    """Return the places of vehicles on their straight road; shapes (B, M) and edges (B, L + 1)."""
-    lane = lane_of(y, edges)
-    left, right = edges.gather(1, lane), edges.gather(1, lane + 1)
-    return OnRoad(y - 0.5 * (left + right), heading, torch.zeros_like(y), y - left, right - y)
-
-
 def replay_features(traffic: Traffic, observers: int | None = None) -> Tensor:
-    """Return the 51 features of the first M vehicles, all if None, shape (B, M, 51)."""
-    bodies = Bodies(traffic.x, traffic.y, traffic.heading, traffic.speed, traffic.length, traffic.width)
-    return perceive(bodies, on_road(traffic.y, traffic.heading, traffic.edges), observers)
+    """Return the 51 features of the first M vehicles, all if None, on their straight road, shape (B, M, 51)."""
+    y, lane = traffic.y, lane_of(traffic.y, traffic.edges)
+    left, right = traffic.edges.gather(1, lane), traffic.edges.gather(1, lane + 1)
+    place = OnRoad(y - 0.5 * (left + right), traffic.heading, torch.zeros_like(y), y - left, right - y)
+    bodies = Bodies(traffic.x, y, traffic.heading, traffic.speed, traffic.length, traffic.width)
+    return perceive(bodies, place, observers)
 
 
 def step_replay(recording: Recording, traffic: Traffic, action: Tensor) -> Traffic:
-    """Move all vehicles by one tick: explicit Euler with the old values, which `infer_motion` inverts.
+    """Return traffic one tick later, differentiable in traffic and action: explicit Euler with the old values.
 
-    Args:
-        recording: The scenes.
-        traffic: B scenes with V vehicles.
-        action: Acceleration [m/s^2] and yaw rate [rad/s], shape (B, V, 2); only those of driven vehicles count.
-
-    Returns:
-        Traffic one tick later, differentiable in traffic and action.
+    `infer_motion` inverts it. Of the actions (B, V, 2), acceleration [m/s^2] and yaw rate [rad/s], only those of driven
+    vehicles count; the others are at their recorded places where the record continues.
     """
     moving = traffic.driven.to(traffic.x.dtype)
     x = traffic.x + traffic.speed * torch.cos(traffic.heading) * DT
@@ -202,19 +166,37 @@ def step_replay(recording: Recording, traffic: Traffic, action: Tensor) -> Traff
     heading = traffic.heading + action[..., 1] * DT * moving
     speed = traffic.speed + action[..., 0] * DT * moving
     speed = speed + (speed.clamp(min=0.0) - speed).detach()  # the gradient passes a standstill
-    moved = {"x": x, "y": y, "heading": heading, "speed": speed}
-    tick = traffic.tick + 1
+    moved, tick = {"x": x, "y": y, "heading": heading, "speed": speed}, traffic.tick + 1
     if not bool(traffic.driven.all()):
-        moved = _replay(recording, traffic, tick, moved)
+        at = tick.minimum(recording.ticks[traffic.scene] - 1)
+
+        def recorded(name: str) -> Tensor:
+            values: Tensor = getattr(recording, name)[traffic.scene, at]  # a field by its name
+            return values.gather(1, traffic.vehicle)
+
+        goes_on = recorded("present") & (tick == at)[:, None] & traffic.there & ~traffic.driven
+        moved = {name: torch.where(goes_on, recorded(name), value) for name, value in moved.items()}
     return traffic._replace(**moved, tick=tick)
 
 
-def _replay(recording: Recording, traffic: Traffic, tick: Tensor, moved: dict[str, Tensor]) -> dict[str, Tensor]:
-    """Return the motion with vehicles that are not driven at their recorded places, where the record continues."""
-    scene, vehicle = traffic.scene, traffic.vehicle
-    at = tick.minimum(recording.ticks[scene] - 1)
-    goes_on = recording.present[scene, at].gather(1, vehicle) & (tick == at)[:, None] & traffic.there & ~traffic.driven
-    return {
-        name: torch.where(goes_on, getattr(recording, name)[scene, at].gather(1, vehicle), value)  # a field by its name
-        for name, value in moved.items()
-    }
+class Pairs(NamedTuple):
+    """Features and actions of n moments of recorded driving."""
+
+    features: Tensor
+    """Shape (n, 51), SI units."""
+    action: Tensor
+    """Acceleration [m/s^2] and yaw rate [rad/s], shape (n, 2)."""
+    scene: Tensor
+    """Scene of each moment, shape (n,)."""
+
+
+def collect_pairs(recording: Recording) -> Pairs:
+    """Return every moment of every vehicle whose surroundings and action are known."""
+    rows = []
+    for tick in range(recording.x.shape[1]):
+        scene = (tick < recording.ticks).nonzero().flatten()
+        traffic = start_replay(recording, scene, torch.full_like(scene, tick))
+        m = traffic.drivers
+        driven, action = traffic.driven[:, :m], recording.actions(scene, tick, traffic.vehicle[:, :m])
+        rows.append((replay_features(traffic, m)[driven], action[driven], scene[:, None].expand_as(driven)[driven]))
+    return Pairs(*(torch.cat(column) for column in zip(*rows, strict=True)))

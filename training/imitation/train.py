@@ -9,11 +9,11 @@ from __future__ import annotations
 import contextlib
 import json
 import shlex
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, fields
 from itertools import groupby
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 
@@ -24,11 +24,11 @@ from rare_envs.files import replace_text
 from training.data.formats import load_recordings
 from training.data.scenes import TrafficScene, load_us101_scenes, scenes_of, split_by_clock
 from training.imitation.adversarial import update_gail, update_mgail
-from training.imitation.clone import ACTION_HIGH, ACTION_LOW, Pairs, clone_policy, collect_pairs, make_seeded
 from training.imitation.config import Config
 from training.imitation.evaluate import header_metrics
-from training.imitation.learner import Critic, Learner, Log, Update, run_updates
-from training.imitation.traffic import Recording, stack_scenes
+from training.imitation.learner import Critic, Learner, Update, clone_policy, make_seeded, run_updates
+from training.imitation.rollout import ACTION_HIGH, ACTION_LOW
+from training.imitation.traffic import Pairs, Recording, collect_pairs, stack_scenes
 
 CPU = torch.device("cpu")
 UPDATE_RULES: dict[str, Update] = {"gail": update_gail, "mgail": update_mgail}
@@ -37,16 +37,22 @@ CHECKPOINT_INTERVAL = 50
 """Number of updates between checkpoints."""
 DRIVER, SETTINGS_FILE, CHECKPOINT = "driver.safetensors", "training.json", "checkpoint.pt"
 """Names of the files in the folder of a training."""
-SOURCE_KINDS = ("data", "ngsim", "highd", "tgsim", "i24")
-"""Kinds of sources: those of recordings that have positions across the road."""
 TEST_SHARE = 0.2
 """Share at the end of a user's recording that is kept for tests."""
-_LICENCES = {
-    "highd": "highD's: non-commercial, and neither the data nor what derives from it is passed on without leave",
-    "tgsim": "public, as reported of TGSIM's records at data.transportation.gov",
-    "i24": "the data use agreement of I-24 MOTION, which asks for a citation of Gloudemans et al., 2023",
+SOURCES = {
+    "data": ("NGSIM US 101", "CC BY-SA 3.0, as reported of the NGSIM record 8ect-6jqj"),
+    "ngsim": ("NGSIM", "CC BY-SA 3.0, as reported of the NGSIM record 8ect-6jqj"),
+    "highd": (
+        "highD",
+        "highD's: non-commercial, and neither the data nor what derives from it is passed on without leave",
+    ),
+    "tgsim": ("TGSIM", "public, as reported of TGSIM's records at data.transportation.gov"),
+    "i24": (
+        "I-24 MOTION",
+        "the data use agreement of I-24 MOTION, which asks for a citation of Gloudemans et al., 2023",
+    ),
 }
-_NGSIM_LICENCE = "CC BY-SA 3.0, as reported of the NGSIM record 8ect-6jqj"
+"""Name and licence of each kind of source: those of recordings that have positions across the road."""
 
 
 @dataclass(frozen=True)
@@ -63,7 +69,7 @@ class Source:
     """
 
     kind: str
-    """"data" for a folder with the compact tables of US 101, or the format of the files, one of `SOURCE_KINDS`."""
+    """"data" for a folder with the compact tables of US 101, or the format of the files, one of `SOURCES`."""
     path: Path
     location: str | None = None
     """Location to read from a raw NGSIM file that has several."""
@@ -73,22 +79,22 @@ class Source:
     """Duration of the scenes that a user's recording is cut into [s]."""
 
     def __post_init__(self) -> None:
-        if self.kind not in SOURCE_KINDS:
-            raise ValueError(f"Expected one of {', '.join(SOURCE_KINDS)}, got {self.kind!r}.")
+        if self.kind not in SOURCES:
+            raise ValueError(f"Expected one of {', '.join(SOURCES)}, got {self.kind!r}.")
 
     @property
     def description(self) -> str:
         """Description of the data, for users of a driver who do not have them."""
         if self.kind == "data":
             return "NGSIM US 101, 15 June 2005, 07:49:51 to 07:52:53 without 64 to 88 s and 158 to 193 s of its clock"
-        names = {"ngsim": "NGSIM", "highd": "highD", "tgsim": "TGSIM", "i24": "I-24 MOTION"}
         parts = ", ".join(self.recordings) or ("all recordings" if self.kind == "highd" else self.path.stem)
-        return f"{names[self.kind]}, {self.location or parts}, the first {1 - TEST_SHARE:.0%} of each recording"
+        share = f"the first {1 - TEST_SHARE:.0%} of each recording"
+        return f"{SOURCES[self.kind][0]}, {self.location or parts}, {share}"
 
     @property
     def licence(self) -> str:
         """Licence of the data."""
-        return _LICENCES.get(self.kind, _NGSIM_LICENCE)
+        return SOURCES[self.kind][1]
 
     @property
     def options(self) -> str:
@@ -101,26 +107,19 @@ class Source:
         return shlex.join(words)
 
 
-def load_scenes(source: Source) -> tuple[tuple[TrafficScene, ...], tuple[TrafficScene, ...]]:
-    """Return scenes to learn from and scenes to test on, which share no moment.
+Scenes = tuple[TrafficScene, ...]
 
-    Raises:
-        ValueError: A file is missing or broken; see the loaders.
 
-    Example:
-        >>> load_scenes(Source("ngsim", Path("no_such_file.csv")))  # doctest: +ELLIPSIS
-        Traceback (most recent call last):
-        ValueError: Cannot read no_such_file.csv: ...
-    """
+def load_scenes(source: Source) -> tuple[Scenes, Scenes]:
+    """Return scenes to learn from and scenes to test on, which share no moment."""
     if source.kind == "data":
         return split_by_clock(load_us101_scenes(source.path))
-    tables = load_recordings(
-        source.kind, source.path, location=source.location, recordings=source.recordings, gaps="cut"
-    )
+    places: dict[str, Any] = {"location": source.location, "recordings": source.recordings}
+    tables = load_recordings(source.kind, source.path, **places, gaps="cut")
     return split_end([scene for table in tables for scene in scenes_of(table, source.seconds)])
 
 
-def split_end(scenes: Sequence[TrafficScene]) -> tuple[tuple[TrafficScene, ...], tuple[TrafficScene, ...]]:
+def split_end(scenes: Sequence[TrafficScene]) -> tuple[Scenes, Scenes]:
     """Split scenes into those to learn from and the last fifth of every recording; of a single scene none is kept."""
     learn: list[TrafficScene] = []
     test: list[TrafficScene] = []
@@ -132,16 +131,8 @@ def split_end(scenes: Sequence[TrafficScene]) -> tuple[tuple[TrafficScene, ...],
     return tuple(learn), tuple(test)
 
 
-@dataclass(frozen=True)
-class Data:
-    """Recorded traffic, prepared for trainings.
-
-    Example:
-        >>> from training.data import scenes_of, synthetic_traffic
-        >>> data = prepare_data(scenes_of(synthetic_traffic(), seconds=4.0))
-        >>> data.test is None
-        True
-    """
+class Data(NamedTuple):
+    """Recorded traffic, prepared for trainings."""
 
     recording: Recording
     pairs: Pairs
@@ -227,15 +218,39 @@ def train_learner(
         >>> mean.shape
         torch.Size([708, 2])
     """
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
     if out is not None and (out / CHECKPOINT).exists():
         learner.load(out / CHECKPOINT)
-    with _progress_bar(learner, progress) as show, _tensorboard(out if log else None, learner.update) as write:
+    columns = (BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(), TextColumn("{task.description}"))
+    bar = Progress(*columns, console=Console(stderr=True), disable=not progress)
+    with bar, _tensorboard(out if log else None, learner.update) as writer:
+        task = bar.add_task("", total=learner.config.updates, completed=learner.update)
         for entry in run_updates(learner, UPDATE_RULES[learner.config.method]):
-            show(learner, entry)
-            write(learner, entry)
+            text = ", ".join(f"{name} {entry[name]:.3f}" for name in ("collision", "edge", "critic"))
+            bar.update(task, completed=learner.update, description=text)
+            for name, value in (*entry.items(), ("vehicle_steps", learner.simulated)) if writer else ():
+                writer.add_scalar(name, value, learner.update)
             if out is not None and (learner.update % every == 0 or learner.update == learner.config.updates):
                 learner.save(out / CHECKPOINT)
     return learner.policy
+
+
+def _summary_writer() -> Any:
+    """Return TensorBoard's class of writers; a ValueError if it is not installed."""
+    try:
+        from torch.utils.tensorboard import SummaryWriter
+    except ImportError as error:
+        raise ValueError("Logs need TensorBoard: pip install 'rare-envs[logs]', or leave logs out.") from error
+    return SummaryWriter
+
+
+def _tensorboard(folder: Path | None, update: int) -> contextlib.AbstractContextManager[Any]:
+    """Open TensorBoard logs in a folder, without what a stopped run left of later updates; None gives None."""
+    if folder is None:
+        return contextlib.nullcontext()
+    return contextlib.closing(_summary_writer()(str(folder), purge_step=update + 1))
 
 
 def train_driver(
@@ -275,10 +290,8 @@ def train_driver(
     if log:
         _summary_writer()
     place = find_device(device)
-    settings = format_settings(source, config)
-    check_folder(out, settings)
-    data = prepare_data(*load_scenes(source))
-    write_settings(out, settings)
+    with claim_folder(out, source, config):
+        data = prepare_data(*load_scenes(source))
     policy = train_learner(make_learner(data, config, device=place), out, log, progress)
     driver = driver_of(policy.cpu(), config)
     provenance = Provenance(
@@ -319,102 +332,37 @@ def command_of(source: Source, config: Config, device: str = "cpu") -> str:
     return f"python -m training.imitation {source.options} {shlex.join(words)}"
 
 
-def format_settings(source: Source, config: Config) -> str:
-    """Return source and settings as JSON."""
-    return json.dumps({"source": {**asdict(source), "path": str(source.path)}, "config": asdict(config)}, indent=1)
+@contextlib.contextmanager
+def claim_folder(out: Path, source: Source, config: Config) -> Iterator[None]:
+    """Check that a folder can take a training, and write its settings into it if the block, which reads, succeeds.
 
-
-def check_folder(out: Path, settings: str) -> None:
-    """Check that a folder can take a training.
-
-    Raises:
-        ValueError: It is a file, or holds a training with other settings.
+    A ValueError says that it is a file, cannot be made, or holds a training with other settings.
     """
+    settings = {"source": {**asdict(source), "path": str(source.path)}, "config": asdict(config)}
+    text = json.dumps(settings, indent=1)
     if out.exists() and not out.is_dir():
         raise ValueError(f"Expected a folder for the training, got the file {str(out)!r}.")
-    begun = any((out / name).exists() for name in (CHECKPOINT, DRIVER))
-    noted = out / SETTINGS_FILE
-    if begun and noted.exists() and json.loads(noted.read_text(encoding="utf-8")) != json.loads(settings):
+    begun, noted = any((out / name).exists() for name in (CHECKPOINT, DRIVER)), out / SETTINGS_FILE
+    if begun and noted.exists() and json.loads(noted.read_text(encoding="utf-8")) != json.loads(text):
         raise ValueError(f"{str(out)!r} holds a training with other settings; choose another folder or remove it.")
-
-
-def write_settings(out: Path, settings: str) -> None:
-    """Write settings to a folder, which is made if there is none.
-
-    Raises:
-        ValueError: It cannot be made.
-    """
+    yield
     try:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise ValueError(f"Cannot make the folder {str(out)!r}: {error}.") from None
-    replace_text(out / SETTINGS_FILE, settings + "\n")
+    replace_text(noted, text + "\n")
 
 
 def read_training_settings(folder: Path) -> tuple[Source, Config]:
-    """Return source and settings of the training in a folder.
-
-    Raises:
-        ValueError: It holds none.
-    """
+    """Return source and settings of the training in a folder; a ValueError if it holds none."""
     path = folder / SETTINGS_FILE
     if not path.is_file():
         raise ValueError(f"Expected a training in {str(folder)!r}, but there is no {SETTINGS_FILE}.")
     noted = json.loads(path.read_text(encoding="utf-8"))
-    source, config = ({name: _as_tuple(value) for name, value in noted[part].items()} for part in ("source", "config"))
+    source, config = (
+        dict[str, Any](
+            {name: tuple(value) if isinstance(value, list) else value for name, value in noted[part].items()}
+        )
+        for part in ("source", "config")
+    )
     return Source(**{**source, "path": Path(source["path"])}), Config(**config)
-
-
-def _as_tuple(value: Any) -> Any:
-    """Return a list as a tuple, as JSON has none; other values as they are."""
-    return tuple(value) if isinstance(value, list) else value
-
-
-AfterUpdate = Callable[[Learner, Log], None]
-"""Function that is called after every update."""
-
-
-@contextlib.contextmanager
-def _progress_bar(learner: Learner, show: bool) -> Iterator[AfterUpdate]:
-    """Open a progress bar on standard error; yield the function to call after every update."""
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-
-    columns = (BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(), TextColumn("{task.description}"))
-    with Progress(*columns, console=Console(stderr=True), disable=not show) as shown:
-        task = shown.add_task("", total=learner.config.updates, completed=learner.update)
-
-        def after(learner: Learner, entry: Log) -> None:
-            text = ", ".join(f"{name} {entry[name]:.3f}" for name in ("collision", "edge", "critic"))
-            shown.update(task, completed=learner.update, description=text)
-
-        yield after
-
-
-def _summary_writer() -> Any:
-    """Return TensorBoard's class of writers.
-
-    Raises:
-        ValueError: TensorBoard is not installed.
-    """
-    try:
-        from torch.utils.tensorboard import SummaryWriter
-    except ImportError as error:
-        raise ValueError("Logs need TensorBoard: pip install 'rare-envs[logs]', or leave logs out.") from error
-    return SummaryWriter
-
-
-@contextlib.contextmanager
-def _tensorboard(folder: Path | None, update: int) -> Iterator[AfterUpdate]:
-    """Open TensorBoard logs in a folder, without what a stopped run left of later updates; None writes nothing."""
-    if folder is None:
-        yield lambda learner, entry: None
-        return
-    writer: Any = _summary_writer()(str(folder), purge_step=update + 1)
-
-    def after(learner: Learner, entry: Log) -> None:
-        for name, value in (*entry.items(), ("vehicle_steps", learner.simulated)):
-            writer.add_scalar(name, value, learner.update)
-
-    with contextlib.closing(writer):
-        yield after

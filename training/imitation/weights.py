@@ -21,7 +21,6 @@ References:
 
 from __future__ import annotations
 
-import contextlib
 import copy
 import warnings
 from collections.abc import Sequence
@@ -44,9 +43,9 @@ from rare_envs.files import replace_file
 from rare_envs.threads import use_one_thread
 from samplers.problem import FloatArray
 from training.command_line import report_errors, run_command
-from training.imitation.clone import Pairs
 from training.imitation.config import Config
 from training.imitation.learner import Critic, Learner, run_updates
+from training.imitation.traffic import Pairs
 from training.imitation.train import (
     CHECKPOINT,
     DRIVER,
@@ -71,11 +70,7 @@ INNER_TOLERANCES = (1e-6, 1e-4)
 
 @dataclass(frozen=True)
 class Ensemble:
-    """Settings of an ensemble.
-
-    Raises:
-        ValueError: There are too few members to fit a distribution, or too few updates.
-    """
+    """Settings of an ensemble: enough members to fit a distribution."""
 
     members: int = 32
     updates: int = 60
@@ -90,12 +85,10 @@ class Ensemble:
 
 
 class Member(NamedTuple):
-    """A trained member."""
+    """Weights of the last layer of a member (404,), and their standard deviations over the second half of its run."""
 
     weights: FloatArray
-    """Weights of its last layer, shape (404,)."""
     within: FloatArray
-    """Standard deviation of each weight over the second half of its run, shape (404,)."""
 
 
 def member_config(base: Config, updates: int) -> Config:
@@ -108,16 +101,7 @@ def member_config(base: Config, updates: int) -> Config:
 def train_member(
     data: Data, driver: LearnedDriver, base: Config, checkpoint: Path, ensemble: Ensemble, number: int
 ) -> Member:
-    """Train a member.
-
-    Args:
-        data: Data that the base learned from.
-        driver: The base.
-        base: Settings of the base.
-        checkpoint: Checkpoint of the base's training.
-        ensemble: Settings of the ensemble.
-        number: Number of the member; with the ensemble's seed it decides everything random.
-    """
+    """Train a member around a base: a driver, its settings and its checkpoint; the number decides all chance."""
     (seed,) = np.random.SeedSequence([ensemble.seed, number]).generate_state(1)
     generator = torch.Generator().manual_seed(int(seed))
     scenes = torch.unique(data.pairs.scene)
@@ -139,11 +123,7 @@ def select_scenes(pairs: Pairs, drawn: Tensor) -> Pairs:
 
 
 def train_members(folder: Path, ensemble: Ensemble, progress: bool = False) -> list[Member]:
-    """Train an ensemble around the driver in a folder; members that are kept there are not trained again.
-
-    Raises:
-        ValueError: The folder holds no finished training, or members of another driver.
-    """
+    """Train an ensemble around the driver in a folder; members that are kept there are not trained again."""
     source, base = read_training_settings(folder)
     driver = read_driver(folder / DRIVER)
     own = head_weights(driver.policy).double().numpy()
@@ -176,11 +156,7 @@ def measure_spread(members: list[Member], base: FloatArray) -> dict[str, float]:
 
 
 def make_ensemble(folder: Path, ensemble: Ensemble, out: Path, progress: bool = False) -> Path:
-    """Write a copy of the driver of a finished training, with a distribution of its weights, to a `.safetensors` file.
-
-    Raises:
-        ValueError: There is no finished training, or no distribution can be fitted.
-    """
+    """Write the driver of a finished training with a distribution of its weights to a `.safetensors` file."""
     members = train_members(folder, ensemble, progress)
     driver, provenance = read_driver(folder / DRIVER), read_provenance(folder / DRIVER)
     fit = fit_weights(np.stack([member.weights for member in members]))
@@ -195,14 +171,10 @@ _FAILURES = (FloatingPointError, ConvergenceWarning, RuntimeWarning, np.linalg.L
 
 
 class WeightFit(NamedTuple):
-    """A fitted distribution and a record of the fit."""
+    """A fitted distribution, and a record of the fit for JSON: what was chosen, and how each penalty did."""
 
     distribution: WeightDistribution
     metadata: dict[str, Any]
-    """Record of the fit, ready for JSON: members, folds, shrinkage, penalty (chosen), nonzeros (share of the
-    off-diagonal entries of the precision), condition (of the precision of standardised weights), spread_median,
-    spread_max, stopped (why no smaller penalty was tried), tried: for each penalty its nonzeros, condition and
-    held-out log-likelihood per member."""
 
 
 def fit_weights(
@@ -214,32 +186,14 @@ def fit_weights(
     folds: int = FOLDS,
     names: Sequence[str] = WEIGHT_NAMES,
 ) -> WeightFit:
-    """Return the Gaussian N(mean, precision^-1) fitted to the weights of an ensemble.
+    """Return the Gaussian N(mean, precision^-1) fitted to the last layers of K drivers, members (K, 404).
 
     Penalties are tried in descending order until one fails, on all members or without one of the folds; the one with
-    the greatest held-out log-likelihood is taken.
-
-    Args:
-        members: Last layers of K drivers, shape (K, 404). Members that depend on each other (iterates of one run) must
-            be neighbours, because a fold holds out consecutive members.
-        radius: Distance by which a search may move each mean.
-        penalties: Penalties to try, in descending order.
-        shrinkage: Share of the identity mixed into the correlations.
-        folds: Number of times that members are held out.
-        names: Names of the columns in error messages.
-
-    Raises:
-        ValueError: There are too few members, a weight is not finite or the same in all members of a fit, or not even
-            the first penalty succeeds.
-
-    Example:
-        >>> members = np.random.default_rng(0).standard_normal((20, 3))
-        >>> fit = fit_weights(members, names=("a", "b", "c"))
-        >>> fit.metadata["members"], fit.distribution.mean.shape
-        (20, (3,))
+    the greatest held-out log-likelihood is taken. Members that depend on each other (iterates of one run) must be
+    neighbours, because a fold holds out consecutive members. A search may move each mean by the radius. A ValueError
+    says what is wrong: a weight that is not finite or the same in all, or not even one penalty succeeds.
     """
     members = np.asarray(members, dtype=np.float64)
-    _check_arguments(members, penalties, shrinkage, folds, names)
     everyone = _moments(members, shrinkage, names)
     held_out = np.array_split(np.arange(len(members)), folds)
     without = [_moments(np.delete(members, fold, axis=0), shrinkage, names) for fold in held_out]
@@ -255,8 +209,15 @@ def fit_weights(
             stopped = f"penalty {penalty} failed: {' '.join(str(failure).split())[:120]}"
             break
         scores = np.concatenate([part.log_prob(members[fold]) for part, fold in zip(fitted, held_out, strict=True)])
-        likelihood = {"penalty": float(penalty), "held_out_log_likelihood": float(scores.mean())}
-        tried.append({**likelihood, **_describe_precision(precision)})
+        beside = precision[~np.eye(len(precision), dtype=bool)]
+        tried.append(
+            {
+                "penalty": float(penalty),
+                "held_out_log_likelihood": float(scores.mean()),
+                "nonzeros": float((beside != 0.0).mean()),
+                "condition": float(np.linalg.cond(precision)),
+            }
+        )
         precisions.append(precision)
     if not tried:
         raise ValueError(f"No distribution could be fitted: {stopped}. Start at a larger penalty or shrink more.")
@@ -272,18 +233,6 @@ def fit_weights(
         "tried": tried,
     }
     return WeightFit(_to_distribution(everyone, precisions[best], radius), metadata)
-
-
-def _check_arguments(
-    members: FloatArray, penalties: Sequence[float], shrinkage: float, folds: int, names: Sequence[str]
-) -> None:
-    """Raise ValueError for arguments of `fit_weights` that do not fit together."""
-    if members.ndim != 2 or members.shape[1] != len(names):
-        raise ValueError(f"Expected members of shape (K, {len(names)}), got {members.shape}.")
-    if folds < 2 or len(members) < 2 * folds:
-        raise ValueError(f"Expected at least 2 folds of 2 members each, got {len(members)} members in {folds} folds.")
-    if not 0.0 < shrinkage < 1.0 or list(penalties) != sorted(penalties, reverse=True) or not penalties:
-        raise ValueError(f"Expected shrinkage in (0, 1) and descending penalties, got {shrinkage} and {penalties}.")
 
 
 class _Moments(NamedTuple):
@@ -313,34 +262,27 @@ def _moments(members: FloatArray, shrinkage: float, names: Sequence[str]) -> _Mo
 
 def _lasso(correlation: FloatArray, penalty: float) -> FloatArray:
     """Return the sparse precision of standardised weights; one of `_FAILURES` if no inner tolerance succeeds."""
-    for tolerance in INNER_TOLERANCES[:-1]:
-        with contextlib.suppress(*_FAILURES):
-            return _solve_lasso(correlation, penalty, tolerance)
-    return _solve_lasso(correlation, penalty, INNER_TOLERANCES[-1])
-
-
-def _solve_lasso(correlation: FloatArray, penalty: float, tolerance: float) -> FloatArray:
-    """Return the precision at one inner tolerance."""
     state = np.random.get_state()  # noqa: NPY002 - scikit-learn draws a number that nothing depends on
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error")
-            _, precision = graphical_lasso(correlation, penalty, tol=DUALITY_GAP, enet_tol=tolerance)
+            for tolerance in INNER_TOLERANCES:
+                try:
+                    _, precision = graphical_lasso(correlation, penalty, tol=DUALITY_GAP, enet_tol=tolerance)
+                    np.linalg.cholesky(precision)
+                except _FAILURES:
+                    if tolerance == INNER_TOLERANCES[-1]:
+                        raise
+                else:
+                    break
     finally:
         np.random.set_state(state)  # noqa: NPY002
-    np.linalg.cholesky(precision)
     return np.asarray(precision, dtype=np.float64)
 
 
 def _to_distribution(moments: _Moments, precision: FloatArray, radius: float) -> WeightDistribution:
     """Return the distribution with a precision of standardised weights."""
     return WeightDistribution(moments.mean, precision / np.outer(moments.spread, moments.spread), radius)
-
-
-def _describe_precision(precision: FloatArray) -> dict[str, float]:
-    """Return the share of nonzero off-diagonal entries, and the condition number."""
-    beside = precision[~np.eye(len(precision), dtype=bool)]
-    return {"nonzeros": float((beside != 0.0).mean()), "condition": float(np.linalg.cond(precision))}
 
 
 @use_one_thread()

@@ -4,17 +4,23 @@
 
 Their names say the site, and behind a hyphen in what they differ from the one that the events support best: `us101-gap`
 (plain gaps) is a test distribution near the p of Tian et al., `us101-15-offsets` has lateral offsets from 15 events,
-`i80-all-pairs` has pairs that were under way too.
+`i80-all-pairs` has pairs that were under way too. What a file says in words (source, licence, moment of x) and the
+frequencies that others counted stand in the file itself; a new fit keeps them.
 
 Rates of recordings that were picked for lane changes are never used: the scenes of US 101 show 42 changes per
 vehicle-hour, the complete recording 11. Offset and duration of a lane change belong together (correlation of .36 and
 .42 of displacement and log duration), and go with neither the speed nor the gap ahead, so that they are fitted apart.
 The positions of US 101 were smoothed at 0.35 Hz, which makes short changes longer: courses of 2, 3, 4 and 5 s over 3 m
 look like ones of 3.1, 3.6, 4.3 and 5.1 s.
+
+`highway` is free-flow traffic, assembled and not fitted: naturalistic data (highD) may not be passed on. Its means
+follow from published statistics; its spreads and correlations are chosen such that the IDM ego collides with a
+probability between 1e-4 and 1e-3, as in Tian et al. 2024, who fitted mixtures to highD.
 """
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -23,35 +29,40 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rare_envs.distributions.fitted import EventFrequency
-from rare_envs.distributions.space import Parameter
-from rare_envs.scenarios.registry import env_id_of, scenario_named, split_version
+from rare_envs.distributions.coordinates import CoordinateKind, Coordinates
+from rare_envs.distributions.fitted import FittedDistribution, read_distribution
+from rare_envs.distributions.mixture import CoordinateMixture, TruncatedGaussianMixture
+from rare_envs.scenarios.base_distributions import load_base
+from rare_envs.scenarios.registry import scenario_named
 from rare_envs.traffic.state import VEHICLE_LENGTH
 from samplers.problem import FloatArray
-from training.data.brakings import find_standstill_brakings, track_exposure
-from training.data.events import course_durations, time_around_peak, time_between_spans
+from training.data.events import (
+    braking_exposure,
+    course_durations,
+    find_standstill_brakings,
+    time_around_peak,
+    time_between_spans,
+)
 from training.data.table import DT, VEHICLES_FILE, read_columns
-from training.fit.base import FitRequest, fit_base, format_base
+from training.fit.base import FitRequest, check_predictions, fit_base, format_base, mass_outside
 from training.fit.coordinates import COORDINATE_SYSTEMS
 from training.fit.filters import (
-    EVENT_DEFINITIONS,
     EVENT_RECIPES,
     FILTER_REASONS,
     EventRecipe,
     EventSet,
+    Rule,
+    drop_events,
     filter_events,
+    range_rule,
     read_csv_columns,
     read_events,
 )
-from training.recipes.highway_bases import CIRCLES_FILE, HIGHWAY_BASES, build_highway_base, check_against_following
 
 COMMAND = "rare-envs fit --data DIR --out rare_envs/data"
-FOLLOWING, BRAKING = "car_following", "hard_brake"
-CUT_IN_V0, CUT_IN_V1 = "rare_envs/CutIn-v0", "rare_envs/CutIn-v1"
-PAIRS = ("v_ego", "v_lead", "gap")
-CUT_INS = ("v_ego", "v_cutin", "v_lead", "gap_ego_cutin", "gap_cutin_lead")
-I80_PAIRS_FILE = "i80_coifman_pairs.csv"
-PROFILES_FILE, CHANGES_FILE = "lane_change_profiles.parquet", "us101_lane_changes.csv"
+FOLLOWING, CUT_IN_V0, CUT_IN_V1, BRAKING = "car_following", "rare_envs/CutIn-v0", "rare_envs/CutIn-v1", "hard_brake"
+CIRCLES_FILE, PROFILES_FILE = "i24_circles_following.parquet", "lane_change_profiles.parquet"
+CHANGES_FILE = "us101_lane_changes.csv"
 MIN_LANE_TIME = 3.0
 """Least time in one lane on either side of a change of a single vehicle on US 101 [s]."""
 MIN_JUMP, JUMP_TICKS, LEAST_PAUSE = 6.0, 3, 20
@@ -61,90 +72,23 @@ SETTLING_TICKS, STEADY_TICKS, MAX_STEP = 8, 10, 2.0
 gap changes by at most so much in one [m]."""
 NO_LEADER = 252.0
 """Gap that stands for nobody ahead [m]."""
+STATE_TICKS = 100
+"""Ticks between two states: 10 s, after which gap and closing speed are nearly independent."""
 
-_CHANGES = "events extracted from the trajectories, filtered as listed, fitted with a mixture"
-US101_SOURCE = {
-    "site": "US 101, Los Angeles, 07:50, congested",
-    "date": "15 June 2005",
-    "data": "Next Generation Simulation (NGSIM) Vehicle Trajectories and Supporting Data, US 101 "
-    "(Los Angeles, southbound, 15 June 2005), record 8ect-6jqj",
-    "publisher": "U.S. Department of Transportation, Federal Highway Administration (FHWA)",
-    "licence": "CC BY-SA 3.0 (as the data's public record was reported); these parameters are derived from the data "
-    "and are offered under the same licence",
-    "changes": _CHANGES,
-}
-I80_SOURCE = {
-    "site": "I-80, Emeryville, 16:00, congested",
-    "date": "13 April 2005",
-    "data": "the data set from Coifman and Li (2017): A Critical Evaluation of the Next Generation Simulation "
-    "(NGSIM) Vehicle Trajectory Dataset, Transportation Research Part B 105, 2017, 362-377 (13 April 2005)",
-    "publisher": "B. Coifman, L. Li, Ohio State University",
-    "licence": "none stated; citation asked for. Parameters only",
-    "changes": _CHANGES,
-}
-I24_SOURCE = {
-    "site": "I-24, Nashville, rush hours, 27 m/s in the median",
-    "date": "March and April 2021",
-    "data": "CIRCLES, one instrumented car with radar, 26 drives of March and April 2021 (doi 10.5281/zenodo.6366761)",
-    "publisher": "CIRCLES consortium",
-    "licence": "none seen; citation asked for. Parameters only",
-    "changes": _CHANGES,
-}
-US101_PAIRS = {
-    **US101_SOURCE,
-    "no_frequency": "most of its pairs (76 %) were under way when the ego came into the picture and are no events "
-    "of traffic, and the scenes were picked for lane changes, so that the new leaders among them cannot be counted",
-}
-I80_PAIRS = {
-    **I80_SOURCE,
-    "no_frequency": "most of its pairs (93 %) were under way when the ego came into the picture and are no events "
-    "of traffic; the base 'i80' has the new leaders among them",
-}
-_COUNTS = (
-    "wein2004/lane-change-externality, outputs/tables/02_detection_summary.md: complete NGSIM recordings; lane changes "
-    "with a follower in the new lane, stable for 3 s"
+PAIRS = ("v_ego", "v_lead", "gap")
+CUT_INS = ("v_ego", "v_cutin", "v_lead", "gap_ego_cutin", "gap_cutin_lead")
+US101_PAIRS = EventRecipe("us101_car_following_events.csv", PAIRS, cluster=("scene",))
+I80_PAIRS = EventRecipe("i80_coifman_pairs.csv", PAIRS, cluster=("frame",))
+US101_CUT_INS = EventRecipe("us101_cut_in_events.csv", CUT_INS, where={"phase": "start"}, cluster=("scene",))
+I80_CUT_INS = EventRecipe(
+    "i80_coifman_lane_changes.csv", CUT_INS, where={"phase": "start", "settled": True}, cluster=("frame",)
 )
-_COIFMAN = "Coifman and Li 2017, I-80, 16:00, every vehicle of one camera"
-NEW_LEADERS_I80 = EventFrequency(
-    count=153,
-    hours=5.98,
-    km=169.7,
-    share=152 / 153,
-    share_events=153,
-    definition=EVENT_DEFINITIONS[FOLLOWING],
-    source=_COIFMAN,
-)
-NEW_LEADERS_I24 = EventFrequency(
-    count=123,
-    hours=3.87,
-    km=336.8,
-    share=98 / 123,
-    share_events=123,
-    definition="the gap to the vehicle ahead jumps by 6 m or more within 0.3 s and a leader is tracked after it",
-    source="CIRCLES, one instrumented car on I-24, 60 drives of 2021 (doi 10.5281/zenodo.6366761); the 26 drives with "
-    "radar, which the events come from",
-)
-CUT_INS_US101 = EventFrequency(
-    count=1221,
-    hours=112.0,
-    km=3900.0,
-    share=38 / 46,
-    share_events=46,
-    definition=EVENT_DEFINITIONS["cut_in"],
-    source=f"{_COUNTS}; the share with both gaps in range from 46 recorded changes with a follower",
-)
-CUT_INS_I80 = EventFrequency(
-    count=1693,
-    hours=122.5,
-    km=2860.0,
-    share=63 / 77,
-    share_events=77,
-    definition=EVENT_DEFINITIONS["cut_in"],
-    source=f"{_COUNTS}; the share with both gaps in range from 77 changes with a follower, at the crossing: "
-    f"1.3 s before it fewer of them are within the picture ({_COIFMAN})",
+US101_OFFSETS = replace(
+    US101_CUT_INS, columns=(*CUT_INS, "lateral_offset"), apart=("lateral_offset",), required=("start_seen",)
 )
 
-Read = tuple[EventSet, EventFrequency | None]
+Read = tuple[EventSet, dict[str, Any]]
+"""Usable events, and what was counted of their frequency."""
 
 
 @dataclass(frozen=True)
@@ -154,36 +98,39 @@ class ShippedBase:
     scenario: str
     """Short name, or environment id where its scenario has several versions."""
     name: str
-    read: Callable[[Path], Read]
-    """Reads its events from the folder of compact tables, and how often they happen."""
-    source: Mapping[str, str]
-    """Site, data, publisher, licence and changes."""
-    moment: str
-    """Moment of an event at which x is taken."""
+    events: EventRecipe | Callable[[Path], Read]
+    """Columns and filters of a file in the folder of compact tables, or a function that reads them from it."""
+    changes: str | None = None
+    """Site whose lane changes have the columns apart."""
     system: str | None = None
     """Name of its coordinate system; None for the one that the events support best."""
 
     @property
     def file(self) -> str:
         """Name of its file in the package."""
-        return name_file(self.scenario, self.name)
+        return find_file(self.scenario, self.name).name
+
+    def read(self, folder: Path) -> Read:
+        """Return its events from the folder of compact tables."""
+        if not isinstance(self.events, EventRecipe):
+            return self.events(folder)
+        box = scenario_named(self.scenario).parameters
+        events = filter_events(read_events(folder / self.events.file, self.events), self.events, box)
+        if self.changes:
+            events = _add_changes(events, read_lane_changes(folder, self.changes), box[len(CUT_INS) :])
+        return events, {}
 
 
-def name_file(scenario: str, base: str) -> str:
-    """Return the name of the file of a base, with the version of its scenario if that is not the first."""
-    version = split_version(env_id_of(scenario))[1]
-    parts = (scenario_named(scenario).name, *([f"v{version}"] if version else []), base.replace("-", "_"))
-    return "_".join(parts) + ".json"
+def find_file(scenario: str, base: str) -> Path:
+    """Return the shipped file of a base; a scenario's base of that name is in a file."""
+    file: Any = scenario_named(scenario).bases[base]
+    return Path(file)
 
 
 def fit_shipped_bases(
     data: Path, scenarios: Sequence[str], seed: int = 0, n_refits: int | None = None
 ) -> Iterator[tuple[str, str]]:
-    """Yield name and text of each file of the package for some scenarios, as soon as it is fitted.
-
-    Raises:
-        ValueError: A table cannot be read.
-    """
+    """Yield name and text of each file of the package for some scenarios, as soon as it is fitted."""
     for base in SHIPPED_BASES:
         if scenario_named(base.scenario).name in scenarios:
             yield base.file, fit_shipped_base(base, data, seed, n_refits)
@@ -192,39 +139,22 @@ def fit_shipped_bases(
             content = build_highway_base(scenario)
             if scenario == FOLLOWING:
                 content = check_against_following(content, data)
-            yield name_file(scenario, "highway"), format_base(scenario, content)
+            yield find_file(scenario, "highway").name, format_base(scenario, content)
 
 
 def fit_shipped_base(base: ShippedBase, data: Path, seed: int = 0, n_refits: int | None = None) -> str:
     """Return the text of the file of a base of the package, from the folder of compact tables."""
-    events, frequency = base.read(data)
-    source = {**base.source, "moment": base.moment}
-    request = FitRequest(base.scenario, events, source, COMMAND, frequency, base.system, n_refits=n_refits, seed=seed)
+    shipped = load_base(scenario_named(base.scenario), base.name)
+    assert isinstance(shipped, FittedDistribution)
+    events, counted = base.read(data)
+    frequency = None if shipped.frequency is None else replace(shipped.frequency, **counted)
+    request = FitRequest(
+        base.scenario, events, shipped.record["source"], COMMAND, frequency, base.system, n_refits=n_refits, seed=seed
+    )
     return format_base(base.scenario, fit_base(request).to_dict())
 
 
-def _filter(folder: Path, recipe: EventRecipe, scenario: str) -> EventSet:
-    """Return the usable events of a file of the folder."""
-    return filter_events(read_events(folder / recipe.file, recipe), recipe, scenario_named(scenario).parameters)
-
-
-def _us101_pairs(folder: Path) -> Read:
-    """Return pairs of the scenes of US 101 at their first frame; 76 % are the ego's entry into the picture."""
-    return _filter(folder, EventRecipe("us101_car_following_events.csv", PAIRS, cluster=("scene",)), FOLLOWING), None
-
-
-def _i80_new_leaders(folder: Path) -> Read:
-    """Return pairs of the I-80 that begin in the picture, at their first frame."""
-    recipe = replace(EVENT_RECIPES[FOLLOWING], file=I80_PAIRS_FILE, cluster=("frame",))
-    return _filter(folder, recipe, FOLLOWING), NEW_LEADERS_I80
-
-
-def _i80_pairs(folder: Path) -> Read:
-    """Return all pairs of the I-80 at their first frame; 93 % are the ego's entry into the picture."""
-    return _filter(folder, EventRecipe(I80_PAIRS_FILE, PAIRS, cluster=("frame",)), FOLLOWING), None
-
-
-def _i24_pairs(folder: Path) -> Read:
+def _read_i24_leaders(folder: Path) -> Read:
     """Return new leaders of the instrumented car on the I-24, within the ranges of the scenario.
 
     A cut-in, an own lane change and a leader that leaves the lane all give the car a new leader; each is the beginning
@@ -238,24 +168,22 @@ def _i24_pairs(folder: Path) -> Read:
         parts.append(find_new_leaders(*(rows[name][chosen].astype(float) for name in ("speed", "rel_speed", "gap"))))
         drives.append(np.full(len(parts[-1]), drive, dtype=np.int64))
     events, clusters = np.concatenate(parts), np.concatenate(drives)
-    box = scenario_named(FOLLOWING).parameters
-    inside = np.all([_inside(column, p) for column, p in zip(events.T, box, strict=True)], axis=0)
-    rule = {"rule": "within the ranges of the scenario", "reason": "outside the physical range"}
-    log = (
-        {"rule": "events read", "events": len(events)},
-        {**rule, "dropped": int((~inside).sum())},
-        {"rule": "events used", "events": int(inside.sum())},
-    )
-    return EventSet(events[inside], clusters[inside], cluster="drive", log=log), NEW_LEADERS_I24
+    inside, keep = _in_ranges(events, FOLLOWING), np.ones(len(events), dtype=bool)
+    rule = ("within the ranges of the scenario", "outside the physical range", inside)
+    log = ({"rule": "events read", "events": len(events)}, *drop_events(keep, [rule]))
+    return EventSet(events[keep], clusters[keep], cluster="drive", log=log), {}
+
+
+def _in_ranges(x: FloatArray, scenario: str) -> NDArray[np.bool_]:
+    """Return which points (n, d) lie in the ranges of a scenario's parameters; NaN lies in none."""
+    box = scenario_named(scenario).parameters
+    return np.asarray(((x >= [p.low for p in box]) & (x <= [p.high for p in box])).all(axis=1))
 
 
 def find_new_leaders(speed: FloatArray, relative_speed: FloatArray, gap: FloatArray) -> FloatArray:
-    """Return the new leaders of one drive: own speed, speed ahead and gap [m/s, m/s, m] once tracked, shape (n, 3).
+    """Return own speed, speed ahead and gap [m/s, m/s, m] of new leaders once tracked, (n, 3), of columns (T,).
 
-    Args:
-        speed: Own speed at consecutive ticks [m/s], shape (T,).
-        relative_speed: Speed ahead less own speed [m/s], NaN where it is not known, shape (T,).
-        gap: Distance to the vehicle ahead [m], NaN where nobody is, shape (T,).
+    The relative speed is that ahead less the own, NaN where it is not known; the gap is NaN where nobody is.
     """
     filled = np.where(np.isnan(gap), NO_LEADER, gap)
     jumps = np.abs(filled[JUMP_TICKS:] - filled[:-JUMP_TICKS]) > MIN_JUMP
@@ -271,64 +199,28 @@ def find_new_leaders(speed: FloatArray, relative_speed: FloatArray, gap: FloatAr
     return np.array(found).reshape(-1, 3)
 
 
-def _us101_brakings(folder: Path) -> Read:
+def _read_us101_brakings(folder: Path) -> Read:
     """Return brakings to a standstill of single vehicles on US 101, at their beginning."""
     table = read_columns(folder / VEHICLES_FILE, ("vehicle", "frame", "epoch_ms", "y_along", "space_headway"))
-    parts, frames, seconds, metres = [np.empty((0, 3))], [np.empty(0, dtype=np.int64)], 0.0, 0.0
-    for vehicle in np.unique(table["vehicle"]):
-        rows = np.flatnonzero(table["vehicle"] == vehicle)
-        rows = rows[np.argsort(table["frame"][rows], kind="stable")]
-        for track in np.split(rows, np.flatnonzero(np.diff(table["frame"][rows]) != 1) + 1):
-            position = table["y_along"][track]
-            events, onsets = find_standstill_brakings(position, table["space_headway"][track] - VEHICLE_LENGTH)
-            parts.append(events)
-            frames.append(table["epoch_ms"][track][onsets] // 100)
-            track_seconds, track_metres = track_exposure(position)
-            seconds, metres = seconds + track_seconds, metres + track_metres
+    order = np.lexsort([table["frame"], table["vehicle"]])
+    edges = np.flatnonzero((np.diff(table["vehicle"][order]) != 0) | (np.diff(table["frame"][order]) != 1)) + 1
+    tracks = np.split(order, edges)
+    positions = [table["y_along"][track] for track in tracks]
+    parts, frames = [], []
+    for track, position in zip(tracks, positions, strict=True):
+        events, onsets = find_standstill_brakings(position, table["space_headway"][track] - VEHICLE_LENGTH)
+        parts.append(events)
+        frames.append(table["epoch_ms"][track][onsets] // 100)
     recipe = replace(EVENT_RECIPES[BRAKING], cluster=("frame",))  # stop waves brake one vehicle after the other
     columns = dict(zip(recipe.columns, np.concatenate(parts).T, strict=True))
     found = filter_events({"frame": np.concatenate(frames), **columns}, recipe, scenario_named(BRAKING).parameters)
     # Without columns apart nothing is drawn for them, so that the refits stay those of the published file.
     found = replace(found, apart=np.empty((0, 0)))
-    frequency = EventFrequency(
-        count=len(found.joint),
-        hours=round(seconds / 3600.0, 3),
-        km=round(metres / 1000.0, 1),
-        definition=EVENT_DEFINITIONS[BRAKING],
-        source="NGSIM, US 101, 370 vehicles over 640 m each, counted on the vehicles themselves",
-    )
-    return found, frequency
+    seconds, metres = braking_exposure(positions)
+    return found, {"count": len(found.joint), "hours": round(seconds / 3600.0, 3), "km": round(metres / 1000.0, 1)}
 
 
-def _us101_cut_ins(folder: Path) -> EventSet:
-    """Return cut-ins of the scenes of US 101 without the columns that are fitted apart."""
-    recipe = EventRecipe("us101_cut_in_events.csv", CUT_INS, phase="start", cluster=("scene",))
-    return _filter(folder, recipe, CUT_IN_V0)
-
-
-def _us101_cut_ins_alone(folder: Path) -> Read:
-    """Return cut-ins of the scenes of US 101, with the lateral offsets of the 15 whose start was seen."""
-    recipe = EventRecipe(
-        "us101_cut_in_events.csv",
-        (*CUT_INS, "lateral_offset"),
-        apart=("lateral_offset",),
-        required=("start_seen",),
-        phase="start",
-        cluster=("scene",),
-    )
-    return _filter(folder, recipe, CUT_IN_V0), CUT_INS_US101
-
-
-def _i80_cut_ins(folder: Path) -> EventSet:
-    """Return settled cut-ins of the I-80, 1.3 s before the crossing, the mean start of those on US 101."""
-    recipe = EventRecipe("i80_coifman_lane_changes.csv", CUT_INS, phase="start", cluster=("frame",))
-    rows = read_events(folder / recipe.file, recipe)
-    settled = read_csv_columns(folder / recipe.file, ("settled",))["settled"].astype(bool)
-    chosen = {name: values[settled] for name, values in rows.items()}
-    return filter_events(chosen, recipe, scenario_named(CUT_IN_V0).parameters)
-
-
-def lane_change_shapes(folder: Path, site: str) -> FloatArray:
+def read_lane_changes(folder: Path, site: str) -> FloatArray:
     """Return displacement [m] and duration [s] of the recorded lane changes of a site ("i80" or "us101"), shape (n, 2).
 
     One table for each site, since two of US 101 may hold the same changes: of I-80 the 165 changes that were smoothed
@@ -368,71 +260,102 @@ def _us101_changes(folder: Path) -> tuple[FloatArray, FloatArray]:
     return above, np.where(np.isnan(wide), narrow, wide)
 
 
-def _inside(values: FloatArray, p: Parameter) -> NDArray[np.bool_]:
-    """Return which values are within the range of a parameter."""
-    return np.asarray((values >= p.low) & (values <= p.high))
-
-
-def _with_shapes(events: EventSet, shapes: FloatArray, columns: tuple[Parameter, ...]) -> EventSet:
-    """Return events with the columns fitted apart, lateral offset and perhaps duration, from shapes of lane changes."""
-    names = ("displacement", "duration")[: len(columns)]
-    reasons = ("bodies that overlap across, or more than one lane apart", FILTER_REASONS["duration"])
-    rules: list[dict[str, Any]] = []
-    keep = np.ones(len(shapes), dtype=bool)
-
-    def apply(rule: str, reason: str, passes: Any) -> None:
-        rules.append({"rule": rule, "reason": reason, "dropped": int((keep & ~passes).sum())})
-        np.logical_and(keep, passes, out=keep)
-
-    if len(columns) == 1:  # a displacement that is not known was no change of the table
-        shapes = shapes[~np.isnan(shapes[:, 0]), :1]
-        keep = np.ones(len(shapes), dtype=bool)
+def _add_changes(events: EventSet, changes: FloatArray, box: Sequence[Any]) -> EventSet:
+    """Return events with the columns apart, lateral offset and perhaps duration, from lane changes (n, 2)."""
+    rules: list[Rule] = []
+    log: list[dict[str, Any]] = []
+    if len(box) == 1:  # a displacement that is not known was no change of the table
+        changes = changes[~np.isnan(changes[:, 0]), :1]
     else:
-        rules.append({"rule": "lane changes read", "events": len(shapes)})
+        log.append({"rule": "lane changes read", "events": len(changes)})
         reason = "start or end of the change was not recorded, or it ended where it began"
-        apply("displacement and duration are given", reason, np.isfinite(shapes).all(axis=1))
-    for j, (name, p) in enumerate(zip(names, columns, strict=True)):
-        apply(f"{p.low:g} <= {name} <= {p.high:g} {p.unit}", reasons[j], _inside(shapes[:, j], p))
-    rules.append({"rule": "events used", "columns": [p.name for p in columns], "events": int(keep.sum())})
-    return replace(events, apart=shapes[keep], log=(*events.log, *rules))
+        rules.append(("displacement and duration are given", reason, np.asarray(np.isfinite(changes).all(axis=1))))
+    reasons = ("bodies that overlap across, or more than one lane apart", FILTER_REASONS["duration"])
+    for j, (name, p) in enumerate(zip(("displacement", "duration"), box, strict=False)):
+        rules.append(range_rule(name, changes[:, j], p, reasons[j]))
+    keep = np.ones(len(changes), dtype=bool)
+    log += drop_events(keep, rules, [p.name for p in box])
+    return replace(events, apart=changes[keep], log=(*events.log, *log))
 
 
-def _cut_ins(scenario: str, site: str) -> Callable[[Path], Read]:
-    """Return the reader of cut-ins of a site, with the shapes of its lane changes."""
-
-    def read(folder: Path) -> Read:
-        events, frequency = (
-            (_us101_cut_ins(folder), CUT_INS_US101) if site == "us101" else (_i80_cut_ins(folder), CUT_INS_I80)
-        )
-        columns = tuple(scenario_named(scenario).parameters)[len(CUT_INS) :]
-        return _with_shapes(events, lane_change_shapes(folder, site), columns), frequency
-
-    return read
-
-
-_CLOSING_GAPS = COORDINATE_SYSTEMS["cut_in"][2].name
-_FIRST_FRAME = "first frame of the pair"
-_MOMENTS = {"us101": "start of the lane change", "i80": "1.3 s before the crossing"}
-
-
-def _cut_in_bases(scenario: str) -> Iterator[ShippedBase]:
-    """Yield the bases of one version of the cut-in, of each site in the best coordinates and in closing speeds."""
-    for site, source in (("us101", US101_SOURCE), ("i80", I80_SOURCE)):
-        read = _cut_ins(scenario, site)
-        yield ShippedBase(scenario, site, read, source, _MOMENTS[site])
-        yield ShippedBase(scenario, f"{site}-closing", read, source, _MOMENTS[site], _CLOSING_GAPS)
-
-
+_CLOSING = COORDINATE_SYSTEMS["cut_in"][2].name
 SHIPPED_BASES = (
-    ShippedBase(FOLLOWING, "us101", _us101_pairs, US101_PAIRS, _FIRST_FRAME),
-    ShippedBase(FOLLOWING, "us101-gap", _us101_pairs, US101_PAIRS, _FIRST_FRAME, "plain"),
-    ShippedBase(FOLLOWING, "us101-log-gap", _us101_pairs, US101_PAIRS, _FIRST_FRAME, "log gap"),
-    ShippedBase(FOLLOWING, "i80", _i80_new_leaders, I80_SOURCE, _FIRST_FRAME),
-    ShippedBase(FOLLOWING, "i80-all-pairs", _i80_pairs, I80_PAIRS, _FIRST_FRAME),
-    ShippedBase(FOLLOWING, "i24", _i24_pairs, I24_SOURCE, "0.8 s after the gap began to jump"),
-    *_cut_in_bases(CUT_IN_V1),
-    *_cut_in_bases(CUT_IN_V0),
-    ShippedBase(CUT_IN_V0, "us101-15-offsets", _us101_cut_ins_alone, US101_SOURCE, _MOMENTS["us101"], "log gaps"),
-    ShippedBase(BRAKING, "us101", _us101_brakings, US101_SOURCE, "beginning of the braking"),
+    ShippedBase(FOLLOWING, "us101", US101_PAIRS),
+    ShippedBase(FOLLOWING, "us101-gap", US101_PAIRS, system="plain"),
+    ShippedBase(FOLLOWING, "us101-log-gap", US101_PAIRS, system="log gap"),
+    ShippedBase(FOLLOWING, "i80", replace(I80_PAIRS, excluded=("at_entry",))),
+    ShippedBase(FOLLOWING, "i80-all-pairs", I80_PAIRS),
+    ShippedBase(FOLLOWING, "i24", _read_i24_leaders),
+    *(
+        ShippedBase(scenario, site + ending, recipe, site, system)
+        for scenario in (CUT_IN_V1, CUT_IN_V0)
+        for site, recipe in (("us101", US101_CUT_INS), ("i80", I80_CUT_INS))
+        for ending, system in (("", None), ("-closing", _CLOSING))
+    ),
+    ShippedBase(CUT_IN_V0, "us101-15-offsets", US101_OFFSETS, system="log gaps"),
+    ShippedBase(BRAKING, "us101", _read_us101_brakings),
 )
 """Bases of the package that are fitted to recorded events."""
+
+# 30 and 24 m/s are the published speeds of cars and trucks; 38 m at 30 m/s is a headway of 1.27 s, in the published
+# mode of 1 to 1.5 s, as are 30 m (1 s) and 45 m (1.5 s) of the cut-ins; 75 m (2.5 s) stands for the long tail, trucks
+# keep 40 m (1.67 s). A lane change takes 6.28 s in the mean; CutIn-v0 has no duration.
+SITUATIONS = {
+    "car_following": (
+        (0.45, (30.0, 30.0, 38.0), (3.5, 3.5, 14.0), 0.6),
+        (0.25, (30.0, 30.0, 75.0), (3.5, 3.5, 25.0), 0.6),
+        (0.2, (24.0, 24.0, 40.0), (1.5, 1.5, 14.0), 0.8),
+        (0.1, (28.0, 24.0, 45.0), (2.5, 1.5, 16.0), 0.5),
+    ),
+    "cut_in": (
+        (0.6, (30.0, 30.0, 31.0, 30.0, 40.0, 3.75, 6.28), (3.0, 3.0, 3.0, 12.0, 18.0, 0.3, 2.0), 0.6),
+        (0.4, (30.0, 26.0, 28.0, 45.0, 45.0, 3.75, 6.28), (3.0, 2.5, 2.5, 16.0, 18.0, 0.3, 2.0), 0.6),
+    ),
+}
+"""Components of `highway`: weight, means and standard deviations of the parameters, and correlation of the speeds."""
+GAP_CORRELATIONS = {"car_following": ((0, 2), (1, 2)), "cut_in": ((0, 3),)}
+"""Speeds and gaps that go together a little (0.2): a fast ego has more room."""
+HIGHWAY_BASES = (FOLLOWING, CUT_IN_V0, CUT_IN_V1)
+"""Scenarios that have one."""
+
+
+def build_highway_base(scenario: str) -> dict[str, Any]:
+    """Return the entries of the assembled base of a scenario, by short name or id, its provenance included."""
+    name, box = scenario_named(scenario).name, scenario_named(scenario).parameters
+    d, speeds = len(box), sum(p.unit == "m/s" for p in box)
+    covariances = []
+    for _, _, deviation, together in SITUATIONS[name]:
+        correlation = np.eye(len(deviation))
+        correlation[:speeds, :speeds] += together * (1.0 - np.eye(speeds))
+        for i, j in GAP_CORRELATIONS[name]:
+            correlation[i, j] = correlation[j, i] = 0.2
+        covariances.append((np.outer(deviation, deviation) * correlation)[:d, :d])
+    weights, means = (np.array([one[k] for one in SITUATIONS[name]]) for k in (0, 1))
+    mixture = (weights, means[:, :d], np.array(covariances))
+    low, high = np.array([p.low for p in box]), np.array([p.high for p in box])
+    kinds: list[CoordinateKind] = ["plain"] * d
+    plain = CoordinateMixture(Coordinates(low, high, tuple(kinds)), *mixture)
+    shipped = json.loads(find_file(scenario, "highway").read_text(encoding="utf-8"))["provenance"]
+    words = {key: shipped[key] for key in ("kind", "published", "chosen", "components")}
+    provenance = {**words, "mass_outside_box": mass_outside(plain)}
+    return {**TruncatedGaussianMixture(*mixture, low, high).to_dict(), "provenance": provenance}
+
+
+def check_against_following(content: Mapping[str, Any], folder: Path) -> dict[str, Any]:
+    """Return an assembled base of car-following, its predictive checks against recorded states in its provenance.
+
+    The states are own speed, speed ahead and gap every `STATE_TICKS` of the drives with radar on I-24.
+    """
+    rows = read_columns(folder / CIRCLES_FILE, ("t", "speed", "gap", "rel_speed", "radar"))
+    chosen = rows["radar"].astype(bool) & (np.round(10.0 * rows["t"]).astype(np.int64) % STATE_TICKS == 0)
+    speed, gap, relative = (rows[name][chosen].astype(float) for name in ("speed", "gap", "rel_speed"))
+    states = np.column_stack([speed, speed + relative, gap])
+    states = states[_in_ranges(states, FOLLOWING)]
+    names = [p.name for p in scenario_named(FOLLOWING).parameters]
+    checks = check_predictions(FOLLOWING, names, states, read_distribution(content))
+    provenance = {
+        **content["provenance"],
+        "checked_against": f"{len(states):,} states of following on I-24, {STATE_TICKS // 10} s apart, by radar",
+        "checks": [{"name": each.name, "recorded": each.recorded, "expected": each.expected} for each in checks],
+    }
+    return {**content, "provenance": provenance}

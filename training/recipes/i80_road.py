@@ -43,15 +43,7 @@ THINNING = 3
 
 
 def read_lines(path: Path, key: str) -> list[FloatArray]:
-    """Return the lines of a survey file, shape (n, 2) each, in the order of their numbers.
-
-    Args:
-        path: CSV file.
-        key: Name of the column with the line's number.
-
-    Raises:
-        ValueError: The file cannot be read, lacks a column, or does not have six lines.
-    """
+    """Return the six lines of a survey file (n, 2), in the order of the numbers that the column `key` has."""
     try:
         table = csv.read_csv(
             path, convert_options=csv.ConvertOptions(column_types=dict.fromkeys((key, "x", "y"), "float64"))
@@ -65,11 +57,11 @@ def read_lines(path: Path, key: str) -> list[FloatArray]:
     return [points[number == k] for k in range(SURVEY_LANES)]
 
 
-def to_frame(points: FloatArray, origin: FloatArray, angle: float) -> FloatArray:
-    """Return points in the frame at `origin` with x in direction `angle` and y to the right, shape (n, 2)."""
+def to_frame(points: FloatArray, origin: FloatArray, angle: float, side: float = -1.0) -> FloatArray:
+    """Return points (n, 2) in the frame at `origin` with x in direction `angle` and y to the right, or left (1)."""
     cos, sin = np.cos(angle), np.sin(angle)
     dx, dy = (points - origin).T
-    return np.column_stack((dx * cos + dy * sin, dx * sin - dy * cos))
+    return np.column_stack((dx * cos + dy * sin, side * (dy * cos - dx * sin)))
 
 
 def to_road_coordinates(curve: ReferenceLine, points: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -94,7 +86,7 @@ def fit_reference_line(lanes: list[FloatArray]) -> tuple[ReferenceLine, FloatArr
 
     def residuals(z: FloatArray) -> FloatArray:
         curve, start, turn, offsets = unpack(z)
-        across = [to_road_coordinates(curve, rotate_points(lane, start, turn))[1] for lane in fitted]
+        across = [to_road_coordinates(curve, to_frame(lane, start, turn, side=1.0))[1] for lane in fitted]
         return np.concatenate([y - offset for y, offset in zip(across, offsets, strict=True)])
 
     guess = [float(lane[0, 1]) for lane in fitted[:-1]]
@@ -103,19 +95,8 @@ def fit_reference_line(lanes: list[FloatArray]) -> tuple[ReferenceLine, FloatArr
     return curve, origin + start[1] * right, angle - turn
 
 
-def rotate_points(points: FloatArray, start: FloatArray, turn: float) -> FloatArray:
-    """Return points in a frame that starts elsewhere and is turned to the right."""
-    cos, sin = np.cos(turn), np.sin(turn)
-    dx, dy = (points - start).T
-    return np.column_stack((dx * cos + dy * sin, dy * cos - dx * sin))
-
-
 def fit_lane_edges(lines: list[FloatArray], rightmost: FloatArray, curve: ReferenceLine) -> list[float]:
-    """Return lane edges from left to right, their y [m].
-
-    The edge on the right was not surveyed: it is set as far from the rightmost lane's median as the line on its
-    left.
-    """
+    """Return lane edges from left to right, their y [m]; that on the right, not surveyed, mirrors the line before."""
 
     def typical(points: FloatArray) -> float:
         s, y = to_road_coordinates(curve, points)

@@ -7,10 +7,10 @@ and the gradient goes through the simulator. Two things differ. Beside recorded 
 this project's scenarios, which the others replay, many behind each other on one road. And its loss has penalties on
 following closely, leaving the middle of the lane and speeding.
 
-Then it is corrected by DAgger (Ross, Gordon and Bagnell, AISTATS 2011): it drives ordinary traffic, draws of the
-scenarios and half of the failures that a search has found, and learns labels of an expert that sees the true state,
-keeps 0.3 s, and may only ask for more braking. In ordinary traffic and where recorded people were, the label is what
-the ego did before, so that it forgets nothing. The other failures are held out.
+Then it is corrected (`training.recipes.corrections`): it drives ordinary traffic, draws of the scenarios and half of
+the failures that a search has found, and learns labels of an expert that keeps 0.3 s, and may only ask for more
+braking. In ordinary traffic and where recorded people were, the label is what the ego did before, so that it forgets
+nothing.
 
 Writes `driver.safetensors` and `rounds.json` into the folder. A training that was stopped before the corrections is
 taken up.
@@ -20,7 +20,6 @@ from __future__ import annotations
 
 import copy
 import json
-import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -32,8 +31,6 @@ import typer
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-import rare_envs
-import samplers
 from agents import LearnedDriver, LearnedEgo, Provenance, save_driver
 from agents.learned.networks import Policy
 from rare_envs.control.idm import IDM
@@ -49,23 +46,21 @@ from rare_envs.traffic.neighbours import Lead
 from rare_envs.traffic.state import VEHICLE_LENGTH, VEHICLE_WIDTH, State
 from training.command_line import RunFolderOption, report_errors, run_command
 from training.data.scenes import TrafficScene
-from training.imitation.clone import collect_pairs
 from training.imitation.config import Config
 from training.imitation.evaluate import header_metrics
 from training.imitation.learner import Learner
-from training.imitation.traffic import stack_scenes
+from training.imitation.traffic import collect_pairs, stack_scenes
 from training.imitation.train import (
     DRIVER,
     Data,
     Source,
-    check_folder,
+    claim_folder,
     driver_of,
-    format_settings,
     load_scenes,
     make_learner,
     train_learner,
-    write_settings,
 )
+from training.recipes.corrections import count_failing, learn, search_failures
 from training.recipes.ordinary_traffic import CASES, draw_inputs, judge_all_cases, make_world
 
 FloatArray = NDArray[np.float64]
@@ -147,23 +142,22 @@ ENCOUNTERS = (
 
 @dataclass(frozen=True)
 class Corrections:
-    """Amounts of the corrections."""
+    """Amounts of the corrections.
+
+    In a round: draws of each scenario, drives of a minute in each case of `ordinary` traffic, simulations of each
+    search for failures, gradient steps. Moments of recorded people, at which the ego is to do what it did, are drawn
+    once.
+    """
 
     seed: int = 0
     rounds: int = 1
     draws: int = 1000
-    """Draws of each scenario in a round."""
     recorded: int = 100_000
-    """Moments of recorded people, at which the ego is to do what it did."""
     ordinary: int = 100
-    """Drives of a minute in each case of ordinary traffic in a round."""
     simulations: int = 2000
-    """Of each search for failures."""
     steps: int = 3000
-    """Gradient steps of a round."""
     batch: int = 1024
     rate: float = 5e-4
-    """Of Adam, falling to zero as a cosine in each round."""
 
 
 def make_scenes(kinds: Sequence[EncounterSpec], rng: np.random.Generator) -> list[TrafficScene]:
@@ -244,15 +238,10 @@ def expert_acceleration(state: State) -> Tensor:
 def record_drive(
     driver: LearnedDriver, teacher: Policy, world: World, x: FloatArray, every: int, corrected: bool
 ) -> tuple[Tensor, Tensor]:
-    """Let an ego drive, and return what it perceives until it collides (n, 51) with the outputs that are right (n, 4).
+    """Let an ego drive x (n, d); return what it perceives until it collides (m, 51) with the right outputs (m, 4).
 
-    Args:
-        driver: The ego.
-        teacher: Network before all corrections.
-        world: One in which vehicles look.
-        x: Scenarios, shape (n, d).
-        every: Ticks from one moment that is recorded to the next.
-        corrected: Whether the expert may ask for less acceleration than the teacher.
+    The right ones are those of the teacher, the network before all corrections; if corrected, the expert may ask for
+    less acceleration. Moments are so many ticks apart.
     """
     rows = []
     for tick, episode in enumerate(drive(world, LearnedEgo(driver), torch.from_numpy(x).float())):
@@ -270,38 +259,29 @@ def record_drive(
 
 
 def learn_labels(
-    policy: Policy, features: Tensor, outputs: Tensor, plan: Corrections, rng: np.random.Generator
+    policy: Policy, data: Sequence[tuple[Tensor, Tensor]], plan: Corrections, rng: np.random.Generator
 ) -> None:
-    """Train a network on labels."""
-    policy.requires_grad_(True)
-    features, outputs = features.clone(), outputs.clone()  # they were recorded in inference mode
+    """Train a network on perceptions (n, 51) and right outputs (n, 4)."""
+    features, outputs = (torch.cat(column).clone() for column in zip(*data, strict=True))  # of inference mode
     weights = outputs.new_tensor(OUTPUT_WEIGHTS)
-    optimiser = torch.optim.Adam(policy.parameters(), plan.rate)
-    for step in range(plan.steps):
-        for group in optimiser.param_groups:
-            group["lr"] = 0.5 * plan.rate * (1.0 + math.cos(math.pi * step / plan.steps))
+
+    def loss() -> Tensor:
         some = torch.from_numpy(rng.integers(0, len(features), plan.batch))
         given = torch.cat(policy(features[some]), dim=1)
         errors = nn.functional.smooth_l1_loss(given, outputs[some], reduction="none", beta=0.3)
-        optimiser.zero_grad()
-        torch.autograd.backward((weights * errors).mean())
-        optimiser.step()
+        return (weights * errors).mean()
+
+    policy.requires_grad_(True)
+    learn(list(policy.parameters()), loss, plan.steps, plan.rate)
     policy.requires_grad_(False)
 
 
 def correct_ego(
     before: LearnedDriver, plan: Corrections, recorded: Tensor | None = None
 ) -> tuple[LearnedDriver, list[dict[str, Any]]]:
-    """Correct an ego, which stays as it is.
+    """Return a corrected copy of an ego, and for each round and scenario searched a record, see `count_failing`.
 
-    Args:
-        before: The ego.
-        plan: Amounts.
-        recorded: What recorded people perceived, of which the ego is to make what it did, shape (n, 51).
-
-    Returns:
-        The corrected ego, and for each round and scenario searched: p of the ego at its beginning, failures driven in
-        training and held out, and the share of each in which the corrected ego fails.
+    Of what recorded people perceived (n, 51) it is to make what it did.
     """
     rng, teacher = np.random.default_rng(plan.seed), before.policy
     driver = replace(before, policy=copy.deepcopy(teacher))
@@ -310,28 +290,19 @@ def correct_ego(
         some = recorded[torch.from_numpy(rng.integers(0, len(recorded), plan.recorded))]
         with torch.inference_mode():
             data.append((some, torch.cat(teacher(some), dim=1)))
-    records, parts = list[dict[str, Any]](), []
+    searches = []
     for number in range(plan.rounds):
         for k, (env_id, base) in enumerate(SEARCHED):
-            problem = rare_envs.DrivingProblem(env_id, ego=LearnedEgo(driver), base=base)
             seed = 1000 * plan.seed + 10 * number + k
-            estimate = samplers.estimate(problem, samplers.TwoStage(), seed=seed, max_sim=plan.simulations)
-            x = rng.permutation(np.asarray(estimate.failures.x))
-            parts.append({"driven": x[::2], "held_out": x[1::2]})
-            records.append({"round": number, "env_id": env_id, "base": base, "p": estimate.p, "found": len(x)})
-            typer.echo(f"round {number}: {env_id} p = {estimate.p:.2g}, {len(x)} failures found", err=True)
-            if len(x):
+            found = search_failures(LearnedEgo(driver), env_id, base, rng, seed=seed, max_sim=plan.simulations)
+            typer.echo(f"round {number}: {found.record}", err=True)
+            searches.append(found)
+            if len(found.driven):
                 world = World(find_scenario(env_id), Sensing("features", lidar=True))
-                data.append(record_drive(driver, teacher, world, x[::2], 2, corrected=True))
+                data.append(record_drive(driver, teacher, world, found.driven, 2, corrected=True))
         data += _record_round(driver, teacher, plan, rng)
-        features, outputs = (torch.cat(column) for column in zip(*data, strict=True))
-        learn_labels(driver.policy, features, outputs, plan, rng)
-    for record, each in zip(records, parts, strict=True):
-        problem = rare_envs.DrivingProblem(record["env_id"], ego=LearnedEgo(driver))
-        for name, x in each.items():
-            failing = float((problem.evaluate(x) <= 0.0).mean()) if len(x) else math.nan
-            record |= {name: len(x), f"{name}_failing": failing}
-    return driver, records
+        learn_labels(driver.policy, data, plan, rng)
+    return driver, [count_failing(found, LearnedEgo(driver)) for found in searches]
 
 
 def _record_round(
@@ -356,10 +327,8 @@ def main(
     """Train and correct the ego `imitation`."""
     config, source = replace(CONFIG, seed=seed), Source("data", data)
     with report_errors("imitation"):
-        settings = format_settings(source, config)
-        check_folder(out, settings)
-        learn, test = load_scenes(source)
-        write_settings(out, settings)
+        with claim_folder(out, source, config):
+            learn, test = load_scenes(source)
         learner = prepare_learner(learn, ENCOUNTERS, config)
     before = replace(driver_of(train_learner(learner, out, progress=True), config), name="imitation")
     driver, records = correct_ego(before, Corrections(seed=seed), collect_pairs(stack_scenes(learn)).features)

@@ -34,11 +34,7 @@ VISION_USE = (
 
 
 def format_model_card(folder: Path) -> str:
-    """Return the card of all drivers, and egos that see, in a folder, as Markdown.
-
-    Raises:
-        ValueError: The folder holds no driver, or a file is neither.
-    """
+    """Return the card of all drivers, and egos that see, in a folder, as Markdown."""
     files = sorted(folder.glob("*.safetensors"))
     seeing = [path for path in files if holds_vision(path)]
     paths = [path for path in files if path not in seeing]

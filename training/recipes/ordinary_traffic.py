@@ -211,18 +211,17 @@ def draw_inputs(case: Case, world: World, n: int, own: int, rng: np.random.Gener
 
 
 class Verdicts(NamedTuple):
-    """Verdicts of n rollouts."""
+    """Of n rollouts, (n,) each: index of `VERDICT_NAMES` and time of the verdict [s], and what came before it.
+
+    That is the least time headway [s], inf without a lead, the least distance from the body to a line of the lane [m],
+    negative beyond it, and the mean speed of the whole rollout [m/s].
+    """
 
     reason: NDArray[np.int64]
-    """Index of `VERDICT_NAMES`, shape (n,)."""
     time: FloatArray
-    """Time of the verdict [s], shape (n,)."""
     headway: FloatArray
-    """Least time headway until then [s], inf without a lead, shape (n,)."""
     margin: FloatArray
-    """Least distance from the body to a line of the lane until then [m], negative beyond it, shape (n,)."""
     speed: FloatArray
-    """Mean speed of the whole rollout [m/s], shape (n,)."""
 
 
 def judge(
@@ -230,15 +229,7 @@ def judge(
 ) -> Verdicts:
     """Return for each rollout in ordinary traffic whether an ego keeps its lane and its distance.
 
-    Args:
-        ego: An ego as `rare_envs.DrivingProblem` takes it, such as one from `agents.load_ego`.
-        case: One of `CASES`, or a `Case`.
-        rollouts: Number of rollouts.
-        seed: Seed of the starts and of the others' noise.
-        seconds: Length of each rollout [s].
-
-    Raises:
-        ValueError: If there is no such case, or the ego does not fit.
+    The ego is one as `rare_envs.DrivingProblem` takes it; the seed is that of the starts and of the others' noise.
     """
     if isinstance(case, str) and case not in CASES:
         raise ValueError(f"Unknown case {case!r}; expected one of {', '.join(CASES)}.")
@@ -270,7 +261,7 @@ def _judge_tile(world: World, driver: Driver, x: Tensor) -> tuple[NDArray[Any], 
         headway = torch.where(gap < torch.inf, gap / speed.clamp(min=0.1), torch.inf)
         far, same = (headway >= FLOOR_HEADWAY) & (gap >= FLOOR_GAP), follows == lead
         since, had = torch.where(same, since + world.clock.dt, 0.0), (had & same) | far
-        margin = lane_margin(state, first)
+        margin = _lane_margin(state, first)
         verdict = torch.full_like(reason, PASSED)
         verdict[~far & (had | (since >= GRACE))] = TOO_CLOSE
         verdict[margin < 0.0] = LEFT_LANE
@@ -288,7 +279,7 @@ def _judge_tile(world: World, driver: Driver, x: Tensor) -> tuple[NDArray[Any], 
     return tuple(column.numpy() for column in (reason, time.double(), least, room, way / world.clock.seconds))
 
 
-def lane_margin(state: State, first: Episode) -> Tensor:
+def _lane_margin(state: State, first: Episode) -> Tensor:
     """Return the distance from the ego's body to the nearer line of its first lane [m], shape (B,)."""
     road, y, heading = first.road, state.y[:, 0], state.heading[:, 0]
     left, right = road.markers(first.state.y[:, 0])

@@ -168,14 +168,7 @@ def draw_road(rng: np.random.Generator, least: int = 1) -> Road:
 
 
 def start_situation(situation: Situation, rows: int, seconds: float, rng: np.random.Generator) -> tuple[World, Episode]:
-    """Return a world and its episodes at time 0, with egos in or beside their lanes.
-
-    Args:
-        situation: Traffic to train in.
-        rows: Number of scenarios B.
-        seconds: Length of the episodes.
-        rng: Source of roads, scenarios and places.
-    """
+    """Return a world of so many scenarios, with episodes at time 0 of some length [s]."""
     scenario = situation.scenario(rng)
     world = World(scenario, Sensing(OBSERVATION, weather=True), situation.drivers, clock=Clock(horizon=seconds))
     own = situation.sample(rows, rng)

@@ -3,12 +3,11 @@
     python -m training.recipes.vision --out runs/vision
 
 Round 0 imitates the expert in its own drives. In each later round the network drives, mixed with the expert less and
-less, the expert labels the pictures, and the network learns from those of all rounds: DAgger (Ross, Gordon and Bagnell,
-AISTATS 2011). Then rounds of corrections: a search finds failures in hard brakes, half of which are held out; the ego
-drives the other half, draws of the scenarios and the situations of before, and learns labels that ask for harder
-braking than the vehicle's, so that an error of regression about them still brakes fully. At test time there is the
-network alone, which sees pictures and its own speed. The shipped file is one of `--seed 0`, corrected in two rounds of
-seed 0 and one of seed 1.
+less, the expert labels the pictures, and the network learns from those of all rounds (DAgger). Then it is corrected
+(`training.recipes.corrections`): it drives failures in hard brakes, draws of the scenarios and situations of before,
+and learns labels that ask for harder braking than the vehicle's, so that an error of regression about them still brakes
+fully. At test time there is the network alone, which sees pictures and its own speed. The shipped file is one of
+`--seed 0`, corrected in two rounds of seed 0 and one of seed 1.
 """
 
 from __future__ import annotations
@@ -26,8 +25,6 @@ import typer
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-import rare_envs
-import samplers
 from agents import Provenance
 from agents.learned.driver import HEADING_TIME, OFFSET_TIME
 from agents.vision import (
@@ -56,6 +53,7 @@ from rare_envs.simulation.world import World
 from rare_envs.threads import use_one_thread
 from rare_envs.traffic.state import VEHICLE_LENGTH, State
 from training.command_line import RunFolderOption, run_command
+from training.recipes.corrections import count_failing, descend, learn, search_failures
 from training.recipes.ordinary_traffic import judge_all_cases
 from training.recipes.situations import make_situations, start_situation
 
@@ -73,56 +71,53 @@ DRAWN = (
 """Scenarios and bases in which failures are searched, and that are driven by draws."""
 FIRST_TICKS, CAMERA_ROWS = 10, 64
 """Ticks at the start that are all recorded, because a short gap is braked for then or never; rows driven at once."""
+MAX_GRADIENT_NORM = 5.0
+"""Norm to which gradients are clipped."""
 JUDGE_SEED = 2026
 """Seed of the drives that evaluate the result, which no training uses."""
 
 
 @dataclass(frozen=True)
 class VisionPlan:
-    """Amounts of the training: pairs are those of round 0 and of each later round of DAgger."""
+    """Amounts of the training; pairs are those of round 0, in which the expert drives, and of each round of DAgger.
+
+    In round k the expert decides at a share `mixing`^k of the ticks. Of the drives, situations of so many `rows` and
+    ticks, a share of the moments is `recorded`; visits are pictures that are learned from, with repetition. The rate of
+    Adam falls as a cosine to a hundredth; `truth_weight` is that of the second task, see `auxiliary_targets`.
+    """
 
     seed: int = 0
     rounds: int = 5
     drives: tuple[int, int] = (56, 7)
-    """Situations."""
     rows: int = 24
-    """Scenarios of a situation."""
     ticks: tuple[int, int] = (100, 120)
-    """Length of a scenario."""
     recorded: tuple[float, float] = (0.1, 0.2)
-    """Share of the moments that are recorded."""
     mixing: float = 0.5
-    """In round k the expert decides at a share `mixing`^k of the ticks."""
     visits: tuple[int, int] = (40_000, 20_000)
-    """Pictures that are learned from, with repetition."""
     batch: int = 32
     rate: float = 1e-3
-    """Of Adam, falling as a cosine to a hundredth."""
     truth_weight: float = 0.5
-    """Of the second task, see `auxiliary_targets`."""
 
 
 @dataclass(frozen=True)
 class CorrectionPlan:
-    """Amounts of the corrections."""
+    """Amounts of the corrections: simulations of a search, most failures driven, draws of each scenario in a round.
+
+    Of the first training's situations the expert drives some before the first round, and the network some in each;
+    drives take so many seconds.
+    """
 
     seed: int = 0
     rounds: int = 3
     simulations: int = 600
-    """Of each search for failures."""
     driven: int = 192
-    """Most failures of each search that are driven."""
     draws: int = 64
-    """Draws of each scenario in a round."""
     drives: tuple[int, int] = (28, 14)
-    """Situations of the first training that the expert drives before the first round, and the network in each."""
     rows: int = 24
     seconds: float = 10.0
-    """Length of a drive."""
     visits: int = 30_000
     batch: int = 32
     rate: float = 3e-4
-    """Of Adam, falling to zero as a cosine in each round."""
 
 
 def expert_outputs(episode: Episode, brakes: float = VISION_EXPERT.max_deceleration) -> Tensor:
@@ -157,18 +152,16 @@ def auxiliary_targets(episode: Episode) -> Tensor:
 
 
 class LabelledPictures(NamedTuple):
-    """Pictures and labels of n moments."""
+    """Moments: pictures (n, 66, 200, 3) and luma of those before them (n, 66, 200), uint8; own speed [m/s] (n,).
+
+    Then the expert's outputs (n, 2) and the auxiliary targets (n, 5).
+    """
 
     picture: Tensor
-    """uint8, shape (n, 66, 200, 3)."""
     earlier: Tensor
-    """Luma of the picture before it, uint8, shape (n, 66, 200)."""
     speed: Tensor
-    """Own speed [m/s], shape (n,)."""
     expert: Tensor
-    """Outputs of the expert, shape (n, 2)."""
     truth: Tensor
-    """Auxiliary targets, shape (n, 5)."""
 
 
 def concatenate(parts: list[LabelledPictures]) -> LabelledPictures:
@@ -200,20 +193,11 @@ def drive_and_label(
     brakes: float = VISION_EXPERT.max_deceleration,
     first_ticks: int = 0,
 ) -> Iterator[LabelledPictures]:
-    """Drive, and yield pictures with the outputs of the expert, until egos collide.
+    """Drive on from a moment, and yield pictures with the outputs of the expert, until egos collide.
 
-    Args:
-        world: Where they drive.
-        episode: Its first moment.
-        network: Decides at a share of the ticks, the expert at the others; with None the expert drives alone.
-        share: That share.
-        ticks: Length of the drive.
-        rng: Source of everything that is random.
-        recorded_share: Share of the ticks that are recorded.
-        noise: Factor of a noise of the actions, 0.5 m/s^2 and 0.05 rad/s for about half a second, so that places off
-            the expert's path are seen.
-        brakes: Hardest braking that the labels ask for [m/s^2].
-        first_ticks: Ticks at the start that are all recorded.
+    The network decides at a share of the ticks, the expert at the others; with None the expert drives alone. A share of
+    the ticks is recorded, the first ones all. Actions have a factor of a noise of 0.5 m/s^2 and 0.05 rad/s for about
+    half a second, so that places off the expert's path are seen. Labels ask for braking of up to `brakes` [m/s^2].
     """
     state, swing, before = None, np.zeros((len(episode.collided), 2)), deque([episode], LAG)
     for tick in range(ticks):
@@ -268,8 +252,7 @@ def train_vision(plan: VisionPlan) -> PilotNet:
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(plan.seed)
         network, probe = PilotNet(), nn.Linear(PILOTNET_HIDDEN_UNITS, 5)
-    parameters = [*network.parameters(), *probe.parameters()]
-    optimiser = torch.optim.Adam(parameters, plan.rate)
+    optimiser = torch.optim.Adam([*network.parameters(), *probe.parameters()], plan.rate)
     all_visits, visited = plan.visits[0] + plan.rounds * plan.visits[1], 0
     recorded: list[LabelledPictures] = []
     for number in range(plan.rounds + 1):
@@ -286,33 +269,19 @@ def train_vision(plan: VisionPlan) -> PilotNet:
         )
         data, left = concatenate(recorded), plan.visits[later]
         while left > 0:
-            for group in optimiser.param_groups:
-                group["lr"] = plan.rate * (0.505 + 0.495 * math.cos(math.pi * visited / all_visits))
             some = draw_batch(data, min(plan.batch, left), rng)
             hidden = network.hidden(some.picture, some.earlier, some.speed)
             error = nn.functional.smooth_l1_loss(network.out(hidden), some.expert, beta=0.5)
             truth = nn.functional.smooth_l1_loss(probe(hidden), some.truth)
-            _step(optimiser, error + plan.truth_weight * truth, parameters)
+            rate = plan.rate * (0.505 + 0.495 * math.cos(math.pi * visited / all_visits))
+            descend(optimiser, error + plan.truth_weight * truth, rate, MAX_GRADIENT_NORM)
             left, visited = left - len(some.speed), visited + len(some.speed)
         typer.echo(f"round {number}: {len(data.speed):,} pictures, loss {error.item():.4f}", err=True)
     return network.eval().requires_grad_(False)
 
 
-def _step(optimiser: torch.optim.Optimizer, loss: Tensor, parameters: list[nn.Parameter]) -> None:
-    """Make one step down a loss, with a clipped gradient."""
-    optimiser.zero_grad()
-    torch.autograd.backward(loss)
-    nn.utils.clip_grad_norm_(parameters, 5.0)
-    optimiser.step()
-
-
 def correct_vision(network: PilotNet, plan: CorrectionPlan) -> list[dict[str, Any]]:
-    """Correct a network in place.
-
-    Returns:
-        For each round: p of the ego at its beginning, failures driven in training and held out, and how many of each
-        the corrected ego fails.
-    """
+    """Correct a network in place; return a record of each round, see `count_failing`."""
     rng, ticks = np.random.default_rng(plan.seed), round(plan.seconds / VisionEgo.dt)
     how: dict[str, Any] = {"brakes": DEMANDED_BRAKING}
 
@@ -327,38 +296,33 @@ def correct_vision(network: PilotNet, plan: CorrectionPlan) -> list[dict[str, An
                 world, start, network, 1.0, ticks, rng, recorded_share=recorded, first_ticks=FIRST_TICKS, **how
             )
 
-    data = list(situations(None, plan.drives[0], 0.06, 1.0))
-    records, parts = list[dict[str, Any]](), []
+    data, searches = list(situations(None, plan.drives[0], 0.06, 1.0)), []
     for number in range(plan.rounds):
-        problem = rare_envs.DrivingProblem(SEARCHED[0], ego=VisionEgo(network), base=SEARCHED[1])
-        seed, budget = 1000 * plan.seed + 10 * number, plan.simulations
-        estimate = samplers.estimate(problem, samplers.TwoStage(), seed=seed, max_sim=budget, ensemble_run=False)
-        x = rng.permutation(np.asarray(estimate.failures.x))
-        parts.append({"driven": x[::2][: plan.driven], "held_out": x[1::2][: plan.driven]})
-        records.append({"round": number, "env_id": SEARCHED[0], "p": estimate.p, "found": len(x)})
-        data += scenarios(SEARCHED[0], parts[-1]["driven"], 0.3)
+        options: dict[str, Any] = {
+            "seed": 1000 * plan.seed + 10 * number,
+            "max_sim": plan.simulations,
+            "ensemble_run": False,
+        }
+        found = search_failures(VisionEgo(network), *SEARCHED, rng, **options)
+        found = found._replace(driven=found.driven[: plan.driven], held_out=found.held_out[: plan.driven])
+        typer.echo(f"correction {number}: {found.record}", err=True)
+        searches.append(found)
+        data += scenarios(SEARCHED[0], found.driven, 0.3)
         data += situations(network, plan.drives[1], 0.15, 0.0)
         for env_id, base in DRAWN:
             drawn = np.asarray(load_base(find_scenario(env_id), base).sample(plan.draws, rng))
             data += scenarios(env_id, drawn, 0.15)
         pictures = concatenate(data)
-        network.train().requires_grad_(True)
-        optimiser = torch.optim.Adam(network.parameters(), plan.rate)
-        steps = math.ceil(plan.visits / plan.batch)
-        for step in range(steps):
-            for group in optimiser.param_groups:
-                group["lr"] = 0.5 * plan.rate * (1.0 + math.cos(math.pi * step / steps))
+
+        def loss(pictures: LabelledPictures = pictures) -> Tensor:
             some = draw_batch(pictures, plan.batch, rng)
             given = network(some.picture, some.earlier, some.speed)
-            _step(optimiser, nn.functional.smooth_l1_loss(given, some.expert, beta=0.5), list(network.parameters()))
+            return nn.functional.smooth_l1_loss(given, some.expert, beta=0.5)
+
+        network.train().requires_grad_(True)
+        learn(list(network.parameters()), loss, math.ceil(plan.visits / plan.batch), plan.rate, MAX_GRADIENT_NORM)
         network.eval().requires_grad_(False)
-        typer.echo(f"correction {number}: p = {estimate.p:.2g}, {len(x)} failures found", err=True)
-    problem = rare_envs.DrivingProblem(SEARCHED[0], ego=VisionEgo(network))
-    for record, each in zip(records, parts, strict=True):
-        for name, x in each.items():
-            failing = int((problem.evaluate(x) <= 0.0).sum()) if len(x) else 0
-            record |= {name: len(x), f"{name}_failing": failing}
-    return records
+    return [count_failing(found, VisionEgo(network)) for found in searches]
 
 
 @use_one_thread()

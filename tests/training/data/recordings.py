@@ -1,12 +1,14 @@
-"""Simulated traffic in the file formats of recorded traffic: raw NGSIM and highD."""
+"""Simulated traffic in the file formats of recorded traffic."""
 
 from __future__ import annotations
 
 import csv
+import json
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from scipy.io import savemat
 
 from training.data.table import NOBODY, Trajectories, find_leaders, tabulate
 
@@ -89,120 +91,195 @@ def simulate(seed=0, lanes=3, per_lane=16, seconds=24.0, changers=0.4):
     return Traffic(**record, length=length, width=width, lanes=lanes, changed=changed)
 
 
+@dataclass(frozen=True)
+class Seen:
+    """Rows of the vehicles within the recorded road at every so many steps, by vehicle, then by time, (n,) each."""
+
+    step: np.ndarray
+    vehicle: np.ndarray
+    x: np.ndarray
+    y: np.ndarray
+    speed: np.ndarray
+    acceleration: np.ndarray
+    length: np.ndarray
+    width: np.ndarray
+    lane: np.ndarray
+    """0 the leftmost."""
+
+    def ahead(self):
+        """Vehicle ahead in the same lane, by centres; -1: none."""
+        found = np.full(len(self.x), -1)
+        for row in range(len(self.x)):
+            near = (self.step == self.step[row]) & (self.lane == self.lane[row]) & (self.x > self.x[row])
+            if near.any():
+                found[row] = self.vehicle[near][np.argmin(self.x[near])]
+        return found
+
+
+def see(traffic, every, road):
+    step, vehicle = np.nonzero(traffic.inside(road)[::every])
+    order = np.lexsort([step, vehicle])
+    at = every * step[order], vehicle[order]
+    moving = (getattr(traffic, name)[at] for name in ("x", "y", "speed", "acceleration"))
+    return Seen(*at, *moving, traffic.length[at[1]], traffic.width[at[1]], traffic.lane[at])
+
+
+def as_rows(columns, digits=4):
+    """Rows of columns of numbers, rounded, or of one value for all rows."""
+    n = max(np.size(values) for values in columns.values())
+    columns = {name: np.broadcast_to(values, n) for name, values in columns.items()}
+    rounded = {name: v.round(digits) if v.dtype.kind == "f" else v for name, v in columns.items()}
+    return [dict(zip(rounded, row, strict=True)) for row in zip(*(v.tolist() for v in rounded.values()), strict=True)]
+
+
 def write_csv(path, rows):
     with Path(path).open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, list(rows[0]))
         writer.writeheader()
         writer.writerows(rows)
+    return path
 
 
-def ngsim_rows(traffic, road=400.0):
-    """Rows of the published columns, in feet, sorted by vehicle and frame."""
-    inside, lane, rows = traffic.inside(road), traffic.lane, []
-    front = traffic.x + 0.5 * traffic.length
-    for i in range(traffic.x.shape[1]):
-        for k in np.flatnonzero(inside[:, i])[::1]:
-            if k % 5:
-                continue
-            j, b = nearest(np.where(inside[k], traffic.x[k], np.nan), lane[k], i, lane[k, i])
-            rows.append(
-                {
-                    "Vehicle_ID": i + 1,
-                    "Frame_ID": k // 5 + 1,
-                    "Total_Frames": 0,
-                    "Global_Time": 1_118_846_980_000 + 20 * k,
-                    "Local_X": round(traffic.y[k, i] / FOOT, 3),
-                    "Local_Y": round(front[k, i] / FOOT, 3),
-                    "Global_X": 0.0,
-                    "Global_Y": 0.0,
-                    "v_Length": round(traffic.length[i] / FOOT, 3),
-                    "v_Width": round(traffic.width[i] / FOOT, 3),
-                    "v_Class": 2,
-                    "v_Vel": round(traffic.speed[k, i] / FOOT, 3),
-                    "v_Acc": round(traffic.acceleration[k, i] / FOOT, 3),
-                    "Lane_ID": lane[k, i] + 1,
-                    "Preceding": j + 1,
-                    "Following": b + 1,
-                    "Space_Headway": 0.0,
-                    "Time_Headway": 0.0,
-                }
-            )
-    return rows
-
-
-def write_ngsim(path, traffic, road=400.0):
-    rows = ngsim_rows(traffic, road)
+def write_ngsim(path, traffic, road=ROAD):
+    """The published columns, in feet, sorted by vehicle and frame; returns the rows."""
+    seen = see(traffic, 5, road)
+    columns = {
+        "Vehicle_ID": seen.vehicle + 1,
+        "Frame_ID": seen.step // 5 + 1,
+        "Total_Frames": 0,
+        "Global_Time": 1_118_846_980_000 + 20 * seen.step,
+        "Local_X": seen.y / FOOT,
+        "Local_Y": (seen.x + 0.5 * seen.length) / FOOT,
+        "Global_X": 0.0,
+        "Global_Y": 0.0,
+        "v_Length": seen.length / FOOT,
+        "v_Width": seen.width / FOOT,
+        "v_Class": 2,
+        "v_Vel": seen.speed / FOOT,
+        "v_Acc": seen.acceleration / FOOT,
+        "Lane_ID": seen.lane + 1,
+        "Preceding": seen.ahead() + 1,
+        "Following": 0,
+        "Space_Headway": 0.0,
+        "Time_Headway": 0.0,
+    }
+    rows = as_rows(columns, 3)
     write_csv(path, rows)
     return rows
 
 
+def coifman_matrix(traffic, road=ROAD):
+    """The 18 columns with NGSIM's meaning, of which seven are filled; positions of the rear bumper."""
+    seen = see(traffic, 5, road)
+    matrix = np.zeros((len(seen.x), 18))
+    matrix[:, [0, 1, 5]] = np.column_stack([seen.vehicle + 1, seen.step // 5 + 1, (seen.x - 0.5 * seen.length) / FOOT])
+    motion = seen.speed / FOOT, seen.acceleration / FOOT
+    matrix[:, 11:15] = np.column_stack([*motion, seen.lane + 1, seen.ahead() + 1])
+    return matrix
+
+
+def write_coifman(path, matrix):
+    if path.suffix == ".mat":
+        savemat(path, {"data": matrix, "note": "To use this data set for research or publication, please refer to it"})
+    else:
+        np.savetxt(path, matrix, fmt="%.6f")
+    return path
+
+
 def write_highd(folder, upper, lower, recording="01", road=420.0):
-    """The three files of a recording at 25 Hz; `upper` drives towards -x."""
+    """The three files of a recording at 25 Hz; `upper` drives towards -x. Returns the rows of tracks."""
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
-    rows, meta, first = [], [], 1
-    top = 8.0  # y of the first upper marking in the picture
-    bottom = top + LANE * upper.lanes + 6.0  # and of the first lower one
-    for traffic, direction in ((upper, 1), (lower, 2)):
-        inside, lane = traffic.inside(road), traffic.lane
-        for i in range(traffic.x.shape[1]):
-            seen = [k for k in np.flatnonzero(inside[:, i]) if k % 2 == 0]
-            if not seen:
-                continue
-            meta.append({"id": first + i, "numFrames": len(seen), "class": "Car", "drivingDirection": direction})
-            for k in seen:
-                j, _ = nearest(np.where(inside[k], traffic.x[k], np.nan), lane[k], i, lane[k, i])
-                x, y = traffic.x[k, i], traffic.y[k, i]
-                across = (traffic.y[min(k + 1, len(traffic.y) - 1), i] - traffic.y[k, i]) / DT
-                sign = 1.0
-                if direction == 1:
-                    x, y, sign = road - x, LANE * traffic.lanes - y, -1.0
-                y += top if direction == 1 else bottom
-                rows.append(
-                    {
-                        "frame": k // 2 + 1,
-                        "id": first + i,
-                        "x": round(x - 0.5 * traffic.length[i], 4),
-                        "y": round(y - 0.5 * traffic.width[i], 4),
-                        "width": round(traffic.length[i], 4),
-                        "height": round(traffic.width[i], 4),
-                        "xVelocity": round(sign * traffic.speed[k, i], 4),
-                        "yVelocity": round(sign * across, 4),
-                        "xAcceleration": round(sign * traffic.acceleration[k, i], 4),
-                        "precedingId": first + j if j >= 0 else 0,
-                        "laneId": 0,
-                    }
-                )
-        first += traffic.x.shape[1]
+    rows, meta, markings, first, top = [], [], [], 1, 8.0  # y of the first marking in the picture
+    for traffic, direction, sign in ((upper, 1, -1.0), (lower, 2, 1.0)):
+        seen = see(traffic, 2, road)
+        later = np.minimum(seen.step + 1, len(traffic.y) - 1)
+        across = (traffic.y[later, seen.vehicle] - seen.y) / DT
+        x, y = (seen.x, seen.y) if sign > 0 else (road - seen.x, LANE * traffic.lanes - seen.y)
+        ahead = seen.ahead()
+        columns = {
+            "frame": seen.step // 2 + 1,
+            "id": first + seen.vehicle,
+            "x": x - 0.5 * seen.length,
+            "y": top + y - 0.5 * seen.width,
+            "width": seen.length,
+            "height": seen.width,
+            "xVelocity": sign * seen.speed,
+            "yVelocity": sign * across,
+            "xAcceleration": sign * seen.acceleration,
+            "precedingId": np.where(ahead >= 0, first + ahead, 0),
+            "laneId": 0,
+        }
+        rows += as_rows(columns)
+        meta += as_rows({"id": first + np.unique(seen.vehicle), "class": "Car", "drivingDirection": direction})
+        markings.append(";".join(f"{top + LANE * k:g}" for k in range(traffic.lanes + 1)))
+        first, top = first + traffic.x.shape[1], top + LANE * traffic.lanes + 6.0
     write_csv(folder / f"{recording}_tracks.csv", rows)
     write_csv(folder / f"{recording}_tracksMeta.csv", meta)
-    markings = [
-        ";".join(f"{start + LANE * k:g}" for k in range(traffic.lanes + 1))
-        for start, traffic in ((top, upper), (bottom, lower))
-    ]
-    write_csv(
-        folder / f"{recording}_recordingMeta.csv",
-        [{"id": 1, "frameRate": 25, "upperLaneMarkings": markings[0], "lowerLaneMarkings": markings[1]}],
-    )
+    about = {"id": 1, "frameRate": 25, "upperLaneMarkings": markings[0], "lowerLaneMarkings": markings[1]}
+    write_csv(folder / f"{recording}_recordingMeta.csv", [about])
     return rows
 
 
-def expected(traffic, table, steps, first=0):
-    """Simulated values at the rows of a table, by name."""
-    k, i = steps, table.vehicle - first
-    names = ("x", "y", "speed", "acceleration")
-    values = {name: getattr(traffic, name)[k, i] for name in names}
-    return values | {"length": traffic.length[i], "width": traffic.width[i], "lane": traffic.lane[k, i] + 1}
+WEST_END = 330_000.0
+"""x_position [ft] of x = 0 of the simulated road of I-24, westbound."""
+CLOCK = 1_669_118_400.0
+"""Unix time [s] of the first time step there."""
 
 
-def check_values(table, values, x_offset=0.0, atol=2e-3):
-    for name in ("x", "y", "length", "width", "speed"):
-        offset = x_offset if name == "x" else 0.0
-        np.testing.assert_allclose(table.column(name), values[name] + offset, atol=atol, err_msg=name)
+def bend(x, y, radius=np.inf, angle=0.0, shift=(0.0, 0.0)):
+    """Points of a picture (y down) at x along and y to the right of a road that turns to the right."""
+    theta = x / radius
+    along, across = (x, 0.0 * x) if np.isinf(radius) else (radius * np.sin(theta), radius * (1.0 - np.cos(theta)))
+    u, w = along - y * np.sin(theta), across + y * np.cos(theta)
+    return shift[0] + u * np.cos(angle) - w * np.sin(angle), shift[1] + u * np.sin(angle) + w * np.cos(angle)
 
 
-def change(rows, index, **values):
-    return [{**row, **values} if i == index else row for i, row in enumerate(rows)]
+def tgsim_rows(traffic, run=1, lanes=(1, 2, 3), first=0, road=ROAD, **place):
+    """Rows of the published columns at 10 Hz; lanes of the file from left to right."""
+    seen = see(traffic, 5, road)
+    x, y = bend(seen.x, seen.y, **place)
+    columns = {
+        "id": first + seen.vehicle,
+        "time": (DT * seen.step).round(1),
+        "xloc_kf": x,
+        "yloc_kf": y,
+        "lane_kf": np.array(lanes)[seen.lane],
+        "speed_kf": seen.speed,
+        "acceleration_kf": seen.acceleration,
+        "length_smoothed": seen.length,
+        "width_smoothed": seen.width,
+        "type_most_common": "small-vehicle",
+        "run_index": run,
+    }
+    return as_rows(columns)
+
+
+def i24_documents(traffic, direction=-1, road=ROAD, mark=""):
+    """Documents at 25 Hz; the leftmost lane begins 12 ft from the median."""
+    seen, documents = see(traffic, 2, road), []
+    for vehicle in np.unique(seen.vehicle).tolist():
+        own = seen.vehicle == vehicle
+        back, across = (seen.x - 0.5 * seen.length)[own] / FOOT, 12.0 + seen.y[own] / FOOT
+        documents.append(
+            {
+                "_id": {"$oid": f"6387{mark}{vehicle:04x}"},
+                "timestamp": (CLOCK + DT * seen.step[own]).round(6).tolist(),
+                "x_position": (WEST_END + direction * back).round(5).tolist(),
+                "y_position": (-direction * across).round(5).tolist(),
+                "length": traffic.length[vehicle] / FOOT,
+                "width": traffic.width[vehicle] / FOOT,
+                "direction": direction,
+                "coarse_vehicle_class": 0,
+                "flags": ["none"],
+            }
+        )
+    return documents
+
+
+def write_i24(path, documents, **style):
+    path.write_text(json.dumps(documents, **style), encoding="utf-8")
+    return path
 
 
 def table_of(*tracks, edges=EDGES) -> Trajectories:

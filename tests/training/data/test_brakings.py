@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from tests.training.data.stopping_traffic import PAUSE, stopping_track, stopping_traffic
-from training.data.brakings import (
+from training.data.events import (
     END_TICKS,
     HARD_BRAKE_COLUMNS,
     SHORTEST_TRACK,
@@ -34,11 +34,6 @@ def test_a_braking_that_does_not_end_in_a_standstill_is_none():
     assert len(hard_brake_events(stopping_traffic(SPEEDS, GAPS, DECELERATIONS, final=5.0))["speed"]) == 0
 
 
-def test_a_gap_is_not_known_without_lengths():
-    events = hard_brake_events(stopping_traffic(SPEEDS, GAPS, DECELERATIONS, length=np.nan))
-    assert len(events["gap"]) == 6 and np.isnan(events["gap"]).all()
-
-
 def test_a_braking_under_way_where_a_track_begins_is_left_out():
     """A hole 2.5 s after the onset: the track behind it begins in the braking. A hole before it leaves the braking."""
     table = stopping_traffic((14.0,), (15.0,), (2.5,))
@@ -47,9 +42,13 @@ def test_a_braking_under_way_where_a_track_begins_is_left_out():
     assert len(hard_brake_events(table.select(np.abs(table.frame - PAUSE + 30) > 2))["frame"]) == 2
 
 
+def positions(table):
+    return np.split(table.x, table.track_starts()[1:])
+
+
 def test_exposure_is_that_of_the_tracks_without_their_ends():
     table = stopping_traffic((14.0, 10.0), (15.0, 15.0), (2.5, 2.5))
-    seconds, metres = braking_exposure(table)
+    seconds, metres = braking_exposure(positions(table))
     lengths = np.diff(np.append(table.track_starts(), len(table)))
     assert seconds == pytest.approx(0.1 * (lengths - 2 * END_TICKS).sum())
     braked = [14.0**2 / 5.0, 10.0**2 / 5.0]  # v^2 / (2 a) of each of two vehicles
@@ -58,23 +57,15 @@ def test_exposure_is_that_of_the_tracks_without_their_ends():
     )
     assert metres == pytest.approx(expected, rel=0.03)
     short = table.select(table.frame < SHORTEST_TRACK - 1)
-    assert braking_exposure(short) == (0.0, 0.0)
-
-
-@pytest.mark.parametrize(("final", "expected"), [(0.5, 1), (5.0, 0)])
-def test_only_brakings_to_a_standstill(final, expected):
-    found, _ = find_standstill_brakings(stopping_track(12.0, 2.5, final), np.full(1000, 30.0))
-    assert len(found) == expected
-    if expected:
-        np.testing.assert_allclose(found[0], [12.0, 30.0, 2.5], rtol=0.06)
+    assert braking_exposure(positions(short)) == (0.0, 0.0)
 
 
 def test_a_track_that_runs_backwards_is_left_out():
     """A recorded position that freezes: the smoothed one overshoots and comes back."""
     position = stopping_track(12.0, 2.5)
     gap = np.full(len(position), 30.0)
-    assert len(find_standstill_brakings(position, gap).events) == 1
+    assert len(find_standstill_brakings(position, gap)[0]) == 1
     stop = position[-1]
     frozen = np.where(position > stop - 4.0, stop - 4.0, position)
     frozen[np.argmax(position > stop - 4.0) :] -= 1.0
-    assert len(find_standstill_brakings(frozen, gap).events) == 0
+    assert len(find_standstill_brakings(frozen, gap)[0]) == 0

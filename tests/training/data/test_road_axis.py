@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from tests.training.data.published_files import bend
+from tests.training.data.recordings import bend
 from training.data.road_axis import estimate_lane_edges, fit_road_axis, lanes_of
 
 LANES = np.array([1.8, 5.4, 9.0])
@@ -48,15 +48,6 @@ def test_points_beyond_the_ends_lie_on_the_tangents():
     )
     assert np.diff(along) == pytest.approx([1200.0, 50.0], abs=0.01)
     assert np.ptp(across) < 0.01
-
-
-def test_a_short_road_of_one_lane_has_an_axis():
-    x = np.linspace(0.0, 8.0, 30)
-    along, across = fit_road_axis(x, 2.0 + 0.0 * x, np.zeros(30, dtype=np.int64), np.array([-1.0, 0.0])).project(
-        x, 2.0 + 0.0 * x
-    )
-    np.testing.assert_allclose(np.diff(along), -np.diff(x), atol=1e-6)
-    assert np.ptp(across) < 1e-6
 
 
 def test_a_lane_begins_at_its_left_boundary_and_lane_0_is_outside():

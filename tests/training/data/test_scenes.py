@@ -73,11 +73,6 @@ def test_recorded_scenes_are_what_was_measured():
         assert np.abs(moved[scene.acted[:-1] & scene.present[1:] & (scene.speed[:-1] > MIN_HEADING_SPEED)]).max() < 1e-9
 
 
-def test_a_missing_file_is_named(tmp_path):
-    with pytest.raises(ValueError, match=SCENES_FILE):
-        load_us101_scenes(tmp_path)
-
-
 def test_scenes_follow_the_record_and_meet_where_they_were_cut():
     table = synthetic_traffic(seconds=12.0)
     (whole,) = scenes_of(table, seconds=100.0)

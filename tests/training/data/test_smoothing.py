@@ -9,8 +9,9 @@ from training.data.table import DT
 
 def replayed(track, x, y):
     """The simulator's step: explicit Euler, old values."""
-    states = [(x[0], y[0], track.heading[0], track.speed[0])]
-    for a, w in zip(track.acceleration[:-2], track.yaw_rate[:-2], strict=True):
+    heading, speed, acceleration, yaw_rate = track
+    states = [(x[0], y[0], heading[0], speed[0])]
+    for a, w in zip(acceleration[:-2], yaw_rate[:-2], strict=True):
         px, py, h, v = states[-1]
         states.append((px + v * np.cos(h) * DT, py + v * np.sin(h) * DT, h + w * DT, v + a * DT))
     return np.array(states)
@@ -49,29 +50,27 @@ def test_replaying_the_actions_gives_the_track():
 
 def test_a_creeping_vehicle_does_not_spin():
     jitter = 0.02 * np.random.default_rng(0).standard_normal((2, 50))
-    track = infer_motion(np.cumsum(jitter[0]), jitter[1], DT)
-    assert np.nanmin(track.speed) >= 0.0
-    assert np.nanmax(np.abs(track.heading)) <= np.arctan2(1.5, MIN_HEADING_SPEED)
+    heading, speed, *_ = infer_motion(np.cumsum(jitter[0]), jitter[1], DT)
+    assert np.nanmin(speed) >= 0.0
+    assert np.nanmax(np.abs(heading)) <= np.arctan2(1.5, MIN_HEADING_SPEED)
 
 
 def test_cubics_and_lines_are_exact_and_holes_are_cut():
     frames = np.concatenate([np.arange(3, 40), np.arange(52, 80)])  # at 25 Hz, frames 40 to 51 are missing
     time = 0.04 * frames
-    position = np.column_stack([1.0 + 20.0 * time - time**3, 2.0 * time])
-    speed = (20.0 - 1.5 * time)[:, None]
     order = np.random.default_rng(0).permutation(len(time))
-    rows = resample_tracks(np.full(len(time), 7.0), time[order], 0.04, position[order], speed[order])
+    cubic, line = (1.0 + 20.0 * time - time**3)[order], (20.0 - 1.5 * time)[order]
+    rows, nearest = resample_tracks(np.full(len(time), 7.0), time[order], 0.04, {"x": cubic}, {"speed": line})
     # 0.12 to 1.56 s and 2.08 to 3.16 s
-    assert rows.frame.tolist() == [*range(2, 16), *range(21, 32)]
-    t = 0.1 * rows.frame
-    np.testing.assert_allclose(rows.splined, np.column_stack([1.0 + 20.0 * t - t**3, 2.0 * t]), atol=1e-9)
-    np.testing.assert_allclose(rows.linear[:, 0], 20.0 - 1.5 * t, atol=1e-9)
-    assert (np.abs(time[order][rows.nearest] - t) <= 0.02 + 1e-9).all()
-    assert set(rows.vehicle) == {7.0}
+    assert rows["frame"].tolist() == [*range(2, 16), *range(21, 32)]
+    t = 0.1 * rows["frame"]
+    np.testing.assert_allclose(rows["x"], 1.0 + 20.0 * t - t**3, atol=1e-9)
+    np.testing.assert_allclose(rows["speed"], 20.0 - 1.5 * t, atol=1e-9)
+    assert (np.abs(time[order][nearest] - t) <= 0.02 + 1e-9).all()
+    assert set(rows["vehicle"]) == {7.0}
 
 
 def test_a_track_between_two_ticks_has_no_rows():
-    time = np.array([0.12, 0.16, 1.0, 1.04])
-    values = np.arange(4.0)[:, None]
-    rows = resample_tracks(np.array([1.0, 1.0, 2.0, 2.0]), time, 0.04, values, values)
-    assert rows.vehicle.tolist() == [2.0] and rows.frame.tolist() == [10.0]
+    time, values = np.array([0.12, 0.16, 1.0, 1.04]), {"x": np.arange(4.0)}
+    rows, _ = resample_tracks(np.array([1.0, 1.0, 2.0, 2.0]), time, 0.04, values, {})
+    assert rows["vehicle"].tolist() == [2.0] and rows["frame"].tolist() == [10.0]

@@ -6,10 +6,8 @@ import pytest
 from training.data.formats import load_ngsim
 from training.data.table import (
     COLUMNS,
-    DT,
     NOBODY,
     read_trajectories,
-    synthetic_traffic,
     tabulate,
     write_trajectories,
 )
@@ -55,21 +53,3 @@ def test_a_table_is_sorted_and_checked():
             tabulate({**GOOD, **changes})
     with pytest.raises(ValueError, match="must increase"):
         tabulate(GOOD, {"r": (0.0, 3.5, 3.5)})
-
-
-def test_positions_are_the_sums_of_speeds():
-    table = synthetic_traffic(seconds=3.0)
-    for vehicle in range(9):
-        own = table.select(table.vehicle == vehicle)
-        np.testing.assert_allclose(np.diff(own.x), DT * own.speed[1:])
-        assert own.speed == pytest.approx(12.0 + np.cos(1.3 * own.time + vehicle))
-        assert (own.lane == 1 + vehicle % 3).all()
-
-
-def test_the_first_of_each_lane_has_no_leader():
-    table = synthetic_traffic(seconds=2.0, lanes=2, per_lane=4)
-    assert sorted(set(table.vehicle[table.leader == NOBODY])) == [6, 7]
-    followers = table.leader != NOBODY
-    assert (table.leader[followers] == table.vehicle[followers] + 2).all()
-    gaps = table.x[table.find_rows(table.leader)[followers]] - table.x[followers]
-    assert gaps.min() > 15.0

@@ -41,14 +41,6 @@ def closing_events(n, seed=0):
     return EventSet(x, np.arange(n) // 10)
 
 
-@pytest.mark.parametrize("scenario", COORDINATE_SYSTEMS)
-def test_every_system_fits_its_scenario(scenario):
-    parameters = scenario_named(scenario).parameters
-    for system in COORDINATE_SYSTEMS[scenario]:
-        assert system.coordinates(parameters).dim == len(parameters)
-        assert set(system.kinds) <= {p.name for p in parameters}
-
-
 def test_the_criterion_is_that_of_the_density_of_x(monkeypatch):
     """BIC = -2 log L + (number of parameters) log n, with L the likelihood of x itself; nobody is outside the box."""
     monkeypatch.setattr(mixture_fit, "COVARIANCE_FLOOR", 0.0)
@@ -96,15 +88,6 @@ def test_columns_apart_are_independent(quick):
     np.testing.assert_allclose(covariance[5:, 5:], np.cov(logs.T, bias=True), rtol=0.011)
 
 
-@pytest.mark.parametrize(("errors", "chosen"), [(1.5, 1), (2.5, 0)])
-def test_two_paired_standard_errors_are_clearly_worse(errors, chosen):
-    """The better one in prediction is second here and first there; the other has the smaller criterion by far."""
-    loss = ERROR_PATTERN + errors * np.sqrt(50) * ERROR_PATTERN.std(ddof=1) / 50
-    good = np.zeros(50)
-    assert choose_system([20.0, 8.0], [good, good - loss], np.arange(50)) == chosen
-    assert choose_system([8.0, 20.0], [good - loss, good], np.arange(50)) == 1 - chosen
-
-
 def test_events_of_a_cluster_err_together():
     """Losses of 1 in three clusters of ten and -0.5 in two: clearly worse only if each event were by itself."""
     clusters = np.repeat(np.arange(5), 10)
@@ -139,18 +122,6 @@ def events(n, seed=0, per_cluster=1):
     rng = np.random.default_rng(seed)
     x = np.column_stack([rng.normal(15.0, 3.0, (n, 2)), np.exp(rng.normal(3.0, 0.4, n))])
     return EventSet(x, np.arange(n) // per_cluster)
-
-
-def test_clusters_are_drawn_whole():
-    drawn = draw_events(events(60, per_cluster=3), np.random.default_rng(1))
-    original = events(60, per_cluster=3).joint
-    assert len(drawn.joint) == 60
-    assert len(np.unique(drawn.clusters)) == 20  # one drawn twice counts as two
-    for label in np.unique(drawn.clusters):
-        rows = drawn.joint[drawn.clusters == label]
-        first = int(np.flatnonzero((original == rows[0]).all(axis=1))[0])
-        assert first % 3 == 0
-        assert (rows == original[first : first + 3]).all()
 
 
 def test_columns_apart_are_drawn_by_themselves():
@@ -210,3 +181,15 @@ def test_refits_follow_the_seed_and_few_clusters_have_none(quick):
     assert [fit.distribution.to_dict() for fit in one] == [fit.distribution.to_dict() for fit in other]
     assert told == [f"refit {number} of 3" for number in (1, 2, 3)]
     assert refit(events(40, per_cluster=10), [LOG_GAP], FOLLOWING) == ()
+
+
+def test_clusters_are_drawn_whole():
+    drawn = draw_events(events(60, per_cluster=3), np.random.default_rng(1))
+    original = events(60, per_cluster=3).joint
+    assert len(drawn.joint) == 60
+    assert len(np.unique(drawn.clusters)) == 20  # one drawn twice counts as two
+    for label in np.unique(drawn.clusters):
+        rows = drawn.joint[drawn.clusters == label]
+        first = int(np.flatnonzero((original == rows[0]).all(axis=1))[0])
+        assert first % 3 == 0
+        assert (rows == original[first : first + 3]).all()

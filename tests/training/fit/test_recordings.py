@@ -9,30 +9,29 @@ import pytest
 
 from rare_envs.scenarios.base_distributions import load_base
 from rare_envs.scenarios.registry import scenario_named
-from tests.training.data.published_files import (
+from tests.training.data.recordings import (
     CLOCK,
     coifman_matrix,
     i24_documents,
+    simulate,
     tgsim_rows,
     write_coifman,
+    write_csv,
     write_i24,
-    write_tgsim,
 )
-from tests.training.data.recordings import simulate, write_highd, write_ngsim
 from tests.training.data.stopping_traffic import PAUSE, stopping_traffic
 from training.command_line import EventOptions
-from training.data.brakings import braking_exposure
-from training.data.events import car_following_events, cut_in_events
+from training.data.events import braking_exposure, car_following_events, cut_in_events
 from training.data.table import synthetic_traffic
 from training.fit import mixture as mixture_fit
 from training.fit.filters import EVENT_RECIPES, filter_events, read_events
 from training.fit.recordings import (
     SECONDS_BETWEEN,
     FitProgress,
-    ObservedTraffic,
     count_events,
     fit_bases,
     fit_own_bases,
+    observe_traffic,
 )
 
 GOOD = [15.0, 14.0, 16.0, 12.0, 20.0, 3.0, 4.5]
@@ -100,13 +99,6 @@ def test_filters_drop_and_count(tmp_path):
     }
 
 
-def test_missing_column_is_named(tmp_path):
-    path = tmp_path / "events.csv"
-    path.write_text("v_ego,v_lead\n1,2\n", encoding="utf-8")
-    with pytest.raises(ValueError, match="lacks the columns gap"):
-        read_events(path, EVENT_RECIPES["car_following"])
-
-
 def test_pairs_that_were_under_way_are_no_new_leaders(tmp_path):
     path = tmp_path / "car_following_events.csv"
     rows = ["v_ego,v_lead,gap,at_entry,recording,frame", "10,9,20,true,a,0", "11,9,20,false,a,5", "12,9,0.5,false,a,9"]
@@ -118,24 +110,17 @@ def test_pairs_that_were_under_way_are_no_new_leaders(tmp_path):
     assert dropped == {"not at_entry": 1, "1 <= gap <= 150 m": 1}
 
 
-def test_exposure_is_time_and_distance_of_all_vehicles():
-    table = synthetic_traffic(seconds=10.0, per_lane=2)
-    exposure = ObservedTraffic().plus(table).plus(table)
-    assert exposure.hours == pytest.approx(2 * len(table) * 0.1 / 3600)
-    assert exposure.km == pytest.approx(2 * table.speed.mean() * len(table) * 0.1 / 1000)
-
-
 def test_pairs_at_the_entry_do_not_count():
     """Nobody changes lane, so that all pairs are there from the first frame on: no new leader was recorded."""
     table = synthetic_traffic(seconds=4.0, per_lane=2)
     events = car_following_events(table)
     assert events["at_entry"].all()
-    assert count_events("car_following", events, len(events["ego"]), ObservedTraffic().plus(table)) is None
+    assert count_events("car_following", events, len(events["ego"]), observe_traffic(table)) is None
 
 
 def test_new_leaders_count_with_the_share_that_is_used():
     events = {"at_entry": np.array([True, False, False, True, False, False]), "ego": np.arange(6)}
-    frequency = count_events("car_following", events, 3, ObservedTraffic(hours=2.0, km=100.0))
+    frequency = count_events("car_following", events, 3, np.array([2.0, 100.0, 0.0, 0.0]))
     assert frequency is not None
     assert (frequency.count, frequency.share_events) == (4, 4)
     assert frequency.per_hour == pytest.approx(3 / 2.0)
@@ -143,49 +128,25 @@ def test_new_leaders_count_with_the_share_that_is_used():
 
 def test_cut_ins_count_with_the_share_that_is_used():
     events = {"phase": np.array(["start", "crossing"] * 4), "ego": np.array([1, 1, 2, 2, -1, -1, 3, 3])}
-    frequency = count_events("cut_in", events, 2, ObservedTraffic(hours=2.0, km=100.0))
+    frequency = count_events("cut_in", events, 2, np.array([2.0, 100.0, 0.0, 0.0]))
     assert frequency is not None
     assert (frequency.count, frequency.share_events) == (3, 3)
     assert frequency.per_hour == pytest.approx(3 / 2.0 * 2 / 3)
     assert frequency.per_km == pytest.approx(3 / 100.0 * 2 / 3)
     none = cut_in_events(synthetic_traffic(seconds=3.0, per_lane=2))
-    assert count_events("cut_in", none, 0, ObservedTraffic(2.0, 100.0)) is None
+    assert count_events("cut_in", none, 0, np.array([2.0, 100.0, 0.0, 0.0])) is None
 
 
-def test_brakings_count_in_the_time_in_which_they_could_begin():
-    table = stopping_traffic((10.0, 14.0), (6.0, 15.0), (1.5, 2.5))
-    traffic = ObservedTraffic().plus(table).plus(table)
-    seconds, metres = braking_exposure(table)
-    frequency = count_events("hard_brake", {}, 4, traffic)
-    assert frequency is not None
-    assert (frequency.count, frequency.share) == (4, 1.0)
-    assert frequency.per_hour == pytest.approx(4 / (2 * seconds / 3600))
-    assert frequency.per_km == pytest.approx(4 / (2 * metres / 1000))
-    assert count_events("hard_brake", {}, 0, traffic) is None
-
-
-@pytest.mark.parametrize("kind", ["highd", "ngsim", "tgsim", "i24"])
-def test_bases_are_fitted_to_recordings_of_every_kind(kind, simulated, quick, tmp_path, capsys):
-    data = tmp_path / "data"
-    data.mkdir()
-    if kind == "highd":
-        write_highd(data, simulated, simulate(1, lanes=2, per_lane=4, seconds=8.0))
-    elif kind == "ngsim":
-        write_ngsim(data / "us101.csv", simulated)
-    elif kind == "tgsim":
-        write_tgsim(data / "I294_L1.csv", tgsim_rows(simulated, radius=900.0, angle=2.6))
-    else:
-        write_i24(data / "morning.json", i24_documents(simulated))
-    path = data if kind in ("highd", "tgsim") else next(data.iterdir())
-    files = fit(tmp_path / "bases", **{kind: path})
+def test_bases_are_fitted_to_recordings(simulated, quick, tmp_path, capsys):
+    write_csv(tmp_path / "I294_L1.csv", tgsim_rows(simulated, radius=900.0, angle=2.6))
+    files = fit(tmp_path / "bases", tgsim=tmp_path)
     assert [file.name for file in files] == ["car_following_own.json", "cut_in_own.json"]
     assert "hard_brake_events.csv: 0 events are too few" in capsys.readouterr().err  # nobody stops
-    recording = {"highd": "01-lower, 01-upper", "ngsim": "us101", "tgsim": "I294_L1-1-left", "i24": "morning-west"}
     for scenario, file in zip(("car_following", "cut_in"), files, strict=True):
         points = load_base(scenario_named(scenario), file).sample(100, np.random.default_rng(0))
         assert np.isfinite(points).all() and 12.0 < points[:, 0].mean() < 25.0  # simulated: 9 to 27 m/s
         source = json.loads(file.read_text(encoding="utf-8"))["provenance"]["source"]
-        assert source["data"] == f"recordings {recording[kind]}"
+        assert source["data"] == "recordings I294_L1-1-left"
 
 
 def test_too_few_events_are_an_error_that_names_all_scenarios(simulated, quick, tmp_path, capsys):
@@ -216,7 +177,7 @@ def test_a_hard_brake_base_is_fitted_to_brakings_to_a_standstill(quick, tmp_path
     for column, recorded in ((0, speeds), (2, decelerations)):
         assert points[:, column].mean() == pytest.approx(recorded.mean(), rel=0.12)
     assert base.frequency.count == n
-    seconds, metres = braking_exposure(table)
+    seconds, metres = braking_exposure(np.split(table.x, table.track_starts()[1:]))
     assert base.frequency.per_hour == pytest.approx(3600 * n / seconds, rel=1e-3)
     assert base.frequency.per_km == pytest.approx(1000 * n / metres, rel=1e-3)
     assert [check.name for check in base.checks] == ["time headway < 0.5 s", "deceleration > 3 m/s^2", "gap < 3 m"]
@@ -245,11 +206,10 @@ def test_bad_arguments_are_refused(source, options, message, tmp_path):
 def test_counts_are_printed_every_few_seconds(capsys):
     now = 100.0
     progress = FitProgress(clock=lambda: now)
-    count = progress.counter("cut_in")
     progress.say("cut_in: 40 events")
     for number in range(20):
         now += 0.3 * SECONDS_BETWEEN
-        count(f"refit {number + 1} of 20")
+        progress.count("cut_in", f"refit {number + 1} of 20")
     printed = capsys.readouterr()
     assert printed.out == ""
     assert printed.err.splitlines() == [

@@ -3,17 +3,10 @@
 import pytest
 import torch
 
-from tests.training.imitation.synthetic_scenes import generator, plain_policy, scene, tiny
-from training.imitation.clone import (
-    Pairs,
-    clone_policy,
-    collect_pairs,
-    denormalise_action,
-    log_likelihood,
-    normalise_action,
-    scaling_of,
-)
-from training.imitation.traffic import stack_scenes
+from tests.training.imitation.synthetic_scenes import generator, plain_policy, tiny
+from training.imitation.learner import clone_policy, log_likelihood, scaling_of
+from training.imitation.rollout import denormalise_action, normalise_action
+from training.imitation.traffic import Pairs, collect_pairs
 
 
 def test_likelihood_is_that_of_torch():
@@ -37,12 +30,6 @@ def test_pairs_hold_every_known_moment_of_followers(recording):
     assert pairs.action[:, 0].abs().max() <= 0.6 + 1e-6
 
 
-def test_scenes_without_followers_are_refused():
-    lonely = scene(vehicles=3)
-    with pytest.raises(ValueError, match="followers"):
-        scaling_of(collect_pairs(stack_scenes([lonely])))
-
-
 def linear_driver(n=3000, noise=0.1):
     """Pairs of a driver whose actions are two of the features, and Gaussian noise."""
     features = torch.randn(n, 51, generator=generator(1))
@@ -60,11 +47,3 @@ def test_a_linear_driver_is_cloned_with_its_noise():
     assert off.square().mean() < 0.04
     # and knows how large its errors are: a Gaussian's likelihood is greatest at the root mean square
     torch.testing.assert_close(log_std.exp().mean(dim=0), off.square().mean(dim=0).sqrt(), rtol=0.3, atol=0.0)
-
-
-def test_the_same_generator_gives_the_same_policy_and_the_global_one_is_left_alone():
-    pairs, before = linear_driver(200), torch.get_rng_state()
-    first, second, other = (clone_policy(pairs, tiny(), generator(seed)).head.weight for seed in (3, 3, 4))
-    assert torch.equal(first, second)
-    assert not torch.equal(first, other)
-    assert torch.equal(torch.get_rng_state(), before)

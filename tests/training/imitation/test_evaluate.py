@@ -11,7 +11,6 @@ from training.imitation.evaluate import (
     BINS,
     behaviour_of,
     binned_quantities,
-    collect_statistics,
     drive_traffic,
     find_overlaps,
     jensen_shannon,
@@ -68,14 +67,6 @@ def test_the_record_has_no_divergence_from_itself(recording):
     assert max(found.divergence.values()) == 0
     assert found.collision == found.hard_brake == found.off_road == found.ever == 0
     assert found.vehicles == 4 * 6
-
-
-def test_times_of_one_rollout_are_those_of_two(recording):
-    both = collect_statistics(recording, constant, (1.0, 2.0))
-    alone = collect_statistics(recording, constant, (1.0,))
-    for name in ("speed", "acceleration"):
-        np.testing.assert_array_equal(both[1.0].counts[name], alone[1.0].counts[name])
-    assert both[2.0].steps.sum() == 2 * both[1.0].steps.sum()
 
 
 def test_divergence_is_symmetric_knows_empty_bins_and_is_at_most_log_two():

@@ -4,10 +4,9 @@ import numpy as np
 import pytest
 import torch
 
-from rare_envs.sensors.lidar import FEATURES
 from tests.training.imitation.synthetic_scenes import at_start, generator, scene, tiny
 from training.imitation.rollout import draw_pool
-from training.imitation.traffic import replay_features, stack_scenes, start_replay, step_replay
+from training.imitation.traffic import stack_scenes, start_replay, step_replay
 
 
 def test_shorter_scenes_are_padded_with_absent_vehicles():
@@ -34,11 +33,6 @@ def test_roads_with_fewer_lanes_repeat_their_last_edge():
     recording = stack_scenes([wide, narrow])
     assert recording.edges[0].tolist() == pytest.approx([0.0, 3.6, 7.2, 10.8])
     assert recording.edges[1].tolist() == pytest.approx([0.0, 3.6, 3.6, 3.6])
-
-
-def test_no_scene_is_no_recording():
-    with pytest.raises(ValueError, match="at least one scene"):
-        stack_scenes([])
 
 
 def recorded(recording, traffic, name):
@@ -74,30 +68,11 @@ def test_replayed_vehicles_follow_the_record_and_then_keep_their_speed(recording
     torch.testing.assert_close(traffic.x[ahead], recording.x[:, 40, 7])
 
 
-def test_driven_vehicles_stop_and_do_not_reverse(recording):
-    traffic = at_start(recording)
-    brake = torch.zeros(*traffic.x.shape, 2)
-    brake[..., 0] = -8.0
-    for _ in range(30):
-        traffic = step_replay(recording, traffic, brake)
-    assert (traffic.speed[traffic.driven] == 0).all()
-
-
 def test_a_curriculum_drives_the_rearmost(recording):
     rows = torch.arange(3)
     traffic = start_replay(recording, rows, torch.zeros_like(rows), most=2)
     assert traffic.driven.sum(dim=1).tolist() == [2, 2, 2]
     assert traffic.x[traffic.driven].max() < 25
-
-
-def test_features_are_where_the_names_say(recording):
-    traffic = at_start(recording)
-    features = replay_features(traffic)
-    assert len(FEATURES) == features.shape[-1] == 51
-    torch.testing.assert_close(features[..., FEATURES.index("speed")], traffic.speed)
-    left, right = (features[..., FEATURES.index(name)] for name in ("left_marker", "right_marker"))
-    torch.testing.assert_close(left + right, torch.full_like(left, 3.6))
-    torch.testing.assert_close(features[..., 0], 0.5 * (left - right))
 
 
 def pool_of(recording, among, shortest=20, seed=0, size=64):

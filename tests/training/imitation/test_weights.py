@@ -14,10 +14,8 @@ from training.imitation.config import Config
 from training.imitation.train import DRIVER, Source, prepare_data, train_driver
 from training.imitation.weights import (
     Ensemble,
-    Member,
     fit_weights,
     make_ensemble,
-    measure_spread,
     member_config,
     select_scenes,
     train_members,
@@ -94,15 +92,6 @@ def test_members_go_on_where_the_schedules_of_the_base_ended():
     assert config.critic_weight == Config().critic_weight
 
 
-def test_spread_on_paper():
-    members = [Member(np.array([0.0, 1.0]), np.array([0.1, 0.2])), Member(np.array([2.0, 1.5]), np.array([0.3, 0.2]))]
-    spread = measure_spread(members, base=np.array([0.0, 1.25]))
-    assert spread["between_max"] == pytest.approx(np.sqrt(2))
-    assert spread["within_median"] == pytest.approx(0.2)
-    assert spread["bias_max"] == pytest.approx(1.0)
-    assert spread["bias_over_spread"] == pytest.approx(np.sqrt(1.0 / (2.0 + 0.125)))
-
-
 @pytest.mark.parametrize(
     ("settings", "message"),
     [({"members": 9}, r"10 or more members.*, got 9\."), ({"updates": 1}, r"2 or more updates.*, got 1\.")],
@@ -136,14 +125,6 @@ def test_it_finds_the_dependences_and_predicts_new_members(truth, rng):
     alone = WeightDistribution(fit.distribution.mean, np.diag(1 / np.diag(fit.distribution.covariance)))
     gain = fit.distribution.log_prob(new) - alone.log_prob(new)
     assert gain.mean() > 5 * gain.std() / np.sqrt(len(new))
-
-
-def test_means_and_spreads_are_those_of_the_members(truth, rng):
-    members = truth.sample(40, rng)
-    fit = fit_weights(members, names=NAMES, radius=0.02)
-    np.testing.assert_allclose(fit.distribution.mean, members.mean(axis=0), rtol=1e-12)
-    np.testing.assert_allclose(np.sqrt(np.diag(fit.distribution.covariance)), members.std(axis=0, ddof=1), rtol=0.02)
-    assert fit.distribution.radius == 0.02
 
 
 def test_the_penalty_with_the_best_held_out_likelihood_is_taken(truth, rng):
@@ -198,27 +179,3 @@ def test_an_inert_weight_is_named(rng, value):
     assert WEIGHT_NAMES[303] == "log_std_yaw_rate_0"
     with pytest.raises(ValueError, match=r"1 of 404 are inert.*: log_std_yaw_rate_0"):
         fit_weights(members)
-
-
-@pytest.mark.parametrize(
-    ("members", "settings", "message"),
-    [
-        (np.zeros((10, 3)), {}, r"shape \(K, 12\), got \(10, 3\)"),
-        (np.zeros((7, D)), {}, "7 members in 5 folds"),
-        (np.zeros((10, D)), {"penalties": (0.1, 0.2)}, "descending"),
-        (np.zeros((10, D)), {"penalties": ()}, "descending"),
-        (np.zeros((10, D)), {"shrinkage": 1.0}, "shrinkage"),
-    ],
-)
-def test_impossible_settings_are_refused(members, settings, message):
-    with pytest.raises(ValueError, match=message):
-        fit_weights(members, names=NAMES, **settings)
-
-
-def test_the_global_generator_is_left_alone(truth, rng):
-    members = truth.sample(20, rng)
-    before = np.random.get_state()[1:3]  # noqa: NPY002
-    fit_weights(members, names=NAMES)
-    after = np.random.get_state()[1:3]  # noqa: NPY002
-    np.testing.assert_array_equal(after[0], before[0])
-    assert after[1] == before[1]

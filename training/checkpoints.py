@@ -1,14 +1,16 @@
-"""Checkpoint of a training of an ego: everything that decides its further course, so that a resumed one ends alike.
+"""Checkpoints of trainings: files of tensors, numbers and text only, which are read without running code.
 
-That is the model with its optimisers, counters and replay buffer, the batch of episodes that is under way, and the
-states of all random generators. The file holds tensors, numbers and text only, read without running code.
+That of an ego holds everything that decides the further course of its training, so that a resumed one ends alike: the
+model with its optimisers, counters and replay buffer, the batch of episodes that is under way, and the states of all
+random generators.
 """
 
 from __future__ import annotations
 
 import json
 import random
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
@@ -19,15 +21,25 @@ from rare_envs.files import replace_file
 
 CHECKPOINT_FORMAT = 1
 """Version of the file."""
-COUNTERS = (
-    "num_timesteps",
-    "_n_updates",
-    "_episode_num",
-    "_n_calls",
-    "exploration_rate",
-    "_current_progress_remaining",
-)
+COUNTERS = "num_timesteps _n_updates _episode_num _n_calls exploration_rate _current_progress_remaining".split()
 """Attributes of a model that count, where its algorithm has them."""
+
+
+def write_checkpoint(path: Path, state: Mapping[str, Any]) -> None:
+    """Write the state of a training; an interruption leaves the file of before."""
+    with replace_file(path) as draft:
+        torch.save(state, draft)
+
+
+def read_checkpoint(path: Path, entries: Sequence[str], device: torch.device | str = "cpu") -> dict[str, Any]:
+    """Return the state that `write_checkpoint` wrote, which is to have some entries; a ValueError if it is damaged."""
+    try:
+        state: dict[str, Any] = torch.load(path, weights_only=True, map_location=device)
+        if not state.keys() >= {*entries}:
+            raise ValueError("it lacks some of the state")
+    except Exception as error:  # a damaged file can raise anything at all
+        raise ValueError(f"Cannot take up {str(path)!r}: it is damaged or no checkpoint; remove it.") from error
+    return state
 
 
 def save_checkpoint(path: Path, arguments: Mapping[str, Any], model: Any) -> None:
@@ -40,30 +52,22 @@ def save_checkpoint(path: Path, arguments: Mapping[str, Any], model: Any) -> Non
     state = {
         "format": CHECKPOINT_FORMAT,
         "arguments": json.dumps(arguments, sort_keys=True),
-        "parameters": {name: _find(model, name).state_dict() for name in names},
-        "variables": {name: _find(model, name).detach() for name in variables if _find(model, name) is not None},
+        "parameters": {name: attrgetter(name)(model).state_dict() for name in names},
+        "variables": {name: value.detach() for name in variables if (value := attrgetter(name)(model)) is not None},
         "counters": {name: float(vars(model)[name]) for name in COUNTERS if name in vars(model)},
-        "last": [to_tensors(model._last_obs), to_tensors(model._last_episode_starts)],
+        "last": [_to_tensors(model._last_obs), _to_tensors(model._last_episode_starts)],
         "replay": _replay_state(vars(model).get("replay_buffer")),
         "environment": monitor.venv.env.unwrapped.export_state(),
-        "monitor": to_tensors({"returns": monitor.episode_returns, "lengths": monitor.episode_lengths}),
+        "monitor": _to_tensors({"returns": monitor.episode_returns, "lengths": monitor.episode_lengths}),
         "generators": _generator_states(model),
     }
-    with replace_file(path) as draft:
-        torch.save(state, draft)
+    write_checkpoint(path, state)
 
 
 def load_checkpoint(path: Path, arguments: Mapping[str, Any]) -> dict[str, Any]:
-    """Read a checkpoint of the training with these arguments.
-
-    Raises:
-        ValueError: It is no checkpoint, is damaged, or that of a training with other arguments.
-    """
-    try:
-        state: dict[str, Any] = torch.load(path, weights_only=True, map_location="cpu")
-        begun, version = json.loads(state["arguments"]), state["format"]
-    except Exception as error:  # a damaged file can raise anything at all
-        raise ValueError(f"Cannot take up {str(path)!r}: it is damaged or no checkpoint; remove it.") from error
+    """Read a checkpoint of the training with these arguments; a ValueError if it is another's, or damaged."""
+    state = read_checkpoint(path, ("arguments", "format"))
+    begun, version = json.loads(state["arguments"]), state["format"]
     if version != CHECKPOINT_FORMAT:
         raise ValueError(f"{str(path)!r} is a checkpoint of another version of this program; remove it.")
     given = json.loads(json.dumps(arguments))
@@ -75,25 +79,21 @@ def load_checkpoint(path: Path, arguments: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def restore_model(model: Any, state: Mapping[str, Any]) -> None:
-    """Bring a new model, whose environment has been reset once, to the state of a checkpoint.
-
-    Raises:
-        ValueError: The checkpoint is of another model.
-    """
+    """Bring a new model, whose environment has been reset once, to the state of a checkpoint, which has to fit."""
     try:
         for name, parameters in state["parameters"].items():
-            _find(model, name).load_state_dict(parameters)
+            attrgetter(name)(model).load_state_dict(parameters)
         for name, value in state["variables"].items():
-            _find(model, name).data.copy_(value)
+            attrgetter(name)(model).data.copy_(value)
         for name, value in state["counters"].items():
             kind = type(vars(model)[name])
             setattr(model, name, kind(value))
-        model._last_obs, model._last_episode_starts = (to_arrays(one) for one in state["last"])
+        model._last_obs, model._last_episode_starts = (_to_arrays(one) for one in state["last"])
         _restore_replay(vars(model).get("replay_buffer"), state["replay"])
         monitor = model.get_env()
         monitor.venv.env.unwrapped.restore_state(state["environment"])
-        monitor.episode_returns[:] = to_arrays(state["monitor"])["returns"]
-        monitor.episode_lengths[:] = to_arrays(state["monitor"])["lengths"]
+        monitor.episode_returns[:] = _to_arrays(state["monitor"])["returns"]
+        monitor.episode_lengths[:] = _to_arrays(state["monitor"])["lengths"]
         _restore_generators(model, state["generators"])
     except (KeyError, RuntimeError, TypeError, AttributeError) as error:
         raise ValueError(
@@ -101,25 +101,18 @@ def restore_model(model: Any, state: Mapping[str, Any]) -> None:
         ) from error
 
 
-def to_tensors(value: Any) -> Any:
+def _to_tensors(value: Any) -> Any:
     """Return arrays, also in mappings, as tensors."""
     if isinstance(value, Mapping):
-        return {name: to_tensors(part) for name, part in value.items()}
+        return {name: _to_tensors(part) for name, part in value.items()}
     return torch.from_numpy(np.array(value))
 
 
-def to_arrays(value: Any) -> Any:
+def _to_arrays(value: Any) -> Any:
     """Return tensors, also in mappings, as arrays."""
     if isinstance(value, Mapping):
-        return {name: to_arrays(part) for name, part in value.items()}
+        return {name: _to_arrays(part) for name, part in value.items()}
     return value.numpy().copy()
-
-
-def _find(model: Any, name: str) -> Any:
-    """Return an attribute by its dotted name, as Stable-Baselines3 names what it saves."""
-    for part in name.split("."):
-        model = getattr(model, part)
-    return model
 
 
 def _replay_state(buffer: Any) -> dict[str, Any] | None:
@@ -127,7 +120,7 @@ def _replay_state(buffer: Any) -> dict[str, Any] | None:
     if buffer is None:
         return None
     filled = buffer.buffer_size if buffer.full else buffer.pos
-    return {"pos": buffer.pos, "full": buffer.full, **to_tensors(_replay_arrays(buffer, filled))}
+    return {"pos": buffer.pos, "full": buffer.full, **_to_tensors(_replay_arrays(buffer, filled))}
 
 
 def _replay_arrays(buffer: Any, filled: int) -> dict[str, Any]:
@@ -147,7 +140,7 @@ def _restore_replay(buffer: Any, state: Mapping[str, Any] | None) -> None:
     buffer.pos, buffer.full = state["pos"], state["full"]
     views = _replay_arrays(buffer, buffer.buffer_size if buffer.full else buffer.pos)
     for name, view in views.items():
-        saved = to_arrays(state[name])
+        saved = _to_arrays(state[name])
         pairs = [(view, saved)] if isinstance(view, np.ndarray) else [(view[key], saved[key]) for key in view]
         for part, values in pairs:
             part[:] = values
@@ -159,7 +152,7 @@ def _generator_states(model: Any) -> dict[str, Any]:
     version, words, gauss = random.getstate()
     return {
         "torch": torch.get_rng_state(),
-        "numpy_key": to_tensors(numpy_state["state"]["key"].astype(np.int64)),
+        "numpy_key": _to_tensors(numpy_state["state"]["key"].astype(np.int64)),
         "numpy": [int(numpy_state["state"]["pos"]), int(numpy_state["has_gauss"]), float(numpy_state["gauss"])],
         "python": [version, list(words), gauss],
         "actions": json.dumps(model.action_space.np_random.bit_generator.state),
@@ -169,7 +162,7 @@ def _generator_states(model: Any) -> dict[str, Any]:
 def _restore_generators(model: Any, states: Mapping[str, Any]) -> None:
     torch.set_rng_state(states["torch"])
     position, has_gauss, gauss = states["numpy"]
-    np.random.set_state(("MT19937", to_arrays(states["numpy_key"]).astype(np.uint32), position, has_gauss, gauss))  # noqa: NPY002
+    np.random.set_state(("MT19937", _to_arrays(states["numpy_key"]).astype(np.uint32), position, has_gauss, gauss))  # noqa: NPY002
     version, words, spare = states["python"]
     random.setstate((version, tuple(words), spare))
     model.action_space.np_random.bit_generator.state = json.loads(states["actions"])
