@@ -300,7 +300,11 @@ def _refine(
     n = int(shares[number - 1] * room)
     if n > 0:
         state, refinement = yield from _draw_round(run, state, refinement, proposal, n)
-    enough = refinement.noisy or not state.rounds or state.rounds[-1].ess >= REFINEMENT.good_rate * state.rounds[-1].n
+    enough = (
+        refinement.exploration.noisy
+        or not state.rounds
+        or state.rounds[-1].ess >= REFINEMENT.good_rate * state.rounds[-1].n
+    )
     final = number == len(shares) or (enough and number >= len(REFINEMENT.round_shares))
     return state, refinement, build_proposal(refinement, state.history, final=final), final
 
@@ -341,14 +345,16 @@ def _gives_up(
     """
     if run.left_at_all < FALLBACK.min_fallback_budget or not state.rounds:
         return False
-    if refinement.noisy and not (final and run.noise_marginalised):
+    if refinement.exploration.noisy and not (final and run.noise_marginalised):
         return False  # a tempered mixture meets few failures but does not miss any: nothing else is better
     last, early = state.rounds[-1], FALLBACK.early_rates
     late = FALLBACK.relative_rate / max(refinement.exploration.levels, FEWEST_LEVELS)
     rate = early[number - 1] if number <= len(early) else late
     if last.ess < (FALLBACK.sloped_rate if refinement.within is not None else 1.0) * rate * last.n:
         return True
-    described = refinement.noisy or refinement.within is not None  # ends of lines in a ring are no typical failures
+    described = (
+        refinement.exploration.noisy or refinement.within is not None
+    )  # ends of lines in a ring are no typical failures
     doubtful = final and not described and last.ess < REFINEMENT.good_rate * last.n
     return doubtful and float(np.median(typical_weights(refinement, proposal))) > FALLBACK.max_typical * last.p
 
@@ -419,7 +425,7 @@ def _estimate(run: RunContext, state: RunState, refinement: RefinementState, pro
         *check_rounds(sample, state.rounds),
         *check_regions(whole),
         *check_discovery(whole.p, discovery, goal.confidence),
-        *([] if refinement.noisy else check_efficiency(sample)),
+        *([] if refinement.exploration.noisy else check_efficiency(sample)),
     ]
     return replace(
         outcome,

@@ -148,13 +148,9 @@ class SubspaceMixture(NamedTuple):
 def fit_shrunk_subspace_gaussian(u: FloatArray, weights: FloatArray, ess: float) -> tuple[SubspaceGaussian, float]:
     """Return the component of weighted points, and the share of the shrinkage target in its covariance.
 
-    Its covariance is shrunk as by `shrink_covariance`. Above `high_dim` dimensions it is the target alone: one
-    direction, that of the mean, and N(0, 1) across it.
-
-    Args:
-        u: Points, shape (n, d).
-        weights: Adding up to 1, shape (n,).
-        ess: How many independent points they are worth.
+    The points u (n, d) have weights (n,) that add up to 1 and are worth `ess` independent ones. The covariance is
+    shrunk as by `shrink_covariance`. Above `high_dim` dimensions it is the target alone: one direction, that of the mean, and
+    N(0, 1) across it.
     """
     dim = u.shape[1]
     mean = weights @ u
@@ -338,8 +334,7 @@ FLOOR_ROUNDING = 1e-12
 """A group that is this little below its floor has reached it."""
 
 
-@dataclass(frozen=True, eq=False)
-class Floor:
+class Floor(NamedTuple):
     """Components that together get at least some share of the draws."""
 
     members: NDArray[np.bool_]
@@ -353,22 +348,17 @@ def minimise_second_moment(
 ) -> FloatArray:
     """Return weights a (k,) of a mixture q_a = sum_k a_k q_k that minimise the second moment of its estimate.
 
-    That is sum_i w_i (phi / q_a)(u_i) over failing points u_i with importance weights w_i, convex in a. Each update
-    multiplies a_k by the square root of G_k = sum_i w_i (phi q_k / q_a^2)(u_i); at the optimum all G_k with a_k > 0
-    are equal.
-
-    Args:
-        log_r: log(q_k / phi) at the failing points, shape (k, n).
-        log_weights: Of the failing points, shape (n,).
-        start: First weights, shape (k,).
-        floors: Lower limits of disjoint groups, kept in every update.
+    That is sum_i w_i (phi / q_a)(u_i) over failing points u_i with importance weights w_i, as logarithms (n,), convex
+    in a; log_r (k, n) has log(q_k / phi) there. Each update multiplies a_k by the square root of
+    G_k = sum_i w_i (phi q_k / q_a^2)(u_i); at the optimum all G_k with a_k > 0 are equal. The floors of disjoint groups
+    are kept in every update.
     """
     matter = log_weights > log_weights.max() - NEGLIGIBLE
     log_r, log_weights = log_r[:, matter], log_weights[matter]
     largest = log_r.max(axis=0)
     ratio = np.exp(log_r - largest)
     scaled = np.exp(log_weights - largest - (log_weights - largest).max())
-    a, limits = start, _FloorIndex.of(floors, len(start))
+    a, limits = start, FloorIndex.of(floors, len(start))
     for _ in range(WEIGHT_UPDATES):
         q = np.maximum(a @ ratio, LEAST_DENSITY_RATIO)
         a = a * np.sqrt(ratio @ (scaled / (q * q)))
@@ -376,18 +366,8 @@ def minimise_second_moment(
     return a
 
 
-def raise_to_floors(a: FloatArray, floors: Sequence[Floor]) -> FloatArray:
-    """Return weights (k,) raised to the floors, the others lowered in proportion; they add up to 1.
-
-    Members of a floor keep their proportions; without any weight they share the floor evenly. Lowering may bring
-    another group under its floor, which is then raised too. Floors that add up to more than 1 are lowered in
-    proportion.
-    """
-    return _FloorIndex.of(floors, len(a)).apply(a)
-
-
-class _FloorIndex(NamedTuple):
-    """Floors as they are read in every update of the weights."""
+class FloorIndex(NamedTuple):
+    """Floors of k components as they are read in every update of the weights."""
 
     groups: NDArray[np.intp]
     """Floor of each component, shape (k,); m where it has none."""
@@ -395,7 +375,7 @@ class _FloorIndex(NamedTuple):
     """Least share of each, 0 without a floor; m + 1."""
 
     @classmethod
-    def of(cls, floors: Sequence[Floor], k: int) -> "_FloorIndex":
+    def of(cls, floors: Sequence[Floor], k: int) -> "FloorIndex":
         """Return the floors of k components."""
         groups = np.full(k, len(floors))
         for number, floor in enumerate(floors):
@@ -403,7 +383,12 @@ class _FloorIndex(NamedTuple):
         return cls(groups, [*(each.least for each in floors), 0.0])
 
     def apply(self, a: FloatArray) -> FloatArray:
-        """Return weights raised to the floors, see `raise_to_floors`."""
+        """Return weights (k,) raised to the floors, the others lowered in proportion; they add up to 1.
+
+        Members of a floor keep their proportions; without any weight they share the floor evenly. Lowering may bring
+        another group under its floor, which is then raised too. Floors that add up to more than 1 are lowered in
+        proportion.
+        """
         own = np.bincount(self.groups, a, len(self.least))
         shares = _raise_shares(own.tolist(), self.least)
         if shares is None:

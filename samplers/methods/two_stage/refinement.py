@@ -24,13 +24,13 @@ from samplers.methods.two_stage.edges import half_space_proposals, intersection_
 from samplers.methods.two_stage.mixture import (
     NO_REGION,
     Floor,
+    FloorIndex,
     GroupedPoints,
     MixtureProposal,
     ProposalComponent,
     fit_radial,
     fit_subspace_mixture,
     minimise_second_moment,
-    raise_to_floors,
     refit_components,
     truncate_weights,
 )
@@ -91,16 +91,6 @@ class RefinementState:
     def regions(self) -> list[Region]:
         """Regions of failure."""
         return self.exploration.regions
-
-    @property
-    def noisy(self) -> bool:
-        """Whether f has noise of its own."""
-        return self.exploration.noisy
-
-    @property
-    def scattered(self) -> bool:
-        """Whether the regions are no more than pieces of something like a shell."""
-        return self.exploration.scattered
 
     @property
     def dim(self) -> int:
@@ -254,7 +244,7 @@ def build_proposal(
         return MixtureProposal(candidates, weights)
     floors = _set_floors(state, history, candidates, radial=state.dim <= REFINEMENT.radial_dim, final=final)
     u, log_w = history.u, history.log_weights
-    if state.noisy:
+    if state.exploration.noisy:
         u, log_w = _smooth_indicators(history, state.gamma)
     log_r = log_ratios([candidate.component for candidate in candidates], u)
     weights = minimise_second_moment(log_r, log_w, weights, floors)
@@ -264,7 +254,7 @@ def build_proposal(
         weights = np.where(explored, np.maximum(weights, REFINEMENT.explored_share), weights)
         keeps = keeps | explored
     weights = np.where((weights < REFINEMENT.min_share) & ~keeps, 0.0, weights)
-    return MixtureProposal(candidates, raise_to_floors(weights / weights.sum(), floors))
+    return MixtureProposal(candidates, FloorIndex.of(floors, len(weights)).apply(weights / weights.sum()))
 
 
 def list_candidates(state: RefinementState, history: MultipleImportanceSample) -> list[ProposalComponent]:
@@ -273,14 +263,18 @@ def list_candidates(state: RefinementState, history: MultipleImportanceSample) -
         ProposalComponent(gaussian, "gaussian", explored.region)
         for gaussian, explored in zip(state.gaussians, state.explored, strict=True)
     ]
-    regional = gaussians + ([] if state.noisy else list(state.linear)) + (list(state.explored) if state.rounds else [])
+    regional = (
+        gaussians
+        + ([] if state.exploration.noisy else list(state.linear))
+        + (list(state.explored) if state.rounds else [])
+    )
     candidates = [
         ProposalComponent(IsotropicNormal(state.dim), "base"),
         ProposalComponent(IsotropicNormal(state.dim, REFINEMENT.wide_scale), "wide"),
         *_fit_radial_components(state, history),
         *regional,
         *_fit_directional_components(state, history),
-        *_temper_gaussians(regional, REFINEMENT.noisy_tempering if state.noisy else REFINEMENT.tempering),
+        *_temper_gaussians(regional, REFINEMENT.noisy_tempering if state.exploration.noisy else REFINEMENT.tempering),
     ]
     candidates += _lift_candidates(state, history)
     return [candidate for candidate in candidates if candidate.kind in INITIAL_SHARES]
@@ -327,7 +321,7 @@ def _fit_radial_components(state: RefinementState, history: MultipleImportanceSa
 
 def _fit_directional_components(state: RefinementState, history: MultipleImportanceSample) -> list[ProposalComponent]:
     """Return one direction with a radius, fitted to all failures, where these are something like a shell or a cone."""
-    if not state.scattered or state.dim < 2:
+    if not state.exploration.scattered or state.dim < 2:
         return []
     law = VonMisesFisherNakagami.fit(*_weighted_failures(state, history))
     return [ProposalComponent(law, "directional")]
@@ -366,25 +360,25 @@ def _set_floors(
     """
     kinds = np.array([candidate.kind for candidate in candidates])
     regions = np.array([candidate.region for candidate in candidates])
-    spread = state.scattered and state.within is not None
+    spread = state.exploration.scattered and state.within is not None
     extra = 0.0 if spread else REFINEMENT.extra_tempered_share * (1 - state.hit_rate)
-    tempered = REFINEMENT.noisy_tempered_share if state.noisy else REFINEMENT.tempered_share + extra
+    tempered = REFINEMENT.noisy_tempered_share if state.exploration.noisy else REFINEMENT.tempered_share + extra
     n = len(state.regions)
     floors = [Floor(kinds == "tempered", tempered)]
-    if n > 1 and not state.scattered:
+    if n > 1 and not state.exploration.scattered:
         shares = _share_among_regions(state, history)
         floors = [Floor((kinds == "tempered") & (regions == k), tempered * shares[k]) for k in range(n)]
-    if state.scattered or (state.rounds and state.rounds[-1].worth(state.gamma) < REFINEMENT.good_rate):
+    if state.exploration.scattered or (state.rounds and state.rounds[-1].worth(state.gamma) < REFINEMENT.good_rate):
         floors.append(Floor(kinds == "spread", REFINEMENT.spread_share))
-    if state.scattered or (radial and not state.noisy):
+    if state.exploration.scattered or (radial and not state.exploration.noisy):
         floors.append(Floor(kinds == "radial", REFINEMENT.radial_share))
-    if n > 1 and not state.scattered:
+    if n > 1 and not state.exploration.scattered:
         share = REFINEMENT.final_region_share if final else REFINEMENT.region_share
         floors += [Floor((regions == k) & (kinds != "tempered"), share / n) for k in range(n)]
-    base = REFINEMENT.noisy_base_share if state.noisy else REFINEMENT.base_share
+    base = REFINEMENT.noisy_base_share if state.exploration.noisy else REFINEMENT.base_share
     floors = [floor for floor in floors if floor.members.any()]
     fit = min(1.0, (1 - base) / max(sum(floor.least for floor in floors), base))
-    floors = [replace(floor, least=fit * floor.least) for floor in floors]
+    floors = [floor._replace(least=fit * floor.least) for floor in floors]
     return [*floors, Floor(kinds == "base", base)] if "base" in kinds else floors
 
 

@@ -39,9 +39,8 @@ class Discovery(NamedTuple):
 def count_lineages(roots: int, wide_log_weights: FloatArray) -> float:
     """Return the number of independent lineages.
 
-    Args:
-        roots: Distinct base draws whose line of descent, or path of subset simulation, came to a failure.
-        wide_log_weights: log(phi / q) of the wide draws that failed, shape (k,).
+    `roots` distinct base draws have lines of descent, or paths of subset simulation, that came to a failure; the wide
+    draws that failed have log(phi / q) (k,).
     """
     return roots + max(effective_sample_size(wide_log_weights), len(wide_log_weights) / HITS_PER_LINEAGE)
 
@@ -150,15 +149,7 @@ def grow_regions(
     """Run chains from failing points, twice; sort them into regions after each time.
 
     The first chains come from wide failures to likely ones. The second start where these ended, follow the direction
-    of their region, and are more for regions that have few.
-
-    Args:
-        simulator: Gives outcomes.
-        starts: Failing points, shape (n, d).
-        descent: Points of subset simulation.
-        gamma: Threshold of failure.
-        limit: Simulations after which points are no longer compared.
-        rng: Source of randomness.
+    of their region, and are more for regions that have few. Beyond `limit` simulations points are no longer compared.
     """
     dim = starts.shape[1]
     high_dim = dim > SUBSPACE.high_dim
@@ -176,7 +167,9 @@ def grow_regions(
     wanted = min(max(few, math.ceil(REGIONS.points_per_dim * dim / steps[1])), many)
     chosen = _replicate_seeds(labels, wanted, min(room, REGIONS.max_replicated), rng)
     first, labels = first.select(chosen), labels[chosen]
-    directions = _estimate_directions(first, labels, descent)
+    n = labels.max() + 1  # the points of subset simulation belong to the only region
+    only = descent if n == 1 else None
+    directions = np.array([_estimate_direction(first.select(labels == k), only) for k in range(n)])
     last = yield from _pcn_chains(simulator, first.ends, first.sigma, directions[labels], steps[1], gamma, rng)
     labels, scattered = yield from label_regions(simulator, last.ends, gamma, limit)
     regions = _collect_regions(first, last, labels, REGIONS.late_steps_high_dim if high_dim else REGIONS.late_steps)
@@ -253,10 +246,7 @@ def label_regions(
 
     The first point of a region is the one nearest to the origin: far ones may lie in two regions, or reach into
     another one by half. Points left over after the last region, or at the limit of simulations, go to the region with
-    the nearest mean.
-
-    Returns:
-        The regions' numbers (n,), and whether so many points are left over that failure is something like a shell.
+    the nearest mean. Return also whether so many points are left over that failure is something like a shell.
     """
     labels = np.full(len(u), -1)
     scattered = False
@@ -271,7 +261,9 @@ def label_regions(
         others = free[free != first]
         if not all_compared:
             all_compared = len(free) <= REGIONS.few_points
-            left, right = free[_all_pairs(len(free))] if all_compared else (np.full_like(others, first), others)
+            left, right = np.full_like(others, first), others
+            if all_compared:
+                left, right = free[np.stack(np.triu_indices(len(free), 1))]
             if simulator.n_sim + len(left) > limit:
                 break
             joined[left, right] = (yield from simulator.evaluate(0.5 * (u[left] + u[right]))) <= gamma
@@ -285,11 +277,6 @@ def label_regions(
     return labels, scattered
 
 
-def _all_pairs(n: int) -> NDArray[np.int64]:
-    """Return the pairs of n indices, shape (2, n (n - 1) / 2)."""
-    return np.stack(np.triu_indices(n, 1))
-
-
 def _replicate_seeds(labels: Labels, wanted: int, room: int, rng: np.random.Generator) -> NDArray[np.int64]:
     """Return the indices of all chains, those of small regions repeated until each has `wanted`, or `room` is used."""
     more = []
@@ -297,13 +284,6 @@ def _replicate_seeds(labels: Labels, wanted: int, room: int, rng: np.random.Gene
         own = np.flatnonzero(labels == k)
         more.append(rng.choice(own, max(wanted - len(own), 0)))
     return np.concatenate([np.arange(len(labels)), np.concatenate(more)[:room]])
-
-
-def _estimate_directions(paths: ChainPaths, labels: Labels, descent: SubsetPoints) -> FloatArray:
-    """Return the direction of each region, shape (m, d); the points of subset simulation belong to the only one."""
-    n = labels.max() + 1
-    only = descent if n == 1 else None
-    return np.array([_estimate_direction(paths.select(labels == k), only) for k in range(n)])
 
 
 def _estimate_direction(paths: ChainPaths, descent: SubsetPoints | None) -> FloatArray:

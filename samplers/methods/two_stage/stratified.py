@@ -58,11 +58,6 @@ class MultipleImportanceSample:
         """Return a sample without draws in d dimensions."""
         return cls(np.empty((0, dim)), np.empty(0))
 
-    @property
-    def n(self) -> int:
-        """Number of draws."""
-        return sum(len(batch.f) for batch in self.batches)
-
     def add(self, batch: ComponentDraws, gamma: float) -> "MultipleImportanceSample":
         """Return the sample with another batch; the failing ones are those with f <= gamma."""
         used = tuple(c for c, n in zip(batch.components, batch.counts, strict=True) if n > 0)
@@ -88,7 +83,7 @@ class MultipleImportanceSample:
     def to_draws(self, inputs: Inputs, gamma: float) -> Draws:
         """Return all draws as those from one proposal."""
         u, f, log_weights = self.all_draws()
-        return Draws.from_outcomes(f, log_weights + math.log(self.n), inputs.base.from_standard_normal(u), gamma)
+        return Draws.from_outcomes(f, log_weights + math.log(len(f)), inputs.base.from_standard_normal(u), gamma)
 
 
 MAX_LOG_WEIGHT = 700.0
@@ -188,22 +183,14 @@ class StratifiedSample:
         base_f: FloatArray,
         base_u: FloatArray,
         gamma: float,
-        counted: Draws | None = None,
+        counted: Draws,
     ) -> Sample:
         """Return the weighted points behind p: failing draws as they are, the others together with base draws.
 
         Thresholds above gamma rest on draws that did not fail. The proposal makes few of those where f is large; base
-        draws of the exploration help there, weighted together with them by multiple importance sampling.
-
-        Args:
-            proposal: Of these draws.
-            base_f: Outcomes of the base draws, shape (n0,).
-            base_u: The base draws, shape (n0, d).
-            gamma: Threshold of failure.
-            counted: All draws that p rests on, whose failing ones are taken: these, and those of earlier proposals if
-                any count.
+        draws of the exploration (n0, d) help there, weighted together with them by multiple importance sampling. The
+        failing ones are those of `counted`, all draws that p rests on.
         """
-        counted = self.draws if counted is None else counted
         n, n_base = self.draws.n, len(base_f)
         more = base_f > gamma
         u = np.concatenate([self.u_safe, base_u[more]])

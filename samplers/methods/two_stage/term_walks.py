@@ -58,21 +58,7 @@ class DifferentiableDistribution(Distribution, Protocol):
     """A distribution that knows the derivatives of its map from standard normal space."""
 
     def pull_back(self, u: FloatArray, gradients: FloatArray) -> FloatArray:
-        """Return gradients J' g with respect to u of gradients g with respect to x, both (n, d).
-
-        Args:
-            u: Points, shape (n, d), at which J = dx / du.
-            gradients: At x = T(u), shape (n, d).
-        """
-
-
-@runtime_checkable
-class HasBlocks(Protocol):
-    """A base distribution of independent blocks side by side."""
-
-    @property
-    def blocks(self) -> Sequence[Any]:
-        """Distributions with `dim`, in the order of the columns of x."""
+        """Return gradients J' g (n, d) by u of gradients g (n, d) by x at x = T(u), u (n, d), with J = dx / du."""
 
 
 class TransformSlopes:
@@ -84,7 +70,7 @@ class TransformSlopes:
     def __init__(self, inputs: Inputs) -> None:
         base, noise = inputs.base, noise_mask(inputs)
         self._identity = isinstance(base, StandardNormal)
-        blocks = tuple(base.blocks) if isinstance(base, HasBlocks) else ()
+        blocks: tuple[Any, ...] = tuple(getattr(base, "blocks", ()))  # independent, side by side
         dims = [block.dim for block in blocks]
         if sum(dims) != inputs.dim or not all(isinstance(block, Distribution) for block in blocks):
             blocks, dims = (base,), [inputs.dim]
@@ -119,22 +105,17 @@ class DifferencedMap:
     def pull_back(self, u: FloatArray, gradients: FloatArray) -> FloatArray:
         """Return the gradients (n, d) with respect to x at T(u), u (n, d), as gradients with respect to u."""
         if self._groups is None:
-            self._find_pattern(u[:PATTERN_POINTS])
+            self._groups = self._find_pattern(u[:PATTERN_POINTS])
         result = gradients.copy()  # noise, where dx / du = I
         for first in range(0, len(u), POINTS_AT_ONCE):
-            self._pull_back(u[first : first + POINTS_AT_ONCE], result[first : first + POINTS_AT_ONCE])
+            part = slice(first, first + POINTS_AT_ONCE)
+            slopes = self._differences(u[part], [self._moved[group] for group in self._groups])
+            for group, slope in zip(self._groups, slopes, strict=True):
+                result[part, self._moved[group]] = (slope * gradients[part]) @ self._pattern[group].T
         return result
 
-    def _pull_back(self, u: FloatArray, gradients: FloatArray) -> None:
-        """Replace the gradients at some points by J' g, with J = dx / du."""
-        assert self._groups is not None
-        given = gradients.copy()
-        slopes = self._differences(u, [self._moved[group] for group in self._groups])
-        for group, slope in zip(self._groups, slopes, strict=True):
-            gradients[:, self._moved[group]] = (slope * given) @ self._pattern[group].T
-
-    def _find_pattern(self, u: FloatArray) -> None:
-        """Find which coordinates of x each moved coordinate of u changes, and groups of them that do not meet."""
+    def _find_pattern(self, u: FloatArray) -> list[NDArray[np.int64]]:
+        """Find which coordinates of x each moved coordinate of u changes; return groups of them that do not meet."""
         self._pattern = (self._differences(u, list(self._moved[:, None])) != 0).any(axis=1)
         groups, taken = list[list[int]](), list[NDArray[np.bool_]]()
         for number, row in enumerate(self._pattern):
@@ -144,7 +125,7 @@ class DifferencedMap:
                 taken.append(np.zeros_like(row))
             groups[k].append(number)
             taken[k] = taken[k] | row
-        self._groups = [np.array(group) for group in groups]
+        return [np.array(group) for group in groups]
 
     def _differences(self, u: FloatArray, groups: list[NDArray[np.int64]]) -> FloatArray:
         """Return central differences of T at u (n, d), with the coordinates of each group moved together, (k, n, d)."""
@@ -186,11 +167,7 @@ NEAR_FAILURES = 1.5
 def describe_half_spaces(term: NDArray[np.int64], u: FloatArray, slopes: FloatArray, excess: FloatArray) -> Directions:
     """Return unit gradients where they exist, and the half-spaces {excess + slope (v - u) <= 0} of those near them.
 
-    Args:
-        term: Number of the term of each gradient, shape (k,).
-        u: Points, shape (k, d).
-        slopes: Gradients there, shape (k, d).
-        excess: Values of the terms there less their threshold, shape (k,).
+    The terms (k,) have these slopes (k, d) at points u (k, d), where they exceed their threshold by `excess` (k,).
     """
     norm = np.linalg.norm(slopes, axis=1)
     good = np.isfinite(norm) & (norm > 0)
@@ -265,16 +242,9 @@ def walk_downhill(
 ) -> SimulationSteps[Walks]:
     """Walk from points u (m, d) with known terms down one term each, until it fails or the steps are used up.
 
-    A step goes along the gradient, as far as the term would fall to its threshold if it were linear, but no further
-    than its length. A step that does not fall is taken back, and its gradient kept.
-
-    Args:
-        simulator: Counts.
-        u: Starts.
-        terms: Terms there.
-        term: The term that each walk follows, shape (m,).
-        gamma: Threshold of f.
-        limit: Value of `simulator.n_sim` that is not exceeded.
+    A step goes along the gradient of the walk's `term` (m,), as far as the term would fall to its threshold if it were
+    linear, but no further than its length. A step that does not fall is taken back, and its gradient kept. `limit` is
+    a value of `simulator.n_sim` that is not exceeded.
     """
     rows = np.arange(len(u))
     distance = np.full(len(u), np.nan)
@@ -322,11 +292,6 @@ def walk_downhill(
         ticks,
         distance,
         passed,
-        _join([points for points, _ in failing], u[:0]),
-        _join([least for _, least in failing], np.empty(0, np.int64)),
+        np.concatenate([u[:0], *(points for points, _ in failing)]),
+        np.concatenate([np.empty(0, np.int64), *(least for _, least in failing)]),
     )
-
-
-def _join(parts: list, empty: NDArray) -> NDArray:  # type: ignore[type-arg]
-    """Return arrays joined, or the empty one where there are none."""
-    return np.concatenate(parts) if parts else empty
