@@ -149,8 +149,8 @@ def fit_shrunk_subspace_gaussian(u: FloatArray, weights: FloatArray, ess: float)
     """Return the component of weighted points, and the share of the shrinkage target in its covariance.
 
     The points u (n, d) have weights (n,) that add up to 1 and are worth `ess` independent ones. The covariance is
-    shrunk as by `shrink_covariance`. Above `high_dim` dimensions it is the target alone: one direction, that of the mean, and
-    N(0, 1) across it.
+    shrunk as by `shrink_covariance`. Above `high_dim` dimensions it is the target alone: one direction, that of the
+    mean, and N(0, 1) across it.
     """
     dim = u.shape[1]
     mean = weights @ u

@@ -87,19 +87,6 @@ def test_the_lines_stand_under_the_sampling_interval():
     assert "simulations, gain" in lines[4]
 
 
-def test_json_has_all_of_it():
-    for refits in (SHIFTED, WIDE):
-        result = run(fitted(refits))
-        data = json.loads(result.to_json())["base_uncertainty"]
-        found = result.base_uncertainty
-        assert data["interval"] == (None if found.interval is None else list(found.interval))
-        assert data["p_refits"] == list(found.p_refits)
-        assert data["ess_refits"] == list(found.ess_refits)
-        assert (data["spread"], data["expected"], data["bound"]) == (found.spread, found.expected, found.bound)
-        assert (data["clusters"], data["fitted_to"]) == (17, "38 + 15 events of 17 scenes")
-        assert len(data["p_refits"]) == len(data["ess_refits"]) == 30
-
-
 @pytest.mark.parametrize(
     ("change", "text"),
     [
@@ -153,14 +140,6 @@ class Impossible:
 
     def log_prob(self, x):
         return np.where(x[:, 0] < 2.99, normal().log_prob(x), -np.inf)
-
-
-@pytest.mark.slow
-def test_replicates_are_reweighted_together():
-    result = run(BASE, replicates=4, max_sim=8000)
-    found = result.base_uncertainty
-    assert np.log(found.p_refits) == pytest.approx(np.log([refit.p for refit in SHIFTED]), abs=0.3)
-    assert min(found.ess_refits) > min(run(BASE, max_sim=2000).base_uncertainty.ess_refits)
 
 
 def test_a_further_run_is_made_exactly_where_the_points_do_not_reach_the_refits():

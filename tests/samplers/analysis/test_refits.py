@@ -146,16 +146,6 @@ def test_a_refit_that_does_not_fit_is_refused_before_the_first_simulation(refit,
     check_refits(fitted([normal(), normal()]), 2)
 
 
-def test_what_cannot_be_reweighted_says_so():
-    base = fitted(resampled(400, 3))
-    with pytest.raises(ValueError, match="nothing failed"):
-        reweight_to_refits(samplers.estimate(HalfSpace(base, 9.0), "mc", seed=1, max_sim=100), base.refits)
-    with pytest.raises(ValueError, match="gave no weighted points"):
-        reweight_to_refits(replace(run(base), sample=None), base.refits)
-    with pytest.raises(ValueError, match="does not know its base"):
-        reweight_to_refits(replace(run(base), base=None), base.refits)
-
-
 class CountedRefit:
     """A refit that counts how often its density is asked for."""
 

@@ -103,14 +103,6 @@ def test_changed_bases_with_exact_p(method, base):
     assert judge(method, base, runs, **options) >= stats.binom.ppf(1e-3, runs, 0.9) / runs
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("base", CHANGES, ids=str)
-@pytest.mark.parametrize("method", ["mc", "ce", "ss", "adss"])
-def test_changed_bases_with_exact_p_and_many_seeds(method, base):
-    runs = 200
-    assert judge(method, base, runs, **({"max_sim": 100_000} if method == "mc" else {})) >= 0.9
-
-
 def test_subset_simulation_counts_paths_not_points():
     result = run("adss")
     found = result.reweight(Normal(0.5))

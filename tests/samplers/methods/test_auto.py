@@ -84,8 +84,3 @@ def test_a_run_goes_on_from_its_journal_in_chunks_and_by_ask_and_tell(tmp_path, 
         run.tell(problem.evaluate(run.ask()))
     assert run.result() == first
     assert samplers.plan_runs(first.pilot(), target_cov=first.cov / 2)[0].method == "surrogate"
-
-
-def test_settings_are_checked():
-    with pytest.raises(ValueError, match="seconds_per_simulation"):
-        samplers.Auto(seconds_per_simulation=-1.0)

@@ -104,8 +104,3 @@ def test_joint_ratio_is_the_projection_of_equation_2(rng):
             assert block.box[0] < block.alpha[0] < block.box[1]
             found = [stats.beta(block.alpha[0], block.beta[0]).expect(g) for g in (np.log, lambda y: np.log1p(-y))]
             assert np.allclose(found, expected, atol=0.02) == right
-
-
-def test_needs_announced_blocks():
-    with pytest.raises(ValueError, match='family "blocks" needs a base distribution with an attribute blocks'):
-        samplers.estimate(samplers.FunctionProblem(lambda x: x[:, 0], 2), CE(family="blocks"), seed=1)

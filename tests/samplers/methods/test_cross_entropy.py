@@ -7,9 +7,7 @@ import pytest
 from scipy import stats
 
 import samplers
-from samplers.importance import Draws, defensive_mixture, simulate_until, weight_warnings, weighted_interval
-from samplers.limit_states import four_branches, half_space, parabola, plateau, two_modes
-from samplers.method import Goal
+from samplers.limit_states import four_branches, half_space, parabola, two_modes
 from samplers.methods.blocks import GaussianBlock, MixtureBlock, Product
 from samplers.proposals import Gaussian
 
@@ -30,15 +28,6 @@ def test_search_goes_down_to_gamma_and_is_counted():
     assert result.p == result.trace[-1].estimate  # the fresh draws alone
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("tied", [0.6, 0.85, 0.95])
-def test_ties_at_a_cap(study, tied):
-    found = study(plateau(3, 3.2, tied), CE(), 60)
-    assert abs(found.ratios.mean() - 1) < 4 * mean_error(found) + 0.01
-    assert found.covered >= stats.binom.ppf(1e-3, 60, 0.90)
-    assert {str(result.status) for result in found.results} == {"converged"}
-
-
 @pytest.mark.parametrize(
     "reference",
     [
@@ -53,31 +42,6 @@ def test_mixture_family(study, reference):
     assert abs(found.ratios.mean() - 1) < 4 * mean_error(found) + 0.02
     assert found.covered >= stats.binom.ppf(1e-3, 40, 0.90)
     assert found.own_cov < 0.05
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("family", ["gaussian", "mean", "mixture"])
-@pytest.mark.parametrize("reference", [half_space(), half_space(6), parabola(), plateau()], ids=lambda r: r.name)
-def test_one_region_is_covered_at_the_usual_settings(study, reference, family):
-    found = study(reference, CE(family=family), 200)
-    assert abs(found.ratios.mean() - 1) < 4 * mean_error(found) + 0.01
-    assert found.covered >= 0.88 * 200
-    assert 0.8 < found.own_cov / found.ratios.std(ddof=1) < 1.3
-
-
-@pytest.mark.parametrize("family", ["gaussian", "mean", "mixture"])
-def test_a_run_stopped_in_the_search_gives_what_there_is(family):
-    """After each batch in turn; all of it within its own error of p, or wide."""
-    reference = half_space(2, 3.0)
-    for after in range(1, 6):
-        run = CE(family=family, n_final=1000).start(reference.problem, seed=3, target_cov=0.01)
-        for _ in range(after):
-            run.tell(reference.problem.f(run.ask()))
-        result = run.result()
-        assert result.status == "stopped"
-        assert result.n_sim == sum(level.n_sim for level in result.trace) == 1000 * after
-        assert result.interval[0] / 1.2 <= reference.p <= 1.2 * result.interval[1]
-        assert result.warnings if after < 4 else 0 < result.cov < 0.2
 
 
 def test_final_draws_serve_higher_thresholds():
@@ -124,29 +88,6 @@ def test_target_cov_is_met_by_more_final_draws():
     assert tight.n_sim > loose.n_sim
 
 
-def test_weights_of_the_final_draws_give_p(drive, rng):
-    reference, far = half_space(2, 3.0), Gaussian(np.full(2, 2.2), np.eye(2))
-    base = Product((GaussianBlock(Gaussian.standard(2)),))
-    proposal = Product((GaussianBlock(far),))
-    sampler = defensive_mixture(base, proposal.widen(1.5), proposal, 0.1, 0.2)
-    draws = drive(
-        simulate_until(reference.problem, sampler, Goal(gamma=0.0), 50_000, 50_000, rng), reference.problem
-    ).value[0]
-    assert draws.p == pytest.approx(reference.p, rel=4 * draws.cov)
-    assert np.exp(draws.log_weights).max() <= 10.0
-    assert draws.cov < 0.02
-
-
-def test_warns_when_few_draws_carry_the_estimate():
-    heavy = Draws(1000, np.zeros(3), np.array([0.0, 0.0, 3.0]))
-    assert len(weight_warnings(heavy)) == 2
-    assert weight_warnings(Draws(1000, np.zeros(500), np.zeros(500))) == []
-    light = weighted_interval(Draws(1000, np.zeros(500), np.full(500, -5.0)), 0.95, 10.0)
-    assert light[1] / light[0] < 1.3
-    wide = weighted_interval(heavy, 0.95, 10.0)
-    assert wide[1] / wide[0] > 10
-
-
 @pytest.mark.slow
 def test_interval_of_a_hopeless_proposal_still_holds_p():
     """d = 300: the weights degenerate, p-hat is far too small, and the result does not hide it."""
@@ -155,32 +96,6 @@ def test_interval_of_a_hopeless_proposal_still_holds_p():
         result = samplers.estimate(reference.problem, CE(), seed=seed, max_sim=4000)
         assert result.interval[0] <= reference.p <= result.interval[1]
         assert result.warnings
-
-
-@pytest.mark.parametrize(
-    "settings",
-    [
-        {"rho": 0.6},
-        {"alpha": 0.0},
-        {"alpha": 1.2},
-        {"n_iteration": 1},
-        {"n_final": 0},
-        {"max_iterations": 0},
-        {"base_share": 0.0},
-        {"wide_share": 0.95},
-        {"wide_factor": 0.5},
-        {"family": "beta"},
-        {"likelihood_ratio": "none"},
-        {"choice": "last"},
-        {"components": 0},
-        {"alpha": (0.8, 1.2)},
-        {"alpha": ()},
-        {"n_iteration": (1000, 5)},
-    ],
-)
-def test_settings_out_of_range(settings):
-    with pytest.raises(ValueError, match=f"CrossEntropy: expected .*{next(iter(settings))}"):
-        CE(**settings)
 
 
 def uniform_weights(n):

@@ -64,12 +64,3 @@ def test_base_draws_where_one_tilt_does_not_serve(study, reference):
     found = study(reference, IS(), 20)
     assert all(any("draws from the base distribution replace it" in text for text in r.warnings) for r in found.results)
     assert found.covered >= 16
-
-
-@pytest.mark.parametrize(
-    "settings",
-    [{"half_width": 0.0}, {"n": 0}, {"batch": 0}, {"n_round": 5}, {"max_rounds": 0}, {"rho": 0.5}, {"base_share": 1.0}],
-)
-def test_settings_out_of_range(settings):
-    with pytest.raises(ValueError, match=f"ImportanceSampling: expected .*{next(iter(settings))}"):
-        IS(**settings)

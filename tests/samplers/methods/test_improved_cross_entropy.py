@@ -11,10 +11,8 @@ from samplers.limit_states import four_branches, half_space, parabola, plateau, 
 from samplers.method import Goal
 from samplers.methods.improved_cross_entropy import log_smooth_indicator, next_width, weights_cov
 from samplers.problem import FunctionProblem
-from samplers.sample import Status
 
 ICE = samplers.ImprovedCrossEntropy
-FAMILIES = ("gaussian", "mixture", "vmfn")
 
 
 def gain(found):
@@ -71,23 +69,6 @@ def test_the_width_gives_the_weights_their_spread(rng):
     assert next_width(-abs(g), log_ratio, 1.5, 1e-15, 30.0) == 1e-15  # all fail
 
 
-def endless(family, seed):
-    """The steps of a run that does not end before it is interrupted."""
-    goal = Goal(gamma=0.0, target_cov=1e-4)
-    return ICE(family=family, n_final=500).steps(half_space().problem, goal, np.random.default_rng(seed))
-
-
-@pytest.mark.parametrize("family", FAMILIES)
-@pytest.mark.parametrize("at", [1, 2, 3, 4, 5, 6])
-def test_interrupted_anywhere_it_answers_from_what_was_simulated(drive, family, at):
-    outcome, f = drive(endless(family, 2), half_space().problem, interrupt_at=at)
-    assert outcome.status is Status.STOPPED
-    assert sum(level.n_sim for level in outcome.trace) == len(f)
-    assert 0 <= outcome.interval[0] <= outcome.p <= outcome.interval[1] <= 1
-    sample = outcome.sample
-    assert sample.weights[sample.f <= 0].sum() == pytest.approx(outcome.p)
-
-
 def test_final_weights_are_bounded_by_the_base_draws(drive):
     problem = four_branches().problem
     sample = drive(ICE().steps(problem, Goal(gamma=0.0), np.random.default_rng(1)), problem).value.sample
@@ -101,22 +82,3 @@ def test_stops_at_a_target():
     result = samplers.estimate(half_space().problem, ICE(n_final=500), seed=1, target_cov=0.03)
     assert result.cov <= 0.03
     assert result.status == "converged"
-
-
-@pytest.mark.parametrize(
-    "settings",
-    [
-        {"family": "student"},
-        {"components": 0},
-        {"weight_cov": 0.0},
-        {"n_round": 5},
-        {"max_rounds": 0},
-        {"n_final": 5},
-        {"base_share": 1.0},
-        {"wide_share": 0.9},
-        {"wide_factor": 1.0},
-    ],
-)
-def test_settings_out_of_range(settings):
-    with pytest.raises(ValueError, match=f"ImprovedCrossEntropy: expected .*{next(iter(settings))}"):
-        ICE(**settings)

@@ -44,6 +44,28 @@ def test_our_own_are_frozen_documented_dataclasses_that_can_be_asked(name):
         assert f"{field.name}:" in type(method).__doc__
 
 
+BAD_SETTINGS = {
+    samplers.MonteCarlo: [{"n": 0}, {"batch": 10.5}],
+    samplers.ImportanceSampling: [{"half_width": 0.0}, {"n_round": 5}, {"max_rounds": 0}, {"rho": 0.5}],
+    samplers.CrossEntropy: [
+        *({"rho": 0.6}, {"alpha": 1.2}, {"alpha": ()}, {"alpha": (0.8, 1.2)}, {"n_iteration": (1000, 5)}),
+        *({"base_share": 0.0}, {"wide_share": 0.95}, {"family": "beta"}, {"likelihood_ratio": "none"}),
+    ],
+    samplers.ImprovedCrossEntropy: [{"family": "student"}, {"weight_cov": 0.0}, {"wide_share": 0.9}],
+    samplers.SubsetSimulation: [{"distribution": "beta"}, {"spread": 0.0}],
+    samplers.AdaptiveSubsetSimulation: [{"n": 5}, {"p0": 0.5}, {"scale": 0.0}, {"sigma0": "sample"}],
+    samplers.TwoStage: [{"n": 399}, {"n": True}],
+    samplers.Surrogate: [{"n": 59}],
+    samplers.Auto: [{"seconds_per_simulation": -1.0}],
+}
+
+
+@pytest.mark.parametrize(("kind", "settings"), [(kind, one) for kind, some in BAD_SETTINGS.items() for one in some])
+def test_settings_out_of_range_are_named(kind, settings):
+    with pytest.raises(ValueError, match=f"{kind.__name__}: expected .*{next(iter(settings))}"):
+        kind(**settings)
+
+
 @pytest.mark.parametrize(
     "check", [pytest.param(check, marks=pytest.mark.slow if check in SLOW_CHECKS else ()) for check in METHOD_CHECKS]
 )

@@ -30,12 +30,6 @@ def test_stops_at_the_target():
     assert result.trace[-2].cov > 0.1
 
 
-def test_says_when_the_target_was_missed():
-    result = samplers.estimate(EASY.problem, "mc", seed=1, target_cov=0.01, max_sim=3000)
-    assert result.status == "budget"
-    assert any("target" in text for text in result.remarks)
-
-
 def test_draws_from_the_base_itself():
     """Its points come from base.sample: a base needs no map from standard normal space."""
 
@@ -50,12 +44,6 @@ def test_draws_from_the_base_itself():
             return x[:, 0]
 
     assert samplers.estimate(Problem(), "mc", seed=1, max_sim=100).p > 0.3
-
-
-@pytest.mark.parametrize("settings", [{"n": 0}, {"batch": 0}, {"n": 10.5}])
-def test_settings_out_of_range(settings):
-    with pytest.raises(ValueError, match="whole number of at least 1"):
-        samplers.MonteCarlo(**settings)
 
 
 def test_gives_all_its_draws_with_equal_weight(recorder):

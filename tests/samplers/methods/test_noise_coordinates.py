@@ -7,7 +7,6 @@ import pytest
 from scipy import stats
 
 import samplers
-from samplers.limit_states import Reference
 from samplers.methods.searched import marginalise_noise
 from samplers.problem import FunctionProblem, StandardNormal
 
@@ -81,12 +80,3 @@ def test_points_keep_their_noise():
     assert np.abs(again[3:, 3:] - x[:, 3:]).min(axis=0).max() > 0
     np.testing.assert_array_equal(inputs.base.to_standard_normal(x), u)
     assert inputs.base.sample(4, np.random.default_rng(2)).shape == (4, 303)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", PROBLEMS)
-def test_right_and_covered(study, name):
-    f, p = PROBLEMS[name]
-    found = study(Reference(name, problem(f), float(p)), samplers.TwoStage(), 60)
-    assert abs(found.ratios.mean() - 1) < 4 * max(found.ratios.std(ddof=1), found.own_cov) / np.sqrt(60)
-    assert found.covered >= stats.binom.ppf(1e-3, 60, 0.95)

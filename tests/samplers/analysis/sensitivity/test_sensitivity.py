@@ -35,15 +35,6 @@ def test_importance_of_a_half_space_is_the_squared_direction(result):
     assert (0.64 * far**2) / 2 / -stats.norm.logsf(8.0) == pytest.approx(0.64, abs=0.06)  # the limit alpha_j^2
 
 
-def test_columns_of_a_block_count_together(result):
-    blocks = {each.name: each for each in result.sensitivity(["a", "rest"], [1, 2]).columns}
-    alone = {each.name: each for each in result.sensitivity().columns}
-    joint = alone["x2"].importance + alone["x3"].importance
-    assert blocks["a"].importance == pytest.approx(alone["x1"].importance)
-    assert blocks["rest"].importance == pytest.approx(joint, abs=0.003)
-    assert blocks["rest"].direction > 0
-
-
 def test_irrelevant_noise_has_no_importance():
     """300 columns of noise: without the correction of the bias their block would have most of it."""
     base = samplers.StandardNormal(302)
@@ -89,18 +80,6 @@ def test_standard_errors_are_those_of_repetitions():
         z = np.array([(each[name].d_log_p - (ALPHA * HAZARD)[2 * j]) / each[name].error for each in found])
         assert abs(z.mean()) < 4 / np.sqrt(30)
         assert 0.6 < z.std() < 1.5
-
-
-def test_derivatives_agree_with_finite_differences_of_common_draws(result):
-    """The same failing points under bases to both sides: no error of sampling between the two."""
-    parameters = BASE.parameters()
-    values = np.array([each.value for each in parameters])
-    derivatives = {each.name: each.d_log_p for each in result.sensitivity().parameters}
-    for i, each in enumerate(parameters):
-        step = np.zeros(len(values))
-        step[i] = 1e-3 * each.change
-        up, down = (result.reweight(BASE.with_parameters(values + sign * step)).p for sign in (1, -1))
-        assert derivatives[each.name] == pytest.approx((np.log(up) - np.log(down)) / 2e-3, abs=1e-3)
 
 
 def test_shares_of_the_spread_add_up_and_name_what_varies():
