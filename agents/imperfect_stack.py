@@ -15,7 +15,6 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from agents.files import read_settings
 from rare_envs.devices import constant, fixed_draws, move_to
 from rare_envs.egos.policy import as_driver
 from rare_envs.sensors.lidar import perceive_traffic
@@ -43,13 +42,6 @@ class Stack:
     making in autonomous vehicles", IJCAI). The defaults are our choice, round numbers for an ordinary stack on an
     ordinary road; none is a measurement of one stack, so give those of yours. Where a published figure is known to us
     it stands beside the default.
-
-    Raises:
-        ValueError: If a number is negative or a probability is not below 1.
-
-    Example:
-        >>> Stack.read("latency=0.3&missed=0.05").missed
-        0.05
     """
 
     across: float = 0.1
@@ -92,36 +84,23 @@ class Stack:
             got = f"{self.missed:g}, {self.jerk:g} and {self.steering_rate:g}"
             raise ValueError(f"Expected missed below 1, and jerk and steering_rate above 0, got {got}.")
 
-    @classmethod
-    def read(cls, query: str) -> Stack:
-        """Return the stack of settings such as "latency=0.3&missed=0.05".
+    def every(self, world: World) -> int:
+        """Return the number of ticks from plan to plan."""
+        return max(1, round(self.period / world.clock.dt))
 
-        Raises:
-            ValueError: If a name is unknown or a value is no number.
-        """
-        return cls(**read_settings(cls, query))
+    def noise_shape(self, world: World) -> tuple[int, int]:
+        """Return the shape of an episode's standard normal draws: plans, and errors K of the ego and the others."""
+        plans = math.ceil(world.clock.ticks / self.every(world))
+        return plans, OWN_ERRORS + ERRORS_PER_VEHICLE * (world.scenario.vehicles - 1)
 
-
-def ticks_per_plan(stack: Stack, world: World) -> int:
-    """Return the number of ticks from plan to plan."""
-    return max(1, round(stack.period / world.clock.dt))
-
-
-def noise_shape(stack: Stack, world: World) -> tuple[int, int]:
-    """Return the shape of an episode's standard normal draws: plans, and errors K of the ego and the other vehicles."""
-    plans = math.ceil(world.clock.ticks / ticks_per_plan(stack, world))
-    return plans, OWN_ERRORS + ERRORS_PER_VEHICLE * (world.scenario.vehicles - 1)
+    def noise_columns(self, world: World) -> int:
+        """Return how many standard normal columns of x, the last ones, are its noise in a world."""
+        return math.prod(self.noise_shape(world)) if world.noise is True else 0
 
 
 @dataclass(frozen=True)
 class NoisyEgo:
-    """An ego behind a stack; a `DrivingProblem` turns it into a driver of its world.
-
-    Example:
-        >>> from agents import load_ego
-        >>> load_ego("noisy:idm?latency=0.3").stack.latency
-        0.3
-    """
+    """An ego behind a stack; a `DrivingProblem` turns it into a driver of its world."""
 
     ego: Any
     """Whatever `rare_envs.DrivingProblem` takes."""
@@ -141,14 +120,10 @@ class NoisyEgo:
 
     def noise_columns(self, world: World) -> int:
         """Return how many standard normal columns of x are the stack's noise in a world."""
-        return math.prod(noise_shape(self.stack, world)) if world.noise is True else 0
+        return self.stack.noise_columns(world)
 
     def in_world(self, world: World) -> NoisyDriver:
-        """Return the driver that it is in a world.
-
-        Raises:
-            ValueError: The ego does not fit the world, decides meta-actions, or has noise of its own.
-        """
+        """Return the driver that it is in a world."""
         if world.clock.action != "continuous":
             raise ValueError(f'Expected action="continuous" for an ego behind a stack, got {world.clock.action!r}.')
         driver = as_driver(self.ego, world)
@@ -188,19 +163,9 @@ class NoisyDriver:
     """Standard normal, shape (B, plans, K); None for what the world's noise says without columns of x."""
 
     @property
-    def every(self) -> int:
-        """Number of ticks from plan to plan."""
-        return ticks_per_plan(self.stack, self.world)
-
-    @property
-    def shape(self) -> tuple[int, int]:
-        """Shape of an episode's draws: plans and K."""
-        return noise_shape(self.stack, self.world)
-
-    @property
     def noise_columns(self) -> int:
         """Number of columns of x that are its noise, the last ones."""
-        return math.prod(self.shape) if self.world.noise is True else 0
+        return self.stack.noise_columns(self.world)
 
     @property
     def recordable(self) -> bool:
@@ -213,51 +178,46 @@ class NoisyDriver:
 
     def with_draws(self, draws: Tensor) -> NoisyDriver:
         """Return the driver of B episodes with standard normal draws, shape (B, `noise_columns`)."""
-        return replace(self, draws=draws.reshape(-1, *self.shape))
+        return replace(self, draws=draws.reshape(-1, *self.stack.noise_shape(self.world)))
 
     def act(self, episode: Episode, memory: Any) -> tuple[Tensor, Any]:
         """Decide by delayed and erroneous perception, at the plan's rate, through lagging actuators; see `Driver`."""
-        state = episode.state
+        state, stack = episode.state, self.stack
         if memory is None:
             nothing = state.x.new_zeros(len(state.x), 2)
-            memory = _StackMemory(0, (), state.x.new_zeros(len(state.x), self.shape[1]), None, nothing, nothing)
-        back = round(self.stack.latency / self.world.clock.dt)
+            errors = state.x.new_zeros(len(state.x), stack.noise_shape(self.world)[1])
+            memory = _StackMemory(0, (), errors, None, nothing, nothing)
+        back = round(stack.latency / self.world.clock.dt)
         past = (*memory.past, state)[-back - 1 :]
-        replan = memory.tick % self.every == 0
-        errors = self._step_errors(memory.errors, memory.tick // self.every) if replan else memory.errors
+        plan, later = divmod(memory.tick, stack.every(self.world))
+        errors = memory.errors if later else self._step_errors(memory.errors, plan)
         seen = self._perceive(state, past[0], errors)
         perception = None if episode.perception is None else perceive_traffic(seen, episode.road)
         shown = episode._replace(state=seen, lead=lead_of(seen, episode.road), perception=perception)
         planned, inner = self.inner.act(shown, memory.inner)
-        if not replan:  # the speed keeps the last plan, the path is followed at every tick
+        if later:  # the speed keeps the last plan, the path is followed at every tick
             planned = torch.stack((memory.planned[:, 0], planned[:, 1]), dim=1)
         actuated = self._actuate(memory.actuated, planned)
         return actuated, _StackMemory(memory.tick + 1, past, errors, inner, planned, actuated)
 
     def _step_errors(self, errors: Tensor, plan: int) -> Tensor:
         """Return the errors at a plan from those at the plan before: autoregressions of order 1 with variance 1."""
-        if self.world.noise is False:
+        world, tau = self.world, self.stack.correlation
+        if world.noise is False:
             return errors
         if self.draws is not None:
             fresh = self.draws[:, min(plan, self.draws.shape[1] - 1)]
-        elif self.world.noise == "fixed":
-            fresh = fixed_draws(self.shape, FIXED_STACK_SEED, errors)[plan].expand_as(errors)
+        elif world.noise == "fixed":
+            fresh = fixed_draws(self.stack.noise_shape(world), FIXED_STACK_SEED, errors)[plan].expand_as(errors)
         else:
             raise ValueError("Expected the draws of its noise: call with_draws first.")
         if plan == 0:
             return fresh
-        tau = self.stack.correlation
-        correlation = math.exp(-self.every * self.world.clock.dt / tau) if tau else 0.0
+        correlation = math.exp(-self.stack.every(world) * world.clock.dt / tau) if tau else 0.0
         return correlation * errors + math.sqrt(1.0 - correlation * correlation) * fresh
 
     def _perceive(self, now: State, late: State, errors: Tensor) -> State:
-        """Return the traffic as the stack perceives it: the ego as of now, the others relative to it, with delay.
-
-        Args:
-            now: True state.
-            late: True state when the others were sensed.
-            errors: Standard normal, shape (B, K).
-        """
+        """Return the traffic with errors, standard normal (B, K): the ego as of now, the others as of late."""
         stack, own = self.stack, errors[:, :OWN_ERRORS]
         of_others = errors[:, OWN_ERRORS:].reshape(len(errors), -1, ERRORS_PER_VEHICLE)
         along, across, speed, hidden = of_others.unbind(dim=-1)

@@ -11,18 +11,8 @@ from typing import Any, Final, Literal, Protocol, cast, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
-from agents.files import (
-    HUMAN,
-    LANE_CHANGING,
-    RULE_BASED,
-    SHIPPED,
-    SHIPPED_DRIVERS,
-    SHIPPED_EGOS,
-    SUFFIX,
-    VISION,
-    holds_vision,
-    read_settings,
-)
+from agents import files
+from agents.files import HUMAN, RULE_BASED, SHIPPED_DRIVERS, SHIPPED_EGOS, SUFFIX, VISION
 from agents.imperfect_stack import NoisyEgo, Stack
 from agents.learned.driver import LearnedDriver, LearnedEgo, RuleDriver, read_driver
 from agents.learned.networks import HUMAN_NOISE
@@ -141,7 +131,7 @@ def load_ego(
     if kind == "noisy":
         inner, mark, settings = _require_inner_ego(text).rpartition("?")
         ego = load_ego(inner if mark else settings, algo, trust, stats)
-        return cast(Ego, NoisyEgo(ego, Stack(**read_settings(Stack, settings if mark else ""))))
+        return cast(Ego, NoisyEgo(ego, Stack(**files.read_settings(Stack, settings if mark else ""))))
     for name, value in (("algo", algo), ("stats", stats)):
         if value is not None and kind != "process":
             raise ValueError(
@@ -165,7 +155,7 @@ def find_ego_kind(spec: str) -> EgoKind:
     name = spec.partition("?")[0]
     if name in (RULE_BASED, HUMAN):
         return "rule"
-    if spec == VISION or (spec.endswith(SUFFIX) and holds_vision(spec)):
+    if spec == VISION or (spec.endswith(SUFFIX) and files.holds_vision(spec)):
         return "vision"
     if name in (*SHIPPED_DRIVERS, *SHIPPED_EGOS) or spec.endswith(SUFFIX):
         return "learned"
@@ -201,8 +191,8 @@ def suggest_ego(text: str) -> str:
     if saved.is_file():
         return f" (did you mean {str(saved)!r}?)"
     if text and Path(text).is_dir():
-        files = sorted(path.name for path in Path(text).iterdir() if path.suffix in EGO_SUFFIXES)
-        return f" (a folder; name a file in it: {', '.join(files[:5])})" if files else " (a folder without egos)"
+        near = sorted(path.name for path in Path(text).iterdir() if path.suffix in EGO_SUFFIXES)
+        return f" (a folder; name a file in it: {', '.join(near[:5])})" if near else " (a folder without egos)"
     missing = " (there is no such file)" if Path(text).suffix or "/" in text else ""
     return did_you_mean(text, EGO_NAMES) or missing
 
@@ -214,8 +204,8 @@ def _load_rule_based(text: str) -> Any:
         return text
     try:
         if name == HUMAN:
-            return HumanEgo(HumanDriverModel(**read_settings(HumanDriverModel, query)))
-        return IDM(**read_settings(IDM, query))
+            return HumanEgo(HumanDriverModel(**files.read_settings(HumanDriverModel, query)))
+        return IDM(**files.read_settings(IDM, query))
     except ValueError as error:
         raise ValueError(f"The ego {text!r}: {error}") from None
 
@@ -302,18 +292,18 @@ def load_driver(name: str | PathLike[str]) -> LearnedDriver | RuleDriver | LaneC
     text = str(name)
     if text == RULE_BASED:
         return RuleDriver()
-    if text == LANE_CHANGING:
+    if text == files.LANE_CHANGING:
         return LaneChangingDriver()
     shipped, _, query = text.partition("?")
     if shipped in (*SHIPPED_DRIVERS, *SHIPPED_EGOS):
-        settings = DriverSettings(**read_settings(DriverSettings, query))
-        driver = read_driver(SHIPPED / f"{shipped}{SUFFIX}")
+        settings = DriverSettings(**files.read_settings(DriverSettings, query))
+        driver = read_driver(files.SHIPPED / f"{shipped}{SUFFIX}")
         if settings.rules:
             return driver
         return replace(driver, colour=HUMAN_NOISE, avoidance=None, hard_braking=1.0, changes=None)
     if text.endswith(SUFFIX) or Path(text).is_file():
         return read_driver(text)
-    names = (*SHIPPED_DRIVERS, *SHIPPED_EGOS, RULE_BASED, LANE_CHANGING)
+    names = (*SHIPPED_DRIVERS, *SHIPPED_EGOS, RULE_BASED, files.LANE_CHANGING)
     saved = Path(f"{text}{SUFFIX}")
     hint = f" (did you mean {str(saved)!r}?)" if saved.is_file() else did_you_mean(text, names)
     raise ValueError(f"Unknown driver {text!r}{hint}; expected {', '.join(map(repr, names))} or a path to a {SUFFIX}.")

@@ -94,15 +94,10 @@ class SavedEgo:
         return find_stacking(self.statistics.observation_space.shape, self.model.observation_space.shape)
 
     @cached_property
-    def policy(self) -> Any:
-        """The model behind its statistics and stacks."""
+    def same_as(self) -> Any:
+        """The model behind its statistics and stacks: it acts as this does; compiled rollouts read its network."""
         policy = self.model if self.frames is None else FrameStackedPolicy(self.model, *self.frames)
         return policy if self.statistics is None else NormalisedPolicy(policy, self.statistics.normalize_obs)
-
-    @property
-    def same_as(self) -> Any:
-        """A policy that acts as it does; compiled rollouts read its network."""
-        return self.policy
 
     def find_missing_statistics(self, expected: Any) -> str:
         """Return why it seems to have been trained on normalised observations, if it has no statistics; "" if not.
@@ -123,7 +118,7 @@ class SavedEgo:
         deterministic: bool = True,
     ) -> tuple[NDArray[Any], Any]:
         """Choose an action for each row of a batch; see `agents.Ego.predict`."""
-        actions, state = self.policy.predict(observation, state, episode_start, deterministic)
+        actions, state = self.same_as.predict(observation, state, episode_start, deterministic)
         return actions, state
 
 

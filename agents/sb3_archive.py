@@ -11,17 +11,17 @@ network of more numbers than the file holds is refused as it is built.
 from __future__ import annotations
 
 import base64
-import importlib
 import io
 import json
 import math
 import pickle
+import pkgutil
 import re
 import zipfile
 import zlib
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, NamedTuple
 
 import torch
 from gymnasium import spaces
@@ -31,38 +31,34 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from agents.safe_pickle import ForbiddenObject, open_pickle, require
 from rare_envs.plugins import did_you_mean
 
-ALGORITHMS = {  # name -> package and class; sb3_contrib is optional
-    **{name: ("stable_baselines3", name.upper()) for name in ("ppo", "a2c", "sac", "td3", "ddpg", "dqn")},
-    "recurrent_ppo": ("sb3_contrib", "RecurrentPPO"),
-    "maskable_ppo": ("sb3_contrib", "MaskablePPO"),
-    "trpo": ("sb3_contrib", "TRPO"),
-    "tqc": ("sb3_contrib", "TQC"),
-    "qrdqn": ("sb3_contrib", "QRDQN"),
-    "crossq": ("sb3_contrib", "CrossQ"),
-    "ars": ("sb3_contrib", "ARS"),
-}
-POLICY_MODULES = {  # start of the policy's module -> algorithm; "common" policies serve several
-    "stable_baselines3.sac.": "sac",
-    "stable_baselines3.td3.": "td3",  # DDPG is TD3 with other settings, and acts alike
-    "stable_baselines3.dqn.": "dqn",
-    "sb3_contrib.common.recurrent.": "recurrent_ppo",
-    "sb3_contrib.ppo_recurrent.": "recurrent_ppo",
-    "sb3_contrib.common.maskable.": "maskable_ppo",
-    "sb3_contrib.ppo_mask.": "maskable_ppo",
-    "sb3_contrib.tqc.": "tqc",
-    "sb3_contrib.qrdqn.": "qrdqn",
-    "sb3_contrib.crossq.": "crossq",
-    "sb3_contrib.ars.": "ars",
-}
-SETTINGS_OF_ALGORITHM = {  # a setting that only this algorithm has; the first that is present decides
-    "top_quantiles_to_drop_per_net": "tqc",
-    "cg_max_steps": "trpo",
-    "n_delta": "ars",
-    "clip_range": "ppo",
-    "target_policy_noise": "td3",
-    "target_entropy": "sac",
-    "exploration_initial_eps": "dqn",
-    "gae_lambda": "a2c",  # on-policy, and none of the above: A2C with RMSprop or Adam
+
+class Algorithm(NamedTuple):
+    """Where an algorithm is, and how its files are known: by the module of their policy, or by a setting."""
+
+    package: str
+    name: str
+    policies: tuple[str, ...] = ()
+    """Beginnings of the policy's module; "common" policies serve several."""
+    setting: str = ""
+    """One that only this algorithm has, of those that come later here."""
+
+
+ALGORITHMS = {
+    "ppo": Algorithm("stable_baselines3", "PPO", (), "clip_range"),
+    "tqc": Algorithm("sb3_contrib", "TQC", ("sb3_contrib.tqc.",), "top_quantiles_to_drop_per_net"),
+    "trpo": Algorithm("sb3_contrib", "TRPO", (), "cg_max_steps"),
+    "ars": Algorithm("sb3_contrib", "ARS", ("sb3_contrib.ars.",), "n_delta"),
+    "td3": Algorithm("stable_baselines3", "TD3", ("stable_baselines3.td3.",), "target_policy_noise"),
+    "ddpg": Algorithm("stable_baselines3", "DDPG"),  # TD3 with other settings, which acts alike
+    "sac": Algorithm("stable_baselines3", "SAC", ("stable_baselines3.sac.",), "target_entropy"),
+    "dqn": Algorithm("stable_baselines3", "DQN", ("stable_baselines3.dqn.",), "exploration_initial_eps"),
+    "a2c": Algorithm("stable_baselines3", "A2C", (), "gae_lambda"),  # on-policy, and none of the above
+    "recurrent_ppo": Algorithm(
+        "sb3_contrib", "RecurrentPPO", ("sb3_contrib.common.recurrent.", "sb3_contrib.ppo_recurrent.")
+    ),
+    "maskable_ppo": Algorithm("sb3_contrib", "MaskablePPO", ("sb3_contrib.common.maskable.", "sb3_contrib.ppo_mask.")),
+    "qrdqn": Algorithm("sb3_contrib", "QRDQN", ("sb3_contrib.qrdqn.",)),
+    "crossq": Algorithm("sb3_contrib", "CrossQ", ("sb3_contrib.crossq.",)),
 }
 MAX_UNPACKED, MAX_RATIO = 64 * 2**20, 20
 """Bytes that any archive may unpack to, and the factor by which a larger one may grow: Stable-Baselines3 stores its
@@ -137,8 +133,8 @@ def find_algorithm(header: Mapping[str, Any], path: Path) -> str:
     """Return the name of the algorithm of a saved model, one of `ALGORITHMS`, from its settings."""
     policy = header.get("policy_class")
     module = str(policy.get("__module__", "")) if isinstance(policy, dict) else ""
-    by_module = [name for start, name in POLICY_MODULES.items() if module.startswith(start)]
-    by_setting = [name for setting, name in SETTINGS_OF_ALGORITHM.items() if setting in header]
+    by_module = [name for name, each in ALGORITHMS.items() if module.startswith(each.policies)]
+    by_setting = [name for name, each in ALGORITHMS.items() if each.setting in header]
     for name in (*by_module, *by_setting):
         return name
     raise ValueError(
@@ -152,12 +148,12 @@ def find_algorithm_class(name: str, path: Path) -> Any:
     if name not in ALGORITHMS:
         hint = did_you_mean(name, ALGORITHMS)
         raise ValueError(f"Unknown algorithm {name!r}{hint}; expected one of {', '.join(ALGORITHMS)}.")
-    package, kind = ALGORITHMS[name]
+    found = ALGORITHMS[name]
     try:
-        return getattr(importlib.import_module(package), kind)  # a class by its name
+        return pkgutil.resolve_name(f"{found.package}:{found.name}")
     except ImportError as error:
         raise ValueError(
-            f"{str(path)!r} holds {kind}, which needs a package that is not installed: pip install sb3-contrib."
+            f"{str(path)!r} holds {found.name}, which needs a package that is not installed: pip install sb3-contrib."
         ) from error
 
 

@@ -19,17 +19,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from agents.files import (
-    SHIPPED,
-    SUFFIX,
-    VISION,
-    VISION_ENTRY,
-    Provenance,
-    check_form,
-    read_file,
-    read_network,
-    write_file,
-)
+from agents import files
+from agents.files import SUFFIX, VISION, Provenance
 from rare_envs.control.actions import MAX_ACCELERATION, MAX_STEERING, action_space
 from rare_envs.simulation.observation import EGO_FEATURES, observation_space
 from rare_envs.traffic.vehicle_models import steering_for
@@ -208,12 +199,12 @@ def _read_observation(observation: dict[str, NDArray[Any]]) -> tuple[Tensor, Ten
 
 def load_vision(name: str | PathLike[str] = VISION) -> VisionEgo:
     """Return the ego `vision`, or one from a file that `save_vision` wrote."""
-    path = SHIPPED / f"{VISION}{SUFFIX}" if str(name) == VISION else Path(name)
-    header, tensors = read_file(path, VISION_ENTRY)
-    check_form(header, _FORM, path)
-    return VisionEgo(read_network(PilotNet, tensors, path).arrange())
+    path = files.SHIPPED / f"{VISION}{SUFFIX}" if str(name) == VISION else Path(name)
+    header, tensors = files.read_file(path, files.VISION_ENTRY)
+    files.check_form(header, _FORM, path)
+    return VisionEgo(files.read_network(PilotNet, tensors, path).arrange())
 
 
 def save_vision(network: PilotNet, provenance: Provenance, path: str | PathLike[str]) -> Path:
     """Write a network to one .safetensors, and return its path."""
-    return write_file(Path(path), network.state_dict(), VISION_ENTRY, {**_FORM, **asdict(provenance)})
+    return files.write_file(Path(path), network.state_dict(), files.VISION_ENTRY, {**_FORM, **asdict(provenance)})

@@ -13,16 +13,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from agents.files import (
-    DRIVER_ENTRY,
-    Provenance,
-    check_form,
-    check_tensor,
-    read_file,
-    read_network,
-    require,
-    write_file,
-)
+from agents import files
+from agents.files import Provenance
 from agents.learned.networks import (
     ACTION_SIZE,
     FEATURE_CLIP,
@@ -37,21 +29,11 @@ from agents.learned.networks import (
     apply_heads,
     is_plain,
 )
-from agents.learned.rules import STATE_SIZE, ChangeState, CollisionAvoidance, LaneChanges
+from agents.learned.rules import STATE_SIZE, ChangeState, CollisionAvoidance, LaneChanges, Seen
 from rare_envs.control import actions
 from rare_envs.control.idm import IDM
 from rare_envs.devices import constant
-from rare_envs.sensors.lidar import (
-    AHEAD_BEAM,
-    CURVATURE_COLUMN,
-    FEATURES,
-    HEADING_COLUMN,
-    LANE_OFFSET_COLUMN,
-    MAX_RANGE,
-    RANGE_COLUMNS,
-    RATE_COLUMNS,
-    SPEED_COLUMN,
-)
+from rare_envs.sensors.lidar import AHEAD_BEAM, CURVATURE_COLUMN, FEATURES, MAX_RANGE, SPEED_COLUMN
 from rare_envs.simulation.cuda_graphs import says_recordable
 from rare_envs.simulation.observation import LIDAR_SCALES, observation_space
 from rare_envs.traffic.neighbours import Lead
@@ -68,7 +50,6 @@ OFFSET_TIME = 0.6
 """The lateral speed that is aimed at is lane offset / this [s], as in `rare_envs.control.idm`."""
 HEADING_TIME = 0.2
 """The yaw rate is heading error / this [s], as in `rare_envs.control.idm`."""
-_LENGTH = FEATURES.index("length")
 _NOISE_SIZE = 2 * ACTION_SIZE
 """Numbers that a vehicle keeps in mind of its noise."""
 _POLICY, _WEIGHTS = "policy.", "weights."
@@ -369,13 +350,13 @@ class RuleDriver:
         memory: Tensor | None = None,
     ) -> tuple[Tensor, Tensor | None]:
         """Return accelerations [m/s^2] and yaw rates [rad/s] (B, M, 2) for features (B, M, 51), and the memory."""
-        ahead, rate = features[..., RANGE_COLUMNS][..., AHEAD_BEAM], features[..., RATE_COLUMNS][..., AHEAD_BEAM]
-        speed = features[..., SPEED_COLUMN]
-        gap = torch.where(ahead < MAX_RANGE, ahead - 0.5 * features[..., _LENGTH], torch.inf)
-        acceleration = self.idm.acceleration(speed, Lead(gap, -rate))
-        across = -features[..., LANE_OFFSET_COLUMN] / (OFFSET_TIME * speed.clamp(min=NEAR_ZERO))
+        seen = Seen.read(features)
+        ahead = seen.ranges[..., AHEAD_BEAM]
+        gap = torch.where(ahead < MAX_RANGE, ahead - 0.5 * seen.length, torch.inf)
+        acceleration = self.idm.acceleration(seen.speed, Lead(gap, -seen.rates[..., AHEAD_BEAM]))
+        across = -seen.offset / (OFFSET_TIME * seen.speed.clamp(min=NEAR_ZERO))
         wanted = torch.asin(across.clamp(-1.0, 1.0)).clamp(-torch.pi / 4, torch.pi / 4)
-        yaw_rate = ((wanted - features[..., HEADING_COLUMN]) / HEADING_TIME).clamp(*self.yaw_rate)
+        yaw_rate = ((wanted - seen.heading) / HEADING_TIME).clamp(*self.yaw_rate)
         return torch.stack((acceleration, yaw_rate), dim=-1), memory
 
 
@@ -420,7 +401,7 @@ def save_driver(driver: LearnedDriver, provenance: Provenance, path: str | PathL
         "changes": None if driver.changes is None else asdict(driver.changes),
         "radius": None if driver.weights is None else driver.weights.radius,
     }
-    return write_file(Path(path), tensors, DRIVER_ENTRY, {**_FORM, **header, **asdict(provenance)})
+    return files.write_file(Path(path), tensors, files.DRIVER_ENTRY, {**_FORM, **header, **asdict(provenance)})
 
 
 def read_driver(path: str | PathLike[str]) -> LearnedDriver:
@@ -437,11 +418,11 @@ def read_driver(path: str | PathLike[str]) -> LearnedDriver:
         (-8.0, 4.0)
     """
     path = Path(path)
-    header, tensors = read_file(path, DRIVER_ENTRY)
-    check_form(header, _FORM, path)
-    require(header, ("name", "colour", "acceleration", "yaw_rate", "radius"), path)
+    header, tensors = files.read_file(path, files.DRIVER_ENTRY)
+    files.check_form(header, _FORM, path)
+    files.require(header, ("name", "colour", "acceleration", "yaw_rate", "radius"), path)
     sizes = (FEATURE_SIZE, FEATURE_SIZE, ACTION_SIZE, ACTION_SIZE)
-    policy = read_network(lambda: Policy(Scaling(*map(torch.empty, sizes))), tensors, path, _POLICY)
+    policy = files.read_network(lambda: Policy(Scaling(*map(torch.empty, sizes))), tensors, path, _POLICY)
     rule, changes = header.get("avoidance"), header.get("changes")  # earlier files have none
     try:
         return LearnedDriver(
@@ -462,6 +443,6 @@ def read_driver(path: str | PathLike[str]) -> LearnedDriver:
 def _read_weights(tensors: dict[str, Tensor], radius: float, path: Path) -> WeightDistribution:
     """Return the distribution of the last layer's weights in a file's tensors."""
     names = ("mean", "rows", "columns", "precision")
-    require(tensors, [_WEIGHTS + name for name in names], path)
-    check_tensor(f"{_WEIGHTS}mean", tensors[f"{_WEIGHTS}mean"], (HEAD_SIZE,), torch.float64, path)
+    files.require(tensors, [_WEIGHTS + name for name in names], path)
+    files.check_tensor(f"{_WEIGHTS}mean", tensors[f"{_WEIGHTS}mean"], (HEAD_SIZE,), torch.float64, path)
     return WeightDistribution.from_arrays({name: tensors[_WEIGHTS + name].numpy() for name in names}, radius)

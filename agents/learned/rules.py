@@ -19,17 +19,8 @@ import torch
 from torch import Tensor
 
 from rare_envs.devices import constant
-from rare_envs.sensors.lidar import (
-    AHEAD_BEAM,
-    FEATURES,
-    HEADING_COLUMN,
-    LANE_OFFSET_COLUMN,
-    MAX_RANGE,
-    RANGE_COLUMNS,
-    RATE_COLUMNS,
-    SPEED_COLUMN,
-    beam_angles,
-)
+from rare_envs.sensors import lidar
+from rare_envs.sensors.lidar import AHEAD_BEAM, FEATURES, MAX_RANGE
 from rare_envs.simulation.episode import LEARNED_TICK
 
 LEFT_MARKER_COLUMN, RIGHT_MARKER_COLUMN = FEATURES.index("left_marker"), FEATURES.index("right_marker")
@@ -59,7 +50,7 @@ STATE_SIZE = 10
 """Numbers that a vehicle keeps in mind of lane changes."""
 
 
-class _Seen(NamedTuple):
+class Seen(NamedTuple):
     """Features by name: shape (B, M), of beams (B, M, 20), of left and right (B, M, 2)."""
 
     speed: Tensor
@@ -76,20 +67,20 @@ class _Seen(NamedTuple):
     angles: Tensor
 
     @classmethod
-    def read(cls, features: Tensor) -> _Seen:
+    def read(cls, features: Tensor) -> Seen:
         """Return what features (B, M, 51) tell."""
         left, right = features[..., LEFT_MARKER_COLUMN], features[..., RIGHT_MARKER_COLUMN]
         return cls(
-            features[..., SPEED_COLUMN],
-            features[..., HEADING_COLUMN],
-            features[..., LANE_OFFSET_COLUMN],
+            features[..., lidar.SPEED_COLUMN],
+            features[..., lidar.HEADING_COLUMN],
+            features[..., lidar.LANE_OFFSET_COLUMN],
             features[..., _LENGTH],
             features[..., _WIDTH],
             torch.stack((left, right), dim=-1),
             left + right,
-            features[..., RANGE_COLUMNS],
-            features[..., RATE_COLUMNS],
-            beam_angles(features),
+            features[..., lidar.RANGE_COLUMNS],
+            features[..., lidar.RATE_COLUMNS],
+            lidar.beam_angles(features),
         )
 
     @property
@@ -159,13 +150,13 @@ class CollisionAvoidance:
 
     def limit(self, features: Tensor, action: Tensor) -> Tensor:
         """Return accelerations [m/s^2] and yaw rates [rad/s] (B, M, 2) within the bounds; features (B, M, 51)."""
-        seen = _Seen.read(features)
+        seen = Seen.read(features)
         acceleration = torch.minimum(action[..., 0], self._bound_acceleration(seen))
         left, right = self._bound_yaw_rates(seen)
         yaw_rate = torch.minimum(torch.maximum(action[..., 1], -left), right)
         return torch.stack((acceleration, yaw_rate), dim=-1)
 
-    def _bound_acceleration(self, seen: _Seen) -> Tensor:
+    def _bound_acceleration(self, seen: Seen) -> Tensor:
         """Return the greatest acceleration [m/s^2], infinite with nobody ahead, (B, M)."""
         cos, across = torch.cos(seen.angles), seen.ranges * torch.sin(seen.angles)
         ahead, gap = cos > _FORWARD, seen.ranges * cos - 0.5 * seen.length[..., None]
@@ -187,7 +178,7 @@ class CollisionAvoidance:
         firm = -(b + closing.clamp(min=0.0) / self.closing_time).clamp(max=self.hardest)
         return torch.where((gap < self.standstill_gap) & (closing > 0.0), torch.minimum(bound, firm), bound)
 
-    def _bound_yaw_rates(self, seen: _Seen) -> tuple[Tensor, Tensor]:
+    def _bound_yaw_rates(self, seen: Seen) -> tuple[Tensor, Tensor]:
         """Return the greatest yaw rates to the left and right [rad/s], (B, M); below 0 for who is steered back."""
         along, sin = seen.ranges * torch.cos(seen.angles), torch.sin(seen.angles)
         beside = (seen.ranges < MAX_RANGE) & (along.abs() < 0.5 * seen.length[..., None] + self.reach)
@@ -209,7 +200,7 @@ class CollisionAvoidance:
         That is HighwayEnv's lateral controller towards the end of the room. Unlike beside a body, bounds below 0 steer
         back as far as that takes.
         """
-        seen, wanted = _Seen.read(features), room / self.lateral_time
+        seen, wanted = Seen.read(features), room / self.lateral_time
         lag = self.heading_time * seen.speed.clamp(min=_LEAST_SPEED)
         return (wanted[..., 0] + seen.across) / lag, (wanted[..., 1] - seen.across) / lag
 
@@ -235,7 +226,7 @@ class AdjacentLanes(NamedTuple):
     @classmethod
     def read(cls, features: Tensor) -> AdjacentLanes:
         """Return what features (..., 51) show of the lanes beside, differentiable."""
-        seen = _Seen.read(features)
+        seen = Seen.read(features)
         ranges, beams = seen.ranges[..., None, :], seen.angles
         angle = beams + seen.heading[..., None, None]
         side = constant((-1.0, 1.0), features)[:, None]
@@ -291,7 +282,7 @@ class ChangeState(NamedTuple):
         """Return it as a memory of shape (B, M, 10)."""
         return torch.cat((self.patience, self.unseen, torch.stack(self[2:], dim=-1)), dim=-1)
 
-    def distance_left(self, seen: _Seen) -> Tensor:
+    def distance_left(self, seen: Seen) -> Tensor:
         """Return the distance across to the middle of the new lane [m], (B, M); lanes are taken as equally wide."""
         return seen.lane * (1.0 - self.crossed) - self.side * seen.offset
 
@@ -375,7 +366,7 @@ class LaneChanges:
                 f"Expected {len(COVARIATES)} finite coefficients of the hazard, got {self.coefficients!r}."
             )
         object.__setattr__(self, "coefficients", coefficients)
-        _check_positive(self, "lane changes", but=("coefficients",))
+        _check_positive(self, "lane changes")
 
     def begin(self, draws: Tensor) -> ChangeState:
         """Return the state before anything was perceived, from standard normal draws (B, M, 2)."""
@@ -393,7 +384,7 @@ class LaneChanges:
             state: As the last call returned it, at the start `begin`.
             innovations: Standard normal draws, shape (B, M, 2); None for 0.
         """
-        seen, lanes = _Seen.read(features), AdjacentLanes.read(features)
+        seen, lanes = Seen.read(features), AdjacentLanes.read(features)
         state = self._remember(seen, lanes, state)
         state = self._take_up(seen, lanes, state)
         state = self._begin_change(seen, lanes, state, innovations)
@@ -405,7 +396,7 @@ class LaneChanges:
         action = self._follow_course(seen, lanes, state, left, slowness)
         return action, state._replace(share=state.share + LEARNED_TICK * (state.pace * slowness))
 
-    def _remember(self, seen: _Seen, lanes: AdjacentLanes, state: ChangeState) -> ChangeState:
+    def _remember(self, seen: Seen, lanes: AdjacentLanes, state: ChangeState) -> ChangeState:
         """Return the state with what is known of the lanes beside, also where a line was crossed."""
         moved = torch.where(state.share == _UNSTARTED, 0.0, state.offset - seen.offset)  # about a lane across a line
         crossed = moved.abs() > 0.5 * seen.lane
@@ -417,7 +408,7 @@ class LaneChanges:
             offset=seen.offset,
         )
 
-    def _take_up(self, seen: _Seen, lanes: AdjacentLanes, state: ChangeState) -> ChangeState:
+    def _take_up(self, seen: Seen, lanes: AdjacentLanes, state: ChangeState) -> ChangeState:
         """Return the state with changes that were under way at the first moment."""
         first, side = state.share == _UNSTARTED, self._recognise(seen, lanes)
         offset, begins = side * seen.offset, first & (side != 0.0)
@@ -430,7 +421,7 @@ class LaneChanges:
             distance=torch.where(begins, torch.maximum(seen.lane, seen.lane - offset), state.distance),
         )
 
-    def _recognise(self, seen: _Seen, lanes: AdjacentLanes) -> Tensor:
+    def _recognise(self, seen: Seen, lanes: AdjacentLanes) -> Tensor:
         """Return the side of a change that is under way, -1 to the left, 1 to the right, 0 for none, (B, M)."""
         across, line = seen.across.abs(), 0.5 * seen.lane
         side = seen.across.sign()
@@ -442,7 +433,7 @@ class LaneChanges:
         return torch.where(changing | (offset + self.near * across > line), side, 0.0)
 
     def _begin_change(
-        self, seen: _Seen, lanes: AdjacentLanes, state: ChangeState, innovations: Tensor | None
+        self, seen: Seen, lanes: AdjacentLanes, state: ChangeState, innovations: Tensor | None
     ) -> ChangeState:
         """Return the state one tick of hazard later."""
         may_begin = lanes.least_gap_after(self.accepted_time) > self.accepted_gap
@@ -461,7 +452,7 @@ class LaneChanges:
             distance=torch.where(begins, begun.distance_left(seen), state.distance),
         )
 
-    def _hazard(self, seen: _Seen, lanes: AdjacentLanes) -> Tensor:
+    def _hazard(self, seen: Seen, lanes: AdjacentLanes) -> Tensor:
         """Return exp(coefficients . `COVARIATES`) [1/s] for either side, (B, M, 2)."""
         led, lagged = lanes.lead_gap < torch.inf, lanes.lag_gap < torch.inf
         advantage = torch.where(led, -lanes.lead_closing, torch.where(lagged, lanes.lag_closing, 0.0))
@@ -473,7 +464,7 @@ class LaneChanges:
         return torch.exp((covariates * constant(self.coefficients, covariates)).sum(dim=-1))
 
     def _follow_course(
-        self, seen: _Seen, lanes: AdjacentLanes, state: ChangeState, left: Tensor, slowness: Tensor
+        self, seen: Seen, lanes: AdjacentLanes, state: ChangeState, left: Tensor, slowness: Tensor
     ) -> ChangeAction:
         """Return how to act with some distance left [m], where time passes slower by a factor, (B, M) each."""
         share, pace, frequency = state.share.clamp(0.0, 1.0), state.pace * slowness, self.frequency * slowness
@@ -506,9 +497,9 @@ def _of_side(values: Tensor, side: Tensor) -> Tensor:
     return torch.where(side < 0.0, values[..., 0], values[..., 1])
 
 
-def _check_positive(settings: Any, of: str, but: tuple[str, ...] = ()) -> None:
-    """Refuse a field that is not a positive number."""
-    for name in (each.name for each in fields(settings) if each.name not in but):
+def _check_positive(settings: Any, of: str) -> None:
+    """Refuse a field of one number that is not a positive one."""
+    for name in (each.name for each in fields(settings) if isinstance(each.default, float)):
         value = getattr(settings, name)  # a field by its name
         if isinstance(value, bool) or not isinstance(value, int | float) or not 0.0 < value < math.inf:
             raise ValueError(f"Expected {name} of the {of} above 0, got {value!r}.")

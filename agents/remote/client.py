@@ -2,36 +2,67 @@
 
 from __future__ import annotations
 
+import contextlib
 import itertools
+import json
+import math
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
 import time
 import warnings
 import weakref
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 from urllib.parse import parse_qsl
 
 import numpy as np
+import zmq
 from numpy.typing import NDArray
+from zmq.utils.monitor import recv_monitor_message
 
 from agents.remote import protocol
-from agents.remote.link import HandshakeError, LinkError, NoReply, ProcessLink, ServerLink, read_secret
-from agents.remote.protocol import MalformedMessage, Message
+from agents.remote.protocol import SECRET_VARIABLE, MalformedMessage, Message, Socket, derive_server_keys, read_secret
 from rare_envs.egos.errors import EgoGone, NoAnswer
 from rare_envs.sensors.kinds import batch_size
 
 TIMEOUT, PATIENCE = 10.0, 30.0
 """Seconds to wait for an answer, and for an ego that has gone to come back."""
-MAX_NAME = 100
-"""Letters of an ego's name that are kept."""
-_MAX_REASON = 500
-"""Letters of an error's reason that are kept."""
+_MAX_NAME, _MAX_REASON = 100, 500
+"""Letters of an ego's name, and of an error's reason, that are kept."""
 _HELLO_INTERVAL = 1.0
 """Time [s] after which a hello without an answer is sent again, and after which the user is told of the wait."""
 _RETRY_PAUSE = 0.1
 """Time [s] between attempts to connect where they fail at once."""
 _PART_FACTOR, _MIN_PART_TIMEOUT = 10.0, 0.5
 """A part of a batch that was not answered gets this multiple of the longest answer so far, and at least so long [s]."""
+_EXIT_WAIT = 1.0
+"""Time [s] for a process that has closed its socket to end, so that its exit status is known."""
+_HANDSHAKE = f"the handshake failed; both sides need the same secret ({SECRET_VARIABLE}), or none"
+_BROKEN = {
+    zmq.EVENT_CLOSED: "nothing listens there",
+    zmq.EVENT_DISCONNECTED: "the connection broke",
+    zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL: _HANDSHAKE,  # or a tunnel or proxy whose server is not there yet
+    zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL: _HANDSHAKE,
+    zmq.EVENT_HANDSHAKE_FAILED_AUTH: _HANDSHAKE,
+}
+"""Events after which no answer will come, and what they mean."""
+_HOPELESS = (zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL, zmq.EVENT_HANDSHAKE_FAILED_AUTH)
+
+
+class LinkError(Exception):
+    """A request without an answer: the server is silent, or the connection broke."""
+
+
+class NoReply(LinkError):
+    """A request that was not answered in time, or at which the ego's process ended: perhaps the request caused it."""
+
+
+class HandshakeError(LinkError):
+    """A connection that the server will never accept: one side has a secret and the other none, say."""
 
 
 class WaitingForEgo(UserWarning):
@@ -52,12 +83,138 @@ class RemoteError(RuntimeError):
         self.code = code
 
 
-def parse_address(spec: str) -> tuple[str, dict[str, float]]:
-    """Split "tcp://127.0.0.1:5555?timeout=10&patience=30" into the address and the time-outs.
+# --- links ---------------------------------------------------------------------------------------
 
-    Raises:
-        ValueError: The part after "?" has other settings.
+
+class ServerLink:
+    """A link to a server: a DEALER socket that sends as REQ does, so that any REP or ROUTER can answer."""
+
+    load_timeout: ClassVar[float] = 0.0
+    """Least time [s] to wait for the first answer, in which an ego may have to be loaded."""
+
+    def __init__(self, address: str, secret: bytes | None = None) -> None:
+        """Make a link to an address such as "tcp://127.0.0.1:5555", with a secret if its server has one."""
+        self.address, self._secret = address, secret
+        # one for all links: ending a context may wait, closing a socket does not
+        self._context: zmq.Context[Socket] = zmq.Context.instance()
+        self._socket: Socket | None = None
+        self._monitor: Socket | None = None
+
+    def open(self) -> None:
+        """Connect anew; a request under way is dropped."""
+        self.close()
+        self._socket = self._context.socket(zmq.DEALER)
+        self._socket.setsockopt(zmq.LINGER, 0)
+        self._socket.setsockopt(zmq.RECONNECT_IVL, 100)
+        self._socket.setsockopt(zmq.MAXMSGSIZE, protocol.MAX_BYTES)
+        self._monitor = self._socket.get_monitor_socket(sum(_BROKEN))
+        self._attach(self._socket)
+
+    def _attach(self, socket: Socket) -> None:
+        """Connect a socket to the server."""
+        if self._secret is not None:
+            socket.curve_serverkey = derive_server_keys(self._secret)[0]
+            socket.curve_publickey, socket.curve_secretkey = zmq.curve_keypair()
+        port = self.address.rpartition(":")[2]
+        if self.address.startswith("tcp://") and port.isdigit() and not 0 < int(port) < 65536:
+            raise ValueError(f"Cannot connect to {self.address!r}: expected a port from 1 to 65535.")
+        try:
+            socket.connect(self.address)
+        except zmq.ZMQError as error:
+            raise ValueError(f"Cannot connect to {self.address!r}: {error}; expected tcp://host:port.") from error
+
+    def request(self, content: bytes, timeout: float) -> bytes:
+        """Send a message and return its answer, which comes within a time [s]."""
+        assert self._socket is not None and self._monitor is not None
+        self._socket.send_multipart([b"", content])
+        poller, deadline = zmq.Poller(), time.monotonic() + timeout
+        poller.register(self._socket, zmq.POLLIN)
+        poller.register(self._monitor, zmq.POLLIN)
+        while True:
+            left = deadline - time.monotonic()
+            ready = dict(poller.poll(max(0, math.ceil(1000 * self._bound_wait(left)))))
+            if self._socket in ready:
+                return protocol.open_envelope(self._socket.recv_multipart())[1]
+            if ready:
+                event = zmq.Event(recv_monitor_message(self._monitor)["event"])
+                raise (HandshakeError if event in _HOPELESS else LinkError)(_BROKEN[event])
+            if left <= 0:
+                raise NoReply(f"no answer within {timeout:.3g} s")
+
+    def _bound_wait(self, left: float) -> float:
+        """Return how long to wait for an event before looking again [s]."""
+        return left
+
+    def close(self) -> None:
+        """Disconnect."""
+        if self._socket is not None and self._monitor is not None:
+            self._socket.disable_monitor()
+            self._monitor.close(0)
+            self._socket.close(0)
+        self._socket = self._monitor = None
+
+    def __del__(self) -> None:
+        """Disconnect."""
+        self.close()
+
+
+class ProcessLink(ServerLink):
+    """A link to an ego in a process of its own, so that one that hangs or dies takes nothing with it.
+
+    The process connects to a socket file in a folder that other users cannot enter.
     """
+
+    load_timeout: ClassVar[float] = 60.0
+
+    def __init__(self, spec: str, **how: Any) -> None:
+        """Make a link; `open` starts the process. Arguments are those of `agents.load_ego`, which is called there."""
+        self._process: subprocess.Popen[bytes] | None = None
+        self._folder: str | None = None
+        super().__init__(f"process:{spec}")
+        if os.name != "posix":
+            raise ValueError("Expected Linux or macOS for process:EGO, whose socket is a file; use serve-ego.")
+        self._arguments = json.dumps({"spec": spec, **how}, default=str)
+
+    def _attach(self, socket: Socket) -> None:
+        """Start a process that connects to a socket."""
+        self._folder = tempfile.mkdtemp(prefix="rare-envs-")
+        address = f"ipc://{self._folder}/ego"
+        socket.bind(address)
+        words = [sys.executable, "-m", "agents.remote.server", address, self._arguments]
+        # an ego may print: to standard error, because standard output is for answers
+        self._process = subprocess.Popen(words, stdin=subprocess.DEVNULL, stdout=2)
+
+    def request(self, content: bytes, timeout: float) -> bytes:
+        """Send a message and return its answer; see `ServerLink.request`."""
+        assert self._process is not None
+        try:
+            return super().request(content, timeout)
+        except NoReply:
+            raise
+        except LinkError as error:
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                self._process.wait(_EXIT_WAIT)
+            raise NoReply(f"its process ended (exit status {self._process.returncode})") from error
+
+    def _bound_wait(self, left: float) -> float:
+        """Look now and then whether the process ended before it connected."""
+        if self._process is not None and self._process.poll() is not None:
+            raise LinkError("its process ended")
+        return min(left, 0.1)
+
+    def close(self) -> None:
+        """End the process."""
+        super().close()
+        if self._process is not None:
+            self._process.kill()
+            self._process.wait()
+        if self._folder is not None:
+            shutil.rmtree(self._folder, ignore_errors=True)
+        self._process = self._folder = None
+
+
+def parse_address(spec: str) -> tuple[str, dict[str, float]]:
+    """Split "tcp://127.0.0.1:5555?timeout=10&patience=30" into the address and the time-outs."""
     address, mark, query = spec.partition("?")
     try:
         settings = {name: float(value) for name, value in parse_qsl(query, strict_parsing=bool(mark))}
@@ -66,6 +223,9 @@ def parse_address(spec: str) -> tuple[str, dict[str, float]]:
     if set(settings) - {"timeout", "patience"} or not all(0 < value < 1e6 for value in settings.values()):
         raise ValueError(f"Expected ?timeout=SECONDS&patience=SECONDS behind the address, got {query!r}.")
     return address, settings
+
+
+# --- egos ----------------------------------------------------------------------------------------
 
 
 @dataclass(eq=False)
@@ -78,8 +238,8 @@ class _Session:
     epoch: int = -1
     """Connection on which the server knows it."""
     memory: bool = False
-    history: list[tuple[Any, NDArray[np.bool_] | None]] = field(default_factory=list)
-    """Observations and starts of the episode up to now, if the session has a memory."""
+    history: list[Message] = field(default_factory=list)
+    """What was sent of each tick of the episode up to now, if the session has a memory."""
 
 
 class RemoteEgo:
@@ -117,29 +277,24 @@ class RemoteEgo:
             EgoGone: No server answers.
             ValueError: The server refuses, speaks another version or another protocol.
         """
-        self._link = link
-        self._timeout, self._patience = timeout, patience
+        self._link, self._timeout, self._patience = link, timeout, patience
         self._ids, self._numbers = itertools.count(1), itertools.count(1)
-        self._epoch = 0
-        self._smallest_unanswered = 0
-        self._longest_answer = 0.0
-        self._warm = False
-        self._connected = False
+        self._epoch, self._connected, self._warm = 0, False, False
+        self._smallest_unanswered, self._longest_answer = 0, 0.0
         self._reusable: dict[int, _Session] = {}
         self._ended: list[int] = []
         try:
             hello = self._connect()
-            self.observation_space = protocol.decode_space(hello.get("observation"))
-            self.action_space = protocol.decode_space(hello.get("action"))
+            self._spaces = hello.get("observation"), hello.get("action")
+            self.observation_space, self.action_space = map(protocol.decode_space, self._spaces)
         except RemoteError as error:
             link.close()
             raise ValueError(f"The ego at {link.address} refuses: {error}") from error
         except BaseException:
             link.close()
             raise
-        self._spaces = _declared_spaces(hello)
         self.deterministic = None if hello.get("deterministic") is None else bool(hello["deterministic"])
-        self.name = str(hello.get("name", "ego"))[:MAX_NAME]
+        self.name = str(hello.get("name", "ego"))[:_MAX_NAME]
 
     def predict(
         self,
@@ -156,10 +311,10 @@ class RemoteEgo:
             EgoGone: It is not there any more.
         """
         session = self._find_session(batch_size(observation)) if state is None else state
-        start = None if episode_start is None or session.step == 0 else np.asarray(episode_start, dtype=bool)
-        if start is not None and not start.any():
-            start = None
-        action = self._act(session, observation, start)
+        tick = {"observation": protocol.pack_observation(observation)}
+        if episode_start is not None and session.step > 0 and np.any(episode_start):
+            tick["start"] = protocol.pack_array(np.asarray(episode_start, dtype=bool))
+        action = self._act(session, tick)
         if session.memory:
             self._reusable.pop(session.batch, None)
             return action, session
@@ -180,17 +335,15 @@ class RemoteEgo:
         weakref.finalize(session, self._ended.append, session.number)
         return session
 
-    def _act(self, session: _Session, observation: Any, start: NDArray[np.bool_] | None) -> NDArray[Any]:
+    def _act(self, session: _Session, tick: Message) -> NDArray[Any]:
         """Return the actions for one tick of a session; try again on a new connection where that may help."""
         reason = ""
         if session.batch >= self._smallest_unanswered:
             self._smallest_unanswered = 0
         for _ in range(2):
             try:
-                if not self._connected:
-                    self._reconnect()
                 self._restore(session)
-                reply = self._send_act(session, session.step, observation, start)
+                reply = self._send_act(session, session.step, tick)
                 action = protocol.unpack_array(reply.get("action"))
             except NoReply as error:
                 self._connected = False
@@ -198,62 +351,45 @@ class RemoteEgo:
                 raise NoAnswer(f"The ego at {self._link.address}: {error}.") from error
             except (LinkError, MalformedMessage) as error:
                 self._connected, reason = False, str(error)
-                continue
             except RemoteError as error:
                 session.epoch, reason = -1, str(error)
                 if error.code != "session":
                     raise
-                continue
-            session.history.append((observation, start))
-            session.step += 1
-            session.memory = session.memory or bool(reply.get("memory"))
-            return action
+            else:
+                session.history.append(tick)
+                session.step += 1
+                session.memory = session.memory or bool(reply.get("memory"))
+                return action
         raise RemoteError(f"The ego at {self._link.address} failed twice on this batch: {reason}")
 
     def _restore(self, session: _Session) -> None:
-        """Begin a session on the server if it does not know it, and bring it to the present tick."""
+        """Connect if need be, begin a session on the server if it does not know it, bring it to the present tick."""
+        if not self._connected:
+            self._reconnect()
         if session.epoch == self._epoch:
             return
         self._request({"type": "reset", "session": session.number, "batch": session.batch})
         if not session.memory:
             session.step = 0
-        for step, (observation, start) in enumerate(session.history):
-            self._send_act(session, step, observation, start)
+        for step, tick in enumerate(session.history):
+            self._send_act(session, step, tick)
         session.epoch = self._epoch
 
-    def _send_act(self, session: _Session, step: int, observation: Any, start: NDArray[np.bool_] | None) -> Message:
-        """Return the answer for one tick of a session."""
-        message: Message = {
-            "type": "act",
-            "session": session.number,
-            "step": step,
-            "observation": protocol.pack_observation(observation),
-        }
-        if start is not None:
-            message["start"] = protocol.pack_array(start)
-        sent = time.monotonic()
-        reply = self._request(message, self._timeout_of(session.batch))
+    def _send_act(self, session: _Session, step: int, tick: Message) -> Message:
+        """Return the answer for one tick of a session.
+
+        Parts of a batch that was not answered in time get less time, some multiple of the longest answer so far. A part
+        that would have been answered a little later does no harm: its rows are sent one by one, with the full time.
+        """
+        timeout, sent = self._timeout, time.monotonic()
+        if self._warm and 1 < session.batch < self._smallest_unanswered:
+            timeout = min(timeout, max(_MIN_PART_TIMEOUT, _PART_FACTOR * self._longest_answer))
+        reply = self._request({"type": "act", "session": session.number, "step": step, **tick}, timeout)
         self._longest_answer, self._warm = max(self._longest_answer, time.monotonic() - sent), True
         return reply
 
-    def _timeout_of(self, batch: int) -> float:
-        """Return how many seconds to wait for the actions of a batch.
-
-        Parts of a batch that was not answered in time get less, some multiple of the longest answer so far. A part
-        that would have been answered a little later does no harm: its rows are sent one by one, with the full time.
-        """
-        if not (self._warm and 1 < batch < self._smallest_unanswered):
-            return self._timeout
-        return min(self._timeout, max(_MIN_PART_TIMEOUT, _PART_FACTOR * self._longest_answer))
-
     def _request(self, message: Message, timeout: float | None = None) -> Message:
-        """Send a message and return its answer.
-
-        Raises:
-            LinkError: There is no answer.
-            MalformedMessage: The answer is malformed, or one to another message.
-            RemoteError: The answer is an error.
-        """
+        """Send a message and return its answer; an answer that is an error is raised."""
         number = next(self._ids)
         content = self._link.request(protocol.pack({**message, "id": number}), timeout or self._timeout)
         reply = protocol.unpack(content)
@@ -266,12 +402,11 @@ class RemoteEgo:
 
     def _connect(self) -> Message:
         """Connect and exchange hello messages, retrying for `patience` seconds; return the server's."""
-        began, reason, told = time.monotonic(), "no answer", False
-        deadline = began + self._patience
+        began, told, address = time.monotonic(), False, self._link.address
         greeting = {"type": "hello", "protocol": protocol.PROTOCOL, "client": "rare-envs"}
         while True:
             self._link.open()
-            left = max(deadline - time.monotonic(), 0.05)
+            left = max(began + self._patience - time.monotonic(), 0.05)
             try:
                 reply = self._request(greeting, max(min(_HELLO_INTERVAL, left), self._link.load_timeout))
                 break
@@ -279,10 +414,10 @@ class RemoteEgo:
                 raise RemoteError(str(error)) from error
             except LinkError as error:
                 reason = str(error)
-            now, address = time.monotonic(), self._link.address
-            if now >= deadline:
+            waited = time.monotonic() - began
+            if waited >= self._patience:
                 raise EgoGone(f"No ego at {address} within {self._patience:g} s: {reason}.")
-            if now >= began + _HELLO_INTERVAL and not told:
+            if waited >= _HELLO_INTERVAL and not told:
                 told = True
                 warnings.warn(
                     f"no ego at {address} yet: {reason}; waiting for one, {self._patience:g} s at most "
@@ -298,17 +433,13 @@ class RemoteEgo:
         return reply
 
     def _reconnect(self) -> None:
-        """Connect again, to the same ego.
-
-        Raises:
-            EgoGone: Another one is there, or it refuses.
-        """
+        """Connect again, to the same ego."""
         address = self._link.address
         try:
             hello = self._connect()
         except (RemoteError, MalformedMessage) as error:
             raise EgoGone(f"The ego at {address} went away, and what is there now refuses: {error}") from error
-        if _declared_spaces(hello) != self._spaces:
+        if (hello.get("observation"), hello.get("action")) != self._spaces:
             raise EgoGone(f"The ego at {address} went away, and one with other spaces is there now.")
 
     def close(self) -> None:
@@ -316,30 +447,13 @@ class RemoteEgo:
         self._link.close()
 
 
-def _declared_spaces(hello: Message) -> tuple[Any, Any]:
-    """Return the spaces that a hello declares, as maps."""
-    return hello.get("observation"), hello.get("action")
-
-
 def connect(spec: str) -> RemoteEgo:
-    """Connect to the ego at an address.
-
-    Args:
-        spec: "tcp://host:port"; "?timeout=10&patience=30" behind it sets how many seconds to wait for an answer, and
-            for the ego to come back. The shared secret, if there is one, is in the environment: RARE_ENVS_SECRET.
-
-    Raises:
-        EgoGone: No server answers.
-        ValueError: The address is malformed, or something else than an ego answers.
-    """
+    """Connect to the ego at "tcp://host:port?timeout=10&patience=30", with the secret of RARE_ENVS_SECRET if any."""
     address, settings = parse_address(spec)
     return RemoteEgo(ServerLink(address, read_secret()), **settings)
 
 
 def isolate(spec: str, algo: str | None = None, trust: bool = False, stats: str | Path | None = None) -> RemoteEgo:
-    """Load an ego in a process of its own; arguments and errors are those of `agents.load_ego`.
-
-    "?timeout=10" behind its name sets how many seconds an answer may take.
-    """
-    address, settings = parse_address(spec)
-    return RemoteEgo(ProcessLink(address, algo, trust, stats), **settings)
+    """Load an ego in a process of its own, as `agents.load_ego` does; "?timeout=10" behind its name bounds answers."""
+    name, settings = parse_address(spec)
+    return RemoteEgo(ProcessLink(name, algo=algo, trust=trust, stats=stats), **settings)

@@ -1,14 +1,30 @@
-"""Messages between the simulation and a remote ego: msgpack maps, arrays as bytes, spaces. See docs/egos.md."""
+"""Messages between the simulation and a remote ego: msgpack maps, arrays as bytes, spaces; and the keys of a secret.
+
+See docs/egos.md. The server's key pair is derived from the shared secret by scrypt, which makes guessing expensive. The
+client derives it too, and takes the public key as that of the server; its own key pair is fresh. Neither key is ever
+sent in the clear, and the handshake fails for a client that does not know the server's public key, so only holders of
+the secret get through.
+
+References:
+    CurveZMQ, https://rfc.zeromq.org/spec/26/: each handshake agrees on fresh keys, so that a message can be neither
+    read, changed nor repeated, and recorded traffic stays secret if the shared secret leaks later.
+    Percival and Josefsson, RFC 7914 (scrypt); N = 2^14, r = 8, p = 1 is its recommendation for interactive use.
+"""
 
 from __future__ import annotations
 
+import functools
+import hashlib
 import math
+import os
 from typing import Any, TypeGuard
 
 import msgpack
 import numpy as np
+import zmq
 from gymnasium import spaces
 from numpy.typing import NDArray
+from zmq.utils import z85
 
 from rare_envs.egos.errors import reason_of
 
@@ -24,16 +40,25 @@ DTYPES = ("<f4", "<f8", "<i4", "<i8", "|u1")
 """Types of arrays, by NumPy's names."""
 _LIMITS = {"max_array_len": 4096, "max_map_len": 64, "max_str_len": 2**16, "max_ext_len": 0}
 _MAX_AXES = 5
-MAX_BOUNDS = 1024
+_MAX_BOUNDS = 1024
 """Entries of a space's bound that are sent."""
-MAX_ENTRIES = 2**23
+_MAX_ENTRIES = 2**23
 """Entries of one observation, in a space that a client accepts."""
+SECRET_VARIABLE = "RARE_ENVS_SECRET"
+"""Environment variable with the shared secret; on a command line other users could read it."""
 
 Message = dict[str, Any]
+Socket = zmq.Socket[bytes]
 
 
 class MalformedMessage(ValueError):
     """A message that is not of the protocol's form."""
+
+
+def _demand(holds: object, what: str) -> None:
+    """Refuse a message unless a condition holds."""
+    if not holds:
+        raise MalformedMessage(what)
 
 
 def pack(message: Message) -> bytes:
@@ -43,13 +68,8 @@ def pack(message: Message) -> bytes:
 
 
 def unpack(content: bytes) -> Message:
-    """Return the message in some bytes, whoever wrote them.
-
-    Raises:
-        MalformedMessage: They are no msgpack map with text for keys, or too many.
-    """
-    if len(content) > MAX_BYTES:
-        raise MalformedMessage(f"a message of {len(content)} bytes, more than {MAX_BYTES}")
+    """Return the message in some bytes, whoever wrote them."""
+    _demand(len(content) <= MAX_BYTES, f"a message of {len(content)} bytes, more than {MAX_BYTES}")
     try:
         message = msgpack.unpackb(content, raw=False, strict_map_key=True, max_bin_len=len(content), **_LIMITS)
     except Exception as error:  # msgpack raises many kinds
@@ -59,35 +79,46 @@ def unpack(content: bytes) -> Message:
     return message
 
 
-def pack_array(values: NDArray[Any]) -> Message:
-    """Return an array as a map of dtype, shape and little-endian bytes in C order.
+def open_envelope(frames: list[bytes]) -> tuple[list[bytes], bytes]:
+    """Return the empty delimiter of REQ, if it is there, and the message of frames; "" for several frames."""
+    delimiter = [b""] if len(frames) > 1 and frames[0] == b"" else []
+    return delimiter, frames[-1] if len(frames) == len(delimiter) + 1 else b""
 
-    Raises:
-        MalformedMessage: It holds something else than numbers.
-    """
+
+def is_count(value: object, most: int = MAX_COUNT) -> TypeGuard[int]:
+    """Return whether a value is an integer from 0 to most; a bool is none."""
+    return isinstance(value, int) and not isinstance(value, bool) and 0 <= value <= most
+
+
+def _is_shape(value: object, most: int = MAX_BYTES) -> TypeGuard[list[int]]:
+    """Return whether a value is a list of sizes with a product of at most `most`."""
+    if not isinstance(value, list) or len(value) > _MAX_AXES or not all(is_count(size, most) for size in value):
+        return False
+    return math.prod(value) <= most
+
+
+# --- arrays --------------------------------------------------------------------------------------
+
+
+def pack_array(values: NDArray[Any]) -> Message:
+    """Return an array of numbers as a map of dtype, shape and little-endian bytes in C order."""
     if values.dtype == bool:
         values = values.astype(np.uint8)
     elif np.issubdtype(values.dtype, np.integer) and values.dtype != np.uint8:
         values = values.astype("<i8")
     elif np.issubdtype(values.dtype, np.floating):
         values = values.astype("<f8" if values.dtype == np.float64 else "<f4")
-    if values.dtype.str not in DTYPES:
-        raise MalformedMessage(f"an array of {values.dtype}, expected numbers")
+    _demand(values.dtype.str in DTYPES, f"an array of {values.dtype}, expected numbers")
     return {"dtype": values.dtype.str, "shape": list(values.shape), "data": values.tobytes()}
 
 
 def unpack_array(given: Any) -> NDArray[Any]:
-    """Return the array in a map that `pack_array` made.
-
-    Raises:
-        MalformedMessage: It is not of that form, or dtype, shape and bytes do not go together.
-    """
+    """Return the array in a map that `pack_array` made."""
     if not isinstance(given, dict) or set(given) != {"dtype", "shape", "data"}:
         raise MalformedMessage("an array is a map of dtype, shape and data")
     dtype, shape, data = given["dtype"], given["shape"], given["data"]
-    if dtype not in DTYPES:
-        raise MalformedMessage(f"dtype {dtype!r}, expected one of {', '.join(DTYPES)}")
-    if not is_shape(shape):
+    _demand(dtype in DTYPES, f"dtype {dtype!r}, expected one of {', '.join(DTYPES)}")
+    if not _is_shape(shape):
         raise MalformedMessage(f"shape {shape!r:.100}")
     if not isinstance(data, bytes) or len(data) != math.prod(shape) * np.dtype(dtype).itemsize:
         raise MalformedMessage(f"data do not fill shape {shape} of {dtype}")
@@ -102,32 +133,19 @@ def pack_observation(observed: Any) -> Message:
 
 
 def unpack_observation(given: Any, batch: int) -> Any:
-    """Return the observations in a map that `pack_observation` made.
-
-    Raises:
-        MalformedMessage: It is not of that form, or has another number of rows.
-    """
+    """Return the observations of a number of rows in a map that `pack_observation` made."""
     named = isinstance(given, dict) and set(given) == {"parts"}
     parts = given["parts"] if named else {"": given}
     if not isinstance(parts, dict) or not parts or not all(isinstance(name, str) for name in parts):
         raise MalformedMessage("parts is a map from names to arrays")
     arrays = {name: unpack_array(part) for name, part in parts.items()}
     for part in arrays.values():
-        if part.ndim < 2 or len(part) != batch:
-            raise MalformedMessage(f"expected observations of {batch} rows, got shape {part.shape}")
+        rows = part.ndim >= 2 and len(part) == batch
+        _demand(rows, f"expected observations of {batch} rows, got shape {part.shape}")
     return arrays if named else arrays[""]
 
 
-def is_count(value: object, most: int = MAX_COUNT) -> TypeGuard[int]:
-    """Return whether a value is an integer from 0 to most; a bool is none."""
-    return isinstance(value, int) and not isinstance(value, bool) and 0 <= value <= most
-
-
-def is_shape(value: object, most: int = MAX_BYTES) -> TypeGuard[list[int]]:
-    """Return whether a value is a list of sizes with a product of at most `most`."""
-    if not isinstance(value, list) or len(value) > _MAX_AXES or not all(is_count(size, most) for size in value):
-        return False
-    return math.prod(value) <= most
+# --- spaces --------------------------------------------------------------------------------------
 
 
 def encode_space(space: Any) -> Message | None:
@@ -146,15 +164,11 @@ def _encode_bound(values: NDArray[Any]) -> Any:
     """Return a bound as one number if all entries are equal, as a list, or as None if there are too many entries."""
     if values.size and (values == values.flat[0]).all():
         return float(values.flat[0])
-    return values.ravel().tolist() if values.size <= MAX_BOUNDS else None
+    return values.ravel().tolist() if values.size <= _MAX_BOUNDS else None
 
 
 def decode_space(given: Any) -> spaces.Space[Any] | None:
-    """Return the space in a map that `encode_space` made; None if there is none.
-
-    Raises:
-        MalformedMessage: It is not of that form.
-    """
+    """Return the space in a map that `encode_space` made; None if there is none."""
     try:
         return _decode_space(given, nested=False)
     except Exception as error:  # the server may have sent anything
@@ -166,30 +180,44 @@ def _decode_space(given: Any, nested: bool) -> spaces.Space[Any] | None:
     if given is None:
         return None
     if "parts" in given:
-        if nested:
-            raise MalformedMessage("parts of parts")
+        _demand(not nested, "parts of parts")
         parts = {name: _decode_space(part, nested=True) for name, part in given["parts"].items()}
         if not parts or None in parts.values():
             return None
         return spaces.Dict({name: part for name, part in parts.items() if part is not None})
     if "n" in given:
-        if not is_count(given["n"]):
-            raise MalformedMessage("n is a whole number")
+        _demand(is_count(given["n"]), "n is a whole number")
         return spaces.Discrete(given["n"])
     shape = given["shape"]
-    if not is_shape(shape, MAX_ENTRIES):
+    if not _is_shape(shape, _MAX_ENTRIES):
         raise MalformedMessage(f"shape {shape!r:.50}")
     dtype: Any = np.uint8 if given.get("dtype") == "|u1" else np.float32
     widest = (0, 255) if dtype == np.uint8 else (-np.inf, np.inf)
-    low, high = (
-        _decode_bound(given.get(end), shape, limit) for end, limit in zip(("low", "high"), widest, strict=True)
-    )
-    return spaces.Box(low.clip(*widest).astype(dtype), high.clip(*widest).astype(dtype), dtype=dtype)
+    bounds = (_decode_bound(given.get(end), shape, limit) for end, limit in zip(("low", "high"), widest, strict=True))
+    low, high = (bound.clip(*widest).astype(dtype) for bound in bounds)
+    return spaces.Box(low, high, dtype=dtype)
 
 
 def _decode_bound(given: Any, shape: list[int], limit: float) -> NDArray[np.float64]:
     """Return a bound for every entry, shape `shape`."""
     bound = np.asarray(limit if given is None else given, dtype=np.float64)
-    if np.isnan(bound).any():
-        raise MalformedMessage("a bound is NaN")
+    _demand(not np.isnan(bound).any(), "a bound is NaN")
     return bound.reshape(shape) if bound.ndim else np.full(shape, bound)
+
+
+# --- secrets -------------------------------------------------------------------------------------
+
+
+@functools.cache
+def derive_server_keys(secret: bytes) -> tuple[bytes, bytes]:
+    """Return the server's public and secret key, 40 letters of Z85 each."""
+    if not zmq.has("curve"):
+        raise ValueError("A secret needs a ZeroMQ with CURVE, which this one lacks: install another pyzmq.")
+    scrypted = hashlib.scrypt(secret, salt=b"rare-envs ego server", n=2**14, r=8, p=1, dklen=32)
+    private = z85.encode(scrypted)
+    return zmq.curve_public(private), private
+
+
+def read_secret() -> bytes | None:
+    """Return the shared secret from the environment; None without one."""
+    return os.environ.get(SECRET_VARIABLE, "").encode() or None

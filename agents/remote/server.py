@@ -8,6 +8,7 @@ is the program of the process in which `process:EGO` answers: it connects to ADD
 
 from __future__ import annotations
 
+import contextlib
 import ipaddress
 import json
 import os
@@ -24,8 +25,7 @@ import numpy as np
 import zmq
 
 from agents.remote import protocol
-from agents.remote.link import SECRET_VARIABLE, Socket, derive_server_keys
-from agents.remote.protocol import MalformedMessage, Message
+from agents.remote.protocol import SECRET_VARIABLE, MalformedMessage, Message, Socket, derive_server_keys, is_count
 from rare_envs.egos.errors import EgoGone, is_policy, reason_of
 from rare_envs.threads import use_one_thread
 
@@ -33,9 +33,9 @@ MAX_CLIENTS, MAX_SESSIONS = 64, 1024
 """Connections, and sessions of all of them, that are remembered; the least recently used makes room."""
 MAX_MEMORY = 2**28
 """Bytes of the memory of the ego that are kept for all sessions; the least recently used ones make room."""
-QUEUED_MESSAGES = 4
+_QUEUED_MESSAGES = 4
 """Messages of a connection that ZeroMQ keeps in each direction; a client has one request under way."""
-POLL_INTERVAL = 100
+_POLL_INTERVAL = 100
 """Time after which the server looks whether it is to stop [ms]."""
 
 
@@ -49,14 +49,11 @@ class RequestRefused(Exception):
 
 @dataclass
 class _Session:
-    """One batch of episodes."""
+    """One batch of episodes: its rows, its next tick, and the state of the ego after the last one."""
 
     batch: int
-    """Number of rows."""
     step: int = 0
-    """Next tick."""
     memory: Any = None
-    """State of the ego after the last tick."""
     size: int = 0
     """Bytes of the memory."""
 
@@ -65,12 +62,7 @@ class RequestHandler:
     """Answers requests for an ego, whatever they contain."""
 
     def __init__(self, ego: Any, name: str = "ego") -> None:
-        """Make a handler.
-
-        Args:
-            ego: Has `predict`; its `observation_space`, `action_space` and `deterministic` are sent if it has them.
-            name: Name of the ego, which clients are told.
-        """
+        """Make a handler for an ego, whose name clients are told."""
         self._ego, self._name = ego, name
         self._last_ids: OrderedDict[bytes, int] = OrderedDict()
         self._sessions: OrderedDict[tuple[bytes, int], _Session] = OrderedDict()
@@ -82,16 +74,11 @@ class RequestHandler:
         }
 
     def handle(self, connection: bytes, content: bytes) -> bytes:
-        """Return the answer to a request; there always is one, if only an error.
-
-        Args:
-            connection: Identifies the connection that the request came on.
-            content: The request.
-        """
+        """Return the answer to a request that came on a connection; there always is one, if only an error."""
         number = None
         try:
             message = protocol.unpack(content)
-            number = message.get("id") if protocol.is_count(message.get("id")) else None
+            number = message.get("id") if is_count(message.get("id")) else None
             if number is None:
                 raise MalformedMessage("id is a whole number")
             answer = self._hello if message.get("type") == "hello" else self._answer
@@ -107,7 +94,7 @@ class RequestHandler:
     def _hello(self, connection: bytes, message: Message) -> Message:
         """Begin a connection, and describe the ego."""
         version = message.get("protocol")
-        if not protocol.is_count(version) or version != protocol.PROTOCOL:
+        if not is_count(version) or version != protocol.PROTOCOL:
             raise RequestRefused("version", f"This server speaks protocol {protocol.PROTOCOL}, not {version!r:.50}.")
         self._forget(connection)
         self._last_ids[connection] = message["id"]
@@ -133,13 +120,12 @@ class RequestHandler:
 
     def _answer(self, connection: bytes, message: Message) -> Message:
         """Answer a request that comes after the hello."""
-        last = self._last_ids.get(connection)
+        last, kind = self._last_ids.get(connection), message.get("type")
         if last is None:
             raise RequestRefused("hello", "Expected a hello first.")
         if message["id"] <= last:
             raise RequestRefused("malformed", f"Expected an id above {last}, got {message['id']}.")
         self._last_ids[connection] = message["id"]
-        kind = message.get("type")
         if not isinstance(kind, str) or kind not in self._actions:
             raise RequestRefused("unknown", f"Unknown type {kind!r:.50}; expected hello, {', '.join(self._actions)}.")
         return self._actions[kind](connection, message)
@@ -147,7 +133,7 @@ class RequestHandler:
     def _reset(self, connection: bytes, message: Message) -> Message:
         """Begin a session."""
         batch, number = message.get("batch"), message.get("session")
-        if not protocol.is_count(batch, protocol.MAX_BATCH) or not batch or not protocol.is_count(number):
+        if not is_count(batch, protocol.MAX_BATCH) or not batch or not is_count(number):
             raise MalformedMessage(f"reset has a session (a number) and a batch from 1 to {protocol.MAX_BATCH}")
         self._sessions.pop((connection, number), None)
         self._sessions[connection, number] = _Session(batch)
@@ -157,7 +143,7 @@ class RequestHandler:
     def _act(self, connection: bytes, message: Message) -> Message:
         """Query the ego for one tick of a session."""
         number, step = message.get("session"), message.get("step")
-        session = self._sessions.get((connection, number)) if protocol.is_count(number) else None
+        session = self._sessions.get((connection, number)) if is_count(number) else None
         if number is None or session is None or step != session.step or isinstance(step, bool):
             reason = "Unknown session or another step; reset it and send its observations again."
             raise RequestRefused("session", reason)
@@ -179,7 +165,7 @@ class RequestHandler:
         except (Exception, SystemExit, EgoGone) as error:  # the ego is the user's: anything may happen in it
             del self._sessions[connection, number]
             raise RequestRefused("ego", reason_of(error)) from error
-        session.memory, session.step, session.size = memory, session.step + 1, measure_bytes(memory)
+        session.memory, session.step, session.size = memory, session.step + 1, _measure_bytes(memory)
         self._sessions.move_to_end((connection, number))
         self._make_room()
         return {"type": "action", "action": packed, "memory": memory is not None}
@@ -193,23 +179,21 @@ class RequestHandler:
     def _end(self, connection: bytes, message: Message) -> Message:
         """Forget a session."""
         number = message.get("session")
-        if protocol.is_count(number):
+        if is_count(number):
             self._sessions.pop((connection, number), None)
         return {"type": "ended"}
 
 
-def measure_bytes(memory: Any) -> int:
+def _measure_bytes(memory: Any) -> int:
     """Return the bytes of the arrays in what an ego remembers, and about those of other objects."""
     own = sys.getsizeof(memory)
-    if isinstance(memory, dict):
-        return own + sum(measure_bytes(value) for value in memory.values())
-    if isinstance(memory, tuple | list):
-        return own + sum(map(measure_bytes, memory))
+    if isinstance(memory, dict | tuple | list):
+        return own + sum(map(_measure_bytes, memory.values() if isinstance(memory, dict) else memory))
     n_bytes = getattr(memory, "nbytes", 0)  # of NumPy and torch; the memory is the ego's
     return max(own, n_bytes) if isinstance(n_bytes, int) else own
 
 
-class EgoServer:
+class EgoServer(contextlib.AbstractContextManager["EgoServer"]):
     """Answers requests for an ego, one after the other; docs/egos.md has the messages.
 
     Attributes:
@@ -247,10 +231,9 @@ class EgoServer:
             raise ValueError(
                 f"Listening on {bind!r} lets others in: set a shared secret ({SECRET_VARIABLE}), or bind to 127.0.0.1."
             )
-        self._handler = RequestHandler(ego, name)
-        self._stop = threading.Event()
+        self._handler, self._stop = RequestHandler(ego, name), threading.Event()
         self._context: zmq.Context[Socket] = zmq.Context()
-        self._socket = make_router(self._context)
+        self._socket = _make_router(self._context)
         try:
             if secret:
                 self._socket.curve_publickey, self._socket.curve_secretkey = derive_server_keys(secret)
@@ -267,7 +250,7 @@ class EgoServer:
     def run(self) -> None:
         """Answer until `stop` is called."""
         while not self._stop.is_set():
-            answer_next(self._socket, self._handler.handle)
+            _answer_next(self._socket, self._handler.handle)
 
     def stop(self) -> None:
         """End `run` from another thread."""
@@ -277,33 +260,27 @@ class EgoServer:
         """Stop listening."""
         self._context.destroy(0)
 
-    def __enter__(self) -> EgoServer:
-        """Return the server."""
-        return self
-
     def __exit__(self, *_: object) -> None:
         """Stop listening."""
         self.close()
 
 
-def make_router(context: zmq.Context[Socket]) -> Socket:
+def _make_router(context: zmq.Context[Socket]) -> Socket:
     """Return a socket for requests, of bounded messages and queues."""
     router = context.socket(zmq.ROUTER)
     router.setsockopt(zmq.MAXMSGSIZE, protocol.MAX_BYTES)
     router.setsockopt(zmq.LINGER, 0)
-    router.setsockopt(zmq.RCVHWM, QUEUED_MESSAGES)
-    router.setsockopt(zmq.SNDHWM, QUEUED_MESSAGES)
+    router.setsockopt(zmq.RCVHWM, _QUEUED_MESSAGES)
+    router.setsockopt(zmq.SNDHWM, _QUEUED_MESSAGES)
     return router
 
 
-def answer_next(router: Socket, handle: Callable[[bytes, bytes], bytes]) -> None:
+def _answer_next(router: Socket, handle: Callable[[bytes, bytes], bytes]) -> None:
     """Answer one request, if one comes soon."""
-    if not router.poll(POLL_INTERVAL):
-        return
-    connection, *frames = router.recv_multipart()
-    envelope = [b""] if len(frames) > 1 and frames[0] == b"" else []  # of REQ, which DEALER may leave out
-    content = frames[-1] if len(frames) == len(envelope) + 1 else b""  # several frames are no message
-    router.send_multipart([connection, *envelope, handle(connection, content)])  # to nobody, if the client has gone
+    if router.poll(_POLL_INTERVAL):
+        connection, *frames = router.recv_multipart()
+        delimiter, content = protocol.open_envelope(frames)
+        router.send_multipart([connection, *delimiter, handle(connection, content)])  # to nobody, if it has gone
 
 
 def is_loopback(address: str) -> bool:
@@ -311,10 +288,8 @@ def is_loopback(address: str) -> bool:
     if address.startswith(("ipc://", "inproc://")):
         return True
     host = address.removeprefix("tcp://").rpartition(":")[0].strip("[]")
-    if host == "localhost":
-        return True
     try:
-        return ipaddress.ip_address(host).is_loopback
+        return host == "localhost" or ipaddress.ip_address(host).is_loopback
     except ValueError:
         return False
 
@@ -323,19 +298,14 @@ def is_loopback(address: str) -> bool:
 
 
 def main(address: str, arguments: str) -> None:
-    """Load an ego and answer for it, as long as the process that started this one is there.
-
-    Args:
-        address: Of the socket to connect to.
-        arguments: Of `agents.load_ego`, as JSON.
-    """
+    """Load an ego and answer for it, as long as the process that started this one is there."""
     parent = os.getppid()
     with use_one_thread():
         handle = _load_handler(arguments)
-        router = make_router(zmq.Context.instance())
+        router = _make_router(zmq.Context.instance())
         router.connect(address)
         while os.getppid() == parent:
-            answer_next(router, handle)
+            _answer_next(router, handle)
     shutil.rmtree(Path(address.removeprefix("ipc://")).parent, ignore_errors=True)  # which nobody else will remove
 
 

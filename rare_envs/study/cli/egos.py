@@ -194,7 +194,7 @@ def serve_ego_command(
     from rare_envs.egos.errors import is_policy
 
     try:
-        from agents.remote.link import read_secret
+        from agents.remote.protocol import read_secret
         from agents.remote.server import EgoServer
     except ImportError as error:
         raise BadInput("Serving needs pyzmq and msgpack: pip install 'rare-envs[remote]'.") from error

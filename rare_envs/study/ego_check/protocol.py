@@ -21,8 +21,8 @@ def check_protocol(spec: str) -> Iterator[Finding]:
     """Check a server."""
     try:
         from agents.remote import protocol
-        from agents.remote.client import TIMEOUT, parse_address
-        from agents.remote.link import LinkError, ServerLink, read_secret
+        from agents.remote.client import TIMEOUT, LinkError, ServerLink, parse_address
+        from agents.remote.protocol import read_secret
     except ImportError:
         yield report_failure("protocol", "pyzmq and msgpack are not installed", "pip install 'rare-envs[remote]'")
         return

@@ -1,17 +1,20 @@
+"""Lane changes: when they begin, their course, and the driver that has them."""
+
 import math
-from dataclasses import replace
+from dataclasses import fields, replace
 from itertools import pairwise
 
 import pytest
 import torch
 
-from agents import load_driver, read_driver, read_provenance, save_driver
+from agents import load_driver
 from agents.learned.driver import EASED_BEYOND
 from agents.learned.rules import (
     LEFT_MARKER_COLUMN,
     RIGHT_MARKER_COLUMN,
     STATE_SIZE,
     ChangeState,
+    CollisionAvoidance,
     LaneChanges,
     patience_of,
 )
@@ -50,12 +53,6 @@ def drive(state, seconds, changes=CHANGES, speed=20.0, y=0.0, heading=0.0, beams
         yield 0.1 * tick, y, heading, state
         y += speed * math.sin(heading) * 0.1
         heading += 0.1 * float(action.yaw_rate) * bool(action.changing)
-
-
-def test_patience_is_exponentially_distributed():
-    patience = patience_of(torch.randn(200_000, generator=torch.Generator().manual_seed(0)))
-    for q in (0.5, 1.0, 3.0):
-        assert float((patience > q).float().mean()) == pytest.approx(math.exp(-q), abs=5 * 0.5 / math.sqrt(200_000))
 
 
 @pytest.mark.parametrize("side", [-1, 1])
@@ -105,12 +102,6 @@ def test_no_change_begins_and_no_patience_is_used_if(why, beams, speed):
     assert state.patience.flatten().tolist() == [0.1, 0.1], why
 
 
-def test_a_lane_is_remembered_for_a_while():
-    _, state = CHANGES.step(on_lane(**OTHERS), begin(left=99.0, right=99.0), None)
-    waited = [float(state.patience[..., 1]) for _, _, _, state in drive(state, 15.0, beams={})]
-    assert waited[-1] == pytest.approx(99.0 - HAZARD * CHANGES.remembered, abs=2 * HAZARD * 0.1)
-
-
 def test_whoever_is_ahead_in_the_new_lane_is_kept_off_until_the_line():
     ahead = {"range_18": 13.0, "rate_18": -1.0} | {"range_m36": 11.0}
     action, state = CHANGES.step(on_lane(**ahead), begin(right=0.0), None)
@@ -143,12 +134,6 @@ def test_who_is_over_the_line_far_enough_has_a_lane_there_that_nobody_shows():
     for over_line, side in ((0.4, 0), (0.2, 1)):
         _, state = replace(CHANGES, over_line=over_line).step(moving, begin(), None)
         assert int(state.side) == side
-
-
-def test_who_looks_further_ahead_takes_slower_motion_for_a_change():
-    moving = on_lane(0.5, 0.58 / 20.0, **OTHERS)  # the middle reaches the line in 2.24 s
-    for foresight, side in ((2.1, 0), (2.4, 1)):
-        assert int(replace(CHANGES, foresight=foresight).step(moving, begin(), None)[1].side) == side
 
 
 def test_whoever_is_nearly_over_the_line_is_changing_into_any_lane():
@@ -194,12 +179,6 @@ def test_there_is_room_to_the_line_where_no_lane_is_known():
     assert action.room.flatten().tolist() == [MAX_RANGE, MAX_RANGE]  # in a change
 
 
-def test_behind_a_line_the_lane_that_was_left_is_known_and_the_other_side_is_not():
-    _, state = CHANGES.step(on_lane(1.7, **OTHERS), begin(), None)
-    _, state = CHANGES.step(on_lane(-1.8), state, None)  # drifted over the line to the right
-    assert state.unseen.flatten().tolist() == [0.0, math.inf]
-
-
 def test_gradients_are_those_of_finite_differences():
     driver = replace(load_driver("mgail"), changes=CHANGES, policy=load_driver("mgail").policy.double())
     state = begin(right=0.0)
@@ -218,23 +197,6 @@ def test_gradients_are_those_of_finite_differences():
     for features, memory in cases:
         act = lambda values, memory=memory: driver.act(values, None, none, memory)[0]  # noqa: E731
         assert torch.autograd.gradcheck(act, features.requires_grad_(), atol=1e-4)
-
-
-def test_states_are_packed_and_unpacked():
-    memory = torch.randn(2, 3, STATE_SIZE)
-    assert torch.equal(ChangeState.unpack(memory).pack(), memory)
-
-
-@pytest.mark.parametrize("value", [0.0, -1.0, math.nan, math.inf, True, "2"])
-def test_settings_are_positive_numbers(value):
-    with pytest.raises(ValueError, match="Expected duration of the lane changes above 0"):
-        LaneChanges(duration=value)
-
-
-@pytest.mark.parametrize("coefficients", [(1.0, 2.0), (0.0, 0.0, 0.0, 0.0, math.nan)])
-def test_there_is_a_finite_coefficient_of_each_covariate(coefficients):
-    with pytest.raises(ValueError, match="Expected 5 finite coefficients of the hazard"):
-        LaneChanges(coefficients=coefficients)
 
 
 # --- the driver ----------------------------------------------------------------------------------
@@ -287,20 +249,6 @@ def test_hard_braking_is_eased_but_for_the_rule():
         replace(plain, hard_braking=0.0)
 
 
-def test_lane_changes_need_the_rule():
-    driver = load_driver("mgail")
-    with pytest.raises(ValueError, match="Expected a rule of collision avoidance beside the lane changes"):
-        replace(driver, avoidance=None)
-
-
-def test_lane_changes_are_read_from_the_file(tmp_path):
-    driver = replace(load_driver("mgail"), changes=CHANGES, hard_braking=0.9)
-    path = save_driver(driver, read_provenance("agents/data/mgail.safetensors"), tmp_path / "mine.safetensors")
-    read = read_driver(path)
-    assert (read.changes, read.hard_braking, read.colour) == (CHANGES, 0.9, driver.colour)
-    assert read.colour.balanced
-
-
 def test_who_is_slow_takes_longer_and_keeps_its_heading_small():
     path = list(drive(begin(right=0.0), 9.0, speed=4.0))
     changing = [time for time, _, _, state in path if state.side != 0]
@@ -320,3 +268,14 @@ def test_a_change_does_not_end_before_it_goes_along_the_lane_again():
             on_lane(heading=heading, **OTHERS), state._replace(share=0.0 * state.share + share), None
         )
         assert bool(after.side == 1) == goes_on
+
+
+@pytest.mark.parametrize("kind", [CollisionAvoidance, LaneChanges])
+def test_settings_are_positive_numbers(kind):
+    name = fields(kind)[3].name
+    for value in (0.0, -1.0, math.nan, math.inf, True, "2"):
+        with pytest.raises(ValueError, match=f"Expected {name} of the .* above 0"):
+            kind(**{name: value})
+    for coefficients in ((1.0, 2.0), (0.0, 0.0, 0.0, 0.0, math.nan)):
+        with pytest.raises(ValueError, match="Expected 5 finite coefficients of the hazard"):
+            LaneChanges(coefficients=coefficients)

@@ -11,8 +11,7 @@ import pytest
 
 pytest.importorskip("zmq", reason="the extra remote is optional")
 pytest.importorskip("msgpack", reason="the extra remote is optional")
-from agents.remote.client import RemoteEgo
-from agents.remote.link import ServerLink
+from agents.remote.client import RemoteEgo, ServerLink
 from agents.remote.server import EgoServer
 from tests.agents.remote.egos import Braking, problem
 

@@ -1,13 +1,11 @@
-"""The protocol from another language: an ego and a client in JavaScript, without any package."""
+"""The protocol from another language: a client in JavaScript, without any package."""
 
 from __future__ import annotations
 
 import json
 import shutil
-import socket
 import subprocess
 import threading
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -15,10 +13,7 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 
-import rare_envs
-
 pytest.importorskip("zmq", reason="the extra remote is optional")
-from agents import load_ego
 from agents.remote.server import EgoServer
 
 NODE = shutil.which("node")
@@ -27,51 +22,11 @@ FOLDER = Path(__file__).parents[3] / "examples" / "remote"
 ENV = "rare_envs/CarFollowing-v0"
 
 
-@pytest.fixture(scope="module")
-def address() -> Iterator[str]:
-    """Of the ego in JavaScript."""
-    process = subprocess.Popen([str(NODE), str(FOLDER / "ego.mjs"), "0"], stdout=subprocess.PIPE, text=True)
-    with process:
-        assert process.stdout is not None
-        yield process.stdout.readline().strip()
-        process.kill()
-
-
 class Same:
-    """What ego.mjs decides, again."""
-
     def predict(self, observation: Any, **_: Any) -> Any:
         speed, y, heading, gap, relative = observation[:, :5].astype(np.float64).T
         wanted = 0.5 * (50 * gap - 1.5 * 30 * speed) + 10 * relative
         return np.stack((wanted / 5, -0.2 * y - 0.5 * heading), axis=1).clip(-1, 1).astype(np.float32), None
-
-
-def test_an_ego_in_javascript_drives(address: str) -> None:
-    ego = load_ego(f"{address}?timeout=20&patience=20")
-    assert ego.name == "javascript"
-    problems = [rare_envs.DrivingProblem(ENV, ego=each) for each in (ego, Same())]
-    x = problems[0].base.sample(50, np.random.default_rng(0))
-    f = [problem.evaluate(x) for problem in problems]
-    np.testing.assert_array_equal(f[0], f[1])
-    assert len(np.unique(f[0])) > 10
-    ego.close()
-
-
-def test_noise_does_not_end_it(address: str) -> None:
-    host, port = address.removeprefix("tcp://").split(":")
-    for content in (b"GET / HTTP/1.1\r\n\r\n" * 9, np.random.default_rng(0).bytes(500), b"\xff" + bytes(8) + b"\x7f"):
-        with socket.create_connection((host, int(port)), timeout=5.0) as raw:
-            raw.sendall(content)
-    ego = load_ego(f"{address}?timeout=20&patience=20")
-    assert ego.predict(np.ones((2, 7), np.float32))[0].shape == (2, 2)
-    ego.close()
-
-
-def test_several_kinds_of_observations_come_by_name(address: str) -> None:
-    ego = load_ego(f"{address}?timeout=20&patience=20")
-    seen = {"camera": np.zeros((2, 4, 6, 3), np.uint8), "features": np.full((2, 7), 0.5, np.float32)}
-    np.testing.assert_array_equal(ego.predict(seen)[0], Same().predict(seen["features"])[0])
-    ego.close()
 
 
 class SameWithCamera(Same):

@@ -16,12 +16,10 @@ import pytest
 import stable_baselines3 as sb3
 import torch
 from gymnasium import spaces
-from gymnasium.wrappers import FrameStackObservation
 from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecNormalize
 
 import rare_envs
 from agents import Ego, SavedEgo, load_ego
-from rare_envs.egos.wrappers import FrameStackedPolicy, find_stacking
 
 contrib = pytest.importorskip("sb3_contrib", reason="sb3-contrib is optional")
 ENV = "rare_envs/CarFollowing-v0"
@@ -60,7 +58,6 @@ ALGORITHMS = {
     "ppo": (sb3.PPO, "MlpPolicy", {}),
     "ppo with gSDE, squashed": (sb3.PPO, "MlpPolicy", {"use_sde": True, "policy_kwargs": {"squash_output": True}}),
     "a2c": (sb3.A2C, "MlpPolicy", {"policy_kwargs": {"activation_fn": torch.nn.ReLU}}),
-    "a2c with Adam": (sb3.A2C, "MlpPolicy", {"use_rms_prop": False}),
     "sac": (sb3.SAC, "MlpPolicy", OFF_POLICY),
     "td3": (sb3.TD3, "MlpPolicy", OFF_POLICY),
     "ddpg": (sb3.DDPG, "MlpPolicy", OFF_POLICY),
@@ -233,42 +230,6 @@ def test_wrappers_of_the_training_are_put_back(wrapping: str, tmp_path: Path) ->
     assert_same_drives(load(tmp_path / "ego.zip"), model, env)
 
 
-def test_gymnasiums_frames_have_an_axis_of_their_own(tmp_path: Path) -> None:
-    env = one_env(lambda env: FrameStackObservation(env, 4))
-    model = untrained("ppo", env)
-    assert model.observation_space.shape == (4, FEATURES)
-    assert_same_drives(model, model, env)
-
-
-@pytest.mark.parametrize(
-    ("wanted", "found"),
-    [
-        ((7,), (1, False)),
-        ((21,), (3, False)),
-        ((3, 7), (3, True)),
-        ((20,), None),
-        ((0,), None),
-        ((7, 3), None),
-        ((), None),
-    ],
-)
-def test_the_number_of_frames_is_read_from_the_shapes(wanted: tuple[int, ...], found: Any) -> None:
-    assert find_stacking((7,), wanted) == found
-
-
-def test_frames_of_one_row_begin_anew_where_its_episode_does() -> None:
-    class Echo:
-        def predict(self, observation: Any, state: Any, episode_start: Any, deterministic: bool) -> Any:
-            return observation, state
-
-    stacked, state = FrameStackedPolicy(Echo(), 2), None
-    starts = [[True, True], [False, False], [False, True]]
-    for tick, start in enumerate(starts):
-        observation = np.array([[10.0 + tick], [20.0 + tick]])
-        shown, state = stacked.predict(observation, state, np.array(start), True)
-    np.testing.assert_array_equal(shown, [[11.0, 12.0], [0.0, 22.0]])
-
-
 # --- files that are no egos, or that would run code -----------------------------------------------
 
 
@@ -278,33 +239,15 @@ def refuse(path: Path, said: str, **options: Any) -> None:
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize(
-    ("members", "said"),
-    [
-        ({}, "not a Stable-Baselines3 model"),
-        ({"data": "{}", "policy.pth": ""}, "not a Stable-Baselines3 model"),
-        ({"data": "[1]", "policy.pth": ""}, "not a Stable-Baselines3 model"),
-        ({"data": "{", "policy.pth": ""}, "is damaged"),
-        ({"data": "[" * 100_000, "policy.pth": ""}, "is damaged"),
-    ],
-)
-def test_other_archives_are_refused(members: dict[str, str], said: str, tmp_path: Path) -> None:
-    with zipfile.ZipFile(tmp_path / "ego.zip", "w") as archive:
-        for name, content in members.items():
-            archive.writestr(name, content)
-    refuse(tmp_path / "ego.zip", said)
-
-
 def test_damaged_files_are_refused_in_one_line(tmp_path: Path) -> None:
     path = saved(tmp_path)
     refuse(rewrite(path, tmp_path / "broken.zip", {"policy.pth": b"not weights"}), r"Cannot load .*broken\.zip' as PPO")
     other = saved(tmp_path, env=Still(features=FEATURES + 1))
     weights = zipfile.ZipFile(other).read("policy.pth")
     refuse(rewrite(saved(tmp_path), tmp_path / "mixed.zip", {"policy.pth": weights}), "Cannot load .* as PPO")
-    content = path.read_bytes()
-    for cut in (0.0, 0.3, 0.9, 0.999):
-        path.write_bytes(content[: int(len(content) * cut)])
-        refuse(path, r"ego\.zip' is (not a zip file|damaged|a zip file but not)")
+    with zipfile.ZipFile(tmp_path / "other.zip", "w") as archive:
+        archive.writestr("mine.txt", "")
+    refuse(tmp_path / "other.zip", "not a Stable-Baselines3 model")
     (tmp_path / "folder.zip").mkdir()
     refuse(tmp_path / "folder.zip", "got the folder")
 
@@ -316,36 +259,6 @@ def test_an_archive_that_would_fill_the_memory_is_not_unpacked(tmp_path: Path) -
         archive.writestr("policy.pth", bytes(65 * 2**20))
     for trust in (False, True):
         refuse(path, r"would unpack from 0\.\d to 68 MB", trust=trust)
-
-
-class Hostile:
-    """What a pickle can do: call anything when it is opened."""
-
-    def __reduce__(self) -> Any:
-        return os.mkdir, (self.path,)
-
-    def __init__(self, path: Path) -> None:
-        self.path = str(path)
-
-
-@pytest.mark.parametrize("entry", ["policy_kwargs", "observation_space", "policy_class", "env"])
-def test_a_hostile_zip_is_refused_and_runs_nothing(entry: str, tmp_path: Path) -> None:
-    mark = tmp_path / "was_here"
-    code = base64.b64encode(pickle.dumps(Hostile(mark))).decode()
-    path = change_settings(saved(tmp_path), **{entry: {":serialized:": code}})
-    refuse(path, rf"Will not load .*zip.*in its '{entry}' it asks for posix\.mkdir", algo="ppo")
-    assert not mark.exists()
-
-
-def test_names_that_lead_out_of_an_archive_lead_nowhere(tmp_path: Path) -> None:
-    inside = tmp_path / "inside"
-    inside.mkdir()
-    path = saved(inside)
-    with zipfile.ZipFile(path, "a") as archive:
-        archive.writestr("../outside.txt", b"x")
-        archive.writestr("/outside.txt", b"x")
-    load_ego(path)
-    assert [entry.name for folder in (tmp_path, inside) for entry in folder.iterdir()] == ["inside", "ego.zip"]
 
 
 def test_what_saved_models_hold_survives(tmp_path: Path) -> None:
