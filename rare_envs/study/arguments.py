@@ -1,16 +1,20 @@
-"""Arguments of an evaluation, each written once: options, keys of YAML files and study.json follow from these fields.
+"""Arguments of an evaluation, each written once: options, keys of YAML files, study.json and their table follow.
 
-Importing this takes milliseconds, so that the command line starts without torch.
+`python -m rare_envs.study.arguments` prints the table. Importing this takes milliseconds, so that the command line
+starts without torch.
 """
 
 from __future__ import annotations
 
+import contextlib
 import inspect
 import reprlib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import Field, dataclass, field, fields
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
+from rare_envs.plugins import did_you_mean
 from rare_envs.scenarios.registry import find_scenario, split_layout
 from rare_envs.study.errors import BadInput
 
@@ -18,18 +22,15 @@ if TYPE_CHECKING:
     from samplers import Executor, RunArguments, Stepping
     from samplers.validation import OnError
 
-GIB = 2.0**30
 EXECUTORS = ("local", "ray")
-_JSON_TYPES: dict[str, tuple[type, ...]] = {
-    "str": (str,),
-    "int": (int,),
-    "float": (int, float),
-    "bool": (bool,),
-    "None": (type(None),),
+_KINDS: dict[str, tuple[tuple[type, ...], str]] = {
+    "str": ((str,), "a text"),
+    "int": ((int,), "a whole number"),
+    "float": ((int, float), "a number"),
+    "bool": ((bool,), "true or false"),
+    "None": ((type(None),), "null"),
 }
-"""Names in the annotations of fields to types in JSON."""
-_TYPE_WORDS = {"str": "a text", "int": "a whole number", "float": "a number", "bool": "true or false", "None": "null"}
-"""What the messages call them."""
+"""Words in the annotations of fields to types in JSON, and to what messages call them."""
 
 
 def argument(default: Any, help: str, **about: Any) -> Any:
@@ -124,6 +125,14 @@ class Question:
         """The arguments of `samplers.estimate`."""
         from samplers.run import RunArguments
 
+        confidence = RunArguments.confidence
+        if self.max_p is not None:
+            if not 0.0 < self.max_p < 1.0:
+                raise ValueError(f"Expected max_p above 0 and below 1, got {self.max_p!r}.")
+            one_sided = self.gate_confidence
+            if not 0.5 < one_sided < 1.0:
+                raise ValueError(f"Expected a one-sided confidence above 0.5 and below 1, got {one_sided!r}.")
+            confidence = round(2.0 * one_sided - 1.0, 12)  # 0.9, where floating point has 0.8999999999999999
         return RunArguments(
             gamma=self.gamma,
             seed=self.seed,
@@ -131,17 +140,8 @@ class Question:
             target_cov=self.target_cov,
             replicates=self.replicates,
             on_error=cast("OnError", self.on_error),
-            confidence=RunArguments.confidence if self.max_p is None else self._two_sided_confidence,
+            confidence=confidence,
         )
-
-    @property
-    def _two_sided_confidence(self) -> float:
-        """Coverage of an interval whose ends are at `gate_confidence` each."""
-        if not 0.0 < cast(float, self.max_p) < 1.0:
-            raise ValueError(f"Expected max_p above 0 and below 1, got {self.max_p!r}.")
-        if not 0.5 < self.gate_confidence < 1.0:
-            raise ValueError(f"Expected a one-sided confidence above 0.5 and below 1, got {self.gate_confidence!r}.")
-        return round(2.0 * self.gate_confidence - 1.0, 12)  # 0.9, where floating point has 0.8999999999999999
 
     def check(self) -> Stepping:
         """Return the method, after a check of all that is known before the ego is loaded, which takes seconds."""
@@ -184,7 +184,7 @@ class ExecutorOptions:
             raise ValueError("--address does not go with --executor local.")
         if self.memory_limit is not None and not 0.0 < self.memory_limit < float("inf"):
             raise ValueError(f"Expected --memory-limit to be a number of GiB above 0, got {self.memory_limit}.")
-        memory = None if self.memory_limit is None else self.memory_limit * GIB
+        memory = None if self.memory_limit is None else self.memory_limit * 2.0**30
         if self.executor == "ray":
             return samplers.RayCluster(self.address, self.workers, self.time_limit, memory_limit=memory)
         return samplers.LocalProcesses(self.workers, self.time_limit, memory)
@@ -200,6 +200,29 @@ def option_name(argument: Field[Any]) -> str:
     return str(argument.metadata.get("option", argument.name))
 
 
+def list_arguments() -> str:
+    """Return a Markdown table of all arguments: key, type, default and what it does."""
+    rows = ["| key | type | default | |", "|---|---|---|---|"]
+    for each in (*fields(Question), *fields(ExecutorOptions)):
+        kind = str(each.type).replace(" | ", " or ")
+        default = "" if not isinstance(each.default, str | float | int) else f"`{each.default}`"
+        rows.append(f"| `{option_name(each)}` | {kind} | {default} | {each.metadata['help']} |")
+    return "\n".join(rows)
+
+
+def join_question(given: Mapping[str, Any], env: str | None, options: Mapping[str, Any], typed: set[str]) -> Question:
+    """Return the question of a file and a command line."""
+    named = join_options(given, options, typed) | ({} if env is None else {"env_id": env})
+    if "env_id" not in named:
+        raise BadInput("Expected an environment: rare-envs estimate ENV, or env: ENV in the file of --config.")
+    return Question(**named)
+
+
+def join_options(given: Mapping[str, Any], options: Mapping[str, Any], typed: set[str]) -> dict[str, Any]:
+    """Return options by name: what was typed, else what a file gives, else the default."""
+    return {**options, **given, **{name: value for name, value in options.items() if name in typed}}
+
+
 def read_question(values: Any) -> Question:
     """Return the question that a file has, without the fields that this version does not know."""
     if not isinstance(values, dict) or "env_id" not in values:
@@ -212,8 +235,96 @@ def read_question(values: Any) -> Question:
 def check_types(known: Mapping[str, Field[Any]], values: Mapping[str, Any], where: str = "") -> None:
     """Raise a BadInput if a value is not of the type of its argument; `where` stands behind its name."""
     for name, argument in known.items():
-        words, value = str(argument.type).split(" | "), values[name]
-        types = tuple(kind for word in words for kind in _JSON_TYPES[word])
+        kinds, value = [_KINDS[word] for word in str(argument.type).split(" | ")], values[name]
+        types = tuple(kind for found, _ in kinds for kind in found)
         if not isinstance(value, types) or (isinstance(value, bool) and bool not in types):
-            wanted = " or ".join(_TYPE_WORDS[word] for word in words)
+            wanted = " or ".join(words for _, words in kinds)
             raise BadInput(f"Expected {name}{where} to be {wanted}, got {reprlib.repr(value)}.")
+
+
+MAX_QUESTION_BYTES = 2**20
+NOT_IN_FILES = ("trust",)
+"""Whoever asks decides whether code runs, not a file."""
+KEYS = {option_name(each): each for kind in (Question, ExecutorOptions) for each in fields(kind)}
+"""Keys, with - or _ between words, and the fields that they stand for."""
+_NULLS = dict.fromkeys(("null", "~", ""))
+_SWITCHES = {**dict.fromkeys(("true", "yes", "on"), True), **dict.fromkeys(("false", "no", "off"), False)}
+
+
+def read_question_file(path: Path) -> dict[str, Any]:
+    """Return the fields of `Question` and `ExecutorOptions` that a YAML file, which may be JSON, gives.
+
+    What a value is follows from its field: 1e6 is a whole number where one is wanted.
+    """
+    values: dict[str, Any] = {}
+    for key, node in _read_nodes(path):
+        name = key.replace("-", "_")
+        if name in NOT_IN_FILES:
+            raise BadInput(f"{str(path)!r} cannot say {key}: give --{key} on the command line.")
+        if name not in KEYS:
+            known = [each for each in KEYS if each not in NOT_IN_FILES]
+            hint = did_you_mean(name, known)
+            raise BadInput(f"{str(path)!r} has an unknown key {key!r}{hint}. It may have: {', '.join(known)}.")
+        if name in values:
+            raise BadInput(f"{str(path)!r} gives the same option twice.")
+        values[name] = _read_value(node, KEYS[name])
+    try:
+        check_types({name: KEYS[name] for name in values}, values)
+    except BadInput as error:
+        raise BadInput(f"{str(path)!r}: {error}") from error
+    return {KEYS[name].name: value for name, value in values.items()}
+
+
+def _read_nodes(path: Path) -> list[tuple[str, Any]]:
+    """Return the keys of a YAML file with their nodes; no object is made of any."""
+    import yaml
+
+    try:
+        if path.stat().st_size > MAX_QUESTION_BYTES:
+            raise BadInput(f"{str(path)!r} has more than {MAX_QUESTION_BYTES:,} bytes.")
+        node = yaml.compose(path.read_text(encoding="utf-8"), Loader=yaml.SafeLoader)
+    except OSError as error:
+        raise BadInput(f"Cannot read {str(path)!r}: {error.strerror}.") from error
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
+        raise BadInput(f"{str(path)!r} is no YAML: {error}") from error
+    if node is None:
+        raise BadInput(f"{str(path)!r} has no keys: expected lines like gamma: 0.0.")
+    pairs = node.value if isinstance(node, yaml.MappingNode) else None
+    if pairs is None or not all(isinstance(each, yaml.ScalarNode) for pair in pairs for each in pair):
+        raise BadInput(f"Expected {str(path)!r} to have lines like gamma: 0.0.")
+    keys = [key.value for key, _ in pairs]
+    for key in keys:
+        if keys.count(key) > 1:
+            raise BadInput(f"{str(path)!r} has the key {key!r} more than once.")
+    return [(key.value, value) for key, value in pairs]
+
+
+def _read_whole(text: str) -> int:
+    """Return a whole number, which may be written as 1e6."""
+    try:
+        return int(text)
+    except ValueError:
+        if (number := float(text)).is_integer():
+            return int(number)
+        raise
+
+
+_READERS: dict[str, Callable[[str], Any]] = {
+    "None": lambda text: _NULLS[text.lower()],
+    "bool": lambda text: _SWITCHES[text.lower()],
+    "int": _read_whole,
+    "float": float,
+}
+
+
+def _read_value(node: Any, argument: Field[Any]) -> Any:
+    """Return what a node stands for by the type of its argument; its text where it does not fit."""
+    kinds = str(argument.type).split(" | ") if node.style is None else []  # what is in quotes is a text
+    for kind in (kind for kind in _READERS if kind in kinds):
+        with contextlib.suppress(KeyError, ValueError):
+            return _READERS[kind](node.value)
+    return node.value
+
+
+if __name__ == "__main__":
+    print(list_arguments())

@@ -1,10 +1,12 @@
-"""Columns of x one by one: their names and units, and which are shown to a person."""
+"""Columns of x one by one: their names and units, which are shown to a person, and scenarios by their digests."""
 
 from __future__ import annotations
 
-from typing import NamedTuple
+import hashlib
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from rare_envs.distributions.space import ScenarioSpace
 from samplers.problem import FloatArray
@@ -13,6 +15,8 @@ MAX_SHOWN = 12
 """Blocks of more values than this, drivers' weights and noise, are summarised instead of shown."""
 ORDINARY_DRAWS = 4000
 """Scenarios drawn from the base distribution to show what is ordinary."""
+LONGEST_KEY = 64
+"""Bytes of a scenario that are its own digest."""
 
 
 class Column(NamedTuple):
@@ -51,3 +55,12 @@ def find_ordinary_range(values: FloatArray) -> tuple[FloatArray, FloatArray]:
 def format_value(value: float, places: int = 2) -> str:
     """Return a value with `places` decimals, or with two digits where these would be zeros (fog is 1e-4 per metre)."""
     return f"{value:.2g}" if 0.0 < abs(value) < 10.0**-places else f"{value:.{places}f}"
+
+
+def digest_scenarios(x: NDArray[Any]) -> list[bytes]:
+    """Return the digest of each of some scenarios x (n, d), in single precision, in which they are simulated."""
+    rows = np.ascontiguousarray(x, dtype=np.float32)
+    keys: list[bytes] = rows.view(f"V{4 * rows.shape[1]}").ravel().tolist()
+    if 4 * rows.shape[1] <= LONGEST_KEY:
+        return keys
+    return [hashlib.blake2b(key, digest_size=16).digest() for key in keys]

@@ -20,10 +20,9 @@ from numpy.typing import NDArray
 
 from rare_envs.distributions.space import ScenarioSpace
 from rare_envs.files import replace_file
-from rare_envs.study.columns import MAX_SHOWN
+from rare_envs.study.columns import MAX_SHOWN, digest_scenarios
 from rare_envs.study.run_folder import EPISODES
 from samplers.evaluate import Simulated
-from samplers.journal import digest_points
 from samplers.problem import FloatArray
 from samplers.result import Estimate
 from samplers.sample import SimulationRows
@@ -45,11 +44,6 @@ DRAFTED = ("f", "error", "seconds")
 """Columns beside x that are known while the run goes on."""
 
 
-def digest_scenario(x: NDArray[Any]) -> str:
-    """Return the digest of a scenario x (d,), in single precision, in which it is simulated."""
-    return digest_points(x.astype(np.float32))
-
-
 def name_columns(space: ScenarioSpace) -> dict[str, pa.DataType]:
     """Return the columns of x and their types: numbers by name, and blocks of many values as lists."""
     types: dict[str, pa.DataType] = {}
@@ -68,23 +62,24 @@ class EpisodeTable:
     The draft is a file without a name, which is gone when the process is.
 
     Args:
-        folder: Of the run.
+        folder: Of the run; None for no table.
         space: Of x.
 
     Attributes:
         lost: Why there is no table; "" as long as all is well.
     """
 
-    def __init__(self, folder: Path, space: ScenarioSpace) -> None:
+    def __init__(self, folder: Path | None, space: ScenarioSpace) -> None:
         self.lost = ""
         self._folder, self._columns = folder, name_columns(space)
         self._waiting: list[Simulated] = []
         self._rows = max(min(ROWS_AT_ONCE, BYTES_AT_ONCE // (8 * max(sum(space.sizes), 1))), 1)
         self._schema = pa.schema([*self._columns.items(), *((name, BEHIND_X[name]) for name in DRAFTED)])
         self._file: Any = None
-        with self._giving_up():
-            self._file = TemporaryFile(dir=folder)
-            self._writer = pa.ipc.new_stream(self._file, self._schema)
+        if folder is not None:
+            with self._giving_up():
+                self._file = TemporaryFile(dir=folder)
+                self._writer = pa.ipc.new_stream(self._file, self._schema)
 
     def add(self, seen: Simulated) -> None:
         """Add simulations."""
@@ -95,19 +90,12 @@ class EpisodeTable:
             with self._giving_up():
                 self._write_draft()
 
-    def write(self, estimate: Estimate, crashes: Mapping[str, str]) -> None:
-        """Write the table of a run that is done.
-
-        Args:
-            estimate: Its result.
-            crashes: Kinds of crash of failures that were driven again, by `digest_scenario`.
-        """
-        if self._file is None:
+    def write(self, estimate: Estimate, crashes: Mapping[bytes, str]) -> None:
+        """Write the table of a run that is done; kinds of crash of its failures are by `digest_scenarios`."""
+        if self._file is None or self._folder is None:
             return
-        schema = pa.schema(
-            [*BEFORE_X.items(), *self._columns.items(), *BEHIND_X.items()],
-            metadata={"rare_envs.format": str(EPISODE_FORMAT)},
-        )
+        fields = [*BEFORE_X.items(), *self._columns.items(), *BEHIND_X.items()]
+        schema = pa.schema(fields, metadata={"rare_envs.format": str(EPISODE_FORMAT)})
         with self._giving_up():
             self._folder.mkdir(parents=True, exist_ok=True)  # somebody may have removed it
             with (
@@ -116,7 +104,7 @@ class EpisodeTable:
             ):
                 first = 0
                 for batch in self._read_draft():
-                    known = {**_describe(batch, estimate, first), **self._find_crashes(batch, estimate.gamma, crashes)}
+                    known = self._describe(batch, estimate, first, crashes)
                     columns = [known[name] if name in known else batch.column(name) for name in schema.names]
                     file.write_batch(pa.record_batch(columns, schema=schema))
                     first += batch.num_rows
@@ -171,28 +159,26 @@ class EpisodeTable:
         with pa.ipc.open_stream(self._file) as reader:
             yield from reader
 
-    def _find_crashes(self, batch: pa.RecordBatch, gamma: float, crashes: Mapping[str, str]) -> dict[str, Any]:
-        """Return the columns on failures: the kind of crash is null where a failure was not driven again."""
-        f = batch.column("f").to_numpy()
-        failed = np.isnan(f) | (f <= gamma)
-        found, rows = np.full(len(f), None, dtype=object), np.flatnonzero(failed)
-        if len(rows) and crashes:
+    def _describe(
+        self, batch: pa.RecordBatch, estimate: Estimate, first: int, crashes: Mapping[bytes, str]
+    ) -> dict[str, Any]:
+        """Return the columns of simulations from number `first` on that are known at the end."""
+        n, f = batch.num_rows, batch.column("f").to_numpy()
+        about, failed = describe_simulations(estimate, first, n), np.isnan(f) | (f <= estimate.gamma)
+        found, rows = np.full(n, None, dtype=object), np.flatnonzero(failed)
+        if len(rows) and crashes:  # null where a failure was not driven again
             failing = batch.take(pa.array(rows))
             x = np.hstack([_as_table(failing.column(name)) for name in self._columns])
-            found[rows] = [crashes.get(digest_scenario(row)) for row in x]
-        return {"failed": pa.array(failed), "crash": pa.array(found, pa.string())}
-
-
-def _describe(batch: pa.RecordBatch, estimate: Estimate, first: int) -> dict[str, Any]:
-    """Return the columns on what simulations were made for, from number `first` on."""
-    about, f = describe_simulations(estimate, first, batch.num_rows), batch.column("f").to_numpy()
-    return {
-        "simulation": pa.array(np.arange(first, first + batch.num_rows)),
-        "run": pa.array(about.run, type=pa.int32()),
-        "stage": pa.array(about.stage, type=pa.int32(), mask=about.stage < 0),
-        "f": pa.array(f, mask=np.isnan(f)),
-        "log_weight": pa.array(about.log_weight, mask=np.isnan(about.log_weight)),
-    }
+            found[rows] = [crashes.get(digest) for digest in digest_scenarios(x)]
+        return {
+            "simulation": pa.array(np.arange(first, first + n)),
+            "run": pa.array(about.run, type=pa.int32()),
+            "stage": pa.array(about.stage, type=pa.int32(), mask=about.stage < 0),
+            "f": pa.array(f, mask=np.isnan(f)),
+            "failed": pa.array(failed),
+            "log_weight": pa.array(about.log_weight, mask=np.isnan(about.log_weight)),
+            "crash": pa.array(found, pa.string()),
+        }
 
 
 def describe_simulations(estimate: Estimate, first: int, n: int) -> SimulationRows:
@@ -201,19 +187,19 @@ def describe_simulations(estimate: Estimate, first: int, n: int) -> SimulationRo
     The further run has the number after the last replicate, and its simulations have no weight in p.
     """
     index, further = estimate.simulations, estimate.ensemble_run
-    run, stage, log_weight = np.full(n, -1), np.full(n, -1), np.full(n, np.nan)
+    more = None if further is None else further.simulations
+    rows = SimulationRows(np.full(n, -1), np.full(n, -1), np.full(n, np.nan))
     n_first = 0 if index is None else index.n
     inside = max(min(n_first - first, n), 0)
     if index is not None and inside:
-        run[:inside], stage[:inside], log_weight[:inside] = index.describe(first, inside)
-    more = None if further is None else further.simulations
+        for whole, part in zip(rows, index.describe(first, inside), strict=True):
+            whole[:inside] = part
     start = first + inside - n_first
-    rest = 0 if more is None else max(min(more.n - start, n - inside), 0)
+    rest = 0 if index is None or more is None else max(min(more.n - start, n - inside), 0)
     if index is not None and more is not None and rest:
-        rows = slice(inside, inside + rest)
-        run[rows] = 1 + max(number for number, _, _ in index.spans)
-        stage[rows] = more.describe(start, rest).stage
-    return SimulationRows(run, stage, log_weight)
+        rows.run[inside : inside + rest] = 1 + max(number for number, _, _ in index.spans)
+        rows.stage[inside : inside + rest] = more.describe(start, rest).stage
+    return rows
 
 
 def _is_list(kind: pa.DataType) -> bool:

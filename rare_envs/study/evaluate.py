@@ -1,10 +1,16 @@
-"""Evaluation of an ego: a question is answered, into a folder or not, and an interrupted run is continued."""
+"""Evaluation of an ego: a question is answered, into a folder or not, and an interrupted run is continued.
+
+A sample of the simulations of a run is done again at its end, in another order and company: f is to be a function of x.
+An ego that is random after its first call, keeps a counter that nobody resets, or whose row depends on the other rows
+of its batch gives an f that is none, and a p that means nothing; at the first call it shows nothing of that.
+"""
 
 from __future__ import annotations
 
+import shlex
 import time
 from collections.abc import Callable
-from contextlib import ExitStack, closing
+from contextlib import closing
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, cast
@@ -18,53 +24,38 @@ from rare_envs.egos.errors import EgoGone
 from rare_envs.problem import DrivingProblem
 from rare_envs.study.arguments import Question
 from rare_envs.study.episodes import EpisodeTable
-from rare_envs.study.errors import BadInput, output_folder
-from rare_envs.study.interruption import (
-    NOT_KEPT,
+from rare_envs.study.errors import (
+    BadInput,
     RunInterrupted,
-    describe_early_stop,
-    describe_kept,
+    UnwrittenResults,
     describe_stop,
     keep_answer,
-)
-from rare_envs.study.journal import (
-    JOURNAL,
-    begin_journal,
-    check_same_files,
-    continue_journal,
-    digest_files,
-    find_changed_files,
+    output_folder,
 )
 from rare_envs.study.modes import CrashKinds, classify_failures, list_all_kinds
-from rare_envs.study.question import Study, build_problem, prepare
-from rare_envs.study.recorded_question import note_question, open_question
-from rare_envs.study.repeatability import Repeatability, RowKeeper, check_repeatability
-from rare_envs.study.report import Report
-from rare_envs.study.run_folder import STUDY
-from rare_envs.study.writing import (
-    begin_study_file,
-    check_no_results,
-    finish_study_file,
-    note_resumption,
-    remove_drafts,
-    remove_results,
-    write_run,
+from rare_envs.study.question import (
+    Study,
+    build_problem,
+    digest_files,
+    find_changed_files,
+    note_question,
+    open_question,
+    prepare,
 )
+from rare_envs.study.report import Repeatability, Report
+from rare_envs.study.run_folder import STUDY
+from rare_envs.study.writing import begin_journal, begin_study_file, continue_journal, finish_run, note_resumption
 from samplers.estimation import check_base, simulate
-from samplers.evaluate import Evaluator
+from samplers.evaluate import Evaluator, Simulated, find_changed
 from samplers.executors import Executor
 from samplers.journal import Journal
+from samplers.problem import FloatArray
+from samplers.sample import Status
 from samplers.validation import OnError
 from samplers.workers import ExecutorError
 
-
-class UnwrittenResults(BadInput):
-    """A run is done, but its results could not be written."""
-
-    def __init__(self, message: str, report: Report) -> None:
-        super().__init__(message)
-        self.report = report
-        """The answer."""
+KEPT_ROWS, COMPANY, ROWS_ALONE = 64, 16, 2
+"""Simulations that are done again, how many of them in one batch, and how many also each alone."""
 
 
 def run(
@@ -103,14 +94,11 @@ def run(
         (0.021, 1000)
     """
     start, study = time.perf_counter(), settle_chunk(study, executor)
-    advice = "" if journal else NOT_KEPT
+    advice = "" if journal else " With --out finished simulations would have been kept."
     evaluator = open_evaluator(study, journal, executor)
-    table = None if folder is None else EpisodeTable(folder, study.problem.space)
     keeper = RowKeeper(study.problem.dim, study.question.gamma)
-    evaluator.watchers += [keeper.keep, *([] if table is None else [table.add])]
-    with ExitStack() as stack:
-        if table is not None:
-            stack.callback(table.close)
+    with closing(EpisodeTable(folder, study.problem.space)) as table:
+        evaluator.watchers += [keeper.keep, table.add]
         try:
             estimate = _estimate(study, evaluator, progress)
         except EgoGone as error:
@@ -121,18 +109,17 @@ def run(
             report = _report_early(study, evaluator, stopped.estimate, time.perf_counter() - start)
             raise RunInterrupted(f"{describe_stop(report.estimate)}{advice}", report) from None
         except KeyboardInterrupt:
-            known = describe_early_stop(evaluator.n_made, evaluator.n_failed)
-            raise RunInterrupted(f"{known}{advice if evaluator.n_made else ''}") from None
+            made = f"{evaluator.n_made:,} simulations made, {evaluator.n_failed:,} of them failed.{advice}"
+            known = made if evaluator.n_made else "no simulation made."
+            raise RunInterrupted(f"Stopped: no estimate yet, {known}") from None
         report = _report_early(study, evaluator, estimate, time.perf_counter() - start)
         with keep_answer(report):
-            kinds = classify_failures(study.problem, estimate)
-            estimate, kinds = list_all_kinds(study.problem, estimate, kinds)
+            estimate, kinds = list_all_kinds(study.problem, estimate, classify_failures(study.problem, estimate))
             report = replace(report, estimate=estimate, kinds=kinds)
-            if table is not None:
-                table.write(estimate, kinds.by_scenario)
+            table.write(estimate, kinds.by_scenario)
     with keep_answer(report):
         again = recheck(study, keeper)
-    return replace(report, repeatability=again, lost="" if table is None else table.lost)
+    return replace(report, repeatability=again, lost=table.lost)
 
 
 def _report_early(study: Study, evaluator: Evaluator, estimate: samplers.Estimate, seconds: float) -> Report:
@@ -180,12 +167,7 @@ class SentProblem:
 
 
 def _load_problem(question: Question, files: dict[str, str]) -> DrivingProblem:
-    """Return the problem of a question.
-
-    Raises:
-        BadInput: A file that it names is not the one that the driver has.
-        ValueError: Something cannot be loaded.
-    """
+    """Return the problem of a question, in a worker; raise a BadInput if a file is not the one that the driver has."""
     changed = find_changed_files(files, digest_files(question))
     if changed:
         raise BadInput(f"{', '.join(changed)} is not here, or not the file with which the run was begun")
@@ -203,19 +185,72 @@ def _estimate(
         return simulate(evaluator, study.method, question.run_arguments, progress, ensemble_run=question.ensemble_run)
 
 
-def recheck(study: Study, keeper: RowKeeper) -> Repeatability | None:
-    """Simulate a sample again.
+class RowKeeper:
+    """Keeps `size` of the scenarios that are simulated, with their f.
+
+    Half of them are a uniform sample, half those with f nearest to the threshold gamma, which decide p: in ordinary
+    traffic most scenarios have the largest f there is, whatever the ego does.
+    """
+
+    def __init__(self, dim: int, gamma: float, size: int = KEPT_ROWS) -> None:
+        self._gamma, self._size, self._seen = gamma, size // 2, 0
+        self._sample = self._near = np.empty((0, dim + 1))
+        self._rng = np.random.default_rng(0)  # of its own, so that the run draws what it would draw without
+
+    @property
+    def x(self) -> FloatArray:
+        """Scenarios kept, shape (n, d)."""
+        return np.vstack((self._sample, self._near))[:, :-1]
+
+    @property
+    def f(self) -> FloatArray:
+        """Their f, shape (n,)."""
+        return np.concatenate((self._sample[:, -1], self._near[:, -1]))
+
+    def keep(self, seen: Simulated) -> None:
+        """Keep some of the scenarios that were simulated."""
+        rows = np.column_stack((seen.x, seen.f))[~np.isnan(seen.f)]
+        self._keep_sample(rows)
+        rows = np.vstack((self._near, rows))
+        self._near = rows[np.argsort(np.abs(rows[:, -1] - self._gamma), kind="stable")[: self._size]]
+
+    def _keep_sample(self, rows: FloatArray) -> None:
+        """Give each scenario so far the same chance to be in the sample (Vitter's algorithm R)."""
+        room = self._size - len(self._sample)
+        kept = np.vstack((self._sample, rows[:room]))
+        later = np.arange(min(room, len(rows)), len(rows))
+        place = (self._rng.random(len(later)) * (self._seen + 1 + later)).astype(np.int64)
+        for row, at in zip(later[place < self._size], place[place < self._size], strict=True):
+            kept[at] = rows[row]
+        self._sample = kept
+        self._seen += len(rows)
+
+
+def recheck(study: Study, kept: RowKeeper) -> Repeatability | None:
+    """Simulate the kept scenarios again: in another order and in small batches, and a few each alone.
 
     None where ego and measure are rules of this package, which keep nothing; where the ego says that its answers vary;
     and where it is gone, which must not cost the answer.
     """
-    rules = study.problem.ego in ("idm", "human") if isinstance(study.problem.ego, str) else False
-    if study.problem.needs.varies or (rules and ":" not in study.question.measure):
+    problem = study.problem
+    rules = isinstance(problem.ego, str) and problem.ego in ("idm", "human") and ":" not in study.question.measure
+    if problem.needs.varies or rules:
         return None
+    x, f = kept.x, kept.f
+    order = np.random.default_rng(1).permutation(len(f))
+    batches = [order[first : first + COMPANY] for first in range(0, len(order), COMPANY)]
+    batches += [order[row : row + 1] for row in range(min(ROWS_ALONE, len(order)))]
+    if not batches:
+        return Repeatability(0, 0, 0.0)
+    evaluator = Evaluator(problem, on_error="failure")
     try:
-        return check_repeatability(study.problem, keeper)
+        again = np.concatenate([evaluator.evaluate(x[rows]) for rows in batches])
     except (EgoGone, ValueError):
         return None
+    before = f[np.concatenate(batches)]
+    changed = find_changed(again, before)
+    apart = np.nan_to_num(np.abs(again[changed] - before[changed]), nan=np.inf)
+    return Repeatability(len(again), int(changed.sum()), float(apart.max(initial=0.0)))
 
 
 def run_into(
@@ -251,10 +286,7 @@ def run_into(
     """
     study = settle_chunk(study, executor)
     with output_folder(folder):
-        if not force and not (folder / JOURNAL).exists():
-            check_no_results(folder)
         with closing(begin_journal(folder, study.question, force)) as journal:
-            remove_results(folder)
             begin_study_file(folder, study)
             note_question(study.question)
             return _run(folder, study, journal, progress, executor)
@@ -299,8 +331,12 @@ def resume(
         if ego is not None and {find_ego_kind(ego), find_ego_kind(question.ego)} != {"remote"}:
             raise BadInput(f"Expected --ego for one whose address has changed only; the run has {question.ego!r}.")
         question = replace(question, ego=ego or question.ego, on_error=on_error or question.on_error)
-        check_same_files(journal, question)
-        remove_drafts(folder)
+        changed = find_changed_files(journal.head.get("files") or {}, digest_files(question))
+        if changed:
+            raise BadInput(
+                f"{', '.join(changed)} has changed since the run in {str(folder)!r} was begun, and its simulations "
+                "are of what it was before. Begin anew with --force."
+            )
         study = prepare(question)
         if question.chunk is None and executor is not None:  # it is continued in the batches in which it was begun
             study = replace(study, question=replace(question, chunk=study.problem.tile))
@@ -309,16 +345,17 @@ def resume(
 
 
 def _run(folder: Path, study: Study, journal: Journal, progress: bool, executor: Executor | None = None) -> Report:
+    """Run a study into its folder; whatever stops it says what is kept."""
     target, earlier = folder.absolute(), journal.earlier_seconds  # an ego may change the working directory
 
     def kept(report: Report | None = None) -> str:
-        return describe_kept(journal, folder, study.question.trust, report)
+        return _describe_kept(journal, folder, study.question.trust, report)
 
     try:
         report = run(study, progress, journal, executor, target)
         report = replace(report, seconds=report.seconds + earlier, earlier_seconds=earlier)
         with keep_answer(report):
-            _write(target, report)
+            finish_run(target, report)
     except UnwrittenResults as error:
         raise UnwrittenResults(f"{error}{kept(error.report)}", error.report) from error
     except BadInput as error:
@@ -334,13 +371,14 @@ def _run(folder: Path, study: Study, journal: Journal, progress: bool, executor:
     return report
 
 
-def _write(folder: Path, report: Report) -> None:
-    """Write the results; a folder that somebody has removed is made again."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        write_run(folder, report)
-        finish_study_file(folder, report.study, report.seconds)
-    except OSError as error:
-        raise UnwrittenResults(
-            f"Cannot write the results to {str(folder)!r}: {error.strerror or error}.", report
-        ) from error
+def _describe_kept(journal: Journal, folder: Path, trust: bool, report: Report | None) -> str:
+    """Return the number of simulations kept and the command that continues the run, behind a space."""
+    if not journal.has_simulations or not journal.flush():
+        return ""
+    count = f"{journal.n:,} simulations"
+    if report is not None and report.estimate.status is not Status.STOPPED:
+        n, further = report.estimate.n_sim, report.estimate.ensemble_run
+        n_further = journal.n - n if further is None else further.n_sim
+        if n_further > 0:
+            count = f"{n:,} simulations and a further {n_further:,} under the mixture of the refits"
+    return f" {count} are kept; go on with: rare-envs resume {shlex.quote(str(folder))}{' --trust' if trust else ''}"

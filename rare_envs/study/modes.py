@@ -22,9 +22,8 @@ import samplers
 from rare_envs.distributions.space import ScenarioSpace
 from rare_envs.egos.errors import EgoGone
 from rare_envs.problem import DrivingProblem
-from rare_envs.study.columns import list_columns
-from rare_envs.study.episodes import digest_scenario
-from rare_envs.study.severity import MAX_REPLAYED, Severity, compute_severity, replay_failures, replay_further_failures
+from rare_envs.study.columns import digest_scenarios, list_columns
+from rare_envs.study.severity import MAX_REPLAYED, Severity, compute_severity, replay_failures
 from rare_envs.traffic.crash import CRASH_KINDS, Crash, describe_crash
 from samplers.analysis import NO_OUTCOME_LABEL, sum_by_label
 from samplers.analysis.weighted import choose_failures, require_sample
@@ -36,6 +35,20 @@ LEAST_CLUSTER, LEAST_SHARE = 10, 0.05
 """Failures of a cluster at least, and their share among those of its kind."""
 LEAST_CLUSTERED = 0.5
 """Share of the failures that must lie in clusters; fewer are the tails of one."""
+KIND_DESCRIPTIONS = MappingProxyType(
+    {
+        "rear_end": "the ego runs into a vehicle ahead",
+        "rear_ended": "the ego is run into from behind",
+        "side": "flank against flank",
+        "road_edge": "the ego leaves the road",
+        "others": "other vehicles collide",
+        "none": "nobody collides",
+        "no outcome": "the ego failed",
+    }
+)
+"""Kinds of crash in words."""
+Crashes = Mapping[bytes, str]
+"""Kinds of crash of failures that were driven again, by `digest_scenarios`."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -53,34 +66,8 @@ class FailureMode:
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain values for JSON."""
-        return {
-            "crash": self.crash,
-            **self.share.to_dict(),
-            "interval": list(self.share.interval),
-            "failure": self.failure,
-            "center": dict(self.center),
-        }
-
-
-def find_modes(
-    space: ScenarioSpace, estimate: samplers.Estimate, crashes: Mapping[str, str]
-) -> tuple[FailureMode, ...]:
-    """Return the modes of failure of a run, the largest first; none where nothing failed or there are no weights."""
-    found = assign_modes(space, estimate, crashes)
-    if found is None:
-        return ()
-    sample, labels = require_sample(estimate), found.labels
-    shares = sum_by_label(estimate, found.rows, labels)
-    x, weights = sample.x[found.rows], sample.weights[np.flatnonzero(sample.f <= estimate.gamma)[found.rows]]
-    return tuple(
-        FailureMode(
-            crash=str(found.kinds[np.argmax(labels == label)]),
-            share=share,
-            failure=int(np.argmax(found.listed == label)) if (found.listed == label).any() else None,
-            center=_mean_parameters(space, x[labels == label], weights[labels == label]),
-        )
-        for label, share in shares.items()
-    )
+        share = {**self.share.to_dict(), "interval": list(self.share.interval)}
+        return {"crash": self.crash, **share, "failure": self.failure, "center": dict(self.center)}
 
 
 class LabelledFailures(NamedTuple):
@@ -96,30 +83,64 @@ class LabelledFailures(NamedTuple):
     """Mode of each failure of the run's list; "" where none of its kind was labelled."""
 
 
-def assign_modes(
-    space: ScenarioSpace, estimate: samplers.Estimate, crashes: Mapping[str, str]
-) -> LabelledFailures | None:
-    """Return `MAX_CLUSTERED` failing points with their modes, or None; arguments as of `find_modes`."""
-    if estimate.sample is None or not (estimate.sample.f <= estimate.gamma).any() or estimate.p <= 0:
+def find_modes(space: ScenarioSpace, estimate: samplers.Estimate, crashes: Crashes) -> tuple[FailureMode, ...]:
+    """Return the modes of failure of a run, the largest first; none where nothing failed or there are no weights."""
+    found = assign_modes(space, estimate, crashes)
+    if found is None:
+        return ()
+    sample, labels = require_sample(estimate), found.labels
+    x, weights = sample.x[found.rows], sample.weights[sample.f <= estimate.gamma][found.rows]
+    return tuple(
+        FailureMode(
+            crash=str(found.kinds[np.argmax(labels == label)]),
+            share=share,
+            failure=int(np.argmax(found.listed == label)) if (found.listed == label).any() else None,
+            center=_mean_parameters(space, x[labels == label], weights[labels == label]),
+        )
+        for label, share in sum_by_label(estimate, found.rows, labels).items()
+    )
+
+
+def _mean_parameters(space: ScenarioSpace, x: FloatArray, weights: FloatArray) -> dict[str, float]:
+    """Return the weighted mean of the shown columns of x (n, d), by name."""
+    mean = np.average(x, axis=0, weights=weights) if weights.sum() > 0 else x.mean(axis=0)
+    return {column.name: float(value) for column, value in zip(list_columns(space), mean, strict=True) if column.shown}
+
+
+def assign_modes(space: ScenarioSpace, estimate: samplers.Estimate, crashes: Crashes) -> LabelledFailures | None:
+    """Return at most `MAX_CLUSTERED` failing points with their modes; None where nothing failed or has a weight.
+
+    A failure of the list has the mode of the nearest clustered failure of its kind.
+    """
+    sample, listed = estimate.sample, estimate.failures
+    if sample is None or not (sample.f <= estimate.gamma).any() or estimate.p <= 0:
         return None
-    sample = require_sample(estimate)
+    shown = [column.shown for column in list_columns(space)]
     rows = choose_failures(sample, estimate.gamma, MAX_REPLAYED)
     rows = rows[:: math.ceil(len(rows) / MAX_CLUSTERED)]
-    failing = np.flatnonzero(sample.f <= estimate.gamma)[rows]
-    x = sample.x[rows]
-    kinds = np.array([crashes.get(digest_scenario(each), "") for each in x], dtype=object)
-    kinds[np.isneginf(sample.f[failing])] = NO_OUTCOME_LABEL
-    labels = label_modes(_shown_normal(space, x), kinds)
-    return LabelledFailures(rows, kinds, labels, _label_listed(space, estimate, crashes, x, kinds, labels))
+    f = sample.f[sample.f <= estimate.gamma][rows]
+    kinds = _find_kinds(sample.x[rows], np.isneginf(f), crashes)
+    u = space.to_standard_normal(sample.x[rows])[:, shown]
+    labels = label_modes(u, kinds)
+    kinds_listed = _find_kinds(listed.x, np.isnan(listed.f), crashes)
+    u_listed = space.to_standard_normal(listed.x)[:, shown]
+    found = np.full(len(listed), "", dtype=object)
+    for kind in dict.fromkeys(kinds_listed.tolist()):
+        mine, like = kinds_listed == kind, np.flatnonzero(kinds == kind)
+        if len(like):
+            found[mine] = labels[like[_find_nearest(u_listed[mine], u[like])]]
+    return LabelledFailures(rows, kinds, labels, found)
+
+
+def _find_kinds(x: FloatArray, without_outcome: NDArray[np.bool_], crashes: Crashes) -> NDArray[np.object_]:
+    """Return the kinds of crash of scenarios x (n, d), shape (n,); "" where that is not known."""
+    kinds = np.array([crashes.get(digest, "") for digest in digest_scenarios(x)], dtype=object)
+    kinds[without_outcome] = NO_OUTCOME_LABEL
+    return kinds
 
 
 def label_modes(u: FloatArray, kinds: NDArray[np.object_]) -> NDArray[np.object_]:
-    """Return the mode of each failure, as a word.
-
-    Args:
-        u: Failures in standard normal space, shape (n, k).
-        kinds: Their kinds of crash, shape (n,).
-    """
+    """Return the mode, a word, of each of n failures u (n, k) in standard normal space with kinds of crash (n,)."""
     labels = np.empty(len(kinds), dtype=object)
     for kind in dict.fromkeys(kinds.tolist()):
         mine = np.flatnonzero(kinds == kind)
@@ -149,110 +170,6 @@ def _find_nearest(u: FloatArray, among: FloatArray) -> NDArray[np.int64]:
     return np.asarray(cKDTree(among).query(u)[1], dtype=np.int64)
 
 
-def _shown_normal(space: ScenarioSpace, x: FloatArray) -> FloatArray:
-    """Return the parameters that are shown, in standard normal space, shape (n, k)."""
-    shown = [column.shown for column in list_columns(space)]
-    return np.asarray(space.to_standard_normal(x)[:, shown])
-
-
-def _label_listed(
-    space: ScenarioSpace,
-    estimate: samplers.Estimate,
-    crashes: Mapping[str, str],
-    x: FloatArray,
-    kinds: NDArray[np.object_],
-    labels: NDArray[np.object_],
-) -> NDArray[np.object_]:
-    """Return the mode of each failure of the list: that of the nearest clustered failure x (n, d) of its kind."""
-    failures = estimate.failures
-    listed = np.array([crashes.get(digest_scenario(each), "") for each in failures.x], dtype=object)
-    listed[np.isnan(failures.f)] = NO_OUTCOME_LABEL
-    found = np.full(len(listed), "", dtype=object)
-    u, known = _shown_normal(space, failures.x), _shown_normal(space, x)
-    for kind in dict.fromkeys(listed.tolist()):
-        mine, like = listed == kind, np.flatnonzero(kinds == kind)
-        if len(like):
-            found[mine] = labels[like[_find_nearest(u[mine], known[like])]]
-    return found
-
-
-def _mean_parameters(space: ScenarioSpace, x: FloatArray, weights: FloatArray) -> dict[str, float]:
-    """Return the weighted mean of the shown columns of x (n, d), by name."""
-    mean = np.average(x, axis=0, weights=weights) if weights.sum() > 0 else x.mean(axis=0)
-    return {column.name: float(value) for column, value in zip(list_columns(space), mean, strict=True) if column.shown}
-
-
-def list_every_mode(
-    space: ScenarioSpace, estimate: samplers.Estimate, crashes: Mapping[str, str]
-) -> tuple[samplers.Estimate, NDArray[np.int64]]:
-    """Return an estimate that lists a failure of each mode and kind of crash, and where the new ones stand."""
-    if estimate.failures.total <= len(estimate.failures) or estimate.sample is None or estimate.p <= 0:
-        return estimate, np.empty(0, dtype=np.int64)
-    longer = _append(estimate, _find_kinds(estimate, crashes))
-    longer = _append(longer, _find_modes(space, longer, crashes))
-    known = {digest_scenario(x) for x in estimate.failures.x}
-    added = [k for k, x in enumerate(longer.failures.x) if digest_scenario(x) not in known]
-    return longer, np.array(added, dtype=np.int64)
-
-
-def _find_kinds(estimate: samplers.Estimate, crashes: Mapping[str, str]) -> NDArray[np.int64]:
-    """Return rows of `Sample.x`: the most likely failure of each kind of crash that the list lacks."""
-    sample = require_sample(estimate)
-    rows = choose_failures(sample, estimate.gamma, MAX_REPLAYED)
-    kinds = np.array([crashes.get(digest_scenario(x), "") for x in sample.x[rows]], dtype=object)
-    listed = {crashes.get(digest_scenario(x), "") for x in estimate.failures.x}
-    return _pick_likely(estimate, rows, kinds, {*listed, ""})
-
-
-def _find_modes(space: ScenarioSpace, estimate: samplers.Estimate, crashes: Mapping[str, str]) -> NDArray[np.int64]:
-    """Return rows of `Sample.x`: the most likely labelled failure of each mode that the list lacks."""
-    found = assign_modes(space, estimate, crashes)
-    if found is None:
-        return np.empty(0, dtype=np.int64)
-    return _pick_likely(estimate, found.rows, found.labels, {*found.listed, f"{NO_OUTCOME_LABEL}/0", "/0"})
-
-
-def _append(estimate: samplers.Estimate, rows: NDArray[np.int64]) -> samplers.Estimate:
-    """Return an estimate with some rows of `Sample.x` in its list of failures too."""
-    if not len(rows):
-        return estimate
-    sample, failures = require_sample(estimate), estimate.failures
-    x, f = sample.x[rows], sample.f[sample.f <= estimate.gamma][rows]
-    more = failures.merge(x, f, _log_density(estimate, x), keep=len(failures) + len(rows))
-    return replace(estimate, failures=replace(more, total=failures.total))
-
-
-def _pick_likely(
-    estimate: samplers.Estimate, rows: NDArray[np.int64], labels: NDArray[np.object_], known: set[Any]
-) -> NDArray[np.int64]:
-    """Return the most likely of the rows of each label that is not known."""
-    log_density = _log_density(estimate, require_sample(estimate).x[rows])
-    missing = [labels == label for label in dict.fromkeys(labels.tolist()) if label not in known]
-    best = [np.argmax(np.where(mine, log_density, -np.inf)) for mine in missing]
-    return rows[np.array(best, dtype=np.int64)]
-
-
-def _log_density(estimate: samplers.Estimate, x: FloatArray) -> FloatArray:
-    """Return the logarithm of the base density at points x (k, d), shape (k,)."""
-    if estimate.base is None:
-        raise ValueError("The estimate does not know its base distribution.")
-    return np.asarray(estimate.base.log_prob(x), dtype=np.float64)
-
-
-KIND_DESCRIPTIONS = MappingProxyType(
-    {
-        "rear_end": "the ego runs into a vehicle ahead",
-        "rear_ended": "the ego is run into from behind",
-        "side": "flank against flank",
-        "road_edge": "the ego leaves the road",
-        "others": "other vehicles collide",
-        "none": "nobody collides",
-        "no outcome": "the ego failed",
-    }
-)
-"""Kinds of crash in words."""
-
-
 @dataclass(frozen=True)
 class CrashKinds:
     """Crashes in which the failures of a run ended."""
@@ -263,8 +180,7 @@ class CrashKinds:
     """The crash of each failure of the list, see `rare_envs.traffic.crash.describe_crash`; empty if it is not known."""
     unknown: str = ""
     """Reason why it is not known."""
-    by_scenario: Mapping[str, str] = field(default_factory=dict, repr=False)
-    """Kind of each failure that was driven again, by `digest_scenario`."""
+    by_scenario: Crashes = field(default_factory=dict, repr=False)
     severity: Severity | None = None
     """How severe the collisions are; None if there are none, or it is not known."""
 
@@ -287,6 +203,29 @@ def classify_failures(problem: DrivingProblem, estimate: samplers.Estimate) -> C
     return CrashKinds(shares, tuple(listed), by_scenario=by_scenario, severity=severity)
 
 
+def _weigh_crashes(
+    problem: DrivingProblem, estimate: samplers.Estimate, by_scenario: dict[bytes, str]
+) -> tuple[dict[str, samplers.Share], Severity | None]:
+    """Return p by kind of crash and the severity, from failing points that are driven again once for both.
+
+    The kind of each is added to `by_scenario`.
+    """
+    if estimate.sample is None or not estimate.p:  # no failures, or the search's alone
+        return {}, None
+    replayed, further = replay_failures(problem, estimate)
+    failures = replayed.failures
+    labels = np.full(len(failures.rows), NO_OUTCOME_LABEL, dtype=object)
+    by_scenario |= _label_scenarios(failures.x[failures.has_outcome], replayed.crash)
+    labels[failures.has_outcome] = [CRASH_KINDS[kind] for kind in replayed.crash.kind]
+    shares = sum_by_label(estimate, failures.rows, labels)
+    return shares, compute_severity(problem, estimate, replayed, further)
+
+
+def _label_scenarios(x: FloatArray, crash: Crash) -> dict[bytes, str]:
+    """Return the kinds of crash of scenarios x (k, d), by their digest."""
+    return {key: CRASH_KINDS[int(kind)] for key, kind in zip(digest_scenarios(x), crash.kind, strict=True)}
+
+
 def list_all_kinds(
     problem: DrivingProblem, estimate: samplers.Estimate, kinds: CrashKinds
 ) -> tuple[samplers.Estimate, CrashKinds]:
@@ -306,25 +245,36 @@ def list_all_kinds(
     return longer, replace(kinds, listed=tuple(listed))
 
 
-def _weigh_crashes(
-    problem: DrivingProblem, estimate: samplers.Estimate, by_scenario: dict[str, str]
-) -> tuple[dict[str, samplers.Share], Severity | None]:
-    """Return p by kind of crash and the severity, from failing points that are driven again once for both.
+def list_every_mode(
+    space: ScenarioSpace, estimate: samplers.Estimate, crashes: Crashes
+) -> tuple[samplers.Estimate, NDArray[np.int64]]:
+    """Return an estimate that lists a failure of each mode and kind of crash, and where the new ones stand."""
+    failures, sample = estimate.failures, estimate.sample
+    if failures.total <= len(failures) or sample is None or estimate.p <= 0:
+        return estimate, np.empty(0, dtype=np.int64)
+    rows = choose_failures(sample, estimate.gamma, MAX_REPLAYED)
+    kinds, listed = (_find_kinds(x, np.zeros(len(x), dtype=bool), crashes) for x in (sample.x[rows], failures.x))
+    longer = _list_more(estimate, rows, kinds, {*listed, ""})
+    found = assign_modes(space, longer, crashes)
+    if found is not None:
+        longer = _list_more(longer, found.rows, found.labels, {*found.listed, f"{NO_OUTCOME_LABEL}/0", "/0"})
+    known = set(digest_scenarios(failures.x))
+    added = [row for row, digest in enumerate(digest_scenarios(longer.failures.x)) if digest not in known]
+    return longer, np.array(added, dtype=np.int64)
 
-    The kind of each is added to `by_scenario`.
-    """
-    if estimate.sample is None or not estimate.p:  # no failures, or the search's alone
-        return {}, None
-    replayed = replay_failures(problem, estimate)
-    failures = replayed.failures
-    labels = np.full(len(failures.rows), NO_OUTCOME_LABEL, dtype=object)
-    by_scenario |= _label_scenarios(failures.x[failures.has_outcome], replayed.crash)
-    labels[failures.has_outcome] = [CRASH_KINDS[kind] for kind in replayed.crash.kind]
-    shares = sum_by_label(estimate, failures.rows, labels)
-    further = replay_further_failures(problem, estimate)
-    return shares, compute_severity(problem, estimate, replayed, further=further)
 
-
-def _label_scenarios(x: FloatArray, crash: Crash) -> dict[str, str]:
-    """Return the kinds of crash of scenarios x (k, d), by their digest."""
-    return {digest_scenario(row): CRASH_KINDS[int(kind)] for row, kind in zip(x, crash.kind, strict=True)}
+def _list_more(
+    estimate: samplers.Estimate, rows: NDArray[np.int64], labels: NDArray[np.object_], known: set[Any]
+) -> samplers.Estimate:
+    """Return an estimate whose list has the most likely of the rows of `Sample.x` of each label that is not known."""
+    missing = [labels == label for label in dict.fromkeys(labels.tolist()) if label not in known]
+    if not missing:
+        return estimate
+    if estimate.base is None:
+        raise ValueError("The estimate does not know its base distribution.")
+    sample, failures = require_sample(estimate), estimate.failures
+    log_density = np.asarray(estimate.base.log_prob(sample.x[rows]), dtype=np.float64)
+    best = [int(np.argmax(np.where(mine, log_density, -np.inf))) for mine in missing]
+    f = sample.f[sample.f <= estimate.gamma][rows[best]]
+    more = failures.merge(sample.x[rows[best]], f, log_density[best], keep=len(failures) + len(best))
+    return replace(estimate, failures=replace(more, total=failures.total))

@@ -1,8 +1,9 @@
-"""Pictures: of an evaluation, of what p is sensitive to, of the severity of collisions and of a risk."""
+"""Pictures: of an evaluation, of its most likely failure and of a risk; each is drawn into axes that are given."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import contextlib
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,7 +16,6 @@ from matplotlib.patches import Rectangle
 from matplotlib.transforms import Affine2D
 from numpy.typing import NDArray
 
-import samplers
 from rare_envs.distributions.space import ScenarioSpace
 from rare_envs.egos.errors import EgoGone, reason_of
 from rare_envs.exposure import CONTACTS_100CAR, REAR_END_CONTACTS_100CAR, RateInterval, TotalRate
@@ -23,12 +23,9 @@ from rare_envs.files import replace_file
 from rare_envs.study.columns import draw_ordinary, list_columns
 from rare_envs.study.replay import Drive, drive_again
 from rare_envs.study.report import Report
-from rare_envs.study.severity import Severity
 from rare_envs.study.text import format_rate, format_share, format_with_interval, name_scenario, name_source
 from rare_envs.traffic.palette import CRASH_COLOUR, vehicle_colour
-from rare_envs.traffic.road import Road
 from rare_envs.traffic.state import VEHICLE_LENGTH, VEHICLE_WIDTH
-from samplers.problem import FloatArray
 
 if TYPE_CHECKING:
     from samplers.sample import Failures
@@ -56,29 +53,41 @@ DOTS_PER_INCH = 120
 LINE_COLOUR, HIT_COLOUR, ORDINARY_COLOUR = "#3b6fb5", "#c0392b", "#b8b8b8"
 
 
+@contextlib.contextmanager
+def saved_figure(path: Path, width: float, height: float) -> Iterator[Figure]:
+    """Yield an empty picture of a size [inch], which is saved at the end of the block.
+
+    It is drawn and laid out once: `Figure.savefig` does both twice, for the same pixels.
+    """
+    with matplotlib.rc_context(STYLE):
+        figure = Figure(figsize=(width, height), layout="constrained")
+        yield figure
+        figure.set_dpi(DOTS_PER_INCH)
+        with replace_file(path) as draft:
+            FigureCanvasAgg(figure).print_png(draft)  # type: ignore[no-untyped-call]
+
+
 def save_plot(path: Path, report: Report) -> None:
     """Draw a report and save it."""
-    with matplotlib.rc_context(STYLE):
-        view = _relative_view_height(report.study.problem.world.scenario.road)
-        figure = Figure(figsize=(16, 5.4 * (MOMENTS * view + CURVES) / (MOMENTS + CURVES)), layout="constrained")
-        columns = figure.subfigures(1, 3, squeeze=False, width_ratios=(1.0, 1.05, 1.25), wspace=0.03)
-        left, middle, right = columns[0]
-        figure.suptitle(_format_title(report), fontsize=12, fontweight="bold")
+    road, estimate, question = report.study.problem.world.scenario.road, report.estimate, report.study.question
+    view = max(1.0, road.lanes * road.width / ORDINARY_ROAD)  # height of a bird's-eye view over that of usual roads
+    low, high = estimate.interval
+    with saved_figure(path, 16, 5.4 * (MOMENTS * view + CURVES) / (MOMENTS + CURVES)) as figure:
+        figure.suptitle(
+            f"{question.env_id}, ego {question.ego}: P[f ≤ {estimate.gamma:g}] = {estimate.p:.2e}   "
+            f"({100 * estimate.confidence:g} % interval {low:.1e} to {high:.1e}, "
+            f"{estimate.n_sim:,} simulations{report.average and f'; {report.average}'})",
+            fontsize=12,
+            fontweight="bold",
+        )
+        ((left, middle, right),) = figure.subfigures(1, 3, squeeze=False, width_ratios=(1.0, 1.05, 1.25), wspace=0.03)
         draw_convergence(left.subplots(), report.to_dict())
-        draw_failures(middle.subplots(), report.study.problem.space, report.estimate.failures)
+        draw_failures(middle.subplots(), report.study.problem.space, estimate.failures)
         drive = _replay_likeliest_failure(report)
         if isinstance(drive, str):
             _write_message(right.subplots(), drive)
         else:
             draw_drive(list(right.subplots(MOMENTS + 1, height_ratios=[view] * MOMENTS + [CURVES])), drive)
-        save_figure(path, figure)
-
-
-def save_figure(path: Path, figure: Figure) -> None:
-    """Save a picture, drawn and laid out once: `Figure.savefig` does both twice, for the same pixels."""
-    figure.set_dpi(DOTS_PER_INCH)
-    with replace_file(path) as draft:
-        FigureCanvasAgg(figure).print_png(draft)  # type: ignore[no-untyped-call]
 
 
 def _replay_likeliest_failure(report: Report) -> Drive | str:
@@ -102,21 +111,6 @@ def explain_no_failure(report: Report) -> str:
         f"less than one failure in {1 / estimate.interval[1]:,.0f} scenarios.\n\n"
         "Ten times as many simulations would lower this bound to a tenth;\n"
         "methods that search for failures go further."
-    )
-
-
-def _relative_view_height(road: Road) -> float:
-    """Return the height of a bird's-eye view relative to that of an ordinary road."""
-    return max(1.0, road.lanes * road.width / ORDINARY_ROAD)
-
-
-def _format_title(report: Report) -> str:
-    question, estimate = report.study.question, report.estimate
-    low, high = estimate.interval
-    return (
-        f"{question.env_id}, ego {question.ego}: P[f ≤ {estimate.gamma:g}] = {estimate.p:.2e}   "
-        f"({100 * estimate.confidence:g} % interval {low:.1e} to {high:.1e}, "
-        f"{estimate.n_sim:,} simulations{report.average and f'; {report.average}'})"
     )
 
 
@@ -179,26 +173,16 @@ def _label_thresholds(axes: Axes, spent: NDArray[np.int64], values: NDArray[np.f
             axes.annotate(f"f ≤ {gamma:.3g}", (n, value), (5, 5), textcoords="offset points", fontsize=8)
 
 
-def rank_shifted_parameters(space: ScenarioSpace, ordinary: FloatArray, failures: FloatArray) -> list[int]:
-    """Return the parameters in which failures differ most from ordinary traffic, the most shifted first.
-
-    Args:
-        space: Of the parameters.
-        ordinary: Scenarios from the base distribution, shape (n, d).
-        failures: Failures, shape (m, d).
-    """
-    shown = np.flatnonzero([column.shown for column in list_columns(space)])
-    spread = np.maximum(ordinary[:, shown].std(axis=0), 1e-12)
-    shift = np.abs(failures[:, shown].mean(axis=0) - ordinary[:, shown].mean(axis=0)) / spread
-    return [int(i) for i in shown[np.argsort(-shift, kind="stable")]]
-
-
 def draw_failures(axes: Axes, space: ScenarioSpace, failures: Failures) -> None:
     """Draw failures over ordinary traffic in the two parameters in which they differ most."""
-    ordinary = draw_ordinary(space)[:BACKGROUND_DRAWS]
-    a, b = rank_shifted_parameters(space, ordinary, failures.x)[:2] if len(failures) else (0, 1)
+    ordinary, columns = draw_ordinary(space)[:BACKGROUND_DRAWS], list_columns(space)
+    a, b = 0, 1
+    if len(failures):
+        shown = np.flatnonzero([column.shown for column in columns])
+        spread = np.maximum(ordinary[:, shown].std(axis=0), 1e-12)
+        shift = np.abs(failures.x[:, shown].mean(axis=0) - ordinary[:, shown].mean(axis=0)) / spread
+        a, b = (int(j) for j in shown[np.argsort(-shift, kind="stable")][:2])
     axes.scatter(ordinary[:, a], ordinary[:, b], s=6, color=ORDINARY_COLOUR, label="ordinary traffic", linewidths=0)
-    columns = list_columns(space)
     axes.set_xlabel(columns[a].label)
     axes.set_ylabel(columns[b].label)
     if len(failures):
@@ -215,11 +199,16 @@ def draw_failures(axes: Axes, space: ScenarioSpace, failures: Failures) -> None:
     axes.legend(loc="best", fontsize=8)
 
 
+def choose_moments(drive: Drive) -> list[int]:
+    """Return `MOMENTS` moments, spread over the last seconds up to the worst one."""
+    first = int(np.argmin(np.abs(drive.time - (drive.time[drive.worst] - LAST_SECONDS))))
+    return [int(t) for t in np.linspace(first, drive.worst, MOMENTS).round()]
+
+
 def draw_drive(axes: list[Axes], drive: Drive) -> None:
     """Draw the seconds up to the worst moment of a drive from above, and its gap and speeds over time."""
-    first = int(np.argmin(np.abs(drive.time - (drive.time[drive.worst] - LAST_SECONDS))))
-    for view, t in zip(axes[:MOMENTS], np.linspace(first, drive.worst, MOMENTS).round(), strict=True):
-        draw_moment(view, drive, int(t))
+    for view, t in zip(axes[:MOMENTS], choose_moments(drive), strict=True):
+        draw_moment(view, drive, t)
     axes[0].set_title("The most likely failure from above, and its speeds and gap", fontsize=10)
     draw_speeds(axes[-1], drive)
 
@@ -284,20 +273,11 @@ def _write_message(axes: Axes, text: str) -> None:
     axes.text(0.5, 0.5, text, ha="center", va="center", transform=axes.transAxes)
 
 
-def save_sensitivity(path: Path, sensitivity: samplers.Sensitivity) -> None:
-    """Draw importance and derivatives as bars and save the picture."""
-    with matplotlib.rc_context(STYLE):
-        figure = Figure(figsize=(14, 4.5), layout="constrained")
-        sensitivity.plot(list(figure.subplots(1, 2)))
-        save_figure(path, figure)
-
-
-def save_severity(path: Path, severity: Severity) -> None:
-    """Draw the curve of delta-v with its bands and save the picture."""
-    with matplotlib.rc_context(STYLE):
-        figure = Figure(figsize=(7, 4.5), layout="constrained")
-        severity.plot(figure.subplots())
-        save_figure(path, figure)
+def draw_measure(axes: Axes, drive: Drive) -> None:
+    """Draw the measure over time: that of each moment, and that of the drive so far."""
+    axes.plot(drive.time, drive.f_alone, color="#777777", linewidth=1, label="this moment")
+    axes.step(drive.time, drive.f_so_far, where="post", color="black", linewidth=1.5, label="f so far")
+    axes.set_xlabel("time [s]")
 
 
 FRACTION_BELOW = 0.1
@@ -306,24 +286,14 @@ FRACTION_BELOW = 0.1
 
 def save_risk_plot(path: Path, ego: str, total: TotalRate) -> None:
     """Draw a total and the rates of which it is the sum, and save it."""
-    with matplotlib.rc_context(STYLE):
-        height = 1.6 + 0.45 * max(len(total.rates) + 1, len(total.shares))
-        figure = Figure(figsize=(12, height), layout="constrained")
+    level = f"{100 * total.confidence:g} %: "
+    unit, ends = " collisions per million km", total.interval_per_million_km
+    with saved_figure(path, 12, 1.6 + 0.45 * max(len(total.rates) + 1, len(total.shares))) as figure:
         left, right = figure.subplots(1, 2, width_ratios=(1.5, 1.0))
-        figure.suptitle(
-            f"ego {ego}: "
-            + format_with_interval(
-                total.per_million_km,
-                total.interval_per_million_km,
-                " collisions per million km",
-                f"{100 * total.confidence:g} %: ",
-            ),
-            fontsize=12,
-            fontweight="bold",
-        )
+        title = f"ego {ego}: {format_with_interval(total.per_million_km, ends, unit, level)}"
+        figure.suptitle(title, fontsize=12, fontweight="bold")
         draw_rates(left, total)
         draw_shares(right, total)
-        save_figure(path, figure)
 
 
 def draw_rates(axes: Axes, total: TotalRate) -> None:
@@ -361,8 +331,7 @@ def draw_shares(axes: Axes, total: TotalRate) -> None:
     of_what = "" if len(total.determined) == len(total.rates) else " of the determined part"
     axes.set_title(f"sources of the uncertainty{of_what}\n(shares of the variance)", fontsize=10)
     if not shares:
-        axes.set_axis_off()
-        axes.text(0.5, 0.5, "not known: no rate has a lower end", ha="center", va="center", transform=axes.transAxes)
+        _write_message(axes, "not known: no rate has a lower end")
         return
     axes.barh(range(len(shares)), [100 * each.share for each in shares], color=LINE_COLOUR)
     for row, each in enumerate(shares):

@@ -1,12 +1,19 @@
-"""Study: a question with everything that it names, checked and loaded before the first simulation."""
+"""Study: a question with everything that it names, checked and loaded before the first simulation.
+
+A question that a folder records is read from a file that anybody may have written, and asked for trust. Files that it
+names have digests, and are found again where the folder has moved together with them.
+"""
 
 from __future__ import annotations
 
+import contextlib
 import itertools
+import re
 import warnings
-from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,28 +21,34 @@ import torch
 
 import agents
 import samplers
+from agents.loading import find_ego_kind, strip_prefixes
+from agents.saved_ego import HUB_PREFIX, find_cached_model, find_statistics
+from rare_envs.code_trust import check_code_trust, find_module_file, note_own_run
 from rare_envs.distributions.fitted import FittedDistribution
 from rare_envs.distributions.space import Distribution
 from rare_envs.egos.errors import EgoGone
 from rare_envs.egos.needs import AmbiguousActions, MissingStatistics
+from rare_envs.files import parse_json_object, read_text_file
 from rare_envs.measures.registry import MEASURES
 from rare_envs.problem import DrivingProblem
 from rare_envs.scenarios.base_distributions import load_base
 from rare_envs.scenarios.registry import find_scenario
 from rare_envs.simulation.rollout import drive
-from rare_envs.study.arguments import Question
+from rare_envs.study.arguments import Question, read_question
 from rare_envs.study.errors import BadInput, as_bad_input
+from rare_envs.study.run_folder import STUDY, LoadedStudy, digest_file
+
+NAMING_FILES = ("ego", "stats", "base", "drivers", "measure", "also_under")
+"""Fields of a question that can name files."""
+MAX_TEXT = 2**16
+"""Letters of a name or formula in a question."""
+CHANGEABLE = ("trust", "on_error", "core", "device")
+"""Fields that a resumed run may change, or that follow from what is installed."""
 
 
 @dataclass(frozen=True)
 class Study:
-    """A question with everything that it names, loaded and checked.
-
-    Example:
-        >>> study = prepare(Question(env_id="rare_envs/CarFollowing-v0", method="mc"))
-        >>> study.problem.space.names, study.method.name
-        (('ego_speed', 'lead_speed', 'gap'), 'mc')
-    """
+    """A question with everything that it names, loaded and checked."""
 
     question: Question
     problem: DrivingProblem
@@ -163,3 +176,154 @@ def _answers_vary(problem: DrivingProblem) -> bool:
         raise BadInput(f"The ego fails on its first observation: {words or repr(error)}") from error
     same = torch.equal(first.state.speed, again.state.speed) and torch.equal(first.state.heading, again.state.heading)
     return not same
+
+
+def digest_files(question: Question) -> dict[str, str]:
+    """Return the digests of the files that a question names, by path; modules are found, not imported.
+
+    The `VecNormalize` statistics that are read with its ego are among them.
+    """
+    bases = map(str.strip, (question.also_under or "").split(","))
+    names = filter(None, (question.base, question.drivers, question.measure, *bases))
+    paths = {path for name in names for path in find_named_files(name)}
+    return digest_contents(sorted(paths | set(find_ego_files(question))))
+
+
+def digest_contents(paths: Iterable[Path]) -> dict[str, str]:
+    """Return the digests of files, by path."""
+    return {str(path): digest_file(path) for path in paths}
+
+
+def find_ego_files(question: Question) -> list[Path]:
+    """Return the files of the ego of a question, the `VecNormalize` statistics that it is loaded with included."""
+    spec = strip_prefixes(question.ego)
+    files = find_named_files(spec)
+    if find_ego_kind(spec) not in ("zip", "hub"):
+        return files
+    found = [Path(question.stats)] if question.stats else [find_statistics(path) for path in files]
+    return [*files, *(path for path in found if path is not None and path.is_file())]
+
+
+def find_named_files(name: str) -> list[Path]:
+    """Return the file that an option names, or that of its module: a.zip, noisy:a.zip, hf:user/a, module:function."""
+    if name.startswith(HUB_PREFIX):
+        cached = find_cached_model(name)
+        return [] if cached is None else [cached]
+    parts = name.split(":")
+    with contextlib.suppress(OSError, ValueError):  # too long a name, or with a null byte
+        files = [path for path in map(Path, (name, *parts)) if path.is_file()]
+        modules = (find_module_file(part) for part in parts[:-1] if part.replace(".", "_").isidentifier())
+        return files or [path for path in modules if path is not None]
+    return []
+
+
+def find_changed_files(before: Mapping[str, str], now: Mapping[str, str]) -> list[str]:
+    """Return the files of other content, those that are gone and those that are new; where a file lies does not matter.
+
+    Example:
+        >>> find_changed_files({"a.zip": "1"}, {"moved/a.zip": "1"}), find_changed_files({"a.zip": "1"}, {"a.zip": "2"})
+        ([], ['a.zip'])
+    """
+    gone = {name for name, digest in before.items() if digest not in now.values()}
+    new = {name for name, digest in now.items() if digest not in before.values()}
+    return sorted(gone | new)
+
+
+def warn_of_changed_files(question: Question, folder: Path) -> None:
+    """Warn where a file of a run, or the statistics beside its ego, are not what they were when it was begun."""
+    about = _read_about(folder)
+    changed = find_changed_files(_texts(about["files"]), digest_files(question)) if "files" in about else []
+    if changed:
+        warnings.warn(
+            f"{', '.join(changed)} changed since the run in {str(folder)!r} was begun, whose numbers are of what it "
+            "was before.",
+            stacklevel=2,
+        )
+
+
+def find_moved_files(question: Question, folder: Path) -> Question:
+    """Return the question of a run with files that are not where they were in the places that they have now.
+
+    A file is looked for where it lay as seen from the folder of the run; its content must be what it was.
+    """
+    about = _read_about(folder)
+    before, places = _texts(about.get("files")), _texts(about.get("file_places"))
+    moved: dict[str, str] = {}
+    with as_bad_input(OSError, ValueError):  # names of somebody else's making
+        for name in sorted(before.keys() & places.keys()):
+            old, path = Path(name), folder / places[name]
+            if not path.is_file() or (old.is_file() and digest_file(old) == before[name]):
+                continue
+            if digest_file(path) == before[name]:
+                moved[name] = str(path)
+            elif not old.is_file():
+                raise BadInput(
+                    f"{str(path)!r} has changed since the run in {str(folder)!r} was begun, which names it as "
+                    f"{name!r}: put the earlier file there, or begin anew."
+                )
+    renamed: dict[str, Any] = {name: _rename(getattr(question, name), moved) for name in NAMING_FILES}
+    return replace(question, **renamed)
+
+
+def _rename(value: str | None, moved: Mapping[str, str]) -> str | None:
+    """Return what a field names, such as noisy:a.zip?delay=1, with the new paths of files."""
+    for name, place in moved.items() if value is not None else ():
+        value = place.join(re.split(rf"(?:^|(?<=[:,\s])){re.escape(name)}(?=$|[?:,\s])", str(value)))
+    return value
+
+
+def _read_about(folder: Path) -> dict[str, Any]:
+    """Return what study.json holds; nothing where it cannot be read, which others tell."""
+    try:
+        return parse_json_object(read_text_file(folder / STUDY), STUDY)
+    except (OSError, ValueError):
+        return {}
+
+
+def _texts(value: object) -> dict[str, str]:
+    """Return the entries of an object that are texts."""
+    found = value.items() if isinstance(value, dict) else ()
+    return {str(name): text for name, text in found if isinstance(text, str)}
+
+
+def open_run(study: LoadedStudy, trust: bool) -> Question:
+    """Return the question of a finished run, see `open_question`."""
+    return open_question(study.result.get("question"), study.folder, trust)
+
+
+def open_question(recorded: object, folder: Path, trust: bool) -> Question:
+    """Return the question of a folder, if its values are of the right types and what code it names may run.
+
+    What simulates it (`core`) is chosen anew, on the CPU, and files that have moved with the folder are found.
+    """
+    question = replace(read_question(recorded), trust=trust, core="auto", device="cpu")
+    if any(isinstance(value, str) and len(value) > MAX_TEXT for value in asdict(question).values()):
+        raise BadInput(f"The question of the run in {str(folder)!r} has a name of more than {MAX_TEXT} letters.")
+    with as_bad_input(ValueError):
+        check_code_trust(_keep_asked(question), list_code(question), folder, trust)
+    return find_moved_files(question, folder)
+
+
+def note_question(question: Question) -> None:
+    """Note that a question was asked here, so that its folder needs no trust."""
+    note_own_run(_keep_asked(question), list_code(question))
+
+
+def is_same_question(recorded: object, question: Question) -> bool:
+    """Return whether a recorded question is this one, but for what a run that is resumed may change."""
+    asked = _keep_asked(question)
+    if find_ego_kind(question.ego) == "remote":
+        del asked["ego"]  # its address may change
+    return isinstance(recorded, Mapping) and all(recorded.get(name) == value for name, value in asked.items())
+
+
+def list_code(question: Question) -> list[str]:
+    """Return the code that a question names, as `module:name`."""
+    ego, measure, env_id = strip_prefixes(question.ego), question.measure, question.env_id
+    found = [ego] if find_ego_kind(ego) == "function" else []
+    found += [measure] if ":" in measure and not measure.startswith("stl:") else []
+    return found + ([env_id] if ":" in env_id else [])
+
+
+def _keep_asked(question: Question) -> dict[str, Any]:
+    return {name: value for name, value in asdict(question).items() if name not in CHANGEABLE}

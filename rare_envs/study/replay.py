@@ -1,24 +1,35 @@
-"""Replay: one scenario driven again, every moment of it kept."""
+"""Replay: one scenario, or a failure that a run has recorded, driven again, every moment of it kept."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from rare_envs.distributions.space import ScenarioSpace
 from rare_envs.measures import Moment
 from rare_envs.problem import DrivingProblem
 from rare_envs.simulation.episode import Episode
 from rare_envs.simulation.rollout import drive
+from rare_envs.study.columns import MAX_SHOWN, format_value
+from rare_envs.study.errors import BadInput, as_bad_input
+from rare_envs.study.question import open_run, prepare, warn_of_changed_files
+from rare_envs.study.run_folder import FAILURES, load_finished
 from rare_envs.traffic.crash import describe_crash
 from rare_envs.traffic.road import Road
 from samplers.problem import FloatArray
+
+REPLAY_TOLERANCE = 1e-3
+"""Largest difference of f to the recorded one: products of networks round differently by batch size."""
+OWN_NOISE = "ego_noise"
+"""Parameter that an ego has which is random itself."""
 
 
 @dataclass(frozen=True)
@@ -144,3 +155,103 @@ def drive_again(problem: DrivingProblem, x: NDArray[np.float64]) -> Drive:
         if bool(episode.collided):
             break
     return Drive(problem, tuple(episodes))
+
+
+class RecordedFailure(NamedTuple):
+    """A failure as a run has recorded it."""
+
+    problem: DrivingProblem
+    x: FloatArray
+    """Scenario parameters, shape (d,)."""
+    f: float
+    log_p0: float
+    n_listed: int
+    """Number of failures that the run lists, the most likely ones."""
+    n_found: int
+    """Number of failures that it found."""
+
+
+def find_failure(folder: Path, number: int, trust: bool = False, ego: str | None = None) -> RecordedFailure:
+    """Return failure `number` of a run, the most likely being number 0; with another ego in its world, if one is named.
+
+    What code the run or the egos name runs only with `trust`, unless the run was made here.
+
+    Raises:
+        BadInput: There is no such run or failure, or what it was about cannot be loaded any longer.
+    """
+    run = load_finished(folder)
+    question, table, count = open_run(run, trust), run.failures, len(run.failures["f"])
+    warn_of_changed_files(question, folder)
+    if not count:
+        raise BadInput("The run has no failure.")
+    if not 0 <= number < count:
+        raise BadInput(f"Expected a failure from 0 to {count - 1}, got {number}.")
+    if ego is not None:
+        question = replace(question, ego=ego, algo=None, stats=None, observation=None, action=None)
+    with as_bad_input(TypeError, OverflowError, RecursionError, MemoryError):
+        problem = prepare(question).problem
+    x, found = read_row(table, problem, number), run.result.get("n_failures")
+    n_found = found if isinstance(found, int) and found > count else count
+    return RecordedFailure(problem, x, float(table["f"][number]), float(table["log_p0"][number]), count, n_found)
+
+
+def read_row(table: Mapping[str, NDArray[Any]], problem: DrivingProblem, number: int) -> FloatArray:
+    """Return x (d,) of a row of the failures of a run.
+
+    Raises:
+        BadInput: The columns are others than those of the problem, or x is no scenario of its traffic.
+    """
+    names = [name for name in problem.space.names if name in table]
+    try:
+        x = join_parts({name: table[name][number] for name in names}, problem.space)
+    except ValueError as error:
+        wanted = ", ".join(problem.space.names)
+        raise BadInput(f"Expected {FAILURES} with the columns {wanted}; the run is of another problem.") from error
+    if not np.isfinite(x).all() or not np.isfinite(problem.base.log_prob(x[None])).all():
+        raise BadInput(f"Failure {number} in {FAILURES} is no scenario of {problem.env_id} and its base distribution.")
+    return x
+
+
+def join_parts(parts: Mapping[str, Any], space: ScenarioSpace) -> FloatArray:
+    """Return x (d,) from the values of its parameters by name.
+
+    An ego's own noise belongs to the ego that failed: another one has zeros, its mean actions.
+    """
+    found = []
+    for name, size in zip(space.names, space.sizes, strict=True):
+        part = np.atleast_1d(np.asarray(parts.get(name, ()), dtype=np.float64))
+        if len(part) != size and name != OWN_NOISE:
+            raise ValueError(f"has {len(part)} values of {name}, its scenario has {size}")
+        found.append(part if len(part) == size else np.zeros(size))
+    return np.concatenate(found)
+
+
+def describe_drive(recorded: RecordedFailure, drive: Drive, number: int, ego: str | None = None) -> list[str]:
+    """Return the drive in words, line by line."""
+    space, labels = recorded.problem.space, recorded.problem.world.scenario.labels
+    listed = f" ({recorded.n_listed:,} of them listed)" if recorded.n_listed < recorded.n_found else ""
+    lines = [
+        f"Failure {number} of {recorded.n_found:,} found{listed} in {recorded.problem.env_id}: "
+        f"f = {drive.f:.4g}, log p0 = {recorded.log_p0:.2f}"
+    ]
+    for name, values in space.named(recorded.x).items():
+        unit = space.units[space.names.index(name)]
+        several = np.atleast_1d(values)
+        shown = " ".join(map(format_value, several)) if len(several) <= MAX_SHOWN else f"{len(several)} values"
+        lines.append(f"  {name:<15} {shown} {unit}".rstrip())
+    end = drive.time[-1]
+    crash = drive.crash
+    if crash is None:
+        lines.append(f"No crash within {end:.1f} s; the worst moment was at {drive.time[drive.worst]:.1f} s.")
+    else:
+        who, whom = ("the edge of the road" if j < 0 else labels[j] for j in crash["vehicles"])
+        how = f"{crash['kind']}, closing at {crash['closing_speed']:.1f} m/s"
+        lines.append(f"Crash after {end:.1f} s: {who} into {whom} ({how}).")
+    if ego is not None:
+        lines.append(f"The ego was {ego}; that of the run had f = {recorded.f:.4g}.")
+    elif abs(drive.f - recorded.f) > REPLAY_TOLERANCE:
+        why = "ego, drivers or this program have changed since"
+        if recorded.problem.varies:
+            why = "the ego answers differently from run to run, and what was recorded is what counts"
+        lines.append(f"warning: the run recorded f = {recorded.f:.4g}; {why}.")
+    return lines

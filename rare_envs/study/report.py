@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 import samplers
 from agents.saved_ego import SavedEgo
 from rare_envs.distributions.fitted import EventFrequency, FittedDistribution
-from rare_envs.distributions.space import Distribution
 from rare_envs.egos.wrappers import describe_missing_normalisation
 from rare_envs.exposure import HUMAN_BENCHMARKS, CollisionProbability, CollisionRate, explain_no_frequency, read_source
 from rare_envs.measures.base import Measure
@@ -23,25 +22,33 @@ from rare_envs.scenarios.registry import find_scenario
 from rare_envs.study.arguments import Question
 from rare_envs.study.modes import CrashKinds, FailureMode, find_modes
 from rare_envs.study.question import Study
-from rare_envs.study.repeatability import Repeatability
-from rare_envs.study.severity import Severity
 from rare_envs.version import __version__
 from samplers.analysis.base_error import FIT_BIAS
 from samplers.analysis.reweight import refit_quantile
 from samplers.evaluate import Fault
-from samplers.sample import Sample
 from samplers.statistics import Interval
 
+MOST_DIFFERING = 0.05
+"""Share of simulations that may differ by more: a choice between two actions may hang on rounding in a rare one."""
 N_THRESHOLDS = 25
 REACH = 0.5
 """P[f <= g] at the largest threshold."""
+COLLISION_MEASURE = "ttc"
+"""The measure to advise: -1 after a collision and above 0 without one."""
+ENSEMBLE_REASON = (
+    "the parameters of an ensemble are those of all its refits; without --ensemble derivatives are by those of the base"
+)
+"""Why there are no derivatives of the mean over refits."""
 
 
 def compute_threshold_curve(estimate: samplers.Estimate) -> samplers.Curve | None:
-    """Return p over thresholds with its band; None where the run does not tell it."""
-    if estimate.sample is None or estimate.p <= 0:
+    """Return p over thresholds, up to that at which `REACH` of the weight lies; None where the run does not tell it."""
+    sample = estimate.sample
+    if sample is None or estimate.p <= 0:
         return None
-    top = _find_quantile(estimate.sample)
+    order = np.argsort(sample.f, kind="stable")
+    below = np.cumsum(sample.weights[order])
+    top = float(sample.f[order][min(int(np.searchsorted(below, REACH * below[-1])), len(order) - 1)])
     if not np.isfinite(top) or top <= estimate.gamma:
         return None
     try:
@@ -50,58 +57,48 @@ def compute_threshold_curve(estimate: samplers.Estimate) -> samplers.Curve | Non
         return None
 
 
-def _find_quantile(sample: Sample) -> float:
-    """Return the f below which `REACH` of the weight lies."""
-    order = np.argsort(sample.f, kind="stable")
-    below = np.cumsum(sample.weights[order])
-    place = min(int(np.searchsorted(below, REACH * below[-1])), len(order) - 1)
-    return float(sample.f[order][place])
-
-
-COLLISION_MEASURE = "ttc"
-"""The measure to advise: -1 after a collision and above 0 without one."""
-
-
 def find_frequency(study: Study) -> EventFrequency:
-    """Return the frequency of the events whose failures a question counts."""
+    """Return the frequency of the events whose failures a question counts, or raise a ValueError that says why not."""
     reason = _explain_no_collisions(study.question)
     if reason:
         raise ValueError(f"no rate per hour or km: {reason}")
-    frequency = study.base.frequency if isinstance(study.base, FittedDistribution) else None
-    if frequency is None:
+    base = study.base if isinstance(study.base, FittedDistribution) else None
+    if base is None or base.frequency is None:
         scenario = find_scenario(study.question.env_id).name
-        record = study.base.record if isinstance(study.base, FittedDistribution) else {}
         raise ValueError(
             f"no rate per hour or km: the base {study.base_name!r} of {scenario} has no event frequency, "
-            f"{explain_no_frequency(record)}"
+            f"{explain_no_frequency({} if base is None else base.record)}"
         )
-    return frequency
+    return base.frequency
 
 
-def compute_rate(study: Study, estimate: samplers.Estimate) -> CollisionRate:
-    """Return the rate of collisions of an estimate."""
+def _explain_no_collisions(question: Question) -> str:
+    """Return why p is no probability of a collision of the ego; empty if it is one."""
+    measure = MEASURES.get(question.measure)
+    if not (isinstance(measure, Measure) and measure.collisions_only):
+        return f"--measure {question.measure} counts other events than collisions (--measure {COLLISION_MEASURE} does)"
+    lowest = measure.collision if isinstance(measure.collision, float) else 0.0  # no number: f is graded by the crash
+    if not lowest <= question.gamma <= 0:
+        return f"--gamma {question.gamma:g} counts other events than collisions (--gamma 0 does)"
+    if question.collisions != "ego":
+        return f"--collisions {question.collisions} counts those between other vehicles too"
+    return ""
+
+
+def compute_rate(study: Study, estimate: samplers.Estimate, probability: CollisionProbability) -> CollisionRate:
+    """Return the rate of what has a probability per event: those of two bases fitted to the same events say so."""
+    base = study.base
+    data = read_source(base.record)["data"] if isinstance(base, FittedDistribution) else ""
     return CollisionRate(
         scenario=study.problem.world.scenario.name,
-        probability=describe_probability(estimate),
+        probability=probability,
         frequency=find_frequency(study),
         confidence=estimate.confidence,
-        fitted_to=_identify_events(study),
+        fitted_to=f"{base.fitted_to}, {data}" if isinstance(base, FittedDistribution) and data else "",
     )
 
 
-def compute_injury_rate(study: Study, estimate: samplers.Estimate, severity: Severity) -> CollisionRate:
-    """Return the rate of serious injuries (MAIS 3 or more) of an estimate: injuries per event in place of p."""
-    injuries = severity.injuries
-    probability = _describe_value(injuries.value, injuries.cov, injuries.interval, severity.injuries_base)
-    return replace(compute_rate(study, estimate), probability=probability)
-
-
-def describe_probability(estimate: samplers.Estimate) -> CollisionProbability:
-    """Return p of an estimate with its errors: that of sampling, and where refits are known, that of the base."""
-    return _describe_value(estimate.p, estimate.cov, estimate.interval, estimate.base_uncertainty)
-
-
-def _describe_value(
+def describe_value(
     value: float, cov: float, sampling: Interval, base: samplers.BaseUncertainty | None
 ) -> CollisionProbability:
     """Return an expectation per event with its errors; its interval is that of the base where there is one."""
@@ -140,32 +137,6 @@ def describe_left_out(study: Study, estimate: samplers.Estimate) -> tuple[str, .
     return tuple(found)
 
 
-def _explain_no_collisions(question: Question) -> str:
-    """Return why p is no probability of a collision of the ego; empty if it is one."""
-    measure = MEASURES.get(question.measure)
-    if not (isinstance(measure, Measure) and measure.collisions_only):
-        return f"--measure {question.measure} counts other events than collisions (--measure {COLLISION_MEASURE} does)"
-    lowest = measure.collision if isinstance(measure.collision, float) else 0.0  # no number: f is graded by the crash
-    if not lowest <= question.gamma <= 0:
-        return f"--gamma {question.gamma:g} counts other events than collisions (--gamma 0 does)"
-    if question.collisions != "ego":
-        return f"--collisions {question.collisions} counts those between other vehicles too"
-    return ""
-
-
-def _identify_events(study: Study) -> str:
-    """Return words that two base distributions share if they were fitted to the same events; empty if not known."""
-    base = study.base
-    data = read_source(base.record)["data"] if isinstance(base, FittedDistribution) else ""
-    return f"{base.fitted_to}, {data}" if isinstance(base, FittedDistribution) and data else ""
-
-
-ENSEMBLE_REASON = (
-    "the parameters of an ensemble are those of all its refits; without --ensemble derivatives are by those of the base"
-)
-"""Why there are no derivatives of the mean over refits."""
-
-
 def has_exact_bound(estimate: samplers.Estimate) -> bool:
     """Return whether the answer is the upper end: no simulation failed, and all are draws from the base distribution.
 
@@ -182,9 +153,27 @@ class BaseAnswer(NamedTuple):
     found: samplers.Reweighted | None
     refused: str = ""
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return plain values for JSON."""
-        return {"base": self.base, "refused": self.refused, **(self.found.to_dict() if self.found else {})}
+
+class Repeatability(NamedTuple):
+    """Simulations done again, in another order and company."""
+
+    n: int
+    """How many."""
+    n_differing: int
+    """With another f."""
+    largest: float
+    """Largest difference of f."""
+
+    @property
+    def warning(self) -> str:
+        """Doubt about p; "" if few or none differ."""
+        if self.n_differing <= MOST_DIFFERING * self.n:
+            return ""
+        return (
+            f"of {self.n} simulations done again in another order and company {self.n_differing} gave another f, by up "
+            f"to {self.largest:.3g}: the ego or the measure is random, keeps something from one call to the next, or "
+            "mixes the rows of a batch, so p may be wrong by any factor; rare-envs check-ego may say where"
+        )
 
 
 @dataclass(frozen=True)
@@ -238,11 +227,10 @@ class Report:
     @property
     def average(self) -> str:
         """What p is a mean over, in words; empty where it is p under one distribution."""
-        if not self.study.question.ensemble:
-            return ""
         base = self.study.base
-        number = len(base.refits) if isinstance(base, FittedDistribution) else 0
-        return f"mean over the {number} refits of {self.study.base_name}"
+        if not self.study.question.ensemble or not isinstance(base, FittedDistribution):
+            return ""
+        return f"mean over the {len(base.refits)} refits of {self.study.base_name}"
 
     @property
     def doubtful(self) -> bool:
@@ -254,46 +242,56 @@ class Report:
         """Doubts about p: of the method, about the base distribution, the ego's statistics, and f as a function."""
         base = self.estimate.base_uncertainty
         doubts = () if base is None else tuple(f"base distribution: {text}" for text in base.warnings)
-        return (*(() if self.is_exact_bound else self.estimate.warnings), *doubts, *self.doubts_of_f)
+        return (*self.doubts_of_method, *doubts, *self.doubts_of_f)
 
     @property
-    def is_exact_bound(self) -> bool:
-        """Whether the answer is the upper end, see `has_exact_bound`."""
-        return has_exact_bound(self.estimate)
-
-    @property
-    def remarks(self) -> tuple[str, ...]:
-        """Facts about how the run went that cast no doubt on the numbers."""
-        return (*(self.estimate.warnings if self.is_exact_bound else ()), *self.estimate.remarks)
+    def doubts_of_method(self) -> tuple[str, ...]:
+        """Warnings of the estimate, but for that of an exact upper end."""
+        return () if has_exact_bound(self.estimate) else self.estimate.warnings
 
     @property
     def doubts_of_f(self) -> tuple[str, ...]:
         """Doubts about the ego's statistics, and f as a function; the estimate's own warnings are not among them."""
-        again = (self.repeatability.warning,) if self.repeatability and self.repeatability.warning else ()
-        return (*self._missing_statistics, *again)
+        again = "" if self.repeatability is None else self.repeatability.warning
+        return tuple(filter(None, (self.missing_statistics, again)))
 
     @property
-    def _missing_statistics(self) -> tuple[str, ...]:
-        ego = self.study.problem.ego
-        problem = self.study.problem
+    def missing_statistics(self) -> str:
+        """Why the ego seems to lack its `VecNormalize` statistics; empty if it does not."""
+        ego, problem = self.study.problem.ego, self.study.problem
         missing = describe_missing_normalisation(ego, problem.world.observation_space)
         option = " (--stats)" if isinstance(ego, SavedEgo) else ""
-        return (f"the ego has no VecNormalize statistics{option}, but {missing}",) if missing else ()
+        return f"the ego has no VecNormalize statistics{option}, but {missing}" if missing else ""
+
+    @property
+    def vec_normalize(self) -> str | None:
+        """File of the `VecNormalize` statistics that were applied to a saved ego's observations, if there was one."""
+        ego = self.study.problem.ego
+        return str(ego.statistics_path) if isinstance(ego, SavedEgo) and ego.statistics_path else None
+
+    @property
+    def remarks(self) -> tuple[str, ...]:
+        """Facts about how the run went that cast no doubt on the numbers."""
+        return (*(self.estimate.warnings if has_exact_bound(self.estimate) else ()), *self.estimate.remarks)
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Options that make no difference here, notes of the problem, what is not known, what the rate leaves out."""
+        world, noise = self.study.problem.world, self.study.question.noise
+        found = list(self.study.problem.notes)
+        drivers_vary = world.background is not None and world.background.noisy
+        if noise is not True and not world.sensing.weather and not drivers_vary:
+            word = "off" if noise is False else noise
+            found.insert(0, f"--noise {word} changes nothing: nobody in this traffic drives with noise (see --drivers)")
+        found += [f"kinds of crash are not known: {self.kinds.unknown}"] if self.kinds.unknown else []
+        found += [f"sensitivity is not known: {self.sensitivity}"] if isinstance(self.sensitivity, str) else []
+        found += [self.lost] if self.lost else []
+        return (*found, *(() if self.no_rate else describe_left_out(self.study, self.estimate)))
 
     @property
     def crashes(self) -> tuple[dict[str, Any] | None, ...]:
         """The crash of each listed failure, see `rare_envs.traffic.crash.describe_crash`; None where nobody crashed."""
         return self.kinds.listed or (None,) * len(self.estimate.failures)
-
-    @property
-    def notes(self) -> tuple[str, ...]:
-        """Options that make no difference here, notes of the problem, what is not known, what the rate leaves out."""
-        unknown = [f"kinds of crash are not known: {self.kinds.unknown}"] if self.kinds.unknown else []
-        if isinstance(self.sensitivity, str):
-            unknown.append(f"sensitivity is not known: {self.sensitivity}")
-        unknown += [self.lost] if self.lost else []
-        left_out = () if self.no_rate else describe_left_out(self.study, self.estimate)
-        return (*self._unused_options, *self.study.problem.notes, *unknown, *left_out)
 
     @cached_property
     def verdict(self) -> samplers.Verdict | None:
@@ -320,17 +318,6 @@ class Report:
         return compute_threshold_curve(self.estimate)
 
     @cached_property
-    def rate(self) -> CollisionRate | None:
-        """Collisions per hour and per km; None where `no_rate` says why there are none."""
-        return compute_rate(self.study, self.estimate) if not self.no_rate else None
-
-    @cached_property
-    def injury_rate(self) -> CollisionRate | None:
-        """Serious injuries (MAIS 3 or more) per hour and per km; None where there is no rate, or no collision."""
-        severity = self.kinds.severity
-        return None if self.no_rate or severity is None else compute_injury_rate(self.study, self.estimate, severity)
-
-    @cached_property
     def no_rate(self) -> str:
         """Why there is no rate; empty if there is one."""
         try:
@@ -340,84 +327,86 @@ class Report:
         return ""
 
     @cached_property
+    def rate(self) -> CollisionRate | None:
+        """Collisions per hour and per km; None where `no_rate` says why there are none."""
+        if self.no_rate:
+            return None
+        estimate = self.estimate
+        p = describe_value(estimate.p, estimate.cov, estimate.interval, estimate.base_uncertainty)
+        return compute_rate(self.study, estimate, p)
+
+    @cached_property
+    def injury_rate(self) -> CollisionRate | None:
+        """Serious injuries (MAIS 3 or more) per hour and per km; None where there is no rate, or no collision."""
+        severity = self.kinds.severity
+        if self.no_rate or severity is None:
+            return None
+        injuries = severity.injuries
+        per_event = describe_value(injuries.value, injuries.cov, injuries.interval, severity.injuries_base)
+        return compute_rate(self.study, self.estimate, per_event)
+
+    @cached_property
     def other_bases(self) -> tuple[BaseAnswer, ...]:
         """P under the other base distributions that the question names, from the same simulations."""
-        return tuple(_reweight(self.estimate, name, base) for name, base in self.study.other_bases.items())
-
-    @property
-    def _unused_options(self) -> tuple[str, ...]:
-        world, noise = self.study.problem.world, self.study.question.noise
-        if noise is True or world.sensing.weather or (world.background is not None and world.background.noisy):
-            return ()
-        word = "off" if noise is False else noise
-        return (f"--noise {word} changes nothing: nobody in this traffic drives with noise (see --drivers)",)
-
-    @property
-    def vec_normalize(self) -> str | None:
-        """File of the `VecNormalize` statistics that were applied to a saved ego's observations, if there was one."""
-        ego = self.study.problem.ego
-        return str(ego.statistics_path) if isinstance(ego, SavedEgo) and ego.statistics_path else None
+        found = []
+        for name, base in self.study.other_bases.items():
+            try:
+                found.append(BaseAnswer(name, self.estimate.reweight(base)))
+            except ValueError as error:
+                found.append(BaseAnswer(name, None, str(error)))
+        return tuple(found)
 
     def to_dict(self, top: int = 10) -> dict[str, Any]:
         """Return the report as JSON-ready values: question, estimate and the `top` most likely failures."""
-        failures = self.estimate.failures
-        space = self.study.problem.space
-        ranked = [
-            {
-                "parameters": self._parameters(failure.x),
-                "f": failure.f if math.isfinite(failure.f) else None,
-                "log_p0": failure.log_p0,
-                "crash": crash,
-            }
-            for failure, crash in itertools.islice(zip(failures, self.crashes, strict=True), top)
-        ]
+        failures, space = self.estimate.failures, self.study.problem.space
+        listed = itertools.islice(zip(failures, self.crashes, strict=True), top)
+
+        def convert(value: Any) -> Any:
+            return None if value is None else value.to_dict()
+
         return {
             **self.estimate.to_dict(),
             "question": asdict(self.study.question),
             "average": self.average,
             "valid": self.estimate.proviso,
-            "gate": None if self.verdict is None else self.verdict.to_dict(),
+            "gate": convert(self.verdict),
             "doubtful": self.doubtful,
             "doubts": self.warnings,
             "notes": self.notes,
             "vec_normalize": self.vec_normalize,
-            "missing_statistics": self._missing_statistics[0] if self._missing_statistics else "",
+            "missing_statistics": self.missing_statistics,
             "seconds": self.seconds,
             "earlier_seconds": self.earlier_seconds,
             "n_failures": failures.total,
             "kinds": {kind: share.to_dict() for kind, share in self.kinds.shares.items()},
             "modes": [mode.to_dict() for mode in self.modes],
-            "curve": None if self.curve is None else self.curve.to_dict(),
-            "severity": None if self.kinds.severity is None else self.kinds.severity.to_dict(),
+            "curve": convert(self.curve),
+            "severity": convert(self.kinds.severity),
             "sensitivity": self.sensitivity.to_dict() if isinstance(self.sensitivity, samplers.Sensitivity) else None,
-            "failures": ranked,
+            "failures": [
+                {
+                    "parameters": self._parameters(one.x),
+                    "f": one.f if math.isfinite(one.f) else None,
+                    "log_p0": one.log_p0,
+                    "crash": crash,
+                }
+                for one, crash in listed
+            ],
             "n_faults": len(self.faults),
             "n_retried": self.n_retried,
             "repeatability": None if self.repeatability is None else self.repeatability._asdict(),
-            "faults": [
-                {"parameters": self._parameters(fault.x), "reason": fault.reason} for fault in self.faults[:top]
-            ],
+            "faults": [{"parameters": self._parameters(one.x), "reason": one.reason} for one in self.faults[:top]],
             "units": dict(zip(space.names, space.units, strict=True)),
-            "rate": None if self.rate is None else {**self.rate.to_dict(), "people": _human_benchmarks()},
-            "injury_rate": None if self.injury_rate is None else self.injury_rate.to_dict(),
+            "rate": None
+            if self.rate is None
+            else {**self.rate.to_dict(), "people": [each.to_dict() for each in HUMAN_BENCHMARKS]},
+            "injury_rate": convert(self.injury_rate),
             "no_rate": self.no_rate,
-            "other_bases": [each.to_dict() for each in self.other_bases],
+            "other_bases": [
+                {"base": each.base, "refused": each.refused, **(convert(each.found) or {})} for each in self.other_bases
+            ],
             "version": __version__,
         }
 
     def _parameters(self, x: NDArray[np.float64]) -> dict[str, Any]:
-        named = self.study.problem.space.named(x)
-        return {name: np.asarray(value).tolist() for name, value in named.items()}
-
-
-def _human_benchmarks() -> list[dict[str, Any]]:
-    """Return what people's rates are, to compare with, for JSON."""
-    return [benchmark.to_dict() for benchmark in HUMAN_BENCHMARKS]
-
-
-def _reweight(estimate: samplers.Estimate, name: str, base: Distribution) -> BaseAnswer:
-    """Return p under another base distribution, or the reason why not."""
-    try:
-        return BaseAnswer(name, estimate.reweight(base))
-    except ValueError as error:
-        return BaseAnswer(name, None, str(error))
+        return {name: np.asarray(value).tolist() for name, value in self.study.problem.space.named(x).items()}

@@ -28,9 +28,8 @@ from rare_envs.scenarios.base import Scenario
 from rare_envs.scenarios.base_distributions import load_base
 from rare_envs.scenarios.registry import env_id_of, scenario_named
 from rare_envs.study.arguments import Question
-from rare_envs.study.errors import BadInput, as_bad_input
+from rare_envs.study.errors import BadInput, RunInterrupted, as_bad_input, keep_answer
 from rare_envs.study.evaluate import run, run_into
-from rare_envs.study.interruption import RunInterrupted, keep_answer
 from rare_envs.study.plots import save_risk_plot
 from rare_envs.study.question import Study, prepare
 from rare_envs.study.report import Report, find_frequency
@@ -44,6 +43,12 @@ from rare_envs.study.text import (
 )
 from rare_envs.study.writing import check_no_results
 from rare_envs.version import __version__
+
+SCENARIO_SET = ("cut_in", "hard_brake")
+"""Scenarios that count nothing twice."""
+TWICE = ("cut_in", "car_following")
+"""Scenarios of which a set may have one: a cut-in gives the ego a new leader, so that car-following behind new leaders
+contains the cut-ins."""
 
 
 def list_sites(scenario: Scenario) -> dict[str, str]:
@@ -59,22 +64,32 @@ def list_sites(scenario: Scenario) -> dict[str, str]:
     return found
 
 
+def _read_site_of(base: Distribution) -> str:
+    """Return the site of a base distribution in words; empty where it was not fitted to events of one."""
+    return read_site(base.record) if isinstance(base, FittedDistribution) else ""
+
+
+def _find_frequency(scenario: Scenario, name: str) -> EventFrequency | None:
+    """Return the frequency of the events of a base; None where they were not counted."""
+    base = load_base(scenario, name)
+    return base.frequency if isinstance(base, FittedDistribution) else None
+
+
 def check_sites(scenarios: Sequence[Scenario], sites: Sequence[str]) -> None:
     """Raise a ValueError unless sites are different ones, each of a scenario at least."""
     if not sites or len(set(sites)) < len(sites):
         raise ValueError(f"Expected one site or more, such as us101, each once; got {', '.join(sites) or 'none'}.")
-    known = {name for scenario in scenarios for name in list_sites(scenario)}
+    known = sorted({name for scenario in scenarios for name in list_sites(scenario)})
     for site in (each for each in sites if each not in known):
         owner = next((scenario for scenario in scenarios if site in scenario.bases), None)
         if owner is None:
-            names = ", ".join(scenario.name for scenario in scenarios)
-            hint = did_you_mean(site, known)
-            raise ValueError(f"No base of {names} is of a site {site!r}{hint}; there are {', '.join(sorted(known))}.")
+            names, hint = ", ".join(scenario.name for scenario in scenarios), did_you_mean(site, known)
+            raise ValueError(f"No base of {names} is of a site {site!r}{hint}; there are {', '.join(known)}.")
         place = _read_site_of(load_base(owner, site))
         first = next((name for name, each in list_sites(owner).items() if each == place), "")
         further = f"is a further base of the site {first!r}" if first else "has no site"
         raise ValueError(
-            f"{site!r} is no site: this base of {owner.name} {further}. The sites are {', '.join(sorted(known))}; "
+            f"{site!r} is no site: this base of {owner.name} {further}. The sites are {', '.join(known)}; "
             f"--base {owner.name}={site} takes it as the base."
         )
 
@@ -92,15 +107,9 @@ def choose_base(scenario: Scenario, given: str | PathLike[str] | None, site: str
             f"{scenario.name} has no base of the site {site!r} (it has {', '.join(sites) or 'none'}): "
             f"--base {scenario.name}={scenario.default_base} takes another one."
         )
-    if _has_frequency(scenario, site):
-        return site, ()
-    found = next((name for name in scenario.bases if _has_frequency(scenario, name)), site)
+    counted = (name for name in (site, *scenario.bases) if _find_frequency(scenario, name) is not None)
+    found = next(counted, site)
     return found, () if found == site else (f"it has no event frequency at {site!r}: {found!r} is used",)
-
-
-def _has_frequency(scenario: Scenario, name: str) -> bool:
-    base = load_base(scenario, name)
-    return isinstance(base, FittedDistribution) and base.frequency is not None
 
 
 def compare_sites(report: Report, sites: Sequence[str], progress: bool = False) -> dict[str, float]:
@@ -109,41 +118,22 @@ def compare_sites(report: Report, sites: Sequence[str], progress: bool = False) 
     They come from the simulations of the report, reweighted. Where these do not suffice, sites that are asked for are
     simulated, and others left out; all are left out where nothing failed.
     """
-    study = report.study
+    study, factors = report.study, dict[str, float]()
     if report.estimate.p == 0 or report.rate is None:
-        return {}
-    factors = {}
-    for name, frequency in _other_frequencies(study).items():
-        p = _estimate_under(report, name, name in sites, progress)
+        return factors
+    scenario = study.problem.world.scenario
+    for name, site in list_sites(scenario).items():
+        frequency = _find_frequency(scenario, name)
+        if site == _read_site_of(study.base) or frequency is None:
+            continue
+        other = study.under(name)
+        try:
+            p = report.estimate.reweight(other.problem.base).p
+        except ValueError:
+            p = run(other, progress).estimate.p if name in sites else math.nan
         if p > 0:
             factors[name] = p * frequency.per_km / report.rate.per_million_km * MILLION_KM
     return factors
-
-
-def _other_frequencies(study: Study) -> dict[str, EventFrequency]:
-    """Return the frequencies of the events at each other site, by its name, as far as they were counted."""
-    scenario = study.problem.world.scenario
-    own = _read_site_of(study.base)
-    found = {}
-    for name, site in list_sites(scenario).items():
-        base = load_base(scenario, name)
-        if site != own and isinstance(base, FittedDistribution) and base.frequency is not None:
-            found[name] = base.frequency
-    return found
-
-
-def _read_site_of(base: Distribution) -> str:
-    """Return the site of a base distribution in words; empty where it was not fitted to events of one."""
-    return read_site(base.record) if isinstance(base, FittedDistribution) else ""
-
-
-def _estimate_under(report: Report, name: str, asked: bool, progress: bool) -> float:
-    """Return p under another base; NaN where the simulations do not give it and it was not asked for."""
-    other = report.study.under(name)
-    try:
-        return report.estimate.reweight(other.problem.base).p
-    except ValueError:
-        return run(other, progress).estimate.p if asked else math.nan
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -164,11 +154,6 @@ class ScenarioRisk:
         return self.rate.scenario
 
     @property
-    def base_name(self) -> str:
-        """Name or file of the base distribution."""
-        return self.report.study.base_name
-
-    @property
     def events(self) -> int | None:
         """Recorded events behind the base distribution, of its first part; None where nobody says."""
         base = self.report.study.base
@@ -182,22 +167,22 @@ class ScenarioRisk:
 
     def describe(self) -> str:
         """Return the line of the table: frequency x p = rate, its interval, and the events behind it."""
-        rate, base = self.rate, self.report.study.base
-        behind = base.fitted_to if isinstance(base, FittedDistribution) else "events not known"
-        version = self.report.study.question.env_id.rpartition("/")[2]  # whose bases may have the same names
+        rate, study = self.rate, self.report.study
+        behind = study.base.fitted_to if isinstance(study.base, FittedDistribution) else "events not known"
+        version = study.question.env_id.rpartition("/")[2]  # whose bases may have the same names
         factors = {name: factor for name, factor in self.site_factors.items() if factor > 0}
         sites = "".join(f", under {name} {factor:.2g} times as much" for name, factor in factors.items())
         return (
             f"{name_scenario(self.name):<13} {format_rate(rate.frequency.per_km)} per km x {rate.probability.p:.1e} = "
             f"{format_with_interval(rate.per_million_km, rate.interval_per_million_km, ' ')}   "
-            f"{behind} ({self.base_name} of {version}){sites}"
+            f"{behind} ({study.base_name} of {version}){sites}"
         )
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain values for JSON."""
         return {
             **self.rate.to_dict(),
-            "base": self.base_name,
+            "base": self.report.study.base_name,
             "events": self.events,
             "site_factors": dict(self.site_factors),
             "kinds_per_million_km": self.kinds,
@@ -222,20 +207,16 @@ class Risk:
     @cached_property
     def injuries(self) -> TotalRate | None:
         """Serious injuries (MAIS 3 or more), summed over the scenarios with collisions; None where there are none."""
-        rates = tuple(
-            replace(each.report.injury_rate, site_log_sd=each.rate.site_log_sd)
-            for each in self.scenarios
-            if each.report.injury_rate is not None
-        )
+        found = [(each.report.injury_rate, each.rate.site_log_sd) for each in self.scenarios]
+        rates = tuple(replace(rate, site_log_sd=spread) for rate, spread in found if rate is not None)
         return TotalRate(rates) if rates else None
 
     @property
     def kinds(self) -> dict[str, float]:
         """Collisions per million km by kind of crash, the most frequent first."""
         sums: dict[str, float] = {}
-        for each in self.scenarios:
-            for kind, rate in each.kinds.items():
-                sums[kind] = sums.get(kind, 0.0) + rate
+        for kind, rate in (part for each in self.scenarios for part in each.kinds.items()):
+            sums[kind] = sums.get(kind, 0.0) + rate
         return dict(sorted(sums.items(), key=lambda kind: -kind[1]))
 
     @property
@@ -255,19 +236,20 @@ class Risk:
 
     def __str__(self) -> str:
         """Return the table, for people."""
-        total = self.total
-        level = f"{100 * total.confidence:g} %: "
+        total, kinds = self.total, self.kinds
+        level, whole = f"{100 * total.confidence:g} %: ", sum(kinds.values())
         per_km = format_with_interval(total.per_million_km, total.interval_per_million_km, " ", level)
         per_hour = format_with_interval(total.per_hour, total.interval_per_hour, " ", level)
         lines = [
             f"collisions per million km  {per_km}   {describe_human_contacts()}",
             *(f"  {each.describe()}" for each in self.scenarios),
             f"  per hour      {per_hour}",
-            *self._describe_kinds(),
-            *([] if self.injuries is None else [f"  {describe_injuries(self.injuries)}"]),
         ]
-        uncertainty = describe_uncertainty(total, self.recorded_events)
-        lines += [uncertainty] if uncertainty else []
+        if whole > 0:
+            parts = [f"{kind} {format_rate(rate)} ({format_share(rate / whole)})" for kind, rate in kinds.items()]
+            lines.append(f"  by kind       {', '.join(parts)}")
+        lines += [] if self.injuries is None else [f"  {describe_injuries(self.injuries)}"]
+        lines += filter(None, [describe_uncertainty(total, self.recorded_events)])
         lines += [f"warning: {text}" for text in self.warnings]
         return "\n".join(lines + [f"note: {text}" for text in self.notes])
 
@@ -291,18 +273,6 @@ class Risk:
     def save_plot(self, path: str | PathLike[str]) -> None:
         """Draw the rates with their intervals and what the uncertainty comes from, and save it as a .png."""
         save_risk_plot(Path(path), self.ego, self.total)
-
-    def _describe_kinds(self) -> list[str]:
-        whole = sum(self.kinds.values())
-        parts = [f"{kind} {format_rate(rate)} ({format_share(rate / whole)})" for kind, rate in self.kinds.items()]
-        return [f"  by kind       {', '.join(parts)}"] if whole > 0 else []
-
-
-SCENARIO_SET = ("cut_in", "hard_brake")
-"""Scenarios that count nothing twice."""
-TWICE = ("cut_in", "car_following")
-"""Scenarios of which a set may have one: a cut-in gives the ego a new leader, so that car-following behind new leaders
-contains the cut-ins."""
 
 
 def risk(
@@ -345,41 +315,29 @@ def risk(
         rare_envs.study.errors.BadInput: Expected one of cut_in, car_following: a cut-in is a new leader, and would count twice.
     """  # noqa: E501 (the example shows a whole message)
     sites = (sites,) if isinstance(sites, str) else sites
-    _check_scenarios(scenarios, sites, bases or {})
+    folder, bases = None if out is None else Path(out), bases or {}
+    _check_scenarios(scenarios, sites, bases)
     with as_bad_input(ValueError):
-        chosen = {name: choose_base(scenario_named(name), (bases or {}).get(name), sites[0]) for name in scenarios}
-    prepared = []
-    for name in scenarios:
-        base, notes = chosen[name]
-        study = _prepare(ego, name, base, options)
+        chosen = [choose_base(scenario_named(name), bases.get(name), sites[0]) for name in scenarios]
+    studies = []
+    for name, (base, _) in zip(scenarios, chosen, strict=True):
+        studies.append(_prepare(ego, name, base, options))
         with as_bad_input(ValueError):
-            find_frequency(study)
-        prepared.append((study, notes))
-    folder = None if out is None else Path(out)
-    if folder is not None and not force:
-        for name in scenarios:  # all of them, before the first one is run
-            check_no_results(folder / name)
+            find_frequency(studies[-1])
+    for name in scenarios if folder is not None and not force else ():  # all of them, before the first one is run
+        check_no_results(Path(folder or "", name))
     done: list[ScenarioRisk] = []
-    for study, notes in prepared:
+    for study, (_, notes) in zip(studies, chosen, strict=True):
         try:
             done.append(_evaluate(study, notes, sites[1:], folder, progress, force))
         except RunInterrupted as error:
-            raise RunInterrupted(f"{error}{_describe_done(done)}", error.report) from None
+            known = "; ".join(" ".join(one.describe().split()) for one in done)
+            raise RunInterrupted(f"{error}{f' Done before: {known}.' if done else ''}", error.report) from None
     found = Risk(ego=ego if isinstance(ego, str) else type(ego).__name__, scenarios=tuple(done))
     if folder is not None:
-        write_risk(folder, found)
+        replace_text(folder / "risk.json", format_json(found.to_dict()) + "\n")
+        found.save_plot(folder / "risk.png")
     return found
-
-
-def write_risk(folder: Path, found: Risk) -> None:
-    """Write risk.json and risk.png into an existing folder."""
-    replace_text(folder / "risk.json", format_json(found.to_dict()) + "\n")
-    found.save_plot(folder / "risk.png")
-
-
-def _describe_done(done: Sequence[ScenarioRisk]) -> str:
-    """Return what is known of scenarios whose runs are done, behind a space; empty if there are none."""
-    return f" Done before: {'; '.join(' '.join(one.describe().split()) for one in done)}." if done else ""
 
 
 def _check_scenarios(scenarios: Sequence[str], sites: Sequence[str], bases: Mapping[str, Any]) -> None:

@@ -8,8 +8,9 @@ import hashlib
 import io
 import math
 import reprlib
+import shlex
 import zipfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -20,12 +21,13 @@ from numpy.typing import NDArray
 
 from rare_envs.files import check_ordinary, parse_json_object, read_text_file
 from rare_envs.plugins import one_line
-from rare_envs.study.errors import BadInput
+from rare_envs.study.errors import BadInput, as_bad_input
 
 if TYPE_CHECKING:
     import pyarrow
 
-
+JOURNAL = "journal.bin"
+"""Finished simulations of a run that is not done; `samplers.journal` has its form and its promises."""
 STUDY = "study.json"
 """What was asked, by what command and with which versions."""
 STUDY_FORMAT = 1
@@ -35,17 +37,13 @@ RESULT, FAILURES, BLOCKS, PLOT = "result.json", "failures.csv", "failures.npz", 
 EPISODES = "episodes.parquet"
 """All simulations."""
 REPORT = "report.html"
-SENSITIVITY = "sensitivity.png"
-"""Bars of what p is sensitive to, if the question asks for it."""
-SEVERITY = "severity.png"
-"""P[collision with delta-v > v] over v, if there are collisions."""
+SENSITIVITY, SEVERITY = "sensitivity.png", "severity.png"
+"""What p is sensitive to, if the question asks for it, and P[collision with delta-v > v], if there are collisions."""
 FAULTS, FAULT_BLOCKS = "faults.csv", "faults.npz"
 """The same as of failures for scenarios on which the ego failed."""
-RESULT_FILES = (RESULT, FAILURES, BLOCKS, PLOT, SENSITIVITY, SEVERITY, FAULTS, FAULT_BLOCKS, STUDY, EPISODES, REPORT)
-
-
-MAX_BLOCK_BYTES = 1 << 30
-"""Bytes of blocks that are unpacked at most: a thousand failures with a quarter of a million values each."""
+DIGESTED = (RESULT, FAILURES, BLOCKS, FAULTS, FAULT_BLOCKS, EPISODES)
+"""Files that hold numbers of a run; pictures follow from them."""
+RESULT_FILES = (*DIGESTED, PLOT, SENSITIVITY, SEVERITY, STUDY, REPORT)
 CRASH = (
     "crash",
     "striking",
@@ -58,6 +56,10 @@ CRASH = (
     "injury_risk_struck",
 )
 """Columns of failures.csv that say what a failure ended in: `rare_envs.traffic.crash.Crash`."""
+MAX_BLOCK_BYTES = 1 << 30
+"""Bytes of blocks that are unpacked at most: a thousand failures with a quarter of a million values each."""
+MAX_TABLE_BYTES = 2**32
+"""Largest table that is read at once [bytes]: 40 million simulations with twelve numbers each."""
 
 
 def read_failures(folder: Path) -> dict[str, NDArray[Any]]:
@@ -129,54 +131,23 @@ def _read_blocks(path: Path) -> dict[str, NDArray[Any]]:
     return {name: block.astype(np.float64) for name, block in found.items()}
 
 
-DIGESTED = (RESULT, FAILURES, BLOCKS, FAULTS, FAULT_BLOCKS, EPISODES)
-"""Files that hold numbers of a run; pictures follow from them."""
-_BLOCK = 1 << 20
-
-
 def digest_results(folder: Path) -> dict[str, str]:
-    """Return the BLAKE2b digests of the files with numbers in a folder, by name."""
-    return {name: _digest_file(folder / name) for name in DIGESTED if (folder / name).is_file()}
+    """Return the digests of the files with numbers in a folder, by name."""
+    return {name: digest_file(folder / name) for name in DIGESTED if (folder / name).is_file()}
 
 
-def find_changed_results(folder: Path, about: Mapping[str, Any]) -> list[str]:
-    """Return the files with numbers that are not what the run wrote: changed, removed or added since."""
-    written = about.get("results")
-    if not isinstance(written, Mapping):
-        return []
-    now = digest_results(folder)
-    return [name for name in DIGESTED if now.get(name) != written.get(name)]
-
-
-def _digest_file(path: Path) -> str:
+def digest_file(path: Path) -> str:
+    """Return the BLAKE2b digest of a file."""
     digest = hashlib.blake2b(digest_size=16)
     with path.open("rb") as file:
-        while block := file.read(_BLOCK):
+        while block := file.read(1 << 20):
             digest.update(block)
     return digest.hexdigest()
 
 
-MAX_TABLE_BYTES = 2**32
-"""Largest table that is read at once [bytes]: 40 million simulations with twelve numbers each."""
-
-
 @dataclass(frozen=True)
 class LoadedStudy:
-    """A finished run; nothing of the ego or of its question is run, whoever wrote the folder.
-
-    Example:
-        >>> from tempfile import TemporaryDirectory
-        >>> from rare_envs.study import Question, prepare, run_into
-        >>> question = Question(
-        ...     env_id="rare_envs/CarFollowing-v0", base="us101-gap", gamma=3.0, horizon=3.0, method="mc", max_sim=1000
-        ... )
-        >>> with TemporaryDirectory() as folder:
-        ...     _ = run_into(Path(folder), prepare(question))
-        ...     study = load_study(folder)
-        ...     episodes = study.episodes(columns=["gap", "failed"])
-        >>> study.p, study.question["method"], episodes.shape, sum(episodes["failed"].to_pylist())
-        (0.021, 'mc', (1000, 2), 21)
-    """
+    """A finished run; nothing of the ego or of its question is run, whoever wrote the folder."""
 
     folder: Path
     about: dict[str, Any]
@@ -211,26 +182,16 @@ class LoadedStudy:
 
         study.json has their digests; the whole table of simulations is read for its own.
         """
-        return find_changed_results(self.folder, self.about)
+        written = self.about.get("results")
+        if not isinstance(written, dict):
+            return []
+        found = digest_results(self.folder)
+        return [name for name in DIGESTED if found.get(name) != written.get(name)]
 
     @property
     def episodes_path(self) -> Path:
         """File of all simulations, for programs that read Parquet by themselves."""
         return self.folder / EPISODES
-
-    def episodes(self, columns: list[str] | None = None, failed: bool | None = None) -> pyarrow.Table:
-        """Return the table of all simulations, a row each; docs/using_results.md has its columns."""
-        import pyarrow.parquet as pq
-
-        where = None if failed is None else [("failed", "=", failed)]
-        if not self.episodes_path.is_file():
-            raise FileNotFoundError(f"There is no {EPISODES} in {str(self.folder)!r}.")
-        missing = sorted(set(columns or []) - set(self.column_names))
-        if missing:
-            raise ValueError(f"{EPISODES} has no column {', '.join(missing)}; it has {', '.join(self.column_names)}.")
-        _check_size(self.episodes_path, columns)
-        with _damage_as_value_error(self.episodes_path):
-            return pq.read_table(self.episodes_path, columns=columns, filters=where)
 
     @property
     def column_names(self) -> list[str]:
@@ -240,23 +201,36 @@ class LoadedStudy:
         with _damage_as_value_error(self.episodes_path):
             return list(pq.read_schema(self.episodes_path).names)
 
+    def episodes(self, columns: list[str] | None = None, failed: bool | None = None) -> pyarrow.Table:
+        """Return the table of all simulations, a row each; docs/using_results.md has its columns."""
+        import pyarrow.parquet as pq
 
-def _check_size(path: Path, columns: list[str] | None) -> None:
-    """Raise a ValueError if some columns of a table, all for None, would take more than `MAX_TABLE_BYTES`.
+        path, known = self.episodes_path, self.column_names if self.episodes_path.is_file() else None
+        if known is None:
+            raise FileNotFoundError(f"There is no {EPISODES} in {str(self.folder)!r}.")
+        missing = sorted(set(columns or []) - set(known))
+        if missing:
+            raise ValueError(f"{EPISODES} has no column {', '.join(missing)}; it has {', '.join(known)}.")
+        _check_size(path, columns or known)
+        where = None if failed is None else [("failed", "=", failed)]
+        with _damage_as_value_error(path):
+            return pq.read_table(path, columns=columns, filters=where)
+
+
+def _check_size(path: Path, columns: list[str]) -> None:
+    """Raise a ValueError if some columns of a table would take more than `MAX_TABLE_BYTES`.
 
     A file of a few kilobytes can hold billions of rows that are alike, so the size of the file says nothing.
     """
     import pyarrow.parquet as pq
 
-    with _damage_as_value_error(path):
-        with pq.ParquetFile(path) as file:
-            about, schema = file.metadata, file.schema_arrow
+    with _damage_as_value_error(path), pq.ParquetFile(path) as file:
+        about, schema = file.metadata, file.schema_arrow
     n_rows = sum(about.row_group(i).num_rows for i in range(about.num_row_groups))
-    wanted = [field for field in schema if columns is None or field.name in columns]
-    n_bytes = n_rows * sum(_count_bytes(field.type) for field in wanted)
+    n_bytes = n_rows * sum(_count_bytes(schema.field(name).type) for name in columns)
     if n_bytes > MAX_TABLE_BYTES:
         raise ValueError(
-            f"{len(wanted)} columns of {EPISODES} take {n_bytes / 2**30:,.1f} GiB, more than the "
+            f"{len(columns)} columns of {EPISODES} take {n_bytes / 2**30:,.1f} GiB, more than the "
             f"{MAX_TABLE_BYTES / 2**30:g} GiB that are read at once: ask for fewer columns, or read {str(path)!r} in "
             "parts by a program of your own."
         )
@@ -283,6 +257,18 @@ def _damage_as_value_error(path: Path) -> Iterator[None]:
         raise ValueError(f"Cannot read {str(path)!r}: {' '.join(str(error).split())}") from error
 
 
+def load_finished(folder: Path) -> LoadedStudy:
+    """Return a finished run with its failures, or raise a BadInput: there is none, or its files are damaged."""
+    if (folder / JOURNAL).exists():
+        raise BadInput(
+            f"The run in {str(folder)!r} is not finished: rare-envs resume {shlex.quote(str(folder))} comes first."
+        )
+    study = load_study(folder)
+    with as_bad_input(OSError, ValueError):
+        _ = study.failures  # read here
+    return study
+
+
 def load_study(folder: str | Path) -> LoadedStudy:
     """Read the folder of a finished run.
 
@@ -306,33 +292,21 @@ def load_study(folder: str | Path) -> LoadedStudy:
         raise BadInput(
             f"No finished run in {str(folder)!r}: expected {RESULT} and {FAILURES}, as rare-envs estimate --out writes."
         )
-    about = _check_about(_read_object(path / STUDY), path) if (path / STUDY).exists() else {}
-    return LoadedStudy(path, about, _check_result(_read_object(path / RESULT), path))
+    about = _read_object(path / STUDY) if (path / STUDY).exists() else {}
+    if about.get("format") != STUDY_FORMAT and (path / STUDY).exists():
+        raise BadInput(
+            f"Expected format {STUDY_FORMAT} in {str(path / STUDY)!r}, got {reprlib.repr(about.get('format'))}: "
+            "the file is damaged, or of a newer version of rare-envs. Without it the run can be read."
+        )
+    result = _read_object(path / RESULT)
+    interval = result.get("interval")
+    numbers = [result.get("p"), *(interval if isinstance(interval, list) and len(interval) == 2 else [None])]
+    if not all(type(value) in (int, float) and 0.0 <= value < math.inf for value in numbers):
+        raise BadInput(f"Expected p and its interval as numbers, 0 or more, in {str(path / RESULT)!r}.")
+    return LoadedStudy(path, about, result)
 
 
 def _read_object(path: Path) -> dict[str, Any]:
     """Return the object of a JSON file."""
-    try:
+    with as_bad_input(OSError, ValueError):
         return parse_json_object(read_text_file(path), repr(str(path)))
-    except (OSError, ValueError) as error:
-        raise BadInput(error) from error
-
-
-def _check_about(about: dict[str, Any], folder: Path) -> dict[str, Any]:
-    """Return what study.json holds; raise a BadInput unless it is of the format that this version knows."""
-    if about.get("format") != STUDY_FORMAT:
-        raise BadInput(
-            f"Expected format {STUDY_FORMAT} in {str(folder / STUDY)!r}, got {reprlib.repr(about.get('format'))}: "
-            "the file is damaged, or of a newer version of rare-envs. Without it the run can be read."
-        )
-    return about
-
-
-def _check_result(result: dict[str, Any], folder: Path) -> dict[str, Any]:
-    """Return a result; raise a BadInput unless it has p and an interval, finite and not negative."""
-    interval = result.get("interval")
-    numbers = [result.get("p"), *(interval if isinstance(interval, list) and len(interval) == 2 else [None])]
-    known = [value for value in numbers if isinstance(value, int | float) and not isinstance(value, bool)]
-    if len(known) < len(numbers) or not all(0.0 <= value < math.inf for value in known):
-        raise BadInput(f"Expected p and its interval as numbers, 0 or more, in {str(folder / RESULT)!r}.")
-    return result

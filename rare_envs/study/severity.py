@@ -49,25 +49,19 @@ class ReplayedFailures(NamedTuple):
 
 def replay_failures(
     problem: DrivingProblem, estimate: EstimateData, most: int | None = MAX_REPLAYED
-) -> ReplayedFailures:
-    """Drive failing points of a run once more."""
+) -> tuple[ReplayedFailures, ReplayedFailures | None]:
+    """Drive failing points of a run once more, and those of its run under the mixture of the refits, if it has one."""
     if problem.varies:
         raise ValueError("The ego's answers vary from run to run, so that its failures cannot be seen again.")
-    failures = weigh_failures(estimate, most)
-    return ReplayedFailures(failures, problem.crashes(failures.x[failures.has_outcome]))
 
+    def replay(run: EstimateData, most: int | None) -> ReplayedFailures:
+        failures = weigh_failures(run, most)
+        return ReplayedFailures(failures, problem.crashes(failures.x[failures.has_outcome]))
 
-def replay_further_failures(
-    problem: DrivingProblem, estimate: EstimateData, most: int | None = MAX_REPLAYED
-) -> ReplayedFailures | None:
-    """Drive failing points of the further run under the mixture of the refits once more; None where there is none.
-
-    Arguments as of `replay_failures`; at most `MAX_REPLAYED_FURTHER` are driven.
-    """
-    run = estimate.ensemble_run
-    if run is None or run.p <= 0 or run.sample is None:
-        return None
-    return replay_failures(problem, run, min(MAX_REPLAYED_FURTHER, MAX_REPLAYED if most is None else most))
+    own, further = replay(estimate, most), estimate.ensemble_run
+    if further is None or further.p <= 0 or further.sample is None:
+        return own, None
+    return own, replay(further, min(MAX_REPLAYED_FURTHER, MAX_REPLAYED if most is None else most))
 
 
 DELTA_V_STEP, FINE_STEP, FINE_UP_TO = 0.5, 0.1, 2.5
@@ -83,22 +77,6 @@ class Severity:
 
     Of the two vehicles of a collision the larger delta-v counts. Injuries are those of one occupant in each of the two,
     MAIS 3 or more, see `rare_envs.traffic.crash.injury_risk`.
-
-    Example:
-        >>> curve = Exceedance(
-        ...     thresholds=np.array([1.0, 2.0]), p=np.array([2e-3, 1e-3]), low=np.array([1e-3, 4e-4]),
-        ...     high=np.array([4e-3, 2.5e-3]), cov=np.array([0.2, 0.3]), ess=np.array([25.0, 11.0]), confidence=0.95)
-        >>> injuries = FailureExpectation(
-        ...     value=3e-5, interval=(2e-5, 5e-5), confidence=0.95, cov=0.2, per_failure=0.015)
-        >>> severity = Severity(
-        ...     curve=curve, largest_delta_v=2.6, injuries=injuries, injuries_base=None,
-        ...     n_replayed=500, n_failures=1200, unknown=0.0)
-        >>> print(severity)
-        collisions with delta-v > 1 m/s 2.0e-03 [1.0e-03, 4.0e-03], > 2 m/s 1.0e-03 [4.0e-04, 2.5e-03], at most 2.6 m/s
-        serious injuries (MAIS 3+) 3.0e-05 per scenario [2.0e-05, 5.0e-05], 0.015 per failure
-        from 500 of 1,200 failing scenarios, simulated again
-        >>> print(severity.summarise())
-        delta-v > 1 m/s 2.0e-03, > 2 m/s 1.0e-03, at most 2.6 m/s; serious injuries (MAIS 3+) 3.0e-05 per scenario
     """
 
     curve: Exceedance
@@ -120,27 +98,28 @@ class Severity:
 
     def __str__(self) -> str:
         """Return a few lines for people."""
-        curve, shown = self.curve, self._shown_thresholds
-        parts = [
-            f"> {curve.thresholds[i]:g} m/s {curve.p[i]:.1e} [{curve.low[i]:.1e}, {curve.high[i]:.1e}]" for i in shown
-        ]
-        low, high = self.injuries.interval
-        lines = [
-            f"collisions with delta-v {', '.join([*parts, f'at most {self.largest_delta_v:.2g} m/s'])}",
-            *self._describe_base(shown),
+        curve, shown, (low, high) = self.curve, self._shown_thresholds, self.injuries.interval
+        ends = [f" [{curve.low[i]:.1e}, {curve.high[i]:.1e}]" for i in shown]
+        lines = [f"collisions with delta-v {self._list_speeds(ends)}"]
+        if curve.base is not None and shown:
+            base = curve.base
+            held = f"{100 * base.confidence:g} % of all thresholds together"
+            parts = [f"> {curve.thresholds[i]:g} m/s {_format_ends(base.low[i], base.high[i])}" for i in shown]
+            lines.append(f"  base distribution {held}  {', '.join(parts)} ({base.fitted_to}, {base.n_refits} refits)")
+        lines.append(
             f"serious injuries (MAIS 3+) {self.injuries.value:.1e} per scenario [{low:.1e}, {high:.1e}], "
-            f"{self.injuries.per_failure:.2g} per failure",
-            *("" if self.injuries_base is None else f"  {self.injuries_base}").splitlines()[:1],
-            f"from {self.n_replayed:,} of {self.n_failures:,} failing scenarios, simulated again",
-        ]
+            f"{self.injuries.per_failure:.2g} per failure"
+        )
+        if self.injuries_base is not None:
+            lines.append(f"  {self.injuries_base}".splitlines()[0])
+        lines.append(f"from {self.n_replayed:,} of {self.n_failures:,} failing scenarios, simulated again")
         if self.unknown:
             lines[-1] += f"; {100 * self.unknown:.2g} % of p have no outcome and are left out"
         return "\n".join(lines)
 
     def summarise(self) -> str:
         """Return a short line for people, without intervals."""
-        parts = [f"> {self.curve.thresholds[i]:g} m/s {self.curve.p[i]:.1e}" for i in self._shown_thresholds]
-        speeds = ", ".join([*parts, f"at most {self.largest_delta_v:.2g} m/s"])
+        speeds = self._list_speeds([""] * len(self._shown_thresholds))
         return f"delta-v {speeds}; serious injuries (MAIS 3+) {self.injuries.value:.1e} per scenario"
 
     @property
@@ -149,17 +128,11 @@ class Severity:
         known = [i for i, v in enumerate(self.curve.thresholds) if v in SHOWN_DELTA_V and self.curve.low[i] > 0]
         return known[-SHOWN_THRESHOLDS:]
 
-    def _describe_base(self, shown: list[int]) -> list[str]:
-        """Return what the events behind the base allow for the curve, in words."""
-        base = self.curve.base
-        if base is None or not shown:
-            return []
-        parts = [
-            f"> {self.curve.thresholds[i]:g} m/s {format_ends(float(base.low[i]), float(base.high[i]))}" for i in shown
-        ]
-        behind = f"({base.fitted_to}, {base.n_refits} refits)"
-        held = f"{100 * base.confidence:g} % of all thresholds together"
-        return [f"  base distribution {held}  {', '.join(parts)} {behind}"]
+    def _list_speeds(self, ends: list[str]) -> str:
+        """Return the curve at the thresholds that are printed, each with what stands behind it, and the largest."""
+        curve, shown = self.curve, zip(self._shown_thresholds, ends, strict=True)
+        parts = [f"> {curve.thresholds[i]:g} m/s {curve.p[i]:.1e}{end}" for i, end in shown]
+        return ", ".join([*parts, f"at most {self.largest_delta_v:.2g} m/s"])
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain lists and numbers for JSON."""
@@ -212,8 +185,7 @@ def severity_curve(
         >>> bool(severity.curve.p[0] > severity.curve.p[1]), 0.0005 < severity.injuries.per_failure < 0.1
         (True, True)
     """
-    replayed, further = replay_failures(problem, estimate, most), replay_further_failures(problem, estimate, most)
-    severity = compute_severity(problem, estimate, replayed, thresholds, further)
+    severity = compute_severity(problem, estimate, *replay_failures(problem, estimate, most), thresholds)
     if severity is None:
         raise ValueError(f"No failure (f <= {estimate.gamma:g}) that was driven again is a collision.")
     return severity
@@ -223,51 +195,36 @@ def compute_severity(
     problem: DrivingProblem,
     estimate: samplers.Estimate,
     replayed: ReplayedFailures,
-    thresholds: ArrayLike | None = None,
     further: ReplayedFailures | None = None,
+    thresholds: ArrayLike | None = None,
 ) -> Severity | None:
     """Return the severity of failures that were driven again; None where none of them is a collision.
 
-    Arguments as of `severity_curve`; and `further`, failures of the run under the mixture of the refits, if there is
-    one: they tell the severity under refits that the failures of the first run do not reach.
+    `further` are failures of the run under the mixture of the refits, if there is one: they tell the severity under
+    refits that the failures of the first run do not reach.
     """
     failures, any_vehicle = replayed.failures, problem.world.measurement.collisions == "any"
     delta_v, injuries = _severities(replayed, any_vehicle)
-    more_delta_v, more_injuries = _further_severities(further, any_vehicle)
+    more: list[FurtherFailures | None] = [None, None]
+    if further is not None:
+        more = [FurtherFailures(further.failures, values) for values in _severities(further, any_vehicle)]
     collided = np.isfinite(delta_v)
     if not collided.any():
         return None
+    largest = float(delta_v[collided].max())
     if thresholds is None:
-        largest = float(delta_v[collided].max())
         step = DELTA_V_STEP if largest > FINE_UP_TO else FINE_STEP
         thresholds = step * np.arange(math.ceil(largest / step) or 1)
     expected = expect_over_failures(failures, injuries, estimate.confidence)
     return Severity(
-        curve=compute_exceedance(estimate, failures, delta_v, thresholds, more_delta_v),
-        largest_delta_v=float(delta_v[collided].max()),
+        curve=compute_exceedance(estimate, failures, delta_v, thresholds, more[0]),
+        largest_delta_v=largest,
         injuries=expected,
-        injuries_base=expect_under_refits(estimate, failures, injuries, expected, more_injuries),
+        injuries_base=expect_under_refits(estimate, failures, injuries, expected, more[1]),
         n_replayed=int(failures.has_outcome.sum()),
         n_failures=failures.total,
         unknown=float(failures.weights[~failures.has_outcome].sum() / failures.weights.sum()),
     )
-
-
-def _further_severities(
-    further: ReplayedFailures | None, any_vehicle: bool
-) -> tuple[FurtherFailures | None, FurtherFailures | None]:
-    """Return delta-v and injuries at the failing points of the further run; None where there is none."""
-    if further is None:
-        return None, None
-    delta_v, injuries = _severities(further, any_vehicle)
-    return FurtherFailures(further.failures, delta_v), FurtherFailures(further.failures, injuries)
-
-
-def format_ends(low: float, high: float) -> str:
-    """Return an interval of a probability, or what it is below."""
-    if low > 0:
-        return f"{low:.1e} to {high:.1e}"
-    return f"below {high:.1e}" if high < 1 else "not bounded"
 
 
 def _severities(replayed: ReplayedFailures, any_vehicle: bool) -> tuple[FloatArray, FloatArray]:
@@ -279,3 +236,10 @@ def _severities(replayed: ReplayedFailures, any_vehicle: bool) -> tuple[FloatArr
     delta_v[known] = np.where(counts, crash.delta_v.double().amax(dim=1).numpy(), -np.inf)
     injuries[known] = np.where(counts, crash.injury_risk.double().sum(dim=1).numpy(), 0.0)
     return delta_v, injuries
+
+
+def _format_ends(low: float, high: float) -> str:
+    """Return an interval of a probability, or what it is below."""
+    if low > 0:
+        return f"{low:.1e} to {high:.1e}"
+    return f"below {high:.1e}" if high < 1 else "not bounded"

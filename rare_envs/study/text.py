@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from rich.console import Console
 
 import samplers
+from rare_envs.distributions.space import ScenarioSpace
 from rare_envs.exposure import (
     CollisionRate,
-    FurtherEvents,
     RateInterval,
     TotalRate,
     VarianceShare,
@@ -23,7 +23,7 @@ from rare_envs.exposure import (
 from rare_envs.measures import MEASURES
 from rare_envs.study.columns import MAX_SHOWN, draw_ordinary, find_ordinary_range, format_value, list_columns
 from rare_envs.study.modes import KIND_DESCRIPTIONS
-from rare_envs.study.report import Report
+from rare_envs.study.report import BaseAnswer, Report
 from samplers.output import indent_lines
 from samplers.problem import FloatArray
 from samplers.sample import describe_outcome
@@ -46,19 +46,17 @@ def format_alike(*values: float) -> list[str]:
     sizes = [value for value in values if value > 0 and math.isfinite(value)]
     least = SMALL if max(sizes, default=SMALL) < SMALL else SMALL_BESIDE
     decimal = all(value >= least for value in sizes)
-    return [_format_decimal(value) if decimal else _format_power(value) for value in values]
 
+    def write(value: float) -> str:
+        if value <= 0 or not math.isfinite(value):
+            return f"{value:g}"
+        if not decimal:
+            return f"{value:.1e}"
+        if value >= LARGE:
+            return f"{round(value, 1 - math.floor(math.log10(value))):,.0f}"
+        return f"{value:#.2g}".rstrip(".")
 
-def _format_power(value: float) -> str:
-    return f"{value:.1e}" if value > 0 and math.isfinite(value) else f"{value:g}"
-
-
-def _format_decimal(value: float) -> str:
-    if value <= 0 or not math.isfinite(value):
-        return f"{value:g}"
-    if value >= LARGE:
-        return f"{round(value, 1 - math.floor(math.log10(value))):,.0f}"
-    return f"{value:#.2g}".rstrip(".")
+    return [write(value) for value in values]
 
 
 def format_with_interval(value: float, interval: RateInterval, unit: str = "", level: str = "") -> str:
@@ -77,35 +75,11 @@ def name_scenario(name: str) -> str:
     return "cut-in" if name == "cut_in" else name.replace("_", " ")
 
 
-def name_events(name: str) -> str:
-    """Return the events of a scenario, in the plural."""
-    return EVENT_NOUNS.get(name, "events")
-
-
-def describe_parts(rate: CollisionRate) -> str:
-    """Return the parts of the uncertainty of one rate, the largest first; empty where it is not determined."""
-    parts = sorted(rate.shares.items(), key=lambda part: -part[1])
-    return ", ".join(f"{format_share(share)} {PART_NOUNS[name]}" for name, share in parts if share > 0)
-
-
 def describe_injuries(rate: CollisionRate | TotalRate) -> str:
     """Return a rate of serious injuries with its interval, in words."""
     return "serious injuries (MAIS 3+) " + format_with_interval(
         rate.per_million_km, rate.interval_per_million_km, " per million km", f"{100 * rate.confidence:g} %: "
     )
-
-
-def describe_sources(shares: tuple[VarianceShare, ...]) -> str:
-    """Return the sources of the uncertainty of a total, the largest first."""
-    return ", ".join(f"{format_share(each.share)} {name_source(each)}" for each in shares)
-
-
-def describe_further_events(needed: FurtherEvents) -> str:
-    """Return how many further events would halve the uncertainty, in words."""
-    events = name_events(needed.scenario)
-    if needed.number is not None:
-        return f"about {format_rate(needed.number)} further recorded {events} would halve it"
-    return f"further {events} alone would not halve it; about {format_rate(needed.own)} would halve their own part"
 
 
 def describe_uncertainty(total: TotalRate, recorded: dict[str, int]) -> str:
@@ -117,9 +91,16 @@ def describe_uncertainty(total: TotalRate, recorded: dict[str, int]) -> str:
     if total.shares:
         whole = len(total.determined) == len(total.rates)
         of_what = "the uncertainty" if whole else "the uncertainty of the determined part"
-        parts.append(f"{of_what} is {describe_sources(total.shares)}")
-        needed = total.further_events(recorded)
-        parts += [] if needed is None else [f"{describe_further_events(needed)} (a spread falls with 1 / sqrt(events))"]
+        sources = ", ".join(f"{format_share(each.share)} {name_source(each)}" for each in total.shares)
+        parts.append(f"{of_what} is {sources}")
+    needed = total.further_events(recorded) if total.shares else None
+    if needed is not None:
+        events = EVENT_NOUNS.get(needed.scenario, "events")
+        what = f"about {format_rate(needed.number or 0.0)} further recorded {events} would halve it"
+        if needed.number is None:
+            own = f"about {format_rate(needed.own)} would halve their own part"
+            what = f"further {events} alone would not halve it; {own}"
+        parts.append(f"{what} (a spread falls with 1 / sqrt(events))")
     for rate in (each for each in total.rates if not each.determined):
         high = format_rate(rate.interval_per_million_km[1])
         parts.append(f"{name_scenario(rate.scenario)} is not determined, and adds {high} to the upper end")
@@ -193,40 +174,21 @@ def summarise_answer(result: Result, base: str) -> str:
     return f"{seen}; with {percent} confidence fewer than 1 in {rare:,.0f} do. {where}"
 
 
-def _describe_ends(result: Result) -> str:
-    """Return why the interval has another confidence than usual; empty where it has not."""
-    if not isinstance(result.get("gate"), dict):
-        return ""
-    return f"; each end is one-sided at {50 + 50 * float(result['confidence']):g} %, for the limit of --max-p"
-
-
 def describe_intervals(result: Result) -> list[tuple[str, str, str]]:
     """Return the intervals of p: name, ends, and what each holds."""
-    percent, p = f"{100 * float(result['confidence']):g} %", float(result["p"])
-    low, high = (float(end) for end in result["interval"])
-    rows = [
-        (
-            f"{percent}, sampling",
-            f"{format_probability(low, p)} to {format_probability(high, p)}",
-            "error of a finite number of simulations; the model of traffic taken as true" + _describe_ends(result),
-        )
-    ]
+    confidence, p = float(result["confidence"]), float(result["p"])
+    low, high = (format_probability(float(end), p) for end in result["interval"])
+    what = "error of a finite number of simulations; the model of traffic taken as true"
+    if isinstance(result.get("gate"), dict):
+        what += f"; each end is one-sided at {50 + 50 * confidence:g} %, for the limit of --max-p"
+    rows = [(f"{100 * confidence:g} %, sampling", f"{low} to {high}", what)]
     base = result.get("base_uncertainty")
     if isinstance(base, dict):
-        ends = base.get("interval") or [None, None]
-        text = (
-            f"{format_probability(ends[0], p)} to {format_probability(ends[1], p)}"
-            if ends[0] is not None
-            else "not determined"
-        )
-        rows.append(
-            (
-                f"{100 * float(base.get('confidence') or 0.95):g} %, base distribution",
-                text,
-                f"what the recorded events allow ({base.get('fitted_to', '')}); predictive mean "
-                f"{format_probability(base.get('expected'), p)}",
-            )
-        )
+        low, high = (format_probability(end, p) for end in base.get("interval") or (None, None))
+        mean = format_probability(base.get("expected"), p)
+        what = f"what the recorded events allow ({base.get('fitted_to', '')}); predictive mean {mean}"
+        ends = f"{low} to {high}" if base.get("interval") else "not determined"
+        rows.append((f"{100 * float(base.get('confidence') or 0.95):g} %, base distribution", ends, what))
     return rows
 
 
@@ -290,133 +252,10 @@ NAMED_SHARE = 1e-4
 """Share of p from which on a kind of crash is named."""
 
 
-class Row(NamedTuple):
-    """A line of the answer."""
-
-    name: str
-    text: str
-
-
-def list_rows(report: Report) -> list[Row]:
-    """Return the lines between the intervals and the most likely failure."""
-    estimate = report.estimate
-    return [
-        *_describe_rate(report),
-        Row("c.o.v.", f"{format_cov(estimate)}; gain {format_gain(estimate)}"),
-        Row("method", f"{describe_run(report)}; {estimate.n_sim:,} simulations in {describe_time(report)}"),
-        *([Row("chosen", estimate.choice)] if estimate.chose_another else []),
-        Row("valid", estimate.proviso),
-        *_describe_kinds(report),
-        *_describe_severity(report),
-    ]
-
-
-def format_cov(estimate: samplers.Estimate) -> str:
-    """Return the coefficient of variation."""
-    return "not known" if math.isinf(estimate.cov) else f"{estimate.cov:.3f}"
-
-
-def format_gain(estimate: samplers.Estimate) -> str:
-    """Return the gain over plain Monte Carlo, and the simulations that it stands for."""
-    if math.isnan(estimate.gain):
-        return explain_no_gain(estimate.p)
-    needed = estimate.gain * estimate.n_sim
-    gain = f"{estimate.gain:,.0f}" if estimate.gain >= 100 else f"{estimate.gain:.3g}"
-    return f"{gain} (plain Monte Carlo: about {needed:,.0f} simulations for the same c.o.v.)"
-
-
-def describe_run(report: Report) -> str:
-    """Return the method, its seed and how it ended."""
-    estimate = report.estimate
-    return f"{estimate.method.name}, seed {estimate.seed}, {describe_outcome(estimate.status, report.warnings)}"
-
-
-def describe_time(report: Report) -> str:
-    """Return the wall time, how much of it was before an interruption, and what made the rollouts."""
-    text = f"{report.seconds:.1f} s"
-    earlier = f" ({report.earlier_seconds:.0f} s before it was resumed)" if report.earlier_seconds else ""
-    question = report.study.question
-    return f"{text}{earlier} by {question.core}{'' if question.device == 'cpu' else f' on {question.device}'}"
-
-
-def summarise_crash(crash: dict[str, Any], labels: tuple[str, ...]) -> str:
-    """Return who ran into whom, how fast, and the risk of injury, in words; `labels` are those of the vehicles."""
-    who = ["the edge of the road" if one < 0 else labels[one] for one in crash["vehicles"]]
-    speeds = f"{crash['impact_speed']:.1f} m/s at contact, delta-v {max(crash['delta_v']):.1f} m/s"
-    return f"{who[0]} runs into {who[1]}: {speeds}, serious injury {100 * max(crash['injury_risk']):.2g} %"
-
-
-def list_unusual(report: Report) -> str:
-    """Return the parameters of the most likely failure that are outside the central 90 % of ordinary scenarios.
-
-    The furthest comes first, by the width of that range. Values of large blocks (weights, noise) are not among them.
-    """
-    space, x = report.study.problem.space, report.estimate.failures.x[0]
-    columns = list_columns(space)
-    low, high = find_ordinary_range(draw_ordinary(space))
-    beyond = np.maximum(low - x, x - high) / np.maximum(high - low, 1e-12)
-    shown = [j for j in np.argsort(-beyond) if beyond[j] > 0 and columns[j].shown]
-
-    def describe(j: int) -> str:
-        ends = f"[{format_value(low[j], 1)} to {format_value(high[j], 1)}]"
-        return f"{columns[j].name} {format_value(x[j])} {columns[j].unit} {ends}"
-
-    named = [describe(j) for j in shown[:N_UNUSUAL]]
-    more = [f"{len(shown) - N_UNUSUAL} more"] if len(shown) > N_UNUSUAL else []
-    return ", ".join([*named, *more])
-
-
-def describe_failure(report: Report) -> list[str]:
-    """Return the most likely failure: how it ends, and what is unusual about it."""
-    failures = report.estimate.failures
-    if not len(failures):
-        return ["no failure found"]
-    crash, labels = report.crashes[0], report.study.problem.world.scenario.labels
-    what = f"f = {failures.f[0]:.3g}" if crash is None else summarise_crash(crash, labels)
-    unusual = list_unusual(report)
-    large = any(size > MAX_SHOWN for size in report.study.problem.space.sizes)
-    none = "nothing beyond the central 90 % of ordinary scenarios" + (" but drivers' weights or noise" if large else "")
-    return [
-        f"most likely of {failures.total:,} failures found: {what}",
-        f"  unusual in it: {f'{unusual} (in brackets the central 90 % of ordinary scenarios)' if unusual else none}",
-    ]
-
-
-def _describe_rate(report: Report) -> list[Row]:
-    """Return collisions and injuries per million km, or why they are not known."""
-    rate, injuries = report.rate, report.injury_rate
-    if rate is None:
-        return [Row("collisions", report.no_rate)]
-    rows = [Row("collisions", f"{_describe_per_km(rate)}; {summarise_human_contacts()}")]
-    if injuries is not None:
-        rows.append(Row("injuries", f"{_describe_per_km(injuries)}, serious ones (MAIS 3+)"))
-    return rows
-
-
-def _describe_per_km(rate: CollisionRate) -> str:
-    return format_with_interval(rate.per_million_km, rate.interval_per_million_km, " per million km")
-
-
-def _describe_kinds(report: Report) -> list[Row]:
-    """Return the shares of p by kind of crash."""
-    shares = report.kinds.shares
-    named = {kind: each.of_failures for kind, each in shares.items() if each.of_failures >= NAMED_SHARE}
-    parts = [f"{100 * share:.3g} % {KIND_DESCRIPTIONS.get(kind, kind)}" for kind, share in named.items()]
-    rare = len(shares) - len(named)
-    parts += [f"{rare} rarer than {100 * NAMED_SHARE:g} %"] if rare else []
-    return [Row("of which", "; ".join(parts))] if parts else []
-
-
-def _describe_severity(report: Report) -> list[Row]:
-    """Return the most severe collisions whose probability is known."""
-    severity = report.kinds.severity
-    if severity is None:
-        return []
-    return [Row("severity", severity.summarise())]
-
-
 ENOUGH, MANY = 3.0, 300_000
 """Simulations over p that show with 95 % a region of failure as probable as all that was found; what they may cost."""
+Row = tuple[str, str]
+"""A line of the answer: its name, and its text."""
 
 
 def print_report(report: Report, out: Path | None = None, details: bool = False) -> None:
@@ -437,34 +276,31 @@ def print_report(report: Report, out: Path | None = None, details: bool = False)
     # markup off: P[f <= 0] and what warnings quote would be read as tags
     console = Console(highlight=False, soft_wrap=True, markup=False)
     estimate, question = report.estimate, report.study.question
-    low, high = estimate.interval
+    odds = f" (1 in {1 / estimate.p:,.0f} scenarios)" if 0 < estimate.p < 0.1 else ""
     console.print(
-        f"P[f <= {estimate.gamma:g}] = {estimate.p:.3e}{_format_odds(estimate.p)}   "
+        f"P[f <= {estimate.gamma:g}] = {estimate.p:.3e}{odds}   "
         f"{question.env_id}, ego {question.ego}{report.average and f', {report.average}'}",
         style="bold",
     )
-    limited = report.verdict is not None
-    ends = f" (each end is one-sided at {50 + 50 * estimate.confidence:g} %, for --max-p)" if limited else ""
-    console.print(f"  {f'{100 * estimate.confidence:g} % interval':<15} {low:.3e} to {high:.3e}{ends}")
-    if limited:
-        console.print(f"  {'limit':<15} {report.verdict}", style="bold")
-    for line in indent_lines(estimate.base_uncertainty or _describe_fixed_base(report)):
+    ends = "{:.3e} to {:.3e}".format(*estimate.interval)
+    if report.verdict is not None:
+        ends += f" (each end is one-sided at {50 + 50 * estimate.confidence:g} %, for --max-p)"
+    _print_rows(console, [(f"{100 * estimate.confidence:g} % interval", ends)])
+    if report.verdict is not None:
+        _print_rows(console, [("limit", str(report.verdict))], style="bold")
+    name = report.study.base_name
+    fixed = f"base distribution  no interval: {name!r} has no refits to events, so p takes it as the truth"
+    for line in indent_lines(estimate.base_uncertainty or fixed):
         console.print(line)
-    _print_other_bases(console, report)
-    if details:
-        _print_details(console, report)
-    else:
-        _print_rows(console, list_rows(report))
+    _print_rows(console, [row for each in report.other_bases for row in _describe_other_base(each)])
+    _print_rows(console, [*_list_rates(report, details), *_list_effort(report, details), *_list_kinds(report, details)])
     _print_rows(console, _list_faults(report))
-    if details:
-        _print_failure(console, report)
-    else:
-        for line in describe_failure(report):
-            console.print(f"  {line}")
+    for line in _describe_failure(report, details):
+        console.print(f"  {line}")
     if isinstance(report.sensitivity, samplers.Sensitivity):
         for line in indent_lines(report.sensitivity):
             console.print(line)
-    for warning in (*(() if report.is_exact_bound else estimate.warnings), *report.doubts_of_f):
+    for warning in (*report.doubts_of_method, *report.doubts_of_f):
         console.print(f"warning: {warning}", style="yellow")
     for remark in report.remarks:
         console.print(f"remark: {remark}")
@@ -478,121 +314,149 @@ def print_report(report: Report, out: Path | None = None, details: bool = False)
         console.print(f"written to {out}: {names}")
 
 
-def _print_rows(console: Console, rows: list[Row]) -> None:
+def _print_rows(console: Console, rows: Iterable[Row], style: str | None = None) -> None:
     for name, text in rows:
-        console.print(f"  {name:<15} {text}")
+        console.print(f"  {name:<15} {text}", style=style)
 
 
-def _print_details(console: Console, report: Report) -> None:
-    """Print rates, effort and kinds of crash with their intervals."""
-    estimate = report.estimate
-    _print_rate(console, report)
-    _print_rows(
-        console,
-        [
-            Row("c.o.v.", format_cov(estimate)),
-            Row("simulations", f"{estimate.n_sim:,} in {describe_time(report)}"),
-            Row("valid", estimate.proviso),
-            Row("gain", format_gain(estimate)),
-            Row("method", describe_run(report)),
-            *([Row("chosen", estimate.choice)] if estimate.chose_another else []),
-        ],
-    )
-    _print_kinds(console, report)
+def _describe_other_base(answer: BaseAnswer) -> list[Row]:
+    """Return p under another base that the question names, or why the simulations do not give it."""
+    name, found = f"under {answer.base}", answer.found
+    if found is None:
+        advice = f"--base {answer.base} simulates there; a larger --max-sim gives more failing points"
+        return [(name, f"not known: {answer.refused}"), ("", advice)]
+    low, high = found.interval
+    return [(name, f"{found.p:.3e} ({low:.1e} to {high:.1e}), {found.ess:.0f} effective failing points")]
+
+
+def _list_rates(report: Report, details: bool) -> list[Row]:
+    """Return collisions and injuries per million km beside those of people, or why they are not known."""
+    rate, injuries = report.rate, report.injury_rate
+    if rate is None:
+        return [("collisions", report.no_rate)]
+    per_km = format_with_interval(rate.per_million_km, rate.interval_per_million_km, " per million km")
+    if details:
+        per_hour = format_with_interval(rate.per_hour, rate.interval_per_hour, " per hour")
+        rows = [("collisions", f"{per_km}, {per_hour}; {describe_human_contacts()}")]
+        shares = sorted(rate.shares.items(), key=lambda part: -part[1])
+        parts = ", ".join(f"{format_share(share)} {PART_NOUNS[name]}" for name, share in shares if share > 0)
+        events = f"{format_rate(rate.frequency.per_km)} {EVENT_NOUNS.get(rate.scenario, 'events')} per km"
+        rows.append(("", f"from {events}{f'; the uncertainty is {parts}' if parts else ''}"))
+        return rows + ([] if injuries is None else [("", describe_injuries(injuries))])
+    rows = [("collisions", f"{per_km}; {summarise_human_contacts()}")]
+    if injuries is not None:
+        per_km = format_with_interval(injuries.per_million_km, injuries.interval_per_million_km, " per million km")
+        rows.append(("injuries", f"{per_km}, serious ones (MAIS 3+)"))
+    return rows
+
+
+def _list_effort(report: Report, details: bool) -> list[Row]:
+    """Return the coefficient of variation, the method, and what the run took."""
+    estimate, question = report.estimate, report.study.question
+    cov = "not known" if math.isinf(estimate.cov) else f"{estimate.cov:.3f}"
+    gain = explain_no_gain(estimate.p)
+    if not math.isnan(estimate.gain):
+        size = f"{estimate.gain:,.0f}" if estimate.gain >= 100 else f"{estimate.gain:.3g}"
+        needed = estimate.gain * estimate.n_sim
+        gain = f"{size} (plain Monte Carlo: about {needed:,.0f} simulations for the same c.o.v.)"
+    run = f"{estimate.method.name}, seed {estimate.seed}, {describe_outcome(estimate.status, report.warnings)}"
+    earlier = f" ({report.earlier_seconds:.0f} s before it was resumed)" if report.earlier_seconds else ""
+    made_by = f"{question.core}{'' if question.device == 'cpu' else f' on {question.device}'}"
+    time = f"{estimate.n_sim:,}{'' if details else ' simulations'} in {report.seconds:.1f} s{earlier} by {made_by}"
+    chosen = [("chosen", estimate.choice)] if estimate.chose_another else []
+    valid = ("valid", estimate.proviso)
+    if details:
+        return [("c.o.v.", cov), ("simulations", time), valid, ("gain", gain), ("method", run), *chosen]
+    return [("c.o.v.", f"{cov}; gain {gain}"), ("method", f"{run}; {time}"), *chosen, valid]
+
+
+def _list_kinds(report: Report, details: bool) -> list[Row]:
+    """Return p by kind of crash, and how severe the collisions are."""
+    shares, severity = report.kinds.shares, report.kinds.severity
+    if details:
+        kinds = []
+        for kind, share in shares.items():
+            low, high = share.interval
+            numbers = f"{share.p:.1e} [{low:.1e}, {high:.1e}], {100 * share.of_failures:.3g} %"
+            kinds.append(f"{numbers}: {KIND_DESCRIPTIONS.get(kind, kind)}")
+        lines = str(severity or "").splitlines()
+        return [*zip(["of which", *[""] * len(kinds)], kinds), *zip(["severity", *[""] * len(lines)], lines)]  # noqa: B905
+    named = {kind: each.of_failures for kind, each in shares.items() if each.of_failures >= NAMED_SHARE}
+    parts = [f"{100 * share:.3g} % {KIND_DESCRIPTIONS.get(kind, kind)}" for kind, share in named.items()]
+    rare = len(shares) - len(named)
+    parts += [f"{rare} rarer than {100 * NAMED_SHARE:g} %"] if rare else []
+    rows = [("of which", "; ".join(parts))] if parts else []
+    return rows + ([] if severity is None else [("severity", severity.summarise())])
 
 
 def _list_faults(report: Report) -> list[Row]:
     """Return the statistics that normalise observations, and the scenarios on which the ego failed."""
-    rows = []
-    if report.vec_normalize is not None:
-        rows.append(Row("observations", f"normalised by {report.vec_normalize}"))
+    rows = [] if report.vec_normalize is None else [("observations", f"normalised by {report.vec_normalize}")]
     if report.faults:
         first = report.faults[0].reason
-        rows.append(Row("faults", f"the ego failed twice on {len(report.faults)} scenarios; the first: {first}"))
-        rows.append(Row("", f"{report.n_retried:,} more simulations were made to find them"))
+        rows.append(("faults", f"the ego failed twice on {len(report.faults)} scenarios; the first: {first}"))
+        rows.append(("", f"{report.n_retried:,} more simulations were made to find them"))
     return rows
 
 
-def _describe_fixed_base(report: Report) -> str:
-    """Return that nothing is known of the error of the base distribution."""
-    name = report.study.base_name
-    return f"base distribution  no interval: {name!r} has no refits to events, so p takes it as the truth"
-
-
-def _print_other_bases(console: Console, report: Report) -> None:
-    """Print p under the other bases that the question names, or why the simulations do not give it."""
-    for each in report.other_bases:
-        if each.found is None:
-            console.print(f"  {f'under {each.base}':<15} not known: {each.refused}")
-            console.print(
-                f"  {'':<15} --base {each.base} simulates there; a larger --max-sim gives more failing points"
-            )
-        else:
-            low, high = each.found.interval
-            console.print(
-                f"  {f'under {each.base}':<15} {each.found.p:.3e} ({low:.1e} to {high:.1e}), "
-                f"{each.found.ess:.0f} effective failing points"
-            )
-
-
-def _print_rate(console: Console, report: Report) -> None:
-    """Print collisions per million km and per hour beside those of people, or why they are not known."""
-    rate = report.rate
-    if rate is None:
-        console.print(f"  {'collisions':<15} {report.no_rate}")
-        return
-    console.print(
-        f"  {'collisions':<15} "
-        f"{format_with_interval(rate.per_million_km, rate.interval_per_million_km, ' per million km')}, "
-        f"{format_with_interval(rate.per_hour, rate.interval_per_hour, ' per hour')}; {describe_human_contacts()}"
-    )
-    events = f"{format_rate(rate.frequency.per_km)} {name_events(rate.scenario)} per km"
-    parts = describe_parts(rate)
-    console.print(f"  {'':<15} from {events}{f'; the uncertainty is {parts}' if parts else ''}")
-    if report.injury_rate is not None:
-        console.print(f"  {'':<15} {describe_injuries(report.injury_rate)}")
-
-
-def _print_kinds(console: Console, report: Report) -> None:
-    """Print p by kind of crash, and how severe the collisions are."""
-    for number, (kind, share) in enumerate(report.kinds.shares.items()):
-        low, high = share.interval
-        share_of_p = f"{share.p:.1e} [{low:.1e}, {high:.1e}], {100 * share.of_failures:.3g} %"
-        text = f"{share_of_p}: {KIND_DESCRIPTIONS.get(kind, kind)}"
-        console.print(f"  {'of which' if number == 0 else '':<15} {text}")
-    for number, line in enumerate(str(report.kinds.severity or "").splitlines()):
-        console.print(f"  {'severity' if number == 0 else '':<15} {line}")
-
-
-def _format_odds(p: float) -> str:
-    """Return a small probability in words."""
-    return f" (1 in {1 / p:,.0f} scenarios)" if 0 < p < 0.1 else ""
-
-
-def _print_failure(console: Console, report: Report) -> None:
-    """Print the most likely failure beside the range that is ordinary for each parameter."""
+def _describe_failure(report: Report, details: bool) -> list[str]:
+    """Return the most likely failure: how it ends, and what is unusual about it, or all of its parameters."""
     failures, space = report.estimate.failures, report.study.problem.space
     if not len(failures):
-        console.print("  no failure found")
-        return
+        return ["no failure found"]
+    crash, f = report.crashes[0], f"f = {failures.f[0]:.3g}"
+    what = "" if crash is None else summarise_crash(crash, report.study.problem.world.scenario.labels)
+    found, brackets = f"most likely of {failures.total:,} failures found", "in brackets the central 90 %"
+    if details:
+        head = f"{found} ({f}; {brackets} of ordinary scenarios):"
+        return [head, *([f"  {what}"] if what else []), *_list_parameters(space, failures.x[0])]
+    unusual = _list_unusual(space, failures.x[0])
+    if unusual:
+        unusual += f" ({brackets} of ordinary scenarios)"
+    else:
+        but = " but drivers' weights or noise" if max(space.sizes) > MAX_SHOWN else ""
+        unusual = f"nothing beyond the central 90 % of ordinary scenarios{but}"
+    return [f"{found}: {what or f}", f"  unusual in it: {unusual}"]
+
+
+def summarise_crash(crash: dict[str, Any], labels: tuple[str, ...]) -> str:
+    """Return who ran into whom, how fast, and the risk of injury, in words; `labels` are those of the vehicles."""
+    who = ["the edge of the road" if one < 0 else labels[one] for one in crash["vehicles"]]
+    speeds = f"{crash['impact_speed']:.1f} m/s at contact, delta-v {max(crash['delta_v']):.1f} m/s"
+    return f"{who[0]} runs into {who[1]}: {speeds}, serious injury {100 * max(crash['injury_risk']):.2g} %"
+
+
+def _list_unusual(space: ScenarioSpace, x: FloatArray) -> str:
+    """Return the parameters of a scenario x (d,) that are outside the central 90 % of ordinary scenarios.
+
+    The furthest comes first, by the width of that range. Values of large blocks (weights, noise) are not among them.
+    """
+    columns = list_columns(space)
+    low, high = find_ordinary_range(draw_ordinary(space))
+    beyond = np.maximum(low - x, x - high) / np.maximum(high - low, 1e-12)
+    shown = [j for j in np.argsort(-beyond) if beyond[j] > 0 and columns[j].shown]
+    named = [
+        f"{columns[j].name} {format_value(x[j])} {columns[j].unit} "
+        f"[{format_value(low[j], 1)} to {format_value(high[j], 1)}]"
+        for j in shown[:N_UNUSUAL]
+    ]
+    return ", ".join([*named, *([f"{len(shown) - N_UNUSUAL} more"] if len(shown) > N_UNUSUAL else [])])
+
+
+def _list_parameters(space: ScenarioSpace, x: FloatArray) -> list[str]:
+    """Return the parameters of a scenario x (d,), each beside the range that is ordinary; large blocks in summary."""
     ordinary = draw_ordinary(space)
-    console.print(
-        f"  most likely of {failures.total:,} failures found (f = {failures.f[0]:.3g}; "
-        "in brackets the central 90 % of ordinary scenarios):"
-    )
-    if report.crashes[0] is not None:
-        console.print(f"    {summarise_crash(report.crashes[0], report.study.problem.world.scenario.labels)}")
-    normal = space.columns(space.to_standard_normal(np.vstack((failures.x[:1], ordinary))))
-    likeliest, usual = space.columns(failures.x[:1]), space.columns(ordinary)
-    for j, name in enumerate(space.names):
-        if space.sizes[j] <= MAX_SHOWN:
+    normal = space.columns(space.to_standard_normal(np.vstack((x, ordinary))))
+    own, usual, lines = space.columns(x[None]), space.columns(ordinary), []
+    for name, size, unit in zip(space.names, space.sizes, space.units, strict=True):
+        if size <= MAX_SHOWN:
             (low,), (high,) = find_ordinary_range(usual[name].reshape(-1, 1))  # of all values of a block
-            values = " ".join(f"{format_value(value):>8}" for value in likeliest[name].flat)
-            console.print(
-                f"    {name:<15} {values} {space.units[j]:<4} [{format_value(low, 1)} to {format_value(high, 1)}]"
-            )
+            values = " ".join(f"{format_value(value):>8}" for value in own[name].flat)
+            text = f"{values} {unit:<4} [{format_value(low, 1)} to {format_value(high, 1)}]"
         else:
-            console.print(f"    {name:<15} {_summarise_block(name, likeliest[name][0], usual[name], normal[name])}")
+            text = _summarise_block(name, own[name][0], usual[name], normal[name])
+        lines.append(f"  {name:<15} {text}")
+    return lines
 
 
 def _summarise_block(name: str, values: FloatArray, ordinary: FloatArray, normal: FloatArray) -> str:

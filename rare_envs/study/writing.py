@@ -1,13 +1,13 @@
-"""Writing of the folder of a run: study.json at its beginning, results, tables and pictures at its end."""
+"""Writing of the folder of a run: journal and study.json at its beginning, results, tables and pictures at its end."""
 
 from __future__ import annotations
 
 import csv
 import hashlib
+import os
 import platform
 import shlex
 import sys
-from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import asdict
 from datetime import datetime, timezone
@@ -23,19 +23,18 @@ from agents.loading import find_ego_kind, strip_prefixes
 from rare_envs.distributions.fitted import FittedDistribution
 from rare_envs.distributions.space import ScenarioSpace
 from rare_envs.files import format_json, parse_json_object, read_text_file, replace_file, replace_text
-from rare_envs.study.arguments import Question
+from rare_envs.study.arguments import Question, read_question
 from rare_envs.study.columns import MAX_SHOWN, list_columns
-from rare_envs.study.errors import BadInput
-from rare_envs.study.journal import digest_contents, digest_files, find_ego_files
-from rare_envs.study.plots import save_plot, save_sensitivity, save_severity
-from rare_envs.study.question import Study
-from rare_envs.study.recorded_question import describe_places, is_same_question
+from rare_envs.study.errors import BadInput, UnwrittenResults
+from rare_envs.study.plots import save_plot, saved_figure
+from rare_envs.study.question import Study, digest_contents, digest_files, find_ego_files, is_same_question
 from rare_envs.study.report import Report
 from rare_envs.study.run_folder import (
     CRASH,
     FAILURES,
     FAULT_BLOCKS,
     FAULTS,
+    JOURNAL,
     PLOT,
     RESULT,
     RESULT_FILES,
@@ -47,7 +46,89 @@ from rare_envs.study.run_folder import (
 )
 from rare_envs.traffic.crash import CRASH_KINDS, NONE
 from rare_envs.version import __version__
+from samplers.journal import Journal, JournalError, NothingRecorded
 from samplers.result import method_settings
+
+BEGIN_AGAIN = "give the command again."
+"""Advice where there is nothing to continue."""
+
+
+def begin_journal(folder: Path, question: Question, force: bool = False) -> Journal:
+    """Return the journal of a new run; with `force` it replaces that of an unfinished one.
+
+    Raises:
+        BadInput: There is a run, finished or not, somebody else is writing it, or nothing can be written.
+    """
+    if not force and not (folder / JOURNAL).exists():
+        check_no_results(folder)
+    head = {"version": __version__, "question": asdict(question), "files": digest_files(question)}
+    try:
+        return Journal.create(folder / JOURNAL, head, replace=force)
+    except JournalError as error:
+        if "already" not in str(error):
+            raise BadInput(error) from error
+        raise BadInput(
+            f"There is an unfinished run in {str(folder)!r}: continue it with rare-envs resume "
+            f"{shlex.quote(str(folder))}, or replace it by --force."
+        ) from error
+    except OSError as error:
+        raise BadInput(f"Cannot write to the folder {str(folder)!r}: {error.strerror}.") from error
+
+
+def continue_journal(folder: Path, mend: bool = False) -> tuple[Journal, Question]:
+    """Return the journal of an unfinished run, and its question; of a damaged one `mend` keeps what is before that.
+
+    Raises:
+        BadInput: There is none to continue, or one of another version of this program; it is damaged, or in use.
+    """
+    path = folder / JOURNAL
+    try:
+        journal = Journal.open(path, mend)
+    except FileNotFoundError as error:
+        raise BadInput(f"There is no unfinished run in {str(folder)!r}: {_explain_no_journal(folder)}") from error
+    except NothingRecorded as error:
+        raise BadInput(f"The run in {str(folder)!r} was stopped before its first simulations: {BEGIN_AGAIN}") from error
+    except OSError as error:
+        raise BadInput(f"Cannot take up {str(path)!r}: {error.strerror}.") from error
+    except JournalError as error:
+        advice = ""
+        if "damaged from its first record on" in str(error):
+            advice = " Nothing can be taken from it: it is left as it is, and the command with --force replaces it."
+        elif "damaged" in str(error):
+            again = f"rare-envs resume {shlex.quote(str(folder))} --mend"
+            advice = f" What stands before the damage is kept by {again}."
+        raise BadInput(f"{error}{advice}") from error
+    version = journal.head.get("version")
+    try:
+        if version != __version__:
+            raise BadInput(f"it was begun by version {version}, this is {__version__}.")
+        return journal, read_question(journal.head.get("question"))
+    except BadInput as error:
+        journal.close()
+        raise BadInput(f"Cannot take up {str(path)!r}: {error}") from error
+
+
+def _explain_no_journal(folder: Path) -> str:
+    """Return why a folder has no journal, and what to do."""
+    if (folder / RESULT).is_file():
+        return f"it has a finished one ({RESULT})."
+    if not folder.is_dir():
+        return f"the folder does not exist. Of a run that was stopped before its first simulations, {BEGIN_AGAIN}"
+    return f"it has no {JOURNAL}. Of one that was stopped before its first simulations, {BEGIN_AGAIN}"
+
+
+def check_no_results(folder: Path, *names: str) -> None:
+    """Raise a BadInput if a folder has results of a finished run, or files of these names."""
+    for name in (RESULT, FAILURES, *names):
+        if (folder / name).exists():
+            raise BadInput(f"There is a finished run in {str(folder)!r} ({name}): replace it by --force.")
+
+
+def _remove_drafts(folder: Path) -> None:
+    """Remove the drafts of a run that was killed while it wrote, see `rare_envs.files.replace_file`."""
+    for name in map(Path, RESULT_FILES):
+        for draft in folder.glob(f".{name.stem}.*.part{name.suffix}"):
+            draft.unlink(missing_ok=True)
 
 
 def write_run(folder: Path, report: Report) -> None:
@@ -67,44 +148,23 @@ def write_run(folder: Path, report: Report) -> None:
         ...     json.loads((Path(folder) / "result.json").read_text())["status"]
         'no_hits'
     """
+    space, faults = report.study.problem.space, report.faults
     replace_text(folder / RESULT, format_json(report.to_dict()) + "\n")
-    _write_failures(folder, report)
-    _write_faults(folder, report)
-    save_plot(folder / PLOT, report)
-    for name in (SENSITIVITY, SEVERITY):
-        (folder / name).unlink(missing_ok=True)
-    if isinstance(report.sensitivity, samplers.Sensitivity):
-        save_sensitivity(folder / SENSITIVITY, report.sensitivity)
-    if report.kinds.severity is not None:
-        save_severity(folder / SEVERITY, report.kinds.severity)
-
-
-def check_no_results(folder: Path, *names: str) -> None:
-    """Raise a BadInput if a folder has results of a finished run, or files of these names."""
-    for name in (RESULT, FAILURES, *names):
-        if (folder / name).exists():
-            raise BadInput(f"There is a finished run in {str(folder)!r} ({name}): replace it by --force.")
-
-
-def remove_results(folder: Path) -> None:
-    """Remove the files of a finished run, and drafts of them."""
-    for name in RESULT_FILES:
-        (folder / name).unlink(missing_ok=True)
-    remove_drafts(folder)
-
-
-def remove_drafts(folder: Path) -> None:
-    """Remove the drafts of a run that was killed while it wrote, see `rare_envs.files.replace_file`."""
-    for name in map(Path, RESULT_FILES):
-        for draft in folder.glob(f".{name.stem}.*.part{name.suffix}"):
-            draft.unlink(missing_ok=True)
-
-
-def _write_failures(folder: Path, report: Report) -> None:
-    """Write one failure per row, the most likely first: x, f, log p0 and the crash."""
     kind = "" if report.kinds.unknown else CRASH_KINDS[NONE]
     crashes = [_crash_columns(crash, kind) for crash in report.crashes]
-    write_failures(folder, report.study.problem.space, report.estimate.failures, CRASH, crashes)
+    write_failures(folder, space, report.estimate.failures, CRASH, crashes)
+    for name in (FAULTS, FAULT_BLOCKS, SENSITIVITY, SEVERITY):
+        (folder / name).unlink(missing_ok=True)
+    if faults:
+        x = np.stack([fault.x for fault in faults])
+        _write_table(folder / FAULTS, space, x, ("reason",), [(fault.reason,) for fault in faults])
+    save_plot(folder / PLOT, report)
+    if isinstance(report.sensitivity, samplers.Sensitivity):
+        with saved_figure(folder / SENSITIVITY, 14, 4.5) as figure:
+            report.sensitivity.plot(list(figure.subplots(1, 2)))
+    if report.kinds.severity is not None:
+        with saved_figure(folder / SEVERITY, 7, 4.5) as figure:
+            report.kinds.severity.plot(figure.subplots())
 
 
 def write_failures(
@@ -128,20 +188,10 @@ def _crash_columns(crash: dict[str, Any] | None, kind: str) -> tuple[Any, ...]:
     return (crash["kind"], *crash["vehicles"], *speeds, *crash["delta_v"], *crash["injury_risk"])
 
 
-def _write_faults(folder: Path, report: Report) -> None:
-    """Write one scenario per row on which the ego failed: x and the reason; no file without one."""
-    space, faults = report.study.problem.space, report.faults
-    for name in (FAULTS, FAULT_BLOCKS):
-        (folder / name).unlink(missing_ok=True)
-    if faults:
-        x = np.stack([fault.x for fault in faults])
-        _write_table(folder / FAULTS, space, x, ("reason",), [(fault.reason,) for fault in faults])
-
-
 def _write_table(
     path: Path, space: ScenarioSpace, x: NDArray[np.float64], names: tuple[str, ...], rest: list[tuple[Any, ...]]
 ) -> None:
-    """Write scenarios, one per row.
+    """Write scenarios x (n, d), one per row.
 
     The table has the columns of x by name but for large blocks, then the rest. Large blocks go row by row into a file
     of arrays beside it, in single precision, in which they are simulated, so that they replay to the same f.
@@ -179,9 +229,10 @@ LIBRARIES = (
 
 def describe_study(study: Study, folder: Path = Path()) -> dict[str, Any]:
     """Return what study.json holds at the beginning of a run, whose folder is given."""
-    question, space = study.question, study.problem.space
+    question, space, base = study.question, study.problem.space, study.base
     files = digest_files(question)
     rows = zip(space.names, space.units, space.sizes, strict=True)
+    fit = {"fitted_to": base.fitted_to, "family": base.family} if isinstance(base, FittedDistribution) else {}
     return {
         "format": STUDY_FORMAT,
         "command": _describe_command(sys.argv),
@@ -191,44 +242,66 @@ def describe_study(study: Study, folder: Path = Path()) -> dict[str, Any]:
         "seed": question.seed,
         "gamma": question.gamma,
         "ego": _describe_ego(question),
-        "base": _describe_base(study),
+        "base": {"name": study.base_name, "fitted_to": "", "family": "", **fit},
         "method": {"name": study.method.name, "settings": method_settings(study.method)},
         "parameters": [{"name": name, "unit": unit, "size": int(size)} for name, unit, size in rows],
         "question": asdict(question),
         "files": files,
-        "file_places": describe_places(files, folder),
+        "file_places": _describe_places(files, folder),
         "versions": find_versions(),
         "platform": platform.platform(),
     }
 
 
+def _describe_places(files: dict[str, str], folder: Path) -> dict[str, str]:
+    """Return where files lie as seen from the folder of a run, by their paths."""
+    places = {}
+    for name in files:
+        with suppress(ValueError):  # another drive of Windows
+            places[name] = Path(os.path.relpath(name, folder)).as_posix()
+    return places
+
+
 def begin_study_file(folder: Path, study: Study) -> None:
-    """Write study.json of a run that begins."""
-    replace_text(folder / STUDY, format_json(describe_study(study, folder)) + "\n")
+    """Write study.json of a run that begins, in place of the files of an earlier one."""
+    for name in RESULT_FILES:
+        (folder / name).unlink(missing_ok=True)
+    _remove_drafts(folder)
+    _write_study_file(folder, describe_study(study, folder))
+
+
+def _write_study_file(folder: Path, about: dict[str, Any]) -> None:
+    replace_text(folder / STUDY, format_json(about) + "\n")
 
 
 def note_resumption(folder: Path, earlier_seconds: float) -> None:
-    """Note in study.json that an interrupted run goes on; one that cannot be read or written is left as it is.
-
-    Args:
-        folder: Of the run.
-        earlier_seconds: Wall time of the run before it was interrupted [s].
-    """
+    """Note in study.json that an interrupted run of so many seconds goes on; one that cannot be read is left."""
+    _remove_drafts(folder)
     with suppress(OSError, ValueError):  # a full disk is found when results are written
         about = parse_json_object(read_text_file(folder / STUDY), STUDY)
-        about |= {"resumed": _now(), "earlier_seconds": earlier_seconds}
-        replace_text(folder / STUDY, format_json(about) + "\n")
+        _write_study_file(folder, about | {"resumed": _now(), "earlier_seconds": earlier_seconds})
+
+
+def finish_run(folder: Path, report: Report) -> None:
+    """Write the results, and note in study.json that the run is done; a folder that somebody removed is made again.
+
+    Raises:
+        UnwrittenResults: They cannot be written.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        write_run(folder, report)
+        finish_study_file(folder, report.study, report.seconds)
+    except OSError as error:
+        raise UnwrittenResults(
+            f"Cannot write the results to {str(folder)!r}: {error.strerror or error}.", report
+        ) from error
 
 
 def finish_study_file(folder: Path, study: Study, seconds: float) -> None:
-    """Note in study.json that the run is done, and the digests of its files; what it held of the beginning stays.
+    """Note in study.json that the run is done, its wall time [s], and the digests of its files.
 
-    A study.json of another question, which somebody has put there, is written anew.
-
-    Args:
-        folder: Of the run.
-        study: What was asked.
-        seconds: Wall time, that before interruptions included [s].
+    What it held of the beginning stays; one of another question, which somebody has put there, is written anew.
     """
     try:
         begun = parse_json_object(read_text_file(folder / STUDY), STUDY)
@@ -237,17 +310,15 @@ def finish_study_file(folder: Path, study: Study, seconds: float) -> None:
     if "question" in begun and not is_same_question(begun["question"], study.question):
         begun = describe_study(study, folder)
     ended = {"finished": _now(), "seconds": seconds, "results": digest_results(folder)}
-    replace_text(folder / STUDY, format_json({**begun, **ended}) + "\n")
+    _write_study_file(folder, {**begun, **ended})
 
 
 def find_versions() -> dict[str, str]:
     """Return the versions of this program, Python and the libraries that are installed."""
     found = {"rare-envs": __version__, "python": platform.python_version()}
     for name in LIBRARIES:
-        try:
+        with suppress(metadata.PackageNotFoundError):
             found[name] = metadata.version(name)
-        except metadata.PackageNotFoundError:
-            continue
     return found
 
 
@@ -261,12 +332,6 @@ def _describe_ego(question: Question) -> dict[str, Any]:
         "files": files,
         "fingerprint": hashlib.blake2b(rests_on.encode(), digest_size=16).hexdigest(),
     }
-
-
-def _describe_base(study: Study) -> Mapping[str, Any]:
-    base = study.base
-    fit = {"fitted_to": base.fitted_to, "family": base.family} if isinstance(base, FittedDistribution) else {}
-    return {"name": study.base_name, "fitted_to": "", "family": "", **fit}
 
 
 def _describe_command(words: list[str]) -> str:

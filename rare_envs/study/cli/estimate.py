@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from rare_envs.scenarios.registry import find_scenario, is_highway_env_id
-from rare_envs.study.arguments import ExecutorOptions, Question
+from rare_envs.study.arguments import ExecutorOptions, Question, join_options, join_question, read_question_file
 from rare_envs.study.cli.options import (
     ASKED,
     EGO_FILE,
@@ -60,8 +60,6 @@ def estimate_command(
     details: DetailsOption = False,
 ) -> Answer:
     """Estimate how often an ego fails, with an interval, and show its most likely failure."""
-    from rare_envs.study.question_file import join_options, join_question, read_question_file
-
     given = {} if config is None else read_question_file(config)
     of_executor = {name: value for name in places if (value := given.pop(name, None)) is not None}
     question = join_question(given, env, asked, typed)
@@ -93,7 +91,7 @@ def estimate_highway_env(question: Question, out: Path | None, force: bool, exec
     import agents
     import rare_envs
     import samplers
-    from rare_envs.study.interruption import FIRST_BATCH, RunInterrupted, describe_stop
+    from rare_envs.study.errors import FIRST_BATCH, RunInterrupted, describe_stop
 
     file = None if out is None else out / ESTIMATE_FILE
     if file is not None and file.exists() and not force:
@@ -181,7 +179,7 @@ def plan_command(
 ) -> Answer:
     """Plan simulations and wall time for a precision, by each of --method (joined by commas) and plain Monte Carlo."""
     from rare_envs.study.plan import format_seconds, plan_by_pilots, plan_from_result
-    from rare_envs.study.recorded_question import load_finished
+    from rare_envs.study.run_folder import load_finished
     from samplers.validation import check_number
 
     with as_bad_input(ValueError):

@@ -66,11 +66,10 @@ def corpus_run_command(
     junit: Annotated[Path | None, typer.Option(help="File for a JUnit report.")] = None,
 ) -> Answer:
     """Try an ego in all scenarios of a corpus. Exit code 0: it fails in none; 4: it does."""
-    from rare_envs.study.corpus import EgoChoice, read_corpus, try_ego, write_junit
+    from rare_envs.study.corpus import read_corpus, try_ego, write_junit
 
-    trust, choice = asked.pop("trust"), EgoChoice(ego=ego, **asked)
     with contextlib.nullcontext() if junit is None else output_file(junit):
-        trials, seconds = try_ego(read_corpus(corpus), choice, corpus, trust)
+        trials, seconds = try_ego(read_corpus(corpus), corpus, ego, **asked)
         if junit is not None:
             with _unwritten(junit):
                 write_junit(junit, trials, ego, seconds)
@@ -79,13 +78,13 @@ def corpus_run_command(
 
 def replay_all(run: Path, ego: str | None, trust: bool) -> Answer:
     """Simulate all failures that a run has recorded again, with its ego or another."""
-    from rare_envs.study.corpus import EgoChoice, read_run, repeat_run, try_ego
+    from rare_envs.study.corpus import read_run, repeat_run, try_ego
 
     failures = read_run(run, trust)
     if not failures:
         raise BadInput(f"The run in {str(run)!r} has no failure.")
     if ego is not None:
-        tried, seconds = try_ego(failures, EgoChoice(ego=ego), run, trust)
+        tried, seconds = try_ego(failures, run, ego, trust=trust)
         return _describe_tries(tried, ego, seconds)
     trials, seconds = repeat_run(run, trust)
     different = [trial for trial in trials if not trial.same]
@@ -112,9 +111,7 @@ def _count(trials: Sequence[Trial], seconds: float) -> dict[str, Any]:
 
 def _list(trials: Sequence[Trial]) -> list[str]:
     """Return a line for each trial, the first `MOST_SHOWN`."""
-    from rare_envs.study.corpus import describe_trial
-
-    lines = [f"  {each.failure.key}  {each.failure.env_id}  {describe_trial(each)}" for each in trials[:MOST_SHOWN]]
+    lines = [f"  {each.failure.key}  {each.failure.env_id}  {each.describe()}" for each in trials[:MOST_SHOWN]]
     rest = len(trials) - MOST_SHOWN
     return lines if rest <= 0 else [*lines, f"  and {rest:,} more; --json has all."]
 
@@ -134,8 +131,8 @@ def replay_command(
     ] = False,
 ) -> Answer:
     """Replay a failure that a run has found, and show it with its measure over time."""
-    from rare_envs.study.replay import drive_again
-    from rare_envs.study.video import REPLAY_TOLERANCE, check_film_path, describe_drive, find_failure, write_film
+    from rare_envs.study.replay import REPLAY_TOLERANCE, describe_drive, drive_again, find_failure
+    from rare_envs.study.video import check_film_path, write_film
 
     if replay_each and out is not None:
         raise BadInput("Expected --all without --out: a film shows one failure.")
@@ -184,7 +181,7 @@ def export_command(
 ) -> Answer:
     """Write a failure as OpenSCENARIO and OpenDRIVE, for CARLA's scenario_runner, or as CommonRoad XML."""
     from rare_envs.study.export import check_export, export_scenario
-    from rare_envs.study.video import find_failure
+    from rare_envs.study.replay import find_failure
 
     with as_bad_input(ValueError):
         check_export(out, format, ego)

@@ -25,9 +25,8 @@ from rare_envs.study.html_report.figures import (
     figures_of_result,
     passes_levels,
 )
-from rare_envs.study.question import prepare
-from rare_envs.study.recorded_question import load_finished, open_run, warn_of_changed_files
-from rare_envs.study.run_folder import EPISODES, REPORT, RESULT, STUDY, LoadedStudy
+from rare_envs.study.question import open_run, prepare, warn_of_changed_files
+from rare_envs.study.run_folder import EPISODES, REPORT, RESULT, STUDY, LoadedStudy, load_finished
 from rare_envs.study.text import (
     describe_intervals,
     describe_kind,

@@ -20,10 +20,10 @@ from rare_envs.problem import DrivingProblem
 from rare_envs.study.columns import find_ordinary_range, format_value, list_columns
 from rare_envs.study.errors import BadInput
 from rare_envs.study.html_report.figures import FigureOfPage
-from rare_envs.study.plots import HIT_COLOUR, LAST_SECONDS, MOMENTS, draw_moment, draw_speeds
-from rare_envs.study.replay import Drive, drive_again
+from rare_envs.study.plots import HIT_COLOUR, MOMENTS, choose_moments, draw_measure, draw_moment, draw_speeds
+from rare_envs.study.replay import Drive, drive_again, read_row
 from rare_envs.study.text import describe_kind, format_probability, name_measure
-from rare_envs.study.video import draw_frames, join_parameters, save_gif
+from rare_envs.study.video import draw_frames, save_gif
 from samplers.problem import FloatArray
 
 
@@ -135,7 +135,7 @@ def _build_entry(source: AtlasSource, number: int, mode: Mapping[str, Any]) -> A
     entry = AtlasEntry(number, title, share)
     if failure is None:
         return entry._replace(missing="none of its failures is in failures.csv")
-    x = join_parameters(dict(source.failures), source.problem, int(failure))
+    x = read_row(source.failures, source.problem, int(failure))
     nearest = None
     if source.events is not None:
         shown = [column.shown for column in list_columns(source.problem.space)]
@@ -189,12 +189,10 @@ def _list_parameters(
 
 def _draw_drive(drive: Drive, number: int) -> list[FigureOfPage]:
     """Return the figures of a drive: from above, the measure, and speeds."""
-    first = int(np.argmin(np.abs(drive.time - (drive.time[drive.worst] - LAST_SECONDS))))
-    moments = np.linspace(first, drive.worst, MOMENTS).round().astype(int)
 
     def draw_views(figure: Figure) -> None:
-        for axes, t in zip(figure.subplots(MOMENTS, 1), moments, strict=True):
-            draw_moment(axes, drive, int(t))
+        for axes, t in zip(figure.subplots(MOMENTS, 1), choose_moments(drive), strict=True):
+            draw_moment(axes, drive, t)
 
     height = 0.25 + MOMENTS * max(0.6, 0.045 * drive.road.lanes * drive.road.width)
     return [
@@ -210,10 +208,8 @@ def _draw_drive(drive: Drive, number: int) -> list[FigureOfPage]:
 def _draw_measure(figure: Figure, drive: Drive) -> None:
     axes = figure.subplots()
     measure = drive.problem.world.measurement.measure
-    axes.plot(drive.time, drive.f_alone, color="#777777", linewidth=1, label="this moment")
-    axes.step(drive.time, drive.f_so_far, where="post", color="black", linewidth=1.5, label="f so far")
+    draw_measure(axes, drive)
     axes.axvline(drive.time[drive.worst], color=HIT_COLOUR, linewidth=1, label="worst moment")
-    axes.set_xlabel("time [s]")
     axes.set_ylabel(name_measure(measure if isinstance(measure, str) else ""))
     axes.legend(frameon=False, fontsize=8)
 

@@ -16,7 +16,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from agents import load_ego
 from agents.loading import find_ego_kind
 from agents.saved_ego import SavedEgo, find_cached_model, find_hub_cache, find_hub_model
-from rare_envs.study.journal import find_named_files
+from rare_envs.study.question import find_named_files
 
 NAME, COMMIT = "hf:somebody/ppo-Pendulum-v1", "0123abc"
 

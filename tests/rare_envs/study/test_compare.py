@@ -3,9 +3,8 @@
 import json
 
 from rare_envs.study.run_folder import read_failures
-from tests.rare_envs.study.refusals import assert_refused
+from tests.rare_envs.study.refusals import FOLLOWING, assert_refused
 
-FOLLOWING = "rare_envs/CarFollowing-v0"
 RANDOM_LATER = """
 import numpy as np
 

@@ -8,16 +8,11 @@ import os
 import shutil
 import zipfile
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 
-from rare_envs.study import evaluate, writing
-from rare_envs.study.arguments import Question, read_question
-from rare_envs.study.errors import BadInput
-from rare_envs.study.journal import JOURNAL
-from rare_envs.study.question import prepare
+from rare_envs.study.run_folder import JOURNAL
 from tests.rare_envs.study.test_damaged_kinds import FOLLOWING, assert_one_line, cli
 
 
@@ -30,14 +25,9 @@ def npz(**entries: bytes) -> bytes:
     return file.getvalue()
 
 
-def npy(header: str, content: bytes = b"", version: bytes = b"\x01\x00") -> bytes:
-    return (
-        b"\x93NUMPY"
-        + version
-        + len(header).to_bytes(2 if version == b"\x01\x00" else 4, "little")
-        + header.encode()
-        + content
-    )
+def npy(header: str, version: bytes = b"\x01\x00") -> bytes:
+    size = len(header).to_bytes(2 if version == b"\x01\x00" else 4, "little")
+    return b"\x93NUMPY" + version + size + header.encode()
 
 
 HEADERS = (
@@ -65,24 +55,11 @@ BLOCKS = [
 ]
 
 
-@pytest.fixture(scope="module")
-def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A finished run with a few failures."""
-    folder = tmp_path_factory.mktemp("finished")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(writing, "save_plot", lambda path, report: None)
-        evaluate.run_into(
-            folder / "run",
-            prepare(Question(env_id=FOLLOWING, base="us101-gap", gamma=3.0, horizon=2.0, method="mc", max_sim=600)),
-        )
-    return folder / "run"
-
-
 @pytest.fixture
-def run(finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def run(finished_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A copy of it to damage, in the working directory."""
     monkeypatch.chdir(tmp_path)
-    return Path(shutil.copytree(finished, tmp_path / "run"))
+    return Path(shutil.copytree(finished_run, tmp_path / "run"))
 
 
 @pytest.mark.parametrize("number", range(len(BLOCKS)))
@@ -91,22 +68,6 @@ def test_damaged_blocks_are_one_line(number: int, run: Path) -> None:
     refused = cli("replay", "run")
     assert_one_line(refused, *((0,) if number == len(HEADERS) + 3 else ()))  # an archive without blocks
     assert not Path("ran").exists()
-
-
-@pytest.mark.parametrize(
-    ("values", "words"),
-    [
-        ([1], "an object with env_id"),
-        ({}, "an object with env_id"),
-        ({"env_id": FOLLOWING, "seed": 1.5}, "seed of the recorded question to be a whole number, got 1.5"),
-        ({"env_id": FOLLOWING, "seed": True}, "seed of the recorded question to be a whole number, got True"),
-        ({"env_id": FOLLOWING, "ego": None}, "ego of the recorded question to be a text"),
-        ({"env_id": [FOLLOWING]}, "env_id of the recorded question to be a text"),
-    ],
-)
-def test_what_is_no_question_is_refused(values: Any, words: str) -> None:
-    with pytest.raises(BadInput, match=words):
-        read_question(values)
 
 
 def test_an_ego_that_sets_numpys_errors_sets_them_for_itself(here: Path, risky: str) -> None:

@@ -11,7 +11,6 @@ import rare_envs
 import samplers
 from rare_envs.egos.errors import EgoGone
 from samplers.evaluate import Evaluator
-from samplers.validation import EvaluationError
 
 ENV = "rare_envs/CarFollowing-v0"
 GAP = 30.0
@@ -63,15 +62,15 @@ def x() -> np.ndarray:
     return points
 
 
-def tolerate(problem: Any, on_error: Any = "failure") -> Evaluator:
-    return Evaluator(problem, on_error=on_error, name="The ego")
+def tolerate(problem: Any) -> Evaluator:
+    return Evaluator(problem, on_error="failure")
 
 
 def problem(ego: Any) -> rare_envs.DrivingProblem:
     return rare_envs.DrivingProblem(ENV, ego=ego, horizon=1.0)
 
 
-@pytest.mark.parametrize(("how", "memory"), [*((how, False) for how in FAILING), ("raises", True), ("gives NaN", True)])
+@pytest.mark.parametrize(("how", "memory"), [*((how, False) for how in FAILING), ("raises", True)])
 def test_only_scenarios_on_which_the_ego_fails_are_lost(how: str, memory: bool, x: np.ndarray) -> None:
     fail, reason = FAILING[how]
     tolerant = tolerate(problem(Coasting(fail, memory)))
@@ -84,27 +83,6 @@ def test_only_scenarios_on_which_the_ego_fails_are_lost(how: str, memory: bool, 
     assert all(reason in fault.reason and "\n" not in fault.reason for fault in tolerant.faults)
 
 
-def test_to_raise_names_the_scenario_and_the_reason(x: np.ndarray) -> None:
-    with pytest.raises(EvaluationError, match=r"failed twice on x = \[.*25\..*\]: RuntimeError: no road"):
-        tolerate(problem(Coasting(raises)), "raise").evaluate(x)
-
-
-@pytest.mark.parametrize("on_error", ["raise", "bound"])
-def test_a_fault_that_passes_costs_nothing_but_time(on_error: str, x: np.ndarray) -> None:
-    calls: list[int] = []
-
-    def once(actions: Any, short: Any) -> Any:
-        calls.append(1)
-        if len(calls) == 1:
-            raise OSError("busy")
-        return actions
-
-    tolerant = tolerate(problem(Coasting(once)), on_error)
-    np.testing.assert_array_equal(tolerant.evaluate(x), problem(Coasting()).evaluate(x))
-    assert not tolerant.faults
-    assert len(calls) > 1
-
-
 def test_nobody_is_asked_again_once_the_ego_is_gone(x: np.ndarray) -> None:
     calls = []
 
@@ -113,14 +91,14 @@ def test_nobody_is_asked_again_once_the_ego_is_gone(x: np.ndarray) -> None:
         raise EgoGone("not there")
 
     with pytest.raises(EgoGone):
-        tolerate(problem(Coasting(gone)), "bound").evaluate(x)
+        tolerate(problem(Coasting(gone))).evaluate(x)
     assert len(calls) == 1
     with pytest.raises(EgoGone, match="not there"):
         samplers.estimate(problem(Coasting(gone)), "mc", gamma=3.0, max_sim=300, seed=0, on_error="bound")
     assert len(calls) == 2
 
 
-@pytest.mark.parametrize(("how", "memory"), [("raises", False), ("raises", True), ("gives NaN", False)])
+@pytest.mark.parametrize(("how", "memory"), [("raises", True), ("gives NaN", False)])
 def test_terms_of_the_same_scenarios_are_lost_and_no_others(how: str, memory: bool, x: np.ndarray) -> None:
     fail, reason = FAILING[how]
     tolerant, bad = tolerate(problem(Coasting(fail, memory))), x[:, 2] < GAP
@@ -134,39 +112,16 @@ def test_terms_of_the_same_scenarios_are_lost_and_no_others(how: str, memory: bo
     assert 0 < tolerant.n_retried < (5 if memory else 2) * len(x)
 
 
-@pytest.mark.parametrize("memory", [False, True])
-def test_where_all_scenarios_fail_no_term_is_known(memory: bool, x: np.ndarray) -> None:
-    bad = x[x[:, 2] < GAP]
-    tolerant = tolerate(problem(Coasting(raises, memory)), "bound")
-    found = tolerant.terms(bad)
-    assert np.isnan(found.f).all() and np.isnan(found.values).all()
-    assert found.values.shape == found.ticks.shape == (len(bad), len(found.names))
-    assert len(tolerant.faults) == len(bad)
-
-
-@pytest.mark.parametrize("how", ["raises", "ends the program"])
-def test_scenarios_on_which_a_gradient_fails_have_none_and_the_others_theirs(how: str, x: np.ndarray) -> None:
+def test_scenarios_on_which_a_gradient_fails_have_none_and_the_others_theirs(x: np.ndarray) -> None:
     good = problem(Coasting())
     term = np.zeros(len(x), dtype=np.int64)
     ticks = 1 + np.arange(len(x)) % 5  # at tick 0 nobody asks the ego
     assert good.gradient is not None
     expected, bad = good.gradient(x, term, ticks), x[:, 2] < GAP
-    tolerant = tolerate(problem(Coasting(FAILING[how][0])))
+    tolerant = tolerate(problem(Coasting(raises)))
     found = tolerant.gradient(x, term, ticks)
     np.testing.assert_allclose(found.values, np.where(bad[:, None], np.nan, expected.values), rtol=1e-6)
     at_most = good.gradient_cost * bad.sum()  # what a row costs at most, for those that gave nothing
     assert at_most < found.cost <= at_most + expected.cost
     assert not tolerant.faults  # they have an outcome
     assert tolerant.n_retried > 0
-    strict = tolerate(problem(Coasting(FAILING[how][0])), "raise")
-    with pytest.raises(EvaluationError, match=r"failed twice on x = \[.*25\."):
-        strict.gradient(x, term, ticks)
-
-
-def test_a_gradient_is_not_asked_for_again_once_the_ego_is_gone(x: np.ndarray) -> None:
-    def gone(actions: Any, short: Any) -> Any:
-        raise EgoGone("not there")
-
-    tolerant = tolerate(problem(Coasting(gone)), "bound")
-    with pytest.raises(EgoGone):
-        tolerant.gradient(x, np.zeros(len(x), dtype=np.int64), np.full(len(x), 3))

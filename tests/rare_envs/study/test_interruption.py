@@ -14,14 +14,14 @@ from typing import Any
 import pytest
 
 from rare_envs.problem import DrivingProblem
-from rare_envs.study import evaluate, question
+from rare_envs.study import evaluate, question, writing
 from rare_envs.study import risk as total_risk
 from samplers import estimation
 from samplers.journal import Journal
 from tests.rare_envs.study.fitted_files import write_fitted
 from tests.rare_envs.study.refusals import FOLLOWING, Cli
 
-SIGNALS = ("SIGINT", "SIGTERM", "SIGHUP")
+SIGNALS = ("SIGTERM", *(pytest.param(name, marks=pytest.mark.slow) for name in ("SIGINT", "SIGHUP")))
 WORDS = ("estimate", FOLLOWING, "--method", "mc", "--horizon", "1", "--gamma", "2", "--max-sim", "600", "--seed", "0")
 NOTHING = "Stopped: no estimate yet, no simulation made."
 LOST = "With --out finished simulations would have been kept."
@@ -104,7 +104,7 @@ def test_later_p_so_far_is_the_first_line_and_the_answer_follows(
     assert_stopped(result, name, f"Stopped after 10,000 simulations: {known}. {LOST}")
 
 
-@pytest.mark.parametrize("step", ["classify_failures", "recheck"])
+@pytest.mark.parametrize("step", ["classify_failures", pytest.param("recheck", marks=pytest.mark.slow)])
 def test_after_the_last_simulation_the_answer_is_there(
     step: str, cli: Cli, risky: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -122,7 +122,7 @@ def test_in_the_final_writes_the_answer_is_printed_and_kept(
     cli: Cli, here: Path, risky: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with monkeypatch.context() as patch:
-        patch.setattr(evaluate, "write_run", lambda *_: stop("SIGTERM"))
+        patch.setattr(writing, "write_run", lambda *_: stop("SIGTERM"))
         result = cli(*WORDS, "--base", risky, "--out", "run", "--json")
     p = json.loads(result.stdout)["p"]
     assert result.exit_code == 143
@@ -134,7 +134,7 @@ def test_simulations_of_the_further_run_are_not_those_of_the_run(
     cli: Cli, here: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(estimation, "needs_ensemble_run", lambda *_: True)
-    monkeypatch.setattr(evaluate, "write_run", full)
+    monkeypatch.setattr(writing, "write_run", full)
     result = cli(*WORDS, "--base", write_fitted(here / "base.json", "car_following"), "--out", "run", "--json")
     assert json.loads(result.stdout)["n_sim"] == 600
     kept = "600 simulations and a further 600 under the mixture of the refits are kept; go on with: "

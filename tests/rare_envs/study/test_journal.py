@@ -24,14 +24,14 @@ from rare_envs.problem import DrivingProblem
 from rare_envs.study import evaluate, writing
 from rare_envs.study.arguments import Question
 from rare_envs.study.errors import BadInput
-from rare_envs.study.journal import JOURNAL, begin_journal, continue_journal, digest_files
-from rare_envs.study.question import prepare
+from rare_envs.study.question import digest_files, prepare
+from rare_envs.study.run_folder import JOURNAL
+from rare_envs.study.writing import begin_journal, continue_journal
 from samplers.journal import COLUMNS, _Row
 from samplers.workers import ExecutorError
 from tests.rare_envs.study.refusals import FOLLOWING, assert_refused
 
 Cli = Callable[..., Result]
-FILES = ("result.json", "failures.csv")
 FRAIL = """
 import os
 from pathlib import Path
@@ -72,14 +72,14 @@ def frail(here: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def answer(folder: Path) -> dict[str, Any]:
-    found: dict[str, Any] = json.loads((folder / "result.json").read_text())
+    found = json.loads((folder / "result.json").read_text())
     del found["seconds"], found["earlier_seconds"]
     return found
 
 
-def question(base: str, method: str) -> Question:
+def question(base: str, method: str = "mc") -> Question:
     return Question(
-        env_id="rare_envs/CarFollowing-v0",
+        env_id=FOLLOWING,
         ego="frail:make",
         base=base,
         method=method,
@@ -91,83 +91,78 @@ def question(base: str, method: str) -> Question:
     )
 
 
+def leave(asked: Question, after: int = 150, folder: str = "run", **more: Any) -> str:
+    """Begin a run whose ego goes away after some calls, and return what is said of it."""
+    Path("left").write_text(str(after))
+    with pytest.raises(BadInput, match=r"[\d,]+ simulations are kept; go on with: rare-envs resume") as stopped:
+        evaluate.run_into(Path(folder), prepare(asked), **more)
+    return str(stopped.value)
+
+
+def assert_same(run: str, whole: str) -> None:
+    assert answer(Path(run)) == answer(Path(whole))
+    for name in ("failures.csv", "faults.csv"):
+        assert Path(run, name).read_bytes() == Path(whole, name).read_bytes()
+
+
 @pytest.mark.parametrize(("method", "after", "again"), [("two-stage", 120, 95), ("mc", 150, 95)])
 def test_the_answer_is_that_of_an_undisturbed_run(method: str, after: int, again: int, frail: Path, risky: str) -> None:
     asked = question(risky, method)
-    evaluate.run_into(frail / "whole", prepare(asked))
-    whole = answer(frail / "whole")
-    assert whole["n_faults"] > 0
-    (frail / "left").write_text(str(after))
-    with pytest.raises(
-        BadInput, match=r"No ego at tcp://here\. [\d,]+ simulations are kept; go on with: rare-envs resume"
-    ):
-        evaluate.run_into(frail / "run", prepare(asked))
-    assert sorted(path.name for path in (frail / "run").iterdir()) == [JOURNAL, "study.json"]
-    kept, about = continue_journal(frail / "run")
+    assert evaluate.run_into(Path("whole"), prepare(asked)).faults
+    assert "No ego at tcp://here." in leave(asked, after)
+    assert sorted(path.name for path in Path("run").iterdir()) == [JOURNAL, "study.json"]
+    kept, about = continue_journal(Path("run"))
     assert about.method == method
     kept.close()
-    (frail / "left").write_text(str(again))  # it goes away again, a little later
+    Path("left").write_text(str(again))  # it goes away again, a little later
     with pytest.raises(BadInput, match="are kept"):
-        evaluate.resume(frail / "run")
-    evaluate.resume(frail / "run")
-    assert answer(frail / "run") == whole
-    for name in ("failures.csv", "faults.csv"):
-        assert (frail / "run" / name).read_bytes() == (frail / "whole" / name).read_bytes()
-    assert not (frail / "run" / JOURNAL).exists()
+        evaluate.resume(Path("run"))
+    evaluate.resume(Path("run"))
+    assert_same("run", "whole")
+    assert not Path("run", JOURNAL).exists()
 
 
 def test_the_command_that_goes_on_can_be_typed(frail: Path, risky: str) -> None:
-    folder = frail / "my run"
-    (frail / "left").write_text("150")
-    with pytest.raises(BadInput, match="go on with") as stopped:
-        evaluate.run_into(folder, prepare(replace(question(risky, "mc"), trust=True)))
-    words = shlex.split(str(stopped.value).partition("go on with: ")[2])
-    assert words == ["rare-envs", "resume", str(folder), "--trust"]
+    said = leave(replace(question(risky), trust=True), folder="my run")
+    assert shlex.split(said.partition("go on with: ")[2]) == ["rare-envs", "resume", "my run", "--trust"]
     with pytest.raises(BadInput, match="unfinished run") as begun:
-        evaluate.run_into(folder, prepare(question(risky, "mc")))
-    assert shlex.quote(str(folder)) in str(begun.value)
+        evaluate.run_into(Path("my run"), prepare(question(risky)))
+    assert "'my run'" in str(begun.value)
 
 
 @pytest.mark.slow
 def test_a_search_by_terms_is_continued_like_any_other(frail: Path) -> None:
     """The ego goes away among walks, in a round and among the final ones; 15 calls drive 1.5 s."""
-    asked = Question(
+    asked = replace(
+        question(""),
         env_id="rare_envs/Highway-v0",
-        ego="frail:make",
+        base=None,
+        method="auto",
         measure="clearance",
         gamma=0.2,
         horizon=1.5,
-        max_sim=1200,
-        seed=3,
-        on_error="bound",
     )
-    whole = evaluate.run_into(frail / "whole", prepare(asked))
-    assert len(whole.faults) > 0
-    assert whole.estimate.n_sim == 1200
-    (frail / "left").write_text("40")
-    with pytest.raises(BadInput, match=r"[\d,]+ simulations are kept"):
-        evaluate.run_into(frail / "run", prepare(asked))
+    whole = evaluate.run_into(Path("whole"), prepare(asked))
+    assert whole.faults and whole.estimate.n_sim == 1200
+    leave(asked, 40)
     for left in (75, 40):
-        (frail / "left").write_text(str(left))
+        Path("left").write_text(str(left))
         with pytest.raises(BadInput, match="are kept") as ended:
-            evaluate.resume(frail / "run")
+            evaluate.resume(Path("run"))
         assert int(str(ended.value).split(" simulations")[0].split()[-1].replace(",", "")) < 1200
-    evaluate.resume(frail / "run")
-    assert answer(frail / "run") == answer(frail / "whole")
-    for name in ("failures.csv", "faults.csv"):
-        assert (frail / "run" / name).read_bytes() == (frail / "whole" / name).read_bytes()
+    evaluate.resume(Path("run"))
+    assert_same("run", "whole")
 
 
 def test_on_the_command_line(cli: Cli, frail: Path, risky: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    words = ["estimate", "rare_envs/CarFollowing-v0", "--ego", "frail:make", "--base", risky, "--horizon", 2]
+    words = ["estimate", FOLLOWING, "--ego", "frail:make", "--base", risky, "--horizon", 2]
     words += ["--method", "mc", "--max-sim", 600, "--gamma", 2, "--on-error", "failure", "--out", "run"]
     (frail / "left").write_text("100")
     ended = cli(*words)
     assert (ended.exit_code, ended.stdout) == (2, "")
     assert "simulations are kept; go on with: rare-envs resume run" in ended.stderr
     again = cli(*words)
-    assert (again.exit_code, again.stdout) == (2, "")
-    assert "continue it with rare-envs resume run" in again.stderr
+    assert (again.exit_code, again.stdout) == (2, "") and "continue it with rare-envs resume run" in again.stderr
     monkeypatch.setenv("FRAIL", "stop")
     (frail / "left").write_text("60")
     stopped = cli("resume", "run")
@@ -179,7 +174,6 @@ def test_on_the_command_line(cli: Cli, frail: Path, risky: str, monkeypatch: pyt
     done = cli("resume", "run", "--json")
     assert done.exit_code in (0, 3), done.stderr
     assert json.loads(done.stdout)["n_sim"] == 600
-    assert (cli("resume", "run").exit_code, cli("resume", "nowhere").exit_code) == (2, 2)
 
 
 def change_head(path: Path, **change: Any) -> None:
@@ -193,31 +187,27 @@ def change_head(path: Path, **change: Any) -> None:
 
 
 def test_another_run_does_not_take_the_journal(frail: Path, risky: str) -> None:
-    (frail / "left").write_text("150")
-    asked = question(risky, "mc")
-    with pytest.raises(BadInput, match="are kept"):
-        evaluate.run_into(frail / "run", prepare(asked))
-    journal = frail / "run" / JOURNAL
+    asked, journal = question(risky), Path("run", JOURNAL)
+    leave(asked)
     content = journal.read_bytes()
-    change_head(journal, question=asdict(replace(asked, seed=4)))
-    with pytest.raises(BadInput, match="asks for other points"):
-        evaluate.resume(frail / "run", trust=True)
-    change_head(journal, question=asdict(asked), version="9.0")
-    with pytest.raises(BadInput, match=r"begun by version 9\.0"):
-        evaluate.resume(frail / "run", trust=True)
-    for head in ({"question": {"env": 1}}, {"question": None}, {"question": [1]}):
+    heads: list[tuple[dict[str, Any], str]] = [
+        ({"question": asdict(replace(asked, seed=4))}, "asks for other points"),
+        ({"version": "9.0"}, r"begun by version 9\.0"),
+        *(({"question": other}, "Cannot take up") for other in ({"env": 1}, None, [1])),
+    ]
+    for head, said in heads:
         journal.write_bytes(content)
         change_head(journal, **head)
-        with pytest.raises(BadInput, match="Cannot take up"):
-            evaluate.resume(frail / "run", trust=True)
+        with pytest.raises(BadInput, match=said):
+            evaluate.resume(Path("run"), trust=True)
     journal.write_bytes(content)
     with pytest.raises(BadInput, match="whose address has changed only"):
-        evaluate.resume(frail / "run", ego="tcp://127.0.0.1:5555", trust=True)
+        evaluate.resume(Path("run"), ego="tcp://127.0.0.1:5555", trust=True)
     journal.write_bytes(b"nothing" * 100)
     with pytest.raises(BadInput, match="is of another kind"):
-        evaluate.resume(frail / "run", trust=True)
+        evaluate.resume(Path("run"), trust=True)
     journal.write_bytes(content)
-    assert evaluate.resume(frail / "run", trust=True).estimate.n_sim == 1200
+    assert evaluate.resume(Path("run"), trust=True).estimate.n_sim == 1200
 
 
 def damage(path: Path, statement: str) -> None:
@@ -231,12 +221,9 @@ def damage(path: Path, statement: str) -> None:
 def test_values_of_f_that_were_zeroed_are_refused_and_those_before_them_can_be_kept(
     frail: Path, risky: str, cli: Cli
 ) -> None:
-    asked = question(risky, "mc")
-    evaluate.run_into(frail / "whole", prepare(asked))
-    (frail / "left").write_text("150")
-    with pytest.raises(BadInput, match="600 simulations are kept"):
-        evaluate.run_into(frail / "run", prepare(asked))
-    journal = frail / "run" / JOURNAL
+    asked, journal = question(risky), Path("run", JOURNAL)
+    evaluate.run_into(Path("whole"), prepare(asked))
+    leave(asked)
     content = journal.read_bytes()
     damage(journal, "UPDATE chunks SET notes = '{}' WHERE id = 0")
     damaged = journal.read_bytes()
@@ -260,18 +247,16 @@ class Unstarted:
 
 
 def test_an_executor_that_does_not_start_costs_a_resumed_run_nothing(frail: Path, risky: str) -> None:
-    asked = question(risky, "mc")
-    evaluate.run_into(frail / "whole", prepare(asked))
-    (frail / "left").write_text("150")
-    with pytest.raises(BadInput, match="are kept"):
-        evaluate.run_into(frail / "run", prepare(asked))
+    asked = question(risky)
+    evaluate.run_into(Path("whole"), prepare(asked))
+    leave(asked)
     with pytest.raises(BadInput, match=r"No workers come\. 600 simulations are kept; go on with: rare-envs resume"):
-        evaluate.resume(frail / "run", executor=Unstarted())
-    evaluate.resume(frail / "run")
-    assert answer(frail / "run") == answer(frail / "whole")
+        evaluate.resume(Path("run"), executor=Unstarted())
+    evaluate.resume(Path("run"))
+    assert_same("run", "whole")
     with pytest.raises(BadInput, match=r"No workers come\.$"):
-        evaluate.run_into(frail / "new", prepare(asked), executor=Unstarted())
-    assert not (frail / "new").exists()
+        evaluate.run_into(Path("new"), prepare(asked), executor=Unstarted())
+    assert not Path("new").exists()
 
 
 @pytest.mark.parametrize("length", [None, 0])
@@ -282,68 +267,60 @@ def test_a_run_that_was_stopped_before_its_first_simulation_says_what_to_do(
     Path("run").mkdir()
     if length is not None:
         begin_journal(Path("run"), Question(env_id=FOLLOWING)).close()
-        whole = Path("run", JOURNAL).read_bytes()
-        Path("run", JOURNAL).write_bytes(whole[:length])
-    refused = cli("resume", "run")
-    assert_refused(refused, "stopped before its first simulations", "ive the command again.")
+        Path("run", JOURNAL).write_bytes(Path("run", JOURNAL).read_bytes()[:length])
+    assert_refused(cli("resume", "run"), "stopped before its first simulations", "ive the command again.")
     assert cli(*words).exit_code in (0, 3)
     assert_refused(cli("resume", "run"), "no unfinished run in 'run': it has a finished one (result.json)")
     assert_refused(cli("resume", "nowhere"), "no unfinished run in 'nowhere': the folder does not exist")
 
 
 def test_an_ego_that_has_changed_is_noticed(frail: Path, risky: str) -> None:
-    (frail / "left").write_text("150")
-    with pytest.raises(BadInput, match="are kept"):
-        evaluate.run_into(frail / "run", prepare(question(risky, "mc")))
-    before = (frail / "frail.py").read_text()
-    assert sorted(Path(name).name for name in digest_files(question(risky, "mc"))) == ["frail.py", "risky.json"]
+    asked, file, journal = question(risky), Path("frail.py"), Path("run", JOURNAL)
+    leave(asked)
+    before = file.read_text()
+    assert sorted(Path(name).name for name in digest_files(asked)) == ["frail.py", "risky.json"]
     # of another length: within a second Python tells compiled files apart by that alone
-    (frail / "frail.py").write_text(before.replace("gap - 0.3", "gap - 0.25"))
+    file.write_text(before.replace("gap - 0.3", "gap - 0.25"))
     with pytest.raises(BadInput, match=r"frail\.py has changed since the run"):
-        evaluate.resume(frail / "run")
-    now = digest_files(question(risky, "mc"))
-    change_head(frail / "run" / JOURNAL, files=now)  # as if the part that has changed were not in that file
+        evaluate.resume(Path("run"))
+    change_head(journal, files=digest_files(asked))  # as if the part that has changed were not in that file
     sys.modules.pop("frail")
     with pytest.raises(BadInput, match=r"f is .* at a point where .*: it has changed"):
-        evaluate.resume(frail / "run")
-    (frail / "frail.py").write_text(before)
-    change_head(frail / "run" / JOURNAL, files=digest_files(question(risky, "mc")))
+        evaluate.resume(Path("run"))
+    file.write_text(before)
+    change_head(journal, files=digest_files(asked))
     sys.modules.pop("frail")
-    assert evaluate.resume(frail / "run").estimate.n_sim == 1200
+    assert evaluate.resume(Path("run")).estimate.n_sim == 1200
 
 
 def test_a_run_is_continued_by_one_process_alone(frail: Path, risky: str) -> None:
-    (frail / "left").write_text("150")
-    with pytest.raises(BadInput, match="are kept"):
-        evaluate.run_into(frail / "run", prepare(question(risky, "mc")))
-    journal, _ = continue_journal(frail / "run")
+    leave(question(risky))
+    journal, _ = continue_journal(Path("run"))
     for attempt in (
-        lambda: evaluate.resume(frail / "run"),
-        lambda: evaluate.run_into(frail / "run", prepare(question(risky, "mc")), force=True),
+        lambda: evaluate.resume(Path("run")),
+        lambda: evaluate.run_into(Path("run"), prepare(question(risky)), force=True),
     ):
         with pytest.raises(BadInput, match="Another process is writing"):
             attempt()
     journal.close()
-    evaluate.resume(frail / "run")
+    evaluate.resume(Path("run"))
 
 
 def test_a_finished_run_is_replaced_by_force_alone_and_never_replayed_for_a_new_one(
     frail: Path, risky: str, cli: Cli
 ) -> None:
-    evaluate.run_into(frail / "run", prepare(question(risky, "mc")))
-    first = answer(frail / "run")
+    evaluate.run_into(Path("run"), prepare(question(risky)))
+    first = answer(Path("run"))
     with pytest.raises(BadInput, match=r"There is a finished run in .* replace it by --force"):
-        evaluate.run_into(frail / "run", prepare(question(risky, "mc")))
-    assert answer(frail / "run") == first
-    (frail / "left").write_text("150")
-    new = replace(question(risky, "mc"), seed=8)
-    with pytest.raises(BadInput, match="are kept"):
-        evaluate.run_into(frail / "run", prepare(new), force=True)
-    assert sorted(path.name for path in (frail / "run").iterdir()) == [JOURNAL, "study.json"]
+        evaluate.run_into(Path("run"), prepare(question(risky)))
+    assert answer(Path("run")) == first
+    new = replace(question(risky), seed=8)
+    leave(new, force=True)
+    assert sorted(path.name for path in Path("run").iterdir()) == [JOURNAL, "study.json"]
     assert_refused(cli("replay", "run"), "is not finished: rare-envs resume run comes first")
-    evaluate.resume(frail / "run")
-    evaluate.run_into(frail / "new", prepare(new))
-    assert answer(frail / "run") == answer(frail / "new") != first
+    evaluate.resume(Path("run"))
+    evaluate.run_into(Path("new"), prepare(new))
+    assert answer(Path("run")) == answer(Path("new")) != first
 
 
 def killed_once_there_is(path: Path, process: subprocess.Popen[str]) -> None:
@@ -361,14 +338,7 @@ def test_a_remote_ego_that_is_killed_for_good_and_started_later(cli: Cli, frail:
     text = (frail / "served.py").read_text()
     (frail / "served.py").write_text(f"import time\n{text}")
     paths = os.pathsep.join([str(Path(rare_envs.__file__).parents[1]), str(frail)])
-    main = [
-        sys.executable,
-        "-c",
-        "from rare_envs.study.cli import main; main()",
-        "serve-ego",
-        "served:make",
-        "--bind",
-    ]
+    main = [sys.executable, "-c", "from rare_envs.study.cli import main; main()", "serve-ego", "served:make", "--bind"]
 
     def served(bind: str) -> tuple[subprocess.Popen[str], str]:
         process = subprocess.Popen(

@@ -1,26 +1,33 @@
-"""Reports: what they note, and the scenarios on which the ego fails."""
+"""Reports: what they note and doubt, the curve over thresholds, and the scenarios on which the ego fails."""
 
 from __future__ import annotations
 
 import csv
 import json
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
-from typer.testing import Result
+from scipy import stats
 
+import samplers
 from rare_envs.study import Question, prepare, run
-
-SMALL = ("estimate", "rare_envs/CarFollowing-v0", "--method", "mc", "--max-sim", 400)
-
-Cli = Callable[..., Result]
-
-FOLLOWING = "rare_envs/CarFollowing-v0"
+from rare_envs.study.report import N_THRESHOLDS, compute_threshold_curve
+from tests.rare_envs.study.refusals import FOLLOWING, SMALL, Cli
 
 
-def test_the_result_names_the_statistics_that_were_applied(cli, tmp_path):
+@pytest.mark.parametrize("method", ["mc", "two-stage", "adss"])
+def test_the_curve_starts_at_p_and_its_band_holds_the_truth(method: str) -> None:
+    problem = samplers.FunctionProblem(lambda x: 2.5 - x[:, 0], dim=2)
+    estimate = samplers.estimate(problem, method, seed=1, max_sim=5000)
+    curve = compute_threshold_curve(estimate)
+    assert len(curve) == N_THRESHOLDS and curve.gammas[0] == 0.0 and curve.p[0] == pytest.approx(estimate.p)
+    truth = stats.norm.cdf(curve.gammas - 2.5)
+    assert np.mean((curve.low <= truth) & (truth <= curve.high)) > 0.9
+    assert 0.3 < curve.p[-1] < 0.7
+
+
+def test_the_result_names_the_statistics_that_were_applied(cli: Cli, tmp_path: Path) -> None:
     """A policy with somebody else's VecNormalize statistics drives unlike its training data: say which file it was."""
     from stable_baselines3 import PPO
     from stable_baselines3.common.vec_env import VecNormalize
@@ -47,7 +54,7 @@ def test_the_result_names_the_statistics_that_were_applied(cli, tmp_path):
     ],
 )
 def test_scenarios_on_which_the_ego_fails_are_listed(cli: Cli, here: Path, risky: str, ego: str, reason: str) -> None:
-    words = (*SMALL, "--base", risky, "--ego", f"egos_here:{ego}", "--out", here / "run")
+    words = (*SMALL[:-1], 400, "--base", risky, "--ego", f"egos_here:{ego}", "--out", here / "run")
     found = {}
     for on_error in ("bound", "failure"):
         result = cli(*words, "--on-error", on_error, "--force")
@@ -60,12 +67,9 @@ def test_scenarios_on_which_the_ego_fails_are_listed(cli: Cli, here: Path, risky
     assert header == ["ego_speed", "lead_speed", "gap", "reason"]
     assert len(rows) == answer["n_faults"] == answer["n_failures"] > 10  # this ego fails before it collides
     assert all(reason in row[-1] for row in rows)
-    assert answer["n_retried"] >= len(rows)
+    assert answer["n_retried"] >= len(rows) and answer["p"] == pytest.approx(len(rows) / 400)
     assert answer["faults"][0]["parameters"]["gap"] == float(rows[0][2])
-    assert answer["p"] == pytest.approx(len(rows) / 400)
-    assert found["bound"]["interval"][0] == 0.0
-    assert found["bound"]["interval"][1] == answer["interval"][1]
-    assert np.isfinite(np.array([row[:-1] for row in rows], dtype=float)).all()
+    assert found["bound"]["interval"] == [0.0, answer["interval"][1]]
     assert cli(*SMALL, "--ego", "idm", "--out", here / "run", "--force").exit_code in (0, 3)
     assert not (here / "run" / "faults.csv").exists()
 
@@ -73,9 +77,13 @@ def test_scenarios_on_which_the_ego_fails_are_listed(cli: Cli, here: Path, risky
 @pytest.mark.slow
 def test_a_doubt_about_the_base_distribution_makes_a_report_doubtful() -> None:
     """Some 20 failures tell p to a quarter, and are too few to tell it under each of 30 refits."""
-    study = prepare(Question(env_id="rare_envs/CutIn-v0", method="mc", max_sim=20_000, seed=1))
-    report = run(study)
+    report = run(prepare(Question(env_id="rare_envs/CutIn-v0", method="mc", max_sim=20_000, seed=1)))
     assert not report.estimate.warnings
     assert any("refits rest on under 10 effective failing points" in text for text in report.warnings)
-    assert report.doubtful
-    assert report.to_dict()["doubtful"]
+    assert report.doubtful and report.to_dict()["doubtful"]
+
+
+def test_progress_reaches_the_caller(risky: str) -> None:
+    seen: list[int] = []
+    report = run(prepare(Question(env_id=FOLLOWING, base=risky)), lambda progress: seen.append(progress.n_sim))
+    assert seen == sorted(seen) and seen[-1] == report.estimate.n_sim

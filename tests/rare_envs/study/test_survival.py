@@ -21,9 +21,9 @@ from rare_envs.problem import DrivingProblem
 from rare_envs.study import evaluate, writing
 from rare_envs.study.arguments import Question
 from rare_envs.study.errors import BadInput
-from rare_envs.study.journal import JOURNAL, continue_journal
 from rare_envs.study.question import prepare
-from rare_envs.study.run_folder import RESULT_FILES
+from rare_envs.study.run_folder import JOURNAL, RESULT_FILES
+from rare_envs.study.writing import continue_journal
 from samplers import journal as journals
 from tests.rare_envs.study.conftest import write_base
 from tests.rare_envs.study.forked_command import TILE, ForkedCommand
@@ -71,9 +71,9 @@ def finish(folder: Path, *words: str, executor: str | None = None) -> None:
     assert ended.code in (0, 3), ended
 
 
-def assert_same_files(run: Path, whole: Path, *names: str) -> None:
+def assert_same_files(run: Path, whole: Path) -> None:
     """The files of a run that was killed are those of one that was not, but for their times."""
-    assert tables_of(run) == list(names)
+    assert tables_of(run) == list(TABLES)
     assert answer(run) == answer(whole)
     assert (run / "failures.csv").read_bytes() == (whole / "failures.csv").read_bytes()
     assert episodes_of(run).equals(episodes_of(whole))
@@ -121,16 +121,7 @@ def kill_and_resume(
     chunk: tuple[str, ...] = (),
     executor_of: Callable[[int], str | None] = lambda number: None,
 ) -> None:
-    """Kill a run many times, at its beginning and while it simulates; then let it come to its end.
-
-    Args:
-        folder: Gets the run, as `run`.
-        base: Of the run.
-        rng: Draws the times.
-        kills: Number of kills.
-        chunk: Option for the size of the chunks.
-        executor_of: Executor of the command of a number.
-    """
+    """Kill a run many times, at its beginning and while it simulates; then let it come to its end."""
     words: tuple[str, ...] = ("estimate", FOLLOWING, "--base", base, *WORDS, *chunk, "--out", "run")
     for number in range(kills):
         command = ForkedCommand(folder, *words, pause=PAUSE, executor=executor_of(number))
@@ -143,19 +134,10 @@ def kill_and_resume(
     finish(folder, *words, executor=executor_of(kills))
 
 
-def kill_in_final_writes(folder: Path, kill_at: int, *words: str, executor: str | None = None) -> bool:
-    """Kill a command before the change of a file in its final writes, and return whether it had not ended before."""
-    before = len(RESULT_FILES) + 2  # study.json
-    ended = ForkedCommand(folder, *words, kill_at=kill_at + before, executor=executor).end()
-    if ended.code == -signal.SIGKILL:
-        assert (folder / "run" / JOURNAL).exists()
-    return ended.code == -signal.SIGKILL
-
-
 @pytest.mark.parametrize("kills", [3, pytest.param(21, marks=pytest.mark.slow)])
 def test_killed_at_random_times_it_gives_the_same_files(kills: int, tmp_path: Path, base: str, whole: Path) -> None:
     kill_and_resume(tmp_path, base, np.random.default_rng(21), kills)
-    assert_same_files(tmp_path / "run", whole, *TABLES)
+    assert_same_files(tmp_path / "run", whole)
 
 
 @pytest.mark.parametrize("name", [case(name) for name in EXECUTORS])
@@ -164,7 +146,7 @@ def test_killed_under_every_executor_it_gives_the_same_files(
 ) -> None:
     """The driver is killed 21 times, in turn here and under an executor."""
     kill_and_resume(tmp_path, base, np.random.default_rng(22), 21, CHUNK, lambda number: name if number % 3 else None)
-    assert_same_files(tmp_path / "run", whole_in_chunks, *TABLES)
+    assert_same_files(tmp_path / "run", whole_in_chunks)
 
 
 @pytest.mark.parametrize("kill_at", [pytest.param(k, marks=[] if k == 3 else pytest.mark.slow) for k in KILLS])
@@ -172,30 +154,11 @@ def test_killed_in_the_final_writes_it_gives_the_same_files(
     kill_at: int, tmp_path: Path, base: str, whole: Path
 ) -> None:
     words = ("estimate", FOLLOWING, "--base", base, *WORDS, "--out", "run")
-    if kill_in_final_writes(tmp_path, kill_at, *words):
+    before = len(RESULT_FILES) + 2  # study.json
+    if ForkedCommand(tmp_path, *words, kill_at=kill_at + before).end().code == -signal.SIGKILL:
+        assert (tmp_path / "run" / JOURNAL).exists()
         finish(tmp_path, "resume", "run")
-    assert_same_files(tmp_path / "run", whole, *TABLES)
-
-
-@pytest.mark.parametrize(
-    "name", ["SIGTERM", *(pytest.param(name, marks=pytest.mark.slow) for name in ("SIGINT", "SIGHUP"))]
-)
-def test_a_signal_is_one_line_and_what_is_known(name: str, tmp_path: Path, risky: str) -> None:
-    number = getattr(signal, name)
-    words = ["estimate", FOLLOWING, "--base", risky, "--gamma", "1", "--method", "ce", "--max-sim", "100000"]
-    command = ForkedCommand(tmp_path, *words, "--target-cov", "0.001", "--json", "--out", "run")
-    for _ in range(40):  # over several batches
-        command.wait_for_more(tmp_path / "run" / JOURNAL)
-    command.signal(number)
-    code, printed, said = command.end()
-    assert code == 128 + number, said
-    found = json.loads(printed)
-    assert found["status"] == "stopped"
-    assert found["n_sim"] > 0
-    assert "Traceback" not in said
-    assert said.splitlines()[-1] == f"rare-envs: stopped by {name}"
-    assert "simulations are kept; go on with: rare-envs resume run" in said
-    assert sorted(path.name for path in (tmp_path / "run").iterdir()) == [JOURNAL, "study.json"]
+    assert_same_files(tmp_path / "run", whole)
 
 
 def test_a_full_disk_at_the_start_is_one_line(cli: Cli, here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -211,19 +174,19 @@ def test_a_full_disk_at_the_end_prints_the_answer_and_loses_nothing(
 ) -> None:
     words = (*SMALL[:-1], 600, "--base", risky, "--json", "--out")
     whole = cli(*words, "whole")
-    write = evaluate.write_run
+    write = writing.write_run
 
     def full(*_: Any) -> None:
         raise NO_SPACE
 
-    monkeypatch.setattr(evaluate, "write_run", full)
+    monkeypatch.setattr(writing, "write_run", full)
     ended = cli(*words, "run")
     assert ended.exit_code == 2
     assert json.loads(ended.stdout)["p"] == json.loads(whole.stdout)["p"] > 0
     assert "Cannot write the results to" in ended.stderr
     assert "No space left on device. 600 simulations are kept; go on with: rare-envs resume run" in ended.stderr
     assert "Traceback" not in ended.stderr
-    monkeypatch.setattr(evaluate, "write_run", write)
+    monkeypatch.setattr(writing, "write_run", write)
     assert cli("resume", "run").exit_code in (0, 3)
     assert answer(here / "run") == answer(here / "whole")
 
@@ -270,5 +233,5 @@ def test_an_ego_that_changes_the_working_directory(here: Path, risky: str, no_pi
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(DrivingProblem, "attempt", moving)
         evaluate.run_into(Path("run"), study)
-    assert tables_of(here / "run") == ["episodes.parquet", "failures.csv", "result.json", "study.json"]
+    assert tables_of(here / "run") == list(TABLES)
     assert not list((here / "elsewhere").iterdir())

@@ -7,8 +7,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+import agents
 from rare_envs.study import Question, prepare, run
-from rare_envs.study.repeatability import KEPT_ROWS, ROWS_ALONE, RowKeeper
+from rare_envs.study.evaluate import KEPT_ROWS, ROWS_ALONE, RowKeeper
 from samplers.evaluate import Simulated
 
 QUESTION = Question(
@@ -58,8 +59,6 @@ def test_an_ego_without_an_f_is_noticed(ego: type[Braking]) -> None:
 
 @pytest.mark.parametrize("ego", [Braking(), "imitation"])
 def test_others_are_not_suspected(ego: Any) -> None:
-    import agents
-
     found = run(prepare(QUESTION, ego=agents.load_ego(ego) if isinstance(ego, str) else ego)).repeatability
     assert found is not None
     assert (found.n, found.n_differing, found.warning) == (KEPT_ROWS + ROWS_ALONE, 0, "")

@@ -1,0 +1,216 @@
+"""A corpus of failures: stored to the bit, refused when changed, and what egos do in it."""
+
+from __future__ import annotations
+
+import json
+import math
+import shutil
+import xml.etree.ElementTree as ET
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from rare_envs.study import Question, prepare, run_into
+from rare_envs.study.corpus import (
+    WORLD_FIELDS,
+    StoredFailure,
+    Trial,
+    add_run,
+    make_stored,
+    parse_stored,
+    plan_retraining,
+    read_corpus,
+    read_run,
+    read_stored,
+    try_ego,
+    write_junit,
+)
+from rare_envs.study.errors import BadInput
+from training import train_ego
+
+ENV = "rare_envs/CarFollowing-v0"
+FOLLOWING = Question(env_id=ENV, horizon=4.0)
+
+
+def stored(question: Question, *values: float) -> StoredFailure:
+    x = dict(zip(("ego_speed", "lead_speed", "gap"), map(np.array, values), strict=True))
+    return make_stored(question, x, -1.0, -9.25, "rear_end")
+
+
+CRASH, SAFE = stored(FOLLOWING, 20.0, 5.0 / 3.0, 10.0), stored(FOLLOWING, 20.0, 20.0, 80.0)
+
+
+def test_a_failure_comes_back_to_the_bit_and_its_key_is_that_of_the_scenario_alone() -> None:
+    again = parse_stored(CRASH.to_json(), "the file")
+    assert again == CRASH and again.x["lead_speed"] == [5.0 / 3.0] and set(CRASH.world) == set(WORLD_FIELDS)
+    assert math.isnan(parse_stored(replace(CRASH, f=math.nan).to_json(), "the file").f)
+    assert replace(CRASH, ego="human", f=0.0, crash="", versions=None).key == CRASH.key
+    assert replace(CRASH, x={**CRASH.x, "gap": [10.000001]}).key != CRASH.key
+    assert replace(CRASH, world={**CRASH.world, "horizon": 5.0}).key != CRASH.key
+
+
+CHANGED: tuple[dict[str, Any], ...] = (
+    {"format": 2},
+    {"sha256": "0" * 64},
+    {"x": {**CRASH.x, "gap": [3.0]}},
+    {"x": {**CRASH.x, "gap": ["3"]}},
+    {"x": []},
+    {"env_id": 3},
+    {"base": 7},
+    {"world": {}},
+    {"world": {**CRASH.world, "gamma": "low"}},
+    {"f": "NaN"},
+)
+OTHER = ("", "[]", "[" * 100_000, '{"format": 1}', '{"format": 1e400}')
+
+
+@pytest.mark.parametrize("text", [*(json.dumps({**json.loads(CRASH.to_json()), **each}) for each in CHANGED), *OTHER])
+def test_what_was_changed_and_other_files_are_refused(text: str) -> None:
+    with pytest.raises(ValueError, match="the file") as refused:
+        parse_stored(text, "the file")
+    assert "\n" not in str(refused.value)
+
+
+def test_two_hundred_damaged_files_are_refused_or_the_same(tmp_path: Path) -> None:
+    """A byte changed anywhere: the scenario is either untouched or the file is refused."""
+    text, rng, refused = CRASH.to_json().encode(), np.random.default_rng(0), 0
+    for _ in range(200):
+        damaged = bytearray(text)
+        damaged[rng.integers(len(text))] = rng.integers(256)
+        (tmp_path / "a.json").write_bytes(damaged)
+        try:
+            assert read_stored(tmp_path / "a.json").digest == CRASH.digest
+        except ValueError:
+            refused += 1
+    assert refused > 50
+
+
+@pytest.fixture
+def run(finished_run: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(finished_run, tmp_path / "run"))
+
+
+def test_failures_of_a_run_are_added_once(run: Path, tmp_path: Path) -> None:
+    chosen, new = add_run(run, tmp_path / "corpus", most=5)
+    assert new == 5 == len(chosen)
+    assert [each.key for each in read_corpus(tmp_path / "corpus")] == sorted(each.key for each in chosen)
+    before = {path.name: path.read_bytes() for path in (tmp_path / "corpus").iterdir()}
+    assert add_run(run, tmp_path / "corpus", most=5)[1] == 0
+    assert {path.name: path.read_bytes() for path in (tmp_path / "corpus").iterdir()} == before
+    recorded = read_run(run)
+    assert chosen[0] == recorded[0] and recorded[0].log_p0 >= recorded[-1].log_p0
+    assert recorded[0].crash == "rear_end" and recorded[0].ego == "idm"
+
+
+def test_runs_and_corpora_that_are_refused(run: Path, tmp_path: Path) -> None:
+    for folder, most, said in ((tmp_path, 20, "No finished run in"), (run, 0, "at least one")):
+        with pytest.raises(BadInput, match=said):
+            add_run(folder, tmp_path / "corpus", most)
+    assert not (tmp_path / "corpus").exists()
+    with pytest.raises(BadInput, match="There is no corpus"):
+        read_corpus(tmp_path / "corpus")
+    table = (run / "failures.csv").read_text()
+    (run / "failures.csv").write_text(table.replace(table.splitlines()[1].split(",")[0], "nan"))
+    with pytest.raises(BadInput, match="no number"):
+        read_run(run)
+
+
+def test_trials_in_their_order(tmp_path: Path) -> None:
+    near = stored(Question(env_id=ENV, gamma=9.0), 20.0, 17.0, 24.0)  # another world: ttc below 9 s
+    trials, _ = try_ego([SAFE, near, CRASH], tmp_path, "idm")
+    assert [trial.outcome for trial in trials] == ["passed", "failed", "failed"]
+    assert [trial.failure for trial in trials] == [SAFE, near, CRASH]
+    assert trials[2].f == -1.0 and trials[2].crash == "rear_end" and trials[2].same and not trials[0].same
+    assert trials[1].f == pytest.approx(8.0, abs=0.5) and trials[1].crash == "none"
+    assert json.loads(json.dumps(trials[2].to_dict()))["outcome"] == "failed"
+
+
+def test_an_ego_that_breaks_is_told_apart(here: Path) -> None:
+    """It answers NaN where the lead is close."""
+    trials, _ = try_ego([CRASH, SAFE], here, "egos_here:nan_when_close")
+    assert [trial.outcome for trial in trials] == ["error", "passed"]
+    assert trials[0].reason and np.isnan(trials[0].f) and trials[0].to_dict()["f"] is None
+
+
+def test_code_of_a_corpus_from_elsewhere_waits_for_trust(here: Path) -> None:
+    (here / "theirs.py").write_text("open('ran', 'w').close()\ndef measure(moment): return moment.lead.gap\n")
+    foreign = stored(Question(env_id=ENV, measure="theirs:measure"), 20.0, 5.0, 10.0)
+    with pytest.raises(BadInput, match="--trust"):
+        try_ego([foreign], here, "idm")
+    assert not (here / "ran").exists()
+    trials, _ = try_ego([foreign], here, "idm", trust=True)
+    assert (here / "ran").exists() and trials[0].outcome == "failed"
+
+
+def test_what_cannot_be_driven_is_one_line(tmp_path: Path) -> None:
+    outside = stored(FOLLOWING, 20.0, 5.0, -10.0)
+    gone = stored(Question(env_id="rare_envs/Gone-v0"), 20.0, 5.0, 10.0)
+    other = replace(CRASH, x={**CRASH.x, "gap": [1.0, 2.0]})
+    for failure, ego, said in (
+        (CRASH, "nowhere.zip", "nowhere"),
+        (outside, "idm", "gap"),
+        (gone, "idm", "Gone"),
+        (other, "idm", "2 values of gap, its scenario has 1"),
+    ):
+        with pytest.raises(BadInput, match=said):
+            try_ego([failure], tmp_path, ego)
+
+
+def test_junit_counts_its_cases_whatever_an_egos_error_says(tmp_path: Path) -> None:
+    error = Trial(CRASH, "error", math.nan, reason="<&\x00\x1b]]> \ud800 no answer")
+    trials = [Trial(CRASH, "passed", 1.5), Trial(CRASH, "failed", -1.0, "side"), error]
+    write_junit(tmp_path / "out.xml", trials, "a & b", 3.0)
+    root = ET.parse(tmp_path / "out.xml").getroot()
+    suite = root[0]
+    assert root.tag == "testsuites" and suite.tag == "testsuite" and suite.get("name") == "rare-envs corpus, ego a & b"
+    cases = suite.findall("testcase")
+    for counted in (root, suite):
+        assert (counted.get("tests"), counted.get("failures"), counted.get("errors")) == ("3", "1", "1")
+    assert [[child.tag for child in case] for case in cases] == [[], ["failure"], ["error"]]
+    assert all(case.get("name") == CRASH.key and case.get("classname") == ENV for case in cases)
+    assert sum(float(str(case.get("time"))) for case in cases) == 3.0
+    assert "no answer" in str(cases[2][0].get("message")) and cases[1][0].get("type") == "side"
+
+
+def make_run(folder: Path, base: str, **more: Any) -> Path:
+    asked = Question(env_id=ENV, base=base, method="mc", max_sim=500, horizon=4.0, core="torch", **more)
+    run_into(folder, prepare(asked))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def ego(tmp_path_factory: pytest.TempPathFactory) -> str:
+    folder = tmp_path_factory.mktemp("egos")
+    return str(train_ego(ENV, "a2c", 16, num_envs=8, out=folder / "ego.zip", progress=False))
+
+
+def test_a_retraining_has_the_failures_of_all_runs_and_the_ego_of_the_last(
+    ego: str, risky: str, tmp_path: Path
+) -> None:
+    first = make_run(tmp_path / "first", risky, ego="idm", observation="features")
+    second = make_run(tmp_path / "second", risky, ego=ego, seed=5)
+    plan = plan_retraining([first, second], 0.3)
+    assert (plan.env_id, plan.algo, plan.next_seed, plan.retraining.share) == (ENV, "a2c", 6, 0.3)
+    assert (plan.world["base"], plan.world["horizon"], plan.retraining.ego) == (risky, 4.0, Path(ego))
+    failures = [*read_run(first), *read_run(second)]
+    assert len(failures) > 4
+    x = [np.concatenate([one.x[name] for name in ("ego_speed", "lead_speed", "gap")]) for one in failures]
+    assert np.array_equal(plan.retraining.failures, x)
+
+
+@pytest.mark.slow
+def test_runs_that_do_not_go_together_are_refused(ego: str, risky: str, safe: str, tmp_path: Path) -> None:
+    own = shutil.copy(ego, tmp_path / "own.zip")
+    first, other = make_run(tmp_path / "first", risky, ego=str(own)), make_run(tmp_path / "other", safe)
+    with pytest.raises(BadInput, match=r"Expected runs of one environment with the same options, got base = .*safe"):
+        plan_retraining([other, first], 0.3)
+    with pytest.raises(BadInput, match="There is no failure in"):
+        plan_retraining([other], 0.3)
+    with pytest.raises(BadInput, match=r"saved \(.zip\) in .*, got 'idm'"):
+        plan_retraining([make_run(tmp_path / "rule", risky)], 0.3)
+    own.unlink()
+    with pytest.raises(BadInput, match="No ego at"):
+        plan_retraining([first], 0.3)

@@ -1,0 +1,174 @@
+"""Kinds of crash and modes of failure: their shares add up to p, and each has a failure in the list."""
+
+from __future__ import annotations
+
+import csv
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import rare_envs
+import samplers
+from rare_envs.control.idm import IDM
+from rare_envs.study import Question, Report
+from rare_envs.study.columns import digest_scenarios
+from rare_envs.study.modes import (
+    classify_failures,
+    cluster_points,
+    find_modes,
+    label_modes,
+    list_all_kinds,
+    list_every_mode,
+)
+from rare_envs.study.question import Study
+from rare_envs.study.run_folder import CRASH, read_failures
+from rare_envs.study.writing import write_run
+from samplers.analysis import NO_OUTCOME_LABEL
+from samplers.problem import FloatArray
+
+CUT_IN = "rare_envs/CutIn-v0"
+
+
+def tail(rng: np.random.Generator, n: int, dim: int, axis: int, sign: float) -> FloatArray:
+    """Failures of a half-space at a distance of 3: the tail of a normal distribution."""
+    u = rng.standard_normal((n, dim))
+    u[:, axis] = sign * (3.0 + rng.exponential(1 / 3, n))
+    return u
+
+
+@pytest.mark.parametrize(("n", "dim"), [(12, 2), (400, 6)])
+def test_one_region_is_one_cluster_and_two_are_two(n: int, dim: int) -> None:
+    rng = np.random.default_rng(n + dim)
+    assert not cluster_points(tail(rng, n, dim, 0, 1.0)).any()
+    both = np.vstack([tail(rng, n, dim, 0, 1.0), tail(rng, n, dim, 0, -1.0)])
+    found = cluster_points(both)
+    assert len(set(found[:n])) == 1 and len(set(found[n:])) == 1 and found[0] != found[-1]
+
+
+def test_kinds_of_crash_are_never_in_one_mode() -> None:
+    kinds = np.array(["side", "rear_end", NO_OUTCOME_LABEL] * 20, dtype=object)
+    labels = label_modes(np.random.default_rng(0).standard_normal((60, 2)), kinds)
+    assert labels.tolist() == [f"{kind}/0" for kind in kinds]
+
+
+class Plane:
+    """Two parameters in standard normal space: what is needed of a space."""
+
+    names = column_names = ("a", "b")
+    sizes, units = (1, 1), ("m", "")
+
+    def to_standard_normal(self, x: FloatArray) -> FloatArray:
+        return x
+
+
+@pytest.mark.parametrize("method", ["mc", "two-stage"])
+def test_shares_of_modes_add_up_to_p_and_name_their_most_likely_failure(method: str) -> None:
+    problem = samplers.FunctionProblem(lambda x: np.minimum(2.0 - x[:, 0], 2.5 + x[:, 0]), dim=2)
+    estimate = samplers.estimate(problem, method, seed=0, max_sim=20_000 if method == "mc" else 4000)
+    assert estimate.sample is not None
+    crashes = dict.fromkeys(digest_scenarios(np.vstack([estimate.sample.x, estimate.failures.x])), "side")
+    modes = find_modes(Plane(), estimate, crashes)
+    assert sum(mode.share.p for mode in modes) == pytest.approx(estimate.p, rel=1e-9)
+    assert [mode.crash for mode in modes] == ["side", "side"]
+    # Phi(-2) = 0.02275 and Phi(-2.5) = 0.00621: 79 % and 21 %; each interval holds its own with probability 0.95
+    for mode, truth, sign in zip(modes, (0.02275, 0.00621), (1.0, -1.0), strict=True):
+        assert mode.share.p == pytest.approx(truth, abs=4 * mode.share.cov * mode.share.p)
+        assert np.sign(mode.center["a"]) == sign
+        side = np.flatnonzero(np.sign(estimate.failures.x[:, 0]) == sign)
+        assert mode.failure == (side[0] if len(side) else None)
+
+
+def test_a_kind_beyond_the_list_gets_its_most_likely_failure() -> None:
+    """p = Phi(-1.5) to the right, Phi(-3) to the left: 15 % of the failures kept are the most likely ones."""
+    problem = samplers.FunctionProblem(lambda x: np.minimum(1.5 - x[:, 0], 3.0 + x[:, 0]), dim=2)
+    estimate = samplers.estimate(problem, "mc", seed=1, max_sim=40_000)
+    assert estimate.sample is not None and estimate.failures.total > len(estimate.failures) == 1000
+    points = np.vstack([estimate.sample.x, estimate.failures.x])
+    kinds = np.where(points[:, 0] > 0, "side", "rear_end").tolist()
+    crashes = dict(zip(digest_scenarios(points), kinds, strict=True))
+    assert {crashes[key] for key in digest_scenarios(estimate.failures.x)} == {"side"}
+    assert [mode.failure for mode in find_modes(Plane(), estimate, crashes)] == [0, None]
+    longer, added = list_every_mode(Plane(), estimate, crashes)
+    assert added.tolist() == [1000] and longer.failures.total == estimate.failures.total
+    assert (np.diff(longer.failures.log_p0) <= 0).all()
+    rare = estimate.sample.x[estimate.sample.x[:, 0] < 0]
+    likely = rare[np.argmin((rare**2).sum(axis=1))]
+    assert (longer.failures.x[1000] == likely).all() and longer.failures.f[1000] == 3.0 + likely[0]
+    assert [mode.failure for mode in find_modes(Plane(), longer, crashes)] == [0, 1000]
+    again, more = list_every_mode(Plane(), longer, crashes)
+    assert again is longer and not len(more)
+
+
+class Forgetful:
+    """An ego that drives once and never again."""
+
+    asked = 0
+
+    def predict(self, observation: np.ndarray, **_: object) -> tuple[np.ndarray, None]:
+        self.asked += 1
+        if self.asked > 100:
+            raise RuntimeError("the ego has gone home")
+        return np.zeros((len(observation), 2), dtype=np.float32), None
+
+
+def make_report(ego: object, max_sim: int, gamma: float = 0.0) -> Report:
+    problem = rare_envs.DrivingProblem(CUT_IN, ego=ego)
+    estimate = samplers.estimate(problem, "mc", max_sim=max_sim, gamma=gamma, seed=0)
+    study = Study(Question(env_id=CUT_IN, gamma=gamma, method="mc"), problem, samplers.get_method("mc"))
+    return Report(study, estimate, 1.0, kinds=classify_failures(problem, estimate))
+
+
+@pytest.fixture(scope="module")
+def report() -> Report:
+    """gamma = 0.5 counts near misses too."""
+    return make_report(IDM(max_deceleration=1.0), 3000, 0.5)
+
+
+def test_each_failure_of_the_list_has_its_crash_and_shares_add_up(
+    report: Report, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("rare_envs.study.writing.save_plot", lambda *_: None)  # pictures have their own tests
+    write_run(tmp_path, report)
+    with (tmp_path / "failures.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    result = json.loads((tmp_path / "result.json").read_text())
+    assert {"side", "rear_end", "none"} <= set(result["kinds"])
+    assert sum(kind["p"] for kind in result["kinds"].values()) == pytest.approx(report.estimate.p)
+    assert sum(kind["points"] for kind in result["kinds"].values()) == report.estimate.failures.total
+    problem = report.study.problem
+    x = np.array([[float(row[name]) for name in problem.space.names] for row in rows])
+    assert [row["crash"] for row in rows] == problem.crash_kinds(x)
+    for row, failure in zip(rows, result["failures"], strict=False):
+        assert (row["f"] == "-1.0") == (failure["crash"] is not None)
+        if failure["crash"] is None:
+            assert (row["crash"], row["striking"], row["impact_speed"]) == ("none", "", "")
+        else:
+            assert [int(row["striking"]), int(row["struck"])] == failure["crash"]["vehicles"]
+            assert float(row["impact_speed"]) == failure["crash"]["impact_speed"]
+    found = read_failures(tmp_path)
+    assert list(found)[-len(CRASH) :] == list(CRASH)
+    assert np.array_equal(np.isnan(found["delta_v_struck"]), found["crash"] == "none")
+
+
+def test_what_cannot_be_driven_again_is_not_known_and_said() -> None:
+    report = make_report(Forgetful(), 200)
+    assert report.kinds.shares == {}
+    assert any("the ego has gone home" in note for note in report.notes)
+    assert report.to_dict()["failures"][0]["crash"] is None
+
+
+def test_a_kind_that_the_list_lacks_is_added_with_its_crash(report: Report) -> None:
+    problem, failures = report.study.problem, report.estimate.failures
+    kinds = [crash["kind"] if crash else "none" for crash in report.crashes]
+    others = np.array([kind != "rear_end" for kind in kinds])
+    short = replace(failures, x=failures.x[others], f=failures.f[others], log_p0=failures.log_p0[others])
+    listed = tuple(crash for crash, kept in zip(report.crashes, others, strict=True) if kept)
+    estimate, found = list_all_kinds(
+        problem, replace(report.estimate, failures=short), replace(report.kinds, listed=listed)
+    )
+    (added,) = [k for k, crash in enumerate(found.listed) if crash is not None and crash["kind"] == "rear_end"]
+    assert len(found.listed) == len(estimate.failures) == len(short) + 1
+    assert (estimate.failures.x[added] == failures.x[kinds.index("rear_end")]).all()

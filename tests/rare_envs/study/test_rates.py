@@ -1,0 +1,222 @@
+"""Rates against the formula by hand, sums over scenarios, other sites, and their text."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+from types import MappingProxyType
+
+import numpy as np
+import pytest
+from scipy import stats
+
+import rare_envs
+from rare_envs.exposure import TotalRate
+from rare_envs.scenarios.hard_brake import HARD_BRAKE
+from rare_envs.scenarios.registry import SCENARIOS, scenario_named
+from rare_envs.study import BadInput, Question, prepare, run
+from rare_envs.study.report import describe_left_out, find_frequency
+from rare_envs.study.risk import choose_base, compare_sites
+from rare_envs.study.text import describe_uncertainty, format_rate, format_with_interval
+from tests.rare_envs.exposure.test_rate import frequency, rate
+from tests.rare_envs.study.fitted_files import fitted_entries, write_fitted
+
+FEW = {"method": "mc", "max_sim": 400}
+OTHER_SITE = {"source": {"site": "another", "data": "more"}}
+
+
+def question(base: str, **changes) -> Question:
+    return Question(env_id="rare_envs/HardBrake-v0", base=base, method="mc", **{"max_sim": 500, **changes})
+
+
+@pytest.fixture
+def bases(tmp_path: Path) -> dict[str, str]:
+    return {name: write_fitted(tmp_path / f"{name}.json", name) for name in ("cut_in", "hard_brake")}
+
+
+def test_the_rate_is_p_times_the_frequency_with_the_interval_by_hand(bases: dict[str, str]) -> None:
+    """42 brakings in 5.64 h; 30 refits of 40 scenes: t with 29 degrees of freedom."""
+    report = run(prepare(question(bases["hard_brake"])))
+    estimate, rate, uncertainty = report.estimate, report.rate, report.estimate.base_uncertainty
+    assert rate.per_hour == pytest.approx(42 / 5.64 * estimate.p)
+    base = stats.t.ppf(0.975, 29) * math.sqrt(uncertainty.spread**2 + estimate.cov**2 + 0.2**2)
+    half = math.hypot(base, stats.norm.ppf(0.975) / math.sqrt(42))
+    assert rate.interval_per_hour[0] == pytest.approx(rate.per_hour * math.exp(-half))
+    assert math.log(estimate.p / uncertainty.interval[0]) == pytest.approx(base)
+    assert report.to_dict()["rate"]["per_hour"] == rate.per_hour
+    assert report.no_rate == ""
+
+
+def test_nothing_failed(tmp_path: Path) -> None:
+    base = write_fitted(tmp_path / "safe.json", "hard_brake", means=[[5.0, 100.0, 1.0]])
+    report = run(prepare(question(base, max_sim=100)))
+    assert report.estimate.p == 0.0 == report.rate.per_hour
+    assert report.rate.interval_per_hour[1] >= 42 / 5.64 * report.estimate.interval[1]
+    (left_out,) = describe_left_out(report.study, report.estimate)
+    assert left_out.startswith("nothing failed")
+
+
+NO_COLLISIONS = {
+    "--measure drac": {"measure": "drac"},
+    "--gamma 1": {"gamma": 1.0},
+    "--gamma -0.5": {"measure": "margin", "gamma": -0.5},
+    "--gamma -2": {"measure": "clearance", "gamma": -2.0},
+    "--collisions any": {"collisions": "any"},
+}
+
+
+def test_what_counts_no_collisions_has_no_rate(bases: dict[str, str]) -> None:
+    study = prepare(question(bases["hard_brake"]))
+    for said, changes in NO_COLLISIONS.items():
+        with pytest.raises(ValueError, match=said):
+            find_frequency(replace(study, question=replace(study.question, **changes)))
+
+
+@pytest.mark.parametrize("measure", ["clearance", "margin"])
+def test_measures_that_are_positive_until_contact_have_the_rate_of_collisions(
+    bases: dict[str, str], measure: str
+) -> None:
+    study, other = (prepare(question(bases["hard_brake"], measure=each)) for each in ("ttc", measure))
+    assert find_frequency(other) == find_frequency(study)
+    if measure != "margin":  # which is graded by the speed at contact
+        assert find_frequency(replace(other, question=replace(other.question, gamma=-0.5))) == find_frequency(study)
+    x = study.problem.base.sample(500, np.random.default_rng(0))
+    collided = study.problem.evaluate(x) <= 0
+    assert 0 < collided.sum() < 500
+    np.testing.assert_array_equal(other.problem.evaluate(x) <= 0, collided)
+
+
+def test_a_base_without_counted_events_has_no_rate() -> None:
+    with pytest.raises(ValueError, match="nobody counted"):
+        find_frequency(prepare(Question(env_id="rare_envs/CutIn-v0", base="highway", method="mc")))
+
+
+class Coasting:
+    """An ego of the user's own, which does nothing."""
+
+    observation_space = action_space = None
+
+    def predict(self, observation, state=None, episode_start=None, deterministic=True):
+        return np.zeros((len(observation), 2), np.float32), state
+
+
+def test_the_total_is_the_sum_of_frequency_times_p(bases: dict[str, str]) -> None:
+    found = rare_envs.risk("idm", bases=bases, **FEW)
+    p = [each.report.estimate.p for each in found.scenarios]
+    expected = 1e6 * (1221 * 38 / 46 / 3900 * p[0] + 42 / 218 * p[1])
+    assert found.total.per_million_km == pytest.approx(expected)
+    low, high = found.total.interval_per_million_km
+    assert 0 < low < expected < high
+    assert sum(found.kinds.values()) == pytest.approx(expected)
+    assert found.recorded_events == {"cut_in": 38, "hard_brake": 42} and found.notes == ()
+    text = str(found)
+    assert text.startswith("collisions per million km  ") and "people: 21 contacts of all kinds" in text
+    assert "38 + 15 events of 17 scenes" in text and "the uncertainty is" in text
+
+
+def test_an_ego_that_is_an_object(bases: dict[str, str]) -> None:
+    found = rare_envs.risk(Coasting(), scenarios=("hard_brake",), bases={"hard_brake": bases["hard_brake"]}, **FEW)
+    assert found.ego == "Coasting" and found.scenarios[0].report.estimate.p > 0.2
+
+
+REFUSED = {
+    "counted twice": ({"scenarios": ("cut_in", "car_following")}, "count twice"),
+    "site of one scenario alone": ({"sites": ("i80",), "bases": {}}, "hard_brake has no base of the site 'i80'"),
+    "base of another scenario": ({"bases": {"highway": "x.json"}}, "highway"),
+    "no frequency": ({"bases": {"cut_in": "highway"}}, "nobody counted"),
+    "unknown option": ({"speed": 3}, "speed"),
+}
+
+
+@pytest.mark.parametrize(("changes", "said"), REFUSED.values(), ids=REFUSED.keys())
+def test_bad_input_is_one_line_before_any_simulation(
+    bases: dict[str, str], monkeypatch: pytest.MonkeyPatch, changes: dict[str, object], said: str
+) -> None:
+    def simulated(*_: object) -> None:
+        raise AssertionError("a simulation was started")
+
+    monkeypatch.setattr(rare_envs.DrivingProblem, "evaluate", simulated)
+    with pytest.raises(BadInput, match=said) as refused:
+        rare_envs.risk("idm", **{"bases": bases, **FEW, **changes})
+    assert "\n" not in str(refused.value)
+
+
+def set_bases(monkeypatch: pytest.MonkeyPatch, **bases: object) -> None:
+    scenario = replace(HARD_BRAKE, bases=MappingProxyType(bases))
+    monkeypatch.setitem(SCENARIOS._entries, "rare_envs/HardBrake-v0", scenario)
+
+
+def test_the_spread_between_sites_widens_the_interval(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two sites whose rates differ by a factor r: the sd of the logarithm is log(r) / sqrt(2)."""
+    other = fitted_entries("hard_brake", shift=-0.4, provenance=OTHER_SITE)
+    set_bases(monkeypatch, us101=fitted_entries("hard_brake"), i80=other)
+    one = rare_envs.risk("idm", scenarios=("hard_brake",), **FEW)
+    two = rare_envs.risk("idm", scenarios=("hard_brake",), sites=["us101", "i80"], **FEW)
+    factor = two.scenarios[0].site_factors["i80"]
+    assert one.scenarios[0].site_factors == {"i80": factor}
+    assert one.total.rates[0].site_log_sd == 0.0
+    assert two.total.rates[0].site_log_sd == pytest.approx(abs(math.log(factor)) / math.sqrt(2))
+    assert two.total.interval_per_hour[1] > one.total.interval_per_hour[1]
+    assert ", under i80 " in str(one)
+
+
+def test_other_sites_are_known_from_the_same_simulations(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The near site has twice the frequency; the others are too far, no sites of their own, or assembled."""
+    near = fitted_entries("hard_brake", shift=0.2, provenance=OTHER_SITE)
+    near["frequency"] = {**near["frequency"], "count": 84}
+    set_bases(
+        monkeypatch,
+        us101=fitted_entries("hard_brake"),
+        near=near,
+        far=fitted_entries("hard_brake", shift=6.0, provenance={"source": {"site": "a third"}}),
+        near_gap=fitted_entries("hard_brake", shift=0.3, provenance=OTHER_SITE),
+        assembled=fitted_entries("hard_brake", refits=None, events=None, family=None, frequency=None, checks=None),
+    )
+    own = run(prepare(Question(env_id="rare_envs/HardBrake-v0", method="mc", max_sim=1000)))
+    factors = compare_sites(own, ())
+    assert list(factors) == ["near"]
+    p = run(prepare(Question(env_id="rare_envs/HardBrake-v0", base="near", method="mc", max_sim=4000))).estimate.p
+    assert factors["near"] == pytest.approx(2 * p / own.estimate.p, rel=0.15)
+
+
+def test_the_base_of_a_scenario_at_a_site() -> None:
+    """Pairs of US 101 were under way, and cannot be counted; the new leaders of I-80 were."""
+    assert choose_base(HARD_BRAKE, None, "us101") == ("us101", ())
+    assert choose_base(HARD_BRAKE, Path("mine.json"), "us101") == ("mine.json", ())
+    with pytest.raises(ValueError, match=r"hard_brake has no base of the site 'i80' \(it has us101\): --base hard_br"):
+        choose_base(HARD_BRAKE, None, "i80")
+    car_following = scenario_named("car_following")
+    note = "it has no event frequency at 'us101': 'i80' is used"
+    assert choose_base(car_following, None, "us101") == ("i80", (note,))
+    assert choose_base(car_following, None, "i24") == ("i24", ())
+    assert choose_base(car_following, "us101", "us101") == ("us101", ())  # refused with its reason later
+
+
+@pytest.mark.parametrize(
+    ("value", "text"), [(12345.0, "12,000"), (99.6, "100"), (9.99, "10"), (0.0123, "0.012"), (0.00999, "1.0e-02")]
+)
+def test_rates_have_two_digits(value: float, text: str) -> None:
+    assert format_rate(value) == text
+
+
+@pytest.mark.parametrize(
+    ("value", "interval", "text"),
+    [
+        (0.011, (0.001, 0.12), "0.011 (0.0010 to 0.12)"),
+        (0.003, (0.0004, 0.012), "3.0e-03 (4.0e-04 to 1.2e-02)"),
+        (11.0, (0.16, 820.0), "11 (0.16 to 820)"),
+        (2e-7, (0.0, 1700.0), "2.0e-07 (below 1.7e+03)"),
+        (math.nan, (0.0, 5e-4), "nan (below 5.0e-04)"),
+    ],
+)
+def test_a_rate_and_its_interval_have_one_form(value: float, interval: tuple[float, float], text: str) -> None:
+    assert format_with_interval(value, interval) == text
+
+
+def test_the_line_of_a_total_names_the_largest_source_first() -> None:
+    total = TotalRate((rate(spread=1.4, counted=frequency(100)),))
+    text = describe_uncertainty(total, {"cut_in": 38})
+    assert text.startswith("the uncertainty is 99 % the cut-in distribution, 0.5 % event counts, 0.02 % simulation;")
+    assert "120 further recorded cut-ins would halve it (a spread falls with 1 / sqrt(events))" in text
+    assert "further" not in describe_uncertainty(total, {})
