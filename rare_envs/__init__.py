@@ -10,20 +10,19 @@ from rare_envs.plugins import make_lazy_getattr, warn_of_namesakes
 from rare_envs.scenarios.registry import SCENARIOS
 from rare_envs.version import __version__ as __version__
 
-_is_bare = is_command_line() and bool(find_missing_libraries())
-"""Whether this is the command line of an installation without the extra `driving`, for its help and `bench`."""
-if not _is_bare:
+if not is_command_line() or not find_missing_libraries():  # a command line shows its help without them
     require_libraries()  # before anything that needs them
 
     from rare_envs.registration import (
         env,
-        ignore_version_warnings,
         make_batch,
         parallel_env,
         raw_env,
         register_envs,
         register_scenario,
     )
+
+    register_envs()
 
 if TYPE_CHECKING:
     from rare_envs.control.idm import IDM
@@ -55,9 +54,6 @@ __all__ = [
     "risk",
 ]
 warn_of_namesakes()
-if not _is_bare:
-    register_envs()
-    ignore_version_warnings()
 
 _LAZY = {
     "DrivingProblem": "rare_envs.problem",
@@ -76,6 +72,4 @@ _import_lazily = make_lazy_getattr(__name__, _LAZY)
 
 def __getattr__(name: str) -> Any:
     """Import torch only when a name that needs it is used; list the environments as they are now."""
-    if _is_bare and name in __all__:
-        require_libraries()
     return tuple(SCENARIOS) if name == "ENV_IDS" else _import_lazily(name)

@@ -24,6 +24,13 @@ if TYPE_CHECKING:
     from rare_envs.scenarios.base import Scenario
 
 
+# A version is a scenario of its own, with results of its own, and earlier ones are kept as they are. Warnings of other
+# packages, and of versions that are registered under other namespaces, stay.
+warnings.filterwarnings(
+    "ignore", message=r".*The environment rare_envs/\S+ is out of date", category=DeprecationWarning
+)
+
+
 def register_envs() -> None:
     """Register the ids with Gymnasium, once, and each again with HighwayEnv's layout (`kinematics_id`)."""
     for env_id in SCENARIOS:
@@ -35,17 +42,6 @@ def register_envs() -> None:
                     vector_entry_point="rare_envs.envs.vector:DrivingVectorEnv",
                     kwargs={"env_id": env_id, **layout},
                 )
-
-
-def ignore_version_warnings() -> None:
-    """Turn off Gymnasium's warning that an earlier version of an id of this package is out of date.
-
-    A version is a scenario of its own, with results of its own; the earlier ones are kept as they are. Warnings of
-    other packages, and of versions that are registered under other namespaces, stay.
-    """
-    warnings.filterwarnings(
-        "ignore", message=r".*The environment rare_envs/\S+ is out of date", category=DeprecationWarning
-    )
 
 
 def register_scenario(env_id: str, scenario: Scenario) -> None:

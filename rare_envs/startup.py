@@ -29,7 +29,6 @@ DRIVING = (
     "yaml",
 )
 """Import names of what the extra `driving` installs (pyproject.toml)."""
-_COMMAND = "rare-envs"
 _handlers: dict[int, Any] = {}
 """Handlers of signals in whose place `_end` stands."""
 
@@ -46,26 +45,14 @@ def find_missing_libraries(modules: tuple[str, ...] = DRIVING) -> tuple[str, ...
     return tuple(name for name in modules if find_spec(name) is None)
 
 
-def require_libraries(modules: tuple[str, ...] = DRIVING, what: str = "rare_envs, agents and training need") -> None:
-    """Raise an error of one line that says what to install if a library is missing.
-
-    Args:
-        modules: Import names of the libraries; nothing is imported.
-        what: Subject and verb of the line: what needs them.
-
-    Raises:
-        ImportError: If one is not installed.
-
-    Example:
-        >>> require_libraries()
-        >>> require_libraries(("torch", "car"))
-        Traceback (most recent call last):
-            ...
-        ImportError: rare_envs, agents and training need car, not installed: pip install 'rare-envs[driving]'.
-    """
-    missing = find_missing_libraries(modules)
+def require_libraries() -> None:
+    """Raise an error of one line that says what to install if a library of `DRIVING` is missing."""
+    missing = find_missing_libraries()
     if missing:
-        raise ImportError(f"{what} {', '.join(missing)}, not installed: pip install 'rare-envs[driving]'.")
+        names = ", ".join(missing)
+        raise ImportError(
+            f"rare_envs, agents and training need {names}, not installed: pip install 'rare-envs[driving]'."
+        )
 
 
 def is_command_line() -> bool:
@@ -82,7 +69,7 @@ def is_command_line() -> bool:
         return "rare_envs" in sys.orig_argv[1:4]
     folder, name = os.path.split(program)
     is_module = name == "__main__.py" and os.path.basename(folder) == "rare_envs"
-    return is_module or os.path.splitext(name)[0] == _COMMAND
+    return is_module or os.path.splitext(name)[0] == "rare-envs"
 
 
 def end_at_signals() -> None:

@@ -6,7 +6,7 @@ import html
 import io
 import math
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -94,15 +94,13 @@ MAX_HISTOGRAMS = 12
 def draw_levels(figure: Figure, result: Result, stacked: bool = False) -> None:
     """Draw the share of each level's points below its threshold, and the threshold, where that changes."""
     panels = _make_panels(figure, 2 if passes_levels(result) else 1, stacked)
-    shares = panels[0]
     trace = [level for level in result.get("trace") or [] if level["run"] == 0]
-    numbers = range(len(trace))
-    shares.bar(numbers, [level["p"] or 0.0 for level in trace], color=LINE_COLOUR)
-    shares.set_ylabel("share of the level's points with f ≤ threshold")
-    shares.set_ylim(0, 1)
+    panels[0].bar(range(len(trace)), [level["p"] or 0.0 for level in trace], color=LINE_COLOUR)
+    panels[0].set_ylabel("share of the level's points with f ≤ threshold")
+    panels[0].set_ylim(0, 1)
     for thresholds in panels[1:]:
         gammas = [np.nan if level["gamma"] is None else level["gamma"] for level in trace]
-        thresholds.plot(numbers, gammas, "o-", color=LINE_COLOUR, markersize=4)
+        thresholds.plot(gammas, "o-", color=LINE_COLOUR, markersize=4)
         thresholds.axhline(float(result["gamma"]), color=HIT_COLOUR, linewidth=1, label="gamma")
         thresholds.set_ylabel("threshold of f")
         thresholds.legend(frameon=False, fontsize=8)
@@ -128,18 +126,31 @@ def draw_weights(figure: Figure, log_weights: FloatArray, p: float, stacked: boo
 
 def draw_curve(figure: Figure, curve: Mapping[str, Any], gamma: float, measure: str) -> None:
     """Draw p over the threshold with its simultaneous band."""
-    axes = figure.subplots()
-    g, p, low, high = (np.array(curve[name], dtype=float) for name in ("gammas", "p", "low", "high"))
-    floor = p[p > 0].min(initial=1.0) / 10
-    percent = 100 * float(curve["confidence"])
-    band = f"{percent:g} % band, for all thresholds together"
-    axes.fill_between(g, np.maximum(low, floor), high, color=LINE_COLOUR, alpha=0.2, linewidth=0, label=band)
-    axes.plot(g, p, color=LINE_COLOUR, label="P[f ≤ threshold]")
+    band = f"{100 * float(curve['confidence']):g} % band, for all thresholds together"
+    axes = _draw_band(figure, curve, "gammas", (band, "P[f ≤ threshold]"))
     axes.axvline(gamma, color=HIT_COLOUR, linewidth=1, label="gamma")
-    axes.set_yscale("log")
     axes.set_xlabel(f"threshold of f{f', {measure}' if measure else ''}")
     axes.set_ylabel("P[f ≤ threshold]")
     axes.legend(frameon=False, fontsize=8)
+
+
+def draw_severity(figure: Figure, severity: Mapping[str, Any]) -> None:
+    """Draw P[collision with a larger delta-v] with its band."""
+    axes = _draw_band(figure, severity["curve"], "delta_v")
+    axes.set_xlabel("delta-v [m/s]")
+    axes.set_ylabel("P[collision with a larger delta-v]")
+
+
+def _draw_band(figure: Figure, curve: Mapping[str, Any], axis: str, labels: Sequence[str] = ("", "")) -> Axes:
+    """Draw p of a curve and its band over one of its entries, p on a log scale."""
+    axes = figure.subplots()
+    over, p, low, high = (np.array(curve[name], dtype=float) for name in (axis, "p", "low", "high"))
+    floor = p[p > 0].min(initial=1.0) / 10  # an end of 0 has no place on a log scale
+    band = (np.maximum(low, floor), np.maximum(high, floor))
+    axes.fill_between(over, *band, color=LINE_COLOUR, alpha=0.2, linewidth=0, label=labels[0])
+    axes.plot(over, np.where(p > 0, p, np.nan), color=LINE_COLOUR, label=labels[1])
+    axes.set_yscale("log")
+    return axes
 
 
 def draw_parameters(
@@ -164,19 +175,6 @@ def draw_parameters(
         axes.set_ylabel("density")
     lines, words = panels[0].get_legend_handles_labels()
     figure.legend(lines, words, loc="outside upper right", ncols=2, frameon=False, fontsize=8)
-
-
-def draw_severity(figure: Figure, severity: Mapping[str, Any]) -> None:
-    """Draw P[collision with a larger delta-v] with its band."""
-    curve = severity["curve"]
-    v, p, low, high = (np.array(curve[name], dtype=float) for name in ("delta_v", "p", "low", "high"))
-    axes = figure.subplots()
-    floor = p[p > 0].min(initial=1.0) / 10
-    axes.fill_between(v, np.maximum(low, floor), np.maximum(high, floor), color=LINE_COLOUR, alpha=0.2, linewidth=0)
-    axes.plot(v, np.where(p > 0, p, np.nan), color=LINE_COLOUR)
-    axes.set_yscale("log")
-    axes.set_xlabel("delta-v [m/s]")
-    axes.set_ylabel("P[collision with a larger delta-v]")
 
 
 def figures_of_result(result: Result, log_weights: FloatArray, measure: str) -> dict[str, FigureOfPage]:
