@@ -395,11 +395,13 @@ class TruncatedGaussianMixture(CoordinateMixture):
         return TruncatedGaussianMixture(*_pick_fields(data, (*COMPONENT_FIELDS, *BOX_FIELDS)))
 
 
-def apply_by_chunks(function: Callable[[FloatArray], FloatArray], points: FloatArray, columns: int) -> FloatArray:
-    """Return a function of rows, shape (n, columns), computed for `CHUNK_ROWS` rows at a time."""
+def apply_by_chunks(
+    function: Callable[[FloatArray], FloatArray], points: FloatArray, columns: int, rows: int = CHUNK_ROWS
+) -> FloatArray:
+    """Return a function of rows, shape (n, columns), computed for some rows at a time."""
     out = np.empty((len(points), columns))
-    for start in range(0, len(points), CHUNK_ROWS):
-        out[start : start + CHUNK_ROWS] = function(points[start : start + CHUNK_ROWS])
+    for start in range(0, len(points), rows):
+        out[start : start + rows] = function(points[start : start + rows])
     return out
 
 

@@ -3,40 +3,26 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from functools import partial
-from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
-from scipy.special import ndtr, ndtri
+from numpy.typing import ArrayLike
 
 from rare_envs.arrays import FloatArray
 from rare_envs.distributions.coordinates import Coordinates, move_inside
 from rare_envs.distributions.mixture import (
     COMPONENT_FIELDS,
     BoxPoints,
-    ConditioningState,
     CoordinateMixture,
     TruncatedGaussianMixture,
     apply_by_chunks,
 )
 from rare_envs.distributions.space import Distribution
-from rare_envs.distributions.truncated_normal import (
-    MIN_U,
-    TAIL_U,
-    Tail,
-    TruncatedConditional,
-    find_root,
-    log_sum,
-    quantile_scale,
-    solve,
-    sum_components,
-)
+from rare_envs.distributions.truncated_normal import TruncatedConditional, log_sum
 
-MIN_SHARE = 1e-20
-"""Parts with a smaller share than this may be left out."""
+CHUNK_ROWS = 256
+"""Rows worked on together, of a hundred components or more in all."""
 
 
 class Refits(tuple[Distribution, ...]):
@@ -132,42 +118,6 @@ def _reorder(mixture: CoordinateMixture, names: tuple[str, ...], columns: tuple[
     return CoordinateMixture(coordinates, mixture.weights, means, covariances)
 
 
-class _Part(NamedTuple):
-    """One part of a pool at column j of n rows, of which the earlier columns are given."""
-
-    mixture: CoordinateMixture
-    state: ConditioningState
-    log_weight: FloatArray
-    """Logarithm of its weight times its density of the earlier columns, shape (n,)."""
-    conditional: TruncatedConditional
-    """Its distribution of the coordinate of the column."""
-
-    @classmethod
-    def at(
-        cls, j: int, x: FloatArray, mixture: CoordinateMixture, state: ConditioningState, log_weight: FloatArray
-    ) -> _Part:
-        """Return the part at column j of rows x (n, d)."""
-        conditional = mixture.next_conditional(state, mixture.coordinates.bounds(j, x))
-        return cls(mixture, state, log_weight, conditional)
-
-    def log_masses(self, j: int, x: FloatArray, rows: NDArray[np.intp]) -> FloatArray:
-        """Return logarithms of its weight times its masses below and above column j of some rows x (m, d), (2, m)."""
-        coordinates, conditional = self.mixture.coordinates, self.conditional.take(rows)
-        y = move_inside(coordinates.coordinate(j, x), conditional.low, conditional.high)
-        below, above = conditional.log_masses(y)
-        if coordinates.sign(j) < 0.0:
-            below, above = above, below
-        return self.log_weight[rows] + np.stack([below, above]) - np.logaddexp(below, above)
-
-    def observe(self, j: int, after: int, x: FloatArray) -> _Part:
-        """Return the part at the column after column j."""
-        coordinates, conditional = self.mixture.coordinates, self.conditional
-        y = move_inside(coordinates.coordinate(j, x), conditional.low, conditional.high)
-        state = self.mixture.observe(conditional, self.state, y)
-        density = log_sum(state.log_weights) - conditional.log_whole_mass() + coordinates.log_slope(j, x)
-        return _Part.at(after, x, self.mixture, state, self.log_weight + density)
-
-
 @dataclass(frozen=True, eq=False)
 class PooledMixture:
     """Mixtures in different coordinates of one box, pooled: the density is the weighted mean of theirs.
@@ -217,124 +167,54 @@ class PooledMixture:
     def to_standard_normal(self, x: ArrayLike) -> FloatArray:
         """Map points in the box to standard normal space, (n, d) -> (n, d)."""
         points = self.parts[0].coordinates.interior(self.parts[0].rows_in_box(x))
-        return apply_by_chunks(self._to_normal, points, self.dim)
+        return apply_by_chunks(self._to_normal, points, self.dim, CHUNK_ROWS)
 
     def from_standard_normal(self, u: ArrayLike) -> FloatArray:
         """Map standard normal points to points strictly inside the box, (n, d) -> (n, d)."""
-        return apply_by_chunks(self._from_normal, self.parts[0].finite_rows(u), self.dim)
-
-    @property
-    def _columns(self) -> tuple[int, ...]:
-        return self.parts[0].coordinates.columns
-
-    def _start(self, x: FloatArray) -> list[_Part]:
-        weights = np.log(self.weights)[:, None] + np.zeros(len(x))
-        pairs = zip(self.parts, weights, strict=True)
-        return [_Part.at(self._columns[0], x, each, each.start(), weight) for each, weight in pairs]
+        return apply_by_chunks(self._from_normal, self.parts[0].finite_rows(u), self.dim, CHUNK_ROWS)
 
     def _to_normal(self, x: FloatArray) -> FloatArray:
-        parts, u, rows = self._start(x), np.empty_like(x), np.arange(len(x))
-        for j, after in zip(self._columns, (*self._columns[1:], None), strict=True):
-            u[:, j] = _pooled_quantile_scale(j, x, rows, parts)
-            if after is not None:
-                parts = [part.observe(j, after, x) for part in parts]
+        u = np.empty_like(x)
+        for j, column in self._conditionals(x):
+            u[:, j] = column.to_normal(x[:, j])
         return u
 
     def _from_normal(self, u: FloatArray) -> FloatArray:
         x = np.empty_like(u)
-        parts = self._start(x)
-        for j, after in zip(self._columns, (*self._columns[1:], None), strict=True):
-            x[:, j] = _find_quantiles(j, x, u[:, j], parts)
-            if after is not None:
-                parts = [part.observe(j, after, x) for part in parts]
+        for j, column in self._conditionals(x):
+            x[:, j] = move_inside(column.from_normal(u[:, j]), self.low[j], self.high[j])
         return x
 
+    def _conditionals(self, x: FloatArray) -> Iterator[tuple[int, TruncatedConditional]]:
+        """Yield columns and their distributions given the earlier ones of x (n, d), which may be set on the way."""
+        weights = np.log(self.weights)[:, None] + np.zeros(len(x))
+        states = [part.start() for part in self.parts]
+        columns = self.parts[0].coordinates.columns
+        for j in columns:
+            own = [
+                part.next_conditional(state, part.coordinates.bounds(j, x))
+                for part, state in zip(self.parts, states, strict=True)
+            ]
+            masses = [each.log_whole_mass() for each in own]
+            yield j, self._join(j, x, own, weights - masses)
+            if j == columns[-1]:
+                return
+            for i, (part, conditional) in enumerate(zip(self.parts, own, strict=True)):
+                y = move_inside(part.coordinates.coordinate(j, x), conditional.low, conditional.high)
+                states[i] = part.observe(conditional, states[i], y)
+                weights[i] += log_sum(states[i].log_weights) - masses[i] + part.coordinates.log_slope(j, x)
 
-def _pooled_quantile_scale(j: int, x: FloatArray, rows: NDArray[np.intp], parts: Sequence[_Part]) -> FloatArray:
-    """Return Phi^-1 of the pooled distribution function of column j at x (m, d), which are some rows of the parts."""
-    lower, upper = np.moveaxis(np.array([part.log_masses(j, x, rows) for part in parts]), 1, 0)
-    return quantile_scale(log_sum(lower), log_sum(upper))
-
-
-def _find_quantiles(j: int, x: FloatArray, u: FloatArray, parts: Sequence[_Part]) -> FloatArray:
-    """Return the value of column j at which the pooled distribution function is Phi(u), for rows x (n, d), (n,)."""
-    pool, fits = _PooledTail.of(j, x, u, parts)
-    below = np.maximum(-np.abs(u), MIN_U)
-    found, fits = pool.sign * solve(pool, below, pool.guess(below)), fits & (below > MIN_U)
-    coordinates = parts[0].mixture.coordinates
-    low, high = coordinates.low[j], coordinates.high[j]
-    if not fits.all():
-        rest = np.flatnonzero(~fits)
-        found[rest] = find_root(
-            partial(_find_scale, j, x, rest, parts), u[rest], *np.full((len(rest), 2), (low, high)).T
+    def _join(
+        self, j: int, x: FloatArray, own: Sequence[TruncatedConditional], weights: FloatArray
+    ) -> TruncatedConditional:
+        """Return the distribution of column j with the components of all parts, whose log weights (G, n) are given."""
+        pairs = [
+            part.coordinates.linear(j, np.broadcast_to(each.mean, (len(each.mean), len(x))), each.scale, x)
+            for part, each in zip(self.parts, own, strict=True)
+        ]
+        mean, scale = (np.concatenate(arrays) for arrays in zip(*pairs, strict=True))
+        log_weights = np.concatenate([each.log_weights + row for each, row in zip(own, weights, strict=True)])
+        is_log = np.concatenate([[part.coordinates.is_log(j)] * len(part.weights) for part in self.parts])[:, None]
+        return TruncatedConditional(
+            log_weights, mean, scale, self.low[j], self.high[j], is_log if is_log.any() else None
         )
-    return move_inside(found, low, high)
-
-
-def _find_scale(
-    j: int, x: FloatArray, of: NDArray[np.intp], parts: Sequence[_Part], values: FloatArray, rows: NDArray[np.intp]
-) -> FloatArray:
-    """Return Phi^-1 of the pooled distribution function of column j at values (m,) in some of some rows of x (n, d)."""
-    points = x[of[rows]]
-    points[:, j] = values
-    return _pooled_quantile_scale(j, points, of[rows], parts)
-
-
-class _PooledTail(NamedTuple):
-    """The distribution function of column j of the pool, to be inverted from its lower end; rows may be mirrored."""
-
-    j: int
-    x: FloatArray
-    """With the columns before j, shape (n, d); column j is written over."""
-    sign: FloatArray
-    """-1 in rows that are mirrored, (n,)."""
-    low: FloatArray
-    high: FloatArray
-    """Interval of the column, mirrored where the row is, (n,)."""
-    coordinates: list[Coordinates]
-    tails: list[Tail]
-    shares: FloatArray
-    """Of the parts given the earlier columns, (G, n)."""
-
-    @classmethod
-    def of(cls, j: int, x: FloatArray, u: FloatArray, parts: Sequence[_Part]) -> tuple[_PooledTail, NDArray[np.bool_]]:
-        """Return the distribution functions to be inverted at u (n,), and which rows fit into plain numbers."""
-        coordinates = [part.mixture.coordinates for part in parts]
-        pairs = [Tail.of(part.conditional, own.sign(j) * u) for part, own in zip(parts, coordinates, strict=True)]
-        log_weights = np.stack([part.log_weight for part in parts])
-        shares = np.exp(log_weights - log_sum(log_weights))
-        ends = coordinates[0].low[j], coordinates[0].high[j]
-        low, high = (np.where(u > 0.0, -far, near) for near, far in (ends, ends[::-1]))
-        fits = np.all([each | (share < MIN_SHARE) for (_, each), share in zip(pairs, shares, strict=True)], axis=0)
-        sign = np.where(u > 0.0, -1.0, 1.0)
-        return cls(j, x.copy(), sign, low, high, coordinates, [tail for tail, _ in pairs], shares), fits
-
-    def take(self, rows: NDArray[np.intp]) -> _PooledTail:
-        """Return those of some rows."""
-        sign, low, high, shares = (array[..., rows] for array in (self.sign, self.low, self.high, self.shares))
-        tails = [tail.take(rows) for tail in self.tails]
-        return _PooledTail(self.j, self.x[rows], sign, low, high, self.coordinates, tails, shares)
-
-    def guess(self, u: FloatArray) -> FloatArray:
-        """Return about where the distribution functions are Phi(u), (n,) for u <= 0.
-
-        The mean of the guesses of the parts; in the tail the least of those at Phi(u) over their shares.
-        """
-        alone = ndtri(np.minimum(ndtr(u) / np.maximum(self.shares, MIN_SHARE), 0.5))
-        guesses = []
-        for coordinates, tail, own in zip(self.coordinates, self.tails, np.where(u < TAIL_U, alone, u), strict=True):
-            y = tail.sign * tail.guess(own)
-            guesses.append(self.sign * coordinates.value(self.j, y, self.x))
-        mean = sum_components(self.shares * np.stack(guesses))
-        return np.clip(np.where(u < TAIL_U, np.min(guesses, axis=0), mean), self.low, self.high)
-
-    def evaluate(self, x: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return the distribution functions, the densities, and over what length these change, at x (n,)."""
-        self.x[:, self.j] = self.sign * x
-        cdf, density, length = np.zeros_like(x), np.zeros_like(x), np.full_like(x, np.inf)
-        for coordinates, tail, share in zip(self.coordinates, self.tails, self.shares, strict=True):
-            own_cdf, own_density, own_length = tail.evaluate(tail.sign * coordinates.coordinate(self.j, self.x))
-            slope = np.exp(coordinates.log_slope(self.j, self.x))
-            cdf, density = cdf + share * own_cdf, density + share * own_density * slope
-            length = np.minimum(length, own_length / slope)
-        return cdf, density, length

@@ -1,21 +1,19 @@
 """One-dimensional normal mixtures cut to an interval: masses, maps to and from the standard normal, draws.
 
 Arrays hold components in rows and points in columns, (K, n). A column does not depend, bit for bit, on the others of a
-call. Masses and the map to the standard normal are in logarithms of the smaller tail. Quantiles are found in plain
-numbers by Newton's method, and where these do not do, by a bracketing search on the map in logarithms.
+call. Masses and the map to the standard normal are in logarithms of the smaller tail. Quantiles of one normal have a
+closed form. Those of mixtures are found in plain numbers by Halley's method, and where that does not do, by a
+bracketing search on the map in logarithms.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from functools import reduce
-from typing import Any, NamedTuple, Protocol, cast
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import elementwise
 from scipy.special import log_ndtr, ndtr, ndtri, ndtri_exp
-from typing_extensions import Self
 
 from rare_envs.arrays import FloatArray
 
@@ -24,25 +22,22 @@ LOG_SQRT_2PI = 0.5 * np.log(2.0 * np.pi)
 NARROW = 1e-3
 """Intervals of less than this over (1 + |a|) are integrated by the midpoint rule: its error, (width a)^4, is then as
 small as the cancellation in a difference of distribution functions, 1e-12."""
-SERIES_WIDTH = 0.1
-"""The same by a series with four terms, of relative error 1e-16."""
+CANCELS = 0.01
+"""A difference of distribution functions of less than this share of one of them is found by a series, of relative error
+1e-16."""
 ALL = 8.3
 """From here on Phi is 1 but for rounding."""
 MIN_MASS = 1e-200
 """Least mass of an untruncated mixture in its interval, and..."""
 MIN_U = -30.0
 """...least quantile scale, Phi(-30) = 5e-198, for which plain numbers do."""
-TAIL_U = -1.5
-"""Quantile scale below which the first guess also looks at single components."""
-LOWEST, HIGHEST = -35.0, 7.0
-"""On the quantile scale; below, Phi nearly underflows, and above it is so near to 1 that its rounding leads astray."""
-LAST_STEP = 1e-8
-"""A step of Newton's method of less than this times the narrowest scale over (1 + |u|) is the last: it leaves the
-square of this."""
-MIN_CONTRACTION = 0.75
-"""A step that does not shrink at least by this factor is left for a bisection, which halves."""
-MAX_STEPS = 200
-"""Bisection alone would need about 60."""
+LAST_STEP = 1e-5
+"""A step of Halley's method of less than this, over the narrowest scale and over cdf / density, is the last: it leaves
+the third power of this."""
+MAX_BEND = 0.5
+"""Largest change of a step of Newton's method by that of Halley."""
+FIRST_STEPS, FURTHER_STEPS = 3, 30
+"""Most rows take two or three; the others go on by themselves, and after these are left for a bracketing search."""
 MAX_ERROR = 1e3
 """On the quantile scale; at an end of an interval it is infinite, which a search for a root cannot interpolate."""
 
@@ -51,7 +46,7 @@ class TruncatedConditional(NamedTuple):
     """One coordinate given the earlier ones: a one-dimensional mixture cut to [low, high].
 
     log_weights, which need not be normalised, and mean have shape (K, n), or (K, 1) if they are the same in all rows,
-    and scale (K, 1); low and high are scalars or (n,).
+    and scale (K, 1) or (K, n); low and high are scalars or (n,). Components with is_log (K, 1) are normal in log x.
     """
 
     log_weights: FloatArray
@@ -59,6 +54,7 @@ class TruncatedConditional(NamedTuple):
     scale: FloatArray
     low: Any
     high: Any
+    is_log: NDArray[np.bool_] | None = None
 
     def take(self, rows: NDArray[np.intp]) -> TruncatedConditional:
         """Return the distributions of some rows."""
@@ -72,8 +68,7 @@ class TruncatedConditional(NamedTuple):
 
     def log_whole_mass(self) -> FloatArray:
         """Return the log mass of the mixture in [low, high], its weights as they are, (n,)."""
-        top = self.log_weights.max(axis=0)
-        top = np.where(np.isfinite(top), top, 0.0)
+        top = _highest(self.log_weights)
         start, end = ((each - self.mean) / self.scale for each in (self.low, self.high))
         mass, narrow = _plain_mass(start, end)
         mass *= np.exp(self.log_weights - top)
@@ -88,40 +83,49 @@ class TruncatedConditional(NamedTuple):
 
     def to_normal(self, x: FloatArray) -> FloatArray:
         """Return Phi^-1 of the distribution function at x (n,), by the smaller tail."""
-        return quantile_scale(*self.log_masses(x))
-
-    def log_masses(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the log masses of the mixture below and above x (n,), its weights as they are, (n,) each."""
-        a, b, c = ((end - self.mean) / self.scale for end in (self.low, x, self.high))
-        below, above = (x - self.low) / self.scale, (self.high - x) / self.scale
-        lower = log_sum(self.log_weights + log_interval(a, b, below))
-        return lower, log_sum(self.log_weights + log_interval(b, c, above))
+        low, y, high = (_place(self.is_log, end) for end in (self.low, x, self.high))
+        a, b, c = ((end - self.mean) / self.scale for end in (low, y, high))
+        lower = log_sum(self.log_weights + log_interval(a, b, (y - low) / self.scale))
+        upper = log_sum(self.log_weights + log_interval(b, c, (high - y) / self.scale))
+        tail = np.minimum(lower, upper) - np.logaddexp(lower, upper)
+        return cast(FloatArray, np.where(lower <= upper, 1.0, -1.0) * ndtri_exp(tail))
 
     def from_normal(self, u: FloatArray) -> FloatArray:
         """Invert `to_normal`, (n,) -> (n,)."""
-        tail, fits = Tail.of(self, u)
-        below = np.maximum(-np.abs(u), MIN_U)
-        found, fits = tail.sign * solve(tail, below, tail.guess(below)), fits & (below > MIN_U)
+        if len(self.mean) == 1 and self.is_log is None:
+            found, fits = self._invert_alone(u)
+        else:
+            tail, fits = Tail.of(self, u)
+            found, ended = tail.solve(u)
+            fits &= ended
         if not fits.all():
             rest = np.flatnonzero(~fits)
-            low, high = (np.full(len(u), end)[rest] for end in (self.low, self.high))
-            found[rest] = find_root(lambda x, rows: self.take(rest[rows]).to_normal(x), u[rest], low, high)
+            found[rest] = self.take(rest)._search(u[rest])
         return found
 
+    def _invert_alone(self, u: FloatArray) -> tuple[FloatArray, NDArray[np.bool_]]:
+        """Return the quantiles of one normal at Phi(u), (n,), and where plain numbers do for that."""
+        sign = np.where(u > 0.0, -1.0, 1.0)  # mirrored, so that they are read from the lower end
+        a, b = ((end - self.mean[0]) / self.scale[0] for end in (self.low, self.high))
+        a, b = np.where(u > 0.0, -b, a), np.where(u > 0.0, -a, b)
+        turned = np.where(a > 0.0, -1.0, 1.0)
+        start = ndtr(turned * a)
+        mass = ndtr(turned * b) - start
+        z = turned * ndtri(start + mass * ndtr(-np.abs(u)))
+        fits = (np.abs(mass) >= np.maximum(CANCELS * start, MIN_MASS)) & (np.abs(u) < -MIN_U)
+        return self.mean[0] + sign * z * self.scale[0], fits
 
-def find_root(
-    to_normal: Callable[[FloatArray, NDArray[np.intp]], FloatArray], u: FloatArray, low: FloatArray, high: FloatArray
-) -> FloatArray:
-    """Return x in [low, high] where a rising map from x (m,) in some rows (m,) to the standard normal is u, (n,)."""
+    def _search(self, u: FloatArray) -> FloatArray:
+        """Return where `to_normal` is u (n,), by a bracketing search."""
+        low, high = (np.full(len(u), end, dtype=np.float64) for end in (self.low, self.high))
 
-    def find_error(x: FloatArray, rows: FloatArray) -> FloatArray:
-        chosen = rows.astype(np.intp)
-        error = np.clip(to_normal(x, chosen) - u[chosen], -MAX_ERROR, MAX_ERROR)
-        error = np.where(x <= low[chosen], -MAX_ERROR, error)
-        return np.asarray(np.where(x >= high[chosen], MAX_ERROR, error))
+        def find_error(x: FloatArray, index: FloatArray) -> FloatArray:
+            rows = index.astype(np.intp)
+            error = np.clip(self.take(rows).to_normal(x) - u[rows], -MAX_ERROR, MAX_ERROR)
+            error = np.where(x <= low[rows], -MAX_ERROR, error)
+            return np.asarray(np.where(x >= high[rows], MAX_ERROR, error))
 
-    rows = np.arange(len(u), dtype=np.float64)
-    return np.asarray(elementwise.find_root(find_error, (low, high), args=(rows,)).x)
+        return np.asarray(elementwise.find_root(find_error, (low, high), args=(np.arange(len(u), dtype=np.float64),)).x)
 
 
 def _take_rows(array: Any, rows: NDArray[np.intp]) -> Any:
@@ -129,22 +133,9 @@ def _take_rows(array: Any, rows: NDArray[np.intp]) -> Any:
     return array if np.shape(array)[-1:] in ((), (1,)) else np.take(array, rows, axis=-1)
 
 
-class Invertible(Protocol):
-    """Distribution functions of n rows, to be inverted from their lower ends."""
-
-    @property
-    def low(self) -> FloatArray:
-        """Lower ends of their intervals, (n,)."""
-
-    @property
-    def high(self) -> FloatArray:
-        """Upper ends, (n,)."""
-
-    def take(self, rows: NDArray[np.intp]) -> Self:
-        """Return those of some rows."""
-
-    def evaluate(self, x: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return the functions, their densities, and over what length these change, at x (n,)."""
+def _place(is_log: NDArray[np.bool_] | None, x: Any, sign: Any = 1.0) -> Any:
+    """Return x, or for components in log x its logarithm, (n,) or (K, n); both mirrored at 0 where the sign is -1."""
+    return x if is_log is None else np.where(is_log, sign * np.log(sign * x), x)
 
 
 class Tail(NamedTuple):
@@ -171,68 +162,97 @@ class Tail(NamedTuple):
     """Mass of the component in the interval, negative where it is turned round, (K, n)."""
     weight: FloatArray
     """Of the component, negative where it is turned round; times the mass they sum to 1, (K, n)."""
-    narrow: FloatArray
-    """Least scale of the components, (n,)."""
+    is_log: NDArray[np.bool_] | None
+    """As in `TruncatedConditional`."""
 
     @classmethod
     def of(cls, conditional: TruncatedConditional, u: FloatArray) -> tuple[Tail, NDArray[np.bool_]]:
         """Return the distribution functions to be inverted at u (n,), and which rows fit into plain numbers."""
-        sign = np.where(u > 0.0, -1.0, 1.0)
-        low, high = (np.full(len(u), end, dtype=np.float64) for end in (conditional.low, conditional.high))
-        low, high = np.where(sign < 0.0, -high, low), np.where(sign < 0.0, -low, high)
+        is_log, mirrored = conditional.is_log, u > 0.0
+        sign = np.where(mirrored, -1.0, 1.0)
+        low, high = (
+            np.where(mirrored, -conditional.high, conditional.low),
+            np.where(mirrored, -conditional.low, conditional.high),
+        )
         mean = sign * conditional.mean
-        scale = np.broadcast_to(conditional.scale, mean.shape)
-        start = (low - mean) / scale
+        start = (_place(is_log, low, sign) - mean) / conditional.scale
         turned = np.where(start > 0.0, -1.0, 1.0)
-        rate, start = turned / scale, -np.abs(start)
-        tail = cls(sign, low, high, mean, rate, start, ndtr(start), rate, rate, scale.min(axis=0))
-        mass = tail._rise(high)
-        top = conditional.log_weights.max(axis=0)
-        weight = np.exp(conditional.log_weights - np.where(np.isfinite(top), top, 0.0))
-        total = sum_components(weight * mass * turned)
-        fits = total >= MIN_MASS
-        return tail._replace(mass=mass, weight=weight * turned / np.where(fits, total, 1.0)), fits
+        rate, start = turned / conditional.scale, -np.abs(start)
+        tail = cls(sign, low, high, mean, rate, start, ndtr(start), rate, turned, is_log)
+        mass = tail._rise(high, (_place(is_log, high, sign) - mean) * rate)
+        weight = np.exp(conditional.log_weights - _highest(conditional.log_weights)) * turned
+        total = sum_components(weight * mass)
+        fits = (total >= MIN_MASS) & (np.abs(u) < -MIN_U)
+        return tail._replace(mass=mass, weight=weight / np.where(fits, total, 1.0)), fits
 
-    def take(self, rows: NDArray[np.intp]) -> Tail:
-        """Return those of some rows."""
-        return Tail(*(np.take(array, rows, axis=-1) for array in self))
+    def solve(self, u: FloatArray) -> tuple[FloatArray, NDArray[np.bool_]]:
+        """Return where the distribution functions are Phi(-|u|), mirrored back, (n,), and which rows were found."""
+        p = ndtr(np.maximum(-np.abs(u), MIN_U))
+        with np.errstate(all="ignore"):  # the ends of the interval, and components without weight, give inf and nan
+            x, found = self._iterate(p, self._guess(p), FIRST_STEPS)
+            rest = np.flatnonzero(~found)
+            if rest.size:
+                few = Tail(*(_take_rows(array, rest) for array in self))
+                x[rest], found[rest] = few._iterate(p[rest], x[rest], FURTHER_STEPS)
+        return self.sign * x, found
 
-    def guess(self, u: FloatArray) -> FloatArray:
-        """Return about where the distribution functions are Phi(u), (n,) for u <= 0; exact for K = 1.
+    def _iterate(self, p: FloatArray, x: FloatArray, steps: int) -> tuple[FloatArray, NDArray[np.bool_]]:
+        """Return x (n,) after some steps, and which rows have ended, each by itself; these stay where they are.
 
-        That of a normal of equal moments. In the tail between the least quantile of the components at Phi(u) and, since
-        each component alone gives a part of the probability, the least one at Phi(u) over their weights.
+        Halley's method on the logarithm of the distribution function, which is to be log p, within brackets.
         """
-        p = ndtr(u)
-        with np.errstate(divide="ignore", over="ignore"):  # a component without weight
-            guess = most = self._least_quantile(p / self.weight)
-        if len(self.mean) > 1:
-            share = self.weight * self.mass
-            mean = sum_components(share * self.mean)
-            away = self.mean - mean
-            normal = mean + np.sqrt(sum_components(share * (1.0 / (self.rate * self.rate) + away * away))) * u
-            between = np.minimum(np.maximum(normal, self._least_quantile(p * self.mass)), most)
-            guess = np.where(u < TAIL_U, between, normal)
-        return np.minimum(np.maximum(guess, self.low), self.high)
+        left, right, found = self.low, self.high, np.zeros(len(p), dtype=np.bool_)
+        scale = 1.0 / np.abs(self.rate)
+        length = (scale if self.is_log is None else np.where(self.is_log, np.abs(x) * scale, scale)).min(axis=0)
+        for _ in range(steps):
+            cdf, density, pull = self._evaluate(x)
+            is_below = cdf <= p
+            left, right = np.where(is_below, x, left), np.where(is_below, right, x)
+            hazard = density / cdf
+            newton = np.where(cdf > 0.0, np.log(p / cdf) / hazard, p / density)  # from the lower end by the mass
+            bend = np.minimum(np.maximum(-0.5 * newton * (pull / density + hazard), -MAX_BEND), MAX_BEND)
+            step = newton / (1.0 + bend)
+            target = x + step
+            ends = (np.abs(step) * np.maximum(hazard, 1.0 / length) <= LAST_STEP) | (target == x)
+            fits = ends | ((target >= left) & (target <= right))
+            x, found = np.where(found, x, np.where(fits, target, 0.5 * (left + right))), found | ends
+            if found.all():
+                break
+        return x, found
 
-    def _least_quantile(self, mass: FloatArray) -> FloatArray:
-        """Return the least end up to which some component has a mass (K, n), negative where turned round; (n,)."""
-        b = ndtri(np.minimum(np.maximum(self.start_mass + mass, 0.0), 1.0))
-        return np.asarray((self.mean + b / self.rate).min(axis=0))
+    def _guess(self, p: FloatArray) -> FloatArray:
+        """Return about where the distribution functions are p, (n,) for p <= 0.5: the mean of the components'.
 
-    def evaluate(self, x: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return the distribution functions, the densities, and over what length these change, at x (n,)."""
-        b = (x - self.mean) * self.rate
-        density = np.exp(-0.5 * b * b) * self.weight * self.rate
-        return sum_components(self._rise(x) * self.weight), sum_components(density) / SQRT_2PI, self.narrow
+        At most the least one at p over their weights, since each component alone gives a part of the probability.
+        """
+        masses = self.start_mass + np.stack((p * self.mass, p / self.weight))
+        y = self.mean + ndtri(np.minimum(np.maximum(masses, 0.0), 1.0)) / self.rate
+        low, high = (_place(self.is_log, end, self.sign) for end in (self.low, self.high))
+        y = np.minimum(np.maximum(y, low), high)
+        own, most = y if self.is_log is None else np.where(self.is_log, self.sign * np.exp(self.sign * y), y)
+        return np.asarray(np.minimum(sum_components(self.weight * self.mass * own), most.min(axis=0)))
 
-    def _rise(self, x: FloatArray) -> FloatArray:
-        """Return the masses of the components between the lower ends and x (n,), (K, n)."""
-        rise = np.asarray(ndtr((x - self.mean) * self.rate)) - self.start_mass
-        width = (x - self.low) * self.rate
-        near = np.abs(width) < SERIES_WIDTH / (1.0 - self.start)
+    def _evaluate(self, x: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return the distribution functions, their densities and the negative slopes of these at x (n,), (n,) each."""
+        b = (_place(self.is_log, x, self.sign) - self.mean) * self.rate
+        density, change = np.exp(-0.5 * b * b) * self.weight * (self.rate / SQRT_2PI), b * self.rate
+        if self.is_log is not None:  # y = log x, of which dy/dx = 1 / x
+            slope = np.where(self.is_log, 1.0 / np.abs(x), 1.0)
+            density, change = density * slope, (change + self.is_log * self.sign) * slope
+        return sum_components(self._rise(x, b) * self.weight), sum_components(density), sum_components(density * change)
+
+    def _rise(self, x: FloatArray, b: FloatArray) -> FloatArray:
+        """Return the masses of the components between the lower ends and x (n,), in their units b (K, n); (K, n)."""
+        rise = np.asarray(ndtr(b)) - self.start_mass
+        near = np.abs(rise) < CANCELS * self.start_mass
         if near.any():
-            rise[near] = _narrow_mass(self.start[near], width[near])
+            distance = x - self.low
+            if self.is_log is not None:
+                distance = np.where(
+                    self.is_log, self.sign * np.log1p(self.sign * distance / np.abs(self.low)), distance
+                )
+            width = np.broadcast_to(distance, near.shape)[near] * self.rate[near]
+            rise[near] = _narrow_mass(self.start[near], width)
         return rise
 
 
@@ -240,51 +260,8 @@ def _narrow_mass(a: FloatArray, width: FloatArray) -> FloatArray:
     """Return Phi(a + width) - Phi(a) by the series about the middle of the interval, of either sign."""
     middle, half = a + 0.5 * width, 0.5 * width
     m2, h2 = middle * middle, half * half
-    fourth, sixth = (m2 - 6.0) * m2 + 3.0, ((m2 - 15.0) * m2 + 45.0) * m2 - 15.0
-    series = 1.0 + h2 / 6.0 * (m2 - 1.0 + h2 / 20.0 * (fourth + h2 / 42.0 * sixth))
+    series = 1.0 + h2 / 6.0 * (m2 - 1.0 + h2 / 20.0 * ((m2 - 6.0) * m2 + 3.0))
     return np.asarray(width * np.exp(-0.5 * m2) / SQRT_2PI * series)
-
-
-def solve(tail: Invertible, u: FloatArray, x: FloatArray) -> FloatArray:
-    """Return where distribution functions are Phi(u), (n,), from first guesses x (n,); each row stops by itself.
-
-    Newton's method on the quantile scale, near the end of the interval on that of the mass, else bisection.
-    """
-    found, rows = x.copy(), np.arange(len(u))
-    left, right = tail.low, tail.high
-    last = right - left
-    for _ in range(MAX_STEPS):
-        step, reach, rises = _step(tail, u, x)
-        left, right = np.where(rises, x, left), np.where(rises, right, x)
-        target = x + step
-        fits = (target >= left) & (target <= right) & (np.abs(step) <= MIN_CONTRACTION * last)
-        middle = left + 0.5 * (right - left)  # an end where the bracket has no float inside
-        target = np.where(fits, target, middle)
-        last = np.abs(target - x)
-        done = fits & (last <= LAST_STEP * reach)
-        done |= (middle == left) | (middle == right) | (target == x)
-        found[rows] = x = target
-        keep = np.flatnonzero(~done)
-        if keep.size == 0:
-            break
-        if keep.size < len(rows):
-            tail, rows = tail.take(keep), rows[keep]
-            u, x, left, right, last = (array[keep] for array in (u, x, left, right, last))
-    return found
-
-
-def _step(tail: Invertible, u: FloatArray, x: FloatArray) -> tuple[FloatArray, FloatArray, NDArray[np.bool_]]:
-    """Return a step of each row, NaN where there is none, over what length it holds, and whether the root is ahead."""
-    cdf, density, length = tail.evaluate(x)
-    distance, length = x - tail.low, length / (1.0 - u)
-    close = distance < length  # there the mass is nearly linear, and the quantile scale has a pole at the end
-    with np.errstate(all="ignore"):  # the ends of the interval give inf and nan: bisected
-        q = ndtri(np.minimum(np.maximum(cdf, 0.0), 1.0))
-        by_quantile = (u - q) * np.exp(-0.5 * q * q) / (density * SQRT_2PI)
-        step = np.where(close, (ndtr(u) - cdf) / density, by_quantile)
-        step = np.where((q >= LOWEST) & (q <= HIGHEST), step, np.nan)
-    reach = np.where(close, length, np.minimum(distance, length))
-    return step, reach, np.where(np.isnan(step), u - q, step) >= 0.0
 
 
 def _plain_mass(a: FloatArray, b: FloatArray) -> tuple[FloatArray, NDArray[np.bool_]]:
@@ -295,12 +272,6 @@ def _plain_mass(a: FloatArray, b: FloatArray) -> tuple[FloatArray, NDArray[np.bo
         return 1.0 - below, narrow
     mass = ndtr(np.where(turned, -b, b)) - below
     return np.where(turned, -mass, mass), narrow
-
-
-def quantile_scale(lower: FloatArray, upper: FloatArray) -> FloatArray:
-    """Return Phi^-1 of a distribution function by the smaller tail, from logarithms of masses below and above, (n,)."""
-    tail = np.minimum(lower, upper) - np.logaddexp(lower, upper)
-    return cast(FloatArray, np.where(lower <= upper, 1.0, -1.0) * ndtri_exp(tail))
 
 
 def log_interval(a: FloatArray, b: FloatArray, width: FloatArray) -> FloatArray:
@@ -351,12 +322,17 @@ def choose(score: FloatArray, v: FloatArray) -> NDArray[np.intp]:
 
 def log_sum(values: FloatArray) -> FloatArray:
     """Return the log of the sum of exponentials over components, (K, n) -> (n,)."""
-    top = values.max(axis=0)
-    top = np.where(np.isfinite(top), top, 0.0)
+    top = _highest(values)
     with np.errstate(divide="ignore"):
-        return cast(FloatArray, top + np.log(sum_components(np.exp(values - top))))
+        return top + np.log(sum_components(np.exp(values - top)))
+
+
+def _highest(values: FloatArray) -> FloatArray:
+    """Return the largest over components, or 0 where that is not finite, (K, n) -> (n,)."""
+    top = values.max(axis=0)
+    return np.where(np.isfinite(top), top, 0.0)
 
 
 def sum_components(values: FloatArray) -> FloatArray:
-    """Sum over components, (K, n) -> (n,), in a fixed order: np.sum picks it by the shape."""
-    return reduce(np.add, values)
+    """Sum over components, (K, n) -> (n,), one after the other; of a single column NumPy would add up pairs."""
+    return np.asarray(np.add.reduce(values) if values.shape[1] > 1 else np.add.accumulate(values)[-1])
