@@ -9,7 +9,8 @@ simulated x replays.
 
 import math
 from collections.abc import Generator
-from typing import Any, NamedTuple, TypeVar, cast
+from dataclasses import dataclass
+from typing import Any, Generic, NamedTuple, TypeVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -121,6 +122,39 @@ class Simulator:
         f = yield x
         self.n_sim += len(x)
         return f
+
+
+_S = TypeVar("_S", bound=Simulator, covariant=True)
+
+
+@dataclass(frozen=True, eq=False)
+class RunContext(Generic[_S]):
+    """What is fixed for a run, and the simulator that counts."""
+
+    inputs: Inputs
+    """All of x."""
+    simulator: _S
+    """Of the coordinates that are searched."""
+    goal: Goal
+    budget: int
+    """Simulations that the exploration and the rounds are planned for."""
+    end: int
+    """Simulations that are never exceeded; more than `budget` where only a target c.o.v. is given."""
+    rng: np.random.Generator
+
+    @property
+    def left(self) -> int:
+        """Simulations left of the budget."""
+        return self.budget - self.simulator.n_sim
+
+    @property
+    def left_at_all(self) -> int:
+        """Simulations left before the end."""
+        return self.end - self.simulator.n_sim
+
+    def meets_target(self, cov: float) -> bool:
+        """Return whether there is a target c.o.v. and this one meets it."""
+        return self.goal.target_cov is not None and cov <= self.goal.target_cov
 
 
 class ComponentDraws(NamedTuple):

@@ -13,6 +13,7 @@ from samplers.method import Goal, Interrupted, Outcome, Steps, TermsOffer, no_ou
 from samplers.methods.base import Method
 from samplers.methods.searched import (
     ComponentDraws,
+    RunContext,
     SimulationSteps,
     Simulator,
     marginalise_noise,
@@ -158,44 +159,7 @@ def run_two_stage(inputs: Inputs, goal: Goal, budget: int, rng: np.random.Genera
     return outcome if record is None else replace(outcome, remarks=(*outcome.remarks, *record.describe(outcome.p)))
 
 
-@dataclass(frozen=True, eq=False)
-class RunContext:
-    """What is fixed for a run, and the simulator that counts."""
-
-    inputs: Inputs
-    """All of x."""
-    simulator: Simulator
-    """Of the coordinates that are not noise."""
-    goal: Goal
-    budget: int
-    """Simulations that the exploration and the rounds are planned for."""
-    end: int
-    """Simulations that are never exceeded; more than `budget` where only a target c.o.v. is given."""
-    rng: np.random.Generator
-
-    @property
-    def left(self) -> int:
-        """Simulations left of the budget."""
-        return self.budget - self.simulator.n_sim
-
-    @property
-    def left_at_all(self) -> int:
-        """Simulations left before the end."""
-        return self.end - self.simulator.n_sim
-
-    @property
-    def target_batch(self) -> int:
-        """Draws after which a target c.o.v. is looked at."""
-        return max(self.budget // TWO_STAGE.target_batches, TWO_STAGE.min_target_batch)
-
-    @property
-    def noise_marginalised(self) -> bool:
-        """Whether x has coordinates of noise that are not searched."""
-        return self.simulator.inputs is not self.inputs
-
-    def meets_target(self, cov: float) -> bool:
-        """Return whether there is a target c.o.v. and this one meets it."""
-        return self.goal.target_cov is not None and cov <= self.goal.target_cov
+SearchRun = RunContext[Simulator]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -265,7 +229,7 @@ def _explore_and_estimate(
     return replace(outcome, warnings=(*outcome.warnings, about))
 
 
-def _draw_first(run: RunContext, state: RunState) -> SimulationSteps[RunState]:
+def _draw_first(run: SearchRun, state: RunState) -> SimulationSteps[RunState]:
     """Make the base draws and the wide draws of the exploration."""
     gamma, sizes = run.goal.gamma, Sizes.within(run.budget)
     first = yield from draw_isotropic(run.simulator, ((1.0, sizes.base), *sizes.wide), run.rng)
@@ -281,7 +245,7 @@ def _draw_first(run: RunContext, state: RunState) -> SimulationSteps[RunState]:
     return state
 
 
-def _explore(run: RunContext, state: RunState) -> SimulationSteps[ExplorationResult]:
+def _explore(run: SearchRun, state: RunState) -> SimulationSteps[ExplorationResult]:
     """Find the failure regions, starting from the first draws; there are none where nothing fails."""
     gamma, sizes = run.goal.gamma, Sizes.within(run.budget)
     exploration = yield from find_regions(run.simulator, state.history.batches[0], run.goal, sizes, run.rng)
@@ -293,7 +257,12 @@ def _explore(run: RunContext, state: RunState) -> SimulationSteps[ExplorationRes
 
 
 def _refine(
-    run: RunContext, state: RunState, refinement: RefinementState, number: int, room: int, proposal: MixtureProposal
+    run: SearchRun,
+    state: RunState,
+    refinement: RefinementState,
+    number: int,
+    room: int,
+    proposal: MixtureProposal,
 ) -> SimulationSteps[tuple[RunState, RefinementState, MixtureProposal, bool]]:
     """Run one round of refinement; return also the proposal that follows from it, and whether that is the last one."""
     shares = (*REFINEMENT.round_shares, *REFINEMENT.further_shares)
@@ -310,7 +279,7 @@ def _refine(
 
 
 def _draw_round(
-    run: RunContext, state: RunState, refinement: RefinementState, proposal: MixtureProposal, n: int
+    run: SearchRun, state: RunState, refinement: RefinementState, proposal: MixtureProposal, n: int
 ) -> SimulationSteps[tuple[RunState, RefinementState]]:
     """Draw n points from a proposal and learn from them."""
     state, batch = yield from _draw(run, state, proposal, n)
@@ -331,7 +300,7 @@ def _draw_round(
 
 
 def _gives_up(
-    run: RunContext,
+    run: SearchRun,
     state: RunState,
     refinement: RefinementState,
     proposal: MixtureProposal,
@@ -345,7 +314,7 @@ def _gives_up(
     """
     if run.left_at_all < FALLBACK.min_fallback_budget or not state.rounds:
         return False
-    if refinement.exploration.noisy and not (final and run.noise_marginalised):
+    if refinement.exploration.noisy and not (final and run.simulator.inputs is not run.inputs):
         return False  # a tempered mixture meets few failures but does not miss any: nothing else is better
     last, early = state.rounds[-1], FALLBACK.early_rates
     late = FALLBACK.relative_rate / max(refinement.exploration.levels, FEWEST_LEVELS)
@@ -359,10 +328,10 @@ def _gives_up(
     return doubtful and float(np.median(typical_weights(refinement, proposal))) > FALLBACK.max_typical * last.p
 
 
-def _fall_back(run: RunContext, state: RunState, levels: int) -> Steps:
+def _fall_back(run: SearchRun, state: RunState, levels: int) -> Steps:
     """Spend the rest on subset simulation in all coordinates, which needs no proposal."""
     known: RootedPoints | None = RootedPoints(state.base_u, state.base_f, np.arange(len(state.base_f)))
-    if run.noise_marginalised:  # the base draws lack the coordinates of noise
+    if run.simulator.inputs is not run.inputs:  # the base draws lack the coordinates of noise
         known = None
     trace, before = run.simulator.close_trace(), _estimate_early(run, state)
     outcome = yield from spend_on_subset_simulation(run.inputs, run.goal, levels, run.left_at_all, known, run.rng)
@@ -390,7 +359,7 @@ def _reconcile(subset_outcome: Outcome, earlier: Outcome) -> Outcome:
     )
 
 
-def _estimate(run: RunContext, state: RunState, refinement: RefinementState, proposal: MixtureProposal) -> Steps:
+def _estimate(run: SearchRun, state: RunState, refinement: RefinementState, proposal: MixtureProposal) -> Steps:
     """Draw from the last proposal until the budget is used or the target is met.
 
     p rests on these draws and on those of the rounds that count, each weighted as a draw of its own proposal.
@@ -399,7 +368,7 @@ def _estimate(run: RunContext, state: RunState, refinement: RefinementState, pro
     typical = typical_weights(refinement, proposal)
     sample = StratifiedSample.empty(len(proposal.weights), inputs.dim, typical)
     whole = sample
-    size = run.left if goal.target_cov is None else run.target_batch
+    size = run.left if goal.target_cov is None else _target_batch(run)
     while run.left_at_all > 0:
         try:
             state, batch = yield from _draw(run, state, proposal, min(size, run.left_at_all))
@@ -436,7 +405,7 @@ def _estimate(run: RunContext, state: RunState, refinement: RefinementState, pro
     )
 
 
-def _estimate_early(run: RunContext, state: RunState) -> Outcome:
+def _estimate_early(run: SearchRun, state: RunState) -> Outcome:
     """Return what all draws from known components say, for a run that ends before its estimate."""
     draws = state.history.to_draws(run.simulator.inputs, run.goal.gamma)
     largest_weight = draws.n / max(len(state.base_f), 1)
@@ -447,11 +416,11 @@ def _estimate_early(run: RunContext, state: RunState) -> Outcome:
     return replace(outcome, sample=draws.sample, draw_weights=weights, status=Status.STOPPED)
 
 
-def _run_monte_carlo(run: RunContext, state: RunState, *, counted: bool = True) -> Steps:
+def _run_monte_carlo(run: SearchRun, state: RunState, *, counted: bool = True) -> Steps:
     """Spend the rest on base draws."""
     goal, inputs, stopped, first = run.goal, run.simulator.inputs, False, run.simulator.n_sim
     u, f = (state.base_u, state.base_f) if counted else (state.base_u[:0], state.base_f[:0])
-    size = TWO_STAGE.monte_carlo_batch if goal.target_cov is None else run.target_batch
+    size = TWO_STAGE.monte_carlo_batch if goal.target_cov is None else _target_batch(run)
     while run.left_at_all > 0:
         new_u = run.rng.standard_normal((min(run.left_at_all, size), inputs.dim))
         try:
@@ -481,7 +450,7 @@ def _run_monte_carlo(run: RunContext, state: RunState, *, counted: bool = True) 
 
 
 def _draw(
-    run: RunContext, state: RunState, proposal: MixtureProposal, n: int
+    run: SearchRun, state: RunState, proposal: MixtureProposal, n: int
 ) -> SimulationSteps[tuple[RunState, ComponentDraws]]:
     """Make n > 0 draws of a proposal; those from its first component, the base distribution, are counted."""
     u, counts = proposal.draw(n, run.rng)
@@ -491,12 +460,17 @@ def _draw(
     return replace(state, base_draws=state.base_draws + int(counts[0])), batch
 
 
-def _record_draws(run: RunContext, batch: ComponentDraws, estimate: float, cov: float, ess: float) -> None:
+def _target_batch(run: SearchRun) -> int:
+    """Return the draws after which a target c.o.v. is looked at."""
+    return max(run.budget // TWO_STAGE.target_batches, TWO_STAGE.min_target_batch)
+
+
+def _record_draws(run: SearchRun, batch: ComponentDraws, estimate: float, cov: float, ess: float) -> None:
     """Add draws of a proposal to the trace."""
     run.simulator.record(float((batch.f <= run.goal.gamma).mean()), estimate, len(batch.f), cov, ess)
 
 
-def _outcome(run: RunContext, state: RunState, draws: Draws, cov: float, interval: Interval) -> Outcome:
+def _outcome(run: SearchRun, state: RunState, draws: Draws, cov: float, interval: Interval) -> Outcome:
     """Return what weighted draws say of p."""
     return Outcome(
         p=draws.p,

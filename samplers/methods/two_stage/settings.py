@@ -424,7 +424,6 @@ class FALLBACK:
     max_typical = 30.0
     """How many times p a typical point of most regions may weigh as a draw: 1 to 3 is usual, 17 was seen to do. From
     `REFINEMENT.good_rate` on it does not apply."""
-    """Points of a level at p0 = 0.1 for an independent one: (1 - p0) / p0, and correlation along chains."""
 
 
 class DIAGNOSTICS:

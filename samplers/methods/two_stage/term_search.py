@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from samplers.importance import Draws, weight_warnings, weighted_interval
 from samplers.method import Goal, Interrupted, Outcome, Steps, TermsOffer, no_outcome_share, request_terms
 from samplers.methods.monte_carlo import MonteCarlo
-from samplers.methods.searched import SimulationSteps
+from samplers.methods.searched import RunContext, SimulationSteps
 from samplers.methods.subset import spend_on_subset_simulation
 from samplers.methods.two_stage.settings import (
     DIAGNOSTICS,
@@ -230,22 +230,7 @@ def order_by_terms(steps: Steps, gamma: float) -> Steps:
     return replace(outcome, sample=replace(outcome.sample, f=f, layers=()))
 
 
-@dataclass(frozen=True, eq=False)
-class TermSearch:
-    """What is fixed for a search, and the simulator that counts."""
-
-    simulator: TermSimulator
-    goal: Goal
-    budget: int
-    """Simulations to plan for."""
-    end: int
-    """Simulations that are never exceeded."""
-    rng: np.random.Generator
-
-    @property
-    def left(self) -> int:
-        """Simulations left of the budget."""
-        return self.budget - self.simulator.n_sim
+TermSearch = RunContext[TermSimulator]
 
 
 @dataclass(frozen=True, eq=False)
@@ -274,7 +259,7 @@ def search_terms(inputs: Inputs, offer: TermsOffer, goal: Goal, budget: int, rng
     """Estimate P[f(X) <= goal.gamma] by terms and their gradients."""
     open_ended = goal.max_sim is None and goal.target_cov is not None
     end = budget + TWO_STAGE.max_batches * ROUNDS.target_batch if open_ended else budget
-    search = TermSearch(TermSimulator(inputs, offer, goal), goal, budget, end, rng)
+    search = TermSearch(inputs, TermSimulator(inputs, offer, goal), goal, budget, end, rng)
     state = yield from _draw_base(search)
     try:
         if state.base_rate >= TWO_STAGE.common_share:
@@ -291,7 +276,7 @@ def search_terms(inputs: Inputs, offer: TermsOffer, goal: Goal, budget: int, rng
 def _draw_base(search: TermSearch) -> SimulationSteps[SearchState]:
     """Make the base draws."""
     n = min(max(int(ROUNDS.base * search.budget), ROUNDS.min_base), ROUNDS.max_base)
-    u = search.rng.standard_normal((n, search.simulator.inputs.dim))
+    u = search.rng.standard_normal((n, search.inputs.dim))
     terms = yield from search.simulator.terms(u)
     failures = int((terms.f <= search.goal.gamma).sum())
     share = failures / n
@@ -346,7 +331,7 @@ def _draw_round(
     u, strata = proposal.draw(n, search.rng)
     first = search.simulator.n_sim
     terms = yield from search.simulator.terms(u)
-    x = search.simulator.inputs.base.from_standard_normal(u)
+    x = search.inputs.base.from_standard_normal(u)
     drawn = FinalRound(x, terms, -proposal.log_ratio(u), strata, factor=1.0, first=first)
     fails = terms.f <= gamma
     ess = effective_sample_size(drawn.log_weights[fails])
@@ -390,16 +375,16 @@ def _estimate(search: TermSearch, state: SearchState) -> Steps:
     ceiling = state.ceiling
     while not stopped:
         number = len(state.finals)
-        if number and goal.target_cov is not None and _combine(search, state).cov <= goal.target_cov:
+        if number and search.meets_target(_combine(search, state).cov):
             break
         size, factor = plan[number] if number < len(plan) else (ROUNDS.target_batch, 1.0)
         last = number == len(plan) - 1
-        if number >= len(plan) and (goal.target_cov is None or search.simulator.n_sim >= search.end):
+        if number >= len(plan) and (goal.target_cov is None or search.left_at_all <= 0):
             break
         try:
             if 0 < number < len(plan):
                 state = yield from _refit(search, state, sum(n for n, _ in plan[number:]))
-            size = search.left if last else min(size, search.end - search.simulator.n_sim)
+            size = search.left if last else min(size, search.left_at_all)
             state, drawn = yield from _draw_round(search, state, size, final=True)
             ceiling = state.ceiling if number < len(plan) else ceiling
             state = replace(state, finals=(*state.finals, replace(drawn, factor=factor)), ceiling=ceiling)
@@ -434,7 +419,7 @@ def _conclude(search: TermSearch, state: SearchState, stopped: bool) -> Outcome:
 def _estimate_early(search: TermSearch, state: SearchState) -> Outcome:
     """Return what all draws from known proposals say, for a run that ends before its estimate."""
     history = state.history
-    x = search.simulator.inputs.base.from_standard_normal(history.u)
+    x = search.inputs.base.from_standard_normal(history.u)
     n = len(history.u)
     draws = Draws.from_outcomes(history.terms.f, history.log_weights + np.log(n), x, search.goal.gamma)
     return Outcome(
@@ -453,16 +438,16 @@ def _estimate_early(search: TermSearch, state: SearchState) -> Outcome:
 
 def _run_monte_carlo(search: TermSearch, state: SearchState) -> Steps:
     """Spend the rest on base draws; those made so far decided on this and do not count."""
-    left = search.end - search.simulator.n_sim
+    left = search.left_at_all
     batch = TWO_STAGE.monte_carlo_batch if search.goal.target_cov is None else ROUNDS.target_batch
     method = MonteCarlo(n=left, batch=batch)
-    outcome = yield from method.steps(search.simulator.inputs, replace(search.goal, max_sim=left), search.rng)
+    outcome = yield from method.steps(search.inputs, replace(search.goal, max_sim=left), search.rng)
     return _after(search, state, outcome)
 
 
 def _fall_back(search: TermSearch, state: SearchState) -> Steps:
     """Spend the rest on subset simulation in the order of the terms."""
-    left, inputs = search.end - search.simulator.n_sim, search.simulator.inputs
+    left, inputs = search.left_at_all, search.inputs
     levels = _expected_levels(state.history, search.goal.gamma)
     steps = spend_on_subset_simulation(inputs, replace(search.goal, max_sim=left), levels, left, None, search.rng)
     outcome = yield from order_by_terms(steps, search.goal.gamma)
