@@ -63,12 +63,7 @@ class Auto(Method):
             check_setting("Auto", "seconds_per_simulation", self.seconds_per_simulation, 0.0, math.inf)
 
     def choose(self, inputs: Inputs, goal: Goal) -> Choice:
-        """Return the method for one run.
-
-        Args:
-            inputs: Dimension, base distribution, and whether terms are offered.
-            goal: Budget and target of one replicate.
-        """
+        """Return the method for one run, with the budget and the target of one replicate."""
         noise = noise_mask(inputs)
         dim = inputs.dim - (0 if noise.all() else int(np.count_nonzero(noise)))
         slow = (self.seconds_per_simulation or 0.0) >= SLOW and goal.target_cov is None

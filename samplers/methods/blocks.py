@@ -552,10 +552,7 @@ class Product:
     def project(self, x: FloatArray, weights: FloatArray, alpha: float) -> "Product":
         """Return the projection of alpha Q + (1 - alpha) P, block by block (equation 2).
 
-        Args:
-            x: Points, shape (n, d).
-            weights: Their weights for each block, rows that add up to 1, shape (blocks, n).
-            alpha: Step size.
+        Q has the points x (n, d) with weights (blocks, n) for each block, rows that add up to 1.
         """
         parts = zip(self.blocks, self._parts(x), weights, strict=True)
         return Product(tuple(block.project(part, w, alpha) for block, part, w in parts))
@@ -579,10 +576,8 @@ def announced_blocks(inputs: Inputs) -> Product:
 
     `inputs.base.blocks` holds one entry per block, in the order of the coordinates: a `Block`, or
     any object with the attributes alpha, beta, low and high (and box, if that is not the paper's),
-    or with mean and covariance (and radius, if the mean is to stay in a box).
-
-    Raises:
-        ValueError: If there are no blocks, one is not as described, or their product is not the base distribution.
+    or with mean and covariance (and radius, if the mean is to stay in a box). A ValueError says that there are no
+    blocks, one is not as described, or their product is not the base distribution.
     """
     announced = getattr(inputs.base, "blocks", None)  # the user's own class
     if announced is None:

@@ -41,22 +41,6 @@ class Iterate(NamedTuple):
     record: Level
 
 
-def make_iterate(drawn: Round, proposal: Product, level: float, rho: float, log_weights: FloatArray) -> Iterate:
-    """Return the iterate that one round of draws describes.
-
-    Args:
-        drawn: The draws.
-        proposal: theta_k, where they are from.
-        level: gamma_k.
-        rho: Elite fraction.
-        log_weights: log(p0 / p_theta) of the draws with f <= gamma_k, shape (k,).
-    """
-    n = len(drawn.f)
-    rank = int(np.ceil(rho * n)) - 1
-    quantile = float(np.partition(drawn.f, rank)[rank])
-    return Iterate(proposal, quantile, level, round_record(level, n, log_weights))
-
-
 def best_iterate(iterates: Sequence[Iterate], choice: str) -> Iterate | None:
     """Return the iterate to sample from; None if there is none.
 
@@ -71,7 +55,6 @@ def best_iterate(iterates: Sequence[Iterate], choice: str) -> Iterate | None:
 
 
 SettingT = TypeVar("SettingT")
-FAMILIES = ("gaussian", "mean", "mixture", "blocks")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -179,7 +162,7 @@ class CrossEntropy(Method):
     def __post_init__(self) -> None:
         """Check the settings."""
         who = "CrossEntropy"
-        check_choice(who, "family", self.family, FAMILIES)
+        check_choice(who, "family", self.family, ("gaussian", "mean", "mixture", "blocks"))
         check_choice(who, "likelihood_ratio", self.likelihood_ratio, ("joint", "block"))
         check_choice(who, "choice", self.choice, ("cov", "quantile"))
         check_count(who, "components", self.components, 1)
@@ -250,7 +233,10 @@ class CrossEntropy(Method):
             elite = u[f <= lowest]
             log_ratios = base.log_probs(elite) - proposal.log_probs(elite)
             rounds = [*rounds[:1], Round(base, proposal, u, f)]  # those that `pool_rounds` needs
-            iterates.append(make_iterate(rounds[-1], proposal, lowest, self.rho, log_ratios.sum(axis=0)))
+            rank = int(np.ceil(self.rho * size)) - 1
+            quantile = float(np.partition(f, rank)[rank])
+            record = round_record(lowest, size, log_ratios.sum(axis=0))
+            iterates.append(Iterate(proposal, quantile, lowest, record))
             goal.on_level(iterates[-1].record)
             if level is None:
                 return ended(Status.STALLED)

@@ -126,10 +126,14 @@ class ImportanceSampling(Method):
         to_target = replace(goal, target_cov=target)
         final = yield from draw_after_search(inputs, to_target, search, sampler, base_share, limit, self.batch, rng)
         status = Status.CONVERGED if final.cov <= target else Status.BUDGET
-        outcome = final.outcome(goal, status, _tilt_warnings(search, goal.gamma, missed))
+        doubts = search_warnings(search, goal.gamma)
+        if missed > MOST_UNREACHED:
+            where = f"{100 * missed:.0f} % of the failing points found lie outside the tilted distribution"
+            doubts = [f"{where}: draws from the base distribution replace it."]
+        outcome = final.outcome(goal, status, doubts)
         if (
             final.stopped or status is not Status.BUDGET or goal.target_cov is not None
-        ):  # a goal's target: `Run` says it
+        ):  # `Run` tells of a goal's target
             return outcome
         return outcome.remark_first(f"All draws were used at a c.o.v. of {final.cov:.3g}, above {target:.3g}.")
 
@@ -178,11 +182,3 @@ def unreached_share(search: Search, theta: FloatArray, inputs: Inputs, gamma: fl
         return behind
     weights = normalise_weights(pool_rounds(search.rounds, inputs.base.from_standard_normal, gamma).log_weights)
     return max(behind, float(weights[failing @ theta < 0.5 * float(theta @ theta)].sum()))
-
-
-def _tilt_warnings(search: Search, gamma: float, missed: float) -> list[str]:
-    """Return the warning about a search that did not end well."""
-    if missed > MOST_UNREACHED:
-        where = f"{100 * missed:.0f} % of the failing points found lie outside the tilted distribution"
-        return [f"{where}: draws from the base distribution replace it."]
-    return search_warnings(search, gamma)

@@ -172,7 +172,8 @@ class ImprovedCrossEntropy(Method):
             if reached and k == 0:
                 return Search(rounds, trace, Status.CONVERGED), None
             if k == 0:
-                scale = median_scale(g)
+                sizes = np.abs(g[(np.abs(g) < HUGE) & (g != 0)])
+                scale = float(np.median(sizes)) if len(sizes) else 1.0
                 width, narrowest = WIDEST * scale, NARROWEST * scale
             width = next_width(g, log_ratio, self.weight_cov, narrowest, width)
             if reached or (width == narrowest and (g <= 0).any()):
@@ -217,14 +218,8 @@ def weights_cov(log_weights: FloatArray) -> float:
 def next_width(g: FloatArray, log_ratio: FloatArray, target: float, low: float, high: float) -> float:
     """Return the width in [low, high] at which the weights Phi(-g / width) p0 / q have the target c.o.v.
 
-    `low` where they have less at any width, `high` where they have more.
-
-    Args:
-        g: f - gamma, shape (n,).
-        log_ratio: log(p0 / q), shape (n,).
-        target: Wanted c.o.v.
-        low: Least width.
-        high: Largest width, that of the round before.
+    `low` where they have less at any width, `high`, that of the round before, where they have more; g = f - gamma and
+    log_ratio = log(p0 / q) have shape (n,).
     """
     if weights_cov(log_smooth_indicator(g, low) + log_ratio) <= target:
         return low
@@ -237,9 +232,3 @@ def next_width(g: FloatArray, log_ratio: FloatArray, target: float, low: float, 
         else:
             high = middle
     return high
-
-
-def median_scale(g: FloatArray) -> float:
-    """Return the median of |g| over finite g other than 0; 1 where there is none."""
-    sizes = np.abs(g[(np.abs(g) < HUGE) & (g != 0)])
-    return float(np.median(sizes)) if len(sizes) else 1.0

@@ -188,12 +188,9 @@ class _Outcomes(NamedTuple):
 
 
 def fit_kriging(u: FloatArray, y: FloatArray, before: Kriging | None = None) -> Kriging:
-    """Fit a process to outcomes.
+    """Fit a process to outcomes y = f - gamma (n,), which may be infinite, at points u (n, d).
 
-    Args:
-        u: Points, shape (n, d).
-        y: f - gamma there, shape (n,); may be infinite.
-        before: Fitted to some of them: its covariance parameters are kept unless there are many more points.
+    The covariance parameters of `before`, fitted to some of them, are kept unless there are many more points.
     """
     search = before is None or len(y) >= KRIGING.refit_growth * before.n_searched
     scale = outcome_scale(y) if before is None or search else before.scale

@@ -23,15 +23,8 @@ LEAST_FAILING = 10_000
 class EvenlySpaced:
     """Rows 0, s, 2 s, ... of a stream; s is 1 and doubles where more than `most` would be kept.
 
-    Which rows are kept depends on their number alone, so that independent draws stay independent and unselected.
-
-    Args:
-        most: Rows kept at most.
-        shape: Of a row.
-
-    Attributes:
-        stride: s.
-        n: Rows seen.
+    Which rows are kept depends on their number alone, so that independent draws stay independent and unselected. The
+    attribute `stride` is s, and n the number of rows seen.
     """
 
     def __init__(self, most: int, shape: tuple[int, ...] = ()) -> None:
@@ -57,12 +50,7 @@ class EvenlySpaced:
 
 
 class KeptDraws:
-    """Independent draws of equal weight: all of them while they are few, evenly spaced ones when they are many.
-
-    Args:
-        gamma: Threshold of failure.
-        dim: Number of dimensions of x.
-    """
+    """Independent draws of equal weight: all of them while they are few, evenly spaced ones when they are many."""
 
     def __init__(self, gamma: float, dim: int, most: int = MOST_DRAWS, most_failing: int | None = None) -> None:
         self._gamma, self._n_missing = gamma, 0

@@ -37,12 +37,7 @@ class NoiseMarginalisedInputs:
     """The coordinates that are not noise, as inputs of their own; points u (n, k) become x (n, d) with noise drawn.
 
     The same u gets the same noise again: rows of u are known by their bytes, and their noise is made anew from a
-    counter, so that nothing large is kept.
-
-    Args:
-        inputs: All of x.
-        noise: Which coordinates are noise, shape (d,).
-        rng: Seeds the noise.
+    counter, so that nothing large is kept. The mask `noise` (d,) says which coordinates are noise.
     """
 
     def __init__(self, inputs: Inputs, noise: NDArray[np.bool_], rng: np.random.Generator) -> None:

@@ -254,11 +254,8 @@ def descent_cov(roots: NDArray[np.int64], n: int) -> float:
     With h_i failing points descending from point i of n at level 0, p-hat is proportional to the
     mean of the h_i. Were the thresholds fixed, these would be independent, so
     c.o.v.^2 = sum h_i^2 / (sum h_i)^2 - 1/n. Unlike the product over levels this holds the
-    correlation between levels: a lucky point at level 0 is lucky at all.
-
-    Args:
-        roots: For each failing point the point of level 0 from which it descends, shape (k,).
-        n: Points of level 0.
+    correlation between levels: a lucky point at level 0 is lucky at all. `roots` (k,) has for each failing point the
+    one of level 0 that it descends from.
     """
     if roots.size == 0:
         return math.inf
@@ -457,11 +454,7 @@ class AdaptiveSubsetSimulation(SubsetMethod):
     def steps(self, inputs: Inputs, goal: Goal, rng: np.random.Generator, known: RootedPoints | None = None) -> Steps:
         """Go from level to level until the share of failures among its points is p0 or more.
 
-        Args:
-            inputs: Of the problem.
-            goal: Threshold and budget.
-            rng: Source of randomness.
-            known: Base draws whose outcomes are known, at most n: level 0 begins with them.
+        Level 0 begins with base draws whose outcomes are known, at most n.
         """
         kernel = ScaledKernel(
             self.proposal, self.sigma0, self.scale, self.target_acceptance, deviations=np.ones(inputs.dim)
