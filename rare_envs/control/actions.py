@@ -63,16 +63,7 @@ def read_actions(kind: str, actions: Tensor, batch: int, ignored: Tensor | None 
 
 
 def to_meta(action: Tensor, batch: int, ignored: Tensor | None = None) -> Tensor:
-    """Return meta-actions as int64, checked.
-
-    Args:
-        action: Indices of `META_ACTIONS`, whole numbers of shape (B,).
-        batch: B.
-        ignored: Rows whose action does not matter, boolean of shape (B,); they get `IDLE`.
-
-    Returns:
-        The indices, int64, shape (B,).
-    """
+    """Return meta-actions (B,), whole numbers, as int64, checked; rows `ignored` (B,) get `IDLE`."""
     if action.shape != (batch,) or action.is_floating_point() or action.dtype == torch.bool:
         raise ValueError(
             f"Expected {batch} meta-actions, whole numbers from 0 to {len(META_ACTIONS) - 1} "
@@ -87,16 +78,9 @@ def to_meta(action: Tensor, batch: int, ignored: Tensor | None = None) -> Tensor
 
 
 def to_physical(action: Tensor, batch: int, ignored: Tensor | None = None) -> Tensor:
-    """Scale actions to physical units.
+    """Return acceleration [m/s^2] and steering angle [rad], (B, 2), of actions (B, 2) in [-1, 1] or indices (B,).
 
-    Args:
-        action: Shape (B, 2) in [-1, 1] (clipped, taken as float32), or (B,) integers that index `DISCRETE_ACTIONS`.
-        batch: B.
-        ignored: Rows whose action does not matter, boolean of shape (B,); they get 0.
-
-    Returns:
-        Acceleration [m/s^2] and steering angle [rad], shape (B, 2). Of actions on a GPU that are not finite they are
-        NaN: to raise an error there is to wait for it.
+    Rows `ignored` (B,) get 0. On a GPU actions that are not finite become NaN: to raise an error there is to wait.
     """
     if ignored is not None and action.shape[:1] == (batch,):
         action = torch.where(ignored.reshape(-1, *[1] * (action.ndim - 1)), torch.zeros_like(action), action)
@@ -149,19 +133,10 @@ def initial_aim(state: State, road: Road) -> Aim:
 def follow_meta_actions(
     aim: Aim, action: Tensor, commanded: Tensor | None, state: State, road: Road
 ) -> tuple[Aim, Tensor]:
-    """Turn meta-actions into what the controllers do in one tick.
+    """Return the new aim (B, N), and acceleration [m/s^2] and steering angle [rad] of a tick, (B, 2).
 
-    A vehicle whose action does not count has no aim of its own: when it is first commanded, its aim is where it is.
-
-    Args:
-        aim: Targets of all vehicles, shape (B, N).
-        action: Meta-actions of the ego, shape (B,); with `commanded` of all vehicles, shape (B, N).
-        commanded: Which vehicles follow their action, boolean, shape (B, N), the ego always; None for the ego alone.
-        state: Traffic of B scenarios.
-        road: Their road.
-
-    Returns:
-        The new aim, and acceleration [m/s^2] and steering angle [rad], shape (B, 2), or (B, N, 2) with `commanded`.
+    With `commanded` (B, N), of all vehicles that follow their action (B, N), (B, N, 2); the ego always does. A vehicle
+    whose action does not count has no aim of its own: when it is first commanded, its aim is where it is.
     """
     if commanded is None:
         pad = state.x.shape[1] - 1
@@ -181,21 +156,11 @@ def follow_meta_actions(
 
 
 def update_aim(aim: Aim, action: Tensor, y: Tensor, speed: Tensor, road: Road) -> Aim:
-    """Return the targets after meta-actions.
+    """Return the targets after meta-actions, all of one shape.
 
     Left and right move the target lane by one from the present target, if there is such a lane and its middle is within
     two lane widths of the vehicle. Faster and slower aim for the speed after or before the one nearest to the vehicle's
     present speed (not to the present target).
-
-    Args:
-        aim: The targets so far.
-        action: Indices of `rare_envs.control.actions.META_ACTIONS`, of the same shape.
-        y: Place across the road [m], likewise.
-        speed: Speed [m/s], likewise.
-        road: The road.
-
-    Returns:
-        The new targets; where the action is idle, the same.
     """
     centres, widths = _lanes(road, y.dtype, y.device)
     aside = (action == LANE_RIGHT).long() - (action == LANE_LEFT).long()
@@ -207,21 +172,10 @@ def update_aim(aim: Aim, action: Tensor, y: Tensor, speed: Tensor, road: Road) -
 
 
 def control_towards(aim: Aim, x: Tensor, y: Tensor, heading: Tensor, speed: Tensor, road: Road) -> Tensor:
-    """Return the actions of HighwayEnv's two low-level controllers for one tick.
+    """Return acceleration [m/s^2] and steering [rad] of HighwayEnv's two controllers for one tick: (...) -> (..., 2).
 
-    Acceleration is (target speed - speed) / 0.6 s, without a limit. Steering as in
-    `rare_envs.control.idm.steering_control`, towards the middle of the target lane.
-
-    Args:
-        aim: Their targets.
-        x: Place along the road [m], of the same shape, as the other tensors.
-        y: Place across the road [m].
-        heading: Relative to the road [rad].
-        speed: [m/s].
-        road: The road.
-
-    Returns:
-        Acceleration [m/s^2] and steering angle [rad], in a last axis of 2.
+    The acceleration is (target speed - speed) / 0.6 s, without a limit; `steering_control` goes to the middle of the
+    target lane.
     """
     acceleration = (constant(tuple(TARGET_SPEEDS), speed)[aim.speed] - speed) / _TAU_SPEED
     centres, _ = _lanes(road, y.dtype, y.device)

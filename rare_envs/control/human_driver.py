@@ -116,13 +116,10 @@ def remaining_duration(share: Tensor) -> Tensor:
 
 
 def draw_glances(draws: Tensor) -> Glances:
-    """Return the glances of B drivers: a stationary sequence.
+    """Return the glances of B drivers, a stationary sequence, from standard normal draws (B, `count_glance_draws`).
 
     Times between glances are exponential, as in the simulations of Rootzen and Zholud ("Tail estimation for
     window-censored processes", Technometrics 58, 2016).
-
-    Args:
-        draws: Standard normal, shape (B, `count_glance_draws(horizon)`).
     """
     share = torch.special.ndtr(draws).clamp(1e-7, 1.0 - 1e-7)
     left = torch.where(share[:, 0] < OFF_ROAD_SHARE, remaining_duration(share[:, 1]), 0.0)[:, None]
@@ -209,36 +206,22 @@ def in_wandering_zone(state: State, road: Road, wandering: float) -> Tensor:
     """Return which vehicles are in the ego's lane, or off the centre of the next one towards it, boolean, (B, V).
 
     The first is the case up to half a lane from the centre of the ego's lane; the second as far as a lane's width less
-    the zone in which a vehicle may wander about the centre of its lane.
-
-    Args:
-        state: Traffic of B scenarios with V vehicles beside the ego.
-        road: Their road.
-        wandering: Half the width of that zone [m].
+    the zone of `wandering` [m] about the centre of its lane.
     """
     lane_y = road.centre_of(state.y[:, :1])
     return (state.y[:, 1:] - lane_y).abs() <= road.width - wandering
 
 
 def look(state: State, noticed: Tensor) -> Percept:
-    """Return what there is to see of the other vehicles.
-
-    Args:
-        state: Traffic of B scenarios with V vehicles beside the ego.
-        noticed: See `Percept`.
-    """
+    """Return what there is to see of V other vehicles, of which some are noticed (B, V)."""
     speed = state.speed[:, 1:] * torch.cos(state.heading[:, 1:] - state.heading[:, :1])
     return Percept(state.x[:, 1:] - state.x[:, :1], speed, noticed)
 
 
 def inverse_tau(percept: Percept, speed: Tensor) -> Tensor:
-    """Return how fast the most urgent leader comes closer, as a share of its gap [1/s], shape (B,); 0 without one.
+    """Return how fast the most urgent leader comes closer, as a share of its gap [1/s], (B,); 0 without one.
 
     It is the inverse of the time to collision, which tau, the optical size over its rate of change, gives to the eye.
-
-    Args:
-        percept: What there is to see.
-        speed: Of the driver [m/s], shape (B,).
     """
     gap = (percept.distance - VEHICLE_LENGTH).clamp(min=NEAR_ZERO)
     ahead = percept.noticed & (percept.distance >= 0.0)
@@ -247,31 +230,19 @@ def inverse_tau(percept: Percept, speed: Tensor) -> Tensor:
 
 
 def step_errors(errors: Tensor, fresh: Tensor, dt: float, correlation: float) -> Tensor:
-    """Return errors after a time: Ornstein-Uhlenbeck processes of variance 1, exactly.
+    """Return errors after dt [s]: Ornstein-Uhlenbeck processes of variance 1, exactly, from fresh normal draws.
 
     dw = -w dt / tau + sqrt(2 / tau) dW, the "Wiener processes" of Treiber, Kesting and Helbing (2006).
-
-    Args:
-        errors: Before it, any shape.
-        fresh: Standard normal, same shape.
-        dt: The time [s].
-        correlation: tau [s].
     """
     kept = math.exp(-dt / correlation) if correlation else 0.0
     return kept * errors + math.sqrt(1.0 - kept * kept) * fresh
 
 
 def estimate_leads(percept: Percept, speed: Tensor, errors: Tensor, model: HumanDriverModel) -> Lead:
-    """Return gaps and speed differences to V leaders as a driver estimates them, shape (B, V), with gap inf for others.
+    """Return gaps and speed differences to V leaders as a driver estimates them, (B, V), with gap inf for others.
 
-    s_est = s exp(V_s w_s) and dv_est = dv + s sigma_r w_v. The gap to the second leader is the sum of both net gaps:
-    the bodies in between are not counted.
-
-    Args:
-        percept: Of the vehicles around.
-        speed: Of the driver [m/s], shape (B,).
-        errors: w_s and w_v, standard normal, shape (B, 2).
-        model: The driver.
+    s_est = s exp(V_s w_s) and dv_est = dv + s sigma_r w_v with errors w_s and w_v (B, 2). The gap to the second leader
+    is the sum of both net gaps: the bodies in between are not counted.
     """
     ahead = percept.noticed & (percept.distance >= 0.0)
     way = torch.where(ahead, percept.distance, torch.inf)
@@ -285,30 +256,19 @@ def estimate_leads(percept: Percept, speed: Tensor, errors: Tensor, model: Human
 
 
 def anticipate(lead: Lead, speed: Tensor, acceleration: Tensor, delay: float) -> tuple[Lead, Tensor]:
-    """Return leads and own speed as a driver expects them after its reaction time.
+    """Return leads (B, V) and own speed (B,) as a driver expects them after its reaction time `delay` [s].
 
     s' = s - T' dv, dv' = dv, v' = v + T' a: other speeds, and the own acceleration, are taken for constant.
-
-    Args:
-        lead: As it was estimated, shape (B, V).
-        speed: Own speed at that time [m/s], shape (B,).
-        acceleration: Own acceleration at that time [m/s^2], shape (B,).
-        delay: T' [s].
     """
     expected = lead._replace(gap=lead.gap - delay * lead.closing_speed)
     return expected, (speed + delay * acceleration).clamp(min=0.0)
 
 
 def respond(lead: Lead, speed: Tensor, model: HumanDriverModel) -> Tensor:
-    """Return the acceleration that a driver chooses [m/s^2], shape (B,).
+    """Return the acceleration that a driver chooses behind V leads (B, V) as it expects them [m/s^2], (B,).
 
     The IDM with the interactions (s*/s_j)^2 of n leaders, weighted by 1 / sum_j j^-2 so that a queue in equilibrium
     keeps the gaps of the IDM.
-
-    Args:
-        lead: Expected gaps and speed differences to V leaders, shape (B, V); gap inf for no leader.
-        speed: Expected own speed [m/s], shape (B,).
-        model: The driver.
     """
     ratio = speed / model.idm.desired_speed
     each = model.idm.interaction(speed[:, None], ratio[:, None], lead)

@@ -56,16 +56,7 @@ def lane_keeping(y: Tensor, heading: Tensor, speed: Tensor, road: Road) -> Tenso
 
 
 def steering_control(offset: Tensor, heading: Tensor, speed: Tensor) -> Tensor:
-    """Return the steering angle of HighwayEnv's controller (`ControlledVehicle.steering_control`) towards a line.
-
-    Args:
-        offset: Place to the right of the line [m], any shape; the other tensors have the same.
-        heading: Heading relative to the line [rad].
-        speed: Speed [m/s].
-
-    Returns:
-        Steering angle [rad].
-    """
+    """Return HighwayEnv's steering angle [rad] back to a line at an offset to the right of it [m], any shape."""
     return steering_for(yaw_rate_towards(offset, heading, speed), speed.clamp(min=NEAR_ZERO))
 
 

@@ -81,14 +81,7 @@ class Mobil:
         return cls(0.0, 0.2, 2.0, 1.0, own_safety=False, reach=1.0)
 
     def choose(self, traffic: LaneTraffic, who: slice, idm: IDM, target: Tensor | None = None) -> LaneChoice:
-        """Return what changes to the left and to the right are worth.
-
-        Args:
-            traffic: B scenes of V vehicles.
-            who: The M vehicles that choose, of the V.
-            idm: Model by which everybody accelerates.
-            target: Lane that each vehicle moves to, its own if it keeps it, int64, shape (B, V); None if all keep it.
-        """
+        """Return what changes to both sides are worth to M of V vehicles, which move to lanes `target` (B, V)."""
         around = find_neighbours(traffic, who, traffic.lane if target is None else target, self.reach)
         return self.judge(traffic, who, idm, around)
 
@@ -116,17 +109,7 @@ class Mobil:
 
 
 def acceleration_behind(traffic: LaneTraffic, idm: IDM, follower: Tensor, lead: Tensor) -> Tensor:
-    """Return the acceleration of followers behind leads [m/s^2]; 0 where there is no follower.
-
-    Args:
-        traffic: B scenes of V vehicles.
-        idm: The model.
-        follower: Indices of the V, -1 for none, int64, shape (B, M, K) or one that broadcasts with it.
-        lead: Likewise.
-
-    Returns:
-        Shape (B, M, K).
-    """
+    """Return accelerations of followers behind leads [m/s^2], (B, M, K), by indices of V; 0 for none (-1)."""
     follower, lead = follower + torch.zeros_like(lead), lead + torch.zeros_like(follower)
 
     def of(values: Tensor, index: Tensor) -> Tensor:
@@ -183,16 +166,9 @@ class LaneChangingDriver:
         return draws.new_zeros(*draws.shape[:2], 2)
 
     def decide(self, traffic: LaneTraffic, who: slice, memory: Tensor, dt: float) -> tuple[Tensor, Tensor]:
-        """Decide for one tick.
+        """Return accelerations [m/s^2] and yaw rates [rad/s] of M of V vehicles for a tick, (B, M, 2), and new memory.
 
-        Args:
-            traffic: B scenes of V vehicles.
-            who: The M vehicles that are driven, of the V.
-            memory: Of each, its target lane + 1 and the time since it last decided [s], shape (B, M, 2).
-            dt: Tick [s].
-
-        Returns:
-            Accelerations [m/s^2] and yaw rates relative to the road [rad/s], shape (B, M, 2), and the new memory.
+        The memory of each is its target lane + 1 and the time since it last decided [s], (B, M, 2).
         """
         lane, y = traffic.lane, traffic.y[:, who]
         new = memory[..., 0] == 0

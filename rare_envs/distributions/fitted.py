@@ -31,13 +31,7 @@ def read_distribution(data: Mapping[str, Any]) -> FileDistribution:
 
 
 def read_record(kind: type[RecordT], what: str, data: object) -> RecordT:
-    """Return a frozen dataclass from an object of a file, with the same names.
-
-    Args:
-        kind: The dataclass, whose constructor checks the values.
-        what: Key of the object, for messages.
-        data: The object.
-    """
+    """Return a frozen dataclass, whose constructor checks the values, from an object of a file (`what` in messages)."""
     names = [each.name for each in fields(kind)]  # type: ignore[arg-type]  # a dataclass
     if not isinstance(data, Mapping):
         raise ValueError(f"Expected {what} as an object with {', '.join(names)}, got {data!r}.")

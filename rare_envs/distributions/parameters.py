@@ -88,11 +88,7 @@ def list_mixture_parameters(
 ) -> tuple[DistributionParameter, ...]:
     """Return weights (of several components), means, standard deviations and correlations, component by component.
 
-    Args:
-        mixture: Its arrays, in the order of the coordinates.
-        coordinates: Its coordinates.
-        names: Of the columns of x.
-        like: Mixture whose numbering of components is followed, if it has as many.
+    The components are numbered as those of `like`, if it has as many.
     """
     if like is not None and len(like.weights) == len(mixture.weights):
         mixture = MixtureArrays(*(values[match_components(mixture, like)] for values in mixture))

@@ -51,14 +51,11 @@ class Refits(tuple[Distribution, ...]):
 
 
 def pool_mixtures(mixtures: Sequence[CoordinateMixture]) -> CoordinateMixture | PooledMixture:
-    """Return one distribution of all mixtures, each with equal weight.
+    """Return one distribution of mixtures in the same box, each with equal weight.
 
     Those of the same coordinates become one mixture with the components of all, whose conditionals are cut to the box
-    as a whole, not each mixture's by itself. Its density is the mean of their densities up to factors 1 / (1 - mass
-    outside the box). Where the coordinates differ, the columns are taken in an order that serves all.
-
-    Args:
-        mixtures: In the same box; coordinates and numbers of components may differ.
+    as a whole, not each mixture's by itself: its density is the mean of theirs up to factors 1 / (1 - mass outside the
+    box). Where the coordinates differ, the columns are taken in an order that serves all.
     """
     for i, each in enumerate(mixtures):
         if not (np.array_equal(each.low, mixtures[0].low) and np.array_equal(each.high, mixtures[0].high)):

@@ -151,12 +151,7 @@ class EpisodeMeasure(Protocol):
 
 
 def check_one_each(value: Any, like: Tensor) -> Tensor:
-    """Return what a measure's function gave, if it is one number for each of B episodes.
-
-    Args:
-        value: What the function returned.
-        like: A tensor of shape (B,).
-    """
+    """Return what a measure's function gave, if it is one number for each of B episodes, as `like` (B,) has."""
     if isinstance(value, Tensor) and value.shape == like.shape:
         return value
     came = f"a tensor of shape {tuple(value.shape)}" if isinstance(value, Tensor) else repr(value)

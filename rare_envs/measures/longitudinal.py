@@ -107,12 +107,9 @@ def lidar_ttc(moment: Moment) -> Tensor:
 
 
 def lidar_ttc_terms(moment: Moment) -> Tensor:
-    """Return `lidar_ttc` by vehicle that a beam meets, and by whether that beam looks ahead or behind.
+    """Return `lidar_ttc` of each vehicle that a beam meets ahead, then behind [s], shape (B, 2 (N - 1)).
 
     Beams square to the ego look ahead. A vehicle that no beam meets has `TTC_MAX`.
-
-    Returns:
-        Time to collision [s], shape (B, 2 (N - 1)): of each vehicle ahead, then behind.
     """
     times, vehicles = _beam_times(moment).clamp(max=TTC_MAX), moment.state.x.shape[1] - 1
     met = (find_vehicles_met(moment.state, moment.road) - 1).clamp(min=0)  # what meets nobody has `TTC_MAX`

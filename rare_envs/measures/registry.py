@@ -63,12 +63,7 @@ FORMULA = "stl:"
 
 
 def load_measure(measure: Any) -> Any:
-    """Return what a text such as "stl:FORMULA" or "module:name" stands for; `find_measure` takes what it returns.
-
-    Args:
-        measure: "stl:always (gap > 2)", a formula of signal temporal logic; "module:name", a function of a `Moment` or
-            a measure in a module of the user's (those in the working directory are found); all else stays as it is.
-    """
+    """Return what "stl:FORMULA" or "module:name" (a function or a measure) stands for; all else as it is."""
     if not isinstance(measure, str) or ":" not in measure:
         return measure
     if measure.startswith(FORMULA):

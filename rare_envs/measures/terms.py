@@ -139,12 +139,7 @@ def find_order(measure: EpisodeMeasure, collisions: str, gamma: float) -> tuple[
 
     Where {f <= gamma} is the collision, as at gamma = 0 of times to collision, it is the clearance, which tells near
     from far where times are capped and does not jump from car to car: between the ego and the others, or between all
-    where all collisions count. Else it is the measure itself; None if that has no terms and no moments.
-
-    Args:
-        measure: Whose f it is.
-        collisions: Those that count, "ego" or "any".
-        gamma: Threshold of f.
+    where `collisions` are "any". Else it is the measure itself; None if that has no terms and no moments.
     """
     if gamma == 0.0 and isinstance(measure, Measure) and measure.collisions_only:
         return (PAIR_CLEARANCE if collisions == "any" else CLEARANCE), 0.0

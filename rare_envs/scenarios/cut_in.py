@@ -58,17 +58,10 @@ def _place_vehicles(
 
 
 def bezier(progress: Tensor, length: Tensor, offset: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the cubic Bezier from (0, offset) to (length, 0) with inner control points at thirds: level at both ends.
+    """Return y [m] and slope dy/dx of the cubic Bezier from (0, offset) to (length, 0), level at both ends, (B,) each.
 
-    With t = progress / length it is y = offset (1 - 3 t^2 + 2 t^3), before and after it straight on.
-
-    Args:
-        progress: Way along the road since the start of the path [m], shape (B,).
-        length: Length of the path along the road [m], shape (B,).
-        offset: Lateral offset at the start [m], shape (B,).
-
-    Returns:
-        y [m] and slope dy/dx, shape (B,) each.
+    Its inner control points are at thirds: with t = progress / length, y = offset (1 - 3 t^2 + 2 t^3), before and after
+    it straight on.
     """
     one, two, three, six = scalars((1.0, 2.0, 3.0, 6.0), progress)
     t = (progress / length).clamp(0.0, 1.0)

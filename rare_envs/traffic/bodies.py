@@ -107,17 +107,7 @@ def _reach(half: Sequence[Tensor], other: Sequence[Tensor], cos: Tensor, sin: Te
 
 
 def project_on_axes(x: Tensor, y: Tensor, heading: Tensor, other_heading: Tensor) -> Tensor:
-    """Return a vector along the four axes.
-
-    Args:
-        x: Component along the world's X axis, any shape; the other tensors have the same.
-        y: Component along its Y axis.
-        heading: Headings of the first bodies [rad].
-        other_heading: Headings of the other bodies [rad].
-
-    Returns:
-        Shape (..., 4).
-    """
+    """Return vectors (x, y) along the axes of two bodies by their headings [rad], any shape: (...) -> (..., 4)."""
     cos, sin = torch.cos(heading), torch.sin(heading)
     other_cos, other_sin = torch.cos(other_heading), torch.sin(other_heading)
     return torch.stack(
@@ -126,14 +116,7 @@ def project_on_axes(x: Tensor, y: Tensor, heading: Tensor, other_heading: Tensor
 
 
 def axes_of(dx: Tensor, dy: Tensor, heading: Tensor, other_heading: Tensor) -> Axes:
-    """Return two bodies along their four axes.
-
-    Args:
-        dx: Centre of the other less centre of the first [m], any shape; the other tensors have the same.
-        dy: Likewise across.
-        heading: Headings of the first [rad].
-        other_heading: Headings of the other [rad].
-    """
+    """Return two bodies along their four axes, from the way (dx, dy) [m] to the other's centre and headings [rad]."""
     turn = other_heading - heading
     cos, sin = torch.cos(turn).abs(), torch.sin(turn).abs()
     half = _halves(_SIZE, dx)
@@ -142,25 +125,14 @@ def axes_of(dx: Tensor, dy: Tensor, heading: Tensor, other_heading: Tensor) -> A
 
 
 def separation(axes: Axes) -> Tensor:
-    """Return the largest gap along an axis [m], shape (...).
-
-    Positive if and only if the bodies are apart, then at most their distance; else the negative depth of their overlap:
-    the least way that one has to be moved to be clear of the other.
-    """
+    """Return the largest gap along an axis [m], (...): the negative depth of an overlap, else at most the distance."""
     return axes.gap.amax(-1)
 
 
 def box_distance(axes: Axes, turn: Tensor) -> Tensor:
-    """Return the exact distance between two bodies [m], the negative depth of their overlap if they do.
+    """Return the exact distance of two bodies [m], (...), the negative depth of an overlap; turn is between headings.
 
     The distance of two convex polygons that are apart is that of a corner of one from the other.
-
-    Args:
-        axes: Of the two.
-        turn: Heading of the other less heading of the first [rad], shape (...).
-
-    Returns:
-        Shape (...).
     """
     along, across, other_along, other_across = axes.offset.unbind(-1)
     corners = _corner_distance(along, across, turn)
@@ -184,12 +156,7 @@ def _corner_distance(along: Tensor, across: Tensor, turn: Tensor) -> Tensor:
 
 
 def crossing(axes: Axes, rate: Tensor) -> Crossing:
-    """Return when the bodies overlap along each axis.
-
-    Args:
-        axes: Of the two bodies now.
-        rate: Velocity of the other less that of the first along the axes [m/s], shape (..., 4).
-    """
+    """Return when bodies overlap along each axis, (..., 4), at rates [m/s] of the offsets (..., 4)."""
     still = rate == 0
     speed = torch.where(still, 1.0, rate)
     middle, half = -axes.offset / speed, axes.reach / speed.abs()
@@ -198,16 +165,9 @@ def crossing(axes: Axes, rate: Tensor) -> Crossing:
 
 
 def time_to_contact(axes: Axes, rate: Tensor) -> Tensor:
-    """Return the exact time until two bodies touch if velocities and headings stay [s]: a swept test on the four axes.
+    """Return the exact time until two bodies touch if velocities and headings stay [s], (...); 0 now, inf for never.
 
-    They overlap while they do along every axis: from the last entry to the first exit.
-
-    Args:
-        axes: Of the two bodies now.
-        rate: Velocity of the other less that of the first along the axes [m/s], shape (..., 4).
-
-    Returns:
-        0 where they overlap now, inf where they never will, shape (...).
+    They overlap while they do along every axis: from the last entry to the first exit. Rates [m/s] are (..., 4).
     """
     times = crossing(axes, rate)
     enter, leave = times.enter.amax(-1), times.leave.amin(-1)
@@ -268,16 +228,7 @@ def _compare(state: State, road: Road, first: Tensor | slice, second: Tensor | s
 
 
 def ego_overlaps(state: State, road: Road, pose: WorldPose | None = None) -> Tensor:
-    """Return which vehicles' bodies overlap the ego's.
-
-    Args:
-        state: Traffic of B scenarios.
-        road: Their road.
-        pose: Where they are in the world, if that is known already.
-
-    Returns:
-        Boolean, shape (B, N - 1).
-    """
+    """Return which vehicles' bodies overlap the ego's, boolean, (B, N - 1); `pose` is where they are, if known."""
     return _overlap_of(_in_world(state, road, pose), slice(0, 1), slice(1, None))
 
 
@@ -290,16 +241,7 @@ def others_overlap(state: State, road: Road, pose: WorldPose | None = None) -> T
 
 
 def pairwise_overlaps(state: State, road: Road, pose: WorldPose | None = None) -> Tensor:
-    """Return which vehicles' bodies overlap which.
-
-    Args:
-        state: Traffic of B scenarios.
-        road: Their road.
-        pose: Where they are in the world, if that is known already.
-
-    Returns:
-        Boolean, shape (B, N, N), symmetric, nobody with itself; row 0 is `ego_overlaps`.
-    """
+    """Return which bodies overlap which, boolean, (B, N, N), symmetric, nobody with itself; row 0 is `ego_overlaps`."""
     batch, n = state.x.shape
     first, second = (indices(index, state.x) for index in pairs(n))
     overlapping = _overlap_of(_in_world(state, road, pose), first, second)

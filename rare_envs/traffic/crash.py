@@ -105,15 +105,8 @@ def injury_risk(delta_v: Tensor, mode: str = "all") -> Tensor:
 def crash_of(state: State, road: Road, before: State | None = None, dt: float = 0.1) -> Crash:
     """Return the crash of the ego in each of B scenarios at the moment in which it happened.
 
-    Args:
-        state: Traffic at that moment.
-        road: Their road.
-        before: Traffic one tick earlier, from which the ways of the tick are known; None goes by speeds and headings.
-        dt: Tick [s].
-
-    Returns:
-        With the first vehicle that the ego touched, or with the edge of the road where it overlaps none and has left
-        the road; else no crash.
+    With the first vehicle that it touched, or with the edge of the road where it overlaps none and is off the road. The
+    ways of the tick are known from `before`, the traffic one tick earlier; None goes by speeds and headings.
     """
     crash = _pair_crash(state, road, before, dt, slice(0, state.x.shape[1] - 1))
     off = (crash.kind == NONE) & road.off_road(state.y[:, 0])

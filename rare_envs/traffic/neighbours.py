@@ -129,14 +129,10 @@ class Neighbours(NamedTuple):
 
 
 def find_neighbours(traffic: LaneTraffic, who: slice, target: Tensor, reach: float = 0.0) -> Neighbours:
-    """Return the neighbours of some vehicles, by the places of centres: ahead where x is not less.
+    """Return the neighbours of the M vehicles `who` in V, by the places of centres: ahead where x is not less.
 
-    Args:
-        traffic: B scenes of V vehicles.
-        who: The M vehicles whose neighbours are wanted, of the V.
-        target: Lane that each vehicle moves to, its own if it keeps it, int64, shape (B, V). A vehicle counts as one in
-            its target lane, as one does that has signalled.
-        reach: A vehicle also counts as one in a lane while its centre is at most this far beyond the lane's edge [m].
+    A vehicle counts in its own lane, in the lane `target` (B, V) that it moves to, as one does that has signalled, and
+    in those whose edges are within `reach` [m] of its centre.
     """
     lane = traffic.lane
     wanted = lane[:, who, None] + torch.arange(-1, 2, device=lane.device)  # (B, M, 3)

@@ -11,12 +11,7 @@ CRASH_COLOUR = "#d62828"
 
 
 def vehicle_colour(name: str, number: int = 0) -> str:
-    """Return the colour of a vehicle.
-
-    Args:
-        name: What the scenario calls it.
-        number: Of the vehicle, to tell those of other names apart.
-    """
+    """Return the colour of a vehicle by its name, or by its number if scenarios call no vehicle so."""
     return OTHER_COLOURS[number % len(OTHER_COLOURS)] if name not in ROLE_COLOURS else ROLE_COLOURS[name]
 
 

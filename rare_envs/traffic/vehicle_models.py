@@ -74,17 +74,10 @@ def bicycle(
 
 
 def steering_for(yaw_rate: Tensor, speed: Tensor) -> Tensor:
-    """Return the steering angle with which `bicycle` turns at a yaw rate.
+    """Return the steering angle [rad] with which `bicycle` turns at a yaw rate [rad/s] and speed [m/s], (B,).
 
     Inverts yaw rate = v sin(beta) / (l / 2), beta = atan(tan(steering) / 2), with l the vehicle's length. A vehicle
     too slow to turn as fast as wanted steers by `STEERING_LIMIT`.
-
-    Args:
-        yaw_rate: Wanted [rad/s], shape (B,).
-        speed: [m/s], shape (B,).
-
-    Returns:
-        Steering angle [rad], shape (B,).
     """
     sine = VEHICLE_LENGTH / 2 / speed.clamp(min=NEAR_ZERO) * yaw_rate
     slip = torch.asin(sine.clamp(-MAX_SLIP_SINE, MAX_SLIP_SINE))
