@@ -13,6 +13,7 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 import training.fit.recordings as fitting
+from rare_envs.study.ego_check import VERDICTS
 from tests.rare_envs.study.refusals import FOLLOWING, SMALL, Cli, assert_refused
 
 REFUSED = {
@@ -47,7 +48,12 @@ REFUSED = {
         (["--out", "bases", "--highd", "a", "--scenario", "overtaking"], "Unknown scenario overtaking"),
         (["--out", "bases", "--highd", "a", "--name", "a/b"], "Expected --name"),
     ),
-    "check-ego": ((["idm", "rare_envs/CutIn-v9"], "rare_envs/CutIn-v0"),),
+    "check-ego": (
+        (["idm", "rare_envs/CutIn-v9"], "rare_envs/CutIn-v0"),
+        (["no_such.zip", FOLLOWING], "No ego at 'no_such.zip'; in that folder: corrupt.zip"),
+        (["process:no_such.onnx", FOLLOWING], "No ego at 'no_such.onnx': the folder '.' has no .onnx"),
+        (["imitatoin", FOLLOWING], "Unknown ego 'imitatoin' (did you mean 'imitation'?)"),
+    ),
 }
 
 
@@ -118,7 +124,7 @@ def test_an_ego_is_checked_in_the_traffic_that_is_asked_for(cli: Cli) -> None:
     assert findings[-1]["status"] == "fail"
     assert "nowhere" in findings[-1]["found"]
     refused = cli("check-ego", "https://example.org/ego.zip", FOLLOWING)
-    assert refused.exit_code == 2 and "remote place" in refused.stdout
+    assert refused.exit_code == 2 and "remote place" in refused.stdout and VERDICTS[2] in refused.stdout
 
 
 def test_an_ego_is_exported(cli: Cli, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
