@@ -59,12 +59,8 @@ class Methods(Mapping[str, type[Stepping]]):
         [project.entry-points."rare_envs.samplers"]
         lattice = "their_package:Lattice"
 
-    with the `name` of the class on the left. Other packages are imported when a name that is not
-    ours, or the list of all names, is first requested. An entry point that cannot be used is left
-    out with a `RuntimeWarning` that names it.
-
-    Args:
-        own: Our own methods.
+    with the `name` of the class on the left. Other packages are imported when a name that is not ours, or the list of
+    all names, is first requested. An entry point that cannot be used is left out with a `RuntimeWarning` that names it.
     """
 
     def __init__(self, *own: type[Stepping]) -> None:
@@ -85,8 +81,9 @@ class Methods(Mapping[str, type[Stepping]]):
                     raise ValueError("that name is taken")
                 loaded[entry.name] = _load_method(entry)
             except Exception as error:  # an error of another package must not break this one
-                message = f"The method {_describe_entry(entry)} cannot be used: {type(error).__name__}: {error}"
-                warnings.warn(message, RuntimeWarning, stacklevel=2)
+                package = "" if entry.dist is None else f" of {entry.dist.name}"
+                what = f"The method {entry.name!r}{package} ({entry.value}) cannot be used"
+                warnings.warn(f"{what}: {type(error).__name__}: {error}", RuntimeWarning, stacklevel=2)
         return loaded
 
     def __getitem__(self, name: str) -> type[Stepping]:
@@ -146,12 +143,6 @@ def _load_method(entry: EntryPoint) -> type[Stepping]:
     if cls.name != entry.name:
         raise ValueError(f"the class {cls.__name__} is named {cls.name!r}, its entry point {entry.name!r}")
     return cls
-
-
-def _describe_entry(entry: EntryPoint) -> str:
-    """Return the name, package and value of an entry point, in words."""
-    package = "" if entry.dist is None else f" of {entry.dist.name}"
-    return f"{entry.name!r}{package} ({entry.value})"
 
 
 # The estimate
@@ -393,7 +384,7 @@ def _run_method(
     """Run a method to its end, to the first condition that stops it, or to an interruption."""
     with show_bar(arguments.max_sim) if progress is True else nullcontext(progress or None) as listener:
         if evaluator.workers and listener is not None:
-            listener = _Pace(listener, evaluator).on_progress
+            listener = _follow_chunks(listener, evaluator)
         run = Run(inputs, method, arguments, listener, evaluator.offer, keep_points)
         try:
             while not run.done:
@@ -426,34 +417,30 @@ def _add_remarks(result: Estimate, evaluator: Evaluator) -> Estimate:
 # Progress
 
 
-class _Pace:
-    """Tells a listener of every chunk that the workers of an evaluator have done, and how long the rest takes."""
+def _follow_chunks(listener: Listener, evaluator: Evaluator) -> Listener:
+    """Return a listener of a run that is told of every chunk of the workers too, and how long the rest takes."""
+    started, shown = time.monotonic(), 0
+    latest: Progress | None = None
 
-    def __init__(self, listener: Listener, evaluator: Evaluator) -> None:
-        self._listener, self._evaluator = listener, evaluator
-        self._started = time.monotonic()
-        self._latest: Progress | None = None
-        self._shown = 0
-        evaluator.on_chunk = self.on_chunk
-
-    def on_progress(self, progress: Progress) -> None:
-        """Take the progress of the run, after a batch or a level."""
-        self._latest = progress
-        self._show(progress)
-
-    def on_chunk(self, n_done: int) -> None:
-        """Take the number of simulations of the present batch that are done."""
-        latest = self._latest
-        if latest is not None and latest.n_sim + n_done > self._shown:
-            self._show(replace(latest, n_sim=latest.n_sim + n_done))
-
-    def _show(self, progress: Progress) -> None:
-        self._shown, counts = progress.n_sim, self._evaluator
-        n_made, seconds = progress.n_sim - counts.n_restored, time.monotonic() - self._started
-        left = None
+    def show(progress: Progress) -> None:
+        nonlocal shown
+        shown, left = progress.n_sim, None
+        n_made = progress.n_sim - evaluator.n_restored
         if progress.max_sim is not None and n_made > 0:
-            left = (progress.max_sim - progress.n_sim) * seconds / n_made
-        self._listener(replace(progress, workers=counts.workers, n_retries=counts.n_retries, seconds_left=left))
+            left = (progress.max_sim - progress.n_sim) * (time.monotonic() - started) / n_made
+        listener(replace(progress, workers=evaluator.workers, n_retries=evaluator.n_retries, seconds_left=left))
+
+    def take_progress(progress: Progress) -> None:
+        nonlocal latest
+        latest = progress
+        show(progress)
+
+    def take_chunk(n_done: int) -> None:
+        if latest is not None and latest.n_sim + n_done > shown:
+            show(replace(latest, n_sim=latest.n_sim + n_done))
+
+    evaluator.on_chunk = take_chunk
+    return take_progress
 
 
 def describe_workers(progress: Progress) -> str:

@@ -63,8 +63,7 @@ class Evaluator:
         lost: Why rows have nothing that no worker survived.
         n_retried: Rows that were simulated again to find those that fail; they are not in `n_sim` of an estimate.
         n_restored: Rows whose results were taken from the journal.
-        n_made: Simulations of which f is known, those of a request that is not complete included.
-        n_failed: Those of them that failed, or have no outcome.
+        n_made, n_failed: Simulations of which f is known, also of a request that is not complete; those that failed.
         workers: Number of workers; 0 without an executor.
         watchers: Each is called with what was simulated, request by request.
         on_chunk: Called with the number of rows of a request that are done, after every chunk.
@@ -95,22 +94,12 @@ class Evaluator:
         name: str = "f",
         precision: DTypeLike = np.float64,
     ) -> None:
-        """Wrap a problem.
+        """Wrap a problem; `gamma`, `on_error` and `name` are those of `Work`.
 
-        Args:
-            problem: As of `Work`.
-            gamma: Threshold of failure.
-            on_error: As of `Work`.
-            journal: Keeps what has been computed, and may have some from before.
-            executor: Where chunks are computed; None for here.
-            seed: Of the run, for what simulations draw in workers.
-            size: Rows of a chunk; None for `chunk_size` of the problem with an executor, and to leave requests whole
-                without one.
-            name: Of what fails, for messages.
-            precision: In which x is simulated: points that differ by less are the same to the journal.
-
-        Raises:
-            ValueError: If the problem has gradients and its gradient_cost is no positive number, or a size is none.
+        The journal keeps what has been computed, and may have some from before. Chunks, of `size` rows, are computed by
+        the executor, if any, and what simulations draw there follows from the seed; without a size they have the
+        problem's `chunk_size` with an executor, and are whole requests without. Points that differ by less than the
+        precision, in which x is simulated, are the same to the journal.
         """
         self.problem, self._journal, self._executor, self._seed = problem, journal, executor, seed
         self.dim, self.base = int(problem.dim), problem.base
@@ -145,12 +134,7 @@ class Evaluator:
         return 0 if self._pool is None else self._pool.n_retries
 
     def respond(self, requests: Sequence[Request]) -> list[Answer]:
-        """Return the answers to some requests, in their order; f may still be NaN.
-
-        Raises:
-            EvaluationError: A row fails (on_error "raise"), or what the problem gives is not of the right form.
-            JournalError: The journal has other points, or f had other values at them than it has now.
-        """
+        """Return the answers to some requests, in their order; f may still be NaN."""
         answers: dict[int, Answer] = {}
         plain = {i: one for i, one in enumerate(requests) if isinstance(one, np.ndarray)}
         wanted = {i: one.x for i, one in enumerate(requests) if isinstance(one, TermsRequest)}

@@ -123,12 +123,7 @@ class Journal:
 
     @classmethod
     def create(cls, path: Path, head: dict[str, Any], replace: bool = False) -> Journal:
-        """Begin a journal in the place of one without finished simulations, or of any (`replace`).
-
-        Raises:
-            JournalError: There is one already, or another process has it open.
-            OSError: It cannot be written.
-        """
+        """Begin a journal in the place of one without finished simulations, or of any (`replace`), that is not open."""
         if _has_simulations(path) and not replace:
             raise JournalError(f"There is a journal already, {str(path)!r}: remove it, or choose another file.")
         for name in (path, _wal(path)):
@@ -153,11 +148,7 @@ class Journal:
         """Continue a journal, all of whose digests are verified.
 
         Of a damaged one, `mend` keeps what stands before the damage; if that is its first record it is left as it is.
-
-        Raises:
-            NothingRecorded: It was cut before its first record.
-            JournalError: It is damaged, with `mend` in its first record, or another process has it open.
-            OSError: It cannot be read.
+        Raises NothingRecorded for one that was cut before its first record.
         """
         missing = _count_missing(path)
         try:

@@ -45,7 +45,32 @@ class Goal:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Outcome:
+class Finding:
+    """What one run of a method and the whole estimate have in common."""
+
+    p: float
+    """Estimated probability P[f(X) <= gamma]."""
+    interval: tuple[float, float]
+    """Interval that should hold the true p with probability `confidence`."""
+    cov: float
+    """Estimated coefficient of variation of p; inf where p = 0."""
+    status: Status
+    """End of the run."""
+    warnings: tuple[str, ...] = ()
+    """Reasons for which the numbers are doubtful, a sentence each; empty if none is known."""
+    remarks: tuple[str, ...] = ()
+    """Facts about how the run went that cast no doubt on the numbers, a sentence each, such as a change of method."""
+    trace: tuple[Level, ...] = ()
+    """One entry per level, iteration or batch."""
+    sample: Sample | None = field(default=None, compare=False, repr=False)
+    """The weighted points behind p; None if the method cannot give them."""
+    base_draws: int = 0
+    """Independent draws from the base distribution that the run made, search included: `Estimate.unseen` follows from
+    them. Of draws from a mixture, the expected number from its base component."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Outcome(Finding):
     """Result of one run of a method.
 
     Example:
@@ -55,29 +80,10 @@ class Outcome:
         (0.01, [0.0048, 0.0183], 0.315)
     """
 
-    p: float
-    """Estimated probability P[f(X) <= goal.gamma]."""
-    interval: tuple[float, float]
-    """Interval that should hold the true p with probability goal.confidence."""
-    cov: float
-    """Estimated coefficient of variation of p; inf where p = 0."""
-    status: Status
-    """End of the run."""
-    warnings: tuple[str, ...] = ()
-    """Reasons for which the numbers are doubtful, a sentence each."""
-    remarks: tuple[str, ...] = ()
-    """Facts about how the run went that cast no doubt on the numbers, a sentence each."""
-    trace: tuple[Level, ...] = ()
-    """One entry per level, iteration or batch."""
     no_outcome_share: float = 0.0
     """Share of p that comes from points without an outcome (f raised or gave NaN)."""
     counts: tuple[int, int] | None = None
     """(k, n) where p = k / n and k counts the failing ones of n independent draws: such runs pool."""
-    sample: Sample | None = None
-    """The points behind p; None if the method cannot give them."""
-    base_draws: int = 0
-    """Independent draws from the base distribution that the run made, search included: `Estimate.unseen` follows from
-    them. Of draws from a mixture, the expected number from its base component."""
     draw_weights: tuple[DrawWeights, ...] = ()
     """Weights of single simulations in p; empty where p is no sum over simulations, as with chains."""
 
@@ -266,45 +272,27 @@ def _hit_warnings(hits: int, n: int) -> tuple[str, ...]:
 
 
 @dataclass(frozen=True, kw_only=True)
-class EstimateData:
-    """The attributes of `samplers.Estimate`, which its analyses read."""
+class EstimateData(Finding):
+    """What a whole run has found, before any analysis of it: the attributes of `samplers.Estimate`."""
 
-    p: float
-    """Estimated probability."""
-    interval: tuple[float, float]
-    """Interval that should hold the true p with probability `confidence`."""
     confidence: float
     """Nominal coverage of `interval`."""
-    cov: float
-    """Estimated coefficient of variation of p; inf where p = 0."""
     gamma: float
     """Threshold of failure."""
     n_sim: int
     """Simulated points of the whole run, search included."""
     gain: float
     """Plain Monte Carlo runs for the same c.o.v., divided by n_sim; NaN where p is 0 or 1."""
-    status: Status
-    """End of the run."""
-    warnings: tuple[str, ...]
-    """Reasons for which the numbers are doubtful; empty if none is known."""
-    remarks: tuple[str, ...] = ()
-    """Facts about how the run went that cast no doubt on the numbers, such as a change of method."""
-    trace: tuple[Level, ...]
-    """One entry per level, iteration or batch."""
     failures: Failures
     """Failing points, the most likely first."""
     method: Stepping
     """The method and its settings."""
     seed: int
     """Seed that gives the same run again."""
-    sample: Sample | None = field(default=None, compare=False, repr=False)
-    """The weighted points behind p; None if the method cannot give them."""
     base: Distribution | None = field(default=None, compare=False, repr=False)
     """Distribution of X."""
     on_error: str = field(default="raise", repr=False)
     """Treatment of rows on which f raised or gave NaN."""
-    base_draws: int = 0
-    """Simulations that were independent draws from the base distribution."""
     given: str = ""
     """Condition of p, which the problem holds fixed: its attribute `given`, if it has one."""
     column_names: tuple[str, ...] = field(default=(), compare=False, repr=False)
