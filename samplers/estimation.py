@@ -10,7 +10,7 @@ import warnings
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing, contextmanager, nullcontext
 from dataclasses import replace
-from functools import cached_property
+from functools import cached_property, partial
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from types import FrameType
@@ -284,8 +284,11 @@ def estimate(
         known = choose_seed(seed if kept is None else kept.head["seed"])
         arguments = replace(arguments, seed=known)
         with Evaluator(problem, arguments.gamma, on_error, journal=kept, executor=places, seed=known) as evaluator:
+            run = partial(run_method, evaluator, progress=progress, stop=stops, keep_points=keep_points)
             try:
-                result = simulate(evaluator, chosen, arguments, progress, stops, ensemble_run, keep_points)
+                result = run(evaluator, chosen, arguments)
+                if ensemble_run:
+                    result = add_ensemble_run(result, evaluator, chosen, arguments, run)
             except EstimationInterrupted as stopped:
                 raise EstimationInterrupted(_add_remarks(stopped.estimate, evaluator)) from None
     return _add_remarks(result, evaluator)
@@ -336,52 +339,19 @@ def find_stop(time_limit: float | None, stop: Callable[[Progress], bool] | None)
     return reason
 
 
-def simulate(
-    evaluator: Evaluator,
-    method: Stepping,
-    arguments: RunArguments,
-    progress: bool | Listener = False,
-    stop: Stop = lambda progress: None,
-    ensemble_run: bool = True,
-    keep_points: bool = False,
-) -> Estimate:
-    """Return the estimate of a method, and of its further run under the mixture of the refits if it needs one.
-
-    `TwoStage` makes that where the method cannot search under a mixture. An interruption, if not before the first
-    batch, is an EstimationInterrupted with what is known.
-    """
-    first = _run_method(evaluator, evaluator, method, arguments, progress, stop, keep_points)
-    problem, base = evaluator.problem, evaluator.base
-    split = getattr(problem, "failing_parts", None)  # shares (m, k) of failing points (k, d) in m parts
-    if not ensemble_run or first.status is Status.STOPPED or not needs_ensemble_run(first, split):
-        return first
-    if not hasattr(base, "ensemble"):
-        return first
-    further = replace(arguments, seed=first.seed, target_cov=None, replicates=1)
-    try:
-        inputs = InputsOnly(evaluator.dim, pool_refits(base))
-    except ValueError:  # refits that are no mixtures; the first run stands, with a warning of `BaseUncertainty`
-        return first
-    try:
-        Run(inputs, method, further)
-    except ValueError:  # blocks of a product, which a mixture has none of
-        method = TwoStage()
-    try:
-        return replace(first, ensemble_run=_run_method(evaluator, inputs, method, further, progress, stop, keep_points))
-    except KeyboardInterrupt:
-        raise EstimationInterrupted(first) from None
-
-
-def _run_method(
+def run_method(
     evaluator: Evaluator,
     inputs: Inputs,
     method: Stepping,
     arguments: RunArguments,
-    progress: bool | Listener,
-    stop: Stop,
-    keep_points: bool,
+    progress: bool | Listener = False,
+    stop: Stop = lambda progress: None,
+    keep_points: bool = False,
 ) -> Estimate:
-    """Run a method to its end, to the first condition that stops it, or to an interruption."""
+    """Run a method to its end, to the first condition that stops it, or to an interruption.
+
+    That, if not before the first batch, is an EstimationInterrupted with what is known.
+    """
     with show_bar(arguments.max_sim) if progress is True else nullcontext(progress or None) as listener:
         if evaluator.workers and listener is not None:
             listener = _follow_chunks(listener, evaluator)
@@ -400,6 +370,31 @@ def _run_method(
             run.stop("Interrupted")
             raise EstimationInterrupted(run.result()) from None
     return run.result()
+
+
+def add_ensemble_run(
+    first: Estimate, evaluator: Evaluator, method: Stepping, arguments: RunArguments, run: Callable[..., Estimate]
+) -> Estimate:
+    """Return an estimate with the run under the mixture of the refits, where it needs one and there can be one.
+
+    `TwoStage` makes that, by `run(inputs, method, arguments)`, where the method cannot search under a mixture.
+    """
+    base, split = evaluator.base, getattr(evaluator.problem, "failing_parts", None)  # shares (m, k) of points in parts
+    if first.status is Status.STOPPED or not needs_ensemble_run(first, split) or not hasattr(base, "ensemble"):
+        return first
+    further = replace(arguments, seed=first.seed, target_cov=None, replicates=1)
+    try:
+        inputs = InputsOnly(evaluator.dim, pool_refits(base))
+    except ValueError:  # refits that are no mixtures; the first run stands, with a warning of `BaseUncertainty`
+        return first
+    try:
+        Run(inputs, method, further)
+    except ValueError:  # blocks of a product, which a mixture has none of
+        method = TwoStage()
+    try:
+        return replace(first, ensemble_run=run(inputs, method, further))
+    except KeyboardInterrupt:
+        raise EstimationInterrupted(first) from None
 
 
 def _add_remarks(result: Estimate, evaluator: Evaluator) -> Estimate:

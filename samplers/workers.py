@@ -108,8 +108,12 @@ def join_results(parts: Sequence[Result]) -> Result:
 # Rows that fail
 
 
-def isolate(attempt: Callable[[Chunk], Result], chunk: Chunk, fail: Callable[..., None]) -> Result:
-    """Return what the rows of a chunk give, those that fail left out; its `reasons` are a dict by row.
+Attempt = Callable[[Chunk], Result]
+"""Its notes have `reasons` as a dict by row."""
+
+
+def isolate(attempt: Attempt, chunk: Chunk, first: Result | BaseException, fail: Callable[..., None]) -> Result:
+    """Return what the rows of a chunk give, those that fail left out, after a first attempt that gave or raised this.
 
     Where an attempt raises, its parts are attempted (`split_rows`), until the rows that raise stand alone. A row that
     has given nothing is attempted once more; if that gives nothing either, `fail(row, reason, error)` is told, which
@@ -117,38 +121,42 @@ def isolate(attempt: Callable[[Chunk], Result], chunk: Chunk, fail: Callable[...
     """
     n_retried, lost, found = 0, dict[int, str](), list[tuple[NDArray[np.int64], Result]]()
 
-    def settle(rows: NDArray[np.int64], again: bool = True) -> None:
+    def settle(rows: NDArray[np.int64], met: Result | BaseException, again: bool) -> None:
         nonlocal n_retried
-        n_retried += len(rows) if again else 0
-        try:
-            found.append((rows, attempt(chunk.take(rows) if again else chunk)))
-        except (Exception, SystemExit) as error:  # the simulation is the user's: anything may happen in it
-            if getattr(error, "final", False):  # calling f again cannot help
-                raise
-            if again and len(rows) == 1:
-                lost[int(rows[0])] = reason_of(error)
-                fail(int(rows[0]), reason_of(error), error)
-                found.append((rows, Result(np.full((1, 1), np.nan), {})))
-                return
-            parts = split_rows(rows, error, len(chunk))
+        if isinstance(met, Result):
+            found.append((rows, met))
+        elif getattr(met, "final", False):  # calling f again cannot help
+            raise met
+        elif again and len(rows) == 1:
+            lost[int(rows[0])] = reason_of(met)
+            fail(int(rows[0]), lost[int(rows[0])], met)
+            found.append((rows, Result(np.full((1, 1), np.nan), {})))
         else:
-            return
-        for part in parts:
-            settle(part)
+            for part in split_rows(rows, met, len(chunk)):
+                n_retried += len(part)
+                settle(part, try_attempt(attempt, chunk.take(part)), True)
 
-    settle(np.arange(len(chunk)), again=False)
+    settle(np.arange(len(chunk)), first, False)
     unsure = {int(rows[at]): why for rows, each in found for at, why in each.notes.get("reasons", {}).items()}
     if unsure:
-        settle(np.array(sorted(unsure)))
+        rows = np.array(sorted(unsure))
+        n_retried += len(rows)
+        settle(rows, try_attempt(attempt, chunk.take(rows)), True)
     whole = join_results([each for _, each in found])
-    table = whole.table
-    if len(found) > 1:
-        table = np.empty((len(chunk), whole.table.shape[1]))
-        table[np.concatenate([rows for rows, _ in found])] = whole.table  # what came last stands
+    table = np.empty((len(chunk), whole.table.shape[1]))
+    table[np.concatenate([rows for rows, _ in found])] = whole.table  # what came last stands
     again_failed = {row: why for row, why in unsure.items() if np.isnan(table[row, 0])}
     for row in sorted(set(again_failed) - set(lost)):
         fail(row, again_failed[row])
     return Result(table, {**whole.notes, "reasons": {**again_failed, **lost}, "n_retried": n_retried})
+
+
+def try_attempt(attempt: Attempt, chunk: Chunk) -> Result | BaseException:
+    """Return what an attempt gives or raises; what is no fault of a row (an ego that is gone, Ctrl-C) is raised."""
+    try:
+        return attempt(chunk)
+    except (Exception, SystemExit) as error:  # the simulation is the user's: anything may happen in it
+        return error
 
 
 def split_rows(rows: NDArray[np.int64], error: BaseException, whole: int) -> list[NDArray[np.int64]]:
@@ -191,10 +199,16 @@ class Work:
 
     def __call__(self, chunk: Chunk) -> Result:
         """Compute a chunk; raise an EvaluationError for a row that fails ("raise") and for results of a wrong form."""
-        start = time.perf_counter()
+        start, attempt = time.perf_counter(), partial(_ATTEMPTS[chunk.kind], self.problem, self.gamma)
         with np.errstate():  # a problem that sets NumPy's errors sets them for itself
-            attempt = partial(_ATTEMPTS[chunk.kind], self.problem, self.gamma)
-            table, notes = isolate(attempt, chunk, partial(self.refuse, chunk))
+            found: Any
+            try:
+                found = attempt(chunk)
+            except (Exception, SystemExit) as error:  # the problem is the user's: anything may happen in it
+                found = error
+            if not isinstance(found, Result) or found.notes["reasons"]:
+                found = isolate(attempt, chunk, found, partial(self.refuse, chunk))
+        table, notes = found.table, {"n_retried": 0, **found.notes}
         reasons = notes.pop("reasons")
         if chunk.kind == "gradient":
             notes["cost"] = notes.get("cost", 0.0) + float(self.problem.gradient_cost) * len(reasons)
@@ -242,7 +256,7 @@ def _attempt_gradient(problem: Any, gamma: float, chunk: Chunk) -> Result:
     values = np.asarray(found.values, dtype=np.float64)
     if values.shape != x.shape:
         raise EvaluationError(f"Expected gradients of shape {x.shape}, got {values.shape}.")
-    return Result(values, {"cost": float(found.cost)})
+    return Result(values, {"cost": float(found.cost), "reasons": {}})
 
 
 _ATTEMPTS: dict[str, Callable[..., Result]] = {

@@ -12,6 +12,7 @@ import time
 from collections.abc import Callable
 from contextlib import closing
 from dataclasses import asdict, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, cast
 
@@ -45,7 +46,7 @@ from rare_envs.study.question import (
 from rare_envs.study.report import Repeatability, Report
 from rare_envs.study.run_folder import STUDY
 from rare_envs.study.writing import begin_journal, begin_study_file, continue_journal, finish_run, note_resumption
-from samplers.estimation import check_base, simulate
+from samplers.estimation import add_ensemble_run, check_base, run_method
 from samplers.evaluate import Evaluator, Simulated, find_changed
 from samplers.executors import Executor
 from samplers.journal import Journal
@@ -180,9 +181,12 @@ def _estimate(
 ) -> samplers.Estimate:
     """Run the method of a study, and the further run under the refits."""
     check_base(study.problem)
-    question = study.question
+    arguments, run = study.question.run_arguments, partial(run_method, evaluator, progress=progress)
     with evaluator:
-        return simulate(evaluator, study.method, question.run_arguments, progress, ensemble_run=question.ensemble_run)
+        estimate = run(evaluator, study.method, arguments)
+        if study.question.ensemble_run:
+            estimate = add_ensemble_run(estimate, evaluator, study.method, arguments, run)
+    return estimate
 
 
 class RowKeeper:

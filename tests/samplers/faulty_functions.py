@@ -69,7 +69,12 @@ class KillsItself:
 
     def __call__(self, x: Any) -> float:
         number = len(list(self.folder.iterdir()))
-        (self.folder / f"{number}-{os.getpid()}-{time.monotonic_ns()}").touch()
+        while True:  # each number once, whoever counts at the same time
+            try:
+                (self.folder / str(number)).touch(exist_ok=False)
+                break
+            except FileExistsError:
+                number += 1
         if number % self.one_in == self.one_in - 1:
             os.kill(os.getpid(), signal.SIGKILL)
         return half_space(x)

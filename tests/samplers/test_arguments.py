@@ -22,13 +22,6 @@ def test_the_defaults_of_the_front_doors_are_these(door):
     assert {each.name: defaults[each.name] for each in fields(RunArguments)} == vars(RunArguments())
 
 
-def test_goal_has_numbers_of_python():
-    arguments = RunArguments(gamma=np.float32(0.5), max_sim=np.int16(900), target_cov=np.float32(0.25), confidence=0.9)
-    goal = arguments.goal
-    assert (goal.gamma, goal.max_sim, goal.target_cov, goal.confidence) == (0.5, 900, 0.25, 0.9)
-    assert [type(value) for value in (goal.gamma, goal.max_sim, goal.target_cov)] == [float, int, float]
-
-
 def test_a_seed_is_kept_or_drawn():
     assert choose_seed(np.int64(7)) == 7
     assert type(choose_seed(np.int64(7))) is int

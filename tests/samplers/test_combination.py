@@ -30,13 +30,6 @@ def test_cov_is_the_larger_of_own_and_seen():
     assert apart == pytest.approx(math.sqrt(2) / 2 / math.sqrt(2))
 
 
-def test_without_any_hit_the_interval_is_one_sided():
-    none = [outcome(0.0, math.inf, Status.NO_HITS, interval=(0.0, h)) for h in (0.01, 0.02)]
-    result = combine(none, 0.95)
-    assert (result.p, result.interval, result.status) == (0.0, (0.0, 0.02), Status.NO_HITS)
-    assert math.isinf(result.cov)
-
-
 def test_runs_that_nearly_tie_are_no_closer_than_their_own_errors_allow():
     """Three shares of 333, 333 and 334 draws with five hits each: their spread is rounding."""
     result = combine([outcome(5 / n, 0.45) for n in (333, 333, 334)], 0.95)
@@ -57,12 +50,6 @@ def test_warnings_are_counted_and_the_worst_status_kept():
     result = combine([*runs, outcome(1e-4, warnings=("odd",))], 0.95)
     assert result.warnings == ("In 2 of 3 runs: odd",)
     assert result.status is Status.BUDGET
-
-
-@pytest.mark.parametrize("counts", [None, (1, 10_000)])
-def test_remarks_are_counted_too_and_are_no_warnings(counts):
-    runs = [outcome(1e-4, cov=1.0, remarks=("base draws",), counts=counts), outcome(1e-4, cov=1.0, counts=counts)]
-    assert combine(runs, 0.95).remarks == ("In 1 of 2 runs: base draws",)
 
 
 def test_replicates_of_monte_carlo_are_one_longer_run():
@@ -144,22 +131,6 @@ def test_runs_that_disagree_are_told_of():
     assert any("disagree" in text for text in combine(runs, 0.95).warnings)
     alike = [outcome(p, cov=0.02) for p in (1.00e-4, 1.03e-4, 0.97e-4, 1.02e-4, 0.99e-4)]
     assert not combine(alike, 0.95).warnings
-
-
-@pytest.mark.parametrize(("hits", "n"), [(1, 50), (20, 400), (400, 400)])
-def test_outcome_of_counts_is_the_binomial_share(hits, n):
-    outcome = samplers.Outcome.of_counts(hits, n, 0.9, trace=())
-    assert outcome.p == hits / n
-    assert outcome.interval == clopper_pearson(hits, n, 0.9)
-    assert outcome.cov == binomial_cov(hits / n, n)
-    assert (outcome.counts, outcome.base_draws, outcome.status) == ((hits, n), n, "converged")
-
-
-def test_no_hit_has_a_one_sided_interval_and_a_warning():
-    outcome = samplers.Outcome.of_counts(0, 1000, 0.95, trace=())
-    assert (outcome.p, outcome.cov, outcome.status) == (0.0, math.inf, "no_hits")
-    assert outcome.interval[0] == 0 < outcome.interval[1] < 0.01
-    assert outcome.warnings == ("None of 1,000 simulations failed: p = 0 with a one-sided interval.",)
 
 
 def test_all_or_none_without_an_outcome_is_exact_whatever_the_weights():

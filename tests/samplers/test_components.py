@@ -18,8 +18,6 @@ from samplers.components import (
     SubspaceGaussian,
     VonMisesFisherNakagami,
     draw_counts,
-    log_ratios,
-    mixture_log_ratio,
 )
 
 N = 20_000
@@ -109,18 +107,6 @@ def test_tempered_is_the_normalised_geometric_mean_with_the_base(dim, power):
     expected = log_q - math.log((mass * np.exp(log_q)).sum())
     near = np.linalg.norm(u, axis=1) < 6
     np.testing.assert_allclose(component.temper(power).log_ratio(u)[near], expected[near], atol=1e-7)
-
-
-def test_mixture_is_the_sum_of_its_parts(rng):
-    components, weights = (
-        [IsotropicNormal(3), subspace_gaussian(3, 2), HalfSpaceNormal(np.eye(3)[0], 1.0), RadialLaw(3, 1.0, 1.5, 2.5)],
-        np.array([0.1, 0.4, 0.5, 0]),
-    )
-    u = 2 * rng.standard_normal((500, 3))
-    log_r = log_ratios(components, u)
-    np.testing.assert_allclose(mixture_log_ratio(log_r, weights), np.log(weights @ np.exp(log_r)), atol=1e-12)
-    assert np.isneginf(mixture_log_ratio(np.full((2, 3), -np.inf), np.array([0.5, 0.5]))).all()
-    assert mixture_log_ratio(np.array([[900.0], [0.0]]), np.array([0.5, 0.5]))[0] == pytest.approx(900 - math.log(2))
 
 
 @given(

@@ -12,7 +12,6 @@ from samplers.importance import (
     Search,
     bernstein_bound,
     calibrate,
-    defensive_mixture,
     draw_after_search,
     pool_rounds,
     round_record,
@@ -119,17 +118,6 @@ def test_doubts_are_of_few_and_of_heavy_draws():
     assert "None of 1,000 final draws failed" in weight_warnings(weighing())[0]
 
 
-def test_no_weight_exceeds_one_over_the_base_s_share(rng):
-    base, far, wide = (Gaussian(np.full(2, m), s * np.eye(2)) for m, s in ((0.0, 1.0), (3.0, 0.1), (3.0, 4.0)))
-    u = 4.0 * rng.standard_normal((2000, 2))
-    for wide_share in (0.0, 0.25):
-        mixture = defensive_mixture(base, wide, far, 0.125, wide_share)
-        parts = [0.125 * np.exp(base.log_prob(u)), wide_share * np.exp(wide.log_prob(u))]
-        density = sum(parts) + (0.875 - wide_share) * np.exp(far.log_prob(u))
-        np.testing.assert_allclose(mixture.log_prob(u), np.log(density))
-        assert (base.log_prob(u) - mixture.log_prob(u)).max() <= math.log(8.0) * (1 + 1e-12)
-
-
 def until(drive, limit, batch, **goal):
     problem, told = half_space(2, 1.0).problem, []
     steps = simulate_until(
@@ -194,15 +182,3 @@ def test_a_stopped_search_is_its_own_estimate(drive, rng):
     assert outcome.status is Status.STOPPED
     assert outcome.warnings[0].startswith("Stopped before the final draws")
     assert outcome.p == pytest.approx(inputs.p, rel=5 * outcome.cov)
-
-
-def test_final_draws_alone_count_after_a_finished_search(drive, rng):
-    """Of n final draws with a base share of 0.1, n / 10 are expected to be base draws."""
-    inputs = half_space(2, 2.0)
-    rounds = rounds_of(inputs, [0.0, 2.0], 500, rng)
-    search = Search(rounds, [round_record(0.0, 500, np.zeros(9))] * 2, Status.CONVERGED)
-    steps = draw_after_search(inputs.problem, Goal(gamma=0.0), search, TiltedNormal(np.ones(2)), 0.1, 1000, 400, rng)
-    final, f = drive(steps, inputs.problem)
-    assert final.draws.n == len(f) == 1000
-    assert (final.base_draws, final.largest_weight, final.stopped) == (600, 10.0, False)
-    assert [level.n_sim for level in final.trace] == [500, 500, 400, 400, 200]

@@ -21,7 +21,7 @@ import pytest
 
 import samplers
 from samplers import journal as journals
-from samplers.journal import Journal, JournalError, NothingRecorded, digest_points
+from samplers.journal import Journal, JournalError, NothingRecorded
 from samplers.problem import FloatArray, TermGradients, Terms
 from samplers.workers import Result
 
@@ -352,12 +352,6 @@ def test_the_wall_time_of_all_parts_adds_up(tmp_path: Path, monkeypatch: pytest.
     clock[0] = 5.0  # another boot
     assert go_on(Journal.open(path), 20.0) == 60.0
     assert go_on(Journal.open(path)) == 80.0
-
-
-def test_points_are_known_by_value_and_shape() -> None:
-    x = np.arange(6.0).reshape(3, 2)
-    assert digest_points(x) == digest_points(x.copy())
-    assert len({digest_points(each) for each in (x, x.reshape(2, 3), x + 1e-15, x[::-1], x.astype("f4"))}) == 5
 
 
 class Series:

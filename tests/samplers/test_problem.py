@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
-from dataclasses import dataclass, field
 
 import numpy as np
 import pytest
 
 import samplers
-from samplers.problem import FloatArray, Terms
 
 
 @pytest.mark.parametrize("dim", [0, -1, 2.0, "2", True])
@@ -130,26 +128,3 @@ def test_an_f_of_batches_that_raises_gets_none():
 def test_names_of_columns_that_do_not_fit_are_refused(names):
     with pytest.raises(ValueError, match="2 different names, got"):
         samplers.FunctionProblem(lambda x: x[:, 0], dim=2, column_names=names)
-
-
-@dataclass
-class OwnProblem:
-    """A user's problem, of no class of the package."""
-
-    dim: int = 2
-    base: samplers.StandardNormal = field(default_factory=lambda: samplers.StandardNormal(2))
-
-    def evaluate(self, x: FloatArray) -> FloatArray:
-        return np.asarray(x[:, 0])
-
-
-class WithTerms(OwnProblem):
-    def terms(self, x: FloatArray, gamma: float = 0.0) -> Terms:
-        return Terms(x.min(axis=1), x, np.zeros(x.shape, dtype=np.int64), gamma)
-
-
-def test_the_least_term_and_the_lowest_value_are_those_of_each_row() -> None:
-    x = np.array([[2.0, -1.0], [0.5, 3.0]])
-    terms = WithTerms().terms(x)
-    np.testing.assert_array_equal(terms.least, [1, 0])
-    np.testing.assert_array_equal(terms.lowest, [-1.0, 0.5])

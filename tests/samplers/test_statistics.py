@@ -30,12 +30,6 @@ def test_clopper_pearson_against_scipy():
         np.testing.assert_allclose(clopper_pearson(hits, 50, 0.9), exact)
 
 
-def test_clopper_pearson_is_one_sided_at_the_ends():
-    assert clopper_pearson(0, 100, 0.95)[0] == 0.0
-    assert clopper_pearson(0, 100, 0.95)[1] == pytest.approx(1 - 0.025**0.01)
-    assert clopper_pearson(100, 100, 0.95)[1] == 1.0
-
-
 def test_log_normal_covers_a_log_normal_estimate(rng):
     cov, p, runs = 0.3, 1e-4, 4000
     sigma = math.sqrt(math.log1p(cov**2))
@@ -71,12 +65,6 @@ def test_correlation_factor_predicts_the_variance_of_a_share(rng):
     assert np.mean(predicted) == pytest.approx(shares.var(), rel=0.15)
 
 
-def test_distinct_outcomes_give_the_quantile_with_its_true_share(rng):
-    f = rng.permutation(np.arange(1, 1001)) / 10
-    assert next_level(f, 0.1, -1.0) == 10.0
-    assert np.count_nonzero(f <= 10.0) == 100
-
-
 def test_gamma_as_soon_as_enough_points_fail():
     f = np.arange(100.0)
     assert next_level(f, 0.1, 9.0) == 9.0  # ten points, exactly the fraction
@@ -100,12 +88,6 @@ def test_the_upper_end_is_the_quantile_of_both_errors_together():
         assert add_unseen(1e-3, 1e-3 * high, lineages, 0.95) / 1e-3 == pytest.approx(
             np.quantile(np.exp(sigma * z) / (1 - m), 0.975), rel=0.01
         )
-
-
-def test_effective_sample_size():
-    assert effective_sample_size(np.zeros(10)) == pytest.approx(10)
-    assert effective_sample_size(np.log([1.0, 3.0])) == pytest.approx(16 / 10)
-    assert effective_sample_size(np.empty(0)) == 0
 
 
 def test_weights_far_outside_the_range_of_floats():
