@@ -76,6 +76,7 @@ def test_every_algorithm_trains_saves_and_drives(algo: str, tmp_path: Path) -> N
     assert ((f == -1.0) | (f > 0.0)).all()
 
 
+@pytest.mark.slow
 @use_one_thread()
 def test_a_trained_ego_collides_far_less_than_a_random_policy(tmp_path: Path) -> None:
     path = train_ego(ENV_ID, steps=100_000, seed=0, out=tmp_path / "ego.zip", progress=False)
@@ -94,17 +95,11 @@ def test_progress_goes_to_standard_error(tmp_path: Path, capsys: pytest.CaptureF
     assert "collisions" in captured.err
 
 
-def test_an_unknown_environment_leaves_no_folder_behind(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="did you mean 'rare_envs/CutIn-v1'"):
-        train_ego("CutIn", steps=1, out=tmp_path / "new" / "ego.zip")
-    assert not (tmp_path / "new").exists()
-
-
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
         ({"steps": 0}, "steps >= 1, got 0"),
-        ({"steps": -5}, "steps >= 1, got -5"),
+        ({"env_id": "CutIn", "out": "new/ego"}, "did you mean 'rare_envs/CutIn-v1'"),
         ({"algo": "pp0"}, r"Unknown algorithm 'pp0' \(did you mean 'ppo'\?\)"),
         ({"num_envs": 0}, "num_envs >= 1, got 0"),
         ({"out": "."}, "got the folder"),
@@ -117,9 +112,9 @@ def test_bad_requests_are_refused_before_work(
     monkeypatch.chdir(tmp_path)
     (tmp_path / "file").write_text("")
     with pytest.raises(ValueError, match=message) as caught:
-        train_ego(ENV, **arguments)
+        train_ego(**{"env_id": ENV, **arguments})
     assert "\n" not in str(caught.value)
-    assert not list(tmp_path.glob("*.zip"))
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]
 
 
 def test_import_training_is_light() -> None:
@@ -297,22 +292,15 @@ def test_what_does_not_fit_is_refused_before_training(egos: Path, tmp_path: Path
 @pytest.mark.parametrize(
     ("changed", "said"),
     [
-        ({}, None),
-        ({"algorithm": "a2c"}, r"^Expected an ego trained by ppo, got 'ego\.zip', trained by a2c\.$"),
         ({"statistics": object()}, "trained behind VecNormalize, train-ego has none"),
-        ({"model": SimpleNamespace(observation_space=4, action_space=2)}, "its observation_space is 4, .* is 3"),
         ({"model": SimpleNamespace(observation_space=3, action_space=5)}, "its action_space is 5, .* is 2"),
     ],
 )
-def test_an_ego_trained_otherwise_is_refused(changed: dict[str, Any], said: str | None) -> None:
+def test_an_ego_trained_otherwise_is_refused(changed: dict[str, Any], said: str) -> None:
     env = SimpleNamespace(observation_space=3, action_space=2)  # anything that compares as spaces do
     usual = {"path": Path("ego.zip"), "algorithm": "ppo", "statistics": None, "model": env}
-    saved = SimpleNamespace(**{**usual, **changed})
-    if said is None:
-        check_retrainable(saved, "ppo", env)
-        return
     with pytest.raises(ValueError, match=said):
-        check_retrainable(saved, "ppo", env)
+        check_retrainable(SimpleNamespace(**{**usual, **changed}), "ppo", env)
 
 
 def test_a_training_that_goes_on_explores_as_at_its_end_and_learns_at_once() -> None:

@@ -148,21 +148,10 @@ def tabulate(columns: Mapping[str, Any], edges: Mapping[str, tuple[float, ...]] 
         ValueError: A row occurs twice, or a value is impossible.
 
     Example:
-        >>> table = tabulate(
-        ...     {
-        ...         "recording": "my road",
-        ...         "vehicle": [2, 1, 1],
-        ...         "frame": [0, 1, 0],
-        ...         "x": [30.0, 11.5, 10.0],
-        ...         "y": 1.75,
-        ...         "speed": 15.0,
-        ...         "acceleration": 0.0,
-        ...         "length": 4.5,
-        ...         "width": 1.8,
-        ...         "lane": 1,
-        ...         "leader": [NOBODY, NOBODY, 2],
-        ...     }
-        ... )
+        >>> size = {"length": 4.5, "width": 1.8}
+        >>> same = {"recording": "my road", "y": 1.75, "speed": 15.0, "acceleration": 0.0, "lane": 1, **size}
+        >>> own = {"vehicle": [2, 1, 1], "frame": [0, 1, 0], "leader": [NOBODY, NOBODY, 2]}
+        >>> table = tabulate({**same, **own, "x": [30.0, 11.5, 10.0]})
         >>> table.x.tolist()
         [10.0, 11.5, 30.0]
     """

@@ -70,11 +70,6 @@ def conditional_action(
     return mean + torch.exp(log_std) * noise, log_std + torch.log(noise.new_tensor(colour.scale))
 
 
-def clipped_surrogate(ratio: Tensor, advantage: Tensor, clip: float) -> Tensor:
-    """Return PPO's clipped objective, to be maximised, shape (n,)."""
-    return torch.minimum(ratio * advantage, ratio.clamp(1.0 - clip, 1.0 + clip) * advantage)
-
-
 def value_inputs(policy: Policy, steps: RolloutSteps) -> Tensor:
     """Return the input of the value network: normalised features and the expected noise, shape (n, 53)."""
     return torch.cat((policy.normalise(steps.features), steps.noise), dim=1)
@@ -112,7 +107,8 @@ def update_gail(learner: Learner) -> Log:
             moments = conditional_action(policy, steps.features[rows], steps.noise[rows], config.colour)
             ratio = torch.exp(log_likelihood(*moments, steps.action[rows]) - old[rows])
             clone = config.geometric_schedule(config.clone_weight, learner.update) * learner.clone_loss()
-            surrogate = clipped_surrogate(ratio, gain[rows], config.clip).mean()
+            clipped = ratio.clamp(1.0 - config.clip, 1.0 + config.clip)
+            surrogate = torch.minimum(ratio * gain[rows], clipped * gain[rows]).mean()
             descend(learner.policy_optimiser, clone - surrogate, policy)
             error = (value(seen[rows])[:, 0] - target[rows]).square().mean()
             descend(learner.value_optimiser, error)

@@ -107,28 +107,24 @@ def drive_traffic(recording: Recording, traffic: Traffic, act: Act, ticks: int) 
 
 
 class Behaviour(NamedTuple):
-    """Motion and contacts of n vehicles in T ticks; shapes (T, n) unless said, NaN where a value is not known."""
+    """Motion and contacts of n vehicles, of a scene each (n,), in T ticks: shapes (T, n).
+
+    `known` is True where a vehicle is there and counts; elsewhere its other values mean nothing. Units are m/s, m/s^2
+    and rad/s; `ahead` and `rate` are the range [m] and range rate [m/s] of the beam ahead. `contact` is True where its
+    body overlaps with another that it did not overlap with at the start, `off_road` where its middle is beyond the edge
+    of the road, `changed` where its lane differs from that of the tick before.
+    """
 
     scene: Tensor
-    """Scene of each vehicle, shape (n,)."""
     known: Tensor
-    """True where the vehicle is there and counts; elsewhere its other values mean nothing."""
     speed: Tensor
-    """[m/s]."""
     acceleration: Tensor
-    """[m/s^2]."""
     yaw_rate: Tensor
-    """[rad/s]."""
     ahead: Tensor
-    """Range of the beam ahead [m]."""
     rate: Tensor
-    """Range rate of the beam ahead [m/s]."""
     contact: Tensor
-    """True where its body overlaps with another that it did not overlap with at the start."""
     off_road: Tensor
-    """True where its middle is beyond the edge of the road."""
     changed: Tensor
-    """True where its lane differs from that of the tick before."""
 
 
 def find_overlaps(traffic: Traffic, m: int) -> Tensor:
@@ -212,18 +208,18 @@ def current_errors(recording: Recording, traffic: Traffic) -> Errors:
 
 
 class DrivingStatistics(NamedTuple):
-    """Sums over the vehicle-steps of each of S scenes, from which rates, divergences and errors follow."""
+    """Sums over the vehicle-steps of each of S scenes, from which rates, divergences and errors follow.
+
+    Numbers of vehicle-steps and of vehicles, (S,) each; sums of hard braking, collision, off-road, lane changes and
+    speed by vehicle-step, and of `ever` by vehicle; histograms (S, bins); squared errors of position [m^2], speed and
+    lateral position after 5 s, and their number.
+    """
 
     steps: FloatArray
-    """Number of vehicle-steps, shape (S,)."""
     vehicles: FloatArray
-    """Number of vehicles, shape (S,)."""
     sums: dict[str, FloatArray]
-    """Hard braking, collision, off-road, lane changes and speed by vehicle-step, `ever` by vehicle, shape (S,) each."""
     counts: dict[str, FloatArray]
-    """Histogram of each quantity, shape (S, bins)."""
     squared: dict[str, FloatArray]
-    """Squared errors of position [m^2], speed and lateral position after 5 s, and their number, shape (S,) each."""
 
 
 def binned_quantities(behaviour: Behaviour) -> dict[str, tuple[Tensor, Tensor]]:

@@ -149,16 +149,16 @@ def draw_pool(
 
 
 class RolloutSteps(NamedTuple):
-    """Moments of driven vehicles, n in all: T ticks, each with the same vehicles in the same order."""
+    """Moments of driven vehicles, n in all: T ticks, each with the same vehicles in the same order.
+
+    Features (n, 51) in SI units, normalised actions (n, 2), costs (n,) each, and the expected noise of the action given
+    the ticks before (n, 2).
+    """
 
     features: Tensor
-    """Shape (n, 51), SI units."""
     action: Tensor
-    """Normalised, shape (n, 2)."""
     costs: Penalties
-    """Costs of each moment, shape (n,) each."""
     noise: Tensor
-    """Expected noise of the action given the ticks before, shape (n, 2)."""
 
 
 def roll_out(

@@ -22,26 +22,25 @@ PARKING_X, PARKING_GAP = -1e4, 300.0
 
 
 class Recording(NamedTuple):
-    """S scenes of at most T ticks, V vehicles and L lanes, single precision; units and frame as in `TrafficScene`."""
+    """S scenes of at most T ticks, V vehicles and L lanes, single precision; units and frame as in `TrafficScene`.
+
+    The first eight have shape (S, T, V): `present` is True where a vehicle is recorded, `acts` where its acceleration
+    and yaw rate are known; the others are 0 where it is absent. Sizes have shape (S, V). Lane boundaries, left to right
+    (S, L + 1), repeat the last edge beyond the last lane. `ticks` is the number of ticks of each scene (S,).
+    """
 
     x: Tensor
-    """Shape (S, T, V), as the next five; 0 where absent."""
     y: Tensor
     heading: Tensor
     speed: Tensor
     acceleration: Tensor
     yaw_rate: Tensor
     present: Tensor
-    """True where a vehicle is recorded, shape (S, T, V)."""
     acts: Tensor
-    """True where its acceleration and yaw rate are known, shape (S, T, V)."""
     length: Tensor
-    """Shape (S, V)."""
     width: Tensor
     edges: Tensor
-    """Lane boundaries from left to right [m], shape (S, L + 1); beyond the last lane the last edge is repeated."""
     ticks: Tensor
-    """Number of ticks of each scene, shape (S,)."""
 
     def actions(self, scene: Tensor, tick: Tensor | int, vehicle: Tensor) -> Tensor:
         """Return recorded actions of vehicles (B, M) at moments of scenes (B,), shape (B, M, 2)."""
@@ -74,28 +73,25 @@ def stack_scenes(scenes: Sequence[TrafficScene]) -> Recording:
 
 
 class Traffic(NamedTuple):
-    """Vehicles of B scenes, V each, at one moment; driven vehicles come first."""
+    """Vehicles of B scenes, V each, at one moment, driven ones first; frame and units as in `TrafficScene`.
+
+    Shapes are (B, V) but for the lane boundaries (B, L + 1), scene and tick (B,), which may pass the scene's end.
+    `vehicle` is the number in the scene, `there` True for vehicles that exist (the others are parked far away), and
+    `driven` for those that are driven.
+    """
 
     x: Tensor
-    """Shape (B, V), as the next three; frame and units as in `TrafficScene`."""
     y: Tensor
     heading: Tensor
     speed: Tensor
     length: Tensor
-    """Shape (B, V) [m], as the next."""
     width: Tensor
     edges: Tensor
-    """Lane boundaries [m], shape (B, L + 1)."""
     scene: Tensor
-    """Scene of the recording, shape (B,)."""
     tick: Tensor
-    """Tick of the scene, shape (B,); may pass its end."""
     vehicle: Tensor
-    """Vehicle of the scene, shape (B, V)."""
     there: Tensor
-    """True for vehicles that exist, shape (B, V); the others are parked far away."""
     driven: Tensor
-    """True for vehicles that are driven, shape (B, V)."""
 
     @property
     def drivers(self) -> int:
