@@ -44,16 +44,9 @@ FAULTS, FAULT_BLOCKS = "faults.csv", "faults.npz"
 DIGESTED = (RESULT, FAILURES, BLOCKS, FAULTS, FAULT_BLOCKS, EPISODES)
 """Files that hold numbers of a run; pictures follow from them."""
 RESULT_FILES = (*DIGESTED, PLOT, SENSITIVITY, SEVERITY, STUDY, REPORT)
-CRASH = (
-    "crash",
-    "striking",
-    "struck",
-    "impact_speed",
-    "closing_speed",
-    "delta_v_striking",
-    "delta_v_struck",
-    "injury_risk_striking",
-    "injury_risk_struck",
+CRASH = tuple(
+    "crash striking struck impact_speed closing_speed delta_v_striking delta_v_struck "
+    "injury_risk_striking injury_risk_struck".split()
 )
 """Columns of failures.csv that say what a failure ended in: `rare_envs.traffic.crash.Crash`."""
 MAX_BLOCK_BYTES = 1 << 30

@@ -212,18 +212,7 @@ def _write_table(
             np.savez_compressed(draft, **blocks)  # type: ignore[arg-type]
 
 
-LIBRARIES = (
-    "cvxpy",
-    "gymnasium",
-    "highway-env",
-    "numba",
-    "numpy",
-    "onnxruntime",
-    "scikit-learn",
-    "scipy",
-    "stable-baselines3",
-    "torch",
-)
+LIBRARIES = "cvxpy gymnasium highway-env numba numpy onnxruntime scikit-learn scipy stable-baselines3 torch".split()
 """Distributions whose versions may change a number."""
 
 

@@ -110,18 +110,3 @@ def test_terms_of_the_same_scenarios_are_lost_and_no_others(how: str, memory: bo
     np.testing.assert_array_equal([fault.x for fault in tolerant.faults], x[bad])
     assert all(reason in fault.reason for fault in tolerant.faults)
     assert 0 < tolerant.n_retried < (5 if memory else 2) * len(x)
-
-
-def test_scenarios_on_which_a_gradient_fails_have_none_and_the_others_theirs(x: np.ndarray) -> None:
-    good = problem(Coasting())
-    term = np.zeros(len(x), dtype=np.int64)
-    ticks = 1 + np.arange(len(x)) % 5  # at tick 0 nobody asks the ego
-    assert good.gradient is not None
-    expected, bad = good.gradient(x, term, ticks), x[:, 2] < GAP
-    tolerant = tolerate(problem(Coasting(raises)))
-    found = tolerant.gradient(x, term, ticks)
-    np.testing.assert_allclose(found.values, np.where(bad[:, None], np.nan, expected.values), rtol=1e-6)
-    at_most = good.gradient_cost * bad.sum()  # what a row costs at most, for those that gave nothing
-    assert at_most < found.cost <= at_most + expected.cost
-    assert not tolerant.faults  # they have an outcome
-    assert tolerant.n_retried > 0
