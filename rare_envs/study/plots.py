@@ -14,7 +14,6 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from matplotlib.transforms import Affine2D
-from numpy.typing import NDArray
 
 from rare_envs.distributions.space import ScenarioSpace
 from rare_envs.egos.errors import EgoGone, reason_of
@@ -130,10 +129,13 @@ def draw_convergence(axes: Axes, result: Mapping[str, Any]) -> None:
         values = np.array([level["estimate"] or np.nan for level in levels])
         seen += [value for value in values if value > 0]
         axes.plot(spent, values, "o-", color=LINE_COLOUR, alpha=max(0.25, 1 / len(runs)), markersize=4)
-        if len(runs) == 1 and by_levels:
-            _label_thresholds(axes, spent, values, [_as_float(level["gamma"]) for level in levels])
+        gammas, cov = (np.array([level[name] for level in levels], dtype=float) for name in ("gamma", "cov"))
+        if len(runs) == 1 and by_levels:  # each threshold that differs from the one before
+            for i in np.flatnonzero(np.isfinite(values) & (np.diff(gammas, prepend=np.nan) != 0)):
+                place: Any = {"xytext": (5, 5), "textcoords": "offset points", "fontsize": 8}
+                axes.annotate(f"f ≤ {gammas[i]:.3g}", (spent[i], values[i]), **place)
         elif len(runs) == 1:
-            cov = np.nan_to_num([_as_float(level["cov"]) for level in levels], nan=np.inf)
+            cov = np.nan_to_num(cov, nan=np.inf)
             spread = np.exp(NORMAL_QUANTILE * np.minimum(cov, WIDEST_COV))
             axes.fill_between(spent, values / spread, values * spread, color=LINE_COLOUR, alpha=0.15, linewidth=0)
     axes.axhspan(max(low, 1e-300), high, color=HIT_COLOUR, alpha=0.12, linewidth=0)
@@ -155,22 +157,10 @@ def draw_convergence(axes: Axes, result: Mapping[str, Any]) -> None:
         axes.set_ylim(least / 1.5, min(most * 1.5, 1.5))
     axes.set_xlim(left=0)
     axes.set_xlabel("simulations" if len(runs) == 1 else f"simulations, each of {len(runs)} runs")
-    way = "From ordinary traffic to the failures, level by level" if by_levels else "The estimate, batch by batch"
     axes.set_ylabel("P[f ≤ threshold of the level]" if by_levels else f"P[f ≤ {gamma:g}]")
+    way = "From ordinary traffic to the failures, level by level" if by_levels else "The estimate, batch by batch"
     axes.set_title(way, fontsize=10)
     axes.legend(loc="upper right", frameon=False)
-
-
-def _as_float(value: float | None) -> float:
-    """Return a number of a JSON file, where NaN and infinities are null."""
-    return np.nan if value is None else float(value)
-
-
-def _label_thresholds(axes: Axes, spent: NDArray[np.int64], values: NDArray[np.float64], gammas: list[float]) -> None:
-    """Write each level's threshold beside its point, where it differs from the one before."""
-    for i, (n, value, gamma) in enumerate(zip(spent, values, gammas, strict=True)):
-        if np.isfinite(value) and (i == 0 or gamma != gammas[i - 1]):
-            axes.annotate(f"f ≤ {gamma:.3g}", (n, value), (5, 5), textcoords="offset points", fontsize=8)
 
 
 def draw_failures(axes: Axes, space: ScenarioSpace, failures: Failures) -> None:
@@ -183,19 +173,16 @@ def draw_failures(axes: Axes, space: ScenarioSpace, failures: Failures) -> None:
         shift = np.abs(failures.x[:, shown].mean(axis=0) - ordinary[:, shown].mean(axis=0)) / spread
         a, b = (int(j) for j in shown[np.argsort(-shift, kind="stable")][:2])
     axes.scatter(ordinary[:, a], ordinary[:, b], s=6, color=ORDINARY_COLOUR, label="ordinary traffic", linewidths=0)
-    axes.set_xlabel(columns[a].label)
-    axes.set_ylabel(columns[b].label)
+    axes.set(xlabel=columns[a].label, ylabel=columns[b].label)
     if len(failures):
         rising = slice(None, None, -1)  # the most likely on top
         x, y = failures.x[rising, a], failures.x[rising, b]
         dots = axes.scatter(x, y, s=12, c=failures.log_p0[rising], cmap="YlOrRd", linewidths=0)
         assert axes.figure is not None
         axes.figure.colorbar(dots, ax=axes, label="log density in traffic (darker: more likely)")
-        star = failures.x[0]
-        axes.plot(star[a], star[b], "*", color="black", markersize=13, label="most likely failure")
-        axes.set_title("Failures against ordinary traffic (two most shifted parameters)", fontsize=10)
-    else:
-        axes.set_title("Ordinary traffic; no failure found", fontsize=10)
+        axes.plot(x[-1], y[-1], "*", color="black", markersize=13, label="most likely failure")
+    title = "Failures against ordinary traffic (two most shifted parameters)"
+    axes.set_title(title if len(failures) else "Ordinary traffic; no failure found", fontsize=10)
     axes.legend(loc="best", fontsize=8)
 
 
@@ -229,41 +216,33 @@ def draw_moment(axes: Axes, drive: Drive, t: int) -> None:
         axes.add_patch(body)
     left, *_, right = drive.road.edges
     for y in drive.road.edges:
-        edge = y in (left, right)
-        axes.axhline(
-            y, color="black" if edge else ORDINARY_COLOUR, linewidth=1, dashes=(None, None) if edge else (6, 6)
-        )
+        colour, dashes = ("black", (None, None)) if y in (left, right) else (ORDINARY_COLOUR, (6, 6))
+        axes.axhline(y, color=colour, linewidth=1, dashes=dashes)
     furthest = float(np.max(drive.position[:, :1, 0] - drive.position[..., 0])) + VEHICLE_LENGTH
     axes.set_xlim(-min(max(VIEW_BEHIND, furthest), VIEW_FAR_BEHIND), VIEW_AHEAD)
     # the lateral axis points right of the direction of travel, which is down when driving to the right
     axes.set_ylim(right + 0.1 * drive.road.width, left - 0.1 * drive.road.width)
-    axes.set_aspect("equal")
-    axes.set_yticks([])
-    axes.set_xticks([])
-    for spine in axes.spines.values():
-        spine.set_visible(False)
+    axes.set(aspect="equal", xticks=[], yticks=[])
+    axes.spines[:].set_visible(False)
     axes.set_ylabel(f"{drive.time[t]:.1f} s", rotation=0, ha="right", va="center")
     if t == drive.worst:
-        lane = drive.position[t, 0, 1]
-        word = "collision" if hit else "closest"
-        axes.text(VIEW_AHEAD, lane, word, color=HIT_COLOUR, ha="right", va="center", fontweight="bold")
+        style: Any = {"color": HIT_COLOUR, "ha": "right", "va": "center", "fontweight": "bold"}
+        axes.text(VIEW_AHEAD, drive.position[t, 0, 1], "collision" if hit else "closest", **style)
 
 
 def draw_speeds(axes: Axes, drive: Drive) -> None:
     """Draw speeds (left axis) and the gap to the vehicle ahead (right axis) over time."""
     for j, (name, role) in enumerate(zip(drive.names, drive.problem.world.scenario.vehicle_names, strict=True)):
         axes.plot(drive.time, drive.speed[:, j], color=vehicle_colour(role, j), label=f"speed of {name}")
-    axes.set_xlabel("time [s]")
-    axes.set_ylabel("speed [m/s]")
-    axes.set_ylim(0, HEADROOM * max(1.0, float(drive.speed.max())))
+    axes.set(xlabel="time [s]", ylabel="speed [m/s]", ylim=(0, HEADROOM * max(1.0, float(drive.speed.max()))))
     gaps = axes.twinx()
     gap = np.where(np.isfinite(drive.gap), drive.gap, np.nan)
     gaps.plot(drive.time, gap, color="black", linestyle=":", label="gap to the vehicle ahead")
     gaps.set_ylabel("gap [m]")
     gaps.set_ylim(min(0.0, float(np.nanmin(gap, initial=0.0))), HEADROOM * float(np.nanmax(gap, initial=1.0)))
     gaps.spines["right"].set_visible(True)
-    handles = [*axes.get_legend_handles_labels()[0], *gaps.get_legend_handles_labels()[0]]
-    labels = [*axes.get_legend_handles_labels()[1], *gaps.get_legend_handles_labels()[1]]
+    parts = zip(axes.get_legend_handles_labels(), gaps.get_legend_handles_labels(), strict=True)
+    handles, labels = ([*own, *more] for own, more in parts)
     axes.legend(handles, labels, loc="upper center", ncols=2 if len(drive.names) < 5 else 3, fontsize=8, frameon=False)
 
 
@@ -315,13 +294,11 @@ def draw_rates(axes: Axes, total: TotalRate) -> None:
             axes.annotate("", (start, row), (high, row), arrowprops=style)
             axes.plot(high, row, "|", color=colour, markersize=12, markeredgewidth=2)
             axes.annotate(f"below {format_rate(high)}", (high, row), (6, -3), textcoords="offset points", fontsize=8)
-    axes.set_xscale("log")
-    axes.set_xlim(start, max(*shown, people[0].per_million_km) / FRACTION_BELOW)
+    axes.set(xscale="log", xlim=(start, max(*shown, people[0].per_million_km) / FRACTION_BELOW))
     for each, dashes in zip(people, ("--", ":"), strict=True):
         axes.axvline(each.per_million_km, color="black", linewidth=1, linestyle=dashes, label=each.kind)
     axes.set_yticks(range(len(rows)), [name for name, _, _ in rows])
-    axes.set_ylim(len(rows) + 0.4, -0.6)  # room for the legend below
-    axes.set_xlabel("collisions per million km")
+    axes.set(ylim=(len(rows) + 0.4, -0.6), xlabel="collisions per million km")  # room for the legend below
     axes.legend(title="people (100-Car)", loc="lower left", fontsize=8, frameon=False)
 
 
@@ -337,7 +314,5 @@ def draw_shares(axes: Axes, total: TotalRate) -> None:
     for row, each in enumerate(shares):
         axes.text(100 * each.share + 1, row, format_share(each.share), va="center")
     axes.set_yticks(range(len(shares)), [name_source(each) for each in shares])
-    axes.set_ylim(len(shares) - 0.4, -0.6)
-    axes.set_xlim(0, 115)
-    axes.set_xlabel("%")
+    axes.set(ylim=(len(shares) - 0.4, -0.6), xlim=(0, 115), xlabel="%")
     axes.grid(axis="x", color=ORDINARY_COLOUR, alpha=0.4)
