@@ -6,6 +6,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 import agents
@@ -34,6 +35,20 @@ def make():
     ego = egos_here.Ego()
     ego.choose = lambda observation: np.random.uniform(-1, 1, (len(observation), 2))
     return ego
+"""
+STRICT = """
+import numpy as np, egos_here
+
+np.seterr(all="raise")
+
+class Strict(egos_here.Ego):
+    def choose(self, observation):
+        np.seterr(all="raise")
+        return np.zeros((len(observation), 2), np.float32)
+
+def make():
+    np.seterr(all="raise")
+    return Strict()
 """
 
 
@@ -93,3 +108,13 @@ def test_a_threshold_that_nothing_or_only_collisions_reach_is_told() -> None:
     with pytest.warns(UserWarning, match="counts collisions, as --gamma 0 does"):
         prepare(Question(env_id=FOLLOWING, gamma=-1.0))
     assert prepare(Question(env_id=FOLLOWING, measure="margin", gamma=-5.0)).question.gamma == -5.0
+
+
+def test_an_ego_that_sets_numpys_errors_sets_them_for_itself(cli: Cli, here: Path, risky: str) -> None:
+    (here / "strict.py").write_text(STRICT)
+    before = np.geterr()
+    words = ("--base", risky, "--max-sim", "2000", "--horizon", "2", "--gamma", "1", "--json")
+    strict, usual = (cli("estimate", FOLLOWING, "--ego", ego, *words) for ego in ("strict:make", "egos_here:coasting"))
+    assert strict.exit_code in (0, 3), strict.stderr
+    assert json.loads(strict.stdout)["p"] == json.loads(usual.stdout)["p"]
+    assert np.geterr() == before
