@@ -29,7 +29,7 @@ from agents.learned.networks import (
     apply_heads,
     is_plain,
 )
-from agents.learned.rules import STATE_SIZE, ChangeState, CollisionAvoidance, LaneChanges, Seen
+from agents.learned.rules import STATE_SIZE, ChangeAction, ChangeState, CollisionAvoidance, LaneChanges, Seen
 from rare_envs.control import actions
 from rare_envs.control.idm import IDM
 from rare_envs.devices import constant
@@ -153,11 +153,15 @@ class LearnedDriver:
             noise, swings = self.colour.step(swings.to(hidden.dtype), innovations.to(hidden.dtype))
             normal = normal + log_std.exp() * noise
         action = self._limit(features, policy.scaling.action_mean + policy.scaling.action_std * normal)
+        if self.avoidance is None:
+            return action, swings
+        seen = Seen.read(features)
         if self.changes is None or memory is None or swings is None:
-            return self._avoid(features, action), swings
+            return self.avoidance.limit(seen, action), swings
         state = ChangeState.unpack(memory[..., _NOISE_SIZE:])
-        action, state = self._change_lanes(self.changes, features, action, state, innovations)
-        return self._avoid(features, action), torch.cat((swings.flatten(-2), state.pack().to(swings.dtype)), dim=-1)
+        change, state = self.changes.step(seen, state, innovations)
+        action = self.avoidance.limit(seen, self._change_lanes(self.avoidance, seen, change, action))
+        return action, torch.cat((swings.flatten(-2), state.pack().to(swings.dtype)), dim=-1)
 
     def _check(self, **given: Tensor | None) -> tuple[int, int]:
         """Return B and M; refuse other arguments of `act` than tensors of the right shapes."""
@@ -193,22 +197,14 @@ class LearnedDriver:
         eased = torch.maximum(acceleration, self.hard_braking * (acceleration + EASED_BEYOND) - EASED_BEYOND)
         return torch.stack((eased, yaw_rate), dim=-1)
 
-    def _change_lanes(
-        self, changes: LaneChanges, features: Tensor, action: Tensor, state: ChangeState, innovations: Tensor | None
-    ) -> tuple[Tensor, ChangeState]:
+    def _change_lanes(self, rule: CollisionAvoidance, seen: Seen, change: ChangeAction, action: Tensor) -> Tensor:
         """Return actions (B, M, 2) with the course of a lane change for the steering of those who are in one."""
-        assert self.avoidance is not None
-        change, state = changes.step(features, state, innovations)
-        bound = self.avoidance.bound_acceleration_behind(change.gap, change.closing, features[..., SPEED_COLUMN])
+        bound = rule.bound_acceleration_behind(change.gap, change.closing, seen.speed)
         acceleration = torch.where(change.follows, torch.minimum(action[..., 0], bound), action[..., 0])
-        left, right = self.avoidance.bound_yaw_rates_within(features, change.room)
+        left, right = rule.bound_yaw_rates_within(seen, change.room)
         inside = torch.minimum(torch.maximum(action[..., 1], -left), right)
         yaw_rate = torch.where(change.changing, change.yaw_rate, inside).clamp(*self.yaw_rate)
-        return torch.stack((acceleration, yaw_rate), dim=-1), state
-
-    def _avoid(self, features: Tensor, action: Tensor) -> Tensor:
-        """Return actions (B, M, 2) within the bounds of the rule, if there is one."""
-        return action if self.avoidance is None else self.avoidance.limit(features, action)
+        return torch.stack((acceleration, yaw_rate), dim=-1)
 
     @property
     def recordable(self) -> bool:

@@ -148,9 +148,8 @@ class CollisionAvoidance:
     def __post_init__(self) -> None:
         _check_positive(self, "collision avoidance")
 
-    def limit(self, features: Tensor, action: Tensor) -> Tensor:
-        """Return accelerations [m/s^2] and yaw rates [rad/s] (B, M, 2) within the bounds; features (B, M, 51)."""
-        seen = Seen.read(features)
+    def limit(self, seen: Seen, action: Tensor) -> Tensor:
+        """Return accelerations [m/s^2] and yaw rates [rad/s] (B, M, 2) within the bounds."""
         acceleration = torch.minimum(action[..., 0], self._bound_acceleration(seen))
         left, right = self._bound_yaw_rates(seen)
         yaw_rate = torch.minimum(torch.maximum(action[..., 1], -left), right)
@@ -194,13 +193,13 @@ class CollisionAvoidance:
         )
         return left, right
 
-    def bound_yaw_rates_within(self, features: Tensor, room: Tensor) -> tuple[Tensor, Tensor]:
+    def bound_yaw_rates_within(self, seen: Seen, room: Tensor) -> tuple[Tensor, Tensor]:
         """Return the greatest yaw rates to the left and to the right [rad/s] within some room (B, M, 2) [m], (B, M).
 
         That is HighwayEnv's lateral controller towards the end of the room. Unlike beside a body, bounds below 0 steer
         back as far as that takes.
         """
-        seen, wanted = Seen.read(features), room / self.lateral_time
+        wanted = room / self.lateral_time
         lag = self.heading_time * seen.speed.clamp(min=_LEAST_SPEED)
         return (wanted[..., 0] + seen.across) / lag, (wanted[..., 1] - seen.across) / lag
 
@@ -224,12 +223,11 @@ class AdjacentLanes(NamedTuple):
     """Whether a body is seen beyond the line, so that there is a lane."""
 
     @classmethod
-    def read(cls, features: Tensor) -> AdjacentLanes:
-        """Return what features (..., 51) show of the lanes beside, differentiable."""
-        seen = Seen.read(features)
+    def read(cls, seen: Seen) -> AdjacentLanes:
+        """Return what is seen of the lanes beside, differentiable."""
         ranges, beams = seen.ranges[..., None, :], seen.angles
         angle = beams + seen.heading[..., None, None]
-        side = constant((-1.0, 1.0), features)[:, None]
+        side = constant((-1.0, 1.0), ranges)[:, None]
         along, across = ranges * torch.cos(angle), side * ranges * torch.sin(angle)
         line, lane, met = seen.lines[..., None], seen.lane[..., None, None], ranges < MAX_RANGE
         inside = met & (across > line - _LINE_OVERLAP) & (across < line + lane)
@@ -374,17 +372,15 @@ class LaneChanges:
         never = torch.full_like(draws, torch.inf)
         return ChangeState(patience_of(draws), never, none, none + _UNSTARTED, none, none, none, none)
 
-    def step(
-        self, features: Tensor, state: ChangeState, innovations: Tensor | None
-    ) -> tuple[ChangeAction, ChangeState]:
+    def step(self, seen: Seen, state: ChangeState, innovations: Tensor | None) -> tuple[ChangeAction, ChangeState]:
         """Return how to act for one tick, and the new state.
 
         Args:
-            features: What M vehicles in B scenarios perceive, shape (B, M, 51).
+            seen: What M vehicles in B scenarios perceive.
             state: As the last call returned it, at the start `begin`.
             innovations: Standard normal draws, shape (B, M, 2); None for 0.
         """
-        seen, lanes = Seen.read(features), AdjacentLanes.read(features)
+        lanes = AdjacentLanes.read(seen)
         state = self._remember(seen, lanes, state)
         state = self._take_up(seen, lanes, state)
         state = self._begin_change(seen, lanes, state, innovations)

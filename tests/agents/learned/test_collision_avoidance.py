@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from agents.learned.rules import LEFT_MARKER_COLUMN, RIGHT_MARKER_COLUMN, AdjacentLanes, CollisionAvoidance
+from agents.learned.rules import LEFT_MARKER_COLUMN, RIGHT_MARKER_COLUMN, AdjacentLanes, CollisionAvoidance, Seen
 from rare_envs.sensors.lidar import FEATURES, HEADING_COLUMN, MAX_RANGE, Bodies, OnRoad, perceive
 
 RULE = CollisionAvoidance()
@@ -21,7 +21,7 @@ def seen(speed=20.0, **beams):
 
 
 def limited(features, acceleration=1.0, yaw_rate=0.0):
-    action = RULE.limit(features, torch.tensor([[[acceleration, yaw_rate]]], dtype=torch.float64))
+    action = RULE.limit(Seen.read(features), torch.tensor([[[acceleration, yaw_rate]]], dtype=torch.float64))
     return tuple(action[0, 0].tolist())
 
 
@@ -136,7 +136,7 @@ def test_gradients_are_those_of_finite_differences():
     ).requires_grad_()
     wanted = [[[1.0, 0.6]], [[0.5, 0.5]], [[0.3, -0.01]], [[0.5, 0.2]]]
     action = torch.tensor(wanted, dtype=torch.float64, requires_grad=True)
-    assert torch.autograd.gradcheck(RULE.limit, (features, action))
+    assert torch.autograd.gradcheck(lambda *given: RULE.limit(Seen.read(given[0]), given[1]), (features, action))
 
 
 @pytest.mark.parametrize("side", [0, 1])
@@ -148,10 +148,10 @@ def test_within_some_room_steering_is_bounded_by_the_way_that_is_left_and_leads_
         features[..., HEADING_COLUMN] = towards * math.asin(across / 20.0)
         room = torch.full((1, 1, 2), MAX_RANGE, dtype=torch.float64)
         room[..., side] = distance
-        bounds = RULE.bound_yaw_rates_within(features, room)
+        bounds = RULE.bound_yaw_rates_within(Seen.read(features), room)
         assert bounds[side].item() == pytest.approx((distance / 0.6 - across) / (0.2 * 20.0))
         assert bounds[1 - side].item() > 40.0  # no bound
-    assert RULE.bound_yaw_rates_within(seen(speed=0.0), torch.zeros(1, 1, 2))[0].item() == 0.0
+    assert RULE.bound_yaw_rates_within(Seen.read(seen(speed=0.0)), torch.zeros(1, 1, 2))[0].item() == 0.0
 
 
 # --- the lanes beside ----------------------------------------------------------------------------
@@ -161,12 +161,12 @@ WIDTH = 3.6
 
 
 def perceived(x, y, speed, heading=None):
-    """Return the features (51,) of the first of some cars of 5 m by 2 m; its lane's middle is at y = 0."""
+    """Return what is seen by the first of some cars of 5 m by 2 m; its lane's middle is at y = 0."""
     x, y, speed = (torch.tensor([values], dtype=torch.float64) for values in (x, y, speed))
     heading = 0.0 * x if heading is None else torch.tensor([heading], dtype=torch.float64)
     sizes = (torch.tensor(5.0), torch.tensor(2.0))
     place = OnRoad(y, heading, 0.0 * y, 0.5 * WIDTH + y, 0.5 * WIDTH - y)
-    return perceive(Bodies(x, y, heading, speed, *sizes), place, 1)[0, 0]
+    return Seen.read(perceive(Bodies(x, y, heading, speed, *sizes), place, 1)[0, 0])
 
 
 def test_gaps_and_closing_speeds_in_the_next_lanes():

@@ -16,6 +16,7 @@ from agents.learned.rules import (
     ChangeState,
     CollisionAvoidance,
     LaneChanges,
+    Seen,
     patience_of,
 )
 from rare_envs.sensors.lidar import HEADING_COLUMN, LANE_OFFSET_COLUMN, MAX_RANGE
@@ -45,11 +46,16 @@ def begin(left=9.0, right=9.0, changes=CHANGES):
     return state._replace(patience=torch.tensor([[[left, right]]], dtype=torch.float64))
 
 
+def step(features, state, draws=None, changes=CHANGES):
+    """Return how to act for a tick, and the state after it."""
+    return changes.step(Seen.read(features), state, draws)
+
+
 def drive(state, seconds, changes=CHANGES, speed=20.0, y=0.0, heading=0.0, beams=OTHERS):
     """Yield time, y from the middle of the first lane, heading and state of a car that steers by changes alone."""
     for tick in range(round(seconds / 0.1)):
         lane = round(y / WIDTH)
-        action, state = changes.step(on_lane(y - lane * WIDTH, heading, speed, **beams), state, None)
+        action, state = step(on_lane(y - lane * WIDTH, heading, speed, **beams), state, changes=changes)
         yield 0.1 * tick, y, heading, state
         y += speed * math.sin(heading) * 0.1
         heading += 0.1 * float(action.yaw_rate) * bool(action.changing)
@@ -80,7 +86,7 @@ def test_durations_differ_by_the_draw_of_the_moment():
     paces = []
     for draw in (-1.0, 0.0, 1.0):
         draws = torch.tensor([[[draw, 3.0]]], dtype=torch.float64)
-        _, state = CHANGES.step(on_lane(**OTHERS), begin(right=0.0), draws)
+        _, state = step(on_lane(**OTHERS), begin(right=0.0), draws)
         paces.append(1.0 / float(state.pace))
         assert float(state.patience[..., 1]) == pytest.approx(float(patience_of(draws)[..., 1]))
     assert paces == pytest.approx([CHANGES.duration * math.exp(CHANGES.spread * draw) for draw in (-1, 0, 1)])
@@ -104,11 +110,11 @@ def test_no_change_begins_and_no_patience_is_used_if(why, beams, speed):
 
 def test_whoever_is_ahead_in_the_new_lane_is_kept_off_until_the_line():
     ahead = {"range_18": 13.0, "rate_18": -1.0} | {"range_m36": 11.0}
-    action, state = CHANGES.step(on_lane(**ahead), begin(right=0.0), None)
+    action, state = step(on_lane(**ahead), begin(right=0.0), None)
     assert bool(action.follows)
     assert float(action.gap) == pytest.approx(13.0 * math.cos(math.radians(18)) - 2.5)
     assert float(action.closing) == pytest.approx(1.0 / math.cos(math.radians(18)))
-    action, _ = CHANGES.step(on_lane(-1.7, **ahead), state._replace(offset=state.offset + 1.7), None)
+    action, _ = step(on_lane(-1.7, **ahead), state._replace(offset=state.offset + 1.7), None)
     assert not bool(action.follows)
 
 
@@ -117,22 +123,22 @@ def test_a_change_under_way_at_the_first_moment_is_taken_up():
     assert all(int(state.side) == 1 for _, _, _, state in path[:10])
     assert path[-1][1] == pytest.approx(WIDTH, abs=0.15)
     late = list(drive(begin(), 0.3, y=0.0, heading=0.0))[-1][3]
-    moving, _ = CHANGES.step(on_lane(0.8, 0.8 / 20.0, **OTHERS), late, None)
+    moving, _ = step(on_lane(0.8, 0.8 / 20.0, **OTHERS), late, None)
     assert not bool(moving.changing)  # at the first moment only: later it may be the noise
 
 
 def test_nobody_is_taken_to_change_over_the_edge_of_the_road():
     leftmost = {"range_36": 11.0}
-    _, state = CHANGES.step(on_lane(-0.8, -0.5 / 20.0, **leftmost), begin(), None)
+    _, state = step(on_lane(-0.8, -0.5 / 20.0, **leftmost), begin(), None)
     assert int(state.side) == 0
-    _, state = CHANGES.step(on_lane(-0.8, -0.5 / 20.0, **OTHERS), begin(), None)
+    _, state = step(on_lane(-0.8, -0.5 / 20.0, **OTHERS), begin(), None)
     assert int(state.side) == -1
 
 
 def test_who_is_over_the_line_far_enough_has_a_lane_there_that_nobody_shows():
     moving = on_lane(1.1, 0.36 / 20.0)  # over the line by 0.3 m
     for over_line, side in ((0.4, 0), (0.2, 1)):
-        _, state = replace(CHANGES, over_line=over_line).step(moving, begin(), None)
+        _, state = step(moving, begin(), changes=replace(CHANGES, over_line=over_line))
         assert int(state.side) == side
 
 
@@ -141,41 +147,41 @@ def test_whoever_is_nearly_over_the_line_is_changing_into_any_lane():
     for offset, across, waits in ((0.8, 0.8, True), (0.8, 0.5, False)):
         for beams in (OTHERS | BESIDE, {}):  # a lane that is not free, and one that nobody shows
             moving = on_lane(offset, math.asin(across / 20.0), **beams)
-            assert bool(CHANGES.step(moving, begin(), None)[1].side == 1) == waits
+            assert bool(step(moving, begin(), None)[1].side == 1) == waits
     free = on_lane(0.8, math.asin(0.5 / 20.0), **OTHERS)
-    assert int(CHANGES.step(free, begin(), None)[1].side) == 1  # within 2.1 s, as without waiting
+    assert int(step(free, begin(), None)[1].side) == 1  # within 2.1 s, as without waiting
 
 
 def test_a_change_goes_on_beside_a_body_until_its_time_is_over():
     *_, (_, y, heading, state) = list(drive(begin(right=0.0), 0.8, changes=CHANGES))
     assert not bool(state.crossed)
     blocked = on_lane(y, heading, **OTHERS, **BESIDE)
-    action, after = CHANGES.step(blocked, state, None)
+    action, after = step(blocked, state, None)
     assert int(after.side) == 1 and bool(action.changing)
     assert not bool(action.follows)  # nobody brakes for whoever is beside
     path = list(drive(state, 9.0, changes=CHANGES, y=y, beams=OTHERS | BESIDE))
     ahead = OTHERS | {"range_18": 13.0, "rate_18": -1.0}
-    assert bool(CHANGES.step(on_lane(y, heading, **ahead), state, None)[0].follows)
+    assert bool(step(on_lane(y, heading, **ahead), state, None)[0].follows)
     assert int(path[-1][3].side) == 0
 
 
 def test_a_change_over_the_edge_of_the_road_is_given_up_behind_it():
     outward = on_lane(1.75, 0.03)
-    _, state = CHANGES.step(outward, begin(), None)
+    _, state = step(outward, begin(), None)
     assert int(state.side) == 1
     beyond = on_lane(1.85, 0.03)  # 5 cm over the line, and still in its old lane: there is no other
-    action, state = CHANGES.step(beyond, state, None)
+    action, state = step(beyond, state, None)
     assert int(state.side) == 0
     assert action.room[..., 1].item() == pytest.approx(-0.05 - LaneChanges.margin)
 
 
 def test_there_is_room_to_the_line_where_no_lane_is_known():
     one_side = {"range_36": 11.0}  # a lane to the right
-    action, state = CHANGES.step(on_lane(0.5, **one_side), begin(), None)
+    action, state = step(on_lane(0.5, **one_side), begin(), None)
     assert action.room.flatten().tolist() == pytest.approx([0.5 * WIDTH + 0.5 - LaneChanges.margin, MAX_RANGE])
-    action, _ = CHANGES.step(on_lane(0.5), state, None)  # it is remembered
+    action, _ = step(on_lane(0.5), state, None)  # it is remembered
     assert action.room[..., 1].item() == MAX_RANGE
-    action, _ = CHANGES.step(on_lane(0.5), begin(left=0.0)._replace(side=-torch.ones(1, 1)), None)
+    action, _ = step(on_lane(0.5), begin(left=0.0)._replace(side=-torch.ones(1, 1)), None)
     assert action.room.flatten().tolist() == [MAX_RANGE, MAX_RANGE]  # in a change
 
 
@@ -184,7 +190,7 @@ def test_gradients_are_those_of_finite_differences():
     state = begin(right=0.0)
     for tick in range(12):
         y = 0.02 * tick
-        _, state = CHANGES.step(on_lane(y, 0.01, **OTHERS), state, None)
+        _, state = step(on_lane(y, 0.01, **OTHERS), state, None)
     changing = torch.cat((torch.zeros(1, 1, 4, dtype=torch.float64), state.pack()), dim=-1)
     fresh = torch.cat((torch.zeros(1, 1, 4, dtype=torch.float64), begin().pack()), dim=-1)
     none = torch.zeros(1, 1, 2, dtype=torch.float64)
@@ -264,9 +270,7 @@ def test_a_change_does_not_end_before_it_goes_along_the_lane_again():
         crossed=torch.ones(1, 1, dtype=torch.float64),
     )
     for heading, share, goes_on in ((0.03, 1.01, True), (0.005, 1.01, False), (0.03, 1.6, False)):
-        _, after = CHANGES.step(
-            on_lane(heading=heading, **OTHERS), state._replace(share=0.0 * state.share + share), None
-        )
+        _, after = step(on_lane(heading=heading, **OTHERS), state._replace(share=0.0 * state.share + share), None)
         assert bool(after.side == 1) == goes_on
 
 
