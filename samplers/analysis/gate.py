@@ -32,7 +32,7 @@ from samplers.analysis.base_error import BaseUncertainty
 from samplers.analysis.weighted import Reported
 from samplers.method import EstimateData
 from samplers.sample import Status
-from samplers.statistics import Interval, zero_hit_bound
+from samplers.statistics import zero_hit_bound
 from samplers.validation import check_number
 
 Decision = Literal["passes", "fails", "undecided"]
@@ -100,7 +100,11 @@ def judge_estimate(estimate: EstimateData, max_p: float, base: BaseUncertainty |
     confidence = round(0.5 + estimate.confidence / 2, 12)
     none_failed = estimate.status is Status.NO_HITS
     own = (0.0, zero_hit_bound(estimate.base_draws, confidence)) if none_failed else estimate.interval
-    (low, high), reason = (own, "") if base is None else _limits_of_base(base)
+    (low, high), reason = own, ""
+    if base is not None:
+        low, high = base.interval or (0.0, 1.0 if base.bound is None else base.bound)
+        if base.interval is None and base.bound is None:
+            reason = f"p under the refits of the base distribution is not known: {base.reason.rstrip('.')}"
     doubts = (*(() if none_failed else estimate.warnings), *(() if base is None else base.warnings))
     if doubts:
         reason = f"there is a warning: {doubts[0].rstrip('.')}"
@@ -116,15 +120,6 @@ def judge_estimate(estimate: EstimateData, max_p: float, base: BaseUncertainty |
         includes_base=base is not None,
         reason=reason,
     )
-
-
-def _limits_of_base(base: BaseUncertainty) -> tuple[Interval, str]:
-    """Return the ends of p under the uncertainty of the base, and why they are not known."""
-    if base.interval is not None:
-        return base.interval, ""
-    if base.bound is not None:
-        return (0.0, base.bound), ""
-    return (0.0, 1.0), f"p under the refits of the base distribution is not known: {base.reason.rstrip('.')}"
 
 
 MAX_PILOT_COV = 0.5

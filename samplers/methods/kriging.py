@@ -244,16 +244,11 @@ def outcome_scale(y: FloatArray) -> float:
 
 def compress_outcomes(y: FloatArray, scale: float) -> _Outcomes:
     """Return compressed outcomes of y = f - gamma (n,), and which of them stand at a cap or floor of f."""
-    y = np.clip(y, *_finite_range(y[np.abs(y) < LARGEST]))
+    size = float(np.abs(y[np.abs(y) < LARGEST]).max(initial=0.0)) or 1.0  # stands for infinity
+    y = np.clip(y, -size, size)
     ties = max(KRIGING.least_ties, KRIGING.tie_share * len(y))
     capped, floored = (y == y.max()) & (y > 0), (y == y.min()) & (y <= 0)
     return _Outcomes(np.arcsinh(y / scale), capped & (capped.sum() >= ties), floored & (floored.sum() >= ties))
-
-
-def _finite_range(y: FloatArray) -> tuple[float, float]:
-    """Return bounds that stand for -inf and +inf beside finite outcomes y (n,)."""
-    size = float(np.abs(y).max()) if len(y) else 1.0
-    return -(size or 1.0), size or 1.0
 
 
 def _impute_first(kernel: Any, u: FloatArray, outcomes: _Outcomes, *, search: bool) -> tuple[Any, FloatArray]:

@@ -47,7 +47,6 @@ from samplers.methods.subset import descent_cov, level_record, multiply_levels, 
 from samplers.methods.two_stage.regions import (
     Discovery,
     ExplorationResult,
-    Labels,
     Region,
     SubsetPoints,
     count_lineages,
@@ -365,7 +364,9 @@ def find_regions(
     if simulator.inputs.dim > SUBSPACE.high_dim and labels.max(initial=-1) + 1 >= LINES.many_regions:
         region = Region(ends[:, None], descent.u, descent.f)
         return ExplorationResult([region], noisy=False, scattered=True, levels=descent.levels, discovery=discovery)
-    near = _choose_lines(ends, labels, rng)
+    order, n_regions = rng.permutation(len(ends)), int(labels.max(initial=-1)) + 1
+    few = [order[labels[order] == k][: LINES.starts] for k in range(n_regions)]  # of each region
+    near = np.take(ends, np.concatenate([np.empty(0, dtype=np.int64), *few]), axis=0)
     others = min(max(sizes.level_starts, sizes.starts + sizes.level_starts - len(far)), most - len(far))
     starts = np.concatenate([far, near, rng.permutation(descent.failing)[: max(others - len(near), 0)]])
     if len(starts) == 0:
@@ -406,13 +407,6 @@ def _find_lines(
     ends, failing = yield from walk_lines(simulator, u[roots], f[roots], gamma, scale, rng)
     near = yield from bisect_towards_origin(simulator, ends[failing], gamma, EXPLORATION.bisections)
     return near, roots[failing]
-
-
-def _choose_lines(u: FloatArray, labels: Labels, rng: np.random.Generator) -> FloatArray:
-    """Return ends of lines (n, d) for chains to start from: a few of each region."""
-    order = rng.permutation(len(u))
-    chosen = [order[labels[order] == k][: LINES.starts] for k in range(int(labels.max(initial=-1)) + 1)]
-    return np.take(u, np.concatenate([np.empty(0, dtype=np.int64), *chosen]), axis=0)
 
 
 def find_slopes(
@@ -472,7 +466,8 @@ def _collect_points(exploration: ExplorationResult, gamma: float, rng: np.random
     """
     groups, fails = list[FloatArray](), list[bool]()
     for region in exploration.regions:
-        tied, failing = _find_ties(region.f), region.f <= gamma
+        _, where, counts = np.unique(region.f, return_inverse=True, return_counts=True)
+        tied, failing = counts[where] > 1, region.f <= gamma
         flat = failing.any() and tied[failing].mean() > 0.5
         groups += [region.chains[: 0 if flat else None, -1], region.u[~failing & ~tied]]
         fails += [True, False]
@@ -482,12 +477,6 @@ def _collect_points(exploration: ExplorationResult, gamma: float, rng: np.random
         np.repeat(fails, sizes),
         np.concatenate([np.arange(size) for size in sizes]),
     )
-
-
-def _find_ties(f: FloatArray) -> NDArray[np.bool_]:
-    """Return which outcomes (n,) others share."""
-    _, where, counts = np.unique(f, return_inverse=True, return_counts=True)
-    return np.asarray(counts[where] > 1)
 
 
 def _choose_unexplained(points: _Points, n: int, axes: FloatArray) -> NDArray[np.int64]:

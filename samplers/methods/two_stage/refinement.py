@@ -268,12 +268,16 @@ def list_candidates(state: RefinementState, history: MultipleImportanceSample) -
         + ([] if state.exploration.noisy else list(state.linear))
         + (list(state.explored) if state.rounds else [])
     )
+    directional = []
+    if state.exploration.scattered and state.dim >= 2:  # failures are something like a shell or a cone
+        law = VonMisesFisherNakagami.fit(*_weighted_failures(state, history))
+        directional = [ProposalComponent(law, "directional")]
     candidates = [
         ProposalComponent(IsotropicNormal(state.dim), "base"),
         ProposalComponent(IsotropicNormal(state.dim, REFINEMENT.wide_scale), "wide"),
         *_fit_radial_components(state, history),
         *regional,
-        *_fit_directional_components(state, history),
+        *directional,
         *_temper_gaussians(regional, REFINEMENT.noisy_tempering if state.exploration.noisy else REFINEMENT.tempering),
     ]
     candidates += _lift_candidates(state, history)
@@ -287,15 +291,11 @@ def _lift_candidates(state: RefinementState, history: MultipleImportanceSample) 
         return []
     failures = history.within(axes)
     inside = [c for c in list_candidates(state.within, failures) if c.kind not in ("base", "wide")]
-    inside.append(ProposalComponent(_fit_spread(state.within, failures), "spread"))
+    u, weights = _weighted_failures(state.within, failures)
+    values, across = np.linalg.eigh((u * weights[:, None]).T @ u)  # as wide as the failures, at least N(0, I)
+    spread = SubspaceGaussian(across, np.zeros(len(values)), np.maximum(values, 1.0))
+    inside.append(ProposalComponent(spread, "spread"))
     return [candidate._replace(component=LiftedComponent(candidate.component, axes)) for candidate in inside]
-
-
-def _fit_spread(state: RefinementState, history: MultipleImportanceSample) -> SubspaceGaussian:
-    """Return the Gaussian around the origin that is as wide as the failures, and at least N(0, I)."""
-    u, weights = _weighted_failures(state, history)
-    values, axes = np.linalg.eigh((u * weights[:, None]).T @ u)
-    return SubspaceGaussian(axes, np.zeros(len(values)), np.maximum(values, 1.0))
 
 
 def _temper_gaussians(components: list[ProposalComponent], powers: tuple[float, ...]) -> list[ProposalComponent]:
@@ -317,14 +317,6 @@ def _fit_radial_components(state: RefinementState, history: MultipleImportanceSa
         log_w = history.log_weights
         radial.append(fit_radial(history.u, np.exp(log_w - log_w.max())))
     return [ProposalComponent(component, "radial") for component in radial]
-
-
-def _fit_directional_components(state: RefinementState, history: MultipleImportanceSample) -> list[ProposalComponent]:
-    """Return one direction with a radius, fitted to all failures, where these are something like a shell or a cone."""
-    if not state.exploration.scattered or state.dim < 2:
-        return []
-    law = VonMisesFisherNakagami.fit(*_weighted_failures(state, history))
-    return [ProposalComponent(law, "directional")]
 
 
 def _weighted_failures(state: RefinementState, history: MultipleImportanceSample) -> tuple[FloatArray, FloatArray]:

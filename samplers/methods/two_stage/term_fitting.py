@@ -134,11 +134,6 @@ class TermHistory:
     firsts: tuple[int, ...] = ()
     """Simulations that the run had spent before each proposal's draws."""
 
-    @classmethod
-    def of_base_draws(cls, u: FloatArray, terms: Terms) -> "TermHistory":
-        """Return the history of base draws u (n, d) alone."""
-        return cls(u, terms, np.full(len(u), np.log(len(u))), (), len(u))
-
     @property
     def log_weights(self) -> FloatArray:
         """log(phi / q) - log(n), shape (n,): exp of them over some points adds up to their probability."""
@@ -292,7 +287,10 @@ def build_law(
     groups.append(ComponentGroup(LAW.tempered_share, tempered, weights / weights.sum()))
     if len(ends):
         nearest = np.argmax(log_ratios(bumps, ends) + np.log(weights)[:, None], axis=0)
-        around = tuple(_around(bumps[k], LAW.end_mean * end) for k, end in zip(nearest, ends, strict=True))
+        around = tuple(  # in the shape of the nearest bump, but wider
+            SubspaceGaussian(b.axes, b.axes.T @ (LAW.end_mean * end), np.minimum(LAW.end_variance * b.variance, 1.0))
+            for b, end in zip((bumps[k] for k in nearest), ends, strict=True)
+        )
         groups.append(ComponentGroup(LAW.end_share, around, np.full(len(ends), 1 / len(ends))))
     if len(guards):
         identity = np.eye(guards.shape[1])
@@ -300,11 +298,6 @@ def build_law(
         groups.append(ComponentGroup(LAW.guard_share, half_spaces, np.full(len(guards), 1 / len(guards))))
     total = sum(group.share for group in groups)
     return TermLaw(axes, tuple(ComponentGroup(g.share / total, g.components, g.weights) for g in groups))
-
-
-def _around(bump: SubspaceGaussian, centre: FloatArray) -> SubspaceGaussian:
-    """Return a Gaussian around a point z (r,), in the shape of a bump but wider."""
-    return SubspaceGaussian(bump.axes, bump.axes.T @ centre, np.minimum(LAW.end_variance * bump.variance, 1.0))
 
 
 def temper_weights(log_weights: FloatArray, wanted: float) -> FloatArray:

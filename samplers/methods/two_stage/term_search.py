@@ -56,6 +56,8 @@ from samplers.statistics import (
 _T = TypeVar("_T")
 
 
+MOST_LEVELS = 6
+"""Levels of a tenth to plan for at most, and where nothing is known: with fewer than needed the last are short."""
 MIN_STRATUM_DRAWS = 5
 """Of strata with fewer draws the second moment stands in for the variance."""
 
@@ -281,7 +283,9 @@ def _draw_base(search: TermSearch) -> SimulationSteps[SearchState]:
     failures = int((terms.f <= search.goal.gamma).sum())
     share = failures / n
     ceiling = clopper_pearson(failures, n, search.goal.confidence)[1]
-    state = SearchState(TermHistory.of_base_draws(u, terms), base_draws=n, base_failures=failures, ceiling=ceiling)
+    state = SearchState(
+        TermHistory(u, terms, np.full(n, np.log(n)), (), n), base_draws=n, base_failures=failures, ceiling=ceiling
+    )
     search.simulator.record(share, share, n, binomial_cov(share, n))
     return state
 
@@ -448,20 +452,11 @@ def _run_monte_carlo(search: TermSearch, state: SearchState) -> Steps:
 def _fall_back(search: TermSearch, state: SearchState) -> Steps:
     """Spend the rest on subset simulation in the order of the terms."""
     left, inputs = search.left_at_all, search.inputs
-    levels = _expected_levels(state.history, search.goal.gamma)
+    p = float(np.exp(state.history.log_weights[state.history.failing(search.goal.gamma)]).sum())
+    levels = min(math.ceil(-math.log10(min(p, 1.0))), MOST_LEVELS) if p > 0 else MOST_LEVELS
     steps = spend_on_subset_simulation(inputs, replace(search.goal, max_sim=left), levels, left, None, search.rng)
     outcome = yield from order_by_terms(steps, search.goal.gamma)
     return _after(search, state, outcome)
-
-
-MOST_LEVELS = 6
-"""Levels of a tenth to plan for at most, and where nothing is known: with fewer than needed the last are short."""
-
-
-def _expected_levels(history: TermHistory, gamma: float) -> int:
-    """Return the levels of a tenth that the p of all draws so far takes."""
-    p = float(np.exp(history.log_weights[history.failing(gamma)]).sum())
-    return min(math.ceil(-math.log10(min(p, 1.0))), MOST_LEVELS) if p > 0 else MOST_LEVELS
 
 
 def _after(search: TermSearch, state: SearchState, outcome: Outcome) -> Outcome:

@@ -31,12 +31,14 @@ _T = TypeVar("_T")
 class TermRecord:
     """Points of the exploration with their terms, and the terms whose failures were searched for and not found.
 
-    It is changed in place, as the count of the simulator is.
+    It is changed in place, as the count of the simulator is. `unreached` has the names of terms that were the least
+    somewhere and of which no failure is known, those that were followed alone and those for which no simulations were
+    left, and the probability from which on a half-space would have been hit by the first draws.
     """
 
     def __init__(self) -> None:
         self._x, self._terms = list[FloatArray](), list[Terms]()
-        self._unreached: tuple[tuple[str, ...], tuple[str, ...], float] = (), (), 0.0
+        self.unreached: tuple[tuple[str, ...], tuple[str, ...], float] = (), (), 0.0
 
     @property
     def several(self) -> bool:
@@ -56,17 +58,9 @@ class TermRecord:
         """Return all points (n, d), n > 0, and their terms, in the order in which they were simulated."""
         return np.concatenate(self._x), join_terms(self._terms)
 
-    def note_unreached(self, searched: tuple[str, ...], unsearched: tuple[str, ...], limit: float) -> None:
-        """Note the names of terms that were the least somewhere and of which no failure is known.
-
-        Those that were followed alone, those for which no simulations were left, and the probability from which on a
-        half-space would have been hit by the first draws.
-        """
-        self._unreached = searched, unsearched, limit
-
     def describe(self, p: float) -> tuple[str, ...]:
-        """Return remarks on these, for an estimate p."""
-        searched, unsearched, limit = self._unreached
+        """Return remarks on the terms that were not reached, for an estimate p."""
+        searched, unsearched, limit = self.unreached
         share = f" ({limit / p:.0e} of p)" if p > 0 else ""
         bound = f"the first draws rule out a half-space with probability above {limit:.0e}{share}"
         parts = (("searched one by one without reaching failure", searched), ("not searched one by one", unsearched))
@@ -102,7 +96,11 @@ def explore_terms(
         each = int(share * room) // max(len(group), 1)
         starts += [_choose_low_draws(first, terms, j, each, rng) for j in group]
     descents = [_descend_alone(start, terms.threshold, rng) for start in starts]
-    far, numbers = _farthest(exploration), np.array([*known, *searched, *scouted], dtype=np.int64)
+    nearest = [float((region.points**2).sum(axis=1).min()) for region in exploration.regions]
+    far = min(nearest, default=math.inf) - 2 * math.log(
+        TERMS_ALONE.least_density
+    )  # |u|^2: beyond, failures hardly matter
+    numbers = np.array([*known, *searched, *scouted], dtype=np.int64)
     ends = yield from _run_together(simulator, descents, numbers, far)
     likely = [points[(points**2).sum(axis=1) <= far] for points in ends]
     ranked = [points[rank] for rank in range(TERMS_ALONE.lines) for points in likely if rank < len(points)]
@@ -114,11 +112,8 @@ def explore_terms(
         exploration = exploration._replace(regions=[*exploration.regions, *grown.regions], discovery=discovery)
     names = terms.names or tuple(str(j) for j in range(terms.values.shape[1]))
     arrived = dict(zip(numbers.tolist(), map(len, ends), strict=True))
-    record.note_unreached(
-        tuple(names[j] for j in searched if not arrived[j]),
-        tuple(names[j] for j in met[len(searched) :]),
-        hit_limit(first),
-    )
+    missed = tuple(names[j] for j in searched if not arrived[j])
+    record.unreached = missed, tuple(names[j] for j in met[len(searched) :]), hit_limit(first)
     return exploration
 
 
@@ -149,12 +144,6 @@ def _rank_missing(
     met = [j for j in order if least[j] and not fail[j]]
     others = [j for j in order if not least[j] and not fail[j] and np.isfinite(index[j])]
     return known, met, others
-
-
-def _farthest(exploration: ExplorationResult) -> float:
-    """Return abs(u)^2 from which on a failure is too improbable beside those known to matter; inf where none is."""
-    likeliest = [float((region.points**2).sum(axis=1).min()) for region in exploration.regions]
-    return min(likeliest, default=math.inf) - 2 * math.log(TERMS_ALONE.least_density)
 
 
 class _Starts(NamedTuple):
