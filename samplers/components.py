@@ -291,10 +291,12 @@ class VonMisesFisherNakagami:
         mu = resultant / length if length > 0 else np.eye(dim)[0]
         chance = float(weights @ weights)
         length = math.sqrt(max((length**2 - chance) / (1 - chance), 0.0)) if chance < 1 else length
+        r = min(length, LARGEST_RESULTANT)
+        kappa = max(r * (dim - r * r) / (1 - r * r), LEAST_CONCENTRATION)  # Banerjee et al., equation 4.4
         square = float(weights @ radius**2)
         spread = float(weights @ (radius**2 - square) ** 2)
         shape = min(square * square / spread, LARGEST_SHAPE) if spread > 0 else LARGEST_SHAPE
-        return cls(mu, concentration(length, dim), max(shape, LEAST_SHAPE), square)
+        return cls(mu, kappa, max(shape, LEAST_SHAPE), square)
 
     def widen(self, factor: float) -> "VonMisesFisherNakagami":
         """Return the same with deviations of direction and radius about `factor` times as large."""
@@ -319,12 +321,6 @@ class VonMisesFisherNakagami:
     def log_ratio(self, u: FloatArray) -> FloatArray:
         """Return the log density less that of N(0, I) at u (n, d), shape (n,)."""
         return np.asarray(self.log_prob(u) + 0.5 * (np.einsum("ij,ij->i", u, u) + len(self.mu) * LOG_TWO_PI))
-
-
-def concentration(length: float, dim: int) -> float:
-    """Return kappa of the mean resultant length, R (d - R^2) / (1 - R^2)."""
-    r = min(length, LARGEST_RESULTANT)
-    return max(r * (dim - r * r) / (1 - r * r), LEAST_CONCENTRATION)
 
 
 def log_normaliser(kappa: float, dim: int) -> float:

@@ -36,7 +36,7 @@ from numpy.typing import NDArray
 
 from samplers.method import Goal, Interrupted, Outcome, no_outcome_share
 from samplers.problem import FloatArray, Inputs
-from samplers.proposals import Gaussian, Mixture, ProposalDistribution, SupportsLogProb
+from samplers.proposals import Gaussian, Mixture, ProposalDistribution
 from samplers.sample import DrawWeights, Level, Sample, Status
 from samplers.statistics import (
     Interval,
@@ -106,10 +106,6 @@ LARGE_SHARE = 0.15
 """Share of p in one draw that is worth a warning; with 30 equal draws it is 0.03."""
 
 
-def _none() -> FloatArray:
-    return np.empty(0)
-
-
 @dataclass(frozen=True, eq=False)
 class Draws:
     """n independent draws from one proposal, of which k fail; p rests on these.
@@ -122,8 +118,8 @@ class Draws:
     f: FloatArray  # of the failing ones, (k,)
     log_weights: FloatArray  # (k,)
     x: FloatArray = field(default_factory=lambda: np.empty((0, 0)))  # in physical space, (k, d)
-    f_safe: FloatArray = field(default_factory=_none)  # of the others, (n - k,)
-    log_weights_safe: FloatArray = field(default_factory=_none)  # (n - k,)
+    f_safe: FloatArray = field(default_factory=lambda: np.empty(0))  # of the others, (n - k,)
+    log_weights_safe: FloatArray = field(default_factory=lambda: np.empty(0))  # (n - k,)
     fails: NDArray[np.bool_] = field(default_factory=lambda: np.empty(0, dtype=bool))
 
     @classmethod
@@ -336,7 +332,7 @@ LEAST_ROUNDS = 10
 class Round(NamedTuple):
     """Simulated draws u (n, d), with outcomes f (n,), from a proposal q in the space where p0 is the base."""
 
-    base: SupportsLogProb
+    base: ProposalDistribution
     proposal: ProposalDistribution
     u: FloatArray
     f: FloatArray

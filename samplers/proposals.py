@@ -124,18 +124,14 @@ class TiltedNormal:
         return StandardNormal(len(self.shift)).log_prob(u - self.shift)
 
 
-class SupportsLogProb(Protocol):
-    """A distribution whose density is known."""
-
-    def log_prob(self, u: FloatArray, /) -> FloatArray:
-        """Return the log density at u (n, d), shape (n,)."""
-
-
-class ProposalDistribution(SupportsLogProb, Protocol):
+class ProposalDistribution(Protocol):
     """A distribution that can be drawn from and whose density is known; all that importance sampling needs."""
 
     def sample(self, n: int, rng: np.random.Generator) -> FloatArray:
         """Draw n independent points, shape (n, d)."""
+
+    def log_prob(self, u: FloatArray, /) -> FloatArray:
+        """Return the log density at u (n, d), shape (n,)."""
 
 
 @dataclass(frozen=True, eq=False)

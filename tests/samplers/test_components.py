@@ -154,11 +154,3 @@ def test_fit_recovers_the_distribution(rng, dim):
 def test_few_points_give_a_finite_distribution():
     one = VonMisesFisherNakagami.fit(np.array([[1.0, 2.0]]), np.ones(1))
     assert np.isfinite(one.log_prob(np.array([[1.0, 2.0], [-3.0, 0.0], [0.0, 0.0]]))).all()
-
-
-@pytest.mark.parametrize("dim", [2, 7, 120])
-def test_ratio_to_the_base_is_that_of_the_densities(dim, rng):
-    law = VonMisesFisherNakagami(np.eye(dim)[0], 3.0, dim / 3, 1.5 * dim)
-    u = rng.standard_normal((50, dim))
-    expected = law.log_prob(u) - stats.norm.logpdf(u).sum(axis=1)
-    np.testing.assert_allclose(law.log_ratio(u), expected, rtol=1e-10, atol=1e-9)

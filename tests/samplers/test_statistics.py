@@ -7,9 +7,6 @@ import pytest
 from scipy import stats
 from scipy.special import logsumexp
 
-import samplers
-from samplers.analysis.weighted import simultaneous_intervals, simultaneous_level, unit_sums
-from samplers.sample import Layer, Sample
 from samplers.statistics import (
     PRIOR_SHARE,
     add_unseen,
@@ -122,83 +119,3 @@ def test_a_sum_of_nothing_and_one_beyond_all_numbers():
     assert log_sum_exp(np.array([0.0, np.inf])) == np.inf
     assert np.isnan(log_sum_exp(np.array([0.0, np.nan])))
     assert float(log_sum_exp(np.array([1000.0, 1000.0]))) == 1000.0 + np.log(2.0)
-
-
-def plain(f):
-    """Draws from the base, all with the same weight."""
-    f = np.array(f, dtype=float)
-    n = len(f)
-    return Sample(f=f, weights=np.full(n, 1 / n), units=np.arange(n), n_units=n, x=f[f <= 0, None])
-
-
-@pytest.fixture
-def families(rng):
-    """60 weighted points that descend from 12 of 20 units."""
-    f, weights, units = rng.normal(size=60), rng.uniform(0.0, 0.02, 60), rng.integers(0, 12, 60)
-    return Sample(f=f, weights=weights, units=units, n_units=20, x=f[f <= 0, None])
-
-
-def test_sums_are_those_over_units(families):
-    gammas = np.array([-1.0, 0.0, 0.7])
-    totals = np.zeros((20, 3))
-    for f, weight, unit in zip(families.f, families.weights, families.units, strict=True):
-        totals[unit] += weight * (f <= gammas)
-    sums = unit_sums(families, gammas)
-    np.testing.assert_allclose(sums.p, totals.sum(axis=0))
-    np.testing.assert_allclose(sums.second, totals.T @ totals)
-    np.testing.assert_allclose(sums.ess, totals.sum(axis=0) ** 2 / (totals**2).sum(axis=0))
-    # p is 20 times a mean: its variance is that of 20 totals, (n - 1) / n of what is unbiased
-    np.testing.assert_allclose(sums.cov, np.sqrt(20 * totals.var(axis=0)) / totals.sum(axis=0))
-    np.testing.assert_allclose(sums.correlation, np.corrcoef(totals.T))
-    assert not sums.independent
-    assert not sums.is_count.any()
-
-
-def test_shares_of_plain_draws_are_binomial():
-    """Of 10 draws 0, 5, 9 and 10 have f <= g: nested indicators, with r = sqrt(p (1 - q) / (q (1 - p))) for p <= q."""
-    sums = unit_sums(plain(range(10)), np.array([-0.5, 4.0, 8.5, 20.0]))
-    np.testing.assert_allclose(sums.p, [0.0, 0.5, 0.9, 1.0])
-    np.testing.assert_allclose(sums.cov, [np.inf, np.sqrt(0.5 / 5), np.sqrt(0.1 / 9), 0.0], atol=1e-7)
-    np.testing.assert_allclose(sums.ess, [0.0, 5.0, 9.0, 10.0])
-    assert sums.is_count[1:].all()
-    r = np.sqrt(0.5 * 0.1 / (0.9 * 0.5))
-    expected = np.zeros((4, 4))  # what does not vary is correlated with nothing
-    expected[1:3, 1:3] = [[1.0, r], [r, 1.0]]
-    np.testing.assert_allclose(sums.correlation, expected, atol=1e-12)
-
-
-def test_a_layer_speaks_for_its_own_thresholds():
-    """Levels at 2 and 0: thresholds from 0 to 2 rest on all points of the first, those below on the second."""
-    first = Layer(f=np.array([3.0, 1.0, -1.0]), weights=np.full(3, 0.3), units=np.array([0, 1, 2]), low=0.0)
-    second = Layer(f=np.array([-1.0, -2.0]), weights=np.full(2, 0.1), units=np.array([2, 2]), high=0.0)
-    sample = Sample(
-        f=np.array([-1.0, -2.0]),
-        weights=np.full(2, 0.1),
-        units=np.array([2, 2]),
-        n_units=3,
-        x=np.zeros((2, 1)),
-        layers=(first, second),
-    )
-    sums = unit_sums(sample, np.array([-1.5, -0.5, 0.0, 1.0, 3.0]))
-    np.testing.assert_allclose(sums.p, [0.1, 0.2, 0.3, 0.6, 0.9])
-    np.testing.assert_allclose(np.diag(sums.second), [0.01, 0.04, 0.09, 0.18, 0.27])
-
-
-def level_of(correlation):
-    return simultaneous_level(np.array(correlation), 0.95, np.random.default_rng(0))
-
-
-@pytest.mark.parametrize("number", [2, 5])
-def test_independent_estimates_need_the_root(number):
-    """All of k hold together with 0.95 if each does with 0.95^(1 / k); 10,000 draws know the quantile to about 1 %."""
-    assert level_of(np.eye(number)) == pytest.approx(0.95 ** (1 / number), abs=0.004)
-
-
-def test_intervals_of_counts_are_exact_at_the_common_level_and_open_where_they_are_not_used():
-    f = np.concatenate([np.full(20, -1.0), np.full(30, 0.5), np.full(950, 2.0)])
-    sums = unit_sums(samplers.Sample.of_equal_draws(f, np.zeros((20, 1))), np.array([0.0, 1.0]))
-    low, high = simultaneous_intervals(sums, np.array([0]), sums.p, sums.cov, 0.95, seed=0)
-    assert (low[0], high[0]) == pytest.approx(clopper_pearson(20, 1000, 0.95))
-    assert (low[1], high[1]) == (0.0, 1.0)
-    both, _ = simultaneous_intervals(sums, np.array([0, 1]), sums.p, sums.cov, 0.95, seed=0)
-    assert both[0] < low[0]
