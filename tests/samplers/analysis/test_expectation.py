@@ -7,7 +7,7 @@ from scipy import stats
 from samplers.analysis.expectation import FurtherFailures, expect_over_failures, expect_under_refits
 from samplers.analysis.weighted import weigh_failures
 from tests.samplers.analysis.half_space_tail import BETA, METHODS, PHI, P, estimate_half_space
-from tests.samplers.analysis.sensitivity.parametric_normal import ALPHA, fitted, run
+from tests.samplers.analysis.parametric_normal import ALPHA, fitted, run
 from tests.samplers.fitted_bases import FittedWithEnsemble, normal
 from tests.samplers.fitted_bases import fitted as fitted_normal
 from tests.samplers.fitted_bases import run as run_normal

@@ -47,17 +47,6 @@ def test_the_interval_by_hand():
     assert found.spread == pytest.approx(spread)
 
 
-def test_the_ratio_is_known_better_than_either():
-    first, second = estimates()
-    found = samplers.compute_ratio_uncertainty(first, second)
-    width, *widths = (math.log(each[1] / each[0]) for each in (found.interval, *_intervals(first, second)))
-    assert width < 0.5 * min(widths)
-
-
-def _intervals(*results):
-    return [result.base_uncertainty.interval for result in results]
-
-
 def test_two_sides_of_one_run():
     """`compare` takes both from the same draws: the same refits, another error of the run."""
     base = BASE

@@ -90,14 +90,6 @@ def test_one_estimate_against_exact_p(name):
     assert first == again
 
 
-def test_failing_points_fail_and_are_all_counted(method, recorder):
-    f = recorder(parabola().problem.f)
-    result = samplers.estimate(FunctionProblem(f, 2), method, seed=2)
-    values = parabola().problem.evaluate(f.points)
-    assert result.failures.total == np.count_nonzero(values <= 0)
-    np.testing.assert_allclose(parabola().problem.evaluate(result.failures.x), result.failures.f)
-
-
 @pytest.mark.slow
 def test_works_through_any_base(method):
     """An exponential distribution: P[x1 + x2 >= 14] has a closed form."""

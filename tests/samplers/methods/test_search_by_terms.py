@@ -97,32 +97,6 @@ def test_a_term_with_an_early_and_a_late_mode():
     assert max(r.cov for r in results) < 0.06
 
 
-def lobes(dim=300, cosine=0.3):
-    """Three terms, each a least over three planes whose normals share a direction, as those of other ticks do.
-
-    Planes of one term meet at corr = cosine^2, so that p is the sum of all but a millionth.
-    """
-    rng = np.random.default_rng(0)
-    axes = np.linalg.qr(rng.standard_normal((dim, 12)))[0].T.reshape(3, 4, dim)
-    normals = cosine * axes[:, :1] + np.sqrt(1 - cosine**2) * axes[:, 1:]
-    beta = np.array([3.6, 3.9, 4.2])[:, None] + 0.35 * rng.standard_normal((3, 3))
-
-    def values(x):
-        return beta - np.einsum("id,jkd->ijk", x, normals)
-
-    def gradient(x, term):
-        return -normals[term, values(x)[np.arange(len(x)), term].argmin(axis=1)]
-
-    terms = samplers.FunctionProblem(dim=dim, terms=lambda x: values(x).min(axis=2), gradient=gradient)
-    return terms, float(norm.sf(beta).sum())
-
-
-@pytest.mark.slow
-def test_terms_with_several_modes():
-    problem, exact = lobes()
-    check(runs(problem, range(10, 14)), exact)
-
-
 @pytest.mark.slow
 def test_a_wrong_gradient_costs_accuracy_and_nothing_else(half_spaces):
     """Gradients that are as much noise as signal: p stays right, the c.o.v. about doubles. With noise alone the search
