@@ -68,8 +68,6 @@ class TwoStage(Method):
     p-hat is unbiased, as the estimate from each mixture is given what came before it, with two exceptions. Whether
     another method takes over after the third round or later depends on draws that count. With a target c.o.v., the
     draws decide themselves when they end, which costs a bias of the order of its square (`docs/two_stage.md`).
-    (Weighting all draws as if from one mixture, as adaptive multiple importance sampling does, would bias p by some
-    per cent and make intervals too short.)
 
     All stages work in standard normal space, so that wide draws stay within the support of the parameters. A run
     yields 45 to 90 batches, half of them steps of the levels and the lines of descent. Regression of f, subset
@@ -77,12 +75,12 @@ class TwoStage(Method):
 
     *Noise.* f may have noise of its own that is no part of x: p is then the marginal probability. No stored outcome
     is simulated again. A noisy f is recognised by 30 points right beside failing ones. Regions are then not
-    separated, and half of the draws come from tempered Gaussians: the best proposal where failure is by chance.
-    Coordinates of x that the base distribution calls noise are not searched (`methods/noise_coordinates.py`).
+    separated, and half of the draws come from tempered Gaussians. Coordinates of x that the base distribution calls
+    noise are not searched (`methods/searched.py`).
 
     *Interval* (`regions.py`). Log-normal, with t quantiles where few draws carry the weight and Bernstein's
-    bound where very few do; p-hat exp(q s) with s^2 = log(1 + c.o.v.^2). The upper end is at least Hall's, which
-    knows the skewness of the weights, and holds the share M of p in regions that were not found:
+    bound where very few do. The upper end is at least Hall's, which knows the skewness of the weights, and holds the
+    share M of p in regions that were not found:
 
         upper end = 97.5 % point of  p-hat exp(s Z) / (1 - M),    Z ~ N(0, 1),   M ~ Beta(1/10, nu)
         nu = distinct base draws whose line or path of levels failed + max(ESS, hits / 4) of the wide draws
@@ -93,19 +91,15 @@ class TwoStage(Method):
 
     *Warnings* (`stratified.py`): uneven weights, base draws that fail more often than p allows, rounds that
     contradict the estimate, regions that the last draws hardly reach, and a search of so few lineages that M may
-    exceed 0.3; the message says what cannot be excluded in units of p. A region that neither f announces nor any draw
-    has hit gives no warning; `Estimate.unseen` bounds its probability.
+    exceed 0.3. A region that neither f announces nor any draw has hit gives no warning; `Estimate.unseen` bounds it.
 
     *Terms.* Problems that offer terms and their gradients, in 30 dimensions or more and with 1,000 simulations or more,
-    are searched by another algorithm (`terms/search.py`). Where terms are offered otherwise, all points of the
-    exploration are simulated with them, and a term of which no state of the chains fails is searched alone
-    (`terms_alone.py`); a remark names those that were the least somewhere and did not reach failure.
+    are searched by another algorithm (`term_search.py`). Where terms are offered otherwise, a term of which no state
+    of the chains fails is searched alone (`terms_alone.py`); a remark names those that did not reach failure.
 
-    *Other methods take over* where a tenth of the base draws fails, or no failure is found (plain Monte Carlo for the
-    rest), and where no mixture describes the failures: dozens of regions, hundreds of dimensions without a direction
-    that matters, failures that noise alone decides on. That is decided after each round, by what its draws are
-    worth; adaptive subset simulation in all coordinates then goes on from the base draws (`py`), and a remark
-    says so.
+    *Other methods take over*, with a remark, where a tenth of the base draws fails, or no failure is found (plain Monte
+    Carlo), and where no mixture describes the failures (adaptive subset simulation in all coordinates): dozens of
+    regions, hundreds of dimensions without a direction that matters, failures that noise alone decides on.
 
     Args:
         n: Simulations where `max_sim` does not say how many; with a target c.o.v. final batches of a tenth of it
