@@ -187,6 +187,7 @@ def ego(tmp_path_factory: pytest.TempPathFactory) -> str:
     return str(train_ego(ENV, "a2c", 16, num_envs=8, out=folder / "ego.zip", progress=False))
 
 
+@pytest.mark.slow
 def test_a_retraining_has_the_failures_of_all_runs_and_the_ego_of_the_last(
     ego: str, risky: str, tmp_path: Path
 ) -> None:

@@ -169,6 +169,7 @@ def test_a_risk_says_what_was_done_before(cli: Cli, here: Path, monkeypatch: pyt
     assert f"\n{NOTHING} Done before: cut-in 0.26 per km x " in result.stderr
 
 
+@pytest.mark.slow
 def test_in_an_environment_of_highway_env(cli: Cli, monkeypatch: pytest.MonkeyPatch) -> None:
     from rare_envs.interop.problem import HighwayEnvProblem
 

@@ -27,6 +27,7 @@ def test_the_curve_starts_at_p_and_its_band_holds_the_truth(method: str) -> None
     assert 0.3 < curve.p[-1] < 0.7
 
 
+@pytest.mark.slow
 def test_the_result_names_the_statistics_that_were_applied(cli: Cli, tmp_path: Path) -> None:
     """A policy with somebody else's VecNormalize statistics drives unlike its training data: say which file it was."""
     from stable_baselines3 import PPO

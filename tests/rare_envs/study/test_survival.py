@@ -149,7 +149,8 @@ def test_killed_under_every_executor_it_gives_the_same_files(
     assert_same_files(tmp_path / "run", whole_in_chunks)
 
 
-@pytest.mark.parametrize("kill_at", [pytest.param(k, marks=[] if k == 3 else pytest.mark.slow) for k in KILLS])
+@pytest.mark.slow
+@pytest.mark.parametrize("kill_at", KILLS)
 def test_killed_in_the_final_writes_it_gives_the_same_files(
     kill_at: int, tmp_path: Path, base: str, whole: Path
 ) -> None:

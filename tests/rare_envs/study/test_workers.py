@@ -71,7 +71,7 @@ def test_whatever_the_ego_does_the_answer_is_that_of_one_that_gives_nan(
     assert seen[-1].workers == 2
 
 
-@pytest.mark.parametrize("chunk", [50, None])
+@pytest.mark.parametrize("chunk", [pytest.param(50, marks=pytest.mark.slow), None])
 def test_what_one_executor_began_another_continues(
     chunk: int | None, faulty: Path, risky: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -102,6 +102,7 @@ def test_with_an_executor_the_question_says_how_large_chunks_are(faulty: Path, r
     assert evaluate.settle_chunk(study, samplers.InProcess()).question.chunk == 256
 
 
+@pytest.mark.slow
 def test_a_worker_that_cannot_load_the_ego_is_one_line(faulty: Path, risky: str) -> None:
     class Later:
         """The file changes after the driver has loaded it and before a worker does."""
