@@ -90,21 +90,14 @@ def find_modes(space: ScenarioSpace, estimate: samplers.Estimate, crashes: Crash
         return ()
     sample, labels = require_sample(estimate), found.labels
     x, weights = sample.x[found.rows], sample.weights[sample.f <= estimate.gamma][found.rows]
-    return tuple(
-        FailureMode(
-            crash=str(found.kinds[np.argmax(labels == label)]),
-            share=share,
-            failure=int(np.argmax(found.listed == label)) if (found.listed == label).any() else None,
-            center=_mean_parameters(space, x[labels == label], weights[labels == label]),
-        )
-        for label, share in sum_by_label(estimate, found.rows, labels).items()
-    )
-
-
-def _mean_parameters(space: ScenarioSpace, x: FloatArray, weights: FloatArray) -> dict[str, float]:
-    """Return the weighted mean of the shown columns of x (n, d), by name."""
-    mean = np.average(x, axis=0, weights=weights) if weights.sum() > 0 else x.mean(axis=0)
-    return {column.name: float(value) for column, value in zip(list_columns(space), mean, strict=True) if column.shown}
+    modes = []
+    for label, share in sum_by_label(estimate, found.rows, labels).items():
+        mine, listed = labels == label, np.flatnonzero(found.listed == label)
+        mean = np.average(x[mine], axis=0, weights=weights[mine] if weights[mine].sum() > 0 else None)
+        center = {column.name: float(mean[j]) for j, column in enumerate(list_columns(space)) if column.shown}
+        failure, crash = int(listed[0]) if len(listed) else None, str(found.kinds[mine][0])
+        modes.append(FailureMode(crash=crash, share=share, failure=failure, center=center))
+    return tuple(modes)
 
 
 def assign_modes(space: ScenarioSpace, estimate: samplers.Estimate, crashes: Crashes) -> LabelledFailures | None:

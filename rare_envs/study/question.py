@@ -10,7 +10,7 @@ import contextlib
 import itertools
 import re
 import warnings
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -186,12 +186,7 @@ def digest_files(question: Question) -> dict[str, str]:
     bases = map(str.strip, (question.also_under or "").split(","))
     names = filter(None, (question.base, question.drivers, question.measure, *bases))
     paths = {path for name in names for path in find_named_files(name)}
-    return digest_contents(sorted(paths | set(find_ego_files(question))))
-
-
-def digest_contents(paths: Iterable[Path]) -> dict[str, str]:
-    """Return the digests of files, by path."""
-    return {str(path): digest_file(path) for path in paths}
+    return {str(path): digest_file(path) for path in sorted(paths | set(find_ego_files(question)))}
 
 
 def find_ego_files(question: Question) -> list[Path]:

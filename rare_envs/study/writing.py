@@ -27,7 +27,7 @@ from rare_envs.study.arguments import Question, read_question
 from rare_envs.study.columns import MAX_SHOWN, list_columns
 from rare_envs.study.errors import BadInput, UnwrittenResults
 from rare_envs.study.plots import save_plot, saved_figure
-from rare_envs.study.question import Study, digest_contents, digest_files, find_ego_files, is_same_question
+from rare_envs.study.question import Study, digest_files, find_ego_files, is_same_question
 from rare_envs.study.report import Report
 from rare_envs.study.run_folder import (
     CRASH,
@@ -42,6 +42,7 @@ from rare_envs.study.run_folder import (
     SEVERITY,
     STUDY,
     STUDY_FORMAT,
+    digest_file,
     digest_results,
 )
 from rare_envs.traffic.crash import CRASH_KINDS, NONE
@@ -313,7 +314,7 @@ def find_versions() -> dict[str, str]:
 
 def _describe_ego(question: Question) -> dict[str, Any]:
     """Return name, kind and fingerprint of the ego: of its files, or of this version where it comes with it."""
-    files = digest_contents(find_ego_files(question))
+    files = {str(path): digest_file(path) for path in find_ego_files(question)}
     rests_on = "".join(sorted(files.values())) or f"{question.ego} of rare-envs {__version__}"
     return {
         "name": question.ego,
