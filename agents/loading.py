@@ -152,13 +152,6 @@ def load_ego(
 
 def find_ego_kind(spec: str) -> EgoKind:
     """Return the kind of ego of a name, file, address or function; the header identifies a `.safetensors` file."""
-    name = spec.partition("?")[0]
-    if name in (RULE_BASED, HUMAN):
-        return "rule"
-    if spec == VISION or (spec.endswith(SUFFIX) and files.holds_vision(spec)):
-        return "vision"
-    if name in (*SHIPPED_DRIVERS, *SHIPPED_EGOS) or spec.endswith(SUFFIX):
-        return "learned"
     beginnings: dict[str, EgoKind] = {
         "process:": "process",
         "noisy:": "noisy",
@@ -169,6 +162,13 @@ def find_ego_kind(spec: str) -> EgoKind:
     for beginning, kind in beginnings.items():
         if spec.startswith(beginning):
             return kind
+    name = spec.partition("?")[0]
+    if name in (RULE_BASED, HUMAN):
+        return "rule"
+    if spec == VISION or (spec.endswith(SUFFIX) and files.holds_vision(spec)):
+        return "vision"
+    if name in (*SHIPPED_DRIVERS, *SHIPPED_EGOS) or spec.endswith(SUFFIX):
+        return "learned"
     if "://" in spec:
         return "url"
     if spec.endswith(".onnx"):

@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from agents import Ego, LearnedEgo, Provenance, load_driver, load_ego, save_driver
+from agents.loading import find_ego_kind
 from rare_envs import IDM
 from rare_envs.control.human_driver import HumanDriverModel
 from rare_envs.egos.human import HumanEgo
@@ -105,6 +106,7 @@ def test_what_is_near_an_incomplete_name_is_told(tmp_path: Path) -> None:
 def test_rule_based_egos_with_settings_are_those_drivers() -> None:
     assert load_ego("idm?time_headway=2&desired_speed=30") == IDM(time_headway=2.0, desired_speed=30.0)
     assert load_ego("human?noticing_time=0") == HumanEgo(HumanDriverModel(noticing_time=0.0))
+    assert [find_ego_kind(f"{kind}:mine.safetensors") for kind in ("noisy", "process")] == ["noisy", "process"]
     noisy = load_ego("noisy:idm?time_headway=2?latency=0.3")
     assert (noisy.ego, noisy.stack.latency) == (IDM(time_headway=2.0), 0.3)  # type: ignore[union-attr]
 

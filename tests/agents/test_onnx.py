@@ -156,12 +156,6 @@ def test_the_best_of_five_scores_is_the_action(tmp_path: Path) -> None:
     np.testing.assert_array_equal(ego.predict(observation)[0], expected)
 
 
-def test_another_size_of_observations_is_refused(tmp_path: Path) -> None:
-    ego = load_ego(write(nn.Linear(7, 2), tmp_path / "ego.onnx"))
-    with pytest.raises(ValueError, match="The ego expects observations"):
-        rare_envs.DrivingProblem("rare_envs/CutIn-v0", ego=ego)
-
-
 class TwoOutputs(nn.Module):
     def forward(self, observation: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         return observation[:, :2], observation
