@@ -11,9 +11,10 @@ from samplers.analysis.sensitivity import Sensitivity
 from samplers.analysis.weighted import Share
 from samplers.comparison import Comparison, compare
 from samplers.distributions import as_distribution
-from samplers.estimation import METHODS, EstimationInterrupted, estimate, get_method
+from samplers.estimation import EstimationInterrupted, estimate
 from samplers.executors import Executor, FuturesPool, InProcess, LocalProcesses, RayCluster
 from samplers.method import Goal, Interrupted, Outcome, Stepping, Steps
+from samplers.methods import METHODS, get_method
 from samplers.methods.auto import Auto
 from samplers.methods.base import Method
 from samplers.methods.blocks import BetaBlock, GaussianBlock, MappedBlock, MixtureBlock, NormalBlock, Product

@@ -19,7 +19,7 @@ import samplers
 from benchmarks import RESULTS
 from benchmarks.estimators.truth import TRUTH_RESULT
 from rare_envs.threads import use_one_thread
-from samplers.estimation import get_method
+from samplers.methods import get_method
 
 COMPARISON_RESULT = RESULTS / "against_truth.json"
 MONTE_CARLO_BUDGET = 100_000

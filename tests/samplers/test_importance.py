@@ -15,14 +15,13 @@ from samplers.importance import (
     draw_after_search,
     pool_rounds,
     round_record,
-    simulate_until,
     weight_warnings,
     weighted_interval,
 )
 from samplers.limit_states import half_space
 from samplers.method import Goal
 from samplers.problem import StandardNormal
-from samplers.proposals import Gaussian, TiltedNormal
+from samplers.proposals import TiltedNormal
 from samplers.sample import Status
 
 BETA = 1.7
@@ -116,32 +115,6 @@ def test_doubts_are_of_few_and_of_heavy_draws():
     (doubt,) = weight_warnings(weighing(*others, 17.8))  # 15.1 %
     assert "One draw carries 15 %" in doubt
     assert "None of 1,000 final draws failed" in weight_warnings(weighing())[0]
-
-
-def until(drive, limit, batch, **goal):
-    problem, told = half_space(2, 1.0).problem, []
-    steps = simulate_until(
-        problem,
-        Gaussian(np.full(2, 0.7), np.eye(2)),
-        Goal(gamma=0.0, on_level=told.append, **goal),
-        limit,
-        batch,
-        np.random.default_rng(0),
-    )
-    draws, trace, stopped = drive(steps, problem).value
-    assert told == trace
-    return draws, trace, stopped
-
-
-def test_batches_up_to_a_limit_or_a_target(drive):
-    draws, trace, stopped = until(drive, 2500, 1000)
-    assert [level.n_sim for level in trace] == [level.n_points for level in trace] == [1000, 1000, 500]
-    assert (draws.n, stopped) == (2500, False)
-    assert (trace[-1].estimate, trace[-1].cov, trace[-1].ess) == (draws.p, draws.cov, draws.ess)
-    assert trace[0].p == pytest.approx(stats.norm.sf(1.0 - 0.7 * math.sqrt(2)), abs=4 * 0.5 / math.sqrt(1000))
-    assert draws.p == pytest.approx(stats.norm.sf(1.0), rel=4 * draws.cov)
-    draws, trace, _ = until(drive, 100_000, 500, target_cov=0.02)
-    assert trace[-1].cov <= 0.02 < trace[-2].cov
 
 
 BASE = StandardNormal(2)

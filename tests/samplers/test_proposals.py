@@ -1,8 +1,5 @@
 """Gaussians and mixtures fitted to weighted points."""
 
-from dataclasses import dataclass
-from itertools import pairwise
-
 import numpy as np
 import pytest
 
@@ -12,54 +9,11 @@ from samplers.proposals import (
     Mixture,
     Moments,
     correct_eigenvalues,
-    expectation_maximisation,
     fit_proposal_mixture,
     fit_shrunk_gaussian,
     shrink_covariance,
     shrink_towards_present,
-    start_from_centres,
 )
-
-
-@dataclass
-class UnitVariance:
-    """Mixtures of N(mean, I): the textbook M-step; it keeps the log likelihoods that it saw."""
-
-    u: np.ndarray
-    weights: np.ndarray
-
-    def __post_init__(self):
-        self.seen = []
-
-    def maximise(self, responsibilities):
-        mass = responsibilities * self.weights
-        totals = mass.sum(axis=1)
-        means = mass @ self.u / totals[:, None]
-        return Mixture(totals / totals.sum(), [Gaussian(mean, np.eye(len(mean))) for mean in means])
-
-    def log_terms(self, mixture):
-        self.seen.append(float(self.weights @ mixture.log_prob(self.u)))
-        return mixture.log_terms(self.u)
-
-
-def two_groups(rng, n=2000):
-    """0.25 of the points around (-3, 0), the others around (3, 1)."""
-    first = rng.random(n) < 0.25
-    return rng.standard_normal((n, 2)) + np.where(first[:, None], [-3.0, 0.0], [3.0, 1.0])
-
-
-def fit(u, weights, k, rng, steps=60):
-    family = UnitVariance(u, weights)
-    start = start_from_centres(u, weights, k, rng)
-    return *expectation_maximisation(family.maximise, family.log_terms, start, weights, steps, lambda _: 1e-8), family
-
-
-def test_every_step_raises_the_likelihood(rng):
-    mixture, reached, family = fit(two_groups(rng) * 0.5, np.full(2000, 1 / 2000), 3, rng)
-    assert len(family.seen) > 5
-    assert all(after >= before - 1e-12 for before, after in pairwise(family.seen))
-    assert reached == pytest.approx(family.seen[-1])
-    assert reached == pytest.approx(float(mixture.log_prob(family.u).mean()))
 
 
 def equal(n):

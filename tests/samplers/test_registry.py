@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 
 import samplers
 from rare_envs.study.cli.app import app
-from samplers.estimation import ENTRY_POINT_GROUP, METHODS, Methods
+from samplers.methods import ENTRY_POINT_GROUP, METHODS, Methods
 from samplers.testing import check_method
 
 LATTICE = """

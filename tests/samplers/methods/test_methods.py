@@ -7,8 +7,8 @@ import pytest
 from scipy import stats
 
 import samplers
-from samplers.estimation import METHODS
 from samplers.limit_states import four_branches, half_space, parabola, plateau, two_modes
+from samplers.methods import METHODS
 from samplers.problem import FunctionProblem
 from samplers.testing import METHOD_CHECKS, check_accuracy, check_budget, check_dimensions, check_interruption
 
