@@ -67,22 +67,6 @@ class HasLogProb(Protocol):
 
 
 @runtime_checkable
-class CanSample(Protocol):
-    """A distribution that can be sampled."""
-
-    def sample(self, n: int, rng: np.random.Generator, /) -> FloatArray:
-        """Draw n independent points, shape (n, d)."""
-
-
-@runtime_checkable
-class HasSiblings(Protocol):
-    """A base distribution that knows others of the same X by name."""
-
-    def sibling(self, name: str) -> HasLogProb:
-        """Return the base distribution with this name; a ValueError if there is none."""
-
-
-@runtime_checkable
 class FittedBase(Distribution, Protocol):
     """A base distribution that was fitted to events, with its bootstrap refits; without refits it is like any other.
 
@@ -206,9 +190,9 @@ def reweight_estimate(estimate: EstimateData, new_base: Any) -> Reweighted:
     )
 
 
-def find_sibling(base: object, name: str) -> HasLogProb:
+def find_sibling(base: Any, name: str) -> Any:
     """Return another base distribution of the same X by its name; a ValueError if there is none."""
-    if not isinstance(base, HasSiblings):
+    if not hasattr(base, "sibling"):  # the user's own class
         raise ValueError(f"This base distribution knows no others by name: give a distribution in place of {name!r}.")
     return base.sibling(name)
 
@@ -237,7 +221,7 @@ def _log_density_ratios(estimate: EstimateData, new_base: HasLogProb, x: FloatAr
     if len(x) == 0:
         raise ValueError(f"No point failed (f <= {estimate.gamma:g}): there is nothing to reweight.")
     _check_dimensions(new_base, dim)
-    if isinstance(new_base, CanSample):
+    if hasattr(new_base, "sample"):  # the user's own class
         draws = np.asarray(new_base.sample(SUPPORT_DRAWS, np.random.default_rng(estimate.seed)), dtype=np.float64)
         if draws.shape != (SUPPORT_DRAWS, dim):
             raise ValueError(
@@ -308,7 +292,7 @@ def check_refits(base: Distribution, dim: int) -> None:
         try:
             _check_dimensions(refit, dim)
             inside = np.isfinite(log_density(refit, x)).all()
-            if isinstance(refit, CanSample):
+            if hasattr(refit, "sample"):  # the user's own class
                 draws = np.asarray(refit.sample(REFIT_CHECK_DRAWS, np.random.default_rng(0)))
                 inside &= np.isfinite(log_density(fitted, draws)).all()
         except ValueError as error:

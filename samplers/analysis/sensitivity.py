@@ -71,30 +71,6 @@ SHOWN_PARAMETERS = 12
 """Rows of the table for people, and bars of the picture."""
 
 
-class BaseParameter(Protocol):
-    """A parameter of a base distribution."""
-
-    @property
-    def name(self) -> str:
-        """In words, such as "mean of log gap"."""
-
-    @property
-    def value(self) -> float:
-        """Its value."""
-
-    @property
-    def change(self) -> float:
-        """Change for which the sensitivity is stated, > 0, such as a standard deviation for a mean."""
-
-    @property
-    def change_name(self) -> str:
-        """The same in words, such as "1 sd"."""
-
-    @property
-    def columns(self) -> tuple[int, ...]:
-        """Columns of x that it is about; none if it is about all."""
-
-
 @runtime_checkable
 class ParametricBase(Protocol):
     """A base distribution whose parameters can be moved one by one."""
@@ -102,8 +78,13 @@ class ParametricBase(Protocol):
     def log_prob(self, x: FloatArray) -> FloatArray:
         """Log density at x (n, d), shape (n,)."""
 
-    def parameters(self, names: Sequence[str] = (), like: object = None) -> Sequence[BaseParameter]:
-        """Return the parameters."""
+    def parameters(self, names: Sequence[str] = (), like: object = None) -> Sequence[Any]:
+        """Return the parameters, given names of the columns of x and a base of the same family to be like.
+
+        Each has a `name` in words, such as "mean of log gap", its `value`, a `change` > 0 for which the sensitivity is
+        stated, such as a standard deviation for a mean, a `change_name`, such as "1 sd", and the `columns` of x that it
+        is about; none if it is about all.
+        """
 
     def with_parameters(self, values: FloatArray) -> HasLogProb:
         """Return the same distribution with other values of the parameters, in the order of `parameters()`."""

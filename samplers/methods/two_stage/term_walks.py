@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple, Protocol, runtime_checkable
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -53,18 +53,10 @@ class TermSimulator(Simulator):
         return self._slopes.pull_back(u, answer.values)
 
 
-@runtime_checkable
-class DifferentiableDistribution(Distribution, Protocol):
-    """A distribution that knows the derivatives of its map from standard normal space."""
-
-    def pull_back(self, u: FloatArray, gradients: FloatArray) -> FloatArray:
-        """Return gradients J' g (n, d) by u of gradients g (n, d) by x at x = T(u), u (n, d), with J = dx / du."""
-
-
 class TransformSlopes:
     """Derivatives of x = T(u), the map from standard normal space, block by block: no simulation.
 
-    A block that is a `DifferentiableDistribution` has its own; others are differentiated by `DifferencedMap`.
+    A block with `pull_back`, as here, has its own; others are differentiated by `DifferencedMap`.
     """
 
     def __init__(self, inputs: Inputs) -> None:
@@ -76,7 +68,7 @@ class TransformSlopes:
             blocks, dims = (base,), [inputs.dim]
         self._ends = np.cumsum(dims)[:-1]
         self._maps = [
-            block if isinstance(block, DifferentiableDistribution) else DifferencedMap(block, own)
+            block if hasattr(block, "pull_back") else DifferencedMap(block, own)
             for block, own in zip(blocks, np.split(noise, self._ends), strict=True)
         ]
 
