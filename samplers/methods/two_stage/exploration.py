@@ -12,12 +12,10 @@ fails, so that plateaus, ties, jumps and misleading level sets do not matter to 
    (`regions.py`).
 5. The points half way between two failing points: if one fails, the two belong to one region (`regions.py`).
 
-Lines of descent: points that walk downhill, each alone, until they fail.
-
 In subset simulation points descend from the few that were lowest at first: of 500 base draws three to five effectively
-have descendants among the failures, and a region that none of these leads to is not found. Here no line ends because
-another one is lower: each moves where f is no larger than at its own point. So each is a trial of its own of which
-region is found, and nothing else: its end is no draw given failure.
+have descendants among the failures, and a region that none of these leads to is not found. No line of descent ends
+because another one is lower: each is a trial of its own of which region is found, and nothing else: its end is no draw
+given failure.
 
 Slopes: in dozens of dimensions some hundred failing points do not show in which directions failures differ from
 N(0, I). Gradients of f at a handful of points do, by finite differences, where few directions matter or f is the least

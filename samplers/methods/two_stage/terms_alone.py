@@ -97,9 +97,7 @@ def explore_terms(
         starts += [_choose_low_draws(first, terms, j, each, rng) for j in group]
     descents = [_descend_alone(start, terms.threshold, rng) for start in starts]
     nearest = [float((region.points**2).sum(axis=1).min()) for region in exploration.regions]
-    far = min(nearest, default=math.inf) - 2 * math.log(
-        TERMS_ALONE.least_density
-    )  # |u|^2: beyond, failures hardly matter
+    far = min(nearest, default=math.inf) - 2 * math.log(TERMS_ALONE.least_density)  # |u|^2 of failures that matter
     numbers = np.array([*known, *searched, *scouted], dtype=np.int64)
     ends = yield from _run_together(simulator, descents, numbers, far)
     likely = [points[(points**2).sum(axis=1) <= far] for points in ends]
