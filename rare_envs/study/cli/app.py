@@ -34,49 +34,43 @@ from rare_envs.study.cli.shell import Answer, OneLineErrors, SummarisedCommands,
 from rare_envs.study.errors import as_bad_input
 from rare_envs.version import __version__
 
-EXAMPLES: dict[str, tuple[str, ...]] = {
-    "": ("rare-envs list", "rare-envs estimate rare_envs/CutIn-v0 --ego idm --max-sim 3000"),
-    "list": ("rare-envs list", "rare-envs list egos", "rare-envs list CutIn-v0"),
-    "estimate": (
-        "rare-envs estimate rare_envs/CutIn-v0 --ego ppo.zip --out runs/cutin",
-        "rare-envs estimate rare_envs/CarFollowing-v0 --base us101-gap --method mc --max-sim 1e5",
-        "rare-envs estimate highway-fast-v0 --ego dqn.zip --max-sim 300",
-    ),
-    "resume": ("rare-envs resume runs/cutin", "rare-envs resume runs/cutin --workers 4"),
-    "risk": ("rare-envs risk ppo.zip --out runs/risk", "rare-envs risk idm --sites us101,i80"),
-    "bases": ("rare-envs bases cut_in", "rare-envs bases rare_envs/HardBrake-v0 --json"),
-    "compare": ("rare-envs compare old.zip new.zip rare_envs/CutIn-v0 --out runs/compared",),
-    "plan": ("rare-envs plan rare_envs/CutIn-v0 --ego ppo.zip --cov 0.1", "rare-envs plan runs/cutin --cov 0.05"),
-    "replay": (
-        "rare-envs replay runs/cutin --out crash.gif",
-        "rare-envs replay runs/cutin --failure 3 --ego new.zip",
-        "rare-envs replay runs/cutin --all",
-    ),
-    "report": ("rare-envs report runs/cutin --figures pdf",),
-    "export": (
-        "rare-envs export runs/cutin --out crash.xosc",
-        "rare-envs export runs/cutin --out crash.xml --format commonroad",
-    ),
-    "fit": (
-        "rare-envs fit --highd path/to/highD/data --out bases --name cologne",
-        "rare-envs fit --tgsim path/to/tgsim --cut-gaps --scenario cut_in --out bases",
-    ),
-    "train-ego": (
-        "rare-envs train-ego rare_envs/CutIn-v0 --steps 200000 --out ppo.zip",
-        "rare-envs train-ego rare_envs/CutIn-v0 --algo dqn --out dqn.zip",
-    ),
-    "train-drivers": ("rare-envs train-drivers --highd path/to/highD/data --out runs/drivers --method gail",),
-    "check-ego": (
-        "rare-envs check-ego ppo.zip rare_envs/CutIn-v0",
-        "rare-envs check-ego tcp://127.0.0.1:5555 rare_envs/CutIn-v0",
-    ),
-    "serve-ego": ("rare-envs serve-ego ppo.zip --bind tcp://127.0.0.1:5555",),
-    "export-ego": ("rare-envs export-ego ppo.zip ppo.onnx",),
-    "corpus": ("rare-envs corpus add runs/cutin", "rare-envs corpus run --ego new.zip --junit corpus.xml"),
-    "corpus add": ("rare-envs corpus add runs/cutin --corpus corpus --most 5",),
-    "corpus run": ("rare-envs corpus run --ego new.zip --corpus corpus --junit corpus.xml",),
-}
-"""Commands to examples of them, in one line each."""
+EXAMPLES = """
+rare-envs list
+rare-envs list egos
+rare-envs list CutIn-v0
+rare-envs estimate rare_envs/CutIn-v0 --ego ppo.zip --out runs/cutin
+rare-envs estimate rare_envs/CarFollowing-v0 --base us101-gap --method mc --max-sim 1e5
+rare-envs estimate highway-fast-v0 --ego dqn.zip --max-sim 300
+rare-envs resume runs/cutin
+rare-envs resume runs/cutin --workers 4
+rare-envs risk ppo.zip --out runs/risk
+rare-envs risk idm --sites us101,i80
+rare-envs bases cut_in
+rare-envs bases rare_envs/HardBrake-v0 --json
+rare-envs compare old.zip new.zip rare_envs/CutIn-v0 --out runs/compared
+rare-envs plan rare_envs/CutIn-v0 --ego ppo.zip --cov 0.1
+rare-envs plan runs/cutin --cov 0.05
+rare-envs replay runs/cutin --out crash.gif
+rare-envs replay runs/cutin --failure 3 --ego new.zip
+rare-envs replay runs/cutin --all
+rare-envs report runs/cutin --figures pdf
+rare-envs export runs/cutin --out crash.xosc
+rare-envs export runs/cutin --out crash.xml --format commonroad
+rare-envs fit --highd path/to/highD/data --out bases --name cologne
+rare-envs fit --tgsim path/to/tgsim --cut-gaps --scenario cut_in --out bases
+rare-envs train-ego rare_envs/CutIn-v0 --steps 200000 --out ppo.zip
+rare-envs train-ego rare_envs/CutIn-v0 --algo dqn --out dqn.zip
+rare-envs train-drivers --highd path/to/highD/data --out runs/drivers --method gail
+rare-envs check-ego ppo.zip rare_envs/CutIn-v0
+rare-envs check-ego tcp://127.0.0.1:5555 rare_envs/CutIn-v0
+rare-envs serve-ego ppo.zip --bind tcp://127.0.0.1:5555
+rare-envs export-ego ppo.zip ppo.onnx
+rare-envs corpus add runs/cutin --corpus corpus --most 5
+rare-envs corpus run --ego new.zip --corpus corpus --junit corpus.xml
+"""
+"""Examples of all commands, shown on their pages."""
+FIRST = ("rare-envs list", "rare-envs estimate rare_envs/CutIn-v0 --ego idm --max-sim 3000")
+"""Examples on the first page."""
 
 app = typer.Typer(
     cls=OneLineErrors,
@@ -134,9 +128,14 @@ def bases_command(
     return Answer(data, partial(print_bases, env_id, found))
 
 
-def format_examples(name: str) -> str:
+def list_examples(page: str) -> list[str]:
+    """Return the examples on the help page of a command, or of a group of them."""
+    return [line for line in EXAMPLES.split("\n") if f"{line} ".startswith(f"rare-envs {page} ")] if page else [*FIRST]
+
+
+def format_examples(page: str) -> str:
     """Return the text below a help page, whose lines are not to be filled."""
-    return "\n".join(("\b", "Examples:", *(f"  {line}" for line in EXAMPLES[name])))
+    return "\n".join(("\b", "Examples:", *(f"  {line}" for line in list_examples(page))))
 
 
 COMMANDS: dict[str, Callable[..., None]] = {
