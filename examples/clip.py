@@ -16,7 +16,7 @@ from PIL import Image
 
 import agents
 import rare_envs
-from rare_envs.envs import Renderer
+from rare_envs.envs.rendering import Renderer
 from rare_envs.simulation import drive
 from rare_envs.traffic import describe_crash
 

@@ -79,7 +79,7 @@ def set_up(
         collisions: Which count: those of the "ego", or "any", those between two other vehicles too.
         camera: Of the observation "camera": a `rare_envs.sensors.camera.Camera`, or the size (height, width) of its
             pictures; None for 66 x 200.
-        weather: Whether weather and the camera's noise are part of x, see `rare_envs.sensors.camera.context`; without
+        weather: Whether weather and the camera's noise are part of x, see `rare_envs.sensors.camera`; without
             it there is a clear day. Weather does not change the traffic.
         **unknown: Any other argument, which is refused.
 

@@ -11,20 +11,11 @@ class EgoGone(BaseException):
     """The ego cannot be queried any more, whatever the scenario.
 
     Like KeyboardInterrupt it is no `Exception`: code that survives failing scenarios must not take it for one.
-
-    Example:
-        >>> issubclass(EgoGone, Exception)
-        False
     """
 
 
 class NoAnswer(RuntimeError):
-    """The ego has not answered in time, or has died: perhaps because of one of the rows of the query.
-
-    Example:
-        >>> reason_of(NoAnswer("no answer within 10 s"))
-        'NoAnswer: no answer within 10 s'
-    """
+    """The ego has not answered in time, or has died: perhaps because of one of the rows of the query."""
 
     waits: ClassVar[bool] = True
     """Each costs its time, or a process that starts again; `samplers` reads this attribute."""

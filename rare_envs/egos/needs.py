@@ -50,19 +50,7 @@ class WorldEgo(Protocol):
 
 @runtime_checkable
 class WrappedEgo(WorldEgo, Protocol):
-    """An ego behind something that stands between it and its world, such as an imperfect stack.
-
-    Example:
-        >>> from rare_envs.control.idm import IDM
-        >>> class SameAsEver:
-        ...     ego = "idm"
-        ...     def noise_columns(self, world):
-        ...         return 0
-        ...     def in_world(self, world):
-        ...         return IDM()
-        >>> isinstance(SameAsEver(), WrappedEgo)
-        True
-    """
+    """An ego behind something that stands between it and its world, such as an imperfect stack."""
 
     @property
     def ego(self) -> Any:
@@ -259,24 +247,9 @@ RULE_BASED_EGOS: Mapping[str, Any] = MappingProxyType({"idm": IDM(), "human": Hu
 
 
 def resolve(ego: Any, vehicles: int = 1) -> EgoNeeds:
-    """Return what an ego needs of its world.
+    """Return what an ego of any kind, see `as_driver`, needs of its world, in a scenario with so many vehicles.
 
     An ego that wraps another one needs what that one needs, and noise columns of its own.
-
-    Args:
-        ego: "idm", "human", a `Driver`, an object with `predict`, a `WorldEgo`, or a function or torch module from
-            observations to actions.
-        vehicles: Of the scenario, whose features have a space for each number of them.
-
-    Example:
-        >>> from rare_envs.simulation.observation import observation_space
-        >>> class Policy:
-        ...     observation_space = observation_space(1, "lidar")
-        ...     deterministic = False
-        ...     def predict(self, observation, state=None, episode_start=None, deterministic=True): ...
-        >>> needs = resolve(Policy(), vehicles=3)
-        >>> needs.observation, needs.varies, needs.queries_policy
-        ('lidar', True, True)
     """
     ego = find_rule_based(ego)
     if isinstance(ego, WrappedEgo):

@@ -215,21 +215,10 @@ def find_device_driver(driver: Driver, device: torch.device, before: Driver | No
 
 
 def as_driver(ego: Any, world: World, needs: EgoNeeds | None = None) -> Driver:
-    """Return the Driver that an ego stands for in a world.
+    """Return the Driver that an ego stands for in a world, which has what `resolve` says it needs; else a ValueError.
 
-    Args:
-        ego: "idm", "human", a `Driver`, an object with `predict`, a `rare_envs.egos.needs.WorldEgo`, or a function or
-            torch module from observations to actions.
-        world: The world; what `resolve` says that the ego needs it has.
-        needs: The answer of `resolve`, if it is known already; None resolves the ego here.
-
-    Example:
-        >>> from rare_envs.scenarios.cut_in import CUT_IN
-        >>> type(as_driver("idm", World(CUT_IN))).__name__
-        'IDM'
-
-    Raises:
-        ValueError: If it is none of these, or its spaces do not fit.
+    "idm", "human", a `Driver`, an object with `predict`, a `WorldEgo`, or a function or torch module from observations
+    to actions. `needs` is the answer of `resolve`, if it is known already.
     """
     ego = find_rule_based(ego)
     if isinstance(ego, str | type):  # a class has the attributes of its egos

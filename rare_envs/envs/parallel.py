@@ -102,11 +102,6 @@ class DrivingParallelEnv(_SeveralAgents, ParallelEnv[str, SingleObservation, Flo
     `ego`. An agent terminates when its vehicle touches another one or leaves the road, is truncated at the horizon,
     and then leaves `agents`; its vehicle rolls out, see `rare_envs.multi_agent`.
 
-    Example:
-        >>> env = DrivingParallelEnv("rare_envs/CutIn-v0")
-        >>> observations, infos = env.reset(seed=0)
-        >>> env.agents, observations["cutter"].shape
-        (['ego', 'cutter', 'lead'], (11,))
     """
 
     metadata: dict[str, Any] = {  # noqa: RUF012  (PettingZoo's own form)
@@ -135,9 +130,6 @@ class DrivingParallelEnv(_SeveralAgents, ParallelEnv[str, SingleObservation, Flo
             rewards: Rewards of agents by name; by default each has the reward of an ego, in its own view.
             render_mode: None, "rgb_array" or "human".
             **kwargs: See `rare_envs.make.set_up`.
-
-        Raises:
-            ValueError: If an argument is invalid.
         """
         self.possible_agents = self._set_up(env_id, agents, ego, rewards, kwargs)
         self.metadata = {**self.metadata, "name": env_id, "render_fps": self.world.clock.decisions_per_second}
@@ -178,9 +170,6 @@ class DrivingParallelEnv(_SeveralAgents, ParallelEnv[str, SingleObservation, Flo
 
         Returns:
             Observations and infos by agent.
-
-        Raises:
-            ValueError: If an option is unknown, of the wrong shape, NaN or outside its range.
         """
         if seed is not None or self._np_random is None:
             self._np_random, _ = seeding.np_random(seed)
@@ -301,10 +290,6 @@ class AgentsVectorEnv(_SeveralAgents, VectorEnv[NDArray[np.float32], NDArray[Any
     at the horizon. That terminates the rows of agents that have collided, all rows if it was the ego, and truncates the
     others: their episodes are cut short, so a learner should bootstrap there.
 
-    Example:
-        >>> env = AgentsVectorEnv("rare_envs/CutIn-v0", scenarios=2, agents=["ego", "cutter"])
-        >>> env.num_envs, env.reset(seed=0)[0].shape
-        (4, (4, 11))
     """
 
     metadata = {  # noqa: RUF012  (Gymnasium's own form)
@@ -331,9 +316,6 @@ class AgentsVectorEnv(_SeveralAgents, VectorEnv[NDArray[np.float32], NDArray[Any
             ego: What drives the ego if it is no agent; without memory, because scenarios begin at different times.
             rewards: Rewards of agents by name, as in `DrivingParallelEnv`.
             **kwargs: See `rare_envs.make.set_up`.
-
-        Raises:
-            ValueError: If an argument is invalid.
         """
         if not isinstance(scenarios, (int, np.integer)) or isinstance(scenarios, bool) or scenarios < 1:
             raise ValueError(f"Expected one or more scenarios, got {scenarios!r}.")

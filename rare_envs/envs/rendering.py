@@ -114,24 +114,10 @@ _Outlines = dict[str, tuple[Colour, Collection[int]]]
 
 
 class Renderer:
-    """Painter of episodes of a world, on one surface that follows the ego.
-
-    Example:
-        >>> import gymnasium
-        >>> env = gymnasium.make("rare_envs/CutIn-v0", render_mode="rgb_array")
-        >>> _ = env.reset(seed=0)
-        >>> env.render().shape  # by a Renderer
-        (208, 800, 3)
-    """
+    """Painter of episodes of a world, on one surface that follows the ego."""
 
     def __init__(self, world: World, window: bool = False, fps: int = 10) -> None:
-        """Prepare a surface.
-
-        Args:
-            world: Of the episodes.
-            window: Whether to show it in a window too.
-            fps: Frames per second of the window.
-        """
+        """Prepare a surface, shown in a window too if asked, at so many frames per second."""
         import pygame
         import pygame.freetype
         from highway_env.road.graphics import WorldSurface
@@ -163,17 +149,10 @@ class Renderer:
         agents: Collection[int] = (),
         crashed: Collection[int] | None = None,
     ) -> NDArray[np.uint8]:
-        """Draw one of B episodes.
+        """Return the image, (H, FRAME_WIDTH, 3), of one of B episodes, a time after its start [s].
 
-        Args:
-            episode: The episodes.
-            time: Since their start [s].
-            row: Which one.
-            agents: Indices of the vehicles that agents drive.
-            crashed: Indices of the vehicles that have crashed; None for the ego, if it has, and whom it touches.
-
-        Returns:
-            The image, shape (H, FRAME_WIDTH, 3).
+        Vehicles that agents drive, and those that have `crashed` (None: the ego, if it has, and whom it touches), are
+        outlined.
         """
         outlines: _Outlines = {
             "driven by an agent": (AGENT, set(agents) - {0}),

@@ -171,10 +171,7 @@ def episode_info(space: ScenarioSpace, x: NDArray[Any], episode: Episode) -> Inf
 def step_info(
     space: ScenarioSpace, x: NDArray[Any], episode: Episode, reward: Any, over: bool, vehicle: int = 0
 ) -> Info:
-    """Return the info after a step, of an episode as a vehicle sees it.
-
-    It adds `reward_terms` to that of `episode_info`, and at the end (`over`) `measure`, `crash` and `collision_type`.
-    """
+    """Return the info after a step, of an episode as a vehicle sees it."""
     info = episode_info(space, x, episode)
     info["reward_terms"] = {name: float(value) for name, value in terms_of(reward).items()}
     if over:

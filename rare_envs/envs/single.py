@@ -30,12 +30,6 @@ class DrivingEnv(HighwayEnvInterface, gym.Env[SingleObservation, Any]):
     `crash`, which say who ran into whom and how hard (`rare_envs.traffic.crash`), or None. Scripts for HighwayEnv
     find what they read, see `rare_envs.envs.highway_env_interface`.
 
-    Example:
-        >>> import gymnasium
-        >>> env = gymnasium.make("rare_envs/CutIn-v0")
-        >>> observation, info = env.reset(seed=0, options={"cut_in_gap": 9.0})
-        >>> observation.shape, info["scenario"]["cut_in_gap"], info["collision"]
-        ((11,), 9.0, False)
     """
 
     metadata = {"render_modes": list(RENDER_MODES), "render_fps": 10}  # noqa: RUF012  (Gymnasium's own form)
@@ -49,9 +43,6 @@ class DrivingEnv(HighwayEnvInterface, gym.Env[SingleObservation, Any]):
             core: What carries out the steps, "torch" or "numba" (compiled, for scripted scenarios); "auto" for the
                 compiled ones where they can be had. They differ by rounding.
             **kwargs: See `rare_envs.make.set_up`.
-
-        Raises:
-            ValueError: If an argument is invalid.
         """
         world, self.space = set_up(env_id, **kwargs)
         self.world = world.with_statistics()
@@ -78,9 +69,6 @@ class DrivingEnv(HighwayEnvInterface, gym.Env[SingleObservation, Any]):
 
         Returns:
             Observation and info.
-
-        Raises:
-            ValueError: If an option is unknown, of the wrong shape, NaN or outside its range.
         """
         super().reset(seed=seed)
         self._x = self.space.scenario_x(options, 1, self.np_random)[0]

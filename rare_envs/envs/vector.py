@@ -42,11 +42,6 @@ class DrivingVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[Any]
     it, whose action does not count and whose reward is 0. With DISABLED a `reset` with options={"reset_mask": rows}
     does. One generator draws for the whole batch.
 
-    Example:
-        >>> env = DrivingVectorEnv("rare_envs/CutIn-v0", num_envs=3)
-        >>> observations, infos = env.reset(seed=0, options={"cut_in_gap": [9.0, 20.0, 40.0]})
-        >>> observations.shape, infos["scenario"]["cut_in_gap"].tolist()
-        ((3, 11), [9.0, 20.0, 40.0])
     """
 
     metadata = {  # noqa: RUF012  (Gymnasium's own form)
@@ -77,9 +72,6 @@ class DrivingVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[Any]
             device: Where torch carries them out: "cpu", or a GPU, such as "cuda". Observations and rewards are arrays
                 as ever.
             **kwargs: See `rare_envs.make.set_up`.
-
-        Raises:
-            ValueError: If an argument is invalid.
         """
         if not isinstance(num_envs, (int, np.integer)) or isinstance(num_envs, bool) or num_envs < 1:
             raise ValueError(f"Expected num_envs of at least 1, got {num_envs!r}.")
@@ -133,9 +125,6 @@ class DrivingVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[Any]
 
         Returns:
             Observations, shape (num_envs, F), and infos.
-
-        Raises:
-            ValueError: If an option is unknown, of the wrong shape, NaN or outside its range.
         """
         if isinstance(seed, list):
             self._np_random = np.random.default_rng([s for s in seed if s is not None] or None)

@@ -31,17 +31,9 @@ ELSEWHERE = (
 
 
 def read_kinds(observation: Any) -> str:
-    """Return the kinds of an observation in the alphabetical order of their names, joined by "+".
+    """Return the kinds of an observation in the alphabetical order of their names, joined by "+"; else a ValueError.
 
-    Args:
-        observation: One of `OBSERVATIONS`, several joined by "+", or a list or tuple of them.
-
-    Raises:
-        ValueError: If it is none of these, or one is named twice.
-
-    Example:
-        >>> read_kinds(["speed", "camera"])
-        'camera+speed'
+    It is one of `OBSERVATIONS`, several joined by "+", or a list or tuple of them.
     """
     names = observation.split("+") if isinstance(observation, str) else observation
     if not isinstance(names, list | tuple) or not names or not all(name in OBSERVATIONS for name in names):
@@ -60,12 +52,7 @@ def kinds_of(observation: str) -> tuple[str, ...]:
 
 
 def map_kinds(function: Callable[..., Any], *observed: Any) -> Any:
-    """Apply a function to an observation, or to each of those in a mapping.
-
-    Args:
-        function: Takes as many arguments as there are observations.
-        *observed: Tensors or arrays, or mappings of such with the same names.
-    """
+    """Apply a function to tensors or arrays, or to those of each name in mappings with the same names."""
     if isinstance(observed[0], dict):
         return {name: function(*(one[name] for one in observed)) for name in observed[0]}
     return function(*observed)
@@ -99,25 +86,10 @@ def kinematics_space() -> "spaces.Box[np.float32]":
 
 
 def observe_kinematics(state: State, road: Road, vehicle: int = 0) -> Tensor:
-    """Return what a vehicle observes.
+    """Return what a vehicle observes, (B, 5, 5), float32, in [-1, 1]: `KINEMATICS_FEATURES`, the observer's row first.
 
     The others are those within `VIEW` and less than `BEHIND` behind, nearest along the road first (vehicles at one
     distance in the order of the state), at most four of them.
-
-    Args:
-        state: Traffic of B scenarios.
-        road: Their road.
-        vehicle: Which of the N vehicles observes.
-
-    Returns:
-        Shape (B, 5, 5), float32, in [-1, 1]: rows of `KINEMATICS_FEATURES`, the observer's first.
-
-    Example:
-        >>> from rare_envs.traffic import straight
-        >>> x = torch.tensor([[0.0, 100.0]])
-        >>> state = State(x, 0 * x, 0 * x, torch.tensor([[20.0, 10.0]]), theta=x[:, :0])
-        >>> observe_kinematics(state, straight(1))[0, :2].tolist()  # presence, x / 200, y, vx / 80, vy
-        [[1.0, 0.0, 0.0, 0.25, 0.0], [1.0, 0.5, 0.0, -0.125, 0.0]]
     """
     moving = (state.x, state.y, state.speed * torch.cos(state.heading), state.speed * torch.sin(state.heading))
     values = torch.stack((torch.ones_like(state.x), *moving), dim=-1)

@@ -12,13 +12,12 @@ References:
 """
 
 import math
-from functools import cache
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from rare_envs.devices import can_look, constant
+from rare_envs.devices import can_look, constant, indices
 from rare_envs.traffic.road import Road, WorldPose
 from rare_envs.traffic.state import VEHICLE_LENGTH, VEHICLE_WIDTH, State
 
@@ -79,16 +78,9 @@ def beam_angles(like: Tensor) -> Tensor:
 
 
 def sense(bodies: Bodies, observers: int | None = None) -> Readings:
-    """Return what the lidars of the first vehicles measure.
+    """Return what lidars of the first M of V vehicles in B scenes measure (of all for None), differentiable in them.
 
     Vehicles that are not there are parked further than `MAX_RANGE` from all others.
-
-    Args:
-        bodies: V vehicles in B scenes.
-        observers: M, how many of the vehicles measure; None for all.
-
-    Returns:
-        Readings of the first M vehicles, differentiable in the bodies.
     """
     bodies = Bodies(*(field.expand_as(bodies.x) for field in bodies))
     m = bodies.x.shape[1] if observers is None else observers
@@ -160,7 +152,7 @@ def _first_met(bodies: Bodies, m: int) -> tuple[Tensor, Tensor]:
         observer = torch.div(pair, v, rounding_mode="floor")
         vehicle = pair - observer * v
         body = vehicle + torch.div(observer, m, rounding_mode="floor") * v
-        beam = (_take(facing, pair) + _offsets(offsets, dx.device)) % BEAMS
+        beam = (_take(facing, pair) + indices(offsets, dx)) % BEAMS
         enters, leaves = _crossing(
             _take(dx, pair),
             _take(dy, pair),
@@ -196,11 +188,6 @@ def _read_keys(keys: Tensor) -> tuple[Tensor, Tensor]:
 def _take(field: Tensor, numbers: Tensor) -> Tensor:
     """Return entries of a field by their numbers in it (n,), as a column (n, 1)."""
     return field.flatten().index_select(0, numbers)[:, None]
-
-
-@cache  # never forgotten: recorded rollouts read it where it is
-def _offsets(offsets: tuple[int, ...], device: torch.device) -> Tensor:
-    return torch.tensor(offsets, device=device)
 
 
 def _key(distance: Tensor, vehicle: Tensor) -> Tensor:
@@ -254,16 +241,7 @@ class OnRoad(NamedTuple):
 
 
 def perceive(bodies: Bodies, on_road: OnRoad, observers: int | None = None) -> Tensor:
-    """Return the 51 features of the first vehicles.
-
-    Args:
-        bodies: V vehicles in B scenes.
-        on_road: Where they are on the road.
-        observers: M, how many of the vehicles look; None for all.
-
-    Returns:
-        Shape (B, M, 51), in the order of `FEATURES`, SI units.
-    """
+    """Return the 51 `FEATURES` of the first M of V vehicles in B scenes (of all for None), (B, M, 51), SI units."""
     m = bodies.x.shape[1] if observers is None else observers
     readings = sense(bodies, m)
     zero = torch.zeros_like(bodies.x)
@@ -284,21 +262,7 @@ def perceive(bodies: Bodies, on_road: OnRoad, observers: int | None = None) -> T
 
 
 def perceive_traffic(state: State, road: Road, pose: WorldPose | None = None) -> Tensor:
-    """Return the 51 features of all vehicles, shape (B, N, 51).
-
-    Args:
-        state: Traffic of B scenarios.
-        road: Their road.
-        pose: Where they are in the world, if that is known already.
-
-    Example:
-        >>> from rare_envs.traffic import straight
-        >>> x = torch.tensor([[0.0, 30.0]])
-        >>> state = State(x, 0 * x, 0 * x, torch.tensor([[20.0, 10.0]]), theta=x[:, :0])
-        >>> seen = perceive_traffic(state, straight(1))
-        >>> seen[0, 0, RANGE_COLUMNS][AHEAD_BEAM].item(), seen[0, 0, RATE_COLUMNS][AHEAD_BEAM].item()
-        (27.5, -10.0)
-    """
+    """Return the 51 `FEATURES` of all vehicles, (B, N, 51); `pose` is where they are in the world, if that is known."""
     x, y, heading, curvature = pose or road.place(state.x, state.y, state.heading)
     bodies = _bodies(state, x, y, heading)
     left, right = road.markers(state.y)

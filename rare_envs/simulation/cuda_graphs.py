@@ -34,29 +34,12 @@ class RecordedRollouts:
     """Rollouts of a driver on a GPU: as `rollout`, but for what the processor takes to start the operations.
 
     What cannot be recorded is made by `rollout` itself: for users' drivers and measures see `is_recordable`, and where
-    an operation has to wait for the GPU, as those of a camera, the record breaks off.
-
-    Attributes:
-        driver: The ego, on the GPU.
-        sizes: Numbers of rollouts that are recorded, ascending.
-
-    Example:
-        >>> from rare_envs.control.idm import IDM
-        >>> from rare_envs.scenarios.car_following import CAR_FOLLOWING
-        >>> rollouts = RecordedRollouts(IDM(), tile=4096)
-        >>> rollouts.sizes
-        (64, 256, 1024, 4096)
-        >>> rollouts(World(CAR_FOLLOWING), torch.tensor([[20.0, 15.0, 30.0]])).f.tolist()  # on the CPU, not recorded
-        [6.0]
+    an operation has to wait for the GPU, as those of a camera, the record breaks off. `sizes` are the numbers of
+    rollouts that are recorded, ascending.
     """
 
     def __init__(self, driver: Driver, tile: int) -> None:
-        """Record nothing yet.
-
-        Args:
-            driver: The ego, on the GPU.
-            tile: Most rollouts at once.
-        """
+        """Record nothing yet of a driver, on the GPU, and of a tile, the most rollouts at once."""
         self.driver = driver
         self.sizes = tuple(sorted({max(1, tile // 4**step) for step in range(STEPS)}))
         self._recordings: list[_Recording] = []
@@ -68,15 +51,7 @@ class RecordedRollouts:
         return vars(self) | {"_recordings": []}
 
     def __call__(self, world: World, x: Tensor) -> Episode:
-        """Drive B scenarios from start to horizon.
-
-        Args:
-            world: The world.
-            x: Scenarios, shape (B, d), of which B is at most a tile.
-
-        Returns:
-            The episodes at the horizon.
-        """
+        """Return the episodes of scenarios x (B, d), B at most a tile, at the horizon, as `rollout` does."""
         if x.device.type != "cuda" or not len(x):
             return rollout(world, self.driver, x)
         with torch.cuda.device(x.device):  # else one of several GPUs would be recorded on the first
@@ -129,17 +104,7 @@ class _Recording:
 
 
 def record(world: World, driver: Driver, x: Tensor, size: int) -> _Recording | None:
-    """Return the record of a rollout of some scenarios; None where an operation cannot be recorded.
-
-    Args:
-        world: The world.
-        driver: The ego, on the GPU.
-        x: Scenarios, shape (B, d), on the GPU.
-        size: Number of scenarios of the record.
-
-    Raises:
-        torch.OutOfMemoryError: The GPU has too little memory for them.
-    """
+    """Return the record of a rollout of `size` scenarios like x (B, d) on the GPU; None where there cannot be one."""
     place = x[0].expand(size, -1).clone()
     aside = torch.cuda.Stream(x.device)  # type: ignore[no-untyped-call]
     aside.wait_stream(torch.cuda.current_stream(x.device))
@@ -163,12 +128,6 @@ def is_recordable(world: World, driver: Driver) -> bool:
 
     What a recording does is fixed, as are the numbers in it. So it is for drivers whose own class says that they never
     change (`says_recordable`), for scenarios and measures of this package, not for what a user wrote.
-
-    Example:
-        >>> from rare_envs.control.idm import IDM
-        >>> from rare_envs.scenarios.car_following import CAR_FOLLOWING
-        >>> is_recordable(World(CAR_FOLLOWING), IDM()), is_recordable(World(CAR_FOLLOWING), object())
-        (True, False)
     """
     drivers = (driver,) if world.background is None else (driver, world.background)
     steady = all(says_recordable(each) for each in drivers)
@@ -178,15 +137,7 @@ def is_recordable(world: World, driver: Driver) -> bool:
 
 
 def says_recordable(driver: Any) -> bool:
-    """Return whether a driver's own class says that it never changes; what it says is not inherited.
-
-    Example:
-        >>> from rare_envs.control.idm import IDM
-        >>> class Hesitant(IDM):
-        ...     "May do anything."
-        >>> says_recordable(IDM()), says_recordable(Hesitant())
-        (True, False)
-    """
+    """Return whether a driver's own class says that it never changes; what it says is not inherited."""
     return "recordable" in vars(type(driver)) and bool(driver.recordable)
 
 

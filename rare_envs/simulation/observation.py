@@ -12,10 +12,10 @@ from torch import Tensor
 
 from rare_envs.devices import constant, scalars
 from rare_envs.distributions.space import Distribution, Parameter
-from rare_envs.sensors.camera import Camera, CameraContext, clear_day, take_picture
-from rare_envs.sensors.camera.context import read_weather, weather_parameters
+from rare_envs.sensors.camera import Camera, CameraContext, clear_day, read_weather, weather_parameters
 from rare_envs.sensors.kinds import kinds_of, kinematics_space, observe_kinematics
 from rare_envs.sensors.lidar import BEAMS, MAX_RANGE
+from rare_envs.sensors.pictures import take_picture
 from rare_envs.traffic.state import LANE_WIDTH, VEHICLE_LENGTH, State
 
 if TYPE_CHECKING:

@@ -181,14 +181,7 @@ class World:
         )
 
     def update(self, episode: Episode, state: State, perception: Tensor | None, hit: Tensor) -> Episode:
-        """Return episodes one tick later, in a new state of the traffic; their drivers stay as they were.
-
-        Args:
-            episode: Before the tick.
-            state: After it.
-            perception: Lidar features after it.
-            hit: Whether the vehicle in the ego's place touches another or is off the road, boolean, shape (B,).
-        """
+        """Return episodes a tick later: new state, lidar features and hits of the vehicle in the ego's place, (B,)."""
         moment = Moment(state, lead_of(state, episode.road), episode.road, perception, episode.state, self.clock.dt)
         collided = episode.collided | hit
         measure_state = episode.measure.update(episode.measure_state, moment, episode.collided, collided)
@@ -300,16 +293,7 @@ def apply_overrides(
     driver_actions: Tensor | None,
     dt: float,
 ) -> tuple[Others, Tensor]:
-    """Return the others after a tick in which some take an agent's actions, and who was commanded by now, (B, N).
-
-    Args:
-        episode: B episodes before the tick.
-        action: Acceleration [m/s^2] and steering angle [rad] of all vehicles, shape (B, N, 2).
-        commanded: Which of them take it, boolean, shape (B, N); None for none.
-        scripted: Where the script or the drivers take vehicles that were never commanded.
-        driver_actions: Accelerations and yaw rates by the world's drivers, shape (B, N - 1, 2); None if it has none.
-        dt: Tick [s].
-    """
+    """Return the others after a tick in which some take an agent's actions, and who was commanded by now, (B, N)."""
     state, road = episode.state, episode.road
     if commanded is None:
         commanded = torch.zeros_like(state.x, dtype=torch.bool)

@@ -6,7 +6,6 @@ import torch
 import rare_envs
 from rare_envs.devices import (
     CAMERA_TILE,
-    GPU_TILES,
     LIDAR_TILE,
     POLICY_CHUNK,
     POLICY_TILE,
@@ -18,12 +17,7 @@ from rare_envs.devices import (
     may_hold,
     move_to,
     scalars,
-    tile_size,
 )
-
-
-def test_the_cpu_is_always_there() -> None:
-    assert find_device("cpu") == torch.device("cpu")
 
 
 @pytest.mark.parametrize("name", ["gpu", "", "mps", "meta", "cuda:x", None, 3])
@@ -75,21 +69,11 @@ def test_where_values_are_not_at_hand_conditions_may_hold_and_nothing_is_zero() 
         assert not are_zero(elsewhere)
 
 
-def test_what_has_nothing_on_a_device_stays_itself() -> None:
-    policy = object()
-    assert move_to(torch.device("meta"), policy) is policy
-
-
 def test_a_module_is_copied_and_the_caller_s_stays_where_it_is() -> None:
     module = torch.nn.Linear(2, 2)
     moved = move_to(torch.device("meta"), module)
     assert moved.weight.device.type == "meta"
     assert module.weight.device.type == "cpu"
-
-
-def test_numbers_beside_integers_stay_numbers() -> None:
-    (half,) = scalars((0.5,), torch.arange(3))
-    assert half.item() == 0.5
 
 
 def stands_still(observation):
@@ -110,16 +94,3 @@ def test_what_costs_more_memory_is_simulated_in_smaller_tiles():
 
 def test_nobody_looks_at_the_camera_of_a_rule_based_ego():
     assert sizes(observation="camera") == (RULE_TILE, RULE_CHUNK)
-
-
-def test_a_chunk_may_be_given():
-    assert sizes(chunk_size=7) == (RULE_TILE, 7)
-
-
-@pytest.mark.parametrize(("pictures", "much"), [(False, False), (False, True), (True, False)])
-def test_a_gpu_has_more_at_once(pictures, much):
-    on_cpu, on_gpu = (
-        tile_size(torch.device(name), by_policy=True, takes_pictures=pictures, keeps_much=much)
-        for name in ("cpu", "cuda")
-    )
-    assert on_gpu == GPU_TILES * on_cpu

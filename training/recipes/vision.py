@@ -46,7 +46,8 @@ from rare_envs.control.idm import IDM
 from rare_envs.files import replace_text
 from rare_envs.scenarios.base_distributions import load_base
 from rare_envs.scenarios.registry import find_scenario
-from rare_envs.sensors.camera import Weather, take_picture
+from rare_envs.sensors.camera import Weather
+from rare_envs.sensors.pictures import take_picture
 from rare_envs.simulation.episode import Clock, Episode
 from rare_envs.simulation.observation import Sensing
 from rare_envs.simulation.world import World

@@ -9,7 +9,6 @@ import torch
 from stable_baselines3 import A2C, DQN, PPO, SAC
 from stable_baselines3.common.vec_env import VecNormalize
 
-import agents
 import rare_envs
 import training
 from rare_envs.egos.dense_policies import DenseInference, find_inference, read_dense_policy
@@ -78,22 +77,6 @@ def _flatten():
     from stable_baselines3.common.torch_layers import FlattenExtractor
 
     return FlattenExtractor
-
-
-@pytest.mark.slow
-def test_a_saved_policy_is_read(tmp_path):
-    make().save(tmp_path / "ego.zip")
-    saved = agents.load_ego(tmp_path / "ego.zip")
-    assert rare_envs.DrivingProblem(CAR_FOLLOWING, ego=saved).core == "numba"
-    for one, other in zip(read_dense_policy(saved).layers, read_dense_policy(make().policy).layers, strict=True):
-        assert np.array_equal(one[0], other[0]) and np.array_equal(one[1], other[1])
-
-
-def test_what_is_read_of_an_algorithm():
-    policy = read_dense_policy(make(A2C, net_arch=(32,), activation_fn=torch.nn.ReLU))
-    assert policy.activation == "relu" and not policy.chooses and policy.normalisation is None
-    assert [weight.shape for weight, _ in policy.layers] == [(32, 7), (2, 32)]
-    assert policy.clip is not None and policy.clip[0].tolist() == [-1.0, -1.0]
 
 
 CUT_IN = "rare_envs/CutIn-v0"

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 import rare_envs
-from rare_envs.egos.errors import EgoGone, NoAnswer, check_predict, is_policy, reason_of, refuse_ego
+from rare_envs.egos.errors import NoAnswer, check_predict, reason_of, refuse_ego
 
 
 @pytest.mark.parametrize(
@@ -24,10 +24,6 @@ def test_reasons_are_one_line(error: BaseException, reason: str) -> None:
     assert reason_of(error) == reason
 
 
-def test_who_survives_exceptions_does_not_survive_an_ego_that_is_gone() -> None:
-    assert not issubclass(EgoGone, Exception)
-
-
 class Still:
     """A policy."""
 
@@ -40,11 +36,6 @@ class Proxy:
 
     def __getattr__(self, name: str) -> Any:
         return getattr(Still(), name)
-
-
-def test_who_has_predict_is_a_policy_also_by_delegation() -> None:
-    assert is_policy(Still())
-    assert is_policy(Proxy())
 
 
 class Short:

@@ -14,18 +14,13 @@ import agents
 import rare_envs
 import training
 from rare_envs.egos.needs import (
-    AMBIGUOUS,
-    TAKEN_AS_ACCELERATIONS,
     AmbiguousActions,
     EgoNeeds,
-    FunctionEgo,
     ModuleEgo,
-    PerceivingDriver,
     WrappedEgo,
     choose_action,
     choose_observation,
     find_fitting_kinds,
-    load_named_ego,
     name_ambiguities,
     resolve,
     takes_indices,
@@ -57,14 +52,6 @@ class Declared:
 )
 def test_what_it_observes_is_read_from_its_space(space: Any, vehicles: int, fitting: tuple[str, ...]) -> None:
     assert resolve(Declared(observation_space=space), vehicles).observations == fitting
-
-
-def test_a_driver_that_perceives_needs_the_lidar_and_queries_no_policy() -> None:
-    ego = agents.load_ego("mgail")
-    assert isinstance(ego, PerceivingDriver)
-    needs = resolve(ego, vehicles=3)
-    assert (needs.lidar, needs.queries_policy) == (True, False)
-    assert rare_envs.DrivingProblem(CUT_IN, ego=ego, horizon=0.1).world.uses_lidar
 
 
 def test_a_wrapped_ego_needs_what_the_one_behind_it_needs_and_its_own_noise() -> None:
@@ -174,19 +161,6 @@ def test_an_ego_that_drives_itself_says_that_named_actions_change_nothing(action
     rare_envs.DrivingProblem(KINEMATICS, ego="idm")  # the id's own actions need no warning
 
 
-@pytest.mark.parametrize(
-    ("space", "kinds", "notes"),
-    [
-        (None, ("features",), ()),
-        (spaces.Box(-1.0, 1.0, (2,)), ("features",), ()),
-        (spaces.Discrete(5), ("kinematics",), (AMBIGUOUS,)),
-        (spaces.Discrete(5), ("camera", "lidar"), (TAKEN_AS_ACCELERATIONS,)),
-    ],
-)
-def test_only_five_numbers_can_be_two_things(space, kinds, notes):
-    assert name_ambiguities(space, kinds) == notes
-
-
 def test_other_bounds_are_told_as_people_write_them():
     (note,) = name_ambiguities(spaces.Box(np.float32([-0.3, -4.0]), np.float32([0.1, 2.0])), ("features",))
     assert note.startswith("the ego's actions, between [-0.3, -4.0] and [0.1, 2.0], are mapped to [-1, 1]")
@@ -221,12 +195,6 @@ class BrakingNetwork(torch.nn.Module):
 def test_they_drive_as_the_policy_does(ego):
     wanted = rare_envs.DrivingProblem("rare_envs/CarFollowing-v0", ego=Brake()).evaluate(X)
     np.testing.assert_array_equal(rare_envs.DrivingProblem("rare_envs/CarFollowing-v0", ego=ego).evaluate(X), wanted)
-
-
-def test_a_function_can_choose_whole_numbers():
-    ego = FunctionEgo(lambda observation: np.full(len(observation), 1))  # -2 m/s^2, as `brake`
-    found = rare_envs.DrivingProblem("rare_envs/CarFollowing-v0", ego=ego).evaluate(X)
-    np.testing.assert_array_equal(found, rare_envs.DrivingProblem("rare_envs/CarFollowing-v0", ego=brake).evaluate(X))
 
 
 def test_other_egos_stay_as_they_are():
@@ -264,9 +232,3 @@ def test_what_cannot_be_loaded_is_refused_in_one_line(tmp_path):
         rare_envs.DrivingProblem(ENV_ID, ego=tmp_path / "nothing.zip")
     with pytest.raises(ValueError, match=r"Unknown ego 'imd' \(did you mean 'idm'\?\)"):
         rare_envs.DrivingProblem(ENV_ID, ego="imd")
-
-
-def test_other_egos_are_not_loaded():
-    ego = object()
-    assert load_named_ego(ego) is ego
-    assert load_named_ego("human") == "human"

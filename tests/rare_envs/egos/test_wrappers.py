@@ -9,7 +9,6 @@ from rare_envs.egos.wrappers import (
     FrameStackedPolicy,
     describe_missing_normalisation,
     find_frame_stacking,
-    find_stacking,
 )
 
 SMALL = (36, 60)
@@ -35,14 +34,6 @@ class Echo:
         self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = True
     ) -> Any:
         return observation, state
-
-
-def test_stackings_by_shape() -> None:
-    assert find_stacking((11,), (11,)) == (1, False)
-    assert find_stacking((5, 5), (4, 5, 5)) == (4, True)
-    assert find_stacking((11,), (33,)) == (3, False)
-    assert find_stacking((11,), (12,)) is None
-    assert find_stacking((5, 5), (25,)) is None
 
 
 def test_frames_side_by_side_begin_with_zeros_and_along_an_axis_with_copies() -> None:

@@ -1,15 +1,11 @@
 """Rows of a batch: drawn ahead, replaced in whatever holds them, and in Gymnasium's forms."""
 
-from typing import NamedTuple
-
 import numpy as np
 import pytest
-import torch
-from torch import Tensor
 
 from rare_envs.distributions import BetaDistribution, NoiseDistribution, ProductDistribution, TruncatedGaussianMixture
 from rare_envs.distributions.space import Distribution
-from rare_envs.envs.rows_and_infos import ROWS_AHEAD, DrawsAhead, merge_rows
+from rare_envs.envs.rows_and_infos import ROWS_AHEAD, DrawsAhead
 
 BETA = BetaDistribution([2.0, 0.5], [2.0, 3.0], [0.0, 1.0], [1.0, 4.0])
 MIXTURE = TruncatedGaussianMixture([0.4, 0.6], [[0.0], [2.0]], [[[1.0]], [[0.3]]], [-1.0], [3.0])
@@ -35,19 +31,3 @@ def test_a_generator_that_others_draw_from_too_is_not_put_back(kind: type[np.ran
     others = rng.random(5)
     ahead.settle()
     assert not np.isin(rng.random(10 * ROWS_AHEAD), others).any()
-
-
-class Pair(NamedTuple):
-    left: Tensor
-    right: object
-
-
-def test_rows_are_replaced_in_tensors_tuples_and_what_lies_in_them() -> None:
-    old = (Pair(torch.zeros(3), "road"), (torch.zeros(3, 2), None))
-    new = (Pair(torch.ones(2), "another"), (torch.ones(2, 2), None))
-    merged = merge_rows(old, torch.tensor([2, 0]), new)
-    assert isinstance(merged[0], Pair)
-    assert merged[0].left.tolist() == [1.0, 0.0, 1.0]
-    assert merged[0].right == "road"  # common to all
-    assert merged[1][0][:, 1].tolist() == [1.0, 0.0, 1.0]
-    assert old[0].left.tolist() == [0.0] * 3  # the old ones stay

@@ -19,14 +19,13 @@ from rare_envs.envs.rendering import (
     caption,
     make_network,
     make_scene,
-    make_traffic,
     world_places,
     world_point,
 )
 from rare_envs.make import set_up
 from rare_envs.scenarios.registry import SCENARIOS
 from rare_envs.traffic.palette import CRASH_COLOUR, ROLE_COLOURS, as_rgb
-from rare_envs.traffic.road import i80, straight
+from rare_envs.traffic.road import i80
 from rare_envs.traffic.state import State
 
 every = pytest.mark.parametrize("env_id", rare_envs.ENV_IDS)
@@ -133,29 +132,6 @@ def test_nothing_to_render_is_a_warning(world, episode, mode, monkeypatch):
     monkeypatch.setattr(gym.logger, "warn", warned.append)
     assert Display(world, mode).draw(episode if mode is None else None, 0.0) is None
     assert len(warned) == 1 and "Nothing to render" in warned[0]
-
-
-def test_a_window_gives_no_image(world, episode, monkeypatch):
-    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
-    display = Display(world, "human")
-    assert display.is_window and display.draw(episode, 0.0) is None
-    display.close()
-
-
-def test_an_unknown_mode_is_refused(world):
-    with pytest.raises(ValueError, match="Expected render_mode None, 'rgb_array' or 'human', got 'ansi'"):
-        Display(world, "ansi")
-
-
-def test_vehicles_are_where_the_state_has_them() -> None:
-    x = torch.tensor([[0.0, 30.0], [5.0, 50.0]])
-    state = State(x, y=torch.tensor([[0.0, 4.0], [8.0, 0.0]]), heading=0.1 * x, speed=x + 1.0, theta=x[:, :0])
-    traffic = make_traffic(state, straight(3), row=1)
-    ego, other = traffic.vehicles
-    np.testing.assert_allclose([ego.position, other.position], [[5.0, 8.0], [50.0, 0.0]])
-    assert (ego.lane_index[2], other.lane_index[2]) == (2, 0)
-    assert (ego.speed, other.heading) == (6.0, pytest.approx(5.0))
-    assert traffic.neighbour_vehicles(ego, ("0", "1", 0))[0] is other  # HighwayEnv's own methods work on it
 
 
 def test_a_curved_road_has_a_lane_for_each_lane_along_its_pieces() -> None:

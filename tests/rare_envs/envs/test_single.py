@@ -7,11 +7,10 @@ import torch
 
 import rare_envs
 from rare_envs.control.idm import IDM
-from rare_envs.envs.rows_and_infos import episode_info, step_info
+from rare_envs.envs.rows_and_infos import step_info
 from rare_envs.make import set_up
 from rare_envs.multi_agent import start
 from rare_envs.scenarios.registry import SCENARIOS
-from rare_envs.simulation.decision import reward_terms
 
 SCRIPTED_IDS = [env_id for env_id, scenario in SCENARIOS.items() if scenario.drivers is None]
 scripted = pytest.mark.parametrize("env_id", SCRIPTED_IDS)  # no network, so batch sizes change no bit
@@ -73,31 +72,6 @@ def test_reset_options(env_id: str) -> None:
         env.reset(options={name: float("nan")})
     with pytest.raises(ValueError, match="shape"):
         env.reset(options={"x": [1.0, 2.0]})
-
-
-def test_wrong_actions_are_refused_and_the_episode_goes_on() -> None:
-    env = gym.make("rare_envs/CarFollowing-v0").unwrapped
-    env.reset(seed=0)
-    for action in (1, np.zeros(3), np.zeros((1, 2)), [np.nan, 0.0]):
-        with pytest.raises(ValueError, match=r"shape \(2,\)|NaN"):
-            env.step(action)
-    assert env.step([0.0, 0.0])[4]["x"].shape == (3,)
-
-
-def test_info_grows_by_the_reward_and_at_the_end_by_the_crash() -> None:
-    world, space = set_up("rare_envs/CarFollowing-v0")
-    world, x = world.with_statistics(), torch.tensor([[20.0, 10.0, 0.5]])
-    episode = world.start(x)
-    info = episode_info(space, x[0].double().numpy(), episode)
-    assert info["scenario"] == {"ego_speed": 20.0, "lead_speed": 10.0, "gap": 0.5}
-    assert not info["collision"]
-    assert info["min_ttc"] == pytest.approx(0.05)
-    episode = world.step(episode, torch.zeros(1, 2))
-    reward = reward_terms(episode, torch.zeros(1, 2))
-    assert "measure" not in step_info(space, x[0].numpy(), episode, reward, over=False)
-    info = step_info(space, x[0].numpy(), episode, reward, over=True)
-    assert (info["measure"], info["collision_type"], info["min_ttc"]) == (-1.0, "rear_end", 0.0)
-    assert sum(info["reward_terms"].values()) == pytest.approx(float(reward.total), rel=1e-6)
 
 
 def test_vehicles_of_a_crash_are_numbered_as_in_the_scenario_whoever_sees_it() -> None:

@@ -42,16 +42,6 @@ def test_what_is_not_compiled_is_simulated_by_torch(env_id: str, arguments: dict
         rare_envs.DrivingProblem(env_id, core="numba", **arguments)
 
 
-def test_a_core_that_does_not_exist_is_refused() -> None:
-    with pytest.raises(ValueError, match="Expected core to be one of 'auto', 'torch', 'numba', got 'jax'"):
-        rare_envs.DrivingProblem(CAR_FOLLOWING, core="jax")
-
-
-def test_an_own_measure_of_the_same_name_is_not_compiled() -> None:
-    measure = rare_envs.measures.Measure(rare_envs.measures.ttc)
-    assert rare_envs.DrivingProblem(CAR_FOLLOWING, measure=measure).core == "torch"
-
-
 def test_another_world_or_driver_is_what_is_simulated() -> None:
     problem = rare_envs.DrivingProblem(CAR_FOLLOWING)
     assert (problem.core, problem.terms_with_f, problem.evaluate(X)) == ("numba", False, [6.0])

@@ -104,15 +104,6 @@ def test_states_in_double_precision_are_left_to_torch_or_refused(core):
         assert env._episode.state.x.dtype == torch.float64
 
 
-def test_actions_are_refused_as_by_torch():
-    env = gym.make("rare_envs/CarFollowing-v0").unwrapped
-    env.reset(seed=0)
-    with pytest.raises(ValueError, match="NaN or infinite actions"):
-        env.step(np.array([np.nan, 0.0]))
-    with pytest.raises(ValueError, match="Expected an action of shape"):
-        env.step(np.zeros(3))
-
-
 @pytest.mark.parametrize(
     ("action", "expected"),
     [
@@ -149,10 +140,3 @@ def test_other_worlds_are_stepped_by_torch(env_id, arguments):
     assert find_scripted_step(env.world) is None and env._compiled is None
     with pytest.raises(ValueError, match="core='numba' cannot simulate this"):
         find_scripted_step(env.world, "numba")
-
-
-def test_steps_are_compiled_unless_torch_is_asked_for():
-    assert gym.make("rare_envs/CutIn-v0").unwrapped._compiled is not None
-    assert gym.make("rare_envs/CutIn-v0", core="torch").unwrapped._compiled is None
-    with pytest.raises(ValueError, match="Expected core to be one of 'auto', 'torch', 'numba', got 'jax'"):
-        gym.make("rare_envs/CutIn-v0", core="jax")

@@ -7,7 +7,6 @@ import torch
 from torch import Tensor
 
 from rare_envs.sensors.lidar import (
-    AHEAD_BEAM,
     BEAMS,
     FEATURES,
     MAX_RANGE,
@@ -66,23 +65,6 @@ def slowly(scene, i, k):
     own = speed[i] * math.cos(heading[i]), speed[i] * math.sin(heading[i])
     other = speed[who] * math.cos(heading[who]), speed[who] * math.sin(heading[who])
     return best, (other[0] - own[0]) * way[0] + (other[1] - own[1]) * way[1]
-
-
-def test_a_car_ahead_is_seen_by_the_beam_ahead():
-    readings = sense(bodies((0, 0, 0, 20, 5, 2), (30, 0, 0, 15, 5, 2)))
-    assert readings.range[0, 0, AHEAD_BEAM] == pytest.approx(27.5)
-    assert readings.rate[0, 0, AHEAD_BEAM] == pytest.approx(-5.0)
-    # and the ego by the one behind, which is beam 19
-    assert readings.range[0, 1, 19] == pytest.approx(27.5)
-    assert readings.rate[0, 1, 19] == pytest.approx(-5.0)
-
-
-def test_the_side_of_a_neighbour_is_seen_to_the_right_of_the_heading():
-    readings = sense(bodies((0, 0, 0, 10, 5, 2), (0, 3.7, 0, 12, 5, 2)))
-    right = AHEAD_BEAM + 5  # 90 degrees
-    assert readings.range[0, 0, right] == pytest.approx(2.7)
-    assert readings.range[0, 0, right - 10] == MAX_RANGE
-    assert readings.rate[0, 0, right] == pytest.approx(0.0, abs=1e-12)
 
 
 @pytest.mark.parametrize("seed", range(4))

@@ -8,11 +8,9 @@ from agents.files import LANE_CHANGING, RULE_BASED, SHIPPED_DRIVERS
 from rare_envs.control.lane_changing import LaneChangingDriver
 from rare_envs.devices import fixed_draws
 from rare_envs.simulation.background import (
-    FIRST_DRAWS,
     FIXED_SEED,
     BackgroundState,
     find_drivers,
-    noise_size,
     query_background,
 )
 
@@ -54,11 +52,6 @@ def test_rows_of_a_batch_may_be_at_different_ticks():
     action, _ = step_background(drivers, mixed, features)
     torch.testing.assert_close(action[0], step_background(drivers, first, features)[0][0], rtol=1e-5, atol=1e-5)
     torch.testing.assert_close(action[1], step_background(drivers, later, features)[0][1], rtol=1e-5, atol=1e-5)
-
-
-def test_draws_are_two_for_each_vehicle_and_tick_and_four_for_the_start():
-    assert noise_size(100, 5) == (2 + 100) * 5 * 2 == fixed_draws((1, 2 + 100, 5, 2), 1, torch.zeros(1)).numel()
-    assert FIRST_DRAWS == 2
 
 
 def test_drivers_are_found_by_name_and_wrong_names_refused():

@@ -2,13 +2,15 @@
 
 from typing import NamedTuple
 
+import gymnasium as gym
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
 
 from rare_envs.control.actions import IDLE
 from rare_envs.scenarios.car_following import CAR_FOLLOWING
-from rare_envs.simulation.decision import TickReward, advance, hold_finished, reward_terms, run_ticks
+from rare_envs.simulation.decision import TickReward, advance, reward_terms, run_ticks
 from rare_envs.simulation.episode import Clock
 from rare_envs.simulation.world import World
 
@@ -35,18 +37,6 @@ def test_the_reward_of_a_meta_action_is_the_mean_over_its_ticks() -> None:
     assert float(result.terms.progress[1]) == pytest.approx(0.4 * 20.0 / 21.72)
     assert float(result.terms.collision[1]) == pytest.approx(-3.0)
     assert torch.equal(result.episode.state.x[1], seen[3].state.x[1])  # it stays as it was then
-
-
-def test_finished_episodes_are_held() -> None:
-    world = World(CAR_FOLLOWING)
-    old = world.start(torch.tensor([[20.0, 15.0, 30.0], [20.0, 15.0, 30.0]]))
-    new = world.step(old, torch.zeros(2, 2))
-    held = hold_finished(torch.tensor([True, False]), old, new)
-    for before, after, kept in zip(old.state, new.state, held.state, strict=True):
-        assert torch.equal(kept[0], before[0])
-        assert torch.equal(kept[1], after[1])
-    assert float(held.lead.gap[0]) == 30.0
-    assert float(held.lead.gap[1]) == pytest.approx(29.5)
 
 
 class Countdown(NamedTuple):
@@ -81,19 +71,23 @@ def test_a_decision_ends_when_all_have_collided() -> None:
     torch.testing.assert_close(terms.left, torch.tensor([0.4, 1.0]))
 
 
-def test_a_physical_action_lasts_as_long_as_the_decision() -> None:
-    seen: list[tuple[list[float], bool]] = []
-    clock = Clock(dt=0.5, horizon=2.0, action="meta")
-    run_ticks(clock, Countdown(torch.tensor([9, 9])), torch.tensor([0.5, -0.5]), count_down(seen))
-    assert seen == [([0.5, -0.5], True), ([0.5, -0.5], False)]
-
-
-def test_without_agents_there_is_no_reward() -> None:
-    end, rewards = run_ticks(
-        Clock(horizon=2.0),
-        Countdown(torch.tensor([2])),
-        torch.zeros(1, 2),
-        lambda old, *_: (Countdown(old.left - 1), ()),
-    )
-    assert end.left.tolist() == [1]
-    assert rewards == ()
+def test_reward_by_hand() -> None:
+    env = gym.make("rare_envs/CarFollowing-v0")
+    env.reset(options={"x": [20.0, 15.0, 14.5]})
+    _, reward, _, _, info = env.step(np.array([0.5, 0.0]))
+    # after the tick: speed 20.25, gap 14.5 - 0.5 = 14, closing at 5.25
+    terms = {
+        "progress": 20.25 / 21.72,
+        "comfort": -0.1 * 0.5**2,
+        "lane": 0.0,
+        "risk": -(1.0 - (14.0 / 5.25) / 4.0),
+        "headway": -0.5 * (1.0 - 14.0 / 22.25),
+        "collision": 0.0,
+    }
+    assert info["reward_terms"] == pytest.approx(terms, abs=1e-6)
+    assert reward == pytest.approx(sum(terms.values()), abs=1e-6)
+    env.reset(options={"x": [20.0, 15.0, 1.0]})
+    for _ in range(3):
+        _, _, terminated, _, info = env.step(np.array([1.0, 0.0]))
+    assert terminated
+    assert info["reward_terms"]["collision"] == -30.0

@@ -7,7 +7,6 @@ import torch
 
 import rare_envs
 from rare_envs.make import set_up
-from rare_envs.sensors.camera import Camera
 from rare_envs.sensors.lidar import perceive_traffic
 from rare_envs.simulation.observation import CLIP, Sensing, observation_space, observe
 
@@ -20,15 +19,6 @@ def test_observation_by_hand() -> None:
     np.testing.assert_allclose(observation, [20 / 30, 0.0, 0.0, *cutter, *lead], rtol=1e-6)
     assert np.abs(observation).max() < CLIP
     assert observation_space(3).shape == (11,)
-
-
-@torch.inference_mode()
-def test_what_the_cutter_observes_by_hand():
-    world, _ = set_up("rare_envs/CutIn-v0")
-    episode = world.start(torch.tensor([[20.0, 15.0, 18.0, 10.0, 30.0, 3.6]]))
-    ego, lead = [-20 / 50, 5 / 10, -3.6 / 4, 0.0], [30 / 50, 3 / 10, -3.6 / 4, 0.0]
-    seen = observe(episode, "features", vehicle=1)[0]
-    np.testing.assert_allclose(seen, [15 / 30, 3.6 / 4, 0.0, *ego, *lead], rtol=1e-6, atol=1e-7)
 
 
 @pytest.mark.parametrize("env_id", rare_envs.ENV_IDS)
@@ -46,21 +36,6 @@ def test_lidar_is_computed_where_it_is_observed_or_needed() -> None:
     assert not Sensing("camera+features").uses_lidar
     assert Sensing("camera+lidar").uses_lidar
     assert Sensing("features", lidar=True).uses_lidar
-
-
-def test_spaces_are_those_of_the_kinds() -> None:
-    assert Sensing("features").space(vehicles=3).shape == (3 + 2 * 4,)
-    both = Sensing("camera+speed", Camera(32, 64)).space(vehicles=3)
-    assert {name: both[name].shape for name in ("camera", "speed")} == {"camera": (32, 64, 3), "speed": (1,)}
-
-
-def test_weather_is_part_of_x_where_there_is_weather_and_the_sensors_noise_with_it() -> None:
-    def names(sensing: Sensing, noisy: bool) -> list[str]:
-        return [each.name for parameters, _ in sensing.weather_distributions(noisy) for each in parameters]
-
-    assert names(Sensing(), noisy=True) == []
-    assert names(Sensing(weather=True), noisy=False) == ["fog", "sun_elevation", "sun_azimuth"]
-    assert names(Sensing(weather=True), noisy=True)[-1] == "sensor_noise"
 
 
 def test_a_camera_starts_at_tick_0_with_the_weather_of_x() -> None:

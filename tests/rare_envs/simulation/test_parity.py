@@ -109,18 +109,3 @@ def test_difference_collision_is_overlap_and_not_a_prediction() -> None:
     contact, gap = int(collided[0].argmax()), ours[0, :, 1, 0] - ours[0, :, 0, 0] - 5.0
     assert collided.any()
     assert gap[contact] < 0.0 <= gap[contact - 1]
-
-
-def test_difference_leaving_the_road_is_a_collision() -> None:
-    world = World(CAR_FOLLOWING)
-    episode = world.start(torch.tensor([[20.0, 20.0, 50.0]]))
-    for _ in range(30):
-        episode = world.step(episode, torch.tensor([[0.0, 0.1]]))
-    assert episode.f.item() == -1.0
-
-
-def test_difference_no_soft_speed_limit() -> None:
-    """HighwayEnv holds vehicles back above 40 m/s; ours take the acceleration they are given."""
-    fast = torch.tensor([44.0])
-    *_, speed = bicycle(fast, fast, fast * 0, fast, torch.tensor([1.0]), fast * 0, 0.1)
-    assert speed.item() == pytest.approx(44.1)

@@ -11,11 +11,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from rare_envs.sensors.camera import Camera
-from rare_envs.sensors.camera import surfaces as b
-from rare_envs.sensors.camera import surfaces as g
-from rare_envs.sensors.camera import surfaces as li
-from rare_envs.sensors.camera.context import GROUND_RANGE
+from rare_envs.sensors import pictures as b
+from rare_envs.sensors.camera import GROUND_RANGE, Camera
 from rare_envs.traffic.road import Road
 from rare_envs.traffic.state import VEHICLE_LENGTH, VEHICLE_WIDTH
 
@@ -104,10 +101,10 @@ class Scene:
 
     def __init__(self, road: SlowRoad, placed: list[Place], own: int, fog: float, sun: Array) -> None:
         self.road, self.placed, self.own, self.fog, self.sun = road, placed, own, fog, sun
-        through = math.exp(-fog * li.FOG_DEPTH / sun[2])
-        self.direct = li.DIRECT * through
-        self.diffuse = li.DIFFUSE + (li.DIRECT - self.direct) * sun[2] / 2
-        self.air = np.array(li.AIR) * (0.6 + 0.4 * sun[2])
+        through = math.exp(-fog * b.FOG_DEPTH / sun[2])
+        self.direct = b.DIRECT * through
+        self.diffuse = b.DIFFUSE + (b.DIRECT - self.direct) * sun[2] / 2
+        self.air = np.array(b.AIR) * (0.6 + 0.4 * sun[2])
         self.shadows = [shadow(*place, sun) for place in placed]
 
     def colour(self, eye: Array, ray, row: int, column: int) -> Array:  # type: ignore[no-untyped-def]
@@ -134,11 +131,11 @@ class Scene:
         level = math.hypot(way[0], way[1])
         if way[2] < 0.0 and eye[2] / -way[2] * level <= GROUND_RANGE:
             return self.ground(eye, ray, row, column)
-        steep = min(max(way[2] / li.STEEP, 0.0), 1.0)
-        blue = (np.array(li.HORIZON) * (1 - steep) + np.array(li.ZENITH) * steep) * (0.6 + 0.4 * self.sun[2])
-        glow = max(0.0, way @ self.sun) ** li.GLOW * self.direct / li.DIRECT
-        depth = min(li.SKY_PATH, li.FOG_DEPTH / way[2]) if way[2] > 0 else li.SKY_PATH
-        return self.seen(blue * (1 - glow) + np.array(li.SUN) * glow, depth)
+        steep = min(max(way[2] / b.STEEP, 0.0), 1.0)
+        blue = (np.array(b.HORIZON) * (1 - steep) + np.array(b.ZENITH) * steep) * (0.6 + 0.4 * self.sun[2])
+        glow = max(0.0, way @ self.sun) ** b.GLOW * self.direct / b.DIRECT
+        depth = min(b.SKY_PATH, b.FOG_DEPTH / way[2]) if way[2] > 0 else b.SKY_PATH
+        return self.seen(blue * (1 - glow) + np.array(b.SUN) * glow, depth)
 
     def seen(self, colour: Array, distance: float) -> Array:
         """Through the air."""
@@ -164,14 +161,14 @@ class Scene:
         places = t + across * (np.arange(4000) + 0.5 - 2000) / 4000
 
         def part(edge: float) -> float:
-            return float((np.abs(places - edge) < g.LINE_WIDTH / 2).mean())
+            return float((np.abs(places - edge) < b.LINE_WIDTH / 2).mean())
 
         ways = s + along * (np.arange(4000) + 0.5 - 2000) / 4000
-        dash = float((ways % g.PERIOD < g.DASH).mean())
-        road = float(((places > left - g.LINE_WIDTH / 2) & (places < right + g.LINE_WIDTH / 2)).mean())
+        dash = float((ways % b.PERIOD < b.DASH).mean())
+        road = float(((places > left - b.LINE_WIDTH / 2) & (places < right + b.LINE_WIDTH / 2)).mean())
         white, yellow = sum(map(part, inner)) * dash + part(right), part(left)
-        colour = np.array(g.VERGE) * (1 - road) + np.array(g.ASPHALT) * (road - white - yellow)
-        colour = colour + white * np.array(g.WHITE_LINE) + yellow * np.array(g.YELLOW_LINE)
+        colour = np.array(b.VERGE) * (1 - road) + np.array(b.ASPHALT) * (road - white - yellow)
+        colour = colour + white * np.array(b.WHITE_LINE) + yellow * np.array(b.YELLOW_LINE)
         dark = any(within(polygon, middle[:2]) for polygon in self.shadows)
         light = self.diffuse + (0.0 if dark else self.direct * self.sun[2])
         return self.seen(colour * light, float(np.linalg.norm(middle - eye)))

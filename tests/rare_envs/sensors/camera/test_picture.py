@@ -8,8 +8,8 @@ import torch
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
-from rare_envs.sensors.camera import Camera, CameraContext, Weather, clear_day, take_picture
-from rare_envs.sensors.camera.surfaces import ASPHALT, BODY_HEIGHT, DASH, PERIOD
+from rare_envs.sensors.camera import Camera, CameraContext, Weather, clear_day
+from rare_envs.sensors.pictures import ASPHALT, BODY_HEIGHT, DASH, PERIOD, take_picture
 from rare_envs.traffic.road import Road, i80, straight
 from rare_envs.traffic.state import VEHICLE_LENGTH, VEHICLE_WIDTH, State
 from tests.rare_envs.sensors.camera.scenes import SHARPEST, weather

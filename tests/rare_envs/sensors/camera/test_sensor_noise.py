@@ -2,13 +2,11 @@
 
 import math
 
-import numpy as np
 import pytest
 import torch
-from scipy import stats
 
 from rare_envs.sensors.camera import Camera, CameraContext, Weather
-from rare_envs.sensors.camera.picture import draw_pixel_noise
+from rare_envs.sensors.pictures import draw_pixel_noise
 
 N = 3 * 66 * 200
 """Values of a picture."""
@@ -47,22 +45,6 @@ def test_equal_to_the_hash_in_plain_integers(tick: int, viewer: int) -> None:
     for row, key in zip(found, KEYS, strict=True):
         for place in (0, 1, 2, 255, 600, N - 1):
             assert row[place].item() == pytest.approx(slow_noise(key, tick, viewer, place), abs=1e-6)
-
-
-def test_values_are_distributed_as_the_sum_of_four_bytes() -> None:
-    """The exact distribution by convolution, the ends of which lie 3.45 standard deviations away."""
-    exact = np.ones(1)
-    for _ in range(4):
-        exact = np.convolve(exact, np.full(256, 1 / 256))
-    deviation = math.sqrt(4 * (256**2 - 1) / 12)
-    values = draw_pixel_noise(cameras(*KEYS), N).double().numpy().ravel()
-    totals = np.rint(values * deviation + 510).astype(int)
-    np.testing.assert_allclose((totals - 510) / deviation, values, atol=1e-6)
-    seen = np.bincount(totals, minlength=1021)
-    bins = np.searchsorted(np.linspace(0.0, 1.0, 201)[1:-1], np.cumsum(exact))  # about 200, equally probable
-    observed, expected = (np.bincount(bins, counts) for counts in (seen, exact * len(values)))
-    assert stats.chisquare(observed, expected).pvalue > 1e-3
-    assert values.min() < -3.2 and values.max() > 3.2
 
 
 def test_noise_is_white() -> None:

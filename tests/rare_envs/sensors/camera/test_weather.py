@@ -1,7 +1,6 @@
 """Weather: its distributions, what it does to pictures, and that all of it is in x."""
 
 import math
-from dataclasses import replace
 from typing import Any
 
 import gymnasium as gym
@@ -15,19 +14,17 @@ from torch import Tensor
 import rare_envs
 import samplers
 from rare_envs.distributions.product import join_independent
-from rare_envs.make import build_space
-from rare_envs.scenarios.base_distributions import load_base
-from rare_envs.scenarios.registry import find_scenario
-from rare_envs.sensors.camera import Camera, CameraContext, Weather, take_picture
-from rare_envs.sensors.camera.context import (
+from rare_envs.sensors.camera import (
     CONDITIONS,
     FOG_DISTRIBUTION,
     SENSOR_NOISE,
     SENSOR_NOISE_DISTRIBUTION,
     SUN_DISTRIBUTION,
+    Camera,
+    CameraContext,
+    Weather,
 )
-from rare_envs.simulation.observation import Sensing
-from rare_envs.simulation.world import World
+from rare_envs.sensors.pictures import take_picture
 from rare_envs.traffic.road import straight
 from rare_envs.traffic.state import State
 
@@ -44,15 +41,6 @@ def shots(**sky: Any) -> Tensor:
     state = State(x, torch.zeros_like(x), torch.zeros_like(x), torch.zeros_like(x), x[:, :0])
     weather = Weather(**{name: column.long() if name == "key" else column.float() for name, column in columns.items()})
     return take_picture(state, straight(3), CameraContext.at_start(Camera(), weather)).float()
-
-
-def test_fog_hides_what_is_far_first() -> None:
-    images = shots(fog=[1e-5, 0.003, 0.01, 0.03, 0.1])
-    car = (images[:, 22:26, 95:105] - images[:, 10:14, 95:105]).abs().mean(dim=(1, 2, 3))  # against the sky
-    line = images[:, 55:, :].std(dim=(1, 2)).amax(dim=1)
-    assert (car.diff() < 0).all()
-    assert car[-1] < 0.15 * car[0]  # exp(-0.1 x 22)
-    assert line[-1] > 0.3 * line[0]  # the line 5 m ahead is still there
 
 
 def test_noise_is_as_strong_as_it_says_and_grows_with_it() -> None:
@@ -113,16 +101,6 @@ def test_on_the_highway_weather_stands_before_the_drivers_and_all_noise_behind()
         torch.rad2deg(episode.camera_context.weather.sun_azimuth), parts["sun_azimuth"], rtol=1e-6
     )
     np.testing.assert_allclose(episode.camera_context.weather.noise, parts["sensor_noise"], rtol=1e-6)
-
-
-def test_a_scenario_with_fog_of_its_own_has_to_rename_it() -> None:
-    scenario = find_scenario(CUT_IN)
-    first = replace(scenario.parameters[0], name="fog")
-    foggy = replace(scenario, parameters=(first, *scenario.parameters[1:]))
-    base = load_base(scenario, None)
-    assert "fog" in build_space(World(foggy), base).names
-    with pytest.raises(ValueError, match="fog"):
-        build_space(World(foggy, Sensing(weather=True)), base)
 
 
 def test_weather_is_a_reset_option() -> None:

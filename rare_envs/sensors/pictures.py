@@ -1,4 +1,4 @@
-"""Colours of what a camera sees: sky and air, the ground with its lane lines, vehicles and their shadows.
+"""Pictures of a camera: sky and air, the ground with its lane lines, vehicles, their shadows, the sensor's noise.
 
 A surface shows its colour times diffuse light plus, where the sun shines on it, direct light times the cosine to its
 normal (Lambert). Of what leaves a surface exp(-fog x distance) arrives, the rest is the colour of the air (Koschmieder
@@ -12,14 +12,14 @@ of a box in the box's own frame (Kay and Kajiya 1986); the nearest box wins.
 """
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
-from rare_envs.sensors.camera.context import Camera, Pixels, Weather
+from rare_envs.sensors.camera import Camera, CameraContext, Pixels, Weather, pixels
 from rare_envs.traffic.road import Road
-from rare_envs.traffic.state import VEHICLE_LENGTH, VEHICLE_WIDTH
+from rare_envs.traffic.state import VEHICLE_LENGTH, VEHICLE_WIDTH, State, map_tensors
 
 DIRECT, DIFFUSE = 0.65, 0.45
 """Light of the sun on a surface that faces it, and of the sky, in clear air."""
@@ -53,15 +53,7 @@ class Light(NamedTuple):
     """Of sky and air, shape (T,)."""
 
     def through(self, distance: Tensor, frame: Tensor | None = None) -> Tensor:
-        """Return the part of the light that passes a way through the air.
-
-        Args:
-            distance: Its length [m], shape (...) for all pictures, or one for each entry of `frame`.
-            frame: Numbers of pictures.
-
-        Returns:
-            Shape (T, ...), or that of `frame`.
-        """
+        """Return the part of the light that passes ways [m], (...) for all T pictures, or one for each of `frame`."""
         if frame is None:
             return torch.exp(-self.fog.view(-1, *[1] * distance.ndim) * distance)
         return torch.exp(-self.fog[frame] * distance)
@@ -79,16 +71,7 @@ def light_of(weather: Weather, heading: Tensor) -> Light:
 
 
 def colour_sky(light: Light, ray: Tensor, norm: Tensor) -> Tensor:
-    """Return the colours of the sky.
-
-    Args:
-        light: Of T pictures.
-        ray: Directions, shape (3, K).
-        norm: Their lengths, shape (K,).
-
-    Returns:
-        Shape (T, 3, K).
-    """
+    """Return the colours of the sky, (T, 3, K), in directions (3, K) of these lengths (K,)."""
     direction = ray / norm
     up = direction[2].clamp(min=FOG_DEPTH / SKY_PATH)
     clear = light.through(FOG_DEPTH / up)
@@ -233,17 +216,7 @@ def _dashes(s: Tensor, length: Tensor) -> Tensor:
 
 
 def colour_ground(cover: Cover, shade: Tensor | None, light: Light, seen: Pixels) -> Tensor:
-    """Return the colours of the ground.
-
-    Args:
-        cover: What covers it.
-        shade: Which pixels are in a shadow, boolean, shape (T, R, W), or None for none of them.
-        light: Of the T pictures.
-        seen: What the pixels see.
-
-    Returns:
-        Shape (T, 3, R, W).
-    """
+    """Return the colours of the ground, (T, 3, R, W); `shade`, boolean (T, R, W), tells who is in a shadow."""
     clear = light.through(seen.distance)
     sunny = (light.diffuse + light.direct * light.sun[:, 2]).view(-1, 1, 1)
     lit = clear * sunny if shade is None else clear * torch.where(shade, light.diffuse.view(-1, 1, 1), sunny)
@@ -306,17 +279,10 @@ class Candidates(NamedTuple):
 
 
 def project_points(camera: Camera, forward: Tensor, right: Tensor, up: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return points in the camera's frame, along its axis.
+    """Return how far points, ahead, to the right and above ground, are right of the camera's axis, below and along it.
 
-    Args:
-        camera: The camera.
-        forward: Ahead of it [m], any shape, as the others.
-        right: To its right [m].
-        up: Above the ground [m].
-
-    Returns:
-        How far they are to the right of its axis, below it, and along it [m]. A point at (r, d, z) is seen in column
-        `width` / 2 + `focal` r / z and row `height` / 2 + `focal` d / z; (0, 0) is the picture's upper left corner.
+    All in [m]. One at (r, d, z) is seen in column `width` / 2 + `focal` r / z and row `height` / 2 + `focal` d / z;
+    (0, 0) is the picture's upper left corner.
     """
     cos, sin = math.cos(camera.pitch), math.sin(camera.pitch)
     above = up - camera.mount_height
@@ -324,16 +290,9 @@ def project_points(camera: Camera, forward: Tensor, right: Tensor, up: Tensor) -
 
 
 def find_candidates(camera: Camera, forward: Tensor, right: Tensor, up: Tensor, first_row: int = 0) -> Candidates:
-    """Pixels in the rectangles around the convex hulls of sets of K points.
+    """Return the pixels, from a first row on, in the rectangles around the convex hulls of sets of K points (T, N, K).
 
     What is behind the camera is cut off at a plane just ahead of it, where the hull is no wider than the points are.
-
-    Args:
-        camera: The camera.
-        forward: As in `project_points`, shape (T, N, K), as the others.
-        right: Likewise.
-        up: Likewise.
-        first_row: First row that counts.
     """
     right, down, depth = project_points(camera, forward, right, up)
     scale = camera.focal / depth.clamp(min=_NEAR)
@@ -415,16 +374,7 @@ def cast_shadows(boxes: Boxes, light: Light, camera: Camera, seen: Pixels) -> Te
 
 
 def draw_boxes(image: Tensor, boxes: Boxes, light: Light, camera: Camera, seen: Pixels, colours: Tensor) -> None:
-    """Draw boxes into pictures.
-
-    Args:
-        image: Colours, shape (T, H W, 3), changed in place.
-        boxes: N boxes in each.
-        light: Of the pictures.
-        camera: The camera.
-        seen: What its pixels see.
-        colours: Of the boxes, shape (N, 3).
-    """
+    """Draw boxes of colours (N, 3) into pictures (T, H W, 3), in place."""
     forward, right = (torch.cat((part, part), -1) for part in boxes.corners())
     up = torch.zeros_like(forward)
     up[..., 4:] = BODY_HEIGHT
@@ -471,3 +421,112 @@ def _faces(boxes: Boxes, origin: tuple[Tensor, Tensor], light: Light, colours: T
     bright = light.diffuse[:, None, None] + light.direct[:, None, None] * facing.clamp(min=0.0)
     paints = torch.stack((colours, colours.new_tensor(GLASS).expand_as(colours)), dim=1)
     return (bright[..., None, None] * paints[:, None]).view(-1, 3)
+
+
+TILE = 2**17
+"""Pixels that are drawn at once: few enough for the cache."""
+
+
+class PictureScene(NamedTuple):
+    """Scenes in front of T cameras."""
+
+    boxes: Boxes
+    """All N vehicles, the camera's own first."""
+    light: Light
+    lines: Lines
+    """Road coordinates of the rows of pixels that see ground."""
+
+
+@torch.no_grad()
+def take_picture(state: State, road: Road, context: CameraContext) -> Tensor:
+    """Return the pictures of the cameras of the vehicles in the ego's place, uint8, (B, H, W, 3): red, green and blue.
+
+    Every picture depends on its own row alone, bit for bit. The `viewer` of the context says which vehicle is in the
+    ego's place, see `State.seen_by`.
+    """
+    camera, device = context.camera, state.x.device
+    seen = pixels(camera, device)
+    scene = _scene(state, road, context, seen)
+    colours = torch.tensor(_colours(state.x.shape[1], context.viewer), device=device).view(-1, 3)
+    noisy = bool(context.weather.noise.any())
+    rows = max(1, TILE // (camera.height * camera.width))
+    image = torch.empty(len(state.x), camera.height, camera.width, 3, dtype=torch.uint8, device=device)
+    for first in range(0, len(image), rows):
+        part = slice(first, first + rows)
+        drawn = _draw(_rows(scene, part), road, camera, seen, colours).mul_(255.0)
+        if noisy:
+            when = context._replace(weather=_rows(context.weather, part), tick=context.tick[part])
+            strength = when.weather.noise.float()[:, None, None]
+            drawn.addcmul_(strength, draw_pixel_noise(when, drawn[0].numel()).view(drawn.shape))
+        image[part] = drawn.round_().clamp_(0.0, 255.0).to(torch.uint8).view(-1, *image.shape[1:])
+    return image
+
+
+def _rows(fields: Any, part: slice) -> Any:
+    """Return some rows of tensors, which may lie in tuples of tuples."""
+    return map_tensors(lambda field: field[part], fields)
+
+
+def _scene(state: State, road: Road, context: CameraContext, seen: Pixels) -> PictureScene:
+    """Place vehicles, light and road in the frames of the cameras."""
+    x, y, heading = road.to_world(state.x, state.y, state.heading)
+    own, camera = heading[:, :1], context.camera
+    cos, sin, ahead, right = torch.cos(own), torch.sin(own), camera.mount_ahead, camera.mount_right
+    camera_x, camera_y = x[:, :1] + ahead * cos - right * sin, y[:, :1] + ahead * sin + right * cos
+    gaze = own + camera.yaw
+    cos, sin = torch.cos(gaze), torch.sin(gaze)
+    dx, dy, turn = x - camera_x, y - camera_y, (heading - gaze).float()
+    boxes = Boxes((dx * cos + dy * sin).float(), (dy * cos - dx * sin).float(), torch.cos(turn), torch.sin(turn))
+    view = View(camera_x[:, 0], camera_y[:, 0], gaze[:, 0])
+    return PictureScene(boxes, light_of(context.weather, view.heading), road_lines(view, road, seen))
+
+
+def _draw(scene: PictureScene, road: Road, camera: Camera, seen: Pixels, colours: Tensor) -> Tensor:
+    """Return colours from 0 to 1, shape (T, H W, 3), without noise."""
+    boxes, light, lines = scene
+    image = torch.empty(len(light.fog), camera.height * camera.width, 3, device=colours.device)
+    above = seen.sky * camera.width
+    if seen.sky:
+        image[:, :above] = colour_sky(light, seen.ray[:, :above], seen.norm[:above]).movedim(1, 2)
+    if seen.sky < camera.height:
+        shade = cast_shadows(boxes, light, camera, seen)
+        image[:, above:] = colour_ground(cover_of(lines, road, seen), shade, light, seen).flatten(2).movedim(1, 2)
+    draw_boxes(image, Boxes(*(part[:, 1:] for part in boxes)), light, camera, seen, colours)
+    return image
+
+
+def _colours(vehicles: int, viewer: int) -> list[RGB]:
+    """Return the colours of the vehicles that a viewer sees, in the order of `State.seen_by`."""
+    return [PAINT[(j - 1) % len(PAINT)] for j in range(vehicles) if j != viewer]
+
+
+WEYL_STEP = -1640531535
+"""2^32 over the golden ratio, as int32: Weyl's sequence spreads consecutive numbers."""
+MIXING_FACTORS = (0x7FEB352D, 0x846CA68B - 2**32)
+"""Of a mixing function with low bias: Wellons, "Prospecting for hash functions", 2018 (lowbias32)."""
+EVEN_BYTES, BOTH_HALVES = 0x00FF00FF, 0x00010001
+"""Bytes 0 and 2 of a word, and the factor that adds its halves in the upper one."""
+BYTES_MEAN, BYTES_DEVIATION = 4 * 127.5, (4 * (256**2 - 1) / 12) ** 0.5
+"""Of the sum of four bytes."""
+
+
+def draw_pixel_noise(context: CameraContext, values: int) -> Tensor:
+    """Return the noise of one picture for each of B cameras, shape (B, values), mean 0 and variance 1.
+
+    A 32-bit hash of key, tick, viewer and pixel gives four bytes; their sum, centred and scaled, is nearly normal (the
+    Irwin-Hall distribution of four terms, which ends at 3.5 standard deviations). Nothing is random but the key.
+    """
+    key = context.weather.key.to(torch.int32)
+    for number in (context.tick, torch.full_like(context.tick, context.viewer)):
+        key = _mix_bits(key + (number.to(torch.int32) + 1) * WEYL_STEP)
+    place = torch.arange(values, dtype=torch.int32, device=key.device) * WEYL_STEP
+    bits = _mix_bits(place + key[:, None])
+    pairs = (bits >> 8).bitwise_and_(EVEN_BYTES).add_(bits.bitwise_and_(EVEN_BYTES))  # bytes 0 + 1 and 2 + 3
+    return (pairs.mul_(BOTH_HALVES) >> 16).sub(BYTES_MEAN).div_(BYTES_DEVIATION)
+
+
+def _mix_bits(bits: Tensor) -> Tensor:
+    """Scramble 32-bit integers, in place; multiplication wraps around."""
+    bits.bitwise_xor_((bits >> 16).bitwise_and_(0xFFFF)).mul_(MIXING_FACTORS[0])
+    bits.bitwise_xor_((bits >> 15).bitwise_and_(0x1FFFF)).mul_(MIXING_FACTORS[1])
+    return bits.bitwise_xor_((bits >> 16).bitwise_and_(0xFFFF))

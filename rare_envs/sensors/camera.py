@@ -6,7 +6,7 @@ gives the reasons.
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from typing import ClassVar, NamedTuple
 
@@ -25,20 +25,11 @@ GROUND_RANGE = 2000.0
 
 @dataclass(frozen=True)
 class Camera:
-    """A pinhole camera on a vehicle, level across its line of sight; pixels are square.
+    """A pinhole camera on a vehicle, level across its line of sight, with square pixels; else a ValueError.
 
-    66 x 200 is what PilotNet takes (Bojarski et al. 2016). The mount is behind the windscreen of a car of 1.5 m; field
-    of view and pitch show the ground from 4.3 m ahead, and put the horizon at three tenths of the picture.
-
-    Raises:
-        ValueError: If a size is not a whole number of pixels, or another setting is out of its range.
-
-    References:
-        Bojarski et al., "End to end learning for self-driving cars", 2016.
-
-    Example:
-        >>> round(Camera(height=40, width=120).focal, 1)  # of a field of view of 70 degrees
-        85.7
+    66 x 200 is what PilotNet takes (Bojarski et al., "End to end learning for self-driving cars", 2016). The mount is
+    behind the windscreen of a car of 1.5 m; field of view and pitch show the ground from 4.3 m ahead, and put the
+    horizon at three tenths of the picture.
     """
 
     height: int = 66
@@ -82,18 +73,7 @@ class Camera:
 
 
 def find_camera(camera: object) -> Camera:
-    """Return the camera that a keyword argument `camera` stands for.
-
-    Args:
-        camera: A `Camera`, the size of its pictures as (height, width), or None for the usual one.
-
-    Raises:
-        ValueError: If it is none of these.
-
-    Example:
-        >>> find_camera((40, 120)).width
-        120
-    """
+    """Return the camera of an argument: a `Camera`, the size of its pictures (height, width), or None for the usual."""
     if camera is None:
         return Camera()
     if isinstance(camera, Camera):
@@ -209,13 +189,11 @@ class LogNormalDistribution:
         """Return it with the median moved towards that of weighted points, by alpha of the way in logarithms."""
         logs = np.log(np.clip(x[:, 0], self.low, self.high))
         wanted = float(np.sum(weights * logs) / np.sum(weights))
-        return LogNormalDistribution(
-            math.exp((1.0 - alpha) * math.log(self.median) + alpha * wanted), self.spread, self.low, self.high
-        )
+        return replace(self, median=math.exp((1.0 - alpha) * math.log(self.median) + alpha * wanted))
 
     def widen(self, factor: float) -> "LogNormalDistribution":
         """Return it with a spread larger by a factor."""
-        return LogNormalDistribution(self.median, self.spread * factor, self.low, self.high)
+        return replace(self, spread=self.spread * factor)
 
 
 class WeatherBeta(BetaDistribution):
@@ -241,11 +219,7 @@ SENSOR_NOISE_DISTRIBUTION = WeatherBeta(*map(np.array, ([2.0], [5.0], [0.0], [10
 
 
 def weather_parameters(noisy: bool) -> Iterator[tuple[tuple[Parameter, ...], Distribution]]:
-    """Yield parameters of the weather with their distributions, in the order of x.
-
-    Args:
-        noisy: Whether the camera has noise.
-    """
+    """Yield parameters of the weather with their distributions, in the order of x; a camera's noise if `noisy`."""
     yield CONDITIONS[:1], FOG_DISTRIBUTION
     yield CONDITIONS[1:], SUN_DISTRIBUTION
     if noisy:
@@ -253,13 +227,7 @@ def weather_parameters(noisy: bool) -> Iterator[tuple[tuple[Parameter, ...], Dis
 
 
 class Weather(NamedTuple):
-    """The weather of B scenarios, and the noise of their cameras; shapes (B,).
-
-    Example:
-        >>> fog = Weather(*(torch.full((2,), value) for value in (0.03, 0.5, 1.0, 0.0)), key=torch.zeros(2).long())
-        >>> (3.0 / fog.fog).round().tolist()  # visibility [m]
-        [100.0, 100.0]
-    """
+    """The weather of B scenarios, and the noise of their cameras; shapes (B,)."""
 
     fog: Tensor
     """Extinction coefficient of the air [1/m]."""
@@ -278,23 +246,13 @@ CLEAR = (1.5e-4, math.radians(45.0), math.radians(120.0))
 
 
 def clear_day(like: Tensor) -> Weather:
-    """Return the weather of a clear day without sensor noise, for the B rows of a tensor.
-
-    Example:
-        >>> round(3.0 / clear_day(torch.zeros(1, 3)).fog.item())  # visibility [m]
-        20000
-    """
+    """Return the weather of a clear day without sensor noise, for the B rows of a tensor."""
     fog, elevation, azimuth = (like.new_full((len(like),), value) for value in CLEAR)
     return Weather(fog, elevation, azimuth, torch.zeros_like(fog), _keys(fog[:, None]))
 
 
 def read_weather(x: Tensor, key: Tensor) -> Weather:
-    """Return the weather in columns of x.
-
-    Args:
-        x: Fog, elevation and azimuth [deg], and the noise if there is any; shape (B, 3) or (B, 4).
-        key: A standard normal column from which the noise follows, shape (B, 1), or (B, 0) for one pattern for all.
-    """
+    """Return the weather in columns of x: fog, elevation and azimuth [deg], and perhaps noise, (B, 3) or (B, 4)."""
     fog, elevation, azimuth = x[:, :3].unbind(1)
     noise = x[:, 3] if x.shape[1] > 3 else torch.zeros_like(fog)
     key = key if key.shape[1] else x.new_zeros(len(x), 1)
@@ -307,13 +265,7 @@ def _keys(column: Tensor) -> Tensor:
 
 
 class CameraContext(NamedTuple):
-    """Camera, weather and time: all that pictures depend on beside the traffic.
-
-    Example:
-        >>> context = CameraContext.at_start(Camera(), clear_day(torch.zeros(2, 3)))
-        >>> context.later().tick.tolist()
-        [1, 1]
-    """
+    """Camera, weather and time: all that pictures depend on beside the traffic."""
 
     camera: Camera
     """The camera."""
