@@ -117,9 +117,3 @@ RULE_CHUNK = 4096
 """Rollouts of a rule-based ego that a worker makes at once: enough for torch, and some for each of several workers."""
 POLICY_CHUNK = 256
 """Likewise with a policy, which is slower."""
-
-
-def tile_size(device: torch.device, *, by_policy: bool, takes_pictures: bool, keeps_much: bool) -> int:
-    """Return how many rollouts torch simulates at once; lidar, or a measure of whole episodes, keeps much."""
-    size = CAMERA_TILE if takes_pictures else LIDAR_TILE if keeps_much else POLICY_TILE if by_policy else RULE_TILE
-    return size if device.type == "cpu" else GPU_TILES * size

@@ -13,7 +13,17 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from rare_envs.devices import POLICY_CHUNK, RULE_CHUNK, find_device, move_to, tile_size
+from rare_envs.devices import (
+    CAMERA_TILE,
+    GPU_TILES,
+    LIDAR_TILE,
+    POLICY_CHUNK,
+    POLICY_TILE,
+    RULE_CHUNK,
+    RULE_TILE,
+    find_device,
+    move_to,
+)
 from rare_envs.distributions.space import Distribution, ScenarioSpace
 from rare_envs.egos.dense_policies import NotCompiled
 from rare_envs.egos.errors import reason_of
@@ -329,13 +339,13 @@ class DrivingProblem:
 
     @property
     def tile(self) -> int:
-        """Number of rollouts simulated at once."""
-        return tile_size(
-            self.device,
-            by_policy=isinstance(self.driver, PolicyDriver),
-            takes_pictures=self.needs.queries_policy and "camera" in self.world.sensing.kinds,
-            keeps_much=self.world.uses_lidar or self.world.measurement.episode_measure.records,
-        )
+        """Number of rollouts simulated at once; lidar, or a measure of whole episodes, keeps much."""
+        size = POLICY_TILE if isinstance(self.driver, PolicyDriver) else RULE_TILE
+        if self.needs.queries_policy and "camera" in self.world.sensing.kinds:
+            size = CAMERA_TILE
+        elif self.world.uses_lidar or self.world.measurement.episode_measure.records:
+            size = LIDAR_TILE
+        return size if self.device.type == "cpu" else GPU_TILES * size
 
     @property
     def chunk_size(self) -> int:
@@ -415,7 +425,9 @@ class DrivingProblem:
             end = known(world, rows)
         except (Exception, SystemExit):  # the policy is the user's: anything may happen in it
             return None
-        return None if has_nan(end) else end
+        # an action that is NaN leaves the ego so for good; f need not notice, since nobody is seen by such an ego
+        unknown = torch.stack([end.f.isnan(), *(values[:, 0].isnan() for values in end.state[:4])])
+        return None if bool(unknown.any()) else end
 
     def _check_known(self, x: NDArray[np.float64], f: NDArray[np.float64], failed_rows: dict[int, str] | None) -> None:
         """Raise a ValueError where f is NaN, or add the row to those that failed."""
@@ -425,15 +437,6 @@ class DrivingProblem:
                 measure = self.world.measurement.measure
                 raise ValueError(f"The measure {measure!r} gave NaN, first at row {row}: {named}.")
             failed_rows.setdefault(int(row), "the measure gave NaN")
-
-
-def has_nan(end: Episode) -> bool:
-    """Return whether f or an ego is NaN at the horizon of any episode.
-
-    An action that is NaN leaves the ego so for good; f need not notice, since nobody is seen by or near such an ego.
-    """
-    own = (values[:, 0] for values in end.state[:4])
-    return bool(torch.stack([end.f.isnan(), *(values.isnan() for values in own)]).any())
 
 
 @contextmanager

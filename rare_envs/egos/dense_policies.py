@@ -164,21 +164,16 @@ class DenseInference:
     high: Tensor
 
     def predict(
-        self,
-        observation: NDArray[Any],
-        state: Any = None,
-        episode_start: NDArray[Any] | None = None,
-        deterministic: bool = True,
-    ) -> tuple[NDArray[Any], Any]:
+        self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = True
+    ) -> Any:
         """Return mean actions for observations (B, F), clipped; where they are not finite, what `policy` does then."""
         with torch.no_grad():
             rows = np.ascontiguousarray(observation)  # torch takes no negative strides
             actions = self._apply(torch.from_numpy(rows))
         if not np.isfinite(actions.numpy()).all():
-            answer: tuple[NDArray[Any], Any] = self.policy.predict(
+            return self.policy.predict(
                 observation, state=state, episode_start=episode_start, deterministic=deterministic
             )
-            return answer
         return actions.clamp(self.low, self.high).numpy(), state
 
     def decide(self, observation: Tensor) -> Tensor:

@@ -145,7 +145,8 @@ class HumanDriver:
         late, speed, acceleration = past[0]
         due, away = self._look_away(memory, late, speed)
         known = self._carry_forward(memory, late, away)
-        lead = estimate_leads(known, speed, self._errors_at(memory.tick, speed), model)
+        errors = speed.new_zeros(1, 2) if self.errors is None else self.errors[:, memory.tick // self.error_ticks]
+        lead = estimate_leads(known, speed, errors, model)
         lead, expected = anticipate(lead, speed, acceleration, min(memory.tick, self.delay) * dt)
         wanted = respond(lead, expected, model)
         actual = torch.maximum(wanted, memory.acceleration.clamp(max=0.0) - model.jerk * dt)
@@ -185,9 +186,3 @@ class HumanDriver:
         distance = memory.known.distance + moved * (memory.known.speed - memory.late_speed[:, None])
         held = memory.known._replace(distance=distance)
         return Percept(*(torch.where(away[:, None], old, new) for old, new in zip(held, late, strict=True)))
-
-    def _errors_at(self, tick: int, like: Tensor) -> Tensor:
-        """Return w_s and w_v of a tick, shape (B, 2)."""
-        if self.errors is not None:
-            return self.errors[:, tick // self.error_ticks]
-        return like.new_zeros(1, 2)

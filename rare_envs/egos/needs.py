@@ -15,7 +15,6 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 import torch
 from gymnasium import spaces
-from numpy.typing import NDArray
 
 from rare_envs.control.actions import DISCRETE_ACTIONS
 from rare_envs.control.idm import IDM
@@ -99,7 +98,7 @@ class FunctionEgo:
 
     def predict(
         self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = True
-    ) -> tuple[NDArray[Any], Any]:
+    ) -> Any:
         """Stable-Baselines3's `predict`; the function has no memory."""
         return np.asarray(self.function(observation)), state
 
@@ -113,7 +112,7 @@ class ModuleEgo:
 
     def predict(
         self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = True
-    ) -> tuple[NDArray[Any], Any]:
+    ) -> Any:
         """Stable-Baselines3's `predict`; the module has no memory."""
         return self.decide(observation).numpy(force=True), state
 

@@ -162,20 +162,14 @@ def _isolate_failing_rows(
             if len(part.start) > 1:
                 found, why = _isolate_failing_rows(policy, kind, part, raised, whole)
             else:
-                found, why = _ignored_action(kind, part.over), {0: reason_of(raised)}
+                nothing = torch.zeros(1, dtype=torch.int64) if kind == "meta" else torch.zeros(1, 2)
+                found, why = read_actions(kind, nothing, 1, torch.ones_like(part.over)), {0: reason_of(raised)}
         else:
             if hidden is not None:
                 raise error
         actions.append(found)
         reasons.update({first + row: reason for row, reason in why.items()})
     return torch.cat(actions), reasons
-
-
-def _ignored_action(kind: str, over: Tensor) -> Tensor:
-    """Return the action of rows whose action does not matter, for as many rows as `over` has."""
-    batch = len(over)
-    nothing = torch.zeros(batch, dtype=torch.int64) if kind == "meta" else torch.zeros(batch, 2)
-    return read_actions(kind, nothing, batch, torch.ones_like(over))
 
 
 @dataclass(frozen=True, eq=False)

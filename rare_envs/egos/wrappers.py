@@ -23,18 +23,11 @@ class NormalisedPolicy:
     normalise: Callable[[NDArray[Any]], NDArray[Any]]
 
     def predict(
-        self,
-        observation: NDArray[Any],
-        state: Any = None,
-        episode_start: NDArray[Any] | None = None,
-        deterministic: bool = True,
-    ) -> tuple[NDArray[Any], Any]:
+        self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = True
+    ) -> Any:
         """Stable-Baselines3's `predict` on observations as the environment gives them."""
         shown = self.normalise(observation)
-        action, state = self.policy.predict(
-            shown, state=state, episode_start=episode_start, deterministic=deterministic
-        )
-        return action, state
+        return self.policy.predict(shown, state=state, episode_start=episode_start, deterministic=deterministic)
 
 
 @dataclass(frozen=True)
@@ -51,8 +44,8 @@ class FrameStackedPolicy:
     new_axis: bool = False
 
     def predict(
-        self, observation: Any, state: Any = None, episode_start: NDArray[Any] | None = None, deterministic: bool = True
-    ) -> tuple[NDArray[Any], Any]:
+        self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = True
+    ) -> Any:
         """Stable-Baselines3's `predict` on single observations."""
         starts = np.full(batch_size(observation), state is None)
         if episode_start is not None:
@@ -86,8 +79,8 @@ class RescaledPolicy:
     high: NDArray[Any]
 
     def predict(
-        self, observation: Any, state: Any = None, episode_start: NDArray[Any] | None = None, deterministic: bool = True
-    ) -> tuple[NDArray[Any], Any]:
+        self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = True
+    ) -> Any:
         """Stable-Baselines3's `predict` with actions in [-1, 1]."""
         action, state = self.policy.predict(
             observation, state=state, episode_start=episode_start, deterministic=deterministic

@@ -367,7 +367,11 @@ class AgentsVectorEnv(_SeveralAgents, VectorEnv[NDArray[np.float32], NDArray[Any
             episode, earned, memory = step_agents(
                 self.world, self._episode, chosen, commanded, rewards_of, self._driver, None
             )
-            _refuse_memory(memory)
+            if (memory[0] if isinstance(memory, tuple) else memory) is not None:
+                raise ValueError(
+                    "Expected an ego without memory: scenarios of a batch begin at different times, and a recurrent or "
+                    "stacked policy would remember another one's. rare_envs.parallel_env takes such egos."
+                )
             reward = self._by_row([total_of(earned[vehicle]) for vehicle in self._of_agents]).double().numpy()
         self._tick += self.world.clock.stride
         observation = self._observe(episode)
@@ -396,12 +400,3 @@ class AgentsVectorEnv(_SeveralAgents, VectorEnv[NDArray[np.float32], NDArray[Any
     def _observe(self, episode: MultiAgentEpisode) -> Any:
         views = [observe(episode.views[vehicle], self.world.sensing.observation) for vehicle in self._of_agents]
         return map_kinds(lambda *parts: self._by_row(list(parts)).numpy(), *views)
-
-
-def _refuse_memory(memory: Any) -> None:
-    """Raise a ValueError if the ego's driver has a memory."""
-    if (memory[0] if isinstance(memory, tuple) else memory) is not None:
-        raise ValueError(
-            "Expected an ego without memory: scenarios of a batch begin at different times, and a recurrent or stacked "
-            "policy would remember another one's. rare_envs.parallel_env takes such egos."
-        )

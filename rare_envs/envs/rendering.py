@@ -182,8 +182,12 @@ class Renderer:
         RoadGraphics.display_traffic(traffic, self._surface, offscreen=True)
         for colour, vehicles in outlines.values():
             for j in sorted(vehicles):
-                corners = [self._surface.pos2pix(x, y) for x, y in _corners(*places[j])]
-                self._pygame.draw.polygon(self._surface, colour, corners, width=3)
+                *middle, heading = places[j]
+                along = VEHICLE_LENGTH / 2 * np.array((np.cos(heading), np.sin(heading)))
+                across = VEHICLE_WIDTH / 2 * np.array((-np.sin(heading), np.cos(heading)))
+                corners = (along + across, along - across, -along - across, across - along)
+                pixels = [self._surface.pos2pix(*(middle + corner)) for corner in corners]
+                self._pygame.draw.polygon(self._surface, colour, pixels, width=3)
 
     def _draw_legend(self, outlines: _Outlines) -> None:
         """Draw colours and what they mean, in a line below the road."""
@@ -217,14 +221,6 @@ def caption(world: World, episode: Episode, time: float | None, row: int = 0) ->
     measure = f" ({world.measurement.measure})" if isinstance(world.measurement.measure, str) else ""
     parts.append(f"f so far{measure} {float(episode.f[row]):.2f}")
     return "    ".join(parts)
-
-
-def _corners(x: float, y: float, heading: float) -> list[tuple[float, float]]:
-    """Return the corners of a vehicle in the world [m]."""
-    along, across = VEHICLE_LENGTH / 2, VEHICLE_WIDTH / 2
-    cos, sin = np.cos(heading), np.sin(heading)
-    box = ((along, across), (along, -across), (-along, -across), (-along, across))
-    return [(x + a * cos - b * sin, y + a * sin + b * cos) for a, b in box]
 
 
 RENDER_MODES = ("rgb_array", "human")

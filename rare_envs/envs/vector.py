@@ -77,7 +77,11 @@ class DrivingVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[Any]
             raise ValueError(f"Expected num_envs of at least 1, got {num_envs!r}.")
         if render_mode not in (None, "rgb_array"):
             raise ValueError(f"Expected render_mode None or 'rgb_array' for a batch, got {render_mode!r}.")
-        self._mode = read_autoreset_mode(autoreset_mode)
+        known = [mode.value for mode in AutoresetMode]
+        if autoreset_mode not in [*known, *AutoresetMode]:
+            names = ", ".join(map(repr, known))
+            raise ValueError(f"Unknown autoreset_mode {autoreset_mode!r}; expected one of {names}.")
+        self._mode = AutoresetMode(autoreset_mode)
         self.device = find_device(device)
         if self.device.type != "cpu" and core == "numba":
             raise ValueError(f"Expected core 'torch' or 'auto' with device={device!r}, got 'numba'.")
@@ -318,12 +322,3 @@ def clear_rows(actions: Any, rows: NDArray[np.bool_]) -> NDArray[Any]:
         cleared = cleared.copy()
         cleared[rows] = 0
     return cleared
-
-
-def read_autoreset_mode(mode: AutoresetMode | str) -> AutoresetMode:
-    """Return Gymnasium's autoreset mode of a value, such as "NextStep"."""
-    try:
-        return AutoresetMode(mode)
-    except ValueError:
-        known = ", ".join(repr(each.value) for each in AutoresetMode)
-        raise ValueError(f"Unknown autoreset_mode {mode!r}; expected one of {known}.") from None

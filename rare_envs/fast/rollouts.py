@@ -28,6 +28,7 @@ from rare_envs.fast.equations import (
 from rare_envs.fast.networks import LANES, PolicyNumbers, decide_by_policy, observe
 from rare_envs.fast.rows import (
     HIT,
+    OWN,
     UNKNOWN,
     Rows,
     ScriptNumbers,
@@ -35,9 +36,7 @@ from rare_envs.fast.rows import (
     begin,
     begin_step,
     decide_by_idm,
-    make_table,
     rows_of,
-    stack_state,
     tick,
 )
 from rare_envs.measures.base import COLLISION
@@ -79,6 +78,19 @@ def drive(script: str, state: State, ego: IDM | DensePolicy, road: Road, dt: flo
         values, spare = np.zeros((2, policy.widths.max(), LANES), dtype=np.float32)
         drive_by_policy(start, table, vehicles, policy, values, spare, numbers, ticks, f)
     return np.where(f == UNKNOWN, np.nan, f.astype(np.float64))
+
+
+def stack_state(state: State) -> SingleArray:
+    """Return x, y, heading and speed of the N vehicles and theta side by side, shape (4 N + P, B)."""
+    return np.concatenate([field.numpy().T for field in state])
+
+
+def make_table(start: SingleArray, vehicles: int, size: int) -> SingleArray:
+    """Return the memory of so many rows, which begin as the first columns of `stack_state`."""
+    table = np.zeros((len(start) + vehicles + OWN, size), dtype=np.float32)
+    first = start[:, :size]
+    table[: len(start), : first.shape[1]] = first
+    return table
 
 
 @compiled

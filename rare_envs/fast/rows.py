@@ -42,7 +42,6 @@ from rare_envs.fast.equations import (
 )
 from rare_envs.measures.base import COLLISION
 from rare_envs.measures.longitudinal import TTC_MAX
-from rare_envs.traffic.state import State
 
 SingleArray: TypeAlias = NDArray[np.float32]
 OWN = 8
@@ -90,19 +89,6 @@ class Rows(NamedTuple):
     """Written over, shape (2, B)."""
     size: int
     """Rows that are driven, the first ones."""
-
-
-def stack_state(state: State) -> SingleArray:
-    """Return x, y, heading and speed of the N vehicles and theta side by side, shape (4 N + P, B)."""
-    return np.concatenate([field.numpy().T for field in state])
-
-
-def make_table(start: SingleArray, vehicles: int, size: int) -> SingleArray:
-    """Return the memory of so many rows, which begin as the first columns of `stack_state`."""
-    table = np.zeros((len(start) + vehicles + OWN, size), dtype=np.float32)
-    first = start[:, :size]
-    table[: len(start), : first.shape[1]] = first
-    return table
 
 
 @inlined

@@ -103,12 +103,6 @@ def sense(bodies: Bodies, observers: int | None = None) -> Readings:
     return Readings(torch.where(met, distance.clamp(0.0, MAX_RANGE), MAX_RANGE), rate)
 
 
-@torch.no_grad()
-def find_met(bodies: Bodies, observers: int) -> Tensor:
-    """Return the index of the body that each beam of the first M vehicles meets first, -1 for none, (B, M, 20)."""
-    return _first_met(Bodies(*(field.expand_as(bodies.x) for field in bodies)), observers)[0]
-
-
 def _crossing(
     dx: Tensor, dy: Tensor, heading: Tensor, turn: Tensor, length: Tensor, width: Tensor
 ) -> tuple[Tensor, Tensor]:
@@ -269,9 +263,11 @@ def perceive_traffic(state: State, road: Road, pose: WorldPose | None = None) ->
     return perceive(bodies, OnRoad(0.5 * (left - right), state.heading, curvature, left, right))
 
 
+@torch.no_grad()
 def find_vehicles_met(state: State, road: Road) -> Tensor:
     """Return the index of the vehicle that each of the ego's beams meets first, -1 for none, int64, shape (B, 20)."""
-    return find_met(_bodies(state, *road.to_world(state.x, state.y, state.heading)), 1)[:, 0]
+    bodies = _bodies(state, *road.to_world(state.x, state.y, state.heading))
+    return _first_met(Bodies(*(field.expand_as(bodies.x) for field in bodies)), 1)[0][:, 0]
 
 
 def _bodies(state: State, x: Tensor, y: Tensor, heading: Tensor) -> Bodies:

@@ -103,17 +103,6 @@ _OFF = 40.0
 """Points further off the reference line are taken to be there [m]; whatever their place, they are on no road."""
 
 
-class View(NamedTuple):
-    """Poses of T cameras in the flat world, shapes (T,)."""
-
-    x: Tensor
-    """[m]."""
-    y: Tensor
-    """[m]."""
-    heading: Tensor
-    """[rad]."""
-
-
 class Lines(NamedTuple):
     """Road coordinates along the R rows of T pictures as functions of the place r to the right [m]; (T, R, 1) each."""
 
@@ -125,9 +114,8 @@ class Lines(NamedTuple):
     """Sine of the camera's heading relative to the road there."""
 
 
-def road_lines(view: View, road: Road, seen: Pixels) -> Lines:
-    """Return road coordinates of what the rows of ground pixels look at."""
-    x, y, heading = (part[:, None] for part in view)
+def road_lines(x: Tensor, y: Tensor, heading: Tensor, road: Road, seen: Pixels) -> Lines:
+    """Return road coordinates of what the rows of ground pixels look at, of T cameras in the flat world, (T, 1)."""
     forward = seen.forward[:, 0].to(x)
     cos, sin = torch.cos(heading), torch.sin(heading)
     half = seen.right[:, -1].to(x)  # to the middle of the last column
@@ -161,13 +149,8 @@ def _quadratic(values: Tensor, middle: Tensor, reach: Tensor) -> tuple[Tensor, T
     return one, linear, square
 
 
-class Cover(NamedTuple):
-    """Share of each ground pixel that each surface covers, from 0 to 1, shapes (T, R, W)."""
-
-    road: Tensor
-    """The road, lines included."""
-    white: Tensor
-    yellow: Tensor
+Cover = tuple[Tensor, Tensor, Tensor]
+"""Share of each ground pixel, 0 to 1, (T, R, W), that are road, lines included, white lines and yellow ones."""
 
 
 def cover_of(lines: Lines, road: Road, seen: Pixels) -> Cover:
@@ -200,7 +183,7 @@ def cover_of(lines: Lines, road: Road, seen: Pixels) -> Cover:
         s = torch.addcmul(s1, s2, seen.right).mul_(seen.right).add_(s0)
         white *= _dashes(s, (t1 * seen.forward_per_row).addcmul(lines.turn, seen.right_per_row, value=-1.0))
     white += band(right, *line)
-    return Cover(surface.mul_(share), white.mul_(share), band(left, *line).mul_(share))
+    return surface.mul_(share), white.mul_(share), band(left, *line).mul_(share)
 
 
 def _dashes(s: Tensor, length: Tensor) -> Tensor:
@@ -217,14 +200,14 @@ def _dashes(s: Tensor, length: Tensor) -> Tensor:
 
 def colour_ground(cover: Cover, shade: Tensor | None, light: Light, seen: Pixels) -> Tensor:
     """Return the colours of the ground, (T, 3, R, W); `shade`, boolean (T, R, W), tells who is in a shadow."""
-    clear = light.through(seen.distance)
+    (surface, white, yellow), clear = cover, light.through(seen.distance)
     sunny = (light.diffuse + light.direct * light.sun[:, 2]).view(-1, 1, 1)
     lit = clear * sunny if shade is None else clear * torch.where(shade, light.diffuse.view(-1, 1, 1), sunny)
     image = clear.new_empty(len(clear), 3, *clear.shape[1:])
     for channel in range(3):
-        colour = cover.road * (ASPHALT[channel] - VERGE[channel]) + VERGE[channel]
-        colour.add_(cover.white, alpha=WHITE_LINE[channel] - ASPHALT[channel])
-        colour.add_(cover.yellow, alpha=YELLOW_LINE[channel] - ASPHALT[channel])
+        colour = surface * (ASPHALT[channel] - VERGE[channel]) + VERGE[channel]
+        colour.add_(white, alpha=WHITE_LINE[channel] - ASPHALT[channel])
+        colour.add_(yellow, alpha=YELLOW_LINE[channel] - ASPHALT[channel])
         air = (AIR[channel] * light.brightness).view(-1, 1, 1)
         torch.addcmul(air * (1.0 - clear), colour, lit, out=image[:, channel])
     return image
@@ -267,15 +250,8 @@ class Boxes(NamedTuple):
         return self.forward[..., None] + along * cos - across * sin, self.right[..., None] + along * sin + across * cos
 
 
-class Candidates(NamedTuple):
-    """Pixels that a box or its shadow may cover; shapes (C,)."""
-
-    box: Tensor
-    """Number of the box, frame by frame, 0 to T N - 1."""
-    row: Tensor
-    """Row of the pixel."""
-    pixel: Tensor
-    """Number of the pixel in the picture, row by row."""
+Candidates = tuple[Tensor, Tensor, Tensor]
+"""Pixels that a box or its shadow may cover, (C,): number of the box, frame by frame, row and number of the pixel."""
 
 
 def project_points(camera: Camera, forward: Tensor, right: Tensor, up: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -313,9 +289,7 @@ def find_candidates(camera: Camera, forward: Tensor, right: Tensor, up: Tensor, 
     row = line + top.index_select(0, box)
     stretch, place = _enumerate_groups((end - left).index_select(0, box))
     start = row * camera.width + left.index_select(0, box)
-    return Candidates(
-        box.index_select(0, stretch), row.index_select(0, stretch), start.index_select(0, stretch) + place
-    )
+    return box.index_select(0, stretch), row.index_select(0, stretch), start.index_select(0, stretch) + place
 
 
 def _enumerate_groups(count: Tensor) -> tuple[Tensor, Tensor]:
@@ -350,24 +324,24 @@ def cast_shadows(boxes: Boxes, light: Light, camera: Camera, seen: Pixels) -> Te
     steep = (BODY_HEIGHT / sun_up)[..., None]
     moved = forward - sun_forward[..., None] * steep, right - sun_right[..., None] * steep
     forward, right = torch.cat((forward, moved[0]), -1), torch.cat((right, moved[1]), -1)
-    at = find_candidates(camera, forward, right, torch.zeros_like(forward), seen.sky)
-    if not len(at.box):
+    box, row, pixel = find_candidates(camera, forward, right, torch.zeros_like(forward), seen.sky)
+    if not len(box):
         return None
     origin = _to_box_frame(boxes.forward, boxes.right, boxes.cos, boxes.sin)
     sun = _to_box_frame(sun_forward, sun_right, boxes.cos, boxes.sin)
     above = (BODY_HEIGHT / sun_up).expand_as(boxes.cos)
     x0, y0, cos, sin, inverse_x, inverse_y, leaves = _pick(
-        at.box, *origin, boxes.cos, boxes.sin, 1.0 / sun[0], 1.0 / sun[1], above
+        box, *origin, boxes.cos, boxes.sin, 1.0 / sun[0], 1.0 / sun[1], above
     )
-    pixel = at.pixel - seen.sky * camera.width
-    (ground_forward,), (ground_right,) = _pick(at.row - seen.sky, seen.forward), _pick(pixel, seen.right)
+    pixel = pixel - seen.sky * camera.width
+    (ground_forward,), (ground_right,) = _pick(row - seen.sky, seen.forward), _pick(pixel, seen.right)
     x, y = _to_box_frame(ground_forward, ground_right, cos, sin)
     near_x, far_x = _slab(x - x0, inverse_x, VEHICLE_LENGTH)
     near_y, far_y = _slab(y - y0, inverse_y, VEHICLE_WIDTH)
     enters = torch.maximum(near_x, near_y).clamp_(min=0.0)
     (dark,) = (enters <= torch.minimum(torch.minimum(far_x, far_y), leaves)).nonzero(as_tuple=True)
     shade = torch.zeros(len(boxes.cos), *seen.right.shape, dtype=torch.bool, device=x.device)
-    box, pixel = _pick(dark, at.box, pixel)
+    box, pixel = _pick(dark, box, pixel)
     frame = torch.div(box, boxes.cos.shape[1], rounding_mode="floor")
     shade.view(-1).index_fill_(0, frame * seen.right.numel() + pixel, True)
     return shade
@@ -378,15 +352,15 @@ def draw_boxes(image: Tensor, boxes: Boxes, light: Light, camera: Camera, seen: 
     forward, right = (torch.cat((part, part), -1) for part in boxes.corners())
     up = torch.zeros_like(forward)
     up[..., 4:] = BODY_HEIGHT
-    at = find_candidates(camera, forward, right, up)
-    if not len(at.box):
+    box, _, pixel = find_candidates(camera, forward, right, up)
+    if not len(box):
         return
     origin = _to_box_frame(-boxes.forward, -boxes.right, boxes.cos, boxes.sin)
     ray_forward, ray_right, ray_up = seen.ray
     middle = camera.mount_height - 0.5 * BODY_HEIGHT
     near_z, far_z = _slab(torch.full_like(ray_up, middle), 1.0 / ray_up, BODY_HEIGHT)  # the same for all boxes
-    x0, y0, cos, sin = _pick(at.box, *origin, boxes.cos, boxes.sin)
-    way_forward, way_right, near_z, far_z = _pick(at.pixel, ray_forward, ray_right, near_z, far_z)
+    x0, y0, cos, sin = _pick(box, *origin, boxes.cos, boxes.sin)
+    way_forward, way_right, near_z, far_z = _pick(pixel, ray_forward, ray_right, near_z, far_z)
     x, y = _to_box_frame(way_forward, way_right, cos, sin)
     near_x, far_x = _slab(x0, x.reciprocal_(), VEHICLE_LENGTH)
     near_y, far_y = _slab(y0, y.reciprocal_(), VEHICLE_WIDTH)
@@ -394,7 +368,7 @@ def draw_boxes(image: Tensor, boxes: Boxes, light: Light, camera: Camera, seen: 
     (hit,) = ((enters <= torch.minimum(torch.minimum(far_x, far_y), far_z)) & (enters > 0.0)).nonzero(as_tuple=True)
 
     n, size = boxes.cos.shape[1], image.shape[1]
-    box, pixel, enters, near_y, near_z = _pick(hit, at.box, at.pixel, enters, near_y, near_z)
+    box, pixel, enters, near_y, near_z = _pick(hit, box, pixel, enters, near_y, near_z)
     frame = torch.div(box, n, rounding_mode="floor")
     slot = frame * size + pixel
     key = enters.view(torch.int32).to(torch.int64) * (n * len(image)) + box
@@ -447,7 +421,8 @@ def take_picture(state: State, road: Road, context: CameraContext) -> Tensor:
     camera, device = context.camera, state.x.device
     seen = pixels(camera, device)
     scene = _scene(state, road, context, seen)
-    colours = torch.tensor(_colours(state.x.shape[1], context.viewer), device=device).view(-1, 3)
+    painted = [PAINT[(j - 1) % len(PAINT)] for j in range(state.x.shape[1]) if j != context.viewer]
+    colours = torch.tensor(painted, device=device).view(-1, 3)
     noisy = bool(context.weather.noise.any())
     rows = max(1, TILE // (camera.height * camera.width))
     image = torch.empty(len(state.x), camera.height, camera.width, 3, dtype=torch.uint8, device=device)
@@ -477,8 +452,8 @@ def _scene(state: State, road: Road, context: CameraContext, seen: Pixels) -> Pi
     cos, sin = torch.cos(gaze), torch.sin(gaze)
     dx, dy, turn = x - camera_x, y - camera_y, (heading - gaze).float()
     boxes = Boxes((dx * cos + dy * sin).float(), (dy * cos - dx * sin).float(), torch.cos(turn), torch.sin(turn))
-    view = View(camera_x[:, 0], camera_y[:, 0], gaze[:, 0])
-    return PictureScene(boxes, light_of(context.weather, view.heading), road_lines(view, road, seen))
+    lines = road_lines(camera_x, camera_y, gaze, road, seen)
+    return PictureScene(boxes, light_of(context.weather, gaze[:, 0]), lines)
 
 
 def _draw(scene: PictureScene, road: Road, camera: Camera, seen: Pixels, colours: Tensor) -> Tensor:
@@ -493,11 +468,6 @@ def _draw(scene: PictureScene, road: Road, camera: Camera, seen: Pixels, colours
         image[:, above:] = colour_ground(cover_of(lines, road, seen), shade, light, seen).flatten(2).movedim(1, 2)
     draw_boxes(image, Boxes(*(part[:, 1:] for part in boxes)), light, camera, seen, colours)
     return image
-
-
-def _colours(vehicles: int, viewer: int) -> list[RGB]:
-    """Return the colours of the vehicles that a viewer sees, in the order of `State.seen_by`."""
-    return [PAINT[(j - 1) % len(PAINT)] for j in range(vehicles) if j != viewer]
 
 
 WEYL_STEP = -1640531535

@@ -11,8 +11,7 @@ from gymnasium import spaces
 from torch import Tensor
 
 from rare_envs.devices import constant, scalars
-from rare_envs.distributions.space import Distribution, Parameter
-from rare_envs.sensors.camera import Camera, CameraContext, clear_day, read_weather, weather_parameters
+from rare_envs.sensors.camera import Camera, CameraContext, clear_day, read_weather
 from rare_envs.sensors.kinds import kinds_of, kinematics_space, observe_kinematics
 from rare_envs.sensors.lidar import BEAMS, MAX_RANGE
 from rare_envs.sensors.pictures import take_picture
@@ -112,10 +111,6 @@ def observe_features(state: State) -> Tensor:
     return (torch.stack(values, dim=1) / scales).clamp(-CLIP, CLIP).float()
 
 
-WeatherDistributions = tuple[tuple[tuple[Parameter, ...], Distribution], ...]
-"""Parameters of the weather with their distributions, in the order of x."""
-
-
 @dataclass(frozen=True)
 class Sensing:
     """Sensors of the ego."""
@@ -138,14 +133,6 @@ class Sensing:
     def uses_lidar(self) -> bool:
         """Whether lidar features are computed for the ego."""
         return self.lidar or "lidar" in self.kinds
-
-    def space(self, vehicles: int) -> spaces.Space[Any]:
-        """Return the space of the ego's observations among so many vehicles."""
-        return observation_space(vehicles, self.observation, self.camera)
-
-    def weather_distributions(self, noisy: bool) -> WeatherDistributions:
-        """Return the weather's parameters with their distributions, with noise if `noisy`; none on a clear day."""
-        return tuple(weather_parameters(noisy)) if self.weather else ()
 
     def start_camera(self, weather: Tensor, key: Tensor) -> CameraContext | None:
         """Return what pictures depend on beside the traffic, at time 0; None without a camera.

@@ -13,9 +13,10 @@ from torch import Tensor
 from rare_envs.control.actions import follow_meta_actions, initial_aim, space_of_actions
 from rare_envs.control.idm import IDM
 from rare_envs.devices import fixed_draws
+from rare_envs.distributions.space import Distribution, Parameter
 from rare_envs.measures import Moment
 from rare_envs.scenarios.base import Others, Scenario, drive_points
-from rare_envs.sensors.camera import CameraContext
+from rare_envs.sensors.camera import CameraContext, weather_parameters
 from rare_envs.sensors.lidar import perceive_traffic
 from rare_envs.simulation.background import (
     FIRST_DRAWS,
@@ -27,7 +28,7 @@ from rare_envs.simulation.background import (
     query_background,
 )
 from rare_envs.simulation.episode import LEARNED_TICK, Clock, Episode, EpisodeStatistics, Measurement
-from rare_envs.simulation.observation import Sensing, WeatherDistributions
+from rare_envs.simulation.observation import Sensing, observation_space
 from rare_envs.traffic.bodies import ego_overlaps, others_overlap
 from rare_envs.traffic.neighbours import lead_of
 from rare_envs.traffic.road import WorldPose
@@ -93,9 +94,9 @@ class World:
         return self.sensing.uses_lidar or by_lidar or self.measurement.episode_measure.sees
 
     @property
-    def weather_distributions(self) -> WeatherDistributions:
-        """Parameters of the weather with their distributions, in the order of x."""
-        return self.sensing.weather_distributions(noisy=self.noise is not False)
+    def weather_distributions(self) -> tuple[tuple[tuple[Parameter, ...], Distribution], ...]:
+        """Parameters of the weather with their distributions, in the order of x; none on a clear day."""
+        return tuple(weather_parameters(noisy=self.noise is not False)) if self.sensing.weather else ()
 
     @cached_property
     def columns(self) -> Columns:
@@ -117,7 +118,7 @@ class World:
     @property
     def observation_space(self) -> spaces.Space[Any]:
         """Space of the ego's observations."""
-        return self.sensing.space(self.scenario.vehicles)
+        return observation_space(self.scenario.vehicles, self.sensing.observation, self.sensing.camera)
 
     @property
     def action_space(self) -> spaces.Space[Any]:
@@ -141,7 +142,12 @@ class World:
         own, weather, weights, noise, key = torch.split(x, list(self.columns), dim=1)
         state, background = self.scenario.initial(own), None
         if self.background is not None:
-            background = BackgroundState.start(self.background, weights.contiguous(), self._draws(noise))
+            batch, others = len(noise), self.scenario.vehicles - 1
+            draws = noise.reshape(batch, noise.shape[1] // (2 * others) if self._noisy else 0, others, 2)
+            if self._noisy and self.noise == "fixed":
+                shape = (1, FIRST_DRAWS + self.clock.ticks, others, 2)
+                draws = fixed_draws(shape, FIXED_SEED, noise).expand(batch, -1, -1, -1)
+            background = BackgroundState.start(self.background, weights.contiguous(), draws)
         perception = self._perceive(state, self._place(state))
         return self.start_from(state, perception, background, self.sensing.start_camera(weather, key))
 
@@ -264,14 +270,6 @@ class World:
     def _least_ttc(self, measure_state: Tensor) -> Tensor | None:
         """Return the least time to collision, where that is the measure."""
         return measure_state if self.measurement.measure == "ttc" else None
-
-    def _draws(self, noise: Tensor) -> Tensor:
-        """Return draws of the drivers' noise as a tensor of shape (B, 2 + T, M, 2), or (B, 0, M, 2) without noise."""
-        batch, others = len(noise), self.scenario.vehicles - 1
-        if self._noisy and self.noise == "fixed":
-            shape = (1, FIRST_DRAWS + self.clock.ticks, others, 2)
-            return fixed_draws(shape, FIXED_SEED, noise).expand(batch, -1, -1, -1)
-        return noise.reshape(batch, noise.shape[1] // (2 * others) if self._noisy else 0, others, 2)
 
     def _place(self, state: State) -> WorldPose | None:
         """Return where the vehicles are in the flat world; None in a world without lidar."""

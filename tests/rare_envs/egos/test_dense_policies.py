@@ -86,8 +86,8 @@ def make_cut_in(algorithm=PPO, **policy_kwargs):
     return algorithm("MlpPolicy", gym.make(CUT_IN), device="cpu", seed=0, policy_kwargs=policy_kwargs or None)
 
 
-@pytest.mark.parametrize("size", [1, 7, 25, 1000, 4096])
-@pytest.mark.parametrize("net_arch", [[64, 64], [256, 128, 32], []])
+@pytest.mark.parametrize("size", [1, 25, 4096])
+@pytest.mark.parametrize("net_arch", [[64, 64], []])
 def test_actions_between_rectifiers_are_those_of_predict_to_the_last_bit(net_arch, size):
     model = make_cut_in(A2C, activation_fn=torch.nn.ReLU, net_arch=net_arch)
     seen = np.random.default_rng(1).uniform(-5, 5, (size, 11)).astype(np.float32)
@@ -96,8 +96,8 @@ def test_actions_between_rectifiers_are_those_of_predict_to_the_last_bit(net_arc
     np.testing.assert_array_equal(found.predict(seen)[0], model.predict(seen, deterministic=True)[0])
 
 
-@pytest.mark.parametrize("gain", [0.3, 1.0, 5.0])
-@pytest.mark.parametrize("net_arch", [[64, 64], [256, 128, 32], [16], []])
+@pytest.mark.parametrize("gain", [0.3, 5.0])
+@pytest.mark.parametrize("net_arch", [[64, 64], [256, 128, 32]])
 def test_actions_between_tangents_are_as_near_to_exact_ones_as_those_of_predict(net_arch, gain):
     model = make_cut_in(net_arch=net_arch)
     with torch.no_grad():

@@ -16,7 +16,6 @@ import training
 from rare_envs.egos.needs import (
     AmbiguousActions,
     EgoNeeds,
-    ModuleEgo,
     WrappedEgo,
     choose_action,
     choose_observation,
@@ -24,7 +23,6 @@ from rare_envs.egos.needs import (
     name_ambiguities,
     resolve,
     takes_indices,
-    wrap_callable,
 )
 from rare_envs.simulation.observation import observation_space
 
@@ -195,15 +193,6 @@ class BrakingNetwork(torch.nn.Module):
 def test_they_drive_as_the_policy_does(ego):
     wanted = rare_envs.DrivingProblem("rare_envs/CarFollowing-v0", ego=Brake()).evaluate(X)
     np.testing.assert_array_equal(rare_envs.DrivingProblem("rare_envs/CarFollowing-v0", ego=ego).evaluate(X), wanted)
-
-
-def test_other_egos_stay_as_they_are():
-    policy = Brake()
-    for ego in (policy, "idm", Brake, 3, None):
-        assert wrap_callable(ego) is ego
-    assert isinstance(wrap_callable(torch.nn.Linear(11, 2)), ModuleEgo)
-    with pytest.raises(ValueError, match="got the class Brake"):
-        rare_envs.DrivingProblem("rare_envs/CarFollowing-v0", ego=Brake)
 
 
 PAIR = [[20.0, 15.0, 30.0], [30.0, 5.0, 20.0]]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import warnings
 from collections.abc import Callable
 from pathlib import Path
@@ -11,8 +10,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
-from gymnasium.wrappers import RecordVideo
-from stable_baselines3 import DQN, PPO
+from stable_baselines3 import PPO
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv
 
@@ -81,34 +79,6 @@ def test_the_picture_is_taken_and_the_rest_is_left_out_with_a_warning() -> None:
     with pytest.warns(UserWarning, match="Unknown key 'lanes_cuont'"):
         env.configure({"lanes_cuont": 3})
     assert (env.config["screen_width"], env.config["simulation_frequency"]) == (900, 10)
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(importlib.util.find_spec("moviepy") is None, reason="the extra video is optional")
-@pytest.mark.filterwarnings("ignore:invalid escape sequence")  # in moviepy 1's own text, when it is first compiled
-def test_the_script_for_dqn_runs_with_another_id(tmp_path: Path) -> None:
-    """The calls of HighwayEnv's sb3_highway_dqn.py: train, save, load, record a video and configure its frame rate."""
-    env = gym.make(CUT_IN, render_mode="rgb_array")
-    env.reset()
-    settings = {"learning_rate": 5e-4, "buffer_size": 15000, "learning_starts": 4, "batch_size": 32, "gamma": 0.8}
-    steps = {"train_freq": 1, "gradient_steps": 1, "target_update_interval": 50}
-    model = DQN("MlpPolicy", env, policy_kwargs={"net_arch": [8]}, device="cpu", **settings, **steps)
-    model.learn(total_timesteps=12)
-    model.save(tmp_path / "model")
-    model = DQN.load(tmp_path / "model", env=env)
-    video = RecordVideo(env, video_folder=str(tmp_path / "videos"), episode_trigger=lambda _: True)
-    video.unwrapped.set_record_video_wrapper(video)
-    with pytest.warns(UserWarning, match=r"simulation_frequency'\] stays 10"):
-        video.unwrapped.configure({"simulation_frequency": 15})
-    done = truncated = False
-    observation, _ = video.reset()
-    while not (done or truncated):
-        action, _ = model.predict(observation, deterministic=True)
-        observation, _, done, truncated, info = video.step(action)
-        video.render()
-    video.close()
-    assert info["crashed"] == done
-    assert len(list((tmp_path / "videos").glob("*.mp4"))) == 1
 
 
 @pytest.mark.parametrize("processes", [False, pytest.param(True, marks=pytest.mark.slow)])

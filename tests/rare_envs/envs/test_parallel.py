@@ -54,7 +54,9 @@ def test_pettingzoo_render(env_id, monkeypatch):
     render_test(lambda render_mode: parallel_to_aec(rare_envs.parallel_env(env_id, render_mode=render_mode)))
 
 
-@pytest.mark.parametrize(("env_id", "agents"), [(CUT_IN, ["ego"]), ("rare_envs/Highway-v0", None)])
+@pytest.mark.parametrize(
+    ("env_id", "agents"), [(CUT_IN, ["ego"]), pytest.param("rare_envs/Highway-v0", None, marks=pytest.mark.slow)]
+)
 def test_an_ego_alone_has_exactly_the_environment_of_one(env_id, agents):
     """To the last bit, until the ego's end: whether the others may not act or do not."""
     for kwargs in (

@@ -11,7 +11,6 @@ import torch
 
 import rare_envs
 from rare_envs.envs.rendering import (
-    AGENT,
     FRAME_WIDTH,
     TEXT_HEIGHT,
     Display,
@@ -70,15 +69,6 @@ def test_the_picture_shows_where_vehicles_are_and_who_has_crashed():
     crashed = colours(road_of(renderer.draw(episode, row=1)))
     assert as_rgb(CRASH_COLOUR) in crashed and as_rgb(CRASH_COLOUR) not in colours(image)
     assert {as_rgb(ROLE_COLOURS[role]) for role in ("ego", "lead")} <= crashed  # each is still who it is
-
-
-def test_agents_are_outlined():
-    env = rare_envs.parallel_env(CUT_IN, agents=["ego", "cutter"], render_mode="rgb_array")
-    env.reset(seed=0)
-    assert AGENT in colours(road_of(env.render()))
-    alone = rare_envs.parallel_env(CUT_IN, agents=["ego"], render_mode="rgb_array")
-    alone.reset(seed=0)
-    assert AGENT not in colours(alone.render())
 
 
 def test_the_numbers_in_the_picture_by_hand():

@@ -89,12 +89,3 @@ def test_a_measure_of_ones_own_with_terms() -> None:
     assert np.array_equal(terms.lowest, problem.evaluate(x))
     assert set(terms.least) == {0, 1} or (terms.least == 0).all()
     assert problem.gradient is not None
-
-
-def test_nan_is_refused() -> None:
-    def nowhere(moment: Any) -> torch.Tensor:
-        return torch.where(moment.state.x[:, 0] > 30.0, torch.nan, moment.state.x[:, 0])
-
-    problem, x = make("car-following", measure=nowhere)
-    with pytest.raises(ValueError, match="gave NaN, first at row"):
-        problem.terms(x)
