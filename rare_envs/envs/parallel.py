@@ -101,7 +101,6 @@ class DrivingParallelEnv(_SeveralAgents, ParallelEnv[str, SingleObservation, Flo
     A vehicle without an action keeps its driver: the scenario's script or learned drivers, and for the ego the driver
     `ego`. An agent terminates when its vehicle touches another one or leaves the road, is truncated at the horizon,
     and then leaves `agents`; its vehicle rolls out, see `rare_envs.multi_agent`.
-
     """
 
     metadata: dict[str, Any] = {  # noqa: RUF012  (PettingZoo's own form)
@@ -289,7 +288,6 @@ class AgentsVectorEnv(_SeveralAgents, VectorEnv[NDArray[np.float32], NDArray[Any
     Row b A + a is agent a of scenario b. A scenario is replaced within the step when the ego or an agent collides, or
     at the horizon. That terminates the rows of agents that have collided, all rows if it was the ego, and truncates the
     others: their episodes are cut short, so a learner should bootstrap there.
-
     """
 
     metadata = {  # noqa: RUF012  (Gymnasium's own form)

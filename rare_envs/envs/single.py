@@ -29,7 +29,6 @@ class DrivingEnv(HighwayEnvInterface, gym.Env[SingleObservation, Any]):
     `crashed` (the same), `speed` [m/s] and `reward_terms`, and at the end `measure` (f(x)), `collision_type` and
     `crash`, which say who ran into whom and how hard (`rare_envs.traffic.crash`), or None. Scripts for HighwayEnv
     find what they read, see `rare_envs.envs.highway_env_interface`.
-
     """
 
     metadata = {"render_modes": list(RENDER_MODES), "render_fps": 10}  # noqa: RUF012  (Gymnasium's own form)

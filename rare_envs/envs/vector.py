@@ -41,7 +41,6 @@ class DrivingVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[Any]
     observation and info are in `infos["final_obs"]` and `infos["final_info"]`. With NEXT_STEP the next step replaces
     it, whose action does not count and whose reward is 0. With DISABLED a `reset` with options={"reset_mask": rows}
     does. One generator draws for the whole batch.
-
     """
 
     metadata = {  # noqa: RUF012  (Gymnasium's own form)

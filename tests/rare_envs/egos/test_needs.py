@@ -36,7 +36,8 @@ class Declared:
         self.__dict__.update(attributes)
 
     def predict(self, observation: Any, **_: Any) -> Any:
-        return np.zeros((len(observation), 2)), None
+        chooses = isinstance(getattr(self, "action_space", None), spaces.Discrete)
+        return (np.ones(len(observation), np.int64) if chooses else np.zeros((len(observation), 2))), None
 
 
 @pytest.mark.parametrize(
@@ -72,14 +73,9 @@ def test_a_wrapped_ego_needs_what_the_one_behind_it_needs_and_its_own_noise() ->
 CUT_IN, KINEMATICS = "rare_envs/CutIn-v0", "rare_envs/CutIn-kinematics-v0"
 
 
-class Idle:
-    """A policy with the spaces that it is given."""
-
-    def __init__(self, observed: Any = None, acted: Any = None) -> None:
-        self.observation_space, self.action_space = observed, acted
-
-    def predict(self, observation: Any, **_: Any) -> Any:
-        return np.ones(len(observation), np.int64), None
+def idle(observed: Any = None, acted: Any = None) -> Declared:
+    """A policy with these spaces."""
+    return Declared(observation_space=observed, action_space=acted)
 
 
 @pytest.mark.parametrize(
@@ -88,17 +84,12 @@ class Idle:
         (spaces.Box(-5, 5, (44,)), ("features",)),  # four frames side by side
         (spaces.Box(-5, 5, (4, 51)), ("lidar",)),
         (spaces.Box(0, 255, (12, 40, 80), np.uint8), ("camera",)),  # four frames of another size, channels first
-        (spaces.Box(0, 255, (84, 84, 12), np.uint8), ("camera",)),
         (spaces.Box(0, 255, (4, 3, 84, 84), np.uint8), ("camera",)),  # four frames on an axis of their own
         (spaces.Box(0, 255, (4, 128, 64), np.uint8), ()),  # HighwayEnv's grayscale
-        (spaces.Box(0, 255, (1, 84, 84), np.uint8), ()),
         (spaces.Box(0, 255, (4, 84, 84), np.uint8), ()),
-        (spaces.Box(0, 255, (84, 84, 4), np.uint8), ()),
         (spaces.Box(-1, 1, (7, 11, 11)), ()),  # its occupancy grid
-        (spaces.Box(-1, 1, (15, 7)), ()),
         (spaces.Box(-1, 1, (97,)), ()),
         (spaces.Dict({"radar": spaces.Box(0, 1, (3,))}), ()),
-        (spaces.Dict({}), ()),
         ("Box", ()),
     ],
 )
@@ -110,17 +101,16 @@ def test_several_or_none_are_refused_in_a_line() -> None:
     both = find_fitting_kinds(observation_space(13, "lidar"), vehicles=13)
     with pytest.raises(ValueError, match="fit features and lidar: say which"):
         choose_observation(EgoNeeds(observations=both), vehicles=13)
-    grayscale = [spaces.Box(0, 255, shape, np.uint8) for shape in ((1, 84, 84), (4, 84, 84), (84, 84, 4))]
-    others = [spaces.Box(-1, 1, shape) for shape in ((15, 7), (4, 128, 64), (7, 11, 11))]
-    for space, elsewhere in ((spaces.Box(-1, 1, (97,)), False), *((each, True) for each in (*grayscale, *others))):
+    grayscale, grid = spaces.Box(0, 255, (4, 84, 84), np.uint8), spaces.Box(-1, 1, (7, 11, 11))
+    for space, elsewhere in ((spaces.Box(-1, 1, (97,)), False), (grayscale, True), (grid, True)):
         with pytest.raises(ValueError, match=r"features \(11,\), lidar \(51,\), kinematics \(5, 5\)") as refused:
-            rare_envs.DrivingProblem(CUT_IN, ego=Idle(space))
+            rare_envs.DrivingProblem(CUT_IN, ego=idle(space))
         assert ("rare_envs.highway_env_problem" in str(refused.value)) == elsewhere
         assert "\n" not in str(refused.value)
 
 
 def test_a_policy_of_highway_env_says_by_its_id_or_by_hand_what_its_actions_are() -> None:
-    ego = Idle(observation_space(3, "kinematics"), spaces.Discrete(5))
+    ego = idle(observation_space(3, "kinematics"), spaces.Discrete(5))
     with pytest.raises(ValueError, match=r"fit two kinds.*--action meta.*--action discrete"):
         rare_envs.DrivingProblem(CUT_IN, ego=ego)
     for env_id, asked, action in (
@@ -138,7 +128,7 @@ def test_other_policies_are_taken_to_accelerate() -> None:
     for acted, indices in ((spaces.Discrete(5), True), (spaces.Discrete(3), False), (None, False)):
         assert takes_indices(acted) is indices
         assert choose_action(acted, "lidar") == "continuous"
-    problem = rare_envs.DrivingProblem(CUT_IN, ego=Idle(observation_space(3, "features"), spaces.Discrete(5)))
+    problem = rare_envs.DrivingProblem(CUT_IN, ego=idle(observation_space(3, "features"), spaces.Discrete(5)))
     assert len(problem.notes) == 1 and "--action meta" in problem.notes[0]  # and no warning
     x = problem.base.sample(4, np.random.default_rng(0))
     said = rare_envs.DrivingProblem(CUT_IN, ego=problem.ego, action="discrete")
