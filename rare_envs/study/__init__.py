@@ -12,11 +12,11 @@ if TYPE_CHECKING:
     from rare_envs.study.compare import compare_egos
     from rare_envs.study.errors import BadInput
     from rare_envs.study.evaluate import resume, run, run_into
+    from rare_envs.study.failures import severity_curve
     from rare_envs.study.question import prepare
     from rare_envs.study.replay import Drive, drive_again
     from rare_envs.study.report import Report
     from rare_envs.study.run_folder import read_failures
-    from rare_envs.study.severity import severity_curve
     from rare_envs.study.video import write_film
     from rare_envs.study.writing import write_run
 
@@ -42,11 +42,11 @@ _MODULES = {
     "compare": ("compare_egos",),
     "errors": ("BadInput",),
     "evaluate": ("resume", "run", "run_into"),
+    "failures": ("severity_curve",),
     "question": ("prepare",),
     "replay": ("Drive", "drive_again"),
     "report": ("Report",),
     "run_folder": ("read_failures",),
-    "severity": ("severity_curve",),
     "video": ("write_film",),
     "writing": ("write_run",),
 }

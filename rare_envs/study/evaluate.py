@@ -33,7 +33,7 @@ from rare_envs.study.errors import (
     keep_answer,
     output_folder,
 )
-from rare_envs.study.modes import CrashKinds, classify_failures, list_all_kinds
+from rare_envs.study.failures import CrashKinds, classify_failures, list_all_kinds
 from rare_envs.study.question import (
     Study,
     build_problem,

@@ -20,7 +20,7 @@ from rare_envs.measures.base import Measure
 from rare_envs.measures.registry import MEASURES
 from rare_envs.scenarios.registry import find_scenario
 from rare_envs.study.arguments import Question
-from rare_envs.study.modes import CrashKinds, FailureMode, find_modes
+from rare_envs.study.failures import CrashKinds, FailureMode, find_modes
 from rare_envs.study.question import Study
 from rare_envs.version import __version__
 from samplers.analysis.base_error import FIT_BIAS

@@ -22,7 +22,7 @@ from rare_envs.exposure import (
 )
 from rare_envs.measures import MEASURES
 from rare_envs.study.columns import MAX_SHOWN, draw_ordinary, find_ordinary_range, format_value, list_columns
-from rare_envs.study.modes import KIND_DESCRIPTIONS
+from rare_envs.study.failures import KIND_DESCRIPTIONS
 from rare_envs.study.report import BaseAnswer, Report
 from samplers.output import indent_lines
 from samplers.problem import FloatArray

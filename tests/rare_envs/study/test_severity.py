@@ -14,7 +14,7 @@ import samplers
 from rare_envs.control.idm import IDM
 from rare_envs.distributions import EventCounts, FittedDistribution
 from rare_envs.study import severity_curve
-from rare_envs.study.severity import compute_severity, replay_failures
+from rare_envs.study.failures import compute_severity, replay_failures
 from rare_envs.traffic.crash import injury_risk
 
 FOLLOWING, CUT_IN = "rare_envs/CarFollowing-v0", "rare_envs/CutIn-v0"
