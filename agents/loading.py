@@ -162,6 +162,8 @@ def find_ego_kind(spec: str) -> EgoKind:
     for beginning, kind in beginnings.items():
         if spec.startswith(beginning):
             return kind
+    if "://" in spec:
+        return "url"
     name = spec.partition("?")[0]
     if name in (RULE_BASED, HUMAN):
         return "rule"
@@ -169,8 +171,6 @@ def find_ego_kind(spec: str) -> EgoKind:
         return "vision"
     if name in (*SHIPPED_DRIVERS, *SHIPPED_EGOS) or spec.endswith(SUFFIX):
         return "learned"
-    if "://" in spec:
-        return "url"
     if spec.endswith(".onnx"):
         return "onnx"
     if spec.endswith(".zip") or Path(spec).is_file():

@@ -135,6 +135,13 @@ def _fits(shape: Any, dtype: Any, content: Any) -> bool:
     return sizes and len(content) == math.prod(shape) * dtype.itemsize
 
 
+def _is_key(value: object) -> bool:
+    """Return whether a value is a text, a number, or a short tuple of such, which are quick to hash."""
+    plain = str | bytes | int | float | None
+    short = type(value) is tuple and len(value) <= MAX_AXES and all(isinstance(one, plain) for one in value)
+    return isinstance(value, plain) or short
+
+
 def _make_ordered(items: Any = ()) -> OrderedDict[Any, Any]:
     """Return a mapping of pairs."""
     pairs = isinstance(items, list | tuple) and all(isinstance(one, list | tuple) and len(one) == 2 for one in items)
@@ -187,12 +194,30 @@ MADE_BASES = {
 """Likewise, whose instances may be made, empty, and filled."""
 
 _PythonUnpickler: Any = getattr(pickle, "_Unpickler")  # noqa: B009  (in Python, not in C; unknown to type checkers)
+_HASHED = {
+    pickle.SETITEM: slice(-2, -1),
+    pickle.SETITEMS: slice(None, None, 2),
+    pickle.DICT: slice(None, None, 2),
+    pickle.ADDITEMS: slice(None),
+    pickle.FROZENSET: slice(None),
+}
+"""Steps that hash a part of the stack, which is checked first: some keys take ages to hash."""
+_REFUSED = (pickle.NEWOBJ_EX, pickle.INST, pickle.OBJ, pickle.NEXT_BUFFER, pickle.EXT1, pickle.EXT2, pickle.EXT4)
+"""Steps that no saved model needs."""
+
+
+def _check_keys(load: Callable[..., None], keys: slice) -> Callable[..., None]:
+    """Return a step whose keys, a part of the stack, are checked first."""
+
+    def load_checked(self: Any) -> None:
+        require(all(map(_is_key, self.stack[keys])), "it has keys that are no text or numbers")
+        load(self)
+
+    return load_checked
 
 
 class _RestrictedUnpickler(_PythonUnpickler):  # type: ignore[misc]
     """Unpickler that takes listed steps only."""
-
-    dispatch: ClassVar[dict[int, Callable[..., None]]] = dict(_PythonUnpickler.dispatch)
 
     def find_class(self, module: str, name: str) -> Any:
         """Return the function or the class that a name stands for."""
@@ -223,65 +248,30 @@ class _RestrictedUnpickler(_PythonUnpickler):  # type: ignore[misc]
             self.load_reduce()
 
     def load_build(self) -> None:
-        """BUILD: fill an object."""
-        state = self.stack.pop()
-        _fill(self.stack[-1], state)
+        """BUILD: fill an object that was made empty."""
+        state, value = self.stack.pop(), self.stack[-1]
+        if isinstance(value, np.ndarray):
+            _fill_array(value, state)
+        elif isinstance(value, np.dtype):
+            _fill_dtype(value, state)
+        elif value is not None:  # which was left out
+            made = tuple(base for bases in MADE_BASES.values() for base in bases)
+            named = isinstance(state, dict) and all(isinstance(name, str) for name in state)
+            require(_is_subclass(type(value), made) and named, f"it holds contents of {type(value).__name__}")
+            getattr(value, "__setstate__", value.__dict__.update)(state)  # in Python, and keeps what it is given
 
     def load_refused(self) -> None:
         """Refuse what no saved model needs."""
         raise ForbiddenObject("it takes a step that no saved model needs")
 
-
-def _check_keys(load: Callable[..., None], keys: slice) -> Callable[..., None]:
-    """Return a step of the unpickler whose keys, a part of the stack, are checked first: some take ages to hash."""
-
-    def load_checked(self: Any) -> None:
-        require(all(map(_is_key, self.stack[keys])), "it has keys that are no text or numbers")
-        load(self)
-
-    return load_checked
-
-
-def _is_key(value: object) -> bool:
-    """Return whether a value is a text, a number, or a short tuple of such, which are quick to hash."""
-    plain = str | bytes | int | float | None
-    short = type(value) is tuple and len(value) <= MAX_AXES and all(isinstance(one, plain) for one in value)
-    return isinstance(value, plain) or short
-
-
-_STEPS = _RestrictedUnpickler.dispatch
-for _opcode, _keys in (
-    (pickle.SETITEM, slice(-2, -1)),
-    (pickle.SETITEMS, slice(None, None, 2)),
-    (pickle.DICT, slice(None, None, 2)),
-    (pickle.ADDITEMS, slice(None)),
-    (pickle.FROZENSET, slice(None)),
-):
-    _STEPS[_opcode[0]] = _check_keys(_STEPS[_opcode[0]], _keys)
-for _opcode in (pickle.NEWOBJ_EX, pickle.INST, pickle.OBJ, pickle.NEXT_BUFFER, pickle.EXT1, pickle.EXT2, pickle.EXT4):
-    _STEPS[_opcode[0]] = _RestrictedUnpickler.load_refused
-_STEPS[pickle.REDUCE[0]] = _RestrictedUnpickler.load_reduce
-_STEPS[pickle.NEWOBJ[0]] = _RestrictedUnpickler.load_newobj
-_STEPS[pickle.BUILD[0]] = _RestrictedUnpickler.load_build
-
-
-def _fill(value: Any, state: Any) -> None:
-    """Fill an object that was made empty."""
-    from gymnasium.spaces import Space
-    from stable_baselines3.common.running_mean_std import RunningMeanStd
-    from stable_baselines3.common.vec_env import VecNormalize
-
-    if value is None:  # left out
-        return
-    if isinstance(value, np.ndarray):
-        _fill_array(value, state)
-    elif isinstance(value, np.dtype):
-        _fill_dtype(value, state)
-    else:
-        known = isinstance(value, Space | RunningMeanStd | VecNormalize)
-        named = isinstance(state, dict) and all(isinstance(name, str) for name in state)
-        require(known and named, f"it holds contents of {type(value).__name__}")
-        getattr(value, "__setstate__", value.__dict__.update)(state)  # in Python, and keeps what it is given
+    dispatch: ClassVar[dict[int, Callable[..., None]]] = {
+        **_PythonUnpickler.dispatch,
+        **{step[0]: _check_keys(_PythonUnpickler.dispatch[step[0]], keys) for step, keys in _HASHED.items()},
+        **dict.fromkeys((step[0] for step in _REFUSED), load_refused),
+        pickle.REDUCE[0]: load_reduce,
+        pickle.NEWOBJ[0]: load_newobj,
+        pickle.BUILD[0]: load_build,
+    }
 
 
 def _is_subclass(value: Any, bases: tuple[str, ...]) -> bool:
