@@ -57,42 +57,24 @@ def load_base(scenario: Scenario, base: str | PathLike[str] | Distribution | Non
     base = scenario.default_base if base is None else base
     if not isinstance(base, str | PathLike):
         return _check_object(scenario, base)
-    shipped = scenario.bases.get(str(base))
-    if isinstance(shipped, Mapping):
+    source, names = str(base), tuple(p.name for p in scenario.parameters)
+    found = scenario.bases.get(source, Path(base))
+    if isinstance(found, Mapping):
         box = scenario.column_parameters
-        own = {
-            "names": [p.name for p in scenario.parameters],
-            "low": [p.low for p in box],
-            "high": [p.high for p in box],
-        }
-        return _from_dict(scenario, str(base), {**own, **shipped})
-    if isinstance(shipped, TextFile):
-        return _from_json(scenario, str(base), shipped.read_text(encoding="utf-8"))
-    if shipped is not None:
-        return _check_object(scenario, shipped)
-    path = Path(base)
-    if not path.is_file():
+        own = {"names": list(names), "low": [p.low for p in box], "high": [p.high for p in box]}
+        return _fit_to(scenario, source, _read(scenario.name, names, source, {**own, **found}))
+    if not isinstance(found, TextFile):
+        return _check_object(scenario, found)
+    if isinstance(found, Path) and not found.is_file():
         raise ValueError(
-            f"No base distribution {str(base)!r} for {scenario.name}"
-            f"{did_you_mean(str(base), scenario.bases)}: neither one of {', '.join(scenario.bases)} nor a file."
+            f"No base distribution {source!r} for {scenario.name}"
+            f"{did_you_mean(source, scenario.bases)}: neither one of {', '.join(scenario.bases)} nor a file."
         )
     try:
-        text = path.read_text(encoding="utf-8")
+        text = found.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
-        raise ValueError(f"Cannot read the base distribution {path}: {error}.") from None
-    return _from_json(scenario, str(path), text)
-
-
-def _from_json(scenario: Scenario, source: str, text: str) -> Distribution:
-    return _fit_to(scenario, source, _read_text(scenario.name, _names_of(scenario), source, text))
-
-
-def _from_dict(scenario: Scenario, source: str, data: Mapping[str, Any]) -> Distribution:
-    return _fit_to(scenario, source, _read(scenario.name, _names_of(scenario), source, data))
-
-
-def _names_of(scenario: Scenario) -> tuple[str, ...]:
-    return tuple(p.name for p in scenario.parameters)
+        raise ValueError(f"Cannot read the base distribution {found}: {error}.") from None
+    return _fit_to(scenario, source, _read_text(scenario.name, names, source, text))
 
 
 @lru_cache(maxsize=64)
@@ -127,20 +109,15 @@ def _fit_to(scenario: Scenario, source: str, distribution: FileDistribution | Fi
             f"Base distribution {source} does not fit {scenario.name}: "
             f"expected {columns} columns, got {distribution.dim}."
         )
-    _check_box(scenario, source, distribution)
+    for p, low, high in zip(scenario.column_parameters, distribution.low, distribution.high, strict=True):
+        if low < p.low or high > p.high:
+            raise ValueError(
+                f"Base distribution {source} gives {p.name} the range [{low:g}, {high:g}] {p.unit}; {scenario.name} "
+                f"allows [{p.low:g}, {p.high:g}]."
+            )
     if isinstance(distribution, FittedDistribution):
         return replace(distribution, siblings=partial(load_base, scenario))
     return distribution
-
-
-def _check_box(scenario: Scenario, source: str, distribution: FileDistribution | FittedDistribution) -> None:
-    box = scenario.column_parameters
-    for parameter, low, high in zip(box, distribution.low, distribution.high, strict=True):
-        if low < parameter.low or high > parameter.high:
-            raise ValueError(
-                f"Base distribution {source} gives {parameter.name} the range [{low:g}, {high:g}] "
-                f"{parameter.unit}; {scenario.name} allows [{parameter.low:g}, {parameter.high:g}]."
-            )
 
 
 def _check_object(scenario: Scenario, base: object) -> Distribution:
@@ -175,8 +152,6 @@ _DT = 0.1
 
 def try_scenario(scenario: Scenario) -> None:
     """Start a few episodes and move the vehicles around the ego by one tick, by the script and by commands."""
-    import numpy as np
-
     for name in scenario.bases:
         load_base(scenario, name)
     x = torch.from_numpy(load_base(scenario).sample(_DRAWS, np.random.default_rng(0))).float()
@@ -192,12 +167,8 @@ def try_scenario(scenario: Scenario) -> None:
             f"Scenario {scenario.name!r}: expected theta of {_DRAWS} rows, got {tuple(state.theta.shape)}."
         )
     _check(scenario, "others(state, dt)", scenario.others(state, _DT), n - 1)
-    _check(scenario, "driven(state, action, dt)", scenario.driven(state, _zero_action(state), _DT), n - 1)
-
-
-def _zero_action(state: State) -> Tensor:
-    """Return accelerations and yaw rates of 0 for the vehicles around the ego, shape (B, N - 1, 2)."""
-    return torch.zeros_like(state.x[:, 1:, None]).expand(-1, -1, 2)
+    action = torch.zeros_like(state.x[:, 1:, None]).expand(-1, -1, 2)
+    _check(scenario, "driven(state, action, dt)", scenario.driven(state, action, _DT), n - 1)
 
 
 def _check(scenario: Scenario, what: str, fields: tuple[Tensor, ...], vehicles: int) -> None:
