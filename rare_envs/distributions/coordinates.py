@@ -109,10 +109,9 @@ class Coordinates:
         return -1.0 if j in self._sources else 1.0
 
     def bounds(self, j: int, x: FloatArray) -> tuple[Any, Any]:
-        """Return the range of the coordinate of column j in rows x (n, d), of which the earlier columns are set.
+        """Return the ends of the coordinate of column j in rows x (n, d), of which the earlier columns are set.
 
-        Returns:
-            Lower and upper ends: numbers, or shape (n,) for a closing speed.
+        They are numbers, or (n,) for a closing speed.
         """
         if j in self._sources:
             behind, root = self._behind_and_root(j, x)
@@ -150,13 +149,9 @@ class Coordinates:
         return self.kinds[j] == "log"
 
     def linear(self, j: int, mean: FloatArray, scale: FloatArray, x: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return mean and scale of column j, or of its logarithm, from those of its coordinate, (K, n) each.
+        """Return mean and scale of column j, or of its logarithm, (K, n) each, from those of its coordinate.
 
-        Args:
-            j: The column.
-            mean: Of its coordinate, (K, n).
-            scale: Likewise, (K, n) or (K, 1).
-            x: Rows of which the earlier columns are set, (n, d).
+        The scale may be (K, 1); of rows x (n, d) the earlier columns are set.
         """
         if j in self._sources:
             behind, root = self._behind_and_root(j, x)
@@ -168,10 +163,7 @@ class Coordinates:
 
         A density of x is that of y plus this, in logarithms.
         """
-        total = np.zeros(len(x))
-        for j in range(self.dim):
-            total = total + self.log_slope(j, x)
-        return total
+        return np.asarray(sum((self.log_slope(j, x) for j in range(self.dim)), np.zeros(len(x))))
 
     def log_slope(self, j: int, x: FloatArray) -> FloatArray:
         """Return log |dy/dx| of the coordinate of column j alone, (n, d) -> (n,); the other columns are held."""
@@ -195,7 +187,11 @@ class Coordinates:
         box = {"low": self.low.tolist(), "high": self.high.tolist()}
         # fields by name
         texts = {name: list(getattr(self, name)) for name in ("names", "order") if getattr(self, name)}
-        return {**box, "coordinates": [_format_kind(kind) for kind in self.kinds], **texts}
+        kinds = [
+            {"closing_behind": kind.behind, "gap": kind.gap} if isinstance(kind, ClosingSpeed) else kind
+            for kind in self.kinds
+        ]
+        return {**box, "coordinates": kinds, **texts}
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> Coordinates:
@@ -293,10 +289,6 @@ def _check_names(names: Sequence[str], order: Sequence[str], d: int) -> None:
             f"order must have each of the columns {', '.join(names) or '(names are missing)'} once, "
             f"got {', '.join(order)}."
         )
-
-
-def _format_kind(kind: CoordinateKind) -> str | dict[str, str]:
-    return {"closing_behind": kind.behind, "gap": kind.gap} if isinstance(kind, ClosingSpeed) else kind
 
 
 def _read_kinds(data: Mapping[str, Any]) -> tuple[CoordinateKind, ...]:

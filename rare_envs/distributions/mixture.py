@@ -224,11 +224,7 @@ class CoordinateMixture:
         return MixtureArrays(self.weights, self.means, self.covariances)
 
     def rows(self, name: str, points: ArrayLike) -> FloatArray:
-        """Return points as float64 of shape (n, d).
-
-        Raises:
-            ValueError: Wrong shape.
-        """
+        """Return points as float64 (n, d), if they have that shape."""
         array = np.asarray(points, dtype=np.float64)
         if array.ndim != 2 or array.shape[1] != self.dim:
             hint = "; add a batch axis" if array.shape == (self.dim,) else ""
@@ -236,11 +232,7 @@ class CoordinateMixture:
         return array
 
     def finite_rows(self, u: ArrayLike) -> FloatArray:
-        """Return standard normal points as float64 of shape (n, d).
-
-        Raises:
-            ValueError: Wrong shape, or a value is not finite.
-        """
+        """Return standard normal points as float64 (n, d), if they have that shape and are finite."""
         points = self.rows("u", u)
         if not np.isfinite(points).all():
             i, j = np.argwhere(~np.isfinite(points))[0]
@@ -248,11 +240,7 @@ class CoordinateMixture:
         return points
 
     def rows_in_box(self, x: ArrayLike) -> FloatArray:
-        """Return points as float64 of shape (n, d).
-
-        Raises:
-            ValueError: Wrong shape, or a point outside the box.
-        """
+        """Return points as float64 (n, d), if they have that shape and are in the box."""
         points, (low, high) = self.rows("x", x), (self.low, self.high)
         outside = ~((points >= low) & (points <= high))
         if outside.any():

@@ -8,14 +8,14 @@ no parameter. A distribution that has parameters offers them by two methods: `pa
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple, Protocol, runtime_checkable
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.optimize import linear_sum_assignment
 
 from rare_envs.arrays import FloatArray
-from rare_envs.distributions.coordinates import ClosingSpeed, Coordinates
+from rare_envs.distributions.coordinates import ClosingSpeed, CoordinateKind, Coordinates
 from rare_envs.distributions.space import Distribution
 
 RELATIVE_CHANGE = 0.1
@@ -92,7 +92,8 @@ def list_mixture_parameters(
     """
     if like is not None and len(like.weights) == len(mixture.weights):
         mixture = MixtureArrays(*(values[match_components(mixture, like)] for values in mixture))
-    labels = name_coordinates(coordinates, names)
+    columns = tuple(names) or coordinates.names or number_columns(coordinates.dim)
+    labels = [_name_coordinate(coordinates.kinds[j], columns[j]) for j in coordinates.columns]
     k = len(mixture.weights)
     found: list[DistributionParameter] = []
     if k > 1:
@@ -106,35 +107,30 @@ def list_mixture_parameters(
     return tuple(found)
 
 
+def _name_coordinate(kind: CoordinateKind, column: str) -> str:
+    """Return a coordinate in words; "closing to" a column is its `ClosingSpeed`."""
+    if isinstance(kind, ClosingSpeed):
+        return f"closing to {column}"
+    return f"log {column}" if kind == "log" else column
+
+
 def _list_component(
     mean: FloatArray, covariance: FloatArray, labels: Sequence[str], columns: Sequence[int], end: str
 ) -> list[DistributionParameter]:
     """Return means, standard deviations and correlations of one component."""
     sd = np.sqrt(np.diag(covariance))
     correlation = covariance / np.outer(sd, sd)
-    each = range(len(sd))
-    means = [
-        DistributionParameter(f"mean of {labels[i]}{end}", float(mean[i]), float(sd[i]), "1 sd", (columns[i],))
-        for i in each
-    ]
-    spreads = [
-        DistributionParameter(
-            f"sd of {labels[i]}{end}", float(sd[i]), RELATIVE_CHANGE * float(sd[i]), "10 %", (columns[i],)
-        )
-        for i in each
-    ]
-    correlations = [
-        DistributionParameter(
-            f"correlation of {labels[j]} and {labels[i]}{end}",
-            float(correlation[i, j]),
-            CORRELATION_CHANGE,
-            f"{CORRELATION_CHANGE:g}",
-            (columns[j], columns[i]),
-        )
-        for i in each
-        for j in range(i)
-    ]
-    return [*means, *spreads, *correlations]
+    found = []
+    for label, value, deviation, column in zip(labels, mean.tolist(), sd.tolist(), columns, strict=True):
+        found.append(DistributionParameter(f"mean of {label}{end}", value, deviation, "1 sd", (column,)))
+    for label, deviation, column in zip(labels, sd.tolist(), columns, strict=True):
+        change = RELATIVE_CHANGE * deviation
+        found.append(DistributionParameter(f"sd of {label}{end}", deviation, change, "10 %", (column,)))
+    for i, j in ((later, earlier) for later in range(len(sd)) for earlier in range(later)):
+        name, pair = f"correlation of {labels[j]} and {labels[i]}{end}", (columns[j], columns[i])
+        change = CORRELATION_CHANGE
+        found.append(DistributionParameter(name, float(correlation[i, j]), change, f"{change:g}", pair))
+    return found
 
 
 def set_mixture_parameters(mixture: MixtureArrays, values: ArrayLike) -> MixtureArrays:
@@ -161,22 +157,6 @@ def check_values(values: FloatArray, n: int) -> None:
         raise ValueError(f"Expected {n} values, one for each parameter, got shape {values.shape}.")
 
 
-def name_coordinates(coordinates: Coordinates, names: Sequence[str] = ()) -> list[str]:
-    """Return the coordinates of a mixture in words, in their order.
-
-    "closing to lead_speed" is the coordinate `ClosingSpeed` of that column, (speed behind - lead_speed) / sqrt(gap).
-    """
-    columns = tuple(names) or coordinates.names or number_columns(coordinates.dim)
-    labels = []
-    for j in coordinates.columns:
-        kind = coordinates.kinds[j]
-        if isinstance(kind, ClosingSpeed):
-            labels.append(f"closing to {columns[j]}")
-        else:
-            labels.append(f"log {columns[j]}" if kind == "log" else columns[j])
-    return labels
-
-
 def match_components(mixture: MixtureArrays, like: MixtureArrays) -> list[int]:
     """Return the components of a mixture in the numbering of another with as many.
 
@@ -195,20 +175,3 @@ def arrays_of(distribution: object) -> MixtureArrays | None:
     """Return the arrays of a distribution that is a mixture; None for any other."""
     arrays = tuple(getattr(distribution, name, None) for name in MixtureArrays._fields)
     return None if any(values is None for values in arrays) else MixtureArrays(*(np.asarray(v) for v in arrays))
-
-
-def list_block_parameters(
-    blocks: Sequence[Any], names: Sequence[str], like: object = None
-) -> tuple[DistributionParameter, ...]:
-    """Return the parameters of independent blocks, those that have some, with the columns of the whole."""
-    found: list[DistributionParameter] = []
-    others = getattr(like, "blocks", ())
-    others = others if len(others) == len(blocks) else (None,) * len(blocks)
-    first = 0
-    for block, other in zip(blocks, others, strict=True):
-        size: int = block.dim
-        if isinstance(block, HasParameters):
-            own = block.parameters(names[first : first + size], other)
-            found += [each._replace(columns=tuple(first + j for j in each.columns)) for each in own]
-        first += size
-    return tuple(found)

@@ -18,7 +18,6 @@ from rare_envs.distributions.parameters import (
     DistributionParameter,
     HasParameters,
     check_values,
-    list_block_parameters,
     number_columns,
 )
 from rare_envs.distributions.space import Distribution
@@ -131,7 +130,17 @@ class ProductDistribution:
 
     def parameters(self, names: Sequence[str] = (), like: object = None) -> tuple[DistributionParameter, ...]:
         """Return the parameters of the blocks that have some, see `HasParameters`."""
-        return list_block_parameters(self.blocks, names or number_columns(self.dim), like)
+        names, found = names or number_columns(self.dim), list[DistributionParameter]()
+        others = getattr(like, "blocks", ())
+        others = others if len(others) == len(self.blocks) else (None,) * len(self.blocks)
+        first = 0
+        for block, other in zip(self.blocks, others, strict=True):
+            size: int = block.dim
+            if isinstance(block, HasParameters):
+                own = block.parameters(names[first : first + size], other)
+                found += [each._replace(columns=tuple(first + j for j in each.columns)) for each in own]
+            first += size
+        return tuple(found)
 
     def with_parameters(self, values: ArrayLike) -> "ProductDistribution":
         """Return the blocks with other values of their parameters.

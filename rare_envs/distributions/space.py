@@ -179,7 +179,10 @@ class ScenarioSpace:
 
     def describe(self) -> str:
         """Return all valid names with their ranges, in the order of x."""
-        return ", ".join(f"{self._title(j)} {self._range(j)}" for j in range(len(self.names)))
+        return ", ".join(
+            f"{name} {self._range(j)}" if size == 1 else f"{name} ({size} values) {self._range(j)}"
+            for j, (name, size) in enumerate(zip(self.names, self.sizes, strict=True))
+        )
 
     def __repr__(self) -> str:
         """Return one line; `describe` has the ranges."""
@@ -189,23 +192,15 @@ class ScenarioSpace:
 
     def _repr_html_(self) -> str:
         """Return a table of the parameters for notebooks."""
+        first = [at.start for at in self._slices]
         rows = "".join(
             f"<tr><th>{escape(name)}</th><td>{low:g} to {high:g}</td><td>{escape(unit)}</td><td>{size}</td></tr>"
             for name, unit, size, low, high in zip(
-                self.names, self.units, self.sizes, *self._parameter_bounds, strict=True
+                self.names, self.units, self.sizes, self.low[first], self.high[first], strict=True
             )
         )
         header = "<tr><th>parameter</th><th>range</th><th>unit</th><th>values</th></tr>"
         return f"<table>{header}{rows}</table>"
-
-    @property
-    def _parameter_bounds(self) -> tuple[FloatArray, FloatArray]:
-        """Lower and upper ends, one for each parameter."""
-        first = [at.start for at in self._slices]
-        return self.low[first], self.high[first]
-
-    def _title(self, j: int) -> str:
-        return self.names[j] if self.sizes[j] == 1 else f"{self.names[j]} ({self.sizes[j]} values)"
 
     def validate(self, x: ArrayLike) -> FloatArray:
         """Check shape and ranges.

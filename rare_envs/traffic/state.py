@@ -82,12 +82,6 @@ class State(_Fields):
         state._columns = tuple(Vehicle(*columns[number::n]) for number in range(n))
         return state
 
-    def with_columns(self, vehicles: tuple[Vehicle, ...]) -> State:
-        """Return the state with its `vehicles` at hand, where somebody has them."""
-        state = self._replace()
-        state._columns = vehicles
-        return state
-
     def __reduce__(self) -> tuple[type[State], tuple[Tensor, ...]]:
         """Pickle the fields alone: columns would each bring the memory of all."""
         return type(self), tuple(self)
