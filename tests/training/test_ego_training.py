@@ -39,7 +39,7 @@ from training.ego_training import (
 ENV = "rare_envs/CutIn-v0"
 STEPS, ROWS = 64, 8
 ALGORITHMS = ("ppo", "a2c", "sac", "td3", "dqn")
-OFF_POLICY = ("sac", "td3", "dqn")
+EACH = [pytest.param(algo, marks=() if algo in ("ppo", "dqn") else pytest.mark.slow) for algo in ALGORITHMS]
 FACTOR = 20.0
 """After 100,000 steps; the demo's 400,000 reach several thousand."""
 FAILURE = np.array([[25.0, 12.0, 20.0, 2.0, 40.0, 3.5]])
@@ -50,7 +50,7 @@ def weights(path: Path) -> torch.Tensor:
     return torch.cat([value.flatten().double() for value in ego.model.policy.state_dict().values()])
 
 
-@pytest.mark.parametrize("algo", ALGORITHMS)
+@pytest.mark.parametrize("algo", EACH)
 def test_every_algorithm_trains_saves_and_drives(algo: str, tmp_path: Path) -> None:
     path = train_ego(
         ENV,
@@ -140,7 +140,14 @@ def stop_after(monkeypatch: pytest.MonkeyPatch, count: int) -> None:
     monkeypatch.setattr(training.ego_training, "save_checkpoint", save_and_stop)
 
 
-@pytest.mark.parametrize(("algo", "steps", "checkpoint"), [("ppo", 480, 2), *((a, 160, 11) for a in OFF_POLICY)])
+@pytest.mark.parametrize(
+    ("algo", "steps", "checkpoint"),
+    [
+        ("ppo", 480, 2),
+        ("sac", 160, 11),
+        *(pytest.param(algo, 160, 11, marks=pytest.mark.slow) for algo in ("td3", "dqn")),
+    ],
+)
 def test_a_resumed_training_ends_alike(
     algo: str, steps: int, checkpoint: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -239,7 +246,7 @@ def test_the_share_of_failures_is_drawn_and_the_rest_is_of_the_base() -> None:
     assert (np.abs(rest.mean(axis=0) - usual.mean(axis=0)) < 4.5 * spread).all()
 
 
-@pytest.mark.parametrize("algo", ALGORITHMS)
+@pytest.mark.parametrize("algo", EACH)
 def test_every_algorithm_goes_on_from_the_weights_of_the_ego(
     algo: str, egos: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

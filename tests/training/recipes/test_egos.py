@@ -58,7 +58,7 @@ def reasons(found: Any) -> Counter[str]:
     return Counter(VERDICT_NAMES[k] for k in found.reason.tolist())
 
 
-@pytest.mark.parametrize("case", ["straight", pytest.param("i80", marks=pytest.mark.slow), "bends"])
+@pytest.mark.parametrize("case", [*(pytest.param(c, marks=pytest.mark.slow) for c in ("straight", "i80")), "bends"])
 def test_a_driver_by_rule_is_nominal(case: str) -> None:
     found = judge(agents.load_ego("idm"), case, rollouts=12, seed=3, seconds=30.0)
     assert reasons(found) == {"passed": 12}
