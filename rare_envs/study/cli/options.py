@@ -94,7 +94,7 @@ def command(*names: str, stopped: str = "") -> Callable[[Callable[..., Answer | 
             if "typed" in taken:
                 sources = {name: context.get_parameter_source(name) for name in context.params}
                 values["typed"] = {name for name, source in sources.items() if source and source.name == "COMMANDLINE"}
-            answering(lambda: function(**values), as_json, stopped, values.get("details", False))
+            answering(functools.partial(function, **values), as_json, stopped, values.get("details", False))
 
         parameters = [_parameter("context", typer.Context)]
         for name, parameter in taken.items():
