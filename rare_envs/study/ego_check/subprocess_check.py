@@ -11,14 +11,16 @@ from collections.abc import Iterator
 from multiprocessing.connection import Connection
 from pathlib import Path
 
+import numpy as np
+
 from rare_envs.scenarios.registry import find_scenario
 from rare_envs.study.arguments import Question
 from rare_envs.study.ego_check import Finding, report_failure, report_pass, report_warning
 from rare_envs.study.errors import BadInput, as_bad_input
 from rare_envs.threads import use_one_thread
 
-START_TIMEOUT = 60.0
-"""Duration that the process may take before its first check [s]."""
+START_TIMEOUT, COMPILING_TIMEOUT = 60.0, 600.0
+"""Durations that the process may take before its first check, and for compiling rollouts [s]."""
 
 
 def check_ego(question: Question, time_limit: float = 30.0) -> list[Finding]:
@@ -87,6 +89,7 @@ def _check_in_subprocess(question: Question, time_limit: float) -> Iterator[Find
                 yield event
             else:
                 doing = event
+                limit = COMPILING_TIMEOUT if event == "compiling" else time_limit
         advice = "an ego that hangs stops the run; process:EGO?timeout=SECONDS would end it there"
         yield report_failure(doing, f"no end after {limit:g} s", advice)
     except EOFError:
@@ -127,11 +130,14 @@ def run_checks(question: Question) -> Iterator[Finding | str]:
     try:
         ego = agents.load_ego(question.ego, algo=question.algo, trust=question.trust, stats=question.stats)
         yield report_pass("loading", f"{type(ego).__name__}" if not isinstance(ego, str) else ego)
+        yield "compiling"  # takes no time of a check
         problem = build_problem(question, ego)
         for note in problem.notes:
             if note in (AMBIGUOUS, TAKEN_AS_ACCELERATIONS):  # of other bounds than ours a check of its own tells
                 yield report_warning("action space", note, "say which by --action", note == AMBIGUOUS)
         probe = Probe.of(ego, problem)
+        if problem.core == "numba":  # then the ego is not asked
+            problem.evaluate(problem.base.sample(1, np.random.default_rng(0)))
     except (Exception, SystemExit, EgoGone) as error:  # the ego is the user's: anything may happen in it
         yield report_failure("loading", reason_of(error), "see docs/egos.md for what an ego is")
         return
