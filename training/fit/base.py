@@ -49,7 +49,13 @@ MASS_SAMPLES = 1_000_000
 
 @dataclass(frozen=True)
 class FitRequest:
-    """What a base is fitted to, and how."""
+    """What a base is fitted to, and how.
+
+    Example:
+        >>> events = EventSet(np.array([[12.0, 11.0, 15.0], [14.0, 12.0, 20.0]]), clusters=np.arange(2))
+        >>> FitRequest("car_following", events, source={"site": "my road"}, command="python fit.py").seed
+        0
+    """
 
     scenario: str
     """Short name or environment id."""
@@ -109,6 +115,15 @@ def fit_base(request: FitRequest, report: Callable[[str], None] = lambda _: None
 
     Raises:
         ValueError: The events are too few, or there is no such coordinate system.
+
+    Example:
+        >>> rng = np.random.default_rng(0)
+        >>> columns = [rng.normal(14, 3, 60), rng.normal(14, 3, 60), rng.lognormal(3, 0.4, 60)]  # m/s, m/s, m
+        >>> events = EventSet(np.stack(columns, axis=1), clusters=np.arange(60))
+        >>> request = FitRequest("car_following", events, {"site": "my road"}, "fit.py", system="plain", n_refits=2)
+        >>> base = fit_base(request)
+        >>> base.clusters, len(base.refits)
+        (60, 2)
     """
     events, seed, scenario = request.events, request.seed, scenario_named(request.scenario)
     parameters, systems = tuple(scenario.parameters), COORDINATE_SYSTEMS[scenario.name]

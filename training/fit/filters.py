@@ -42,7 +42,12 @@ class EventRecipe:
 
 @dataclass(frozen=True)
 class EventSet:
-    """Usable events of a scenario, columns in the order of its parameters."""
+    """Usable events of a scenario, columns in the order of its parameters.
+
+    Example:
+        >>> EventSet(np.array([[12.0, 11.0, 15.0], [14.0, 12.0, 20.0]]), clusters=np.array([0, 0])).counts.clusters
+        1
+    """
 
     joint: FloatArray
     """Columns that are fitted together, shape (n, d - a)."""
