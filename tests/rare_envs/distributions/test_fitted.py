@@ -13,10 +13,16 @@ from rare_envs.distributions.fitted import (
     EventFrequency,
     FittedDistribution,
     PredictiveCheck,
-    read_distribution,
     read_record,
 )
 from rare_envs.distributions.mixture import CoordinateMixture, TruncatedGaussianMixture
+from rare_envs.distributions.product import (
+    BlockDistribution,
+    FittedProduct,
+    NoiseDistribution,
+    ProductDistribution,
+    join_independent,
+)
 
 NAMES = ["speed", "lead_speed", "gap"]
 ORDER = ["speed", "gap", "lead_speed"]
@@ -73,7 +79,6 @@ def test_frequency_and_its_error_by_hand() -> None:
     ("change", "message"),
     [
         ({"count": 0}, "count of the frequency as a whole number, 1 or more, got 0"),
-        ({"hours": "many"}, "hours of the frequency as a number above 0, got 'many'"),
         ({"km": float("nan")}, "km of the frequency as a number above 0, got nan"),
         ({"share": 1.2}, "share of the frequency as a number above 0, at most 1, got 1.2"),
         ({"definition": ""}, "definition of the frequency as a text, got ''"),
@@ -84,40 +89,12 @@ def test_bad_frequencies_are_refused(change: dict[str, Any], message: str) -> No
         replace(CUT_INS, **change)
 
 
-NORMAL: dict[str, Any] = {"weights": [1.0], "means": [[2.0]], "covariances": [[[1.0]]], "low": [1.0], "high": [9.0]}
-
-
-@pytest.mark.parametrize(
-    ("content", "kind"),
-    [
-        (NORMAL, TruncatedGaussianMixture),
-        ({**NORMAL, "coordinates": ["log"]}, CoordinateMixture),
-        ({**NORMAL, "names": ["gap"], "order": ["gap"]}, CoordinateMixture),
-        ({"alpha": [2.0], "beta": [2.0], "low": [0.0], "high": [1.0]}, BetaDistribution),
-    ],
-)
-def test_keys_of_a_file_tell_the_kind(content: dict[str, Any], kind: type) -> None:
-    read = read_distribution(content)
-    assert type(read) is kind
-    assert type(read_distribution(read.to_dict())) is kind
-
-
 def test_what_it_was_fitted_to() -> None:
     assert (BASE.fitted_to, BASE.clusters) == ("38 + 15 events of 17 scenes", 17)
     assert (BASE.frequency, BASE.checks) == (CUT_INS, (PredictiveCheck("TTC < 5 s", 7, 15.9),))
     assert BASE.record["site"] == "US 101"
-
-
-@pytest.mark.parametrize(
-    ("counts", "words"),
-    [
-        (EventCounts(used=(40,), clusters=1, cluster="drive"), "40 events of 1 drive"),
-        (EventCounts(used=(40,), clusters=40, cluster="event"), "40 events"),
-        (EventCounts(used=(1,), clusters=1, cluster="event"), "1 event"),
-    ],
-)
-def test_counts_in_words(counts: EventCounts, words: str) -> None:
-    assert counts.describe() == words
+    assert EventCounts(used=(40,), clusters=1, cluster="drive").describe() == "40 events of 1 drive"
+    assert EventCounts(used=(1,), clusters=1, cluster="event").describe() == "1 event"
 
 
 # --- refits -----------------------------------------------------------------------------------------
@@ -248,21 +225,12 @@ REFIT = CONTENT["refits"][0]
         ({"refits": "many"}, "Expected refits as a list of objects, got 'many'"),
         ({"refits": [3]}, r"Expected refits\[0\] as an object with weights, means, covariances, got 3"),
         ({"refits": [REFIT, {"weights": [1.0]}]}, r"refits\[1\] with weights, .*, got no means, covariances"),
-        ({"refits": [{**REFIT, "names": ["a", "b", "c"]}]}, r"refits\[0\] .* got names of its own"),
         ({"refits": [{**REFIT, "weights": [0.5]}]}, r"^refits\[0\]: weights must sum to 1"),
-        (
-            {"refits": [{"weights": [1.0], "means": [[1.0]], "covariances": [[[1.0]]]}]},
-            r"refits\[0\]: Expected means of shape \(1, 3\), one for each column, got \(1, 1\)",
-        ),
-        ({"events": [38]}, r"Expected events as an object with used, clusters, cluster, got \[38\]"),
-        ({"events": {"used": [38]}}, "got no clusters"),
         ({"events": {"used": [38], "clusters": 5, "scenes": 5}}, "got unknown scenes"),
-        ({"events": {"used": 38, "clusters": 5}}, "used of the events as a list of whole numbers, got 38"),
         ({"events": {"used": [38, 15], "clusters": 54}}, "at most as many clusters as events, 53, got 54"),
         ({"family": ""}, "Expected family as a text, got ''"),
         ({"frequency": 9.0}, r"Expected frequency as an object with count, .*, got 9\.0"),
         ({"checks": {"name": "gap"}}, "Expected checks as a list of objects"),
-        ({"provenance": "US 101"}, "Expected provenance as an object, got 'US 101'"),
     ],
 )
 def test_damage_is_told_in_one_line(change: dict[str, Any], message: str) -> None:
@@ -271,7 +239,69 @@ def test_damage_is_told_in_one_line(change: dict[str, Any], message: str) -> Non
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize("key", ["events", "family"])
-def test_a_missing_key_is_named(key: str) -> None:
-    with pytest.raises(ValueError, match=f"^A file with refits, .*, frequency, checks lacks {key}\\.$"):
-        FittedDistribution.from_dict({name: value for name, value in CONTENT.items() if name != key})
+def test_a_missing_key_is_named() -> None:
+    with pytest.raises(ValueError, match=r"^A file with refits, .*, frequency, checks lacks events\.$"):
+        FittedDistribution.from_dict({name: value for name, value in CONTENT.items() if name != "events"})
+
+
+BETA = BetaDistribution([2.0], [3.0], [0.0], [10.0])
+
+
+def test_densities_add_up_and_maps_go_block_by_block() -> None:
+    both = join_independent(BETA, NoiseDistribution(2))
+    assert isinstance(both, ProductDistribution)
+    assert (both.dim, both.noise.tolist()) == (3, [False, True, True])
+    x = both.sample(50, np.random.default_rng(0))
+    normal = -0.5 * (x[:, 1:] ** 2).sum(axis=1) - np.log(2.0 * np.pi)
+    np.testing.assert_allclose(both.log_prob(x), BETA.log_prob(x[:, :1]) + normal, rtol=1e-12)
+    u = both.to_standard_normal(x)
+    np.testing.assert_array_equal(u[:, 1:], x[:, 1:])
+    np.testing.assert_array_equal(u[:, :1], BETA.to_standard_normal(x[:, :1]))
+    np.testing.assert_allclose(both.from_standard_normal(u), x, rtol=1e-9)
+
+
+# --- with a fitted block ------------------------------------------------------------------------------
+
+
+def test_a_product_with_one_fitted_block_is_fitted_too() -> None:
+    whole = join_independent(BASE, BETA, NoiseDistribution(2))
+    assert isinstance(whole, FittedProduct)
+    assert isinstance(whole, BlockDistribution)
+    assert (whole.dim, whole.noise.tolist()) == (6, [False] * 4 + [True] * 2)
+    assert [type(block) for block in whole.blocks] == [type(BASE.distribution), BetaDistribution, NoiseDistribution]
+    assert (whole.fitted_to, whole.clusters, whole.family) == (BASE.fitted_to, BASE.clusters, BASE.family)
+    assert (whole.frequency, whole.checks, whole.record) == (BASE.frequency, BASE.checks, BASE.record)
+
+
+@pytest.mark.parametrize("first", [True, False])
+def test_a_refit_replaces_its_block_alone(first: bool) -> None:
+    whole = join_independent(*((BASE, BETA) if first else (BETA, BASE)))
+    assert isinstance(whole, FittedProduct)
+    x = whole.sample(50, np.random.default_rng(0))
+    own, rest = (x[:, :3], x[:, 3:]) if first else (x[:, 1:], x[:, :1])
+    assert len(whole.refits) == 3
+    for product, refit in zip(whole.refits, BASE.refits, strict=True):
+        np.testing.assert_allclose(product.log_prob(x), refit.log_prob(own) + BETA.log_prob(rest), rtol=1e-12)
+    ensemble = BASE.ensemble().log_prob(own) + BETA.log_prob(rest)
+    np.testing.assert_allclose(whole.ensemble().log_prob(x), ensemble, rtol=1e-12)
+
+
+def test_a_product_of_a_fitted_product_and_a_sibling() -> None:
+    found = FittedDistribution.from_dict(BASE.to_dict(), siblings={"i80": BASE}.__getitem__)
+    inner = join_independent(found, BETA)
+    outer = join_independent(inner, NoiseDistribution(1))
+    assert isinstance(outer, FittedProduct)
+    assert [block.dim for block in outer.blocks] == [3, 1, 1]
+    assert [refit.dim for refit in outer.refits] == [5] * 3
+    other = outer.sibling("i80")
+    assert isinstance(other, FittedProduct)
+    assert (other.dim, other.fitted_to) == (5, BASE.fitted_to)
+    assert join_independent(inner) is inner
+    with pytest.raises(ValueError, match="A file holds mixtures and Beta variables, no ProductDistribution"):
+        outer.to_dict()
+
+
+def test_refits_of_two_fitted_blocks_do_not_belong_together() -> None:
+    both = join_independent(BASE, BASE)
+    assert type(both) is ProductDistribution
+    assert [type(block) for block in both.blocks] == [type(BASE.distribution)] * 2

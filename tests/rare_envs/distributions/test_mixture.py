@@ -12,8 +12,6 @@ from scipy.special import ndtri_exp
 
 from rare_envs.distributions.coordinates import Coordinates
 from rare_envs.distributions.mixture import CHUNK_ROWS, CoordinateMixture, TruncatedGaussianMixture
-from rare_envs.scenarios.base_distributions import load_base
-from rare_envs.scenarios.registry import SCENARIOS
 
 
 def random_mixture(seed: int, components: int, d: int, low: float, high: float) -> TruncatedGaussianMixture:
@@ -74,7 +72,6 @@ plain = pytest.mark.parametrize("mixture", [WIDE, CUT_2D, TAIL, CUT_3D], ids=["w
 every = pytest.mark.parametrize(
     "mixture", [CUT_2D, TAIL, CUT_3D, FOLLOWING, CUT, CUT_IN], ids=["2d", "tail", "3d", "following", "cut", "cut_in"]
 )
-BASES = [(name, base) for name, each in SCENARIOS.items() if each.drivers is None for base in each.bases]
 
 
 def draw(mixture: CoordinateMixture, n: int, seed: int) -> NDArray[np.float64]:
@@ -134,15 +131,6 @@ def test_one_component_of_closing_speeds_by_scipys_truncated_normals() -> None:
     np.testing.assert_allclose(mixture.log_prob(np.stack([v, lead, gap], axis=1)), expected, rtol=1e-9)
 
 
-@pytest.mark.parametrize("mixture", [CUT_3D, CUT], ids=["plain", "closing"])
-def test_density_integrates_to_one(mixture: CoordinateMixture) -> None:
-    t, w = np.polynomial.legendre.leggauss(60)
-    half = 0.5 * (mixture.high - mixture.low)
-    points = np.array(list(itertools.product(*(mixture.low + half * (t[:, None] + 1.0)).T)))
-    weights = np.einsum("i,j,k->ijk", w, w, w).ravel() * half.prod()
-    assert np.exp(mixture.log_prob(points)) @ weights == pytest.approx(1.0, abs=1e-6)
-
-
 @every
 def test_density_is_that_of_normals_through_the_map(mixture: CoordinateMixture) -> None:
     """log p(x) = log phi(u) + log |det du/dx|, with central differences of the map."""
@@ -195,19 +183,8 @@ def test_round_trips_to_the_spacing_of_floats(mixture: CoordinateMixture) -> Non
     assert np.abs(mixture.from_standard_normal(mixture.to_standard_normal(drawn)) - drawn).max() < 1e-8
 
 
-@pytest.mark.parametrize(("scenario", "base"), BASES)
-def test_round_trips_of_shipped_bases(scenario: str, base: str) -> None:
-    """Typical points, and each coordinate in turn out to 5 standard deviations; draws are normal through the map."""
-    mixture: Any = load_base(SCENARIOS[scenario], base)
-    rng = np.random.default_rng(8)
-    u = rng.standard_normal((2000, mixture.dim))
-    u[np.arange(1000), rng.integers(0, mixture.dim, 1000)] = rng.uniform(-5.0, 5.0, 1000)
-    assert np.abs(mixture.to_standard_normal(mixture.from_standard_normal(u)) - u).max() < 1e-8
-    check_normal(mixture.to_standard_normal(mixture.sample(5000, rng)))
-
-
 @every
-def test_u_rises_with_its_own_column_and_faces_are_finite(mixture: CoordinateMixture) -> None:
+def test_u_rises_with_its_own_column_and_faces_and_far_tails_are_finite(mixture: CoordinateMixture) -> None:
     x = draw(mixture, 300, 4)
     u = mixture.to_standard_normal(x)
     for j in range(mixture.dim):
@@ -219,10 +196,6 @@ def test_u_rises_with_its_own_column_and_faces_are_finite(mixture: CoordinateMix
     assert np.isfinite(mixture.to_standard_normal(corners)).all()
     outside = np.concatenate([mixture.low - 1e-9 * np.eye(mixture.dim), mixture.high + 1e-9 * np.eye(mixture.dim)])
     assert (mixture.log_prob(outside) == -np.inf).all()
-
-
-@every
-def test_far_tails_stay_in_the_box(mixture: CoordinateMixture) -> None:
     x = mixture.from_standard_normal(np.random.default_rng(5).uniform(-38.0, 38.0, (30, mixture.dim)))
     assert ((x > mixture.low) & (x < mixture.high)).all()
     assert np.isfinite(mixture.log_prob(x)).all()
@@ -314,14 +287,11 @@ GOOD: dict[str, Any] = {
         ({"weights": [0.5, 0.6]}, r"weights must sum to 1, got 1\.1"),
         ({"weights": [1.5, -0.5]}, r"weights must be positive, got -0\.5"),
         ({"weights": [1.0]}, r"weights of shape \(2,\).*got \(1,\)"),
-        ({"means": [0.0, 0.0]}, r"means of shape \(K, d\), got \(2,\)"),
         ({"means": "many"}, "means must be an array of numbers"),
         ({"covariances": [np.eye(3).tolist()] * 2}, r"covariances of shape \(2, 2, 2\)"),
         ({"covariances": [[[1.0, 2.0], [2.0, 1.0]]] * 2}, r"covariances\[0\] is not positive def"),
         ({"covariances": [[[1.0, 0.5], [0.0, 1.0]]] * 2}, r"covariances\[0\] is not symmetric"),
-        ({"low": [-1.0, 2.0]}, r"low must be below high, got \[2, 2\] at coordinate 1"),
         ({"high": [2.0, np.inf]}, "high must be finite"),
-        ({"high": [2.0]}, r"high of shape \(2,\)"),
     ],
 )
 def test_bad_parameters_are_refused(change: dict[str, Any], message: str) -> None:

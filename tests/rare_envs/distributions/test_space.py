@@ -51,19 +51,14 @@ def test_x_gives_everything():
     ("options", "message"),
     [
         ({"cutin_gap": 9.0}, r"'cutin_gap' \(did you mean 'cut_in_gap'\?\); valid are ego_speed \[0"),
-        ({"colour": 1.0}, r"Unknown scenario parameter 'colour'; valid are .*lateral_offset"),
-        ({3: 1.0}, "Unknown scenario parameter 3"),
         ({"ego_speed": 99}, r"ego_speed = 99 is outside its range \[0, 45\] m/s; the parameters"),
         ({"ego_speed": np.nan}, r"ego_speed = nan is outside its range \[0, 45\] m/s"),
         ({"lead_gap": [5.0, 0.2, 5.0]}, r"lead_gap = 0.2 \(row 1\) is outside its range \[1, 150\] m"),
         ({"lead_gap": [5.0, 6.0]}, r"lead_gap as one number or an array of shape \(3,\), got \(2,\)"),
-        ({"lead_gap": np.ones((3, 1))}, r"got \(3, 1\)"),
         ({"lead_gap": "far"}, "lead_gap must be a number or an array of numbers, got 'far'"),
-        ({"lead_gap": None}, "lead_gap must be a number"),
         ({"lead_gap": True}, "lead_gap must be a number"),
         ({"x": [1.0, 2.0]}, r"x of shape \(n, 6\) or \(6,\), got \(2,\); its columns are ego_speed"),
         ({"x": [20, 18, 19, 15, 30, np.nan]}, "lateral_offset = nan is outside"),
-        ({"x": [20, 18, 19, 15, 30, 9]}, r"lateral_offset = 9 is outside its range \[2.2, 5\] m"),
         ({"x": [[20, 18, 19, 15, 30, 3]] * 2}, "x with 1 or 3 rows, one per scenario, got 2"),
         ({"x": [20, 18, 19, 15, 30, 3], "lead_gap": 4}, "lead_gap cannot be given beside it"),
     ],
@@ -80,15 +75,12 @@ def test_space_checks_its_own_lengths():
         ScenarioSpace(("a", "b"), ("m", "m", "m"), np.zeros(3), np.ones(3), base)
 
 
-def test_repr_is_one_line_and_html_has_every_parameter():
+def test_repr_is_one_line_and_html_has_every_parameter_escaped():
     space = make_space()
     assert "\n" not in repr(space)
     assert repr(space) == f"<ScenarioSpace of 6 parameters in 6 dimensions: {', '.join(NAMES)}>"
     html = space._repr_html_()
     assert all(f"<th>{name}</th>" in html for name in NAMES)
-
-
-def test_names_are_escaped_in_html():
     space = dataclasses.replace(make_space(), names=("<b>", *NAMES[1:]))
     assert "<b>" not in space._repr_html_()
     assert "&lt;b&gt;" in space._repr_html_()

@@ -8,11 +8,8 @@ import numpy as np
 import pytest
 import torch
 from gymnasium import spaces
-from stable_baselines3 import PPO
 
-import agents
 import rare_envs
-import training
 from rare_envs.egos.needs import (
     AmbiguousActions,
     EgoNeeds,
@@ -70,7 +67,7 @@ def test_a_wrapped_ego_needs_what_the_one_behind_it_needs_and_its_own_noise() ->
     assert needs.noise_columns(rare_envs.DrivingProblem(CUT_IN, horizon=0.5).world) == 35
 
 
-CUT_IN, KINEMATICS = "rare_envs/CutIn-v0", "rare_envs/CutIn-kinematics-v0"
+KINEMATICS = "rare_envs/CutIn-kinematics-v0"
 
 
 def idle(observed: Any = None, acted: Any = None) -> Declared:
@@ -180,34 +177,6 @@ class BrakingNetwork(torch.nn.Module):
 
 
 @pytest.mark.parametrize("ego", [brake, BrakingNetwork(), lambda observation: brake(observation).tolist()])
-def test_they_drive_as_the_policy_does(ego):
+def test_functions_and_networks_drive_as_the_policy_does(ego):
     wanted = rare_envs.DrivingProblem("rare_envs/CarFollowing-v0", ego=Brake()).evaluate(X)
     np.testing.assert_array_equal(rare_envs.DrivingProblem("rare_envs/CarFollowing-v0", ego=ego).evaluate(X), wanted)
-
-
-PAIR = [[20.0, 15.0, 30.0], [30.0, 5.0, 20.0]]
-ENV_ID = "rare_envs/CarFollowing-v0"
-
-
-@pytest.fixture(scope="module")
-def saved(tmp_path_factory):
-    path = tmp_path_factory.mktemp("egos") / "ppo.zip"
-    PPO("MlpPolicy", training.sb3_vec_env(ENV_ID, num_envs=2), n_steps=8, batch_size=16, seed=0, device="cpu").save(
-        path
-    )
-    return path
-
-
-def test_a_file_is_loaded(saved):
-    wanted = rare_envs.DrivingProblem(ENV_ID, ego=agents.load_ego(saved)).evaluate(PAIR)
-    for ego in (saved, str(saved)):
-        problem = rare_envs.DrivingProblem(ENV_ID, ego=ego)
-        np.testing.assert_array_equal(problem.evaluate(PAIR), wanted)
-        assert problem.ego == ego
-
-
-def test_what_cannot_be_loaded_is_refused_in_one_line(tmp_path):
-    with pytest.raises(FileNotFoundError, match=r"nothing\.zip"):
-        rare_envs.DrivingProblem(ENV_ID, ego=tmp_path / "nothing.zip")
-    with pytest.raises(ValueError, match=r"Unknown ego 'imd' \(did you mean 'idm'\?\)"):
-        rare_envs.DrivingProblem(ENV_ID, ego="imd")

@@ -1,5 +1,7 @@
-"""Policies as drivers: what fits a world, and what a policy is shown."""
+"""Policies as drivers: what fits a world, what a policy is shown, its errors, and wrappers around it."""
 
+import subprocess
+import sys
 from typing import Any
 
 import numpy as np
@@ -7,9 +9,15 @@ import pytest
 import torch
 from gymnasium import spaces
 
+import rare_envs
 from rare_envs.control.actions import IDLE
-from rare_envs.egos.errors import EgoGone, NoAnswer
+from rare_envs.egos.errors import EgoGone, NoAnswer, check_predict, reason_of, refuse_ego
 from rare_envs.egos.policy import PolicyDriver, PolicyQuery, as_driver, check_spaces, query_policy
+from rare_envs.egos.wrappers import (
+    FrameStackedPolicy,
+    describe_missing_normalisation,
+    find_frame_stacking,
+)
 from rare_envs.scenarios.car_following import CAR_FOLLOWING
 from rare_envs.simulation.episode import Clock
 from rare_envs.simulation.observation import observation_space
@@ -171,3 +179,119 @@ def test_actions_that_are_no_numbers_are_refused(answer: Any) -> None:
 
     with pytest.raises(ValueError, match="Expected actions as numbers, one or two for each observation, got"):
         query_policy(Wordy(), "continuous", query([0.1, 0.2]))
+
+
+@pytest.mark.parametrize(
+    ("error", "reason"),
+    [
+        (RuntimeError("no\n  road"), "RuntimeError: no road"),
+        (ValueError("Expected this, got that."), "Expected this, got that."),
+        (SystemExit(7), "SystemExit(7)"),
+        (NoAnswer("within 10 s"), "NoAnswer: within 10 s"),
+    ],
+)
+def test_reasons_are_one_line(error: BaseException, reason: str) -> None:
+    assert reason_of(error) == reason
+
+
+class Still:
+    """A policy."""
+
+    def predict(self, observation: Any, **_: Any) -> Any:
+        return observation
+
+
+class Proxy:
+    """Passes all attributes of a policy on."""
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(Still(), name)
+
+
+class Short:
+    """As many write it; Stable-Baselines3 hands over more."""
+
+    def predict(self, observation: Any) -> Any:
+        return observation, None
+
+
+def test_a_predict_of_the_observation_alone_is_refused_before_anything_is_simulated() -> None:
+    for taken in (Still(), Proxy()):
+        check_predict(taken)
+    with pytest.raises(
+        ValueError, match=r"state, episode_start, deterministic\), as .*, got predict\(observation.* of Short"
+    ):
+        rare_envs.DrivingProblem("rare_envs/CutIn-v0", ego=Short())
+
+
+@pytest.mark.parametrize(
+    ("ego", "origin", "message"),
+    [
+        ("imd", "", r"^Unknown ego 'imd'; expected 'idm' or an object\. .* agents\.load_ego\('imd'\)\.$"),
+        ("imd", "from f()", r"^Unknown ego 'imd' from f\(\); "),
+        (Still, "", r"^Expected an ego, got the class Still; make or train one"),
+        (None, "", r"^Expected 'idm' or an object with a method predict\(observation, \.\.\.\), got NoneType\.$"),
+    ],
+)
+def test_a_refusal_says_what_was_expected(ego: object, origin: str, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        refuse_ego(ego, origin)
+
+
+def test_the_module_needs_no_torch() -> None:
+    code = "import sys, rare_envs.egos.errors; sys.exit('torch' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+SMALL = (36, 60)
+
+
+def test_frames_of_spaces() -> None:
+    image, row = spaces.Box(0, 255, (*SMALL, 3), np.uint8), spaces.Box(-5.0, 5.0, (51,))
+    first = spaces.Box(0, 255, (6, *SMALL), np.uint8)
+    assert find_frame_stacking(image, image) == (1, False)
+    assert find_frame_stacking(image, first) == (2, False)
+    assert find_frame_stacking(row, spaces.Box(-5.0, 5.0, (102,))) == (2, False)
+    both = spaces.Dict({"camera": image, "lidar": row})
+    assert find_frame_stacking(both, both) == (1, False)
+    assert find_frame_stacking(both, spaces.Dict({"camera": first, "lidar": row})) is None  # not the same number
+    assert find_frame_stacking(both, spaces.Dict({"camera": image})) is None
+    assert find_frame_stacking(both, image) is None
+
+
+class Echo:
+    """A policy whose action is what it is shown."""
+
+    def predict(
+        self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = True
+    ) -> Any:
+        return observation, state
+
+
+def test_frames_side_by_side_begin_with_zeros_and_along_an_axis_with_copies() -> None:
+    one, two = np.array([[1.0], [2.0]]), np.array([[3.0], [4.0]])
+    for new_axis, first, second in (
+        (False, [[0, 1], [0, 2]], [[1, 3], [0, 4]]),
+        (True, [[[1], [1]], [[2], [2]]], [[[1], [3]], [[4], [4]]]),
+    ):
+        policy = FrameStackedPolicy(Echo(), 2, new_axis)
+        shown, state = policy.predict(one)
+        np.testing.assert_array_equal(shown, first)
+        shown, _ = policy.predict(two, state, episode_start=np.array([False, True]))  # the second row begins anew
+        np.testing.assert_array_equal(shown, second)
+
+
+class Model:
+    """What a Stable-Baselines3 model in memory tells of its training."""
+
+    def __init__(self, high: float, statistics: Any = None) -> None:
+        self.observation_space = spaces.Box(-high, high, (3,))
+        self.get_vec_normalize_env = lambda: statistics
+
+
+def test_bounds_tell_of_normalised_observations_unless_the_statistics_are_there() -> None:
+    given = spaces.Box(-5.0, 5.0, (3,))
+    assert "NormalizeObservation" in describe_missing_normalisation(Model(np.inf), given)
+    assert describe_missing_normalisation(Model(5.0), given) == ""
+    assert describe_missing_normalisation(Model(np.inf, statistics=object()), given) == ""
+    assert describe_missing_normalisation(Model(np.inf), spaces.Box(-np.inf, np.inf, (3,))) == ""

@@ -106,19 +106,10 @@ def test_gymnasium_records_a_video(tmp_path):
     assert film.stat().st_size > 1000
 
 
-@pytest.fixture(scope="module")
-def world():
-    return rare_envs.DrivingProblem("rare_envs/CarFollowing-v0").world
-
-
-@pytest.fixture(scope="module")
-def episode(world):
-    return world.start(torch.tensor([[20.0, 20.0, 30.0]]))
-
-
 @pytest.mark.parametrize("mode", [None, "rgb_array", "human"])
-def test_nothing_to_render_is_a_warning(world, episode, mode, monkeypatch):
-    warned = []
+def test_nothing_to_render_is_a_warning(mode, monkeypatch):
+    world, warned = set_up("rare_envs/CarFollowing-v0")[0], []
+    episode = world.start(torch.tensor([[20.0, 20.0, 30.0]]))
     monkeypatch.setattr(gym.logger, "warn", warned.append)
     assert Display(world, mode).draw(episode if mode is None else None, 0.0) is None
     assert len(warned) == 1 and "Nothing to render" in warned[0]

@@ -1,12 +1,17 @@
-"""The batched environment: agreement with the environment of one and with rollout, and its autoreset."""
+"""Environments of one and batched: their agreement, autoreset, infos, reset options, and scenarios drawn ahead."""
 
 import gymnasium as gym
 import numpy as np
 import pytest
+import torch
 
 import rare_envs
-from rare_envs.envs.rows_and_infos import DRAWS_IN_A_ROW
+from rare_envs.distributions import BetaDistribution, NoiseDistribution, ProductDistribution, TruncatedGaussianMixture
+from rare_envs.distributions.space import Distribution
+from rare_envs.envs.rows_and_infos import DRAWS_IN_A_ROW, ROWS_AHEAD, DrawsAhead, step_info
 from rare_envs.envs.vector import DrivingVectorEnv
+from rare_envs.make import set_up
+from rare_envs.multi_agent import start
 from rare_envs.scenarios.registry import SCENARIOS
 
 ids = pytest.mark.parametrize("env_id", rare_envs.ENV_IDS)
@@ -154,3 +159,88 @@ def test_a_wrong_mask_or_mode_is_refused(mask: np.ndarray) -> None:
         batch.reset(options={"reset_mask": mask})
     with pytest.raises(ValueError, match=r"autoreset_mode 'later'; expected one of 'NextStep', 'SameStep', 'Disabled'"):
         rare_envs.make_batch("rare_envs/CutIn-v0", 2, autoreset_mode="later")
+
+
+BETA = BetaDistribution([2.0, 0.5], [2.0, 3.0], [0.0, 1.0], [1.0, 4.0])
+MIXTURE = TruncatedGaussianMixture([0.4, 0.6], [[0.0], [2.0]], [[[1.0]], [[0.3]]], [-1.0], [3.0])
+
+
+@pytest.mark.parametrize("base", [BETA, MIXTURE, ProductDistribution((BETA, NoiseDistribution(1)))])
+def test_rows_drawn_ahead_are_those_drawn_one_call_after_the_other(base: Distribution) -> None:
+    ahead, rng, plain = DrawsAhead(base), *(np.random.default_rng(3) for _ in range(2))
+    for n in (1, 3, ROWS_AHEAD - 5, 2, 0, ROWS_AHEAD + 7, 1):
+        np.testing.assert_array_equal(ahead.sample(n, rng), base.sample(n, plain))
+    ahead.settle()
+    assert rng.bit_generator.state == plain.bit_generator.state
+    for n in (2, 4):  # another generator begins anew
+        other, same = (np.random.default_rng(n) for _ in range(2))
+        np.testing.assert_array_equal(ahead.sample(n, other), base.sample(n, same))
+
+
+@pytest.mark.parametrize("kind", [np.random.PCG64, np.random.MT19937])
+def test_a_generator_that_others_draw_from_too_is_not_put_back(kind: type[np.random.BitGenerator]) -> None:
+    """Their draws would come again."""
+    ahead, rng = DrawsAhead(BETA), np.random.Generator(kind(3))
+    ahead.sample(1, rng)
+    others = rng.random(5)
+    ahead.settle()
+    assert not np.isin(rng.random(10 * ROWS_AHEAD), others).any()
+
+
+@scripted
+def test_info_at_start_and_end(env_id: str) -> None:
+    env = gym.make(env_id)
+    _, info = env.reset(seed=3)
+    space = env.unwrapped.space  # type: ignore[attr-defined]
+    assert info["scenario"] == dict(zip(space.names, info["x"].tolist(), strict=True))
+    assert not {"measure", "collision_type"} & info.keys()
+    done = False
+    while not done:
+        _, reward, terminated, truncated, info = env.step(np.array([1.0, 0.0], np.float32))
+        assert reward == pytest.approx(sum(info["reward_terms"].values()), rel=1e-5)
+        done = terminated or truncated
+    assert {"scenario", "x", "min_ttc", "collision", "measure", "collision_type"} <= info.keys()
+    assert terminated  # full throttle runs into the lead
+    assert (info["measure"], info["min_ttc"]) == (-1.0, 0.0)
+    assert info["collision_type"] in ("rear_end", "side")
+
+
+@scripted
+def test_reset_options(env_id: str) -> None:
+    env = gym.make(env_id)
+    name = env.unwrapped.space.names[0]  # type: ignore[attr-defined]
+    _, free = env.reset(seed=11)
+    _, given = env.reset(seed=11, options={name: 12.5})
+    assert given["scenario"][name] == 12.5
+    assert np.array_equal(given["x"][1:], free["x"][1:])  # the others are drawn as without the option
+    _, again = env.reset(options={"x": free["x"]})
+    np.testing.assert_array_equal(again["x"], free["x"])
+    for options, words in (({name: -1.0}, rf"{name}.*range.*m/s"), ({f"{name}_": 12.5}, rf"did you mean '{name}'")):
+        with pytest.raises(ValueError, match=words):
+            env.reset(options=options)
+
+
+def test_vehicles_of_a_crash_are_numbered_as_in_the_scenario_whoever_sees_it() -> None:
+    world, space = set_up("rare_envs/CarFollowing-v0")
+    world, x = world.with_statistics(), torch.tensor([[20.0, 10.0, 0.5]])
+    episode = start(world, x)
+    traffic = world.step(episode.traffic, torch.zeros(1, 2))
+    hit = torch.tensor([True])
+    numbers = []
+    for vehicle, view in enumerate(episode.views):
+        seen = world.update(view, traffic.state.seen_by(vehicle), None, hit)
+        info = step_info(space, x[0].numpy(), seen, torch.zeros(1), over=True, vehicle=vehicle)
+        numbers.append(sorted(info["crash"]["vehicles"]))
+        assert info["reward_terms"] == {"reward": 0.0}
+    assert numbers == [[0, 1], [0, 1]]
+
+
+def test_info_has_the_names_of_highway_env() -> None:
+    alone, batch = gym.make("rare_envs/CutIn-v0"), gym.make_vec("rare_envs/CutIn-v0", num_envs=2)
+    x = {"ego_speed": 20.0, "cut_in_speed": 20.0, "cut_in_gap": 50.0}
+    one, many = alone.reset(seed=0, options=x)[1], batch.reset(seed=0, options=x)[1]
+    assert (one["speed"], one["crashed"]) == (20.0, False)
+    assert many["speed"].tolist() == [20.0, 20.0]
+    brake = np.array([-1.0, 0.0], np.float32)  # 5 m/s^2 for a tick of 0.1 s
+    assert alone.step(brake)[4]["speed"] == pytest.approx(19.5)
+    np.testing.assert_allclose(batch.step(np.stack([brake, brake]))[4]["speed"], 19.5, rtol=1e-6)

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from scipy.stats import kstest
 
 import rare_envs
 from rare_envs.distributions.beta import BetaDistribution
@@ -37,6 +38,8 @@ def test_shipped_bases_fit_their_scenario(scenario: Scenario, base: str) -> None
     assert np.isfinite(space.log_prob(x)).all()
     back = space.from_standard_normal(space.to_standard_normal(x))
     np.testing.assert_allclose(back, x, atol=1e-8)
+    if scenario.drivers is None:
+        assert min(kstest(column, "norm").pvalue for column in space.to_standard_normal(x).T) > 1e-5
 
 
 def test_a_file_is_read_once_until_it_changes_and_knows_the_bases_of_its_own_scenario(tmp_path: Path) -> None:

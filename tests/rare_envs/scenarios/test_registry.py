@@ -65,13 +65,7 @@ def test_scenarios_by_id_and_by_name_are_the_same() -> None:
     ]:
         assert find_scenario(env_id) is scenario_named(name) is SCENARIOS[env_id]
         assert scenario_named(name).name == name
-
-
-def test_unknown_scenario() -> None:
-    with pytest.raises(
-        ValueError,
-        match=r"^Unknown scenario 'cutin' \(did you mean 'cut_in'\?\); there are car_following, cut_in, highway",
-    ):
+    with pytest.raises(ValueError, match=r"^Unknown scenario 'cutin' \(did you mean 'cut_in'\?\); there are car_foll"):
         scenario_named("cutin")
 
 
@@ -86,7 +80,6 @@ def test_unknown_scenario() -> None:
             "highway",
             r"^Unknown environment 'highway'.*; the environments are rare_envs/CarFollowing-v0, rare_envs/CutIn",
         ),
-        ("my-highway-v0", "^Unknown environment 'my-highway-v0'"),
         (None, "^Unknown environment None; the environments are rare_envs/CarFollowing-v0, "),
         (["rare_envs/CutIn-v0"], r"^Unknown environment \['rare_envs/CutIn-v0'\]"),
         (
@@ -96,7 +89,7 @@ def test_unknown_scenario() -> None:
         ),
         *(
             (name, rf"rare_envs.highway_env_problem\('{name}', ego=...\)\. The environments here are rare_envs/CarFoll")
-            for name in ("highway-v0", "highway-fast-v0", "merge-v0", "intersection-v1", "roundabout-v0")
+            for name in ("highway-fast-v0", "roundabout-v0")
         ),
     ],
 )

@@ -116,6 +116,3 @@ def test_four_seconds_are_the_first_version_to_the_bit() -> None:
     assert (second.evaluate(np.column_stack([x, np.full(400, CUT_IN_DURATION)])) == f).all()
     slow, fast = (second.evaluate(np.column_stack([x, np.full(400, seconds)])) for seconds in (8.0, 2.0))
     assert (slow <= 0.0).sum() > (f <= 0.0).sum() > (fast <= 0.0).sum() > 0
-
-
-# --- bases of the second version ------------------------------------------------------------------

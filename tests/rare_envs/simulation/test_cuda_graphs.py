@@ -93,17 +93,14 @@ def own_gap(moment: Moment) -> torch.Tensor:
     return moment.lead.gap
 
 
-@pytest.mark.parametrize("ego", ["idm", "human", "noisy:idm"])
-def test_egos_of_this_package_are_recorded(ego: str) -> None:
-    assert is_recordable(World(CUT_IN), as_driver(agents.load_ego(ego), World(CUT_IN)))
+def test_egos_and_drivers_of_this_package_are_recorded() -> None:
+    for ego in ("idm", "human", "noisy:idm"):
+        assert is_recordable(World(CUT_IN), as_driver(agents.load_ego(ego), World(CUT_IN)))
+    for drivers in (agents.load_driver("mgail"), LaneChangingDriver(), agents.load_driver("idm")):
+        assert is_recordable(World(HIGHWAY, background=drivers), IDM())
 
 
-@pytest.mark.parametrize("drivers", [agents.load_driver("mgail"), LaneChangingDriver(), agents.load_driver("idm")])
-def test_drivers_of_this_package_are_recorded(drivers: Any) -> None:
-    assert is_recordable(World(HIGHWAY, background=drivers), IDM())
-
-
-def test_what_a_user_made_of_a_driver_is_not_recorded() -> None:
+def test_what_a_user_made_of_a_driver_or_a_scenario_is_not_recorded() -> None:
     class Hesitant(IDM):
         """Its class says nothing, and what it inherits does not count."""
 
@@ -111,6 +108,7 @@ def test_what_a_user_made_of_a_driver_is_not_recorded() -> None:
         """Rules of one's own."""
 
     assert not is_recordable(World(CUT_IN), Hesitant())
+    assert not is_recordable(World(replace(CUT_IN, initial=lambda x: CUT_IN.initial(x))), IDM())
     behind = replace(as_driver(agents.load_ego("noisy:idm"), World(CUT_IN)), inner=Hesitant())
     assert not is_recordable(World(CUT_IN), behind)
     driver: Any = agents.load_driver("mgail")
@@ -127,7 +125,3 @@ def test_measures_of_this_package_are_recorded_with_their_terms_and_users_are_no
     assert is_recordable(World(CUT_IN, measurement=Measurement(tracked)), IDM())
     for own in (own_gap, Measure(own_gap)):
         assert not is_recordable(World(CUT_IN, measurement=Measurement(own)), IDM())
-
-
-def test_scenarios_of_users_are_not_recorded() -> None:
-    assert not is_recordable(World(replace(CUT_IN, initial=lambda x: CUT_IN.initial(x))), IDM())

@@ -1,14 +1,22 @@
 """Episodes: their clock, f, what counts as a collision, and statistics of who crashed with whom."""
 
 import math
+from dataclasses import dataclass, replace
+from typing import Any
 
+import gymnasium as gym
+import numpy as np
 import pytest
 import torch
+from torch import Tensor
 
-from rare_envs.measures import MEASURES, TTC_MAX
+from rare_envs.control.actions import FASTER, IDLE
+from rare_envs.measures import TTC_MAX
 from rare_envs.scenarios.car_following import CAR_FOLLOWING
 from rare_envs.scenarios.cut_in import CUT_IN
-from rare_envs.simulation.episode import Clock, Measurement
+from rare_envs.simulation.decision import advance, reward_terms
+from rare_envs.simulation.episode import Clock, Episode, Measurement
+from rare_envs.simulation.rollout import drive, rollout
 from rare_envs.simulation.world import World
 from rare_envs.traffic.crash import CRASH_KINDS, NONE
 
@@ -55,12 +63,6 @@ def test_unknown_measures_and_collisions_are_refused() -> None:
         Measurement(collisions="all")
 
 
-def test_only_measures_of_whole_episodes_record() -> None:
-    assert Measurement("pet").episode_measure.records
-    assert not Measurement("ttc").episode_measure.records
-    assert Measurement(lambda moment: moment.state.x[:, 0]).episode_measure not in MEASURES.values()
-
-
 def test_the_least_time_to_collision_is_kept_whatever_the_measure() -> None:
     """Closing at 5 m/s from 30 m, then the ego brakes: least at the start; a lead that brakes: it falls."""
     for measure in ("ttc", "thw"):
@@ -104,3 +106,99 @@ def test_a_crash_of_others_does_not_hide_that_of_the_ego() -> None:
     assert episode.statistics is not None
     assert int(episode.statistics.own.kind) == NONE
     assert CRASH_KINDS[int(episode.statistics.crash.kind)] == "others"
+
+
+X = torch.tensor([[20.0, 20.0, 60.0]])
+
+
+class Coasting:
+    def act(self, episode: Episode, memory: Any) -> tuple[Tensor, Any]:
+        return torch.zeros(len(episode.collided), 2), (memory or 0) + 1
+
+
+@dataclass(frozen=True)
+class Shaken:
+    """A driver whose acceleration is its noise."""
+
+    draws: Tensor | None = None
+    noise_columns: int = 3
+
+    def with_draws(self, draws: Tensor) -> "Shaken":
+        return replace(self, draws=draws)
+
+    def act(self, episode: Episode, memory: Any) -> tuple[Tensor, Any]:
+        assert self.draws is not None
+        tick = memory or 0
+        return torch.stack((self.draws[:, tick], torch.zeros(len(self.draws))), dim=1), tick + 1
+
+
+def test_one_moment_at_time_0_and_one_after_each_tick() -> None:
+    episodes = list(drive(World(CAR_FOLLOWING, clock=Clock(horizon=0.5)), Coasting(), X))
+    assert len(episodes) == 6
+    assert [float(each.state.x[0, 0]) for each in episodes] == pytest.approx([2.0 * k for k in range(6)])
+
+
+def test_the_last_columns_of_x_are_the_egos_noise() -> None:
+    world = World(CAR_FOLLOWING, clock=Clock(horizon=0.3))
+    end = rollout(world, Shaken(), torch.cat((X, torch.tensor([[1.0, 2.0, -4.0]])), dim=1))
+    assert float(end.state.speed[0, 0]) == pytest.approx(20.0 + 0.1 * (1.0 + 2.0 - 4.0))
+    fixed = rollout(world, Shaken(torch.ones(1, 3), noise_columns=0), X)  # its noise is not part of x
+    assert float(fixed.state.speed[0, 0]) == pytest.approx(20.3)
+
+
+def test_meta_actions_are_decoded_in_the_loop() -> None:
+    class Faster:
+        def act(self, episode: Episode, memory: Any) -> tuple[Tensor, Any]:
+            tick = memory or 0
+            return torch.full((len(episode.collided),), IDLE if tick else FASTER), tick + 1
+
+    world = World(CAR_FOLLOWING, clock=Clock(horizon=5.0, action="meta"))
+    speed = [float(each.state.speed[0, 0]) for each in drive(world, Faster(), X)]
+    # towards 25 m/s with a time constant of 0.6 s: each tick closes a sixth of the distance
+    assert speed == pytest.approx([25.0 - 5.0 * (5.0 / 6.0) ** k for k in range(51)], rel=1e-5)
+
+
+def test_a_continuous_action_is_one_tick() -> None:
+    world = World(CAR_FOLLOWING)
+    episode = world.start(torch.tensor([[20.0, 15.0, 30.0]]))
+    action = torch.tensor([[1.0, 0.0]])
+    result, expected = advance(world, episode, action), world.step(episode, action)
+    assert torch.equal(result.episode.state.x, expected.state.x)
+    assert torch.equal(result.terms.total, reward_terms(expected, action).total)
+
+
+def test_the_reward_of_a_meta_action_is_the_mean_over_its_ticks() -> None:
+    """20 m/s is a target speed, so the ego coasts; ticks after a collision count as 0."""
+    world = World(CAR_FOLLOWING, clock=Clock(horizon=2.0, action="meta"))
+    episode = world.start(torch.tensor([[20.0, 10.0, 80.0], [20.0, 10.0, 3.5]]))
+    seen = []
+    result = advance(world, episode, torch.tensor([IDLE, IDLE]), watch=seen.append)
+    assert len(seen) == 10
+    assert float(result.terms.progress[0]) == pytest.approx(20.0 / 21.72)
+    # 3.5 m at 10 m/s: the bodies overlap after the fourth tick
+    assert result.episode.collided.tolist() == [False, True]
+    assert float(result.terms.progress[1]) == pytest.approx(0.4 * 20.0 / 21.72)
+    assert float(result.terms.collision[1]) == pytest.approx(-3.0)
+    assert torch.equal(result.episode.state.x[1], seen[3].state.x[1])  # it stays as it was then
+
+
+def test_reward_by_hand() -> None:
+    env = gym.make("rare_envs/CarFollowing-v0")
+    env.reset(options={"x": [20.0, 15.0, 14.5]})
+    _, reward, _, _, info = env.step(np.array([0.5, 0.0]))
+    # after the tick: speed 20.25, gap 14.5 - 0.5 = 14, closing at 5.25
+    terms = {
+        "progress": 20.25 / 21.72,
+        "comfort": -0.1 * 0.5**2,
+        "lane": 0.0,
+        "risk": -(1.0 - (14.0 / 5.25) / 4.0),
+        "headway": -0.5 * (1.0 - 14.0 / 22.25),
+        "collision": 0.0,
+    }
+    assert info["reward_terms"] == pytest.approx(terms, abs=1e-6)
+    assert reward == pytest.approx(sum(terms.values()), abs=1e-6)
+    env.reset(options={"x": [20.0, 15.0, 1.0]})
+    for _ in range(3):
+        _, _, terminated, _, info = env.step(np.array([1.0, 0.0]))
+    assert terminated
+    assert info["reward_terms"]["collision"] == -30.0

@@ -12,12 +12,8 @@ from tests.rare_envs.traffic_states import F64, traffic
 
 def test_lead_is_the_nearest_ahead_that_reaches_into_the_lane() -> None:
     ego = (0.0, 0.0, 0.0, 20.0)
-    far, near, beside, behind = (
-        (60.0, 0.0, 0.0, 15.0),
-        (30.0, 2.9, 0.0, 12.0),
-        (20.0, 3.1, 0.0, 5.0),
-        (-8.0, 0, 0, 30.0),
-    )
+    far, near = (60.0, 0.0, 0.0, 15.0), (30.0, 2.9, 0.0, 12.0)
+    beside, behind = (20.0, 3.1, 0.0, 5.0), (-8.0, 0.0, 0.0, 30.0)
     lead = lead_of(traffic(ego, far, near, beside, behind), straight(2))
     assert (lead.gap.item(), lead.closing_speed.item()) == (25.0, 8.0)
     nobody = lead_of(traffic(ego, beside, behind), straight(2))

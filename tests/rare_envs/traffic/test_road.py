@@ -6,14 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from rare_envs.control.idm import IDM
-from rare_envs.distributions.space import Parameter
-from rare_envs.scenarios.base import Others, Scenario, columns
-from rare_envs.simulation.rollout import drive
-from rare_envs.simulation.world import World
 from rare_envs.traffic import road as reference_line
 from rare_envs.traffic.road import ReferenceLine, Road, i80, straight
-from rare_envs.traffic.state import State
 from rare_envs.traffic.vehicle_models import point_mass
 
 F64 = torch.float64
@@ -145,69 +139,3 @@ def test_gradients(road: Road) -> None:
         return point_mass(*state, 0.1, road.curvature(state[0]))
 
     assert torch.autograd.gradcheck(step, (x, y, heading, speed, acceleration, rate))
-
-
-def test_point_mass_by_hand() -> None:
-    state = [torch.tensor(v, dtype=F64) for v in (10.0, 1.0, 0.3, 20.0)]
-    action = [torch.tensor(v, dtype=F64) for v in (-2.0, 0.5)]
-    moved = point_mass(*state, *action, 0.1)
-    wanted = (10.0 + 2.0 * math.cos(0.3), 1.0 + 2.0 * math.sin(0.3), 0.35, 19.8)
-    assert [v.item() for v in moved] == pytest.approx(wanted)
-    *_, speed = point_mass(*state[:3], torch.tensor(0.1, dtype=F64), *action, 0.1)
-    assert speed.item() == 0.0
-
-
-@CURVED
-def test_a_car_that_turns_with_the_road_stays_in_its_lane(road: Road) -> None:
-    y0, speed, dt = 4.0, 20.0, 0.1
-    state = [torch.tensor(v, dtype=F64) for v in (0.0, y0, 0.0, speed)]
-    zero = torch.zeros((), dtype=F64)
-    for _ in range(300):
-        curvature = road.curvature(state[0])
-        rate = curvature * speed / (1.0 - curvature * state[1])
-        state = list(point_mass(*state, zero, rate, dt, curvature))
-    assert (state[1].item(), state[2].item()) == pytest.approx((y0, 0.0), abs=1e-12)
-    # in the world it went 600 m along its own line, which is longer than the reference line where that turns left
-    assert road.reference_line is not None
-    s = torch.arange(0.0, state[0].item(), 0.01, dtype=F64)
-    own_line = state[0].item() - y0 * float(road.reference_line.at(s[-1]).heading)
-    assert own_line == pytest.approx(600.0, abs=0.05)
-
-
-def others(state: State, dt: float) -> Others:
-    x, y, heading, speed, _ = (field[:, 1:] for field in state)
-    return Others(x + speed * dt, y, heading, speed)
-
-
-@pytest.mark.parametrize("dtype", [torch.float32, F64])
-def test_an_ego_keeps_its_lane_of_the_i80(dtype: torch.dtype) -> None:
-    def initial(x: torch.Tensor) -> State:
-        ones = torch.ones_like(x[:, 0])
-        return State(
-            columns(0 * ones, 60 * ones),
-            columns(x[:, 0], 11 * ones),
-            columns(*[0 * ones] * 2),
-            columns(*[25 * ones] * 2),
-            x[:, :0],
-        )
-
-    road = i80()
-    script = Scenario(
-        name="drive",
-        road=road,
-        vehicle_names=("ego", "other"),
-        horizon=30.0,
-        parameters=(Parameter("y", "m", -2.0, 30.0, "initial place across the road"),),
-        bases={"even": {"alpha": [1.0], "beta": [1.0]}},
-        initial=initial,
-        others=others,
-        driven=lambda state, action, dt: others(state, dt),
-    )
-    world = World(script)
-    starts = torch.tensor([[road.centre(lane) + 0.8] for lane in range(6)], dtype=dtype)
-    episodes = list(drive(world, IDM(desired_speed=25.0), starts))
-    assert not episodes[-1].collided.any()
-    y = torch.stack([episode.state.y[:, 0] for episode in episodes[50:]])
-    off = (y - torch.tensor([road.centre(lane) for lane in range(6)], dtype=dtype)).abs().amax(0)
-    assert (off < 0.02).all()  # 0.12 v^2 / R at 25 m/s and R = 3600 m
-    assert (off > 0.005).all()  # the road does turn

@@ -58,16 +58,9 @@ class SlowRoad:
 def picture(
     vehicles: Array, road: Road, camera: Camera, fog: float, elevation: float, azimuth: float, seen_from: int = 0
 ) -> Array:
-    """Colours from 0 to 255, not rounded, shape (H, W, 3).
+    """Colours from 0 to 255, not rounded, (H, W, 3), of vehicles (N, 3) with s, t and heading in the road.
 
-    Args:
-        vehicles: s, t and heading of each in the road, shape (N, 3).
-        road: The road.
-        camera: The camera.
-        fog: [1/m].
-        elevation: Of the sun [rad].
-        azimuth: Of the sun, from the world's X axis to the right [rad].
-        seen_from: Which vehicle has the camera.
+    Fog is in 1/m, elevation and azimuth of the sun, from the world's X axis to the right, are in rad.
     """
     slow = SlowRoad(road)
     placed = [slow.world(*vehicle) for vehicle in vehicles]

@@ -1,4 +1,4 @@
-"""Pictures against pencil and paper, against a slow renderer, and against themselves in other batches."""
+"""Cameras and their pictures: rays, a slow renderer, other batches, and sensor noise against its hash."""
 
 import math
 
@@ -6,94 +6,26 @@ import numpy as np
 import pytest
 import torch
 from numpy.typing import NDArray
-from scipy.spatial import ConvexHull
 
-from rare_envs.sensors.camera import Camera, CameraContext, Weather, clear_day
-from rare_envs.sensors.pictures import ASPHALT, BODY_HEIGHT, DASH, PERIOD, take_picture
-from rare_envs.traffic.road import Road, i80, straight
-from rare_envs.traffic.state import VEHICLE_LENGTH, VEHICLE_WIDTH, State
-from tests.rare_envs.sensors.camera.scenes import SHARPEST, weather
+from rare_envs.sensors.camera import Camera, CameraContext, Weather, clear_day, find_camera, pixels
+from rare_envs.sensors.pictures import draw_pixel_noise, take_picture
+from rare_envs.traffic.road import MAX_CURVATURE, ReferenceLine, Road, i80, straight
+from rare_envs.traffic.state import State
 from tests.rare_envs.sensors.camera.slow_camera import picture
 
 Array = NDArray[np.float64]
-LARGE = Camera(264, 800)
-OVERHEAD = (0.0, math.pi / 2, 0.0)
-"""No fog, and the sun where shadows are under their bodies."""
 
 
-def traffic(vehicles: list[list[float]] | Array) -> State:
-    """One scenario of vehicles with x, y and heading."""
-    x, y, heading = torch.tensor(np.array(vehicles), dtype=torch.float32).T.unsqueeze(1)
-    return State(x, y, heading, torch.zeros_like(x), torch.zeros(1, 0))
+def shot(vehicles: Array, road: Road, camera: Camera, sky: tuple[float, float, float]) -> Array:
+    """Take a picture of vehicles with x, y and heading under fog [1/m] and a sun of elevation and azimuth [rad]."""
+    x, y, heading = torch.tensor(vehicles, dtype=torch.float32).T.unsqueeze(1)
+    state = State(x, y, heading, torch.zeros_like(x), torch.zeros(1, 0))
+    weather = Weather(*torch.tensor([*sky, 0.0], dtype=torch.float32)[:, None], torch.tensor([0]))
+    return take_picture(state, road, CameraContext.at_start(camera, weather))[0].numpy().astype(float)
 
 
-def shot(
-    vehicles: list[list[float]] | Array, road: Road, camera: Camera = LARGE, sky: tuple[float, float, float] = OVERHEAD
-) -> Array:
-    image = take_picture(traffic(vehicles), road, CameraContext.at_start(camera, weather(*sky)))
-    return image[0].numpy().astype(float)
-
-
-def pinhole(camera: Camera, forward: float, right: float, up: float) -> tuple[float, float]:
-    """Column and row of a point ahead of the camera, by similar triangles."""
-    focal = camera.width / (2 * math.tan(camera.field_of_view / 2))
-    lower = math.atan2(camera.mount_height - up, forward) - camera.pitch  # angle below the axis
-    distance = math.hypot(forward, camera.mount_height - up)
-    depth = distance * math.cos(lower)
-    return camera.width / 2 + focal * right / depth, camera.height / 2 + focal * math.tan(lower)
-
-
-@pytest.mark.parametrize(
-    ("x", "y", "heading"), [(12.0, 0.0, 0.0), (30.0, 4.0, 0.0), (15.0, -3.5, 0.3), (60.0, 1.0, -0.2), (9.0, 3.0, 0.1)]
-)
-@pytest.mark.parametrize("camera", [LARGE, Camera(400, 600, 1.4, -0.02, 1.1, 1.5, -0.4, 0.15)], ids=["usual", "other"])
-def test_a_body_is_where_its_projected_corners_are(x: float, y: float, heading: float, camera: Camera) -> None:
-    far = [-500.0, 0.0, 0.0]
-    with_it = shot([[0.0, 0.0, 0.0], [x, y, heading]], straight(3), camera)
-    without = shot([[0.0, 0.0, 0.0], far], straight(3), camera)
-    seen = np.abs(with_it - without).max(axis=2) > 0
-    corners = []
-    for along, across, up in np.ndindex(2, 2, 2):
-        dx, dy = (along - 0.5) * VEHICLE_LENGTH, (across - 0.5) * VEHICLE_WIDTH
-        forward = x + dx * math.cos(heading) - dy * math.sin(heading) - camera.mount_ahead
-        right = y + dx * math.sin(heading) + dy * math.cos(heading) - camera.mount_right
-        cos, sin = math.cos(camera.yaw), math.sin(camera.yaw)
-        corners.append(pinhole(camera, forward * cos + right * sin, right * cos - forward * sin, up * BODY_HEIGHT))
-    sides = ConvexHull(np.array(corners)).equations  # a point is inside where all sides @ (column, row, 1) < 0
-    row, column = np.indices(seen.shape) + 0.5
-    outside = (sides @ np.stack((column, row, np.ones_like(row))).reshape(3, -1)).max(axis=0).reshape(seen.shape)
-    assert seen[outside < -0.02].all()
-    assert not seen[outside > 0.02].any()  # pixels
-
-
-@pytest.mark.parametrize("heading", [0.0, 0.05])
-def test_lane_lines_are_where_they_are_projected(heading: float) -> None:
-    road, y = straight(3), 3.0
-    image = shot([[0.0, y, heading], [-500.0, 0.0, 0.0]], road)
-    brightness = image.sum(axis=2) - 255 * sum(ASPHALT) * 1.1
-    cos, sin, checked = math.cos(heading), math.sin(heading), 0
-    for row in range(110, LARGE.height):
-        lower = math.atan((row + 0.5 - LARGE.height / 2) / LARGE.focal) + LARGE.pitch
-        forward = LARGE.mount_height / math.tan(lower)  # where the middle of the row meets the ground
-        length = forward**2 / (LARGE.mount_height * LARGE.focal)  # how much ground a row sees, nearly
-        for edge in road.edges[1:]:
-            right = (edge - y - (LARGE.mount_ahead + forward) * sin) / cos
-            along = ((LARGE.mount_ahead + forward) * cos - right * sin) % PERIOD
-            column, _ = pinhole(LARGE, forward, right, 0.0)
-            near_end = min(along, abs(along - DASH), PERIOD - along) < 0.6 * length
-            if not 12 <= column <= LARGE.width - 12 or (edge < road.edges[-1] and near_end):
-                continue
-            around = slice(int(column) - 11, int(column) + 12)
-            line = brightness[row, around].clip(0.0)
-            if edge < road.edges[-1] and along > DASH:
-                assert line.max() < 5.0
-                continue
-            place = (line * (np.arange(around.start, around.stop) + 0.5)).sum() / line.sum()
-            assert place == pytest.approx(column, abs=0.5)
-            checked += 1
-    assert checked > 50
-
-
+SHARPEST = Road((-2.0, 2.0, 6.0), ReferenceLine(50.0, (0.0, MAX_CURVATURE, MAX_CURVATURE, 0.0)))
+"""A bend as sharp as roads may be."""
 SCENES = [
     (straight(2), Camera(16, 44), (1.5e-4, 0.8, 2.1)),
     (straight(1), Camera(14, 36, 1.5, 0.1, 1.2), (0.02, 0.2, 2.8)),
@@ -151,3 +83,89 @@ def test_any_heading_and_place_gives_a_picture() -> None:
     for road in (straight(1), i80(), SHARPEST):
         images = take_picture(state, road, CameraContext.at_start(Camera(20, 40), clear_day(x)))
         assert images.float().std() > 10.0
+
+
+def test_rays_span_the_field_of_view() -> None:
+    camera = Camera(height=3, width=101, pitch=0.0, field_of_view=math.radians(60.0))
+    ray = pixels(camera, torch.device("cpu")).ray.view(3, 3, 101)
+    middle_row = ray[:, 1].double()
+    torch.testing.assert_close(middle_row[:, 50], torch.tensor([1.0, 0.0, 0.0]).double())
+    # the middle of the last pixel is half a pixel inside the edge, which is at 30 degrees
+    assert middle_row[1, -1].item() == pytest.approx(math.tan(math.radians(30.0)) * 100 / 101, rel=1e-6)
+    torch.testing.assert_close(middle_row[1], -middle_row[1].flip(0))
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"height": 0},
+        {"width": 2.5},
+        {"field_of_view": math.pi},
+        {"mount_height": math.nan},
+    ],
+)
+def test_cameras_out_of_range_are_refused(settings: dict[str, float]) -> None:
+    with pytest.raises(ValueError, match=next(iter(settings))):
+        Camera(**settings)  # type: ignore[arg-type]
+
+
+def test_a_camera_by_its_size() -> None:
+    assert find_camera(None) == Camera()
+    assert find_camera([40, 120]) == Camera(40, 120)
+    with pytest.raises(ValueError, match="Camera or a size"):
+        find_camera("wide")
+
+
+N = 3 * 66 * 200
+"""Values of a picture."""
+KEYS = (0, 1, 2**30, 1065353216, 1065353217)
+GOLDEN = 2654435761
+"""2^32 over the golden ratio, a prime."""
+WORD = 2**32
+
+
+def cameras(*keys: int, tick: int = 0, viewer: int = 0) -> CameraContext:
+    context = CameraContext.at_start(Camera(), Weather(*torch.zeros(4, len(keys)), torch.tensor(keys)))
+    return context._replace(tick=context.tick + tick, viewer=viewer)
+
+
+def lowbias32(x: int) -> int:
+    """Wellons' mixing function, as published."""
+    x ^= x >> 16
+    x = x * 0x7FEB352D % WORD
+    x ^= x >> 15
+    x = x * 0x846CA68B % WORD
+    return x ^ x >> 16
+
+
+def slow_noise(key: int, tick: int, viewer: int, place: int) -> float:
+    """One value of the noise: the sum of the four bytes of a hash, less its mean, over its standard deviation."""
+    bits = key
+    for number in (tick, viewer):
+        bits = lowbias32((bits + (number + 1) * GOLDEN) % WORD)
+    bits = lowbias32((bits + place * GOLDEN) % WORD)
+    return (sum(bits.to_bytes(4, "big")) - 4 * 127.5) / math.sqrt(4 * (256**2 - 1) / 12)
+
+
+@pytest.mark.parametrize(("tick", "viewer"), [(0, 0), (1, 0), (99, 5)])
+def test_equal_to_the_hash_in_plain_integers(tick: int, viewer: int) -> None:
+    found = draw_pixel_noise(cameras(*KEYS, tick=tick, viewer=viewer), N)
+    for row, key in zip(found, KEYS, strict=True):
+        for place in (0, 1, 2, 255, 600, N - 1):
+            assert row[place].item() == pytest.approx(slow_noise(key, tick, viewer, place), abs=1e-6)
+
+
+def test_noise_is_white() -> None:
+    """Within pictures and between those of different keys, ticks and viewers."""
+    pictures = [
+        draw_pixel_noise(cameras(*KEYS, tick=tick, viewer=viewer), N) for tick, viewer in ((0, 0), (1, 0), (0, 1))
+    ]
+    for values in pictures:
+        assert values.mean(dim=1).abs().max() < 5 / math.sqrt(N)
+        assert (values.var(dim=1) - 1).abs().max() < 5 * math.sqrt(2 / N)
+        for lag in (1, 3, 600, 66 * 200):  # along rows, channels and columns
+            together = (values[:, lag:] * values[:, :-lag]).mean(dim=1)
+            assert together.abs().max() < 5 / math.sqrt(N - lag)
+    pairs = torch.cat(pictures)
+    across = torch.corrcoef(pairs) - torch.eye(len(pairs))
+    assert across.abs().max() < 5 / math.sqrt(N)
