@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy import stats
 from scipy.special import ndtri_exp
 
-from rare_envs.distributions.coordinates import Coordinates
+from rare_envs.distributions.coordinates import LEAST_DISTANCE, ClosingSpeed, Coordinates, as_finite, move_inside
 from rare_envs.distributions.mixture import CHUNK_ROWS, CoordinateMixture, TruncatedGaussianMixture
 
 
@@ -314,3 +314,58 @@ def test_bad_points_are_refused() -> None:
         FOLLOWING.to_standard_normal([[10.0, 10.0, 0.5]])
     with pytest.raises(ValueError, match=r"u\[0, 1\] = nan must be finite"):
         FOLLOWING.from_standard_normal([[0.0, np.nan, 0.0]])
+
+
+CLOSING = {"closing_behind": "v", "gap": "gap"}
+DRIVERS: dict[str, Any] = {
+    "names": ["v", "lead", "gap"],
+    "order": ["v", "gap", "lead"],
+    "coordinates": ["plain", CLOSING, "log"],
+    "low": [0.0, 5.0, 1.0],
+    "high": [45.0, 40.0, 150.0],
+}
+BEHIND = Coordinates.from_dict(DRIVERS)
+
+
+def test_dictionary_round_trip() -> None:
+    assert BEHIND.to_dict() == DRIVERS
+    assert Coordinates.from_dict({"low": [0.0], "high": [1.0]}).kinds == ("plain",)
+    assert BEHIND.kinds[1] == ClosingSpeed("v", "gap")
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"coordinates": ["plain", "sqrt", "log"]}, 'Unknown coordinate \'sqrt\'; known are "plain", "log" and'),
+        ({"coordinates": ["plain", {**CLOSING, "gap": "space"}, "log"]}, "names no column 'space'; columns are v, lea"),
+        (
+            {"coordinates": ["plain", {**CLOSING, "gap": "lead"}, "log"]},
+            "lead depends on lead, which must come earlier",
+        ),
+        ({"order": ["v", "lead", "gap"]}, "of lead depends on gap, which must come earlier in order; order is v, lead"),
+        ({"order": ["v", "gap"]}, "order must have each of the columns v, lead, gap once, got v, gap"),
+        ({"names": ["v", "lead"]}, "Expected 3 different names, one for each column, got v, lead"),
+        ({"coordinates": ["log"]}, r"low of shape \(1,\), one for each column, got \(3,\)"),
+        ({"low": [0.0, 5.0, 0.0]}, "The gap 'gap' of the closing speed of lead needs a positive low"),
+        ({"low": [0.0, 50.0, 1.0]}, r"low must be below high, got \[50, 40\] at coordinate 1"),
+    ],
+)
+def test_wrong_coordinates_are_refused_in_one_line(change: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message) as caught:
+        Coordinates.from_dict({**DRIVERS, **change})
+    assert "\n" not in str(caught.value)
+
+
+def test_a_missing_end_of_the_box_is_named() -> None:
+    with pytest.raises(ValueError, match="Missing high; needed are low and high"):
+        Coordinates.from_dict({key: value for key, value in DRIVERS.items() if key != "high"})
+
+
+def test_values_move_off_the_ends_by_one_float() -> None:
+    ends = move_inside(np.array([1.0, 1.5, 2.0]), 1.0, 2.0)
+    assert ends.tolist() == [np.nextafter(1.0, 2.0), 1.5, np.nextafter(2.0, 1.0)]
+    at_zero = move_inside(np.array([0.0, -0.5]), np.array([0.0, -1.0]), np.array([1.0, 0.0]))
+    assert at_zero.tolist() == [LEAST_DISTANCE, -0.5]
+    assert move_inside(np.array([0.0]), -1.0, 0.0).tolist() == [-LEAST_DISTANCE]
+    with pytest.raises(ValueError, match="gaps must be finite"):
+        as_finite("gaps", [1.0, np.inf])

@@ -37,19 +37,6 @@ class Declared:
         return (np.ones(len(observation), np.int64) if chooses else np.zeros((len(observation), 2))), None
 
 
-@pytest.mark.parametrize(
-    ("space", "vehicles", "fitting"),
-    [
-        (observation_space(3, "lidar"), 3, ("lidar",)),
-        (observation_space(13, "lidar"), 13, ("features", "lidar")),  # as many numbers as the lidar has
-        (spaces.Dict({}), 3, ()),
-        (None, 3, ("features",)),
-    ],
-)
-def test_what_it_observes_is_read_from_its_space(space: Any, vehicles: int, fitting: tuple[str, ...]) -> None:
-    assert resolve(Declared(observation_space=space), vehicles).observations == fitting
-
-
 def test_a_wrapped_ego_needs_what_the_one_behind_it_needs_and_its_own_noise() -> None:
     class Behind:
         ego: ClassVar[Any] = Declared(observation_space=observation_space(3, "lidar"), dt=0.2, deterministic=False)
@@ -78,6 +65,8 @@ def idle(observed: Any = None, acted: Any = None) -> Declared:
 @pytest.mark.parametrize(
     ("space", "fitting"),
     [
+        (None, ("features",)),
+        (observation_space(3, "lidar"), ("lidar",)),
         (spaces.Box(-5, 5, (44,)), ("features",)),  # four frames side by side
         (spaces.Box(-5, 5, (4, 51)), ("lidar",)),
         (spaces.Box(0, 255, (12, 40, 80), np.uint8), ("camera",)),  # four frames of another size, channels first
@@ -90,7 +79,7 @@ def idle(observed: Any = None, acted: Any = None) -> Declared:
         ("Box", ()),
     ],
 )
-def test_what_else_fits(space: Any, fitting: tuple[str, ...]) -> None:
+def test_what_it_observes_is_read_from_its_space(space: Any, fitting: tuple[str, ...]) -> None:
     assert find_fitting_kinds(space, vehicles=3) == fitting
 
 

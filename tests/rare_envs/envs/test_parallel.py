@@ -183,18 +183,6 @@ def test_bad_actions_and_options():
     assert set(observations) == {"ego", "cutter"}
 
 
-@pytest.mark.parametrize("make", [rare_envs.parallel_env, rare_envs.env], ids=["parallel", "in turn"])
-def test_the_state_lies_in_the_state_space(make):
-    """As trainers with a central critic take it: every vehicle, also those that nobody commands."""
-    world = make("rare_envs/CutIn-v1")
-    world.reset(seed=1)
-    state = world.state()
-    assert world.state_space.contains(state)
-    assert state.shape == (3, 4)
-    world.reset(seed=2)
-    assert (world.state() != state).any()
-
-
 def test_a_row_of_a_batch_is_the_episode_alone():
     world, space = set_up(CUT_IN, horizon=5.0)
     x = torch.from_numpy(space.sample(32, np.random.default_rng(0))).float()
@@ -213,28 +201,6 @@ def test_a_row_of_a_batch_is_the_episode_alone():
             assert torch.equal(together.disabled[k], alone[k].disabled[0])
     assert together.disabled.any()
     assert not together.disabled.all()
-
-
-def test_contacts_of_others_are_noted_and_change_nothing():
-    """A cutter much faster than the lead runs into it while the ego is far behind: as in the environment of one."""
-    world, _ = set_up(CUT_IN)
-    x = torch.tensor([[5.0, 40.0, 5.0, 60.0, 60.0, 2.2]])
-    together, episode = start(world, x), world.start(x)
-    nobody = torch.zeros(1, 3, dtype=torch.bool)
-    for _ in range(60):
-        together = step_traffic(world, together, torch.zeros(1, 3, 2), nobody)
-        episode = world.step(episode, torch.zeros(1, 2))
-    assert together.collided.tolist() == [[False, True, True]]
-    assert not together.disabled.any()
-    assert torch.equal(together.traffic.state.x, episode.state.x)
-
-
-def test_a_disabled_vehicle_rolls_out():
-    """It loses a tenth of its speed every tick of 0.1 s, whatever its action."""
-    world, _ = set_up("rare_envs/CarFollowing-v0")
-    episode = start(world, torch.tensor([[20.0, 10.0, 100.0]]))._replace(disabled=torch.tensor([[False, True]]))
-    episode = step_traffic(world, episode, torch.full((1, 2, 2), 3.0), torch.tensor([[True, True]]))
-    torch.testing.assert_close(episode.traffic.state.speed[0, 1], torch.tensor(9.0))
 
 
 def test_the_adversarys_reward_by_hand():

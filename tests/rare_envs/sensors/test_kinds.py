@@ -1,15 +1,9 @@
 """Kinds of observation, and HighwayEnv's kinematics."""
 
-import math
-
 import pytest
-import torch
 
 from rare_envs.sensors.kinds import (
-    KINEMATICS_FEATURES,
-    KINEMATICS_ROWS,
     kinds_of,
-    kinematics_space,
     observe_kinematics,
     read_kinds,
 )
@@ -50,31 +44,6 @@ def places(state: State, vehicle: int = 0) -> list[float]:
     rows = observe_kinematics(state, straight(2), vehicle)[0, 1:]
     assert not rows[rows[:, 0] == 0].any()  # who is missing is all zeros
     return (200.0 * rows[rows[:, 0] == 1, 1]).tolist()
-
-
-def test_features_are_scaled_and_those_of_others_relative() -> None:
-    """Three lanes of 4 m; the other's velocity is 8 m/s along and 6 m/s across."""
-    other = (50.0, 8.0, math.atan2(6.0, 8.0), 10.0)
-    rows = observe_kinematics(traffic((20.0, 4.0, 0.0, 30.0), other), straight(3))[0]
-    assert KINEMATICS_FEATURES == ("presence", "x", "y", "vx", "vy")
-    assert rows[0].tolist() == pytest.approx([1.0, 20 / 200, 4 / 12, 30 / 80, 0.0])
-    assert rows[1].tolist() == pytest.approx([1.0, 30 / 200, 4 / 12, (8 - 30) / 80, 6 / 80])
-    assert not rows[2:].any()
-    assert (rows.shape, rows.dtype) == ((KINEMATICS_ROWS, 5), torch.float32)
-    assert kinematics_space().contains(rows.numpy())
-
-
-def test_vehicles_are_seen_200_m_around_and_10_m_behind() -> None:
-    for x, y, seen in [
-        (199.9, 0.0, True),
-        (200.0, 0.0, False),
-        (199.0, 19.0, True),  # 199.9 m away
-        (199.0, 21.0, False),  # 200.1 m
-        (-9.9, 4.0, True),
-        (-10.0, 4.0, False),
-        (0.0, -30.0, True),
-    ]:
-        assert len(places(traffic(EGO, still(x, y)))) == seen, (x, y)
 
 
 def test_the_nearest_four_along_the_road_come_first_and_in_the_order_of_the_state_if_level() -> None:

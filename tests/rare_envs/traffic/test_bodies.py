@@ -97,37 +97,12 @@ def separation_at(scene: np.ndarray, time: float) -> float:
     return nearest(*bodies(scene, time))[0]
 
 
-@pytest.mark.parametrize(
-    ("dx", "dy", "turn", "overlap"),
-    [
-        (4.99, 0.0, 0.0, True),
-        (5.01, 0.0, 0.0, False),
-        (0.0, 1.99, 0.0, True),
-        (0.0, 2.01, 0.0, False),
-        (3.49, 0.0, math.pi / 2, True),  # 2.5 + 1
-        (3.51, 0.0, math.pi / 2, False),
-        # a box turned by 45 degrees has its nearest corner (5 + 2) / 2 / sqrt(2) = 2.4749 along
-        # and (5 - 2) / 2 / sqrt(2) = 1.06 across from its centre
-        (2.5 + 2.47, 1.06, math.pi / 4, True),
-        (2.5 + 2.48, 1.06, math.pi / 4, False),
-        # within reach on both axes of the first box, apart on an axis of the turned one
-        (4.6, 2.6, math.pi / 4, False),
-        (0.0, 0.0, 1.0, True),
-    ],
-)
-def test_box_overlap(dx: float, dy: float, turn: float, overlap: bool) -> None:
-    for rotation in (0.0, 0.7, -2.0):  # the answer does not depend on the frame
-        c, s = math.cos(rotation), math.sin(rotation)
-        turned = (tensor(c * dx - s * dy), tensor(s * dx + c * dy))
-        assert boxes_overlap(*turned, tensor(rotation), tensor(rotation + turn)).item() is overlap
-
-
 def test_overlap_is_a_negative_separation() -> None:
-    """Two formulas, one answer: of two million boxes near each other none is told differently."""
+    """Two formulas, one answer: of 400,000 boxes near each other none is told differently."""
     generator = torch.Generator().manual_seed(0)
     for dtype in (torch.float32, F64):
         dx, dy, heading, other = (
-            width * (2.0 * torch.rand(1_000_000, generator=generator, dtype=dtype) - 1.0)
+            width * (2.0 * torch.rand(200_000, generator=generator, dtype=dtype) - 1.0)
             for width in (6.0, 6.0, math.pi, math.pi)
         )
         overlapping = boxes_overlap(dx, dy, heading, other)

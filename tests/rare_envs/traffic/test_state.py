@@ -25,16 +25,6 @@ def test_another_vehicle_takes_the_place_of_the_ego_and_the_rest_keep_their_orde
         assert seen.theta is state.theta
 
 
-def test_vehicles_and_fields_are_the_same_numbers_however_the_state_was_made() -> None:
-    state = numbered(3)
-    made = State.of_vehicles(state.vehicles, state.theta)
-    assert all(map(torch.equal, made, state))
-    for number, (known, viewed) in enumerate(zip(made.vehicles, state.vehicles, strict=True)):
-        for own, field, column in zip(known, made[:4], viewed, strict=True):
-            assert torch.equal(own, column)
-            assert own.data_ptr() == field[:, number].data_ptr()
-
-
 def test_a_changed_or_copied_state_has_its_own_vehicles() -> None:
     state = State.of_vehicles(numbered(2).vehicles, torch.zeros(2, 0))
     faster = state._replace(speed=state.speed + 1)

@@ -7,13 +7,10 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch
-from numpy.typing import NDArray
 from scipy import stats
 from torch import Tensor
 
 import rare_envs
-import samplers
-from rare_envs.distributions.product import join_independent
 from rare_envs.sensors.camera import (
     CONDITIONS,
     FOG_DISTRIBUTION,
@@ -65,24 +62,6 @@ def test_distributions_and_their_maps(distribution: Any) -> None:
     expected = (stats.norm.logpdf(u) + np.log(slopes)).sum(axis=1)
     inner = (np.abs(u) < 3).all(axis=1)
     np.testing.assert_allclose(distribution.log_prob(x)[inner], expected[inner], atol=1e-3)
-
-
-def test_a_search_by_blocks_moves_the_weather() -> None:
-    """Cross-entropy in physical space finds fog and low sun; p is known."""
-
-    class FoggyEvening:
-        dim = 3
-        base = join_independent(FOG_DISTRIBUTION, SUN_DISTRIBUTION)
-
-        def evaluate(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
-            u = self.base.to_standard_normal(x)
-            return np.asarray(3.5 - (u[:, 0] - u[:, 1]) / math.sqrt(2.0))
-
-    method = samplers.CrossEntropy(family="blocks", n_iteration=1000, n_final=4000)
-    result = samplers.estimate(FoggyEvening(), method, gamma=0.0, seed=1)
-    assert result.p == pytest.approx(stats.norm.sf(3.5), rel=4 * result.cov)
-    assert result.cov < 0.15
-    assert result.interval[0] < stats.norm.sf(3.5) < result.interval[1]
 
 
 def test_on_the_highway_weather_stands_before_the_drivers_and_all_noise_behind() -> None:
