@@ -158,12 +158,12 @@ def test_wrong_parameters_are_refused():
             Mobil(**wrong)
 
 
-LANES, VEHICLES, STATES, DESIRED_SPEED = 4, 10, 1000, 30.0
+LANES, VEHICLES, STATES, DESIRED_SPEED = 4, 10, 400, 30.0
 
 
 @pytest.mark.parametrize("politeness", [0.0, 0.5])
 def test_decisions_are_those_of_highway_env(politeness, monkeypatch):
-    """1,000 random states, both sides of one vehicle each, under HighwayEnv's conventions; see `Mobil`."""
+    """400 random states, both sides of one vehicle each, under HighwayEnv's conventions; see `Mobil`."""
     monkeypatch.setattr(IDMVehicle, "POLITENESS", politeness)  # shipped as 0, which would leave a term untested
     rng = np.random.default_rng(5)
     lane = rng.integers(0, LANES, (STATES, VEHICLES))
@@ -187,5 +187,5 @@ def test_decisions_are_those_of_highway_env(politeness, monkeypatch):
         assert own[2] == lane[row, 0]
         for index in network.side_lanes(own):
             theirs[row, int(index[2] > own[2])] = road.vehicles[0].mobil(index)
-    assert 100 < theirs.sum() < STATES  # of both kinds there are many
+    assert 40 < theirs.sum() < STATES  # of both kinds there are many
     np.testing.assert_array_equal(ours, theirs)

@@ -196,7 +196,7 @@ def test_u_rises_with_its_own_column_and_faces_and_far_tails_are_finite(mixture:
     assert np.isfinite(mixture.to_standard_normal(corners)).all()
     outside = np.concatenate([mixture.low - 1e-9 * np.eye(mixture.dim), mixture.high + 1e-9 * np.eye(mixture.dim)])
     assert (mixture.log_prob(outside) == -np.inf).all()
-    x = mixture.from_standard_normal(np.random.default_rng(5).uniform(-38.0, 38.0, (30, mixture.dim)))
+    x = mixture.from_standard_normal(np.random.default_rng(5).uniform(-38.0, 38.0, (10, mixture.dim)))
     assert ((x > mixture.low) & (x < mixture.high)).all()
     assert np.isfinite(mixture.log_prob(x)).all()
 

@@ -6,7 +6,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch
-from stable_baselines3 import A2C, DQN, PPO, SAC
+from stable_baselines3 import A2C, PPO, SAC
 from stable_baselines3.common.torch_layers import FlattenExtractor
 from stable_baselines3.common.vec_env import VecNormalize
 
@@ -127,15 +127,6 @@ def test_statistics_that_leave_the_observations_as_they_are_are_not_applied(swit
         rare_envs.DrivingProblem(CUT_IN, ego=each, core="numba").evaluate(x) for each in (ego, make_cut_in())
     )
     assert np.array_equal(f, expected)
-
-
-def test_other_policies_are_asked_by_predict():
-    class Own(PPO):
-        """A PPO that may predict in another way."""
-
-    chooses = DQN("MlpPolicy", gym.make(CUT_IN, action="discrete"), device="cpu", buffer_size=10)
-    for policy in (chooses, make_cut_in(Own), make_cut_in(activation_fn=torch.nn.ELU), object()):
-        assert find_inference(policy) is policy
 
 
 def test_rollouts_are_those_of_predict_and_weights_are_read_for_each(monkeypatch):

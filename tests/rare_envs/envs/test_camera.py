@@ -77,6 +77,7 @@ def test_a_problem_and_an_environment_lead_to_the_same_end() -> None:
         assert info["measure"] == f[row]
 
 
+@pytest.mark.slow
 def test_stacked_frames_of_a_camera() -> None:
     settings: dict[str, Any] = {"observation": "camera", "camera": SMALL, "horizon": 0.5}
     stacked = VecFrameStack(sb3_vec_env(CUT_IN, num_envs=1, seed=0, **settings), n_stack=3)

@@ -94,6 +94,7 @@ def test_a_window(env_id, monkeypatch):
     env.close()
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(importlib.util.find_spec("moviepy") is None, reason="Gymnasium's RecordVideo needs moviepy")
 @pytest.mark.filterwarnings("ignore:invalid escape sequence")  # in moviepy 1's own text, when it is first compiled
 def test_gymnasium_records_a_video(tmp_path):

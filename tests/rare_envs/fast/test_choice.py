@@ -129,6 +129,7 @@ def test_the_lead_of_a_cut_in_that_begins_beside_its_line_is_on_it_after_a_tick_
     assert compiled.evaluate(x) == pytest.approx(reference.evaluate(x), abs=1e-4)
 
 
+@pytest.mark.slow
 def test_both_cores_are_asked_the_same_and_give_the_same_estimate() -> None:
     """Rounding of f moves weights by a millionth; another sequence of points would move p by tenths."""
     compiled, reference = (

@@ -8,7 +8,7 @@ from gymnasium.vector import AutoresetMode
 
 import rare_envs  # noqa: F401  (registers its ids)
 from rare_envs.fast import crashes as fast_crashes
-from rare_envs.fast.choice import find_scripted_step, scale_actions
+from rare_envs.fast.choice import find_scripted_step
 from rare_envs.fast.equations import RoadNumbers
 from rare_envs.simulation.episode import EpisodeStatistics
 from rare_envs.traffic import crash, straight
@@ -108,23 +108,6 @@ def test_states_in_double_precision_are_left_to_torch_or_refused(core):
     else:
         env.step(np.zeros(2, np.float32))
         assert env._episode.state.x.dtype == torch.float64
-
-
-@pytest.mark.parametrize(
-    ("action", "expected"),
-    [
-        (np.array([[2.0, -1.0]]), [[5.0, -0.1]]),
-        (np.array([0]), [[-5.0, 0.0]]),
-        (np.array([5]), None),
-        (np.array([0.0]), None),
-        (np.array([[np.inf, 0.0]]), None),
-        (np.array([["a", "b"]]), None),
-    ],
-)
-def test_actions_in_physical_units(action, expected):
-    found = scale_actions(action, 1)
-    assert (found is None) == (expected is None)
-    assert expected is None or np.allclose(found, expected)
 
 
 @pytest.mark.parametrize(

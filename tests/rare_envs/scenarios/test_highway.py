@@ -91,7 +91,7 @@ def test_learned_drivers_in_the_scripted_scenarios(env_id):
 
 def test_drivers_by_rule_have_neither_weights_nor_noise():
     for noise in (True, "fixed", False):
-        problem = rare_envs.DrivingProblem(HIGHWAY, drivers="idm", noise=noise)
+        problem = rare_envs.DrivingProblem(HIGHWAY, drivers="idm", noise=noise, horizon=5.0)
         assert problem.dim == 24
     x = draw(problem, 64)
     last = list(drive(problem.world, problem.driver, torch.from_numpy(x)))[-1]

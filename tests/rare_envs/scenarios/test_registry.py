@@ -46,16 +46,6 @@ def test_a_scenario_is_imported_when_it_is_first_asked_for_and_kept(place: str) 
         registry["a/D-v0"]
 
 
-def test_scenarios_are_added_replaced_and_removed_in_their_order() -> None:
-    registry = Registry({"a/B-v0": "nowhere:X"})
-    registry.add("a/C-v0", STANDING)
-    registry.add("a/B-v0", STANDING)
-    assert list(registry) == ["a/B-v0", "a/C-v0"]
-    assert registry["a/B-v0"] is STANDING
-    registry.remove("a/B-v0")
-    assert dict(registry) == {"a/C-v0": STANDING}
-
-
 def test_scenarios_by_id_and_by_name_are_the_same() -> None:
     for env_id, name in [
         ("rare_envs/CarFollowing-v0", "car_following"),

@@ -54,14 +54,6 @@ def test_a_scenario_that_contradicts_itself_is_refused(change: dict[str, Any], e
     assert expected in str(caught.value)
 
 
-def test_a_block_takes_as_many_columns_as_its_size() -> None:
-    gaps = Parameter("gap", "m", 1.0, 50.0, "", size=3)
-    scenario = replace(STANDING, parameters=(SPEED, gaps))
-    assert scenario.size == 4
-    assert scenario.column_parameters == [SPEED, gaps, gaps, gaps]
-    assert (STANDING.size, STANDING.vehicles) == (2, 2)
-
-
 def traffic(rows: list[list[tuple[float, float, float, float]]]) -> State:
     """Scenarios of vehicles (x, y, heading, speed)."""
     return State(*torch.tensor(rows, dtype=F64).unbind(dim=-1), theta=torch.zeros(len(rows), 0, dtype=F64))
@@ -208,8 +200,8 @@ def test_it_is_known_everywhere(registered):
 def test_it_passes_the_suites(registered):
     check_env(gym.make(registered).unwrapped, skip_render_check=True)
     sb3_check_env(gym.make(registered))
-    parallel_api_test(rare_envs.parallel_env(registered), num_cycles=60)
-    parallel_seed_test(partial(rare_envs.parallel_env, registered), num_cycles=30)
+    parallel_api_test(rare_envs.parallel_env(registered), num_cycles=20)
+    parallel_seed_test(partial(rare_envs.parallel_env, registered), num_cycles=10)
     batch = gym.make_vec(registered, num_envs=4)
     observation, infos = batch.reset(seed=0, options={"speed": np.full(4, 20.0)})
     assert observation in batch.observation_space
@@ -241,9 +233,6 @@ def test_what_does_not_work_is_not_registered():
         rare_envs.register_scenario("tests/Broken-v0", replace(STANDING, others=lambda state, dt: None))
     assert "tests/Broken-v0" not in rare_envs.ENV_IDS
     assert "tests/Broken-v0" not in gym.registry
-
-
-def test_an_id_is_taken_once():
     with pytest.raises(ValueError, match="is taken"):
         rare_envs.register_scenario("rare_envs/CutIn-v0", STANDING)
 

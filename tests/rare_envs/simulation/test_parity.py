@@ -43,7 +43,7 @@ def points(low: list[float], high: list[float], n: int) -> Array:
 CAR_FOLLOWING_X = points([10, 2, 4], [30, 20, 50], 30)
 CUT_IN_X = np.concatenate(
     [
-        points([8, 6, 6, 3, 8, 2.5], [25, 25, 25, 40, 50, 4.5], 40),
+        points([8, 6, 6, 3, 8, 2.5], [25, 25, 25, 40, 50, 4.5], 24),
         points([4, 0, 4, 3, 8, 2.5], [10, 4, 12, 40, 50, 4.5], 8),  # paths of the least length
     ]
 )

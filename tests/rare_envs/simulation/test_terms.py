@@ -16,15 +16,15 @@ from rare_envs.simulation import terms as term_gradients
 from rare_envs.simulation.rollout import drive
 from rare_envs.simulation.terms import ROLLOUTS_PER_GRADIENT, differentiate_terms
 
-SHORT = 5.0
-"""Seconds of rollouts that are compared tick by tick: half of the usual ones."""
+SHORT = 3.0
+"""Seconds of rollouts, of the usual 10."""
 CASES: dict[str, tuple[str, dict[str, Any], int]] = {
-    "car-following": ("rare_envs/CarFollowing-v0", {"base": "highway"}, 300),
-    "cut-in": ("rare_envs/CutIn-v0", {"base": "highway"}, 300),
-    "hard brake": ("rare_envs/HardBrake-v0", {}, 300),
-    "highway": ("rare_envs/Highway-v0", {}, 64),
-    "highway, imitation": ("rare_envs/Highway-v0", {"ego": "imitation", "noise": "fixed"}, 64),
-    "highway, any": ("rare_envs/Highway-v0", {"collisions": "any"}, 64),
+    "car-following": ("rare_envs/CarFollowing-v0", {"base": "highway"}, 150),
+    "cut-in": ("rare_envs/CutIn-v0", {"base": "highway"}, 150),
+    "hard brake": ("rare_envs/HardBrake-v0", {}, 150),
+    "highway": ("rare_envs/Highway-v0", {}, 24),
+    "highway, imitation": ("rare_envs/Highway-v0", {"ego": "imitation", "noise": "fixed"}, 24),
+    "highway, any": ("rare_envs/Highway-v0", {"collisions": "any"}, 24),
 }
 
 
@@ -49,7 +49,7 @@ def cases() -> Iterator[Any]:
 @pytest.mark.parametrize(("case", "measure"), list(cases()))
 def test_the_least_term_is_f_and_decides_the_failure(case: str, measure: str) -> None:
     problem, x = make(case, measure=measure, horizon=SHORT)
-    x = x[:20] if measure == "pet" else x  # slow
+    x = x[:8] if measure == "pet" else x  # slow
     f = problem.evaluate(x)
     for gamma in (0.0, 0.7):
         terms = problem.terms(x, gamma)
@@ -59,27 +59,6 @@ def test_the_least_term_is_f_and_decides_the_failure(case: str, measure: str) ->
             assert np.array_equal(terms.lowest, f)
         assert np.array_equal(terms.lowest <= terms.threshold, f <= gamma)
         assert ((terms.ticks >= 0) & (terms.ticks <= problem.world.clock.ticks)).all()
-
-
-@pytest.mark.parametrize("case", ["cut-in", "highway"])
-def test_ticks_are_those_of_the_recorded_episode(case: str) -> None:
-    problem, x = make(case, measure="clearance")
-    x = x[:30]
-    terms, measure = problem.terms(x, 0.7), MEASURES["clearance"]
-    assert isinstance(measure, Measure)
-    with torch.inference_mode():
-        episodes = list(drive(problem.world, problem.driver, torch.from_numpy(x).float()))
-    for row in np.flatnonzero(terms.f > 0):
-        distances = []
-        for episode in episodes:
-            before = rare_envs.measures.Moment(episode.state, episode.lead, episode.road, None)
-            distances.append(measure.term_values(before)[row].numpy())
-        for part, first in ((slice(0, 46), 0), (slice(46, None), 46)):  # the cut is at tick 45 of 100
-            of_part = np.array(distances)[part]
-            count = of_part.shape[1]
-            columns = slice(0, count) if first == 0 else slice(count, None)
-            np.testing.assert_array_equal(terms.ticks[row, columns], of_part.argmin(0) + first)
-            np.testing.assert_allclose(terms.values[row, columns], of_part.min(0), rtol=1e-5)
 
 
 def test_a_measure_of_ones_own_with_terms() -> None:
@@ -164,6 +143,7 @@ def test_central_differences_in_double_precision() -> None:
         assert wrong[alive].mean() <= 0.05, j  # a clamp or a root within a step of its kink
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("measure", ["clearance", "lidar_ttc"])
 def test_central_differences_among_learned_drivers(measure: str) -> None:
     """Along the gradient, in single precision: f is rough at this scale in half of the rows, by beams and ticks."""
@@ -207,11 +187,11 @@ def test_a_black_box_is_taken_as_given_and_said_so() -> None:
 
 def test_order_of_rows_and_tiles_do_not_matter(monkeypatch: pytest.MonkeyPatch) -> None:
     problem = rare_envs.DrivingProblem(CUT_IN)
-    x = problem.base.sample(20, np.random.default_rng(6))
+    x = problem.base.sample(12, np.random.default_rng(6))
     whole = gradients(problem, x)
     order = np.random.default_rng(7).permutation(len(x))
     np.testing.assert_allclose(gradients(problem, x[order]).values, whole.values[order], rtol=1e-4, atol=1e-5)
-    monkeypatch.setattr(term_gradients, "GRADIENT_TILE", 7)
+    monkeypatch.setattr(term_gradients, "GRADIENT_TILE", 5)
     tiled = gradients(problem, x)
     np.testing.assert_allclose(tiled.values, whole.values, rtol=1e-4, atol=1e-5)
     monkeypatch.setattr(term_gradients, "KEPT_SHARE", -1.0)  # nobody is left out

@@ -108,7 +108,7 @@ def driven(
 def test_the_first_contact_is_found_as_small_steps_find_it() -> None:
     """The first vehicle touched, and whether front or flank was, by driving the tick in 400 steps with polygons."""
     rng, seen = np.random.default_rng(8), set()
-    for _ in range(250):
+    for _ in range(160):
         x = np.array([0.0, rng.uniform(-6, 6), rng.uniform(-6, 6)])
         y = np.array([0.0, rng.uniform(-2.6, 2.6), rng.uniform(-2.6, 2.6)])
         heading, speed = rng.normal(0.0, 0.08, 3), rng.uniform(0.0, 40.0, 3)

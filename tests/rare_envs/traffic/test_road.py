@@ -125,14 +125,14 @@ def test_world_frame_is_that_of_the_start_with_y_to_the_right() -> None:
 
 @CURVED
 def test_gradients(road: Road) -> None:
-    x, y, heading = (v.requires_grad_() for v in (spread(-20, 750, 40), spread(-3, 20, 40, 1), spread(-0.2, 0.2, 40)))
+    x, y, heading = (v.requires_grad_() for v in (spread(-20, 750, 12), spread(-3, 20, 12, 1), spread(-0.2, 0.2, 12)))
     assert torch.autograd.gradcheck(road.to_world, (x, y, heading))
     world = tuple(v.detach().requires_grad_() for v in road.to_world(x, y, heading))
     assert torch.autograd.gradcheck(road.from_world, world)
     assert torch.autograd.gradcheck(road.curvature, (x,))
     assert torch.autograd.gradcheck(road.markers, (y,))
     speed, acceleration, rate = (
-        v.requires_grad_() for v in (spread(5, 30, 40), spread(-3, 3, 40), spread(-0.1, 0.1, 40))
+        v.requires_grad_() for v in (spread(5, 30, 12), spread(-3, 3, 12), spread(-0.1, 0.1, 12))
     )
 
     def step(*state: torch.Tensor) -> tuple[torch.Tensor, ...]:
