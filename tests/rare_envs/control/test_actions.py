@@ -6,14 +6,7 @@ import pytest
 import torch
 
 from rare_envs.control import actions
-from rare_envs.control.actions import (
-    DISCRETE_ACTIONS,
-    IDLE,
-    MAX_ACCELERATION,
-    MAX_STEERING,
-    read_actions,
-    to_physical,
-)
+from rare_envs.control.actions import DISCRETE_ACTIONS, IDLE, MAX_ACCELERATION, MAX_STEERING, read_actions, to_physical
 
 
 def test_an_action_of_one_is_the_largest() -> None:

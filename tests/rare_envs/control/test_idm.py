@@ -46,12 +46,7 @@ def test_each_follower_may_have_a_desired_speed_of_its_own() -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "value"),
-    [
-        ("max_acceleration", 0.0),
-        ("jam_distance", -0.1),
-        ("time_headway", math.inf),
-    ],
+    ("name", "value"), [("max_acceleration", 0.0), ("jam_distance", -0.1), ("time_headway", math.inf)]
 )
 def test_parameters_without_meaning_are_refused(name: str, value: float) -> None:
     with pytest.raises(ValueError, match=f"^Expected {name} of the IDM to be a number .*, got {value!r}\\.$"):

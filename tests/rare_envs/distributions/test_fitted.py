@@ -8,13 +8,7 @@ import numpy as np
 import pytest
 
 from rare_envs.distributions.beta import BetaDistribution
-from rare_envs.distributions.fitted import (
-    EventCounts,
-    EventFrequency,
-    FittedDistribution,
-    PredictiveCheck,
-    read_record,
-)
+from rare_envs.distributions.fitted import EventCounts, EventFrequency, FittedDistribution, PredictiveCheck, read_record
 from rare_envs.distributions.mixture import CoordinateMixture, TruncatedGaussianMixture
 from rare_envs.distributions.product import (
     BlockDistribution,

@@ -6,10 +6,7 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from rare_envs.distributions.beta import BetaDistribution
-from rare_envs.distributions.truncated_normal import (
-    TruncatedConditional,
-    log_interval,
-)
+from rare_envs.distributions.truncated_normal import TruncatedConditional, log_interval
 
 BETA = BetaDistribution([2.0, 0.7], [5.0, 1.3], [-1.0, 10.0], [3.0, 20.0])
 PARTS = (stats.beta(2.0, 5.0, loc=-1.0, scale=4.0), stats.beta(0.7, 1.3, loc=10.0, scale=10.0))

@@ -16,14 +16,7 @@ from rare_envs.control.actions import IDLE
 from rare_envs.control.idm import IDM
 from rare_envs.envs.parallel import AgentsVectorEnv
 from rare_envs.make import set_up
-from rare_envs.multi_agent import (
-    adversary_reward,
-    own_reward,
-    play,
-    start,
-    step_agents,
-    step_traffic,
-)
+from rare_envs.multi_agent import adversary_reward, own_reward, play, start, step_agents, step_traffic
 from rare_envs.scenarios.car_following import CAR_FOLLOWING
 from rare_envs.sensors.kinds import map_kinds
 from rare_envs.simulation.episode import Clock

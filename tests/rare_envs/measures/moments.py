@@ -4,9 +4,7 @@ import numpy as np
 import torch
 
 import rare_envs
-from rare_envs.measures import (
-    Moment,
-)
+from rare_envs.measures import Moment
 from rare_envs.traffic.neighbours import lead_of
 from rare_envs.traffic.road import straight
 from rare_envs.traffic.state import State

@@ -38,15 +38,7 @@ from rare_envs.measures.registry import MEASURES, find_measure
 from rare_envs.traffic.neighbours import Lead, lead_of
 from rare_envs.traffic.road import i80, straight
 from rare_envs.traffic.state import State
-from tests.rare_envs.measures.moments import (
-    F64,
-    TIME,
-    drives,
-    following,
-    moment,
-    path,
-    problem,
-)
+from tests.rare_envs.measures.moments import F64, TIME, drives, following, moment, path, problem
 from tests.rare_envs.traffic_states import tensor, traffic
 
 

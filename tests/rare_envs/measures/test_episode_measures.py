@@ -28,16 +28,7 @@ from rare_envs.simulation.rollout import drive
 from rare_envs.traffic.neighbours import lead_of
 from rare_envs.traffic.road import straight
 from rare_envs.traffic.state import State
-from tests.rare_envs.measures.moments import (
-    AWAY,
-    CLOSE,
-    CUT_IN,
-    F64,
-    FOLLOWING,
-    HIT,
-    f,
-    problem,
-)
+from tests.rare_envs.measures.moments import AWAY, CLOSE, CUT_IN, F64, FOLLOWING, HIT, f, problem
 from tests.rare_envs.traffic.slow_boxes import corners
 
 

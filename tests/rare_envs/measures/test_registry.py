@@ -10,22 +10,9 @@ import torch
 from torch import Tensor
 
 import rare_envs
-from rare_envs.measures import (
-    Measure,
-    Moment,
-    TraceMeasure,
-    minimum,
-    stl,
-    ttc,
-    weighted,
-)
+from rare_envs.measures import Measure, Moment, TraceMeasure, minimum, stl, ttc, weighted
 from rare_envs.measures.registry import find_measure
-from tests.rare_envs.measures.moments import (
-    AWAY,
-    CLOSE,
-    FOLLOWING,
-    problem,
-)
+from tests.rare_envs.measures.moments import AWAY, CLOSE, FOLLOWING, problem
 
 
 def test_measures_by_what_a_user_types(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -210,10 +210,7 @@ class Complete(Draws):
 @pytest.mark.parametrize(
     ("base", "message"),
     [
-        (
-            3,
-            "A base distribution must be one of us101, .*, a path .*; got int without sample, log_prob, to_stand",
-        ),
+        (3, "A base distribution must be one of us101, .*, a path .*; got int without sample, log_prob, to_stand"),
         (Draws(np.zeros((1, 3))), r"; got Draws without log_prob, to_standard_normal, from_standard_normal\.$"),
         (
             Complete(np.zeros((1, 6))),

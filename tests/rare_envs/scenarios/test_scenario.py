@@ -144,10 +144,7 @@ GOOD_BASE = STANDING.bases["even"]
             "^Base distribution odd: Missing means, covariances",
         ),
         ({"initial": lambda x: None}, r"expected initial\(x\) to give a State, got NoneType\.$"),
-        (
-            {"initial": lambda x: initial(x)._replace(theta=x[:3])},
-            r"expected theta of 8 rows, got \(3, 2\)\.$",
-        ),
+        ({"initial": lambda x: initial(x)._replace(theta=x[:3])}, r"expected theta of 8 rows, got \(3, 2\)\.$"),
         (
             {"vehicle_names": ("ego", "stalled", "ghost"), "labels": ()},
             r"expected x of shape \(B, 3\) from initial\(x\), got \(8, 2\) for B = 8\.$",

@@ -6,16 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from rare_envs.sensors.lidar import (
-    BEAMS,
-    FEATURES,
-    MAX_RANGE,
-    Bodies,
-    OnRoad,
-    perceive,
-    perceive_traffic,
-    sense,
-)
+from rare_envs.sensors.lidar import BEAMS, FEATURES, MAX_RANGE, Bodies, OnRoad, perceive, perceive_traffic, sense
 from rare_envs.traffic.road import Road, straight
 from rare_envs.traffic.state import State
 from tests.rare_envs.traffic_states import ARC, RADIUS, traffic

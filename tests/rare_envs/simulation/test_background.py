@@ -7,12 +7,7 @@ import agents
 from agents.files import LANE_CHANGING, RULE_BASED, SHIPPED_DRIVERS
 from rare_envs.control.lane_changing import LaneChangingDriver
 from rare_envs.devices import fixed_draws
-from rare_envs.simulation.background import (
-    FIXED_SEED,
-    BackgroundState,
-    find_drivers,
-    query_background,
-)
+from rare_envs.simulation.background import FIXED_SEED, BackgroundState, find_drivers, query_background
 
 
 def step_background(drivers, state, features):

@@ -10,13 +10,7 @@ import torch
 
 import rare_envs
 from rare_envs.traffic.bodies import others_overlap
-from rare_envs.traffic.crash import (
-    CRASH_KINDS,
-    crash_of,
-    crash_of_others,
-    describe_crash,
-    injury_risk,
-)
+from rare_envs.traffic.crash import CRASH_KINDS, crash_of, crash_of_others, describe_crash, injury_risk
 from rare_envs.traffic.road import straight
 from tests.rare_envs.traffic.slow_boxes import corners, nearest, overlap
 from tests.rare_envs.traffic_states import F64, traffic

@@ -95,13 +95,7 @@ def test_rays_span_the_field_of_view() -> None:
 
 
 @pytest.mark.parametrize(
-    "settings",
-    [
-        {"height": 0},
-        {"width": 2.5},
-        {"field_of_view": math.pi},
-        {"mount_height": math.nan},
-    ],
+    "settings", [{"height": 0}, {"width": 2.5}, {"field_of_view": math.pi}, {"mount_height": math.nan}]
 )
 def test_cameras_out_of_range_are_refused(settings: dict[str, float]) -> None:
     with pytest.raises(ValueError, match=next(iter(settings))):
