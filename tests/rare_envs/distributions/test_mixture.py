@@ -338,10 +338,7 @@ def test_dictionary_round_trip() -> None:
     [
         ({"coordinates": ["plain", "sqrt", "log"]}, 'Unknown coordinate \'sqrt\'; known are "plain", "log" and'),
         ({"coordinates": ["plain", {**CLOSING, "gap": "space"}, "log"]}, "names no column 'space'; columns are v, lea"),
-        (
-            {"coordinates": ["plain", {**CLOSING, "gap": "lead"}, "log"]},
-            "lead depends on lead, which must come earlier",
-        ),
+        ({"coordinates": ["plain", {**CLOSING, "gap": "lead"}, "log"]}, "lead depends on lead, which must come earl"),
         ({"order": ["v", "lead", "gap"]}, "of lead depends on gap, which must come earlier in order; order is v, lead"),
         ({"order": ["v", "gap"]}, "order must have each of the columns v, lead, gap once, got v, gap"),
         ({"names": ["v", "lead"]}, "Expected 3 different names, one for each column, got v, lead"),

@@ -65,7 +65,6 @@ def idle(observed: Any = None, acted: Any = None) -> Declared:
 @pytest.mark.parametrize(
     ("space", "fitting"),
     [
-        (None, ("features",)),
         (observation_space(3, "lidar"), ("lidar",)),
         (spaces.Box(-5, 5, (44,)), ("features",)),  # four frames side by side
         (spaces.Box(-5, 5, (4, 51)), ("lidar",)),

@@ -212,14 +212,8 @@ class Complete(Draws):
     [
         (3, "A base distribution must be one of us101, .*, a path .*; got int without sample, log_prob, to_stand"),
         (Draws(np.zeros((1, 3))), r"; got Draws without log_prob, to_standard_normal, from_standard_normal\.$"),
-        (
-            Complete(np.zeros((1, 6))),
-            r"must have shape \(1000, 3\), one column for each of ego_speed, lead_speed, gap; got \(1000, 6\)\.$",
-        ),
-        (
-            Complete(np.array([[20.0, 10.0, 30.0], [20.0, 45.1, 30.0]])),
-            r"^Base distribution Complete does not fit car_following: it draws lead_speed outside \[0, 45\] m/s; trunc",
-        ),
+        (Complete(np.zeros((1, 6))), r"shape \(1000, 3\), one column for each of ego_.*, gap; got \(1000, 6\)\.$"),
+        (Complete(np.array([[20.0, 45.1, 30.0]])), r"not fit car_following: it draws lead_speed outside \[0, 45\] m/s"),
         (Complete(np.array([[20.0, 10.0, np.nan]])), r"it draws gap outside \[1, 150\] m; truncate it\.$"),
     ],
 )

@@ -62,21 +62,11 @@ def test_scenarios_by_id_and_by_name_are_the_same() -> None:
 @pytest.mark.parametrize(
     ("env_id", "message"),
     [
-        (
-            "rare_envs/CutInn-v0",
-            r"^Unknown environment 'rare_envs/CutInn-v0' \(did you mean 'rare_envs/CutIn-v0'\?\); ",
-        ),
-        (
-            "highway",
-            r"^Unknown environment 'highway'.*; the environments are rare_envs/CarFollowing-v0, rare_envs/CutIn",
-        ),
+        ("CutInn-v0", r"^Unknown environment 'CutInn-v0' \(did you mean 'rare_envs/CutIn-v0'"),
+        ("highway", r"^Unknown environment 'highway'.*; the environments are rare_envs/CarFollowing-v0, rare_envs"),
         (None, "^Unknown environment None; the environments are rare_envs/CarFollowing-v0, "),
         (["rare_envs/CutIn-v0"], r"^Unknown environment \['rare_envs/CutIn-v0'\]"),
-        (
-            "rare_envs/CutIn-kinematics-v0",
-            r"^'rare_envs/CutIn-kinematics-v0' is for gym.make and gym.make_vec; here take 'rare_envs/CutIn-v0' with "
-            r"observation 'kinematics' and action 'meta'\.$",
-        ),
+        ("rare_envs/CutIn-kinematics-v0", r"here take 'rare_envs/CutIn-v0' with observation 'kinematics' and action '"),
         *(
             (name, rf"rare_envs.highway_env_problem\('{name}', ego=...\)\. The environments here are rare_envs/CarFoll")
             for name in ("highway-fast-v0", "roundabout-v0")

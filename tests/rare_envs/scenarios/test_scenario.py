@@ -132,34 +132,18 @@ def test_the_shipped_scenarios_pass(env_id: str) -> None:
     try_scenario(SCENARIOS[env_id])
 
 
-GOOD_BASE = STANDING.bases["even"]
-"""Of two columns."""
-
-
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (
-            {"bases": {"even": GOOD_BASE, "odd": {"weights": [1.0]}}},
-            "^Base distribution odd: Missing means, covariances",
-        ),
+        ({"bases": {"odd": {"weights": [1.0]}}}, "^Base distribution odd: Missing means, covariances"),
         ({"initial": lambda x: None}, r"expected initial\(x\) to give a State, got NoneType\.$"),
         ({"initial": lambda x: initial(x)._replace(theta=x[:3])}, r"expected theta of 8 rows, got \(3, 2\)\.$"),
-        (
-            {"vehicle_names": ("ego", "stalled", "ghost"), "labels": ()},
-            r"expected x of shape \(B, 3\) from initial\(x\), got \(8, 2\) for B = 8\.$",
-        ),
+        ({"vehicle_names": ("ego", "a", "b"), "labels": ()}, r"x of shape \(B, 3\) from initial\(x\), got \(8, 2\)"),
         ({"initial": without_a_value(initial, "heading")}, r"heading from initial\(x\) is not finite\.$"),
-        (
-            {"others": lambda state, dt: None},
-            r"expected others\(state, dt\) to give x, y, heading and speed, as State or Others; got None\.$",
-        ),
+        ({"others": lambda state, dt: None}, r"expected others\(state, dt\) to give x, y, .* or Others; got None\.$"),
         ({"others": lambda state, dt: Others(1, 2, 3, 4)}, r"heading and speed, as State or Others; got Others\(x=1"),
         ({"others": without_a_value(others, "y")}, r"y from others\(state, dt\) is not finite\.$"),
-        (
-            {"driven": lambda state, action, dt: Others(*state[:4])},
-            r"expected x of shape \(B, 1\) from driven\(state, action, dt\), got \(8, 2\) for B = 8\.$",
-        ),
+        ({"driven": lambda state, action, dt: Others(*state[:4])}, r"x of shape \(B, 1\) from driven.*, got \(8, 2\)"),
     ],
 )
 def test_what_does_not_work_is_refused(change: dict[str, Any], message: str) -> None:
