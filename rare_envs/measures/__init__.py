@@ -2,15 +2,9 @@
 
 from rare_envs.measures.base import COLLISION, EpisodeMeasure, Measure, MeasureTerms, Moment, Trace, TraceMeasure
 from rare_envs.measures.longitudinal import (
-    DECELERATION_MAX,
-    EXPOSURE_MAX,
-    MAX_BRAKING,
-    TTC_CRITICAL,
-    TTC_MAX,
     Exposure,
     btn,
     drac,
-    evasive_manoeuvre,
     lidar_ttc,
     mttc,
     required_deceleration,
@@ -20,11 +14,9 @@ from rare_envs.measures.longitudinal import (
     ttb,
     ttc,
 )
-from rare_envs.measures.registry import MEASURES, Combined, find_measure, minimum, weighted, with_collision
-from rare_envs.measures.temporal_logic import SIGNALS, stl
+from rare_envs.measures.registry import MEASURES, find_measure, minimum, weighted, with_collision
+from rare_envs.measures.temporal_logic import stl
 from rare_envs.measures.two_dimensional import (
-    MARGIN_MAX,
-    PET_MAX,
     RSS,
     clearance,
     margin,
@@ -37,17 +29,8 @@ from rare_envs.measures.two_dimensional import (
 
 __all__ = [
     "COLLISION",
-    "DECELERATION_MAX",
-    "EXPOSURE_MAX",
-    "MARGIN_MAX",
-    "MAX_BRAKING",
     "MEASURES",
-    "PET_MAX",
     "RSS",
-    "SIGNALS",
-    "TTC_CRITICAL",
-    "TTC_MAX",
-    "Combined",
     "EpisodeMeasure",
     "Exposure",
     "Measure",
@@ -58,7 +41,6 @@ __all__ = [
     "btn",
     "clearance",
     "drac",
-    "evasive_manoeuvre",
     "find_measure",
     "lidar_ttc",
     "margin",

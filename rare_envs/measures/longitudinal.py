@@ -259,29 +259,11 @@ def required_deceleration(moment: Moment) -> Tensor:
 
 
 def evasive_manoeuvre(moment: Moment) -> Tensor:
-    """Return how rapid the ego's evasive manoeuvre is: 1 and more makes a near-crash in the 100-Car study.
+    """Return how rapid the ego's evasive manoeuvre is, without unit, shape (B,): 1 and more makes a near-crash.
 
-    The greater of its braking over 0.5 g and its lateral acceleration, beyond that of the road's curve, over 0.4 g.
-    In the words of the study a near-crash is "any circumstance that requires a rapid, evasive maneuver by the subject
-    vehicle, or any other vehicle, pedestrian, cyclist, or animal to avoid a crash"; "general guideline: subject vehicle
-    braking greater than 0.5 g or steering input that results in a lateral acceleration greater than 0.4 g to avoid a
-    crash constitutes a rapid maneuver". Here only the ego counts, and all its braking.
-
-    Critical value: 1.
-
-    Returns:
-        Without unit, in [0, DECELERATION_MAX / RAPID_BRAKING], shape (B,); 0 at the start.
-
-    References:
-        Virginia Tech Transportation Institute, "Researcher dictionary for video reduction data", version 1.3, 2012
-        (variable 5), of the 100-Car study: Dingus et al., DOT HS 810 593, 2006.
-
-    Example:
-        >>> from rare_envs.measures import Moment
-        >>> moment = Moment.of_two(gap=25.0, speed=20.0, lead_speed=20.0)
-        >>> before = moment.state._replace(speed=moment.state.speed + torch.tensor([0.6, 0.0]))
-        >>> round(evasive_manoeuvre(moment._replace(before=before)).item(), 2)  # braked by 6 m/s^2
-        1.22
+    The greater of its braking over 0.5 g and its lateral acceleration, beyond that of the road's curve, over 0.4 g
+    (VTTI, "Researcher dictionary for video reduction data" 1.3, 2012, variable 5; Dingus et al., DOT HS 810 593, 2006).
+    Here only the ego counts, and all its braking; 0 at the start.
     """
     braking = -moment.acceleration[:, 0]
     turned = torch.zeros_like(braking)

@@ -167,17 +167,7 @@ def find_measure(measure: Any) -> EpisodeMeasure:
 
 @dataclass(frozen=True)
 class Combined:
-    """A function of the f of several measures, each of which is updated as it would be alone.
-
-    Example:
-        >>> import rare_envs
-        >>> from rare_envs.measures import find_measure
-        >>> parts = find_measure("ttc"), find_measure("thw")
-        >>> mean = Combined(parts, lambda f: f.mean(0), collision=-1.0)
-        >>> problem = rare_envs.DrivingProblem("rare_envs/CarFollowing-v0", measure=mean, horizon=0.1)
-        >>> problem.evaluate([[20.0, 10.0, 30.0]]).round(2).tolist()  # of 2.98 s and 1.49 s
-        [2.24]
-    """
+    """A function of the f of several measures, each of which is updated as it would be alone."""
 
     parts: tuple[EpisodeMeasure, ...]
     how: Callable[[Tensor], Tensor]

@@ -233,10 +233,11 @@ def test_a_reward_may_be_a_tensor() -> None:
     rewards = {0: lambda transition: torch.ones(2)}
     _, earned, _ = step_agents(world, start(world, X), action, commanded, rewards, IDM())
     torch.testing.assert_close(earned[0], torch.tensor([1.0, 0.4]))  # 3.5 m at 10 m/s: four ticks
-    world = World(CAR_FOLLOWING)
     for wrong in (0.0, torch.zeros(()), torch.zeros(3, 1)):
+        env = rare_envs.parallel_env(FOLLOWING, agents=["lead"], rewards={"lead": lambda _, wrong=wrong: wrong})
+        env.reset(seed=0)
         with pytest.raises(ValueError, match=r"shape \(B,\)"):
-            step_agents(world, start(world, X), torch.zeros(2, 2, 2), commanded, {0: lambda _, w=wrong: w}, IDM())
+            env.step({"lead": np.zeros(2)})
 
 
 SMALL = (36, 60)

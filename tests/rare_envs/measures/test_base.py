@@ -9,17 +9,13 @@ import torch
 from torch import Tensor
 
 from rare_envs.measures import (
-    DECELERATION_MAX,
-    MARGIN_MAX,
     RSS,
-    TTC_MAX,
     EpisodeMeasure,
     Measure,
     Moment,
     btn,
     clearance,
     drac,
-    evasive_manoeuvre,
     margin,
     mttc,
     required_deceleration,
@@ -34,7 +30,9 @@ from rare_envs.measures import (
     ttc_2d,
 )
 from rare_envs.measures.base import acceleration_of_lead
+from rare_envs.measures.longitudinal import DECELERATION_MAX, TTC_MAX, evasive_manoeuvre
 from rare_envs.measures.registry import MEASURES, find_measure
+from rare_envs.measures.two_dimensional import MARGIN_MAX
 from rare_envs.traffic.neighbours import Lead, lead_of
 from rare_envs.traffic.road import i80, straight
 from rare_envs.traffic.state import State

@@ -11,19 +11,8 @@ import torch
 from torch import Tensor
 
 import rare_envs
-from rare_envs.measures import (
-    PET_MAX,
-    Measure,
-    Moment,
-    Trace,
-    TraceMeasure,
-    minimum,
-    pet,
-    stl,
-    ttc,
-    weighted,
-    with_collision,
-)
+from rare_envs.measures import Measure, Moment, Trace, TraceMeasure, minimum, pet, stl, ttc, weighted, with_collision
+from rare_envs.measures.two_dimensional import PET_MAX
 from rare_envs.simulation.rollout import drive
 from rare_envs.traffic.neighbours import lead_of
 from rare_envs.traffic.road import straight

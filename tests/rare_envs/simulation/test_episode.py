@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from rare_envs.control.actions import IDLE
-from rare_envs.measures import TTC_MAX
+from rare_envs.measures.longitudinal import TTC_MAX
 from rare_envs.scenarios.car_following import CAR_FOLLOWING
 from rare_envs.scenarios.cut_in import CUT_IN
 from rare_envs.simulation.decision import advance

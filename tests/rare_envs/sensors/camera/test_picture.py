@@ -28,6 +28,7 @@ SHARPEST = Road((-2.0, 2.0, 6.0), ReferenceLine(50.0, (0.0, MAX_CURVATURE, MAX_C
 """A bend as sharp as roads may be."""
 SCENES = [
     (straight(2), Camera(16, 44), (1.5e-4, 0.8, 2.1)),
+    (straight(1), Camera(14, 36, 1.5, 0.1, 1.2), (0.02, 0.2, 2.8)),
     (i80(), Camera(16, 44), (0.005, 0.1, -0.1)),
     (i80(), Camera(20, 30, 1.2, -0.05, 1.6, 1.0), (1e-3, 1.2, -2.0)),
     (SHARPEST, Camera(16, 44), (1e-4, 0.5, 1.0)),
