@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -34,18 +35,10 @@ def local(x: np.ndarray) -> np.ndarray:  # type: ignore[type-arg]
     return np.array([simulate(*row) for row in x])
 
 
-class Inside:
-    """The same problem in this process."""
-
-    dim, base = SPACE.dim, SPACE.base
-
-    def evaluate(self, x: np.ndarray) -> np.ndarray:  # type: ignore[type-arg]
-        return local(x)
-
-
 def test_the_answer_is_that_of_one_process() -> None:
     outside = example.estimate(max_sim=600, seed=3)
-    same = samplers.estimate(Inside(), samplers.TwoStage(), seed=3, max_sim=600, ensemble_run=False)
+    inside = SimpleNamespace(dim=SPACE.dim, base=SPACE.base, evaluate=local)
+    same = samplers.estimate(inside, samplers.TwoStage(), seed=3, max_sim=600, ensemble_run=False)
     assert outside.p == same.p and outside.interval == same.interval and outside.n_sim == same.n_sim == 600
     assert outside.p > 0.0
 

@@ -28,28 +28,14 @@ SHOWN = {
     "your_own_ego": ("P[f <= 0] =", "p_A", " 0.1 ", " 1e-06 "),
 }
 """Some of what they print."""
-QUICK = ("samplers_without_cars",)
 
 
 def cells_of(name: str) -> list[dict[str, Any]]:
-    """Return the cells of a notebook."""
     return list(json.loads((FOLDER / f"{name}.ipynb").read_text(encoding="utf-8"))["cells"])
 
 
 def code_of(cell: dict[str, Any]) -> str:
-    """Return the text of a cell."""
     return "".join(cell["source"])
-
-
-def run_notebook(name: str) -> None:
-    """Run all cells in one namespace, with the settings of SMALL after the cell that has the settings."""
-    namespace: dict[str, Any] = {"__name__": "__main__"}
-    for number, cell in enumerate(cells_of(name)):
-        if cell["cell_type"] == "code":
-            exec(compile(code_of(cell), f"{name}, cell {number}", "exec"), namespace)
-            if "parameters" in cell["metadata"].get("tags", ()):
-                assert set(SMALL[name]) <= set(namespace)
-                namespace.update(SMALL[name])
 
 
 def test_every_notebook_is_tested() -> None:
@@ -57,7 +43,7 @@ def test_every_notebook_is_tested() -> None:
 
 
 @pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=[] if name in QUICK else pytest.mark.slow) for name in sorted(SMALL)]
+    "name", [pytest.param(name, marks=[pytest.mark.slow] * (number > 0)) for number, name in enumerate(sorted(SMALL))]
 )
 @use_one_thread()
 def test_a_notebook_runs(
@@ -66,31 +52,29 @@ def test_a_notebook_runs(
     matplotlib.use("Agg")
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("PYTHONPATH", str(FOLDER.parents[1]))
-    run_notebook(name)
+    namespace: dict[str, Any] = {"__name__": "__main__"}
+    for number, cell in enumerate(cells_of(name)):
+        if cell["cell_type"] == "code":
+            exec(compile(code_of(cell), f"{name}, cell {number}", "exec"), namespace)
+            if "parameters" in cell["metadata"].get("tags", ()):  # the settings of SMALL after the cell that has them
+                assert set(SMALL[name]) <= set(namespace)
+                namespace.update(SMALL[name])
     printed = capfd.readouterr().out
     assert [text for text in SHOWN[name] if text not in printed] == []
 
 
 @pytest.mark.parametrize("name", sorted(SMALL))
-def test_a_notebook_needs_nothing_of_this_machine(name: str) -> None:
+def test_a_notebook_is_well_formed_and_needs_nothing_of_this_machine(name: str) -> None:
     """A hosted service has the file of the notebook alone: no path outside its working directory, no data beside it."""
-    text = "\n".join(code_of(cell) for cell in cells_of(name))
-    assert re.findall(r"""["'](?:/|~|\.\./|[A-Za-z]:\\\\)""", text) == []
-    assert len((FOLDER / f"{name}.ipynb").read_bytes()) < 20_000  # no data, no pictures
-    install = next(code_of(cell) for cell in cells_of(name) if cell["cell_type"] == "code")
-    source = re.search(r'^SOURCE = "(.*)"$', install, re.MULTILINE)
-    needed = {"samplers_without_cars": "rare-envs"}.get(name, "rare-envs[driving]")
-    assert source is not None and source[1] == needed
-    assert '"pip", "install"' in install
-
-
-@pytest.mark.parametrize("name", sorted(SMALL))
-def test_a_notebook_is_well_formed(name: str) -> None:
     cells = cells_of(name)
     code = [code_of(cell) for cell in cells if cell["cell_type"] == "code"]
+    assert re.findall(r"""["'](?:/|~|\.\./|[A-Za-z]:\\\\)""", "\n".join(map(code_of, cells))) == []
+    assert len((FOLDER / f"{name}.ipynb").read_bytes()) < 20_000  # no data, no pictures
+    source = re.search(r'^SOURCE = "(.*)"$', code[0], re.MULTILINE)
+    needed = {"samplers_without_cars": "rare-envs"}.get(name, "rare-envs[driving]")
+    assert source is not None and source[1] == needed
+    assert '"pip", "install"' in code[0] and "find_spec" in code[0]
     assert cells[0]["cell_type"] == "markdown"
-    assert "pip" in code[0]
-    assert "find_spec" in code[0]
     assert all(compile(text, name, "exec") for text in code)
     assert all(not cell["outputs"] and cell["execution_count"] is None for cell in cells if cell["cell_type"] == "code")
     assert sum("parameters" in cell["metadata"].get("tags", ()) for cell in cells) == 1

@@ -20,12 +20,9 @@ OF_THE_ZOO = ("n_envs", "n_timesteps", "policy", "policy_kwargs")
 OURS = 256
 """Environments of `train_ego`; the Zoo's are fewer, with as many transitions between updates."""
 
-Entries = dict[str, dict[str, Any]]
 
-
-def read(algo: str) -> Entries:
-    entries: Entries = yaml.safe_load((FOLDER / f"{algo}.yml").read_text(encoding="utf-8"))
-    return entries
+def read(algo: str) -> dict[str, dict[str, Any]]:
+    return yaml.safe_load((FOLDER / f"{algo}.yml").read_text(encoding="utf-8"))  # type: ignore[no-any-return]
 
 
 def policy_of(entry: dict[str, Any]) -> dict[str, Any]:
@@ -46,24 +43,17 @@ def test_settings_are_those_of_our_own_training(algo: str) -> None:
         same = {name: value for name, value in ours.settings.items() if name != per_step}
         assert {name: entry[name] for name in same} == same
         assert policy_of(entry) == {**ours.policy, "activation_fn": nn.ReLU}
+        if algo == "dqn":  # `train_ego` keeps every transition, and waits for ten of each environment
+            assert entry["buffer_size"] == entry["n_timesteps"] and entry["learning_starts"] == 10 * OURS
 
 
-def test_ppo_takes_them() -> None:
-    entry = read("ppo")[rare_envs.ENV_IDS[0]]
+def test_the_algorithms_take_them() -> None:
+    """DQN chooses accelerations by index."""
     few = {"n_steps": 8, "batch_size": 8}  # there is one environment here
-    env = gym.make(rare_envs.ENV_IDS[0])
+    entry, env = read("ppo")[rare_envs.ENV_IDS[0]], gym.make(rare_envs.ENV_IDS[0])
     PPO(entry["policy"], env, device="cpu", policy_kwargs=policy_of(entry), **settings_of(entry) | few)
-
-
-def test_dqn_takes_them_with_accelerations_by_index() -> None:
-    entry = read("dqn")[rare_envs.ENV_IDS[0]]
     assert HYPERPARAMETERS["dqn"].discrete
     few = {"buffer_size": 64, "learning_starts": 16, "batch_size": 8}
-    env = gym.make(rare_envs.ENV_IDS[0], action="discrete")
+    entry, env = read("dqn")[rare_envs.ENV_IDS[0]], gym.make(rare_envs.ENV_IDS[0], action="discrete")
     model = DQN(entry["policy"], env, device="cpu", policy_kwargs=policy_of(entry), **settings_of(entry) | few)
     assert model.learn(40).num_timesteps >= 40
-
-
-def test_dqn_learns_on_for_as_long_as_ours() -> None:
-    for entry in read("dqn").values():  # `train_ego` keeps every transition, and waits for ten of each environment
-        assert entry["buffer_size"] == entry["n_timesteps"] and entry["learning_starts"] == 10 * OURS

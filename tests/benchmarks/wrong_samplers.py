@@ -9,28 +9,8 @@ import samplers
 from benchmarks.samplers.problems import limit_state
 
 
-def low(problem, seed, max_sim):
-    """All numbers a fifth too low."""
-    found = samplers.estimate(problem, "two-stage", seed=seed, max_sim=max_sim)
-    low, high = found.interval
-    return replace(found, p=0.8 * found.p, interval=(0.8 * low, 0.8 * high))
-
-
-def hidden(problem, seed, max_sim):
-    """The same estimate twice, of which one is stated."""
-    samplers.estimate(problem, "mc", seed=seed + 1000, max_sim=max_sim // 2)
-    return samplers.estimate(problem, "mc", seed=seed, max_sim=max_sim // 2)
-
-
-def boastful(problem, seed, max_sim):
-    """States twice what it made."""
-    found = samplers.estimate(problem, "mc", seed=seed, max_sim=max_sim)
-    return replace(found, n_sim=2 * found.n_sim)
-
-
-def spendthrift(problem, seed, max_sim):
-    """Twice its budget."""
-    return samplers.estimate(problem, "mc", seed=seed, max_sim=2 * max_sim)
+def monte_carlo(problem, seed, max_sim, budget=1.0):
+    return samplers.estimate(problem, "mc", seed=seed, max_sim=round(budget * max_sim))
 
 
 def plain(problem, seed, max_sim):
@@ -42,15 +22,29 @@ def plain(problem, seed, max_sim):
     return p, p - error, p + error
 
 
+def low(problem, seed, max_sim):
+    """All numbers a fifth too low."""
+    found = samplers.estimate(problem, "two-stage", seed=seed, max_sim=max_sim)
+    low, high = found.interval
+    return replace(found, p=0.8 * found.p, interval=(0.8 * low, 0.8 * high))
+
+
+def hidden(problem, seed, max_sim):
+    """The same estimate twice, of which one is stated."""
+    monte_carlo(problem, seed + 1000, max_sim, 0.5)
+    return monte_carlo(problem, seed, max_sim, 0.5)
+
+
+def boastful(problem, seed, max_sim):
+    """States twice what it made."""
+    found = monte_carlo(problem, seed, max_sim)
+    return replace(found, n_sim=2 * found.n_sim)
+
+
 def narrow(problem, seed, max_sim):
     """Intervals of half the width."""
     p, low, high = plain(problem, seed, max_sim)
     return p, (p + low) / 2, (p + high) / 2
-
-
-def stubborn(problem, seed, max_sim):
-    """The same draws at every seed."""
-    return plain(problem, 5, max_sim)
 
 
 def informed(problem, seed, max_sim):
@@ -58,11 +52,6 @@ def informed(problem, seed, max_sim):
     plain(problem, seed, max_sim)
     p = limit_state("common_d4").p
     return p, 0.9 * p, 1.1 * p
-
-
-def idle(problem, seed, max_sim):
-    """No simulation."""
-    return 0.04, 0.03, 0.05
 
 
 def impossible(problem, seed, max_sim):
@@ -77,11 +66,26 @@ def endless(problem, seed, max_sim):
         problem.evaluate(np.zeros((10_000, problem.dim)))
 
 
+def spendthrift(problem, seed, max_sim):
+    """Twice its budget."""
+    return monte_carlo(problem, seed, max_sim, 2.0)
+
+
+def stubborn(problem, seed, max_sim):
+    """The same draws at every seed."""
+    return plain(problem, 5, max_sim)
+
+
+def idle(problem, seed, max_sim):
+    """No simulation."""
+    return (0.04, 0.03, 0.05)
+
+
 def wordy(problem, seed, max_sim):
     """Two numbers."""
-    return 0.1, 0.2
+    return (0.1, 0.2)
 
 
 def leaving(problem, seed, max_sim):
     """Ends the program."""
-    sys.exit("enough | of\nthis")
+    return sys.exit("enough | of\nthis")

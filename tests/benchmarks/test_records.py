@@ -1,4 +1,4 @@
-"""Lines of runs: made once, made again where a stop has cut them off, refused where they do not belong."""
+"""Records of runs: made once, made again where a stop has cut them off, refused where they do not belong."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from benchmarks.results_page import PAGE, format_page
 from benchmarks.run_lines import RunLines
 from rare_envs.study.errors import BadInput
 
@@ -39,27 +40,22 @@ def test_only_missing_runs_are_made_and_all_come_in_their_order(tmp_path: Path) 
     assert maker.made == ["3", "1", "2"]
 
 
-def test_a_torn_line_is_made_again(tmp_path: Path) -> None:
-    maker = Maker()
-    whole = lines_of(tmp_path).complete(["1", "2"], maker)
-    file = tmp_path / "runs.jsonl"
-    text = file.read_text()
-    file.write_text(text[:-5])
-    assert lines_of(tmp_path).complete(["1", "2"], maker) == whole
-    assert maker.made == ["1", "2", "2"]
-    assert file.read_text() == text
-
-
-def test_a_stop_keeps_what_was_made(tmp_path: Path) -> None:
+def test_a_torn_line_is_made_again_and_a_stop_keeps_what_was_made(tmp_path: Path) -> None:
     def stop(jobs):
         yield from Maker()(jobs[:1])
         raise KeyboardInterrupt
 
+    maker = Maker()
     with pytest.raises(KeyboardInterrupt):
         lines_of(tmp_path).complete(["1", "2"], stop)
-    maker = Maker()
-    lines_of(tmp_path).complete(["1", "2"], maker, progress=True)
+    whole = lines_of(tmp_path).complete(["1", "2"], maker, progress=True)
     assert maker.made == ["2"]
+    file = tmp_path / "runs.jsonl"
+    text = file.read_text()
+    file.write_text(text[:-5])
+    assert lines_of(tmp_path).complete(["1", "2"], maker) == whole
+    assert maker.made == ["2", "2"]
+    assert file.read_text() == text
 
 
 def test_numbers_that_json_has_not_come_back(tmp_path: Path) -> None:
@@ -71,17 +67,17 @@ def test_numbers_that_json_has_not_come_back(tmp_path: Path) -> None:
     assert (run["b"], run["c"], run["d"]) == (math.inf, -math.inf, 0.1)
 
 
-def test_runs_of_something_else_are_refused(tmp_path: Path) -> None:
+def test_runs_of_something_else_and_damaged_files_are_refused_in_one_line(tmp_path: Path) -> None:
     lines_of(tmp_path).complete(["1"], Maker())
     with pytest.raises(BadInput, match="has runs of scale small, this is full: choose another --out"):
         lines_of(tmp_path, scale="full").complete(["1"], Maker())
+    for text in ("x\n", "{}\n", "[]\n", '{"rare_envs": "1"}\n'):
+        (tmp_path / "runs.jsonl").write_text(text)
+        with pytest.raises(BadInput, match="line 1") as caught:
+            lines_of(tmp_path).read()
+        assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize(
-    ("text", "said"), [("x\n", "line 1"), ("{}\n", "line 1"), ("[]\n", "line 1"), ('{"rare_envs": "1"}\n', "line 1")]
-)
-def test_a_damaged_file_is_refused_in_one_line(tmp_path: Path, text: str, said: str) -> None:
-    (tmp_path / "runs.jsonl").write_text(text)
-    with pytest.raises(BadInput, match=said) as caught:
-        lines_of(tmp_path).read()
-    assert "\n" not in str(caught.value)
+def test_the_page_is_what_the_records_give() -> None:
+    assert PAGE.read_text(encoding="utf-8") == format_page(), "run python -m benchmarks.results_page"
+    assert len(format_page().splitlines()) <= 300
