@@ -7,6 +7,8 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -15,6 +17,7 @@ import numpy as np
 import pytest
 import torch
 from gymnasium import spaces
+from stable_baselines3 import PPO, SAC
 from stable_baselines3.common.evaluation import evaluate_policy
 
 import agents
@@ -52,14 +55,7 @@ def weights(path: Path) -> torch.Tensor:
 
 @pytest.mark.parametrize("algo", EACH)
 def test_every_algorithm_trains_saves_and_drives(algo: str, tmp_path: Path) -> None:
-    path = train_ego(
-        ENV,
-        algo,
-        steps=400,
-        num_envs=16,
-        out=tmp_path / "new" / "ego",
-        progress=False,
-    )
+    path = train_ego(ENV, algo, steps=400, num_envs=16, out=tmp_path / "new" / "ego", progress=False)
     assert path == tmp_path / "new" / "ego.zip"
     ego = load_ego(path)
     assert isinstance(ego, SavedEgo)
@@ -95,26 +91,23 @@ def test_progress_goes_to_standard_error(tmp_path: Path, capsys: pytest.CaptureF
     assert "collisions" in captured.err
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
+def test_bad_requests_are_refused_before_work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "file").write_text("")
+    cases: tuple[tuple[dict[str, Any], str], ...] = (
         ({"steps": 0}, "steps >= 1, got 0"),
         ({"env_id": "CutIn", "out": "new/ego"}, "did you mean 'rare_envs/CutIn-v1'"),
         ({"algo": "pp0"}, r"Unknown algorithm 'pp0' \(did you mean 'ppo'\?\)"),
         ({"num_envs": 0}, "num_envs >= 1, got 0"),
         ({"out": "."}, "got the folder"),
         ({"out": "file/ego.zip"}, "Cannot make the folder"),
-    ],
-)
-def test_bad_requests_are_refused_before_work(
-    arguments: dict[str, Any], message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "file").write_text("")
-    with pytest.raises(ValueError, match=message) as caught:
-        train_ego(**{"env_id": ENV, **arguments})
-    assert "\n" not in str(caught.value)
-    assert [path.name for path in tmp_path.iterdir()] == ["file"]
+        ({"out": "ego.zip", "resume": True}, "There is no training to resume"),
+    )
+    for arguments, message in cases:
+        with pytest.raises(ValueError, match=message) as caught:
+            train_ego(**{"env_id": ENV, **arguments})
+        assert "\n" not in str(caught.value)
+        assert [path.name for path in tmp_path.iterdir()] == ["file"]
 
 
 def test_import_training_is_light() -> None:
@@ -144,8 +137,7 @@ def stop_after(monkeypatch: pytest.MonkeyPatch, count: int) -> None:
     ("algo", "steps", "checkpoint"),
     [
         ("ppo", 480, 2),
-        ("sac", 160, 11),
-        *(pytest.param(algo, 160, 11, marks=pytest.mark.slow) for algo in ("td3", "dqn")),
+        *(pytest.param(algo, 160, 11, marks=pytest.mark.slow) for algo in ("sac", "td3", "dqn")),
     ],
 )
 def test_a_resumed_training_ends_alike(
@@ -170,22 +162,15 @@ def test_a_resumed_training_ends_alike(
     assert sorted(path.name for path in tmp_path.iterdir()) == ["ego.zip", "whole.zip"]
 
 
-def test_there_has_to_be_something_to_resume(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="There is no training to resume"):
-        train_ego(ENV, out=tmp_path / "ego.zip", resume=True)
-
-
-@pytest.mark.parametrize("content", [b"", b"noise", b"PK\x03\x04", b"\x80\x02cos\nsystem\n."])
-def test_damaged_checkpoints_are_refused_in_one_line(content: bytes, tmp_path: Path) -> None:
-    (tmp_path / "ego.checkpoint").write_bytes(content)
-    with pytest.raises(ValueError, match="it is damaged or no checkpoint; remove it") as caught:
-        load_checkpoint(tmp_path / "ego.checkpoint", {})
-    assert "\n" not in str(caught.value)
+def test_damaged_checkpoints_are_refused_in_one_line(tmp_path: Path) -> None:
+    for content in (b"", b"noise", b"PK\x03\x04", b"\x80\x02cos\nsystem\n."):
+        (tmp_path / "ego.checkpoint").write_bytes(content)
+        with pytest.raises(ValueError, match="it is damaged or no checkpoint; remove it") as caught:
+            load_checkpoint(tmp_path / "ego.checkpoint", {})
+        assert "\n" not in str(caught.value)
 
 
 def test_an_ego_stays_while_the_next_one_cannot_be_saved(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from stable_baselines3 import PPO
-
     def fail(self: PPO, path: Path) -> None:
         Path(path).write_bytes(b"half")
         raise OSError(28, "No space left on device")
@@ -226,11 +211,10 @@ def test_a_killed_training_is_taken_up(tmp_path: Path) -> None:
 
 
 @pytest.fixture(scope="module")
-def egos(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def egos(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
+    """Return what trains an ego by an algorithm, once."""
     folder = tmp_path_factory.mktemp("egos")
-    for algo in ALGORITHMS:
-        train_ego(ENV, algo, STEPS, num_envs=ROWS, out=folder / f"{algo}.zip", progress=False)
-    return folder
+    return cache(lambda algo: train_ego(ENV, algo, STEPS, num_envs=ROWS, out=folder / f"{algo}.zip", progress=False))
 
 
 def test_the_share_of_failures_is_drawn_and_the_rest_is_of_the_base() -> None:
@@ -248,7 +232,7 @@ def test_the_share_of_failures_is_drawn_and_the_rest_is_of_the_base() -> None:
 
 @pytest.mark.parametrize("algo", EACH)
 def test_every_algorithm_goes_on_from_the_weights_of_the_ego(
-    algo: str, egos: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    algo: str, egos: Callable[[str], Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     started: list[torch.Tensor] = []
     restore = training.ego_training.restore_parameters
@@ -259,55 +243,50 @@ def test_every_algorithm_goes_on_from_the_weights_of_the_ego(
         assert model.get_env().get_attr("space")[0].base.share == 0.5
 
     monkeypatch.setattr(training.ego_training, "restore_parameters", restore_and_look)
-    given = Retraining(egos / f"{algo}.zip", FAILURE, share=0.5)
+    given = Retraining(egos(algo), FAILURE, share=0.5)
     path = train_ego(ENV, algo, STEPS, num_envs=ROWS, out=tmp_path / "on.zip", progress=False, retraining=given)
     before = weights(given.ego)
     assert torch.equal(started[0], before)
     assert not torch.equal(weights(path), before)
 
 
-def test_a_resumed_retraining_ends_alike(egos: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    given = Retraining(egos / "sac.zip", FAILURE, share=0.5)
+def test_a_resumed_retraining_ends_alike(
+    egos: Callable[[str], Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    given = Retraining(egos("sac"), FAILURE, share=0.5)
     common: dict[str, Any] = {"algo": "sac", "steps": STEPS, "num_envs": ROWS, "progress": False}
     whole = train_ego(ENV, out=tmp_path / "whole.zip", retraining=given, **common)
     stop_after(monkeypatch, 4)
     with pytest.raises(Stopped):
         train_ego(ENV, out=tmp_path / "on.zip", retraining=given, checkpoint_interval=0.0, **common)
     monkeypatch.undo()
-    for other in (None, Retraining(egos / "sac.zip", FAILURE, 0.4), Retraining(egos / "sac.zip", FAILURE + 0.1, 0.5)):
+    for other in (None, Retraining(egos("sac"), FAILURE, 0.4), Retraining(egos("sac"), FAILURE + 0.1, 0.5)):
         with pytest.raises(ValueError, match="is of a training with other arguments"):
             train_ego(ENV, out=tmp_path / "on.zip", retraining=other, resume=True, **common)
     resumed = train_ego(ENV, out=tmp_path / "on.zip", retraining=given, resume=True, **common)
     assert torch.equal(weights(resumed), weights(whole))
 
 
-def test_what_does_not_fit_is_refused_before_training(egos: Path, tmp_path: Path) -> None:
+def test_what_does_not_fit_is_refused_before_training(egos: Callable[[str], Path], tmp_path: Path) -> None:
     out = {"out": tmp_path / "on.zip", "progress": False, "steps": STEPS, "num_envs": ROWS}
-    with pytest.raises(ValueError, match=r"Expected an ego trained by ppo, got .*a2c.zip.*, trained by a2c"):
-        train_ego(ENV, "ppo", retraining=Retraining(egos / "a2c.zip", FAILURE), **out)
-    with pytest.raises(ValueError, match=r"Expected x of shape \(n, 6\)"):
-        train_ego(ENV, "ppo", retraining=Retraining(egos / "ppo.zip", FAILURE[:, :3]), **out)
-    with pytest.raises(ValueError, match="ego_speed = 99 is outside its range"):
-        train_ego(ENV, "ppo", retraining=Retraining(egos / "ppo.zip", np.full((1, 6), 99.0)), **out)
-    with pytest.raises(ValueError, match="its observation_space is"):
-        train_ego(ENV, "ppo", retraining=Retraining(egos / "ppo.zip", FAILURE), observation="lidar", **out)
-    with pytest.raises(FileNotFoundError, match=r"No ego at .*pp0\.zip"):
-        train_ego(ENV, "ppo", retraining=Retraining(egos / "pp0.zip", FAILURE), **out)
+    wrong: tuple[tuple[Path, np.ndarray, dict[str, Any], str], ...] = (
+        (egos("sac"), FAILURE, {}, r"Expected an ego trained by ppo, got .*sac.zip.*, trained by sac"),
+        (egos("ppo"), FAILURE[:, :3], {}, r"Expected x of shape \(n, 6\)"),
+        (egos("ppo"), np.full((1, 6), 99.0), {}, "ego_speed = 99 is outside its range"),
+        (egos("ppo"), FAILURE, {"observation": "lidar"}, "its observation_space is"),
+        (tmp_path / "pp0.zip", FAILURE, {}, r"No ego at .*pp0\.zip"),
+    )
+    for path, failures, more, message in wrong:
+        with pytest.raises((ValueError, FileNotFoundError), match=message):
+            train_ego(ENV, "ppo", retraining=Retraining(path, failures), **out, **more)
     assert not list(tmp_path.iterdir())
-
-
-@pytest.mark.parametrize(
-    ("changed", "said"),
-    [
-        ({"statistics": object()}, "trained behind VecNormalize, train-ego has none"),
-        ({"model": SimpleNamespace(observation_space=3, action_space=5)}, "its action_space is 5, .* is 2"),
-    ],
-)
-def test_an_ego_trained_otherwise_is_refused(changed: dict[str, Any], said: str) -> None:
     env = SimpleNamespace(observation_space=3, action_space=2)  # anything that compares as spaces do
     usual = {"path": Path("ego.zip"), "algorithm": "ppo", "statistics": None, "model": env}
-    with pytest.raises(ValueError, match=said):
-        check_retrainable(SimpleNamespace(**{**usual, **changed}), "ppo", env)
+    other = SimpleNamespace(observation_space=3, action_space=5)
+    with pytest.raises(ValueError, match="trained behind VecNormalize, train-ego has none"):
+        check_retrainable(SimpleNamespace(**{**usual, "statistics": object()}), "ppo", env)
+    with pytest.raises(ValueError, match=r"its action_space is 5, .* is 2"):
+        check_retrainable(SimpleNamespace(**{**usual, "model": other}), "ppo", env)
 
 
 def test_a_training_that_goes_on_explores_as_at_its_end_and_learns_at_once() -> None:
@@ -318,10 +297,8 @@ def test_a_training_that_goes_on_explores_as_at_its_end_and_learns_at_once() -> 
     assert continue_settings({"n_steps": 8}) == {"n_steps": 8}  # PPO has none of these arguments
 
 
-def test_sac_keeps_its_entropy_coefficient(egos: Path) -> None:
-    saved = load_saved_ego(egos / "sac.zip", None)
-    from stable_baselines3 import SAC
-
+def test_sac_keeps_its_entropy_coefficient(egos: Callable[[str], Path]) -> None:
+    saved = load_saved_ego(egos("sac"), None)
     model = SAC("MlpPolicy", sb3_vec_env(ENV, 2), policy_kwargs=saved.model.policy_kwargs, device="cpu")
     fresh = model.log_ent_coef.item()
     restore_parameters(model, saved)

@@ -300,3 +300,34 @@ def cutting_in(sign=1.0, pause=20):
     across = 1.75 + np.clip(1.3 * (t - 0.1 * pause), 0.0, 3.5)
     y, other = (across, 5.25) if sign > 0 else (7.0 - across, 1.75)
     return table_of((20.0 + 10.0 * t, y, 10.0), (9.0 * t, other, 9.0), (50.0 + 12.0 * t, other, 12.0))
+
+
+LENGTH = 4.5
+PAUSE = 60
+"""Ticks before and after a braking."""
+TICK = 0.1
+
+
+def stopping_track(speed, deceleration, final=0.0):
+    """Positions of a vehicle that brakes once [m]."""
+    braking = np.arange(speed, final, -deceleration * TICK)
+    return TICK * np.cumsum(np.concatenate([np.full(PAUSE, speed), braking, np.full(PAUSE, final)]))
+
+
+def stopping_traffic(speeds, gaps, decelerations, every=400, length=LENGTH, final=0.0):
+    """Return followers 0, 2, 4 ... behind leaders 1, 3, 5 ...; one pair begins each `every` ticks.
+
+    The leaders, ahead of whom nobody is recorded, make no events.
+    """
+    rows = {name: [] for name in ("vehicle", "frame", "x", "leader", "speed")}
+    for i, (speed, gap, deceleration) in enumerate(zip(speeds, gaps, decelerations, strict=True)):
+        x = stopping_track(speed, deceleration, final)
+        for vehicle, position, leader in ((2 * i, x, 2 * i + 1), (2 * i + 1, x + gap + LENGTH, NOBODY)):
+            rows["vehicle"].append(np.full(len(x), vehicle))
+            rows["frame"].append(every * i + np.arange(len(x)))
+            rows["x"].append(position)
+            rows["leader"].append(np.full(len(x), leader))
+            rows["speed"].append(np.clip(np.gradient(position, TICK), 0.0, None))
+    columns = {name: np.concatenate(parts) for name, parts in rows.items()}
+    constant = {"recording": "stops", "y": 0.0, "acceleration": np.nan, "length": length, "width": 1.8, "lane": 1}
+    return tabulate(columns | constant)

@@ -1,26 +1,30 @@
-"""Events with pencil-and-paper answers, and the recorded ones."""
+"""Events with pencil-and-paper answers, the recorded ones, and made-up brakings that are found with their size."""
 
 import csv
 
 import numpy as np
 import pytest
 
-from tests.training.data.recordings import cutting_in, table_of
-from tests.training.shared_data import DATA, needs_data
+from tests.training.data.recordings import PAUSE, cutting_in, stopping_track, stopping_traffic, table_of
 from training.data.events import (
     CAR_FOLLOWING_COLUMNS,
     CUT_IN_COLUMNS,
+    END_TICKS,
+    HARD_BRAKE_COLUMNS,
     LATERAL_SPEED,
     MIN_PAIR_FRAMES,
+    SHORTEST_TRACK,
+    braking_exposure,
     car_following_events,
     concatenate_events,
     course_durations,
     cut_in_events,
+    find_standstill_brakings,
+    hard_brake_events,
     time_around_peak,
     write_events,
 )
-from training.data.smoothing import CUTOFF_ACROSS, smooth_positions
-from training.data.table import DT, NOBODY, SCENES_FILE, find_leaders, read_columns, tabulate
+from training.data.table import DT
 
 
 def test_a_pair_is_an_event_once_it_was_seen_for_two_seconds():
@@ -74,63 +78,8 @@ def test_a_start_before_the_track_is_not_seen_and_short_visits_do_not_count():
     touch = (10.0 * t, np.where((t > 2.0) & (t < 2.6), 3.6, 3.4), 10.0)
     assert len(cut_in_events(table_of(touch))["frame"]) == 0
 
-
-def test_without_neighbours_values_are_missing():
-    t = 0.1 * np.arange(90)
     alone = cut_in_events(table_of((10.0 * t, 1.75 + np.clip(t - 2.0, 0.0, 3.5), 10.0)))
     assert (alone["ego"] == -1).all() and np.isnan(alone["gap_ego_cutin"]).all() and np.isnan(alone["v_lead"]).all()
-
-
-def load_us101(merged=True):
-    """The scenes of US 101 as one recording, copies of a vehicle averaged; or each as its own."""
-    names = ("scene", "vehicle", "epoch_ms", "y_along", "d", "speed", "accel", "length", "width", "lane")
-    rows = read_columns(DATA / SCENES_FILE, names)
-    rows = {name: values[rows["scene"] != 1] for name, values in rows.items()}
-    recording = np.char.add("us101-", np.char.zfill(rows["scene"].astype(np.str_), 2))
-    if merged:
-        keys = np.column_stack([rows["vehicle"], rows["epoch_ms"]])
-        _, first, copy = np.unique(keys, axis=0, return_index=True, return_inverse=True)
-        count = np.bincount(copy.ravel())
-        for name, values in rows.items():
-            rows[name] = np.bincount(copy.ravel(), values) / count if values.dtype.kind == "f" else values[first]
-        recording = np.full(len(first), "us101")
-    frame, lane = rows["epoch_ms"] // 100, rows["lane"]
-    lead = find_leaders(frame, lane, rows["y_along"], recording)
-    columns = {"recording": recording, "frame": frame, "lane": lane, "y": rows["d"], "acceleration": rows["accel"]}
-    columns |= {name: rows[name] for name in ("vehicle", "speed", "length", "width")}
-    columns |= {
-        "x": rows["y_along"] - 0.5 * rows["length"],
-        "leader": np.where(lead >= 0, rows["vehicle"][lead], NOBODY),
-    }
-    return tabulate(columns)
-
-
-@needs_data(SCENES_FILE)
-def test_recorded_events_are_those_behind_the_shipped_bases():
-    """The shipped events were found scene by scene; here all scenes are one recording, so a few differ."""
-    table = load_us101()
-    with (DATA / "us101_car_following_events.csv").open(encoding="utf-8") as file:
-        shipped = {(int(row["ego"]), int(row["lead"])): row for row in csv.DictReader(file)}
-    events = car_following_events(table)
-    mine = {pair: i for i, pair in enumerate(zip(events["ego"].tolist(), events["lead"].tolist(), strict=True))}
-    common = set(mine) & set(shipped)
-    assert len(common) >= 465 and len(mine) <= 493
-    same = [pair for pair in common if 100 * events["frame"][mine[pair]] == int(shipped[pair]["epoch_ms"])]
-    assert len(same) >= 451
-    apart = car_following_events(load_us101(merged=False))
-    assert len(set(zip(apart["ego"].tolist(), apart["lead"].tolist(), strict=True)) & set(shipped)) == 468
-    for column in ("v_ego", "v_lead", "gap"):
-        differences = [events[column][mine[pair]] - float(shipped[pair][column]) for pair in same]
-        assert np.abs(differences).max() < 0.03
-
-    with (DATA / "us101_cut_in_events.csv").open(encoding="utf-8") as file:
-        rows = {(int(row["vehicle"]), int(row["to_lane"]), row["phase"]): row for row in csv.DictReader(file)}
-    cuts = cut_in_events(table)
-    keys = list(zip(cuts["vehicle"].tolist(), cuts["to_lane"].tolist(), cuts["phase"].tolist(), strict=True))
-    assert set(rows) <= set(keys) and len(keys) == len(rows) + 4
-    late = {key: cuts["frame"][i] - int(rows[key]["epoch_ms"]) // 100 for i, key in enumerate(keys) if key in rows}
-    assert sum(value == 0 for key, value in late.items() if key[2] == "crossing") == 63
-    assert sum(abs(value) <= 1 for key, value in late.items() if key[2] == "start") >= 61
 
 
 def course(t, duration, displacement, start):
@@ -139,12 +88,10 @@ def course(t, duration, displacement, start):
     return displacement * (3.0 * s**2 - 2.0 * s**3)
 
 
-def changing(duration, displacement=3.2, start=3.0, seconds=16.0, smooth=False):
+def changing(duration, displacement=3.2, start=3.0, seconds=16.0):
     """Return a table of one vehicle that changes lanes between two others."""
     t = DT * np.arange(round(seconds / DT))
     across = 0.5 * 3.5 + course(t, duration, displacement, start)
-    if smooth:
-        across = smooth_positions(across, CUTOFF_ACROSS, DT)
     return table_of((20.0 + 10.0 * t, across, 10.0), (9.0 * t, 1.5 * 3.5, 9.0), (50.0 + 12.0 * t, 1.5 * 3.5, 12.0))
 
 
@@ -178,14 +125,6 @@ def test_without_a_start_or_an_end_a_change_has_no_duration():
         assert len(events["duration"]) == 2 and np.isnan(events["duration"]).all()
 
 
-@pytest.mark.parametrize(("duration", "found"), [(2.0, 3.1), (4.0, 4.3), (8.0, 7.8)])
-def test_smoothing_makes_short_changes_longer(duration, found):
-    """What the description of the shipped shapes of US 101 says; over a frame."""
-    tables = [changing(duration, start=4.0 + DT * phase / 12.0, smooth=True) for phase in range(12)]
-    durations = [cut_in_events(table)["duration"][0] for table in tables]
-    assert np.mean(durations) == pytest.approx(found, abs=0.1)
-
-
 def test_pooled_events_are_written_with_missing_values_as_empty_fields(tmp_path):
     events = {"ego": np.array([-1, 4]), "v_ego": np.array([np.nan, 12.34567])}
     pooled = concatenate_events([events, {name: values[:1] for name, values in events.items()}])
@@ -195,3 +134,61 @@ def test_pooled_events_are_written_with_missing_values_as_empty_fields(tmp_path)
     assert rows == [("-1", ""), ("4", "12.3457"), ("-1", "")]
     with pytest.raises(ValueError, match="at least one recording, got none"):
         concatenate_events([])
+
+
+SPEEDS, GAPS, DECELERATIONS = (10.0, 14.0, 18.0), (6.0, 15.0, 30.0), (1.5, 2.5, 3.5)
+
+
+def test_brakings_are_found_with_their_size():
+    events = hard_brake_events(stopping_traffic(SPEEDS, GAPS, DECELERATIONS))
+    assert tuple(events) == HARD_BRAKE_COLUMNS
+    own = ~np.isnan(events["gap"])
+    assert events["vehicle"][own].tolist() == [0, 2, 4] and events["lead"][own].tolist() == [1, 3, 5]
+    assert events["vehicle"][~own].tolist() == [1, 3, 5]  # nobody is ahead of these
+    onsets = events["frame"][own] - np.array([0, 400, 800])
+    assert (np.abs(onsets - PAUSE) <= 12).all()  # the filter of .40 Hz spreads a jump over a second
+    np.testing.assert_allclose(events["speed"][own], SPEEDS, rtol=0.06)
+    np.testing.assert_allclose(events["gap"][own], GAPS, rtol=1e-9)
+    # the smooth deceleration overshoots a jump by up to a tenth
+    np.testing.assert_allclose(events["deceleration"][own], DECELERATIONS, rtol=0.12)
+
+
+def test_a_braking_that_does_not_end_in_a_standstill_is_none():
+    assert len(hard_brake_events(stopping_traffic(SPEEDS, GAPS, DECELERATIONS, final=5.0))["speed"]) == 0
+
+
+def test_a_braking_under_way_where_a_track_begins_is_left_out():
+    """A hole 2.5 s after the onset: the track behind it begins in the braking. A hole before it leaves the braking."""
+    table = stopping_traffic((14.0,), (15.0,), (2.5,))
+    assert len(hard_brake_events(table)["frame"]) == 2
+    assert len(hard_brake_events(table.select(np.abs(table.frame - PAUSE - 25) > 2))["frame"]) == 0
+    assert len(hard_brake_events(table.select(np.abs(table.frame - PAUSE + 30) > 2))["frame"]) == 2
+
+
+def positions(table):
+    return np.split(table.x, table.track_starts()[1:])
+
+
+def test_exposure_is_that_of_the_tracks_without_their_ends():
+    table = stopping_traffic((14.0, 10.0), (15.0, 15.0), (2.5, 2.5))
+    seconds, metres = braking_exposure(positions(table))
+    lengths = np.diff(np.append(table.track_starts(), len(table)))
+    assert seconds == pytest.approx(0.1 * (lengths - 2 * END_TICKS).sum())
+    braked = [14.0**2 / 5.0, 10.0**2 / 5.0]  # v^2 / (2 a) of each of two vehicles
+    expected = sum(
+        2 * (way + speed * (PAUSE - END_TICKS) * 0.1) for way, speed in zip(braked, (14.0, 10.0), strict=True)
+    )
+    assert metres == pytest.approx(expected, rel=0.03)
+    short = table.select(table.frame < SHORTEST_TRACK - 1)
+    assert braking_exposure(positions(short)) == (0.0, 0.0)
+
+
+def test_a_track_that_runs_backwards_is_left_out():
+    """A recorded position that freezes: the smoothed one overshoots and comes back."""
+    position = stopping_track(12.0, 2.5)
+    gap = np.full(len(position), 30.0)
+    assert len(find_standstill_brakings(position, gap)[0]) == 1
+    stop = position[-1]
+    frozen = np.where(position > stop - 4.0, stop - 4.0, position)
+    frozen[np.argmax(position > stop - 4.0) :] -= 1.0
+    assert len(find_standstill_brakings(frozen, gap)[0]) == 0

@@ -426,16 +426,3 @@ def test_folders_without_recordings_are_refused(tmp_path):
     (tmp_path / "empty.csv").write_text("", encoding="utf-8")
     with pytest.raises(ValueError, match="has no CSV file with a column xloc_kf"):
         find_tgsim_files(tmp_path)
-
-
-@pytest.mark.parametrize(
-    ("factor", "message"), [(0.79, r"0\.79 times as fast"), (0.81, None), (1.24, None), (1.26, r"1\.26 times as fast")]
-)
-def test_positions_and_speeds_must_agree_within_a_fifth(factor, message):
-    rows = columns.Rows("road.csv", {}, np.arange(2, 7))
-    arguments = (rows, np.ones(5), np.arange(5), factor * np.arange(5), np.full(5, 10.0), 0.1, "error")
-    if message is None:
-        columns.check_tracks(*arguments)
-    else:
-        with pytest.raises(ValueError, match=message):
-            columns.check_tracks(*arguments)

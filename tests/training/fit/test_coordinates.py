@@ -1,11 +1,12 @@
-"""Coordinate systems: common units, held-out events, which system events choose; refits of whole clusters."""
+"""Mixtures and coordinate systems: known truth, what is rejected, which system is chosen; refits of whole clusters."""
 
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from sklearn.mixture import GaussianMixture
 
-from rare_envs.distributions.mixture import CoordinateMixture
+from rare_envs.distributions.mixture import CoordinateMixture, TruncatedGaussianMixture
 from rare_envs.scenarios.registry import scenario_named
 from training.fit import coordinates as module
 from training.fit import mixture as mixture_fit
@@ -21,19 +22,92 @@ from training.fit.coordinates import (
     refit,
 )
 from training.fit.filters import EventSet
+from training.fit.mixture import (
+    COVARIANCE_FLOOR,
+    EM_ITERATIONS,
+    SMALLEST_COMPONENT,
+    TOLERANCE,
+    fit_mixture,
+    select_mixture,
+)
+
+TRUTH = TruncatedGaussianMixture(
+    [0.65, 0.35],
+    [[10.0, 5.0], [20.0, 12.0]],
+    [[[4.0, 1.5], [1.5, 2.0]], [[2.0, -0.6], [-0.6, 1.0]]],
+    [-20.0, -20.0],
+    [50.0, 50.0],
+)
+
+
+@pytest.fixture
+def quick(monkeypatch):
+    """Fewer starts: enough for well separated clusters."""
+    monkeypatch.setattr(mixture_fit, "EM_STARTS", 1)
+
+
+def test_fit_recovers_a_known_mixture(quick):
+    n = 2000
+    fit = select_mixture(TRUTH.sample(n, np.random.default_rng(1)), 0)
+    mixture = fit.components
+    assert len(mixture.weights) == 2
+    assert abs(mixture.weights[0] - 0.65) < 4.0 * np.sqrt(0.65 * 0.35 / n)
+    counts = n * TRUTH.weights
+    for k in range(2):
+        variance = np.diag(TRUTH.covariances[k])
+        assert (np.abs(mixture.means[k] - TRUTH.means[k]) < 4.0 * np.sqrt(variance / counts[k])).all()
+        # Sampling error of a covariance, and the floor: 1 % of the overall variance.
+        error = 4.0 * np.sqrt(2.0 / counts[k]) * np.sqrt(np.outer(variance, variance))
+        floor = COVARIANCE_FLOOR * np.diag([30.0, 15.0])
+        assert (np.abs(mixture.covariances[k] - TRUTH.covariances[k]) < error + floor).all()
+
+
+def test_a_component_on_a_handful_of_events_is_rejected(quick):
+    rng = np.random.default_rng(0)
+    few = 2 * SMALLEST_COMPONENT - 4
+    far = np.array([60.0, 60.0]) + 0.01 * rng.standard_normal((few, 2))
+    points = np.concatenate([rng.standard_normal((200, 2)), far])
+    fit = select_mixture(points)
+    second = fit.candidates[1]
+    assert second.smallest == pytest.approx(few)
+    assert second.bic < fit.candidates[0].bic
+    assert not second.accepted
+    chosen = min((c for c in fit.candidates if c.accepted), key=lambda c: c.bic)
+    assert len(fit.components.weights) == chosen.components
+
+
+def test_few_events_get_one_component_and_too_few_an_error():
+    points = np.random.default_rng(0).standard_normal((15, 6))
+    assert len(select_mixture(points).candidates) == 1
+    with pytest.raises(ValueError, match="6 events are too few to fit 6 parameters"):
+        select_mixture(points[:6])
+
+
+@pytest.fixture(scope="module")
+def points():
+    rng = np.random.default_rng(0)
+    spread = np.array([[1.0, 0.5, 0.0], [0.0, 0.6, 0.2], [0.0, 0.0, 0.3]])
+    x = np.concatenate([rng.standard_normal((150, 3)) @ spread, 1.5 + 0.4 * rng.standard_normal((60, 3))])
+    return (x - x.mean(axis=0)) / x.std(axis=0)
+
+
+@pytest.mark.parametrize(("components", "seed"), [(1, 0), (4, 2)])
+def test_a_start_leads_where_it_does_in_an_independent_implementation(points, components, seed):
+    """The same k-means clusters, steps and rule of convergence: equal up to rounding."""
+    settings = {"tol": TOLERANCE, "reg_covar": 0.01, "max_iter": EM_ITERATIONS, "n_init": 1, "random_state": seed}
+    model = GaussianMixture(components, **settings).fit(points)
+    fit, likelihood = fit_mixture(points, components, floor=0.01, seed=seed, starts=1)
+    np.testing.assert_allclose(fit.weights, model.weights_, atol=1e-9)
+    np.testing.assert_allclose(fit.means, model.means_, atol=1e-9)
+    np.testing.assert_allclose(fit.covariances, model.covariances_, atol=1e-9)
+    assert likelihood == pytest.approx(len(points) * model.score(points), rel=1e-12)
+
 
 FOLLOWING = scenario_named("car_following").parameters
 CUT_IN = scenario_named("cut_in").parameters
 PLAIN, LOG_GAP, CLOSING = COORDINATE_SYSTEMS["car_following"]
 COMPONENT = ([1.0], [[15.0, 2.8, 0.0]], [np.diag([9.0, 0.16, 0.04])])
 """Speed, log gap, closing speed over the root of the gap."""
-ERROR_PATTERN = np.tile([1.0, -1.0], 25)
-"""Losses of 50 clusters with mean 0; their sum has the standard error sqrt(50) x 1.0102."""
-
-
-@pytest.fixture
-def quick(monkeypatch):
-    monkeypatch.setattr(mixture_fit, "EM_STARTS", 1)
 
 
 def closing_events(n, seed=0):
@@ -97,17 +171,14 @@ def test_events_of_a_cluster_err_together():
     assert choose_system([20.0, 8.0], [np.zeros(50), -loss], np.arange(50)) == 0
 
 
-def test_events_count_that_every_system_predicts():
-    """The second one predicts half of them, and far worse."""
-    half = np.where(np.arange(50) < 25, np.nan, -10.0 + 0.01 * ERROR_PATTERN)
-    assert choose_system([20.0, 8.0], [np.zeros(50), half], np.arange(50)) == 0
-    assert choose_system([10.0, 8.0], [np.full(50, np.nan)] * 2, np.arange(50)) == 1
-
-
-def test_a_tie_of_the_criterion_is_decided_by_the_events_held_out():
-    good, noise = np.zeros(50), np.random.default_rng(0).standard_normal(50)
-    slightly_worse = good - 0.01 + noise - noise.mean()
-    assert choose_system([9.9, 8.0], [good, slightly_worse], np.arange(50)) == 0
+def test_events_count_that_every_system_predicts_and_a_tie_is_decided_by_those_held_out():
+    """The second one predicts half of them, and far worse; then all of them and a little worse."""
+    alone, good = np.arange(50), np.zeros(50)
+    half = np.where(alone < 25, np.nan, -10.0 + 0.01 * np.tile([1.0, -1.0], 25))
+    assert choose_system([20.0, 8.0], [good, half], alone) == 0
+    assert choose_system([10.0, 8.0], [np.full(50, np.nan)] * 2, alone) == 1
+    noise = np.random.default_rng(0).standard_normal(50)
+    assert choose_system([9.9, 8.0], [good, good - 0.01 + noise - noise.mean()], alone) == 0
 
 
 def test_a_parameter_that_does_not_vary_is_named():
@@ -124,14 +195,7 @@ def events(n, seed=0, per_cluster=1):
     return EventSet(x, np.arange(n) // per_cluster)
 
 
-def test_columns_apart_are_drawn_by_themselves():
-    base = events(20)
-    apart = np.arange(15.0)[:, None]
-    drawn = draw_events(EventSet(base.joint, base.clusters, apart), np.random.default_rng(0))
-    assert drawn.apart.shape == (15, 1)
-    assert 5 < len(np.unique(drawn.apart)) < 15
-
-
+@pytest.mark.slow
 def test_the_spread_is_the_standard_error_of_the_mean(quick):
     """Of n independent events: sd / sqrt(n), here from 40 refits, so to 11 % (two standard errors 23 %)."""
     n = 200
@@ -155,6 +219,7 @@ def test_more_refits_where_the_number_of_components_differs(monkeypatch):
         assert families == [f"{number} components" for number in numbers[:wanted]]
 
 
+@pytest.mark.slow
 def test_coordinates_are_chosen_anew_in_each_refit(quick):
     """By the BIC of the events drawn; 400 events of logarithms of gaps leave no doubt."""
     systems = COORDINATE_SYSTEMS["car_following"][:2]
@@ -183,9 +248,11 @@ def test_refits_follow_the_seed_and_few_clusters_have_none(quick):
     assert refit(events(40, per_cluster=10), [LOG_GAP], FOLLOWING) == ()
 
 
-def test_clusters_are_drawn_whole():
-    drawn = draw_events(events(60, per_cluster=3), np.random.default_rng(1))
-    original = events(60, per_cluster=3).joint
+def test_clusters_are_drawn_whole_and_columns_apart_by_themselves():
+    recorded = events(60, per_cluster=3)
+    original, apart = recorded.joint, np.arange(15.0)[:, None]
+    drawn = draw_events(EventSet(original, recorded.clusters, apart), np.random.default_rng(1))
+    assert drawn.apart.shape == (15, 1) and 5 < len(np.unique(drawn.apart)) < 15
     assert len(drawn.joint) == 60
     assert len(np.unique(drawn.clusters)) == 20  # one drawn twice counts as two
     for label in np.unique(drawn.clusters):

@@ -11,23 +11,22 @@ from rare_envs.scenarios.base_distributions import load_base
 from rare_envs.scenarios.registry import scenario_named
 from tests.training.data.recordings import (
     CLOCK,
+    PAUSE,
     coifman_matrix,
     i24_documents,
     simulate,
+    stopping_traffic,
     tgsim_rows,
     write_coifman,
     write_csv,
     write_i24,
 )
-from tests.training.data.stopping_traffic import PAUSE, stopping_traffic
 from training.command_line import EventOptions
 from training.data.events import braking_exposure, car_following_events, cut_in_events
 from training.data.table import synthetic_traffic
 from training.fit import mixture as mixture_fit
 from training.fit.filters import EVENT_RECIPES, filter_events, read_events
 from training.fit.recordings import (
-    SECONDS_BETWEEN,
-    FitProgress,
     count_events,
     fit_bases,
     fit_own_bases,
@@ -118,23 +117,19 @@ def test_pairs_at_the_entry_do_not_count():
     assert count_events("car_following", events, len(events["ego"]), observe_traffic(table)) is None
 
 
-def test_new_leaders_count_with_the_share_that_is_used():
-    events = {"at_entry": np.array([True, False, False, True, False, False]), "ego": np.arange(6)}
-    frequency = count_events("car_following", events, 3, np.array([2.0, 100.0, 0.0, 0.0]))
-    assert frequency is not None
+def test_events_count_with_the_share_that_is_used():
+    driven = np.array([2.0, 100.0, 0.0, 0.0])  # h, km
+    pairs = {"at_entry": np.array([True, False, False, True, False, False]), "ego": np.arange(6)}
+    frequency = count_events("car_following", pairs, 3, driven)
     assert (frequency.count, frequency.share_events) == (4, 4)
     assert frequency.per_hour == pytest.approx(3 / 2.0)
-
-
-def test_cut_ins_count_with_the_share_that_is_used():
-    events = {"phase": np.array(["start", "crossing"] * 4), "ego": np.array([1, 1, 2, 2, -1, -1, 3, 3])}
-    frequency = count_events("cut_in", events, 2, np.array([2.0, 100.0, 0.0, 0.0]))
-    assert frequency is not None
+    cuts = {"phase": np.array(["start", "crossing"] * 4), "ego": np.array([1, 1, 2, 2, -1, -1, 3, 3])}
+    frequency = count_events("cut_in", cuts, 2, driven)
     assert (frequency.count, frequency.share_events) == (3, 3)
     assert frequency.per_hour == pytest.approx(3 / 2.0 * 2 / 3)
     assert frequency.per_km == pytest.approx(3 / 100.0 * 2 / 3)
     none = cut_in_events(synthetic_traffic(seconds=3.0, per_lane=2))
-    assert count_events("cut_in", none, 0, np.array([2.0, 100.0, 0.0, 0.0])) is None
+    assert count_events("cut_in", none, 0, driven) is None
 
 
 def test_bases_are_fitted_to_recordings(simulated, quick, tmp_path, capsys):
@@ -201,18 +196,3 @@ def test_bad_arguments_are_refused(source, options, message, tmp_path):
     recordings = EventOptions(**{kind: Path(path) for kind, path in source.items()})
     with pytest.raises(ValueError, match=message):
         fit_bases(recordings, tmp_path / "out", **options)
-
-
-def test_counts_are_printed_every_few_seconds(capsys):
-    now = 100.0
-    progress = FitProgress(clock=lambda: now)
-    progress.say("cut_in: 40 events")
-    for number in range(20):
-        now += 0.3 * SECONDS_BETWEEN
-        progress.count("cut_in", f"refit {number + 1} of 20")
-    printed = capsys.readouterr()
-    assert printed.out == ""
-    assert printed.err.splitlines() == [
-        "cut_in: 40 events",
-        *(f"cut_in: refit {number} of 20" for number in range(4, 21, 4)),
-    ]

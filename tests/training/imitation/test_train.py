@@ -92,6 +92,8 @@ def test_a_training_that_could_not_begin_does_not_block_its_folder(tmp_path):
     with pytest.raises(ValueError, match=r"no ngsim_us101_scenes\.parquet in the folder 'nope'"):
         train_driver(Source("data", Path("nope")), tiny(updates=1), out)
     assert not out.exists()
+    with pytest.raises(ValueError, match="Nobody follows"):
+        prepare_data([scene(vehicles=3)])
     with pytest.raises(ValueError, match="Cannot read"):
         train_driver(Source("ngsim", tmp_path / "nope.csv"), tiny(updates=1), out)
     write_ngsim(tmp_path / "mine.csv", simulate(seed=1, lanes=2, per_lane=6, seconds=12.0))
@@ -128,13 +130,6 @@ def test_a_source_of_another_format_is_learned_from(traffic, tmp_path):
         assert len(learn) >= 2 and len(test) == 1
         assert source.options == f"--{kind} {name} --seconds 4"
         assert name.partition(".")[0] in source.description and source.licence
-
-
-def test_scenes_without_followers_are_refused():
-    with pytest.raises(ValueError, match="Nobody follows"):
-        prepare_data([scene(vehicles=3)])
-    with pytest.raises(ValueError, match="got none"):
-        prepare_data([])
 
 
 def test_the_command_line_has_every_setting_with_its_default():
@@ -183,21 +178,11 @@ def test_the_shared_command_line_trains_drivers(monkeypatch, tmp_path, capsys):
     assert answer == {"driver": str(tmp_path / "it"), "method": "gail", "seed": 0}
 
 
-@pytest.mark.parametrize("words", [["--data", "t", "--method", "sac"], ["--data", "nowhere"], []])
-def test_the_shared_command_line_refuses_in_one_line(words, tmp_path, capsys):
-    assert rare_envs_command(["train-drivers", *words, "--out", str(tmp_path / "run")]) == 2
-    assert len(capsys.readouterr().err.strip().splitlines()) == 1
-
-
-def test_logs_without_tensorboard_are_refused(data, tmp_path, monkeypatch):
-    monkeypatch.setitem(sys.modules, "torch.utils.tensorboard", None)
-    with pytest.raises(ValueError, match=r"rare-envs\[logs\]"):
-        train_learner(make_learner(data, tiny(updates=1)), tmp_path, log=True)
-    with pytest.raises(ValueError, match=r"rare-envs\[logs\]"):  # before the data are even looked for
-        train_driver(Source("data", tmp_path / "nowhere"), TINY, tmp_path / "run", log=True)
-
-
-def test_logs_go_to_tensorboard(data, tmp_path):
+def test_logs_go_to_tensorboard(data, tmp_path, monkeypatch):
+    with monkeypatch.context() as patch:
+        patch.setitem(sys.modules, "torch.utils.tensorboard", None)
+        with pytest.raises(ValueError, match=r"rare-envs\[logs\]"):  # before the data are even looked for
+            train_driver(Source("data", tmp_path / "nowhere"), TINY, tmp_path / "run", log=True)
     pytest.importorskip("tensorboard", reason="the extra logs is optional")
     train_learner(make_learner(data, tiny(updates=2)), tmp_path, log=True)
     assert list(tmp_path.glob("events.out.*"))

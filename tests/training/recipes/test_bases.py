@@ -141,14 +141,9 @@ def test_the_shipped_checks_are_those_of_the_recorded_states():
         assert one["expected"] == pytest.approx(other["expected"], rel=0.01)
 
 
-def drive(gaps, speed=25.0, relative=-1.0):
-    gap = np.concatenate([np.full(n, value) for value, n in gaps])
-    return np.full(len(gap), speed), np.full(len(gap), relative), gap
-
-
-@pytest.mark.parametrize(
-    ("gaps", "expected"),
-    [
+def test_new_leaders_are_jumps_of_the_gap_that_stay():
+    """The gaps of so many ticks each, and those of the new leaders."""
+    for gaps, expected in (
         ([(60.0, 50), (30.0, 50)], [30.0]),  # somebody cuts in
         ([(30.0, 50), (60.0, 50)], [60.0]),  # the leader leaves
         ([(np.nan, 50), (60.0, 50)], [60.0]),  # nobody, then somebody
@@ -157,12 +152,11 @@ def drive(gaps, speed=25.0, relative=-1.0):
         ([(60.0, 50), (30.0, 10)], []),  # the record ends before the new leader is tracked
         ([(60.0, 50), (30.0, 10), (50.0, 40)], []),  # it jumps again within the second after
         ([(60.0, 50), (30.0, 50), (50.0, 50)], [30.0, 50.0]),
-    ],
-)
-def test_jumps(gaps, expected):
-    found = find_new_leaders(*drive(gaps))
-    assert found[:, 2].tolist() == expected
-    assert (found[:, :2] == [25.0, 24.0]).all()
+    ):
+        gap = np.concatenate([np.full(n, value) for value, n in gaps])
+        found = find_new_leaders(np.full(len(gap), 25.0), np.full(len(gap), -1.0), gap)
+        assert found[:, 2].tolist() == expected
+        assert (found[:, :2] == [25.0, 24.0]).all()
 
 
 def test_profiles_of_cubic_courses_have_their_durations(tmp_path):

@@ -27,7 +27,7 @@ from training.imitation.traffic import stack_scenes, start_replay, step_replay
 from training.imitation.train import train_learner
 from training.recipes import imitation, vision
 from training.recipes.imitation import EXPERT, FREE, EncounterSpec, expert_acceleration, make_scenes, record_drive
-from training.recipes.ordinary_traffic import CASES, FLOOR_HEADWAY, VERDICT_NAMES, OrdinaryDrivers, draw_starts, judge
+from training.recipes.ordinary_traffic import FLOOR_HEADWAY, VERDICT_NAMES, judge
 from training.recipes.situations import make_situations, start_situation
 
 CUT_IN = World(find_scenario("rare_envs/CutIn-v0"), Sensing("features", lidar=True))
@@ -60,44 +60,17 @@ def reasons(found: Any) -> Counter[str]:
 
 @pytest.mark.parametrize("case", [*(pytest.param(c, marks=pytest.mark.slow) for c in ("straight", "i80")), "bends"])
 def test_a_driver_by_rule_is_nominal(case: str) -> None:
-    found = judge(agents.load_ego("idm"), case, rollouts=12, seed=3, seconds=30.0)
-    assert reasons(found) == {"passed": 12}
+    found = judge(agents.load_ego("idm"), case, rollouts=6, seed=3, seconds=20.0)
+    assert reasons(found) == {"passed": 6}
     assert found.headway.min() > FLOOR_HEADWAY and found.margin.min() > 0.4
 
 
-@pytest.mark.parametrize(
-    ("ego", "reason"),
-    [
-        (Flawed(steering=0.005), "left its lane"),
-        (Flawed(brakes=False), "too close"),
-        (Flawed(acceleration=-1.0), "left behind"),
-    ],
-)
-def test_a_flawed_driver_is_caught_and_the_reason_is_told(ego: Any, reason: str) -> None:
+@pytest.mark.parametrize("reason", ["left its lane", "too close", "left behind"])
+def test_a_flawed_driver_is_caught_and_the_reason_is_told(reason: str) -> None:
+    flaws: dict[str, Any] = {"left its lane": {"steering": 0.005}, "too close": {"brakes": False}}
+    ego = Flawed(**flaws.get(reason, {"acceleration": -1.0}))
     found = reasons(judge(ego, "straight", rollouts=16, seed=1, seconds=30.0))
     assert found.keys() <= {reason, "passed"} and found["passed"] < 8  # some leads only ever drive away
-
-
-def _near(n: int, rng: np.random.Generator) -> Any:
-    x = draw_starts(n, rng)
-    x[:, 0], x[:, 2] = 20.0, 6.0
-    return x
-
-
-@pytest.mark.parametrize(
-    ("others", "starts", "own", "reason"), [(0.0, draw_starts, -1.0, "hit by others"), (-1e4, _near, 0.0, "collided")]
-)
-def test_who_runs_into_another_is_to_blame(others: float, starts: Any, own: float, reason: str) -> None:
-    """In one world the follower does not brake and the ego does; in the other the lead stops at once."""
-
-    @dataclass(frozen=True)
-    class Reckless(OrdinaryDrivers):
-        def act(self, features: Any, weights: Any, innovations: Any, memory: Any) -> Any:
-            action, memory = super().act(features, weights, innovations, memory)
-            return torch.full_like(action, others), memory
-
-    case = replace(CASES["straight"], drivers=Reckless, starts=starts)
-    assert reasons(judge(Flawed(acceleration=own), case, rollouts=4, seconds=20.0)) == {reason: 4}
 
 
 def test_an_encounter_is_the_scenario_with_its_ego_free() -> None:
@@ -136,16 +109,12 @@ def traffic(gap: float, aside: float, heading: float = 0.0) -> State:
     return State(x, y, torch.tensor([[0.0, heading]]), torch.tensor([[20.0, 15.0]]), theta=x[:, :0])
 
 
-def test_the_expert_brakes_as_hard_as_idm_behind_a_lead() -> None:
+def test_the_expert_brakes_as_idm_for_those_in_its_path_and_coming_into_it() -> None:
     root = 2.0 * np.sqrt(EXPERT.max_acceleration * EXPERT.comfortable_deceleration)
     desired_gap = EXPERT.jam_distance + 20.0 * EXPERT.time_headway + 20.0 * 5.0 / root
     expected = EXPERT.max_acceleration * (1.0 - (20.0 / 40.0) ** 4 - (desired_gap / 15.0) ** 2)
     assert expert_acceleration(traffic(15.0, 0.0)).item() == pytest.approx(expected, rel=1e-5)
-
-
-@pytest.mark.parametrize(
-    ("state", "brakes"),
-    [
+    for state, brakes in (
         (traffic(10.0, 3.5), False),  # beside
         (traffic(10.0, 2.4), True),  # within the margin
         (traffic(10.0, 3.5, heading=-0.08), True),  # comes 1.2 m nearer within 1 s
@@ -154,23 +123,16 @@ def test_the_expert_brakes_as_hard_as_idm_behind_a_lead() -> None:
         (traffic(10.0, 3.0, heading=-0.5), True),  # will be on the other side by then
         (traffic(-12.0, 0.0), False),  # behind
         (traffic(-2.0, 2.1), True),  # overlaps along the road and across it nearly
-    ],
-)
-def test_the_expert_brakes_for_those_in_its_path_and_coming_into_it(state: State, brakes: bool) -> None:
-    wanted = expert_acceleration(state).item()
-    assert (wanted < -1.0) if brakes else (wanted == FREE)
+    ):
+        wanted = expert_acceleration(state).item()
+        assert (wanted < -1.0) if brakes else (wanted == FREE)
 
 
 @pytest.fixture
-def ego() -> LearnedDriver:
-    driver = agents.load_driver("imitation")
-    assert isinstance(driver, LearnedDriver)
-    return driver
-
-
-@pytest.fixture
-def coasting(ego: LearnedDriver) -> LearnedDriver:
+def coasting() -> LearnedDriver:
     """An ego that hardly accelerates, brakes or steers, whatever it sees."""
+    ego = agents.load_driver("imitation")
+    assert isinstance(ego, LearnedDriver)
     policy = copy.deepcopy(ego.policy)
     for weights in policy.head.parameters():
         weights.data.zero_()
@@ -185,14 +147,6 @@ def test_labels_are_the_teachers_but_for_harder_braking(coasting: LearnedDriver)
     assert (right[1][:, 0] <= 0.0).all() and (right[1][:, 0] == 0.0).sum() > 5
     hardest = EXPERT.max_deceleration / coasting.policy.scaling.action_std[0].item()
     assert right[1][:, 0].min().item() == pytest.approx(-hardest, rel=0.05)
-
-
-def test_nothing_is_recorded_after_a_collision(coasting: LearnedDriver) -> None:
-    one, other, both = (
-        len(record_drive(coasting, coasting.policy, CUT_IN, x, 1, corrected=False)[0])
-        for x in (CUT_INS[:1], CUT_INS[1:], CUT_INS)
-    )
-    assert 0 < one < other == 101 and both == one + other
 
 
 @pytest.mark.slow
@@ -244,16 +198,6 @@ def test_the_expert_of_vision_keeps_lane_and_distance_from_wherever_situations_b
             offset = 0.5 * vision.auxiliary_targets(episode)[:, 0].abs()
         assert int(episode.collided.sum()) <= 1  # some situations begin too fast and too close
         assert float(offset[~episode.collided].max()) < 0.1
-
-
-def test_labels_that_ask_for_more_than_the_brakes_differ_only_where_they_are_the_limit() -> None:
-    _, episode = start_situation(make_situations()[1], 256, 1.0, np.random.default_rng(1))
-    usual, more = vision.expert_outputs(episode), vision.expert_outputs(episode, brakes=10.0)
-    at_limit = usual[:, 0] == usual[:, 0].min()
-    assert 0 < int(at_limit.sum()) < 256 and torch.equal(more[~at_limit], usual[~at_limit])
-    assert bool((more[at_limit, 0] <= usual[at_limit, 0]).all()) and float(more[:, 0].min()) == -5.0
-    speed = episode.state.speed[:, 0]
-    assert torch.equal(to_actions(more, speed), to_actions(usual, speed))  # the same is done
 
 
 def test_pictures_carry_the_outputs_of_the_expert_mirrored_with_the_picture() -> None:
