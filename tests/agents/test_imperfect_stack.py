@@ -7,7 +7,6 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-import pytest
 import torch
 
 import rare_envs
@@ -24,11 +23,11 @@ def problem(ego: Any, noise: Any = True, horizon: float = 4.0) -> rare_envs.Driv
     return rare_envs.DrivingProblem(ENV, ego=ego, noise=noise, horizon=horizon, base="us101-15-offsets")
 
 
-@pytest.mark.parametrize("noise", [True, "fixed", False])
-def test_a_perfect_stack_changes_nothing(noise: Any) -> None:
-    around, plain = problem(NoisyEgo("idm", PERFECT), noise), problem("idm")
-    x = around.base.sample(50, np.random.default_rng(0))
-    np.testing.assert_allclose(around.evaluate(x), plain.evaluate(x[:, :6]), atol=1e-4)
+def test_a_perfect_stack_changes_nothing() -> None:
+    for noise in (True, "fixed", False):
+        around, plain = problem(NoisyEgo("idm", PERFECT), noise), problem("idm")
+        x = around.base.sample(50, np.random.default_rng(0))
+        np.testing.assert_allclose(around.evaluate(x), plain.evaluate(x[:, :6]), atol=1e-4)
 
 
 def test_the_probability_is_that_of_fresh_noise() -> None:
@@ -136,32 +135,6 @@ def test_actuators_follow_with_a_lag_and_within_their_rates() -> None:
         np.testing.assert_allclose(done[0], expected, rtol=1e-4)
     slow = problem(NoisyEgo("idm", Stack(lag=0.0, steering_lag=0.0, jerk=10.0, steering_rate=0.2))).driver
     np.testing.assert_allclose(slow._actuate(torch.zeros(1, 2), wanted)[0], [-1.0, 0.02], rtol=1e-5)
-
-
-def test_any_ego_can_be_behind_a_stack() -> None:
-    class Coast:
-        def predict(self, observation: Any, **_: Any) -> Any:
-            return np.zeros((len(observation), 2)), None
-
-    for ego in (Coast(), load_ego("gail")):
-        around = problem(NoisyEgo(ego), horizon=1.0)
-        assert np.isfinite(around.evaluate(around.base.sample(5, np.random.default_rng(0)))).all()
-
-
-@pytest.mark.parametrize(
-    ("spec", "message"),
-    [
-        ("noisy:idm?latncy=0.3", "Unknown setting 'latncy' .did you mean 'latency'"),
-        ("noisy:idm?latency=soon", "Expected latency to be a number, got 'soon'"),
-        ("noisy:idm?missed=1", "missed below 1"),
-        ("noisy:idm?lag=-1", "Expected lag to be a finite number >= 0"),
-        ("noisy:idn", "Unknown ego 'idn'"),
-    ],
-)
-def test_wrong_settings_are_refused(spec: str, message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        load_ego(spec)
-    assert load_ego("noisy:idm?latency=0.3&missed=0.2").stack == Stack(latency=0.3, missed=0.2)
 
 
 class Absent:

@@ -78,6 +78,8 @@ def test_observations_of_another_form_are_refused(ego: VisionEgo) -> None:
         ego.predict({**seen(2), "camera": np.zeros((2, HEIGHT, WIDTH, 3), np.float32)})
     with pytest.raises(ValueError, match="speed"):
         ego.predict({**seen(2), "speed": np.zeros((3, 1), np.float32)})
+    with pytest.raises(ValueError, match=r"Expected dt=0.1 s"):
+        rare_envs.DrivingProblem(CUT_IN, ego=load_ego("vision"), dt=0.05)
 
 
 def test_a_problem_shows_it_what_it_needs_and_is_a_loop_over_an_environment(ego: VisionEgo) -> None:
@@ -107,11 +109,6 @@ def test_it_drives_behind_a_stack_and_in_a_process_of_its_own(spec: str) -> None
     if spec == "process:vision":
         plain = rare_envs.DrivingProblem(CUT_IN, ego=load_ego("vision"), horizon=0.3)
         np.testing.assert_allclose(f, plain.evaluate(x), atol=1e-6)
-
-
-def test_another_tick_is_refused():
-    with pytest.raises(ValueError, match=r"Expected dt=0.1 s"):
-        rare_envs.DrivingProblem("rare_envs/CutIn-v0", ego=load_ego("vision"), dt=0.05)
 
 
 def test_the_network_is_that_of_the_paper() -> None:

@@ -1,23 +1,190 @@
-"""Learned drivers: one batched pass against a loop over networks, the noise and the limits; as egos, and by rule."""
+"""A learned driver: its network and noise by hand, the distribution of its weights, act, as ego, and by rule."""
 
+import copy
+import math
 from types import SimpleNamespace
 
 import gymnasium as gym
 import numpy as np
 import pytest
 import torch
+from scipy import stats
 
 import rare_envs
 from agents import LearnedDriver, LearnedEgo, load_driver
 from agents.learned.driver import RuleDriver
-from agents.learned.networks import HEAD_SIZE, AutoregressiveNoise, WeightDistribution, head_weights
+from agents.learned.networks import (
+    FEATURE_CLIP,
+    HEAD_SIZE,
+    HUMAN_NOISE,
+    RADIUS,
+    WEIGHT_NAMES,
+    AutoregressiveNoise,
+    Policy,
+    WeightDistribution,
+    head_weights,
+)
 from rare_envs.control.actions import MAX_ACCELERATION
 from rare_envs.control.idm import IDM
 from rare_envs.sensors.lidar import AHEAD_BEAM, CURVATURE_COLUMN, RANGE_COLUMNS, RATE_COLUMNS, SPEED_COLUMN
 from rare_envs.simulation.observation import LIDAR_SCALES
 from rare_envs.traffic.neighbours import Lead
 from rare_envs.traffic.vehicle_models import bicycle
-from tests.agents.learned.heads import replace_head
+from samplers.methods.blocks import announced_blocks
+
+
+def replace_head(policy: Policy, weights: torch.Tensor) -> Policy:
+    """Return a copy of a network with other weights (404,) in its last layer, as `head_weights` has them."""
+    changed, layer = copy.deepcopy(policy), weights.detach().view(4, 101)
+    changed.head.weight.data, changed.head.bias.data = layer[:, :-1].clone(), layer[:, -1].clone()
+    return changed
+
+
+def test_forward_by_hand(policy, features):
+    x = 5.0 * features(3, 2)  # some are clipped
+    mean, log_std = policy(x)
+
+    arrays = {name: value.double().numpy() for name, value in policy.state_dict().items()}
+    z = (x.double().numpy() - arrays["feature_mean"]) / arrays["feature_std"]
+    z = np.clip(z, -FEATURE_CLIP, FEATURE_CLIP)
+    for layer in ("first", "second"):
+        z = np.tanh(z @ arrays[f"{layer}.weight"].T + arrays[f"{layer}.bias"])
+    out = z @ arrays["head.weight"].T + arrays["head.bias"]
+    np.testing.assert_allclose(mean.numpy(), out[..., :2], atol=1e-5)
+    cap = arrays["log_std_cap"]
+    np.testing.assert_allclose(log_std.numpy(), cap - np.log1p(np.exp(cap - out[..., 2:])), atol=1e-5)
+
+
+def test_names_are_in_the_order_of_the_weights(policy):
+    """Changing the weight of a name changes the output and the unit that it names."""
+    assert len(WEIGHT_NAMES) == len(set(WEIGHT_NAMES)) == HEAD_SIZE
+    places = {"mean_acceleration_0": [0, 0], "mean_yaw_rate_99": [1, 99], "log_std_yaw_rate_bias": [3, 100]}
+    for name, place in places.items():
+        weights = head_weights(policy)
+        weights[WEIGHT_NAMES.index(name)] += 1.0
+        changed = replace_head(policy, weights)
+        weight, bias = changed.head.weight - policy.head.weight, changed.head.bias - policy.head.bias
+        assert torch.cat((weight, bias[:, None]), dim=1).nonzero().tolist() == [place]
+
+
+# --- noise ---------------------------------------------------------------------------------------
+
+
+def sequence(colour, ticks, n=100_000, seed=0):
+    generator = torch.Generator().manual_seed(seed)
+    memory = colour.begin(torch.randn(n, 2, 2, generator=generator))
+    values = []
+    for _ in range(ticks):
+        value, memory = colour.step(memory, torch.randn(n, 2, generator=generator))
+        values.append(value)
+    return torch.stack(values)
+
+
+@pytest.mark.parametrize("colour", [HUMAN_NOISE, AutoregressiveNoise((0.95, 0.5), (0.0, 0.0)), AutoregressiveNoise()])
+def test_noise_is_stationary_from_the_first_tick_and_obeys_the_recursion(colour):
+    values = sequence(colour, 30)
+    # the variance of n = 1e5 draws has a standard error of sqrt(2 / n) = 0.0045
+    torch.testing.assert_close(values.var(dim=1), torch.ones(30, 2), atol=5 * 0.0045, rtol=0)
+    for action, (a, b) in enumerate(zip(colour.first, colour.second, strict=True)):
+        rho = [1.0, a / (1 - b)]
+        for _ in range(19):
+            rho.append(a * rho[-1] + b * rho[-2])
+        for lag in (1, 5, 10, 20):
+            found = float((values[0, :, action] * values[lag, :, action]).mean())
+            assert found == pytest.approx(rho[lag], abs=5 / math.sqrt(100_000) * 1.5)
+
+
+def test_balanced_noise_adds_up_to_nothing_but_what_is_fresh():
+    noise = AutoregressiveNoise(HUMAN_NOISE.first, HUMAN_NOISE.second, balanced=True)
+    memory = noise.begin(torch.randn(5, 2, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(0)))
+    total = torch.zeros(5, 2, dtype=torch.float64)
+    for _ in range(400):
+        value, memory = noise.step(memory, torch.zeros(5, 2, dtype=torch.float64))
+        total += value
+    torch.testing.assert_close(total, torch.zeros_like(total), atol=1e-6, rtol=0)
+    values = sequence(noise, 150)
+    torch.testing.assert_close(values[-1].var(dim=0), torch.ones(2), atol=5 * 0.0045, rtol=0)
+
+
+def test_noises_that_cannot_be_are_refused():
+    with pytest.raises(ValueError, match="stationary"):
+        AutoregressiveNoise((1.0, 0.5), (0.0, 0.0))
+    with pytest.raises(ValueError, match="Expected coefficients of lag 2 of a noise that begins balanced"):
+        AutoregressiveNoise((0.9, 0.9), (0.0, 0.0), balanced=True)
+
+
+PRECISION = np.array([[4.0, 1.0, 0.0], [1.0, 3.0, -0.5], [0.0, -0.5, 2.0]])
+MEAN = np.array([1.0, -2.0, 0.5])
+
+
+@pytest.fixture
+def small():
+    return WeightDistribution(MEAN, PRECISION)
+
+
+def test_draws_have_mean_and_covariance(small, rng):
+    n, covariance = 200_000, np.linalg.inv(PRECISION)
+    x = small.sample(n, rng)
+    np.testing.assert_allclose(x.mean(axis=0), MEAN, atol=4 * np.sqrt(covariance.max() / n))
+    np.testing.assert_allclose(np.cov(x.T), covariance, atol=4 * covariance.max() * np.sqrt(2 / n))
+
+
+def test_maps_are_inverse_and_density_is_theirs(weight_distribution, rng):
+    """log p(x) = log phi(u) - log |dx / du| at u = the point in standard normal space."""
+    u = rng.standard_normal((20, weight_distribution.dim))
+    x = weight_distribution.from_standard_normal(u)
+    np.testing.assert_allclose(weight_distribution.to_standard_normal(x), u, atol=1e-10)
+    _, log_det = np.linalg.slogdet(weight_distribution.precision)
+    np.testing.assert_allclose(
+        weight_distribution.log_prob(x), stats.norm.logpdf(u).sum(axis=1) + 0.5 * log_det, rtol=1e-12
+    )
+    np.testing.assert_allclose(
+        weight_distribution.covariance @ weight_distribution.precision, np.eye(weight_distribution.dim), atol=1e-8
+    )
+    np.testing.assert_array_equal(weight_distribution.cholesky, np.tril(weight_distribution.cholesky))
+
+
+def test_it_is_a_block_whose_mean_stays_in_the_box(weight_distribution, rng):
+    base = SimpleNamespace(
+        blocks=(
+            weight_distribution,
+            SimpleNamespace(alpha=np.full(2, 2.0), beta=np.full(2, 2.0), low=np.zeros(2), high=np.ones(2)),
+        ),
+        log_prob=lambda x: weight_distribution.log_prob(x[:, :404]) + stats.beta(2, 2).logpdf(x[:, 404:]).sum(axis=1),
+    )
+    product = announced_blocks(SimpleNamespace(base=base, dim=406))
+    x = product.sample(300, rng)
+    wanted = np.full((2, 300), 1 / 300)
+    x[:, :404] += 0.05  # asks for means far outside the box
+    moved = product.project(x, wanted, 0.8)
+    shift = moved.sample(20_000, rng)[:, :404].mean(axis=0) - weight_distribution.mean
+    assert np.abs(shift).max() < RADIUS + 5 * np.sqrt(weight_distribution.covariance.max()) / np.sqrt(20_000)
+    assert np.abs(shift).max() > 0.5 * RADIUS
+
+
+def test_what_is_no_law_is_refused(small):
+    for given, message in (
+        ((MEAN, PRECISION[:2]), r"got \(3,\) and \(2, 3\)"),
+        ((MEAN * np.nan, PRECISION), "finite"),
+        ((MEAN, PRECISION + np.triu(np.ones((3, 3)), 1)), "symmetric"),
+        ((MEAN, -PRECISION), "positive definite"),
+        ((MEAN, PRECISION, -1.0), "radius"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            WeightDistribution(*given)
+    arrays = small.to_arrays()
+    with pytest.raises(ValueError, match="upper triangle"):
+        WeightDistribution.from_arrays({**arrays, "columns": arrays["columns"] + 1})
+    with pytest.raises(ValueError, match="one length"):
+        WeightDistribution.from_arrays({**arrays, "precision": arrays["precision"][1:]})
+
+
+def test_gradients_are_pulled_back_by_the_map(small, rng):
+    """g(u) = a.x(u) is linear: its gradient is its value at the unit vectors less that at 0."""
+    a = rng.standard_normal(3)
+    expected = small.from_standard_normal(np.eye(3)) @ a - MEAN @ a
+    np.testing.assert_allclose(small.pull_back(rng.standard_normal((2, 3)), np.tile(a, (2, 1))), [expected] * 2)
+
 
 DT = 0.1
 
@@ -48,80 +215,35 @@ def test_one_pass_equals_a_loop_over_networks(driver, features, generator):
         torch.testing.assert_close(memory, after)
 
 
-@pytest.mark.parametrize("sign", [-1.0, 1.0])
-def test_actions_stay_within_their_limits(policy, features, sign):
+def test_actions_stay_within_their_limits(policy, features):
     driver = LearnedDriver(policy, acceleration=(-5.0, 3.0), yaw_rate=(-0.1, 0.2))
-    fresh, memory = torch.full((2, 3, 2), sign * 1e3), torch.zeros(2, 3, 2, 2)
-    action, _ = driver.act(features(2, 3), innovations=fresh, memory=memory)
-    expected = torch.tensor([-5.0, -0.1] if sign < 0 else [3.0, 0.2])
-    torch.testing.assert_close(action, expected.expand(2, 3, 2))
+    for sign, expected in ((-1.0, (-5.0, -0.1)), (1.0, (3.0, 0.2))):
+        fresh, memory = torch.full((2, 3, 2), sign * 1e3), torch.zeros(2, 3, 2, 2)
+        action, _ = driver.act(features(2, 3), innovations=fresh, memory=memory)
+        torch.testing.assert_close(action, torch.tensor(expected).expand(2, 3, 2))
+    with pytest.raises(ValueError, match="ascending"):
+        LearnedDriver(policy, acceleration=(4.0, -8.0))
+    with pytest.raises(ValueError, match="404 weights"):
+        LearnedDriver(policy, weights=WeightDistribution(np.zeros(3), np.eye(3)))
 
 
-def test_strides_and_precision_of_the_input_do_not_matter(driver, features):
-    x = features(4, 6)
-    action, _ = driver.act(x[:, ::2])
-    torch.testing.assert_close(action, driver.act(x[:, ::2].contiguous())[0])
-    double, _ = driver.act(x[:, ::2].double())
-    assert double.dtype == torch.float64
-    torch.testing.assert_close(double.float(), action)
-
-
-def test_actions_have_gradients_in_features_and_weights(driver, features, generator):
-    x = (0.1 * features(2, 2)).requires_grad_()
-    weights = head_weights(driver.policy).repeat(2, 1).requires_grad_()
-    action, _ = driver.act(x, weights, torch.randn(2, 2, 2, generator=generator), torch.ones(2, 2, 2, 2))
-    of_x, of_weights = torch.autograd.grad(action.sum(), (x, weights))
-    assert bool(of_x.isfinite().all()) and of_x.abs().sum() > 0.0
-    assert of_weights.count_nonzero() == 2 * HEAD_SIZE
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
+def test_wrong_shapes_are_refused(driver):
+    noise = torch.zeros(4, 3, 2)
+    for change, message in (
         ({"features": torch.zeros(4, 51)}, r"features of shape \(B, M, 51\), got \(4, 51\)"),
         ({"weights": torch.zeros(HEAD_SIZE)}, r"weights of shape \(4, 404\), got \(404,\)"),
         ({"innovations": torch.zeros(4, 2)}, r"innovations of shape \(4, 3, 2\)"),
-        ({"innovations": torch.zeros(4, 3, 2)}, "memory beside the innovations"),
-        ({"innovations": torch.zeros(4, 3, 2), "memory": torch.zeros(4, 3, 2)}, r"memory of shape \(4, 3, 2, 2\)"),
-    ],
-)
-def test_wrong_shapes_are_refused(driver, change, message):
-    with pytest.raises(ValueError, match=message):
-        driver.act(**{"features": torch.zeros(4, 3, 51), **change})
-    for name in ("features", *change):
-        with pytest.raises(TypeError, match=f"{name} as a torch.Tensor, got ndarray"):
-            driver.act(**{"features": torch.zeros(4, 3, 51), name: np.zeros((4, 3, 51))})
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"acceleration": (4.0,)}, "two numbers"),
-        ({"acceleration": (4.0, -8.0)}, "ascending"),
-        ({"yaw_rate": (float("nan"), 0.3)}, "ascending"),
-        ({"weights": WeightDistribution(np.zeros(3), np.eye(3))}, "404 weights"),
-    ],
-)
-def test_impossible_drivers_are_refused(policy, change, message):
-    with pytest.raises(ValueError, match=message):
-        LearnedDriver(policy, **change)
+        ({"innovations": noise}, "memory beside the innovations"),
+        ({"innovations": noise, "memory": noise}, r"memory of shape \(4, 3, 2, 2\)"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            driver.act(**{"features": torch.zeros(4, 3, 51), **change})
+        for name in ("features", *change):
+            with pytest.raises(TypeError, match=f"{name} as a torch.Tensor, got ndarray"):
+                driver.act(**{"features": torch.zeros(4, 3, 51), name: np.zeros((4, 3, 51))})
 
 
 # --- as ego --------------------------------------------------------------------------------------
-
-
-def test_the_ego_moves_the_bicycle_as_its_driver_wants(driver, features):
-    perception = features(8, 3)
-    perception[..., CURVATURE_COLUMN] = 0.0
-    speed = torch.linspace(5.0, 30.0, 8)
-    perception[:, 0, SPEED_COLUMN] = speed
-    action, memory = LearnedEgo(driver).act(SimpleNamespace(perception=perception), None)
-    wanted = driver.act(perception)[0][:, 0]
-    zero = torch.zeros(8)
-    _, _, heading, new_speed = bicycle(zero, zero, zero, speed, action[:, 0], action[:, 1], DT)
-    torch.testing.assert_close(heading / DT, wanted[:, 1], atol=1e-5, rtol=0.0)
-    torch.testing.assert_close(new_speed, speed + DT * wanted[:, 0])
-    assert memory is None
 
 
 def test_the_ego_turns_with_the_road(driver, features):
@@ -162,8 +284,8 @@ def test_the_ego_predicts_what_it_does(driver, generator):
         ego.predict(np.zeros((1, 7), np.float32))
 
 
-@pytest.mark.parametrize("env_id", ["rare_envs/CarFollowing-v0", "rare_envs/Highway-v0"])
-def test_what_is_simulated_replays_in_an_environment_step_by_step(env_id):
+def test_what_is_simulated_replays_in_an_environment_step_by_step():
+    env_id = "rare_envs/Highway-v0"
     settings = {"drivers": "idm", "horizon": 5.0}
     ego = LearnedEgo(load_driver("mgail"))
     problem = rare_envs.DrivingProblem(env_id, ego=ego, **settings)

@@ -19,7 +19,7 @@ from agents.learned.rules import (
     Seen,
     patience_of,
 )
-from rare_envs.sensors.lidar import HEADING_COLUMN, LANE_OFFSET_COLUMN, MAX_RANGE
+from rare_envs.sensors.lidar import HEADING_COLUMN, LANE_OFFSET_COLUMN
 from tests.agents.learned.test_collision_avoidance import seen
 
 WIDTH = 3.6
@@ -77,6 +77,10 @@ def test_the_course_leads_to_the_middle_of_the_next_lane_in_its_time():
     assert across[-1] == pytest.approx(WIDTH, abs=0.15)  # a tick late
     assert max(across) < WIDTH + 0.1
     assert abs(20.0 * math.sin(path[-1][2])) < 0.2  # across, in m/s
+    slow = list(drive(begin(right=0.0), 9.0, speed=4.0))  # takes longer and keeps its heading small
+    changing = [time for time, _, _, state in slow if state.side != 0]
+    assert changing[-1] - changing[0] == pytest.approx(CHANGES.duration * CHANGES.slow / 4.0, abs=0.5)
+    assert max(abs(heading) for _, _, heading, _ in slow) < 0.18
     fast = sum(0.1 for before, after in pairwise(across) if after - before > 0.02)
     assert fast == pytest.approx(3.4, abs=0.2)  # what people take on US 101, in the median
 
@@ -92,20 +96,17 @@ def test_durations_differ_by_the_draw_of_the_moment():
     assert paces == pytest.approx([CHANGES.duration * math.exp(CHANGES.spread * draw) for draw in (-1, 0, 1)])
 
 
-@pytest.mark.parametrize(
-    ("why", "beams", "speed"),
-    [
+def test_no_change_begins_and_no_patience_is_used_where_there_is_no_room():
+    for why, beams, speed in (
         ("nobody shows that there is a lane", {}, 20.0),
         ("somebody is beside", OTHERS | {"range_90": 2.6, "range_m90": 2.6}, 20.0),
         ("somebody ahead there closes fast", OTHERS | {"range_18": 10.0, "rate_18": -8.0, "range_m90": 2.6}, 20.0),
         ("somebody behind there closes fast", OTHERS | {"range_162": 10.0, "rate_162": -8.0, "range_m90": 2.6}, 20.0),
         ("it is too slow", OTHERS, 2.0),
-    ],
-)
-def test_no_change_begins_and_no_patience_is_used_if(why, beams, speed):
-    _, _, _, state = list(drive(begin(left=0.1, right=0.1), 3.0, speed=speed, beams=beams))[-1]
-    assert int(state.side) == 0, why
-    assert state.patience.flatten().tolist() == [0.1, 0.1], why
+    ):
+        _, _, _, state = list(drive(begin(left=0.1, right=0.1), 3.0, speed=speed, beams=beams))[-1]
+        assert int(state.side) == 0, why
+        assert state.patience.flatten().tolist() == [0.1, 0.1], why
 
 
 def test_whoever_is_ahead_in_the_new_lane_is_kept_off_until_the_line():
@@ -122,24 +123,12 @@ def test_a_change_under_way_at_the_first_moment_is_taken_up():
     path = list(drive(begin(), 4.0, y=0.8, heading=0.8 / 20.0))
     assert all(int(state.side) == 1 for _, _, _, state in path[:10])
     assert path[-1][1] == pytest.approx(WIDTH, abs=0.15)
+    for over_line, side in ((0.4, 0), (0.2, 1)):  # over the line by 0.3 m: there is a lane, though nobody shows it
+        _, state = step(on_lane(1.1, 0.36 / 20.0), begin(), changes=replace(CHANGES, over_line=over_line))
+        assert int(state.side) == side
     late = list(drive(begin(), 0.3, y=0.0, heading=0.0))[-1][3]
     moving, _ = step(on_lane(0.8, 0.8 / 20.0, **OTHERS), late, None)
     assert not bool(moving.changing)  # at the first moment only: later it may be the noise
-
-
-def test_nobody_is_taken_to_change_over_the_edge_of_the_road():
-    leftmost = {"range_36": 11.0}
-    _, state = step(on_lane(-0.8, -0.5 / 20.0, **leftmost), begin(), None)
-    assert int(state.side) == 0
-    _, state = step(on_lane(-0.8, -0.5 / 20.0, **OTHERS), begin(), None)
-    assert int(state.side) == -1
-
-
-def test_who_is_over_the_line_far_enough_has_a_lane_there_that_nobody_shows():
-    moving = on_lane(1.1, 0.36 / 20.0)  # over the line by 0.3 m
-    for over_line, side in ((0.4, 0), (0.2, 1)):
-        _, state = step(moving, begin(), changes=replace(CHANGES, over_line=over_line))
-        assert int(state.side) == side
 
 
 def test_whoever_is_nearly_over_the_line_is_changing_into_any_lane():
@@ -165,26 +154,7 @@ def test_a_change_goes_on_beside_a_body_until_its_time_is_over():
     assert int(path[-1][3].side) == 0
 
 
-def test_a_change_over_the_edge_of_the_road_is_given_up_behind_it():
-    outward = on_lane(1.75, 0.03)
-    _, state = step(outward, begin(), None)
-    assert int(state.side) == 1
-    beyond = on_lane(1.85, 0.03)  # 5 cm over the line, and still in its old lane: there is no other
-    action, state = step(beyond, state, None)
-    assert int(state.side) == 0
-    assert action.room[..., 1].item() == pytest.approx(-0.05 - LaneChanges.margin)
-
-
-def test_there_is_room_to_the_line_where_no_lane_is_known():
-    one_side = {"range_36": 11.0}  # a lane to the right
-    action, state = step(on_lane(0.5, **one_side), begin(), None)
-    assert action.room.flatten().tolist() == pytest.approx([0.5 * WIDTH + 0.5 - LaneChanges.margin, MAX_RANGE])
-    action, _ = step(on_lane(0.5), state, None)  # it is remembered
-    assert action.room[..., 1].item() == MAX_RANGE
-    action, _ = step(on_lane(0.5), begin(left=0.0)._replace(side=-torch.ones(1, 1)), None)
-    assert action.room.flatten().tolist() == [MAX_RANGE, MAX_RANGE]  # in a change
-
-
+@pytest.mark.slow
 def test_gradients_are_those_of_finite_differences():
     driver = replace(load_driver("mgail"), changes=CHANGES, policy=load_driver("mgail").policy.double())
     state = begin(right=0.0)
@@ -208,19 +178,6 @@ def test_gradients_are_those_of_finite_differences():
 # --- the driver ----------------------------------------------------------------------------------
 
 
-def test_a_driver_with_lane_changes_keeps_them_in_its_memory():
-    driver = load_driver("mgail")
-    generator = torch.Generator().manual_seed(0)
-    memory = driver.begin(torch.randn(2, 3, 2, 2, generator=generator))
-    assert memory.shape == (2, 3, 4 + STATE_SIZE)
-    features = on_lane(**OTHERS).float().expand(2, 3, -1)
-    one = driver.act(features, None, torch.zeros(2, 3, 2), memory)
-    again = driver.act(features, None, torch.zeros(2, 3, 2), memory)
-    assert torch.equal(one[0], again[0]) and torch.equal(one[1], again[1])
-    with pytest.raises(ValueError, match=r"Expected memory of shape \(2, 3, 14\)"):
-        driver.act(features, None, torch.zeros(2, 3, 2), memory[..., :4])
-
-
 def test_a_ripe_driver_steers_into_the_next_lane_and_keeps_off_whoever_is_ahead_there():
     driver, draws = load_driver("mgail"), torch.zeros(1, 1, 2, 2)
     draws[..., 1, 1] = 8.0  # no patience for a change to the right
@@ -231,6 +188,9 @@ def test_a_ripe_driver_steers_into_the_next_lane_and_keeps_off_whoever_is_ahead_
     (action, memory), (behind, _) = (driver.act(each, None, none, driver.begin(draws)) for each in (free, ahead))
     assert float(action[..., 1]) > 0.05
     assert ChangeState.unpack(memory[..., 4:]).side.item() == 1.0
+    assert memory.shape == (1, 1, 4 + STATE_SIZE)
+    with pytest.raises(ValueError, match=r"Expected memory of shape \(1, 1, 14\)"):
+        driver.act(free, None, none, memory[..., :4])
     assert float(behind[..., 0]) == pytest.approx(-2.0)
     assert float(action[..., 0]) > -1.0
 
@@ -255,31 +215,12 @@ def test_hard_braking_is_eased_but_for_the_rule():
         replace(plain, hard_braking=0.0)
 
 
-def test_who_is_slow_takes_longer_and_keeps_its_heading_small():
-    path = list(drive(begin(right=0.0), 9.0, speed=4.0))
-    changing = [time for time, _, _, state in path if state.side != 0]
-    assert changing[-1] - changing[0] == pytest.approx(CHANGES.duration * CHANGES.slow / 4.0, abs=0.5)
-    assert max(abs(heading) for _, _, heading, _ in path) < 0.18
-
-
-def test_a_change_does_not_end_before_it_goes_along_the_lane_again():
-    state = begin()._replace(
-        side=torch.ones(1, 1, dtype=torch.float64),
-        share=torch.full((1, 1), 1.01, dtype=torch.float64),
-        pace=torch.full((1, 1), 0.25, dtype=torch.float64),
-        crossed=torch.ones(1, 1, dtype=torch.float64),
-    )
-    for heading, share, goes_on in ((0.03, 1.01, True), (0.005, 1.01, False), (0.03, 1.6, False)):
-        _, after = step(on_lane(heading=heading, **OTHERS), state._replace(share=0.0 * state.share + share), None)
-        assert bool(after.side == 1) == goes_on
-
-
-@pytest.mark.parametrize("kind", [CollisionAvoidance, LaneChanges])
-def test_settings_are_positive_numbers(kind):
-    name = fields(kind)[3].name
-    for value in (0.0, -1.0, math.nan, math.inf, True, "2"):
-        with pytest.raises(ValueError, match=f"Expected {name} of the .* above 0"):
-            kind(**{name: value})
+def test_settings_are_positive_numbers():
+    for kind in (CollisionAvoidance, LaneChanges):
+        name = fields(kind)[3].name
+        for value in (0.0, -1.0, math.nan, math.inf, True, "2"):
+            with pytest.raises(ValueError, match=f"Expected {name} of the .* above 0"):
+                kind(**{name: value})
     for coefficients in ((1.0, 2.0), (0.0, 0.0, 0.0, 0.0, math.nan)):
         with pytest.raises(ValueError, match="Expected 5 finite coefficients of the hazard"):
             LaneChanges(coefficients=coefficients)

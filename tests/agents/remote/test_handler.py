@@ -141,20 +141,6 @@ def test_a_session_counts_its_steps_and_remembers() -> None:
         assert reply["memory"] is True
 
 
-def test_the_least_recently_used_sessions_and_connections_are_forgotten(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(server, "MAX_SESSIONS", 8)
-    handler = RequestHandler(Braking())
-    ask(handler, type="hello", protocol=1, id=1)
-    for number in range(10):
-        ask(handler, type="reset", id=number + 2, session=number, batch=1)
-    observation = protocol.pack_array(np.zeros((1, 7), np.float32))
-    replies = [ask(handler, type="act", id=1000 + k, session=k, step=0, observation=observation) for k in (1, 2)]
-    assert [reply["type"] for reply in replies] == ["error", "action"]
-    for number in range(server.MAX_CLIENTS):
-        ask(handler, str(number).encode(), type="hello", protocol=1, id=1)
-    assert ask(handler, type="ping", id=2000)["code"] == "hello"
-
-
 def test_an_ego_that_fails_ends_its_session_only() -> None:
     class Failing(Braking):
         def predict(self, observation: Any, **_: Any) -> Any:
@@ -171,7 +157,7 @@ def test_an_ego_that_fails_ends_its_session_only() -> None:
 
 
 def test_memories_are_kept_up_to_a_size_the_least_used_make_room(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A client whose session was forgotten is told so, and sends its observations again."""
+    """A client that was forgotten is told so, and sends its observations again."""
 
     class Remembering:
         def predict(
@@ -180,30 +166,29 @@ def test_memories_are_kept_up_to_a_size_the_least_used_make_room(monkeypatch: py
             return np.zeros((len(observation), 2), np.float32), np.zeros(1000)  # 8,000 bytes
 
     monkeypatch.setattr(server, "MAX_MEMORY", 30_000)
-    handler, number = RequestHandler(Remembering()), 0
-
-    def ask(connection: bytes, **message: Any) -> Any:
-        nonlocal number
-        number += 1
-        return protocol.unpack(handler.handle(connection, protocol.pack({**message, "id": number})))
-
+    handler, numbers = RequestHandler(Remembering()), itertools.count(1)
     seen = protocol.pack_observation(np.ones((1, 7), np.float32))
     sessions = [(client, session) for client in (b"a", b"b") for session in range(3)]
     for client in (b"a", b"b"):
-        ask(client, type="hello", protocol=1)
+        ask(handler, client, type="hello", protocol=1, id=next(numbers))
     for client, session in sessions:
-        ask(client, type="reset", session=session, batch=1)
-        assert ask(client, type="act", session=session, step=0, observation=seen)["type"] == "action"
-    kept = [ask(client, type="act", session=session, step=1, observation=seen)["type"] for client, session in sessions]
-    assert kept == ["error"] * 3 + ["action"] * 3
+        ask(handler, client, type="reset", session=session, batch=1, id=next(numbers))
+    kept = [
+        ask(handler, client, type="act", session=session, step=step, observation=seen, id=next(numbers))["type"]
+        for step in (0, 1)
+        for client, session in sessions
+    ]
+    assert kept == ["action"] * 6 + ["error"] * 3 + ["action"] * 3
+    for number in range(server.MAX_CLIENTS):
+        ask(handler, str(number).encode(), type="hello", protocol=1, id=1)
+    assert ask(handler, b"a", type="ping", id=next(numbers))["code"] == "hello"
 
 
 # --- messages -------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("values", "dtype"),
-    [
+def test_arrays_survive_in_a_type_that_holds_them() -> None:
+    for values, dtype in (
         (np.arange(6.0).reshape(2, 3), "<f8"),
         (np.arange(6, dtype=np.float32).reshape(3, 2).T, "<f4"),
         (np.arange(4, dtype=np.float16), "<f4"),
@@ -212,12 +197,10 @@ def test_memories_are_kept_up_to_a_size_the_least_used_make_room(monkeypatch: py
         (np.array([True, False]), "|u1"),
         (np.zeros((0, 7), np.uint8), "|u1"),
         (np.array([np.nan, np.inf, -0.0]), "<f8"),
-    ],
-)
-def test_arrays_survive_in_a_type_that_holds_them(values: np.ndarray, dtype: str) -> None:
-    packed = protocol.unpack(protocol.pack({"array": protocol.pack_array(values)}))["array"]
-    assert packed["dtype"] == dtype
-    np.testing.assert_array_equal(protocol.unpack_array(packed), values)
+    ):
+        packed = protocol.unpack(protocol.pack({"array": protocol.pack_array(values)}))["array"]
+        assert packed["dtype"] == dtype
+        np.testing.assert_array_equal(protocol.unpack_array(packed), values)
     for other in (np.array(["a"]), np.array([None]), np.array([1j])):
         with pytest.raises(protocol.MalformedMessage, match="expected numbers"):
             protocol.pack_array(other)

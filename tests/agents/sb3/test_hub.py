@@ -15,7 +15,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from agents import load_ego
 from agents.loading import find_ego_kind
-from agents.saved_ego import SavedEgo, find_cached_model, find_hub_cache, find_hub_model
+from agents.saved_ego import SavedEgo, find_cached_model, find_hub_model
 from rare_envs.study.question import find_named_files
 
 NAME, COMMIT = "hf:somebody/ppo-Pendulum-v1", "0123abc"
@@ -149,10 +149,10 @@ def test_a_download_that_fails_is_one_line(monkeypatch: pytest.MonkeyPatch) -> N
         load_ego(NAME)
 
 
-@pytest.mark.parametrize("text", ["hf:somebody", "hf:../x/y", "hf:a/b/../c.zip", "hf:a/b@../c", "hf:a/b/c.pkl"])
-def test_a_name_of_another_form_is_refused(text: str) -> None:
-    with pytest.raises(ValueError, match="Expected hf:USER/REPOSITORY"):
-        find_cached_model(text)
+def test_a_name_of_another_form_is_refused() -> None:
+    for text in ("hf:somebody", "hf:../x/y", "hf:a/b/../c.zip", "hf:a/b@../c", "hf:a/b/c.pkl"):
+        with pytest.raises(ValueError, match="Expected hf:USER/REPOSITORY"):
+            find_cached_model(text)
 
 
 def test_several_models_need_a_file(cache: Path, files: Path) -> None:
@@ -162,13 +162,3 @@ def test_several_models_need_a_file(cache: Path, files: Path) -> None:
     (snapshot / "second.zip").write_bytes(b"PK")
     with pytest.raises(ValueError, match=r"/FILE.zip for .* its files are first.zip, second.zip\.$"):
         load_ego(NAME)
-
-
-def test_the_cache_is_where_the_library_has_it(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    for name in ("HF_HUB_CACHE", "HF_HOME", "XDG_CACHE_HOME"):
-        monkeypatch.delenv(name, raising=False)
-    assert find_hub_cache() == Path.home() / ".cache" / "huggingface" / "hub"
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    assert find_hub_cache() == tmp_path / "huggingface" / "hub"
-    monkeypatch.setenv("HF_HOME", str(tmp_path / "home"))
-    assert find_hub_cache() == tmp_path / "home" / "hub"

@@ -119,6 +119,15 @@ def test_a_saved_model_is_recognised_and_acts_as_before(name: str, tmp_path: Pat
     assert len(np.unique(actions, axis=0)) > 1
 
 
+def test_loading_leaves_the_global_generators_alone_and_allocates_no_replay_buffer(tmp_path: Path) -> None:
+    path = change_settings(saved(tmp_path, "sac", seed=5), buffer_size=10**13)  # far beyond any memory
+    drawn = []
+    for _ in range(2):
+        load_ego(path)
+        drawn += [np.random.random(), float(torch.rand(()))]  # noqa: NPY002 (the generator under test)
+    assert len(set(drawn)) == 4
+
+
 class OwnPolicy(sb3.sac.policies.SACPolicy):
     """A user's subclass, whose module says nothing about the algorithm."""
 
@@ -128,19 +137,6 @@ def test_a_policy_class_of_the_user_needs_trust_and_is_recognised_by_its_setting
     with pytest.raises(ValueError, match=r"'policy_class' it asks for .*OwnPolicy, which may run code.*trust=True"):
         load_ego(tmp_path / "ego.zip")
     assert load(tmp_path / "ego.zip", trust=True).algorithm == "sac"
-
-
-def test_loading_leaves_the_global_generators_alone(tmp_path: Path) -> None:
-    path = saved(tmp_path, seed=5)
-    drawn = []
-    for _ in range(2):
-        load_ego(path)
-        drawn += [np.random.random(), float(torch.rand(()))]  # noqa: NPY002 (the generator under test)
-    assert len(set(drawn)) == 4
-
-
-def test_a_large_replay_buffer_is_not_allocated(tmp_path: Path) -> None:
-    load(change_settings(saved(tmp_path, "sac"), buffer_size=10**13))  # far beyond any memory
 
 
 def test_algo_overrides_what_the_file_says(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
