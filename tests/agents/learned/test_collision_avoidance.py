@@ -80,14 +80,6 @@ def test_at_close_range_who_moves_towards_a_body_is_steered_back_but_not_past_th
         assert limited(on_lane(seen(**near), heading), yaw_rate=-sign * 0.3)[1] == -sign * 0.3
 
 
-def test_at_close_range_a_corner_is_not_steered_into():
-    """A beam of 36 degrees, whose range rate tells nothing of lateral motion."""
-    across = HALF_WIDTH + RULE.clearance + 0.06
-    near, heading = {"range_36": across / math.sin(math.radians(36.0))}, 0.03
-    bound = limited(on_lane(seen(**near), heading), yaw_rate=0.1)[1]
-    assert bound == pytest.approx((0.06 / 0.6 - 20.0 * math.sin(heading)) / (0.2 * 20.0))
-
-
 def test_queues_that_brake_comfortably_are_followed_without_contact():
     """The one ahead brakes by 2 m/s^2 to a stop; the one behind is near and 0.6 m/s faster."""
     gap, speed, ahead = 0.5, 8.6, 8.0
@@ -96,17 +88,6 @@ def test_queues_that_brake_comfortably_are_followed_without_contact():
         gap += 0.1 * (ahead - speed)
         speed, ahead = max(speed + 0.1 * acceleration, 0.0), max(ahead - 0.2, 0.0)
         assert gap > 0.0
-
-
-def test_a_point_well_within_the_own_lane_is_in_the_path_at_close_range():
-    """Of one who stands on the left line a beam of 18 degrees meets the far end of the rear, 1.7 m across."""
-    standing = {"range_m18": 1.7 / math.sin(math.radians(18.0)), "rate_m18": -6.0 * math.cos(math.radians(18.0))}
-    shifted = on_lane(seen(speed=6.0, **standing), left=2.2, right=1.4)
-    gap = 1.7 / math.tan(math.radians(18.0)) - HALF_LENGTH
-    assert limited(shifted)[0] == pytest.approx(max(-36.0 / (2.0 * (gap - RULE.least_gap)), -RULE.hardest))
-    assert limited(on_lane(seen(speed=6.0, **standing), left=2.0, right=1.6))[0] == 1.0, "near the line"
-    mirrored = {name.replace("m", ""): value for name, value in standing.items()}
-    assert limited(on_lane(seen(speed=6.0, **mirrored), left=2.2, right=1.4))[0] == 1.0, "the other side"
 
 
 @pytest.mark.slow

@@ -131,29 +131,6 @@ def test_a_change_under_way_at_the_first_moment_is_taken_up():
     assert not bool(moving.changing)  # at the first moment only: later it may be the noise
 
 
-def test_whoever_is_nearly_over_the_line_is_changing_into_any_lane():
-    """The middle reaches the line in 1.25 and 2.0 s."""
-    for offset, across, waits in ((0.8, 0.8, True), (0.8, 0.5, False)):
-        for beams in (OTHERS | BESIDE, {}):  # a lane that is not free, and one that nobody shows
-            moving = on_lane(offset, math.asin(across / 20.0), **beams)
-            assert bool(step(moving, begin(), None)[1].side == 1) == waits
-    free = on_lane(0.8, math.asin(0.5 / 20.0), **OTHERS)
-    assert int(step(free, begin(), None)[1].side) == 1  # within 2.1 s, as without waiting
-
-
-def test_a_change_goes_on_beside_a_body_until_its_time_is_over():
-    *_, (_, y, heading, state) = list(drive(begin(right=0.0), 0.8, changes=CHANGES))
-    assert not bool(state.crossed)
-    blocked = on_lane(y, heading, **OTHERS, **BESIDE)
-    action, after = step(blocked, state, None)
-    assert int(after.side) == 1 and bool(action.changing)
-    assert not bool(action.follows)  # nobody brakes for whoever is beside
-    path = list(drive(state, 9.0, changes=CHANGES, y=y, beams=OTHERS | BESIDE))
-    ahead = OTHERS | {"range_18": 13.0, "rate_18": -1.0}
-    assert bool(step(on_lane(y, heading, **ahead), state, None)[0].follows)
-    assert int(path[-1][3].side) == 0
-
-
 @pytest.mark.slow
 def test_gradients_are_those_of_finite_differences():
     driver = replace(load_driver("mgail"), changes=CHANGES, policy=load_driver("mgail").policy.double())

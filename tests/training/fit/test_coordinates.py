@@ -15,7 +15,6 @@ from training.fit.coordinates import (
     FOLD_STARTS,
     SYSTEMS_APART,
     choose_system,
-    describe_family,
     draw_events,
     fit_system,
     held_out_log_prob,
@@ -229,14 +228,6 @@ def test_coordinates_are_chosen_anew_in_each_refit(quick):
     criteria = [fit_system(drawn, system, FOLLOWING, 0, FOLD_STARTS).bic for system in systems]
     assert few[0].bic == min(criteria)
     assert few[0].system is systems[int(np.argmin(criteria))]
-
-
-def test_the_family_says_in_which_coordinates_refits_are():
-    log, plain = (SimpleNamespace(system=system) for system in COORDINATE_SYSTEMS["car_following"][1::-1])
-    assert describe_family("1 component, log gap", [log, log]) == "1 component, log gap"
-    assert describe_family("1 component, log gap", [plain, log, log]) == (
-        "1 component, log gap; of the refits 2 in log gap, 1 in plain"
-    )
 
 
 def test_refits_follow_the_seed_and_few_clusters_have_none(quick):

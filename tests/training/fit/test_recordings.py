@@ -109,14 +109,6 @@ def test_pairs_that_were_under_way_are_no_new_leaders(tmp_path):
     assert dropped == {"not at_entry": 1, "1 <= gap <= 150 m": 1}
 
 
-def test_pairs_at_the_entry_do_not_count():
-    """Nobody changes lane, so that all pairs are there from the first frame on: no new leader was recorded."""
-    table = synthetic_traffic(seconds=4.0, per_lane=2)
-    events = car_following_events(table)
-    assert events["at_entry"].all()
-    assert count_events("car_following", events, len(events["ego"]), observe_traffic(table)) is None
-
-
 def test_events_count_with_the_share_that_is_used():
     driven = np.array([2.0, 100.0, 0.0, 0.0])  # h, km
     pairs = {"at_entry": np.array([True, False, False, True, False, False]), "ego": np.arange(6)}
@@ -128,8 +120,10 @@ def test_events_count_with_the_share_that_is_used():
     assert (frequency.count, frequency.share_events) == (3, 3)
     assert frequency.per_hour == pytest.approx(3 / 2.0 * 2 / 3)
     assert frequency.per_km == pytest.approx(3 / 100.0 * 2 / 3)
-    none = cut_in_events(synthetic_traffic(seconds=3.0, per_lane=2))
-    assert count_events("cut_in", none, 0, driven) is None
+    table = synthetic_traffic(seconds=4.0, per_lane=2)  # nobody changes lane: all pairs are there at first
+    assert count_events("cut_in", cut_in_events(table), 0, driven) is None
+    pairs = car_following_events(table)
+    assert count_events("car_following", pairs, len(pairs["ego"]), observe_traffic(table)) is None
 
 
 def test_bases_are_fitted_to_recordings(simulated, quick, tmp_path, capsys):
@@ -182,17 +176,14 @@ def test_a_hard_brake_base_is_fitted_to_brakings_to_a_standstill(quick, tmp_path
     assert dropped == {"gap is given": n}  # the leaders
 
 
-@pytest.mark.parametrize(
-    ("source", "options", "message"),
-    [
+def test_bad_arguments_are_refused(tmp_path):
+    for source, options, message in (
         ({"highd": "none"}, {}, "There is no folder none; expected the data folder of highD"),
         ({"ngsim": "none.csv"}, {}, "Cannot read none.csv"),
         ({"data": "none"}, {}, "Cannot read events from"),
         ({"ngsim": "none.csv"}, {"scenarios": ["merge"]}, "Unknown scenario merge"),
         ({"ngsim": "none.csv"}, {"name": "a/b"}, "part of file names, such as cologne, got 'a/b'"),
-    ],
-)
-def test_bad_arguments_are_refused(source, options, message, tmp_path):
-    recordings = EventOptions(**{kind: Path(path) for kind, path in source.items()})
-    with pytest.raises(ValueError, match=message):
-        fit_bases(recordings, tmp_path / "out", **options)
+    ):
+        recordings = EventOptions(**{kind: Path(path) for kind, path in source.items()})
+        with pytest.raises(ValueError, match=message):
+            fit_bases(recordings, tmp_path / "out", **options)

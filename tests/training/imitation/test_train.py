@@ -13,13 +13,10 @@ from typer.testing import CliRunner
 
 from agents import load_driver, read_provenance
 from agents.learned.networks import WHITE_NOISE, head_weights
+from rare_envs.study.cli.app import app
 from tests.training.data.recordings import (
-    i24_documents,
     simulate,
-    tgsim_rows,
-    write_csv,
     write_highd,
-    write_i24,
     write_ngsim,
 )
 from tests.training.imitation.synthetic_scenes import TINY, scene, scenes, tiny
@@ -28,7 +25,6 @@ from training.imitation.config import Config
 from training.imitation.train import (
     Source,
     command_of,
-    load_scenes,
     make_learner,
     prepare_data,
     read_training_settings,
@@ -46,17 +42,9 @@ def traffic():
 
 
 def run(words):
-    app = typer.Typer()
-    app.command()(command_line.main)
-    return CliRunner().invoke(app, words)
-
-
-def rare_envs_command(words):
-    from rare_envs.study.cli.app import app
-
-    with pytest.raises(SystemExit) as stop:
-        app(words, prog_name="rare-envs")
-    return stop.value.code
+    command = typer.Typer()
+    command.command()(command_line.main)
+    return CliRunner().invoke(command, words)
 
 
 def test_a_folder_holds_a_driver_that_says_where_it_comes_from(made_up, tmp_path):
@@ -121,49 +109,26 @@ def test_the_end_of_each_recording_is_kept_for_tests():
     assert split_end(named[:1])[1] == ()
 
 
-def test_a_source_of_another_format_is_learned_from(traffic, tmp_path):
-    write_csv(tmp_path / "I294.csv", tgsim_rows(traffic))
-    write_i24(tmp_path / "morning.json", i24_documents(traffic))
-    for kind, name in (("tgsim", "I294.csv"), ("i24", "morning.json")):
-        source = Source(kind, tmp_path / name, seconds=4.0)
-        learn, test = load_scenes(source)
-        assert len(learn) >= 2 and len(test) == 1
-        assert source.options == f"--{kind} {name} --seconds 4"
-        assert name.partition(".")[0] in source.description and source.licence
-
-
-def test_the_command_line_has_every_setting_with_its_default():
-    options = inspect.signature(command_line.main).parameters
-    assert {field.name: field.default for field in dataclasses.fields(Config)}.items() <= {
-        name: option.default for name, option in options.items()
-    }.items()
-
-
-@pytest.mark.parametrize("device", ["cpu", "cuda:1"])
-def test_a_command_repeats_its_training(device, made_up, monkeypatch, tmp_path):
+def test_a_command_repeats_its_training_and_says_what_is_missing(made_up, monkeypatch, tmp_path):
     """What is written into a file, read by the command line, gives the same settings."""
-    config = tiny(method="gail", seed=4, noise="white", clone_weight=(0.2, 0.1))
-    found = []
-    monkeypatch.setattr(command_line, "train_driver", lambda *given, **how: found.append((*given, how)) or tmp_path)
-    result = run([*command_of(made_up, config, device).split()[3:], "--out", str(tmp_path)])
-    assert result.exit_code == 0, result.output
-    source, settings, _, how = found[0]
-    assert (source, settings, how["device"]) == (Source("data", Path("tables")), config, device)
-
-
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
+    for words, message in (
         ([], "one of --data"),
         (["--data", "nowhere"], "nowhere"),
         (["--ngsim", "a", "--highd", "b"], "one of"),
         (["--data", "nowhere", "--pools", "0"], "Expected pools >= 1, got 0"),
-    ],
-)
-def test_the_command_line_says_what_is_missing(words, message, tmp_path):
-    result = run([*words, "--out", str(tmp_path / "run")])
-    assert result.exit_code == 2
-    assert message in result.output
+    ):
+        result = run([*words, "--out", str(tmp_path / "run")])
+        assert result.exit_code == 2 and message in result.output
+    options = {name: option.default for name, option in inspect.signature(command_line.main).parameters.items()}
+    assert {field.name: field.default for field in dataclasses.fields(Config)}.items() <= options.items()
+    config = tiny(method="gail", seed=4, noise="white", clone_weight=(0.2, 0.1))
+    found = []
+    monkeypatch.setattr(command_line, "train_driver", lambda *given, **how: found.append((*given, how)) or tmp_path)
+    for device in ("cpu", "cuda:1"):
+        result = run([*command_of(made_up, config, device).split()[3:], "--out", str(tmp_path)])
+        assert result.exit_code == 0, result.output
+        source, settings, _, how = found.pop()
+        assert (source, settings, how["device"]) == (Source("data", Path("tables")), config, device)
 
 
 def test_the_shared_command_line_trains_drivers(monkeypatch, tmp_path, capsys):
@@ -172,7 +137,9 @@ def test_the_shared_command_line_trains_drivers(monkeypatch, tmp_path, capsys):
         "training.imitation.train.train_driver", lambda *given, **how: asked.append(given[:2]) or tmp_path / "it"
     )
     words = ["train-drivers", "--data", "tables", "--method", "gail", "--updates", "7", "--json"]
-    assert rare_envs_command([*words, "--out", str(tmp_path / "run")]) == 0
+    with pytest.raises(SystemExit) as stop:
+        app([*words, "--out", str(tmp_path / "run")], prog_name="rare-envs")
+    assert stop.value.code == 0
     assert asked == [(Source("data", Path("tables")), Config("gail", 0, 7))]
     answer = json.loads(capsys.readouterr().out)
     assert answer == {"driver": str(tmp_path / "it"), "method": "gail", "seed": 0}

@@ -19,7 +19,6 @@ from training.recipes.bases import (
     HIGHWAY_BASES,
     PROFILES_FILE,
     SHIPPED_BASES,
-    STATE_TICKS,
     build_highway_base,
     check_against_following,
     find_file,
@@ -116,19 +115,6 @@ def test_highway_files_are_what_the_script_writes(scenario):
         expected["provenance"].pop(name, None)
     assert written == expected
     assert "NOT fitted" in written["provenance"]["kind"]
-
-
-def test_states_are_apart_and_within_the_ranges(tmp_path):
-    n = 6 * STATE_TICKS
-    tick = np.arange(n)
-    gap = np.where(tick < 2 * STATE_TICKS, 30.0, np.where(tick < 3 * STATE_TICKS, np.nan, 200.0))
-    gap[4 * STATE_TICKS :] = 0.1 * tick[4 * STATE_TICKS :]
-    rows = {"t": 0.1 * tick, "speed": np.full(n, 25.0), "gap": gap, "rel_speed": np.full(n, -2.0)}
-    pq.write_table(pa.table({**rows, "radar": tick < 5 * STATE_TICKS}), tmp_path / CIRCLES_FILE)
-    # within the ranges: twice at 30 m, then nobody, then 200 m, then 40 m, then no radar
-    checked = check_against_following(build_highway_base("car_following"), tmp_path)
-    assert checked["provenance"]["checked_against"].startswith("3 states of following")
-    assert {each["recorded"] for each in checked["provenance"]["checks"]} == {0}
 
 
 @needs_data(CIRCLES_FILE)
