@@ -13,7 +13,6 @@ from benchmarks.uncertainty.base_coverage import (
     WORLDS,
     Repetition,
     World,
-    fit_base,
     repeat,
     summarise,
 )
@@ -33,15 +32,6 @@ def test_the_limit_is_exceeded_as_often_as_the_world_says(freedom):
     x = world.draw(np.random.default_rng(0))
     hits = int((x @ DIRECTION > world.limit).sum())
     assert abs(hits - 4000) < 4 * math.sqrt(4000 * 1.5)  # clusters of four: less than half as much again
-
-
-def test_the_ensemble_is_the_mean_of_the_refits():
-    world = WORLDS[0]
-    rng = np.random.default_rng(3)
-    base = fit_base(world.draw(rng), world, rng)
-    x = rng.standard_normal((50, 3))
-    mean = np.mean([np.exp(refit.log_prob(x)) for refit in base.refits], axis=0)
-    assert np.exp(base.ensemble().log_prob(x)) == pytest.approx(mean)
 
 
 def test_intervals_cover_in_a_few_repetitions():
