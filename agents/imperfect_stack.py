@@ -20,9 +20,8 @@ from rare_envs.egos.policy import as_driver
 from rare_envs.sensors.lidar import perceive_traffic
 from rare_envs.simulation.cuda_graphs import says_recordable
 from rare_envs.simulation.episode import Episode
-from rare_envs.simulation.rollout import Driver, StochasticDriver
-from rare_envs.simulation.world import World
-from rare_envs.traffic.neighbours import lead_of
+from rare_envs.simulation.world import Driver, StochasticDriver, World
+from rare_envs.traffic.bodies import lead_of
 from rare_envs.traffic.state import State
 
 OWN_ERRORS, ERRORS_PER_VEHICLE = 3, 4

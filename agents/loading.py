@@ -21,10 +21,9 @@ from agents.vision import load_vision
 from rare_envs.control.human_driver import HumanDriverModel
 from rare_envs.control.idm import IDM
 from rare_envs.control.lane_changing import LaneChangingDriver
-from rare_envs.egos.errors import EgoGone, is_policy, refuse_ego
 from rare_envs.egos.human import HumanEgo
 from rare_envs.egos.needs import wrap_callable
-from rare_envs.plugins import did_you_mean, import_object, one_line
+from rare_envs.plugins import EgoGone, did_you_mean, import_object, is_policy, one_line, refuse_ego
 
 EGO_NAMES = (RULE_BASED, HUMAN, *SHIPPED_EGOS, VISION, *SHIPPED_DRIVERS)
 EXPECTED_EGO: Final = (

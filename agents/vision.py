@@ -23,7 +23,7 @@ from agents import files
 from agents.files import SUFFIX, VISION, Provenance
 from rare_envs.control.actions import MAX_ACCELERATION, MAX_STEERING, action_space
 from rare_envs.simulation.observation import EGO_FEATURES, observation_space
-from rare_envs.traffic.vehicle_models import steering_for
+from rare_envs.traffic.state import steering_for
 
 if TYPE_CHECKING:
     from gymnasium import spaces

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, Generic, TypeVar
 
 from rare_envs.files import replace_text
-from rare_envs.study.errors import BadInput
+from rare_envs.study.arguments import BadInput
 
 _Run = TypeVar("_Run")
 _Job = TypeVar("_Job")

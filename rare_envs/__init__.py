@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from rare_envs.plugins import make_lazy_getattr, warn_of_namesakes
 from rare_envs.scenarios.registry import SCENARIOS
-from rare_envs.version import __version__ as __version__
+from rare_envs.startup import __version__ as __version__
 
 if not is_command_line() or not find_missing_libraries():  # a command line shows its help without them
     require_libraries()  # before anything that needs them

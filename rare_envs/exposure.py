@@ -36,7 +36,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.special import chdtri, gammaincinv, ndtri
 
-from rare_envs.arrays import FloatArray
+from rare_envs.distributions.coordinates import FloatArray
 from rare_envs.distributions.fitted import EventFrequency
 
 __all__ = [

@@ -13,14 +13,12 @@ from rare_envs.distributions.space import Distribution, Parameter, ScenarioSpace
 from rare_envs.egos.needs import EgoNeeds
 from rare_envs.measures.registry import load_measure
 from rare_envs.plugins import did_you_mean
-from rare_envs.scenarios.base import Scenario
-from rare_envs.scenarios.base_distributions import load_base
+from rare_envs.scenarios.base import Scenario, load_base
 from rare_envs.scenarios.registry import SCENARIOS, find_scenario
 from rare_envs.sensors.camera import find_camera
-from rare_envs.sensors.kinds import read_kinds
 from rare_envs.simulation.background import find_drivers
 from rare_envs.simulation.episode import Clock, Measurement
-from rare_envs.simulation.observation import Sensing
+from rare_envs.simulation.observation import Sensing, read_kinds
 from rare_envs.simulation.world import World
 
 NO_NEEDS = EgoNeeds()

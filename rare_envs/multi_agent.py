@@ -19,8 +19,7 @@ from rare_envs.simulation.decision import (
     run_ticks,
 )
 from rare_envs.simulation.episode import Episode
-from rare_envs.simulation.rollout import Driver
-from rare_envs.simulation.world import World
+from rare_envs.simulation.world import Driver, World
 from rare_envs.traffic.bodies import pairwise_overlaps
 
 __all__ = ["AdversaryTerms", "Transition", "adversary_reward", "own_reward", "play"]

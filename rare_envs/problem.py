@@ -26,7 +26,6 @@ from rare_envs.devices import (
 )
 from rare_envs.distributions.space import Distribution, ScenarioSpace
 from rare_envs.egos.dense_policies import NotCompiled
-from rare_envs.egos.errors import reason_of
 from rare_envs.egos.needs import (
     DRIVES_ITSELF,
     TAKEN_AS_ACCELERATIONS,
@@ -42,11 +41,11 @@ from rare_envs.egos.policy import PolicyDriver, as_driver, find_device_driver
 from rare_envs.egos.wrappers import describe_missing_normalisation
 from rare_envs.fast.choice import CompilerFails, check_core, is_compiled, leave_to_torch, simulate
 from rare_envs.make import refuse_unknown, set_up
+from rare_envs.plugins import reason_of
 from rare_envs.scenarios.registry import find_scenario, split_layout
-from rare_envs.sensors.kinds import read_kinds
 from rare_envs.simulation.cuda_graphs import RecordedRollouts
 from rare_envs.simulation.episode import Episode, Measurement
-from rare_envs.simulation.rollout import Driver, StochasticDriver, rollout
+from rare_envs.simulation.observation import read_kinds
 from rare_envs.simulation.terms import (
     ROLLOUTS_PER_GRADIENT,
     Differentiator,
@@ -54,7 +53,7 @@ from rare_envs.simulation.terms import (
     find_differentiator,
     simulate_terms,
 )
-from rare_envs.simulation.world import World
+from rare_envs.simulation.world import Driver, StochasticDriver, World, rollout
 from rare_envs.traffic.crash import CRASH_KINDS, Crash
 
 
@@ -268,7 +267,7 @@ class DrivingProblem:
         """Simulate, and tell apart the terms of which f is the least, one of each vehicle say.
 
         Where f <= gamma means a collision, they are distances to the vehicles, early and late in the episode, whatever
-        the measure; see `rare_envs.measures.terms.find_order`.
+        the measure; see `rare_envs.measures.registry.find_order`.
 
         Args:
             x: Scenario parameters, shape (n, d).

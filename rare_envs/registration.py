@@ -62,7 +62,7 @@ def register_scenario(env_id: str, scenario: Scenario) -> None:
     Raises:
         ValueError: If the id is taken, or the scenario does not work.
     """
-    from rare_envs.scenarios.base_distributions import try_scenario
+    from rare_envs.scenarios.base import try_scenario
 
     if env_id in gym.registry:
         raise ValueError(f"The id {env_id!r} is taken; choose another one.")

@@ -1,4 +1,4 @@
-"""Start: libraries that must be installed, and signals to the command line while modules are imported.
+"""Start: version, libraries that must be installed, signals while modules are imported, and threads of torch.
 
 Imported before everything else, so it imports nothing that is slow. The libraries are those of the extra `driving`,
 without which only `samplers` works.
@@ -6,9 +6,11 @@ without which only `samplers` works.
 
 from __future__ import annotations
 
+import contextlib
 import os
 import signal
 import sys
+from collections.abc import Iterator
 
 TYPE_CHECKING = False  # as of typing, which takes longer than all the rest here
 if TYPE_CHECKING:
@@ -100,3 +102,35 @@ def _end(number: int, frame: FrameType | None) -> NoReturn:
     """End the process, with the line and the exit code of a command that is stopped."""
     os.write(2, f"rare-envs: stopped by {signal.Signals(number).name}\n".encode())
     os._exit(128 + number)
+
+
+__version__ = "0.1.0"
+
+
+@contextlib.contextmanager
+def use_one_thread() -> Iterator[None]:
+    """Keep torch to one thread, and let it have as many as before afterwards; for a block or, as decorator, a function.
+
+    Networks and batches this small lose more time to further threads than they gain, and on one thread sums round alike
+    on every machine. Without torch, there is nothing to keep.
+
+    Example:
+        >>> import torch
+        >>> with use_one_thread():
+        ...     torch.get_num_threads()
+        1
+    """
+    if find_missing_libraries(("torch",)):
+        yield
+        return
+    if "torch" not in sys.modules:
+        end_at_signals()
+    import torch  # here, because the command line shows its help without it
+
+    restore_signals()
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)

@@ -14,8 +14,7 @@ from samplers.distributions import as_distribution
 from samplers.estimation import EstimationInterrupted, estimate
 from samplers.executors import Executor, FuturesPool, InProcess, LocalProcesses, RayCluster
 from samplers.method import Goal, Interrupted, Outcome, Stepping, Steps
-from samplers.methods import METHODS, get_method
-from samplers.methods.auto import Auto
+from samplers.methods import METHODS, Auto, get_method
 from samplers.methods.base import Method
 from samplers.methods.blocks import BetaBlock, GaussianBlock, MappedBlock, MixtureBlock, NormalBlock, Product
 from samplers.methods.cross_entropy import CrossEntropy
@@ -27,6 +26,7 @@ from samplers.methods.surrogate import Surrogate
 from samplers.methods.two_stage.method import TwoStage
 from samplers.problem import (
     Distribution,
+    EvaluationError,
     FunctionProblem,
     HasTermGradients,
     HasTerms,
@@ -38,7 +38,6 @@ from samplers.problem import (
 from samplers.result import Estimate
 from samplers.run import Progress, Run, RunArguments
 from samplers.sample import Failure, Failures, Layer, Level, Sample, SimulatedPoints, Status
-from samplers.validation import EvaluationError
 from samplers.workers import ExecutorError
 
 __all__ = [

@@ -15,7 +15,7 @@ from samplers.analysis.reweight import MAX_LOG, find_fitted_base, reweight_runs_
 from samplers.analysis.weighted import cov_inflation, has_independent_points, interval_of_sum, require_sample
 from samplers.estimation import estimate
 from samplers.method import Stepping
-from samplers.methods.auto import Auto
+from samplers.methods import Auto
 from samplers.output import (
     drawing_axes,
     html_table,
@@ -26,11 +26,10 @@ from samplers.output import (
     to_json_value,
     write_object,
 )
-from samplers.problem import FloatArray, Problem, condition_of, names_of_columns
+from samplers.problem import FloatArray, Problem, check_whole, condition_of, names_of_columns
 from samplers.result import Estimate, without_base
 from samplers.run import Listener, RunArguments, check_problem
-from samplers.statistics import Interval, degrees_of_freedom, effective_number, zero_hit_bound
-from samplers.validation import check_whole
+from samplers.sample import Interval, degrees_of_freedom, effective_number, zero_hit_bound
 
 if TYPE_CHECKING:
     import pandas

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from scipy.special import gammaln, ive, log_ndtr, ndtri_exp
 
 from samplers.problem import LOG_TWO_PI, FloatArray
-from samplers.statistics import log_sum_exp
+from samplers.sample import log_sum_exp
 
 ROWS_FROM = 8
 """With so many coordinates sums over them are taken point by point; fewer are added in the same order either way."""

@@ -19,14 +19,12 @@ from samplers.evaluate import Evaluator
 from samplers.executors import AnyExecutor, find_executor
 from samplers.journal import Journal, JournalError, NothingRecorded
 from samplers.method import Stepping
-from samplers.methods import get_method
-from samplers.methods.auto import Auto
+from samplers.methods import Auto, get_method
 from samplers.methods.two_stage.method import TwoStage
-from samplers.problem import Inputs, Problem, StandardNormal
+from samplers.problem import Inputs, OnError, Problem, StandardNormal, check_number
 from samplers.result import Estimate
 from samplers.run import InputsOnly, Listener, Progress, Run, RunArguments, check_problem, choose_seed
 from samplers.sample import Status
-from samplers.validation import OnError, check_number
 
 DEFERRED_SIGNALS = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name))
 NARROW_TERMINAL = 72

@@ -18,8 +18,18 @@ from numpy.typing import DTypeLike, NDArray
 from samplers.executors import Executor, Pool
 from samplers.journal import Journal, JournalError, digest_points
 from samplers.method import Answer, GradientRequest, Request, TermsOffer, TermsRequest, whole_simulations
-from samplers.problem import FloatArray, TermGradients, Terms, condition_of, names_of_columns, offers_terms
-from samplers.validation import EvaluationError, OnError, check_number, check_whole
+from samplers.problem import (
+    EvaluationError,
+    FloatArray,
+    OnError,
+    TermGradients,
+    Terms,
+    check_number,
+    check_whole,
+    condition_of,
+    names_of_columns,
+    offers_terms,
+)
 from samplers.workers import Chunk, Result, SeededWork, Work, join_results
 
 CHUNK_SIZE = 16

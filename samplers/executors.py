@@ -25,7 +25,7 @@ from dataclasses import dataclass, field
 from hashlib import blake2b
 from typing import Any, Protocol, TypeAlias, runtime_checkable
 
-from samplers.validation import check_number, check_whole
+from samplers.problem import check_number, check_whole
 from samplers.workers import (
     Chunk,
     Compute,

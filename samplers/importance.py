@@ -37,9 +37,12 @@ from numpy.typing import NDArray
 from samplers.method import Goal, Interrupted, Outcome, no_outcome_share
 from samplers.problem import FloatArray, Inputs
 from samplers.proposals import Gaussian, Mixture, ProposalDistribution
-from samplers.sample import DrawWeights, Level, Sample, Status
-from samplers.statistics import (
+from samplers.sample import (
+    DrawWeights,
     Interval,
+    Level,
+    Sample,
+    Status,
     binomial_cov,
     clopper_pearson,
     degrees_of_freedom,

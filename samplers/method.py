@@ -12,8 +12,19 @@ from numpy.typing import NDArray
 from scipy.special import chdtrc, stdtrit
 
 from samplers.problem import Distribution, FloatArray, Inputs, TermGradients, Terms
-from samplers.sample import DrawWeights, Failures, Level, Sample, SimulatedPoints, SimulationIndex, Status
-from samplers.statistics import Interval, binomial_cov, clopper_pearson, normalise_weights
+from samplers.sample import (
+    DrawWeights,
+    Failures,
+    Interval,
+    Level,
+    Sample,
+    SimulatedPoints,
+    SimulationIndex,
+    Status,
+    binomial_cov,
+    clopper_pearson,
+    normalise_weights,
+)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -23,8 +23,7 @@ from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from samplers.problem import FloatArray
-from samplers.validation import needs_library
+from samplers.problem import FloatArray, needs_library
 
 if TYPE_CHECKING:
     import pyarrow

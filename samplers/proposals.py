@@ -29,7 +29,7 @@ from scipy.linalg import solve_triangular
 from scipy.optimize import isotonic_regression
 
 from samplers.problem import LOG_TWO_PI, FloatArray, StandardNormal
-from samplers.statistics import log_sum_exp
+from samplers.sample import log_sum_exp
 
 
 class Moments(NamedTuple):

@@ -42,8 +42,8 @@ from samplers.sample import (
     SimulationIndex,
     Status,
     describe_outcome,
+    zero_hit_bound,
 )
-from samplers.statistics import zero_hit_bound
 
 if TYPE_CHECKING:
     import pandas

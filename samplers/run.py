@@ -29,20 +29,25 @@ from samplers.method import (
     pool_counts,
     whole_simulations,
 )
-from samplers.problem import Distribution, FloatArray, Inputs, TermGradients, Terms, condition_of, names_of_columns
-from samplers.result import Estimate
-from samplers.sample import Failures, SimulatedPoints, SimulationIndex, Status
-from samplers.statistics import gain_over_monte_carlo
-from samplers.validation import (
+from samplers.problem import (
     ON_ERROR,
+    Distribution,
     EvaluationError,
+    FloatArray,
+    Inputs,
     OnError,
+    TermGradients,
+    Terms,
     check_name,
     check_number,
     check_whole,
+    condition_of,
     describe_point,
+    names_of_columns,
     one_per_row,
 )
+from samplers.result import Estimate
+from samplers.sample import Failures, SimulatedPoints, SimulationIndex, Status, gain_over_monte_carlo
 
 MOST_SIMULATIONS = 10**12
 """Largest `max_sim`: more is a slip of the keyboard."""

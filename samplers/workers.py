@@ -22,8 +22,7 @@ from uuid import uuid4
 import numpy as np
 from numpy.typing import NDArray
 
-from samplers.problem import FloatArray
-from samplers.validation import EvaluationError, OnError, describe_point, one_per_row
+from samplers.problem import EvaluationError, FloatArray, OnError, describe_point, one_per_row
 
 PARENT_SECONDS = 1.0
 """Time [s] between two looks of a worker whether its driver is still there."""

@@ -16,7 +16,7 @@ import pytest
 
 import rare_envs
 from rare_envs.scenarios.registry import SCENARIOS
-from rare_envs.threads import use_one_thread
+from rare_envs.startup import use_one_thread
 
 ROOT = Path(__file__).parents[1]
 PAGES = sorted([ROOT / "README.md", *(ROOT / "docs").glob("*.md")])

@@ -10,7 +10,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from rare_envs.threads import use_one_thread
+from rare_envs.startup import use_one_thread
 
 PACKAGES = ("samplers", "rare_envs", "agents", "training")
 

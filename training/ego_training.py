@@ -15,11 +15,11 @@ from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
-from rare_envs.arrays import FloatArray
+from rare_envs.distributions.coordinates import FloatArray
 from rare_envs.distributions.space import Distribution, ScenarioSpace
 from rare_envs.files import replace_file
 from rare_envs.plugins import did_you_mean
-from rare_envs.threads import use_one_thread
+from rare_envs.startup import use_one_thread
 from samplers.estimation import NARROW_TERMINAL
 from training.checkpoints import load_checkpoint, restore_model, save_checkpoint
 

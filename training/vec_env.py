@@ -11,7 +11,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import VecEnv, VecMonitor
 
-from rare_envs.sensors.kinds import map_kinds
+from rare_envs.simulation.observation import map_kinds
 
 Indices = int | Iterable[int] | None
 

@@ -36,8 +36,8 @@ from rare_envs.devices import constant
 from rare_envs.sensors.lidar import AHEAD_BEAM, CURVATURE_COLUMN, FEATURES, MAX_RANGE, SPEED_COLUMN
 from rare_envs.simulation.cuda_graphs import says_recordable
 from rare_envs.simulation.observation import LIDAR_SCALES, observation_space
-from rare_envs.traffic.neighbours import Lead
-from rare_envs.traffic.vehicle_models import NEAR_ZERO, steering_for
+from rare_envs.traffic.bodies import Lead
+from rare_envs.traffic.state import NEAR_ZERO, steering_for
 
 if TYPE_CHECKING:
     from gymnasium import spaces
@@ -264,7 +264,7 @@ class LearnedEgo:
         return actions.action_space()
 
     def act(self, episode: Episode, memory: Any) -> tuple[Tensor, Any]:
-        """Perceive and decide for one tick; see `rare_envs.simulation.rollout.Driver`."""
+        """Perceive and decide for one tick; see `rare_envs.simulation.world.Driver`."""
         if episode.perception is None:
             raise ValueError('Expected a world in which vehicles look: make it with observation="lidar".')
         return self._decide(episode.perception[:, 0]), memory

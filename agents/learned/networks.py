@@ -24,8 +24,8 @@ from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 from torch import Tensor, nn
 
-from rare_envs.arrays import FloatArray
 from rare_envs.devices import constant
+from rare_envs.distributions.coordinates import FloatArray
 
 FEATURE_SIZE = 51
 """Features of `rare_envs.sensors.lidar.FEATURES`."""

@@ -26,8 +26,8 @@ from zmq.utils.monitor import recv_monitor_message
 
 from agents.remote import protocol
 from agents.remote.protocol import SECRET_VARIABLE, MalformedMessage, Message, Socket, derive_server_keys, read_secret
-from rare_envs.egos.errors import EgoGone, NoAnswer
-from rare_envs.sensors.kinds import batch_size
+from rare_envs.plugins import EgoGone, NoAnswer
+from rare_envs.simulation.observation import batch_size
 
 TIMEOUT, PATIENCE = 10.0, 30.0
 """Seconds to wait for an answer, and for an ego that has gone to come back."""

@@ -26,7 +26,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 from zmq.utils import z85
 
-from rare_envs.egos.errors import reason_of
+from rare_envs.plugins import reason_of
 
 PROTOCOL = 1
 """Version of the protocol; both sides must speak the same."""

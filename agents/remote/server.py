@@ -26,8 +26,8 @@ import zmq
 
 from agents.remote import protocol
 from agents.remote.protocol import SECRET_VARIABLE, MalformedMessage, Message, Socket, derive_server_keys, is_count
-from rare_envs.egos.errors import EgoGone, is_policy, reason_of
-from rare_envs.threads import use_one_thread
+from rare_envs.plugins import EgoGone, is_policy, reason_of
+from rare_envs.startup import use_one_thread
 
 MAX_CLIENTS, MAX_SESSIONS = 64, 1024
 """Connections, and sessions of all of them, that are remembered; the least recently used makes room."""

@@ -23,8 +23,8 @@ from benchmarks.samplers.runs import about
 from benchmarks.simulation.throughput import CAR_FOLLOWING, CUT_IN, HIGHWAY, ppo
 from benchmarks.simulation.timing import seconds
 from rare_envs.devices import find_device
-from rare_envs.simulation.rollout import rollout
-from rare_envs.threads import use_one_thread
+from rare_envs.simulation.world import rollout
+from rare_envs.startup import use_one_thread
 
 OUT = Path("build/gpu.json")
 """Where the result goes by default."""

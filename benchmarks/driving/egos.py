@@ -21,8 +21,8 @@ import typer
 import rare_envs
 from benchmarks import RESULTS
 from rare_envs.scenarios.registry import SCENARIOS
+from rare_envs.startup import use_one_thread
 from rare_envs.study import Question, Report, drive_again, prepare, run
-from rare_envs.threads import use_one_thread
 from training import train_ego
 
 EGOS_RESULT = RESULTS / "egos.json"

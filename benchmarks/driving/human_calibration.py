@@ -40,8 +40,8 @@ from rare_envs.measures.longitudinal import MAX_BRAKING, RAPID_BRAKING
 from rare_envs.measures.registry import Combined
 from rare_envs.scenarios import load_base
 from rare_envs.scenarios.registry import find_scenario
-from rare_envs.threads import use_one_thread
-from samplers.statistics import Interval, clopper_pearson
+from rare_envs.startup import use_one_thread
+from samplers.sample import Interval, clopper_pearson
 
 CALIBRATION_RESULT = RESULTS / "human_calibration.json"
 PAGE, MEASURED = Path("docs/human_driver.md"), "## Measured"

@@ -30,7 +30,7 @@ from agents.learned.driver import RuleDriver
 from agents.learned.networks import ACTION_SIZE
 from benchmarks import RESULTS
 from benchmarks.samplers.runs import about
-from rare_envs.threads import use_one_thread
+from rare_envs.startup import use_one_thread
 from samplers.problem import FloatArray
 from training.imitation.evaluate import (
     BINS,

@@ -35,8 +35,8 @@ from benchmarks.driving.realism import constant_velocity, round_numbers, rule_dr
 from benchmarks.driving.sim_agents import MOTORWAY, SCENE_ROLLOUTS, WOSAC_2024, motion_features, score_features
 from benchmarks.samplers.runs import about
 from rare_envs.control.lane_changing import LaneChangingDriver
-from rare_envs.threads import use_one_thread
-from rare_envs.traffic.neighbours import LaneTraffic
+from rare_envs.startup import use_one_thread
+from rare_envs.traffic.bodies import LaneTraffic
 from training.data.table import DT
 from training.imitation.evaluate import Act, regular_starts, sampling_driver
 from training.imitation.traffic import (

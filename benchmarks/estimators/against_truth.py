@@ -18,7 +18,7 @@ import rare_envs
 import samplers
 from benchmarks import RESULTS
 from benchmarks.estimators.truth import TRUTH_RESULT
-from rare_envs.threads import use_one_thread
+from rare_envs.startup import use_one_thread
 from samplers.methods import get_method
 
 COMPARISON_RESULT = RESULTS / "against_truth.json"

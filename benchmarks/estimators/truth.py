@@ -20,7 +20,7 @@ from rich.progress import track
 
 import rare_envs
 from benchmarks import RESULTS
-from rare_envs.threads import use_one_thread
+from rare_envs.startup import use_one_thread
 
 TRUTH_RESULT = RESULTS / "truth.json"
 ROLLOUT_CHUNK = 131_072

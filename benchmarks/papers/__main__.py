@@ -25,8 +25,8 @@ from benchmarks.papers.okelly2018.study import HighwayStudy
 from benchmarks.papers.record import discard_runs
 from benchmarks.papers.renew import OWN_METHOD, PAPERS, renew
 from benchmarks.papers.tian2024.study import REPLICATIONS_FILE, SCALES, TianPlan, reproduce_tian2024
-from rare_envs.study.errors import BadInput
-from rare_envs.threads import use_one_thread
+from rare_envs.startup import use_one_thread
+from rare_envs.study.arguments import BadInput
 
 
 def main(words: list[str] | None = None) -> int:

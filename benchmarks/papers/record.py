@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 import rare_envs
 from benchmarks.samplers.runs import about
 from rare_envs.files import format_json
-from rare_envs.study.errors import BadInput
+from rare_envs.study.arguments import BadInput
 from samplers.output import to_json_value
 
 NOTHING = "–"

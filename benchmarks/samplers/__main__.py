@@ -27,7 +27,7 @@ from benchmarks.samplers.problems import find_problem, list_problems
 from benchmarks.samplers.runs import Job, MethodRun, about, find_method, map_jobs, run_once
 from benchmarks.samplers.summary import Cell, Power, cells_of, find_faults, power_of
 from samplers.output import to_json_value
-from samplers.statistics import clopper_pearson
+from samplers.sample import clopper_pearson
 
 COLUMNS = (
     *("problem", "p", "mean / p", "c.o.v.", "own", "gain", "coverage %", "below %", "warned %", "simulations", "calls"),

@@ -22,7 +22,7 @@ from scipy.special import ndtri
 
 from samplers import FunctionProblem
 from samplers.problem import FloatArray
-from samplers.statistics import log_normal_interval
+from samplers.sample import log_normal_interval
 
 BLOCK = 100
 """Points that OpenTURNS hands over at once: that many chains in subset sampling, 10 % of the points of a level."""

@@ -28,8 +28,8 @@ from benchmarks.samplers.runs import about
 from benchmarks.simulation import highway_env_reference as reference
 from benchmarks.simulation.bound import bound_rate, measure_machine
 from benchmarks.simulation.timing import seconds
-from rare_envs.simulation.rollout import rollout
-from rare_envs.threads import use_one_thread
+from rare_envs.simulation.world import rollout
+from rare_envs.startup import use_one_thread
 
 OUT = Path("build/throughput.json")
 """Where the result goes by default."""

@@ -28,7 +28,7 @@ import rare_envs
 import samplers
 from benchmarks import RESULTS
 from rare_envs.files import replace_text
-from rare_envs.threads import use_one_thread
+from rare_envs.startup import use_one_thread
 from training import Retraining, train_ego
 
 RETRAINING_RESULT = RESULTS / "retraining.json"

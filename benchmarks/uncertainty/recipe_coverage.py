@@ -24,7 +24,7 @@ from benchmarks import RESULTS
 from benchmarks.uncertainty.base_coverage import Repetition, compare_with_truth, summarise_repetitions
 from rare_envs.distributions.fitted import FittedDistribution
 from rare_envs.distributions.mixture import CoordinateMixture
-from rare_envs.scenarios.base_distributions import load_base
+from rare_envs.scenarios.base import load_base
 from rare_envs.scenarios.registry import scenario_named
 from samplers.problem import FloatArray
 from training.fit.base import FitRequest, fit_base

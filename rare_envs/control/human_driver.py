@@ -27,10 +27,9 @@ from torch import Tensor
 
 from rare_envs.control.idm import IDM
 from rare_envs.devices import constant
-from rare_envs.traffic.neighbours import Lead
+from rare_envs.traffic.bodies import Lead
 from rare_envs.traffic.road import Road
-from rare_envs.traffic.state import VEHICLE_LENGTH, State
-from rare_envs.traffic.vehicle_models import NEAR_ZERO, STANDARD_GRAVITY
+from rare_envs.traffic.state import NEAR_ZERO, STANDARD_GRAVITY, VEHICLE_LENGTH, State
 
 GLANCE_CDF: Final = (
     (0.05, 0.0),

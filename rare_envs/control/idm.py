@@ -17,10 +17,9 @@ import torch
 from torch import Tensor
 
 from rare_envs.devices import are_zero, scalars
-from rare_envs.traffic.neighbours import Lead
+from rare_envs.traffic.bodies import Lead
 from rare_envs.traffic.road import Road
-from rare_envs.traffic.state import VEHICLE_LENGTH, State
-from rare_envs.traffic.vehicle_models import NEAR_ZERO, steering_for
+from rare_envs.traffic.state import NEAR_ZERO, VEHICLE_LENGTH, State, steering_for
 
 TAU_LATERAL = 0.6
 """Time constant of the way back to the line [s], HighwayEnv's `TAU_LATERAL`."""

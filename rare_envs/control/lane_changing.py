@@ -22,7 +22,7 @@ import torch
 from torch import Tensor
 
 from rare_envs.control.idm import IDM, TAU_LATERAL, yaw_rate_towards
-from rare_envs.traffic.neighbours import LEFT, OWN, RIGHT, LaneTraffic, Lead, Neighbours, find_neighbours, nearest
+from rare_envs.traffic.bodies import LEFT, OWN, RIGHT, LaneTraffic, Lead, Neighbours, find_neighbours, nearest
 
 _SIDES = (LEFT, RIGHT)
 _NO_LIMIT = 1e12

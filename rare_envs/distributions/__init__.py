@@ -4,7 +4,6 @@ from rare_envs.distributions.beta import BetaDistribution
 from rare_envs.distributions.coordinates import ClosingSpeed, Coordinates
 from rare_envs.distributions.fitted import EventCounts, EventFrequency, FittedDistribution, PredictiveCheck
 from rare_envs.distributions.mixture import CoordinateMixture, TruncatedGaussianMixture
-from rare_envs.distributions.parameters import DistributionParameter, HasParameters
 from rare_envs.distributions.product import (
     BlockDistribution,
     FittedProduct,
@@ -12,7 +11,7 @@ from rare_envs.distributions.product import (
     ProductDistribution,
     join_independent,
 )
-from rare_envs.distributions.space import Distribution, Parameter, ScenarioSpace
+from rare_envs.distributions.space import Distribution, DistributionParameter, HasParameters, Parameter, ScenarioSpace
 
 __all__ = [
     "BetaDistribution",

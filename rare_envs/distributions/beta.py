@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import special
 
-from rare_envs.arrays import FloatArray
-from rare_envs.distributions.parameters import (
+from rare_envs.distributions.coordinates import FloatArray
+from rare_envs.distributions.space import (
     RELATIVE_CHANGE,
     DistributionParameter,
     check_values,

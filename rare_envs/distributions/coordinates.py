@@ -8,9 +8,12 @@ from functools import cached_property, lru_cache
 from typing import Any, Literal, TypeAlias
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
-from rare_envs.arrays import FloatArray
+FloatArray: TypeAlias = NDArray[np.float64]
+"""Double precision, in which statistics are computed."""
+AnyArray: TypeAlias = NDArray[Any]
+"""Observations and actions of any dtype."""
 
 
 @dataclass(frozen=True)

@@ -10,12 +10,11 @@ from typing import Any, TypeVar, cast
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rare_envs.arrays import FloatArray
 from rare_envs.distributions.beta import BetaDistribution
+from rare_envs.distributions.coordinates import FloatArray
 from rare_envs.distributions.mixture import COMPONENT_FIELDS, CoordinateMixture, TruncatedGaussianMixture
-from rare_envs.distributions.parameters import DistributionParameter, HasParameters
 from rare_envs.distributions.pooled import Refits, number_coordinates, pool_mixtures
-from rare_envs.distributions.space import Distribution
+from rare_envs.distributions.space import Distribution, DistributionParameter, HasParameters
 
 FileDistribution = TruncatedGaussianMixture | CoordinateMixture | BetaDistribution
 RecordT = TypeVar("RecordT")

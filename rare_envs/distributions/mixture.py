@@ -14,9 +14,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from rare_envs.arrays import FloatArray
-from rare_envs.distributions.coordinates import CoordinateKind, Coordinates, as_finite, move_inside
-from rare_envs.distributions.parameters import (
+from rare_envs.distributions.coordinates import CoordinateKind, Coordinates, FloatArray, as_finite, move_inside
+from rare_envs.distributions.space import (
     DistributionParameter,
     MixtureArrays,
     arrays_of,

@@ -9,8 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rare_envs.arrays import FloatArray
-from rare_envs.distributions.coordinates import Coordinates, move_inside
+from rare_envs.distributions.coordinates import Coordinates, FloatArray, move_inside
 from rare_envs.distributions.mixture import (
     COMPONENT_FIELDS,
     BoxPoints,

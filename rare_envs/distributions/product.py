@@ -12,15 +12,15 @@ from typing import Any, Protocol, cast, runtime_checkable
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from rare_envs.arrays import FloatArray
+from rare_envs.distributions.coordinates import FloatArray
 from rare_envs.distributions.fitted import FittedDistribution
-from rare_envs.distributions.parameters import (
+from rare_envs.distributions.space import (
+    Distribution,
     DistributionParameter,
     HasParameters,
     check_values,
     number_columns,
 )
-from rare_envs.distributions.space import Distribution
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.optimize import elementwise
 from scipy.special import log_ndtr, ndtr, ndtri, ndtri_exp
 
-from rare_envs.arrays import FloatArray
+from rare_envs.distributions.coordinates import FloatArray
 
 SQRT_2PI = np.sqrt(2.0 * np.pi)
 LOG_SQRT_2PI = 0.5 * np.log(2.0 * np.pi)

@@ -18,13 +18,11 @@ from gymnasium import spaces
 
 from rare_envs.control.actions import DISCRETE_ACTIONS
 from rare_envs.control.idm import IDM
-from rare_envs.egos.errors import check_predict, is_policy
 from rare_envs.egos.human import HumanEgo
 from rare_envs.egos.wrappers import find_action_bounds, find_frame_stacking
-from rare_envs.sensors.kinds import ELSEWHERE, OBSERVATIONS, map_kinds, read_kinds
-from rare_envs.simulation.observation import observation_space
-from rare_envs.simulation.rollout import Driver
-from rare_envs.simulation.world import World
+from rare_envs.plugins import check_predict, is_policy
+from rare_envs.simulation.observation import ELSEWHERE, OBSERVATIONS, map_kinds, observation_space, read_kinds
+from rare_envs.simulation.world import Driver, World
 
 
 @runtime_checkable
@@ -61,8 +59,8 @@ class EgoNeeds:
     """Needs of an ego, and its statements about itself; `resolve` finds it out."""
 
     observations: tuple[str, ...] = ("features",)
-    """Kinds of observation that its space fits, each as `rare_envs.sensors.kinds.read_kinds` writes it; one where it
-    declares none."""
+    """Kinds of observation that its space fits, each as `observation.read_kinds` writes it; one where it declares
+    none."""
     lidar: bool = False
     """Whether it reads `Episode.perception` by itself, whatever is observed."""
     dt: float | None = None

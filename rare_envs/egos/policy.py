@@ -16,14 +16,12 @@ from torch import Tensor
 from rare_envs.control.actions import DISCRETE_ACTIONS, IDLE, META_ACTIONS, read_actions, to_physical
 from rare_envs.devices import move_to
 from rare_envs.egos.dense_policies import DenseInference, find_inference
-from rare_envs.egos.errors import NoAnswer, reason_of, refuse_ego
 from rare_envs.egos.needs import RULE_BASED_EGOS, EgoNeeds, ModuleEgo, WorldEgo, find_rule_based, resolve, takes_indices
 from rare_envs.egos.wrappers import find_frame_stacking, wrap_policy
-from rare_envs.sensors.kinds import map_kinds
+from rare_envs.plugins import NoAnswer, reason_of, refuse_ego
 from rare_envs.simulation.background import Background, TrafficBackground
-from rare_envs.simulation.observation import observe
-from rare_envs.simulation.rollout import Driver
-from rare_envs.simulation.world import World
+from rare_envs.simulation.observation import map_kinds, observe
+from rare_envs.simulation.world import Driver, World
 
 if TYPE_CHECKING:
     from rare_envs.simulation.episode import Episode

@@ -8,7 +8,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from rare_envs.sensors.kinds import batch_size, map_kinds
+from rare_envs.simulation.observation import batch_size, map_kinds
 
 Shape = tuple[int, ...]
 UNBOUNDED = "it declares observations without bounds, as behind Gymnasium's NormalizeObservation"

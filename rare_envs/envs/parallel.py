@@ -29,8 +29,7 @@ from rare_envs.envs.rows_and_infos import (
 from rare_envs.make import set_up
 from rare_envs.multi_agent import MultiAgentEpisode, Reward, own_reward, start, step_agents, total_of
 from rare_envs.plugins import did_you_mean
-from rare_envs.sensors.kinds import map_kinds
-from rare_envs.simulation.observation import observe
+from rare_envs.simulation.observation import map_kinds, observe
 
 Actions = Mapping[str, Any]
 FloatArray = NDArray[np.float32]

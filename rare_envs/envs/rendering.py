@@ -1,4 +1,6 @@
-"""Pictures of episodes: roads and vehicles by HighwayEnv's own graphics, numbers above, a legend below."""
+"""Pictures of episodes: roads and vehicles by HighwayEnv's own graphics, numbers above, a legend below; the palette."""
+
+from __future__ import annotations
 
 from collections.abc import Collection
 from itertools import pairwise
@@ -13,9 +15,26 @@ from rare_envs.control.actions import TARGET_SPEEDS
 from rare_envs.simulation.episode import Episode
 from rare_envs.simulation.world import World
 from rare_envs.traffic.bodies import pairwise_overlaps
-from rare_envs.traffic.palette import CRASH_COLOUR, ROLE_COLOURS, as_rgb
 from rare_envs.traffic.road import Road
 from rare_envs.traffic.state import VEHICLE_LENGTH, VEHICLE_WIDTH, State
+
+ROLE_COLOURS = {"ego": "#22aa3c", "lead": "#3b82d6", "cutter": "#f09a1a", "others": "#b4b4c4"}
+"""Colours of vehicles by what scenarios call them, on paper and on asphalt; "others" for other names."""
+OTHER_COLOURS = ("#8e5aa8", "#3aa6a6", "#7a7a7a", "#b4667e", "#6b7fb0")
+"""Colours that tell vehicles of other names apart in curves."""
+CRASH_COLOUR = "#d62828"
+"""Outline of vehicles that have crashed: they keep their own colour, so that the ego stays the ego."""
+
+
+def vehicle_colour(name: str, number: int = 0) -> str:
+    """Return the colour of a vehicle by its name, or by its number if scenarios call no vehicle so."""
+    return OTHER_COLOURS[number % len(OTHER_COLOURS)] if name not in ROLE_COLOURS else ROLE_COLOURS[name]
+
+
+def as_rgb(colour: str) -> tuple[int, int, int]:
+    """Return a colour as numbers from 0 to 255."""
+    return int(colour[1:3], 16), int(colour[3:5], 16), int(colour[5:7], 16)
+
 
 _SEGMENT = 6 * 4.33
 """A curve is drawn as straight pieces this long [m]: six stripes of HighwayEnv's."""

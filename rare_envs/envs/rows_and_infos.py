@@ -10,15 +10,15 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
-from rare_envs.arrays import FloatArray
 from rare_envs.distributions.beta import BetaDistribution
+from rare_envs.distributions.coordinates import FloatArray
 from rare_envs.distributions.fitted import FittedDistribution
 from rare_envs.distributions.mixture import CoordinateMixture, TruncatedGaussianMixture
 from rare_envs.distributions.space import Distribution, ScenarioSpace
 from rare_envs.measures.base import RowsReplaceable
 from rare_envs.multi_agent import terms_of, view_order
-from rare_envs.sensors.kinds import map_kinds
 from rare_envs.simulation.episode import Episode
+from rare_envs.simulation.observation import map_kinds
 from rare_envs.traffic.crash import describe_crash
 from rare_envs.traffic.state import map_leaves, map_tensors
 

@@ -13,10 +13,9 @@ from rare_envs.envs.rendering import RENDER_MODES, Display
 from rare_envs.envs.rows_and_infos import SingleObservation, episode_info, step_info
 from rare_envs.fast.choice import find_scripted_step
 from rare_envs.make import set_up
-from rare_envs.sensors.kinds import map_kinds
 from rare_envs.simulation.decision import StepResult, advance
 from rare_envs.simulation.episode import Episode
-from rare_envs.simulation.observation import observe
+from rare_envs.simulation.observation import map_kinds, observe
 
 
 class DrivingEnv(HighwayEnvInterface, gym.Env[SingleObservation, Any]):

@@ -27,10 +27,9 @@ from rare_envs.envs.rows_and_infos import (
 )
 from rare_envs.fast.choice import find_scripted_step
 from rare_envs.make import set_up
-from rare_envs.sensors.kinds import map_kinds
 from rare_envs.simulation.decision import RewardTerms, StepResult, advance
 from rare_envs.simulation.episode import Episode
-from rare_envs.simulation.observation import observe
+from rare_envs.simulation.observation import map_kinds, observe
 from rare_envs.traffic.crash import CRASH_KINDS, NONE
 
 

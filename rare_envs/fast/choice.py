@@ -22,8 +22,7 @@ from rare_envs.simulation.observation import observation_space
 if TYPE_CHECKING:
     from rare_envs.simulation.decision import StepResult
     from rare_envs.simulation.episode import Episode
-    from rare_envs.simulation.rollout import Driver
-    from rare_envs.simulation.world import World
+    from rare_envs.simulation.world import Driver, World
 
 CORES = ("auto", "torch", "numba")
 """Choices of what simulates."""

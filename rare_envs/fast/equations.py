@@ -18,10 +18,9 @@ import numpy as np
 
 from rare_envs.control.idm import IDM, MAX_HEADING_COMMAND, MIN_RATIO, TAU_HEADING, TAU_LATERAL
 from rare_envs.measures.base import GAP_MIN, STILL
-from rare_envs.traffic import vehicle_models
 from rare_envs.traffic.bodies import DIAGONAL
 from rare_envs.traffic.road import Road
-from rare_envs.traffic.state import VEHICLE_LENGTH, VEHICLE_WIDTH
+from rare_envs.traffic.state import MAX_SLIP_SINE, NEAR_ZERO, STEERING_LIMIT, VEHICLE_LENGTH, VEHICLE_WIDTH
 
 Function = TypeVar("Function", bound=Callable[..., object])
 PACKAGE = Path(__file__).parents[1]
@@ -89,9 +88,7 @@ _CACHE = find_cache()
 
 ZERO, HALF, ONE, TWO, THREE, FOUR, SIX = single(0.0, 0.5, 1.0, 2.0, 3.0, 4.0, 6.0)
 BODY_LENGTH, _HALF_LENGTH, _HALF_WIDTH = single(VEHICLE_LENGTH, VEHICLE_LENGTH / 2, VEHICLE_WIDTH / 2)
-_NEAREST, _MAX_SINE, _MAX_STEERING = single(
-    vehicle_models.NEAR_ZERO, vehicle_models.MAX_SLIP_SINE, vehicle_models.STEERING_LIMIT
-)
+_NEAREST, _MAX_SINE, _MAX_STEERING = single(NEAR_ZERO, MAX_SLIP_SINE, STEERING_LIMIT)
 _MAX_HEADING, _HEADING_GAIN, _LATERAL_GAIN = single(MAX_HEADING_COMMAND, 1.0 / TAU_HEADING, -TAU_LATERAL)
 _LEAST_GAP, _LEAST_SPEED, _LEAST_RATIO, _FAR = single(GAP_MIN, STILL, MIN_RATIO, DIAGONAL)
 
@@ -181,7 +178,7 @@ def keep_straight(x: float, speed: float, acceleration: float, dt: float) -> tup
 def bicycle(
     x: float, y: float, heading: float, speed: float, acceleration: float, steering: float, dt: float
 ) -> tuple[float, float, float, float]:
-    """Return x, y, heading and speed after a tick: `rare_envs.traffic.vehicle_models.bicycle`."""
+    """Return x, y, heading and speed after a tick: `rare_envs.traffic.state.bicycle`."""
     slip = math.atan(math.tan(steering) * HALF)
     course, distance = heading + slip, speed * dt
     turn = distance * math.sin(slip) / _HALF_LENGTH
@@ -191,7 +188,7 @@ def bicycle(
 
 @compiled
 def steering_for(yaw_rate: float, speed: float) -> float:
-    """Return the steering angle [rad]: `rare_envs.traffic.vehicle_models.steering_for`."""
+    """Return the steering angle [rad]: `rare_envs.traffic.state.steering_for`."""
     slip = math.asin(clip(_HALF_LENGTH / max(speed, _NEAREST) * yaw_rate, -_MAX_SINE, _MAX_SINE))
     return clip(math.atan(TWO * math.tan(slip)), -_MAX_STEERING, _MAX_STEERING)
 

@@ -44,8 +44,8 @@ from rare_envs.scenarios.cut_in import CUTTER_IDM
 from rare_envs.simulation import decision as reward
 from rare_envs.simulation.decision import RewardTerms, StepResult
 from rare_envs.simulation.episode import Episode, EpisodeStatistics
+from rare_envs.traffic.bodies import Lead
 from rare_envs.traffic.crash import Crash
-from rare_envs.traffic.neighbours import Lead
 from rare_envs.traffic.road import Road
 from rare_envs.traffic.state import State
 

@@ -252,7 +252,7 @@ def mark_hits(rows: Rows, turns: bool, road: RoadNumbers) -> None:
 
 @inlined
 def look(rows: Rows, turns: bool, road: RoadNumbers) -> bool:
-    """Find the egos' leads, `rare_envs.traffic.neighbours.lead_of`, and let f be the least time to collision so far.
+    """Find the egos' leads, `rare_envs.traffic.bodies.lead_of`, and let f be the least time to collision so far.
 
     Return whether any ego, of which any may have left its line if one `turns`, is not in the middle of a lane along it.
     """

@@ -20,8 +20,8 @@ from highway_env.vehicle.controller import ControlledVehicle, MDPVehicle
 from highway_env.vehicle.kinematics import Vehicle
 from numpy.typing import ArrayLike
 
-from rare_envs.arrays import FloatArray
 from rare_envs.distributions.beta import BetaDistribution
+from rare_envs.distributions.coordinates import FloatArray
 from rare_envs.distributions.mixture import TruncatedGaussianMixture
 from rare_envs.distributions.space import Distribution, Parameter
 

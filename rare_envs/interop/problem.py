@@ -16,14 +16,13 @@ import numpy as np
 from highway_env.vehicle.behavior import IDMVehicle
 from numpy.typing import NDArray
 
-from rare_envs.arrays import FloatArray
+from rare_envs.distributions.coordinates import FloatArray
 from rare_envs.distributions.space import Distribution, ScenarioSpace
-from rare_envs.egos.errors import is_policy, refuse_ego
 from rare_envs.egos.wrappers import wrap_policy
 from rare_envs.interop.layouts import IDM_PARAMETERS, restore_class_parameters, set_idm
 from rare_envs.interop.scenario import HighwayEnvScenario, install_fast_observation
-from rare_envs.plugins import did_you_mean, one_line
-from rare_envs.threads import use_one_thread
+from rare_envs.plugins import did_you_mean, is_policy, one_line, refuse_ego
+from rare_envs.startup import use_one_thread
 
 MAX_SECONDS = 100.0
 """Longest drive [s] unless told otherwise: HighwayEnv's merge ends at a place, where not every ego arrives."""

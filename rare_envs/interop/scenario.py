@@ -15,7 +15,7 @@ from highway_env.envs.roundabout_env import RoundaboutGenericEnv
 from highway_env.utils import class_from_path, lmap
 from numpy.typing import NDArray
 
-from rare_envs.arrays import FloatArray
+from rare_envs.distributions.coordinates import FloatArray
 from rare_envs.distributions.product import NoiseDistribution, join_independent
 from rare_envs.distributions.space import Parameter, ScenarioSpace
 from rare_envs.interop.layouts import (

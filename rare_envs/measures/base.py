@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from rare_envs.devices import may_hold, scalars
-from rare_envs.traffic.neighbours import Lead, lead_index, lead_of
+from rare_envs.traffic.bodies import Lead, lead_index, lead_of
 from rare_envs.traffic.road import Road, straight
 from rare_envs.traffic.state import VEHICLE_LENGTH, State
 

@@ -14,8 +14,8 @@ from rare_envs.control.actions import MAX_ACCELERATION
 from rare_envs.devices import are_zero, scalars
 from rare_envs.measures.base import GAP_MIN, STILL, Measure, Moment, acceleration_of_lead, gap_of
 from rare_envs.sensors.lidar import RANGE_COLUMNS, RATE_COLUMNS, beam_angles, find_vehicles_met
-from rare_envs.traffic.neighbours import lead_index
-from rare_envs.traffic.vehicle_models import STANDARD_GRAVITY
+from rare_envs.traffic.bodies import lead_index
+from rare_envs.traffic.state import STANDARD_GRAVITY
 
 TTC_MAX = 10.0
 """Cap of the time to collision [s]; what is further away, or not closing, counts as this."""

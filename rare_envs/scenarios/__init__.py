@@ -7,8 +7,7 @@ from rare_envs.scenarios.registry import SCENARIOS, find_scenario, scenario_name
 
 if TYPE_CHECKING:
     from rare_envs.distributions.space import Parameter
-    from rare_envs.scenarios.base import Others, Scenario, columns, drive_points, keep_straight
-    from rare_envs.scenarios.base_distributions import load_base
+    from rare_envs.scenarios.base import Others, Scenario, columns, drive_points, keep_straight, load_base
     from rare_envs.traffic.road import ReferenceLine, Road, i80, straight
     from rare_envs.traffic.state import LANE_WIDTH, VEHICLE_LENGTH, VEHICLE_WIDTH, State
 
@@ -47,7 +46,7 @@ _LAZY = {
     "drive_points": "rare_envs.scenarios.base",
     "i80": "rare_envs.traffic.road",
     "keep_straight": "rare_envs.scenarios.base",
-    "load_base": "rare_envs.scenarios.base_distributions",
+    "load_base": "rare_envs.scenarios.base",
     "straight": "rare_envs.traffic.road",
 }
 """Names that need torch, which `import rare_envs` must not import."""

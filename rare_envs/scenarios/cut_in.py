@@ -12,7 +12,7 @@ from rare_envs.control.idm import IDM
 from rare_envs.devices import scalars
 from rare_envs.distributions.space import Parameter
 from rare_envs.scenarios.base import DATA, SPEED_RANGE, Others, Scenario, columns
-from rare_envs.traffic.neighbours import Lead
+from rare_envs.traffic.bodies import Lead
 from rare_envs.traffic.road import straight
 from rare_envs.traffic.state import VEHICLE_LENGTH, State
 

@@ -14,8 +14,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from rare_envs.arrays import FloatArray
 from rare_envs.distributions.beta import BetaDistribution
+from rare_envs.distributions.coordinates import FloatArray
 from rare_envs.distributions.mixture import CoordinateMixture
 from rare_envs.distributions.space import Distribution, Parameter
 

@@ -2,7 +2,6 @@
 
 from rare_envs.simulation.background import Background, TrafficBackground
 from rare_envs.simulation.episode import Episode
-from rare_envs.simulation.rollout import Driver, drive
-from rare_envs.simulation.world import World
+from rare_envs.simulation.world import Driver, World, drive
 
 __all__ = ["Background", "Driver", "Episode", "TrafficBackground", "World", "drive"]

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from rare_envs.plugins import did_you_mean
-from rare_envs.traffic.neighbours import LaneTraffic
+from rare_envs.traffic.bodies import LaneTraffic
 from rare_envs.traffic.road import Road
 from rare_envs.traffic.state import State
 

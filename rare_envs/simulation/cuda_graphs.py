@@ -14,11 +14,9 @@ import torch
 from torch import Tensor
 
 from rare_envs.measures import MEASURES
-from rare_envs.measures.registry import PAIR_CLEARANCE
-from rare_envs.measures.terms import TermTracker
+from rare_envs.measures.registry import PAIR_CLEARANCE, TermTracker
 from rare_envs.simulation.episode import Episode
-from rare_envs.simulation.rollout import Driver, rollout
-from rare_envs.simulation.world import World
+from rare_envs.simulation.world import Driver, World, rollout
 from rare_envs.traffic.state import map_tensors
 
 STEPS = 4

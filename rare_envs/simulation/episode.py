@@ -16,9 +16,8 @@ from rare_envs.measures import EpisodeMeasure, Moment, ttc
 from rare_envs.measures.registry import MEASURES, find_measure
 from rare_envs.sensors.camera import CameraContext
 from rare_envs.simulation.background import BackgroundState
-from rare_envs.traffic.bodies import others_overlap
+from rare_envs.traffic.bodies import Lead, others_overlap
 from rare_envs.traffic.crash import NONE, Crash, crash_of, crash_of_others
-from rare_envs.traffic.neighbours import Lead
 from rare_envs.traffic.road import Road
 from rare_envs.traffic.state import State
 

@@ -12,12 +12,11 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from rare_envs.arrays import FloatArray
+from rare_envs.distributions.coordinates import FloatArray
 from rare_envs.measures.base import Moment
-from rare_envs.measures.terms import TermMeasure, TermTracker, find_order
+from rare_envs.measures.registry import TermMeasure, TermTracker, find_order
 from rare_envs.simulation.episode import Episode, Measurement
-from rare_envs.simulation.rollout import Driver, StochasticDriver, begin_drive, drive_tick
-from rare_envs.simulation.world import World
+from rare_envs.simulation.world import Driver, StochasticDriver, World, begin_drive, drive_tick
 from rare_envs.traffic.state import map_tensors
 
 GRADIENT_TILE = 256

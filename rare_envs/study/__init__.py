@@ -8,9 +8,8 @@ from typing import TYPE_CHECKING
 from rare_envs.plugins import make_lazy_getattr
 
 if TYPE_CHECKING:
-    from rare_envs.study.arguments import Question
+    from rare_envs.study.arguments import BadInput, Question
     from rare_envs.study.compare import compare_egos
-    from rare_envs.study.errors import BadInput
     from rare_envs.study.evaluate import resume, run, run_into
     from rare_envs.study.failures import severity_curve
     from rare_envs.study.question import prepare

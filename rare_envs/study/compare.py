@@ -9,12 +9,13 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import samplers
-from rare_envs.egos.errors import EgoGone
 from rare_envs.files import format_json, replace_text
-from rare_envs.study.arguments import Question
-from rare_envs.study.errors import (
+from rare_envs.plugins import EgoGone
+from rare_envs.startup import __version__
+from rare_envs.study.arguments import (
     FIRST_BATCH,
     BadInput,
+    Question,
     RunInterrupted,
     as_bad_input,
     describe_stop,
@@ -23,7 +24,6 @@ from rare_envs.study.errors import (
 from rare_envs.study.evaluate import RowKeeper, recheck
 from rare_envs.study.question import prepare
 from rare_envs.study.writing import check_no_results, write_failures
-from rare_envs.version import __version__
 from samplers.evaluate import Evaluator
 
 COMPARISON = "comparison.json"

@@ -26,12 +26,11 @@ from rare_envs.files import check_ordinary, parse_json_object, replace_file, rep
 from rare_envs.make import set_up
 from rare_envs.problem import DrivingProblem
 from rare_envs.scenarios.registry import find_scenario
-from rare_envs.study.arguments import Question, read_question
-from rare_envs.study.errors import BadInput, as_bad_input, output_folder
+from rare_envs.startup import __version__
+from rare_envs.study.arguments import BadInput, Question, as_bad_input, output_folder, read_question
 from rare_envs.study.question import build_problem, note_question, open_question, open_run, prepare
 from rare_envs.study.replay import REPLAY_TOLERANCE, join_parts
 from rare_envs.study.run_folder import CRASH, LoadedStudy, load_finished
-from rare_envs.version import __version__
 from training import Retraining
 
 STORED_FORMAT = 1

@@ -1,4 +1,4 @@
-"""Evaluation of an ego: a question is answered, into a folder or not, and an interrupted run is continued.
+"""Evaluation of an ego, into a folder or not; an interrupted run is continued, and the size of a run is planned.
 
 A sample of the simulations of a run is done again at its end, in another order and company: f is to be a function of x.
 An ego that is random after its first call, keeps a counter that nobody resets, or whose row depends on the other rows
@@ -7,9 +7,11 @@ of its batch gives an f that is none, and a p that means nothing; at the first c
 
 from __future__ import annotations
 
+import math
+import reprlib
 import shlex
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import asdict, replace
 from functools import partial
@@ -21,18 +23,19 @@ import numpy as np
 import agents
 import samplers
 from agents.loading import find_ego_kind
-from rare_envs.egos.errors import EgoGone
+from rare_envs.plugins import EgoGone
 from rare_envs.problem import DrivingProblem
-from rare_envs.study.arguments import Question
-from rare_envs.study.episodes import EpisodeTable
-from rare_envs.study.errors import (
+from rare_envs.study.arguments import (
     BadInput,
+    Question,
     RunInterrupted,
     UnwrittenResults,
+    as_bad_input,
     describe_stop,
     keep_answer,
     output_folder,
 )
+from rare_envs.study.episodes import EpisodeTable
 from rare_envs.study.failures import CrashKinds, classify_failures, list_all_kinds
 from rare_envs.study.question import (
     Study,
@@ -50,9 +53,8 @@ from samplers.estimation import add_ensemble_run, check_base, run_method
 from samplers.evaluate import Evaluator, Simulated, find_changed
 from samplers.executors import Executor
 from samplers.journal import Journal
-from samplers.problem import FloatArray
+from samplers.problem import FloatArray, OnError
 from samplers.sample import Status
-from samplers.validation import OnError
 from samplers.workers import ExecutorError
 
 KEPT_ROWS, COMPANY, ROWS_ALONE = 64, 16, 2
@@ -327,7 +329,7 @@ def resume(
         >>> resume(Path("runs/nowhere"))
         Traceback (most recent call last):
             ...
-        rare_envs.study.errors.BadInput: There is no unfinished run in 'runs/nowhere': the folder does not exist. Of a run that was stopped before its first simulations, give the command again.
+        rare_envs.study.arguments.BadInput: There is no unfinished run in 'runs/nowhere': the folder does not exist. Of a run that was stopped before its first simulations, give the command again.
     """  # noqa: E501 (the example shows a whole message)
     journal, question = continue_journal(folder, mend)
     with closing(journal):
@@ -386,3 +388,62 @@ def _describe_kept(journal: Journal, folder: Path, trust: bool, report: Report |
         if n_further > 0:
             count = f"{n:,} simulations and a further {n_further:,} under the mixture of the refits"
     return f" {count} are kept; go on with: rare-envs resume {shlex.quote(str(folder))}{' --trust' if trust else ''}"
+
+
+def plan_from_result(recorded: Mapping[str, Any], target_cov: float) -> tuple[samplers.PlannedRun, ...]:
+    """Return what the method of a run, and plain Monte Carlo, need."""
+    p, cov, n_sim, seconds = (_read_number(recorded, name) for name in ("p", "cov", "n_sim", "seconds"))
+    described = recorded.get("method")
+    name = described.get("name") if isinstance(described, Mapping) else None
+    with as_bad_input(ValueError):
+        method = samplers.get_method(name if isinstance(name, str) else reprlib.repr(name))
+        final = _read_number(recorded, "final_draws") if recorded.get("final_draws") is not None else None
+        if final is not None and final > n_sim:
+            raise ValueError(f"The result of the run says {final:g} final draws of {n_sim:g} simulations.")
+        pilot = samplers.Pilot(
+            method=method.name,
+            p=p,
+            cov=cov,
+            n_sim=int(n_sim),
+            final_draws=int(final) if final is not None and method.stops_at_target else None,
+            seconds=seconds,
+        )
+        return samplers.plan_runs(pilot, target_cov)
+
+
+def plan_by_pilots(
+    question: Question, methods: Sequence[str], target_cov: float, progress: bool = False
+) -> tuple[samplers.PlannedRun, ...]:
+    """Run a pilot by each method, and return what each needs; plain Monte Carlo last."""
+    found: dict[str, samplers.PlannedRun] = {}
+    with as_bad_input(ValueError):
+        for name in methods:  # all of them before the first pilot, which may take hours
+            samplers.get_method(name)
+    study = prepare(replace(question, method=methods[0], ensemble_run=False))
+    for name in methods:
+        with as_bad_input(ValueError):
+            method = samplers.get_method(name)
+            asked = replace(study, question=replace(study.question, method=name), method=method)
+            report = run(asked, progress)
+            for planned in samplers.plan_runs(report.estimate.pilot(report.seconds), target_cov):
+                if planned.method != "mc" or planned.method not in found:
+                    found[planned.method] = planned
+    last = found.pop("mc")
+    return (*found.values(), last)
+
+
+def format_seconds(seconds: float) -> str:
+    """Return a time in a unit of its size."""
+    for size, unit in ((120.0, "s"), (7200.0, "min")):
+        if seconds < size:
+            return f"{max(1, math.ceil(seconds / {'s': 1, 'min': 60}[unit]))} {unit}"
+    return f"{seconds / 3600:,.0f} h"
+
+
+def _read_number(recorded: Mapping[str, Any], name: str) -> float:
+    """Return a number of at least 0."""
+    value = recorded.get(name)
+    if isinstance(value, bool) or not isinstance(value, int | float) or not (math.isfinite(value) and value >= 0):
+        why = " (the run found no failure)" if name == "cov" and value is None else ""
+        raise BadInput(f"Expected a number {name} in the result of the run, got {reprlib.repr(value)}{why}.")
+    return float(value)

@@ -22,9 +22,9 @@ from numpy.typing import ArrayLike, NDArray
 
 import samplers
 from rare_envs.distributions.space import ScenarioSpace
-from rare_envs.egos.errors import EgoGone
+from rare_envs.plugins import EgoGone
 from rare_envs.problem import DrivingProblem
-from rare_envs.study.columns import digest_scenarios, list_columns
+from rare_envs.study.episodes import digest_scenarios, list_columns
 from rare_envs.traffic.crash import CRASH_KINDS, NONE, OTHERS, Crash, describe_crash
 from samplers.analysis import (
     NO_OUTCOME_LABEL,

@@ -16,14 +16,14 @@ from matplotlib.patches import Rectangle
 from matplotlib.transforms import Affine2D
 
 from rare_envs.distributions.space import ScenarioSpace
-from rare_envs.egos.errors import EgoGone, reason_of
+from rare_envs.envs.rendering import CRASH_COLOUR, vehicle_colour
 from rare_envs.exposure import CONTACTS_100CAR, REAR_END_CONTACTS_100CAR, RateInterval, TotalRate
 from rare_envs.files import replace_file
-from rare_envs.study.columns import draw_ordinary, list_columns
+from rare_envs.plugins import EgoGone, reason_of
+from rare_envs.study.episodes import draw_ordinary, list_columns
 from rare_envs.study.replay import Drive, drive_again
 from rare_envs.study.report import Report
 from rare_envs.study.text import format_rate, format_share, format_with_interval, name_scenario, name_source
-from rare_envs.traffic.palette import CRASH_COLOUR, vehicle_colour
 from rare_envs.traffic.state import VEHICLE_LENGTH, VEHICLE_WIDTH
 
 if TYPE_CHECKING:

@@ -19,14 +19,14 @@ from rare_envs.exposure import HUMAN_BENCHMARKS, CollisionProbability, Collision
 from rare_envs.measures.base import Measure
 from rare_envs.measures.registry import MEASURES
 from rare_envs.scenarios.registry import find_scenario
+from rare_envs.startup import __version__
 from rare_envs.study.arguments import Question
 from rare_envs.study.failures import CrashKinds, FailureMode, find_modes
 from rare_envs.study.question import Study
-from rare_envs.version import __version__
 from samplers.analysis.base_error import FIT_BIAS
 from samplers.analysis.reweight import refit_quantile
 from samplers.evaluate import Fault
-from samplers.statistics import Interval
+from samplers.sample import Interval
 
 MOST_DIFFERING = 0.05
 """Share of simulations that may differ by more: a choice between two actions may hang on rounding in a rare one."""

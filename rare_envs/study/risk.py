@@ -24,11 +24,10 @@ from rare_envs.exposure import (
 )
 from rare_envs.files import format_json, replace_text
 from rare_envs.plugins import did_you_mean
-from rare_envs.scenarios.base import Scenario
-from rare_envs.scenarios.base_distributions import load_base
+from rare_envs.scenarios.base import Scenario, load_base
 from rare_envs.scenarios.registry import env_id_of, scenario_named
-from rare_envs.study.arguments import Question
-from rare_envs.study.errors import BadInput, RunInterrupted, as_bad_input, keep_answer
+from rare_envs.startup import __version__
+from rare_envs.study.arguments import BadInput, Question, RunInterrupted, as_bad_input, keep_answer
 from rare_envs.study.evaluate import run, run_into
 from rare_envs.study.plots import save_risk_plot
 from rare_envs.study.question import Study, prepare
@@ -42,7 +41,6 @@ from rare_envs.study.text import (
     name_scenario,
 )
 from rare_envs.study.writing import check_no_results
-from rare_envs.version import __version__
 
 SCENARIO_SET = ("cut_in", "hard_brake")
 """Scenarios that count nothing twice."""
@@ -312,7 +310,7 @@ def risk(
         >>> risk("idm", scenarios=("cut_in", "car_following"))
         Traceback (most recent call last):
             ...
-        rare_envs.study.errors.BadInput: Expected one of cut_in, car_following: a cut-in is a new leader, and would count twice.
+        rare_envs.study.arguments.BadInput: Expected one of cut_in, car_following: a cut-in is a new leader, and would count twice.
     """  # noqa: E501 (the example shows a whole message)
     sites = (sites,) if isinstance(sites, str) else sites
     folder, bases = None if out is None else Path(out), bases or {}

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from rare_envs.files import check_ordinary, parse_json_object, read_text_file
 from rare_envs.plugins import one_line
-from rare_envs.study.errors import BadInput, as_bad_input
+from rare_envs.study.arguments import BadInput, as_bad_input
 
 if TYPE_CHECKING:
     import pyarrow
@@ -278,7 +278,7 @@ def load_study(folder: str | Path) -> LoadedStudy:
         >>> load_study("runs/nowhere")
         Traceback (most recent call last):
             ...
-        rare_envs.study.errors.BadInput: No finished run in 'runs/nowhere': expected result.json and failures.csv, as rare-envs estimate --out writes.
+        rare_envs.study.arguments.BadInput: No finished run in 'runs/nowhere': expected result.json and failures.csv, as rare-envs estimate --out writes.
     """  # noqa: E501 (the example shows a whole message)
     path = Path(folder)
     if not all((path / name).is_file() for name in (RESULT, FAILURES)):

@@ -21,7 +21,7 @@ from rare_envs.exposure import (
     summarise_human_contacts,
 )
 from rare_envs.measures import MEASURES
-from rare_envs.study.columns import MAX_SHOWN, draw_ordinary, find_ordinary_range, format_value, list_columns
+from rare_envs.study.episodes import MAX_SHOWN, draw_ordinary, find_ordinary_range, format_value, list_columns
 from rare_envs.study.failures import KIND_DESCRIPTIONS
 from rare_envs.study.report import BaseAnswer, Report
 from samplers.output import indent_lines

@@ -10,12 +10,20 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from PIL import Image, ImageDraw
 
-from rare_envs.envs.rendering import AGENT, FRAME_WIDTH, Colour, Renderer
+from rare_envs.envs.rendering import (
+    AGENT,
+    CRASH_COLOUR,
+    FRAME_WIDTH,
+    OTHER_COLOURS,
+    ROLE_COLOURS,
+    Colour,
+    Renderer,
+    as_rgb,
+)
 from rare_envs.files import replace_file
-from rare_envs.study.errors import BadInput, output_file
+from rare_envs.study.arguments import BadInput, output_file
 from rare_envs.study.plots import draw_measure
 from rare_envs.study.replay import Drive
-from rare_envs.traffic.palette import CRASH_COLOUR, OTHER_COLOURS, ROLE_COLOURS, as_rgb
 
 CURVES_HEIGHT = 144
 """Height of the curves below the road of a film [pixels]."""

@@ -23,9 +23,9 @@ from agents.loading import find_ego_kind, strip_prefixes
 from rare_envs.distributions.fitted import FittedDistribution
 from rare_envs.distributions.space import ScenarioSpace
 from rare_envs.files import format_json, parse_json_object, read_text_file, replace_file, replace_text
-from rare_envs.study.arguments import Question, read_question
-from rare_envs.study.columns import MAX_SHOWN, list_columns
-from rare_envs.study.errors import BadInput, UnwrittenResults
+from rare_envs.startup import __version__
+from rare_envs.study.arguments import BadInput, Question, UnwrittenResults, read_question
+from rare_envs.study.episodes import MAX_SHOWN, list_columns
 from rare_envs.study.plots import save_plot, saved_figure
 from rare_envs.study.question import Study, digest_files, find_ego_files, is_same_question
 from rare_envs.study.report import Report
@@ -46,7 +46,6 @@ from rare_envs.study.run_folder import (
     digest_results,
 )
 from rare_envs.traffic.crash import CRASH_KINDS, NONE
-from rare_envs.version import __version__
 from samplers.journal import Journal, JournalError, NothingRecorded
 from samplers.result import method_settings
 

@@ -1,12 +1,20 @@
-"""Traffic states: B scenarios with N vehicles each; and trees of tensors."""
+"""Traffic states: B scenarios with N vehicles each; trees of tensors; and vehicle models, one explicit Euler step each.
+
+HighwayEnv's kinematic bicycle and a point mass move in road coordinates. Where the road is curved, with curvature k, a
+way of d metres along the road at y is d / (1 - k y) of the reference line, and the road turns under the vehicle by k
+times that.
+"""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
+
+from rare_envs.devices import are_zero, scalars
 
 VEHICLE_LENGTH = 5.0
 """Length of every vehicle [m], HighwayEnv's."""
@@ -109,3 +117,124 @@ def map_leaves(function: Callable[..., Any], tree: Any, *others: Any) -> Any:
 def map_tensors(function: Callable[[Tensor], Any], tree: Any) -> Any:
     """Return the tree with a function of its tensors in their places; the rest, as the road, stays."""
     return map_leaves(lambda leaf: function(leaf) if isinstance(leaf, Tensor) else leaf, tree)
+
+
+STEERING_LIMIT = math.pi / 3
+"""Largest steering angle [rad], HighwayEnv's."""
+MAX_SLIP_SINE = math.sin(math.atan(0.5 * math.tan(STEERING_LIMIT)))
+"""Sine of the slip angle at the largest steering angle. Near 1 single precision may give a slip beyond pi / 2, and its
+tangent the other sign."""
+STANDARD_GRAVITY = 9.80665
+"""g [m/s^2]."""
+NEAR_ZERO = 0.01
+"""HighwayEnv's `not_zero`: distances [m] and speeds [m/s] in a denominator are kept at least this far from 0."""
+
+
+def bicycle(
+    x: Tensor,
+    y: Tensor,
+    heading: Tensor,
+    speed: Tensor,
+    acceleration: Tensor,
+    steering: Tensor,
+    dt: float,
+    curvature: Tensor | None = None,
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Move vehicles by one tick with the kinematic bicycle model.
+
+    beta = atan(tan(steering) / 2), then x, y and heading move with the old speed and heading, and the speed last.
+    HighwayEnv's `Vehicle.step` is the same but for one deliberate difference: it lets vehicles reverse, ours stop.
+
+    Args:
+        x: Centres along the road [m], any shape; the other tensors have the same.
+        y: Centres across the road [m].
+        heading: Headings [rad].
+        speed: Speeds [m/s].
+        acceleration: Accelerations [m/s^2].
+        steering: Front wheel angles [rad].
+        dt: Tick [s].
+        curvature: Of the road at x [1/m], positive to the right; None for a straight road.
+
+    Returns:
+        x, y, heading and speed after the tick. On a straight road, where nobody steers and all headings are 0, `y` and
+        `heading` are the tensors that were given: write into neither.
+
+    References:
+        Polack et al., "The kinematic bicycle model", 2017; HighwayEnv, `vehicle/kinematics.py`.
+
+    Example:
+        >>> zero = torch.zeros(1)
+        >>> x, y, heading, speed = bicycle(zero, zero, zero, zero + 20.0, zero + 1.0, zero, dt=0.1)
+        >>> round(x.item(), 2), round(speed.item(), 2)
+        (2.0, 20.1)
+    """
+    tick, half, half_length = scalars((dt, 0.5, VEHICLE_LENGTH / 2), speed)
+    distance, after = speed * tick, (speed + acceleration * tick).clamp_min(0.0)
+    if curvature is None and are_zero(steering, heading):
+        return x + distance, y, heading, after
+    slip = torch.atan(torch.tan(steering) * half)
+    course = heading + slip
+    ahead, turn = distance * torch.cos(course), distance * torch.sin(slip) / half_length
+    if curvature is not None:
+        ahead, turn = _along_curve(ahead, turn, y, curvature)
+    return x + ahead, y + distance * torch.sin(course), heading + turn, after
+
+
+def steering_for(yaw_rate: Tensor, speed: Tensor) -> Tensor:
+    """Return the steering angle [rad] with which `bicycle` turns at a yaw rate [rad/s] and speed [m/s], (B,).
+
+    Inverts yaw rate = v sin(beta) / (l / 2), beta = atan(tan(steering) / 2), with l the vehicle's length. A vehicle
+    too slow to turn as fast as wanted steers by `STEERING_LIMIT`.
+    """
+    sine = VEHICLE_LENGTH / 2 / speed.clamp(min=NEAR_ZERO) * yaw_rate
+    slip = torch.asin(sine.clamp(-MAX_SLIP_SINE, MAX_SLIP_SINE))
+    return torch.atan(2.0 * torch.tan(slip)).clamp(-STEERING_LIMIT, STEERING_LIMIT)
+
+
+def point_mass(
+    x: Tensor,
+    y: Tensor,
+    heading: Tensor,
+    speed: Tensor,
+    acceleration: Tensor,
+    yaw_rate: Tensor,
+    dt: float,
+    curvature: Tensor | None = None,
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Move vehicles by one tick as points that turn at will: the model of learned drivers.
+
+    Args:
+        x: Centres along the road [m], any shape; the other tensors have the same.
+        y: Centres across the road [m].
+        heading: Headings relative to the road [rad].
+        speed: Speeds [m/s].
+        acceleration: Accelerations [m/s^2].
+        yaw_rate: Change of the heading in the world [rad/s].
+        dt: Tick [s].
+        curvature: Of the road at x [1/m], positive to the right; None for a straight road.
+
+    Returns:
+        x, y, heading and speed after the tick; the speed is not negative.
+
+    References:
+        O'Kelly, Sinha, Namkoong, Duchi and Tedrake, "Scalable end-to-end autonomous vehicle testing via rare-event
+        simulation", 2018: the model of their released simulator.
+
+    Example:
+        >>> zero = torch.zeros(1)
+        >>> x, y, heading, speed = point_mass(zero, zero, zero, zero + 20.0, zero, zero + 0.3, dt=0.1)
+        >>> round(heading.item(), 3)
+        0.03
+    """
+    (tick,) = scalars((dt,), speed)
+    distance = speed * tick
+    ahead, turn = distance * torch.cos(heading), yaw_rate * tick
+    if curvature is not None:
+        ahead, turn = _along_curve(ahead, turn, y, curvature)
+    return x + ahead, y + distance * torch.sin(heading), heading + turn, (speed + acceleration * tick).clamp_min(0.0)
+
+
+def _along_curve(ahead: Tensor, turn: Tensor, y: Tensor, curvature: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the way along the reference line [m] and the turn relative to it [rad], for way and turn in the world."""
+    ahead = ahead / (1.0 - curvature * y)
+    return ahead, turn - curvature * ahead

@@ -5,7 +5,7 @@ With p_b the probability under refit b, s the standard deviation of log p_b and 
     p exp(-t S) to p exp(t S),    S^2 = s^2 + cov^2 + 0.2^2,
 
 the upper end raised by the share of p that a search may have missed, as that of the sampling interval is
-(`samplers.statistics`): S does not hold it, since the refits miss what the run misses. It is nowhere
+(`samplers.sample`): S does not hold it, since the refits miss what the run misses. It is nowhere
 narrower than the sampling interval, which of few draws is wider than their c.o.v. says.
 
 Percentiles of the p_b are not used: refits repeat the bias of the fit, and 30 of them do not reach the outer 2.5 %, so
@@ -54,7 +54,7 @@ from samplers.analysis.weighted import (
 )
 from samplers.method import EstimateData
 from samplers.problem import FloatArray
-from samplers.statistics import Interval
+from samplers.sample import Interval
 
 FIT_BIAS = 0.2
 """Bias of the fit itself in log p (floor of the covariances, local optima of the mixture), which refits repeat: it

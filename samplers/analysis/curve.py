@@ -26,10 +26,8 @@ from samplers.output import (
     to_json_value,
     write_object,
 )
-from samplers.problem import FloatArray
-from samplers.sample import Sample
-from samplers.statistics import add_unseen
-from samplers.validation import needs_library
+from samplers.problem import FloatArray, needs_library
+from samplers.sample import Sample, add_unseen
 
 if TYPE_CHECKING:
     import pandas

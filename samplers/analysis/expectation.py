@@ -31,8 +31,7 @@ from samplers.analysis.weighted import (
 from samplers.method import EstimateData
 from samplers.output import drawing_axes
 from samplers.problem import FloatArray
-from samplers.sample import Sample
-from samplers.statistics import Interval, effective_number
+from samplers.sample import Interval, Sample, effective_number
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

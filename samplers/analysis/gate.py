@@ -31,9 +31,8 @@ from typing import Any, Literal
 from samplers.analysis.base_error import BaseUncertainty
 from samplers.analysis.weighted import Reported
 from samplers.method import EstimateData
-from samplers.sample import Status
-from samplers.statistics import zero_hit_bound
-from samplers.validation import check_number
+from samplers.problem import check_number
+from samplers.sample import Status, zero_hit_bound
 
 Decision = Literal["passes", "fails", "undecided"]
 

@@ -34,8 +34,7 @@ from samplers.analysis.weighted import (
 from samplers.distributions import as_distribution, can_convert
 from samplers.method import EstimateData
 from samplers.problem import Distribution, FloatArray
-from samplers.sample import Sample
-from samplers.statistics import Interval, add_unseen, effective_number, raise_log_end
+from samplers.sample import Interval, Sample, add_unseen, effective_number, raise_log_end
 
 MIN_POINTS = 30.0
 """Effective number of failing points that the estimate must rest on."""

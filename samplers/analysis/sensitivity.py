@@ -47,9 +47,8 @@ import numpy as np
 from samplers.analysis.reweight import HasLogProb, find_fitted_base, log_density, require_base, reweight_to_refits
 from samplers.analysis.weighted import Reported, WeightedFailures, weigh_failures
 from samplers.method import EstimateData
-from samplers.problem import Distribution, FloatArray
-from samplers.statistics import effective_number
-from samplers.validation import needs_library
+from samplers.problem import Distribution, FloatArray, needs_library
+from samplers.sample import effective_number
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

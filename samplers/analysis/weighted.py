@@ -24,8 +24,7 @@ from scipy.special import ndtr
 from samplers.method import EstimateData
 from samplers.output import to_json_value
 from samplers.problem import FloatArray
-from samplers.sample import Sample
-from samplers.statistics import Interval, clopper_pearson, degrees_of_freedom, effective_number, log_normal_interval
+from samplers.sample import Interval, Sample, clopper_pearson, degrees_of_freedom, effective_number, log_normal_interval
 
 MIN_UNITS = 5.0
 """Effective number of independent units (draws; paths of chains) that a result must rest on: fewer give a useless t

@@ -1,11 +1,25 @@
-"""Method: the base class of the methods, with `start` for simulations that the user makes."""
+"""Method: the base class of the methods; and the coordinates that are searched, noise drawn afresh for every point.
 
-from typing import Protocol, runtime_checkable
+The randomness of learned drivers, or of a stack of sensors, is hundreds of coordinates of x that are standard normal
+and matter little one by one. Wide draws of all of them are nothing like noise, and no proposal describes failures in so
+many dimensions. Drawn from their own distribution they cost nothing: with Z ~ N(0, I) for the noise,
+p = E[P(f(X, Z) <= gamma | X)], and weights are those of X alone. f is then noisy for the search, and still every
+simulated x replays.
+"""
 
-from samplers.method import Stepping
-from samplers.problem import Inputs
+import math
+from collections.abc import Generator
+from dataclasses import dataclass
+from typing import Any, Generic, NamedTuple, Protocol, TypeVar, cast, runtime_checkable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from samplers.components import MixtureComponent
+from samplers.method import Goal, Stepping
+from samplers.problem import Distribution, FloatArray, HasNoise, Inputs, OnError
 from samplers.run import Run, RunArguments
-from samplers.validation import OnError
+from samplers.sample import Level
 
 
 @runtime_checkable
@@ -68,3 +82,150 @@ class Method(Stepping, Protocol):
         """
         arguments = RunArguments(gamma, seed, max_sim, target_cov, confidence, replicates, on_error)
         return Run(problem, self, arguments)
+
+
+def noise_mask(inputs: Inputs) -> NDArray[np.bool_]:
+    """Return which coordinates of x are noise, shape (d,): none where the base distribution does not say."""
+    noise = inputs.base.noise if isinstance(inputs.base, HasNoise) else None
+    return np.zeros(inputs.dim, dtype=bool) if noise is None else np.asarray(noise, dtype=bool)
+
+
+def marginalise_noise(inputs: Inputs, rng: np.random.Generator) -> Inputs:
+    """Return the inputs to search: these themselves where none of them is noise, or all are."""
+    noise = noise_mask(inputs)
+    return inputs if not noise.any() or noise.all() else cast(Inputs, NoiseMarginalisedInputs(inputs, noise, rng))
+
+
+class NoiseMarginalisedInputs:
+    """The coordinates that are not noise, as inputs of their own; points u (n, k) become x (n, d) with noise drawn.
+
+    The same u gets the same noise again: rows of u are known by their bytes, and their noise is made anew from a
+    counter, so that nothing large is kept. The mask `noise` (d,) says which coordinates are noise.
+    """
+
+    def __init__(self, inputs: Inputs, noise: NDArray[np.bool_], rng: np.random.Generator) -> None:
+        self.dim = int(np.count_nonzero(~noise))
+        self._base, self._noise = inputs.base, noise
+        self._seed = int(rng.integers(2**63))
+        self._numbers: dict[bytes, int] = {}
+
+    @property
+    def base(self) -> Distribution:
+        """Their distribution."""
+        return self
+
+    def from_standard_normal(self, u: FloatArray) -> FloatArray:
+        """Map u (n, k) to x (n, d), with noise."""
+        whole = np.empty((len(u), len(self._noise)))
+        whole[:, ~self._noise] = u
+        count = len(self._noise) - self.dim
+        for row, key in enumerate(map(bytes, np.ascontiguousarray(u))):
+            number = self._numbers.setdefault(key, len(self._numbers))
+            whole[row, self._noise] = np.random.default_rng((self._seed, number)).standard_normal(count)
+        return self._base.from_standard_normal(whole)
+
+    def to_standard_normal(self, x: FloatArray) -> FloatArray:
+        """Map x (n, d) to u (n, k)."""
+        return self._base.to_standard_normal(x)[:, ~self._noise]
+
+    def sample(self, n: int, rng: np.random.Generator) -> FloatArray:
+        """Draw points x, shape (n, d)."""
+        return self.from_standard_normal(rng.standard_normal((n, self.dim)))
+
+    def log_prob(self, x: FloatArray) -> FloatArray:
+        """Return the log density of x (n, d), noise included, shape (n,)."""
+        return self._base.log_prob(x)
+
+
+_T = TypeVar("_T")
+SimulationSteps = Generator[FloatArray, FloatArray, _T]
+"""A computation that needs simulations: yields points x (n, d), is sent their outcomes f (n,), returns a result."""
+
+
+class Simulator:
+    """The way to f from standard normal space, its count and trace: the only part of a run that is changed in place.
+
+    An `Interrupted` that ends a step midway discards the step's state, not the simulations that it made; so the count
+    stands outside the state. `inputs` are the coordinates that are searched, with the map from u to x.
+    """
+
+    def __init__(self, inputs: Inputs, goal: Goal | None = None) -> None:
+        self.inputs, self.goal = inputs, goal
+        self.n_sim = 0
+        self.trace = list[Level]()
+
+    def record(self, p: float, estimate: float, n_points: int, cov: float, ess: float | None = None) -> None:
+        """Add a level to the trace, which has all simulations that no earlier one has."""
+        assert self.goal is not None
+        made = self.n_sim - sum(level.n_sim for level in self.trace)
+        found: dict[str, Any] = {"p": p, "estimate": estimate, "n_points": n_points, "cov": cov, "ess": ess}
+        self.trace.append(Level(gamma=self.goal.gamma, n_sim=made, **found))
+        self.goal.on_level(self.trace[-1])
+
+    def close_trace(self) -> tuple[Level, ...]:
+        """Return the trace; the simulations of an interrupted step, if there are any, are a level of their own."""
+        loose = self.n_sim - sum(level.n_sim for level in self.trace)
+        if loose:
+            self.record(math.nan, math.nan, loose, math.inf)
+        return tuple(self.trace)
+
+    def evaluate(self, u: FloatArray) -> SimulationSteps[FloatArray]:
+        """Return f at u (n, d), shape (n,); no batch is yielded where n = 0."""
+        if len(u) == 0:
+            return np.empty(0)
+        return (yield from self.simulate(self.inputs.base.from_standard_normal(u)))
+
+    def simulate(self, x: FloatArray) -> SimulationSteps[FloatArray]:
+        """Return f at x (n, d), shape (n,), in physical space; n > 0."""
+        f = yield x
+        self.n_sim += len(x)
+        return f
+
+
+_S = TypeVar("_S", bound=Simulator, covariant=True)
+
+
+@dataclass(frozen=True, eq=False)
+class RunContext(Generic[_S]):
+    """What is fixed for a run, and the simulator that counts."""
+
+    inputs: Inputs
+    """All of x."""
+    simulator: _S
+    """Of the coordinates that are searched."""
+    goal: Goal
+    budget: int
+    """Simulations that the exploration and the rounds are planned for."""
+    end: int
+    """Simulations that are never exceeded; more than `budget` where only a target c.o.v. is given."""
+    rng: np.random.Generator
+
+    @property
+    def left(self) -> int:
+        """Simulations left of the budget."""
+        return self.budget - self.simulator.n_sim
+
+    @property
+    def left_at_all(self) -> int:
+        """Simulations left before the end."""
+        return self.end - self.simulator.n_sim
+
+    def meets_target(self, cov: float) -> bool:
+        """Return whether there is a target c.o.v. and this one meets it."""
+        return self.goal.target_cov is not None and cov <= self.goal.target_cov
+
+
+class ComponentDraws(NamedTuple):
+    """Draws from known components, one component after the other, and their outcomes."""
+
+    components: list[MixtureComponent]
+    counts: NDArray[np.int64]
+    """Draws of each component, shape (k,); they add up to n."""
+    u: FloatArray
+    """Shape (n, d)."""
+    f: FloatArray
+    """Shape (n,)."""
+    first: int = 0
+    """Simulations that the run had spent before the first of them."""
+    x: FloatArray | None = None
+    """The points in physical space, shape (n, d), where they are kept: a fitted base takes long to map them again."""

@@ -26,7 +26,7 @@ from scipy.optimize import minimize
 from scipy.special import betainc, betaincc, betainccinv, betaincinv, betaln, digamma, ndtr, ndtri
 
 from samplers.distributions import SizedDistribution, as_distribution, can_convert
-from samplers.problem import FloatArray, Inputs
+from samplers.problem import FloatArray, Inputs, needs_library
 from samplers.proposals import (
     Gaussian,
     Mixture,
@@ -36,7 +36,6 @@ from samplers.proposals import (
     shrink_towards_present,
     weighted_moments,
 )
-from samplers.validation import needs_library
 
 
 def beta_statistics(alpha: FloatArray, beta: FloatArray) -> FloatArray:

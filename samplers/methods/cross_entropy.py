@@ -23,11 +23,9 @@ from samplers.importance import (
 from samplers.method import Goal, Interrupted, Steps
 from samplers.methods.base import Method
 from samplers.methods.blocks import GaussianBlock, MixtureBlock, NormalBlock, Product, announced_blocks
-from samplers.problem import FloatArray, Inputs
+from samplers.problem import FloatArray, Inputs, check_choice, check_count, check_setting, is_number
 from samplers.proposals import Gaussian, ProposalDistribution
-from samplers.sample import Level, Status
-from samplers.statistics import next_level, normalise_weights
-from samplers.validation import check_choice, check_count, check_setting, is_number
+from samplers.sample import Level, Status, next_level, normalise_weights
 
 
 class Iterate(NamedTuple):

@@ -18,11 +18,9 @@ from samplers.importance import (
 )
 from samplers.method import Goal, Interrupted, Steps
 from samplers.methods.base import Method
-from samplers.problem import FloatArray, Inputs, StandardNormal
+from samplers.problem import FloatArray, Inputs, StandardNormal, check_count, check_setting
 from samplers.proposals import Mixture, ProposalDistribution, TiltedNormal
-from samplers.sample import Level, Status
-from samplers.statistics import next_level, normalise_weights
-from samplers.validation import check_count, check_setting
+from samplers.sample import Level, Status, next_level, normalise_weights
 
 QUANTILE = 1.96
 """Half-widths are those of 95 % intervals."""

@@ -22,7 +22,7 @@ from samplers.importance import (
 )
 from samplers.method import Goal, Interrupted, Steps
 from samplers.methods.base import Method
-from samplers.problem import FloatArray, Inputs, StandardNormal
+from samplers.problem import FloatArray, Inputs, StandardNormal, check_choice, check_count, check_setting
 from samplers.proposals import (
     Mixture,
     ProposalDistribution,
@@ -30,9 +30,7 @@ from samplers.proposals import (
     fit_proposal_mixture,
     fit_shrunk_gaussian,
 )
-from samplers.sample import Level, Status
-from samplers.statistics import normalise_weights
-from samplers.validation import check_choice, check_count, check_setting
+from samplers.sample import Level, Status, normalise_weights
 
 WIDEST = 10.0
 NARROWEST = 1e-15

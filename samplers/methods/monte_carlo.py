@@ -8,10 +8,8 @@ from numpy.typing import NDArray
 
 from samplers.method import Goal, Interrupted, Outcome, Steps
 from samplers.methods.base import Method
-from samplers.problem import FloatArray, Inputs
-from samplers.sample import DrawWeights, Level, Sample, Status
-from samplers.statistics import binomial_cov
-from samplers.validation import check_count
+from samplers.problem import FloatArray, Inputs, check_count
+from samplers.sample import DrawWeights, Level, Sample, Status, binomial_cov
 
 MOST_DRAWS = 2**20
 """Draws whose f is kept at most, 8 MiB."""

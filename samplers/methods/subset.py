@@ -30,17 +30,19 @@ from samplers.mcmc import (
 )
 from samplers.method import Goal, Outcome, Steps, no_outcome_share
 from samplers.methods.base import Method
-from samplers.problem import FloatArray, Inputs
-from samplers.sample import Layer, Level, Sample, Status
-from samplers.statistics import (
+from samplers.problem import FloatArray, Inputs, check_choice, check_count, check_setting
+from samplers.sample import (
     Interval,
+    Layer,
+    Level,
+    Sample,
+    Status,
     binomial_cov,
     clopper_pearson,
     correlation_factor,
     log_normal_interval,
     next_level,
 )
-from samplers.validation import check_choice, check_count, check_setting
 
 LONGEST_CHAIN = 50
 """More steps than this from a handful of seeds cost calls of f and add little."""

@@ -28,15 +28,14 @@ from samplers.importance import (
     weighted_interval,
 )
 from samplers.method import Goal, Interrupted, Outcome, Steps, no_outcome_share
-from samplers.methods.base import Method
+from samplers.methods.base import Method, SimulationSteps, Simulator, marginalise_noise
 from samplers.methods.kriging import LEARNING, POOL, PROPOSAL, RUN, Kriging, Prediction, fit_kriging
-from samplers.methods.searched import SimulationSteps, Simulator, marginalise_noise
 from samplers.methods.two_stage.method import run_two_stage
 from samplers.methods.two_stage.regions import count_lineages
-from samplers.problem import FloatArray, Inputs, StandardNormal
+from samplers.problem import FloatArray, Inputs, StandardNormal, check_count
 from samplers.proposals import Gaussian, Mixture, TiltedNormal, fit_proposal_mixture, fit_shrunk_gaussian
-from samplers.sample import Status
-from samplers.statistics import (
+from samplers.sample import (
+    Status,
     add_unseen,
     degrees_of_freedom,
     effective_sample_size,
@@ -44,7 +43,6 @@ from samplers.statistics import (
     log_sum_exp,
     normalise_weights,
 )
-from samplers.validation import check_count
 
 
 class Pool(NamedTuple):

@@ -13,7 +13,7 @@ import rare_envs
 import samplers
 from agents import load_ego
 from agents.imperfect_stack import ERRORS_PER_VEHICLE, OWN_ERRORS, NoisyEgo, Stack
-from rare_envs.simulation.rollout import drive, rollout
+from rare_envs.simulation.world import drive, rollout
 
 ENV = "rare_envs/CutIn-v0"
 PERFECT = Stack(**dict.fromkeys(Stack.__dataclass_fields__, 0.0) | {"jerk": 1e6, "steering_rate": 1e6})

@@ -24,7 +24,7 @@ from benchmarks.estimators.highway.cases import CASES, COUNTED_WORLDS, EARLIER_C
 from benchmarks.estimators.truth import ROLLOUT_CHUNK, count_collisions, truth
 from benchmarks.estimators.two_stage import blind_states, repeated_seeds
 from benchmarks.estimators.two_stage.repeated_seeds import SeededRun, load_catalogue, read_runs, summarise_runs
-from rare_envs.simulation.rollout import rollout
+from rare_envs.simulation.world import rollout
 from samplers.proposals import Gaussian
 
 HELD_OUT, BLIND = held_out_states.make(), blind_states.make()

@@ -9,7 +9,7 @@ import pytest
 
 from benchmarks.results_page import PAGE, format_page
 from benchmarks.run_lines import RunLines
-from rare_envs.study.errors import BadInput
+from rare_envs.study.arguments import BadInput
 
 HEADER = {"rare_envs": "1", "scale": "small"}
 

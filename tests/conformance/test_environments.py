@@ -12,8 +12,8 @@ from stable_baselines3.common.env_checker import check_env as sb3_check_env
 
 import rare_envs
 from rare_envs.control.actions import ACTIONS
-from rare_envs.sensors.kinds import OBSERVATIONS
-from rare_envs.simulation.rollout import drive
+from rare_envs.simulation.observation import OBSERVATIONS
+from rare_envs.simulation.world import drive
 
 KINDS = [kind for kind in OBSERVATIONS if kind != "camera"]
 """Images have a suite of their own: they are slow, and not every wrapper is for them."""

@@ -11,7 +11,7 @@ from typing import Any
 import matplotlib
 import pytest
 
-from rare_envs.threads import use_one_thread
+from rare_envs.startup import use_one_thread
 
 FOLDER = Path(__file__).parents[2] / "examples" / "notebooks"
 SMALL: dict[str, dict[str, Any]] = {

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from rare_envs.code_trust import check_code_trust, find_module_file, find_notes, note_own_run
+from rare_envs.study.question import check_code_trust, find_module_file, find_notes, note_own_run
 
 QUESTION, CODE, FOLDER = {"ego": "mine:make", "seed": 0}, ["mine:make"], Path("run")
 

@@ -17,7 +17,7 @@ import rare_envs
 import samplers
 import training
 from rare_envs.simulation.cuda_graphs import RecordedRollouts
-from rare_envs.simulation.rollout import rollout
+from rare_envs.simulation.world import rollout
 from rare_envs.study.replay import drive_again
 from training.data import scenes_of, synthetic_traffic
 from training.imitation.config import Config

@@ -13,8 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from rare_envs.startup import DRIVING
-from rare_envs.version import __version__
+from rare_envs.startup import DRIVING, __version__
 
 ROOT = Path(__file__).parents[2]
 PACKAGES = ("agents", "rare_envs", "samplers", "training")

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 import pytest
 import torch
 
-from rare_envs.threads import use_one_thread
+from rare_envs.startup import use_one_thread
 
 
 @pytest.fixture(autouse=True)

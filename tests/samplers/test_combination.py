@@ -8,8 +8,7 @@ from scipy import stats
 import samplers
 from samplers.limit_states import half_space
 from samplers.method import Outcome, combine, combined_cov, no_outcome_share
-from samplers.sample import Sample, Status
-from samplers.statistics import binomial_cov, clopper_pearson
+from samplers.sample import Sample, Status, binomial_cov, clopper_pearson
 
 
 def outcome(p, cov=0.2, status=Status.CONVERGED, warnings=(), interval=(0.0, 1.0), **more):

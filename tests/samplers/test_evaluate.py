@@ -8,9 +8,8 @@ import pytest
 import samplers
 from samplers.evaluate import Evaluator
 from samplers.method import Interrupted, Outcome, offer_of, request_gradients, request_terms
-from samplers.problem import TermGradients, Terms
+from samplers.problem import EvaluationError, TermGradients, Terms
 from samplers.sample import Level, Status
-from samplers.validation import EvaluationError
 
 X = np.array([[1.0, 0.0], [3.0, 0.0], [2.0, 7.5], [4.0, 0.0], [-1.0, 0.0]])
 A = np.eye(2)

@@ -9,7 +9,7 @@ import pytest
 
 import samplers
 from samplers.methods.blocks import project_mean
-from samplers.validation import needs_library
+from samplers.problem import needs_library
 
 
 def test_another_missing_module_is_an_error_of_its_own() -> None:

@@ -18,7 +18,7 @@ LATTICE = """
     from typing import ClassVar
 
     import samplers
-    from samplers.statistics import binomial_cov, clopper_pearson
+    from samplers.sample import binomial_cov, clopper_pearson
 
 
     @dataclasses.dataclass(frozen=True)

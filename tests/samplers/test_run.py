@@ -6,10 +6,9 @@ import pytest
 import samplers
 from samplers.limit_states import half_space
 from samplers.method import Goal, GradientRequest, Outcome, TermsOffer, TermsRequest, combine
-from samplers.problem import StandardNormal
+from samplers.problem import EvaluationError, StandardNormal
 from samplers.run import EvaluationLog, InputsOnly, Replicate, Run, RunArguments
-from samplers.statistics import binomial_cov, clopper_pearson
-from samplers.validation import EvaluationError
+from samplers.sample import binomial_cov, clopper_pearson
 from tests.samplers.conftest import QUICK_METHODS
 
 EASY = half_space(2, 2.0).problem

@@ -7,7 +7,7 @@ import pytest
 from scipy import stats
 from scipy.special import logsumexp
 
-from samplers.statistics import (
+from samplers.sample import (
     PRIOR_SHARE,
     add_unseen,
     clopper_pearson,

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import samplers
-from samplers.statistics import binomial_cov, clopper_pearson
+from samplers.sample import binomial_cov, clopper_pearson
 from samplers.testing import check_method
 
 

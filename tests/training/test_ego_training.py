@@ -28,7 +28,7 @@ from agents.saved_ego import load_saved_ego
 from examples.demo import ENV_ID, random_collision_rate
 from rare_envs import DrivingProblem
 from rare_envs.control.actions import DISCRETE_ACTIONS
-from rare_envs.threads import use_one_thread
+from rare_envs.startup import use_one_thread
 from training import sb3_vec_env, train_ego
 from training.checkpoints import load_checkpoint
 from training.ego_training import (

@@ -18,7 +18,7 @@ from examples import adversary, shared_policy
 from rare_envs.distributions.beta import BetaDistribution
 from rare_envs.envs.parallel import AgentsVectorEnv
 from rare_envs.multi_agent import adversary_reward
-from rare_envs.threads import use_one_thread
+from rare_envs.startup import use_one_thread
 from training import sb3_vec_env
 from training.vec_env import BatchedVecEnv
 

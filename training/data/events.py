@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 from pyarrow import csv
 
 from samplers.problem import FloatArray
-from training.data.smoothing import CUTOFF_ALONG, smooth_positions
-from training.data.table import DT, NOBODY, Trajectories
+from training.data.table import CUTOFF_ALONG, DT, NOBODY, Trajectories, smooth_positions
 
 Events = dict[str, NDArray[Any]]
 

@@ -30,8 +30,7 @@ from training.data.columns import (
     read_table,
 )
 from training.data.road_axis import estimate_lane_edges, fit_road_axis, lanes_of, number_lanes
-from training.data.smoothing import LARGEST_STEP, resample_tracks
-from training.data.table import DT, NOBODY, Trajectories, find_leaders, tabulate
+from training.data.table import DT, LARGEST_STEP, NOBODY, Trajectories, find_leaders, resample_tracks, tabulate
 
 FOOT = 0.3048
 """Length of a foot [m]."""

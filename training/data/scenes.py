@@ -10,8 +10,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from samplers.problem import FloatArray
-from training.data.smoothing import CUTOFF_ACROSS, CUTOFF_ALONG, infer_motion, smooth_positions
-from training.data.table import DT, SCENES_FILE, US101_EDGES, Trajectories, read_columns
+from training.data.table import (
+    CUTOFF_ACROSS,
+    CUTOFF_ALONG,
+    DT,
+    SCENES_FILE,
+    US101_EDGES,
+    Trajectories,
+    infer_motion,
+    read_columns,
+    smooth_positions,
+)
 
 Mask = NDArray[np.bool_]
 

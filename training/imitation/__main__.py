@@ -14,7 +14,7 @@ from typing import Annotated
 
 import typer
 
-from rare_envs.threads import use_one_thread
+from rare_envs.startup import use_one_thread
 from training.command_line import (
     LocationOption,
     RecordingOptions,

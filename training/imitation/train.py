@@ -23,10 +23,18 @@ from rare_envs.devices import find_device
 from rare_envs.files import replace_text
 from training.data.formats import load_recordings
 from training.data.scenes import TrafficScene, load_us101_scenes, scenes_of, split_by_clock
-from training.imitation.adversarial import update_gail, update_mgail
 from training.imitation.config import Config
 from training.imitation.evaluate import header_metrics
-from training.imitation.learner import Critic, Learner, Update, clone_policy, make_seeded, run_updates
+from training.imitation.learner import (
+    Critic,
+    Learner,
+    Update,
+    clone_policy,
+    make_seeded,
+    run_updates,
+    update_gail,
+    update_mgail,
+)
 from training.imitation.rollout import ACTION_HIGH, ACTION_LOW
 from training.imitation.traffic import Pairs, Recording, collect_pairs, stack_scenes
 

@@ -40,7 +40,7 @@ from torch import Tensor
 from agents import LearnedDriver, read_driver, read_provenance, save_driver
 from agents.learned.networks import RADIUS, WEIGHT_NAMES, WeightDistribution, head_weights
 from rare_envs.files import replace_file
-from rare_envs.threads import use_one_thread
+from rare_envs.startup import use_one_thread
 from samplers.problem import FloatArray
 from training.command_line import report_errors, run_command
 from training.imitation.config import Config

@@ -32,7 +32,7 @@ from numpy.typing import NDArray
 from rare_envs.distributions.coordinates import CoordinateKind, Coordinates
 from rare_envs.distributions.fitted import FittedDistribution, read_distribution
 from rare_envs.distributions.mixture import CoordinateMixture, TruncatedGaussianMixture
-from rare_envs.scenarios.base_distributions import load_base
+from rare_envs.scenarios.base import load_base
 from rare_envs.scenarios.registry import scenario_named
 from rare_envs.traffic.state import VEHICLE_LENGTH
 from samplers.problem import FloatArray

@@ -13,7 +13,7 @@ from typing import Annotated, Literal
 
 import typer
 
-from rare_envs.threads import use_one_thread
+from rare_envs.startup import use_one_thread
 from training.command_line import RunFolderOption, report_errors, run_command
 from training.imitation.config import Config
 from training.imitation.train import Source, train_driver

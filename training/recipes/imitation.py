@@ -7,8 +7,8 @@ and the gradient goes through the simulator. Two things differ. Beside recorded 
 this project's scenarios, which the others replay, many behind each other on one road. And its loss has penalties on
 following closely, leaving the middle of the lane and speeding.
 
-Then it is corrected (`training.recipes.corrections`): it drives ordinary traffic, draws of the scenarios and half of
-the failures that a search has found, and learns labels of an expert that keeps 0.3 s, and may only ask for more
+Then it is corrected (`ordinary_traffic.learn`): it drives ordinary traffic, draws of the scenarios and half of the
+failures that a search has found, and learns labels of an expert that keeps 0.3 s, and may only ask for more
 braking. In ordinary traffic and where recorded people were, the label is what the ego did before, so that it forgets
 nothing.
 
@@ -35,14 +35,13 @@ from agents import LearnedDriver, LearnedEgo, Provenance, save_driver
 from agents.learned.networks import Policy
 from rare_envs.control.idm import IDM
 from rare_envs.files import replace_text
-from rare_envs.scenarios.base_distributions import load_base
+from rare_envs.scenarios.base import load_base
 from rare_envs.scenarios.registry import find_scenario, scenario_named
 from rare_envs.simulation.episode import Clock
 from rare_envs.simulation.observation import Sensing
-from rare_envs.simulation.rollout import drive
-from rare_envs.simulation.world import World
-from rare_envs.threads import use_one_thread
-from rare_envs.traffic.neighbours import Lead
+from rare_envs.simulation.world import World, drive
+from rare_envs.startup import use_one_thread
+from rare_envs.traffic.bodies import Lead
 from rare_envs.traffic.state import VEHICLE_LENGTH, VEHICLE_WIDTH, State
 from training.command_line import RunFolderOption, report_errors, run_command
 from training.data.scenes import TrafficScene
@@ -60,8 +59,15 @@ from training.imitation.train import (
     make_learner,
     train_learner,
 )
-from training.recipes.corrections import count_failing, learn, search_failures
-from training.recipes.ordinary_traffic import CASES, draw_inputs, judge_all_cases, make_world
+from training.recipes.ordinary_traffic import (
+    CASES,
+    count_failing,
+    draw_inputs,
+    judge_all_cases,
+    learn,
+    make_world,
+    search_failures,
+)
 
 FloatArray = NDArray[np.float64]
 CONFIG = Config(

@@ -1,6 +1,6 @@
 """Ordinary traffic, in which an ego that drives properly is safe for minutes, and whether an ego does.
 
-    python -m training.recipes.ordinary_traffic imitation --rollouts 400
+python -m training.recipes.ordinary_traffic imitation --rollouts 400
 
 The ego follows a lead in the middle of several lanes, with a follower behind it and a vehicle in each lane beside it.
 All of them keep to their lanes. Their speeds vary as recorded ones do, and a vehicle that approaches another brakes.
@@ -10,11 +10,16 @@ into nobody and never follows its lead closer than 0.5 s or 1 m; after a lead cu
 It must also advance: an ego that covers less than half of the distance of its lead (or, without a lead, of that at its
 first speed) is left behind. If another vehicle runs into it from behind or from the side, the rollout counts neither
 way.
+
+An ego that fails is corrected: searches find failures, half of which are held out, and it learns labels of the others
+by DAgger (Ross, Gordon and Bagnell, AISTATS 2011): the ego drives, an expert that sees the true state says what was
+right, and the network learns that.
 """
 
 from __future__ import annotations
 
 import json
+import math
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -28,28 +33,27 @@ import typer
 from numpy.typing import NDArray
 from torch import Tensor
 
+import rare_envs
+import samplers
 from agents import load_driver, load_ego
 from agents.learned.driver import RuleDriver
 from agents.learned.networks import HUMAN_NOISE
 from rare_envs.distributions.space import Parameter
 from rare_envs.egos.needs import resolve
 from rare_envs.egos.policy import as_driver
-from rare_envs.scenarios.base import SPEED_RANGE, Others, Scenario, columns
-from rare_envs.scenarios.base_distributions import load_base
+from rare_envs.scenarios.base import SPEED_RANGE, Others, Scenario, columns, load_base
 from rare_envs.scenarios.car_following import CAR_FOLLOWING
 from rare_envs.scenarios.highway import HIGHWAY
-from rare_envs.sensors.kinds import kinds_of
 from rare_envs.sensors.lidar import SPEED_COLUMN
 from rare_envs.simulation.background import Background, TrafficBackground
 from rare_envs.simulation.episode import Clock, Episode, Measurement
-from rare_envs.simulation.observation import Sensing
-from rare_envs.simulation.rollout import Driver, drive
-from rare_envs.simulation.world import World
+from rare_envs.simulation.observation import Sensing, kinds_of
+from rare_envs.simulation.world import Driver, World, drive
+from rare_envs.traffic.bodies import lead_index
 from rare_envs.traffic.crash import NONE, ROAD_EDGE
-from rare_envs.traffic.neighbours import lead_index
 from rare_envs.traffic.road import ReferenceLine, Road, i80, straight
 from rare_envs.traffic.state import LANE_WIDTH, VEHICLE_LENGTH, VEHICLE_WIDTH, State
-from samplers.statistics import clopper_pearson
+from samplers.sample import clopper_pearson
 from training.command_line import report_errors, run_command
 
 FloatArray = NDArray[np.float64]
@@ -319,3 +323,50 @@ def main(
 
 if __name__ == "__main__":
     run_command(main)
+
+
+class Search(NamedTuple):
+    """A search for failures of an ego."""
+
+    record: dict[str, Any]
+    """Scenario, base, p of the ego and how many failures were found."""
+    driven: NDArray[np.float64]
+    """Failures to learn from, shape (n, d)."""
+    held_out: NDArray[np.float64]
+    """The others."""
+
+
+def search_failures(ego: Any, env_id: str, base: str, rng: np.random.Generator, **options: Any) -> Search:
+    """Return the failures of an ego that `samplers.estimate` finds with some options."""
+    problem = rare_envs.DrivingProblem(env_id, ego=ego, base=base)
+    estimate = samplers.estimate(problem, samplers.TwoStage(), **options)
+    x = rng.permutation(np.asarray(estimate.failures.x))
+    return Search({"env_id": env_id, "base": base, "p": estimate.p, "found": len(x)}, x[::2], x[1::2])
+
+
+def count_failing(search: Search, ego: Any) -> dict[str, Any]:
+    """Return the record of a search, with how many of its failures a corrected ego still fails in."""
+    problem, record = rare_envs.DrivingProblem(search.record["env_id"], ego=ego), dict(search.record)
+    for name, x in (("driven", search.driven), ("held_out", search.held_out)):
+        record |= {name: len(x), f"{name}_failing": int((problem.evaluate(x) <= 0.0).sum()) if len(x) else 0}
+    return record
+
+
+def learn(
+    parameters: list[torch.nn.Parameter], loss: Callable[[], Tensor], steps: int, rate: float, clip: float = math.inf
+) -> None:
+    """Make steps of Adam down a loss of drawn moments, at a rate that falls to zero as a cosine."""
+    optimiser = torch.optim.Adam(parameters, rate)
+    for step in range(steps):
+        descend(optimiser, loss(), rate * (0.5 + 0.5 * math.cos(math.pi * step / steps)), clip)
+
+
+def descend(optimiser: torch.optim.Optimizer, loss: Tensor, rate: float, clip: float = math.inf) -> None:
+    """Make one step down a loss at a rate, with a gradient of at most some norm."""
+    for group in optimiser.param_groups:
+        group["lr"] = rate
+    optimiser.zero_grad()
+    torch.autograd.backward(loss)
+    if clip < math.inf:
+        torch.nn.utils.clip_grad_norm_([p for group in optimiser.param_groups for p in group["params"]], clip)
+    optimiser.step()

@@ -18,8 +18,7 @@ from torch import Tensor
 
 from agents.vision import OBSERVATION
 from rare_envs.distributions.space import Parameter
-from rare_envs.scenarios.base import SPEED_RANGE, Others, Scenario, columns
-from rare_envs.scenarios.base_distributions import load_base
+from rare_envs.scenarios.base import SPEED_RANGE, Others, Scenario, columns, load_base
 from rare_envs.scenarios.registry import scenario_named
 from rare_envs.sensors.camera import CLEAR, SENSOR_NOISE_DISTRIBUTION, SUN_DISTRIBUTION
 from rare_envs.sensors.lidar import perceive_traffic

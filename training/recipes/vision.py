@@ -4,7 +4,7 @@
 
 Round 0 imitates the expert in its own drives. In each later round the network drives, mixed with the expert less and
 less, the expert labels the pictures, and the network learns from those of all rounds (DAgger). Then it is corrected
-(`training.recipes.corrections`): it drives failures in hard brakes, draws of the scenarios and situations of before,
+(`ordinary_traffic.learn`): it drives failures in hard brakes, draws of the scenarios and situations of before,
 and learns labels that ask for harder braking than the vehicle's, so that an error of regression about them still brakes
 fully. At test time there is the network alone, which sees pictures and its own speed. The shipped file is one of
 `--seed 0`, corrected in two rounds of seed 0 and one of seed 1.
@@ -44,18 +44,17 @@ from agents.vision import (
 from rare_envs.control.actions import MAX_STEERING, to_physical
 from rare_envs.control.idm import IDM
 from rare_envs.files import replace_text
-from rare_envs.scenarios.base_distributions import load_base
+from rare_envs.scenarios.base import load_base
 from rare_envs.scenarios.registry import find_scenario
 from rare_envs.sensors.camera import Weather
 from rare_envs.sensors.pictures import take_picture
 from rare_envs.simulation.episode import Clock, Episode
 from rare_envs.simulation.observation import Sensing
 from rare_envs.simulation.world import World
-from rare_envs.threads import use_one_thread
+from rare_envs.startup import use_one_thread
 from rare_envs.traffic.state import VEHICLE_LENGTH, State
 from training.command_line import RunFolderOption, run_command
-from training.recipes.corrections import count_failing, descend, learn, search_failures
-from training.recipes.ordinary_traffic import judge_all_cases
+from training.recipes.ordinary_traffic import count_failing, descend, judge_all_cases, learn, search_failures
 from training.recipes.situations import make_situations, start_situation
 
 VISION_EXPERT = IDM(jam_distance=2.0)

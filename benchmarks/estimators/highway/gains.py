@@ -19,7 +19,7 @@ from benchmarks import RESULTS
 from benchmarks.estimators.highway.cases import CASES, WORLDS
 from benchmarks.estimators.highway.truth import HIGHWAY_TRUTH, Proportion, read_truth
 from rare_envs.files import replace_text
-from rare_envs.threads import use_one_thread
+from rare_envs.startup import use_one_thread
 
 HIGHWAY_GAINS = RESULTS / "highway_gains.json"
 

@@ -18,7 +18,7 @@ import rare_envs
 from benchmarks import RESULTS
 from benchmarks.estimators.highway.cases import CASES, COUNTED_WORLDS, EARLIER_COUNTS
 from rare_envs.files import replace_text
-from rare_envs.threads import use_one_thread
+from rare_envs.startup import use_one_thread
 
 HIGHWAY_TRUTH = RESULTS / "highway_truth.json"
 CHUNK = 2048

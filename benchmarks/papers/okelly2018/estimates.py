@@ -9,7 +9,7 @@ import numpy as np
 from scipy.stats.contingency import relative_risk
 
 from samplers.problem import FloatArray
-from samplers.statistics import Interval, clopper_pearson, effective_sample_size
+from samplers.sample import Interval, clopper_pearson, effective_sample_size
 
 
 @dataclass(frozen=True)

@@ -16,9 +16,9 @@ from benchmarks.papers.record import Finding
 from rare_envs.measures.longitudinal import TTC_MAX
 from rare_envs.sensors.lidar import RANGE_COLUMNS, RATE_COLUMNS, beam_angles
 from rare_envs.simulation.episode import Episode
-from rare_envs.simulation.rollout import drive
+from rare_envs.simulation.world import drive
 from samplers.problem import FloatArray
-from samplers.statistics import Interval
+from samplers.sample import Interval
 
 NEXT_LANES = (2, 3)
 """Vehicles that start in the lanes beside the ego's, see `rare_envs.scenarios.highway.START_LANES`."""

@@ -14,7 +14,7 @@ import numpy as np
 
 from samplers.methods.blocks import BetaBlock, NormalBlock, Product, announced_blocks
 from samplers.problem import FloatArray, Inputs
-from samplers.statistics import effective_sample_size, normalise_weights
+from samplers.sample import effective_sample_size, normalise_weights
 
 
 @dataclass(frozen=True)

@@ -13,6 +13,8 @@ from typing import Annotated
 
 import typer
 
+from rare_envs.startup import __version__
+from rare_envs.study.arguments import as_bad_input
 from rare_envs.study.cli.egos import (
     check_ego_command,
     export_ego_command,
@@ -31,8 +33,6 @@ from rare_envs.study.cli.runs import (
     report_command,
 )
 from rare_envs.study.cli.shell import Answer, OneLineErrors, SummarisedCommands, ignore_signals
-from rare_envs.study.errors import as_bad_input
-from rare_envs.version import __version__
 
 EXAMPLES = """
 rare-envs list

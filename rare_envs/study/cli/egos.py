@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from rare_envs.study.arguments import Question
+from rare_envs.study.arguments import BadInput, Question, as_bad_input, output_file, output_folder
 from rare_envs.study.cli.options import (
     EGO_FILE,
     NOISE,
@@ -25,7 +25,6 @@ from rare_envs.study.cli.options import (
     read_environment,
 )
 from rare_envs.study.cli.shell import Answer
-from rare_envs.study.errors import BadInput, as_bad_input, output_file, output_folder
 from training.command_line import DriverTrainingOptions, EventOptions, RecordingOptions, RunFolderOption, spread_options
 
 if TYPE_CHECKING:
@@ -191,7 +190,7 @@ def serve_ego_command(
 ) -> None:
     """Serve an ego to simulations in other processes or on other machines (estimate --ego tcp://...)."""
     import agents
-    from rare_envs.egos.errors import is_policy
+    from rare_envs.plugins import is_policy
 
     try:
         from agents.remote.protocol import read_secret

@@ -11,7 +11,16 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from rare_envs.scenarios.registry import find_scenario, is_highway_env_id
-from rare_envs.study.arguments import ExecutorOptions, Question, join_options, join_question, read_question_file
+from rare_envs.study.arguments import (
+    BadInput,
+    ExecutorOptions,
+    Question,
+    as_bad_input,
+    join_options,
+    join_question,
+    output_folder,
+    read_question_file,
+)
 from rare_envs.study.cli.options import (
     ASKED,
     EGO_FILE,
@@ -24,7 +33,6 @@ from rare_envs.study.cli.options import (
     option_of,
 )
 from rare_envs.study.cli.shell import DOUBTFUL, Answer, describe_report
-from rare_envs.study.errors import BadInput, as_bad_input, output_folder
 
 if TYPE_CHECKING:
     from samplers import Estimate, Executor
@@ -91,7 +99,7 @@ def estimate_highway_env(question: Question, out: Path | None, force: bool, exec
     import agents
     import rare_envs
     import samplers
-    from rare_envs.study.errors import FIRST_BATCH, RunInterrupted, describe_stop
+    from rare_envs.study.arguments import FIRST_BATCH, RunInterrupted, describe_stop
 
     file = None if out is None else out / ESTIMATE_FILE
     if file is not None and file.exists() and not force:
@@ -178,9 +186,9 @@ def plan_command(
     ] = None,
 ) -> Answer:
     """Plan simulations and wall time for a precision, by each of --method (joined by commas) and plain Monte Carlo."""
-    from rare_envs.study.plan import format_seconds, plan_by_pilots, plan_from_result
+    from rare_envs.study.evaluate import format_seconds, plan_by_pilots, plan_from_result
     from rare_envs.study.run_folder import load_finished
-    from samplers.validation import check_number
+    from samplers.problem import check_number
 
     with as_bad_input(ValueError):
         check_number("--cov", cov, 0.0, math.inf)  # before the pilots

@@ -18,12 +18,11 @@ from rare_envs.exposure import explain_no_frequency, read_source
 from rare_envs.measures.base import Measure, TraceMeasure
 from rare_envs.measures.registry import MEASURES
 from rare_envs.plugins import did_you_mean
-from rare_envs.scenarios.base import Scenario
-from rare_envs.scenarios.base_distributions import TextFile, load_base
+from rare_envs.scenarios.base import Scenario, TextFile, load_base
 from rare_envs.scenarios.registry import HIGHWAY_ENV_IDS, SCENARIOS, env_id_of, find_scenario, kinematics_id
 from rare_envs.sensors.camera import CONDITIONS, SENSOR_NOISE
 from rare_envs.simulation.background import noise_size
-from rare_envs.study.errors import BadInput
+from rare_envs.study.arguments import BadInput
 from rare_envs.study.text import format_rate
 
 TICK = 0.1

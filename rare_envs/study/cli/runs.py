@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from rare_envs.study.arguments import BadInput, as_bad_input, output_file
 from rare_envs.study.cli.options import EGO_FILE, RunArgument, command
 from rare_envs.study.cli.shell import DOUBTFUL, Answer
-from rare_envs.study.errors import BadInput, as_bad_input, output_file
 
 if TYPE_CHECKING:
     from rare_envs.study.corpus import Trial

@@ -20,10 +20,9 @@ from typing import Any, NamedTuple, NoReturn
 import typer
 from typer.core import TyperGroup
 
-from rare_envs.egos.errors import EgoGone
-from rare_envs.startup import find_missing_libraries, restore_signals
-from rare_envs.study.errors import BadInput
-from rare_envs.threads import use_one_thread
+from rare_envs.plugins import EgoGone
+from rare_envs.startup import find_missing_libraries, restore_signals, use_one_thread
+from rare_envs.study.arguments import BadInput
 
 DOUBTFUL = 3
 """Exit code of a command that is done, with warnings that make its number doubtful."""

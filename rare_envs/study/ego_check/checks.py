@@ -16,15 +16,14 @@ import torch
 from gymnasium import spaces
 
 from agents.saved_ego import SavedEgo
-from rare_envs.arrays import AnyArray
 from rare_envs.devices import CAMERA_TILE
-from rare_envs.egos.errors import reason_of
+from rare_envs.distributions.coordinates import AnyArray
 from rare_envs.egos.policy import PolicyDriver
 from rare_envs.egos.wrappers import find_frame_stacking
+from rare_envs.plugins import reason_of
 from rare_envs.problem import DrivingProblem
-from rare_envs.sensors.kinds import batch_size, kinds_of, map_kinds
-from rare_envs.simulation.observation import observe
-from rare_envs.simulation.rollout import drive
+from rare_envs.simulation.observation import batch_size, kinds_of, map_kinds, observe
+from rare_envs.simulation.world import drive
 from rare_envs.study.ego_check import FAIL, HINT, Finding, judge, report_failure, report_pass, report_warning
 from samplers.evaluate import Evaluator
 

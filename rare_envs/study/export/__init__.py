@@ -10,11 +10,10 @@ from numpy.typing import ArrayLike
 
 from rare_envs.plugins import did_you_mean
 from rare_envs.problem import DrivingProblem
+from rare_envs.startup import __version__
 from rare_envs.study.export.commonroad import write_commonroad
 from rare_envs.study.export.openscenario import Story, write_road
-from rare_envs.study.export.trajectories import find_trajectories
-from rare_envs.study.replay import Drive, drive_again
-from rare_envs.version import __version__
+from rare_envs.study.replay import Drive, drive_again, find_trajectories
 
 __all__ = ["EXPORT_FORMATS", "export_drive", "export_scenario"]
 

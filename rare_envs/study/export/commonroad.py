@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from rare_envs.files import replace_file
-from rare_envs.study.export.trajectories import WorldTrajectories, sample_line
+from rare_envs.study.replay import WorldTrajectories, sample_line
 from rare_envs.traffic.road import Road
 from rare_envs.traffic.state import VEHICLE_LENGTH, VEHICLE_WIDTH
 

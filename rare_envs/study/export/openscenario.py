@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from rare_envs.files import replace_file
-from rare_envs.study.export.trajectories import WorldTrajectories, import_scenariogeneration
+from rare_envs.study.replay import WorldTrajectories, import_scenariogeneration
 from rare_envs.traffic.road import ReferenceLine, Road, list_cells
 from rare_envs.traffic.state import VEHICLE_LENGTH, VEHICLE_WIDTH
 

@@ -12,10 +12,11 @@ import jinja2
 import numpy as np
 from markupsafe import Markup
 
+from rare_envs.envs.rendering import CRASH_COLOUR, ROLE_COLOURS
 from rare_envs.files import replace_text
 from rare_envs.plugins import one_line
-from rare_envs.study.columns import draw_ordinary, list_columns
-from rare_envs.study.errors import BadInput, as_bad_input, output_file, output_folder
+from rare_envs.study.arguments import BadInput, as_bad_input, output_file, output_folder
+from rare_envs.study.episodes import draw_ordinary, list_columns
 from rare_envs.study.html_report.atlas import AtlasEntry, AtlasSource, build_atlas, read_recorded_events
 from rare_envs.study.html_report.figures import (
     FORMATS,
@@ -38,7 +39,6 @@ from rare_envs.study.text import (
     name_measure,
     summarise_answer,
 )
-from rare_envs.traffic.palette import CRASH_COLOUR, ROLE_COLOURS
 from samplers.problem import FloatArray
 from samplers.sample import describe_outcome
 

@@ -14,11 +14,11 @@ import numpy as np
 from matplotlib.figure import Figure
 from PIL import Image
 
-from rare_envs.egos.errors import EgoGone, reason_of
 from rare_envs.envs.rendering import FRAME_WIDTH
+from rare_envs.plugins import EgoGone, reason_of
 from rare_envs.problem import DrivingProblem
-from rare_envs.study.columns import find_ordinary_range, format_value, list_columns
-from rare_envs.study.errors import BadInput
+from rare_envs.study.arguments import BadInput
+from rare_envs.study.episodes import find_ordinary_range, format_value, list_columns
 from rare_envs.study.html_report.figures import FigureOfPage
 from rare_envs.study.plots import HIT_COLOUR, MOMENTS, choose_moments, draw_measure, draw_moment, draw_speeds
 from rare_envs.study.replay import Drive, drive_again, read_row

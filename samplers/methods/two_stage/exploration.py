@@ -40,7 +40,7 @@ from scipy.special import ndtri
 from samplers.components import IsotropicNormal, MixtureComponent, draw_components, log_ratios, mixture_log_ratio
 from samplers.mcmc import Chains, Growth, NextLevel, ScaledKernel, descend, independent_chains
 from samplers.method import Goal, Interrupted
-from samplers.methods.searched import ComponentDraws, SimulationSteps, Simulator
+from samplers.methods.base import ComponentDraws, SimulationSteps, Simulator
 from samplers.methods.subset import descent_cov, level_record, multiply_levels, subset_interval
 from samplers.methods.two_stage.regions import (
     Discovery,
@@ -53,8 +53,7 @@ from samplers.methods.two_stage.regions import (
 )
 from samplers.methods.two_stage.settings import EXPLORATION, LINES, SLOPES, SUBSPACE
 from samplers.problem import FloatArray
-from samplers.sample import Level, Status
-from samplers.statistics import next_level
+from samplers.sample import Level, Status, next_level
 
 _A = TypeVar("_A")
 _B = TypeVar("_B")

@@ -10,9 +10,9 @@ import numpy as np
 from samplers.importance import Draws, weight_warnings, weighted_interval
 from samplers.mcmc import RootedPoints
 from samplers.method import Goal, Interrupted, Outcome, Steps, TermsOffer, no_outcome_share, offer_of
-from samplers.methods.base import Method
-from samplers.methods.searched import (
+from samplers.methods.base import (
     ComponentDraws,
+    Method,
     RunContext,
     SimulationSteps,
     Simulator,
@@ -41,10 +41,8 @@ from samplers.methods.two_stage.stratified import (
 )
 from samplers.methods.two_stage.term_search import search_terms
 from samplers.methods.two_stage.terms_alone import TermRecord, explore_terms
-from samplers.problem import FloatArray, Inputs
-from samplers.sample import DrawWeights, Sample, Status
-from samplers.statistics import Interval, binomial_cov, effective_sample_size
-from samplers.validation import check_count
+from samplers.problem import FloatArray, Inputs, check_count
+from samplers.sample import DrawWeights, Interval, Sample, Status, binomial_cov, effective_sample_size
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -32,7 +32,7 @@ from samplers.methods.two_stage.edges import weighted_quantile
 from samplers.methods.two_stage.settings import EDGES, SUBSPACE
 from samplers.problem import FloatArray
 from samplers.proposals import expectation_maximisation, posterior, shrink_covariance, start_from_centres
-from samplers.statistics import normalise_weights
+from samplers.sample import normalise_weights
 
 Kind = Literal[
     "base", "wide", "radial", "gaussian", "linear", "corner", "explored", "tempered", "spread", "directional"

@@ -19,7 +19,7 @@ from samplers.components import (
     VonMisesFisherNakagami,
     log_ratios,
 )
-from samplers.methods.searched import ComponentDraws
+from samplers.methods.base import ComponentDraws
 from samplers.methods.two_stage.edges import half_space_proposals, intersection_of_half_spaces, union_of_half_spaces
 from samplers.methods.two_stage.mixture import (
     NO_REGION,
@@ -38,7 +38,7 @@ from samplers.methods.two_stage.regions import ExplorationResult, Region
 from samplers.methods.two_stage.settings import INITIAL_SHARES, REFINEMENT, SUBSPACE
 from samplers.methods.two_stage.stratified import MultipleImportanceSample
 from samplers.problem import FloatArray
-from samplers.statistics import effective_sample_size
+from samplers.sample import effective_sample_size
 
 SHARP_KINDS = ("gaussian", "linear", "corner", "explored", "radial")
 """Components that are meant to hold failures only."""

@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 from scipy.special import betaincinv
 
 from samplers.importance import Draws, weighted_interval
-from samplers.methods.searched import SimulationSteps, Simulator
+from samplers.methods.base import SimulationSteps, Simulator
 from samplers.methods.two_stage.edges import fit_hyperplane
 from samplers.methods.two_stage.settings import REGIONS, SUBSPACE
 from samplers.problem import FloatArray
-from samplers.statistics import PRIOR_SHARE, Interval, add_unseen, effective_sample_size, skewed_upper_end
+from samplers.sample import PRIOR_SHARE, Interval, add_unseen, effective_sample_size, skewed_upper_end
 
 HITS_PER_LINEAGE = 4
 """Wide failures that count as one lineage at least: draws of N(0, s^2 I) are independent, but reach some regions more

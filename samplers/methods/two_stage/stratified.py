@@ -26,13 +26,12 @@ from scipy.special import bdtrc
 
 from samplers.components import MixtureComponent, log_ratios, mixture_log_ratio
 from samplers.importance import Draws, calibrate
-from samplers.methods.searched import ComponentDraws
+from samplers.methods.base import ComponentDraws
 from samplers.methods.two_stage.mixture import MixtureProposal
 from samplers.methods.two_stage.regions import Discovery
 from samplers.methods.two_stage.settings import DIAGNOSTICS, TWO_STAGE
 from samplers.problem import FloatArray, Inputs
-from samplers.sample import Sample
-from samplers.statistics import effective_sample_size
+from samplers.sample import Sample, effective_sample_size
 
 
 @dataclass(frozen=True, eq=False)

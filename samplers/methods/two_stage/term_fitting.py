@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scipy.special import ndtr
 
 from samplers.components import SubspaceGaussian, draw_counts, log_ratios, mixture_log_ratio
-from samplers.methods.searched import SimulationSteps
+from samplers.methods.base import SimulationSteps
 from samplers.methods.two_stage.mixture import (
     LEAST_VARIANCE_OF_COMPONENT,
     GroupedPoints,
@@ -28,8 +28,8 @@ from samplers.methods.two_stage.settings import LAW, ROUNDS, WALKS
 from samplers.methods.two_stage.term_walks import Directions, TermSimulator, Walks, describe_half_spaces, join_terms
 from samplers.problem import FloatArray, Terms
 from samplers.proposals import correct_eigenvalues, posterior
-from samplers.sample import DrawWeights
-from samplers.statistics import (
+from samplers.sample import (
+    DrawWeights,
     effective_number,
     effective_sample_size,
     log_sum_exp,

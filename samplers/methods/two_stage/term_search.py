@@ -24,8 +24,8 @@ from numpy.typing import NDArray
 
 from samplers.importance import Draws, weight_warnings, weighted_interval
 from samplers.method import Goal, Interrupted, Outcome, Steps, TermsOffer, no_outcome_share, request_terms
+from samplers.methods.base import RunContext, SimulationSteps
 from samplers.methods.monte_carlo import MonteCarlo
-from samplers.methods.searched import RunContext, SimulationSteps
 from samplers.methods.subset import spend_on_subset_simulation
 from samplers.methods.two_stage.settings import (
     DIAGNOSTICS,
@@ -44,8 +44,9 @@ from samplers.methods.two_stage.term_walks import (
     walk_downhill,
 )
 from samplers.problem import FloatArray, Inputs, Terms
-from samplers.sample import DrawWeights, Status
-from samplers.statistics import (
+from samplers.sample import (
+    DrawWeights,
+    Status,
     binomial_cov,
     clopper_pearson,
     effective_number,

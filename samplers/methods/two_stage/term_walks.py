@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from samplers.method import Goal, TermsOffer, request_gradients, request_terms, whole_simulations
-from samplers.methods.searched import SimulationSteps, Simulator, noise_mask
+from samplers.methods.base import SimulationSteps, Simulator, noise_mask
 from samplers.methods.two_stage.settings import EXPLORATION, WALKS
 from samplers.problem import Distribution, FloatArray, Inputs, StandardNormal, Terms
 

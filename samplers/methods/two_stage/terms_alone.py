@@ -17,7 +17,7 @@ from scipy.special import ndtr
 
 from samplers.components import IsotropicNormal
 from samplers.method import request_terms
-from samplers.methods.searched import ComponentDraws, SimulationSteps, Simulator
+from samplers.methods.base import ComponentDraws, SimulationSteps, Simulator
 from samplers.methods.two_stage.exploration import bisect_towards_origin, choose_roots, walk_lines
 from samplers.methods.two_stage.regions import ExplorationResult, SubsetPoints, grow_regions
 from samplers.methods.two_stage.settings import EXPLORATION, TERMS_ALONE

@@ -28,8 +28,8 @@ from rare_envs.control.actions import MAX_ACCELERATION
 from rare_envs.control.idm import IDM
 from rare_envs.sensors.lidar import AHEAD_BEAM, CURVATURE_COLUMN, RANGE_COLUMNS, RATE_COLUMNS, SPEED_COLUMN
 from rare_envs.simulation.observation import LIDAR_SCALES
-from rare_envs.traffic.neighbours import Lead
-from rare_envs.traffic.vehicle_models import bicycle
+from rare_envs.traffic.bodies import Lead
+from rare_envs.traffic.state import bicycle
 from samplers.methods.blocks import announced_blocks
 
 

@@ -35,7 +35,7 @@ from agents.remote.client import (
 )
 from agents.remote.protocol import derive_server_keys
 from agents.remote.server import EgoServer, RequestHandler, is_loopback
-from rare_envs.egos.errors import EgoGone, NoAnswer
+from rare_envs.plugins import EgoGone, NoAnswer
 from samplers.evaluate import Evaluator
 from tests.agents.remote.egos import ENV, Averaging, Braking, problem
 

@@ -64,8 +64,8 @@ from benchmarks.papers.okelly2018.study import (
 from benchmarks.papers.okelly2018.tables import explain_differences, make_tables
 from benchmarks.papers.renew import read_records
 from rare_envs.simulation import drive
-from rare_envs.study.errors import BadInput
-from rare_envs.threads import use_one_thread
+from rare_envs.startup import use_one_thread
+from rare_envs.study.arguments import BadInput
 from samplers import FunctionProblem
 from samplers.methods.blocks import BetaBlock, NormalBlock, Product
 from samplers.proposals import Gaussian

@@ -29,8 +29,8 @@ from benchmarks.papers.tian2024 import study
 from benchmarks.papers.tian2024.replications import ReplicationJob, run_replication
 from benchmarks.papers.tian2024.study import TianPlan
 from benchmarks.papers.tian2024.tables import make_method_tables
-from rare_envs.study.errors import BadInput
-from rare_envs.threads import use_one_thread
+from rare_envs.startup import use_one_thread
+from rare_envs.study.arguments import BadInput
 from samplers.output import to_json_value
 from tests.benchmarks.papers.made_runs import made_run
 

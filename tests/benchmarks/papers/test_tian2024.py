@@ -22,8 +22,8 @@ from benchmarks.papers.tian2024.replications import (
 from benchmarks.papers.tian2024.study import TianPlan, reproduce_tian2024
 from benchmarks.papers.tian2024.summary import ReplicationSummary, assess_claims, ratio_of_work, summarise_runs
 from benchmarks.papers.tian2024.tables import make_method_tables
-from rare_envs.study.errors import BadInput
-from rare_envs.threads import use_one_thread
+from rare_envs.startup import use_one_thread
+from rare_envs.study.arguments import BadInput
 from tests.benchmarks.papers.made_runs import made_run
 
 COMMAND = "python -m benchmarks.papers tian2024 --replications 2 --seed 0"

@@ -24,7 +24,7 @@ from rare_envs.control.human_driver import (
     step_errors,
 )
 from rare_envs.control.idm import IDM
-from rare_envs.traffic.neighbours import Lead
+from rare_envs.traffic.bodies import Lead
 from tests.rare_envs.traffic_states import F64, tensor
 
 MODEL = HumanDriverModel()

@@ -6,9 +6,9 @@ import pytest
 import torch
 
 from rare_envs.control.idm import IDM, lane_keeping, steering_control
-from rare_envs.traffic.neighbours import Lead
+from rare_envs.traffic.bodies import Lead
 from rare_envs.traffic.road import straight
-from rare_envs.traffic.vehicle_models import bicycle
+from rare_envs.traffic.state import bicycle
 from tests.rare_envs.traffic_states import F64, tensor
 
 

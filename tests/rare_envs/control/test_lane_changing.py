@@ -13,10 +13,8 @@ from rare_envs.control.idm import IDM
 from rare_envs.control.lane_changing import LaneChangingDriver, Mobil
 from rare_envs.make import set_up
 from rare_envs.traffic import straight
-from rare_envs.traffic.bodies import boxes_overlap
-from rare_envs.traffic.neighbours import LaneTraffic, Lead
-from rare_envs.traffic.state import State
-from rare_envs.traffic.vehicle_models import point_mass
+from rare_envs.traffic.bodies import LaneTraffic, Lead, boxes_overlap
+from rare_envs.traffic.state import State, point_mass
 from tests.rare_envs.traffic_states import traffic
 
 ROAD, DT = straight(2), 0.1

@@ -22,11 +22,10 @@ from rare_envs.control.actions import (
     initial_aim,
 )
 from rare_envs.make import set_up
-from rare_envs.sensors.kinds import observe_kinematics
+from rare_envs.simulation.observation import observe_kinematics
 from rare_envs.study import Question
 from rare_envs.traffic.road import straight
-from rare_envs.traffic.state import State
-from rare_envs.traffic.vehicle_models import bicycle
+from rare_envs.traffic.state import State, bicycle
 
 Array = NDArray[np.float64]
 SECONDS, TICKS = 5, 50

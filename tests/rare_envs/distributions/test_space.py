@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from rare_envs.distributions.space import ScenarioSpace
-from rare_envs.scenarios.base_distributions import load_base
+from rare_envs.scenarios.base import load_base
 from rare_envs.scenarios.registry import scenario_named
 
 NAMES = [p.name for p in scenario_named("rare_envs/CutIn-v0").parameters]

@@ -15,8 +15,7 @@ import rare_envs
 from rare_envs.control.human_driver import Glances, HumanDriverModel
 from rare_envs.control.idm import IDM
 from rare_envs.egos.human import HumanDriver, HumanEgo
-from rare_envs.simulation.rollout import drive
-from rare_envs.simulation.world import World
+from rare_envs.simulation.world import World, drive
 
 SCENARIOS = ("CarFollowing", "CutIn", "HardBrake")
 FLAWLESS = HumanDriverModel(

@@ -9,9 +9,9 @@ from gymnasium import spaces
 
 import rare_envs
 from rare_envs.control.actions import IDLE
-from rare_envs.egos.errors import EgoGone, NoAnswer, check_predict, reason_of, refuse_ego
 from rare_envs.egos.policy import PolicyDriver, PolicyQuery, as_driver, check_spaces, query_policy
 from rare_envs.egos.wrappers import FrameStackedPolicy, describe_missing_normalisation, find_frame_stacking
+from rare_envs.plugins import EgoGone, NoAnswer, check_predict, reason_of, refuse_ego
 from rare_envs.scenarios.car_following import CAR_FOLLOWING
 from rare_envs.simulation.episode import Clock
 from rare_envs.simulation.observation import observation_space

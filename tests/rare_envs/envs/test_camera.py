@@ -13,7 +13,7 @@ from stable_baselines3.common.vec_env import VecFrameStack
 
 import rare_envs
 from rare_envs.sensors.camera import Camera
-from rare_envs.sensors.kinds import map_kinds
+from rare_envs.simulation.observation import map_kinds
 from training import sb3_vec_env
 
 CUT_IN = "rare_envs/CutIn-v0"

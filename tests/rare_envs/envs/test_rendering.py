@@ -11,10 +11,13 @@ import torch
 
 import rare_envs
 from rare_envs.envs.rendering import (
+    CRASH_COLOUR,
     FRAME_WIDTH,
+    ROLE_COLOURS,
     TEXT_HEIGHT,
     Display,
     Renderer,
+    as_rgb,
     caption,
     make_network,
     make_scene,
@@ -23,7 +26,6 @@ from rare_envs.envs.rendering import (
 )
 from rare_envs.make import set_up
 from rare_envs.scenarios.registry import SCENARIOS
-from rare_envs.traffic.palette import CRASH_COLOUR, ROLE_COLOURS, as_rgb
 from rare_envs.traffic.road import i80
 from rare_envs.traffic.state import State
 

@@ -5,7 +5,7 @@ import torch
 
 import rare_envs
 from rare_envs.measures import Moment
-from rare_envs.traffic.neighbours import lead_of
+from rare_envs.traffic.bodies import lead_of
 from rare_envs.traffic.road import straight
 from rare_envs.traffic.state import State
 

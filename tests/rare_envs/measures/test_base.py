@@ -33,7 +33,7 @@ from rare_envs.measures.base import acceleration_of_lead
 from rare_envs.measures.longitudinal import DECELERATION_MAX, TTC_MAX, evasive_manoeuvre
 from rare_envs.measures.registry import MEASURES, find_measure
 from rare_envs.measures.two_dimensional import MARGIN_MAX
-from rare_envs.traffic.neighbours import Lead, lead_of
+from rare_envs.traffic.bodies import Lead, lead_of
 from rare_envs.traffic.road import i80, straight
 from rare_envs.traffic.state import State
 from tests.rare_envs.measures.moments import F64, TIME, drives, following, moment, path, problem

@@ -13,8 +13,8 @@ from torch import Tensor
 import rare_envs
 from rare_envs.measures import Measure, Moment, Trace, TraceMeasure, minimum, pet, stl, ttc, weighted, with_collision
 from rare_envs.measures.two_dimensional import PET_MAX
-from rare_envs.simulation.rollout import drive
-from rare_envs.traffic.neighbours import lead_of
+from rare_envs.simulation.world import drive
+from rare_envs.traffic.bodies import lead_of
 from rare_envs.traffic.road import straight
 from rare_envs.traffic.state import State
 from tests.rare_envs.measures.moments import AWAY, CLOSE, CUT_IN, F64, FOLLOWING, HIT, f, problem

@@ -6,8 +6,7 @@ import pytest
 import torch
 
 from rare_envs.measures import MEASURES, Moment
-from rare_envs.measures.registry import PAIR_CLEARANCE
-from rare_envs.measures.terms import TermMeasure, TermState, TermTracker, find_order
+from rare_envs.measures.registry import PAIR_CLEARANCE, TermMeasure, TermState, TermTracker, find_order
 from tests.rare_envs.measures.moments import moment
 
 EGO = (0.0, 0.0, 0.0, 20.0)

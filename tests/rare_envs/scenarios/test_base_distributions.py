@@ -15,8 +15,7 @@ from rare_envs.distributions.beta import BetaDistribution
 from rare_envs.distributions.fitted import FittedDistribution
 from rare_envs.distributions.mixture import CoordinateMixture, TruncatedGaussianMixture
 from rare_envs.distributions.space import Distribution, ScenarioSpace
-from rare_envs.scenarios.base import Scenario
-from rare_envs.scenarios.base_distributions import load_base
+from rare_envs.scenarios.base import Scenario, load_base
 from rare_envs.scenarios.registry import SCENARIOS, scenario_named
 from tests.rare_envs.scenarios.standing import STANDING
 

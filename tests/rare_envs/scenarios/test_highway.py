@@ -13,7 +13,7 @@ from rare_envs.measures import Moment, lidar_ttc
 from rare_envs.measures.longitudinal import TTC_MAX
 from rare_envs.scenarios.highway import START_LANES
 from rare_envs.sensors.lidar import perceive_traffic
-from rare_envs.simulation.rollout import drive
+from rare_envs.simulation.world import drive
 from rare_envs.traffic.road import i80
 
 HIGHWAY = "rare_envs/Highway-v0"

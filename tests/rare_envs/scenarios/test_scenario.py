@@ -21,8 +21,7 @@ from typer.testing import CliRunner
 import rare_envs
 import samplers
 from rare_envs.distributions.space import Parameter
-from rare_envs.scenarios.base import Others, Scenario, drive_points, keep_straight
-from rare_envs.scenarios.base_distributions import try_scenario
+from rare_envs.scenarios.base import Others, Scenario, drive_points, keep_straight, try_scenario
 from rare_envs.scenarios.registry import SCENARIOS, scenario_named
 from rare_envs.study.cli.app import app
 from rare_envs.study.cli.listing import list_names

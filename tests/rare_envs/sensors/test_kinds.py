@@ -2,7 +2,7 @@
 
 import pytest
 
-from rare_envs.sensors.kinds import kinds_of, observe_kinematics, read_kinds
+from rare_envs.simulation.observation import kinds_of, observe_kinematics, read_kinds
 from rare_envs.traffic.road import straight
 from rare_envs.traffic.state import State
 from tests.rare_envs.traffic_states import traffic

@@ -12,15 +12,13 @@ from rare_envs.control.idm import IDM
 from rare_envs.control.lane_changing import LaneChangingDriver
 from rare_envs.egos.policy import as_driver
 from rare_envs.measures import MEASURES, Measure, Moment
-from rare_envs.measures.registry import PAIR_CLEARANCE
-from rare_envs.measures.terms import TermTracker
+from rare_envs.measures.registry import PAIR_CLEARANCE, TermTracker
 from rare_envs.scenarios.cut_in import CUT_IN
 from rare_envs.scenarios.highway import HIGHWAY
 from rare_envs.simulation import cuda_graphs
 from rare_envs.simulation.cuda_graphs import RecordedRollouts, is_recordable
 from rare_envs.simulation.episode import Clock, Measurement
-from rare_envs.simulation.rollout import rollout
-from rare_envs.simulation.world import World
+from rare_envs.simulation.world import World, rollout
 
 X = torch.tensor([[20.0, 12.0, 12.0, 20.0, 40.0, 3.5], [30.0, 25.0, 9.0, 20.0, 40.0, -3.5]])
 

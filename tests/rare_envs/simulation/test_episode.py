@@ -16,8 +16,7 @@ from rare_envs.scenarios.car_following import CAR_FOLLOWING
 from rare_envs.scenarios.cut_in import CUT_IN
 from rare_envs.simulation.decision import advance
 from rare_envs.simulation.episode import Clock, Episode, Measurement
-from rare_envs.simulation.rollout import drive, rollout
-from rare_envs.simulation.world import World
+from rare_envs.simulation.world import World, drive, rollout
 from rare_envs.traffic.crash import CRASH_KINDS, NONE
 
 

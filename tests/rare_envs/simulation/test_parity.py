@@ -16,7 +16,7 @@ from rare_envs.scenarios.base import Scenario
 from rare_envs.scenarios.car_following import CAR_FOLLOWING
 from rare_envs.scenarios.cut_in import CUT_IN
 from rare_envs.simulation.world import World
-from rare_envs.traffic.vehicle_models import bicycle
+from rare_envs.traffic.state import bicycle
 
 TOLERANCE = 1e-9
 TICKS = 120

@@ -11,10 +11,10 @@ import rare_envs
 from agents import load_ego
 from rare_envs.control.idm import IDM
 from rare_envs.measures import MEASURES, Measure, MeasureTerms
-from rare_envs.measures.terms import find_order
+from rare_envs.measures.registry import find_order
 from rare_envs.simulation import terms as term_gradients
-from rare_envs.simulation.rollout import drive
 from rare_envs.simulation.terms import ROLLOUTS_PER_GRADIENT, differentiate_terms
+from rare_envs.simulation.world import drive
 
 SHORT = 3.0
 """Seconds of rollouts, of the usual 10."""

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 from rare_envs.study import Question, prepare, run_into
+from rare_envs.study.arguments import BadInput
 from rare_envs.study.corpus import (
     WORLD_FIELDS,
     StoredFailure,
@@ -28,7 +29,6 @@ from rare_envs.study.corpus import (
     try_ego,
     write_junit,
 )
-from rare_envs.study.errors import BadInput
 from training import train_ego
 
 ENV = "rare_envs/CarFollowing-v0"

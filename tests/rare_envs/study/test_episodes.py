@@ -12,8 +12,7 @@ import pytest
 
 import rare_envs
 from rare_envs.study import Question, episodes, prepare, resume, run_into
-from rare_envs.study.columns import digest_scenarios
-from rare_envs.study.episodes import EpisodeTable, name_columns
+from rare_envs.study.episodes import EpisodeTable, digest_scenarios, name_columns
 from samplers.evaluate import Simulated
 from samplers.journal import Journal
 from tests.rare_envs.study.refusals import FOLLOWING

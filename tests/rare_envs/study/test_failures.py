@@ -14,7 +14,7 @@ import rare_envs
 import samplers
 from rare_envs.control.idm import IDM
 from rare_envs.study import Question, Report
-from rare_envs.study.columns import digest_scenarios
+from rare_envs.study.episodes import digest_scenarios
 from rare_envs.study.failures import (
     classify_failures,
     cluster_points,

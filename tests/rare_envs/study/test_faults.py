@@ -9,7 +9,7 @@ import pytest
 
 import rare_envs
 import samplers
-from rare_envs.egos.errors import EgoGone
+from rare_envs.plugins import EgoGone
 from samplers.evaluate import Evaluator
 
 ENV = "rare_envs/CarFollowing-v0"

@@ -21,8 +21,7 @@ from typer.testing import Result
 import rare_envs
 from rare_envs.problem import DrivingProblem
 from rare_envs.study import evaluate, writing
-from rare_envs.study.arguments import Question
-from rare_envs.study.errors import BadInput
+from rare_envs.study.arguments import BadInput, Question
 from rare_envs.study.question import digest_files, prepare
 from rare_envs.study.run_folder import JOURNAL
 from rare_envs.study.writing import begin_journal, continue_journal
@@ -34,7 +33,7 @@ Cli = Callable[..., Result]
 FRAIL = """
 from pathlib import Path
 import numpy as np
-from rare_envs.egos.errors import EgoGone
+from rare_envs.plugins import EgoGone
 
 LEFT = Path("left")  # calls until it fails
 

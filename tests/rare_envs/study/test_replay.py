@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import rare_envs
-from rare_envs.study.errors import BadInput
+from rare_envs.study.arguments import BadInput
 from rare_envs.study.replay import describe_drive, drive_again, find_failure
 from tests.rare_envs.study.refusals import FOLLOWING
 

@@ -19,8 +19,7 @@ from typer.testing import Result
 import rare_envs
 from rare_envs.problem import DrivingProblem
 from rare_envs.study import evaluate, writing
-from rare_envs.study.arguments import Question
-from rare_envs.study.errors import BadInput
+from rare_envs.study.arguments import BadInput, Question
 from rare_envs.study.question import prepare
 from rare_envs.study.run_folder import JOURNAL, RESULT_FILES
 from rare_envs.study.writing import continue_journal

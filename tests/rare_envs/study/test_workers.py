@@ -11,8 +11,7 @@ import pytest
 import samplers
 from rare_envs.problem import DrivingProblem
 from rare_envs.study import evaluate, writing
-from rare_envs.study.arguments import Question
-from rare_envs.study.errors import BadInput
+from rare_envs.study.arguments import BadInput, Question
 from rare_envs.study.question import prepare
 from rare_envs.study.report import Report
 from rare_envs.study.run_folder import JOURNAL

@@ -4,7 +4,7 @@ import math
 
 import torch
 
-from rare_envs.traffic.neighbours import LaneTraffic, find_neighbours, lead_index, lead_of
+from rare_envs.traffic.bodies import LaneTraffic, find_neighbours, lead_index, lead_of
 from rare_envs.traffic.road import straight
 from rare_envs.traffic.state import VEHICLE_LENGTH, State
 from tests.rare_envs.traffic_states import F64, traffic

@@ -8,7 +8,7 @@ import torch
 
 from rare_envs.traffic import road as reference_line
 from rare_envs.traffic.road import ReferenceLine, Road, i80, straight
-from rare_envs.traffic.vehicle_models import point_mass
+from rare_envs.traffic.state import point_mass
 
 F64 = torch.float64
 BEND = Road((-2.0, 2.0, 5.0), ReferenceLine(25.0, (0.0, 0.002, 0.004, -0.002, 0.0)))

@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from rare_envs.traffic.vehicle_models import STEERING_LIMIT, bicycle, point_mass, steering_for
+from rare_envs.traffic.state import STEERING_LIMIT, bicycle, point_mass, steering_for
 from tests.rare_envs.traffic_states import tensor
 
 

@@ -11,7 +11,7 @@ from scipy.special import ndtr, ndtri
 import samplers
 from samplers.analysis.curve import lowest_known_threshold
 from samplers.limit_states import half_space, parabola, plateau
-from samplers.statistics import clopper_pearson
+from samplers.sample import clopper_pearson
 
 GRID = [-0.2, 0.0, 0.4, 1.0, 2.0, 3.0, 4.5]
 

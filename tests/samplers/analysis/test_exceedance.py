@@ -10,7 +10,7 @@ from scipy import stats
 import samplers
 from samplers.analysis.expectation import compute_exceedance
 from samplers.analysis.weighted import weigh_failures
-from samplers.statistics import raise_log_end
+from samplers.sample import raise_log_end
 from tests.samplers.fitted_bases import fitted, normal, resampled
 from tests.samplers.fitted_bases import run as run_fitted
 

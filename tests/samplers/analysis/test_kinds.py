@@ -52,7 +52,7 @@ def test_of_plain_draws_the_interval_is_binomial():
     result = run("mc", max_sim=20_000)
     share = result.shares(side)["north"]
     assert share.p == pytest.approx(share.points / 20_000)
-    assert share.interval == pytest.approx(samplers.statistics.clopper_pearson(share.points, 20_000, 0.95))
+    assert share.interval == pytest.approx(samplers.sample.clopper_pearson(share.points, 20_000, 0.95))
 
 
 def test_some_of_the_points_speak_for_all():

@@ -9,7 +9,7 @@ from scipy import stats
 from samplers.analysis import base_error
 from samplers.analysis.base_error import compute_refit_band
 from samplers.analysis.reweight import RefitSums
-from samplers.statistics import raise_log_end
+from samplers.sample import raise_log_end
 
 THRESHOLDS = np.array([0.0, 1.0, 2.0, 3.0])
 N_EVENTS, N_REFITS = 40, 30

@@ -17,7 +17,7 @@ def test_is_the_share_of_failures_with_the_exact_interval():
     result = samplers.estimate(EASY.problem, "mc", seed=1, max_sim=2000)
     assert result.p == result.failures.total / 2000
     assert result.gain == pytest.approx(1.0)
-    assert result.interval == samplers.statistics.clopper_pearson(result.failures.total, 2000, 0.95)
+    assert result.interval == samplers.sample.clopper_pearson(result.failures.total, 2000, 0.95)
 
 
 def test_stops_at_the_target():

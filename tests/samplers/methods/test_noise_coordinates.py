@@ -7,7 +7,7 @@ import pytest
 from scipy import stats
 
 import samplers
-from samplers.methods.searched import marginalise_noise
+from samplers.methods.base import marginalise_noise
 from samplers.problem import FunctionProblem, StandardNormal
 
 PHI = stats.norm.cdf

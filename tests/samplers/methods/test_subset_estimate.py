@@ -12,8 +12,7 @@ from samplers.mcmc import Chains
 from samplers.method import Goal
 from samplers.methods.subset import LevelProduct, descent_cov, level_record, multiply_levels, summarise
 from samplers.problem import FunctionProblem
-from samplers.sample import Status
-from samplers.statistics import log_normal_interval
+from samplers.sample import Status, log_normal_interval
 
 ADSS = samplers.AdaptiveSubsetSimulation
 

@@ -44,7 +44,7 @@ def test_no_level_after_the_answer_is_known(recorder):
     f = recorder(half_space(2, -stats.norm.ppf(0.3)).problem.f)
     result = run(FunctionProblem(f, 2))
     assert result.n_sim == f.rows == 1000
-    assert result.interval == samplers.statistics.clopper_pearson(round(1000 * result.p), 1000, 0.95)
+    assert result.interval == samplers.sample.clopper_pearson(round(1000 * result.p), 1000, 0.95)
     result = run(half_space(2, -stats.norm.ppf(0.03)).problem)
     assert [level.gamma == 0.0 for level in result.trace] == [False, True]
 
@@ -151,7 +151,7 @@ def test_a_budget_under_level_zero_is_named_as_the_reason(max_sim):
     )
     assert "max_sim was used up at level 0" in result.warnings[1]
     assert not any("ties" in text for text in result.warnings)
-    assert result.interval == samplers.statistics.clopper_pearson(0, max_sim, 0.95)
+    assert result.interval == samplers.sample.clopper_pearson(0, max_sim, 0.95)
 
 
 @pytest.mark.parametrize(

@@ -8,13 +8,16 @@ from tests.training.shared_data import DATA, needs_data
 from training.data.formats import load_ngsim
 from training.data.road_axis import estimate_lane_edges, fit_road_axis
 from training.data.scenes import TrafficScene, load_us101_scenes, scenes_of, split_by_clock
-from training.data.smoothing import MIN_HEADING_SPEED, infer_motion, resample_tracks, smooth_positions
 from training.data.table import (
     COLUMNS,
     DT,
+    MIN_HEADING_SPEED,
     NOBODY,
     SCENES_FILE,
+    infer_motion,
     read_trajectories,
+    resample_tracks,
+    smooth_positions,
     synthetic_traffic,
     tabulate,
     write_trajectories,

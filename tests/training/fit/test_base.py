@@ -9,7 +9,7 @@ from scipy.stats import norm
 from rare_envs.distributions.coordinates import ClosingSpeed, Coordinates
 from rare_envs.distributions.fitted import EventFrequency
 from rare_envs.distributions.mixture import CoordinateMixture, TruncatedGaussianMixture
-from rare_envs.scenarios.base_distributions import load_base
+from rare_envs.scenarios.base import load_base
 from rare_envs.scenarios.registry import scenario_named
 from training.fit import mixture as mixture_fit
 from training.fit.base import (

@@ -9,19 +9,17 @@ import torch
 
 from agents.learned.networks import Policy
 from tests.training.imitation.synthetic_scenes import SMALL, at_start, generator, plain_policy, scenes, tiny
-from training.imitation.adversarial import (
-    advantages,
-    conditional_action,
-    update_mgail,
-)
 from training.imitation.config import Config
 from training.imitation.learner import (
     Critic,
+    advantages,
     clone_policy,
+    conditional_action,
     critic_loss,
     log_likelihood,
     run_updates,
     scaling_of,
+    update_mgail,
 )
 from training.imitation.rollout import (
     Penalties,

@@ -13,11 +13,11 @@ import typer
 from typer.testing import CliRunner
 
 import samplers
+from rare_envs.startup import __version__
 from rare_envs.study.arguments import ExecutorOptions
 from rare_envs.study.cli.app import EXAMPLES, app, list_examples
 from rare_envs.study.cli.options import command, read_count
 from rare_envs.study.cli.shell import Answer
-from rare_envs.version import __version__
 from tests.rare_envs.study.refusals import FOLLOWING, Cli, assert_refused
 
 

@@ -16,6 +16,7 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
+from rare_envs.study.arguments import BadInput
 from rare_envs.study.cli.shell import (
     AnswerCut,
     OneLineErrors,
@@ -25,7 +26,6 @@ from rare_envs.study.cli.shell import (
     print_whole,
     signals_as_exceptions,
 )
-from rare_envs.study.errors import BadInput
 from tests.rare_envs.study.refusals import FOLLOWING, SMALL, Cli, assert_refused
 
 

@@ -41,8 +41,7 @@ def test_a_missing_library_is_named(problem: DrivingProblem, tmp_path: Path, mon
 
 
 def test_a_crash_at_the_start_stands_for_one_tick(problem: DrivingProblem, tmp_path: Path) -> None:
-    from rare_envs.study.export.trajectories import find_trajectories
-    from rare_envs.study.replay import Drive, drive_again
+    from rare_envs.study.replay import Drive, drive_again, find_trajectories
 
     drive = drive_again(problem, np.array(X))
     found = find_trajectories(Drive(problem, drive.episodes[:1]))
