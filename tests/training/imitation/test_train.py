@@ -109,7 +109,7 @@ def test_the_end_of_each_recording_is_kept_for_tests():
     assert split_end(named[:1])[1] == ()
 
 
-def test_a_command_repeats_its_training_and_says_what_is_missing(made_up, monkeypatch, tmp_path):
+def test_a_command_repeats_its_training_and_says_what_is_missing(monkeypatch, tmp_path):
     """What is written into a file, read by the command line, gives the same settings."""
     for words, message in (
         ([], "one of --data"),
@@ -125,7 +125,9 @@ def test_a_command_repeats_its_training_and_says_what_is_missing(made_up, monkey
     found = []
     monkeypatch.setattr(command_line, "train_driver", lambda *given, **how: found.append((*given, how)) or tmp_path)
     for device in ("cpu", "cuda:1"):
-        result = run([*command_of(made_up, config, device).split()[3:], "--out", str(tmp_path)])
+        result = run(
+            [*command_of(Source("data", Path("somewhere/tables")), config, device).split()[3:], "--out", str(tmp_path)]
+        )
         assert result.exit_code == 0, result.output
         source, settings, _, how = found.pop()
         assert (source, settings, how["device"]) == (Source("data", Path("tables")), config, device)
