@@ -37,9 +37,8 @@ __all__ = [
 ]
 
 _MODULES = {
-    "arguments": ("Question",),
+    "arguments": ("BadInput", "Question"),
     "compare": ("compare_egos",),
-    "errors": ("BadInput",),
     "evaluate": ("resume", "run", "run_into"),
     "failures": ("severity_curve",),
     "question": ("prepare",),
