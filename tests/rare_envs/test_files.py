@@ -12,19 +12,11 @@ from pathlib import Path
 
 import pytest
 
-from rare_envs.files import MAX_TEXT_BYTES, read_text_file, replace_file, replace_text
+from rare_envs.files import MAX_TEXT_BYTES, read_text_file, replace_file
 
 
 def names(folder: Path) -> list[str]:
     return sorted(path.name for path in folder.iterdir())
-
-
-def test_text_takes_the_place_of_the_earlier_file(tmp_path: Path) -> None:
-    path = tmp_path / "answer.json"
-    replace_text(path, "first")
-    replace_text(path, "second, ä")
-    assert path.read_text(encoding="utf-8") == "second, ä"
-    assert names(tmp_path) == ["answer.json"]
 
 
 @pytest.mark.parametrize("error", [RuntimeError, KeyboardInterrupt, SystemExit])
@@ -36,24 +28,6 @@ def test_an_error_leaves_the_earlier_file_and_no_draft(error: type[BaseException
         raise error
     assert path.read_bytes() == b"earlier"
     assert names(tmp_path) == ["ego.zip"]
-
-
-@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs a device that is always full")
-def test_a_full_disk_leaves_the_earlier_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    path = tmp_path / "result.json"
-    path.write_text("earlier")
-
-    def write_to_full_disk(self: Path, text: str, encoding: str) -> None:
-        self.touch()
-        with open("/dev/full", "w", encoding=encoding) as file:
-            file.write(text)
-
-    monkeypatch.setattr(Path, "write_text", write_to_full_disk)
-    with pytest.raises(OSError, match="No space left"):
-        replace_text(path, "new")
-    monkeypatch.undo()
-    assert path.read_text() == "earlier"
-    assert names(tmp_path) == ["result.json"]
 
 
 WRITERS = ("write_text", "write_bytes", "savefig", "print_png", "savez", "savez_compressed")

@@ -18,7 +18,6 @@ import samplers
 import training
 from rare_envs.simulation.cuda_graphs import RecordedRollouts
 from rare_envs.simulation.world import rollout
-from rare_envs.study.replay import drive_again
 from training.data import scenes_of, synthetic_traffic
 from training.imitation.config import Config
 from training.imitation.train import make_learner, prepare_data, train_learner
@@ -185,18 +184,6 @@ def test_rows_that_fail_on_a_gpu_are_those_that_fail_on_the_cpu(measure: str) ->
     np.testing.assert_allclose(f, expected, atol=ROUNDING)
 
 
-def test_a_policy_that_gives_nan_among_learned_drivers_is_named_and_leaves_the_gpu_at_work() -> None:
-    model = torch.nn.Linear(gym.make(HIGHWAY).observation_space.shape[0], 2)  # type: ignore[index]
-    with torch.no_grad():
-        model.bias += torch.nan
-    problem = rare_envs.DrivingProblem(HIGHWAY, ego=model, device="cuda")
-    x = problem.base.sample(5, np.random.default_rng(0))
-    f, reasons = problem.attempt(x)
-    assert np.isnan(f).all()
-    assert len(reasons) == len(x)
-    assert torch.ones(3, device="cuda").sum() == 3.0
-
-
 def test_threads_do_not_get_each_others_scenarios() -> None:
     problem = rare_envs.DrivingProblem(CUT_IN, device="cuda")
     parts = np.split(problem.base.sample(2000, np.random.default_rng(0)), 40)
@@ -204,12 +191,6 @@ def test_threads_do_not_get_each_others_scenarios() -> None:
         together = list(threads.map(problem.evaluate, parts))
     for part, f in zip(parts, together, strict=True):
         np.testing.assert_array_equal(problem.evaluate(part), f)
-
-
-def test_a_failure_found_on_a_gpu_is_driven_again() -> None:
-    problem = rare_envs.DrivingProblem(HIGHWAY, device="cuda")
-    x = problem.base.sample(1, np.random.default_rng(0))
-    assert drive_again(problem, x[0]).f == pytest.approx(float(problem.evaluate(x)[0]), abs=ROUNDING)
 
 
 def test_an_estimate_on_a_gpu_agrees_with_that_on_the_cpu() -> None:

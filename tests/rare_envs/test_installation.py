@@ -58,12 +58,6 @@ def test_samplers_imports_nothing_that_is_not_installed_with_it_unless_it_says_s
     assert declared("dependencies") & declared("driving") == set()
 
 
-def test_what_the_test_suite_needs_is_installed_by_its_extra() -> None:
-    text = (ROOT / "pyproject.toml").read_text(encoding="utf-8")
-    (extras,) = re.findall(r'^  "rare-envs\[([a-z,0-9]+)\]",$', text, re.MULTILINE)
-    assert set(extras.split(",")) >= {"driving", "contrib", "export", "logs", "onnx", "remote", "stl"}
-
-
 BARE = f"""
 import sys
 from importlib.machinery import PathFinder

@@ -10,7 +10,6 @@ from rare_envs.plugins import (
     did_you_mean,
     import_module,
     import_object,
-    make_lazy_getattr,
     warn_of_namesakes,
 )
 
@@ -60,17 +59,6 @@ def test_names_are_suggested_without_their_namespace() -> None:
         assert did_you_mean(name, ids) == " (did you mean 'rare_envs/CutIn-v0'?)"
     assert did_you_mean("TTC", ["ttc", "pet"]) == " (did you mean 'ttc'?)"
     assert did_you_mean("zzz", ids) == ""
-
-
-def test_a_name_is_imported_from_its_module_when_it_is_used(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    (tmp_path / "late_module.py").write_text("answer = 42")
-    monkeypatch.syspath_prepend(tmp_path)
-    get = make_lazy_getattr("package", {"answer": "late_module"})
-    assert "late_module" not in sys.modules
-    assert get("answer") == 42
-    with pytest.raises(AttributeError, match="module 'package' has no attribute 'question'"):
-        get("question")
-    del sys.modules["late_module"]
 
 
 @pytest.mark.parametrize("name", SIBLINGS)

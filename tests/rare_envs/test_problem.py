@@ -34,15 +34,6 @@ class Constant:
         return np.repeat(self.action[None], len(observation), axis=0), state
 
 
-def test_fits_the_protocol_of_samplers() -> None:
-    problem: samplers.Problem = rare_envs.DrivingProblem("rare_envs/CarFollowing-v0")
-    assert problem.dim == 3
-    x = problem.base.sample(50, np.random.default_rng(0))
-    f = problem.evaluate(x)
-    assert f.dtype == np.float64
-    assert ((f == -1.0) | ((f > 0.0) & (f <= 10.0))).all()
-
-
 def test_braking_and_accelerating_egos() -> None:
     x = np.array([[20.0, 10.0, 30.0], [20.0, 25.0, 30.0]])
     brakes = rare_envs.DrivingProblem("rare_envs/CarFollowing-v0", ego=Constant([-1.0, 0.0])).evaluate(x)
@@ -53,14 +44,6 @@ def test_braking_and_accelerating_egos() -> None:
     assert brakes[0] == pytest.approx(expected, rel=1e-5)
     assert brakes[1] == 10.0
     assert (throttle == -1.0).all()
-
-
-def test_discrete_egos_use_the_table() -> None:
-    x = np.array([[20.0, 10.0, 30.0]])
-    discrete = Constant(np.int64(0), action_space=spaces.Discrete(5))
-    problem = rare_envs.DrivingProblem("rare_envs/CarFollowing-v0", ego=discrete)
-    brakes = rare_envs.DrivingProblem("rare_envs/CarFollowing-v0", ego=Constant([-1.0, 0.0]))
-    assert problem.evaluate(x) == brakes.evaluate(x)
 
 
 def test_policies_are_asked_in_fixed_tiles() -> None:
@@ -98,12 +81,6 @@ def test_recurrent_egos_get_their_state_back() -> None:
 def test_wrong_egos_are_refused_before_any_simulation(ego: Any, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         rare_envs.DrivingProblem("rare_envs/CutIn-v0", ego=ego)
-
-
-def test_nan_actions_are_an_error_with_a_count() -> None:
-    problem = rare_envs.DrivingProblem("rare_envs/CarFollowing-v0", ego=Constant([np.nan, 0.0]))
-    with pytest.raises(ValueError, match="NaN or infinite actions for 3 of 3 observations"):
-        problem.evaluate(problem.base.sample(3, np.random.default_rng(0)))
 
 
 def test_wrong_x_is_refused() -> None:
@@ -176,12 +153,6 @@ def test_a_row_does_not_depend_on_its_batch(env_id: str) -> None:
     for n in (1, 7, 33):
         np.testing.assert_array_equal(problem.evaluate(x[:n]), f[:n])
     np.testing.assert_array_equal(problem.evaluate(x[::-1])[::-1], f)
-
-
-def test_repr_is_one_line_and_html_has_the_parameters() -> None:
-    problem = rare_envs.DrivingProblem("rare_envs/CutIn-v0", ego=Constant([0.0, 0.0]))
-    assert repr(problem) == "<DrivingProblem rare_envs/CutIn-v0, ego Constant, measure ttc, 6 dimensions>"
-    assert problem.space._repr_html_() in problem._repr_html_()
 
 
 def test_tables_of_a_result_name_the_parameters() -> None:

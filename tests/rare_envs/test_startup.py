@@ -72,14 +72,6 @@ def test_other_programs_keep_their_handlers() -> None:
     assert {name: signal.getsignal(getattr(signal, name)) for name in SIGNALS} == before
 
 
-def test_a_process_that_is_started_anew_has_no_handler_of_its_parent(monkeypatch: pytest.MonkeyPatch) -> None:
-    before = signal.getsignal(signal.SIGINT)
-    monkeypatch.setattr(sys, "argv", ["/somewhere/bin/rare-envs", "estimate"])
-    monkeypatch.setattr(sys, "orig_argv", [sys.executable, "-c", "spawn_main()", "--multiprocessing-fork"])
-    end_at_signals()
-    assert signal.getsignal(signal.SIGINT) is before
-
-
 def test_the_command_line_is_known_by_its_program(monkeypatch: pytest.MonkeyPatch) -> None:
     for program, found in (
         ("/somewhere/bin/rare-envs", True),

@@ -10,11 +10,6 @@ import pytest
 import samplers
 from samplers.method import Interrupted
 
-QUICK_METHODS = [
-    pytest.param(name, marks=pytest.mark.slow if name == "surrogate" else ()) for name in sorted(samplers.METHODS)
-]
-"""All methods; kriging takes seconds of its own, and stands among the slow tests."""
-
 
 class Recorder:
     """Wraps f and keeps its own books, independent of the package's counter."""
@@ -89,11 +84,6 @@ def drive() -> Callable[..., Driven]:
         raise AssertionError("expected an outcome after an interruption")
 
     return run
-
-
-@pytest.fixture
-def study_of() -> type[Study]:
-    return Study
 
 
 @pytest.fixture

@@ -11,23 +11,14 @@ from scipy import stats
 
 import samplers
 from samplers import testing
-from samplers.distributions import FALSE_ALARM, N_DRAWS, _find_other_law, find_base_fault
 from samplers.problem import FloatArray, StandardNormal
-from samplers.run import RunArguments, choose_seed
+from samplers.run import RunArguments
 
 
 @pytest.mark.parametrize("door", [samplers.estimate, samplers.Method.start])
 def test_the_defaults_of_the_front_doors_are_these(door):
     defaults = {name: each.default for name, each in inspect.signature(door).parameters.items()}
     assert {each.name: defaults[each.name] for each in fields(RunArguments)} == vars(RunArguments())
-
-
-def test_a_seed_is_kept_or_drawn():
-    assert choose_seed(np.int64(7)) == 7
-    assert type(choose_seed(np.int64(7))) is int
-    drawn = {choose_seed(None) for _ in range(8)}
-    assert len(drawn) == 8  # equal by chance once in 1.5e8 times
-    assert all(0 <= seed < 2**32 for seed in drawn)
 
 
 class Exponential:
@@ -104,13 +95,3 @@ def test_what_fits_is_not_refused() -> None:
         raise NotImplementedError  # as a base says that it has no map, which plain Monte Carlo does not need
 
     testing.check_base(Exponential(2, to_standard_normal=missing), 2)
-
-
-def test_statistics_of_standard_normal_draws_stay_within_the_level(monkeypatch: pytest.MonkeyPatch) -> None:
-    """With a level of 0.2 at most a fifth of 2,000 sets may be refused, and not none of them: 4 binomial deviations."""
-    monkeypatch.setattr("samplers.distributions.FALSE_ALARM", 0.2)
-    rng = np.random.default_rng(3)
-    refused = sum(_find_other_law(rng.standard_normal((N_DRAWS, 3))) is not None for _ in range(2000))
-    assert 0.05 * 2000 < refused < 0.2 * 2000 + 4 * (2000 * 0.2 * 0.8) ** 0.5
-    assert FALSE_ALARM == 1e-6
-    assert find_base_fault(StandardNormal(3), 3) is None

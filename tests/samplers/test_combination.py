@@ -7,7 +7,7 @@ from scipy import stats
 
 import samplers
 from samplers.limit_states import half_space
-from samplers.method import Outcome, combine, combined_cov, no_outcome_share
+from samplers.method import Outcome, combine, combined_cov
 from samplers.sample import Sample, Status, binomial_cov, clopper_pearson
 
 
@@ -101,15 +101,6 @@ def test_samples_are_merged_as_the_runs_are():
     assert combine([one, replace(two, sample=None)], 0.95).sample is None
 
 
-def test_samples_of_pooled_counts_weigh_draws():
-    few = outcome(0.5, counts=(1, 2), sample=sample([-1.0, 1.0], [0.5] * 2, 0.0))
-    many = outcome(0.25, counts=(2, 8), sample=sample([-1.0] * 2 + [1.0] * 6, [1 / 8] * 8, 5.0))
-    pooled = combine([few, many], 0.95)
-    assert pooled.p == 0.3
-    np.testing.assert_allclose(pooled.sample.weights, 0.1)
-    assert pooled.sample.n_units == 10
-
-
 def test_a_run_on_its_way_has_no_part_in_the_mean():
     ends = [outcome(1e-4), outcome(2e-4)]
     level = samplers.Level(gamma=1.0, p=0.1, estimate=0.1, n_sim=50, n_points=50, cov=0.1)
@@ -130,9 +121,3 @@ def test_runs_that_disagree_are_told_of():
     assert any("disagree" in text for text in combine(runs, 0.95).warnings)
     alike = [outcome(p, cov=0.02) for p in (1.00e-4, 1.03e-4, 0.97e-4, 1.02e-4, 0.99e-4)]
     assert not combine(alike, 0.95).warnings
-
-
-def test_all_or_none_without_an_outcome_is_exact_whatever_the_weights():
-    log_weights = np.log(np.array([0.1, 0.2, 0.7]))
-    assert no_outcome_share(np.full(3, -np.inf), log_weights) == 1.0
-    assert no_outcome_share(np.zeros(3), log_weights) == 0.0

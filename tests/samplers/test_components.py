@@ -43,20 +43,13 @@ def oblique_corner(dim):
 COMPONENTS = {
     "base": (IsotropicNormal(4), 4),
     "wide": (IsotropicNormal(2, 1.5), 2),
-    "wide d=1": (IsotropicNormal(1, 3.0), 1),
     "gaussian d=1": (subspace_gaussian(1, 1), 1),
-    "gaussian": (subspace_gaussian(2, 2), 2),
-    "one direction of 100": (subspace_gaussian(100, 1), 100),
     "three directions of 6": (subspace_gaussian(6, 3), 6),
     "tempered": (subspace_gaussian(6, 3).temper(0.5), 6),
-    "half-space d=1": (HalfSpaceNormal(np.array([-1.0]), 1.5), 1),
     "half-space": (HalfSpaceNormal(rotation(3, 4)[:, 0], 2.0), 3),
     "half-space behind the origin": (HalfSpaceNormal(rotation(3, 4)[:, 0], -0.5), 3),
-    "half-spaces": (HalfSpaceUnion(rotation(2, 4), np.array([0.8, 1.5])), 2),
     "half-spaces d=5": (HalfSpaceUnion(rotation(5, 4)[:3], np.array([2.0, 2.5, 3.0])), 5),
-    "corner": (HalfSpaceIntersection(rotation(2, 4), np.array([1.5, 0.8])), 2),
     "oblique corner d=5": (oblique_corner(5), 5),
-    "radial": (RadialLaw(3, 1.0, 1.5, 2.5), 3),
     "radial d=20": (RadialLaw(20, 12.0, 2.0, 4.0), 20),
     "radial in a plane of 10": (LiftedComponent(RadialLaw(2, 1.0, 1.5, 2.5), rotation(10, 6)[:, :2]), 10),
 }
@@ -149,8 +142,3 @@ def test_fit_recovers_the_distribution(rng, dim):
     assert found.omega == pytest.approx(16.0, rel=0.02)
     if dim > 2:  # Banerjee's formula is an approximation, poor on the line and fair in the plane
         assert found.kappa == pytest.approx(8.0, rel=0.05)
-
-
-def test_few_points_give_a_finite_distribution():
-    one = VonMisesFisherNakagami.fit(np.array([[1.0, 2.0]]), np.ones(1))
-    assert np.isfinite(one.log_prob(np.array([[1.0, 2.0], [-3.0, 0.0], [0.0, 0.0]]))).all()

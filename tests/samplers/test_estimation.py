@@ -8,7 +8,6 @@ import pytest
 import samplers
 from samplers.limit_states import half_space
 from samplers.proposals import Gaussian
-from tests.samplers.conftest import QUICK_METHODS
 from tests.samplers.fitted_bases import FittedWithEnsemble, HalfSpace, fitted, normal
 
 PROBLEM = half_space().problem
@@ -20,16 +19,13 @@ PROBLEM = half_space().problem
         ({"gamma": float("inf")}, "gamma to be a finite number, got inf"),
         ({"gamma": "0"}, "gamma to be a finite number, got '0'"),
         ({"gamma": 10**400}, "gamma to be a finite number, got 10"),
-        ({"confidence": True}, "confidence to be a number between 0 and 1, got True"),
         ({"confidence": 1.2}, "confidence to be a number between 0 and 1, got 1.2"),
         ({"max_sim": 1e4}, "max_sim to be a whole number of at least 1, got 10000.0"),
         ({"max_sim": 10**99}, "max_sim to be at most 1,000,000,000,000, got 1.00e"),
         ({"max_sim": 3, "replicates": 4}, "max_sim to be a whole number of at least 4, got 3"),
         ({"target_cov": 0.0}, "target_cov to be a number above 0, got 0.0"),
-        ({"target_cov": float("nan")}, "target_cov to be a number above 0, got nan"),
         ({"replicates": None}, "replicates to be a whole number of at least 1, got None"),
         ({"seed": -1}, "seed to be a whole number of at least 0, got -1"),
-        ({"on_error": np.array(["raise"])}, "on_error"),
         ({"on_error": "fail"}, "Unknown on_error 'fail'. Did you mean 'failure'.*Valid: raise, failure, bound"),
         ({"method": "adds"}, "method 'adds'. Did you mean 'adss'.*Valid: auto, two-stage, surrogate, mc, .*adss"),
         ({"method": samplers.MonteCarlo}, "the class MonteCarlo; add brackets"),
@@ -70,17 +66,11 @@ def test_unknown_setting_is_named():
 @pytest.mark.parametrize(
     ("cls", "name", "expected"),
     [
-        (samplers.AdaptiveSubsetSimulation, "scale", "a number 0 < scale < inf"),
         (samplers.AdaptiveSubsetSimulation, "p0", "a number 0 < p0 < 0.5"),
-        (samplers.AdaptiveSubsetSimulation, "target_acceptance", "a number 0 < target_acceptance < 1"),
         (samplers.AdaptiveSubsetSimulation, "sigma0", 'sigma0 "unit" or "seeds"'),
         (samplers.AdaptiveSubsetSimulation, "n", "n to be a whole number of at least 10"),
-        (samplers.CrossEntropy, "rho", "a number 0 < rho < 0.5"),
-        (samplers.CrossEntropy, "base_share", "a number 0 < base_share < 1"),
-        (samplers.CrossEntropy, "wide_share", "a number 0 < wide_share < 0.9"),
         (samplers.CrossEntropy, "wide_factor", "a number 1 < wide_factor < inf"),
         (samplers.CrossEntropy, "family", 'family "gaussian" or "mean"'),
-        (samplers.MonteCarlo, "n", "n to be a whole number of at least 1"),
     ],
 )
 @pytest.mark.parametrize("value", [None, "a", True, np.array([0.3, 0.4])], ids=repr)
@@ -112,7 +102,7 @@ def broken_where_u2_is_large(x):
     return f
 
 
-@pytest.mark.parametrize("method", QUICK_METHODS)
+@pytest.mark.parametrize("method", ["mc", "ce", "adss", "two-stage"])
 def test_nan_as_failure_or_bound(method):
     """p = P[u1 >= 1.5 or u2 > 1.28] with NaN as failure; 0.9 x 0.0668 fail for certain."""
     problem = samplers.FunctionProblem(broken_where_u2_is_large, 2)
@@ -167,8 +157,7 @@ def test_time_limit(replicates, recorder):
     assert result.p == result.failures.total / f.rows
 
 
-@pytest.mark.parametrize("name", QUICK_METHODS)
-@pytest.mark.parametrize("replicates", [1, 2])
+@pytest.mark.parametrize(("name", "replicates"), [("mc", 1), ("adss", 2), ("two-stage", 1), ("two-stage", 2)])
 def test_stopped_by_a_callback(name, replicates, recorder):
     f = recorder(PROBLEM.f)
     seen = []
@@ -189,42 +178,20 @@ def test_stopped_by_a_callback(name, replicates, recorder):
     assert any(f"Stopped by the callback after {f.rows:,} simulations" in text for text in result.warnings)
 
 
-def test_a_stop_with_the_last_batch_is_none():
-    result = samplers.estimate(PROBLEM, "mc", seed=1, max_sim=1000, stop=lambda progress: True)
-    assert result == samplers.estimate(PROBLEM, "mc", seed=1, max_sim=1000)
-
-
-def test_a_target_that_is_met_in_fact():
-    """The spread of p-hat over 200 seeds is at most 1.3 times the target."""
-    target, runs = 0.2, 200
-    problem = half_space(2, 1.5).problem
-    method = samplers.MonteCarlo(batch=50)
-    p = np.array([samplers.estimate(problem, method, seed=seed, target_cov=target).p for seed in range(runs)])
-    assert p.std(ddof=1) / half_space(2, 1.5).p <= 1.3 * target
-
-
 FAR_REFITS = [normal(7.0, 0.2 + 0.01 * i) for i in range(30)]
 
 
-def test_a_stopped_run_is_not_followed_by_a_further_one():
-    problem = HalfSpace(fitted(FAR_REFITS, FittedWithEnsemble), 2.0)
-    once = samplers.estimate(
-        problem, samplers.MonteCarlo(batch=1000), seed=1, max_sim=2000, stop=lambda at: at.n_sim >= 1000
-    )
-    assert once.status is samplers.Status.STOPPED
-    assert once.ensemble_run is None
-    twice = samplers.estimate(problem, "mc", seed=1, max_sim=2000)
-    assert twice.ensemble_run.n_sim == 2000
-
-
-def test_the_condition_that_stops_holds_for_the_further_run_too():
+def test_stopping_holds_for_the_further_run_too_and_a_stopped_run_has_none():
     problem, seen = HalfSpace(fitted(FAR_REFITS, FittedWithEnsemble), 2.0), []
 
     def stop(progress):
         seen.append(progress.n_sim)
         return len(seen) == 3
 
-    result = samplers.estimate(problem, samplers.MonteCarlo(batch=1000), seed=1, max_sim=2000, stop=stop)
+    method = samplers.MonteCarlo(batch=1000)
+    once = samplers.estimate(problem, method, seed=1, max_sim=2000, stop=lambda at: at.n_sim >= 1000)
+    assert (once.status, once.ensemble_run) == (samplers.Status.STOPPED, None)
+    result = samplers.estimate(problem, method, seed=1, max_sim=2000, stop=stop)
     assert result.status is samplers.Status.CONVERGED
     assert (result.ensemble_run.status, result.ensemble_run.n_sim) == (samplers.Status.STOPPED, 1000)
     assert any("Stopped by the callback" in text for text in result.base_uncertainty.warnings)
@@ -234,27 +201,23 @@ def test_the_further_run_repeats_with_the_seed_that_the_result_states():
     problem = HalfSpace(fitted(FAR_REFITS, FittedWithEnsemble), 2.0)
     first = samplers.estimate(problem, "mc", max_sim=2000)
     again = samplers.estimate(problem, "mc", seed=first.seed, max_sim=2000)
+    assert first.ensemble_run.n_sim == 2000
     assert again.base_uncertainty == first.base_uncertainty
     assert (again.ensemble_run.seed, again.ensemble_run.p) == (first.seed, first.ensemble_run.p)
 
 
-def test_a_method_that_cannot_search_under_a_mixture_leaves_the_further_run_to_two_stage():
+def test_what_cannot_search_under_a_mixture_is_left_to_two_stage_and_refits_that_cannot_be_mixed_are_told():
     class WithBlocks(FittedWithEnsemble):
         blocks = (samplers.NormalBlock(Gaussian.standard(1)), samplers.NormalBlock(Gaussian.standard(1)))
 
-    problem = HalfSpace(fitted(FAR_REFITS, WithBlocks), 2.0)
-    result = samplers.estimate(problem, samplers.CrossEntropy(family="blocks"), seed=1, max_sim=4000)
-    assert result.method.name == "ce"
-    assert result.ensemble_run.method.name == "two-stage"
-    assert len(result.base_uncertainty.p_refits) == 30
-
-
-def test_refits_that_cannot_be_mixed_leave_the_first_run_with_a_warning():
     class Unmixed(FittedWithEnsemble):
         def ensemble(self):
             raise ValueError("An ensemble needs refits that are Gaussian mixtures.")
 
+    problem = HalfSpace(fitted(FAR_REFITS, WithBlocks), 2.0)
+    result = samplers.estimate(problem, samplers.CrossEntropy(family="blocks"), seed=1, max_sim=4000)
+    assert (result.method.name, result.ensemble_run.method.name) == ("ce", "two-stage")
+    assert len(result.base_uncertainty.p_refits) == 30
     result = samplers.estimate(HalfSpace(fitted(FAR_REFITS, Unmixed), 2.0), "mc", seed=1, max_sim=2000)
-    assert result.ensemble_run is None
-    assert result.p > 0
+    assert result.ensemble_run is None and result.p > 0
     assert "30 of 30 refits rest on under 10" in result.base_uncertainty.warnings[0]

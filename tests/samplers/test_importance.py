@@ -6,23 +6,21 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from samplers.components import VonMisesFisherNakagami
 from samplers.importance import (
     Draws,
-    Round,
-    Search,
     bernstein_bound,
     calibrate,
-    draw_after_search,
-    pool_rounds,
-    round_record,
     weight_warnings,
     weighted_interval,
 )
-from samplers.limit_states import half_space
-from samplers.method import Goal
-from samplers.problem import StandardNormal
-from samplers.proposals import TiltedNormal
-from samplers.sample import Status
+from samplers.proposals import (
+    Gaussian,
+    Mixture,
+    correct_eigenvalues,
+    fit_proposal_mixture,
+    fit_shrunk_gaussian,
+)
 
 BETA = 1.7
 P = stats.norm.sf(BETA)
@@ -117,41 +115,62 @@ def test_doubts_are_of_few_and_of_heavy_draws():
     assert "None of 1,000 final draws failed" in weight_warnings(weighing())[0]
 
 
-BASE = StandardNormal(2)
+def even(n):
+    return np.full(n, 1 / n)
 
 
-def rounds_of(inputs, shifts, n, rng):
-    """Return rounds of n draws from N(shift, I)."""
-    proposals = [TiltedNormal(np.full(2, shift)) for shift in shifts]
-    points = [proposal.sample(n, rng) for proposal in proposals]
-    return [Round(BASE, q, u, inputs.problem.evaluate(u)) for q, u in zip(proposals, points, strict=True)]
+@pytest.mark.parametrize("n", [1, 2, 5])
+def test_few_or_equal_points_give_a_proper_gaussian(n, rng):
+    for u in (rng.standard_normal((n, 4)), np.ones((n, 4)), np.zeros((n, 4))):
+        assert np.isfinite(fit_shrunk_gaussian(u, even(n)).log_prob(u)).all()
 
 
-def test_rounds_pool_into_one_sample(rng):
-    """Weights by the mixture of the proposals: right on average and bounded by the share of base draws."""
-    inputs = half_space(2, 2.0)
-    estimates = []
-    for _ in range(200):
-        draws = pool_rounds(rounds_of(inputs, [0.0, 1.5, 3.0], 200, rng), np.asarray, 0.0)
-        assert draws.n == 600
-        assert np.exp(draws.log_weights).max() <= 3
-        estimates.append(draws.p)
-    error = np.std(estimates, ddof=1) / math.sqrt(200)
-    assert abs(np.mean(estimates) - inputs.p) < 4 * error
+def test_eigenvalues_lose_their_bias(rng):
+    """30 points in 8 dimensions: the least eigenvalue is a fifth too small on average, the corrected one is right."""
+    truth = np.array([0.05, 0.2, 0.4, 1.0, 1.0, 1.0, 1.3, 1.6])
+    draws = rng.standard_normal((300, 30, 8)) * np.sqrt(truth)
+    values, vectors = np.linalg.eigh(np.array([np.cov(u.T) for u in draws]))
+    corrected = np.array([correct_eigenvalues(each, 30.0) for each in values])
+    assert values[:, 0].mean() < 0.85 * 0.05
+    assert abs(corrected[:, 0].mean() - 0.05) < 4 * corrected[:, 0].std() / np.sqrt(300)
+    # Stein's loss of K, tr(K / S) - log det(K / S) - d, for which the estimator is made
+    spread = np.einsum("nij,nij,i->nj", vectors, vectors, 1 / truth)
+    own, new = ((spread * each).sum(axis=1) - np.log(each / truth).sum(axis=1) - 8 for each in (values, corrected))
+    assert (own - new).mean() > 4 * (own - new).std() / np.sqrt(300)
 
 
-def test_a_stopped_search_is_its_own_estimate(drive, rng):
-    """No further simulation; the weights are bounded by all draws over base draws."""
-    inputs = half_space(2, 2.0)
-    rounds = rounds_of(inputs, [0.0, 2.0], 500, rng)
-    trace = [round_record(0.0, 500, one.log_weights[one.f <= 0]) for one in rounds]
-    search = Search(rounds, trace, Status.STOPPED)
-    steps = draw_after_search(inputs.problem, Goal(gamma=0.0), search, BASE, 1.0, 1000, 100, rng)
-    with pytest.raises(StopIteration) as ended:
-        next(steps)
-    final = ended.value.value
-    assert (final.n_first, final.stopped, final.largest_weight, final.base_draws) == (500, True, 2.0, 500)
-    outcome = final.outcome(Goal(gamma=0.0), Status.CONVERGED, ["not said"])
-    assert outcome.status is Status.STOPPED
-    assert outcome.warnings[0].startswith("Stopped before the final draws")
-    assert outcome.p == pytest.approx(inputs.p, rel=5 * outcome.cov)
+TWO = Mixture(
+    np.array([0.3, 0.7]),
+    [
+        Gaussian(np.array([3.0, 0.0]), np.diag([0.5, 1.0])),
+        Gaussian(np.array([-1.0, 3.0]), np.array([[0.8, 0.0], [0.3, 0.4]])),
+    ],
+)
+
+
+def test_mixture_is_recovered(rng):
+    found = fit_proposal_mixture(fit_shrunk_gaussian, TWO.sample(8000, rng), even(8000), 4, 5, rng)
+    order = np.argsort(found.weights)
+    assert len(order) == 2  # the criterion finds the number
+    np.testing.assert_allclose(found.weights[order], TWO.weights, atol=0.03)
+    for k, component in zip(order, TWO.components, strict=True):
+        np.testing.assert_allclose(found.components[k].mean, component.mean, atol=0.1)
+        np.testing.assert_allclose(found.components[k].covariance, component.covariance, atol=0.1)
+
+
+def test_weighted_points_stand_for_their_distribution(rng):
+    """Draws of a wide distribution under weights p / q."""
+    wide = Gaussian(np.zeros(2), 3 * np.eye(2))
+    u = wide.sample(40_000, rng)
+    weights = np.exp(TWO.log_prob(u) - wide.log_prob(u))
+    found = fit_proposal_mixture(fit_shrunk_gaussian, u, weights / weights.sum(), 4, 5, rng)
+    test = TWO.sample(4000, rng)
+    assert np.mean(TWO.log_prob(test) - found.log_prob(test)) < 0.02  # Kullback-Leibler divergence
+
+
+def test_mixture_of_directions(rng):
+    distributions = [VonMisesFisherNakagami(np.eye(8)[k], 40.0, 10.0, 16.0) for k in (0, 3)]
+    u = np.concatenate([distribution.sample(1000, rng) for distribution in distributions])
+    found = fit_proposal_mixture(VonMisesFisherNakagami.fit, u, even(2000), 4, 10, rng)
+    assert len(found.components) == 2
+    assert sorted(int(np.argmax(c.mu)) for c in found.components) == [0, 3]

@@ -4,10 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import itertools
-import json
-import signal
 import sqlite3
-import subprocess
 import sys
 import time
 import warnings
@@ -89,24 +86,6 @@ def test_a_longer_run_of_plain_monte_carlo_continues(tmp_path: Path) -> None:
     assert counted.sizes == [8, 500, 500]
 
 
-@pytest.mark.parametrize("begun_by_executor", [False, True])
-def test_what_is_begun_with_or_without_an_executor_continues_the_other_way(
-    begun_by_executor: bool, tmp_path: Path
-) -> None:
-    here = [samplers.InProcess(), None] if begun_by_executor else [None, samplers.InProcess()]
-    method = samplers.MonteCarlo(batch=100)
-    stops = Counted(stop_at=20 if begun_by_executor else 3)
-    for f, executor in zip((stops, half_space), here, strict=True):
-        problem = samplers.FunctionProblem(f, 4)
-        arguments = {"seed": 1, "max_sim": 600, "journal": tmp_path / "j", "executor": executor}
-        if f is stops:
-            with pytest.raises(KeyboardInterrupt):
-                samplers.estimate(problem, method, **arguments)
-    result = samplers.estimate(problem, method, **arguments)
-    whole = samplers.estimate(samplers.FunctionProblem(half_space, 4), method, seed=1, max_sim=600)
-    assert (result.p, result.n_sim, result.failures.total) == (whole.p, 600, whole.failures.total)
-
-
 def test_what_does_not_belong_to_the_journal_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "j"
     run(path)
@@ -146,12 +125,7 @@ def damage(path: Path, statement: str) -> None:
 
 @pytest.mark.parametrize(
     "statement",
-    [
-        "UPDATE chunks SET numbers = zeroblob(length(numbers)) WHERE id = 3",
-        "UPDATE chunks SET notes = '{}' WHERE id = 3",
-        "UPDATE chunks SET numbers = 'text' WHERE id = 3",
-        "DELETE FROM chunks WHERE id = 3",
-    ],
+    ["UPDATE chunks SET numbers = zeroblob(length(numbers)) WHERE id = 3", "DELETE FROM chunks WHERE id = 3"],
 )
 def test_a_damaged_record_is_refused_and_those_before_it_can_be_kept(statement: str, tmp_path: Path) -> None:
     path, method = tmp_path / "j", samplers.MonteCarlo(batch=500)
@@ -186,8 +160,7 @@ def test_a_page_that_is_lost_costs_what_stands_behind_it(cut: bool, tmp_path: Pa
     journal.close()
 
 
-@pytest.mark.parametrize("mend", [False, True])
-@pytest.mark.parametrize("n_bytes", [4096, 8192, 20480])
+@pytest.mark.parametrize(("n_bytes", "mend"), [(4096, False), (4096, True), (20480, False)])
 def test_killed_while_sqlite_copies_its_log_into_the_file_nothing_is_lost(
     n_bytes: int, mend: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -381,7 +354,7 @@ class Series:
         return TermGradients(-self.normals[term], 2.5 * len(x))
 
 
-@pytest.mark.parametrize("last", [1, 5, 11])
+@pytest.mark.parametrize("last", [5, 11])
 def test_a_search_by_terms_is_continued_from_its_journal(last: int, tmp_path: Path) -> None:
     """Interrupted at the walks, in a round or at the end; the rest alone is computed, and the result is the same."""
     undisturbed, path = Series(), tmp_path / "j"
@@ -396,41 +369,3 @@ def test_a_search_by_terms_is_continued_from_its_journal(last: int, tmp_path: Pa
     rest = Series()
     assert samplers.estimate(rest, seed=1, max_sim=2000, journal=path) == expected
     assert rest.requests == undisturbed.requests - last + 1  # f is called once more, to see that it is the same
-
-
-def test_a_journal_counts_simulations_not_numbers(tmp_path: Path) -> None:
-    """Base draws are 200 simulations, of which the journal has 1 + 2 * 2 numbers each; 24 gradients of 2.5 are 60."""
-    with pytest.raises(KeyboardInterrupt):
-        samplers.estimate(Series(2), seed=1, max_sim=2000, journal=tmp_path / "j")
-    journal = Journal.open(tmp_path / "j")
-    assert journal.n == 260
-    journal.close()
-
-
-CHILD = """
-import sys, time
-import samplers
-def f(x):
-    time.sleep(0.002)
-    return 3.0 - x.sum(axis=1) / x.shape[1] ** 0.5
-result = samplers.estimate(samplers.FunctionProblem(f, 4), sys.argv[2], seed=4, max_sim=3000, on_error="bound",
-                           journal=sys.argv[1])
-print(result.to_json())
-"""
-
-
-@pytest.mark.parametrize("kills", [2, pytest.param(21, marks=pytest.mark.slow)])
-def test_killed_at_random_times_it_comes_to_the_same_result(kills: int, tmp_path: Path) -> None:
-    """It is killed with SIGKILL once there is a journal and a random time after."""
-    path, rng = tmp_path / "j", np.random.default_rng(kills)
-    words = [sys.executable, "-c", CHILD, str(path), "two-stage"]
-    for _ in range(kills):
-        process = subprocess.Popen(words, stdout=subprocess.DEVNULL)
-        deadline = time.monotonic() + 60
-        while not path.exists() and process.poll() is None and time.monotonic() < deadline:
-            time.sleep(0.001)
-        time.sleep(float(rng.uniform(0, 0.1 if path.exists() else 0.02)))
-        process.send_signal(signal.SIGKILL)
-        process.wait()
-    found = subprocess.run(words, capture_output=True, text=True, check=True).stdout
-    assert json.loads(found) == json.loads(run(None).to_json())

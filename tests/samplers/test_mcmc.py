@@ -6,18 +6,12 @@ from scipy import stats
 
 from samplers.mcmc import (
     FixedMetropolis,
-    Growth,
-    NextLevel,
     RootedPoints,
     ScaledKernel,
-    descend,
     grow_chains,
-    independent_chains,
     move_components,
 )
-from samplers.method import Interrupted
 from samplers.problem import FunctionProblem
-from samplers.sample import Status
 
 
 def scaled(proposal, scale, dim=2):
@@ -42,18 +36,7 @@ def test_the_printed_ratio_is_wrong_for_the_conditional_proposal(rng):
     assert stats.kstest(u[:, 0], stats.norm.cdf).pvalue < 1e-12
 
 
-def test_scale_follows_the_acceptance():
-    for scale, acceptance, iteration, expected in (
-        (0.6, 0.44, 1, 0.6),
-        (0.6, 0.64, 4, 0.6 * np.exp(0.1)),
-        (0.6, 0.0, 1, 0.6 * np.exp(-0.44)),
-        (0.9, 1.0, 1, 1.0),
-    ):
-        assert scaled("conditional", scale).adapt(acceptance, iteration).scale == pytest.approx(expected)
-
-
 PROBLEM = FunctionProblem(lambda u: -u[:, 0], dim=2)
-PCN = ScaledKernel("conditional", "unit", 0.6, 0.44, deviations=np.ones(2))
 
 
 def seeds_beyond(level, n, rng):
@@ -88,57 +71,3 @@ def test_points_that_stay_are_not_simulated_again(drive, rng):
     growth, f = drive(grow_chains(PROBLEM, seeds, -2.0, np.full(500, 5), FixedMetropolis(3.0, "uniform"), rng), PROBLEM)
     assert len(f) < 4 * 500
     assert growth.chains.n_new == len(f)
-
-
-def test_interrupted_chains_keep_the_steps_made(rng):
-    steps = grow_chains(PROBLEM, seeds_beyond(-1.0, 4, rng), -1.0, np.full(4, 5), PCN, rng)
-    x = next(steps)
-    steps.send(PROBLEM.evaluate(x))
-    with pytest.raises(StopIteration) as ended:
-        steps.throw(Interrupted())
-    growth = ended.value.value
-    assert growth.interrupted
-    assert growth.chains.u.shape == (4, 2, 2)
-    assert growth.chains.n_new == 4
-    assert (growth.chains.lengths == 2).all()
-
-
-class Scripted:
-    """Goes on with the lowest five points, in chains of three, and keeps what it was told."""
-
-    def __init__(self, levels, end=Status.STALLED):
-        self.levels, self.end, self.told = levels, end, []
-
-    def plan_next(self, chains, depth, n_sim, rng):
-        self.told.append((depth, n_sim, chains.f.size))
-        if depth == self.levels:
-            return self.end
-        points = chains.by_step()
-        lowest = np.argsort(points.f, kind="stable")[:5]
-        return NextLevel(float(points.f[lowest[-1]]), points.select(lowest), np.full(5, 3))
-
-
-def start_from(n, rng):
-    u = rng.standard_normal((n, 2))
-    return Growth.start(independent_chains(u, PROBLEM.evaluate(u)), PCN)
-
-
-@pytest.mark.parametrize("batch", range(4))
-def test_an_interrupted_level_comes_last(batch, drive, rng):
-    """Two batches a level: one that is interrupted at its first batch has its seeds only."""
-    planner = Scripted(levels=9)
-    levels, start = [], start_from(20, rng)
-    steps = descend(PROBLEM, start, planner, lambda *level: levels.append(level), rng)
-    x = next(steps)
-    for _ in range(batch):
-        x = steps.send(PROBLEM.evaluate(x))
-    with pytest.raises(StopIteration) as ended:
-        steps.throw(Interrupted())
-    assert ended.value.value is Status.STOPPED
-    last, planned = levels[-1]
-    assert planned is Status.STOPPED
-    assert last.interrupted
-    assert last.chains.n_new == 5 * (batch % 2)
-    assert last.chains.u.shape == (5, 1 + batch % 2, 2)
-    assert len(planner.told) == 1 + batch // 2  # it is not asked about an unfinished level
-    assert len(levels) == 2 + batch // 2

@@ -18,7 +18,7 @@ LATTICE = """
     from typing import ClassVar
 
     import samplers
-    from samplers.sample import binomial_cov, clopper_pearson
+    from samplers.sample import binomial_cov
 
 
     @dataclasses.dataclass(frozen=True)
@@ -37,14 +37,7 @@ LATTICE = """
             level = samplers.Level(
                 gamma=goal.gamma, p=hits / n, estimate=hits / n, n_sim=n, n_points=n, cov=binomial_cov(hits / n, n)
             )
-            return samplers.Outcome(
-                p=hits / n,
-                interval=clopper_pearson(hits, n, goal.confidence),
-                cov=level.cov,
-                status=samplers.Status.CONVERGED if hits else samplers.Status.NO_HITS,
-                warnings=() if hits else ("No failures.",),
-                trace=(level,),
-            )
+            return samplers.Outcome.of_counts(hits, n, goal.confidence, (level,))
 
 
     class Nameless:

@@ -1,23 +1,31 @@
 """What an estimate says and keeps."""
 
+from __future__ import annotations
+
 import json
-from dataclasses import replace
+import math
+from dataclasses import dataclass, field, replace
+from html.parser import HTMLParser
+from pathlib import Path
 from types import SimpleNamespace
 
+import matplotlib
 import numpy as np
 import pytest
+from matplotlib import pyplot
 
 import samplers
 from samplers.limit_states import half_space
+from samplers.output import StoredMethod, html_table, read_object, register_stored, write_object
 from tests.samplers.fitted_bases import fitted, resampled, run
 
 
-def result(**options):
+def estimate_adss(**options):
     return samplers.estimate(half_space().problem, "adss", seed=1, **options)
 
 
 def test_to_dict_is_plain_json():
-    estimate = result()
+    estimate = estimate_adss()
     data = json.loads(estimate.to_json())
     assert data == estimate.to_dict()
     assert data["p"] == estimate.p
@@ -37,14 +45,14 @@ def test_to_dict_has_no_infinities():
 
 
 def test_says_how_large_a_region_may_have_been_missed():
-    estimate = result()
+    estimate = estimate_adss()
     assert estimate.base_draws == 1000
     assert (1 - estimate.unseen) ** 1000 == pytest.approx(0.05)
     assert (
         "valid if no failure region was missed; 1,000 base draws would have met one with probability above 3.0e-03 "
         "(95 % confidence)" in str(estimate)
     )
-    assert (1 - result(confidence=0.9).unseen) ** 1000 == pytest.approx(0.1)
+    assert (1 - estimate_adss(confidence=0.9).unseen) ** 1000 == pytest.approx(0.1)
     assert estimate.to_dict()["unseen"] == estimate.unseen
     without = replace(estimate, base_draws=0)
     assert without.unseen == 1
@@ -114,7 +122,7 @@ def test_a_region_as_large_as_said_is_rarely_missed(method):
 
 
 def test_failures_read_as_arrays_and_one_by_one():
-    failures = result().failures
+    failures = estimate_adss().failures
     assert failures.x.shape == (len(failures), 2)
     assert (failures.f <= 0).all()
     assert (np.diff(failures.log_p0) <= 0).all()
@@ -122,11 +130,11 @@ def test_failures_read_as_arrays_and_one_by_one():
     np.testing.assert_array_equal(x, failures.x[0])
     assert f == failures.f[0]
     assert log_p0 == max(failure.log_p0 for failure in failures)
-    assert failures != result(gamma=0.1).failures
+    assert failures != estimate_adss(gamma=0.1).failures
 
 
 def test_an_estimate_comes_back_from_its_file(tmp_path):
-    found = result(replicates=2)
+    found = estimate_adss(replicates=2)
     found.save(tmp_path / "result")
     loaded = samplers.Estimate.load(tmp_path / "result")
     assert loaded == found
@@ -154,3 +162,196 @@ def test_the_most_likely_failures_are_kept_a_thousand_of_them(recorder):
     nearest = np.sort(np.abs(f.points[:, 0]))[:1000]
     np.testing.assert_array_equal(np.abs(found.x[:, 0]), nearest)
     assert (len(found), found.total) == (1000, 5000)
+
+
+matplotlib.use("Agg")
+PNG, PDF = b"\x89PNG", b"%PDF"
+
+
+@pytest.fixture(scope="module")
+def result() -> samplers.Estimate:
+    problem = samplers.FunctionProblem(lambda x: 2.0 - x[:, 0], dim=2)
+    return samplers.estimate(problem, "mc", seed=0, max_sim=2000)
+
+
+def test_a_path_is_written_and_leaves_no_figure_open(result: samplers.Estimate, tmp_path: Path) -> None:
+    pyplot.close("all")
+    axes = result.plot(tmp_path / "p.png")
+    result.curve([0.0, 1.0]).plot(str(tmp_path / "curve.pdf"))
+    assert axes.get_title() == f"P[f ≤ 0] = {result.p:.2e}"
+    assert (tmp_path / "p.png").read_bytes().startswith(PNG)
+    assert (tmp_path / "curve.pdf").read_bytes().startswith(PDF)
+    assert pyplot.get_fignums() == []
+    sensitivity = result.sensitivity(["a", "b"])
+    assert len(sensitivity.plot(tmp_path / "sensitivity.png")) == 2
+    assert (tmp_path / "sensitivity.png").read_bytes().startswith(PNG)
+
+
+def test_given_axes_and_the_current_ones_are_used(result: samplers.Estimate) -> None:
+    figure, given = pyplot.subplots()
+    assert result.plot(given) is given
+    assert result.plot(ax=None) is pyplot.gca()
+    pyplot.close(figure)
+
+
+@pytest.mark.parametrize("wrong", [3.0, np.zeros(2), b"p.png"])
+def test_something_else_is_refused(wrong: object, result: samplers.Estimate) -> None:
+    with pytest.raises(TypeError, match="Expected axes of matplotlib or the path of an image"):
+        result.plot(wrong)  # type: ignore[arg-type]
+
+
+def test_the_table_for_notebooks_has_warnings_last():
+    few = samplers.estimate(half_space(2, 4.0).problem, "mc", seed=1, max_sim=100)
+    text = few._repr_html_()
+    assert "95 % interval" in text
+    assert text.index("failing points") < text.index("warning: ")
+
+
+def test_prints_warnings_and_no_gain_without_hits():
+    never = samplers.FunctionProblem(lambda x: np.ones(len(x)), 1)
+    text = str(samplers.estimate(never, "mc", seed=1, max_sim=100))
+    assert "warning: None of 100 simulations failed" in text
+    assert "gain" not in text
+    assert "c.o.v. not known" in text
+
+
+class Reader(HTMLParser):
+    """Collect the texts of cells, and every element that was opened."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.texts: list[str] = []
+        self.tags: list[str] = []
+
+    def handle_starttag(self, tag, attrs):
+        self.tags.append(tag)
+
+    def handle_data(self, data):
+        self.texts.append(data)
+
+
+def read(html):
+    reader = Reader()
+    reader.feed(html)
+    return reader
+
+
+def test_text_is_escaped_everywhere():
+    evil = "<script>alert('x')</script>"
+    found = read(html_table(evil, [(evil, evil)], [evil], [evil]))
+    assert found.texts == [evil] * 5
+    assert "script" not in found.tags
+
+
+@dataclass(frozen=True)
+class Thing:
+    value: object
+    parts: tuple[Thing, ...] = ()
+    derived: int = field(default=0, init=False)
+
+
+register_stored(Thing)
+
+
+VALUES = [None, True, -3, "text", 0.1 + 0.2, math.inf, -math.inf, (1, (2.5, "a")), [1, [2]], {"a": (1,), 2: None}]
+
+
+@pytest.mark.parametrize("value", [*VALUES, samplers.Status.BUDGET, np.float64(0.1)])
+def test_values_come_back_as_they_were(tmp_path, value):
+    write_object(tmp_path / "thing", Thing(value, (Thing("inside"), Thing(math.nan))))
+    found = read_object(tmp_path / "thing", Thing)
+    assert (found.value, found.parts[0]) == (value, Thing("inside"))
+    assert type(found.value) in (type(value), float)
+    assert math.isnan(found.parts[1].value)
+
+
+@pytest.mark.parametrize(
+    "array",
+    [
+        np.arange(6.0).reshape(2, 3).T,
+        np.broadcast_to(0.25, 4),
+        np.empty((0, 3)),
+        np.array([np.nan, -np.inf]),
+        np.array([True, False]),
+        np.arange(3),
+        np.array(2.5),
+    ],
+    ids=["transposed", "broadcast", "empty", "nan", "bool", "whole", "scalar"],
+)
+def test_arrays_come_back_with_their_bits(tmp_path, array):
+    write_object(tmp_path / "thing", Thing(array))
+    found = read_object(tmp_path / "thing", Thing).value
+    assert found.dtype == array.dtype
+    np.testing.assert_array_equal(found, array)
+
+
+def test_other_classes_are_refused_when_written(tmp_path):
+    with pytest.raises(TypeError, match="class function cannot be written"):
+        write_object(tmp_path / "thing", Thing(lambda: 0))
+
+
+def test_a_name_belongs_to_one_class():
+    with pytest.raises(ValueError, match="Another class named Thing"):
+        register_stored(dataclass(type("Thing", (), {})))
+
+
+@pytest.mark.parametrize("cut", [0, 5, 60, -1])
+def test_a_file_that_was_cut_is_refused_in_one_line(tmp_path, cut):
+    path = tmp_path / "thing"
+    write_object(path, Thing(np.arange(100.0)))
+    path.write_bytes(path.read_bytes()[:cut])
+    with pytest.raises(ValueError, match="damaged") as error:
+        read_object(path, Thing)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        (b"samplers 1", b"samplers 2"),
+        (b'\\"object\\"', b'\\"obxect\\"'),
+        (b"Thing", b"Thong"),
+        (b'\\"value\\"', b'\\"valve\\"'),
+        (b'\\"array0\\"', b'\\"array9\\"'),
+    ],
+)
+def test_a_file_that_was_changed_is_refused_in_one_line(tmp_path, old, new):
+    path = tmp_path / "thing"
+    write_object(path, Thing(np.arange(3.0)))
+    assert old in path.read_bytes()
+    path.write_bytes(path.read_bytes().replace(old, new))
+    with pytest.raises(ValueError, match="damaged") as error:
+        read_object(path, Thing)
+    assert "\n" not in str(error.value)
+
+
+def test_a_file_of_something_else_is_refused(tmp_path):
+    write_object(tmp_path / "thing", Thing(1))
+    with pytest.raises(ValueError, match="got Thing"):
+        read_object(tmp_path / "thing", samplers.Level)
+    with pytest.raises(FileNotFoundError, match="no file"):
+        read_object(tmp_path / "nothing", Thing)
+
+
+def test_a_folder_in_place_of_the_file_is_named(tmp_path):
+    with pytest.raises(OSError, match=r"Cannot write '.*': "):
+        write_object(tmp_path, Thing(1))
+
+
+class Other(samplers.Method):
+    name, stops_at_target = "other", False
+
+    def steps(self, inputs, goal, rng):
+        f = yield inputs.base.sample(100, rng)
+        return samplers.Outcome.of_counts(int((f <= goal.gamma).sum()), 100, goal.confidence, trace=())
+
+
+def test_a_method_of_another_package_keeps_its_name(tmp_path):
+    problem = samplers.FunctionProblem(lambda x: x[:, 0], dim=1)
+    result = samplers.estimate(problem, Other(), seed=0)
+    result.save(tmp_path / "result")
+    found = samplers.Estimate.load(tmp_path / "result")
+    assert found.method == StoredMethod("other", False)
+    assert str(found) == str(result)
+    with pytest.raises(ValueError, match="cannot run"):
+        samplers.estimate(problem, found.method)

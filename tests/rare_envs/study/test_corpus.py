@@ -52,30 +52,13 @@ def test_a_failure_comes_back_to_the_bit_and_its_key_is_that_of_the_scenario_alo
     assert replace(CRASH, world={**CRASH.world, "horizon": 5.0}).key != CRASH.key
 
 
-CHANGED: tuple[dict[str, Any], ...] = (
-    {"format": 2},
-    {"sha256": "0" * 64},
-    {"x": {**CRASH.x, "gap": [3.0]}},
-    {"x": {**CRASH.x, "gap": ["3"]}},
-    {"x": []},
-    {"env_id": 3},
-    {"base": 7},
-    {"world": {}},
-    {"world": {**CRASH.world, "gamma": "low"}},
-    {"f": "NaN"},
-)
-OTHER = ("", "[]", "[" * 100_000, '{"format": 1}', '{"format": 1e400}')
-
-
-@pytest.mark.parametrize("text", [*(json.dumps({**json.loads(CRASH.to_json()), **each}) for each in CHANGED), *OTHER])
-def test_what_was_changed_and_other_files_are_refused(text: str) -> None:
-    with pytest.raises(ValueError, match="the file") as refused:
-        parse_stored(text, "the file")
-    assert "\n" not in str(refused.value)
-
-
 def test_two_hundred_damaged_files_are_refused_or_the_same(tmp_path: Path) -> None:
     """A byte changed anywhere: the scenario is either untouched or the file is refused."""
+    values = {**json.loads(CRASH.to_json()), "x": {**CRASH.x, "gap": [3.0]}}
+    for other in (json.dumps(values), "[]", "[" * 100_000, '{"format": 2}'):
+        with pytest.raises(ValueError, match="the file") as caught:
+            parse_stored(other, "the file")
+        assert "\n" not in str(caught.value)
     text, rng, refused = CRASH.to_json().encode(), np.random.default_rng(0), 0
     for _ in range(200):
         damaged = bytearray(text)

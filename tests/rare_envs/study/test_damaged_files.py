@@ -235,32 +235,22 @@ def npz(**entries: bytes) -> bytes:
     return file.getvalue()
 
 
-def npy(header: str, version: bytes = b"\x01\x00") -> bytes:
-    size = len(header).to_bytes(2 if version == b"\x01\x00" else 4, "little")
-    return b"\x93NUMPY" + version + size + header.encode()
+def npy(header: str) -> bytes:
+    return b"\x93NUMPY\x01\x00" + len(header).to_bytes(2, "little") + header.encode()
 
 
-HEADERS = (
-    "{'descr': '<f4', 'fortran_order': False, 'shape': (1000000000000, 1000), }",
-    "{'descr': '|O', 'fortran_order': False, 'shape': (3, 2), }",
-    "{'descr': '<U9', 'fortran_order': False, 'shape': (3, 2), }",
-    "{'descr': '<f4', 'fortran_order': False, 'shape': (3, -2), }",
-    "{'descr': '<f4', 'fortran_order': False, 'shape': 'x', }",
-    "{'descr': '<f4', 'fortran_order': False}",
-    "{'descr': [('a', '<f4', (10000, 100000))], 'fortran_order': False, 'shape': (3,)}",
-    "(" * 3000,
-    "__import__('os').system('touch ran')",
-    "{'descr': '<c8', 'fortran_order': False, 'shape': (0, 2), }",
-    "",
-)
 BLOCKS = [
-    *(npz(gap=npy(header)) for header in HEADERS),
-    npz(gap=npy(HEADERS[0], version=b"\x02\x00")),
-    npz(gap=b"\x93NUMPY\x09\x00"),
-    npz(gap=b"not an array"),
-    npz(),
+    *(
+        npz(gap=npy(header))
+        for header in (
+            "{'descr': '<f4', 'fortran_order': False, 'shape': (1000000000000, 1000), }",
+            "{'descr': '|O', 'fortran_order': False, 'shape': (3, 2), }",
+            "{'descr': [('a', '<f4', (10000, 100000))], 'fortran_order': False, 'shape': (3,)}",
+            "(" * 3000,
+            "__import__('os').system('touch ran')",
+        )
+    ),
     b"PK\x03\x04 this was an archive once",
-    b"",
     npz(gap=bytes(2000))[:-60],
 ]
 
@@ -272,11 +262,10 @@ def run(finished_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
     return Path(shutil.copytree(finished_run, tmp_path / "run"))
 
 
-@pytest.mark.parametrize("number", range(len(BLOCKS)))
-def test_damaged_blocks_are_one_line(number: int, run: Path) -> None:
-    (run / "failures.npz").write_bytes(BLOCKS[number])
-    refused = cli("replay", "run")
-    assert_one_line(refused, *((0,) if number == len(HEADERS) + 3 else ()))  # an archive without blocks
+def test_damaged_blocks_are_one_line(run: Path) -> None:
+    for content in BLOCKS:
+        (run / "failures.npz").write_bytes(content)
+        assert_one_line(cli("replay", "run"))
     assert not Path("ran").exists()
 
 

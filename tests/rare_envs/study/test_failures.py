@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import json
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +19,6 @@ from rare_envs.study.failures import (
     cluster_points,
     find_modes,
     label_modes,
-    list_all_kinds,
     list_every_mode,
 )
 from rare_envs.study.question import Study
@@ -158,17 +156,3 @@ def test_what_cannot_be_driven_again_is_not_known_and_said() -> None:
     assert report.kinds.shares == {}
     assert any("the ego has gone home" in note for note in report.notes)
     assert report.to_dict()["failures"][0]["crash"] is None
-
-
-def test_a_kind_that_the_list_lacks_is_added_with_its_crash(report: Report) -> None:
-    problem, failures = report.study.problem, report.estimate.failures
-    kinds = [crash["kind"] if crash else "none" for crash in report.crashes]
-    others = np.array([kind != "rear_end" for kind in kinds])
-    short = replace(failures, x=failures.x[others], f=failures.f[others], log_p0=failures.log_p0[others])
-    listed = tuple(crash for crash, kept in zip(report.crashes, others, strict=True) if kept)
-    estimate, found = list_all_kinds(
-        problem, replace(report.estimate, failures=short), replace(report.kinds, listed=listed)
-    )
-    (added,) = [k for k, crash in enumerate(found.listed) if crash is not None and crash["kind"] == "rear_end"]
-    assert len(found.listed) == len(estimate.failures) == len(short) + 1
-    assert (estimate.failures.x[added] == failures.x[kinds.index("rear_end")]).all()

@@ -4,19 +4,24 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Callable
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 
 from rare_envs.study import BadInput, Question, prepare, resume, run_into
-from rare_envs.study.arguments import read_question
-from rare_envs.study.question import digest_files, find_changed_files, is_same_question, list_code, open_question
+from rare_envs.study.question import (
+    check_code_trust,
+    digest_files,
+    find_changed_files,
+    is_same_question,
+    list_code,
+    note_own_run,
+    open_question,
+)
 from rare_envs.study.replay import find_failure
-from rare_envs.study.run_folder import BLOCKS, FAILURES, RESULT
+from rare_envs.study.run_folder import RESULT
 from rare_envs.study.writing import begin_journal
 from tests.rare_envs.study.refusals import FOLLOWING, SMALL, Cli, assert_refused
 
@@ -105,78 +110,42 @@ def test_a_run_of_ones_own_needs_no_trust(received: Path, tmp_path: Path) -> Non
         assert find_failure(tmp_path / "mine", 0).n_found > 0
 
 
-QUESTIONS: dict[str, Any] = {
-    "a list": [1],
-    "nothing": None,
-    "no environment": {"ego": "idm"},
-    "ego is a number": {"ego": 3},
-    "ego is unknown": {"ego": "nobody"},
-    "gamma is huge": {"gamma": 10**400},
-    "seed is a fraction": {"seed": 0.5},
-    "base is a device": {"base": "/dev/null"},
-    "method is unknown": {"method": "guess"},
-    "measure is long": {"measure": "stl:" + "not " * 50_000},
-}
+def test_trust_holds_for_the_packages_on_the_way_and_for_ones_own_code_in_its_place(
+    received: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "outer").mkdir()
+    (tmp_path / "outer" / "__init__.py").write_text("raise SystemExit")  # found without being run
+    (tmp_path / "outer" / "inner.py").write_text("first = 1")
+    question, code = {"ego": "outer.inner:make"}, ["outer.inner:make"]
+    check_code_trust(question, code, received, trust=True)
+    check_code_trust(question, code, received, trust=False)
+    (tmp_path / "outer" / "__init__.py").write_text("runs = 'on import'")
+    with pytest.raises(ValueError, match="add --trust"):
+        check_code_trust(question, code, received, trust=False)
+    note_own_run({"ego": "evil:make"}, ["evil:make"])
+    check_code_trust({"ego": "evil:make"}, ["evil:make"], received, trust=False)
+    monkeypatch.chdir(tmp_path / "outer")
+    Path("evil.py").write_text("not_mine = 3")
+    with pytest.raises(ValueError, match="add --trust"):
+        check_code_trust({"ego": "evil:make"}, ["evil:make"], received, trust=False)
 
 
 @pytest.mark.filterwarnings("ignore:.*changed since the run")  # a base in the place of a file
-@pytest.mark.parametrize("name", QUESTIONS)
-def test_damaged_questions_are_refused_in_one_line(name: str, received: Path) -> None:
-    result, change = json.loads((received / RESULT).read_text()), QUESTIONS[name]
-    whole = isinstance(change, dict) and name != "no environment"
-    result["question"] = {**result["question"], **change} if whole else change
-    (received / RESULT).write_text(json.dumps(result))
-    with pytest.raises(BadInput) as caught:
-        find_failure(received, 0)
-    assert "\n" not in str(caught.value) and len(str(caught.value)) < 2000
-
-
-@pytest.mark.parametrize(
-    ("values", "words"),
-    [
-        ([1], "an object with env_id"),
-        ({"env_id": FOLLOWING, "seed": 1.5}, "seed of the recorded question to be a whole number, got 1.5"),
-        ({"env_id": FOLLOWING, "seed": True}, "seed of the recorded question to be a whole number, got True"),
+def test_odd_questions_are_refused_in_one_line(received: Path) -> None:
+    for change, words in (
+        ({"seed": True}, "seed of the recorded question to be a whole number, got True"),
         ({"env_id": [FOLLOWING]}, "env_id of the recorded question to be a text"),
-    ],
-)
-def test_what_is_no_question_is_refused(values: Any, words: str) -> None:
-    with pytest.raises(BadInput, match=words):
-        read_question(values)
-
-
-def write(name: str, content: bytes) -> Callable[[Path], object]:
-    return lambda folder: (folder / name).write_bytes(content)
-
-
-def change_table(change: Callable[[list[str]], list[str]]) -> Callable[[Path], object]:
-    return lambda folder: (folder / FAILURES).write_text(
-        "\n".join(change((folder / FAILURES).read_text().splitlines()))
-    )
-
-
-FILES: dict[str, Callable[[Path], object]] = {
-    "nested result": write(RESULT, b"[" * 100_000),
-    "result is no text": write(RESULT, b"\xff\xfe\x00"),
-    "no table": lambda folder: (folder / FAILURES).unlink(),
-    "table is no text": write(FAILURES, b"\xff\xfe\x00\x01"),
-    "no f": change_table(lambda lines: [line.replace("log_p0", "g").replace("f,", "h,") for line in lines]),
-    "words for numbers": change_table(lambda lines: [lines[0], ",".join("a" * (lines[0].count(",") + 1))]),
-    "far outside": change_table(lambda lines: [lines[0], ",".join(["1e300"] * (lines[0].count(",") + 1))]),
-    "no rows": change_table(lambda lines: lines[:1]),
-    "long cell": change_table(lambda lines: [lines[0], "1" * 200_000]),
-    "another problem": change_table(lambda lines: [line.replace("gap", "gas") for line in lines]),
-    "blocks are no archive": write(BLOCKS, b"PK noise"),
-    "blocks of objects": lambda folder: np.savez(folder / BLOCKS, gap=np.array([print], dtype=object)),
-}
-
-
-@pytest.mark.parametrize("name", FILES)
-def test_damaged_folders_are_refused_in_one_line(name: str, received: Path) -> None:
-    FILES[name](received)
-    with pytest.raises(BadInput) as caught:
-        find_failure(received, 0)
-    assert "\n" not in str(caught.value)
+        ({"gamma": 10**400}, "401 digits"),
+        ({"base": "/dev/null"}, ""),
+        ({"measure": "stl:" + "not " * 50_000}, ""),
+    ):
+        before = (received / RESULT).read_text()
+        change_question(received, **change)
+        with pytest.raises(BadInput) as caught:
+            find_failure(received, 0)
+        said = str(caught.value)
+        assert words in said and "\n" not in said and len(said) < 2000
+        (received / RESULT).write_text(before)
 
 
 def test_values_of_every_field_are_taken_back_and_what_is_no_code_is_not_listed(received: Path) -> None:

@@ -9,8 +9,7 @@ import pytest
 
 import agents
 from rare_envs.study import Question, prepare, run
-from rare_envs.study.evaluate import KEPT_ROWS, ROWS_ALONE, RowKeeper
-from samplers.evaluate import Simulated
+from rare_envs.study.evaluate import KEPT_ROWS, ROWS_ALONE
 
 QUESTION = Question(
     env_id="rare_envs/CarFollowing-v0", base="us101-gap", gamma=3.0, horizon=3.0, method="mc", max_sim=300
@@ -62,20 +61,3 @@ def test_others_are_not_suspected(ego: Any) -> None:
     found = run(prepare(QUESTION, ego=agents.load_ego(ego) if isinstance(ego, str) else ego)).repeatability
     assert found is not None
     assert (found.n, found.n_differing, found.warning) == (KEPT_ROWS + ROWS_ALONE, 0, "")
-
-
-def test_every_row_has_the_same_chance_to_be_kept() -> None:
-    """400 samples of 4 of 10 rows, one of which has no f: each is kept in 4 of 9, five standard errors allowed."""
-    counts = np.zeros(10)
-    for seed in range(400):
-        keeper = RowKeeper(1, gamma=3.2, size=8)
-        keeper._rng = np.random.default_rng(seed)
-        for part in (np.arange(3), np.arange(3, 9), np.arange(9, 10)):
-            x = part[:, None].astype(float)
-            keeper.keep(Simulated(x, np.where(part == 5, np.nan, part).astype(float), [], np.zeros(len(x))))
-        np.testing.assert_array_equal(keeper.x[:, 0], keeper.f)
-        np.testing.assert_array_equal(keeper.f[4:], [3, 4, 2, 1])
-        counts[keeper.f[:4].astype(int)] += 1
-    expected = 400 * 4 / 9
-    assert counts[5] == 0
-    assert np.abs(np.delete(counts, 5) - expected).max() < 5 * (expected * 5 / 9) ** 0.5

@@ -2,15 +2,23 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
+from matplotlib.image import imread
+from PIL import Image
 
 import rare_envs
+import samplers
+from rare_envs.study import Question, Report, prepare, run
 from rare_envs.study.arguments import BadInput
+from rare_envs.study.plots import MOMENTS, draw_convergence, draw_drive, explain_no_failure, save_plot
 from rare_envs.study.replay import describe_drive, drive_again, find_failure
-from tests.rare_envs.study.refusals import FOLLOWING
+from rare_envs.study.video import MARKER, draw_frames, write_film
+from tests.rare_envs.study.refusals import FOLLOWING, SMALL, Cli
 
 
 @pytest.mark.parametrize("env_id", rare_envs.ENV_IDS)
@@ -75,3 +83,74 @@ def test_a_drive_that_comes_out_otherwise_says_why(finished_run: Path) -> None:
     assert "recorded" not in describe_drive(found, drive, 0)[-1]
     with pytest.raises(BadInput, match="Expected a failure from 0 to"):
         find_failure(finished_run, 10_000)
+
+
+pytestmark = pytest.mark.usefixtures("full_pictures")
+
+
+def test_the_folder_of_a_run_holds_what_was_printed_and_a_picture(cli: Cli, risky: str, tmp_path: Path) -> None:
+    out = tmp_path / "runs" / "one"
+    result = cli(*SMALL, "--base", risky, "--out", out, "--json")
+    assert result.exit_code == 0
+    tables = ["episodes.parquet", "failures.csv", "plot.png", "result.json", "severity.png", "study.json"]
+    assert sorted(path.name for path in out.iterdir()) == tables
+    assert json.loads((out / "result.json").read_text()) == json.loads(result.stdout)
+    picture = imread(out / "plot.png")[..., :3]
+    assert picture.shape[0] > 500 and picture.shape[1] > 1500
+    for part in np.array_split(picture, 3, axis=1):  # each of the three drawings has ink and colour
+        assert 0.01 < np.mean(part.min(axis=2) < 0.9) < 0.6
+        assert np.mean(np.ptp(part, axis=2) > 0.2) > 0.001
+
+
+@pytest.mark.parametrize("env_id", ["rare_envs/CutIn-v0", "rare_envs/HardBrake-v0"])
+def test_the_legend_says_which_vehicle_is_which(env_id: str) -> None:
+    problem = rare_envs.DrivingProblem(env_id, horizon=3.0)
+    axes = list(Figure().subplots(MOMENTS + 1))
+    draw_drive(axes, drive_again(problem, problem.base.sample(1, np.random.default_rng(0))[0]))
+    speeds = [f"speed of {label}" for label in problem.world.scenario.labels]
+    assert [text.get_text() for text in axes[-1].get_legend().get_texts()] == [*speeds, "gap to the vehicle ahead"]
+
+
+def test_a_run_without_a_failure_shows_how_its_bound_falls(tmp_path: Path) -> None:
+    report = run(prepare(Question(env_id=FOLLOWING, base="i24", ego="idm", max_sim=200, method="mc")))
+    high = report.estimate.interval[1]
+    axes = Figure().subplots()
+    draw_convergence(axes, report.to_dict())
+    spent, bound = next(line for line in axes.get_lines() if "without a failure" in str(line.get_label())).get_data()
+    np.testing.assert_allclose([spent[0], bound[0], spent[-1], bound[-1]], [1.0, 1.0, 200.0, high], rtol=1e-6)
+    np.testing.assert_allclose(bound[bound < 1.0] * spent[bound < 1.0], 200.0 * high, rtol=1e-6)
+    assert f"below {high:.1e} (95 %)" in explain_no_failure(report)
+    save_plot(tmp_path / "plot.png", report)
+    assert (tmp_path / "plot.png").stat().st_size > 20_000
+
+
+@pytest.mark.parametrize("env_id", rare_envs.ENV_IDS)
+def test_a_film_of_every_scenario_without_a_crash(env_id: str, tmp_path: Path) -> None:
+    problem = rare_envs.DrivingProblem(env_id, horizon=1.0, noise=False)
+    drive = drive_again(problem, problem.base.sample(1, np.random.default_rng(0))[0])
+    shown = draw_frames(drive)
+    assert len(shown) == 11 and drive.crash is None
+    cursor = [np.flatnonzero((np.asarray(each)[-60] == MARKER).all(axis=-1)).mean() for each in shown]
+    np.testing.assert_allclose(np.diff(cursor), np.mean(np.diff(cursor)), atol=1.1)  # the cursor moves evenly
+    write_film(tmp_path / "small.gif", drive, width=400, every=2)
+    with Image.open(tmp_path / "small.gif") as film:
+        assert film.size[0] == 400
+
+
+def test_sensitivity_is_shown_and_written(cli: Cli, tmp_path: Path) -> None:
+    words = ("estimate", FOLLOWING, "--base", "us101-gap", "--max-sim", 2000, "--sensitivity", "--out", tmp_path)
+    shown = cli(*words)
+    assert shown.exit_code in (0, 3) and "importance of the parameters of x" in shown.stdout
+    saved = json.loads((tmp_path / "result.json").read_text())["sensitivity"]
+    assert {each["name"] for each in saved["columns"]} == {"ego_speed", "lead_speed", "gap"}
+    assert any("gap" in each["name"] for each in saved["parameters"])
+    assert (tmp_path / "sensitivity.png").exists()
+
+
+def test_without_failures_a_note_says_why_there_is_no_sensitivity() -> None:
+    for asked in (False, True):
+        study = prepare(Question(env_id=FOLLOWING, method="mc", max_sim=50, sensitivity=asked))
+        report = Report(study, samplers.estimate(study.problem, "mc", max_sim=50, seed=0), 1.0)
+        assert report.to_dict()["sensitivity"] is None
+        note = "sensitivity is not known: No point failed (f <= 0): there is nothing to analyse."
+        assert (note in report.notes) is asked

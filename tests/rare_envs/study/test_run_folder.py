@@ -12,7 +12,7 @@ import pytest
 
 import rare_envs
 from rare_envs.study import BadInput, Question, prepare, run_folder
-from rare_envs.study.writing import _describe_command, finish_study_file
+from rare_envs.study.writing import finish_study_file
 
 
 def test_what_is_loaded_is_what_the_files_hold(finished_run: Path) -> None:
@@ -35,10 +35,7 @@ def test_loading_takes_neither_torch_nor_the_simulation(finished_run: Path) -> N
 
 @pytest.mark.parametrize(
     "text",
-    [
-        *("", "{", "[1]", '{"p": "low", "interval": [0, 1]}', '{"p": 0.1, "interval": [0]}', '{"p": true}'),
-        *('{"p": NaN, "interval": [0, 1]}', '{"p": 0.1, "interval": [-1, 1]}', '{"p": 0.1, "interval": [0, Infinity]}'),
-    ],
+    ["", "[1]", '{"p": "low", "interval": [0, 1]}', '{"p": true}', '{"p": 0.1, "interval": [0, Infinity]}'],
 )
 def test_a_damaged_result_is_refused_in_one_line(tmp_path: Path, text: str) -> None:
     with pytest.raises(BadInput, match="No finished run"):
@@ -80,12 +77,6 @@ def test_a_damaged_table_and_one_that_is_too_large_for_memory_are_refused(
     (tmp_path / "episodes.parquet").write_bytes(study.episodes_path.read_bytes()[:-40])
     with pytest.raises(ValueError, match=r"episodes\.parquet"):
         rare_envs.load_study(tmp_path).episodes()
-
-
-def test_the_command_is_that_of_this_program_alone() -> None:
-    assert _describe_command(["/x/bin/rare-envs", "estimate", "a b"]) == "rare-envs estimate 'a b'"
-    assert _describe_command(["/x/rare_envs/__main__.py", "list"]) == "rare-envs list"
-    assert _describe_command(["/x/pytest"]) == _describe_command([]) == ""
 
 
 def test_a_run_that_ends_keeps_what_its_file_held_of_the_beginning(tmp_path: Path) -> None:

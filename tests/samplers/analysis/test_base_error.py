@@ -72,21 +72,6 @@ def test_a_base_without_refits_prints_what_it_did():
     assert (plain.p, plain.interval, plain.n_sim) == (fitted_run.p, fitted_run.interval, fitted_run.n_sim)
 
 
-def test_the_lines_stand_under_the_sampling_interval():
-    result = run(BASE)
-    lines, found = str(result).splitlines(), result.base_uncertainty
-    low, high = found.interval
-    assert lines[1].startswith("  95 % interval [")
-    assert lines[2] == (
-        f"  base distribution 95 %  {low:.1e} to {high:.1e} (38 + 15 events of 17 scenes, 30 refits); "
-        f"predictive mean {found.expected:.0e}"
-    )
-    assert lines[3] == (
-        "    assumes that the fitted family is correct (1 component, log gaps); errors of the family are not included"
-    )
-    assert "simulations, gain" in lines[4]
-
-
 @pytest.mark.parametrize(
     ("change", "text"),
     [

@@ -56,18 +56,6 @@ def test_one_threshold_has_the_interval_of_the_estimate(method):
     assert (curve.low[0], curve.high[0]) == pytest.approx(result.interval, rel=0.01)
 
 
-@pytest.mark.parametrize("method", ["ss", "adss"])
-def test_thresholds_passed_early_rest_on_all_points_of_their_level(method):
-    result = run(method, beta=3.5)
-    curve = result.curve([3.5, 5.0])  # level 0: 1000 plain draws
-    hits = np.round(curve.p * 1000)
-    np.testing.assert_allclose(curve.p * 1000, hits)
-    np.testing.assert_allclose(curve.ess, hits)
-    np.testing.assert_allclose(curve.cov, np.sqrt((1 - curve.p) / hits))
-    second = result.trace[0].gamma - 1e-9  # just inside level 1, which descends from 100 points
-    assert 40 < result.curve([second]).ess[0] <= 100
-
-
 @pytest.mark.parametrize("method", ["mc", "ce", "adss"])
 def test_too_low_a_threshold_is_refused_with_what_is_known(method):
     result = run(method, max_sim=3000)

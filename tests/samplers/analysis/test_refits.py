@@ -2,7 +2,6 @@
 
 import math
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,7 +13,6 @@ from samplers.analysis.reweight import (
     expect_over_families,
     find_log_ends,
     needs_ensemble_run,
-    read_refit_families,
     reweight_to_refits,
     split_families,
 )
@@ -146,30 +144,6 @@ def test_a_refit_that_does_not_fit_is_refused_before_the_first_simulation(refit,
     check_refits(fitted([normal(), normal()]), 2)
 
 
-class CountedRefit:
-    """A refit that counts how often its density is asked for."""
-
-    def __init__(self, mean):
-        self.distribution, self.calls = normal(mean), 0
-
-    def log_prob(self, x):
-        self.calls += 1
-        return self.distribution.log_prob(x)
-
-
-def test_density_ratios_are_computed_once_for_a_run():
-    base = fitted([CountedRefit(mean) for mean in (-0.1, 0.0, 0.1)])
-    result = samplers.estimate(HalfSpace(base), seed=1, max_sim=3000)
-    for refit in base.refits:
-        refit.calls = 0
-    for again in (result, replace(result, ensemble_run=None)):
-        assert again.base_uncertainty is not None
-        reweight_to_refits(again, base.refits, np.ones((3, len(result.sample.x))))
-        assert [refit.calls for refit in base.refits] == [1, 1, 1]
-    reweight_to_refits(replace(result, sample=replace(result.sample)), base.refits)
-    assert [refit.calls for refit in base.refits] == [2, 2, 2]
-
-
 OWN = np.array([-1.0, 0.0, 1.0] * 20)
 """60 refits around 0, variance 40 / 59."""
 T = {4: 2.776445, 11: 2.200985, 59: 2.000995, 64: 1.997730}
@@ -178,11 +152,6 @@ T = {4: 2.776445, 11: 2.200985, 59: 2.000995, 64: 1.997730}
 
 def ends_of(log_p, values, family_of, other_variance=0.0, clusters=1000):
     return find_log_ends(split_families(log_p, values, family_of), other_variance, 0.95, clusters)
-
-
-def test_one_family_has_the_interval_around_p_itself():
-    half = T[59] * np.sqrt(40 / 59 + 0.04)
-    assert ends_of(0.3, OWN, np.zeros(60, dtype=int), 0.04) == pytest.approx((0.3 - half, 0.3 + half))
 
 
 @pytest.mark.parametrize(("shift", "end"), [(-8.0, 0), (8.0, 1)])
@@ -213,10 +182,3 @@ def test_what_two_families_expect_by_hand():
     assert values.std(ddof=1) == pytest.approx(3.38, abs=0.01)
     families = split_families(np.log(0.01), values, np.repeat([0, 1], [60, 30]))
     assert expect_over_families(families) == pytest.approx(0.014035 * 2 / 3 + 1.412e-5 / 3, rel=1e-3)
-
-
-def test_a_base_may_know_no_families_and_must_know_all():
-    assert read_refit_families(object(), 3).tolist() == [0, 0, 0]
-    assert read_refit_families(SimpleNamespace(refit_families=(0, 1, 1)), 3).tolist() == [0, 1, 1]
-    with pytest.raises(ValueError, match="one family for each of 3 refits"):
-        read_refit_families(SimpleNamespace(refit_families=(0, 1)), 3)

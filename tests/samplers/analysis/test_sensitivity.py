@@ -49,14 +49,6 @@ def test_irrelevant_noise_has_no_importance():
     assert importance["noise"] < 0.05
 
 
-def test_a_single_failing_point_says_so():
-    problem = samplers.FunctionProblem(lambda x: 3.0 - x[:, 0], dim=2)
-    result = samplers.estimate(problem, "mc", seed=0, max_sim=1000)
-    assert result.failures.total == 1
-    with pytest.raises(ValueError, match="A single point failed"):
-        result.sensitivity()
-
-
 @pytest.mark.parametrize("method", ["two-stage", "mc", "is", "ce", "adss"])
 def test_derivatives_are_those_of_the_half_space(method):
     """By a mean, per standard deviation: alpha_j h with h = phi / Phi(-); by a sd, per 10 %: 0.1 alpha_j^2 beta h."""

@@ -18,12 +18,8 @@ def choice(dim=2, seconds=None, **goal):
     ("expected", "arguments"),
     [
         ("two-stage", {}),
-        ("two-stage", {"max_sim": 6000}),
-        ("two-stage", {"max_sim": 299}),
         ("two-stage", {"max_sim": 300, "dim": 7}),
         ("two-stage", {"seconds": 5.0, "dim": 7}),
-        ("two-stage", {"seconds": 5.0, "target_cov": 0.1}),
-        ("two-stage", {"seconds": 0.9}),
         ("surrogate", {"max_sim": 300}),
         ("surrogate", {"max_sim": 500, "dim": 6}),
         ("two-stage", {"seconds": 1.0}),
@@ -34,15 +30,19 @@ def test_rule(expected, arguments):
     assert choice(**arguments) == expected
 
 
-def test_noise_does_not_count_as_dimensions():
+def test_noise_does_not_count_as_dimensions_and_a_search_by_terms_is_named():
+    """Two coordinates are searched and 100 are noise: with terms and 1,000 simulations that is a search by terms."""
+
     class Base(samplers.StandardNormal):
         noise = np.arange(102) >= 2
 
-    class Noisy:
-        dim, base = 102, Base(102)
-
-    choice = samplers.Auto().choose(Noisy(), Goal(gamma=0.0, max_sim=300))
-    assert (choice.method.name, choice.why) == ("surrogate", "surrogate: 300 simulations for 2 dimensions")
+    for offer, max_sim, name, why in (
+        (None, 300, "surrogate", "surrogate: 300 simulations for 2 dimensions"),
+        (None, 1000, "two-stage", "two-stage: 1,000"),
+        (TermsOffer(gradient_cost=5.0), 1000, "two-stage", "two-stage by terms: 1,000"),
+    ):
+        choice = samplers.Auto().choose(InputsOnly(102, Base(102), offer), Goal(gamma=0.0, max_sim=max_sim))
+        assert choice.method.name == name and choice.why.startswith(why)
 
 
 @pytest.mark.parametrize(
@@ -57,17 +57,6 @@ def test_the_result_is_that_of_the_method_chosen(max_sim, name):
     assert (f"chosen {result.choice}" in str(result)) == (name == "surrogate")  # the usual one is not announced
     assert result.to_dict()["choice"] == result.choice
     assert samplers.estimate(problem, name, seed=4, max_sim=max_sim).choice == ""
-
-
-def test_a_search_by_terms_is_named():
-    """Two coordinates are searched and 100 are noise: with terms and 1,000 simulations that is a search by terms."""
-
-    class Base(samplers.StandardNormal):
-        noise = np.arange(102) >= 2
-
-    for offer, expected in ((None, "two-stage"), (TermsOffer(gradient_cost=5.0), "two-stage by terms")):
-        inputs = InputsOnly(102, Base(102), offer)
-        assert samplers.Auto().choose(inputs, Goal(gamma=0.0, max_sim=1000)).why.startswith(f"{expected}: 1,000")
 
 
 @pytest.mark.slow

@@ -18,16 +18,6 @@ def mean_error(found):
     return found.ratios.std(ddof=1) / math.sqrt(len(found.results))
 
 
-def test_search_goes_down_to_gamma_and_is_counted():
-    result = samplers.estimate(half_space().problem, CE(), seed=1)
-    levels = [level.gamma for level in result.trace]
-    assert levels == sorted(levels, reverse=True)
-    assert levels[-1] == 0.0
-    assert result.n_sim == sum(level.n_sim for level in result.trace)
-    assert result.trace[-1].n_sim == 4000
-    assert result.p == result.trace[-1].estimate  # the fresh draws alone
-
-
 @pytest.mark.parametrize(
     "reference",
     [
@@ -52,19 +42,6 @@ def test_final_draws_serve_higher_thresholds():
         weights = sample.weights[sample.f <= g]
         assert weights.sum() == pytest.approx(stats.norm.sf(3.5 - g), abs=4 * np.sqrt((weights**2).sum()))
     np.testing.assert_allclose(half_space(2, 3.5).problem.f(sample.x), sample.f[sample.f <= 0])
-
-
-def test_a_step_of_the_search_matches_moments():
-    """Equation 2 for a Gaussian: with alpha = 1 and many points the moments of the elite."""
-    elite = np.random.default_rng(1).standard_normal((100_000, 2)) * [0.5, 1.0] + [2.0, 0.0]
-    start, ratios = Product((GaussianBlock(Gaussian.standard(2)),)), np.zeros((1, len(elite)))
-    moved = CE()._project(start, elite, ratios, 1.0).blocks[0].gaussian
-    np.testing.assert_allclose(moved.mean, elite.mean(axis=0))
-    np.testing.assert_allclose(moved.covariance, np.cov(elite.T), atol=1e-3)
-    half = CE()._project(start, elite, ratios, 0.5).blocks[0].gaussian
-    np.testing.assert_allclose(half.mean, elite.mean(axis=0) / 2)
-    # mixture of N(0, I) and the elite: mean of the variances plus a quarter of the shift squared
-    np.testing.assert_allclose(np.diag(half.covariance), [0.625 + 1.0, 1.0], atol=0.02)
 
 
 def test_a_step_of_the_search_uses_the_likelihood_ratio(rng):
@@ -100,29 +77,6 @@ def test_interval_of_a_hopeless_proposal_still_holds_p():
 
 def uniform_weights(n):
     return np.full(n, 1 / n)
-
-
-def test_mixture_splits_into_two_regions(rng):
-    """Two clusters and a step alpha = 1: one component each, with the share and the mean of its cluster."""
-    elite = rng.standard_normal((4000, 2)) * 0.3 + np.where(rng.random((4000, 1)) < 0.25, [3.0, 0.0], [-3.0, 1.0])
-    moved = MixtureBlock(Gaussian.standard(2), 2).project(elite, uniform_weights(4000), 1.0)
-    order = np.argsort(moved.mixture.weights)
-    np.testing.assert_allclose(moved.mixture.weights[order], [0.25, 0.75], atol=0.03)
-    means = np.array([moved.mixture.components[j].mean for j in order])
-    np.testing.assert_allclose(means, [[3.0, 0.0], [-3.0, 1.0]], atol=0.05)
-    np.testing.assert_allclose(moved.mixture.components[0].covariance, 0.09 * np.eye(2), atol=0.02)
-
-
-def test_mixture_steps_raise_the_objective_of_equation_2(rng):
-    """alpha E_Q[log p] + (1 - alpha) E_P[log p], by draws; no pull worth mentioning at 20,000 points."""
-    elite = rng.standard_normal((20_000, 2)) + np.where(rng.random((20_000, 1)) < 0.3, [3.0, 0.0], [0.0, 3.0])
-    block = MixtureBlock(Gaussian.standard(2), 3).project(elite, uniform_weights(20_000), 0.5)
-    other = elite * [1.0, 0.6]
-    values = []
-    draws = block.sample(20_000, rng)
-    for distribution in (block, block.project(other, uniform_weights(20_000), 0.7)):
-        values.append(0.7 * distribution.log_prob(other).mean() + 0.3 * distribution.log_prob(draws).mean())
-    assert values[1] > values[0] + 0.01
 
 
 def test_mixture_keeps_the_share_1_minus_alpha_of_the_present_distribution():

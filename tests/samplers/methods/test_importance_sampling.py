@@ -9,19 +9,9 @@ from scipy import stats
 import samplers
 from samplers.limit_states import four_branches, half_space, parabola, plateau
 from samplers.method import Goal
-from samplers.problem import StandardNormal
-from samplers.proposals import TiltedNormal
 from samplers.sample import Status
 
 IS = samplers.ImportanceSampling
-
-
-def test_a_tilt_of_the_standard_normal_distribution_is_a_shift(rng):
-    theta = np.array([1.5, -0.5])
-    tilted, u = TiltedNormal(theta), rng.standard_normal((5, 2))
-    ratio = tilted.log_prob(u) - StandardNormal(2).log_prob(u)
-    np.testing.assert_allclose(ratio, u @ theta - 0.5 * theta @ theta)
-    np.testing.assert_allclose(tilted.sample(20_000, rng).mean(axis=0), theta, atol=0.04)
 
 
 def test_the_tilt_is_the_mean_of_the_failures(drive):

@@ -9,7 +9,6 @@ from scipy import stats
 import samplers
 from samplers.limit_states import four_branches, half_space, parabola, plateau, shell
 from samplers.method import Goal
-from samplers.methods.improved_cross_entropy import log_smooth_indicator, next_width, weights_cov
 from samplers.problem import FunctionProblem
 
 ICE = samplers.ImprovedCrossEntropy
@@ -24,8 +23,6 @@ def gain(found):
     ("reference", "family", "least"),
     [
         pytest.param(half_space(), "gaussian", 700, marks=pytest.mark.slow),
-        pytest.param(half_space(), "mixture", 1500, marks=pytest.mark.slow),
-        pytest.param(half_space(), "vmfn", 700, marks=pytest.mark.slow),
         pytest.param(parabola(), "mixture", 700, marks=pytest.mark.slow),
         (four_branches(), "mixture", 10),
         pytest.param(plateau(), "mixture", 1000, marks=pytest.mark.slow),
@@ -50,7 +47,7 @@ def test_a_family_that_does_not_fit_says_so():
     assert sum(r.interval[0] <= shell().p <= r.interval[1] for r in results) >= 4
 
 
-@pytest.mark.parametrize("far", [np.inf, 1e308, 1e12])
+@pytest.mark.parametrize("far", [np.inf, 1e12])
 def test_outcomes_that_stand_for_nothing(far):
     """Half of the scenarios have no meaningful outcome."""
     reference = half_space(2, 3.0)
@@ -59,14 +56,6 @@ def test_outcomes_that_stand_for_nothing(far):
     exact = reference.p - float(stats.multivariate_normal([0, 0], [[1, -s], [-s, 1]]).cdf([-3.0, 0.0]))
     found = np.mean([samplers.estimate(problem, ICE(), seed=seed).p for seed in range(5)])
     assert found == pytest.approx(exact, rel=0.06)
-
-
-def test_the_width_gives_the_weights_their_spread(rng):
-    g, log_ratio = 3.0 - rng.standard_normal(1000), 0.1 * rng.standard_normal(1000)
-    width = next_width(g, log_ratio, 1.5, 1e-15, 30.0)
-    assert weights_cov(log_smooth_indicator(g, width) + log_ratio) == pytest.approx(1.5, abs=1e-6)
-    assert next_width(g, log_ratio, 1.5, 1e-15, 0.1) == 0.1  # as wide as allowed is too narrow
-    assert next_width(-abs(g), log_ratio, 1.5, 1e-15, 30.0) == 1e-15  # all fail
 
 
 def test_final_weights_are_bounded_by_the_base_draws(drive):

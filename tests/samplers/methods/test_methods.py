@@ -47,11 +47,8 @@ def test_our_own_are_frozen_documented_dataclasses_that_can_be_asked(name):
 BAD_SETTINGS = {
     samplers.MonteCarlo: [{"n": 0}, {"batch": 10.5}],
     samplers.ImportanceSampling: [{"half_width": 0.0}, {"n_round": 5}, {"max_rounds": 0}, {"rho": 0.5}],
-    samplers.CrossEntropy: [
-        *({"rho": 0.6}, {"alpha": 1.2}, {"alpha": ()}, {"alpha": (0.8, 1.2)}, {"n_iteration": (1000, 5)}),
-        *({"base_share": 0.0}, {"wide_share": 0.95}, {"family": "beta"}, {"likelihood_ratio": "none"}),
-    ],
-    samplers.ImprovedCrossEntropy: [{"family": "student"}, {"weight_cov": 0.0}, {"wide_share": 0.9}],
+    samplers.CrossEntropy: [{"rho": 0.6}, {"alpha": (0.8, 1.2)}, {"n_iteration": (1000, 5)}, {"family": "beta"}],
+    samplers.ImprovedCrossEntropy: [{"weight_cov": 0.0}, {"wide_share": 0.9}],
     samplers.SubsetSimulation: [{"distribution": "beta"}, {"spread": 0.0}],
     samplers.AdaptiveSubsetSimulation: [{"n": 5}, {"p0": 0.5}, {"scale": 0.0}, {"sigma0": "sample"}],
     samplers.TwoStage: [{"n": 399}, {"n": True}],
@@ -134,9 +131,6 @@ def test_few_and_large_calls(method, recorder):
 
 
 OUTCOMES = {
-    "+inf": (lambda u: np.full(len(u), np.inf), 0.0),
-    "-inf": (lambda u: np.full(len(u), -np.inf), 1.0),
-    "gamma": (lambda u: np.zeros(len(u)), 1.0),
     "NaN": (lambda u: np.full(len(u), np.nan), 1.0),
     "+inf and less": (lambda u: np.where(u[:, 0] < 0, np.inf, 2.0 - u[:, 0]), stats.norm.sf(2.0)),
     "-inf and +inf": (lambda u: np.where(u[:, 0] > 2.0, -np.inf, np.inf), stats.norm.sf(2.0)),
@@ -145,9 +139,7 @@ OUTCOMES = {
 
 
 @pytest.mark.parametrize("outcome", OUTCOMES)
-@pytest.mark.parametrize(
-    "max_sim", [10, pytest.param(1, marks=pytest.mark.slow), pytest.param(1200, marks=pytest.mark.slow)]
-)
+@pytest.mark.parametrize("max_sim", [10, pytest.param(1200, marks=pytest.mark.slow)])
 def test_any_outcome_with_any_budget(method, outcome, max_sim):
     f, p = OUTCOMES[outcome]
     result = samplers.estimate(FunctionProblem(f, 1), method, seed=4, max_sim=max_sim, on_error="bound")

@@ -46,17 +46,6 @@ def test_draws_from_the_base_itself():
     assert samplers.estimate(Problem(), "mc", seed=1, max_sim=100).p > 0.3
 
 
-def test_gives_all_its_draws_with_equal_weight(recorder):
-    f = recorder(EASY.problem.f)
-    result = samplers.estimate(samplers.FunctionProblem(f, 2), samplers.MonteCarlo(batch=300), seed=1, max_sim=1000)
-    sample = result.sample
-    np.testing.assert_array_equal(sample.f, EASY.problem.f(f.points))
-    np.testing.assert_array_equal(sample.weights, 1e-3)
-    np.testing.assert_array_equal(sample.units, np.arange(1000))
-    assert sample.n_units == 1000
-    np.testing.assert_array_equal(sample.x, f.points[sample.f <= 0])
-
-
 def test_thinned_draws_keep_p_and_match_failing_points_with_their_f(rng: np.random.Generator) -> None:
     x = rng.standard_normal((1000, 2))
     f = np.where(x[:, 1] > 1.5, -np.inf, x[:, 0])

@@ -7,7 +7,6 @@ import pytest
 from scipy import stats
 
 import samplers
-from samplers.methods.base import marginalise_noise
 from samplers.problem import FunctionProblem, StandardNormal
 
 PHI = stats.norm.cdf
@@ -68,15 +67,3 @@ def test_failures_replay_and_their_noise_is_noise():
     np.testing.assert_array_equal(f(x), [failure.f for failure in result.failures])
     size = (x[:, 3:] ** 2).mean(axis=1)  # wide draws of it would have 2 to 9
     assert np.all(np.abs(size - 1) < 6 * np.sqrt(2 / 300))
-
-
-def test_points_keep_their_noise():
-    inputs = marginalise_noise(problem(sum_of), np.random.default_rng(0))
-    assert inputs.dim == 3
-    u = np.random.default_rng(1).standard_normal((5, 3))
-    x = inputs.base.from_standard_normal(u)
-    again = inputs.base.from_standard_normal(np.concatenate([u[2:], u + 1e-9]))
-    np.testing.assert_array_equal(again[:3], x[2:])
-    assert np.abs(again[3:, 3:] - x[:, 3:]).min(axis=0).max() > 0
-    np.testing.assert_array_equal(inputs.base.to_standard_normal(x), u)
-    assert inputs.base.sample(4, np.random.default_rng(2)).shape == (4, 303)

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy import optimize, stats
 from scipy.stats import chi2, norm
 
 import samplers
@@ -9,17 +10,8 @@ from samplers.problem import TermGradients, Terms
 from samplers.sample import Status
 
 
-def make_half_spaces(dim, p, shares=(0.8, 0.15, 0.05), scale=None, seed=0, **options):
-    """Return a problem that fails beyond any of some orthogonal planes, its exact p and the normals (J, d).
-
-    Args:
-        dim: Number of dimensions.
-        p: About the probability.
-        shares: Of the planes in it.
-        scale: Factor of each term.
-        seed: Of the normals.
-        options: Of FunctionProblem.
-    """
+def half_spaces(dim, p, shares=(0.8, 0.15, 0.05), scale=None, seed=0, **options):
+    """Return a problem that fails beyond any of some orthogonal planes, its exact p and the normals (J, d)."""
     normals = np.linalg.qr(np.random.default_rng(seed).standard_normal((dim, len(shares))))[0].T
     beta, scale = -norm.ppf(np.array(shares) * p), np.ones(len(shares)) if scale is None else np.array(scale)
 
@@ -29,11 +21,6 @@ def make_half_spaces(dim, p, shares=(0.8, 0.15, 0.05), scale=None, seed=0, **opt
     options = {"gradient": gradient, **options}
     problem = samplers.FunctionProblem(dim=dim, terms=lambda x: (beta - x @ normals.T) * scale, **options)
     return problem, float(1 - np.prod(norm.cdf(beta))), normals
-
-
-@pytest.fixture
-def half_spaces():
-    return make_half_spaces
 
 
 def runs(problem, seeds, **options):
@@ -59,7 +46,7 @@ def check(results, p, own_low=0.5):
         pytest.param(1448, 1e-5, 10, marks=pytest.mark.slow),
     ],
 )
-def test_series_systems_of_half_spaces(half_spaces, dim, p, seeds):
+def test_series_systems_of_half_spaces(dim, p, seeds):
     """Shares 0.8, 0.15 and 0.05. C.o.v. of 0.017 to 0.037 were measured."""
     problem, exact, _ = half_spaces(dim, p)
     results = runs(problem, range(seeds))
@@ -98,7 +85,7 @@ def test_a_term_with_an_early_and_a_late_mode():
 
 
 @pytest.mark.slow
-def test_a_wrong_gradient_costs_accuracy_and_nothing_else(half_spaces):
+def test_a_wrong_gradient_costs_accuracy_and_nothing_else():
     """Gradients that are as much noise as signal: p stays right, the c.o.v. about doubles. With noise alone the search
     gives up, says so, and subset simulation has the rest."""
     rng = np.random.default_rng(5)
@@ -114,7 +101,7 @@ def test_a_wrong_gradient_costs_accuracy_and_nothing_else(half_spaces):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("known", [False, True])
-def test_failures_of_a_term_that_nobody_pursued_are_told(half_spaces, known):
+def test_failures_of_a_term_that_nobody_pursued_are_told(known):
     """A term with 30 % of p has no gradient, so that nothing but base draws meets its failures; or it has one."""
     _, exact, normals = half_spaces(40, 0.03, shares=(0.7, 0.3))
 
@@ -131,14 +118,14 @@ def test_failures_of_a_term_that_nobody_pursued_are_told(half_spaces, known):
         assert any(told) and all(np.logical_or(told, given_up))
 
 
-def test_common_failures_are_left_to_monte_carlo(half_spaces):
+def test_common_failures_are_left_to_monte_carlo():
     problem, exact, _ = half_spaces(50, 0.3)
     result = samplers.estimate(problem, seed=1, max_sim=4000)
     assert abs(result.p - exact) < 4 * np.sqrt(exact * (1 - exact) / 3600)
     assert result.n_sim == 4000
 
 
-def test_without_any_failure_p_is_0_with_an_upper_end(half_spaces):
+def test_without_any_failure_p_is_0_with_an_upper_end():
     _, _, normals = half_spaces(50, 1e-4, shares=(1.0,))
     options = {"terms": lambda x: 9.0 + x[:, :1] ** 2, "gradient": lambda x, term: -normals[term]}
     safe = samplers.FunctionProblem(dim=50, **options)
@@ -149,7 +136,7 @@ def test_without_any_failure_p_is_0_with_an_upper_end(half_spaces):
 
 
 @pytest.mark.parametrize("max_sim", [1000, 2000])
-def test_budgets_are_kept_and_used(half_spaces, max_sim):
+def test_budgets_are_kept_and_used(max_sim):
     problem, exact, _ = half_spaces(100, 1e-4)
     result = samplers.estimate(problem, seed=2, max_sim=max_sim)
     assert 0.9 * max_sim <= result.n_sim <= max_sim
@@ -158,7 +145,7 @@ def test_budgets_are_kept_and_used(half_spaces, max_sim):
 
 
 @pytest.mark.slow
-def test_a_target_is_met_with_few_simulations_or_many(half_spaces):
+def test_a_target_is_met_with_few_simulations_or_many():
     problem, exact, _ = half_spaces(100, 1e-4)
     coarse, fine = (samplers.estimate(problem, seed=2, target_cov=target) for target in (0.1, 0.012))
     assert coarse.cov <= 0.1 and coarse.n_sim < 4500
@@ -166,7 +153,7 @@ def test_a_target_is_met_with_few_simulations_or_many(half_spaces):
     assert abs(fine.p / exact - 1) < 4 * fine.cov
 
 
-def test_a_run_that_is_stopped_anywhere_has_an_outcome(half_spaces):
+def test_a_run_that_is_stopped_anywhere_has_an_outcome():
     problem, exact, _ = half_spaces(60, 1e-3)
     for at in (200, 800, 1500, 2000):
         result = samplers.estimate(problem, seed=2, max_sim=3000, stop=lambda seen, at=at: seen.n_sim >= at)
@@ -175,16 +162,13 @@ def test_a_run_that_is_stopped_anywhere_has_an_outcome(half_spaces):
         assert result.interval[0] <= exact <= result.interval[1]
 
 
-@pytest.mark.parametrize("fraction", [0.5])
-def test_simulations_made_by_the_user_are_searched_as_before(half_spaces, fraction):
+def test_simulations_made_by_the_user_are_searched_as_before():
     """`start` offers no terms; the run asks for points only and ends with an estimate."""
     problem, _, _ = half_spaces(40, 1e-2)
-    run = samplers.TwoStage().start(problem, seed=1, max_sim=int(3000 * fraction))
+    run = samplers.TwoStage().start(problem, seed=1, max_sim=1500)
     while not run.done:
         run.tell(problem.evaluate(run.ask()))
-    assert run.result() == samplers.estimate(
-        samplers.FunctionProblem(problem.evaluate, dim=40), seed=1, max_sim=int(3000 * fraction)
-    )
+    assert run.result() == samplers.estimate(samplers.FunctionProblem(problem.evaluate, dim=40), seed=1, max_sim=1500)
 
 
 @pytest.mark.parametrize(
@@ -193,11 +177,10 @@ def test_simulations_made_by_the_user_are_searched_as_before(half_spaces, fracti
         (60, 1e-3, {}),  # the final rounds
         (60, 1e-3, {"replicates": 2}),
         (40, 0.3, {}),  # Monte Carlo after base draws that do not count
-        (60, 1e-3, {"stop": lambda seen: seen.n_sim >= 1500}),  # all draws so far
         (60, 1e-3, {"stop": lambda seen: seen.n_sim >= 150}),  # base draws
     ],
 )
-def test_p_is_the_sum_of_the_weights_of_single_simulations(half_spaces, dim, p, options):
+def test_p_is_the_sum_of_the_weights_of_single_simulations(dim, p, options):
     """Gradients cost simulations and are none, so that there are fewer of them than `n_sim`."""
     problem, _, _ = half_spaces(dim, p)
     result = samplers.estimate(problem, seed=2, max_sim=3000, keep_points=True, **options)
@@ -206,3 +189,71 @@ def test_p_is_the_sum_of_the_weights_of_single_simulations(half_spaces, dim, p, 
     weights = np.exp(rows.log_weight[known])
     assert weights[result.points.f[known] <= 0].sum() == pytest.approx(result.p, rel=1e-12)
     assert abs(weights.sum() - 1) <= 5 * weights.std() * len(weights) ** 0.5 + 1e-9  # as in any weighted sample
+
+
+P = 2e-4
+
+
+def half_space_and_ball(dim, share, steepness):
+    """Return a problem of p = 2e-4: a half-space, and a ball 3.2 from the origin that has a share of p.
+
+    They do not meet: the half-space is beyond u_1 = -3.6, the ball around u_1 = 2.3. The steeper the term of the ball,
+    the smaller the part of the space where it is the least.
+    """
+    centre = np.zeros(dim)
+    centre[:2] = 3.2 / np.sqrt(2)
+    radius = optimize.brentq(lambda r: stats.ncx2.cdf(r * r, dim, 3.2**2) - share * P, 1e-3, 3.2)
+    beta = -stats.norm.ppf((1 - share) * P)
+
+    def values(u):
+        ball = steepness * (np.sqrt(((u - centre) ** 2).sum(axis=1)) - radius)
+        return np.column_stack([beta + u[:, 0], ball])
+
+    return samplers.FunctionProblem(dim=dim, terms=values)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("dim", "share", "steepness"), [(2, 0.4, 10.0), (4, 0.25, 10.0), (6, 0.1, 10.0)])
+def test_no_term_is_lost_in_any_seed(dim, share, steepness):
+    """The estimate without the ball is (1 - share) p, with an interval that excludes p.
+
+    No run is below (1 - share / 2) p by more than two of the standard errors that it states, .02 p in most.
+    The mean of 20 runs is within 4 of its standard errors, from their own spread, and 1 % for what the fits cost.
+    By chance fewer than 16 of 20 intervals at 95 % hold p with probability 3e-4.
+    """
+    problem = half_space_and_ball(dim, share, steepness)
+    results = [samplers.estimate(problem, samplers.TwoStage(), seed=seed, max_sim=6000) for seed in range(20)]
+    ratios = np.array([result.p / P for result in results])
+    stated = ratios * np.array([result.cov for result in results])
+    assert (ratios + 2 * stated > 1 - share / 2).all()
+    assert abs(ratios.mean() - 1) < 4 * ratios.std(ddof=1) / np.sqrt(20) + 0.01
+    covered = sum(result.interval[0] <= P <= result.interval[1] for result in results)
+    assert covered >= 16
+    assert all(result.n_sim <= 6000 for result in results)
+
+
+def test_terms_that_are_all_found_change_nothing():
+    """Two half-spaces: the chains hold both, and the run is that of f alone to the bit."""
+
+    def values(u):
+        return np.column_stack([3.4 - u[:, 0], 3.5 - u[:, 1]])
+
+    with_terms = samplers.FunctionProblem(dim=3, terms=values)
+    without = samplers.FunctionProblem(lambda u: values(u).min(axis=1), 3)
+    first, second = (
+        samplers.estimate(problem, samplers.TwoStage(), seed=0, max_sim=3000) for problem in (with_terms, without)
+    )
+    assert (first.p, first.interval, first.remarks) == (second.p, second.interval, second.remarks)
+
+
+def test_a_term_that_is_not_reached_is_named_in_units_of_p():
+    """A term that is often the least, and that never fails."""
+
+    def values(u):
+        return np.column_stack([3.5 - u[:, 0], 0.5 + u[:, 1] ** 2])
+
+    result = samplers.estimate(samplers.FunctionProblem(dim=3, terms=values), samplers.TwoStage(), seed=0, max_sim=6000)
+    (remark,) = (text for text in result.remarks if "Terms that were smallest" in text)
+    assert "'1'" in remark
+    assert "of p)." in remark
+    assert result.p == pytest.approx(stats.norm.sf(3.5), rel=0.1)

@@ -49,9 +49,7 @@ def test_no_level_after_the_answer_is_known(recorder):
     assert [level.gamma == 0.0 for level in result.trace] == [False, True]
 
 
-@pytest.mark.parametrize(
-    "tied", [pytest.param(0.6, marks=pytest.mark.slow), 0.9, pytest.param(0.95, marks=pytest.mark.slow)]
-)
+@pytest.mark.parametrize("tied", [0.9, pytest.param(0.95, marks=pytest.mark.slow)])
 def test_ties_at_a_cap(study, tied):
     reference, runs = plateau(3, 3.0, tied), 40
     found = study(reference, ADSS(), runs)
@@ -62,17 +60,6 @@ def test_ties_at_a_cap(study, tied):
         shares = [result.trace[0].p for result in found.results]
         assert np.mean(shares) == pytest.approx(0.05, abs=0.005)
         assert len(set(shares)) > 10
-
-
-@pytest.mark.slow
-def test_a_small_budget_is_spent_well(study):
-    """A thousand simulations: Monte Carlo would have a c.o.v. of 0.86."""
-    reference, runs = half_space(2, 3.0), 200
-    found = study(reference, ADSS(), runs, max_sim=1000)
-    error = found.ratios.std(ddof=1) / math.sqrt(runs)
-    assert abs(found.ratios.mean() - 1) < 4 * error + 0.04 * 1000 / 270  # bias of order 1/N
-    assert found.ratios.std(ddof=1) < 0.7
-    assert found.covered >= stats.binom.ppf(1e-3, runs, 0.88)
 
 
 @pytest.mark.slow
@@ -123,7 +110,7 @@ def test_every_kernel_gives_p(study, method, reference):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("reference", [half_space(2), half_space(10), half_space(100), shell(20)], ids=lambda r: r.name)
+@pytest.mark.parametrize("reference", [half_space(2), half_space(100), shell(20)], ids=lambda r: r.name)
 @pytest.mark.parametrize("method", [SS(), ADSS()], ids=["ss", "adss"])
 def test_coverage_of_a_single_run(study, reference, method):
     runs = 600
@@ -133,16 +120,7 @@ def test_coverage_of_a_single_run(study, reference, method):
     assert least < found.own_cov / found.ratios.std(ddof=1) < 1.15
 
 
-@pytest.mark.slow
-def test_bias_falls_with_the_number_of_points(study):
-    runs = 400
-    small, large = (study(half_space(), ADSS(n=n), runs) for n in (500, 4000))
-    error = large.ratios.std(ddof=1) / math.sqrt(runs)
-    assert abs(large.ratios.mean() - 1) < 4 * error
-    assert small.ratios.std() > 2 * large.ratios.std()
-
-
-@pytest.mark.parametrize("max_sim", [1, 2, 5, 50, 99])
+@pytest.mark.parametrize("max_sim", [1, 99])
 def test_a_budget_under_level_zero_is_named_as_the_reason(max_sim):
     result = samplers.estimate(half_space().problem, ADSS(), seed=1, max_sim=max_sim)
     assert result.n_sim == max_sim
@@ -164,3 +142,15 @@ def test_warns_of_bad_mixing(bad):
     assert not any("Acceptance" in text for text in good.warnings)
     result = samplers.estimate(problem, ADSS(n=500, **bad), seed=1, max_sim=3000)
     assert any("Acceptance" in text for text in result.warnings)
+
+
+def test_no_failure_from_one_path_excludes_nothing():
+    """One point in 1,000 leads down, to where nothing fails: how likely that is, a single root cannot tell."""
+
+    def f(x):
+        return np.where(x[:, 0] > 3.0, 10 - x[:, 0], 20 - 0.01 * x[:, 1])
+
+    for seed in range(3):
+        result = samplers.estimate(FunctionProblem(f, 2), ADSS(max_levels=6), seed=seed)
+        assert result.p == 0
+        assert result.interval[1] > 0.01

@@ -93,27 +93,16 @@ def test_too_small_a_budget_is_plain_monte_carlo_and_says_so():
     assert any("too few for an exploration" in text for text in result.remarks)
 
 
-def test_target_is_met_with_fewer_simulations_than_n():
+def test_a_target_is_met_with_fewer_simulations_than_n_or_ends_at_max_sim():
     reference = half_space(100)
     result = samplers.estimate(reference.problem, TS(), seed=1, target_cov=0.03)
     assert result.cov <= 0.03
     assert result.status == "converged"
     assert result.n_sim < 6000
     assert near(result, reference.p)
-
-
-def test_target_that_max_sim_does_not_allow():
-    result = samplers.estimate(half_space(100).problem, TS(), seed=1, target_cov=0.001, max_sim=7000)
+    result = samplers.estimate(reference.problem, TS(), seed=1, target_cov=0.001, max_sim=7000)
     assert result.n_sim == 7000
     assert result.status == "budget"
-
-
-def test_failure_is_common(recorder):
-    """Plain Monte Carlo from then on, with a binomial error."""
-    result = counted(recorder, linear(0.524), seed=1)
-    n = 6000 - sum(level.n_sim - level.n_points for level in result.trace[:1])
-    assert result.cov == pytest.approx(math.sqrt(0.7 / 0.3 / n), rel=0.1)
-    assert near(result, PHI(-0.524))
 
 
 @pytest.mark.parametrize(
@@ -211,15 +200,13 @@ def case(name):
     return Reference(name, state.problem(), state.p)
 
 
-@pytest.mark.parametrize("name", ["slabs_d20"])
-def test_subset_simulation_takes_over(recorder, name):
-    reference = case(name)
-    for seed in range(1):
-        result = counted(recorder, reference.problem, seed=seed, max_sim=6000)
-        assert result.remarks[0].startswith("No proposal describes the failures")
-        assert result.interval[0] < reference.p < result.interval[1]
-        assert 0.15 < result.cov < 1
-        assert result.n_sim <= 6000
+def test_subset_simulation_takes_over(recorder):
+    reference = case("slabs_d20")
+    result = counted(recorder, reference.problem, seed=0, max_sim=6000)
+    assert result.remarks[0].startswith("No proposal describes the failures")
+    assert result.interval[0] < reference.p < result.interval[1]
+    assert 0.15 < result.cov < 1
+    assert result.n_sim <= 6000
 
 
 @pytest.mark.parametrize("max_sim", [800, 1500])
@@ -243,12 +230,10 @@ def judge(found, bias=0.01):
         half_space(2),
         half_space(100),
         half_space(6, 5.0),
-        two_regions(10),
         two_regions(30),
         four_branches(),
         plateau(),
         shell(),
-        shell(2),
         deceptive(),
         noisy(),
     ],
@@ -267,8 +252,7 @@ def test_subset_simulation_is_right_and_covered(study, name):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("p", [0.05, 0.1, 0.2])
-def test_hardly_any_bias_where_plain_draws_take_over(study, p):
+def test_hardly_any_bias_where_plain_draws_take_over(study):
     """Whether a tenth of the base draws fails decides on the rest, and they count: 0.8 % too high at p = 0.1."""
-    beta = -stats.norm.ppf(p)
+    p, beta = 0.1, -stats.norm.ppf(0.1)
     judge(study(reference("common", lambda u: beta - u[:, 0], 2, p), TS(), 100, max_sim=2000), 0.008)

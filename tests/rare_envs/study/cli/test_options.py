@@ -13,7 +13,6 @@ import typer
 from typer.testing import CliRunner
 
 import samplers
-from rare_envs.startup import __version__
 from rare_envs.study.arguments import ExecutorOptions
 from rare_envs.study.cli.app import EXAMPLES, app, list_examples
 from rare_envs.study.cli.options import command, read_count
@@ -41,11 +40,6 @@ def test_counts_may_be_written_with_an_exponent() -> None:
     for text in ("many", "1.5", "1e-3", "inf", "nan", ""):
         with pytest.raises(typer.BadParameter, match="expected a whole number"):
             read_count(text)
-
-
-def test_the_command_line_tells_its_version(cli: Cli) -> None:
-    version = cli("--version")
-    assert (version.exit_code, version.stdout) == (0, f"rare-envs {__version__}\n")
 
 
 @pytest.mark.parametrize(

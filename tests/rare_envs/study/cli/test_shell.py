@@ -33,10 +33,8 @@ from tests.rare_envs.study.refusals import FOLLOWING, SMALL, Cli, assert_refused
     ("words", "said", "page"),
     [
         (["estimat"], "estimat", "rare-envs"),
-        (["--loud"], "--loud", "rare-envs"),
         (["list", "--loud"], "--loud", "rare-envs list"),
         (["estimate", FOLLOWING, "--ego"], "--ego", "rare-envs estimate"),
-        (["corpus", "run", "--ego"], "--ego", "rare-envs corpus run"),
         (["corpus", "run"], "--ego", "rare-envs corpus run"),
         (["estimate", "--max-sim", "ten"], "--max-sim", "rare-envs estimate"),
     ],

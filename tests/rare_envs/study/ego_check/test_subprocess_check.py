@@ -246,13 +246,6 @@ def test_a_zip_that_others_can_write_to_is_refused_by_every_command(what: str, s
         agents.load_ego(saved)
 
 
-@pytest.mark.filterwarnings("ignore:.*are mapped to")
-def test_actions_of_other_bounds_are_told_once(broken: str) -> None:
-    every = run_checks(Question(env_id=ENV, ego=f"{broken}:another_unit"))
-    (told,) = (each for each in every if isinstance(each, Finding) and each.check == "action space")
-    assert told.status == "warn" and "--action" not in told.advice
-
-
 def test_a_zip_of_ones_own_is_no_warning(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     Path("ego.zip").touch()

@@ -10,11 +10,14 @@ from collections.abc import Callable
 from html.parser import HTMLParser
 from pathlib import Path
 
+import numpy as np
 import pytest
 from typer.testing import Result
 
+import rare_envs
 from rare_envs.study import BadInput, Question, prepare, run_into
 from rare_envs.study.html_report import SECTIONS, write_html_report
+from rare_envs.study.html_report.atlas import AtlasSource, build_atlas, find_nearest_event, read_recorded_events
 from rare_envs.study.html_report.figures import FigureOfPage
 
 VOID = {"meta", "br", "img", "link", "path", "use", "rect", "circle", "line", "polygon"}
@@ -99,25 +102,6 @@ def test_warnings_come_first_and_text_of_files_is_escaped(
     assert "not what the run wrote, by the digests in its study.json: result.json" in text
 
 
-def test_a_damaged_file_is_one_line(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(FigureOfPage, "to_svg", lambda _: "")
-    run = tmp_path / "run"
-    shutil.copytree(folder, run)
-    for name, change in (
-        ("result.json", {"kinds": [1]}),
-        ("result.json", {"modes": ["x"]}),
-        ("result.json", {"n_sim": "x"}),
-        ("study.json", {"versions": [1]}),
-        ("study.json", {"base": [1]}),
-    ):
-        whole = (run / name).read_text()
-        (run / name).write_text(json.dumps(json.loads(whole) | {"modes": []} | change))
-        with pytest.raises(BadInput, match=r"result\.json or study\.json in .* is damaged"):
-            write_html_report(run, out=tmp_path / "page.html")
-        (run / name).write_text(whole)
-    assert not (tmp_path / "page.html").exists()
-
-
 def test_recorded_events_and_figures_as_files(
     folder: Path, tmp_path: Path, cli: Callable[..., Result], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -152,3 +136,51 @@ def test_what_has_no_report_is_refused(folder: Path, tmp_path: Path, cli: Callab
     (tmp_path / "run" / "journal.bin").touch()
     refused = cli("report", tmp_path / "run")
     assert refused.exit_code == 2 and "is not finished" in refused.stderr
+
+
+MODE = {"crash": "rear_end", "p": 0.01, "interval": [0.005, 0.02], "of_failures": 0.75, "failure": 0}
+
+
+@pytest.fixture
+def source() -> AtlasSource:
+    problem = rare_envs.DrivingProblem("rare_envs/CarFollowing-v0", horizon=3.0)
+    failures = {"ego_speed": [20.0], "lead_speed": [5.0], "gap": [10.0], "f": [-1.0], "log_p0": [-9.0]}
+    arrays = {name: np.array(values) for name, values in failures.items()}
+    ordinary = problem.space.sample(200, np.random.default_rng(0))
+    return AtlasSource(Path("runs/one"), problem, arrays, ordinary, ordinary[:5])
+
+
+def test_an_entry_says_what_happened_and_how_to_see_it_again(source: AtlasSource) -> None:
+    (entry,) = build_atlas(source, [MODE])
+    facts = dict(entry.facts)
+    assert entry.title == "Mode 1: the ego runs into a vehicle ahead" and entry.share.startswith("75 % of p: 1 %")
+    assert facts["crash"].startswith("the ego into the lead after 0.8 s, at ") and facts["f"] == "-1"
+    assert facts["closing speed"].endswith("m/s of it, at right angles to what touches")
+    assert facts["replay"].startswith("rare-envs replay runs/one --failure 0")
+    assert "standard deviations per parameter" in facts["nearest recorded"]
+    assert [row[:2] for row in entry.parameters] == [
+        ("ego_speed [m/s]", "20.00"),
+        ("lead_speed [m/s]", "5.00"),
+        ("gap [m]", "10.00"),
+    ]
+    assert [figure.name for figure in entry.figures] == ["mode1-views", "mode1-measure", "mode1-speeds"]
+
+
+def test_the_nearest_event_is_the_nearest_in_deviations() -> None:
+    ordinary = np.array([[0.0, 0.0], [2.0, 20.0]])  # deviations 1 and 10
+    found = find_nearest_event(np.array([5.0, 0.0]), np.array([[5.0, 30.0], [3.0, 0.0]]), ordinary)
+    assert found.values.tolist() == [3.0, 0.0]  # 2 deviations in one of two parameters, against 3
+    assert found.distance == pytest.approx(2 / 2**0.5)
+    assert found.rarer == 1.0  # (0, 0) is 3 away from it in one parameter, (2, 20) at least 1 and 2
+
+
+def test_files_without_such_events_are_refused(tmp_path: Path) -> None:
+    for text, message in (
+        ("", "columns named as the parameters, a, gap; it has no rows"),
+        ("gap\n1\n", "columns named as the parameters, a, gap; it has gap"),
+        ("a,gap\nx,1\n", "no table"),
+        ("a,gap\n,1\n", "no event"),
+    ):
+        (tmp_path / "events.csv").write_text(text)
+        with pytest.raises(BadInput, match=message):
+            read_recorded_events(tmp_path / "events.csv", ["a", "gap"])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,6 @@ from tests.rare_envs.study.refusals import FOLLOWING, SMALL, Cli, assert_refused
 
 BAD_ESTIMATES = {
     "unknown environment": (["rare_envs/CutIn-v7"], ["rare_envs/CutIn-v"]),
-    "environment without its namespace": (["CutIn"], ["rare_envs/CutIn-v0"]),
     "option that HighwayEnv's do not have": (
         ["merge-v0", "--base", "us101"],
         ["has no --base", "CutIn-v0"],
@@ -24,17 +24,12 @@ BAD_ESTIMATES = {
     "actions of a wrong shape": ([FOLLOWING, "--ego", "egos_here:wrong_shape"], ["(2, 2)"]),
     "an ego that raises": ([FOLLOWING, "--ego", "egos_here:raising"], ["division by zero"]),
     "an ego that exits": ([FOLLOWING, "--ego", "egos_here:exiting_when_asked"], ["SystemExit(7)"]),
-    "algorithm of the rule-based ego": ([FOLLOWING, "--algo", "foo"], ["algo", "'foo'", "'idm'"]),
     "misspelt method": ([FOLLOWING, "--method", "addss"], ["'adss'", "mc"]),
     "misspelt base": ([FOLLOWING, "--base", "us102"], ["'us101'", "highway"]),
     "damaged base": ([FOLLOWING, "--base", "broken.json"], ["broken.json", "JSON"]),
-    "unknown measure": ([FOLLOWING, "--measure", "tttc"], ["ttc"]),
     "misspelt drivers": ([FOLLOWING, "--drivers", "mgial"], ["did you mean 'mgail'"]),
     "unknown observation": ([FOLLOWING, "--observation", "sonar"], ["'features', 'lidar'"]),
     "gamma is NaN": ([FOLLOWING, "--gamma", "nan"], ["gamma", "nan"]),
-    "no budget": ([FOLLOWING, "--max-sim", "0"], ["--max-sim", "0"]),
-    "no replicates": ([FOLLOWING, "--replicates", "0"], ["replicates", "0"]),
-    "negative seed": ([FOLLOWING, "--seed", "-1"], ["seed", "-1"]),
     "out is a file": ([FOLLOWING, "--out", "a_file"], ["a_file"]),
     "misspelt option": ([FOLLOWING, "--mehtod", "adss"], ["--mehtod", "--method"]),
 }
@@ -67,3 +62,30 @@ def test_weather_on_the_command_line(cli: Cli, tmp_path: Path) -> None:
     found = json.loads(cli(*words, "--max-sim", 40, "--horizon", 1, "--out", tmp_path / "run", "--json").stdout)
     assert found["question"]["weather"] is True
     assert found["question"]["observation"] == "camera+lidar"
+
+
+def test_a_plan_from_pilots_and_one_from_a_folder(
+    cli: Cli, risky: str, safe: str, finished_run: Path, tmp_path: Path
+) -> None:
+    options = ("--base", risky, "--method", "mc", "--horizon", 4)
+    answer = json.loads(cli("plan", FOLLOWING, *options, "--pilot", 2000, "--cov", 0.05, "--json").stdout)
+    (planned,) = answer["runs"]
+    assert planned["method"] == "mc" and planned["n_sim"] > 2000 and planned["seconds"] > 0.0
+    shutil.copytree(finished_run, tmp_path / "run")
+    text = cli("plan", tmp_path / "run", "--cov", 0.05).stdout
+    assert cli("plan", tmp_path / "run", "--target-cov", 0.05).stdout == text  # as `estimate` names it
+    assert f"{planned['n_sim']:,} simulations" in text and "--target-cov 0.05" in text  # the same seed, the same pilot
+    none = cli("plan", FOLLOWING, "--base", safe, "--method", "mc", "--pilot", 200)
+    assert none.exit_code == 2 and none.stdout == ""
+    assert "found no failure" in none.stderr.splitlines()[-1]  # behind the bar
+    assert_refused(cli("plan", tmp_path), "No finished run in")
+    for options in (("--method", "ce"), ("--pilot", 500), ("--ego", "human")):
+        assert_refused(cli("plan", tmp_path / "run", *options), f"without {options[0]}")
+    assert_refused(cli("plan", FOLLOWING, "--base", risky, "--method", "mc,nope", "--pilot", 100), "'nope'")
+    assert_refused(cli("plan", "rare_envs/Nowhere-v0"), "Nowhere")
+    assert_refused(cli("plan", tmp_path / "nowhere"), "There is no folder", "nowhere' of a run. Unknown environment")
+
+
+def test_a_precision_that_cannot_be_is_refused_before_the_pilots(cli: Cli) -> None:
+    for cov in ("-1", "0", "nan"):
+        assert_refused(cli("plan", FOLLOWING, "--cov", cov), "Expected --cov to be a number above 0")
