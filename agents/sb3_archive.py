@@ -134,7 +134,7 @@ def find_algorithm(header: Mapping[str, Any], path: Path) -> str:
     policy = header.get("policy_class")
     module = str(policy.get("__module__", "")) if isinstance(policy, dict) else ""
     by_module = [name for name, each in ALGORITHMS.items() if module.startswith(each.policies)]
-    by_setting = [name for name, each in ALGORITHMS.items() if each.setting in header]
+    by_setting = [name for name, each in ALGORITHMS.items() if each.setting and each.setting in header]
     for name in (*by_module, *by_setting):
         return name
     raise ValueError(

@@ -67,7 +67,11 @@ def save_checkpoint(path: Path, arguments: Mapping[str, Any], model: Any) -> Non
 def load_checkpoint(path: Path, arguments: Mapping[str, Any]) -> dict[str, Any]:
     """Read a checkpoint of the training with these arguments; a ValueError if it is another's, or damaged."""
     state = read_checkpoint(path, ("arguments", "format"))
-    begun, version = json.loads(state["arguments"]), state["format"]
+    version = state["format"]
+    try:
+        begun = dict(json.loads(state["arguments"]))
+    except (ValueError, TypeError) as error:
+        raise ValueError(f"Cannot take up {str(path)!r}: it is damaged or no checkpoint; remove it.") from error
     if version != CHECKPOINT_FORMAT:
         raise ValueError(f"{str(path)!r} is a checkpoint of another version of this program; remove it.")
     given = json.loads(json.dumps(arguments))

@@ -92,16 +92,22 @@ class TruncatedConditional(NamedTuple):
 
     def from_normal(self, u: FloatArray) -> FloatArray:
         """Invert `to_normal`, (n,) -> (n,)."""
+        found, fits = np.empty(len(u)), np.zeros(len(u), dtype=bool)
         if len(self.mean) == 1 and self.is_log is None:
             found, fits = self._invert_alone(u)
-        else:
-            tail, fits = Tail.of(self, u)
-            found, ended = tail.solve(u)
-            fits &= ended
+        if not fits.all():
+            rest = np.flatnonzero(~fits)
+            found[rest], fits[rest] = self.take(rest)._invert_by_steps(u[rest])
         if not fits.all():
             rest = np.flatnonzero(~fits)
             found[rest] = self.take(rest)._search(u[rest])
-        return found
+        return np.asarray(np.clip(found, self.low, self.high))
+
+    def _invert_by_steps(self, u: FloatArray) -> tuple[FloatArray, NDArray[np.bool_]]:
+        """Return the quantiles at Phi(u), (n,), and where plain numbers do for that."""
+        tail, fits = Tail.of(self, u)
+        found, ended = tail.solve(u)
+        return found, fits & ended
 
     def _invert_alone(self, u: FloatArray) -> tuple[FloatArray, NDArray[np.bool_]]:
         """Return the quantiles of one normal at Phi(u), (n,), and where plain numbers do for that."""
@@ -111,8 +117,9 @@ class TruncatedConditional(NamedTuple):
         turned = np.where(a > 0.0, -1.0, 1.0)
         start = ndtr(turned * a)
         mass = ndtr(turned * b) - start
-        z = turned * ndtri(start + mass * ndtr(-np.abs(u)))
-        fits = (np.abs(mass) >= np.maximum(CANCELS * start, MIN_MASS)) & (np.abs(u) < -MIN_U)
+        below = ndtr(-np.abs(u))
+        z = turned * ndtri(start + mass * below)
+        fits = (np.abs(mass) * below >= CANCELS * start) & (np.abs(mass) >= MIN_MASS) & (np.abs(u) < -MIN_U)
         return self.mean[0] + sign * z * self.scale[0], fits
 
     def _search(self, u: FloatArray) -> FloatArray:
@@ -230,7 +237,8 @@ class Tail(NamedTuple):
         low, high = (_place(self.is_log, end, self.sign) for end in (self.low, self.high))
         y = np.minimum(np.maximum(y, low), high)
         own, most = y if self.is_log is None else np.where(self.is_log, self.sign * np.exp(self.sign * y), y)
-        return np.asarray(np.minimum(sum_components(self.weight * self.mass * own), most.min(axis=0)))
+        guess = np.minimum(sum_components(self.weight * self.mass * own), most.min(axis=0))
+        return np.asarray(np.clip(guess, self.low, self.high))
 
     def _evaluate(self, x: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return the distribution functions, their densities and the negative slopes of these at x (n,), (n,) each."""

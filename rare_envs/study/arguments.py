@@ -403,8 +403,11 @@ def _read_nodes(path: Path) -> list[tuple[str, Any]]:
     if node is None:
         raise BadInput(f"{str(path)!r} has no keys: expected lines like gamma: 0.0.")
     pairs = node.value if isinstance(node, yaml.MappingNode) else None
-    if pairs is None or not all(isinstance(each, yaml.ScalarNode) for pair in pairs for each in pair):
+    if pairs is None or not all(isinstance(key, yaml.ScalarNode) for key, _ in pairs):
         raise BadInput(f"Expected {str(path)!r} to have lines like gamma: 0.0.")
+    for key, value in pairs:
+        if not isinstance(value, yaml.ScalarNode):
+            raise BadInput(f"Expected {key.value} in {str(path)!r} to be one value, as in gamma: 0.0.")
     keys = [key.value for key, _ in pairs]
     for key in keys:
         if keys.count(key) > 1:
@@ -432,6 +435,8 @@ _READERS: dict[str, Callable[[str], Any]] = {
 
 def _read_value(node: Any, argument: Field[Any]) -> Any:
     """Return what a node stands for by the type of its argument; its text where it does not fit."""
+    if node.style is None and node.tag == "tag:yaml.org,2002:null":
+        return None
     kinds = str(argument.type).split(" | ") if node.style is None else []  # what is in quotes is a text
     for kind in (kind for kind in _READERS if kind in kinds):
         with contextlib.suppress(KeyError, ValueError):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import os
 import signal
 import subprocess
@@ -163,7 +164,9 @@ def test_a_resumed_training_ends_alike(
 
 
 def test_damaged_checkpoints_are_refused_in_one_line(tmp_path: Path) -> None:
-    for content in (b"", b"noise", b"PK\x03\x04", b"\x80\x02cos\nsystem\n."):
+    damaged = io.BytesIO()
+    torch.save({"arguments": "{", "format": 1}, damaged)
+    for content in (b"", b"noise", b"PK\x03\x04", b"\x80\x02cos\nsystem\n.", damaged.getvalue()):
         (tmp_path / "ego.checkpoint").write_bytes(content)
         with pytest.raises(ValueError, match="it is damaged or no checkpoint; remove it") as caught:
             load_checkpoint(tmp_path / "ego.checkpoint", {})

@@ -8,8 +8,8 @@ A server is held against the protocol of docs/egos.md over its socket, message b
 from __future__ import annotations
 
 import itertools
-import multiprocessing
 import os
+import signal
 from collections.abc import Callable, Iterator
 from functools import partial
 from multiprocessing.connection import Connection
@@ -18,6 +18,7 @@ from typing import Any
 
 import numpy as np
 from gymnasium import spaces
+from loky.backend import get_context
 
 from rare_envs.plugins import EgoGone, reason_of
 from rare_envs.scenarios.registry import find_scenario
@@ -81,7 +82,7 @@ def check_ego(question: Question, time_limit: float = 30.0) -> list[Finding]:
 
 def _check_in_subprocess(question: Question, time_limit: float) -> Iterator[Finding]:
     """Yield the findings of a process that is started anew, and a failure if it hangs or dies."""
-    context = multiprocessing.get_context("spawn")
+    context = get_context("loky")  # the main script is not run again, as it is by multiprocessing
     received, sent = context.Pipe(duplex=False)
     process = context.Process(target=_send_findings, args=(question, sent))
     process.start()
@@ -104,7 +105,8 @@ def _check_in_subprocess(question: Question, time_limit: float) -> Iterator[Find
         advice = "an ego that ends its process ends the run; process:EGO would survive it"
         yield report_failure(doing, f"the process ended (exit status {process.exitcode})", advice)
     finally:
-        process.kill()
+        if process.is_alive():
+            os.kill(process.pid, getattr(signal, "SIGKILL", signal.SIGTERM))
         process.join()
 
 

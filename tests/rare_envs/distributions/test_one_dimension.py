@@ -156,3 +156,14 @@ def test_round_trip_through_a_spike_in_a_wide_density() -> None:
 
 
 # --- components -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("scale", [1.0, 10.0, 100.0])
+def test_quantiles_near_an_end_that_cuts_the_bulk_off_are_exact(scale: float) -> None:
+    """Of N(-3 scale, scale^2) on [0, 1]: where the interval's share begins, differences of Phi cancel."""
+    cut = TruncatedConditional(np.zeros((1, 1)), np.full((1, 1), -3.0 * scale), np.full((1, 1), scale), 0.0, 1.0)
+    u = np.linspace(-6.0, 6.0, 101)
+    x = cut.from_normal(u)
+    assert ((x >= 0.0) & (x <= 1.0) & (np.diff(x, prepend=-1.0) > 0.0)).all()
+    np.testing.assert_allclose(cut.to_normal(x)[u < 0], u[u < 0], atol=1e-12)
+    np.testing.assert_allclose(cut.to_normal(x), u, atol=1e-7)  # near 1 the next number is further off
