@@ -11,20 +11,20 @@ from benchmarks.size import BUDGETS, measure_text
 
 ROOT = Path(__file__).parents[1]
 LIMITS = {
-    "package lines": 58_300,
-    "code lines": 35_900,
-    "modules": 241,
+    "package lines": 58_100,
+    "code lines": 35_800,
+    "modules": 218,
     "functions": 3_330,
-    "classes": 541,
-    "import lines, percent of code": 11.6,
-    "test lines": 44_200,
+    "classes": 543,
+    "import lines, percent of code": 11.0,
+    "test lines": 33_700,
     "pages": 18,
-    "words of pages": 44_900,
-    "files entered by an estimate": 72,
-    "files entered by plain Monte Carlo": 39,
-    "files entered by the command": 126,
+    "words of pages": 40_000,
+    "files entered by an estimate": 48,
+    "files entered by plain Monte Carlo": 26,
+    "files entered by the command": 87,
     "own frames from estimate to f": 6,
-    "own frames from the command to f": 15,
+    "own frames from the command to f": 16,
 }
 """What must not grow; the aims are `benchmarks.size.BUDGETS`."""
 
