@@ -17,9 +17,8 @@ from rare_envs.scenarios.base import Scenario, load_base
 from rare_envs.scenarios.registry import SCENARIOS, find_scenario
 from rare_envs.sensors.camera import find_camera
 from rare_envs.simulation.background import find_drivers
-from rare_envs.simulation.episode import Clock, Measurement
-from rare_envs.simulation.observation import Sensing, read_kinds
-from rare_envs.simulation.world import World
+from rare_envs.simulation.observation import read_kinds
+from rare_envs.simulation.world import Clock, Measurement, Sensing, World
 
 NO_NEEDS = EgoNeeds()
 CONFIGURATION_ARGUMENTS = {

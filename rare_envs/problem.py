@@ -44,7 +44,7 @@ from rare_envs.make import refuse_unknown, set_up
 from rare_envs.plugins import reason_of
 from rare_envs.scenarios.registry import find_scenario, split_layout
 from rare_envs.simulation.cuda_graphs import RecordedRollouts
-from rare_envs.simulation.episode import Episode, Measurement
+from rare_envs.simulation.episode import Episode
 from rare_envs.simulation.observation import read_kinds
 from rare_envs.simulation.terms import (
     ROLLOUTS_PER_GRADIENT,
@@ -53,7 +53,7 @@ from rare_envs.simulation.terms import (
     find_differentiator,
     simulate_terms,
 )
-from rare_envs.simulation.world import Driver, StochasticDriver, World, rollout
+from rare_envs.simulation.world import Driver, Measurement, StochasticDriver, World, rollout
 from rare_envs.traffic.crash import CRASH_KINDS, Crash
 
 

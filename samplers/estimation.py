@@ -166,7 +166,7 @@ def estimate(
     if not (callable(progress) or isinstance(progress, bool)):
         raise ValueError(f"Expected progress to be True, False or a function, got {progress!r}.")
     check_base(problem)
-    places = find_executor(workers, executor)
+    places = None if workers is None and executor is None else find_executor(workers, executor)
     with _open_journal(journal, problem, seed) as kept:
         known = choose_seed(seed if kept is None else kept.head["seed"])
         arguments = replace(arguments, seed=known)

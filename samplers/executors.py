@@ -272,10 +272,10 @@ AnyExecutor: TypeAlias = Executor | FuturesExecutor | Callable[[], FuturesExecut
 """Settings, a pool of another library or a function that makes one, or "ray"."""
 
 
-def find_executor(workers: int | None, executor: Any) -> Executor | None:
-    """Return the executor of a run, see `AnyExecutor`; None where neither is given."""
+def find_executor(workers: int | None, executor: Any) -> Executor:
+    """Return the executor of a run, see `AnyExecutor`."""
     if executor is None:
-        return None if workers is None else LocalProcesses(workers)
+        return LocalProcesses(workers)
     if workers is not None:
         raise ValueError("Expected workers or executor, got both; LocalProcesses(workers=...) has more settings.")
     if executor == "ray":

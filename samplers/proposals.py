@@ -8,12 +8,8 @@ References:
     Stein, "Lectures on the theory of estimation of many parameters", Journal of Soviet Mathematics 34, 1986
     (eigenvalues; put into order again as by Lin and Perlman, "A Monte Carlo comparison of four estimators of a
     covariance matrix", 1985).
-    Ledoit and Wolf, "A well-conditioned estimator for large-dimensional covariance matrices",
-    Journal of Multivariate Analysis 88, 2004 (the share of the target).
-    Dempster, Laird and Rubin, "Maximum likelihood from incomplete data via the EM algorithm", JRSS B 39, 1977.
     Geyer, Papaioannou and Straub, "Cross entropy-based importance sampling using Gaussian densities revisited",
     Structural Safety 76, 2019 (weighted points).
-    Arthur and Vassilvitskii, "k-means++: the advantages of careful seeding", SODA 2007.
     Lloyd, "Least squares quantization in PCM", IEEE Transactions on Information Theory 28, 1982.
 """
 
@@ -21,13 +17,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple, Protocol, TypeVar
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 from scipy.optimize import isotonic_regression
 
+from samplers.components import expectation_maximisation, shrink_covariance, start_from_centres
 from samplers.problem import LOG_TWO_PI, FloatArray, StandardNormal
 from samplers.sample import log_sum_exp
 
@@ -166,24 +162,6 @@ PRIOR_DIM = 10
 """Above this many dimensions the present covariance counts as more than d + 1 points, in proportion to d."""
 
 
-def shrink_covariance(
-    covariance: FloatArray, direction: FloatArray, along: float, n: float
-) -> tuple[FloatArray, float]:
-    """Return the covariance S (d, d) drawn towards T = I + (along - 1) v v', and the share of T.
-
-    T is the covariance of N(0, I) beyond a plane with normal v (d,), the direction of the mean. Its share is the
-    expected square error of S, which n independent points are worth, over the square distance between S and T (Ledoit
-    and Wolf), but at least that of (d + 1) / 2 points, counted beside n of S: T where n is small for d, S where n is
-    large.
-    """
-    dim = len(direction)
-    target = np.eye(dim) + (along - 1) * np.outer(direction, direction)
-    noise = (float(np.trace(covariance)) ** 2 + float((covariance * covariance).sum())) / n
-    distance = float(((covariance - target) ** 2).sum())
-    share = max(noise / distance if distance > noise else 1.0, (dim + 1) / (2 * (dim + 1 + n)))
-    return (1 - share) * covariance + share * target, share
-
-
 def correct_eigenvalues(values: FloatArray, n: float) -> FloatArray:
     """Return the eigenvalues l (d,) of a covariance of n > d points, increasing, without their bias, by Stein.
 
@@ -217,60 +195,6 @@ def shrink_towards_present(target: Moments, present: Gaussian, n: float) -> Gaus
     prior = (present.dim + 1) * max(1.0, present.dim / PRIOR_DIM)
     share = prior / (prior + n)
     return Gaussian.from_covariance(target.first, (1 - share) * target.covariance + share * present.covariance)
-
-
-def start_from_centres(x: FloatArray, weights: FloatArray, k: int, rng: np.random.Generator) -> FloatArray:
-    """Return to which of k distant centres each of the points x (n, d) is nearest, as zeros and ones (k, n).
-
-    Centres are points, each drawn with a probability proportional to weight times squared distance from those before
-    (k-means++). There are fewer where the points with a weight have fewer distinct places.
-    """
-    odds, distances, nearest = weights, list[FloatArray](), np.full(len(x), np.inf)
-    while len(distances) < k and odds.sum() > 0:
-        centre = x[int(rng.choice(len(x), p=odds / odds.sum()))]
-        distances.append(((x - centre) ** 2).sum(axis=1))
-        nearest = np.minimum(nearest, distances[-1])
-        odds = weights * nearest
-    return one_hot(np.stack(distances).argmin(axis=0), k)
-
-
-MixtureT = TypeVar("MixtureT")
-
-
-def expectation_maximisation(
-    maximise: Callable[[FloatArray], MixtureT],
-    log_terms: Callable[[MixtureT], FloatArray],
-    responsibilities: FloatArray,
-    weights: FloatArray,
-    max_steps: int,
-    least_gain: Callable[[float], float],
-) -> tuple[MixtureT, float]:
-    """Return the mixture reached from some responsibilities (k, n), and its weighted log likelihood.
-
-    `maximise` returns the likeliest mixture (M-step) given how far each component explains each point, (k, n); it may
-    drop components. `log_terms` returns log(weight_j q_j) of a mixture at the points, (k, n), which have weights (n,).
-    There are `max_steps` M-steps at most; `least_gain` of the log likelihood is the rise of it with which to go on.
-    """
-    reached = -np.inf
-    for _ in range(max_steps):
-        mixture = maximise(responsibilities)
-        terms = log_terms(mixture)
-        total = log_sum_exp(terms, axis=0)
-        log_likelihood = float(weights @ total)
-        if log_likelihood - reached < least_gain(log_likelihood):
-            break
-        reached, responsibilities = log_likelihood, np.exp(terms - total)
-    return mixture, log_likelihood
-
-
-def posterior(terms: FloatArray) -> FloatArray:
-    """Return how likely each point comes from each component, from log(weight_j q_j), both of shape (k, n)."""
-    return np.asarray(np.exp(terms - log_sum_exp(terms, axis=0)))
-
-
-def one_hot(labels: NDArray[np.int64], k: int) -> FloatArray:
-    """Return responsibilities (k, n) of 0 and 1 from labels (n,)."""
-    return np.equal(labels, np.arange(k)[:, None]).astype(np.float64)
 
 
 Fit = Callable[[FloatArray, FloatArray], Any]

@@ -12,8 +12,8 @@ from numpy.typing import ArrayLike
 
 from rare_envs.distributions.beta import BetaDistribution
 from rare_envs.distributions.coordinates import FloatArray
-from rare_envs.distributions.mixture import COMPONENT_FIELDS, CoordinateMixture, TruncatedGaussianMixture
-from rare_envs.distributions.pooled import Refits, number_coordinates, pool_mixtures
+from rare_envs.distributions.mixture import COMPONENT_FIELDS, BoxPoints, CoordinateMixture, TruncatedGaussianMixture
+from rare_envs.distributions.pooled import number_coordinates, pool_mixtures
 from rare_envs.distributions.space import Distribution, DistributionParameter, HasParameters
 
 FileDistribution = TruncatedGaussianMixture | CoordinateMixture | BetaDistribution
@@ -210,6 +210,31 @@ class PredictiveCheck:
         require_count("recorded of a check", self.recorded, least=0)
         if self.expected != 0:
             require_number("expected of a check", self.expected)
+
+
+class Refits(tuple[Distribution, ...]):
+    """Distributions of the same X, of which densities are computed together."""
+
+    __slots__ = ()
+
+    def log_probs(self, x: FloatArray) -> FloatArray:
+        """Return the log density of each, (n, d) -> (R, n); where points are in equal coordinates is found once."""
+        known: dict[tuple[object, ...], BoxPoints] = {}
+        out = np.empty((len(self), len(x)))
+        for row, each in zip(out, self, strict=True):
+            # A class of the user's below one of these may have another density.
+            if type(each) in (CoordinateMixture, TruncatedGaussianMixture):
+                assert isinstance(each, CoordinateMixture)
+                key = each.coordinates.key
+                if key not in known:
+                    known[key] = BoxPoints.of(each.coordinates, each.rows("x", x))
+                row[:] = each.log_prob_at(known[key])
+            else:
+                values = np.asarray(each.log_prob(x))
+                if values.shape != row.shape:
+                    raise ValueError(f"Expected log_prob of a refit of shape {row.shape}, got {values.shape}.")
+                row[:] = values
+        return out
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

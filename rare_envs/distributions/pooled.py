@@ -12,41 +12,13 @@ from numpy.typing import ArrayLike
 from rare_envs.distributions.coordinates import Coordinates, FloatArray, move_inside
 from rare_envs.distributions.mixture import (
     COMPONENT_FIELDS,
-    BoxPoints,
     CoordinateMixture,
-    TruncatedGaussianMixture,
     apply_by_chunks,
 )
-from rare_envs.distributions.space import Distribution
 from rare_envs.distributions.truncated_normal import TruncatedConditional, log_sum
 
 CHUNK_ROWS = 256
 """Rows worked on together, of a hundred components or more in all."""
-
-
-class Refits(tuple[Distribution, ...]):
-    """Distributions of the same X, of which densities are computed together."""
-
-    __slots__ = ()
-
-    def log_probs(self, x: FloatArray) -> FloatArray:
-        """Return the log density of each, (n, d) -> (R, n); where points are in equal coordinates is found once."""
-        known: dict[tuple[object, ...], BoxPoints] = {}
-        out = np.empty((len(self), len(x)))
-        for row, each in zip(out, self, strict=True):
-            # A class of the user's below one of these may have another density.
-            if type(each) in (CoordinateMixture, TruncatedGaussianMixture):
-                assert isinstance(each, CoordinateMixture)
-                key = each.coordinates.key
-                if key not in known:
-                    known[key] = BoxPoints.of(each.coordinates, each.rows("x", x))
-                row[:] = each.log_prob_at(known[key])
-            else:
-                values = np.asarray(each.log_prob(x))
-                if values.shape != row.shape:
-                    raise ValueError(f"Expected log_prob of a refit of shape {row.shape}, got {values.shape}.")
-                row[:] = values
-        return out
 
 
 def pool_mixtures(mixtures: Sequence[CoordinateMixture]) -> CoordinateMixture | PooledMixture:

@@ -229,10 +229,8 @@ class Measure:
     collisions_only: bool = False
     """Whether f is positive in episodes without a collision and only in those: then {f <= 0} is the collision."""
 
-    @property
-    def records(self) -> bool:
-        """False: one number of each episode is kept."""
-        return False
+    records: ClassVar[bool] = False
+    """One number of each episode is kept."""
 
     def gamma(self, value: float) -> float:
         """Return the threshold of f that corresponds to a value in the measure's own unit and sign."""

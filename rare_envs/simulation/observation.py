@@ -20,7 +20,7 @@ from gymnasium import spaces
 from torch import Tensor
 
 from rare_envs.devices import constant, scalars
-from rare_envs.sensors.camera import Camera, CameraContext, clear_day, read_weather
+from rare_envs.sensors.camera import Camera
 from rare_envs.sensors.lidar import BEAMS, MAX_RANGE
 from rare_envs.sensors.pictures import take_picture
 from rare_envs.traffic.state import LANE_WIDTH, VEHICLE_LENGTH, State
@@ -206,36 +206,3 @@ def observe_features(state: State) -> Tensor:
         ]
     scales = constant(_EGO_SCALES + _OTHER_SCALES * len(others), state.x)
     return (torch.stack(values, dim=1) / scales).clamp(-CLIP, CLIP).float()
-
-
-@dataclass(frozen=True)
-class Sensing:
-    """Sensors of the ego."""
-
-    observation: str = "features"
-    """One of `rare_envs.simulation.observation.OBSERVATIONS`, or several joined by "+"."""
-    camera: Camera = Camera()  # noqa: RUF009  (frozen)
-    """The camera that takes the pictures where "camera" is observed."""
-    weather: bool = False
-    """Whether weather is part of x; a camera sees it."""
-    lidar: bool = False
-    """Whether all vehicles' lidar features are computed even if neither observation, drivers nor measure need them."""
-
-    @property
-    def kinds(self) -> tuple[str, ...]:
-        """Kinds of observation by name."""
-        return kinds_of(self.observation)
-
-    @property
-    def uses_lidar(self) -> bool:
-        """Whether lidar features are computed for the ego."""
-        return self.lidar or "lidar" in self.kinds
-
-    def start_camera(self, weather: Tensor, key: Tensor) -> CameraContext | None:
-        """Return what pictures depend on beside the traffic, at time 0; None without a camera.
-
-        The weather are columns of x, (B, 0) on a clear day; from the key, (B, 1) or (B, 0), follows the camera's noise.
-        """
-        if "camera" not in self.kinds:
-            return None
-        return CameraContext.at_start(self.camera, read_weather(weather, key) if self.weather else clear_day(weather))

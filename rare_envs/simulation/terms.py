@@ -15,8 +15,8 @@ from torch import Tensor
 from rare_envs.distributions.coordinates import FloatArray
 from rare_envs.measures.base import Moment
 from rare_envs.measures.registry import TermMeasure, TermTracker, find_order
-from rare_envs.simulation.episode import Episode, Measurement
-from rare_envs.simulation.world import Driver, StochasticDriver, World, begin_drive, drive_tick
+from rare_envs.simulation.episode import Episode
+from rare_envs.simulation.world import Driver, Measurement, StochasticDriver, World, begin_drive, drive_tick
 from rare_envs.traffic.state import map_tensors
 
 GRADIENT_TILE = 256

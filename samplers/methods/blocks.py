@@ -25,17 +25,10 @@ from scipy.linalg import solve_triangular
 from scipy.optimize import minimize
 from scipy.special import betainc, betaincc, betainccinv, betaincinv, betaln, digamma, ndtr, ndtri
 
+from samplers.components import expectation_maximisation, one_hot, posterior
 from samplers.distributions import SizedDistribution, as_distribution, can_convert
 from samplers.problem import FloatArray, Inputs, needs_library
-from samplers.proposals import (
-    Gaussian,
-    Mixture,
-    expectation_maximisation,
-    one_hot,
-    posterior,
-    shrink_towards_present,
-    weighted_moments,
-)
+from samplers.proposals import Gaussian, Mixture, shrink_towards_present, weighted_moments
 
 
 def beta_statistics(alpha: FloatArray, beta: FloatArray) -> FloatArray:

@@ -9,12 +9,11 @@ References:
 """
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import ClassVar, Literal, NamedTuple, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from samplers.mcmc import (
     Chains,
@@ -26,21 +25,20 @@ from samplers.mcmc import (
     ScaledKernel,
     chain_lengths,
     descend,
+    descent_cov,
     draw_first_level,
+    level_record,
+    multiply_levels,
+    subset_interval,
 )
 from samplers.method import Goal, Outcome, Steps, no_outcome_share
 from samplers.methods.base import Method
 from samplers.problem import FloatArray, Inputs, check_choice, check_count, check_setting
 from samplers.sample import (
-    Interval,
     Layer,
     Level,
     Sample,
     Status,
-    binomial_cov,
-    clopper_pearson,
-    correlation_factor,
-    log_normal_interval,
     next_level,
 )
 
@@ -136,41 +134,6 @@ LARGE_COV = 0.5
 """C.o.v. that is worth a warning; the interval then spans a factor of 2.5 to either side."""
 
 
-class LevelProduct(NamedTuple):
-    """Probability of the last level reached, as a product over the levels."""
-
-    p: float = 1.0
-    """Probability of the last level reached."""
-    cov: float = 0.0
-    """Its coefficient of variation."""
-
-
-def level_record(chains: Chains, threshold: float, passed: LevelProduct) -> Level:
-    """Return the record of a level: the true share of its points with f <= threshold."""
-    below = chains.used & (chains.f <= threshold)
-    total = int(chains.lengths.sum())
-    share = int(below.sum()) / total
-    effective = total / (1 + correlation_factor(below, chains.lengths))
-    return Level(
-        gamma=threshold,
-        p=share,
-        estimate=passed.p * share,
-        n_sim=chains.n_new,
-        n_points=total,
-        cov=binomial_cov(share, effective),
-        acceptance=chains.acceptance,
-        ess=effective,
-    )
-
-
-def multiply_levels(trace: Sequence[Level]) -> LevelProduct:
-    """Return the product over the levels, taken as independent of each other; 1 of none."""
-    p, cov = 1.0, 0.0
-    for level in trace:
-        p, cov = p * level.p, math.sqrt((1 + cov**2) * (1 + level.cov**2) - 1)
-    return LevelProduct(p, cov)
-
-
 def weighted_points(inputs: Inputs, levels: list[Chains], trace: list[Level], gamma: float) -> Sample:
     """Return the points of all levels with their weights.
 
@@ -215,53 +178,6 @@ def summarise(chains: Chains, goal: Goal, trace: list[Level], status: Status) ->
         no_outcome_share=no_outcome_share(hits),
         base_draws=trace[0].n_points,
     )
-
-
-def subset_interval(chains: Chains, goal: Goal, trace: list[Level], cov: float) -> Interval:
-    """Return the interval of p = prod of the shares in `trace`, whose c.o.v. is `cov`, after a last level `chains`."""
-    roots = chains.where(chains.f <= goal.gamma).roots
-    if len(trace) == 1:
-        return clopper_pearson(len(roots), trace[0].n_points, goal.confidence)
-    if len(roots) == 0:
-        return _interval_without_hits(chains, goal, trace)
-    p = multiply_levels(trace).p
-    return log_normal_interval(p, cov, goal.confidence, df=max(effective_roots(roots) - 1, 1.0))
-
-
-def _interval_without_hits(chains: Chains, goal: Goal, trace: list[Level]) -> Interval:
-    """Return the interval of p where no point of the last level fails.
-
-    The level reached is as uncertain as its descent, and its share as if each of its roots were one point.
-    """
-    passed, roots = multiply_levels(trace[:-1]), chains.where(chains.used).roots
-    independent = effective_roots(roots)
-    cov = max(passed.cov, descent_cov(roots, trace[0].n_points))
-    reached = log_normal_interval(passed.p, cov, goal.confidence, df=max(independent - 1, 1.0))[1]
-    return 0.0, reached * clopper_pearson(0, max(int(independent), 1), goal.confidence)[1]
-
-
-def effective_roots(roots: NDArray[np.int64]) -> float:
-    """Return how many points of level 0 the failing points (k,) effectively descend from, (sum h)^2 / sum h^2.
-
-    So many independent terms, less one for their mean, are the degrees of freedom of the c.o.v.: as a rule 8 to 15
-    with N = 1000 and p = 2e-4, too few for a normal quantile.
-    """
-    h = np.bincount(roots).astype(np.float64)
-    return float(h.sum() ** 2 / (h * h).sum())
-
-
-def descent_cov(roots: NDArray[np.int64], n: int) -> float:
-    """Return the c.o.v. of p-hat that the descent of the failing points shows.
-
-    With h_i failing points descending from point i of n at level 0, p-hat is proportional to the
-    mean of the h_i. Were the thresholds fixed, these would be independent, so
-    c.o.v.^2 = sum h_i^2 / (sum h_i)^2 - 1/n. Unlike the product over levels this holds the
-    correlation between levels: a lucky point at level 0 is lucky at all. `roots` (k,) has for each failing point the
-    one of level 0 that it descends from.
-    """
-    if roots.size == 0:
-        return math.inf
-    return math.sqrt(max(1 / effective_roots(roots) - 1 / n, 0.0))
 
 
 def _end_warnings(depth: int, status: Status, hits: int, cov: float) -> list[str]:

@@ -37,9 +37,7 @@ from rare_envs.control.idm import IDM
 from rare_envs.files import replace_text
 from rare_envs.scenarios.base import load_base
 from rare_envs.scenarios.registry import find_scenario, scenario_named
-from rare_envs.simulation.episode import Clock
-from rare_envs.simulation.observation import Sensing
-from rare_envs.simulation.world import World, drive
+from rare_envs.simulation.world import Clock, Sensing, World, drive
 from rare_envs.startup import use_one_thread
 from rare_envs.traffic.bodies import Lead
 from rare_envs.traffic.state import VEHICLE_LENGTH, VEHICLE_WIDTH, State

@@ -46,9 +46,9 @@ from rare_envs.scenarios.car_following import CAR_FOLLOWING
 from rare_envs.scenarios.highway import HIGHWAY
 from rare_envs.sensors.lidar import SPEED_COLUMN
 from rare_envs.simulation.background import Background, TrafficBackground
-from rare_envs.simulation.episode import Clock, Episode, Measurement
-from rare_envs.simulation.observation import Sensing, kinds_of
-from rare_envs.simulation.world import Driver, World, drive
+from rare_envs.simulation.episode import Episode
+from rare_envs.simulation.observation import kinds_of
+from rare_envs.simulation.world import Clock, Driver, Measurement, Sensing, World, drive
 from rare_envs.traffic.bodies import lead_index
 from rare_envs.traffic.crash import NONE, ROAD_EDGE
 from rare_envs.traffic.road import ReferenceLine, Road, i80, straight

@@ -48,9 +48,8 @@ from rare_envs.scenarios.base import load_base
 from rare_envs.scenarios.registry import find_scenario
 from rare_envs.sensors.camera import Weather
 from rare_envs.sensors.pictures import take_picture
-from rare_envs.simulation.episode import Clock, Episode
-from rare_envs.simulation.observation import Sensing
-from rare_envs.simulation.world import World
+from rare_envs.simulation.episode import Episode
+from rare_envs.simulation.world import Clock, Sensing, World
 from rare_envs.startup import use_one_thread
 from rare_envs.traffic.state import VEHICLE_LENGTH, State
 from training.command_line import RunFolderOption, run_command

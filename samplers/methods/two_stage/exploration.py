@@ -38,10 +38,20 @@ from numpy.typing import NDArray
 from scipy.special import ndtri
 
 from samplers.components import IsotropicNormal, MixtureComponent, draw_components, log_ratios, mixture_log_ratio
-from samplers.mcmc import Chains, Growth, NextLevel, ScaledKernel, descend, independent_chains
+from samplers.mcmc import (
+    Chains,
+    Growth,
+    NextLevel,
+    ScaledKernel,
+    descend,
+    descent_cov,
+    independent_chains,
+    level_record,
+    multiply_levels,
+    subset_interval,
+)
 from samplers.method import Goal, Interrupted
 from samplers.methods.base import ComponentDraws, SimulationSteps, Simulator
-from samplers.methods.subset import descent_cov, level_record, multiply_levels, subset_interval
 from samplers.methods.two_stage.regions import (
     Discovery,
     ExplorationResult,

@@ -25,13 +25,16 @@ from samplers.components import (
     SubspaceGaussian,
     draw_components,
     draw_counts,
+    expectation_maximisation,
     log_ratios,
     mixture_log_ratio,
+    posterior,
+    shrink_covariance,
+    start_from_centres,
 )
 from samplers.methods.two_stage.edges import weighted_quantile
 from samplers.methods.two_stage.settings import EDGES, SUBSPACE
 from samplers.problem import FloatArray
-from samplers.proposals import expectation_maximisation, posterior, shrink_covariance, start_from_centres
 from samplers.sample import normalise_weights
 
 Kind = Literal[

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
-from samplers.components import SubspaceGaussian, draw_counts, log_ratios, mixture_log_ratio
+from samplers.components import SubspaceGaussian, draw_counts, log_ratios, mixture_log_ratio, posterior
 from samplers.methods.base import SimulationSteps
 from samplers.methods.two_stage.mixture import (
     LEAST_VARIANCE_OF_COMPONENT,
@@ -27,7 +27,7 @@ from samplers.methods.two_stage.mixture import (
 from samplers.methods.two_stage.settings import LAW, ROUNDS, WALKS
 from samplers.methods.two_stage.term_walks import Directions, TermSimulator, Walks, describe_half_spaces, join_terms
 from samplers.problem import FloatArray, Terms
-from samplers.proposals import correct_eigenvalues, posterior
+from samplers.proposals import correct_eigenvalues
 from samplers.sample import (
     DrawWeights,
     effective_number,

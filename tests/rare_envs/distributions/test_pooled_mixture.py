@@ -5,7 +5,8 @@ import pytest
 from scipy import integrate, stats
 
 from rare_envs.distributions import ClosingSpeed, CoordinateMixture, Coordinates, TruncatedGaussianMixture
-from rare_envs.distributions.pooled import PooledMixture, Refits, pool_mixtures
+from rare_envs.distributions.fitted import Refits
+from rare_envs.distributions.pooled import PooledMixture, pool_mixtures
 
 NAMES = ("speed", "lead_speed", "gap")
 BOX = {"low": [0.0, 0.0, 1.0], "high": [45.0, 45.0, 150.0], "names": NAMES}

@@ -15,7 +15,7 @@ import samplers
 from rare_envs.control import IDM
 from rare_envs.fast import choice, rollouts
 from rare_envs.scenarios import car_following
-from rare_envs.simulation.episode import Measurement
+from rare_envs.simulation.world import Measurement
 from rare_envs.traffic.state import State
 
 CAR_FOLLOWING = "rare_envs/CarFollowing-v0"

@@ -17,8 +17,7 @@ from rare_envs.scenarios.cut_in import CUT_IN
 from rare_envs.scenarios.highway import HIGHWAY
 from rare_envs.simulation import cuda_graphs
 from rare_envs.simulation.cuda_graphs import RecordedRollouts, is_recordable
-from rare_envs.simulation.episode import Clock, Measurement
-from rare_envs.simulation.world import World, rollout
+from rare_envs.simulation.world import Clock, Measurement, World, rollout
 
 X = torch.tensor([[20.0, 12.0, 12.0, 20.0, 40.0, 3.5], [30.0, 25.0, 9.0, 20.0, 40.0, -3.5]])
 

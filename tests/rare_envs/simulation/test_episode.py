@@ -15,8 +15,8 @@ from rare_envs.measures.longitudinal import TTC_MAX
 from rare_envs.scenarios.car_following import CAR_FOLLOWING
 from rare_envs.scenarios.cut_in import CUT_IN
 from rare_envs.simulation.decision import advance
-from rare_envs.simulation.episode import Clock, Episode, Measurement
-from rare_envs.simulation.world import World, drive, rollout
+from rare_envs.simulation.episode import Episode
+from rare_envs.simulation.world import Clock, Measurement, World, drive, rollout
 from rare_envs.traffic.crash import CRASH_KINDS, NONE
 
 

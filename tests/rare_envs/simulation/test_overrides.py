@@ -8,7 +8,8 @@ import torch
 import rare_envs
 from rare_envs.make import set_up
 from rare_envs.sensors.lidar import perceive_traffic
-from rare_envs.simulation.observation import CLIP, Sensing, observation_space, observe
+from rare_envs.simulation.observation import CLIP, observation_space, observe
+from rare_envs.simulation.world import Sensing
 
 every = pytest.mark.parametrize("env_id", rare_envs.ENV_IDS)
 

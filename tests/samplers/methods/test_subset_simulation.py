@@ -8,8 +8,8 @@ from scipy import stats
 
 import samplers
 from samplers.limit_states import half_space, plateau, shell
+from samplers.mcmc import descent_cov
 from samplers.method import Goal
-from samplers.methods.subset import descent_cov
 from samplers.problem import FunctionProblem
 
 ADSS = samplers.AdaptiveSubsetSimulation

@@ -18,8 +18,7 @@ from agents.vision import to_actions
 from rare_envs.control.actions import to_physical
 from rare_envs.control.idm import IDM
 from rare_envs.scenarios.registry import find_scenario
-from rare_envs.simulation.observation import Sensing
-from rare_envs.simulation.world import World
+from rare_envs.simulation.world import Sensing, World
 from rare_envs.traffic.state import VEHICLE_LENGTH, State
 from tests.training.imitation.synthetic_scenes import scene
 from training.imitation.config import Config
