@@ -20,9 +20,9 @@ LIMITS = {
     "test lines": 33_700,
     "pages": 18,
     "words of pages": 40_000,
-    "files entered by an estimate": 48,
-    "files entered by plain Monte Carlo": 26,
-    "files entered by the command": 87,
+    "files entered by an estimate": 42,
+    "files entered by plain Monte Carlo": 24,
+    "files entered by the command": 84,
     "own frames from estimate to f": 6,
     "own frames from the command to f": 16,
 }
