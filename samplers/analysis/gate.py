@@ -6,7 +6,7 @@ the ends of a 90 % interval. Where nothing failed, the upper end is the bound th
 themselves, whatever the method.
 
 Where the base distribution was fitted, p is that of the true distribution, and the limits are those that the events
-behind the base leave (`samplers.analysis.base_uncertainty`), unless the base is taken as given.
+behind the base leave (`samplers.analysis.base_error`), unless the base is taken as given.
 
 Budget: simulations for a wished coefficient of variation, from a pilot.
 
