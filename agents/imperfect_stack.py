@@ -20,7 +20,7 @@ from rare_envs.egos.policy import as_driver
 from rare_envs.sensors.lidar import perceive_traffic
 from rare_envs.simulation.cuda_graphs import says_recordable
 from rare_envs.simulation.episode import Episode
-from rare_envs.simulation.world import Driver, StochasticDriver, World
+from rare_envs.simulation.world import Driver, World, noise_columns
 from rare_envs.traffic.bodies import lead_of
 from rare_envs.traffic.state import State
 
@@ -126,7 +126,7 @@ class NoisyEgo:
         if world.clock.action != "continuous":
             raise ValueError(f'Expected action="continuous" for an ego behind a stack, got {world.clock.action!r}.')
         driver = as_driver(self.ego, world)
-        if isinstance(driver, StochasticDriver) and driver.noise_columns:
+        if noise_columns(driver):
             raise ValueError(
                 f"Expected an ego without noise of its own behind a stack, got {type(driver).__name__} with "
                 "some: give one that acts by its means, or leave noisy: out."

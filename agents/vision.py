@@ -22,7 +22,7 @@ from torch import Tensor, nn
 from agents import files
 from agents.files import SUFFIX, VISION, Provenance
 from rare_envs.control.actions import MAX_ACCELERATION, MAX_STEERING, action_space
-from rare_envs.simulation.observation import EGO_FEATURES, observation_space
+from rare_envs.simulation.observation import EGO_SCALES, observation_space
 from rare_envs.traffic.state import steering_for
 
 if TYPE_CHECKING:
@@ -48,7 +48,7 @@ LAG = 5
 """Age of the earlier picture in ticks of 0.1 s: over 0.5 s a closing gap changes the picture visibly."""
 MIN_STEERING_SPEED = 5.0
 """Below this speed [m/s] a yaw rate steers as at it: on a path of given curvature the yaw rate vanishes with speed."""
-SPEED_SCALE = EGO_FEATURES[0].scale
+SPEED_SCALE = EGO_SCALES["speed"]
 """Speed [m/s] of an observation of 1."""
 _FORM: Mapping[str, Any] = {"format": 1, "observation": OBSERVATION, "picture": [HEIGHT, WIDTH], "lag": LAG}
 """Observation that a network was trained for; a file with another one is refused."""

@@ -13,7 +13,6 @@ from rare_envs.egos.policy import PolicyDriver
 from rare_envs.simulation.decision import (
     COLLISION_COST,
     RewardTerms,
-    TickReward,
     hold_finished,
     reward_terms,
     run_ticks,
@@ -21,6 +20,7 @@ from rare_envs.simulation.decision import (
 from rare_envs.simulation.episode import Episode
 from rare_envs.simulation.world import Driver, World
 from rare_envs.traffic.bodies import pairwise_overlaps
+from rare_envs.traffic.state import map_leaves
 
 __all__ = ["AdversaryTerms", "Transition", "adversary_reward", "own_reward", "play"]
 
@@ -117,7 +117,8 @@ class Transition(NamedTuple):
 
 
 Reward: TypeAlias = Callable[[Transition], Any]
-"""From a transition to a reward of shape (B,): a tensor, or a named tuple of terms with their sum as `total`."""
+"""From a transition to a reward: a tensor (B,), a number for all episodes, or a named tuple of such terms with their
+sum as `total`."""
 
 
 def own_reward(transition: Transition) -> RewardTerms:
@@ -192,28 +193,31 @@ def adversary_reward(transition: Transition) -> AdversaryTerms:
 
 
 def total_of(reward: Any) -> Tensor:
-    """Return a reward, as a reward function gives it, as a tensor (B,)."""
-    total = getattr(reward, "total", reward)  # of a tuple of terms, which may be the user's
-    if not isinstance(total, Tensor) or total.ndim != 1:
-        raise ValueError(f"Expected a reward of shape (B,) or terms with a `total`, got {reward!r}.")
+    """Return the sum (B,) of a reward of `step_agents`."""
+    total: Tensor = reward if isinstance(reward, Tensor) else reward.total
     return total
 
 
-def terms_of(reward: Any) -> dict[str, Tensor]:
-    """Return the terms of a reward by name; one, "reward", if it has none."""
-    return dict(reward._asdict()) if hasattr(reward, "total") else {"reward": reward}
+def _read_reward(reward: Any, like: Tensor) -> Any:
+    """Return what a reward function gave as floating-point tensors (B,), `like` another; else a ValueError."""
+
+    def read(term: Any) -> Tensor:
+        try:
+            value = torch.as_tensor(term)
+        except (TypeError, ValueError, RuntimeError):
+            value = torch.empty(0, 0)  # of no shape that fits
+        if value.shape not in ((), like.shape):
+            raise ValueError(f"Expected a reward of shape (B,), a number, or terms with a `total`, got {reward!r}.")
+        return value if value.ndim and value.is_floating_point() else value.to(like).expand(like.shape)
+
+    return map_leaves(read, reward) if hasattr(reward, "total") else read(reward)
 
 
-class _Joint(NamedTuple):
-    """The episodes, and the memory of the ego's driver."""
-
-    episode: MultiAgentEpisode
-    memory: Any
-
-    @property
-    def collided(self) -> Tensor:
-        """Which vehicles have collided, boolean, shape (B, N)."""
-        return self.episode.collided
+def command_nobody(world: World, batch: int) -> tuple[Tensor, Tensor]:
+    """Return actions of all vehicles, (B, N, 2) or (B, N), and which are commanded, (B, N): none yet."""
+    shape = (batch, world.scenario.vehicles)
+    chosen = torch.full(shape, IDLE) if world.clock.action == "meta" else torch.zeros(*shape, 2)
+    return chosen, torch.zeros(shape, dtype=torch.bool)
 
 
 def step_agents(
@@ -235,18 +239,18 @@ def step_agents(
         the ticks, where ticks after its collision count as 0; and the driver's memory.
     """
 
-    def tick(old: _Joint, chosen: Tensor, first: bool) -> tuple[_Joint, list[TickReward]]:
-        before = old.episode
-        traffic, physical, kept = _combine_actions(world, before, chosen, commanded, ego, old.memory)
+    def tick(before: MultiAgentEpisode, chosen: Tensor, first: bool) -> tuple[MultiAgentEpisode, Any]:
+        nonlocal memory
+        traffic, physical, memory = _combine_actions(world, before, chosen, commanded, ego, memory)
         after = step_traffic(world, before._replace(traffic=traffic), physical, commanded)
-        earned = [
-            TickReward(reward(Transition(before, after, j, physical[:, j])), before.views[j].collided)
-            for j, reward in rewards.items()
-        ]
-        return _Joint(after, kept), earned
+        earned = []
+        for j, reward in rewards.items():
+            given = reward(Transition(before, after, j, physical[:, j]))
+            earned.append((_read_reward(given, traffic.state.x[:, 0]), before.views[j].collided))
+        return after, earned
 
-    end, means = run_ticks(world.clock, _Joint(episode, memory), action, tick)
-    return end.episode, dict(zip(rewards, means, strict=True)), end.memory
+    end, means = run_ticks(world.clock, episode, action, tick)
+    return end, dict(zip(rewards, means, strict=True)), memory
 
 
 def _combine_actions(
@@ -292,18 +296,14 @@ def play(world: World, x: Tensor, policies: Mapping[int, Any], ego: Driver) -> M
     Returns:
         The episodes at the horizon.
     """
-    observation, action_kind = world.sensing.observation, world.clock.action
-    drivers = {vehicle: PolicyDriver(policy, observation, action_kind) for vehicle, policy in policies.items()}
-    episode, memory = start(world, x), None
+    observation, kind = world.sensing.observation, world.clock.action
+    drivers = {vehicle: PolicyDriver(policy, observation, kind) for vehicle, policy in policies.items()}
     memories: dict[int, Any] = dict.fromkeys(drivers)
-    batch, n = episode.disabled.shape
-    commanded = torch.zeros(batch, n, dtype=torch.bool, device=x.device)
-    commanded[:, list(drivers)] = True
-    shape = (batch, n) if action_kind == "meta" else (batch, n, 2)
+    episode, memory = start(world, x), None
     for _ in range(world.clock.ticks // world.clock.stride):
-        action = torch.full(shape, IDLE) if action_kind == "meta" else torch.zeros(shape)
+        action, commanded = command_nobody(world, len(x))
         for vehicle, driver in drivers.items():
-            chosen, memories[vehicle] = driver.act(episode.views[vehicle], memories[vehicle])
-            action[:, vehicle] = chosen
+            action[:, vehicle], memories[vehicle] = driver.act(episode.views[vehicle], memories[vehicle])
+            commanded[:, vehicle] = True
         episode, _, memory = step_agents(world, episode, action, commanded, {}, ego, memory)
     return episode

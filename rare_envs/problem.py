@@ -53,7 +53,7 @@ from rare_envs.simulation.terms import (
     find_differentiator,
     simulate_terms,
 )
-from rare_envs.simulation.world import Driver, Measurement, StochasticDriver, World, rollout
+from rare_envs.simulation.world import Driver, Measurement, World, rollout
 from rare_envs.traffic.crash import CRASH_KINDS, Crash
 
 
@@ -218,7 +218,7 @@ class DrivingProblem:
         fixed = ["the ego's own noise is not part of x, so that failures may not replay"] if self.varies else []
         if self.world.noise != "fixed":
             return ", ".join(fixed)
-        if isinstance(self.driver, StochasticDriver):
+        if hasattr(self.driver, "with_draws"):
             fixed.append("the ego's noise is one fixed sequence")
         if self.world.background is not None and self.world.background.noisy:
             fixed.append("the drivers' noise is one fixed sequence")

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from pettingzoo import ParallelEnv
 from torch import Tensor
 
-from rare_envs.control.actions import IDLE, read_actions
+from rare_envs.control.actions import read_actions
 from rare_envs.egos.needs import EgoNeeds, load_named_ego, resolve
 from rare_envs.egos.policy import as_driver
 from rare_envs.envs.rendering import RENDER_MODES, Display
@@ -27,7 +27,7 @@ from rare_envs.envs.rows_and_infos import (
     to_object_rows,
 )
 from rare_envs.make import set_up
-from rare_envs.multi_agent import MultiAgentEpisode, Reward, own_reward, start, step_agents, total_of
+from rare_envs.multi_agent import MultiAgentEpisode, Reward, command_nobody, own_reward, start, step_agents, total_of
 from rare_envs.plugins import did_you_mean
 from rare_envs.simulation.observation import map_kinds, observe
 
@@ -57,12 +57,6 @@ class _SeveralAgents:
     def _start(self, x: NDArray[np.float64]) -> MultiAgentEpisode:
         with torch.inference_mode():
             return start(self.world, torch.from_numpy(x).float())
-
-    def _nobody(self, batch: int) -> tuple[Tensor, Tensor]:
-        """Return actions of all vehicles, (B, N, 2) or (B, N), and which are commanded, (B, N): none yet."""
-        shape = (batch, self.world.scenario.vehicles)
-        chosen = torch.full(shape, IDLE) if self.world.clock.action == "meta" else torch.zeros(*shape, 2)
-        return chosen, torch.zeros(shape, dtype=torch.bool)
 
 
 def _select_agents(names: tuple[str, ...], agents: Sequence[str] | None) -> list[str]:
@@ -223,7 +217,7 @@ class DrivingParallelEnv(_SeveralAgents, ParallelEnv[str, SingleObservation, Flo
 
     def _read(self, actions: Actions) -> tuple[Tensor, Tensor]:
         """Return actions of all vehicles, (1, N, 2) or (1, N), and which are commanded, (1, N)."""
-        chosen, commanded = self._nobody(1)
+        chosen, commanded = command_nobody(self.world, 1)
         for agent, action in actions.items():
             if action is None:
                 continue
@@ -357,7 +351,7 @@ class AgentsVectorEnv(_SeveralAgents, VectorEnv[NDArray[np.float32], NDArray[Any
             raise RuntimeError("Expected reset() before step().")
         rewards_of = {self._vehicles[agent]: self.rewards[agent] for agent in self.agents}
         with torch.inference_mode():
-            chosen, commanded = self._nobody(self.scenarios)
+            chosen, commanded = command_nobody(self.world, self.scenarios)
             given = read_actions(self.world.clock.action, torch.as_tensor(np.asarray(actions)), self.num_envs)
             chosen[:, self._of_agents] = given.view(self.scenarios, len(self.agents), *given.shape[1:])
             commanded[:, self._of_agents] = True

@@ -16,7 +16,7 @@ from rare_envs.distributions.fitted import FittedDistribution
 from rare_envs.distributions.mixture import CoordinateMixture, TruncatedGaussianMixture
 from rare_envs.distributions.space import Distribution, ScenarioSpace
 from rare_envs.measures.base import RowsReplaceable
-from rare_envs.multi_agent import terms_of, view_order
+from rare_envs.multi_agent import view_order
 from rare_envs.simulation.episode import Episode
 from rare_envs.simulation.observation import map_kinds
 from rare_envs.traffic.crash import describe_crash
@@ -173,7 +173,8 @@ def step_info(
 ) -> Info:
     """Return the info after a step, of an episode as a vehicle sees it."""
     info = episode_info(space, x, episode)
-    info["reward_terms"] = {name: float(value) for name, value in terms_of(reward).items()}
+    terms = {"reward": reward} if isinstance(reward, Tensor) else reward._asdict()
+    info["reward_terms"] = {name: float(value) for name, value in terms.items()}
     if over:
         assert episode.statistics is not None
         info["measure"] = float(episode.f)

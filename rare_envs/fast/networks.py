@@ -13,15 +13,15 @@ from rare_envs.control.actions import DISCRETE_ACTIONS, MAX_ACCELERATION, MAX_ST
 from rare_envs.egos.dense_policies import DensePolicy
 from rare_envs.fast.equations import BODY_LENGTH, ONE, ZERO, clip, compiled, compiled_fused, cosine, sine, single
 from rare_envs.fast.rows import UNKNOWN, Rows, SingleArray
-from rare_envs.simulation.observation import CLIP, EGO_FEATURES, OTHER_FEATURES
+from rare_envs.simulation.observation import CLIP, EGO_SCALES, OTHER_SCALES
 
 LANES = 64
 """Rows side by side, a number that the compiler knows."""
 AT_ONCE = 4
 """Inputs and outputs of a layer that are computed at once."""
 _NOTHING, _BOUND, _ACCELERATION, _STEERING = single(np.nan, CLIP, MAX_ACCELERATION, MAX_STEERING)
-_SPEED, _Y, _HEADING = single(*(feature.scale for feature in EGO_FEATURES))
-_GAP, _RELATIVE_SPEED, _RELATIVE_Y, _LATERAL_SPEED = single(*(feature.scale for feature in OTHER_FEATURES))
+_SPEED, _Y, _HEADING = single(*EGO_SCALES.values())
+_GAP, _RELATIVE_SPEED, _RELATIVE_Y, _LATERAL_SPEED = single(*OTHER_SCALES.values())
 _CHOICES = DISCRETE_ACTIONS.astype(np.float32)
 (_LIMIT,) = single(7.905311)
 """Beyond 7.9 the hyperbolic tangent is 1 in single precision."""

@@ -16,7 +16,7 @@ from rare_envs.devices import constant
 from rare_envs.simulation.episode import Episode
 from rare_envs.simulation.world import Clock, World
 from rare_envs.traffic.bodies import Lead
-from rare_envs.traffic.state import State
+from rare_envs.traffic.state import State, map_leaves
 
 TARGET_SPEED = 21.72
 """Speed [m/s] beyond which going faster earns nothing more: the desired speed of the reference IDM ego."""
@@ -82,19 +82,9 @@ def reward_terms(episode: Episode, action: Tensor) -> RewardTerms:
 
 EpisodesT = TypeVar("EpisodesT", bound=Any)
 """B episodes of one agent or of several; `collided` says of which episodes, or of which agents in each."""
-
-
-class TickReward(NamedTuple):
-    """Reward of one tick for one agent in B episodes."""
-
-    terms: Any
-    """A tensor of shape (B,), or a named tuple of such."""
-    over: Tensor
-    """Which had collided before the tick and earn nothing in it, boolean, shape (B,)."""
-
-
-Tick = Callable[[EpisodesT, Tensor, bool], tuple[EpisodesT, Sequence[TickReward]]]
-"""From episodes, an action and whether it was decided just now to the episodes a tick later and the agents' rewards."""
+Tick = Callable[[EpisodesT, Tensor, bool], tuple[EpisodesT, Sequence[tuple[Any, Tensor]]]]
+"""From episodes, an action and whether it was decided just now to the episodes a tick later and, for each agent, its
+reward, a tensor (B,) or a named tuple of such, and which had collided before and earn nothing, boolean (B,)."""
 
 
 def run_ticks(
@@ -105,29 +95,22 @@ def run_ticks(
     Meta-actions are given in the first tick, `IDLE` in those after it; a physical action in all of them. Return the
     episodes at the next decision and the agents' rewards: the means over the ticks, those after a collision being 0.
     """
-    stride, sums = clock.stride, tuple[Any, ...]()
-    for index in range(stride):
-        if index == 1 and not action.is_floating_point():
-            action = torch.full_like(action, IDLE)
-        episodes, rewards = tick(episodes, action, index == 0)
-        sums = tuple(terms for terms, _ in rewards) if index == 0 else tuple(map(_add, sums, rewards))
-        if stride > 1 and bool(episodes.collided.all()):
+    stride = clock.stride
+    episodes, rewards = tick(episodes, action, True)
+    sums = tuple(terms for terms, _ in rewards)
+    if stride == 1:
+        return episodes, sums
+    for _ in range(stride - 1):
+        if bool(episodes.collided.all()):
             break
-    if stride > 1:
-        sums = tuple(_map_terms(lambda term: term / stride, terms) for terms in sums)
-    return episodes, sums
-
-
-def _add(total: Any, reward: TickReward) -> Any:
-    """Add the reward of a later tick, which counts as 0 where the episode was over."""
-    return _map_terms(lambda old, new: old + new.masked_fill(reward.over, 0.0), total, reward.terms)
-
-
-def _map_terms(function: Callable[..., Tensor], *terms: Any) -> Any:
-    """Apply a function term by term."""
-    if isinstance(terms[0], Tensor):
-        return function(*terms)
-    return type(terms[0])(*map(function, *terms))
+        episodes, rewards = tick(
+            episodes, action if action.is_floating_point() else torch.full_like(action, IDLE), False
+        )
+        sums = tuple(
+            map_leaves(lambda old, new, over=over: old + new.masked_fill(over, 0.0), total, terms)
+            for total, (terms, over) in zip(sums, rewards, strict=True)
+        )
+    return episodes, tuple(map_leaves(lambda total: total / stride, terms) for terms in sums)
 
 
 class StepResult(NamedTuple):
@@ -150,14 +133,14 @@ def advance(
     act at every tick, and the measure is updated at every tick too.
     """
 
-    def tick(old: Episode, chosen: Tensor, first: bool) -> tuple[Episode, tuple[TickReward]]:
+    def tick(old: Episode, chosen: Tensor, first: bool) -> tuple[Episode, tuple[tuple[RewardTerms, Tensor]]]:
         ready, physical = world.decode_meta_actions(old, chosen)
         moved = world.step(ready, physical)
-        reward = TickReward(reward_terms(moved, physical), old.collided)
+        terms = reward_terms(moved, physical)
         moved = moved if first else hold_finished(old.collided, old, moved)
         if watch is not None:
             watch(moved)
-        return moved, (reward,)
+        return moved, ((terms, old.collided),)
 
     episode, (terms,) = run_ticks(world.clock, episode, action, tick)
     return StepResult(episode, terms)

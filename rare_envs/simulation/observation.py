@@ -11,7 +11,6 @@ References:
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -56,11 +55,6 @@ def read_kinds(observation: Any) -> str:
     return "+".join(sorted(names))
 
 
-def kinds_of(observation: str) -> tuple[str, ...]:
-    """Return the kinds of an observation that `read_kinds` has written."""
-    return tuple(observation.split("+"))
-
-
 def map_kinds(function: Callable[..., Any], *observed: Any) -> Any:
     """Apply a function to tensors or arrays, or to those of each name in mappings with the same names."""
     if isinstance(observed[0], dict):
@@ -87,14 +81,6 @@ BEHIND = 2 * VEHICLE_LENGTH
 """Vehicles whose centres are this far behind [m], or further, are not seen."""
 
 
-def kinematics_space() -> spaces.Box[np.float32]:
-    """Return the space of `observe_kinematics`, as HighwayEnv declares it, without bounds.
-
-    What is observed is clipped to [-1, 1] here as there, but Stable-Baselines3's `load(path, env)` wants equal spaces.
-    """
-    return spaces.Box(-np.inf, np.inf, (KINEMATICS_ROWS, len(KINEMATICS_FEATURES)), np.float32)
-
-
 def observe_kinematics(state: State, road: Road, vehicle: int = 0) -> Tensor:
     """Return what a vehicle observes, (B, 5, 5), float32, in [-1, 1]: `KINEMATICS_FEATURES`, the observer's row first.
 
@@ -118,31 +104,13 @@ def observe_kinematics(state: State, road: Road, vehicle: int = 0) -> Tensor:
     return (rows / scales).clamp(-1.0, 1.0).float()
 
 
-@dataclass(frozen=True)
-class Feature:
-    """One entry of the observation: the quantity divided by its scale, clipped to +-`CLIP`."""
-
-    name: str
-    unit: str
-    scale: float
-
-
 CLIP = 5.0
 """Bound of every entry; scales are such that traffic in view stays within it."""
-EGO_FEATURES = (
-    Feature("speed", "m/s", 30.0),
-    Feature("y", "m", LANE_WIDTH),
-    Feature("heading", "rad", 0.1),
-)
-OTHER_FEATURES = (
-    Feature("gap", "m", 50.0),
-    Feature("relative_speed", "m/s", 10.0),
-    Feature("relative_y", "m", LANE_WIDTH),
-    Feature("lateral_speed", "m/s", 2.0),
-)
-"""Of each other vehicle: bumper gap along the road (negative beside or behind), its speed along the road less the
-ego's, its position across the road less the ego's, its speed across the road."""
-_EGO_SCALES, _OTHER_SCALES = (tuple(each.scale for each in features) for features in (EGO_FEATURES, OTHER_FEATURES))
+EGO_SCALES = {"speed": 30.0, "y": LANE_WIDTH, "heading": 0.1}
+"""Entries of the ego and what each is divided by, [m/s], [m] and [rad]."""
+OTHER_SCALES = {"gap": 50.0, "relative_speed": 10.0, "relative_y": LANE_WIDTH, "lateral_speed": 2.0}
+"""Likewise of each other vehicle, [m] and [m/s]: bumper gap along the road (negative beside or behind), its speed along
+the road less the ego's, its position across the road less the ego's, its speed across the road."""
 
 _CORE_SCALES = (LANE_WIDTH, 0.1, 30.0, VEHICLE_LENGTH, 2.0, 0.01, LANE_WIDTH, LANE_WIDTH, 1.0, 1.0, 1.0)
 LIDAR_SCALES = (*_CORE_SCALES, *(MAX_RANGE,) * BEAMS, *(10.0,) * BEAMS)
@@ -155,18 +123,19 @@ def observation_space(vehicles: int, observation: str = "features", camera: Came
     "features": 3 of the ego, then 4 of each other vehicle; "lidar": the ego's 51; "kinematics": HighwayEnv's 5 x 5;
     "camera": an image, uint8, H x W x 3, as large as the camera says; "speed": all that a camera does not show of it.
     """
-    kinds = kinds_of(observation)
+    kinds = observation.split("+")
     if len(kinds) > 1:
         return spaces.Dict({kind: observation_space(vehicles, kind, camera) for kind in kinds})
     if observation == "camera":
         camera = camera or Camera()
         return spaces.Box(0, 255, (camera.height, camera.width, 3), np.uint8)
     if observation == "kinematics":
-        return kinematics_space()
+        # HighwayEnv declares no bounds, although it clips; Stable-Baselines3's `load(path, env)` wants equal spaces
+        return spaces.Box(-np.inf, np.inf, (KINEMATICS_ROWS, len(KINEMATICS_FEATURES)), np.float32)
     if observation == "speed":
         return spaces.Box(-CLIP, CLIP, (1,), np.float32)
-    size = len(EGO_FEATURES) + len(OTHER_FEATURES) * (vehicles - 1)
-    return spaces.Box(-CLIP, CLIP, (len(LIDAR_SCALES) if observation == "lidar" else size,), np.float32)
+    size = len(LIDAR_SCALES) if observation == "lidar" else len(EGO_SCALES) + len(OTHER_SCALES) * (vehicles - 1)
+    return spaces.Box(-CLIP, CLIP, (size,), np.float32)
 
 
 def observe(episode: Episode, observation: str, vehicle: int = 0) -> Any:
@@ -175,7 +144,7 @@ def observe(episode: Episode, observation: str, vehicle: int = 0) -> Any:
     Shape (B, F), float32, within +-`CLIP`; (B, 5, 5) for "kinematics"; (B, H, W, 3), uint8, red, green and blue, for
     "camera". Of several, joined by "+", a mapping from their names.
     """
-    kinds = kinds_of(observation)
+    kinds = observation.split("+")
     if len(kinds) > 1:
         return {kind: observe(episode, kind, vehicle) for kind in kinds}
     if observation == "camera":
@@ -189,7 +158,7 @@ def observe(episode: Episode, observation: str, vehicle: int = 0) -> Any:
         scales = constant(tuple(LIDAR_SCALES), episode.perception)
         return (episode.perception[:, vehicle] / scales).clamp(-CLIP, CLIP).float()
     if observation == "speed":
-        return (episode.state.speed[:, vehicle, None] / EGO_FEATURES[0].scale).clamp(-CLIP, CLIP).float()
+        return (episode.state.speed[:, vehicle, None] / EGO_SCALES["speed"]).clamp(-CLIP, CLIP).float()
     return observe_features(episode.state.seen_by(vehicle))
 
 
@@ -204,5 +173,5 @@ def observe_features(state: State) -> Tensor:
             other.y - ego.y,
             other.speed * torch.sin(other.heading),
         ]
-    scales = constant(_EGO_SCALES + _OTHER_SCALES * len(others), state.x)
+    scales = constant((*EGO_SCALES.values(), *[*OTHER_SCALES.values()] * len(others)), state.x)
     return (torch.stack(values, dim=1) / scales).clamp(-CLIP, CLIP).float()

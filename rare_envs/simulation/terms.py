@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, ClassVar
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import torch
@@ -13,10 +14,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from rare_envs.distributions.coordinates import FloatArray
-from rare_envs.measures.base import Moment
+from rare_envs.measures.base import Measure, Moment
 from rare_envs.measures.registry import TermMeasure, TermTracker, find_order
 from rare_envs.simulation.episode import Episode
-from rare_envs.simulation.world import Driver, Measurement, StochasticDriver, World, begin_drive, drive_tick
+from rare_envs.simulation.world import Driver, Measurement, World, drive_tick, noise_columns, split_noise
 from rare_envs.traffic.state import map_tensors
 
 GRADIENT_TILE = 256
@@ -89,6 +90,8 @@ class EpisodeGradients:
 Differentiator = Callable[..., EpisodeGradients]
 """From x (n, d), the numbers of terms (n,), the ticks (n,) at which `DrivingProblem.terms` found them attained, and
 gamma, on which it depends what the terms are, to gradients."""
+_COASTING: Any = SimpleNamespace(act=lambda episode, memory: (torch.zeros_like(episode.state.x[:, :2]), memory))
+"""An ego that does nothing."""
 
 
 def find_differentiator(world: World, driver: Driver, black_box: bool, x: FloatArray) -> Differentiator | None:
@@ -97,7 +100,7 @@ def find_differentiator(world: World, driver: Driver, black_box: bool, x: FloatA
     One tick of any scenario x (1, d) is tried; nothing is differentiated through an ego that is a `black_box`.
     """
     order, _ = find_order(world.measurement.episode_measure, world.measurement.collisions, 0.0)
-    if order is None or not _is_differentiable(world, _Coasting(), order, x[:, : sum(world.columns)]):
+    if order is None or not _is_differentiable(world, _COASTING, order, x[:, : sum(world.columns)]):
         return None
     through = not black_box and _is_differentiable(world, driver, order, x)
     return partial(_differentiate, world, driver, through)
@@ -121,13 +124,13 @@ def _differentiate(
     order, _ = find_order(measurement.episode_measure, measurement.collisions, gamma)
     if order is None:
         raise ValueError(f"The measure {measurement.measure!r} has no moments whose gradient could be taken.")
-    x, term, ticks = np.asarray(x, dtype=np.float64), np.asarray(term), np.asarray(ticks)
+    of = partial(differentiate_terms, world, driver, order, np.asarray(x, float), np.asarray(term), np.asarray(ticks))
     if through_ego:
         try:
-            return EpisodeGradients(*differentiate_terms(world, driver, order, x, term, ticks), True)
+            return of()
         except RuntimeError:  # an ego of the user's that leaves torch on the way
             pass
-    return EpisodeGradients(*differentiate_terms(world, _ActionsAsGiven(driver), order, x, term, ticks), False)
+    return of(through_ego=False)
 
 
 def differentiate_terms(
@@ -137,8 +140,9 @@ def differentiate_terms(
     x: FloatArray,
     term: Integers,
     ticks: Integers,
+    through_ego: bool = True,
     dtype: torch.dtype = torch.float32,
-) -> tuple[FloatArray, float]:
+) -> EpisodeGradients:
     """Return gradients (n, d) of one term of each rollout at the tick at which it is attained, and what they cost.
 
     After contact a measure is flat: where a term is attained by a collision, it is differentiated one tick before. NaN
@@ -149,112 +153,59 @@ def differentiate_terms(
     rows_by_tick = np.argsort(ticks, kind="stable")
     for first in range(0, len(x), GRADIENT_TILE):
         rows = rows_by_tick[first : first + GRADIENT_TILE]
-        leaf = torch.from_numpy(x[rows]).to(dtype).requires_grad_()
-        rollouts = _Unfinished(world, driver, leaf, torch.from_numpy(ticks[rows]))
-        values = rollouts.attained_values(order, torch.from_numpy(term[rows]))
+        leaf, of, at = torch.from_numpy(x[rows]).to(dtype).requires_grad_(), term[rows], ticks[rows]
+        values, simulated = _attain(world, driver, order, leaf, torch.from_numpy(of), torch.from_numpy(at), through_ego)
         (slope,) = torch.autograd.grad(values.sum(), leaf)
         gradients[rows] = slope.double().numpy()
-        moments += rollouts.moments
+        moments += simulated
     gradients[~np.isfinite(gradients).all(axis=1)] = np.nan
-    return gradients, ROLLOUTS_PER_GRADIENT * moments / (world.clock.ticks + 1)
+    return EpisodeGradients(gradients, ROLLOUTS_PER_GRADIENT * moments / (world.clock.ticks + 1), through_ego)
 
 
-class _Unfinished:
-    """Rollouts that go on until their ticks, each; those that have got there are left out where that is possible."""
-
-    def __init__(self, world: World, driver: Driver, x: Tensor, ticks: Tensor) -> None:
-        measure = world.measurement.episode_measure
-        self.world = replace(world, measurement=Measurement(_Unmeasured(measure.sees), world.measurement.collisions))
-        self.episode, self.driver = begin_drive(self.world, driver, x)
-        self.memory: Any = None
-        self.before: Moment | None = None
-        self.ticks = ticks
-        self.index = torch.arange(len(ticks))
-        self.moments = len(ticks)
-        """Moments of rollouts so far."""
-
-    def attained_values(self, order: TermMeasure, term: Tensor) -> Tensor:
-        """Return the values of terms (B,) when they are attained, in no order, with their graph."""
-        values, last = [], int(self.ticks.max())
-        for tick in range(last + 1):
-            episode, before = self.episode, None if self.before is None else self.before.state
-            moment = Moment(episode.state, episode.lead, episode.road, episode.perception, before, self.world.clock.dt)
-            due, collided = self.ticks == tick, episode.collided
-            for rows, at in ((due & ~collided, moment), (due & collided, self.before)):
-                chosen = rows.nonzero()[:, 0]
-                if len(chosen) and at is not None:
-                    of_rows = order.term_values(_select(at, chosen))
-                    number = term[self.index[chosen]] % of_rows.shape[1]
-                    values.append(of_rows.gather(1, number[:, None])[:, 0])
-            if tick < last:
-                self._go_on(moment, self.ticks > tick)
-        # where all have collided before the first moment, nothing depends on x
-        return torch.cat(values) if values else self.episode.state.x[:0, 0]
-
-    def _go_on(self, moment: Moment, unfinished: Tensor) -> None:
-        """Move on by one tick."""
-        if self.memory is None and self.episode.camera_context is None and not _noise_columns(self.driver):
-            keep = unfinished.nonzero()[:, 0]
-            if len(keep) <= KEPT_SHARE * len(unfinished):
-                self.episode, moment = _select(self.episode, keep), _select(moment, keep)
-                self.ticks, self.index = self.ticks[keep], self.index[keep]
-        self.before = moment
-        self.episode, self.memory = drive_tick(self.world, self.driver, self.episode, self.memory)
-        self.moments += len(self.index)
+def _attain(
+    world: World, driver: Driver, order: TermMeasure, x: Tensor, term: Tensor, ticks: Tensor, through_ego: bool
+) -> tuple[Tensor, int]:
+    """Return the values of terms (B,) when they are attained, in no order, with their graph; and moments simulated."""
+    unread = Measure(lambda moment: moment.lead.gap.detach(), sees=world.measurement.episode_measure.sees)
+    world = replace(world, measurement=Measurement(unread, world.measurement.collisions))
+    own = noise_columns(driver)
+    _, driver = split_noise(driver, x if through_ego else x.detach())
+    driver = driver if through_ego else _take_as_given(driver)
+    episode, memory, before = world.start(x[:, : x.shape[1] - own]), None, None
+    values, moments, last = [], 0, int(ticks.max())
+    for tick in range(last + 1):
+        moments += len(ticks)
+        old = None if before is None else before.state
+        moment = Moment(episode.state, episode.lead, episode.road, episode.perception, old, world.clock.dt)
+        due = ticks == tick
+        for rows, at in ((due & ~episode.collided, moment), (due & episode.collided, before)):
+            if at is not None and rows.any():
+                of_rows = order.term_values(_select(at, rows))
+                values.append(of_rows.gather(1, term[rows][:, None] % of_rows.shape[1])[:, 0])
+        if tick == last:
+            break
+        unfinished = ticks > tick
+        free = memory is None and episode.camera_context is None and not own  # nothing else knows the number of rows
+        if free and int(unfinished.sum()) <= KEPT_SHARE * len(ticks):
+            episode, moment, ticks, term = _select((episode, moment, ticks, term), unfinished)
+        before = moment
+        episode, memory = drive_tick(world, driver, episode, memory)
+    # where all have collided before the first moment, nothing depends on x
+    return torch.cat(values) if values else episode.state.x[:0, 0], moments
 
 
-@dataclass(frozen=True)
-class _Unmeasured:
-    """A measure that measures nothing."""
+def _take_as_given(driver: Driver) -> Any:
+    """Return an ego whose actions have no gradient: a black box, in a rollout that is differentiated."""
 
-    sees: bool
-    records: ClassVar[bool] = False
-    unit: ClassVar[str] = ""
-
-    def start(self, moment: Moment, ticks: int) -> None:
-        return None
-
-    def update(self, state: None, moment: Moment, before: Tensor, now: Tensor) -> None:
-        return None
-
-    def f(self, state: None) -> Tensor:
-        raise AssertionError("Gradients are those of the terms: nobody reads f of their rollouts.")
-
-
-class _Coasting:
-    """An ego that does nothing."""
-
-    def act(self, episode: Episode, memory: Any) -> tuple[Tensor, Any]:
-        return torch.zeros_like(episode.state.x[:, :2]), memory
-
-
-@dataclass(frozen=True)
-class _ActionsAsGiven:
-    """An ego whose actions have no gradient: a black box, in a rollout that is differentiated."""
-
-    driver: Any
-    """The ego."""
-
-    @property
-    def noise_columns(self) -> int:
-        """Number of columns of x that are its noise."""
-        return _noise_columns(self.driver)
-
-    def with_draws(self, draws: Tensor) -> Driver:
-        """Return the driver of B episodes with standard normal draws."""
-        return _ActionsAsGiven(self.driver.with_draws(draws.detach()))
-
-    def act(self, episode: Episode, memory: Any) -> tuple[Tensor, Any]:
-        """Return what the ego does in these episodes, as if they were constants."""
+    def act(episode: Episode, memory: Any) -> tuple[Tensor, Any]:
         with torch.no_grad():
-            action, memory = self.driver.act(map_tensors(Tensor.detach, episode), memory)
+            action, memory = driver.act(map_tensors(Tensor.detach, episode), memory)
         return action.detach(), memory
 
-
-def _noise_columns(driver: Driver) -> int:
-    return driver.noise_columns if isinstance(driver, StochasticDriver) else 0
+    return SimpleNamespace(act=act)
 
 
 def _select(tree: Any, rows: Tensor) -> Any:
-    """Return some of the episodes of a tree of tensors."""
-    return map_tensors(lambda part: part[rows], tree)
+    """Return some of the episodes of a tree of tensors, by a mask (B,)."""
+    chosen = rows.nonzero()[:, 0]
+    return map_tensors(lambda part: part[chosen], tree)

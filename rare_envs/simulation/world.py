@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from numbers import Real
-from typing import Any, NamedTuple, Protocol, runtime_checkable
+from typing import Any, NamedTuple, Protocol, cast
 
 import torch
 from gymnasium import spaces
@@ -72,12 +72,8 @@ class Sensing:
 
 LONGEST_TICK = 1.0
 """Largest dt [s]: at motorway speed a vehicle moves 40 m in it, farther than gaps are."""
-
-
 LONGEST_HORIZON = 1e6
 """Episodes are shorter than this [s]; longer ones are a mistake of units."""
-
-
 _ROUNDING = 1e-6
 """By so much a number of ticks may differ from a whole one."""
 
@@ -102,12 +98,11 @@ class Clock:
             raise ValueError(f"Expected a horizon below {LONGEST_HORIZON:g} s, got {self.horizon!r}: it is in seconds.")
         if not (_is_number(self.horizon) and self.dt <= self.horizon and _is_whole(self.horizon / self.dt)):
             raise ValueError(f"Expected a horizon of one or more whole ticks of {self.dt} s, got {self.horizon!r}.")
-        for name, value, number in (("dt", self.dt, 1.0 / self.dt), ("horizon", self.horizon, self.horizon / DECISION)):
-            if self.action == "meta" and not _is_whole(number):
-                raise ValueError(
-                    f"Expected a dt that divides 1 s and a horizon of whole seconds with action='meta', in which a "
-                    f"decision takes 1 s; got {name} = {value!r}."
-                )
+        if self.action == "meta" and not (_is_whole(1.0 / self.dt) and _is_whole(self.horizon / DECISION)):
+            raise ValueError(
+                "Expected a dt that divides 1 s and a horizon of whole seconds with action='meta', in which a decision "
+                f"takes 1 s; got dt = {self.dt!r} and horizon = {self.horizon!r}."
+            )
 
     @property
     def seconds(self) -> float:
@@ -287,14 +282,7 @@ class World:
         background_state: BackgroundState | None = None,
         camera_context: CameraContext | None = None,
     ) -> Episode:
-        """Begin B episodes of the vehicle in the ego's place from any state.
-
-        Args:
-            state: Of B scenarios.
-            perception: Lidar features of the vehicles, (B, N, 51); None in a world without.
-            background_state: Of the drivers around the ego.
-            camera_context: Of a camera on the vehicle in the ego's place.
-        """
+        """Begin B episodes of the vehicle in the ego's place from a state, with lidar features (B, N, 51) or None."""
         road, measure = self.scenario.road, self.measurement.episode_measure
         moment = Moment(state, lead_of(state, road), road, perception, None, self.clock.dt)
         measure_state = measure.start(moment, self.clock.ticks)
@@ -336,16 +324,10 @@ class World:
     def decode_meta_actions(
         self, episode: Episode, action: Tensor, commanded: Tensor | None = None
     ) -> tuple[Episode, Tensor]:
-        """Turn meta-actions into what the vehicles' controllers do in this tick; other actions stay as they are.
+        """Turn meta-actions (B,) into what the controllers do in this tick; other actions stay as they are.
 
-        Args:
-            episode: B episodes.
-            action: Meta-actions, whole numbers of shape (B,), with `commanded` (B, N): a decision, and `IDLE` in the
-                ticks that follow it. Or an action as `step` takes it.
-            commanded: As in `step`.
-
-        Returns:
-            The episodes with their new aims, and accelerations [m/s^2] and steering angles [rad] in a last axis of 2.
+        With `commanded` (B, N), of all vehicles (B, N): a decision, and `IDLE` in the ticks that follow it. Return the
+        episodes with their new aims, and accelerations [m/s^2] and steering angles [rad] in a last axis of 2.
         """
         if episode.aim is None or action.is_floating_point():
             return episode, action
@@ -413,30 +395,28 @@ _RULE = IDM()
 
 
 def apply_overrides(
-    episode: Episode,
-    action: Tensor,
-    commanded: Tensor | None,
-    scripted: Others,
-    driver_actions: Tensor | None,
-    dt: float,
+    episode: Episode, action: Tensor, commanded: Tensor | None, others: Others, driven: Tensor | None, dt: float
 ) -> tuple[Others, Tensor]:
-    """Return the others after a tick in which some take an agent's actions, and who was commanded by now, (B, N)."""
+    """Return the others after a tick in which some take an agent's actions, and who was commanded by now, (B, N).
+
+    `others` are those that follow script or drivers, whose actions are `driven`.
+    """
     state, road = episode.state, episode.road
     if commanded is None:
         commanded = torch.zeros_like(state.x, dtype=torch.bool)
         action = torch.zeros_like(state.x)[..., None].expand(-1, -1, 2)
     overridden = commanded if episode.overridden is None else commanded | episode.overridden
-    released = (overridden & ~commanded)[:, 1:]
-    if bool(released.any()):
-        if driver_actions is None:
-            action = torch.where((overridden & ~commanded)[..., None], rule_based_actions(episode), action)
+    released = overridden & ~commanded
+    if bool(released[:, 1:].any()):
+        if driven is None:
+            action = torch.where(released[..., None], rule_based_actions(episode), action)
             commanded = overridden
         else:
-            scripted = _choose(released, drive_points(state, driver_actions, dt, road), scripted)
+            others = _choose(released[:, 1:], drive_points(state, driven, dt, road), others)
     x, y, heading, speed = (field[:, 1:] for field in state[:4])
     curvature = None if road.reference_line is None else road.curvature(x)
     moved = Others(*bicycle(x, y, heading, speed, action[:, 1:, 0], action[:, 1:, 1], dt, curvature))
-    return _choose(commanded[:, 1:], moved, scripted), overridden
+    return _choose(commanded[:, 1:], moved, others), overridden
 
 
 def rule_based_actions(episode: Episode) -> Tensor:
@@ -482,16 +462,18 @@ class Driver(Protocol):
         ...
 
 
-@runtime_checkable
-class StochasticDriver(Driver, Protocol):
-    """A driver with noise of its own, which can be part of x."""
+def noise_columns(driver: Driver) -> int:
+    """Return how many columns of x are a driver's noise, the last ones: its attribute `noise_columns`, if it has one.
 
-    @property
-    def noise_columns(self) -> int:
-        """Number of columns of x that are its noise, the last ones; 0 where its noise is fixed or off."""
+    A driver with such noise has `with_draws`, which takes standard normal draws (B, columns).
+    """
+    return int(getattr(driver, "noise_columns", 0))  # anybody's object
 
-    def with_draws(self, draws: Tensor) -> Driver:
-        """Return the driver of B episodes with standard normal draws, shape (B, `noise_columns`)."""
+
+def split_noise(driver: Driver, x: Tensor) -> tuple[Tensor, Driver]:
+    """Return the world's part of x (B, d), and the driver with its noise, which are the columns behind it."""
+    own, stochastic = noise_columns(driver), cast(Any, driver)
+    return (x[:, :-own], stochastic.with_draws(x[:, -own:])) if own else (x, driver)
 
 
 def drive(world: World, driver: Driver, x: Tensor) -> Iterator[Episode]:
@@ -514,20 +496,12 @@ def drive(world: World, driver: Driver, x: Tensor) -> Iterator[Episode]:
         >>> len(list(drive(World(CAR_FOLLOWING), IDM(), x)))  # time 0 and 100 ticks
         101
     """
-    episode, driver = begin_drive(world, driver, x)
-    memory = None
+    x, driver = split_noise(driver, x)
+    episode, memory = world.start(x), None
     yield episode
     for _ in range(world.clock.ticks):
         episode, memory = drive_tick(world, driver, episode, memory)
         yield episode
-
-
-def begin_drive(world: World, driver: Driver, x: Tensor) -> tuple[Episode, Driver]:
-    """Return the episodes at time 0, and the driver with its noise; arguments as of `drive`."""
-    if isinstance(driver, StochasticDriver) and driver.noise_columns:
-        own = driver.noise_columns
-        x, driver = x[:, :-own], driver.with_draws(x[:, -own:])
-    return world.start(x), driver
 
 
 def drive_tick(world: World, driver: Driver, episode: Episode, memory: Any) -> tuple[Episode, Any]:

@@ -47,7 +47,6 @@ from rare_envs.scenarios.highway import HIGHWAY
 from rare_envs.sensors.lidar import SPEED_COLUMN
 from rare_envs.simulation.background import Background, TrafficBackground
 from rare_envs.simulation.episode import Episode
-from rare_envs.simulation.observation import kinds_of
 from rare_envs.simulation.world import Clock, Driver, Measurement, Sensing, World, drive
 from rare_envs.traffic.bodies import lead_index
 from rare_envs.traffic.crash import NONE, ROAD_EDGE
@@ -243,7 +242,7 @@ def judge(
     driver = as_driver(ego, world, needs)
     world = replace(world, sensing=replace(world.sensing, lidar=True)) if needs.lidar else world
     x = draw_inputs(case, world, rollouts, needs.noise_columns(world), np.random.default_rng(seed))
-    tile = 64 if "camera" in kinds_of(needs.observation) else 256
+    tile = 64 if "camera" in needs.observation.split("+") else 256
     parts = [_judge_tile(world, driver, part) for part in torch.split(torch.from_numpy(x).float(), tile)]
     return Verdicts(*(np.concatenate(column) for column in zip(*parts, strict=True)))
 

@@ -22,7 +22,7 @@ from rare_envs.egos.policy import PolicyDriver
 from rare_envs.egos.wrappers import find_frame_stacking
 from rare_envs.plugins import reason_of
 from rare_envs.problem import DrivingProblem
-from rare_envs.simulation.observation import batch_size, kinds_of, map_kinds, observe
+from rare_envs.simulation.observation import batch_size, map_kinds, observe
 from rare_envs.simulation.world import drive
 from rare_envs.study.ego_check import FAIL, HINT, Finding, judge, report_failure, report_pass, report_warning
 from samplers.evaluate import Evaluator
@@ -283,7 +283,7 @@ def check_row_independence(probe: Probe) -> Iterator[Finding]:
 def check_latency(probe: Probe) -> Iterator[Finding]:
     """Measure the duration of a call by batch size."""
     times = {}
-    sizes = CAMERA_BATCH_SIZES if "camera" in kinds_of(probe.problem.world.sensing.observation) else BATCH_SIZES
+    sizes = CAMERA_BATCH_SIZES if "camera" in probe.problem.world.sensing.kinds else BATCH_SIZES
     for size in sizes:
         observation = probe.repeat_seen(size)
         probe.query(observation)
@@ -302,7 +302,7 @@ def check_latency(probe: Probe) -> Iterator[Finding]:
 
 def check_memory_growth(probe: Probe) -> Iterator[Finding]:
     """Measure by how much the process grows over 100 calls."""
-    pictures = "camera" in kinds_of(probe.problem.world.sensing.observation)
+    pictures = "camera" in probe.problem.world.sensing.kinds
     observation = probe.repeat_seen(4 if pictures else 256)
     for _ in range(20):
         probe.query(observation)

@@ -2,7 +2,7 @@
 
 import warnings
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
@@ -224,18 +224,37 @@ def test_where_the_ego_is_not_commanded_its_driver_drives() -> None:
     assert torch.equal(end.traffic.state.x[running], alone.state.x[running])
 
 
-def test_a_reward_may_be_a_tensor() -> None:
+@pytest.mark.parametrize("given", [torch.ones(2), torch.ones(()), 1.0, 1, np.float64(1.0)])
+def test_a_reward_may_be_a_tensor_or_a_number(given: Any) -> None:
     """Its mean over the ten ticks of a meta-action; ticks after the agent's collision count as 0."""
     world = World(CAR_FOLLOWING, clock=Clock(horizon=1.0, action="meta"))
     action, commanded = torch.full((2, 2), IDLE), torch.tensor([[True, False]]).expand(2, 2)
-    rewards = {0: lambda transition: torch.ones(2)}
-    _, earned, _ = step_agents(world, start(world, X), action, commanded, rewards, IDM())
+    _, earned, _ = step_agents(world, start(world, X), action, commanded, {0: lambda transition: given}, IDM())
     torch.testing.assert_close(earned[0], torch.tensor([1.0, 0.4]))  # 3.5 m at 10 m/s: four ticks
-    for wrong in (0.0, torch.zeros(()), torch.zeros(3, 1)):
-        env = rare_envs.parallel_env(FOLLOWING, agents=["lead"], rewards={"lead": lambda _, wrong=wrong: wrong})
+
+
+class Two(NamedTuple):
+    gap: Any
+    bonus: Any
+
+    @property
+    def total(self) -> Any:
+        return self.gap + self.bonus
+
+
+@pytest.mark.parametrize("action", ["continuous", "meta"])
+def test_terms_of_a_reward_may_be_numbers_and_what_is_neither_is_refused(action: str) -> None:
+    for given, right in ((Two(torch.full((1,), 2.0), 0.5), True), (torch.zeros(3, 1), False), ("much", False)):
+        rewards = {"lead": lambda transition, given=given: given}
+        env = rare_envs.parallel_env(FOLLOWING, agents=["lead"], rewards=rewards, action=action)
         env.reset(seed=0)
-        with pytest.raises(ValueError, match=r"shape \(B,\)"):
-            env.step({"lead": np.zeros(2)})
+        act = {"lead": np.zeros(2) if action == "continuous" else IDLE}
+        if right:
+            _, reward, *_, infos = env.step(act)
+            assert (reward["lead"], infos["lead"]["reward_terms"]) == (2.5, {"gap": 2.0, "bonus": 0.5})
+        else:
+            with pytest.raises(ValueError, match=r"Expected a reward of shape \(B,\), a number, or terms"):
+                env.step(act)
 
 
 SMALL = (36, 60)

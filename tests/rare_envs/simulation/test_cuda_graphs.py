@@ -27,63 +27,33 @@ def test_on_the_cpu_nothing_is_recorded() -> None:
     assert torch.equal(recorded(World(CUT_IN), X).f, rollout(World(CUT_IN), IDM(), X).f)
 
 
-@pytest.fixture
-def made(monkeypatch: pytest.MonkeyPatch) -> list[tuple[World, int]]:
-    """Worlds and sizes of the recordings that are made, of which only the places of x are there."""
-    asked: list[tuple[World, int]] = []
+def test_each_world_and_size_is_recorded_once_and_what_was_not_played_for_longest_goes_first(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Nothing is recorded here; the places of x are there. Where memory is short, all recordings go first."""
+    made: list[tuple[World, int]] = []
 
     def record(world: World, driver: Any, x: torch.Tensor, size: int) -> Any:
-        asked.append((world, size))
-        return cuda_graphs._Recording(world, x[0].expand(size, -1).clone(), None, None)  # type: ignore[arg-type]
+        if size == 16 and recorded._recordings:
+            raise torch.OutOfMemoryError
+        made.append((world, size))
+        return cuda_graphs.Recording(world, x[0].expand(size, -1).clone(), None if world == broken else object())
 
     monkeypatch.setattr(cuda_graphs, "record", record)
-    return asked
-
-
-def test_each_world_and_size_is_recorded_once(made: list[tuple[World, int]]) -> None:
-    recorded, other = RecordedRollouts(IDM(), 64), World(CUT_IN, measurement=Measurement("pet"))
-    for world in (World(CUT_IN), other, World(CUT_IN), replace(other)):
+    recorded, broken = RecordedRollouts(IDM(), 64), World(CUT_IN, measurement=Measurement("thw"))
+    for world in (World(CUT_IN), replace(World(CUT_IN)), broken):
         for rows in (X, X[:1], torch.cat((X, X))):
             found = recorded._find(world, rows)
-            assert found is not None
-            assert (found.world, len(found.x)) == (world, 1 if len(rows) == 1 else 4)
-    assert len(made) == 4
-
-
-def test_what_was_not_played_for_longest_goes_first(made: list[tuple[World, int]]) -> None:
-    recorded = RecordedRollouts(IDM(), 4)
+            assert found is not None and found.world == world
+            assert found.graph is None or len(found.x) == (1 if len(rows) == 1 else 4)
+    assert [size for _, size in made] == [4, 1, 4]  # what broke off is not tried again
+    recorded._find(World(CUT_IN), torch.cat([X] * 8))
+    assert [len(each.x) for each in recorded._recordings] == [16]
     worlds = [World(CUT_IN, clock=Clock(dt=0.1, horizon=1.0 + 0.1 * n)) for n in range(cuda_graphs.MOST_RECORDINGS + 1)]
-    for world in (*worlds[:-1], worlds[0], worlds[-1], worlds[0]):
+    made.clear()
+    for world in (*worlds[:-1], worlds[0], worlds[-1], worlds[0], worlds[1]):
         recorded._find(world, X)
-    assert [world for world, _ in made] == worlds
-    recorded._find(worlds[1], X)
-    assert made[-1][0] == worlds[1]
-    assert len(recorded._recordings) == cuda_graphs.MOST_RECORDINGS
-
-
-def test_a_record_that_broke_off_is_not_tried_again(monkeypatch: pytest.MonkeyPatch) -> None:
-    tried = []
-    monkeypatch.setattr(cuda_graphs, "record", lambda *given: tried.append(given))
-    recorded = RecordedRollouts(IDM(), 64)
-    assert recorded._find(World(CUT_IN), X) is None
-    assert recorded._find(World(CUT_IN), X[:1]) is None
-    assert len(tried) == 1
-
-
-def test_where_memory_is_short_the_recordings_go_first(
-    made: list[tuple[World, int]], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    recorded, record = RecordedRollouts(IDM(), 64), cuda_graphs.record
-    recorded._find(World(CUT_IN), X[:1])
-
-    def record_if_there_is_room(*given: Any) -> Any:
-        if recorded._recordings:
-            raise torch.OutOfMemoryError
-        return record(*given)
-
-    monkeypatch.setattr(cuda_graphs, "record", record_if_there_is_room)
-    assert recorded._find(World(CUT_IN), X) is not None
-    assert [len(each.x) for each in recorded._recordings] == [4]
+    assert [world for world, _ in made] == [*worlds, worlds[1]]
 
 
 def own_gap(moment: Moment) -> torch.Tensor:

@@ -33,7 +33,7 @@ def test_ticks_and_decisions() -> None:
         *(({"horizon": h}, r"one or more whole ticks of 0\.1 s") for h in (0.0, 0.05, 0.25, math.nan, True, "10")),
         *(({"horizon": h}, r"Expected a horizon below 1e\+06 s") for h in (1e6, math.inf)),
         ({"dt": 0.3, "horizon": 3.0, "action": "meta"}, r"a decision takes 1 s; got dt = 0\.3"),
-        ({"horizon": 2.5, "action": "meta"}, r"a decision takes 1 s; got horizon = 2\.5"),
+        ({"horizon": 2.5, "action": "meta"}, r"a decision takes 1 s; got .*horizon = 2\.5"),
     ],
 )
 def test_times_that_do_not_go_together_are_refused(settings: dict[str, object], message: str) -> None:

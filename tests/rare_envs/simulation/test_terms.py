@@ -125,7 +125,7 @@ def test_central_differences_in_double_precision() -> None:
     ticks = terms.ticks[rows, least]
     order, _ = find_order(MEASURES["clearance"], "ego", 0.0)
     assert order is not None
-    by_autograd, _ = differentiate_terms(problem.world, IDM(), order, x, least, ticks, torch.float64)
+    by_autograd = differentiate_terms(problem.world, IDM(), order, x, least, ticks, dtype=torch.float64).values
 
     steps = 1e-5 * x.std(axis=0)
     shifts = np.concatenate([np.diag(steps), -np.diag(steps)])[:, None]
