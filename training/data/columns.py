@@ -1,4 +1,4 @@
-"""Columns of recordings: maps of names and units, readers of text, and the checks that every recording passes.
+"""Files of recordings as columns: maps of names and units, readers, and the checks that every recording passes.
 
 Errors name the file and the line, counted from 1 as editors do.
 """
@@ -8,7 +8,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -22,8 +22,7 @@ from samplers.problem import FloatArray
 Gaps = Literal["error", "cut"]
 
 CHUNK, LARGEST_DOCUMENT = 1 << 24, 1 << 28
-"""Characters of JSON read at a time (documents have 1e4 to 1e6), and after which one that does not end is taken to be
-broken."""
+"""Characters of JSON read at a time (documents have 1e4 to 1e6), and after which one that does not end is broken."""
 FASTEST_SPEED = 70.0
 """Speed [m/s] above which (252 km/h) units are taken to be wrong, or tracking to be broken."""
 FASTEST_JUMP = 100.0
@@ -55,12 +54,11 @@ ColumnMap = Mapping[str, Column]
 
 @dataclass(frozen=True)
 class Rows:
-    """Columns of a file, with the line, or other unit, that each row stands in."""
+    """Columns of a file (rows,), with the line, or other unit, that each row stands in."""
 
     path: Path
     columns: Mapping[str, NDArray[Any]]
     lines: NDArray[np.int64]
-    """Line of each row, shape (rows,)."""
     unit: str = "line"
     """What `lines` counts, in errors."""
 
@@ -73,23 +71,26 @@ class Rows:
     def select(self, chosen: NDArray[np.bool_]) -> Rows:
         """Return the chosen rows."""
         columns = {name: values[chosen] for name, values in self.columns.items()}
-        return Rows(self.path, columns, self.lines[chosen], self.unit)
+        return replace(self, columns=columns, lines=self.lines[chosen])
 
     def convert(self, columns: ColumnMap) -> Rows:
         """Return the rows with numbers in the units of the table."""
         units = {name: column.unit for name, column in columns.items() if not column.text}
         values = {name: units[name] * array if name in units else array for name, array in self.columns.items()}
-        return Rows(self.path, values, self.lines, self.unit)
+        return replace(self, columns=values)
 
-    def refuse(self, bad: NDArray[np.bool_], describe: Callable[[int], str]) -> None:
-        """Raise a ValueError that names the file and the line of the first bad row, if any is (rows,)."""
+    def refuse(self, bad: NDArray[np.bool_] | bool, text: str | Callable[[int], str]) -> None:
+        """Raise a ValueError with file, line and a text on the first bad row, if any is (rows,) or all are."""
+        bad = np.broadcast_to(bad, len(self))
         if bad.any():
             row = int(np.argmax(bad))
-            raise self.error(row, describe(row))
+            words = text if isinstance(text, str) else text(row)
+            raise ValueError(f"{self.path}, {self.unit} {self.lines[row]}: {words}")
 
-    def error(self, row: int, text: str) -> ValueError:
-        """Return an error that names the file and the line of a row."""
-        return ValueError(f"{self.path}, {self.unit} {self.lines[row]}: {text}")
+    def refuse_infinite(self, name: str, header: str, empty: NDArray[np.bool_] | bool = False) -> None:
+        """Raise a ValueError on a value that was read and is no finite number; empty ones (rows,) are left out."""
+        values = self[name]
+        self.refuse(~(np.isfinite(values) | empty), lambda row: f"{header} is {values[row]:g}, a number was expected.")
 
 
 def read_header(path: Path) -> list[str]:
@@ -104,46 +105,39 @@ def read_header(path: Path) -> list[str]:
     return header
 
 
-def read_table(path: Path | str, columns: ColumnMap, leave_out_empty: bool = False) -> Rows:
-    """Return columns of a CSV file with a header, numbers as float64 in the units of the table.
+def read_table(path: Path, columns: ColumnMap, leave_out_empty: bool = False) -> Rows:
+    """Return columns of a CSV file with a header, numbers in the units of the table, or a ValueError on what is wrong.
 
-    Rows in which a number is not given are left out on request. A ValueError says what is wrong: the file cannot be
-    read, is empty, lacks a column, or holds something else than a number.
+    Rows in which a number is not given are left out on request.
     """
-    path = Path(path)
     header = read_header(path)
-    known = {name.lower(): i for i, name in enumerate(header)}
+    known = {name.lower(): f"c{i}" for i, name in enumerate(header)}
     found = {name: [known[also.lower()] for also in c.names if also.lower() in known] for name, c in columns.items()}
     if missing := [columns[name].names[0] for name, at in found.items() if not (at or columns[name].optional)]:
         raise ValueError(f"{path} lacks the columns {', '.join(missing)}; it has {', '.join(header)}.")
     columns = {name: columns[name] for name, at in found.items() if at}
-    places = {name: f"c{found[name][0]}" for name in columns}
-    named = {places[name]: column.names[0] for name, column in columns.items()}
-    types = {places[name]: pa.string() if column.text else pa.float64() for name, column in columns.items()}
-    table = _read_csv(path, len(header), types, named)
+    places = {name: found[name][0] for name in columns}
+    table = _read_csv(path, len(header), {places[name]: column for name, column in columns.items()})
     if not table.num_rows:
         raise ValueError(f"{path} has a header and no rows.")
     rows = Rows(path, {name: table[place].to_numpy() for name, place in places.items()}, 2 + np.arange(table.num_rows))
     given = np.ones(len(rows), dtype=bool)
-    for name in (name for name, column in columns.items() if not column.text):
+    for name, column in columns.items():
+        if column.text:
+            continue
         empty = np.asarray(table[places[name]].is_null().to_numpy(), dtype=bool)
-        if leave_out_empty:
-            given &= ~empty
-        else:
-            rows.refuse(empty, lambda _, name=name: f"{columns[name].names[0]} is empty, a number was expected.")  # type: ignore[misc]
-        _refuse_infinite(rows, ~empty & ~np.isfinite(rows[name]), name, columns[name].names[0])
+        given &= ~empty
+        if not leave_out_empty:
+            rows.refuse(empty, f"{column.names[0]} is empty, a number was expected.")
+        rows.refuse_infinite(name, column.names[0], empty)
     if not given.any():
         raise ValueError(f"{path} has no row in which every number is given.")
     return (rows if given.all() else rows.select(given)).convert(columns)
 
 
-def _refuse_infinite(rows: Rows, bad: NDArray[np.bool_], name: str, header: str) -> None:
-    """Raise a ValueError for bad values (rows,) of a column, which are read but no finite numbers."""
-    rows.refuse(bad, lambda row: f"{header} is {rows[name][row]:g}, a number was expected.")
-
-
-def _read_csv(path: Path, size: int, types: Mapping[str, pa.DataType], names: Mapping[str, str]) -> pa.Table:
-    """Return columns c0, c1, ... of a file behind its header; errors give them their names."""
+def _read_csv(path: Path, size: int, columns: ColumnMap) -> pa.Table:
+    """Return columns named c0, c1, ... by their places in a file behind its header; errors give them their names."""
+    types = {place: pa.string() if column.text else pa.float64() for place, column in columns.items()}
     reading = csv.ReadOptions(column_names=[f"c{i}" for i in range(size)], skip_rows=1, use_threads=False)
     converting = csv.ConvertOptions(include_columns=sorted(types), column_types=types, strings_can_be_null=False)
     try:
@@ -152,12 +146,12 @@ def _read_csv(path: Path, size: int, types: Mapping[str, pa.DataType], names: Ma
         found = re.search(r"column #(\d+): Row #(\d+): .* invalid value '(.*)'", str(error), re.DOTALL)
         if found is None:
             raise ValueError(f"Cannot read {path}: {error}") from None
-        name, line, value = names[f"c{found[1]}"], found[2], found[3]
+        name, line, value = columns[f"c{found[1]}"].names[0], found[2], found[3]
         raise ValueError(f"{path}, line {line}: {name} is {value!r}, a number was expected.") from None
 
 
 def read_matrix(path: Path, columns: ColumnMap, matrix: FloatArray | None = None, size: int = 18) -> Rows:
-    """Return columns, by their places, of a matrix (rows, size), or of text without a header that holds one.
+    """Return columns, by their places, of a matrix (rows, size), or of text that holds one without a header.
 
     Text is separated by blanks or commas. A ValueError says what is wrong with it.
     """
@@ -173,7 +167,7 @@ def read_matrix(path: Path, columns: ColumnMap, matrix: FloatArray | None = None
     columns = {name: column for name, column in columns.items() if column.place is not None}
     rows = Rows(path, {name: matrix[:, c.place] for name, c in columns.items()}, np.arange(1, 1 + len(matrix)))
     for name, column in columns.items():
-        _refuse_infinite(rows, ~np.isfinite(rows[name]), name, column.names[0])
+        rows.refuse_infinite(name, column.names[0])
     return rows.convert(columns)
 
 
@@ -190,8 +184,7 @@ def read_documents(
     for number, document in enumerate(_documents(path), start=1):
         place = f"{path}, document {number}"
         values = _read_fields(place, document, columns, arrays)
-        identity = document["_id"]
-        name = str(identity["$oid"] if isinstance(identity, dict) and "$oid" in identity else identity)
+        name = str(document["_id"])
         if name in known:
             raise ValueError(f"{place}: _id {name} was given before.")
         known.add(name)
@@ -209,33 +202,24 @@ def read_documents(
 
 def _documents(path: Path) -> Iterator[Mapping[str, Any]]:
     """Yield the objects of a JSON array one by one, without holding the file in memory."""
-    decoder = json.JSONDecoder()
+    decoder, place = json.JSONDecoder(), 1
     try:
         with path.open(encoding="utf-8") as file:
             text = file.read(CHUNK).lstrip()
             if not text.startswith("["):
                 raise ValueError(f"{path} is no JSON array; expected a file of I-24 MOTION, unpacked.")
-            place = 1
-            while True:
-                text, place = text[place:].lstrip(" \t\r\n,"), 0
-                if not text and not (text := file.read(CHUNK)):
-                    raise ValueError(f"{path} ends within the array.")
-                text = text.lstrip(" \t\r\n,")
-                if text.startswith("]"):
-                    return
-                while text:
-                    try:
-                        document, place = decoder.raw_decode(text)
-                        break
-                    except json.JSONDecodeError as error:
-                        more = file.read(CHUNK)
-                        if not more or len(text) > LARGEST_DOCUMENT:
-                            raise ValueError(f"Cannot read {path}: a document does not end ({error.msg}).") from None
-                        text += more
-                if text:
-                    if not isinstance(document, dict):
-                        raise ValueError(f"{path} is no array of JSON objects; expected a file of I-24 MOTION.")
-                    yield document
+            while not (text := text[place:].lstrip(" \t\r\n,")).startswith("]"):
+                try:
+                    document, place = decoder.raw_decode(text)
+                except json.JSONDecodeError as error:
+                    more, place = file.read(CHUNK), 0
+                    if not more or len(text) > LARGEST_DOCUMENT:
+                        raise ValueError(f"{path} ends within the array, or a document does ({error.msg}).") from None
+                    text += more
+                    continue
+                if not isinstance(document, dict):
+                    raise ValueError(f"{path} is no array of JSON objects; expected a file of I-24 MOTION.")
+                yield document
     except (OSError, UnicodeDecodeError) as error:
         raise ValueError(f"Cannot read {path}: {error}") from None
 
@@ -254,9 +238,9 @@ def _read_fields(
     except (TypeError, ValueError):
         one, many = (", ".join(names[name] for name in group) for group in (numbers, arrays))
         raise ValueError(f"{place}: expected numbers in {one} and arrays of numbers in {many}.") from None
-    shapes = {names[name]: values[name].shape for name in arrays}
-    if len(set(shapes.values())) != 1 or values[arrays[0]].ndim != 1 or not values[arrays[0]].size:
-        got = ", ".join(f"{name} {shape}" for name, shape in shapes.items())
+    shapes = [values[name].shape for name in arrays]
+    if len(set(shapes)) != 1 or len(shapes[0]) != 1 or shapes[0] == (0,):
+        got = ", ".join(f"{names[name]} {shape}" for name, shape in zip(arrays, shapes, strict=True))
         raise ValueError(f"{place}: expected arrays of one length, got {got}.")
     for name, array in values.items():
         if not np.isfinite(array).all():
@@ -267,11 +251,10 @@ def _read_fields(
 def check_tracks(
     rows: Rows, vehicle: FloatArray, frame: FloatArray, x: FloatArray, speed: FloatArray, dt: float, gaps: Gaps
 ) -> None:
-    """Check that no row is given twice, no frame is missing, and positions and speeds are possible and agree.
+    """Raise a ValueError if a row is given twice, a frame is missing, or positions and speeds are impossible or differ.
 
     Vehicle, frame of the file, position along the road [m] and recorded speed [m/s] have shape (rows,); frames are dt
-    apart [s]. With gaps = "cut" a vehicle may be missing for some frames. A ValueError names the line of the first row
-    at fault.
+    apart [s]. With gaps = "cut" a vehicle may be missing for some frames.
     """
     rows.refuse(
         (speed < 0.0) | (speed > FASTEST_SPEED),
@@ -288,14 +271,13 @@ def check_tracks(
             f"first in {rows.unit} {rows.lines[before[row]]}."
         ),
     )
-    if gaps == "error":
-        rows.refuse(
-            step > 1,
-            lambda row: (
-                f"vehicle {vehicle[row]:g} was missing for {step[row] - 1:g} frames before; "
-                "gaps='cut' goes on with a new track here."
-            ),
-        )
+    rows.refuse(
+        (step > 1) & (gaps == "error"),
+        lambda row: (
+            f"vehicle {vehicle[row]:g} was missing for {step[row] - 1:g} frames before; "
+            "gaps='cut' goes on with a new track here."
+        ),
+    )
     moved, expected, following = np.abs(x - x[before]), 0.5 * (speed + speed[before]) * dt, step == 1
     rows.refuse(
         following & (moved > FASTEST_JUMP * dt),
@@ -306,24 +288,25 @@ def check_tracks(
     if not SPEED_RATIOS[0] <= ratio <= SPEED_RATIOS[1]:
         typical = following & (np.abs(moved - ratio * expected) <= 0.5 * ratio * expected + 1e-9)
         rows.refuse(
-            typical if typical.any() else np.ones_like(typical),
-            lambda _: (
-                f"positions move {ratio:.3g} times as fast as the recorded speeds say, here and in the whole "
-                "file; are the units of length, time and speed right?"
-            ),
+            typical | (not typical.any()),
+            f"positions move {ratio:.3g} times as fast as the recorded speeds say, here and in the whole file; are the "
+            "units of length, time and speed right?",
         )
 
 
-def check_lengths(rows: Rows, length: FloatArray, unit: str) -> None:
-    """Check that lengths (rows,) are positive, and their median that of vehicles; a ValueError if not."""
+def check_lengths(rows: Rows, unit: str) -> None:
+    """Raise a ValueError if a length is not positive, or their median not that of vehicles."""
+    length, (low, high) = rows["length"], MEDIAN_LENGTHS
     rows.refuse(length <= 0.0, lambda row: f"length of the vehicle is {length[row]:g} m.")
-    median, (low, high) = float(np.median(length)), MEDIAN_LENGTHS
-    if not low <= median <= high:
-        words = f"the median length of vehicles is {median:.3g} m, expected {low:g} to {high:g}"
-        raise rows.error(0, f"{words}; lengths were taken to be in {unit}.")
+    median = float(np.median(length))
+    rows.refuse(
+        not low <= median <= high,
+        f"the median length of vehicles is {median:.3g} m, expected {low:g} to {high:g}; lengths were taken to be in "
+        f"{unit}.",
+    )
 
 
 def check_clock(rows: Rows, steps: FloatArray, expected: float, hint: str = "") -> None:
-    """Check that the steps of time within the tracks [s] are as expected; a ValueError if not."""
+    """Raise a ValueError if the steps of time within the tracks [s] are not as expected."""
     if steps.size and not 0.8 * expected <= (step := float(np.median(steps))) <= 1.2 * expected:
         raise ValueError(f"{rows.path}: times are {step:.3g} s apart, expected {expected:g} s{hint}.")

@@ -5,7 +5,7 @@ The definitions are those behind the shipped `us101` distributions; docs/data.md
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -44,24 +44,15 @@ END_TICKS = 10
 SHORTEST_TRACK = 42
 """Ticks below which a track is too short to show a braking."""
 
-CAR_FOLLOWING_COLUMNS = (
-    *("recording", "frame", "lane", "ego", "lead", "v_ego", "v_lead", "gap", "a_ego", "a_lead", "n", "at_entry"),
-)
-CUT_IN_COLUMNS = (
-    *("recording", "frame", "phase", "vehicle", "from_lane", "to_lane", "start_seen", "v_cutin", "lateral_speed"),
-    *("ego", "v_ego", "gap_ego_cutin", "lateral_offset", "lead", "v_lead", "gap_cutin_lead", "duration"),
-)
-HARD_BRAKE_COLUMNS = ("recording", "frame", "vehicle", "lane", "lead", "speed", "gap", "deceleration")
-
 
 def car_following_events(trajectories: Trajectories) -> Events:
     """Return the first frame of each pair of ego and leader that is seen in one lane for `MIN_PAIR_FRAMES` or more.
 
     Returns:
-        The columns `CAR_FOLLOWING_COLUMNS`, each of shape (events,): speeds [m/s], accelerations [m/s^2], `gap` from
-        bumper to bumper [m], `n` frames the pair was seen for, and `at_entry`. The last says whether the ego was seen
-        first at that frame: such a pair shows following under way, not its beginning. In the order of the table: by
-        ego, then by time.
+        The columns recording, frame, lane, ego, lead, v_ego, v_lead, gap, a_ego, a_lead, n and at_entry, each of shape
+        (events,): speeds [m/s], accelerations [m/s^2], `gap` from bumper to bumper [m], `n` frames the pair was seen
+        for, and `at_entry`. The last says whether the ego was seen first at that frame: such a pair shows following
+        under way, not its beginning. In the order of the table: by ego, then by time.
 
     Example:
         >>> from training.data import synthetic_traffic
@@ -105,8 +96,7 @@ def bumper_gaps(trajectories: Trajectories, behind: NDArray[np.int64], before: N
 
 def _find_lane_changes(t: Trajectories) -> NDArray[np.int64]:
     """Return rows that are the first in a neighbouring lane, `MIN_LANE_FRAMES` or more in one lane on either side."""
-    new_track = np.zeros(len(t), dtype=bool)
-    new_track[t.track_starts()] = True
+    new_track = np.isin(np.arange(len(t)), t.track_starts())
     runs = np.flatnonzero(new_track | np.append(True, np.diff(t.lane) != 0))
     length = np.diff(np.append(runs, len(t)))
     settled = (length[1:] >= MIN_LANE_FRAMES) & (length[:-1] >= MIN_LANE_FRAMES)
@@ -144,11 +134,12 @@ def cut_in_events(trajectories: Trajectories) -> Events:
     """Return lane changes, each at its start and at its crossing, with the vehicles behind and ahead in the new lane.
 
     Returns:
-        The columns `CUT_IN_COLUMNS`, each of shape (2 changes,): ego is the nearest vehicle behind in the new lane,
-        lead the nearest ahead in it, -1 and NaN where there is none. Gaps are bumper to bumper (negative: side by
-        side). Also the lateral offset from ego [m]; `lateral_speed` towards the new lane over 0.8 s around the crossing
-        [m/s]; `duration` of the cubic course that moves across for as long [s], NaN where start or end was not
-        recorded.
+        The columns recording, frame, phase, vehicle, from_lane, to_lane, start_seen, v_cutin, lateral_speed, ego,
+        v_ego, gap_ego_cutin, lateral_offset, lead, v_lead, gap_cutin_lead and duration, each of shape (2 changes,). Ego
+        is the nearest vehicle behind in the new lane, lead the nearest ahead in it, -1 and NaN where there is none.
+        Gaps are bumper to bumper (negative: side by side). Also the lateral offset from ego [m]; `lateral_speed`
+        towards the new lane over 0.8 s around the crossing [m/s]; `duration` of the cubic course that moves across for
+        as long [s], NaN where start or end was not recorded.
 
     Example:
         >>> from dataclasses import replace
@@ -161,13 +152,11 @@ def cut_in_events(trajectories: Trajectories) -> Events:
         (['crossing', 'start'], [4, 4], [3, 3])
     """
     t = trajectories
-    breaks = t.track_starts()
-    crossings = _find_lane_changes(t)
+    breaks, crossings = t.track_starts(), _find_lane_changes(t)
     track = np.searchsorted(breaks, crossings, side="right") - 1
-    firsts, lasts = breaks[track], np.append(breaks[1:], len(t))[track] - 1
-    spans = zip(crossings.tolist(), firsts.tolist(), lasts.tolist(), strict=True)
-    courses = [_find_course(t, *span) for span in spans]
-    starts, seen, durations = (np.array(column) for column in zip(*courses, strict=True)) if courses else [t.y[:0]] * 3
+    spans = np.column_stack([crossings, breaks[track], np.append(breaks[1:], len(t))[track] - 1])
+    courses = np.array([_find_course(t, *span) for span in spans.tolist()]).reshape(-1, 3)
+    starts, seen, durations = courses.T
     rows = np.column_stack([crossings, starts]).ravel().astype(np.int64)
     change = np.repeat(crossings, 2)
     ego, lead = _find_neighbours(t, rows, t.lane[change])
@@ -182,9 +171,7 @@ def cut_in_events(trajectories: Trajectories) -> Events:
         "to_lane": t.lane[change],
         "start_seen": np.repeat(seen.astype(bool), 2),
         "v_cutin": t.speed[rows],
-        "lateral_speed": side * (t.y[change + reach] - t.y[change - reach]) / (2 * reach * DT)
-        if len(rows)
-        else t.y[:0],
+        "lateral_speed": side * (t.y[change + reach] - t.y[change - reach]) / (2 * reach * DT),
         "ego": np.where(ego >= 0, t.vehicle[ego], -1),
         "v_ego": np.where(ego >= 0, t.speed[ego], np.nan),
         "gap_ego_cutin": bumper_gaps(t, ego, rows),
@@ -209,11 +196,9 @@ def _find_neighbours(
     for i, (row, number) in enumerate(zip(rows, lane, strict=True)):
         others = order[low[i] : high[i]]
         others = others[(t.lane[others] == number) & (t.vehicle[others] != t.vehicle[row])]
-        back, ahead = (others[front[others] <= front[row]], others[front[others] > front[row]])
-        if back.size:
-            behind[i] = back[np.argmax(front[back])]
-        if ahead.size:
-            before[i] = ahead[np.argmin(front[ahead])]
+        others = others[np.argsort(front[others], kind="stable")]
+        place = np.searchsorted(front[others], front[row], side="right")
+        behind[i], before[i] = np.concatenate([[-1], others, [-1]])[place : place + 2]
     return behind, before
 
 
@@ -253,13 +238,6 @@ def time_between_spans(start: NDArray[Any], end: NDArray[Any]) -> FloatArray:
     return np.asarray((end - start + LATERAL_SPAN - 1) * DT, dtype=np.float64)
 
 
-def concatenate_events(parts: Sequence[Events]) -> Events:
-    """Return the events of several tables, of one at least, as one."""
-    if not parts:
-        raise ValueError("Expected events of at least one recording, got none.")
-    return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
-
-
 def write_events(events: Mapping[str, NDArray[Any]], path: Path | str) -> None:
     """Write events to a CSV file, missing values as empty fields."""
     columns = {
@@ -273,16 +251,13 @@ def find_standstill_brakings(position: FloatArray, gap: FloatArray) -> tuple[Flo
     """Return speed and gap at the beginning and strongest deceleration of brakings to a standstill (n, 3), and onsets.
 
     Position along the road and gap to the leader (NaN where it is not known) are those of one vehicle at consecutive
-    ticks (T,) [m]; the onset (n,) is the tick at which a braking begins.
-
-    Left out are those in which the smoothed vehicle runs backwards: there the recorded position is frozen or jumps, and
-    the deceleration is that of the error. There is one such among 45 brakings on US 101; it alone, with 7.3 m/s^2
-    beside 3.8 of the next, would move p of the IDM from 1.7e-6 to 2.3e-5. Left out too are those that are under way
-    when the track begins (3 on US 101): speed and gap at their beginning are not known.
+    ticks (T,) [m]; the onset (n,) is the tick at which a braking begins. Left out are those under way when the track
+    begins, and those in which the smoothed vehicle runs backwards: there the recorded position is frozen or jumps, and
+    the deceleration is that of the error (7.3 m/s^2 for one on US 101, beside 3.8 of the next).
     """
     events, onsets = [], []
     if len(position) >= SHORTEST_TRACK:
-        speed = np.gradient(smooth_positions(position, CUTOFF_ALONG, DT), DT)
+        speed = np.gradient(smooth_positions(position, CUTOFF_ALONG), DT)
         acceleration = np.gradient(speed, DT)
         braking = acceleration < -BRAKING_ONSET
         braking[:END_TICKS] = braking[len(braking) - END_TICKS :] = False
@@ -300,9 +275,10 @@ def hard_brake_events(trajectories: Trajectories) -> Events:
     """Return brakings to a standstill of any vehicle by `MIN_SPEED_LOSS` or more, at their beginning.
 
     Returns:
-        The columns `HARD_BRAKE_COLUMNS`, each of shape (events,): speed [m/s] of smoothed positions, `gap` from bumper
-        to bumper to the vehicle's own leader [m], NaN where none is recorded or a length is not known, the strongest
-        `deceleration` [m/s^2]. Who follows the vehicle does not matter, so its own gap stands for that behind it.
+        The columns recording, frame, vehicle, lane, lead, speed, gap and deceleration, each of shape (events,): speed
+        [m/s] of smoothed positions, `gap` from bumper to bumper to the vehicle's own leader [m], NaN where none is
+        recorded or a length is not known, the strongest `deceleration` [m/s^2]. Who follows the vehicle does not
+        matter, so its own gap stands for that behind it.
 
     Example:
         >>> from training.data import synthetic_traffic

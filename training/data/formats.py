@@ -52,11 +52,10 @@ Transportation, record 8ect-6jqj."""
 NGSIM_STEP, NGSIM_PAUSE, RENUMBER_OFFSET = 100.0, 60_000.0, 1_000_000
 """Time between frames, and that after which a number that comes back belongs to another vehicle, because each 15
 minutes were numbered anew [ms]; the number is then raised, once for each time that it comes back."""
-COIFMAN_LI = {name: NGSIM[name] for name in ("vehicle", "x", "speed", "acceleration", "lane", "leader")} | {
-    "frame": Column(("Frame_ID",), place=1)
-}
+COIFMAN_LI = {name: NGSIM[name] for name in ("vehicle", "x", "speed", "acceleration", "lane", "leader", "y", "length")}
+COIFMAN_LI["frame"] = Column(("Frame_ID",), place=1)
 """`x` is that of the rear bumper. Transportation Research Part B 105, 2017, 362-377."""
-COIFMAN_EMPTY = {name: NGSIM[name] for name in ("y", "length")}
+COIFMAN_EMPTY = ("y", "length")
 """Columns that are zero in Coifman and Li's file, and filled in NGSIM's own."""
 MEAN_LENGTH = 4.87
 """Length [m] assumed of a vehicle whose length is not known: mean of 222 vehicles of this recording, from NGSIM."""
@@ -80,11 +79,11 @@ HIGHD_RECORDING = {
     "upper": Column(("upperLaneMarkings",), text=True),
     "lower": Column(("lowerLaneMarkings",), text=True),
 }
-HIGHD_SIDES = {1: "upper", 2: "lower"}
-"""Names of the two carriageways by drivingDirection; those of the upper lanes are turned by half a turn."""
-TGSIM = {"vehicle": Column(("id",)), "time": Column(("time",))} | {
-    name: Column((header, header.replace("_", "-")))
+TGSIM = {
+    name: Column((header, header.replace("_", "-")), optional=name == "run")
     for name, header in {
+        "vehicle": "id",
+        "time": "time",
         "x": "xloc_kf",
         "y": "yloc_kf",
         "lane": "lane_kf",
@@ -92,11 +91,11 @@ TGSIM = {"vehicle": Column(("id",)), "time": Column(("time",))} | {
         "acceleration": "acceleration_kf",
         "length": "length_smoothed",
         "width": "width_smoothed",
+        "run": "run_index",
     }.items()
 }
 """Positions are those of the reference picture, y downwards, taken to be those of the centre. Ammourah et al.,
 Transportation Research Record, 2025."""
-TGSIM["run"] = Column(("run_index", "run-index"), optional=True)
 TGSIM_STREETS = {"speed_kf_x", "speed-kf-x"}
 """Headers of the files of streets, which give two components of the speed."""
 TGSIM_DIRECTIONS = (("right", "down"), ("left", "up"))
@@ -117,8 +116,6 @@ I24_STEP = 0.04
 """Time between frames [s]."""
 I24_EDGES = tuple(round(FOOT * edge, 4) for edge in (12.0, 24.0, 36.0, 48.0, 60.0))
 """Lane boundaries [m] to the right of the median."""
-I24_SIDES = {-1: "west", 1: "east"}
-"""Names of the two carriageways by direction."""
 REVERSING = 1.0
 """Mean speed [m/s] above which moving against one's direction is an error."""
 RECORDING_KINDS = ("ngsim", "highd", "tgsim", "i24", "coifman")
@@ -180,20 +177,14 @@ def load_ngsim(path: Path | str, *, location: str | None = None, gaps: Gaps = "e
     path = Path(path)
     has_header = any(character.isalpha() for character in read_header(path)[0])
     rows = (read_table if has_header else read_matrix)(path, NGSIM)
-    if "location" in rows.columns:
-        places = sorted({str(place) for place in rows["location"]})
-        if location is None and len(places) > 1:
-            raise ValueError(f"{path} has the locations {', '.join(places)}; choose one with location=.")
-        if location is not None and location not in places:
-            raise ValueError(f"{path} has the locations {', '.join(places)}, not {location}.")
-        recording = location or places[0]
-        rows = rows.select(rows["location"] == recording)
-    elif location is None:
-        recording = path.stem
-    else:
-        raise ValueError(f"{path} has no column Location; leave location out.")
+    places = np.unique(rows.columns.get("location", np.empty(0, np.str_))).tolist()
+    if location not in (places if location or len(places) > 1 else (location,)):
+        known = ", ".join(places) or "of no column Location"
+        raise ValueError(f"{path} has the locations {known}; choose one with location=, not {location}.")
+    recording = location or next(iter(places), path.stem)
+    rows = rows.select(rows["location"] == recording) if places else rows
     frame = np.rint(rows["time"] / NGSIM_STEP)
-    check_lengths(rows, rows["length"], "feet")
+    check_lengths(rows, "feet")
     vehicle, leader = _renumber(rows["vehicle"], rows["leader"], frame)
     check_tracks(rows, vehicle, frame, rows["x"], rows["speed"], NGSIM_STEP / 1000.0, gaps)
     lane = rows["lane"].astype(np.int64)
@@ -216,10 +207,10 @@ def _take(rows: Rows, names: str) -> dict[str, NDArray[Any]]:
 
 
 def _renumber(vehicle: FloatArray, leader: FloatArray, frame: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the numbers of vehicles and leaders, with new ones where a number was given again after a pause."""
+    """Return the numbers of vehicles and leaders (rows,), with new ones where one was given again after a pause."""
     order = np.lexsort([frame, vehicle])
     fresh = np.append(True, np.diff(vehicle[order]) != 0)
-    again = np.append(False, (np.diff(vehicle[order]) == 0) & (np.diff(frame[order]) > NGSIM_PAUSE / NGSIM_STEP))
+    again = ~fresh & np.append(False, np.diff(frame[order]) > NGSIM_PAUSE / NGSIM_STEP)
     times = np.cumsum(again)
     since = np.maximum.accumulate(np.where(fresh, np.arange(len(times)), 0))
     number = np.empty(len(vehicle))
@@ -263,10 +254,8 @@ def load_coifman_li(
         [1.524, 3.048, 4.572]
     """
     path = Path(path)
-    if not length > 0.0:
-        raise ValueError(f"Expected a positive length, got {length:g}.")
-    rows = read_matrix(path, COIFMAN_LI | COIFMAN_EMPTY, _read_mat(path) if path.suffix.lower() == ".mat" else None)
-    if filled := [column.names[0] for name, column in COIFMAN_EMPTY.items() if (rows[name] != 0.0).any()]:
+    rows = read_matrix(path, COIFMAN_LI, _read_mat(path) if path.suffix.lower() == ".mat" else None)
+    if filled := [COIFMAN_LI[name].names[0] for name in COIFMAN_EMPTY if rows[name].any()]:
         raise ValueError(
             f"{path} has values in {' and '.join(filled)}, which are empty in the data of Coifman and Li; is it a "
             "file of NGSIM's own, whose positions are those of the front?"
@@ -288,28 +277,25 @@ def load_coifman_li(
 def _read_mat(path: Path) -> FloatArray:
     """Return the matrix `data` of a MATLAB file."""
     try:
-        data = loadmat(path, variable_names=["data"]).get("data")
+        data = np.asarray(loadmat(path, variable_names=["data"]).get("data"))
     except (OSError, ValueError, TypeError, NotImplementedError, MatReadError, zlib.error) as error:
         raise ValueError(f"Cannot read {path}: {error}") from None
-    if data is None:
-        raise ValueError(f"{path} has no matrix 'data'; is it the file of Coifman and Li?")
-    if np.ndim(data) != 2 or np.asarray(data).dtype.kind not in "fiu":
-        raise ValueError(f"{path}: expected 'data' to be a matrix of numbers.")
-    return np.asarray(data, dtype=np.float64)
+    if data.ndim != 2 or data.dtype.kind not in "fiu":
+        raise ValueError(f"{path} has no matrix of numbers 'data'; is it the file of Coifman and Li?")
+    return data.astype(np.float64)
 
 
 def _known_lengths(vehicle: FloatArray, ngsim: Path, length: float) -> FloatArray:
-    """Return lengths by the numbers of vehicles [m], shape (rows,): NGSIM's median, or the assumed one."""
+    """Return lengths by the numbers of vehicles [m], shape (rows,): NGSIM's lower median, or the assumed one."""
     other = load_ngsim(ngsim, gaps="cut")
-    numbers, index = np.unique(other.vehicle, return_inverse=True)
-    order = np.lexsort([other.length, index.ravel()])
-    starts = np.searchsorted(index.ravel()[order], np.arange(len(numbers) + 1))
-    medians = other.length[order][(starts[:-1] + starts[1:] - 1) // 2]
-    place = np.minimum(np.searchsorted(numbers, vehicle), len(numbers) - 1)
-    known = numbers[place] == vehicle
-    if not known.any():
+    parts = np.split(other.length, 1 + np.flatnonzero(np.diff(other.vehicle)))
+    lengths = {
+        number: float(np.sort(part)[(len(part) - 1) // 2])
+        for number, part in zip(np.unique(other.vehicle).tolist(), parts, strict=True)
+    }
+    if not lengths.keys() & {*vehicle.tolist()}:
         raise ValueError(f"{ngsim} has none of the vehicles; is it the recording of I-80 from 16:00 to 16:15?")
-    return np.where(known, medians[place], length)
+    return np.array([lengths.get(number, length) for number in vehicle.tolist()])
 
 
 def highd_recordings(folder: Path | str) -> tuple[str, ...]:
@@ -350,20 +336,19 @@ def load_highd(folder: Path | str, recording: str, *, gaps: Gaps = "error") -> T
         Traceback (most recent call last):
         ValueError: Cannot read no_such_folder/01_recordingMeta.csv: ...
     """
-    folder = Path(folder)
-    rate, markings = _highd_recording(folder / f"{recording}_recordingMeta.csv")
-    listed = read_table(folder / f"{recording}_tracksMeta.csv", HIGHD_VEHICLES)
+    stem = f"{Path(folder) / recording}"
+    rate, (upper, lower) = _highd_recording(Path(f"{stem}_recordingMeta.csv"))
+    listed = read_table(Path(f"{stem}_tracksMeta.csv"), HIGHD_VEHICLES)
     listed.refuse(
-        ~np.isin(listed["direction"], list(HIGHD_SIDES)),
+        ~np.isin(listed["direction"], (1, 2)),
         lambda row: f"drivingDirection is {listed['direction'][row]:g}, expected 1 or 2.",
     )
     directions = dict(zip(listed["vehicle"].tolist(), listed["direction"].astype(int).tolist(), strict=True))
-    rows = read_table(folder / f"{recording}_tracks.csv", HIGHD)
-    vehicles, index = np.unique(rows["vehicle"], return_inverse=True)
-    direction = np.array([directions.get(vehicle, 0) for vehicle in vehicles.tolist()])[index.ravel()]
+    rows = read_table(Path(f"{stem}_tracks.csv"), HIGHD)
+    direction = np.array([directions.get(vehicle, 0) for vehicle in rows["vehicle"].tolist()])
     rows.refuse(direction == 0, lambda row: f"vehicle {rows['vehicle'][row]:g} is not in the file of tracksMeta.")
-    sign = np.where(direction == 1, -1.0, 1.0)
-    check_lengths(rows, rows["length"], "metres")
+    sign = np.where(direction == 1, -1.0, 1.0)  # the upper lanes are turned by half a turn
+    check_lengths(rows, "metres")
     x, speed = sign * (rows["x"] + 0.5 * rows["length"]), np.hypot(rows["vx"], rows["vy"])
     check_tracks(rows, rows["vehicle"], rows["frame"], x, speed, 1.0 / rate, gaps)
     rows.refuse(
@@ -377,34 +362,30 @@ def load_highd(folder: Path | str, recording: str, *, gaps: Gaps = "error") -> T
         {"x": x, "y": sign * (rows["y"] + 0.5 * rows["width"])},
         {"speed": speed, "acceleration": sign * rows["acceleration"], **_take(rows, "length width")},
     )
-    leader, side = rows["leader"][nearest], direction[nearest]
-    names = {number: f"{recording}-{name}" for number, name in HIGHD_SIDES.items()}
-    edges = {names[1]: tuple(-y for y in reversed(markings[0])), names[2]: markings[1]}
-    lane = np.zeros(len(side))
-    for number in np.unique(side):
-        lane[side == number] = lanes_of(tracks["y"][side == number], edges[names[number]])
+    leader, is_upper = rows["leader"][nearest], direction[nearest] == 1
+    edges = {f"{recording}-upper": tuple(-y for y in reversed(upper)), f"{recording}-lower": lower}
+    names = np.where(is_upper, *edges)
     columns = {
         **tracks,
-        "recording": np.array([names[1], names[2]])[side - 1],
-        "lane": lane,
+        "recording": names,
+        "lane": np.where(is_upper, *(lanes_of(tracks["y"], lines) for lines in edges.values())),
         "leader": np.where(leader > 0, leader, NOBODY),
     }
-    return tabulate(columns, {names[number]: edges[names[number]] for number in np.unique(side)})
+    return tabulate(columns, {name: edges[name] for name in np.unique(names).tolist()})
 
 
-def _highd_recording(path: Path) -> tuple[float, tuple[tuple[float, ...], tuple[float, ...]]]:
+def _highd_recording(path: Path) -> tuple[float, list[tuple[float, ...]]]:
     """Return the frame rate [Hz], and the lane markings [m] of the upper and of the lower lanes, top to bottom."""
     rows = read_table(path, HIGHD_RECORDING)
     rate = float(rows["rate"][0])
-    if rate < 1.0 / DT:
-        raise rows.error(0, f"frameRate is {rate:g}, at least {1.0 / DT:g} Hz is needed.")
+    rows.refuse(rate < 1.0 / DT, f"frameRate is {rate:g}, at least {1.0 / DT:g} Hz is needed.")
     try:
-        upper, lower = (tuple(float(y) for y in str(rows[side][0]).split(";")) for side in ("upper", "lower"))
+        markings = [tuple(float(y) for y in str(rows[side][0]).split(";")) for side in ("upper", "lower")]
+        wrong = any(len(side) < 2 or not (np.diff(side) > 0.0).all() for side in markings)
     except ValueError:
-        raise rows.error(0, "lane markings must be numbers separated by semicolons.") from None
-    if any(len(side) < 2 or not (np.diff(side) > 0.0).all() for side in (upper, lower)):
-        raise rows.error(0, "expected at least two lane markings on each side, increasing.")
-    return rate, (upper, lower)
+        wrong = True
+    rows.refuse(wrong, "expected two lane markings or more on each side, increasing numbers separated by semicolons.")
+    return rate, markings
 
 
 def find_tgsim_files(path: Path | str) -> tuple[Path, ...]:
@@ -423,10 +404,9 @@ def find_tgsim_files(path: Path | str) -> tuple[Path, ...]:
         return (path,)
 
     def holds_positions(file: Path) -> bool:
-        try:
-            return bool({name.lower() for name in read_header(file)} & set(wanted))
-        except ValueError:
-            return False
+        with file.open("rb") as lines:
+            first = lines.readline().lower()
+        return any(name.encode() in first for name in wanted)
 
     found = tuple(file for file in sorted(path.glob("*.csv")) if holds_positions(file))
     if not found:
@@ -458,11 +438,10 @@ def load_tgsim(path: Path | str, *, gaps: Gaps = "error") -> Trajectories:
         ('I294-1-right', [-1.8, 1.8])
     """
     path = Path(path)
-    header = {name.lower() for name in read_header(path)}
-    if header & TGSIM_STREETS:
+    if {name.lower() for name in read_header(path)} & TGSIM_STREETS:
         raise ValueError(f"{path} is of streets (speed_kf_x); only TGSIM's files of motorways are read.")
     rows = read_table(path, TGSIM, leave_out_empty=gaps == "cut")
-    check_lengths(rows, rows["length"], "metres")
+    check_lengths(rows, "metres")
     run = rows.columns.get("run", np.ones(len(rows)))
     parts = [
         part
@@ -500,7 +479,6 @@ def _tgsim_columns(
     x, y = fit_road_axis(rows["x"], rows["y"], numbers, heading).project(rows["x"], rows["y"])
     check_tracks(rows, rows["vehicle"], frame, x, rows["speed"], DT, gaps)
     lane = number_lanes(y, numbers)
-    ahead = find_leaders(frame.astype(np.int64), lane, x + 0.5 * rows["length"])
     along = int(abs(heading[1]) > abs(heading[0]))
     columns = {
         **_take(rows, "vehicle speed acceleration length width"),
@@ -509,7 +487,7 @@ def _tgsim_columns(
         "x": x,
         "y": y,
         "lane": lane,
-        "leader": np.where(ahead >= 0, rows["vehicle"][ahead], NOBODY),
+        "leader": find_leaders(rows["vehicle"], frame, lane, x + 0.5 * rows["length"]),
     }
     return columns, estimate_lane_edges(y, lane)
 
@@ -548,15 +526,15 @@ def load_i24_motion(
     path = Path(path)
     rows = read_documents(path, I24, I24_ARRAYS, between)
     sign, vehicle, length = rows["direction"], rows["vehicle"], rows["length"]
-    rows.refuse(~np.isin(sign, list(I24_SIDES)), lambda row: f"direction is {sign[row]:g}, expected 1 or -1.")
-    check_lengths(rows, length, "feet")
+    rows.refuse(~np.isin(sign, (-1, 1)), lambda row: f"direction is {sign[row]:g}, expected 1 or -1.")
+    check_lengths(rows, "feet")
     x = sign * rows["x"] + 0.5 * length
     start = np.floor(rows["time"].min())  # differences of Unix times are coarse in double precision
     time = rows["time"] - start
     slope = _slopes(vehicle, time, x)
-    index = np.unique(vehicle, return_inverse=True)[1].ravel()
+    index = vehicle.astype(np.int64)
     rows.refuse(
-        (np.bincount(index, slope) / np.bincount(index) < -REVERSING)[index],
+        (np.bincount(index, slope) / np.maximum(np.bincount(index), 1) < -REVERSING)[index],
         lambda row: f"the vehicle moves against its direction, {sign[row]:g}.",
     )
     speed = np.maximum(slope, 0.0)
@@ -564,23 +542,19 @@ def load_i24_motion(
     check_clock(rows, np.diff(time)[~fresh[1:]], I24_STEP, "; is it format 1.x?")
     begun = np.minimum.reduceat(time, np.flatnonzero(fresh))[np.cumsum(fresh) - 1]
     check_tracks(rows, vehicle, np.rint((time - begun) / I24_STEP), x, speed, I24_STEP, gaps)
-    sizes = _take(rows, "length width")
-    tracks, nearest = resample_tracks(
-        vehicle, time, I24_STEP, {"x": x, "y": -sign * rows["y"]}, {"speed": speed, **sizes}
-    )
+    curved = {"x": x, "y": -sign * rows["y"]}
+    tracks, nearest = resample_tracks(vehicle, time, I24_STEP, curved, {"speed": speed, **_take(rows, "length width")})
     if not len(nearest):
         raise ValueError(f"{path} has no vehicle for {DT:g} s.")
-    names = {number: f"{path.stem}-{name}" for number, name in I24_SIDES.items()}
-    recording = np.where(sign[nearest] < 0, names[-1], names[1])
-    frame, lane = np.rint(tracks["frame"]).astype(np.int64), lanes_of(tracks["y"], I24_EDGES)
-    ahead = find_leaders(frame, lane, tracks["x"] + 0.5 * tracks["length"], recording)
+    recording = np.where(sign[nearest] < 0, f"{path.stem}-west", f"{path.stem}-east")
+    lane, front = lanes_of(tracks["y"], I24_EDGES), tracks["x"] + 0.5 * tracks["length"]
     columns = {
         **tracks,
         "recording": recording,
-        "frame": frame + round(start / DT),
+        "frame": tracks["frame"] + round(start / DT),
         "acceleration": np.nan,
         "lane": lane,
-        "leader": np.where(ahead >= 0, tracks["vehicle"][ahead], NOBODY),
+        "leader": find_leaders(tracks["vehicle"], tracks["frame"], lane, front, recording),
     }
     return tabulate(columns, dict.fromkeys(np.unique(recording).tolist(), I24_EDGES))
 

@@ -30,18 +30,16 @@ LANE_SPACINGS = (2.5, 5.0)
 
 @dataclass(frozen=True)
 class RoadAxis:
-    """Curve along a road in the plane: w = curve(u) in a frame turned so that u follows the road.
+    """Curve along a road in the plane: w = curve(u) [m] in a frame turned about an origin so that u follows the road.
 
     The frame of (u, w) is right-handed to (x, y) and so keeps its sense: with y downwards, as in pictures, w is to the
     right of u.
     """
 
     origin: FloatArray
-    """Origin of u and w [m], shape (2,)."""
     direction: FloatArray
     """Unit vector of u, shape (2,)."""
     curve: BSpline
-    """w of the axis [m] by u [m]."""
     u: FloatArray
     """Points of the table of lengths [m], shape (n,)."""
     station: FloatArray
@@ -49,7 +47,7 @@ class RoadAxis:
 
     def project(self, x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return distances along the axis and across it, positive towards w [m], shape (n,) each."""
-        u, w = self._turn(x, y)
+        u, w = _turn(x, y, self.origin, self.direction)
         foot, slope = u, self.curve.derivative()
         for _ in range(FOOT_STEPS):
             rise = slope(foot)
@@ -59,9 +57,11 @@ class RoadAxis:
         ends = (foot - np.clip(foot, self.u[0], self.u[-1])) * np.sqrt(1.0 + rise**2)
         return np.interp(foot, self.u, self.station) + ends, across
 
-    def _turn(self, x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
-        dx, dy = x - self.origin[0], y - self.origin[1]
-        return dx * self.direction[0] + dy * self.direction[1], dy * self.direction[0] - dx * self.direction[1]
+
+def _turn(x: FloatArray, y: FloatArray, origin: FloatArray, direction: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return x and y (n,) in the frame at an origin with the first axis in a direction."""
+    dx, dy = x - origin[0], y - origin[1]
+    return dx * direction[0] + dy * direction[1], dy * direction[0] - dx * direction[1]
 
 
 def fit_road_axis(x: FloatArray, y: FloatArray, lane: NDArray[np.int64], heading: FloatArray) -> RoadAxis:
@@ -77,10 +77,9 @@ def fit_road_axis(x: FloatArray, y: FloatArray, lane: NDArray[np.int64], heading
     origin = np.array([x.mean(), y.mean()])
     axis = np.linalg.eigh(np.cov(np.stack([x, y])))[1][:, -1]
     direction = axis * (1.0 if axis @ heading >= 0.0 else -1.0)
-    turned = RoadAxis(origin, direction, BSpline(np.arange(8.0), np.zeros(4), 3), origin, origin)._turn(x, y)
-    u, w, number, weight = _average_bins(*turned, lane)
-    curve = _fit_spline(u, w, number, weight)
-    points = np.append(np.arange(turned[0].min(), turned[0].max(), TABLE_STEP), turned[0].max())
+    u, w = _turn(x, y, origin, direction)
+    curve = _fit_spline(*_average_bins(u, w, lane))
+    points = np.append(np.arange(u.min(), u.max(), TABLE_STEP), u.max())
     steps = np.hypot(np.diff(points), np.diff(curve(points)))
     return RoadAxis(origin, direction, curve, points, np.append(0.0, np.cumsum(steps)))
 

@@ -31,6 +31,7 @@ US101_TEST = ((64.0, 89.0), (157.0, 194.0))
 MIN_STEPS = 4
 """Least number of steps of a scene: the smoother leaves shorter tracks as they are."""
 _US101_COLUMNS = ("scene", "vehicle", "epoch_ms", "y_along", "d", "lane", "length", "width")
+_STATES = ("x", "y", "heading", "speed", "acceleration", "yaw_rate")
 
 
 @dataclass(frozen=True)
@@ -74,19 +75,15 @@ class TrafficScene:
     """Shape (V,) [m]."""
 
     def __post_init__(self) -> None:
-        shape = self.x.shape
-        if len(shape) != 2 or any(values.shape != shape for values in self._fields()):
+        shape, states = self.x.shape, [getattr(self, name) for name in _STATES]
+        if len(shape) != 2 or any(values.shape != shape for values in (*states, self.present)):
             raise ValueError(f"Scene {self.name}: expected arrays of one shape (T, V), got x of shape {shape}.")
         if self.length.shape != shape[1:] or self.width.shape != shape[1:]:
             raise ValueError(f"Scene {self.name}: expected length and width of shape {shape[1:]}.")
-        for values in self._fields()[:4]:
-            if not (np.isfinite(values) == self.present).all():
-                raise ValueError(f"Scene {self.name}: states must be finite where present and NaN elsewhere.")
-        for values in (*self._fields(), self.length, self.width):
+        if any((np.isfinite(values) != self.present).any() for values in states[:4]):
+            raise ValueError(f"Scene {self.name}: states must be finite where present and NaN elsewhere.")
+        for values in (*states, self.present, self.length, self.width):
             values.setflags(write=False)
-
-    def _fields(self) -> tuple[FloatArray | Mask, ...]:
-        return (self.x, self.y, self.heading, self.speed, self.acceleration, self.yaw_rate, self.present)
 
     @property
     def end(self) -> float:
@@ -109,30 +106,20 @@ class TrafficScene:
 
         Such a vehicle may have reacted to somebody outside the window, so its actions are no examples to learn from.
         """
-        lane = self.lane_numbers()
-        x = np.where(self.present, self.x, -np.inf)
-        leads = np.zeros_like(self.present)
-        steps = np.arange(len(x))
+        lane, leads, steps = self.lane_numbers(), np.zeros_like(self.present), np.arange(len(self.x))
         for number in range(-1, len(self.edges) - 1):
             inside = self.present & (lane == number)
-            first = np.argmax(np.where(inside, x, -np.inf), axis=1)
+            first = np.argmax(np.where(inside, self.x, -np.inf), axis=1)
             leads[steps, first] |= inside[steps, first]
         return leads
 
 
-def load_us101_scenes(
-    folder: Path | str, along: float = CUTOFF_ALONG, across: float = CUTOFF_ACROSS
-) -> tuple[TrafficScene, ...]:
-    """Return the 28 usable scenes of US 101, smoothed.
+def load_us101_scenes(folder: Path | str) -> tuple[TrafficScene, ...]:
+    """Return the 28 usable scenes of US 101, smoothed, from a folder with the compact table.
 
     The scenes overlap, so the copies of a vehicle are first merged by vehicle and time. Each track is then cut at its
     holes and smoothed once over its whole length, and the scenes are cut from the tracks. x is NGSIM's Local_Y [m], the
     same in all scenes, moved from the front to the centre. Scene 1 (two vehicles) and ramps are left out.
-
-    Args:
-        folder: Folder with the file.
-        along: Cut-off of the smoother along the road [Hz].
-        across: Cut-off across the road [Hz].
 
     Raises:
         ValueError: The file is missing, cannot be read or lacks a column.
@@ -150,46 +137,37 @@ def load_us101_scenes(
     count = np.bincount(copy)
     x, y, length = (np.bincount(copy, rows[key]) / count for key in ("y_along", "d", "length"))
     breaks = 1 + np.flatnonzero((np.diff(keys[:, 0]) != 0) | (np.diff(keys[:, 1]) != 100))
-    smooth = _smooth_tracks(breaks, x - 0.5 * length, y, along, across)
-    smooth = {key: values[copy] for key, values in smooth.items()}
+    smooth = {key: values[copy] for key, values in _smooth_tracks(breaks, x - 0.5 * length, y).items()}
     scenes = []
     for number in np.unique(rows["scene"]).tolist():
         chosen = np.flatnonzero(rows["scene"] == number)
         first = int(rows["epoch_ms"][chosen].min())
         edges = US101_EDGES if (rows["lane"][chosen] == 6).any() else US101_EDGES[:-1]
         step = np.rint((rows["epoch_ms"] - first) / 100.0).astype(np.int64)
-        sizes = (rows["length"], rows["width"])
-        start = first / 1000.0 - US101_ZERO
-        scenes.append(_cut_scene(f"us101-{number:02}", start, edges, chosen, step, rows["vehicle"], smooth, sizes))
+        place = f"us101-{number:02}", first / 1000.0 - US101_ZERO, edges
+        scenes.append(_cut_scene(place, chosen, step, rows["vehicle"], smooth, (rows["length"], rows["width"])))
     return tuple(scenes)
 
 
-def _smooth_tracks(
-    breaks: NDArray[np.int64], x: FloatArray, y: FloatArray, along: float = CUTOFF_ALONG, across: float = CUTOFF_ACROSS
-) -> dict[str, FloatArray]:
-    """Return the states and actions of `TrafficScene` (rows,), smoothed, of positions (rows,) of tracks.
-
-    A track begins at each of the breaks, and at the first row; cut-offs are in Hz.
-    """
-    result = {key: np.empty(len(x)) for key in ("x", "y", "heading", "speed", "acceleration", "yaw_rate")}
+def _smooth_tracks(breaks: NDArray[np.int64], x: FloatArray, y: FloatArray) -> dict[str, FloatArray]:
+    """Return smoothed states and actions (rows,) of positions (rows,) of tracks; one begins at each break, and at 0."""
+    result = {key: np.empty(len(x)) for key in _STATES}
     for piece in np.split(np.arange(len(x)), breaks[breaks > 0]):
-        px, py = smooth_positions(x[piece], along, DT), smooth_positions(y[piece], across, DT)
-        for key, values in zip(result, (px, py, *infer_motion(px, py, DT)), strict=True):
+        along, across = smooth_positions(x[piece], CUTOFF_ALONG), smooth_positions(y[piece], CUTOFF_ACROSS)
+        for key, values in zip(_STATES, (along, across, *infer_motion(along, across)), strict=True):
             result[key][piece] = values
     return result
 
 
 def _cut_scene(
-    name: str,
-    start: float,
-    edges: Sequence[float],
+    place: tuple[str, float, Sequence[float]],
     chosen: NDArray[np.int64],
     step: NDArray[np.int64],
     vehicle: NDArray[np.int64],
     smooth: Mapping[str, FloatArray],
     sizes: tuple[FloatArray, FloatArray],
 ) -> TrafficScene:
-    """Return the scene of the chosen rows; the others have one value for each row of the table."""
+    """Return the scene of the chosen rows, with its name, start and edges; the others have a value for each row."""
     _, first, column = np.unique(vehicle[chosen], return_index=True, return_inverse=True)
     known = np.isfinite(smooth["speed"][chosen])
     rows, column, at = chosen[known], column.ravel()[known], step[chosen][known]
@@ -197,9 +175,9 @@ def _cut_scene(
     for key, values in smooth.items():
         states[key][at, column] = values[rows]
     length, width = (values[chosen[first]] for values in sizes)
-    return TrafficScene(
-        name, start, tuple(edges), **states, present=np.isfinite(states["x"]), length=length, width=width
-    )
+    name, start, edges = place
+    present = np.isfinite(states["x"])
+    return TrafficScene(name, start, tuple(edges), **states, present=present, length=length, width=width)
 
 
 def split_by_clock(
@@ -258,37 +236,23 @@ def scenes_of(trajectories: Trajectories, seconds: float = 10.0) -> tuple[Traffi
     steps = round(seconds / DT)
     if steps < MIN_STEPS:
         raise ValueError(f"Expected scenes of {MIN_STEPS * DT:g} s or more, got {seconds:g} s.")
-    for name in ("y", "length", "width"):
-        if np.isnan(t.column(name)).any():
-            raise ValueError(f"Scenes need {name} in every row; this table lacks it in some.")
+    if lacking := [name for name in ("y", "length", "width") if np.isnan(getattr(t, name)).any()]:
+        raise ValueError(f"Scenes need {lacking[0]} in every row; this table lacks it in some.")
     smooth = _smooth_tracks(t.track_starts(), t.x, t.y)
     window, known = t.frame // steps, np.isfinite(smooth["speed"])
     scenes: list[TrafficScene] = []
     for recording in np.unique(t.recording).tolist():
-        own = t.recording == recording
-        edges = t.edges.get(recording, ())
-        if not edges:
-            raise ValueError(
-                f"Recording {recording!r} has no lane boundaries, which scenes need. Give the y of each from left to "
-                f"right [m], as in tabulate(columns, edges={{{recording!r}: (0.0, 3.5, 7.0)}}); "
-                f"{_describe_positions(t, own)}."
-            )
-        inside = own & (smooth["y"] >= edges[0]) & (smooth["y"] < edges[-1])
+        own, edges = t.recording == recording, t.edges.get(recording, ())
+        inside = own & (smooth["y"] >= edges[0]) & (smooth["y"] < edges[-1]) if edges else np.zeros_like(own)
         if not inside.any():
+            lanes = [f"lane {n} at {np.median(t.y[own & (t.lane == n)]):.1f} m" for n in np.unique(t.lane[own])]
             raise ValueError(
-                f"Recording {recording!r} has nobody between its lane boundaries, {edges[0]:g} to {edges[-1]:g} m; "
-                f"{_describe_positions(t, own)}."
+                f"Recording {recording!r} has nobody between its lane boundaries, {edges or 'of which it has none'}. "
+                f"Give the y of each from left to right [m], as in tabulate(columns, edges={{{recording!r}: (0.0, 3.5, "
+                f"7.0)}}); its vehicles are at y = {t.y[own].min():.1f} to {t.y[own].max():.1f} m, {', '.join(lanes)}."
             )
         for number in np.unique(window[inside & known]):
             chosen, start = np.flatnonzero(inside & known & (window == number)), DT * float(number * steps)
-            name, step = f"{recording}-{start:.0f}", t.frame - number * steps
-            scenes.append(_cut_scene(name, start, edges, chosen, step, t.vehicle, smooth, (t.length, t.width)))
+            place, step = (f"{recording}-{start:.0f}", start, edges), t.frame - number * steps
+            scenes.append(_cut_scene(place, chosen, step, t.vehicle, smooth, (t.length, t.width)))
     return tuple(scenes)
-
-
-def _describe_positions(t: Trajectories, rows: NDArray[np.bool_]) -> str:
-    """Return a phrase that says where across the road the vehicles of a recording are."""
-    lanes = np.unique(t.lane[rows & (t.lane > 0)])
-    words = f"its vehicles are at y = {t.y[rows].min():.1f} to {t.y[rows].max():.1f} m"
-    medians = ", ".join(f"lane {lane} at {np.median(t.y[rows & (t.lane == lane)]):.1f} m" for lane in lanes[:8])
-    return f"{words}, those of {medians}" if medians else words

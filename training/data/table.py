@@ -82,16 +82,15 @@ class Trajectories:
     """y of the lane boundaries of a recording, left to right [m]: lane n is between the n-th and the next."""
 
     def __post_init__(self) -> None:
-        sizes = {name: self.column(name).shape for name in COLUMNS}
+        sizes = {name: getattr(self, name).shape for name in COLUMNS}
         if len(set(sizes.values())) != 1 or len(self.vehicle.shape) != 1:
             raise ValueError(f"Expected columns of one length, got {sizes}.")
         if not len(self):
             raise ValueError("Expected a table of trajectories with at least one row, got none.")
-        same = (self.recording[1:] == self.recording[:-1]) & (self.vehicle[1:] == self.vehicle[:-1])
-        later = (self.recording[1:] > self.recording[:-1]) | (
-            (self.recording[1:] == self.recording[:-1]) & (self.vehicle[1:] > self.vehicle[:-1])
-        )
-        wrong = np.flatnonzero(~(later | (same & (self.frame[1:] > self.frame[:-1]))))
+        later = np.zeros(len(self) - 1, dtype=bool)
+        for values in (self.frame, self.vehicle, self.recording):
+            later = (values[1:] > values[:-1]) | ((values[1:] == values[:-1]) & later)
+        wrong = np.flatnonzero(~later)
         if wrong.size:
             raise ValueError(f"Rows {wrong[0]} and {wrong[0] + 1} are not in order of recording, vehicle and frame.")
         for name, bad, wanted in (
@@ -103,7 +102,7 @@ class Trajectories:
         ):
             if bad.any():
                 row = int(np.argmax(bad))
-                raise ValueError(f"Row {row}: expected {name} {wanted}, got {self.column(name)[row]:g}.")
+                raise ValueError(f"Row {row}: expected {name} {wanted}, got {getattr(self, name)[row]:g}.")
         for name, edges in self.edges.items():
             if not (np.diff(edges) > 0.0).all():
                 raise ValueError(f"Lane boundaries of {name} must increase to the right, got {edges}.")
@@ -111,14 +110,9 @@ class Trajectories:
     def __len__(self) -> int:
         return len(self.vehicle)
 
-    def column(self, name: str) -> NDArray[Any]:
-        """Return a column by its name."""
-        values: NDArray[Any] = getattr(self, name)  # a field by its name
-        return values
-
     def select(self, chosen: NDArray[Any]) -> Trajectories:
         """Return the chosen rows, given as a mask or as increasing indices."""
-        return replace(self, **{name: self.column(name)[chosen] for name in COLUMNS})
+        return replace(self, **{name: getattr(self, name)[chosen] for name in COLUMNS})
 
     @property
     def time(self) -> FloatArray:
@@ -170,18 +164,20 @@ def tabulate(columns: Mapping[str, Any], edges: Mapping[str, tuple[float, ...]] 
     return Trajectories(**{name: values[order] for name, values in arrays.items()}, edges=dict(edges or {}))
 
 
-def find_leaders(frame: Integers, lane: Integers, x: FloatArray, recording: NDArray[Any] | None = None) -> Integers:
-    """Return the rows of the nearest vehicles ahead in the same lane, of frames, lanes and positions [m] (rows,).
+def find_leaders(
+    vehicle: NDArray[Any], frame: NDArray[Any], lane: Integers, x: FloatArray, recording: NDArray[Any] | None = None
+) -> NDArray[Any]:
+    """Return the numbers of the nearest vehicles ahead in the same lane, of columns (rows,), positions in m.
 
-    -1 where nobody is ahead, or the lane is 0, which is none. Without names of recordings (rows,) all are of one.
+    `NOBODY` where nobody is ahead, or the lane is 0, which is none. Without names of recordings all are of one.
     """
     group = np.zeros(len(x), np.int64) if recording is None else np.unique(recording, return_inverse=True)[1].ravel()
     order = np.lexsort([x, lane, frame, group])
-    sames = [np.diff(values[order]) == 0 for values in (lane, frame, group)]
-    result = np.full(len(x), -1, dtype=np.int64)
-    follows = np.append(sames[0] & sames[1] & sames[2] & (lane[order][1:] > 0), False)
-    result[order[follows]] = order[1:][follows[:-1]]
-    return result
+    same = np.logical_and.reduce([np.diff(values[order]) == 0 for values in (lane, frame, group)])
+    follows = np.flatnonzero(same & (lane[order][1:] > 0))
+    leader = np.full_like(vehicle, NOBODY)
+    leader[order[follows]] = vehicle[order[follows + 1]]
+    return leader
 
 
 def write_trajectories(trajectories: Trajectories, path: Path | str) -> None:
@@ -196,7 +192,7 @@ def write_trajectories(trajectories: Trajectories, path: Path | str) -> None:
         180
     """
     edges = json.dumps({name: list(values) for name, values in trajectories.edges.items()})
-    table = pa.table({name: pa.array(trajectories.column(name)) for name in COLUMNS})
+    table = pa.table({name: pa.array(getattr(trajectories, name)) for name in COLUMNS})
     pq.write_table(table.replace_schema_metadata({_METADATA: edges.encode()}), path)
 
 
@@ -209,9 +205,9 @@ def read_trajectories(path: Path | str) -> Trajectories:
     Example:
         >>> read_trajectories("no_such_table.parquet")  # doctest: +ELLIPSIS
         Traceback (most recent call last):
-        ValueError: Cannot read trajectories from no_such_table.parquet: ...
+        ValueError: Cannot read no_such_table.parquet: ...
     """
-    table = _read_parquet(Path(path), COLUMNS, "trajectories")
+    table = _read_parquet(path, COLUMNS)
     edges = json.loads((table.schema.metadata or {}).get(_METADATA, b"{}"))
     try:
         columns = {name: table[name].to_numpy() for name in COLUMNS}
@@ -227,16 +223,16 @@ def read_columns(path: Path, names: tuple[str, ...]) -> dict[str, NDArray[Any]]:
             f"There is no {path.name} in the folder {str(path.parent)!r}. That is one of the compact tables, which are "
             "no part of the package; recordings of your own are read in the formats of docs/data.md."
         )
-    table = _read_parquet(path, names, "recorded traffic")
+    table = _read_parquet(path, names)
     return {name: table[name].to_numpy() for name in names}
 
 
-def _read_parquet(path: Path, names: tuple[str, ...], what: str) -> pa.Table:
+def _read_parquet(path: Path | str, names: tuple[str, ...]) -> pa.Table:
     """Return the table of a parquet file, which is to have these columns."""
     try:
         table = pq.read_table(path)
     except (OSError, pa.ArrowInvalid) as error:
-        raise ValueError(f"Cannot read {what} from {path}: {error}") from None
+        raise ValueError(f"Cannot read {path}: {error}") from None
     if missing := [name for name in names if name not in table.column_names]:
         raise ValueError(f"{path} lacks the columns {', '.join(missing)}.")
     return table
@@ -267,7 +263,7 @@ def synthetic_traffic(seconds: float = 12.0, lanes: int = 3, per_lane: int = 3) 
     x = 25.0 * (vehicles // lanes) + DT * np.cumsum(speed, axis=0)
     lane = vehicles % lanes
     y = 3.6 * (lane + 0.5) + 0.2 * np.sin(time + 2.0 * vehicles)
-    columns = {
+    columns: dict[str, Any] = {
         "recording": "synthetic",
         "vehicle": np.tile(vehicles, len(frame)),
         "frame": np.repeat(frame, len(vehicles)),
@@ -279,8 +275,7 @@ def synthetic_traffic(seconds: float = 12.0, lanes: int = 3, per_lane: int = 3) 
         "width": 1.8,
         "lane": np.tile(1 + lane, len(frame)),
     }
-    row = find_leaders(columns["frame"], columns["lane"], columns["x"])
-    leader = np.where(row >= 0, columns["vehicle"][row], NOBODY)
+    leader = find_leaders(*(columns[name] for name in ("vehicle", "frame", "lane", "x")))
     edges = tuple(round(3.6 * k, 6) for k in range(lanes + 1))
     return tabulate({**columns, "leader": leader}, {"synthetic": edges})
 
@@ -297,28 +292,26 @@ ROUNDING = 1e-6
 """Tolerance [ticks] within which the end of a track counts as a multiple of `DT`: more than times are rounded by."""
 
 
-def smooth_positions(positions: FloatArray, cutoff: float, dt: float) -> FloatArray:
+def smooth_positions(positions: FloatArray, cutoff: float) -> FloatArray:
     """Return smooth positions z near the recorded y: the minimiser of |y - z|^2 + lambda |third differences of z|^2.
 
     In the middle of a track this is a filter of gain 1 / (1 + lambda (2 - 2 cos(2 pi f dt))^3) without delay; lambda
     makes the gain one half (-6 dB) at the cut-off [Hz]. Parabolas pass unchanged, at the ends too. Positions (T,) [m]
-    are of one coordinate of one track without holes, dt apart [s]; tracks of fewer than four steps stay as they are.
+    are of one coordinate of one track without holes, `DT` apart; tracks of fewer than four steps stay as they are.
     """
     positions = np.asarray(positions, dtype=np.float64)
     if positions.ndim != 1 or not np.isfinite(positions).all():
         raise ValueError("Expected one finite coordinate per time step; cut the track where positions are missing.")
-    if not 0.0 < cutoff <= 0.5 / dt:
-        raise ValueError(f"Expected a cut-off in (0, {0.5 / dt:g}] Hz at steps of {dt:g} s, got {cutoff:g} Hz.")
     if len(positions) < 4:
         return positions.copy()
-    smoothed: FloatArray = cho_solve_banded((_penalty_factor(len(positions), cutoff, dt), True), positions)
+    smoothed: FloatArray = cho_solve_banded((_penalty_factor(len(positions), cutoff), True), positions)
     return smoothed
 
 
 @lru_cache(maxsize=1024)
-def _penalty_factor(n: int, cutoff: float, dt: float) -> FloatArray:
+def _penalty_factor(n: int, cutoff: float) -> FloatArray:
     """Return the Cholesky factor of I + lambda D'D in lower banded form, D the (n - 3, n) third differences."""
-    weight = (2.0 - 2.0 * np.cos(2.0 * np.pi * cutoff * dt)) ** -3
+    weight = (2.0 - 2.0 * np.cos(2.0 * np.pi * cutoff * DT)) ** -3
     stencil = np.array([-1.0, 3.0, -3.0, 1.0])
     bands = np.zeros((4, n))
     bands[0] = 1.0
@@ -329,7 +322,7 @@ def _penalty_factor(n: int, cutoff: float, dt: float) -> FloatArray:
     return factor
 
 
-def infer_motion(x: FloatArray, y: FloatArray, dt: float) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+def infer_motion(x: FloatArray, y: FloatArray) -> list[FloatArray]:
     """Return headings, speeds, accelerations and yaw rates that move a point mass through positions (T,) [m].
 
     This inverts the simulator's step (explicit Euler, old values): x += v cos(h) dt, y += v sin(h) dt, h += w dt,
@@ -338,14 +331,11 @@ def infer_motion(x: FloatArray, y: FloatArray, dt: float) -> tuple[FloatArray, F
     Headings are relative to the road, positive towards +y; values that the end of the track does not determine are NaN:
     of the states the last one, of the actions the last two.
     """
-    vx, vy = np.diff(x) / dt, np.diff(y) / dt
+    vx, vy = np.diff(x) / DT, np.diff(y) / DT
     heading = np.arctan2(vy, np.maximum(vx, MIN_HEADING_SPEED))
     speed = np.maximum(vx * np.cos(heading) + vy * np.sin(heading), 0.0)
-
-    def pad(values: FloatArray) -> FloatArray:
-        return np.concatenate([values, np.full(len(x) - len(values), np.nan)])
-
-    return pad(heading), pad(speed), pad(np.diff(speed) / dt), pad(np.diff(heading) / dt)
+    motion = heading, speed, np.diff(speed) / DT, np.diff(heading) / DT
+    return [np.concatenate([values, np.full(len(x) - len(values), np.nan)]) for values in motion]
 
 
 def resample_tracks(

@@ -11,7 +11,7 @@ import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.metadata import version
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,6 +45,15 @@ from training.fit.mixture import (
 
 MASS_SAMPLES = 1_000_000
 """Draws from which the mass outside the box is estimated."""
+SETTINGS = {
+    "covariance_floor": COVARIANCE_FLOOR,
+    "restarts": EM_STARTS,
+    "restarts_of_refits": FOLD_STARTS,
+    "events_per_component_and_dimension": EVENTS_PER_COMPONENT,
+    "smallest_component_per_dimension": SMALLEST_COMPONENT,
+    "folds": N_FOLDS,
+}
+"""What the record of a fit has of its settings, beside the seed."""
 
 
 @dataclass(frozen=True)
@@ -74,38 +83,6 @@ class FitRequest:
     """Seed of the fits."""
 
 
-class SystemComparison(NamedTuple):
-    """Fits of the same events in several coordinate systems, and the log density of each event held out, (n,) each."""
-
-    fits: list[SystemFit]
-    held_out: list[FloatArray]
-
-    def choose(self, clusters: NDArray[np.int64]) -> SystemFit:
-        """Return the fit that the events support best."""
-        return self.fits[choose_system([fit.bic for fit in self.fits], self.held_out, clusters)]
-
-    def describe(self) -> list[dict[str, Any]]:
-        """Return the criteria of each, for the file."""
-        return [_describe_fit(fit, scores) for fit, scores in zip(self.fits, self.held_out, strict=True)]
-
-
-def compare_systems(
-    events: EventSet,
-    systems: Sequence[CoordinateSystem],
-    parameters: Sequence[Parameter],
-    seed: int,
-    most: int = MAX_COMPONENTS,
-    report: Callable[[str], None] = lambda _: None,
-) -> SystemComparison:
-    """Return fits of `most` components at most in several coordinate systems."""
-    fits = []
-    for system in systems:
-        report(f"fit in the coordinates {system.name}")
-        fits.append(fit_system(events, system, parameters, seed, most=most))
-    report("held-out events")
-    return SystemComparison(fits, [held_out_log_prob(events, system, parameters, seed, most) for system in systems])
-
-
 def fit_base(request: FitRequest, report: Callable[[str], None] = lambda _: None) -> FittedDistribution:
     """Return a base fitted to events: coordinates and components chosen, refits, predictive checks, and its record.
 
@@ -132,73 +109,72 @@ def fit_base(request: FitRequest, report: Callable[[str], None] = lambda _: None
         raise ValueError(f"Unknown coordinate system {request.system!r}; known are {', '.join(names)}.")
     own = parameters[events.joint.shape[1] :]
     refitted = [system for system in systems if request.system in (None, system.name)]
-    apart = None
+    selections: dict[str, Any] = {}
     if systems_apart := [system for p in own for system in SYSTEMS_APART.get(p.name, ())]:
         alone = EventSet(events.apart, np.arange(len(events.apart)))
-        apart = compare_systems(alone, systems_apart, own, seed, most=1)
-        best = apart.choose(alone.clusters).system
-        systems = tuple(system.combine(best) for system in systems)
+        fits, best, selections["selection_apart"] = compare_systems(alone, systems_apart, own, seed, report, most=1)
+        systems = tuple(system.combine(fits[best].system) for system in systems)
         refitted = [system.combine(other) for system in refitted for other in systems_apart]
-    joint = compare_systems(events, systems, parameters, seed, report=report)
-    chosen = joint.choose(events.clusters) if request.system is None else joint.fits[names.index(request.system)]
+    fits, best, selection = compare_systems(events, systems, parameters, seed, report)
+    best = best if request.system is None else names.index(request.system)
+    chosen = fits[best]
     refits = refit(events, refitted, parameters, seed, request.n_refits, report)
-    columns = [p.name for p in parameters]
+    record = {
+        "kind": "fitted to recorded events",
+        **{name: selection[best][name] for name in ("coordinates", "bic", "held_out_log_prob")},
+        "source": dict(request.source),
+        "filters": list(events.log),
+        "selection": selection,
+        **selections,
+        "settings": {**SETTINGS, "seed": seed},
+        "mass_outside_box": mass_outside(chosen.distribution),
+        "command": request.command,
+        "libraries": {name: version(name) for name in ("numpy", "scipy", "scikit-learn")},
+    }
     return FittedDistribution(
         distribution=chosen.distribution,
         refits=tuple(each.distribution for each in refits),
         events=events.counts,
         family=describe_family(chosen.family, refits),
         frequency=request.frequency,
-        checks=check_predictions(scenario.name, columns, events.joint, chosen.distribution, seed),
-        record=_record(request, chosen, joint, apart),
+        checks=check_predictions(scenario.name, [p.name for p in parameters], events.joint, chosen.distribution, seed),
+        record=record,
     )
 
 
-def _record(
-    request: FitRequest, chosen: SystemFit, joint: SystemComparison, apart: SystemComparison | None
-) -> dict[str, Any]:
-    """Return the record of a fit, for its file."""
-    selection = joint.describe()
-    own = selection[joint.fits.index(chosen)]
-    return {
-        "kind": "fitted to recorded events",
-        "coordinates": chosen.system.name,
-        "bic": own["bic"],
-        "held_out_log_prob": own["held_out_log_prob"],
-        "source": dict(request.source),
-        "filters": list(request.events.log),
-        "selection": selection,
-        **({"selection_apart": apart.describe()} if apart else {}),
-        "settings": {
-            "covariance_floor": COVARIANCE_FLOOR,
-            "restarts": EM_STARTS,
-            "restarts_of_refits": FOLD_STARTS,
-            "events_per_component_and_dimension": EVENTS_PER_COMPONENT,
-            "smallest_component_per_dimension": SMALLEST_COMPONENT,
-            "folds": N_FOLDS,
-            "seed": request.seed,
-        },
-        "mass_outside_box": mass_outside(chosen.distribution),
-        "command": request.command,
-        "libraries": {name: version(name) for name in ("numpy", "scipy", "scikit-learn")},
-    }
+def compare_systems(
+    events: EventSet,
+    systems: Sequence[CoordinateSystem],
+    parameters: Sequence[Parameter],
+    seed: int,
+    report: Callable[[str], None],
+    most: int = MAX_COMPONENTS,
+) -> tuple[list[SystemFit], int, list[dict[str, Any]]]:
+    """Return fits of `most` components at most in several systems, which is supported best, and criteria for a file."""
+    fits = []
+    for system in systems:
+        report(f"fit in the coordinates {system.name}")
+        fits.append(fit_system(events, system, parameters, seed, most=most))
+    report("held-out events")
+    held_out = [held_out_log_prob(events, system, parameters, seed, most) for system in systems]
+    best = choose_system([fit.bic for fit in fits], held_out, events.clusters)
+    return fits, best, [_describe_fit(*each) for each in zip(fits, held_out, strict=True)]
 
 
 def _describe_fit(fit: SystemFit, scores: FloatArray) -> dict[str, Any]:
     """Return the criteria of one coordinate system; null where too few events were left to predict from."""
-    known = scores[np.isfinite(scores)]
     return {
         "coordinates": fit.system.name,
         "bic": round(fit.bic, 2),
-        "held_out_log_prob": round(float(known.mean()), 4) if len(known) == len(scores) else None,
+        "held_out_log_prob": round(float(scores.mean()), 4) if np.isfinite(scores).all() else None,
         "components": [
             {
-                "number": candidate.components,
-                "bic": round(candidate.bic - (fit.fit.bic - fit.bic), 2),
+                "number": candidate.number,
+                "bic": round(candidate.bic, 2),
                 "events_in_smallest": round(candidate.smallest, 1),
                 "accepted": candidate.accepted,
             }
-            for candidate in fit.fit.candidates
+            for candidate in fit.candidates
         ],
     }
 

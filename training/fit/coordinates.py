@@ -27,7 +27,7 @@ from rare_envs.distributions.mixture import CoordinateMixture
 from rare_envs.distributions.space import Parameter
 from samplers.problem import FloatArray
 from training.fit.filters import EventSet
-from training.fit.mixture import MAX_COMPONENTS, MixtureFit, append_independent, select_mixture
+from training.fit.mixture import MAX_COMPONENTS, Candidate, Components, append_independent, select_mixture
 
 N_FOLDS = 5
 """Parts of the clusters; each is predicted from the others."""
@@ -120,12 +120,15 @@ class SystemFit:
     system: CoordinateSystem
     distribution: CoordinateMixture
     """Of all columns of x."""
-    fit: MixtureFit
-    """Of the columns that are fitted together."""
-    bic: float
-    """Bayesian information criterion of these, in units of x: comparable between systems."""
+    candidates: Sequence[Candidate]
+    """Numbers of components of the columns that are fitted together, with a BIC in units of x."""
     bic_apart: float = 0.0
-    """The same of the columns fitted apart."""
+    """The BIC of the columns fitted apart."""
+
+    @property
+    def bic(self) -> float:
+        """Bayesian information criterion of the columns fitted together, comparable between systems."""
+        return min(candidate.bic for candidate in self.candidates if candidate.accepted)
 
     @property
     def family(self) -> str:
@@ -147,26 +150,22 @@ def fit_system(
     The parameters are those of the scenario in the order of x, the system has the coordinates of all of them.
     """
     n = events.joint.shape[1]
-    joint, own = system.coordinates(parameters[:n]), system.coordinates(parameters[n:])
-    fit = _fit_in(joint, events.joint, seed, most, starts)
-    components, bic_apart = fit.components, 0.0
+    components, candidates = _fit_in(system.coordinates(parameters[:n]), events.joint, seed, most, starts)
+    bic_apart = 0.0
     if events.apart.shape[1]:
-        apart = _fit_in(own, events.apart, seed, 1, None)
-        components = append_independent(components, apart.components)
-        bic_apart = apart.bic - _log_jacobian(own, events.apart)
-    bic = fit.bic - _log_jacobian(joint, events.joint)
-    return SystemFit(system, CoordinateMixture(system.coordinates(parameters), *components), fit, bic, bic_apart)
+        apart, (single, *_) = _fit_in(system.coordinates(parameters[n:]), events.apart, seed, 1, None)
+        components, bic_apart = append_independent(components, apart), single.bic
+    return SystemFit(system, CoordinateMixture(system.coordinates(parameters), *components), candidates, bic_apart)
 
 
-def _fit_in(coordinates: Coordinates, x: FloatArray, seed: int, most: int, starts: int | None) -> MixtureFit:
-    """Return a mixture fitted to the coordinates of events x (n, d)."""
+def _fit_in(
+    coordinates: Coordinates, x: FloatArray, seed: int, most: int, starts: int | None
+) -> tuple[Components, list[Candidate]]:
+    """Return a mixture fitted to the coordinates y of events x (n, d), and its candidates with a BIC in units of x."""
     names = [coordinates.names[j] for j in coordinates.columns]
-    return select_mixture(coordinates.to_coordinates(x), seed, most, starts, names)
-
-
-def _log_jacobian(coordinates: Coordinates, x: FloatArray) -> float:
-    """Return twice the sum of log |det dy/dx| over x (n, d), by which a BIC of y exceeds that of x."""
-    return 2.0 * float(coordinates.log_jacobian(coordinates.interior(x)).sum())
+    components, candidates = select_mixture(coordinates.to_coordinates(x), seed, most, starts, names)
+    excess = 2.0 * float(coordinates.log_jacobian(coordinates.interior(x)).sum())  # of a BIC of y over that of x
+    return components, [candidate._replace(bic=candidate.bic - excess) for candidate in candidates]
 
 
 def held_out_log_prob(
@@ -220,9 +219,7 @@ def draw_events(events: EventSet, rng: np.random.Generator) -> EventSet:
     names = np.unique(events.clusters)
     rows = [np.flatnonzero(events.clusters == name) for name in rng.choice(names, len(names))]
     labels = np.repeat(np.arange(len(rows)), [len(part) for part in rows])
-    apart = events.apart
-    if len(apart):
-        apart = apart[rng.integers(len(apart), size=len(apart))]
+    apart = events.apart[rng.integers(len(events.apart), size=len(events.apart))] if len(events.apart) else events.apart
     return EventSet(events.joint[np.concatenate(rows)], labels, apart, events.cluster)
 
 
@@ -257,7 +254,5 @@ def refit(
 def describe_family(family: str, refits: Sequence[SystemFit]) -> str:
     """Return the family of a fit in words, with the share of the refits in each coordinates if they differ."""
     systems = Counter(each.system.name for each in refits)
-    if len(systems) < 2:
-        return family
     counts = ", ".join(f"{number} in {name}" for name, number in systems.most_common())
-    return f"{family}; of the refits {counts}"
+    return family if len(systems) < 2 else f"{family}; of the refits {counts}"

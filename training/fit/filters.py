@@ -110,8 +110,7 @@ def read_csv_columns(path: Path, names: Sequence[str]) -> dict[str, NDArray[Any]
         table = csv.read_csv(path)
     except (OSError, ArrowInvalid) as error:
         raise ValueError(f"Cannot read events from {path}: {error}.") from None
-    missing = [name for name in names if name not in table.column_names]
-    if missing:
+    if missing := [name for name in names if name not in table.column_names]:
         raise ValueError(f"{path} lacks the columns {', '.join(missing)}.")
     return {name: table[name].to_numpy() for name in names}
 
@@ -127,7 +126,7 @@ Rule = tuple[str, str, NDArray[np.bool_]]
 """Words of a filter, its reason, and which events pass, shape (n,)."""
 
 
-def range_rule(column: str, values: FloatArray, p: Parameter, reason: str | None = None) -> Rule:
+def range_rule(column: str, values: FloatArray, p: Parameter, reason: str = "") -> Rule:
     """Return the rule that values (n,) lie within the range of a parameter."""
     reason = reason or FILTER_REASONS.get(p.name) or FILTER_REASONS[p.unit]
     return f"{p.low:g} <= {column} <= {p.high:g} {p.unit}", reason, (values >= p.low) & (values <= p.high)
@@ -148,32 +147,35 @@ def filter_events(events: Mapping[str, NDArray[Any]], recipe: EventRecipe, box: 
     `log` has per filter its rule, its reason and the number of events it dropped of those that passed the filters
     before. The filters of the separate columns come last.
     """
-    limits = dict(zip(recipe.columns, box, strict=False))
 
-    def usual_rules(columns: Sequence[str]) -> Iterator[Rule]:
+    def usual_rules(columns: Sequence[str], ranges: Sequence[Parameter]) -> Iterator[Rule]:
         for column in columns:
             given = f"{column} is given"
             yield given, FILTER_REASONS.get(given, FILTER_REASONS["missing"]), ~np.isnan(events[column])
-        for column in columns:
-            yield range_rule(column, events[column], limits[column])
+        for column, p in zip(columns, ranges, strict=False):
+            yield range_rule(column, events[column], p)
 
-    keep = np.ones(len(events[recipe.columns[0]]), dtype=bool)
+    def flag_rules(columns: Sequence[str], words: str, wanted: bool) -> Iterator[Rule]:
+        for column in columns:
+            yield f"{words}{column}", FILTER_REASONS[f"{words}{column}"], events[column].astype(bool) == wanted
+
+    joint = recipe.joint
+    keep = np.ones(len(events[joint[0]]), dtype=bool)
     for column, value in recipe.where.items():
         keep &= events[column] == value
     log = [{"rule": "events read", "events": int(keep.sum())}]
-    names = ((f"not {column}", ~events[column].astype(bool)) for column in recipe.excluded)
-    excluded = [(name, FILTER_REASONS[name], passes) for name, passes in names]
-    log += drop_events(keep, [*excluded, *usual_rules(recipe.joint)], recipe.joint)
-    joint = np.column_stack([events[column][keep] for column in recipe.joint])
-    clusters = _number_clusters(events, recipe)[keep]
+    log += drop_events(keep, [*flag_rules(recipe.excluded, "not ", False), *usual_rules(joint, box)], joint)
+    points, clusters = _table_of(events, joint, keep), _number_clusters(events, recipe)[keep]
     if recipe.apart:
-        required = [(column, FILTER_REASONS[column], events[column].astype(bool)) for column in recipe.required]
-        log += drop_events(keep, [*required, *usual_rules(recipe.apart)], recipe.apart)
-    apart = np.empty((int(keep.sum()), len(recipe.apart)))
-    for j, column in enumerate(recipe.apart):
-        apart[:, j] = events[column][keep]
+        rules = [*flag_rules(recipe.required, "", True), *usual_rules(recipe.apart, box[len(joint) :])]
+        log += drop_events(keep, rules, recipe.apart)
     word = "scene" if recipe.cluster == ("scene",) else "half-minute"
-    return EventSet(joint, clusters, apart, word, tuple(log))
+    return EventSet(points, clusters, _table_of(events, recipe.apart, keep), word, tuple(log))
+
+
+def _table_of(events: Mapping[str, NDArray[Any]], columns: Sequence[str], keep: NDArray[np.bool_]) -> FloatArray:
+    """Return columns of the kept events side by side, shape (n, d)."""
+    return np.array([events[column][keep] for column in columns]).reshape(len(columns), int(keep.sum())).T
 
 
 def _number_clusters(events: Mapping[str, NDArray[Any]], recipe: EventRecipe) -> NDArray[np.int64]:

@@ -9,10 +9,10 @@ monomials of the points, 1, x_i and x_i x_j; points must be standardised, or the
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+from scipy.linalg import block_diag
 from sklearn.cluster import KMeans
 from sklearn.utils import check_random_state
 
@@ -45,30 +45,16 @@ class Components(NamedTuple):
     """Shape (K, d, d)."""
 
 
-@dataclass(frozen=True)
-class MixtureCandidate:
+class Candidate(NamedTuple):
     """A fit with one number of components."""
 
-    components: int
+    number: int
     bic: float
-    """Bayesian information criterion in the units of the points, smaller is better."""
+    """Bayesian information criterion, smaller is better."""
     smallest: float
     """Events in the smallest component (sum of its responsibilities)."""
     accepted: bool
     """False if a component has collapsed on a handful of events."""
-
-
-@dataclass(frozen=True)
-class MixtureFit:
-    """A fitted mixture, and the fits that it was selected from."""
-
-    components: Components
-    candidates: tuple[MixtureCandidate, ...]
-
-    @property
-    def bic(self) -> float:
-        """Bayesian information criterion of the mixture that was selected."""
-        return min(candidate.bic for candidate in self.candidates if candidate.accepted)
 
 
 def select_mixture(
@@ -77,11 +63,11 @@ def select_mixture(
     most: int = MAX_COMPONENTS,
     starts: int | None = None,
     names: Sequence[str] = (),
-) -> MixtureFit:
-    """Return the Gaussian mixture with the least BIC.
+) -> tuple[Components, list[Candidate]]:
+    """Return the Gaussian mixture with the least BIC, in units of points (n, d), and all that it was selected from.
 
     For K = 1, 2, ... while there are `EVENTS_PER_COMPONENT` d events per component: expectation maximisation on
-    standardised points (n, d) from several seeded starts, `EM_STARTS` if None, with a floor under the covariances. Fits
+    standardised points from several seeded starts, `EM_STARTS` if None, with a floor under the covariances. Fits
     with a component of fewer than `SMALLEST_COMPONENT` d events are rejected. Messages name the parameters.
     """
     n, d = points.shape
@@ -89,32 +75,26 @@ def select_mixture(
         raise ValueError(f"{n} events are too few to fit {d} parameters; more than {d} are needed.")
     centre, scale = points.mean(axis=0), points.std(axis=0)
     if (scale == 0).any():
-        which, value = int(np.argmin(scale)), float(centre[np.argmin(scale)])
+        which = int(np.argmin(scale))
         name = names[which] if names else f"parameter {which}"
-        raise ValueError(f"Expected {name} to vary, got {value:.6g} in all {n} events.")
-    standard, candidates = (points - centre) / scale, list[MixtureCandidate]()
-    models: list[Components] = []
+        raise ValueError(f"Expected {name} to vary, got {centre[which]:.6g} in all {n} events.")
+    standard, candidates, models = (points - centre) / scale, list[Candidate](), list[Components]()
     # A density in units of the points is smaller by the product of the scales.
     units = 2.0 * n * float(np.log(scale).sum())
     for k in range(1, int(np.clip(n // (EVENTS_PER_COMPONENT * d), 1, most)) + 1):
         model, likelihood = fit_mixture(standard, k, COVARIANCE_FLOOR, seed, EM_STARTS if starts is None else starts)
         smallest = float(model.weights.min() * n)
         bic = -2.0 * likelihood + (k - 1 + k * d + k * d * (d + 1) // 2) * float(np.log(n))
-        accepted = k == 1 or smallest >= SMALLEST_COMPONENT * d
-        candidates.append(MixtureCandidate(k, bic + units, smallest, accepted))
+        candidates.append(Candidate(k, bic + units, smallest, k == 1 or smallest >= SMALLEST_COMPONENT * d))
         models.append(model)
     best = models[min((i for i, each in enumerate(candidates) if each.accepted), key=lambda i: candidates[i].bic)]
     mixture = Components(best.weights, centre + best.means * scale, best.covariances * np.outer(scale, scale))
-    return MixtureFit(_round(mixture), tuple(candidates))
+    return _round(mixture), candidates
 
 
 def _round(mixture: Components) -> Components:
     """Return components to six significant digits, heaviest first: more say nothing and differ between machines."""
-
-    def significant(values: FloatArray) -> FloatArray:
-        rounded = np.vectorize(lambda value: float(f"{value:.6g}"), otypes=[np.float64])(values)
-        return np.asarray(rounded, dtype=np.float64)
-
+    significant = np.vectorize(lambda value: float(f"{value:.6g}"), otypes=[np.float64])
     order = np.argsort(-mixture.weights)
     shares = np.round(mixture.weights[order], 6)
     shares[0] = 1.0 - shares[1:].sum()
@@ -124,11 +104,8 @@ def _round(mixture: Components) -> Components:
 
 def append_independent(joint: Components, apart: Components) -> Components:
     """Return the joint distribution of two independent parts: a mixture, followed by one of a single component."""
-    k, own = joint.means.shape
-    d = own + apart.means.shape[1]
-    covariances = np.zeros((k, d, d))
-    covariances[:, :own, :own] = joint.covariances
-    covariances[:, own:, own:] = apart.covariances
+    k = len(joint.weights)
+    covariances = np.array([block_diag(one, apart.covariances[0]) for one in joint.covariances])
     return Components(joint.weights, np.hstack([joint.means, np.repeat(apart.means, k, axis=0)]), covariances)
 
 

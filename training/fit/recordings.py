@@ -10,9 +10,9 @@ one file of a base.
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Iterable, Sequence
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +29,6 @@ from training.data.events import (
     Events,
     braking_exposure,
     car_following_events,
-    concatenate_events,
     cut_in_events,
     hard_brake_events,
     write_events,
@@ -50,24 +49,18 @@ SECONDS_BETWEEN = 5.0
 """A count is printed when the line before it is this old [s], so that a short fit prints few lines."""
 
 
-class FitProgress:
-    """Prints on standard error what a fit is doing, and its counts every few seconds."""
+def _make_teller(shown: bool) -> Callable[..., None]:
+    """Return what prints lines on standard error; a passing one only if the line before it is not too young."""
+    printed = -math.inf
 
-    def __init__(self, shown: bool = True, clock: Callable[[], float] = time.monotonic) -> None:
-        """Begin with nothing printed; the clock gives the time [s]."""
-        self._shown, self._clock = shown, clock
-        self._printed = 0.0
+    def tell(text: str, passing: bool = False) -> None:
+        nonlocal printed
+        if not passing or time.monotonic() - printed >= SECONDS_BETWEEN:
+            printed = time.monotonic()
+            if shown:
+                typer.echo(text, err=True)
 
-    def say(self, text: str) -> None:
-        """Print a line."""
-        self._printed = self._clock()
-        if self._shown:
-            typer.echo(text, err=True)
-
-    def count(self, name: str, text: str) -> None:
-        """Print a line about what has a name, if the line before it is not too young."""
-        if self._clock() - self._printed >= SECONDS_BETWEEN:
-            self.say(f"{name}: {text}")
+    return tell
 
 
 def observe_traffic(table: Trajectories) -> FloatArray:
@@ -111,15 +104,13 @@ def fit_own_bases(
     Writes `<scenario>_events.csv` and `<scenario>_<name>.json` into a folder and returns the latter; a ValueError if a
     recording is broken, or the events of all scenarios are too few (then the files of events are written).
     """
-    chosen, told = tuple(EVENT_RECIPES) if scenarios is None else tuple(scenarios), FitProgress(progress)
+    chosen, tell = tuple(scenarios or EVENT_RECIPES), _make_teller(progress)
     out.mkdir(parents=True, exist_ok=True)
-    names: set[str] = set()
-    traffic = np.zeros(4)
-    parts: list[dict[str, Events]] = []
+    names, traffic, parts = set[str](), np.zeros(4), list[dict[str, Events]]()
     for table in tables:
-        here = {str(recording) for recording in np.unique(table.recording)}
-        names |= here
-        told.say(f"{', '.join(sorted(here))}: {len(table):,} rows read; looking for events")
+        here = sorted({*table.recording.tolist()})
+        names.update(here)
+        tell(f"{', '.join(here)}: {len(table):,} rows read; looking for events")
         traffic += observe_traffic(table)
         parts.append({scenario: EXTRACTORS[scenario](table) for scenario in chosen})
     source = {
@@ -127,25 +118,27 @@ def fit_own_bases(
         "data": f"recordings {', '.join(sorted(names))}",
         "licence": "that of the recordings; parameters derived from them may fall under it",
     }
-    pooled = {scenario: concatenate_events([events[scenario] for events in parts]) for scenario in chosen}
+    pooled: dict[str, Events] = {}
     for scenario in chosen:
+        own = [part[scenario] for part in parts]
+        pooled[scenario] = {column: np.concatenate([events[column] for events in own]) for column in own[0]}
         write_events(pooled[scenario], out / f"{scenario}_events.csv")
         typer.echo(out / f"{scenario}_events.csv")
-    too_few, written = [], []
+    too_few, written = 0, []
     for scenario in chosen:
         path, recipe = out / f"{scenario}_events.csv", EVENT_RECIPES[scenario]
         events = filter_events(read_events(path, recipe), recipe, scenario_named(scenario).parameters)
         frequency = count_events(scenario, pooled[scenario], len(events.joint), traffic)
         request = FitRequest(scenario, events, source, COMMAND, frequency, n_refits=n_refits, seed=seed)
-        told.say(f"{scenario}: {len(events.joint):,} events; fitting")
+        tell(f"{scenario}: {len(events.joint):,} events; fitting")
         try:
-            base = fit_base(request, partial(told.count, scenario))
+            base = fit_base(request, lambda text, scenario=scenario: tell(f"{scenario}: {text}", passing=True))
         except ValueError as error:
-            too_few.append(f"{path}: {error}")
-            if len(too_few) == len(chosen):
-                every = "" if len(chosen) == 1 else f" No base of {', '.join(chosen)} is written: give more recordings."
-                raise ValueError(f"{too_few[-1]}{every}") from None
-            typer.echo(f"{too_few[-1]} No base of {scenario} is written.", err=True)
+            too_few += 1
+            words = f"{path}: {error} No base of {{}} is written"
+            if too_few == len(chosen):
+                raise ValueError(f"{words.format(', '.join(chosen))}: give more recordings.") from None
+            typer.echo(f"{words.format(scenario)}.", err=True)
             continue
         written.append(_write_base(out / f"{scenario}_{name}.json", format_base(scenario, base.to_dict())))
         if not base.refits:
@@ -181,7 +174,7 @@ def fit_bases(
     """
     kind, path = recordings.kind_and_path()
     known = tuple(EVENT_RECIPES)
-    if unknown := sorted(set(scenarios or ()) - set(known)):
+    if unknown := sorted({*(scenarios or ())} - {*known}):
         raise ValueError(f"Unknown scenario {unknown[0]}; known are {', '.join(known)}.")
     if not name or Path(name).name != name:
         raise ValueError(f"Expected --name as a part of file names, such as cologne, got {name!r}.")

@@ -288,9 +288,8 @@ def table_of(*tracks, edges=EDGES) -> Trajectories:
     vehicle = np.concatenate([np.full(len(track[0]), number + 1) for number, track in enumerate(tracks)])
     frame = np.concatenate([np.arange(len(track[0])) for track in tracks])
     lane = np.searchsorted(edges, y, side="right")
-    row = find_leaders(frame, lane, x)
     columns = {"recording": "r", "vehicle": vehicle, "frame": frame, "x": x, "y": y, "speed": speed, "lane": lane}
-    columns |= {"acceleration": 0.5, "length": 4.0, "width": 1.8, "leader": np.where(row >= 0, vehicle[row], NOBODY)}
+    columns |= {"acceleration": 0.5, "length": 4.0, "width": 1.8, "leader": find_leaders(vehicle, frame, lane, x)}
     return tabulate(columns, {"r": edges})
 
 

@@ -69,14 +69,13 @@ def truth(traffic, table, step, first=0):
 def check(table, values, atol, names=("x", "y", "speed", "acceleration", "length", "width"), lane=1):
     """The table has these values, lanes from the left, and the nearest ahead as leaders."""
     for name in names:
-        np.testing.assert_allclose(table.column(name), values[name], atol=atol, err_msg=name)
+        np.testing.assert_allclose(getattr(table, name), values[name], atol=atol, err_msg=name)
     assert (table.lane == lane + values["lane"]).all()
-    row = find_leaders(table.frame, table.lane, values["x"], table.recording)
-    assert (table.leader == np.where(row >= 0, table.vehicle[row], NOBODY)).all()
+    assert (table.leader == find_leaders(table.vehicle, table.frame, table.lane, values["x"], table.recording)).all()
 
 
 def same(one, other, names=COLUMNS):
-    return all((one.column(name) == other.column(name)).all() for name in names)
+    return all((getattr(one, name) == getattr(other, name)).all() for name in names)
 
 
 def test_ngsim(traffic, ngsim, tmp_path):
@@ -152,7 +151,7 @@ def test_highd_turns_both_directions_into_the_road_frame(traffic, highd):
         odd = at % 2  # between frames of 0.04 s speeds are interpolated
         values["speed"] = np.hypot(0.5 * (simulated.speed[at - odd, i] + simulated.speed[at + odd, i]), across)
         for name in ("x", "y", "speed", "length", "width"):
-            np.testing.assert_allclose(part.column(name), values[name], atol=0.02, err_msg=name)
+            np.testing.assert_allclose(getattr(part, name), values[name], atol=0.02, err_msg=name)
         np.testing.assert_allclose(np.diff(part.edges[f"01-{side}"]), LANE)
         assert (part.lane == 1 + values["lane"]).mean() > 0.999
         known = part.find_rows(part.leader) >= 0
@@ -226,8 +225,7 @@ def test_both_carriageways_of_i24_become_the_road_frame(direction, name, traffic
     np.testing.assert_allclose(table.speed, traffic.speed[at], atol=0.15)
     assert np.isnan(table.acceleration).all()
     assert (table.lane == lanes_of(traffic.y[at] + 12.0 * FOOT, I24_EDGES)).all() and table.lane.min() == 1
-    row = find_leaders(table.frame, table.lane, table.x)
-    assert (table.leader == np.where(row >= 0, table.vehicle[row], NOBODY)).all()
+    assert (table.leader == find_leaders(table.vehicle, table.frame, table.lane, table.x)).all()
 
 
 def test_carriageways_do_not_follow_each_other(documents, tmp_path):
@@ -316,7 +314,7 @@ REFUSED = {
     ),
     "i24": (
         (lambda d: [d[0], without(d[1], "y_position")], r"document 2 lacks y_position; it has _id,"),
-        (lambda d: [d[0], d[1], d[0]], "document 3: _id 6387.* was given before"),
+        (lambda d: [d[0], d[1], d[0]], "document 3: _id .*6387.* was given before"),
         (lambda d: change(d, 1, x_position=d[1]["x_position"][1:]), r"document 2: expected arrays of one length"),
         (lambda d: change(d, 1, length="long"), "document 2: expected numbers in length"),
         (lambda d: change(d, 1, length=[15.0, 15.0]), "document 2: expected numbers in length"),
@@ -388,7 +386,7 @@ def test_broken_files_beside_the_tracks_are_refused(file, old, new, message, hig
         (load_i24_motion, b"[]", "has no documents"),
         (load_i24_motion, b"[1, 2]", "no array of JSON objects"),
         (load_i24_motion, b"[", "ends within the array"),
-        (load_i24_motion, b'[{"_id": "a", "timestamp": [1.0, 2', "a document does not end"),
+        (load_i24_motion, b'[{"_id": "a", "timestamp": [1.0, 2', "ends within the array"),
         (load_i24_motion, b"[\xff\xfe", "Cannot read"),
     ],
 )
@@ -406,18 +404,16 @@ def test_truncated_files_and_other_matrices_are_refused(documents, matrix, tmp_p
     text, path, other = json.dumps(documents), tmp_path / "cut.json", tmp_path / "other.mat"
     for end in (len(text) // 2, len(text) - 1):
         path.write_text(text[:end], encoding="utf-8")
-        with pytest.raises(ValueError, match=r"cut\.json.*(ends within|does not end)|Cannot read .*cut\.json"):
+        with pytest.raises(ValueError, match=r"cut\.json ends within the array|Cannot read .*cut\.json"):
             load_i24_motion(path)
     whole = write_coifman(other, matrix).read_bytes()
     other.write_bytes(whole[: len(whole) // 2])
     with pytest.raises(ValueError, match="Cannot read"):
         load_coifman_li(other)
-    for content, message in (({"matrix": matrix}, "has no matrix 'data'"), ({"data": "words"}, "matrix of numbers")):
+    for content in ({"matrix": matrix}, {"data": "words"}):
         savemat(other, content)
-        with pytest.raises(ValueError, match=message):
+        with pytest.raises(ValueError, match="has no matrix of numbers 'data'"):
             load_coifman_li(other)
-    with pytest.raises(ValueError, match="positive length"):
-        load_coifman_li(other, length=0.0)
 
 
 def test_folders_without_recordings_are_refused(tmp_path):

@@ -44,8 +44,8 @@ def test_tables_survive_a_file(ngsim, tmp_path):
     again = read_trajectories(tmp_path / "table.parquet")
     assert again.edges == table.edges
     for name in COLUMNS:
-        assert (again.column(name) == table.column(name)).all()
-    with pytest.raises(ValueError, match="Cannot read trajectories from"):
+        assert (getattr(again, name) == getattr(table, name)).all()
+    with pytest.raises(ValueError, match=r"Cannot read .*none"):
         read_trajectories(tmp_path / "none.parquet")
 
 
@@ -81,22 +81,22 @@ def test_gain_of_a_wave_is_that_of_the_filter_and_holes_are_refused():
     for frequency in (0.1, 0.4, 0.8):
         wave = np.sin(2.0 * np.pi * frequency * t)
         gain = 1.0 / (1.0 + ((1 - np.cos(2 * np.pi * frequency * DT)) / (1 - np.cos(2 * np.pi * 0.4 * DT))) ** 3)
-        np.testing.assert_allclose(smooth_positions(wave, 0.4, DT)[middle], gain * wave[middle], atol=1e-6)
+        np.testing.assert_allclose(smooth_positions(wave, 0.4)[middle], gain * wave[middle], atol=1e-6)
     with pytest.raises(ValueError, match="cut the track"):
-        smooth_positions(np.array([1.0, np.nan, 2.0, 3.0]), 0.4, DT)
+        smooth_positions(np.array([1.0, np.nan, 2.0, 3.0]), 0.4)
 
 
 def test_replaying_the_actions_gives_the_track():
     t = DT * np.arange(60)
     x, y = 10.0 * t + np.sin(t), 3.5 / (1.0 + np.exp(3.0 - t))
-    states = replayed(infer_motion(x, y, DT), x, y)
+    states = replayed(infer_motion(x, y), x, y)
     np.testing.assert_allclose(states[:, 0], x[:-1], atol=1e-10)
     np.testing.assert_allclose(states[:, 1], y[:-1], atol=1e-10)
 
 
 def test_a_creeping_vehicle_does_not_spin():
     jitter = 0.02 * np.random.default_rng(0).standard_normal((2, 50))
-    heading, speed, *_ = infer_motion(np.cumsum(jitter[0]), jitter[1], DT)
+    heading, speed, *_ = infer_motion(np.cumsum(jitter[0]), jitter[1])
     assert np.nanmin(speed) >= 0.0
     assert np.nanmax(np.abs(heading)) <= np.arctan2(1.5, MIN_HEADING_SPEED)
 
@@ -230,12 +230,16 @@ def test_scenes_follow_the_record_and_meet_where_they_were_cut():
 
 def test_what_scenes_need_is_named():
     table = cutting_in()
-    columns = {name: table.column(name) for name in COLUMNS}
-    with pytest.raises(ValueError, match=r"'r' has no lane boundaries.*y = 1\.8 to 5\.2 m.*lane 1 at 1\.8 m"):
+    columns = {name: getattr(table, name) for name in COLUMNS}
+    with pytest.raises(
+        ValueError, match=r"'r' .* lane boundaries, of which it has none.*y = 1\.8 to 5\.2 m, lane 1 at 1\.8 m"
+    ):
         scenes_of(tabulate(columns))
-    with pytest.raises(ValueError, match=r"nobody between its lane boundaries, -7 to 0 m; its vehicles are at y ="):
+    with pytest.raises(
+        ValueError, match=r"nobody between its lane boundaries, \(-7\.0, -3\.5, 0\.0\).* its vehicles are at y ="
+    ):
         scenes_of(tabulate(columns, {"r": (-7.0, -3.5, 0.0)}))
     with pytest.raises(ValueError, match="Scenes need width"):
-        scenes_of(tabulate({name: table.column(name) for name in COLUMNS} | {"width": np.nan}))
+        scenes_of(tabulate({name: getattr(table, name) for name in COLUMNS} | {"width": np.nan}))
     with pytest.raises(ValueError, match=r"scenes of 0\.4 s or more"):
         scenes_of(table, seconds=0.1)
