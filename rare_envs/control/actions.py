@@ -10,7 +10,6 @@ References:
     `envs/common/action.py` and `vehicle/controller.py`.
 """
 
-from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -162,10 +161,11 @@ def update_aim(aim: Aim, action: Tensor, y: Tensor, speed: Tensor, road: Road) -
     two lane widths of the vehicle. Faster and slower aim for the speed after or before the one nearest to the vehicle's
     present speed (not to the present target).
     """
-    centres, widths = _lanes(road, y.dtype, y.device)
+    edges = constant(road.edges, y)
     aside = (action == LANE_RIGHT).long() - (action == LANE_LEFT).long()
     wanted = (aim.lane + aside).clamp(0, road.lanes - 1)
-    reachable = (y - centres[wanted]).abs() <= _REACHABLE_LANES * widths[wanted]
+    left, right = edges[wanted], edges[wanted + 1]
+    reachable = (y - (right + left) / 2).abs() <= _REACHABLE_LANES * (right - left)
     change = (action == FASTER).long() - (action == SLOWER).long()
     changed = (_nearest_speed(speed) + change).clamp(0, len(TARGET_SPEEDS) - 1)
     return Aim(torch.where(reachable, wanted, aim.lane), torch.where(change != 0, changed, aim.speed))
@@ -178,11 +178,12 @@ def control_towards(aim: Aim, x: Tensor, y: Tensor, heading: Tensor, speed: Tens
     target lane.
     """
     acceleration = (constant(tuple(TARGET_SPEEDS), speed)[aim.speed] - speed) / _TAU_SPEED
-    centres, _ = _lanes(road, y.dtype, y.device)
+    edges = constant(road.edges, y)
     if road.reference_line is not None:
         ahead = road.reference_line.at(x + speed * _TAU_PURSUIT).heading - road.reference_line.at(x).heading
         heading = heading - ahead
-    return torch.stack((acceleration, steering_control(y - centres[aim.lane], heading, speed)), dim=-1)
+    offset = y - (edges[aim.lane + 1] + edges[aim.lane]) / 2
+    return torch.stack((acceleration, steering_control(offset, heading, speed)), dim=-1)
 
 
 def _nearest_speed(speed: Tensor) -> Tensor:
@@ -190,11 +191,3 @@ def _nearest_speed(speed: Tensor) -> Tensor:
     first, last = TARGET_SPEEDS[0], TARGET_SPEEDS[-1]
     index = torch.round((speed - first) / (last - first) * (len(TARGET_SPEEDS) - 1))
     return index.clamp(0, len(TARGET_SPEEDS) - 1).long()
-
-
-@cache  # never forgotten: recorded rollouts read it where it is
-def _lanes(road: Road, dtype: torch.dtype, device: torch.device) -> tuple[Tensor, Tensor]:
-    """Return the centres and widths of the lanes [m]."""
-    with torch.inference_mode(False):
-        edges = torch.tensor(road.edges, dtype=dtype, device=device)
-        return (edges[1:] + edges[:-1]) / 2, edges[1:] - edges[:-1]

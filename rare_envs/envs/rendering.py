@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from rare_envs.control.actions import TARGET_SPEEDS
 from rare_envs.simulation.episode import Episode
 from rare_envs.simulation.world import World
-from rare_envs.traffic.bodies import pairwise_overlaps
+from rare_envs.traffic.bodies import overlaps
 from rare_envs.traffic.road import Road
 from rare_envs.traffic.state import VEHICLE_LENGTH, VEHICLE_WIDTH, State
 
@@ -79,7 +79,7 @@ def find_crashed(episode: Episode, row: int = 0) -> Collection[int]:
     if not bool(episode.collided[row]):
         return ()
     state = State(*(field[row : row + 1] for field in episode.state))
-    return {0, *pairwise_overlaps(state, episode.road)[0, 0].nonzero().flatten().tolist()}
+    return {0, *(overlaps(state, episode.road)[0].nonzero().flatten() + 1).tolist()}
 
 
 def world_places(state: State, road: Road, row: int = 0) -> list[list[float]]:

@@ -15,7 +15,6 @@ from rare_envs.distributions.coordinates import FloatArray
 from rare_envs.distributions.fitted import FittedDistribution
 from rare_envs.distributions.mixture import CoordinateMixture, TruncatedGaussianMixture
 from rare_envs.distributions.space import Distribution, ScenarioSpace
-from rare_envs.measures.base import RowsReplaceable
 from rare_envs.multi_agent import view_order
 from rare_envs.simulation.episode import Episode
 from rare_envs.simulation.observation import map_kinds
@@ -77,14 +76,14 @@ def _freeze_state(rng: np.random.Generator) -> bytes:
 
 
 def merge_rows(old: _T, rows: Tensor, new: _T) -> _T:
-    """Return tensors, tuples of such or `RowsReplaceable` of B scenarios with the rows (R,) replaced.
+    """Return tensors, tuples of such or what has `replace_rows` of B scenarios with the rows (R,) replaced.
 
     The rest, as the road, is common to all.
     """
 
     def merge(old: Any, new: Any) -> Any:
         if not isinstance(old, Tensor):
-            replace = getattr(old, "replace_rows", None)  # of a `RowsReplaceable`; to ask for the protocol is slow
+            replace = getattr(old, "replace_rows", None)  # of the record of a measure
             return old if replace is None else replace(rows, new)
         old = old.clone()
         old[rows] = new
@@ -99,7 +98,7 @@ def list_tensors(value: Any) -> list[Tensor]:
     found = list[Tensor]()
 
     def collect(leaf: Any) -> None:
-        if isinstance(leaf, RowsReplaceable):
+        if hasattr(leaf, "replace_rows"):
             raise ValueError(f"Expected tensors, to keep them in a file, got {type(leaf).__name__}.")
         if isinstance(leaf, Tensor):
             found.append(leaf)

@@ -134,8 +134,8 @@ class RoadNumbers(NamedTuple):
     @classmethod
     def of(cls, road: Road) -> "RoadNumbers":
         """Return the numbers of a road."""
-        half, reach = (road.edges[-1] - road.edges[0]) / 2, (road.width + VEHICLE_WIDTH) / 2
-        return cls(*single(road.centre(0), road.lanes - 1, road.width, road.middle, half, reach))
+        first, half = sum(road.edges[:2]) / 2, (road.edges[-1] - road.edges[0]) / 2
+        return cls(*single(first, road.lanes - 1, road.width, road.middle, half, (road.width + VEHICLE_WIDTH) / 2))
 
 
 @compiled

@@ -208,7 +208,7 @@ def step(table: SingleArray, vehicles: int, action: SingleArray, script: ScriptN
 
 @compiled
 def others_touch(rows: Rows) -> bool:
-    """Return whether two vehicles other than an ego overlap: `rare_envs.traffic.bodies.others_overlap`."""
+    """Return whether two vehicles other than an ego overlap: `rare_envs.traffic.bodies.overlaps`."""
     x, y, heading = rows.x, rows.y, rows.heading
     for one in range(1, len(x)):
         for other in range(one + 1, len(x)):

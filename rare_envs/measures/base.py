@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from typing import Any, ClassVar, NamedTuple, Protocol, TypeAlias, runtime_checkable
+from typing import Any, NamedTuple, TypeAlias
 
 import torch
 from torch import Tensor
@@ -12,7 +13,7 @@ from torch import Tensor
 from rare_envs.devices import may_hold, scalars
 from rare_envs.traffic.bodies import Lead, lead_index, lead_of
 from rare_envs.traffic.road import Road, straight
-from rare_envs.traffic.state import VEHICLE_LENGTH, State
+from rare_envs.traffic.state import VEHICLE_LENGTH, State, map_leaves, map_tensors
 
 GAP_MIN = 0.01
 """Gaps are floored here [m] so that only a collision, never a narrow escape, comes to 0 or less."""
@@ -20,6 +21,12 @@ GAP_MAX = 1e6
 """And cut here [m], where there is no lead."""
 STILL = 1e-4
 """Speeds in a denominator are floored here [m/s], far below gap / TTC_MAX, so no value under the cap changes."""
+COLLISION = -1.0
+"""f of an episode with a collision, unless a measure says otherwise (Tian et al. 2024, equation 3)."""
+ADDED_MAX = 1000.0
+"""Cap of what is added up over an episode [unit x s]."""
+MeasureState: TypeAlias = Any
+"""State of a measure in B episodes: a tensor (B, ...), a tuple of such, or an object with `replace_rows(rows, new)`."""
 
 
 class Moment(NamedTuple):
@@ -48,13 +55,7 @@ class Moment(NamedTuple):
 
     @classmethod
     def of_two(cls, gap: float, speed: float, lead_speed: float) -> Moment:
-        """Return one scenario of an ego and its lead in the middle of one straight lane: for examples and tests.
-
-        Args:
-            gap: Bumper to bumper [m].
-            speed: Of the ego [m/s].
-            lead_speed: Of the lead [m/s].
-        """
+        """Return an ego and its lead in one straight lane, for examples: bumper to bumper [m], speeds [m/s]."""
         x = torch.tensor([[0.0, gap + VEHICLE_LENGTH]])
         zero, road = torch.zeros_like(x), straight(1)
         state = State(x, zero, zero, torch.tensor([[speed, lead_speed]]), theta=x[:, :0])
@@ -81,26 +82,10 @@ def acceleration_of_lead(moment: Moment) -> Tensor:
     return torch.where(lead > 0, of_lead, 0.0)
 
 
-COLLISION = -1.0
-"""f of an episode with a collision, unless a measure says otherwise (Tian et al. 2024, equation 3)."""
-
-MeasureState: TypeAlias = Any
-"""State of a measure in B episodes: a tensor (B, ...), a tuple of such, or a `RowsReplaceable`."""
-
-
-@runtime_checkable
-class RowsReplaceable(Protocol):
-    """A state of B episodes, some of which can be replaced by those of another state."""
-
-    def replace_rows(self, rows: Tensor, new: Any) -> Any:
-        """Return the state with the episodes `rows` (indices or mask) replaced by the episodes of `new`."""
-
-
-@runtime_checkable
-class EpisodeMeasure(Protocol):
+class EpisodeMeasure(ABC):
     """A safety measure as a fold over the moments of B episodes, as they come. Nothing in it changes.
 
-    A class of your own may inherit from it, and then needs the three methods only.
+    A class of your own inherits from it, and needs the three methods only.
 
     Example:
         >>> class LastSpeed(EpisodeMeasure):
@@ -118,24 +103,20 @@ class EpisodeMeasure(Protocol):
         [20.4]
     """
 
-    @property
-    def sees(self) -> bool:
-        """Whether it needs the lidar features of the vehicles, `Moment.perception`."""
-        return False
+    sees: bool = False
+    """Whether it needs the lidar features of the vehicles, `Moment.perception`."""
+    records: bool = False
+    """Whether it keeps whole episodes, which are then simulated in smaller batches."""
+    unit: str = ""
+    """Unit of f; empty for a number without one."""
+    critical: float | None = None
+    """The critical value of a measure whose large values are dangerous; None where small ones are."""
 
-    @property
-    def records(self) -> bool:
-        """Whether it keeps whole episodes, which are then simulated in smaller batches."""
-        return False
-
-    @property
-    def unit(self) -> str:
-        """Unit of f; empty for a number without one."""
-        return ""
-
+    @abstractmethod
     def start(self, moment: Moment, ticks: int) -> MeasureState:
         """Return the state after the first moment of episodes that are `ticks` long."""
 
+    @abstractmethod
     def update(self, state: MeasureState, moment: Moment, before: Tensor, now: Tensor) -> MeasureState:
         """Return the state after one more moment.
 
@@ -146,8 +127,13 @@ class EpisodeMeasure(Protocol):
             now: Whether it has by this moment, boolean, shape (B,).
         """
 
+    @abstractmethod
     def f(self, state: MeasureState) -> Tensor:
         """Return the measure of the episodes so far, shape (B,)."""
+
+    def gamma(self, value: Any) -> Any:
+        """Return the f that corresponds to a value in the measure's own unit and sign: the critical value less it."""
+        return value if self.critical is None else self.critical - value
 
 
 def check_one_each(value: Any, like: Tensor) -> Tensor:
@@ -160,8 +146,8 @@ def check_one_each(value: Any, like: Tensor) -> Tensor:
     )
 
 
-def _number_terms(vehicle_names: tuple[str, ...]) -> tuple[str, ...]:
-    """Return a name for each other vehicle: its own."""
+def name_others(vehicle_names: tuple[str, ...]) -> tuple[str, ...]:
+    """Return the names of the vehicles but the ego."""
     return vehicle_names[1:]
 
 
@@ -187,7 +173,7 @@ class MeasureTerms:
     hit: Callable[[Moment], Tensor] | None = None
     """The moment of a collision to the number of the term that the collision belongs to, int64, shape (B,); None for
     the most dangerous one at that moment."""
-    names: Callable[[tuple[str, ...]], tuple[str, ...]] = _number_terms
+    names: Callable[[tuple[str, ...]], tuple[str, ...]] = name_others
     """Names of the N vehicles, the ego's first, to those of the K terms."""
     cuts: tuple[float, ...] = ()
     """Shares of the horizon at which each term is cut into one before and one after, which count as different terms."""
@@ -196,21 +182,25 @@ class MeasureTerms:
 
 
 @dataclass(frozen=True)
-class Measure:
-    """A measure that is decided by the most dangerous moment of an episode: f is the least over its moments.
+class Measure(EpisodeMeasure):
+    """A measure that is decided by the most dangerous moment of an episode (f is the least), or that adds up over it.
 
     Where large values are dangerous, such as those of a deceleration, f is the critical value less the value, so that
     f <= 0 says that the critical value was reached.
 
     Example:
         >>> import rare_envs
-        >>> from rare_envs.measures import drac
+        >>> from rare_envs.measures.longitudinal import drac
         >>> comfort = Measure(drac, critical=2.0, collision=-100.0, unit="m/s^2")
         >>> comfort.gamma(3.0)  # f <= -1 where avoiding a crash takes 3 m/s^2
         -1.0
         >>> problem = rare_envs.DrivingProblem("rare_envs/CarFollowing-v0", measure=comfort)
         >>> problem.evaluate([[20.0, 10.0, 25.0]]).round(2).tolist()  # at first 10^2 / (2 25) = 2 m/s^2, then less
         [0.0]
+        >>> slow = Measure(lambda moment: (moment.state.speed[:, 0] < 19.9).float(), critical=2.0, adds=True)
+        >>> problem = rare_envs.DrivingProblem("rare_envs/CarFollowing-v0", measure=slow)
+        >>> problem.evaluate([[20.0, 10.0, 150.0]]).round(1).tolist()  # 6.5 s of the 10 s
+        [-4.5]
     """
 
     of: Callable[[Moment], Tensor]
@@ -228,22 +218,27 @@ class Measure:
     """Numbers of a moment of which `of` is the most dangerous; None for none but itself."""
     collisions_only: bool = False
     """Whether f is positive in episodes without a collision and only in those: then {f <= 0} is the collision."""
-
-    records: ClassVar[bool] = False
-    """One number of each episode is kept."""
-
-    def gamma(self, value: float) -> float:
-        """Return the threshold of f that corresponds to a value in the measure's own unit and sign."""
-        return value if self.critical is None else self.critical - value
+    adds: bool = False
+    """Whether f is the critical value (or 0) less the integral of `of` over time [s], in rectangles of one tick."""
 
     def start(self, moment: Moment, ticks: int) -> Tensor:
-        """Return f of the first moment, which is the whole state."""
-        return self._f_of_moment(moment)
+        """Return f of the first moment, which is the whole state; where f adds up, nothing is added yet."""
+        value = self._value(moment)
+        return torch.full_like(value, self.critical or 0.0) if self.adds else self.gamma(value)
 
     def update(self, state: Tensor, moment: Moment, before: Tensor, now: Tensor) -> Tensor:
-        """Return the lesser of f so far and f of the moment, or what a collision counts as after one."""
-        f = torch.minimum(state, self._f_of_moment(moment))
-        return self._with_collisions(state, f, moment, before, now)
+        """Return f after one more moment: the lesser, or less one tick, or what a collision counts as after one."""
+        if self.adds:
+            f = (state - self._value(moment) * moment.dt).clamp(min=(self.critical or 0.0) - ADDED_MAX)
+        else:
+            f = torch.minimum(state, self.gamma(self._value(moment)))
+        worth = state
+        if callable(self.collision):
+            new = now & ~before
+            worth = torch.where(new, self.collision(moment), state) if may_hold(new) else state
+        elif self.collision is not None:
+            (worth,) = scalars((self.collision,), f)
+        return torch.where(now, worth, f)
 
     def f(self, state: Tensor) -> Tensor:
         """Return the state, which is f."""
@@ -251,26 +246,11 @@ class Measure:
 
     def term_values(self, moment: Moment) -> Tensor:
         """Return f of each of the K terms of a moment, shape (B, K); their least is f of the moment."""
-        if self.terms is None:
-            return self._f_of_moment(moment)[:, None]
-        values = self.terms.of(moment)
-        return values if self.critical is None else self.critical - values
+        values: Tensor = self.gamma(self._value(moment)[:, None] if self.terms is None else self.terms.of(moment))
+        return values
 
-    def _f_of_moment(self, moment: Moment) -> Tensor:
-        value = check_one_each(self.of(moment), moment.lead.gap)
-        return value if self.critical is None else self.critical - value
-
-    def _with_collisions(self, state: Tensor, f: Tensor, moment: Moment, before: Tensor, now: Tensor) -> Tensor:
-        """Return f of the moments, but in episodes with a collision what that counts as."""
-        worth: Tensor
-        if self.collision is None:
-            worth = state
-        elif callable(self.collision):
-            new = now & ~before
-            worth = torch.where(new, self.collision(moment), state) if may_hold(new) else state
-        else:
-            (worth,) = scalars((self.collision,), f)
-        return torch.where(now, worth, f)
+    def _value(self, moment: Moment) -> Tensor:
+        return check_one_each(self.of(moment), moment.lead.gap)
 
 
 class Trace(NamedTuple):
@@ -304,29 +284,12 @@ class Trace(NamedTuple):
     dt: float
     """Tick [s]."""
 
-    @property
-    def time(self) -> Tensor:
-        """Time of each moment [s], shape (T,)."""
-        x = self.state.x
-        return torch.arange(len(x), dtype=x.dtype, device=x.device) * self.dt
-
     def of(self, function: Callable[[Moment], Tensor]) -> Tensor:
         """Return a function of a moment, such as `ttc`, at every moment, shape (T, B)."""
-        before = State(*(torch.cat((field[:1], field[:-1])) for field in self.state))
-        moment = Moment(
-            State(*map(_flat, self.state)),
-            Lead(*map(_flat, self.lead)),
-            self.road,
-            None if self.perception is None else _flat(self.perception),
-            State(*map(_flat, before)),
-            self.dt,
-        )
-        return function(moment).view(self.valid.shape)
-
-
-def _flat(values: Tensor) -> Tensor:
-    """Join the first two axes: (T, B, ...) to (T B, ...)."""
-    return values.flatten(0, 1)
+        before = map_tensors(lambda field: torch.cat((field[:1], field[:-1])), self.state)
+        moment = Moment(self.state, self.lead, self.road, self.perception, before, self.dt)
+        values: Tensor = function(map_tensors(lambda field: field.flatten(0, 1), moment))
+        return values.view(self.valid.shape)
 
 
 @dataclass(frozen=True, eq=False)
@@ -334,7 +297,7 @@ class Record:
     """The moments of B episodes so far; they need not have begun at the same time."""
 
     moments: tuple[Moment, ...]
-    """The latest last; older ones than any of the episodes are dropped."""
+    """The latest last, without the states before them; older ones than any of the episodes are dropped."""
     first: Tensor
     """Index of the first moment of each episode, int64, shape (B,)."""
     last: Tensor
@@ -344,32 +307,19 @@ class Record:
     ticks: int
     """Length of a whole episode."""
 
-    def append(self, moment: Moment, before: Tensor, now: Tensor) -> Record:
-        """Return the record with one more moment; arguments as of `EpisodeMeasure.update`."""
-        old = int(self.first.min())
-        moments = (*self.moments[old:], moment)
-        last = torch.where(before, self.last - old, len(moments) - 1)
-        return Record(moments, self.first - old, last, now, self.ticks)
-
     def replace_rows(self, rows: Tensor, new: Record) -> Record:
         """Return the record with the episodes `rows` replaced by new ones that have just begun."""
-        newest, fresh = self.moments[-1], new.moments[-1]
-        seen = newest.perception
-        if seen is not None and fresh.perception is not None:
-            seen = _replace_rows(seen, rows, fresh.perception)
-        merged = newest._replace(
-            state=State(*(_replace_rows(a, rows, b) for a, b in zip(newest.state, fresh.state, strict=True))),
-            lead=Lead(*(_replace_rows(a, rows, b) for a, b in zip(newest.lead, fresh.lead, strict=True))),
-            perception=seen,
-        )
-        at = torch.full_like(self.first[rows], len(self.moments) - 1)
-        return replace(
-            self,
-            moments=(*self.moments[:-1], merged),
-            first=_replace_rows(self.first, rows, at),
-            last=_replace_rows(self.last, rows, at),
-            collided=_replace_rows(self.collided, rows, new.collided),
-        )
+
+        def put(old: Any, fresh: Any) -> Any:
+            if isinstance(old, Tensor):
+                old = old.clone()
+                old[rows] = fresh
+            return old
+
+        at = torch.full_like(new.first, len(self.moments) - 1)
+        merged = map_leaves(put, self.moments[-1], new.moments[-1])
+        first, last, collided = map_leaves(put, (self.first, self.last, self.collided), (at, at, new.collided))
+        return replace(self, moments=(*self.moments[:-1], merged), first=first, last=last, collided=collided)
 
     def trace(self) -> Trace:
         """Return the trace of the episodes so far, as a measure gets it."""
@@ -377,31 +327,15 @@ class Record:
         at = torch.minimum(self.first + time, self.last)
         row = torch.arange(len(self.first), device=self.first.device)
 
-        def align(values: list[Tensor]) -> Tensor:
-            return torch.stack(values)[at, row]
+        def align(newest: Any, *older: Any) -> Any:
+            return torch.stack((*older, newest))[at, row] if isinstance(newest, Tensor) else newest
 
-        states, leads = [each.state for each in self.moments], [each.lead for each in self.moments]
-        seen = [each.perception for each in self.moments if each.perception is not None]
-        return Trace(
-            State(*(align(list(values)) for values in zip(*states, strict=True))),
-            Lead(*(align(list(values)) for values in zip(*leads, strict=True))),
-            self.moments[-1].road,
-            align(seen) if seen else None,
-            self.first + time <= self.last,
-            self.collided,
-            self.moments[-1].dt,
-        )
-
-
-def _replace_rows(old: Tensor, rows: Tensor, new: Tensor) -> Tensor:
-    """Return a copy of `old` with some rows replaced."""
-    old = old.clone()
-    old[rows] = new
-    return old
+        state, lead, road, perception, _, dt = map_leaves(align, self.moments[-1], *self.moments[:-1])
+        return Trace(state, lead, road, perception, self.first + time <= self.last, self.collided, dt)
 
 
 @dataclass(frozen=True)
-class TraceMeasure:
+class TraceMeasure(EpisodeMeasure):
     """A measure that is a function of the whole episode.
 
     Example:
@@ -423,24 +357,21 @@ class TraceMeasure:
     critical: float | None = None
     """The critical value of a measure whose large values are dangerous, as in `Measure`."""
     unit: str = ""
-    records: ClassVar[bool] = True
-    """It keeps whole episodes."""
-
-    def gamma(self, value: float) -> float:
-        """Return the threshold of f that corresponds to a value in the measure's own unit and sign."""
-        return value if self.critical is None else self.critical - value
+    records = True
 
     def start(self, moment: Moment, ticks: int) -> Record:
         """Return a record of the first moment."""
         at = torch.zeros(len(moment.state.x), dtype=torch.int64, device=moment.state.x.device)
-        return Record((moment,), at, at, at > 0, ticks)
+        return Record((moment._replace(before=None),), at, at, at > 0, ticks)
 
     def update(self, state: Record, moment: Moment, before: Tensor, now: Tensor) -> Record:
         """Return the record with one more moment."""
-        return state.append(moment, before, now)
+        old = int(state.first.min())
+        moments = (*state.moments[old:], moment._replace(before=None))
+        last = torch.where(before, state.last - old, len(moments) - 1)
+        return Record(moments, state.first - old, last, now, state.ticks)
 
     def f(self, state: Record) -> Tensor:
         """Return the function of the episodes so far, shape (B,)."""
-        value = check_one_each(self.of(state.trace()), state.first)
-        f = value if self.critical is None else self.critical - value
+        f: Tensor = self.gamma(check_one_each(self.of(state.trace()), state.first))
         return f if self.collision is None else torch.where(state.collided, self.collision, f)

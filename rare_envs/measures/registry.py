@@ -4,29 +4,36 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from itertools import pairwise
 from types import MappingProxyType
-from typing import Any, NamedTuple, Protocol, runtime_checkable
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 from rare_envs.devices import constant, may_hold
-from rare_envs.measures.base import COLLISION, EpisodeMeasure, Measure, MeasureState, MeasureTerms, Moment, TraceMeasure
+from rare_envs.measures.base import (
+    ADDED_MAX,
+    COLLISION,
+    EpisodeMeasure,
+    Measure,
+    MeasureState,
+    MeasureTerms,
+    Moment,
+    TraceMeasure,
+)
 from rare_envs.measures.longitudinal import (
     AT_START,
     DECELERATION_MAX,
-    EXPOSURE_MAX,
     MAX_BRAKING,
     TTC_MAX,
-    Exposure,
     btn,
     drac,
     evasive_manoeuvre,
     lidar_ttc,
     lidar_ttc_terms,
     mttc,
-    name_edge_terms,
     name_lidar_terms,
     required_deceleration,
     tet,
@@ -48,6 +55,7 @@ from rare_envs.measures.two_dimensional import (
     find_vehicle_or_edge,
     margin,
     margin_terms,
+    name_edge_terms,
     name_pairs,
     pair_clearance,
     pair_clearance_terms,
@@ -126,8 +134,8 @@ MEASURES: MappingProxyType[str, EpisodeMeasure] = MappingProxyType(
         "rss_lateral": Measure(rss_lateral, collision=-MARGIN_MAX, unit="m"),
         "rss_margin": Measure(rss_margin, collision=-MARGIN_MAX, unit="m"),
         "clearance": CLEARANCE,
-        "tet": Exposure(tet, collision=-EXPOSURE_MAX, unit="s"),
-        "tit": Exposure(tit, collision=-EXPOSURE_MAX, unit="s^2"),
+        "tet": Measure(tet, adds=True, critical=1.0, collision=-ADDED_MAX),
+        "tit": Measure(tit, adds=True, critical=1.0, collision=-ADDED_MAX, unit="s^2"),
         "margin": Measure(
             margin, collision=_negative_contact_speed, terms=_to_vehicles_and_edge(margin_terms), collisions_only=True
         ),
@@ -167,7 +175,7 @@ def find_measure(measure: Any) -> EpisodeMeasure:
 
 
 @dataclass(frozen=True)
-class Combined:
+class Combined(EpisodeMeasure):
     """A function of the f of several measures, each of which is updated as it would be alone."""
 
     parts: tuple[EpisodeMeasure, ...]
@@ -176,21 +184,11 @@ class Combined:
     collision: float | None = None
     """f of an episode with a collision; None for the function of the parts."""
 
-    @property
-    def sees(self) -> bool:
-        """Whether a part needs the lidar features of the vehicles."""
-        return any(part.sees for part in self.parts)
-
-    @property
-    def records(self) -> bool:
-        """Whether a part keeps whole episodes."""
-        return any(part.records for part in self.parts)
-
-    @property
-    def unit(self) -> str:
-        """The unit that the parts have in common; empty if they differ."""
+    def __post_init__(self) -> None:
         units = {part.unit for part in self.parts}
-        return units.pop() if len(units) == 1 else ""
+        object.__setattr__(self, "sees", any(part.sees for part in self.parts))
+        object.__setattr__(self, "records", any(part.records for part in self.parts))
+        object.__setattr__(self, "unit", units.pop() if len(units) == 1 else "")
 
     def start(self, moment: Moment, ticks: int) -> tuple[MeasureState, ...]:
         """Return that nobody has collided, and the state of each part."""
@@ -249,7 +247,7 @@ def weighted(*terms: tuple[Any, float]) -> Combined:
     weights = tuple(float(weight) for _, weight in terms)
     if not all(0.0 < weight < float("inf") for weight in weights):
         raise ValueError(f"Expected positive weights (small f is dangerous, in each of the measures), got {weights}.")
-    return Combined(_find_all([measure for measure, _ in terms]), WeightedSum(weights))
+    return Combined(_find_all([measure for measure, _ in terms]), partial(_add_weighted, weights))
 
 
 def with_collision(measure: Any, value: float = COLLISION) -> Combined:
@@ -272,15 +270,9 @@ def with_collision(measure: Any, value: float = COLLISION) -> Combined:
     return Combined(_find_all([measure]), _least, float(value))
 
 
-@dataclass(frozen=True)
-class WeightedSum:
-    """A weighted sum over the first axis."""
-
-    weights: tuple[float, ...]
-
-    def __call__(self, f: Tensor) -> Tensor:
-        """Return the sum over the first axis: (K, B) to (B,)."""
-        return (f * constant(tuple(self.weights), f)[:, None]).sum(0)
+def _add_weighted(weights: tuple[float, ...], f: Tensor) -> Tensor:
+    """Return the weighted sum over the first axis: (K, B) to (B,)."""
+    return (f * constant(weights, f)[:, None]).sum(0)
 
 
 def _least(f: Tensor) -> Tensor:
@@ -292,25 +284,6 @@ def _find_all(measures: Any) -> tuple[EpisodeMeasure, ...]:
     if not measures:
         raise ValueError("Expected one or more measures, got none.")
     return tuple(find_measure(measure) for measure in measures)
-
-
-@runtime_checkable
-class TermMeasure(Protocol):
-    """A measure whose f is the least over the moments of an episode and, in a moment, over its terms.
-
-    A `Measure` is one. So is an `EpisodeMeasure` of your own with these three attributes.
-    """
-
-    @property
-    def terms(self) -> MeasureTerms | None:
-        """Its terms; None if it has but one."""
-
-    @property
-    def collision(self) -> Any:
-        """Value of f in an episode with a collision, as in `Measure.collision`."""
-
-    def term_values(self, moment: Moment) -> Tensor:
-        """Return f of each of the K terms of a moment, shape (B, K); their least is f of the moment."""
 
 
 class TermState(NamedTuple):
@@ -329,7 +302,7 @@ class TermState(NamedTuple):
 
 
 @dataclass(frozen=True)
-class TermTracker:
+class TermTracker(EpisodeMeasure):
     """A measure with terms to search by: its own, or those of another measure whose order is better.
 
     f is the measure's. Terms that are cut at a share of the horizon come part by part: K early ones, then K late ones.
@@ -337,29 +310,21 @@ class TermTracker:
 
     measure: EpisodeMeasure
     """Measure whose f it is."""
-    order: TermMeasure
-    """Measure whose terms they are."""
+    order: Measure
+    """Measure whose terms they are; its lidar features are those of the other."""
+
+    def __post_init__(self) -> None:
+        for name in ("sees", "records", "unit"):
+            object.__setattr__(self, name, getattr(self.measure, name))  # attributes by their names
 
     @property
-    def sees(self) -> bool:
-        """Whether the measure needs lidar features; an order has to do with what its measure has."""
-        return self.measure.sees
-
-    @property
-    def records(self) -> bool:
-        """Whether the measure keeps whole episodes."""
-        return self.measure.records
-
-    @property
-    def unit(self) -> str:
-        """Unit of f."""
-        return self.measure.unit
+    def _terms(self) -> MeasureTerms:
+        return self.order.terms or MeasureTerms(self.order.of, names=lambda _: ("f",))
 
     def start(self, moment: Moment, ticks: int) -> TermState:
         """Return the state after the first moment."""
         first = self.order.term_values(moment)
-        terms = self.order.terms
-        late = [] if terms is None else [torch.full_like(first, terms.unattained) for _ in terms.cuts]
+        late = [torch.full_like(first, self._terms.unattained) for _ in self._terms.cuts]
         values = torch.cat((first, *late), 1)
         zero = torch.zeros_like(values, dtype=torch.int64)
         return TermState(self.measure.start(moment, ticks), values, zero, 0, ticks)
@@ -370,16 +335,17 @@ class TermTracker:
         own = self.measure.update(state.own, moment, before, now)
         latest = self.order.term_values(moment)
         count = latest.shape[1]
-        first = count * self.part_of(tick, state.ticks_in_all)
+        first = count * sum(tick > cut * state.ticks_in_all for cut in self._terms.cuts)
         part = slice(first, first + count)
         old = state.values[:, part]
         lower = (latest < old) & ~now[:, None]
         values, ticks = state.values.clone(), state.ticks.clone()
         values[:, part] = torch.where(lower, latest, old)
         ticks[:, part] = torch.where(lower, tick, ticks[:, part])
-        new = now & ~before
-        if self.order.collision is not None and may_hold(new):
-            term, worth = first + self._find_hit(moment, latest), self._worth(moment, latest)[:, None]
+        new, collision = now & ~before, self.order.collision
+        if collision is not None and may_hold(new):
+            term = first + (self._terms.hit(moment) if self._terms.hit else latest.argmin(1))
+            worth = (collision(moment) if callable(collision) else torch.full_like(latest[:, 0], collision))[:, None]
             hit = new[:, None] & (torch.arange(values.shape[1], device=term.device) == term[:, None])
             values = torch.where(new[:, None], torch.maximum(values, worth), values)
             values, ticks = torch.where(hit, worth, values), torch.where(hit, tick, ticks)
@@ -389,41 +355,23 @@ class TermTracker:
         """Return f of the measure, shape (B,)."""
         return self.measure.f(state.own)
 
-    def part_of(self, tick: int, ticks: int) -> int:
-        """Return the number of the part of the horizon that a tick of `ticks` belongs to."""
-        cuts = () if self.order.terms is None else self.order.terms.cuts
-        return sum(tick > cut * ticks for cut in cuts)
-
     def names(self, vehicle_names: tuple[str, ...]) -> tuple[str, ...]:
         """Return the names of the J terms."""
-        terms = self.order.terms
-        if terms is None:
-            return ("f",)
-        ends = [0, *(round(100 * cut) for cut in terms.cuts), 100]
+        ends = [0, *(round(100 * cut) for cut in self._terms.cuts), 100]
         parts = [f", {low} to {high} % of the time" for low, high in pairwise(ends)]
-        parts = parts if terms.cuts else [""]
-        return tuple(name + part for part in parts for name in terms.names(vehicle_names))
-
-    def _find_hit(self, moment: Moment, latest: Tensor) -> Tensor:
-        hit = None if self.order.terms is None else self.order.terms.hit
-        return latest.argmin(1) if hit is None else hit(moment)
-
-    def _worth(self, moment: Moment, latest: Tensor) -> Tensor:
-        collision = self.order.collision
-        value: Tensor = collision(moment) if callable(collision) else latest.new_full(latest.shape[:1], collision)
-        return value
+        parts = parts if self._terms.cuts else [""]
+        return tuple(name + part for part in parts for name in self._terms.names(vehicle_names))
 
 
-def find_order(measure: EpisodeMeasure, collisions: str, gamma: float) -> tuple[TermMeasure | None, float]:
+def find_order(measure: EpisodeMeasure, collisions: str, gamma: float) -> tuple[Measure | None, float]:
     """Return the measure on whose terms to search for f <= gamma, and the threshold of these terms.
 
     Where {f <= gamma} is the collision, as at gamma = 0 of times to collision, it is the clearance, which tells near
     from far where times are capped and does not jump from car to car: between the ego and the others, or between all
-    where `collisions` are "any". Else it is the measure itself; None if that has no terms and no moments.
+    where `collisions` are "any". Else it is the measure itself; None if that is no least over terms and moments.
     """
-    if gamma == 0.0 and isinstance(measure, Measure) and measure.collisions_only:
-        return (PAIR_CLEARANCE if collisions == "any" else CLEARANCE), 0.0
-    if not isinstance(measure, TermMeasure):
+    if type(measure) is not Measure or measure.adds:
         return None, gamma
-    whole = isinstance(measure, Measure) and type(measure) is not Measure  # such as `Exposure`, no least over moments
-    return (None if whole and measure.terms is None else measure), gamma
+    if gamma == 0.0 and measure.collisions_only:
+        return (PAIR_CLEARANCE if collisions == "any" else CLEARANCE), 0.0
+    return measure, gamma

@@ -11,7 +11,7 @@ import re
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from functools import partial
 from types import MappingProxyType
 from typing import Any
 
@@ -71,25 +71,19 @@ def stl(formula: str) -> TraceMeasure:
         >>> rare_envs.DrivingProblem("rare_envs/CarFollowing-v0", measure=measure)  # doctest: +SKIP
     """
     _parse(formula, 1e-3)
-    return TraceMeasure(Robustness(formula), collision=None)
+    return TraceMeasure(partial(robustness, formula), collision=None)
 
 
-@dataclass(frozen=True)
-class Robustness:
-    """Robustness of a formula over a trace."""
-
-    formula: str
-
-    def __call__(self, trace: Trace) -> Tensor:
-        """Return the robustness in B episodes, shape (B,)."""
-        monitor, names = _parse(self.formula, trace.dt)
-        columns = {name: _signal(trace, name).T.tolist() for name in names}
-        ticks = [trace.dt * k for k in range(len(trace.valid))]
-        robustness = []
-        for row in range(trace.valid.shape[1]):
-            robustness.append(monitor.evaluate({"time": ticks, **{name: columns[name][row] for name in names}})[0][1])
-        values = torch.tensor(robustness, dtype=trace.state.x.dtype, device=trace.state.x.device)
-        return values.clamp(-ROBUSTNESS_MAX, ROBUSTNESS_MAX)
+def robustness(formula: str, trace: Trace) -> Tensor:
+    """Return the robustness of a formula in the B episodes of a trace, shape (B,)."""
+    monitor, names = _parse(formula, trace.dt)
+    columns = {name: _signal(trace, name).T.tolist() for name in names}
+    ticks = [trace.dt * k for k in range(len(trace.valid))]
+    found = []
+    for row in range(trace.valid.shape[1]):
+        found.append(monitor.evaluate({"time": ticks, **{name: columns[name][row] for name in names}})[0][1])
+    values = torch.tensor(found, dtype=trace.state.x.dtype, device=trace.state.x.device)
+    return values.clamp(-ROBUSTNESS_MAX, ROBUSTNESS_MAX)
 
 
 def _signal(trace: Trace, name: str) -> Tensor:

@@ -6,7 +6,6 @@ References:
 """
 
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -14,16 +13,13 @@ from torch import Tensor
 from rare_envs.measures.base import GAP_MIN, Moment, Trace
 from rare_envs.measures.longitudinal import TTC_MAX, time_to_edge
 from rare_envs.traffic.bodies import (
-    Encounter,
+    Which,
     axes_of,
     box_distance,
-    ego_overlaps,
     encounter,
-    encounters_of_all,
     least,
+    overlaps,
     pairs,
-    pairwise_overlaps,
-    separation,
     time_to_contact,
 )
 from rare_envs.traffic.state import VEHICLE_LENGTH, VEHICLE_WIDTH
@@ -40,47 +36,62 @@ TIME_MIN = 1e-3
 """Times to contact are floored here [s], so that only a collision comes to 0 or less."""
 
 
+def contact_time_terms(moment: Moment) -> Tensor:
+    """Return the time to contact with each other vehicle and with the edge of the road [s], shape (B, N)."""
+    met = encounter(moment.state, moment.road)
+    times = time_to_contact(met.axes, met.rate).clamp(TIME_MIN, TTC_MAX)
+    return torch.cat((times, time_to_edge(moment)[:, None]), 1)
+
+
 def ttc_2d(moment: Moment) -> Tensor:
-    """Return the time until the ego's box touches that of any other vehicle, if velocities and headings stay.
+    """Return the time until the ego's box touches any other or leaves the road, in (0, 10] s, velocities kept.
 
-    An exact swept test (`rare_envs.traffic.bodies.time_to_contact`) with every vehicle, whatever its lane, and
-    the way to the edge of the road as in `ttc`; the least of them, at most `TTC_MAX`.
-
-    Critical values: as for `ttc`, often 1.5 to 4 s.
-
-    Returns:
-        Time to collision [s], in (0, TTC_MAX], shape (B,).
-
-    References:
-        Hayward, "Near-miss determination through use of a scale of danger", 1972; Ericson, "Real-time collision
-        detection", 2005, section 5.5 (separating axes of moving bodies).
-
-    Example:
-        >>> from rare_envs.measures import Moment
-        >>> ttc_2d(Moment.of_two(gap=25.0, speed=20.0, lead_speed=10.0)).item()
-        2.5
+    An exact swept test with every vehicle (Hayward 1972; Ericson, "Real-time collision detection", 2005, section 5.5).
     """
-    return torch.minimum(least(_contact_times(moment), TTC_MAX), time_to_edge(moment))
+    return contact_time_terms(moment).amin(1).clamp(max=TTC_MAX)
+
+
+def clearance_terms(moment: Moment) -> Tensor:
+    """Return the distance to each other vehicle [m], at most `CLEARANCE_MAX`, shape (B, N - 1)."""
+    return _distances(moment, "ego")
 
 
 def clearance(moment: Moment) -> Tensor:
-    """Return the exact distance between the ego's body and the nearest other.
+    """Return the exact distance between the ego's body and the nearest other [m], in [0.01, 1000], shape (B,)."""
+    return least(clearance_terms(moment), CLEARANCE_MAX)
 
-    Critical value: none is agreed on; 0.5 m beside and 2 m ahead are small.
 
-    Returns:
-        Distance [m], in [0.01, CLEARANCE_MAX], shape (B,).
+def pair_clearance_terms(moment: Moment) -> Tensor:
+    """Return the distance of the vehicles of each pair [m], those with the ego first, shape (B, N (N - 1) / 2)."""
+    return _distances(moment, "all")
 
-    Example:
-        >>> from rare_envs.measures import Moment
-        >>> clearance(Moment.of_two(gap=25.0, speed=20.0, lead_speed=10.0)).item()
-        25.0
-    """
-    return least(_distances(encounter(moment.state, moment.road)), CLEARANCE_MAX)
+
+def pair_clearance(moment: Moment) -> Tensor:
+    """Return the distance of the two vehicles that are nearest to each other [m], the ego or not, shape (B,)."""
+    return pair_clearance_terms(moment).amin(1)
+
+
+def _distances(moment: Moment, which: Which) -> Tensor:
+    """Return the distance of P pairs [m], shape (B, P)."""
+    met = encounter(moment.state, moment.road, which)
+    return box_distance(met.axes, met.other_heading - met.heading).clamp(GAP_MIN, CLEARANCE_MAX)
+
+
+def margin_terms(moment: Moment) -> Tensor:
+    """Return the margin to each other vehicle and to the edge of the road [s], shape (B, N)."""
+    met = encounter(moment.state, moment.road)
+    axes = met.axes
+    closing = -met.rate * torch.sign(axes.offset)
+    root = (closing.square() + 4.0 * DRIFT**2).sqrt()
+    # the same fraction twice: each form loses its digits where the other keeps them
+    slow = (root - closing) / (2.0 * DRIFT**2)
+    inverse = torch.where(closing > 0, 2.0 / (root + closing.clamp(min=0.0)), slow)
+    margins = (axes.gap.clamp(min=0.0) * inverse).amax(-1).clamp(min=TIME_MIN)
+    return torch.cat((margins, time_to_edge(moment)[:, None]), 1)
 
 
 def margin(moment: Moment) -> Tensor:
-    """Return the uncapped time to contact; it also orders vehicles that do not approach.
+    """Return the uncapped time to contact [s], positive, shape (B,); it also orders vehicles that do not approach.
 
     Along each of the four axes on which two boxes can be apart, the time in which the gap g closes at the rate c:
     2 g / (c + sqrt(c^2 + 4 d^2)) with d = `DRIFT`, about g / c where it closes, g / d where it stays, g |c| / d^2 where
@@ -88,42 +99,15 @@ def margin(moment: Moment) -> Tensor:
     and of the time to the edge of the road.
 
     It rises strictly with gaps and falls strictly with closing speeds, near and far, so levels and gradients go on
-    where times to collision are capped. It is positive until contact; as a measure (`MEASURES["margin"]`) a collision
-    comes to the negative speed at which the bodies met, so it goes on past contact too. It is ours: an order for
-    samplers, not a quantity of the literature.
-
-    Returns:
-        Margin [s], positive, shape (B,).
-
-    Example:
-        >>> from rare_envs.measures import Moment
-        >>> round(margin(Moment.of_two(gap=25.0, speed=20.0, lead_speed=10.0)).item(), 2)  # closing: about 25 / 10
-        2.5
-        >>> round(margin(Moment.of_two(gap=25.0, speed=20.0, lead_speed=20.0)).item(), 2)  # not closing: 25 / 0.2
-        125.0
+    where times to collision are capped. As a measure a collision comes to the negative speed at which the bodies met,
+    so it goes on past contact too. It is ours: an order for samplers, not a quantity of the literature.
     """
-    return torch.minimum(least(_margins(moment), torch.inf), time_to_edge(moment))
+    return margin_terms(moment).amin(1)
 
 
-def contact_time_terms(moment: Moment) -> Tensor:
-    """Return the time to contact with each other vehicle and with the edge of the road [s], shape (B, N)."""
-    times = _contact_times(moment).clamp(max=TTC_MAX)
-    return torch.cat((times, time_to_edge(moment)[:, None]), 1)
-
-
-def clearance_terms(moment: Moment) -> Tensor:
-    """Return the distance to each other vehicle [m], at most `CLEARANCE_MAX`, shape (B, N - 1)."""
-    return _distances(encounter(moment.state, moment.road)).clamp(max=CLEARANCE_MAX)
-
-
-def pair_clearance_terms(moment: Moment) -> Tensor:
-    """Return the distance of the vehicles of each pair [m], those with the ego first, shape (B, N (N - 1) / 2)."""
-    return _distances(encounters_of_all(moment.state, moment.road)).clamp(max=CLEARANCE_MAX)
-
-
-def pair_clearance(moment: Moment) -> Tensor:
-    """Return the distance of the two vehicles that are nearest to each other [m], the ego or not, shape (B,)."""
-    return pair_clearance_terms(moment).amin(1)
+def name_edge_terms(vehicle_names: tuple[str, ...]) -> tuple[str, ...]:
+    """Return the names of terms of the other vehicles and of the edge of the road."""
+    return (*vehicle_names[1:], "edge of the road")
 
 
 def name_pairs(vehicle_names: tuple[str, ...]) -> tuple[str, ...]:
@@ -132,17 +116,12 @@ def name_pairs(vehicle_names: tuple[str, ...]) -> tuple[str, ...]:
     return tuple(f"{vehicle_names[i]} and {vehicle_names[j]}" for i, j in zip(first, second, strict=True))
 
 
-def margin_terms(moment: Moment) -> Tensor:
-    """Return the margin to each other vehicle and to the edge of the road [s], shape (B, N)."""
-    return torch.cat((_margins(moment), time_to_edge(moment)[:, None]), 1)
-
-
 def find_vehicle_or_edge(moment: Moment) -> Tensor:
     """Return the number of the vehicle, from 0, that is nearest to the ego, and N - 1 where it has left the road, (B,).
 
     An ego that overlaps a vehicle has hit that vehicle, wherever it is.
     """
-    apart = ~ego_overlaps(moment.state, moment.road).any(1)
+    apart = ~overlaps(moment.state, moment.road).any(1)
     off = apart & moment.road.off_road(moment.state.y[:, 0])
     return torch.where(off, moment.state.x.shape[1] - 1, clearance_terms(moment).argmin(1))
 
@@ -150,30 +129,8 @@ def find_vehicle_or_edge(moment: Moment) -> Tensor:
 def find_nearest_pair(moment: Moment) -> Tensor:
     """Return the number of the pair of vehicles that overlaps; where none does, of the nearest with the ego, (B,)."""
     distances, own = pair_clearance_terms(moment), moment.state.x.shape[1] - 1
-    touching = pairwise_overlaps(moment.state, moment.road).flatten(1).any(1)
+    touching = overlaps(moment.state, moment.road, "all").any(1)
     return torch.where(touching, distances.argmin(1), distances[:, :own].argmin(1))
-
-
-def _contact_times(moment: Moment) -> Tensor:
-    """Return the time to contact with each other vehicle [s], without a cap, shape (B, N - 1)."""
-    met = encounter(moment.state, moment.road)
-    return time_to_contact(met.axes, met.rate).clamp(min=TIME_MIN)
-
-
-def _distances(met: Encounter) -> Tensor:
-    """Return the distance of P pairs [m], shape (B, P)."""
-    return box_distance(met.axes, met.turn).clamp(min=GAP_MIN)
-
-
-def _margins(moment: Moment) -> Tensor:
-    """Return the margin to each other vehicle [s], shape (B, N - 1)."""
-    met = encounter(moment.state, moment.road)
-    gap, closing = met.axes.gap, -met.rate * torch.sign(met.axes.offset)
-    root = (closing.square() + 4.0 * DRIFT**2).sqrt()
-    # the same fraction twice: each form loses its digits where the other keeps them
-    slow = (root - closing) / (2.0 * DRIFT**2)
-    inverse = torch.where(closing > 0, 2.0 / (root + closing.clamp(min=0.0)), slow)
-    return (gap.clamp(min=0.0) * inverse).amax(-1).clamp(min=TIME_MIN)
 
 
 PET_MAX = 5.0
@@ -187,31 +144,13 @@ PET_MIN = 1e-3
 
 
 def pet(trace: Trace) -> Tensor:
-    """Return the post-encroachment time (PET): the least time between one body leaving a place and another taking it.
+    """Return the post-encroachment time [s]: the least time between one body leaving a place and another taking it.
 
     The place is ground that the bodies of the ego and of another vehicle both cover in the course of the episode,
     either of them first. For every delay the ego's body is compared with where the other was (or will be) that much
     earlier (or later), at all moments and on the straight ways between them. The least delay with an overlap is found
-    to a fraction of a tick, from how far apart the bodies were one tick of delay sooner.
-
-    Critical values: 1 to 1.5 s; under 1 s is a serious conflict.
-
-    Args:
-        moment: Of B scenarios.
-        trace: Of B episodes.
-
-    Returns:
-        Post-encroachment time [s], in (0, PET_MAX], over all other vehicles, shape (B,).
-
-    References:
-        Allen, Shin and Cooper, "Analysis of traffic conflicts and collisions", Transportation Research Record 667,
-        1978.
-
-    Example:
-        >>> import rare_envs
-        >>> problem = rare_envs.DrivingProblem("rare_envs/CarFollowing-v0", measure="pet", horizon=4.0)
-        >>> problem.evaluate([[20.0, 20.0, 30.0]]).round(2).tolist()  # the lead's rear was there so long ago
-        [1.55]
+    to a fraction of a tick, from how far apart the bodies were one tick of delay sooner. In (0, PET_MAX], shape (B,)
+    (Allen, Shin and Cooper, "Analysis of traffic conflicts and collisions", 1978); under 1 s is a serious conflict.
     """
     x, y, heading = trace.road.to_world(trace.state.x, trace.state.y, trace.state.heading)
     pet = torch.full_like(x[0, :, 0], PET_MAX)
@@ -250,7 +189,7 @@ def _apart(x: Tensor, y: Tensor, heading: Tensor, valid: Tensor, delay: int) -> 
     pose = torch.stack((between(late, early), between(early, late)), 1)  # (4, 2, T - delay, B, N - 1)
     near = pose[0].square() + pose[1].square() < NEAR**2
     apart = torch.full_like(pose[0], NEAR)
-    apart[near] = separation(axes_of(*pose[:, near]))
+    apart[near] = axes_of(*pose[:, near]).gap.amax(-1)
     now, before = pose[:, :, 1:], pose[:, :, :-1]
     ends = torch.minimum(apart[:, 1:], apart[:, :-1])
     between_ticks = (ends > 0) & (ends < (now[:2] - before[:2]).abs().sum(0))
@@ -269,7 +208,8 @@ def _least_between(before: Tensor, now: Tensor) -> Tensor:
     apart = torch.full_like(low, NEAR)
     for _ in range(TERNARY_STEPS):
         third = (high - low) / 3
-        left, right = (separation(axes_of(*torch.lerp(before, now, at))) for at in (low + third, high - third))
+        places = (torch.lerp(before, now, at) for at in (low + third, high - third))
+        left, right = (axes_of(*place).gap.amax(-1) for place in places)
         low, high = torch.where(left > right, low + third, low), torch.where(left > right, high, high - third)
         apart = torch.minimum(left, right)
     return apart
@@ -281,15 +221,7 @@ MARGIN_MAX = 1000.0
 
 @dataclass(frozen=True)
 class RSS:
-    """Parameters of the model. The paper leaves them open; these are the starting values of Intel's ad-rss-lib.
-
-    Example:
-        >>> from functools import partial
-        >>> from rare_envs.measures import Measure
-        >>> stricter = Measure(partial(rss_margin, rss=RSS(response=2.0)), collision=-1000.0, unit="m")
-        >>> stricter.of.keywords["rss"].brake_most
-        8.0
-    """
+    """Parameters of the model. The paper leaves them open; these are the starting values of Intel's ad-rss-lib."""
 
     response: float = 1.0
     """Response time rho of the ego [s]."""
@@ -309,17 +241,8 @@ class RSS:
     """Lateral fluctuation mu [m]."""
 
 
-class Margins(NamedTuple):
-    """Distance less the safe one, of the ego and every other vehicle [m], shape (B, N - 1); too near if negative."""
-
-    along: Tensor
-    """Longitudinal: of whoever is behind, the ego or the other, to whoever is ahead."""
-    across: Tensor
-    """Lateral."""
-
-
-def margins(moment: Moment, rss: RSS) -> Margins:
-    """Return the margins of the ego with every other vehicle, along and across the road.
+def rss_margins(moment: Moment, rss: RSS) -> tuple[Tensor, Tensor]:
+    """Return distance less the safe one of the ego and every other vehicle [m], along and across the road, (B, N - 1).
 
     d_along = [v_r rho + a rho^2 / 2 + (v_r + a rho)^2 / (2 b_least) - v_f^2 / (2 b_most)]+ with v_r the speed of the
     rear vehicle and v_f of the front one.
@@ -342,7 +265,7 @@ def margins(moment: Moment, rss: RSS) -> Margins:
     safe_along = (way - front.square() / (2 * rss.brake_most)).clamp(min=0.0)
     side = torch.where(right, 1.0, -1.0)
     sway = _sway(across[:, :1] * side, rss.response, rss) + _sway(-across[:, 1:] * side, rss.response_others, rss)
-    return Margins(
+    return (
         (dx.abs() - VEHICLE_LENGTH).clamp(min=0.0) - safe_along,
         (dy.abs() - VEHICLE_WIDTH).clamp(min=0.0) - rss.wander - sway.clamp(min=0.0),
     )
@@ -355,67 +278,17 @@ def _sway(towards: Tensor, response: float, rss: RSS) -> Tensor:
 
 
 def rss_longitudinal(moment: Moment, rss: RSS = RSS()) -> Tensor:
-    """Return the longitudinal RSS margin: distance less the safe one, of vehicles whose lateral distance is not safe.
-
-    Critical value: 0.
-
-    Args:
-        moment: Of B scenarios.
-        rss: Parameters.
-
-    Returns:
-        The least margin over the other vehicles [m], shape (B,).
-
-    Example:
-        >>> from rare_envs.measures import Moment
-        >>> moment = Moment.of_two(gap=60.0, speed=20.0, lead_speed=20.0)
-        >>> round(rss_longitudinal(moment).item(), 3)  # 60 - (21.75 + 23.5^2 / 8 - 20^2 / 16)
-        -5.781
-    """
-    of = margins(moment, rss)
-    return least(torch.where(of.across < 0, of.along, MARGIN_MAX), MARGIN_MAX)
+    """Return the least longitudinal RSS margin [m], (B,), of the vehicles whose lateral distance is not safe."""
+    along, across = rss_margins(moment, rss)
+    return least(torch.where(across < 0, along, MARGIN_MAX), MARGIN_MAX)
 
 
 def rss_lateral(moment: Moment, rss: RSS = RSS()) -> Tensor:
-    """Return the lateral RSS margin: distance less the safe one, of vehicles whose longitudinal distance is not safe.
-
-    Critical value: 0.
-
-    Args:
-        moment: Of B scenarios.
-        rss: Parameters.
-
-    Returns:
-        The least margin over the other vehicles [m], shape (B,).
-
-    Example:
-        >>> from rare_envs.measures import Moment
-        >>> moment = Moment.of_two(gap=60.0, speed=20.0, lead_speed=20.0)
-        >>> round(rss_lateral(moment).item(), 3)  # level across, and 0.725 m of safe distance
-        -0.725
-    """
-    of = margins(moment, rss)
-    return least(torch.where(of.along < 0, of.across, MARGIN_MAX), MARGIN_MAX)
+    """Return the least lateral RSS margin [m], (B,), of the vehicles whose longitudinal distance is not safe."""
+    along, across = rss_margins(moment, rss)
+    return least(torch.where(along < 0, across, MARGIN_MAX), MARGIN_MAX)
 
 
 def rss_margin(moment: Moment, rss: RSS = RSS()) -> Tensor:
-    """Return the RSS margin: a situation is dangerous where neither distance to a vehicle is safe.
-
-    The larger of the two margins with each vehicle, the least over vehicles: negative exactly in a dangerous situation.
-
-    Critical value: 0.
-
-    Args:
-        moment: Of B scenarios.
-        rss: Parameters.
-
-    Returns:
-        The margin [m], shape (B,).
-
-    Example:
-        >>> from rare_envs.measures import Moment
-        >>> moment = Moment.of_two(gap=60.0, speed=20.0, lead_speed=20.0)
-        >>> round(rss_margin(moment).item(), 3)  # the larger of both
-        -0.725
-    """
-    return least(torch.maximum(*margins(moment, rss)), MARGIN_MAX)
+    """Return the RSS margin [m], (B,): the larger of both with a vehicle, the least over them; negative: danger."""
+    return least(torch.maximum(*rss_margins(moment, rss)), MARGIN_MAX)

@@ -13,7 +13,7 @@ from rare_envs.measures import EpisodeMeasure, Moment, ttc
 from rare_envs.measures.registry import MEASURES
 from rare_envs.sensors.camera import CameraContext
 from rare_envs.simulation.background import BackgroundState
-from rare_envs.traffic.bodies import Lead, others_overlap
+from rare_envs.traffic.bodies import Lead, overlaps
 from rare_envs.traffic.crash import NONE, Crash, crash_of, crash_of_others
 from rare_envs.traffic.road import Road
 from rare_envs.traffic.state import State
@@ -49,7 +49,7 @@ class EpisodeStatistics(NamedTuple):
         `least_ttc` is the least time to collision [s] (B,) where that is known already.
         """
         least = torch.minimum(self.least_ttc, ttc(moment)) if least_ttc is None else least_ttc
-        touch = others_overlap(moment.state, moment.road) & (self.others.kind == NONE) & ~before
+        touch = overlaps(moment.state, moment.road, "others").any(dim=1) & (self.others.kind == NONE) & ~before
         own = _record_crashes(self.own, now & ~before, crash_of, moment)
         return EpisodeStatistics(least, own, _record_crashes(self.others, touch, crash_of_others, moment))
 

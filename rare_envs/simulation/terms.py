@@ -15,7 +15,7 @@ from torch import Tensor
 
 from rare_envs.distributions.coordinates import FloatArray
 from rare_envs.measures.base import Measure, Moment
-from rare_envs.measures.registry import TermMeasure, TermTracker, find_order
+from rare_envs.measures.registry import TermTracker, find_order
 from rare_envs.simulation.episode import Episode
 from rare_envs.simulation.world import Driver, Measurement, World, drive_tick, noise_columns, split_noise
 from rare_envs.traffic.state import map_tensors
@@ -106,7 +106,7 @@ def find_differentiator(world: World, driver: Driver, black_box: bool, x: FloatA
     return partial(_differentiate, world, driver, through)
 
 
-def _is_differentiable(world: World, driver: Driver, order: TermMeasure, x: FloatArray) -> bool:
+def _is_differentiable(world: World, driver: Driver, order: Measure, x: FloatArray) -> bool:
     """Return whether one tick of a rollout can be differentiated."""
     one = np.ones(1, dtype=np.int64)
     try:
@@ -136,7 +136,7 @@ def _differentiate(
 def differentiate_terms(
     world: World,
     driver: Driver,
-    order: TermMeasure,
+    order: Measure,
     x: FloatArray,
     term: Integers,
     ticks: Integers,
@@ -163,7 +163,7 @@ def differentiate_terms(
 
 
 def _attain(
-    world: World, driver: Driver, order: TermMeasure, x: Tensor, term: Tensor, ticks: Tensor, through_ego: bool
+    world: World, driver: Driver, order: Measure, x: Tensor, term: Tensor, ticks: Tensor, through_ego: bool
 ) -> tuple[Tensor, int]:
     """Return the values of terms (B,) when they are attained, in no order, with their graph; and moments simulated."""
     unread = Measure(lambda moment: moment.lead.gap.detach(), sees=world.measurement.episode_measure.sees)

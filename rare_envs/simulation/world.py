@@ -32,7 +32,7 @@ from rare_envs.simulation.background import (
 )
 from rare_envs.simulation.episode import LEARNED_TICK, Episode, EpisodeStatistics
 from rare_envs.simulation.observation import observation_space
-from rare_envs.traffic.bodies import ego_overlaps, lead_of, others_overlap
+from rare_envs.traffic.bodies import lead_of, overlaps
 from rare_envs.traffic.road import WorldPose
 from rare_envs.traffic.state import State, bicycle
 
@@ -372,9 +372,9 @@ class World:
         rest = zip(*(field.unbind(1) for field in others), strict=True)
         state = State.of_vehicles((moved, *rest), old.theta)
         place = self._place(state)
-        hit = ego_overlaps(state, road, place).any(dim=1) | road.off_road(state.vehicles[0].y)
+        hit = overlaps(state, road, "ego", place).any(dim=1) | road.off_road(state.vehicles[0].y)
         if self.measurement.collisions == "any":
-            hit = hit | others_overlap(state, road)
+            hit = hit | overlaps(state, road, "others").any(dim=1)
         episode = episode._replace(background_state=background_state, overridden=overridden)
         return self.update(episode, state, self._perceive(state, place), hit)
 

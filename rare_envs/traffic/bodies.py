@@ -12,8 +12,8 @@ References:
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import cache, lru_cache
-from typing import NamedTuple
+from functools import lru_cache
+from typing import Any, Literal, NamedTuple
 
 import torch
 from torch import Tensor
@@ -25,33 +25,20 @@ from rare_envs.traffic.state import VEHICLE_LENGTH, VEHICLE_WIDTH, State
 DIAGONAL = (VEHICLE_LENGTH**2 + VEHICLE_WIDTH**2) ** 0.5
 """Bodies whose centres are further apart than this [m] do not touch."""
 _SIZE = (VEHICLE_LENGTH, VEHICLE_WIDTH)
-_LENGTHS = (VEHICLE_LENGTH / 2, VEHICLE_WIDTH / 2)
 
 
 class Axes(NamedTuple):
-    """The other body as seen from the first along four axes, the last axis of each tensor.
-
-    They are: along and across the first body, along and across the other.
-    """
+    """Two bodies along four axes, (..., 4): along and across the first body, along and across the other."""
 
     offset: Tensor
-    """Centre of the other less centre of the first [m], shape (..., 4)."""
+    """Centre of the other less centre of the first [m]."""
     reach: Tensor
-    """Offsets smaller than this overlap along the axis [m], shape (..., 4)."""
+    """Offsets smaller than this overlap along the axis [m]."""
 
     @property
     def gap(self) -> Tensor:
-        """Distance between the bodies along each axis [m], negative where they overlap, shape (..., 4)."""
+        """Distance along each axis [m], negative where the bodies overlap; the largest, if negative, is the depth."""
         return self.offset.abs() - self.reach
-
-
-class Crossing(NamedTuple):
-    """Times at which two bodies overlap along each axis, shape (..., 4), if velocities and headings stay."""
-
-    enter: Tensor
-    """From this time [s] on, ..."""
-    leave: Tensor
-    """... until this one."""
 
 
 def boxes_overlap(
@@ -64,7 +51,7 @@ def boxes_overlap(
 ) -> Tensor:
     """Return whether two vehicles' bodies overlap, by the separating axis theorem.
 
-    It is true where `separation` is negative, to rounding.
+    It is true where all of `Axes.gap` are negative, to rounding.
 
     Args:
         dx: Centre of the other less centre of the first [m], any shape; the other tensors have the same.
@@ -82,17 +69,21 @@ def boxes_overlap(
         >>> boxes_overlap(dx, dy, straight, straight).tolist()
         [True, False]
     """
-    cos, sin = torch.cos(heading), torch.sin(heading)
     turn = other_heading - heading
-    along, across = dx * cos + dy * sin, dy * cos - dx * sin
-    cos, sin = torch.cos(turn), torch.sin(turn)
-    other_along, other_across = along * cos + across * sin, across * cos - along * sin
-    cos, sin = cos.abs(), sin.abs()
+    along, across = turn_by(heading, dx, dy)
+    other_along, other_across = turn_by(turn, along, across)
+    cos, sin = torch.cos(turn).abs(), torch.sin(turn).abs()
     half, other_half = _halves(size, dx), _halves(other_size, dx)
     reach = _reach(half, other_half, cos, sin)
     other_reach = reach if other_size is size else _reach(other_half, half, cos, sin)
     overlap = (along.abs() < reach[0]) & (across.abs() < reach[1])
     return overlap & (other_along.abs() < other_reach[0]) & (other_across.abs() < other_reach[1])
+
+
+def turn_by(heading: Tensor, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
+    """Return vectors (x, y) along and across a heading [rad], any shape."""
+    cos, sin = torch.cos(heading), torch.sin(heading)
+    return x * cos + y * sin, y * cos - x * sin
 
 
 def _halves(size: tuple[Tensor | float, Tensor | float], like: Tensor) -> list[Tensor]:
@@ -108,25 +99,15 @@ def _reach(half: Sequence[Tensor], other: Sequence[Tensor], cos: Tensor, sin: Te
 
 def project_on_axes(x: Tensor, y: Tensor, heading: Tensor, other_heading: Tensor) -> Tensor:
     """Return vectors (x, y) along the axes of two bodies by their headings [rad], any shape: (...) -> (..., 4)."""
-    cos, sin = torch.cos(heading), torch.sin(heading)
-    other_cos, other_sin = torch.cos(other_heading), torch.sin(other_heading)
-    return torch.stack(
-        (x * cos + y * sin, y * cos - x * sin, x * other_cos + y * other_sin, y * other_cos - x * other_sin), -1
-    )
+    return torch.stack((*turn_by(heading, x, y), *turn_by(other_heading, x, y)), -1)
 
 
 def axes_of(dx: Tensor, dy: Tensor, heading: Tensor, other_heading: Tensor) -> Axes:
     """Return two bodies along their four axes, from the way (dx, dy) [m] to the other's centre and headings [rad]."""
     turn = other_heading - heading
-    cos, sin = torch.cos(turn).abs(), torch.sin(turn).abs()
     half = _halves(_SIZE, dx)
-    along, across = _reach(half, half, cos, sin)
-    return Axes(project_on_axes(dx, dy, heading, other_heading), torch.stack((along, across, along, across), -1))
-
-
-def separation(axes: Axes) -> Tensor:
-    """Return the largest gap along an axis [m], (...): the negative depth of an overlap, else at most the distance."""
-    return axes.gap.amax(-1)
+    reach = _reach(half, half, torch.cos(turn).abs(), torch.sin(turn).abs())
+    return Axes(project_on_axes(dx, dy, heading, other_heading), torch.stack(reach + reach, -1))
 
 
 def box_distance(axes: Axes, turn: Tensor) -> Tensor:
@@ -137,13 +118,13 @@ def box_distance(axes: Axes, turn: Tensor) -> Tensor:
     along, across, other_along, other_across = axes.offset.unbind(-1)
     corners = _corner_distance(along, across, turn)
     own = _corner_distance(-other_along, -other_across, -turn)
-    depth = separation(axes)
+    depth = axes.gap.amax(-1)
     return torch.where(depth < 0, depth, torch.minimum(corners, own))
 
 
 def _corner_distance(along: Tensor, across: Tensor, turn: Tensor) -> Tensor:
     """Return the least distance [m] of a corner of a turned box at (along, across) from an unturned one at 0."""
-    half_length, half_width = _LENGTHS
+    half_length, half_width = _SIZE[0] / 2, _SIZE[1] / 2
     cos, sin = torch.cos(turn)[..., None], torch.sin(turn)[..., None]
     u = cos.new_tensor([half_length, half_length, -half_length, -half_length])
     v = cos.new_tensor([half_width, -half_width, half_width, -half_width])
@@ -155,13 +136,13 @@ def _corner_distance(along: Tensor, across: Tensor, turn: Tensor) -> Tensor:
     return torch.where(apart, least, 1.0).sqrt() * apart  # the root has no slope at 0
 
 
-def crossing(axes: Axes, rate: Tensor) -> Crossing:
-    """Return when bodies overlap along each axis, (..., 4), at rates [m/s] of the offsets (..., 4)."""
+def crossing(axes: Axes, rate: Tensor) -> tuple[Tensor, Tensor]:
+    """Return from when to when [s] bodies overlap along each axis, (..., 4), at rates [m/s] of the offsets (..., 4)."""
     still = rate == 0
     speed = torch.where(still, 1.0, rate)
     middle, half = -axes.offset / speed, axes.reach / speed.abs()
     always = torch.where(axes.gap < 0, torch.inf, -torch.inf)
-    return Crossing(torch.where(still, -always, middle - half), torch.where(still, always, middle + half))
+    return torch.where(still, -always, middle - half), torch.where(still, always, middle + half)
 
 
 def time_to_contact(axes: Axes, rate: Tensor) -> Tensor:
@@ -169,20 +150,9 @@ def time_to_contact(axes: Axes, rate: Tensor) -> Tensor:
 
     They overlap while they do along every axis: from the last entry to the first exit. Rates [m/s] are (..., 4).
     """
-    times = crossing(axes, rate)
-    enter, leave = times.enter.amax(-1), times.leave.amin(-1)
+    enters, leaves = crossing(axes, rate)
+    enter, leave = enters.amax(-1), leaves.amin(-1)
     return torch.where((enter < leave) & (leave > 0), enter.clamp(min=0.0), torch.inf)
-
-
-class Encounter(NamedTuple):
-    """P pairs of vehicles in B scenarios; shapes (B, P), of axes (B, P, 4)."""
-
-    axes: Axes
-    """Of the first and the other."""
-    rate: Tensor
-    """Velocity of the other less that of the first along the axes [m/s]."""
-    turn: Tensor
-    """Heading of the other less that of the first [rad]."""
 
 
 @lru_cache(maxsize=32)
@@ -192,9 +162,17 @@ def pairs(vehicles: int) -> tuple[tuple[int, ...], tuple[int, ...]]:
     return tuple(i for i, _ in both), tuple(j for _, j in both)
 
 
-def velocities(state: State, heading: Tensor) -> tuple[Tensor, Tensor]:
-    """Return velocities along the axes that headings (B, N) are measured from [m/s], shape (B, N) each."""
-    return state.speed * torch.cos(heading), state.speed * torch.sin(heading)
+Which = Literal["ego", "others", "all"]
+"""Pairs of vehicles: of the ego with each other (P = N - 1), those without the ego, or all in the order of `pairs`."""
+
+
+def select_pairs(state: State, which: Which) -> tuple[Any, Any]:
+    """Return the indices of the first and of the second vehicles of pairs; the ego's are slices, to broadcast."""
+    if which == "ego":
+        return slice(0, 1), slice(1, None)
+    n = state.x.shape[1]
+    first, second = (indices(index[n - 1 if which == "others" else 0 :], state.x) for index in pairs(n))
+    return first, second
 
 
 def least(values: Tensor, nobody: float) -> Tensor:
@@ -202,62 +180,53 @@ def least(values: Tensor, nobody: float) -> Tensor:
     return torch.nn.functional.pad(values, (0, 1), value=nobody).amin(1)
 
 
-def encounter(state: State, road: Road) -> Encounter:
-    """Return the ego with each of the N - 1 other vehicles.
+class Encounter(NamedTuple):
+    """P pairs of vehicles in B scenarios, in the flat world; shapes (B, P)."""
+
+    dx: Tensor
+    """Centre of the other less centre of the first [m]."""
+    dy: Tensor
+    heading: Tensor
+    """Of the first [rad]."""
+    other_heading: Tensor
+    dvx: Tensor
+    """Velocity of the other less that of the first [m/s]."""
+    dvy: Tensor
+
+    @property
+    def axes(self) -> Axes:
+        """The bodies along their axes, (B, P, 4)."""
+        return axes_of(self.dx, self.dy, self.heading, self.other_heading)
+
+    @property
+    def rate(self) -> Tensor:
+        """Change of the offsets along the axes [m/s], (B, P, 4)."""
+        return project_on_axes(self.dvx, self.dvy, self.heading, self.other_heading)
+
+
+def encounter(
+    state: State, road: Road, which: Which = "ego", before: State | None = None, dt: float = 0.1
+) -> Encounter:
+    """Return pairs of vehicles, with velocities by speeds and headings or over the tick since `before`.
 
     They are compared in the world: where the road turns, ways along it are not distances.
     """
-    return _compare(state, road, slice(0, 1), slice(1, None))
-
-
-def encounters_of_all(state: State, road: Road) -> Encounter:
-    """Return every pair of vehicles, P = N (N - 1) / 2, in the order of `pairs`."""
-    first, second = (indices(index, state.x) for index in pairs(state.x.shape[1]))
-    return _compare(state, road, first, second)
-
-
-def _compare(state: State, road: Road, first: Tensor | slice, second: Tensor | slice) -> Encounter:
-    """Return vehicles with others, by their indices; one may be compared with several."""
     x, y, heading = road.to_world(state.x, state.y, state.heading)
-    along, across = velocities(state, heading)
+    if before is None:
+        vx, vy = state.speed * torch.cos(heading), state.speed * torch.sin(heading)
+    else:
+        old_x, old_y, _ = road.to_world(before.x, before.y, before.heading)
+        vx, vy = (x - old_x) / dt, (y - old_y) / dt
+    first, second = select_pairs(state, which)
     other = heading[:, second]
-    one = heading[:, first].expand_as(other)
-    axes = axes_of(x[:, second] - x[:, first], y[:, second] - y[:, first], one, other)
-    rate = project_on_axes(along[:, second] - along[:, first], across[:, second] - across[:, first], one, other)
-    return Encounter(axes, rate, other - one)
+    dx, dy, dvx, dvy = (each[:, second] - each[:, first] for each in (x, y, vx, vy))
+    return Encounter(dx, dy, heading[:, first].expand_as(other), other, dvx, dvy)
 
 
-def ego_overlaps(state: State, road: Road, pose: WorldPose | None = None) -> Tensor:
-    """Return which vehicles' bodies overlap the ego's, boolean, (B, N - 1); `pose` is where they are, if known."""
-    return _overlap_of(_in_world(state, road, pose), slice(0, 1), slice(1, None))
-
-
-def others_overlap(state: State, road: Road, pose: WorldPose | None = None) -> Tensor:
-    """Return whether two vehicles other than the ego overlap, boolean, shape (B,); arguments as of `ego_overlaps`."""
-    n = state.x.shape[1] - 1
-    first, second = (indices(index[n:], state.x) for index in pairs(n + 1))
-    overlapping: Tensor = _overlap_of(_in_world(state, road, pose), first, second).any(1)
-    return overlapping
-
-
-def pairwise_overlaps(state: State, road: Road, pose: WorldPose | None = None) -> Tensor:
-    """Return which bodies overlap which, boolean, (B, N, N), symmetric, nobody with itself; row 0 is `ego_overlaps`."""
-    batch, n = state.x.shape
-    first, second = (indices(index, state.x) for index in pairs(n))
-    overlapping = _overlap_of(_in_world(state, road, pose), first, second)
-    both = torch.zeros(batch, n, n, dtype=torch.bool, device=state.x.device)
-    both[:, first, second] = overlapping
-    both[:, second, first] = overlapping
-    return both
-
-
-def _in_world(state: State, road: Road, pose: WorldPose | None) -> tuple[Tensor, Tensor, Tensor]:
-    return road.to_world(state.x, state.y, state.heading) if pose is None else pose[:3]
-
-
-def _overlap_of(place: tuple[Tensor, Tensor, Tensor], first: Tensor | slice, second: Tensor | slice) -> Tensor:
-    """Return which of P pairs of vehicles overlap, boolean, shape (B, P); one may be compared with several."""
-    x, y, heading = place
+def overlaps(state: State, road: Road, which: Which = "ego", pose: WorldPose | None = None) -> Tensor:
+    """Return which pairs of vehicles overlap, boolean, (B, P); `pose` is where they are in the world, if known."""
+    x, y, heading = road.to_world(state.x, state.y, state.heading) if pose is None else pose[:3]
+    first, second = select_pairs(state, which)
     dx, (diagonal,) = x[:, second] - x[:, first], scalars((DIAGONAL,), x)
     near: Tensor = dx.abs() < diagonal
     if not may_hold(near):  # of a few rows mostly
@@ -363,7 +332,7 @@ class LaneTraffic(NamedTuple):
     def of(cls, state: State, road: Road) -> LaneTraffic:
         """Return the traffic of a world, whose vehicles are all of one size."""
         long, wide = constant((VEHICLE_LENGTH, VEHICLE_WIDTH), state.x).unbind()
-        edges = _edges(road, state.y.dtype, state.y.device).expand(len(state.x), -1)
+        edges = constant(road.edges, state.y).expand(len(state.x), -1)
         sizes = long.expand_as(state.x), wide.expand_as(state.x)
         return cls(state.x, state.y, state.heading, state.speed, *sizes, edges)
 
@@ -416,9 +385,3 @@ def nearest(distance: Tensor, among: Tensor) -> Tensor:
     """Return the index of the least distance among some vehicles, -1 for none: (..., V) -> (...)."""
     least, index = torch.where(among, distance, torch.inf).min(dim=-1)
     return torch.where(least < torch.inf, index, -1)
-
-
-@cache  # never forgotten: recorded rollouts read it where it is
-def _edges(road: Road, dtype: torch.dtype, device: torch.device) -> Tensor:
-    with torch.inference_mode(False):  # a tensor made under it could not be used for gradients later
-        return torch.tensor([road.edges], dtype=dtype, device=device)

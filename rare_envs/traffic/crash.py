@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from rare_envs.devices import indices
-from rare_envs.traffic.bodies import axes_of, boxes_overlap, crossing, pairs, project_on_axes, velocities
+from rare_envs.traffic.bodies import Which, boxes_overlap, crossing, encounter, pairs
 from rare_envs.traffic.road import Road
 from rare_envs.traffic.state import State
 
@@ -108,35 +108,31 @@ def crash_of(state: State, road: Road, before: State | None = None, dt: float = 
     With the first vehicle that it touched, or with the edge of the road where it overlaps none and is off the road. The
     ways of the tick are known from `before`, the traffic one tick earlier; None goes by speeds and headings.
     """
-    crash = _pair_crash(state, road, before, dt, slice(0, state.x.shape[1] - 1))
+    crash = _pair_crash(state, road, before, dt, "ego")
     off = (crash.kind == NONE) & road.off_road(state.y[:, 0])
     return crash.replace_where(off, _edge_crash(state, before, dt))
 
 
 def crash_of_others(state: State, road: Road, before: State | None = None, dt: float = 0.1) -> Crash:
     """Return the crash of vehicles other than the ego, of kind "others"; arguments as of `crash_of`."""
-    crash = _pair_crash(state, road, before, dt, slice(state.x.shape[1] - 1, None))
+    crash = _pair_crash(state, road, before, dt, "others")
     return crash._replace(kind=torch.where(crash.kind == NONE, NONE, OTHERS))
 
 
-def _pair_crash(state: State, road: Road, before: State | None, dt: float, which: slice) -> Crash:
+def _pair_crash(state: State, road: Road, before: State | None, dt: float, which: Which) -> Crash:
     """Return the first contact among some pairs of vehicles."""
-    first, second = (indices(index[which], state.x) for index in pairs(state.x.shape[1]))
-    nothing = Crash.nothing(state.x[:, 0])
-    if not len(first):
+    n, nothing = state.x.shape[1], Crash.nothing(state.x[:, 0])
+    of_pairs = slice(0, n - 1) if which == "ego" else slice(n - 1, None)
+    numbers = [indices(index[of_pairs], state.x) for index in pairs(n)]
+    if not len(numbers[0]):
         return nothing
-    x, y, heading = road.to_world(state.x, state.y, state.heading)
-    along, across = _velocities(state, road, heading, before, dt)
-    one, other = heading[:, first], heading[:, second]
-    dx, dy = x[:, second] - x[:, first], y[:, second] - y[:, first]
-    axes = axes_of(dx, dy, one, other)
-    dvx, dvy = along[:, second] - along[:, first], across[:, second] - across[:, first]
-    rate = project_on_axes(dvx, dvy, one, other)
-    enter = crossing(axes, rate).enter
+    met = encounter(state, road, which, before, dt)
+    axes, rate = met.axes, met.rate
+    enter, _ = crossing(axes, rate)
     since, axis = enter.max(-1)
     resting = torch.isinf(since)  # nothing moves: the axis along which they overlap least
     axis = torch.where(resting, axes.gap.argmax(-1), axis)
-    touching = boxes_overlap(dx, dy, one, other)
+    touching = boxes_overlap(*met[:4])
     at = torch.where(touching, torch.where(resting, torch.finfo(since.dtype).min, since), torch.inf)
     pair = at.argmin(1, keepdim=True)
 
@@ -148,32 +144,22 @@ def _pair_crash(state: State, road: Road, before: State | None, dt: float, which
 
     towards = torch.sign(on_axis(axes.offset))  # the normal points from the first to the second
     closing = (-on_axis(rate) * towards).clamp(min=0.0)
-    index_one, index_two = (each.expand_as(at) for each in (first, second))
-    couple = torch.stack((of(index_one), of(index_two)), -1)
-    kind = _kind(of(axis), of(other - one), of(axes.offset[..., 0]))
+    couple = torch.stack([of(each.expand_as(at)) for each in numbers], -1)
+    kind = _kind(of(axis), of(met.other_heading - met.heading), of(axes.offset[..., 0]))
     own, its = (_approach(state, before, dt, kind == SIDE, each) for each in (couple, couple.flip(-1)))
     vehicles = torch.where((own >= its)[:, None], couple, couple.flip(-1))
     change = ((1.0 + RESTITUTION) / 2.0 * closing)[:, None].expand(-1, 2)
     lengthwise = (kind != SIDE)[:, None]
     risk = torch.stack((injury_risk(change[:, 0], "frontal"), injury_risk(change[:, 1], "rear")), -1)
     risk = torch.where(lengthwise, risk, injury_risk(change))
-    speed = of((dvx.square() + dvy.square()).sqrt())
+    speed = of((met.dvx.square() + met.dvy.square()).sqrt())
     crash = Crash(kind, vehicles, speed, closing, change, risk)
     return nothing.replace_where(touching.any(1), crash)
 
 
-def _velocities(state: State, road: Road, heading: Tensor, before: State | None, dt: float) -> tuple[Tensor, Tensor]:
-    """Return velocities in the world over the last tick [m/s], shape (B, N) each."""
-    if before is None:
-        return velocities(state, heading)
-    x, y, _ = road.to_world(state.x, state.y, state.heading)
-    old_x, old_y, _ = road.to_world(before.x, before.y, before.heading)
-    return (x - old_x) / dt, (y - old_y) / dt
-
-
 def _approach(state: State, before: State | None, dt: float, side: Tensor, couple: Tensor) -> Tensor:
     """Return the speed of the first of two towards the second, across the road or along it [m/s], shape (B,)."""
-    along, across = velocities(state, state.heading)
+    along, across = state.speed * torch.cos(state.heading), state.speed * torch.sin(state.heading)
     if before is not None:
         along, across = (state.x - before.x) / dt, (state.y - before.y) / dt
     place, speed = torch.where(side[:, None], state.y, state.x), torch.where(side[:, None], across, along)

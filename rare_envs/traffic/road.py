@@ -17,7 +17,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from rare_envs.devices import can_look, scalars
+from rare_envs.devices import can_look, constant, scalars
 
 MAX_CURVATURE = 0.005
 """Largest curvature [1/m], a radius of 200 m: below it the series in `ReferenceLine` are good to 1e-4 m a metre."""
@@ -29,17 +29,23 @@ _NEWTON_STEPS = 4
 """They converge quadratically: within a fifth of the least radius the fourth is below rounding."""
 
 
-class LinePoint(NamedTuple):
-    """Points of a reference line, all of one shape."""
+class WorldPose(NamedTuple):
+    """Places in the flat world, of vehicles or of a reference line; all of one shape.
+
+    Example:
+        >>> zero = torch.zeros(1)
+        >>> i80().place(zero + 300.0, zero, zero).heading.sign().tolist()  # the road has turned to the left
+        [-1.0]
+    """
 
     x: Tensor
-    """Along the tangent at the start of the curve [m]."""
+    """Along the tangent at the start of the road [m]."""
     y: Tensor
     """To the right of it [m]."""
     heading: Tensor
     """Relative to it [rad], positive to the right."""
     curvature: Tensor
-    """Change of the heading per metre [1/m], positive where the curve turns to the right."""
+    """Of the road there [1/m], positive where it turns to the right."""
 
 
 @dataclass(frozen=True)
@@ -77,7 +83,7 @@ class ReferenceLine:
         if turn > MAX_TURN:
             raise ValueError(f"Expected a curve that turns by at most {MAX_TURN} rad from its start, got {turn:.3g}.")
 
-    def at(self, s: Tensor) -> LinePoint:
+    def at(self, s: Tensor) -> WorldPose:
         """Return the points of the line.
 
         Args:
@@ -87,7 +93,7 @@ class ReferenceLine:
             The points, of the same shape, differentiable in s.
         """
         (x0, x1, x2, x3, y0, y1, y2, y3, heading, curvature, slope), ds = self._cell(s)
-        return LinePoint(
+        return WorldPose(
             torch.addcmul(x0, ds, torch.addcmul(x1, ds, torch.addcmul(x2, ds, x3))),
             torch.addcmul(y0, ds, torch.addcmul(y1, ds, torch.addcmul(y2, ds, y3))),
             torch.addcmul(heading, ds, torch.addcmul(curvature, ds, slope, value=0.5)),
@@ -98,15 +104,6 @@ class ReferenceLine:
         """Return the curvature alone [1/m]."""
         (*_, curvature, slope), ds = self._cell(s)
         return torch.addcmul(curvature, ds, slope)
-
-    def tabulate(self, dtype: torch.dtype, device: torch.device) -> tuple[Tensor, float]:
-        """Return coefficients of the cells, the straights before and after the curve included, (cells, 11).
-
-        A point is x0 + x1 s + x2 s^2 + x3 s^3 along the tangent at the start and likewise across it (four columns
-        each), its heading h + k s + c s^2 / 2 and its curvature k + c s (the last three columns), with s the way since
-        the start of the cell; and the length of a cell [m].
-        """
-        return _table(self, dtype, device)
 
     def nearest(self, x: Tensor, y: Tensor) -> Tensor:
         """Return the way s along the line of the point nearest to (x, y), by Newton's method.
@@ -141,33 +138,15 @@ class ReferenceLine:
         return rows.unbind(-1), s - number * step
 
 
-class LineCell(NamedTuple):
-    """A cell of a reference line.
+def list_cells(line: ReferenceLine) -> list[tuple[float, ...]]:
+    """Return the cells of a line between its first and its last knot, in order, as numbers.
 
-    From its start it goes s + `cubic_u` s^3 along its heading, and `square_w` s^2 + `cubic_w` s^3 to the right of it.
+    They are length [m], place x, y [m] and heading [rad] of the start, and a, b and c: from there the line goes
+    s + a s^3 along its heading, and b s^2 + c s^3 to the right of it.
     """
-
-    length: float
-    """[m]."""
-    x: float
-    """Start, along the tangent at the start of the curve [m]."""
-    y: float
-    """Start, to the right of it [m]."""
-    heading: float
-    """At the start, relative to it [rad], positive to the right."""
-    cubic_u: float
-    square_w: float
-    cubic_w: float
-
-
-def list_cells(curve: ReferenceLine) -> list[LineCell]:
-    """Return the cells of a line between its first and its last knot, in order."""
-    table, step = _table(curve, torch.float64, torch.device("cpu"))
+    table, step = _table(line, torch.float64, torch.device("cpu"))
     rows = table[1:-1].tolist()  # without the straights before and after the curve
-    return [
-        LineCell(step, x, y, h, cubic_u=-(k**2) / 6, square_w=k / 2, cubic_w=c / 6)
-        for x, _, _, _, y, _, _, _, h, k, c in rows
-    ]
+    return [(step, x, y, h, -(k**2) / 6, k / 2, c / 6) for x, _, _, _, y, _, _, _, h, k, c in rows]
 
 
 def _nodes(curve: ReferenceLine) -> tuple[float, NDArray[np.float64], NDArray[np.float64]]:
@@ -203,25 +182,6 @@ def _table(curve: ReferenceLine, dtype: torch.dtype, device: torch.device) -> tu
         return torch.from_numpy(table).to(device=device, dtype=dtype), step
 
 
-class WorldPose(NamedTuple):
-    """Vehicles in the flat world; all of one shape.
-
-    Example:
-        >>> zero = torch.zeros(1)
-        >>> i80().place(zero + 300.0, zero, zero).heading.sign().tolist()  # the road has turned to the left
-        [-1.0]
-    """
-
-    x: Tensor
-    """[m]."""
-    y: Tensor
-    """[m]."""
-    heading: Tensor
-    """Relative to the X axis [rad]."""
-    curvature: Tensor
-    """Of the road where they are [1/m]."""
-
-
 @dataclass(frozen=True)
 class Road:
     """Lanes beside each other along a line. Lane 0 is the leftmost; all tensors may have any shape.
@@ -244,7 +204,7 @@ class Road:
         if len(self.edges) < 2 or not increasing or not all(map(math.isfinite, self.edges)):
             raise ValueError(f"Expected two or more increasing edges in m, got {self.edges!r}.")
 
-    @property
+    @cached_property
     def lanes(self) -> int:
         """Number of lanes."""
         return len(self.edges) - 1
@@ -270,15 +230,14 @@ class Road:
 
     def lane_of(self, y: Tensor) -> Tensor:
         """Return the index of the lane that y is in, int64; beyond the road's edge it is the outermost lane."""
-        inner, _, _ = _lane_table(self, y.dtype, y.device)
+        inner = constant(self.edges, y)[1:-1]
         return (y >= inner.view(-1, *[1] * y.ndim)).sum(0)  # three times as fast as a search
 
     def centre_of(self, y: Tensor) -> Tensor:
         """Return the centre of the lane that y is in, its y [m]."""
         if not self.equal:
-            _, left, right = _lane_table(self, y.dtype, y.device)
-            lane = self.lane_of(y)
-            return (left[lane] + right[lane]) / 2
+            edges, lane = constant(self.edges, y), self.lane_of(y)
+            return (edges[lane] + edges[lane + 1]) / 2
         first = self.centre(0)
         start, width = scalars((first, self.width), y)
         if self.lanes == 1:
@@ -288,9 +247,8 @@ class Road:
 
     def markers(self, y: Tensor) -> tuple[Tensor, Tensor]:
         """Return the distances to the left and right marker of the own lane [m], negative beyond it: off the road."""
-        _, left, right = _lane_table(self, y.dtype, y.device)
-        lane = self.lane_of(y)
-        return y - left[lane], right[lane] - y
+        edges, lane = constant(self.edges, y), self.lane_of(y)
+        return y - edges[lane], edges[lane + 1] - y
 
     def off_road(self, y: Tensor) -> Tensor:
         """Return whether y is beyond an outer edge of the road."""
@@ -318,7 +276,7 @@ class Road:
             return x, y, heading
         return self.place(x, y, heading)[:3]
 
-    def place(self, x: Tensor, y: Tensor, heading: Tensor) -> "WorldPose":
+    def place(self, x: Tensor, y: Tensor, heading: Tensor) -> WorldPose:
         """Return world coordinates as `to_world` does, and with them the curvature of the reference line at x."""
         if self.reference_line is None:
             return WorldPose(x, y, heading, torch.zeros_like(x))
@@ -347,14 +305,6 @@ class Road:
         point = self.reference_line.at(s)
         across = (y - point.y) * torch.cos(point.heading) - (x - point.x) * torch.sin(point.heading)
         return s, across, heading - point.heading
-
-
-@cache  # never forgotten: recorded rollouts read it where it is
-def _lane_table(road: Road, dtype: torch.dtype, device: torch.device) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the lines between lanes, and the left and the right line of each lane."""
-    with torch.inference_mode(False):  # tables made under it could not be used for gradients later
-        edges = torch.tensor(road.edges, dtype=dtype, device=device)
-        return edges[1:-1].contiguous(), edges[:-1].contiguous(), edges[1:].contiguous()
 
 
 def straight(lanes: int, width: float = 4.0) -> Road:

@@ -39,12 +39,10 @@ def _add_curve(xodr: Any, planview: Any, line: ReferenceLine, start: float, end:
     begin = min(start, 0.0)
     if begin < 0.0:
         planview.add_fixed_geometry(xodr.Line(-begin), begin, 0.0, 0.0)
-    for cell in cells:
-        cubic = xodr.ParamPoly3(
-            0.0, 1.0, 0.0, cell.cubic_u, 0.0, 0.0, -cell.square_w, -cell.cubic_w, prange="arcLength", length=cell.length
-        )
-        planview.add_fixed_geometry(cubic, cell.x, -cell.y, -cell.heading)
-    length = cells[0].length * len(cells)
+    for length, x, y, heading, a, b, c in cells:
+        cubic = xodr.ParamPoly3(0.0, 1.0, 0.0, a, 0.0, 0.0, -b, -c, prange="arcLength", length=length)
+        planview.add_fixed_geometry(cubic, x, -y, -heading)
+    length = cells[0][0] * len(cells)
     last = line.at(torch.tensor([length], dtype=torch.float64))
     rest = max(end - length, 1.0)
     planview.add_fixed_geometry(xodr.Line(rest), last.x.item(), -last.y.item(), -last.heading.item())

@@ -12,7 +12,7 @@ from rare_envs.fast.choice import find_scripted_step
 from rare_envs.fast.equations import RoadNumbers
 from rare_envs.simulation.episode import EpisodeStatistics
 from rare_envs.traffic import crash, straight
-from rare_envs.traffic.bodies import ego_overlaps, others_overlap
+from rare_envs.traffic.bodies import overlaps
 from rare_envs.traffic.state import State
 
 
@@ -151,12 +151,12 @@ def copied(crashes: crash.Crash) -> fast_crashes.CrashRows:
 @pytest.mark.parametrize(("turned", "speed"), [(0.0, 30.0), (0.2, 30.0), (1.5, 10.0), (0.1, 0.0)])
 def test_crashes_are_those_of_torch(turned, speed):
     before, after = tick(turned, speed)
-    now = ego_overlaps(after, ROAD).any(1) | ROAD.off_road(after.y[:, 0])
+    now = overlaps(after, ROAD).any(1) | ROAD.off_road(after.y[:, 0])
     rng = np.random.default_rng(1)
     over, known = (torch.from_numpy(rng.random(N) < 0.2) for _ in range(2))
     now = now | over
     old = nothing().replace_where(known, crash.crash_of_others(after, ROAD))
-    rows = (now & ~over, others_overlap(after, ROAD) & (old.kind == crash.NONE) & ~over)
+    rows = (now & ~over, overlaps(after, ROAD, "others").any(1) & (old.kind == crash.NONE) & ~over)
     expected = EpisodeStatistics(
         torch.zeros(N),
         nothing().replace_where(rows[0], crash.crash_of(after, ROAD, before, 0.1)),

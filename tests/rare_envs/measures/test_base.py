@@ -8,31 +8,30 @@ import pytest
 import torch
 from torch import Tensor
 
-from rare_envs.measures import (
-    RSS,
-    EpisodeMeasure,
-    Measure,
-    Moment,
+from rare_envs.measures import MEASURES, EpisodeMeasure, Measure, Moment, find_measure, ttb, ttc
+from rare_envs.measures.base import acceleration_of_lead
+from rare_envs.measures.longitudinal import (
+    DECELERATION_MAX,
+    TTC_MAX,
     btn,
-    clearance,
     drac,
-    margin,
+    evasive_manoeuvre,
     mttc,
     required_deceleration,
-    rss_lateral,
-    rss_longitudinal,
-    rss_margin,
     tet,
     thw,
     tit,
-    ttb,
-    ttc,
+)
+from rare_envs.measures.two_dimensional import (
+    MARGIN_MAX,
+    RSS,
+    clearance,
+    margin,
+    rss_lateral,
+    rss_longitudinal,
+    rss_margin,
     ttc_2d,
 )
-from rare_envs.measures.base import acceleration_of_lead
-from rare_envs.measures.longitudinal import DECELERATION_MAX, TTC_MAX, evasive_manoeuvre
-from rare_envs.measures.registry import MEASURES, find_measure
-from rare_envs.measures.two_dimensional import MARGIN_MAX
 from rare_envs.traffic.bodies import Lead, lead_of
 from rare_envs.traffic.road import i80, straight
 from rare_envs.traffic.state import State

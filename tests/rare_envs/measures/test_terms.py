@@ -5,14 +5,14 @@ import math
 import pytest
 import torch
 
-from rare_envs.measures import MEASURES, Moment
-from rare_envs.measures.registry import PAIR_CLEARANCE, TermMeasure, TermState, TermTracker, find_order
+from rare_envs.measures import MEASURES, Measure, Moment
+from rare_envs.measures.registry import PAIR_CLEARANCE, TermState, TermTracker, find_order
 from tests.rare_envs.measures.moments import moment
 
 EGO = (0.0, 0.0, 0.0, 20.0)
 
 
-def track(order: TermMeasure, moments: list[Moment], collided: list[bool], ticks: int = 10) -> TermState:
+def track(order: Measure, moments: list[Moment], collided: list[bool], ticks: int = 10) -> TermState:
     """Fold moments of one episode; `collided` says it of each moment."""
     tracker = TermTracker(MEASURES["ttc"], order)
     state = tracker.start(moments[0], ticks)

@@ -9,8 +9,8 @@ from scipy import stats
 import agents
 import rare_envs
 import samplers
-from rare_envs.measures import Moment, lidar_ttc
-from rare_envs.measures.longitudinal import TTC_MAX
+from rare_envs.measures import Moment
+from rare_envs.measures.longitudinal import TTC_MAX, lidar_ttc
 from rare_envs.scenarios.highway import START_LANES
 from rare_envs.sensors.lidar import perceive_traffic
 from rare_envs.simulation.world import drive

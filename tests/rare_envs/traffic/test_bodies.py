@@ -12,12 +12,10 @@ from rare_envs.traffic.bodies import (
     axes_of,
     box_distance,
     boxes_overlap,
-    ego_overlaps,
     encounter,
-    others_overlap,
-    pairwise_overlaps,
+    overlaps,
+    pairs,
     project_on_axes,
-    separation,
     time_to_contact,
 )
 from rare_envs.traffic.road import ReferenceLine, Road, i80, straight
@@ -106,7 +104,7 @@ def test_overlap_is_a_negative_separation() -> None:
             for width in (6.0, 6.0, math.pi, math.pi)
         )
         overlapping = boxes_overlap(dx, dy, heading, other)
-        assert torch.equal(overlapping, separation(axes_of(dx, dy, heading, other)) < 0)
+        assert torch.equal(overlapping, axes_of(dx, dy, heading, other).gap.amax(-1) < 0)
         assert 0.1 < overlapping.double().mean() < 0.5
 
 
@@ -115,26 +113,22 @@ def test_contacts_of_all_pairs_are_those_of_each_vehicle_as_ego() -> None:
     fields = [rng.uniform(low, high, (500, 6)) for low, high in ((0, 25), (0, 12), (-0.5, 0.5), (0, 20))]
     state = State(*map(torch.from_numpy, fields), theta=torch.zeros(500, 0))
     road = i80()
-    both = pairwise_overlaps(state, road)
-    assert torch.equal(both, both.mT)
-    assert not both.diagonal(dim1=1, dim2=2).any()
-    assert 0.05 < both.double().mean() < 0.5
-    assert torch.equal(both[:, 0, 1:], ego_overlaps(state, road))
-    assert torch.equal(both[:, 1:, 1:].any(2).any(1), others_overlap(state, road))
-    for vehicle in range(1, 6):
-        others = [j for j in range(6) if j != vehicle]
-        expected = ego_overlaps(state.seen_by(vehicle), road)
-        assert torch.equal(both[:, vehicle][:, others], expected)
+    found, first, second = overlaps(state, road, "all"), *map(np.array, pairs(6))
+    assert 0.05 < found.double().mean() < 0.5
+    assert torch.equal(found[:, first > 0], overlaps(state, road, "others"))
+    for vehicle in range(6):
+        expected = overlaps(state.seen_by(vehicle), road)
+        assert torch.equal(found[:, (first == vehicle) | (second == vehicle)], expected)
 
 
 def test_bodies_overlap_in_the_world_not_along_the_road() -> None:
     """Where 5 m of the road's line are 5 (1 - k y) m at y."""
     road = Road((-30.0, 0.0, 30.0), ReferenceLine(50.0, (0.0, 0.004, 0.004, 0.0)))
     for y, other_x, touch in [(20.0, 5.3, True), (20.0, 5.5, False), (-20.0, 4.7, False), (-20.0, 4.55, True)]:
-        assert ego_overlaps(traffic((75.0, y, 0.0, 0.0), (75.0 + other_x, y, 0.0, 0.0)), road).item() is touch
+        assert overlaps(traffic((75.0, y, 0.0, 0.0), (75.0 + other_x, y, 0.0, 0.0)), road).item() is touch
     state = traffic((75.0, 20.0, 0.0, 0.0), (75.0, 21.9, 0.0, 0.0))
-    assert ego_overlaps(state, road).item() is True
-    assert ego_overlaps(state._replace(y=torch.tensor([[20.0, 22.1]], dtype=F64)), road).item() is False
+    assert overlaps(state, road).item() is True
+    assert overlaps(state._replace(y=torch.tensor([[20.0, 22.1]], dtype=F64)), road).item() is False
 
 
 def test_a_vehicle_that_crosses_in_front_of_the_ego() -> None:
@@ -144,7 +138,7 @@ def test_a_vehicle_that_crosses_in_front_of_the_ego() -> None:
     torch.testing.assert_close(met.axes.offset[0], torch.stack((tensor(20, 3, 3, -20), tensor(-50, 0, -50, 0))))
     torch.testing.assert_close(met.axes.reach[0], torch.stack((tensor(3.5, 3.5, 3.5, 3.5), tensor(5, 2, 5, 2))))
     torch.testing.assert_close(met.rate[0], torch.stack((tensor(-20, 5, 5, 20), tensor(0, 0, 0, 0))))
-    torch.testing.assert_close(met.turn[0], tensor(math.pi / 2, 0.0))
+    torch.testing.assert_close((met.other_heading - met.heading)[0], tensor(math.pi / 2, 0.0))
 
 
 def test_vehicles_on_a_bend_meet_along_the_chord() -> None:
@@ -159,4 +153,4 @@ def test_vehicles_on_a_bend_meet_along_the_chord() -> None:
     rates = [lead_speed * math.cos(angle) - speed, lead_speed * math.sin(angle)]
     rates += [lead_speed - speed * math.cos(angle), speed * math.sin(angle)]
     assert met.rate[0, 0].tolist() == pytest.approx(rates, abs=1e-6)
-    assert met.turn.item() == pytest.approx(angle, abs=1e-12)
+    assert (met.other_heading - met.heading).item() == pytest.approx(angle, abs=1e-12)

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 import rare_envs
-from rare_envs.traffic.bodies import others_overlap
+from rare_envs.traffic.bodies import overlaps
 from rare_envs.traffic.crash import CRASH_KINDS, crash_of, crash_of_others, describe_crash, injury_risk
 from rare_envs.traffic.road import straight
 from tests.rare_envs.traffic.slow_boxes import corners, nearest, overlap
@@ -73,7 +73,7 @@ def test_vehicles_that_cross_meet_front_or_flank(other: Vehicle, kind: str, vehi
 def test_a_crash_of_others_is_without_the_ego() -> None:
     state = traffic((0.0, 0.0, 0.0, 20.0), (4.5, 0.0, 0.0, 10.0), (-4.5, 0.0, 0.0, 30.0))
     assert describe_crash(crash_of_others(state, straight(1))) is None
-    assert others_overlap(state, straight(1)).tolist() == [False]
+    assert overlaps(state, straight(1), "others").tolist() == [[False]]
     assert describe_crash(crash_of(state, straight(1))) is not None
 
 
