@@ -240,7 +240,7 @@ def run_method(
     That, if not before the first batch, is an EstimationInterrupted with what is known.
     """
     with show_bar(arguments.max_sim) if progress is True else nullcontext(progress or None) as listener:
-        if evaluator.workers and listener is not None:
+        if evaluator.pool.workers and listener is not None:
             listener = _follow_chunks(listener, evaluator)
         run = Run(inputs, method, arguments, listener, evaluator.offer, keep_points)
         try:
@@ -310,7 +310,8 @@ def _follow_chunks(listener: Listener, evaluator: Evaluator) -> Listener:
         n_made = progress.n_sim - evaluator.n_restored
         if progress.max_sim is not None and n_made > 0:
             left = (progress.max_sim - progress.n_sim) * (time.monotonic() - started) / n_made
-        listener(replace(progress, workers=evaluator.workers, n_retries=evaluator.n_retries, seconds_left=left))
+        pool = evaluator.pool
+        listener(replace(progress, workers=pool.workers, n_retries=pool.n_retries, seconds_left=left))
 
     def take_progress(progress: Progress) -> None:
         nonlocal latest

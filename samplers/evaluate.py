@@ -8,16 +8,16 @@ and each simulation is counted.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from samplers.executors import Executor, Pool
+from samplers.executors import Executor, Here, Pool
 from samplers.journal import Journal, JournalError, digest_points
-from samplers.method import Answer, GradientRequest, Request, TermsOffer, TermsRequest, whole_simulations
+from samplers.method import Answer, Request, TermsOffer, whole_simulations
 from samplers.problem import (
     EvaluationError,
     FloatArray,
@@ -28,9 +28,8 @@ from samplers.problem import (
     check_whole,
     condition_of,
     names_of_columns,
-    offers_terms,
 )
-from samplers.workers import Chunk, Result, SeededWork, Work, join_results
+from samplers.workers import Result, Work, join_results, widen_table
 
 CHUNK_SIZE = 16
 """Rows of a chunk of workers where the problem has no `chunk_size`."""
@@ -69,12 +68,12 @@ class Evaluator:
     Attributes:
         problem: What is evaluated, with its `dim`, `base`, `given` and `column_names`.
         offer: What it can answer beside f; None for f alone.
+        pool: The workers; this process without an executor.
         faults: Points without an outcome, in the order in which they were asked for.
         lost: Why rows have nothing that no worker survived.
         n_retried: Rows that were simulated again to find those that fail; they are not in `n_sim` of an estimate.
         n_restored: Rows whose results were taken from the journal.
         n_made, n_failed: Simulations of which f is known, also of a request that is not complete; those that failed.
-        workers: Number of workers; 0 without an executor.
         watchers: Each is called with what was simulated, request by request.
         on_chunk: Called with the number of rows of a request that are done, after every chunk.
 
@@ -111,109 +110,78 @@ class Evaluator:
         problem's `chunk_size` with an executor, and are whole requests without. Points that differ by less than the
         precision, in which x is simulated, are the same to the journal.
         """
-        self.problem, self._journal, self._executor, self._seed = problem, journal, executor, seed
+        self.problem, self._journal, self._executor = problem, journal, executor
         self.dim, self.base = int(problem.dim), problem.base
         self.given, self.column_names = condition_of(problem), names_of_columns(problem)
-        self._gamma, self._work = gamma, Work(problem, gamma, on_error, name)
+        self._gamma, self._work = gamma, Work(problem, gamma, on_error, name, None if executor is None else seed)
         self._split = find_chunk_size(problem, size)
         self._size = None if size is None and executor is None else self._split
         self._precision, self._n_chunks, self._checked = precision, 0, False
-        self._n_terms: int | None = None
-        self._pool: Pool | None = None
+        self._widths: set[int] = set()  # of tables of terms
+        self.pool: Here | Pool = Here(self._work)
         self._stack = ExitStack()
         self.offer = _find_offer(problem)
         self.faults, self.lost = list[Fault](), list[str]()
-        self.n_retried = self.n_restored = self.n_made = self.n_failed = self.workers = 0
+        self.n_retried = self.n_restored = self.n_made = self.n_failed = 0
         self.watchers: list[Callable[[Simulated], None]] = []
         self.on_chunk: Callable[[int], None] | None = None
 
     def __enter__(self) -> Evaluator:
         """Get workers, if there is an executor."""
         if self._executor is not None:
-            self._pool = self._stack.enter_context(self._executor.open(SeededWork(self._work, self._seed)))
-            self.workers = self._pool.workers
+            self.pool = self._stack.enter_context(self._executor.open(self._work))
         return self
 
     def __exit__(self, *error: object) -> None:
         """Let the workers go."""
         self._stack.close()
 
-    @property
-    def n_retries(self) -> int:
-        """Chunks that were computed again because a worker was lost."""
-        return 0 if self._pool is None else self._pool.n_retries
-
     def respond(self, requests: Sequence[Request]) -> list[Answer]:
         """Return the answers to some requests, in their order; f may still be NaN."""
         answers: dict[int, Answer] = {}
-        plain = {i: one for i, one in enumerate(requests) if isinstance(one, np.ndarray)}
-        wanted = {i: one.x for i, one in enumerate(requests) if isinstance(one, TermsRequest)}
-        if plain:
-            f = self._compute("f", np.concatenate(list(plain.values()))).table[:, 0]
-            answers.update(zip(plain, _split(f, list(plain.values())), strict=True))
-        if wanted:
-            terms = self.terms(np.concatenate(list(wanted.values())))
-            rows = _split(np.arange(len(terms.f)), list(wanted.values()))
-            answers.update((i, select_rows(terms, part)) for i, part in zip(wanted, rows, strict=True))
+        for kind in ("f", "terms"):
+            mine = [i for i, one in enumerate(requests) if one.kind == kind]
+            if mine:
+                table, notes = self._compute(Request(kind, (np.concatenate([requests[i].x for i in mine]),)))
+                parts = np.split(table, np.cumsum([len(requests[i]) for i in mine])[:-1])
+                for i, part in zip(mine, parts, strict=True):
+                    answers[i] = part[:, 0] if kind == "f" else self._read_terms(part, notes)
         for i, one in enumerate(requests):
-            if isinstance(one, GradientRequest):
-                answers[i] = self.gradient(one.x, one.term, one.ticks)
+            if one.kind == "gradient":
+                table, notes = self._compute(one)
+                answers[i] = TermGradients(table, float(notes["cost"]))
         return [answers[i] for i in range(len(requests))]
 
     def evaluate(self, x: FloatArray) -> FloatArray:
         """Return f of points x (n, d), shape (n,); NaN where there is no outcome."""
-        return self._compute("f", x).table[:, 0]
+        return self._compute(Request("f", (x,))).table[:, 0]
 
-    def terms(self, x: FloatArray) -> Terms:
-        """Return the terms of points x (n, d); NaN where there is no outcome."""
-        table, notes = self._compute("terms", x)
-        n, n_found = len(table), (table.shape[1] - 1) // 2
-        if n_found and self._n_terms not in (None, n_found):
-            raise _other_number_of_terms({n_found, self._n_terms or 0})
-        self._n_terms = n_found or self._n_terms
-        if not n_found:  # no row has an outcome
-            table = np.full((n, 1 + 2 * (self._n_terms or 1)), np.nan)
+    def _read_terms(self, table: FloatArray, notes: dict[str, Any]) -> Terms:
         f, values, ticks = np.split(table, [1, 1 + (table.shape[1] - 1) // 2], axis=1)
         threshold, names = notes.get("threshold", self._gamma), notes.get("names", ())
         return Terms(f[:, 0], values, np.nan_to_num(ticks).astype(np.int64), threshold, tuple(names))
 
-    def gradient(self, x: FloatArray, term: NDArray[np.int64], ticks: NDArray[np.int64]) -> TermGradients:
-        """Return the gradients of one term of each of the points x (n, d); NaN in rows that have none."""
-        table, notes = self._compute("gradient", x, term, ticks)
-        if table.shape[1] != x.shape[1]:  # no row has one
-            table = np.full(x.shape, np.nan)
-        return TermGradients(table, float(notes["cost"]))
-
-    def _compute(self, kind: str, x: FloatArray, *others: NDArray[np.int64]) -> Result:
-        """Return the result of a request for f, terms or gradients at x (n, d), as far as it goes from the journal."""
-        request = Chunk(kind, (np.asarray(x, dtype=np.float64), *others))
+    def _compute(self, request: Request) -> Result:
+        """Return the result of a request, as far as it goes from the journal; NaN where rows have none."""
+        request = Request(request.kind, (np.asarray(request.x, dtype=np.float64), *request.arrays[1:]))
         chunks, results = self._restore(request)
         first, self._n_chunks = self._n_chunks, self._n_chunks + len(request.split(self._size))
-        left = {number: chunk for number, chunk in enumerate(chunks) if number not in results}
+        left = ((first + number, chunk) for number, chunk in enumerate(chunks) if number not in results)
         n_done = sum(len(chunks[number]) for number in results)
-        for number, result in self._map(first, left):
+        for number_in_run, result in self.pool.run(left):
+            number = number_in_run - first
             if self._journal is not None:
-                n_sim = whole_simulations(result.notes["cost"]) if kind == "gradient" else len(chunks[number])
-                self._journal.append(self._digest(chunks[number]), result, n_sim)
+                cost = whole_simulations(result.notes["cost"]) if request.kind == "gradient" else len(chunks[number])
+                self._journal.append(self._digest(chunks[number]), result, cost)
             results[number] = result
             n_done += len(chunks[number])
-            if kind != "gradient":  # whose rows count as what they cost
+            if request.kind != "gradient":  # whose rows count as what they cost
                 self._count(result)
                 if self.on_chunk is not None:
                     self.on_chunk(n_done)
         return self._conclude(request, [results[number] for number in range(len(chunks))])
 
-    def _map(self, first: int, chunks: dict[int, Chunk]) -> Iterable[tuple[int, Result]]:
-        """Return the results of chunks with their numbers in the request, the first of which has a number in the run.
-
-        Generators of random numbers are keyed by the number in the run.
-        """
-        if self._pool is None:
-            return zip(chunks, map(self._work, chunks.values()), strict=True)
-        done = self._pool.run(((first + number, chunk) for number, chunk in chunks.items()), self._work.lose)
-        return ((number - first, result) for number, result in done)
-
-    def _restore(self, request: Chunk) -> tuple[list[Chunk], dict[int, Result]]:
+    def _restore(self, request: Request) -> tuple[list[Request], dict[int, Result]]:
         """Return the chunks of a request, and the results of those that the journal has.
 
         It may have the request whole, or in chunks, where an executor continues what was begun without one or the
@@ -222,7 +190,7 @@ class Evaluator:
         chunks, known = request.split(self._size), dict[int, Result]()
         if self._journal is None or not self._journal.has_others:
             return chunks, known
-        for parts in {len(each): each for each in (chunks, [request], request.split(self._split))}.values():
+        for parts in (chunks, [request], request.split(self._split)):
             found = {number: self._journal.find(self._digest(chunk)) for number, chunk in enumerate(parts)}
             known = {number: result for number, result in found.items() if result is not None}
             if known:
@@ -241,7 +209,7 @@ class Evaluator:
                 self._count(result)
         return chunks, known
 
-    def _digest(self, chunk: Chunk) -> str:
+    def _digest(self, chunk: Request) -> str:
         """Return the name of a chunk in the journal, by its points."""
         x = digest_points(chunk.x.astype(self._precision))
         if chunk.kind == "f":
@@ -253,37 +221,40 @@ class Evaluator:
         self.n_made += len(f)
         self.n_failed += int((np.isnan(f) | (f <= self._gamma)).sum())
 
-    def _conclude(self, request: Chunk, results: list[Result]) -> Result:
+    def _conclude(self, request: Request, results: list[Result]) -> Result:
         """Return the results of a request as one; note its faults and what it took, and tell the watchers."""
-        widths = {result.table.shape[1] for result in results} - {1}
-        if len(widths) > 1:
-            raise _other_number_of_terms({(width - 1) // 2 for width in widths})
-        whole = join_results(results)
-        self.n_retried += int(whole.notes["n_retried"])
-        self.lost += whole.notes.get("lost", [])
+        table, notes = join_results(results)
+        self.n_retried += int(notes["n_retried"])
+        self.lost += notes.get("lost", [])
         if request.kind == "gradient":
-            return whole
-        f, reasons = whole.table[:, 0], whole.notes["reasons"]
+            return Result(widen_table(table, self.dim), notes)
+        f, reasons = table[:, 0], notes["reasons"]
+        if request.kind == "terms":
+            self._widths |= {result.table.shape[1] for result in results} - {1}  # no row has any
+            if len(self._widths) > 1:
+                counts = sorted((width - 1) // 2 for width in self._widths)
+                raise EvaluationError(f"Expected the same number of terms in every batch, got {counts}.")
+            table = widen_table(table, max(self._widths, default=3))
         self.faults += [Fault(x.copy(), why) for x, why in zip(request.x[np.isnan(f)], reasons, strict=True)]
         if self.watchers:
             parts = [(len(each.table), each.notes.get("seconds", np.nan)) for each in results]
             seconds = np.concatenate([np.full(n, total / max(n, 1)) for n, total in parts])
             for watch in self.watchers:
                 watch(Simulated(request.x, f, reasons, seconds))
-        return whole
+        return Result(table, notes)
 
-    def _check_same_f(self, journal: Journal, chunk: Chunk, known: FloatArray) -> None:
+    def _check_same_f(self, journal: Journal, chunk: Request, known: FloatArray) -> None:
         """Raise a JournalError if f has other values now at some points of the first chunk, the same ones twice."""
         if self._checked:
             return
         self._checked = True
         rows = np.argsort(known)[np.unique(np.linspace(0, len(chunk) - 1, N_CHECKED).astype(int))]
-        f, part = known[rows], {0: Chunk("f", (chunk.x[rows],))}
-        ((_, again),) = self._map(0, part)
+        f, part = known[rows], Request("f", (chunk.x[rows],))
+        ((_, again),) = self.pool.run([(0, part)])
         changed = find_changed(again.table[:, 0], f)
         if not changed.any():
             return
-        ((_, third),) = self._map(0, part)
+        ((_, third),) = self.pool.run([(0, part)])
         if np.array_equal(again.table[:, 0], third.table[:, 0], equal_nan=True):
             row = int(np.argmax(changed))
             raise JournalError(
@@ -311,27 +282,12 @@ def find_changed(again: FloatArray, f: FloatArray) -> NDArray[np.bool_]:
     return ~np.isclose(again, f, rtol=0.0, atol=room, equal_nan=True)
 
 
-def select_rows(terms: Terms, rows: Any) -> Terms:
-    """Return the terms of some of the points."""
-    return Terms(terms.f[rows], terms.values[rows], terms.ticks[rows], terms.threshold, terms.names)
-
-
-def _other_number_of_terms(counts: set[int]) -> EvaluationError:
-    return EvaluationError(f"Expected the same number of terms in every batch, got {sorted(counts)}.")
-
-
 def _find_offer(problem: Any) -> TermsOffer | None:
     """Return what a problem can answer beside f."""
-    if not offers_terms(problem):
+    if not callable(getattr(problem, "terms", None)):  # a user's object
         return None
-    known: Any = problem
-    gradient: Any = getattr(problem, "gradient", None)  # a property may have to find out whether there is one
-    cost = float(known.gradient_cost) if callable(gradient) else None
-    if cost is not None:
-        check_number("gradient_cost", cost, 0.0, np.inf)
+    cost = None
+    if callable(getattr(problem, "gradient", None)):  # a property may have to find out whether there is one
+        check_number("gradient_cost", problem.gradient_cost, 0.0, np.inf)
+        cost = float(problem.gradient_cost)
     return TermsOffer(cost, bool(getattr(problem, "terms_with_f", True)))
-
-
-def _split(rows: Any, parts: Sequence[FloatArray]) -> list[Any]:
-    """Return an array of rows split as these parts are long."""
-    return np.split(rows, np.cumsum([len(part) for part in parts])[:-1])

@@ -25,15 +25,15 @@ from dataclasses import dataclass, field
 from hashlib import blake2b
 from typing import Any, Protocol, TypeAlias, runtime_checkable
 
+from samplers.method import Request
 from samplers.problem import check_number, check_whole
 from samplers.workers import (
-    Chunk,
-    Compute,
     ExecutorError,
     Index,
     Limits,
     Reply,
     Result,
+    Work,
     WorkerLost,
     compute_in_worker,
     describe,
@@ -62,19 +62,17 @@ ENVIRONMENT = {
 """Of local processes."""
 
 
-class Pool(Protocol):
-    """Workers for one run: their number, and the chunks and rows that were computed again because one was lost."""
+class Here:
+    """This process as a pool: it computes one chunk after the other."""
 
-    workers: int
-    n_retries: int
+    n_retries = 0
 
-    def run(
-        self, chunks: Iterable[tuple[int, Chunk]], lose: Callable[[Chunk, str], Result]
-    ) -> Iterator[tuple[int, Result]]:
-        """Yield the results of chunks with their numbers, in any order; what the work raises is raised here.
+    def __init__(self, work: Work, workers: int = 0) -> None:
+        self._work, self.workers = work, workers
 
-        `lose` gives the result of a row that no worker survives, and why that was lost, or raises.
-        """
+    def run(self, chunks: Iterable[tuple[int, Request]]) -> Iterator[tuple[int, Result]]:
+        """Yield the results of chunks with their numbers in the run."""
+        return ((number, self._work(chunk, (number,))) for number, chunk in chunks)
 
 
 @runtime_checkable
@@ -87,7 +85,7 @@ class Executor(Protocol):
         True
     """
 
-    def open(self, compute: Compute) -> AbstractContextManager[Pool]:
+    def open(self, work: Work) -> AbstractContextManager[Here | Pool]:
         """Return workers for a run, which are gone at the end of the block; a ValueError if work cannot be sent."""
 
 
@@ -103,17 +101,21 @@ class InProcess:
     """
 
     @contextmanager
-    def open(self, compute: Compute) -> Iterator[Pool]:
+    def open(self, work: Work) -> Iterator[Here]:
         """Yield this process as a pool of one."""
-        yield _ThisProcess(compute)
+        yield Here(work, workers=1)
 
 
-class _Limited:
-    """Settings of workers that are processes: `workers`, `time_limit` and `memory_limit`."""
+@dataclass(frozen=True, kw_only=True)
+class _Processes:
+    """Settings of workers that are processes."""
 
-    workers: int | None
-    time_limit: float | None
-    memory_limit: float | None
+    workers: int | None = None
+    """Number of workers; None for as many as there are cores, or as a pool says that it has."""
+    time_limit: float | None = None
+    """Longest time for a chunk [s], after which its process ends; None waits for ever. Threads cannot be ended."""
+    memory_limit: float | None = None
+    """Bytes that the simulations may take in each process, where the system can limit that (Linux)."""
 
     def __post_init__(self) -> None:
         """Check the values."""
@@ -130,12 +132,13 @@ class _Limited:
 
 
 @dataclass(frozen=True)
-class LocalProcesses(_Limited):
+class LocalProcesses(_Processes):
     """Computes chunks in processes of this machine.
 
     They are fresh interpreters of loky with one thread each (nothing is forked), and need no
     `if __name__ == "__main__":`. One that ends or does not answer is replaced; its chunk is computed again, and a row
-    that three of them do not survive has no outcome, see `on_error` of `estimate`.
+    that three of them do not survive has no outcome, see `on_error` of `estimate`. `time_limit` [s] is for a chunk,
+    `memory_limit` [bytes] for a process.
 
     Raises:
         ValueError: If a number is out of range.
@@ -149,26 +152,23 @@ class LocalProcesses(_Limited):
     """
 
     workers: int | None = None
-    """Number of processes; None for one per core."""
-    time_limit: float | None = None
-    """Longest time for a chunk [s]; None waits for ever."""
-    memory_limit: float | None = None
-    """Bytes that the simulations may take in each process, where the system can limit that (Linux)."""
 
     @contextmanager
-    def open(self, compute: Compute) -> Iterator[Pool]:
+    def open(self, work: Work) -> Iterator[Pool]:
         """Yield the processes; each starts with its first chunk, and all are killed at the end of the block."""
         number = self.workers or os.cpu_count() or 1
-        with closing(_Workers(_LocalProcess, True, pack(compute), self.limits, 1, number, blames=True)) as pool:
+        with closing(Pool(work, self.limits, _LocalProcess, 1, slots=number, blames=True)) as pool:
             yield pool
 
 
 @dataclass(frozen=True)
-class FuturesPool(_Limited):
+class FuturesPool(_Processes):
     """Computes chunks by any object whose `submit(function, *arguments)` returns a future or a job.
 
     If a worker dies, most pools are of no use any more, and nobody knows whose chunk it was. Give a function that makes
     a pool: a broken one is then replaced, and the chunks that were in flight are computed again, one at a time.
+    `workers` is for pools that do not tell their number; `time_limit` [s] is for a chunk, whose process ends itself
+    then (a thread cannot), `memory_limit` [bytes] for a process.
 
     Raises:
         ValueError: If an argument is not as described.
@@ -184,12 +184,6 @@ class FuturesPool(_Limited):
 
     executor: Any
     """The pool, or a function without arguments that makes one, which is then shut down at the end."""
-    workers: int | None = None
-    """Number of workers, where the pool does not tell."""
-    time_limit: float | None = None
-    """Longest time for a chunk [s]. The worker process ends itself then, which pools of threads do not allow."""
-    memory_limit: float | None = None
-    """Bytes that the simulations may take in each worker process, where the system can limit that (Linux)."""
 
     def __post_init__(self) -> None:
         """Check the values."""
@@ -198,21 +192,22 @@ class FuturesPool(_Limited):
         super().__post_init__()
 
     @contextmanager
-    def open(self, compute: Compute) -> Iterator[Pool]:
+    def open(self, work: Work) -> Iterator[Pool]:
         """Yield the pool; one that was made here is shut down at the end of the block."""
-        packed, made = pack(compute), not _has_submit(self.executor)
-        make = self.executor if made else lambda: self.executor
-        with closing(_Workers(make, made, packed, self.limits, self.workers)) as pool:
+        given = _has_submit(self.executor)
+        make = (lambda: self.executor) if given else self.executor
+        with closing(Pool(work, self.limits, make, self.workers, ours=not given)) as pool:
             yield pool
 
 
 @dataclass(frozen=True)
-class RayCluster(_Limited):
+class RayCluster(_Processes):
     """Computes chunks as tasks of Ray (the extra `ray`).
 
     Worker processes keep the problem that they have loaded, so that a large model is loaded once in each. A task whose
     process or machine is lost, or that does not end in time and is cancelled by force, is computed again by the rules
-    of all executors: Ray itself retries nothing.
+    of all executors: Ray itself retries nothing. `workers` are the tasks in flight, by default as many as the cluster
+    has room for; `time_limit` [s] is for a chunk, `memory_limit` [bytes] for a process.
 
     Raises:
         ValueError: If a number is out of range.
@@ -226,30 +221,23 @@ class RayCluster(_Limited):
 
     address: str | None = None
     """Of a running cluster, or "auto"; None to start one on this machine, unless `ray.init` has been called."""
-    workers: int | None = None
-    """Tasks in flight; None for as many as the cluster has cores for."""
-    time_limit: float | None = None
-    """Longest time for a chunk [s], after which its process ends itself, or is ended; None waits for ever."""
-    options: Mapping[str, Any] = field(default_factory=dict)
+    options: Mapping[str, Any] = field(default_factory=dict, kw_only=True)
     """What a task needs, as for `ray.remote`: num_cpus, num_gpus, memory, runtime_env."""
-    memory_limit: float | None = None
-    """Bytes that the simulations may take in each worker process, where the system can limit that (Linux)."""
 
     @contextmanager
-    def open(self, compute: Compute) -> Iterator[Pool]:
+    def open(self, work: Work) -> Iterator[Pool]:
         """Yield the cluster; one that was started here ends with the block. An ExecutorError where there is none."""
         try:
             import ray
         except ImportError as error:
             raise ValueError("The executor ray needs Ray: pip install 'rare-envs[ray]'.") from error
-        packed, started = pack(compute), not ray.is_initialized()
+        started = not ray.is_initialized()
         if started:
             self._start(ray)
-        options = {"num_cpus": 1, "max_retries": 0, **self.options}
-        workers = self.workers or _count_places(ray, options)
-        tasks = _RayTasks(ray, options)
         try:
-            with closing(_Workers(lambda: tasks, False, packed, self.limits, workers, blames=True)) as pool:
+            tasks = _RayTasks(ray, {"num_cpus": 1, "max_retries": 0, **self.options})
+            workers = self.workers or tasks.count_places()
+            with closing(Pool(work, self.limits, lambda: tasks, workers, ours=False, blames=True)) as pool:
                 yield pool
         finally:
             if started:
@@ -257,14 +245,12 @@ class RayCluster(_Limited):
 
     def _start(self, ray: Any) -> None:
         """Connect to the cluster at the address, or start one here."""
-        words: dict[str, Any] = {"include_dashboard": False} if self.address is None else {}
-        if self.address is None and self.workers is not None:
-            words["num_cpus"] = self.workers
+        words: dict[str, Any] = {} if self.address else {"include_dashboard": False, "num_cpus": self.workers}
         try:
             ray.init(address=self.address or "local", log_to_driver=False, logging_level="error", **words)
         except Exception as error:  # a busy machine, a wrong address, another version of Ray: each has its own
             ray.shutdown()
-            what = "Ray does not start" if self.address is None else f"No Ray cluster answers at {self.address!r}"
+            what = f"No Ray cluster answers at {self.address!r}" if self.address else "Ray does not start"
             raise ExecutorError(f"{what} ({' '.join(describe(error).split())}).") from error
 
 
@@ -294,31 +280,15 @@ def find_executor(workers: int | None, executor: Any) -> Executor:
 # Pools
 
 
-class _ThisProcess:
-    """The pool of one that computes chunks here."""
-
-    workers, n_retries = 1, 0
-
-    def __init__(self, compute: Compute) -> None:
-        self._compute = compute
-
-    def run(
-        self, chunks: Iterable[tuple[int, Chunk]], lose: Callable[[Chunk, str], Result]
-    ) -> Iterator[tuple[int, Result]]:
-        """Compute one chunk after the other."""
-        for number, chunk in chunks:
-            yield number, self._compute((number,), chunk)
-
-
 @dataclass(eq=False)
 class _Task:
     """A chunk on its way, or a row of one; its rows have results in `parts` once it is taken apart."""
 
     index: Index
-    chunk: Chunk
+    chunk: Request
     parent: _Task | None = None
     attempts: int = 0
-    parts: list[Result | None] = field(default_factory=list)
+    parts: dict[int, Result] = field(default_factory=dict)
     call: int = 0
     slot: int = 0
     begun: float = 0.0
@@ -326,51 +296,54 @@ class _Task:
 
     def take_apart(self) -> list[_Task]:
         """Return its rows as tasks: an attempt that costs a process is dear, and many at once are not."""
-        rows = self.chunk.split(1)
-        self.parts = [None] * len(rows)
-        return [_Task((*self.index, number), row, self) for number, row in enumerate(rows)]
+        return [_Task((*self.index, number), row, self) for number, row in enumerate(self.chunk.split(1))]
 
     def put(self, result: Result) -> tuple[int, Result] | None:
         """Take a result; return it with the number of the chunk where the whole chunk is done."""
         if self.parent is None:
             return self.index[0], result
-        self.parent.parts[self.index[-1]] = result
-        parts = [part for part in self.parent.parts if part is not None]
-        return self.parent.put(join_results(parts)) if len(parts) == len(self.parent.parts) else None
+        parts = self.parent.parts
+        parts[self.index[-1]] = result
+        if len(parts) < len(self.parent.chunk):
+            return None
+        return self.parent.put(join_results([parts[row] for row in sorted(parts)]))
 
 
-class _Workers:
-    """Objects with `submit`, in slots, and the work to be done; those of ours (`made`) are replaced where broken.
+class Pool:
+    """Objects with `submit`, in slots, and the work to be done; those of ours are replaced where broken.
 
     Where it `blames`, a worker that is lost costs its own chunk alone, and each worker has one chunk in flight, else
     two: all in flight are then lost together, and suspects go alone.
+
+    Attributes:
+        workers: Their number.
+        n_retries: Chunks and rows that were computed again because a worker was lost.
     """
 
     def __init__(
         self,
-        make: Callable[[], Any],
-        made: bool,
-        packed: bytes,
+        work: Work,
         limits: Limits,
-        workers: int | None = None,
+        make: Callable[[], Any],
+        workers: int | None,
+        *,
         slots: int = 1,
+        ours: bool = True,
         blames: bool = False,
     ) -> None:
-        self._make, self._made, self._packed, self._limits, self._blames = make, made, packed, limits, blames
-        self._key = blake2b(packed, digest_size=16).hexdigest()
+        self._lose, self._packed, self._limits = work.lose, pack(work), limits
+        self._make, self._ours, self._blames = make, ours, blames
+        self._key = blake2b(self._packed, digest_size=16).hexdigest()
         self._pools: list[Any] = [make() for _ in range(slots)]
-        self._restarts, self._calls = [0] * slots, itertools.count()
+        self._restarts, self._calls = 0, itertools.count()
         each = workers or _count_workers(self._pools[0])
-        self.workers = slots * each
+        self.workers, self.n_retries = slots * each, 0
         self._idle = deque(list(range(slots)) * (each if blames else 2 * each))
         self._done: queue.SimpleQueue[tuple[int, float]] = queue.SimpleQueue()
         self._proven = self._warned = False  # a chunk has been computed; a silence has been told
-        self.n_retries = 0
 
-    def run(
-        self, chunks: Iterable[tuple[int, Chunk]], lose: Callable[[Chunk, str], Result]
-    ) -> Iterator[tuple[int, Result]]:
-        """Yield the results of chunks, see `Pool`."""
+    def run(self, chunks: Iterable[tuple[int, Request]]) -> Iterator[tuple[int, Result]]:
+        """Yield the results of chunks with their numbers, in any order; what the work raises is raised here."""
         waiting = deque(_Task((number,), chunk) for number, chunk in chunks)
         running: dict[int, _Task] = {}
         try:
@@ -382,7 +355,7 @@ class _Workers:
                     try:
                         done = task.put(self._take(task, ended))
                     except WorkerLost as error:
-                        done = self._again(task, error, waiting, lose)
+                        done = self._again(task, error, waiting)
                     if done is not None:
                         yield done
         finally:
@@ -392,7 +365,7 @@ class _Workers:
 
     def close(self) -> None:
         """End what was made here, whatever it is doing."""
-        for pool in self._pools if self._made else ():
+        for pool in self._pools if self._ours else ():
             with suppress(Exception):  # foreign, and perhaps broken
                 pool.shutdown(wait=False)
 
@@ -425,15 +398,14 @@ class _Workers:
 
     def _replace(self, slot: int, error: Exception) -> None:
         """Put a new pool in the place of a broken one."""
-        if not self._made:
+        if not self._ours:
             raise ExecutorError(
                 f"A worker of {type(self._pools[slot]).__name__} died, and with it the pool ({describe(error)}); give "
                 "a function that makes the pool (executor=lambda: ...), and a new one is made."
             ) from error
-        self._restarts[slot] += 1
-        if self._restarts[slot] > MOST_RESTARTS:
-            words = f"{MOST_RESTARTS} pools broke one after the other: {describe(error)}."
-            raise ExecutorError(words) from error
+        self._restarts += 1
+        if self._restarts > MOST_RESTARTS * len(self._pools):
+            raise ExecutorError(f"{MOST_RESTARTS} pools broke one after the other: {describe(error)}.") from error
         with suppress(Exception):
             self._pools[slot].shutdown(wait=False)
         self._pools[slot] = self._make()
@@ -441,7 +413,7 @@ class _Workers:
     def _give_up(self, task: _Task) -> None:
         """Cancel a job that nobody waits for, where its pool can do that; a process of our own ends with it."""
         with suppress(Exception):  # foreign: some have no `cancel`, some raise where it is too late
-            if not task.job.cancel() and self._made and self._blames:
+            if not task.job.cancel() and self._ours and self._blames:
                 self._pools[task.slot].shutdown(wait=False)
 
     def _wait(self, running: dict[int, _Task]) -> list[tuple[_Task, float | None]]:
@@ -484,15 +456,12 @@ class _Workers:
             raise ExecutorError(words)
         if reply.call != task.call:
             raise ExecutorError("A future of the executor has the result of another call.")
-        if reply.result is None:
-            assert reply.error is not None
-            raise reply.error
+        if isinstance(reply.found, BaseException):
+            raise reply.found
         self._proven = True
-        return reply.result
+        return reply.found
 
-    def _again(
-        self, task: _Task, error: WorkerLost, waiting: deque[_Task], lose: Callable[[Chunk, str], Result]
-    ) -> tuple[int, Result] | None:
+    def _again(self, task: _Task, error: WorkerLost, waiting: deque[_Task]) -> tuple[int, Result] | None:
         """Put what is to be computed in the place of a task whose worker was lost among those that wait."""
         task.attempts += 1
         if task.attempts < ATTEMPTS:
@@ -503,7 +472,7 @@ class _Workers:
             self.n_retries += len(rows)
             waiting.extendleft(reversed(rows))
         elif self._proven:
-            return task.put(lose(task.chunk, str(error)))
+            return task.put(self._lose(task.chunk, str(error)))
         elif task.attempts < 2 * ATTEMPTS and waiting:  # after the others, which show whether workers work at all
             self.n_retries += 1
             waiting.append(task)
@@ -549,7 +518,7 @@ class _RayTasks:
     """Ray as an object with `submit`."""
 
     def __init__(self, ray: Any, options: Mapping[str, Any]) -> None:
-        self._ray, self._task = ray, ray.remote(**options)(compute_in_worker)
+        self._ray, self._options, self._task = ray, options, ray.remote(**options)(compute_in_worker)
         self._sent: tuple[str, Any] = ("", None)
 
     def submit(self, function: Any, key: str, packed: bytes, *arguments: Any) -> Any:
@@ -561,12 +530,11 @@ class _RayTasks:
         job.cancel = lambda: self._ray.cancel(reference, force=True) or True
         return job
 
-
-def _count_places(ray: Any, options: Mapping[str, Any]) -> int:
-    """Return for how many tasks the cluster has cores and GPUs."""
-    total = ray.cluster_resources()
-    needs = {"CPU": options["num_cpus"], "GPU": options.get("num_gpus", 0)}
-    return max(1, min(int(total.get(name, 0.0) / need) for name, need in needs.items() if need))
+    def count_places(self) -> int:
+        """Return for how many tasks the cluster has cores and GPUs."""
+        total = self._ray.cluster_resources()
+        needs = {"CPU": self._options["num_cpus"], "GPU": self._options.get("num_gpus", 0)}
+        return max(1, min(int(total.get(name, 0.0) / need) for name, need in needs.items() if need))
 
 
 def _has_submit(executor: Any) -> bool:

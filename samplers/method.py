@@ -5,7 +5,7 @@ import sys
 from collections import Counter
 from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass, field, replace
-from typing import ClassVar, NamedTuple, Protocol, cast, runtime_checkable
+from typing import Any, ClassVar, NamedTuple, Protocol, cast, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +19,7 @@ from samplers.sample import (
     Level,
     Sample,
     SimulatedPoints,
-    SimulationIndex,
+    SimulationRows,
     Status,
     binomial_cov,
     clopper_pearson,
@@ -56,8 +56,15 @@ class Goal:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Finding:
-    """What one run of a method and the whole estimate have in common."""
+class Outcome:
+    """Result of one run of a method, or of several runs as one.
+
+    Example:
+        >>> import samplers
+        >>> outcome = samplers.Outcome.of_counts(10, 1000, confidence=0.95, trace=())
+        >>> outcome.p, [round(end, 4) for end in outcome.interval], round(outcome.cov, 3)
+        (0.01, [0.0048, 0.0183], 0.315)
+    """
 
     p: float
     """Estimated probability P[f(X) <= gamma]."""
@@ -78,24 +85,11 @@ class Finding:
     base_draws: int = 0
     """Independent draws from the base distribution that the run made, search included: `Estimate.unseen` follows from
     them. Of draws from a mixture, the expected number from its base component."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Outcome(Finding):
-    """Result of one run of a method.
-
-    Example:
-        >>> import samplers
-        >>> outcome = samplers.Outcome.of_counts(10, 1000, confidence=0.95, trace=())
-        >>> outcome.p, [round(end, 4) for end in outcome.interval], round(outcome.cov, 3)
-        (0.01, [0.0048, 0.0183], 0.315)
-    """
-
     no_outcome_share: float = 0.0
     """Share of p that comes from points without an outcome (f raised or gave NaN)."""
     counts: tuple[int, int] | None = None
     """(k, n) where p = k / n and k counts the failing ones of n independent draws: such runs pool."""
-    draw_weights: tuple[DrawWeights, ...] = ()
+    draw_weights: tuple[DrawWeights, ...] = field(default=(), compare=False, repr=False)
     """Weights of single simulations in p; empty where p is no sum over simulations, as with chains."""
 
     def remark_first(self, about: str) -> "Outcome":
@@ -183,30 +177,41 @@ def offer_of(inputs: Inputs) -> TermsOffer | None:
 
 
 @dataclass(frozen=True, eq=False)
-class TermsRequest:
-    """Points x (n, d), n > 0, to be simulated whose terms are wanted too; a row counts as one simulation."""
+class Request:
+    """Rows x (n, d) whose f ("f"), terms ("terms") or gradients ("gradient") are wanted, or a chunk of them.
 
-    x: FloatArray
+    A row counts as one simulation, but for gradients, which also have the number (n,) and ticks (n,) of one term each.
+    """
+
+    kind: str
+    arrays: tuple[NDArray[Any], ...]
+
+    @property
+    def x(self) -> FloatArray:
+        """Points, (n, d)."""
+        return self.arrays[0]
+
+    def __len__(self) -> int:
+        return len(self.arrays[0])
+
+    def take(self, rows: NDArray[np.int64] | slice) -> "Request":
+        """Return some of the rows."""
+        return Request(self.kind, tuple(array[rows] for array in self.arrays))
+
+    def split(self, size: int | None) -> "list[Request]":
+        """Return chunks of `size` rows, the last one of what is left; itself for None."""
+        if size is None or len(self) <= size:
+            return [self]
+        return [self.take(slice(first, first + size)) for first in range(0, len(self), size)]
 
 
-@dataclass(frozen=True, eq=False)
-class GradientRequest:
-    """Points x (n, d), n > 0, with the number (n,) and ticks (n,) of one term each whose gradient is wanted."""
-
-    x: FloatArray
-    term: NDArray[np.int64]
-    ticks: NDArray[np.int64]
-
-
-Request = FloatArray | TermsRequest | GradientRequest
-"""What the steps of a method yield."""
 Answer = FloatArray | Terms | TermGradients
-"""What they are sent: f, terms (with f = -inf, and every term, where there is no outcome), or gradients."""
+"""What steps are sent: f, terms (with f = -inf, and every term, where there is no outcome), or gradients."""
 
 
 def request_terms(x: FloatArray) -> Generator[FloatArray, FloatArray, Terms]:
     """Ask for the terms of points x (n, d), n > 0, within a method's steps, by `yield from`."""
-    answer = yield cast(FloatArray, TermsRequest(x))  # steps are typed by points and f; see `Steps`
+    answer = yield cast(FloatArray, Request("terms", (x,)))  # steps are typed by points and f; see `Steps`
     return cast(Terms, answer)
 
 
@@ -214,7 +219,7 @@ def request_gradients(
     x: FloatArray, term: NDArray[np.int64], ticks: NDArray[np.int64]
 ) -> Generator[FloatArray, FloatArray, TermGradients]:
     """Ask for the gradients of a term for each of the points x (n, d), n > 0; NaN in rows that have none."""
-    answer = yield cast(FloatArray, GradientRequest(x, term, ticks))
+    answer = yield cast(FloatArray, Request("gradient", (x, term, ticks)))
     return cast(TermGradients, answer)
 
 
@@ -283,7 +288,7 @@ def _hit_warnings(hits: int, n: int) -> tuple[str, ...]:
 
 
 @dataclass(frozen=True, kw_only=True)
-class EstimateData(Finding):
+class EstimateData(Outcome):
     """What a whole run has found, before any analysis of it: the attributes of `samplers.Estimate`."""
 
     confidence: float
@@ -314,12 +319,33 @@ class EstimateData(Finding):
     """Whether that is another method than the usual one, which the text says; `to_dict` has every choice."""
     ensemble_run: "EstimateData | None" = field(default=None, compare=False, repr=False)
     """The further run under the mixture of the refits of the base, where `estimate` needed one."""
-    simulations: SimulationIndex | None = field(default=None, compare=False, repr=False)
-    """What each simulation was made for, and its weight in p; those of `ensemble_run` come after them."""
+    spans: tuple[tuple[int, int, int], ...] = field(default=(), compare=False, repr=False)
+    """A replicate, the number of its simulations that follow each other, and what they cost: more than their number
+    where gradients follow them, which cost simulations and give none. Those of `ensemble_run` come after them."""
     points: SimulatedPoints | None = field(default=None, compare=False, repr=False)
     """All simulations, where `estimate` was told to keep them (`keep_points=True`)."""
     refit_ratios: list[tuple[tuple[object, ...], FloatArray]] = field(default_factory=list, compare=False, repr=False)
     """Density ratios of the refits at the failing points with what they are of, once they were asked for."""
+
+    def describe_simulations(self, first: int, n: int) -> SimulationRows:
+        """Return what simulations first, ..., first + n - 1 were made for, in the order of their making."""
+        runs, sizes, costs = np.array(self.spans, dtype=np.int64).reshape(-1, 3).T
+        before, ends, rows = np.zeros_like(costs), np.cumsum(sizes), np.arange(first, first + n)
+        for number in np.unique(runs):  # what each replicate had spent before a span
+            before[runs == number] = np.cumsum(costs[runs == number]) - costs[runs == number]
+        span = np.searchsorted(ends, rows, side="right")
+        run, local = runs[span], before[span] + rows - (ends - sizes)[span]
+        stage, log_weight = np.full(n, -1), np.full(n, np.nan)
+        for number in np.unique(run):
+            mine = run == number
+            levels = np.cumsum([level.n_sim for level in self.trace if level.run == number])
+            found = np.searchsorted(levels, local[mine], side="right")
+            stage[mine] = np.where(found < len(levels), found, -1)
+        for weights in self.draw_weights:
+            row = local - weights.first
+            inside = (run == weights.run) & (row >= 0) & (row < len(weights.log_weights))
+            log_weight[inside] = weights.log_weights[row[inside]] + weights.log_share
+        return SimulationRows(run, stage, log_weight)
 
 
 # Independent outcomes as one

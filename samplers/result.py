@@ -39,7 +39,6 @@ from samplers.sample import (
     Level,
     Sample,
     SimulatedPoints,
-    SimulationIndex,
     Status,
     describe_outcome,
     zero_hit_bound,
@@ -345,14 +344,14 @@ class Estimate(EstimateData):
             (0.0016, 0.0016)
         """
         columns: dict[str, Any]
-        if self.points is None or self.simulations is None:
+        if self.points is None:
             sample = require_sample(self)
             f, x, failed = sample.f, sample.x, sample.f <= self.gamma
             columns = {"f": f, "weight": sample.weights, "unit": sample.units, "failed": failed}
             rows, missing = np.flatnonzero(failed), {"f": np.isneginf(f)}
         else:
             f, x, lost = self.points.f, self.points.x, np.isnan(self.points.f)
-            about = self.simulations.describe(0, len(f))
+            about = self.describe_simulations(0, len(f))
             weight, failed = np.exp(about.log_weight), lost | (f <= self.gamma)
             columns = {"f": f, "weight": weight, "run": about.run, "stage": about.stage, "failed": failed}
             rows, missing = np.arange(len(f)), {"f": lost, "weight": np.isnan(weight), "stage": about.stage < 0}
@@ -473,4 +472,4 @@ def without_base(estimate: _EstimateT) -> _EstimateT:
 
 
 register_stored(StoredEstimate, Estimate, BaseUncertainty, Failures, Level, Status, StoredMethod)
-register_stored(Sample, Layer, DrawWeights, SimulationIndex, SimulatedPoints)
+register_stored(Sample, Layer, DrawWeights, SimulatedPoints)

@@ -16,14 +16,12 @@ from samplers.method import (
     Answer,
     Choice,
     Goal,
-    GradientRequest,
     Interrupted,
     Outcome,
     Request,
     Stepping,
     Steps,
     TermsOffer,
-    TermsRequest,
     combine,
     combined_cov,
     pool_counts,
@@ -47,7 +45,7 @@ from samplers.problem import (
     one_per_row,
 )
 from samplers.result import Estimate
-from samplers.sample import Failures, SimulatedPoints, SimulationIndex, Status, gain_over_monte_carlo
+from samplers.sample import Failures, SimulatedPoints, Status, gain_over_monte_carlo
 
 MOST_SIMULATIONS = 10**12
 """Largest `max_sim`: more is a slip of the keyboard."""
@@ -251,8 +249,12 @@ class Run:
         choose = getattr(method, "choose", None)  # of `Auto`, or of a method of one's own; by the smallest share
         goal = replace(self._goal, max_sim=shares[0])
         self._choice: Choice = Choice(method) if choose is None else choose(self._inputs, goal)
-        self._log = EvaluationLog(self._inputs, self._goal.gamma, self._on_error, keep_points)
         self.progress, self._listener = Progress(n_sim=0, max_sim=self._goal.max_sim), listener
+        self._n_sim = self._n_errors = 0
+        self._failures = Failures.empty(self._inputs.dim)
+        self._failing: list[tuple[FloatArray, FloatArray]] = []  # not yet among the failures
+        self._spans: list[tuple[Replicate, int, int]] = []
+        self._points: list[tuple[FloatArray, FloatArray]] | None = [] if keep_points else None
         self._asked = False
         self._stopped: str | None = None
         self._replicates: list[Replicate] = []
@@ -283,7 +285,7 @@ class Run:
         if self.done:
             raise RuntimeError("The run is done: nothing more to simulate; see result().")
         self._asked = True
-        return np.concatenate(cast(list[FloatArray], self.requests))
+        return np.concatenate([request.x for request in self.requests])
 
     def tell(self, f: ArrayLike) -> None:
         """Take the outcomes f, shape (n,), of the points that `ask` returned, in their order.
@@ -296,7 +298,7 @@ class Run:
         """
         if not self._asked:
             raise RuntimeError("Nothing has been asked for: call ask() for points, then tell() their outcomes.")
-        ends = np.cumsum([len(cast(FloatArray, points)) for points in self.requests])
+        ends = np.cumsum([len(request) for request in self.requests])
         self.answer(np.split(one_per_row(f, int(ends[-1])), ends[:-1]))
 
     def answer(self, answers: Sequence[Answer]) -> None:
@@ -306,13 +308,63 @@ class Run:
             EvaluationError: If an f is NaN (on_error "raise"), or gradients cost more than they may.
             RuntimeError: If the method asks for more than max_sim.
         """
-        running = self._running
-        seen = self._log.record(running, answers)
+        told = list(zip(self._running, answers, strict=True))
+        self._check_answers(told)
         self._asked = False
-        self._update(n_sim=self._log.n_sim)
-        for replicate, answer in zip(running, seen, strict=True):
+        for replicate, answer in sorted(told, key=lambda one: one[0].requested.kind != "f"):  # as simulated
+            self._record(replicate, answer)
+        if sum(len(rows) for _, rows in self._failing) >= KEEP_FAILURES:
+            self._merge_failures()
+        self._update(n_sim=self._n_sim)
+        for replicate, answer in told:
             replicate.tell(answer)
         self._start_more_for_target()
+
+    def _check_answers(self, told: Sequence[tuple[Replicate, Answer]]) -> None:
+        """Raise an EvaluationError if gradients cost more than offered, or an f is NaN and on_error is "raise"."""
+        for _, answer in told:
+            if isinstance(answer, TermGradients):
+                n, offer = len(answer.values), self._inputs.offer
+                if offer is None or not 0 <= answer.cost <= (offer.gradient_cost or 0.0) * n * (1 + 1e-9):
+                    raise EvaluationError(
+                        f"Expected {n} gradients to cost at most gradient_cost for each, got {answer.cost} simulations."
+                    )
+        simulated = [(one.requested.x, f) for one, answer in told if (f := outcomes_of(answer)) is not None]
+        if self._on_error != "raise" or not simulated:
+            return
+        x, f = (np.concatenate(parts) for parts in zip(*simulated, strict=True))
+        if np.isnan(f).any():
+            row = int(np.argmax(np.isnan(f)))
+            raise EvaluationError(
+                f"f returned NaN for row {row} of a batch of {len(x)}, x = {describe_point(x[row])}; "
+                'on_error="failure" or "bound" would count it instead.'
+            )
+
+    def _record(self, replicate: Replicate, answer: Answer) -> None:
+        """Count the simulations of an answer, note for whom they were made, and keep failing points."""
+        x, f, cost = replicate.requested.x, outcomes_of(answer), count_simulations(answer)
+        n, spent = (0 if f is None else cost), cost
+        self._n_sim += cost
+        if self._spans and self._spans[-1][0] is replicate and self._spans[-1][1] == self._spans[-1][2]:
+            _, n_before, spent_before = self._spans.pop()  # nothing lies between
+            n, spent = n + n_before, spent + spent_before
+        self._spans.append((replicate, n, spent))
+        if f is None:
+            return
+        missing = np.isnan(f)
+        self._n_errors += int(missing.sum())
+        failing = missing | (f <= self._goal.gamma)
+        if failing.any():
+            self._failing.append((x[failing], f[failing]))
+        if self._points is not None:
+            self._points.append((x, f))
+
+    def _merge_failures(self) -> None:
+        """Merge new failing points into the most likely ones: the density of many costs little more than of one."""
+        if self._failing:
+            x, f = (np.concatenate(parts) for parts in zip(*self._failing, strict=True))
+            log_p0 = np.asarray(self._inputs.base.log_prob(x), dtype=np.float64)
+            self._failures, self._failing = self._failures.merge(x, f, log_p0, keep=KEEP_FAILURES), []
 
     def _update(self, **changes: float) -> None:
         """Change the progress and tell the listener."""
@@ -328,7 +380,7 @@ class Run:
         """
         if self.done:
             return
-        self._stopped = f"{why} after {self._log.n_sim:,} simulations, before the method had finished."
+        self._stopped = f"{why} after {self._n_sim:,} simulations, before the method had finished."
         self._asked = False
         self._replicates = [replicate for replicate in self._replicates if replicate.n_sim] or self._replicates[:1]
         for replicate in self._running:
@@ -337,47 +389,41 @@ class Run:
     def result(self) -> Estimate:
         """Return the estimate; a run that is not done is stopped."""
         self.stop()
-        goal, log = self._goal, self._log
-        outcomes = [replicate.outcome for replicate in self._replicates if replicate.outcome is not None]
+        self._merge_failures()
+        goal, outcomes = self._goal, [replicate.outcome for replicate in self._replicates if replicate.outcome]
         whole, met = combine(outcomes, goal.confidence), meets_target(outcomes, goal.target_cov, self._n_wanted)
         low, high = whole.interval
         status, warnings, remarks = whole.status, [*whole.warnings], [*whole.remarks]
         if self._on_error == "bound":
             low *= 1 - whole.no_outcome_share
-        if log.n_errors:
+        if self._n_errors:
             where = " (not in the lower end of the interval)" if self._on_error == "bound" else ""
-            warnings.append(f"{log.n_errors} simulations gave no outcome and were counted as failing{where}.")
+            warnings.append(f"{self._n_errors} simulations gave no outcome and were counted as failing{where}.")
         if self._stopped is not None:
             status = Status.STOPPED
             warnings.append(self._stopped)
         elif not met:  # the interval holds, and is wider than was wished
             status = Status.BUDGET if status is Status.CONVERGED else status
             remarks.append(f"The target c.o.v. {goal.target_cov:g} was not met: {whole.cov:.3g}.")
+        number = {id(replicate): run for run, replicate in enumerate(self._replicates)}
+        found = {"interval": (low, high), "status": status, "warnings": tuple(warnings), "remarks": tuple(remarks)}
         return Estimate(
-            p=whole.p,
-            interval=(low, high),
+            **{**vars(whole), **found},
             confidence=goal.confidence,
-            cov=whole.cov,
             gamma=goal.gamma,
-            n_sim=log.n_sim,
-            gain=gain_over_monte_carlo(whole.p, whole.cov, log.n_sim),
-            status=status,
-            warnings=tuple(warnings),
-            remarks=tuple(remarks),
-            trace=whole.trace,
-            failures=log.failures,
+            n_sim=self._n_sim,
+            gain=gain_over_monte_carlo(whole.p, whole.cov, self._n_sim),
+            failures=self._failures,
             method=self._choice.method,
             seed=self._seed,
-            sample=whole.sample,
             base=self._inputs.base,
             on_error=self._on_error,
-            base_draws=whole.base_draws,
             given=self._given,
             column_names=self._column_names,
             choice=self._choice.why,
             chose_another=self._choice.unusual,
-            simulations=log.index(self._replicates, whole),
-            points=log.join_points(),
+            spans=tuple((number[id(one)], n, cost) for one, n, cost in self._spans if id(one) in number),
+            points=None if self._points is None else SimulatedPoints.join(self._points, self._inputs.dim),
         )
 
     def _start_replicate(self, max_sim: int | None) -> None:
@@ -390,14 +436,13 @@ class Run:
             on_level=lambda level: self._update(level=level.gamma, p=level.estimate, run=number),
         )
         rng = np.random.default_rng(np.random.SeedSequence(self._seed, spawn_key=(number,)))
-        steps = self._choice.method.steps(self._inputs, goal, rng)
-        self._replicates.append(Replicate(steps, goal, self._inputs.dim, self._inputs.offer))
+        self._replicates.append(Replicate(self._choice.method.steps(self._inputs, goal, rng), goal, self._inputs))
 
     def _start_more_for_target(self) -> None:
         """Start one more run where all are done, the target is missed and the budget allows it."""
         while self.done and needs_another(self._replicates, self._choice.method, self._goal, self._n_wanted):
             max_sim = self._goal.max_sim
-            self._start_replicate(None if max_sim is None else max_sim - self._log.n_sim)
+            self._start_replicate(None if max_sim is None else max_sim - self._n_sim)
 
 
 def split_budget(max_sim: int | None, replicates: int) -> list[int | None]:
@@ -441,28 +486,36 @@ class Replicate:
 
     Attributes:
         goal: The goal it was given; more than goal.max_sim points are refused.
-        requested: What the method waits for: points x (n, d) whose f it wants, or a request for terms or gradients; no
-            points once it has its outcome.
+        requested: What the method waits for; no points once it has its outcome.
         n_sim: Simulations made for it so far.
         outcome: Its outcome; None while it runs.
     """
 
-    def __init__(self, steps: Steps, goal: Goal, dim: int, offer: TermsOffer | None = None) -> None:
-        self.goal, self.offer = goal, offer
+    def __init__(self, steps: Steps, goal: Goal, inputs: InputsOnly) -> None:
+        self.goal, self._inputs, self._steps = goal, inputs, steps
         self.n_sim = 0
         self.outcome: Outcome | None = None
-        self.requested: Request = np.empty((0, dim))
-        self._dim, self._steps = dim, steps
+        self.requested = Request("f", (np.empty((0, inputs.dim)),))
         self._advance(lambda: next(steps))
 
     def tell(self, answer: Answer) -> None:
-        """Give the method what it requested, and let it run to its next request or its end."""
+        """Give the method what it requested, without NaN, and let it run to its next request or its end.
+
+        Points without an outcome fail, in every term too.
+        """
         self.n_sim += count_simulations(answer)
-        self._advance(lambda: self._steps.send(cast(FloatArray, answer)))  # see `samplers.method.request_terms`
+        f, seen = outcomes_of(answer), answer
+        if f is not None:
+            shown = np.where(np.isnan(f), NO_OUTCOME, np.maximum(f, SMALLEST_F))
+            seen = shown
+            if isinstance(answer, Terms):
+                values = np.where(np.isneginf(shown)[:, None], -np.inf, answer.values)
+                seen = replace(answer, f=shown, values=values)
+        self._advance(lambda: self._steps.send(cast(FloatArray, seen)))  # see `samplers.method.request_terms`
 
     def interrupt(self) -> None:
         """End the run: its outcome is what the method concludes from the values of f so far."""
-        self.outcome, self.requested = NOT_KNOWN, np.empty((0, self._dim))
+        self.outcome = NOT_KNOWN
         if self.n_sim:
             try:
                 self._steps.throw(Interrupted())
@@ -472,43 +525,45 @@ class Replicate:
                 pass
         self._steps.close()
 
-    def _advance(self, resume: Callable[[], Request]) -> None:
+    def _advance(self, resume: Callable[[], FloatArray | Request]) -> None:
         """Resume the method until it requests at least one point or returns its outcome."""
         try:
-            request = self._check_request(resume())
-            while isinstance(request, np.ndarray) and len(request) == 0:
-                request = self._check_request(self._steps.send(np.empty(0)))
-            self.requested = request
+            self.requested = self._check_request(resume())
+            while len(self.requested) == 0:
+                self.requested = self._check_request(self._steps.send(np.empty(0)))
         except StopIteration as end:
-            self.outcome, self.requested = _check_outcome(end.value), np.empty((0, self._dim))
+            self.outcome = _check_outcome(end.value)
 
-    def _check_request(self, request: Request) -> Request:
-        """Return the request, points as float64; raise unless it is offered, of a right shape and within the budget."""
-        about, gradients = isinstance(request, TermsRequest | GradientRequest), isinstance(request, GradientRequest)
-        x = np.asarray(points_of(request), dtype=np.float64)
-        if about and (self.offer is None or (gradients and self.offer.gradient_cost is None) or len(x) == 0):
-            raise RuntimeError(f"The method made a {type(request).__name__} that the run cannot answer.")
-        if x.ndim != 2 or x.shape[1] != self._dim:
-            raise ValueError(f"Expected x of shape (n, {self._dim}), got {x.shape}.")
-        n = self.offer.count_gradients(len(x)) if gradients and self.offer is not None else len(x)
+    def _check_request(self, given: FloatArray | Request) -> Request:
+        """Return a request, or points as one; raise unless it is offered, of a right shape and within the budget."""
+        request = given if isinstance(given, Request) else Request("f", (np.asarray(given, dtype=np.float64),))
+        offer, n = self._inputs.offer, len(request.x) if request.x.ndim else 0
+        no_gradients = request.kind == "gradient" and (offer is None or offer.gradient_cost is None)
+        if request.kind != "f" and (offer is None or n == 0 or no_gradients):
+            raise RuntimeError(f"The method asked for {request.kind} that the run cannot give.")
+        if request.x.ndim != 2 or request.x.shape[1] != self._inputs.dim:
+            raise ValueError(f"Expected x of shape (n, {self._inputs.dim}), got {request.x.shape}.")
+        if request.kind == "gradient" and offer is not None:
+            n = offer.count_gradients(n)
         if self.n_sim + n > self.goal.budget:
             raise RuntimeError(
                 f"The method asked for {n} simulations with {self.goal.budget - self.n_sim} of "
                 f"max_sim={self.goal.max_sim} left; a method must keep to goal.max_sim."
             )
-        return request if about else x
+        return request
 
 
-def points_of(request: Request) -> FloatArray:
-    """Return the points x (n, d) of a request."""
-    return request.x if isinstance(request, TermsRequest | GradientRequest) else request
+def outcomes_of(answer: Answer) -> FloatArray | None:
+    """Return the outcomes f (n,) of an answer; None for gradients, which have none."""
+    if isinstance(answer, TermGradients):
+        return None
+    return answer.f if isinstance(answer, Terms) else answer
 
 
 def count_simulations(answer: Answer) -> int:
     """Return the simulations behind an answer: its rows or, for gradients, what they cost, as a whole number."""
-    if isinstance(answer, TermGradients):
-        return whole_simulations(answer.cost)
-    return len(answer.f) if isinstance(answer, Terms) else len(answer)
+    f = outcomes_of(answer)
+    return whole_simulations(cast(TermGradients, answer).cost) if f is None else len(f)
 
 
 def _check_outcome(value: object) -> Outcome:
@@ -516,123 +571,3 @@ def _check_outcome(value: object) -> Outcome:
     if not isinstance(value, Outcome):
         raise TypeError(f"Expected the steps of the method to return an Outcome, got {value!r}.")
     return value
-
-
-class EvaluationLog:
-    """Counts every simulation, says for whom it was made, decides what NaN means, keeps the likeliest failing points.
-
-    Attributes:
-        n_sim: Simulations, and what gradients cost.
-        n_errors: Those without an outcome.
-    """
-
-    def __init__(
-        self,
-        inputs: Inputs,
-        gamma: float,
-        on_error: OnError = "raise",
-        keep_points: bool = False,
-        keep: int = KEEP_FAILURES,
-    ) -> None:
-        self.n_sim = self.n_errors = 0
-        self._inputs, self._gamma, self._on_error, self._keep = inputs, gamma, on_error, keep
-        self._failures = Failures.empty(inputs.dim)
-        self._new: list[tuple[FloatArray, FloatArray]] = []
-        self._spans: list[tuple[Replicate, int, int]] = []
-        self._points: list[tuple[FloatArray, FloatArray]] | None = [] if keep_points else None
-
-    def record(self, replicates: Sequence[Replicate], answers: Sequence[Answer]) -> list[Answer]:
-        """Record the answers to what replicates have requested; return them as methods see them.
-
-        Raises:
-            EvaluationError: If an f is NaN and on_error is "raise", or gradients cost too much; nothing is recorded.
-        """
-        for replicate, answer in zip(replicates, answers, strict=True):
-            if isinstance(answer, TermGradients):
-                check_cost(answer, replicate.offer)
-        seen, costs = list(answers), [count_simulations(answer) for answer in answers]
-        simulated = [i for i, answer in enumerate(answers) if not isinstance(answer, TermGradients)]
-        f = [outcomes_of(answers[i]) for i in simulated]
-        if simulated:
-            x = np.concatenate([points_of(replicates[i].requested) for i in simulated])
-            whole = self.record_f(x, np.concatenate(f))
-            for i, part in zip(simulated, np.split(whole, np.cumsum([len(each) for each in f])[:-1]), strict=True):
-                seen[i] = hide_missing(answers[i], part)
-        for i in sorted(range(len(answers)), key=lambda i: not isinstance(answers[i], np.ndarray)):  # as simulated
-            n = costs[i] if i in simulated else 0
-            self.n_sim += costs[i] - n
-            self._add_span(replicates[i], n, costs[i])
-            if self._points is not None and i in simulated:
-                self._points.append((points_of(replicates[i].requested), outcomes_of(answers[i])))
-        return seen
-
-    def record_f(self, x: FloatArray, f: FloatArray) -> FloatArray:
-        """Record f (n,) of the rows of x (n, d); return f as methods see it, shape (n,), never NaN."""
-        missing = np.isnan(f)
-        if missing.any() and self._on_error == "raise":
-            row = int(np.argmax(missing))
-            raise EvaluationError(
-                f"f returned NaN for row {row} of a batch of {len(x)}, x = {describe_point(x[row])}; "
-                'on_error="failure" or "bound" would count it instead.'
-            )
-        self.n_sim += len(x)
-        self.n_errors += int(missing.sum())
-        failing = missing | (f <= self._gamma)
-        if failing.any():
-            self._new.append((x[failing], f[failing]))
-            if sum(len(rows) for _, rows in self._new) >= self._keep:
-                self._merge_new()
-        return np.where(missing, NO_OUTCOME, np.maximum(f, SMALLEST_F))
-
-    @property
-    def failures(self) -> Failures:
-        """The most likely failing points."""
-        self._merge_new()
-        return self._failures
-
-    def _merge_new(self) -> None:
-        """Merge the new failing points into the most likely ones: the density of many costs little more than of one."""
-        if self._new:
-            x, f = (np.concatenate(parts) for parts in zip(*self._new, strict=True))
-            log_p0 = np.asarray(self._inputs.base.log_prob(x), dtype=np.float64)
-            self._failures, self._new = self._failures.merge(x, f, log_p0, keep=self._keep), []
-
-    def _add_span(self, replicate: Replicate, n: int, cost: int) -> None:
-        """Note n simulations of a replicate and what they cost, together with its last ones if nothing lies between."""
-        if self._spans and self._spans[-1][0] is replicate and self._spans[-1][1] == self._spans[-1][2]:
-            _, n_before, cost_before = self._spans.pop()
-            n, cost = n + n_before, cost + cost_before
-        self._spans.append((replicate, n, cost))
-
-    def index(self, replicates: Sequence[Replicate], whole: Outcome) -> SimulationIndex:
-        """Return what the simulations of these replicates were made for."""
-        number = {id(replicate): run for run, replicate in enumerate(replicates)}
-        spans = tuple((number[id(replicate)], n, cost) for replicate, n, cost in self._spans if id(replicate) in number)
-        return SimulationIndex(spans=spans, trace=whole.trace, weights=whole.draw_weights)
-
-    def join_points(self) -> SimulatedPoints | None:
-        """Return all simulations in the order of the spans; None where they were not kept."""
-        if self._points is None:
-            return None
-        x, f = zip((np.empty((0, self._inputs.dim)), np.empty(0)), *self._points, strict=True)
-        return SimulatedPoints(np.concatenate(x), np.concatenate(f))
-
-
-def outcomes_of(answer: Answer) -> FloatArray:
-    """Return the outcomes f (n,) of an answer that has some."""
-    return answer.f if isinstance(answer, Terms) else cast(FloatArray, answer)
-
-
-def hide_missing(answer: Answer, f: FloatArray) -> Answer:
-    """Return an answer with f as methods see it; points without an outcome, f = -inf, fail in every term."""
-    if not isinstance(answer, Terms):
-        return f
-    values = np.where(np.isneginf(f)[:, None], -np.inf, answer.values)
-    return Terms(f, values, answer.ticks, answer.threshold, answer.names)
-
-
-def check_cost(gradients: TermGradients, offer: TermsOffer | None) -> None:
-    """Raise an EvaluationError unless the cost of some gradients is one that `gradient_cost` allows."""
-    n, cost = len(gradients.values), gradients.cost
-    if offer is None or offer.gradient_cost is None or not 0 <= cost <= offer.gradient_cost * n * (1 + 1e-9):
-        raise EvaluationError(f"Expected {n} gradients to cost at most gradient_cost for each, got {cost} simulations.")

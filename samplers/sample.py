@@ -199,61 +199,16 @@ class Sample:
 
 
 class SimulationRows(NamedTuple):
-    """What is known of n simulations that follow each other, from a `SimulationIndex`; (n,) each."""
+    """What n simulations that follow each other were made for; (n,) each."""
 
     run: NDArray[np.int64]  # replicate
     stage: NDArray[np.int64]  # level in the trace of that replicate; -1 for none
-    log_weight: FloatArray  # logarithm of the weight in p; NaN for none
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class SimulationIndex:
-    """Tells of each simulation of an estimate, numbered in the order of their making, what it was made for.
-
-    A span is a replicate, the number of its simulations that follow each other, and what they cost: more than their
-    number where gradients follow them, which cost simulations and give none. There are no weights where p is no sum.
-    """
-
-    spans: tuple[tuple[int, int, int], ...]
-    trace: tuple[Level, ...]
-    weights: tuple[DrawWeights, ...]
-
-    @property
-    def n(self) -> int:
-        """Number of simulations."""
-        return sum(n for _, n, _ in self.spans)
-
-    def describe(self, first: int, n: int) -> SimulationRows:
-        """Return what simulations first, ..., first + n - 1 were made for."""
-        run, local = self._locate(first, n)
-        stage, log_weight = np.full(n, -1), np.full(n, np.nan)
-        for number in np.unique(run):
-            mine = run == number
-            ends = np.cumsum([level.n_sim for level in self.trace if level.run == number])
-            found = np.searchsorted(ends, local[mine], side="right")
-            stage[mine] = np.where(found < len(ends), found, -1)
-        for weights in self.weights:
-            row = local - weights.first
-            inside = (run == weights.run) & (row >= 0) & (row < len(weights.log_weights))
-            log_weight[inside] = weights.log_weights[row[inside]] + weights.log_share
-        return SimulationRows(run, stage, log_weight)
-
-    def _locate(self, first: int, n: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Return the replicate of each simulation and what was spent there before it, shape (n,) each."""
-        runs, sizes, costs = (np.array(each, dtype=np.int64) for each in zip(*self.spans, strict=True))
-        before = np.zeros(len(runs), dtype=np.int64)
-        for number in np.unique(runs):
-            mine = runs == number
-            before[mine] = np.cumsum(costs[mine]) - costs[mine]
-        ends = np.cumsum(sizes)
-        rows = np.arange(first, first + n)
-        span = np.searchsorted(ends, rows, side="right")
-        return runs[span], before[span] + rows - (ends - sizes)[span]
+    log_weight: FloatArray  # logarithm of the weight in p; NaN for none, as where p is no sum over simulations
 
 
 @dataclass(frozen=True, eq=False)
 class SimulatedPoints:
-    """All simulations of a run in the order of their making, as `SimulationIndex` numbers them.
+    """All simulations of a run in the order of their making.
 
     Example:
         >>> import samplers
@@ -267,6 +222,12 @@ class SimulatedPoints:
     """Points, shape (n, d), in physical space."""
     f: FloatArray
     """Outcomes, shape (n,); NaN where f raised or gave NaN."""
+
+    @classmethod
+    def join(cls, parts: Sequence[tuple[FloatArray, FloatArray]], dim: int) -> SimulatedPoints:
+        """Return parts x (k, d) and f (k,) as one."""
+        x, f = zip((np.empty((0, dim)), np.empty(0)), *parts, strict=True)
+        return cls(np.concatenate(x), np.concatenate(f))
 
 
 class Failure(NamedTuple):

@@ -1,4 +1,4 @@
-"""Workers: a chunk of a request, how it is computed, here or in another process, and which of its rows fail."""
+"""Workers: how a chunk of a request is computed, here or in another process, and which of its rows fail."""
 
 from __future__ import annotations
 
@@ -22,6 +22,7 @@ from uuid import uuid4
 import numpy as np
 from numpy.typing import NDArray
 
+from samplers.method import Request
 from samplers.problem import EvaluationError, FloatArray, OnError, describe_point, one_per_row
 
 PARENT_SECONDS = 1.0
@@ -61,33 +62,11 @@ class Result(NamedTuple):
     `lost`, `seconds`, `cost` of gradients, `threshold` and `names` of terms."""
 
 
-@dataclass(frozen=True, eq=False)
-class Chunk:
-    """Rows of a request for `kind`, "f", "terms" or "gradient": x (n, d), for gradients also terms and ticks (n,)."""
-
-    kind: str
-    arrays: tuple[NDArray[Any], ...]
-
-    @property
-    def x(self) -> FloatArray:
-        """Points, (n, d)."""
-        return self.arrays[0]
-
-    def __len__(self) -> int:
-        return len(self.arrays[0])
-
-    def take(self, rows: NDArray[np.int64] | slice) -> Chunk:
-        """Return some of the rows."""
-        return Chunk(self.kind, tuple(array[rows] for array in self.arrays))
-
-    def split(self, size: int | None) -> list[Chunk]:
-        """Return chunks of `size` rows, the last one of what is left; itself for None."""
-        if size is None or len(self) <= size:
-            return [self]
-        return [self.take(slice(first, first + size)) for first in range(0, len(self), size)]
-
-
-Compute = Callable[[Index, Chunk], Result]
+def widen_table(table: FloatArray, width: int) -> FloatArray:
+    """Return a table (n, k) with `width` columns; what it does not know is NaN."""
+    if table.shape[1] == width:
+        return table
+    return np.pad(table, ((0, 0), (0, width - table.shape[1])), constant_values=np.nan)
 
 
 def join_results(parts: Sequence[Result]) -> Result:
@@ -97,22 +76,14 @@ def join_results(parts: Sequence[Result]) -> Result:
         adds = name in notes and name not in ("names", "threshold") and isinstance(value, int | float | list)
         notes[name] = notes[name] + value if adds else notes.get(name, value)
     width = max(part.table.shape[1] for part in parts)
-    tables = [  # narrow ones know nothing
-        t if t.shape[1] == width else np.pad(t, ((0, 0), (0, width - t.shape[1])), constant_values=np.nan)
-        for t in (part.table for part in parts)
-    ]
-    return Result(np.concatenate(tables), notes)
+    return Result(np.concatenate([widen_table(part.table, width) for part in parts]), notes)
 
 
 # Rows that fail
 
 
-Attempt = Callable[[Chunk], Result]
-"""Its notes have `reasons` as a dict by row."""
-
-
-def isolate(attempt: Attempt, chunk: Chunk, first: Result | BaseException, fail: Callable[..., None]) -> Result:
-    """Return what the rows of a chunk give, those that fail left out, after a first attempt that gave or raised this.
+def isolate(attempt: Callable[[Request], Result], chunk: Request, fail: Callable[..., None]) -> Result:
+    """Return what the rows of a chunk give, those that fail left out; notes have their `reasons` as a dict by row.
 
     Where an attempt raises, its parts are attempted (`split_rows`), until the rows that raise stand alone. A row that
     has given nothing is attempted once more; if that gives nothing either, `fail(row, reason, error)` is told, which
@@ -120,27 +91,28 @@ def isolate(attempt: Attempt, chunk: Chunk, first: Result | BaseException, fail:
     """
     n_retried, lost, found = 0, dict[int, str](), list[tuple[NDArray[np.int64], Result]]()
 
-    def settle(rows: NDArray[np.int64], met: Result | BaseException, again: bool) -> None:
+    def settle(rows: NDArray[np.int64], again: bool) -> None:
         nonlocal n_retried
-        if isinstance(met, Result):
-            found.append((rows, met))
-        elif getattr(met, "final", False):  # calling f again cannot help
+        n_retried += len(rows) if again else 0
+        try:
+            found.append((rows, attempt(chunk if len(rows) == len(chunk) else chunk.take(rows))))
+            return
+        except (Exception, SystemExit) as error:  # the simulation is the user's: anything may happen in it
+            met: BaseException = error
+        if getattr(met, "final", False):  # calling f again cannot help
             raise met
-        elif again and len(rows) == 1:
+        if again and len(rows) == 1:
             lost[int(rows[0])] = reason_of(met)
             fail(int(rows[0]), lost[int(rows[0])], met)
             found.append((rows, Result(np.full((1, 1), np.nan), {})))
         else:
             for part in split_rows(rows, met, len(chunk)):
-                n_retried += len(part)
-                settle(part, try_attempt(attempt, chunk.take(part)), True)
+                settle(part, True)
 
-    settle(np.arange(len(chunk)), first, False)
+    settle(np.arange(len(chunk)), False)
     unsure = {int(rows[at]): why for rows, each in found for at, why in each.notes.get("reasons", {}).items()}
     if unsure:
-        rows = np.array(sorted(unsure))
-        n_retried += len(rows)
-        settle(rows, try_attempt(attempt, chunk.take(rows)), True)
+        settle(np.array(sorted(unsure)), True)
     whole = join_results([each for _, each in found])
     table = np.empty((len(chunk), whole.table.shape[1]))
     table[np.concatenate([rows for rows, _ in found])] = whole.table  # what came last stands
@@ -148,14 +120,6 @@ def isolate(attempt: Attempt, chunk: Chunk, first: Result | BaseException, fail:
     for row in sorted(set(again_failed) - set(lost)):
         fail(row, again_failed[row])
     return Result(table, {**whole.notes, "reasons": {**again_failed, **lost}, "n_retried": n_retried})
-
-
-def try_attempt(attempt: Attempt, chunk: Chunk) -> Result | BaseException:
-    """Return what an attempt gives or raises; what is no fault of a row (an ego that is gone, Ctrl-C) is raised."""
-    try:
-        return attempt(chunk)
-    except (Exception, SystemExit) as error:  # the simulation is the user's: anything may happen in it
-        return error
 
 
 def split_rows(rows: NDArray[np.int64], error: BaseException, whole: int) -> list[NDArray[np.int64]]:
@@ -188,40 +152,47 @@ class Work:
 
     A problem that goes on by itself with the rows on which it does not fail has `attempt(x)` and `attempt_terms(x,
     gamma)`, which also give the reasons by row. A row that fails ends the run where on_error is "raise"; else its f and
-    terms are NaN. `name` is that of f in messages.
+    terms are NaN. `name` is that of f in messages. With a seed, what simulations draw follows from it and the index of
+    their chunk (`seed_generators`).
     """
 
     problem: Any
     gamma: float
     on_error: OnError
     name: str = "f"
+    seed: int | None = None
 
-    def __call__(self, chunk: Chunk) -> Result:
+    def __call__(self, chunk: Request, index: Index = ()) -> Result:
         """Compute a chunk; raise an EvaluationError for a row that fails ("raise") and for results of a wrong form."""
-        start, attempt = time.perf_counter(), partial(_ATTEMPTS[chunk.kind], self.problem, self.gamma)
+        if self.seed is None:
+            return self._compute(chunk)
+        torch_is_new = "torch" not in sys.modules
+        with seed_generators(self.seed, index):
+            result = self._compute(chunk)
+        if torch_is_new and "torch" in sys.modules:  # its generator was not seeded
+            with seed_generators(self.seed, index):
+                return self._compute(chunk)
+        return result
+
+    def _compute(self, chunk: Request) -> Result:
+        start = time.perf_counter()
         with np.errstate():  # a problem that sets NumPy's errors sets them for itself
-            found: Any
-            try:
-                found = attempt(chunk)
-            except (Exception, SystemExit) as error:  # the problem is the user's: anything may happen in it
-                found = error
-            if not isinstance(found, Result) or found.notes["reasons"]:
-                found = isolate(attempt, chunk, found, partial(self.refuse, chunk))
-        table, notes = found.table, {"n_retried": 0, **found.notes}
+            found = isolate(partial(_attempt, self.problem, self.gamma), chunk, partial(self._refuse, chunk))
+        notes = dict(found.notes)
         reasons = notes.pop("reasons")
         if chunk.kind == "gradient":
             notes["cost"] = notes.get("cost", 0.0) + float(self.problem.gradient_cost) * len(reasons)
         else:
             notes["reasons"] = [reasons[row] for row in sorted(reasons)]
-        return Result(table, {**notes, "seconds": time.perf_counter() - start})
+        return Result(found.table, {**notes, "seconds": time.perf_counter() - start})
 
-    def lose(self, chunk: Chunk, reason: str) -> Result:
+    def lose(self, chunk: Request, reason: str) -> Result:
         """Return the result of a row that no worker survives; an EvaluationError where on_error is "raise"."""
-        self.refuse(chunk, 0, reason)
+        self._refuse(chunk, 0, reason)
         about = {"cost": float(self.problem.gradient_cost)} if chunk.kind == "gradient" else {"reasons": [reason]}
         return Result(np.full((1, 1), np.nan), {"n_retried": 0, "lost": [reason], **about})
 
-    def refuse(self, chunk: Chunk, row: int, reason: str, cause: BaseException | None = None) -> None:
+    def _refuse(self, chunk: Request, row: int, reason: str, cause: BaseException | None = None) -> None:
         """Raise an EvaluationError for a row of a chunk that has failed for good, if on_error is "raise"."""
         if self.on_error == "raise":
             what = "The gradient" if chunk.kind == "gradient" else self.name
@@ -231,95 +202,55 @@ class Work:
             ) from cause
 
 
-def _attempt_f(problem: Any, gamma: float, chunk: Chunk) -> Result:
-    x, rowwise = chunk.x.copy(), _find_rowwise(problem, "evaluate", "attempt")  # a copy, on which it may write
-    f, reasons = (problem.evaluate(x), {}) if rowwise is None else rowwise(x)
-    f = one_per_row(f, len(x))
-    return Result(f[:, None], {"reasons": _reasons_of_nan(f) | reasons})
+def _attempt(problem: Any, gamma: float, chunk: Request) -> Result:
+    """Return what a problem gives for a chunk, with the reasons by row where it gives nothing; it may write on x."""
+    x, *about = (array.copy() for array in chunk.arrays)
+    n, notes, reasons = len(x), dict[str, Any](), dict[int, str]()
+    if chunk.kind == "gradient":
+        found = problem.gradient(x, *about, gamma)
+        table = np.asarray(found.values, dtype=np.float64)
+        if table.shape != x.shape:
+            raise EvaluationError(f"Expected gradients of shape {x.shape}, got {table.shape}.")
+        return Result(table, {"cost": float(found.cost), "reasons": {}})
+    whole, by_row, more = ("terms", "attempt_terms", (gamma,)) if chunk.kind == "terms" else ("evaluate", "attempt", ())
+    if _have_same_owner(problem, whole, by_row):
+        found, reasons = getattr(problem, by_row)(x, *more)  # foreign methods, by name
+    else:
+        found = getattr(problem, whole)(x, *more)
+    if chunk.kind == "f":
+        f = one_per_row(found, n)
+        table = f[:, None]
+    else:
+        f, values, ticks = one_per_row(found.f, n), np.asarray(found.values, float), np.asarray(found.ticks)
+        if values.ndim != 2 or len(values) != n or values.shape[1] == 0 or ticks.shape != values.shape:
+            raise EvaluationError(f"Expected values and ticks of shape ({n}, J), got {values.shape} and {ticks.shape}.")
+        f = np.where(np.isnan(values).any(axis=1), np.nan, f)
+        table = np.column_stack((f, values, ticks))
+        notes = {"threshold": float(found.threshold), "names": list(getattr(found, "names", ()))}
+    reasons = dict.fromkeys(np.flatnonzero(np.isnan(f)).tolist(), NAN_REASON) | reasons
+    return Result(table, {**notes, "reasons": reasons})
 
 
-def _attempt_terms(problem: Any, gamma: float, chunk: Chunk) -> Result:
-    x, n, rowwise = chunk.x.copy(), len(chunk), _find_rowwise(problem, "terms", "attempt_terms")
-    terms, reasons = (problem.terms(x, gamma), {}) if rowwise is None else rowwise(x, gamma)
-    f, values, ticks = one_per_row(terms.f, n), np.asarray(terms.values, dtype=np.float64), np.asarray(terms.ticks)
-    if values.ndim != 2 or len(values) != n or values.shape[1] == 0 or ticks.shape != values.shape:
-        raise EvaluationError(f"Expected values and ticks of shape ({n}, J), got {values.shape} and {ticks.shape}.")
-    f = np.where(np.isnan(values).any(axis=1), np.nan, f)
-    notes = {"threshold": float(terms.threshold), "names": list(getattr(terms, "names", ()))}
-    return Result(np.column_stack((f, values, ticks)), {**notes, "reasons": _reasons_of_nan(f) | reasons})
-
-
-def _attempt_gradient(problem: Any, gamma: float, chunk: Chunk) -> Result:
-    x, term, ticks = (array.copy() for array in chunk.arrays)
-    found = problem.gradient(x, term, ticks, gamma)
-    values = np.asarray(found.values, dtype=np.float64)
-    if values.shape != x.shape:
-        raise EvaluationError(f"Expected gradients of shape {x.shape}, got {values.shape}.")
-    return Result(values, {"cost": float(found.cost), "reasons": {}})
-
-
-_ATTEMPTS: dict[str, Callable[..., Result]] = {
-    "f": _attempt_f,
-    "terms": _attempt_terms,
-    "gradient": _attempt_gradient,
-}
-
-
-def _find_rowwise(problem: Any, whole: str, rowwise: str) -> Callable[..., Any] | None:
-    """Return the method that goes on with the other rows, if it computes what the method `whole` does.
+def _have_same_owner(problem: Any, whole: str, by_row: str) -> bool:
+    """Return whether the method that goes on with the other rows computes what the method `whole` does.
 
     A subclass, a wrapper or an instance that has `whole` of its own is asked by that.
     """
-    method = getattr(problem, rowwise, None)
-    owner = getattr(method, "__self__", None)
+    owner = getattr(getattr(problem, by_row, None), "__self__", None)
     if owner is None or getattr(getattr(problem, whole, None), "__self__", None) is not owner:
-        return None
-    definition = next(vars(kind) for kind in type(owner).__mro__ if {whole, rowwise} & set(vars(kind)))
-    return method if {whole, rowwise} <= set(definition) else None
+        return False
+    definition = next(vars(kind) for kind in type(owner).__mro__ if {whole, by_row} & set(vars(kind)))
+    return {whole, by_row} <= set(definition)
 
 
-def _reasons_of_nan(f: FloatArray) -> dict[int, str]:
-    return dict.fromkeys(np.flatnonzero(np.isnan(f)).tolist(), NAN_REASON)
-
-
-@dataclass(frozen=True)
-class SeededWork:
-    """Work with the global random generators of its chunk, keyed by the seed of the run and the index of the chunk.
+@contextmanager
+def seed_generators(seed: int, index: Index) -> Iterator[None]:
+    """Let the global generators begin anew for the length of a block, by the seed of the run and a chunk's index.
 
     A simulation is to draw nothing itself. One that does (a policy that samples its actions) draws the same again when
     its chunk is computed again, on whichever worker, as long as it uses the generators of `random`, `numpy.random` or,
     on the CPU, torch.
     """
-
-    work: Callable[[Chunk], Result]
-    seed: int
-
-    def __call__(self, index: Index, chunk: Chunk) -> Result:
-        """Compute a chunk; the generators are then as before.
-
-        A chunk that imports torch, and draws by its generator before that could be seeded, is computed once more.
-        """
-        torch_is_new = "torch" not in sys.modules
-        with seed_generators(self.seed, index):
-            result = self.work(chunk)
-        if not (torch_is_new and _torch_has_drawn()):
-            return result
-        with seed_generators(self.seed, index):
-            return self.work(chunk)
-
-
-def _torch_has_drawn() -> bool:
-    """Return whether torch's generator, which begins in each process with a seed of its own, has left its beginning."""
-    torch: Any = sys.modules.get("torch")
-    if torch is None:
-        return False
-    fresh = torch.Generator().manual_seed(torch.initial_seed())
-    return not torch.equal(fresh.get_state(), torch.random.get_rng_state())
-
-
-@contextmanager
-def seed_generators(seed: int, index: Index) -> Iterator[None]:
-    """Let the global generators begin anew for the length of a block."""
     state = int(np.random.SeedSequence(seed, spawn_key=index).generate_state(1)[0])
     torch: Any = sys.modules.get("torch")  # not imported for this
     before = random.getstate(), np.random.get_state(), None if torch is None else torch.random.get_rng_state()  # noqa: NPY002
@@ -354,19 +285,18 @@ class Limits(NamedTuple):
 
 
 class Reply(NamedTuple):
-    """What comes back for a chunk; `call` is the number of the call.
+    """What a worker has found for a chunk, or raised; `call` is the number of the call.
 
     Dask takes a call with the arguments of an earlier one for that one, and would answer that its worker died.
     """
 
-    result: Result | None
-    error: BaseException | None
+    found: Result | BaseException
     call: int
 
 
 _PROGRAM = uuid4().hex
 _WATCH = "watches the driver"
-_loaded: OrderedDict[str, Compute] = OrderedDict()
+_loaded: OrderedDict[str, Work] = OrderedDict()
 """Work of this process by its digest."""
 
 
@@ -376,29 +306,28 @@ def name_process() -> ProcessName:
 
 
 def compute_in_worker(
-    key: str, packed: bytes, driver: ProcessName, limits: Limits, index: Index, chunk: Chunk, call: int
+    key: str, packed: bytes, driver: ProcessName, limits: Limits, index: Index, chunk: Request, call: int
 ) -> Reply:
     """Compute a chunk in a worker of any kind; the driver, which may be one, is neither ended nor limited."""
-    in_driver = name_process() == driver
     try:
-        compute = _load(key, packed, driver, limits)
+        work = _load(key, packed, driver, limits)
     except BaseException as error:
         words = f"A worker process cannot load the problem ({describe(error)})."
-        return Reply(None, ExecutorError(words), call)
-    seconds = None if in_driver else limits.seconds
+        return Reply(ExecutorError(words), call)
+    seconds = None if name_process() == driver else limits.seconds
     with open(os.devnull, "w", encoding="utf-8") as nothing:
         if seconds is not None:
             faulthandler.dump_traceback_later(seconds, exit=True, file=nothing)
         try:
-            return Reply(compute(index, chunk), None, call)
+            return Reply(work(chunk, index), call)
         except BaseException as error:
-            return Reply(None, make_portable(error), call)
+            return Reply(make_portable(error), call)
         finally:
             if seconds is not None:
                 faulthandler.cancel_dump_traceback_later()
 
 
-def _load(key: str, packed: bytes, driver: ProcessName, limits: Limits) -> Compute:
+def _load(key: str, packed: bytes, driver: ProcessName, limits: Limits) -> Work:
     """Return the work, and limit the process when it is new."""
     if key not in _loaded:
         import cloudpickle  # only workers need it
@@ -437,7 +366,7 @@ def limit_memory(n_bytes: float | None) -> None:
     resource.setrlimit(resource.RLIMIT_DATA, (soft, hard))
 
 
-def pack(work: Any) -> bytes:
+def pack(work: Work) -> bytes:
     """Return work as bytes; functions of a script or a notebook, closures and lambdas go with it."""
     import cloudpickle
 

@@ -299,8 +299,10 @@ class ExecutorOptions:
             raise ValueError(f"Expected --memory-limit to be a number of GiB above 0, got {self.memory_limit}.")
         memory = None if self.memory_limit is None else self.memory_limit * 2.0**30
         if self.executor == "ray":
-            return samplers.RayCluster(self.address, self.workers, self.time_limit, memory_limit=memory)
-        return samplers.LocalProcesses(self.workers, self.time_limit, memory)
+            return samplers.RayCluster(
+                self.address, workers=self.workers, time_limit=self.time_limit, memory_limit=memory
+            )
+        return samplers.LocalProcesses(self.workers, time_limit=self.time_limit, memory_limit=memory)
 
 
 for _kind in (Question, ExecutorOptions):

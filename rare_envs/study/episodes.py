@@ -241,19 +241,17 @@ def describe_simulations(estimate: Estimate, first: int, n: int) -> SimulationRo
 
     The further run has the number after the last replicate, and its simulations have no weight in p.
     """
-    index, further = estimate.simulations, estimate.ensemble_run
-    more = None if further is None else further.simulations
+    further = estimate.ensemble_run
+    n_first, n_more = (sum(n for _, n, _ in run.spans) if run is not None else 0 for run in (estimate, further))
     rows = SimulationRows(np.full(n, -1), np.full(n, -1), np.full(n, np.nan))
-    n_first = 0 if index is None else index.n
     inside = max(min(n_first - first, n), 0)
-    if index is not None and inside:
-        for whole, part in zip(rows, index.describe(first, inside), strict=True):
-            whole[:inside] = part
+    for whole, part in zip(rows, estimate.describe_simulations(first, inside), strict=True):
+        whole[:inside] = part
     start = first + inside - n_first
-    rest = 0 if index is None or more is None else max(min(more.n - start, n - inside), 0)
-    if index is not None and more is not None and rest:
-        rows.run[inside : inside + rest] = 1 + max(number for number, _, _ in index.spans)
-        rows.stage[inside : inside + rest] = more.describe(start, rest).stage
+    rest = max(min(n_more - start, n - inside), 0)
+    if further is not None and n_first and rest:
+        rows.run[inside : inside + rest] = 1 + max(number for number, _, _ in estimate.spans)
+        rows.stage[inside : inside + rest] = further.describe_simulations(start, rest).stage
     return rows
 
 

@@ -43,11 +43,11 @@ def open_executor(name: str, workers: int = 2, **limits: Any) -> Iterator[Any]:
         yield samplers.LocalProcesses(workers, **limits)
     elif name == "futures":
         spawn = multiprocessing.get_context("spawn")
-        yield samplers.FuturesPool(lambda: ProcessPoolExecutor(workers, mp_context=spawn), workers, **limits)
+        yield samplers.FuturesPool(lambda: ProcessPoolExecutor(workers, mp_context=spawn), workers=workers, **limits)
     elif name == "loky":
         import loky
 
-        yield samplers.FuturesPool(lambda: loky.ProcessPoolExecutor(workers), workers, **limits)
+        yield samplers.FuturesPool(lambda: loky.ProcessPoolExecutor(workers), workers=workers, **limits)
     elif name == "dask":
         with open_dask(workers) as pool:
             yield samplers.FuturesPool(pool, **limits)

@@ -7,7 +7,7 @@ import pytest
 
 import samplers
 from samplers.evaluate import Evaluator
-from samplers.method import Interrupted, Outcome, offer_of, request_gradients, request_terms
+from samplers.method import Interrupted, Outcome, Request, offer_of, request_gradients, request_terms
 from samplers.problem import EvaluationError, TermGradients, Terms
 from samplers.sample import Level, Status
 
@@ -321,6 +321,6 @@ def test_terms_and_gradients_of_a_wrong_shape_or_cost_are_an_error():
 
 def test_the_number_of_terms_is_the_same_in_every_batch():
     one = Evaluator(Given(lambda x: x[:, : len(x)]))
-    one.terms(X[:2])
+    one.respond([Request("terms", (X[:2],))])
     with pytest.raises(EvaluationError, match=r"same number of terms in every batch, got \[1, 2\]"):
-        one.terms(X[:1])
+        one.respond([Request("terms", (X[:1],))])

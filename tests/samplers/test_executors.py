@@ -26,7 +26,6 @@ import pytest
 import samplers
 from samplers import executors
 from samplers.executors import FuturesPool, LocalProcesses, RayCluster
-from samplers.workers import Chunk
 from tests.samplers.faulty_functions import BAD, FAULTS, KillsItself, matrix, problem
 from tests.samplers.real_executors import LIBRARIES, case, open_executor
 
@@ -297,7 +296,7 @@ class Lossy:
         self.sizes: list[int] = []
 
     def submit(self, function: Any, *arguments: Any) -> Future[Any]:
-        chunk: Chunk = arguments[-2]
+        chunk = arguments[-2]
         self.jobs = [job for job in self.jobs if not job.done()]
         self.sizes.append(len(chunk))
         job: Future[Any] = Future()

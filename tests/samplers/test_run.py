@@ -15,7 +15,7 @@ from samplers.estimation import EstimationInterrupted, defer_signals, show_bar
 from samplers.limit_states import half_space
 from samplers.method import Answer, Goal, Outcome, combine
 from samplers.problem import EvaluationError, FloatArray
-from samplers.run import Progress, Replicate, Run, RunArguments
+from samplers.run import Progress, Run, RunArguments
 from samplers.sample import Status, binomial_cov, clopper_pearson
 
 EASY = half_space(2, 2.0).problem
@@ -168,27 +168,20 @@ def test_a_method_must_return_an_outcome():
         run.tell(run.ask()[:, 0])
 
 
-def one_after_another(problem, method, seed, replicates, max_sim):
+def one_after_another(drive, problem, method, seed, replicates, max_sim):
     """The same runs without any interleaving."""
-    outcomes = []
-    for i in range(replicates):
-        share = None if max_sim is None else max_sim // replicates
-        goal = Goal(gamma=0.0, max_sim=share)
-        rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(i,)))
-        run = Replicate(method.steps(problem, goal, rng), goal, problem.dim)
-        while run.outcome is None:
-            run.tell(problem.evaluate(run.requested))
-        outcomes.append(run.outcome)
-    return combine(outcomes, 0.95)
+    goal = Goal(gamma=0.0, max_sim=None if max_sim is None else max_sim // replicates)
+    rngs = [np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(i,))) for i in range(replicates)]
+    return combine([drive(method.steps(problem, goal, rng), problem).value for rng in rngs], 0.95)
 
 
 @pytest.mark.parametrize(
     ("method", "max_sim"), [("adss", None), ("ce", 6000), ("ice", None), ("mc", 6000), ("two-stage", 6000)]
 )
-def test_side_by_side_is_one_after_another_in_fewer_calls(method, max_sim, recorder):
+def test_side_by_side_is_one_after_another_in_fewer_calls(method, max_sim, recorder, drive):
     problem, chosen = half_space(3, 3.0).problem, samplers.get_method(method)
     alone, together = (recorder(problem.f) for _ in range(2))
-    expected = one_after_another(samplers.FunctionProblem(alone, 3), chosen, 7, 3, max_sim)
+    expected = one_after_another(drive, samplers.FunctionProblem(alone, 3), chosen, 7, 3, max_sim)
     result = samplers.estimate(samplers.FunctionProblem(together, 3), chosen, seed=7, replicates=3, max_sim=max_sim)
     assert result.p == expected.p
     assert result.interval == expected.interval

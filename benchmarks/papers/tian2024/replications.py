@@ -213,7 +213,7 @@ def run_replication(job: ReplicationJob) -> ReplicationRun:
 
 def _count_final(result: Estimate) -> int:
     """Return the draws that have a weight in p; all simulations where the points of chains stand for each other."""
-    weighted = result.simulations.weights if result.simulations is not None else ()
+    weighted = result.draw_weights
     if not weighted and isinstance(result.method, TwoStage) and result.sample is not None:
         return result.sample.n_units  # the search by terms weights points of its own
     return sum(len(part.log_weights) for part in weighted) or result.n_sim
@@ -233,9 +233,8 @@ def _subsets(result: Estimate, dim: int) -> tuple[Levels, tuple[Levels, ...]]:
     `dim` is the number of parameters that are not noise, the first of x.
     """
     assert result.points is not None
-    assert result.simulations is not None
     x, f = result.points.x[:, :dim], result.points.f
-    stage = result.simulations.describe(0, result.n_sim).stage
+    stage = result.describe_simulations(0, result.n_sim).stage
     bounds = [np.inf, *(level.gamma for level in result.trace[:-1])]
     subsets = [x[(stage == level) & (f <= bound)] for level, bound in enumerate(bounds)]
     means = tuple(tuple(subset.mean(axis=0).tolist()) for subset in subsets if len(subset))

@@ -184,7 +184,7 @@ def test_p_is_the_sum_of_the_weights_of_single_simulations(dim, p, options):
     """Gradients cost simulations and are none, so that there are fewer of them than `n_sim`."""
     problem, _, _ = half_spaces(dim, p)
     result = samplers.estimate(problem, seed=2, max_sim=3000, keep_points=True, **options)
-    rows = result.simulations.describe(0, len(result.points.f))
+    rows = result.describe_simulations(0, len(result.points.f))
     known = ~np.isnan(rows.log_weight)
     weights = np.exp(rows.log_weight[known])
     assert weights[result.points.f[known] <= 0].sum() == pytest.approx(result.p, rel=1e-12)

@@ -63,10 +63,10 @@ def test_a_device_that_is_not_here_is_refused_by_each_command(
 
 
 def test_options_name_an_executor() -> None:
-    assert ExecutorOptions(workers=3, memory_limit=2.0).make() == samplers.LocalProcesses(3, None, 2.0**31)
+    assert ExecutorOptions(workers=3, memory_limit=2.0).make() == samplers.LocalProcesses(3, memory_limit=2.0**31)
     assert ExecutorOptions(executor="local").make() == samplers.LocalProcesses()
     ray = ExecutorOptions(executor="ray", address="auto", time_limit=9.0, memory_limit=1.0)
-    assert ray.make() == samplers.RayCluster("auto", None, 9.0, memory_limit=2.0**30)
+    assert ray.make() == samplers.RayCluster("auto", time_limit=9.0, memory_limit=2.0**30)
 
 
 def test_executor_options_that_do_not_go_together_are_one_line(cli: Cli) -> None:
