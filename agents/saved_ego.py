@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from agents.files import report_missing_file
 from agents.safe_pickle import TRUST, TRUST_ADVICE, ForbiddenObject, find_origin_risks, open_pickle
 from agents.sb3_archive import build_model, find_algorithm, find_algorithm_class, make_training_stubs, read_header
-from rare_envs.egos.wrappers import UNBOUNDED, FrameStackedPolicy, NormalisedPolicy, find_stacking
+from rare_envs.egos.wrappers import UNBOUNDED, WrappedPolicy, find_stacking
 from rare_envs.plugins import one_line
 
 HUB_PREFIX = "hf:"
@@ -96,8 +96,9 @@ class SavedEgo:
     @cached_property
     def same_as(self) -> Any:
         """The model behind its statistics and stacks: it acts as this does; compiled rollouts read its network."""
-        policy = self.model if self.frames is None else FrameStackedPolicy(self.model, *self.frames)
-        return policy if self.statistics is None else NormalisedPolicy(policy, self.statistics.normalize_obs)
+        if self.statistics is None:
+            return self.model
+        return WrappedPolicy(self.model, self.statistics.normalize_obs, *(self.frames or ()))
 
     def find_missing_statistics(self, expected: Any) -> str:
         """Return why it seems to have been trained on normalised observations, if it has no statistics; "" if not.

@@ -29,8 +29,7 @@ from rare_envs.egos.dense_policies import NotCompiled
 from rare_envs.egos.needs import (
     DRIVES_ITSELF,
     TAKEN_AS_ACCELERATIONS,
-    AmbiguousActions,
-    MissingStatistics,
+    EgoWarning,
     choose_action,
     choose_observation,
     load_named_ego,
@@ -161,13 +160,11 @@ class DrivingProblem:
         said_by_id = bool(layout) and not self.needs.queries_policy  # nobody named its actions
         for note in self.notes:
             if note != TAKEN_AS_ACCELERATIONS and not said_by_id:
-                warnings.warn(note, AmbiguousActions, stacklevel=2)
+                warnings.warn(note, EgoWarning, stacklevel=2)
         missing = describe_missing_normalisation(ego, self.world.observation_space)
         if missing:
             advice = "name their file, load_ego(path, stats=FILE), or hand in an ego that normalises before it predicts"
-            warnings.warn(
-                f"the ego has no VecNormalize statistics, but {missing}; {advice}", MissingStatistics, stacklevel=2
-            )
+            warnings.warn(f"the ego has no VecNormalize statistics, but {missing}; {advice}", EgoWarning, stacklevel=2)
 
     def __repr__(self) -> str:
         """Return one line."""
@@ -206,7 +203,7 @@ class DrivingProblem:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What cannot be checked or changes nothing; the grave ones also came as an `AmbiguousActions` warning."""
+        """What cannot be checked or changes nothing; the grave ones also came as an `EgoWarning`."""
         action = self.world.clock.action
         if not self.needs.queries_policy:
             return () if action == "continuous" else (DRIVES_ITSELF.format(action=action),)

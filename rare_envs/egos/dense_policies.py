@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn.functional import linear
 
-from rare_envs.egos.wrappers import NormalisedPolicy, RescaledPolicy
+from rare_envs.egos.wrappers import WrappedPolicy
 
 Activation = Literal["tanh", "relu"]
 ACTIVATIONS: dict[type[nn.Module], Activation] = {nn.Tanh: "tanh", nn.ReLU: "relu"}
@@ -57,10 +57,10 @@ def read_dense_policy(policy: Any) -> DensePolicy:
     hyperbolic tangents or rectifiers, behind `VecNormalize` or not; or an ego whose class has `predict` and `same_as`,
     a policy that gives the same actions for the same observations.
     """
-    if type(policy) is RescaledPolicy:
-        return replace(read_dense_policy(policy.policy), rescale=(policy.low, policy.high))
-    if type(policy) is NormalisedPolicy:
-        return replace(read_dense_policy(policy.policy), normalisation=_read_statistics(policy.normalise))
+    if type(policy) is WrappedPolicy and not policy.stacks:
+        dense = read_dense_policy(policy.policy)
+        normalisation = dense.normalisation if policy.normalise is None else _read_statistics(policy.normalise)
+        return replace(dense, rescale=policy.bounds or dense.rescale, normalisation=normalisation)
     own = vars(type(policy))
     if "same_as" in own and "predict" in own:  # of one class: a subclass may predict in another way
         return read_dense_policy(policy.same_as)
@@ -84,6 +84,7 @@ def _read_network(policy: Any) -> DensePolicy:
         features, parts = policy.pi_features_extractor, [policy.mlp_extractor.policy_net, policy.action_net]
         known = (distributions.DiagGaussianDistribution, distributions.CategoricalDistribution)
         plain = type(policy.action_dist) in known and not policy.squash_output
+        _refuse_changed(policy.action_dist)
     elif type(policy) is DQNPolicy and type(policy.q_net) is QNetwork:
         features, parts, plain = policy.q_net.features_extractor, [policy.q_net.q_net], True
     else:
@@ -92,8 +93,6 @@ def _read_network(policy: Any) -> DensePolicy:
         raise NotCompiled(f"the ego, with a {type(policy).__name__} of other parts than dense layers, is not compiled")
     for module in policy.modules():
         _refuse_changed(module)
-    if type(policy) is ActorCriticPolicy:
-        _refuse_changed(policy.action_dist)
     in_turn = [part if type(part) is nn.Sequential else (part,) for part in parts]
     layers, activation = _read_layers([module for modules in in_turn for module in modules])
     space = policy.action_space
@@ -134,15 +133,13 @@ def _read_statistics(normalise: Any) -> tuple[Any, Any, float] | None:
     module = sys.modules.get(f"{SB3}.common.vec_env.vec_normalize")
     if module is None or type(statistics) is not module.VecNormalize or normalise.__name__ != "normalize_obs":
         raise NotCompiled("an ego behind a normalisation of its own is not compiled")
-    if vars(statistics).keys() & {"normalize_obs", "_normalize_obs"}:
-        raise NotCompiled("an ego behind a VecNormalize that was changed is not compiled")
-    if not statistics.norm_obs:
+    changed = vars(statistics).keys() & {"normalize_obs", "_normalize_obs"}
+    if not changed and not statistics.norm_obs:
         return None
     moments = statistics.obs_rms
-    if not hasattr(moments, "mean"):
+    if changed or not hasattr(moments, "mean"):
         raise NotCompiled("an ego behind a VecNormalize that was changed is not compiled")
-    deviation = np.sqrt(moments.var + statistics.epsilon)
-    return moments.mean, deviation, float(statistics.clip_obs)
+    return moments.mean, np.sqrt(moments.var + statistics.epsilon), float(statistics.clip_obs)
 
 
 _ACTIVATIONS = {"tanh": lambda doubled: doubled.sigmoid_().sub_(0.5), "relu": torch.relu_}
@@ -202,7 +199,7 @@ class DenseInference:
 
 def find_inference(policy: Any) -> Any:
     """Return what gives a policy's actions soonest, behind its wrappers: its layers alone, or the policy itself."""
-    if type(policy) in (RescaledPolicy, NormalisedPolicy):
+    if type(policy) is WrappedPolicy and not policy.stacks:
         return replace(policy, policy=find_inference(policy.policy))
     try:
         dense = read_dense_policy(policy)

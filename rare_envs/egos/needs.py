@@ -1,6 +1,8 @@
 """Needs of egos: what an ego is, what it needs of its world, and which observation and actions fit its spaces.
 
-`resolve` reads once what an ego needs and says about itself; Protocols name what it may have.
+An ego may have `predict` (Stable-Baselines3's), `act` (a `Driver`, with `needs_lidar` if it reads lidar features by
+itself), or `in_world` and `noise_columns`: it becomes a driver only in a world, with noise of its own, maybe around
+another `ego`.
 """
 
 from __future__ import annotations
@@ -10,7 +12,7 @@ from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 import numpy as np
 import torch
@@ -20,38 +22,9 @@ from rare_envs.control.actions import DISCRETE_ACTIONS
 from rare_envs.control.idm import IDM
 from rare_envs.egos.human import HumanEgo
 from rare_envs.egos.wrappers import find_action_bounds, find_frame_stacking
-from rare_envs.plugins import check_predict, is_policy
+from rare_envs.plugins import check_predict, is_policy, refuse_ego
 from rare_envs.simulation.observation import ELSEWHERE, OBSERVATIONS, map_kinds, observation_space, read_kinds
-from rare_envs.simulation.world import Driver, World
-
-
-@runtime_checkable
-class PerceivingDriver(Driver, Protocol):
-    """A driver that reads `Episode.perception` by itself, whatever the environment observes."""
-
-    @property
-    def needs_lidar(self) -> bool:
-        """Whether it reads lidar features."""
-
-
-@runtime_checkable
-class WorldEgo(Protocol):
-    """An ego that becomes a driver only in a world, with noise of its own, such as a human driver."""
-
-    def noise_columns(self, world: World) -> int:
-        """Return how many standard normal columns of x are its noise in a world."""
-
-    def in_world(self, world: World) -> Driver:
-        """Return the driver that it is in a world."""
-
-
-@runtime_checkable
-class WrappedEgo(WorldEgo, Protocol):
-    """An ego behind something that stands between it and its world, such as an imperfect stack."""
-
-    @property
-    def ego(self) -> Any:
-        """The ego behind it."""
+from rare_envs.simulation.world import World
 
 
 @dataclass(frozen=True)
@@ -71,8 +44,8 @@ class EgoNeeds:
     """Whether a policy with `predict` decides, be it behind other parts of the ego."""
     varies: bool = False
     """Whether it says that its answers differ from run to run, by randomness that is not part of x."""
-    noise: WorldEgo | None = None
-    """Its part that has noise in x; None without one."""
+    noise: Any = None
+    """Its part that has noise in x: an object whose `noise_columns` says of a world how many columns; None without."""
     observation_space: Any = None
     """The space of its observations, as it declares it; None if it does not."""
 
@@ -83,7 +56,7 @@ class EgoNeeds:
 
     def noise_columns(self, world: World) -> int:
         """Return how many columns of x are its own noise, the last ones."""
-        return 0 if self.noise is None else self.noise.noise_columns(world)
+        return 0 if self.noise is None else int(self.noise.noise_columns(world))
 
 
 @dataclass(frozen=True)
@@ -219,12 +192,8 @@ DRIVES_ITSELF = "the ego accelerates and steers by itself: action={action!r} (--
 """Scripts and learned drivers have no actions of another kind."""
 
 
-class AmbiguousActions(UserWarning):
-    """An ego's actions can be taken in two ways, or are not of the kind that was named."""
-
-
-class MissingStatistics(UserWarning):
-    """An ego seems to have been trained on normalised observations, and the statistics are not there."""
+class EgoWarning(UserWarning):
+    """An ego's actions can be taken in two ways or are not of the kind that was named, or statistics seem to miss."""
 
 
 def name_ambiguities(action_space: Any, kinds: Collection[str]) -> tuple[str, ...]:
@@ -248,15 +217,14 @@ def resolve(ego: Any, vehicles: int = 1) -> EgoNeeds:
 
     An ego that wraps another one needs what that one needs, and noise columns of its own.
     """
+    # The ego may be anybody's object, such as a Stable-Baselines3 model: it may declare these or not.
     ego = find_rule_based(ego)
-    if isinstance(ego, WrappedEgo):
-        return replace(resolve(ego.ego, vehicles), noise=ego)
-    if isinstance(ego, WorldEgo):
-        return EgoNeeds(noise=ego)
+    if hasattr(ego, "in_world"):
+        inner = resolve(ego.ego, vehicles) if hasattr(ego, "ego") else EgoNeeds()
+        return replace(inner, noise=ego)
     if is_policy(ego):
         check_predict(ego)
-    # The ego may be anybody's object, such as a Stable-Baselines3 model: it may declare these or not.
-    lidar = isinstance(ego, PerceivingDriver) and ego.needs_lidar
+    lidar = hasattr(ego, "act") and bool(getattr(ego, "needs_lidar", False))
     observed = getattr(ego, "observation_space", None)
     return EgoNeeds(
         observations=EgoNeeds.observations if observed is None else find_fitting_kinds(observed, vehicles),
@@ -271,7 +239,10 @@ def resolve(ego: Any, vehicles: int = 1) -> EgoNeeds:
 
 def find_rule_based(ego: Any) -> Any:
     """Return the driver that "idm" or "human" names, a policy for a plain function, and any other ego as it is."""
-    return RULE_BASED_EGOS.get(ego, ego) if isinstance(ego, str) else wrap_callable(ego)
+    ego = RULE_BASED_EGOS.get(ego, ego) if isinstance(ego, str) else wrap_callable(ego)
+    if isinstance(ego, str | type):  # a class has the attributes of its egos
+        refuse_ego(ego, known=tuple(RULE_BASED_EGOS))
+    return ego
 
 
 LOADER = "agents.loading"

@@ -16,7 +16,7 @@ from torch import Tensor
 from rare_envs.control.actions import DISCRETE_ACTIONS, IDLE, META_ACTIONS, read_actions, to_physical
 from rare_envs.devices import move_to
 from rare_envs.egos.dense_policies import DenseInference, find_inference
-from rare_envs.egos.needs import RULE_BASED_EGOS, EgoNeeds, ModuleEgo, WorldEgo, find_rule_based, resolve, takes_indices
+from rare_envs.egos.needs import RULE_BASED_EGOS, EgoNeeds, ModuleEgo, find_rule_based, resolve, takes_indices
 from rare_envs.egos.wrappers import find_frame_stacking, wrap_policy
 from rare_envs.plugins import NoAnswer, reason_of, refuse_ego
 from rare_envs.simulation.background import Background, TrafficBackground
@@ -209,14 +209,13 @@ def find_device_driver(driver: Driver, device: torch.device, before: Driver | No
 def as_driver(ego: Any, world: World, needs: EgoNeeds | None = None) -> Driver:
     """Return the Driver that an ego stands for in a world, which has what `resolve` says it needs; else a ValueError.
 
-    "idm", "human", a `Driver`, an object with `predict`, a `WorldEgo`, or a function or torch module from observations
-    to actions. `needs` is the answer of `resolve`, if it is known already.
+    "idm", "human", a `Driver`, an object with `predict`, an ego of worlds, or a function or torch module of
+    observations. `needs` is the answer of `resolve`, if it is known already.
     """
     ego = find_rule_based(ego)
-    if isinstance(ego, str | type):  # a class has the attributes of its egos
-        refuse_ego(ego, known=tuple(RULE_BASED_EGOS))
-    if isinstance(ego, WorldEgo):
-        return ego.in_world(world)
+    if hasattr(ego, "in_world"):
+        driver: Driver = ego.in_world(world)
+        return driver
     needs = needs or resolve(ego, world.scenario.vehicles)
     if needs.queries_policy:
         check_spaces(ego, world.observation_space, world.clock.action, needs.observation)
@@ -229,7 +228,7 @@ def as_driver(ego: Any, world: World, needs: EgoNeeds | None = None) -> Driver:
     if isinstance(ego, Background | TrafficBackground):
         raise ValueError("These drivers drive the traffic around an ego; as an ego take agents.LearnedEgo(driver).")
     if callable(getattr(ego, "act", None)):  # anybody's object
-        driver: Driver = ego
+        driver = ego
         return driver
     refuse_ego(ego, known=tuple(RULE_BASED_EGOS))
 

@@ -16,77 +16,66 @@ UNBOUNDED = "it declares observations without bounds, as behind Gymnasium's Norm
 
 
 @dataclass(frozen=True)
-class NormalisedPolicy:
-    """A policy whose observations are first normalised by a function, such as SB3's `VecNormalize.normalize_obs`."""
+class WrappedPolicy:
+    """A policy behind what it was trained behind: normalised and stacked observations, actions with other bounds."""
 
     policy: Any
-    normalise: Callable[[NDArray[Any]], NDArray[Any]]
-
-    def predict(
-        self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = True
-    ) -> Any:
-        """Stable-Baselines3's `predict` on observations as the environment gives them."""
-        shown = self.normalise(observation)
-        return self.policy.predict(shown, state=state, episode_start=episode_start, deterministic=deterministic)
-
-
-@dataclass(frozen=True)
-class FrameStackedPolicy:
-    """A policy that sees the last k observations; they are kept in its state, oldest first.
-
-    With one axis as in SB3's `VecFrameStack` (side by side along the last axis, zeros before the first observation),
-    with a new axis as in Gymnasium's `FrameStackObservation` (copies of the first observation before it).
-    """
-
-    policy: Any
-    frames: int
-    """k."""
+    normalise: Callable[[NDArray[Any]], NDArray[Any]] | None = None
+    """Normalises observations, such as SB3's `VecNormalize.normalize_obs`; single ones, or stacks if `whole`."""
+    frames: int = 1
+    """Number k of the last observations that it sees; they are kept in its state, oldest first."""
     new_axis: bool = False
+    """Whether they are along an axis of their own, as in Gymnasium's `FrameStackObservation` (copies of the first
+    observation before it); else side by side along the last axis, as in SB3's `VecFrameStack` (zeros before it)."""
+    whole: bool = False
+    bounds: tuple[NDArray[Any], NDArray[Any]] | None = None
+    """Bounds of its actions that are mapped to [-1, 1], as Gymnasium's `RescaleAction` maps them."""
+
+    @property
+    def stacks(self) -> bool:
+        """Whether it sees frames."""
+        return self.frames > 1 or self.new_axis
 
     def predict(
         self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = True
     ) -> Any:
-        """Stable-Baselines3's `predict` on single observations."""
-        starts = np.full(batch_size(observation), state is None)
+        """Stable-Baselines3's `predict` on observations as the environment gives them, with actions in [-1, 1]."""
+        seen, shown = None, observation
+        if self.normalise is not None and not self.whole:
+            shown = self.normalise(shown)
+        if self.stacks:
+            seen, state = (None, None) if state is None else state
+            seen = self._add_frame(seen, shown, episode_start)
+            shown = map_kinds(self._show_frames, seen)
+        if self.normalise is not None and self.whole:
+            shown = self.normalise(shown)
+        action, state = self.policy.predict(
+            shown, state=state, episode_start=episode_start, deterministic=deterministic
+        )
+        if self.bounds is not None:
+            low, high = (bound.astype(np.float64) for bound in self.bounds)
+            action = ((2.0 * np.asarray(action) - low - high) / (high - low)).astype(np.float32)
+        return action, (seen, state) if self.stacks else state
+
+    def _add_frame(self, seen: Any, shown: Any, episode_start: Any) -> Any:
+        """Return the last k observations, (k, B, ...), of which the latest is shown."""
+        starts = np.full(batch_size(shown), seen is None)
         if episode_start is not None:
             starts |= np.asarray(episode_start, dtype=bool)
 
-        def later(old: NDArray[Any], now: NDArray[Any]) -> NDArray[Any]:
+        def add(old: NDArray[Any], now: NDArray[Any]) -> NDArray[Any]:
             new: NDArray[Any] = np.concatenate((old[1:], now[None]))
             new[:-1, starts] = now[starts] if self.new_axis else 0
             return new
 
-        def side_by_side(frames: NDArray[Any]) -> NDArray[Any]:
-            shown = np.moveaxis(frames, 0, 1) if self.new_axis else np.concatenate(tuple(frames), axis=-1)
-            return np.ascontiguousarray(shown)
+        if seen is None:
+            seen = map_kinds(lambda now: np.zeros((self.frames, *now.shape), now.dtype), shown)
+        return map_kinds(add, seen, shown)
 
-        fresh = map_kinds(lambda now: np.zeros((self.frames, *now.shape), now.dtype), observation)  # (k, B, ...)
-        seen, inner = (fresh, None) if state is None else state
-        seen = map_kinds(later, seen, observation)
-        shown = map_kinds(side_by_side, seen)
-        action, inner = self.policy.predict(
-            shown, state=inner, episode_start=episode_start, deterministic=deterministic
-        )
-        return action, (seen, inner)
-
-
-@dataclass(frozen=True)
-class RescaledPolicy:
-    """A policy whose actions are mapped from their bounds to [-1, 1], as Gymnasium's `RescaleAction` maps them."""
-
-    policy: Any
-    low: NDArray[Any]
-    high: NDArray[Any]
-
-    def predict(
-        self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = True
-    ) -> Any:
-        """Stable-Baselines3's `predict` with actions in [-1, 1]."""
-        action, state = self.policy.predict(
-            observation, state=state, episode_start=episode_start, deterministic=deterministic
-        )
-        low, high = (bound.astype(np.float64) for bound in (self.low, self.high))
-        return ((2.0 * np.asarray(action) - low - high) / (high - low)).astype(np.float32), state
+    def _show_frames(self, frames: NDArray[Any]) -> NDArray[Any]:
+        """Return frames (k, B, ...) as the policy sees them."""
+        shown = np.moveaxis(frames, 0, 1) if self.new_axis else np.concatenate(tuple(frames), axis=-1)
+        return np.ascontiguousarray(shown)
 
 
 def find_action_bounds(space: Any) -> tuple[NDArray[Any], NDArray[Any]] | None:
@@ -141,20 +130,16 @@ def wrap_policy(policy: Any, given: spaces.Space[Any]) -> Any:
     `get_vec_normalize_env`, if it has one, gives SB3's `VecNormalize`, whose space tells whether observations are
     normalised before or after they are stacked.
     """
-    # A Stable-Baselines3 model has both; anybody else's object need not.
+    # A Stable-Baselines3 model has all three; anybody else's object need not.
     bounds = find_action_bounds(getattr(policy, "action_space", None))
     wanted = getattr(policy, "observation_space", None)
-    frames, new_axis = (find_frame_stacking(given, wanted) if wanted is not None else None) or (1, False)
+    stacking = (find_frame_stacking(given, wanted) if wanted is not None else None) or (1, False)
     statistics: Any = getattr(policy, "get_vec_normalize_env", lambda: None)()
     normalise = statistics.normalize_obs if statistics is not None and statistics.norm_obs else None
+    if stacking == (1, False) and normalise is None and bounds is None:
+        return policy
     whole = normalise is not None and find_frame_stacking(statistics.observation_space, wanted) == (1, False)
-    if normalise is not None and whole:
-        policy = NormalisedPolicy(policy, normalise)
-    if frames > 1 or new_axis:
-        policy = FrameStackedPolicy(policy, frames, new_axis)
-    if normalise is not None and not whole:
-        policy = NormalisedPolicy(policy, normalise)
-    return policy if bounds is None else RescaledPolicy(policy, *bounds)
+    return WrappedPolicy(policy, normalise, *stacking, whole, bounds)
 
 
 def describe_missing_normalisation(policy: Any, given: spaces.Space[Any]) -> str:

@@ -228,7 +228,7 @@ def decode(outputs: SingleArray, policy: PolicyNumbers) -> tuple[float, float]:
 
 @compiled
 def decode_one(outputs: SingleArray, policy: PolicyNumbers, number: int) -> float:
-    """Return an output in [-1, 1]: clipped, and rescaled as `rare_envs.egos.wrappers.RescaledPolicy` does."""
+    """Return an output in [-1, 1]: clipped, and rescaled as `rare_envs.egos.wrappers.WrappedPolicy` does."""
     value = clip(outputs[number], policy.low[number], policy.high[number])
     if policy.rescales:
         low, high = policy.rescale_low[number], policy.rescale_high[number]

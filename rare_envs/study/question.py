@@ -34,7 +34,7 @@ from agents.loading import find_ego_kind, strip_prefixes
 from agents.saved_ego import HUB_PREFIX, find_cached_model, find_statistics
 from rare_envs.distributions.fitted import FittedDistribution
 from rare_envs.distributions.space import Distribution
-from rare_envs.egos.needs import AmbiguousActions, MissingStatistics
+from rare_envs.egos.needs import EgoWarning
 from rare_envs.files import parse_json_object, read_text_file
 from rare_envs.measures.registry import MEASURES
 from rare_envs.plugins import EgoGone
@@ -232,8 +232,7 @@ def _check_threshold(question: Question) -> None:
 def build_problem(question: Question, ego: Any) -> DrivingProblem:
     """Return the problem of a question; what it cannot check is among its notes, without a warning."""
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", AmbiguousActions)
-        warnings.simplefilter("ignore", MissingStatistics)  # the report says it
+        warnings.simplefilter("ignore", EgoWarning)  # the report says it
         return DrivingProblem(
             question.env_id,
             ego=ego,

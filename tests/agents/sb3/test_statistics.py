@@ -18,7 +18,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 import rare_envs
 from agents import SavedEgo, load_ego
 from agents.saved_ego import describe_missing_statistics, find_statistics
-from rare_envs.egos.needs import MissingStatistics
+from rare_envs.egos.needs import EgoWarning
 
 ENV = "rare_envs/CarFollowing-v0"
 SETTINGS: dict[str, Any] = {"n_steps": 8, "batch_size": 8, "seed": 0, "device": "cpu"}
@@ -43,7 +43,7 @@ def normalised(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
 def test_observations_are_normalised_once(normalised: tuple[Path, Path], tmp_path: Path) -> None:
     path, statistics = normalised
     shutil.copy(path, tmp_path / "ego.zip")
-    with pytest.warns(MissingStatistics, match="trained behind VecNormalize"):
+    with pytest.warns(EgoWarning, match="trained behind VecNormalize"):
         plain = drive(load(tmp_path / "ego.zip"))
     shutil.copy(statistics, tmp_path / "vecnormalize.pkl")
     ego = load(tmp_path / "ego.zip")
@@ -157,8 +157,8 @@ def test_what_are_no_statistics_is_refused_in_one_line(
 
 def test_a_model_in_memory_says_that_its_statistics_stayed_in_the_training(tmp_path: Path) -> None:
     model = sb3.PPO("MlpPolicy", NormalizeObservation(gym.make(ENV, horizon=1.0)), **SETTINGS)
-    with pytest.warns(MissingStatistics, match="as behind Gymnasium's NormalizeObservation; name"):
+    with pytest.warns(EgoWarning, match="as behind Gymnasium's NormalizeObservation; name"):
         rare_envs.DrivingProblem(ENV, ego=model)
     model.save(tmp_path / "ego.zip")
-    with pytest.warns(MissingStatistics, match="NormalizeObservation"):
+    with pytest.warns(EgoWarning, match="NormalizeObservation"):
         rare_envs.DrivingProblem(ENV, ego=str(tmp_path / "ego.zip"))

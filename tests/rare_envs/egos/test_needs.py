@@ -11,9 +11,8 @@ from gymnasium import spaces
 
 import rare_envs
 from rare_envs.egos.needs import (
-    AmbiguousActions,
     EgoNeeds,
-    WrappedEgo,
+    EgoWarning,
     choose_action,
     choose_observation,
     find_fitting_kinds,
@@ -47,9 +46,7 @@ def test_a_wrapped_ego_needs_what_the_one_behind_it_needs_and_its_own_noise() ->
         def in_world(self, world: Any) -> Any:
             raise AssertionError("An ego is not driven to find its needs.")
 
-    ego = Behind()
-    assert isinstance(ego, WrappedEgo)
-    needs = resolve(ego, vehicles=3)
+    needs = resolve(Behind(), vehicles=3)
     assert (needs.observation, needs.dt, needs.varies, needs.queries_policy) == ("lidar", 0.2, True, True)
     assert needs.noise_columns(rare_envs.DrivingProblem(CUT_IN, horizon=0.5).world) == 35
 
@@ -125,7 +122,7 @@ def test_an_ego_that_drives_itself_says_that_named_actions_change_nothing(action
     told = f"the ego accelerates and steers by itself: action='{action}' (--action {action}) changes nothing for it"
     plain = rare_envs.DrivingProblem(CUT_IN, ego="imitation")
     assert plain.notes == ()
-    with pytest.warns(AmbiguousActions) as warned:
+    with pytest.warns(EgoWarning) as warned:
         named = rare_envs.DrivingProblem(CUT_IN, ego="imitation", action=action)
     assert [str(each.message) for each in warned] == [told]
     assert named.notes == (told,)

@@ -1,7 +1,6 @@
 """The problem of HighwayEnv's environments: f, workers, egos, and p against an integral."""
 
 import pickle
-import threading
 from typing import Any
 
 import numpy as np
@@ -13,7 +12,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 import rare_envs
 import samplers
 from rare_envs.egos.wrappers import wrap_policy
-from rare_envs.interop.problem import make_highway_env, strip_ego
+from rare_envs.interop.problem import BarePolicy, make_highway_env
 from tests.rare_envs.interop.egos import Always, faster
 
 FAST = {"vehicles_count": 3, "duration": 4}
@@ -95,7 +94,6 @@ def test_bad_input_is_refused_at_the_door() -> None:
         (3, {}, "got int"),
         (lambda: 3, {}, "got int from <function"),
         (lambda observation: 1, {}, "a function without arguments that makes one, got .* which fails: TypeError"),
-        (IDLE, {"workers": 0}, "workers of at least 1"),
         (IDLE, {"horizon": -1.0}, "horizon in seconds"),
         (IDLE, {"measure": "ttcc"}, "did you mean 'ttc'"),
     ]
@@ -108,10 +106,6 @@ def test_bad_input_is_refused_at_the_door() -> None:
         rare_envs.highway_env_problem("merge-v0", ego="idm", config={"duration": 5})
     with pytest.raises(ValueError, match="did you mean 'highway-fast-v0'"):
         rare_envs.highway_env_problem("highway-fast")
-    locked = Always(1)
-    locked.lock = threading.Lock()  # type: ignore[attr-defined]
-    with pytest.raises(ValueError, match="give a function without arguments that makes it"):
-        fast(locked, workers=2)
     problem = fast(Always(np.nan))
     x = problem.base.sample(1, np.random.default_rng(0))
     with pytest.raises(ValueError, match="not finite"):
@@ -124,11 +118,9 @@ def test_bad_input_is_refused_at_the_door() -> None:
 
 @pytest.mark.slow
 def test_workers_and_their_number_change_no_bit() -> None:
-    x = fast().base.sample(5, np.random.default_rng(1))
-    expected = fast(Always(3)).evaluate(x)
-    with fast(faster, workers=2) as problem:
-        np.testing.assert_array_equal(problem.evaluate(x), expected)
-        np.testing.assert_array_equal(problem.evaluate(x[::-1])[::-1], expected)
+    alone, shared = (samplers.estimate(fast(Always(3)), "mc", seed=1, max_sim=12, workers=n) for n in (None, 2))
+    np.testing.assert_array_equal(shared.p, alone.p)
+    np.testing.assert_array_equal(fast(faster).evaluate(shared.failures.x), shared.failures.f)
 
 
 def test_a_model_of_stable_baselines3_travels_without_its_environment() -> None:
@@ -137,7 +129,7 @@ def test_a_model_of_stable_baselines3_travels_without_its_environment() -> None:
     vec_env.obs_rms.mean[...] = 0.5  # type: ignore[union-attr]
     seen = np.random.default_rng(0).uniform(-1.0, 1.0, (1, 5, 5)).astype(np.float32)
     expected = model.predict(np.asarray(vec_env.normalize_obs(seen)), deterministic=True)[0]
-    there = wrap_policy(pickle.loads(pickle.dumps(strip_ego(model))), vec_env.observation_space)
+    there = wrap_policy(pickle.loads(pickle.dumps(BarePolicy(model))), vec_env.observation_space)
     assert there.normalise(seen)[0, 0, 0] == pytest.approx(vec_env.normalize_obs(seen)[0, 0, 0])  # type: ignore[call-overload]
     np.testing.assert_array_equal(there.predict(seen)[0], expected)
     problem = fast(model)

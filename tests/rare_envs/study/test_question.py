@@ -12,7 +12,7 @@ import pytest
 
 import agents
 import rare_envs
-from rare_envs.egos.needs import AmbiguousActions
+from rare_envs.egos.needs import EgoWarning
 from rare_envs.study import BadInput, Question, prepare
 from rare_envs.study.arguments import KEYS, list_arguments, read_question_file
 from rare_envs.study.cli.options import EVERYTHING
@@ -73,7 +73,7 @@ def test_what_actions_are_taken_for_is_pointed_out(cli: Cli, tmp_path: Path, mon
     asked = Question(env_id=FOLLOWING, ego="idle_egos:Idle", observation="kinematics", action="continuous")
     (found,) = (each for each in run_checks(asked) if isinstance(each, Finding) and each.found == note)
     assert (found.check, found.status) == ("action space", "warn")
-    with pytest.warns(AmbiguousActions, match="--action meta"):
+    with pytest.warns(EgoWarning, match="--action meta"):
         ego = agents.load_ego("idle_egos:Idle")
         rare_envs.DrivingProblem(FOLLOWING, ego=ego, observation="kinematics", action="continuous")
 
