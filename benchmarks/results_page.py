@@ -106,7 +106,7 @@ def format_known() -> Iterator[str]:
     records = [read(f"two_stage_seeds_{name}") for name in ("third", "hard", "visible", "blind")]
     yield "## Two-stage where p is known\n\n6,000 simulations, 60 seeds each, worst gain first. *low : high* counts"
     yield "intervals wholly below and wholly above p; *error / own* is the root mean square of a run's error over the"
-    yield "standard error that it states (`python -m benchmarks.estimators.two_stage.repeated_seeds`).\n"
+    yield "standard error that it states (`python -m benchmarks.samplers --method two-stage --runs 60`).\n"
     rows = sorted(
         (row for record in records for row in record["rows"] if row["gain"] is not None),
         key=lambda row: float(row["gain"]),

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.integrate import quad
-from scipy.special import log_ndtr, ndtr
+from scipy.special import ndtr
 from scipy.stats import chi2, ncx2
 
 from samplers.limit_states import Reference, integrate, normal_cdf, normal_mean
@@ -51,7 +51,7 @@ class LimitState:
 
 
 @functools.lru_cache(maxsize=8)
-def random_rotation(dim: int, seed: int) -> FloatArray:
+def random_rotation(dim: int, seed: int | tuple[int, ...]) -> FloatArray:
     """Return a random orthogonal matrix, uniform over all (QR with the signs of R made positive)."""
     q, r = np.linalg.qr(np.random.default_rng(seed).standard_normal((dim, dim)))
     rotation: FloatArray = q * np.sign(np.diag(r))
@@ -75,8 +75,8 @@ def half_spaces(dim: int, betas: Sequence[float], slopes: Sequence[float] = (), 
         return np.asarray(np.min(scale * (beta - u[:, : len(beta)]), axis=1))
 
     if not noise:
-        return LimitState(f, dim, _any(betas))
-    p = normal_mean(lambda z: _any([b + noise * z for b in betas]))
+        return LimitState(f, dim, any_of(*ndtr(-beta)))
+    p = normal_mean(lambda z: any_of(*ndtr(-beta - noise * z)))
     return LimitState(f, dim, p, noise=noise)
 
 
@@ -192,7 +192,7 @@ def never(dim: int = 4) -> LimitState:
 
 def slabs(dim: int, beta: float) -> LimitState:
     """Beyond beta along any axis, either way: 2 d regions. f = beta - max |u|, p = 1 - (1 - 2 Phi(-beta))^d."""
-    p = -math.expm1(dim * math.log1p(-2.0 * float(ndtr(-beta))))
+    p = any_of(*[2.0 * float(ndtr(-beta))] * dim)
     return LimitState(lambda u: beta - np.abs(u).max(axis=1), dim, p)
 
 
@@ -231,6 +231,6 @@ def _noisy(f: PointFunction, sd: float, seed: int) -> PointFunction:
     return lambda u: f(u) + sd * rng.standard_normal(len(u))
 
 
-def _any(betas: Sequence[float]) -> float:
-    """Return 1 - prod_k Phi(beta_k), without cancellation."""
-    return -math.expm1(float(np.sum(log_ndtr(betas))))
+def any_of(*p: float) -> float:
+    """Return the probability of any of several independent events, without cancellation."""
+    return -math.expm1(float(np.log1p(-np.array(p)).sum()))

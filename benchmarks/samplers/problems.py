@@ -1,11 +1,14 @@
 """The problems of the sampler benchmark by name and by set."""
 
 import importlib.util
+import json
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache, partial
 from pathlib import Path
 
+from benchmarks import RESULTS
+from benchmarks.samplers.fresh_states import BLIND, HELD_OUT
 from benchmarks.samplers.limit_states import (
     LimitState,
     as_limit_state,
@@ -34,7 +37,7 @@ class BenchmarkProblem:
 
     make: Callable[[], LimitState]
     group: str
-    """The set that it is of: "analytic", "highdim" (30 dimensions and more), "public", "driving" or a file."""
+    """The set that it is of: one of `GROUPS` ("highdim": 30 dimensions and more), or a file."""
     rotation: int | None = None
     """Seed of the rotation of its input space, unless another one is asked for."""
     knowable: bool = True
@@ -45,14 +48,16 @@ def _reference_state(reference: Callable[..., Reference], *args: float) -> Calla
     return lambda: as_limit_state(reference(*args))
 
 
-def _collide(env_id: str, base: str, collisions: int) -> LimitState:
-    """Return a scenario with the IDM as ego, whose collisions were counted in 2e7 rollouts, in N(0, I)."""
+def _collide(env_id: str, base: str) -> LimitState:
+    """Return a scenario with the IDM as ego, whose collisions were counted (`truth.json`), in N(0, I)."""
     from rare_envs.problem import DrivingProblem  # the other problems need no torch
 
+    rows = json.loads((RESULTS / "truth.json").read_text(encoding="utf-8"))["results"]
+    (row,) = (row for row in rows if (row["env_id"], row["base"]) == (env_id, base))
     problem = DrivingProblem(env_id, base=base)
-    p, n = collisions / 2e7, 2e7
-    error = (p * (1 - p) / n) ** 0.5
-    return LimitState(lambda u: problem.evaluate(problem.base.from_standard_normal(u)), problem.dim, p, error)
+    return LimitState(
+        lambda u: problem.evaluate(problem.base.from_standard_normal(u)), problem.dim, row["p"], row["standard_error"]
+    )
 
 
 _analytic = partial(BenchmarkProblem, group="analytic")
@@ -60,6 +65,9 @@ _highdim = partial(BenchmarkProblem, group="highdim")
 _driving = partial(BenchmarkProblem, group="driving")
 
 PROBLEMS: dict[str, BenchmarkProblem] = {
+    # for the time that methods take for themselves
+    "lin_d6": BenchmarkProblem(_reference_state(half_space, 6), "speed"),
+    "lin_d428": BenchmarkProblem(_reference_state(half_space, 428), "speed"),
     # one region
     "lin_d2": _analytic(_reference_state(half_space, 2)),
     "lin_d100": _highdim(_reference_state(half_space, 100)),
@@ -101,11 +109,13 @@ PROBLEMS: dict[str, BenchmarkProblem] = {
     "noisy_d6": _analytic(partial(half_spaces, 6, (3.5,), noise=0.3), rotation=11),
     "noise2_d4": _analytic(partial(half_spaces, 4, (4.0, 4.2), noise=0.6), rotation=12),
     # scenarios
-    "following_us101_d3": _driving(partial(_collide, "rare_envs/CarFollowing-v0", "us101-gap", 2459)),
-    "following_highway_d3": _driving(partial(_collide, "rare_envs/CarFollowing-v0", "highway", 5045)),
-    "cut_in_us101_d6": _driving(partial(_collide, "rare_envs/CutIn-v0", "us101-15-offsets", 15_667)),
-    "cut_in_highway_d6": _driving(partial(_collide, "rare_envs/CutIn-v0", "highway", 6062)),
+    "following_us101_d3": _driving(partial(_collide, "rare_envs/CarFollowing-v0", "us101-gap")),
+    "following_highway_d3": _driving(partial(_collide, "rare_envs/CarFollowing-v0", "highway")),
+    "cut_in_us101_d6": _driving(partial(_collide, "rare_envs/CutIn-v0", "us101-15-offsets")),
+    "cut_in_highway_d6": _driving(partial(_collide, "rare_envs/CutIn-v0", "highway")),
     **{name: BenchmarkProblem(partial(getattr, public, "state"), "public") for name, public in PUBLIC_STATES.items()},
+    **{state.__name__: BenchmarkProblem(state, "blind") for state in BLIND},
+    **{state.__name__: BenchmarkProblem(state, "held-out") for state in HELD_OUT},
 }
 GROUPS = tuple(dict.fromkeys(problem.group for problem in PROBLEMS.values()))
 """Names of the sets."""
@@ -134,9 +144,8 @@ def find_problem(name: str) -> BenchmarkProblem:
         ValueError: There is no such problem.
     """
     file, _, own = name.rpartition(":")
-    if file and own in _load_file(file):
-        f, dim, p = _load_file(file)[own][:3]
-        return BenchmarkProblem(lambda: LimitState(f, dim, p), file)
+    if file and own in (found := _load_file(file)):
+        return BenchmarkProblem(lambda: found[own], file)
     if name not in PROBLEMS:
         raise ValueError(f"Unknown problem {name!r}; known: {', '.join(PROBLEMS)}.")
     return PROBLEMS[name]
@@ -149,10 +158,13 @@ def limit_state(name: str) -> LimitState:
 
 
 @cache
-def _load_file(path: str) -> dict[str, tuple]:  # type: ignore[type-arg]  # f, dim, p and whatever else
+def _load_file(path: str) -> dict[str, LimitState]:
+    """Return the limit states of a file: its `make()` gives tuples (f, d, p, ...), or objects with g, d and p."""
     spec = importlib.util.spec_from_file_location(Path(path).stem, path)
     assert spec is not None and spec.loader is not None, path
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
-    states: dict[str, tuple] = module.make()  # type: ignore[type-arg]
-    return states
+    return {
+        name: LimitState(*(state[:3] if isinstance(state, tuple) else (state.g, state.d, state.p)))
+        for name, state in module.make().items()
+    }

@@ -10,6 +10,7 @@ import numpy as np
 from scipy import stats
 from scipy.special import ndtr, stdtrit
 
+from benchmarks.samplers.limit_states import LimitState
 from benchmarks.samplers.problems import limit_state
 from benchmarks.samplers.runs import MethodRun
 from samplers.problem import FloatArray
@@ -37,26 +38,31 @@ class Cell:
 
     method: str
     problem: str
+    dim: int
     p: float
     runs: int
     raised: int
     """Runs that ended in an exception; they count as not covering and nowhere else."""
-    mean_over_p: float
+    mean: float
+    """Of the estimates, over p."""
     mean_se: float
-    """Standard error of mean_over_p."""
+    """Standard error of that."""
     cov: float
     """Spread of the estimates / their mean."""
     own_cov: float
-    """Mean of what the runs state."""
-    own_over_cov: float
+    """Median of what the runs state."""
+    error_over_own: float
+    """Root mean square of the errors over the run's own standard errors: 1 where these are right."""
     gain: float
     """(1 - p) / p / (n_sim x relative mean square error)."""
-    gain_se: float
-    """Standard error of the gain, that of the mean square error only."""
     coverage: float
     """Share of the intervals that hold p."""
-    below: float
-    """Share of the intervals that are wholly below p: the unsafe side."""
+    low: int
+    """Intervals wholly below p: the unsafe side."""
+    high: int
+    """Intervals wholly above p."""
+    upper_over_lower: float
+    """Of the ends of the interval, the median."""
     warned: float
     worst: float
     """Largest |estimate / p - 1|."""
@@ -94,35 +100,36 @@ def cells_of(runs: Iterable[MethodRun]) -> list[Cell]:
     groups: dict[tuple[str, str, int | None], list[MethodRun]] = defaultdict(list)
     for run in runs:
         groups[run.method, run.problem, run.max_sim].append(run)
-    states = [limit_state(group[0].problem) for group in groups.values()]
-    return [cell_of(group, state.p, state.standard_error) for group, state in zip(groups.values(), states, strict=True)]
+    return [cell_of(group, limit_state(group[0].problem)) for group in groups.values()]
 
 
-def cell_of(runs: Sequence[MethodRun], p: float, standard_error: float = 0.0) -> Cell:
-    """Summarise the runs of one method on one problem with probability p, known to a standard error."""
+def cell_of(runs: Sequence[MethodRun], state: LimitState) -> Cell:
+    """Summarise the runs of one method on one problem."""
+    p = state.p
     ended = [run for run in runs if not run.error]
     estimates = np.array([run.p for run in ended])
     ratio = estimates / p if p > 0 else np.full(len(ended), math.nan)
-    own_cov = _mean([run.cov for run in ended if math.isfinite(run.cov)])
     cov = _spread(ratio) / _mean(ratio) if _mean(ratio) > 0 else math.nan
     error = (ratio - 1.0) ** 2
     n_sim = _mean([run.n_sim for run in runs])
-    gain = (1.0 - p) / p / (n_sim * _mean(error)) if p > 0 and n_sim > 0 and _mean(error) > 0 else math.nan
+    off = np.array([own_errors_off(run, p) for run in ended])
     return Cell(
         method=runs[0].method,
         problem=runs[0].problem,
+        dim=state.dim,
         p=p,
         runs=len(runs),
         raised=len(runs) - len(ended),
-        mean_over_p=_mean(ratio),
+        mean=_mean(ratio),
         mean_se=_spread(ratio) / math.sqrt(max(len(ended), 1)),
         cov=cov,
-        own_cov=own_cov,
-        own_over_cov=own_cov / cov if cov > 0 else math.nan,
-        gain=gain,
-        gain_se=gain * _spread(error) / (_mean(error) * math.sqrt(len(ended))) if _mean(error) > 0 else math.nan,
+        own_cov=_median([run.cov for run in ended if math.isfinite(run.cov)]),
+        error_over_own=math.sqrt(_mean(off[np.isfinite(off)] ** 2)),
+        gain=(1.0 - p) / p / (n_sim * _mean(error)) if p > 0 and n_sim > 0 and _mean(error) > 0 else math.nan,
         coverage=sum(covers(run, p) and is_possible(run) for run in ended) / len(runs),
-        below=sum(run.high < p for run in ended) / len(runs),
+        low=sum(run.high < p for run in ended),
+        high=sum(run.low > p for run in ended),
+        upper_over_lower=_median([run.high / run.low if run.low > 0 else math.inf for run in ended]),
         warned=_mean([bool(run.warnings) for run in ended]),
         worst=float(np.max(np.abs(ratio - 1.0))) if len(ended) else math.nan,
         n_sim=n_sim,
@@ -130,7 +137,7 @@ def cell_of(runs: Sequence[MethodRun], p: float, standard_error: float = 0.0) ->
         seconds=_mean([run.seconds for run in runs]),
         max_sim=runs[0].max_sim,
         hidden=sum(hides_simulations(run) for run in runs) / len(runs),
-        reference_error=standard_error / p if p > 0 else 0.0,
+        reference_error=state.standard_error / p if p > 0 else 0.0,
         overstated=sum(run.stated is not None and run.stated > run.n_sim for run in runs) / len(runs),
         without_f=sum(run.n_sim == 0 for run in ended) / len(runs),
         impossible=sum(not is_possible(run) for run in ended) / len(runs),
@@ -231,6 +238,10 @@ def _mean(values: Sequence[float] | FloatArray) -> float:
     return float(np.mean(values)) if len(values) else math.nan
 
 
+def _median(values: Sequence[float]) -> float:
+    return float(np.median(values)) if values else math.nan
+
+
 def _spread(values: FloatArray) -> float:
     with np.errstate(invalid="ignore"):  # an infinite answer has no spread
         return float(np.std(values, ddof=1)) if len(values) > 1 else math.nan
@@ -253,10 +264,10 @@ def find_faults(cell: Cell, knowable: bool = True) -> tuple[str, ...]:
         return tuple(found)
     if cell.p > 0 and cell.worst < READ_DIGITS:
         found.append(f"p to {-math.log10(READ_DIGITS):.0f} digits in every run, as no draws give it")
-    bias = cell.mean_over_p - 1.0
+    bias = cell.mean - 1.0
     error = math.hypot(cell.mean_se, cell.reference_error)
     if ended >= LEAST_RUNS and abs(bias) > max(errors_allowed(ended) * error, NOTICED_BIAS) and not _is_bad_luck(cell):
-        found.append(f"biased: mean / p {cell.mean_over_p:.3g} +- {error:.2g}")
+        found.append(f"biased: mean / p {cell.mean:.3g} +- {error:.2g}")
     if _is_too_low(cell):
         low, high = cell.coverage_interval
         held = f"intervals hold p in {100 * cell.coverage:.0f} % of {cell.runs} runs"
@@ -283,7 +294,7 @@ def _find_broken_runs(cell: Cell) -> list[str]:
 
 def _describe_one_run(cell: Cell) -> str:
     held = "holds" if cell.coverage > 0 else "does not hold"
-    ratio = f", p over the true one {cell.mean_over_p:.3g}" if cell.p > 0 else ""
+    ratio = f", p over the true one {cell.mean:.3g}" if cell.p > 0 else ""
     return f"the same points at every seed: {cell.runs} runs are one, whose interval {held} p{ratio}"
 
 
@@ -298,12 +309,12 @@ def _is_bad_luck(cell: Cell) -> bool:
     The variance of a mean of hits is as its expectation, so that around p it is what was seen, over mean / p. Where
     no run saw a failure, plain Monte Carlo of all simulations sees none with probability exp(-n p).
     """
-    if cell.mean_over_p == 0:
+    if cell.mean == 0:
         return math.exp(-cell.p * cell.n_sim * cell.runs) > 2 * float(ndtr(-BIAS_ERRORS))
-    if not 0 < cell.mean_over_p < 1:
+    if not 0 < cell.mean < 1:
         return False
-    error = math.hypot(cell.mean_se / math.sqrt(cell.mean_over_p), cell.reference_error)
-    return 1 - cell.mean_over_p <= BIAS_ERRORS * error
+    error = math.hypot(cell.mean_se / math.sqrt(cell.mean), cell.reference_error)
+    return 1 - cell.mean <= BIAS_ERRORS * error
 
 
 def _is_too_low(cell: Cell) -> bool:

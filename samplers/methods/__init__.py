@@ -28,7 +28,7 @@ FEW = (300, 500)
 (`benchmarks/results/few_simulations.json`). With 1,000 its intervals hold p in 68 and 82 % of 40 runs on the cut-ins
 (`benchmarks/results/against_truth.json`), where those of `TwoStage` hold it in 24 of 24 with 600 and with 1,000."""
 MOST_DIMS = 6
-"""Dimensions up to which `Surrogate` was measured (`benchmarks/estimators/few_simulations`)."""
+"""Dimensions up to which `Surrogate` was measured (`benchmarks/results/few_simulations.json`)."""
 SLOW = 1.0
 """Seconds of a simulation from which on 6,000 of them are taken as too many where max_sim does not say: 100 minutes."""
 SLOW_BUDGET = 1000

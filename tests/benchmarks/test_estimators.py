@@ -3,42 +3,21 @@
 from __future__ import annotations
 
 import json
-import math
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from scipy import stats
 
-import rare_envs
 import samplers
 from benchmarks.estimators import against_truth
 from benchmarks.estimators.against_truth import TruthComparison, side_by_side
-from benchmarks.estimators.few_simulations import driving_states, held_out_states, study
 from benchmarks.estimators.highway import gains
 from benchmarks.estimators.highway import truth as highway_truth
 from benchmarks.estimators.highway.cases import CASES, COUNTED_WORLDS, EARLIER_COUNTS, HighwayCase
 from benchmarks.estimators.truth import ROLLOUT_CHUNK, count_collisions, truth
-from benchmarks.estimators.two_stage import blind_states, repeated_seeds
-from benchmarks.estimators.two_stage.repeated_seeds import SeededRun, load_catalogue, read_runs, summarise_runs
 from rare_envs.simulation.world import rollout
-from samplers.proposals import Gaussian
-
-HELD_OUT, BLIND = held_out_states.make(), blind_states.make()
-SET = """
-def make():
-    return {"half": (lambda u: 1.0 - u[:, 0], 2, 0.158655), "other": (lambda u: 2.0 - u[:, 0], 3, 0.02275)}
-"""
-
-
-@pytest.fixture
-def states(tmp_path: Path) -> Path:
-    path = tmp_path / "states.py"
-    path.write_text(SET)
-    return path
 
 
 def read_rows(path: Path, key: str = "rows") -> list[dict[str, Any]]:
@@ -87,34 +66,6 @@ def test_counts_on_the_highway_go_on(monkeypatch: pytest.MonkeyPatch, tmp_path: 
     failures, rollouts = EARLIER_COUNTS["idm collisions"]
     assert highway_truth.read_truth(out)["idm collisions"] == (failures + 2, rollouts + 2 * chunk)
     assert highway_truth.read_truth(tmp_path / "none.json")["idm collisions"] == (failures, rollouts)
-
-
-def test_p_of_held_out_states_is_that_of_wide_draws() -> None:
-    """400,000 weighted draws of N(0, s^2 I): within four standard errors, which are under 5 % of p."""
-    for name, (f, dim, p) in HELD_OUT.items():
-        scale = 1.6 if p > 1e-4 else 2.3
-        wide, base = Gaussian(np.zeros(dim), scale * np.eye(dim)), Gaussian(np.zeros(dim), np.eye(dim))
-        u = wide.sample(400_000, np.random.default_rng(1))
-        terms = np.where(f(u) <= 0, np.exp(base.log_prob(u) - wide.log_prob(u)), 0.0)
-        error = terms.std() / len(terms) ** 0.5
-        assert error < 0.05 * p, name
-        assert abs(terms.mean() - p) < 4 * error, name
-
-
-def test_p_of_blind_states_agrees_with_plain_draws_where_it_can() -> None:
-    for name, (f, dim, p) in BLIND.items():
-        rng = np.random.default_rng(0)
-        hits = sum(int((f(rng.standard_normal((10_000, dim))) <= 0).sum()) for _ in range(4))
-        assert stats.binomtest(hits, 40_000, p).pvalue > 1e-4, name
-
-
-def test_driving_states_are_the_scenarios_in_standard_normal_space() -> None:
-    made = driving_states.make()
-    assert [p for _, _, p in made.values()] == [row["p"] for row in read_rows(driving_states.TRUTH, "results")]
-    f, dim, _ = made["CutIn us101-15-offsets"]
-    problem = rare_envs.DrivingProblem("rare_envs/CutIn-v0", ego="idm", base="us101-15-offsets")
-    u = np.random.default_rng(0).standard_normal((20, dim))
-    np.testing.assert_array_equal(f(u), problem.evaluate(problem.base.from_standard_normal(u)))
 
 
 # --- runs that are kept ----------------------------------------------------------------------------
@@ -168,50 +119,3 @@ def test_figures_of_replications_by_pencil_and_paper() -> None:
     assert figures["spread"] == pytest.approx(0.1)
     assert figures["gain_by_spread"] == pytest.approx(0.99 / (1e-2 * 1000 * 0.01))
     assert (figures["covers_own_mean"], figures["covers_truth"]) == (3, 2)  # 9e-3 reaches to 1.08e-2
-
-
-def test_runs_are_kept_by_budget_and_method_and_not_made_again(states: Path, tmp_path: Path, capsys: Any) -> None:
-    runs, table = tmp_path / "runs.jsonl", tmp_path / "table.json"
-    arguments: dict[str, Any] = {"sets": [states], "problems": "half", "runs": runs, "json_path": table}
-    study.main(budgets="100", seeds="2", methods="mc", **arguments)
-    first = runs.read_text()
-    study.main(budgets="50,100", seeds="1,3", methods="mc,ss", **arguments)
-    assert runs.read_text().startswith(first)
-    made = [(row["method"], row["max_sim"], row["seed"]) for row in map(json.loads, runs.read_text().splitlines())]
-    expected = {(method, n, seed) for method in ("mc", "ss") for n, k in ((50, 1), (100, 3)) for seed in range(k)}
-    assert len(made) == 8 and set(made) == expected
-    counts = [(row["method"], row["max_sim"], row["runs"]) for row in read_rows(table)]
-    assert counts == [("mc", 50, 1), ("ss", 50, 1), ("mc", 100, 3), ("ss", 100, 3)]
-    assert capsys.readouterr().out.count("| half | 2 |") == 5
-    before = runs.read_text()
-    study.main(budgets="50,100", seeds="9,9", methods="mc", made=True, **{**arguments, "problems": ""})
-    assert runs.read_text() == before
-    assert [(row["max_sim"], row["runs"]) for row in read_rows(table)] == [(50, 1), (100, 3)]
-
-
-def test_a_row_counts_misses_and_warnings() -> None:
-    run = SeededRun("one", 0, 2, 1e-3, 1e-3, 0.8e-3, 1.2e-3, 0.1, 1000, "converged")
-    low = replace(run, p=0.5e-3, low=0.4e-3, high=0.6e-3, cov=0.1)  # 10 of its standard errors off
-    high = replace(run, p=1.25e-3, low=1.1e-3, high=1.4e-3, warnings=("doubt",))  # two
-    nothing = replace(run, p=0.0, low=0.0, high=2e-3, cov=math.inf)
-    row = summarise_runs("one", [run, low, high, nothing])
-    assert (row.coverage, row.low, row.high) == (0.5, 1, 1)
-    assert (row.far_off, row.far_off_warned, row.right_warned) == (2, 0, pytest.approx(0.5))
-    assert row.mean == pytest.approx((1 + 0.5 + 1.25 + 0) / 4)
-    assert row.gain == pytest.approx(999 / (1000 * (0.25 + 0.0625 + 1) / 4))
-    # errors of 0, 10 and 2 of the run's own standard errors, and one that states none
-    assert row.error_over_own == pytest.approx(math.sqrt((0 + 10**2 + 2**2 + 0) / 4))
-    assert math.isnan(summarise_runs("all", [run, replace(run, problem="two")]).gain)
-
-
-def test_runs_of_repeated_seeds_are_kept_and_not_made_again(states: Path, tmp_path: Path, capsys: Any) -> None:
-    assert {state.name for state in load_catalogue()} >= {"lin_d2", "noisy_d6"}
-    runs, table = tmp_path / "runs.jsonl", tmp_path / "table.json"
-    arguments: dict[str, Any] = {"sets": [states], "method": "mc", "max_sim": 100, "runs": runs, "json_path": table}
-    repeated_seeds.main(seeds=2, problems="half", **arguments)
-    first = runs.read_text()
-    repeated_seeds.main(seeds=3, problems="half", **arguments)
-    assert runs.read_text().startswith(first)
-    assert [run.seed for run in read_runs(runs)] == [0, 1, 2]
-    assert [(row["problem"], row["runs"]) for row in read_rows(table)] == [("half", 3), ("all", 3)]
-    assert "| half | 2 |" in capsys.readouterr().out

@@ -7,9 +7,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy import stats
 
 from benchmarks.samplers.__main__ import main
+from benchmarks.samplers.fresh_states import BLIND, HELD_OUT
 from benchmarks.samplers.limit_states import (
+    LimitState,
     bowl,
     concave,
     corner,
@@ -24,7 +27,8 @@ from benchmarks.samplers.limit_states import (
 from benchmarks.samplers.problems import find_problem
 from benchmarks.samplers.public_states import PUBLIC_STATES
 from benchmarks.samplers.runs import Job, find_method, map_jobs, run_once
-from benchmarks.samplers.summary import cells_of, find_faults
+from benchmarks.samplers.summary import cell_of, cells_of, find_faults
+from rare_envs import DrivingProblem
 
 WRONG = "tests.benchmarks.wrong_samplers"
 NEAR = {
@@ -63,6 +67,33 @@ def test_public_probabilities_against_wide_draws():
         error = values.std() / np.sqrt(n)
         assert error < 0.1 * state.p or state.p <= 1e-6 or state.dim >= 20, name
         assert values.mean() == pytest.approx(state.p, abs=4 * error + 4 * state.p / np.sqrt(n * state.p + 1)), name
+
+
+def test_probabilities_of_fresh_states_against_draws():
+    """By 400,000 weighted draws of N(0, s^2 I), within four standard errors, or plain ones where p is large enough."""
+    for make in HELD_OUT:
+        state = make()
+        scale = 1.6 if state.p > 1e-4 else 2.3
+        u = scale * np.random.default_rng(1).standard_normal((400_000, state.dim))
+        log_weights = state.dim * np.log(scale) - 0.5 * (1 - scale**-2) * (u**2).sum(axis=1)
+        terms = np.where(state.problem().evaluate(u) <= 0, np.exp(log_weights), 0.0)
+        error = terms.std() / len(terms) ** 0.5
+        assert error < 0.05 * state.p, make.__name__
+        assert terms.mean() == pytest.approx(state.p, abs=4 * error), make.__name__
+    for make in BLIND:
+        state, rng = make(), np.random.default_rng(0)
+        hits = sum(int((state.f(rng.standard_normal((10_000, state.dim))) <= 0).sum()) for _ in range(4))
+        assert stats.binomtest(hits, 40_000, state.p).pvalue > 1e-4, make.__name__
+
+
+def test_driving_states_are_the_scenarios_in_standard_normal_space():
+    state, problem = (
+        find_problem("cut_in_us101_d6").make(),
+        DrivingProblem("rare_envs/CutIn-v0", base="us101-15-offsets"),
+    )
+    u = np.random.default_rng(0).standard_normal((20, state.dim))
+    np.testing.assert_array_equal(state.f(u), problem.evaluate(problem.base.from_standard_normal(u)))
+    assert state.p == 234_665 / 3e8
 
 
 def test_a_function_of_a_third_party_is_counted_and_read():
@@ -138,6 +169,18 @@ def test_right_methods_have_no_faults(method):
     assert faults_of(method, runs=10) == ""
 
 
+def test_a_row_counts_misses_and_their_own_errors():
+    run = replace(run_once(Job("mc", "lin_d2", 0, 100)), p=1e-3, low=0.8e-3, high=1.2e-3, cov=0.1, n_sim=1000)
+    low = replace(run, p=0.5e-3, low=0.4e-3, high=0.6e-3)  # 10 of its standard errors off
+    high = replace(run, p=1.25e-3, low=1.1e-3, high=1.4e-3)  # two
+    nothing = replace(run, p=0.0, low=0.0, high=2e-3, cov=math.inf)
+    cell = cell_of([run, low, high, nothing], LimitState(lambda u: u[:, 0], 2, 1e-3))
+    assert (cell.coverage, cell.low, cell.high) == (0.5, 1, 1)
+    assert cell.mean == pytest.approx((1 + 0.5 + 1.25 + 0) / 4)
+    assert cell.gain == pytest.approx(999 / (1000 * (0.25 + 0.0625 + 1) / 4))
+    assert cell.error_over_own == pytest.approx(math.sqrt((0 + 10**2 + 2**2) / 3))  # of the three that state one
+
+
 def test_plain_draws_that_hit_seldom_or_never_are_not_called_biased():
     """20 runs of n draws, of which k hit: a Poisson number with mean 20 n p.
 
@@ -159,11 +202,16 @@ def test_the_command_prints_a_table_for_each_method_and_writes_its_figures(tmp_p
     own = tmp_path / "mine.py"
     own.write_text("def make():\n    return {'plane_d2': (lambda u: 1.0 - u[:, 0], 2, 0.15865525393145707, 'open')}\n")
     words = ["--method", f"mc,{WRONG}:narrow", "--problems", f"common_d4,{own}:plane_d2", "--budget", "500"]
-    main([*words, "--runs", "6", "--out", str(tmp_path / "figures.json")])
+    keep = tmp_path / "runs.jsonl"
+    words += ["--keep", str(keep), "--out", str(tmp_path / "figures.json")]
+    main([*words, "--runs", "3"])
+    first = keep.read_text()
+    main([*words, "--runs", "6"])
+    assert keep.read_text().startswith(first) and len(keep.read_text().splitlines()) == 1 + 6 * 4
     table = capsys.readouterr().out
-    assert table.index("| common_d4 | 0.0402 |") < table.index(f"## {WRONG}:narrow, 500 simulations")
+    assert table.index("| common_d4 | 4 | 0.0402 |") < table.index(f"## {WRONG}:narrow, 500 simulations")
     assert "- Intervals hold p in " in table
-    cells = json.loads((tmp_path / "figures.json").read_text())["cells"]
+    cells = json.loads((tmp_path / "figures.json").read_text())["rows"]
     assert [cell["runs"] for cell in cells] == [6] * 4
     with pytest.raises(SystemExit):
         main(["--set", "nothing"])

@@ -1,1 +1,0 @@
-"""Studies of methods that need few simulations."""
