@@ -17,8 +17,8 @@ from samplers.estimation import estimate
 from samplers.method import Stepping
 from samplers.methods import Auto
 from samplers.output import (
+    Printed,
     drawing_axes,
-    html_table,
     indent_lines,
     read_object,
     register_stored,
@@ -56,7 +56,7 @@ class Side:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Comparison:
+class Comparison(Printed):
     """p_A / p_B from the same draws with the same weights.
 
     Example:
@@ -151,20 +151,6 @@ class Comparison:
         low, high = self.interval
         ends = f" [{low:.3g}, {high:.3g}]" if self._has_ratio else ""
         return f"<Comparison {self._ratio_text}{ends}, {self.n_sim:,} simulations>"
-
-    def _repr_html_(self) -> str:
-        rows = [
-            ("p_A / p_B", f"{self.ratio:.3g}", "{:.3g} to {:.3g}".format(*self.interval))
-            if self._has_ratio
-            else ("p_A / p_B", self._ratio_text.removeprefix("p_A / p_B "), ""),
-            ("p_A", f"{self.a.p:.3e}", "{:.3e} to {:.3e}".format(*self.a.interval)),
-            ("p_B", f"{self.b.p:.3e}", "{:.3e} to {:.3e}".format(*self.b.interval)),
-            ("both fail", f"{self.both:.3e}", ""),
-            ("simulations", f"{self.n_sim:,}", ""),
-        ]
-        notes = [] if self.base_uncertainty is None else [str(self.base_uncertainty)]
-        header = ("", "estimate", f"{100 * self.confidence:g} % interval")
-        return html_table("", rows, header, [*notes, *(f"warning: {text}" for text in self.warnings)])
 
     def __str__(self) -> str:
         lines = [self._ratio_text]

@@ -158,7 +158,7 @@ class TermsOffer:
     """What a run can answer beside f: the terms of points and, unless `gradient_cost` is None, their gradients.
 
     A row of a gradient takes at most `gradient_cost` simulations; `with_f` says whether terms come with the rollout
-    that gives f, see `samplers.problem.HasTerms`.
+    that gives f, see `samplers.problem.Problem`.
     """
 
     gradient_cost: float | None = None

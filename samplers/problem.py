@@ -12,7 +12,6 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
-from html import escape
 from typing import Any, Literal, Protocol, TypeGuard, get_args, runtime_checkable
 
 import numpy as np
@@ -56,27 +55,16 @@ def check_name(kind: str, name: object, valid: list[str]) -> None:
     raise ValueError(f"Unknown {kind} {name!r}.{hint} Valid: {', '.join(valid)}.")
 
 
-def check_setting(
-    method: str, name: str, value: object, low: float, high: float, *, or_equal_high: bool = False
-) -> None:
-    """Raise a ValueError unless value is a number with low < value < high (or value = high, if that is allowed)."""
-    if is_number(value) and (low < value < high or (or_equal_high and value == high)):
-        return
-    sign = "<=" if or_equal_high else "<"
-    raise ValueError(f"{method}: expected a number {low:g} < {name} {sign} {high:g}, got {value!r}.")
-
-
-def check_choice(method: str, name: str, value: object, choices: tuple[str, ...]) -> None:
-    """Raise a ValueError unless value is one of the choices."""
-    if not isinstance(value, str) or value not in choices:
-        wanted = " or ".join(f'"{choice}"' for choice in choices)
-        raise ValueError(f"{method}: expected {name} {wanted}, got {value!r}.")
-
-
-def check_count(method: str, name: str, value: object, least: int) -> None:
-    """Raise a ValueError unless value is a whole number of at least `least`."""
-    if not is_whole(value, least):
-        raise ValueError(f"{method}: expected {name} to be a whole number of at least {least}, got {value!r}.")
+def check_settings(method: object, **rules: int | tuple[float, float] | tuple[str, ...]) -> None:
+    """Check settings of a method: a whole number of at least `rule`, one between two numbers, or one of some words."""
+    for name, rule in rules.items():
+        value, label = getattr(method, name), f"{type(method).__name__}.{name}"  # settings by name
+        if isinstance(rule, int):
+            check_whole(label, value, rule)
+        elif isinstance(rule[0], str):
+            check_name(label, value, list(map(str, rule)))
+        else:
+            check_number(label, value, float(rule[0]), float(rule[1]))
 
 
 OnError = Literal["raise", "failure", "bound"]
@@ -141,7 +129,8 @@ FloatArray = NDArray[np.float64]
 class Distribution(Protocol):
     """A distribution on R^d with an exact map to and from standard normal space.
 
-    One that is also `HasNoise` says which coordinates are the simulation's own randomness.
+    One some of whose coordinates are the simulation's own randomness, independent and standard normal, has their mask
+    `noise`, shape (d,): `TwoStage` does not search among them, it draws them as they come.
 
     Example:
         Half-normal in each coordinate: x = Phi^-1((1 + Phi(u)) / 2).
@@ -190,22 +179,17 @@ class Inputs(Protocol):
 
 
 @runtime_checkable
-class HasNoise(Protocol):
-    """A base distribution some of whose coordinates are the simulation's own randomness.
-
-    They are independent standard normal. `TwoStage` does not search among them: it draws them as they come.
-    """
-
-    @property
-    def noise(self) -> NDArray[np.bool_] | None:
-        """Mask of the coordinates of x that are noise, shape (d,); None for none."""
-
-
-@runtime_checkable
 class Problem(Inputs, Protocol):
     """P[f(X) <= gamma] for X ~ base; small f is dangerous.
 
-    Any object with these three attributes is one; nothing has to be inherited.
+    Any object with these three attributes is one; nothing has to be inherited. Where f is the least of several terms, a
+    problem may tell them apart, and methods may ask for terms in place of f, at the price of one simulation a row; an
+    attribute that is None counts as not offered:
+
+    - `terms(x, gamma)` gives the `Terms` of x (n, d). Where that is another simulation than f, a slower one that rounds
+      otherwise, an attribute `terms_with_f` that is False says so.
+    - `gradient(x, term, ticks, gamma)` gives the `TermGradients` with respect to x of one term of each point, whose
+      number and ticks (n,) `terms` told; a row takes at most `gradient_cost` simulations, above 0.
 
     Example:
         >>> import samplers
@@ -277,62 +261,6 @@ class TermGradients:
     """Gradient with respect to x of the term asked for, shape (n, d); NaN in rows that have none."""
     cost: float
     """Simulations that they took, all rows together."""
-
-
-@runtime_checkable
-class HasTerms(Protocol):
-    """A problem whose f is the least of several terms, and that can tell them apart.
-
-    Methods may ask for terms in place of f, at the price of one simulation a row. An attribute that is None counts as
-    not offered, so that a class can offer it for some of its objects only. Where terms take another simulation than f,
-    a slower one that rounds otherwise, an attribute `terms_with_f` of the problem that is False says so.
-
-    Example:
-        >>> import samplers
-        >>> problem = samplers.FunctionProblem(dim=2, terms=lambda x: 3.0 - x)
-        >>> isinstance(problem, samplers.HasTerms), isinstance(problem, samplers.HasTermGradients)
-        (True, False)
-    """
-
-    def terms(self, x: FloatArray, gamma: float = 0.0) -> Terms:
-        """Simulate the rows of x (n, d); return f and terms whose least decides whether f <= gamma."""
-
-
-@runtime_checkable
-class HasTermGradients(HasTerms, Protocol):
-    """A problem with terms that also has their gradients.
-
-    Example:
-        >>> import numpy as np, samplers
-        >>> problem = samplers.FunctionProblem(
-        ...     dim=2, terms=lambda x: 3.0 - x, gradient=lambda x, term: -np.eye(2)[term]
-        ... )
-        >>> isinstance(problem, samplers.HasTermGradients)
-        True
-        >>> problem.gradient(np.zeros((1, 2)), term=np.array([1]), ticks=np.array([0])).values
-        array([[-0., -1.]])
-    """
-
-    @property
-    def gradient_cost(self) -> float:
-        """Simulations that a row of `gradient` takes at most, above 0; a budget is planned with it."""
-
-    def gradient(
-        self, x: FloatArray, term: NDArray[np.int64], ticks: NDArray[np.int64], gamma: float = 0.0
-    ) -> TermGradients:
-        """Return the gradient with respect to x of one term for each row of x (n, d).
-
-        Args:
-            x: Points whose terms are known, shape (n, d).
-            term: Number of the term, shape (n,).
-            ticks: Index of the time at which `terms` found it attained, shape (n,).
-            gamma: Threshold of f that `terms` was given.
-        """
-
-
-def offers_terms(problem: object) -> TypeGuard[HasTerms]:
-    """Return whether a problem has terms."""
-    return callable(getattr(problem, "terms", None))  # a user's object
 
 
 def condition_of(problem: Inputs) -> str:
@@ -487,9 +415,6 @@ class FunctionProblem:
         base = "" if isinstance(self.base, StandardNormal) else f", base {type(self.base).__name__}"
         return f"<FunctionProblem of {what}, {self.dim} dimension{'s' * (self.dim != 1)}{base}>"
 
-    def _repr_html_(self) -> str:
-        return f"<p>{escape(repr(self)[1:-1])}</p><p>base: {escape(repr(self.base))}</p>"
-
     def evaluate(self, x: FloatArray) -> FloatArray:
         """Call f on the rows of x (n, d); return its values as float64.
 
@@ -531,7 +456,7 @@ def _takes_one_point(f: Callable[[FloatArray], Any], x: FloatArray) -> bool:
 
 
 def _call_terms(function: Callable[..., ArrayLike], dim: int, x: FloatArray, gamma: float = 0.0) -> Terms:
-    """Return `HasTerms.terms` by a function from points (n, d) to terms (n, J); f is their least."""
+    """Return `Problem.terms` by a function from points (n, d) to terms (n, J); f is their least."""
     _check_points(x, dim)
     values = np.asarray(function(x), dtype=np.float64)
     if values.ndim != 2 or len(values) != len(x) or values.shape[1] == 0:
@@ -548,7 +473,7 @@ def _call_gradient(
     ticks: NDArray[np.int64],
     gamma: float = 0.0,
 ) -> TermGradients:
-    """Return `HasTermGradients.gradient` by a function from points (n, d) and terms (n,), the same for every gamma."""
+    """Return `Problem.gradient` by a function from points (n, d) and terms (n,), the same for every gamma."""
     _check_points(x, dim)
     return TermGradients(np.asarray(function(x, term), dtype=np.float64), cost * len(x))
 

@@ -19,10 +19,10 @@ from samplers.analysis.sensitivity import Sensitivity, compute_sensitivity
 from samplers.analysis.weighted import Share, require_sample, split_by_kind
 from samplers.method import EstimateData, Stepping
 from samplers.output import (
+    Printed,
     StoredMethod,
     arrow_table,
     drawing_axes,
-    html_table,
     indent_lines,
     is_stored,
     read_object,
@@ -54,7 +54,7 @@ PLOTTED_THRESHOLDS = 60
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)
-class Estimate(EstimateData):
+class Estimate(EstimateData, Printed):
     """P[f(X) <= gamma] with its interval, its cost and its failures.
 
     Example:
@@ -284,21 +284,6 @@ class Estimate(EstimateData):
             f"<Estimate P[f <= {self.gamma:g}] = {self.p:.3e} [{low:.3e}, {high:.3e}], {self.n_sim:,} simulations, "
             f"{self.method.name}, {self.status}{doubts}>"
         )
-
-    def _repr_html_(self) -> str:
-        low, high = self.interval
-        rows = [
-            (f"{100 * self.confidence:g} % interval", f"{low:.3e} to {high:.3e}"),
-            ("c.o.v.", "not known" if math.isinf(self.cov) else f"{self.cov:.3g}"),
-            *([("base distribution", str(self.base_uncertainty))] if self.base_uncertainty is not None else []),
-            ("simulations", f"{self.n_sim:,}"),
-            *([] if math.isnan(self.gain) else [("gain over Monte Carlo", f"{self.gain:.3g}")]),
-            ("failing points", f"{self.failures.total:,}"),
-            ("method", f"{self.method.name}, seed {self.seed}, {describe_outcome(self.status, self.warnings)}"),
-            ("valid", self.proviso),
-        ]
-        notes = [*(f"remark: {text}" for text in self.remarks), *(f"warning: {text}" for text in self.warnings)]
-        return html_table(f"P[f <= {self.gamma:g}] = {self.p:.3e}", rows, notes=notes)
 
     def __str__(self) -> str:
         low, high = self.interval

@@ -18,8 +18,8 @@ from samplers.analysis.weighted import (
 )
 from samplers.method import EstimateData
 from samplers.output import (
+    Printed,
     drawing_axes,
-    html_table,
     read_object,
     register_stored,
     require_pandas,
@@ -38,7 +38,7 @@ _Curve = TypeVar("_Curve", bound="ProbabilityCurve")
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, repr=False)
-class ProbabilityCurve:
+class ProbabilityCurve(Printed):
     """Probabilities over thresholds, with a band that should hold all of them at once; `Curve` and `Exceedance` are.
 
     A subclass has the thresholds as a further field.
@@ -121,15 +121,6 @@ class ProbabilityCurve:
             f"<{type(self).__name__} P[{self.event}] at {n} threshold{'s' * (n != 1)}, {over.min():g} to "
             f"{over.max():g}: {self.p.min():.3e} to {self.p.max():.3e}, {100 * self.confidence:g} % band>"
         )
-
-    def _repr_html_(self) -> str:
-        """Return a table for notebooks."""
-        rows: list[tuple[Any, ...]] = [
-            (f"{t:g}", f"{p:.3e}", f"{low:.3e} to {high:.3e}")
-            for t, p, low, high in zip(self._over, self.p, self.low, self.high, strict=True)
-        ]
-        header = ("threshold", f"P[{self.event}]", f"{100 * self.confidence:g} % band")
-        return html_table("", rows, header)
 
     def plot(self, ax: "Axes | str | PathLike[str] | None" = None) -> "Axes":
         """Draw the curve and its band over the thresholds, p on a log scale; needs matplotlib."""

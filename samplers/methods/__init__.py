@@ -21,7 +21,7 @@ from samplers.methods.subset import AdaptiveSubsetSimulation, SubsetSimulation
 from samplers.methods.surrogate import Surrogate
 from samplers.methods.two_stage.method import TwoStage, suits_terms
 from samplers.output import register_stored
-from samplers.problem import Inputs, check_name, check_setting
+from samplers.problem import Inputs, check_name, check_settings
 
 FEW = (300, 500)
 """Simulations of a run, from and to, for `Surrogate`. It was measured from 300 on
@@ -69,7 +69,7 @@ class Auto(Method):
     def __post_init__(self) -> None:
         """Check the settings."""
         if self.seconds_per_simulation is not None:
-            check_setting("Auto", "seconds_per_simulation", self.seconds_per_simulation, 0.0, math.inf)
+            check_settings(self, seconds_per_simulation=(0.0, math.inf))
 
     def choose(self, inputs: Inputs, goal: Goal) -> Choice:
         """Return the method for one run, with the budget and the target of one replicate."""

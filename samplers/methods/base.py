@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from samplers.components import MixtureComponent
 from samplers.method import Goal, Stepping
-from samplers.problem import Distribution, FloatArray, HasNoise, Inputs, OnError
+from samplers.problem import Distribution, FloatArray, Inputs, OnError
 from samplers.run import Run, RunArguments
 from samplers.sample import Level
 
@@ -86,7 +86,7 @@ class Method(Stepping, Protocol):
 
 def noise_mask(inputs: Inputs) -> NDArray[np.bool_]:
     """Return which coordinates of x are noise, shape (d,): none where the base distribution does not say."""
-    noise = inputs.base.noise if isinstance(inputs.base, HasNoise) else None
+    noise = getattr(inputs.base, "noise", None)  # a user's distribution need not have it
     return np.zeros(inputs.dim, dtype=bool) if noise is None else np.asarray(noise, dtype=bool)
 
 

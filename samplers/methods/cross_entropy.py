@@ -23,7 +23,7 @@ from samplers.importance import (
 from samplers.method import Goal, Interrupted, Steps
 from samplers.methods.base import Method
 from samplers.methods.blocks import GaussianBlock, MixtureBlock, NormalBlock, Product, announced_blocks
-from samplers.problem import FloatArray, Inputs, check_choice, check_count, check_setting, is_number
+from samplers.problem import FloatArray, Inputs, check_number, check_settings, check_whole, is_number
 from samplers.proposals import Gaussian, ProposalDistribution
 from samplers.sample import Level, Status, next_level, normalise_weights
 
@@ -159,22 +159,24 @@ class CrossEntropy(Method):
 
     def __post_init__(self) -> None:
         """Check the settings."""
-        who = "CrossEntropy"
-        check_choice(who, "family", self.family, ("gaussian", "mean", "mixture", "blocks"))
-        check_choice(who, "likelihood_ratio", self.likelihood_ratio, ("joint", "block"))
-        check_choice(who, "choice", self.choice, ("cov", "quantile"))
-        check_count(who, "components", self.components, 1)
-        check_count(who, "max_iterations", self.max_iterations, 1)
-        check_count(who, "n_final", self.n_final, 10)
+        check_settings(
+            self,
+            family=("gaussian", "mean", "mixture", "blocks"),
+            likelihood_ratio=("joint", "block"),
+            choice=("cov", "quantile"),
+            components=1,
+            max_iterations=1,
+            n_final=10,
+            rho=(0.0, 0.5),
+            base_share=(0.0, 1.0),
+            wide_factor=(1.0, math.inf),
+        )
         for size in as_tuple(self.n_iteration) or [None]:
-            check_count(who, "n_iteration", size, 10)
+            check_whole("CrossEntropy.n_iteration", size, 10)
         for step in as_tuple(self.alpha) or [None]:
-            check_setting(who, "alpha", step, 0.0, 1.0, or_equal_high=True)
-        check_setting(who, "rho", self.rho, 0.0, 0.5)
-        check_setting(who, "base_share", self.base_share, 0.0, 1.0)
+            check_number("CrossEntropy.alpha", step, 0.0, math.nextafter(1.0, 2.0))
         if not (is_number(self.wide_share) and self.wide_share == 0):
-            check_setting(who, "wide_share", self.wide_share, 0.0, 1.0 - self.base_share)
-        check_setting(who, "wide_factor", self.wide_factor, 1.0, math.inf)
+            check_settings(self, wide_share=(0.0, 1.0 - self.base_share))
 
     def steps(self, inputs: Inputs, goal: Goal, rng: np.random.Generator) -> Steps:
         """Search for a proposal, then estimate with fresh draws."""

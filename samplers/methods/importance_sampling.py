@@ -18,7 +18,7 @@ from samplers.importance import (
 )
 from samplers.method import Goal, Interrupted, Steps
 from samplers.methods.base import Method
-from samplers.problem import FloatArray, Inputs, StandardNormal, check_count, check_setting
+from samplers.problem import FloatArray, Inputs, StandardNormal, check_settings
 from samplers.proposals import Mixture, ProposalDistribution, TiltedNormal
 from samplers.sample import Level, Status, next_level, normalise_weights
 
@@ -100,14 +100,8 @@ class ImportanceSampling(Method):
 
     def __post_init__(self) -> None:
         """Check the settings."""
-        who = "ImportanceSampling"
-        check_setting(who, "half_width", self.half_width, 0.0, math.inf)
-        check_count(who, "n", self.n, 1)
-        check_count(who, "batch", self.batch, 1)
-        check_count(who, "n_round", self.n_round, 10)
-        check_count(who, "max_rounds", self.max_rounds, 1)
-        check_setting(who, "rho", self.rho, 0.0, 0.5)
-        check_setting(who, "base_share", self.base_share, 0.0, 1.0)
+        check_settings(self, half_width=(0.0, math.inf), n=1, batch=1, n_round=10, max_rounds=1)
+        check_settings(self, rho=(0.0, 0.5), base_share=(0.0, 1.0))
 
     def steps(self, inputs: Inputs, goal: Goal, rng: np.random.Generator) -> Steps:
         """Search for the tilt, then draw until the interval is narrow enough."""

@@ -22,7 +22,7 @@ from samplers.importance import (
 )
 from samplers.method import Goal, Interrupted, Steps
 from samplers.methods.base import Method
-from samplers.problem import FloatArray, Inputs, StandardNormal, check_choice, check_count, check_setting
+from samplers.problem import FloatArray, Inputs, StandardNormal, check_settings
 from samplers.proposals import (
     Mixture,
     ProposalDistribution,
@@ -119,16 +119,9 @@ class ImprovedCrossEntropy(Method):
 
     def __post_init__(self) -> None:
         """Check the settings."""
-        who = "ImprovedCrossEntropy"
-        check_choice(who, "family", self.family, ("gaussian", "mixture", "vmfn"))
-        check_count(who, "components", self.components, 1)
-        check_setting(who, "weight_cov", self.weight_cov, 0.0, math.inf)
-        check_count(who, "n_round", self.n_round, 10)
-        check_count(who, "max_rounds", self.max_rounds, 1)
-        check_count(who, "n_final", self.n_final, 10)
-        check_setting(who, "base_share", self.base_share, 0.0, 1.0)
-        check_setting(who, "wide_share", self.wide_share, 0.0, 1.0 - self.base_share)
-        check_setting(who, "wide_factor", self.wide_factor, 1.0, math.inf)
+        check_settings(self, family=("gaussian", "mixture", "vmfn"), components=1, n_round=10, max_rounds=1, n_final=10)
+        check_settings(self, weight_cov=(0.0, math.inf), base_share=(0.0, 1.0), wide_factor=(1.0, math.inf))
+        check_settings(self, wide_share=(0.0, 1.0 - self.base_share))
 
     def steps(self, inputs: Inputs, goal: Goal, rng: np.random.Generator) -> Steps:
         """Search for a proposal, then estimate with fresh draws."""

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from samplers.method import Goal, Interrupted, Outcome, Steps
 from samplers.methods.base import Method
-from samplers.problem import FloatArray, Inputs, check_count
+from samplers.problem import FloatArray, Inputs, check_settings
 from samplers.sample import DrawWeights, Level, Sample, Status, binomial_cov
 
 MOST_DRAWS = 2**20
@@ -121,8 +121,7 @@ class MonteCarlo(Method):
 
     def __post_init__(self) -> None:
         """Check the settings."""
-        check_count("MonteCarlo", "n", self.n, 1)
-        check_count("MonteCarlo", "batch", self.batch, 1)
+        check_settings(self, n=1, batch=1)
 
     def steps(self, inputs: Inputs, goal: Goal, rng: np.random.Generator) -> Steps:
         """Draw batches until the target or the end of the budget."""

@@ -33,7 +33,7 @@ from samplers.mcmc import (
 )
 from samplers.method import Goal, Outcome, Steps, no_outcome_share
 from samplers.methods.base import Method
-from samplers.problem import FloatArray, Inputs, check_choice, check_count, check_setting
+from samplers.problem import FloatArray, Inputs, check_settings
 from samplers.sample import (
     Layer,
     Level,
@@ -66,10 +66,7 @@ class SubsetMethod(Method, Protocol):
 
     def _check_levels(self) -> None:
         """Check the settings of the levels."""
-        who = type(self).__name__
-        check_count(who, "n", self.n, 10)
-        check_count(who, "max_levels", self.max_levels, 1)
-        check_setting(who, "p0", self.p0, 0.0, 0.5)
+        check_settings(self, n=10, max_levels=1, p0=(0.0, 0.5))
 
     def _descend(
         self, inputs: Inputs, goal: Goal, rng: np.random.Generator, kernel: Kernel, known: RootedPoints | None = None
@@ -268,9 +265,7 @@ class SubsetSimulation(SubsetMethod):
     def __post_init__(self) -> None:
         """Check the settings."""
         self._check_levels()
-        who = "SubsetSimulation"
-        check_choice(who, "distribution", self.distribution, ("uniform", "normal"))
-        check_setting(who, "spread", self.spread, 0.0, math.inf)
+        check_settings(self, distribution=("uniform", "normal"), spread=(0.0, math.inf))
 
     def steps(self, inputs: Inputs, goal: Goal, rng: np.random.Generator) -> Steps:
         """Go from level to level until the share of failures among its points is p0 or more."""
@@ -363,11 +358,8 @@ class AdaptiveSubsetSimulation(SubsetMethod):
     def __post_init__(self) -> None:
         """Check the settings."""
         self._check_levels()
-        who = "AdaptiveSubsetSimulation"
-        check_setting(who, "scale", self.scale, 0.0, math.inf)
-        check_setting(who, "target_acceptance", self.target_acceptance, 0.0, 1.0)
-        check_choice(who, "proposal", self.proposal, ("conditional", "metropolis"))
-        check_choice(who, "sigma0", self.sigma0, ("unit", "seeds"))
+        check_settings(self, scale=(0.0, math.inf), target_acceptance=(0.0, 1.0))
+        check_settings(self, proposal=("conditional", "metropolis"), sigma0=("unit", "seeds"))
 
     def steps(self, inputs: Inputs, goal: Goal, rng: np.random.Generator, known: RootedPoints | None = None) -> Steps:
         """Go from level to level until the share of failures among its points is p0 or more.

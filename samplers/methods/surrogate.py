@@ -32,7 +32,7 @@ from samplers.methods.base import Method, SimulationSteps, Simulator, marginalis
 from samplers.methods.kriging import LEARNING, POOL, PROPOSAL, RUN, Kriging, Prediction, fit_kriging
 from samplers.methods.two_stage.method import run_two_stage
 from samplers.methods.two_stage.regions import count_lineages
-from samplers.problem import FloatArray, Inputs, StandardNormal, check_count
+from samplers.problem import FloatArray, Inputs, StandardNormal, check_settings
 from samplers.proposals import Gaussian, Mixture, TiltedNormal, fit_proposal_mixture, fit_shrunk_gaussian
 from samplers.sample import (
     Status,
@@ -412,7 +412,7 @@ class Surrogate(Method):
 
     def __post_init__(self) -> None:
         """Check the settings."""
-        check_count("Surrogate", "n", self.n, RUN.least_budget)
+        check_settings(self, n=RUN.least_budget)
 
     def steps(self, inputs: Inputs, goal: Goal, rng: np.random.Generator) -> Steps:
         """Learn, then estimate."""

@@ -66,16 +66,16 @@ def test_unknown_setting_is_named():
 @pytest.mark.parametrize(
     ("cls", "name", "expected"),
     [
-        (samplers.AdaptiveSubsetSimulation, "p0", "a number 0 < p0 < 0.5"),
-        (samplers.AdaptiveSubsetSimulation, "sigma0", 'sigma0 "unit" or "seeds"'),
+        (samplers.AdaptiveSubsetSimulation, "p0", "p0 to be a number between 0 and 0.5"),
+        (samplers.AdaptiveSubsetSimulation, "sigma0", "sigma0 .*Valid: unit, seeds"),
         (samplers.AdaptiveSubsetSimulation, "n", "n to be a whole number of at least 10"),
-        (samplers.CrossEntropy, "wide_factor", "a number 1 < wide_factor < inf"),
-        (samplers.CrossEntropy, "family", 'family "gaussian" or "mean"'),
+        (samplers.CrossEntropy, "wide_factor", "wide_factor to be a number above 1"),
+        (samplers.CrossEntropy, "family", "family .*Valid: gaussian, mean"),
     ],
 )
 @pytest.mark.parametrize("value", [None, "a", True, np.array([0.3, 0.4])], ids=repr)
 def test_settings_of_the_wrong_type_are_refused_by_name(cls, name, expected, value):
-    with pytest.raises(ValueError, match=f"{cls.__name__}: expected {expected}"):
+    with pytest.raises(ValueError, match=rf"(Expected|Unknown) {cls.__name__}\.{expected}"):
         cls(**{name: value})
 
 

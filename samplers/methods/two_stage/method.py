@@ -41,7 +41,7 @@ from samplers.methods.two_stage.stratified import (
 )
 from samplers.methods.two_stage.term_search import search_terms
 from samplers.methods.two_stage.terms_alone import TermRecord, explore_terms
-from samplers.problem import FloatArray, Inputs, check_count
+from samplers.problem import FloatArray, Inputs, check_settings
 from samplers.sample import DrawWeights, Interval, Sample, Status, binomial_cov, effective_sample_size
 
 
@@ -128,7 +128,7 @@ class TwoStage(Method):
 
     def __post_init__(self) -> None:
         """Check the settings."""
-        check_count("TwoStage", "n", self.n, TWO_STAGE.min_exploration_budget)
+        check_settings(self, n=TWO_STAGE.min_exploration_budget)
 
     def steps(self, inputs: Inputs, goal: Goal, rng: np.random.Generator) -> Steps:
         """Explore, refine, estimate."""
