@@ -31,7 +31,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import gammaln, ive, log_ndtr, ndtri_exp
 
-from samplers.problem import LOG_TWO_PI, FloatArray
+from samplers.distributions import LOG_TWO_PI
+from samplers.problem import FloatArray
 from samplers.sample import log_sum_exp
 
 ROWS_FROM = 8

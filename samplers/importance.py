@@ -6,16 +6,9 @@ mean(y), y = weight times indicator of failure, is off: they are control variate
 
     p = mean(y) - b . (mean(h) - 1),    b = (H'H + r n I)^-1 H'y,    H_i = h_i less the mean of h in its stratum
 
-b minimises the variance within the strata. p is linear in y, so that it is also the mean of y with calibrated weights,
+p is linear in y, so that it is also the mean of y with calibrated weights, which serve any threshold,
 
     p = mean(c y),    c_i = 1 - n H_i . (H'H + r n I)^-1 (mean(h) - 1)
-
-c knows nothing of y, and so serves any threshold and any other base distribution too. That b is estimated from the same
-draws biases p by the order of 1 / n, where its standard error is of the order of 1 / sqrt(n).
-
-Methods that search a proposal by iteration share the rounds of draws, the end of the search and the final draws. Only
-these count, unless the run is stopped before them: then the draws of the search are weighted as draws from the mixture
-of its proposals.
 
 References:
     Owen and Zhou, "Safe and effective importance sampling", JASA 95, 2000 (components as control variates, defensive
@@ -29,14 +22,14 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from samplers.method import Goal, Interrupted, Outcome, no_outcome_share
-from samplers.problem import FloatArray, Inputs
-from samplers.proposals import Gaussian, Mixture, ProposalDistribution
+from samplers.problem import FloatArray, Inputs, StandardNormal
+from samplers.proposals import Mixture, ProposalDistribution
 from samplers.sample import (
     DrawWeights,
     Interval,
@@ -184,6 +177,29 @@ class Draws:
         third = (float(((w - mean) ** 3).sum()) - (self.n - len(w)) * mean**3) / self.n
         return third / variance**1.5 if variance > 0 else 0.0
 
+    def outcome(
+        self,
+        goal: Goal,
+        status: Status,
+        trace: Sequence[Level],
+        largest_weight: float,
+        base_draws: int,
+        warnings: Sequence[str] = (),
+    ) -> Outcome:
+        """Return the outcome of a run whose last simulations these are; their largest weight is 1 for plain draws."""
+        return Outcome(
+            p=self.p,
+            interval=weighted_interval(self, goal.confidence, largest_weight),
+            cov=binomial_cov(self.p, self.n) if largest_weight == 1 else self.cov,
+            status=status if len(self.f) or status is Status.STOPPED else Status.NO_HITS,
+            warnings=(*warnings, *weight_warnings(self)),
+            trace=tuple(trace),
+            no_outcome_share=no_outcome_share(self.f, self.log_weights),
+            sample=self.sample,
+            base_draws=base_draws,
+            draw_weights=self.weights_after(sum(level.n_sim for level in trace) - self.n),
+        )
+
 
 def weighted_cov(n: int, log_weights: FloatArray) -> float:
     """Return the c.o.v. of sum(w) / n over n draws whose nonzero terms have these log weights; inf without one.
@@ -257,64 +273,21 @@ def heavy_draw_warnings(draws: Draws) -> list[str]:
     return [f"One draw carries {100 * share:.0f} % of p: the proposal barely covers some failures."]
 
 
+def round_record(level: float, n: int, log_weights: FloatArray) -> Level:
+    """Return the record of a round of n draws: P[f <= level] by log(p0 / q) (k,) of those with f <= level."""
+    return Level(
+        gamma=level,
+        p=len(log_weights) / n,
+        estimate=float(np.exp(log_weights).sum()) / n,
+        n_sim=n,
+        n_points=n,
+        cov=weighted_cov(n, log_weights),
+        ess=effective_sample_size(log_weights),
+    )
+
+
 MOST_FINAL_BATCHES = 100
 """Batches of final draws after which a target c.o.v. is given up where max_sim does not say."""
-
-
-class Space(NamedTuple):
-    """The space of a proposal: the base distribution there, and the map of its points (n, d) to physical space."""
-
-    base: ProposalDistribution
-    to_x: Callable[[FloatArray], FloatArray]
-
-
-def simulate_until(
-    inputs: Inputs,
-    sampler: ProposalDistribution,
-    goal: Goal,
-    limit: int,
-    batch: int,
-    rng: np.random.Generator,
-    space: Space | None = None,
-) -> Generator[FloatArray, FloatArray, tuple[Draws, list[Level], bool]]:
-    """Simulate batches from `sampler`, in `space` (None: standard normal space), until `limit` draws or the target.
-
-    Return the draws, a record of every batch and whether the run was interrupted.
-    """
-    base, to_x = space or Space(Gaussian.standard(inputs.dim), inputs.base.from_standard_normal)
-    draws = Draws(0, np.empty(0), np.empty(0))
-    trace: list[Level] = []
-    while draws.n < limit:
-        u = sampler.sample(min(batch, limit - draws.n), rng)
-        x = to_x(u)
-        try:
-            f = yield x
-        except Interrupted:
-            return draws, trace, True
-        new = Draws.from_outcomes(f, base.log_prob(u) - sampler.log_prob(u), x, goal.gamma)
-        draws = draws.join(new)
-        record = round_record(goal.gamma, new.n, new.log_weights)
-        trace.append(replace(record, estimate=draws.p, cov=draws.cov, ess=draws.ess))  # of all so far
-        goal.on_level(trace[-1])
-        if goal.target_cov is not None and draws.cov <= goal.target_cov:
-            break
-    return draws, trace, False
-
-
-def defensive_mixture(
-    base: ProposalDistribution,
-    wide: ProposalDistribution,
-    proposal: ProposalDistribution,
-    base_share: float,
-    wide_share: float,
-) -> Mixture:
-    """Return base_share of the base distribution + wide_share (may be 0) of a widened proposal + the rest proposal.
-
-    Its density is at least base_share of the base, so that no weight exceeds 1 / base_share.
-    """
-    if wide_share == 0:
-        return Mixture(np.array([base_share, 1 - base_share]), [base, proposal])
-    return Mixture(np.array([base_share, wide_share, 1 - (base_share + wide_share)]), [base, wide, proposal])
 
 
 def count_final_draws(goal: Goal, spent: int, n_final: int) -> int:
@@ -346,144 +319,138 @@ class Round(NamedTuple):
         return self.base.log_prob(self.u) - self.proposal.log_prob(self.u)
 
 
-class Search(NamedTuple):
-    """A finished search: the rounds whose draws are kept, the first from the base, and a record of every round.
+class Search:
+    """A search for a proposal by rounds of draws, then final draws, which alone p rests on unless the run is stopped.
 
-    Its status is CONVERGED where it reached gamma.
+    It works in the space of the base distribution `base` there, N(0, I) as a rule, which `to_x` maps to physical space.
+    `rounds` are those whose draws are kept, the first from the base; `trace` has a record of every round. The status is
+    CONVERGED where the search reached gamma.
     """
 
-    rounds: Sequence[Round]
-    trace: Sequence[Level]
-    status: Status
+    def __init__(
+        self,
+        inputs: Inputs,
+        goal: Goal,
+        rng: np.random.Generator,
+        base: ProposalDistribution | None = None,
+        to_x: Callable[[FloatArray], FloatArray] | None = None,
+    ) -> None:
+        self.goal, self.rng = goal, rng
+        self.base = base or StandardNormal(inputs.dim)
+        self.to_x = to_x or inputs.base.from_standard_normal
+        self.rounds, self.trace = list[Round](), list[Level]()
+        self.status = Status.STALLED
 
     @property
     def n_sim(self) -> int:
-        """Simulations made."""
+        """Simulations made so far."""
         return sum(level.n_sim for level in self.trace)
 
-    @property
-    def base_draws(self) -> int:
-        """Draws from the base distribution: the first round."""
-        return len(self.rounds[0].f) if self.rounds else 0
+    def draw(
+        self, proposal: ProposalDistribution, n_round: int, max_rounds: int
+    ) -> Generator[FloatArray, FloatArray, Round | None]:
+        """Simulate n_round draws, fewer where max_sim is small; None where the search is over, its status says why."""
+        budget = self.goal.budget
+        size = min(n_round, budget // LEAST_ROUNDS)
+        if len(self.trace) == max_rounds:
+            return None
+        if budget < LEAST_SEARCH_BUDGET or self.n_sim + size > int(SEARCH_SHARE * budget):
+            self.status = Status.BUDGET
+            return None
+        u = proposal.sample(size, self.rng)
+        try:
+            f = yield self.to_x(u)
+        except Interrupted:
+            self.status = Status.STOPPED
+            return None
+        self.rounds.append(Round(self.base, proposal, u, f))
+        return self.rounds[-1]
 
+    def record(self, level: float, log_weights: FloatArray) -> None:
+        """Record the last round: its level, and log(p0 / q) (k,) of the draws with f <= level."""
+        self.trace.append(round_record(level, len(self.rounds[-1].f), log_weights))
+        self.goal.on_level(self.trace[-1])
 
-class FinalDraws(NamedTuple):
-    """The draws that p rests on, after a search, and the records of the search and of the final batches.
+    def failing_points(self) -> FloatArray:
+        """Return the failing draws of all rounds kept, in the space of the search, shape (k, d)."""
+        return np.concatenate([one.u[one.f <= self.goal.gamma] for one in self.rounds])
 
-    No weight exceeds `largest_weight`, 1 for draws from the base distribution. `n_first` is 0 but where there are only
-    the draws of the search: then the number in its first round, which other rounds may follow before the rest of these.
-    """
+    def pool_rounds(self) -> Draws:
+        """Return the draws of the rounds kept as if drawn from the mixture of their proposals.
 
-    draws: Draws
-    trace: tuple[Level, ...]
-    largest_weight: float
-    base_draws: int  # see `Outcome.base_draws`
-    stopped: bool
-    n_first: int = 0
+        The first round being base draws, no weight exceeds N / n_0. Later proposals were fitted to earlier draws, so
+        that this is not unbiased as fresh draws would be: low by 1 to 4 %, by 9 % after two rounds of a mixture with
+        several regions; its interval covers p in 92 to 100 % of runs.
+        """
+        n = np.array([len(one.f) for one in self.rounds])
+        u, f = (np.concatenate(parts) for parts in zip(*((one.u, one.f) for one in self.rounds), strict=True))
+        mixture = Mixture(n / n.sum(), [one.proposal for one in self.rounds])
+        return Draws.from_outcomes(f, self.base.log_prob(u) - mixture.log_prob(u), self.to_x(u), self.goal.gamma)
 
-    @property
-    def cov(self) -> float:
-        """Coefficient of variation of p."""
-        return binomial_cov(self.draws.p, self.draws.n) if self.largest_weight == 1 else self.draws.cov
+    def warnings(self) -> list[str]:
+        """Return the warning about a search that did not reach gamma."""
+        if self.status is Status.CONVERGED:
+            return []
+        if not self.trace:
+            return [f"max_sim is under {LEAST_SEARCH_BUDGET}, too little for a search: base draws only."]
+        lowest = min(level.gamma for level in self.trace)
+        where = f" at f <= {lowest:.4g}," if lowest > self.goal.gamma else ""
+        why = {Status.BUDGET: "its share of max_sim was used up", Status.STOPPED: "it was stopped"}
+        return [f"The search for a proposal ended{where} before gamma: {why.get(self.status, 'it came no closer')}."]
 
-    def outcome(self, goal: Goal, status: Status, warnings: Sequence[str]) -> Outcome:
-        """Return the outcome of a run with these draws."""
-        draws = self.draws
-        ended = status if len(draws.f) else Status.NO_HITS
-        if self.n_first:
-            warnings = ["Stopped before the final draws: the estimate rests on those of the search."]
-        return Outcome(
-            p=draws.p,
-            interval=weighted_interval(draws, goal.confidence, self.largest_weight),
-            cov=self.cov,
-            status=Status.STOPPED if self.stopped else ended,
-            warnings=(*warnings, *weight_warnings(draws)),
-            trace=self.trace,
-            no_outcome_share=no_outcome_share(draws.f, draws.log_weights),
-            sample=draws.sample,
-            base_draws=self.base_draws,
-            draw_weights=self._draw_weights,
-        )
+    def mix(self, proposal: Any, base_share: float, wide_share: float = 0.0, wide_factor: float = 1.0) -> Mixture:
+        """Return base_share of the base + wide_share (may be 0) of the proposal widened by a factor + the rest of it.
 
-    @property
-    def _draw_weights(self) -> tuple[DrawWeights, ...]:
-        """Weight of every draw in p."""
-        spent = sum(level.n_sim for level in self.trace)
-        if not self.n_first:
-            return self.draws.weights_after(spent - self.draws.n)
-        rest = self.draws.n - self.n_first
-        return tuple(
-            part for each in self.draws.weights_after(0) for part in each.split((0, self.n_first), (spent - rest, rest))
-        )
+        Its density is at least base_share of the base, so that no weight exceeds 1 / base_share.
+        """
+        if wide_share == 0:
+            return Mixture(np.array([base_share, 1 - base_share]), [self.base, proposal])
+        shares = np.array([base_share, wide_share, 1 - (base_share + wide_share)])
+        return Mixture(shares, [self.base, proposal.widen(wide_factor), proposal])
 
+    def draw_final(
+        self, sampler: ProposalDistribution, limit: int, batch: int, target_cov: float | None
+    ) -> Generator[FloatArray, FloatArray, Draws]:
+        """Simulate batches of a sampler until there are `limit` draws, or their c.o.v. is met; none after a stop."""
+        draws = Draws(0, np.empty(0), np.empty(0))
+        while self.status is not Status.STOPPED and draws.n < limit:
+            u = sampler.sample(min(batch, limit - draws.n), self.rng)
+            x = self.to_x(u)
+            try:
+                f = yield x
+            except Interrupted:
+                self.status = Status.STOPPED
+                break
+            new = Draws.from_outcomes(f, self.base.log_prob(u) - sampler.log_prob(u), x, self.goal.gamma)
+            draws = draws.join(new)
+            record = round_record(self.goal.gamma, new.n, new.log_weights)
+            self.trace.append(replace(record, estimate=draws.p, cov=draws.cov, ess=draws.ess))  # of all so far
+            self.goal.on_level(self.trace[-1])
+            if target_cov is not None and draws.cov <= target_cov:
+                break
+        return draws
 
-def plan_rounds(goal: Goal, n_round: int, max_rounds: int) -> tuple[int, int]:
-    """Return the draws per round and the number of rounds that the budget allows; no rounds if it is too small."""
-    if goal.budget < LEAST_SEARCH_BUDGET:
-        return 0, 0
-    size = min(n_round, goal.budget // LEAST_ROUNDS)
-    return size, min(max_rounds, int(SEARCH_SHARE * goal.budget) // size)
+    def finish(
+        self,
+        sampler: ProposalDistribution,
+        base_share: float,
+        limit: int,
+        batch: int,
+        target_cov: float | None,
+        warnings: Sequence[str],
+    ) -> Generator[FloatArray, FloatArray, Outcome]:
+        """Simulate the final draws of a sampler with that share of base draws; return what they say of p.
 
-
-def round_record(level: float, n: int, log_weights: FloatArray) -> Level:
-    """Return the record of a round of n draws: P[f <= level] by log(p0 / q) (k,) of those with f <= level."""
-    return Level(
-        gamma=level,
-        p=len(log_weights) / n,
-        estimate=float(np.exp(log_weights).sum()) / n,
-        n_sim=n,
-        n_points=n,
-        cov=weighted_cov(n, log_weights),
-        ess=effective_sample_size(log_weights),
-    )
-
-
-def pool_rounds(rounds: Sequence[Round], to_x: Callable[[FloatArray], FloatArray], gamma: float) -> Draws:
-    """Return the draws of one or more rounds as if drawn from the mixture of their proposals.
-
-    For a run that is stopped during its search. The first round being base draws, no weight exceeds N / n_0.
-    Later proposals were fitted to earlier draws, so that this is not unbiased as fresh draws would be: low by 1 to
-    4 %, by 9 % after two rounds of a mixture with several regions; its interval covers p in 92 to 100 % of runs.
-    """
-    n = np.array([len(one.f) for one in rounds])
-    u, f = (np.concatenate(parts) for parts in zip(*((one.u, one.f) for one in rounds), strict=True))
-    mixture = Mixture(n / n.sum(), [one.proposal for one in rounds])
-    return Draws.from_outcomes(f, rounds[0].base.log_prob(u) - mixture.log_prob(u), to_x(u), gamma)
-
-
-def draw_after_search(
-    inputs: Inputs,
-    goal: Goal,
-    search: Search,
-    sampler: ProposalDistribution,
-    base_share: float,
-    limit: int,
-    batch: int,
-    rng: np.random.Generator,
-    space: Space | None = None,
-) -> Generator[FloatArray, FloatArray, FinalDraws]:
-    """Simulate the final draws; without any, as the run was stopped, take those of the search."""
-    limit = 0 if search.status is Status.STOPPED else limit
-    draws, trace, stopped = yield from simulate_until(inputs, sampler, goal, limit, batch, rng, space)
-    largest, n_base = 1 / base_share, search.base_draws + int(base_share * draws.n)
-    n_first = 0
-    if draws.n == 0:
-        n_first = search.base_draws
-        to_x = inputs.base.from_standard_normal if space is None else space.to_x
-        draws = pool_rounds(search.rounds, to_x, goal.gamma)
-        largest = draws.n / n_first
-    stopped = stopped or search.status is Status.STOPPED
-    return FinalDraws(draws, (*search.trace, *trace), largest, n_base, stopped, n_first)
-
-
-def search_warnings(search: Search, gamma: float) -> list[str]:
-    """Return the warning about a search that did not reach gamma."""
-    if search.status is Status.CONVERGED:
-        return []
-    if not search.trace:
-        return [f"max_sim is under {LEAST_SEARCH_BUDGET}, too little for a search: base draws only."]
-    lowest = min(level.gamma for level in search.trace)
-    where = f" at f <= {lowest:.4g}," if lowest > gamma else ""
-    why = {Status.BUDGET: "its share of max_sim was used up", Status.STOPPED: "it was stopped"}
-    reason = why.get(search.status, "it came no closer")
-    return [f"The search for a proposal ended{where} before gamma: {reason}."]
+        Where the run was stopped before, the draws of the search are weighted as from the mixture of its proposals.
+        """
+        base_draws = len(self.rounds[0].f) if self.rounds else 0
+        draws = yield from self.draw_final(sampler, limit, batch, target_cov)
+        if draws.n:
+            made = base_draws + int(base_share * draws.n)
+            return draws.outcome(self.goal, self.status, self.trace, 1 / base_share, made, warnings)
+        draws = self.pool_rounds()
+        about = ["Stopped before the final draws: the estimate rests on those of the search."]
+        outcome = draws.outcome(self.goal, self.status, self.trace, draws.n / base_draws, base_draws, about)
+        rest = draws.n - base_draws
+        parts = ((0, base_draws), (self.n_sim - rest, rest))  # the first round and the last ones, others between them
+        return replace(outcome, draw_weights=draws.weights_after(0)[0].split(*parts))

@@ -17,7 +17,7 @@ from typing import Any, Literal, Protocol, TypeGuard, get_args, runtime_checkabl
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from samplers.distributions import as_distribution
+from samplers.distributions import LOG_TWO_PI, as_distribution
 
 
 def is_number(value: object) -> TypeGuard[float]:
@@ -274,9 +274,6 @@ def names_of_columns(problem: Inputs) -> tuple[str, ...]:
     if names and (len(set(names)) != int(problem.dim) or not all(isinstance(name, str) for name in names)):
         raise ValueError(f"Expected column_names of a problem to be {int(problem.dim)} different names, got {names!r}.")
     return names
-
-
-LOG_TWO_PI = float(np.log(2 * np.pi))
 
 
 @dataclass(frozen=True)

@@ -1,123 +1,31 @@
 """Proposals: Gaussians and mixtures, fitted to weighted points by expectation-maximisation with shrunk covariances.
 
 A covariance that is estimated from few weighted points is drawn towards N(0, I) with one special direction, for points
-of one failure region, or towards the present Gaussian of a search, for a step of it. Without a target its eigenvalues
-are corrected by factors (Stein).
+of one failure region, or towards the present Gaussian of a search, for a step of it.
 
 References:
+    Geyer, Papaioannou and Straub, "Cross entropy-based importance sampling using Gaussian densities revisited",
+    Structural Safety 76, 2019 (weighted points).
     Stein, "Lectures on the theory of estimation of many parameters", Journal of Soviet Mathematics 34, 1986
     (eigenvalues; put into order again as by Lin and Perlman, "A Monte Carlo comparison of four estimators of a
     covariance matrix", 1985).
-    Geyer, Papaioannou and Straub, "Cross entropy-based importance sampling using Gaussian densities revisited",
-    Structural Safety 76, 2019 (weighted points).
-    Lloyd, "Least squares quantization in PCM", IEEE Transactions on Information Theory 28, 1982.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple, Protocol
+from typing import Any, Protocol
 
 import numpy as np
-from scipy.linalg import solve_triangular
 from scipy.optimize import isotonic_regression
 
 from samplers.components import expectation_maximisation, shrink_covariance, start_from_centres
-from samplers.problem import LOG_TWO_PI, FloatArray, StandardNormal
+from samplers.distributions import Gaussian
+from samplers.problem import FloatArray, StandardNormal
 from samplers.sample import log_sum_exp
 
-
-class Moments(NamedTuple):
-    """Mean parameters of a Gaussian: E[u] (d,) and E[u u'] (d, d)."""
-
-    first: FloatArray
-    second: FloatArray
-
-    @property
-    def covariance(self) -> FloatArray:
-        """E[u u'] - E[u] E[u]', shape (d, d)."""
-        return self.second - np.outer(self.first, self.first)
-
-    def mix_with(self, other: Moments, share: float) -> Moments:
-        """Return the moments of the mixture of this distribution, with weight `share`, and another one."""
-        return Moments(share * self.first + (1 - share) * other.first, share * self.second + (1 - share) * other.second)
-
-
-@dataclass(frozen=True, eq=False)
-class Gaussian:
-    """N(mean, L L') with a mean (d,) and lower triangular L (d, d)."""
-
-    mean: FloatArray
-    cholesky: FloatArray
-
-    @classmethod
-    def standard(cls, dim: int) -> Gaussian:
-        """Return N(0, I)."""
-        return cls(np.zeros(dim), np.eye(dim))
-
-    @classmethod
-    def from_covariance(cls, mean: FloatArray, covariance: FloatArray) -> Gaussian:
-        """Return N(mean, covariance) from a mean (d,) and a positive definite covariance (d, d)."""
-        return cls(mean, np.asarray(np.linalg.cholesky(covariance), dtype=np.float64))
-
-    @property
-    def dim(self) -> int:
-        """Number of coordinates d."""
-        return len(self.mean)
-
-    @property
-    def covariance(self) -> FloatArray:
-        """L L', shape (d, d)."""
-        return self.cholesky @ self.cholesky.T
-
-    @property
-    def moments(self) -> Moments:
-        """E[u] and E[u u']."""
-        return Moments(self.mean, self.covariance + np.outer(self.mean, self.mean))
-
-    def widen(self, factor: float) -> Gaussian:
-        """Return the same with all standard deviations multiplied by factor."""
-        return Gaussian(self.mean, factor * self.cholesky)
-
-    def sample(self, n: int, rng: np.random.Generator) -> FloatArray:
-        """Draw n independent points, shape (n, d)."""
-        return self.from_standard_normal(rng.standard_normal((n, self.dim)))
-
-    def log_prob(self, u: FloatArray) -> FloatArray:
-        """Return the log density at u (n, d), shape (n,)."""
-        z = self.to_standard_normal(u)
-        log_det = float(np.log(np.diag(self.cholesky)).sum())
-        return np.asarray(-0.5 * np.einsum("ij,ij->i", z, z) - log_det - 0.5 * self.dim * LOG_TWO_PI)
-
-    def to_standard_normal(self, u: FloatArray) -> FloatArray:
-        """Return L^-1 (u - mean) of the rows of u (n, d)."""
-        return np.asarray(solve_triangular(self.cholesky, (u - self.mean).T, lower=True).T)
-
-    def from_standard_normal(self, z: FloatArray) -> FloatArray:
-        """Return mean + L z of the rows of z (n, d)."""
-        return np.asarray(self.mean + z @ self.cholesky.T)
-
-
-def weighted_moments(u: FloatArray, weights: FloatArray) -> Moments:
-    """Return E[u] and E[u u'] of points u (n, d) under weights (n,) that add up to 1."""
-    return Moments(weights @ u, (u * weights[:, None]).T @ u)
-
-
-@dataclass(frozen=True, eq=False)
-class TiltedNormal:
-    """N(shift, I), that is N(0, I) tilted by exp(shift' u - |shift|^2 / 2)."""
-
-    shift: FloatArray
-    """Shape (d,)."""
-
-    def sample(self, n: int, rng: np.random.Generator) -> FloatArray:
-        """Draw n independent points, shape (n, d)."""
-        return self.shift + rng.standard_normal((n, len(self.shift)))
-
-    def log_prob(self, u: FloatArray, /) -> FloatArray:
-        """Return the log density at u (n, d), shape (n,)."""
-        return StandardNormal(len(self.shift)).log_prob(u - self.shift)
+__all__ = ["Gaussian", "Mixture", "correct_eigenvalues", "fit_proposal_mixture", "fit_shrunk_gaussian"]
 
 
 class ProposalDistribution(Protocol):
@@ -128,6 +36,21 @@ class ProposalDistribution(Protocol):
 
     def log_prob(self, u: FloatArray, /) -> FloatArray:
         """Return the log density at u (n, d), shape (n,)."""
+
+
+@dataclass(frozen=True, eq=False)
+class TiltedNormal:
+    """N(shift, I), that is N(0, I) tilted by exp(shift' u - |shift|^2 / 2), for a shift (d,)."""
+
+    shift: FloatArray
+
+    def sample(self, n: int, rng: np.random.Generator) -> FloatArray:
+        """Draw n independent points, shape (n, d)."""
+        return self.shift + rng.standard_normal((n, len(self.shift)))
+
+    def log_prob(self, u: FloatArray, /) -> FloatArray:
+        """Return the log density at u (n, d), shape (n,)."""
+        return StandardNormal(len(self.shift)).log_prob(u - self.shift)
 
 
 @dataclass(frozen=True, eq=False)
@@ -165,9 +88,9 @@ PRIOR_DIM = 10
 def correct_eigenvalues(values: FloatArray, n: float) -> FloatArray:
     """Return the eigenvalues l (d,) of a covariance of n > d points, increasing, without their bias, by Stein.
 
-    Of few points the small eigenvalues are too small and the large ones too large. Each is divided by
-    1 - (d - 1) / n + (2 / n) sum_j l_i / (l_i - l_j): small ones change by a factor, where a target of variance 1 would
-    add to them. Failures between two planes have a variance of 0.05 across, which a tenth of I triples.
+    Each is divided by 1 - (d - 1) / n + (2 / n) sum_j l_i / (l_i - l_j): small ones change by a factor, where a target
+    of variance 1 would add to them. Failures between two planes have a variance of 0.05 across, which a tenth of I
+    triples.
     """
     gaps = values[:, None] - values
     gaps[gaps == 0] = np.inf  # its own, and equal ones
@@ -178,23 +101,27 @@ def correct_eigenvalues(values: FloatArray, n: float) -> FloatArray:
 
 def fit_shrunk_gaussian(u: FloatArray, weights: FloatArray) -> Gaussian:
     """Return the Gaussian of points u (n, d) with weights (n,), its covariance shrunk by `shrink_covariance`."""
-    moments = weighted_moments(u, weights)
-    mean, s = moments.first, moments.covariance
+    mean = weights @ u
+    covariance = (u * weights[:, None]).T @ u - np.outer(mean, mean)
     v = mean / max(float(np.linalg.norm(mean)), np.finfo(np.float64).tiny)
-    along = max(float(v @ s @ v), LEAST_VARIANCE)
-    shrunk, _ = shrink_covariance(s, v, along, 1 / float(weights @ weights))
+    along = max(float(v @ covariance @ v), LEAST_VARIANCE)
+    shrunk, _ = shrink_covariance(covariance, v, along, 1 / float(weights @ weights))
     return Gaussian.from_covariance(mean, shrunk + LEAST_VARIANCE * np.eye(len(mean)))
 
 
-def shrink_towards_present(target: Moments, present: Gaussian, n: float) -> Gaussian:
-    """Return the Gaussian with the target's mean and its covariance drawn towards the present one.
+def move_gaussian(present: Gaussian, u: FloatArray, weights: FloatArray, share: float) -> Gaussian:
+    """Return the Gaussian with the moments of share Q + (1 - share) P, its covariance drawn towards that of P.
 
-    The present covariance counts as (d + 1) max(1, d / PRIOR_DIM) points beside the n behind the target: in many
-    dimensions the noise of the d (d + 1) / 2 entries of a covariance ruins importance weights.
+    P is the present Gaussian; Q has the points u (n, d) with weights (n,) that add up to 1. The covariance of P counts
+    as (d + 1) max(1, d / PRIOR_DIM) points beside the effective ones of Q: in many dimensions the noise of the
+    d (d + 1) / 2 entries of a covariance ruins importance weights.
     """
+    own = present.covariance
+    mean = share * (weights @ u) + (1 - share) * present.mean
+    square = share * ((u * weights[:, None]).T @ u) + (1 - share) * (own + np.outer(present.mean, present.mean))
     prior = (present.dim + 1) * max(1.0, present.dim / PRIOR_DIM)
-    share = prior / (prior + n)
-    return Gaussian.from_covariance(target.first, (1 - share) * target.covariance + share * present.covariance)
+    pull = prior / (prior + 1 / float(weights @ weights))
+    return Gaussian.from_covariance(mean, (1 - pull) * (square - np.outer(mean, mean)) + pull * own)
 
 
 Fit = Callable[[FloatArray, FloatArray], Any]
@@ -222,7 +149,7 @@ def fit_proposal_mixture(
     for k in range(1, most + 1):
         if k * size >= points:  # the criterion means nothing there
             break
-        mixture = best if k == 1 else fit_mixture_of_size(fit, u, weights, k, rng)
+        mixture = best if k == 1 else _fit_mixture_of_size(fit, u, weights, k, rng)
         score = points * float(weights @ mixture.log_prob(u)) - 0.5 * (k * size + k - 1) * np.log(points)
         if score <= highest:
             break
@@ -230,7 +157,7 @@ def fit_proposal_mixture(
     return best
 
 
-def fit_mixture_of_size(fit: Fit, u: FloatArray, weights: FloatArray, k: int, rng: np.random.Generator) -> Mixture:
+def _fit_mixture_of_size(fit: Fit, u: FloatArray, weights: FloatArray, k: int, rng: np.random.Generator) -> Mixture:
     """Return a mixture of at most k components by expectation-maximisation, from distant first centres."""
 
     def maximise(responsibilities: FloatArray) -> Mixture:

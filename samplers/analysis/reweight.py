@@ -31,7 +31,7 @@ from samplers.analysis.weighted import (
     interval_of_sum,
     require_sample,
 )
-from samplers.distributions import as_distribution, can_convert
+from samplers.distributions import as_distribution, convert
 from samplers.method import EstimateData
 from samplers.problem import Distribution, FloatArray
 from samplers.sample import Interval, Sample, add_unseen, effective_number, raise_log_end
@@ -151,7 +151,7 @@ def reweight_estimate(estimate: EstimateData, new_base: Any) -> Reweighted:
     as that of the estimate does; its lineages count for less as the effective units become fewer.
     """
     sample = require_sample(estimate)
-    if can_convert(new_base) or isinstance(new_base, list | tuple):
+    if isinstance(new_base, list | tuple) or convert(new_base) is not None:
         new_base = as_distribution(new_base, sample.x.shape[1])
     failing = sample.f <= estimate.gamma
     f, old, owners = sample.f[failing], sample.weights[failing], sample.units[failing]

@@ -7,49 +7,23 @@ from typing import ClassVar, Literal, NamedTuple, TypeVar
 
 import numpy as np
 
-from samplers.importance import (
-    LEAST_ROUNDS,
-    LEAST_SEARCH_BUDGET,
-    SEARCH_SHARE,
-    Round,
-    Search,
-    Space,
-    count_final_draws,
-    defensive_mixture,
-    draw_after_search,
-    round_record,
-    search_warnings,
-)
-from samplers.method import Goal, Interrupted, Steps
+from samplers.distributions import Gaussian
+from samplers.importance import Search, count_final_draws
+from samplers.method import Goal, Steps
 from samplers.methods.base import Method
 from samplers.methods.blocks import GaussianBlock, MixtureBlock, NormalBlock, Product, announced_blocks
 from samplers.problem import FloatArray, Inputs, check_number, check_settings, check_whole, is_number
-from samplers.proposals import Gaussian, ProposalDistribution
-from samplers.sample import Level, Status, next_level, normalise_weights
+from samplers.proposals import ProposalDistribution
+from samplers.sample import Status, next_level, normalise_weights
 
 
 class Iterate(NamedTuple):
     """One proposal of the search, with the results of its draws."""
 
     proposal: Product
-    quantile: float
-    """The rho-quantile of f under the proposal."""
-    level: float
-    """gamma_k: the quantile, but not less than gamma."""
-    record: Level
-
-
-def best_iterate(iterates: Sequence[Iterate], choice: str) -> Iterate | None:
-    """Return the iterate to sample from; None if there is none.
-
-    The one with the lowest rho-quantile, with choice "cov" not counted below gamma; among equals that with the
-    smallest c.o.v.
-    """
-
-    def rank(iterate: Iterate) -> tuple[float, float]:
-        return (iterate.quantile if choice == "quantile" else iterate.level, iterate.record.cov)
-
-    return min(iterates, key=rank, default=None)
+    quantile: float  # the rho-quantile of f under the proposal
+    level: float  # gamma_k: the quantile, but not less than gamma
+    cov: float  # of P[f <= level]
 
 
 SettingT = TypeVar("SettingT")
@@ -72,29 +46,19 @@ class CrossEntropy(Method):
     Families. In standard normal space: one Gaussian with mean and covariance ("gaussian"), with
     the mean only ("mean"), or a mixture of Gaussians ("mixture"), which can follow several
     regions of failure. In physical space: the paper's blocks ("blocks"), for a base distribution
-    that announces its own (`base.blocks`, see `announced_blocks`; `Product` is one): Beta in a
+    that announces its own (`base.blocks`; `Product` is one): Beta in a
     box, Normal with fixed covariance and its mean in a box, Gaussian, mixture.
 
     Where the paper, its released code and this implementation differ:
 
-    - *gamma_k.* The algorithm box says "minimum of gamma and the quantile", the text
-      gamma_k >= gamma; the latter is meant and done here.
-    - *Equation 3* divides by N_k; we divide by the sum of the weights, so that Q_k has mass 1.
-      The code divides by N rho even where more points than that are below gamma.
-    - *Likelihood ratio.* The code updates each block with its own ratio; here that is
-      likelihood_ratio="block". It varies less in many dimensions, but is not the projection of
-      equation 2: coordinates are moved towards the distribution of points with f <= gamma_k under a
-      product that is the base distribution in the one block and the proposal in all others.
-    - *Projection.* As in the paper. The code's programme for the mean of a Normal has the
-      covariance where its inverse belongs, and its Beta box is [0.5, 5], the paper's [1.5, 7].
-    - *Family.* The default is not the paper's: one Gaussian with its covariance covers curved
-      and two-lobed regions better than products. The covariance is drawn towards the present
-      one (`shrink_towards_present`).
-    - *End.* The paper runs K = 100 iterations of 5000; ours ends the search when two
-      proposals have reached gamma, unless early_end=False. Search simulations are part of n_sim.
-    - *Choice.* The paper takes the iterate with the lowest rho-quantile (choice="quantile"), the
-      code that with the lowest mean of the elite. Ours does not count quantiles below gamma;
-      among equals the smallest c.o.v. decides: an ever lower quantile favours one mode.
+    - *gamma_k* >= gamma, as the text says; the algorithm box has "minimum of gamma and the quantile".
+    - *Equation 3* divides by N_k, the code by N rho; we divide by the sum of the weights, so that Q_k has mass 1.
+    - *Likelihood ratio.* Joint, as in equation 2; the code's, by block, is likelihood_ratio="block" (less variance).
+    - *Projection.* The code has the covariance where its inverse belongs, and a Beta box of [0.5, 5], not [1.5, 7].
+    - *Family.* One Gaussian, its covariance drawn towards the present one, covers curved regions better than products.
+    - *End.* When two proposals have reached gamma; the paper's K = 100 iterations: early_end=False.
+    - *Choice.* The lowest rho-quantile is choice="quantile"; ours does not count quantiles below gamma, as an ever
+      lower one favours one mode, and takes the smallest c.o.v. among equals.
     - *Ties.* gamma_k is an outcome that occurred; if most outcomes tie, the largest below.
     - *Weights.* The paper samples from the proposal alone, whose weights are unbounded.
 
@@ -180,71 +144,56 @@ class CrossEntropy(Method):
 
     def steps(self, inputs: Inputs, goal: Goal, rng: np.random.Generator) -> Steps:
         """Search for a proposal, then estimate with fresh draws."""
-        base, space = self._start(inputs)
-        search, iterates = yield from self._search(base, space, goal, rng)
-        best = best_iterate(iterates, self.choice)
+        base = self._start(inputs)
+        search = Search(inputs, goal, rng, base, np.asarray if self.family == "blocks" else None)
+        iterates = yield from self._search(search, base)
+        best = min(iterates, key=self._rank, default=None)
         sampler: ProposalDistribution = base
         base_share = 1.0
         if best is not None and len(iterates) > 1:  # else the base draws fail often enough, or there is no way on
             base_share = self.base_share
-            wide = best.proposal.widen(self.wide_factor)
-            sampler = defensive_mixture(base, wide, best.proposal, base_share, self.wide_share)
+            sampler = search.mix(best.proposal, base_share, self.wide_share, self.wide_factor)
+        doubts = [] if best is not None and best.level == goal.gamma else search.warnings()
         limit = count_final_draws(goal, search.n_sim, self.n_final)
-        final = yield from draw_after_search(inputs, goal, search, sampler, base_share, limit, self.n_final, rng, space)
-        reached = best is not None and best.level == goal.gamma
-        return final.outcome(goal, search.status, [] if reached else search_warnings(search, goal.gamma))
+        return (yield from search.finish(sampler, base_share, limit, self.n_final, goal.target_cov, doubts))
 
-    def _start(self, inputs: Inputs) -> tuple[Product, Space]:
-        """Return the base distribution by blocks, theta_0, and the space that the search works in."""
+    def _start(self, inputs: Inputs) -> Product:
+        """Return the base distribution by blocks, theta_0, in the space that the search works in."""
         if self.family == "blocks":
-            base = announced_blocks(inputs)
-            return base, Space(base, np.asarray)
+            return announced_blocks(inputs)
         gaussian = Gaussian.standard(inputs.dim)
         if self.family == "mixture":
-            base = Product((MixtureBlock(gaussian, self.components),))
-        else:
-            base = Product((GaussianBlock(gaussian) if self.family == "gaussian" else NormalBlock(gaussian),))
-        return base, Space(base, inputs.base.from_standard_normal)
+            return Product((MixtureBlock(gaussian, self.components),))
+        return Product((GaussianBlock(gaussian) if self.family == "gaussian" else NormalBlock(gaussian),))
 
-    def _search(
-        self, base: Product, space: Space, goal: Goal, rng: np.random.Generator
-    ) -> Generator[FloatArray, FloatArray, tuple[Search, list[Iterate]]]:
+    def _rank(self, iterate: Iterate) -> tuple[float, float]:
+        """Return the order of the iterates: the least one is sampled from."""
+        return (iterate.quantile if self.choice == "quantile" else iterate.level, iterate.cov)
+
+    def _search(self, search: Search, proposal: Product) -> Generator[FloatArray, FloatArray, Sequence[Iterate]]:
         """Run algorithm 1, as a rule until two proposals have reached gamma."""
-        rounds, iterates = list[Round](), list[Iterate]()
-
-        def ended(status: Status) -> tuple[Search, list[Iterate]]:
-            return Search(rounds, [iterate.record for iterate in iterates], status), iterates
-
-        if goal.budget < LEAST_SEARCH_BUDGET:
-            return ended(Status.BUDGET)
-        proposal, spent = base, 0
-        for k in range(self.max_iterations):
-            size = min(value_at(self.n_iteration, k), goal.budget // LEAST_ROUNDS)
-            if spent + size > int(SEARCH_SHARE * goal.budget):
-                return ended(Status.BUDGET)
-            u = proposal.sample(size, rng)
-            try:
-                f = yield space.to_x(u)
-            except Interrupted:
-                return ended(Status.STOPPED)
-            spent += size
-            level = next_level(f, self.rho, goal.gamma)
-            lowest = float(f.min()) if level is None else level
-            elite = u[f <= lowest]
+        iterates, gamma, base = list[Iterate](), search.goal.gamma, proposal
+        while last := (
+            yield from search.draw(proposal, value_at(self.n_iteration, len(iterates)), self.max_iterations)
+        ):
+            del search.rounds[1:-1]  # `Search.pool_rounds` takes the first and the last one
+            level = next_level(last.f, self.rho, gamma)
+            lowest = float(last.f.min()) if level is None else level
+            elite = last.u[last.f <= lowest]
             log_ratios = base.log_probs(elite) - proposal.log_probs(elite)
-            rounds = [*rounds[:1], Round(base, proposal, u, f)]  # those that `pool_rounds` needs
-            rank = int(np.ceil(self.rho * size)) - 1
-            quantile = float(np.partition(f, rank)[rank])
-            record = round_record(lowest, size, log_ratios.sum(axis=0))
-            iterates.append(Iterate(proposal, quantile, lowest, record))
-            goal.on_level(iterates[-1].record)
+            rank = int(np.ceil(self.rho * len(last.f))) - 1
+            search.record(lowest, log_ratios.sum(axis=0))
+            iterates.append(Iterate(proposal, float(np.partition(last.f, rank)[rank]), lowest, search.trace[-1].cov))
             if level is None:
-                return ended(Status.STALLED)
-            n_reached = sum(iterate.level == goal.gamma for iterate in iterates)
-            if n_reached == 2 - (k == 0) and (self.early_end or k == 0):
-                return ended(Status.CONVERGED)
-            proposal = self._project(proposal, elite, log_ratios, value_at(self.alpha, k))
-        return ended(Status.CONVERGED if level == goal.gamma else Status.STALLED)
+                return iterates
+            n_reached, first = sum(iterate.level == gamma for iterate in iterates), len(iterates) == 1
+            if n_reached == 2 - first and (self.early_end or first):
+                search.status = Status.CONVERGED
+                return iterates
+            proposal = self._project(proposal, elite, log_ratios, value_at(self.alpha, len(iterates) - 1))
+        if search.status is Status.STALLED and iterates[-1].level == gamma:
+            search.status = Status.CONVERGED
+        return iterates
 
     def _project(self, proposal: Product, elite: FloatArray, log_ratios: FloatArray, alpha: float) -> Product:
         """Return the proposal after one step of equation 2 towards the elite points."""

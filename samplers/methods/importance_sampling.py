@@ -7,20 +7,12 @@ from typing import ClassVar
 
 import numpy as np
 
-from samplers.importance import (
-    Round,
-    Search,
-    draw_after_search,
-    plan_rounds,
-    pool_rounds,
-    round_record,
-    search_warnings,
-)
-from samplers.method import Goal, Interrupted, Steps
+from samplers.importance import Search
+from samplers.method import Goal, Steps
 from samplers.methods.base import Method
-from samplers.problem import FloatArray, Inputs, StandardNormal, check_settings
-from samplers.proposals import Mixture, ProposalDistribution, TiltedNormal
-from samplers.sample import Level, Status, next_level, normalise_weights
+from samplers.problem import FloatArray, Inputs, check_settings
+from samplers.proposals import ProposalDistribution, TiltedNormal
+from samplers.sample import Status, next_level, normalise_weights
 
 QUANTILE = 1.96
 """Half-widths are those of 95 % intervals."""
@@ -44,13 +36,10 @@ class ImportanceSampling(Method):
     Tian et al. say of their baseline only that it has "the same configuration as" Xu, Zou and Sun 2018;
     the rest is in their released script. Where that script and this implementation differ:
 
-    - *The mean* of the script adds weighted draws from the tilt and unweighted draws from the base
-      distribution in one average, which estimates neither. Ours weights every draw by p0 / (mixture of both), which
-      is what makes draws from both usable; no weight exceeds 1 / base_share.
-    - *Tilt.* The script fits every coordinate by one of about 70 distributions, taken as independent, and tilts
-      each in physical units with theta in [-1, 0], found by differential evolution on the
-      cross-entropy. Ours tilts in standard normal space, where dependence is kept, in any direction,
-      and the optimum is in closed form.
+    - *The mean* of the script averages weighted and unweighted draws, which estimates neither; ours weights every draw
+      by p0 / (mixture of both), so that no weight exceeds 1 / base_share.
+    - *Tilt.* The script tilts fitted marginals, taken as independent, in physical units by differential evolution; ours
+      tilts in standard normal space, where dependence is kept and the optimum is in closed form.
     - *Stop.* Both stop when the half-width is first under 0.2. Ours looks after every batch only; its
       c.o.v. holds the largest weight in addition, so that a lucky early batch does not stop it.
     - *Cost.* The search is part of n_sim.
@@ -105,63 +94,49 @@ class ImportanceSampling(Method):
 
     def steps(self, inputs: Inputs, goal: Goal, rng: np.random.Generator) -> Steps:
         """Search for the tilt, then draw until the interval is narrow enough."""
-        search, tilt = yield from self._search(inputs, goal, rng)
-        missed = unreached_share(search, tilt.shift, inputs, goal.gamma) if tilt else 0.0
-        base = TiltedNormal(np.zeros(inputs.dim))
-        sampler: ProposalDistribution = base
-        base_share = 1.0
-        if tilt and missed <= MOST_UNREACHED:
-            base_share = self.base_share
-            sampler = Mixture(np.array([base_share, 1 - base_share]), [base, tilt])
-        target = self.half_width / QUANTILE if goal.target_cov is None else goal.target_cov
-        limit = min(goal.budget - search.n_sim, self.n if goal.max_sim is None else goal.max_sim)
-        to_target = replace(goal, target_cov=target)
-        final = yield from draw_after_search(inputs, to_target, search, sampler, base_share, limit, self.batch, rng)
-        status = Status.CONVERGED if final.cov <= target else Status.BUDGET
-        doubts = search_warnings(search, goal.gamma)
+        search = Search(inputs, goal, rng)
+        tilt = yield from self._search(search)
+        missed = unreached_share(search, tilt.shift) if tilt and search.status is not Status.STOPPED else 0.0
+        sampler, base_share, doubts = search.base, 1.0, search.warnings()
         if missed > MOST_UNREACHED:
             where = f"{100 * missed:.0f} % of the failing points found lie outside the tilted distribution"
             doubts = [f"{where}: draws from the base distribution replace it."]
-        outcome = final.outcome(goal, status, doubts)
-        if (
-            final.stopped or status is not Status.BUDGET or goal.target_cov is not None
-        ):  # `Run` tells of a goal's target
+        elif tilt:
+            sampler, base_share = search.mix(tilt, self.base_share), self.base_share
+        target = self.half_width / QUANTILE if goal.target_cov is None else goal.target_cov
+        limit = min(goal.budget - search.n_sim, self.n if goal.max_sim is None else goal.max_sim)
+        outcome = yield from search.finish(sampler, base_share, limit, self.batch, target, doubts)
+        met = outcome.cov <= target
+        if outcome.status is Status.STOPPED:
             return outcome
-        return outcome.remark_first(f"All draws were used at a c.o.v. of {final.cov:.3g}, above {target:.3g}.")
+        if outcome.status is not Status.NO_HITS:
+            outcome = replace(outcome, status=Status.CONVERGED if met else Status.BUDGET)
+        if met or goal.target_cov is not None:  # `Run` tells of a goal's target
+            return outcome
+        return outcome.remark_first(f"All draws were used at a c.o.v. of {outcome.cov:.3g}, above {target:.3g}.")
 
-    def _search(
-        self, inputs: Inputs, goal: Goal, rng: np.random.Generator
-    ) -> Generator[FloatArray, FloatArray, tuple[Search, TiltedNormal | None]]:
+    def _search(self, search: Search) -> Generator[FloatArray, FloatArray, TiltedNormal | None]:
         """Follow the level down to gamma and fit the shift there twice; None where base draws serve."""
-        rounds, trace = list[Round](), list[Level]()
-        size, n_rounds = plan_rounds(goal, self.n_round, self.max_rounds)
-        if n_rounds == 0:
-            return Search(rounds, trace, Status.BUDGET), None
-        base = StandardNormal(inputs.dim)
-        proposal, reached = TiltedNormal(np.zeros(inputs.dim)), 0
-        for k in range(n_rounds):
-            u = proposal.sample(size, rng)
-            try:
-                f = yield inputs.base.from_standard_normal(u)
-            except Interrupted:
-                return Search(rounds, trace, Status.STOPPED), proposal
-            rounds.append(Round(base, proposal, u, f))
-            level = next_level(f, self.rho, goal.gamma)
-            inside, log_weights = f <= (float(f.min()) if level is None else level), rounds[-1].log_weights
-            trace.append(round_record(float(f.min()) if level is None else level, size, log_weights[inside]))
-            goal.on_level(trace[-1])
-            if level is None or (k == 0 and level == goal.gamma):
-                status = Status.STALLED if level is None else Status.CONVERGED
-                return Search(rounds, trace, status), proposal if k else None
-            proposal = TiltedNormal(normalise_weights(log_weights[inside]) @ u[inside])
-            reached += level == goal.gamma
+        tilt, gamma, reached = None, search.goal.gamma, 0
+        proposal: ProposalDistribution = search.base
+        while last := (yield from search.draw(proposal, self.n_round, self.max_rounds)):
+            level = next_level(last.f, self.rho, gamma)
+            lowest = float(last.f.min()) if level is None else level
+            inside, log_weights = last.f <= lowest, last.log_weights
+            search.record(lowest, log_weights[inside])
+            if level is None or (tilt is None and level == gamma):
+                search.status = Status.STALLED if level is None else Status.CONVERGED
+                return tilt
+            proposal = tilt = TiltedNormal(normalise_weights(log_weights[inside]) @ last.u[inside])
+            reached += level == gamma
             if reached == FITS_AT_GAMMA:
                 break
-        ended = Status.BUDGET if n_rounds < self.max_rounds else Status.STALLED
-        return Search(rounds, trace, Status.CONVERGED if reached else ended), proposal
+        if reached and search.status is not Status.STOPPED:
+            search.status = Status.CONVERGED
+        return tilt
 
 
-def unreached_share(search: Search, theta: FloatArray, inputs: Inputs, gamma: float) -> float:
+def unreached_share(search: Search, theta: FloatArray) -> float:
     """Return the share of the search's failing points that the tilt theta (d,) does not reach.
 
     The larger of two: of the base draws under the first level, those with theta' u < 0; of the mass of the
@@ -169,8 +144,8 @@ def unreached_share(search: Search, theta: FloatArray, inputs: Inputs, gamma: fl
     """
     first = search.rounds[0]
     behind = float((first.u[first.f <= search.trace[0].gamma] @ theta < 0).mean())
-    failing = np.concatenate([one.u[one.f <= gamma] for one in search.rounds])
+    failing = search.failing_points()
     if len(failing) == 0:
         return behind
-    weights = normalise_weights(pool_rounds(search.rounds, inputs.base.from_standard_normal, gamma).log_weights)
+    weights = normalise_weights(search.pool_rounds().log_weights)
     return max(behind, float(weights[failing @ theta < 0.5 * float(theta @ theta)].sum()))

@@ -9,28 +9,12 @@ import numpy as np
 from scipy.special import log_ndtr
 
 from samplers.components import VonMisesFisherNakagami
-from samplers.importance import (
-    Round,
-    Search,
-    count_final_draws,
-    defensive_mixture,
-    draw_after_search,
-    plan_rounds,
-    pool_rounds,
-    round_record,
-    search_warnings,
-)
-from samplers.method import Goal, Interrupted, Steps
+from samplers.importance import Search, count_final_draws
+from samplers.method import Goal, Steps
 from samplers.methods.base import Method
-from samplers.problem import FloatArray, Inputs, StandardNormal, check_settings
-from samplers.proposals import (
-    Mixture,
-    ProposalDistribution,
-    TiltedNormal,
-    fit_proposal_mixture,
-    fit_shrunk_gaussian,
-)
-from samplers.sample import Level, Status, normalise_weights
+from samplers.problem import FloatArray, Inputs, check_settings
+from samplers.proposals import Mixture, ProposalDistribution, fit_proposal_mixture, fit_shrunk_gaussian
+from samplers.sample import Status, normalise_weights
 
 WIDEST = 10.0
 NARROWEST = 1e-15
@@ -60,21 +44,15 @@ class ImprovedCrossEntropy(Method):
 
     Where the authors' released code (the ERA group's iCE scripts) and this implementation differ:
 
-    - *Estimate.* The code estimates from the last draws of the search. Their proposal was stopped by
-      looking at them, and its weights are not bounded; fresh draws with base draws among them cost
-      more simulations and are right whatever the search did. They also come from a proposal fitted once
-      more, to the failures alone (sigma = 0) and to those of all rounds, weighted by p0 / (mixture of
-      the proposals): a region that the last round has thinned out or lost is still in the first ones.
-    - *Wide draws* are ours: a Gaussian fitted to failures beyond a plane falls off sideways and outwards as
-      fast as they do or faster, and the weights there would be heavy.
-    - *sigma* is sought by halving intervals of its logarithm, between 1e-15 and 10 times the median of |f - gamma|. The
-      code minimises |c.o.v. - target| over sigma itself, from a first width of 10 times the mean of f (`sigma_t(1) =
-      10*mean(geval)` in iCE_SG, iCE_GM and iCE_vMFNM). An outlier or a negative mean spoils that. f may be infinite:
-      +inf has weight 0 at any finite width. Ties and a cap of f are no difficulty, since no quantile is taken.
-    - *Components.* The code starts with a given number and drops the small ones. Ours takes the number
-      with the best Bayesian information criterion, up to `components`.
-    - *Covariances* are shrunk towards I but for the direction of the mean (`fit_shrunk_gaussian`), which
-      makes "gaussian" and "mixture" usable in a hundred dimensions, where those of the points alone are not.
+    - *Estimate.* The code estimates from the last draws of the search, whose proposal was stopped by looking at them.
+      Fresh draws, base draws among them, are right whatever the search did; their proposal is fitted to the failures of
+      all rounds, as the last round may have lost a region.
+    - *Wide draws* are ours: a Gaussian fitted to failures beyond a plane falls off as fast as they do or faster.
+    - *sigma* is sought by bisection between 1e-15 and 10 times the median of |f - gamma|; the code's first width,
+      `10*mean(geval)`, is spoilt by an outlier or a negative mean. f may be infinite.
+    - *Components.* The number with the best Bayesian information criterion; the code starts with one and drops some.
+    - *Covariances* are shrunk towards I but for the direction of the mean (`fit_shrunk_gaussian`), so that a hundred
+      dimensions can be had.
 
     A region that the search did not see or lost in fitting is seen by base draws only, as a rare heavy
     weight (then warned of) or not at all. The interval is log-normal (`weighted_interval`); where the base draws
@@ -125,58 +103,43 @@ class ImprovedCrossEntropy(Method):
 
     def steps(self, inputs: Inputs, goal: Goal, rng: np.random.Generator) -> Steps:
         """Search for a proposal, then estimate with fresh draws."""
-        search, proposal = yield from self._search(inputs, goal, rng)
-        sampler: ProposalDistribution = TiltedNormal(np.zeros(inputs.dim))
-        base_share = 1.0
+        search = Search(inputs, goal, rng)
+        proposal = yield from self._search(search)
+        sampler, base_share = search.base, 1.0
         if proposal is not None:
             base_share = self.base_share
-            wide = proposal.widen(self.wide_factor)
-            sampler = defensive_mixture(sampler, wide, proposal, base_share, self.wide_share)
+            sampler = search.mix(proposal, base_share, self.wide_share, self.wide_factor)
         limit = count_final_draws(goal, search.n_sim, self.n_final)
-        final = yield from draw_after_search(inputs, goal, search, sampler, base_share, limit, self.n_final, rng)
-        return final.outcome(goal, search.status, search_warnings(search, goal.gamma))
+        doubts = search.warnings()
+        return (yield from search.finish(sampler, base_share, limit, self.n_final, goal.target_cov, doubts))
 
-    def _search(
-        self, inputs: Inputs, goal: Goal, rng: np.random.Generator
-    ) -> Generator[FloatArray, FloatArray, tuple[Search, Mixture | None]]:
+    def _search(self, search: Search) -> Generator[FloatArray, FloatArray, Mixture | None]:
         """Narrow the target down to failure; return the proposal fitted last, None where base draws serve."""
-        rounds, trace = list[Round](), list[Level]()
-        size, n_rounds = plan_rounds(goal, self.n_round, self.max_rounds)
-        if n_rounds == 0:
-            return Search(rounds, trace, Status.BUDGET), None
-        base, to_x = StandardNormal(inputs.dim), inputs.base.from_standard_normal
-        sampler: ProposalDistribution = TiltedNormal(np.zeros(inputs.dim))
+        gamma, rng = search.goal.gamma, search.rng
+        sampler: ProposalDistribution = search.base
         proposal: Mixture | None = None
         width, narrowest = math.inf, 0.0
-        for k in range(n_rounds):
-            u = sampler.sample(size, rng)
-            try:
-                f = yield to_x(u)
-            except Interrupted:
-                return Search(rounds, trace, Status.STOPPED), None
-            rounds.append(Round(base, sampler, u, f))
-            log_ratio = rounds[-1].log_weights
-            trace.append(round_record(goal.gamma, size, log_ratio[f <= goal.gamma]))
-            goal.on_level(trace[-1])
-            g = np.clip(f - goal.gamma, -HUGE, HUGE)
+        while last := (yield from search.draw(sampler, self.n_round, self.max_rounds)):
+            log_ratio = last.log_weights
+            search.record(gamma, log_ratio[last.f <= gamma])
+            g = np.clip(last.f - gamma, -HUGE, HUGE)
             reached = weights_cov(np.where(g <= 0, -log_smooth_indicator(g, width), -np.inf)) <= self.weight_cov
-            if reached and k == 0:
-                return Search(rounds, trace, Status.CONVERGED), None
-            if k == 0:
+            if proposal is None:
+                if reached:
+                    search.status = Status.CONVERGED
+                    return None
                 sizes = np.abs(g[(np.abs(g) < HUGE) & (g != 0)])
                 scale = float(np.median(sizes)) if len(sizes) else 1.0
                 width, narrowest = WIDEST * scale, NARROWEST * scale
             width = next_width(g, log_ratio, self.weight_cov, narrowest, width)
             if reached or (width == narrowest and (g <= 0).any()):
-                failures = np.concatenate([one.u[one.f <= goal.gamma] for one in rounds])
-                last = self._fit(failures, pool_rounds(rounds, to_x, goal.gamma).log_weights, rng)
-                return Search(rounds, trace, Status.CONVERGED), last
+                search.status = Status.CONVERGED
+                return self._fit(search.failing_points(), search.pool_rounds().log_weights, rng)
             log_weights = log_smooth_indicator(g, width) + log_ratio
             if width == narrowest or not np.isfinite(log_weights).any():  # all outcomes alike
-                return Search(rounds, trace, Status.STALLED), proposal
-            sampler = proposal = self._fit(u, log_weights, rng)
-        ended = Status.BUDGET if n_rounds < self.max_rounds else Status.STALLED
-        return Search(rounds, trace, ended), proposal
+                return proposal
+            sampler = proposal = self._fit(last.u, log_weights, rng)
+        return proposal
 
     def _fit(self, u: FloatArray, log_weights: FloatArray, rng: np.random.Generator) -> Mixture:
         """Return the member of the family nearest to points u (n, d) with these weights (n,)."""

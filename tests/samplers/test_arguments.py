@@ -57,7 +57,7 @@ WRONG: dict[str, tuple[dict[str, Callable[..., Any]], str]] = {
     ),
     "another shape": (
         {"sample": lambda n, rng: stats.expon.isf(stats.norm.sf(np.sign(rng.standard_normal((n, 2)))))},
-        "is not normal",
+        "Kolmogorov distance",
     ),
     "correlated": ({"sample": correlated}, r"correlation 0\.[78]\d? between coordinates 0 and 1"),
     "no inverse": ({"from_standard_normal": lambda u: stats.norm.cdf(u)}, "where x is"),

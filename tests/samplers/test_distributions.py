@@ -11,7 +11,6 @@ from samplers.distributions import (
     IndependentDistributions,
     OpenTurnsDistribution,
     ScipyDistribution,
-    ScipyMultivariateNormal,
     as_distribution,
 )
 
@@ -72,13 +71,13 @@ def test_array_parameters_are_independent_coordinates():
 def test_multivariate_normal_has_its_moments_and_density():
     mean, covariance = np.array([1.0, -2.0]), np.array([[4.0, 1.5], [1.5, 1.0]])
     frozen = stats.multivariate_normal(mean, covariance)
-    base = ScipyMultivariateNormal(frozen)
+    base = as_distribution(frozen)
     square_root = base.from_standard_normal(np.eye(2)) - mean
     np.testing.assert_allclose(square_root.T @ square_root, covariance)
     x = base.sample(5, np.random.default_rng(0))
     np.testing.assert_allclose(base.log_prob(x), frozen.logpdf(x))
     np.testing.assert_allclose(base.from_standard_normal(base.to_standard_normal(x)), x)
-    assert ScipyMultivariateNormal(stats.multivariate_normal(2.0, 9.0)).from_standard_normal(np.ones((1, 1))) == 5.0
+    assert as_distribution(stats.multivariate_normal(2.0, 9.0)).from_standard_normal(np.ones((1, 1))) == 5.0
 
 
 @pytest.mark.parametrize("base", [stats.lognorm(0.5), stats.multivariate_normal([1.0, 2.0])])
@@ -89,7 +88,7 @@ def test_they_travel_to_workers(base):
 
 def test_what_has_no_map_is_refused():
     with pytest.raises(ValueError, match="covariance of rank 2, got rank 1"):
-        ScipyMultivariateNormal(stats.multivariate_normal([0, 0], [[1, 1], [1, 1]], allow_singular=True))
+        as_distribution(stats.multivariate_normal([0, 0], [[1, 1], [1, 1]], allow_singular=True))
     with pytest.raises(ValueError, match="discrete poisson"):
         ScipyDistribution(stats.poisson(3.0))
     with pytest.raises(ValueError, match="valid parameters of norm"):

@@ -30,8 +30,9 @@ from samplers.components import (
     MixtureComponent,
     SubspaceGaussian,
 )
+from samplers.distributions import LOG_TWO_PI
 from samplers.methods.two_stage.settings import CORNER, EDGES, LINEAR_MODEL, PIECES
-from samplers.problem import LOG_TWO_PI, FloatArray
+from samplers.problem import FloatArray
 
 LAD_MIN_DEVIATION = 1e-12
 """Added to each deviation before it divides: all of them are 0 where f is linear."""

@@ -7,6 +7,7 @@ import pytest
 from scipy import stats
 
 import samplers
+from samplers.importance import Search
 from samplers.limit_states import four_branches, half_space, parabola, plateau
 from samplers.method import Goal
 from samplers.sample import Status
@@ -17,8 +18,8 @@ IS = samplers.ImportanceSampling
 def test_the_tilt_is_the_mean_of_the_failures(drive):
     """For a half-space at beta that is phi(beta) / Phi(-beta) along its normal."""
     reference = half_space(2, 3.0)
-    steps = IS(n_round=5000)._search(reference.problem, Goal(gamma=0.0), np.random.default_rng(1))
-    search, tilt = drive(steps, reference.problem).value
+    search = Search(reference.problem, Goal(gamma=0.0), np.random.default_rng(1))
+    tilt = drive(IS(n_round=5000)._search(search), reference.problem).value
     assert search.status is Status.CONVERGED
     length = stats.norm.pdf(3.0) / stats.norm.sf(3.0)
     np.testing.assert_allclose(tilt.shift, np.full(2, length / math.sqrt(2)), atol=0.1)

@@ -8,15 +8,13 @@ from scipy.stats import norm
 import samplers
 from samplers.limit_states import half_space, two_modes
 from samplers.methods.kriging import Prediction, compress_outcomes, fit_kriging, outcome_scale
-from samplers.methods.surrogate import Pool, build_pool_proposal, first_mixture
+from samplers.methods.surrogate import Pool, PoolProposal, isotropic_mixture
 from samplers.problem import FunctionProblem, StandardNormal
-
-SCALES = (1.0, 1.5, 2.2, 3.0)
 
 
 def pool_of(mean, n=4000, dim=2, seed=0, sd=0.3):
     """A pool whose surrogate predicts `mean(u)` with one standard deviation everywhere."""
-    mixture = first_mixture(dim, SCALES)
+    mixture = isotropic_mixture(dim)
     u = mixture.sample(n, np.random.default_rng(seed))
     log_weights = StandardNormal(dim).log_prob(u) - mixture.log_prob(u)
     return Pool(u, log_weights, Prediction(mean(u), np.full(n, sd)))
@@ -30,7 +28,7 @@ def test_the_estimate_is_unbiased_whatever_the_surrogate_says(seen_as):
     rng, estimates = np.random.default_rng(1), []
     for seed in range(300):
         pool = pool_of(lambda u: seen_as - u[:, 0], n=1000, seed=seed)
-        chosen, log_weights, _ = build_pool_proposal(pool, SCALES).draw(60, rng)
+        chosen, log_weights, _ = PoolProposal.build(pool).draw(60, rng)
         estimates.append(np.exp(log_weights)[pool.u[chosen, 0] > 2.0].sum() / 60)
     error = np.std(estimates, ddof=1) / np.sqrt(300)
     assert abs(np.mean(estimates) - norm.sf(2.0)) < 4 * error
