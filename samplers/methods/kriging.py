@@ -78,7 +78,7 @@ class Kriging:
         return Prediction(mean - self.limit, np.maximum(sd, 1e-9) * self.inflation)
 
     def covariance(self, u: FloatArray) -> tuple[FloatArray, float]:
-        """Return the posterior covariance of f without noise at u (n, d), shape (n, n), and the variance of the noise."""
+        """Return the posterior covariance of f without noise at u (n, d), (n, n), and the variance of the noise."""
         smooth, nugget = self.process.kernel_.k1, self.process.kernel_.k2
         half = solve_triangular(self.process.L_, smooth(u, self.process.X_train_).T, lower=True)
         square = self.inflation**2
