@@ -126,7 +126,7 @@ def load_ego(
     if kind == "unknown":
         raise ValueError(f"Unknown ego {text!r}{suggest_ego(text)}; expected {EXPECTED_EGO}.")
     if kind in ("zip", "hub"):
-        return load_saved_ego(find_hub_model(text) if kind == "hub" else Path(text), algo, trust, stats)
+        return load_saved_ego(cast(Path, find_hub_model(text)) if kind == "hub" else Path(text), algo, trust, stats)
     if kind == "noisy":
         inner, mark, settings = _require_inner_ego(text).rpartition("?")
         ego = load_ego(inner if mark else settings, algo, trust, stats)

@@ -160,7 +160,7 @@ class _Graph(nn.Module):
 
     def __init__(self, ego: SavedEgo) -> None:
         super().__init__()
-        self.policy = ego.model.policy
+        self.policy = ego.policy
         self.policy.set_training_mode(False)
         self.recurrent = hasattr(self.policy, "lstm_actor")  # sb3_contrib's policies have no common class
         self.frames = 1 if ego.frames is None else ego.frames[0]
@@ -252,7 +252,7 @@ def _trace(ego: SavedEgo, path: Path) -> None:
                 dynamo=False,
             )
         except Exception as error:  # torch has many, without a common class
-            raise ValueError(f"Cannot export a policy of class {type(ego.model.policy).__name__}: {error}") from error
+            raise ValueError(f"Cannot export a policy of class {type(ego.policy).__name__}: {error}") from error
 
 
 def compare_actions(policy: Any, other: Any, rng: np.random.Generator) -> tuple[float, int]:

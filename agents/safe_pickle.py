@@ -1,10 +1,10 @@
 """Files of others: whether anybody could have written them, and their pickles opened so that they cannot run code.
 
-A pickle names classes and functions, calls them and fills what they return. Here a name gives a class of a short list
-of families, which may be referred to but is not called, or a function of this module, which checks its arguments, and
-only objects of known classes are filled. What NumPy's own functions accept is not safe to pass on
-(`numpy.ndarray(shape, dtype, buffer)` with a dtype of objects takes bytes of the file for addresses), so arrays are
-numbers, filled with as many bytes as they have. What is made takes memory in proportion to the content.
+A pickle names classes and functions, calls them and fills what they return. Here it is first read into a tree of inert
+notes of what it wants; then each is made if its name is on a short list, from arguments that are checked. What NumPy's
+own functions accept is not safe to pass on (`numpy.ndarray(shape, dtype, buffer)` with a dtype of objects takes bytes
+of the file for addresses), so arrays are numbers, of as many bytes as they have. What is made takes memory in
+proportion to the content.
 """
 
 from __future__ import annotations
@@ -70,69 +70,38 @@ def require(holds: object, what: str) -> None:
 
 
 def open_pickle(content: bytes) -> Any:
-    """Return the object in a pickle; raise `ForbiddenObject` before anything unlisted is called."""
-    return _RestrictedUnpickler(io.BytesIO(content)).load()
+    """Return the object in a pickle; raise `ForbiddenObject` where it needs anything unlisted."""
+    return _Maker().make(_InertUnpickler(io.BytesIO(content)).load())
 
 
-# --- numbers ----------------------------------------------------------------------------------------
+# --- reading ----------------------------------------------------------------------------------------
 
 MAX_AXES, MAX_SIZE = 8, 2**31
 """Most axes of an array, and the largest size of one."""
-_NUMBERS = re.compile(r"[<>=|]?(b1|[iu][1248]|f[248])")
-"""Names of the dtypes of numbers."""
-_PLAIN_DTYPE = (None, None, None, -1, -1, 0)
-"""What the state of a dtype has behind its version and byte order: no fields, no shape, no alignment of its own."""
 
 
-def _make_dtype(name: Any, *_: Any) -> np.dtype[Any]:
-    """Return the dtype of a name, of numbers."""
-    require(isinstance(name, str) and _NUMBERS.fullmatch(name), f"it holds an array of {name!r:.50}, not of numbers")
-    dtype: np.dtype[Any] = np.dtype(name, copy=True)
-    return dtype
+class _Note:
+    """What a pickle names; an instance is what it wants made of that: from arguments, a state, and entries put in."""
 
+    name: ClassVar[str]
 
-def _fill_dtype(dtype: np.dtype[Any], state: Any) -> None:
-    """Give a dtype its byte order."""
-    plain = type(state) is tuple and len(state) >= 8 and state[1] in ("<", ">", "=", "|") and state[2:8] == _PLAIN_DTYPE
-    require(plain, "it holds a dtype that is not one of numbers")
-    dtype.__setstate__((3, state[1], *_PLAIN_DTYPE))  # type: ignore[attr-defined]
+    def __new__(cls, *arguments: Any) -> _Note:
+        note = super().__new__(cls)
+        note.arguments, note.state, note.entries = arguments, None, dict[Any, Any]()
+        return note
 
+    arguments: tuple[Any, ...]
+    state: Any
+    entries: dict[Any, Any]
 
-def _make_array(*_: Any) -> NDArray[Any]:
-    """Return an array that is filled later."""
-    return np.empty(0, np.uint8)
+    def __call__(self, *_: Any) -> None:
+        raise ForbiddenObject(f"it asks for {self.name}, which may run code")
 
+    def __setstate__(self, state: Any) -> None:
+        self.state = state
 
-def _fill_array(array: NDArray[Any], state: Any) -> None:
-    """Fill an empty array with as many bytes as it has."""
-    once = not array.size and array.base is None and type(state) is tuple and len(state) == 5
-    require(once, "it holds an array twice")
-    _, shape, dtype, fortran, content = state
-    filled = _fits(shape, dtype, content) and isinstance(content, bytes) and isinstance(fortran, int)
-    require(filled, "it holds an array that its bytes do not fill")
-    array.__setstate__((1, shape, dtype, bool(fortran), content))  # type: ignore[arg-type]  # as pickles have it
-
-
-def _read_buffer(content: Any, dtype: Any, shape: Any, order: Any = "C", axes: Any = None) -> NDArray[Any]:
-    whole = _fits(shape, dtype, content) and order in ("C", "F") and axes is None
-    require(whole, "it holds an array that its bytes do not fill")
-    return np.frombuffer(bytearray(content), dtype=dtype).reshape(shape, order=order)
-
-
-def _make_scalar(dtype: Any, content: Any = None) -> Any:
-    """Return the number in some bytes."""
-    require(_fits((), dtype, content), "it holds a strange number")
-    return np.frombuffer(content, dtype=dtype)[0]
-
-
-def _fits(shape: Any, dtype: Any, content: Any) -> bool:
-    """Return whether content fills an array of numbers of a shape."""
-    if not isinstance(dtype, np.dtype) or dtype.kind not in "biuf" or dtype.itemsize > 8:
-        return False
-    if type(shape) is not tuple or len(shape) > MAX_AXES or not isinstance(content, bytes | bytearray):
-        return False
-    sizes = all(type(size) is int and 0 <= size < MAX_SIZE for size in shape)
-    return sizes and len(content) == math.prod(shape) * dtype.itemsize
+    def __setitem__(self, key: Any, value: Any) -> None:
+        self.entries[key] = value
 
 
 def _is_key(value: object) -> bool:
@@ -142,40 +111,37 @@ def _is_key(value: object) -> bool:
     return isinstance(value, plain) or short
 
 
-def _make_ordered(items: Any = ()) -> OrderedDict[Any, Any]:
-    """Return a mapping of pairs."""
-    pairs = isinstance(items, list | tuple) and all(isinstance(one, list | tuple) and len(one) == 2 for one in items)
-    require(pairs and all(_is_key(key) for key, _ in items), "it has keys that are no text or numbers")
-    return OrderedDict((key, value) for key, value in items)
+_PythonUnpickler: Any = getattr(pickle, "_Unpickler")  # noqa: B009  (in Python, not in C; unknown to type checkers)
 
 
-def _leave_out(*_: Any) -> None:
-    """Stand for a random generator: a space without one makes its own."""
+def _check_keys(step: bytes, keys: slice) -> Callable[[Any], None]:
+    """Return a step whose keys, a part of the stack, are checked first."""
+
+    def load(self: Any) -> None:
+        require(all(map(_is_key, self.stack[keys])), "it has keys that are no text or numbers")
+        _PythonUnpickler.dispatch[step[0]](self)
+
+    return load
 
 
-def _refuse_call(*_: Any) -> None:
-    raise ForbiddenObject("it makes an array over memory that it names")
+class _InertUnpickler(_PythonUnpickler):  # type: ignore[misc]
+    """Unpickler that makes notes in place of objects, and hashes nothing that takes ages to hash."""
+
+    dispatch: ClassVar[dict[int, Callable[[Any], None]]] = {
+        **_PythonUnpickler.dispatch,
+        pickle.SETITEM[0]: _check_keys(pickle.SETITEM, slice(-2, -1)),
+        pickle.SETITEMS[0]: _check_keys(pickle.SETITEMS, slice(None, None, 2)),
+        pickle.DICT[0]: _check_keys(pickle.DICT, slice(None, None, 2)),
+        pickle.ADDITEMS[0]: _check_keys(pickle.ADDITEMS, slice(None)),
+        pickle.FROZENSET[0]: _check_keys(pickle.FROZENSET, slice(None)),
+    }
+
+    def find_class(self, module: str, name: str) -> type[_Note]:
+        """Return a kind of note for a name."""
+        return type("Note", (_Note,), {"name": f"{module}.{name}"})
 
 
-CALLED: dict[str, Callable[..., Any]] = {
-    "numpy.dtype": _make_dtype,
-    "numpy.ndarray": _refuse_call,
-    "numpy._core.numeric._frombuffer": _read_buffer,
-    "numpy._core.multiarray._reconstruct": _make_array,
-    "numpy._core.multiarray.scalar": _make_scalar,
-    "numpy.random._pickle.__generator_ctor": _leave_out,
-    "numpy.random._pickle.__bit_generator_ctor": _leave_out,
-    "numpy.random._pickle.__randomstate_ctor": _leave_out,
-    "numpy.random.bit_generator.__pyx_unpickle_SeedSequence": _leave_out,
-    "numpy.random.bit_generator.SeedSequence": _leave_out,
-    "numpy.random._pcg64.PCG64": _leave_out,
-    "numpy.random._mt19937.MT19937": _leave_out,
-    "collections.OrderedDict": _make_ordered,
-}
-"""Names in a pickle to the functions that they stand for."""
-
-
-# --- objects ----------------------------------------------------------------------------------------
+# --- making -----------------------------------------------------------------------------------------
 
 REFERRED_BASES = {
     "torch.nn": ("torch.nn.Module",),
@@ -192,88 +158,88 @@ MADE_BASES = {
     ),
 }
 """Likewise, whose instances may be made, empty, and filled."""
-
-_PythonUnpickler: Any = getattr(pickle, "_Unpickler")  # noqa: B009  (in Python, not in C; unknown to type checkers)
-_HASHED = {
-    pickle.SETITEM: slice(-2, -1),
-    pickle.SETITEMS: slice(None, None, 2),
-    pickle.DICT: slice(None, None, 2),
-    pickle.ADDITEMS: slice(None),
-    pickle.FROZENSET: slice(None),
-}
-"""Steps that hash a part of the stack, which is checked first: some keys take ages to hash."""
-_REFUSED = (pickle.NEWOBJ_EX, pickle.INST, pickle.OBJ, pickle.NEXT_BUFFER, pickle.EXT1, pickle.EXT2, pickle.EXT4)
-"""Steps that no saved model needs."""
+_NUMBERS = re.compile(r"[<>=|]?(b1|[iu][1248]|f[248])")
+"""Names of the dtypes of numbers."""
 
 
-def _check_keys(load: Callable[..., None], keys: slice) -> Callable[..., None]:
-    """Return a step whose keys, a part of the stack, are checked first."""
+class _Maker:
+    """Makes what notes want, each once."""
 
-    def load_checked(self: Any) -> None:
-        require(all(map(_is_key, self.stack[keys])), "it has keys that are no text or numbers")
-        load(self)
+    def __init__(self) -> None:
+        self.made = dict[int, Any]()
+        self.special: dict[str, Callable[[_Note], Any]] = {
+            "numpy.dtype": self.make_dtype,
+            "numpy._core.numeric._frombuffer": lambda note: self.fill(*note.arguments),
+            "numpy._core.multiarray._reconstruct": self.make_array,
+            "numpy._core.multiarray.scalar": lambda note: self.fill(note.arguments[1], note.arguments[0], ())[()],
+            "collections.OrderedDict": self.make_ordered,
+        }
 
-    return load_checked
+    def make(self, value: Any) -> Any:
+        """Return a value with everything in it made."""
+        if id(value) not in self.made:
+            self.made[id(value)] = self._make(value)
+        return self.made[id(value)]
+
+    def _make(self, value: Any) -> Any:
+        if isinstance(value, dict):
+            return {key: self.make(one) for key, one in value.items()}
+        if type(value) in (list, tuple):
+            return type(value)(map(self.make, value))
+        if isinstance(value, type):
+            return _find_class(value.name, REFERRED_BASES)
+        if not isinstance(value, _Note):
+            return value
+        name = re.sub(r"^numpy\.core\.", "numpy._core.", value.name)  # what NumPy 1 called it
+        if name.startswith("numpy.random."):
+            return None  # a random generator: a space without one makes its own
+        return self.special[name](value) if name in self.special else self.make_object(value)
+
+    def make_object(self, note: _Note) -> Any:
+        """Return an object that was made empty and filled."""
+        cls, state = _find_class(note.name, MADE_BASES), self.make(note.state)
+        require(not note.arguments, f"it calls {note.name}, which may run code")
+        named = isinstance(state, dict) and all(isinstance(name, str) for name in state)
+        require(named, f"it holds contents of {cls.__name__}")
+        value = cls.__new__(cls)
+        getattr(value, "__setstate__", value.__dict__.update)(state)  # in Python, and keeps what it is given
+        return value
+
+    def make_ordered(self, note: _Note) -> OrderedDict[Any, Any]:
+        """Return a mapping of pairs."""
+        pairs = [*(note.arguments[0] if note.arguments else ()), *note.entries.items()]
+        require(all(_is_key(key) for key, _ in pairs), "it has keys that are no text or numbers")
+        return OrderedDict((key, self.make(value)) for key, value in pairs)
+
+    def make_dtype(self, note: _Note) -> np.dtype[Any]:
+        """Return a dtype of numbers."""
+        name, *_ = note.arguments
+        require(isinstance(name, str) and _NUMBERS.fullmatch(name), f"it holds an array of {name!r:.50}, not numbers")
+        dtype: np.dtype[Any] = np.dtype(name)
+        return dtype.newbyteorder(note.state[1]) if type(note.state) is tuple else dtype
+
+    def make_array(self, note: _Note) -> NDArray[Any]:
+        """Return an array that is filled by its state."""
+        require(type(note.state) is tuple and len(note.state) == 5, "it holds an array that is not filled")
+        _, shape, dtype, fortran, content = note.state
+        return self.fill(content, dtype, shape, "F" if fortran is True else "C")
+
+    def fill(self, content: Any, kind: Any, shape: Any, order: Any = "C") -> NDArray[Any]:
+        """Return an array of numbers of a shape that some bytes fill."""
+        dtype = self.make(kind)
+        sizes = type(shape) is tuple and len(shape) <= MAX_AXES
+        sizes = sizes and all(type(size) is int and 0 <= size < MAX_SIZE for size in shape)
+        fits = sizes and isinstance(dtype, np.dtype) and isinstance(content, bytes | bytearray) and order in ("C", "F")
+        require(fits and len(content) == math.prod(shape) * dtype.itemsize, "it holds an array not filled by its bytes")
+        return np.ndarray(shape, dtype, bytearray(content), order=order)
 
 
-class _RestrictedUnpickler(_PythonUnpickler):  # type: ignore[misc]
-    """Unpickler that takes listed steps only."""
-
-    def find_class(self, module: str, name: str) -> Any:
-        """Return the function or the class that a name stands for."""
-        module = re.sub(r"^numpy\.core\.", "numpy._core.", module)  # what NumPy 1 called it
-        if f"{module}.{name}" in CALLED:
-            return CALLED[f"{module}.{name}"]
-        for package, bases in (*REFERRED_BASES.items(), *MADE_BASES.items()):
-            if "." not in name and f"{module}.".startswith(f"{package}."):
-                named = getattr(importlib.import_module(module), name, None)  # pickles name what they need
-                if _is_subclass(named, bases):
-                    return named
-        raise ForbiddenObject(f"it asks for {module}.{name}, which may run code")
-
-    def load_reduce(self) -> None:
-        """REDUCE: call a function."""
-        arguments, function = self.stack.pop(), self.stack[-1]
-        known = any(function is each for each in CALLED.values())
-        require(known, f"it calls {getattr(function, '__qualname__', type(function).__name__)}, which may run code")
-        self.stack[-1] = function(*arguments)
-
-    def load_newobj(self) -> None:
-        """NEWOBJ: make an empty object."""
-        arguments, cls = self.stack.pop(), self.stack[-1]
-        if arguments == () and any(_is_subclass(cls, bases) for bases in MADE_BASES.values()):
-            self.stack[-1] = cls.__new__(cls)
-        else:
-            self.stack.append(arguments)
-            self.load_reduce()
-
-    def load_build(self) -> None:
-        """BUILD: fill an object that was made empty."""
-        state, value = self.stack.pop(), self.stack[-1]
-        if isinstance(value, np.ndarray):
-            _fill_array(value, state)
-        elif isinstance(value, np.dtype):
-            _fill_dtype(value, state)
-        elif value is not None:  # which was left out
-            made = tuple(base for bases in MADE_BASES.values() for base in bases)
-            named = isinstance(state, dict) and all(isinstance(name, str) for name in state)
-            require(_is_subclass(type(value), made) and named, f"it holds contents of {type(value).__name__}")
-            getattr(value, "__setstate__", value.__dict__.update)(state)  # in Python, and keeps what it is given
-
-    def load_refused(self) -> None:
-        """Refuse what no saved model needs."""
-        raise ForbiddenObject("it takes a step that no saved model needs")
-
-    dispatch: ClassVar[dict[int, Callable[..., None]]] = {
-        **_PythonUnpickler.dispatch,
-        **{step[0]: _check_keys(_PythonUnpickler.dispatch[step[0]], keys) for step, keys in _HASHED.items()},
-        **dict.fromkeys((step[0] for step in _REFUSED), load_refused),
-        pickle.REDUCE[0]: load_reduce,
-        pickle.NEWOBJ[0]: load_newobj,
-        pickle.BUILD[0]: load_build,
-    }
-
-
-def _is_subclass(value: Any, bases: tuple[str, ...]) -> bool:
-    """Return whether a value is a class below one of some classes, which are imported when needed."""
-    return isinstance(value, type) and issubclass(value, tuple(map(pkgutil.resolve_name, bases)))
+def _find_class(name: str, known: dict[str, tuple[str, ...]]) -> Any:
+    """Return the class of a name, in one of some packages and below one of its classes."""
+    module, _, attribute = name.rpartition(".")
+    for package, bases in known.items():
+        if f"{module}.".startswith(f"{package}."):
+            found = getattr(importlib.import_module(module), attribute, None)  # pickles name what they need
+            if isinstance(found, type) and issubclass(found, tuple(map(pkgutil.resolve_name, bases))):
+                return found
+    raise ForbiddenObject(f"it asks for {name}, which may run code")

@@ -7,16 +7,13 @@ that needs classes of its author's own is opened as Stable-Baselines3 does, and 
 from __future__ import annotations
 
 import base64
-import io
-import os
 import pickle
 import re
-import warnings
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from gymnasium import spaces
@@ -24,7 +21,7 @@ from numpy.typing import NDArray
 
 from agents.files import report_missing_file
 from agents.safe_pickle import TRUST, TRUST_ADVICE, ForbiddenObject, find_origin_risks, open_pickle
-from agents.sb3_archive import build_model, find_algorithm, find_algorithm_class, make_training_stubs, read_header
+from agents.sb3_archive import build_policy, find_algorithm, read_archive
 from rare_envs.egos.wrappers import UNBOUNDED, WrappedPolicy, find_stacking
 from rare_envs.plugins import one_line
 
@@ -63,12 +60,14 @@ class SavedEgo:
         (5, 1)
     """
 
-    model: Any
-    """The Stable-Baselines3 algorithm, on the CPU."""
+    policy: Any
+    """The Stable-Baselines3 policy, on the CPU."""
     algorithm: str
-    """Its name, such as "ppo"."""
+    """Name of the algorithm that trained it, such as "ppo"."""
     path: Path
     """The `.zip`."""
+    policy_kwargs: Mapping[str, Any] = field(default_factory=dict, repr=False)
+    """Arguments of the policy's class beside spaces and schedule."""
     statistics: Any = None
     """Its `VecNormalize` statistics, or None; observations pass through them first."""
     statistics_path: Path | None = None
@@ -79,26 +78,26 @@ class SavedEgo:
     @property
     def observation_space(self) -> Any:
         """Observations of the policy; those of single frames if they were normalised one by one."""
-        return self.model.observation_space if self.frames is None else self.statistics.observation_space
+        return self.policy.observation_space if self.frames is None else self.statistics.observation_space
 
     @property
     def action_space(self) -> Any:
         """The action space that the policy was trained on."""
-        return self.model.action_space
+        return self.policy.action_space
 
     @property
     def frames(self) -> tuple[int, bool] | None:
         """Frames stacked behind `VecNormalize`, as `rare_envs.egos.wrappers.find_stacking` says; None without."""
-        if self.statistics is None or self.statistics.observation_space.shape == self.model.observation_space.shape:
+        if self.statistics is None or self.statistics.observation_space.shape == self.policy.observation_space.shape:
             return None
-        return find_stacking(self.statistics.observation_space.shape, self.model.observation_space.shape)
+        return find_stacking(self.statistics.observation_space.shape, self.policy.observation_space.shape)
 
     @cached_property
     def same_as(self) -> Any:
-        """The model behind its statistics and stacks: it acts as this does; compiled rollouts read its network."""
+        """The policy behind its statistics and stacks: it acts as this does; compiled rollouts read its network."""
         if self.statistics is None:
-            return self.model
-        return WrappedPolicy(self.model, self.statistics.normalize_obs, *(self.frames or ()))
+            return self.policy
+        return WrappedPolicy(self.policy, self.statistics.normalize_obs, *(self.frames or ()))
 
     def find_missing_statistics(self, expected: Any) -> str:
         """Return why it seems to have been trained on normalised observations, if it has no statistics; "" if not.
@@ -109,7 +108,7 @@ class SavedEgo:
         if self.statistics is not None:
             return ""
         last = _open_observation(self.header, "_last_obs")
-        return describe_missing_statistics(self.header, last, self.model.observation_space, expected)
+        return describe_missing_statistics(self.header, last, self.policy.observation_space, expected)
 
     def predict(
         self,
@@ -137,29 +136,20 @@ def load_saved_ego(path: Path, algo: str | None, trust: bool = False, stats: str
         raise FileNotFoundError(f"No VecNormalize statistics at {str(statistics_path)!r}.")
     if not trust and (risks := find_origin_risks(path, statistics_path)):
         raise ValueError(f"Will not open it: {'; '.join(risks)}; {TRUST_ADVICE}.")
-    header = read_header(path)
-    name = algo.lower() if algo is not None else find_algorithm(header, path)
-    model = _load_model(name, header, path, trust)
-    statistics = None if statistics_path is None else load_statistics(statistics_path, model.observation_space, trust)
-    return SavedEgo(model, name, path, statistics, statistics_path, header)
-
-
-def _load_model(name: str, header: Mapping[str, Any], path: Path, trust: bool) -> Any:
-    """Return the model of an algorithm with the weights of a file."""
-    algorithm = find_algorithm_class(name, path)
+    header, weights = read_archive(path.read_bytes(), str(path))
+    name = find_algorithm(header, algo, str(path))
     try:
-        content = path.read_bytes()  # once, so that what is loaded is what was looked at
-        if not trust:
-            return build_model(algorithm, content, str(path))
-        return algorithm.load(io.BytesIO(content), device="cpu", custom_objects=make_training_stubs())
+        policy, policy_kwargs = build_policy(name, header, weights, trust)
     except ForbiddenObject as error:
         raise ValueError(f"Will not load {str(path)!r}: {error}; {TRUST}.") from error
-    except Exception as error:  # a damaged or foreign pickle can raise anything at all
+    except Exception as error:  # a damaged or foreign file can raise anything at all
+        contrib = "pip install sb3-contrib" if "sb3_contrib" in str(error) else "needs a package that is not installed"
         raise ValueError(
             f"Cannot load {str(path)!r} as {name.upper()} (saved by Stable-Baselines3 {header['version']}): "
-            f"{one_line(error)}. The file is damaged, needs a package that is not installed, or "
-            "holds another algorithm (name it with algo)."
+            f"{one_line(error)}. The file is damaged, {contrib}, or holds another algorithm (name it with algo)."
         ) from error
+    statistics = None if statistics_path is None else load_statistics(statistics_path, policy.observation_space, trust)
+    return SavedEgo(policy, name, path, policy_kwargs, statistics, statistics_path, header)
 
 
 # --- statistics of VecNormalize -------------------------------------------------------------------
@@ -197,45 +187,31 @@ def load_statistics(path: Path, observation_space: Any, trust: bool) -> Any:
     try:
         content = path.read_bytes()
         statistics = pickle.loads(content) if trust else open_pickle(content)
+        if not isinstance(statistics, VecNormalize):
+            raise TypeError(f"expected VecNormalize, got {type(statistics).__name__}")
+        theirs, ours = statistics.observation_space.shape or (), observation_space.shape or ()
+        fits = find_stacking(theirs, ours) is not None
+        whole = not fits or _normalises(statistics)
     except ForbiddenObject as error:
         raise ValueError(f"Will not read the {what}: {error}; {TRUST}.") from error
     except Exception as error:  # a damaged pickle can raise anything at all
         raise ValueError(f"Cannot read the {what}: {one_line(error)}. Save them again, or {elsewhere}.") from error
-    if not isinstance(statistics, VecNormalize):
-        kind = type(statistics).__name__
-        raise ValueError(f"Expected VecNormalize statistics in {str(path)!r}, got {kind}; {elsewhere}.")
-    if not _is_whole(vars(statistics)):
-        raise ValueError(f"{what} are damaged; save them again.")
-    theirs, ours = statistics.observation_space.shape or (), observation_space.shape or ()
-    if find_stacking(theirs, ours) is None:
+    if not fits:
         raise ValueError(f"{what} are for observations of shape {theirs}, the ego's have {ours}; {elsewhere}.")
+    if not whole:
+        raise ValueError(f"{what} are damaged; save them again.")
     statistics.training = False
     return statistics
 
 
-def _is_whole(values: Mapping[str, Any]) -> bool:
-    """Return whether statistics have everything that normalising an observation reads, in the right shapes."""
-    space, normalise, moments = (values.get(name) for name in ("observation_space", "norm_obs", "obs_rms"))
-    numbers = all(isinstance(values.get(name), int | float | np.floating) for name in ("clip_obs", "epsilon"))
-    if not isinstance(space, spaces.Space) or not isinstance(normalise, bool) or not numbers:
-        return False
-    if not normalise:
-        return True
-    if isinstance(space, spaces.Dict):
-        keys = values.get("norm_obs_keys")
-        if not isinstance(moments, dict) or not isinstance(keys, list):
-            return False
-        known = set(keys) <= set(moments) & set(space.spaces)
-        return known and all(_has_moments(moments[key], space[key].shape) for key in keys)
-    return _has_moments(moments, space.shape)
-
-
-def _has_moments(moments: Any, shape: Any) -> bool:
-    """Return whether there are a mean and a variance, not negative, of a shape."""
-    mean, variance = (getattr(moments, name, None) for name in ("mean", "var"))
-    if not isinstance(mean, np.ndarray) or not isinstance(variance, np.ndarray):
-        return False
-    return mean.shape == variance.shape == shape and bool((variance >= 0.0).all())
+def _normalises(statistics: Any) -> bool:
+    """Return whether statistics normalise an observation to finite numbers of its shape."""
+    seen = statistics.observation_space.sample()
+    with np.errstate(all="ignore"):
+        shown = statistics.normalize_obs(seen)
+    if isinstance(seen, dict):
+        return all(np.shape(shown[name]) == seen[name].shape and np.isfinite(shown[name]).all() for name in seen)
+    return bool(np.shape(shown) == seen.shape and np.isfinite(shown).all())
 
 
 def describe_missing_statistics(header: Mapping[str, Any], last: Any, own: Any, expected: Any) -> str:
@@ -297,118 +273,59 @@ def _open_observation(header: Mapping[str, Any], name: str) -> Any:
 
 
 # --- the Hugging Face Hub -------------------------------------------------------------------------
-#
-# A model with its statistics in the Hub's cache on this machine is taken as it is, without a connection. Whatever else
-# is there may be part of a repository (huggingface_sb3's `load_from_hub` keeps the `.zip` alone): the library
-# huggingface_hub completes it, at the commit that is there, so that a resumed run keeps its ego.
 
 
-class _HubName(NamedTuple):
-    """Place of a policy on the Hub."""
+def find_hub_model(text: str, download: bool = True) -> Path | None:
+    """Return the file of a policy "hf:USER/REPOSITORY"; None if it is not in the cache and nothing is to be downloaded.
 
-    text: str
-    user: str
-    repository: str
-    file: str | None
-    revision: str
-
-    @classmethod
-    def read(cls, text: str) -> _HubName:
-        """Return the place that "hf:USER/REPOSITORY" stands for."""
-        found = _HUB_NAME.fullmatch(text)
-        if found is None:
-            raise ValueError(
-                f"Expected hf:USER/REPOSITORY, and /FILE.zip or @REVISION behind it if need be, got {text!r}."
-            )
-        user, repository, file, revision = found.groups()
-        return cls(text, user, repository, file, revision or "main")
-
-    def find_snapshot(self) -> Path:
-        """Return the folder of its files in the cache, named by their commit; it need not be there."""
-        folder = find_hub_cache() / f"models--{self.user}--{self.repository}"
-        pointer = folder / "refs" / self.revision
-        commit = pointer.read_text(encoding="utf-8").strip() if pointer.is_file() else self.revision
-        return folder / "snapshots" / commit
-
-    def choose_model(self, snapshot: Path) -> Path:
-        """Return the model of a snapshot: the one that is named, or that has the repository's name, or the only one."""
-        models = _list_models(snapshot)
-        wanted = self.file or f"{self.repository}.zip"
-        if wanted in models:
-            return snapshot / wanted
-        if self.file is None and len(models) == 1:
-            return snapshot / models[0]
+    A model with its statistics in the Hub's cache is taken without a connection. Whatever else is there may be part of
+    a repository (huggingface_sb3's `load_from_hub` keeps the `.zip` alone) and is completed at the commit that is
+    there, so that a resumed run keeps its ego.
+    """
+    found = _HUB_NAME.fullmatch(text)
+    if found is None:
+        raise ValueError(f"Expected hf:USER/REPOSITORY, and /FILE.zip or @REVISION behind it if need be, got {text!r}.")
+    user, repository, file, revision = found.groups()
+    try:
+        import huggingface_hub
+    except ImportError as error:
+        if not download:
+            return None
         raise ValueError(
-            f"Expected a model as hf:{self.user}/{self.repository}/FILE.zip for {self.text!r}; its files are "
-            f"{', '.join(models) or 'none'}."
-        )
+            f"{text!r} needs huggingface_hub: pip install 'rare-envs[hub]', or download the .zip yourself and name it."
+        ) from error
+
+    def fetch(revision: str | None, **how: Any) -> Path:
+        kinds, place = ["*.zip", "*.pkl"], f"{user}/{repository}"
+        return Path(huggingface_hub.snapshot_download(place, revision=revision, allow_patterns=kinds, **how))
+
+    try:
+        cached = fetch(revision, local_files_only=True)
+    except Exception:  # it is not there, or only in part
+        cached = None
+    model = None if cached is None else _choose_model(cached, repository, file)
+    if not download or (model is not None and find_statistics(model) is not None):
+        return model
+    try:
+        snapshot = fetch(revision if cached is None else cached.name)
+    except Exception as error:  # of the connection, of the library, or there is no such repository
+        raise ValueError(f"Cannot download {text!r}: {one_line(error)}") from error
+    chosen = _choose_model(snapshot, repository, file)
+    if chosen is None:
+        names = ", ".join(_list_models(snapshot)) or "none"
+        raise ValueError(f"Expected a model as hf:{user}/{repository}/FILE.zip for {text!r}; its files are {names}.")
+    return chosen
 
 
-def find_hub_cache() -> Path:
-    """Return the folder of the Hub's cache, which its environment variables name as the library reads them."""
-    if "HF_HUB_CACHE" in os.environ:
-        return Path(os.environ["HF_HUB_CACHE"])
-    home = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "huggingface"
-    return Path(os.environ.get("HF_HOME", home)) / "hub"
+def _choose_model(snapshot: Path, repository: str, file: str | None) -> Path | None:
+    """Return the model of a snapshot: the one that is named, or that has the repository's name, or the only one."""
+    models = _list_models(snapshot)
+    wanted = file or f"{repository}.zip"
+    if wanted in models:
+        return snapshot / wanted
+    return snapshot / models[0] if file is None and len(models) == 1 else None
 
 
 def _list_models(snapshot: Path) -> list[str]:
     """Return the names of the models in a folder."""
     return sorted(path.name for path in snapshot.glob("*.zip") if path.name not in _NOT_MODELS)
-
-
-def find_cached_model(text: str) -> Path | None:
-    """Return the file of a policy "hf:USER/REPOSITORY" in the cache; None if it is not there. Nothing is downloaded."""
-    name = _HubName.read(text)
-    snapshot = name.find_snapshot()
-    models = _list_models(snapshot)
-    there = name.file in models if name.file else bool(models)
-    return name.choose_model(snapshot) if there else None
-
-
-def find_hub_model(text: str) -> Path:
-    """Return the file of a policy "hf:USER/REPOSITORY", downloaded if it or its statistics are not in the cache.
-
-    Without a connection or the library, a model in the cache is taken, with a warning if it has no statistics there.
-    """
-    name = _HubName.read(text)
-    cached = name.find_snapshot()
-    wanted, known = cached / (name.file or f"{name.repository}.zip"), cached.is_dir()
-    if wanted.is_file() and find_statistics(wanted) is not None:
-        return wanted
-    try:
-        import huggingface_hub
-    except ImportError as error:
-        if (model := find_cached_model(text)) is not None:
-            return _doubt_statistics(model, text, "huggingface_hub is not installed (pip install 'rare-envs[hub]')")
-        raise ValueError(
-            f"{text!r} is not in the cache {str(find_hub_cache())!r}; to download it pip install 'rare-envs[hub]', or "
-            "download the .zip yourself and name its path."
-        ) from error
-    place = {"repo_id": f"{name.user}/{name.repository}", "revision": cached.name if known else name.revision}
-    try:
-        kinds = ["*.zip", "*.pkl"]
-        snapshot = huggingface_hub.snapshot_download(**place, allow_patterns=kinds, cache_dir=str(find_hub_cache()))
-    except Exception as error:  # of the connection, of the library, or there is no such repository
-        incomplete = type(error).__name__ == "IncompleteSnapshotError"  # the library knows which files are missing
-        if known and not incomplete and (model := find_cached_model(text)) is not None:
-            return _doubt_statistics(model, text, one_line(error))
-        raise ValueError(f"Cannot download {text!r}: {one_line(error)}") from error
-    model = name.choose_model(Path(snapshot))
-    if known and find_statistics(model) is None:
-        try:  # without a connection the library returns what is there, and does not tell
-            huggingface_hub.file_exists(place["repo_id"], "vec_normalize.pkl", revision=place["revision"])
-        except Exception as error:
-            return _doubt_statistics(model, text, one_line(error))
-    return model
-
-
-def _doubt_statistics(model: Path, text: str, reason: str) -> Path:
-    """Return a model of the cache; warn if it has no statistics, of which the Hub cannot tell for a reason."""
-    if find_statistics(model) is None:
-        warnings.warn(
-            f"{text!r} is taken from the cache, which has no VecNormalize statistics of it, and the Hub cannot tell "
-            f"whether it has any: {reason}. If it was trained behind VecNormalize, its results here are wrong.",
-            stacklevel=3,
-        )
-    return model

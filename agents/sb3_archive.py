@@ -1,64 +1,59 @@
-"""The `.zip` of a Stable-Baselines3 policy: its settings, its algorithm, and the model built from it without its code.
+"""The `.zip` of a Stable-Baselines3 policy: its settings, its algorithm, and the policy built from class and weights.
 
 The archive has a member `data`: JSON with simple values as they are and other values as
 `{":type:": ..., "__module__": ..., ":serialized:": <pickle>}`, and members `*.pth` with tensors. Names of settings and
-the policy's module are enough to tell the algorithms apart. The pickles are opened by `agents.safe_pickle`, the
-tensors by torch's own reader of weights; what they hold goes to Stable-Baselines3 in a new archive of our own. The file
-also says how large the networks are, and Stable-Baselines3 builds them before it compares them with the tensors, so a
-network of more numbers than the file holds is refused as it is built.
+the policy's module are enough to tell the algorithms apart. Of the pickles those that the policy is made of are opened,
+by `agents.safe_pickle`, and `policy.pth` by torch's own reader of weights. The file also says how large the networks
+are, so a network of more numbers than the file holds is refused as it is built, before its memory is written to.
 """
 
 from __future__ import annotations
 
 import base64
+import contextlib
 import io
 import json
 import math
 import pickle
-import pkgutil
-import re
 import zipfile
 import zlib
 from collections.abc import Iterator, Mapping
-from pathlib import Path
-from typing import Any, BinaryIO, NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from gymnasium import spaces
-from torch import Tensor
-from torch.utils._python_dispatch import TorchDispatchMode
+from torch import Tensor, nn
+from torch.nn.modules.module import register_module_parameter_registration_hook
 
 from agents.safe_pickle import ForbiddenObject, open_pickle, require
 from rare_envs.plugins import did_you_mean
 
 
 class Algorithm(NamedTuple):
-    """Where an algorithm is, and how its files are known: by the module of their policy, or by a setting."""
+    """How the files of an algorithm are known: by the module of their policy, or by a setting."""
 
-    package: str
-    name: str
     policies: tuple[str, ...] = ()
     """Beginnings of the policy's module; "common" policies serve several."""
     setting: str = ""
     """One that only this algorithm has, of those that come later here."""
+    takes_sde: bool = False
+    """Whether its policy is told of gSDE by an argument of its own."""
 
 
 ALGORITHMS = {
-    "ppo": Algorithm("stable_baselines3", "PPO", (), "clip_range"),
-    "tqc": Algorithm("sb3_contrib", "TQC", ("sb3_contrib.tqc.",), "top_quantiles_to_drop_per_net"),
-    "trpo": Algorithm("sb3_contrib", "TRPO", (), "cg_max_steps"),
-    "ars": Algorithm("sb3_contrib", "ARS", ("sb3_contrib.ars.",), "n_delta"),
-    "td3": Algorithm("stable_baselines3", "TD3", ("stable_baselines3.td3.",), "target_policy_noise"),
-    "ddpg": Algorithm("stable_baselines3", "DDPG"),  # TD3 with other settings, which acts alike
-    "sac": Algorithm("stable_baselines3", "SAC", ("stable_baselines3.sac.",), "target_entropy"),
-    "dqn": Algorithm("stable_baselines3", "DQN", ("stable_baselines3.dqn.",), "exploration_initial_eps"),
-    "a2c": Algorithm("stable_baselines3", "A2C", (), "gae_lambda"),  # on-policy, and none of the above
-    "recurrent_ppo": Algorithm(
-        "sb3_contrib", "RecurrentPPO", ("sb3_contrib.common.recurrent.", "sb3_contrib.ppo_recurrent.")
-    ),
-    "maskable_ppo": Algorithm("sb3_contrib", "MaskablePPO", ("sb3_contrib.common.maskable.", "sb3_contrib.ppo_mask.")),
-    "qrdqn": Algorithm("sb3_contrib", "QRDQN", ("sb3_contrib.qrdqn.",)),
-    "crossq": Algorithm("sb3_contrib", "CrossQ", ("sb3_contrib.crossq.",)),
+    "ppo": Algorithm((), "clip_range", takes_sde=True),
+    "tqc": Algorithm(("sb3_contrib.tqc.",), "top_quantiles_to_drop_per_net"),
+    "trpo": Algorithm((), "cg_max_steps", takes_sde=True),
+    "ars": Algorithm(("sb3_contrib.ars.",), "n_delta"),
+    "td3": Algorithm(("stable_baselines3.td3.",), "target_policy_noise"),
+    "ddpg": Algorithm(),  # TD3 with other settings, which acts alike
+    "sac": Algorithm(("stable_baselines3.sac.",), "target_entropy"),
+    "dqn": Algorithm(("stable_baselines3.dqn.",), "exploration_initial_eps"),
+    "a2c": Algorithm((), "gae_lambda", takes_sde=True),  # on-policy, and none of the above
+    "recurrent_ppo": Algorithm(("sb3_contrib.common.recurrent.", "sb3_contrib.ppo_recurrent."), takes_sde=True),
+    "maskable_ppo": Algorithm(("sb3_contrib.common.maskable.", "sb3_contrib.ppo_mask.")),
+    "qrdqn": Algorithm(("sb3_contrib.qrdqn.",)),
+    "crossq": Algorithm(("sb3_contrib.crossq.",)),
 }
 MAX_UNPACKED, MAX_RATIO = 64 * 2**20, 20
 """Bytes that any archive may unpack to, and the factor by which a larger one may grow: Stable-Baselines3 stores its
@@ -67,38 +62,36 @@ MAX_VALUES = 1_000_000
 """Values in the settings of a model."""
 MAX_OBSERVED = 2**22
 """Most numbers of an observation, and most actions to choose from."""
-SPARE_NUMBERS, SPARE_TENSORS = 2**24, 10_000
-"""Numbers and tensors that building may take beside a multiple of those in the file: buffers, initial values."""
-_PER_HELD = 8
-"""Numbers and tensors that building may take for each in the file (networks, initial values, optimisers), and bytes of
-tensors for each byte of a member, which tensors may share."""
-_FACTORY = re.compile(
-    r"aten\.(new_)?(empty|zeros|ones|full|rand|randn|randint|arange|eye|randperm|linspace)(_strided)?\b"
-)
-"""Operations of torch that make a tensor of a size that they are told."""
-_STATE_MEMBER = re.compile(r"(?!pytorch_variables|tensors)[a-z][a-z0-9_]*(\.[a-z][a-z0-9_]*)*\.pth")
-"""Members with tensors, but for those that only training needs."""
+_SPARE = 1_000, 2**20
+"""Parameters, and numbers in them, that building a policy may take beside twice those in the file."""
+_PER_BYTE = 8
+"""Bytes of tensors for each byte of a member, which tensors may share."""
 
 
 class ArchiveTooLarge(ValueError):
     """An archive that would take far more memory than its own size."""
 
 
-def read_header(file: Path | BinaryIO, name: str | None = None) -> dict[str, Any]:
-    """Return the settings of a saved model, their pickles closed, and "version" (of Stable-Baselines3).
+def read_archive(content: bytes, name: str) -> tuple[dict[str, Any], bytes]:
+    """Return the settings of a saved model, their pickles closed, with "version" (of Stable-Baselines3); the weights.
 
-    The file exists, or is its content; its name in messages is the path when None.
+    Its name is for messages.
     """
-    name = str(file) if name is None else name
+    file, version = io.BytesIO(content), "_stable_baselines3_version"
     if not zipfile.is_zipfile(file):
         raise ValueError(f"{name!r} is not a zip file (or is cut short); expected a model saved by Stable-Baselines3.")
     try:
         with zipfile.ZipFile(file) as archive:
-            _check_size(archive, name)
-            members = set(archive.namelist())
-            header = _parse_settings(archive.read("data"), name) if "data" in members else None
-            version = "_stable_baselines3_version"
-            version = archive.read(version).decode().strip() if version in members else "unknown"
+            unpacked = sum(member.file_size for member in archive.infolist())
+            if unpacked > max(MAX_UNPACKED, MAX_RATIO * len(content)):
+                sizes = f"from {len(content) / 1e6:.1f} to {unpacked / 1e6:,.0f} MB"
+                raise ArchiveTooLarge(f"{name!r} would unpack {sizes}; no policy does that.")
+            members = {
+                member: archive.read(member)
+                for member in ("data", "policy.pth", version)
+                if member in archive.namelist()
+            }
+        header = _parse_settings(members.get("data", b"{}"), name)
     except ArchiveTooLarge:
         raise
     except (zipfile.BadZipFile, zlib.error, ValueError, RuntimeError, RecursionError, OSError) as error:
@@ -108,18 +101,9 @@ def read_header(file: Path | BinaryIO, name: str | None = None) -> dict[str, Any
             f"{name!r} is a zip file but not a Stable-Baselines3 model: it lacks its members "
             "'data' and 'policy.pth'. Write it with model.save(path)."
         )
-    return {**header, "version": version}
-
-
-def _check_size(archive: zipfile.ZipFile, name: str) -> None:
-    """Refuse an archive that would fill the memory."""
-    unpacked = sum(member.file_size for member in archive.infolist())
-    assert archive.fp is not None
-    packed = archive.fp.seek(0, io.SEEK_END)  # not the sum over members, which may share their bytes
-    if unpacked > max(MAX_UNPACKED, MAX_RATIO * packed):
-        raise ArchiveTooLarge(
-            f"{name!r} would unpack from {packed / 1e6:.1f} to {unpacked / 1e6:,.0f} MB; no policy does that."
-        )
+    return {**header, "version": members.get(version, b"unknown").decode(errors="replace").strip()}, members[
+        "policy.pth"
+    ]
 
 
 def _parse_settings(content: bytes, name: str) -> Any:
@@ -129,107 +113,77 @@ def _parse_settings(content: bytes, name: str) -> Any:
     return json.loads(content)
 
 
-def find_algorithm(header: Mapping[str, Any], path: Path) -> str:
-    """Return the name of the algorithm of a saved model, one of `ALGORITHMS`, from its settings."""
+def find_algorithm(header: Mapping[str, Any], algo: str | None, name: str) -> str:
+    """Return the name of the algorithm of a saved model, one of `ALGORITHMS`, from its settings or as a user says."""
     policy = header.get("policy_class")
     module = str(policy.get("__module__", "")) if isinstance(policy, dict) else ""
-    by_module = [name for name, each in ALGORITHMS.items() if module.startswith(each.policies)]
-    by_setting = [name for name, each in ALGORITHMS.items() if each.setting and each.setting in header]
-    for name in (*by_module, *by_setting):
-        return name
+    if algo is not None:
+        if algo.lower() not in ALGORITHMS:
+            hint = did_you_mean(algo, ALGORITHMS)
+            raise ValueError(f"Unknown algorithm {algo!r}{hint}; expected one of {', '.join(ALGORITHMS)}.")
+        lacks = ALGORITHMS[algo.lower()].setting
+        if lacks and lacks not in header:
+            raise ValueError(f"Cannot load {name!r} as {algo.upper()}: its settings have no {lacks}.")
+        return algo.lower()
+    by_module = [each for each, known in ALGORITHMS.items() if module.startswith(known.policies)]
+    by_setting = [each for each, known in ALGORITHMS.items() if known.setting and known.setting in header]
+    for each in (*by_module, *by_setting):
+        return each
     raise ValueError(
-        f"Cannot tell which algorithm saved {str(path)!r} (policy from {module or 'unknown'!r}); "
+        f"Cannot tell which algorithm saved {name!r} (policy from {module or 'unknown'!r}); "
         f"name it with algo: {', '.join(ALGORITHMS)}."
     )
 
 
-def find_algorithm_class(name: str, path: Path) -> Any:
-    """Return the class of an algorithm, with its `load`, for a file."""
-    if name not in ALGORITHMS:
-        hint = did_you_mean(name, ALGORITHMS)
-        raise ValueError(f"Unknown algorithm {name!r}{hint}; expected one of {', '.join(ALGORITHMS)}.")
-    found = ALGORITHMS[name]
-    try:
-        return pkgutil.resolve_name(f"{found.package}:{found.name}")
-    except ImportError as error:
-        raise ValueError(
-            f"{str(path)!r} holds {found.name}, which needs a package that is not installed: pip install sb3-contrib."
-        ) from error
-
-
-def make_training_stubs() -> dict[str, Any]:
-    """Return stand-ins for the entries that only training needs, as `custom_objects` of `load`.
-
-    Those pickles break between versions of Python, a replay buffer would allocate its full memory, and a seed would
-    reset the global generators. Entries that a model lacks are ignored.
-    """
-    schedules = ("lr_schedule", "clip_range_vf", "exploration_schedule", "delta_std_schedule")
-    buffers = ("replay_buffer_class", "rollout_buffer_class", "ep_info_buffer", "ep_success_buffer")
-    last = ("_last_obs", "_last_episode_starts", "_last_original_obs", "_last_lstm_states")
-    return {
-        **dict.fromkeys(("seed", "action_noise", "weights", *schedules, *buffers, *last)),
-        "learning_rate": 0.0,
-        "clip_range": 0.0,
-        "n_envs": 1,
-        "n_steps": 1,
-        "train_freq": 1,
-        "buffer_size": 1,
-        "optimize_memory_usage": False,
-        "replay_buffer_kwargs": {},
-        "rollout_buffer_kwargs": {},
-    }
-
-
-def build_model(algorithm: Any, content: bytes, name: str) -> Any:
-    """Return the model of a class in the content of a `.zip`, on the CPU; its name is for messages.
+def build_policy(algorithm: str, header: Mapping[str, Any], weights: bytes, trust: bool) -> tuple[Any, dict[str, Any]]:
+    """Return the policy of a saved model, on the CPU, and its arguments beside spaces and schedule.
 
     `ForbiddenObject` is raised if it holds something that may run code, or builds more than it holds; anything if it is
-    damaged.
+    damaged. With trust the pickles are opened as Stable-Baselines3 does.
     """
-    given = make_training_stubs()
-    given = {**_open_objects(read_header(io.BytesIO(content), name), set(given)), **given}
-    for key in ("observation_space", "action_space"):
-        _check_space(given.get(key))
-    clean, held = _rewrite(content)
-    numbers, tensors = sum(one.numel() for one in held), len(held)
-    with _BoundedTensors(SPARE_NUMBERS + _PER_HELD * numbers, SPARE_TENSORS + _PER_HELD * tensors):
-        return algorithm.load(clean, device="cpu", custom_objects=given)
+    names = ("policy_class", "observation_space", "action_space", "policy_kwargs")
+    kind, *between, given = (_open_entry(header, name, trust) for name in names)
+    from stable_baselines3.common.policies import BasePolicy
+
+    require(isinstance(kind, type) and issubclass(kind, BasePolicy), "its policy_class is no policy")
+    for space in between:
+        _check_space(space)
+    layers = given.get("net_arch")
+    if isinstance(layers, list) and layers and isinstance(layers[0], dict):  # before Stable-Baselines3 1.8
+        given = {**given, "net_arch": layers[0]}
+    schedule = () if algorithm == "ars" else (_no_rate,)
+    told = {"use_sde": header.get("use_sde") is True} if ALGORITHMS[algorithm].takes_sde else {}
+    state = _read_tensors(weights, trust)
+    arguments = {name: value for name, value in given.items() if name != "device"}
+    with contextlib.nullcontext() if trust else _bounded_parameters(state):
+        policy = kind(*between, *schedule, **told, **arguments)
+    left = policy.load_state_dict(state, strict=False)
+    # before 1.7 the features of actor and critic, one module of several names, were saved once
+    missing = [name for name in left.missing_keys if not name.startswith(("pi_features_", "vf_features_"))]
+    if missing or left.unexpected_keys:
+        raise ValueError(f"its weights lack {missing[:3]} and have {left.unexpected_keys[:3]} beside")
+    return policy, dict(given)
 
 
-def _open_objects(header: Mapping[str, Any], without: set[str]) -> dict[str, Any]:
-    """Open the pickled entries of a model's settings safely; an error names the entry."""
-    opened = {}
-    for key, value in header.items():
-        if key in without or not isinstance(value, dict) or ":serialized:" not in value:
-            continue
-        try:
-            opened[key] = open_pickle(base64.b64decode(str(value[":serialized:"])))
-        except ForbiddenObject as error:
-            raise ForbiddenObject(f"in its {key!r} {error}") from error
-    return opened
+def _no_rate(_: float) -> float:
+    """Return a learning rate of 0: nothing is learned."""
+    return 0.0
 
 
-def _rewrite(content: bytes) -> tuple[io.BytesIO, list[Tensor]]:
-    """Return an archive of the same settings and of tensors that have been read safely, and these tensors."""
-    clean, held = io.BytesIO(), list[Tensor]()
-    with zipfile.ZipFile(io.BytesIO(content)) as given, zipfile.ZipFile(clean, "w") as archive:
-        for member in dict.fromkeys(given.namelist()):
-            if member in ("data", "_stable_baselines3_version"):
-                archive.writestr(member, given.read(member))
-            if _STATE_MEMBER.fullmatch(member):
-                try:
-                    state = _read_tensors(given.read(member))
-                except ForbiddenObject as error:
-                    raise ForbiddenObject(f"in its {member!r} {error}") from error
-                held += _find_tensors(state)
-                with archive.open(member, "w") as file:
-                    torch.save(state, file)
-    clean.seek(0)
-    return clean, held
+def _open_entry(header: Mapping[str, Any], name: str, trust: bool) -> Any:
+    """Return the value of a setting, its pickle opened."""
+    entry = header.get(name, {})
+    if not isinstance(entry, dict) or ":serialized:" not in entry:
+        return entry
+    content = base64.b64decode(str(entry[":serialized:"]))
+    try:
+        return pickle.loads(content) if trust else open_pickle(content)
+    except ForbiddenObject as error:
+        raise ForbiddenObject(f"in its {name!r} {error}") from error
 
 
-def _read_tensors(content: bytes) -> Any:
-    """Return what a `.pth` member holds: mappings, lists, plain values and tensors that fit into it, on the CPU."""
+def _read_tensors(content: bytes, trust: bool) -> dict[str, Tensor]:
+    """Return the weights in a `.pth` member, which fit into it, on the CPU."""
     if not zipfile.is_zipfile(io.BytesIO(content)):
         raise ValueError("its tensors are not in the format of torch 1.6 and later")
     with zipfile.ZipFile(io.BytesIO(content)) as archive:
@@ -238,44 +192,32 @@ def _read_tensors(content: bytes) -> Any:
     fits = stored and sum(info.file_size for info in infos) <= len(content)
     require(fits, "its tensors would unpack to more than the file holds")
     try:
-        state = torch.load(io.BytesIO(content), map_location="cpu", weights_only=True)
+        state = torch.load(io.BytesIO(content), map_location="cpu", weights_only=not trust)
     except pickle.UnpicklingError:  # whose message advises to load it unsafely
-        raise ValueError("its tensors are damaged, or there is something else among them") from None
-    size = sum(one.numel() * one.element_size() for one in _find_tensors(state))
-    require(size <= _PER_HELD * len(content), "it holds tensors larger than their storage")
-    return state
+        raise ForbiddenObject("in its 'policy.pth' are damaged tensors, or something else among them") from None
+    tensors = isinstance(state, dict) and all(isinstance(one, Tensor) for one in state.values())
+    require(tensors, "its 'policy.pth' has something else than tensors")
+    size = sum(one.numel() * one.element_size() for one in state.values())
+    require(size <= _PER_BYTE * len(content), "it holds tensors larger than their storage")
+    return dict(state)
 
 
-def _find_tensors(value: Any) -> Iterator[Tensor]:
-    """Yield the tensors in mappings and lists."""
-    if isinstance(value, Tensor):
-        yield value
-    elif isinstance(value, Mapping | list | tuple):
-        for one in value.values() if isinstance(value, Mapping) else value:
-            yield from _find_tensors(one)
+@contextlib.contextmanager
+def _bounded_parameters(state: Mapping[str, Tensor]) -> Iterator[None]:
+    """Refuse in the block to build networks of more than about so many parameters and numbers."""
+    most = _SPARE[0] + 2 * len(state), _SPARE[1] + 2 * sum(one.numel() for one in state.values())
+    made = [0, 0]
 
+    def count(_module: nn.Module, _name: str, parameter: Tensor | None) -> None:
+        made[0] += 1
+        made[1] += 0 if parameter is None else parameter.numel()
+        require(made[0] <= most[0] and made[1] <= most[1], "it describes networks of more numbers than it holds")
 
-class _BoundedTensors(TorchDispatchMode):  # type: ignore[no-untyped-call]
-    """Mode in which torch makes no more tensors and numbers than a limit."""
-
-    def __init__(self, numbers: int, tensors: int) -> None:
-        super().__init__()  # type: ignore[no-untyped-call]
-        self._numbers, self._tensors = numbers, tensors
-
-    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
-        if _FACTORY.match(str(func)):
-            self._tensors -= 1
-            self._numbers -= max((_count_numbers(one) for one in args), default=0)
-            within = self._numbers >= 0 and self._tensors >= 0
-            require(within, "it describes networks of more numbers than it holds")
-        return func(*args, **(kwargs or {}))
-
-
-def _count_numbers(argument: Any) -> int:
-    """Return the numbers of a tensor of which this is the shape or the length."""
-    if isinstance(argument, list | tuple) and all(isinstance(size, int) for size in argument):
-        return math.prod(argument)
-    return argument if isinstance(argument, int) else 0
+    handle = register_module_parameter_registration_hook(count)
+    try:
+        yield
+    finally:
+        handle.remove()
 
 
 def _check_space(space: Any, depth: int = 0) -> None:

@@ -251,7 +251,7 @@ def _continue_model(
     saved = load_saved_ego(retraining.ego, None)
     check_retrainable(saved, algo, env)
     env.set_attr("space", retraining.mix(env.get_attr("space")[0]))
-    model = _make_model(algo, env, seed, continue_settings(settings), saved.model.policy_kwargs, device)
+    model = _make_model(algo, env, seed, continue_settings(settings), saved.policy_kwargs, device)
     restore_parameters(model, saved)
     return model
 
@@ -264,7 +264,7 @@ def check_retrainable(saved: Any, algo: str, env: Any) -> None:
     if saved.statistics is not None:
         raise ValueError(f"Cannot train {name} on: it was trained behind VecNormalize, train-ego has none.")
     for what in ("observation_space", "action_space"):
-        own, given = getattr(saved.model, what), getattr(env, what)  # both have these two
+        own, given = getattr(saved.policy, what), getattr(env, what)  # both have these two
         if own != given:
             raise ValueError(f"Cannot train {name} on: its {what} is {own}, that of the environment is {given}.")
 

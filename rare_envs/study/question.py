@@ -31,7 +31,7 @@ import torch
 import agents
 import samplers
 from agents.loading import find_ego_kind, strip_prefixes
-from agents.saved_ego import HUB_PREFIX, find_cached_model, find_statistics
+from agents.saved_ego import HUB_PREFIX, find_hub_model, find_statistics
 from rare_envs.distributions.fitted import FittedDistribution
 from rare_envs.distributions.space import Distribution
 from rare_envs.egos.needs import EgoWarning
@@ -299,7 +299,7 @@ def find_ego_files(question: Question) -> list[Path]:
 def find_named_files(name: str) -> list[Path]:
     """Return the file that an option names, or that of its module: a.zip, noisy:a.zip, hf:user/a, module:function."""
     if name.startswith(HUB_PREFIX):
-        cached = find_cached_model(name)
+        cached = find_hub_model(name, download=False)
         return [] if cached is None else [cached]
     parts = name.split(":")
     with contextlib.suppress(OSError, ValueError):  # too long a name, or with a null byte

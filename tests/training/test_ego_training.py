@@ -51,7 +51,7 @@ FAILURE = np.array([[25.0, 12.0, 20.0, 2.0, 40.0, 3.5]])
 
 def weights(path: Path) -> torch.Tensor:
     ego: Any = load_ego(path)
-    return torch.cat([value.flatten().double() for value in ego.model.policy.state_dict().values()])
+    return torch.cat([value.flatten().double() for value in ego.policy.state_dict().values()])
 
 
 @pytest.mark.parametrize("algo", EACH)
@@ -65,7 +65,7 @@ def test_every_algorithm_trains_saves_and_drives(algo: str, tmp_path: Path) -> N
     assert ego.observation_space == env.observation_space
     expected = spaces.Discrete(len(DISCRETE_ACTIONS)) if algo == "dqn" else env.action_space
     assert ego.action_space == expected
-    returns, lengths = evaluate_policy(ego.model, env, n_eval_episodes=4, return_episode_rewards=True)
+    returns, lengths = evaluate_policy(ego, env, n_eval_episodes=4, return_episode_rewards=True)
     assert np.isfinite(returns).all()
     assert min(lengths) > 0  # type: ignore[type-var]
     problem = DrivingProblem(ENV, ego=ego)
@@ -284,12 +284,12 @@ def test_what_does_not_fit_is_refused_before_training(egos: Callable[[str], Path
             train_ego(ENV, "ppo", retraining=Retraining(path, failures), **out, **more)
     assert not list(tmp_path.iterdir())
     env = SimpleNamespace(observation_space=3, action_space=2)  # anything that compares as spaces do
-    usual = {"path": Path("ego.zip"), "algorithm": "ppo", "statistics": None, "model": env}
+    usual = {"path": Path("ego.zip"), "algorithm": "ppo", "statistics": None, "policy": env}
     other = SimpleNamespace(observation_space=3, action_space=5)
     with pytest.raises(ValueError, match="trained behind VecNormalize, train-ego has none"):
         check_retrainable(SimpleNamespace(**{**usual, "statistics": object()}), "ppo", env)
     with pytest.raises(ValueError, match=r"its action_space is 5, .* is 2"):
-        check_retrainable(SimpleNamespace(**{**usual, "model": other}), "ppo", env)
+        check_retrainable(SimpleNamespace(**{**usual, "policy": other}), "ppo", env)
 
 
 def test_a_training_that_goes_on_explores_as_at_its_end_and_learns_at_once() -> None:
@@ -302,7 +302,7 @@ def test_a_training_that_goes_on_explores_as_at_its_end_and_learns_at_once() -> 
 
 def test_sac_keeps_its_entropy_coefficient(egos: Callable[[str], Path]) -> None:
     saved = load_saved_ego(egos("sac"), None)
-    model = SAC("MlpPolicy", sb3_vec_env(ENV, 2), policy_kwargs=saved.model.policy_kwargs, device="cpu")
+    model = SAC("MlpPolicy", sb3_vec_env(ENV, 2), policy_kwargs=saved.policy_kwargs, device="cpu")
     fresh = model.log_ent_coef.item()
     restore_parameters(model, saved)
     assert model.log_ent_coef.item() != fresh

@@ -17,7 +17,7 @@ MOST_GROWTH = 300.0
 """Memory [MB] that one file may take; the good one has 40 kB."""
 
 
-HARMLESS = ("member, class.zip", "settings, text for numbers.zip")
+HARMLESS = ("member, class.zip", "settings, text for numbers.zip", "settings, own names.zip")
 """Files that may load: what is strange in them is not read."""
 
 

@@ -6,6 +6,7 @@ import base64
 import json
 import os
 import pickle
+import sys
 import zipfile
 from pathlib import Path
 from typing import Any
@@ -145,9 +146,11 @@ def test_algo_overrides_what_the_file_says(tmp_path: Path, monkeypatch: pytest.M
     for wrong, said in (("sac", r"Cannot load .* as SAC"), ("pp0", r"Unknown algorithm 'pp0' \(did you mean 'ppo'")):
         with pytest.raises(ValueError, match=said):
             load_ego(path, algo=wrong)
-    monkeypatch.setitem(__import__("sys").modules, "sb3_contrib", None)  # as if not installed
-    with pytest.raises(ValueError, match=r"RecurrentPPO.*pip install sb3-contrib"):
-        load_ego(path, algo="recurrent_ppo")
+    other = saved(tmp_path, "ars").rename(tmp_path / "ars.zip")
+    monkeypatch.setitem(sys.modules, "sb3_contrib.ars.policies", None)  # as if not installed
+    with pytest.raises(ValueError, match=r"Cannot load .*pip install sb3-contrib"):
+        load_ego(other)
+    path = saved(tmp_path)
     unknown = {"policy_class": {"__module__": "mine"}}
     members = {"data": json.dumps(unknown).encode()}
     with pytest.raises(ValueError, match=r"Cannot tell which algorithm .* name it with algo: ppo"):
