@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import difflib
 import json
-import math
 import reprlib
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, fields
@@ -16,7 +15,6 @@ from itertools import zip_longest
 from os import PathLike
 from pathlib import Path
 from typing import Any, TypeVar
-from urllib.parse import parse_qsl
 
 import safetensors.torch
 import torch
@@ -24,7 +22,6 @@ from safetensors import SafetensorError, safe_open
 from torch import Tensor, nn
 
 from rare_envs.files import parse_json_object, replace_file
-from rare_envs.plugins import did_you_mean
 
 RULE_BASED = "idm"
 """The Intelligent Driver Model with lane keeping."""
@@ -68,32 +65,6 @@ class Provenance:
     """Measured quality: names to numbers, or to names and numbers."""
     ensemble: Mapping[str, Any] = field(default_factory=dict)
     """Settings of the fit of the distribution of its weights."""
-
-
-def read_settings(kind: type, query: str) -> dict[str, Any]:
-    """Return numbers for fields of a dataclass from "name=value&name=value"; of true or false, from 1 or 0."""
-    known = {each.name: type(each.default) for each in fields(kind) if isinstance(each.default, int | float)}
-    given: dict[str, Any] = {}
-    for name, text in parse_qsl(query, keep_blank_values=True):
-        if name not in known:
-            raise ValueError(f"Unknown setting {name!r}{did_you_mean(name, known)}; expected {', '.join(known)}.")
-        if name in given:
-            raise ValueError(f"Expected {name} once, got it again as {text!r}.")
-        given[name] = _read_number(name, text, known[name])
-    return given
-
-
-def _read_number(name: str, text: str, kind: type) -> Any:
-    """Return a value of a field as what its default is: a float, a whole number, true or false."""
-    try:
-        value = float(text)
-    except ValueError:
-        raise ValueError(f"Expected {name} to be a number, got {text!r}.") from None
-    if not math.isfinite(value) or value < 0 or (kind is not float and value != int(value)):
-        raise ValueError(f"Expected {name} to be a {'finite' if kind is float else 'whole'} number >= 0, got {text!r}.")
-    if kind is bool and value not in (0.0, 1.0):
-        raise ValueError(f"Expected {name} to be 1 (yes) or 0 (no), got {text!r}.")
-    return kind(value)
 
 
 def report_missing_file(path: Path, what: str = "ego") -> FileNotFoundError:

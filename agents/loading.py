@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-import inspect
-from dataclasses import dataclass, replace
+import math
+from collections.abc import Callable
+from dataclasses import fields, replace
 from os import PathLike
 from pathlib import Path
-from typing import Any, Final, Literal, Protocol, cast, runtime_checkable
+from typing import Any, Final, Protocol, cast, runtime_checkable
+from urllib.parse import parse_qsl
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,9 +36,6 @@ EXPECTED_EGO: Final = (
 )
 EGO_SUFFIXES = (".zip", ".onnx", SUFFIX)
 """How the files of egos end."""
-EgoKind = Literal[
-    "rule", "learned", "vision", "url", "remote", "process", "noisy", "onnx", "zip", "hub", "function", "unknown"
-]
 
 
 @runtime_checkable
@@ -121,60 +120,19 @@ def load_ego(
     """
     text = str(spec)
     kind = find_ego_kind(text)
-    if kind == "url":
-        raise ValueError(f"Will not load an ego from {text!r}: download the file, look where it comes from, name it.")
     if kind == "unknown":
         raise ValueError(f"Unknown ego {text!r}{suggest_ego(text)}; expected {EXPECTED_EGO}.")
-    if kind in ("zip", "hub"):
-        return load_saved_ego(cast(Path, find_hub_model(text)) if kind == "hub" else Path(text), algo, trust, stats)
-    if kind == "noisy":
-        inner, mark, settings = _require_inner_ego(text).rpartition("?")
-        ego = load_ego(inner if mark else settings, algo, trust, stats)
-        return cast(Ego, NoisyEgo(ego, Stack(**files.read_settings(Stack, settings if mark else ""))))
     for name, value in (("algo", algo), ("stats", stats)):
-        if value is not None and kind != "process":
+        if value is not None and kind not in ("zip", "hub", "noisy", "process"):
             raise ValueError(
                 f"Expected {name} for a Stable-Baselines3 .zip only, got {str(value)!r} for {text!r}; leave it out."
             )
-    if kind in ("remote", "process"):
-        return _load_elsewhere(text, algo, trust, stats)
-    if kind == "onnx":
-        from agents.onnx import OnnxEgo
-
-        return OnnxEgo(Path(text))
-    if kind == "vision":
-        return load_vision(text)
-    if kind == "learned":
-        return LearnedEgo(cast(LearnedDriver, load_driver(text)))
-    return cast(Ego, _call_factory(text)) if kind == "function" else _load_rule_based(text)
+    return cast(Ego, KINDS[kind][1](text, algo, trust, stats))
 
 
-def find_ego_kind(spec: str) -> EgoKind:
-    """Return the kind of ego of a name, file, address or function; the header identifies a `.safetensors` file."""
-    beginnings: dict[str, EgoKind] = {
-        "process:": "process",
-        "noisy:": "noisy",
-        HUB_PREFIX: "hub",
-        "tcp://": "remote",
-        "ipc://": "remote",
-    }
-    for beginning, kind in beginnings.items():
-        if spec.startswith(beginning):
-            return kind
-    if "://" in spec:
-        return "url"
-    name = spec.partition("?")[0]
-    if name in (RULE_BASED, HUMAN):
-        return "rule"
-    if spec == VISION or (spec.endswith(SUFFIX) and files.holds_vision(spec)):
-        return "vision"
-    if name in (*SHIPPED_DRIVERS, *SHIPPED_EGOS) or spec.endswith(SUFFIX):
-        return "learned"
-    if spec.endswith(".onnx"):
-        return "onnx"
-    if spec.endswith(".zip") or Path(spec).is_file():
-        return "zip"
-    return "function" if ":" in spec and "/" not in spec else "unknown"
+def find_ego_kind(spec: str) -> str:
+    """Return the kind of ego of a name, file, address or function, one of `KINDS`, or "unknown"."""
+    return next((kind for kind, (is_one, _) in KINDS.items() if is_one(spec)), "unknown")
 
 
 def strip_prefixes(spec: str) -> str:
@@ -196,57 +154,90 @@ def suggest_ego(text: str) -> str:
     return did_you_mean(text, EGO_NAMES) or missing
 
 
-def _load_rule_based(text: str) -> Any:
+# --- kinds --------------------------------------------------------------------------------------
+
+
+def _load_rule_based(text: str, *_: Any) -> Any:
     """Return a name as it stands; with settings behind it, the driver that has them."""
     name, mark, query = text.partition("?")
     if not mark:
         return text
     try:
         if name == HUMAN:
-            return HumanEgo(HumanDriverModel(**files.read_settings(HumanDriverModel, query)))
-        return IDM(**files.read_settings(IDM, query))
+            return HumanEgo(HumanDriverModel(**_read_settings(HumanDriverModel, query)))
+        return IDM(**_read_settings(IDM, query))
     except ValueError as error:
         raise ValueError(f"The ego {text!r}: {error}") from None
 
 
-def _call_factory(spec: str) -> Any:
-    """Return what `module:function` gives: "idm" or an object with `predict`; a plain function is wrapped in one."""
-    function = import_object(spec, f"the ego {spec!r}")
-    if not callable(function):
-        raise ValueError(f"Expected {spec!r} to be a function that returns an ego, got {type(function).__name__}.")
-    try:
-        parameters = list(inspect.signature(function).parameters.values())
-    except (TypeError, ValueError):  # of a function in C
-        parameters = []
-    open_ended = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
-    needed = [each.name for each in parameters if each.default is each.empty and each.kind not in open_ended]
-    if needed:
-        raise ValueError(
-            f"Expected {spec!r} to be a function without arguments that returns the ego, got one that needs "
-            f"{', '.join(needed)}; for an ego that is a function, name another one that returns it."
-        )
-    try:
-        ego = wrap_callable(function())
-    except (Exception, SystemExit) as error:  # the function is the user's: anything may happen in it
-        raise ValueError(f"{spec!r} failed to make an ego: {one_line(error)}.") from error
-    rule_based = isinstance(ego, str) and ego == RULE_BASED  # an array, say, compares element by element
-    if not rule_based and not is_policy(ego):
-        refuse_ego(ego, f"from {spec!r}")
-    return ego
+def _load_noisy(text: str, *how: Any) -> NoisyEgo:
+    """Return any ego behind the imperfections of a full stack."""
+    inner, mark, settings = _require_inner_ego(text).rpartition("?")
+    ego = load_ego(inner if mark else settings, *how)
+    return NoisyEgo(ego, Stack(**_read_settings(Stack, settings if mark else "")))
 
 
-def _load_elsewhere(text: str, algo: str | None, trust: bool, stats: str | Path | None) -> Ego:
+def _load_elsewhere(text: str, *how: Any) -> Any:
     """Connect to an ego in another program, or in a process of its own."""
     try:
         from agents.remote.client import connect, isolate
     except ImportError as error:
         raise ValueError(f"{text!r} needs pyzmq and msgpack: pip install 'rare-envs[remote]'.") from error
     try:
-        if text.startswith("process:"):
-            return isolate(_require_inner_ego(text), algo, trust, stats)
-        return connect(text)
+        return isolate(_require_inner_ego(text), *how) if text.startswith("process:") else connect(text)
     except EgoGone as error:
         raise ValueError(str(error)) from error
+
+
+def _load_onnx(text: str, *_: Any) -> Any:
+    """Return the ego in an ONNX file, whose reader is optional."""
+    from agents.onnx import OnnxEgo
+
+    return OnnxEgo(Path(text))
+
+
+def _refuse_url(text: str, *_: Any) -> Any:
+    raise ValueError(f"Will not load an ego from {text!r}: download the file, look where it comes from, name it.")
+
+
+def _call_factory(spec: str, *_: Any) -> Any:
+    """Return what `module:function` gives: "idm" or an object with `predict`; a plain function is wrapped in one."""
+    function = import_object(spec, f"the ego {spec!r}")
+    if not callable(function):
+        raise ValueError(f"Expected {spec!r} to be a function that returns an ego, got {type(function).__name__}.")
+    try:
+        ego = wrap_callable(function())
+    except (Exception, SystemExit) as error:  # the function is the user's: anything may happen in it
+        raise ValueError(f"{spec!r}, called without arguments, failed to make an ego: {one_line(error)}.") from error
+    rule_based = isinstance(ego, str) and ego == RULE_BASED  # an array, say, compares element by element
+    if not rule_based and not is_policy(ego):
+        refuse_ego(ego, f"from {spec!r}")
+    return ego
+
+
+KINDS: dict[str, tuple[Callable[[str], bool], Callable[..., Any]]] = {
+    "process": (lambda spec: spec.startswith("process:"), _load_elsewhere),
+    "noisy": (lambda spec: spec.startswith("noisy:"), _load_noisy),
+    "hub": (lambda spec: spec.startswith(HUB_PREFIX), lambda text, *how: load_saved_ego(find_hub_model(text), *how)),
+    "remote": (lambda spec: spec.startswith(("tcp://", "ipc://")), _load_elsewhere),
+    "url": (lambda spec: "://" in spec, _refuse_url),
+    "rule": (lambda spec: spec.partition("?")[0] in (RULE_BASED, HUMAN), _load_rule_based),
+    "vision": (
+        lambda spec: spec == VISION or (spec.endswith(SUFFIX) and files.holds_vision(spec)),
+        lambda text, *_: load_vision(text),
+    ),
+    "learned": (
+        lambda spec: spec.partition("?")[0] in (*SHIPPED_DRIVERS, *SHIPPED_EGOS) or spec.endswith(SUFFIX),
+        lambda text, *_: LearnedEgo(cast(LearnedDriver, load_driver(text))),
+    ),
+    "onnx": (lambda spec: spec.endswith(".onnx"), _load_onnx),
+    "zip": (
+        lambda spec: spec.endswith(".zip") or Path(spec).is_file(),
+        lambda text, *how: load_saved_ego(Path(text), *how),
+    ),
+    "function": (lambda spec: ":" in spec and "/" not in spec, _call_factory),
+}
+"""Kinds of ego, the first that holds of a name counts: whether it does, and how the ego is loaded."""
 
 
 def _require_inner_ego(text: str) -> str:
@@ -257,12 +248,32 @@ def _require_inner_ego(text: str) -> str:
     return inner
 
 
-@dataclass(frozen=True)
-class DriverSettings:
-    """What can be set in the name of a shipped driver."""
+_SETTINGS: dict[type, tuple[str, Callable[[float], bool]]] = {
+    float: ("a finite number >= 0", math.isfinite),
+    int: ("a whole number >= 0", float.is_integer),
+    bool: ("1 (yes) or 0 (no)", (0.0, 1.0).__contains__),
+}
+"""Types of the settings in a name: what is expected, and whether a number >= 0 is it."""
 
-    rules: bool = True
-    """Whether its rules bound its actions and change lanes."""
+
+def _read_settings(kind: type, query: str) -> dict[str, Any]:
+    """Return numbers for fields of a dataclass from "name=value&name=value"; of true or false, from 1 or 0."""
+    known = {each.name: type(each.default) for each in fields(kind) if isinstance(each.default, int | float)}
+    given: dict[str, Any] = {}
+    for name, text in parse_qsl(query, keep_blank_values=True):
+        if name not in known:
+            raise ValueError(f"Unknown setting {name!r}{did_you_mean(name, known)}; expected {', '.join(known)}.")
+        if name in given:
+            raise ValueError(f"Expected {name} once, got it again as {text!r}.")
+        expected, is_one = _SETTINGS[known[name]]
+        try:
+            value = float(text)
+        except ValueError:
+            value = math.nan
+        if not value >= 0 or not is_one(value):
+            raise ValueError(f"Expected {name} to be {expected}, got {text!r}.")
+        given[name] = known[name](value)
+    return given
 
 
 def load_driver(name: str | PathLike[str]) -> LearnedDriver | RuleDriver | LaneChangingDriver:
@@ -295,9 +306,10 @@ def load_driver(name: str | PathLike[str]) -> LearnedDriver | RuleDriver | LaneC
         return LaneChangingDriver()
     shipped, _, query = text.partition("?")
     if shipped in (*SHIPPED_DRIVERS, *SHIPPED_EGOS):
-        settings = DriverSettings(**files.read_settings(DriverSettings, query))
+        if query not in ("", "rules=0", "rules=1"):
+            raise ValueError(f"Expected {shipped} or {shipped}?rules=0, got {text!r}.")
         driver = read_driver(files.SHIPPED / f"{shipped}{SUFFIX}")
-        if settings.rules:
+        if query != "rules=0":
             return driver
         return replace(driver, colour=HUMAN_NOISE, avoidance=None, hard_braking=1.0, changes=None)
     if text.endswith(SUFFIX) or Path(text).is_file():

@@ -25,7 +25,15 @@ from numpy.typing import NDArray
 from zmq.utils.monitor import recv_monitor_message
 
 from agents.remote import protocol
-from agents.remote.protocol import SECRET_VARIABLE, MalformedMessage, Message, Socket, derive_server_keys, read_secret
+from agents.remote.protocol import (
+    SECRET_VARIABLE,
+    MalformedMessage,
+    Message,
+    Socket,
+    demand,
+    derive_server_keys,
+    read_secret,
+)
 from rare_envs.plugins import EgoGone, NoAnswer
 from rare_envs.simulation.observation import batch_size
 
@@ -61,16 +69,8 @@ class NoReply(LinkError):
     """A request that was not answered in time, or at which the ego's process ended: perhaps the request caused it."""
 
 
-class HandshakeError(LinkError):
-    """A connection that the server will never accept: one side has a secret and the other none, say."""
-
-
-class WaitingForEgo(UserWarning):
-    """No server answers yet, and the client waits for one."""
-
-
 class RemoteError(RuntimeError):
-    """A request that was answered with an error, or twice not at all.
+    """A request that was answered with an error, or twice not at all; or a connection that the server refuses.
 
     Example:
         >>> RemoteError("no road", "ego").code
@@ -137,7 +137,7 @@ class ServerLink:
                 return protocol.open_envelope(self._socket.recv_multipart())[1]
             if ready:
                 event = zmq.Event(recv_monitor_message(self._monitor)["event"])
-                raise (HandshakeError if event in _HOPELESS else LinkError)(_BROKEN[event])
+                raise (RemoteError if event in _HOPELESS else LinkError)(_BROKEN[event])
             if left <= 0:
                 raise NoReply(f"no answer within {timeout:.3g} s")
 
@@ -287,14 +287,14 @@ class RemoteEgo:
             hello = self._connect()
             self._spaces = hello.get("observation"), hello.get("action")
             self.observation_space, self.action_space = map(protocol.decode_space, self._spaces)
-        except RemoteError as error:
+        except (RemoteError, MalformedMessage) as error:
             link.close()
             raise ValueError(f"The ego at {link.address} refuses: {error}") from error
         except BaseException:
             link.close()
             raise
         self.deterministic = None if hello.get("deterministic") is None else bool(hello["deterministic"])
-        self.name = str(hello.get("name", "ego"))[:_MAX_NAME]
+        self.name = _one_line(hello.get("name", "ego"), _MAX_NAME)
 
     def predict(
         self,
@@ -326,7 +326,7 @@ class RemoteEgo:
         """Return a session without a memory, if there is one of this size, else a new one."""
         while self._ended and self._connected:  # batches with a memory that nobody refers to any more
             try:
-                self._request({"type": "end", "session": self._ended.pop()})
+                self._request({"type": "end", "session": self._ended.pop()}, self._timeout)
             except (LinkError, MalformedMessage, RemoteError):
                 self._connected = False
         if batch in self._reusable:
@@ -368,7 +368,7 @@ class RemoteEgo:
             self._reconnect()
         if session.epoch == self._epoch:
             return
-        self._request({"type": "reset", "session": session.number, "batch": session.batch})
+        self._request({"type": "reset", "session": session.number, "batch": session.batch}, self._timeout)
         if not session.memory:
             session.step = 0
         for step, tick in enumerate(session.history):
@@ -388,16 +388,15 @@ class RemoteEgo:
         self._longest_answer, self._warm = max(self._longest_answer, time.monotonic() - sent), True
         return reply
 
-    def _request(self, message: Message, timeout: float | None = None) -> Message:
+    def _request(self, message: Message, timeout: float) -> Message:
         """Send a message and return its answer; an answer that is an error is raised."""
         number = next(self._ids)
-        content = self._link.request(protocol.pack({**message, "id": number}), timeout or self._timeout)
-        reply = protocol.unpack(content)
+        reply = protocol.unpack(self._link.request(protocol.pack({**message, "id": number}), timeout))
         if reply.get("type") == "error":
-            reason = str(reply.get("reason", "no reason given"))[:_MAX_REASON]
-            raise RemoteError(reason, str(reply.get("code", "")))
-        if reply.get("id") != number:
-            raise MalformedMessage(f"an answer to {reply.get('id')!r}, expected one to {number}")
+            raise RemoteError(
+                _one_line(reply.get("reason", "no reason given"), _MAX_REASON), str(reply.get("code", ""))
+            )
+        demand(reply.get("id") == number, f"an answer to {reply.get('id')!r:.50}, expected one to {number}")
         return reply
 
     def _connect(self) -> Message:
@@ -410,24 +409,20 @@ class RemoteEgo:
             try:
                 reply = self._request(greeting, max(min(_HELLO_INTERVAL, left), self._link.load_timeout))
                 break
-            except HandshakeError as error:
-                raise RemoteError(str(error)) from error
             except LinkError as error:
                 reason = str(error)
             waited = time.monotonic() - began
             if waited >= self._patience:
                 raise EgoGone(f"No ego at {address} within {self._patience:g} s: {reason}.")
             if waited >= _HELLO_INTERVAL and not told:
-                told = True
-                warnings.warn(
-                    f"no ego at {address} yet: {reason}; waiting for one, {self._patience:g} s at most "
-                    "(?patience=SECONDS behind the address)",
-                    WaitingForEgo,
-                    stacklevel=3,
+                told, wait = (
+                    True,
+                    f"waiting for one, {self._patience:g} s at most (?patience=SECONDS behind the address)",
                 )
+                warnings.warn(f"no ego at {address} yet: {reason}; {wait}", stacklevel=3)
             time.sleep(_RETRY_PAUSE)
-        if reply.get("protocol") != protocol.PROTOCOL:
-            raise RemoteError(f"it speaks protocol {reply.get('protocol')!r}, expected {protocol.PROTOCOL}")
+        speaks = reply.get("protocol")
+        demand(speaks == protocol.PROTOCOL, f"it speaks protocol {speaks!r:.50}, expected {protocol.PROTOCOL}")
         self._epoch += 1
         self._connected, self._warm = True, False
         return reply
@@ -445,6 +440,12 @@ class RemoteEgo:
     def close(self) -> None:
         """End the connection."""
         self._link.close()
+
+
+def _one_line(text: Any, most: int) -> str:
+    """Return what a server said, whatever it is, as one line that a terminal can show."""
+    words = " ".join(str(text)[: 4 * most].split())
+    return "".join(letter for letter in words if letter.isprintable())[:most]
 
 
 def connect(spec: str) -> RemoteEgo:

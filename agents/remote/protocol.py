@@ -38,10 +38,12 @@ MAX_COUNT = 2**63 - 1
 """Largest number of a session or message."""
 DTYPES = ("<f4", "<f8", "<i4", "<i8", "|u1")
 """Types of arrays, by NumPy's names."""
-_LIMITS = {"max_array_len": 4096, "max_map_len": 64, "max_str_len": 2**16, "max_ext_len": 0}
-_MAX_AXES = 5
 _MAX_BOUNDS = 1024
 """Entries of a space's bound that are sent."""
+_LIMITS = {"max_array_len": _MAX_BOUNDS, "max_map_len": 64, "max_str_len": 2**16, "max_ext_len": 0}
+_MAX_CONTAINERS = 1000
+"""Lists and maps of a message: those of one byte each would otherwise take a hundred times its size."""
+_MAX_AXES = 5
 _MAX_ENTRIES = 2**23
 """Entries of one observation, in a space that a client accepts."""
 SECRET_VARIABLE = "RARE_ENVS_SECRET"
@@ -52,13 +54,17 @@ Socket = zmq.Socket[bytes]
 
 
 class MalformedMessage(ValueError):
-    """A message that is not of the protocol's form."""
+    """A message that is not of the protocol's form, or cannot be answered; docs/egos.md has the codes."""
+
+    def __init__(self, reason: str, code: str = "malformed") -> None:
+        super().__init__(reason)
+        self.code = code
 
 
-def _demand(holds: object, what: str) -> None:
+def demand(holds: object, what: str, code: str = "malformed") -> None:
     """Refuse a message unless a condition holds."""
     if not holds:
-        raise MalformedMessage(what)
+        raise MalformedMessage(what, code)
 
 
 def pack(message: Message) -> bytes:
@@ -69,12 +75,24 @@ def pack(message: Message) -> bytes:
 
 def unpack(content: bytes) -> Message:
     """Return the message in some bytes, whoever wrote them."""
-    _demand(len(content) <= MAX_BYTES, f"a message of {len(content)} bytes, more than {MAX_BYTES}")
+    demand(len(content) <= MAX_BYTES, f"a message of {len(content)} bytes, more than {MAX_BYTES}")
+    containers = 0
+
+    def count(container: Any) -> Any:
+        nonlocal containers
+        containers += 1
+        demand(containers <= _MAX_CONTAINERS, f"more than {_MAX_CONTAINERS} lists and maps")
+        demand(isinstance(container, list) or all(isinstance(key, str) for key in container), "no map from text")
+        return container
+
+    hooks = {"object_hook": count, "list_hook": count}
     try:
-        message = msgpack.unpackb(content, raw=False, strict_map_key=True, max_bin_len=len(content), **_LIMITS)
+        message = msgpack.unpackb(content, raw=False, max_bin_len=len(content), **_LIMITS, **hooks)
+    except MalformedMessage:
+        raise
     except Exception as error:  # msgpack raises many kinds
         raise MalformedMessage(f"no msgpack: {type(error).__name__}: {error}") from error
-    if not isinstance(message, dict) or not all(isinstance(key, str) for key in message):
+    if not isinstance(message, dict):
         raise MalformedMessage("no map from text")
     return message
 
@@ -90,11 +108,10 @@ def is_count(value: object, most: int = MAX_COUNT) -> TypeGuard[int]:
     return isinstance(value, int) and not isinstance(value, bool) and 0 <= value <= most
 
 
-def _is_shape(value: object, most: int = MAX_BYTES) -> TypeGuard[list[int]]:
-    """Return whether a value is a list of sizes with a product of at most `most`."""
-    if not isinstance(value, list) or len(value) > _MAX_AXES or not all(is_count(size, most) for size in value):
-        return False
-    return math.prod(value) <= most
+def _check_shape(value: Any, most: int = MAX_BYTES) -> None:
+    """Refuse what is no list of sizes with a product of at most `most`."""
+    sizes = isinstance(value, list) and len(value) <= _MAX_AXES and all(is_count(size, most) for size in value)
+    demand(sizes and math.prod(value) <= most, f"shape {value!r:.50}")
 
 
 # --- arrays --------------------------------------------------------------------------------------
@@ -102,26 +119,24 @@ def _is_shape(value: object, most: int = MAX_BYTES) -> TypeGuard[list[int]]:
 
 def pack_array(values: NDArray[Any]) -> Message:
     """Return an array of numbers as a map of dtype, shape and little-endian bytes in C order."""
-    if values.dtype == bool:
-        values = values.astype(np.uint8)
-    elif np.issubdtype(values.dtype, np.integer) and values.dtype != np.uint8:
-        values = values.astype("<i8")
-    elif np.issubdtype(values.dtype, np.floating):
-        values = values.astype("<f8" if values.dtype == np.float64 else "<f4")
-    _demand(values.dtype.str in DTYPES, f"an array of {values.dtype}, expected numbers")
-    return {"dtype": values.dtype.str, "shape": list(values.shape), "data": values.tobytes()}
+    wide = values.dtype.itemsize >= 8
+    sent = {"b": "|u1", "u": "|u1" if values.dtype == np.uint8 else "<i8", "i": "<i8", "f": "<f8" if wide else "<f4"}
+    demand(values.dtype.kind in sent, f"an array of {values.dtype}, expected numbers")
+    dtype = sent[values.dtype.kind]
+    return {"dtype": dtype, "shape": list(values.shape), "data": values.astype(dtype, copy=False).tobytes()}
 
 
 def unpack_array(given: Any) -> NDArray[Any]:
     """Return the array in a map that `pack_array` made."""
-    if not isinstance(given, dict) or set(given) != {"dtype", "shape", "data"}:
-        raise MalformedMessage("an array is a map of dtype, shape and data")
+    demand(
+        isinstance(given, dict) and set(given) == {"dtype", "shape", "data"},
+        "an array is a map of dtype, shape and data",
+    )
     dtype, shape, data = given["dtype"], given["shape"], given["data"]
-    _demand(dtype in DTYPES, f"dtype {dtype!r}, expected one of {', '.join(DTYPES)}")
-    if not _is_shape(shape):
-        raise MalformedMessage(f"shape {shape!r:.100}")
-    if not isinstance(data, bytes) or len(data) != math.prod(shape) * np.dtype(dtype).itemsize:
-        raise MalformedMessage(f"data do not fill shape {shape} of {dtype}")
+    demand(dtype in DTYPES, f"dtype {dtype!r:.50}, expected one of {', '.join(DTYPES)}")
+    _check_shape(shape)
+    filled = isinstance(data, bytes) and len(data) == math.prod(shape) * np.dtype(dtype).itemsize
+    demand(filled, f"data do not fill shape {shape} of {dtype}")
     return np.frombuffer(bytearray(data), dtype=dtype).reshape(shape)  # a bytearray, so that it can be written to
 
 
@@ -136,12 +151,11 @@ def unpack_observation(given: Any, batch: int) -> Any:
     """Return the observations of a number of rows in a map that `pack_observation` made."""
     named = isinstance(given, dict) and set(given) == {"parts"}
     parts = given["parts"] if named else {"": given}
-    if not isinstance(parts, dict) or not parts or not all(isinstance(name, str) for name in parts):
-        raise MalformedMessage("parts is a map from names to arrays")
+    demand(isinstance(parts, dict) and parts, "parts is a map from names to arrays")
     arrays = {name: unpack_array(part) for name, part in parts.items()}
     for part in arrays.values():
         rows = part.ndim >= 2 and len(part) == batch
-        _demand(rows, f"expected observations of {batch} rows, got shape {part.shape}")
+        demand(rows, f"expected observations of {batch} rows, got shape {part.shape}")
     return arrays if named else arrays[""]
 
 
@@ -167,41 +181,33 @@ def _encode_bound(values: NDArray[Any]) -> Any:
     return values.ravel().tolist() if values.size <= _MAX_BOUNDS else None
 
 
-def decode_space(given: Any) -> spaces.Space[Any] | None:
-    """Return the space in a map that `encode_space` made; None if there is none."""
-    try:
-        return _decode_space(given, nested=False)
-    except Exception as error:  # the server may have sent anything
-        raise MalformedMessage(f"a space {given!r:.100}: {reason_of(error)}") from error
-
-
-def _decode_space(given: Any, nested: bool) -> spaces.Space[Any] | None:
-    """Return the space in a map; parts may not have parts of their own."""
+def decode_space(given: Any, nested: bool = False) -> spaces.Space[Any] | None:
+    """Return the space in a map that `encode_space` made; None if there is none. Parts may not have parts."""
     if given is None:
         return None
-    if "parts" in given:
-        _demand(not nested, "parts of parts")
-        parts = {name: _decode_space(part, nested=True) for name, part in given["parts"].items()}
-        if not parts or None in parts.values():
-            return None
-        return spaces.Dict({name: part for name, part in parts.items() if part is not None})
-    if "n" in given:
-        _demand(is_count(given["n"]), "n is a whole number")
-        return spaces.Discrete(given["n"])
-    shape = given["shape"]
-    if not _is_shape(shape, _MAX_ENTRIES):
-        raise MalformedMessage(f"shape {shape!r:.50}")
-    dtype: Any = np.uint8 if given.get("dtype") == "|u1" else np.float32
-    widest = (0, 255) if dtype == np.uint8 else (-np.inf, np.inf)
-    bounds = (_decode_bound(given.get(end), shape, limit) for end, limit in zip(("low", "high"), widest, strict=True))
-    low, high = (bound.clip(*widest).astype(dtype) for bound in bounds)
-    return spaces.Box(low, high, dtype=dtype)
+    try:
+        if "parts" in given and not nested:
+            parts = {name: decode_space(part, nested=True) for name, part in given["parts"].items()}
+            return spaces.Dict(parts) if parts and None not in parts.values() else None  # type: ignore[arg-type]
+        if "n" in given:
+            demand(is_count(given["n"]), "n is a whole number")
+            return spaces.Discrete(given["n"])
+        _check_shape(given["shape"], _MAX_ENTRIES)
+        dtype: Any = np.uint8 if given.get("dtype") == "|u1" else np.float32
+        widest = (0, 255) if dtype == np.uint8 else (-np.inf, np.inf)
+        low, high = (
+            _decode_bound(given.get(end), given["shape"], limit).clip(*widest).astype(dtype)
+            for end, limit in zip(("low", "high"), widest, strict=True)
+        )
+        return spaces.Box(low, high, dtype=dtype)
+    except Exception as error:  # the server may have sent anything
+        raise MalformedMessage(f"a space {given!r:.100}: {reason_of(error)}") from error
 
 
 def _decode_bound(given: Any, shape: list[int], limit: float) -> NDArray[np.float64]:
     """Return a bound for every entry, shape `shape`."""
     bound = np.asarray(limit if given is None else given, dtype=np.float64)
-    _demand(not np.isnan(bound).any(), "a bound is NaN")
+    demand(not np.isnan(bound).any(), "a bound is NaN")
     return bound.reshape(shape) if bound.ndim else np.full(shape, bound)
 
 

@@ -25,7 +25,15 @@ import numpy as np
 import zmq
 
 from agents.remote import protocol
-from agents.remote.protocol import SECRET_VARIABLE, MalformedMessage, Message, Socket, derive_server_keys, is_count
+from agents.remote.protocol import (
+    SECRET_VARIABLE,
+    MalformedMessage,
+    Message,
+    Socket,
+    demand,
+    derive_server_keys,
+    is_count,
+)
 from rare_envs.plugins import EgoGone, is_policy, reason_of
 from rare_envs.startup import use_one_thread
 
@@ -37,14 +45,6 @@ _QUEUED_MESSAGES = 4
 """Messages of a connection that ZeroMQ keeps in each direction; a client has one request under way."""
 _POLL_INTERVAL = 100
 """Time after which the server looks whether it is to stop [ms]."""
-
-
-class RequestRefused(Exception):
-    """A request that is answered with an error, by its code; docs/egos.md has the codes."""
-
-    def __init__(self, code: str, reason: str) -> None:
-        super().__init__(reason)
-        self.code = code
 
 
 @dataclass
@@ -67,6 +67,7 @@ class RequestHandler:
         self._last_ids: OrderedDict[bytes, int] = OrderedDict()
         self._sessions: OrderedDict[tuple[bytes, int], _Session] = OrderedDict()
         self._actions: dict[str, Callable[[bytes, Message], Message]] = {
+            "hello": self._hello,
             "reset": self._reset,
             "act": self._act,
             "end": self._end,
@@ -78,24 +79,33 @@ class RequestHandler:
         number = None
         try:
             message = protocol.unpack(content)
-            number = message.get("id") if is_count(message.get("id")) else None
-            if number is None:
-                raise MalformedMessage("id is a whole number")
-            answer = self._hello if message.get("type") == "hello" else self._answer
-            reply = answer(connection, message)
-        except RequestRefused as error:
-            reply = {"type": "error", "code": error.code, "reason": str(error)}
+            number = message["id"] if is_count(message.get("id")) else None
+            demand(number is not None, "id is a whole number")
+            reply = self._answer(connection, message)
         except MalformedMessage as error:
-            reply = {"type": "error", "code": "malformed", "reason": f"Malformed message: {error}."}
+            reason = f"Malformed message: {error}." if error.code == "malformed" else str(error)
+            reply = {"type": "error", "code": error.code, "reason": reason}
         except Exception as error:  # no request may end the server
             reply = {"type": "error", "code": "internal", "reason": reason_of(error)}
         return protocol.pack({**reply, "id": number})
 
+    def _answer(self, connection: bytes, message: Message) -> Message:
+        """Answer a request with an id; all but hello come after a hello, with an id that is higher than the last."""
+        kind, last = message.get("type"), self._last_ids.get(connection)
+        if kind != "hello":
+            if last is None:
+                raise MalformedMessage("Expected a hello first.", "hello")
+            demand(message["id"] > last, f"expected an id above {last}, got {message['id']}")
+            self._last_ids[connection] = message["id"]
+        known = isinstance(kind, str) and kind in self._actions
+        demand(known, f"Unknown type {kind!r:.50}; expected {', '.join(self._actions)}.", "unknown")
+        return self._actions[str(kind)](connection, message)
+
     def _hello(self, connection: bytes, message: Message) -> Message:
         """Begin a connection, and describe the ego."""
         version = message.get("protocol")
-        if not is_count(version) or version != protocol.PROTOCOL:
-            raise RequestRefused("version", f"This server speaks protocol {protocol.PROTOCOL}, not {version!r:.50}.")
+        speaks = is_count(version) and version == protocol.PROTOCOL
+        demand(speaks, f"This server speaks protocol {protocol.PROTOCOL}, not {version!r:.50}.", "version")
         self._forget(connection)
         self._last_ids[connection] = message["id"]
         while len(self._last_ids) > MAX_CLIENTS:
@@ -118,18 +128,6 @@ class RequestHandler:
         for key in [key for key in self._sessions if key[0] == connection]:
             del self._sessions[key]
 
-    def _answer(self, connection: bytes, message: Message) -> Message:
-        """Answer a request that comes after the hello."""
-        last, kind = self._last_ids.get(connection), message.get("type")
-        if last is None:
-            raise RequestRefused("hello", "Expected a hello first.")
-        if message["id"] <= last:
-            raise RequestRefused("malformed", f"Expected an id above {last}, got {message['id']}.")
-        self._last_ids[connection] = message["id"]
-        if not isinstance(kind, str) or kind not in self._actions:
-            raise RequestRefused("unknown", f"Unknown type {kind!r:.50}; expected hello, {', '.join(self._actions)}.")
-        return self._actions[kind](connection, message)
-
     def _reset(self, connection: bytes, message: Message) -> Message:
         """Begin a session."""
         batch, number = message.get("batch"), message.get("session")
@@ -146,13 +144,12 @@ class RequestHandler:
         session = self._sessions.get((connection, number)) if is_count(number) else None
         if number is None or session is None or step != session.step or isinstance(step, bool):
             reason = "Unknown session or another step; reset it and send its observations again."
-            raise RequestRefused("session", reason)
+            raise MalformedMessage(reason, "session")
         observation = protocol.unpack_observation(message.get("observation"), session.batch)
         start = np.full(session.batch, session.step == 0)
         if message.get("start") is not None:
             given = protocol.unpack_array(message["start"])
-            if given.shape != (session.batch,):
-                raise MalformedMessage(f"start has one number for each of {session.batch} rows")
+            demand(given.shape == start.shape, f"start has one number for each of {session.batch} rows")
             start |= given.astype(bool)
         try:
             action, memory = self._ego.predict(
@@ -164,7 +161,7 @@ class RequestHandler:
             packed = protocol.pack_array(action)
         except (Exception, SystemExit, EgoGone) as error:  # the ego is the user's: anything may happen in it
             del self._sessions[connection, number]
-            raise RequestRefused("ego", reason_of(error)) from error
+            raise MalformedMessage(reason_of(error), "ego") from error
         session.memory, session.step, session.size = memory, session.step + 1, _measure_bytes(memory)
         self._sessions.move_to_end((connection, number))
         self._make_room()

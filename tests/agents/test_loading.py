@@ -57,15 +57,15 @@ UNKNOWN = {
     "no_such_module:make": "Cannot import 'no_such_module'",
     "https://example.org/ego.zip": r"Will not load an ego from 'https://example\.org/ego\.zip': download",
     "idm?headway=2": r"Unknown setting 'headway' \(did you mean 'time_headway'\?\); expected desired_speed",
-    "idm?time_headway=long": "time_headway to be a number, got 'long'",
+    "idm?time_headway=long": "time_headway to be a finite number >= 0, got 'long'",
     "idm?time_headway=-1": "time_headway to be a finite number >= 0, got '-1'",
     "idm?time_headway=nan": "time_headway to be a finite number",
     "idm?time_headway=1&time_headway=2": "time_headway once",
     "human?leaders=1.5": "leaders to be a whole number",
     "human?glances=2": "glances to be 1",
-    "idm?time_headway": "time_headway to be a number, got ''",
+    "idm?time_headway": "time_headway to be a finite number >= 0, got ''",
     "noisy:idm?latncy=0.3": "Unknown setting 'latncy' .did you mean 'latency'",
-    "noisy:idm?latency=soon": "Expected latency to be a number, got 'soon'",
+    "noisy:idm?latency=soon": "Expected latency to be a finite number >= 0, got 'soon'",
     "noisy:idm?missed=1": "missed below 1",
     "noisy:idm?lag=-1": "Expected lag to be a finite number >= 0",
     "noisy:idn": "Unknown ego 'idn'",
@@ -156,7 +156,7 @@ def test_a_function_or_module_that_does_not_serve_is_refused(own_module: str, tm
         ("make_trouble", "failed to make an ego: RuntimeError: no weights"),
         ("make_exit", "failed to make an ego: SystemExit: 7"),
         ("make_array", "got ndarray from"),
-        ("drive", "without arguments that returns the ego, got one that needs observation; for an ego that is a"),
+        ("drive", "called without arguments, failed to make an ego: TypeError: .*missing 1 required .*'observation'"),
     ):
         with pytest.raises(ValueError, match=message) as caught:
             load_ego(f"{own_module}:{function}")

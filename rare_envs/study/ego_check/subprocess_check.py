@@ -168,7 +168,7 @@ def check_protocol(spec: str) -> Iterator[Finding]:
     """Check a server."""
     try:
         from agents.remote import protocol
-        from agents.remote.client import TIMEOUT, LinkError, ServerLink, parse_address
+        from agents.remote.client import TIMEOUT, LinkError, RemoteError, ServerLink, parse_address
         from agents.remote.protocol import read_secret
     except ImportError:
         yield report_failure("protocol", "pyzmq and msgpack are not installed", "pip install 'rare-envs[remote]'")
@@ -197,7 +197,7 @@ def check_protocol(spec: str) -> Iterator[Finding]:
         yield _compare_reply("two sessions", _alternate(hello, ask), "action")
         yield _compare_reply("end", ask({"type": "end", "session": 1}), "ended")
         yield _compare_reply("after it all", ask({"type": "ping"}), "pong")
-    except (LinkError, EgoGone, ValueError) as error:
+    except (LinkError, RemoteError, EgoGone, ValueError) as error:
         yield report_failure("protocol", reason_of(error), f"is it running at {address}? {PROTOCOL_ADVICE}")
     finally:
         link.close()
