@@ -66,10 +66,7 @@ def indices(numbers: tuple[int, ...], like: Tensor) -> Tensor:
 
 
 def fixed_draws(shape: tuple[int, ...], seed: int, like: Tensor) -> Tensor:
-    """Return one sequence of standard normal draws with dtype and device of a tensor, made once, as `constant`.
-
-    They are drawn in double precision on the CPU, so that they are the same numbers on every device.
-    """
+    """Return one sequence of standard normal draws, made once, the same on every device, like a tensor."""
     return _draw(shape, seed, like.dtype, like.device)
 
 

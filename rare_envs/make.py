@@ -12,7 +12,7 @@ from rare_envs.distributions.product import NoiseDistribution, join_independent
 from rare_envs.distributions.space import Distribution, Parameter, ScenarioSpace
 from rare_envs.egos.needs import EgoNeeds
 from rare_envs.measures.registry import load_measure
-from rare_envs.plugins import did_you_mean
+from rare_envs.plugins import check_name, did_you_mean
 from rare_envs.scenarios.base import Scenario, load_base
 from rare_envs.scenarios.registry import SCENARIOS, find_scenario
 from rare_envs.sensors.camera import find_camera
@@ -86,8 +86,7 @@ def set_up(
     scenario = find_scenario(scenario) if isinstance(scenario, str) else scenario
     refuse_unknown(scenario, unknown)
     kinds = read_kinds(observation)
-    if action not in ACTIONS:
-        raise ValueError(f"Unknown action {action!r}; expected one of {', '.join(map(repr, ACTIONS))}.")
+    check_name("action", action, ACTIONS)
     if not isinstance(weather, bool):
         raise ValueError(f"Expected weather True or False, got {weather!r}.")
     background = find_drivers(scenario.drivers if drivers is None else drivers)
@@ -111,7 +110,8 @@ def refuse_unknown(scenario: Scenario, arguments: Mapping[str, Any], more: Seque
     known = [*more, *own]
     for name in (name for name in arguments if name not in known):
         if name == "config":
-            raise TypeError(_describe_configuration(arguments[name]))
+            ours = ", ".join(f"{argument} ({key})" for key, argument in CONFIGURATION_ARGUMENTS.items())
+            raise TypeError(f"Expected keyword arguments in place of HighwayEnv's config: {ours}; the rest is fixed.")
         of_reset = name in (parameter.name for parameter in scenario.parameters)
         hint = " (reset takes it as an option)" if of_reset else did_you_mean(name, known)
         env_id = next((each for each, registered in SCENARIOS.items() if registered is scenario), scenario.name)
@@ -133,10 +133,7 @@ def _try_measure(world: World, space: ScenarioSpace) -> None:
 
 
 def build_space(world: World, base: Distribution, ego_noise: int = 0) -> ScenarioSpace:
-    """Return the parameters of a world: the scenario's, then the weather's, its drivers' weights and all noise.
-
-    `base` is the distribution of the scenario's own; the columns of the ego's own noise are the last ones.
-    """
+    """Return the parameters of a world: the scenario's (`base`), the weather's, drivers' weights, all noise."""
     parameters, distributions, sizes = list(world.scenario.parameters), [base], world.columns
     for weather, distribution in world.weather_distributions:
         parameters += weather
@@ -161,19 +158,3 @@ def build_space(world: World, base: Distribution, ego_noise: int = 0) -> Scenari
             "have; rename them."
         )
     return ScenarioSpace.of(parameters, join_independent(*distributions))
-
-
-def _describe_configuration(config: Any) -> str:
-    """Return what to write in place of HighwayEnv's argument `config`."""
-    advice = []
-    for name, value in config.items() if isinstance(config, Mapping) else ():
-        if name == "duration":
-            advice.append(f"horizon={value!r} in place of 'duration'")
-        elif name in CONFIGURATION_ARGUMENTS:
-            advice.append(f"the argument {CONFIGURATION_ARGUMENTS[name]} in place of {name!r}")
-        else:
-            advice.append(f"nothing in place of {name!r}, which belongs to the scenario or its picture")
-    what_to_do = "; ".join(advice) or "horizon, dt, observation, action or drivers"
-    return (
-        f"Expected keyword arguments of their own, not HighwayEnv's config, got config={config!r}; write {what_to_do}."
-    )

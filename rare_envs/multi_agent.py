@@ -240,12 +240,9 @@ def step_agents(
 ) -> tuple[MultiAgentEpisode, dict[int, Any], Any]:
     """Carry out decisions (B, N, 2), or meta-actions (B, N), as `rare_envs.simulation.decision.advance` does for one.
 
-    The ego's driver, with its memory, drives the ego where it is not commanded (B, N). Vehicles that have collided are
-    held by `step_traffic`, because some may have before the decision.
-
-    Returns:
-        The episodes at the time of the next decision; rewards by vehicle, as its function gives them: their mean over
-        the ticks, where ticks after its collision count as 0; and the driver's memory.
+    The ego's driver, with its memory, drives the ego where it is not commanded (B, N). Return the episodes at the time
+    of the next decision, rewards by vehicle, means over the ticks of which those after its collision count as 0, and
+    the memory.
     """
 
     def tick(before: MultiAgentEpisode, chosen: Tensor, first: bool) -> tuple[MultiAgentEpisode, Any]:

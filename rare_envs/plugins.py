@@ -24,10 +24,7 @@ SIBLINGS = {"agents": "agents.loading", "samplers": "samplers.estimation", "trai
 
 
 def warn_of_namesakes() -> None:
-    """Warn, in one line each, of packages named as one of SIBLINGS that Python finds in place of ours.
-
-    Nothing is imported: the file that Python would import is read.
-    """
+    """Warn, in one line each, of packages named as one of SIBLINGS that Python finds in place of ours."""
     for name, part in SIBLINGS.items():
         with contextlib.suppress(ImportError, ValueError, OSError):  # not there, or made by hand
             found = importlib.util.find_spec(name)
@@ -82,11 +79,16 @@ def did_you_mean(name: str, valid: Iterable[str]) -> str:
     return f" (did you mean {names[near[0]]!r}?)" if near else ""
 
 
-def one_line(error: BaseException) -> str:
-    """Return an exception as one line without a full stop: its class, and up to 200 characters of its message.
+def check_name(kind: str, name: object, valid: Iterable[str]) -> None:
+    """Raise a ValueError that lists the valid names of a kind, with the nearest, unless a name is one of them."""
+    names = list(valid)
+    if not isinstance(name, str) or name not in names:
+        hint = did_you_mean(str(name), names)
+        raise ValueError(f"Unknown {kind} {name!r}{hint}; expected one of {', '.join(map(repr, names))}.")
 
-    Colours of a terminal, which numba's messages have where colorama is installed, are left out.
-    """
+
+def one_line(error: BaseException) -> str:
+    """Return an exception as a line without colours and full stop: class, up to 200 characters of its message."""
     words = " ".join(_COLOUR.sub("", str(error)).split()).rstrip(".")
     kind = type(error).__name__
     return f"{kind}: {words[:_MAX_WORDS]}" if words else kind
@@ -105,10 +107,7 @@ def working_directory_first() -> Iterator[None]:
 
 
 class EgoGone(BaseException):
-    """The ego cannot be queried any more, whatever the scenario.
-
-    Like KeyboardInterrupt it is no `Exception`: code that survives failing scenarios must not take it for one.
-    """
+    """The ego cannot be queried any more; no `Exception`, which code that survives failing scenarios catches."""
 
 
 class NoAnswer(RuntimeError):

@@ -24,7 +24,7 @@ from rare_envs.devices import (
     find_device,
     move_to,
 )
-from rare_envs.distributions.space import Distribution, ScenarioSpace
+from rare_envs.distributions.space import Distribution
 from rare_envs.egos.dense_policies import NotCompiled
 from rare_envs.egos.needs import (
     DRIVES_ITSELF,
@@ -38,9 +38,9 @@ from rare_envs.egos.needs import (
 )
 from rare_envs.egos.policy import PolicyDriver, as_driver, find_device_driver
 from rare_envs.egos.wrappers import describe_missing_normalisation
-from rare_envs.fast.choice import CompilerFails, check_core, is_compiled, leave_to_torch, simulate
+from rare_envs.fast.choice import CORES, CompilerFails, is_compiled, leave_to_torch, simulate
 from rare_envs.make import refuse_unknown, set_up
-from rare_envs.plugins import reason_of
+from rare_envs.plugins import check_name, reason_of
 from rare_envs.scenarios.registry import find_scenario, split_layout
 from rare_envs.simulation.cuda_graphs import RecordedRollouts
 from rare_envs.simulation.episode import Episode
@@ -80,6 +80,9 @@ class DrivingProblem:
         >>> problem.evaluate(x).round(2)  # time to collision 30 m / (5 m/s), and a collision
         array([ 6., -1.])
     """
+
+    gradient_cost = ROLLOUTS_PER_GRADIENT
+    """Rollouts that a row of `gradient` takes as long as, at most."""
 
     def __init__(
         self,
@@ -129,42 +132,34 @@ class DrivingProblem:
         """
         env_id, layout = split_layout(env_id)
         named = {name: value for name, value in make_kwargs.items() if value is not None or name not in layout}
-        make_kwargs = {**layout, **named}
-        self.env_id = env_id
-        self.ego = ego
-        ego = load_named_ego(ego)
-        self._chunk_size = chunk_size
-        self.device = find_device(device)
-        self.world: World
-        self.space: ScenarioSpace
-        scenario = find_scenario(env_id)
-        refuse_unknown(scenario, make_kwargs, more=("ego", "core", "chunk_size", "device"))
-        with _ego_errors_as_value_errors(ego):
-            self.needs = resolve(ego, scenario.vehicles)
-        make_kwargs["observation"] = make_kwargs.get("observation") or choose_observation(self.needs, scenario.vehicles)
-        make_kwargs["action"] = make_kwargs.get("action") or choose_action(
-            self.needs.action_space, read_kinds(make_kwargs["observation"])
-        )
-        self.world, self.space = set_up(scenario, self.needs, measure=measure, base=base, noise=noise, **make_kwargs)
-        with _ego_errors_as_value_errors(ego):
-            self.driver = as_driver(ego, self.world, self.needs)
-        if self.device.type != "cpu":
-            self.world = replace(self.world, background=move_to(self.device, self.world.background))
-            self.driver = move_to(self.device, self.driver)
-        self.varies = self.needs.varies
-        check_core(core)
-        self._core = core
+        settings = {**layout, **named}
+        check_name("core", core, CORES)
+        self.env_id, self.ego, self.device = env_id, ego, find_device(device)
+        self._chunk_size, self._core = chunk_size, core
         self._recorded: RecordedRollouts | None = None
+        ego, scenario = load_named_ego(ego), find_scenario(env_id)
+        refuse_unknown(scenario, settings, more=("ego", "core", "chunk_size", "device"))
+        with _ego_errors_as_value_errors(ego):
+            self.needs = needs = resolve(ego, scenario.vehicles)
+        kinds = settings.get("observation") or choose_observation(needs, scenario.vehicles)
+        settings["observation"] = kinds
+        settings["action"] = settings.get("action") or choose_action(needs.action_space, read_kinds(kinds))
+        self.world, self.space = set_up(scenario, needs, measure=measure, base=base, noise=noise, **settings)
+        with _ego_errors_as_value_errors(ego):
+            self.driver = as_driver(ego, self.world, needs)
+        if self.device.type != "cpu":
+            self.world, self.driver = self._move(self.device)
+        self.varies = needs.varies
         if core == "numba":
             self._simulate_compiled(np.empty((0, self.dim)))
-        said_by_id = bool(layout) and not self.needs.queries_policy  # nobody named its actions
-        for note in self.notes:
-            if note != TAKEN_AS_ACCELERATIONS and not said_by_id:
-                warnings.warn(note, EgoWarning, stacklevel=2)
+        said_by_id = bool(layout) and not needs.queries_policy  # nobody named its actions
+        doubts = [note for note in self.notes if note != TAKEN_AS_ACCELERATIONS and not said_by_id]
         missing = describe_missing_normalisation(ego, self.world.observation_space)
         if missing:
             advice = "name their file, load_ego(path, stats=FILE), or hand in an ego that normalises before it predicts"
-            warnings.warn(f"the ego has no VecNormalize statistics, but {missing}; {advice}", EgoWarning, stacklevel=2)
+            doubts.append(f"the ego has no VecNormalize statistics, but {missing}; {advice}")
+        for doubt in doubts:
+            warnings.warn(doubt, EgoWarning, stacklevel=2)
 
     def __repr__(self) -> str:
         """Return one line."""
@@ -256,9 +251,7 @@ class DrivingProblem:
             Exception: A policy with a memory has failed on the batch, which may be the fault of any row.
         """
         failed_rows: dict[int, str] = {}
-        f = self._simulate(x, failed_rows)
-        f[list(failed_rows)] = np.nan
-        return f, failed_rows
+        return self._simulate(x, failed_rows), failed_rows
 
     def terms(self, x: NDArray[np.float64], gamma: float = 0.0) -> EpisodeTerms:
         """Simulate, and tell apart the terms of which f is the least, one of each vehicle say.
@@ -301,15 +294,11 @@ class DrivingProblem:
 
     def on_cpu(self) -> tuple[World, Driver]:
         """Return the world and the driver as they simulate on the CPU."""
-        cpu = torch.device("cpu")
-        if self.device == cpu:
-            return self.world, self.driver
-        return replace(self.world, background=move_to(cpu, self.world.background)), move_to(cpu, self.driver)
+        return (self.world, self.driver) if self.device.type == "cpu" else self._move(torch.device("cpu"))
 
-    @property
-    def gradient_cost(self) -> float:
-        """Rollouts that a row of `gradient` takes as long as, at most."""
-        return ROLLOUTS_PER_GRADIENT
+    def _move(self, device: torch.device) -> tuple[World, Driver]:
+        """Return the world and the driver on a device."""
+        return replace(self.world, background=move_to(device, self.world.background)), move_to(device, self.driver)
 
     def crashes(self, x: NDArray[np.float64]) -> Crash:
         """Simulate again and return the kind of crash that each scenario ends in.
@@ -350,6 +339,7 @@ class DrivingProblem:
         return min(self.tile, usual) if self._chunk_size is None else self._chunk_size
 
     def _simulate(self, x: NDArray[np.float64], failed_rows: dict[int, str] | None) -> NDArray[np.float64]:
+        """Return f of scenarios x (n, d); NaN in `failed_rows`, which takes the reasons, unless it is None."""
         x = self.space.validate(np.atleast_2d(x))
         f = self._simulate_compiled(x)
         if f is None:
@@ -360,6 +350,7 @@ class DrivingProblem:
             if failed_rows is not None and failed is not None:
                 failed_rows.update({int(rows[row]): reason for row, reason in failed.items()})
         self._check_known(x, f, failed_rows)
+        f[list(failed_rows or ())] = np.nan
         return f
 
     def _simulate_compiled(self, x: NDArray[np.float64]) -> NDArray[np.float64] | None:
@@ -386,10 +377,7 @@ class DrivingProblem:
         return terms
 
     def _roll_out(self, world: World, x: NDArray[np.float64], failed_rows: dict[int, str] | None) -> Iterator[Episode]:
-        """Yield the episodes of scenarios x (n, d) in a world at the horizon, tile by tile.
-
-        `failed_rows` takes the rows on which a policy fails, with the reason; None if such a failure is raised.
-        """
+        """Yield the episodes of x (n, d) at the horizon by tiles; `failed_rows` takes reasons, None raises them."""
         for first in range(0, len(x), self.tile):
             rows = torch.from_numpy(x[first : first + self.tile]).float().to(self.device)
             driver, mine = self.driver, dict[int, str]()

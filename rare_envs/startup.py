@@ -36,12 +36,7 @@ _handlers: dict[int, Any] = {}
 
 
 def find_missing_libraries(modules: tuple[str, ...] = DRIVING) -> tuple[str, ...]:
-    """Return those of some libraries that are not installed; nothing is imported.
-
-    Example:
-        >>> find_missing_libraries(("torch", "car"))
-        ('car',)
-    """
+    """Return those of some libraries that are not installed; nothing is imported."""
     from importlib.util import find_spec  # some milliseconds, in which no signal is caught yet
 
     return tuple(name for name in modules if find_spec(name) is None)
@@ -58,14 +53,7 @@ def require_libraries() -> None:
 
 
 def is_command_line() -> bool:
-    """Return whether this process is the command `rare-envs`, `python -m rare_envs`, or a worker of one.
-
-    A worker that is started anew has the arguments of its parent.
-
-    Example:
-        >>> is_command_line()
-        False
-    """
+    """Return whether this process is the command `rare-envs`, `python -m rare_envs`, or a worker of one."""
     program = sys.argv[0] if sys.argv else ""
     if program == "-m":  # the module is being looked for
         return "rare_envs" in sys.orig_argv[1:4]

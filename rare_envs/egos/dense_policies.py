@@ -125,10 +125,7 @@ def _refuse_changed(part: Any) -> None:
 
 
 def _read_statistics(normalise: Any) -> tuple[Any, Any, float] | None:
-    """Return mean, standard deviation and bound of the observations of `VecNormalize`, from its method.
-
-    None where it leaves the observations as they are.
-    """
+    """Return mean, deviation and bound of observations by `VecNormalize`'s method; None where it leaves them."""
     statistics: Any = getattr(normalise, "__self__", None)  # of a function, none
     module = sys.modules.get(f"{SB3}.common.vec_env.vec_normalize")
     if module is None or type(statistics) is not module.VecNormalize or normalise.__name__ != "normalize_obs":
@@ -215,10 +212,7 @@ def find_inference(policy: Any) -> Any:
 
 
 def _scale_for_tangents(layers: _Layers) -> _Layers:
-    """Return layers of which the hidden ones give twice their sums and take half of their tangents.
-
-    Both are powers of 2, so that nothing is rounded.
-    """
+    """Return layers whose hidden ones give twice their sums and take half of their tangents, without rounding."""
     last = len(layers) - 1
     return tuple(
         (weights * (2 if place > 0 else 1) * (2 if place < last else 1), biases * (2 if place < last else 1))

@@ -166,10 +166,7 @@ class HumanDriver:
         return _HumanMemory(0, since, (), none, on_road, look(state, in_lane), nothing, nothing)
 
     def _look_away(self, memory: _HumanMemory, late: Percept, speed: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the number of the glance that is due a reaction time ago, and whether the eyes are off the road then.
-
-        A glance that falls on a moment of danger is left out. Once begun it is not broken off.
-        """
+        """Return the number of the glance due, and whether the eyes are off the road; none begins in danger."""
         if self.glances is None:
             return memory.glance, memory.away
         time = max(0, memory.tick - self.delay) * self.world.clock.dt
@@ -178,10 +175,7 @@ class HumanDriver:
         return due, begun & self.glances.off_road(time)
 
     def _carry_forward(self, memory: _HumanMemory, late: Percept, away: Tensor) -> Percept:
-        """Return what the driver knows of a reaction time ago: what it saw then, or what follows from its last look.
-
-        While the eyes are off the road the others are taken to keep their speeds; the own motion is felt.
-        """
+        """Return what is known of a reaction time ago: seen then, or by the last look if speeds were kept."""
         moved = self.world.clock.dt if memory.tick > self.delay else 0.0
         distance = memory.known.distance + moved * (memory.known.speed - memory.late_speed[:, None])
         held = memory.known._replace(distance=distance)

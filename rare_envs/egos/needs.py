@@ -127,10 +127,7 @@ def find_fitting_kinds(observed: Any, vehicles: int = 1) -> tuple[str, ...]:
 
 
 def _shows_pictures(observed: Any) -> bool:
-    """Return whether a space is that of coloured pictures, of one frame or several, channels first or last.
-
-    The channels are the shorter of these two axes; the other one is a side of the picture, of any length.
-    """
+    """Return whether a space is that of coloured pictures; channels, the shorter axis, are first or last."""
     shape = getattr(observed, "shape", None)  # whatever a user's ego declares
     if not isinstance(shape, tuple) or getattr(observed, "dtype", None) != np.uint8:
         return False

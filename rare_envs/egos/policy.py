@@ -191,10 +191,7 @@ class DevicePolicyDriver:
 
 
 def find_device_driver(driver: Driver, device: torch.device, before: Driver | None = None) -> Driver | None:
-    """Return what decides as a driver does on a GPU, with its present weights; None if only the CPU can query it.
-
-    What this returned before is returned again if nothing has changed.
-    """
+    """Return what decides as a driver on a GPU, `before` if nothing has changed; None if only the CPU can query it."""
     if not isinstance(driver, PolicyDriver):
         return driver
     policy = find_inference(driver.policy)

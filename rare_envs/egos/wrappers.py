@@ -79,10 +79,7 @@ class WrappedPolicy:
 
 
 def find_action_bounds(space: Any) -> tuple[NDArray[Any], NDArray[Any]] | None:
-    """Return the bounds of a policy's actions where they are not those of the environment; None where nothing differs.
-
-    Actions without bounds are clipped, as `Env.step` does.
-    """
+    """Return a policy's bounds of actions where they are not the environment's; else None."""
     if not isinstance(space, spaces.Box) or space.shape != (2,) or not np.isfinite([space.low, space.high]).all():
         return None
     if (space.low == -1.0).all() and (space.high == 1.0).all():
@@ -105,10 +102,7 @@ def find_stacking(given: Shape, wanted: Shape) -> tuple[int, bool] | None:
 
 
 def find_frame_stacking(given: spaces.Space[Any], wanted: Any) -> tuple[int, bool] | None:
-    """Return the stacking of an environment's space in a policy's; None if they do not go together.
-
-    Mappings go by name, and all of their parts have to agree; images may also have their channels first.
-    """
+    """Return the stacking of a space in a policy's, alike in all parts of a mapping; None if they do not fit."""
     if isinstance(given, spaces.Dict):
         if not isinstance(wanted, spaces.Dict) or set(given.spaces) != set(wanted.spaces):
             return None

@@ -4,12 +4,13 @@ import warnings
 from collections import UserDict
 from collections.abc import Mapping
 from functools import cached_property
+from types import MappingProxyType
 from typing import Any
 
 from rare_envs.control.actions import MAX_ACCELERATION, MAX_STEERING
 from rare_envs.envs.rendering import make_scene
 from rare_envs.make import CONFIGURATION_ARGUMENTS
-from rare_envs.plugins import did_you_mean
+from rare_envs.plugins import check_name
 from rare_envs.simulation.decision import COLLISION_COST
 from rare_envs.simulation.episode import Episode
 from rare_envs.simulation.world import World
@@ -24,38 +25,28 @@ FRAME_RATE = "simulation_frequency"
 
 
 class FixedConfiguration(UserDict[str, Any]):
-    """A configuration that is read like a dictionary, and refuses to set what is fixed when the environment is made.
+    """HighwayEnv's configuration: keys of the picture can be set, what was fixed with the environment cannot.
 
     The frame rate stays too, but with a warning: HighwayEnv's scripts set it after the training, for a smoother video.
     """
-
-    def __init__(self, values: Mapping[str, Any]) -> None:
-        """Take over values by HighwayEnv's key; dictionaries among them refuse likewise."""
-        super().__init__()
-        self.data = {k: FixedConfiguration(v) if isinstance(v, dict) else v for k, v in values.items()}
 
     def __setitem__(self, name: str, value: Any) -> None:
         """Set a key of the picture, or another one to the value that it has."""
         if name in PICTURE_KEYS:
             self.data[name] = value
-        elif name not in self:
-            raise ValueError(f"Unknown key {name!r}{did_you_mean(name, self)} of config; it has {', '.join(self)}.")
-        elif self[name] != value and name == FRAME_RATE:
-            warnings.warn(
-                f"config[{name!r}] stays {self[name]!r}, not {value!r}: the time between frames is fixed when the "
-                "environment is made, by gym.make's argument dt.",
-                stacklevel=2,
-            )
-        elif self[name] != value:
-            argument = CONFIGURATION_ARGUMENTS.get(name)
-            advice = f"give gym.make the argument {argument}" if argument else "it belongs to the scenario"
-            raise ValueError(
-                f"Expected config[{name!r}] to stay {self[name]!r}, got {value!r}; "
-                f"it is fixed when the environment is made: {advice}."
-            )
-
-    def __delitem__(self, name: str) -> None:
-        raise ValueError(f"Expected config to keep its key {name!r}; copy it with dict(config) to change the copy.")
+            return
+        check_name("key of config", name, self)
+        if self[name] == value:
+            return
+        argument = CONFIGURATION_ARGUMENTS.get(name)
+        advice = f"give gym.make the argument {argument}" if argument else "it belongs to the scenario"
+        message = (
+            f"Expected config[{name!r}] to stay {self[name]!r}, got {value!r}; "
+            f"it is fixed when the environment is made: {advice}."
+        )
+        if name != FRAME_RATE:
+            raise ValueError(message)
+        warnings.warn(message, stacklevel=2)
 
 
 class HighwayEnvInterface:
@@ -72,9 +63,10 @@ class HighwayEnvInterface:
         clock, scenario = self.world.clock, self.world.scenario
         kinds = {"meta": "DiscreteMetaAction", "discrete": "DiscreteAction", "continuous": "ContinuousAction"}
         observation = self.world.sensing.observation
-        values: dict[str, Any] = {
-            "observation": {"type": "Kinematics" if observation == "kinematics" else observation},
-            "action": {"type": kinds[clock.action]},
+        configuration = FixedConfiguration()
+        configuration.data = {
+            "observation": MappingProxyType({"type": "Kinematics" if observation == "kinematics" else observation}),
+            "action": MappingProxyType({"type": kinds[clock.action]}),
             "simulation_frequency": round(1.0 / clock.dt),
             "policy_frequency": clock.decisions_per_second,
             "duration": clock.seconds,
@@ -88,7 +80,7 @@ class HighwayEnvInterface:
             "manual_control": False,
             "real_time_rendering": False,
         }
-        return FixedConfiguration(values)
+        return configuration
 
     def configure(self, config: Mapping[str, Any] | None) -> None:
         """Take a change of the configuration as HighwayEnv's method does; what is fixed is left out with a warning."""

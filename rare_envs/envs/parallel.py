@@ -16,7 +16,7 @@ from torch import Tensor
 from rare_envs.control.actions import read_actions
 from rare_envs.egos.needs import EgoNeeds, load_named_ego, resolve
 from rare_envs.egos.policy import as_driver
-from rare_envs.envs.rendering import RENDER_MODES, Display
+from rare_envs.envs.rendering import RENDER_MODES, Renderer
 from rare_envs.envs.rows_and_infos import (
     Info,
     SingleObservation,
@@ -28,7 +28,8 @@ from rare_envs.envs.rows_and_infos import (
 )
 from rare_envs.make import set_up
 from rare_envs.multi_agent import MultiAgentEpisode, Reward, command_nobody, own_reward, start, step_agents, total_of
-from rare_envs.plugins import did_you_mean
+from rare_envs.plugins import check_name
+from rare_envs.simulation.episode import Episode
 from rare_envs.simulation.observation import map_kinds, observe
 
 Actions = Mapping[str, Any]
@@ -66,9 +67,7 @@ def _select_agents(names: tuple[str, ...], agents: Sequence[str] | None) -> list
     if isinstance(agents, str) or not isinstance(agents, Sequence):
         raise ValueError(f"Expected agents as a list of names, such as ['{names[-1]}'], got {agents!r}.")
     for agent in agents:
-        if agent not in names:
-            hint = did_you_mean(str(agent), names)
-            raise ValueError(f"There is no vehicle {agent!r}{hint}; the vehicles are {', '.join(names)}.")
+        check_name("vehicle", agent, names)
     if not agents or len(set(agents)) < len(agents):
         raise ValueError(f"Expected one or more different agents, got {list(agents)}.")
     return list(agents)
@@ -77,14 +76,10 @@ def _select_agents(names: tuple[str, ...], agents: Sequence[str] | None) -> list
 def _select_rewards(agents: Sequence[str], rewards: Mapping[str, Reward] | None) -> dict[str, Reward]:
     """Return the reward of each agent."""
     rewards = {} if rewards is None else rewards
-    if not isinstance(rewards, Mapping):
+    if not isinstance(rewards, Mapping) or not all(map(callable, rewards.values())):
         raise ValueError(f"Expected rewards as a mapping of agents to functions of a Transition, got {rewards!r}.")
-    for agent, reward in rewards.items():
-        if agent not in agents:
-            hint = did_you_mean(str(agent), agents)
-            raise ValueError(f"Reward for {agent!r}{hint}, but the agents are {', '.join(agents)}.")
-        if not callable(reward):
-            raise ValueError(f"Expected the reward of {agent!r} as a function of a Transition, got {reward!r}.")
+    for agent in rewards:
+        check_name("agent of a reward", agent, agents)
     return {agent: rewards.get(agent, own_reward) for agent in agents}
 
 
@@ -126,10 +121,11 @@ class DrivingParallelEnv(_SeveralAgents, ParallelEnv[str, SingleObservation, Flo
         self.possible_agents = self._set_up(env_id, agents, ego, rewards, kwargs)
         self.metadata = {**self.metadata, "name": env_id, "render_fps": self.world.clock.decisions_per_second}
         self.render_mode = render_mode
-        self._display = Display(self.world, render_mode)
+        self._renderer = Renderer(self.world, render_mode)
         self.agents: list[str] = []
-        self.observation_spaces = {agent: self.world.observation_space for agent in self.possible_agents}
-        self.action_spaces = {agent: self.world.action_space for agent in self.possible_agents}
+        self._spaces = {
+            agent: (self.world.observation_space, self.world.action_space) for agent in self.possible_agents
+        }
         self._np_random: np.random.Generator | None = None
         self._x = np.full(self.space.dim, np.nan)
         self._memory: Any = None
@@ -137,11 +133,11 @@ class DrivingParallelEnv(_SeveralAgents, ParallelEnv[str, SingleObservation, Flo
 
     def observation_space(self, agent: str) -> spaces.Space[Any]:
         """Return the space of an agent's observations."""
-        return self.observation_spaces[agent]
+        return self._spaces[agent][0]
 
     def action_space(self, agent: str) -> spaces.Space[Any]:
         """Return the space of an agent's actions."""
-        return self.action_spaces[agent]
+        return self._spaces[agent][1]
 
     @property
     def state_space(self) -> "spaces.Box[np.float32]":
@@ -170,9 +166,11 @@ class DrivingParallelEnv(_SeveralAgents, ParallelEnv[str, SingleObservation, Flo
         self._x = self.space.scenario_x(options, 1, self._np_random)[0]
         self._tick, self._memory, self.agents = 0, None, list(self.possible_agents)
         self._episode = episode = self._start(self._x[None])
-        infos = {agent: episode_info(self.space, self._x, self._view(episode, agent)) for agent in self.agents}
-        self._show()
-        return self._observe(episode), infos
+        views = self._views(episode)
+        infos = {agent: episode_info(self.space, self._x, view) for agent, view in views.items()}
+        if self._renderer.is_window:
+            self.render()
+        return self._observe(views), infos
 
     def step(
         self, actions: Actions
@@ -203,7 +201,8 @@ class DrivingParallelEnv(_SeveralAgents, ParallelEnv[str, SingleObservation, Flo
             terms = {agent: earned[self._vehicles[agent]] for agent in self.agents}
             rewards = {agent: float(total_of(reward)) for agent, reward in terms.items()}
         self._episode, self._tick = episode, self._tick + self.world.clock.stride
-        observations, views = self._observe(episode), {agent: self._view(episode, agent) for agent in self.agents}
+        views = self._views(episode)
+        observations = self._observe(views)
         terminated = {agent: bool(view.collided) for agent, view in views.items()}
         over = self._tick >= self.world.clock.ticks
         truncated = {agent: over and not terminated[agent] for agent in self.agents}
@@ -212,7 +211,8 @@ class DrivingParallelEnv(_SeveralAgents, ParallelEnv[str, SingleObservation, Flo
             for agent, view in views.items()
         }
         self.agents = [agent for agent in self.agents if not (terminated[agent] or truncated[agent])]
-        self._show()
+        if self._renderer.is_window:
+            self.render()
         return observations, rewards, terminated, truncated, infos
 
     def _read(self, actions: Actions) -> tuple[Tensor, Tensor]:
@@ -221,8 +221,10 @@ class DrivingParallelEnv(_SeveralAgents, ParallelEnv[str, SingleObservation, Flo
         for agent, action in actions.items():
             if action is None:
                 continue
-            self._check_agent(agent)
-            shape = self.action_spaces[agent].shape
+            check_name("agent", agent, self.possible_agents)
+            if agent not in self.agents:
+                raise ValueError(f"Expected actions of {', '.join(self.agents)} only: {agent!r} has left.")
+            shape = self.world.action_space.shape
             if np.shape(action) != shape:
                 raise ValueError(f"Expected an action of shape {shape} for {agent!r}, got {np.shape(action)}.")
             given = torch.as_tensor(np.asarray(action))[None]
@@ -230,33 +232,19 @@ class DrivingParallelEnv(_SeveralAgents, ParallelEnv[str, SingleObservation, Flo
             commanded[:, self._vehicles[agent]] = True
         return chosen, commanded
 
-    def _check_agent(self, agent: str) -> None:
-        if agent in self.agents:
-            return
-        if agent in self.possible_agents:
-            raise ValueError(
-                f"Expected actions of {', '.join(self.agents)} only: {agent!r} has left, because its vehicle collided."
-            )
-        hint = did_you_mean(str(agent), self.possible_agents)
-        raise ValueError(f"There is no agent {agent!r}{hint}; the agents are {', '.join(self.possible_agents)}.")
-
-    def _view(self, episode: MultiAgentEpisode, agent: str) -> Any:
-        return episode.views[self._vehicles[agent]]
+    def _views(self, episode: MultiAgentEpisode) -> dict[str, Episode]:
+        """Return the episode as each agent sees it."""
+        return {agent: episode.views[self._vehicles[agent]] for agent in self.agents}
 
     @torch.inference_mode()
-    def _observe(self, episode: MultiAgentEpisode) -> dict[str, SingleObservation]:
-        kinds = self.world.sensing.observation
-        seen = {agent: observe(self._view(episode, agent), kinds) for agent in self.agents}
+    def _observe(self, views: Mapping[str, Episode]) -> dict[str, SingleObservation]:
+        seen = {agent: observe(view, self.world.sensing.observation) for agent, view in views.items()}
         return {agent: map_kinds(lambda part: part[0].numpy(), each) for agent, each in seen.items()}
-
-    def _show(self) -> None:
-        if self._display.is_window:
-            self.render()
 
     def render(self) -> NDArray[np.uint8] | None:
         """Draw the road with HighwayEnv's graphics: an (H, W, 3) image for "rgb_array", a window for "human"."""
         episode = self._episode
-        return self._display.draw(
+        return self._renderer.render(
             None if episode is None else episode.traffic,
             self._tick * self.world.clock.dt,
             agents=list(self._vehicles.values()),
@@ -272,7 +260,7 @@ class DrivingParallelEnv(_SeveralAgents, ParallelEnv[str, SingleObservation, Flo
 
     def close(self) -> None:
         """Close the window."""
-        self._display.close()
+        self._renderer.close()
 
 
 class AgentsVectorEnv(_SeveralAgents, VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[Any]]):

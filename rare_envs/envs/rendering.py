@@ -54,10 +54,7 @@ def make_traffic(state: State, road: Road, row: int = 0) -> Any:
 
 
 def make_scene(episode: Episode, crashed: Collection[int] | None = None) -> Any:
-    """Return HighwayEnv's road of an episode, a batch of one, as code of its users reads it: crashes and targets.
-
-    The numbers of the vehicles that have `crashed` may be given. With meta-actions the ego is an `MDPVehicle`.
-    """
+    """Return HighwayEnv's road of a batch of one, with crashes; with meta-actions the ego is an `MDPVehicle`."""
     from highway_env.vehicle.controller import MDPVehicle
 
     traffic = make_traffic(episode.state, episode.road)
@@ -132,19 +129,29 @@ _Outlines = dict[str, tuple[Colour, Collection[int]]]
 """Colours of the outlines of vehicles, and whose, by what they mean."""
 
 
-class Renderer:
-    """Painter of episodes of a world, on one surface that follows the ego."""
+RENDER_MODES = ("rgb_array", "human")
 
-    def __init__(self, world: World, window: bool = False, fps: int = 10) -> None:
-        """Prepare a surface, shown in a window too if asked, at so many frames per second."""
+
+class Renderer:
+    """Painter of episodes of a world, on one surface that follows the ego; HighwayEnv's graphics are loaded for it."""
+
+    def __init__(self, world: World, mode: str | None = "rgb_array") -> None:
+        """Paint into arrays, for "human" into a window too, or nothing by `render`, for None."""
+        if mode is not None and mode not in RENDER_MODES:
+            raise ValueError(f"Expected render_mode None, 'rgb_array' or 'human', got {mode!r}.")
+        self._world, self._road, self._mode = world, world.scenario.road, mode
+        self._roles = [name if name in ROLE_COLOURS else "others" for name in world.scenario.vehicle_names]
+        self.is_window = mode == "human"
+        self._pygame: Any = None
+        """The library, once a surface is there."""
+
+    def _open(self) -> None:
+        """Prepare a surface, and the window."""
         import pygame
         import pygame.freetype
         from highway_env.road.graphics import WorldSurface
 
-        self._pygame: Any = pygame
-        self._world = world
-        self._road: Road = world.scenario.road
-        self._roles = [name if name in ROLE_COLOURS else "others" for name in world.scenario.vehicle_names]
+        self._pygame = pygame
         height = max(FRAME_HEIGHT, 16 * round((self._road.lanes * self._road.width + 2 * _MARGIN) * _SCALING / 16))
         self._surface = WorldSurface((FRAME_WIDTH, height), 0, pygame.Surface((FRAME_WIDTH, height)))
         self._surface.scaling = _SCALING
@@ -153,12 +160,20 @@ class Renderer:
         pygame.freetype.init()
         self._font = pygame.freetype.Font(None, 14)
         self._font.origin = True  # texts are placed by their base line
-        self._fps = fps
-        self._screen = None
-        if window:
+        if self.is_window:
             pygame.display.init()  # not pygame.init(), which would also want a sound card
             self._screen = pygame.display.set_mode(self._canvas.get_size())
             self._clock = pygame.time.Clock()
+
+    def render(self, episode: Episode | None, time: float, **details: Any) -> NDArray[np.uint8] | None:
+        """Return the picture of `draw`, or show it in the window; warn if there is none."""
+        if self._mode is None or episode is None:
+            gym.logger.warn(
+                "Nothing to render: make the environment with render_mode='rgb_array' or 'human', and reset it first."
+            )
+            return None
+        image = self.draw(episode, time, **details)
+        return None if self.is_window else image
 
     def draw(
         self,
@@ -173,6 +188,8 @@ class Renderer:
         Vehicles that agents drive, and those that have `crashed` (None: the ego, if it has, and whom it touches), are
         outlined.
         """
+        if self._pygame is None:
+            self._open()
         outlines: _Outlines = {
             "driven by an agent": (AGENT, set(agents) - {0}),
             "crashed": (as_rgb(CRASH_COLOUR), find_crashed(episode, row) if crashed is None else crashed),
@@ -182,10 +199,10 @@ class Renderer:
         self._canvas.blit(self._surface, (0, TEXT_HEIGHT))
         self._write(8, 17, caption(self._world, episode, time, row))
         self._draw_legend(outlines)
-        if self._screen is not None:
+        if self.is_window:
             self._screen.blit(self._canvas, (0, 0))
             self._pygame.event.pump()
-            self._clock.tick(self._fps)
+            self._clock.tick(self._world.clock.decisions_per_second)
             self._pygame.display.flip()
         image: NDArray[np.uint8] = np.moveaxis(self._pygame.surfarray.array3d(self._canvas), 0, 1)
         return image
@@ -223,10 +240,10 @@ class Renderer:
         return width
 
     def close(self) -> None:
-        """Close the window, if there is one."""
-        if self._screen is not None:
+        """Close the window, if there is one; another picture opens it again."""
+        if self.is_window and self._pygame is not None:
             self._pygame.display.quit()
-            self._screen = None
+            self._pygame = None
 
 
 def caption(world: World, episode: Episode, time: float | None, row: int = 0) -> str:
@@ -240,42 +257,3 @@ def caption(world: World, episode: Episode, time: float | None, row: int = 0) ->
     measure = f" ({world.measurement.measure})" if isinstance(world.measurement.measure, str) else ""
     parts.append(f"f so far{measure} {float(episode.f[row]):.2f}")
     return "    ".join(parts)
-
-
-RENDER_MODES = ("rgb_array", "human")
-
-
-class Display:
-    """The picture of an environment in its render mode; HighwayEnv's graphics are loaded for the first one."""
-
-    def __init__(self, world: World, mode: str | None) -> None:
-        if mode is not None and mode not in RENDER_MODES:
-            raise ValueError(f"Expected render_mode None, 'rgb_array' or 'human', got {mode!r}.")
-        self._world, self._mode = world, mode
-        self.is_window = mode == "human"
-        self._renderer: Renderer | None = None
-
-    def draw(
-        self,
-        episode: Episode | None,
-        time: float,
-        agents: Collection[int] = (),
-        crashed: Collection[int] | None = None,
-    ) -> NDArray[np.uint8] | None:
-        """Return the picture of a batch of one, or show it in the window, as `Renderer.draw`; warn if there is none."""
-        if self._mode is None or episode is None:
-            gym.logger.warn(
-                "Nothing to render: make the environment with render_mode='rgb_array' or 'human', and reset it first."
-            )
-            return None
-        if self._renderer is None:
-            clock = self._world.clock
-            self._renderer = Renderer(self._world, self.is_window, clock.decisions_per_second)
-        image = self._renderer.draw(episode, time, agents=agents, crashed=crashed)
-        return None if self.is_window else image
-
-    def close(self) -> None:
-        """Close the window."""
-        if self._renderer is not None:
-            self._renderer.close()
-            self._renderer = None

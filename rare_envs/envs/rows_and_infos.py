@@ -1,25 +1,32 @@
-"""Rows of a batch: drawn ahead, replaced and picked; infos beside observation and reward."""
+"""Parts of environments: scenarios drawn ahead, a step, rows of a batch replaced and picked, and infos."""
 
 from __future__ import annotations
 
 import pickle
-from collections.abc import Iterator
-from typing import Any, TypeVar
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from rare_envs.control.actions import read_actions
 from rare_envs.distributions.beta import BetaDistribution
 from rare_envs.distributions.coordinates import FloatArray
 from rare_envs.distributions.fitted import FittedDistribution
 from rare_envs.distributions.mixture import CoordinateMixture, TruncatedGaussianMixture
 from rare_envs.distributions.space import Distribution, ScenarioSpace
 from rare_envs.multi_agent import view_order
+from rare_envs.simulation.decision import StepResult, advance
 from rare_envs.simulation.episode import Episode
 from rare_envs.simulation.observation import map_kinds
 from rare_envs.traffic.crash import describe_crash
-from rare_envs.traffic.state import map_leaves, map_tensors
+from rare_envs.traffic.state import map_leaves
+
+if TYPE_CHECKING:
+    from rare_envs.fast.choice import ScriptedStep
+    from rare_envs.simulation.world import World
 
 _T = TypeVar("_T")
 ROWS_AHEAD = 256
@@ -40,8 +47,10 @@ class DrawsAhead:
         plain = base.distribution if type(base) is FittedDistribution else base
         self._in_a_row = type(plain) in DRAWS_IN_A_ROW
         self._rng: np.random.Generator | None = None
-        self._state: Any = None
-        self._state_ahead = b""
+        self._before: Any = None
+        """State of the generator before the rows, of which the first `_given` were given, and ..."""
+        self._after = b""
+        """... after them, as bytes, for some states have arrays in them."""
         self._rows = np.empty((0, 0))
         self._given = 0
 
@@ -52,9 +61,9 @@ class DrawsAhead:
         if rng is not self._rng or self._given + n > len(self._rows):
             if rng is self._rng:
                 self.settle()
-            self._rng, self._state, self._given = rng, rng.bit_generator.state, 0
+            self._rng, self._before, self._given = rng, rng.bit_generator.state, 0
             self._rows = self._base.sample(max(n, ROWS_AHEAD), rng)
-            self._state_ahead = _freeze_state(rng)
+            self._after = pickle.dumps(rng.bit_generator.state)
         self._given += n
         return self._rows[self._given - n : self._given].copy()
 
@@ -64,15 +73,25 @@ class DrawsAhead:
         One that somebody else has drawn from since stays where it is: his draws would come again.
         """
         if self._rng is not None:
-            if _freeze_state(self._rng) == self._state_ahead:
-                self._rng.bit_generator.state = self._state
+            if pickle.dumps(self._rng.bit_generator.state) == self._after:
+                self._rng.bit_generator.state = self._before
                 self._base.sample(self._given, self._rng)
             self._rng, self._rows = None, self._rows[:0]
 
 
-def _freeze_state(rng: np.random.Generator) -> bytes:
-    """Return the state of a generator as bytes, for some have arrays in it."""
-    return pickle.dumps(rng.bit_generator.state)
+def take_step(
+    world: World,
+    compiled: ScriptedStep | None,
+    episode: Episode,
+    actions: Any,
+    ignored: NDArray[np.bool_] | None = None,
+    watch: Callable[[Episode], None] | None = None,
+) -> StepResult:
+    """Carry out decisions (B, ...) as `decision.advance`, compiled or by torch; `ignored` rows do not count."""
+    mask = None if ignored is None else torch.from_numpy(ignored)
+    read = read_actions(world.clock.action, torch.as_tensor(np.asarray(actions)), len(episode.collided), mask)
+    moved = None if compiled is None else compiled.advance(episode, read)
+    return moved or advance(world, episode, read.to(episode.collided.device), watch)
 
 
 def merge_rows(old: _T, rows: Tensor, new: _T) -> _T:
@@ -107,36 +126,12 @@ def list_tensors(value: Any) -> list[Tensor]:
     return found
 
 
-def put_tensors(value: _T, tensors: Iterator[Tensor]) -> _T:
-    """Return nested tuples with other tensors in the places of `list_tensors`."""
-
-    def put(old: Tensor) -> Tensor:
-        new = next(tensors, None)
-        if new is None or new.shape != old.shape or new.dtype != old.dtype:
-            raise ValueError(f"Expected a tensor of {old.dtype} and shape {tuple(old.shape)}.")
-        return new
-
-    result: _T = map_tensors(put, value)
-    return result
-
-
 def to_object_rows(observation: Any, mask: NDArray[np.bool_]) -> NDArray[Any]:
     """Return rows of an observation as objects, None where the mask (B,) is not set: `final_obs` of Gymnasium."""
     rows = np.full(len(mask), None, dtype=object)
     for row in np.flatnonzero(mask):
         rows[row] = map_kinds(lambda part, row=row: part[row].copy(), observation)
     return rows
-
-
-def replace_rows(observation: Any, rows: NDArray[np.intp], fresh: Any) -> Any:
-    """Return an observation of B environments with R rows, (R,), replaced by those of another."""
-
-    def replace(old: NDArray[Any], new: NDArray[Any]) -> NDArray[Any]:
-        old = old.copy()
-        old[rows] = new
-        return old
-
-    return map_kinds(replace, observation, fresh)
 
 
 def mask_infos(values: dict[str, Any], mask: NDArray[np.bool_]) -> dict[str, Any]:

@@ -7,13 +7,11 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from rare_envs.control.actions import read_actions
 from rare_envs.envs.highway_env_interface import HighwayEnvInterface
-from rare_envs.envs.rendering import RENDER_MODES, Display
-from rare_envs.envs.rows_and_infos import SingleObservation, episode_info, step_info
+from rare_envs.envs.rendering import RENDER_MODES, Renderer
+from rare_envs.envs.rows_and_infos import SingleObservation, episode_info, step_info, take_step
 from rare_envs.fast.choice import find_scripted_step
 from rare_envs.make import set_up
-from rare_envs.simulation.decision import StepResult, advance
 from rare_envs.simulation.episode import Episode
 from rare_envs.simulation.observation import map_kinds, observe
 
@@ -48,7 +46,7 @@ class DrivingEnv(HighwayEnvInterface, gym.Env[SingleObservation, Any]):
         self.action_space = self.world.action_space
         self.metadata = {**self.metadata, "render_fps": self.world.clock.decisions_per_second}
         self.render_mode = render_mode
-        self._display = Display(self.world, render_mode)
+        self._renderer = Renderer(self.world, render_mode)
         self._x = np.full(self.space.dim, np.nan)
         self._episode: Episode | None = None
         self._tick = 0
@@ -74,7 +72,8 @@ class DrivingEnv(HighwayEnvInterface, gym.Env[SingleObservation, Any]):
         with torch.inference_mode():
             self._episode = self.world.start(torch.from_numpy(self._x[None]).float())
             observation = self._observe(self._episode)
-        self._show()
+        if self._renderer.is_window:
+            self.render()
         return observation, episode_info(self.space, self._x, self._episode)
 
     def step(self, action: Any) -> tuple[SingleObservation, float, bool, bool, dict[str, Any]]:
@@ -88,9 +87,12 @@ class DrivingEnv(HighwayEnvInterface, gym.Env[SingleObservation, Any]):
         if np.shape(action) != self.action_space.shape:
             wanted = "of shape (2,) (acceleration, steering)" if self.action_space.shape else "as one whole number"
             raise ValueError(f"Expected an action {wanted}, got shape {np.shape(action)}.")
-        moved = None if self._compiled is None else self._compiled.advance(self._episode, np.asarray(action)[None])
+        self._between = False
+        watched = self.world.clock.stride > 1 and (self._recorder or self._renderer.is_window)
+        watch = self._watch if watched else None
         with torch.inference_mode():
-            episode, terms, features = moved or self._advance_by_torch(action)
+            given = np.asarray(action)[None]
+            episode, terms, features = take_step(self.world, self._compiled, self._episode, given, watch=watch)
             if features is not None and self.world.sensing.observation == "features":
                 observation: SingleObservation = features[0]
             else:
@@ -100,38 +102,27 @@ class DrivingEnv(HighwayEnvInterface, gym.Env[SingleObservation, Any]):
         terminated = bool(episode.collided)
         truncated = not terminated and self._tick >= self.world.clock.ticks
         info = step_info(self.space, self._x, episode, terms, terminated or truncated)
-        self._show()
+        if self._renderer.is_window:
+            self.render()
         return observation, reward, terminated, truncated, info
 
     def _observe(self, episode: Episode) -> SingleObservation:
         """Return what the ego observes now, an array or a dictionary of arrays."""
-        with torch.inference_mode():
-            observed = observe(episode, self.world.sensing.observation)
+        observed = observe(episode, self.world.sensing.observation)
         return cast("SingleObservation", map_kinds(lambda part: part[0].numpy(), observed))
-
-    def _advance_by_torch(self, action: Any) -> StepResult:
-        assert self._episode is not None
-        given = read_actions(self.world.clock.action, torch.as_tensor(np.asarray(action))[None], 1)
-        self._between = False
-        watched = self.world.clock.stride > 1 and (self._recorder or self._display.is_window)
-        return advance(self.world, self._episode, given, watch=self._watch if watched else None)
 
     def _watch(self, episode: Episode) -> None:
         """Render the ticks within a decision; its last one is rendered after it."""
-        if self._between and self._display.is_window:
+        if self._between and self._renderer.is_window:
             self.render()
         elif self._between:
             self._recorder._capture_frame()
         self._episode, self._between = episode, True
 
-    def _show(self) -> None:
-        if self._display.is_window:
-            self.render()
-
     def render(self) -> NDArray[np.uint8] | None:
         """Draw the road with HighwayEnv's graphics: an (H, W, 3) image for "rgb_array", a window for "human"."""
-        return self._display.draw(self._episode, self._tick * self.world.clock.dt)
+        return self._renderer.render(self._episode, self._tick * self.world.clock.dt)
 
     def close(self) -> None:
         """Close the window."""
-        self._display.close()
+        self._renderer.close()

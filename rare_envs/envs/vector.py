@@ -12,7 +12,6 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 from torch import Tensor
 
-from rare_envs.control.actions import read_actions
 from rare_envs.devices import find_device, move_to
 from rare_envs.envs.rendering import Renderer
 from rare_envs.envs.rows_and_infos import (
@@ -21,16 +20,17 @@ from rare_envs.envs.rows_and_infos import (
     list_tensors,
     mask_infos,
     merge_rows,
-    put_tensors,
-    replace_rows,
+    take_step,
     to_object_rows,
 )
 from rare_envs.fast.choice import find_scripted_step
 from rare_envs.make import set_up
-from rare_envs.simulation.decision import RewardTerms, StepResult, advance
+from rare_envs.plugins import check_name
+from rare_envs.simulation.decision import RewardTerms
 from rare_envs.simulation.episode import Episode
 from rare_envs.simulation.observation import map_kinds, observe
 from rare_envs.traffic.crash import CRASH_KINDS, NONE
+from rare_envs.traffic.state import map_tensors
 
 
 class DrivingVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[Any]]):
@@ -75,10 +75,8 @@ class DrivingVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[Any]
             raise ValueError(f"Expected num_envs of at least 1, got {num_envs!r}.")
         if render_mode not in (None, "rgb_array"):
             raise ValueError(f"Expected render_mode None or 'rgb_array' for a batch, got {render_mode!r}.")
-        known = [mode.value for mode in AutoresetMode]
-        if autoreset_mode not in [*known, *AutoresetMode]:
-            names = ", ".join(map(repr, known))
-            raise ValueError(f"Unknown autoreset_mode {autoreset_mode!r}; expected one of {names}.")
+        if not isinstance(autoreset_mode, AutoresetMode):
+            check_name("autoreset_mode", autoreset_mode, [mode.value for mode in AutoresetMode])
         self._mode = AutoresetMode(autoreset_mode)
         self.device = find_device(device)
         if self.device.type != "cpu" and core == "numba":
@@ -87,8 +85,8 @@ class DrivingVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[Any]
         if self.device.type != "cpu":
             world = replace(world, background=move_to(self.device, world.background))
         self.world = world.with_statistics()
-        frames = self.world.clock.decisions_per_second
-        self.metadata = {**self.metadata, "render_fps": frames, "autoreset_mode": self._mode}
+        fps = self.world.clock.decisions_per_second
+        self.metadata = {**self.metadata, "render_fps": fps, "autoreset_mode": self._mode}
         self.num_envs = int(num_envs)
         self.render_mode = render_mode
         self.single_observation_space = self.world.observation_space
@@ -101,7 +99,7 @@ class DrivingVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[Any]
         self._ended = np.zeros(num_envs, dtype=bool)
         """Episodes that are over and were not replaced yet."""
         self._episode: Episode | None = None
-        self._renderer: Renderer | None = None
+        self._renderer = Renderer(self.world, render_mode)
         self._compiled = find_scripted_step(self.world, core) if self.device.type == "cpu" else None
 
     @property
@@ -174,11 +172,13 @@ class DrivingVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[Any]
                 "Expected reset(options={'reset_mask': ...}) before step(): episodes "
                 f"{np.flatnonzero(fresh).tolist()} have ended and autoreset is disabled."
             )
-        started = self._replace(np.flatnonzero(fresh)) if fresh.any() else None
+        rows = np.flatnonzero(fresh)
+        started = self._replace(rows) if len(rows) else None
         with torch.inference_mode():
-            episode, terms, features = self._advance(actions, fresh)
+            ignored = fresh if len(rows) else None
+            episode, terms, features = take_step(self.world, self._compiled, self._episode, actions, ignored)
             if started is not None:  # which do not move in the step that starts them
-                episode, features = merge_rows(episode, self._place(np.flatnonzero(fresh)), started), None
+                episode, features = merge_rows(episode, self._place(rows), started), None
             reward = terms.total.double().numpy(force=True)
         reward[fresh] = 0.0
         self._episode = episode
@@ -189,17 +189,6 @@ class DrivingVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[Any]
         observation = features if known else self._observe(episode)
         observation, infos = self._finish(observation, terms, terminated | truncated, fresh)
         return observation, reward, terminated.copy(), truncated, infos
-
-    def _advance(self, actions: NDArray[Any], fresh: NDArray[np.bool_]) -> StepResult:
-        """Carry out a decision, in which the actions of `fresh` rows (B,) do not count."""
-        assert self._episode is not None
-        if self._compiled is not None:
-            moved = self._compiled.advance(self._episode, clear_rows(actions, fresh))
-            if moved is not None:
-                return moved
-        ignored = torch.from_numpy(fresh) if fresh.any() else None
-        given = read_actions(self.world.clock.action, torch.as_tensor(np.asarray(actions)), self.num_envs, ignored)
-        return advance(self.world, self._episode, given.to(self.device))
 
     def _finish(
         self, observation: Any, terms: RewardTerms, done: NDArray[np.bool_], fresh: NDArray[np.bool_]
@@ -216,8 +205,8 @@ class DrivingVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[Any]
             final = self._info(episode, done) | mask_infos(earned, done) | self._end_info(episode, done)
             infos = {"final_obs": to_object_rows(observation, done), "_final_obs": done.copy()}
             infos |= {"final_info": final, "_final_info": done.copy()}
-            rows = np.flatnonzero(done)
-            observation = replace_rows(observation, rows, self._observe(self._replace(rows)))
+            rows, observation = np.flatnonzero(done), map_kinds(np.copy, observation)
+            map_kinds(lambda old, new: old.__setitem__(rows, new), observation, self._observe(self._replace(rows)))
         return observation, infos | self._info(self._episode, everyone) | mask_infos(earned, ~done)
 
     def _observe(self, episode: Episode) -> Any:
@@ -294,10 +283,10 @@ class DrivingVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[Any]
         Raises:
             ValueError: They are of another environment.
         """
-        tensors = (tensor.to(self.device) for tensor in state["episode"])
-        self._episode = put_tensors(self._episode, tensors)
-        if next(tensors, None) is not None or state["x"].shape != self._x.shape:
+        old, new = list_tensors(self._episode), list(state["episode"])
+        if [(each.shape, each.dtype) for each in old] != [(each.shape, each.dtype) for each in new]:
             raise ValueError("The episodes are of another environment.")
+        self._episode = map_tensors(lambda _: new.pop(0).to(self.device), self._episode)
         self._x, self._tick = state["x"].numpy().copy(), state["tick"].numpy().copy()
         self._ended = state["ended"].numpy().copy() if "ended" in state else np.zeros(self.num_envs, dtype=bool)
         self.np_random.bit_generator.state = json.loads(state["generator"])
@@ -307,16 +296,5 @@ class DrivingVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[Any]
         if self.render_mode is None or self._episode is None:
             gym.logger.warn("Nothing to render: pass render_mode='rgb_array' to gym.make_vec and reset first.")
             return None
-        if self._renderer is None:
-            self._renderer = Renderer(self.world, False, self.metadata["render_fps"])
         episode, draw, dt = self._episode, self._renderer.draw, self.world.clock.dt
         return tuple(draw(episode, self._tick[row] * dt, row).copy() for row in range(self.num_envs))
-
-
-def clear_rows(actions: Any, rows: NDArray[np.bool_]) -> NDArray[Any]:
-    """Return actions with 0 in some rows, boolean (B,); those of another number of rows as they are."""
-    cleared: NDArray[Any] = np.asarray(actions)
-    if rows.any() and cleared.shape[:1] == rows.shape:
-        cleared = cleared.copy()
-        cleared[rows] = 0
-    return cleared

@@ -9,13 +9,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
-from rare_envs.control.actions import DISCRETE_ACTIONS, MAX_ACCELERATION, MAX_STEERING
+from rare_envs.control.actions import DISCRETE_ACTIONS
 from rare_envs.control.idm import IDM
 from rare_envs.egos.dense_policies import DensePolicy, NotCompiled, read_dense_policy
 from rare_envs.egos.policy import PolicyDriver
 from rare_envs.measures import MEASURES
-from rare_envs.plugins import one_line
+from rare_envs.plugins import check_name, one_line
 from rare_envs.scenarios import car_following, cut_in, hard_brake
 from rare_envs.simulation.observation import observation_space
 
@@ -31,18 +32,10 @@ SCRIPTS = ((car_following.others, "STEADY", 2), (hard_brake.others, "BRAKING", 2
 are for, the ego included."""
 MAX_UNITS = 128
 """Widest layer: beyond it torch's matrix products are faster than the compiled ones, which are made for few units."""
-ACTION_SCALES = np.array([MAX_ACCELERATION, MAX_STEERING], dtype=np.float32)
-"""Acceleration [m/s^2] and steering angle [rad] of an action of 1."""
 
 
 class CompilerFails(NotCompiled):
     """numba does not work here."""
-
-
-def check_core(core: str) -> None:
-    """Raise a ValueError if there is no such core."""
-    if core not in CORES:
-        raise ValueError(f"Expected core to be one of {', '.join(map(repr, CORES))}, got {core!r}.")
 
 
 def leave_to_torch(reason: NotCompiled, core: str, stacklevel: int) -> None:
@@ -74,11 +67,7 @@ def is_compiled(world: World, driver: Driver) -> bool:
 
 
 def simulate(world: World, driver: Driver, x: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return f of scenarios x (B, d) within the physical box, NaN where a policy's outputs are not finite.
-
-    Raises:
-        NotCompiled: The world or the ego is not compiled, or numba does not work here (`CompilerFails`).
-    """
+    """Return f of scenarios x (B, d), NaN where a policy's outputs are not finite; NotCompiled for others."""
     script, ego, compiled = find_script(world), read_ego(world, driver), import_compiler()
     with torch.inference_mode():
         state = world.scenario.initial(torch.from_numpy(x).float())
@@ -142,8 +131,8 @@ def _refuse(obstacles: dict[str, bool]) -> None:
 class ScriptedStep:
     """Compiled steps of a world: an episode and actions to the episode a tick later, its reward and its features."""
 
-    def __init__(self, world: World, required: bool = False) -> None:
-        """Take the numbers of a world, or raise NotCompiled; states in double precision are refused if `required`."""
+    def __init__(self, world: World) -> None:
+        """Take the numbers of a world, or raise NotCompiled."""
         script, sensing = find_script(world, statistics=True), world.sensing
         _refuse(
             {
@@ -152,50 +141,27 @@ class ScriptedStep:
             }
         )
         self._numbers = import_compiler().numbers_of(script, world.scenario.road, world.clock.dt)
-        self._required = required
 
-    def advance(self, episode: Episode, action: NDArray[Any]) -> StepResult | None:
-        """Carry out a decision of the ego, in [-1, 1], (B, 2), or numbers of discrete actions, (B,).
+    def advance(self, episode: Episode, physical: Tensor) -> StepResult | None:
+        """Carry out accelerations [m/s^2] and steering angles [rad] of the egos (B, 2) for a tick.
 
-        None for an action that has to be refused, for episodes in which vehicles were commanded, and for states in
-        double precision, unless compiled steps are required: then a ValueError.
+        None for episodes in which vehicles were commanded, and for states in double precision.
         """
-        physical = scale_actions(action, len(episode.collided))
-        if physical is None or episode.overridden is not None or episode.statistics is None:
-            return None
-        if episode.state.x.dtype != torch.float32 or episode.measure_state.dtype != torch.float32:
-            if self._required:
-                raise ValueError(
-                    "core='numba' steps states in single precision, got one in "
-                    f"{episode.state.x.numpy().dtype}; make the environment with core='torch'."
-                )
+        single = episode.state.x.dtype == episode.measure_state.dtype == torch.float32
+        if not single or episode.overridden is not None or episode.statistics is None:
             return None
         # the module is not kept: a step is copied and sent
-        result: StepResult = import_compiler().advance(episode, physical, self._numbers)
+        result: StepResult = import_compiler().advance(episode, physical.numpy(), self._numbers)
         return result
 
 
 def find_scripted_step(world: World, core: str = "auto") -> ScriptedStep | None:
     """Return the compiled steps of a world; None where torch has to carry them out, a ValueError with "numba"."""
-    check_core(core)
+    check_name("core", core, CORES)
     if core == "torch":
         return None
     try:
-        return ScriptedStep(world, required=core == "numba")
+        return ScriptedStep(world)
     except NotCompiled as reason:
         leave_to_torch(reason, core, stacklevel=3)
     return None
-
-
-def scale_actions(action: NDArray[Any], batch: int) -> NDArray[np.float32] | None:
-    """Return accelerations [m/s^2] and steering angles [rad], (B, 2); None for what `to_physical` refuses."""
-    if action.shape == (batch,) and action.dtype.kind in "iu":
-        if action.min() < 0 or action.max() >= len(DISCRETE_ACTIONS):
-            return None
-        action = DISCRETE_ACTIONS[action]
-    if action.shape != (batch, 2) or action.dtype.kind not in "fiu":
-        return None
-    action = action.astype(np.float32)
-    if not np.isfinite(action).all():
-        return None
-    return np.asarray(action.clip(-1.0, 1.0) * ACTION_SCALES, dtype=np.float32)

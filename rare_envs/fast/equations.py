@@ -10,6 +10,7 @@ import os
 import shutil
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar, cast
 
@@ -50,14 +51,10 @@ def compiled(function: Function, **options: Any) -> Function:
         _CONFIG.CACHE_DIR = before
 
 
-def inlined(function: Function) -> Function:
-    """Compile as `compiled` does, into its callers: `Rows` are many numbers to hand over."""
-    return compiled(function, inline="always")
-
-
-def compiled_fused(function: Function) -> Function:
-    """Compile as `compiled` does; products that are added are not rounded before, where the processor can do so."""
-    return compiled(function, fastmath={"contract"})
+inlined = partial(compiled, inline="always")
+"""Compiles a function into its callers: `Rows` are many numbers to hand over."""
+compiled_fused = partial(compiled, fastmath={"contract"})
+"""Compiles a function so that products that are added are not rounded before, where the processor can do so."""
 
 
 def single(*values: float) -> tuple[float, ...]:

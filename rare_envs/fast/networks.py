@@ -11,7 +11,19 @@ from numpy.typing import NDArray
 
 from rare_envs.control.actions import DISCRETE_ACTIONS, MAX_ACCELERATION, MAX_STEERING
 from rare_envs.egos.dense_policies import DensePolicy
-from rare_envs.fast.equations import BODY_LENGTH, ONE, ZERO, clip, compiled, compiled_fused, cosine, sine, single
+from rare_envs.fast.equations import (
+    BODY_LENGTH,
+    ONE,
+    ZERO,
+    at_least,
+    at_most,
+    clip,
+    compiled,
+    compiled_fused,
+    cosine,
+    sine,
+    single,
+)
 from rare_envs.fast.rows import UNKNOWN, Rows, SingleArray
 from rare_envs.simulation.observation import CLIP, EGO_SCALES, OTHER_SCALES
 
@@ -35,8 +47,6 @@ _P1, _P3, _P5, _P7, _P9, _P11, _P13 = single(
     -2.76076847742355e-16,
 )
 _Q0, _Q2, _Q4, _Q6 = single(4.89352518554385e-03, 2.26843463243900e-03, 1.18534705686654e-04, 1.19825839466702e-06)
-_ANYTHING = np.full((2, 2), [[-np.inf], [np.inf]])
-"""Bounds of two outputs."""
 _single: Any = np.float32  # to the type checker no float
 
 
@@ -52,46 +62,39 @@ class PolicyNumbers(NamedTuple):
     bounded: bool
     """Whether the activation is the hyperbolic tangent; else the larger of 0 and the value."""
     chooses: bool
-    low: SingleArray
-    """Bounds to which the outputs are clipped, shape (2,)."""
-    high: SingleArray
+    clip: SingleArray
+    """Bounds to which the outputs are clipped, shape (2, 2), the lower ones first."""
     rescales: bool
-    rescale_low: NDArray[np.float64]
-    """Bounds that are mapped to [-1, 1], shape (2,)."""
-    rescale_high: NDArray[np.float64]
-    normalises: bool
+    rescale: NDArray[np.float64]
+    """Bounds that are mapped to [-1, 1], likewise."""
     mean: NDArray[np.float64]
-    """Of the observations, shape (F,)."""
+    """Of the observations, shape (F,), likewise the next."""
     deviation: NDArray[np.float64]
-    """Shape (F,)."""
     furthest: float
     """Normalised observations are clipped to plus or minus this."""
 
     @classmethod
     def of(cls, policy: DensePolicy) -> "PolicyNumbers":
         """Return the numbers of a policy."""
-        weights, biases, widths = [], [], [pad(policy.layers[0][0].shape[1])]
+        features = policy.layers[0][0].shape[1]
+        weights, biases, widths = [], [], [pad(features)]
         for weight, bias in policy.layers:
             padded = np.zeros((pad(len(bias)), widths[-1]), dtype=np.float32)
             padded[: weight.shape[0], : weight.shape[1]] = weight
             weights.append(padded.ravel())
             biases.append(np.pad(bias.astype(np.float32), (0, len(padded) - len(bias))))
             widths.append(len(padded))
-        low, high = (np.asarray(bound, dtype=np.float32) for bound in policy.clip or _ANYTHING)
-        rescale_low, rescale_high = (np.asarray(bound, dtype=np.float64) for bound in policy.rescale or _ANYTHING)
-        mean, deviation, furthest = policy.normalisation or (np.zeros(1), np.ones(1), np.inf)
+        anything = [[-np.inf] * 2, [np.inf] * 2]
+        mean, deviation, furthest = policy.normalisation or (np.zeros(features), np.ones(features), np.inf)
         return cls(
             weights=np.concatenate(weights),
             biases=np.concatenate(biases),
             widths=np.array(widths),
             bounded=policy.activation == "tanh",
             chooses=policy.chooses,
-            low=low,
-            high=high,
+            clip=np.array(policy.clip or anything, dtype=np.float32),
             rescales=policy.rescale is not None,
-            rescale_low=rescale_low,
-            rescale_high=rescale_high,
-            normalises=policy.normalisation is not None,
+            rescale=np.array(policy.rescale or anything, dtype=np.float64),
             mean=np.asarray(mean, dtype=np.float64),
             deviation=np.asarray(deviation, dtype=np.float64),
             furthest=float(furthest),
@@ -105,14 +108,10 @@ def pad(width: int) -> int:
 
 @compiled
 def decide_by_policy(rows: Rows, policy: PolicyNumbers, values: SingleArray, spare: SingleArray) -> None:
-    """Decide for at most `LANES` egos; f of a row on which an output is not finite is `UNKNOWN`.
-
-    `values` and `spare`, (widest layer, `LANES`), are written over.
-    """
+    """Decide for at most `LANES` egos, f of failing ones is `UNKNOWN`; writes over two (widest layer, `LANES`)."""
     values[4 * len(rows.x) - 1 : policy.widths[0]] = ZERO
     observe(rows, values)
-    if policy.normalises:
-        normalise(policy, values, rows.size)
+    normalise(policy, values, rows.size)
     apply_layers(policy, values, spare)
     outputs = values if len(policy.widths) % 2 else spare
     for row in range(rows.size):
@@ -149,7 +148,7 @@ def normalise(policy: PolicyNumbers, values: SingleArray, size: int) -> None:
     for feature in range(len(policy.mean)):
         for row in range(size):
             normal = (np.float64(values[feature, row]) - policy.mean[feature]) / policy.deviation[feature]
-            values[feature, row] = np.float32(min(max(normal, -policy.furthest), policy.furthest))
+            values[feature, row] = np.float32(at_most(at_least(normal, -policy.furthest), policy.furthest))
 
 
 @compiled
@@ -229,8 +228,8 @@ def decode(outputs: SingleArray, policy: PolicyNumbers) -> tuple[float, float]:
 @compiled
 def decode_one(outputs: SingleArray, policy: PolicyNumbers, number: int) -> float:
     """Return an output in [-1, 1]: clipped, and rescaled as `rare_envs.egos.wrappers.WrappedPolicy` does."""
-    value = clip(outputs[number], policy.low[number], policy.high[number])
+    value = clip(outputs[number], policy.clip[0, number], policy.clip[1, number])
     if policy.rescales:
-        low, high = policy.rescale_low[number], policy.rescale_high[number]
+        low, high = policy.rescale[0, number], policy.rescale[1, number]
         value = _single((2.0 * np.float64(value) - low - high) / (high - low))
     return clip(value, -ONE, ONE)

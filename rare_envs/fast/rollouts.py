@@ -34,8 +34,8 @@ from rare_envs.fast.rows import (
     ScriptNumbers,
     SingleArray,
     begin,
-    begin_step,
     decide_by_idm,
+    look,
     rows_of,
     tick,
 )
@@ -68,7 +68,7 @@ def numbers_of(script: str, road: Road, dt: float) -> ScriptNumbers:
 
 def drive(script: str, state: State, ego: IDM | DensePolicy, road: Road, dt: float, ticks: int) -> NDArray[np.float64]:
     """Return f (B,) of scenarios from their state at time 0, NaN where a policy's outputs are not finite."""
-    start, vehicles, f = stack_state(state), state.x.shape[1], np.empty(len(state.x), dtype=np.float32)
+    start, vehicles, f = stack_state(state), state.x.shape[1], np.full(len(state.x), np.inf, dtype=np.float32)
     table = make_table(start, vehicles, min(ROWS, max(len(f), 1)) if isinstance(ego, IDM) else LANES)
     numbers = numbers_of(script, road, dt)
     if isinstance(ego, IDM):
@@ -103,10 +103,11 @@ def drive_by_idm(
     ticks: int,
     f: SingleArray,
 ) -> None:
-    """Write f (B,) of each row of `stack_state`, block by block in a table of `make_table`."""
+    """Write f (B,), infinite before, of each row of `stack_state`, block by block in a table of `make_table`."""
     for first in range(0, len(f), table.shape[1]):
         rows = rows_of(table, vehicles, load(start, table, first))
-        turns = begin(rows, script.road)
+        begin(rows, f[first:])
+        turns = look(rows, True, script.road)
         for _ in range(ticks):
             decide_by_idm(rows, turns, idm)
             turns = tick(rows, turns, script)
@@ -129,7 +130,8 @@ def drive_by_policy(
     """Write f (B,) of each row, as `drive_by_idm`; `values` and `spare` as of `decide_by_policy`."""
     for first in range(0, len(f), table.shape[1]):
         rows = rows_of(table, vehicles, load(start, table, first))
-        begin(rows, script.road)
+        begin(rows, f[first:])
+        look(rows, True, script.road)
         for _ in range(ticks):
             decide_by_policy(rows, policy, values, spare)
             tick(rows, True, script)
@@ -188,12 +190,9 @@ def advance(episode: Episode, action: SingleArray, script: ScriptNumbers) -> Ste
 
 @compiled
 def step(table: SingleArray, vehicles: int, action: SingleArray, script: ScriptNumbers, stepped: Stepped) -> bool:
-    """Move all vehicles of a table of `make_table` by a tick: `rare_envs.simulation.decision.advance`.
-
-    Return whether an ego has collided in this tick, or two other vehicles touch.
-    """
+    """Move all vehicles of a table by a tick; return whether an ego has collided in it, or two other vehicles touch."""
     rows, f = rows_of(table, vehicles, len(action)), stepped.f
-    begin_step(rows, f)
+    begin(rows, f)
     for row in range(len(f)):
         rows.acceleration[row], rows.steering[row] = action[row, 0], action[row, 1]
     tick(rows, True, script)

@@ -164,24 +164,10 @@ def bezier(progress: float, length: float, offset: float) -> tuple[float, float]
 
 
 @compiled
-def begin(rows: Rows, road: RoadNumbers) -> bool:
-    """Take the moment at time 0; return whether any ego is off its line, as `look` does."""
-    find_cosines(rows)
-    rows.f[:] = _NOWHERE
-    return look(rows, True, road)
-
-
-@compiled
-def begin_step(rows: Rows, f: SingleArray) -> None:
+def begin(rows: Rows, f: SingleArray) -> None:
     """Go on from a moment with the measure (B,) that it has had so far."""
-    find_cosines(rows)
     for row in range(rows.size):
         rows.f[row] = f[row]
-
-
-@compiled
-def find_cosines(rows: Rows) -> None:
-    """Find the cosines of the headings."""
     for vehicle in range(len(rows.x)):
         for row in range(rows.size):
             rows.cosine[vehicle, row] = cosine(rows.heading[vehicle, row])
@@ -189,10 +175,7 @@ def find_cosines(rows: Rows) -> None:
 
 @inlined
 def tick(rows: Rows, turns: bool, script: ScriptNumbers) -> bool:
-    """Move all by a tick, and take the moment after it; return whether any ego is off its line.
-
-    Egos move by their `acceleration`, and by their `steering` if any `turns`: steers or is off its line.
-    """
+    """Move all by a tick, egos steered if any `turns`, and look; return whether any is off its line."""
     move_others(rows, script)
     move_egos(rows, turns, script.dt)
     mark_hits(rows, turns, script.road)

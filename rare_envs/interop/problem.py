@@ -15,7 +15,7 @@ from rare_envs.distributions.space import Distribution, ScenarioSpace
 from rare_envs.egos.wrappers import wrap_policy
 from rare_envs.interop.layouts import IDM_PARAMETERS, restore_class_parameters, set_idm
 from rare_envs.interop.scenario import HighwayEnvScenario, install_fast_observation
-from rare_envs.plugins import did_you_mean, is_policy, one_line, refuse_ego
+from rare_envs.plugins import check_name, did_you_mean, is_policy, one_line, refuse_ego
 from rare_envs.startup import use_one_thread
 
 MAX_SECONDS = 100.0
@@ -31,10 +31,8 @@ def make_highway_env(env_id: str, config: Mapping[str, Any] | None) -> gym.Env[A
         # an older version is asked for on purpose: results belong to a version
         warnings.filterwarnings("ignore", message=".*is out of date", category=DeprecationWarning)
         env = gym.make(env_id, config=None if config is None else dict(config))
-    words = list(env.unwrapped.default_config())  # type: ignore[attr-defined]
     for word in config or ():
-        if word not in words:
-            raise ValueError(f"{env_id} has no {word!r} to configure{did_you_mean(word, words)}; {', '.join(words)}.")
+        check_name(f"key of the config of {env_id}", word, env.unwrapped.default_config())  # type: ignore[attr-defined]
     return env
 
 

@@ -29,7 +29,7 @@ from rare_envs.interop.layouts import (
 )
 from rare_envs.measures.base import COLLISION
 from rare_envs.measures.longitudinal import TTC_MAX
-from rare_envs.plugins import did_you_mean
+from rare_envs.plugins import check_name
 from rare_envs.scenarios.registry import HIGHWAY_ENV_IDS
 
 TTC_MIN = 0.01
@@ -47,10 +47,7 @@ def ttc_to_any(env: Any) -> float:
 
 
 def ttc_to_front(env: Any) -> float:
-    """Return the time to collision with the vehicle that HighwayEnv finds in front of the ego in its lane [s].
-
-    Bumper gap along the lane / closing speed along the ego's heading.
-    """
+    """Return gap over closing speed along the lane, to the vehicle that HighwayEnv finds in front of the ego [s]."""
     ego = env.vehicle
     front, _ = env.road.neighbour_vehicles(ego, ego.lane_index)
     if front is None:
@@ -93,10 +90,7 @@ HIGHWAY_ENV_MEASURES: dict[str, Callable[[Any], float]] = {"ttc": ttc_to_any, "f
 
 
 def install_fast_observation(env: Any, blind: bool = False) -> None:
-    """Replace the `Kinematics` observation of a HighwayEnv environment, from its next reset on; other kinds stay.
-
-    A blind ego, which uses no observation, observes zeros.
-    """
+    """Replace the `Kinematics` observation of a HighwayEnv environment from its next reset on, by zeros if `blind`."""
     define_spaces = env.define_spaces
 
     def define_spaces_fast() -> None:
@@ -196,7 +190,9 @@ class HighwayEnvScenario(gym.Wrapper[Any, Any, Any, Any]):
         """
         super().__init__(env)
         self.layout = _find_layout(env)
-        self._measure = measure if callable(measure) else _find_measure(measure)
+        if not callable(measure):
+            check_name("measure", measure, HIGHWAY_ENV_MEASURES)
+        self._measure = measure if callable(measure) else HIGHWAY_ENV_MEASURES[measure]
         if noise is not True and noise != "fixed":
             raise ValueError(f"Expected noise True or 'fixed', got {noise!r}.")
         self._rng = np.random.default_rng()
@@ -302,19 +298,12 @@ def _find_layout(env: gym.Env[Any, Any]) -> Layout:
         raise ValueError(f"Expected an environment of HighwayEnv ({', '.join(HIGHWAY_ENV_IDS)}), got {env}.")
     if plain is not inner:
         raise ValueError(f"Expected the environment as gym.make gives it, got {plain}; put wrappers around this one.")
+    layout = next((layout for kind, layout in LAYOUTS.items() if isinstance(inner, kind)), None)
     generic = isinstance(inner, MergeGenericEnv | RoundaboutGenericEnv)
-    layouts = [layout for kind, layout in LAYOUTS.items() if isinstance(inner, kind) and not generic]
-    if not layouts or len(inner.controlled_vehicles) != 1:
+    if layout is None or generic or len(inner.controlled_vehicles) != 1:
         known = ", ".join(HIGHWAY_ENV_IDS)
         raise ValueError(f"No parameters are known for {type(inner).__name__}; expected {known}, with one ego.")
-    return layouts[0]
-
-
-def _find_measure(name: str) -> Callable[[Any], float]:
-    if name in HIGHWAY_ENV_MEASURES:
-        return HIGHWAY_ENV_MEASURES[name]
-    hint = did_you_mean(str(name), HIGHWAY_ENV_MEASURES)
-    raise ValueError(f"Unknown measure {name!r}{hint}; expected {', '.join(HIGHWAY_ENV_MEASURES)} or a function.")
+    return layout
 
 
 def _hold_parameters(groups: list[Group], fixed: Mapping[str, Any] | str | None) -> dict[str, Any]:
@@ -326,9 +315,7 @@ def _hold_parameters(groups: list[Group], fixed: Mapping[str, Any] | str | None)
         raise ValueError(f"Expected fixed as a mapping of names to values or 'highway_env', got {fixed!r}.")
     alone = {group.parameters[0].name: group for group in groups if len(group.parameters) == 1}
     for name in fixed:
-        if name not in alone:
-            hint = did_you_mean(str(name), alone)
-            raise ValueError(f"Cannot hold {name!r}{hint}; what can be held is {', '.join(alone)}.")
+        check_name("parameter to hold", name, alone)
     if not fixed:
         return {}
     held = _make_space([alone[name] for name in fixed], False, None)

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple, Protocol, runtime_checkable
 import torch
 from torch import Tensor
 
-from rare_envs.plugins import did_you_mean
+from rare_envs.plugins import check_name
 from rare_envs.traffic.bodies import LaneTraffic
 from rare_envs.traffic.road import Road
 from rare_envs.traffic.state import State
@@ -129,10 +129,7 @@ def query_background(
     perception: Tensor | None,
     dt: float,
 ) -> tuple[Tensor, BackgroundState]:
-    """Query the drivers of vehicles 1 to N - 1 for one tick, by lidar features (B, N, 51) or by where everybody is.
-
-    Return accelerations [m/s^2] and yaw rates [rad/s], (B, N - 1, 2), and the drivers' state one tick later.
-    """
+    """Query the drivers of vehicles 1 to N - 1 for a tick: actions as of `Background.act`, and the state after it."""
     others, memory = slice(1, None), background.memory
     if isinstance(drivers, TrafficBackground):
         action, later = drivers.decide(LaneTraffic.of(state, road), others, memory, dt)
@@ -166,9 +163,6 @@ def find_drivers(drivers: Any) -> Background | TrafficBackground | None:
     offered = "file" if name.endswith(".safetensors") else name.partition("?")[0].partition("+")[0]
     if offered not in known:
         names = sorted({*known, *(f"{name}+mobil" for name in known if name == "idm")} - {"file"})
-        listed = ", ".join(map(repr, names)) or "none is installed: pip install rare-envs"
-        raise ValueError(
-            f"Unknown drivers {name!r}{did_you_mean(name, names)}; expected one of {listed}, or a .safetensors file."
-        )
+        check_name("drivers (or a .safetensors file)", name, names)
     background: Background | TrafficBackground = known[offered].load()(name)
     return background

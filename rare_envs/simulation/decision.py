@@ -127,11 +127,7 @@ class StepResult(NamedTuple):
 def advance(
     world: World, episode: Episode, action: Tensor, watch: Callable[[Episode], None] | None = None
 ) -> StepResult:
-    """Carry out a decision of the ego, as of `World.decode_meta_actions`; `watch` gets the episodes after each tick.
-
-    A continuous action lasts one tick. A meta-action lasts a second: it is given to the controllers once, which then
-    act at every tick, and the measure is updated at every tick too.
-    """
+    """Carry out a decision of the ego, as of `World.decode_meta_actions`; `watch` gets the episodes after each tick."""
 
     def tick(old: Episode, chosen: Tensor, first: bool) -> tuple[Episode, tuple[tuple[RewardTerms, Tensor]]]:
         ready, physical = world.decode_meta_actions(old, chosen)

@@ -44,10 +44,7 @@ class EpisodeStatistics(NamedTuple):
         return cls(ttc(moment) if least_ttc is None else least_ttc, nothing, nothing)
 
     def update(self, moment: Moment, before: Tensor, now: Tensor, least_ttc: Tensor | None = None) -> EpisodeStatistics:
-        """Return the statistics a moment later: had it ended `before`, has it `now`, boolean (B,).
-
-        `least_ttc` is the least time to collision [s] (B,) where that is known already.
-        """
+        """Return the statistics a moment later: had it ended `before`, has it `now` (B,); `least_ttc` if known."""
         least = torch.minimum(self.least_ttc, ttc(moment)) if least_ttc is None else least_ttc
         touch = overlaps(moment.state, moment.road, "others").any(dim=1) & (self.others.kind == NONE) & ~before
         own = _record_crashes(self.own, now & ~before, crash_of, moment)

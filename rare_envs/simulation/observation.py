@@ -40,10 +40,7 @@ ELSEWHERE = (
 
 
 def read_kinds(observation: Any) -> str:
-    """Return the kinds of an observation in the alphabetical order of their names, joined by "+"; else a ValueError.
-
-    It is one of `OBSERVATIONS`, several joined by "+", or a list or tuple of them.
-    """
+    """Return `OBSERVATIONS`, one, several joined by "+" or a list, sorted and joined by "+"; else a ValueError."""
     names = observation.split("+") if isinstance(observation, str) else observation
     if not isinstance(names, list | tuple) or not names or not all(name in OBSERVATIONS for name in names):
         raise ValueError(

@@ -61,10 +61,7 @@ class Sensing:
         return self.lidar or "lidar" in self.kinds
 
     def start_camera(self, weather: Tensor, key: Tensor) -> CameraContext | None:
-        """Return what pictures depend on beside the traffic, at time 0; None without a camera.
-
-        The weather are columns of x, (B, 0) on a clear day; from the key, (B, 1) or (B, 0), follows the camera's noise.
-        """
+        """Return what pictures depend on beside the traffic, from weather (B, W) and key (B, 1), or None."""
         if "camera" not in self.kinds:
             return None
         return CameraContext.at_start(self.camera, read_weather(weather, key) if self.weather else clear_day(weather))
@@ -397,10 +394,7 @@ _RULE = IDM()
 def apply_overrides(
     episode: Episode, action: Tensor, commanded: Tensor | None, others: Others, driven: Tensor | None, dt: float
 ) -> tuple[Others, Tensor]:
-    """Return the others after a tick in which some take an agent's actions, and who was commanded by now, (B, N).
-
-    `others` are those that follow script or drivers, whose actions are `driven`.
-    """
+    """Return the others (`driven`, or by script) after a tick in which some take agents' actions, and who did."""
     state, road = episode.state, episode.road
     if commanded is None:
         commanded = torch.zeros_like(state.x, dtype=torch.bool)

@@ -222,11 +222,11 @@ def test_new_scenarios_follow_those_that_ended():
 
 
 def test_bad_arguments():
-    with pytest.raises(ValueError, match="no vehicle 'leed'"):
+    with pytest.raises(ValueError, match="vehicle 'leed'"):
         training.sb3_agents_env(CUT_IN, 4, agents=["leed"])
     with pytest.raises(ValueError, match="one or more scenarios"):
         training.sb3_agents_env(CUT_IN, 0)
-    with pytest.raises(ValueError, match="Reward for 'ego'"):
+    with pytest.raises(ValueError, match="agent of a reward 'ego'"):
         training.sb3_agents_env(CUT_IN, 4, agents=["lead"], rewards={"ego": adversary_reward})
 
     class Recurrent:

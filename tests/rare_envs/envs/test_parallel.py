@@ -135,12 +135,15 @@ def test_a_vehicle_off_the_road_is_its_own_collision():
 @pytest.mark.parametrize(
     ("kwargs", "message"),
     [
-        ({"agents": ["cuter"]}, r"no vehicle 'cuter' \(did you mean 'cutter'\?\); the vehicles are ego, cutter, lead"),
+        (
+            {"agents": ["cuter"]},
+            r"'cuter' \(did you mean 'cutter'\?\); expected one of 'ego', 'cutter', 'lead'",
+        ),
         ({"agents": "ego"}, "agents as a list of names"),
         ({"agents": []}, "one or more different agents"),
         ({"agents": ["ego", "ego"]}, "one or more different agents"),
-        ({"rewards": {"leed": own_reward}}, r"Reward for 'leed' \(did you mean 'lead'"),
-        ({"rewards": {"lead": 3}}, "reward of 'lead' as a function"),
+        ({"rewards": {"leed": own_reward}}, r"agent of a reward 'leed' \(did you mean 'lead'"),
+        ({"rewards": {"lead": 3}}, "rewards as a mapping of agents to functions"),
         ({"render_mode": "ansi"}, "render_mode"),
         ({"observation": "feature"}, "Unknown observation"),
         ({"ego": "idn"}, "Unknown ego"),
@@ -162,8 +165,8 @@ def test_bad_actions_and_options():
         env.reset(options={"cut_in_gab": 9.0})
     env.reset(seed=0)
     for actions, message in (
-        ({"eggo": np.zeros(2)}, r"no agent 'eggo' \(did you mean 'ego'\?\); the agents are ego, cutter"),
-        ({"lead": np.zeros(2)}, "no agent 'lead'"),
+        ({"eggo": np.zeros(2)}, r"agent 'eggo' \(did you mean 'ego'\?\); expected one of 'ego', 'cutter'"),
+        ({"lead": np.zeros(2)}, "Unknown agent 'lead'"),
         ({"cutter": np.zeros(3)}, r"shape \(2,\) for 'cutter', got \(3,\)"),
         ({"ego": np.array([np.nan, 0.0])}, "NaN"),
         ([np.zeros(2)], "actions as a mapping of agents to actions, got list"),

@@ -15,7 +15,6 @@ from rare_envs.envs.rendering import (
     FRAME_WIDTH,
     ROLE_COLOURS,
     TEXT_HEIGHT,
-    Display,
     Renderer,
     as_rgb,
     caption,
@@ -114,7 +113,7 @@ def test_nothing_to_render_is_a_warning(mode, monkeypatch):
     world, warned = set_up("rare_envs/CarFollowing-v0")[0], []
     episode = world.start(torch.tensor([[20.0, 20.0, 30.0]]))
     monkeypatch.setattr(gym.logger, "warn", warned.append)
-    assert Display(world, mode).draw(episode if mode is None else None, 0.0) is None
+    assert Renderer(world, mode).render(episode if mode is None else None, 0.0) is None
     assert len(warned) == 1 and "Nothing to render" in warned[0]
 
 

@@ -74,7 +74,7 @@ def test_wrong_environments_and_settings_are_refused() -> None:
     for kwargs, message in (
         ({"vehicles": 7}, "vehicles from 1 to 6"),
         ({"measure": "tcc"}, "did you mean 'ttc'"),
-        ({"fixed": {"gap": [5.0] * 4}}, "Cannot hold 'gap'"),
+        ({"fixed": {"gap": [5.0] * 4}}, "Unknown parameter to hold 'gap'"),
         ({"fixed": {"ego_sped": 5.0}}, "did you mean 'ego_speed'"),
         ({"fixed": {"ego_speed": 99.0}}, r"ego_speed = 99 .* \[0, 40\]"),
         ({"noise": False}, "noise True or 'fixed'"),
