@@ -12,7 +12,8 @@ from samplers.analysis.weighted import Share
 from samplers.comparison import Comparison, compare
 from samplers.distributions import as_distribution
 from samplers.estimation import EstimationInterrupted, estimate
-from samplers.executors import Executor, FuturesPool, InProcess, LocalProcesses, RayCluster
+from samplers.evaluate import Executor
+from samplers.executors import FuturesPool, InProcess, LocalProcesses, RayCluster
 from samplers.method import Goal, Interrupted, Outcome, Stepping, Steps
 from samplers.methods import METHODS, Auto, get_method
 from samplers.methods.base import Method

@@ -2,20 +2,25 @@
 
     request -> chunks -> journal, or work (here or by a worker) -> journal -> answer
 
-What comes back is checked. Where the problem raises or gives NaN, the rows that fail are found (`samplers.workers`),
-and each simulation is counted.
+What comes back is checked. Where the problem raises or gives NaN, the rows that fail are found, and each simulation is
+counted. `samplers.executors` has the workers.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from contextlib import ExitStack
-from typing import Any, NamedTuple
+import math
+import random
+import sys
+import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import AbstractContextManager, ExitStack, contextmanager
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from samplers.executors import Executor, Here, Pool
 from samplers.journal import Journal, JournalError, digest_points
 from samplers.method import Answer, Request, TermsOffer, whole_simulations
 from samplers.problem import (
@@ -27,9 +32,10 @@ from samplers.problem import (
     check_number,
     check_whole,
     condition_of,
+    describe_point,
     names_of_columns,
+    one_per_row,
 )
-from samplers.workers import Result, Work, join_results, widen_table
 
 CHUNK_SIZE = 16
 """Rows of a chunk of workers where the problem has no `chunk_size`."""
@@ -37,6 +43,261 @@ N_CHECKED = 8
 """Points at which a continued journal calls f again, from the least f of its first chunk to the largest."""
 F_TOLERANCE = 1e-3
 """Largest difference of f there, as a share of the largest |f|: products of networks round differently by batch."""
+
+
+NAN_REASON = "f is NaN"
+
+Index = tuple[int, ...]
+"""Number of a chunk in its run; of a row computed by itself, also its number in the chunk. It keys random draws."""
+
+
+class Result(NamedTuple):
+    """What a chunk gives."""
+
+    table: FloatArray
+    """A row for each row of the chunk, (n, k): f; f, values and ticks of terms; or a gradient. NaN where there is none;
+    k = 1 where no row has any."""
+    notes: dict[str, Any]
+    """What else is known, JSON-ready: `reasons` of rows without f, in their order (in an attempt: by row), `n_retried`,
+    `lost`, `seconds`, `cost` of gradients, `threshold` and `names` of terms."""
+
+
+def widen_table(table: FloatArray, width: int) -> FloatArray:
+    """Return a table (n, k) with `width` columns; what it does not know is NaN."""
+    if table.shape[1] == width:
+        return table
+    return np.pad(table, ((0, 0), (0, width - table.shape[1])), constant_values=np.nan)
+
+
+def join_results(parts: Sequence[Result]) -> Result:
+    """Return the results of parts as one: numbers in notes are added, lists joined, the rest is that of the first."""
+    notes: dict[str, Any] = {}
+    for name, value in (item for part in parts for item in part.notes.items()):
+        adds = name in notes and name not in ("names", "threshold") and isinstance(value, int | float | list)
+        notes[name] = notes[name] + value if adds else notes.get(name, value)
+    width = max(part.table.shape[1] for part in parts)
+    return Result(np.concatenate([widen_table(part.table, width) for part in parts]), notes)
+
+
+# Rows that fail
+
+
+def isolate(attempt: Callable[[Request], Result], chunk: Request, fail: Callable[..., None]) -> Result:
+    """Return what the rows of a chunk give, those that fail left out; notes have their `reasons` as a dict by row.
+
+    Where an attempt raises, its parts are attempted (`split_rows`), until the rows that raise stand alone. A row that
+    has given nothing is attempted once more; if that gives nothing either, `fail(row, reason, error)` is told, which
+    may raise.
+    """
+    n_retried, lost, found = 0, dict[int, str](), list[tuple[NDArray[np.int64], Result]]()
+
+    def settle(rows: NDArray[np.int64], again: bool) -> None:
+        nonlocal n_retried
+        n_retried += len(rows) if again else 0
+        try:
+            found.append((rows, attempt(chunk if len(rows) == len(chunk) else chunk.take(rows))))
+            return
+        except (Exception, SystemExit) as error:  # the simulation is the user's: anything may happen in it
+            met: BaseException = error
+        if getattr(met, "final", False):  # calling f again cannot help
+            raise met
+        if again and len(rows) == 1:
+            lost[int(rows[0])] = reason_of(met)
+            fail(int(rows[0]), lost[int(rows[0])], met)
+            found.append((rows, Result(np.full((1, 1), np.nan), {})))
+        else:
+            for part in split_rows(rows, met, len(chunk)):
+                settle(part, True)
+
+    settle(np.arange(len(chunk)), False)
+    unsure = {int(rows[at]): why for rows, each in found for at, why in each.notes.get("reasons", {}).items()}
+    if unsure:
+        settle(np.array(sorted(unsure)), True)
+    whole = join_results([each for _, each in found])
+    table = np.empty((len(chunk), whole.table.shape[1]))
+    table[np.concatenate([rows for rows, _ in found])] = whole.table  # what came last stands
+    again_failed = {row: why for row, why in unsure.items() if np.isnan(table[row, 0])}
+    for row in sorted(set(again_failed) - set(lost)):
+        fail(row, again_failed[row])
+    return Result(table, {**whole.notes, "reasons": {**again_failed, **lost}, "n_retried": n_retried})
+
+
+def split_rows(rows: NDArray[np.int64], error: BaseException, whole: int) -> list[NDArray[np.int64]]:
+    """Return the parts in which rows are attempted after an error.
+
+    Halves take the fewest attempts. Where the error means that an answer was waited for (its attribute `waits`),
+    attempts are cheaper than errors: then parts of about the root of the whole chunk, and after that each row alone.
+    """
+    if not getattr(error, "waits", False):
+        return np.array_split(rows, min(2, len(rows)))
+    root = math.isqrt(whole)
+    size = root if 1 < root < len(rows) else 1
+    return np.split(rows, range(size, len(rows), size))
+
+
+def reason_of(error: BaseException) -> str:
+    """Return what went wrong, in one line."""
+    words = " ".join(str(error).split())
+    if isinstance(error, ValueError) and words:  # most say what is wrong by themselves
+        return words
+    return f"{type(error).__name__}: {words}" if words and not isinstance(error, SystemExit) else repr(error)
+
+
+# What a chunk is computed by
+
+
+@dataclass(frozen=True)
+class Work:
+    """Computes a chunk, here or in a worker, by `evaluate`, `terms` or `gradient` of a problem.
+
+    A problem that goes on by itself with the rows on which it does not fail has `attempt(x)` and `attempt_terms(x,
+    gamma)`, which also give the reasons by row. A row that fails ends the run where on_error is "raise"; else its f and
+    terms are NaN. `name` is that of f in messages. With a seed, what simulations draw follows from it and the index of
+    their chunk (`seed_generators`).
+    """
+
+    problem: Any
+    gamma: float
+    on_error: OnError
+    name: str = "f"
+    seed: int | None = None
+
+    def __call__(self, chunk: Request, index: Index = ()) -> Result:
+        """Compute a chunk; raise an EvaluationError for a row that fails ("raise") and for results of a wrong form."""
+        if self.seed is None:
+            return self._compute(chunk)
+        torch_is_new = "torch" not in sys.modules
+        with seed_generators(self.seed, index):
+            result = self._compute(chunk)
+        if torch_is_new and "torch" in sys.modules:  # its generator was not seeded
+            with seed_generators(self.seed, index):
+                return self._compute(chunk)
+        return result
+
+    def _compute(self, chunk: Request) -> Result:
+        start = time.perf_counter()
+        with np.errstate():  # a problem that sets NumPy's errors sets them for itself
+            found = isolate(partial(_attempt, self.problem, self.gamma), chunk, partial(self._refuse, chunk))
+        notes = dict(found.notes)
+        reasons = notes.pop("reasons")
+        if chunk.kind == "gradient":
+            notes["cost"] = notes.get("cost", 0.0) + float(self.problem.gradient_cost) * len(reasons)
+        else:
+            notes["reasons"] = [reasons[row] for row in sorted(reasons)]
+        return Result(found.table, {**notes, "seconds": time.perf_counter() - start})
+
+    def lose(self, chunk: Request, reason: str) -> Result:
+        """Return the result of a row that no worker survives; an EvaluationError where on_error is "raise"."""
+        self._refuse(chunk, 0, reason)
+        about = {"cost": float(self.problem.gradient_cost)} if chunk.kind == "gradient" else {"reasons": [reason]}
+        return Result(np.full((1, 1), np.nan), {"n_retried": 0, "lost": [reason], **about})
+
+    def _refuse(self, chunk: Request, row: int, reason: str, cause: BaseException | None = None) -> None:
+        """Raise an EvaluationError for a row of a chunk that has failed for good, if on_error is "raise"."""
+        if self.on_error == "raise":
+            what = "The gradient" if chunk.kind == "gradient" else self.name
+            raise EvaluationError(
+                f'{what} failed twice on x = {describe_point(chunk.x[row])}: {reason}; on_error "failure" or "bound" '
+                "would count it instead."
+            ) from cause
+
+
+def _attempt(problem: Any, gamma: float, chunk: Request) -> Result:
+    """Return what a problem gives for a chunk, with the reasons by row where it gives nothing; it may write on x."""
+    x, *about = (array.copy() for array in chunk.arrays)
+    n, notes, reasons = len(x), dict[str, Any](), dict[int, str]()
+    if chunk.kind == "gradient":
+        found = problem.gradient(x, *about, gamma)
+        table = np.asarray(found.values, dtype=np.float64)
+        if table.shape != x.shape:
+            raise EvaluationError(f"Expected gradients of shape {x.shape}, got {table.shape}.")
+        return Result(table, {"cost": float(found.cost), "reasons": {}})
+    whole, by_row, more = ("terms", "attempt_terms", (gamma,)) if chunk.kind == "terms" else ("evaluate", "attempt", ())
+    if _have_same_owner(problem, whole, by_row):
+        found, reasons = getattr(problem, by_row)(x, *more)  # foreign methods, by name
+    else:
+        found = getattr(problem, whole)(x, *more)
+    if chunk.kind == "f":
+        f = one_per_row(found, n)
+        table = f[:, None]
+    else:
+        f, values, ticks = one_per_row(found.f, n), np.asarray(found.values, float), np.asarray(found.ticks)
+        if values.ndim != 2 or len(values) != n or values.shape[1] == 0 or ticks.shape != values.shape:
+            raise EvaluationError(f"Expected values and ticks of shape ({n}, J), got {values.shape} and {ticks.shape}.")
+        f = np.where(np.isnan(values).any(axis=1), np.nan, f)
+        table = np.column_stack((f, values, ticks))
+        notes = {"threshold": float(found.threshold), "names": list(getattr(found, "names", ()))}
+    reasons = dict.fromkeys(np.flatnonzero(np.isnan(f)).tolist(), NAN_REASON) | reasons
+    return Result(table, {**notes, "reasons": reasons})
+
+
+def _have_same_owner(problem: Any, whole: str, by_row: str) -> bool:
+    """Return whether the method that goes on with the other rows computes what the method `whole` does.
+
+    A subclass, a wrapper or an instance that has `whole` of its own is asked by that.
+    """
+    owner = getattr(getattr(problem, by_row, None), "__self__", None)
+    if owner is None or getattr(getattr(problem, whole, None), "__self__", None) is not owner:
+        return False
+    definition = next(vars(kind) for kind in type(owner).__mro__ if {whole, by_row} & set(vars(kind)))
+    return {whole, by_row} <= set(definition)
+
+
+@contextmanager
+def seed_generators(seed: int, index: Index) -> Iterator[None]:
+    """Let the global generators begin anew for the length of a block, by the seed of the run and a chunk's index.
+
+    A simulation is to draw nothing itself. One that does (a policy that samples its actions) draws the same again when
+    its chunk is computed again, on whichever worker, as long as it uses the generators of `random`, `numpy.random` or,
+    on the CPU, torch.
+    """
+    state = int(np.random.SeedSequence(seed, spawn_key=index).generate_state(1)[0])
+    torch: Any = sys.modules.get("torch")  # not imported for this
+    before = random.getstate(), np.random.get_state(), None if torch is None else torch.random.get_rng_state()  # noqa: NPY002
+    random.seed(state)
+    np.random.seed(state)  # noqa: NPY002  (the global generator, which foreign code uses)
+    if torch is not None:
+        torch.random.default_generator.manual_seed(state)
+    try:
+        yield
+    finally:
+        random.setstate(before[0])
+        np.random.set_state(before[1])  # noqa: NPY002
+        if torch is not None:
+            torch.random.set_rng_state(before[2])
+
+
+class Pool:
+    """What computes chunks: this process, one after the other; `samplers.executors` has pools of others.
+
+    Attributes:
+        workers: Their number; 0 where there is no executor.
+        n_retries: Chunks and rows that were computed again because a worker was lost.
+    """
+
+    def __init__(self, work: Work, workers: int = 0) -> None:
+        self._work, self.workers, self.n_retries = work, workers, 0
+
+    def run(self, chunks: Iterable[tuple[int, Request]]) -> Iterator[tuple[int, Result]]:
+        """Yield the results of chunks with their numbers in the run, in any order; what the work raises is raised."""
+        return ((number, self._work(chunk, (number,))) for number, chunk in chunks)
+
+
+@runtime_checkable
+class Executor(Protocol):
+    """Settings from which workers are made for a run.
+
+    Example:
+        >>> import samplers
+        >>> isinstance(samplers.LocalProcesses(workers=2), samplers.Executor)
+        True
+    """
+
+    def open(self, work: Work) -> AbstractContextManager[Pool]:
+        """Return workers for a run, which are gone at the end of the block; a ValueError if work cannot be sent."""
+
+
+# The way of a request
 
 
 class Fault(NamedTuple):
@@ -118,7 +379,7 @@ class Evaluator:
         self._size = None if size is None and executor is None else self._split
         self._precision, self._n_chunks, self._checked = precision, 0, False
         self._widths: set[int] = set()  # of tables of terms
-        self.pool: Here | Pool = Here(self._work)
+        self.pool = Pool(self._work)
         self._stack = ExitStack()
         self.offer = _find_offer(problem)
         self.faults, self.lost = list[Fault](), list[str]()
@@ -172,7 +433,7 @@ class Evaluator:
             number = number_in_run - first
             if self._journal is not None:
                 cost = whole_simulations(result.notes["cost"]) if request.kind == "gradient" else len(chunks[number])
-                self._journal.append(self._digest(chunks[number]), result, cost)
+                self._journal.append(self._digest(chunks[number]), *result, cost)
             results[number] = result
             n_done += len(chunks[number])
             if request.kind != "gradient":  # whose rows count as what they cost
@@ -192,7 +453,7 @@ class Evaluator:
             return chunks, known
         for parts in (chunks, [request], request.split(self._split)):
             found = {number: self._journal.find(self._digest(chunk)) for number, chunk in enumerate(parts)}
-            known = {number: result for number, result in found.items() if result is not None}
+            known = {number: Result(*result) for number, result in found.items() if result is not None}
             if known:
                 chunks = parts
                 break

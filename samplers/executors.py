@@ -20,26 +20,22 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import BrokenExecutor, CancelledError
 from concurrent.futures import Executor as FuturesExecutor
-from contextlib import AbstractContextManager, closing, contextmanager, suppress
+from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass, field
 from hashlib import blake2b
-from typing import Any, Protocol, TypeAlias, runtime_checkable
+from typing import Any, TypeAlias
 
+from samplers.evaluate import Executor, Index, Pool, Result, Work, join_results
 from samplers.method import Request
 from samplers.problem import check_number, check_whole
 from samplers.workers import (
     ExecutorError,
-    Index,
-    Limits,
     Reply,
-    Result,
-    Work,
     WorkerLost,
     compute_in_worker,
     describe,
     describe_loss,
     end_with,
-    join_results,
     name_process,
     pack,
 )
@@ -62,33 +58,6 @@ ENVIRONMENT = {
 """Of local processes."""
 
 
-class Here:
-    """This process as a pool: it computes one chunk after the other."""
-
-    n_retries = 0
-
-    def __init__(self, work: Work, workers: int = 0) -> None:
-        self._work, self.workers = work, workers
-
-    def run(self, chunks: Iterable[tuple[int, Request]]) -> Iterator[tuple[int, Result]]:
-        """Yield the results of chunks with their numbers in the run."""
-        return ((number, self._work(chunk, (number,))) for number, chunk in chunks)
-
-
-@runtime_checkable
-class Executor(Protocol):
-    """Settings from which workers are made for a run.
-
-    Example:
-        >>> import samplers
-        >>> isinstance(samplers.LocalProcesses(workers=2), Executor)
-        True
-    """
-
-    def open(self, work: Work) -> AbstractContextManager[Here | Pool]:
-        """Return workers for a run, which are gone at the end of the block; a ValueError if work cannot be sent."""
-
-
 @dataclass(frozen=True)
 class InProcess:
     """Computes chunks in this process: for a debugger, or to continue elsewhere what workers began.
@@ -101,9 +70,9 @@ class InProcess:
     """
 
     @contextmanager
-    def open(self, work: Work) -> Iterator[Here]:
+    def open(self, work: Work) -> Iterator[Pool]:
         """Yield this process as a pool of one."""
-        yield Here(work, workers=1)
+        yield Pool(work, workers=1)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -124,11 +93,6 @@ class _Processes:
         for name, limit in (("time_limit", self.time_limit), ("memory_limit", self.memory_limit)):
             if limit is not None:
                 check_number(name, limit, 0.0, math.inf)
-
-    @property
-    def limits(self) -> Limits:
-        """What a chunk may take."""
-        return Limits(self.time_limit, self.memory_limit)
 
 
 @dataclass(frozen=True)
@@ -154,10 +118,10 @@ class LocalProcesses(_Processes):
     workers: int | None = None
 
     @contextmanager
-    def open(self, work: Work) -> Iterator[Pool]:
+    def open(self, work: Work) -> Iterator[WorkerPool]:
         """Yield the processes; each starts with its first chunk, and all are killed at the end of the block."""
         number = self.workers or os.cpu_count() or 1
-        with closing(Pool(work, self.limits, _LocalProcess, 1, slots=number, blames=True)) as pool:
+        with closing(WorkerPool(work, self, _LocalProcess, 1, slots=number, blames=True)) as pool:
             yield pool
 
 
@@ -192,11 +156,11 @@ class FuturesPool(_Processes):
         super().__post_init__()
 
     @contextmanager
-    def open(self, work: Work) -> Iterator[Pool]:
+    def open(self, work: Work) -> Iterator[WorkerPool]:
         """Yield the pool; one that was made here is shut down at the end of the block."""
         given = _has_submit(self.executor)
         make = (lambda: self.executor) if given else self.executor
-        with closing(Pool(work, self.limits, make, self.workers, ours=not given)) as pool:
+        with closing(WorkerPool(work, self, make, self.workers, ours=not given)) as pool:
             yield pool
 
 
@@ -225,7 +189,7 @@ class RayCluster(_Processes):
     """What a task needs, as for `ray.remote`: num_cpus, num_gpus, memory, runtime_env."""
 
     @contextmanager
-    def open(self, work: Work) -> Iterator[Pool]:
+    def open(self, work: Work) -> Iterator[WorkerPool]:
         """Yield the cluster; one that was started here ends with the block. An ExecutorError where there is none."""
         try:
             import ray
@@ -237,7 +201,7 @@ class RayCluster(_Processes):
         try:
             tasks = _RayTasks(ray, {"num_cpus": 1, "max_retries": 0, **self.options})
             workers = self.workers or tasks.count_places()
-            with closing(Pool(work, self.limits, lambda: tasks, workers, ours=False, blames=True)) as pool:
+            with closing(WorkerPool(work, self, lambda: tasks, workers, ours=False, blames=True)) as pool:
                 yield pool
         finally:
             if started:
@@ -309,21 +273,17 @@ class _Task:
         return self.parent.put(join_results([parts[row] for row in sorted(parts)]))
 
 
-class Pool:
+class WorkerPool(Pool):
     """Objects with `submit`, in slots, and the work to be done; those of ours are replaced where broken.
 
     Where it `blames`, a worker that is lost costs its own chunk alone, and each worker has one chunk in flight, else
     two: all in flight are then lost together, and suspects go alone.
-
-    Attributes:
-        workers: Their number.
-        n_retries: Chunks and rows that were computed again because a worker was lost.
     """
 
     def __init__(
         self,
         work: Work,
-        limits: Limits,
+        settings: _Processes,
         make: Callable[[], Any],
         workers: int | None,
         *,
@@ -331,19 +291,20 @@ class Pool:
         ours: bool = True,
         blames: bool = False,
     ) -> None:
-        self._lose, self._packed, self._limits = work.lose, pack(work), limits
+        super().__init__(work)
+        self._packed, self._limits = pack(work), (settings.time_limit, settings.memory_limit)
         self._make, self._ours, self._blames = make, ours, blames
         self._key = blake2b(self._packed, digest_size=16).hexdigest()
         self._pools: list[Any] = [make() for _ in range(slots)]
         self._restarts, self._calls = 0, itertools.count()
         each = workers or _count_workers(self._pools[0])
-        self.workers, self.n_retries = slots * each, 0
+        self.workers = slots * each
         self._idle = deque(list(range(slots)) * (each if blames else 2 * each))
         self._done: queue.SimpleQueue[tuple[int, float]] = queue.SimpleQueue()
         self._proven = self._warned = False  # a chunk has been computed; a silence has been told
 
     def run(self, chunks: Iterable[tuple[int, Request]]) -> Iterator[tuple[int, Result]]:
-        """Yield the results of chunks with their numbers, in any order; what the work raises is raised here."""
+        """Yield the results of chunks with their numbers, see `Pool`."""
         waiting = deque(_Task((number,), chunk) for number, chunk in chunks)
         running: dict[int, _Task] = {}
         try:
@@ -434,7 +395,7 @@ class Pool:
                     "workers (dask, Ray) never answers, nor does a hung ego without a time limit (time_limit=)."
                 )
                 warnings.warn(message, RuntimeWarning, stacklevel=2)
-            limit = math.inf if self._limits.seconds is None else self._limits.seconds + START_SECONDS
+            limit = math.inf if self._limits[0] is None else self._limits[0] + START_SECONDS
             late = [task for task in running.values() if time.monotonic() - task.begun > limit]
             for task in late:
                 self._give_up(running.pop(task.call))
@@ -444,13 +405,13 @@ class Pool:
     def _take(self, task: _Task, ended: float | None) -> Result:
         """Return what a job has come to; what the pool itself raises means that a worker was lost."""
         if ended is None:
-            raise WorkerLost(f"no answer within {self._limits.seconds:g} s")
+            raise WorkerLost(f"no answer within {self._limits[0]:g} s")
         try:
             reply: Any = task.job.result()
         except ConnectionError as error:  # of a cluster that is gone
             raise ExecutorError(f"The executor does not answer any more ({describe(error)}).") from error
         except (Exception, CancelledError) as error:
-            raise WorkerLost(describe_loss(error, ended - task.begun, self._limits.seconds)) from error
+            raise WorkerLost(describe_loss(error, ended - task.begun, self._limits[0])) from error
         if not isinstance(reply, Reply):
             words = f"Expected what the submitted function returns as result of a future, got {reprlib.repr(reply)}."
             raise ExecutorError(words)
@@ -472,7 +433,7 @@ class Pool:
             self.n_retries += len(rows)
             waiting.extendleft(reversed(rows))
         elif self._proven:
-            return task.put(self._lose(task.chunk, str(error)))
+            return task.put(self._work.lose(task.chunk, str(error)))
         elif task.attempts < 2 * ATTEMPTS and waiting:  # after the others, which show whether workers work at all
             self.n_retries += 1
             waiting.append(task)

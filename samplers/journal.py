@@ -27,7 +27,7 @@ from urllib.parse import quote
 import numpy as np
 from numpy.typing import NDArray
 
-from samplers.workers import Result
+from samplers.problem import FloatArray
 
 SYNC_SECONDS = 1.0
 """Longest time for which finished simulations are not on the disk yet: what a power cut loses, beside the chunk."""
@@ -103,10 +103,10 @@ class Journal:
         >>> from tempfile import TemporaryDirectory
         >>> with TemporaryDirectory() as folder:
         ...     journal = Journal.create(Path(folder) / "journal.bin", {"seed": 1})
-        ...     journal.append("of x", Result(np.array([[2.0], [-1.0]]), {}), 2)
+        ...     journal.append("of x", np.array([[2.0], [-1.0]]), {}, 2)
         ...     journal.close()
         ...     journal = Journal.open(Path(folder) / "journal.bin")
-        ...     print(journal.head, journal.find("of x").table.ravel(), journal.find("of others"))
+        ...     print(journal.head, journal.find("of x")[0].ravel(), journal.find("of others"))
         ...     journal.close()
         {'seed': 1} [ 2. -1.] None
     """
@@ -192,8 +192,8 @@ class Journal:
         """Whether an earlier run has recorded something after the last chunk that this one has found."""
         return self._last_taken < self._earlier
 
-    def find(self, points: str) -> Result | None:
-        """Return the result of some points by their digest; None where they are not recorded."""
+    def find(self, points: str) -> tuple[FloatArray, dict[str, Any]] | None:
+        """Return table and notes of some points by their digest; None where they are not recorded."""
         found = self._connection.execute(f"SELECT {COLUMNS} FROM chunks WHERE points = ?", (points,)).fetchone()
         if found is None:
             return None
@@ -201,19 +201,19 @@ class Journal:
         self._last_taken = max(self._last_taken, row.id)
         try:
             numbers = np.frombuffer(row.numbers, "<f8").astype(np.float64)
-            return Result(numbers.reshape(-1, row.width), dict(json.loads(row.notes)))
+            return numbers.reshape(-1, row.width), dict(json.loads(row.notes))
         except (ValueError, TypeError, RecursionError) as error:
             raise JournalError(f"{str(self.path)!r} is no journal of this version: {error}.") from error
 
-    def append(self, points: str, result: Result, n_sim: int) -> None:
-        """Write n_sim finished simulations under the digest of their points.
+    def append(self, points: str, table: FloatArray, notes: dict[str, Any], n_sim: int) -> None:
+        """Write the table (n, k) and notes of n_sim finished simulations under the digest of their points.
 
         Those that cannot be written are tried again with the next ones; a UserWarning says so once.
         """
-        numbers = np.ascontiguousarray(result.table, dtype="<f8").tobytes()
+        numbers = np.ascontiguousarray(table, dtype="<f8").tobytes()
         elapsed = self.earlier_seconds + time.monotonic() - self._opened  # without that between two parts of the run
-        seconds, notes = round(elapsed, 3), json.dumps(result.notes)
-        self._waiting.append(_Row(-1, points, result.table.shape[1], n_sim, seconds, notes, numbers))
+        seconds, text = round(elapsed, 3), json.dumps(notes)
+        self._waiting.append(_Row(-1, points, table.shape[1], n_sim, seconds, text, numbers))
         self._write_waiting()
 
     def flush(self) -> bool:

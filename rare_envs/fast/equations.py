@@ -10,7 +10,7 @@ import os
 import shutil
 import time
 from collections.abc import Callable
-from functools import partial
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar, cast
 
@@ -107,6 +107,7 @@ class IDMNumbers(NamedTuple):
     """1 with the cut-off, else 0."""
 
     @classmethod
+    @lru_cache
     def of(cls, idm: IDM) -> "IDMNumbers":
         """Return the parameters of an IDM."""
         return cls(*single(*(getattr(idm, name) for name in cls._fields)))

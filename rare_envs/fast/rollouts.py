@@ -1,6 +1,7 @@
 """Rollouts and steps of the scripted scenarios, compiled by numba: blocks of rows from time 0 to f, or by a tick."""
 
 import math
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -60,6 +61,7 @@ _STANDING_GAP, _TIME_GAP, _COST, _LEAST_CLOSING = single(
 )
 
 
+@lru_cache
 def numbers_of(script: str, road: Road, dt: float) -> ScriptNumbers:
     """Return the numbers of a script, named as in `rare_envs.fast.rows`, on a straight road with equal lanes."""
     number: int = getattr(fast_rows, script)

@@ -50,8 +50,7 @@ from rare_envs.study.report import Repeatability, Report
 from rare_envs.study.run_folder import STUDY
 from rare_envs.study.writing import begin_journal, begin_study_file, continue_journal, finish_run, note_resumption
 from samplers.estimation import add_ensemble_run, check_base, run_method
-from samplers.evaluate import Evaluator, Simulated, find_changed
-from samplers.executors import Executor
+from samplers.evaluate import Evaluator, Executor, Simulated, find_changed
 from samplers.journal import Journal
 from samplers.problem import FloatArray, OnError
 from samplers.sample import Status

@@ -20,10 +20,9 @@ import samplers
 from samplers import journal as journals
 from samplers.journal import Journal, JournalError, NothingRecorded
 from samplers.problem import FloatArray, TermGradients, Terms
-from samplers.workers import Result
 
 F = Callable[[FloatArray], FloatArray]
-ONE = Result(np.ones((3, 1)), {})
+ONE = (np.ones((3, 1)), dict[str, object]())
 
 
 def half_space(x: FloatArray) -> FloatArray:
@@ -146,7 +145,7 @@ def test_a_page_that_is_lost_costs_what_stands_behind_it(cut: bool, tmp_path: Pa
     path = tmp_path / "j"
     journal = Journal.create(path, {"seed": 1})
     for k in range(40):
-        journal.append(str(k), Result(np.full((300, 1), float(k)), {}), 300)
+        journal.append(str(k), np.full((300, 1), float(k)), {}, 300)
     journal.close()
     content = bytearray(path.read_bytes())
     half = len(content) // 2
@@ -169,7 +168,7 @@ def test_killed_while_sqlite_copies_its_log_into_the_file_nothing_is_lost(
     path, killed = tmp_path / "journal.bin", tmp_path / "killed.bin"
     with contextlib.closing(Journal.create(path, {})) as journal:
         for number in range(20):
-            journal.append(str(number), Result(np.full((200, 1), number), {}), 200)
+            journal.append(str(number), np.full((200, 1), number), {}, 200)
         before, log = path.read_bytes(), journals._wal(path).read_bytes()
     after = path.read_bytes()
     assert len(after) > 20480 >= len(before)
@@ -215,7 +214,7 @@ def test_creating_replaces_an_empty_journal_alone_and_one_process_has_it(tmp_pat
     path = tmp_path / "j"
     Journal.create(path, {"seed": 1}).close()
     journal = Journal.create(path, {"seed": 2})
-    journal.append("points", ONE, 3)
+    journal.append("points", *ONE, 3)
     for attempt in (lambda: Journal.create(path, {}, replace=True), lambda: Journal.open(path)):
         with pytest.raises(JournalError, match="Another process"):
             attempt()
@@ -290,10 +289,10 @@ def test_interrupted_anywhere_in_a_write_each_record_stands_there_once(tmp_path:
     path = tmp_path / "journal.bin"
     for line in itertools.count(1):
         journal = Journal.create(path, {}, replace=True)
-        journal.append("0", ONE, 3)
-        interrupted = interrupt_at(line, lambda journal=journal: journal.append("1", ONE, 3))  # type: ignore[misc]
+        journal.append("0", *ONE, 3)
+        interrupted = interrupt_at(line, lambda journal=journal: journal.append("1", *ONE, 3))  # type: ignore[misc]
         for points in "23":
-            journal.append(points, ONE, 3)
+            journal.append(points, *ONE, 3)
         journal.close()
         journal = Journal.open(path)
         found = [points for points in "0123" if journal.find(points) is not None]
@@ -313,7 +312,7 @@ def test_the_wall_time_of_all_parts_adds_up(tmp_path: Path, monkeypatch: pytest.
     def go_on(journal: Journal, *times: float) -> float:
         for seconds in times:
             clock[0] += seconds
-            journal.append(str(next(number)), ONE, 3)
+            journal.append(str(next(number)), *ONE, 3)
         clock[0] += 40.0
         journal.close()
         return journal.earlier_seconds

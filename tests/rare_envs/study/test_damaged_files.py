@@ -29,7 +29,6 @@ from rare_envs.study.html_report import atlas
 from rare_envs.study.html_report.figures import FigureOfPage
 from rare_envs.study.run_folder import JOURNAL
 from rare_envs.study.writing import begin_journal
-from samplers.workers import Result as Computed
 from tests.rare_envs.study.conftest import write_base
 
 FOLLOWING = "rare_envs/CarFollowing-v0"
@@ -183,7 +182,7 @@ def write_journal(folder: Path, base: str) -> None:
     folder.mkdir()
     journal = begin_journal(folder, Question(env_id=FOLLOWING, base=base, horizon=1.0, method="mc", max_sim=60))
     for number in range(3):
-        journal.append(f"of other points {number}", Computed(np.ones((20, 1)), {"reasons": [], "n_retried": 0}), 20)
+        journal.append(f"of other points {number}", np.ones((20, 1)), {"reasons": [], "n_retried": 0}, 20)
     journal.close()
 
 
