@@ -57,7 +57,7 @@ def register_scenario(env_id: str, scenario: Scenario) -> None:
         >>> register_scenario("docs/LongCutIn-v0", dataclasses.replace(scenario_named("cut_in"), horizon=20.0))
         >>> gym.make("docs/LongCutIn-v0").unwrapped.world.clock.seconds
         20.0
-        >>> SCENARIOS.remove("docs/LongCutIn-v0")
+        >>> del SCENARIOS["docs/LongCutIn-v0"]
 
     Raises:
         ValueError: If the id is taken, or the scenario does not work.
@@ -67,7 +67,7 @@ def register_scenario(env_id: str, scenario: Scenario) -> None:
     if env_id in gym.registry:
         raise ValueError(f"The id {env_id!r} is taken; choose another one.")
     try_scenario(scenario)
-    SCENARIOS.add(env_id, scenario)
+    SCENARIOS[env_id] = scenario
     register_envs()
 
 

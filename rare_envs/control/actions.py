@@ -57,23 +57,21 @@ def space_of_actions(kind: str) -> spaces.Space[Any]:
 
 
 def read_actions(kind: str, actions: Tensor, batch: int, ignored: Tensor | None = None) -> Tensor:
-    """Return what a world steps with, from what a policy returns: `to_meta` or `to_physical` by the kind of action."""
-    return (to_meta if kind == "meta" else to_physical)(actions, batch, ignored)
+    """Return what a world steps with, from what a policy returns: `to_physical`, or meta-actions (B,), int64, checked.
 
-
-def to_meta(action: Tensor, batch: int, ignored: Tensor | None = None) -> Tensor:
-    """Return meta-actions (B,), whole numbers, as int64, checked; rows `ignored` (B,) get `IDLE`."""
-    if action.shape != (batch,) or action.is_floating_point() or action.dtype == torch.bool:
+    Rows `ignored` (B,) get `IDLE`, or 0.
+    """
+    if kind != "meta":
+        return to_physical(actions, batch, ignored)
+    if actions.shape != (batch,) or actions.is_floating_point() or actions.dtype == torch.bool:
         raise ValueError(
             f"Expected {batch} meta-actions, whole numbers from 0 to {len(META_ACTIONS) - 1} "
-            f"({', '.join(META_ACTIONS)}), got {action.dtype} of shape {tuple(action.shape)}."
+            f"({', '.join(META_ACTIONS)}), got {actions.dtype} of shape {tuple(actions.shape)}."
         )
-    action = action.long()
-    if ignored is not None:
-        action = torch.where(ignored, IDLE, action)
-    if bool(((action < 0) | (action >= len(META_ACTIONS))).any()):
-        raise ValueError(f"Expected meta-actions from 0 to {len(META_ACTIONS) - 1}, got {action.tolist()[:5]}.")
-    return action
+    actions = actions.long() if ignored is None else torch.where(ignored, IDLE, actions.long())
+    if bool(((actions < 0) | (actions >= len(META_ACTIONS))).any()):
+        raise ValueError(f"Expected meta-actions from 0 to {len(META_ACTIONS) - 1}, got {actions.tolist()[:5]}.")
+    return actions
 
 
 def to_physical(action: Tensor, batch: int, ignored: Tensor | None = None) -> Tensor:

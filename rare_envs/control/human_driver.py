@@ -17,7 +17,7 @@ References:
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, fields
 from itertools import pairwise
 from typing import Final, NamedTuple
 
@@ -87,15 +87,10 @@ class Glances(NamedTuple):
         return (self.start <= time).sum(dim=1)
 
 
-def count_glances(horizon: float) -> int:
-    """Return how many glances are drawn for an episode [s]: five standard deviations more than begin on average."""
-    mean = horizon / MEAN_ON_ROAD
-    return math.ceil(mean + 5.0 * math.sqrt(mean) + 2.0)
-
-
 def count_glance_draws(horizon: float) -> int:
-    """Return how many standard normal draws the glances of an episode [s] take."""
-    return START_DRAWS + 2 * count_glances(horizon)
+    """Return how many standard normal draws the glances of an episode [s] take: 5 deviations more than begin."""
+    mean = horizon / MEAN_ON_ROAD
+    return START_DRAWS + 2 * math.ceil(mean + 5.0 * math.sqrt(mean) + 2.0)
 
 
 def glance_duration(share: Tensor) -> Tensor:
@@ -140,18 +135,17 @@ MAX_HUMAN_BRAKING = 0.774 * STANDARD_GRAVITY
 (esmini) has it, which all values of this regulation below are from."""
 
 
-def _attentive_idm() -> IDM:
-    """Return the IDM of motorways: Treiber and Kesting (2013), table 11.2, its values as commonly quoted."""
-    return IDM(
-        desired_speed=120.0 / 3.6,
-        time_headway=1.0,
-        max_acceleration=1.0,
-        comfortable_deceleration=1.5,
-        jam_distance=2.0,
-        jam_distance_speed=0.0,
-        max_deceleration=MAX_HUMAN_BRAKING,
-        cut_off=True,
-    )
+ATTENTIVE_IDM: Final = IDM(
+    desired_speed=120.0 / 3.6,
+    time_headway=1.0,
+    max_acceleration=1.0,
+    comfortable_deceleration=1.5,
+    jam_distance=2.0,
+    jam_distance_speed=0.0,
+    max_deceleration=MAX_HUMAN_BRAKING,
+    cut_off=True,
+)
+"""The IDM of motorways: Treiber and Kesting (2013), table 11.2, its values as commonly quoted."""
 
 
 class Percept(NamedTuple):
@@ -172,8 +166,8 @@ class HumanDriverModel:
     Values of the book and of Regulation 157 are as quoted or implemented in public; neither text was consulted.
     """
 
-    idm: IDM = field(default_factory=_attentive_idm)
-    """How the driver wants to drive: Treiber and Kesting (2013), table 11.2, motorway."""
+    idm: IDM = ATTENTIVE_IDM
+    """How the driver wants to drive."""
     reaction_time: float = 0.6
     """T' [s]: Treiber and Kesting (2013), table of the human driver model (page 216)."""
     gap_error: float = 0.1

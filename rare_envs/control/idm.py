@@ -10,7 +10,7 @@ import math
 from dataclasses import dataclass
 from functools import cached_property
 from numbers import Real
-from typing import Any, ClassVar, Protocol
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -19,7 +19,7 @@ from torch import Tensor
 from rare_envs.devices import are_zero, scalars
 from rare_envs.traffic.bodies import Lead
 from rare_envs.traffic.road import Road
-from rare_envs.traffic.state import NEAR_ZERO, VEHICLE_LENGTH, State, steering_for
+from rare_envs.traffic.state import NEAR_ZERO, VEHICLE_LENGTH, steering_for
 
 TAU_LATERAL = 0.6
 """Time constant of the way back to the line [s], HighwayEnv's `TAU_LATERAL`."""
@@ -70,22 +70,6 @@ _POSITIVE = ("desired_speed", "max_acceleration", "comfortable_deceleration", "e
 _NOT_NEGATIVE = ("time_headway", "jam_distance", "jam_distance_speed", "added_length")
 MIN_RATIO = 1e-24
 """Floor of speed / desired speed under the root: its slope stays finite at standstill, in single precision too."""
-
-
-class EgoScene(Protocol):
-    """The part of an episode that a rule-based ego reads."""
-
-    @property
-    def state(self) -> State:
-        """State of the traffic."""
-
-    @property
-    def lead(self) -> Lead:
-        """The ego's lead in this state."""
-
-    @property
-    def road(self) -> Road:
-        """The road that all are on."""
 
 
 @dataclass(frozen=True)
@@ -141,7 +125,7 @@ class IDM:
                 least = "above 0" if name in _POSITIVE else "of at least 0"
                 raise ValueError(f"Expected {name} of the IDM to be a number {least}, got {value!r}.")
 
-    @property
+    @cached_property
     def closing_gain(self) -> float:
         """1 / (2 sqrt(a_max b)) [s^2/m], the factor of v dv in s*."""
         return 0.5 / math.sqrt(self.max_acceleration * self.comfortable_deceleration)
@@ -171,13 +155,7 @@ class IDM:
         return self.combine(ratio, self.interaction(speed, ratio, lead))
 
     def interaction(self, speed: Tensor, ratio: Tensor, lead: Lead) -> Tensor:
-        """Return (s*/gap)^2 for a lead.
-
-        Args:
-            speed: Speed of the follower [m/s], any shape; the others have one that broadcasts with it.
-            ratio: Its speed as a share of its desired speed.
-            lead: The lead.
-        """
+        """Return (s*/gap)^2 of followers at a speed [m/s], and its ratio to the desired one, for leads; any shapes."""
         time, gain, jam, jam_speed, added = scalars(self._interaction_numbers, speed)
         headway = time + lead.closing_speed * gain
         desired_gap = jam + speed * (headway.clamp_min(0.0) if self.cut_off else headway)
@@ -194,7 +172,7 @@ class IDM:
         acceleration: Tensor = largest * (one - free - interaction)
         return acceleration.clamp_min(-self.max_deceleration)
 
-    def act(self, episode: EgoScene, memory: Any) -> tuple[Tensor, Any]:
+    def act(self, episode: Any, memory: Any) -> tuple[Tensor, Any]:
         """Return IDM behind the lead and lane keeping across, shape (B, 2); there is no memory."""
         _, y, heading, speed = episode.state.vehicles[0]
         steering = lane_keeping(y, heading, speed, episode.road)

@@ -16,96 +16,19 @@ References:
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import ClassVar, NamedTuple
+from typing import ClassVar
 
 import torch
 from torch import Tensor
 
 from rare_envs.control.idm import IDM, TAU_LATERAL, yaw_rate_towards
-from rare_envs.traffic.bodies import LEFT, OWN, RIGHT, LaneTraffic, Lead, Neighbours, find_neighbours, nearest
+from rare_envs.traffic.bodies import LEFT, OWN, RIGHT, LaneTraffic, Lead, find_neighbours, nearest
 
 _SIDES = (LEFT, RIGHT)
 _NO_LIMIT = 1e12
 """A deceleration [m/s^2] that no gap asks for."""
-
-
-class LaneChoice(NamedTuple):
-    """Value of changes of M vehicles to the lane on the left and on the right; shapes (B, M, 2)."""
-
-    incentive: Tensor
-    """Left-hand side of the criterion [m/s^2]; -inf where there is no lane."""
-    safe: Tensor
-    """Whether there is a lane, and nobody would have to brake harder than is safe."""
-    wanted: Tensor
-    """Whether the change is safe and worth it."""
-
-
-@dataclass(frozen=True)
-class Mobil:
-    """Parameters of MOBIL.
-
-    Threshold and safe deceleration are those of Kesting et al. (2007). Where HighwayEnv's `IDMVehicle` differs
-    (`Mobil.highway_env`): politeness 0, a threshold of 0.2 m/s^2, at most 2 m/s^2 of braking imposed. It does not look
-    at what the changing vehicle itself would have to brake. Vehicles count in a lane up to 1 m beyond its edge, so that
-    one counts in two lanes. Of two lanes that are worth it HighwayEnv takes the right one, we the better one.
-    Accelerations are not limited to what the brakes can do, in both and in the paper.
-    """
-
-    politeness: float = 0.25
-    """p: weight of the others' accelerations; the middle of the range of 0 to 0.5 that Treiber calls realistic on his
-    page about the model."""
-    threshold: float = 0.1
-    """a_th [m/s^2]."""
-    safe_deceleration: float = 4.0
-    """b_safe [m/s^2]."""
-    delay: float = 1.0
-    """Time between two decisions of a vehicle [s], HighwayEnv's; the paper decides at every step."""
-    own_safety: bool = True
-    """Whether the changing vehicle's own braking is limited by b_safe too: a vehicle that is abreast with its centre
-    ahead is no follower, so that the paper's criterion does not see it."""
-    reach: float = 0.0
-    """Distance beyond a lane's edge [m] up to which a centre counts in the lane."""
-    least_speed: float = 1.0
-    """Speed [m/s] below which nobody begins a change, HighwayEnv's."""
-
-    def __post_init__(self) -> None:
-        if not self.safe_deceleration > 0 or self.threshold < 0 or self.delay < 0:
-            raise ValueError(
-                "Expected a positive safe deceleration and a threshold and a delay that are not negative, got "
-                f"{self.safe_deceleration}, {self.threshold} and {self.delay}."
-            )
-
-    @classmethod
-    def highway_env(cls) -> Mobil:
-        """Return the parameters and conventions of HighwayEnv's `IDMVehicle`."""
-        return cls(0.0, 0.2, 2.0, 1.0, own_safety=False, reach=1.0)
-
-    def choose(self, traffic: LaneTraffic, who: slice, idm: IDM, target: Tensor | None = None) -> LaneChoice:
-        """Return what changes to both sides are worth to M of V vehicles, which move to lanes `target` (B, V)."""
-        around = find_neighbours(traffic, who, traffic.lane if target is None else target, self.reach)
-        return self.judge(traffic, who, idm, around)
-
-    def judge(self, traffic: LaneTraffic, who: slice, idm: IDM, around: Neighbours) -> LaneChoice:
-        """Return the same for known neighbours."""
-        unlimited = replace(idm, max_deceleration=_NO_LIMIT)
-        batch, m, _ = around.lead.shape
-        own = torch.arange(traffic.x.shape[1], device=traffic.x.device)[who].view(1, m, 1).expand(batch, m, 2)
-        lead, follower = around.lead[..., _SIDES], around.follower[..., _SIDES]
-        old_lead, old_follower = around.lead[..., OWN, None], around.follower[..., OWN, None]
-
-        def by(behind: Tensor, ahead: Tensor) -> Tensor:
-            return acceleration_behind(traffic, unlimited, behind, ahead)
-
-        after = by(own, lead)
-        of_follower = by(follower, own)
-        gain = after - by(own[..., :1], old_lead)
-        others = of_follower - by(follower, lead) + by(old_follower, old_lead) - by(old_follower, own[..., :1])
-        exists = around.exists[..., _SIDES]
-        incentive = torch.where(exists, gain + self.politeness * others, -torch.inf)
-        safe = exists & (of_follower >= -self.safe_deceleration)
-        if self.own_safety:
-            safe = safe & (after >= -self.safe_deceleration)
-        return LaneChoice(incentive, safe, safe & (incentive >= self.threshold))
+SETTLED = 0.5
+"""A change ends when the centre of the vehicle is this close to the middle of its target lane [m]."""
 
 
 def acceleration_behind(traffic: LaneTraffic, idm: IDM, follower: Tensor, lead: Tensor) -> Tensor:
@@ -124,15 +47,11 @@ def acceleration_behind(traffic: LaneTraffic, idm: IDM, follower: Tensor, lead: 
     return torch.where(follower < 0, 0.0, idm.acceleration(speed, Lead(gap, closing_speed)))
 
 
-SETTLED = 0.5
-"""A change ends when the centre of the vehicle is this close to the middle of its target lane [m]."""
-
-
 @dataclass(frozen=True)
 class LaneChangingDriver:
     """IDM along the road, MOBIL for the lane, and the lane keeping of `rare_envs.control.idm` towards it.
 
-    Vehicles decide once in `Mobil.delay`, each in a phase of its own that follows from its place when it is first
+    Vehicles decide once in `delay`, each in a phase of its own that follows from its place when it is first
     driven, as in HighwayEnv. A change under way is not reconsidered until it ends (the centre is within `SETTLED` of
     the middle of the target lane) or becomes unsafe by MOBIL's criterion of safety while the centre is still in the old
     lane: then the vehicle goes back. HighwayEnv's changes end when the centre crosses the line, and are taken back
@@ -140,13 +59,29 @@ class LaneChangingDriver:
 
     Along the road a vehicle follows the nearest ahead in its lane, in its target lane, and in its way (bodies overlap
     across the road), whichever asks for more braking. A vehicle that is changing counts in both lanes, so others make
-    room as for one that signals.
+    room as for one that signals. HighwayEnv's `IDMVehicle` has politeness 0, a threshold of 0.2 m/s^2, at most 2 m/s^2
+    of braking imposed, a reach of 1 m and no safety of its own, and takes the right one of two lanes that are worth it.
 
     Nothing is random, and nothing of it is part of x: there are no weights and no noise. Decisions jump, so f does too.
     """
 
     idm: IDM = field(default_factory=IDM)
-    mobil: Mobil = field(default_factory=Mobil)
+    politeness: float = 0.25
+    """p: weight of the others' accelerations; the middle of the range of 0 to 0.5 that Treiber calls realistic on his
+    page about the model."""
+    threshold: float = 0.1
+    """a_th [m/s^2], as b_safe Kesting et al.'s (2007)."""
+    safe_deceleration: float = 4.0
+    """b_safe [m/s^2]."""
+    delay: float = 1.0
+    """Time between two decisions of a vehicle [s], HighwayEnv's; the paper decides at every step."""
+    own_safety: bool = True
+    """Whether the changing vehicle's own braking is limited by b_safe too: a vehicle that is abreast with its centre
+    ahead is no follower, so that the paper's criterion does not see it."""
+    reach: float = 0.0
+    """Distance beyond a lane's edge [m] up to which a centre counts in the lane; in HighwayEnv 1 m."""
+    least_speed: float = 1.0
+    """Speed [m/s] below which nobody begins a change, HighwayEnv's."""
     lateral_speed: float = 1.0
     """Largest speed across the road that is aimed at [m/s]: the median of the largest ones in 372 recorded changes on
     US 101 (NGSIM). HighwayEnv has no limit, so that its changes take a second."""
@@ -158,8 +93,11 @@ class LaneChangingDriver:
     """Whether its operations may be recorded: nothing about it changes."""
 
     def __post_init__(self) -> None:
-        if not self.lateral_speed > 0:
-            raise ValueError(f"Expected a positive lateral speed in m/s, got {self.lateral_speed!r}.")
+        if not (self.safe_deceleration > 0 and self.lateral_speed > 0 and self.threshold >= 0 and self.delay >= 0):
+            raise ValueError(
+                "Expected a positive safe deceleration and lateral speed and a threshold and a delay that are not "
+                f"negative, got {self.safe_deceleration}, {self.lateral_speed}, {self.threshold} and {self.delay}."
+            )
 
     def begin(self, draws: Tensor) -> Tensor:
         """Return the memory before the first decision: (B, M, 2, 2) -> (B, M, 2)."""
@@ -173,34 +111,62 @@ class LaneChangingDriver:
         lane, y = traffic.lane, traffic.y[:, who]
         new = memory[..., 0] == 0
         target = torch.where(new, lane[:, who], memory[..., 0].long() - 1)
-        phase = torch.remainder((traffic.x[:, who] + y) * torch.pi, max(self.mobil.delay, 1e-6))
+        phase = torch.remainder((traffic.x[:, who] + y) * torch.pi, max(self.delay, 1e-6))
         timer = torch.where(new, phase, memory[..., 1]) + dt
-        target, decided = self._choose_lanes(traffic, who, lane, target, timer >= self.mobil.delay)
+        target, decided = self._choose_lanes(traffic, who, lane, target, timer >= self.delay)
         timer = torch.where(decided, 0.0, timer)
         offset = (y - traffic.centre(target)).clamp(-self.lateral_speed * TAU_LATERAL, self.lateral_speed * TAU_LATERAL)
         turn = yaw_rate_towards(offset, traffic.heading[:, who], traffic.speed[:, who]).clamp(*self.yaw_rate)
         action = torch.stack((self._accelerate(traffic, who, lane, target), turn), dim=-1)
         return action, torch.stack(((target + 1).to(timer.dtype), timer), dim=-1)
 
+    def judge_changes(self, traffic: LaneTraffic, who: slice, target: Tensor) -> tuple[Tensor, Tensor]:
+        """Return MOBIL's incentive [m/s^2], -inf without a lane, and safety of changes left and right, (B, M, 2).
+
+        All V vehicles move to lanes `target` (B, V). Accelerations are not limited to what the brakes can do, here and
+        in the paper.
+        """
+        ahead, behind, exists = find_neighbours(traffic, who, target, self.reach)
+        unlimited = replace(self.idm, max_deceleration=_NO_LIMIT)
+        batch, m, _ = ahead.shape
+        own = torch.arange(traffic.x.shape[1], device=traffic.x.device)[who].view(1, m, 1).expand(batch, m, 2)
+        lead, follower = ahead[..., _SIDES], behind[..., _SIDES]
+        old_lead, old_follower = ahead[..., OWN, None], behind[..., OWN, None]
+
+        def by(follower: Tensor, lead: Tensor) -> Tensor:
+            return acceleration_behind(traffic, unlimited, follower, lead)
+
+        after = by(own, lead)
+        of_follower = by(follower, own)
+        gain = after - by(own[..., :1], old_lead)
+        others = of_follower - by(follower, lead) + by(old_follower, old_lead) - by(old_follower, own[..., :1])
+        exists = exists[..., _SIDES]
+        incentive = torch.where(exists, gain + self.politeness * others, -torch.inf)
+        safe = exists & (of_follower >= -self.safe_deceleration)
+        if self.own_safety:
+            safe = safe & (after >= -self.safe_deceleration)
+        return incentive, safe
+
     def _choose_lanes(
         self, traffic: LaneTraffic, who: slice, lane: Tensor, target: Tensor, may_decide: Tensor
     ) -> tuple[Tensor, Tensor]:
         """Return the new target lanes (B, M), and who has decided or gone back."""
         own = lane[:, who]
-        choice = self.mobil.choose(traffic, who, self.idm, _all_targets(lane, who, target))
+        incentive, safe = self.judge_changes(traffic, who, _all_targets(lane, who, target))
         side = target - own
-        gone_back = (side != 0) & ~_is_safe(choice, side)
+        towards = safe.gather(2, (side > 0).long()[..., None])[..., 0]
+        gone_back = (side != 0) & ~(towards & (side.abs() == 1))  # a change by more lanes than one is not safe
         settled = (side == 0) & ((traffic.y[:, who] - traffic.centre(target)).abs() <= SETTLED)
         decides = may_decide & settled
-        best = torch.where(choice.wanted, choice.incentive, -torch.inf).max(dim=-1)
-        moves = decides & (best.values > -torch.inf) & (traffic.speed[:, who] >= self.mobil.least_speed)
+        best = torch.where(safe & (incentive >= self.threshold), incentive, -torch.inf).max(dim=-1)
+        moves = decides & (best.values > -torch.inf) & (traffic.speed[:, who] >= self.least_speed)
         target = torch.where(gone_back, own, torch.where(moves, own + 2 * best.indices - 1, target))
         return target, gone_back | decides
 
     def _accelerate(self, traffic: LaneTraffic, who: slice, lane: Tensor, target: Tensor) -> Tensor:
         """Return accelerations (B, M) behind the nearest ahead in the lane, in the target lane and in the way."""
         targets = _all_targets(lane, who, target)
-        own = find_neighbours(traffic, who, targets).lead
+        own, _, _ = find_neighbours(traffic, who, targets)
         side = (target - lane[:, who]).clamp(-1, 1)
         in_target = own.gather(2, (side + OWN)[..., None])
         ahead = traffic.x[:, None, :] - traffic.x[:, who, None]
@@ -218,9 +184,3 @@ def _all_targets(lane: Tensor, who: slice, target: Tensor) -> Tensor:
     targets = lane.clone()
     targets[:, who] = target
     return targets
-
-
-def _is_safe(choice: LaneChoice, side: Tensor) -> Tensor:
-    """Return whether a change by -1 or 1 lanes is safe, (B, M); one by more lanes is not."""
-    towards = choice.safe.gather(2, (side > 0).long()[..., None])[..., 0]
-    return towards & (side.abs() == 1)

@@ -33,22 +33,11 @@ __all__ = [
 ]
 
 _LAZY = {
-    "LANE_WIDTH": "rare_envs.traffic.state",
-    "VEHICLE_LENGTH": "rare_envs.traffic.state",
-    "VEHICLE_WIDTH": "rare_envs.traffic.state",
-    "Others": "rare_envs.scenarios.base",
-    "Parameter": "rare_envs.distributions.space",
-    "ReferenceLine": "rare_envs.traffic.road",
-    "Road": "rare_envs.traffic.road",
-    "Scenario": "rare_envs.scenarios.base",
-    "State": "rare_envs.traffic.state",
-    "columns": "rare_envs.scenarios.base",
-    "drive_points": "rare_envs.scenarios.base",
-    "i80": "rare_envs.traffic.road",
-    "keep_straight": "rare_envs.scenarios.base",
-    "load_base": "rare_envs.scenarios.base",
-    "straight": "rare_envs.traffic.road",
+    "rare_envs.distributions.space": "Parameter",
+    "rare_envs.scenarios.base": "Others Scenario columns drive_points keep_straight load_base",
+    "rare_envs.traffic.road": "ReferenceLine Road i80 straight",
+    "rare_envs.traffic.state": "LANE_WIDTH VEHICLE_LENGTH VEHICLE_WIDTH State",
 }
-"""Names that need torch, which `import rare_envs` must not import."""
+"""Names that need torch, which `import rare_envs` must not import, by their modules."""
 
-__getattr__ = make_lazy_getattr(__name__, _LAZY)
+__getattr__ = make_lazy_getattr(__name__, {name: module for module, names in _LAZY.items() for name in names.split()})

@@ -9,7 +9,7 @@ from functools import lru_cache, partial
 from importlib import resources
 from os import PathLike
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol, cast, runtime_checkable
+from typing import Any, TypeAlias, cast
 
 import numpy as np
 import torch
@@ -21,28 +21,10 @@ from rare_envs.distributions.space import Distribution, Parameter
 from rare_envs.files import parse_json_object
 from rare_envs.plugins import did_you_mean
 from rare_envs.traffic.road import Road
-from rare_envs.traffic.state import State, point_mass
+from rare_envs.traffic.state import Motion, State, point_mass
 
-
-class Others(NamedTuple):
-    """Vehicles 1 to N - 1 after a tick; shapes (B, N - 1).
-
-    Example:
-        >>> one = torch.full((1, 1), 12.0)
-        >>> Others(x=one, y=0 * one, heading=0 * one, speed=one).speed.tolist()
-        [[12.0]]
-    """
-
-    x: Tensor
-    """Centres along the road [m]."""
-    y: Tensor
-    """Centres across the road [m], positive to the right."""
-    heading: Tensor
-    """Headings relative to the road [rad]."""
-    speed: Tensor
-    """Speeds along the headings [m/s]."""
-
-
+Others = Motion
+"""Vehicles 1 to N - 1 after a tick; shapes (B, N - 1)."""
 DATA = resources.files("rare_envs") / "data"
 """Files that come with the package."""
 SPEED_RANGE = ("m/s", 0.0, 45.0)
@@ -101,14 +83,15 @@ class Scenario:
                 f"Expected vehicles with names, got {self.vehicle_names!r} in the scenario {self.name!r}; an empty one "
                 "has no label and calls no agent."
             )
-        names = tuple(p.name for p in self.parameters)
-        labels = self.labels or tuple(_in_words(vehicle) for vehicle in self.vehicle_names)
+        names = [p.name for p in self.parameters]
+        words = (vehicle.replace("_", " ") for vehicle in self.vehicle_names)
+        labels = self.labels or tuple(each if each[-1].isdigit() else f"the {each}" for each in words)
         object.__setattr__(self, "labels", labels)
         for what, right in {
             'vehicles with different names, "ego" first': self.vehicle_names[:1] == ("ego",)
-            and _distinct(self.vehicle_names),
-            "as many labels as vehicles": len(labels) == len(self.vehicle_names),
-            "parameters with different names, none of them 'x'": names and _distinct(names) and "x" not in names,
+            and len(set(self.vehicle_names)) == self.vehicles,
+            "as many labels as vehicles": len(labels) == self.vehicles,
+            "parameters with different names, none of them 'x'": 0 < len(names) == len({*names, "x"}) - 1,
             "parameters with low < high": all(p.low < p.high and p.size >= 1 for p in self.parameters),
             "at least one base distribution": len(self.bases) > 0,
             "a horizon in s": math.isfinite(self.horizon) and self.horizon > 0,
@@ -137,17 +120,6 @@ class Scenario:
         return [parameter for parameter in self.parameters for _ in range(parameter.size)]
 
 
-def _distinct(names: tuple[str, ...]) -> bool:
-    """Return whether no name stands twice."""
-    return len(set(names)) == len(names)
-
-
-def _in_words(vehicle: str) -> str:
-    """Return a vehicle's name in words: "the cutter", "vehicle 1"."""
-    words = vehicle.replace("_", " ")
-    return words if words[-1].isdigit() else f"the {words}"
-
-
 def columns(*values: Tensor) -> Tensor:
     """Return columns (B,) side by side as (B, N), each contiguous in memory: ticks work on one vehicle's at a time.
 
@@ -156,6 +128,11 @@ def columns(*values: Tensor) -> Tensor:
         [[1.0, 3.0], [2.0, 4.0]]
     """
     return torch.stack(values).T
+
+
+def keep_lane(state: State, action: Tensor, dt: float) -> Others:
+    """Move vehicles 1 to N - 1 straight on with the accelerations of their drivers, actions (B, N - 1, 2)."""
+    return keep_straight(state, action[..., 0], dt)
 
 
 def keep_straight(state: State, acceleration: Tensor | float, dt: float) -> Others:
@@ -206,14 +183,6 @@ _TRIAL_DRAWS = 1000
 DISTRIBUTION_METHODS = ("sample", "log_prob", "to_standard_normal", "from_standard_normal")
 
 
-@runtime_checkable
-class TextFile(Protocol):
-    """A file of the package or a path."""
-
-    def read_text(self, encoding: str | None = None) -> str:
-        """Return the content."""
-
-
 def load_base(scenario: Scenario, base: str | PathLike[str] | Distribution | None = None) -> Distribution:
     """Return the base distribution of a scenario.
 
@@ -236,66 +205,58 @@ def load_base(scenario: Scenario, base: str | PathLike[str] | Distribution | Non
         3
     """
     base = scenario.default_base if base is None else base
-    if not isinstance(base, str | PathLike):
-        return _check_object(scenario, base)
-    source, names = str(base), tuple(p.name for p in scenario.parameters)
-    found = scenario.bases.get(source, Path(base))
+    found: Any = scenario.bases.get(str(base), Path(base)) if isinstance(base, str | PathLike) else base
+    where = (scenario.name, tuple(p.name for p in scenario.parameters), str(base))
     if isinstance(found, Mapping):
         box = scenario.column_parameters
-        own = {"names": list(names), "low": [p.low for p in box], "high": [p.high for p in box]}
-        return _fit_to(scenario, source, _read(scenario.name, names, source, {**own, **found}))
-    if not isinstance(found, TextFile):
+        own = {"names": list(where[1]), "low": [p.low for p in box], "high": [p.high for p in box]}
+        return _fit_to(scenario, str(base), _read(*where, {**own, **found}))
+    if not callable(getattr(found, "read_text", None)):
         return _check_object(scenario, found)
     if isinstance(found, Path) and not found.is_file():
         raise ValueError(
-            f"No base distribution {source!r} for {scenario.name}"
-            f"{did_you_mean(source, scenario.bases)}: neither one of {', '.join(scenario.bases)} nor a file."
+            f"No base distribution {str(base)!r} for {scenario.name}"
+            f"{did_you_mean(str(base), scenario.bases)}: neither one of {', '.join(scenario.bases)} nor a file."
         )
     try:
         text = found.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
         raise ValueError(f"Cannot read the base distribution {found}: {error}.") from None
-    return _fit_to(scenario, source, _read_text(scenario.name, names, source, text))
+    return _fit_to(scenario, str(base), _read_text(*where, text))
+
+
+Known: TypeAlias = FileDistribution | FittedDistribution
 
 
 @lru_cache(maxsize=64)
-def _read_text(scenario: str, wanted: tuple[str, ...], source: str, text: str) -> FileDistribution | FittedDistribution:
+def _read_text(scenario: str, names: tuple[str, ...], source: str, text: str) -> Known:
     """Return the distribution of a text. It is kept: a file has some 100 refits, an environment is made often."""
-    return _read(scenario, wanted, source, parse_json_object(text, f"Base distribution {source}"))
+    return _read(scenario, names, source, parse_json_object(text, f"Base distribution {source}"))
 
 
-def _read(
-    scenario: str, wanted: tuple[str, ...], source: str, data: Mapping[str, Any]
-) -> FileDistribution | FittedDistribution:
+def _read(scenario: str, names: tuple[str, ...], source: str, data: Mapping[str, Any]) -> Known:
     """Return the distribution of a file, a fitted one if the file says what it was fitted to."""
-    names = data.get("names")
-    if names != list(wanted):
+    if data.get("names") != list(names):
         raise ValueError(
             f"Base distribution {source} does not fit {scenario}: "
-            f"expected names {list(wanted)} in this order, got {names}."
+            f"expected names {list(names)} in this order, got {data.get('names')}."
         )
     try:
-        if any(key in data for key in FITTED_KEYS):
-            return FittedDistribution.from_dict(data)
-        return read_distribution(data)
+        fitted = any(key in data for key in FITTED_KEYS)
+        return FittedDistribution.from_dict(data) if fitted else read_distribution(data)
     except ValueError as error:
         raise ValueError(f"Base distribution {source}: {error}") from None
 
 
-def _fit_to(scenario: Scenario, source: str, distribution: FileDistribution | FittedDistribution) -> Distribution:
+def _fit_to(scenario: Scenario, source: str, distribution: Known) -> Distribution:
     """Return the distribution as one of a scenario, with its size and range checked."""
-    columns = len(scenario.column_parameters)
-    if distribution.dim != columns:
-        raise ValueError(
-            f"Base distribution {source} does not fit {scenario.name}: "
-            f"expected {columns} columns, got {distribution.dim}."
-        )
-    for p, low, high in zip(scenario.column_parameters, distribution.low, distribution.high, strict=True):
+    box, wrong = scenario.column_parameters, f"Base distribution {source} does not fit {scenario.name}: "
+    if distribution.dim != len(box):
+        raise ValueError(f"{wrong}expected {len(box)} columns, got {distribution.dim}.")
+    for p, low, high in zip(box, distribution.low, distribution.high, strict=True):
         if low < p.low or high > p.high:
-            raise ValueError(
-                f"Base distribution {source} gives {p.name} the range [{low:g}, {high:g}] {p.unit}; {scenario.name} "
-                f"allows [{p.low:g}, {p.high:g}]."
-            )
+            allowed = f"[{p.low:g}, {p.high:g}] {p.unit}"
+            raise ValueError(f"{wrong}expected {p.name} within {allowed}, got [{low:g}, {high:g}].")
     if isinstance(distribution, FittedDistribution):
         return replace(distribution, siblings=partial(load_base, scenario))
     return distribution
@@ -336,34 +297,24 @@ def try_scenario(scenario: Scenario) -> None:
     for name in scenario.bases:
         load_base(scenario, name)
     x = torch.from_numpy(load_base(scenario).sample(_DRAWS, np.random.default_rng(0))).float()
-    n = scenario.vehicles
-    state = scenario.initial(x)
+    state, wrong, n = scenario.initial(x), f"Scenario {scenario.name!r}: ", scenario.vehicles
     if not isinstance(state, State):
-        raise ValueError(
-            f"Scenario {scenario.name!r}: expected initial(x) to give a State, got {type(state).__name__}."
-        )
-    _check(scenario, "initial(x)", state[:4], n)
+        raise ValueError(f"{wrong}expected initial(x) to give a State, got {type(state).__name__}.")
     if len(state.theta) != _DRAWS:
-        raise ValueError(
-            f"Scenario {scenario.name!r}: expected theta of {_DRAWS} rows, got {tuple(state.theta.shape)}."
-        )
-    _check(scenario, "others(state, dt)", scenario.others(state, _DT), n - 1)
+        raise ValueError(f"{wrong}expected theta of {_DRAWS} rows, got {tuple(state.theta.shape)}.")
+    _check(wrong, "initial(x)", state[:4], n)
     action = torch.zeros_like(state.x[:, 1:, None]).expand(-1, -1, 2)
-    _check(scenario, "driven(state, action, dt)", scenario.driven(state, action, _DT), n - 1)
+    _check(wrong, "others(state, dt)", scenario.others(state, _DT), n - 1)
+    _check(wrong, "driven(state, action, dt)", scenario.driven(state, action, _DT), n - 1)
 
 
-def _check(scenario: Scenario, what: str, fields: tuple[Tensor, ...], vehicles: int) -> None:
+def _check(wrong: str, what: str, fields: tuple[Tensor, ...], vehicles: int) -> None:
     """Check that fields are tensors (B, vehicles) of finite numbers."""
-    if not isinstance(fields, tuple) or not all(isinstance(field, Tensor) for field in fields[:4]) or len(fields) < 4:
-        raise ValueError(
-            f"Scenario {scenario.name!r}: expected {what} to give x, y, heading and speed, as State or Others; "
-            f"got {fields!r}."
-        )
+    if not isinstance(fields, tuple) or len(fields) < 4 or not all(isinstance(field, Tensor) for field in fields[:4]):
+        raise ValueError(f"{wrong}expected {what} to give x, y, heading and speed, as State or Others; got {fields!r}.")
     for name, field in zip(State._fields, fields, strict=False):
         if field.shape != (_DRAWS, vehicles):
-            raise ValueError(
-                f"Scenario {scenario.name!r}: expected {name} of shape (B, {vehicles}) from {what}, got "
-                f"{tuple(field.shape)} for B = {_DRAWS}."
-            )
+            shapes = f"{name} of shape (B, {vehicles}) from {what}, got {tuple(field.shape)} for B = {_DRAWS}"
+            raise ValueError(f"{wrong}expected {shapes}.")
         if not bool(torch.isfinite(field).all()):
-            raise ValueError(f"Scenario {scenario.name!r}: {name} from {what} is not finite.")
+            raise ValueError(f"{wrong}{name} from {what} is not finite.")

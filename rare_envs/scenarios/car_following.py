@@ -5,7 +5,7 @@ from torch import Tensor
 
 from rare_envs.devices import scalars
 from rare_envs.distributions.space import Parameter
-from rare_envs.scenarios.base import DATA, SPEED_RANGE, Others, Scenario, columns, keep_straight
+from rare_envs.scenarios.base import DATA, SPEED_RANGE, Others, Scenario, columns, keep_lane
 from rare_envs.traffic.road import straight
 from rare_envs.traffic.state import VEHICLE_LENGTH, State
 
@@ -27,11 +27,6 @@ def others(state: State, dt: float) -> Others:
     """Move the lead at its speed."""
     speed, (tick,) = state.speed[:, 1:], scalars((dt,), state.speed)
     return Others(state.x[:, 1:] + speed * tick, state.y[:, 1:], state.heading[:, 1:], speed)
-
-
-def driven(state: State, action: Tensor, dt: float) -> Others:
-    """Move the lead with the acceleration of its driver, in the middle of the lane."""
-    return keep_straight(state, action[..., 0], dt)
 
 
 CAR_FOLLOWING = Scenario(
@@ -57,5 +52,5 @@ CAR_FOLLOWING = Scenario(
     },
     initial=initial,
     others=others,
-    driven=driven,
+    driven=keep_lane,
 )

@@ -29,21 +29,11 @@ def initial(x: Tensor) -> State:
 
     Columns of x: ego_speed, cut_in_speed, lead_speed [m/s], cut_in_gap (ego to cutter), lead_gap (cutter to lead),
     lateral_offset [m] and, of `CutIn-v1`, duration [s]. Vehicles: 0 ego, 1 cutter, 2 lead. Columns of theta: start of
-    the cutter's path [m], its length [m], lateral offset [m], the cutter's desired speed [m/s].
+    the cutter's path [m], its length (the cutter's way in its duration at its initial speed) [m], lateral offset [m],
+    the cutter's desired speed [m/s].
     """
-    return _place_vehicles(*x.unbind(dim=1))
-
-
-def _place_vehicles(
-    ego_speed: Tensor,
-    cut_in_speed: Tensor,
-    lead_speed: Tensor,
-    cut_in_gap: Tensor,
-    lead_gap: Tensor,
-    lateral_offset: Tensor,
-    duration: Tensor | float = CUT_IN_DURATION,
-) -> State:
-    """Return the state at time 0; the path is as long as the cutter's way in `duration` at its initial speed."""
+    ego_speed, cut_in_speed, lead_speed, cut_in_gap, lead_gap, lateral_offset, *durations = x.unbind(dim=1)
+    duration = durations[0] if durations else CUT_IN_DURATION
     zero = torch.zeros_like(ego_speed)
     cutter_x = cut_in_gap + VEHICLE_LENGTH
     length = (cut_in_speed * duration).clamp(min=CUT_IN_MIN_LENGTH)

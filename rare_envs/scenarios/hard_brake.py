@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from rare_envs.distributions.space import Parameter
-from rare_envs.scenarios.base import DATA, Others, Scenario, columns, keep_straight
+from rare_envs.scenarios.base import DATA, Others, Scenario, columns, keep_lane, keep_straight
 from rare_envs.traffic.road import straight
 from rare_envs.traffic.state import VEHICLE_LENGTH, State
 
@@ -47,11 +47,6 @@ def others(state: State, dt: float) -> Others:
     return keep_straight(state, -state.theta, dt)
 
 
-def driven(state: State, action: Tensor, dt: float) -> Others:
-    """Move the lead with the acceleration of its driver, in the middle of the lane."""
-    return keep_straight(state, action[..., 0], dt)
-
-
 HARD_BRAKE = Scenario(
     name="hard_brake",
     road=straight(1),
@@ -66,5 +61,5 @@ HARD_BRAKE = Scenario(
     bases={"us101": DATA / "hard_brake_us101.json", "us101-all-brakings": US101},
     initial=initial,
     others=others,
-    driven=driven,
+    driven=keep_lane,
 )

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping
-from typing import TYPE_CHECKING
+from collections import UserDict
+from typing import TYPE_CHECKING, Any, cast
 
 from rare_envs.plugins import did_you_mean, import_module, import_object
 
@@ -12,39 +12,15 @@ if TYPE_CHECKING:
     from rare_envs.scenarios.base import Scenario
 
 
-class Registry(Mapping[str, "Scenario"]):
-    """Environment ids to scenarios; a file is imported, and torch with it, when its scenario is first asked for."""
-
-    def __init__(self, entries: Mapping[str, str]) -> None:
-        """Register ids with the places of their scenarios, "module:name"."""
-        self._entries: dict[str, str | Scenario] = dict(entries)
+class Registry(UserDict[str, Any]):
+    """Environment ids to scenarios, or to their places, "module:name", which are imported when first asked for."""
 
     def __getitem__(self, env_id: str) -> Scenario:
         """Return the scenario of an id."""
-        entry = self._entries[env_id]
+        entry = self.data[env_id]
         if isinstance(entry, str):
-            entry = self._entries[env_id] = import_object(entry, f"the environment {env_id!r}")
-        return entry
-
-    def __contains__(self, env_id: object) -> bool:
-        """Return whether there is a scenario of an id; it is not imported."""
-        return env_id in self._entries
-
-    def __iter__(self) -> Iterator[str]:
-        """Iterate over the ids in the order of their registration."""
-        return iter(self._entries)
-
-    def __len__(self) -> int:
-        """Return the number of scenarios."""
-        return len(self._entries)
-
-    def add(self, env_id: str, scenario: Scenario) -> None:
-        """Add a scenario, or replace one."""
-        self._entries[env_id] = scenario
-
-    def remove(self, env_id: str) -> None:
-        """Forget a scenario."""
-        del self._entries[env_id]
+            entry = self.data[env_id] = import_object(entry, f"the environment {env_id!r}")
+        return cast("Scenario", entry)
 
 
 SCENARIOS = Registry(

@@ -6,8 +6,8 @@ gives the reasons.
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
-from functools import cached_property, lru_cache
+from dataclasses import dataclass
+from functools import lru_cache
 from typing import ClassVar, NamedTuple
 
 import numpy as np
@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from rare_envs.distributions.beta import BetaDistribution
-from rare_envs.distributions.coordinates import FloatArray
+from rare_envs.distributions.coordinates import Coordinates
 from rare_envs.distributions.mixture import CoordinateMixture
 from rare_envs.distributions.space import Distribution, Parameter
 
@@ -145,57 +145,6 @@ def pixels(camera: Camera, device: torch.device) -> Pixels:
         )
 
 
-@dataclass(frozen=True)
-class LogNormalDistribution:
-    """A positive variable whose logarithm is normal, cut to a range; to cross-entropy a block that moves its median."""
-
-    median: float
-    spread: float
-    """Standard deviation of the logarithm."""
-    low: float
-    high: float
-    dim: ClassVar[int] = 1
-
-    @cached_property
-    def _log_normal(self) -> CoordinateMixture:
-        return CoordinateMixture.from_dict(
-            {
-                "weights": [1.0],
-                "means": [[math.log(self.median)]],
-                "covariances": [[[self.spread**2]]],
-                "low": [self.low],
-                "high": [self.high],
-                "coordinates": ["log"],
-            }
-        )
-
-    def sample(self, n: int, rng: np.random.Generator) -> FloatArray:
-        """Draw independent points, shape (n, 1)."""
-        return self._log_normal.sample(n, rng)
-
-    def log_prob(self, x: FloatArray) -> FloatArray:
-        """Return the log density, (n, 1) -> (n,); -inf outside the range."""
-        return self._log_normal.log_prob(x)
-
-    def to_standard_normal(self, x: FloatArray) -> FloatArray:
-        """Map to standard normal space, (n, 1) -> (n, 1)."""
-        return self._log_normal.to_standard_normal(x)
-
-    def from_standard_normal(self, u: FloatArray) -> FloatArray:
-        """Map from standard normal space, (n, 1) -> (n, 1)."""
-        return self._log_normal.from_standard_normal(u)
-
-    def project(self, x: FloatArray, weights: FloatArray, alpha: float) -> "LogNormalDistribution":
-        """Return it with the median moved towards that of weighted points, by alpha of the way in logarithms."""
-        logs = np.log(np.clip(x[:, 0], self.low, self.high))
-        wanted = float(np.sum(weights * logs) / np.sum(weights))
-        return replace(self, median=math.exp((1.0 - alpha) * math.log(self.median) + alpha * wanted))
-
-    def widen(self, factor: float) -> "LogNormalDistribution":
-        """Return it with a spread larger by a factor."""
-        return replace(self, spread=self.spread * factor)
-
-
 class WeatherBeta(BetaDistribution):
     """Independent Beta variables; a cross-entropy search keeps their shape parameters from 1 to 7."""
 
@@ -210,8 +159,13 @@ CONDITIONS = (
 """Parameters of the scenario with `weather=True`, behind its own."""
 SENSOR_NOISE = Parameter("sensor_noise", "levels", 0.0, 10.0, "standard deviation of the noise of a pixel, of 255")
 """One more, unless `noise=False`."""
-FOG_DISTRIBUTION = LogNormalDistribution(1.9e-4, 1.2, 1e-5, 0.3)
-"""Median visibility 16 km; less than 1 km, which is fog by definition, in 1 of 100 cases."""
+FOG_DISTRIBUTION = CoordinateMixture(
+    Coordinates(np.array([1e-5]), np.array([0.3]), ("log",)),
+    weights=np.ones(1),
+    means=np.array([[math.log(1.9e-4)]]),
+    covariances=np.array([[[1.2**2]]]),
+)
+"""Log-normal: median visibility 16 km; less than 1 km, which is fog by definition, in 1 of 100 cases."""
 SUN_DISTRIBUTION = WeatherBeta(*map(np.array, ([1.1, 1.0], [1.58, 1.0], [5.0, -180.0], [76.0, 180.0])))
 """Elevation as over the year's days at the latitude of the I-80 site, azimuth uniform."""
 SENSOR_NOISE_DISTRIBUTION = WeatherBeta(*map(np.array, ([2.0], [5.0], [0.0], [10.0])))

@@ -18,6 +18,7 @@ import torch
 from torch import Tensor
 
 from rare_envs.devices import can_look, constant, indices
+from rare_envs.traffic.bodies import rotate
 from rare_envs.traffic.road import Road, WorldPose
 from rare_envs.traffic.state import VEHICLE_LENGTH, VEHICLE_WIDTH, State
 
@@ -63,24 +64,17 @@ class Bodies(NamedTuple):
     """[m]."""
 
 
-class Readings(NamedTuple):
-    """Measurements of M observers in B scenes."""
-
-    range: Tensor
-    """Distance to the nearest body along each beam [m], 0 to `MAX_RANGE`, shape (B, M, 20)."""
-    rate: Tensor
-    """Its velocity less the observer's, along the beam [m/s], shape (B, M, 20); negative while closing."""
-
-
 def beam_angles(like: Tensor) -> Tensor:
     """Return the angles of the beams relative to the heading [rad], shape (20,), with dtype and device of a tensor."""
     return FIRST_BEAM_ANGLE + BEAM_SPACING * torch.arange(BEAMS, dtype=like.dtype, device=like.device)
 
 
-def sense(bodies: Bodies, observers: int | None = None) -> Readings:
-    """Return what lidars of the first M of V vehicles in B scenes measure (of all for None), differentiable in them.
+def sense(bodies: Bodies, observers: int | None = None) -> tuple[Tensor, Tensor]:
+    """Return ranges [m] and rates [m/s] of the lidars of the first M of V vehicles (of all for None), (B, M, 20).
 
-    Vehicles that are not there are parked further than `MAX_RANGE` from all others.
+    A range is the distance to the nearest body along a beam, at most `MAX_RANGE`, a rate its velocity less the
+    observer's along the beam, negative while closing. Both are differentiable. Vehicles that are not there are parked
+    further than `MAX_RANGE` from all others.
     """
     bodies = Bodies(*(field.expand_as(bodies.x) for field in bodies))
     m = bodies.x.shape[1] if observers is None else observers
@@ -100,17 +94,17 @@ def sense(bodies: Bodies, observers: int | None = None) -> Readings:
         heading = of_target(bodies.heading)
         dx, dy = of_target(bodies.x) - bodies.x[:, :m, None], of_target(bodies.y) - bodies.y[:, :m, None]
         distance, _ = _crossing(dx, dy, heading, angle - heading, of_target(bodies.length), of_target(bodies.width))
-    return Readings(torch.where(met, distance.clamp(0.0, MAX_RANGE), MAX_RANGE), rate)
+    return torch.where(met, distance.clamp(0.0, MAX_RANGE), MAX_RANGE), rate
 
 
 def _crossing(
     dx: Tensor, dy: Tensor, heading: Tensor, turn: Tensor, length: Tensor, width: Tensor
 ) -> tuple[Tensor, Tensor]:
     """Return where a beam enters and leaves a box, as distances along the beam (slab method; Kay and Kajiya, 1986)."""
-    cos, sin = torch.cos(heading), torch.sin(heading)
+    ahead, aside = rotate(dx, dy, torch.cos(heading), torch.sin(heading))
     along, across = _away_from_zero(torch.cos(turn)).reciprocal(), _away_from_zero(torch.sin(turn)).reciprocal()
-    middle_along, half_along = (dx * cos + dy * sin) * along, 0.5 * length * along.abs()
-    middle_across, half_across = (dy * cos - dx * sin) * across, 0.5 * width * across.abs()
+    middle_along, half_along = ahead * along, 0.5 * length * along.abs()
+    middle_across, half_across = aside * across, 0.5 * width * across.abs()
     enters = torch.maximum(middle_along - half_along, middle_across - half_across)
     leaves = torch.minimum(middle_along + half_along, middle_across + half_across)
     return enters, leaves
@@ -237,7 +231,6 @@ class OnRoad(NamedTuple):
 def perceive(bodies: Bodies, on_road: OnRoad, observers: int | None = None) -> Tensor:
     """Return the 51 `FEATURES` of the first M of V vehicles in B scenes (of all for None), (B, M, 51), SI units."""
     m = bodies.x.shape[1] if observers is None else observers
-    readings = sense(bodies, m)
     zero = torch.zeros_like(bodies.x)
     core = (
         on_road.offset,
@@ -252,7 +245,7 @@ def perceive(bodies: Bodies, on_road: OnRoad, observers: int | None = None) -> T
         zero,
         zero,
     )
-    return torch.cat((torch.stack(core, dim=-1)[:, :m], readings.range, readings.rate), dim=-1)
+    return torch.cat((torch.stack(core, dim=-1)[:, :m], *sense(bodies, m)), dim=-1)
 
 
 def perceive_traffic(state: State, road: Road, pose: WorldPose | None = None) -> Tensor:

@@ -12,12 +12,14 @@ of a box in the box's own frame (Kay and Kajiya 1986); the nearest box wins.
 """
 
 import math
-from typing import Any, NamedTuple
+from operator import itemgetter
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from rare_envs.sensors.camera import Camera, CameraContext, Pixels, Weather, pixels
+from rare_envs.traffic.bodies import rotate
 from rare_envs.traffic.road import Road
 from rare_envs.traffic.state import VEHICLE_LENGTH, VEHICLE_WIDTH, State, map_tensors
 
@@ -254,23 +256,16 @@ Candidates = tuple[Tensor, Tensor, Tensor]
 """Pixels that a box or its shadow may cover, (C,): number of the box, frame by frame, row and number of the pixel."""
 
 
-def project_points(camera: Camera, forward: Tensor, right: Tensor, up: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return how far points, ahead, to the right and above ground, are right of the camera's axis, below and along it.
-
-    All in [m]. One at (r, d, z) is seen in column `width` / 2 + `focal` r / z and row `height` / 2 + `focal` d / z;
-    (0, 0) is the picture's upper left corner.
-    """
-    cos, sin = math.cos(camera.pitch), math.sin(camera.pitch)
-    above = up - camera.mount_height
-    return right, -forward * sin - above * cos, forward * cos - above * sin
-
-
 def find_candidates(camera: Camera, forward: Tensor, right: Tensor, up: Tensor, first_row: int = 0) -> Candidates:
     """Return the pixels, from a first row on, in the rectangles around the convex hulls of sets of K points (T, N, K).
 
-    What is behind the camera is cut off at a plane just ahead of it, where the hull is no wider than the points are.
+    A point d below, z along and r to the right of the camera's axis is seen in row `height` / 2 + `focal` d / z and
+    column `width` / 2 + `focal` r / z from the picture's upper left corner. What is behind the camera is cut off at a
+    plane just ahead of it, where the hull is no wider than the points are.
     """
-    right, down, depth = project_points(camera, forward, right, up)
+    cos, sin = math.cos(camera.pitch), math.sin(camera.pitch)
+    above = up - camera.mount_height
+    down, depth = -forward * sin - above * cos, forward * cos - above * sin
     scale = camera.focal / depth.clamp(min=_NEAR)
     near, cut = camera.focal / _NEAR, (depth < _NEAR).any(-1)
     some = (depth > _NEAR).any(-1)  # else the rectangle is empty
@@ -304,11 +299,6 @@ def _slab(origin: Tensor, inverse: Tensor, size: float) -> tuple[Tensor, Tensor]
     return torch.minimum(one, other), torch.maximum(one, other)
 
 
-def _to_box_frame(forward: Tensor, right: Tensor, cos: Tensor, sin: Tensor) -> tuple[Tensor, Tensor]:
-    """Return a vector in a box's own frame."""
-    return forward * cos + right * sin, right * cos - forward * sin
-
-
 def _pick(numbers: Tensor, *values: Tensor) -> tuple[Tensor, ...]:
     """Return entries of flat tensors by their numbers (C,)."""
     return tuple(value.flatten().index_select(0, numbers) for value in values)
@@ -327,15 +317,15 @@ def cast_shadows(boxes: Boxes, light: Light, camera: Camera, seen: Pixels) -> Te
     box, row, pixel = find_candidates(camera, forward, right, torch.zeros_like(forward), seen.sky)
     if not len(box):
         return None
-    origin = _to_box_frame(boxes.forward, boxes.right, boxes.cos, boxes.sin)
-    sun = _to_box_frame(sun_forward, sun_right, boxes.cos, boxes.sin)
+    origin = rotate(boxes.forward, boxes.right, boxes.cos, boxes.sin)
+    sun = rotate(sun_forward, sun_right, boxes.cos, boxes.sin)
     above = (BODY_HEIGHT / sun_up).expand_as(boxes.cos)
     x0, y0, cos, sin, inverse_x, inverse_y, leaves = _pick(
         box, *origin, boxes.cos, boxes.sin, 1.0 / sun[0], 1.0 / sun[1], above
     )
     pixel = pixel - seen.sky * camera.width
     (ground_forward,), (ground_right,) = _pick(row - seen.sky, seen.forward), _pick(pixel, seen.right)
-    x, y = _to_box_frame(ground_forward, ground_right, cos, sin)
+    x, y = rotate(ground_forward, ground_right, cos, sin)
     near_x, far_x = _slab(x - x0, inverse_x, VEHICLE_LENGTH)
     near_y, far_y = _slab(y - y0, inverse_y, VEHICLE_WIDTH)
     enters = torch.maximum(near_x, near_y).clamp_(min=0.0)
@@ -355,13 +345,13 @@ def draw_boxes(image: Tensor, boxes: Boxes, light: Light, camera: Camera, seen: 
     box, _, pixel = find_candidates(camera, forward, right, up)
     if not len(box):
         return
-    origin = _to_box_frame(-boxes.forward, -boxes.right, boxes.cos, boxes.sin)
+    origin = rotate(-boxes.forward, -boxes.right, boxes.cos, boxes.sin)
     ray_forward, ray_right, ray_up = seen.ray
     middle = camera.mount_height - 0.5 * BODY_HEIGHT
     near_z, far_z = _slab(torch.full_like(ray_up, middle), 1.0 / ray_up, BODY_HEIGHT)  # the same for all boxes
     x0, y0, cos, sin = _pick(box, *origin, boxes.cos, boxes.sin)
     way_forward, way_right, near_z, far_z = _pick(pixel, ray_forward, ray_right, near_z, far_z)
-    x, y = _to_box_frame(way_forward, way_right, cos, sin)
+    x, y = rotate(way_forward, way_right, cos, sin)
     near_x, far_x = _slab(x0, x.reciprocal_(), VEHICLE_LENGTH)
     near_y, far_y = _slab(y0, y.reciprocal_(), VEHICLE_WIDTH)
     enters = torch.maximum(torch.maximum(near_x, near_y), near_z)
@@ -390,7 +380,7 @@ def draw_boxes(image: Tensor, boxes: Boxes, light: Light, camera: Camera, seen: 
 def _faces(boxes: Boxes, origin: tuple[Tensor, Tensor], light: Light, colours: Tensor) -> Tensor:
     """Return the colours of the faces that a camera sees: front or rear, a side and the roof, body and windows."""
     sun_forward, sun_right, sun_up = light.sun[:, :, None].unbind(1)
-    along, across = _to_box_frame(sun_forward, sun_right, boxes.cos, boxes.sin)
+    along, across = rotate(sun_forward, sun_right, boxes.cos, boxes.sin)
     facing = torch.stack((along * origin[0].sign(), across * origin[1].sign(), sun_up.expand_as(along)), dim=-1)
     bright = light.diffuse[:, None, None] + light.direct[:, None, None] * facing.clamp(min=0.0)
     paints = torch.stack((colours, colours.new_tensor(GLASS).expand_as(colours)), dim=1)
@@ -401,14 +391,8 @@ TILE = 2**17
 """Pixels that are drawn at once: few enough for the cache."""
 
 
-class PictureScene(NamedTuple):
-    """Scenes in front of T cameras."""
-
-    boxes: Boxes
-    """All N vehicles, the camera's own first."""
-    light: Light
-    lines: Lines
-    """Road coordinates of the rows of pixels that see ground."""
+PictureScene = tuple[Boxes, Light, Lines]
+"""Scenes in front of T cameras: all N vehicles, the camera's own first, light, and rows of pixels that see ground."""
 
 
 @torch.no_grad()
@@ -428,32 +412,29 @@ def take_picture(state: State, road: Road, context: CameraContext) -> Tensor:
     image = torch.empty(len(state.x), camera.height, camera.width, 3, dtype=torch.uint8, device=device)
     for first in range(0, len(image), rows):
         part = slice(first, first + rows)
-        drawn = _draw(_rows(scene, part), road, camera, seen, colours).mul_(255.0)
+        those, weather = map_tensors(itemgetter(part), (scene, context.weather))
+        drawn = _draw(those, road, camera, seen, colours).mul_(255.0)
         if noisy:
-            when = context._replace(weather=_rows(context.weather, part), tick=context.tick[part])
+            when = context._replace(weather=weather, tick=context.tick[part])
             strength = when.weather.noise.float()[:, None, None]
             drawn.addcmul_(strength, draw_pixel_noise(when, drawn[0].numel()).view(drawn.shape))
         image[part] = drawn.round_().clamp_(0.0, 255.0).to(torch.uint8).view(-1, *image.shape[1:])
     return image
 
 
-def _rows(fields: Any, part: slice) -> Any:
-    """Return some rows of tensors, which may lie in tuples of tuples."""
-    return map_tensors(lambda field: field[part], fields)
-
-
 def _scene(state: State, road: Road, context: CameraContext, seen: Pixels) -> PictureScene:
     """Place vehicles, light and road in the frames of the cameras."""
     x, y, heading = road.to_world(state.x, state.y, state.heading)
     own, camera = heading[:, :1], context.camera
-    cos, sin, ahead, right = torch.cos(own), torch.sin(own), camera.mount_ahead, camera.mount_right
-    camera_x, camera_y = x[:, :1] + ahead * cos - right * sin, y[:, :1] + ahead * sin + right * cos
+    cos, sin, ahead, aside = torch.cos(own), torch.sin(own), camera.mount_ahead, camera.mount_right
+    camera_x, camera_y = x[:, :1] + ahead * cos - aside * sin, y[:, :1] + ahead * sin + aside * cos
     gaze = own + camera.yaw
     cos, sin = torch.cos(gaze), torch.sin(gaze)
     dx, dy, turn = x - camera_x, y - camera_y, (heading - gaze).float()
-    boxes = Boxes((dx * cos + dy * sin).float(), (dy * cos - dx * sin).float(), torch.cos(turn), torch.sin(turn))
+    forward, right = rotate(dx, dy, cos, sin)
+    boxes = Boxes(forward.float(), right.float(), torch.cos(turn), torch.sin(turn))
     lines = road_lines(camera_x, camera_y, gaze, road, seen)
-    return PictureScene(boxes, light_of(context.weather, gaze[:, 0]), lines)
+    return boxes, light_of(context.weather, gaze[:, 0]), lines
 
 
 def _draw(scene: PictureScene, road: Road, camera: Camera, seen: Pixels, colours: Tensor) -> Tensor:

@@ -70,9 +70,10 @@ def boxes_overlap(
         [True, False]
     """
     turn = other_heading - heading
-    along, across = turn_by(heading, dx, dy)
-    other_along, other_across = turn_by(turn, along, across)
-    cos, sin = torch.cos(turn).abs(), torch.sin(turn).abs()
+    along, across = rotate(dx, dy, torch.cos(heading), torch.sin(heading))
+    cos, sin = torch.cos(turn), torch.sin(turn)
+    other_along, other_across = rotate(along, across, cos, sin)
+    cos, sin = cos.abs(), sin.abs()
     half, other_half = _halves(size, dx), _halves(other_size, dx)
     reach = _reach(half, other_half, cos, sin)
     other_reach = reach if other_size is size else _reach(other_half, half, cos, sin)
@@ -80,9 +81,8 @@ def boxes_overlap(
     return overlap & (other_along.abs() < other_reach[0]) & (other_across.abs() < other_reach[1])
 
 
-def turn_by(heading: Tensor, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
-    """Return vectors (x, y) along and across a heading [rad], any shape."""
-    cos, sin = torch.cos(heading), torch.sin(heading)
+def rotate(x: Tensor, y: Tensor, cos: Tensor, sin: Tensor) -> tuple[Tensor, Tensor]:
+    """Return vectors (x, y) along and across a direction (cos, sin), any shape."""
     return x * cos + y * sin, y * cos - x * sin
 
 
@@ -99,7 +99,8 @@ def _reach(half: Sequence[Tensor], other: Sequence[Tensor], cos: Tensor, sin: Te
 
 def project_on_axes(x: Tensor, y: Tensor, heading: Tensor, other_heading: Tensor) -> Tensor:
     """Return vectors (x, y) along the axes of two bodies by their headings [rad], any shape: (...) -> (..., 4)."""
-    return torch.stack((*turn_by(heading, x, y), *turn_by(other_heading, x, y)), -1)
+    parts = (rotate(x, y, torch.cos(angle), torch.sin(angle)) for angle in (heading, other_heading))
+    return torch.stack([part for both in parts for part in both], -1)
 
 
 def axes_of(dx: Tensor, dy: Tensor, heading: Tensor, other_heading: Tensor) -> Axes:
@@ -307,7 +308,7 @@ def lead_index(state: State, road: Road) -> Tensor:
 
 
 LEFT, OWN, RIGHT = range(3)
-"""Lanes in the last axis of `Neighbours`."""
+"""Lanes in the last axis of `find_neighbours`."""
 
 
 class LaneTraffic(NamedTuple):
@@ -347,20 +348,12 @@ class LaneTraffic(NamedTuple):
         return 0.5 * (self.edges.gather(1, lane) + self.edges.gather(1, lane + 1))
 
 
-class Neighbours(NamedTuple):
-    """Neighbours of M vehicles in three lanes: the one on the left, the own one, the one on the right."""
+def find_neighbours(
+    traffic: LaneTraffic, who: slice, target: Tensor, reach: float = 0.0
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Return the nearest ahead (x is not less) and behind of the M vehicles `who` in V, and which lanes there are.
 
-    lead: Tensor
-    """Index of the nearest vehicle ahead, -1 for none, int64, shape (B, M, 3)."""
-    follower: Tensor
-    """Index of the nearest vehicle behind, likewise."""
-    exists: Tensor
-    """Whether there is such a lane, boolean, shape (B, M, 3)."""
-
-
-def find_neighbours(traffic: LaneTraffic, who: slice, target: Tensor, reach: float = 0.0) -> Neighbours:
-    """Return the neighbours of the M vehicles `who` in V, by the places of centres: ahead where x is not less.
-
+    Indices in the lane on the left, the own one and the one on the right, -1 for nobody, int64, (B, M, 3), and boolean.
     A vehicle counts in its own lane, in the lane `target` (B, V) that it moves to, as one does that has signalled, and
     in those whose edges are within `reach` [m] of its centre.
     """
@@ -378,7 +371,7 @@ def find_neighbours(traffic: LaneTraffic, who: slice, target: Tensor, reach: flo
     others = ~torch.eye(lane.shape[1], dtype=torch.bool, device=lane.device)[who]
     inside = inside & exists[..., None] & others[:, None, :]
     ahead = (traffic.x[:, None, :] - traffic.x[:, who, None])[:, :, None, :].expand_as(inside)
-    return Neighbours(nearest(ahead, inside & (ahead >= 0)), nearest(-ahead, inside & (ahead < 0)), exists)
+    return nearest(ahead, inside & (ahead >= 0)), nearest(-ahead, inside & (ahead < 0)), exists
 
 
 def nearest(distance: Tensor, among: Tensor) -> Tensor:

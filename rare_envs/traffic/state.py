@@ -24,13 +24,23 @@ LANE_WIDTH = 4.0
 """Lane width [m], HighwayEnv's."""
 
 
-class Vehicle(NamedTuple):
-    """One vehicle in B scenarios: the columns of the fields of a `State`, shape (B,)."""
+class Motion(NamedTuple):
+    """Vehicles at one moment, all fields of one shape: (B, N - 1) of those around the ego, (B,) of one.
+
+    Example:
+        >>> one = torch.full((1, 1), 12.0)
+        >>> Motion(x=one, y=0 * one, heading=0 * one, speed=one).speed.tolist()
+        [[12.0]]
+    """
 
     x: Tensor
+    """Centres along the road [m]."""
     y: Tensor
+    """Centres across the road [m], positive to the right."""
     heading: Tensor
+    """Headings relative to the road [rad]."""
     speed: Tensor
+    """Speeds along the headings [m/s]."""
 
 
 class _Fields(NamedTuple):
@@ -62,16 +72,16 @@ class State(_Fields):
         [[15.0, 20.0]]
     """
 
-    _columns: tuple[Vehicle, ...] | None = None
+    _columns: tuple[Motion, ...] | None = None
     """Columns from which the state was made, in the same memory: views of them would cost an operation each."""
 
     @property
-    def vehicles(self) -> tuple[Vehicle, ...]:
+    def vehicles(self) -> tuple[Motion, ...]:
         """Each vehicle by itself, the ego first."""
         if self._columns is not None:
             return self._columns
         fields = (field.unbind(1) for field in self[:4])
-        return tuple(Vehicle(*columns) for columns in zip(*fields, strict=True))
+        return tuple(Motion(*columns) for columns in zip(*fields, strict=True))
 
     @classmethod
     def of_vehicles(cls, vehicles: Sequence[Sequence[Tensor]], theta: Tensor) -> State:
@@ -87,7 +97,7 @@ class State(_Fields):
         table = torch.stack([column for field in zip(*vehicles, strict=True) for column in field])
         x, y, heading, speed = table.view(4, n, table.shape[1]).mT.unbind(0)
         state, columns = cls(x, y, heading, speed, theta), table.unbind(0)
-        state._columns = tuple(Vehicle(*columns[number::n]) for number in range(n))
+        state._columns = tuple(Motion(*columns[number::n]) for number in range(n))
         return state
 
     def __reduce__(self) -> tuple[type[State], tuple[Tensor, ...]]:

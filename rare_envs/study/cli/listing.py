@@ -18,7 +18,7 @@ from rare_envs.exposure import explain_no_frequency, read_source
 from rare_envs.measures.base import Measure, TraceMeasure
 from rare_envs.measures.registry import MEASURES
 from rare_envs.plugins import did_you_mean
-from rare_envs.scenarios.base import Scenario, TextFile, load_base
+from rare_envs.scenarios.base import Scenario, load_base
 from rare_envs.scenarios.registry import HIGHWAY_ENV_IDS, SCENARIOS, env_id_of, find_scenario, kinematics_id
 from rare_envs.sensors.camera import CONDITIONS, SENSOR_NOISE
 from rare_envs.simulation.background import noise_size
@@ -211,7 +211,7 @@ def print_bases(env_id: str, bases: Mapping[str, Mapping[str, Any]]) -> None:
 def _describe_base(scenario: Scenario, name: str) -> dict[str, Any]:
     """Return what is known of a base distribution, JSON-ready; None and empty where nothing is."""
     base, file = load_base(scenario, name), scenario.bases[name]
-    content = json.loads(file.read_text(encoding="utf-8")) if isinstance(file, TextFile) else file
+    content = json.loads(file.read_text(encoding="utf-8")) if hasattr(file, "read_text") else file
     record = content.get("provenance") if isinstance(content, Mapping) else None
     record = record if isinstance(record, Mapping) else {}
     known: dict[str, Any] = {

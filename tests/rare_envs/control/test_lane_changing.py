@@ -10,7 +10,7 @@ from highway_env.road.road import RoadNetwork
 from highway_env.vehicle.behavior import IDMVehicle
 
 from rare_envs.control.idm import IDM
-from rare_envs.control.lane_changing import LaneChangingDriver, Mobil
+from rare_envs.control.lane_changing import LaneChangingDriver
 from rare_envs.make import set_up
 from rare_envs.traffic import straight
 from rare_envs.traffic.bodies import LaneTraffic, Lead, boxes_overlap
@@ -19,7 +19,7 @@ from tests.rare_envs.traffic_states import traffic
 
 ROAD, DT = straight(2), 0.1
 EGO, SLOW_LEAD = (0.0, 4.0, 0.0, 20.0), (40.0, 4.0, 0.0, 10.0)
-PROMPT = LaneChangingDriver(mobil=Mobil(delay=0.0))
+PROMPT = LaneChangingDriver(delay=0.0)
 
 
 def step(driver, state, memory, road=ROAD, driven=1):
@@ -54,7 +54,7 @@ def test_it_brakes_for_the_lead_in_the_old_and_in_the_new_lane():
     nearer = IDM().acceleration(torch.tensor([20.0]), Lead(torch.tensor([40.0]), torch.tensor([5.0])))
     assert action[0, 0, 0].item() == pytest.approx(nearer.item(), rel=1e-6)
     keeps = torch.tensor([[[2.0, 0.0]]])
-    _, _, action = step(LaneChangingDriver(mobil=Mobil(delay=9.0)), scene, keeps)
+    _, _, action = step(LaneChangingDriver(delay=9.0), scene, keeps)
     further = IDM().acceleration(torch.tensor([20.0]), Lead(torch.tensor([55.0]), torch.tensor([5.0])))
     assert action[0, 0, 0].item() == pytest.approx(further.item(), rel=1e-6)
 
@@ -110,8 +110,10 @@ NEAR_LEAD = (30.0, 4.0, 0.0, 10.0)
 
 
 def choice(*vehicles, lanes=2, **parameters):
+    """Incentive and safety of a change of the first vehicle to the left."""
     scene = LaneTraffic.of(traffic(*vehicles), straight(lanes))
-    return Mobil(**parameters).choose(scene, slice(0, 1), IDM())
+    incentive, safe = LaneChangingDriver(**parameters).judge_changes(scene, slice(0, 1), scene.lane)
+    return incentive[0, 0, 0].item(), safe[0, 0, 0].item()
 
 
 def interaction(speed, gap, closing):
@@ -125,8 +127,8 @@ def test_no_change_that_makes_the_new_follower_brake_too_hard():
         found = choice(EGO, NEAR_LEAD, (x, 0.0, 0.0, speed))
         braking = 2.22 * (1 - (speed / 21.72) ** 4) - interaction(speed, -x - 5, speed - 20)
         assert (braking >= -4.0) == safe
-        assert found.incentive[0, 0, 0] > 0.1
-        assert found.safe[0, 0, 0].item() == found.wanted[0, 0, 0].item() == safe
+        assert found[0] > 0.1
+        assert found[1] == safe
 
 
 def test_who_is_polite_counts_the_losses_of_others():
@@ -135,11 +137,9 @@ def test_who_is_polite_counts_the_losses_of_others():
     own, loss = interaction(20.0, 55.0, 3.0), interaction(20.0, 21.0, 0.0)
     assert 0.1 < own < loss < 4.0
     for politeness in (0.0, 0.25, 1.0):
-        found = choice(*scene, politeness=politeness)
-        assert found.safe[0, 0, 0]
-        assert found.incentive[0, 0, 0].item() == pytest.approx(own - politeness * loss)
-    assert choice(*scene, politeness=0.0).wanted[0, 0, 0]
-    assert not choice(*scene, politeness=1.0).wanted[0, 0, 0]
+        incentive, safe = choice(*scene, politeness=politeness)
+        assert safe
+        assert incentive == pytest.approx(own - politeness * loss)
 
 
 def test_the_old_follower_gains():
@@ -147,13 +147,13 @@ def test_the_old_follower_gains():
     scene = (EGO, NEAR_LEAD, (-20.0, 4.0, 0.0, 20.0))
     gain = interaction(20.0, 15.0, 0.0) - interaction(20.0, 45.0, 10.0)
     selfish, polite = choice(*scene, politeness=0.0), choice(*scene, politeness=1.0)
-    assert (polite.incentive - selfish.incentive)[0, 0, 0].item() == pytest.approx(gain)
+    assert polite[0] - selfish[0] == pytest.approx(gain)
 
 
 def test_wrong_parameters_are_refused():
-    for wrong in ({"safe_deceleration": 0.0}, {"threshold": -0.1}, {"delay": -1.0}):
+    for wrong in ({"safe_deceleration": 0.0}, {"lateral_speed": 0.0}, {"threshold": -0.1}, {"delay": -1.0}):
         with pytest.raises(ValueError, match="Expected a positive safe deceleration"):
-            Mobil(**wrong)
+            LaneChangingDriver(**wrong)
 
 
 LANES, VEHICLES, STATES, DESIRED_SPEED = 4, 10, 400, 30.0
@@ -161,7 +161,7 @@ LANES, VEHICLES, STATES, DESIRED_SPEED = 4, 10, 400, 30.0
 
 @pytest.mark.parametrize("politeness", [0.0, 0.5])
 def test_decisions_are_those_of_highway_env(politeness, monkeypatch):
-    """400 random states, both sides of one vehicle each, under HighwayEnv's conventions; see `Mobil`."""
+    """400 random states, both sides of one vehicle each, under HighwayEnv's conventions."""
     monkeypatch.setattr(IDMVehicle, "POLITENESS", politeness)  # shipped as 0, which would leave a term untested
     rng = np.random.default_rng(5)
     lane = rng.integers(0, LANES, (STATES, VEHICLES))
@@ -169,10 +169,11 @@ def test_decisions_are_those_of_highway_env(politeness, monkeypatch):
     y = 4.0 * lane + rng.uniform(-1.9, 1.9, (STATES, VEHICLES))
     heading, speed = rng.uniform(-0.1, 0.1, (STATES, VEHICLES)), rng.uniform(5.0, 30.0, (STATES, VEHICLES))
     state = State(*(torch.from_numpy(part) for part in (x, y, heading, speed)), torch.zeros(STATES, 0))
-    mobil = Mobil(politeness, 0.2, 2.0, own_safety=False, reach=1.0)
-    assert Mobil.highway_env() == Mobil(0.0, 0.2, 2.0, own_safety=False, reach=1.0)
+    idm = IDM.highway_env(DESIRED_SPEED)
+    driver = LaneChangingDriver(idm, politeness, 0.2, 2.0, own_safety=False, reach=1.0)
     scene = LaneTraffic.of(state, straight(LANES))
-    ours = mobil.choose(scene, slice(0, 1), IDM.highway_env(DESIRED_SPEED)).wanted[:, 0].numpy()
+    incentive, safe = driver.judge_changes(scene, slice(0, 1), scene.lane)
+    ours = (safe & (incentive >= driver.threshold))[:, 0].numpy()
     network = RoadNetwork.straight_road_network(LANES, length=10_000.0, speed_limit=None)
     theirs = np.zeros((STATES, 2), dtype=bool)
     for row in range(STATES):

@@ -82,7 +82,7 @@ def test_unknown_environment(env_id: object, message: str) -> None:
 def test_an_id_may_name_the_module_that_registers_it(place: str) -> None:
     Path(f"{place}.py").write_text(
         "from rare_envs.scenarios.registry import SCENARIOS\n"
-        "SCENARIOS.add('tests/Crest-v0', SCENARIOS['rare_envs/CutIn-v0'])\n"
+        "SCENARIOS['tests/Crest-v0'] = SCENARIOS['rare_envs/CutIn-v0']\n"
     )
     try:
         assert find_scenario(f"{place}:tests/Crest-v0") is SCENARIOS["rare_envs/CutIn-v0"]
@@ -90,7 +90,7 @@ def test_an_id_may_name_the_module_that_registers_it(place: str) -> None:
         with pytest.raises(ValueError, match="did you mean 'tests/Crest-v0'"):
             find_scenario(f"{place}:tests/Crests-v0")
     finally:
-        SCENARIOS.remove("tests/Crest-v0")
+        del SCENARIOS["tests/Crest-v0"]
 
 
 def test_a_module_that_cannot_be_imported_is_named_with_the_id(place: str) -> None:
@@ -111,7 +111,7 @@ def test_an_id_may_lack_its_namespace_unless_two_end_so(monkeypatch: pytest.Monk
     assert env_id_of("CutIn-v0") == "rare_envs/CutIn-v0" and env_id_of("cut_in") == "rare_envs/CutIn-v1"
     assert split_layout("CutIn-kinematics-v0") == split_layout("rare_envs/CutIn-kinematics-v0")
     assert complete_id("a:CutIn-v0") == "a:CutIn-v0"
-    monkeypatch.setitem(SCENARIOS._entries, "mine/CutIn-v0", STANDING)
+    monkeypatch.setitem(SCENARIOS.data, "mine/CutIn-v0", STANDING)
     assert complete_id("CutIn-v0") == "CutIn-v0"
     with pytest.raises(ValueError, match=r"^Unknown environment 'CutIn-v0' \(did you mean '\w+/CutIn-v0'"):
         find_scenario("CutIn-v0")

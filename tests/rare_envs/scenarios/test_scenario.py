@@ -140,7 +140,7 @@ def test_the_shipped_scenarios_pass(env_id: str) -> None:
         ({"vehicle_names": ("ego", "a", "b"), "labels": ()}, r"x of shape \(B, 3\) from initial\(x\), got \(8, 2\)"),
         ({"initial": without_a_value(initial, "heading")}, r"heading from initial\(x\) is not finite\.$"),
         ({"others": lambda state, dt: None}, r"expected others\(state, dt\) to give x, y, .* or Others; got None\.$"),
-        ({"others": lambda state, dt: Others(1, 2, 3, 4)}, r"heading and speed, as State or Others; got Others\(x=1"),
+        ({"others": lambda state, dt: Others(1, 2, 3, 4)}, r"heading and speed, as State or Others; got Motion\(x=1"),
         ({"others": without_a_value(others, "y")}, r"y from others\(state, dt\) is not finite\.$"),
         ({"driven": lambda state, action, dt: Others(*state[:4])}, r"x of shape \(B, 1\) from driven.*, got \(8, 2\)"),
     ],
@@ -163,7 +163,7 @@ ENV_ID = "tests/Standing-v0"
 def registered():
     rare_envs.register_scenario(ENV_ID, STANDING)
     yield ENV_ID
-    SCENARIOS.remove(ENV_ID)
+    del SCENARIOS[ENV_ID]
     del gym.registry[ENV_ID]
 
 
@@ -235,5 +235,5 @@ def test_a_command_imports_the_module_that_registers_it(tmp_path, monkeypatch):
         assert json.loads(ran.stdout)["question"]["env_id"] == env_id
         assert rare_envs.DrivingProblem(env_id).space.names == ("speed", "distance")
     finally:
-        SCENARIOS.remove("tests/Crest-v0")
+        del SCENARIOS["tests/Crest-v0"]
         del gym.registry["tests/Crest-v0"]

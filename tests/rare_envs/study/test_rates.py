@@ -139,7 +139,7 @@ def test_bad_input_is_one_line_before_any_simulation(
 
 def set_bases(monkeypatch: pytest.MonkeyPatch, **bases: object) -> None:
     scenario = replace(HARD_BRAKE, bases=MappingProxyType(bases))
-    monkeypatch.setitem(SCENARIOS._entries, "rare_envs/HardBrake-v0", scenario)
+    monkeypatch.setitem(SCENARIOS.data, "rare_envs/HardBrake-v0", scenario)
 
 
 def test_the_spread_between_sites_widens_the_interval(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -54,7 +54,7 @@ def test_beyond_the_road_there_is_no_lane():
     assert around(lanes=2) == [[-1, -1, -1], [-1, -1, -1], [True, True, False]]
     padded = LaneTraffic.of(traffic(EGO), straight(2))
     padded = padded._replace(edges=torch.cat((padded.edges, padded.edges[:, -1:]), dim=1))  # another scene has 3 lanes
-    assert find_neighbours(padded, slice(0, 1), padded.lane).exists[0, 0].tolist() == [True, True, False]
+    assert find_neighbours(padded, slice(0, 1), padded.lane)[2][0, 0].tolist() == [True, True, False]
     assert padded.lane.tolist() == [[1]]
 
 

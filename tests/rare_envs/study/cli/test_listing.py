@@ -84,7 +84,7 @@ def test_bases_tell_events_site_fit_and_frequency(cli: Cli, monkeypatch: pytest.
         "us101": fitted_entries("hard_brake"),
         "plain": {**HARD_BRAKE.bases["us101-all-brakings"], "provenance": None},
     }
-    monkeypatch.setitem(SCENARIOS._entries, "rare_envs/HardBrake-v0", replace(HARD_BRAKE, bases=bases))
+    monkeypatch.setitem(SCENARIOS.data, "rare_envs/HardBrake-v0", replace(HARD_BRAKE, bases=bases))
     answer = json.loads(cli("bases", "hard_brake", "--json").stdout)
     assert answer["bases"]["us101"]["fitted_to"] == "42 events of 40 scenes"
     assert answer["env_id"] == "rare_envs/HardBrake-v0"
