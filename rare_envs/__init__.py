@@ -6,7 +6,7 @@ end_at_signals()  # before what takes long to import
 
 from typing import TYPE_CHECKING, Any
 
-from rare_envs.plugins import make_lazy_getattr, warn_of_namesakes
+from rare_envs.plugins import make_lazy_getattr
 from rare_envs.scenarios.registry import SCENARIOS
 from rare_envs.startup import __version__ as __version__
 
@@ -53,8 +53,6 @@ __all__ = [
     "register_scenario",
     "risk",
 ]
-warn_of_namesakes()
-
 _LAZY = {
     "DrivingProblem": "rare_envs.problem",
     "IDM": "rare_envs.control.idm",

@@ -8,8 +8,8 @@ import numpy as np
 import torch
 
 from rare_envs.control.actions import ACTIONS
-from rare_envs.distributions.product import NoiseDistribution, join_independent
-from rare_envs.distributions.space import Distribution, Parameter, ScenarioSpace
+from rare_envs.distributions.product import join_independent
+from rare_envs.distributions.space import Distribution, ScenarioSpace
 from rare_envs.egos.needs import EgoNeeds
 from rare_envs.measures.registry import load_measure
 from rare_envs.plugins import check_name, did_you_mean
@@ -18,7 +18,7 @@ from rare_envs.scenarios.registry import SCENARIOS, find_scenario
 from rare_envs.sensors.camera import find_camera
 from rare_envs.simulation.background import find_drivers
 from rare_envs.simulation.observation import read_kinds
-from rare_envs.simulation.world import Clock, Measurement, Sensing, World
+from rare_envs.simulation.world import Clock, Measurement, Sensing, World, noise_block
 
 NO_NEEDS = EgoNeeds()
 CONFIGURATION_ARGUMENTS = {
@@ -122,7 +122,7 @@ def refuse_unknown(scenario: Scenario, arguments: Mapping[str, Any], more: Seque
 def _try_measure(world: World, space: ScenarioSpace) -> None:
     """Evaluate a user's measure on two drives of one tick, so that a broken one is found before the simulations."""
     drawn = space.sample(2, np.random.default_rng(0))
-    x = torch.from_numpy(drawn[:, : sum(world.columns)]).float()  # the ego, whose noise is behind, is not asked
+    x = torch.from_numpy(drawn[:, : world.dim]).float()  # the ego, whose noise is behind, is not asked
     measure = world.measurement.measure
     try:
         f = world.step(world.start(x), torch.zeros(2, 2)).f
@@ -134,22 +134,10 @@ def _try_measure(world: World, space: ScenarioSpace) -> None:
 
 def build_space(world: World, base: Distribution, ego_noise: int = 0) -> ScenarioSpace:
     """Return the parameters of a world: the scenario's (`base`), the weather's, drivers' weights, all noise."""
-    parameters, distributions, sizes = list(world.scenario.parameters), [base], world.columns
-    for weather, distribution in world.weather_distributions:
-        parameters += weather
-        distributions.append(distribution)
-    background = world.background
-    if background is not None and background.weights is not None:
-        parameters.append(Parameter("weights", "", -np.inf, np.inf, "of the drivers' last layer", sizes.weights))
-        distributions.append(background.weights)
-    for name, meaning, size in (
-        ("noise", "of the drivers, tick by tick", sizes.noise),
-        ("camera_noise", "from which the noise of all pixels follows", sizes.camera_noise),
-        ("ego_noise", "of the ego", ego_noise),
-    ):
-        if size:
-            parameters.append(Parameter(name, "", -np.inf, np.inf, meaning, size))
-            distributions.append(NoiseDistribution(size))
+    blocks = [block for part in world.blocks.values() for block in part] + noise_block(
+        "ego_noise", "of the ego", ego_noise
+    )
+    parameters = [*world.scenario.parameters, *(parameter for own, _ in blocks for parameter in own)]
     names = [p.name for p in parameters]
     twice = {name for name in names if names.count(name) > 1}
     if twice:
@@ -157,4 +145,4 @@ def build_space(world: World, base: Distribution, ego_noise: int = 0) -> Scenari
             f"{world.scenario.name} has parameters of its own named {', '.join(sorted(twice))}, as weather or drivers "
             "have; rename them."
         )
-    return ScenarioSpace.of(parameters, join_independent(*distributions))
+    return ScenarioSpace.of(parameters, join_independent(base, *(distribution for _, distribution in blocks)))

@@ -10,41 +10,26 @@ import inspect
 import os
 import re
 import sys
-import warnings
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from pathlib import Path
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from types import ModuleType
 from typing import Any, ClassVar, NoReturn
 
 _COLOUR = re.compile(r"\x1b\[[0-9;]*m")
 _MAX_WORDS = 200
 """Characters of an exception's message that `one_line` keeps: a line of a terminal or two."""
-SIBLINGS = {"agents": "agents.loading", "samplers": "samplers.estimation", "training": "training.ego_training"}
-"""Packages that are installed with this one, and a module that the `__init__` of each imports."""
-
-
-def warn_of_namesakes() -> None:
-    """Warn, in one line each, of packages named as one of SIBLINGS that Python finds in place of ours."""
-    for name, part in SIBLINGS.items():
-        with contextlib.suppress(ImportError, ValueError, OSError):  # not there, or made by hand
-            found = importlib.util.find_spec(name)
-            origin = found.origin if found else None
-            if origin and part not in Path(origin).read_text(encoding="utf-8", errors="replace"):
-                warnings.warn(
-                    f"Expected {name!r} of Rare Envs, found another package of that name, {origin}; rename or "
-                    "uninstall it, or use an environment of its own (docs/index.md).",
-                    RuntimeWarning,
-                    stacklevel=3,
-                )
 
 
 def import_module(name: str, purpose: str) -> ModuleType:
     """Return a module that a user names, for a purpose that errors name; the working directory is searched first."""
+    here = os.getcwd()
+    sys.path.insert(0, here)  # as `python -m` does, and console scripts do not
     try:
-        with working_directory_first():
-            return importlib.import_module(name)
+        return importlib.import_module(name)
     except (Exception, SystemExit) as error:  # the module is the user's: anything may happen in it
         raise ValueError(f"Cannot import {name!r} for {purpose}: {one_line(error)}.") from error
+    finally:
+        with contextlib.suppress(ValueError):
+            sys.path.remove(here)
 
 
 def import_object(spec: str, purpose: str) -> Any:
@@ -92,18 +77,6 @@ def one_line(error: BaseException) -> str:
     words = " ".join(_COLOUR.sub("", str(error)).split()).rstrip(".")
     kind = type(error).__name__
     return f"{kind}: {words[:_MAX_WORDS]}" if words else kind
-
-
-@contextlib.contextmanager
-def working_directory_first() -> Iterator[None]:
-    """Search modules in the working directory first, as `python -m` does and console scripts do not."""
-    here = os.getcwd()
-    sys.path.insert(0, here)
-    try:
-        yield
-    finally:
-        with contextlib.suppress(ValueError):
-            sys.path.remove(here)
 
 
 class EgoGone(BaseException):

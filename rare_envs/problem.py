@@ -24,7 +24,6 @@ from rare_envs.devices import (
     find_device,
     move_to,
 )
-from rare_envs.distributions.space import Distribution
 from rare_envs.egos.dense_policies import NotCompiled
 from rare_envs.egos.needs import (
     DRIVES_ITSELF,
@@ -70,6 +69,9 @@ class DrivingProblem:
         world: The simulation.
         driver: The ego as a Driver.
         space: Names, units, bounds and base distribution of x.
+        dim: Number of columns of x.
+        column_names: Their names, for the tables of results.
+        base: Distribution of x in ordinary traffic.
         varies: Whether the ego answers differently from run to run, by randomness that is not part of x: an attribute
             `deterministic` of it that is False says so. Then p is over that randomness as well, outcomes count as they
             fell, and failures may not replay.
@@ -145,6 +147,7 @@ class DrivingProblem:
         settings["observation"] = kinds
         settings["action"] = settings.get("action") or choose_action(needs.action_space, read_kinds(kinds))
         self.world, self.space = set_up(scenario, needs, measure=measure, base=base, noise=noise, **settings)
+        self.dim, self.column_names, self.base = self.space.dim, self.space.column_names, self.space.base
         with _ego_errors_as_value_errors(ego):
             self.driver = as_driver(ego, self.world, needs)
         if self.device.type != "cpu":
@@ -187,16 +190,6 @@ class DrivingProblem:
         return not is_compiled(self.world, self.driver)
 
     @property
-    def dim(self) -> int:
-        """Number of scenario parameters."""
-        return self.space.dim
-
-    @property
-    def column_names(self) -> tuple[str, ...]:
-        """Names of the columns of x, for the tables of results."""
-        return self.space.column_names
-
-    @property
     def notes(self) -> tuple[str, ...]:
         """What cannot be checked or changes nothing; the grave ones also came as an `EgoWarning`."""
         action = self.world.clock.action
@@ -217,11 +210,6 @@ class DrivingProblem:
         if self.world.sensing.weather:
             fixed.append("the camera's noise is one fixed pattern of each tick")
         return ", ".join(fixed)
-
-    @property
-    def base(self) -> Distribution:
-        """Distribution of x in ordinary traffic."""
-        return self.space.base
 
     def evaluate(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
         """Simulate.

@@ -142,6 +142,4 @@ def make_batch(env_id: str, num_envs: int, **kwargs: Any) -> VectorEnv[Any, Any,
         ValueError: If the id or an argument is unknown.
     """
     find_scenario(split_layout(env_id)[0])
-    if not isinstance(num_envs, int) or num_envs < 1:
-        raise ValueError(f"Expected num_envs of at least 1, got {num_envs!r}.")
     return gym.make_vec(complete_id(env_id), num_envs=num_envs, vectorization_mode="vector_entry_point", **kwargs)

@@ -8,7 +8,9 @@ whose mean it takes: with 25 observations that takes six times as long as the la
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
 from types import FunctionType
 from typing import Any, Literal
 
@@ -23,7 +25,10 @@ from rare_envs.egos.wrappers import WrappedPolicy
 
 Activation = Literal["tanh", "relu"]
 ACTIVATIONS: dict[type[nn.Module], Activation] = {nn.Tanh: "tanh", nn.ReLU: "relu"}
+_APPLIED: dict[str, Callable[[Tensor], Tensor]] = {"tanh": lambda x: x.sigmoid_().sub_(0.5), "relu": torch.relu_}
+"""Half of the tangent of half of a value, or the larger of 0 and it."""
 SB3 = "stable_baselines3"
+_Layers = tuple[tuple[Tensor, Tensor], ...]
 
 
 class NotCompiled(ValueError):
@@ -32,22 +37,73 @@ class NotCompiled(ValueError):
 
 @dataclass(frozen=True, eq=False)
 class DensePolicy:
-    """A policy that is a network of dense layers on the `features` observation, without memory or noise."""
+    """A policy that is a network of dense layers on the `features` observation, without memory or noise.
 
-    layers: tuple[tuple[NDArray[np.floating], NDArray[np.floating]], ...]
+    It is made anew for each rollout, with present weights. Only one that is clipped alone is queried; all are compiled.
+    """
+
+    layers: _Layers
     """Weights, shape (outputs, inputs), and biases, shape (outputs,), of each layer, first to last."""
     activation: Activation
     """Between the layers; there is none behind the last."""
     chooses: bool = False
     """Whether the outputs are scores of `rare_envs.control.actions.DISCRETE_ACTIONS`, of which the largest is taken;
     else they are acceleration and steering."""
-    clip: tuple[NDArray[np.floating], NDArray[np.floating]] | None = None
+    clip: tuple[Tensor, Tensor] | None = None
     """Bounds to which acceleration and steering are clipped, shape (2,) each."""
     rescale: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None
     """Bounds that are then mapped to [-1, 1], shape (2,) each; None for those that are so already."""
     normalisation: tuple[NDArray[np.float64], NDArray[np.float64], float] | None = None
     """Mean and standard deviation of the observations, shape (F,) each, by which they are normalised before they are
     clipped to plus or minus the last; None for observations as they are."""
+    policy: Any = None
+    """Whose `predict` this one stands for."""
+
+    def predict(
+        self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = True
+    ) -> Any:
+        """Return mean actions for observations (B, F), clipped; where they are not finite, what `policy` does then."""
+        rows = np.ascontiguousarray(observation)  # torch takes no negative strides
+        with torch.no_grad():
+            actions = self.decide(torch.from_numpy(rows)).numpy()
+        if not np.isfinite(actions).all():
+            return self.policy.predict(
+                observation, state=state, episode_start=episode_start, deterministic=deterministic
+            )
+        return actions, state
+
+    def decide(self, observation: Tensor) -> Tensor:
+        """Return mean actions (B, 2) for observations (B, F), clipped, not finite where they are; all on its device."""
+        assert self.clip is not None
+        values = observation.float()
+        for weights, biases in self._doubled[:-1]:
+            values = _APPLIED[self.activation](linear(values, weights, biases))
+        actions = linear(values, *self._doubled[-1])
+        return torch.where(actions.isfinite(), actions.clamp(*self.clip), actions)
+
+    @cached_property
+    def _doubled(self) -> _Layers:
+        """Layers whose hidden ones give twice their sums and take half of their tangents, without rounding."""
+        if self.activation == "relu":
+            return self.layers
+        last = len(self.layers) - 1
+        return tuple(
+            (weights * (2 if place > 0 else 1) * (2 if place < last else 1), biases * (2 if place < last else 1))
+            for place, (weights, biases) in enumerate(self.layers)
+        )
+
+    def to(self, device: torch.device) -> DensePolicy:
+        """Return it with its weights on a device."""
+        layers: _Layers = tuple((weights.to(device), biases.to(device)) for weights, biases in self.layers)
+        clip = None if self.clip is None else (self.clip[0].to(device), self.clip[1].to(device))
+        return replace(self, layers=layers, clip=clip)
+
+    def equals(self, other: Any) -> bool:
+        """Return whether another that is clipped alone has the same numbers on the same device."""
+        if not isinstance(other, DensePolicy) or other.activation != self.activation:
+            return False
+        mine, its = ((*sum(each.layers, ()), *(each.clip or ())) for each in (self, other))
+        return len(mine) == len(its) and all(torch.equal(one, two) for one, two in zip(mine, its, strict=True))
 
 
 def read_dense_policy(policy: Any) -> DensePolicy:
@@ -97,23 +153,23 @@ def _read_network(policy: Any) -> DensePolicy:
     layers, activation = _read_layers([module for modules in in_turn for module in modules])
     space = policy.action_space
     chooses = isinstance(space, spaces.Discrete) and int(space.start) == 0
-    clip = (space.low, space.high) if isinstance(space, spaces.Box) else None
+    clip = (torch.from_numpy(space.low), torch.from_numpy(space.high)) if isinstance(space, spaces.Box) else None
     if clip is None and not chooses:
         raise NotCompiled(f"an ego that acts in {space} is not compiled")
     return DensePolicy(layers, activation, chooses, clip)
 
 
-def _read_layers(modules: list[Any]) -> tuple[tuple[Any, ...], Activation]:
+def _read_layers(modules: list[Any]) -> tuple[_Layers, Activation]:
     """Return weights and biases of layers, between which is the same activation."""
     layers, between = modules[::2], {type(module) for module in modules[1::2]}
     good = len(modules) % 2 and all(type(layer) is nn.Linear and layer.bias is not None for layer in layers)
     if not good or len(between) > 1 or not between <= set(ACTIVATIONS):
         names = ", ".join(type(module).__name__ for module in modules)
         raise NotCompiled(f"an ego with the layers {names} is not compiled")
-    arrays = tuple((layer.weight.numpy(force=True), layer.bias.numpy(force=True)) for layer in layers)
-    if any(array.dtype != np.float32 for layer in arrays for array in layer):
+    tensors = tuple((layer.weight.detach().cpu(), layer.bias.detach().cpu()) for layer in layers)
+    if any(each.dtype != torch.float32 for layer in tensors for each in layer):
         raise NotCompiled("an ego with weights that are not in single precision is not compiled")
-    return arrays, ACTIVATIONS[between.pop()] if between else "relu"
+    return tensors, ACTIVATIONS[between.pop()] if between else "relu"
 
 
 def _refuse_changed(part: Any) -> None:
@@ -139,61 +195,6 @@ def _read_statistics(normalise: Any) -> tuple[Any, Any, float] | None:
     return moments.mean, np.sqrt(moments.var + statistics.epsilon), float(statistics.clip_obs)
 
 
-_ACTIVATIONS = {"tanh": lambda doubled: doubled.sigmoid_().sub_(0.5), "relu": torch.relu_}
-_Layers = tuple[tuple[Tensor, Tensor], ...]
-
-
-@dataclass(frozen=True, eq=False)
-class DenseInference:
-    """A policy with continuous actions that is dense layers; it is made anew for each rollout, with present weights."""
-
-    policy: Any
-    """Whose `predict` this one stands for."""
-    layers: _Layers
-    """Weights, shape (outputs, inputs), and biases, shape (outputs,), of each layer, first to last."""
-    activation: str
-    """Between the layers, "tanh" or "relu"."""
-    low: Tensor
-    """Bounds of the actions, shape (2,)."""
-    high: Tensor
-
-    def predict(
-        self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = True
-    ) -> Any:
-        """Return mean actions for observations (B, F), clipped; where they are not finite, what `policy` does then."""
-        with torch.no_grad():
-            rows = np.ascontiguousarray(observation)  # torch takes no negative strides
-            actions = self._apply(torch.from_numpy(rows))
-        if not np.isfinite(actions.numpy()).all():
-            return self.policy.predict(
-                observation, state=state, episode_start=episode_start, deterministic=deterministic
-            )
-        return actions.clamp(self.low, self.high).numpy(), state
-
-    def decide(self, observation: Tensor) -> Tensor:
-        """Return mean actions (B, 2) for observations (B, F), clipped, NaN where they are; all on its device."""
-        return self._apply(observation).clamp(self.low, self.high)
-
-    def to(self, device: torch.device) -> DenseInference:
-        """Return it with its weights on a device."""
-        layers: _Layers = tuple((weights.to(device), biases.to(device)) for weights, biases in self.layers)
-        return replace(self, layers=layers, low=self.low.to(device), high=self.high.to(device))
-
-    def equals(self, other: Any) -> bool:
-        """Return whether another has the same numbers on the same device."""
-        if not isinstance(other, DenseInference) or other.activation != self.activation:
-            return False
-        mine, its = ((*sum(each.layers, ()), each.low, each.high) for each in (self, other))
-        return len(mine) == len(its) and all(torch.equal(one, two) for one, two in zip(mine, its, strict=True))
-
-    def _apply(self, observation: Tensor) -> Tensor:
-        """Return the outputs of the last layer."""
-        between, values = _ACTIVATIONS[self.activation], observation.float()
-        for weights, biases in self.layers[:-1]:
-            values = between(linear(values, weights, biases))
-        return linear(values, *self.layers[-1])
-
-
 def find_inference(policy: Any) -> Any:
     """Return what gives a policy's actions soonest, behind its wrappers: its layers alone, or the policy itself."""
     if type(policy) is WrappedPolicy and not policy.stacks:
@@ -205,16 +206,4 @@ def find_inference(policy: Any) -> Any:
     on_cpu = str(getattr(getattr(policy, "same_as", policy), "device", "cpu")) == "cpu"  # of SB3 all have one
     if dense.clip is None or dense.rescale or dense.normalisation or not on_cpu:  # discrete actions, or wrapped twice
         return policy
-    layers: _Layers = tuple((torch.from_numpy(weights), torch.from_numpy(biases)) for weights, biases in dense.layers)
-    if dense.activation == "tanh":
-        layers = _scale_for_tangents(layers)
-    return DenseInference(policy, layers, dense.activation, *map(torch.from_numpy, dense.clip))
-
-
-def _scale_for_tangents(layers: _Layers) -> _Layers:
-    """Return layers whose hidden ones give twice their sums and take half of their tangents, without rounding."""
-    last = len(layers) - 1
-    return tuple(
-        (weights * (2 if place > 0 else 1) * (2 if place < last else 1), biases * (2 if place < last else 1))
-        for place, (weights, biases) in enumerate(layers)
-    )
+    return replace(dense, policy=policy)

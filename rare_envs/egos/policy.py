@@ -15,7 +15,7 @@ from torch import Tensor
 
 from rare_envs.control.actions import DISCRETE_ACTIONS, IDLE, META_ACTIONS, read_actions, to_physical
 from rare_envs.devices import move_to
-from rare_envs.egos.dense_policies import DenseInference, find_inference
+from rare_envs.egos.dense_policies import DensePolicy, find_inference
 from rare_envs.egos.needs import RULE_BASED_EGOS, EgoNeeds, ModuleEgo, find_rule_based, resolve, takes_indices
 from rare_envs.egos.wrappers import find_frame_stacking, wrap_policy
 from rare_envs.plugins import NoAnswer, reason_of, refuse_ego
@@ -174,14 +174,14 @@ def _isolate_failing_rows(
 class DevicePolicyDriver:
     """A policy with continuous actions that answers where the observations are: nothing of a tick goes to the CPU."""
 
-    policy: DenseInference | ModuleEgo
+    policy: DensePolicy | ModuleEgo
     observation: str = "features"
     """What it observes."""
 
     @property
     def recordable(self) -> bool:
         """Whether its answers depend on the observations alone: those of layers that were copied, not of a module."""
-        return isinstance(self.policy, DenseInference)
+        return isinstance(self.policy, DensePolicy)
 
     def act(self, episode: Episode, memory: Any) -> tuple[Tensor, Any]:
         """Observe and decide; an ego whose policy does not answer by finite numbers is NaN from then on."""
@@ -195,10 +195,10 @@ def find_device_driver(driver: Driver, device: torch.device, before: Driver | No
     if not isinstance(driver, PolicyDriver):
         return driver
     policy = find_inference(driver.policy)
-    if driver.action != "continuous" or not isinstance(policy, DenseInference | ModuleEgo):
+    if driver.action != "continuous" or not isinstance(policy, DensePolicy | ModuleEgo):
         return None
-    placed = move_to(device, policy) if isinstance(policy, DenseInference) else policy
-    if isinstance(before, DevicePolicyDriver) and isinstance(placed, DenseInference) and placed.equals(before.policy):
+    placed = move_to(device, policy) if isinstance(policy, DensePolicy) else policy
+    if isinstance(before, DevicePolicyDriver) and isinstance(placed, DensePolicy) and placed.equals(before.policy):
         return before
     return DevicePolicyDriver(placed, driver.observation)
 

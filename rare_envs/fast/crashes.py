@@ -23,17 +23,6 @@ _HALF_LENGTH, _HALF_WIDTH, _PART, _NEVER, _ALWAYS = single(
 )
 
 
-class CrashRows(NamedTuple):
-    """A `rare_envs.traffic.crash.Crash` of B episodes as arrays."""
-
-    kind: NDArray[np.int64]
-    vehicles: NDArray[np.int64]
-    impact_speed: SingleArray
-    closing_speed: SingleArray
-    delta_v: SingleArray
-    injury_risk: SingleArray
-
-
 class Contact(NamedTuple):
     """How two bodies came to overlap."""
 
@@ -59,10 +48,10 @@ def record_crashes(
     is_over: NDArray[np.bool_],
     road: RoadNumbers,
     dt: float,
-    own: CrashRows,
-    others: CrashRows,
+    own: crash.Crash,
+    others: crash.Crash,
 ) -> None:
-    """Put the crashes of a tick in, from x, y, heading and speed (4, N, B): `EpisodeStatistics.update`."""
+    """Put the crashes of a tick into arrays, from x, y, heading and speed (4, N, B): `EpisodeStatistics.update`."""
     vehicles = after.shape[1]
     for row in range(after.shape[2]):
         if was_over[row]:
@@ -83,7 +72,7 @@ def write_crash(
     last: int,
     road: RoadNumbers,
     dt: float,
-    found: CrashRows,
+    found: crash.Crash,
     row: int,
 ) -> None:
     """Write the crash of vehicles from `first` to before `last` with those behind them, (4, N): `crash.crash_of`."""
@@ -137,7 +126,7 @@ def find_contact(old: SingleArray, new: SingleArray, one: int, other: int, dt: f
 
 @compiled
 def _write_contact(
-    contact: Contact, old: SingleArray, new: SingleArray, pair: tuple[int, int], dt: float, found: CrashRows, row: int
+    contact: Contact, old: SingleArray, new: SingleArray, pair: tuple[int, int], dt: float, found: crash.Crash, row: int
 ) -> None:
     """Write a crash of two vehicles."""
     kind, (one, other) = _kind(contact), pair
@@ -164,7 +153,7 @@ def _kind(contact: Contact) -> int:
 
 
 @compiled
-def _write_edge(old: SingleArray, new: SingleArray, dt: float, found: CrashRows, row: int) -> None:
+def _write_edge(old: SingleArray, new: SingleArray, dt: float, found: crash.Crash, row: int) -> None:
     """Write a crash of the ego with the edge of the road: `rare_envs.traffic.crash._edge_crash`."""
     across = abs((new[1, 0] - old[1, 0]) / dt)
     change = _PART * across

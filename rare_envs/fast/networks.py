@@ -80,9 +80,9 @@ class PolicyNumbers(NamedTuple):
         weights, biases, widths = [], [], [pad(features)]
         for weight, bias in policy.layers:
             padded = np.zeros((pad(len(bias)), widths[-1]), dtype=np.float32)
-            padded[: weight.shape[0], : weight.shape[1]] = weight
+            padded[: weight.shape[0], : weight.shape[1]] = weight.numpy()
             weights.append(padded.ravel())
-            biases.append(np.pad(bias.astype(np.float32), (0, len(padded) - len(bias))))
+            biases.append(np.pad(bias.numpy(), (0, len(padded) - len(bias))))
             widths.append(len(padded))
         anything = [[-np.inf] * 2, [np.inf] * 2]
         mean, deviation, furthest = policy.normalisation or (np.zeros(features), np.ones(features), np.inf)
@@ -92,7 +92,9 @@ class PolicyNumbers(NamedTuple):
             widths=np.array(widths),
             bounded=policy.activation == "tanh",
             chooses=policy.chooses,
-            clip=np.array(policy.clip or anything, dtype=np.float32),
+            clip=np.array(
+                anything if policy.clip is None else [bound.numpy() for bound in policy.clip], dtype=np.float32
+            ),
             rescales=policy.rescale is not None,
             rescale=np.array(policy.rescale or anything, dtype=np.float64),
             mean=np.asarray(mean, dtype=np.float64),

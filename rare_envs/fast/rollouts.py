@@ -12,7 +12,7 @@ from rare_envs.control.actions import MAX_ACCELERATION, MAX_STEERING
 from rare_envs.control.idm import IDM
 from rare_envs.egos.dense_policies import DensePolicy
 from rare_envs.fast import rows as fast_rows
-from rare_envs.fast.crashes import CrashRows, record_crashes
+from rare_envs.fast.crashes import record_crashes
 from rare_envs.fast.equations import (
     ONE,
     TWO,
@@ -177,7 +177,7 @@ def advance(episode: Episode, action: SingleArray, script: ScriptNumbers) -> Ste
     assert statistics is not None
     statistics = statistics._replace(least_ttc=least)
     if eventful:
-        own, others = (CrashRows(*(field.numpy().copy() for field in each)) for each in statistics[1:])
+        own, others = (Crash(*(field.numpy().copy() for field in each)) for each in statistics[1:])
         record_crashes(before, after, episode.collided.numpy(), now.numpy(), script.road, script.dt, own, others)
         statistics = EpisodeStatistics(least, *(Crash(*map(tensor, each)) for each in (own, others)))
     moved = episode._replace(

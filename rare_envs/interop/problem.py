@@ -11,7 +11,7 @@ import numpy as np
 from highway_env.vehicle.behavior import IDMVehicle
 
 from rare_envs.distributions.coordinates import FloatArray
-from rare_envs.distributions.space import Distribution, ScenarioSpace
+from rare_envs.distributions.space import ScenarioSpace
 from rare_envs.egos.wrappers import wrap_policy
 from rare_envs.interop.layouts import IDM_PARAMETERS, restore_class_parameters, set_idm
 from rare_envs.interop.scenario import HighwayEnvScenario, install_fast_observation
@@ -94,6 +94,9 @@ class HighwayEnvProblem:
         env_id: The environment's id.
         ego: What was given; in another process its policy alone.
         space: Names, units, bounds and base distribution of x.
+        dim: Number of columns of x.
+        column_names: Their names, for the tables of results.
+        base: Distribution of x.
         fixed: Parameters that are held, and their values.
         given: Condition of p in words, for `samplers.Estimate.given`; empty if nothing is held fixed.
         chunk_size: Drives that a worker of `samplers.estimate(..., workers=2)` makes at once: each takes a good part of
@@ -156,24 +159,10 @@ class HighwayEnvProblem:
         self._policy = None if is_idm else BarePolicy(ego) if is_model else ego
         env, _ = self._driven
         self.space: ScenarioSpace = env.space
+        self.dim, self.column_names, self.base = env.space.dim, env.space.column_names, env.space.base
         self.fixed: dict[str, Any] = env.fixed
         held = env.layout.leftover and noise == "fixed"
         self.given = "what HighwayEnv draws beyond x is one fixed draw" if held else ""
-
-    @property
-    def dim(self) -> int:
-        """Number of columns of x."""
-        return self.space.dim
-
-    @property
-    def column_names(self) -> tuple[str, ...]:
-        """Names of the columns of x, for the tables of results."""
-        return self.space.column_names
-
-    @property
-    def base(self) -> Distribution:
-        """Distribution of x."""
-        return self.space.base
 
     @use_one_thread()
     def evaluate(self, x: FloatArray) -> FloatArray:

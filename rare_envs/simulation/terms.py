@@ -97,7 +97,7 @@ _COASTING: Any = SimpleNamespace(act=lambda episode, memory: (torch.zeros_like(e
 def find_differentiator(world: World, driver: Driver, black_box: bool, x: FloatArray) -> Differentiator | None:
     """Return the gradients of a problem; None if a tick of x (1, d) shows that measure or world have none."""
     order, _ = find_order(world.measurement.episode_measure, world.measurement.collisions, 0.0)
-    if order is None or not _is_differentiable(world, _COASTING, order, x[:, : sum(world.columns)]):
+    if order is None or not _is_differentiable(world, _COASTING, order, x[:, : world.dim]):
         return None
     through = not black_box and _is_differentiable(world, driver, order, x)
     return partial(_differentiate, world, driver, through)

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from numbers import Real
-from typing import Any, NamedTuple, Protocol, cast
+from typing import Any, Protocol, cast
 
 import torch
 from gymnasium import spaces
@@ -15,6 +16,7 @@ from torch import Tensor
 from rare_envs.control.actions import DECISION, follow_meta_actions, initial_aim, space_of_actions
 from rare_envs.control.idm import IDM
 from rare_envs.devices import fixed_draws
+from rare_envs.distributions.product import NoiseDistribution
 from rare_envs.distributions.space import Distribution, Parameter
 from rare_envs.measures import EpisodeMeasure, Moment
 from rare_envs.measures.registry import find_measure
@@ -157,18 +159,14 @@ class Measurement:
         return find_measure(self.measure)
 
 
-class Columns(NamedTuple):
-    """Numbers of columns of x, in their order."""
+Block = tuple[tuple[Parameter, ...], Distribution]
+"""Parameters of x that are drawn together, with their distribution."""
 
-    scenario: int
-    """The scenario's own parameters."""
-    weather: int
-    weights: int
-    """Weights of the background drivers."""
-    noise: int
-    """Background drivers' noise."""
-    camera_noise: int
-    """The key from which the camera's noise follows: 1 or 0."""
+
+def noise_block(name: str, meaning: str, size: int) -> list[Block]:
+    """Return one parameter of so many standard normal columns; none of 0 columns."""
+    parameter = Parameter(name, "", -math.inf, math.inf, meaning, size)
+    return [((parameter,), NoiseDistribution(size))] if size else []
 
 
 @dataclass(frozen=True)
@@ -214,23 +212,32 @@ class World:
         by_lidar = self.background is not None and not isinstance(self.background, TrafficBackground)
         return self.sensing.uses_lidar or by_lidar or self.measurement.episode_measure.sees
 
-    @property
-    def weather_distributions(self) -> tuple[tuple[tuple[Parameter, ...], Distribution], ...]:
-        """Parameters of the weather with their distributions, in the order of x; none on a clear day."""
-        return tuple(weather_parameters(noisy=self.noise is not False)) if self.sensing.weather else ()
+    @cached_property
+    def blocks(self) -> dict[str, list[Block]]:
+        """Parameters of x behind the scenario's own: weather, weights of drivers, noise of drivers, of the camera."""
+        weights = None if self.background is None else self.background.weights
+        noise = noise_size(self.clock.ticks, self.scenario.vehicles - 1) if self._noisy and self.noise is True else 0
+        found: dict[str, list[Block]] = {"weather": [], "weights": []}
+        if self.sensing.weather:
+            found["weather"] = list(weather_parameters(noisy=self.noise is not False))
+        if weights is not None:
+            own = Parameter("weights", "", -math.inf, math.inf, "of the drivers' last layer", weights.dim)
+            found["weights"] = [((own,), weights)]
+        found["noise"] = noise_block("noise", "of the drivers, tick by tick", noise)
+        key = int(self.sensing.weather and self.noise is True)
+        found["camera_noise"] = noise_block("camera_noise", "from which the noise of all pixels follows", key)
+        return found
 
     @cached_property
-    def columns(self) -> Columns:
-        """Numbers of columns of x."""
-        weights = None if self.background is None else self.background.weights
-        others = self.scenario.vehicles - 1
-        return Columns(
-            scenario=self.scenario.size,
-            weather=sum(each.size for parameters, _ in self.weather_distributions for each in parameters),
-            weights=0 if weights is None else weights.dim,
-            noise=noise_size(self.clock.ticks, others) if self._noisy and self.noise is True else 0,
-            camera_noise=int(self.sensing.weather and self.noise is True),
-        )
+    def columns(self) -> dict[str, int]:
+        """Numbers of columns of x, in their order: those of the scenario, and of each of the `blocks`."""
+        sizes = {name: sum(p.size for own, _ in blocks for p in own) for name, blocks in self.blocks.items()}
+        return {"scenario": self.scenario.size, **sizes}
+
+    @cached_property
+    def dim(self) -> int:
+        """Number of columns of x, without those of an ego's noise."""
+        return sum(self.columns.values())
 
     @property
     def _noisy(self) -> bool:
@@ -260,7 +267,7 @@ class World:
         Returns:
             The episodes at time 0.
         """
-        own, weather, weights, noise, key = torch.split(x, list(self.columns), dim=1)
+        own, weather, weights, noise, key = torch.split(x, list(self.columns.values()), dim=1)
         state, background = self.scenario.initial(own), None
         if self.background is not None:
             batch, others = len(noise), self.scenario.vehicles - 1

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ast
 import os
 import signal
 import subprocess
@@ -28,28 +27,6 @@ def test_an_error_leaves_the_earlier_file_and_no_draft(error: type[BaseException
         raise error
     assert path.read_bytes() == b"earlier"
     assert names(tmp_path) == ["ego.zip"]
-
-
-WRITERS = ("write_text", "write_bytes", "savefig", "print_png", "savez", "savez_compressed")
-ROOT = Path(__file__).parents[2]
-
-
-def direct_writes() -> list[str]:
-    """Return calls in the packages that write into a file that is not a draft, nor a buffer in memory."""
-    found = []
-    for package in ("agents", "rare_envs", "training"):
-        for path in sorted((ROOT / package).rglob("*.py")):
-            for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-                if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute) and node.func.attr in WRITERS:
-                    target = node.func.value if node.func.attr.startswith("write") else node.args[0]
-                    if not (isinstance(target, ast.Name) and target.id in ("draft", "buffer")):
-                        found.append(f"{path.relative_to(ROOT)}:{node.lineno}")
-    return found
-
-
-@pytest.mark.slow
-def test_every_file_of_the_packages_is_replaced_whole() -> None:
-    assert not direct_writes()
 
 
 WRITER = """

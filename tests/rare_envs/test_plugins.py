@@ -6,11 +6,9 @@ from pathlib import Path
 import pytest
 
 from rare_envs.plugins import (
-    SIBLINGS,
     did_you_mean,
     import_module,
     import_object,
-    warn_of_namesakes,
 )
 
 
@@ -59,16 +57,3 @@ def test_names_are_suggested_without_their_namespace() -> None:
         assert did_you_mean(name, ids) == " (did you mean 'rare_envs/CutIn-v0'?)"
     assert did_you_mean("TTC", ["ttc", "pet"]) == " (did you mean 'ttc'?)"
     assert did_you_mean("zzz", ids) == ""
-
-
-@pytest.mark.parametrize("name", SIBLINGS)
-def test_a_package_of_the_same_name_is_noticed(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (tmp_path / name).mkdir()
-    (tmp_path / name / "__init__.py").write_text("raise RuntimeError('imported')")
-    monkeypatch.syspath_prepend(tmp_path)
-    monkeypatch.delitem(sys.modules, name, raising=False)
-    with pytest.warns(RuntimeWarning, match=f"Expected '{name}' of Rare Envs, found another package") as caught:
-        warn_of_namesakes()
-    assert len(caught) == 1
-    assert str(tmp_path) in str(caught[0].message)
-    assert "\n" not in str(caught[0].message)

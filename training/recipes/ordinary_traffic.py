@@ -207,10 +207,10 @@ def make_world(case: Case, seconds: float = SECONDS, observation: str = "feature
 def draw_inputs(case: Case, world: World, n: int, own: int, rng: np.random.Generator) -> FloatArray:
     """Draw starts, drivers' weights, noise of drivers and (`own` columns) of the ego, side by side, shape (n, d)."""
     parts = [case.starts(n, rng)]
-    if world.columns.weights:
+    if world.columns["weights"]:
         assert world.background is not None and world.background.weights is not None
         parts.append(world.background.weights.sample(n, rng))
-    return np.concatenate((*parts, rng.standard_normal((n, world.columns.noise + own))), axis=1)
+    return np.concatenate((*parts, rng.standard_normal((n, world.columns["noise"] + own))), axis=1)
 
 
 class Verdicts(NamedTuple):

@@ -173,7 +173,7 @@ def start_situation(situation: Situation, rows: int, seconds: float, rng: np.ran
     parts = [own, _draw_weather(rows, rng)]
     if world.background is not None and world.background.weights is not None:
         parts.append(world.background.weights.sample(rows, rng))
-    parts.append(rng.standard_normal((rows, world.columns.noise + world.columns.camera_noise)))
+    parts.append(rng.standard_normal((rows, world.columns["noise"] + world.columns["camera_noise"])))
     start = world.start(torch.from_numpy(np.concatenate(parts, axis=1)).float())
     state = _displace_ego(start.state, scenario, rng)
     perception = perceive_traffic(state, scenario.road) if world.uses_lidar else None

@@ -12,7 +12,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 import rare_envs
 import training
-from rare_envs.egos.dense_policies import DenseInference, find_inference, read_dense_policy
+from rare_envs.egos.dense_policies import DensePolicy, find_inference, read_dense_policy
 from rare_envs.egos.wrappers import WrappedPolicy, wrap_policy
 
 CAR_FOLLOWING = "rare_envs/CarFollowing-v0"
@@ -74,7 +74,7 @@ def make_cut_in(algorithm=PPO, **policy_kwargs):
 def test_actions_between_rectifiers_are_those_of_predict_to_the_last_bit(net_arch):
     model = make_cut_in(A2C, activation_fn=torch.nn.ReLU, net_arch=net_arch)
     found = find_inference(model)
-    assert isinstance(found, DenseInference)
+    assert isinstance(found, DensePolicy)
     for size in (1, 25, 4096):
         seen = np.random.default_rng(1).uniform(-5, 5, (size, 11)).astype(np.float32)
         np.testing.assert_array_equal(found.predict(seen)[0], model.predict(seen, deterministic=True)[0])
@@ -91,7 +91,7 @@ def test_actions_between_tangents_are_as_near_to_exact_ones_as_those_of_predict(
         model.policy.action_net.weight /= 8 * gain  # the actions' bounds clip few of them
     seen = np.random.default_rng(1).uniform(-5, 5, (1000, 11)).astype(np.float32)
     found = find_inference(model)
-    assert isinstance(found, DenseInference)
+    assert isinstance(found, DensePolicy)
     single = model.predict(seen, deterministic=True)[0]
     policy = model.policy.double()
     with torch.no_grad():
@@ -110,7 +110,7 @@ def test_wrappers_stay_around_the_layers():
     wrapped = WrappedPolicy(inner, bounds=(np.full(2, -2.0), np.ones(2)))
     found = find_inference(wrapped)
     assert type(found) is type(found.policy) is WrappedPolicy
-    assert isinstance(found.policy.policy, DenseInference)
+    assert isinstance(found.policy.policy, DensePolicy)
     seen = np.random.default_rng(1).uniform(-5, 5, (25, 11)).astype(np.float32)
     np.testing.assert_allclose(found.predict(seen)[0], wrapped.predict(seen, deterministic=True)[0], atol=1e-6)
 

@@ -9,9 +9,9 @@ from gymnasium import spaces
 
 import rare_envs
 from rare_envs.control.actions import IDLE
-from rare_envs.egos.policy import PolicyDriver, PolicyQuery, as_driver, check_spaces, query_policy
-from rare_envs.egos.wrappers import WrappedPolicy, describe_missing_normalisation, find_frame_stacking
-from rare_envs.plugins import EgoGone, NoAnswer, check_predict, reason_of, refuse_ego
+from rare_envs.egos.policy import PolicyQuery, as_driver, check_spaces, query_policy
+from rare_envs.egos.wrappers import WrappedPolicy, find_frame_stacking
+from rare_envs.plugins import EgoGone, NoAnswer, check_predict, refuse_ego
 from rare_envs.scenarios.car_following import CAR_FOLLOWING
 from rare_envs.simulation.observation import observation_space
 from rare_envs.simulation.world import Clock, World
@@ -57,18 +57,6 @@ def test_spaces_of_actions() -> None:
             check_spaces(Recorder(action_space=space), expected, kind)
     with pytest.raises(ValueError, match=r"takes Discrete\(5\) \(LANE_LEFT"):
         check_spaces(Recorder(action_space=spaces.Box(-1, 1, (2,))), expected, "meta")
-
-
-def test_rows_after_a_collision_and_rows_that_failed_are_shown_what_another_row_sees() -> None:
-    episode = WORLD.start(X)._replace(collided=torch.tensor([True, False, False]))
-    policy = Recorder()
-    _, memory = PolicyDriver(policy).act(episode, None)
-    PolicyDriver(policy, failed_rows={1: "no road"}).act(episode, memory)
-    (first, begins), (second, goes_on) = policy.shown
-    np.testing.assert_allclose(first[:, 0] * 30.0, [25.0, 25.0, 30.0])
-    np.testing.assert_allclose(second[:, 0] * 30.0, [30.0, 30.0, 30.0])
-    assert begins.all()
-    assert not goes_on.any()
 
 
 def test_a_policy_with_meta_actions_is_queried_once_a_second() -> None:
@@ -167,19 +155,6 @@ def test_actions_that_are_no_numbers_are_refused(answer: Any) -> None:
         query_policy(Wordy(), "continuous", query([0.1, 0.2]))
 
 
-@pytest.mark.parametrize(
-    ("error", "reason"),
-    [
-        (RuntimeError("no\n  road"), "RuntimeError: no road"),
-        (ValueError("Expected this, got that."), "Expected this, got that."),
-        (SystemExit(7), "SystemExit(7)"),
-        (NoAnswer("within 10 s"), "NoAnswer: within 10 s"),
-    ],
-)
-def test_reasons_are_one_line(error: BaseException, reason: str) -> None:
-    assert reason_of(error) == reason
-
-
 class Still:
     """A policy."""
 
@@ -260,19 +235,3 @@ def test_frames_side_by_side_begin_with_zeros_and_along_an_axis_with_copies() ->
         np.testing.assert_array_equal(shown, first)
         shown, _ = policy.predict(two, state, episode_start=np.array([False, True]))  # the second row begins anew
         np.testing.assert_array_equal(shown, second)
-
-
-class Model:
-    """What a Stable-Baselines3 model in memory tells of its training."""
-
-    def __init__(self, high: float, statistics: Any = None) -> None:
-        self.observation_space = spaces.Box(-high, high, (3,))
-        self.get_vec_normalize_env = lambda: statistics
-
-
-def test_bounds_tell_of_normalised_observations_unless_the_statistics_are_there() -> None:
-    given = spaces.Box(-5.0, 5.0, (3,))
-    assert "NormalizeObservation" in describe_missing_normalisation(Model(np.inf), given)
-    assert describe_missing_normalisation(Model(5.0), given) == ""
-    assert describe_missing_normalisation(Model(np.inf, statistics=object()), given) == ""
-    assert describe_missing_normalisation(Model(np.inf), spaces.Box(-np.inf, np.inf, (3,))) == ""

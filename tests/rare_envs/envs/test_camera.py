@@ -5,14 +5,12 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
-import torch
 from gymnasium import spaces
 from numpy.typing import NDArray
 from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import VecFrameStack
 
 import rare_envs
-from rare_envs.sensors.camera import Camera
 from rare_envs.simulation.observation import map_kinds
 from training import sb3_vec_env
 
@@ -100,26 +98,3 @@ def test_an_ego_for_other_pictures_is_refused() -> None:
         rare_envs.DrivingProblem(CUT_IN, ego=Daredevil(), observation="camera", camera=(32, 64))
     with pytest.raises(ValueError, match="66, 200, 3"):
         rare_envs.DrivingProblem(CUT_IN, ego=Daredevil(), observation="camera+lidar")
-
-
-@pytest.mark.gpu
-def test_pictures_of_a_gpu_are_those_of_the_cpu() -> None:
-    from rare_envs.sensors.camera import CameraContext, Weather, clear_day
-    from rare_envs.sensors.pictures import take_picture
-    from rare_envs.traffic.road import i80
-    from rare_envs.traffic.state import State
-
-    x = torch.rand(32, 6) * 60
-    y, heading = torch.rand(32, 6) * 15, torch.randn(32, 6) * 0.05
-    state, sky = (
-        State(x, y, heading, torch.zeros_like(x), x[:, :0]),
-        clear_day(x)._replace(noise=torch.full((32,), 4.0)),
-    )
-    here = take_picture(state, i80(), CameraContext.at_start(Camera(), sky)).int()
-    there = take_picture(
-        State(*(field.cuda() for field in state)),
-        i80(),
-        CameraContext.at_start(Camera(), Weather(*(field.cuda() for field in sky))),
-    )
-    difference = (there.cpu().int() - here).abs()
-    assert (difference > 1).float().mean() < 1e-3  # silhouettes

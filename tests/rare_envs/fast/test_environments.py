@@ -139,8 +139,8 @@ def nothing() -> crash.Crash:
     return crash.Crash.nothing(torch.zeros(N))
 
 
-def copied(crashes: crash.Crash) -> fast_crashes.CrashRows:
-    return fast_crashes.CrashRows(*(field.numpy().copy() for field in crashes))
+def copied(crashes: crash.Crash) -> crash.Crash:
+    return crash.Crash(*(field.numpy().copy() for field in crashes))
 
 
 @pytest.mark.parametrize(("turned", "speed"), [(0.0, 30.0), (0.2, 30.0), (1.5, 10.0), (0.1, 0.0)])

@@ -6,8 +6,7 @@ import torch
 import agents
 from agents.files import LANE_CHANGING, RULE_BASED, SHIPPED_DRIVERS
 from rare_envs.control.lane_changing import LaneChangingDriver
-from rare_envs.devices import fixed_draws
-from rare_envs.simulation.background import FIXED_SEED, BackgroundState, find_drivers, query_background
+from rare_envs.simulation.background import BackgroundState, find_drivers, query_background
 
 
 def step_background(drivers, state, features):
@@ -18,22 +17,6 @@ def step_background(drivers, state, features):
 @pytest.fixture(autouse=True)
 def seeded() -> None:
     torch.manual_seed(0)
-
-
-def test_fixed_noise_is_one_sequence_and_no_noise_is_none():
-    drivers = agents.load_driver("mgail?rules=0")
-    features = torch.randn(3, 5, 51)
-    draws = fixed_draws((1, 2 + 7, 5, 2), FIXED_SEED, torch.zeros(1, dtype=torch.float64))
-    torch.testing.assert_close(draws, fixed_draws((1, 2 + 7, 5, 2), FIXED_SEED, torch.zeros(1, dtype=torch.float64)))
-    quiet = BackgroundState.start(drivers, torch.zeros(3, 0), torch.zeros(3, 0, 5, 2))
-    torch.testing.assert_close(step_background(drivers, quiet, features)[0], drivers.act(features)[0])
-    noisy = BackgroundState.start(drivers, torch.zeros(3, 0), draws.expand(3, -1, -1, -1).float())
-    action, after = step_background(drivers, noisy, features)
-    memory = drivers.begin(draws[:, :2].movedim(1, -1).expand(3, -1, -1, -1).float())
-    expected, _ = drivers.act(features, None, draws[:, 2].expand(3, -1, -1).float(), memory)
-    torch.testing.assert_close(action, expected)
-    assert isinstance(after, BackgroundState)
-    assert after.tick.tolist() == [1, 1, 1]
 
 
 def test_rows_of_a_batch_may_be_at_different_ticks():

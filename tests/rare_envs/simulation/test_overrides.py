@@ -9,7 +9,6 @@ import rare_envs
 from rare_envs.make import set_up
 from rare_envs.sensors.lidar import perceive_traffic
 from rare_envs.simulation.observation import CLIP, observation_space, observe
-from rare_envs.simulation.world import Sensing
 
 every = pytest.mark.parametrize("env_id", rare_envs.ENV_IDS)
 
@@ -111,22 +110,3 @@ def test_every_vehicle_observes_what_an_ego_in_its_place_would(env_id):
         as_ego = episode._replace(state=state, perception=perceive_traffic(state, world.scenario.road))
         for observation in ("features", "lidar"):
             torch.testing.assert_close(observe(episode, observation, vehicle), observe(as_ego, observation))
-
-
-def test_lidar_is_computed_where_it_is_observed_or_needed() -> None:
-    assert not Sensing("camera+features").uses_lidar
-    assert Sensing("camera+lidar").uses_lidar
-    assert Sensing("features", lidar=True).uses_lidar
-
-
-def test_a_camera_starts_at_tick_0_with_the_weather_of_x() -> None:
-    x, key = torch.tensor([[0.01, 30.0, 90.0, 2.0]]), torch.tensor([[0.5]])
-    assert Sensing("features", weather=True).start_camera(x, key) is None
-    context = Sensing("camera", weather=True).start_camera(x, key)
-    assert context is not None
-    assert context.tick.tolist() == [0]
-    torch.testing.assert_close(context.weather.fog, torch.tensor([0.01]))
-    torch.testing.assert_close(context.weather.sun_elevation, torch.tensor([torch.pi / 6]))
-    clear = Sensing("camera").start_camera(x[:, :0], key[:, :0])
-    assert clear is not None
-    assert clear.weather.noise.tolist() == [0.0]
