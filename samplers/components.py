@@ -29,11 +29,10 @@ from typing import Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import gammaln, ive, log_ndtr, ndtri_exp
+from scipy.special import gammaln, ive, log_ndtr, logsumexp, ndtri_exp
 
 from samplers.distributions import LOG_TWO_PI
 from samplers.problem import FloatArray
-from samplers.sample import log_sum_exp
 
 ROWS_FROM = 8
 """With so many coordinates sums over them are taken point by point; fewer are added in the same order either way."""
@@ -154,12 +153,12 @@ class HalfSpaceUnion:
         """Return log k(u) less the logarithm of the sum of the half-spaces' probabilities."""
         beyond = np.count_nonzero(u @ self.axes.T >= self.starts, axis=1)
         with np.errstate(divide="ignore"):
-            return np.asarray(np.log(beyond) - log_sum_exp(log_ndtr(-self.starts)))
+            return np.asarray(np.log(beyond) - logsumexp(log_ndtr(-self.starts)))
 
     def sample(self, n: int, rng: np.random.Generator) -> FloatArray:
         """Draw n points."""
         log_p = log_ndtr(-self.starts)
-        chosen = rng.choice(len(self.starts), n, p=np.exp(log_p - log_sum_exp(log_p)))
+        chosen = rng.choice(len(self.starts), n, p=np.exp(log_p - logsumexp(log_p)))
         axes, xi = self.axes[chosen], rng.standard_normal((n, self.axes.shape[1]))
         t = -ndtri_exp(np.log1p(-rng.random(n)) + log_p[chosen])
         return np.asarray(xi + (t - (xi * axes).sum(axis=1))[:, None] * axes)
@@ -239,7 +238,7 @@ def log_ratios(components: Sequence[MixtureComponent], u: FloatArray) -> FloatAr
 
 def mixture_log_ratio(log_r: FloatArray, weights: FloatArray) -> FloatArray:
     """Return the log ratio of sum_k weights_k q_k from those of the q_k (k, n), shape (n,)."""
-    return np.asarray(log_sum_exp(log_r, axis=0, weights=weights[:, None]))
+    return np.asarray(logsumexp(log_r, axis=0, b=weights[:, None]))
 
 
 def draw_counts(weights: FloatArray, n: int, rng: np.random.Generator) -> NDArray[np.int64]:
@@ -413,7 +412,7 @@ def expectation_maximisation(
     for _ in range(max_steps):
         mixture = maximise(responsibilities)
         terms = log_terms(mixture)
-        total = log_sum_exp(terms, axis=0)
+        total = logsumexp(terms, axis=0)
         log_likelihood = float(weights @ total)
         if log_likelihood - reached < least_gain(log_likelihood):
             break
@@ -423,7 +422,7 @@ def expectation_maximisation(
 
 def posterior(terms: FloatArray) -> FloatArray:
     """Return how likely each point comes from each component, from log(weight_j q_j), both of shape (k, n)."""
-    return np.asarray(np.exp(terms - log_sum_exp(terms, axis=0)))
+    return np.asarray(np.exp(terms - logsumexp(terms, axis=0)))
 
 
 def one_hot(labels: NDArray[np.int64], k: int) -> FloatArray:

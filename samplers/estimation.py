@@ -28,9 +28,7 @@ from samplers.sample import Status
 
 DEFERRED_SIGNALS = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name))
 NARROW_TERMINAL = 72
-"""Columns of a terminal below which a bar keeps itself, the count and the time only."""
-WIDE_TERMINAL = 110
-"""Columns of a terminal below which the bar is short where there are workers, so that all of the line is seen."""
+"""Columns of a terminal below which a progress bar keeps itself, the count and the time only."""
 Stop = Callable[[Progress], str | None]
 """Returns the reason to stop a run, in words, or None."""
 
@@ -241,7 +239,7 @@ def run_method(
     """
     with show_bar(arguments.max_sim) if progress is True else nullcontext(progress or None) as listener:
         if evaluator.pool.workers and listener is not None:
-            listener = _follow_chunks(listener, evaluator)
+            listener = _follow_chunks(listener, evaluator, arguments.max_sim)
         run = Run(inputs, method, arguments, listener, evaluator.offer, keep_points)
         try:
             while not run.done:
@@ -299,74 +297,56 @@ def _add_remarks(result: Estimate, evaluator: Evaluator) -> Estimate:
 # Progress
 
 
-def _follow_chunks(listener: Listener, evaluator: Evaluator) -> Listener:
+def _follow_chunks(listener: Listener, evaluator: Evaluator, max_sim: int | None) -> Listener:
     """Return a listener of a run that is told of every chunk of the workers too, and how long the rest takes."""
-    started, shown = time.monotonic(), 0
-    latest: Progress | None = None
+    started, shown, latest = time.monotonic(), 0, Progress(n_sim=0, max_sim=max_sim)
 
-    def show(progress: Progress) -> None:
-        nonlocal shown
-        shown, left = progress.n_sim, None
-        n_made = progress.n_sim - evaluator.n_restored
+    def show(progress: Progress, n_more: int = 0) -> None:
+        nonlocal latest, shown
+        latest, n_sim, pool = progress, progress.n_sim + n_more, evaluator.pool
+        if n_more and n_sim <= shown:
+            return
+        shown, n_made = n_sim, n_sim - evaluator.n_restored
+        left = None
         if progress.max_sim is not None and n_made > 0:
-            left = (progress.max_sim - progress.n_sim) * (time.monotonic() - started) / n_made
-        pool = evaluator.pool
-        listener(replace(progress, workers=pool.workers, n_retries=pool.n_retries, seconds_left=left))
+            left = (progress.max_sim - n_sim) * (time.monotonic() - started) / n_made
+        about = {"workers": pool.workers, "n_retries": pool.n_retries}
+        listener(replace(progress, n_sim=n_sim, seconds_left=left, **about))
 
-    def take_progress(progress: Progress) -> None:
-        nonlocal latest
-        latest = progress
-        show(progress)
-
-    def take_chunk(n_done: int) -> None:
-        if latest is not None and latest.n_sim + n_done > shown:
-            show(replace(latest, n_sim=latest.n_sim + n_done))
-
-    evaluator.on_chunk = take_chunk
-    return take_progress
+    evaluator.on_chunk = lambda n_done: show(latest, n_done)
+    return show
 
 
-def describe_workers(progress: Progress) -> str:
-    """Return words for the workers, what they lost, and the time left; empty without workers."""
-    if not progress.workers:
-        return ""
-    words = f", {progress.workers} workers{f', {progress.n_retries} retries' if progress.n_retries else ''}"
-    if progress.seconds_left is None:
-        return words
-    for unit, seconds in (("d", 86400.0), ("h", 3600.0), ("min", 60.0)):
-        if progress.seconds_left >= 2 * seconds:
-            return f"{words}, {progress.seconds_left / seconds:.0f} {unit} left"
-    return f"{words}, {progress.seconds_left:.0f} s left"
+def describe_progress(progress: Progress) -> str:
+    """Return the level and p so far, and with workers their number, what they lost, and the time left."""
+    words = f"run {progress.run + 1} " if progress.run else ""
+    if not math.isnan(progress.p):
+        words += f"P[f <= {progress.level:.3g}] = {progress.p:.2e}"
+    if progress.workers:
+        words += f", {progress.workers} workers{f', {progress.n_retries} retries' if progress.n_retries else ''}"
+    if progress.seconds_left is not None:
+        units = (("d", 86400.0), ("h", 3600.0), ("min", 60.0), ("s", 1.0))
+        unit, seconds = next((each for each in units if progress.seconds_left >= 2 * each[1]), units[-1])
+        words += f", {progress.seconds_left / seconds:.0f} {unit} left"
+    return words
 
 
 @contextmanager
 def show_bar(max_sim: int | None) -> Iterator[Listener]:
     """Show a bar on standard error while the run lasts; one that fails leaves nothing of it."""
     from rich.console import Console  # optional, and slow to import
-    from rich.progress import BarColumn, ProgressColumn, TextColumn, TimeElapsedColumn
+    from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
     from rich.progress import Progress as Bar
 
-    console, length = Console(stderr=True), BarColumn(bar_width=20)
-    columns: tuple[ProgressColumn, ...] = (
-        TextColumn("[bold]{task.description}"),
-        length,
-        TextColumn("{task.completed:,.0f} {task.fields[unit]}"),
-        TextColumn("{task.fields[state]}", markup=False),
-        TimeElapsedColumn(),
-    )
-    narrow = (BarColumn(bar_width=10), TextColumn("{task.completed:,.0f} done"), TimeElapsedColumn())
-    bar = Bar(*(columns if console.width >= NARROW_TERMINAL else narrow), console=console)
-    task = bar.add_task("estimate", total=max_sim, state="", unit="simulations")
+    console, time_column = Console(stderr=True), TimeElapsedColumn()
+    columns = (BarColumn(bar_width=10), TextColumn("{task.completed:,.0f} {task.fields[unit]}"))
+    state_column = (TextColumn("{task.fields[state]}", markup=False),) if console.width >= NARROW_TERMINAL else ()
+    bar = Bar(*columns, *state_column, time_column, console=console)
+    task = bar.add_task("", total=max_sim, state="", unit="simulations")
 
     def show(progress: Progress) -> None:
-        state = f"run {progress.run + 1} " if progress.run else ""
-        if not math.isnan(progress.p):
-            state += f"P[f <= {progress.level:.3g}] = {progress.p:.2e}"
-        state += describe_workers(progress)
-        if progress.workers and console.width < WIDE_TERMINAL:  # the rest of the line needs the room
-            length.bar_width = 10
-            bar.update(task, description="", unit="done")
-        bar.update(task, completed=progress.n_sim, state=state)
+        unit = "done" if progress.workers else "simulations"  # the rest of the line needs the room
+        bar.update(task, completed=progress.n_sim, state=describe_progress(progress), unit=unit)
 
     bar.start()
     try:

@@ -19,11 +19,11 @@ from typing import Any, Protocol
 
 import numpy as np
 from scipy.optimize import isotonic_regression
+from scipy.special import logsumexp
 
 from samplers.components import expectation_maximisation, shrink_covariance, start_from_centres
 from samplers.distributions import Gaussian
 from samplers.problem import FloatArray, StandardNormal
-from samplers.sample import log_sum_exp
 
 __all__ = ["Gaussian", "Mixture", "correct_eigenvalues", "fit_proposal_mixture", "fit_shrunk_gaussian"]
 
@@ -68,7 +68,7 @@ class Mixture:
 
     def log_prob(self, u: FloatArray, /) -> FloatArray:
         """Return the log density at u (n, d), shape (n,)."""
-        return np.asarray(log_sum_exp(self.log_terms(u), axis=0))
+        return np.asarray(logsumexp(self.log_terms(u), axis=0))
 
     def log_terms(self, u: FloatArray) -> FloatArray:
         """Return log(weight_j q_j) of the components at u (n, d), shape (k, n)."""

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from samplers.analysis.base_error import BaseUncertainty, compute_base_uncertainty
 from samplers.analysis.curve import Curve, compute_curve, lowest_known_threshold
 from samplers.analysis.gate import Pilot, Verdict, judge_estimate
-from samplers.analysis.reweight import Reweighted, find_sibling, reweight_estimate
+from samplers.analysis.reweight import Reweighted, reweight_estimate
 from samplers.analysis.sensitivity import Sensitivity, compute_sensitivity
 from samplers.analysis.weighted import Share, require_sample, split_by_kind
 from samplers.method import EstimateData, Stepping
@@ -131,25 +131,6 @@ class Estimate(EstimateData, Printed):
             0.006
         """
         return reweight_estimate(self, new_base)
-
-    def under(self, base: Any) -> Reweighted:
-        """Return P[f(X) <= gamma] with X from another base distribution, which may be one that the base knows by name.
-
-        Args:
-            base: The other distribution, as for `reweight`, or a name for `sibling` of this run's base distribution.
-
-        Raises:
-            ValueError: As in `reweight`; or the base distribution knows no others by name, or not this one.
-
-        Example:
-            >>> import samplers
-            >>> result = samplers.estimate(samplers.FunctionProblem(lambda x: 3.0 - x[:, 0], dim=2), seed=0)
-            >>> result.under("i80")
-            Traceback (most recent call last):
-                ...
-            ValueError: This base distribution knows no others by name: give a distribution in place of 'i80'.
-        """
-        return self.reweight(find_sibling(self.base, base) if isinstance(base, str) else base)
 
     @cached_property
     def base_uncertainty(self) -> BaseUncertainty | None:
@@ -392,32 +373,19 @@ class Estimate(EstimateData, Printed):
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain lists, numbers and strings for JSON; NaN and infinities become None."""
-        data = {
-            "p": self.p,
-            "interval": list(self.interval),
-            "confidence": self.confidence,
-            "cov": self.cov,
-            "base_uncertainty": None if self.base_uncertainty is None else self.base_uncertainty.to_dict(),
-            "gamma": self.gamma,
-            "n_sim": self.n_sim,
-            "base_draws": self.base_draws,
+        plain = "p interval confidence cov gamma n_sim base_draws unseen given gain warnings remarks choice seed"
+        uncertainty, points = self.base_uncertainty, self.failures
+        data = {name: getattr(self, name) for name in plain.split()} | {
+            "base_uncertainty": None if uncertainty is None else uncertainty.to_dict(),
             "final_draws": None if self.sample is None else self.sample.n_units,
-            "unseen": self.unseen,
-            "given": self.given,
-            "gain": self.gain,
             "status": str(self.status),
-            "warnings": list(self.warnings),
-            "remarks": list(self.remarks),
             "trace": [asdict(level) for level in self.trace],
-            "failures": {
-                **{name: getattr(self.failures, name).tolist() for name in ("x", "f", "log_p0")},
-                "total": self.failures.total,
-            },
+            "failures": {"total": points.total}
+            | {name: getattr(points, name).tolist() for name in ("x", "f", "log_p0")},
             "method": {"name": self.method.name, "settings": method_settings(self.method)},
-            "choice": self.choice,
-            "seed": self.seed,
         }
-        return {key: to_json_value(value) for key, value in data.items()}
+        found: dict[str, Any] = to_json_value(data)
+        return found
 
     def to_json(self) -> str:
         """Return `to_dict` as one line of JSON."""

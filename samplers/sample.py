@@ -15,11 +15,11 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from enum import Enum
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import betaincinv, ndtr, ndtri, stdtrit
+from scipy.special import betaincinv, logsumexp, ndtr, ndtri, stdtrit
 
 from samplers.problem import FloatArray
 
@@ -314,38 +314,16 @@ class Failures:
     __hash__ = None  # type: ignore[assignment]  # arrays have no hash
 
 
-def log_sum_exp(a: FloatArray, axis: int | None = None, weights: FloatArray | None = None) -> Any:
-    """Return log(sum of weights * exp(a)) along an axis, which is dropped, or of all numbers; -inf for no numbers.
-
-    Weights are not negative, and all 1 where there are none. The bits are those of `scipy.special.logsumexp`, in a
-    third of its time for the arrays of an estimate, most of which have some thousand numbers: the largest number is
-    left out of the sum and its share is added by log1p.
-    """
-    if weights is not None:
-        a = np.where(weights == 0, -np.inf, a)
-    if a.size == 0:
-        return np.full(np.delete(a.shape, axis) if axis is not None else (), -np.inf)[()]
-    largest = a.max(axis=axis, keepdims=True)
-    first = a == largest
-    with np.errstate(invalid="ignore", divide="ignore"):  # all numbers may be -inf
-        others = np.exp(a - largest)
-        others[first] = 0.0
-        m = (first if weights is None else weights * first).sum(axis=axis, keepdims=True, dtype=np.float64)
-        s = (others if weights is None else weights * others).sum(axis=axis, keepdims=True)
-        out = np.log1p(np.where(s == 0, s, s / m)) + np.log(m) + largest
-    return np.where(np.isfinite(largest), out, largest).squeeze(axis)[()]
-
-
 def normalise_weights(log_weights: FloatArray) -> FloatArray:
     """Return weights proportional to exp(log_weights) (n,) that add up to 1."""
-    return np.asarray(np.exp(log_weights - log_sum_exp(log_weights)))
+    return np.asarray(np.exp(log_weights - logsumexp(log_weights)))
 
 
 def effective_sample_size(log_weights: FloatArray) -> float:
     """Return Kish's (sum w)^2 / sum w^2 of weights given as logarithms (n,); 0 for none."""
     if log_weights.size == 0:
         return 0.0
-    return float(np.exp(2 * log_sum_exp(log_weights) - log_sum_exp(2 * log_weights)))
+    return float(np.exp(2 * logsumexp(log_weights) - logsumexp(2 * log_weights)))
 
 
 def largest_weight_share(log_weights: FloatArray) -> float:

@@ -189,13 +189,6 @@ def reweight_estimate(estimate: EstimateData, new_base: Any) -> Reweighted:
     )
 
 
-def find_sibling(base: Any, name: str) -> Any:
-    """Return another base distribution of the same X by its name; a ValueError if there is none."""
-    if not hasattr(base, "sibling"):  # the user's own class
-        raise ValueError(f"This base distribution knows no others by name: give a distribution in place of {name!r}.")
-    return base.sibling(name)
-
-
 def require_base(estimate: EstimateData) -> Distribution:
     """Return the base distribution of an estimate, or raise a ValueError that says it is not known."""
     if estimate.base is None:

@@ -14,7 +14,7 @@ from typing import ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import ndtri
+from scipy.special import logsumexp, ndtri
 
 from samplers.distributions import Gaussian
 from samplers.importance import (
@@ -39,7 +39,6 @@ from samplers.sample import (
     degrees_of_freedom,
     effective_sample_size,
     log_normal_interval,
-    log_sum_exp,
     normalise_weights,
 )
 
@@ -104,7 +103,7 @@ class Pool(NamedTuple):
 
         With b ~ w sqrt(P), n cov^2 = (sum w sqrt(P) / sum w P)^2 - 1.
         """
-        ratio = float(log_sum_exp(self.log_proposal)) - log_sum_exp(self.log_weights + self.prediction.log_fail)
+        ratio = float(logsumexp(self.log_proposal)) - logsumexp(self.log_weights + self.prediction.log_fail)
         return float(np.sqrt(np.expm1(min(2 * ratio, 100.0)) / max(n, 1)))
 
 
@@ -146,7 +145,7 @@ class PoolProposal(NamedTuple):
     @property
     def largest_weight(self) -> float:
         """Upper bound of the weights."""
-        return float(np.exp(log_sum_exp(self.pool.log_weights))) / (len(self.pool.u) * float(PART_SHARES[BASE]))
+        return float(np.exp(logsumexp(self.pool.log_weights))) / (len(self.pool.u) * float(PART_SHARES[BASE]))
 
     @property
     def pool_variance(self) -> float:

@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 from scipy import stats
-from scipy.special import logsumexp
 
 from samplers.sample import (
     PRIOR_SHARE,
@@ -12,7 +11,6 @@ from samplers.sample import (
     correlation_factor,
     effective_sample_size,
     largest_weight_share,
-    log_sum_exp,
     next_level,
     normalise_weights,
 )
@@ -82,18 +80,3 @@ def test_weights_far_outside_the_range_of_floats():
     assert effective_sample_size(log_weights) == pytest.approx(1.6)
     assert largest_weight_share(log_weights) == pytest.approx(0.75)
     assert largest_weight_share(np.empty(0)) == 0
-
-
-def numbers(rng, shape):
-    """Logarithms of any size, a fifth of them -inf, some columns wholly so."""
-    a = rng.normal(0.0, 50.0, shape)
-    a[rng.random(shape) < 0.2] = -np.inf
-    if len(shape) == 2:
-        a[:, rng.random(shape[1]) < 0.1] = -np.inf
-    return a
-
-
-def test_the_bits_are_those_of_scipy(rng):
-    for shape, axis in (((1,), None), ((3000,), None), ((1, 5), 0), ((30, 1200), 0)):
-        a = numbers(rng, shape)
-        np.testing.assert_array_equal(log_sum_exp(a, axis=axis), logsumexp(a, axis=axis))

@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import ndtr
+from scipy.special import logsumexp, ndtr
 
 from samplers.components import SubspaceGaussian, draw_counts, log_ratios, mixture_log_ratio, posterior
 from samplers.methods.base import SimulationSteps
@@ -32,7 +32,6 @@ from samplers.sample import (
     DrawWeights,
     effective_number,
     effective_sample_size,
-    log_sum_exp,
     normalise_weights,
 )
 
@@ -93,7 +92,7 @@ class TermProposal:
         terms = [np.full(len(u), math.log(self.base_share))]
         for share, law in zip(self.shares, self.laws, strict=True):
             terms.append(math.log((1 - self.base_share) * share) + law.log_ratio(u))
-        return np.asarray(log_sum_exp(np.array(terms), axis=0))
+        return np.asarray(logsumexp(np.array(terms), axis=0))
 
     @property
     def stratum_shares(self) -> FloatArray:
