@@ -88,7 +88,8 @@ class Trajectories:
         if not len(self):
             raise ValueError("Expected a table of trajectories with at least one row, got none.")
         later = np.zeros(len(self) - 1, dtype=bool)
-        for values in (self.frame, self.vehicle, self.recording):
+        columns: tuple[NDArray[Any], ...] = (self.frame, self.vehicle, self.recording)
+        for values in columns:
             later = (values[1:] > values[:-1]) | ((values[1:] == values[:-1]) & later)
         wrong = np.flatnonzero(~later)
         if wrong.size:

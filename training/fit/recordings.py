@@ -13,6 +13,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Iterable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -49,16 +50,16 @@ SECONDS_BETWEEN = 5.0
 """A count is printed when the line before it is this old [s], so that a short fit prints few lines."""
 
 
-def _make_teller(shown: bool) -> Callable[..., None]:
-    """Return what prints lines on standard error; a passing one only if the line before it is not too young."""
-    printed = -math.inf
+def _make_teller(shown: bool) -> Callable[[str, str], None]:
+    """Return what prints a name and a text on standard error, texts of one name not too soon after each other."""
+    last, printed = "", -math.inf
 
-    def tell(text: str, passing: bool = False) -> None:
-        nonlocal printed
-        if not passing or time.monotonic() - printed >= SECONDS_BETWEEN:
-            printed = time.monotonic()
+    def tell(name: str, text: str) -> None:
+        nonlocal last, printed
+        if name != last or time.monotonic() - printed >= SECONDS_BETWEEN:
+            last, printed = name, time.monotonic()
             if shown:
-                typer.echo(text, err=True)
+                typer.echo(f"{name}: {text}", err=True)
 
     return tell
 
@@ -110,7 +111,7 @@ def fit_own_bases(
     for table in tables:
         here = sorted({*table.recording.tolist()})
         names.update(here)
-        tell(f"{', '.join(here)}: {len(table):,} rows read; looking for events")
+        tell(", ".join(here), f"{len(table):,} rows read; looking for events")
         traffic += observe_traffic(table)
         parts.append({scenario: EXTRACTORS[scenario](table) for scenario in chosen})
     source = {
@@ -130,9 +131,9 @@ def fit_own_bases(
         events = filter_events(read_events(path, recipe), recipe, scenario_named(scenario).parameters)
         frequency = count_events(scenario, pooled[scenario], len(events.joint), traffic)
         request = FitRequest(scenario, events, source, COMMAND, frequency, n_refits=n_refits, seed=seed)
-        tell(f"{scenario}: {len(events.joint):,} events; fitting")
+        tell(scenario, f"{len(events.joint):,} events; fitting")
         try:
-            base = fit_base(request, lambda text, scenario=scenario: tell(f"{scenario}: {text}", passing=True))
+            base = fit_base(request, partial(tell, scenario))
         except ValueError as error:
             too_few += 1
             words = f"{path}: {error} No base of {{}} is written"

@@ -16,13 +16,13 @@ from typing import Annotated
 import numpy as np
 import torch
 import typer
-from pyarrow import ArrowInvalid, csv
 from scipy.optimize import least_squares
 
 from rare_envs.files import replace_text
 from rare_envs.traffic.road import ReferenceLine, Road
 from samplers.problem import FloatArray
 from training.command_line import report_errors, run_command
+from training.data.columns import Column, read_table
 
 ROAD_COMMAND = "python -m training.recipes.i80_road FOLDER"
 SURVEY_SOURCE = (
@@ -44,17 +44,10 @@ THINNING = 3
 
 def read_lines(path: Path, key: str) -> list[FloatArray]:
     """Return the six lines of a survey file (n, 2), in the order of the numbers that the column `key` has."""
-    try:
-        table = csv.read_csv(
-            path, convert_options=csv.ConvertOptions(column_types=dict.fromkeys((key, "x", "y"), "float64"))
-        )
-        number, x, y = (np.asarray(table[name], dtype=np.float64) for name in (key, "x", "y"))
-    except (OSError, ArrowInvalid, KeyError) as error:
-        raise ValueError(f"Cannot read {path}: {error}") from None
-    if np.unique(number).tolist() != list(range(SURVEY_LANES)) or not np.isfinite(x + y).all():
-        raise ValueError(f"{path}: expected {key} 0 to {SURVEY_LANES - 1} and numbers x and y in every row.")
-    points = np.column_stack((x, y))
-    return [points[number == k] for k in range(SURVEY_LANES)]
+    rows = read_table(path, {name: Column((name,)) for name in (key, "x", "y")})
+    rows.refuse(~np.isin(rows[key], range(SURVEY_LANES)), f"expected {key} 0 to {SURVEY_LANES - 1}.")
+    points = np.column_stack((rows["x"], rows["y"]))
+    return [points[rows[key] == k] for k in range(SURVEY_LANES)]
 
 
 def to_frame(points: FloatArray, origin: FloatArray, angle: float, side: float = -1.0) -> FloatArray:
@@ -64,11 +57,11 @@ def to_frame(points: FloatArray, origin: FloatArray, angle: float, side: float =
     return np.column_stack((dx * cos + dy * sin, side * (dy * cos - dx * sin)))
 
 
-def to_road_coordinates(curve: ReferenceLine, points: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return distances along and across the road of points, shape (n,) each [m]."""
+def find_across(points: FloatArray, curve: ReferenceLine, surveyed: bool = True) -> FloatArray:
+    """Return distances across the road of points (n, 2) [m], of those where all was surveyed, or of all."""
     x, y = torch.from_numpy(points).unbind(dim=1)
-    s, across, _ = Road((-1.0, 1.0), curve).from_world(x, y, torch.zeros_like(x))
-    return s.numpy(), across.numpy()
+    s, across, _ = (values.numpy() for values in Road((-1.0, 1.0), curve).from_world(x, y, torch.zeros_like(x)))
+    return across[(s >= 0.0) & (s <= SURVEYED)] if surveyed else across
 
 
 def fit_reference_line(lanes: list[FloatArray]) -> tuple[ReferenceLine, FloatArray, float]:
@@ -86,7 +79,7 @@ def fit_reference_line(lanes: list[FloatArray]) -> tuple[ReferenceLine, FloatArr
 
     def residuals(z: FloatArray) -> FloatArray:
         curve, start, turn, offsets = unpack(z)
-        across = [to_road_coordinates(curve, to_frame(lane, start, turn, side=1.0))[1] for lane in fitted]
+        across = [find_across(to_frame(lane, start, turn, side=1.0), curve, surveyed=False) for lane in fitted]
         return np.concatenate([y - offset for y, offset in zip(across, offsets, strict=True)])
 
     guess = [float(lane[0, 1]) for lane in fitted[:-1]]
@@ -97,21 +90,8 @@ def fit_reference_line(lanes: list[FloatArray]) -> tuple[ReferenceLine, FloatArr
 
 def fit_lane_edges(lines: list[FloatArray], rightmost: FloatArray, curve: ReferenceLine) -> list[float]:
     """Return lane edges from left to right, their y [m]; that on the right, not surveyed, mirrors the line before."""
-
-    def typical(points: FloatArray) -> float:
-        s, y = to_road_coordinates(curve, points)
-        return float(np.median(y[(s >= 0.0) & (s <= SURVEYED)]))
-
-    edges = [typical(line) for line in reversed(lines)]
-    return [*edges, 2.0 * typical(rightmost) - edges[-1]]
-
-
-def describe_residuals(name: str, points: FloatArray, curve: ReferenceLine, expected: float) -> str:
-    """Return a line of text on the distance of surveyed points from where the road has them."""
-    s, y = to_road_coordinates(curve, points)
-    error = y[(s >= 0.0) & (s <= SURVEYED)] - expected
-    rms, largest = float(np.sqrt(np.mean(error**2))), float(np.abs(error).max())
-    return f"{name} at y = {expected:7.3f} m: off by {rms:.3f} m rms, {largest:.3f} m at most"
+    *edges, lane = (float(np.median(find_across(points, curve))) for points in (*reversed(lines), rightmost))
+    return [*edges, 2.0 * lane - edges[-1]]
 
 
 def main(
@@ -125,18 +105,13 @@ def main(
     curve = ReferenceLine(KNOT_SPACING, tuple(round(k, 9) for k in curve.curvature))
     lanes, lines = ([to_frame(points, origin, angle) for points in group] for group in (lanes, lines))
     road = Road(tuple(round(y, 3) for y in fit_lane_edges(lines, lanes[0], curve)), curve)
-    for k in range(SURVEY_LANES):
-        typer.echo(describe_residuals(f"left line of lane {k}", lines[SURVEY_LANES - 1 - k], curve, road.edges[k]))
-    for k in range(SURVEY_LANES):
-        typer.echo(describe_residuals(f"centre of lane {k}", lanes[SURVEY_LANES - 1 - k], curve, road.centre(k)))
-    table = {
-        "source": SURVEY_SOURCE,
-        "command": ROAD_COMMAND,
-        "spacing": KNOT_SPACING,
-        "edges": road.edges,
-        "curvature": curve.curvature,
-    }
-    replace_text(out, json.dumps(table, indent=1) + "\n")
+    centres = tuple(road.centre(k) for k in range(SURVEY_LANES))
+    for name, group, places in (("lines", lines, road.edges), ("lanes", lanes, centres)):
+        each = [find_across(points, curve) - y for points, y in zip(reversed(group), places, strict=False)]
+        off = np.abs(np.concatenate(each))
+        typer.echo(f"{name} are off by {np.sqrt(np.mean(off**2)):.3f} m rms, {off.max():.3f} m at most")
+    shape = {"spacing": KNOT_SPACING, "edges": road.edges, "curvature": curve.curvature}
+    replace_text(out, json.dumps({"source": SURVEY_SOURCE, "command": ROAD_COMMAND, **shape}, indent=1) + "\n")
     typer.echo(out)
 
 

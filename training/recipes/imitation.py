@@ -20,10 +20,10 @@ from __future__ import annotations
 
 import copy
 import json
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 import torch
@@ -57,17 +57,12 @@ from training.imitation.train import (
     make_learner,
     train_learner,
 )
-from training.recipes.ordinary_traffic import (
-    CASES,
-    count_failing,
-    draw_inputs,
-    judge_all_cases,
-    learn,
-    make_world,
-    search_failures,
-)
+from training.recipes.ordinary_traffic import CASES, Search, correct, draw_inputs, judge_all_cases, learn, make_world
 
 FloatArray = NDArray[np.float64]
+Labelled = tuple[Tensor, Tensor]
+"""What an ego perceives (m, 51) and the right outputs (m, 4)."""
+SENSING = Sensing("features", lidar=True)
 CONFIG = Config(
     method="mgail",
     updates=1000,
@@ -117,8 +112,7 @@ JUDGED, JUDGED_SEED = 400, 1000
 """Rollouts of each case of ordinary traffic in the header of the file, and their seed."""
 
 
-@dataclass(frozen=True)
-class EncounterSpec:
+class EncounterSpec(NamedTuple):
     """Encounters of one kind."""
 
     scenario: str
@@ -127,7 +121,7 @@ class EncounterSpec:
     scenes: int
     seconds: float
     """Length [s]; the others keep their speed afterwards."""
-    given: Mapping[str, float] = field(default_factory=dict)
+    given: tuple[tuple[str, float], ...] = ()
     """Parameters with a fixed value."""
 
 
@@ -138,8 +132,8 @@ ENCOUNTERS = (
     EncounterSpec("car_following", "us101-gap", 2, 8.0),
     EncounterSpec("car_following", "highway", 2, 8.0),
     EncounterSpec("straight", None, 10, 30.0),
-    EncounterSpec("straight", None, 2, 30.0, {"gap": 140.0, "lead_speed": 25.0}),
-    EncounterSpec("car_following", "highway", 2, 8.0, {"gap": 140.0}),
+    EncounterSpec("straight", None, 2, 30.0, (("gap", 140.0), ("lead_speed", 25.0))),
+    EncounterSpec("car_following", "highway", 2, 8.0, (("gap", 140.0),)),
 )
 """Encounters of the training; in the last two the lead is out of sight."""
 
@@ -168,33 +162,30 @@ def make_scenes(kinds: Sequence[EncounterSpec], rng: np.random.Generator) -> lis
     """Return scenes full of encounters; every other one is mirrored, since scenarios have one side only."""
     scenes = []
     for kind in kinds:
-        case = CASES.get(kind.scenario)
-        clock = Clock(horizon=kind.seconds)
+        case, clock = CASES.get(kind.scenario), Clock(horizon=kind.seconds)
         world = make_world(case, kind.seconds) if case else World(scenario_named(kind.scenario), clock=clock)
         each = SCENE_VEHICLES // world.scenario.vehicles
         n = each * kind.scenes
-        x = (
-            draw_inputs(case, world, n, 0, rng)
-            if case
-            else np.asarray(load_base(world.scenario, kind.base).sample(n, rng))
-        )
+        if case:
+            x = draw_inputs(case, world, n, 0, rng)
+        else:
+            x = np.asarray(load_base(world.scenario, kind.base).sample(n, rng))
         names = [parameter.name for parameter in world.scenario.parameters]
-        for name, value in kind.given.items():
+        for name, value in kind.given:
             x[:, names.index(name)] = value
         with torch.inference_mode():
             states = [episode.state for episode in drive(world, IDM(), torch.from_numpy(x))]
-            tracks = torch.stack([torch.stack((s.x, s.y, s.heading, s.speed), dim=-1) for s in states]).numpy()
-        for number in range(kind.scenes):
-            part = tracks[:, number * each : (number + 1) * each]
+            tracks = torch.stack([torch.stack((s.x, s.y, s.heading, s.speed)) for s in states], dim=1).numpy()
+        for number, part in enumerate(np.split(tracks, kind.scenes, axis=2)):
             name = f"{kind.scenario} {kind.base or ''} {number}"
             scenes.append(_make_scene(name, world, part, -1.0 if number % 2 else 1.0))
     return scenes
 
 
 def _make_scene(name: str, world: World, tracks: FloatArray, side: float) -> TrafficScene:
-    """Return one scene of some encounters (T, n, N, 4), mirrored for side = -1."""
-    ticks, n, vehicles, _ = tracks.shape
-    x, y, heading, speed = np.moveaxis(tracks, -1, 0)
+    """Return one scene of n encounters with x, y, heading and speed (4, T, n, N), mirrored for side = -1."""
+    x, y, heading, speed = tracks
+    ticks, n, vehicles = x.shape
     flat = {"x": x + APART * np.arange(n)[:, None], "y": side * y, "heading": side * heading, "speed": speed}
     # vehicles without actions are replayed; the actions of the ego are not learned from, so zeros do
     action = np.where(np.arange(n * vehicles) % vehicles == 0, 0.0, np.nan) * np.ones((ticks, 1))
@@ -241,8 +232,8 @@ def expert_acceleration(state: State) -> Tensor:
 @torch.inference_mode()
 def record_drive(
     driver: LearnedDriver, teacher: Policy, world: World, x: FloatArray, every: int, corrected: bool
-) -> tuple[Tensor, Tensor]:
-    """Let an ego drive x (n, d); return what it perceives until it collides (m, 51) with the right outputs (m, 4).
+) -> Labelled:
+    """Let an ego drive x (n, d); return what it perceives until it collides with the right outputs.
 
     The right ones are those of the teacher, the network before all corrections; if corrected, the expert may ask for
     less acceleration. Moments are so many ticks apart.
@@ -262,10 +253,8 @@ def record_drive(
     return features, outputs
 
 
-def learn_labels(
-    policy: Policy, data: Sequence[tuple[Tensor, Tensor]], plan: Corrections, rng: np.random.Generator
-) -> None:
-    """Train a network on perceptions (n, 51) and right outputs (n, 4)."""
+def learn_labels(policy: Policy, data: Sequence[Labelled], plan: Corrections, rng: np.random.Generator) -> None:
+    """Train a network on labelled perceptions."""
     features, outputs = (torch.cat(column).clone() for column in zip(*data, strict=True))  # of inference mode
     weights = outputs.new_tensor(OUTPUT_WEIGHTS)
 
@@ -281,45 +270,35 @@ def learn_labels(
 
 
 def correct_ego(
-    before: LearnedDriver, plan: Corrections, recorded: Tensor | None = None
+    before: LearnedDriver, plan: Corrections, recorded: Tensor
 ) -> tuple[LearnedDriver, list[dict[str, Any]]]:
-    """Return a corrected copy of an ego, and for each round and scenario searched a record, see `count_failing`.
+    """Return a corrected copy of an ego, and for each round and scenario searched a record, see `correct`.
 
     Of what recorded people perceived (n, 51) it is to make what it did.
     """
     rng, teacher = np.random.default_rng(plan.seed), before.policy
     driver = replace(before, policy=copy.deepcopy(teacher))
-    data: list[tuple[Tensor, Tensor]] = []
-    if recorded is not None:
-        some = recorded[torch.from_numpy(rng.integers(0, len(recorded), plan.recorded))]
-        with torch.inference_mode():
-            data.append((some, torch.cat(teacher(some), dim=1)))
-    searches = []
-    for number in range(plan.rounds):
-        for k, (env_id, base) in enumerate(SEARCHED):
-            seed = 1000 * plan.seed + 10 * number + k
-            found = search_failures(LearnedEgo(driver), env_id, base, rng, seed=seed, max_sim=plan.simulations)
-            typer.echo(f"round {number}: {found.record}", err=True)
-            searches.append(found)
-            if len(found.driven):
-                world = World(find_scenario(env_id), Sensing("features", lidar=True))
-                data.append(record_drive(driver, teacher, world, found.driven, 2, corrected=True))
-        data += _record_round(driver, teacher, plan, rng)
+    some = recorded[torch.from_numpy(rng.integers(0, len(recorded), plan.recorded))]
+    with torch.inference_mode():
+        data = [(some, torch.cat(teacher(some), dim=1))]
+
+    def learn_from(searches: Sequence[Search]) -> None:
+        for search in searches:
+            if len(search.driven):
+                world = World(find_scenario(search.record["env_id"]), SENSING)
+                data.append(record_drive(driver, teacher, world, search.driven, 2, corrected=True))
+        for case in CASES.values():
+            world = make_world(case)
+            x = draw_inputs(case, world, plan.ordinary, 0, rng)
+            data.append(record_drive(driver, teacher, world, x, 10, corrected=False))
+        for env_id, base in DRAWN:
+            scenario = find_scenario(env_id)
+            x = np.asarray(load_base(scenario, base).sample(plan.draws, rng))
+            data.append(record_drive(driver, teacher, World(scenario, SENSING), x, 3, corrected=True))
         learn_labels(driver.policy, data, plan, rng)
-    return driver, [count_failing(found, LearnedEgo(driver)) for found in searches]
 
-
-def _record_round(
-    driver: LearnedDriver, teacher: Policy, plan: Corrections, rng: np.random.Generator
-) -> Iterator[tuple[Tensor, Tensor]]:
-    """Yield what the ego meets in ordinary traffic and in draws of the scenarios."""
-    for case in CASES.values():
-        world = make_world(case)
-        yield record_drive(driver, teacher, world, draw_inputs(case, world, plan.ordinary, 0, rng), 10, corrected=False)
-    for env_id, base in DRAWN:
-        scenario = find_scenario(env_id)
-        x = np.asarray(load_base(scenario, base).sample(plan.draws, rng))
-        yield record_drive(driver, teacher, World(scenario, Sensing("features", lidar=True)), x, 3, corrected=True)
+    options = {"max_sim": plan.simulations}
+    return driver, correct(lambda: LearnedEgo(driver), SEARCHED, plan.rounds, plan.seed, rng, learn_from, **options)
 
 
 @use_one_thread()
@@ -332,10 +311,10 @@ def main(
     config, source = replace(CONFIG, seed=seed), Source("data", data)
     with report_errors("imitation"):
         with claim_folder(out, source, config):
-            learn, test = load_scenes(source)
-        learner = prepare_learner(learn, ENCOUNTERS, config)
+            learning, test = load_scenes(source)
+        learner = prepare_learner(learning, ENCOUNTERS, config)
     before = replace(driver_of(train_learner(learner, out, progress=True), config), name="imitation")
-    driver, records = correct_ego(before, Corrections(seed=seed), collect_pairs(stack_scenes(learn)).features)
+    driver, records = correct_ego(before, Corrections(seed=seed), collect_pairs(stack_scenes(learning)).features)
     replace_text(out / "rounds.json", json.dumps(records, indent=1) + "\n")
     provenance = Provenance(
         kind="mgail, with encounters, corrected",

@@ -1,6 +1,4 @@
-"""Ordinary traffic, in which an ego that drives properly is safe for minutes, and whether an ego does.
-
-python -m training.recipes.ordinary_traffic imitation --rollouts 400
+"""Ordinary traffic, in which an ego that drives properly is safe for minutes, whether an ego does, and its correction.
 
 The ego follows a lead in the middle of several lanes, with a follower behind it and a vehicle in each lane beside it.
 All of them keep to their lanes. Their speeds vary as recorded ones do, and a vehicle that approaches another brakes.
@@ -18,14 +16,12 @@ right, and the network learns that.
 
 from __future__ import annotations
 
-import json
 import math
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from types import MappingProxyType
-from typing import Annotated, Any, ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 import torch
@@ -35,7 +31,7 @@ from torch import Tensor
 
 import rare_envs
 import samplers
-from agents import load_driver, load_ego
+from agents import load_driver
 from agents.learned.driver import RuleDriver
 from agents.learned.networks import HUMAN_NOISE
 from rare_envs.distributions.space import Parameter
@@ -53,7 +49,6 @@ from rare_envs.traffic.crash import NONE, ROAD_EDGE
 from rare_envs.traffic.road import ReferenceLine, Road, i80, straight
 from rare_envs.traffic.state import LANE_WIDTH, VEHICLE_LENGTH, VEHICLE_WIDTH, State
 from samplers.sample import clopper_pearson
-from training.command_line import report_errors, run_command
 
 FloatArray = NDArray[np.float64]
 SECONDS = 60.0
@@ -124,9 +119,6 @@ def make_ordinary_traffic(name: str, road: Road, lane: int) -> Scenario:
         ahead = speed * dt / (1.0 - road.curvature(x) * y)
         return Others(x + ahead, y, state.heading[:, 1:], (speed + action[..., 0] * dt).clamp(min=0.0))
 
-    def others(state: State, dt: float) -> Others:
-        return driven(state, torch.zeros_like(state.x[:, 1:, None]).expand(-1, -1, 2), dt)
-
     return Scenario(
         name=name,
         road=road,
@@ -144,7 +136,7 @@ def make_ordinary_traffic(name: str, road: Road, lane: int) -> Scenario:
         ),
         bases=CAR_FOLLOWING.bases,
         initial=initial,
-        others=others,
+        others=lambda state, dt: driven(state, torch.zeros_like(state.x[:, 1:, None]).expand(-1, -1, 2), dt),
         driven=driven,
     )
 
@@ -175,26 +167,22 @@ def _is_nominal(x: FloatArray) -> NDArray[np.bool_]:
     return np.asarray((left >= floor) & (gap >= START_HEADWAY * speed))
 
 
-@dataclass(frozen=True)
-class Case:
-    """A kind of traffic that an ego is judged in."""
+class Case(NamedTuple):
+    """A kind of traffic that an ego is judged in; `starts` draws the scenario's own parameters, shape (n, d)."""
 
     scenario: Scenario
     drivers: Callable[[], Background | TrafficBackground]
     starts: Callable[[int, np.random.Generator], FloatArray]
-    """Of the scenario's own parameters, shape (n, d)."""
 
 
 _BENDS = Road(straight(3).edges, ReferenceLine(75.0, (0.0, *(1e-3, 0.0, -1e-3, 0.0) * 8)))
 """Three lanes that wind with radii down to 1 km, 3.6 times as sharply as the I-80 does, for 2.4 km."""
-CASES = MappingProxyType(
-    {
-        "straight": Case(make_ordinary_traffic("straight", straight(3, LANE_WIDTH), 1), OrdinaryDrivers, draw_starts),
-        "i80": Case(make_ordinary_traffic("i80", i80(), 2), OrdinaryDrivers, draw_starts),
-        "bends": Case(make_ordinary_traffic("bends", _BENDS, 1), OrdinaryDrivers, draw_starts),
-        "highway": Case(HIGHWAY, partial(load_driver, "mgail?rules=0"), load_base(HIGHWAY).sample),
-    }
-)
+CASES = {
+    "straight": Case(make_ordinary_traffic("straight", straight(3, LANE_WIDTH), 1), OrdinaryDrivers, draw_starts),
+    "i80": Case(make_ordinary_traffic("i80", i80(), 2), OrdinaryDrivers, draw_starts),
+    "bends": Case(make_ordinary_traffic("bends", _BENDS, 1), OrdinaryDrivers, draw_starts),
+    "highway": Case(HIGHWAY, partial(load_driver, "mgail?rules=0"), load_base(HIGHWAY).sample),
+}
 """A straight road, the I-80 as it is, a road that winds more, and `rare_envs/Highway-v0` with its learned drivers."""
 
 
@@ -214,72 +202,60 @@ def draw_inputs(case: Case, world: World, n: int, own: int, rng: np.random.Gener
 
 
 class Verdicts(NamedTuple):
-    """Of n rollouts, (n,) each: index of `VERDICT_NAMES` and time of the verdict [s], and what came before it.
+    """Of n rollouts, (n,) each: index of `VERDICT_NAMES`, and before the verdict the least headway [s] and margin [m].
 
-    That is the least time headway [s], inf without a lead, the least distance from the body to a line of the lane [m],
-    negative beyond it, and the mean speed of the whole rollout [m/s].
+    The headway is inf without a lead, the margin that from the body to a line of the lane, negative beyond it.
     """
 
     reason: NDArray[np.int64]
-    time: FloatArray
     headway: FloatArray
     margin: FloatArray
-    speed: FloatArray
 
 
-def judge(
-    ego: Any, case: str | Case = "straight", rollouts: int = 400, seed: int = 0, seconds: float = SECONDS
-) -> Verdicts:
-    """Return for each rollout in ordinary traffic whether an ego keeps its lane and its distance.
+def judge(ego: Any, case: str = "straight", rollouts: int = 400, seed: int = 0, seconds: float = SECONDS) -> Verdicts:
+    """Return for each rollout in one of `CASES` whether an ego keeps its lane and its distance.
 
     The ego is one as `rare_envs.DrivingProblem` takes it; the seed is that of the starts and of the others' noise.
     """
-    if isinstance(case, str) and case not in CASES:
-        raise ValueError(f"Unknown case {case!r}; expected one of {', '.join(CASES)}.")
-    case = CASES[case] if isinstance(case, str) else case
     needs = resolve(ego)
-    world = make_world(case, seconds, needs.observation)
+    world = make_world(CASES[case], seconds, needs.observation)
     driver = as_driver(ego, world, needs)
     world = replace(world, sensing=replace(world.sensing, lidar=True)) if needs.lidar else world
-    x = draw_inputs(case, world, rollouts, needs.noise_columns(world), np.random.default_rng(seed))
+    x = draw_inputs(CASES[case], world, rollouts, needs.noise_columns(world), np.random.default_rng(seed))
     tile = 64 if "camera" in needs.observation.split("+") else 256
     parts = [_judge_tile(world, driver, part) for part in torch.split(torch.from_numpy(x).float(), tile)]
-    return Verdicts(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+    return Verdicts(*(torch.cat(column).numpy() for column in zip(*parts, strict=True)))
 
 
 @torch.inference_mode()
-def _judge_tile(world: World, driver: Driver, x: Tensor) -> tuple[NDArray[Any], ...]:
+def _judge_tile(world: World, driver: Driver, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Return the columns of `Verdicts` of one tile."""
     reason = torch.full((len(x),), PASSED)
-    time = torch.full((len(x),), world.clock.seconds)
-    least, room = torch.full_like(time, torch.inf), torch.full_like(time, torch.inf)
-    lead, since, had = torch.zeros_like(reason), torch.zeros_like(time), torch.zeros(len(x), dtype=torch.bool)
+    least, room = torch.full((2, len(x)), torch.inf)
+    lead, since, had = torch.zeros_like(reason), torch.zeros_like(least), torch.zeros(len(x), dtype=torch.bool)
     first: Episode | None = None
-    for tick, episode in enumerate(drive(world, driver, x)):
+    for episode in drive(world, driver, x):
         first = first or episode
-        state, now = episode.state, tick * world.clock.dt
-        running = reason == PASSED
+        state, running = episode.state, reason == PASSED
         follows = lead_index(state, world.scenario.road)
         gap, speed = episode.lead.gap, state.speed[:, 0]
         headway = torch.where(gap < torch.inf, gap / speed.clamp(min=0.1), torch.inf)
         far, same = (headway >= FLOOR_HEADWAY) & (gap >= FLOOR_GAP), follows == lead
-        since, had = torch.where(same, since + world.clock.dt, 0.0), (had & same) | far
+        since, had, lead = torch.where(same, since + world.clock.dt, 0.0), (had & same) | far, follows
         margin = _lane_margin(state, first)
         verdict = torch.full_like(reason, PASSED)
         verdict[~far & (had | (since >= GRACE))] = TOO_CLOSE
         verdict[margin < 0.0] = LEFT_LANE
         verdict = torch.where(episode.collided, _blame(episode), verdict)
-        lead = follows
         least = torch.where(running, torch.minimum(least, headway), least)
         room = torch.where(running, torch.minimum(room, margin), room)
-        time = torch.where(running & (verdict != PASSED), now, time)
         reason = torch.where(running, verdict, reason)
     assert first is not None
     ways, leader = episode.state.x - first.state.x, lead_index(first.state, world.scenario.road)
     of_lead = ways.gather(1, leader[:, None])[:, 0]
-    way, due = ways[:, 0], torch.where(leader > 0, of_lead, first.state.speed[:, 0] * world.clock.seconds)
-    reason = torch.where((reason == PASSED) & (way < LEAST_WAY * due), LEFT_BEHIND, reason)
-    return tuple(column.numpy() for column in (reason, time.double(), least, room, way / world.clock.seconds))
+    due = torch.where(leader > 0, of_lead, first.state.speed[:, 0] * world.clock.seconds)
+    behind = (reason == PASSED) & (ways[:, 0] < LEAST_WAY * due)
+    return torch.where(behind, LEFT_BEHIND, reason), least, room
 
 
 def _lane_margin(state: State, first: Episode) -> Tensor:
@@ -310,37 +286,42 @@ def judge_all_cases(ego: Any, rollouts: int, seed: int) -> dict[str, dict[str, A
     return found
 
 
-def main(
-    ego: Annotated[str, typer.Argument(help="As in every command: idm, imitation, a file ...")] = "idm",
-    rollouts: Annotated[int, typer.Option(min=1)] = 400,
-    seed: Annotated[int, typer.Option()] = 0,
-) -> None:
-    """Judge an ego in ordinary traffic."""
-    with report_errors("ordinary_traffic"):
-        print(json.dumps(judge_all_cases(load_ego(ego), rollouts, seed), indent=1))
-
-
-if __name__ == "__main__":
-    run_command(main)
-
-
 class Search(NamedTuple):
-    """A search for failures of an ego."""
+    """A search for failures of an ego: its record, those to learn from (n, d), and the others."""
 
     record: dict[str, Any]
-    """Scenario, base, p of the ego and how many failures were found."""
-    driven: NDArray[np.float64]
-    """Failures to learn from, shape (n, d)."""
-    held_out: NDArray[np.float64]
-    """The others."""
+    driven: FloatArray
+    held_out: FloatArray
 
 
-def search_failures(ego: Any, env_id: str, base: str, rng: np.random.Generator, **options: Any) -> Search:
-    """Return the failures of an ego that `samplers.estimate` finds with some options."""
-    problem = rare_envs.DrivingProblem(env_id, ego=ego, base=base)
-    estimate = samplers.estimate(problem, samplers.TwoStage(), **options)
-    x = rng.permutation(np.asarray(estimate.failures.x))
-    return Search({"env_id": env_id, "base": base, "p": estimate.p, "found": len(x)}, x[::2], x[1::2])
+def correct(
+    ego: Callable[[], Any],
+    searched: Sequence[tuple[str, str]],
+    rounds: int,
+    seed: int,
+    rng: np.random.Generator,
+    learn_from: Callable[[list[Search]], None],
+    most: int | None = None,
+    **options: Any,
+) -> list[dict[str, Any]]:
+    """Search failures in scenarios and bases, and let an ego learn from half of them, some rounds long.
+
+    Returns for each search its p, the failures found, and how many of the `most` that are driven, and of as many
+    others, the corrected ego still fails in. The options are those of `samplers.estimate`.
+    """
+    searches = []
+    for number in range(rounds):
+        found = []
+        for k, (env_id, base) in enumerate(searched):
+            problem = rare_envs.DrivingProblem(env_id, ego=ego(), base=base)
+            each = samplers.estimate(problem, samplers.TwoStage(), seed=1000 * seed + 10 * number + k, **options)
+            x = rng.permutation(np.asarray(each.failures.x))
+            record = {"env_id": env_id, "base": base, "p": each.p, "found": len(x)}
+            found.append(Search(record, x[::2][:most], x[1::2][:most]))
+            typer.echo(f"round {number}: {found[-1].record}", err=True)
+        learn_from(found)
+        searches += found
+    return [count_failing(search, ego()) for search in searches]
 
 
 def count_failing(search: Search, ego: Any) -> dict[str, Any]:

@@ -1,7 +1,6 @@
 """Situations in which the ego `vision` is trained: following, cut-ins, hard brakes and the I-80, in all weathers.
 
-Ranges are wide, so that dangerous situations are common; shares say how often a rare kind of situation is seen. Half of
-the days are clear; on the others there is fog of up to 300 m of visibility, low sun and sensor noise.
+Ranges are wide, so that dangerous situations are common; shares say how often a rare kind of situation is seen.
 """
 
 from __future__ import annotations

@@ -53,7 +53,7 @@ from rare_envs.simulation.world import Clock, Sensing, World
 from rare_envs.startup import use_one_thread
 from rare_envs.traffic.state import VEHICLE_LENGTH, State
 from training.command_line import RunFolderOption, run_command
-from training.recipes.ordinary_traffic import count_failing, descend, judge_all_cases, learn, search_failures
+from training.recipes.ordinary_traffic import Search, correct, descend, judge_all_cases, learn
 from training.recipes.situations import make_situations, start_situation
 
 VISION_EXPERT = IDM(jam_distance=2.0)
@@ -241,9 +241,8 @@ def mirror(pictures: LabelledPictures, rows: Tensor) -> LabelledPictures:
     picture, earlier = pictures.picture.clone(), pictures.earlier.clone()
     picture[rows], earlier[rows] = picture[rows].flip(2), earlier[rows].flip(2)
     expert = pictures.expert * torch.cat((one, sign), dim=1)
-    return LabelledPictures(
-        picture, earlier, pictures.speed, expert, pictures.truth * torch.cat((sign, sign, sign, one, one), dim=1)
-    )
+    truth = pictures.truth * torch.cat((sign, sign, sign, one, one), dim=1)
+    return LabelledPictures(picture, earlier, pictures.speed, expert, truth)
 
 
 def train_vision(plan: VisionPlan) -> PilotNet:
@@ -256,16 +255,9 @@ def train_vision(plan: VisionPlan) -> PilotNet:
     recorded: list[LabelledPictures] = []
     for number in range(plan.rounds + 1):
         rng, later = np.random.default_rng((plan.seed, number)), int(number > 0)
-        recorded += drive_situations(
-            network if later else None,
-            1.0 - plan.mixing**number,
-            plan.drives[later],
-            plan.rows,
-            plan.ticks[later],
-            rng,
-            recorded_share=plan.recorded[later],
-            noise=0.0 if later else 1.0,
-        )
+        share, drives, ticks = 1.0 - plan.mixing**number, plan.drives[later], plan.ticks[later]
+        how = {"recorded_share": plan.recorded[later], "noise": 0.0 if later else 1.0}
+        recorded += drive_situations(network if later else None, share, drives, plan.rows, ticks, rng, **how)
         data, left = concatenate(recorded), plan.visits[later]
         while left > 0:
             some = draw_batch(data, min(plan.batch, left), rng)
@@ -280,40 +272,31 @@ def train_vision(plan: VisionPlan) -> PilotNet:
 
 
 def correct_vision(network: PilotNet, plan: CorrectionPlan) -> list[dict[str, Any]]:
-    """Correct a network in place; return a record of each round, see `count_failing`."""
+    """Correct a network in place; return a record of each round, see `correct`."""
     rng, ticks = np.random.default_rng(plan.seed), round(plan.seconds / VisionEgo.dt)
-    how: dict[str, Any] = {"brakes": DEMANDED_BRAKING}
 
-    def situations(by: PilotNet | None, drives: int, recorded: float, noise: float) -> Iterator[LabelledPictures]:
-        return drive_situations(by, 1.0, drives, plan.rows, ticks, rng, recorded_share=recorded, noise=noise, **how)
+    def situations(by: PilotNet | None, drives: int, share: float, noise: float) -> Iterator[LabelledPictures]:
+        how = {"recorded_share": share, "noise": noise, "brakes": DEMANDED_BRAKING}
+        return drive_situations(by, 1.0, drives, plan.rows, ticks, rng, **how)
 
-    def scenarios(env_id: str, x: NDArray[np.float64], recorded: float) -> Iterator[LabelledPictures]:
+    def scenarios(env_id: str, x: NDArray[np.float64], share: float) -> Iterator[LabelledPictures]:
         world = World(find_scenario(env_id), Sensing(OBSERVATION), clock=Clock(horizon=plan.seconds))
+        how: dict[str, Any] = {"recorded_share": share, "brakes": DEMANDED_BRAKING, "first_ticks": FIRST_TICKS}
         for rows in torch.split(torch.from_numpy(x).float(), CAMERA_ROWS) if len(x) else ():
-            start = world.start(rows)
-            yield from drive_and_label(
-                world, start, network, 1.0, ticks, rng, recorded_share=recorded, first_ticks=FIRST_TICKS, **how
-            )
+            yield from drive_and_label(world, world.start(rows), network, 1.0, ticks, rng, **how)
 
-    data, searches = list(situations(None, plan.drives[0], 0.06, 1.0)), []
-    for number in range(plan.rounds):
-        options: dict[str, Any] = {
-            "seed": 1000 * plan.seed + 10 * number,
-            "max_sim": plan.simulations,
-            "ensemble_run": False,
-        }
-        found = search_failures(VisionEgo(network), *SEARCHED, rng, **options)
-        found = found._replace(driven=found.driven[: plan.driven], held_out=found.held_out[: plan.driven])
-        typer.echo(f"correction {number}: {found.record}", err=True)
-        searches.append(found)
-        data += scenarios(SEARCHED[0], found.driven, 0.3)
-        data += situations(network, plan.drives[1], 0.15, 0.0)
+    data = list(situations(None, plan.drives[0], 0.06, 1.0))
+
+    def learn_from(searches: list[Search]) -> None:
+        for search in searches:
+            data.extend(scenarios(search.record["env_id"], search.driven, 0.3))
+        data.extend(situations(network, plan.drives[1], 0.15, 0.0))
         for env_id, base in DRAWN:
             drawn = np.asarray(load_base(find_scenario(env_id), base).sample(plan.draws, rng))
-            data += scenarios(env_id, drawn, 0.15)
+            data.extend(scenarios(env_id, drawn, 0.15))
         pictures = concatenate(data)
 
-        def loss(pictures: LabelledPictures = pictures) -> Tensor:
+        def loss() -> Tensor:
             some = draw_batch(pictures, plan.batch, rng)
             given = network(some.picture, some.earlier, some.speed)
             return nn.functional.smooth_l1_loss(given, some.expert, beta=0.5)
@@ -321,7 +304,9 @@ def correct_vision(network: PilotNet, plan: CorrectionPlan) -> list[dict[str, An
         network.train().requires_grad_(True)
         learn(list(network.parameters()), loss, math.ceil(plan.visits / plan.batch), plan.rate, MAX_GRADIENT_NORM)
         network.eval().requires_grad_(False)
-    return [count_failing(found, VisionEgo(network)) for found in searches]
+
+    options: dict[str, Any] = {"most": plan.driven, "max_sim": plan.simulations, "ensemble_run": False}
+    return correct(lambda: VisionEgo(network), (SEARCHED,), plan.rounds, plan.seed, rng, learn_from, **options)
 
 
 @use_one_thread()
