@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.papers.okelly2018.reproduction import reproduce_okelly2018
-from benchmarks.papers.okelly2018.study import HighwayStudy
+from benchmarks.papers.okelly2018.study import HighwayStudy, RolloutFolder
 from benchmarks.papers.record import discard_runs
 from benchmarks.papers.renew import OWN_METHOD, PAPERS, renew
 from benchmarks.papers.tian2024.study import REPLICATIONS_FILE, SCALES, TianPlan, reproduce_tian2024
@@ -98,7 +98,9 @@ def _run_okelly(arguments: argparse.Namespace) -> None:
         "--out FOLDER"
     )
     with _open_workers(arguments.workers) as executor:
-        record = reproduce_okelly2018(study, arguments.out, command, executor, arguments.at_most, progress=True)
+        problem = study.make_problem()
+        rollouts = RolloutFolder(study, arguments.out, problem, executor, arguments.at_most, progress=True)
+        record = reproduce_okelly2018(rollouts, command)
     _tell(record, arguments)
 
 

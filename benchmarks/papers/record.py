@@ -1,12 +1,13 @@
-"""Record of a reproduction: a paper's numbers beside ours, what made them, its Markdown, and the folder of the runs."""
+"""Record of a reproduction: a paper's numbers beside ours, what made them, its Markdown, and the folder of the runs.
+
+Values, tables and findings are mappings, as the JSON of the record has them.
+"""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
 from importlib.metadata import PackageNotFoundError, version
-from itertools import groupby
 from pathlib import Path
 from typing import Any
 
@@ -20,96 +21,80 @@ from samplers.output import to_json_value
 
 NOTHING = "–"
 """Text of a cell without content."""
+Entry = dict[str, Any]
+"""A value, table or finding of a record."""
+Drawings = Mapping[str, tuple[Callable[[Figure], None], tuple[float, float]]]
+"""Figures by the names that their data have in a record: what draws them, and their size [inches]."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class ComparedValue:
-    """One number of a paper's table beside ours.
+def compare(labels: Sequence[str], quantity: str, paper: float | None = None, **more: Any) -> Entry:
+    """Return one number of a paper's table beside ours; None where one of them is not known.
+
+    `labels` tell the row of the table: the method, the system under test and so on. Further entries are `ours` and its
+    95 % `interval`; `paper_all_in` and `ours_all_in`, with every simulation counted, the search among them; what the
+    `released` code does, in words; and `reasons` why the two differ, names of explanations of the table.
 
     Example:
-        >>> value = ComparedValue(labels=("SS", "IDM"), quantity="mean of p", paper=8.0e-4, ours=8.4e-4)
-        >>> f"{value.difference:+.0%}"
+        >>> f"{compare(('SS', 'IDM'), 'mean of p', 8.0e-4, ours=8.4e-4)['difference']:+.0%}"
         '+5%'
     """
-
-    labels: tuple[str, ...]
-    """Row of the table: the method, the system under test and so on."""
-    quantity: str
-    paper: float | None = None
-    """As printed; None where the paper has none."""
-    ours: float | None = None
-    interval: tuple[float, float] | None = None
-    """95 % interval of ours."""
-    paper_all_in: float | None = None
-    """The paper's number with every simulation counted, the search among them; None where that is not known."""
-    ours_all_in: float | None = None
-    released: str = ""
-    """What the released code does or gives, in words."""
-    reasons: tuple[str, ...] = ()
-    """Why the two differ: names of explanations of the table."""
-
-    @property
-    def difference(self) -> float | None:
-        """Ours over the paper's, less 1; None where one of them is not known, or negative."""
-        if self.ours is None or not self.paper or min(self.ours, self.paper) < 0.0:
-            return None
-        return self.ours / self.paper - 1.0
+    usual = {"ours": None, "interval": None, "paper_all_in": None, "ours_all_in": None, "released": "", "reasons": ()}
+    value = {"labels": labels, "quantity": quantity, "paper": paper, **usual, **more}
+    ours = value["ours"]
+    known = ours is not None and paper and min(ours, paper) >= 0.0
+    return {**value, "difference": ours / paper - 1.0 if known else None}
 
 
-@dataclass(frozen=True, kw_only=True)
-class ComparisonTable:
-    """A table of a paper beside ours."""
+def make_table(
+    name: str,
+    title: str,
+    keys: Sequence[str],
+    values: Sequence[Entry],
+    explanations: Mapping[str, str],
+    *,
+    measured: Sequence[Entry] = (),
+    measured_title: str = "",
+    all_in_title: str = "all simulations",
+) -> Entry:
+    """Return a table of a paper beside ours, with the explanations that its values have as reasons, or that these name.
 
-    name: str
-    """A word, unique in the record: `table2`."""
-    title: str
-    keys: tuple[str, ...]
-    """Heads of the columns of the labels."""
-    values: tuple[ComparedValue, ...]
-    explanations: Mapping[str, str] = field(default_factory=dict)
-    """Sentences by the names that the values have as reasons."""
-    measured: tuple[Mapping[str, Any], ...] = ()
-    """Rows of ours alone, shown below: `labels`, and `values` by quantity, the same quantities in every row."""
-    measured_title: str = ""
-    all_in_title: str = "all simulations"
-    """Of the columns with every simulation counted."""
+    Args:
+        name: A word, unique in the record: `table2`.
+        title: Its title.
+        keys: Heads of the columns of the labels.
+        values: Numbers, see `compare`.
+        explanations: Sentences by the names that the values have as reasons.
+        measured: Rows of ours alone, shown below: `labels`, and `values` by quantity, the same quantities in every row.
+        measured_title: Of these.
+        all_in_title: Of the columns with every simulation counted.
 
-    def __post_init__(self) -> None:
-        for labels in (*(value.labels for value in self.values), *(row["labels"] for row in self.measured)):
-            if len(labels) != len(self.keys):
-                raise ValueError(f"Expected {len(self.keys)} labels ({', '.join(self.keys)}), got {labels}.")
-        for reason in (reason for value in self.values for reason in value.reasons):
-            if reason not in self.explanations:
-                raise ValueError(f"No explanation {reason!r} in the table; known: {', '.join(self.explanations)}.")
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return the table as a record has it."""
-        values = [{**asdict(value), "difference": value.difference} for value in self.values]
-        return {**asdict(self), "values": values}
-
-
-@dataclass(frozen=True, kw_only=True)
-class Finding:
-    """A statement of a paper, and the test statistic that says whether it is so here."""
-
-    claim: str
-    statistic: str
-    """What is computed, in words."""
-    value: float | None
-    interval: tuple[float, float] | None
-    """95 % interval of the statistic."""
-    verdict: str
-    """In a few words: holds, does not hold here, cannot be told."""
+    Raises:
+        ValueError: A row has other labels than the table, or a reason is not explained.
+    """
+    for row in (*values, *measured):
+        if len(row["labels"]) != len(keys):
+            raise ValueError(f"Expected {len(keys)} labels ({', '.join(keys)}), got {row['labels']}.")
+    used = {reason for value in values for reason in value["reasons"]}
+    if unknown := used - explanations.keys():
+        raise ValueError(f"No explanation {min(unknown)!r} in the table; known: {', '.join(explanations)}.")
+    used |= {word for word in explanations if any(f"`{word}`" in explanations[each] for each in used)}
+    return {
+        "name": name,
+        "title": title,
+        "keys": keys,
+        "values": values,
+        "explanations": {word: text for word, text in explanations.items() if word in used},
+        "measured": measured,
+        "measured_title": measured_title,
+        "all_in_title": all_in_title,
+    }
 
 
-@dataclass(frozen=True)
-class DrawnFigure:
-    """A figure of a record: the name that its data have there, and its drawing."""
-
-    name: str
-    draw: Callable[[Figure], None]
-    size: tuple[float, float]
-    """[inches]."""
+def find(
+    claim: str, statistic: str, verdict: str, value: float | None = None, interval: tuple[float, float] | None = None
+) -> Entry:
+    """Return a statement of a paper, and the statistic with its 95 % interval that says whether it is so here."""
+    return {"claim": claim, "statistic": statistic, "value": value, "interval": interval, "verdict": verdict}
 
 
 def make_record(
@@ -118,12 +103,12 @@ def make_record(
     source: str,
     command: str,
     settings: Mapping[str, Any],
-    tables: Sequence[ComparisonTable],
-    figures: Mapping[str, Mapping[str, Any]],
-    findings: Sequence[Finding] = (),
+    tables: Sequence[Entry],
+    figures: Mapping[str, Entry],
+    findings: Sequence[Entry] = (),
     notes: Sequence[str] = (),
     runs: Sequence[Mapping[str, Any]] = (),
-) -> dict[str, Any]:
+) -> Entry:
     """Return a record as plain values for JSON.
 
     Args:
@@ -139,19 +124,9 @@ def make_record(
         runs: The single runs.
     """
     libraries = {name: _find_version(name) for name in ("torch", "numba", "gymnasium")}
-    record: dict[str, Any] = to_json_value(
-        {
-            "title": title,
-            "source": source,
-            "command": command,
-            "about": about(rare_envs=rare_envs.__version__, **libraries, **settings),
-            "notes": list(notes),
-            "tables": [table.to_dict() for table in tables],
-            "findings": [asdict(finding) for finding in findings],
-            "figures": dict(figures),
-            "runs": [dict(run) for run in runs],
-        }
-    )
+    made = about(rare_envs=rare_envs.__version__, **libraries, **settings)
+    content = {"notes": notes, "tables": tables, "findings": findings, "figures": figures, "runs": runs}
+    record: Entry = to_json_value({"title": title, "source": source, "command": command, "about": made, **content})
     return record
 
 
@@ -162,25 +137,20 @@ def _find_version(library: str) -> str:
         return "not installed"
 
 
-def write_record(out: Path, record: Mapping[str, Any], figures: Sequence[DrawnFigure]) -> None:
+def write_record(out: Path, record: Mapping[str, Any], figures: Drawings) -> None:
     """Write a record as JSON and as Markdown, and its figures as PNG files, into a folder that exists."""
     (out / "reproduction.json").write_text(format_json(dict(record)) + "\n", encoding="utf-8")
     (out / "reproduction.md").write_text(format_record(record), encoding="utf-8")
-    for each in figures:
-        figure = Figure(figsize=each.size, layout="constrained")
-        each.draw(figure)
-        figure.savefig(out / f"{each.name}.png", dpi=150)
+    for name, (draw, size) in figures.items():
+        figure = Figure(figsize=size, layout="constrained")
+        draw(figure)
+        figure.savefig(out / f"{name}.png", dpi=150)
 
 
 def check_folder(out: Path, study: Mapping[str, Any]) -> None:
-    """Refuse a folder with runs of another paper, seed, scale or ego.
+    """Raise BadInput if a folder, which need not exist, has runs of another paper, seed, scale or ego.
 
-    Args:
-        out: Folder of the files; it need not exist.
-        study: What the runs are to be of, as the first line of each file of runs has it under `study`.
-
-    Raises:
-        BadInput: A file of runs in the folder is of something else.
+    `study` is what the runs are to be of, as the first line of each file of runs has it.
     """
     for file in sorted(out.glob("*.jsonl")):
         held = _read_study(file)
@@ -211,9 +181,8 @@ def _read_study(file: Path) -> Mapping[str, Any] | None:
 
 
 def _describe_study(study: Mapping[str, Any]) -> str:
-    if not study:
-        return "runs of another command or version"
-    return ", ".join(str(value) if name == "paper" else f"{name} {value}" for name, value in study.items())
+    words = (str(value) if name == "paper" else f"{name} {value}" for name, value in study.items())
+    return ", ".join(words) or "runs of another command or version"
 
 
 def format_record(record: Mapping[str, Any]) -> str:
@@ -236,8 +205,7 @@ def format_record(record: Mapping[str, Any]) -> str:
         ]
         lines += ["", "### Findings", ""]
         lines += _format_rows(["statement", "statistic", "value", "95 % interval", "here"], rows)
-    if record["figures"]:
-        lines += ["", "### Figures", ""]
+    lines += ["", "### Figures", ""] if record["figures"] else []
     lines += [
         f"- {each['title']} {each['caption']} In the paper: {each['paper']}" for each in record["figures"].values()
     ]
@@ -246,30 +214,24 @@ def format_record(record: Mapping[str, Any]) -> str:
 
 def _format_compared(table: Mapping[str, Any]) -> Iterator[str]:
     """Return a table of a record as Markdown; what no value has is no column, and labels stand once."""
-    columns = {
-        head: [show(value) for value in table["values"]] for head, show in _columns(table["all_in_title"]).items()
-    }
-    shown = {head: cells for head, cells in columns.items() if set(cells) != {NOTHING}}
-    labels: list[list[str]] = []
-    for label, group in groupby(value["labels"] for value in table["values"]):
-        labels += [label, *([""] * len(label) for _ in list(group)[1:])]
-    rows = [[*label, *cells] for label, *cells in zip(labels, *shown.values(), strict=True)]
-    return _format_rows([*table["keys"], *shown], rows)
-
-
-def _columns(all_in: str) -> dict[str, Callable[[Mapping[str, Any]], str]]:
-    """Return the columns behind those of the labels: how each shows a value."""
-    return {
-        "quantity": lambda value: str(value["quantity"]),
-        "paper": lambda value: format_number(value["paper"]),
-        "ours": lambda value: format_number(value["ours"]),
-        "95 % interval": lambda value: format_ends(value["interval"]),
-        "difference": lambda value: format_difference(value["difference"]),
-        f"paper, {all_in}": lambda value: format_number(value["paper_all_in"]),
-        f"ours, {all_in}": lambda value: format_number(value["ours_all_in"]),
-        "released code": lambda value: value["released"] or NOTHING,
-        "why they differ": lambda value: ", ".join(value["reasons"]) or NOTHING,
-    }
+    all_in = table["all_in_title"]
+    rows, before = [], None
+    for value in table["values"]:
+        cells = {
+            "quantity": str(value["quantity"]),
+            "paper": format_number(value["paper"]),
+            "ours": format_number(value["ours"]),
+            "95 % interval": format_ends(value["interval"]),
+            "difference": format_difference(value["difference"]),
+            f"paper, {all_in}": format_number(value["paper_all_in"]),
+            f"ours, {all_in}": format_number(value["ours_all_in"]),
+            "released code": value["released"] or NOTHING,
+            "why they differ": ", ".join(value["reasons"]) or NOTHING,
+        }
+        rows.append(([""] * len(table["keys"]) if value["labels"] == before else value["labels"], cells))
+        before = value["labels"]
+    shown = [head for head in (rows[0][1] if rows else ()) if any(cells[head] != NOTHING for _, cells in rows)]
+    return _format_rows([*table["keys"], *shown], [[*labels, *map(cells.get, shown)] for labels, cells in rows])
 
 
 def format_number(value: float | None) -> str:

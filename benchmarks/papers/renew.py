@@ -13,12 +13,19 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks import RESULTS
-from benchmarks.papers.okelly2018.estimates import ThresholdEstimate
 from benchmarks.papers.okelly2018.reproduction import compare_own, make_okelly_record
 from benchmarks.papers.okelly2018.study import HighwayStudy, estimate_own
 from benchmarks.papers.tian2024.figures import collect_figures
-from benchmarks.papers.tian2024.replications import METHOD_ROWS, ReplicationRun, run_replication
-from benchmarks.papers.tian2024.study import RUN_COLUMNS, TianPlan, open_replications, record_replications
+from benchmarks.papers.tian2024.replications import (
+    FURTHER_COLUMNS,
+    METHOD_ROWS,
+    ROW_COLUMNS,
+    RUN_COLUMNS,
+    Run,
+    row_of,
+    run_replication,
+)
+from benchmarks.papers.tian2024.study import TianPlan, open_replications, record_replications
 from benchmarks.samplers.runs import map_jobs
 from rare_envs.files import format_json
 from samplers.output import to_json_value
@@ -36,15 +43,18 @@ def read_records() -> dict[str, dict[str, Any]]:
     return {paper: json.loads((RESULTS / f"{paper}.json").read_text(encoding="utf-8")) for paper in PAPERS}
 
 
-def read_replications(record: dict[str, Any]) -> list[ReplicationRun]:
+def read_replications(record: dict[str, Any]) -> list[Run]:
     """Return the replications of a record of Tian et al., as far as it has them: no traces, no texts of warnings."""
-    runs = []
-    for group in record["runs"]:
-        names = {name: group[name] for name in ("scenario", "system", "method")}
-        for place, count in enumerate(group["warnings"]):
-            values = {name: math.nan if group[name][place] is None else group[name][place] for name in RUN_COLUMNS}
-            runs.append(ReplicationRun(**names, **values, warnings=("",) * count, trace=()))
-    return runs
+    return [
+        {
+            **{name: group[name] for name in ROW_COLUMNS},
+            **{name: math.nan if group[name][place] is None else group[name][place] for name in RUN_COLUMNS},
+            **{name: [] for name in FURTHER_COLUMNS},
+            "warnings": [""] * count,
+        }
+        for group in record["runs"]
+        for place, count in enumerate(group["warnings"])
+    ]
 
 
 def renew_tian(record: dict[str, Any], folder: Path, methods: Sequence[str] = ()) -> dict[str, Any]:
@@ -64,8 +74,8 @@ def renew_tian(record: dict[str, Any], folder: Path, methods: Sequence[str] = ()
         jobs = [job for job in plan.jobs() if job.method in methods]
         lines = open_replications(folder, plan)
         made = lines.complete(jobs, lambda missing: map_jobs(run_replication, missing), True, "replications")
-        new = {(run.row, run.seed): run for run in made}
-        runs = [new.get((run.row, run.seed), run) for run in runs]
+        new = {(*row_of(run), run["seed"]): run for run in made}
+        runs = [new.get((*row_of(run), run["seed"]), run) for run in runs]
     anew = record_replications(plan, runs, record["command"])
     figures = {**record["figures"]}
     figures["figure8"] = {**figures["figure8"], "ends": to_json_value(collect_figures(runs))["figure8"]["ends"]}
@@ -80,9 +90,8 @@ def renew_okelly(record: dict[str, Any], folder: Path, own: bool = True) -> dict
     found = {**details, "findings": []}
     if own and details["own"]:
         folder.mkdir(parents=True, exist_ok=True)
-        naive = [ThresholdEstimate(**each) for each in details["naive"]]
         made = estimate_own(study, folder, study.make_problem(), [each["gamma"] for each in details["own"]], True)
-        found["own"] = [compare_own(each, naive) for each in made]
+        found["own"] = [compare_own(each, details["naive"]) for each in made]
     anew = make_okelly_record(study, record["command"], found)
     return {**anew, "about": about, "findings": record["findings"]}
 

@@ -45,8 +45,8 @@ class Job:
 
 
 @dataclass(frozen=True, kw_only=True)
-class SeededEstimate:
-    """Estimate of one run of a method, and the seed that brings it back."""
+class MethodRun:
+    """What came of a run."""
 
     method: str
     seed: int
@@ -55,12 +55,6 @@ class SeededEstimate:
     high: float
     cov: float
     """As the run itself states it."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class MethodRun(SeededEstimate):
-    """What came of a run."""
-
     problem: str
     n_sim: int
     """Points at which f was evaluated."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -12,7 +11,7 @@ import torch
 from scipy import stats
 from torch import Tensor
 
-from benchmarks.papers.record import Finding
+from benchmarks.papers.record import Entry, find
 from rare_envs.measures.longitudinal import TTC_MAX
 from rare_envs.sensors.lidar import RANGE_COLUMNS, RATE_COLUMNS, beam_angles
 from rare_envs.simulation.episode import Episode
@@ -32,8 +31,7 @@ StartColumns = Mapping[str, FloatArray]
 """Scenario parameters by name, (n, 6) each, the ego first."""
 
 
-@dataclass(frozen=True)
-class PaperClaim:
+class PaperClaim(NamedTuple):
     """A statement of the paper as a ratio of failing runs to ordinary ones.
 
     Example:
@@ -48,14 +46,14 @@ class PaperClaim:
     printed: float | None = None
     """The ratio that the paper prints."""
 
-    def judge(self, interval: Interval | None) -> str:
-        """Return what the 95 % interval of the ratio says of the claim."""
-        if interval is None or not all(math.isfinite(end) for end in interval):
-            return "cannot be told"
+    def judge(self, interval: Interval, equal: float = 1.0) -> str:
+        """Return what the 95 % interval of the ratio, or of a difference that is 0 where equal, says of the claim."""
         low, high = interval
-        if low <= 1.0 <= high:
+        if not math.isfinite(low + high):
+            return "cannot be told"
+        if low <= equal <= high:
             return "not seen here"
-        if (low > 1.0) != self.above:
+        if (low > equal) != self.above:
             return "the opposite here"
         if self.printed is None or low <= self.printed <= high:
             return "holds"
@@ -71,16 +69,9 @@ def speed_behind(columns: StartColumns) -> FloatArray:
     return np.asarray(np.where(count > 0, total / np.maximum(count, 1), np.nan))
 
 
-def distance_beside(columns: StartColumns) -> FloatArray:
-    """Return the mean distance along the road to the vehicles in the lanes beside [m], shape (n,)."""
-    along = np.abs(columns["s"][:, 1:] - columns["s"][:, :1])
-    return np.asarray(along[:, [j - 1 for j in NEXT_LANES]].mean(axis=1))
-
-
-def is_boxed_in(columns: StartColumns) -> FloatArray:
-    """Return 1 where both vehicles in the lanes beside start within `BESIDE` of the ego, else 0, shape (n,)."""
-    along = np.abs(columns["s"][:, 1:] - columns["s"][:, :1])[:, [j - 1 for j in NEXT_LANES]]
-    return np.asarray((along <= BESIDE).all(axis=1), dtype=np.float64)
+def distances_beside(columns: StartColumns) -> FloatArray:
+    """Return the distances along the road to the vehicles in the lanes beside [m], shape (n, 2)."""
+    return np.asarray(np.abs(columns["s"][:, NEXT_LANES] - columns["s"][:, :1]))
 
 
 def spread_of_starts(columns: StartColumns, base: StartColumns) -> FloatArray:
@@ -88,74 +79,55 @@ def spread_of_starts(columns: StartColumns, base: StartColumns) -> FloatArray:
 
     Its mean is the ratio of variances to those of the base, averaged over all 24 variables.
     """
-    parts = [
-        (columns[name] - columns[name].mean(axis=0)) ** 2 / base[name].var(axis=0, ddof=1) * _unbias(columns[name])
-        for name in STARTS
-    ]
-    return np.asarray(np.concatenate(parts, axis=1).mean(axis=1))
-
-
-def _unbias(values: FloatArray) -> float:
-    return len(values) / max(len(values) - 1, 1)
+    n = len(columns["s"])
+    parts = [(columns[name] - columns[name].mean(axis=0)) ** 2 / base[name].var(axis=0, ddof=1) for name in STARTS]
+    return np.asarray(np.concatenate(parts, axis=1).mean(axis=1) * n / max(n - 1, 1))
 
 
 def compare_means(
     claim: PaperClaim, quantity: str, failing: FloatArray, ordinary: FloatArray, groups: str = "failing / ordinary"
-) -> Finding:
+) -> Entry:
     """Test a claim on the ratio of two means, a value of each run: Welch's t, and a bootstrap interval of the ratio.
+
+    Where no ordinary run has any of it there is no ratio, and the shares of runs that have any are compared.
 
     Example:
         >>> rng = np.random.default_rng(0)
         >>> claim = PaperClaim("they are faster", above=True, printed=1.2)
         >>> found = compare_means(claim, "speed [m/s]", rng.normal(12, 1, 200), rng.normal(10, 1, 200))
-        >>> round(found.value, 1), found.verdict
+        >>> round(found["value"], 1), found["verdict"]
         (1.2, 'holds')
     """
     failing, ordinary = failing[~np.isnan(failing)], ordinary[~np.isnan(ordinary)]
     sizes = f"{len(failing):,} and {len(ordinary):,} runs"
-    if min(len(failing), len(ordinary)) > 1 and not ordinary.any():
-        return _compare_shares(claim, f"{quantity}, {groups}", failing, ordinary)
-    if len(failing) < 2 or len(ordinary) < 2 or ordinary.mean() == 0.0:
+    if min(len(failing), len(ordinary)) < 2:
         known = [f"{values.mean():.3g}" if len(values) else "none" for values in (failing, ordinary)]
-        return Finding(
-            claim=claim.text,
-            statistic=f"{quantity}, {groups}: {' and '.join(known)}, {sizes}",
-            value=None,
-            interval=None,
-            verdict="cannot be told",
-        )
-    interval = bootstrap_ratio(failing, ordinary)
+        return find(claim.text, f"{quantity}, {groups}: {' and '.join(known)}, {sizes}", "cannot be told")
+    if not ordinary.any():
+        return _compare_shares(claim, f"{quantity}, {groups}", failing, ordinary)
     # equal values in both groups have no spread, and no statistic
     if failing.std() == 0.0 and ordinary.std() == 0.0:
         test = "no spread"
     else:
-        found = stats.ttest_ind(failing, ordinary, equal_var=False)
-        test = f"Welch's t = {float(found.statistic):.1f}, p = {max(float(found.pvalue), LEAST_P):.1g}"
-    means = f"{failing.mean():.3g} / {ordinary.mean():.3g}"
-    return Finding(
-        claim=claim.text,
-        statistic=f"{quantity}, {groups}: {means}; {test}; {sizes}",
-        value=float(failing.mean() / ordinary.mean()),
-        interval=interval,
-        verdict=claim.judge(interval),
-    )
+        tested = stats.ttest_ind(failing, ordinary, equal_var=False)
+        test = f"Welch's t = {float(tested.statistic):.1f}, p = {max(float(tested.pvalue), LEAST_P):.1g}"
+    statistic = f"{quantity}, {groups}: {failing.mean():.3g} / {ordinary.mean():.3g}; {test}; {sizes}"
+    interval = bootstrap_ratio(failing, ordinary)
+    return find(claim.text, statistic, claim.judge(interval), float(failing.mean() / ordinary.mean()), interval)
 
 
-def _compare_shares(claim: PaperClaim, quantity: str, failing: FloatArray, ordinary: FloatArray) -> Finding:
-    """Test a claim by the shares of runs that have any of it, where no ordinary run has: there is no ratio of means."""
+def _compare_shares(claim: PaperClaim, quantity: str, failing: FloatArray, ordinary: FloatArray) -> Entry:
+    """Test a claim by the shares of runs that have any of it."""
     counts = [(int(np.count_nonzero(values)), len(values)) for values in (failing, ordinary)]
-    low, high = difference_interval(*counts)
-    found = stats.fisher_exact(np.array([[k, n - k] for k, n in counts]))
+    interval = difference_interval(*counts)
+    tested = stats.fisher_exact(np.array([[k, n - k] for k, n in counts]))
     shares = " and ".join(f"{k:,} of {n:,}" for k, n in counts)
-    seen = "holds" if (low > 0.0) == claim.above else "the opposite here"
-    return Finding(
-        claim=claim.text,
-        statistic=f"{quantity}: difference of the shares of runs with any, {shares}; "
-        f"Fisher's exact test, p = {float(found.pvalue):.1g}",
-        value=counts[0][0] / counts[0][1] - counts[1][0] / counts[1][1],
-        interval=(low, high),
-        verdict="not seen here" if low <= 0.0 <= high else seen,
+    statistic = (
+        f"{quantity}: difference of the shares of runs with any, {shares}; Fisher's exact test, "
+        f"p = {float(tested.pvalue):.1g}"
     )
+    value = counts[0][0] / counts[0][1] - counts[1][0] / counts[1][1]
+    return find(claim.text, statistic, claim._replace(printed=None).judge(interval, equal=0.0), value, interval)
 
 
 def difference_interval(first: tuple[int, int], second: tuple[int, int]) -> Interval:
@@ -189,23 +161,31 @@ def bootstrap_ratio(failing: FloatArray, ordinary: FloatArray) -> Interval:
     return float(low), float(high)
 
 
-BOXED_IN = PaperClaim("vehicles box in the ego", above=True)
-NEARER_NEIGHBOURS = PaperClaim("vehicles box in the ego: neighbours are nearer", above=False)
-FASTER_BEHIND = PaperClaim("vehicles behind the ego are 20 % faster", above=True, printed=1.2)
-LESS_VARIANCE = PaperClaim("variances of the initial conditions are 50 % smaller", above=False, printed=0.5)
-_OF_STARTS: tuple[tuple[PaperClaim, str, Callable[[StartColumns], FloatArray]], ...] = (
-    (BOXED_IN, f"share of starts with a vehicle within {BESIDE:g} m in both lanes beside", is_boxed_in),
-    (NEARER_NEIGHBOURS, "distance to the vehicles in the lanes beside at the start [m]", distance_beside),
-    (FASTER_BEHIND, "initial speed of the vehicles that start behind [m/s]", speed_behind),
-)
-
-
-def compare_starts(failing: StartColumns, ordinary: StartColumns, groups: str) -> list[Finding]:
+def compare_starts(failing: StartColumns, ordinary: StartColumns, groups: str) -> list[Entry]:
     """Test what the paper says of initial conditions."""
-    found = [compare_means(claim, words, value(failing), value(ordinary), groups) for claim, words, value in _OF_STARTS]
-    spreads = [spread_of_starts(columns, ordinary) for columns in (failing, ordinary)]
-    words = "variance of the 24 initial values, mean over them, in units of the base's"
-    return [*found, compare_means(LESS_VARIANCE, words, spreads[0], spreads[1], groups)]
+    claims: tuple[tuple[PaperClaim, str, Callable[[StartColumns], FloatArray]], ...] = (
+        (
+            PaperClaim("vehicles box in the ego", above=True),
+            f"share of starts with a vehicle within {BESIDE:g} m in both lanes beside",
+            lambda columns: (distances_beside(columns) <= BESIDE).all(axis=1).astype(np.float64),
+        ),
+        (
+            PaperClaim("vehicles box in the ego: neighbours are nearer", above=False),
+            "distance to the vehicles in the lanes beside at the start [m]",
+            lambda columns: distances_beside(columns).mean(axis=1),
+        ),
+        (
+            PaperClaim("vehicles behind the ego are 20 % faster", above=True, printed=1.2),
+            "initial speed of the vehicles that start behind [m/s]",
+            speed_behind,
+        ),
+        (
+            PaperClaim("variances of the initial conditions are 50 % smaller", above=False, printed=0.5),
+            "variance of the 24 initial values, mean over them, in units of the base's",
+            lambda columns: spread_of_starts(columns, ordinary),
+        ),
+    )
+    return [compare_means(claim, words, value(failing), value(ordinary), groups) for claim, words, value in claims]
 
 
 HARD_BRAKE_LIMIT = -3.0
@@ -264,40 +244,24 @@ def find_least_time(episode: Episode) -> tuple[Tensor, Tensor]:
     return least, (angle >= SIDEWAYS_ANGLES[0]) & (angle <= SIDEWAYS_ANGLES[1])
 
 
-MORE_LANE_CHANGES = PaperClaim("perturbed weights make lane changes more frequent", above=True)
-MORE_HARD_BRAKES = PaperClaim("perturbed weights make hard brakes more frequent", above=True)
-MORE_SIDESWIPES = PaperClaim("dangerous events include frequent sideswipes", above=True)
-
-
 def compare_behaviour(
     failing: RunBehaviour, ordinary: RunBehaviour, with_their_weights: RunBehaviour, all_failing: int
-) -> list[Finding]:
+) -> list[Entry]:
     """Test what the paper says of behaviour."""
     groups = "ordinary starts with weights of failing runs / with their own"
-    found = [
-        compare_means(
-            MORE_LANE_CHANGES,
-            "lane changes of a vehicle in 10 s",
-            with_their_weights.lane_changes,
-            ordinary.lane_changes,
-            groups,
-        ),
-        compare_means(
-            MORE_HARD_BRAKES,
-            "share of steps that brake at 3 m/s^2 or more",
-            with_their_weights.hard_brakes,
-            ordinary.hard_brakes,
-            groups,
-        ),
-    ]
-    words = "share of runs whose least time to collision is along a beam to the side (45 to 135 degrees)"
-    collided = f"the ego collides in {failing.collided.mean():.0%} of the failing runs"
+    lane_changes = PaperClaim("perturbed weights make lane changes more frequent", above=True)
+    hard_brakes = PaperClaim("perturbed weights make hard brakes more frequent", above=True)
+    sideswipes = PaperClaim("dangerous events include frequent sideswipes", above=True)
+    of_beams = (
+        "share of runs whose least time to collision is along a beam to the side (45 to 135 degrees); "
+        f"the ego collides in {failing.collided.mean():.0%} of the failing runs, {len(failing.collided):,} of "
+        f"{all_failing:,} driven again"
+    )
+    theirs, own = with_their_weights, ordinary
     return [
-        *found,
+        compare_means(lane_changes, "lane changes of a vehicle in 10 s", theirs.lane_changes, own.lane_changes, groups),
         compare_means(
-            MORE_SIDESWIPES,
-            f"{words}; {collided}, {len(failing.collided):,} of {all_failing:,} driven again",
-            failing.sideways,
-            ordinary.sideways,
+            hard_brakes, "share of steps that brake at 3 m/s^2 or more", theirs.hard_brakes, own.hard_brakes, groups
         ),
+        compare_means(sideswipes, of_beams, failing.sideways, ordinary.sideways),
     ]

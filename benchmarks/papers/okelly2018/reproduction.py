@@ -3,20 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from concurrent.futures import Executor
 from dataclasses import asdict
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from benchmarks.papers.okelly2018.estimates import (
-    ThresholdEstimate,
-    compare_with_naive,
-    estimate_naive,
-    estimate_weighted,
-    mean_ratio,
-)
+from benchmarks.papers.okelly2018.estimates import compare_with_naive, estimate_naive, estimate_weighted
 from benchmarks.papers.okelly2018.findings import compare_behaviour, compare_starts, measure_behaviour
 from benchmarks.papers.okelly2018.printed import describe_printed
 from benchmarks.papers.okelly2018.search import (
@@ -25,7 +17,6 @@ from benchmarks.papers.okelly2018.search import (
     PRINTED_SEARCH,
     SEARCHES,
     STUDY_SCALES,
-    SearchSettings,
     choose_sampler,
     describe_sampler,
     draw_chunk,
@@ -35,11 +26,13 @@ from benchmarks.papers.okelly2018.study import (
     ChunkJob,
     HighwayStudy,
     MeasuredHighway,
+    RolloutFolder,
     SearchRun,
+    join_outcomes,
     measure_highway,
 )
 from benchmarks.papers.okelly2018.tables import describe_figures, list_thresholds, make_figures, make_tables
-from benchmarks.papers.record import Finding, check_folder, make_record, write_record
+from benchmarks.papers.record import Entry, check_folder, make_record, write_record
 from samplers.problem import FloatArray
 
 SOURCE = (
@@ -48,23 +41,16 @@ SOURCE = (
 )
 
 
-def reproduce_okelly2018(
-    study: HighwayStudy,
-    out: Path,
-    command: str,
-    executor: Executor | None = None,
-    limit: int | None = None,
-    progress: bool = False,
-) -> dict[str, Any]:
+def reproduce_okelly2018(rollouts: RolloutFolder, command: str) -> dict[str, Any]:
     """Make the rollouts that a folder does not have yet, and write record and figures of what there is.
 
     Raises:
         BadInput: The folder has rollouts of something else, or damaged ones.
     """
+    study, out = rollouts.study, rollouts.folder
     check_folder(out, study.identity)
-    problem = study.make_problem()
-    measured = measure_highway(study, out, problem, executor, limit, progress)
-    record = make_okelly_record(study, command, summarise_highway(study, problem, measured))
+    found = summarise_highway(study, rollouts.problem, measure_highway(rollouts))
+    record = make_okelly_record(study, command, found)
     write_record(out, record, make_figures(record))
     return record
 
@@ -132,7 +118,7 @@ FIRST = 8
 
 
 def summarise_highway(study: HighwayStudy, problem: Any, measured: MeasuredHighway) -> dict[str, Any]:
-    """Return the figures of what was measured, as plain values but for the findings.
+    """Return the figures of what was measured, as plain values.
 
     Returns:
         naive, naive_equal: Estimates of the thresholds, and of as many draws as a final sample has; empty if none.
@@ -143,112 +129,89 @@ def summarise_highway(study: HighwayStudy, problem: Any, measured: MeasuredHighw
         rollouts: All of them but those of our own method.
         rollouts_per_second: Of the fastest chunk of naive Monte Carlo, wall time; None if there is none.
     """
-    scale, f = study.settings, _join([each.f for each in measured.naive])
+    final, f = study.settings.final, join_outcomes(measured.naive)
     references = [estimate_naive(f, gamma) for gamma in study.gammas] if len(f) else []
-    equal = [estimate_naive(f[: scale.final], gamma) for gamma in study.gammas] if len(f) >= scale.final else []
-    searches = {name: _summarise_search(study, run, f, SEARCHES[name]) for name, run in measured.searches.items()}
+    equal = [estimate_naive(f[:final], gamma) for gamma in study.gammas] if len(f) >= final else []
+    searches = {name: _summarise_search(study, name, run, f) for name, run in measured.searches.items()}
+    speeds = (len(each["f"]) / each["seconds"] for each in measured.naive if each["seconds"])
     return {
-        "naive": [asdict(each) for each in references],
-        "naive_equal": [asdict(each) for each in equal],
+        "naive": references,
+        "naive_equal": equal,
         "searches": searches,
         "own": [compare_own(each, references) for each in measured.own],
         "findings": _find(study, problem, measured, f) if len(f) else [],
         "rollouts": len(f) + sum(each["search"] + each["final"] for each in searches.values()),
         "first": f[:FIRST].tolist(),
-        "rollouts_per_second": max(
-            (len(each.f) / each.seconds for each in measured.naive if each.seconds), default=None
-        ),
+        "rollouts_per_second": max(speeds, default=None),
     }
 
 
-def _summarise_search(
-    study: HighwayStudy, run: SearchRun, naive: FloatArray, settings: SearchSettings
-) -> dict[str, Any]:
-    scale = study.settings
+def _summarise_search(study: HighwayStudy, name: str, run: SearchRun, naive: FloatArray) -> dict[str, Any]:
+    """Return settings and progress of a search, and what its final sample says beside naive outcomes (n,)."""
+    scale, f = study.settings, join_outcomes(run.final)
     n_search = len(run.steps) * scale.draws
     found: dict[str, Any] = {
-        **asdict(settings),
+        **asdict(SEARCHES[name]),
         "iterations": len(run.steps),
         "of": scale.iterations,
         "search": n_search,
-        "final": sum(len(each.f) for each in run.final),
+        "final": len(f),
         "steps": [{"quantile": s.quantile, "level": s.level, "elite": s.elite, "ess": s.ess} for s in run.steps],
         "estimates": [],
         "comparisons": [],
     }
-    if not run.final or not len(naive):
+    if not len(f) or not len(naive):
         return found
-    references = [estimate_naive(naive, gamma) for gamma in study.gammas]
     jobs = run.jobs[: len(run.final)]
-    f = _join([each.f for each in run.final])
-    ratios = _join(
-        [find_log_ratios(run.base, run.chosen, draw_chunk(job.sampler, job.n, study.seed, job.key)) for job in jobs]
-    )
+    draws = [draw_chunk(job.sampler, job.n, study.seed, job.key) for job in jobs]
+    ratios = np.concatenate([find_log_ratios(run.base, run.chosen, x) for x in draws])
     estimates = [estimate_weighted(f, ratios, gamma) for gamma in study.gammas]
-    comparisons = [
-        compare_with_naive(each, reference, n_search) for each, reference in zip(estimates, references, strict=True)
-    ]
+    curve = [estimate_weighted(f, ratios, gamma) for gamma in list_thresholds(study.gammas)]
+    comparisons, traced = (
+        [compare_with_naive(each, estimate_naive(naive, each["gamma"]), n_search) for each in group]
+        for group in (estimates, curve)
+    )
     return found | {
         "chosen": choose_sampler(run.steps),
         "sampler": describe_sampler(run.base, run.chosen),
-        "mean_ratio": mean_ratio(ratios),
-        "estimates": [asdict(each) for each in estimates],
-        "comparisons": [asdict(each) for each in comparisons],
-        "curve": _trace_curve(study, f, ratios, naive, n_search),
+        "mean_ratio": float(np.exp(ratios).mean()),  # 1 but for chance; far below, the draws lie where nothing is
+        "estimates": estimates,
+        "comparisons": comparisons,
+        "curve": traced,
     }
 
 
-def _trace_curve(
-    study: HighwayStudy, f: FloatArray, ratios: FloatArray, naive: FloatArray, n_search: int
-) -> list[dict[str, Any]]:
-    """Return the comparisons with naive Monte Carlo over the thresholds of the figures."""
-    return [
-        asdict(compare_with_naive(estimate_weighted(f, ratios, gamma), estimate_naive(naive, gamma), n_search))
-        for gamma in list_thresholds(study.gammas)
-    ]
-
-
-def compare_own(own: dict[str, Any], references: Sequence[ThresholdEstimate]) -> dict[str, Any]:
+def compare_own(own: dict[str, Any], references: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Add the gain over naive Monte Carlo at as many simulations, by the method's own c.o.v.
 
     Example:
         >>> own = {"gamma": 0.5, "p": 1e-3, "cov": 0.1, "n_sim": 1000}
-        >>> naive = ThresholdEstimate(0.5, n=10_000, events=10, p=1e-3, standard_error=3.2e-4)
-        >>> round(compare_own(own, [naive])["gain"], 1)
+        >>> round(compare_own(own, [{"gamma": 0.5, "p": 1e-3}])["gain"], 1)
         99.9
     """
-    p = next((each.p for each in references if each.gamma == own["gamma"]), 0.0)
+    p = next((each["p"] for each in references if each["gamma"] == own["gamma"]), 0.0)
     error = own["p"] * own["cov"]
     gain = p * (1.0 - p) / own["n_sim"] / error**2 if p > 0.0 and 0.0 < error < float("inf") else None
     return {**own, "gain": gain}
 
 
-def _find(study: HighwayStudy, problem: Any, measured: MeasuredHighway, f: FloatArray) -> list[Finding]:
+def _find(study: HighwayStudy, problem: Any, measured: MeasuredHighway, f: FloatArray) -> list[Entry]:
     """Test what the paper says on the naive runs, and on the sampler of the search as printed."""
     fails = f <= study.gammas[-1]
     failing = _draw_rows(study, measured.naive_jobs, np.flatnonzero(fails))
     ordinary = _draw_rows(study, measured.naive_jobs, np.flatnonzero(~fails)[:ORDINARY_COMPARED])
-    found: list[Finding] = []
+    columns, found = problem.space.columns, list[Entry]()
     if len(failing) > 1:
-        columns, usual = problem.space.columns(failing), problem.space.columns(ordinary)
-        found += compare_starts(columns, usual, "failing / ordinary")
+        found += compare_starts(columns(failing), columns(ordinary), "failing / ordinary")
     run = measured.searches[PRINTED_SEARCH]
     if run.final:
         drawn = draw_chunk(run.chosen, ORDINARY_COMPARED, study.seed, "starts of the sampler")
-        found += compare_starts(
-            problem.space.columns(drawn), problem.space.columns(ordinary), "sampler of the search as printed / ordinary"
-        )
+        found += compare_starts(columns(drawn), columns(ordinary), "sampler of the search as printed / ordinary")
     if len(failing) > 1:
-        again, usual_x = failing[:FAILING_DRIVEN], ordinary[: ORDINARY_DRIVEN[study.ego]]
-        mixed = usual_x.copy()
-        weights = slice(problem.space.dim - WEIGHT_COUNT, problem.space.dim)
-        mixed[:, weights] = again[np.arange(len(mixed)) % len(again)][:, weights]
-        found += compare_behaviour(
-            measure_behaviour(problem, again),
-            measure_behaviour(problem, usual_x),
-            measure_behaviour(problem, mixed),
-            all_failing=len(failing),
-        )
+        again, usual = failing[:FAILING_DRIVEN], ordinary[: ORDINARY_DRIVEN[study.ego]]
+        mixed = usual.copy()
+        mixed[:, -WEIGHT_COUNT:] = again[np.arange(len(mixed)) % len(again), -WEIGHT_COUNT:]
+        found += compare_behaviour(*(measure_behaviour(problem, x) for x in (again, usual, mixed)), len(failing))
     return found
 
 
@@ -260,8 +223,4 @@ def _draw_rows(study: HighwayStudy, jobs: Sequence[ChunkJob], rows: Any) -> Floa
         for number, job in enumerate(jobs)
         if (rows // size == number).any()
     ]
-    return _join(parts)
-
-
-def _join(parts: Sequence[FloatArray]) -> FloatArray:
     return np.concatenate(parts) if parts else np.empty(0)

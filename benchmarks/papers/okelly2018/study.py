@@ -6,10 +6,11 @@ Rollouts are made in chunks, each a line of a file: a run goes on where it ended
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import asdict, dataclass, field
 from functools import partial
+from itertools import takewhile
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -36,6 +37,7 @@ from benchmarks.samplers.runs import map_jobs
 from samplers.methods.blocks import Product
 from samplers.problem import FloatArray
 
+OWN_FILE = "own.jsonl"
 WAITING = 64
 """Chunks that an executor has at a time: a sampler of 428 dimensions takes a megabyte."""
 
@@ -82,15 +84,16 @@ class HighwayStudy:
         """What tells studies apart."""
         return {"paper": "okelly2018", "ego": self.ego, "scale": self.scale, "seed": self.seed}
 
-    @property
-    def header(self) -> dict[str, Any]:
-        """What all rollouts of a folder have in common."""
-        return {
+    def open_lines(self, file: Path, key: str) -> RunLines[Any, dict[str, Any]]:
+        """Return a file of runs that are told apart by one of their entries, which is their job too, or its `key`."""
+        header = {
             "study": self.identity,
             "rare_envs": rare_envs.__version__,
             "settings": asdict(self.settings),
             "gammas": list(self.gammas),
         }
+        read, job_key = (lambda line: {**line, key: line[key]}), (lambda job: getattr(job, key, job))
+        return RunLines(file, header, read, dict, job_key, lambda run: run[key])
 
 
 class ChunkJob(NamedTuple):
@@ -103,53 +106,38 @@ class ChunkJob(NamedTuple):
     """Where they are drawn from."""
 
 
-@dataclass(frozen=True, eq=False)
-class ChunkOutcomes:
-    """What came of them: a line of a file."""
-
-    key: str
-    seed: int
-    seconds: float
-    """Wall time of its simulations."""
-    f: FloatArray
-    """Outcomes, rounded to single precision, in which the simulator computes."""
-
-    @classmethod
-    def from_line(cls, line: dict[str, Any]) -> ChunkOutcomes:
-        """Return the content of a line."""
-        f = np.array(line["f"], dtype=np.float32).astype(np.float64)
-        return cls(str(line["key"]), int(line["seed"]), float(line["seconds"]), f)
-
-    def to_line(self) -> dict[str, Any]:
-        """Return the content of the line, with as few digits as give the same numbers."""
-        f = [float(str(value)) for value in self.f.astype(np.float32)]
-        return {"key": self.key, "seed": self.seed, "seconds": round(self.seconds, 3), "f": f}
-
-
 def split_jobs(stage: str, n: int, size: int, sampler: Product) -> list[ChunkJob]:
     """Return the chunks of a stage with n rollouts, of `size` at most."""
     starts = range(0, n, size)
     return [ChunkJob(f"{stage}/{number}", min(size, n - start), sampler) for number, start in enumerate(starts)]
 
 
-def simulate_chunk(job: ChunkJob, problem: Any, seed: int) -> ChunkOutcomes:
-    """Draw the scenarios of a chunk and simulate them."""
+def simulate_chunk(job: ChunkJob, problem: Any, seed: int) -> dict[str, Any]:
+    """Draw the scenarios of a chunk and simulate them; return the content of its line.
+
+    Outcomes have single precision, in which the simulator computes, and as few digits as give the same numbers.
+    """
     x = draw_chunk(job.sampler, job.n, seed, job.key)
     start = time.perf_counter()
-    f = np.asarray(problem.evaluate(x)).astype(np.float32).astype(np.float64)
-    return ChunkOutcomes(job.key, seed, time.perf_counter() - start, f)
+    f = np.asarray(problem.evaluate(x)).astype(np.float32)
+    seconds = round(time.perf_counter() - start, 3)
+    return {"key": job.key, "seed": seed, "seconds": seconds, "f": [float(str(value)) for value in f]}
+
+
+def join_outcomes(lines: Sequence[Mapping[str, Any]]) -> FloatArray:
+    """Return the outcomes of chunks, shape (n,)."""
+    parts = [np.array(line["f"], dtype=np.float32).astype(np.float64) for line in lines]
+    return np.concatenate(parts) if parts else np.empty(0)
 
 
 @dataclass
 class RolloutFolder:
-    """Makes rollouts and keeps their outcomes in files of a folder, one for each stage."""
+    """Makes rollouts of a study and keeps their outcomes in files of a folder, one for each stage."""
 
+    study: HighwayStudy
     folder: Path
     problem: Any
     """What simulates; has `evaluate`."""
-    header: dict[str, Any]
-    """What all lines have in common."""
-    seed: int
     executor: Executor | None = None
     """Where the simulations are made; None for this process."""
     limit: int | None = None
@@ -158,24 +146,13 @@ class RolloutFolder:
     made: int = 0
     """Rollouts that were made now."""
 
-    def outcomes(self, jobs: Sequence[ChunkJob], description: str = "") -> list[ChunkOutcomes]:
+    def outcomes(self, jobs: Sequence[ChunkJob], description: str = "") -> list[dict[str, Any]]:
         """Return the outcomes of the chunks of one stage, the missing ones made as far as the limit allows."""
         stage = jobs[0].key.partition("/")[0]
-        lines = RunLines(
-            self.folder / f"{stage}.jsonl",
-            self.header,
-            ChunkOutcomes.from_line,
-            ChunkOutcomes.to_line,
-            key_of_job=lambda job: job.key,
-            key_of_run=lambda run: run.key,
-        )
+        lines = self.study.open_lines(self.folder / f"{stage}.jsonl", "key")
         drop_torn_line(lines.file)
-        known = {run.key for run in lines.read()}
-        wanted: list[ChunkJob] = []
-        for job in jobs:
-            if job.key not in known and not self.spend(job.n):
-                break
-            wanted.append(job)
+        known = {run["key"] for run in lines.read()}
+        wanted = list(takewhile(lambda job: job.key in known or self.spend(job.n), jobs))
         progress = self.progress and any(job.key not in known for job in wanted)
         return lines.complete(wanted, self._make, progress, description)
 
@@ -185,8 +162,8 @@ class RolloutFolder:
         self.made += n if allowed else 0
         return allowed
 
-    def _make(self, jobs: list[ChunkJob]) -> Iterator[ChunkOutcomes]:
-        once = partial(simulate_chunk, problem=self.problem, seed=self.seed)
+    def _make(self, jobs: list[ChunkJob]) -> Iterator[dict[str, Any]]:
+        once = partial(simulate_chunk, problem=self.problem, seed=self.study.seed)
         for first in range(0, len(jobs), WAITING):
             yield from map_jobs(once, jobs[first : first + WAITING], executor=self.executor)
 
@@ -197,7 +174,7 @@ class SearchRun:
 
     base: Product
     steps: list[SearchStep] = field(default_factory=list)
-    final: list[ChunkOutcomes] = field(default_factory=list)
+    final: list[dict[str, Any]] = field(default_factory=list)
     jobs: list[ChunkJob] = field(default_factory=list)
     """Of the final sample."""
 
@@ -210,46 +187,35 @@ class SearchRun:
 class MeasuredHighway(NamedTuple):
     """Outcomes of all stages, as far as they were made."""
 
-    naive: list[ChunkOutcomes]
+    naive: list[dict[str, Any]]
     naive_jobs: list[ChunkJob]
     searches: dict[str, SearchRun]
     own: list[dict[str, Any]]
 
 
-def measure_highway(
-    study: HighwayStudy,
-    out: Path,
-    problem: Any,
-    executor: Executor | None = None,
-    limit: int | None = None,
-    progress: bool = False,
-) -> MeasuredHighway:
-    """Make the rollouts that a folder does not have yet, `limit` of them at most.
-
-    Raises:
-        BadInput: The folder has rollouts of something else, or damaged ones.
-    """
+def measure_highway(rollouts: RolloutFolder) -> MeasuredHighway:
+    """Make the rollouts that a folder does not have yet; BadInput if it has some of something else, or damaged ones."""
+    study, out, problem = rollouts.study, rollouts.folder, rollouts.problem
     scale = study.settings
     out.mkdir(parents=True, exist_ok=True)
-    rollouts = RolloutFolder(out, problem, study.header, study.seed, executor, limit, progress)
     jobs = split_jobs("naive", scale.naive, scale.chunk, make_base(problem, SEARCHES[PRINTED_SEARCH]))
     naive = rollouts.outcomes(jobs, "naive Monte Carlo")
-    searches = {
-        name: run_search(rollouts, number, settings, study)
-        for number, (name, settings) in enumerate(SEARCHES.items(), 1)
-    }
-    known = read_own(study, out)
+    searches = {name: run_search(rollouts, number, SEARCHES[name]) for number, name in enumerate(SEARCHES, 1)}
+    lines = study.open_lines(out / OWN_FILE, "gamma")
+    drop_torn_line(lines.file)
+    known = {run["gamma"] for run in lines.read()}
     wanted = [gamma for gamma in study.gammas if scale.own and (gamma in known or rollouts.spend(scale.own))]
-    own = estimate_own(study, out, problem, wanted, progress and not known.issuperset(wanted)) if wanted else []
+    progress = rollouts.progress and not known.issuperset(wanted)
+    own = estimate_own(study, out, problem, wanted, progress) if wanted else []
     return MeasuredHighway(naive, jobs[: len(naive)], searches, own)
 
 
-def run_search(rollouts: RolloutFolder, number: int, settings: SearchSettings, study: HighwayStudy) -> SearchRun:
+def run_search(rollouts: RolloutFolder, number: int, settings: SearchSettings) -> SearchRun:
     """Run algorithm 1 and draw from the sampler that it chooses, as far as rollouts may be made.
 
     Its files are `search_NUMBER.jsonl` and `final_NUMBER.jsonl`.
     """
-    scale, base = study.settings, make_base(rollouts.problem, settings)
+    study, scale, base = rollouts.study, rollouts.study.settings, make_base(rollouts.problem, settings)
     run, sampler, title = SearchRun(base), base, f"search {number} of {len(SEARCHES)}"
     for k in range(scale.iterations):
         jobs = split_jobs(f"search_{number}/{k}", scale.draws, scale.chunk, sampler)
@@ -257,29 +223,17 @@ def run_search(rollouts: RolloutFolder, number: int, settings: SearchSettings, s
         if len(found) < len(jobs):
             return run
         x = np.concatenate([draw_chunk(sampler, job.n, study.seed, job.key) for job in jobs])
-        f = np.concatenate([each.f for each in found])
-        step, sampler = take_step(base, sampler, x, f, settings, study.gammas[0])
+        step, sampler = take_step(base, sampler, x, join_outcomes(found), settings, study.gammas[0])
         run.steps.append(step)
     run.jobs = split_jobs(f"final_{number}", scale.final, scale.chunk, run.chosen)
     run.final = rollouts.outcomes(run.jobs, f"{title}, final sample")
     return run
 
 
-def read_own(study: HighwayStudy, out: Path) -> set[float]:
-    """Return the thresholds of which a folder has an estimate by our default method."""
-    lines = _open_own(study, out)
-    drop_torn_line(lines.file)
-    return {run["gamma"] for run in lines.read()}
-
-
 def estimate_own(
     study: HighwayStudy, out: Path, problem: Any, gammas: Sequence[float], progress: bool = False
 ) -> list[dict[str, Any]]:
-    """Estimate thresholds [s] by the package's default method, but those that the folder has.
-
-    Raises:
-        BadInput: The folder has estimates of something else or of other code, or damaged ones.
-    """
+    """Estimate thresholds [s] by the package's default method, but those that the folder has; BadInput as above."""
 
     def make(missing: list[float]) -> Iterator[dict[str, Any]]:
         for gamma in missing:
@@ -294,10 +248,4 @@ def estimate_own(
                 "warnings": list(found.warnings),
             }
 
-    return _open_own(study, out).complete(list(gammas), make, progress, "our default method")
-
-
-def _open_own(study: HighwayStudy, out: Path) -> RunLines[float, dict[str, Any]]:
-    return RunLines(
-        out / "own.jsonl", study.header, dict, dict, key_of_job=lambda gamma: gamma, key_of_run=lambda run: run["gamma"]
-    )
+    return study.open_lines(out / OWN_FILE, "gamma").complete(list(gammas), make, progress, "our default method")

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
 
-from benchmarks.papers.okelly2018.printed import PRINTED_TABLES, PrintedTable
+from benchmarks.papers.okelly2018.printed import PRINTED_TABLES, find_errors_off, find_variance_ratio
 from benchmarks.papers.okelly2018.search import PRINTED_SEARCH, WHY_OTHER_THRESHOLDS
-from benchmarks.papers.record import ComparedValue, ComparisonTable, DrawnFigure
+from benchmarks.papers.record import Drawings, Entry, compare, make_table
 
 Z_95 = 1.96
 MISSED_ERRORS = 3.0
@@ -19,52 +19,35 @@ MISSED_ERRORS = 3.0
 FEW_DRAWS = 0.02
 """Effective sample size over rare draws below which a few draws are said to make up an estimate."""
 KEYS = ("sample", "gamma, theirs / ours [s]")
-SEARCH_COUNTED = "search counted"
 _ERROR = "standard error"
 _VARIANCE_RATIO = "variance, naive / sampler, equal draws"
 _DISTANCE_RATIO = "mean square distance from the naive p instead of the variance"
 
 
-def make_tables(ego: str, gammas: tuple[float, ...], found: Mapping[str, Any]) -> tuple[ComparisonTable, ...]:
+def make_tables(ego: str, gammas: Sequence[float], found: Mapping[str, Any]) -> list[Entry]:
     """Return the table of estimates and that of ratios."""
-    printed = PRINTED_TABLES[ego]
-    reasons = explain_differences(ego, found)
-    heads = [f"{theirs} / {ours}" for theirs, ours in zip(printed.thresholds, gammas, strict=True)]
-    estimates = _list_estimates(printed, heads, found)
-    ratios = _list_ratios(printed, heads, found)
-    return (
-        ComparisonTable(
-            name=printed.name.lower().replace(" ", ""),
-            title=f"{printed.name}: probabilities with the {ego} ego",
-            keys=KEYS,
-            values=tuple(estimates),
-            explanations=_keep_used(reasons, estimates),
-            all_in_title=SEARCH_COUNTED,
-        ),
-        ComparisonTable(
-            name=f"{printed.name.lower().replace(' ', '')}_ratios",
-            title=f"What cross-entropy gains over naive Monte Carlo with the {ego} ego",
-            keys=KEYS,
-            values=tuple(ratios),
-            explanations=_keep_used(reasons, ratios),
-            all_in_title=SEARCH_COUNTED,
-        ),
-    )
-
-
-def _keep_used(reasons: Mapping[str, str], values: Iterable[ComparedValue]) -> dict[str, str]:
-    """Return the explanations that some value refers to; `underflow` refers to `weights`."""
-    used = {reason for value in values for reason in value.reasons}
-    used |= {"weights"} if "underflow" in used else set()
-    return {name: text for name, text in reasons.items() if name in used}
+    name, reasons = PRINTED_TABLES[ego]["table"], explain_differences(ego, found)
+    word = name.lower().replace(" ", "")
+    ratios = f"What cross-entropy gains over naive Monte Carlo with the {ego} ego"
+    return [
+        make_table(of_table, title, KEYS, list(values(ego, gammas, found)), reasons, all_in_title="search counted")
+        for of_table, title, values in (
+            (word, f"{name}: probabilities with the {ego} ego", _list_estimates),
+            (f"{word}_ratios", ratios, _list_ratios),
+        )
+    ]
 
 
 def explain_differences(ego: str, found: Mapping[str, Any]) -> dict[str, str]:
     """Return sentences by the names that values have as reasons."""
-    printed = found["searches"][PRINTED_SEARCH]
+    printed, naive = found["searches"][PRINTED_SEARCH], found["naive"]
+    whole = bool(naive) and naive[0]["n"] >= PRINTED_TABLES[ego]["draws"]["naive"]
+    beside = "of as many rollouts as theirs: beside other reasons there is chance."
     texts = {
         "thresholds": WHY_OTHER_THRESHOLDS[ego],
-        "scale": _explain_scale(PRINTED_TABLES[ego], found["naive"]),
+        "scale": f"One run of each row with one seed, {beside}"
+        if whole
+        else "One run, with fewer rollouts than theirs; the rows say how many.",
         "search": "Their tables leave out the rollouts of the search; here they are counted.",
         "not run": "These rollouts were not made.",
         "no event": "Too rare for as many rollouts: nothing to compare with.",
@@ -80,199 +63,137 @@ def explain_differences(ego: str, found: Mapping[str, Any]) -> dict[str, str]:
         "underflow": "The standard error is below the smallest number of the machine, for the reason `weights`.",
         "extra": "Not in the paper.",
     }
-    if "sampler" not in printed:
-        return texts
-    sampler = printed["sampler"]
-    texts["weights"] = (
-        "The 404 weights of our drivers have standard deviations of 0.001 to 0.004, so that the paper's box of 0.01 is "
-        f"some of them wide; the mean moved by {sampler['shift']:.3g} of them (Mahalanobis). The likelihood ratio of "
-        f"equation 3 then hardly ever is of any size: its mean over the final draws is {printed['mean_ratio']:.2g}, "
-        "where it should be 1, so p is too small, and its standard error says nothing. The paper's covariance was not "
-        "released; their mean ratio must have been near 1. `starts alone` leaves the weights as they are."
-    )
+    if "sampler" in printed:
+        shift, ratio = f"{printed['sampler']['shift']:.3g}", f"{printed['mean_ratio']:.2g}"
+        texts["weights"] = (
+            "The 404 weights of our drivers have standard deviations of 0.001 to 0.004, so that the paper's box of "
+            f"0.01 is some of them wide; the mean moved by {shift} of them (Mahalanobis). The likelihood ratio of "
+            f"equation 3 then hardly ever is of any size: its mean over the final draws is {ratio}, where it should be "
+            "1, so p is too small, and its standard error says nothing. The paper's covariance was not released; their "
+            "mean ratio must have been near 1. `starts alone` leaves the weights as they are."
+        )
     return texts
 
 
-def _explain_scale(printed: PrintedTable, naive: list[dict[str, Any]]) -> str:
-    """Return what the numbers of rollouts make of a difference."""
-    if naive and naive[0]["n"] >= printed.draws["naive"]:
-        return "One run of each row with one seed, of as many rollouts as theirs: beside other reasons there is chance."
-    return "One run, with fewer rollouts than theirs; the rows say how many."
+def _heads(ego: str, gammas: Sequence[float]) -> list[str]:
+    return [f"{theirs} / {ours}" for theirs, ours in zip(PRINTED_TABLES[ego]["thresholds"], gammas, strict=True)]
 
 
-def _list_estimates(printed: PrintedTable, heads: list[str], found: Mapping[str, Any]) -> list[ComparedValue]:
-    searches = found["searches"]
-    rows: list[tuple[str, str | None, list[dict[str, Any]], tuple[str, ...]]] = [
-        ("naive", "naive", found["naive"], ("thresholds", "scale")),
-        ("naive, equal draws", "naive, equal draws", found["naive_equal"], ("thresholds", "scale")),
-        *(
-            (
-                f"cross-entropy, {name}",
-                "cross-entropy" if name == PRINTED_SEARCH else None,
-                each["estimates"],
-                ("thresholds", "weights", "scale") if each["weights_move"] else ("extra",),
-            )
-            for name, each in searches.items()
-        ),
-    ]
-    values: list[ComparedValue] = []
-    for label, row, estimates, reasons in rows:
-        if row not in printed.rows and not estimates:
-            values.append(_not_run(label))
-            continue
-        values.append(_count_rollouts(label, row, printed, estimates, searches.get(label.partition(", ")[2])))
-        for j, head in enumerate(heads):
-            paper = printed.rows[row][j] if row in printed.rows else (None, None)
-            values += _pair(label, head, paper, estimates[j] if estimates else None, reasons)
+def _list_estimates(ego: str, gammas: Sequence[float], found: Mapping[str, Any]) -> Iterator[Entry]:
+    """Yield rollouts, p and standard error of naive Monte Carlo, of each search and of our default method."""
+    for name in ("naive", "naive, equal draws"):
+        estimates = found["naive" if name == "naive" else "naive_equal"]
+        yield from _row_of_estimates(ego, gammas, name, name, estimates, ("thresholds", "scale"), None)
+    for name, search in found["searches"].items():
+        row = "cross-entropy" if name == PRINTED_SEARCH else ""
+        reasons = ("thresholds", "weights", "scale") if search["weights_move"] else ("extra",)
+        yield from _row_of_estimates(ego, gammas, f"cross-entropy, {name}", row, search["estimates"], reasons, search)
     for own in found["own"]:
-        head = next(each for each in heads if each.endswith(f" {own['gamma']}"))
-        labels = (f"our default method, {own['n_sim']:,} simulations all in", head)
-        values += [
-            ComparedValue(labels=labels, quantity="rollouts", ours_all_in=own["n_sim"], reasons=("extra",)),
-            ComparedValue(
-                labels=labels, quantity="p", ours=own["p"], interval=(own["low"], own["high"]), reasons=("extra",)
-            ),
-            ComparedValue(labels=labels, quantity=_ERROR, ours=own["p"] * own["cov"], reasons=("extra",)),
-        ]
-    return values
+        labels, extra = _label_own(ego, gammas, own), ("extra",)
+        yield compare(labels, "rollouts", ours_all_in=own["n_sim"], reasons=extra)
+        yield compare(labels, "p", ours=own["p"], interval=(own["low"], own["high"]), reasons=extra)
+        yield compare(labels, _ERROR, ours=own["p"] * own["cov"], reasons=extra)
 
 
-def _count_rollouts(
+def _label_own(ego: str, gammas: Sequence[float], own: Mapping[str, Any]) -> tuple[str, str]:
+    head = _heads(ego, gammas)[list(gammas).index(own["gamma"])]
+    return f"our default method, {own['n_sim']:,} simulations all in", head
+
+
+def _row_of_estimates(
+    ego: str,
+    gammas: Sequence[float],
     label: str,
-    row: str | None,
-    printed: PrintedTable,
-    estimates: list[dict[str, Any]],
+    row: str,
+    estimates: Sequence[Mapping[str, Any]],
+    reasons: tuple[str, ...],
     search: Mapping[str, Any] | None,
-) -> ComparedValue:
-    """Return the rollouts of a row, and with those of its search."""
-    theirs = printed.draws.get(row or "")
-    ours = estimates[0]["n"] if estimates else None
-    return ComparedValue(
-        labels=(_label_rollouts(label, ours), "all"),
-        quantity="rollouts",
-        paper=theirs,
+) -> Iterator[Entry]:
+    """Yield the rollouts of a row, and with those of its search, then p and standard error at each threshold."""
+    table = PRINTED_TABLES[ego]
+    if row not in table["rows"] and not estimates:
+        yield compare((f"{label}: not run", "all"), "all", reasons=("not run",))
+        return
+    theirs, ours = table["draws"].get(row), estimates[0]["n"] if estimates else None
+    label = f"{label}, {ours:,} rollouts" if ours else f"{label}: not run"
+    yield compare(
+        (label, "all"),
+        "rollouts",
+        theirs,
         ours=ours,
-        paper_all_in=None if theirs is None else theirs + (printed.search if search else 0),
-        ours_all_in=None if ours is None else ours + (search["search"] if search else 0),
+        paper_all_in=theirs and theirs + (table["search"] if search else 0),
+        ours_all_in=ours and ours + (search["search"] if search else 0),
         reasons=("not run",) if ours is None else ("search", "scale") if search else ("scale",),
     )
-
-
-def _label_rollouts(label: str, n: int | None) -> str:
-    return f"{label}: not run" if n is None else f"{label}, {n:,} rollouts"
-
-
-def _not_run(label: str) -> ComparedValue:
-    """Return the one line of a row that the paper does not have and that was not run."""
-    return ComparedValue(labels=(f"{label}: not run", "all"), quantity="all", reasons=("not run",))
-
-
-def _pair(
-    label: str,
-    head: str,
-    paper: tuple[float | None, float | None],
-    ours: Mapping[str, Any] | None,
-    reasons: tuple[str, ...],
-) -> list[ComparedValue]:
-    """Return an estimate and its standard error."""
-    if ours is None:
-        labels = (_label_rollouts(label, None), head)
-        return [
-            ComparedValue(labels=labels, quantity=quantity, paper=value, reasons=("not run",))
-            for quantity, value in zip(("p", _ERROR), paper, strict=True)
-        ]
-    p, error = ours["p"], ours["standard_error"]
-    around = (max(0.0, p - Z_95 * error), p + Z_95 * error) if error > 0.0 else None
-    interval = ours["interval"] or around
-    labels = (_label_rollouts(label, ours["n"]), head)
-    return [
-        ComparedValue(
-            labels=labels,
-            quantity=f"p ({ours['events']:,} events)",
-            paper=paper[0],
-            ours=p,
-            interval=None if interval is None else tuple(interval),
-            reasons=reasons,
-        ),
-        ComparedValue(labels=labels, quantity=_ERROR, paper=paper[1], ours=error, reasons=reasons),
-    ]
-
-
-def _list_ratios(printed: PrintedTable, heads: list[str], found: Mapping[str, Any]) -> list[ComparedValue]:
-    values: list[ComparedValue] = []
-    for name, each in found["searches"].items():
-        of_paper = name == PRINTED_SEARCH
-        if not of_paper and not each["comparisons"]:
-            values.append(_not_run(f"cross-entropy, {name}"))
+    for j, head in enumerate(_heads(ego, gammas)):
+        p, error = table["rows"][row][j] if row in table["rows"] else (None, None)
+        if not estimates:
+            for quantity, value in (("p", p), (_ERROR, error)):
+                yield compare((label, head), quantity, value, reasons=("not run",))
             continue
-        for j, head in enumerate(heads):
-            ratio = printed.variance_ratio(j) if of_paper else None
-            draws = printed.draws["cross-entropy"]
-            all_in = None if ratio is None else ratio * draws / (draws + printed.search)
-            theirs = (ratio, all_in, printed.errors_off(j) if of_paper else None)
-            known = each["comparisons"][j] if each["comparisons"] else None
-            few = bool(each["estimates"]) and _rests_on_few(each["estimates"][j])
-            values += _ratios_of(f"cross-entropy, {name}", head, theirs, known, each, few)
+        own = estimates[j]
+        half = Z_95 * own["standard_error"]
+        around = (max(0.0, own["p"] - half), own["p"] + half) if half > 0.0 else None
+        interval = own["interval"] or around
+        events = f"p ({own['events']:,} events)"
+        yield compare((label, head), events, p, ours=own["p"], interval=interval, reasons=reasons)
+        yield compare((label, head), _ERROR, error, ours=own["standard_error"], reasons=reasons)
+
+
+def _list_ratios(ego: str, gammas: Sequence[float], found: Mapping[str, Any]) -> Iterator[Entry]:
+    """Yield the ratios of each search at each threshold, and the gain of our default method."""
+    draws, n_search = PRINTED_TABLES[ego]["draws"]["cross-entropy"], PRINTED_TABLES[ego]["search"]
+    for name, search in found["searches"].items():
+        printed, label = name == PRINTED_SEARCH, f"cross-entropy, {name}"
+        if not printed and not search["comparisons"]:
+            yield compare((f"{label}: not run", "all"), "all", reasons=("not run",))
+            continue
+        for j, head in enumerate(_heads(ego, gammas)):
+            theirs: dict[str, float] = {}
+            if printed:
+                ratio = find_variance_ratio(ego, j)
+                theirs = {"variance_ratio": ratio, "all_in": ratio * draws / (draws + n_search)}
+                theirs["errors_off"] = find_errors_off(ego, j)
+            yield from _ratios_of(label, head, theirs, search, j)
     for own in found["own"]:
-        head = next(each for each in heads if each.endswith(f" {own['gamma']}"))
-        values.append(
-            ComparedValue(
-                labels=(f"our default method, {own['n_sim']:,} simulations all in", head),
-                quantity=_VARIANCE_RATIO,
-                ours_all_in=own["gain"],
-                reasons=("extra",) if own["gain"] is not None else ("no event",),
-            )
-        )
-    return values
-
-
-def _rests_on_few(estimate: Mapping[str, Any]) -> bool:
-    """Return whether a few draws make up an estimate."""
-    ess = estimate.get("ess")
-    return ess is not None and ess < FEW_DRAWS * estimate["events"]
+        reasons = ("extra",) if own["gain"] is not None else ("no event",)
+        yield compare(_label_own(ego, gammas, own), _VARIANCE_RATIO, ours_all_in=own["gain"], reasons=reasons)
 
 
 def _ratios_of(
-    label: str,
-    head: str,
-    theirs: tuple[float | None, float | None, float | None],
-    known: Mapping[str, Any] | None,
-    search: Mapping[str, Any],
-    few: bool,
-) -> list[ComparedValue]:
-    """Return the ratios of one search at one threshold; `few` says whether its estimate rests on few draws."""
-    if known is None:
-        labels, missing = (f"{label}: {search['iterations']} of {search['of']} iterations run", head), ("not run",)
-        known = {
-            name: None
-            for name in ("events_ratio", "events_interval", "variance_ratio", "all_in", "error_ratio", "errors_off")
-        }
+    label: str, head: str, theirs: Mapping[str, float], search: Mapping[str, Any], j: int
+) -> Iterator[Entry]:
+    """Yield the ratios of one search at the j-th threshold."""
+    known, why = search["comparisons"][j] if search["comparisons"] else {}, ("thresholds",)
+    if not known:
+        label, missing = f"{label}: {search['iterations']} of {search['of']} iterations run", ("not run",)
     else:  # a standard error of 0 is one below the smallest number
-        labels, missing = (label, head), ("no event",) if known["events_ratio"] is None else ("underflow",)
-    why = ("thresholds", "weights", "scale") if search["weights_move"] and "sampler" in search else ("thresholds",)
-    low = known["errors_off"] is not None and known["errors_off"] < -MISSED_ERRORS
-    why = (*why, "missed") if low and not search["weights_move"] else why
-    of_weights = (*why, "few draws") if few and not search["weights_move"] else why
-    ratio, all_in, off = theirs
-    rows = (
-        ("rare events, sampler / naive, equal draws", (None, None), (known["events_ratio"], None), why),
-        (_VARIANCE_RATIO, (ratio, all_in), (known["variance_ratio"], known["all_in"]), ("search", *of_weights)),
-        (_DISTANCE_RATIO, (None, None), (None, known["error_ratio"]), ("search", *of_weights)),
-        ("p less the naive p, in joint standard errors", (off, None), (known["errors_off"], None), of_weights),
-    )
-    return [
-        ComparedValue(
-            labels=labels,
-            quantity=quantity,
-            paper=paper[0],
-            paper_all_in=paper[1],
-            ours=ours[0],
-            ours_all_in=ours[1],
-            interval=known["events_interval"] if quantity.startswith("rare events") else None,
-            reasons=reasons if any(value is not None for value in ours) else missing,
+        missing = ("no event",) if known["events_ratio"] is None else ("underflow",)
+    of_weights: tuple[str, ...] = why
+    if search["weights_move"]:
+        why = of_weights = ("thresholds", "weights", "scale") if "sampler" in search else why
+    elif known:
+        off, estimate = known["errors_off"], search["estimates"][j] if search["estimates"] else {}
+        few = estimate.get("ess") is not None and estimate["ess"] < FEW_DRAWS * estimate["events"]
+        why = (*why, "missed") if off is not None and off < -MISSED_ERRORS else why
+        of_weights = (*why, "few draws") if few else why
+    for quantity, name, all_in, reasons in (
+        ("rare events, sampler / naive, equal draws", "events_ratio", "", why),
+        (_VARIANCE_RATIO, "variance_ratio", "all_in", ("search", *of_weights)),
+        (_DISTANCE_RATIO, "", "error_ratio", ("search", *of_weights)),
+        ("p less the naive p, in joint standard errors", "errors_off", "", of_weights),
+    ):
+        ours, ours_all_in = known.get(name), known.get(all_in)
+        yield compare(
+            (label, head),
+            quantity,
+            theirs.get(name),
+            paper_all_in=theirs.get(all_in),
+            ours=ours,
+            ours_all_in=ours_all_in,
+            interval=known.get("events_interval") if name == "events_ratio" else None,
+            reasons=reasons if ours is not None or ours_all_in is not None else missing,
         )
-        for quantity, paper, ours, reasons in rows
-    ]
 
 
 POINTS = 16
@@ -281,7 +202,7 @@ _SHOWN_RATIOS = (1e-4, 1e4)
 """Ratios beyond are drawn at the edge: a sample variance of 0 says nothing."""
 
 
-def list_thresholds(gammas: tuple[float, ...]) -> list[float]:
+def list_thresholds(gammas: Sequence[float]) -> list[float]:
     """Return the thresholds of the curves, from the rarest in the table to a tenth beyond its last.
 
     Example:
@@ -292,38 +213,35 @@ def list_thresholds(gammas: tuple[float, ...]) -> list[float]:
     return [round(float(gamma), 4) for gamma in np.linspace(gammas[0], 1.1 * gammas[-1], POINTS)]
 
 
-def describe_figures(ego: str, found: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+def describe_figures(ego: str, found: Mapping[str, Any]) -> dict[str, Entry]:
     """Return the data of both figures of an ego as a record has them."""
     printed = PRINTED_TABLES[ego]
-    word = printed.figure.lower().replace(" ", "")
+    figure = printed["figure"]
     curves = {name: each["curve"] for name, each in found["searches"].items() if each.get("curve")}
     words = (
-        ("a", "number of rare events, sampler / naive Monte Carlo, at equal draws", "events_ratio", printed.events),
-        ("b", "variance, naive Monte Carlo / sampler, at equal draws", "variance_ratio", printed.variance),
+        ("a", "number of rare events, sampler / naive Monte Carlo, at equal draws", "events_ratio", "events"),
+        ("b", "variance, naive Monte Carlo / sampler, at equal draws", "variance_ratio", "variance"),
     )
     return {
-        f"{word}{letter}": {
-            "title": f"{printed.figure}{letter}: {title}",
+        f"{figure.lower().replace(' ', '')}{letter}": {
+            "title": f"{figure}{letter}: {title}",
             "caption": "A curve for each search; without the rollouts of the search, as in the paper."
             + ("" if curves else " Not run yet."),
-            "paper": f"{range_}.",
+            "paper": f"{printed[theirs]}.",
             "axis": title,
             "curves": {
                 name: {"gamma": [p["gamma"] for p in curve], "ratio": [p[key] for p in curve]}
                 for name, curve in curves.items()
             },
         }
-        for letter, title, key, range_ in words
+        for letter, title, key, theirs in words
     }
 
 
-def make_figures(record: Mapping[str, Any]) -> list[DrawnFigure]:
+def make_figures(record: Mapping[str, Any]) -> Drawings:
     """Return the figures of a record, those without curves left out."""
-    return [
-        DrawnFigure(name, partial(draw_ratios, data=data), (7.0, 4.0))
-        for name, data in record["figures"].items()
-        if data["curves"]
-    ]
+    figures = {name: data for name, data in record["figures"].items() if data["curves"]}
+    return {name: (partial(draw_ratios, data=data), (7.0, 4.0)) for name, data in figures.items()}
 
 
 def draw_ratios(figure: Figure, data: Mapping[str, Any]) -> None:

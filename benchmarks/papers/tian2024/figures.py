@@ -10,8 +10,8 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator, StrMethodFormatter
 
-from benchmarks.papers.record import DrawnFigure
-from benchmarks.papers.tian2024.replications import FIGURE7_METHOD, SCENARIO_ROWS, SYSTEMS, ReplicationRun
+from benchmarks.papers.record import Drawings, Entry
+from benchmarks.papers.tian2024.replications import FIGURE7_METHOD, SCENARIO_ROWS, SYSTEMS, Run
 from rare_envs.study.plots import HIT_COLOUR, LINE_COLOUR, ORDINARY_COLOUR
 
 _ROMAN = ("I", "II", "III", "IV", "V", "VI", "VII", "VIII")
@@ -23,18 +23,22 @@ FIGURE8_METHODS = ("SS", "ADSS", "two-stage")
 FIGURE8_LINES = ("MC", "IS")
 
 
-def collect_figures(runs: Sequence[ReplicationRun]) -> dict[str, dict[str, Any]]:
+def collect_figures(runs: Sequence[Run]) -> dict[str, Entry]:
     """Return the data of the figures, with captions, as a record has them."""
-    first = min((run.seed for run in runs), default=0)
+    first = min((run["seed"] for run in runs), default=0)
+    beginning = [run for run in runs if run["seed"] == first]
+    shown = [run for run in runs if (run["scenario"], run["system"]) == ("cut-in", "stack")]
+    subset_runs = [run for run in shown if (run["method"], run["seed"]) == (FIGURE7_METHOD, first)]
+    subsets = [level for run in subset_runs for level in run["level_points"]]
     return {
         "figure6": {
             "title": "Figure 6: collision rates by Monte Carlo.",
             "caption": "Share of collisions over the simulations so far, with its 95 % band, first replication.",
             "paper": "the same of Apollo alone, with 20 % relative half-width at the end.",
             "lines": [
-                {"scenario": run.scenario, "system": run.system, **_line(run)}
-                for run in runs
-                if run.method == "MC" and run.seed == first
+                {"scenario": run["scenario"], "system": run["system"], **_line(run)}
+                for run in beginning
+                if run["method"] == "MC"
             ],
         },
         "figure7": {
@@ -44,7 +48,7 @@ def collect_figures(runs: Sequence[ReplicationRun]) -> dict[str, dict[str, Any]]
                 "axes v1 and v2 [m/s] and dis1y [m]."
             ),
             "paper": "the same axes with Apollo; its text says that v2 increases and dis1x decreases from I to IV.",
-            "levels": _subsets_shown(runs, first),
+            "levels": [[[row[j] for j in _SHOWN_COLUMNS] for row in level] for level in subsets],
         },
         "figure8": {
             "title": "Figure 8: collision rate over simulations in the cut-in.",
@@ -54,56 +58,43 @@ def collect_figures(runs: Sequence[ReplicationRun]) -> dict[str, dict[str, Any]]
             ),
             "paper": "Apollo: about 237,000 simulations of IS, 5,000 of SS and half as many of ADSS.",
             "lines": [
-                {"method": run.method, **_line(run)}
-                for run in runs
-                if _in_figure8(run) and run.method in FIGURE8_LINES and run.seed == first
+                {"method": run["method"], **_line(run)}
+                for run in shown
+                if run["method"] in FIGURE8_LINES and run["seed"] == first
             ],
             "ends": {
-                method: [[run.simulated, run.p] for run in runs if _in_figure8(run) and run.method == method]
+                method: [[run["simulated"], run["p"]] for run in shown if run["method"] == method]
                 for method in FIGURE8_METHODS
             },
         },
     }
 
 
-def draw_figures(figures: Mapping[str, Mapping[str, Any]]) -> list[DrawnFigure]:
+def draw_figures(figures: Mapping[str, Mapping[str, Any]]) -> Drawings:
     """Return the drawings of what `collect_figures` returns; none of a figure without data."""
     rates, subsets, comparison = (figures[f"figure{number}"] for number in (6, 7, 8))
     rows = -(-len(subsets["levels"]) // _PANELS_IN_A_ROW)
-    drawn = []
-    if rates["lines"]:
-        drawn.append(DrawnFigure("figure6", partial(_draw_rates, data=rates), (8.0, 3.2)))
-    if subsets["levels"]:
-        drawn.append(DrawnFigure("figure7", partial(_draw_subsets, data=subsets), (7.2, 3.4 * rows)))
-    if comparison["lines"] or any(comparison["ends"].values()):
-        drawn.append(DrawnFigure("figure8", partial(_draw_comparison, data=comparison), (6.4, 3.8)))
-    return drawn
+    compared = comparison["lines"] or any(comparison["ends"].values())
+    drawings: Drawings = {
+        "figure6": (partial(_draw_rates, data=rates), (8.0, 3.2)),
+        "figure7": (partial(_draw_subsets, levels=subsets["levels"]), (7.2, 3.4 * rows)),
+        "figure8": (partial(_draw_comparison, data=comparison), (6.4, 3.8)),
+    }
+    known = {"figure6": rates["lines"], "figure7": subsets["levels"], "figure8": compared}
+    return {name: drawing for name, drawing in drawings.items() if known[name]}
 
 
-def _line(run: ReplicationRun) -> dict[str, list[float]]:
+def _line(run: Run) -> dict[str, list[float]]:
     """Return the estimates of p on the way, those of other thresholds left out."""
-    reached = [(n, p) for n, p, threshold in run.trace if threshold <= 0.0]
+    reached = [(n, p) for n, p, threshold in run["trace"] if threshold <= 0.0]
     return {"n": [n for n, _ in reached], "p": [p for _, p in reached]}
-
-
-def _in_figure8(run: ReplicationRun) -> bool:
-    return (run.scenario, run.system) == ("cut-in", "stack")
-
-
-def _subsets_shown(runs: Sequence[ReplicationRun], seed: int) -> list[list[list[float]]]:
-    for run in runs:
-        if _in_figure8(run) and run.method == FIGURE7_METHOD and run.seed == seed:
-            return [[[row[j] for j in _SHOWN_COLUMNS] for row in level] for level in run.level_points]
-    return []
 
 
 def _draw_rates(figure: Figure, data: Mapping[str, Any]) -> None:
     panels = figure.subplots(1, len(SCENARIO_ROWS), squeeze=False)[0]
     for axes, scenario in zip(panels, SCENARIO_ROWS, strict=True):
         for system, colour in zip(SYSTEMS, _COLOURS, strict=False):
-            for line in data["lines"]:
-                if (line["scenario"], line["system"]) != (scenario, system):
-                    continue
+            for line in (each for each in data["lines"] if (each["scenario"], each["system"]) == (scenario, system)):
                 n, p = np.array(line["n"]), np.array(line["p"])
                 half = 1.96 * np.sqrt(p * (1.0 - p) / n)
                 axes.plot(n, p, color=colour, label=system)
@@ -117,8 +108,7 @@ def _draw_rates(figure: Figure, data: Mapping[str, Any]) -> None:
         axes.legend(frameon=False, fontsize=8)
 
 
-def _draw_subsets(figure: Figure, data: Mapping[str, Any]) -> None:
-    levels = data["levels"]
+def _draw_subsets(figure: Figure, levels: Sequence[Sequence[Sequence[float]]]) -> None:
     rows = -(-len(levels) // _PANELS_IN_A_ROW)
     everything = np.array([row for level in levels for row in level])
     low, high = everything.min(axis=0), everything.max(axis=0)

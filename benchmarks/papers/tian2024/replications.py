@@ -2,24 +2,27 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, field
 from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.samplers.runs import SeededEstimate, use_one_core
+from benchmarks.samplers.runs import use_one_core
 from rare_envs.problem import DrivingProblem
-from samplers.estimation import estimate
-from samplers.method import Stepping, whole_simulations
-from samplers.methods.cross_entropy import CrossEntropy
-from samplers.methods.importance_sampling import ImportanceSampling
-from samplers.methods.improved_cross_entropy import ImprovedCrossEntropy
-from samplers.methods.monte_carlo import MonteCarlo
-from samplers.methods.subset import AdaptiveSubsetSimulation, SubsetSimulation
-from samplers.methods.two_stage.method import TwoStage
-from samplers.result import Estimate
+from samplers import (
+    AdaptiveSubsetSimulation,
+    CrossEntropy,
+    Estimate,
+    ImportanceSampling,
+    ImprovedCrossEntropy,
+    MonteCarlo,
+    Stepping,
+    SubsetSimulation,
+    TwoStage,
+    estimate,
+)
+from samplers.method import whole_simulations
 
 TRAFFIC_BASE = "highway"
 """Base distribution: assembled from published statistics of German motorways; the paper's mixtures are not public."""
@@ -84,7 +87,8 @@ METHOD_ROWS = {
 """The paper's methods with its settings, then ours."""
 Key = tuple[str, str, str]
 """Scenario, system and method."""
-Levels = tuple[tuple[float, ...], ...]
+Run = dict[str, Any]
+"""A replication as a line of the file has it: `ROW_COLUMNS`, `RUN_COLUMNS` and `FURTHER_COLUMNS`."""
 
 
 class ReplicationJob(NamedTuple):
@@ -98,45 +102,26 @@ class ReplicationJob(NamedTuple):
     """Whether points of the levels are kept, for Figure 7."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class ReplicationRun(SeededEstimate):
-    """What came of it."""
-
-    scenario: str
-    system: str
-    n_sim: int
-    """Simulations that the method states."""
-    simulated: int
-    """All simulations that were made, counted outside the method."""
-    final: int
-    """Those behind the estimate: without the search of importance sampling and cross-entropy."""
-    levels: int
-    """Levels, iterations or batches."""
-    warnings: tuple[str, ...]
-    trace: tuple[tuple[int, float, float], ...]
-    """Simulations so far, estimate and threshold on the way."""
-    level_means: Levels = ()
-    """Subset simulation: means of the parameters among the points of each level that are in its subset."""
-    level_points: tuple[Levels, ...] = field(default=())
-    """Subset simulation: some of these points, in the order of the scenario's parameters."""
-
-    to_line = asdict
-
-    @classmethod
-    def from_line(cls, content: dict[str, Any]) -> ReplicationRun:
-        """Return the run of a line."""
-        trace = tuple((int(n), float(p), float(level)) for n, p, level in content["trace"])
-        nested = {name: _as_tuples(content[name]) for name in ("level_means", "level_points")}
-        return cls(**{**content, **nested, "trace": trace, "warnings": tuple(content["warnings"])})
-
-    @property
-    def row(self) -> Key:
-        """Where the run stands in the tables."""
-        return self.scenario, self.system, self.method
+RUN_COLUMNS = ("seed", "p", "low", "high", "cov", "n_sim", "simulated", "final", "levels")
+"""Figures of a run: seed, estimate and interval; simulations that the method states, all that were made, counted
+outside the method, and those behind the estimate (without a search); levels, iterations or batches."""
+ROW_COLUMNS = ("scenario", "system", "method")
+"""Where a run stands in the tables."""
+FURTHER_COLUMNS = ("warnings", "trace", "level_means", "level_points")
+"""Texts; simulations so far, estimate and threshold on the way; of subset simulation, means of the parameters among the
+points of each level that are in its subset, and some of these points."""
 
 
-def _as_tuples(value: Any) -> Any:
-    return tuple(_as_tuples(each) for each in value) if isinstance(value, list | tuple) else value
+def read_run(content: dict[str, Any]) -> Run:
+    """Return the run of a line; a ValueError if it is of something else."""
+    if content.keys() != {*ROW_COLUMNS, *RUN_COLUMNS, *FURTHER_COLUMNS}:
+        raise ValueError(f"It has {', '.join(content)}.")
+    return content
+
+
+def row_of(run: Run) -> Key:
+    """Return where a run stands in the tables."""
+    return run["scenario"], run["system"], run["method"]
 
 
 class CountedSimulations:
@@ -176,7 +161,7 @@ def driving_problem(scenario: str, system: str) -> DrivingProblem:
     )
 
 
-def run_replication(job: ReplicationJob) -> ReplicationRun:
+def run_replication(job: ReplicationJob) -> Run:
     """Make one replication."""
     row = METHOD_ROWS[job.method]
     problem = CountedSimulations(driving_problem(job.scenario, job.system))
@@ -190,25 +175,25 @@ def run_replication(job: ReplicationJob) -> ReplicationRun:
             keep_points=job.points,
             ensemble_run=False,
         )
-    means, points = _subsets(result, len(problem.problem.world.scenario.parameters)) if job.points else ((), ())
-    return ReplicationRun(
-        scenario=job.scenario,
-        system=job.system,
-        method=job.method,
-        seed=job.seed,
-        p=result.p,
-        low=result.interval[0],
-        high=result.interval[1],
-        cov=result.cov,
-        n_sim=result.n_sim,
-        simulated=problem.simulated,
-        final=_count_final(result),
-        levels=len(result.trace),
-        warnings=result.warnings,
-        trace=_thin_trace(result),
-        level_means=means,
-        level_points=points,
-    )
+    means, points = _subsets(result, len(problem.problem.world.scenario.parameters)) if job.points else ([], [])
+    return {
+        "scenario": job.scenario,
+        "system": job.system,
+        "method": job.method,
+        "seed": job.seed,
+        "p": result.p,
+        "low": result.interval[0],
+        "high": result.interval[1],
+        "cov": result.cov,
+        "n_sim": result.n_sim,
+        "simulated": problem.simulated,
+        "final": _count_final(result),
+        "levels": len(result.trace),
+        "warnings": list(result.warnings),
+        "trace": _thin_trace(result),
+        "level_means": means,
+        "level_points": points,
+    }
 
 
 def _count_final(result: Estimate) -> int:
@@ -219,15 +204,15 @@ def _count_final(result: Estimate) -> int:
     return sum(len(part.log_weights) for part in weighted) or result.n_sim
 
 
-def _thin_trace(result: Estimate) -> tuple[tuple[int, float, float], ...]:
+def _thin_trace(result: Estimate) -> list[list[float]]:
     """Return simulations so far, estimate and threshold after some levels, the last included."""
     spent = np.cumsum([level.n_sim for level in result.trace])
     step = max(1, -(-len(spent) // MOST_TRACE_POINTS))
     chosen = sorted({*range(0, len(spent), step), len(spent) - 1}) if len(spent) else []
-    return tuple((int(spent[k]), result.trace[k].estimate, result.trace[k].gamma) for k in chosen)
+    return [[int(spent[k]), result.trace[k].estimate, result.trace[k].gamma] for k in chosen]
 
 
-def _subsets(result: Estimate, dim: int) -> tuple[Levels, tuple[Levels, ...]]:
+def _subsets(result: Estimate, dim: int) -> tuple[list[list[float]], list[list[list[float]]]]:
     """Return, of the points that each level of subset simulation found in its subset, the means and some of them.
 
     `dim` is the number of parameters that are not noise, the first of x.
@@ -237,5 +222,5 @@ def _subsets(result: Estimate, dim: int) -> tuple[Levels, tuple[Levels, ...]]:
     stage = result.describe_simulations(0, result.n_sim).stage
     bounds = [np.inf, *(level.gamma for level in result.trace[:-1])]
     subsets = [x[(stage == level) & (f <= bound)] for level, bound in enumerate(bounds)]
-    means = tuple(tuple(subset.mean(axis=0).tolist()) for subset in subsets if len(subset))
-    return means, _as_tuples([np.round(subset[:SHOWN_POINTS], 3).tolist() for subset in subsets])
+    means = [subset.mean(axis=0).tolist() for subset in subsets if len(subset)]
+    return means, [np.round(subset[:SHOWN_POINTS], 3).tolist() for subset in subsets]

@@ -17,15 +17,19 @@ from benchmarks.papers.tian2024.replications import (
     FIGURE7_METHOD,
     METHOD_ROWS,
     POINTS_OF_A_LEVEL,
+    ROW_COLUMNS,
+    RUN_COLUMNS,
     SCENARIO_ROWS,
     SYSTEMS,
     TRAFFIC_BASE,
+    Key,
     ReplicationJob,
-    ReplicationRun,
+    Run,
+    read_run,
+    row_of,
     run_replication,
 )
-from benchmarks.papers.tian2024.summary import assess_claims, group_runs
-from benchmarks.papers.tian2024.tables import make_method_tables
+from benchmarks.papers.tian2024.summary import assess_claims, make_method_tables
 from benchmarks.run_lines import RunLines
 from benchmarks.samplers.runs import map_jobs
 
@@ -104,19 +108,19 @@ def reproduce_tian2024(
     return record
 
 
-def open_replications(out: Path, plan: TianPlan) -> RunLines[ReplicationJob, ReplicationRun]:
+def open_replications(out: Path, plan: TianPlan) -> RunLines[ReplicationJob, Run]:
     """Return the replications of a folder."""
     return RunLines(
         out / REPLICATIONS_FILE,
         {"study": plan.identity, "rare_envs": rare_envs.__version__},
-        ReplicationRun.from_line,
-        ReplicationRun.to_line,
+        read_run,
+        dict,
         key_of_job=lambda job: job[:4],
-        key_of_run=lambda run: (*run.row, run.seed),
+        key_of_run=lambda run: (*row_of(run), run["seed"]),
     )
 
 
-def record_replications(plan: TianPlan, runs: Sequence[ReplicationRun], command: str) -> dict[str, Any]:
+def record_replications(plan: TianPlan, runs: Sequence[Run], command: str) -> dict[str, Any]:
     """Return the record of some replications."""
     return make_record(
         title="Tian et al. 2024: adaptive subset simulation",
@@ -157,17 +161,16 @@ def _describe_setting(plan: TianPlan) -> list[str]:
     ]
 
 
-RUN_COLUMNS = ("seed", "p", "low", "high", "cov", "n_sim", "simulated", "final", "levels")
-"""Of the single runs in the record."""
-
-
-def _list_runs(runs: Sequence[ReplicationRun]) -> list[dict[str, Any]]:
+def _list_runs(runs: Sequence[Run]) -> list[dict[str, Any]]:
     """Return the runs of each method on each system in each scenario, a list for each of their figures."""
+    groups: dict[Key, list[Run]] = {}
+    for run in runs:
+        groups.setdefault(row_of(run), []).append(run)
     return [
         {
-            **dict(zip(("scenario", "system", "method"), key, strict=True)),
-            **{name: [getattr(run, name) for run in group] for name in RUN_COLUMNS},
-            "warnings": [len(run.warnings) for run in group],
+            **dict(zip(ROW_COLUMNS, key, strict=True)),
+            **{name: [run[name] for run in group] for name in RUN_COLUMNS},
+            "warnings": [len(run["warnings"]) for run in group],
         }
-        for key, group in group_runs(runs).items()
+        for key, group in groups.items()
     ]

@@ -1,187 +1,217 @@
-"""Figures over the replications of a method, with intervals, and what they say of the paper's statements."""
+"""Figures over the replications of each method, with intervals; Tables II and III, and the paper's statements."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
 from itertools import groupby
+from typing import Any
 
 import numpy as np
+import pandas as pd
 from scipy import stats
 
-from benchmarks.papers.record import Finding
-from benchmarks.papers.tian2024.replications import FIGURE7_METHOD, Key, ReplicationRun
+from benchmarks.papers.record import Entry, compare, find, make_table
+from benchmarks.papers.tian2024.printed import EXPLANATIONS, MOST_HALF_WIDTH_DRAWS, PRINTED, RELEASED, PrintedRow
+from benchmarks.papers.tian2024.replications import (
+    ADSS_SIMULATIONS,
+    FIGURE7_METHOD,
+    METHOD_ROWS,
+    POINTS_OF_A_LEVEL,
+    ROW_COLUMNS,
+    SCENARIO_ROWS,
+    SYSTEMS,
+    Key,
+    Run,
+)
 
 INTERVAL_CONFIDENCE = 0.95
 _UPPER = 0.5 + INTERVAL_CONFIDENCE / 2
 _LOWER = 0.5 - INTERVAL_CONFIDENCE / 2
 Ends = tuple[float, float]
+Summaries = pd.DataFrame
+"""A row for each scenario, system and method, see `derive`."""
 
 
-@dataclass(frozen=True)
-class ReplicationSummary:
-    """A method on a system in a scenario, over its replications.
+def summarise_runs(runs: Sequence[Run]) -> Summaries:
+    """Return figures over the replications of each method; the truth of a system is p by its Monte Carlo."""
+    frame = pd.DataFrame(runs, columns=[*ROW_COLUMNS, "p", "final", "simulated", "levels"])
+    groups = frame.groupby(list(ROW_COLUMNS), sort=False)
+    found = groups["p"].agg(replications="size", mean="mean", spread="std")
+    found[["simulations", "all_simulations", "levels"]] = groups[["final", "simulated", "levels"]].mean()
+    truths = {key[:2]: mean for key, mean in found["mean"].items() if key[2] == "MC"}
+    found["truth"] = [truths.get(key[:2], mean) for key, mean in found["mean"].items()]
+    return derive(found)
 
-    Example:
-        >>> summary = ReplicationSummary.of_estimates([1e-4, 3e-4, 2e-4, 2e-4], simulations=1000.0)
-        >>> f"{summary.mean:.1e}", round(summary.cov, 3), round(summary.squared_cov, 3)
-        ('2.0e-04', 0.408, 0.167)
+
+def derive(found: pd.DataFrame) -> Summaries:
+    """Return summaries with what follows from them.
+
+    Given are replications, mean and spread (standard deviation) of the estimates of p; simulations (mean number as the
+    paper counts them, without the search of importance sampling) and all_simulations (counted outside the method); and
+    truth (p by Monte Carlo; its own error is left out).
+
+    Added are cov, the spread over the mean; squared_cov, what the paper prints as COV; error, the mean over the truth,
+    less 1; work, all simulations times the mean square error over p², less is better; gain, the variance of plain Monte
+    Carlo with as many simulations, search included, over the mean square error (the c.o.v. alone would praise a method
+    that misses most of p in all of its runs); and intervals: of the mean by Student's distribution, of c.o.v. and gain
+    by the chi-square distribution of the variance and the mean square error of normal estimates.
     """
-
-    replications: int
-    mean: float
-    """Of the estimates of p."""
-    cov: float
-    """Standard deviation of the estimates over their mean; NaN where all are 0."""
-    simulations: float
-    """Mean number of simulations as the paper counts them: without the search of importance sampling."""
-    all_simulations: float
-    """Mean number of all simulations, counted outside the method."""
-    truth: float
-    """p by Monte Carlo; its own error is left out."""
-
-    @classmethod
-    def of_estimates(
-        cls, p: Sequence[float], simulations: float, all_simulations: float | None = None, truth: float | None = None
-    ) -> ReplicationSummary:
-        """Return the summary of two estimates or more; p is their mean where no truth is given."""
-        if len(p) < 2:
-            raise ValueError(f"Expected 2 replications at least, got {len(p)}.")
-        mean, spread = float(np.mean(p)), float(np.std(p, ddof=1))
-        all_simulations = simulations if all_simulations is None else all_simulations
-        cov = spread / mean if mean > 0 else math.nan
-        return cls(len(p), mean, cov, simulations, all_simulations, mean if truth is None else truth)
-
-    @property
-    def squared_cov(self) -> float:
-        """What the paper prints as COV."""
-        return self.cov**2
-
-    @property
-    def mean_interval(self) -> Ends:
-        """Interval of the mean by Student's distribution."""
-        half = float(stats.t.ppf(_UPPER, self.replications - 1)) * self.cov * self.mean / self.replications**0.5
-        return max(self.mean - half, 0.0), self.mean + half
-
-    @property
-    def cov_interval(self) -> Ends:
-        """Interval of the c.o.v. by the chi-square distribution of the variance of normal estimates."""
-        df = self.replications - 1
-        low, high = (float(stats.chi2.ppf(share, df)) for share in (_UPPER, _LOWER))
-        return self.cov * (df / low) ** 0.5, self.cov * (df / high) ** 0.5
-
-    @property
-    def squared_cov_interval(self) -> Ends:
-        """Square of `cov_interval`."""
-        low, high = self.cov_interval
-        return low**2, high**2
-
-    @property
-    def error(self) -> float:
-        """Mean of the estimates over p by Monte Carlo, less 1."""
-        return self.mean / self.truth - 1.0
-
-    @property
-    def work(self) -> float:
-        """All simulations times the mean square error over p², p by Monte Carlo; less is better."""
-        spread = 0.0 if self.mean == 0.0 else (self.cov * self.mean / self.truth) ** 2
-        return self.all_simulations * (spread + self.error**2)
-
-    @property
-    def gain(self) -> float:
-        """Variance of plain Monte Carlo with as many simulations, search included, over the mean square error.
-
-        The c.o.v. alone would praise a method that misses most of p in all of its runs.
-        """
-        work = self.truth * self.work
-        return (1.0 - self.truth) / work if work > 0 else math.nan
-
-    @property
-    def gain_interval(self) -> Ends:
-        """Interval of the gain by the chi-square distribution of the mean square error of normal estimates."""
-        df = self.replications - 1
-        low, high = (float(stats.chi2.ppf(share, df)) for share in (_LOWER, _UPPER))
-        return self.gain * low / df, self.gain * high / df
+    found = found.copy()
+    df = found["replications"] - 1
+    low, high = (stats.chi2.ppf(share, df) for share in (_LOWER, _UPPER))
+    half = stats.t.ppf(_UPPER, df) * found["spread"] / found["replications"] ** 0.5
+    found["mean_low"], found["mean_high"] = np.maximum(found["mean"] - half, 0.0), found["mean"] + half
+    found["cov"] = found["spread"] / found["mean"]
+    found["cov_low"], found["cov_high"] = found["cov"] * (df / high) ** 0.5, found["cov"] * (df / low) ** 0.5
+    for name in ("cov", "cov_low", "cov_high"):
+        found[f"squared_{name}"] = found[name] ** 2
+    found["error"] = found["mean"] / found["truth"] - 1.0
+    found["work"] = found["all_simulations"] * ((found["spread"] / found["truth"]) ** 2 + found["error"] ** 2)
+    found["gain"] = (1.0 - found["truth"]) / (found["truth"] * found["work"]).replace(0.0, np.nan)
+    found["gain_low"], found["gain_high"] = found["gain"] * low / df, found["gain"] * high / df
+    return found
 
 
-Summaries = Mapping[Key, ReplicationSummary]
+def ends_of(ours: pd.Series, name: str) -> Ends:
+    """Return the interval of a figure."""
+    return float(ours[f"{name}_low"]), float(ours[f"{name}_high"])
 
 
-def group_runs(runs: Iterable[ReplicationRun]) -> dict[Key, list[ReplicationRun]]:
-    """Return the runs by scenario, system and method."""
-    groups: dict[Key, list[ReplicationRun]] = {}
-    for run in runs:
-        groups.setdefault(run.row, []).append(run)
-    return groups
-
-
-def summarise_runs(runs: Iterable[ReplicationRun]) -> dict[Key, ReplicationSummary]:
-    """Return the summaries by scenario, system and method; the truth of a system is its Monte Carlo."""
-    groups = group_runs(runs)
-    truths = {key[:2]: float(np.mean([run.p for run in group])) for key, group in groups.items() if key[2] == "MC"}
-    return {
-        key: ReplicationSummary.of_estimates(
-            [run.p for run in group],
-            float(np.mean([run.final for run in group])),
-            float(np.mean([run.simulated for run in group])),
-            truths.get(key[:2]),
-        )
-        for key, group in groups.items()
-    }
-
-
-def ratio_of_work(one: ReplicationSummary, other: ReplicationSummary) -> tuple[float, Ends]:
-    """Return the work of one method over that of another, and its interval by the F distribution of two variances.
-
-    Example:
-        >>> noisy = ReplicationSummary(20, 1e-4, 0.4, 2000.0, 2000.0, truth=1e-4)
-        >>> exact = ReplicationSummary(20, 1e-4, 0.2, 1000.0, 1000.0, truth=1e-4)
-        >>> ratio, (low, high) = ratio_of_work(noisy, exact)
-        >>> round(ratio, 3), round(low, 2), round(high, 1)
-        (8.0, 3.17, 20.2)
-    """
-    ratio = one.work / other.work
-    df = one.replications - 1, other.replications - 1
+def ratio_of_work(one: pd.Series, other: pd.Series) -> tuple[float, Ends]:
+    """Return the work of one method over that of another, and its interval by the F distribution of two variances."""
+    ratio = float(one["work"] / other["work"])
+    df = one["replications"] - 1, other["replications"] - 1
     low, high = (float(stats.f.ppf(share, *df)) for share in (_UPPER, _LOWER))
     return ratio, (ratio / low, ratio / high)
 
 
-def assess_claims(runs: Sequence[ReplicationRun]) -> list[Finding]:
+SYSTEM_LABELS = {"IDM": "IDM", "stack": "stack (paper: Apollo)"}
+MEASURED = {
+    "mean of p": "mean",
+    "error of the mean": "error",
+    "c.o.v.": "cov",
+    "square of the c.o.v.": "squared_cov",
+    "simulations of the estimate": "simulations",
+    "all simulations": "all_simulations",
+    "gain over plain Monte Carlo": "gain",
+    "gain, from": "gain_low",
+    "to": "gain_high",
+}
+"""Columns of the summaries of methods that the paper does not have, by their heads."""
+
+
+def make_method_tables(runs: Sequence[Run]) -> list[Entry]:
+    """Return Tables II and III, as far as there are runs; Monte Carlo is among them wherever another method is."""
+    found = summarise_runs(runs)
+    tables = []
+    for scenario, row in SCENARIO_ROWS.items():
+        keys = [
+            key for system in SYSTEMS for method in METHOD_ROWS if (key := (scenario, system, method)) in found.index
+        ]
+        if not keys:
+            continue
+        own = [key for key in keys if not METHOD_ROWS[key[2]].paper]
+        table = make_table(
+            row.table,
+            row.title,
+            ("method", "system under test"),
+            [value for key in keys if key not in own for value in _compare(key, found.loc[key])],
+            EXPLANATIONS,
+            measured=[_measure(key, found.loc[key]) for key in own],
+            measured_title=f"Our methods with {ADSS_SIMULATIONS:,} simulations, and ADSS in its other reading",
+        )
+        tables.append(table)
+    return tables
+
+
+def _compare(key: Key, ours: pd.Series) -> Iterator[Entry]:
+    """Yield the numbers of a method that the paper has beside ours."""
+    scenario, system, method = key
+    paper = METHOD_ROWS[method].paper
+    printed = PRINTED.get((scenario, system, paper), PrintedRow())
+    stacked = ("system",) if system == "stack" else ()
+    off = ("weights", "chance") if paper == "IS" else ("chance", *stacked)
+    spread = {"IS": ("squared", "weights"), "MCS": ("squared", "chance")}.get(
+        paper, ("squared", "settings", "limit state", *stacked)
+    )
+    cost = {"IS": ("weights",), "MCS": ("stop rule", "traffic")}.get(paper, ("traffic", "settings"))
+    rows: tuple[tuple[str, str, float | None, tuple[str, ...], Entry], ...] = (
+        ("mean", "mean of p", printed.p, ("traffic", *stacked), {"released": RELEASED[paper]}),
+        ("error", "error of the mean against Monte Carlo", printed.error, off, {}),
+        ("cov", "c.o.v. of p", printed.cov, spread, {}),
+        ("squared_cov", 'square of the c.o.v. (printed as "COV")', printed.squared_cov, spread, {}),
+        (
+            "simulations",
+            "simulations, as the paper counts",
+            printed.n_sim,
+            (*cost, "counting"),
+            {"released": _released_cost(paper, printed.p, ours), "ours_all_in": float(ours["all_simulations"])},
+        ),
+        ("gain", "gain over plain Monte Carlo", printed.gain, (*cost, "counting"), {}),
+    )
+    for name, quantity, theirs, reasons, further in rows:
+        if paper == "MCS" and name == "error":
+            continue  # it is compared with itself
+        yield compare(
+            ("Monte Carlo" if paper == "MCS" else paper, SYSTEM_LABELS[system]),
+            quantity,
+            theirs,
+            ours=_finite(abs(ours[name])),
+            interval=ends_of(ours, name) if f"{name}_low" in ours and math.isfinite(ours[name]) else None,
+            reasons=(*reasons, "text") if scenario == "cut-in" and theirs is not None else reasons,
+            **further,
+        )
+
+
+def _released_cost(paper: str, p: float | None, ours: pd.Series) -> str:
+    """Return the simulations that the released code would make, in words."""
+    if paper == "MCS":
+        rule = [f"{MOST_HALF_WIDTH_DRAWS * (1 - each) / each:,.0f}" for each in (p, ours["mean"]) if each]
+        return f"the rule gives {rule[0]} for the printed p, {rule[-1]} for ours" if p else f"the rule gives {rule[-1]}"
+    levels = POINTS_OF_A_LEVEL * ours["levels"]
+    return {
+        "SS": f"N in every level: {levels:,.0f} for the same levels",
+        "ADSS": f"N in every level and once more at the end: {levels + POINTS_OF_A_LEVEL:,.0f} for the same levels",
+    }.get(paper, "")
+
+
+def _measure(key: Key, ours: pd.Series) -> Entry:
+    """Return the figures of a method that the paper does not have."""
+    values = {head: abs(ours[name]) if name == "error" else ours[name] for head, name in MEASURED.items()}
+    return {"labels": (key[2], SYSTEM_LABELS[key[1]]), "values": {head: _finite(v) for head, v in values.items()}}
+
+
+def _finite(value: Any) -> float | None:
+    return float(value) if math.isfinite(value) else None
+
+
+def assess_claims(runs: Sequence[Run]) -> list[Entry]:
     """Return the paper's statements with what the replications say about them, as far as there are runs."""
     found = summarise_runs(runs)
     return [*_efficiency(found, "SS"), *_efficiency(found, "IS"), *_accuracy(found), *_moves(runs)]
 
 
-def _efficiency(found: Summaries, other: str) -> Iterator[Finding]:
-    for scenario, system, method in found:
-        if method == "ADSS" and (scenario, system, other) in found:
-            ratio, ends = ratio_of_work(found[scenario, system, other], found[scenario, system, "ADSS"])
-            yield Finding(
-                claim=f"ADSS needs fewer simulations than {other} ({scenario}, {system})",
-                statistic=f"all simulations times mean square error of {other} over that of ADSS",
-                value=ratio,
-                interval=ends,
-                verdict=_judge(ends, 1.0),
-            )
+def _efficiency(found: Summaries, other: str) -> Iterator[Entry]:
+    for scenario, system, method in found.index:
+        if method == "ADSS" and (scenario, system, other) in found.index:
+            ratio, ends = ratio_of_work(found.loc[scenario, system, other], found.loc[scenario, system, "ADSS"])
+            claim = f"ADSS needs fewer simulations than {other} ({scenario}, {system})"
+            statistic = f"all simulations times mean square error of {other} over that of ADSS"
+            yield find(claim, statistic, _judge(ends, 1.0), ratio, ends)
 
 
-def _accuracy(found: Summaries) -> Iterator[Finding]:
-    for (scenario, system, method), ours in found.items():
-        if method != "IS" or (scenario, system, "MC") not in found:
+def _accuracy(found: Summaries) -> Iterator[Entry]:
+    for scenario, system, method in found.index:
+        if method != "IS" or (scenario, system, "MC") not in found.index:
             continue
-        truth = found[scenario, system, "MC"]
-        ratio = 1.0 + ours.error
-        error = ratio * (ours.cov**2 / ours.replications + truth.cov**2 / truth.replications) ** 0.5
-        half = float(stats.t.ppf(_UPPER, ours.replications - 1)) * error
-        ends = ratio - half, ratio + half
-        yield Finding(
-            claim=f"IS is off by 2 to 17 % ({scenario}, {system})",
-            statistic="mean of p by IS over that by Monte Carlo",
-            value=ratio,
-            interval=ends,
-            verdict="no error to be seen" if ends[0] <= 1.0 <= ends[1] else f"off by {100 * (ratio - 1):+.0f} %",
-        )
+        ours, truth = found.loc[scenario, system, "IS"], found.loc[scenario, system, "MC"]
+        ratio = 1.0 + float(ours["error"])
+        error = ratio * (ours["cov"] ** 2 / ours["replications"] + truth["cov"] ** 2 / truth["replications"]) ** 0.5
+        ends = _around(ratio, float(error), int(ours["replications"]))
+        verdict = "no error to be seen" if ends[0] <= 1.0 <= ends[1] else f"off by {100 * (ratio - 1):+.0f} %"
+        claim = f"IS is off by 2 to 17 % ({scenario}, {system})"
+        yield find(claim, "mean of p by IS over that by Monte Carlo", verdict, ratio, ends)
 
 
 _MOVES = (
@@ -191,25 +221,24 @@ _MOVES = (
 """Columns of the cut-in, the signs of their moves, the paper's statements and units."""
 
 
-def _moves(runs: Sequence[ReplicationRun]) -> Iterator[Finding]:
-    for system, group in groupby(sorted(runs, key=lambda run: run.system), lambda run: run.system):
-        means = [
-            run.level_means
-            for run in group
-            if (run.scenario, run.method) == ("cut-in", FIGURE7_METHOD) and len(run.level_means) > 1
-        ]
-        for column, sign, claim, unit in _MOVES if len(means) > 1 else ():
-            moved = np.array([levels[-1][column] - levels[0][column] for levels in means])
-            error = moved.std(ddof=1) / len(moved) ** 0.5
-            half = float(stats.t.ppf(_UPPER, len(moved) - 1)) * error
-            ends = float(moved.mean() - half), float(moved.mean() + half)
-            yield Finding(
-                claim=f"{claim} (cut-in, {system})",
-                statistic=f"mean in the last subset less that in the first [{unit}]",
-                value=float(moved.mean()),
-                interval=ends,
-                verdict=_judge(ends if sign > 0 else (-ends[1], -ends[0]), 0.0),
-            )
+def _moves(runs: Sequence[Run]) -> Iterator[Entry]:
+    shown = [run for run in runs if (run["scenario"], run["method"]) == ("cut-in", FIGURE7_METHOD)]
+    shown = [run for run in shown if len(run["level_means"]) > 1]
+    for system, group in groupby(sorted(shown, key=lambda run: run["system"]), lambda run: run["system"]):
+        moves = np.array([np.subtract(run["level_means"][-1], run["level_means"][0]) for run in group])
+        for column, sign, claim, unit in _MOVES if len(moves) > 1 else ():
+            moved = moves[:, column]
+            mean, error = float(moved.mean()), float(moved.std(ddof=1)) / len(moved) ** 0.5
+            ends = _around(mean, error, len(moved))
+            verdict = _judge(ends if sign > 0 else (-ends[1], -ends[0]), 0.0)
+            statistic = f"mean in the last subset less that in the first [{unit}]"
+            yield find(f"{claim} (cut-in, {system})", statistic, verdict, mean, ends)
+
+
+def _around(mean: float, error: float, n: int) -> Ends:
+    """Return the interval of a mean of n values with a standard error, by Student's distribution."""
+    half = float(stats.t.ppf(_UPPER, n - 1)) * error
+    return mean - half, mean + half
 
 
 def _judge(ends: Ends, bound: float) -> str:

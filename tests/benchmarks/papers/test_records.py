@@ -14,21 +14,20 @@ from benchmarks.papers import renew
 from benchmarks.papers.__main__ import main
 from benchmarks.papers.okelly2018.study import HighwayStudy
 from benchmarks.papers.record import (
-    ComparedValue,
-    ComparisonTable,
-    DrawnFigure,
-    Finding,
     check_folder,
+    compare,
     discard_runs,
+    find,
     format_record,
     make_record,
+    make_table,
     write_record,
 )
 from benchmarks.papers.renew import read_records, read_replications, renew_okelly, renew_tian
 from benchmarks.papers.tian2024 import study
-from benchmarks.papers.tian2024.replications import ReplicationJob, run_replication
+from benchmarks.papers.tian2024.replications import ReplicationJob, row_of, run_replication
 from benchmarks.papers.tian2024.study import TianPlan
-from benchmarks.papers.tian2024.tables import make_method_tables
+from benchmarks.papers.tian2024.summary import make_method_tables
 from rare_envs.startup import use_one_thread
 from rare_envs.study.arguments import BadInput
 from samplers.output import to_json_value
@@ -157,27 +156,21 @@ def test_runs_of_another_paper_are_not_deleted(tmp_path: Path) -> None:
 
 
 def record_by_hand() -> dict[str, Any]:
-    p = ComparedValue(labels=("SS", "IDM"), quantity="mean of p", paper=8e-4, ours=6e-4, reasons=("traffic",))
-    cost = ComparedValue(
-        labels=("SS", "IDM"), quantity="simulations", ours=4980, interval=(4900.0, 5100.0), ours_all_in=5500
-    )
-    other = ComparedValue(labels=("MC", "IDM"), quantity="mean of p", paper=8.36e-4, released="does <not> run")
+    row = ("SS", "IDM")
+    values = [
+        compare(row, "mean of p", 8e-4, ours=6e-4, reasons=("traffic",)),
+        compare(row, "simulations", ours=4980, interval=(4900.0, 5100.0), ours_all_in=5500),
+        compare(("MC", "IDM"), "mean of p", 8.36e-4, released="does <not> run"),
+    ]
+    explanations = {"traffic": "Other roads, see `maps`.", "maps": "None.", "chance": "Unused."}
     return make_record(
         title="A paper",
         source="Somebody, 2024.",
         command="python -m benchmarks.papers paper",
         settings={"scale": "small", "seed": 3},
-        tables=[
-            ComparisonTable(
-                name="table9",
-                title="Table IX: a table.",
-                keys=("method", "system"),
-                values=(p, cost, other),
-                explanations={"traffic": "Other roads."},
-            )
-        ],
+        tables=[make_table("table9", "Table IX: a table.", ("method", "system"), values, explanations)],
         figures={"figure9": {"title": "Figure 9.", "caption": "A line.", "paper": "Another line.", "y": [0.0, 1.0]}},
-        findings=[Finding(claim="A < B", statistic="A / B", value=0.5, interval=(0.4, 0.6), verdict="holds")],
+        findings=[find("A < B", "A / B", "holds", 0.5, (0.4, 0.6))],
         notes=["Counted."],
         runs=[{"p": float("nan")}],
     )
@@ -188,31 +181,27 @@ def test_a_record_says_what_made_it_and_is_written(tmp_path: Path) -> None:
     assert record["about"]["rare_envs"] == rare_envs.__version__
     assert {"torch", "numba", "numpy", "processor", "scale", "seed"} <= set(record["about"])
     assert record["tables"][0]["values"][0]["difference"] == 6e-4 / 8e-4 - 1
-    write_record(
-        tmp_path, record, [DrawnFigure("figure9", lambda drawing: drawing.subplots().plot([0.0, 1.0]), (3, 2))]
-    )
+    assert set(record["tables"][0]["explanations"]) == {"traffic", "maps"}
+    write_record(tmp_path, record, {"figure9": (lambda drawing: drawing.subplots().plot([0.0, 1.0]), (3, 2))})
     assert json.loads((tmp_path / "reproduction.json").read_text()) == record
-    assert "8.00e-04" in (tmp_path / "reproduction.md").read_text()
     assert (tmp_path / "figure9.png").stat().st_size > 1000
-
-
-def test_the_markdown_has_tables_findings_and_figures() -> None:
-    lines = format_record(record_by_hand()).splitlines()
+    lines = (tmp_path / "reproduction.md").read_text().splitlines()
+    assert lines == format_record(record).splitlines()
     assert lines[0] == "## A paper"
     assert "| SS | IDM | mean of p | 8.00e-04 | 6.00e-04 | – | -25 % | – | – | traffic |" in lines
     assert "|  |  | simulations | – | 4,980 | 4,900 to 5,100 | – | 5,500 | – | – |" in lines
     assert "| A < B | A / B | 0.5 | 0.4 to 0.6 | holds |" in lines
-    assert "- *traffic*: Other roads." in lines
+    assert "- *traffic*: Other roads, see `maps`." in lines
     assert "- Figure 9. A line. In the paper: Another line." in lines
     assert {line.count("|") for line in lines if line.startswith("|")} == {11, 6}
 
 
 def test_a_table_has_the_labels_and_reasons_that_it_names() -> None:
-    value = ComparedValue(labels=("x",), quantity="p", reasons=("traffic",))
+    values = [compare(("x",), "p", reasons=("traffic",))]
     with pytest.raises(ValueError, match="Expected 2 labels"):
-        ComparisonTable(name="t", title="t", keys=("a", "b"), values=(value,))
+        make_table("t", "t", ("a", "b"), values, {})
     with pytest.raises(ValueError, match="No explanation 'traffic'"):
-        ComparisonTable(name="t", title="t", keys=("a",), values=(value,))
+        make_table("t", "t", ("a",), values, {})
 
 
 @pytest.fixture(scope="module")
@@ -240,8 +229,8 @@ def test_a_cheap_run_made_again_gives_the_committed_value(tian, scenario: str, m
     runs = runs_of(tian, scenario, "IDM", method)
     with use_one_thread():
         again = run_replication(ReplicationJob(scenario, "IDM", method, runs["seed"][place]))
-    assert again.p == pytest.approx(runs["p"][place], rel=1e-6)
-    assert (again.n_sim, again.simulated) == (runs["n_sim"][place], runs["simulated"][place])
+    assert again["p"] == pytest.approx(runs["p"][place], rel=1e-6)
+    assert [again[name] for name in ("n_sim", "simulated")] == [runs[name][place] for name in ("n_sim", "simulated")]
 
 
 def test_the_committed_record_has_the_replications_that_it_says(tian) -> None:
@@ -259,10 +248,12 @@ def test_the_committed_record_has_the_replications_that_it_says(tian) -> None:
 def test_a_row_of_the_committed_tables_made_again_is_the_committed_one(tian, scenario: str, method: str) -> None:
     with use_one_thread():
         runs = [
-            run_replication(ReplicationJob(*run.row, run.seed)) if run.row == (scenario, "IDM", method) else run
+            run_replication(ReplicationJob(*row_of(run), run["seed"]))
+            if row_of(run) == (scenario, "IDM", method)
+            else run
             for run in read_replications(tian)
         ]
-    again = to_json_value([table.to_dict() for table in make_method_tables(runs)])
+    again = to_json_value(make_method_tables(runs))
     for one, other in zip(again, tian["tables"], strict=True):
         for value, shown in zip(one["values"], other["values"], strict=True):
             assert value["ours"] == pytest.approx(shown["ours"], rel=1e-6)
@@ -275,7 +266,7 @@ def test_a_row_of_tian_that_is_wrong_is_put_right_and_the_others_stay(tian, tmp_
     """Replications are made and give what is committed; the others are taken from there."""
     wrong = copy.deepcopy(tian)
     runs_of(wrong, "cut-in", "IDM", "cross-entropy")["p"][0] *= 2
-    known = {(*run.row, run.seed): run for run in read_replications(tian)}
+    known = {(*row_of(run), run["seed"]): run for run in read_replications(tian)}
     made: list[ReplicationJob] = []
 
     def make(job: ReplicationJob):

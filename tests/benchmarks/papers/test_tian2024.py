@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import json
-import math
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
 from scipy import stats
 
@@ -15,13 +16,19 @@ from benchmarks.papers.tian2024.printed import EXPLANATIONS, PRINTED, PrintedRow
 from benchmarks.papers.tian2024.replications import (
     CountedSimulations,
     ReplicationJob,
-    ReplicationRun,
     driving_problem,
+    read_run,
     run_replication,
 )
 from benchmarks.papers.tian2024.study import TianPlan, reproduce_tian2024
-from benchmarks.papers.tian2024.summary import ReplicationSummary, assess_claims, ratio_of_work, summarise_runs
-from benchmarks.papers.tian2024.tables import make_method_tables
+from benchmarks.papers.tian2024.summary import (
+    assess_claims,
+    derive,
+    ends_of,
+    make_method_tables,
+    ratio_of_work,
+    summarise_runs,
+)
 from rare_envs.startup import use_one_thread
 from rare_envs.study.arguments import BadInput
 from tests.benchmarks.papers.made_runs import made_run
@@ -49,36 +56,31 @@ def test_root_error_and_gain_of_printed_rows() -> None:
 
 
 @pytest.fixture(scope="module")
-def subset_run() -> ReplicationRun:
+def subset_run() -> dict[str, Any]:
     with use_one_thread():
         return run_replication(ReplicationJob("cut-in", "IDM", "SS", seed=3, points=True))
 
 
-def test_all_simulations_are_counted_and_subsets_have_ever_smaller_gaps(subset_run: ReplicationRun) -> None:
-    assert subset_run.simulated == subset_run.n_sim == subset_run.final == subset_run.trace[-1][0]
-    assert 500 + 400 * (subset_run.levels - 1) <= subset_run.n_sim <= 500 * subset_run.levels
-    assert len(subset_run.level_means) == len(subset_run.level_points) == subset_run.levels
-    assert {len(row) for level in subset_run.level_points for row in level} == {6}
-    gaps = [means[3] for means in subset_run.level_means]
-    assert gaps[-1] < 0.5 * gaps[0]
-    offsets = np.array(subset_run.level_points[0])[:, 5]
+def test_all_simulations_are_counted_and_subsets_have_ever_smaller_gaps(subset_run: dict[str, Any]) -> None:
+    n, levels, means, points = (subset_run[name] for name in ("n_sim", "levels", "level_means", "level_points"))
+    assert subset_run["simulated"] == n == subset_run["final"] == subset_run["trace"][-1][0]
+    assert 500 + 400 * (levels - 1) <= n <= 500 * levels
+    assert len(means) == len(points) == levels
+    assert {len(row) for level in points for row in level} == {6}
+    assert means[-1][3] < 0.5 * means[0][3]
+    offsets = np.array(points[0])[:, 5]
     assert 2.2 <= offsets.min() <= offsets.max() <= 5.0
-    assert ReplicationRun.from_line(json.loads(json.dumps(subset_run.to_line()))) == subset_run
+    assert read_run(json.loads(json.dumps(subset_run))) == subset_run
 
 
 def test_the_search_of_importance_sampling_is_told_from_its_estimate() -> None:
     with use_one_thread():
         run = run_replication(ReplicationJob("car-following", "IDM", "IS", seed=0))
-    assert run.simulated == run.n_sim > run.final >= 1000
-    assert run.level_points == ()
-
-
-@pytest.mark.parametrize(
-    "content", [{}, {"trace": 1}, {**made_run(ReplicationJob("a", "b", "c", 0)).to_line(), "x": 1}]
-)
-def test_a_line_of_something_else_is_no_run(content) -> None:
-    with pytest.raises((KeyError, TypeError, ValueError)):
-        ReplicationRun.from_line(content)
+    assert run["simulated"] == run["n_sim"] > run["final"] >= 1000
+    assert run["level_points"] == []
+    for content in ({}, {"trace": 1}, {**run, "x": 1}):
+        with pytest.raises(ValueError, match="It has"):
+            read_run(content)
 
 
 def test_the_counter_counts_rows_whatever_asks() -> None:
@@ -96,48 +98,48 @@ def test_noise_of_the_stack_is_part_of_x() -> None:
     assert [driving_problem("cut-in", system).dim for system in ("IDM", "stack")] == [6, 281]
 
 
+def summary_of(estimates: Any, n: float, truth: float) -> pd.DataFrame:
+    """Return the summaries of several sets of estimates (sets, replications) with n simulations each."""
+    p = np.atleast_2d(estimates)
+    columns = {"replications": p.shape[1], "mean": p.mean(axis=1), "spread": p.std(axis=1, ddof=1)}
+    return derive(pd.DataFrame({**columns, "simulations": n, "all_simulations": n, "truth": truth}))
+
+
 def test_a_method_that_misses_most_of_p_has_no_gain() -> None:
     """Its c.o.v. is small, its error is not."""
-    blind = ReplicationSummary.of_estimates([1e-9, 1.1e-9], 1000.0, 1000.0, truth=1e-3)
-    assert blind.cov < 0.1
-    assert blind.error == pytest.approx(-1.0, abs=1e-5)
-    assert blind.gain == pytest.approx(0.999, rel=1e-3)
-    nothing = ReplicationSummary.of_estimates([0.0, 0.0], 1000.0, 1000.0, truth=1e-3)
-    assert math.isnan(nothing.cov)
-    assert nothing.gain == pytest.approx(0.999)
-    with pytest.raises(ValueError, match="2 replications at least, got 1"):
-        ReplicationSummary.of_estimates([1e-4], 10.0)
+    blind, nothing = (summary_of(p, 1000.0, 1e-3).iloc[0] for p in ([1e-9, 1.1e-9], [0.0, 0.0]))
+    assert blind["cov"] < 0.1
+    assert blind["error"] == pytest.approx(-1.0, abs=1e-5)
+    assert blind["gain"] == pytest.approx(0.999, rel=1e-3)
+    assert np.isnan(nothing["cov"])
+    assert nothing["gain"] == pytest.approx(0.999)
 
 
 def test_intervals_cover_in_95_percent() -> None:
-    rng = np.random.default_rng(1)
+    found = summary_of(1e-3 * np.random.default_rng(1).normal(1.0, 0.1, (1000, 20)), 1000.0, 1e-3)
     gain = (1 - 1e-3) / (1e-3 * 1000 * 0.1**2)
-    held = np.zeros(3)
-    for _ in range(1000):
-        draws = list(1e-3 * rng.normal(1.0, 0.1, 20))
-        summary = ReplicationSummary.of_estimates(draws, 1000.0, truth=1e-3)
-        ends = (summary.mean_interval, summary.cov_interval, summary.gain_interval)
-        held += [low <= known <= high for (low, high), known in zip(ends, (1e-3, 0.1, gain), strict=True)]
     low, high = stats.binom.ppf([1e-4, 1 - 1e-4], 1000, 0.95)
-    assert low <= held[0] <= high
-    assert low - 20 <= held[1] <= high + 20  # the mean that divides is estimated, too
-    assert low - 20 <= held[2] <= high + 20
+    for name, known, slack in (("mean", 1e-3, 0), ("cov", 0.1, 20), ("gain", gain, 20)):  # a mean that divides errs too
+        held = ((found[f"{name}_low"] <= known) & (known <= found[f"{name}_high"])).sum()
+        assert low - slack <= held <= high + slack, name
 
 
 def test_plain_monte_carlo_has_a_gain_of_one_and_the_work_of_itself() -> None:
     p, n, rng = 0.01, 2000, np.random.default_rng(0)
-    summary = ReplicationSummary.of_estimates(list(rng.binomial(n, p, 4000) / n), float(n), truth=p)
-    assert summary.gain == pytest.approx(1.0, rel=0.1)
+    summary = summary_of(rng.binomial(n, p, 4000) / n, float(n), p).iloc[0]
+    assert summary["gain"] == pytest.approx(1.0, rel=0.1)
     ratio, (low, high) = ratio_of_work(summary, summary)
     assert (ratio, low) == (1.0, pytest.approx(1 / high))
+    noisy, exact = ({"work": work, "replications": 20} for work in (8.0, 1.0))
+    assert ratio_of_work(noisy, exact) == (8.0, pytest.approx((3.17, 20.2), rel=2e-3))
 
 
 def test_runs_are_compared_with_monte_carlo_of_their_cell() -> None:
     jobs = [ReplicationJob("cut-in", "IDM", method, seed) for method in ("MC", "IS") for seed in (0, 1)]
     found = summarise_runs([made_run(job, 2e-4 if job.method == "MC" else 1e-4) for job in jobs])
-    assert found["cut-in", "IDM", "IS"].error == pytest.approx(-0.5)
-    assert found["cut-in", "IDM", "IS"].simulations == 1500
-    assert found["cut-in", "IDM", "IS"].all_simulations == 3000
+    ours = found.loc["cut-in", "IDM", "IS"]
+    assert (ours["error"], ours["simulations"], ours["all_simulations"]) == (pytest.approx(-0.5), 1500, 3000)
+    assert ends_of(ours, "mean") == (pytest.approx(1e-4), pytest.approx(1e-4))
 
 
 def claims_of(spreads: dict[str, float], points: bool = False, shift: float = 0.0):
@@ -146,22 +148,22 @@ def claims_of(spreads: dict[str, float], points: bool = False, shift: float = 0.
     ]
     factors = [1 + spreads[job.method] * (-1) ** job.seed + (shift if job.method == "IS" else 0.0) for job in jobs]
     runs = [made_run(job, 2e-4 * factor) for job, factor in zip(jobs, factors, strict=True)]
-    return {claim.claim.partition(" (")[0]: claim for claim in assess_claims(runs)}
+    return {found["claim"].partition(" (")[0]: found for found in assess_claims(runs)}
 
 
 def test_verdicts_on_runs_made_by_hand() -> None:
     found = claims_of({"MC": 0.1, "ADSS": 0.2, "SS": 0.6, "IS": 0.05})
-    assert found["ADSS needs fewer simulations than SS"].verdict == "holds"
-    assert found["ADSS needs fewer simulations than IS"].verdict == "the opposite holds"
+    assert found["ADSS needs fewer simulations than SS"]["verdict"] == "holds"
+    assert found["ADSS needs fewer simulations than IS"]["verdict"] == "the opposite holds"
     equal = claims_of({"MC": 0.1, "ADSS": 0.3, "SS": 0.3})
-    assert equal["ADSS needs fewer simulations than SS"].verdict == "cannot be told from these replications"
+    assert equal["ADSS needs fewer simulations than SS"]["verdict"] == "cannot be told from these replications"
     name = "IS is off by 2 to 17 %"
-    assert claims_of({"MC": 0.1, "IS": 0.1})[name].verdict == "no error to be seen"
-    assert claims_of({"MC": 0.1, "IS": 0.1}, shift=0.2)[name].verdict == "off by +20 %"
+    assert claims_of({"MC": 0.1, "IS": 0.1})[name]["verdict"] == "no error to be seen"
+    assert claims_of({"MC": 0.1, "IS": 0.1}, shift=0.2)[name]["verdict"] == "off by +20 %"
     moved = claims_of({"MC": 0.1, "SS": 0.3}, points=True)
-    assert moved["the cutter's speed v2 increases from subset to subset"].verdict == "the opposite holds"
+    assert moved["the cutter's speed v2 increases from subset to subset"]["verdict"] == "the opposite holds"
     gap = moved["the gap dis1x to it decreases from subset to subset"]
-    assert (gap.value, gap.verdict) == (-30.0, "holds")
+    assert (gap["value"], gap["verdict"]) == (-30.0, "holds")
     assert assess_claims([]) == []
 
 
@@ -180,36 +182,39 @@ def tables_of(*methods: str, scenarios=("car-following", "cut-in")):
 def find(table, method: str, system: str, quantity: str):
     (found,) = (
         value
-        for value in table.values
-        if value.labels[0] == method and value.labels[1].startswith(system) and value.quantity.startswith(quantity)
+        for value in table["values"]
+        if value["labels"][0] == method
+        and value["labels"][1].startswith(system)
+        and value["quantity"].startswith(quantity)
     )
     return found
 
 
 def test_paper_ours_and_difference() -> None:
     table2, table3 = tables_of("MC", "SS", "IS", "ADSS", "two-stage")
-    assert (table2.name, table3.name) == ("table2", "table3")
+    assert (table2["name"], table3["name"]) == ("table2", "table3")
     p = find(table2, "SS", "IDM", "mean of p")
-    assert (p.paper, p.ours, p.difference) == (8.03e-4, pytest.approx(2e-4), pytest.approx(2 / 8.03 - 1))
+    assert (p["paper"], p["ours"], p["difference"]) == (8.03e-4, pytest.approx(2e-4), pytest.approx(2 / 8.03 - 1))
     squared = find(table2, "SS", "IDM", "square of the c.o.v.")
-    assert (squared.paper, squared.ours) == (0.152, pytest.approx(0.125))
-    assert find(table2, "SS", "IDM", "c.o.v.").paper == pytest.approx(0.152**0.5)
-    assert [find(table2, "SS", "stack", "simulations").paper, find(table2, "SS", "stack", "simulations").ours] == [
-        4980,
-        1800,
-    ]
-    assert find(table3, "SS", "stack", "mean of p").paper == 2.49e-4
-    assert "text" in find(table3, "SS", "stack", "mean of p").reasons
+    assert (squared["paper"], squared["ours"]) == (0.152, pytest.approx(0.125))
+    assert find(table2, "SS", "IDM", "c.o.v.")["paper"] == pytest.approx(0.152**0.5)
+    cost = find(table2, "SS", "stack", "simulations")
+    assert (cost["paper"], cost["ours"]) == (4980, 1800)
+    repeated = find(table3, "SS", "stack", "mean of p")
+    assert repeated["paper"] == 2.49e-4 and "text" in repeated["reasons"]
     searched = find(table2, "IS", "IDM", "simulations")
-    assert (searched.ours, searched.ours_all_in) == (1500, 3000)
-    assert "does not run as released" in find(table2, "IS", "IDM", "mean of p").released
-    assert find(table2, "SS", "IDM", "simulations").released == "N in every level: 2,000 for the same levels"
-    assert find(table2, "ADSS", "IDM", "simulations").released.endswith("at the end: 2,500 for the same levels")
-    assert "114,784" in find(table2, "Monte Carlo", "IDM", "simulations").released
-    assert all(value.reasons for table in (table2, table3) for value in table.values)
-    assert [row["labels"][0] for row in table2.measured] == ["two-stage"] * 2
-    assert table2.measured[0]["values"]["all simulations"] == 2681
-    assert [table.name for table in tables_of("MC", scenarios=("cut-in",))] == ["table3"]
+    assert (searched["ours"], searched["ours_all_in"]) == (1500, 3000)
+    for method, quantity, words in (
+        ("IS", "mean of p", "does not run as released"),
+        ("SS", "simulations", "N in every level: 2,000 for the same levels"),
+        ("ADSS", "simulations", "at the end: 2,500 for the same levels"),
+        ("Monte Carlo", "simulations", "114,784"),
+    ):
+        assert words in find(table2, method, "IDM", quantity)["released"]
+    assert all(value["reasons"] for table in (table2, table3) for value in table["values"])
+    assert [row["labels"][0] for row in table2["measured"]] == ["two-stage"] * 2
+    assert table2["measured"][0]["values"]["all simulations"] == 2681
+    assert [table["name"] for table in tables_of("MC", scenarios=("cut-in",))] == ["table3"]
 
 
 @pytest.fixture

@@ -59,7 +59,7 @@ def test_the_card_has_every_driver_with_its_command_metrics_and_licence(tmp_path
         "|  | gail | mgail |",
         "| collision | 0.05235 | 0.004 |",
         "| js speed |  | 0.03 |",
-        "| penalty |  | 0.5 |",
+        "| penalty | 0.5 |",
         "| noise, coefficients of lag 1 | 0.95, 0 | 0.95, 0 |",
         "- mgail: `train mgail`",
         "US 101, 3 minutes. Licence of the data and files: CC BY-SA 3.0.",
