@@ -7,6 +7,7 @@ read only where it is an ordinary file of a bounded size.
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import json
 import os
 import re
@@ -59,6 +60,15 @@ def read_text_file(path: str | Path) -> str:
     """Return the text of an ordinary file in UTF-8 of at most `MAX_TEXT_BYTES`."""
     check_ordinary(path, MAX_TEXT_BYTES)
     return Path(path).read_text(encoding="utf-8")
+
+
+def digest_file(path: Path) -> str:
+    """Return the BLAKE2b digest of a file."""
+    digest = hashlib.blake2b(digest_size=16)
+    with path.open("rb") as file:
+        while block := file.read(1 << 20):
+            digest.update(block)
+    return digest.hexdigest()
 
 
 def _sync(path: Path) -> None:

@@ -26,11 +26,6 @@ CRASH_COLOUR = "#d62828"
 """Outline of vehicles that have crashed: they keep their own colour, so that the ego stays the ego."""
 
 
-def vehicle_colour(name: str, number: int = 0) -> str:
-    """Return the colour of a vehicle by its name, or by its number if scenarios call no vehicle so."""
-    return OTHER_COLOURS[number % len(OTHER_COLOURS)] if name not in ROLE_COLOURS else ROLE_COLOURS[name]
-
-
 def as_rgb(colour: str) -> tuple[int, int, int]:
     """Return a colour as numbers from 0 to 255."""
     return int(colour[1:3], 16), int(colour[3:5], 16), int(colour[5:7], 16)

@@ -9,14 +9,13 @@ from rare_envs.plugins import make_lazy_getattr
 
 if TYPE_CHECKING:
     from rare_envs.study.arguments import BadInput, Question
-    from rare_envs.study.compare import compare_egos
-    from rare_envs.study.evaluate import resume, run, run_into
+    from rare_envs.study.evaluate import run, run_into
     from rare_envs.study.failures import severity_curve
+    from rare_envs.study.plots import write_film
     from rare_envs.study.question import prepare
     from rare_envs.study.replay import Drive, drive_again
     from rare_envs.study.report import Report
     from rare_envs.study.run_folder import read_failures
-    from rare_envs.study.video import write_film
     from rare_envs.study.writing import write_run
 
 __all__ = [
@@ -24,11 +23,9 @@ __all__ = [
     "Drive",
     "Question",
     "Report",
-    "compare_egos",
     "drive_again",
     "prepare",
     "read_failures",
-    "resume",
     "run",
     "run_into",
     "severity_curve",
@@ -38,14 +35,13 @@ __all__ = [
 
 _MODULES = {
     "arguments": ("BadInput", "Question"),
-    "compare": ("compare_egos",),
-    "evaluate": ("resume", "run", "run_into"),
+    "evaluate": ("run", "run_into"),
     "failures": ("severity_curve",),
     "question": ("prepare",),
     "replay": ("Drive", "drive_again"),
     "report": ("Report",),
     "run_folder": ("read_failures",),
-    "video": ("write_film",),
+    "plots": ("write_film",),
     "writing": ("write_run",),
 }
 

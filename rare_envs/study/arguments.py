@@ -10,8 +10,9 @@ from __future__ import annotations
 
 import contextlib
 import inspect
+import os
 import reprlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import Field, dataclass, field, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
@@ -20,15 +21,8 @@ from rare_envs.plugins import did_you_mean
 from rare_envs.scenarios.registry import find_scenario, split_layout
 
 if TYPE_CHECKING:
-    from samplers import Executor, RunArguments, Stepping
+    from samplers import Estimate, Executor, RunArguments, Stepping
     from samplers.problem import OnError
-import os
-from collections.abc import Iterator
-from typing import TYPE_CHECKING
-
-if TYPE_CHECKING:
-    from samplers import Estimate
-
 
 MAX_MESSAGE = 2_000
 """Characters of a message, which may repeat a name or a value of any length; of a longer one the middle is left out."""
@@ -61,10 +55,7 @@ class UnwrittenResults(BadInput):
 
 
 class RunInterrupted(KeyboardInterrupt):
-    """A run was interrupted; the message says what is known and how to continue it.
-
-    `report` is the answer from the simulations made so far, as the command prints it; None before the first ones.
-    """
+    """A run was interrupted; the message says what is known and how to continue it."""
 
     def __init__(self, message: str, report: Any = None) -> None:
         super().__init__(message)
@@ -73,10 +64,10 @@ class RunInterrupted(KeyboardInterrupt):
 
 def describe_stop(estimate: Estimate, name: str = "p") -> str:
     """Return what a run knows that was stopped, in one line; `name` is that of the probability."""
-    low, high = estimate.interval
-    so_far = f"{name} so far" if estimate.status == "stopped" else name
+    n, (low, high), so_far = estimate.n_sim, estimate.interval, estimate.status == "stopped"
     return (
-        f"Stopped after {estimate.n_sim:,} simulations: {so_far} {estimate.p:.3e} "
+        f"{f'Stopped after {n:,} simulations' if so_far else f'Stopped behind the last of {n:,} simulations'}: "
+        f"{name}{' so far' if so_far else ''} {estimate.p:.3e} "
         f"({100 * estimate.confidence:g} % interval {low:.3e} to {high:.3e})."
     )
 
@@ -101,13 +92,16 @@ def as_bad_input(*kinds: type[BaseException]) -> Iterator[None]:
 
 @contextlib.contextmanager
 def output_folder(path: Path) -> Iterator[None]:
-    """Make the folder for results before the work, so that no run ends without a place to write to.
-
-    If the work fails, new folders are removed again, as far as they are empty.
-    """
+    """Make the folder for results before the work, so that no run ends without a place to write to."""
     new = [folder for folder in (path, *path.parents) if not os.path.exists(folder)]
     try:
-        _make_writable(path)
+        try:
+            path.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            reason = "there is a file of that name" if os.path.isfile(path) else error.strerror
+            raise BadInput(f"Cannot make the folder {str(path)!r}: {reason}.") from error
+        if not os.access(path, os.W_OK):
+            raise BadInput(f"Cannot write to the folder {str(path)!r}.")
         yield
     except BaseException:
         for folder in new:  # the innermost first
@@ -117,22 +111,12 @@ def output_folder(path: Path) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def output_file(path: Path) -> Iterator[None]:
-    """Make the folder of a file before the work, as `output_folder` does."""
-    if path.is_dir():
+def output_file(path: Path | None) -> Iterator[None]:
+    """Make the folder of a file before the work, as `output_folder` does; None where there is none to write."""
+    if path is not None and path.is_dir():
         raise BadInput(f"Expected a file to write, got the folder {str(path)!r}.")
-    with output_folder(path.parent):
+    with contextlib.nullcontext() if path is None else output_folder(path.parent):
         yield
-
-
-def _make_writable(path: Path) -> None:
-    try:
-        path.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        reason = "there is a file of that name" if os.path.isfile(path) else error.strerror
-        raise BadInput(f"Cannot make the folder {str(path)!r}: {reason}.") from error
-    if not os.access(path, os.W_OK):
-        raise BadInput(f"Cannot write to the folder {str(path)!r}.")
 
 
 EXECUTORS = ("local", "ray")
@@ -325,19 +309,6 @@ def list_arguments() -> str:
     return "\n".join(rows)
 
 
-def join_question(given: Mapping[str, Any], env: str | None, options: Mapping[str, Any], typed: set[str]) -> Question:
-    """Return the question of a file and a command line."""
-    named = join_options(given, options, typed) | ({} if env is None else {"env_id": env})
-    if "env_id" not in named:
-        raise BadInput("Expected an environment: rare-envs estimate ENV, or env: ENV in the file of --config.")
-    return Question(**named)
-
-
-def join_options(given: Mapping[str, Any], options: Mapping[str, Any], typed: set[str]) -> dict[str, Any]:
-    """Return options by name: what was typed, else what a file gives, else the default."""
-    return {**options, **given, **{name: value for name, value in options.items() if name in typed}}
-
-
 def read_question(values: Any) -> Question:
     """Return the question that a file has, without the fields that this version does not know."""
     if not isinstance(values, dict) or "env_id" not in values:
@@ -362,15 +333,10 @@ NOT_IN_FILES = ("trust",)
 """Whoever asks decides whether code runs, not a file."""
 KEYS = {option_name(each): each for kind in (Question, ExecutorOptions) for each in fields(kind)}
 """Keys, with - or _ between words, and the fields that they stand for."""
-_NULLS = dict.fromkeys(("null", "~", ""))
-_SWITCHES = {**dict.fromkeys(("true", "yes", "on"), True), **dict.fromkeys(("false", "no", "off"), False)}
 
 
 def read_question_file(path: Path) -> dict[str, Any]:
-    """Return the fields of `Question` and `ExecutorOptions` that a YAML file, which may be JSON, gives.
-
-    What a value is follows from its field: 1e6 is a whole number where one is wanted.
-    """
+    """Return the fields of `Question` and `ExecutorOptions` that a YAML file, which may be JSON, gives."""
     values: dict[str, Any] = {}
     for key, node in _read_nodes(path):
         name = key.replace("-", "_")
@@ -381,7 +347,7 @@ def read_question_file(path: Path) -> dict[str, Any]:
             hint = did_you_mean(name, known)
             raise BadInput(f"{str(path)!r} has an unknown key {key!r}{hint}. It may have: {', '.join(known)}.")
         if name in values:
-            raise BadInput(f"{str(path)!r} gives the same option twice.")
+            raise BadInput(f"{str(path)!r} has the key {key!r} more than once.")
         values[name] = _read_value(node, KEYS[name])
     try:
         check_types({name: KEYS[name] for name in values}, values)
@@ -402,22 +368,17 @@ def _read_nodes(path: Path) -> list[tuple[str, Any]]:
         raise BadInput(f"Cannot read {str(path)!r}: {error.strerror}.") from error
     except (yaml.YAMLError, ValueError, RecursionError) as error:
         raise BadInput(f"{str(path)!r} is no YAML: {error}") from error
-    if node is None:
-        raise BadInput(f"{str(path)!r} has no keys: expected lines like gamma: 0.0.")
-    pairs = node.value if isinstance(node, yaml.MappingNode) else None
-    if pairs is None or not all(isinstance(key, yaml.ScalarNode) for key, _ in pairs):
-        raise BadInput(f"Expected {str(path)!r} to have lines like gamma: 0.0.")
+    pairs = node.value if isinstance(node, yaml.MappingNode) else []
+    if not pairs or not all(isinstance(key, yaml.ScalarNode) for key, _ in pairs):
+        has = "has no keys: expected" if node is None else "cannot be used: expected"
+        raise BadInput(f"{str(path)!r} {has} lines like gamma: 0.0.")
     for key, value in pairs:
         if not isinstance(value, yaml.ScalarNode):
             raise BadInput(f"Expected {key.value} in {str(path)!r} to be one value, as in gamma: 0.0.")
-    keys = [key.value for key, _ in pairs]
-    for key in keys:
-        if keys.count(key) > 1:
-            raise BadInput(f"{str(path)!r} has the key {key!r} more than once.")
     return [(key.value, value) for key, value in pairs]
 
 
-def _read_whole(text: str) -> int:
+def read_whole(text: str) -> int:
     """Return a whole number, which may be written as 1e6."""
     try:
         return int(text)
@@ -428,9 +389,9 @@ def _read_whole(text: str) -> int:
 
 
 _READERS: dict[str, Callable[[str], Any]] = {
-    "None": lambda text: _NULLS[text.lower()],
-    "bool": lambda text: _SWITCHES[text.lower()],
-    "int": _read_whole,
+    "None": dict.fromkeys(("null", "~", "")).__getitem__,
+    "bool": {"true": True, "yes": True, "on": True, "false": False, "no": False, "off": False}.__getitem__,
+    "int": read_whole,
     "float": float,
 }
 
@@ -442,7 +403,7 @@ def _read_value(node: Any, argument: Field[Any]) -> Any:
     kinds = str(argument.type).split(" | ") if node.style is None else []  # what is in quotes is a text
     for kind in (kind for kind in _READERS if kind in kinds):
         with contextlib.suppress(KeyError, ValueError):
-            return _READERS[kind](node.value)
+            return _READERS[kind](node.value.lower())
     return node.value
 
 

@@ -28,9 +28,10 @@ from rare_envs.problem import DrivingProblem
 from rare_envs.scenarios.registry import find_scenario
 from rare_envs.startup import __version__
 from rare_envs.study.arguments import BadInput, Question, as_bad_input, output_folder, read_question
-from rare_envs.study.question import build_problem, note_question, open_question, open_run, prepare
+from rare_envs.study.question import build_problem, note_question, open_question, open_run
 from rare_envs.study.replay import REPLAY_TOLERANCE, join_parts
 from rare_envs.study.run_folder import CRASH, LoadedStudy, load_finished
+from samplers.output import to_json_value
 from training import Retraining
 
 STORED_FORMAT = 1
@@ -45,20 +46,7 @@ WORLD_FIELDS = ("measure", "gamma", "noise", "drivers", "horizon", "collisions",
 
 @dataclass(frozen=True)
 class StoredFailure:
-    """A scenario in which an ego failed.
-
-    Attributes:
-        env_id: The environment.
-        world: Values of `WORLD_FIELDS`.
-        x: Scenario parameters by name, each of shape (size,).
-        f: The measure that was recorded.
-        log_p0: Log density under the base distribution.
-        ego: The ego that failed, as its run named it.
-        crash: Kind of its crash, in words.
-        base: Base distribution of the run; the scenario's default when None. It says how likely x is, and does not
-            change what happens in it.
-        versions: Versions of this program and of the libraries that simulate.
-    """
+    """A scenario in which an ego failed."""
 
     env_id: str
     world: Mapping[str, Any]
@@ -91,15 +79,9 @@ class StoredFailure:
         return {"env_id": self.env_id, "ego": "idm", **self.world}
 
     def to_json(self) -> str:
-        """Return the text of its file."""
-        numbers = {"f": finite_or_none(self.f), "log_p0": finite_or_none(self.log_p0)}
-        content = {"format": STORED_FORMAT, "sha256": self.digest, **asdict(self), **numbers}
+        """Return the text of its file; f and log p0 that are no numbers are null."""
+        content = {"format": STORED_FORMAT, "sha256": self.digest, **to_json_value(asdict(self))}
         return json.dumps(content, allow_nan=False, indent=1) + "\n"
-
-
-def finite_or_none(value: float) -> float | None:
-    """Return a number, or None where JSON has none."""
-    return value if math.isfinite(value) else None
 
 
 def make_stored(
@@ -121,31 +103,20 @@ def parse_stored(text: str, source: str) -> StoredFailure:
     content = parse_json_object(text, source)
     if content.get("format") != STORED_FORMAT:
         raise ValueError(f"{source}: expected format {STORED_FORMAT}, got {reprlib.repr(content.get('format'))}.")
-    try:
-        values = {each.name: content[each.name] for each in fields(StoredFailure)}
-    except KeyError as error:
-        raise ValueError(f"{source} has no {error}.") from None
-    words, world = [values[name] for name in ("env_id", "ego", "crash")], values["world"]
-    rows = list(values["x"].values()) if isinstance(values["x"], dict) else []
-    numbers = [value for value in (values["f"], values["log_p0"]) if value is not None]
-    for expected, found in (
-        (
-            f"env_id, ego and crash of up to {MAX_WORD} letters",
-            all(isinstance(word, str) and len(word) <= MAX_WORD for word in words),
-        ),
-        ("base to be a name or null", isinstance(values["base"], str | None)),
-        (f"a world with {', '.join(WORLD_FIELDS)}", isinstance(world, dict) and set(world) == set(WORLD_FIELDS)),
-        (
-            "x with lists of finite numbers by name",
-            bool(rows) and all(isinstance(row, list) and all(map(_is_number, row)) for row in rows),
-        ),
-        (
-            "gamma, f and log_p0 to be numbers",
-            isinstance(world, dict) and all(map(_is_number, [world.get("gamma"), *numbers])),
-        ),
+    values: dict[str, Any] = {each.name: content.get(each.name) for each in fields(StoredFailure)}
+    words, world, x = [values[name] for name in ("env_id", "ego", "crash")], values["world"], values["x"]
+    numbers = [values[name] for name in ("f", "log_p0") if values[name] is not None]
+    if not (
+        all(isinstance(word, str) and len(word) <= MAX_WORD for word in words)
+        and isinstance(values["base"], str | None)
+        and (isinstance(world, dict) and set(world) == set(WORLD_FIELDS))
+        and (isinstance(x, dict) and x and all(isinstance(row, list) for row in x.values()))
+        and all(map(_is_number, [world["gamma"], *numbers, *(value for row in x.values() for value in row)]))
     ):
-        if not found:
-            raise ValueError(f"{source}: expected {expected}.")
+        raise ValueError(
+            f"{source} is no stored failure: expected env_id, ego and crash of up to {MAX_WORD} letters, a base, "
+            f"a world with {', '.join(WORLD_FIELDS)}, x with lists of numbers by name, f and log_p0."
+        )
     for name in ("f", "log_p0"):
         values[name] = math.nan if values[name] is None else float(values[name])
     stored = StoredFailure(**values)
@@ -156,12 +127,6 @@ def parse_stored(text: str, source: str) -> StoredFailure:
 
 def _is_number(value: object) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
-
-
-def read_stored(path: Path) -> StoredFailure:
-    """Read a file of a corpus."""
-    check_ordinary(path, MAX_STORED)
-    return parse_stored(path.read_bytes().decode("utf-8", "replace"), repr(str(path)))
 
 
 def read_corpus(folder: Path) -> list[StoredFailure]:
@@ -175,24 +140,16 @@ def read_corpus(folder: Path) -> list[StoredFailure]:
         raise BadInput(f"There is no corpus in {str(folder)!r}: rare-envs corpus add RUN makes one.")
     if len(paths) > MAX_CORPUS_FILES:
         raise BadInput(f"The corpus in {str(folder)!r} has more than {MAX_CORPUS_FILES:,} files.")
+    found = []
     with as_bad_input(ValueError, OSError):
-        return [read_stored(path) for path in paths]
+        for path in paths:
+            check_ordinary(path, MAX_STORED)
+            found.append(parse_stored(path.read_bytes().decode("utf-8", "replace"), repr(str(path))))
+    return found
 
 
-def read_run(folder: Path, trust: bool = False) -> list[StoredFailure]:
-    """Return the failures of a run, the most likely first; nothing is simulated and no ego is loaded.
-
-    Args:
-        folder: Of `rare-envs estimate --out`.
-        trust: Trust the code that a run from elsewhere names.
-
-    Raises:
-        BadInput: There is no such run, it is not finished, its files are damaged, or it is not trusted.
-    """
-    return _list_failures(load_finished(folder), trust)
-
-
-def _list_failures(run: LoadedStudy, trust: bool) -> list[StoredFailure]:
+def list_failures(run: LoadedStudy, trust: bool = False) -> list[StoredFailure]:
+    """Return the failures of a run, the most likely first; nothing is simulated and no ego is loaded."""
     question, table = open_run(run, trust), run.failures
     names = [name for name in table if name not in ("f", "log_p0", *CRASH)]
     if not names or not all(np.isfinite(table[name]).all() for name in names):
@@ -222,8 +179,7 @@ def add_run(run: Path, corpus: Path, most: int = 20, trust: bool = False) -> tup
     if most < 1:
         raise BadInput(f"Expected at least one failure to add, got {most}.")
     study = load_finished(run)
-    failures = _list_failures(study, trust)
-    chosen = [failures[number] for number in _choose_likely(failures, most, study.result.get("modes"))]
+    chosen = _choose_likely(list_failures(study, trust), most, study.result.get("modes"))
     if not chosen:
         raise BadInput(f"The run in {str(run)!r} has no failure.")
     new = 0
@@ -237,17 +193,13 @@ def add_run(run: Path, corpus: Path, most: int = 20, trust: bool = False) -> tup
     return chosen, new
 
 
-def _choose_likely(failures: Sequence[StoredFailure], most: int, modes: object) -> list[int]:
-    """Return the numbers of the `most` most likely failures.
-
-    One of each kind of crash, and of each mode that result.json has, is among them as far as there is room.
-    """
-    first: dict[str, int] = {}
-    for number, failure in enumerate(failures):
-        first.setdefault(failure.crash, number)
+def _choose_likely(failures: Sequence[StoredFailure], most: int, modes: object) -> list[StoredFailure]:
+    """Return the `most` most likely failures."""
+    first = {failure.crash: number for number, failure in reversed(list(enumerate(failures)))}
     named = [mode.get("failure") for mode in modes if isinstance(mode, dict)] if isinstance(modes, list) else []
     of_modes = [number for number in named if type(number) is int and 0 <= number < len(failures)]
-    return sorted(list(dict.fromkeys([*first.values(), *of_modes, *range(len(failures))]))[:most])
+    order = dict.fromkeys([*sorted(first.values()), *of_modes, *range(len(failures))])
+    return [failures[number] for number in sorted(list(order)[:most])]
 
 
 def join_x(failures: Sequence[StoredFailure], space: ScenarioSpace) -> NDArray[np.float64]:
@@ -265,15 +217,7 @@ def join_x(failures: Sequence[StoredFailure], space: ScenarioSpace) -> NDArray[n
 
 @dataclass(frozen=True)
 class Trial:
-    """An ego in one stored scenario.
-
-    Attributes:
-        failure: The scenario.
-        outcome: "passed" if f > gamma, "failed" if not, "error" if the ego failed to answer.
-        f: Its measure; NaN after an error.
-        crash: Kind of its crash, where it failed.
-        reason: The error.
-    """
+    """An ego in one stored scenario."""
 
     failure: StoredFailure
     outcome: Literal["passed", "failed", "error"]
@@ -288,18 +232,11 @@ class Trial:
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain values for JSON."""
-        return {
-            "key": self.failure.key,
-            "env_id": self.failure.env_id,
-            "outcome": self.outcome,
-            "f": finite_or_none(self.f),
-            "gamma": self.failure.gamma,
-            "f_recorded": finite_or_none(self.failure.f),
-            "crash": self.crash,
-            "crash_recorded": self.failure.crash,
-            "ego_recorded": self.failure.ego,
-            "reason": self.reason,
-        }
+        stored = self.failure
+        own = {"key": stored.key, "env_id": stored.env_id, "outcome": self.outcome, "f": self.f, "gamma": stored.gamma}
+        recorded = {"f_recorded": stored.f, "crash_recorded": stored.crash, "ego_recorded": stored.ego}
+        found: dict[str, Any] = to_json_value({**own, **recorded, "crash": self.crash, "reason": self.reason})
+        return found
 
     def describe(self) -> str:
         """Return what happened, in a line."""
@@ -349,31 +286,22 @@ def try_ego(
         loaded = agents.load_ego(ego, algo=algo, trust=trust, stats=stats)
         for question, numbers in zip(questions, worlds.values(), strict=True):
             problem = build_problem(replace(question, ego=ego, observation=observation, action=action), loaded)
-            trials |= zip(numbers, _try_world(problem, [failures[k] for k in numbers]), strict=True)
+            trials |= zip(numbers, try_world(problem, [failures[k] for k in numbers]), strict=True)
     return [trials[number] for number in range(len(failures))], time.perf_counter() - start
 
 
-def repeat_run(folder: Path, trust: bool = False) -> tuple[list[Trial], float]:
-    """Drive the ego of a run through its failures again; returns and errors as of `try_ego`."""
-    start, run = time.perf_counter(), load_finished(folder)
-    failures = _list_failures(run, trust)
-    with as_bad_input(ValueError, OSError):
-        trials = _try_world(prepare(open_run(run, trust)).problem, failures)
-    return trials, time.perf_counter() - start
-
-
-def _try_world(problem: DrivingProblem, failures: Sequence[StoredFailure]) -> list[Trial]:
-    """Return the trials of scenarios of one world."""
-    x = problem.space.validate(join_x(failures, problem.space))
+def try_world(problem: DrivingProblem, failures: Sequence[StoredFailure]) -> list[Trial]:
+    """Return the trials of the ego of a problem in scenarios of its world."""
+    x, trials = problem.space.validate(join_x(failures, problem.space)), []
     f, reasons = problem.attempt(x)
-    failed = np.array([k not in reasons and f[k] <= failures[k].gamma for k in range(len(x))])
-    kinds = iter(problem.crash_kinds(x[failed]) if failed.any() else ())
-    return [
-        Trial(failure, "error", math.nan, reason=reasons[k])
-        if k in reasons
-        else Trial(failure, "failed" if failed[k] else "passed", float(f[k]), next(kinds) if failed[k] else "")
-        for k, failure in enumerate(failures)
-    ]
+    failed = [k for k in range(len(x)) if k not in reasons and f[k] <= failures[k].gamma]
+    kinds = dict(zip(failed, problem.crash_kinds(x[failed]) if failed else (), strict=True))
+    for k, failure in enumerate(failures):
+        if k in reasons:
+            trials.append(Trial(failure, "error", math.nan, reason=reasons[k]))
+        else:
+            trials.append(Trial(failure, "failed" if k in kinds else "passed", float(f[k]), kinds.get(k, "")))
+    return trials
 
 
 _NOT_XML = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
@@ -383,21 +311,17 @@ _NOT_XML = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 def write_junit(path: Path, trials: Sequence[Trial], ego: str, seconds: float) -> None:
     """Write a report of test cases, one for each stored scenario; `seconds` is the wall time of all of them."""
     outcomes = [trial.outcome for trial in trials]
-    counts = {
-        "tests": str(len(trials)),
-        "failures": str(outcomes.count("failed")),
-        "errors": str(outcomes.count("error")),
-        "time": f"{seconds:.3f}",
-    }
+    failed, errors = str(outcomes.count("failed")), str(outcomes.count("error"))
+    counts = {"tests": str(len(trials)), "failures": failed, "errors": errors, "time": f"{seconds:.3f}"}
 
     def add(parent: ET.Element, tag: str, **attributes: str) -> ET.Element:
         return ET.SubElement(parent, tag, {name: _NOT_XML.sub("?", text) for name, text in attributes.items()})
 
     root = ET.Element("testsuites", counts)
     suite = add(root, "testsuite", name=f"rare-envs corpus, ego {ego}", skipped="0", **counts)
-    each = f"{seconds / len(trials):.3f}"
     for trial in trials:
-        case = add(suite, "testcase", classname=trial.failure.env_id, name=trial.failure.key, time=each)
+        time = f"{seconds / len(trials):.3f}"
+        case = add(suite, "testcase", classname=trial.failure.env_id, name=trial.failure.key, time=time)
         if trial.outcome != "passed":
             kind = "failure" if trial.outcome == "failed" else "error"
             element = add(case, kind, message=trial.describe(), type=trial.crash or kind)
@@ -428,22 +352,20 @@ def plan_retraining(folders: Sequence[Path], share: float, trust: bool = False) 
     """Return how to train the ego of the last of some runs on with the failures of all."""
     runs = [load_finished(folder) for folder in folders]
     questions = [open_run(run, trust) for run in runs]
-    failures = [failure for run in runs for failure in _list_failures(run, trust)]
-    last = questions[-1]
+    failures = [failure for run in runs for failure in list_failures(run, trust)]
+    last, place = questions[-1], repr(str(folders[-1]))
     for folder, question in zip(folders, questions, strict=True):
         for name in ("env_id", *TRAINED_FIELDS):
             one, other = getattr(question, name), getattr(last, name)  # fields by their names
             if one != other:
                 raise BadInput(
                     f"Expected runs of one environment with the same options, got {name} = {one!r} in "
-                    f"{str(folder)!r} and {other!r} in {str(folders[-1])!r}."
+                    f"{str(folder)!r} and {other!r} in {place}."
                 )
     if not failures:
         raise BadInput(f"There is no failure in {', '.join(repr(str(folder)) for folder in folders)} to train with.")
     if find_ego_kind(last.ego) != "zip":
-        raise BadInput(
-            f"Expected a run of an ego that train-ego has saved (.zip) in {str(folders[-1])!r}, got {last.ego!r}."
-        )
+        raise BadInput(f"Expected a run of an ego that train-ego has saved (.zip) in {place}, got {last.ego!r}.")
     world = {name: getattr(last, name) for name in TRAINED_FIELDS}
     world |= {"observation": last.observation or "features", "action": last.action or "continuous"}
     with as_bad_input(ValueError, OSError):

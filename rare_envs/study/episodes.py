@@ -1,18 +1,18 @@
 """Table of all simulations of a run: a draft grows while it runs, and becomes episodes.parquet when it is done.
 
 What a simulation weighs in p is known only at the end. So each batch goes into the draft, a stream of Arrow's, and the
-draft is read once more, part by part, when the run is done. Neither step holds more than `ROWS_AT_ONCE` simulations,
-or `BYTES_AT_ONCE` of them where they are large.
+draft is read once more, part by part, when the run is done. Neither step holds many more than `ROWS_AT_ONCE`
+simulations, or `BYTES_AT_ONCE` of them where they are large.
 """
 
 from __future__ import annotations
 
 import contextlib
 import hashlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from tempfile import TemporaryFile
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 import pyarrow as pa
@@ -112,38 +112,27 @@ def name_columns(space: ScenarioSpace) -> dict[str, pa.DataType]:
 
 
 class EpisodeTable:
-    """The table of a run. It is no part of the answer: where it cannot be written, the run goes on without it.
-
-    The draft is a file without a name, which is gone when the process is.
-
-    Args:
-        folder: Of the run; None for no table.
-        space: Of x.
-
-    Attributes:
-        lost: Why there is no table; "" as long as all is well.
-    """
+    """The table of a run. It is no part of the answer: where it cannot be written, the run goes on without it."""
 
     def __init__(self, folder: Path | None, space: ScenarioSpace) -> None:
         self.lost = ""
-        self._folder, self._columns = folder, name_columns(space)
-        self._waiting: list[Simulated] = []
+        self._folder, self._columns, self._file = folder, name_columns(space), cast(Any, None)
         self._rows = max(min(ROWS_AT_ONCE, BYTES_AT_ONCE // (8 * max(sum(space.sizes), 1))), 1)
-        self._schema = pa.schema([*self._columns.items(), *((name, BEHIND_X[name]) for name in DRAFTED)])
-        self._file: Any = None
         if folder is not None:
             with self._giving_up():
                 self._file = TemporaryFile(dir=folder)
+                self._schema = pa.schema([*self._columns.items(), *((name, BEHIND_X[name]) for name in DRAFTED)])
                 self._writer = pa.ipc.new_stream(self._file, self._schema)
 
     def add(self, seen: Simulated) -> None:
-        """Add simulations."""
-        if self._file is None:
-            return
-        self._waiting.append(seen)
-        if sum(len(each.f) for each in self._waiting) >= self._rows:
+        """Add simulations to the draft."""
+        if self._file is not None:
+            errors = np.full(len(seen.f), None, dtype=object)
+            errors[np.isnan(seen.f)] = seen.reasons
+            own = {"f": seen.f, "error": errors, "seconds": seen.seconds.astype(np.float32)}
+            arrays = [*self._split(seen.x), *(pa.array(own[name], BEHIND_X[name]) for name in DRAFTED)]
             with self._giving_up():
-                self._write_draft()
+                self._writer.write_batch(pa.record_batch(arrays, schema=self._schema))
 
     def write(self, estimate: Estimate, crashes: Mapping[bytes, str]) -> None:
         """Write the table of a run that is done; kinds of crash of its failures are by `digest_scenarios`."""
@@ -152,17 +141,20 @@ class EpisodeTable:
         fields = [*BEFORE_X.items(), *self._columns.items(), *BEHIND_X.items()]
         schema = pa.schema(fields, metadata={"rare_envs.format": str(EPISODE_FORMAT)})
         with self._giving_up():
+            self._writer.close()
+            self._file.seek(0)
             self._folder.mkdir(parents=True, exist_ok=True)  # somebody may have removed it
             with (
                 replace_file(self._folder / EPISODES) as path,
                 pq.ParquetWriter(path, schema, compression="zstd") as file,
+                pa.ipc.open_stream(self._file) as draft,
             ):
                 first = 0
-                for batch in self._read_draft():
-                    known = self._describe(batch, estimate, first, crashes)
-                    columns = [known[name] if name in known else batch.column(name) for name in schema.names]
-                    file.write_batch(pa.record_batch(columns, schema=schema))
-                    first += batch.num_rows
+                for part in _join_batches(draft, self._rows):
+                    known = self._describe(part, estimate, first, crashes)
+                    columns = [known[name] if name in known else part[name] for name in schema.names]
+                    file.write_table(pa.table(columns, schema=schema), row_group_size=self._rows)
+                    first += part.num_rows
 
     def close(self) -> None:
         """Drop the draft: after an interruption the journal has what is needed to make it again."""
@@ -170,7 +162,6 @@ class EpisodeTable:
             with contextlib.suppress(OSError):
                 self._file.close()
             self._file = None
-            self._waiting.clear()
 
     @contextlib.contextmanager
     def _giving_up(self) -> Iterator[None]:
@@ -181,49 +172,24 @@ class EpisodeTable:
             self.lost = f"{EPISODES} could not be written: {error.strerror or error}"
             self.close()
 
-    def _write_draft(self) -> None:
-        """Write what waits."""
-        if not self._waiting:
-            return
-        rows = [(each.x, each.f, each.seconds) for each in self._waiting]
-        x, f, seconds = (np.concatenate(parts) for parts in zip(*rows, strict=True))
-        errors = np.full(len(f), None, dtype=object)
-        errors[np.isnan(f)] = [reason for each in self._waiting for reason in each.reasons]
-        self._waiting.clear()
-        for first in range(0, len(f), self._rows):
-            part = slice(first, first + self._rows)
-            own = (f[part], errors[part], seconds[part].astype(np.float32))
-            arrays = [*self._split(x[part]), *(pa.array(v, BEHIND_X[n]) for n, v in zip(DRAFTED, own, strict=True))]
-            self._writer.write_batch(pa.record_batch(arrays, schema=self._schema))
-
     def _split(self, x: FloatArray) -> Iterator[Any]:
         """Yield the columns of x (n, d) as Arrow's."""
-        ends = np.cumsum([kind.list_size if _is_list(kind) else 1 for kind in self._columns.values()])
+        ends = np.cumsum([getattr(kind, "list_size", 1) for kind in self._columns.values()])
         for kind, part in zip(self._columns.values(), np.split(x, ends[:-1], axis=1), strict=True):
-            if _is_list(kind):
+            if hasattr(kind, "list_size"):
                 values = pa.array(np.ascontiguousarray(part, dtype=np.float32).ravel())
                 yield pa.FixedSizeListArray.from_arrays(values, kind.list_size)
             else:
                 yield pa.array(part[:, 0], kind)
 
-    def _read_draft(self) -> Iterator[pa.RecordBatch]:
-        """Go through all simulations, part by part; there will be no more of them."""
-        self._write_draft()
-        self._writer.close()
-        self._file.seek(0)
-        with pa.ipc.open_stream(self._file) as reader:
-            yield from reader
-
-    def _describe(
-        self, batch: pa.RecordBatch, estimate: Estimate, first: int, crashes: Mapping[bytes, str]
-    ) -> dict[str, Any]:
+    def _describe(self, part: pa.Table, estimate: Estimate, first: int, crashes: Mapping[bytes, str]) -> dict[str, Any]:
         """Return the columns of simulations from number `first` on that are known at the end."""
-        n, f = batch.num_rows, batch.column("f").to_numpy()
+        n, f = part.num_rows, part["f"].to_numpy()
         about, failed = describe_simulations(estimate, first, n), np.isnan(f) | (f <= estimate.gamma)
         found, rows = np.full(n, None, dtype=object), np.flatnonzero(failed)
         if len(rows) and crashes:  # null where a failure was not driven again
-            failing = batch.take(pa.array(rows))
-            x = np.hstack([_as_table(failing.column(name)) for name in self._columns])
+            failing = part.take(pa.array(rows)).combine_chunks()
+            x = np.hstack([_as_array(failing[name].chunk(0)) for name in self._columns])
             found[rows] = [crashes.get(digest) for digest in digest_scenarios(x)]
         return {
             "simulation": pa.array(np.arange(first, first + n)),
@@ -236,11 +202,28 @@ class EpisodeTable:
         }
 
 
-def describe_simulations(estimate: Estimate, first: int, n: int) -> SimulationRows:
-    """Return what simulations were made for, those of the further run under the refits included.
+def _join_batches(draft: Iterable[pa.RecordBatch], rows: int) -> Iterator[pa.Table]:
+    """Yield tables of at least `rows` simulations, and the rest."""
+    waiting: list[pa.RecordBatch] = []
+    count = 0
+    for batch in draft:
+        waiting.append(batch)
+        count += batch.num_rows
+        if count >= rows:
+            yield pa.Table.from_batches(waiting)
+            waiting, count = [], 0
+    if waiting:
+        yield pa.Table.from_batches(waiting)
 
-    The further run has the number after the last replicate, and its simulations have no weight in p.
-    """
+
+def _as_array(column: pa.Array) -> NDArray[np.float32]:
+    """Return a column of x, numbers or lists, as an array of shape (n, k)."""
+    values = column.flatten() if hasattr(column.type, "list_size") else column
+    return np.asarray(values.to_numpy(), dtype=np.float32).reshape(len(column), -1)
+
+
+def describe_simulations(estimate: Estimate, first: int, n: int) -> SimulationRows:
+    """Return what simulations were made for, those of the further run under the refits included."""
     further = estimate.ensemble_run
     n_first, n_more = (sum(n for _, n, _ in run.spans) if run is not None else 0 for run in (estimate, further))
     rows = SimulationRows(np.full(n, -1), np.full(n, -1), np.full(n, np.nan))
@@ -249,17 +232,7 @@ def describe_simulations(estimate: Estimate, first: int, n: int) -> SimulationRo
         whole[:inside] = part
     start = first + inside - n_first
     rest = max(min(n_more - start, n - inside), 0)
-    if further is not None and n_first and rest:
+    if further is not None and n_first and rest:  # numbered after the last replicate, without a weight in p
         rows.run[inside : inside + rest] = 1 + max(number for number, _, _ in estimate.spans)
         rows.stage[inside : inside + rest] = further.describe_simulations(start, rest).stage
     return rows
-
-
-def _is_list(kind: pa.DataType) -> bool:
-    return bool(pa.types.is_fixed_size_list(kind))
-
-
-def _as_table(column: pa.Array) -> NDArray[np.float32]:
-    """Return a column of x, numbers or lists, as an array of shape (n, k)."""
-    values: NDArray[np.float32] = (column.flatten() if _is_list(column.type) else column).to_numpy().astype(np.float32)
-    return values.reshape(len(column), -1)

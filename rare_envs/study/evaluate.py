@@ -1,4 +1,4 @@
-"""Evaluation of an ego, into a folder or not; an interrupted run is continued, and the size of a run is planned.
+"""Evaluation of an ego, or of two, into a folder or not; an interrupted run is continued, and its size is planned.
 
 A sample of the simulations of a run is done again at its end, in another order and company: f is to be a function of x.
 An ego that is random after its first call, keeps a counter that nobody resets, or whose row depends on the other rows
@@ -7,12 +7,12 @@ of its batch gives an f that is none, and a p that means nothing; at the first c
 
 from __future__ import annotations
 
+import contextlib
 import math
 import reprlib
 import shlex
 import time
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import closing
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
@@ -23,9 +23,13 @@ import numpy as np
 import agents
 import samplers
 from agents.loading import find_ego_kind
+from rare_envs.files import format_json, replace_text
 from rare_envs.plugins import EgoGone
 from rare_envs.problem import DrivingProblem
+from rare_envs.startup import __version__
+from rare_envs.study import writing
 from rare_envs.study.arguments import (
+    FIRST_BATCH,
     BadInput,
     Question,
     RunInterrupted,
@@ -36,28 +40,21 @@ from rare_envs.study.arguments import (
     output_folder,
 )
 from rare_envs.study.episodes import EpisodeTable
-from rare_envs.study.failures import CrashKinds, classify_failures, list_all_kinds
-from rare_envs.study.question import (
-    Study,
-    build_problem,
-    digest_files,
-    find_changed_files,
-    note_question,
-    open_question,
-    prepare,
-)
+from rare_envs.study.failures import CrashKinds, classify_failures
+from rare_envs.study.question import Study, build_problem, digest_files, find_changed_files, open_question, prepare
 from rare_envs.study.report import Repeatability, Report
 from rare_envs.study.run_folder import STUDY
-from rare_envs.study.writing import begin_journal, begin_study_file, continue_journal, finish_run, note_resumption
 from samplers.estimation import add_ensemble_run, check_base, run_method
 from samplers.evaluate import Evaluator, Executor, Simulated, find_changed
 from samplers.journal import Journal
 from samplers.problem import FloatArray, OnError
-from samplers.sample import Status
 from samplers.workers import ExecutorError
 
 KEPT_ROWS, COMPANY, ROWS_ALONE = 64, 16, 2
 """Simulations that are done again, how many of them in one batch, and how many also each alone."""
+COMPARISON = "comparison.json"
+UNUSED_FIELDS = ("target_cov", "replicates", "on_error", "sensitivity")
+"""Fields of a question that a comparison does not use."""
 
 
 def run(
@@ -98,36 +95,38 @@ def run(
     start, study = time.perf_counter(), settle_chunk(study, executor)
     advice = "" if journal else " With --out finished simulations would have been kept."
     evaluator = open_evaluator(study, journal, executor)
-    keeper = RowKeeper(study.problem.dim, study.question.gamma)
-    with closing(EpisodeTable(folder, study.problem.space)) as table:
+    keeper = RowKeeper(study.question.gamma)
+
+    def report_on(estimate: samplers.Estimate) -> Report:
+        kinds, faults = CrashKinds(unknown="the run was interrupted"), tuple(evaluator.faults)
+        return Report(study, estimate, time.perf_counter() - start, faults, kinds, evaluator.n_retried)
+
+    with contextlib.closing(EpisodeTable(folder, study.problem.space)) as table:
         evaluator.watchers += [keeper.keep, table.add]
         try:
-            estimate = _estimate(study, evaluator, progress)
+            check_base(study.problem)
+            arguments, run = study.question.run_arguments, partial(run_method, evaluator, progress=progress)
+            with evaluator:
+                estimate = run(evaluator, study.method, arguments)
+                if study.question.ensemble_run:
+                    estimate = add_ensemble_run(estimate, evaluator, study.method, arguments, run)
+            report = report_on(estimate)
         except EgoGone as error:
             raise BadInput(f"{error}{advice}") from error
         except (ValueError, ExecutorError) as error:
             raise BadInput(error) from error
         except samplers.EstimationInterrupted as stopped:
-            report = _report_early(study, evaluator, stopped.estimate, time.perf_counter() - start)
-            raise RunInterrupted(f"{describe_stop(report.estimate)}{advice}", report) from None
+            raise RunInterrupted(f"{describe_stop(stopped.estimate)}{advice}", report_on(stopped.estimate)) from None
         except KeyboardInterrupt:
             made = f"{evaluator.n_made:,} simulations made, {evaluator.n_failed:,} of them failed.{advice}"
             known = made if evaluator.n_made else "no simulation made."
             raise RunInterrupted(f"Stopped: no estimate yet, {known}") from None
-        report = _report_early(study, evaluator, estimate, time.perf_counter() - start)
         with keep_answer(report):
-            estimate, kinds = list_all_kinds(study.problem, estimate, classify_failures(study.problem, estimate))
+            estimate, kinds = classify_failures(study.problem, report.estimate)
             report = replace(report, estimate=estimate, kinds=kinds)
             table.write(estimate, kinds.by_scenario)
     with keep_answer(report):
-        again = recheck(study, keeper)
-    return replace(report, repeatability=again, lost=table.lost)
-
-
-def _report_early(study: Study, evaluator: Evaluator, estimate: samplers.Estimate, seconds: float) -> Report:
-    """Return the report of an estimate whose failures were not driven again."""
-    kinds = CrashKinds(unknown="the run was interrupted")
-    return Report(study, estimate, seconds, tuple(evaluator.faults), kinds, evaluator.n_retried)
+        return replace(report, repeatability=recheck(study, keeper), lost=table.lost)
 
 
 def settle_chunk(study: Study, executor: Executor | None) -> Study:
@@ -177,71 +176,36 @@ def _load_problem(question: Question, files: dict[str, str]) -> DrivingProblem:
     return build_problem(question, ego)
 
 
-def _estimate(
-    study: Study, evaluator: Evaluator, progress: bool | Callable[[samplers.Progress], None]
-) -> samplers.Estimate:
-    """Run the method of a study, and the further run under the refits."""
-    check_base(study.problem)
-    arguments, run = study.question.run_arguments, partial(run_method, evaluator, progress=progress)
-    with evaluator:
-        estimate = run(evaluator, study.method, arguments)
-        if study.question.ensemble_run:
-            estimate = add_ensemble_run(estimate, evaluator, study.method, arguments, run)
-    return estimate
-
-
 class RowKeeper:
-    """Keeps `size` of the scenarios that are simulated, with their f.
+    """Keeps `KEPT_ROWS` of the scenarios that are simulated, with their f."""
 
-    Half of them are a uniform sample, half those with f nearest to the threshold gamma, which decide p: in ordinary
-    traffic most scenarios have the largest f there is, whatever the ego does.
-    """
-
-    def __init__(self, dim: int, gamma: float, size: int = KEPT_ROWS) -> None:
-        self._gamma, self._size, self._seen = gamma, size // 2, 0
-        self._sample = self._near = np.empty((0, dim + 1))
+    def __init__(self, gamma: float) -> None:
+        self._gamma = gamma
+        self._kept: list[FloatArray] = []
         self._rng = np.random.default_rng(0)  # of its own, so that the run draws what it would draw without
 
     @property
-    def x(self) -> FloatArray:
-        """Scenarios kept, shape (n, d)."""
-        return np.vstack((self._sample, self._near))[:, :-1]
-
-    @property
-    def f(self) -> FloatArray:
-        """Their f, shape (n,)."""
-        return np.concatenate((self._sample[:, -1], self._near[:, -1]))
+    def rows(self) -> tuple[FloatArray, FloatArray]:
+        """The scenarios x (n, d) and their f (n,)."""
+        rows = np.vstack(self._kept)
+        return rows[:, 2:], rows[:, 1]
 
     def keep(self, seen: Simulated) -> None:
-        """Keep some of the scenarios that were simulated."""
-        rows = np.column_stack((seen.x, seen.f))[~np.isnan(seen.f)]
-        self._keep_sample(rows)
-        rows = np.vstack((self._near, rows))
-        self._near = rows[np.argsort(np.abs(rows[:, -1] - self._gamma), kind="stable")[: self._size]]
-
-    def _keep_sample(self, rows: FloatArray) -> None:
-        """Give each scenario so far the same chance to be in the sample (Vitter's algorithm R)."""
-        room = self._size - len(self._sample)
-        kept = np.vstack((self._sample, rows[:room]))
-        later = np.arange(min(room, len(rows)), len(rows))
-        place = (self._rng.random(len(later)) * (self._seen + 1 + later)).astype(np.int64)
-        for row, at in zip(later[place < self._size], place[place < self._size], strict=True):
-            kept[at] = rows[row]
-        self._sample = kept
-        self._seen += len(rows)
+        """Keep some of the scenarios that were simulated: those of the least rank, at random or by distance."""
+        known = ~np.isnan(seen.f)
+        ranks = (self._rng.random(len(known)), np.abs(seen.f - self._gamma))
+        new = [np.column_stack((rank, seen.f, seen.x))[known] for rank in ranks]
+        both = [np.vstack(pair) for pair in zip(self._kept, new, strict=True)] if self._kept else new
+        self._kept = [rows[np.argsort(rows[:, 0], kind="stable")[: KEPT_ROWS // 2]] for rows in both]
 
 
 def recheck(study: Study, kept: RowKeeper) -> Repeatability | None:
-    """Simulate the kept scenarios again: in another order and in small batches, and a few each alone.
-
-    None where ego and measure are rules of this package, which keep nothing; where the ego says that its answers vary;
-    and where it is gone, which must not cost the answer.
-    """
+    """Simulate the kept scenarios again: in another order and in small batches, and a few each alone."""
     problem = study.problem
     rules = isinstance(problem.ego, str) and problem.ego in ("idm", "human") and ":" not in study.question.measure
     if problem.needs.varies or rules:
         return None
-    x, f = kept.x, kept.f
+    x, f = kept.rows
     order = np.random.default_rng(1).permutation(len(f))
     batches = [order[first : first + COMPANY] for first in range(0, len(order), COMPANY)]
     batches += [order[row : row + 1] for row in range(min(ROWS_ALONE, len(order)))]
@@ -290,11 +254,9 @@ def run_into(
         ['episodes.parquet', 'failures.csv', 'plot.png', 'result.json', 'study.json']
     """
     study = settle_chunk(study, executor)
-    with output_folder(folder):
-        with closing(begin_journal(folder, study.question, force)) as journal:
-            begin_study_file(folder, study)
-            note_question(study.question)
-            return _run(folder, study, journal, progress, executor)
+    with output_folder(folder), contextlib.closing(writing.begin_journal(folder, study.question, force)) as journal:
+        writing.begin_study_file(folder, study)
+        return _run(folder, study, journal, progress, executor)
 
 
 def resume(
@@ -306,32 +268,9 @@ def resume(
     mend: bool = False,
     executor: Executor | None = None,
 ) -> Report:
-    """Continue an interrupted run; the answer is that of an undisturbed one.
-
-    Args:
-        folder: Of the run.
-        ego: Address of an ego in another program, if it has changed.
-        on_error: What to count scenarios as on which the ego fails, if that has changed.
-        trust: Let the ego's file run code, as the run was allowed to, and code that a run from elsewhere names.
-        progress: Show a bar on standard error.
-        mend: Of a damaged journal, keep the simulations before the damage.
-        executor: As in `run`; it need not be that with which the run was begun. It gets the chunks in which that was
-            begun, so that the answer is the same to the bit.
-
-    Raises:
-        BadInput: There is no unfinished run, or it cannot be continued: its journal is damaged or in use, or a file
-            that it names has changed.
-        UnwrittenResults: The run is done, but its results cannot be written.
-        RunInterrupted: It was interrupted again.
-
-    Example:
-        >>> resume(Path("runs/nowhere"))
-        Traceback (most recent call last):
-            ...
-        rare_envs.study.arguments.BadInput: There is no unfinished run in 'runs/nowhere': the folder does not exist. Of a run that was stopped before its first simulations, give the command again.
-    """  # noqa: E501 (the example shows a whole message)
-    journal, question = continue_journal(folder, mend)
-    with closing(journal):
+    """Continue an interrupted run; the answer is that of an undisturbed one."""
+    journal, question = writing.continue_journal(folder, mend)
+    with contextlib.closing(journal):
         question = replace(open_question(asdict(question), folder, trust), core=question.core, device=question.device)
         if ego is not None and {find_ego_kind(ego), find_ego_kind(question.ego)} != {"remote"}:
             raise BadInput(f"Expected --ego for one whose address has changed only; the run has {question.ego!r}.")
@@ -345,7 +284,7 @@ def resume(
         study = prepare(question)
         if question.chunk is None and executor is not None:  # it is continued in the batches in which it was begun
             study = replace(study, question=replace(question, chunk=study.problem.tile))
-        note_resumption(folder, journal.earlier_seconds)
+        writing.note_resumption(folder, journal.earlier_seconds)
         return _run(folder, study, journal, progress, executor)
 
 
@@ -354,13 +293,22 @@ def _run(folder: Path, study: Study, journal: Journal, progress: bool, executor:
     target, earlier = folder.absolute(), journal.earlier_seconds  # an ego may change the working directory
 
     def kept(report: Report | None = None) -> str:
-        return _describe_kept(journal, folder, study.question.trust, report)
+        if not journal.has_simulations or not journal.flush():
+            return ""
+        count = f"{journal.n:,} simulations"
+        if report is not None and report.estimate.status is not samplers.Status.STOPPED:
+            n, further = report.estimate.n_sim, report.estimate.ensemble_run
+            n_further = journal.n - n if further is None else further.n_sim
+            if n_further > 0:
+                count = f"{n:,} simulations and a further {n_further:,} under the mixture of the refits"
+        trust = " --trust" if study.question.trust else ""
+        return f" {count} are kept; go on with: rare-envs resume {shlex.quote(str(folder))}{trust}"
 
     try:
         report = run(study, progress, journal, executor, target)
         report = replace(report, seconds=report.seconds + earlier, earlier_seconds=earlier)
         with keep_answer(report):
-            finish_run(target, report)
+            writing.finish_run(target, report)
     except UnwrittenResults as error:
         raise UnwrittenResults(f"{error}{kept(error.report)}", error.report) from error
     except BadInput as error:
@@ -376,37 +324,67 @@ def _run(folder: Path, study: Study, journal: Journal, progress: bool, executor:
     return report
 
 
-def _describe_kept(journal: Journal, folder: Path, trust: bool, report: Report | None) -> str:
-    """Return the number of simulations kept and the command that continues the run, behind a space."""
-    if not journal.has_simulations or not journal.flush():
-        return ""
-    count = f"{journal.n:,} simulations"
-    if report is not None and report.estimate.status is not Status.STOPPED:
-        n, further = report.estimate.n_sim, report.estimate.ensemble_run
-        n_further = journal.n - n if further is None else further.n_sim
-        if n_further > 0:
-            count = f"{n:,} simulations and a further {n_further:,} under the mixture of the refits"
-    return f" {count} are kept; go on with: rare-envs resume {shlex.quote(str(folder))}{' --trust' if trust else ''}"
+def compare_egos(
+    question: Question,
+    ego_b: str,
+    progress: bool = False,
+    out: Path | None = None,
+    force: bool = False,
+    algo_b: str | None = None,
+    stats_b: str | None = None,
+) -> tuple[samplers.Comparison, dict[str, Any]]:
+    """Estimate p_A / p_B, see `samplers.compare`; some simulations of each are done again at the end."""
+    if out is not None and not force:
+        writing.check_no_results(out, COMPARISON)
+    studies = {"A": prepare(question), "B": prepare(replace(question, ego=ego_b, algo=algo_b, stats=stats_b))}
+    dims = [study.problem.dim for study in studies.values()]
+    if dims[0] != dims[1]:  # of the egos that are shipped, human and noisy:EGO
+        raise BadInput(
+            f"Expected two egos with the same x, got {dims[0]} and {dims[1]} dimensions, as an ego that is "
+            "random has its own in x: estimate each by itself."
+        )
+    kept = {name: RowKeeper(question.gamma) for name in studies}
+    evaluators = {name: Evaluator(each.problem, question.gamma, name="The ego") for name, each in studies.items()}
+    for name, evaluator in evaluators.items():
+        evaluator.watchers.append(kept[name].keep)
+    asked: dict[str, Any] = {name: getattr(question, name) for name in ("gamma", "seed", "max_sim", "ensemble_run")}
+    with contextlib.nullcontext() if out is None else output_folder(out):
+        try:
+            with as_bad_input(ValueError, EgoGone):
+                method = studies["A"].method
+                found = samplers.compare(evaluators["A"], evaluators["B"], method, progress=progress, **asked)
+        except samplers.EstimationInterrupted as stopped:
+            raise RunInterrupted(describe_stop(stopped.estimate, "P[A or B fails]")) from None
+        except KeyboardInterrupt:
+            raise RunInterrupted(FIRST_BATCH) from None
+        checks = {name: recheck(study, kept[name]) for name, study in studies.items()}
+        doubts = [f"{name}: {check.warning}" for name, check in checks.items() if check is not None and check.warning]
+        found = replace(found, warnings=(*found.warnings, *doubts))
+        inputs = {key: value for key, value in asdict(question).items() if key not in UNUSED_FIELDS}
+        answer = {
+            **found.to_dict(),
+            "question": {"ego_a": inputs.pop("ego"), "ego_b": ego_b, **inputs, "algo_b": algo_b, "stats_b": stats_b},
+            "notes": [f"{name}: {note}" for name, study in studies.items() for note in study.problem.notes],
+            "version": __version__,
+        }
+        if out is not None:
+            replace_text(out / COMPARISON, format_json(answer) + "\n")
+            writing.write_failures(out, studies["A"].problem.space, found.either.failures)
+    return found, answer
 
 
 def plan_from_result(recorded: Mapping[str, Any], target_cov: float) -> tuple[samplers.PlannedRun, ...]:
-    """Return what the method of a run, and plain Monte Carlo, need."""
-    p, cov, n_sim, seconds = (_read_number(recorded, name) for name in ("p", "cov", "n_sim", "seconds"))
+    """Return what the method of a run, of which result.json holds this, and plain Monte Carlo need."""
     described = recorded.get("method")
     name = described.get("name") if isinstance(described, Mapping) else None
+    p, cov, n_sim, seconds = (_read_number(recorded, each) for each in ("p", "cov", "n_sim", "seconds"))
     with as_bad_input(ValueError):
         method = samplers.get_method(name if isinstance(name, str) else reprlib.repr(name))
-        final = _read_number(recorded, "final_draws") if recorded.get("final_draws") is not None else None
+        final = None if recorded.get("final_draws") is None else int(_read_number(recorded, "final_draws"))
         if final is not None and final > n_sim:
-            raise ValueError(f"The result of the run says {final:g} final draws of {n_sim:g} simulations.")
-        pilot = samplers.Pilot(
-            method=method.name,
-            p=p,
-            cov=cov,
-            n_sim=int(n_sim),
-            final_draws=int(final) if final is not None and method.stops_at_target else None,
-            seconds=seconds,
-        )
+            raise ValueError(f"The result says {final} final draws of {n_sim:g} simulations.")
+        kept = final if method.stops_at_target else None
+        pilot = samplers.Pilot(method=method.name, p=p, cov=cov, n_sim=int(n_sim), final_draws=kept, seconds=seconds)
         return samplers.plan_runs(pilot, target_cov)
 
 
@@ -416,27 +394,14 @@ def plan_by_pilots(
     """Run a pilot by each method, and return what each needs; plain Monte Carlo last."""
     found: dict[str, samplers.PlannedRun] = {}
     with as_bad_input(ValueError):
-        for name in methods:  # all of them before the first pilot, which may take hours
-            samplers.get_method(name)
+        chosen = {name: samplers.get_method(name) for name in methods}  # before a pilot, which may take hours
     study = prepare(replace(question, method=methods[0], ensemble_run=False))
-    for name in methods:
+    for name, method in chosen.items():
         with as_bad_input(ValueError):
-            method = samplers.get_method(name)
-            asked = replace(study, question=replace(study.question, method=name), method=method)
-            report = run(asked, progress)
-            for planned in samplers.plan_runs(report.estimate.pilot(report.seconds), target_cov):
-                if planned.method != "mc" or planned.method not in found:
-                    found[planned.method] = planned
-    last = found.pop("mc")
-    return (*found.values(), last)
-
-
-def format_seconds(seconds: float) -> str:
-    """Return a time in a unit of its size."""
-    for size, unit in ((120.0, "s"), (7200.0, "min")):
-        if seconds < size:
-            return f"{max(1, math.ceil(seconds / {'s': 1, 'min': 60}[unit]))} {unit}"
-    return f"{seconds / 3600:,.0f} h"
+            report = run(replace(study, question=replace(study.question, method=name), method=method), progress)
+            planned = samplers.plan_runs(report.estimate.pilot(report.seconds), target_cov)
+            found |= {each.method: each for each in planned if each.method not in found}
+    return tuple(sorted(found.values(), key=lambda each: each.method == "mc"))
 
 
 def _read_number(recorded: Mapping[str, Any], name: str) -> float:

@@ -10,6 +10,7 @@ References:
 
 from __future__ import annotations
 
+import contextlib
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -47,6 +48,8 @@ from samplers.problem import FloatArray
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
+VARIES = "the ego's answers vary from run to run, so that its failures cannot be seen again"
+"""Why crashes are not known."""
 MAX_REPLAYED = 10_000
 """Largest number of failing points that are driven again, evenly spaced among all."""
 MAX_REPLAYED_FURTHER = 2_000
@@ -61,13 +64,22 @@ class ReplayedFailures(NamedTuple):
     crash: Crash
     """Crashes of the points that have an outcome, in their order."""
 
+    def severities(self, any_vehicle: bool) -> tuple[FloatArray, FloatArray]:
+        """Return delta-v [m/s] (-inf without a collision) and expected injuries of each failing point, shape (k,)."""
+        kind, known = self.crash.kind.numpy(), self.failures.has_outcome
+        counts = (kind != NONE) & (any_vehicle | (kind != OTHERS))
+        delta_v, injuries = np.full(len(known), -np.inf), np.zeros(len(known))
+        delta_v[known] = np.where(counts, self.crash.delta_v.double().amax(dim=1).numpy(), -np.inf)
+        injuries[known] = np.where(counts, self.crash.injury_risk.double().sum(dim=1).numpy(), 0.0)
+        return delta_v, injuries
+
 
 def replay_failures(
     problem: DrivingProblem, estimate: EstimateData, most: int | None = MAX_REPLAYED
 ) -> tuple[ReplayedFailures, ReplayedFailures | None]:
     """Drive failing points of a run once more, and those of its run under the mixture of the refits, if it has one."""
     if problem.varies:
-        raise ValueError("The ego's answers vary from run to run, so that its failures cannot be seen again.")
+        raise ValueError(f"{VARIES[0].upper()}{VARIES[1:]}.")
 
     def replay(run: EstimateData, most: int | None) -> ReplayedFailures:
         failures = weigh_failures(run, most)
@@ -88,11 +100,7 @@ SHOWN_THRESHOLDS = 3
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Severity:
-    """How severe the collisions among the failures of a run are.
-
-    Of the two vehicles of a collision the larger delta-v counts. Injuries are those of one occupant in each of the two,
-    MAIS 3 or more, see `rare_envs.traffic.crash.injury_risk`.
-    """
+    """How severe the collisions among the failures of a run are."""
 
     curve: Exceedance
     """P[failure in a collision with delta-v > v] over v [m/s], with simultaneous bands of the sampling and, where the
@@ -113,8 +121,7 @@ class Severity:
     def __str__(self) -> str:
         """Return a few lines for people."""
         curve, shown, (low, high) = self.curve, self._shown_thresholds, self.injuries.interval
-        ends = [f" [{curve.low[i]:.1e}, {curve.high[i]:.1e}]" for i in shown]
-        lines = [f"collisions with delta-v {self._list_speeds(ends)}"]
+        lines = [f"collisions with delta-v {self._list_speeds(with_ends=True)}"]
         if curve.base is not None and shown:
             base = curve.base
             held = f"{100 * base.confidence:g} % of all thresholds together"
@@ -133,8 +140,8 @@ class Severity:
 
     def summarise(self) -> str:
         """Return a short line for people, without intervals."""
-        speeds = self._list_speeds([""] * len(self._shown_thresholds))
-        return f"delta-v {speeds}; serious injuries (MAIS 3+) {self.injuries.value:.1e} per scenario"
+        injuries = f"serious injuries (MAIS 3+) {self.injuries.value:.1e} per scenario"
+        return f"delta-v {self._list_speeds(with_ends=False)}; {injuries}"
 
     @property
     def _shown_thresholds(self) -> list[int]:
@@ -142,10 +149,12 @@ class Severity:
         known = [i for i, v in enumerate(self.curve.thresholds) if v in SHOWN_DELTA_V and self.curve.low[i] > 0]
         return known[-SHOWN_THRESHOLDS:]
 
-    def _list_speeds(self, ends: list[str]) -> str:
-        """Return the curve at the thresholds that are printed, each with what stands behind it, and the largest."""
-        curve, shown = self.curve, zip(self._shown_thresholds, ends, strict=True)
-        parts = [f"> {curve.thresholds[i]:g} m/s {curve.p[i]:.1e}{end}" for i, end in shown]
+    def _list_speeds(self, with_ends: bool) -> str:
+        """Return the curve at the thresholds that are printed, each with its interval or without, and the largest."""
+        curve, parts = self.curve, []
+        for i in self._shown_thresholds:
+            ends = f" [{curve.low[i]:.1e}, {curve.high[i]:.1e}]" if with_ends else ""
+            parts.append(f"> {curve.thresholds[i]:g} m/s {curve.p[i]:.1e}{ends}")
         return ", ".join([*parts, f"at most {self.largest_delta_v:.2g} m/s"])
 
     def to_dict(self) -> dict[str, Any]:
@@ -209,16 +218,12 @@ def compute_severity(
     further: ReplayedFailures | None = None,
     thresholds: ArrayLike | None = None,
 ) -> Severity | None:
-    """Return the severity of failures that were driven again; None where none of them is a collision.
-
-    `further` are failures of the run under the mixture of the refits, if there is one: they tell the severity under
-    refits that the failures of the first run do not reach.
-    """
+    """Return the severity of failures that were driven again; None where none of them is a collision."""
     failures, any_vehicle = replayed.failures, problem.world.measurement.collisions == "any"
-    delta_v, injuries = _severities(replayed, any_vehicle)
+    delta_v, injuries = replayed.severities(any_vehicle)
     more: list[FurtherFailures | None] = [None, None]
     if further is not None:
-        more = [FurtherFailures(further.failures, values) for values in _severities(further, any_vehicle)]
+        more = [FurtherFailures(further.failures, values) for values in further.severities(any_vehicle)]
     collided = np.isfinite(delta_v)
     if not collided.any():
         return None
@@ -236,17 +241,6 @@ def compute_severity(
         n_failures=failures.total,
         unknown=float(failures.weights[~failures.has_outcome].sum() / failures.weights.sum()),
     )
-
-
-def _severities(replayed: ReplayedFailures, any_vehicle: bool) -> tuple[FloatArray, FloatArray]:
-    """Return delta-v [m/s] (-inf without a collision) and expected injuries of each failing point, shape (k,) each."""
-    crash, known = replayed.crash, replayed.failures.has_outcome
-    kind = crash.kind.numpy()
-    counts = (kind != NONE) & (any_vehicle | (kind != OTHERS))
-    delta_v, injuries = np.full(len(known), -np.inf), np.zeros(len(known))
-    delta_v[known] = np.where(counts, crash.delta_v.double().amax(dim=1).numpy(), -np.inf)
-    injuries[known] = np.where(counts, crash.injury_risk.double().sum(dim=1).numpy(), 0.0)
-    return delta_v, injuries
 
 
 def _format_ends(low: float, high: float) -> str:
@@ -328,10 +322,7 @@ def find_modes(space: ScenarioSpace, estimate: samplers.Estimate, crashes: Crash
 
 
 def assign_modes(space: ScenarioSpace, estimate: samplers.Estimate, crashes: Crashes) -> LabelledFailures | None:
-    """Return at most `MAX_CLUSTERED` failing points with their modes; None where nothing failed or has a weight.
-
-    A failure of the list has the mode of the nearest clustered failure of its kind.
-    """
+    """Return at most `MAX_CLUSTERED` failing points with their modes; None where nothing failed or has a weight."""
     sample, listed = estimate.sample, estimate.failures
     if sample is None or not (sample.f <= estimate.gamma).any() or estimate.p <= 0:
         return None
@@ -339,11 +330,10 @@ def assign_modes(space: ScenarioSpace, estimate: samplers.Estimate, crashes: Cra
     rows = choose_failures(sample, estimate.gamma, MAX_REPLAYED)
     rows = rows[:: math.ceil(len(rows) / MAX_CLUSTERED)]
     f = sample.f[sample.f <= estimate.gamma][rows]
-    kinds = _find_kinds(sample.x[rows], np.isneginf(f), crashes)
-    u = space.to_standard_normal(sample.x[rows])[:, shown]
+    kinds = _find_kinds(sample.x[rows], crashes, np.isneginf(f))
+    kinds_listed = _find_kinds(listed.x, crashes, np.isnan(listed.f))
+    u, u_listed = (space.to_standard_normal(x)[:, shown] for x in (sample.x[rows], listed.x))
     labels = label_modes(u, kinds)
-    kinds_listed = _find_kinds(listed.x, np.isnan(listed.f), crashes)
-    u_listed = space.to_standard_normal(listed.x)[:, shown]
     found = np.full(len(listed), "", dtype=object)
     for kind in dict.fromkeys(kinds_listed.tolist()):
         mine, like = kinds_listed == kind, np.flatnonzero(kinds == kind)
@@ -352,10 +342,11 @@ def assign_modes(space: ScenarioSpace, estimate: samplers.Estimate, crashes: Cra
     return LabelledFailures(rows, kinds, labels, found)
 
 
-def _find_kinds(x: FloatArray, without_outcome: NDArray[np.bool_], crashes: Crashes) -> NDArray[np.object_]:
-    """Return the kinds of crash of scenarios x (n, d), shape (n,); "" where that is not known."""
+def _find_kinds(x: FloatArray, crashes: Crashes, failed: NDArray[np.bool_] | None = None) -> NDArray[np.object_]:
+    """Return the kinds of crash of scenarios x (n, d), shape (n,); "" where that is not known, and where f failed."""
     kinds = np.array([crashes.get(digest, "") for digest in digest_scenarios(x)], dtype=object)
-    kinds[without_outcome] = NO_OUTCOME_LABEL
+    if failed is not None:
+        kinds[failed] = NO_OUTCOME_LABEL
     return kinds
 
 
@@ -403,33 +394,54 @@ class CrashKinds:
     by_scenario: Crashes = field(default_factory=dict, repr=False)
     severity: Severity | None = None
     """How severe the collisions are; None if there are none, or it is not known."""
+    modes: tuple[FailureMode, ...] = ()
+    """Modes of failure, the largest first; empty if they are not known."""
 
 
-def classify_failures(problem: DrivingProblem, estimate: samplers.Estimate) -> CrashKinds:
+def classify_failures(problem: DrivingProblem, estimate: samplers.Estimate) -> tuple[samplers.Estimate, CrashKinds]:
     """Drive failures of a run once more: those of its list, and for shares and severity `MAX_REPLAYED` of all."""
-    known = np.isfinite(estimate.failures.f)
-    if not known.any():
-        return CrashKinds()
-    if problem.varies:
-        return CrashKinds(unknown="the ego's answers vary from run to run, so that its failures cannot be seen again")
-    try:
-        crashes = problem.crashes(estimate.failures.x[known])
-        by_scenario = _label_scenarios(estimate.failures.x[known], crashes)
-        shares, severity = _weigh_crashes(problem, estimate, by_scenario)
-    except (Exception, SystemExit, EgoGone) as error:  # the ego is the user's, and need not do again what it did before
-        return CrashKinds(unknown=f"{type(error).__name__}: {error}")
-    row = np.cumsum(known) - 1
-    listed = (describe_crash(crashes, int(at)) if one else None for at, one in zip(row, known, strict=True))
-    return CrashKinds(shares, tuple(listed), by_scenario=by_scenario, severity=severity)
+    estimate = replace(estimate, failures=_drop_repeated(estimate.failures))
+    known, kinds = np.isfinite(estimate.failures.f), dict[bytes, str]()
+    described: dict[bytes, dict[str, Any] | None] = {}
+
+    def drive(x: FloatArray) -> None:
+        crash = problem.crashes(x)
+        kinds.update(_label_scenarios(x, crash))
+        described.update((digest, describe_crash(crash, row)) for row, digest in enumerate(digest_scenarios(x)))
+
+    shares: Mapping[str, samplers.Share] = {}
+    severity = None
+    if known.any():
+        if problem.varies:
+            return estimate, CrashKinds(unknown=VARIES)
+        try:
+            drive(estimate.failures.x[known])
+            shares, severity = _weigh_crashes(problem, estimate, kinds)
+        except (Exception, SystemExit, EgoGone) as error:  # the ego is the user's, and need not do again what it did
+            return estimate, CrashKinds(unknown=f"{type(error).__name__}: {error}")
+        longer = list_every_mode(problem.space, estimate, kinds)
+        with contextlib.suppress(Exception, SystemExit, EgoGone):  # likewise
+            driven = np.array([digest in described for digest in digest_scenarios(longer.failures.x)])
+            new = ~driven & np.isfinite(longer.failures.f)
+            if new.any():
+                drive(longer.failures.x[new])
+            estimate = longer
+    listed = tuple(described.get(digest) for digest in digest_scenarios(estimate.failures.x))
+    modes = find_modes(problem.space, estimate, kinds)
+    return estimate, CrashKinds(shares, listed, by_scenario=kinds, severity=severity, modes=modes)
+
+
+def _drop_repeated(failures: samplers.Failures) -> samplers.Failures:
+    """Return failures without those whose scenario is listed before, as chains that stay in a place make them."""
+    first = {digest: row for row, digest in reversed(list(enumerate(digest_scenarios(failures.x))))}
+    rows = sorted(first.values())
+    return replace(failures, x=failures.x[rows], f=failures.f[rows], log_p0=failures.log_p0[rows])
 
 
 def _weigh_crashes(
     problem: DrivingProblem, estimate: samplers.Estimate, by_scenario: dict[bytes, str]
 ) -> tuple[dict[str, samplers.Share], Severity | None]:
-    """Return p by kind of crash and the severity, from failing points that are driven again once for both.
-
-    The kind of each is added to `by_scenario`.
-    """
+    """Return p by kind of crash and the severity, from failing points that are driven again once for both."""
     if estimate.sample is None or not estimate.p:  # no failures, or the search's alone
         return {}, None
     replayed, further = replay_failures(problem, estimate)
@@ -446,41 +458,18 @@ def _label_scenarios(x: FloatArray, crash: Crash) -> dict[bytes, str]:
     return {key: CRASH_KINDS[int(kind)] for key, kind in zip(digest_scenarios(x), crash.kind, strict=True)}
 
 
-def list_all_kinds(
-    problem: DrivingProblem, estimate: samplers.Estimate, kinds: CrashKinds
-) -> tuple[samplers.Estimate, CrashKinds]:
-    """Return both with one failure at least of each kind of crash and each mode in the list of failures."""
-    if not kinds.by_scenario:
-        return estimate, kinds
-    longer, added = list_every_mode(problem.space, estimate, kinds.by_scenario)
-    if not len(added):
-        return estimate, kinds
-    try:
-        crashes = problem.crashes(longer.failures.x[added])
-    except (Exception, SystemExit, EgoGone):  # the ego is the user's, and need not do again what it did before
-        return estimate, kinds
-    listed = list(kinds.listed)
-    for at, row in enumerate(added.tolist()):
-        listed.insert(row, describe_crash(crashes, at))
-    return longer, replace(kinds, listed=tuple(listed))
-
-
-def list_every_mode(
-    space: ScenarioSpace, estimate: samplers.Estimate, crashes: Crashes
-) -> tuple[samplers.Estimate, NDArray[np.int64]]:
-    """Return an estimate that lists a failure of each mode and kind of crash, and where the new ones stand."""
+def list_every_mode(space: ScenarioSpace, estimate: samplers.Estimate, crashes: Crashes) -> samplers.Estimate:
+    """Return an estimate that lists a failure of each mode and kind of crash."""
     failures, sample = estimate.failures, estimate.sample
     if failures.total <= len(failures) or sample is None or estimate.p <= 0:
-        return estimate, np.empty(0, dtype=np.int64)
+        return estimate
     rows = choose_failures(sample, estimate.gamma, MAX_REPLAYED)
-    kinds, listed = (_find_kinds(x, np.zeros(len(x), dtype=bool), crashes) for x in (sample.x[rows], failures.x))
+    kinds, listed = (_find_kinds(x, crashes) for x in (sample.x[rows], failures.x))
     longer = _list_more(estimate, rows, kinds, {*listed, ""})
     found = assign_modes(space, longer, crashes)
-    if found is not None:
-        longer = _list_more(longer, found.rows, found.labels, {*found.listed, f"{NO_OUTCOME_LABEL}/0", "/0"})
-    known = set(digest_scenarios(failures.x))
-    added = [row for row, digest in enumerate(digest_scenarios(longer.failures.x)) if digest not in known]
-    return longer, np.array(added, dtype=np.int64)
+    if found is None:
+        return longer
+    return _list_more(longer, found.rows, found.labels, {*found.listed, f"{NO_OUTCOME_LABEL}/0", "/0"})
 
 
 def _list_more(

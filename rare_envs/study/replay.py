@@ -1,15 +1,9 @@
-"""Replay: one scenario, or a failure that a run has recorded, driven again, every moment of it kept.
-
-Exchange formats have a flat frame with y to the left and headings counter-clockwise. Ours has y to the right and
-headings clockwise (`rare_envs.traffic.state`); x is the same. On a curved road, world coordinates are those of
-`rare_envs.traffic.road.Road.to_world`, mirrored.
-"""
+"""Replay: one scenario, or a failure that a run has recorded, driven again, every moment of it kept."""
 
 from __future__ import annotations
 
-import importlib
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -17,7 +11,6 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 from rare_envs.distributions.space import ScenarioSpace
 from rare_envs.measures import Moment
@@ -38,13 +31,9 @@ OWN_NOISE = "ego_noise"
 """Parameter that an ego has which is random itself."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Drive:
     """T + 1 moments of N vehicles, the ego first; the last one is the collision, if there is one.
-
-    Attributes:
-        problem: The world and its ego.
-        episodes: The moments, each a batch of one.
 
     Example:
         >>> problem = DrivingProblem("rare_envs/CarFollowing-v0", horizon=1.0)
@@ -54,42 +43,37 @@ class Drive:
     """
 
     problem: DrivingProblem
+    """The world and its ego."""
     episodes: tuple[Episode, ...]
+    """The moments, each a batch of one."""
+    time: FloatArray = field(init=False)
+    """Time [s], shape (T + 1,)."""
+    position: FloatArray = field(init=False)
+    """Centres, along and across the road [m], shape (T + 1, N, 2)."""
+    heading: FloatArray = field(init=False)
+    """Heading [rad], shape (T + 1, N)."""
+    speed: FloatArray = field(init=False)
+    """Speed [m/s], shape (T + 1, N)."""
+    gap: FloatArray = field(init=False)
+    """Bumper to bumper from the ego to its lead [m], shape (T + 1,)."""
+    closing_speed: FloatArray = field(init=False)
+    """Of the ego on its lead, positive when closing [m/s], shape (T + 1,)."""
+    f_so_far: FloatArray = field(init=False)
+    """Safety measure of the episode up to each moment, shape (T + 1,)."""
 
-    @cached_property
-    def time(self) -> FloatArray:
-        """Time [s], shape (T + 1,)."""
-        return np.arange(len(self.episodes), dtype=np.float64) * self.problem.world.clock.dt
-
-    @cached_property
-    def position(self) -> FloatArray:
-        """Centres, along and across the road [m], shape (T + 1, N, 2)."""
-        return self._stack(lambda each: torch.stack((each.state.x[0], each.state.y[0]), dim=-1))
-
-    @cached_property
-    def heading(self) -> FloatArray:
-        """Heading [rad], shape (T + 1, N)."""
-        return self._stack(lambda each: each.state.heading[0])
-
-    @cached_property
-    def speed(self) -> FloatArray:
-        """Speed [m/s], shape (T + 1, N)."""
-        return self._stack(lambda each: each.state.speed[0])
-
-    @cached_property
-    def gap(self) -> FloatArray:
-        """Bumper to bumper from the ego to its lead [m], shape (T + 1,)."""
-        return self._stack(lambda each: each.lead.gap[0])
-
-    @cached_property
-    def closing_speed(self) -> FloatArray:
-        """Of the ego on its lead, positive when closing [m/s], shape (T + 1,)."""
-        return self._stack(lambda each: each.lead.closing_speed[0])
-
-    @cached_property
-    def f_so_far(self) -> FloatArray:
-        """Safety measure of the episode up to each moment, shape (T + 1,)."""
-        return self._stack(lambda each: each.f[0])
+    def __post_init__(self) -> None:
+        """Put the moments side by side."""
+        states, leads = [each.state for each in self.episodes], [each.lead for each in self.episodes]
+        for name, moments in {
+            "position": [torch.stack((state.x[0], state.y[0]), dim=-1) for state in states],
+            "heading": [state.heading[0] for state in states],
+            "speed": [state.speed[0] for state in states],
+            "gap": [lead.gap[0] for lead in leads],
+            "closing_speed": [lead.closing_speed[0] for lead in leads],
+            "f_so_far": [each.f[0] for each in self.episodes],
+            "time": list(torch.arange(len(states), dtype=torch.float64) * self.problem.world.clock.dt),
+        }.items():
+            object.__setattr__(self, name, torch.stack(moments).double().numpy())
 
     @cached_property
     def f_alone(self) -> FloatArray:
@@ -131,9 +115,6 @@ class Drive:
     def names(self) -> tuple[str, ...]:
         """Names of the vehicles, length N."""
         return self.problem.world.scenario.labels
-
-    def _stack(self, value: Callable[[Episode], Tensor]) -> FloatArray:
-        return torch.stack([value(each) for each in self.episodes]).double().numpy()
 
 
 @torch.inference_mode()
@@ -178,13 +159,7 @@ class RecordedFailure(NamedTuple):
 
 
 def find_failure(folder: Path, number: int, trust: bool = False, ego: str | None = None) -> RecordedFailure:
-    """Return failure `number` of a run, the most likely being number 0; with another ego in its world, if one is named.
-
-    What code the run or the egos name runs only with `trust`, unless the run was made here.
-
-    Raises:
-        BadInput: There is no such run or failure, or what it was about cannot be loaded any longer.
-    """
+    """Return failure `number` of a run, 0 being the most likely; with another ego in its world, if one is named."""
     run = load_finished(folder)
     question, table, count = open_run(run, trust), run.failures, len(run.failures["f"])
     warn_of_changed_files(question, folder)
@@ -202,11 +177,7 @@ def find_failure(folder: Path, number: int, trust: bool = False, ego: str | None
 
 
 def read_row(table: Mapping[str, NDArray[Any]], problem: DrivingProblem, number: int) -> FloatArray:
-    """Return x (d,) of a row of the failures of a run.
-
-    Raises:
-        BadInput: The columns are others than those of the problem, or x is no scenario of its traffic.
-    """
+    """Return x (d,) of a row of the failures of a run."""
     names = [name for name in problem.space.names if name in table]
     try:
         x = join_parts({name: table[name][number] for name in names}, problem.space)
@@ -219,10 +190,7 @@ def read_row(table: Mapping[str, NDArray[Any]], problem: DrivingProblem, number:
 
 
 def join_parts(parts: Mapping[str, Any], space: ScenarioSpace) -> FloatArray:
-    """Return x (d,) from the values of its parameters by name.
-
-    An ego's own noise belongs to the ego that failed: another one has zeros, its mean actions.
-    """
+    """Return x (d,) from the values of its parameters by name."""
     found = []
     for name, size in zip(space.names, space.sizes, strict=True):
         part = np.atleast_1d(np.asarray(parts.get(name, ()), dtype=np.float64))
@@ -234,7 +202,7 @@ def join_parts(parts: Mapping[str, Any], space: ScenarioSpace) -> FloatArray:
 
 def describe_drive(recorded: RecordedFailure, drive: Drive, number: int, ego: str | None = None) -> list[str]:
     """Return the drive in words, line by line."""
-    space, labels = recorded.problem.space, recorded.problem.world.scenario.labels
+    space = recorded.problem.space
     listed = f" ({recorded.n_listed:,} of them listed)" if recorded.n_listed < recorded.n_found else ""
     lines = [
         f"Failure {number} of {recorded.n_found:,} found{listed} in {recorded.problem.env_id}: "
@@ -245,12 +213,11 @@ def describe_drive(recorded: RecordedFailure, drive: Drive, number: int, ego: st
         several = np.atleast_1d(values)
         shown = " ".join(map(format_value, several)) if len(several) <= MAX_SHOWN else f"{len(several)} values"
         lines.append(f"  {name:<15} {shown} {unit}".rstrip())
-    end = drive.time[-1]
-    crash = drive.crash
+    end, crash = drive.time[-1], drive.crash
     if crash is None:
         lines.append(f"No crash within {end:.1f} s; the worst moment was at {drive.time[drive.worst]:.1f} s.")
     else:
-        who, whom = ("the edge of the road" if j < 0 else labels[j] for j in crash["vehicles"])
+        who, whom = name_parties(crash, drive.names)
         how = f"{crash['kind']}, closing at {crash['closing_speed']:.1f} m/s"
         lines.append(f"Crash after {end:.1f} s: {who} into {whom} ({how}).")
     if ego is not None:
@@ -263,46 +230,6 @@ def describe_drive(recorded: RecordedFailure, drive: Drive, number: int, ego: st
     return lines
 
 
-def import_scenariogeneration(part: str) -> Any:
-    """Return `scenariogeneration.xosc` or `.xodr`."""
-    try:
-        return importlib.import_module(f"scenariogeneration.{part}")
-    except ImportError as error:
-        raise ValueError(
-            'OpenSCENARIO and OpenDRIVE need scenariogeneration: pip install "rare-envs[export]".'
-        ) from error
-
-
-@dataclass(frozen=True)
-class WorldTrajectories:
-    """T + 1 moments of N vehicles, the ego first, in a right-handed flat world."""
-
-    names: tuple[str, ...]
-    """Of the vehicles, length N; the ego is "ego"."""
-    time: FloatArray
-    """[s], shape (T + 1,)."""
-    x: FloatArray
-    """Centres of the bodies [m], shape (T + 1, N)."""
-    y: FloatArray
-    """Centres, positive to the left [m], shape (T + 1, N)."""
-    heading: FloatArray
-    """From the x axis, counter-clockwise [rad], shape (T + 1, N)."""
-    speed: FloatArray
-    """Along the heading [m/s], shape (T + 1, N)."""
-
-
-def find_trajectories(drive: Drive) -> WorldTrajectories:
-    """Return the trajectories of a drive; one that ends at time 0 stands still for one tick."""
-    along, across = (torch.from_numpy(drive.position[..., axis].copy()) for axis in (0, 1))
-    x, y, heading = (part.numpy() for part in drive.road.to_world(along, across, torch.from_numpy(drive.heading)))
-    rows = np.arange(len(drive.time)) if len(drive.time) > 1 else np.zeros(2, dtype=int)
-    time = np.arange(len(rows), dtype=np.float64) * drive.problem.world.clock.dt
-    names = drive.problem.world.scenario.vehicle_names
-    return WorldTrajectories(names, time, x[rows], 0.0 - y[rows], 0.0 - heading[rows], drive.speed[rows])  # no -0.0
-
-
-def sample_line(road: Road, y: float, along: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return points, x and y [m], of a line y [m] to the right of the road's, at places along it (k,)."""
-    s = torch.from_numpy(along)
-    x, across, _ = road.to_world(s, torch.full_like(s, y), torch.zeros_like(s))
-    return x.numpy(), -across.numpy()
+def name_parties(crash: Mapping[str, Any], labels: Sequence[str]) -> list[str]:
+    """Return who ran into whom in a crash, by the labels of the vehicles."""
+    return ["the edge of the road" if one < 0 else labels[one] for one in crash["vehicles"]]

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 import samplers
 from agents.saved_ego import SavedEgo
-from rare_envs.distributions.fitted import EventFrequency, FittedDistribution
+from rare_envs.distributions.fitted import EventFrequency
 from rare_envs.egos.wrappers import describe_missing_normalisation
 from rare_envs.exposure import HUMAN_BENCHMARKS, CollisionProbability, CollisionRate, explain_no_frequency, read_source
 from rare_envs.measures.base import Measure
@@ -21,7 +21,7 @@ from rare_envs.measures.registry import MEASURES
 from rare_envs.scenarios.registry import find_scenario
 from rare_envs.startup import __version__
 from rare_envs.study.arguments import Question
-from rare_envs.study.failures import CrashKinds, FailureMode, find_modes
+from rare_envs.study.failures import CrashKinds
 from rare_envs.study.question import Study
 from samplers.analysis.base_error import FIT_BIAS
 from samplers.analysis.reweight import refit_quantile
@@ -62,7 +62,7 @@ def find_frequency(study: Study) -> EventFrequency:
     reason = _explain_no_collisions(study.question)
     if reason:
         raise ValueError(f"no rate per hour or km: {reason}")
-    base = study.base if isinstance(study.base, FittedDistribution) else None
+    base = study.fitted
     if base is None or base.frequency is None:
         scenario = find_scenario(study.question.env_id).name
         raise ValueError(
@@ -83,19 +83,6 @@ def _explain_no_collisions(question: Question) -> str:
     if question.collisions != "ego":
         return f"--collisions {question.collisions} counts those between other vehicles too"
     return ""
-
-
-def compute_rate(study: Study, estimate: samplers.Estimate, probability: CollisionProbability) -> CollisionRate:
-    """Return the rate of what has a probability per event: those of two bases fitted to the same events say so."""
-    base = study.base
-    data = read_source(base.record)["data"] if isinstance(base, FittedDistribution) else ""
-    return CollisionRate(
-        scenario=study.problem.world.scenario.name,
-        probability=probability,
-        frequency=find_frequency(study),
-        confidence=estimate.confidence,
-        fitted_to=f"{base.fitted_to}, {data}" if isinstance(base, FittedDistribution) and data else "",
-    )
 
 
 def describe_value(
@@ -138,20 +125,8 @@ def describe_left_out(study: Study, estimate: samplers.Estimate) -> tuple[str, .
 
 
 def has_exact_bound(estimate: samplers.Estimate) -> bool:
-    """Return whether the answer is the upper end: no simulation failed, and all are draws from the base distribution.
-
-    The end is then exact, so that the warning that nothing failed is a remark.
-    """
+    """Return whether the answer is the upper end, exactly: no simulation failed, and all are draws from the base."""
     return estimate.status is samplers.Status.NO_HITS and estimate.base_draws == estimate.n_sim
-
-
-class BaseAnswer(NamedTuple):
-    """p under another base distribution, or why the simulations of this run do not give it."""
-
-    base: str
-    """Name or file of the base distribution."""
-    found: samplers.Reweighted | None
-    refused: str = ""
 
 
 class Repeatability(NamedTuple):
@@ -227,8 +202,8 @@ class Report:
     @property
     def average(self) -> str:
         """What p is a mean over, in words; empty where it is p under one distribution."""
-        base = self.study.base
-        if not self.study.question.ensemble or not isinstance(base, FittedDistribution):
+        base = self.study.fitted
+        if not self.study.question.ensemble or base is None:
             return ""
         return f"mean over the {len(base.refits)} refits of {self.study.base_name}"
 
@@ -306,13 +281,6 @@ class Report:
         return replace(found, decision="undecided", reason=f"there is a warning: {doubts[0].rstrip('.')}")
 
     @cached_property
-    def modes(self) -> tuple[FailureMode, ...]:
-        """Modes of failure, the largest first; empty where they are not known."""
-        if self.kinds.unknown:
-            return ()
-        return find_modes(self.study.problem.space, self.estimate, self.kinds.by_scenario)
-
-    @cached_property
     def curve(self) -> samplers.Curve | None:
         """Probability over the threshold, from the same simulations; None where the run does not tell it."""
         return compute_threshold_curve(self.estimate)
@@ -329,32 +297,44 @@ class Report:
     @cached_property
     def rate(self) -> CollisionRate | None:
         """Collisions per hour and per km; None where `no_rate` says why there are none."""
-        if self.no_rate:
-            return None
         estimate = self.estimate
-        p = describe_value(estimate.p, estimate.cov, estimate.interval, estimate.base_uncertainty)
-        return compute_rate(self.study, estimate, p)
+        return self._rate_of(estimate.p, estimate.cov, estimate.interval, estimate.base_uncertainty)
 
     @cached_property
     def injury_rate(self) -> CollisionRate | None:
         """Serious injuries (MAIS 3 or more) per hour and per km; None where there is no rate, or no collision."""
         severity = self.kinds.severity
-        if self.no_rate or severity is None:
+        if severity is None:
             return None
         injuries = severity.injuries
-        per_event = describe_value(injuries.value, injuries.cov, injuries.interval, severity.injuries_base)
-        return compute_rate(self.study, self.estimate, per_event)
+        return self._rate_of(injuries.value, injuries.cov, injuries.interval, severity.injuries_base)
+
+    def _rate_of(
+        self, value: float, cov: float, sampling: Interval, uncertainty: samplers.BaseUncertainty | None
+    ) -> CollisionRate | None:
+        """Return the rate of what has a value per event: those of two bases fitted to the same events say so."""
+        if self.no_rate:
+            return None
+        base = self.study.fitted
+        data = "" if base is None else read_source(base.record)["data"]
+        return CollisionRate(
+            scenario=self.study.problem.world.scenario.name,
+            probability=describe_value(value, cov, sampling, uncertainty),
+            frequency=find_frequency(self.study),
+            confidence=self.estimate.confidence,
+            fitted_to=f"{base.fitted_to}, {data}" if base is not None and data else "",
+        )
 
     @cached_property
-    def other_bases(self) -> tuple[BaseAnswer, ...]:
-        """P under the other base distributions that the question names, from the same simulations."""
-        found = []
+    def other_bases(self) -> dict[str, samplers.Reweighted | str]:
+        """P under the other base distributions that the question names, by name, or why this run does not give it."""
+        found: dict[str, samplers.Reweighted | str] = {}
         for name, base in self.study.other_bases.items():
             try:
-                found.append(BaseAnswer(name, self.estimate.reweight(base)))
+                found[name] = self.estimate.reweight(base)
             except ValueError as error:
-                found.append(BaseAnswer(name, None, str(error)))
-        return tuple(found)
+                found[name] = str(error)
+        return found
 
     def to_dict(self, top: int = 10) -> dict[str, Any]:
         """Return the report as JSON-ready values: question, estimate and the `top` most likely failures."""
@@ -379,7 +359,7 @@ class Report:
             "earlier_seconds": self.earlier_seconds,
             "n_failures": failures.total,
             "kinds": {kind: share.to_dict() for kind, share in self.kinds.shares.items()},
-            "modes": [mode.to_dict() for mode in self.modes],
+            "modes": [mode.to_dict() for mode in self.kinds.modes],
             "curve": convert(self.curve),
             "severity": convert(self.kinds.severity),
             "sensitivity": self.sensitivity.to_dict() if isinstance(self.sensitivity, samplers.Sensitivity) else None,
@@ -403,7 +383,8 @@ class Report:
             "injury_rate": convert(self.injury_rate),
             "no_rate": self.no_rate,
             "other_bases": [
-                {"base": each.base, "refused": each.refused, **(convert(each.found) or {})} for each in self.other_bases
+                {"base": name, **({"refused": found} if isinstance(found, str) else {"refused": "", **found.to_dict()})}
+                for name, found in self.other_bases.items()
             ],
             "version": __version__,
         }

@@ -12,8 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from rare_envs.distributions.fitted import EventFrequency, FittedDistribution
-from rare_envs.distributions.space import Distribution
+from rare_envs.distributions.fitted import FittedDistribution
 from rare_envs.exposure import (
     HUMAN_BENCHMARKS,
     MILLION_KM,
@@ -27,19 +26,12 @@ from rare_envs.plugins import did_you_mean
 from rare_envs.scenarios.base import Scenario, load_base
 from rare_envs.scenarios.registry import env_id_of, scenario_named
 from rare_envs.startup import __version__
-from rare_envs.study.arguments import BadInput, Question, RunInterrupted, as_bad_input, keep_answer
+from rare_envs.study import text
+from rare_envs.study.arguments import Question, RunInterrupted, as_bad_input, keep_answer
 from rare_envs.study.evaluate import run, run_into
 from rare_envs.study.plots import save_risk_plot
 from rare_envs.study.question import Study, prepare
 from rare_envs.study.report import Report, find_frequency
-from rare_envs.study.text import (
-    describe_injuries,
-    describe_uncertainty,
-    format_rate,
-    format_share,
-    format_with_interval,
-    name_scenario,
-)
 from rare_envs.study.writing import check_no_results
 
 SCENARIO_SET = ("cut_in", "hard_brake")
@@ -49,54 +41,25 @@ TWICE = ("cut_in", "car_following")
 contains the cut-ins."""
 
 
-def list_sites(scenario: Scenario) -> dict[str, str]:
-    """Return the sites of a scenario: the name of the first base of each, and the site in words.
+def _load_fitted(scenario: Scenario, name: str) -> FittedDistribution | None:
+    """Return a base that was fitted to events; None where it was assembled otherwise."""
+    base = load_base(scenario, name)
+    return base if isinstance(base, FittedDistribution) else None
 
-    Further bases of a site are other families for the same events, no other site; an assembled base has none.
-    """
+
+def list_sites(scenario: Scenario) -> dict[str, str]:
+    """Return the sites of a scenario: the name of the first base of each, and the site in words."""
     found: dict[str, str] = {}
     for name in scenario.bases:
-        site = _read_site_of(load_base(scenario, name))
+        base = _load_fitted(scenario, name)
+        site = "" if base is None else read_site(base.record)
         if site and site not in found.values():
             found[name] = site
     return found
 
 
-def _read_site_of(base: Distribution) -> str:
-    """Return the site of a base distribution in words; empty where it was not fitted to events of one."""
-    return read_site(base.record) if isinstance(base, FittedDistribution) else ""
-
-
-def _find_frequency(scenario: Scenario, name: str) -> EventFrequency | None:
-    """Return the frequency of the events of a base; None where they were not counted."""
-    base = load_base(scenario, name)
-    return base.frequency if isinstance(base, FittedDistribution) else None
-
-
-def check_sites(scenarios: Sequence[Scenario], sites: Sequence[str]) -> None:
-    """Raise a ValueError unless sites are different ones, each of a scenario at least."""
-    if not sites or len(set(sites)) < len(sites):
-        raise ValueError(f"Expected one site or more, such as us101, each once; got {', '.join(sites) or 'none'}.")
-    known = sorted({name for scenario in scenarios for name in list_sites(scenario)})
-    for site in (each for each in sites if each not in known):
-        owner = next((scenario for scenario in scenarios if site in scenario.bases), None)
-        if owner is None:
-            names, hint = ", ".join(scenario.name for scenario in scenarios), did_you_mean(site, known)
-            raise ValueError(f"No base of {names} is of a site {site!r}{hint}; there are {', '.join(known)}.")
-        place = _read_site_of(load_base(owner, site))
-        first = next((name for name, each in list_sites(owner).items() if each == place), "")
-        further = f"is a further base of the site {first!r}" if first else "has no site"
-        raise ValueError(
-            f"{site!r} is no site: this base of {owner.name} {further}. The sites are {', '.join(known)}; "
-            f"--base {owner.name}={site} takes it as the base."
-        )
-
-
 def choose_base(scenario: Scenario, given: str | PathLike[str] | None, site: str) -> tuple[str, tuple[str, ...]]:
-    """Return the base distribution of a scenario at a site, and notes on it.
-
-    Where that of the site has no event frequency, it is the first one that has, as the notes say.
-    """
+    """Return the base distribution of a scenario at a site, and notes on it."""
     if given is not None:
         return str(given), ()
     sites = list_sites(scenario)
@@ -105,24 +68,20 @@ def choose_base(scenario: Scenario, given: str | PathLike[str] | None, site: str
             f"{scenario.name} has no base of the site {site!r} (it has {', '.join(sites) or 'none'}): "
             f"--base {scenario.name}={scenario.default_base} takes another one."
         )
-    counted = (name for name in (site, *scenario.bases) if _find_frequency(scenario, name) is not None)
-    found = next(counted, site)
+    bases = {name: _load_fitted(scenario, name) for name in (site, *scenario.bases)}
+    found = next((name for name, base in bases.items() if base is not None and base.frequency is not None), site)
     return found, () if found == site else (f"it has no event frequency at {site!r}: {found!r} is used",)
 
 
 def compare_sites(report: Report, sites: Sequence[str], progress: bool = False) -> dict[str, float]:
-    """Return rates per km at other sites over that of a report, by name.
-
-    They come from the simulations of the report, reweighted. Where these do not suffice, sites that are asked for are
-    simulated, and others left out; all are left out where nothing failed.
-    """
+    """Return rates per km at other sites over that of a report, by name."""
     study, factors = report.study, dict[str, float]()
     if report.estimate.p == 0 or report.rate is None:
         return factors
-    scenario = study.problem.world.scenario
+    scenario, own = study.problem.world.scenario, study.fitted
     for name, site in list_sites(scenario).items():
-        frequency = _find_frequency(scenario, name)
-        if site == _read_site_of(study.base) or frequency is None:
+        base = _load_fitted(scenario, name)
+        if base is None or base.frequency is None or (own is not None and site == read_site(own.record)):
             continue
         other = study.under(name)
         try:
@@ -130,7 +89,7 @@ def compare_sites(report: Report, sites: Sequence[str], progress: bool = False) 
         except ValueError:
             p = run(other, progress).estimate.p if name in sites else math.nan
         if p > 0:
-            factors[name] = p * frequency.per_km / report.rate.per_million_km * MILLION_KM
+            factors[name] = p * base.frequency.per_km / report.rate.per_million_km * MILLION_KM
     return factors
 
 
@@ -152,12 +111,6 @@ class ScenarioRisk:
         return self.rate.scenario
 
     @property
-    def events(self) -> int | None:
-        """Recorded events behind the base distribution, of its first part; None where nobody says."""
-        base = self.report.study.base
-        return base.events.used[0] if isinstance(base, FittedDistribution) else None
-
-    @property
     def kinds(self) -> dict[str, float]:
         """Collisions per million km by kind of crash; empty where it is not known."""
         scale = self.rate.frequency.per_km * MILLION_KM
@@ -166,22 +119,23 @@ class ScenarioRisk:
     def describe(self) -> str:
         """Return the line of the table: frequency x p = rate, its interval, and the events behind it."""
         rate, study = self.rate, self.report.study
-        behind = study.base.fitted_to if isinstance(study.base, FittedDistribution) else "events not known"
+        behind = "events not known" if study.fitted is None else study.fitted.fitted_to
         version = study.question.env_id.rpartition("/")[2]  # whose bases may have the same names
         factors = {name: factor for name, factor in self.site_factors.items() if factor > 0}
         sites = "".join(f", under {name} {factor:.2g} times as much" for name, factor in factors.items())
+        per_km = text.format_with_interval(rate.per_million_km, rate.interval_per_million_km, " ")
         return (
-            f"{name_scenario(self.name):<13} {format_rate(rate.frequency.per_km)} per km x {rate.probability.p:.1e} = "
-            f"{format_with_interval(rate.per_million_km, rate.interval_per_million_km, ' ')}   "
-            f"{behind} ({study.base_name} of {version}){sites}"
+            f"{text.name_scenario(self.name):<13} {text.format_rate(rate.frequency.per_km)} per km x "
+            f"{rate.probability.p:.1e} = {per_km}   {behind} ({study.base_name} of {version}){sites}"
         )
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain values for JSON."""
+        fitted = self.report.study.fitted
         return {
             **self.rate.to_dict(),
             "base": self.report.study.base_name,
-            "events": self.events,
+            "events": None if fitted is None else fitted.events.used[0],
             "site_factors": dict(self.site_factors),
             "kinds_per_million_km": self.kinds,
             "notes": list(self.notes),
@@ -219,37 +173,40 @@ class Risk:
 
     @property
     def recorded_events(self) -> dict[str, int]:
-        """Recorded events behind each base distribution, by scenario."""
-        return {each.name: each.events for each in self.scenarios if each.events is not None}
+        """Recorded events behind each base distribution, of its first part, by scenario."""
+        fitted = {each.name: each.report.study.fitted for each in self.scenarios}
+        return {name: base.events.used[0] for name, base in fitted.items() if base is not None}
 
     @property
     def warnings(self) -> tuple[str, ...]:
         """Doubts about p and about the error of its base distribution, by scenario."""
-        return tuple(f"{name_scenario(each.name)}: {text}" for each in self.scenarios for text in each.report.warnings)
+        named = ((text.name_scenario(each.name), each.report.warnings) for each in self.scenarios)
+        return tuple(f"{name}: {warning}" for name, warnings in named for warning in warnings)
 
     @property
     def notes(self) -> tuple[str, ...]:
         """Errors that are left out, and bases that differ from those asked for."""
-        return tuple(f"{name_scenario(each.name)}: {text}" for each in self.scenarios for text in each.notes)
+        return tuple(f"{text.name_scenario(each.name)}: {note}" for each in self.scenarios for note in each.notes)
 
     def __str__(self) -> str:
         """Return the table, for people."""
         total, kinds = self.total, self.kinds
         level, whole = f"{100 * total.confidence:g} %: ", sum(kinds.values())
-        per_km = format_with_interval(total.per_million_km, total.interval_per_million_km, " ", level)
-        per_hour = format_with_interval(total.per_hour, total.interval_per_hour, " ", level)
+        per_km = text.format_with_interval(total.per_million_km, total.interval_per_million_km, " ", level)
+        per_hour = text.format_with_interval(total.per_hour, total.interval_per_hour, " ", level)
         lines = [
             f"collisions per million km  {per_km}   {describe_human_contacts()}",
             *(f"  {each.describe()}" for each in self.scenarios),
             f"  per hour      {per_hour}",
         ]
         if whole > 0:
-            parts = [f"{kind} {format_rate(rate)} ({format_share(rate / whole)})" for kind, rate in kinds.items()]
+            parts = (f"{kind} {text.format_rate(r)} ({text.format_share(r / whole)})" for kind, r in kinds.items())
             lines.append(f"  by kind       {', '.join(parts)}")
-        lines += [] if self.injuries is None else [f"  {describe_injuries(self.injuries)}"]
-        lines += filter(None, [describe_uncertainty(total, self.recorded_events)])
-        lines += [f"warning: {text}" for text in self.warnings]
-        return "\n".join(lines + [f"note: {text}" for text in self.notes])
+        lines += [] if self.injuries is None else [f"  {text.describe_injuries(self.injuries)}"]
+        lines += filter(None, [text.describe_uncertainty(total, self.recorded_events)])
+        return "\n".join(
+            [*lines, *(f"warning: {each}" for each in self.warnings), *(f"note: {each}" for each in self.notes)]
+        )
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain values for JSON."""
@@ -313,15 +270,21 @@ def risk(
         rare_envs.study.arguments.BadInput: Expected one of cut_in, car_following: a cut-in is a new leader, and would count twice.
     """  # noqa: E501 (the example shows a whole message)
     sites = (sites,) if isinstance(sites, str) else sites
-    folder, bases = None if out is None else Path(out), bases or {}
-    _check_scenarios(scenarios, sites, bases)
+    folder, bases, named = None if out is None else Path(out), bases or {}, isinstance(ego, str)
+    ego_name = ego if named else type(ego).__name__
     with as_bad_input(ValueError):
+        _check_scenarios(scenarios, sites, bases)
         chosen = [choose_base(scenario_named(name), bases.get(name), sites[0]) for name in scenarios]
-    studies = []
-    for name, (base, _) in zip(scenarios, chosen, strict=True):
-        studies.append(_prepare(ego, name, base, options))
-        with as_bad_input(ValueError):
-            find_frequency(studies[-1])
+    with as_bad_input(TypeError):
+        asked = {"ego": ego_name, **options}
+        questions = [
+            Question(env_id=env_id_of(name), base=base, **asked)
+            for name, (base, _) in zip(scenarios, chosen, strict=True)
+        ]
+    with as_bad_input(ValueError):
+        studies = [prepare(question, None if named else ego) for question in questions]
+        for study in studies:
+            find_frequency(study)
     for name in scenarios if folder is not None and not force else ():  # all of them, before the first one is run
         check_no_results(Path(folder or "", name))
     done: list[ScenarioRisk] = []
@@ -331,36 +294,33 @@ def risk(
         except RunInterrupted as error:
             known = "; ".join(" ".join(one.describe().split()) for one in done)
             raise RunInterrupted(f"{error}{f' Done before: {known}.' if done else ''}", error.report) from None
-    found = Risk(ego=ego if isinstance(ego, str) else type(ego).__name__, scenarios=tuple(done))
+    found = Risk(ego=ego_name, scenarios=tuple(done))
     if folder is not None:
         replace_text(folder / "risk.json", format_json(found.to_dict()) + "\n")
         found.save_plot(folder / "risk.png")
     return found
 
 
-def _check_scenarios(scenarios: Sequence[str], sites: Sequence[str], bases: Mapping[str, Any]) -> None:
-    """Raise a BadInput unless the scenarios exist, count nothing twice, and have bases of these sites."""
-    with as_bad_input(ValueError):
-        known = [scenario_named(name) for name in scenarios]
-    if not scenarios or len(set(scenarios)) < len(scenarios):
-        raise BadInput(f"Expected one or more different scenarios, got {', '.join(scenarios) or 'none'}.")
-    if set(TWICE) <= set(scenarios):
-        raise BadInput(f"Expected one of {', '.join(TWICE)}: a cut-in is a new leader, and would count twice.")
-    with as_bad_input(ValueError):
-        check_sites(known, sites)
-    for name in bases:
-        if name not in scenarios:
-            raise BadInput(f"A base is given for {name!r}, which is none of {', '.join(scenarios)}.")
-
-
-def _prepare(ego: Any, name: str, base: str, options: Mapping[str, Any]) -> Study:
-    """Return the study of one scenario."""
-    named = isinstance(ego, str)
-    try:
-        question = Question(env_id=env_id_of(name), ego=ego if named else type(ego).__name__, base=base, **options)
-    except TypeError as error:
-        raise BadInput(f"Cannot use an option of risk: {error}") from error
-    return prepare(question, None if named else ego)
+def _check_scenarios(names: Sequence[str], sites: Sequence[str], bases: Mapping[str, Any]) -> None:
+    """Raise a ValueError unless the scenarios exist, count nothing twice, and have bases of these sites."""
+    scenarios = [scenario_named(name) for name in names]
+    if not names or len(set(names)) < len(names):
+        raise ValueError(f"Expected one or more different scenarios, got {', '.join(names) or 'none'}.")
+    if set(TWICE) <= set(names):
+        raise ValueError(f"Expected one of {', '.join(TWICE)}: a cut-in is a new leader, and would count twice.")
+    for name in set(bases) - set(names):
+        raise ValueError(f"A base is given for {name!r}, which is none of {', '.join(names)}.")
+    if not sites or len(set(sites)) < len(sites):
+        raise ValueError(f"Expected one site or more, such as us101, each once; got {', '.join(sites) or 'none'}.")
+    known = sorted({name for scenario in scenarios for name in list_sites(scenario)})
+    for site in (each for each in sites if each not in known):
+        owner, there = next((each.name for each in scenarios if site in each.bases), ""), ", ".join(map(repr, known))
+        if owner:
+            raise ValueError(
+                f"{site!r} is no site, but a base of {owner}. The sites are {there}; --base {owner}={site} takes it."
+            )
+        hint = did_you_mean(site, known)
+        raise ValueError(f"No base of {', '.join(names)} is of a site {site!r}{hint}; there are {there}.")
 
 
 def _evaluate(
@@ -373,10 +333,5 @@ def _evaluate(
     with keep_answer(report):
         factors = compare_sites(report, other_sites, progress)
     logs = [0.0, *(float(np.log(factors[site])) for site in other_sites if factors.get(site, 0) > 0)]
-    spread = float(np.std(logs, ddof=1)) if len(logs) > 1 else 0.0
-    return ScenarioRisk(
-        report=report,
-        rate=replace(report.rate, site_log_sd=spread),
-        site_factors=factors,
-        notes=(*notes, *report.notes),
-    )
+    rate = replace(report.rate, site_log_sd=float(np.std(logs, ddof=1)) if len(logs) > 1 else 0.0)
+    return ScenarioRisk(report=report, rate=rate, site_factors=factors, notes=(*notes, *report.notes))

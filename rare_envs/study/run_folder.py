@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import csv
-import hashlib
 import io
 import math
 import reprlib
@@ -19,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rare_envs.files import check_ordinary, parse_json_object, read_text_file
+from rare_envs.files import check_ordinary, digest_file, parse_json_object, read_text_file
 from rare_envs.plugins import one_line
 from rare_envs.study.arguments import BadInput, as_bad_input
 
@@ -124,20 +123,6 @@ def _read_blocks(path: Path) -> dict[str, NDArray[Any]]:
     return {name: block.astype(np.float64) for name, block in found.items()}
 
 
-def digest_results(folder: Path) -> dict[str, str]:
-    """Return the digests of the files with numbers in a folder, by name."""
-    return {name: digest_file(folder / name) for name in DIGESTED if (folder / name).is_file()}
-
-
-def digest_file(path: Path) -> str:
-    """Return the BLAKE2b digest of a file."""
-    digest = hashlib.blake2b(digest_size=16)
-    with path.open("rb") as file:
-        while block := file.read(1 << 20):
-            digest.update(block)
-    return digest.hexdigest()
-
-
 @dataclass(frozen=True)
 class LoadedStudy:
     """A finished run; nothing of the ego or of its question is run, whoever wrote the folder."""
@@ -171,14 +156,11 @@ class LoadedStudy:
 
     @property
     def changed_files(self) -> list[str]:
-        """Names of files that are not what the run wrote: damaged, edited, removed, or of another run.
-
-        study.json has their digests; the whole table of simulations is read for its own.
-        """
+        """Names of files that are not what the run wrote: damaged, edited, removed, or of another run."""
         written = self.about.get("results")
         if not isinstance(written, dict):
             return []
-        found = digest_results(self.folder)
+        found = {name: digest_file(self.folder / name) for name in DIGESTED if (self.folder / name).is_file()}
         return [name for name in DIGESTED if found.get(name) != written.get(name)]
 
     @property
@@ -198,9 +180,10 @@ class LoadedStudy:
         """Return the table of all simulations, a row each; docs/using_results.md has its columns."""
         import pyarrow.parquet as pq
 
-        path, known = self.episodes_path, self.column_names if self.episodes_path.is_file() else None
-        if known is None:
+        path = self.episodes_path
+        if not path.is_file():
             raise FileNotFoundError(f"There is no {EPISODES} in {str(self.folder)!r}.")
+        known = self.column_names
         missing = sorted(set(columns or []) - set(known))
         if missing:
             raise ValueError(f"{EPISODES} has no column {', '.join(missing)}; it has {', '.join(known)}.")
@@ -211,34 +194,19 @@ class LoadedStudy:
 
 
 def _check_size(path: Path, columns: list[str]) -> None:
-    """Raise a ValueError if some columns of a table would take more than `MAX_TABLE_BYTES`.
-
-    A file of a few kilobytes can hold billions of rows that are alike, so the size of the file says nothing.
-    """
+    """Raise a ValueError if some columns of a table would take more than `MAX_TABLE_BYTES`."""
     import pyarrow.parquet as pq
 
     with _damage_as_value_error(path), pq.ParquetFile(path) as file:
         about, schema = file.metadata, file.schema_arrow
     n_rows = sum(about.row_group(i).num_rows for i in range(about.num_row_groups))
-    n_bytes = n_rows * sum(_count_bytes(schema.field(name).type) for name in columns)
+    n_bytes = 8 * n_rows * sum(int(getattr(schema.field(name).type, "list_size", 1)) for name in columns)
     if n_bytes > MAX_TABLE_BYTES:
         raise ValueError(
             f"{len(columns)} columns of {EPISODES} take {n_bytes / 2**30:,.1f} GiB, more than the "
             f"{MAX_TABLE_BYTES / 2**30:g} GiB that are read at once: ask for fewer columns, or read {str(path)!r} in "
             "parts by a program of your own."
         )
-
-
-def _count_bytes(kind: pyarrow.DataType) -> float:
-    """Return the bytes of a value; of a text, which most rows have not, those of its place."""
-    import pyarrow as pa
-
-    if pa.types.is_fixed_size_list(kind):
-        return int(kind.list_size) * _count_bytes(kind.value_type)
-    try:
-        return float(kind.bit_width) / 8
-    except ValueError:  # of no fixed size
-        return 4.0
 
 
 @contextlib.contextmanager

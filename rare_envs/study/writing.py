@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import csv
 import hashlib
-import os
 import platform
 import shlex
 import sys
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import asdict
 from datetime import datetime, timezone
@@ -20,17 +20,17 @@ from numpy.typing import NDArray
 
 import samplers
 from agents.loading import find_ego_kind, strip_prefixes
-from rare_envs.distributions.fitted import FittedDistribution
 from rare_envs.distributions.space import ScenarioSpace
-from rare_envs.files import format_json, parse_json_object, read_text_file, replace_file, replace_text
+from rare_envs.files import digest_file, format_json, replace_file, replace_text
 from rare_envs.startup import __version__
 from rare_envs.study.arguments import BadInput, Question, UnwrittenResults, read_question
 from rare_envs.study.episodes import MAX_SHOWN, list_columns
 from rare_envs.study.plots import save_plot, saved_figure
-from rare_envs.study.question import Study, digest_files, find_ego_files, is_same_question
+from rare_envs.study.question import Study, digest_files, find_ego_files, is_same_question, note_question, read_about
 from rare_envs.study.report import Report
 from rare_envs.study.run_folder import (
     CRASH,
+    DIGESTED,
     FAILURES,
     FAULT_BLOCKS,
     FAULTS,
@@ -42,8 +42,6 @@ from rare_envs.study.run_folder import (
     SEVERITY,
     STUDY,
     STUDY_FORMAT,
-    digest_file,
-    digest_results,
 )
 from rare_envs.traffic.crash import CRASH_KINDS, NONE
 from samplers.journal import Journal, JournalError, NothingRecorded
@@ -54,11 +52,7 @@ BEGIN_AGAIN = "give the command again."
 
 
 def begin_journal(folder: Path, question: Question, force: bool = False) -> Journal:
-    """Return the journal of a new run; with `force` it replaces that of an unfinished one.
-
-    Raises:
-        BadInput: There is a run, finished or not, somebody else is writing it, or nothing can be written.
-    """
+    """Return the journal of a new run; with `force` it replaces that of an unfinished one."""
     if not force and not (folder / JOURNAL).exists():
         check_no_results(folder)
     head = {"version": __version__, "question": asdict(question), "files": digest_files(question)}
@@ -76,18 +70,19 @@ def begin_journal(folder: Path, question: Question, force: bool = False) -> Jour
 
 
 def continue_journal(folder: Path, mend: bool = False) -> tuple[Journal, Question]:
-    """Return the journal of an unfinished run, and its question; of a damaged one `mend` keeps what is before that.
-
-    Raises:
-        BadInput: There is none to continue, or one of another version of this program; it is damaged, or in use.
-    """
-    path = folder / JOURNAL
+    """Return the journal of an unfinished run, and its question; of a damaged one `mend` keeps what is before that."""
+    path, begun = folder / JOURNAL, "stopped before its first simulations"
     try:
         journal = Journal.open(path, mend)
     except FileNotFoundError as error:
-        raise BadInput(f"There is no unfinished run in {str(folder)!r}: {_explain_no_journal(folder)}") from error
+        why = f"it has no {JOURNAL}. Of one that was {begun}, {BEGIN_AGAIN}"
+        if (folder / RESULT).is_file():
+            why = f"it has a finished one ({RESULT})."
+        elif not folder.is_dir():
+            why = f"the folder does not exist. Of a run that was {begun}, {BEGIN_AGAIN}"
+        raise BadInput(f"There is no unfinished run in {str(folder)!r}: {why}") from error
     except NothingRecorded as error:
-        raise BadInput(f"The run in {str(folder)!r} was stopped before its first simulations: {BEGIN_AGAIN}") from error
+        raise BadInput(f"The run in {str(folder)!r} was {begun}: {BEGIN_AGAIN}") from error
     except OSError as error:
         raise BadInput(f"Cannot take up {str(path)!r}: {error.strerror}.") from error
     except JournalError as error:
@@ -106,15 +101,6 @@ def continue_journal(folder: Path, mend: bool = False) -> tuple[Journal, Questio
     except BadInput as error:
         journal.close()
         raise BadInput(f"Cannot take up {str(path)!r}: {error}") from error
-
-
-def _explain_no_journal(folder: Path) -> str:
-    """Return why a folder has no journal, and what to do."""
-    if (folder / RESULT).is_file():
-        return f"it has a finished one ({RESULT})."
-    if not folder.is_dir():
-        return f"the folder does not exist. Of a run that was stopped before its first simulations, {BEGIN_AGAIN}"
-    return f"it has no {JOURNAL}. Of one that was stopped before its first simulations, {BEGIN_AGAIN}"
 
 
 def check_no_results(folder: Path, *names: str) -> None:
@@ -148,11 +134,10 @@ def write_run(folder: Path, report: Report) -> None:
         ...     json.loads((Path(folder) / "result.json").read_text())["status"]
         'no_hits'
     """
-    space, faults = report.study.problem.space, report.faults
+    space, faults, kinds = report.study.problem.space, report.faults, report.kinds
     replace_text(folder / RESULT, format_json(report.to_dict()) + "\n")
-    kind = "" if report.kinds.unknown else CRASH_KINDS[NONE]
-    crashes = [_crash_columns(crash, kind) for crash in report.crashes]
-    write_failures(folder, space, report.estimate.failures, CRASH, crashes)
+    nobody = ("" if kinds.unknown else CRASH_KINDS[NONE], *("" for _ in CRASH[1:]))
+    write_failures(folder, space, report.estimate.failures, [_list_crash(each) or nobody for each in report.crashes])
     for name in (FAULTS, FAULT_BLOCKS, SENSITIVITY, SEVERITY):
         (folder / name).unlink(missing_ok=True)
     if faults:
@@ -162,39 +147,35 @@ def write_run(folder: Path, report: Report) -> None:
     if isinstance(report.sensitivity, samplers.Sensitivity):
         with saved_figure(folder / SENSITIVITY, 14, 4.5) as figure:
             report.sensitivity.plot(list(figure.subplots(1, 2)))
-    if report.kinds.severity is not None:
+    if kinds.severity is not None:
         with saved_figure(folder / SEVERITY, 7, 4.5) as figure:
-            report.kinds.severity.plot(figure.subplots())
+            kinds.severity.plot(figure.subplots())
 
 
-def write_failures(
-    folder: Path,
-    space: ScenarioSpace,
-    failures: samplers.Failures,
-    names: tuple[str, ...] = (),
-    more: list[tuple[Any, ...]] | None = None,
-) -> None:
-    """Write `FAILURES`: one failure a row, the most likely first: x, f, log p0, and what more there is, by name."""
-    # repr of a float gives it back exactly, so that a row replays to the same f
-    rest = [(one.f, one.log_p0, *extra) for one, extra in zip(failures, more or [()] * len(failures), strict=True)]
-    _write_table(folder / FAILURES, space, failures.x, ("f", "log_p0", *names), rest)
-
-
-def _crash_columns(crash: dict[str, Any] | None, kind: str) -> tuple[Any, ...]:
-    """Return a crash as the columns `CRASH`; `kind` and blanks where there is none."""
+def _list_crash(crash: dict[str, Any] | None) -> tuple[Any, ...]:
+    """Return a crash as the columns `CRASH`; () where there is none."""
     if crash is None:
-        return (kind, *("" for _ in CRASH[1:]))
+        return ()
     speeds = (crash["impact_speed"], crash["closing_speed"])
     return (crash["kind"], *crash["vehicles"], *speeds, *crash["delta_v"], *crash["injury_risk"])
 
 
+def write_failures(
+    folder: Path, space: ScenarioSpace, failures: samplers.Failures, crashes: Sequence[tuple[Any, ...]] = ()
+) -> None:
+    """Write `FAILURES`: one failure a row, the most likely first: x, f, log p0, and the columns `CRASH` if known."""
+    rows = [(one.f, one.log_p0, *crash) for one, crash in zip(failures, crashes or [()] * len(failures), strict=True)]
+    _write_table(folder / FAILURES, space, failures.x, ("f", "log_p0", *(CRASH if crashes else ())), rows)
+
+
 def _write_table(
-    path: Path, space: ScenarioSpace, x: NDArray[np.float64], names: tuple[str, ...], rest: list[tuple[Any, ...]]
+    path: Path, space: ScenarioSpace, x: NDArray[np.float64], names: Sequence[str], rest: list[tuple[Any, ...]]
 ) -> None:
     """Write scenarios x (n, d), one per row.
 
     The table has the columns of x by name but for large blocks, then the rest. Large blocks go row by row into a file
-    of arrays beside it, in single precision, in which they are simulated, so that they replay to the same f.
+    of arrays beside it, in single precision, in which they are simulated, so that they replay to the same f; so do
+    numbers of the table, as repr of a float gives it back exactly.
     """
     columns = list_columns(space)
     shown = [column.shown for column in columns]
@@ -202,11 +183,11 @@ def _write_table(
         writer = csv.writer(file)
         writer.writerow([*(column.name for column in columns if column.shown), *names])
         writer.writerows([*row[shown].tolist(), *more] for row, more in zip(x, rest, strict=True))
-    large = {name for name, size in zip(space.names, space.sizes, strict=True) if size > MAX_SHOWN}
+    parts = zip(space.columns(x).items(), space.sizes, strict=True)
+    blocks = {name: part.astype(np.float32) for (name, part), size in parts if size > MAX_SHOWN}
     blocks_path = path.with_suffix(".npz")
     blocks_path.unlink(missing_ok=True)
-    if large:
-        blocks = {name: part.astype(np.float32) for name, part in space.columns(x).items() if name in large}
+    if blocks:
         with replace_file(blocks_path) as draft:
             # allow_pickle=False, as its types would like, is a block to NumPy 2.0
             np.savez_compressed(draft, **blocks)  # type: ignore[arg-type]
@@ -216,67 +197,25 @@ LIBRARIES = "cvxpy gymnasium highway-env numba numpy onnxruntime scikit-learn sc
 """Distributions whose versions may change a number."""
 
 
-def describe_study(study: Study, folder: Path = Path()) -> dict[str, Any]:
-    """Return what study.json holds at the beginning of a run, whose folder is given."""
-    question, space, base = study.question, study.problem.space, study.base
-    files = digest_files(question)
-    rows = zip(space.names, space.units, space.sizes, strict=True)
-    fit = {"fitted_to": base.fitted_to, "family": base.family} if isinstance(base, FittedDistribution) else {}
-    return {
-        "format": STUDY_FORMAT,
-        "command": _describe_command(sys.argv),
-        "begun": _now(),
-        "finished": None,
-        "seconds": None,
-        "seed": question.seed,
-        "gamma": question.gamma,
-        "ego": _describe_ego(question),
-        "base": {"name": study.base_name, "fitted_to": "", "family": "", **fit},
-        "method": {"name": study.method.name, "settings": method_settings(study.method)},
-        "parameters": [{"name": name, "unit": unit, "size": int(size)} for name, unit, size in rows],
-        "question": asdict(question),
-        "files": files,
-        "file_places": _describe_places(files, folder),
-        "versions": find_versions(),
-        "platform": platform.platform(),
-    }
-
-
-def _describe_places(files: dict[str, str], folder: Path) -> dict[str, str]:
-    """Return where files lie as seen from the folder of a run, by their paths."""
-    places = {}
-    for name in files:
-        with suppress(ValueError):  # another drive of Windows
-            places[name] = Path(os.path.relpath(name, folder)).as_posix()
-    return places
-
-
 def begin_study_file(folder: Path, study: Study) -> None:
-    """Write study.json of a run that begins, in place of the files of an earlier one."""
+    """Write study.json of a run that begins, in place of the files of an earlier one, and note that it was asked."""
     for name in RESULT_FILES:
         (folder / name).unlink(missing_ok=True)
     _remove_drafts(folder)
-    _write_study_file(folder, describe_study(study, folder))
-
-
-def _write_study_file(folder: Path, about: dict[str, Any]) -> None:
-    replace_text(folder / STUDY, format_json(about) + "\n")
+    _write_study_file(folder, describe_study(study))
+    note_question(study.question)
 
 
 def note_resumption(folder: Path, earlier_seconds: float) -> None:
     """Note in study.json that an interrupted run of so many seconds goes on; one that cannot be read is left."""
     _remove_drafts(folder)
-    with suppress(OSError, ValueError):  # a full disk is found when results are written
-        about = parse_json_object(read_text_file(folder / STUDY), STUDY)
-        _write_study_file(folder, about | {"resumed": _now(), "earlier_seconds": earlier_seconds})
+    if about := read_about(folder):
+        with suppress(OSError):  # a full disk is found when results are written
+            _write_study_file(folder, about | {"resumed": _now(), "earlier_seconds": earlier_seconds})
 
 
 def finish_run(folder: Path, report: Report) -> None:
-    """Write the results, and note in study.json that the run is done; a folder that somebody removed is made again.
-
-    Raises:
-        UnwrittenResults: They cannot be written.
-    """
+    """Write the results, and note in study.json that the run is done; a folder that somebody removed is made again."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
         write_run(folder, report)
@@ -288,46 +227,53 @@ def finish_run(folder: Path, report: Report) -> None:
 
 
 def finish_study_file(folder: Path, study: Study, seconds: float) -> None:
-    """Note in study.json that the run is done, its wall time [s], and the digests of its files.
-
-    What it held of the beginning stays; one of another question, which somebody has put there, is written anew.
-    """
-    try:
-        begun = parse_json_object(read_text_file(folder / STUDY), STUDY)
-    except (OSError, ValueError):  # of an earlier version, or somebody has removed it
-        begun = {"question": None}
-    if "question" in begun and not is_same_question(begun["question"], study.question):
-        begun = describe_study(study, folder)
-    ended = {"finished": _now(), "seconds": seconds, "results": digest_results(folder)}
-    _write_study_file(folder, {**begun, **ended})
+    """Note in study.json that the run is done, its wall time [s], and the digests of its files."""
+    begun = read_about(folder)
+    if not begun or ("question" in begun and not is_same_question(begun["question"], study.question)):
+        begun = describe_study(study)
+    digests = {name: digest_file(folder / name) for name in DIGESTED if (folder / name).is_file()}
+    _write_study_file(folder, {**begun, "finished": _now(), "seconds": seconds, "results": digests})
 
 
-def find_versions() -> dict[str, str]:
-    """Return the versions of this program, Python and the libraries that are installed."""
-    found = {"rare-envs": __version__, "python": platform.python_version()}
+def describe_study(study: Study) -> dict[str, Any]:
+    """Return what study.json holds at the beginning of a run."""
+    question, space, base = study.question, study.problem.space, study.fitted
+    fit = {} if base is None else {"fitted_to": base.fitted_to, "family": base.family}
+    ego_files = {str(path): digest_file(path) for path in find_ego_files(question)}
+    rests_on = "".join(sorted(ego_files.values())) or f"{question.ego} of rare-envs {__version__}"
+    versions = {"rare-envs": __version__, "python": platform.python_version()}
     for name in LIBRARIES:
         with suppress(metadata.PackageNotFoundError):
-            found[name] = metadata.version(name)
-    return found
-
-
-def _describe_ego(question: Question) -> dict[str, Any]:
-    """Return name, kind and fingerprint of the ego: of its files, or of this version where it comes with it."""
-    files = {str(path): digest_file(path) for path in find_ego_files(question)}
-    rests_on = "".join(sorted(files.values())) or f"{question.ego} of rare-envs {__version__}"
+            versions[name] = metadata.version(name)
+    program = Path(sys.argv[0] if sys.argv else "")
+    ours = program.stem == "rare-envs" or program.parts[-2:] == ("rare_envs", "__main__.py")
+    columns = zip(space.names, space.units, space.sizes, strict=True)
     return {
-        "name": question.ego,
-        "kind": find_ego_kind(strip_prefixes(question.ego)),
-        "files": files,
-        "fingerprint": hashlib.blake2b(rests_on.encode(), digest_size=16).hexdigest(),
+        "format": STUDY_FORMAT,
+        "command": shlex.join(["rare-envs", *sys.argv[1:]]) if ours else "",
+        "begun": _now(),
+        "finished": None,
+        "seconds": None,
+        "seed": question.seed,
+        "gamma": question.gamma,
+        "ego": {
+            "name": question.ego,
+            "kind": find_ego_kind(strip_prefixes(question.ego)),
+            "files": ego_files,
+            "fingerprint": hashlib.blake2b(rests_on.encode(), digest_size=16).hexdigest(),
+        },
+        "base": {"name": study.base_name, "fitted_to": "", "family": "", **fit},
+        "method": {"name": study.method.name, "settings": method_settings(study.method)},
+        "parameters": [{"name": name, "unit": unit, "size": int(size)} for name, unit, size in columns],
+        "question": asdict(question),
+        "files": digest_files(question),
+        "versions": versions,
+        "platform": platform.platform(),
     }
 
 
-def _describe_command(words: list[str]) -> str:
-    """Return the command line that was typed; empty where another program runs."""
-    program = Path(words[0]) if words else Path()
-    ours = program.stem == "rare-envs" or program.parts[-2:] == ("rare_envs", "__main__.py")
-    return shlex.join(["rare-envs", *words[1:]]) if ours else ""
+def _write_study_file(folder: Path, about: dict[str, Any]) -> None:
+    replace_text(folder / STUDY, format_json(about) + "\n")
 
 
 def _now() -> str:

@@ -24,7 +24,6 @@ from rare_envs.study.cli.egos import (
     train_ego_command,
 )
 from rare_envs.study.cli.estimate import compare_command, estimate_command, plan_command, resume_command, risk_command
-from rare_envs.study.cli.options import command
 from rare_envs.study.cli.runs import (
     corpus_add_command,
     corpus_run_command,
@@ -32,7 +31,7 @@ from rare_envs.study.cli.runs import (
     replay_command,
     report_command,
 )
-from rare_envs.study.cli.shell import Answer, OneLineErrors, SummarisedCommands, ignore_signals
+from rare_envs.study.cli.shell import Answer, OneLineErrors, SummarisedCommands, command, ignore_signals
 
 EXAMPLES = """
 rare-envs list
@@ -106,13 +105,13 @@ def list_command(
     ] = None,
 ) -> Answer:
     """Show the names of environments, methods, egos, drivers and measures; with one of these words, what they mean."""
-    from rare_envs.study.cli.listing import check_kind, choose_entries, list_names, print_details, print_overview
+    from rare_envs.study.cli.listing import choose_entries, list_names, print_details, print_overview
 
     entries = list_names()
     if what is None:
         return Answer(entries, partial(print_overview, entries))
-    chosen = check_kind(entries, what)
-    return Answer(choose_entries(entries, chosen), partial(print_details, entries, chosen))
+    chosen = choose_entries(entries, what)
+    return Answer(chosen, partial(print_details, chosen))
 
 
 @command()
@@ -120,10 +119,10 @@ def bases_command(
     scenario: Annotated[str, typer.Argument(metavar="SCENARIO", help="Environment, or its short name: cut_in.")],
 ) -> Answer:
     """List the base distributions of a scenario: events, site, family, fit, frequency and predictive checks."""
-    from rare_envs.study.cli.listing import list_bases, print_bases, resolve_scenario
+    from rare_envs.study.cli.listing import list_bases, print_bases
 
     with as_bad_input(ValueError):
-        found, env_id = list_bases(scenario), resolve_scenario(scenario)
+        env_id, found = list_bases(scenario)
     data = {"scenario": scenario, "env_id": env_id, "bases": found}
     return Answer(data, partial(print_bases, env_id, found))
 

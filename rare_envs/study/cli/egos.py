@@ -13,18 +13,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from rare_envs.study.arguments import BadInput, Question, as_bad_input, output_file, output_folder
-from rare_envs.study.cli.options import (
-    EGO_FILE,
-    NOISE,
-    SCENARIO,
-    WORLD,
-    EgoArgument,
-    EnvArgument,
-    command,
-    read_count,
-    read_environment,
-)
-from rare_envs.study.cli.shell import Answer
+from rare_envs.study.cli import shell
+from rare_envs.study.cli.shell import Answer, command
 from training.command_line import DriverTrainingOptions, EventOptions, RecordingOptions, RunFolderOption, spread_options
 
 if TYPE_CHECKING:
@@ -34,7 +24,7 @@ USUAL = {"noise": "on", "observation": "features", "action": "continuous", "coll
 """Options of `estimate` that need not be typed for an ego that is trained here."""
 
 
-@command(*WORLD, "seed", "trust")
+@command(*shell.WORLD, "seed", "trust")
 def train_ego_command(
     asked: dict[str, Any],
     env: Annotated[
@@ -42,14 +32,14 @@ def train_ego_command(
         typer.Argument(
             metavar="[ENV]",
             help="Environment, such as rare_envs/CutIn-v0; --from-failures tells it.",
-            callback=read_environment,
+            callback=shell.read_environment,
         ),
     ] = None,
     algo: Annotated[
         str | None, typer.Option(help="Stable-Baselines3 algorithm; --from-failures tells it.", show_default="ppo")
     ] = None,
     steps: Annotated[
-        int, typer.Option(help="Environment steps to train for.", parser=read_count, metavar="INTEGER")
+        int, typer.Option(help="Environment steps to train for.", parser=shell.read_count, metavar="INTEGER")
     ] = 200_000,
     out: Annotated[Path, typer.Option(help="File to save the ego in.")] = Path("ego.zip"),
     num_envs: Annotated[int, typer.Option(help="Episodes that run side by side.")] = 256,
@@ -94,9 +84,13 @@ def train_ego_command(
         data["failure_share"] = retraining.share
     if HYPERPARAMETERS[algo].discrete and asked["action"] is None:
         world["action"] = "discrete"  # which is what the algorithm made of it
-    seed_words = "" if plan is None else f" --seed {plan.next_seed}"
-    words = f"rare-envs estimate {env} --ego {shlex.quote(str(path))}{_estimate_options(world)}{seed_words}"
-    return Answer(data, f"Saved {path}. Next: {words}")
+    told = {**world, "noise": next(word for word, argument in shell.NOISE.items() if argument == world["noise"])}
+    told |= {"weather": None, "seed": None if plan is None else plan.next_seed}
+    options = [
+        f"--{name} {shlex.quote(str(each))}" for name, each in told.items() if each not in (None, USUAL.get(name))
+    ]
+    words = " ".join(["rare-envs estimate", env, "--ego", shlex.quote(str(path)), *options])
+    return Answer(data, f"Saved {path}. Next: {words}{' --weather' if world['weather'] else ''}")
 
 
 def _read_plan(
@@ -112,15 +106,6 @@ def _read_plan(
         if given not in (None, own):
             raise BadInput(f"Expected {name} {own}, that of the run in {str(runs[-1])!r}, got {given!r}; leave it out.")
     return plan
-
-
-def _estimate_options(world: Mapping[str, Any]) -> str:
-    """Return the options with which `estimate` makes the world that an ego was trained in."""
-    noise = next(word for word, argument in NOISE.items() if argument == world["noise"])
-    values = {**world, "noise": noise, "weather": None}
-    told = {name: str(value) for name, value in values.items() if value not in (None, USUAL.get(name))}
-    words = "".join(f" --{name} {shlex.quote(value)}" for name, value in told.items())
-    return words + (" --weather" if world["weather"] else "")
 
 
 @spread_options
@@ -161,17 +146,16 @@ def fit_command(
     return Answer({"bases": [str(path) for path in files]}, "\n".join(lines))
 
 
-@command(*SCENARIO, *EGO_FILE, "trust")
+@command(*shell.SCENARIO, *shell.EGO_FILE, "trust")
 def check_ego_command(
-    ego: EgoArgument,
-    env: EnvArgument,
+    ego: shell.EgoArgument,
+    env: shell.EnvArgument,
     asked: dict[str, Any],
     time_limit: Annotated[float, typer.Option(help="Seconds that one check may take.")] = 30.0,
     show_all: Annotated[bool, typer.Option("--all", help="Show each check that passed in a row of its own.")] = False,
 ) -> Answer:
     """Check in seconds whether an ego fits: spaces, normalisation, determinism, memory, speed. 2: it does not."""
-    from rare_envs.study.ego_check import VERDICTS, exit_code, print_findings
-    from rare_envs.study.ego_check.subprocess_check import check_ego
+    from rare_envs.study.ego_check import VERDICTS, check_ego, exit_code, print_findings
 
     findings = check_ego(Question(env_id=env, ego=ego, **asked), time_limit)
     code = exit_code(findings)
@@ -180,9 +164,9 @@ def check_ego_command(
     return Answer(data, partial(print_findings, findings, f"{ego} in {env}", show_all), code)
 
 
-@command(*EGO_FILE, "trust")
+@command(*shell.EGO_FILE, "trust")
 def serve_ego_command(
-    ego: EgoArgument,
+    ego: shell.EgoArgument,
     asked: dict[str, Any],
     bind: Annotated[
         str, typer.Option(help="Address; beyond 127.0.0.1 it needs RARE_ENVS_SECRET.")
@@ -207,7 +191,7 @@ def serve_ego_command(
         server.run()
 
 
-@command(*EGO_FILE, "trust")
+@command(*shell.EGO_FILE, "trust")
 def export_ego_command(
     asked: dict[str, Any],
     model: Annotated[Path, typer.Argument(metavar="MODEL", help="A .zip saved by Stable-Baselines3.")],

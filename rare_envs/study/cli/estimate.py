@@ -16,23 +16,11 @@ from rare_envs.study.arguments import (
     ExecutorOptions,
     Question,
     as_bad_input,
-    join_options,
-    join_question,
     output_folder,
     read_question_file,
 )
-from rare_envs.study.cli.options import (
-    ASKED,
-    EGO_FILE,
-    EVERYTHING,
-    DetailsOption,
-    EgoArgument,
-    EnvArgument,
-    ForceOption,
-    command,
-    option_of,
-)
-from rare_envs.study.cli.shell import DOUBTFUL, Answer, describe_report
+from rare_envs.study.cli import shell
+from rare_envs.study.cli.shell import DOUBTFUL, Answer, command, describe_report, option_of
 
 if TYPE_CHECKING:
     from samplers import Estimate, Executor
@@ -52,7 +40,7 @@ HELD = "HighwayEnv's environment as it is: what it holds fixed is held; rare_env
 """Condition of p."""
 
 
-@command(*EVERYTHING, stopped=NOTHING_MADE)
+@command(*shell.EVERYTHING, stopped=NOTHING_MADE)
 def estimate_command(
     asked: dict[str, Any],
     places: dict[str, Any],
@@ -64,18 +52,22 @@ def estimate_command(
         Path | None, typer.Option(help="YAML file with ENV (env: ...) and options; those given here come first.")
     ] = None,
     out: Annotated[Path | None, typer.Option(help="Folder of the run: result.json, episodes.parquet and more.")] = None,
-    force: ForceOption = False,
-    details: DetailsOption = False,
+    force: shell.ForceOption = False,
+    details: shell.DetailsOption = False,
 ) -> Answer:
     """Estimate how often an ego fails, with an interval, and show its most likely failure."""
     given = {} if config is None else read_question_file(config)
-    of_executor = {name: value for name in places if (value := given.pop(name, None)) is not None}
-    question = join_question(given, env, asked, typed)
+    chosen = {**asked, **places, **given, **{name: (asked | places)[name] for name in typed & {*asked, *places}}}
+    of_executor = {name: chosen.pop(name) for name in places}
+    chosen |= {} if env is None else {"env_id": env}
+    if "env_id" not in chosen:
+        raise BadInput("Expected an environment: rare-envs estimate ENV, or env: ENV in the file of --config.")
+    question = Question(**chosen)
     for name, option in (("given_base", "--given-base"), ("gate_confidence", "--confidence")):
         if question.max_p is None and name in typed | set(given):
             raise BadInput(f"Expected {option} together with --max-p, the limit of p.")
     with as_bad_input(ValueError):
-        executor = ExecutorOptions(**join_options(of_executor, places, typed)).make()
+        executor = ExecutorOptions(**of_executor).make()
     if is_highway_env_id(question.env_id):
         refused = sorted(typed - OPTIONS)
         if refused:
@@ -92,6 +84,14 @@ def estimate_command(
 
     estimate = run if out is None else partial(run_into, out, force=force)
     return describe_report(estimate(prepare(question), progress=True, executor=executor), out, details)
+
+
+def format_seconds(seconds: float) -> str:
+    """Return a time in a unit of its size."""
+    if seconds < 7200.0:
+        size, unit = (1.0, "s") if seconds < 120.0 else (60.0, "min")
+        return f"{max(1, math.ceil(seconds / size))} {unit}"
+    return f"{seconds / 3600:,.0f} h"
 
 
 def estimate_highway_env(question: Question, out: Path | None, force: bool, executor: Executor | None) -> Answer:
@@ -141,10 +141,10 @@ def _describe(question: Question, problem: Any, result: Estimate, out: Path | No
         named = problem.space.named(result.failures.x[0].round(3))
         likeliest = {name: np.asarray(value).tolist() for name, value in named.items()}
         lines.append(f"  most likely failure: {', '.join(f'{name} {value}' for name, value in likeliest.items())}")
-    doubtful = bool(shown.warnings)
+    lines += [] if out is None else [f"Wrote {out}."]
     about = {"env_id": question.env_id, "ego": question.ego, "given": HELD, "most_likely": likeliest}
-    text = "\n".join(lines if out is None else [*lines, f"Wrote {out}."])
-    return Answer({**result.to_dict(), **about, "doubtful": doubtful}, text, DOUBTFUL if doubtful else 0)
+    data = {**result.to_dict(), **about, "doubtful": bool(shown.warnings)}
+    return Answer(data, "\n".join(lines), DOUBTFUL if shown.warnings else 0)
 
 
 @command("trust", stopped="Stopped before the run went on; what it had kept is still there.")
@@ -159,7 +159,7 @@ def resume_command(
     mend: Annotated[
         bool, typer.Option("--mend", help="Of a damaged journal, keep the simulations before the damage.")
     ] = False,
-    details: DetailsOption = False,
+    details: shell.DetailsOption = False,
 ) -> Answer:
     """Continue an interrupted run; the result is the same as without the interruption."""
     from rare_envs.study.evaluate import resume
@@ -170,7 +170,7 @@ def resume_command(
     return describe_report(report, run, details)
 
 
-@command(*ASKED, *EGO_FILE)
+@command(*shell.ASKED)
 def plan_command(
     target: Annotated[
         str, typer.Argument(metavar="ENV|RUN", help="Environment, of which pilots are run; or the folder of a run.")
@@ -186,7 +186,7 @@ def plan_command(
     ] = None,
 ) -> Answer:
     """Plan simulations and wall time for a precision, by each of --method (joined by commas) and plain Monte Carlo."""
-    from rare_envs.study.evaluate import format_seconds, plan_by_pilots, plan_from_result
+    from rare_envs.study.evaluate import plan_by_pilots, plan_from_result
     from rare_envs.study.run_folder import load_finished
     from samplers.problem import check_number
 
@@ -213,9 +213,11 @@ def plan_command(
     return Answer({"target_cov": cov, "runs": [each.to_dict() for each in found]}, "\n".join(lines))
 
 
-@command("method", "ensemble_run", "device", "seed", *EGO_FILE, "trust", "observation", "action", stopped=NOTHING_MADE)
+@command(
+    "method", "ensemble_run", "device", "seed", *shell.EGO_FILE, "trust", "observation", "action", stopped=NOTHING_MADE
+)
 def risk_command(
-    ego: EgoArgument,
+    ego: shell.EgoArgument,
     asked: dict[str, Any],
     leaders: Annotated[
         str, typer.Option("--with", help="Scenario of new leaders beside hard brake: cut-in or car-following.")
@@ -229,7 +231,7 @@ def risk_command(
     ] = None,
     max_sim: Annotated[int | None, option_of("max_sim", help="Largest number of simulations of each scenario.")] = None,
     out: Annotated[Path | None, typer.Option(help="Folder for risk.json, risk.png and a run of each scenario.")] = None,
-    force: ForceOption = False,
+    force: shell.ForceOption = False,
 ) -> Answer:
     """Estimate collisions per million km, summed over scenarios, with an interval."""
     from rare_envs.study.risk import risk
@@ -262,11 +264,11 @@ def risk_command(
     return Answer(found.to_dict(), text, DOUBTFUL if found.warnings else 0)
 
 
-@command(*ASKED, *EGO_FILE, stopped=NOTHING_MADE)
+@command(*shell.ASKED, stopped=NOTHING_MADE)
 def compare_command(
     ego_a: Annotated[str, typer.Argument(metavar="EGO_A", help="An ego, as for estimate --ego.")],
     ego_b: Annotated[str, typer.Argument(metavar="EGO_B", help="The other ego.")],
-    env: EnvArgument,
+    env: shell.EnvArgument,
     asked: dict[str, Any],
     max_sim: Annotated[
         int, option_of("max_sim", help="Largest number of simulations, of both egos together.", show_default=True)
@@ -274,13 +276,13 @@ def compare_command(
     algo_b: Annotated[str | None, typer.Option(help="As --algo, for the .zip of EGO_B.")] = None,
     stats_b: Annotated[str | None, typer.Option(help="As --stats, for the .zip of EGO_B.")] = None,
     out: Annotated[Path | None, typer.Option(help="Folder for comparison.json and failures.csv.")] = None,
-    force: ForceOption = False,
+    force: shell.ForceOption = False,
 ) -> Answer:
     """Estimate how many times likelier ego A fails than ego B, with an interval, from the same scenarios."""
-    from rare_envs.study.compare import compare_egos
+    from rare_envs.study.evaluate import compare_egos
 
     question = Question(env_id=env, ego=ego_a, max_sim=max_sim, **asked)
-    found = compare_egos(question, ego_b, progress=True, out=out, force=force, algo_b=algo_b, stats_b=stats_b)
-    lines = [f"A = {ego_a}, B = {ego_b}, {env}", str(found.comparison)]
-    lines += [f"  note: {note}" for note in found.answer["notes"]] + ([] if out is None else [f"Wrote {out}."])
-    return Answer(found.answer, "\n".join(lines), DOUBTFUL if found.comparison.warnings else 0)
+    found, answer = compare_egos(question, ego_b, progress=True, out=out, force=force, algo_b=algo_b, stats_b=stats_b)
+    lines = [f"A = {ego_a}, B = {ego_b}, {env}", str(found), *(f"  note: {note}" for note in answer["notes"])]
+    lines += [] if out is None else [f"Wrote {out}."]
+    return Answer(answer, "\n".join(lines), DOUBTFUL if found.warnings else 0)

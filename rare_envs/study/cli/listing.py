@@ -49,44 +49,6 @@ DRIVERS = {
     "idm+mobil": "the same, which changes lanes too, by MOBIL",
     "FILE.safetensors": "driver that you trained, see rare-envs train-drivers",
 }
-
-
-def list_names() -> dict[str, Any]:
-    """Return everything that can be named on the command line, as JSON-ready values."""
-    environments = {
-        env_id: {
-            "kinematics_id": kinematics_id(env_id),
-            "parameters": [asdict(parameter) for parameter in scenario.parameters],
-            "vehicles": list(scenario.vehicle_names),
-            "bases": list(scenario.bases),
-            "drivers": scenario.drivers,
-            "of_learned_drivers": [
-                {"name": "weights", "size": HEAD_SIZE},
-                {"name": "noise", "size": noise_size(round(scenario.horizon / TICK), scenario.vehicles - 1)},
-            ],
-        }
-        for env_id, scenario in SCENARIOS.items()
-    }
-    return {
-        "environments": environments,
-        "highway_env": list(HIGHWAY_ENV_IDS),
-        "weather": [asdict(parameter) for parameter in (*CONDITIONS, SENSOR_NOISE)],
-        "methods": {name: _first_line(method) for name, method in samplers.METHODS.items()},
-        "egos": EGOS,
-        "drivers": DRIVERS,
-        "measures": {
-            name: _first_line(measure.of if isinstance(measure, Measure | TraceMeasure) else measure)
-            for name, measure in MEASURES.items()
-        },
-    }
-
-
-def _first_line(documented: object) -> str:
-    """Return the first line of a docstring, as a noun: "Return the gap ..." becomes "Gap ..."."""
-    line = (documented.__doc__ or "").strip().partition("\n")[0].removeprefix("Return ").removeprefix("the ")
-    return line[:1].upper() + line[1:]
-
-
 TITLES = {
     "methods": "Methods",
     "egos": "Egos",
@@ -97,6 +59,37 @@ TITLES = {
 EVERYTHING = "all"
 KINDS = ("environments", *TITLES, "weather", EVERYTHING)
 """What can be shown in detail, beside one environment."""
+
+
+def list_names() -> dict[str, Any]:
+    """Return everything that can be named on the command line, as JSON-ready values."""
+    environments = {}
+    for env_id, scenario in SCENARIOS.items():
+        n_noise = noise_size(round(scenario.horizon / TICK), scenario.vehicles - 1)
+        environments[env_id] = {
+            "kinematics_id": kinematics_id(env_id),
+            "parameters": [asdict(parameter) for parameter in scenario.parameters],
+            "vehicles": list(scenario.vehicle_names),
+            "bases": list(scenario.bases),
+            "drivers": scenario.drivers,
+            "of_learned_drivers": [{"name": "weights", "size": HEAD_SIZE}, {"name": "noise", "size": n_noise}],
+        }
+    measures = {name: each.of if isinstance(each, Measure | TraceMeasure) else each for name, each in MEASURES.items()}
+    return {
+        "environments": environments,
+        "highway_env": list(HIGHWAY_ENV_IDS),
+        "weather": [asdict(parameter) for parameter in (*CONDITIONS, SENSOR_NOISE)],
+        "methods": {name: _first_line(method) for name, method in samplers.METHODS.items()},
+        "egos": EGOS,
+        "drivers": DRIVERS,
+        "measures": {name: _first_line(measure) for name, measure in measures.items()},
+    }
+
+
+def _first_line(documented: object) -> str:
+    """Return the first line of a docstring, as a noun: "Return the gap ..." becomes "Gap ..."."""
+    line = (documented.__doc__ or "").strip().partition("\n")[0].removeprefix("Return ").removeprefix("the ")
+    return line[:1].upper() + line[1:]
 
 
 def print_overview(entries: dict[str, Any]) -> None:
@@ -120,81 +113,64 @@ def print_overview(entries: dict[str, Any]) -> None:
     )
 
 
-def print_details(entries: dict[str, Any], what: str) -> None:
-    """Print the names of one kind with their meanings."""
-    console, whole = Console(highlight=False), what == EVERYTHING
-    for env_id, environment in entries["environments"].items():
-        if whole or what in ("environments", env_id):
-            _print_environment(console, env_id, environment)
-    if whole or what == "environments":
-        console.print(
-            "HighwayEnv's own, for estimate, and with its settings for rare_envs.highway_env_problem in Python: "
-            f"{', '.join(entries['highway_env'])}\n"
-        )
-    if whole or what == "weather":
-        console.print(_make_parameter_table("Weather, which --weather adds for egos with a camera", entries["weather"]))
-    for kind, title in TITLES.items():
-        if whole or what == kind:
-            console.print(_make_table(title, ["name", "what it is"], entries[kind].items()))
-
-
 def choose_entries(entries: dict[str, Any], what: str) -> dict[str, Any]:
-    """Return the part of the names that `print_details` prints, under the keys that it has in the whole."""
-    if what == EVERYTHING:
-        return entries
-    if what not in KINDS:
-        return {"environments": {what: entries["environments"][what]}}
-    kinds = ("environments", "highway_env") if what == "environments" else (what,)
-    return {kind: entries[kind] for kind in kinds}
-
-
-def check_kind(entries: dict[str, Any], what: str) -> str:
-    """Return what to show in detail: a kind, or the id that an id or its part behind the slash means."""
-    known: dict[str, str] = {name: name for name in (*KINDS, *entries["environments"])}
-    known |= {name.partition("/")[2]: name for name in entries["environments"]}
+    """Return the part of the names that a kind, an environment id or its part behind the slash means."""
+    known = {name: name for name in KINDS}
+    known |= {part: name for name in entries["environments"] for part in (name, name.partition("/")[2])}
     if what not in known:
         kinds = ", ".join(KINDS)
         raise BadInput(f"Expected {kinds} or an environment, got {what!r}{did_you_mean(what, known)}.")
-    return known[what]
+    if what == EVERYTHING:
+        return entries
+    if what not in KINDS:
+        return {"environments": {known[what]: entries["environments"][known[what]]}}
+    return {kind: entries[kind] for kind in (("environments", "highway_env") if what == "environments" else (what,))}
 
 
-def _print_environment(console: Console, env_id: str, environment: dict[str, Any]) -> None:
-    """Print the parameters of an environment, and what else can be chosen there."""
-    console.print(_make_parameter_table(env_id, environment["parameters"]))
-    console.print(f"  vehicles, each of which can be an agent: {', '.join(environment['vehicles'])}")
-    console.print(f"  base distributions: {', '.join(environment['bases'])}, or your own JSON file")
-    around = environment["drivers"] or "a script, unless told otherwise"
-    console.print(f"  drivers around the ego: {around}")
-    added = ", ".join(f"{each['name']} ({each['size']:,} values)" for each in environment["of_learned_drivers"])
-    console.print(f"  learned drivers add{', those above too' if environment['drivers'] else ''}: {added}")
-    console.print(f"  with HighwayEnv's observations and actions: {environment['kinematics_id']}\n")
+def print_details(chosen: dict[str, Any]) -> None:
+    """Print names that `choose_entries` returns with their meanings."""
+    console = Console(highlight=False)
+    for env_id, environment in chosen.get("environments", {}).items():
+        _print_parameters(console, env_id, environment["parameters"])
+        added = ", ".join(f"{each['name']} ({each['size']:,} values)" for each in environment["of_learned_drivers"])
+        for text in (
+            f"vehicles, each of which can be an agent: {', '.join(environment['vehicles'])}",
+            f"base distributions: {', '.join(environment['bases'])}, or your own JSON file",
+            f"drivers around the ego: {environment['drivers'] or 'a script, unless told otherwise'}",
+            f"learned drivers add{', those above too' if environment['drivers'] else ''}: {added}",
+            f"with HighwayEnv's observations and actions: {environment['kinematics_id']}\n",
+        ):
+            console.print(f"  {text}")
+    if "highway_env" in chosen:
+        own = "HighwayEnv's own, for estimate, and with its settings for rare_envs.highway_env_problem in Python: "
+        console.print(f"{own}{', '.join(chosen['highway_env'])}\n")
+    if "weather" in chosen:
+        _print_parameters(console, "Weather, which --weather adds for egos with a camera", chosen["weather"])
+    for kind in (kind for kind in TITLES if kind in chosen):
+        _print_table(console, TITLES[kind], ["name", "what it is"], chosen[kind].items())
 
 
-def _make_parameter_table(title: str, parameters: list[dict[str, Any]]) -> Table:
-    """Return a table of names, units, ranges and meanings."""
+def _print_parameters(console: Console, title: str, parameters: list[dict[str, Any]]) -> None:
+    """Print a table of names, units, ranges and meanings."""
     rows = []
     for each in parameters:
         name = each["name"] if each["size"] == 1 else f"{each['name']} ({each['size']} values)"
         rows.append((name, each["unit"], f"{each['low']:g} to {each['high']:g}", each["meaning"]))
-    return _make_table(title, ["parameter", "unit", "range", "meaning"], rows)
+    _print_table(console, title, ["parameter", "unit", "range", "meaning"], rows)
 
 
-def _make_table(title: str, heads: list[str], rows: Iterable[tuple[str, ...]]) -> Table:
+def _print_table(console: Console, title: str, heads: list[str], rows: Iterable[tuple[str, ...]]) -> None:
     table = Table(*heads, title=title, title_justify="left", title_style="bold")
     for row in rows:
         table.add_row(*row)
-    return table
+    console.print(table)
 
 
-def list_bases(scenario: str) -> dict[str, dict[str, Any]]:
-    """Return what is known of each base distribution of a scenario, by name, the default first; JSON-ready."""
-    found = find_scenario(resolve_scenario(scenario))
-    return {name: _describe_base(found, name) for name in found.bases}
-
-
-def resolve_scenario(scenario: str) -> str:
-    """Return the environment id that an id or a short name means; versions have bases of the same names."""
-    return scenario if ":" in scenario else env_id_of(scenario)
+def list_bases(scenario: str) -> tuple[str, dict[str, dict[str, Any]]]:
+    """Return the environment id that an id or a short name means, and its base distributions, the default first."""
+    env_id = scenario if ":" in scenario else env_id_of(scenario)
+    found = find_scenario(env_id)
+    return env_id, {name: _describe_base(found, name) for name in found.bases}
 
 
 def print_bases(env_id: str, bases: Mapping[str, Mapping[str, Any]]) -> None:
@@ -218,9 +194,8 @@ def _describe_base(scenario: Scenario, name: str) -> dict[str, Any]:
         "kind": record.get("kind"),
         **{key: text or None for key, text in read_source(record).items()},
         **{key: record.get(key) for key in ("coordinates", "bic", "held_out_log_prob")},
-        **dict.fromkeys(("fitted_to", "events", "family")),
+        **dict.fromkeys(("fitted_to", "events", "family", "frequency")),
         "refits": 0,
-        "frequency": None,
         "no_frequency": explain_no_frequency(record),
         "checks": record.get("checks", []),
         "checked_against": record.get("checked_against"),
@@ -244,20 +219,20 @@ def _summarise(base: Mapping[str, Any]) -> dict[str, str]:
     """Return titles and texts of the lines of one base; empty texts where nothing is known."""
     fit = {"BIC {:,.1f}": base["bic"], "held-out log likelihood {:.2f} per event": base["held_out_log_prob"]}
     family, coordinates = base["family"] or "", base["coordinates"] or ""
-    checks = [f"{each['name']} {each['recorded']} / {each['expected']:.3g}" for each in base["checks"]]
-    frequency = base["frequency"]
+    checks = ", ".join(f"{each['name']} {each['recorded']} / {each['expected']:.3g}" for each in base["checks"])
+    counted, known = f"not known, no rate per hour or km: {base['no_frequency']}", base["frequency"]
+    if known is not None:
+        counted = f"{format_rate(known['per_hour'])} per hour, {format_rate(known['per_km'])} per km: "
+        counted += f"{known['count']:,} in {known['hours']:g} h ({known['definition']})"
     return {
         "fitted to": f"{base['fitted_to']}, {base['refits'] or 'no'} refits" if base["fitted_to"] else "",
         "kind": base["kind"] or "",
-        "site": ", ".join(text for text in (base["site"], base["date"]) if text),
+        "site": ", ".join(filter(None, (base["site"], base["date"]))),
         "data": base["data"] or "",
         "licence": base["licence"] or "",
-        "family": family if coordinates in family else ", ".join(text for text in (family, coordinates) if text),
+        "family": family if coordinates in family else ", ".join(filter(None, (family, coordinates))),
         "fit": ", ".join(text.format(value) for text, value in fit.items() if value is not None),
-        "frequency": f"not known, no rate per hour or km: {base['no_frequency']}"
-        if frequency is None
-        else f"{format_rate(frequency['per_hour'])} per hour, {format_rate(frequency['per_km'])} per km: "
-        f"{frequency['count']:,} in {frequency['hours']:g} h ({frequency['definition']})",
-        "counted in": (frequency or {}).get("source", ""),
-        "recorded / expected": ", ".join(checks) + (f" ({base['checked_against']})" if base["checked_against"] else ""),
+        "frequency": counted,
+        "counted in": (known or {}).get("source", ""),
+        "recorded / expected": checks + (f" ({base['checked_against']})" if base["checked_against"] else ""),
     }

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -10,8 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from rare_envs.study.arguments import BadInput, as_bad_input, output_file
-from rare_envs.study.cli.options import EGO_FILE, RunArgument, command
-from rare_envs.study.cli.shell import DOUBTFUL, Answer
+from rare_envs.study.cli.shell import DOUBTFUL, EGO_FILE, Answer, RunArgument, command
 
 if TYPE_CHECKING:
     from rare_envs.study.corpus import Trial
@@ -68,32 +68,36 @@ def corpus_run_command(
     """Try an ego in all scenarios of a corpus. Exit code 0: it fails in none; 4: it does."""
     from rare_envs.study.corpus import read_corpus, try_ego, write_junit
 
-    with contextlib.nullcontext() if junit is None else output_file(junit):
+    with output_file(junit):
         trials, seconds = try_ego(read_corpus(corpus), corpus, ego, **asked)
         if junit is not None:
             with _unwritten(junit):
                 write_junit(junit, trials, ego, seconds)
-    return _describe_tries(trials, ego, seconds)
+    return _describe_tries(trials, seconds, ego)
 
 
-def replay_all(run: Path, ego: str | None, trust: bool) -> Answer:
+def replay_all(folder: Path, ego: str | None, trust: bool) -> Answer:
     """Simulate all failures that a run has recorded again, with its ego or another."""
-    from rare_envs.study.corpus import read_run, repeat_run, try_ego
+    from rare_envs.study.corpus import list_failures, try_ego, try_world
+    from rare_envs.study.question import open_run, prepare
+    from rare_envs.study.run_folder import load_finished
 
-    failures = read_run(run, trust)
+    start, run = time.perf_counter(), load_finished(folder)
+    failures = list_failures(run, trust)
     if not failures:
-        raise BadInput(f"The run in {str(run)!r} has no failure.")
+        raise BadInput(f"The run in {str(folder)!r} has no failure.")
     if ego is not None:
-        tried, seconds = try_ego(failures, run, ego, trust=trust)
-        return _describe_tries(tried, ego, seconds)
-    trials, seconds = repeat_run(run, trust)
+        return _describe_tries(*try_ego(failures, folder, ego, trust=trust), ego)
+    with as_bad_input(ValueError, OSError):
+        trials = try_world(prepare(open_run(run, trust)).problem, failures)
     different = [trial for trial in trials if not trial.same]
     same = len(trials) - len(different)
     lines = [f"{same:,} of {len(trials):,} failures that the run lists come to the f recorded.", *_list(different)]
-    return Answer(_count(trials, seconds) | {"same": same}, "\n".join(lines), DOUBTFUL if different else 0)
+    data = _count(trials, time.perf_counter() - start) | {"same": same}
+    return Answer(data, "\n".join(lines), DOUBTFUL if different else 0)
 
 
-def _describe_tries(trials: Sequence[Trial], ego: str, seconds: float) -> Answer:
+def _describe_tries(trials: Sequence[Trial], seconds: float, ego: str) -> Answer:
     """Return the answer of trials of an ego."""
     bad = [trial for trial in trials if trial.outcome != "passed"]
     errors = sum(trial.outcome == "error" for trial in trials)
@@ -131,18 +135,18 @@ def replay_command(
     ] = False,
 ) -> Answer:
     """Replay a failure that a run has found, and show it with its measure over time."""
+    from rare_envs.study.plots import check_film_path, write_film
     from rare_envs.study.replay import REPLAY_TOLERANCE, describe_drive, drive_again, find_failure
-    from rare_envs.study.video import check_film_path, write_film
 
-    if replay_each and out is not None:
-        raise BadInput("Expected --all without --out: a film shows one failure.")
-    if replay_each and "failure" in typed:
-        raise BadInput("Expected --all without --failure: it simulates all of them.")
     if replay_each:
+        if out is not None:
+            raise BadInput("Expected --all without --out: a film shows one failure.")
+        if "failure" in typed:
+            raise BadInput("Expected --all without --failure: it simulates all of them.")
         return replay_all(run, ego, **asked)
     if out is not None:
         check_film_path(out)
-    with contextlib.nullcontext() if out is None else output_file(out):
+    with output_file(out):
         recorded = find_failure(run, failure, asked["trust"], ego)
         drive = drive_again(recorded.problem, recorded.x)
         if out is not None:

@@ -1,9 +1,11 @@
-"""Behaviour that all commands share: errors in one line and answers as JSON."""
+"""What all commands share: options from the fields of questions, answers as text or JSON, errors in one line."""
 
 from __future__ import annotations
 
 import contextlib
 import ctypes
+import functools
+import inspect
 import json
 import os
 import re
@@ -13,44 +15,35 @@ import sys
 import threading
 import warnings
 from collections.abc import Callable, Iterator, Mapping
+from dataclasses import fields
 from pathlib import Path
-from types import FrameType
-from typing import Any, NamedTuple, NoReturn
+from typing import Annotated, Any, Literal, NamedTuple, NoReturn, get_type_hints
 
 import typer
 from typer.core import TyperGroup
 
 from rare_envs.plugins import EgoGone
 from rare_envs.startup import find_missing_libraries, restore_signals, use_one_thread
-from rare_envs.study.arguments import BadInput
+from rare_envs.study.arguments import BadInput, ExecutorOptions, Question, option_name, read_whole
 
 DOUBTFUL = 3
 """Exit code of a command that is done, with warnings that make its number doubtful."""
-
 GATE_CODES = {"passes": 0, "fails": 4, "undecided": 5}
 """Exit codes of a comparison of p with a limit."""
 WHOLE = 1_000
 """Characters of a summary in a list of commands: more than any has."""
-
 _SIGPIPE = int(getattr(signal, "SIGPIPE", 13))
 """Signal of a reader that is gone; Windows has none of this number."""
+_ENDING = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP", "SIGINT") if hasattr(signal, name)]
+"""Signals to end; Windows has no SIGHUP."""
 _UsageError: type[Exception] = typer.BadParameter.__bases__[0]
 """Error that Typer raises for a wrong option or a missing word; older versions of Typer take it from click."""
-
-
-class Terminated(KeyboardInterrupt):
-    """The process was asked to end, by a signal other than that of Ctrl-C."""
-
-    def __init__(self, number: int) -> None:
-        super().__init__(f"ended by {signal.Signals(number).name}")
-        self.number = number
-
-
-class AnswerCut(KeyboardInterrupt):
-    """The printing of an answer was interrupted."""
-
-    report = None
-    """As of `RunInterrupted`: what could be said has been said."""
+_PLAIN_WORDS = (
+    (r"Value error, ", ""),
+    (r"Input should be a valid number, unable to parse string as a number", "expected a number"),
+    (r"Input should be a valid integer, unable to parse string as an \w+", "expected a whole number"),
+)
+"""What Typer says of a wrong value in words of the library that it checks values with, and what is said instead."""
 
 
 class SummarisedCommands(TyperGroup):
@@ -65,17 +58,14 @@ class SummarisedCommands(TyperGroup):
 
 
 class OneLineErrors(SummarisedCommands):
-    """Commands whose errors are one line on standard error and exit code 2.
-
-    SIGTERM and SIGHUP end a command as Ctrl-C does; the exit code is 128 and the number of the signal.
-    """
+    """Commands whose errors are one line on standard error and exit code 2."""
 
     def invoke(self, ctx: Any) -> Any:
         """Run a command; where an error names an argument of Python, name the option that stands for it."""
         try:
             return super().invoke(ctx)
         except BadInput as error:
-            error.args = (name_options(str(error), find_options(self.get_command(ctx, ctx.invoked_subcommand))),)
+            error.args = (name_options(str(error), self.get_command(ctx, ctx.invoked_subcommand)),)
             raise
 
     def main(self, *args: Any, **extra: Any) -> NoReturn:
@@ -90,7 +80,9 @@ class OneLineErrors(SummarisedCommands):
                 code = super().main(*args, **{**extra, "standalone_mode": False})
                 ended = code != 128 + signal.SIGINT
         except _UsageError as error:
-            said = _in_plain_words(getattr(error, "format_message")())  # noqa: B009  (differs by version)
+            said = getattr(error, "format_message")()  # noqa: B009  (differs by version)
+            for pattern, plain in _PLAIN_WORDS:
+                said = re.sub(pattern, plain, said)
             path = getattr(getattr(error, "ctx", None), "command_path", "") or self._find_path(words)
             help_command = " ".join(["rare-envs", *path.split()[1:]])
             _fail(f"{said.rstrip('.')}{'' if said.endswith('?') else '.'} See {help_command} --help.")
@@ -124,33 +116,15 @@ class OneLineErrors(SummarisedCommands):
         return " ".join(path)
 
 
-def _in_plain_words(message: str) -> str:
-    """Return what Typer says of a wrong value without the words of the library that it checks values with."""
-    message = message.replace("Value error, ", "")
-    message = message.replace("Input should be a valid number, unable to parse string as a number", "expected a number")
-    return re.sub(
-        r"Input should be a valid integer, unable to parse string as an \w+", "expected a whole number", message
-    )
-
-
-def find_options(command: Any) -> dict[str, str]:
-    """Return the options of a command, and of the commands below it, by the names that they have in Python."""
-    found: dict[str, str] = {}
-    for each in (command, *getattr(command, "commands", {}).values()):  # of a group
-        for parameter in getattr(each, "params", ()):
-            for option in [word for word in getattr(parameter, "opts", ()) if word.startswith("--")][:1]:
-                found[parameter.name] = found[option[2:].replace("-", "_")] = option
-    return found
-
-
-def name_options(message: str, options: Mapping[str, str]) -> str:
-    """Return a message with options in place of the names that they have in Python.
-
-    A name of one word is an ordinary word too: it is replaced behind "Expected" at the beginning alone. What is said
-    of a file of --config stays as it is: its keys are these names.
-    """
+def name_options(message: str, command: Any) -> str:
+    """Return a message with the options of a command, or of those in a group, in place of their names in Python."""
     if message.startswith("'"):
         return message
+    options: dict[str, str] = {}
+    for each in (command, *getattr(command, "commands", {}).values()):
+        for parameter in getattr(each, "params", ()):
+            for option in [word for word in getattr(parameter, "opts", ()) if word.startswith("--")][:1]:
+                options[parameter.name] = options[option[2:].replace("-", "_")] = option
     for name, option in options.items():
         before = r"(?<![-\w'\"/.])" if "_" in name else "^Expected "
         after = r"(?![-\w'\"/(=]|\.\w)"
@@ -160,16 +134,16 @@ def name_options(message: str, options: Mapping[str, str]) -> str:
 
 @contextlib.contextmanager
 def signals_as_exceptions(received: list[int]) -> Iterator[None]:
-    """Raise `Terminated` on SIGTERM and SIGHUP, where they would end the process without a word."""
+    """Raise a KeyboardInterrupt on SIGTERM and SIGHUP, where they would end the process without a word."""
 
-    def end(number: int, frame: FrameType | None) -> None:
+    def end(number: int, _: object) -> None:
         received.append(number)
-        raise Terminated(number)
+        raise KeyboardInterrupt(f"ended by {signal.Signals(number).name}")
 
     before: dict[int, Any] = {}
     if threading.current_thread() is threading.main_thread():
-        for number in (signal.SIGTERM, getattr(signal, "SIGHUP", signal.SIGTERM)):
-            if signal.getsignal(number) is signal.SIG_DFL:  # nohup has SIGHUP ignored
+        for number in _ENDING:
+            if signal.getsignal(number) is signal.SIG_DFL:  # nohup has SIGHUP ignored, Python has SIGINT handled
                 before[number] = signal.signal(number, end)
     try:
         yield
@@ -180,9 +154,8 @@ def signals_as_exceptions(received: list[int]) -> Iterator[None]:
 
 def ignore_signals() -> None:
     """Ignore signals to end, for a process that has given its answer and is about to end by itself."""
-    for name in ("SIGINT", "SIGTERM", "SIGHUP"):
-        if hasattr(signal, name):
-            signal.signal(getattr(signal, name), signal.SIG_IGN)
+    for number in _ENDING:
+        signal.signal(number, signal.SIG_IGN)
 
 
 @contextlib.contextmanager
@@ -222,6 +195,22 @@ class Answer(NamedTuple):
     code: int = 0
     """Exit code."""
 
+    def print(self, as_json: bool) -> None:
+        """Print it to its end: the first signal meanwhile changes nothing, as the command is about to end."""
+        from samplers.estimation import defer_signals  # slow to import, and known by now
+
+        whole = False
+        try:
+            with defer_signals():
+                if as_json or isinstance(self.text, str):
+                    print(json.dumps(self.data, indent=2, allow_nan=False) if as_json else self.text)
+                else:
+                    self.text()
+                whole = True
+        except KeyboardInterrupt:
+            if not whole:
+                raise
+
 
 def describe_report(report: Any, out: Path | None, details: bool) -> Answer:
     """Return the answer of a `Report`, of a run in a folder `out` or of none."""
@@ -238,49 +227,21 @@ def describe_report(report: Any, out: Path | None, details: bool) -> Answer:
 
 
 def answering(work: Callable[[], Answer | None], as_json: bool, stopped: str, details: bool) -> None:
-    """Do the work of a command, print its answer, if any, and exit.
-
-    If it is interrupted, or its results cannot be written, what is known is printed: the message of the interruption,
-    one line, comes first, because whoever ended the process may not wait for the rest. `stopped` is what is known of a
-    run that has not begun.
-    """
+    """Do the work of a command, print its answer, if any, and exit."""
     try:
         with use_one_thread(), keep_stdout_for_the_answer():
             answer = work()
     except (KeyboardInterrupt, BadInput) as error:
         report = getattr(error, "report", None)  # of `RunInterrupted` and `UnwrittenResults`, slow to import
+        # whoever ended the process may not wait for more than one line
         if isinstance(error, KeyboardInterrupt) and (hasattr(error, "report") or stopped):
             _print_stderr(str(error) if hasattr(error, "report") else stopped)
         if report is not None:
-            known = report if isinstance(report, Answer) else describe_report(report, None, details)
-            print_whole(lambda: _print_answer(known, as_json))
+            (report if isinstance(report, Answer) else describe_report(report, None, details)).print(as_json)
         raise
     if answer is not None:
-        print_whole(lambda: _print_answer(answer, as_json))
+        answer.print(as_json)
         raise typer.Exit(answer.code)
-
-
-def _print_answer(answer: Answer, as_json: bool) -> None:
-    if as_json:
-        print(json.dumps(answer.data, indent=2, allow_nan=False))
-    elif isinstance(answer.text, str):
-        print(answer.text)
-    else:
-        answer.text()
-
-
-def print_whole(show: Callable[[], None]) -> None:
-    """Print an answer to its end: the first signal meanwhile changes nothing, as the command is about to end."""
-    from samplers.estimation import defer_signals  # slow to import, and known by now
-
-    whole = False
-    try:
-        with defer_signals():
-            show()
-            whole = True
-    except KeyboardInterrupt:
-        if not whole:
-            raise AnswerCut from None
 
 
 @contextlib.contextmanager
@@ -300,3 +261,100 @@ def keep_stdout_for_the_answer() -> Iterator[None]:
                 ctypes.CDLL(None).fflush(None)  # what C's standard library still has to write
             os.dup2(answer, 1)
             os.close(answer)
+
+
+SCENARIO = ("base", "drivers", "observation", "action", "horizon")
+"""Fields of `Question` that are options of each command that drives an ego."""
+WORLD = (*SCENARIO, "noise", "weather")
+EGO_FILE = ("algo", "stats")
+ASKED = (*WORLD, "method", "measure", "gamma", "seed", "collisions", "device", "ensemble_run", "trust", *EGO_FILE)
+EVERYTHING = tuple(field.name for field in fields(Question) if field.name != "env_id")
+EXECUTOR = tuple(field.name for field in fields(ExecutorOptions))
+NOISE = {"on": True, "fixed": "fixed", "off": False}
+"""Words of --noise for the `noise` argument of `DrivingProblem`."""
+KINDS: dict[str, Any] = {"noise": Literal["on", "fixed", "off"], "executor": Literal["local", "ray"] | None}
+"""Types of options of which the fields have another."""
+
+
+def read_count(text: str) -> int:
+    """Return the whole number that a text stands for, such as "10000" or "1e4"."""
+    try:
+        return read_whole(text)
+    except ValueError:
+        raise typer.BadParameter(f"expected a whole number, such as 10000 or 1e4, got {text!r}.") from None
+
+
+def read_environment(text: str | None) -> str | None:
+    """Return the id of an environment with its namespace, where it was typed without."""
+    from rare_envs.scenarios.registry import complete_id
+
+    return None if text is None else complete_id(text)
+
+
+def option_of(name: str, owner: type[Any] = Question, **changes: Any) -> Any:
+    """Return the option of a field, with changes to what `typer.Option` is told."""
+    field = next(each for each in fields(owner) if each.name == name)
+    about = {key: field.metadata[key] for key in ("help", "show_default") if key in field.metadata} | changes
+    if field.metadata.get("count"):
+        return typer.Option(parser=read_count, metavar="INTEGER", **about)
+    return typer.Option(field.metadata.get("flags", f"--{option_name(field).replace('_', '-')}"), **about)
+
+
+EnvArgument = Annotated[
+    str, typer.Argument(metavar="ENV", help="Environment, such as rare_envs/CutIn-v0.", callback=read_environment)
+]
+EgoArgument = Annotated[str, typer.Argument(metavar="EGO", help="An ego, as for estimate --ego.")]
+RunArgument = Annotated[Path, typer.Argument(metavar="RUN", help="Folder that rare-envs estimate --out has written.")]
+ForceOption = Annotated[bool, typer.Option("--force", help="Replace what the folder of --out has of an earlier run.")]
+DetailsOption = Annotated[
+    bool, typer.Option("--details", help="Print all intervals, and all parameters of the most likely failure.")
+]
+JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object and nothing else.")]
+
+
+def command(*names: str, stopped: str = "") -> Callable[[Callable[..., Answer | None]], Callable[..., None]]:
+    """Let a function be a command of Typer: the answer that it returns, if any, is printed, as JSON with --json.
+
+    Its parameter `asked` becomes the options of these fields of `Question`, `places` those of `ExecutorOptions`, and it
+    gets a mapping of them; `typed` gets the names of what was typed. `stopped` is said of an early interruption.
+    """
+    groups: dict[str, tuple[type[Any], tuple[str, ...]]] = {
+        "asked": (Question, names),
+        "places": (ExecutorOptions, EXECUTOR),
+    }
+
+    def decorate(function: Callable[..., Answer | None]) -> Callable[..., None]:
+        signature = inspect.signature(function, eval_str=True)
+        taken = signature.parameters
+
+        @functools.wraps(function)
+        def run(context: typer.Context, as_json: bool = False, **values: Any) -> None:
+            for group in groups.keys() & taken.keys():
+                known = {name: values.pop(name) for name in groups[group][1]}
+                values[group] = {name: NOISE[value] if name == "noise" else value for name, value in known.items()}
+            if "typed" in taken:
+                sources = {name: context.get_parameter_source(name) for name in context.params}
+                values["typed"] = {name for name, source in sources.items() if source and source.name == "COMMANDLINE"}
+            answering(functools.partial(function, **values), as_json, stopped, values.get("details", False))
+
+        keyword = functools.partial(inspect.Parameter, kind=inspect.Parameter.KEYWORD_ONLY)
+        parameters = [keyword("context", annotation=typer.Context)]
+        for name, parameter in taken.items():
+            if name in groups:
+                owner, known = groups[name]
+                kinds: Any = {**get_type_hints(owner), **KINDS}
+                for each in known:
+                    default = "on" if each == "noise" else getattr(owner, each)
+                    parameters.append(
+                        keyword(each, default=default, annotation=Annotated[kinds[each], option_of(each, owner)])
+                    )
+            elif name != "typed":
+                parameters.append(parameter.replace(kind=inspect.Parameter.KEYWORD_ONLY))
+        if signature.return_annotation is not None:
+            parameters.append(keyword("as_json", default=False, annotation=JsonOption))
+        run.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+        run.__annotations__ = {each.name: each.annotation for each in parameters}
+        del run.__wrapped__
+        return run
+
+    return decorate

@@ -1,34 +1,49 @@
 """Checks of an ego: spaces, normalisation, actions, determinism, memory, independent rows, latency, a few drives.
 
-Each check is a function from a `Probe` to findings; `EGO_CHECKS` lists all of them.
+Each check is a function from a `Probe` to findings; `EGO_CHECKS` has all of them by name. A server is held against the
+protocol of docs/egos.md over its socket, message by message.
 """
 
 from __future__ import annotations
 
-import sys
+import itertools
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Any
+from functools import partial
+from pathlib import Path
+from typing import Any, Literal
 
 import numpy as np
 import torch
 from gymnasium import spaces
 
+import agents
+from agents.loading import find_ego_kind
 from agents.saved_ego import SavedEgo
 from rare_envs.devices import CAMERA_TILE
 from rare_envs.distributions.coordinates import AnyArray
+from rare_envs.egos.needs import AMBIGUOUS, TAKEN_AS_ACCELERATIONS
 from rare_envs.egos.policy import PolicyDriver
 from rare_envs.egos.wrappers import find_frame_stacking
-from rare_envs.plugins import reason_of
+from rare_envs.plugins import EgoGone, reason_of
 from rare_envs.problem import DrivingProblem
 from rare_envs.simulation.observation import batch_size, map_kinds, observe
 from rare_envs.simulation.world import drive
-from rare_envs.study.ego_check import FAIL, HINT, Finding, judge, report_failure, report_pass, report_warning
+from rare_envs.study.arguments import Question
+from rare_envs.study.ego_check import Finding
+from rare_envs.study.question import build_problem
 from samplers.evaluate import Evaluator
 
 BATCH_ROWS = 32
 """Observations in a query."""
+
+
+def judge(
+    check: str, bad: str | bool, good: str, advice: str, status: Literal["warn", "fail"] = "warn", doubtful: bool = True
+) -> Finding:
+    """Return what is bad, if anything, with what to do, else that the check passed with what is good."""
+    return Finding(check, status, str(bad), advice, doubtful) if bad else Finding(check, "pass", good)
 
 
 @dataclass(frozen=True)
@@ -50,30 +65,33 @@ class Probe:
         return cls(ego, problem, seen)
 
     @property
-    def space(self) -> spaces.Space[Any]:
-        """Space of the environment's observations."""
-        return self.problem.world.observation_space
-
-    def transform_seen(self, change: Callable[[AnyArray], Any]) -> Any:
-        """Return the observations after a function, each of its own type."""
-        return map_kinds(lambda part: np.asarray(change(part)).astype(part.dtype), self.seen)
-
-    def repeat_seen(self, size: int) -> Any:
-        """Return as many observations as `size`, repeating those that there are."""
-        return self.transform_seen(lambda part: np.resize(part, (size, *part.shape[1:])))
+    def has_camera(self) -> bool:
+        """Whether it observes pictures, of which a batch is small."""
+        return "camera" in self.problem.world.sensing.kinds
 
     @property
     def policy(self) -> Any:
         """Policy of the ego with the wrappers of its training; None if the ego is a driver."""
         return self.problem.driver.policy if isinstance(self.problem.driver, PolicyDriver) else None
 
+    def change_seen(self, change: Callable[[AnyArray], Any]) -> Any:
+        """Return the observations after a function, each of its own type."""
+        return map_kinds(lambda part: np.asarray(change(part)).astype(part.dtype), self.seen)
+
+    def repeat_seen(self, size: int) -> Any:
+        """Return as many observations as `size`, repeating those that there are."""
+        return self.change_seen(lambda part: np.resize(part, (size, *part.shape[1:])))
+
     def query(self, observation: Any, state: Any = None, start: Any = None) -> tuple[AnyArray, Any]:
         """Return the actions as numbers, and the memory."""
         begun = np.full(batch_size(observation), state is None) if start is None else start
-        action, state = self.policy.predict(
-            map_kinds(np.copy, observation), state=state, episode_start=begun, deterministic=True
-        )
+        seen = map_kinds(np.copy, observation)
+        action, state = self.policy.predict(seen, state=state, episode_start=begun, deterministic=True)
         return np.asarray(action), state
+
+    def act(self, observation: Any) -> AnyArray:
+        """Return the actions as numbers, of episodes that begin."""
+        return self.query(observation)[0]
 
 
 def largest_difference(one: AnyArray, other: AnyArray) -> float:
@@ -85,42 +103,39 @@ def largest_difference(one: AnyArray, other: AnyArray) -> float:
     return float(np.nan_to_num(apart, nan=np.inf).max(initial=0.0))
 
 
-OUTLYING = 5.0
-"""Standard deviations of the training; observations beyond are unlike those that the ego was trained on."""
-MANY_OUTLYING = 0.2
-"""Share of ordinary scenarios with such observations from which the statistics are most likely of another ego."""
-
-
 def check_declared_spaces(probe: Probe) -> Iterator[Finding]:
     """Compare declared spaces with the environment's; that they fit at all was found when the problem was made."""
-    ours, ours_to_act = probe.space, probe.problem.world.action_space
-    # the ego is the user's: it need not declare anything
-    observed, acted = declared = [getattr(probe.ego, f"{name}_space", None) for name in ("observation", "action")]
-    missing = [name for name, space in zip(("observation", "action"), declared, strict=True) if space is None]
+    ours, ours_to_act = probe.problem.world.observation_space, probe.problem.world.action_space
+    names = ("observation_space", "action_space")
+    observed, acted = (getattr(probe.ego, name, None) for name in names)  # the user's ego need not declare anything
+    missing = [name for name, space in zip(names, (observed, acted), strict=True) if space is None]
     if missing:
-        found = f"it has no {' and '.join(f'{name}_space' for name in missing)}"
-        yield report_warning("spaces", found, "taken at its word; declare them, so that a mix-up is noticed", False)
+        advice = "taken at its word; declare them, so that a mix-up is noticed"
+        yield Finding("spaces", "warn", f"it has no {' and '.join(missing)}", advice, False)
     if observed is not None:
         frames, _ = find_frame_stacking(ours, observed) or (1, False)
         stacked = f", {frames} frames of {ours.shape or ours}" if frames > 1 else ""
         words = f"{observed.shape} {observed.dtype}" if observed.shape is not None else str(observed)
-        yield report_pass("observations", f"{words}{stacked}")
-        kinds = [space.dtype is not None and np.issubdtype(space.dtype, np.floating) for space in (observed, ours)]
-        if observed.dtype is not None and kinds[0] != kinds[1]:
+        yield Finding("observations", "pass", f"{words}{stacked}")
+        real, ours_real = (space.dtype is None or np.issubdtype(space.dtype, np.floating) for space in (observed, ours))
+        if observed.dtype is not None and real != ours_real:
             found = f"it was made for {observed.dtype}, here they are {ours.dtype}"
-            yield report_warning("observations", found, "train it on these")
+            yield Finding("observations", "warn", found, "train it on these")
     if isinstance(acted, spaces.Box) and isinstance(ours_to_act, spaces.Box):
         same = np.array_equal(acted.low, ours_to_act.low) and np.array_equal(acted.high, ours_to_act.high)
-        unbounded = not (np.isfinite(acted.low).any() or np.isfinite(acted.high).any())
-        yield judge(
-            "action space",
-            not (same or unbounded)
-            and f"from {acted.low.tolist()} to {acted.high.tolist()}, the environment's from -1 to 1",
-            "in [-1, 1]" if same else "unbounded; clipped to [-1, 1]",
-            "they are rescaled, as behind RescaleAction; if its units differ, put a function of yours around it",
-        )
+        bounded = np.isfinite(acted.low).any() or np.isfinite(acted.high).any()
+        bad = f"from {acted.low.tolist()} to {acted.high.tolist()}, the environment's from -1 to 1"
+        good = "in [-1, 1]" if same else "unbounded; clipped to [-1, 1]"
+        advice = "they are rescaled, as behind RescaleAction; if its units differ, put a function of yours around it"
+        yield judge("action space", bool(bounded) and not same and bad, good, advice)
     elif acted is not None:
-        yield report_pass("action space", str(acted))
+        yield Finding("action space", "pass", str(acted))
+
+
+OUTLYING = 5.0
+"""Standard deviations of the training; observations beyond are unlike those that the ego was trained on."""
+MANY_OUTLYING = 0.2
+"""Share of ordinary scenarios with such observations from which the statistics are most likely of another ego."""
 
 
 def check_normalisation(probe: Probe) -> Iterator[Finding]:
@@ -128,16 +143,16 @@ def check_normalisation(probe: Probe) -> Iterator[Finding]:
     if not isinstance(probe.ego, SavedEgo):
         return
     name, statistics, path = "normalisation", probe.ego.statistics, probe.ego.statistics_path
-    missing = probe.ego.find_missing_statistics(probe.space)
+    missing = probe.ego.find_missing_statistics(probe.problem.world.observation_space)
     if missing:
-        yield report_warning(name, f"no VecNormalize statistics, but {missing}", "name their file with --stats")
+        yield Finding(name, "warn", f"no VecNormalize statistics, but {missing}", "name their file with --stats")
     elif statistics is None:
         advice = "if it was trained behind VecNormalize, put vecnormalize.pkl there, or name it with --stats"
         yield Finding(name, "pass", "no VecNormalize statistics beside the file", advice)
     elif not statistics.norm_obs:
-        yield report_pass(name, f"{path} does not normalise observations")
+        yield Finding(name, "pass", f"{path} does not normalise observations")
     elif isinstance(probe.seen, dict) or probe.seen.ndim > 2:
-        yield report_pass(name, f"{path}; of such observations their fit is not checked")
+        yield Finding(name, "pass", f"{path}; of such observations their fit is not checked")
     else:
         size = statistics.observation_space.shape[0]
         seen = np.repeat(probe.seen, size // probe.seen.shape[1], 1)  # frames of a stack are alike at time 0
@@ -149,65 +164,50 @@ def check_normalisation(probe: Probe) -> Iterator[Finding]:
 
 def check_actions(probe: Probe) -> Iterator[Finding]:
     """Check shape, type and range of actions on ordinary observations."""
-    action, _ = probe.query(probe.seen)
-    declared = getattr(probe.ego, "action_space", None)  # likewise
+    action, declared = probe.act(probe.seen), getattr(probe.ego, "action_space", None)  # likewise
     whole = np.issubdtype(action.dtype, np.integer)
     what, shape = f"{action.dtype} of shape {action.shape}", (BATCH_ROWS,) if whole else (BATCH_ROWS, 2)
+    bad = advice = ""
     if action.shape != shape or action.dtype == object:
-        yield report_failure("actions", what, f"return shape {(BATCH_ROWS, 2)}, or {BATCH_ROWS} whole numbers")
-        return
-    n_bad = int((~np.isfinite(action).reshape(BATCH_ROWS, -1).all(axis=1)).sum())
-    if n_bad:
-        bad = f"NaN or infinite for {n_bad} of {BATCH_ROWS} observations"
-        yield report_failure("actions", bad, "check weights and normalisation")
-        return
-    if declared is not None and isinstance(declared, spaces.Discrete) != whole:
-        yield report_failure("actions", f"{what}, but it says {declared}", "make both agree")
+        bad, advice = what, f"return shape {(BATCH_ROWS, 2)}, or {BATCH_ROWS} whole numbers"
+    elif n_bad := int((~np.isfinite(action).reshape(BATCH_ROWS, -1).all(axis=1)).sum()):
+        bad, advice = f"NaN or infinite for {n_bad} of {BATCH_ROWS} observations", "check weights and normalisation"
+    elif declared is not None and isinstance(declared, spaces.Discrete) != whole:
+        bad, advice = f"{what}, but it says {declared}", "make both agree"
+    if bad:
+        yield Finding("actions", "fail", bad, advice)
         return
     beyond = 0.0 if whole else float((np.abs(action) > 1.0 + 1e-6).mean())
     if beyond:
         far = f"{beyond:.0%} beyond [-1, 1], up to {np.abs(action).max():.3g}"
-        yield report_warning("actions", far, "they are clipped", False)
+        yield Finding("actions", "warn", far, "they are clipped", False)
     same = len(np.unique(action.round(6), axis=0)) == 1
-    yield judge(
-        "actions",
-        same and f"the same for all {BATCH_ROWS} observations: {action[0].tolist()}",
-        f"{action.dtype} of shape (B{', 2' if not whole else ''}), finite",
-        "does it look at all?",
-    )
+    bad = f"the same for all {BATCH_ROWS} observations: {action[0].tolist()}"
+    good = f"{action.dtype} of shape (B{', 2' if not whole else ''}), finite"
+    yield judge("actions", same and bad, good, "does it look at all?")
 
 
 def check_extreme_observations(probe: Probe) -> Iterator[Finding]:
-    """Query the ego with zeros (rows whose episode is over), with the bounds of its observations, and with NaN."""
-    space = probe.space
+    """Query the ego with zeros (rows whose episode is over) and with the bounds of its observations."""
+    space = probe.problem.world.observation_space
     boxes = dict(space.spaces) if isinstance(space, spaces.Dict) else space
-    cases = {
-        "zeros": probe.transform_seen(np.zeros_like),
-        "the lower end": map_kinds(lambda part, box: _fill_with_bound(box.low, -1.0, part), probe.seen, boxes),
-        "the upper end": map_kinds(lambda part, box: _fill_with_bound(box.high, 1.0, part), probe.seen, boxes),
-    }
+
+    def fill(end: str, unbounded: float) -> Any:
+        def of(part: AnyArray, box: spaces.Box) -> AnyArray:
+            bound = getattr(box, end)
+            return np.broadcast_to(np.where(np.isfinite(bound), bound, unbounded), part.shape).astype(part.dtype)
+
+        return map_kinds(of, probe.seen, boxes)
+
+    cases = {"zeros": probe.change_seen(np.zeros_like), "the lower end": fill("low", -1.0)}
     bad = []
-    for name, case in cases.items():
+    for name, case in (cases | {"the upper end": fill("high", 1.0)}).items():
         try:
-            action, _ = probe.query(case)
-            bad += [] if np.isfinite(action).all() else [f"{name}: NaN or infinite"]
+            bad += [] if np.isfinite(probe.act(case)).all() else [f"{name}: NaN or infinite"]
         except (Exception, SystemExit) as error:
             bad.append(f"{name}: {reason_of(error)}")
     advice = "such observations come; rows are zeros after a crash"
-    yield judge("range", "; ".join(bad), "finite at zeros and at both ends of what is observed", advice, FAIL)
-    if not isinstance(probe.seen, dict) and probe.seen.dtype == np.uint8:
-        return
-    try:
-        action, _ = probe.query(map_kinds(lambda part: part if part.dtype == np.uint8 else part * np.nan, probe.seen))
-        numbers = "answered by numbers; the environment never gives NaN"
-        yield report_pass("NaN", numbers if np.isfinite(action).all() else "answered by NaN")
-    except (Exception, SystemExit) as error:
-        yield report_pass("NaN", f"refused: {reason_of(error)}")
-
-
-def _fill_with_bound(bound: AnyArray, unbounded: float, part: AnyArray) -> AnyArray:
-    """Return observations at a bound of their space, or at `unbounded` where it has none."""
-    return np.broadcast_to(np.where(np.isfinite(bound), bound, unbounded), part.shape).astype(part.dtype)
+    yield judge("range", "; ".join(bad), "finite at zeros and at both ends of what is observed", advice, "fail")
 
 
 ACTION_ROUNDING = 1e-3
@@ -222,97 +222,89 @@ SLOW_SECONDS = 3600.0
 """Duration of such an estimation [s] from which latency is worth a warning."""
 LEAK_MEGABYTES = 64.0
 """Growth of the process over 100 calls [MB] from which it is worth a warning."""
+STATM = Path("/proc/self/statm")
+"""Pages of memory of this process, the second number."""
 MANY_COLLISIONS = 0.5
 """Share of ordinary scenarios: an ego that collides in more has most likely been given wrong inputs."""
 
 
 def check_determinism(probe: Probe) -> Iterator[Finding]:
     """Check whether an answer repeats, and whether it depends on earlier calls."""
-    other = probe.transform_seen(lambda part: np.roll(part, 1, axis=0) * 0.5)
-    first, second = probe.query(probe.seen)[0], probe.query(probe.seen)[0]
-    probe.query(other)
-    third, off = probe.query(probe.seen)[0], largest_difference(first, second)
-    if off:
+    first, second = probe.act(probe.seen), probe.act(probe.seen)
+    probe.act(probe.change_seen(lambda part: np.roll(part, 1, axis=0) * 0.5))
+    third = probe.act(probe.seen)
+    if off := largest_difference(first, second):
         found = f"its answers vary from call to call, by up to {off:.2g}"
         advice = "random, or a memory not in its state; p is then over this too, and failures may not replay"
-        yield report_warning("determinism", found, advice)
+        yield Finding("determinism", "warn", found, advice)
         return
-    yield judge(
-        "determinism",
-        largest_difference(first, third) > 0.0 and "its answers depend on earlier calls",
-        "the same answer to the same observations",
-        "carry its memory in the state that predict returns: batches of many scenarios take turns",
-        FAIL,
-    )
+    bad = largest_difference(first, third) > 0.0 and "its answers depend on earlier calls"
+    advice = "carry its memory in the state that predict returns: batches of many scenarios take turns"
+    yield judge("determinism", bad, "the same answer to the same observations", advice, "fail")
 
 
 def check_memory(probe: Probe) -> Iterator[Finding]:
     """Check whether the ego has a memory, and whether it is reset where an episode begins."""
     first, state = probe.query(probe.seen)
     if state is None:
-        yield report_pass("memory", "none: an answer depends on one observation")
+        yield Finding("memory", "pass", "none: an answer depends on one observation")
         return
     for _ in range(2):
-        _, state = probe.query(probe.transform_seen(lambda part: part * 0.9), state)
-    begun = np.zeros(BATCH_ROWS, dtype=bool)
-    begun[: BATCH_ROWS // 2] = True
+        _, state = probe.query(probe.change_seen(lambda part: part * 0.9), state)
+    begun = np.arange(BATCH_ROWS) < BATCH_ROWS // 2
     again, _ = probe.query(probe.seen, state, begun)
     off = largest_difference(first[begun], again[begun])
-    yield judge(
-        "memory",
-        off > ACTION_ROUNDING and f"kept in its state, but rows that begin an episode are off by {off:.2g}",
-        "kept in its state, reset where an episode begins",
-        "reset the rows of episode_start; here whole batches begin together, so this may not matter",
-        HINT,
-    )
+    bad = off > ACTION_ROUNDING and f"kept in its state, but rows that begin an episode are off by {off:.2g}"
+    advice = "reset the rows of episode_start; here whole batches begin together, so this may not matter"
+    yield judge("memory", bad, "kept in its state, reset where an episode begins", advice, doubtful=False)
 
 
 def check_row_independence(probe: Probe) -> Iterator[Finding]:
     """Check whether a row's answer depends on the other rows, their order or their number."""
-    whole = probe.query(probe.seen)[0]
-    order = np.random.default_rng(1).permutation(BATCH_ROWS)
-    shuffled = largest_difference(probe.query(probe.transform_seen(lambda part: part[order]))[0], whole[order])
-    single = [probe.transform_seen(lambda part, row=row: part[row : row + 1]) for row in range(8)]  # type: ignore[misc]
-    alone = largest_difference(np.concatenate([probe.query(row)[0] for row in single]), whole[:8])
-    for name, off in (("order of the batch", shuffled), ("size of the batch", alone)):
+    whole, order = probe.act(probe.seen), np.random.default_rng(1).permutation(BATCH_ROWS)
+    shuffled = probe.act(probe.change_seen(lambda part: part[order]))
+    single = [probe.act(probe.change_seen(lambda part, row=row: part[row : row + 1])) for row in range(8)]  # type: ignore[misc]
+    for name, off in (
+        ("order of the batch", largest_difference(shuffled, whole[order])),
+        ("size of the batch", largest_difference(np.concatenate(single), whole[:8])),
+    ):
         bad = off > ACTION_ROUNDING and f"actions change with it, by up to {off:.2g}"
         good = "no effect" if off == 0.0 else f"rounding, {off:.1g}"
-        yield judge(name, bad, good, "a row must not depend on the others; is a batch norm in training mode?", FAIL)
+        yield judge(name, bad, good, "a row must not depend on the others; is a batch norm in training mode?", "fail")
 
 
 def check_latency(probe: Probe) -> Iterator[Finding]:
     """Measure the duration of a call by batch size."""
     times = {}
-    sizes = CAMERA_BATCH_SIZES if "camera" in probe.problem.world.sensing.kinds else BATCH_SIZES
-    for size in sizes:
-        observation = probe.repeat_seen(size)
-        probe.query(observation)
-        durations = []
-        for _ in range(5 if size < sizes[-1] else 3):
+    for size in CAMERA_BATCH_SIZES if probe.has_camera else BATCH_SIZES:
+        observation, durations = probe.repeat_seen(size), []
+        for _ in range(6 if size == 1 else 4):
             begun = time.perf_counter()
-            probe.query(observation)
+            probe.act(observation)
             durations.append(time.perf_counter() - begun)
-        times[size] = float(np.median(durations))
+        times[size] = float(np.median(durations[1:]))
     calls = ", ".join(f"{1e3 * seconds:.2g} ms for {size}" for size, seconds in times.items())
-    needed = TYPICAL_SIMULATIONS / sizes[-1] * times[sizes[-1]] * probe.problem.world.clock.ticks
+    needed = TYPICAL_SIMULATIONS / size * times[size] * probe.problem.world.clock.ticks
+    duration = "under 1 s" if needed < 1.0 else f"{needed:.0f} s"
     slow = f"{calls}: {needed / 3600:.1f} h for {TYPICAL_SIMULATIONS} simulations"
-    good = f"{calls}: {needed:.0f} s for {TYPICAL_SIMULATIONS} simulations"
-    yield judge("latency", needed > SLOW_SECONDS and slow, good, "batch its work", HINT)
+    good = f"{calls}: {duration} for {TYPICAL_SIMULATIONS} simulations"
+    yield judge("latency", needed > SLOW_SECONDS and slow, good, "batch its work", doubtful=False)
 
 
 def check_memory_growth(probe: Probe) -> Iterator[Finding]:
-    """Measure by how much the process grows over 100 calls."""
-    pictures = "camera" in probe.problem.world.sensing.kinds
-    observation = probe.repeat_seen(4 if pictures else 256)
-    for _ in range(20):
-        probe.query(observation)
-    before = _read_megabytes()
-    for _ in range(100):
-        probe.query(observation)
-    grown = _read_megabytes() - before
+    """Measure by how much the process grows over 100 calls, where the system tells that (Linux)."""
+    if not STATM.exists():
+        return
+    observation = probe.repeat_seen(4 if probe.has_camera else 256)
+    used = []
+    for calls in (20, 100):
+        for _ in range(calls):
+            probe.act(observation)
+        used.append(int(STATM.read_text().split()[1]) * 4096 / 2**20)
+    grown = used[1] - used[0]
     bad = grown > LEAK_MEGABYTES and f"{grown:.0f} MB more after 100 calls"
-    good = f"{before:.0f} MB in all, {max(grown, 0.0):.0f} MB more after 100 calls"
-    yield judge("space", bad, good, "it keeps what it has seen; a long run ends early", HINT)
+    good = f"{used[0]:.0f} MB in all, {max(grown, 0.0):.0f} MB more after 100 calls"
+    yield judge("space", bad, good, "it keeps what it has seen; a long run ends early", doubtful=False)
 
 
 def check_driving(probe: Probe) -> Iterator[Finding]:
@@ -322,7 +314,7 @@ def check_driving(probe: Probe) -> Iterator[Finding]:
     if evaluator.faults:
         failed = f"fails on {len(evaluator.faults)} of {BATCH_ROWS} ordinary scenarios: {evaluator.faults[0].reason}"
         advice = "mend it, or count such scenarios with --on-error failure or bound"
-        yield report_failure("driving", failed, advice)
+        yield Finding("driving", "fail", failed, advice)
         return
     crashed = float((f == -1.0).mean())
     result = f"collides in {crashed:.0%} of {BATCH_ROWS} ordinary scenarios"
@@ -330,28 +322,127 @@ def check_driving(probe: Probe) -> Iterator[Finding]:
     yield judge("driving", crashed > MANY_COLLISIONS and result, result, advice)
 
 
-EGO_CHECKS: tuple[Callable[[Probe], Iterator[Finding]], ...] = (
-    check_declared_spaces,
-    check_normalisation,
-    check_actions,
-    check_determinism,
-    check_memory,
-    check_row_independence,
-    check_extreme_observations,
-    check_driving,
-    check_latency,
-    check_memory_growth,
-)
+EGO_CHECKS: dict[str, Callable[[Probe], Iterator[Finding]]] = {
+    "declared spaces": check_declared_spaces,
+    "normalisation": check_normalisation,
+    "actions": check_actions,
+    "determinism": check_determinism,
+    "memory": check_memory,
+    "row independence": check_row_independence,
+    "extreme observations": check_extreme_observations,
+    "driving": check_driving,
+    "latency": check_latency,
+    "memory growth": check_memory_growth,
+}
 
 
-def _read_megabytes() -> float:
-    """Return the memory of this process [MB]: the present use where the system reports it, else the peak."""
+def run_checks(question: Question) -> Iterator[Finding | str]:
+    """Load the ego and check it: yield findings, and before each check its name."""
+    if find_ego_kind(question.ego) == "remote":
+        yield "protocol"
+        findings = list(check_protocol(question.ego))
+        yield from findings
+        if any(finding.status == "fail" for finding in findings):
+            return
+    yield "loading"
     try:
-        with open("/proc/self/statm") as file:
-            return int(file.read().split()[1]) * 4096 / 2**20
-    except OSError:
+        ego = agents.load_ego(question.ego, algo=question.algo, trust=question.trust, stats=question.stats)
+        yield Finding("loading", "pass", ego if isinstance(ego, str) else type(ego).__name__)
+        yield "compiling"  # takes no time of a check
+        problem = build_problem(question, ego)
+        for note in problem.notes:
+            if note in (AMBIGUOUS, TAKEN_AS_ACCELERATIONS):  # of other bounds than ours a check of its own tells
+                yield Finding("action space", "warn", note, "say which by --action", note == AMBIGUOUS)
+        probe = Probe.of(ego, problem)
+        if problem.core == "numba":  # then the ego is not asked
+            problem.evaluate(problem.base.sample(1, np.random.default_rng(0)))
+    except (Exception, SystemExit, EgoGone) as error:  # the ego is the user's: anything may happen in it
+        yield Finding("loading", "fail", reason_of(error), "see docs/egos.md for what an ego is")
+        return
+    for name in EGO_CHECKS if probe.policy is not None else ("driving",):
+        yield name
         try:
-            import resource
-        except ImportError:  # Windows, where the standard library does not tell
-            return 0.0
-        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (2**20 if sys.platform == "darwin" else 2**10)
+            yield from EGO_CHECKS[name](probe)
+        except (Exception, SystemExit, EgoGone) as error:  # likewise
+            gone = isinstance(error, EgoGone)
+            yield Finding(name, "fail", reason_of(error), "start it again" if gone else "the ego failed in this check")
+            if gone:
+                return
+
+
+PROTOCOL_ADVICE = "docs/egos.md has the protocol"
+
+
+def check_protocol(spec: str) -> Iterator[Finding]:
+    """Check a server."""
+    try:
+        from agents.remote import protocol
+        from agents.remote.client import TIMEOUT, LinkError, RemoteError, ServerLink, parse_address
+    except ImportError:
+        yield Finding("protocol", "fail", "pyzmq and msgpack are not installed", "pip install 'rare-envs[remote]'")
+        return
+    address, settings = parse_address(spec)
+    link, numbers = ServerLink(address, protocol.read_secret()), itertools.count(1)
+
+    def ask(message: Any) -> Any:
+        content = message if isinstance(message, bytes) else protocol.pack({"id": next(numbers), **message})
+        return protocol.unpack(link.request(content, settings.get("timeout", TIMEOUT)))
+
+    def compare(name: str, kind: str, reply: Any) -> Finding:
+        found, reason = reply.get("type"), reply.get("reason", "")
+        if found == kind:
+            return Finding(name, "pass", f"{kind}: {reason}" if kind == "error" and reason else kind)
+        return Finding(name, "fail", f"got {found!r} ({reason}), expected {kind!r}", PROTOCOL_ADVICE)
+
+    try:
+        link.open()
+        before = ask({"type": "ping"})
+        link.open()
+        hello = ask({"type": "hello", "protocol": protocol.PROTOCOL, "client": "check-ego"})
+        if hello.get("type") != "hello" or hello.get("protocol") != protocol.PROTOCOL:
+            yield Finding("handshake", "fail", f"{hello.get('reason', hello)}", PROTOCOL_ADVICE)
+            return
+        yield Finding("handshake", "pass", f"protocol {protocol.PROTOCOL}, {hello.get('name', 'no name')!r}")
+        yield compare("before hello", "error", before)
+        for name, (kind, *messages) in _list_cases(hello).items():
+            replies = [ask(message) for message in messages]
+            steps = [isinstance(message, dict) and "step" in message for message in messages]
+            acts = [reply for reply, step in zip(replies, steps, strict=True) if step]
+            yield compare(name, kind, next((reply for reply in acts if reply.get("type") != kind), replies[-1]))
+    except (LinkError, RemoteError, EgoGone, ValueError) as error:
+        yield Finding("protocol", "fail", reason_of(error), f"is it running at {address}? {PROTOCOL_ADVICE}")
+    finally:
+        link.close()
+
+
+def _act(hello: Any, session: int, step: int, rows: int = 3) -> dict[str, Any]:
+    """Return a query with blank observations of the space that the server has declared."""
+    from agents.remote import protocol
+
+    space = protocol.decode_space(hello.get("observation")) or spaces.Box(-5.0, 5.0, (7,), np.float32)
+    parts = dict(space.spaces) if isinstance(space, spaces.Dict) else space
+    blank = map_kinds(lambda part: np.zeros((rows, *part.shape), part.dtype), parts)
+    return {"type": "act", "session": session, "step": step, "observation": protocol.pack_observation(blank)}
+
+
+def _list_cases(hello: Any) -> dict[str, tuple[Any, ...]]:
+    """Return the cases after the handshake: the reply to the last of some messages."""
+    act, reset, ping = partial(_act, hello), {"type": "reset", "session": 1, "batch": 3}, {"type": "ping"}
+    one, other = ({**reset, "session": session} for session in (11, 12))
+    empty = {"dtype": "<f4", "shape": [3, 7], "data": b""}
+    return {
+        "heartbeat": ("pong", ping),
+        "unknown type": ("error", {"type": "dance"}),
+        "no msgpack": ("error", b"\xc1 not a message"),
+        "cut short": ("error", b"\x82\xa4type\xa5res"),
+        "no reset": ("error", act(99, 0)),
+        "reset": ("ready", reset),
+        "act": ("action", act(1, 0)),
+        "act again": ("action", act(1, 1)),
+        "another step": ("error", act(1, 7)),
+        "another batch": ("error", reset, act(1, 0, rows=4)),
+        "data missing": ("error", reset, {**act(1, 0), "observation": empty}),
+        "two sessions": ("action", one, other, act(11, 0), act(12, 0), act(11, 1), act(12, 1)),
+        "end": ("ended", {"type": "end", "session": 1}),
+        "after it all": ("pong", ping),
+    }

@@ -2,43 +2,35 @@
 
 from __future__ import annotations
 
+import base64
 import contextlib
+import csv
+import io
 import re
+import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jinja2
 import numpy as np
 from markupsafe import Markup
+from matplotlib.figure import Figure
+from PIL import Image
 
-from rare_envs.envs.rendering import CRASH_COLOUR, ROLE_COLOURS
+from rare_envs.envs.rendering import CRASH_COLOUR, FRAME_WIDTH, ROLE_COLOURS
+from rare_envs.exposure import describe_human_contacts
 from rare_envs.files import replace_text
-from rare_envs.plugins import one_line
+from rare_envs.plugins import EgoGone, one_line, reason_of
+from rare_envs.problem import DrivingProblem
+from rare_envs.study import plots, text
 from rare_envs.study.arguments import BadInput, as_bad_input, output_file, output_folder
-from rare_envs.study.episodes import draw_ordinary, list_columns
-from rare_envs.study.html_report.atlas import AtlasEntry, AtlasSource, build_atlas, read_recorded_events
-from rare_envs.study.html_report.figures import (
-    FORMATS,
-    MAX_HISTOGRAMS,
-    FigureOfPage,
-    figure_of_parameters,
-    figures_of_result,
-    passes_levels,
-)
+from rare_envs.study.episodes import draw_ordinary, find_ordinary_range, format_value, list_columns
+from rare_envs.study.html_report import figures as drawings
+from rare_envs.study.html_report.figures import FigureOfPage
 from rare_envs.study.question import open_run, prepare, warn_of_changed_files
+from rare_envs.study.replay import Drive, drive_again, name_parties, read_row
 from rare_envs.study.run_folder import EPISODES, REPORT, RESULT, STUDY, LoadedStudy, load_finished
-from rare_envs.study.text import (
-    describe_intervals,
-    describe_kind,
-    describe_method,
-    describe_rate,
-    describe_wide_base,
-    explain_no_gain,
-    format_probability,
-    name_measure,
-    summarise_answer,
-)
 from samplers.problem import FloatArray
 from samplers.sample import describe_outcome
 
@@ -48,6 +40,153 @@ BROKEN_NUMBER = re.compile(r"(?<=\d) (?=%|× 10)|(?<=×) (?=10)")
 """Spaces within a number: "0.12 %", "3.1 × 10⁻⁵"."""
 SECTIONS = ("warnings", "answer", "convergence", "levels", "weights", "curve", "parameters", "kinds", "atlas", "made")
 """Ids of the sections of the page, in their order."""
+SIZED_BY_BUDGET = ("mc", "is", "two-stage", "surrogate")
+"""Methods whose setting n is their budget where max_sim does not say; the n of others is that of a level."""
+
+
+class NearestEvent(NamedTuple):
+    """The recorded event that is nearest to a failure."""
+
+    distance: float
+    """Root mean square over the parameters of their differences in standard deviations of ordinary traffic."""
+    rarer: float
+    """Share of ordinary scenarios that are at least as far from the event nearest to them."""
+    values: FloatArray
+    """Its parameters, shape (k,)."""
+
+
+def read_recorded_events(path: Path, names: list[str]) -> FloatArray:
+    """Read events from a CSV file with a column for each of some parameters; others are not looked at."""
+    try:
+        with path.open(newline="", encoding="utf-8") as file:
+            rows = list(csv.DictReader(file))
+        missing = [name for name in names if rows and name not in rows[0]]
+        if missing or not rows:
+            has = f"it has {', '.join(rows[0])}" if rows else "it has no rows"
+            raise BadInput(
+                f"Expected events in {str(path)!r} with columns named as the parameters, {', '.join(names)}; {has}."
+            )
+        values = np.array([[float(row[name] or "nan") for name in names] for row in rows])
+    except OSError as error:
+        raise BadInput(f"Cannot read {str(path)!r}: {error.strerror}.") from error
+    except (ValueError, TypeError, csv.Error) as error:
+        raise BadInput(f"{str(path)!r} is no table of events: {error}.") from error
+    known: FloatArray = values[np.isfinite(values).all(axis=1)]
+    if not len(known):
+        raise BadInput(f"{str(path)!r} has no event with all of {', '.join(names)}.")
+    return known
+
+
+def find_nearest_event(x: FloatArray, events: FloatArray, ordinary: FloatArray) -> NearestEvent:
+    """Return the event nearest to a failure x (k,), among events (n, k), beside ordinary scenarios (m, k)."""
+    spread = np.maximum(ordinary.std(axis=0), 1e-12)
+    distances = _distances(x[None], events, spread)[0]
+    nearest = int(distances.argmin())
+    usual = _distances(ordinary, events, spread).min(axis=1)
+    return NearestEvent(float(distances[nearest]), float((usual >= distances[nearest]).mean()), events[nearest])
+
+
+def _distances(x: FloatArray, events: FloatArray, spread: FloatArray) -> FloatArray:
+    """Return distances of x (m, k) to events (n, k), shape (m, n)."""
+    squares = sum(
+        ((x[:, None, j] - events[None, :, j]) / spread[j]) ** 2 for j in range(x.shape[1])
+    )  # parameter by parameter, for memory
+    return np.asarray(np.sqrt(squares / x.shape[1]))
+
+
+MOST_MODES = 8
+"""Modes that are shown with pictures; the others have a row in the table."""
+CLIP_WIDTH, CLIP_EVERY = 560, 2
+"""Width of a clip [pixels], and of how many ticks it shows one."""
+CLIP_SECONDS = 5.0
+"""Seconds of a clip, the last ones up to the end of the drive."""
+
+
+class AtlasEntry(NamedTuple):
+    """A mode of failure as the page shows it."""
+
+    mode: Mapping[str, Any]
+    """What result.json holds of it."""
+    f: float = np.nan
+    x: FloatArray | None = None
+    """The parameters that are shown of its most likely failure, shape (k,)."""
+    nearest: NearestEvent | None = None
+    """The recorded event that is nearest to it, if there are recordings."""
+    drive: Drive | None = None
+    """That failure driven again."""
+    clip: str = ""
+    """Moving picture as a data URI; "" if there is none."""
+    figures: Sequence[FigureOfPage] = ()
+    missing: str = ""
+    """Why there are no pictures; "" if there are."""
+
+
+class AtlasSource(NamedTuple):
+    """What the atlas of a run is made from."""
+
+    problem: DrivingProblem
+    failures: Mapping[str, Any]
+    """Of failures.csv."""
+    ordinary: FloatArray
+    """Draws of the base distribution, shape (n, d)."""
+    events: FloatArray | None
+    """Recorded events, columns of x that are shown, shape (m, k); None without recordings."""
+
+
+def build_atlas(source: AtlasSource, modes: list[dict[str, Any]]) -> list[AtlasEntry]:
+    """Return the entries of the largest modes."""
+    return [_build_entry(source, number, mode) for number, mode in enumerate(modes[:MOST_MODES], 1)]
+
+
+def _build_entry(source: AtlasSource, number: int, mode: Mapping[str, Any]) -> AtlasEntry:
+    failure = mode.get("failure")
+    if failure is None:
+        return AtlasEntry(mode, missing="none of its failures is in failures.csv")
+    whole = read_row(source.failures, source.problem, int(failure))
+    shown = [column.shown for column in list_columns(source.problem.space)]
+    x, events = whole[shown], source.events
+    nearest = None if events is None else find_nearest_event(x, events, source.ordinary[:, shown])
+    entry = AtlasEntry(mode, float(source.failures["f"][int(failure)]), x, nearest)
+    try:
+        drive = drive_again(source.problem, whole)
+        figures, clip = _draw_drive(drive, number), encode_clip(drive)
+    except (Exception, SystemExit, EgoGone) as error:  # the ego is the user's, and need not do again what it did before
+        return entry._replace(missing=f"it cannot be shown: {reason_of(error)}")
+    return entry._replace(drive=drive, clip=clip, figures=figures)
+
+
+def _draw_drive(drive: Drive, number: int) -> list[FigureOfPage]:
+    """Return the figures of a drive: from above, the measure, and speeds."""
+
+    def draw_views(figure: Figure) -> None:
+        for axes, t in zip(figure.subplots(plots.MOMENTS, 1), plots.choose_moments(drive), strict=True):
+            plots.draw_moment(axes, drive, t)
+
+    def draw_measure(figure: Figure) -> None:
+        axes, measure = figure.subplots(), drive.problem.world.measurement.measure
+        plots.draw_measure(axes, drive)
+        axes.axvline(drive.time[drive.worst], color=plots.HIT_COLOUR, linewidth=1, label="worst moment")
+        axes.set_ylabel(text.name_measure(measure if isinstance(measure, str) else ""))
+        axes.legend(frameon=False, fontsize=8)
+
+    def draw_speeds(figure: Figure) -> None:
+        plots.draw_speeds(figure.subplots(), drive)
+
+    height = 0.25 + plots.MOMENTS * max(0.6, 0.045 * drive.road.lanes * drive.road.width)
+    return [
+        FigureOfPage(f"mode{number}-views", "From above; the ego is green", draw_views, (6.4, height)),
+        FigureOfPage(f"mode{number}-measure", "The measure over time", draw_measure, (6.4, 2.2)),
+        FigureOfPage(f"mode{number}-speeds", "Speeds and gap over time", draw_speeds, (6.4, 2.8)),
+    ]
+
+
+def encode_clip(drive: Drive) -> str:
+    """Return the last seconds of a drive as a data URI."""
+    dt, buffer = drive.problem.world.clock.dt, io.BytesIO()
+    frames = plots.draw_frames(drive)[-max(round(CLIP_SECONDS / dt), 2) :]
+    size = (CLIP_WIDTH, round(frames[0].height * CLIP_WIDTH / FRAME_WIDTH))
+    plots.save_gif(buffer, [frame.resize(size, Image.Resampling.LANCZOS) for frame in frames], dt, CLIP_EVERY)
+    return f"data:image/gif;base64,{base64.b64encode(buffer.getvalue()).decode()}"
 
 
 def write_html_report(
@@ -77,8 +216,8 @@ def write_html_report(
         ...     [page.name for page in write_html_report(Path(folder))]
         ['report.html']
     """
-    if figures is not None and figures not in FORMATS:
-        raise BadInput(f"Expected --figures {', '.join(FORMATS)}, got {figures!r}.")
+    if figures is not None and figures not in drawings.FORMATS:
+        raise BadInput(f"Expected --figures {', '.join(drawings.FORMATS)}, got {figures!r}.")
     study, page = load_finished(folder), out or folder / REPORT
     with output_file(page):
         question = open_run(study, trust)
@@ -86,13 +225,13 @@ def write_html_report(
         problem = prepare(question).problem
         shown = [column.name for column in list_columns(problem.space) if column.shown]
         known = None if events is None else read_recorded_events(events, shown)
-        source = AtlasSource(folder, problem, study.failures, draw_ordinary(problem.space), known)
+        source = AtlasSource(problem, study.failures, draw_ordinary(problem.space), known)
         with _damage_as_bad_input(folder):
             atlas = build_atlas(source, list(study.result.get("modes") or []))
             drawn = _make_figures(study, source)
-            text = render_page(study, drawn, atlas)
+            content = render_page(study, source, drawn, atlas)
         with as_bad_input(OSError):
-            replace_text(page, text)
+            replace_text(page, content)
             if figures is None:
                 return [page]
             every = [*drawn.values(), *(figure for entry in atlas for figure in entry.figures)]
@@ -100,9 +239,16 @@ def write_html_report(
                 return [page, *(figure.save(page.parent / "figures", figures) for figure in every)]
 
 
-def render_page(study: LoadedStudy, figures: Mapping[str, FigureOfPage], atlas: Sequence[AtlasEntry]) -> str:
+def render_page(
+    study: LoadedStudy, source: AtlasSource, figures: Mapping[str, FigureOfPage], atlas: Sequence[AtlasEntry]
+) -> str:
     """Return the page as text; everything that files say is escaped."""
-    result = study.result
+    result, base = study.result, study.result.get("base_uncertainty")
+    with as_bad_input(OSError):
+        changed = study.changed_files
+    doubts = [f"not what the run wrote, by the digests in its {STUDY}: {', '.join(changed)}"] if changed else []
+    own, noted = ([str(each) for name in names for each in result.get(name) or []] for names in (["doubts"], NOTED))
+    doubts += [*own, *filter(None, [text.describe_wide_base(result)])]
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader("rare_envs.study.html_report"),
         autoescape=True,
@@ -110,28 +256,36 @@ def render_page(study: LoadedStudy, figures: Mapping[str, FigureOfPage], atlas: 
         lstrip_blocks=True,
         finalize=_keep_numbers_whole,
     )
-    doubts = _list_texts(result, "doubts")
     return environment.get_template("report.html.j2").render(
         result=result,
+        question=result.get("question") or {},
+        base=base if isinstance(base, dict) else None,
         about=study.about,
         folder=str(study.folder),
-        summary=summarise_answer(result, str((study.about.get("base") or {}).get("name") or "its default base")),
-        doubts=[*_describe_changes(study), *doubts, *filter(None, [describe_wide_base(result)])],
-        remarks=[text for text in _list_texts(result, "warnings", "remarks", "notes") if text not in doubts],
-        intervals=describe_intervals(result),
-        validity=str(result.get("valid", "")),
-        end=describe_outcome(str(result.get("status")), doubts),
-        no_gain=explain_no_gain(float(result["p"])),
-        rate=describe_rate(result),
-        method=describe_method(result),
+        quoted_folder=shlex.quote(str(study.folder)),
+        doubts=doubts,
+        remarks=[each for each in noted if each not in own],
+        end=describe_outcome(str(result.get("status")), own),
+        no_gain=text.explain_no_gain(float(result["p"])),
+        people=describe_human_contacts(),
+        sized_by_budget=SIZED_BY_BUDGET,
         figures={name: figure.to_svg() for name, figure in figures.items()},
-        passes_levels=passes_levels(result),
+        passes_levels=drawings.passes_levels(result),
         atlas=atlas,
-        svgs={figure.name: figure.to_svg() for entry in atlas for figure in entry.figures},
-        kinds=[(describe_kind(kind), share) for kind, share in (result.get("kinds") or {}).items()],
-        probability=format_probability,
+        columns=[column for column in list_columns(source.problem.space) if column.shown],
+        usual=_keep_shown(source, np.array(find_ordinary_range(source.ordinary))),
+        describe_kind=text.describe_kind,
+        probability=text.format_probability,
+        parties=name_parties,
+        two_digits=lambda number: f"{float(f'{number:.2g}'):,.0f}",
+        value=format_value,
+        with_interval=text.format_with_interval,
         roles={**ROLE_COLOURS, "outline: crashed": CRASH_COLOUR},
     )
+
+
+NOTED = ("warnings", "remarks", "notes")
+"""Lists of result.json that are remarks of the page, as far as they are no doubts."""
 
 
 def _keep_numbers_whole(value: object) -> object:
@@ -148,34 +302,29 @@ def _damage_as_bad_input(folder: Path) -> Iterator[None]:
         raise BadInput(f"{RESULT} or {STUDY} in {str(folder)!r} is damaged: {one_line(error)}.") from error
 
 
-def _describe_changes(study: LoadedStudy) -> list[str]:
-    """Return a warning of files that are not what the run wrote, if there are any."""
-    with as_bad_input(OSError):
-        changed = study.changed_files
-    return [f"not what the run wrote, by the digests in its {STUDY}: {', '.join(changed)}"] if changed else []
-
-
-def _list_texts(result: Mapping[str, Any], *names: str) -> list[str]:
-    """Return the texts that some entries of a result list."""
-    return [str(text) for name in names for text in result.get(name) or []]
+def _keep_shown(source: AtlasSource, x: FloatArray) -> FloatArray:
+    """Return the columns of x (n, d) that are shown."""
+    return x[:, [column.shown for column in list_columns(source.problem.space)]]
 
 
 def _make_figures(study: LoadedStudy, source: AtlasSource) -> dict[str, FigureOfPage]:
     """Return the figures of the run by name."""
-    every = list_columns(source.problem.space)
-    columns, ordinary = [each for each in every if each.shown], source.ordinary[:, [each.shown for each in every]]
+    columns, ordinary = (
+        [each for each in list_columns(source.problem.space) if each.shown],
+        _keep_shown(source, source.ordinary),
+    )
     failing, log_weights = _read_failing(study, [column.name for column in columns])
     weighted = ~np.isnan(log_weights)
-    measure = name_measure(str(study.question.get("measure", "")))
-    figures = figures_of_result(study.result, log_weights[weighted], measure)
+    measure = text.name_measure(str(study.question.get("measure", "")))
+    figures = drawings.figures_of_result(study.result, log_weights[weighted], measure)
     if len(failing) and columns:
         weights = np.ones(len(failing))
         if weighted.any():
             failing, weights = failing[weighted], np.exp(log_weights[weighted])
         shift = np.abs(np.average(failing, axis=0, weights=weights) - ordinary.mean(axis=0))
-        order = np.argsort(-shift / np.maximum(ordinary.std(axis=0), 1e-12), kind="stable")[:MAX_HISTOGRAMS]
+        order = np.argsort(-shift / np.maximum(ordinary.std(axis=0), 1e-12), kind="stable")[: drawings.MAX_HISTOGRAMS]
         labels = [columns[j].label for j in order]
-        figures["parameters"] = figure_of_parameters(ordinary[:, order], failing[:, order], weights, labels)
+        figures["parameters"] = drawings.figure_of_parameters(ordinary[:, order], failing[:, order], weights, labels)
     return figures
 
 

@@ -32,11 +32,7 @@ Size = tuple[float, float]
 
 
 class FigureOfPage:
-    """A figure of the page, drawn once for each format that is asked for.
-
-    Its name is that of its file, its size in inch. `narrow` are function and size for a narrow screen; without them the
-    same figure is shown there, and has to be moved where it is wide.
-    """
+    """A figure of the page, drawn once for each format that is asked for."""
 
     def __init__(
         self, name: str, caption: str, draw: Draw, size: Size, narrow: tuple[Draw, Size] | None = None
@@ -45,10 +41,7 @@ class FigureOfPage:
         self._narrow = None if narrow is None else FigureOfPage(f"{name}-narrow", caption, *narrow)
 
     def to_svg(self) -> str:
-        """Return it as an element of a page: it has the width of its place, and its text is text.
-
-        Two elements where there is a form for narrow screens, of which the page shows one.
-        """
+        """Return it as an element of a page: it has the width of its place, and its text is text."""
         if self._narrow is None:
             return self._make_svg()
         wide, narrow = self._make_svg(), self._narrow.to_svg()
@@ -178,10 +171,7 @@ def draw_parameters(
 
 
 def figures_of_result(result: Result, log_weights: FloatArray, measure: str) -> dict[str, FigureOfPage]:
-    """Return the figures that the numbers of a run allow, by name.
-
-    `log_weights` (k,) are those of its failing simulations, none where they are not known; `measure` is what f is.
-    """
+    """Return the figures that the numbers of a run allow, by name."""
     two = passes_levels(result)
     curve, severity = result.get("curve"), result.get("severity")
     drawn: dict[str, tuple[Any, ...]] = {

@@ -20,15 +20,15 @@ from rare_envs.study.corpus import (
     StoredFailure,
     Trial,
     add_run,
+    list_failures,
     make_stored,
     parse_stored,
     plan_retraining,
     read_corpus,
-    read_run,
-    read_stored,
     try_ego,
     write_junit,
 )
+from rare_envs.study.run_folder import load_finished
 from training import train_ego
 
 ENV = "rare_envs/CarFollowing-v0"
@@ -38,6 +38,10 @@ FOLLOWING = Question(env_id=ENV, horizon=4.0)
 def stored(question: Question, *values: float) -> StoredFailure:
     x = dict(zip(("ego_speed", "lead_speed", "gap"), map(np.array, values), strict=True))
     return make_stored(question, x, -1.0, -9.25, "rear_end")
+
+
+def list_failures_of(run: Path) -> list[StoredFailure]:
+    return list_failures(load_finished(run))
 
 
 CRASH, SAFE = stored(FOLLOWING, 20.0, 5.0 / 3.0, 10.0), stored(FOLLOWING, 20.0, 20.0, 80.0)
@@ -52,23 +56,12 @@ def test_a_failure_comes_back_to_the_bit_and_its_key_is_that_of_the_scenario_alo
     assert replace(CRASH, world={**CRASH.world, "horizon": 5.0}).key != CRASH.key
 
 
-def test_two_hundred_damaged_files_are_refused_or_the_same(tmp_path: Path) -> None:
-    """A byte changed anywhere: the scenario is either untouched or the file is refused."""
+def test_a_file_that_is_not_what_was_stored_is_refused() -> None:
     values = {**json.loads(CRASH.to_json()), "x": {**CRASH.x, "gap": [3.0]}}
-    for other in (json.dumps(values), "[]", "[" * 100_000, '{"format": 2}'):
+    for other in (json.dumps(values), "[]", "[" * 100_000, '{"format": 2}', '{"format": 1}'):
         with pytest.raises(ValueError, match="the file") as caught:
             parse_stored(other, "the file")
         assert "\n" not in str(caught.value)
-    text, rng, refused = CRASH.to_json().encode(), np.random.default_rng(0), 0
-    for _ in range(200):
-        damaged = bytearray(text)
-        damaged[rng.integers(len(text))] = rng.integers(256)
-        (tmp_path / "a.json").write_bytes(damaged)
-        try:
-            assert read_stored(tmp_path / "a.json").digest == CRASH.digest
-        except ValueError:
-            refused += 1
-    assert refused > 50
 
 
 @pytest.fixture
@@ -83,22 +76,16 @@ def test_failures_of_a_run_are_added_once(run: Path, tmp_path: Path) -> None:
     before = {path.name: path.read_bytes() for path in (tmp_path / "corpus").iterdir()}
     assert add_run(run, tmp_path / "corpus", most=5)[1] == 0
     assert {path.name: path.read_bytes() for path in (tmp_path / "corpus").iterdir()} == before
-    recorded = read_run(run)
+    recorded = list_failures_of(run)
     assert chosen[0] == recorded[0] and recorded[0].log_p0 >= recorded[-1].log_p0
     assert recorded[0].crash == "rear_end" and recorded[0].ego == "idm"
 
 
-def test_runs_and_corpora_that_are_refused(run: Path, tmp_path: Path) -> None:
-    for folder, most, said in ((tmp_path, 20, "No finished run in"), (run, 0, "at least one")):
-        with pytest.raises(BadInput, match=said):
-            add_run(folder, tmp_path / "corpus", most)
-    assert not (tmp_path / "corpus").exists()
-    with pytest.raises(BadInput, match="There is no corpus"):
-        read_corpus(tmp_path / "corpus")
+def test_a_run_with_a_damaged_parameter_is_refused(run: Path) -> None:
     table = (run / "failures.csv").read_text()
     (run / "failures.csv").write_text(table.replace(table.splitlines()[1].split(",")[0], "nan"))
     with pytest.raises(BadInput, match="no number"):
-        read_run(run)
+        list_failures_of(run)
 
 
 def test_trials_in_their_order(tmp_path: Path) -> None:
@@ -179,7 +166,7 @@ def test_a_retraining_has_the_failures_of_all_runs_and_the_ego_of_the_last(
     plan = plan_retraining([first, second], 0.3)
     assert (plan.env_id, plan.algo, plan.next_seed, plan.retraining.share) == (ENV, "a2c", 6, 0.3)
     assert (plan.world["base"], plan.world["horizon"], plan.retraining.ego) == (risky, 4.0, Path(ego))
-    failures = [*read_run(first), *read_run(second)]
+    failures = [*list_failures_of(first), *list_failures_of(second)]
     assert len(failures) > 4
     x = [np.concatenate([one.x[name] for name in ("ego_speed", "lead_speed", "gap")]) for one in failures]
     assert np.array_equal(plan.retraining.failures, x)

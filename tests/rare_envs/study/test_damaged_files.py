@@ -23,9 +23,8 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from typer.testing import CliRunner, Result
 
 import rare_envs
-from rare_envs.study import Question, corpus, evaluate, prepare, writing
+from rare_envs.study import Question, corpus, evaluate, html_report, prepare, writing
 from rare_envs.study.cli.app import app
-from rare_envs.study.html_report import atlas
 from rare_envs.study.html_report.figures import FigureOfPage
 from rare_envs.study.run_folder import JOURNAL
 from rare_envs.study.writing import begin_journal
@@ -200,7 +199,7 @@ def write_policy(folder: Path) -> None:
 def here(good: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A copy of it to damage, in the working directory; no pictures are drawn."""
     monkeypatch.setattr(FigureOfPage, "to_svg", lambda _: "")
-    monkeypatch.setattr(atlas, "encode_clip", lambda drive: "")
+    monkeypatch.setattr(html_report, "encode_clip", lambda drive: "")
     monkeypatch.setattr(writing, "save_plot", lambda path, report: None)
     shutil.copytree(good, tmp_path, dirs_exist_ok=True)
     monkeypatch.chdir(tmp_path)

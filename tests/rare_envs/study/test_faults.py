@@ -1,16 +1,25 @@
-"""Scenarios on which an ego raises, stops, or gives NaN or a wrong shape are found, and no others lost."""
+"""Egos that fail on some x, or whose f is no function of x, here and in workers: found, and no others lost."""
 
 from __future__ import annotations
 
+from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+import agents
 import rare_envs
 import samplers
 from rare_envs.plugins import EgoGone
+from rare_envs.problem import DrivingProblem
+from rare_envs.study import BadInput, Question, evaluate, prepare, run, writing
+from rare_envs.study.evaluate import KEPT_ROWS, ROWS_ALONE
+from rare_envs.study.report import Report
+from rare_envs.study.run_folder import JOURNAL
 from samplers.evaluate import Evaluator
+from samplers.run import Progress
 
 ENV = "rare_envs/CarFollowing-v0"
 GAP = 30.0
@@ -110,3 +119,220 @@ def test_terms_of_the_same_scenarios_are_lost_and_no_others(how: str, memory: bo
     np.testing.assert_array_equal([fault.x for fault in tolerant.faults], x[bad])
     assert all(reason in fault.reason for fault in tolerant.faults)
     assert 0 < tolerant.n_retried < (5 if memory else 2) * len(x)
+
+
+FAULTY = """
+import os, signal, sys, time
+import numpy as np
+
+
+class Faulty:
+    def __init__(self, fail):
+        self.fail = fail
+
+    def predict(self, observation, state=None, episode_start=None, deterministic=True):
+        gap = observation[:, 3]
+        actions = np.stack((np.minimum(gap - 0.3, 0.0), 0.0 * gap), axis=1)
+        bad = np.abs(gap - 0.55) < 0.00005
+        if bad.any():
+            self.fail(actions, bad)
+        return actions, None
+
+
+def give_nan(actions, bad):
+    actions[bad] = np.nan
+
+
+def stop(actions, bad):
+    raise ArithmeticError("off the map")
+
+
+def sleep(actions, bad):
+    time.sleep(3600)
+
+
+def leave(actions, bad):
+    os._exit(3)
+
+
+def die(actions, bad):
+    os.kill(os.getpid(), signal.SIGSEGV)
+
+
+def eat(actions, bad):
+    kept = []
+    while True:
+        kept.append(bytearray(1 << 28))
+
+
+def nan():
+    return Faulty(give_nan)
+
+
+def raising():
+    return Faulty(stop)
+
+
+def hanging():
+    return Faulty(sleep)
+
+
+def exiting():
+    return Faulty(leave)
+
+
+def crashing():
+    return Faulty(die)
+
+
+def hungry():
+    return Faulty(eat)
+"""
+
+
+QUESTION = Question(
+    env_id="rare_envs/CarFollowing-v0", base="us101-gap", gamma=3.0, horizon=3.0, method="mc", max_sim=300
+)
+
+
+class Braking:
+    """Brakes by a share of what is asked for; the share is what goes wrong in others."""
+
+    calls = 0
+
+    def predict(self, observation: Any, state: Any = None, **_: Any) -> Any:
+        self.calls += 1
+        share = np.broadcast_to(self.share(np.asarray(observation)), len(observation))
+        return np.stack((-share, np.zeros_like(share)), axis=1).astype(np.float32), None
+
+    def share(self, observation: np.ndarray) -> Any:
+        return np.clip(observation.sum(axis=1), 0.0, 1.0)
+
+
+class RandomLater(Braking):
+    def share(self, observation: np.ndarray) -> Any:
+        rng = np.random.default_rng(self.calls if self.calls > 4 else 0)
+        return rng.random(len(observation))
+
+
+class Counting(Braking):
+    def share(self, observation: np.ndarray) -> Any:
+        return min(1.0, self.calls / 100.0)
+
+
+class Mixing(Braking):
+    def share(self, observation: np.ndarray) -> Any:
+        return np.clip(0.5 + (seen := observation.sum(axis=1)) - seen.mean(), 0.0, 1.0)
+
+
+@pytest.mark.parametrize("ego", [RandomLater, Counting, Mixing])
+def test_an_ego_without_an_f_is_noticed(ego: type[Braking]) -> None:
+    report = run(prepare(QUESTION, ego=ego()))
+    assert report.doubtful
+    (warning,) = (text for text in report.warnings if "done again in another order and company" in text)
+    assert f"of {KEPT_ROWS + ROWS_ALONE} simulations" in warning
+    answer = report.to_dict()
+    assert answer["repeatability"]["n_differing"] > 3 and warning in answer["doubts"]
+
+
+@pytest.mark.parametrize("ego", [Braking(), "imitation"])
+def test_others_are_not_suspected(ego: Any) -> None:
+    found = run(prepare(QUESTION, ego=agents.load_ego(ego) if isinstance(ego, str) else ego)).repeatability
+    assert found is not None
+    assert (found.n, found.n_differing, found.warning) == (KEPT_ROWS + ROWS_ALONE, 0, "")
+
+
+ASKED = Question(
+    env_id="rare_envs/CarFollowing-v0",
+    ego="faulty:nan",
+    gamma=2.0,
+    horizon=2.0,
+    method="mc",
+    max_sim=400,
+    seed=5,
+    on_error="bound",
+    chunk=50,
+)
+
+
+@pytest.fixture
+def faulty(here: Path, risky: str, monkeypatch: pytest.MonkeyPatch) -> Path:
+    (here / "faulty.py").write_text(FAULTY)
+    monkeypatch.setattr(writing, "save_plot", lambda path, report: None)
+    return here
+
+
+def ask(ego: str, risky: str, **more: Any) -> Question:
+    return replace(ASKED, ego=f"faulty:{ego}", base=risky, **more)
+
+
+def fault_rows(report: Report) -> list[list[float]]:
+    return [fault.x.tolist() for fault in report.faults]
+
+
+@pytest.mark.parametrize(
+    ("ego", "words"),
+    [
+        ("raising", "off the map"),
+        pytest.param("crashing", "ended by SIGSEGV", marks=pytest.mark.slow),
+        pytest.param("hanging", "no answer within 5 s", marks=pytest.mark.slow),
+        pytest.param("exiting", "exit code 3", marks=pytest.mark.slow),
+        pytest.param("hungry", "MemoryError", marks=pytest.mark.slow),
+    ],
+)
+def test_whatever_the_ego_does_the_answer_is_that_of_one_that_gives_nan(
+    ego: str, words: str, faulty: Path, risky: str
+) -> None:
+    expected = evaluate.run(prepare(ask("nan", risky)))
+    assert 1 <= len(expected.faults) <= 8
+    seen: list[Progress] = []
+    executor = samplers.LocalProcesses(2, time_limit=5.0, memory_limit=2.0**30)
+    report = evaluate.run(prepare(ask(ego, risky)), seen.append, executor=executor)
+    assert report.estimate == expected.estimate
+    assert fault_rows(report) == fault_rows(expected)
+    assert all(words in fault.reason for fault in report.faults)
+    assert seen[-1].workers == 2
+
+
+@pytest.mark.parametrize("chunk", [pytest.param(50, marks=pytest.mark.slow), None])
+def test_what_one_executor_began_another_continues(
+    chunk: int | None, faulty: Path, risky: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(DrivingProblem, "tile", 50)
+    monkeypatch.setattr(DrivingProblem, "chunk_size", 30)
+    whole = evaluate.run(prepare(ask("nan", risky, chunk=chunk)))
+    attempt, rows = DrivingProblem.attempt, [0]
+
+    def interrupted(self: DrivingProblem, x: Any) -> Any:
+        rows[0] += len(x)
+        if rows[0] > 230:
+            raise KeyboardInterrupt
+        return attempt(self, x)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(DrivingProblem, "attempt", interrupted)
+        with pytest.raises(evaluate.RunInterrupted, match="200 simulations are kept"):
+            evaluate.run_into(faulty / "run", prepare(ask("nan", risky, chunk=chunk)))
+    assert (faulty / "run" / JOURNAL).exists()
+    report = evaluate.resume(faulty / "run", executor=samplers.LocalProcesses(1))
+    assert report.estimate == whole.estimate
+    assert fault_rows(report) == fault_rows(whole)
+
+
+def test_with_an_executor_the_question_says_how_large_chunks_are(faulty: Path, risky: str) -> None:
+    study = prepare(ask("nan", risky, chunk=None))
+    assert evaluate.settle_chunk(study, None).question.chunk is None
+    assert evaluate.settle_chunk(study, samplers.InProcess()).question.chunk == 256
+
+
+@pytest.mark.slow
+def test_a_worker_that_cannot_load_the_ego_is_one_line(faulty: Path, risky: str) -> None:
+    class Later:
+        """The file changes after the driver has loaded it and before a worker does."""
+
+        def open(self, compute: Any) -> Any:
+            (faulty / "faulty.py").write_text(FAULTY + "# changed")
+            return samplers.LocalProcesses(1).open(compute)
+
+    with pytest.raises(BadInput, match=r"A worker process cannot load the problem .* not the file"):
+        evaluate.run(prepare(ask("nan", risky)), executor=Later())

@@ -97,7 +97,7 @@ def test_after_the_last_simulation_the_answer_is_printed_and_kept(
     assert all(found[key] == whole[key] for key in ("p", "interval", "n_sim", "n_failures", "status"))
     _, known, stopped = result.stderr.splitlines()  # the bar comes first
     assert (result.exit_code, stopped) == (143, "rare-envs: stopped by SIGTERM")
-    assert known.startswith(f"Stopped after 600 simulations: p {whole['p']:.3e} (95 % interval ")
+    assert known.startswith(f"Stopped behind the last of 600 simulations: p {whole['p']:.3e} (95 % interval ")
     with monkeypatch.context() as patch:
         patch.setattr(writing, "write_run", lambda *_: stop())
         result = cli(*WORDS, "--base", risky, "--out", "run", "--json")

@@ -10,20 +10,13 @@ from typing import Any
 
 import pytest
 
-from rare_envs.study import BadInput, Question, prepare, resume, run_into
-from rare_envs.study.question import (
-    check_code_trust,
-    digest_files,
-    find_changed_files,
-    is_same_question,
-    list_code,
-    note_own_run,
-    open_question,
-)
+from rare_envs.study import BadInput, Question, prepare, run_into
+from rare_envs.study.evaluate import resume
+from rare_envs.study.question import digest_files, find_changed_files, is_same_question, list_code, open_question
 from rare_envs.study.replay import find_failure
 from rare_envs.study.run_folder import RESULT
 from rare_envs.study.writing import begin_journal
-from tests.rare_envs.study.refusals import FOLLOWING, SMALL, Cli, assert_refused
+from tests.rare_envs.study.refusals import FOLLOWING
 
 EVIL = """
 from pathlib import Path
@@ -90,44 +83,26 @@ def test_a_received_run_is_neither_replayed_nor_resumed_without_trust(name: str,
 
 
 @pytest.mark.filterwarnings("ignore:.*changed since the run")  # the folder is that of another ego
-def test_trust_is_asked_for_once(received: Path) -> None:
+def test_trust_is_asked_for_each_time(received: Path) -> None:
     change_question(received, ego="evil:make")
     assert find_failure(received, 0, trust=True).n_found > 0
     assert Path("was_here").exists()
-    assert find_failure(received, 0).n_found > 0
-    with Path("evil.py").open("a") as file:
-        file.write("\nmore = 1\n")
     with pytest.raises(BadInput, match="add --trust"):
         find_failure(received, 0)
 
 
-def test_a_run_of_ones_own_needs_no_trust(received: Path, tmp_path: Path) -> None:
+def test_a_run_of_ones_own_needs_no_trust(received: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     question = Question(env_id=FOLLOWING, ego="evil:make", base="us101-gap", method="mc", max_sim=200, gamma=5.0)
     run_into(tmp_path / "mine", prepare(question))
     with Path("evil.py").open("a") as file:
         file.write("\nmended = True\n")
     with pytest.warns(UserWarning, match=r"evil\.py changed since the run in .*mine' was begun"):
         assert find_failure(tmp_path / "mine", 0).n_found > 0
-
-
-def test_trust_holds_for_the_packages_on_the_way_and_for_ones_own_code_in_its_place(
-    received: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    (tmp_path / "outer").mkdir()
-    (tmp_path / "outer" / "__init__.py").write_text("raise SystemExit")  # found without being run
-    (tmp_path / "outer" / "inner.py").write_text("first = 1")
-    question, code = {"ego": "outer.inner:make"}, ["outer.inner:make"]
-    check_code_trust(question, code, received, trust=True)
-    check_code_trust(question, code, received, trust=False)
-    (tmp_path / "outer" / "__init__.py").write_text("runs = 'on import'")
-    with pytest.raises(ValueError, match="add --trust"):
-        check_code_trust(question, code, received, trust=False)
-    note_own_run({"ego": "evil:make"}, ["evil:make"])
-    check_code_trust({"ego": "evil:make"}, ["evil:make"], received, trust=False)
-    monkeypatch.chdir(tmp_path / "outer")
-    Path("evil.py").write_text("not_mine = 3")
-    with pytest.raises(ValueError, match="add --trust"):
-        check_code_trust({"ego": "evil:make"}, ["evil:make"], received, trust=False)
+    Path("elsewhere").mkdir()
+    shutil.copy("evil.py", "elsewhere")
+    monkeypatch.chdir("elsewhere")  # a module of the same name, which is not that of the run
+    with pytest.raises(BadInput, match="add --trust"):
+        find_failure(tmp_path / "mine", 0)
 
 
 @pytest.mark.filterwarnings("ignore:.*changed since the run")  # a base in the place of a file
@@ -154,25 +129,6 @@ def test_values_of_every_field_are_taken_back_and_what_is_no_code_is_not_listed(
     assert open_question({**recorded, "unknown": 1}, received, trust=True) == question
     for ego in ("idm", "ego.zip", "noisy:gail", "tcp://127.0.0.1:5555", "process:imitation?timeout=3"):
         assert list_code(Question(env_id=FOLLOWING, ego=ego)) == []
-
-
-def test_a_file_that_moved_with_its_run_is_found_and_refused_once_it_has_changed(
-    cli: Cli, here: Path, risky: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    project = here / "project"
-    project.mkdir()
-    shutil.copy(risky, project / "base.json")
-    monkeypatch.chdir(project)
-    result = cli(*SMALL, "--base", "base.json", "--out", "runs/a")
-    assert result.exit_code == 0, result.output
-    monkeypatch.chdir(here)
-    moved = project.rename(here / "elsewhere")
-    result = cli("replay", moved / "runs/a", "--json")
-    assert result.exit_code == 0, result.output
-    assert json.loads(result.stdout)["same"]
-    with (moved / "base.json").open("a") as file:
-        file.write(" ")
-    assert_refused(cli("replay", moved / "runs/a"), "base.json", "has changed")
 
 
 @pytest.mark.parametrize("name", ["vecnormalize.pkl", "mine.pkl"])

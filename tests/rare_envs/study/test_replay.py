@@ -15,9 +15,17 @@ import rare_envs
 import samplers
 from rare_envs.study import Question, Report, prepare, run
 from rare_envs.study.arguments import BadInput
-from rare_envs.study.plots import MOMENTS, draw_convergence, draw_drive, explain_no_failure, save_plot
+from rare_envs.study.plots import (
+    MARKER,
+    MOMENTS,
+    draw_convergence,
+    draw_drive,
+    draw_frames,
+    explain_no_failure,
+    save_plot,
+    write_film,
+)
 from rare_envs.study.replay import describe_drive, drive_again, find_failure
-from rare_envs.study.video import MARKER, draw_frames, write_film
 from tests.rare_envs.study.refusals import FOLLOWING, SMALL, Cli
 
 

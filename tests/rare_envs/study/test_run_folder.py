@@ -1,4 +1,4 @@
-"""The folder of a finished run: what is read back from it, and its study.json."""
+"""The folder of a finished run: what is read back from it, its study.json, and the table of all simulations."""
 
 from __future__ import annotations
 
@@ -6,13 +6,22 @@ import json
 import shutil
 import subprocess
 import sys
+import time
 from pathlib import Path
 
+import numpy as np
+import pyarrow.parquet as pq
 import pytest
 
 import rare_envs
-from rare_envs.study import BadInput, Question, prepare, run_folder
+import samplers
+from rare_envs.study import Question, episodes, prepare, run_folder, run_into
+from rare_envs.study.episodes import EpisodeTable, digest_scenarios, name_columns
+from rare_envs.study.evaluate import resume
 from rare_envs.study.writing import finish_study_file
+from samplers.evaluate import Simulated
+from samplers.journal import Journal
+from tests.rare_envs.study.refusals import FOLLOWING
 
 
 def test_what_is_loaded_is_what_the_files_hold(finished_run: Path) -> None:
@@ -31,19 +40,6 @@ def test_loading_takes_neither_torch_nor_the_simulation(finished_run: Path) -> N
         "assert 'torch' not in sys.modules and 'matplotlib' not in sys.modules, 'slow to import'"
     )
     subprocess.run([sys.executable, "-c", code, str(finished_run)], check=True)
-
-
-@pytest.mark.parametrize(
-    "text",
-    ["", "[1]", '{"p": "low", "interval": [0, 1]}', '{"p": true}', '{"p": 0.1, "interval": [0, Infinity]}'],
-)
-def test_a_damaged_result_is_refused_in_one_line(tmp_path: Path, text: str) -> None:
-    with pytest.raises(BadInput, match="No finished run"):
-        rare_envs.load_study(tmp_path)
-    (tmp_path / "failures.csv").write_text("f,log_p0\n")
-    (tmp_path / "result.json").write_text(text)
-    with pytest.raises(BadInput, match=r"result\.json"):
-        rare_envs.load_study(tmp_path)
 
 
 def test_what_is_not_what_the_run_wrote_is_named(finished_run: Path, tmp_path: Path) -> None:
@@ -88,3 +84,129 @@ def test_a_run_that_ends_keeps_what_its_file_held_of_the_beginning(tmp_path: Pat
     (tmp_path / "study.json").write_text("{")
     finish_study_file(tmp_path, study, 2.5)
     assert json.loads((tmp_path / "study.json").read_text())["seed"] == 0
+
+
+def ask(risky: str, method: str, **more: object) -> Question:
+    return Question(**{"env_id": FOLLOWING, "base": risky, "method": method, "max_sim": 900, "horizon": 4.0, **more})
+
+
+@pytest.mark.parametrize(("method", "replicates"), [("mc", 1), ("mc", 2), ("is", 1), ("two-stage", 1)])
+def test_p_is_the_sum_of_the_weights_of_the_failures(risky: str, tmp_path: Path, method: str, replicates: int) -> None:
+    report = run_into(tmp_path / "run", prepare(ask(risky, method, replicates=replicates)))
+    study = rare_envs.load_study(tmp_path / "run")
+    table = study.episodes().to_pydict()
+    assert study.p == report.estimate.p > 0
+    assert len(table["f"]) == study.result["n_sim"]
+    weights = [w for w, failed in zip(table["log_weight"], table["failed"], strict=True) if failed and w is not None]
+    assert np.exp(weights).sum() == pytest.approx(study.result["p"], rel=1e-12)
+    assert table["simulation"] == list(range(len(table["f"])))
+    assert len(table["f"]) == sum(level["n_sim"] for level in study.result["trace"])
+    assert set(table["run"]) == set(range(replicates))
+
+
+def test_a_row_has_the_scenario_its_f_and_its_crash(risky: str, tmp_path: Path) -> None:
+    report = run_into(tmp_path / "run", prepare(ask(risky, "mc", max_sim=400)))
+    study = rare_envs.load_study(tmp_path / "run")
+    table = study.episodes()
+    problem = report.study.problem
+    x = np.column_stack([table[name].to_numpy() for name in problem.space.names])
+    f = table["f"].to_numpy()
+    np.testing.assert_array_equal(problem.evaluate(x), f)
+    np.testing.assert_array_equal(table["failed"].to_numpy(), f <= 0)
+    failing = study.episodes(failed=True)
+    assert set(failing["crash"].to_pylist()) == {"rear_end"} and failing.num_rows == report.estimate.failures.total
+    assert study.episodes(["crash"], failed=False)["crash"].null_count == 400 - failing.num_rows
+    assert (table["seconds"].to_numpy() > 0).all() and table["error"].null_count == 400
+    listed = {tuple(row) for row in np.column_stack([study.failures[name] for name in problem.space.names])}
+    assert listed <= {tuple(row) for row in x}
+
+
+def test_a_resumed_run_has_the_same_table_but_for_times(
+    risky: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    question = ask(risky, "is")
+    run_into(tmp_path / "whole", prepare(question))
+
+    def interrupt(self: object, *_: object) -> None:
+        raise KeyboardInterrupt
+
+    append = Journal.append
+
+    def append_late(self: Journal, *record: object) -> None:
+        self._opened = time.monotonic() - 3600.0
+        append(self, *record)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(EpisodeTable, "write", interrupt)
+        patch.setattr(Journal, "append", append_late)
+        with pytest.raises(KeyboardInterrupt):
+            run_into(tmp_path / "cut", prepare(question))
+    assert sorted(path.name for path in (tmp_path / "cut").iterdir()) == ["journal.bin", "study.json"]
+    begun = json.loads((tmp_path / "cut" / "study.json").read_text())
+    assert begun["finished"] is None and begun["seed"] == 0
+    report = resume(tmp_path / "cut")
+    assert 3600.0 <= report.earlier_seconds < report.seconds < 3700.0
+    whole, cut = (rare_envs.load_study(tmp_path / name) for name in ("whole", "cut"))
+    assert cut.episodes().drop(["seconds"]).equals(whole.episodes().drop(["seconds"]))
+    assert (cut.episodes()["seconds"].to_numpy() > 0).all()
+    assert cut.about["begun"] == begun["begun"] and cut.about["seconds"] == report.seconds and cut.about["finished"]
+
+
+def test_large_blocks_are_lists_in_single_precision(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(episodes, "ROWS_AT_ONCE", 8)
+    space = rare_envs.DrivingProblem("rare_envs/Highway-v0", noise=False).space
+    kinds = name_columns(space)
+    assert kinds["weights"].list_size == 404 and str(kinds["speed[5]"]) == "double"
+    x = space.sample(20, np.random.default_rng(0))
+    table = EpisodeTable(tmp_path, space)
+    for part in np.split(x, 4):
+        table.add(Simulated(part, np.zeros(5), [], np.ones(5)))
+    problem = samplers.FunctionProblem(lambda u: np.ones(len(u)), 3)
+    table.write(samplers.estimate(problem, "mc", max_sim=20, seed=0), {})
+    table.close()
+    found = pq.read_table(tmp_path / "episodes.parquet")
+    values = found["weights"].combine_chunks().flatten().to_numpy().reshape(-1, 404)
+    np.testing.assert_array_equal(values, space.columns(x)["weights"].astype(np.float32))
+    rows = [episodes._as_array(found[name].combine_chunks()) for name in kinds]
+    assert digest_scenarios(np.hstack(rows)) == digest_scenarios(x)
+
+
+def test_row_groups_are_bounded_and_the_schema_says_its_version(
+    risky: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(episodes, "ROWS_AT_ONCE", 128)
+    run_into(tmp_path / "run", prepare(ask(risky, "mc", max_sim=500)))
+    file = pq.ParquetFile(tmp_path / "run" / "episodes.parquet")
+    sizes = [file.metadata.row_group(k).num_rows for k in range(file.num_row_groups)]
+    assert sum(sizes) == 500 and max(sizes) <= 128
+    assert file.schema_arrow.metadata[b"rare_envs.format"] == b"1"
+
+
+@pytest.mark.parametrize("on_error", ["failure", "bound"])
+def test_faults_have_their_reason_and_count_as_failures(here: Path, risky: str, on_error: str) -> None:
+    question = ask(risky, "mc", max_sim=300, ego="egos_here:nan_when_close", on_error=on_error)
+    report = run_into(here / "run", prepare(question))
+    table = rare_envs.load_study(here / "run").episodes()
+    lost = table["f"].is_null().to_numpy()
+    assert lost.sum() == len(report.faults) > 0
+    reasons = [fault.reason for fault in report.faults]
+    assert [text for text in table["error"].to_pylist() if text] == reasons
+    assert table["failed"].to_numpy()[lost].all() and table["crash"].filter(lost).null_count == lost.sum()
+    assert np.exp(table["log_weight"].to_numpy())[table["failed"].to_numpy()].sum() == pytest.approx(report.estimate.p)
+
+
+def test_a_table_that_cannot_be_written_does_not_end_the_run(
+    risky: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(episodes, "_join_batches", refuse)
+    report = run_into(tmp_path / "run", prepare(ask(risky, "mc", max_sim=300)))
+    assert report.estimate.n_sim == 300
+    assert "episodes.parquet could not be written: No space left on device" in report.notes
+    assert sorted(path.name for path in (tmp_path / "run").glob("*episodes*")) == []
+    study = rare_envs.load_study(tmp_path / "run")
+    assert study.p == report.estimate.p
+    with pytest.raises(FileNotFoundError, match=r"no episodes\.parquet"):
+        study.episodes()

@@ -14,11 +14,24 @@ import numpy as np
 import pytest
 from typer.testing import Result
 
-import rare_envs
 from rare_envs.study import BadInput, Question, prepare, run_into
-from rare_envs.study.html_report import SECTIONS, write_html_report
-from rare_envs.study.html_report.atlas import AtlasSource, build_atlas, find_nearest_event, read_recorded_events
+from rare_envs.study.html_report import SECTIONS, find_nearest_event, read_recorded_events, write_html_report
 from rare_envs.study.html_report.figures import FigureOfPage
+from tests.rare_envs.study.conftest import write_base
+
+
+@pytest.fixture(scope="session")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run with failures, and its report."""
+    path = tmp_path_factory.mktemp("runs")
+    base = write_base(path / "risky.json", gap=30.0)
+    question = Question(
+        env_id="rare_envs/CarFollowing-v0", base=str(base), method="is", max_sim=600, horizon=4.0, target_cov=0.2
+    )
+    run_into(path / "run", prepare(question))
+    write_html_report(path / "run")
+    return path / "run"
+
 
 VOID = {"meta", "br", "img", "link", "path", "use", "rect", "circle", "line", "polygon"}
 
@@ -75,7 +88,9 @@ def test_the_page_says_what_the_files_say(folder: Path) -> None:
     text = (folder / "report.html").read_text(encoding="utf-8")
     result = json.loads((folder / "result.json").read_text())
     assert f"p = {100 * result['p']:.2g}\xa0%" in text  # a number and its unit stay in one line
-    assert "ends in a collision" in text and "the ego runs into a vehicle ahead" in text
+    assert "ends in a collision" in text and "Mode 1: the ego runs into a vehicle ahead" in text
+    assert re.search(r"the ego into the lead after \d\.\d s, at [\d.]+ m/s", text)
+    assert "m/s of it, at right angles to what touches" in text
     for name in ("ego_speed [m/s]", "lead_speed [m/s]", "gap [m]"):
         assert name in text
     assert f"rare-envs replay {folder} --failure {result['modes'][0]['failure']}" in text
@@ -128,42 +143,10 @@ def test_a_run_without_failures_has_a_page(tmp_path: Path, safe: str) -> None:
 
 
 def test_what_has_no_report_is_refused(folder: Path, tmp_path: Path, cli: Callable[..., Result]) -> None:
-    with pytest.raises(BadInput, match="No finished run"):
-        write_html_report(tmp_path)
-    with pytest.raises(BadInput, match="Expected --figures svg, pdf, png"):
-        write_html_report(folder, figures="bmp")
     shutil.copytree(folder, tmp_path / "run")
     (tmp_path / "run" / "journal.bin").touch()
     refused = cli("report", tmp_path / "run")
     assert refused.exit_code == 2 and "is not finished" in refused.stderr
-
-
-MODE = {"crash": "rear_end", "p": 0.01, "interval": [0.005, 0.02], "of_failures": 0.75, "failure": 0}
-
-
-@pytest.fixture
-def source() -> AtlasSource:
-    problem = rare_envs.DrivingProblem("rare_envs/CarFollowing-v0", horizon=3.0)
-    failures = {"ego_speed": [20.0], "lead_speed": [5.0], "gap": [10.0], "f": [-1.0], "log_p0": [-9.0]}
-    arrays = {name: np.array(values) for name, values in failures.items()}
-    ordinary = problem.space.sample(200, np.random.default_rng(0))
-    return AtlasSource(Path("runs/one"), problem, arrays, ordinary, ordinary[:5])
-
-
-def test_an_entry_says_what_happened_and_how_to_see_it_again(source: AtlasSource) -> None:
-    (entry,) = build_atlas(source, [MODE])
-    facts = dict(entry.facts)
-    assert entry.title == "Mode 1: the ego runs into a vehicle ahead" and entry.share.startswith("75 % of p: 1 %")
-    assert facts["crash"].startswith("the ego into the lead after 0.8 s, at ") and facts["f"] == "-1"
-    assert facts["closing speed"].endswith("m/s of it, at right angles to what touches")
-    assert facts["replay"].startswith("rare-envs replay runs/one --failure 0")
-    assert "standard deviations per parameter" in facts["nearest recorded"]
-    assert [row[:2] for row in entry.parameters] == [
-        ("ego_speed [m/s]", "20.00"),
-        ("lead_speed [m/s]", "5.00"),
-        ("gap [m]", "10.00"),
-    ]
-    assert [figure.name for figure in entry.figures] == ["mode1-views", "mode1-measure", "mode1-speeds"]
 
 
 def test_the_nearest_event_is_the_nearest_in_deviations() -> None:

@@ -1,0 +1,368 @@
+"""The other commands: listing, egos, finished runs and risk."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import sys
+import xml.etree.ElementTree as ET
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import highway_env  # noqa: F401  (registers its ids)
+import numpy as np
+import pytest
+from PIL import Image
+from stable_baselines3 import PPO
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+
+import agents
+import rare_envs
+import samplers
+import training.fit.recordings as fitting
+from rare_envs.scenarios.hard_brake import HARD_BRAKE
+from rare_envs.scenarios.registry import SCENARIOS
+from rare_envs.study import html_report
+from rare_envs.study.cli.listing import TITLES
+from rare_envs.study.cli.runs import FAILS
+from rare_envs.study.corpus import read_corpus
+from rare_envs.study.ego_check import VERDICTS
+from rare_envs.study.plots import CURVES_HEIGHT, LAST_FRAME_TICKS
+from rare_envs.study.run_folder import read_failures
+from tests.rare_envs.study.fitted_files import fitted_entries, write_fitted
+from tests.rare_envs.study.refusals import FOLLOWING, SMALL, Cli, assert_refused
+
+
+def test_list_shows_what_there_is(cli: Cli) -> None:
+    shown = cli("list", "all").stdout
+    entries = json.loads(cli("list", "--json").stdout)
+    assert list(entries["environments"]) == list(SCENARIOS)
+    assert list(entries["methods"]) == list(samplers.METHODS)
+    for env_id, environment in entries["environments"].items():
+        space = rare_envs.DrivingProblem(env_id).space
+        assert environment["vehicles"] == rare_envs.parallel_env(env_id).possible_agents
+        listed = environment["parameters"]
+        sizes = [each["size"] for each in listed]
+        assert [each["name"] for each in listed] == list(space.names[: len(listed)])
+        assert set(space.names[len(listed) :]) == ({"weights", "noise"} if environment["drivers"] else set())
+        learned = rare_envs.DrivingProblem(env_id, drivers="mgail").space
+        added = [(each["name"], each["size"]) for each in environment["of_learned_drivers"]]
+        assert added == list(zip(learned.names, learned.sizes, strict=True))[len(listed) :]
+        for end in ("low", "high"):
+            expected = np.repeat([each[end] for each in listed], sizes).tolist()
+            assert expected == getattr(space, end)[: sum(sizes)].tolist()
+        assert all(each["unit"] and each["meaning"] for each in listed)
+        assert environment["kinematics_id"] in gym.registry
+        assert environment["kinematics_id"] in shown
+    assert all(name in gym.registry for name in entries["highway_env"])
+    assert "speed (6 values)" in shown
+    assert "weights (404 values), noise (1,020 values)" in " ".join(shown.split())
+    for name in (*SCENARIOS, *samplers.METHODS, "us101", *agents.files.SHIPPED_DRIVERS, "okelly2018", "lidar_ttc"):
+        assert name in shown
+
+
+def test_all_names_fit_a_screen(cli: Cli, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    entries, shown = json.loads(cli("list", "--json").stdout), cli("list").stdout
+    assert len(shown.splitlines()) <= 24
+    words = set(shown.replace(",", " ").split())
+    names = [*entries["environments"], *entries["highway_env"], *(name for kind in TITLES for name in entries[kind])]
+    names += [each["name"] for environment in entries["environments"].values() for each in environment["parameters"]]
+    assert {word for name in names for word in name.replace(",", " ").split()} <= words
+    (highway,) = (line for line in shown.splitlines() if "Highway-v0" in line)
+    assert "weights, noise" in highway
+    assert all("weights" not in line for line in shown.splitlines() if "CutIn" in line)
+
+
+def test_one_kind_is_explained_alone(cli: Cli) -> None:
+    whole = json.loads(cli("list", "all", "--json").stdout)
+    for what, there, absent, keys in (
+        ("egos", "rule-based driver", "lateral_offset", ["egos"]),
+        ("measures", "Post-encroachment time", "rule-based driver", ["measures"]),
+        ("CutIn-v0", "us101-closing", "CarFollowing", None),
+        ("rare_envs/CutIn-v0", "lateral_offset", "CarFollowing", None),
+        ("environments", "merge-v0", "rule-based driver", ["environments", "highway_env"]),
+    ):
+        shown, alone = cli("list", what).stdout, json.loads(cli("list", what, "--json").stdout)
+        assert there in shown and absent not in shown
+        env_id = "rare_envs/CutIn-v0"
+        one = {"environments": {env_id: whole["environments"][env_id]}}
+        assert alone == (one if keys is None else {key: whole[key] for key in keys})
+
+
+def test_bases_tell_events_site_fit_and_frequency(cli: Cli, monkeypatch: pytest.MonkeyPatch) -> None:
+    bases = {
+        "us101": fitted_entries("hard_brake"),
+        "plain": {**HARD_BRAKE.bases["us101-all-brakings"], "provenance": None},
+    }
+    monkeypatch.setitem(SCENARIOS.data, "rare_envs/HardBrake-v0", replace(HARD_BRAKE, bases=bases))
+    answer = json.loads(cli("bases", "hard_brake", "--json").stdout)
+    assert answer["bases"]["us101"]["fitted_to"] == "42 events of 40 scenes"
+    assert answer["env_id"] == "rare_envs/HardBrake-v0"
+    text = " ".join(cli("bases", "rare_envs/HardBrake-v0").stdout.split())
+    assert "us101 (the default) fitted to 42 events of 40 scenes, 30 refits" in text
+    assert "site site of hard_brake, 2005-06-15" in text
+    assert "fit BIC 1,086.8, held-out log likelihood -14.60 per event" in text
+    assert "7.4 per hour, 0.19 per km: 42 in 5.64 h (events of a test)" in text
+    assert "recorded / expected TTC < 5 s 2 / 7.5" in text
+    assert "plain frequency not known, no rate per hour or km: nobody counted" in text
+
+
+def test_an_ego_is_trained_and_then_estimated(cli: Cli, risky: str, tmp_path: Path) -> None:
+    ego = tmp_path / "ego.zip"
+    trained = cli("train-ego", FOLLOWING, "--steps", 512, "--num-envs", 8, "--out", ego)
+    assert trained.exit_code == 0, trained.output
+    assert f"rare-envs estimate {FOLLOWING} --ego {ego}" in trained.stdout.replace("\n", " ")
+    result = cli(*SMALL, "--base", risky, "--ego", ego, "--json")
+    assert result.exit_code in (0, 3)
+    assert json.loads(result.stdout)["question"]["ego"] == str(ego)
+    assert_refused(cli("estimate", "rare_envs/CutIn-v0", "--ego", ego), "(7,)", "(11,)")
+
+
+def test_an_ego_is_trained_on_with_the_failures_of_its_runs(cli: Cli, risky: str, tmp_path: Path) -> None:
+    words = ("--steps", 40, "--num-envs", 8, "--json")
+    ego, on, runs = tmp_path / "ego.zip", tmp_path / "on.zip", [tmp_path / "first", tmp_path / "second"]
+    assert cli("train-ego", FOLLOWING, "--algo", "a2c", "--out", ego, *words).exit_code == 0
+    for seed, run in enumerate(runs):
+        estimated = cli(*SMALL, "--base", risky, "--ego", ego, "--seed", 7 + seed, "--out", run)
+        assert estimated.exit_code in (0, 3), estimated.output
+    found = [len((run / "failures.csv").read_text().splitlines()) - 1 for run in runs]
+    both = [part for run in runs for part in ("--from-failures", run)]
+    trained = cli("train-ego", *both, "--failure-share", 0.5, "--out", on, *words)
+    assert trained.exit_code == 0, trained.output
+    answer = json.loads(trained.stdout)
+    expected = {"env_id": FOLLOWING, "algo": "a2c", "base": risky, "retrained": str(ego)}
+    assert expected | {"failures": sum(found), "failure_share": 0.5} == {
+        name: answer[name] for name in (*expected, "failures", "failure_share")
+    }
+    printed = cli("train-ego", "--from-failures", runs[0], "--out", on, *words[:-1]).stdout.replace("\n", " ")
+    assert f"--base {risky} --seed 8" in printed.replace("  ", " ")
+    one = ("train-ego", "--from-failures", runs[0], "--out", on)
+    assert_refused(cli(*one, "--algo", "ppo"), "Expected --algo a2c", "'ppo'")
+    assert_refused(cli("train-ego", "rare_envs/CutIn-v0", *one[1:]), f"Expected ENV {FOLLOWING}")
+    assert_refused(cli(*one, "--failure-share", 1), "share of failures above 0 and below 1")
+
+
+def test_the_files_that_were_fitted_are_the_answer(cli: Cli, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    asked: dict[str, Any] = {}
+    file = tmp_path / "cut_in_own.json"
+
+    def fit(recordings: Any, out: Path, **options: Any) -> list[Path]:
+        asked.update(options, kind=recordings.kind_and_path()[0], between=recordings.between)
+        print("progress")
+        return [out / file.name]
+
+    monkeypatch.setattr(fitting, "fit_bases", fit)
+    words = ("--i24", "morning.json", "--between", 1, 2, "--scenario", "cut_in", "--refits", 3, "--out", tmp_path)
+    answer = cli("fit", *words, "--json")
+    assert json.loads(answer.stdout) == {"bases": [str(file)]}
+    assert "progress" in answer.stderr
+    given = {"kind": "i24", "between": (1.0, 2.0), "scenarios": ["cut_in"], "n_refits": 3}
+    assert asked == {**given, "cut_gaps": False, "name": "own", "seed": 0, "progress": True}
+    assert cli("fit", *words).stdout == f"{file}: rare-envs estimate ENV --base {file}\n"
+
+
+def test_an_ego_is_checked_in_the_traffic_that_is_asked_for(cli: Cli) -> None:
+    findings = json.loads(cli("check-ego", "idm", FOLLOWING, "--base", "nowhere", "--json").stdout)["findings"]
+    assert findings[-1]["status"] == "fail"
+    assert "nowhere" in findings[-1]["found"]
+    refused = cli("check-ego", "https://example.org/ego.zip", FOLLOWING)
+    assert refused.exit_code == 2 and "remote place" in refused.stdout and VERDICTS[2] in refused.stdout
+
+
+def test_an_ego_is_exported(cli: Cli, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    env = VecNormalize(DummyVecEnv([lambda: gym.make("Pendulum-v1")]))
+    model, out = tmp_path / "ego.zip", tmp_path / "a.onnx"
+    PPO("MlpPolicy", env, n_steps=8, batch_size=8, seed=0, device="cpu", policy_kwargs={"net_arch": [4]}).save(model)
+    env.save(str(tmp_path / "vecnormalize.pkl"))
+    with monkeypatch.context() as patch:
+        patch.setitem(sys.modules, "onnx", None)
+        said = "Exporting needs onnx and onnxruntime: pip install 'rare-envs[onnx]'."
+        assert_refused(cli("export-ego", model, out), said)
+    assert not out.exists()
+    pytest.importorskip("onnxruntime", reason="the extra onnx is optional")
+    pytest.importorskip("onnx", reason="the extra onnx is optional")
+    done = cli("export-ego", model, out, "--json")
+    assert done.exit_code == 0, done.output
+    report = json.loads(done.stdout)
+    assert report["onnx"] == str(out)
+    assert report["largest_difference"] <= report["tolerance"]
+    assert cli("export-ego", model, out).stdout == (
+        f"Wrote {out}: its actions differ by {report['largest_difference']:.1e} at most on 1,440 random observations.\n"
+    )
+
+
+@pytest.fixture
+def run(finished_run: Path, here: Path) -> Path:
+    """The folder `run` in a working directory with egos."""
+    shutil.copytree(finished_run, here / "run")
+    return Path("run")
+
+
+def test_a_failure_of_a_run_is_shown(cli: Cli, run: Path, tmp_path: Path) -> None:
+    result = cli("replay", run, "--failure", 1, "--out", "clip.gif", "--json")
+    assert result.exit_code == 0, result.stderr
+    answer = json.loads(result.stdout)
+    assert answer["f"] == answer["f_recorded"] == read_failures(run)["f"][1] == -1.0
+    assert answer["crash"]["kind"] == "rear_end"
+    assert answer["crash"]["vehicles"] == [0, 1]
+    with Image.open("clip.gif") as film:
+        assert film.size == (800, 160 + 48 + CURVES_HEIGHT)
+        length = 0
+        for k in range(film.n_frames):
+            film.seek(k)
+            length += film.info["duration"]
+    assert length == pytest.approx(1000 * answer["seconds"] + 100 * LAST_FRAME_TICKS, abs=1)  # equal frames are one
+    words = cli("replay", run, "--out", "worst.png").stdout
+    n_found = json.loads((run / "result.json").read_text())["n_failures"]
+    for said in (
+        f"Failure 0 of {n_found} found in ",
+        "ego_speed",
+        "the ego into the lead (rear_end",
+        "Wrote worst.png",
+    ):
+        assert said in words
+
+
+def test_all_failures_replay_and_another_ego_takes_them(cli: Cli, run: Path) -> None:
+    answer = json.loads(cli("replay", run, "--all", "--json").stdout)
+    assert answer["same"] == len(answer["trials"]) > 20
+    other = cli("replay", run, "--all", "--ego", "egos_here:coasting", "--json")
+    assert other.exit_code == FAILS and json.loads(other.stdout)["failed"] == len(answer["trials"])
+    one = cli("replay", run, "--ego", "egos_here:coasting")
+    assert one.exit_code == 0
+    assert one.stdout.splitlines()[-1] == "The ego was egos_here:coasting; that of the run had f = -1."
+    table = (run / "failures.csv").read_text().splitlines()
+    row = table[1].split(",")
+    row[table[0].split(",").index("f")] = "-0.5"
+    (run / "failures.csv").write_text("\n".join([table[0], ",".join(row), *table[2:]]) + "\n")
+    changed = cli("replay", run, "--all")
+    assert changed.exit_code == 3 and changed.stdout.count("\n") == 2
+
+
+def test_another_f_than_recorded_is_a_warning(cli: Cli, run: Path) -> None:
+    result = json.loads((run / "result.json").read_text())
+    result["question"]["horizon"] = 0.5  # as if the program had changed
+    (run / "result.json").write_text(json.dumps(result))
+    answer = cli("replay", run)
+    assert answer.exit_code == 3
+    assert "warning: the run recorded f = -1" in answer.stdout
+
+
+def test_a_failure_becomes_files_of_other_simulators(cli: Cli, run: Path) -> None:
+    result = cli("export", run, "--format", "commonroad", "--out", "a.xml", "--json")
+    assert result.exit_code == 0, result.output
+    assert json.loads(result.stdout)["files"] == ["a.xml"] and Path("a.xml").stat().st_size > 1000
+    pytest.importorskip("scenariogeneration", reason='scenariogeneration comes with "rare-envs[export]"')
+    result = cli("export", run, "--failure", 1, "--format", "carla", "--out", "a.xosc")
+    assert result.exit_code == 0 and result.stdout == "Wrote a.xosc and a.xodr.\n" and Path("a.xodr").exists()
+
+
+def test_options_reach_the_report_and_the_answer_names_the_files(cli: Cli, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[object] = []
+
+    def write(run: Path, **options: object) -> list[Path]:
+        asked.append((run, options))
+        return [Path("a.html"), Path("figures/curve.pdf")]
+
+    monkeypatch.setattr(html_report, "write_html_report", write)
+    words = ("report", "run", "--out", "a.html", "--events", "e.csv", "--figures", "pdf", "--trust")
+    assert json.loads(cli(*words, "--json").stdout) == {"report": "a.html", "figures": ["figures/curve.pdf"]}
+    options = {"trust": True, "events": Path("e.csv"), "out": Path("a.html"), "figures": "pdf"}
+    assert asked == [(Path("run"), options)]
+    assert cli(*words).stdout == "Wrote a.html and 1 figures.\n"
+
+
+def test_from_a_run_to_a_regression_test(cli: Cli, run: Path) -> None:
+    assert cli("corpus", "add", run).stdout.startswith("Added 20 of 20")
+    again = json.loads(cli("corpus", "add", run, "--json").stdout)
+    assert again["added"] == 0 and len(again["failures"]) == 20
+    same = cli("corpus", "run", "--ego", "idm", "--junit", "out.xml", "--json")
+    assert same.exit_code == FAILS
+    answer = json.loads(same.stdout)
+    assert (answer["passed"], answer["failed"], answer["error"]) == (0, 20, 0)
+    assert ET.parse("out.xml").getroot()[0].get("failures") == "20"
+    lines = cli("corpus", "run", "--ego", "egos_here:coasting").stdout.splitlines()
+    assert lines[0].startswith("egos_here:coasting fails in 20 of 20 scenarios") and len(lines) == 21
+    for stored in read_corpus(Path("corpus")):  # thresholds below any f that there is
+        strict = replace(stored, world={**stored.world, "gamma": -2.0})
+        Path("corpus", f"{stored.key}.json").unlink()
+        Path("corpus", f"{strict.key}.json").write_text(strict.to_json())
+    result = cli("corpus", "run", "--ego", "idm")
+    assert result.exit_code == 0 and result.stdout.startswith("idm fails in 0 of 20 scenarios")
+
+
+def test_damaged_files_of_a_corpus_and_a_run_are_one_line(cli: Cli, run: Path) -> None:
+    cli("corpus", "add", run)
+    assert_refused(cli("corpus", "run", "--ego", "nowhere.zip"), "nowhere.zip")
+    Path("corpus", "stray.json").write_text("{}")
+    assert_refused(cli("corpus", "run", "--ego", "idm"), "stray.json", "format")
+    (run / "result.json").write_text("[" * 100_000)
+    assert_refused(cli("export", run, "--format", "commonroad", "--out", "a.xml"), "result.json")
+
+
+FEW = ("--method", "mc", "--max-sim", 300)
+BRAKE = ("estimate", "rare_envs/HardBrake-v0", *FEW)
+
+
+@pytest.fixture
+def bases(here: Path) -> list[str]:
+    """Options that name a fitted base for each scenario."""
+    names = ("cut_in", "hard_brake")
+    return [word for name in names for word in ("--base", f"{name}={write_fitted(here / f'{name}.json', name)}")]
+
+
+def test_the_table_and_the_folder(cli: Cli, bases: list[str], here: Path) -> None:
+    result = cli("risk", "idm", *bases, *FEW, "--out", here / "out")
+    assert result.exit_code == 0, result.output
+    assert result.stdout.startswith("collisions per million km  ")
+    assert "cut-in        0.26 per km x " in result.stdout
+    assert result.stdout.endswith(f"Wrote {here / 'out'}.\n")
+    assert (here / "out" / "risk.png").exists()
+
+
+def test_estimate_prints_the_rate_beside_people(cli: Cli, here: Path) -> None:
+    base = write_fitted(here / "fitted.json", "hard_brake")
+    short = " ".join(cli(*BRAKE, "--base", base).stdout.split())
+    assert "per million km (" in short and "; people 15 to 21 (contacts at any speed) " in short
+    text = " ".join(cli(*BRAKE, "--base", base, "--details").stdout.split())
+    assert "per million km (" in text
+    assert (
+        "people: 21 contacts of all kinds, 4.3 into a vehicle ahead (100-Car), 15 crashes without tyre strikes (SHRP 2)"
+        in text
+    )
+    assert "from 0.19 brakings per km; the uncertainty is" in text
+    data = json.loads(cli(*BRAKE, "--base", base, "--json").stdout)
+    assert data["rate"]["per_hour"] == pytest.approx(42 / 5.64 * data["p"])
+
+
+def test_estimate_says_in_one_line_why_there_is_no_rate(cli: Cli, here: Path) -> None:
+    base = write_fitted(here / "fitted.json", "hard_brake")
+    for words, said in (
+        (("--base", base, "--gamma", "1"), "--gamma 1 counts other events"),
+        (("--base", base, "--measure", "drac"), "--measure drac counts other events"),
+        (("--base", write_fitted(here / "b.json", "hard_brake", frequency=None)), "nobody counted"),
+    ):
+        lines = [line for line in cli(*BRAKE, *words).stdout.splitlines() if "no rate" in line]
+        assert len(lines) == 1
+        assert said in lines[0]
+
+
+def test_p_under_other_bases(cli: Cli, here: Path) -> None:
+    """A near one is answered, a far one refused with its reason; one that is not there before any simulation."""
+    base, near, far = (
+        write_fitted(here / f"{name}.json", "hard_brake", shift=shift)
+        for name, shift in (("own", 0.0), ("near", 0.2), ("far", 8.0))
+    )
+    words = (*BRAKE, "--base", base, "--also-under", f"{near}, {far}")
+    answers = {Path(each["base"]).stem: each for each in json.loads(cli(*words, "--json").stdout)["other_bases"]}
+    assert answers["near"]["refused"] == ""
+    low, high = answers["near"]["interval"]
+    assert low < answers["near"]["p"] < high
+    assert "effective" in answers["far"]["refused"] or "worth" in answers["far"]["refused"]
+    text = cli(*words).stdout
+    assert f"under {near} " in text
+    assert f"under {far} not known: " in " ".join(text.split())
+    assert_refused(cli(*BRAKE, "--base", base, "--also-under", "nowhere"), "nowhere")

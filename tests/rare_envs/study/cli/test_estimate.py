@@ -1,0 +1,284 @@
+"""The commands `estimate` and `plan`: what they print, exit codes and options; HighwayEnv and learned drivers too."""
+
+from __future__ import annotations
+
+import csv
+import json
+import re
+import shlex
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import highway_env  # noqa: F401  (registers its ids)
+import numpy as np
+import pytest
+import typer
+from stable_baselines3 import DQN
+from typer.testing import CliRunner
+
+import agents
+import rare_envs
+import samplers
+from rare_envs.study.arguments import ExecutorOptions
+from rare_envs.study.cli.app import EXAMPLES, app, list_examples
+from rare_envs.study.cli.estimate import ESTIMATE_FILE
+from rare_envs.study.cli.shell import GATE_CODES, Answer, command, read_count
+from rare_envs.study.run_folder import CRASH, read_failures
+from tests.rare_envs.study.refusals import FOLLOWING, SMALL, Cli, assert_refused
+
+
+def test_a_doubtful_number_says_so_and_exits_with_3(cli: Cli, safe: str) -> None:
+    words = ("estimate", FOLLOWING, "--method", "adss", "--max-sim", 2000, "--base", safe)
+    result = cli(*words)
+    assert result.exit_code == 3
+    assert "warning: " in result.stdout and ", converged" not in result.stdout
+    assert "no failure found" in result.stdout
+    assert re.search(r"; gain not known, as nothing that failed counts in p\n", result.stdout)
+    answer = cli(*words, "--json")
+    assert answer.exit_code == 3 and json.loads(answer.stdout)["doubtful"] is True
+
+
+@pytest.mark.usefixtures("full_pictures")
+def test_an_upper_bound_by_plain_monte_carlo_is_an_answer(cli: Cli, safe: str, tmp_path: Path) -> None:
+    result = cli(*SMALL, "--base", safe, "--out", tmp_path / "run")
+    assert result.exit_code == 0
+    assert "warning: " not in result.stdout
+    assert "remark: None of 2,000 simulations failed: p = 0 with a one-sided interval." in result.stdout
+    assert "none of 2,000 base draws failed, so p is below 1.5e-03 with 95 % confidence" in result.stdout
+    written = json.loads((tmp_path / "run" / "result.json").read_text())
+    assert written["doubtful"] is False and written["doubts"] == []
+    assert written["interval"][1] == pytest.approx(1 - 0.025 ** (1 / 2000))
+    assert (tmp_path / "run" / "plot.png").stat().st_size > 10_000
+
+
+def test_the_answer_is_short_unless_details_are_asked_for(cli: Cli, risky: str, tmp_path: Path) -> None:
+    words = (*SMALL, "--base", risky)
+    short, long = cli(*words).stdout, cli(*words, "--details").stdout
+    names = [line.split()[0] for line in short.splitlines()]
+    assert names == "P[f 95 base collisions c.o.v. method valid of severity most unusual all".split()
+    assert len(long.splitlines()) > len(names) and "all intervals and parameters" not in long
+    assert short.splitlines()[:4] == long.splitlines()[:4]
+    assert short.splitlines()[-1] == "all intervals and parameters: --details"
+    written = cli(*words, "--out", tmp_path / "a b").stdout.splitlines()
+    assert written[-1] == f"all intervals and parameters: rare-envs report '{tmp_path / 'a b'}'"
+
+
+def test_what_is_unusual_in_the_most_likely_failure_is_named(cli: Cli, risky: str, tmp_path: Path) -> None:
+    words = (*SMALL, "--base", risky, "--out", tmp_path)
+    [line] = [line for line in cli(*words).stdout.splitlines() if line.startswith("    unusual in it: ")]
+    named = re.findall(r"(\w+) (-?[\d.]+) (?:m|m/s) \[(-?[\d.]+) to (-?[\d.]+)\]", line)
+    failure = json.loads((tmp_path / "result.json").read_text())["failures"][0]["parameters"]
+    for name, value, low, high in named:
+        assert float(value) == pytest.approx(failure[name], abs=0.005)
+        assert not float(low) <= failure[name] <= float(high)
+    assert bool(named) != ("nothing beyond" in line)
+
+
+@pytest.mark.parametrize(("limit", "decision"), [(0.2, "passes"), (0.001, "fails"), (0.017, "undecided")])
+def test_exit_codes(cli: Cli, risky: str, limit: float, decision: str) -> None:
+    """About one scenario in sixty fails; that base was fitted to nothing, so that its ends are those of p."""
+    result = cli(*SMALL, "--base", risky, "--max-p", limit, "--json")
+    answer = json.loads(result.stdout)
+    low, high = answer["interval"]
+    assert answer["gate"]["decision"] == decision, (low, high)
+    assert result.exit_code == GATE_CODES[decision]
+    assert answer["confidence"] == 0.9 and answer["gate"]["confidence"] == 0.95  # no 0.8999999999999999
+
+
+def test_one_sentence_is_printed_and_a_resumed_run_has_it_too(cli: Cli, risky: str, tmp_path: Path) -> None:
+    result = cli(*SMALL, "--base", risky, "--max-p", 0.2, "--confidence", 0.99, "--out", tmp_path / "run")
+    assert result.exit_code == 0
+    assert "passes: p is below 0.2 with 99 % confidence (one-sided upper end" in result.stdout
+    assert "98 % interval" in result.stdout and "(each end is one-sided at 99 %, for --max-p)" in result.stdout
+    recorded = json.loads((tmp_path / "run" / "result.json").read_text())
+    assert recorded["question"]["max_p"] == 0.2 and recorded["gate"]["decision"] == "passes"
+
+
+def test_an_ego_that_fails_on_the_way_is_one_line(cli: Cli, here: Path, risky: str) -> None:
+    words = (*SMALL[:-1], 300, "--base", risky, "--ego", "egos_here:nan_when_close", "--out")
+    assert_refused(cli(*words, here / "new" / "run"), "NaN")
+    assert not (here / "new").exists()
+    (here / "old").mkdir()
+    assert_refused(cli(*words, here / "old"), "NaN")
+    assert (here / "old").exists()
+
+
+def test_weather_on_the_command_line(cli: Cli, tmp_path: Path) -> None:
+    words = ("estimate", "rare_envs/CutIn-v0", "--weather", "--observation", "camera+lidar", "--method", "mc")
+    found = json.loads(cli(*words, "--max-sim", 40, "--horizon", 1, "--out", tmp_path / "run", "--json").stdout)
+    assert found["question"]["weather"] is True
+    assert found["question"]["observation"] == "camera+lidar"
+
+
+def test_a_plan_from_pilots_and_one_from_a_folder(
+    cli: Cli, risky: str, safe: str, finished_run: Path, tmp_path: Path
+) -> None:
+    options = ("--base", risky, "--method", "mc", "--horizon", 4)
+    answer = json.loads(cli("plan", FOLLOWING, *options, "--pilot", 2000, "--cov", 0.05, "--json").stdout)
+    (planned,) = answer["runs"]
+    assert planned["method"] == "mc" and planned["n_sim"] > 2000 and planned["seconds"] > 0.0
+    shutil.copytree(finished_run, tmp_path / "run")
+    text = cli("plan", tmp_path / "run", "--cov", 0.05).stdout
+    assert cli("plan", tmp_path / "run", "--target-cov", 0.05).stdout == text  # as `estimate` names it
+    assert f"{planned['n_sim']:,} simulations" in text and "--target-cov 0.05" in text  # the same seed, the same pilot
+    none = cli("plan", FOLLOWING, "--base", safe, "--method", "mc", "--pilot", 200)
+    assert none.exit_code == 2 and none.stdout == ""
+    assert "found no failure" in none.stderr.splitlines()[-1]  # behind the bar
+
+
+def test_a_word_of_noise_is_an_argument_of_the_problem() -> None:
+    shown = []
+
+    def show(asked: dict[str, Any]) -> Answer:
+        shown.append(asked)
+        return Answer(asked, "")
+
+    other = typer.Typer()
+    other.command()(command("noise", "seed")(show))
+    for words in ([], ["--noise", "fixed"], ["--noise", "off", "--seed", "1e1"]):
+        assert CliRunner().invoke(other, words).exit_code == 0
+    assert shown == [{"noise": True, "seed": 0}, {"noise": "fixed", "seed": 0}, {"noise": False, "seed": 10}]
+
+
+def test_counts_may_be_written_with_an_exponent() -> None:
+    for text, number in (("10000", 10_000), ("1e4", 10_000), ("2.5e3", 2500), ("-5", -5), ("1_000", 1000)):
+        assert read_count(text) == number
+    for text in ("many", "1.5", "1e-3", "inf", "nan", ""):
+        with pytest.raises(typer.BadParameter, match="expected a whole number"):
+            read_count(text)
+
+
+def test_options_name_an_executor() -> None:
+    assert ExecutorOptions(workers=3, memory_limit=2.0).make() == samplers.LocalProcesses(3, memory_limit=2.0**31)
+    assert ExecutorOptions(executor="local").make() == samplers.LocalProcesses()
+    ray = ExecutorOptions(executor="ray", address="auto", time_limit=9.0, memory_limit=1.0)
+    assert ray.make() == samplers.RayCluster("auto", time_limit=9.0, memory_limit=2.0**30)
+
+
+@pytest.mark.slow
+def test_workers_change_the_progress_line_alone(cli: Cli, here: Path, risky: str) -> None:
+    words = ["estimate", FOLLOWING, "--base", risky, "--method", "mc", "--max-sim", 400, "--gamma", 2, "--horizon", 1]
+    one = cli(*words, "--chunk", 100, "--json")
+    two = cli(*words, "--chunk", 100, "--json", "--workers", 2)
+    assert "2 workers" in two.stderr and "workers" not in one.stderr
+    first, second = json.loads(one.stdout), json.loads(two.stdout)
+    del first["seconds"], second["seconds"]
+    assert second == first and first["p"] > 0
+
+
+def commands(group: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield each command and group by its name, a group's before those in it."""
+    for name, found in group.commands.items():
+        yield f"{prefix}{name}", found
+        if hasattr(found, "commands"):
+            yield from commands(found, f"{prefix}{name} ")
+
+
+def test_every_help_page_has_examples_of_options_that_its_command_takes(cli: Cli) -> None:
+    tree = dict(commands(typer.main.get_command(app)))
+    pages = {page: list_examples(page) for page in ("", *tree)}
+    assert {line for lines in pages.values() for line in lines} >= set(EXAMPLES.split("\n")) - {""}
+    for page, lines in pages.items():
+        shown = cli(*page.split(), "--help").stdout
+        assert lines
+        for line in lines:
+            assert f"    {line}\n" in shown and len(line) <= 96
+            program, name, *words = shlex.split(line)
+            if f"{name} {words[0] if words else ''}" in tree:
+                name = f"{name} {words.pop(0)}"
+            assert program == "rare-envs"
+            tree[name].make_context(name, words)  # parses; raises where an option is none of the command's
+
+
+def test_summaries_are_whole_and_no_line_is_wider_than_the_terminal(cli: Cli, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    for words in (("--help",), ("corpus", "--help")):
+        shown = cli(*words).stdout
+        assert max(map(len, shown.splitlines())) <= 80
+        assert "...\n" not in shown.partition("Commands:")[2]
+    assert "and show its most likely failure." in " ".join(cli("--help").stdout.split())
+
+
+@pytest.fixture(scope="module")
+def saved(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A policy for HighwayEnv's environments, untrained."""
+    path = tmp_path_factory.mktemp("egos") / "ego.zip"
+    env: Any = gym.make("highway-fast-v0")
+    DQN("MlpPolicy", env, policy_kwargs={"net_arch": [4]}, buffer_size=10, seed=0, device="cpu").save(path)
+    return path
+
+
+def test_a_policy_from_there_is_estimated_there(cli: Cli, saved: Path, tmp_path: Path) -> None:
+    words = ("estimate", "highway-fast-v0", "--ego", saved, "--method", "mc", "--max-sim", 4, "--horizon", 2)
+    result = cli(*words, "--out", tmp_path / "run", "--json")
+    assert result.exit_code in (0, 3), result.output
+    answer = json.loads(result.stdout)
+    assert (answer["n_sim"], answer["env_id"], answer["ego"]) == (4, "highway-fast-v0", str(saved))
+    kept = samplers.Estimate.load(tmp_path / "run" / ESTIMATE_FILE)
+    assert kept.p == answer["p"]
+    assert_refused(cli(*words, "--out", tmp_path / "run"), "--force")
+    text = cli(*words).stdout
+    assert text.startswith(f"highway-fast-v0, ego {saved}\nP[f <= 0] = ") and "what it holds fixed is held" in text
+
+
+def test_an_upper_bound_there_is_an_answer(cli: Cli) -> None:
+    words = ("estimate", "highway-fast-v0", "--method", "mc", "--max-sim", 4, "--horizon", 1, "--gamma", -99)
+    found, text = cli(*words, "--json"), cli(*words)
+    answer = json.loads(found.stdout)
+    assert (answer["status"], answer["doubtful"], len(answer["warnings"])) == ("no_hits", False, 1)
+    assert (found.exit_code, text.exit_code) == (0, 0)
+    assert "warning" not in text.stdout and answer["warnings"][0] in text.stdout
+
+
+def test_a_policy_from_there_is_told_here_what_its_actions_are(cli: Cli, saved: Path) -> None:
+    assert_refused(cli("estimate", FOLLOWING, "--ego", saved), "fit two kinds", "--action meta")
+
+
+HIGHWAY = ("estimate", "rare_envs/Highway-v0", "--measure", "lidar_ttc", "--gamma", 1.0, "--horizon", 2)
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("full_pictures")
+def test_the_highway_end_to_end(cli: Cli, tmp_path: Path) -> None:
+    """Blocks of x in every place where parameters are told, and drivers and horizon in the record."""
+    words = ("--ego", "mgail", "--drivers", "gail", "--noise", "fixed", "--method", "mc", "--max-sim", 256, "--details")
+    result = cli(*HIGHWAY, *words, "--out", tmp_path)
+    assert result.exit_code in (0, 3), result.output
+    assert "the drivers' noise is one fixed sequence" in result.stdout
+    assert max(map(len, result.stdout.splitlines())) < 200
+    lines = {line.split()[0]: line for line in result.stdout.splitlines() if line.strip()}
+    assert len(lines["speed"].partition("m/s")[0].split()) == 1 + 6
+    assert "404 values" in lines["weights"]
+
+    answer = json.loads((tmp_path / "result.json").read_text())
+    asked = answer["question"]
+    assert (asked["drivers"], asked["ego"], asked["horizon"], asked["noise"]) == ("gail", "mgail", 2.0, "fixed")
+    assert asked["observation"] == "lidar"
+    assert answer["given"] == "the drivers' noise is one fixed sequence"
+    likely = answer["failures"][0]["parameters"]
+    assert {name: len(values) for name, values in likely.items()} == {
+        "s": 6,
+        "t": 6,
+        "heading": 6,
+        "speed": 6,
+        "weights": 404,
+    }
+    with (tmp_path / "failures.csv").open(newline="") as file:
+        header, *rows = csv.reader(file)
+    assert header[:2] == ["s[0]", "s[1]"]
+    assert header[-3 - len(CRASH) :] == ["speed[5]", "f", "log_p0", *CRASH]
+    found = read_failures(tmp_path)
+    assert [len(values) for values in found.values()] == [len(rows)] * (7 + len(CRASH))
+    for name, values in likely.items():
+        np.testing.assert_array_equal(found[name][0], np.float32(values) if name == "weights" else values)
+    ego = agents.load_ego(asked["ego"])
+    problem = rare_envs.DrivingProblem(
+        asked["env_id"], ego=ego, measure="lidar_ttc", noise="fixed", drivers="gail", horizon=2.0
+    )
+    x = np.concatenate([found[name] for name in problem.space.names], axis=1)
+    np.testing.assert_allclose(problem.evaluate(x), found["f"], atol=1e-3)  # products round by batch size
+    np.testing.assert_allclose(problem.base.log_prob(x), found["log_p0"], atol=0.1)
+    assert (tmp_path / "plot.png").stat().st_size > 50_000

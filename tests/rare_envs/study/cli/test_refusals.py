@@ -1,0 +1,163 @@
+"""Bad input of every command: exit code 2 and one line that says what is wrong, before any simulation."""
+
+from __future__ import annotations
+
+import re
+import shutil
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import rare_envs
+from tests.rare_envs.study.fitted_files import write_fitted
+from tests.rare_envs.study.refusals import FOLLOWING, Cli, assert_refused
+
+RISK = ("risk", "idm", "--base", "cut_in=cut_in.json", "--base", "hard_brake=hard_brake.json", "--max-sim", 300)
+ESTIMATE, TRAIN, EXPORT = ("estimate", FOLLOWING), ("train-ego", FOLLOWING), ("export", "run", "--out")
+CUDA = ("--device", "cuda:99")
+REFUSED: tuple[tuple[tuple[Any, ...], tuple[str, ...]], ...] = (
+    (("estimat",), ("estimat", "See rare-envs --help.")),
+    (("list", "--loud"), ("--loud", "See rare-envs list --help.")),
+    (("list", "egoss"), ("did you mean 'egos'", "environments, methods, egos")),
+    (("bases", "merge"), ("merge", "cut_in")),
+    (("bases", "cutin"), ("did you mean 'cut_in'?",)),
+    (("estimate", "rare_envs/CutIn-v7"), ("rare_envs/CutIn-v",)),
+    (("estimate",), ("Expected an environment",)),
+    (("estimate", "--config", "none.yaml"), ("Cannot read",)),
+    ((*ESTIMATE, "--ego"), ("--ego", "See rare-envs estimate --help.")),
+    (
+        (*ESTIMATE, "--max-sim", "ten"),
+        ("'--max-sim'", "such as 10000 or 1e4", "See rare-envs estimate"),
+    ),
+    ((*ESTIMATE, "--max-sim", -5), ("--max-sim",)),
+    ((*ESTIMATE, "--seed", -1), ("--seed",)),
+    ((*ESTIMATE, "--target-cov", 0), ("--target-cov",)),
+    ((*ESTIMATE, "--replicates", 0), ("--replicates",)),
+    ((*ESTIMATE, "--on-error", "stop"), ("--on-error",)),
+    ((*ESTIMATE, "--chunk", 0), ("--chunk",)),
+    ((*ESTIMATE, "--gamma", "nan"), ("gamma", "nan")),
+    ((*ESTIMATE, "--gamma", "abc"), ("'--gamma'",)),
+    ((*ESTIMATE, "--mehtod", "adss"), ("--mehtod", "--method")),
+    ((*ESTIMATE, "--method", "addss"), ("'adss'", "mc")),
+    ((*ESTIMATE, "--base", "us102"), ("'us101'", "highway")),
+    ((*ESTIMATE, "--base", "broken.json"), ("broken.json", "JSON")),
+    ((*ESTIMATE, "--drivers", "mgial"), ("did you mean 'mgail'",)),
+    ((*ESTIMATE, "--observation", "sonar"), ("'features', 'lidar'",)),
+    ((*ESTIMATE, "--also-under", ","), ("one base or more",)),
+    ((*ESTIMATE, "--also-under", "i24,i24"), ("each once",)),
+    ((*ESTIMATE, "--out", "a_file"), ("a_file",)),
+    ((*ESTIMATE, "--ego", "corrupt.zip"), ("corrupt.zip",)),
+    ((*ESTIMATE, "--ego", "egos_here:wrong_space"), ("99", "(7,)")),
+    ((*ESTIMATE, "--ego", "egos_here:wrong_shape"), ("(2, 2)",)),
+    ((*ESTIMATE, "--ego", "egos_here:raising"), ("division by zero",)),
+    (
+        (*ESTIMATE, "--ego", "egos_here:raising", "--on-error", "bound"),
+        ("zero. --on-error bound", "comes before"),
+    ),
+    ((*ESTIMATE, "--ego", "egos_here:exiting_when_asked"), ("SystemExit(7)",)),
+    ((*ESTIMATE, "--max-p", 2), ("Expected --max-p above 0",)),
+    ((*ESTIMATE, "--max-p", 0.1, "--confidence", 0.4), ("0.4",)),
+    ((*ESTIMATE, "--confidence", 0.9), ("--confidence together with --max-p",)),
+    ((*ESTIMATE, "--given-base"), ("--given-base together with --max-p",)),
+    ((*ESTIMATE, "--time-limit", 5), ("Expected --time-limit together with --workers",)),
+    ((*ESTIMATE, "--workers", 2, "--address", "auto"), ("--address does not go with --executor local",)),
+    ((*ESTIMATE, "--workers", 0), ("workers",)),
+    ((*ESTIMATE, "--workers", 2, "--memory-limit", "nan"), ("a number of GiB above 0, got nan",)),
+    ((*ESTIMATE, "--executor", "dask"), ("--executor",)),
+    ((*ESTIMATE, *CUDA), ("'cuda:99' is not here", "take 'cpu'")),
+    (("estimate", "merge-v0", "--base", "us101"), ("has no --base", "CutIn-v0")),
+    (("estimate", "highway-fast-v0", "--weather"), ("has no --weather",)),
+    (("estimate", "highway-fast-v0", "--method", "addss"), ("'adss'",)),
+    (("estimate", "highway-fast-v0", "--measure", "braking"), ("'braking'",)),
+    (("estimate", "highway-fast-v0", "--ego", "nowhere.zip"), ("nowhere.zip",)),
+    (("estimate", "highway-fast-v0", "--max-sim", 0), ("--max-sim",)),
+    (("compare", "idm", "human", FOLLOWING, *CUDA), ("'cuda:99' is not here",)),
+    (("compare", "idm", "human", FOLLOWING), ("the same x, got 3 and", "estimate each by itself")),
+    (("compare", "idm", "idm", FOLLOWING, "--collisions", "none"), ("none",)),
+    (("plan", FOLLOWING, *CUDA), ("'cuda:99' is not here",)),
+    (("plan", FOLLOWING, "--cov", "-1"), ("Expected --cov to be a number above 0",)),
+    (("plan", FOLLOWING, "--cov", "nan"), ("Expected --cov to be a number above 0",)),
+    (("plan", FOLLOWING, "--method", "mc,nope"), ("'nope'",)),
+    (("plan", "rare_envs/Nowhere-v0"), ("Nowhere",)),
+    (("plan", "nowhere"), ("There is no folder", "nowhere' of a run. Unknown environment")),
+    (("plan", "."), ("No finished run in",)),
+    (("plan", "run", "--method", "ce"), ("without --method",)),
+    (("plan", "run", "--pilot", 500), ("without --pilot",)),
+    (("risk", "idm", *CUDA), ("'cuda:99' is not here",)),
+    ((*RISK[:1], "imd", *RISK[2:]), ("idm",)),
+    ((*RISK, "--with", "merge"), ("cut-in or --with car-following", "'merge'")),
+    ((*RISK, "--base", "hard_brake=mine.json"), ("several for 'hard_brake'",)),
+    ((*RISK, "--sites", "us101-closing"), ("no site", "'us101'", "cut_in=us101-closing")),
+    (("risk", "idm", "--base", "cut_in=mine.json"), ("mine.json",)),
+    (("risk", "idm", "--base", "cut_in=broken.json"), ("broken.json", "JSON")),
+    (("risk", "idm", "--base", "cut_in=highway"), ("'highway'", "nobody counted")),
+    ((*RISK, "--max-sim", "0"), ("--max-sim",)),
+    ((*RISK, "--out", "a_file"), ("a_file",)),
+    ((*TRAIN, "--algo", "poo"), ("'ppo'",)),
+    ((*TRAIN, "--steps", "2.5"), ("'--steps': expected a whole number, such as 10000 or 1e4",)),
+    ((*TRAIN, "--steps", "10", *CUDA), ("'cuda:99' is not here",)),
+    ((*TRAIN, "--out", "."), ("folder",)),
+    (("train-ego",), ("--from-failures",)),
+    (("train-ego", "--from-failures", "nowhere"), ("No finished run in 'nowhere'",)),
+    (("train-ego", "--from-failures", "nowhere", "--base", "us101"), ("leave --base",)),
+    (("train-drivers", "--data", "tables", "--out", "new", "--method", "gail", *CUDA), ("'cuda:99' is not here",)),
+    (("serve-ego", "idm"), ("needs more than observations",)),
+    (("serve-ego", "egos_here:coasting", "--bind", "tcp://*:5555"), ("set a shared secret",)),
+    (("serve-ego", "egos_here:coasting", "--bind", "tcp://127.0.0.1:port"), ("Cannot listen",)),
+    (("serve-ego", "nowhere.zip"), ("nowhere.zip",)),
+    (("export-ego", "idm", "b.onnx"), ("files that end in .zip, are exported; got 'idm'.",)),
+    (("export-ego", "ego.zip", "b.zip"), ("Expected a file that ends in .onnx, got 'b.zip'.",)),
+    (
+        ("export-ego", "ego.zip", "corrupt.zip/b.onnx"),
+        ("the folder 'corrupt.zip': there is a file of that name",),
+    ),
+    (("export-ego", "nowhere.zip", "b.onnx"), ("No ego at 'nowhere.zip'",)),
+    (("export-ego", "corrupt.zip", "b.onnx"), ("corrupt.zip",)),
+    (("fit", "--out", "bases"), ("Expected one of --data, --ngsim",)),
+    (("fit", "--out", "bases", "--highd", "a", "--tgsim", "b"), ("Expected one of --data, --ngsim",)),
+    (("fit", "--out", "bases", "--highd", "nowhere"), ("nowhere",)),
+    (("fit", "--out", "bases", "--highd", "a", "--scenario", "overtaking"), ("Unknown scenario overtaking",)),
+    (("fit", "--out", "bases", "--highd", "a", "--name", "a/b"), ("Expected --name",)),
+    (("check-ego", "idm", "rare_envs/CutIn-v9"), ("rare_envs/CutIn-v0",)),
+    (("check-ego", "no_such.zip", FOLLOWING), ("No ego at 'no_such.zip'; in that folder: corrupt.zip",)),
+    (("check-ego", "process:no_such.onnx", FOLLOWING), ("No ego at 'no_such.onnx': the folder '.' has no .onnx",)),
+    (("check-ego", "imitatoin", FOLLOWING), ("Unknown ego 'imitatoin' (did you mean 'imitation'?)",)),
+    (("replay", "run", "--failure", 100000), ("Expected a failure from 0 to",)),
+    (("replay", "run", "--failure", -1), ("Expected a failure from 0 to",)),
+    (("replay", "run", "--out", "clip.mp4"), ("ends in .gif",)),
+    (("replay", "run", "--out", "run/result.json/clip.gif"), ("there is a file of that name",)),
+    (("replay", "run", "--all", "--out", "a.gif"), ("--all without --out",)),
+    (("replay", "run", "--all", "--failure", 0), ("--all without --failure",)),
+    (("report", "."), ("No finished run",)),
+    (("report", "run", "--figures", "bmp"), ("Expected --figures svg, pdf, png",)),
+    (("export", "none", "--out", "a.xosc"), ("No finished run in",)),
+    ((*EXPORT, "a.gif"), ("ends in .xosc",)),
+    ((*EXPORT, "a.xosc", "--format", "carla", "--ego", "recorded"), ("free",)),
+    ((*EXPORT, "a.xml", "--format", "commonroad", "--failure", 10_000), ("from 0 to",)),
+    (("corpus", "run"), ("--ego", "See rare-envs corpus run --help.")),
+    (("corpus", "run", "--ego", "idm"), ("There is no corpus",)),
+    (("corpus", "run", "--ego", "idm", "--junit", "run/result.json/a.xml"), ("Cannot make the folder",)),
+    (("corpus", "add", "run", "--most", 0), ("at least one",)),
+)
+
+
+@pytest.mark.filterwarnings("ignore:.*changed since the run")
+def test_bad_input_is_one_line_and_leaves_no_file(
+    cli: Cli, here: Path, finished_run: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def simulated(*_: Any) -> None:
+        raise AssertionError("a simulation was started")
+
+    monkeypatch.setattr(rare_envs.DrivingProblem, "evaluate", simulated)
+    shutil.copytree(finished_run, here / "run")
+    for name in ("cut_in", "hard_brake"):
+        write_fitted(here / f"{name}.json", name)
+    before = set(here.iterdir())
+    for words, said in REFUSED:
+        refused = cli(*words)
+        assert refused.exit_code == 2, (words, refused.output)
+        assert_refused(refused, *said)
+        if words[0] == "estimate" and len(words) == 4 and words[3] in (-5, -1, 0):
+            assert not re.search(r"[a-z]_[a-z]", refused.stderr)  # the option, not its name in Python
+    assert set(here.iterdir()) - {here / "__pycache__"} == before and (here / "a_file").read_text() == "mine"
