@@ -155,7 +155,8 @@ def check_ego_command(
     show_all: Annotated[bool, typer.Option("--all", help="Show each check that passed in a row of its own.")] = False,
 ) -> Answer:
     """Check in seconds whether an ego fits: spaces, normalisation, determinism, memory, speed. 2: it does not."""
-    from rare_envs.study.ego_check import VERDICTS, check_ego, exit_code, print_findings
+    from rare_envs.study.ego_check import VERDICTS, exit_code, print_findings
+    from rare_envs.study.ego_check.subprocess_check import check_ego
 
     findings = check_ego(Question(env_id=env, ego=ego, **asked), time_limit)
     code = exit_code(findings)

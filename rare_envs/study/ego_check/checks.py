@@ -1,16 +1,13 @@
 """Checks of an ego: spaces, normalisation, actions, determinism, memory, independent rows, latency, a few drives.
 
-Each check is a function from a `Probe` to findings; `EGO_CHECKS` has all of them by name. A server is held against the
-protocol of docs/egos.md over its socket, message by message.
+Each check is a function from a `Probe` to findings; `EGO_CHECKS` has all of them by name.
 """
 
 from __future__ import annotations
 
-import itertools
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -18,21 +15,16 @@ import numpy as np
 import torch
 from gymnasium import spaces
 
-import agents
-from agents.loading import find_ego_kind
 from agents.saved_ego import SavedEgo
 from rare_envs.devices import CAMERA_TILE
 from rare_envs.distributions.coordinates import AnyArray
-from rare_envs.egos.needs import AMBIGUOUS, TAKEN_AS_ACCELERATIONS
 from rare_envs.egos.policy import PolicyDriver
 from rare_envs.egos.wrappers import find_frame_stacking
-from rare_envs.plugins import EgoGone, reason_of
+from rare_envs.plugins import reason_of
 from rare_envs.problem import DrivingProblem
 from rare_envs.simulation.observation import batch_size, map_kinds, observe
 from rare_envs.simulation.world import drive
-from rare_envs.study.arguments import Question
 from rare_envs.study.ego_check import Finding
-from rare_envs.study.question import build_problem
 from samplers.evaluate import Evaluator
 
 BATCH_ROWS = 32
@@ -334,115 +326,3 @@ EGO_CHECKS: dict[str, Callable[[Probe], Iterator[Finding]]] = {
     "latency": check_latency,
     "memory growth": check_memory_growth,
 }
-
-
-def run_checks(question: Question) -> Iterator[Finding | str]:
-    """Load the ego and check it: yield findings, and before each check its name."""
-    if find_ego_kind(question.ego) == "remote":
-        yield "protocol"
-        findings = list(check_protocol(question.ego))
-        yield from findings
-        if any(finding.status == "fail" for finding in findings):
-            return
-    yield "loading"
-    try:
-        ego = agents.load_ego(question.ego, algo=question.algo, trust=question.trust, stats=question.stats)
-        yield Finding("loading", "pass", ego if isinstance(ego, str) else type(ego).__name__)
-        yield "compiling"  # takes no time of a check
-        problem = build_problem(question, ego)
-        for note in problem.notes:
-            if note in (AMBIGUOUS, TAKEN_AS_ACCELERATIONS):  # of other bounds than ours a check of its own tells
-                yield Finding("action space", "warn", note, "say which by --action", note == AMBIGUOUS)
-        probe = Probe.of(ego, problem)
-        if problem.core == "numba":  # then the ego is not asked
-            problem.evaluate(problem.base.sample(1, np.random.default_rng(0)))
-    except (Exception, SystemExit, EgoGone) as error:  # the ego is the user's: anything may happen in it
-        yield Finding("loading", "fail", reason_of(error), "see docs/egos.md for what an ego is")
-        return
-    for name in EGO_CHECKS if probe.policy is not None else ("driving",):
-        yield name
-        try:
-            yield from EGO_CHECKS[name](probe)
-        except (Exception, SystemExit, EgoGone) as error:  # likewise
-            gone = isinstance(error, EgoGone)
-            yield Finding(name, "fail", reason_of(error), "start it again" if gone else "the ego failed in this check")
-            if gone:
-                return
-
-
-PROTOCOL_ADVICE = "docs/egos.md has the protocol"
-
-
-def check_protocol(spec: str) -> Iterator[Finding]:
-    """Check a server."""
-    try:
-        from agents.remote import protocol
-        from agents.remote.client import TIMEOUT, LinkError, RemoteError, ServerLink, parse_address
-    except ImportError:
-        yield Finding("protocol", "fail", "pyzmq and msgpack are not installed", "pip install 'rare-envs[remote]'")
-        return
-    address, settings = parse_address(spec)
-    link, numbers = ServerLink(address, protocol.read_secret()), itertools.count(1)
-
-    def ask(message: Any) -> Any:
-        content = message if isinstance(message, bytes) else protocol.pack({"id": next(numbers), **message})
-        return protocol.unpack(link.request(content, settings.get("timeout", TIMEOUT)))
-
-    def compare(name: str, kind: str, reply: Any) -> Finding:
-        found, reason = reply.get("type"), reply.get("reason", "")
-        if found == kind:
-            return Finding(name, "pass", f"{kind}: {reason}" if kind == "error" and reason else kind)
-        return Finding(name, "fail", f"got {found!r} ({reason}), expected {kind!r}", PROTOCOL_ADVICE)
-
-    try:
-        link.open()
-        before = ask({"type": "ping"})
-        link.open()
-        hello = ask({"type": "hello", "protocol": protocol.PROTOCOL, "client": "check-ego"})
-        if hello.get("type") != "hello" or hello.get("protocol") != protocol.PROTOCOL:
-            yield Finding("handshake", "fail", f"{hello.get('reason', hello)}", PROTOCOL_ADVICE)
-            return
-        yield Finding("handshake", "pass", f"protocol {protocol.PROTOCOL}, {hello.get('name', 'no name')!r}")
-        yield compare("before hello", "error", before)
-        for name, (kind, *messages) in _list_cases(hello).items():
-            replies = [ask(message) for message in messages]
-            steps = [isinstance(message, dict) and "step" in message for message in messages]
-            acts = [reply for reply, step in zip(replies, steps, strict=True) if step]
-            yield compare(name, kind, next((reply for reply in acts if reply.get("type") != kind), replies[-1]))
-    except (LinkError, RemoteError, EgoGone, ValueError) as error:
-        yield Finding("protocol", "fail", reason_of(error), f"is it running at {address}? {PROTOCOL_ADVICE}")
-    finally:
-        link.close()
-
-
-def _act(hello: Any, session: int, step: int, rows: int = 3) -> dict[str, Any]:
-    """Return a query with blank observations of the space that the server has declared."""
-    from agents.remote import protocol
-
-    space = protocol.decode_space(hello.get("observation")) or spaces.Box(-5.0, 5.0, (7,), np.float32)
-    parts = dict(space.spaces) if isinstance(space, spaces.Dict) else space
-    blank = map_kinds(lambda part: np.zeros((rows, *part.shape), part.dtype), parts)
-    return {"type": "act", "session": session, "step": step, "observation": protocol.pack_observation(blank)}
-
-
-def _list_cases(hello: Any) -> dict[str, tuple[Any, ...]]:
-    """Return the cases after the handshake: the reply to the last of some messages."""
-    act, reset, ping = partial(_act, hello), {"type": "reset", "session": 1, "batch": 3}, {"type": "ping"}
-    one, other = ({**reset, "session": session} for session in (11, 12))
-    empty = {"dtype": "<f4", "shape": [3, 7], "data": b""}
-    return {
-        "heartbeat": ("pong", ping),
-        "unknown type": ("error", {"type": "dance"}),
-        "no msgpack": ("error", b"\xc1 not a message"),
-        "cut short": ("error", b"\x82\xa4type\xa5res"),
-        "no reset": ("error", act(99, 0)),
-        "reset": ("ready", reset),
-        "act": ("action", act(1, 0)),
-        "act again": ("action", act(1, 1)),
-        "another step": ("error", act(1, 7)),
-        "another batch": ("error", reset, act(1, 0, rows=4)),
-        "data missing": ("error", reset, {**act(1, 0), "observation": empty}),
-        "two sessions": ("action", one, other, act(11, 0), act(12, 0), act(11, 1), act(12, 1)),
-        "end": ("ended", {"type": "end", "session": 1}),
-        "after it all": ("pong", ping),
-    }
