@@ -2,21 +2,12 @@
 
 from __future__ import annotations
 
-import os
-import signal
-from collections.abc import Iterator
 from dataclasses import dataclass
-from multiprocessing.connection import Connection
-from pathlib import Path
 from typing import Literal
 
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
-
-from rare_envs.scenarios.registry import find_scenario
-from rare_envs.startup import use_one_thread
-from rare_envs.study.arguments import BadInput, Question, as_bad_input
 
 MEASUREMENTS = ("driving", "latency")
 """Checks whose result is of interest though it passed."""
