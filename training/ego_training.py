@@ -10,7 +10,7 @@ from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from types import MappingProxyType
+from types import MappingProxyType, SimpleNamespace
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
@@ -70,22 +70,6 @@ HYPERPARAMETERS: Mapping[str, Hyperparameters] = MappingProxyType(
 
 
 @dataclass(frozen=True, eq=False)
-class ScenariosWithFailures:
-    """Distribution to train in: it only draws, with probability `share` one of the failures (k, d), else of `base`."""
-
-    base: Distribution
-    failures: FloatArray
-    share: float
-
-    def sample(self, n: int, rng: np.random.Generator) -> FloatArray:
-        """Draw scenarios, shape (n, d)."""
-        x = np.array(self.base.sample(n, rng))
-        chosen = rng.random(n) < self.share
-        x[chosen] = self.failures[rng.integers(0, len(self.failures), int(chosen.sum()))]
-        return x
-
-
-@dataclass(frozen=True, eq=False)
 class Retraining:
     """What `train_ego` goes on from: an ego that it trained before, and scenarios in which that ego failed.
 
@@ -129,8 +113,15 @@ class Retraining:
 
     def mix(self, space: ScenarioSpace) -> ScenarioSpace:
         """Return the space of an environment with the failures, which have to be of it, among its draws."""
-        mixed = ScenariosWithFailures(space.base, space.validate(self.failures), self.share)
-        return replace(space, base=cast(Distribution, mixed))  # an environment only draws
+        failures = space.validate(self.failures)
+
+        def sample(n: int, rng: np.random.Generator) -> FloatArray:
+            x = np.array(space.base.sample(n, rng))
+            chosen = rng.random(n) < self.share
+            x[chosen] = failures[rng.integers(0, len(failures), int(chosen.sum()))]
+            return x
+
+        return replace(space, base=cast(Distribution, SimpleNamespace(sample=sample)))  # an environment only draws
 
 
 def train_ego(
@@ -257,7 +248,7 @@ def _continue_model(
 
 
 def check_retrainable(saved: Any, algo: str, env: Any) -> None:
-    """Raise a ValueError if an ego, an `agents.SavedEgo`, cannot be trained on by an algorithm in an environment."""
+    """Refuse an ego, an `agents.SavedEgo`, that cannot be trained on by an algorithm in an environment."""
     name = repr(str(saved.path))
     if saved.algorithm != algo:
         raise ValueError(f"Expected an ego trained by {algo}, got {name}, trained by {saved.algorithm}.")
@@ -360,18 +351,12 @@ def _make_callback(bar: Progress, steps: int, path: Path, arguments: Mapping[str
         def _on_step(self) -> bool:
             if not bar.disable:
                 crashes.extend(bool(info["collision"]) for info in self.locals["infos"] if "collision" in info)
-                done = min(self.model.num_timesteps, steps)
-                bar.update(task, completed=done, description=_summary(self.model.ep_info_buffer, crashes))
+                episodes, words = self.model.ep_info_buffer, list[str]()
+                if episodes:
+                    words.append(f"return {sum(end['r'] for end in episodes) / len(episodes):.1f}")
+                if crashes:
+                    words.append(f"collisions {100 * sum(crashes) / len(crashes):.1f} %")
+                bar.update(task, completed=min(self.model.num_timesteps, steps), description=", ".join(words))
             return True
 
     return Callback()
-
-
-def _summary(episodes: deque[dict[str, Any]] | None, crashes: deque[bool]) -> str:
-    """Return a line with mean return and collision rate of the last episodes."""
-    words = []
-    if episodes:
-        words.append(f"return {sum(end['r'] for end in episodes) / len(episodes):.1f}")
-    if crashes:
-        words.append(f"collisions {100 * sum(crashes) / len(crashes):.1f} %")
-    return ", ".join(words)

@@ -104,11 +104,8 @@ def sb3_agents_env(
 class BatchedVecEnv(VecEnv):
     """Adapter from a Gymnasium `VectorEnv` with same-step autoreset to a `VecEnv`.
 
-    The infos of a step are empty except for episodes that ended in it: those hold what the
-    environment said of the end, `terminal_observation` and `TimeLimit.truncated`. Filling a
-    dictionary for every environment at every step would cost more than the simulation.
-
-    Seed and options apply to the next reset, as everywhere in Stable-Baselines3. All environments
+    The infos of a step are empty except for episodes that ended in it: those hold what the environment said of the
+    end, `terminal_observation` and `TimeLimit.truncated`. Seed and options apply to the next reset. All environments
     live in one simulation, so attributes and methods are those of the batch.
     """
 

@@ -102,12 +102,10 @@ class LearnedDriver:
 
     def __post_init__(self) -> None:
         for name in ("acceleration", "yaw_rate"):
-            pair = tuple(float(value) for value in getattr(self, name))  # a field by its name
-            if len(pair) != ACTION_SIZE:
-                raise ValueError(f"Expected {name} as two numbers, got {pair}.")
-            if not pair[0] < pair[1]:
-                raise ValueError(f"Expected limits of {name} in ascending order, got {pair}.")
-            object.__setattr__(self, name, pair)
+            low, high = (float(value) for value in getattr(self, name))  # a field by its name
+            if not low < high:
+                raise ValueError(f"Expected limits of {name} in ascending order, got {(low, high)}.")
+            object.__setattr__(self, name, (low, high))
         if not 0.0 < self.hard_braking <= 1.0:
             raise ValueError(f"Expected a share of hard braking in (0, 1], got {self.hard_braking!r}.")
         if self.changes is not None and self.avoidance is None:
@@ -135,11 +133,10 @@ class LearnedDriver:
             Accelerations [m/s^2] and yaw rates [rad/s], shape (B, M, 2), and the new memory.
 
         Raises:
-            TypeError: If something is no tensor.
             ValueError: If a shape is wrong, or innovations come without a memory.
         """
-        batch, vehicles = self._check(features=features, weights=weights, innovations=innovations, memory=memory)
-        policy = self.policy
+        self._check_shapes(features, weights, innovations, memory)
+        policy, (batch, vehicles, _) = self.policy, features.shape
         hidden = policy.trunk(features.to(policy.head.weight.dtype).reshape(batch * vehicles, FEATURE_SIZE))
         if weights is None:
             output = policy.head(hidden).view(batch, vehicles, 2 * ACTION_SIZE)
@@ -163,29 +160,21 @@ class LearnedDriver:
         action = self.avoidance.limit(seen, self._change_lanes(self.avoidance, seen, change, action))
         return action, torch.cat((swings.flatten(-2), state.pack().to(swings.dtype)), dim=-1)
 
-    def _check(self, **given: Tensor | None) -> tuple[int, int]:
-        """Return B and M; refuse other arguments of `act` than tensors of the right shapes."""
-        for name, value in given.items():
-            if not isinstance(value, Tensor) and (value is not None or name == "features"):
-                raise TypeError(f"Expected {name} as a torch.Tensor, got {type(value).__name__}; use torch.as_tensor.")
-        features = given["features"]
-        assert features is not None
+    def _check_shapes(
+        self, features: Tensor, weights: Tensor | None, innovations: Tensor | None, memory: Tensor | None
+    ) -> None:
+        """Refuse arguments of `act` of other shapes."""
         if features.ndim != 3 or features.shape[-1] != FEATURE_SIZE:
             raise ValueError(f"Expected features of shape (B, M, {FEATURE_SIZE}), got {tuple(features.shape)}.")
         batch, vehicles, _ = features.shape
         each = (ACTION_SIZE, 2) if self.changes is None else (_NOISE_SIZE + STATE_SIZE,)
-        shapes = {
-            "weights": (batch, HEAD_SIZE),
-            "innovations": (batch, vehicles, ACTION_SIZE),
-            "memory": (batch, vehicles, *each),
-        }
-        for name, shape in shapes.items():
-            value = given[name]
+        shapes = (batch, HEAD_SIZE), (batch, vehicles, ACTION_SIZE), (batch, vehicles, *each)
+        given = {"weights": weights, "innovations": innovations, "memory": memory}
+        for (name, value), shape in zip(given.items(), shapes, strict=True):
             if value is not None and value.shape != shape:
                 raise ValueError(f"Expected {name} of shape {shape}, got {tuple(value.shape)}.")
-        if given["innovations"] is not None and given["memory"] is None:
+        if innovations is not None and memory is None:
             raise ValueError("Expected a memory beside the innovations; at the start it is driver.begin(draws).")
-        return batch, vehicles
 
     def _limit(self, features: Tensor, action: Tensor) -> Tensor:
         """Return actions (B, M, 2) within the limits, with a share of the braking beyond `EASED_BEYOND`."""
@@ -281,22 +270,10 @@ class LearnedEgo:
         episode_start: NDArray[np.bool_] | None = None,
         deterministic: bool = True,
     ) -> tuple[NDArray[np.float32], Any]:
-        """Choose actions as a Stable-Baselines3 model does, for the observation "lidar".
+        """Return actions in [-1, 1], shape (B, 2), and the state, for observations "lidar", (B, 51); of one without B.
 
         The environment's actions reach to 5 m/s^2 and 0.1 rad, those of `act` as far as the driver's: where it brakes
-        harder or steers further, this gives the limit.
-
-        Args:
-            observation: Of one environment, shape (51,), or of B, shape (B, 51).
-            state: Returned as it is.
-            episode_start: Not used.
-            deterministic: Not used; the actions are the mean ones either way.
-
-        Returns:
-            Actions in [-1, 1], shape (2,) or (B, 2), and the state.
-
-        Raises:
-            ValueError: If the observation has another shape.
+        harder or steers further, this gives the limit. A ValueError says that the observation has another shape.
         """
         del episode_start, deterministic
         seen = torch.as_tensor(np.asarray(observation, dtype=np.float32))
@@ -320,11 +297,7 @@ class LearnedEgo:
 
 @dataclass(frozen=True)
 class RuleDriver:
-    """IDM behind what the beam ahead meets, and the lane keeping of `rare_envs.control.idm` as a yaw rate.
-
-    It has the interface of a `LearnedDriver`, so that one harness measures both; it has no weights and no noise, and
-    knows vehicles in its lane only where the beam meets them.
-    """
+    """IDM behind what the beam ahead meets, with its lane keeping, in place of a `LearnedDriver`."""
 
     idm: IDM = field(default_factory=IDM)
     yaw_rate: tuple[float, float] = (-0.3, 0.3)
@@ -332,7 +305,6 @@ class RuleDriver:
     weights: ClassVar[None] = None
     noisy: ClassVar[bool] = False
     recordable: ClassVar[bool] = True
-    """Whether its operations may be recorded: nothing about it changes."""
 
     def begin(self, draws: Tensor) -> Tensor:
         """Return an empty memory: (B, M, 2, 2) -> (B, M, 0)."""
@@ -362,16 +334,8 @@ class RuleDriver:
 def save_driver(driver: LearnedDriver, provenance: Provenance, path: str | PathLike[str]) -> Path:
     """Write a driver to one file; an interrupted call leaves no partial file.
 
-    Args:
-        driver: The driver.
-        provenance: Its origin; numbers, strings, lists and mappings only.
-        path: Ends with .safetensors.
-
-    Returns:
-        The path.
-
-    Raises:
-        ValueError: If the path has another ending, or something is NaN or infinite.
+    The path, which is returned, ends with .safetensors. A ValueError says that it does not, or that something is NaN or
+    infinite.
 
     Example:
         >>> import tempfile
@@ -440,5 +404,4 @@ def _read_weights(tensors: dict[str, Tensor], radius: float, path: Path) -> Weig
     """Return the distribution of the last layer's weights in a file's tensors."""
     names = ("mean", "rows", "columns", "precision")
     files.require(tensors, [_WEIGHTS + name for name in names], path)
-    files.check_tensor(f"{_WEIGHTS}mean", tensors[f"{_WEIGHTS}mean"], (HEAD_SIZE,), torch.float64, path)
     return WeightDistribution.from_arrays({name: tensors[_WEIGHTS + name].numpy() for name in names}, radius)

@@ -124,13 +124,10 @@ def apply_heads(hidden: Tensor, weights: Tensor) -> Tensor:
 
 
 def is_plain(policy: Policy) -> bool:
-    """Return whether a network does what a `Policy` does: its class and layers, nothing put in their place."""
-    if type(policy) is not Policy:
-        return False
-    modules = (policy, policy.first, policy.second, policy.head)
-    changed = any(vars(module).keys() & {"forward", "trunk", "normalise", "split"} for module in modules)
+    """Return whether a network does what a `Policy` does: its class and layers, without hooks."""
+    modules = policy, policy.first, policy.second, policy.head
     hooked = any(module._forward_hooks or module._forward_pre_hooks for module in modules)
-    return all(type(layer) is nn.Linear for layer in modules[1:]) and not (changed or hooked)
+    return not hooked and tuple(map(type, modules)) == (Policy, nn.Linear, nn.Linear, nn.Linear)
 
 
 @dataclass(frozen=True)
@@ -246,11 +243,7 @@ class WeightDistribution:
 
     @cached_property
     def _whitening(self) -> FloatArray:
-        """Lower triangular A with A' A = precision: the inverse of the covariance's Cholesky factor.
-
-        It is the Cholesky factor of the precision with rows and columns in reverse order, transposed and reversed back,
-        so neither matrix has to be inverted to get at it.
-        """
+        """Lower triangular A with A' A = precision, the inverse of the Cholesky factor of the covariance."""
         try:
             reversed_factor = np.linalg.cholesky(self.precision[::-1, ::-1])
         except np.linalg.LinAlgError:
@@ -272,8 +265,6 @@ class WeightDistribution:
 
     def sample(self, n: int, rng: np.random.Generator) -> FloatArray:
         """Draw n independent points, shape (n, d)."""
-        if not isinstance(rng, np.random.Generator):
-            raise TypeError(f"Expected rng as a numpy.random.Generator, got {rng!r}; see np.random.default_rng.")
         return self.from_standard_normal(rng.standard_normal((n, self.dim)))
 
     def log_prob(self, x: FloatArray, /) -> FloatArray:

@@ -91,27 +91,19 @@ class Seen(NamedTuple):
 
 @dataclass(frozen=True)
 class CollisionAvoidance:
-    """Bounds of acceleration and yaw rate that keep off the vehicle ahead and off those beside.
+    """Upper bounds of acceleration and yaw rate that keep off the vehicle ahead and off those beside.
 
-    Ahead. Of each beam that meets a body in the vehicle's path, v is the own speed, g the gap to the point met, dv
-    the closing speed and v_l = v - dv the speed ahead. With the safe speed of Krauss,
+    Ahead, of each beam that meets a body in the path: at a gap g that closes at dv, the acceleration from v is at most
+    (v_safe - v) / T, but -b at the least, with the safe speed of Krauss behind a speed v_l = v - dv,
 
         v_safe = -b tau + sqrt((b tau)^2 + v_l^2 + 2 b (g - s0)),
 
-    the acceleration is at most (v_safe - v) / T, but -b at the least; and at most -dv^2 / (2 (g - s1)), what is needed
-    to reach the speed ahead within the gap, where that is harder than b.
+    and at most -dv^2 / (2 (g - s1)) where that is harder than b. Nearer than s0, who comes closer brakes by
+    b + dv / `closing_time`. Beams are 18 degrees apart: a point well within the own lane is in the path too.
 
-    Beside. With the distance d across to the side of a body that is beside, closing at c, the yaw rate towards it is
-    at most ((d - d0) / T_y - c) / (T_psi v), HighwayEnv's lateral controller towards a line d0 from it, and never
-    less than 0: it is not steered towards, but nobody is steered away. Nor is a curve driven narrower than a car can.
-
-    Near. Ahead, nearer than the standstill gap, who comes closer brakes by b + dv / `closing_time`, as if the other
-    braked by b too, which the lidar does not show. Beams are 18 degrees apart, so of who stands on the line the one
-    beside the middle meets the far end first: a point well within the own lane is in the path too. Beside, who moves
-    towards a body that is too near is steered back, but never further than along the road. A beam that meets a corner
-    tells nothing of lateral motion; there the own is taken.
-
-    Both are upper bounds: where nobody is near, actions stay as they are.
+    Beside, at a distance d across that closes at c, the yaw rate towards it is at most
+    ((d - d0) / T_y - c) / (T_psi v), HighwayEnv's lateral controller towards a line d0 from it; below 0 it steers who
+    moves towards it back, but never further than along the road. No curve is narrower than a car can drive.
     """
 
     deceleration: float = 2.0
@@ -194,23 +186,14 @@ class CollisionAvoidance:
         return left, right
 
     def bound_yaw_rates_within(self, seen: Seen, room: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the greatest yaw rates to the left and to the right [rad/s] within some room (B, M, 2) [m], (B, M).
-
-        That is HighwayEnv's lateral controller towards the end of the room. Unlike beside a body, bounds below 0 steer
-        back as far as that takes.
-        """
+        """Return the greatest yaw rates to the left and right [rad/s] (B, M) within some room (B, M, 2) [m]."""
         wanted = room / self.lateral_time
         lag = self.heading_time * seen.speed.clamp(min=_LEAST_SPEED)
         return (wanted[..., 0] + seen.across) / lag, (wanted[..., 1] - seen.across) / lag
 
 
 class AdjacentLanes(NamedTuple):
-    """What is seen of the lanes to the left and to the right, shape (..., 2) each.
-
-    Beams are 18 degrees apart, so that in the next lane a body is met for sure if it is within 8 m of the own middle,
-    and its rear or front up to 13 m. What is further along that lane stays unseen. A beam that meets its side finds the
-    gap up to 2 m too long.
-    """
+    """What is seen of the lanes to the left and to the right, up to 8 to 13 m along, shape (..., 2) each."""
 
     lead_gap: Tensor
     """Gap to the nearest body ahead in that lane [m], negative beside it, infinite if none is seen."""
@@ -306,25 +289,18 @@ class ChangeAction(NamedTuple):
 class LaneChanges:
     """Lane changes at a hazard rate, on a cubic course.
 
-    Begin. The hazard of a change to a side is exp(coefficients . `COVARIATES`) [1/s] while there is a lane, a gap and
-    speed enough. Each driver has a patience for either side, exponentially distributed, which the hazard uses up; at 0
-    the change begins, with a duration of its own, and the next patience is drawn, all from the noise of the driver.
+    Begin. The hazard of a change to a side is exp(coefficients . `COVARIATES`) [1/s] while there is a lane (a body was
+    seen beyond the line within `remembered`), a gap (`accepted_gap` is left after `accepted_time`, ahead and behind)
+    and speed enough. It uses up an exponentially distributed patience of that side; at 0 the change begins, with a
+    duration of its own. Who at the first moment will reach the line within `foresight`, where there is a lane and a
+    gap, or within `near` anyway, is changing already: the course is taken up there.
 
-    There is a lane where a body was seen beyond the line within `remembered`. A gap is enough if `accepted_gap` will
-    be left after `accepted_time` at the present speeds, ahead and behind.
+    Course. The distance left is D (1 - 3 s^2 + 2 s^3) with s = t / `duration`; errors are corrected as by a critically
+    damped oscillator, and below `slow` time passes slower. A change ends with its course, along the lane; none is given
+    up for want of a gap, which the rule of collision avoidance waits for.
 
-    Who at the first moment moves across so that its middle will reach the line within `foresight` is changing already:
-    the course is taken up there. So is who will be at the line within `near`, also where the new lane is not free or
-    nobody shows it.
-
-    Course. The distance left is D (1 - 3 s^2 + 2 s^3) with s = t / `duration`, and its speed and acceleration; errors
-    are corrected as by a critically damped oscillator. Below `slow` time passes slower, so that headings stay small. A
-    change ends with its course, when the vehicle goes along its lane again; then the network steers again. No change is
-    given up for want of a gap: the rule of collision avoidance keeps the vehicle off until there is one.
-
-    The edge of the road shows in two ways. Whose middle is over the line while the lane is still the old one has no
-    lane there: its change is given up. And who is not changing keeps `margin` inside its line where it knows of no lane
-    beyond, and steers back from further out.
+    Edge of the road. Whose middle is over the line while the lane is still the old one has no lane there: its change is
+    given up. Who is not changing keeps `margin` inside its line where it knows of no lane beyond.
     """
 
     coefficients: tuple[float, ...] = (-6.0, 0.0, 0.0, 0.0, 0.0)
@@ -373,13 +349,7 @@ class LaneChanges:
         return ChangeState(patience_of(draws), never, none, none + _UNSTARTED, none, none, none, none)
 
     def step(self, seen: Seen, state: ChangeState, innovations: Tensor | None) -> tuple[ChangeAction, ChangeState]:
-        """Return how to act for one tick, and the new state.
-
-        Args:
-            seen: What M vehicles in B scenarios perceive.
-            state: As the last call returned it, at the start `begin`.
-            innovations: Standard normal draws, shape (B, M, 2); None for 0.
-        """
+        """Return how to act for one tick, and the new state; with standard normal draws (B, M, 2), None for 0."""
         lanes = AdjacentLanes.read(seen)
         state = self._remember(seen, lanes, state)
         state = self._take_up(seen, lanes, state)

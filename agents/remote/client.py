@@ -444,8 +444,8 @@ class RemoteEgo:
 
 def _one_line(text: Any, most: int) -> str:
     """Return what a server said, whatever it is, as one line that a terminal can show."""
-    words = " ".join(str(text)[: 4 * most].split())
-    return "".join(letter for letter in words if letter.isprintable())[:most]
+    shown = "".join(letter if letter.isprintable() else " " for letter in str(text)[: 4 * most])
+    return " ".join(shown.split())[:most]
 
 
 def connect(spec: str) -> RemoteEgo:

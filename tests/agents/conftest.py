@@ -1,8 +1,10 @@
-"""Shared by the tests of learned drivers: a generator, a network with random weights and plausible features."""
+"""Shared by the tests of egos: networks with random weights, plausible features, servers in threads and clients."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import threading
+from collections.abc import Callable, Iterator
+from typing import Any
 
 import numpy as np
 import pytest
@@ -49,3 +51,45 @@ def weight_distribution(rng: np.random.Generator) -> WeightDistribution:
     rows, columns = rng.integers(HEAD_SIZE, size=(2, 400))
     factor[rows, columns] += 50.0 * rng.standard_normal(400)
     return WeightDistribution(rng.normal(0.0, 0.1, HEAD_SIZE), factor @ factor.T)
+
+
+@pytest.fixture
+def serve() -> Iterator[Callable[..., Any]]:
+    """Start servers in threads."""
+    from agents.remote.server import EgoServer
+
+    running: list[tuple[Any, threading.Thread]] = []
+
+    def start(ego: Any, bind: str = "tcp://127.0.0.1:*", **settings: Any) -> Any:
+        server = EgoServer(ego, bind, **settings)
+        thread = threading.Thread(target=server.run)
+        thread.start()
+        running.append((server, thread))
+        server.end = lambda: end(server, thread)
+        return server
+
+    def end(server: Any, thread: threading.Thread) -> None:
+        server.stop()
+        thread.join()
+        server.close()
+
+    yield start
+    for server, thread in running:
+        if thread.is_alive():
+            end(server, thread)
+
+
+@pytest.fixture
+def connect_ego() -> Iterator[Callable[..., Any]]:
+    """Connect clients."""
+    from agents.remote.client import RemoteEgo, ServerLink
+
+    made: list[Any] = []
+
+    def one(address: str, secret: bytes | None = None, timeout: float = 20.0, patience: float = 20.0) -> Any:
+        made.append(RemoteEgo(ServerLink(address, secret), timeout, patience))
+        return made[-1]
+
+    yield one
+    for ego in made:
+        ego.close()

@@ -64,17 +64,6 @@ def test_everything_random_is_in_x() -> None:
     assert around.dim == 6 + plans * size == len(around.space.low)
 
 
-def test_noise_can_be_fixed_or_left_out() -> None:
-    x = problem("idm").base.sample(30, np.random.default_rng(0))
-    found = {noise: problem(load_ego("noisy:idm"), noise) for noise in ("fixed", False)}
-    assert {each.dim for each in found.values()} == {6}
-    assert found["fixed"].given == "the ego's noise is one fixed sequence"
-    assert found[False].given == problem(load_ego("noisy:idm")).given == ""
-    f = {noise: each.evaluate(x) for noise, each in found.items()}
-    assert (f["fixed"] != f[False]).any()
-    assert (f[False] != problem("idm").evaluate(x)).any()  # the lags remain
-
-
 def test_errors_have_the_declared_distribution() -> None:
     stack = Stack(missed=0.05, correlation=0.4)
     driver = problem(NoisyEgo("idm", stack)).driver

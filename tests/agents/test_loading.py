@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from agents import Ego, LearnedEgo, Provenance, load_driver, load_ego, save_driver
+from agents import LearnedEgo, Provenance, load_driver, load_ego, save_driver
 from agents.loading import find_ego_kind
 from rare_envs import IDM
 from rare_envs.control.human_driver import HumanDriverModel
@@ -140,15 +140,9 @@ def own_module(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
     return "own_egos_for_test"
 
 
-def test_a_function_of_the_user_makes_the_ego(own_module: str) -> None:
-    ego = load_ego(f"{own_module}:make")
-    assert isinstance(ego, Ego)
-    assert ego.predict(np.zeros((2, 7), np.float32))[0] == [[0.0, 0.0]] * 2
+def test_a_function_or_module_that_does_not_serve_is_refused(own_module: str, tmp_path: Path) -> None:
     assert load_ego(f"{own_module}:make_rule_based") == "idm"
     assert load_ego(f"{own_module}:make_function").predict(np.zeros((2, 7), np.float32))[0].tolist() == [[0.5, 0.5]] * 2
-
-
-def test_a_function_or_module_that_does_not_serve_is_refused(own_module: str, tmp_path: Path) -> None:
     for function, message in (
         ("mak", r"has nothing called 'mak' \(did you mean 'make'\?\)\."),
         ("zzz", r"has nothing called 'zzz'\."),

@@ -99,16 +99,6 @@ def test_an_exported_policy_acts_as_before(name: str, saved: Any, tmp_path: Path
     assert sorted(path.name for path in tmp_path.glob("*onnx*")) == ["ego.onnx"]
 
 
-def test_a_memory_begins_anew_where_an_episode_does(saved: Any, tmp_path: Path) -> None:
-    export_onnx(saved("normalised, then stacked, recurrent"), tmp_path / "ego.onnx")
-    ego = load_ego(tmp_path / "ego.onnx")
-    observation = np.ones((2, 7), np.float32)
-    first, state = ego.predict(observation, None, np.ones(2, bool))
-    second, _ = ego.predict(observation, state, np.array([False, True]))
-    np.testing.assert_allclose(second[1], first[1], rtol=1e-6)
-    assert np.abs(second[0] - first[0]).max() > 1e-6
-
-
 def test_an_export_that_acts_otherwise_is_not_written(saved: Any, tmp_path: Path, monkeypatch: Any) -> None:
     monkeypatch.setattr("agents.onnx.ACTION_TOLERANCE", 1e-12)
     with pytest.raises(ValueError, match=r"acts differently, by up to .*; nothing was written"):

@@ -3,7 +3,6 @@
 from pathlib import Path
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 import pytest
 import torch
@@ -41,16 +40,6 @@ def seen(n: int, seed: int = 0) -> dict[str, Any]:
     return {"camera": pictures(n, seed).numpy(), "speed": speed}
 
 
-def test_a_row_does_not_depend_on_the_others(ego: VisionEgo) -> None:
-    observation = seen(5)
-    state = np.random.default_rng(1).integers(0, 256, (5, LAG, HEIGHT, WIDTH), dtype=np.uint8)
-    together, after = ego.predict(observation, state)
-    for row in range(5):
-        alone, mine = ego.predict({name: part[row : row + 1] for name, part in observation.items()}, state[[row]])
-        np.testing.assert_allclose(alone[0], together[row], atol=1e-5)
-        assert np.array_equal(mine[0], after[row])
-
-
 def test_the_memory_is_of_the_last_pictures_row_by_row() -> None:
     shots = [pictures(2, seed) for seed in range(9)]
     state: Any = None
@@ -80,35 +69,6 @@ def test_observations_of_another_form_are_refused(ego: VisionEgo) -> None:
         ego.predict({**seen(2), "speed": np.zeros((3, 1), np.float32)})
     with pytest.raises(ValueError, match=r"Expected dt=0.1 s"):
         rare_envs.DrivingProblem(CUT_IN, ego=load_ego("vision"), dt=0.05)
-
-
-def test_a_problem_shows_it_what_it_needs_and_is_a_loop_over_an_environment(ego: VisionEgo) -> None:
-    problem = rare_envs.DrivingProblem(CUT_IN, ego=load_ego("vision"), horizon=1.5)
-    x = problem.base.sample(2, np.random.default_rng(4))
-    env = gym.make(CUT_IN, observation="camera+speed", horizon=1.5)
-    for row, f in zip(x, problem.evaluate(x), strict=True):
-        observation, info = env.reset(options={"x": row})
-        state: Any = None
-        done = False
-        while not done:
-            batch = {name: part[None] for name, part in observation.items()}
-            action, state = ego.predict(batch, state, np.array([state is None]))
-            observation, _, terminated, truncated, info = env.step(action[0])
-            done = terminated or truncated
-        assert info["measure"] == pytest.approx(f, abs=1e-3)
-    env.close()
-
-
-@pytest.mark.parametrize("spec", ["noisy:vision", pytest.param("process:vision", marks=pytest.mark.slow)])
-def test_it_drives_behind_a_stack_and_in_a_process_of_its_own(spec: str) -> None:
-    problem = rare_envs.DrivingProblem(CUT_IN, ego=load_ego(spec), horizon=0.3)
-    assert problem.world.sensing.observation == "camera+speed"
-    x = problem.base.sample(2, np.random.default_rng(4))
-    f = problem.evaluate(x)
-    assert np.isfinite(f).all()
-    if spec == "process:vision":
-        plain = rare_envs.DrivingProblem(CUT_IN, ego=load_ego("vision"), horizon=0.3)
-        np.testing.assert_allclose(f, plain.evaluate(x), atol=1e-6)
 
 
 def test_the_network_is_that_of_the_paper() -> None:

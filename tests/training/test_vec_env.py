@@ -10,7 +10,7 @@ import pytest
 from gymnasium import spaces
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from stable_baselines3.common.monitor import Monitor
-from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecMonitor
+from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor
 
 import rare_envs
 import training
@@ -203,22 +203,6 @@ def test_rows_are_the_agents_of_the_parallel_environment(env_id, kwargs):
                     if ended[agent] or cut[agent]:
                         assert infos["final_info"]["measure"][row] == info[agent]["measure"]
     assert not any(running)
-
-
-def test_new_scenarios_follow_those_that_ended():
-    env = training.sb3_agents_env(CUT_IN, 8, agents=["ego", "lead"], horizon=1.0, seed=0)
-    assert isinstance(env, VecEnv)
-    assert env.num_envs == 16
-    env.reset()
-    ended = 0
-    for _ in range(25):
-        observation, _, dones, infos = env.step(np.zeros((16, 2), np.float32))
-        assert np.isfinite(observation).all()
-        for row in np.flatnonzero(dones):
-            assert infos[row]["TimeLimit.truncated"] != infos[row]["collision"]
-            assert infos[row]["terminal_observation"].shape == observation[row].shape
-            ended += 1
-    assert ended == 2 * 16
 
 
 def test_bad_arguments():

@@ -11,7 +11,7 @@ References:
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from types import MappingProxyType
 from typing import Any, NamedTuple
@@ -55,12 +55,9 @@ ERROR_NAMES = ("position", "speed", "lateral")
 
 
 def sampling_driver(driver: LearnedDriver, generator: torch.Generator, weights: Tensor | None = None) -> Act:
-    """Return a function that draws the actions of a learned driver, with its noise.
+    """Return a function that draws the actions of a learned driver, with noise of a generator.
 
-    Args:
-        driver: The driver.
-        generator: Source of the noise.
-        weights: Last layers of each scene, shape (B, 404), or of all, shape (404,); None for the driver's own.
+    Weights are last layers of each scene, shape (B, 404), or of all, shape (404,); None for the driver's own.
 
     Example:
         >>> from agents import load_driver
@@ -88,22 +85,6 @@ def regular_starts(recording: Recording, seconds: float = 2.0) -> tuple[Tensor, 
     ]
     scene, tick = torch.tensor(starts).T
     return scene, tick
-
-
-Moment = tuple[Traffic, Tensor, Tensor]
-"""Traffic at one tick, features (B, M, 51) and actions (B, M, 2) of its first M vehicles."""
-
-
-def drive_traffic(recording: Recording, traffic: Traffic, act: Act, ticks: int) -> Iterator[Moment]:
-    """Yield each tick, before its action, of traffic whose driven vehicles a driver drives."""
-    m = traffic.drivers
-    unused = torch.zeros(*traffic.x.shape[:1], traffic.x.shape[1] - m, 2)
-    memory = None
-    for _ in range(ticks):
-        features = replay_features(traffic, m)
-        action, memory = act(features, memory)
-        yield traffic, features, action
-        traffic = step_replay(recording, traffic, torch.cat((action, unused), dim=1))
 
 
 class Behaviour(NamedTuple):
@@ -138,22 +119,27 @@ def find_overlaps(traffic: Traffic, m: int) -> Tensor:
     return touching & ~torch.eye(m, traffic.x.shape[1], dtype=torch.bool)
 
 
-def behaviour_of(moments: Iterator[Moment]) -> Behaviour:
-    """Return the behaviour of driven vehicles from a start on."""
-    rows: list[tuple[Tensor, ...]] = []
-    scene = driven = overlapping = lane = torch.zeros(0)
-    with torch.inference_mode():
-        for traffic, features, action in moments:
-            m = action.shape[1]
-            now, touching = lane_of(traffic.y, traffic.edges)[:, :m], find_overlaps(traffic, m)
-            if not rows:
-                driven, overlapping, lane = traffic.driven[:, :m], touching, now
-                scene = traffic.scene[:, None].expand_as(driven)[driven]
-            row = _row(traffic, features, action, (touching & ~overlapping).any(dim=2), now != lane)
-            rows.append(tuple(column[driven] for column in row))
-            lane = now
+def drive_recording(
+    recording: Recording, act: Act, ticks: int, starts: tuple[Tensor, Tensor]
+) -> tuple[Behaviour, Errors | None]:
+    """Return the behaviour of driven vehicles from some starts on, and their errors after `ERROR_TIME` if it lasts."""
+    traffic, memory, errors = start_replay(recording, *starts), None, None
+    m = traffic.drivers
+    driven, unused = traffic.driven[:, :m], torch.zeros(len(traffic.x), traffic.x.shape[1] - m, 2)
+    overlapping, lane = find_overlaps(traffic, m), lane_of(traffic.y, traffic.edges)[:, :m]
+    rows = []
+    for tick in range(ticks):
+        if tick == round(ERROR_TIME / DT):
+            errors = current_errors(recording, traffic)
+        features = replay_features(traffic, m)
+        action, memory = act(features, memory)
+        contact = (find_overlaps(traffic, m) & ~overlapping).any(dim=2)
+        before, lane = lane, lane_of(traffic.y, traffic.edges)[:, :m]
+        rows.append([column[driven] for column in _row(traffic, features, action, contact, lane != before)])
+        traffic = step_replay(recording, traffic, torch.cat((action, unused), dim=1))
     columns = [torch.stack(column) for column in zip(*rows, strict=True)]
-    return Behaviour(scene, torch.ones_like(columns[0], dtype=torch.bool), *columns)
+    scene = traffic.scene[:, None].expand_as(driven)[driven]
+    return Behaviour(scene, torch.ones_like(columns[0], dtype=torch.bool), *columns), errors
 
 
 def recorded_behaviour(recording: Recording) -> Behaviour:
@@ -346,33 +332,22 @@ def collect_statistics(
 
     Starts are scenes and ticks, (B,) each; None for every 2 s of every scene.
     """
-    met: list[Errors] = []
-
-    def watch() -> Iterator[Moment]:
-        traffic = start_replay(recording, *(regular_starts(recording) if starts is None else starts))
-        for tick, moment in enumerate(drive_traffic(recording, traffic, act, round(seconds[-1] / DT))):
-            if tick == round(ERROR_TIME / DT):
-                met.append(current_errors(recording, moment[0]))
-            yield moment
-
-    whole = behaviour_of(watch())
+    starts = regular_starts(recording) if starts is None else starts
+    with torch.inference_mode():
+        whole, errors = drive_recording(recording, act, round(seconds[-1] / DT), starts)
     out = {}
     for time in seconds:
         part = Behaviour(whole.scene, *(column[: round(time / DT)] for column in whole[1:]))
-        out[time] = sum_by_scene(part, len(recording.x), met[0] if met else None)
+        out[time] = sum_by_scene(part, len(recording.x), errors)
     return out
 
 
 def measure(
     recording: Recording, act: Act, starts: tuple[Tensor, Tensor] | None = None, seconds: float = 10.0
 ) -> Realism:
-    """Drive recorded scenes and compare with the record.
+    """Drive scenes that a driver has not learned from for some seconds, and compare with the record.
 
-    Args:
-        recording: Scenes that the driver has not learned from.
-        act: Driver of all vehicles.
-        starts: Scenes and ticks to start from; None for every 2 s of every scene.
-        seconds: Time for which each start is driven [s].
+    Starts are scenes and ticks, (B,) each; None for every 2 s of every scene.
 
     Example:
         >>> from training.data import scenes_of, synthetic_traffic

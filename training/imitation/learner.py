@@ -81,10 +81,7 @@ def make_seeded(make: Callable[[], Module], generator: torch.Generator) -> Modul
 
 
 def clone_policy(pairs: Pairs, config: Config, generator: torch.Generator) -> Policy:
-    """Return a new policy that maximises the likelihood of recorded actions.
-
-    Few epochs are made: 51 features say little about the next action, and further epochs overfit.
-    """
+    """Return a new policy that maximises the likelihood of recorded actions; further epochs overfit."""
     policy = make_seeded(lambda: Policy(scaling_of(pairs), config.log_std_cap), generator).to(pairs.features.device)
     optimiser = torch.optim.Adam(policy.parameters(), lr=config.clone_rate, weight_decay=config.weight_decay)
     action = normalise_action(policy, pairs.action)
@@ -132,19 +129,13 @@ def critic_inputs(policy: Policy, features: Tensor, action: Tensor) -> Tensor:
 def policy_cost(critic: Critic, pairs: Tensor) -> Tensor:
     """Return -log of the probability that a pair is recorded, softplus(-logit), shape (n,).
 
-    GAIL's paper minimises log(1 - D), where D is the probability that the pair is the policy's. In our sign D is
-    that of being recorded, and -log D keeps a gradient where the policy is easily recognised, as in the code of the
-    papers.
+    GAIL's paper minimises log(1 - D) of the probability D of the policy; this keeps a gradient where it is recognised.
     """
     return nn.functional.softplus(-critic(pairs))
 
 
 def critic_loss(critic: Critic, recorded: Tensor, made: Tensor, penalty: float, generator: torch.Generator) -> Tensor:
-    """Return the logistic loss with a penalty on the gradient between recorded and made pairs, (n, 53) each.
-
-    The penalty is on the mean squared norm itself, not on its distance to 1 as in WGAN-GP: with a logistic loss
-    nothing favours a slope of 1.
-    """
+    """Return the logistic loss with a penalty on the mean squared gradient between recorded and made pairs (n, 53)."""
     share = torch.rand(len(recorded), 1, generator=generator).to(recorded.device)
     between = (share * recorded + (1.0 - share) * made).requires_grad_(True)
     (slope,) = torch.autograd.grad(critic(between).sum(), between, create_graph=True)
@@ -260,12 +251,9 @@ class Learner:
         return state
 
 
-Update = Callable[[Learner], Log]
-"""One round: drive, train the critic, change the policy; figures of it."""
-
-
-def run_updates(learner: Learner, update: Update) -> Iterator[Log]:
+def run_updates(learner: Learner) -> Iterator[Log]:
     """Make the remaining updates of a training, which may have been resumed, one by one; yield figures of each."""
+    update = {"gail": update_gail, "mgail": update_mgail}[learner.config.method]
     if learner.update == 0:
         for _ in range(learner.config.warm_up):  # the critic learns before the policy moves
             with torch.no_grad():
@@ -302,11 +290,7 @@ def update_mgail(learner: Learner) -> Log:
 
 
 def advantages(reward: Tensor, value: Tensor, discount: float, gae: float) -> Tensor:
-    """Return generalised advantage estimates (T, n) of rollouts that continue beyond their last moment.
-
-    Of rewards (T, n) and values (T + 1, n), of which the last are those of the moment after; discount per tick, and
-    lambda of the estimates.
-    """
+    """Return generalised advantage estimates (T, n) of rewards (T, n) and values (T + 1, n), with lambda `gae`."""
     error = reward + discount * value[1:] - value[:-1]
     out = torch.empty_like(error)
     running = torch.zeros_like(error[0])
@@ -319,23 +303,9 @@ def advantages(reward: Tensor, value: Tensor, discount: float, gae: float) -> Te
 def conditional_action(
     policy: Policy, features: Tensor, noise: Tensor, colour: AutoregressiveNoise
 ) -> tuple[Tensor, Tensor]:
-    """Return mean and log standard deviation of actions, given the expected noise.
-
-    Coloured noise makes actions depend on each other; given the noise before, they are independent Gaussians again.
-    """
+    """Return mean and log standard deviation of actions, which are independent given the noise expected by now."""
     mean, log_std = policy(features)
     return mean + torch.exp(log_std) * noise, log_std + torch.log(noise.new_tensor(colour.scale))
-
-
-def value_inputs(policy: Policy, steps: RolloutSteps) -> Tensor:
-    """Return the input of the value network: normalised features and the expected noise, shape (n, 53)."""
-    return torch.cat((policy.normalise(steps.features), steps.noise), dim=1)
-
-
-def rewards(learner: Learner, steps: RolloutSteps) -> Tensor:
-    """Return minus the costs of each moment, shape (n,)."""
-    likeness = policy_cost(learner.critic, critic_inputs(learner.policy, steps.features, steps.action))
-    return -total_cost(learner.config, likeness, steps.costs)
 
 
 def update_gail(learner: Learner) -> Log:
@@ -349,8 +319,9 @@ def update_gail(learner: Learner) -> Log:
         steps = learner.drive(1.0)
     critic_error = learner.learn_critic(steps)
     with torch.no_grad():
-        reward = rewards(learner, steps).view(ticks, -1)
-        seen = value_inputs(policy, steps)
+        likeness = policy_cost(learner.critic, critic_inputs(policy, steps.features, steps.action))
+        reward = -total_cost(config, likeness, steps.costs).view(ticks, -1)
+        seen = torch.cat((policy.normalise(steps.features), steps.noise), dim=1)
         expected = value(seen).view(ticks, -1)
         gain = advantages(reward[:-1], expected, config.discount, config.gae)
         target = (gain + expected[:-1]).flatten()

@@ -25,22 +25,11 @@ from training.data.formats import load_recordings
 from training.data.scenes import TrafficScene, load_us101_scenes, scenes_of, split_by_clock
 from training.imitation.config import Config
 from training.imitation.evaluate import header_metrics
-from training.imitation.learner import (
-    Critic,
-    Learner,
-    Update,
-    clone_policy,
-    make_seeded,
-    run_updates,
-    update_gail,
-    update_mgail,
-)
+from training.imitation.learner import Critic, Learner, clone_policy, make_seeded, run_updates
 from training.imitation.rollout import ACTION_HIGH, ACTION_LOW
 from training.imitation.traffic import Pairs, Recording, collect_pairs, stack_scenes
 
 CPU = torch.device("cpu")
-UPDATE_RULES: dict[str, Update] = {"gail": update_gail, "mgail": update_mgail}
-"""Update of each method."""
 CHECKPOINT_INTERVAL = 50
 """Number of updates between checkpoints."""
 DRIVER, SETTINGS_FILE, CHECKPOINT = "driver.safetensors", "training.json", "checkpoint.pt"
@@ -149,11 +138,7 @@ class Data(NamedTuple):
 
 
 def prepare_data(scenes: Sequence[TrafficScene], test: Sequence[TrafficScene] = ()) -> Data:
-    """Return scenes as one recording, with the pairs of features and actions in them.
-
-    Args:
-        scenes: Scenes to learn from.
-        test: Scenes kept for tests.
+    """Return scenes to learn from as one recording, with their pairs of features and actions, and scenes for tests.
 
     Raises:
         ValueError: There is no scene, or nobody follows anybody in any of them.
@@ -164,8 +149,6 @@ def prepare_data(scenes: Sequence[TrafficScene], test: Sequence[TrafficScene] = 
         >>> data.recording.x.shape, data.pairs.features.shape
         (torch.Size([3, 40, 9]), torch.Size([708, 51]))
     """
-    if not scenes:
-        raise ValueError("Expected scenes to learn from, got none.")
     recording = stack_scenes(scenes)
     pairs = collect_pairs(recording)
     if not len(pairs.scene):
@@ -176,11 +159,7 @@ def prepare_data(scenes: Sequence[TrafficScene], test: Sequence[TrafficScene] = 
 def make_learner(data: Data, config: Config, among: torch.Tensor | None = None, device: torch.device = CPU) -> Learner:
     """Return a training before its first update: a cloned policy and a new critic.
 
-    Args:
-        data: Recorded traffic.
-        config: Settings.
-        among: Scenes that are driven, with repetition, shape (k,); None for all that have pairs.
-        device: Where it is trained.
+    The scenes `among` (k,), with repetition, are driven; None for all that have pairs.
 
     Example:
         >>> from training.data import scenes_of, synthetic_traffic
@@ -214,9 +193,6 @@ def train_learner(
         progress: Show a bar on standard error.
         every: Number of updates between checkpoints.
 
-    Raises:
-        ValueError: Logs are to be written and TensorBoard is not installed.
-
     Example:
         >>> from training.data import scenes_of, synthetic_traffic
         >>> data = prepare_data(scenes_of(synthetic_traffic(), seconds=4.0))
@@ -235,7 +211,7 @@ def train_learner(
     bar = Progress(*columns, console=Console(stderr=True), disable=not progress)
     with bar, _tensorboard(out if log else None, learner.update) as writer:
         task = bar.add_task("", total=learner.config.updates, completed=learner.update)
-        for entry in run_updates(learner, UPDATE_RULES[learner.config.method]):
+        for entry in run_updates(learner):
             text = ", ".join(f"{name} {entry[name]:.3f}" for name in ("collision", "edge", "critic"))
             bar.update(task, completed=learner.update, description=text)
             for name, value in (*entry.items(), ("vehicle_steps", learner.simulated)) if writer else ():
@@ -245,20 +221,15 @@ def train_learner(
     return learner.policy
 
 
-def _summary_writer() -> Any:
-    """Return TensorBoard's class of writers; a ValueError if it is not installed."""
-    try:
-        from torch.utils.tensorboard import SummaryWriter
-    except ImportError as error:
-        raise ValueError("Logs need TensorBoard: pip install 'rare-envs[logs]', or leave logs out.") from error
-    return SummaryWriter
-
-
 def _tensorboard(folder: Path | None, update: int) -> contextlib.AbstractContextManager[Any]:
     """Open TensorBoard logs in a folder, without what a stopped run left of later updates; None gives None."""
     if folder is None:
         return contextlib.nullcontext()
-    return contextlib.closing(_summary_writer()(str(folder), purge_step=update + 1))
+    try:
+        from torch.utils.tensorboard import SummaryWriter
+    except ImportError as error:
+        raise ValueError("Logs need TensorBoard: pip install 'rare-envs[logs]', or leave logs out.") from error
+    return contextlib.closing(SummaryWriter(str(folder), purge_step=update + 1))  # type: ignore[no-untyped-call]
 
 
 def train_driver(
@@ -280,23 +251,19 @@ def train_driver(
         log: Write TensorBoard logs to it.
         progress: Show a bar on standard error.
         measured: Measure the driver in the scenes kept for tests, for the header of its file.
-        device: Where it is trained: "cpu", or a GPU, such as "cuda". Weights differ by rounding that grows with the
-            updates; what is drawn is the same.
+        device: "cpu", or a GPU, such as "cuda", whose weights differ by rounding that grows with the updates.
 
     Returns:
         The file of the driver.
 
     Raises:
-        ValueError: The data cannot be read, the folder holds another training, or logs are to be written and
-            TensorBoard is not installed.
+        ValueError: The data cannot be read, the folder holds another training, or TensorBoard is not installed.
 
     Example:
         >>> train_driver(Source("data", Path("no_such_folder")), Config(), Path("out"))  # doctest: +ELLIPSIS
         Traceback (most recent call last):
         ValueError: There is no ngsim_us101_scenes.parquet in the folder 'no_such_folder'. ...
     """
-    if log:
-        _summary_writer()
     place = find_device(device)
     with claim_folder(out, source, config):
         data = prepare_data(*load_scenes(source))
@@ -367,10 +334,6 @@ def read_training_settings(folder: Path) -> tuple[Source, Config]:
     if not path.is_file():
         raise ValueError(f"Expected a training in {str(folder)!r}, but there is no {SETTINGS_FILE}.")
     noted = json.loads(path.read_text(encoding="utf-8"))
-    source, config = (
-        dict[str, Any](
-            {name: tuple(value) if isinstance(value, list) else value for name, value in noted[part].items()}
-        )
-        for part in ("source", "config")
-    )
-    return Source(**{**source, "path": Path(source["path"])}), Config(**config)
+    for part in noted.values():  # JSON has lists
+        part |= {name: tuple(value) for name, value in part.items() if isinstance(value, list)}
+    return Source(**{**noted["source"], "path": Path(noted["source"]["path"])}), Config(**noted["config"])

@@ -2,15 +2,10 @@
 
     python -m training.imitation.weights runs/mgail --members 32 --out mgail.safetensors
 
-A member continues the training of the base: from the base's weights, with the base's critic, optimisers and losses as
-they were at its end, and with the trunk frozen. Members differ by chance alone: each draws its scenes from the base's
-with repetition, both those that it drives in and those that its driving is compared with. Any other difference (new
-critics, other weights of the losses) would move all members the same way, and their mean away from the base.
-
-Scenes of one recording overlap in vehicles and time, and a run is short. So the spread says how far the last layer can
-move without loss; it is no posterior. A few dozen members say next to nothing about most of the 81,406 correlations of
-404 weights. So the correlations are first shrunk towards 0, the graphical lasso keeps the dependences that stand out,
-and the penalty that decides how many it keeps is the one with the greatest likelihood of held-out members.
+A member continues the training of the base, trunk frozen, on scenes drawn from the base's with repetition, so that
+members differ by chance alone. The spread says how far the last layer can move without loss; it is no posterior.
+Correlations are shrunk towards 0, the graphical lasso keeps the dependences that stand out, and the penalty is the one
+with the greatest likelihood of held-out members.
 
 References:
     Friedman, Hastie and Tibshirani, "Sparse inverse covariance estimation with the graphical lasso", Biostatistics
@@ -49,7 +44,6 @@ from training.imitation.traffic import Pairs
 from training.imitation.train import (
     CHECKPOINT,
     DRIVER,
-    UPDATE_RULES,
     Data,
     load_scenes,
     prepare_data,
@@ -111,7 +105,7 @@ def train_member(
     config, pairs = member_config(base, ensemble.updates), select_scenes(data.pairs, drawn)
     learner = Learner(config, data.recording, drawn, pairs, policy, Critic(), generator)
     learner.inherit(checkpoint)
-    visited = [head_weights(policy).detach() for _ in run_updates(learner, UPDATE_RULES[config.method])]
+    visited = [head_weights(policy).detach() for _ in run_updates(learner)]
     late = torch.stack(visited[len(visited) // 2 :]).double().numpy()
     return Member(late[-1], late.std(axis=0))
 
@@ -188,10 +182,9 @@ def fit_weights(
 ) -> WeightFit:
     """Return the Gaussian N(mean, precision^-1) fitted to the last layers of K drivers, members (K, 404).
 
-    Penalties are tried in descending order until one fails, on all members or without one of the folds; the one with
-    the greatest held-out log-likelihood is taken. Members that depend on each other (iterates of one run) must be
-    neighbours, because a fold holds out consecutive members. A search may move each mean by the radius. A ValueError
-    says what is wrong: a weight that is not finite or the same in all, or not even one penalty succeeds.
+    Penalties are tried in descending order until one fails, on all members or without one of the folds, which hold out
+    consecutive members; the one with the greatest held-out log-likelihood is taken. A search may move each mean by the
+    radius. A ValueError says that a weight is not finite or the same in all, or that no penalty succeeds.
     """
     members = np.asarray(members, dtype=np.float64)
     everyone = _moments(members, shrinkage, names)
@@ -204,7 +197,7 @@ def fit_weights(
     for penalty in penalties:
         try:
             precision = _lasso(everyone.correlation, penalty)
-            fitted = [_to_distribution(part, _lasso(part.correlation, penalty), radius) for part in without]
+            fitted = [part.distribution(_lasso(part.correlation, penalty), radius) for part in without]
         except _FAILURES as failure:
             stopped = f"penalty {penalty} failed: {' '.join(str(failure).split())[:120]}"
             break
@@ -232,7 +225,7 @@ def fit_weights(
         "stopped": stopped,
         "tried": tried,
     }
-    return WeightFit(_to_distribution(everyone, precisions[best], radius), metadata)
+    return WeightFit(everyone.distribution(precisions[best], radius), metadata)
 
 
 class _Moments(NamedTuple):
@@ -241,6 +234,10 @@ class _Moments(NamedTuple):
     mean: FloatArray
     spread: FloatArray
     correlation: FloatArray
+
+    def distribution(self, precision: FloatArray, radius: float) -> WeightDistribution:
+        """Return the distribution with a precision of standardised weights."""
+        return WeightDistribution(self.mean, precision / np.outer(self.spread, self.spread), radius)
 
 
 def _moments(members: FloatArray, shrinkage: float, names: Sequence[str]) -> _Moments:
@@ -278,11 +275,6 @@ def _lasso(correlation: FloatArray, penalty: float) -> FloatArray:
     finally:
         np.random.set_state(state)  # noqa: NPY002
     return np.asarray(precision, dtype=np.float64)
-
-
-def _to_distribution(moments: _Moments, precision: FloatArray, radius: float) -> WeightDistribution:
-    """Return the distribution with a precision of standardised weights."""
-    return WeightDistribution(moments.mean, precision / np.outer(moments.spread, moments.spread), radius)
 
 
 @use_one_thread()

@@ -161,5 +161,5 @@ def test_a_shipped_driver_may_drive_without_its_rules():
     low, high = torch.tensor((alone.acceleration, alone.yaw_rate)).T
     assert torch.equal(alone.act(features)[0], torch.clamp(expected, low, high))
     assert not torch.equal(whole.act(features)[0], alone.act(features)[0])
-    with pytest.raises(ValueError, match="Unknown setting 'rule'"):
+    with pytest.raises(ValueError, match=r"Expected mgail or mgail\?rules=0, got 'mgail\?rule=0'"):
         load_driver("mgail?rule=0")

@@ -131,27 +131,6 @@ def test_a_change_under_way_at_the_first_moment_is_taken_up():
     assert not bool(moving.changing)  # at the first moment only: later it may be the noise
 
 
-@pytest.mark.slow
-def test_gradients_are_those_of_finite_differences():
-    driver = replace(load_driver("mgail"), changes=CHANGES, policy=load_driver("mgail").policy.double())
-    state = begin(right=0.0)
-    for tick in range(12):
-        y = 0.02 * tick
-        _, state = step(on_lane(y, 0.01, **OTHERS), state, None)
-    changing = torch.cat((torch.zeros(1, 1, 4, dtype=torch.float64), state.pack()), dim=-1)
-    fresh = torch.cat((torch.zeros(1, 1, 4, dtype=torch.float64), begin().pack()), dim=-1)
-    none = torch.zeros(1, 1, 2, dtype=torch.float64)
-    cases = (
-        (on_lane(0.25, 0.012, range_18=12.0, rate_18=-1.0, **OTHERS), changing),
-        (on_lane(0.8, 0.05, **OTHERS), fresh),
-        (on_lane(0.0, 0.0, **OTHERS), fresh),
-        (on_lane(1.5, 0.01), fresh),
-    )
-    for features, memory in cases:
-        act = lambda values, memory=memory: driver.act(values, None, none, memory)[0]  # noqa: E731
-        assert torch.autograd.gradcheck(act, features.requires_grad_(), atol=1e-4)
-
-
 # --- the driver ----------------------------------------------------------------------------------
 
 

@@ -15,7 +15,7 @@ from gymnasium import spaces
 
 from agents.remote import protocol, server
 from agents.remote.server import RequestHandler
-from tests.agents.remote.egos import Averaging, Braking, good_messages
+from tests.agents.remote.egos import Braking, good_messages
 
 
 def ask(handler: RequestHandler, connection: bytes = b"me", **message: Any) -> dict[str, Any]:
@@ -69,6 +69,10 @@ def test_arrays_that_do_not_add_up_get_an_error() -> None:
         assert protocol.unpack(handler.handle(b"me", protocol.pack(act)))["code"] == "malformed", (name, value)
 
 
+MANY = b"\xdd\x00\x00\x03\xe8" + (b"\xdd\x00\x00\x03\xe8" + b"\x90" * 1000) * 1000
+"""A million empty lists, which would take a hundred times their bytes."""
+
+
 @pytest.mark.parametrize("n", [1500, pytest.param(20_000, marks=pytest.mark.slow)])
 def test_random_bytes_get_an_error_and_are_never_run(n: int, tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
@@ -79,7 +83,7 @@ def test_random_bytes_get_an_error_and_are_never_run(n: int, tmp_path: Path) -> 
         def __reduce__(self) -> Any:
             return os.mkdir, (str(tmp_path / "was_here"),)
 
-    inputs = [pickle.dumps(Run()), b"", b"\x81" * 5000, b"\xdd\xff\xff\xff\xff", b"\xc6\xff\xff\xff\xff"]
+    inputs = [pickle.dumps(Run()), b"", b"\x81" * 5000, MANY, b"\xdd\xff\xff\xff\xff", b"\xc6\xff\xff\xff\xff"]
     inputs += [message[: int(cut)] for message in whole for cut in range(len(message))]
     for _ in range(n):
         content = bytearray(whole[rng.integers(len(whole))])
@@ -124,21 +128,6 @@ def test_a_hello_comes_first_and_ids_rise() -> None:
     assert ask(handler, type="ping", id=6)["type"] == "pong"
     assert ask(handler, b"another", type="ping", id=7)["code"] == "hello"
     assert ask(handler, type="dance", id=8)["code"] == "unknown"
-
-
-def test_a_session_counts_its_steps_and_remembers() -> None:
-    handler, local = RequestHandler(Averaging()), Averaging()
-    ask(handler, type="hello", protocol=1, id=1)
-    ask(handler, type="reset", id=2, session=9, batch=2)
-    state = None
-    for step in range(3):
-        observation = np.full((2, 7), step + 1, np.float32)
-        act = {"type": "act", "session": 9, "observation": protocol.pack_array(observation)}
-        assert ask(handler, id=10 * step + 3, step=step + 1, **act)["code"] == "session"
-        reply = ask(handler, id=10 * step + 4, step=step, **act)
-        expected, state = local.predict(observation, state, np.full(2, step == 0))
-        np.testing.assert_array_equal(protocol.unpack_array(reply["action"]), expected)
-        assert reply["memory"] is True
 
 
 def test_an_ego_that_fails_ends_its_session_only() -> None:

@@ -19,26 +19,15 @@ from training.imitation.learner import (
     log_likelihood,
     run_updates,
     scaling_of,
-    update_mgail,
 )
 from training.imitation.rollout import (
-    Penalties,
     ScenePool,
     compute_penalties,
-    denormalise_action,
     normalise_action,
     roll_out,
-    total_cost,
 )
 from training.imitation.traffic import Pairs, Recording, Traffic, collect_pairs, stack_scenes
 from training.imitation.train import make_learner, train_learner
-
-
-def test_actions_in_physical_units_and_back_within_their_bounds():
-    policy, action = plain_policy(), torch.tensor([[0.3, -1.0]])
-    assert denormalise_action(policy, action)[0].tolist() == pytest.approx([1.1, -0.1])
-    torch.testing.assert_close(normalise_action(policy, denormalise_action(policy, action)), action)
-    assert denormalise_action(policy, torch.tensor([[1e3, -1e3]])).tolist() == [[4.0, pytest.approx(-0.3)]]
 
 
 def test_a_linear_driver_is_cloned_with_its_noise():
@@ -54,11 +43,6 @@ def test_a_linear_driver_is_cloned_with_its_noise():
     assert off.square().mean() < 0.04
     # and knows how large its errors are: a Gaussian's likelihood is greatest at the root mean square
     torch.testing.assert_close(log_std.exp().mean(dim=0), off.square().mean(dim=0).sqrt(), rtol=0.3, atol=0.0)
-
-
-def test_learning_rates_fall_after_the_schedules():
-    config = Config(updates=1000, anneal=0.7, last_rate=0.1)
-    assert [config.rate_factor(update) for update in (0, 700, 850, 1000)] == pytest.approx([1.0, 1.0, 0.55, 0.1])
 
 
 def test_settings_are_checked():
@@ -105,13 +89,6 @@ def test_manners_cost_on_paper():
     assert cost.headway[0].tolist() == pytest.approx([1 - 10 / 38, 0.0, 0.5 * (1 - (1.5 - 6) / 38)])
     assert cost.lane[0].tolist() == pytest.approx([0.0, 0.0, 0.3])
     assert cost.speed[0].tolist() == pytest.approx([0.1, 0.0, 0.1])
-
-
-def test_total_cost_by_hand():
-    costs = Penalties(*(torch.tensor([float(value)]) for value in (1, 2, 3, 4, 5, 6)))
-    names = ("collision", "edge", "brake", "headway", "lane", "speed")
-    weights = {f"{name}_weight": 10.0**power for power, name in enumerate(names)}
-    assert total_cost(Config(critic_weight=0.5, **weights), torch.tensor([2.0]), costs).tolist() == [654322.0]
 
 
 def test_the_gradient_of_a_rollout_is_that_of_finite_differences(recording):
@@ -200,7 +177,7 @@ def test_mgail_lowers_its_loss(data):
     learner = make_learner(data, config)
     with torch.no_grad():
         learner.policy.head.bias[0] = -10.0  # brakes at about 4 m/s^2
-    losses = [entry["brake"] for entry in run_updates(learner, update_mgail)]
+    losses = [entry["brake"] for entry in run_updates(learner)]
     assert losses[-1] < 0.7 * losses[0]
 
 
@@ -230,25 +207,3 @@ def test_a_killed_training_resumes_to_the_same_weights(data, method, tmp_path):
     resumed = train_learner(make_learner(data, config), tmp_path, every=3)
     assert torch.equal(weights(resumed), weights(whole))
     assert not torch.equal(weights(make_learner(data, config).policy), weights(whole))
-
-
-@pytest.mark.slow
-def test_gail_brakes_less_when_braking_costs(data):
-    config = dataclasses.replace(
-        SMALL,
-        method="gail",
-        updates=25,
-        scenes=8,
-        noise="white",
-        policy_rate=3e-3,
-        clone_weight=(1e-9, 1e-9),
-        critic_weight=0.0,
-    )
-    learner = make_learner(data, config)
-    with torch.no_grad():
-        learner.policy.head.bias[0], learner.policy.head.bias[2] = -6.0, 1.0
-        before = float(learner.drive(1.0).costs.brake.mean())
-    train_learner(learner)
-    with torch.no_grad():
-        after = float(learner.drive(1.0).costs.brake.mean())
-    assert after < 0.7 * before

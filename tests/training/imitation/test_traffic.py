@@ -9,7 +9,6 @@ import torch
 from tests.training.imitation.synthetic_scenes import at_start, generator, scene, tiny
 from training.imitation.evaluate import (
     binned_quantities,
-    find_overlaps,
     jensen_shannon,
     measure,
     recorded_behaviour,
@@ -92,15 +91,6 @@ def test_the_record_counts_every_moment_that_may_be_driven_and_no_more(recording
     assert accelerations.abs().max() <= 0.6 + 1e-6
     jerk, _ = binned_quantities(behaviour)["jerk"]
     assert jerk.abs().max() <= 0.6 * 1.3 + 0.05  # 0.6 cos(1.3 t)
-
-
-def test_overlap_of_boxes():
-    traffic = at_start(stack_scenes([scene(vehicles=6)]))
-    traffic = traffic._replace(x=traffic.x * 0, y=traffic.y * 0, heading=traffic.heading * 0)
-    beside = traffic._replace(y=torch.tensor([[0.0, 1.8, 3.0, 5.4, 30.0, 60.0]]))
-    assert find_overlaps(beside, 6)[0, 0].tolist() == [False, True, False, False, False, False]
-    turned = beside._replace(heading=torch.tensor([[0.0, 0.0, math.pi / 2, 0.0, 0.0, 0.0]]))
-    assert find_overlaps(turned, 6)[0, 0].tolist() == [False, True, True, False, False, False]  # 0.95 + 2.25 > 3
 
 
 def test_divergence_is_symmetric_knows_empty_bins_and_is_at_most_log_two():

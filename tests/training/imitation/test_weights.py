@@ -10,12 +10,11 @@ from agents import read_driver, read_provenance
 from agents.learned.networks import HEAD_SIZE, WeightDistribution, head_weights
 from tests.training.imitation.synthetic_scenes import scenes, tiny
 from training.imitation import weights as module
-from training.imitation.train import DRIVER, Source, prepare_data, train_driver
+from training.imitation.train import DRIVER, Source, train_driver
 from training.imitation.weights import (
     Ensemble,
     fit_weights,
     make_ensemble,
-    select_scenes,
     train_members,
 )
 
@@ -65,16 +64,6 @@ def test_members_are_kept_and_are_the_same_when_trained_again(run):
     np.savez(path, base=np.zeros(HEAD_SIZE), weights=first[4].weights, within=first[4].within)
     with pytest.raises(ValueError, match="another driver"):
         train_members(run, FEW)
-
-
-def test_scenes_are_drawn_with_their_pairs_as_often_as_they_are_drawn():
-    pairs = prepare_data(scenes(3)).pairs
-    drawn = torch.tensor([2, 0, 2])
-    chosen = select_scenes(pairs, drawn)
-    count = [(pairs.scene == scene).sum() for scene in drawn]
-    assert len(chosen.scene) == sum(count)
-    assert (chosen.scene == 2).sum() == 2 * count[0]
-    assert not (chosen.scene == 1).any()
 
 
 def test_too_few_and_a_folder_without_a_training_are_refused(tmp_path):
