@@ -19,7 +19,7 @@ import torch
 
 from rare_envs.files import replace_file
 
-CHECKPOINT_FORMAT = 1
+CHECKPOINT_FORMAT = 2
 """Version of the file."""
 COUNTERS = "num_timesteps _n_updates _episode_num _n_calls exploration_rate _current_progress_remaining".split()
 """Attributes of a model that count, where its algorithm has them."""
@@ -119,45 +119,36 @@ def _to_arrays(value: Any) -> Any:
     return value.numpy().copy()
 
 
+def _replay_arrays(buffer: Any) -> dict[str, Any]:
+    """Return views of the filled rows of the arrays of a replay buffer, those in mappings as "name/key"."""
+    filled = buffer.buffer_size if buffer.full else buffer.pos
+    nested = {name: value for name, value in vars(buffer).items() if isinstance(value, dict)}
+    parts = {f"{name}/{key}": part for name, value in nested.items() for key, part in value.items()}
+    return {name: part[:filled] for name, part in {**vars(buffer), **parts}.items() if isinstance(part, np.ndarray)}
+
+
 def _replay_state(buffer: Any) -> dict[str, Any] | None:
     """Return the filled part of a replay buffer; None without one."""
     if buffer is None:
         return None
-    filled = buffer.buffer_size if buffer.full else buffer.pos
-    return {"pos": buffer.pos, "full": buffer.full, **_to_tensors(_replay_arrays(buffer, filled))}
-
-
-def _replay_arrays(buffer: Any, filled: int) -> dict[str, Any]:
-    """Return views of the first rows of the arrays of a replay buffer."""
-    kept: dict[str, Any] = {}
-    for name, value in vars(buffer).items():
-        if isinstance(value, np.ndarray):
-            kept[name] = value[:filled]
-        elif isinstance(value, dict) and value and all(isinstance(part, np.ndarray) for part in value.values()):
-            kept[name] = {key: part[:filled] for key, part in value.items()}
-    return kept
+    return {"pos": buffer.pos, "full": buffer.full, **_to_tensors(_replay_arrays(buffer))}
 
 
 def _restore_replay(buffer: Any, state: Mapping[str, Any] | None) -> None:
     if buffer is None or state is None:
         return
     buffer.pos, buffer.full = state["pos"], state["full"]
-    views = _replay_arrays(buffer, buffer.buffer_size if buffer.full else buffer.pos)
-    for name, view in views.items():
-        saved = _to_arrays(state[name])
-        pairs = [(view, saved)] if isinstance(view, np.ndarray) else [(view[key], saved[key]) for key in view]
-        for part, values in pairs:
-            part[:] = values
+    for name, view in _replay_arrays(buffer).items():
+        view[:] = state[name].numpy()
 
 
 def _generator_states(model: Any) -> dict[str, Any]:
     """Return the states of the generators that a training draws from."""
-    numpy_state: Any = np.random.get_state(legacy=False)  # noqa: NPY002  (Stable-Baselines3 draws from it)
+    kind, key, *counts = np.random.get_state()  # noqa: NPY002  (Stable-Baselines3 draws from it)
     version, words, gauss = random.getstate()
     return {
         "torch": torch.get_rng_state(),
-        "numpy_key": _to_tensors(numpy_state["state"]["key"].astype(np.int64)),
-        "numpy": [int(numpy_state["state"]["pos"]), int(numpy_state["has_gauss"]), float(numpy_state["gauss"])],
+        "numpy": [str(kind), _to_tensors(np.asarray(key, dtype=np.int64)), *(float(count) for count in counts)],
         "python": [version, list(words), gauss],
         "actions": json.dumps(model.action_space.np_random.bit_generator.state),
     }
@@ -165,8 +156,8 @@ def _generator_states(model: Any) -> dict[str, Any]:
 
 def _restore_generators(model: Any, states: Mapping[str, Any]) -> None:
     torch.set_rng_state(states["torch"])
-    position, has_gauss, gauss = states["numpy"]
-    np.random.set_state(("MT19937", _to_arrays(states["numpy_key"]).astype(np.uint32), position, has_gauss, gauss))  # noqa: NPY002
+    kind, key, position, has_gauss, gauss = states["numpy"]
+    np.random.set_state((kind, key.numpy().astype(np.uint32), int(position), int(has_gauss), gauss))  # noqa: NPY002
     version, words, spare = states["python"]
     random.setstate((version, tuple(words), spare))
     model.action_space.np_random.bit_generator.state = json.loads(states["actions"])

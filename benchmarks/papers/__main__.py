@@ -22,9 +22,8 @@ from typing import Any
 
 from benchmarks.papers.okelly2018.reproduction import reproduce_okelly2018
 from benchmarks.papers.okelly2018.study import HighwayStudy, RolloutFolder
-from benchmarks.papers.record import discard_runs
 from benchmarks.papers.renew import OWN_METHOD, PAPERS, renew
-from benchmarks.papers.tian2024.study import REPLICATIONS_FILE, SCALES, TianPlan, reproduce_tian2024
+from benchmarks.papers.tian2024.study import SCALES, TianPlan, reproduce_tian2024
 from rare_envs.startup import use_one_thread
 from rare_envs.study.arguments import BadInput
 
@@ -52,10 +51,7 @@ def _make_parser() -> argparse.ArgumentParser:
     tian = commands.add_parser("tian2024", help="Tian et al. 2024: Tables II and III, Figures 6 to 8")
     tian.add_argument("--scale", choices=SCALES, default="full", help="5 replications of every method, or 20")
     tian.add_argument("--replications", type=int, help="of every method, instead of the scale's")
-    tian.add_argument("--monte-carlo-replications", type=int, help="of Monte Carlo, which takes most of the time")
-    tian.add_argument("--further-replications", type=int, help="of the methods that the paper does not have")
     tian.add_argument("--seed", type=int, default=0, help="of the first replication")
-    tian.add_argument("--afresh", action="store_true", help="delete the runs in the folder and make all anew")
     okelly = commands.add_parser("okelly2018", help="O'Kelly et al. 2018: Tables 1 and 2, Figures 2 and 3")
     okelly.add_argument("--scale", default="small", help="small, or full: the paper's, for days")
     okelly.add_argument("--ego", default="lidar", help="lidar (Table 1, Figure 2) or vision (Table 2, Figure 3)")
@@ -73,18 +69,8 @@ def _make_parser() -> argparse.ArgumentParser:
 
 
 def _run_tian(arguments: argparse.Namespace) -> None:
-    number = arguments.replications or SCALES[arguments.scale]
-    plan = TianPlan(
-        replications=number,
-        seed=arguments.seed,
-        monte_carlo=arguments.monte_carlo_replications,
-        further=arguments.further_replications,
-    )
-    if arguments.afresh:
-        discard_runs(arguments.out / REPLICATIONS_FILE, "tian2024")
-    options = {"--monte-carlo-replications": plan.monte_carlo, "--further-replications": plan.further}
-    fewer = "".join(f" {name} {value}" for name, value in options.items() if value is not None)
-    command = f"python -m benchmarks.papers tian2024 --replications {number}{fewer} --seed {plan.seed}"
+    plan = TianPlan(arguments.replications or SCALES[arguments.scale], arguments.seed)
+    command = f"python -m benchmarks.papers tian2024 --replications {plan.replications} --seed {plan.seed}"
     record = reproduce_tian2024(plan, arguments.out, command, arguments.workers, progress=True)
     _tell(record, arguments)
 

@@ -160,13 +160,6 @@ def check_folder(out: Path, study: Mapping[str, Any]) -> None:
             )
 
 
-def discard_runs(file: Path, paper: str) -> None:
-    """Delete a file of runs if they are of a paper; others stay, for `check_folder` to refuse."""
-    held = _read_study(file) if file.is_file() else {}
-    if held is None or held.get("paper") == paper:
-        file.unlink()
-
-
 def _read_study(file: Path) -> Mapping[str, Any] | None:
     """Return what the runs of a file are of; None for a file without a whole line."""
     with file.open(encoding="utf-8", errors="replace") as lines:

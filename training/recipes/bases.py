@@ -13,25 +13,22 @@ vehicle-hour, the complete recording 11. Offset and duration of a lane change be
 The positions of US 101 were smoothed at 0.35 Hz, which makes short changes longer: courses of 2, 3, 4 and 5 s over 3 m
 look like ones of 3.1, 3.6, 4.3 and 5.1 s.
 
-`highway` is free-flow traffic, assembled and not fitted: naturalistic data (highD) may not be passed on. Its means
-follow from published statistics; its spreads and correlations are chosen such that the IDM ego collides with a
-probability between 1e-4 and 1e-3, as in Tian et al. 2024, who fitted mixtures to highD.
+`highway` is free-flow traffic, assembled and not fitted, and its files are their own source: naturalistic data (highD)
+may not be passed on. Means are published: cars drive 30 m/s and trucks 24, headways have their mode at 1 to 1.5 s (38 m
+at 30 m/s is 1.27 s), a lane change takes 6.28 s. Spreads and correlations are chosen such that the IDM ego collides
+with a probability between 1e-4 and 1e-3, as in Tian et al. 2024, who fitted mixtures to highD.
 """
 
 from __future__ import annotations
 
-import json
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from rare_envs.distributions.coordinates import CoordinateKind, Coordinates
-from rare_envs.distributions.fitted import FittedDistribution, read_distribution
-from rare_envs.distributions.mixture import CoordinateMixture, TruncatedGaussianMixture
+from rare_envs.distributions.fitted import FittedDistribution
 from rare_envs.scenarios.base import load_base
 from rare_envs.scenarios.registry import scenario_named
 from rare_envs.traffic.state import VEHICLE_LENGTH
@@ -44,7 +41,7 @@ from training.data.events import (
     time_between_spans,
 )
 from training.data.table import DT, VEHICLES_FILE, read_columns
-from training.fit.base import FitRequest, check_predictions, fit_base, format_base, mass_outside
+from training.fit.base import FitRequest, fit_base, format_base
 from training.fit.coordinates import COORDINATE_SYSTEMS
 from training.fit.filters import (
     EVENT_RECIPES,
@@ -72,8 +69,6 @@ SETTLING_TICKS, STEADY_TICKS, MAX_STEP = 8, 10, 2.0
 gap changes by at most so much in one [m]."""
 NO_LEADER = 252.0
 """Gap that stands for nobody ahead [m]."""
-STATE_TICKS = 100
-"""Ticks between two states: 10 s, after which gap and closing speed are nearly independent."""
 
 PAIRS = ("v_ego", "v_lead", "gap")
 CUT_INS = ("v_ego", "v_cutin", "v_lead", "gap_ego_cutin", "gap_cutin_lead")
@@ -108,7 +103,7 @@ class ShippedBase:
     @property
     def file(self) -> str:
         """Name of its file in the package."""
-        return find_file(self.scenario, self.name).name
+        return Path(str(scenario_named(self.scenario).bases[self.name])).name
 
     def read(self, folder: Path) -> Read:
         """Return its events from the folder of compact tables."""
@@ -121,12 +116,6 @@ class ShippedBase:
         return events, {}
 
 
-def find_file(scenario: str, base: str) -> Path:
-    """Return the shipped file of a base; a scenario's base of that name is in a file."""
-    file: Any = scenario_named(scenario).bases[base]
-    return Path(file)
-
-
 def fit_shipped_bases(
     data: Path, scenarios: Sequence[str], seed: int = 0, n_refits: int | None = None
 ) -> Iterator[tuple[str, str]]:
@@ -134,12 +123,6 @@ def fit_shipped_bases(
     for base in SHIPPED_BASES:
         if scenario_named(base.scenario).name in scenarios:
             yield base.file, fit_shipped_base(base, data, seed, n_refits)
-    for scenario in HIGHWAY_BASES:
-        if scenario_named(scenario).name in scenarios:
-            content = build_highway_base(scenario)
-            if scenario == FOLLOWING:
-                content = check_against_following(content, data)
-            yield find_file(scenario, "highway").name, format_base(scenario, content)
 
 
 def fit_shipped_base(base: ShippedBase, data: Path, seed: int = 0, n_refits: int | None = None) -> str:
@@ -168,16 +151,11 @@ def _read_i24_leaders(folder: Path) -> Read:
         parts.append(find_new_leaders(*(rows[name][chosen].astype(float) for name in ("speed", "rel_speed", "gap"))))
         drives.append(np.full(len(parts[-1]), drive, dtype=np.int64))
     events, clusters = np.concatenate(parts), np.concatenate(drives)
-    inside, keep = _in_ranges(events, FOLLOWING), np.ones(len(events), dtype=bool)
+    box, keep = scenario_named(FOLLOWING).parameters, np.ones(len(events), dtype=bool)
+    inside = ((events >= [p.low for p in box]) & (events <= [p.high for p in box])).all(axis=1)
     rule = ("within the ranges of the scenario", "outside the physical range", inside)
     log = ({"rule": "events read", "events": len(events)}, *drop_events(keep, [rule]))
     return EventSet(events[keep], clusters[keep], cluster="drive", log=log), {}
-
-
-def _in_ranges(x: FloatArray, scenario: str) -> NDArray[np.bool_]:
-    """Return which points (n, d) lie in the ranges of a scenario's parameters; NaN lies in none."""
-    box = scenario_named(scenario).parameters
-    return np.asarray(((x >= [p.low for p in box]) & (x <= [p.high for p in box])).all(axis=1))
 
 
 def find_new_leaders(speed: FloatArray, relative_speed: FloatArray, gap: FloatArray) -> FloatArray:
@@ -296,66 +274,3 @@ SHIPPED_BASES = (
     ShippedBase(BRAKING, "us101", _read_us101_brakings),
 )
 """Bases of the package that are fitted to recorded events."""
-
-# 30 and 24 m/s are the published speeds of cars and trucks; 38 m at 30 m/s is a headway of 1.27 s, in the published
-# mode of 1 to 1.5 s, as are 30 m (1 s) and 45 m (1.5 s) of the cut-ins; 75 m (2.5 s) stands for the long tail, trucks
-# keep 40 m (1.67 s). A lane change takes 6.28 s in the mean; CutIn-v0 has no duration.
-SITUATIONS = {
-    "car_following": (
-        (0.45, (30.0, 30.0, 38.0), (3.5, 3.5, 14.0), 0.6),
-        (0.25, (30.0, 30.0, 75.0), (3.5, 3.5, 25.0), 0.6),
-        (0.2, (24.0, 24.0, 40.0), (1.5, 1.5, 14.0), 0.8),
-        (0.1, (28.0, 24.0, 45.0), (2.5, 1.5, 16.0), 0.5),
-    ),
-    "cut_in": (
-        (0.6, (30.0, 30.0, 31.0, 30.0, 40.0, 3.75, 6.28), (3.0, 3.0, 3.0, 12.0, 18.0, 0.3, 2.0), 0.6),
-        (0.4, (30.0, 26.0, 28.0, 45.0, 45.0, 3.75, 6.28), (3.0, 2.5, 2.5, 16.0, 18.0, 0.3, 2.0), 0.6),
-    ),
-}
-"""Components of `highway`: weight, means and standard deviations of the parameters, and correlation of the speeds."""
-GAP_CORRELATIONS = {"car_following": ((0, 2), (1, 2)), "cut_in": ((0, 3),)}
-"""Speeds and gaps that go together a little (0.2): a fast ego has more room."""
-HIGHWAY_BASES = (FOLLOWING, CUT_IN_V0, CUT_IN_V1)
-"""Scenarios that have one."""
-
-
-def build_highway_base(scenario: str) -> dict[str, Any]:
-    """Return the entries of the assembled base of a scenario, by short name or id, its provenance included."""
-    name, box = scenario_named(scenario).name, scenario_named(scenario).parameters
-    d, speeds = len(box), sum(p.unit == "m/s" for p in box)
-    covariances = []
-    for _, _, deviation, together in SITUATIONS[name]:
-        correlation = np.eye(len(deviation))
-        correlation[:speeds, :speeds] += together * (1.0 - np.eye(speeds))
-        for i, j in GAP_CORRELATIONS[name]:
-            correlation[i, j] = correlation[j, i] = 0.2
-        covariances.append((np.outer(deviation, deviation) * correlation)[:d, :d])
-    weights, means = (np.array([one[k] for one in SITUATIONS[name]]) for k in (0, 1))
-    mixture = (weights, means[:, :d], np.array(covariances))
-    low, high = np.array([p.low for p in box]), np.array([p.high for p in box])
-    kinds: list[CoordinateKind] = ["plain"] * d
-    plain = CoordinateMixture(Coordinates(low, high, tuple(kinds)), *mixture)
-    shipped = json.loads(find_file(scenario, "highway").read_text(encoding="utf-8"))["provenance"]
-    words = {key: shipped[key] for key in ("kind", "published", "chosen", "components")}
-    provenance = {**words, "mass_outside_box": mass_outside(plain)}
-    return {**TruncatedGaussianMixture(*mixture, low, high).to_dict(), "provenance": provenance}
-
-
-def check_against_following(content: Mapping[str, Any], folder: Path) -> dict[str, Any]:
-    """Return an assembled base of car-following, its predictive checks against recorded states in its provenance.
-
-    The states are own speed, speed ahead and gap every `STATE_TICKS` of the drives with radar on I-24.
-    """
-    rows = read_columns(folder / CIRCLES_FILE, ("t", "speed", "gap", "rel_speed", "radar"))
-    chosen = rows["radar"].astype(bool) & (np.round(10.0 * rows["t"]).astype(np.int64) % STATE_TICKS == 0)
-    speed, gap, relative = (rows[name][chosen].astype(float) for name in ("speed", "gap", "rel_speed"))
-    states = np.column_stack([speed, speed + relative, gap])
-    states = states[_in_ranges(states, FOLLOWING)]
-    names = [p.name for p in scenario_named(FOLLOWING).parameters]
-    checks = check_predictions(FOLLOWING, names, states, read_distribution(content))
-    provenance = {
-        **content["provenance"],
-        "checked_against": f"{len(states):,} states of following on I-24, {STATE_TICKS // 10} s apart, by radar",
-        "checks": [{"name": each.name, "recorded": each.recorded, "expected": each.expected} for each in checks],
-    }
-    return {**content, "provenance": provenance}

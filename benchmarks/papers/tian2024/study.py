@@ -51,41 +51,31 @@ class TianPlan:
     replications: int = SCALES["full"]
     seed: int = 0
     """Of the first replication; the others have the seeds that follow."""
-    monte_carlo: int | None = None
-    """Replications of Monte Carlo, which take most of the time; None for as many as of the others."""
-    further: int | None = None
-    """Replications of the methods that the paper does not have; None for as many as of those that it has."""
 
     def __post_init__(self) -> None:
         if self.replications < 2:
             raise ValueError(f"Expected 2 replications at least, for a spread, got {self.replications}.")
-        for what, number in (("Monte Carlo", self.monte_carlo), ("further methods", self.further)):
-            if number is not None and not 2 <= number <= self.replications:
-                raise ValueError(f"Expected 2 to {self.replications} replications of {what}, got {number}.")
         if self.seed < 0:
             raise ValueError(f"Expected a seed of at least 0, got {self.seed}.")
 
     @property
     def identity(self) -> dict[str, Any]:
         """What tells reproductions apart."""
-        counts = {"of Monte Carlo": self.monte_carlo, "of further methods": self.further}
-        other = {name: count for name, count in counts.items() if count not in (None, self.replications)}
-        return {"paper": "tian2024", "replications": self.replications, **other, "seed": self.seed}
+        return {"paper": "tian2024", "replications": self.replications, "seed": self.seed}
 
     def jobs(self) -> list[ReplicationJob]:
         """Return the replications: the paper's methods, then further ones, Monte Carlo at the end."""
-        own = {name: self.replications for name, row in METHOD_ROWS.items() if row.paper and name != "MC"}
-        further = {name: self.further or self.replications for name, row in METHOD_ROWS.items() if not row.paper}
+        own = [name for name, row in METHOD_ROWS.items() if row.paper and name != "MC"]
+        further = [name for name, row in METHOD_ROWS.items() if not row.paper]
         return [
             ReplicationJob(
                 scenario, system, method, self.seed + k, points=method == FIGURE7_METHOD and scenario == "cut-in"
             )
-            for counts in (own, further, {"MC": self.monte_carlo or self.replications})
+            for methods in (own, further, ["MC"])
             for k in range(self.replications)
             for scenario in SCENARIO_ROWS
             for system in SYSTEMS
-            for method, count in counts.items()
-            if k < count
+            for method in methods
         ]
 
 
@@ -128,8 +118,6 @@ def record_replications(plan: TianPlan, runs: Sequence[Run], command: str) -> di
         command=command,
         settings={
             "replications": plan.replications,
-            "replications_of_monte_carlo": plan.monte_carlo or plan.replications,
-            "replications_of_further_methods": plan.further or plan.replications,
             "seeds": f"{plan.seed} to {plan.seed + plan.replications - 1}",
             "base": TRAFFIC_BASE,
             "horizon": EPISODE_SECONDS,
@@ -144,10 +132,8 @@ def record_replications(plan: TianPlan, runs: Sequence[Run], command: str) -> di
 
 def _describe_setting(plan: TianPlan) -> list[str]:
     return [
-        f"Every figure is over {plan.replications} replications (Monte Carlo {plan.monte_carlo or plan.replications}, "
-        f"methods that the paper does not have {plan.further or plan.replications}; the paper has 20 and does not say "
-        "how many of Monte Carlo); intervals are 95 %: of a mean by Student's "
-        "distribution, of a c.o.v. by the chi-square distribution.",
+        f"Every figure is over {plan.replications} replications (the paper has 20 and does not say how many of Monte "
+        "Carlo); intervals are 95 %: of a mean by Student's distribution, of a c.o.v. by the chi-square distribution.",
         "Failure is a collision of the ego within 5 s. Systems under test: the IDM with the paper's parameters, and "
         "`noisy:idm`, an imperfect stack around it, where the paper has Apollo.",
         f"SS and ADSS have {POINTS_OF_A_LEVEL} points a level; Monte Carlo and IS stop at 20 % relative half-width; "

@@ -402,7 +402,7 @@ def test_a_full_scale_that_is_not_all_run_says_what_the_rest_takes(monkeypatch: 
     assert len(write_notes(study, {**found, "rollouts": rollouts, "own": [{"n_sim": 6000}] * 4})) == 2
 
 
-# tables
+# tables: what committed records have is compared with these
 
 GAMMAS = THRESHOLDS["lidar"]
 NOT_RUN = {"iterations": 2, "of": 20, "weights_move": True, "estimates": [], "comparisons": []}
@@ -426,37 +426,16 @@ RUN = {
 }
 
 
-def found_of(search: dict[str, Any], own: tuple[dict[str, Any], ...] = ()) -> dict[str, Any]:
-    return {"naive": [ESTIMATE] * 4, "naive_equal": [], "searches": {PRINTED_SEARCH: search}, "own": own}
+def found_of(search: dict[str, Any]) -> dict[str, Any]:
+    return {"naive": [ESTIMATE] * 4, "naive_equal": [], "searches": {PRINTED_SEARCH: search}, "own": ()}
 
 
-def tables_of(search: dict[str, Any], own: tuple[dict[str, Any], ...] = ()):
-    return [table["values"] for table in make_tables("lidar", GAMMAS, found_of(search, own))]
+def tables_of(search: dict[str, Any]):
+    return [table["values"] for table in make_tables("lidar", GAMMAS, found_of(search))]
 
 
 def of(value: dict[str, Any], *names: str) -> list[Any]:
     return [value[name] for name in names]
-
-
-def test_ours_stand_beside_theirs_and_the_search_counts_for_both() -> None:
-    estimates, ratios = tables_of(RUN)
-    rollouts, first, *_ = (value for value in estimates if value["labels"][0].startswith("naive, 1,000 rollouts"))
-    assert of(rollouts, "quantity", "paper", "ours") == ["rollouts", 1_300_000, 1000]
-    assert of(first, "paper", "ours", "quantity") == [12.4e-6, 0.01, "p (10 events)"]
-    assert first["labels"][1] == f"0.14 / {GAMMAS[0]}"
-    assert first["interval"] == pytest.approx((0.00412, 0.01588))
-    searched = [value for value in estimates if PRINTED_SEARCH in value["labels"][0]]
-    assert [value["paper"] for value in searched[:3]] == [100_000, 19.8e-6, 8.88e-6]
-    assert of(searched[0], "paper_all_in", "ours", "ours_all_in") == [600_000, 1000, 21_000]
-    (ratio,) = (value for value in ratios[:3] if value["paper"] is not None)
-    assert of(ratio, "paper", "paper_all_in") == pytest.approx([1.57, 1.57 / 6], abs=0.01)
-    assert of(ratio, "ours", "ours_all_in") == [7.2, 1.2]
-    assert of(ratios[2], "ours", "ours_all_in", "reasons") == [None, None, ("underflow",)]
-    one, other = make_tables("lidar", GAMMAS, found_of(RUN))
-    assert set(one["explanations"]) == {"thresholds", "scale", "search", "not run", "weights"}
-    assert set(other["explanations"]) == {"thresholds", "scale", "search", "underflow", "weights"}
-    make_tables("vision", THRESHOLDS["vision"], found_of(RUN))  # a reason without an explanation is refused
-    assert "1e-09" in explain_differences("lidar", found_of(RUN))["weights"]
 
 
 def test_what_was_not_run_has_no_number() -> None:
@@ -471,22 +450,6 @@ def test_what_was_not_run_has_no_number() -> None:
     for table in make_tables("lidar", GAMMAS, found):
         (line,) = (value for value in table["values"] if name in value["labels"][0])
         assert line["labels"] == (f"cross-entropy, {name}: not run", "all")
-
-
-def test_our_own_method_stands_at_its_threshold() -> None:
-    own = {"gamma": GAMMAS[2], "n_sim": 3000, "p": 1e-3, "low": 8e-4, "high": 1.2e-3, "cov": 0.1, "gain": 30.0}
-    estimates, ratios = tables_of(RUN, (own,))
-    assert estimates[-2]["labels"][1] == f"0.19 / {GAMMAS[2]}"
-    assert estimates[-1]["ours"] == pytest.approx(1e-4)
-    assert ratios[-1]["ours_all_in"] == 30.0
-    assert [value["ours_all_in"] for value in estimates[-3:]] == [3000, None, None]
-
-
-def test_standard_errors_that_say_nothing() -> None:
-    run = {**RUN, "comparisons": [{**COMPARISON, "variance_ratio": None, "all_in": None}] * 4}
-    assert tables_of(run)[1][1]["reasons"] == ("underflow",)
-    run = {**RUN, "estimates": [{**ESTIMATE, "p": 1e-300, "standard_error": 0.0}] * 4}
-    assert [v["interval"] for v in tables_of(run)[0] if v["quantity"] == "p (10 events)"][4:] == [None] * 4
 
 
 def test_reasons_of_differences() -> None:

@@ -25,7 +25,6 @@ from benchmarks.papers.tian2024.summary import (
     assess_claims,
     derive,
     ends_of,
-    make_method_tables,
     ratio_of_work,
     summarise_runs,
 )
@@ -167,56 +166,6 @@ def test_verdicts_on_runs_made_by_hand() -> None:
     assert assess_claims([]) == []
 
 
-def tables_of(*methods: str, scenarios=("car-following", "cut-in")):
-    return make_method_tables(
-        [
-            made_run(ReplicationJob(scenario, system, method, seed))
-            for scenario in scenarios
-            for system in ("IDM", "stack")
-            for method in methods
-            for seed in (0, 1)
-        ]
-    )
-
-
-def find(table, method: str, system: str, quantity: str):
-    (found,) = (
-        value
-        for value in table["values"]
-        if value["labels"][0] == method
-        and value["labels"][1].startswith(system)
-        and value["quantity"].startswith(quantity)
-    )
-    return found
-
-
-def test_paper_ours_and_difference() -> None:
-    table2, table3 = tables_of("MC", "SS", "IS", "ADSS", "two-stage")
-    assert (table2["name"], table3["name"]) == ("table2", "table3")
-    p = find(table2, "SS", "IDM", "mean of p")
-    assert (p["paper"], p["ours"], p["difference"]) == (8.03e-4, pytest.approx(2e-4), pytest.approx(2 / 8.03 - 1))
-    squared = find(table2, "SS", "IDM", "square of the c.o.v.")
-    assert (squared["paper"], squared["ours"]) == (0.152, pytest.approx(0.125))
-    assert find(table2, "SS", "IDM", "c.o.v.")["paper"] == pytest.approx(0.152**0.5)
-    cost = find(table2, "SS", "stack", "simulations")
-    assert (cost["paper"], cost["ours"]) == (4980, 1800)
-    repeated = find(table3, "SS", "stack", "mean of p")
-    assert repeated["paper"] == 2.49e-4 and "text" in repeated["reasons"]
-    searched = find(table2, "IS", "IDM", "simulations")
-    assert (searched["ours"], searched["ours_all_in"]) == (1500, 3000)
-    for method, quantity, words in (
-        ("IS", "mean of p", "does not run as released"),
-        ("SS", "simulations", "N in every level: 2,000 for the same levels"),
-        ("ADSS", "simulations", "at the end: 2,500 for the same levels"),
-        ("Monte Carlo", "simulations", "114,784"),
-    ):
-        assert words in find(table2, method, "IDM", quantity)["released"]
-    assert all(value["reasons"] for table in (table2, table3) for value in table["values"])
-    assert [row["labels"][0] for row in table2["measured"]] == ["two-stage"] * 2
-    assert table2["measured"][0]["values"]["all simulations"] == 2681
-    assert [table["name"] for table in tables_of("MC", scenarios=("cut-in",))] == ["table3"]
-
-
 @pytest.fixture
 def made(monkeypatch: pytest.MonkeyPatch) -> list[tuple]:
     """Replications made by hand; those that were asked for are listed."""
@@ -253,10 +202,3 @@ def test_a_folder_has_lines_record_and_page_and_goes_on_to_the_same(made, tmp_pa
     with pytest.raises(BadInput, match="holds tian2024, replications 2, seed 0; this is tian2024, replications 3"):
         reproduce_tian2024(TianPlan(replications=3), tmp_path, COMMAND)
     assert (made, file.read_text()) == ([], text)
-
-
-def test_monte_carlo_and_further_methods_may_have_fewer_replications(made, tmp_path: Path) -> None:
-    record = reproduce_tian2024(TianPlan(replications=4, monte_carlo=2, further=3), tmp_path, COMMAND)
-    counts = {runs["method"]: len(runs["p"]) for runs in record["runs"]}
-    assert (counts["MC"], counts["SS"], counts["two-stage"]) == (2, 4, 3)
-    assert "over 4 replications (Monte Carlo 2, methods that the paper does not have 3;" in record["notes"][0]

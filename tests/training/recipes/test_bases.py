@@ -11,17 +11,11 @@ import pytest
 from rare_envs.scenarios.base import load_base
 from rare_envs.scenarios.registry import scenario_named
 from tests.training.shared_data import DATA, needs_data
-from training.fit.base import format_base
 from training.fit.coordinates import BIC_TIE
 from training.recipes.bases import (
     CHANGES_FILE,
-    CIRCLES_FILE,
-    HIGHWAY_BASES,
     PROFILES_FILE,
     SHIPPED_BASES,
-    build_highway_base,
-    check_against_following,
-    find_file,
     find_new_leaders,
     fit_shipped_base,
     read_lane_changes,
@@ -105,26 +99,6 @@ def test_fit_of_the_recorded_events_is_the_shipped_file(base):
     assert new["bic"] == pytest.approx(old["bic"], abs=0.1)
     for key in ("filters", "settings", "command", "coordinates"):
         assert new[key] == old[key]
-
-
-@pytest.mark.parametrize("scenario", HIGHWAY_BASES)
-def test_highway_files_are_what_the_script_writes(scenario):
-    written = json.loads(format_base(scenario, build_highway_base(scenario)))
-    expected = shipped(find_file(scenario, "highway").name)
-    for name in ("checks", "checked_against"):  # what recordings say of it
-        expected["provenance"].pop(name, None)
-    assert written == expected
-    assert "NOT fitted" in written["provenance"]["kind"]
-
-
-@needs_data(CIRCLES_FILE)
-def test_the_shipped_checks_are_those_of_the_recorded_states():
-    expected = shipped("car_following_highway.json")["provenance"]
-    written = check_against_following(build_highway_base("car_following"), DATA)["provenance"]
-    assert written["checked_against"] == expected["checked_against"]
-    for one, other in zip(written["checks"], expected["checks"], strict=True):
-        assert (one["name"], one["recorded"]) == (other["name"], other["recorded"])
-        assert one["expected"] == pytest.approx(other["expected"], rel=0.01)
 
 
 def test_new_leaders_are_jumps_of_the_gap_that_stay():
