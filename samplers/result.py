@@ -115,7 +115,7 @@ class Estimate(EstimateData, Printed):
         Args:
             new_base: The other distribution of X: an object whose `log_prob` of points (n, d) in physical space gives
                 (n,); or a frozen distribution of `scipy.stats`, one of OpenTURNS, or a list of them, as for
-                `FunctionProblem(base=...)`.
+                `FunctionProblem(base=...)`; or the name of one that the base of this run knows (its `sibling`).
 
         Raises:
             ValueError: If the effective number of units or points is too small, the new base has

@@ -151,6 +151,11 @@ def reweight_estimate(estimate: EstimateData, new_base: Any) -> Reweighted:
     as that of the estimate does; its lineages count for less as the effective units become fewer.
     """
     sample = require_sample(estimate)
+    if isinstance(new_base, str):
+        base: Any = require_base(estimate)
+        if not hasattr(base, "sibling"):  # the user's own class
+            raise ValueError(f"The base distribution knows no others by name: give one in place of {new_base!r}.")
+        new_base = base.sibling(new_base)
     if isinstance(new_base, list | tuple) or convert(new_base) is not None:
         new_base = as_distribution(new_base, sample.x.shape[1])
     failing = sample.f <= estimate.gamma
