@@ -16,7 +16,7 @@ from rare_envs.simulation.episode import Episode
 from rare_envs.simulation.world import World
 from rare_envs.traffic.bodies import overlaps
 from rare_envs.traffic.road import Road
-from rare_envs.traffic.state import VEHICLE_LENGTH, VEHICLE_WIDTH, State
+from rare_envs.traffic.state import State
 
 ROLE_COLOURS = {"ego": "#22aa3c", "lead": "#3b82d6", "cutter": "#f09a1a", "others": "#b4b4c4"}
 """Colours of vehicles by what scenarios call them, on paper and on asphalt; "others" for other names."""
@@ -43,18 +43,17 @@ def make_traffic(state: State, road: Road, row: int = 0) -> Any:
     from highway_env.vehicle.kinematics import Vehicle
 
     traffic = Traffic(make_network(road, float(state.x[row, 0])))
-    for (x, y, heading), speed in zip(world_places(state, road, row), state.speed[row].tolist(), strict=True):
+    world = road.to_world(state.x[row], state.y[row], state.heading[row])
+    for x, y, heading, speed in torch.stack((*world, state.speed[row]), dim=1).tolist():
         traffic.vehicles.append(Vehicle(traffic, [x, y], heading, speed))
     return traffic
 
 
-def make_scene(episode: Episode, crashed: Collection[int] | None = None) -> Any:
+def make_scene(episode: Episode) -> Any:
     """Return HighwayEnv's road of a batch of one, with crashes; with meta-actions the ego is an `MDPVehicle`."""
     from highway_env.vehicle.controller import MDPVehicle
 
-    traffic = make_traffic(episode.state, episode.road)
-    if crashed is None:
-        crashed = find_crashed(episode)
+    traffic, crashed = make_traffic(episode.state, episode.road), find_crashed(episode)
     if episode.aim is not None:
         seen = traffic.vehicles[0]
         target = (*seen.lane_index[:2], int(episode.aim.lane[0, 0]))
@@ -72,13 +71,6 @@ def find_crashed(episode: Episode, row: int = 0) -> Collection[int]:
         return ()
     state = State(*(field[row : row + 1] for field in episode.state))
     return {0, *(overlaps(state, episode.road)[0].nonzero().flatten() + 1).tolist()}
-
-
-def world_places(state: State, road: Road, row: int = 0) -> list[list[float]]:
-    """Return X, Y [m] and heading [rad] in the world of each vehicle of a row, shape (N, 3)."""
-    x, y, heading = road.to_world(state.x[row], state.y[row], state.heading[row])
-    places: list[list[float]] = torch.stack((x, y, heading), dim=1).tolist()
-    return places
 
 
 def make_network(road: Road, x: float) -> Any:
@@ -205,7 +197,7 @@ class Renderer:
     def _draw_road(self, state: State, row: int, outlines: _Outlines) -> None:
         from highway_env.road.graphics import RoadGraphics
 
-        traffic, places = make_traffic(state, self._road, row), world_places(state, self._road, row)
+        traffic = make_traffic(state, self._road, row)
         for vehicle, role in zip(traffic.vehicles, self._roles, strict=True):
             vehicle.color = as_rgb(ROLE_COLOURS[role])
         self._surface.move_display_window_to(world_point(self._road, float(state.x[row, 0]), self._road.middle))
@@ -213,11 +205,7 @@ class Renderer:
         RoadGraphics.display_traffic(traffic, self._surface, offscreen=True)
         for colour, vehicles in outlines.values():
             for j in sorted(vehicles):
-                *middle, heading = places[j]
-                along = VEHICLE_LENGTH / 2 * np.array((np.cos(heading), np.sin(heading)))
-                across = VEHICLE_WIDTH / 2 * np.array((-np.sin(heading), np.cos(heading)))
-                corners = (along + across, along - across, -along - across, across - along)
-                pixels = [self._surface.pos2pix(*(middle + corner)) for corner in corners]
+                pixels = [self._surface.pos2pix(*corner) for corner in traffic.vehicles[j].polygon()[:4]]
                 self._pygame.draw.polygon(self._surface, colour, pixels, width=3)
 
     def _draw_legend(self, outlines: _Outlines) -> None:

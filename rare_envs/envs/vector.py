@@ -288,7 +288,7 @@ class DrivingVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[Any]
             raise ValueError("The episodes are of another environment.")
         self._episode = map_tensors(lambda _: new.pop(0).to(self.device), self._episode)
         self._x, self._tick = state["x"].numpy().copy(), state["tick"].numpy().copy()
-        self._ended = state["ended"].numpy().copy() if "ended" in state else np.zeros(self.num_envs, dtype=bool)
+        self._ended = state["ended"].numpy().copy()
         self.np_random.bit_generator.state = json.loads(state["generator"])
 
     def render(self) -> tuple[NDArray[np.uint8], ...] | None:

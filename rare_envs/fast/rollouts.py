@@ -48,7 +48,7 @@ from rare_envs.simulation.episode import Episode, EpisodeStatistics
 from rare_envs.traffic.bodies import Lead
 from rare_envs.traffic.crash import Crash
 from rare_envs.traffic.road import Road
-from rare_envs.traffic.state import State
+from rare_envs.traffic.state import State, map_tensors
 
 ROWS = 256
 """Rows in a block with the IDM as ego: enough that starting a loop costs little, and in the processor's first cache."""
@@ -177,7 +177,7 @@ def advance(episode: Episode, action: SingleArray, script: ScriptNumbers) -> Ste
     assert statistics is not None
     statistics = statistics._replace(least_ttc=least)
     if eventful:
-        own, others = (Crash(*(field.numpy().copy() for field in each)) for each in statistics[1:])
+        own, others = map_tensors(lambda field: field.numpy().copy(), statistics[1:])
         record_crashes(before, after, episode.collided.numpy(), now.numpy(), script.road, script.dt, own, others)
         statistics = EpisodeStatistics(least, *(Crash(*map(tensor, each)) for each in (own, others)))
     moved = episode._replace(

@@ -1,7 +1,7 @@
 """Problem for samplers: the probability that an ego crashes in one of HighwayEnv's own environments."""
 
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from functools import cached_property
 from typing import Any
 
@@ -121,12 +121,8 @@ class HighwayEnvProblem:
         ego: Any = "idm",
         *,
         config: Mapping[str, Any] | None = None,
-        vehicles: int | None = None,
-        measure: str | Callable[[Any], float] = "ttc",
-        fixed: Mapping[str, Any] | str | None = None,
-        noise: bool | str = True,
-        base: Any = None,
         horizon: float = MAX_SECONDS,
+        **settings: Any,
     ) -> None:
         """Build the environment once, so that errors show before the simulations.
 
@@ -136,14 +132,10 @@ class HighwayEnvProblem:
             ego: "idm" for HighwayEnv's `IDMVehicle`, an object with Stable-Baselines3's `predict`, or a function
                 without arguments that makes one in each worker process. Policies act by their means.
             config: HighwayEnv's configuration, such as the observation that the ego was trained with.
-            vehicles: Number of vehicles with parameters, on the highway; 4 by default.
-            measure: "ttc" (least time until the ego's body touches any other), "front_ttc" (to the vehicle in front),
-                or a function of HighwayEnv's environment.
-            fixed: Values of parameters that are held, or "highway_env" for those that HighwayEnv itself holds: p is
-                then the share of crashes in the environment as it is (up to what docs/highway_env.md says of each).
-            noise: True, what is left random is seeded by the parameter `noise`; "fixed", by one number for all x.
-            base: Distribution of the parameters without noise; HighwayEnv's own by default.
             horizon: Drives are cut off here [s], if the environment does not end them before.
+            **settings: Keyword arguments of `HighwayEnvScenario`: `vehicles`, `measure`, `fixed`, `noise`, `base`. With
+                `fixed="highway_env"` p is the share of crashes in the environment as it is (up to what
+                docs/highway_env.md says of each).
 
         Raises:
             ValueError: If an argument is invalid, or the ego's spaces are not the environment's.
@@ -154,14 +146,14 @@ class HighwayEnvProblem:
         if not is_idm and not is_policy(ego) and (isinstance(ego, type) or not callable(ego)):
             refuse_ego(ego)
         self.env_id, self.ego, self._config, self._seconds = env_id, ego, config, float(horizon)
-        self._settings = {"vehicles": vehicles, "measure": measure, "fixed": fixed, "noise": noise, "base": base}
+        self._settings = settings
         is_model = is_policy(ego) and hasattr(ego, "get_vec_normalize_env")  # anybody's object need not have it
         self._policy = None if is_idm else BarePolicy(ego) if is_model else ego
         env, _ = self._driven
         self.space: ScenarioSpace = env.space
         self.dim, self.column_names, self.base = env.space.dim, env.space.column_names, env.space.base
         self.fixed: dict[str, Any] = env.fixed
-        held = env.layout.leftover and noise == "fixed"
+        held = env.layout.leftover and settings.get("noise") == "fixed"
         self.given = "what HighwayEnv draws beyond x is one fixed draw" if held else ""
 
     @use_one_thread()

@@ -168,7 +168,9 @@ def _attain(
     own = noise_columns(driver)
     _, driver = split_noise(driver, x if through_ego else x.detach())
     driver = driver if through_ego else _take_as_given(driver)
-    episode, memory, before = world.start(x[:, : x.shape[1] - own]), None, None
+    memory: Any = None
+    before: Moment | None = None
+    episode = world.start(x[:, : x.shape[1] - own])
     values, moments, last = [], 0, int(ticks.max())
     for tick in range(last + 1):
         moments += len(ticks)

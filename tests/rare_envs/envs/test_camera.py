@@ -7,12 +7,9 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 from numpy.typing import NDArray
-from stable_baselines3 import PPO
-from stable_baselines3.common.vec_env import VecFrameStack
 
 import rare_envs
 from rare_envs.simulation.observation import map_kinds
-from training import sb3_vec_env
 
 CUT_IN = "rare_envs/CutIn-v0"
 SMALL = (36, 60)
@@ -73,24 +70,6 @@ def test_a_problem_and_an_environment_lead_to_the_same_end() -> None:
             observation, _, terminated, truncated, info = env.step(action[0])
             over = terminated or truncated
         assert info["measure"] == f[row]
-
-
-@pytest.mark.slow
-def test_stacked_frames_of_a_camera() -> None:
-    settings: dict[str, Any] = {"observation": "camera", "camera": SMALL, "horizon": 0.5}
-    stacked = VecFrameStack(sb3_vec_env(CUT_IN, num_envs=1, seed=0, **settings), n_stack=3)
-    model = PPO("CnnPolicy", stacked, n_steps=4, batch_size=4, device="cpu", seed=0)
-    assert model.observation_space.shape == (9, *SMALL)
-    problem = rare_envs.DrivingProblem(CUT_IN, ego=model, **settings)
-    x = problem.base.sample(1, np.random.default_rng(0))
-    f = problem.evaluate(x)
-
-    stacked.set_options({"x": x[0]})
-    shown, done = stacked.reset(), [False]
-    while not done[0]:
-        action, _ = model.predict(shown, deterministic=True)
-        shown, _, done, infos = stacked.step(action)
-    assert infos[0]["measure"] == pytest.approx(f[0], abs=1e-5)
 
 
 def test_an_ego_for_other_pictures_is_refused() -> None:

@@ -18,7 +18,7 @@ from rare_envs.envs.rendering import (
     caption,
     make_network,
     make_scene,
-    world_places,
+    make_traffic,
     world_point,
 )
 from rare_envs.make import set_up
@@ -110,7 +110,8 @@ def test_a_curved_road_has_a_lane_for_each_lane_along_its_pieces() -> None:
         assert network.get_closest_lane_index(point)[2] == lane
     zero = torch.zeros(1, 1)
     state = State(zero + 310.0, zero + road.centre(2), zero, zero, zero[:, :0])
-    np.testing.assert_allclose(world_places(state, road)[0][:2], world_point(road, 310.0, road.centre(2)), atol=1e-3)
+    (vehicle,) = make_traffic(state, road).vehicles
+    np.testing.assert_allclose(vehicle.position, world_point(road, 310.0, road.centre(2)), atol=1e-3)
 
 
 def test_who_touches_the_ego_has_crashed_and_targets_are_those_of_its_controller() -> None:
@@ -124,4 +125,3 @@ def test_who_touches_the_ego_has_crashed_and_targets_are_those_of_its_controller
         episode = world.step(episode, torch.zeros(1, 2))
     assert bool(episode.collided)
     assert [vehicle.crashed for vehicle in make_scene(episode).vehicles] == [True, True]
-    assert [vehicle.crashed for vehicle in make_scene(episode, crashed=[1]).vehicles] == [False, True]

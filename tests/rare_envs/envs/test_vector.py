@@ -152,23 +152,6 @@ def test_a_generator_that_others_draw_from_too_is_not_put_back(kind: type[np.ran
 
 
 @scripted
-def test_info_at_start_and_end(env_id: str) -> None:
-    env = gym.make(env_id)
-    _, info = env.reset(seed=3)
-    space = env.unwrapped.space  # type: ignore[attr-defined]
-    assert info["scenario"] == dict(zip(space.names, info["x"].tolist(), strict=True))
-    assert not {"measure", "collision_type"} & info.keys()
-    done = False
-    while not done:
-        _, reward, terminated, truncated, info = env.step(np.array([1.0, 0.0], np.float32))
-        assert reward == pytest.approx(sum(info["reward_terms"].values()), rel=1e-5)
-        done = terminated or truncated
-    assert terminated  # full throttle runs into the lead
-    assert (info["measure"], info["min_ttc"]) == (-1.0, 0.0)
-    assert info["collision_type"] in ("rear_end", "side")
-
-
-@scripted
 def test_reset_options(env_id: str) -> None:
     env = gym.make(env_id)
     name = env.unwrapped.space.names[0]  # type: ignore[attr-defined]

@@ -1,6 +1,5 @@
 """What is compiled; what is not falls back to torch, or is refused with the reason."""
 
-import pickle
 import warnings
 from dataclasses import dataclass, replace
 from typing import Any
@@ -67,11 +66,6 @@ def test_where_numba_fails_torch_simulates_and_one_line_says_so(monkeypatch: pyt
         assert (problem.core, problem.evaluate(X)) == ("torch", pytest.approx(6.0))
     with pytest.raises(ValueError, match=f"core='numba' cannot simulate this: {line}"):
         rare_envs.DrivingProblem(CAR_FOLLOWING, core="numba")
-
-
-def test_a_problem_is_sent_to_other_processes_with_its_core() -> None:
-    problem = pickle.loads(pickle.dumps(rare_envs.DrivingProblem(CAR_FOLLOWING)))
-    assert (problem.core, problem.evaluate(X)) == ("numba", pytest.approx(6.0))
 
 
 def test_a_scenario_that_places_the_vehicles_otherwise_is_compiled_and_a_script_of_ones_own_is_not() -> None:

@@ -46,18 +46,6 @@ def test_same_x_same_scene_whatever_came_before(env_id: str, monkeypatch: pytest
     assert env.space.names == tuple(n for n in info["scenario"] if n not in env.fixed)
 
 
-def test_wrong_options_name_the_parameter_and_its_range() -> None:
-    env = scenario("highway-fast-v0")
-    cases: list[tuple[dict[str, Any], str]] = [
-        ({"gap": [-1.0, 5.0, 5.0, 5.0]}, r"gap\[0\] = -1 .* \[0, 300\] m"),
-        ({"lane": [0, 1, 2, 4]}, r"lane\[3\] = 4 .* \[0, 3\]"),
-        ({"x": np.zeros(3)}, r"shape \(n, 19\)"),
-    ]
-    for options, message in cases:
-        with pytest.raises(ValueError, match=message):
-            env.reset(options=options)
-
-
 def test_wrong_environments_and_settings_are_refused() -> None:
     for env, message in (
         (gym.make("CartPole-v1"), "Expected an environment of HighwayEnv"),

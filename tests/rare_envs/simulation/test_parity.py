@@ -98,14 +98,3 @@ def test_difference_vehicles_stop_where_highway_env_reverses() -> None:
     ours, _ = drive(CAR_FOLLOWING, IDM.highway_env(25.0), x[None])
     assert theirs[:, 0, 3].min() < 0.0
     assert ours[0, :, 0, 3].min() == 0.0
-
-
-def test_difference_collision_is_overlap_and_not_a_prediction() -> None:
-    """HighwayEnv flags a hit that its swept test predicts; ours is counted when the bodies overlap."""
-    x = np.array([30.0, 2.0, 11.0])
-    _, crashed = reference.drive_road(reference.car_following_road(x, IDMVehicle, 30.0), TICKS)
-    ours, collided = drive(CAR_FOLLOWING, IDM.highway_env(30.0), x[None])
-    assert crashed
-    contact, gap = int(collided[0].argmax()), ours[0, :, 1, 0] - ours[0, :, 0, 0] - 5.0
-    assert collided.any()
-    assert gap[contact] < 0.0 <= gap[contact - 1]

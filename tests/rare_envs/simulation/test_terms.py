@@ -220,8 +220,3 @@ def test_cost_goes_by_the_moments_simulated() -> None:
 )
 def test_a_measure_without_a_gradient_offers_none(measure: Any) -> None:
     assert rare_envs.DrivingProblem(FOLLOWING, measure=measure).gradient is None
-
-
-def test_a_measure_of_ones_own_has_a_gradient() -> None:
-    problem = rare_envs.DrivingProblem(FOLLOWING, ego=Coasting(), measure=Measure(lambda moment: moment.lead.gap))
-    np.testing.assert_allclose(gradients(problem, [[20.0, 18.0, 100.0]], 5.0).values, [[-10.0, 10.0, 1.0]], atol=1e-4)
