@@ -17,10 +17,10 @@ import torch
 from gymnasium import spaces
 from torch import Tensor
 
-from rare_envs.control.idm import steering_control
+from rare_envs.control.idm import yaw_rate_towards
 from rare_envs.devices import can_look, constant
 from rare_envs.traffic.road import Road
-from rare_envs.traffic.state import State
+from rare_envs.traffic.state import State, steering_for
 
 ACTIONS = ("continuous", "discrete", "meta")
 """Kinds of actions."""
@@ -40,12 +40,7 @@ LANE_LEFT, IDLE, LANE_RIGHT, FASTER, SLOWER = range(len(META_ACTIONS))
 
 
 def action_space() -> "spaces.Box[np.float32]":
-    """Return the space of the continuous action: acceleration and steering, each in [-1, 1].
-
-    Example:
-        >>> action_space()
-        Box(-1.0, 1.0, (2,), float32)
-    """
+    """Return the space of the continuous action: acceleration and steering, each in [-1, 1]."""
     return spaces.Box(-1.0, 1.0, (2,), np.float32)
 
 
@@ -155,9 +150,8 @@ def follow_meta_actions(
 def update_aim(aim: Aim, action: Tensor, y: Tensor, speed: Tensor, road: Road) -> Aim:
     """Return the targets after meta-actions, all of one shape.
 
-    Left and right move the target lane by one from the present target, if there is such a lane and its middle is within
-    two lane widths of the vehicle. Faster and slower aim for the speed after or before the one nearest to the vehicle's
-    present speed (not to the present target).
+    Left and right move the target lane by one, if there is such a lane and its middle is within two lane widths of the
+    vehicle. Faster and slower aim for the speed after or before the one nearest to the vehicle's present speed.
     """
     edges = constant(road.edges, y)
     aside = (action == LANE_RIGHT).long() - (action == LANE_LEFT).long()
@@ -170,10 +164,9 @@ def update_aim(aim: Aim, action: Tensor, y: Tensor, speed: Tensor, road: Road) -
 
 
 def control_towards(aim: Aim, x: Tensor, y: Tensor, heading: Tensor, speed: Tensor, road: Road) -> Tensor:
-    """Return acceleration [m/s^2] and steering [rad] of HighwayEnv's two controllers for one tick: (...) -> (..., 2).
+    """Return acceleration, (target speed - speed) / 0.6 s [m/s^2], and steering [rad], (...) -> (..., 2).
 
-    The acceleration is (target speed - speed) / 0.6 s, without a limit; `steering_control` goes to the middle of the
-    target lane.
+    Without a limit; `yaw_rate_towards` goes to the middle of the target lane.
     """
     acceleration = (constant(tuple(TARGET_SPEEDS), speed)[aim.speed] - speed) / _TAU_SPEED
     edges = constant(road.edges, y)
@@ -181,7 +174,8 @@ def control_towards(aim: Aim, x: Tensor, y: Tensor, heading: Tensor, speed: Tens
         ahead = road.reference_line.at(x + speed * _TAU_PURSUIT).heading - road.reference_line.at(x).heading
         heading = heading - ahead
     offset = y - (edges[aim.lane + 1] + edges[aim.lane]) / 2
-    return torch.stack((acceleration, steering_control(offset, heading, speed)), dim=-1)
+    steering = steering_for(yaw_rate_towards(offset, heading, speed), speed)
+    return torch.stack((acceleration, steering), dim=-1)
 
 
 def _nearest_speed(speed: Tensor) -> Tensor:

@@ -99,7 +99,7 @@ def glance_duration(share: Tensor) -> Tensor:
 
 
 def remaining_duration(share: Tensor) -> Tensor:
-    """Return the same quantile of what is left of a glance at a moment at which the eyes are off the road [s].
+    """Return the same quantile of what is left of a glance at a moment of eyes off the road [s].
 
     In a stationary sequence it has the density P[duration > r] / mean duration (Cox, "Renewal theory", 1962).
     """
@@ -196,11 +196,7 @@ class HumanDriverModel:
 
 
 def in_wandering_zone(state: State, road: Road, wandering: float) -> Tensor:
-    """Return which vehicles are in the ego's lane, or off the centre of the next one towards it, boolean, (B, V).
-
-    The first is the case up to half a lane from the centre of the ego's lane; the second as far as a lane's width less
-    the zone of `wandering` [m] about the centre of its lane.
-    """
+    """Return which vehicles are in the ego's lane, or off the next's centre towards it by `wandering` [m], (B, V)."""
     lane_y = road.centre_of(state.y[:, :1])
     return (state.y[:, 1:] - lane_y).abs() <= road.width - wandering
 
@@ -212,10 +208,7 @@ def look(state: State, noticed: Tensor) -> Percept:
 
 
 def inverse_tau(percept: Percept, speed: Tensor) -> Tensor:
-    """Return how fast the most urgent leader comes closer, as a share of its gap [1/s], (B,); 0 without one.
-
-    It is the inverse of the time to collision, which tau, the optical size over its rate of change, gives to the eye.
-    """
+    """Return how fast the most urgent leader comes closer, as a share of its gap [1/s], (B,), 0 without: 1 / TTC."""
     gap = (percept.distance - VEHICLE_LENGTH).clamp(min=NEAR_ZERO)
     ahead = percept.noticed & (percept.distance >= 0.0)
     closing = torch.where(ahead, speed[:, None] - percept.speed, 0.0)

@@ -30,37 +30,19 @@ MAX_HEADING_COMMAND = np.pi / 4
 
 
 def lane_keeping(y: Tensor, heading: Tensor, speed: Tensor, road: Road) -> Tensor:
-    """Return the steering angle of HighwayEnv's controller towards the centre of the nearest lane.
+    """Return the steering angle of HighwayEnv's controller towards the centre of the nearest lane [rad], (B,).
 
     Offset to heading command (proportional, 0.6 s), heading error to yaw rate (0.2 s), yaw rate to steering angle.
     On a curve of radius R it runs wide by 0.12 s^2 v^2 / R, 3 cm at 30 m/s on the I-80.
-
-    Args:
-        y: Position across the road [m], shape (B,).
-        heading: Heading [rad], shape (B,).
-        speed: Speed [m/s], shape (B,).
-        road: The road they are on.
-
-    Returns:
-        Steering angle [rad], shape (B,).
-
-    Example:
-        >>> from rare_envs.traffic import straight
-        >>> zero = torch.zeros(1)
-        >>> round(lane_keeping(zero + 0.5, zero, zero + 20.0, straight(1)).item(), 4)  # to the left, back to the lane
-        -0.0521
     """
     offset = y - road.centre_of(y)
-    return torch.zeros_like(y) if are_zero(offset, heading) else steering_control(offset, heading, speed)
-
-
-def steering_control(offset: Tensor, heading: Tensor, speed: Tensor) -> Tensor:
-    """Return HighwayEnv's steering angle [rad] back to a line at an offset to the right of it [m], any shape."""
-    return steering_for(yaw_rate_towards(offset, heading, speed), speed.clamp(min=NEAR_ZERO))
+    if are_zero(offset, heading):
+        return torch.zeros_like(y)
+    return steering_for(yaw_rate_towards(offset, heading, speed), speed)
 
 
 def yaw_rate_towards(offset: Tensor, heading: Tensor, speed: Tensor) -> Tensor:
-    """Return the yaw rate that `steering_control` asks for [rad/s]; arguments as there."""
+    """Return HighwayEnv's yaw rate [rad/s] back to a line at an offset to the right of it [m], any shape."""
     heading_command = torch.asin((offset / (-TAU_LATERAL * speed.clamp(min=NEAR_ZERO))).clamp(-1.0, 1.0))
     heading_command = heading_command.clamp(-MAX_HEADING_COMMAND, MAX_HEADING_COMMAND)
     return (1.0 / TAU_HEADING) * (heading_command - heading)
@@ -141,16 +123,7 @@ class IDM:
         return cls(desired_speed, 1.5, 3.0, 5.0, 4.0, 10.0, 0.0, 6.0, VEHICLE_LENGTH)
 
     def acceleration(self, speed: Tensor, lead: Lead, desired_speed: Tensor | None = None) -> Tensor:
-        """Return the IDM acceleration.
-
-        Args:
-            speed: Speed of the follower [m/s], shape (B,).
-            lead: Its lead.
-            desired_speed: v0 [m/s] of each follower, shape (B,), in place of the common one.
-
-        Returns:
-            Acceleration [m/s^2], shape (B,).
-        """
+        """Return accelerations [m/s^2] of followers at speeds [m/s], (B,), with a desired one of their own or one."""
         ratio = speed / (scalars((self.desired_speed,), speed)[0] if desired_speed is None else desired_speed)
         return self.combine(ratio, self.interaction(speed, ratio, lead))
 

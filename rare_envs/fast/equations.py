@@ -206,7 +206,7 @@ def off_road(y: float, road: RoadNumbers) -> bool:
 
 @compiled
 def steer_to_line(offset: float, heading: float, speed: float) -> float:
-    """Return the steering angle [rad]: `rare_envs.control.idm.steering_control`."""
+    """Return the steering angle [rad]: `rare_envs.control.idm.yaw_rate_towards`."""
     speed = max(speed, _NEAREST)
     command = math.asin(clip(offset / (_LATERAL_GAIN * speed), -ONE, ONE))
     command = clip(command, -_MAX_HEADING, _MAX_HEADING)

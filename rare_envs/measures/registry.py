@@ -13,6 +13,8 @@ import torch
 from torch import Tensor
 
 from rare_envs.devices import constant, may_hold
+from rare_envs.measures import longitudinal as line
+from rare_envs.measures import two_dimensional as plane
 from rare_envs.measures.base import (
     ADDED_MAX,
     COLLISION,
@@ -23,48 +25,7 @@ from rare_envs.measures.base import (
     Moment,
     TraceMeasure,
 )
-from rare_envs.measures.longitudinal import (
-    AT_START,
-    DECELERATION_MAX,
-    MAX_BRAKING,
-    TTC_MAX,
-    btn,
-    drac,
-    evasive_manoeuvre,
-    lidar_ttc,
-    lidar_ttc_terms,
-    mttc,
-    name_lidar_terms,
-    required_deceleration,
-    tet,
-    thw,
-    tit,
-    ttb,
-    ttc,
-    ttc_terms,
-)
 from rare_envs.measures.temporal_logic import stl
-from rare_envs.measures.two_dimensional import (
-    CLEARANCE_MAX,
-    EARLY_SHARE,
-    MARGIN_MAX,
-    clearance,
-    clearance_terms,
-    contact_time_terms,
-    find_nearest_pair,
-    find_vehicle_or_edge,
-    margin,
-    margin_terms,
-    name_edge_terms,
-    name_pairs,
-    pair_clearance,
-    pair_clearance_terms,
-    pet,
-    rss_lateral,
-    rss_longitudinal,
-    rss_margin,
-    ttc_2d,
-)
 from rare_envs.plugins import did_you_mean, import_object
 from rare_envs.traffic.crash import crash_of
 
@@ -90,54 +51,43 @@ def _negative_contact_speed(moment: Moment) -> Tensor:
 
 def _to_vehicles_and_edge(of: Callable[[Moment], Tensor]) -> MeasureTerms:
     """Return terms that are times to each other vehicle and to the edge of the road."""
-    return MeasureTerms(of, find_vehicle_or_edge, name_edge_terms)
+    return MeasureTerms(of, plane.find_vehicle_or_edge, plane.name_edge_terms)
 
 
-CLEARANCE = Measure(
-    clearance,
-    unit="m",
-    terms=MeasureTerms(clearance_terms, cuts=(EARLY_SHARE,), unattained=CLEARANCE_MAX),
-    collisions_only=True,
-)
+_SOON: dict[str, Any] = {"cuts": (plane.EARLY_SHARE,), "unattained": plane.CLEARANCE_MAX}
+CLEARANCE = Measure(plane.clearance, unit="m", terms=MeasureTerms(plane.distances, **_SOON), collisions_only=True)
 """Distance to the nearest vehicle. A collision belongs to the vehicle that was hit, off the road to the nearest."""
-PAIR_CLEARANCE = Measure(
-    pair_clearance,
-    unit="m",
-    terms=MeasureTerms(
-        pair_clearance_terms, find_nearest_pair, name_pairs, cuts=(EARLY_SHARE,), unattained=CLEARANCE_MAX
-    ),
-    collisions_only=True,
-)
+_PAIRS = MeasureTerms(partial(plane.distances, which="all"), plane.find_nearest_pair, plane.name_pairs, **_SOON)
+PAIR_CLEARANCE = Measure(plane.pair_clearance, unit="m", terms=_PAIRS, collisions_only=True)
 """Distance of the two vehicles that are nearest to each other, the ego or not."""
-
+_BEAMS = MeasureTerms(line.lidar_ttc_terms, None, line.name_lidar_terms, (line.AT_START,), line.TTC_MAX)
+_BRAKING, _SUM, _MARGIN = -line.DECELERATION_MAX, -ADDED_MAX, -plane.MARGIN_MAX
 MEASURES: MappingProxyType[str, EpisodeMeasure] = MappingProxyType(
     {
-        "ttc": Measure(ttc, terms=_to_vehicles_and_edge(ttc_terms), collisions_only=True),
-        "lidar_ttc": Measure(
-            lidar_ttc,
-            sees=True,
-            collision=None,
-            terms=MeasureTerms(lidar_ttc_terms, names=name_lidar_terms, cuts=(AT_START,), unattained=TTC_MAX),
-        ),
-        "ttc_2d": Measure(ttc_2d, terms=_to_vehicles_and_edge(contact_time_terms), collisions_only=True),
-        "mttc": Measure(mttc, collisions_only=True),
-        "thw": Measure(thw, collisions_only=True),
-        "drac": Measure(drac, collision=-DECELERATION_MAX, critical=3.4, unit="m/s^2"),
+        "ttc": Measure(line.ttc, terms=_to_vehicles_and_edge(line.ttc_terms), collisions_only=True),
+        "lidar_ttc": Measure(line.lidar_ttc, sees=True, collision=None, terms=_BEAMS),
+        "ttc_2d": Measure(plane.ttc_2d, terms=_to_vehicles_and_edge(plane.contact_time_terms), collisions_only=True),
+        "mttc": Measure(line.mttc, collisions_only=True),
+        "thw": Measure(line.thw, collisions_only=True),
+        "drac": Measure(line.drac, collision=_BRAKING, critical=3.4, unit="m/s^2"),
         "required_deceleration": Measure(
-            required_deceleration, collision=-DECELERATION_MAX, critical=MAX_BRAKING, unit="m/s^2"
+            line.required_deceleration, collision=_BRAKING, critical=line.MAX_BRAKING, unit="m/s^2"
         ),
-        "btn": Measure(btn, collision=-DECELERATION_MAX, critical=1.0, unit=""),
-        "near_crash": Measure(evasive_manoeuvre, collision=-DECELERATION_MAX, critical=1.0, unit=""),
-        "ttb": Measure(ttb, collision=-TTC_MAX),
-        "pet": TraceMeasure(pet, unit="s"),
-        "rss_longitudinal": Measure(rss_longitudinal, collision=-MARGIN_MAX, unit="m"),
-        "rss_lateral": Measure(rss_lateral, collision=-MARGIN_MAX, unit="m"),
-        "rss_margin": Measure(rss_margin, collision=-MARGIN_MAX, unit="m"),
+        "btn": Measure(line.btn, collision=_BRAKING, critical=1.0, unit=""),
+        "near_crash": Measure(line.evasive_manoeuvre, collision=_BRAKING, critical=1.0, unit=""),
+        "ttb": Measure(line.ttb, collision=-line.TTC_MAX),
+        "pet": TraceMeasure(plane.pet, unit="s"),
+        "rss_longitudinal": Measure(plane.rss_longitudinal, collision=_MARGIN, unit="m"),
+        "rss_lateral": Measure(plane.rss_lateral, collision=_MARGIN, unit="m"),
+        "rss_margin": Measure(plane.rss_margin, collision=_MARGIN, unit="m"),
         "clearance": CLEARANCE,
-        "tet": Measure(tet, adds=True, critical=1.0, collision=-ADDED_MAX),
-        "tit": Measure(tit, adds=True, critical=1.0, collision=-ADDED_MAX, unit="s^2"),
+        "tet": Measure(line.tet, adds=True, critical=1.0, collision=_SUM),
+        "tit": Measure(line.tit, adds=True, critical=1.0, collision=_SUM, unit="s^2"),
         "margin": Measure(
-            margin, collision=_negative_contact_speed, terms=_to_vehicles_and_edge(margin_terms), collisions_only=True
+            plane.margin,
+            collision=_negative_contact_speed,
+            terms=_to_vehicles_and_edge(plane.margin_terms),
+            collisions_only=True,
         ),
     }
 )

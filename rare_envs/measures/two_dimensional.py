@@ -51,30 +51,20 @@ def ttc_2d(moment: Moment) -> Tensor:
     return contact_time_terms(moment).amin(1).clamp(max=TTC_MAX)
 
 
-def clearance_terms(moment: Moment) -> Tensor:
-    """Return the distance to each other vehicle [m], at most `CLEARANCE_MAX`, shape (B, N - 1)."""
-    return _distances(moment, "ego")
+def distances(moment: Moment, which: Which = "ego") -> Tensor:
+    """Return the distances of P pairs of vehicles [m], at most `CLEARANCE_MAX`, shape (B, P)."""
+    met = encounter(moment.state, moment.road, which)
+    return box_distance(met.axes, met.other_heading - met.heading).clamp(GAP_MIN, CLEARANCE_MAX)
 
 
 def clearance(moment: Moment) -> Tensor:
     """Return the exact distance between the ego's body and the nearest other [m], in [0.01, 1000], shape (B,)."""
-    return least(clearance_terms(moment), CLEARANCE_MAX)
-
-
-def pair_clearance_terms(moment: Moment) -> Tensor:
-    """Return the distance of the vehicles of each pair [m], those with the ego first, shape (B, N (N - 1) / 2)."""
-    return _distances(moment, "all")
+    return least(distances(moment), CLEARANCE_MAX)
 
 
 def pair_clearance(moment: Moment) -> Tensor:
     """Return the distance of the two vehicles that are nearest to each other [m], the ego or not, shape (B,)."""
-    return pair_clearance_terms(moment).amin(1)
-
-
-def _distances(moment: Moment, which: Which) -> Tensor:
-    """Return the distance of P pairs [m], shape (B, P)."""
-    met = encounter(moment.state, moment.road, which)
-    return box_distance(met.axes, met.other_heading - met.heading).clamp(GAP_MIN, CLEARANCE_MAX)
+    return distances(moment, "all").amin(1)
 
 
 def margin_terms(moment: Moment) -> Tensor:
@@ -111,7 +101,7 @@ def name_edge_terms(vehicle_names: tuple[str, ...]) -> tuple[str, ...]:
 
 
 def name_pairs(vehicle_names: tuple[str, ...]) -> tuple[str, ...]:
-    """Return the names of `pair_clearance_terms`."""
+    """Return the names of all pairs of vehicles."""
     first, second = pairs(len(vehicle_names))
     return tuple(f"{vehicle_names[i]} and {vehicle_names[j]}" for i, j in zip(first, second, strict=True))
 
@@ -123,14 +113,14 @@ def find_vehicle_or_edge(moment: Moment) -> Tensor:
     """
     apart = ~overlaps(moment.state, moment.road).any(1)
     off = apart & moment.road.off_road(moment.state.y[:, 0])
-    return torch.where(off, moment.state.x.shape[1] - 1, clearance_terms(moment).argmin(1))
+    return torch.where(off, moment.state.x.shape[1] - 1, distances(moment).argmin(1))
 
 
 def find_nearest_pair(moment: Moment) -> Tensor:
     """Return the number of the pair of vehicles that overlaps; where none does, of the nearest with the ego, (B,)."""
-    distances, own = pair_clearance_terms(moment), moment.state.x.shape[1] - 1
+    of_pairs, own = distances(moment, "all"), moment.state.x.shape[1] - 1
     touching = overlaps(moment.state, moment.road, "all").any(1)
-    return torch.where(touching, distances.argmin(1), distances[:, :own].argmin(1))
+    return torch.where(touching, of_pairs.argmin(1), of_pairs[:, :own].argmin(1))
 
 
 PET_MAX = 5.0

@@ -168,9 +168,8 @@ def drive_points(state: State, action: Tensor, dt: float, road: Road) -> Others:
         >>> from rare_envs.scenarios import State, straight
         >>> x = torch.tensor([[0.0, 30.0]])
         >>> state = State(x, 0 * x, 0 * x, torch.full((1, 2), 20.0), theta=x[:, :0])
-        >>> after = drive_points(state, torch.tensor([[[1.0, 0.2]]]), 0.5, straight(2))
-        >>> round(after.heading.item(), 3), after.speed.item()
-        (0.1, 20.5)
+        >>> drive_points(state, torch.tensor([[[1.0, 0.2]]]), 0.5, straight(2)).speed.item()
+        20.5
     """
     x, y, heading, speed = (field[:, 1:] for field in (state.x, state.y, state.heading, state.speed))
     curvature = road.curvature(x)

@@ -48,26 +48,20 @@ def scenario_named(name: str) -> Scenario:
 
 
 def env_id_of(name: str) -> str:
-    """Return the environment id of a scenario's short name, in its newest version, or of an id itself."""
+    """Return the environment id of a scenario's short name, first registered, in its newest version, or of an id."""
     name = complete_id(name)
     if name in SCENARIOS:
         return name
-    ids = _newest_ids()
-    if name not in ids:
-        hint = did_you_mean(name.rpartition("/")[2].lower(), ids)
-        raise ValueError(f"Unknown scenario {name!r}{hint}; there are {', '.join(ids)}.")
-    return ids[name]
-
-
-def _newest_ids() -> dict[str, str]:
-    """Return the ids by the short names of their scenarios: of one name the first registered, in its newest version."""
     ids: dict[str, str] = {}
     for env_id, scenario in SCENARIOS.items():
         family, version = split_version(env_id)
         known, earlier = split_version(ids.setdefault(scenario.name, env_id))
         if known == family and (earlier or 0) < (version or 0):
             ids[scenario.name] = env_id
-    return ids
+    if name not in ids:
+        hint = did_you_mean(name.rpartition("/")[2].lower(), ids)
+        raise ValueError(f"Unknown scenario {name!r}{hint}; there are {', '.join(ids)}.")
+    return ids[name]
 
 
 def split_version(env_id: str) -> tuple[str, int | None]:
@@ -124,10 +118,7 @@ def is_highway_env_id(env_id: object) -> bool:
 
 
 def complete_id(env_id: str) -> str:
-    """Return an id with its namespace: of "CutIn-v0", or "CutIn-kinematics-v0", the one that ends so; else as it is.
-
-    The word "rare_envs:" before it, by which `gym.make` imports this package, is left out.
-    """
+    """Return an id with its namespace: of "CutIn-v0" the one that ends so; else as it is, without "rare_envs:"."""
     if isinstance(env_id, str):  # what is no id is refused where the scenario is looked for
         env_id = env_id.removeprefix("rare_envs:")
     known = (each for name in SCENARIOS for each in (name, kinematics_id(name)))
@@ -140,19 +131,13 @@ HIGHWAY_ENV_LAYOUT = {"observation": "kinematics", "action": "meta"}
 
 
 def kinematics_id(env_id: str) -> str:
-    """Return the id under which an environment has HighwayEnv's layout.
-
-    For `gym.make` and `gym.make_vec`, so that scripts written for HighwayEnv run with nothing but the id changed.
-    """
+    """Return the id under which an environment has HighwayEnv's layout, for `gym.make` and scripts of HighwayEnv."""
     name, _, version = env_id.rpartition("-v")
     return f"{name}-kinematics-v{version}"
 
 
 def split_layout(env_id: str) -> tuple[str, dict[str, str]]:
-    """Return the id of the scenario itself for an id with HighwayEnv's layout, and the keyword arguments it stands for.
-
-    The id may lack its namespace, see `complete_id`.
-    """
+    """Return the id of the scenario itself for one with HighwayEnv's layout, and the keyword arguments it means."""
     layouts, env_id = {kinematics_id(each): each for each in SCENARIOS}, complete_id(env_id)
     known = isinstance(env_id, str) and env_id in layouts
     return (layouts[env_id], dict(HIGHWAY_ENV_LAYOUT)) if known else (env_id, {})

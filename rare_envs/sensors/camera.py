@@ -5,7 +5,6 @@ gives the reasons.
 """
 
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import ClassVar, NamedTuple
@@ -172,12 +171,12 @@ SENSOR_NOISE_DISTRIBUTION = WeatherBeta(*map(np.array, ([2.0], [5.0], [0.0], [10
 """Mean 2.9 levels: a signal-to-noise ratio of 39 dB at full scale."""
 
 
-def weather_parameters(noisy: bool) -> Iterator[tuple[tuple[Parameter, ...], Distribution]]:
-    """Yield parameters of the weather with their distributions, in the order of x; a camera's noise if `noisy`."""
-    yield CONDITIONS[:1], FOG_DISTRIBUTION
-    yield CONDITIONS[1:], SUN_DISTRIBUTION
-    if noisy:
-        yield (SENSOR_NOISE,), SENSOR_NOISE_DISTRIBUTION
+WEATHER: tuple[tuple[tuple[Parameter, ...], Distribution], ...] = (
+    (CONDITIONS[:1], FOG_DISTRIBUTION),
+    (CONDITIONS[1:], SUN_DISTRIBUTION),
+    ((SENSOR_NOISE,), SENSOR_NOISE_DISTRIBUTION),
+)
+"""Parameters of the weather with their distributions, in the order of x; the last for a noisy camera."""
 
 
 class Weather(NamedTuple):
@@ -234,7 +233,3 @@ class CameraContext(NamedTuple):
     def at_start(cls, camera: Camera, weather: Weather) -> "CameraContext":
         """Return the context at time 0."""
         return cls(camera, weather, torch.zeros_like(weather.key))
-
-    def later(self) -> "CameraContext":
-        """Return the context one tick later."""
-        return self._replace(tick=self.tick + 1)

@@ -179,10 +179,7 @@ def _take(field: Tensor, numbers: Tensor) -> Tensor:
 
 
 def _key(distance: Tensor, vehicle: Tensor) -> Tensor:
-    """Return integers that are ordered as the distances are, with the vehicle in the last bits.
-
-    The bits of positive single-precision numbers, read as integers, are ordered as the numbers are.
-    """
+    """Return integers ordered as the distances (the bits of positive singles are), with the vehicle in the last."""
     bits = distance.clamp(min=0.0).float().view(torch.int32).to(torch.int64)
     return (bits << _VEHICLE_BITS) | vehicle
 

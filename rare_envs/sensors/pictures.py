@@ -305,10 +305,7 @@ def _pick(numbers: Tensor, *values: Tensor) -> tuple[Tensor, ...]:
 
 
 def cast_shadows(boxes: Boxes, light: Light, camera: Camera, seen: Pixels) -> Tensor | None:
-    """Return which ground pixels see no sun because of a box, boolean, shape (T, R, W); None if all do.
-
-    Shadows count for all N boxes, that of the camera's own vehicle included.
-    """
+    """Return which ground pixels see no sun because of a box, its own included, boolean, (T, R, W); None if all do."""
     sun_forward, sun_right, sun_up = light.sun[:, :, None].unbind(1)
     forward, right = boxes.corners()
     steep = (BODY_HEIGHT / sun_up)[..., None]
@@ -397,10 +394,9 @@ PictureScene = tuple[Boxes, Light, Lines]
 
 @torch.no_grad()
 def take_picture(state: State, road: Road, context: CameraContext) -> Tensor:
-    """Return the pictures of the cameras of the vehicles in the ego's place, uint8, (B, H, W, 3): red, green and blue.
+    """Return pictures of the cameras of the vehicles in the ego's place, uint8, (B, H, W, 3): red, green and blue.
 
-    Every picture depends on its own row alone, bit for bit. The `viewer` of the context says which vehicle is in the
-    ego's place, see `State.seen_by`.
+    Every picture depends on its own row alone, bit for bit; `viewer` says who is in the ego's place (`State.seen_by`).
     """
     camera, device = context.camera, state.x.device
     seen = pixels(camera, device)

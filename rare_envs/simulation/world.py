@@ -21,7 +21,7 @@ from rare_envs.distributions.space import Distribution, Parameter
 from rare_envs.measures import EpisodeMeasure, Moment
 from rare_envs.measures.registry import find_measure
 from rare_envs.scenarios.base import Others, Scenario, drive_points
-from rare_envs.sensors.camera import Camera, CameraContext, clear_day, read_weather, weather_parameters
+from rare_envs.sensors.camera import WEATHER, Camera, CameraContext, clear_day, read_weather
 from rare_envs.sensors.lidar import perceive_traffic
 from rare_envs.simulation.background import (
     FIRST_DRAWS,
@@ -219,7 +219,7 @@ class World:
         noise = noise_size(self.clock.ticks, self.scenario.vehicles - 1) if self._noisy and self.noise is True else 0
         found: dict[str, list[Block]] = {"weather": [], "weights": []}
         if self.sensing.weather:
-            found["weather"] = list(weather_parameters(noisy=self.noise is not False))
+            found["weather"] = list(WEATHER[:-1] if self.noise is False else WEATHER)
         if weights is not None:
             own = Parameter("weights", "", -math.inf, math.inf, "of the drivers' last layer", weights.dim)
             found["weights"] = [((own,), weights)]
@@ -322,7 +322,7 @@ class World:
             collided=collided,
             perception=perception,
             statistics=statistics,
-            camera_context=None if camera_context is None else camera_context.later(),
+            camera_context=camera_context and camera_context._replace(tick=camera_context.tick + 1),
         )
 
     def decode_meta_actions(

@@ -49,25 +49,10 @@ def boxes_overlap(
     size: tuple[Tensor | float, Tensor | float] = _SIZE,
     other_size: tuple[Tensor | float, Tensor | float] = _SIZE,
 ) -> Tensor:
-    """Return whether two vehicles' bodies overlap, by the separating axis theorem.
+    """Return whether two bodies share more than their edges, by the separating axis theorem; any shape.
 
-    It is true where all of `Axes.gap` are negative, to rounding.
-
-    Args:
-        dx: Centre of the other less centre of the first [m], any shape; the other tensors have the same.
-        dy: Likewise across the road [m].
-        heading: Headings of the first [rad].
-        other_heading: Headings of the other [rad].
-        size: Length and width of the first [m].
-        other_size: Of the other [m].
-
-    Returns:
-        True where the boxes share more than their edges.
-
-    Example:
-        >>> dx, dy, straight = torch.tensor([4.9, 5.1]), torch.zeros(2), torch.zeros(2)
-        >>> boxes_overlap(dx, dy, straight, straight).tolist()
-        [True, False]
+    Arguments are the way to the other's centre [m], headings [rad], and length and width [m] of both. It is true where
+    all of `Axes.gap` are negative, to rounding.
     """
     turn = other_heading - heading
     along, across = rotate(dx, dy, torch.cos(heading), torch.sin(heading))
@@ -112,10 +97,7 @@ def axes_of(dx: Tensor, dy: Tensor, heading: Tensor, other_heading: Tensor) -> A
 
 
 def box_distance(axes: Axes, turn: Tensor) -> Tensor:
-    """Return the exact distance of two bodies [m], (...), the negative depth of an overlap; turn is between headings.
-
-    The distance of two convex polygons that are apart is that of a corner of one from the other.
-    """
+    """Return the exact distance of two bodies [m], a corner from the other; the negative depth of an overlap, (...)."""
     along, across, other_along, other_across = axes.offset.unbind(-1)
     corners = _corner_distance(along, across, turn)
     own = _corner_distance(-other_along, -other_across, -turn)
@@ -149,7 +131,7 @@ def crossing(axes: Axes, rate: Tensor) -> tuple[Tensor, Tensor]:
 def time_to_contact(axes: Axes, rate: Tensor) -> Tensor:
     """Return the exact time until two bodies touch if velocities and headings stay [s], (...); 0 now, inf for never.
 
-    They overlap while they do along every axis: from the last entry to the first exit. Rates [m/s] are (..., 4).
+    They overlap while they do along every axis: from the last entry to the first exit, at rates [m/s] (..., 4).
     """
     enters, leaves = crossing(axes, rate)
     enter, leave = enters.amax(-1), leaves.amin(-1)
@@ -208,10 +190,7 @@ class Encounter(NamedTuple):
 def encounter(
     state: State, road: Road, which: Which = "ego", before: State | None = None, dt: float = 0.1
 ) -> Encounter:
-    """Return pairs of vehicles, with velocities by speeds and headings or over the tick since `before`.
-
-    They are compared in the world: where the road turns, ways along it are not distances.
-    """
+    """Return pairs of vehicles in the world, with velocities by speeds and headings or over the tick since `before`."""
     x, y, heading = road.to_world(state.x, state.y, state.heading)
     if before is None:
         vx, vy = state.speed * torch.cos(heading), state.speed * torch.sin(heading)
@@ -245,12 +224,7 @@ def overlaps(state: State, road: Road, which: Which = "ego", pose: WorldPose | N
 
 
 class Lead(NamedTuple):
-    """The lead of a follower.
-
-    Example:
-        >>> Lead(gap=torch.tensor([25.0]), closing_speed=torch.tensor([5.0])).gap.item()
-        25.0
-    """
+    """The lead of a follower."""
 
     gap: Tensor
     """Bumper to bumper along the road [m], shape (B,); inf without a lead, negative side by side."""
@@ -264,21 +238,6 @@ def lead_of(state: State, road: Road) -> Lead:
     "Ahead" compares centres. A body reaches into a lane when its centre is within half a lane and half a vehicle of
     the lane's centre, which for a 4 m lane is HighwayEnv's `on_lane` with its margin of 1 m. Gaps are measured along
     the road's reference line.
-
-    Args:
-        state: Traffic of B scenarios.
-        road: Their road.
-
-    Returns:
-        Gap and closing speed, shape (B,) each.
-
-    Example:
-        >>> from rare_envs.traffic import straight
-        >>> x = torch.tensor([[0.0, 30.0]])
-        >>> state = State(x, 0 * x, 0 * x, torch.tensor([[20.0, 15.0]]), theta=x[:, :0])
-        >>> lead = lead_of(state, straight(1))
-        >>> lead.gap.item(), lead.closing_speed.item()  # vehicles are 5 m long
-        (25.0, 5.0)
     """
     own, *others = state.vehicles
     numbers = (0.0, (road.width + VEHICLE_WIDTH) / 2, torch.inf, VEHICLE_LENGTH)

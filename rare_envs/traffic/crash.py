@@ -78,25 +78,12 @@ class Crash(NamedTuple):
 
 
 def injury_risk(delta_v: Tensor, mode: str = "all") -> Tensor:
-    """Return the probability of a serious injury (MAIS 3 or more) of an occupant by the delta-v of the vehicle.
+    """Return the probability of a serious injury (MAIS 3 or more) of an occupant by delta-v [m/s], any shape.
 
     Logistic, 1 / (1 + exp(-(a + b delta-v))), from tow-away crashes of light vehicles in the United States, 2010 to
-    2015 (NASS-CDS); restraint, age and intrusion are averaged over. That sample has few light crashes, and the curve
-    does not go to 0 at 0 (about 0.1 %), so it is an order of severity rather than a forecast.
-
-    Args:
-        delta_v: Change of velocity in the impact [m/s], any shape.
-        mode: "frontal", "rear" (struck from behind) or "all" crashes.
-
-    Returns:
-        Probability, same shape.
-
-    References:
-        Wang, "MAIS(05/08) injury probability curves as functions of delta V", NHTSA, DOT HS 813 219, 2022.
-
-    Example:
-        >>> round(injury_risk(torch.tensor(19.0)).item(), 3)  # 42.5 mph
-        0.501
+    2015 (NASS-CDS), in the mode "frontal", "rear" (struck from behind) or "all" (Wang, DOT HS 813 219, 2022);
+    restraint, age and intrusion are averaged over. That sample has few light crashes, and the curve does not go to 0
+    at 0 (about 0.1 %), so it is an order of severity rather than a forecast.
     """
     intercept, slope = MAIS3[mode]
     return torch.sigmoid(intercept + slope * MPH * delta_v)
@@ -194,7 +181,7 @@ def describe_crash(crash: Crash, row: int = 0) -> dict[str, Any] | None:
         "injury_risk" (both of the two vehicles in this order).
 
     Example:
-        >>> from rare_envs.traffic import State, straight
+        >>> from rare_envs.scenarios import State, straight
         >>> x = torch.tensor([[0.0, 4.9]])  # bodies of 5 m
         >>> state = State(x, 0 * x, 0 * x, torch.tensor([[20.0, 10.0]]), theta=x[:, :0])
         >>> described = describe_crash(crash_of(state, straight(1)))

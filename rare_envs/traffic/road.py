@@ -30,13 +30,7 @@ _NEWTON_STEPS = 4
 
 
 class WorldPose(NamedTuple):
-    """Places in the flat world, of vehicles or of a reference line; all of one shape.
-
-    Example:
-        >>> zero = torch.zeros(1)
-        >>> i80().place(zero + 300.0, zero, zero).heading.sign().tolist()  # the road has turned to the left
-        [-1.0]
-    """
+    """Places in the flat world, of vehicles or of a reference line; all of one shape."""
 
     x: Tensor
     """Along the tangent at the start of the road [m]."""
@@ -84,14 +78,7 @@ class ReferenceLine:
             raise ValueError(f"Expected a curve that turns by at most {MAX_TURN} rad from its start, got {turn:.3g}.")
 
     def at(self, s: Tensor) -> WorldPose:
-        """Return the points of the line.
-
-        Args:
-            s: Way along the curve [m], any shape; negative before its start.
-
-        Returns:
-            The points, of the same shape, differentiable in s.
-        """
+        """Return the points at ways s along the line [m], any shape, negative before its start; differentiable in s."""
         (x0, x1, x2, x3, y0, y1, y2, y3, heading, curvature, slope), ds = self._cell(s)
         return WorldPose(
             torch.addcmul(x0, ds, torch.addcmul(x1, ds, torch.addcmul(x2, ds, x3))),
@@ -100,20 +87,10 @@ class ReferenceLine:
             torch.addcmul(curvature, ds, slope),
         )
 
-    def curvature_at(self, s: Tensor) -> Tensor:
-        """Return the curvature alone [1/m]."""
-        (*_, curvature, slope), ds = self._cell(s)
-        return torch.addcmul(curvature, ds, slope)
-
     def nearest(self, x: Tensor, y: Tensor) -> Tensor:
-        """Return the way s along the line of the point nearest to (x, y), by Newton's method.
+        """Return the way s [m] along the line of the point nearest to (x, y), any shape, by Newton's method.
 
-        Args:
-            x: Along the tangent at the start [m], any shape; the other tensor has the same.
-            y: To the right of it [m], within a fifth of the least radius of the curve.
-
-        Returns:
-            s [m], of the same shape, differentiable once.
+        (x, y) is within a fifth of the least radius of the curve; s is differentiable once.
         """
         with torch.no_grad():
             s = x.clone()
@@ -141,8 +118,8 @@ class ReferenceLine:
 def list_cells(line: ReferenceLine) -> list[tuple[float, ...]]:
     """Return the cells of a line between its first and its last knot, in order, as numbers.
 
-    They are length [m], place x, y [m] and heading [rad] of the start, and a, b and c: from there the line goes
-    s + a s^3 along its heading, and b s^2 + c s^3 to the right of it.
+    Length [m], place x, y [m] and heading [rad] of the start, and a, b and c: from there the line goes s + a s^3 along
+    its heading, and b s^2 + c s^3 to the right of it.
     """
     table, step = _table(line, torch.float64, torch.device("cpu"))
     rows = table[1:-1].tolist()  # without the straights before and after the curve
@@ -257,20 +234,12 @@ class Road:
 
     def curvature(self, x: Tensor) -> Tensor:
         """Return the curvature of the reference line [1/m], positive where the road turns to the right."""
-        return torch.zeros_like(x) if self.reference_line is None else self.reference_line.curvature_at(x)
+        return torch.zeros_like(x) if self.reference_line is None else self.reference_line.at(x).curvature
 
     def to_world(self, x: Tensor, y: Tensor, heading: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Transform road to world coordinates.
+        """Transform x, y [m] and heading [rad] in the road to the flat world, any shape.
 
-        The world is flat. Its X axis is the reference line's tangent at x = 0, its Y axis points to the right of it.
-
-        Args:
-            x: Along the road [m].
-            y: Across the road [m].
-            heading: Relative to the road [rad].
-
-        Returns:
-            X [m], Y [m] and the heading relative to the X axis [rad].
+        Its X axis is the reference line's tangent at x = 0, its Y axis points to the right of it.
         """
         if self.reference_line is None:
             return x, y, heading
@@ -289,16 +258,7 @@ class Road:
         )
 
     def from_world(self, x: Tensor, y: Tensor, heading: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Transform world to road coordinates, the inverse of `to_world`.
-
-        Args:
-            x: X [m].
-            y: Y [m]; within a fifth of the road's least radius of the reference line.
-            heading: Relative to the X axis [rad].
-
-        Returns:
-            x and y in the road [m], and the heading relative to the road [rad].
-        """
+        """Transform world to road coordinates: the inverse of `to_world`, up to a fifth of the road's least radius."""
         if self.reference_line is None:
             return x, y, heading
         s = self.reference_line.nearest(x, y)

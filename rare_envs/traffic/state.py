@@ -25,7 +25,7 @@ LANE_WIDTH = 4.0
 
 
 class Motion(NamedTuple):
-    """Vehicles at one moment, all fields of one shape: (B, N - 1) of those around the ego, (B,) of one.
+    """Vehicles at one moment [m, rad, m/s], all fields of one shape: (B, N - 1) of those around the ego, (B,) of one.
 
     Example:
         >>> one = torch.full((1, 1), 12.0)
@@ -85,14 +85,7 @@ class State(_Fields):
 
     @classmethod
     def of_vehicles(cls, vehicles: Sequence[Sequence[Tensor]], theta: Tensor) -> State:
-        """Return the state of N vehicles, of which the columns are copied, all at once.
-
-        Each stays contiguous in memory, as ticks work on one vehicle's at a time.
-
-        Args:
-            vehicles: x, y, heading and speed of each, shape (B,) each.
-            theta: As the field.
-        """
+        """Return the state of N vehicles by x, y, heading and speed (B,) of each, copied, contiguous as ticks need."""
         n = len(vehicles)
         table = torch.stack([column for field in zip(*vehicles, strict=True) for column in field])
         x, y, heading, speed = table.view(4, n, table.shape[1]).mT.unbind(0)
@@ -105,11 +98,7 @@ class State(_Fields):
         return type(self), tuple(self)
 
     def seen_by(self, vehicle: int) -> State:
-        """Return the same traffic with another vehicle in the ego's place; the others follow in their order.
-
-        Args:
-            vehicle: Index of the vehicle that becomes number 0.
-        """
+        """Return the same traffic with another vehicle in the ego's place; the others follow in their order."""
         if vehicle == 0:
             return self
         order = [vehicle, *(j for j in range(self.x.shape[1]) if j != vehicle)]
@@ -150,33 +139,13 @@ def bicycle(
     dt: float,
     curvature: Tensor | None = None,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Move vehicles by one tick with the kinematic bicycle model.
+    """Move vehicles by one tick [s] with the kinematic bicycle model; all tensors of one shape.
 
-    beta = atan(tan(steering) / 2), then x, y and heading move with the old speed and heading, and the speed last.
-    HighwayEnv's `Vehicle.step` is the same but for one deliberate difference: it lets vehicles reverse, ours stop.
-
-    Args:
-        x: Centres along the road [m], any shape; the other tensors have the same.
-        y: Centres across the road [m].
-        heading: Headings [rad].
-        speed: Speeds [m/s].
-        acceleration: Accelerations [m/s^2].
-        steering: Front wheel angles [rad].
-        dt: Tick [s].
-        curvature: Of the road at x [1/m], positive to the right; None for a straight road.
-
-    Returns:
-        x, y, heading and speed after the tick. On a straight road, where nobody steers and all headings are 0, `y` and
-        `heading` are the tensors that were given: write into neither.
-
-    References:
-        Polack et al., "The kinematic bicycle model", 2017; HighwayEnv, `vehicle/kinematics.py`.
-
-    Example:
-        >>> zero = torch.zeros(1)
-        >>> x, y, heading, speed = bicycle(zero, zero, zero, zero + 20.0, zero + 1.0, zero, dt=0.1)
-        >>> round(x.item(), 2), round(speed.item(), 2)
-        (2.0, 20.1)
+    beta = atan(tan(steering) / 2), then x, y [m] and heading [rad] move with the old speed and heading, and the speed
+    [m/s] last, by acceleration [m/s^2] and front wheel angle [rad] (Polack et al., "Kinematic bicycle model", 2017).
+    HighwayEnv's `Vehicle.step` is the same but for one deliberate difference: it lets vehicles reverse, ours stop. The
+    curvature [1/m] is the road's at x. On a straight road (None), where nobody steers and all headings are 0, `y` and
+    `heading` are the tensors that were given: write into neither.
     """
     tick, half, half_length = scalars((dt, 0.5, VEHICLE_LENGTH / 2), speed)
     distance, after = speed * tick, (speed + acceleration * tick).clamp_min(0.0)
@@ -191,10 +160,9 @@ def bicycle(
 
 
 def steering_for(yaw_rate: Tensor, speed: Tensor) -> Tensor:
-    """Return the steering angle [rad] with which `bicycle` turns at a yaw rate [rad/s] and speed [m/s], (B,).
+    """Return the steering angle [rad] with which `bicycle` turns at a yaw rate [rad/s] and speed [m/s], any shape.
 
-    Inverts yaw rate = v sin(beta) / (l / 2), beta = atan(tan(steering) / 2), with l the vehicle's length. A vehicle
-    too slow to turn as fast as wanted steers by `STEERING_LIMIT`.
+    Inverts yaw rate = v sin(beta) / (l / 2); a vehicle too slow to turn as fast as wanted steers by `STEERING_LIMIT`.
     """
     sine = VEHICLE_LENGTH / 2 / speed.clamp(min=NEAR_ZERO) * yaw_rate
     slip = torch.asin(sine.clamp(-MAX_SLIP_SINE, MAX_SLIP_SINE))
@@ -211,30 +179,9 @@ def point_mass(
     dt: float,
     curvature: Tensor | None = None,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Move vehicles by one tick as points that turn at will: the model of learned drivers.
+    """Move vehicles by one tick [s] as points that turn by yaw rates in the world [rad/s]; arguments as of `bicycle`.
 
-    Args:
-        x: Centres along the road [m], any shape; the other tensors have the same.
-        y: Centres across the road [m].
-        heading: Headings relative to the road [rad].
-        speed: Speeds [m/s].
-        acceleration: Accelerations [m/s^2].
-        yaw_rate: Change of the heading in the world [rad/s].
-        dt: Tick [s].
-        curvature: Of the road at x [1/m], positive to the right; None for a straight road.
-
-    Returns:
-        x, y, heading and speed after the tick; the speed is not negative.
-
-    References:
-        O'Kelly, Sinha, Namkoong, Duchi and Tedrake, "Scalable end-to-end autonomous vehicle testing via rare-event
-        simulation", 2018: the model of their released simulator.
-
-    Example:
-        >>> zero = torch.zeros(1)
-        >>> x, y, heading, speed = point_mass(zero, zero, zero, zero + 20.0, zero, zero + 0.3, dt=0.1)
-        >>> round(heading.item(), 3)
-        0.03
+    The model of learned drivers, that of the simulator released by O'Kelly et al. (2018).
     """
     (tick,) = scalars((dt,), speed)
     distance = speed * tick

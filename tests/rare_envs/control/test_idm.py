@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from rare_envs.control.idm import IDM, lane_keeping, steering_control
+from rare_envs.control.idm import IDM, lane_keeping
 from rare_envs.traffic.bodies import Lead
 from rare_envs.traffic.road import straight
 from rare_envs.traffic.state import bicycle
@@ -80,9 +80,11 @@ def test_steering_by_hand() -> None:
     """3 m to the right at 20 m/s: heading command -asin(3 / 12), yaw rate 5 times that, slip asin(2.5 rate / v)."""
     yaw_rate = -5.0 * math.asin(3.0 / (0.6 * 20.0))
     steering = math.atan(2.0 * math.tan(math.asin(2.5 * yaw_rate / 20.0)))
-    assert steering_control(tensor(3.0), tensor(0.0), tensor(20.0)).item() == pytest.approx(steering, rel=1e-12)
+    assert lane_keeping(tensor(3.0), tensor(0.0), tensor(20.0), straight(1)).item() == pytest.approx(
+        steering, rel=1e-12
+    )
     # the heading that the offset asks for needs no steering
-    held = steering_control(tensor(3.0), tensor(-math.asin(0.25)), tensor(20.0))
+    held = lane_keeping(tensor(3.0), tensor(-math.asin(0.25)), tensor(20.0), straight(1))
     assert held.item() == pytest.approx(0.0, abs=1e-15)
 
 

@@ -12,8 +12,8 @@ from highway_env.vehicle.behavior import IDMVehicle
 from rare_envs.control.idm import IDM
 from rare_envs.control.lane_changing import LaneChangingDriver
 from rare_envs.make import set_up
-from rare_envs.traffic import straight
 from rare_envs.traffic.bodies import LaneTraffic, Lead, boxes_overlap
+from rare_envs.traffic.road import straight
 from rare_envs.traffic.state import State, point_mass
 from tests.rare_envs.traffic_states import traffic
 

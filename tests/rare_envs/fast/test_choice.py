@@ -11,7 +11,7 @@ import torch
 import agents
 import rare_envs
 import samplers
-from rare_envs.control import IDM
+from rare_envs import IDM
 from rare_envs.fast import rollouts
 from rare_envs.scenarios import car_following
 from rare_envs.simulation.world import Measurement

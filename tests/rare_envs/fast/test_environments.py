@@ -11,8 +11,9 @@ from rare_envs.fast import crashes as fast_crashes
 from rare_envs.fast.choice import find_scripted_step
 from rare_envs.fast.equations import RoadNumbers
 from rare_envs.simulation.episode import EpisodeStatistics
-from rare_envs.traffic import crash, straight
+from rare_envs.traffic import crash
 from rare_envs.traffic.bodies import overlaps
+from rare_envs.traffic.road import straight
 from rare_envs.traffic.state import State
 
 

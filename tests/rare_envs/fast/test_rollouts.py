@@ -13,7 +13,7 @@ from stable_baselines3 import A2C, DQN, PPO
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 import rare_envs
-from rare_envs.control import IDM
+from rare_envs import IDM
 from rare_envs.control.actions import DISCRETE_ACTIONS
 from rare_envs.traffic.road import Road, straight
 
