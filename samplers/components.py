@@ -1,14 +1,7 @@
 """Components of proposal mixtures in standard normal space, and the fit of mixtures by expectation-maximisation.
 
-Each component has its density ratio to N(0, I). A covariance that is estimated from few weighted points is drawn
-towards N(0, I) with one special direction.
-
-Where a component is N(0, I) in most directions, its ratio depends on the few others only, which keeps weights exact
-and cheap in hundreds of dimensions.
-
-The von Mises-Fisher-Nakagami distribution is a direction and, independent of it, a radius. N(0, I) is one, with uniform
-directions and a chi-squared square of the radius; d + 3 parameters describe a component where a Gaussian needs
-d (d + 3) / 2.
+Each has its density ratio to N(0, I). Where a component is N(0, I) in most directions, its ratio depends on the few
+others only, which keeps weights exact and cheap in hundreds of dimensions.
 
 References:
     Papaioannou, Geyer and Straub, "Improved cross entropy-based importance sampling with a flexible mixture
@@ -255,16 +248,11 @@ def draw_components(
     return np.concatenate([c.sample(int(k), rng) for c, k in zip(components, counts, strict=True)])
 
 
-LARGEST_RESULTANT = 0.999
-"""Mean resultant lengths above this are cut: the concentration would run away on a few close points."""
-LEAST_CONCENTRATION = 1e-3
-"""Stands for 0, where the direction is uniform: the formulae divide by it."""
-LEAST_SHAPE = 0.5
-"""Least m of a Nakagami distribution."""
-LARGEST_SHAPE = 1e4
-"""A radius with a c.o.v. of 0.5 %; points at one radius would give an infinite m."""
-LARGE_ORDER = 50.0
-"""Order of the Bessel function from which on its asymptotic expansion is used; its logarithm is then exact to 2e-7."""
+LARGEST_RESULTANT = 0.999  # Mean resultant lengths above are cut: a few close points would make kappa run away
+LEAST_CONCENTRATION = 1e-3  # Stands for 0, where the direction is uniform: the formulae divide by it
+LEAST_SHAPE = 0.5  # Least m of a Nakagami distribution
+LARGEST_SHAPE = 1e4  # A radius with a c.o.v. of 0.5 %; points at one radius would give an infinite m
+LARGE_ORDER = 50.0  # Order of a Bessel function from which on its asymptotic expansion is used, exact to 2e-7
 
 
 @dataclass(frozen=True, eq=False)
@@ -272,6 +260,7 @@ class VonMisesFisherNakagami:
     """u = r a with a ~ von Mises-Fisher(mu, kappa) on the unit sphere and r ~ Nakagami(m, omega).
 
     mu (d,) is the mean direction, of length 1, kappa the concentration; r^2 ~ Gamma(m, omega / m), omega = E[r^2].
+    N(0, I) is one; d + 3 parameters describe a component where a Gaussian needs d (d + 3) / 2.
     """
 
     mu: FloatArray
@@ -313,7 +302,13 @@ class VonMisesFisherNakagami:
     def sample(self, n: int, rng: np.random.Generator) -> FloatArray:
         """Draw n independent points, shape (n, d)."""
         radius = np.sqrt(rng.gamma(self.m, self.omega / self.m, n))
-        return radius[:, None] * directions(self.mu, self.kappa, n, rng)
+        if len(self.mu) == 1:  # two directions
+            with_mu = rng.random(n) < 1 / (1 + math.exp(-2 * self.kappa))
+            return radius[:, None] * np.where(with_mu, self.mu[0], -self.mu[0])[:, None]
+        from scipy import stats  # takes a second to import
+
+        law = stats.vonmises_fisher(self.mu, self.kappa)  # type: ignore[arg-type]  # the stubs ask for a whole kappa
+        return radius[:, None] * np.asarray(law.rvs(n, random_state=rng)).reshape(n, len(self.mu))
 
     def log_prob(self, u: FloatArray, /) -> FloatArray:
         """Return the log density at u (n, d), shape (n,)."""
@@ -345,17 +340,6 @@ def log_normaliser(kappa: float, dim: int) -> float:
         series = 1 + (3 * t - 5 * t**3) / (24 * v) + (81 * t**2 - 462 * t**4 + 385 * t**6) / (1152 * v * v)
         log_bessel = root + v * math.log(kappa / (v + root)) - 0.5 * (LOG_TWO_PI + math.log(root)) + math.log(series)
     return v * math.log(kappa) - (v + 1) * LOG_TWO_PI - log_bessel
-
-
-def directions(mu: FloatArray, kappa: float, n: int, rng: np.random.Generator) -> FloatArray:
-    """Draw n directions from the von Mises-Fisher distribution, shape (n, d)."""
-    if len(mu) == 1:  # two directions
-        with_mu = rng.random(n) < 1 / (1 + math.exp(-2 * kappa))
-        return np.asarray(np.where(with_mu, mu[0], -mu[0])[:, None])
-    from scipy import stats  # takes a second to import
-
-    distribution = stats.vonmises_fisher(mu, kappa)  # type: ignore[arg-type]  # the stubs ask for a whole kappa
-    return np.asarray(distribution.rvs(n, random_state=rng)).reshape(n, len(mu))
 
 
 def shrink_covariance(

@@ -17,7 +17,7 @@ FloatArray = NDArray[np.float64]
 LOG_TWO_PI = float(np.log(2 * np.pi))
 
 
-class _ByItsMap:
+class DrawnByItsMap:
     """A distribution of `dim` coordinates that is drawn from by its map from standard normal space, by `rng` alone."""
 
     dim: Any
@@ -32,7 +32,7 @@ class _ByItsMap:
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class IndependentDistributions(_ByItsMap):
+class IndependentDistributions(DrawnByItsMap):
     """The product of distributions, each of some consecutive coordinates."""
 
     blocks: tuple[Any, ...]
@@ -69,7 +69,7 @@ class IndependentDistributions(_ByItsMap):
 
 
 @dataclass(frozen=True, eq=False)
-class Gaussian(_ByItsMap):
+class Gaussian(DrawnByItsMap):
     """N(mean, L L') with a mean (d,) and lower triangular L (d, d)."""
 
     mean: FloatArray
@@ -127,7 +127,7 @@ def gaussian_of_scipy(frozen: Any) -> Gaussian:
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class ScipyDistribution(_ByItsMap):
+class ScipyDistribution(DrawnByItsMap):
     """Independent coordinates with a frozen continuous distribution of `scipy.stats`, k of them for parameters (k,)."""
 
     frozen: Any
@@ -183,7 +183,7 @@ LARGEST_ERROR = 0.02
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class OpenTurnsDistribution(_ByItsMap):
+class OpenTurnsDistribution(DrawnByItsMap):
     """A continuous distribution of OpenTURNS, or a copula, which is one with uniform marginals.
 
     Refused are those whose iso-probabilistic transformation leads elsewhere than to N(0, I) (multivariate Student), or
@@ -197,9 +197,12 @@ class OpenTurnsDistribution(_ByItsMap):
         name = type(self.distribution).__name__
         if not self.distribution.isContinuous():
             raise ValueError(f"Expected a continuous distribution, got {name} of OpenTURNS, which is not.")
-        if self._standard != "Normal" and self.dim > 1:
+        standard = self.distribution.getStandardDistribution()
+        inside = getattr(standard, "getImplementation", None)  # some come in an interface object
+        leads_to = str((standard if inside is None else inside()).getClassName())
+        if leads_to != "Normal" and self.dim > 1:
             raise ValueError(
-                f"The iso-probabilistic transformation of this {name} leads to {self._standard}, not to N(0, I): "
+                f"The iso-probabilistic transformation of this {name} leads to {leads_to}, not to N(0, I): "
                 "use another copula, such as openturns.NormalCopula."
             )
         error = self._density_error() if self.dim <= CHECKED_DIMS else 0.0
@@ -220,13 +223,6 @@ class OpenTurnsDistribution(_ByItsMap):
         log_phi = -0.5 * (u**2).sum(axis=1) - 0.5 * self.dim * LOG_TWO_PI
         return float(np.median(np.abs(self.log_prob(self.from_standard_normal(u)) - log_phi + volume)))
 
-    @cached_property
-    def _standard(self) -> str:
-        """Name of the distribution that the transformation leads to."""
-        standard = self.distribution.getStandardDistribution()
-        inside = getattr(standard, "getImplementation", None)  # some come in an interface object
-        return str((standard if inside is None else inside()).getClassName())
-
     @property
     def dim(self) -> int:
         """Number of coordinates d."""
@@ -246,7 +242,7 @@ class OpenTurnsDistribution(_ByItsMap):
 
     def to_standard_normal(self, x: FloatArray, /) -> FloatArray:
         """Map x (n, d) to u ~ N(0, I)."""
-        if self._standard == "Normal":
+        if self.dim > 1:
             return _map(self.distribution.getIsoProbabilisticTransformation(), x)
         above = np.asarray(self.distribution.computeComplementaryCDF(x))
         return np.where(above < 0.5, -ndtri(above), ndtri(np.asarray(self.distribution.computeCDF(x))))
@@ -266,7 +262,7 @@ class OpenTurnsDistribution(_ByItsMap):
 
     def _find_x(self, u: FloatArray) -> FloatArray:
         """Return the points that OpenTURNS finds for u (n, d); some lie at infinity."""
-        if self._standard == "Normal":
+        if self.dim > 1:
             return _map(self.distribution.getInverseIsoProbabilisticTransformation(), u)
         tail = ndtr(-np.abs(u[:, 0]))
         low, high = (np.asarray(self.distribution.computeQuantile(tail, upper)) for upper in (False, True))

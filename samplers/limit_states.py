@@ -88,11 +88,6 @@ def unannounced_region(announced: float = 4.0, hidden: float = 3.1) -> Reference
     return _reference("unannounced", lambda u: np.where(u[:, 0] < -hidden, -1.0, announced - u[:, 0]), 2, p)
 
 
-def references() -> list[Reference]:
-    """Return one of each kind, for benchmarks; intervals need not hold the p of `unannounced_region`."""
-    return [half_space(), two_modes(), parabola(), four_branches(), plateau(), shell(), unannounced_region()]
-
-
 def _reference(name: str, f: Callable[[FloatArray], ArrayLike], dim: int, p: float) -> Reference:
     return Reference(name, FunctionProblem(f, dim), p)
 

@@ -4,9 +4,6 @@ A kernel proposes candidates that leave N(0, I) invariant; a candidate is taken 
 N(0, I) given f <= level the invariant distribution, without a ratio test. A chain that stays keeps its stored outcome,
 so that this is also right for an f with noise of its own: on (point, noise) together it is exact.
 
-The points of level j + 1 are chains inside {f <= b_(j+1)}, grown from seeds among the points of level j. A
-`LevelPlanner` chooses threshold, seeds and lengths; the loop grows the chains and hands the kernel on.
-
 References:
     Au and Beck, "Estimation of small failure probabilities in high dimensions by subset simulation",
     Probabilistic Engineering Mechanics 16, 2001 (modified Metropolis, section 4).
@@ -20,7 +17,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal, NamedTuple, Protocol
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,105 +35,61 @@ from samplers.sample import (
 )
 
 
-class Kernel(Protocol):
-    """Proposal of the moves of a level's chains, with its adaptation."""
-
-    def start_level(self, seeds: FloatArray) -> Kernel:
-        """Return the kernel for a level whose chains start at these points (n, d)."""
-
-    def propose(self, u: FloatArray, rng: np.random.Generator) -> FloatArray:
-        """Propose a move from each of the points u (n, d); a row equal to its point is a stay."""
-
-    def adapt(self, acceptance: float, iteration: int) -> Kernel:
-        """Return the kernel after the iteration-th step of a level, of which this share was accepted."""
-
-
-@dataclass(frozen=True)
-class FixedMetropolis:
-    """Component-wise Metropolis whose steps, of this half-width or standard deviation, never change (Au and Beck)."""
-
-    spread: float
-    distribution: Literal["uniform", "normal"]
-
-    def start_level(self, seeds: FloatArray) -> FixedMetropolis:
-        """Return itself."""
-        return self
-
-    def propose(self, u: FloatArray, rng: np.random.Generator) -> FloatArray:
-        """Propose a move from each of the points u (n, d)."""
-        unit = rng.uniform(-1, 1, u.shape) if self.distribution == "uniform" else rng.standard_normal(u.shape)
-        return move_components(u, self.spread * unit, rng)
-
-    def adapt(self, acceptance: float, iteration: int) -> FixedMetropolis:
-        """Return itself."""
-        return self
-
-
 @dataclass(frozen=True, eq=False)
-class ScaledKernel:
-    """Conditional sampling (pCN) or component-wise Metropolis with an adaptive scale (Tian et al. 2024).
+class Kernel:
+    """Proposal of the moves of a level's chains, with its adaptation (Tian et al. 2024); it leaves N(0, I) invariant.
 
-    sigma = min(scale sigma_0, 1), equation (14), with the deviations sigma_0 (d,) of the seeds or as given. Conditional
-    sampling, v = rho u + sigma xi with xi ~ N(0, I) and rho = sqrt(1 - sigma^2), leaves N(0, I) invariant.
+    sigma = scale sigma_0, with deviations sigma_0 (d,), and at most 1 where the scale adapts (equation 14).
+    Conditional sampling, v = rho u + sigma xi with xi ~ N(0, I) and rho = sqrt(1 - sigma^2), does so on its own.
+    Metropolis moves every component by a symmetric step, normal or uniform with half-width sigma, kept with probability
+    min(1, phi(new) / phi(old)) (equations 19, 20): a step that is not symmetric needs another ratio.
     """
 
-    proposal: Literal["conditional", "metropolis"]
-    sigma0: Literal["unit", "seeds"]
+    proposal: Literal["conditional", "normal", "uniform"]
     scale: float
-    target: float  # acceptance rate that the scale is steered to
-    deviations: FloatArray
+    target: float | None = None  # acceptance rate that the scale is steered to; None for a scale that stays
+    by_seeds: bool = False  # whether the deviations are those of the seeds of each level
+    deviations: FloatArray | float = 1.0
 
-    def start_level(self, seeds: FloatArray) -> ScaledKernel:
-        """Return the kernel with the scale reached and, if asked for, the deviations of these seeds (n, d)."""
-        if self.sigma0 == "unit":
+    def start_level(self, seeds: FloatArray) -> Kernel:
+        """Return the kernel for a level whose chains start at these points (n, d), with the scale reached."""
+        if not self.by_seeds:
             return self
         spread = seeds.std(axis=0, ddof=1) if len(seeds) > 1 else np.zeros(seeds.shape[1])
         return replace(self, deviations=np.where(spread > 0, spread, 1.0))
 
     def propose(self, u: FloatArray, rng: np.random.Generator) -> FloatArray:
-        """Propose a move from each of the points u (n, d)."""
-        sigma = np.minimum(self.scale * self.deviations, 1.0)
+        """Propose a move from each of the points u (n, d); a row equal to its point is a stay."""
+        sigma = self.scale * self.deviations
+        sigma = sigma if self.target is None else np.minimum(sigma, 1.0)
+        step = sigma * (rng.uniform(-1, 1, u.shape) if self.proposal == "uniform" else rng.standard_normal(u.shape))
         if self.proposal == "conditional":
-            return np.asarray(np.sqrt(1.0 - sigma * sigma) * u + sigma * rng.standard_normal(u.shape))
-        return move_components(u, sigma * rng.standard_normal(u.shape), rng)
+            return np.asarray(np.sqrt(1.0 - sigma * sigma) * u + step)
+        moved = u + step
+        log_ratio = 0.5 * (u * u - moved * moved)
+        return np.where(np.log1p(-rng.random(u.shape)) <= log_ratio, moved, u)
 
-    def adapt(self, acceptance: float, iteration: int) -> ScaledKernel:
+    def adapt(self, acceptance: float, iteration: int) -> Kernel:
         """Return the kernel with log s' = log s + iteration^(-1/2) (acceptance - target), equation (16).
 
         From the largest scale on every dimension has sigma = 1; growing past it would only delay the way back.
         """
-        largest = 1 / float(self.deviations.min())
+        if self.target is None:
+            return self
+        largest = 1 / float(np.min(self.deviations))
         growth = math.exp((acceptance - self.target) / math.sqrt(iteration))
         return replace(self, scale=min(self.scale * growth, largest))
-
-
-def move_components(u: FloatArray, steps: FloatArray, rng: np.random.Generator) -> FloatArray:
-    """Move every component of u (n, d) by a symmetric step (n, d), kept with probability min(1, phi(new) / phi(old)).
-
-    The first half of the modified Metropolis algorithm (Au and Beck, section 4; equations 7, 8 and 19, 20 of
-    Tian et al. 2024). Each component on its own leaves N(0, 1) invariant because its step is symmetric: a
-    step that is not, such as that of conditional sampling, needs another ratio.
-    """
-    moved = u + steps
-    log_ratio = 0.5 * (u * u - moved * moved)
-    return np.where(np.log1p(-rng.random(u.shape)) <= log_ratio, moved, u)
 
 
 class Chains(NamedTuple):
     """Points of one level, chain by chain. Level 0 is N chains of length 1."""
 
-    u: FloatArray
-    """Shape (chains, steps, d); row i is chain i in time order, its seed first."""
-    f: FloatArray
-    """Shape (chains, steps)."""
-    lengths: NDArray[np.int64]
-    """Steps of each chain that are used, seed included, shape (chains,)."""
-    roots: NDArray[np.int64]
-    """Point of level 0 from which each chain descends, shape (chains,)."""
-    n_new: int
-    """Simulations made for this level."""
-    acceptance: float | None
-    """Share of moves that were accepted."""
+    u: FloatArray  # (chains, steps, d); row i is chain i in time order, its seed first
+    f: FloatArray  # (chains, steps)
+    lengths: NDArray[np.int64]  # steps of each chain that are used, seed included, (chains,)
+    roots: NDArray[np.int64]  # point of level 0 from which each chain descends, (chains,)
+    n_new: int  # simulations made for this level
+    acceptance: float | None  # share of moves that were accepted
 
     @property
     def used(self) -> NDArray[np.bool_]:
@@ -175,33 +128,11 @@ class Growth(NamedTuple):
     candidates: FloatArray  # (m, d)
     f_candidates: FloatArray  # (m,)
 
-    @classmethod
-    def start(cls, chains: Chains, kernel: Kernel) -> Growth:
-        """Return a level before any move, and the kernel of the first one."""
-        return cls(chains, kernel, False, chains.u[:0, 0], chains.f[:0, 0])
-
 
 def independent_chains(u: FloatArray, f: FloatArray) -> Chains:
     """Return level 0: each of the independent points u (n, d), f (n,) is a chain of length 1."""
     n = len(f)
     return Chains(u[:, None], f[:, None], np.ones(n, dtype=np.int64), np.arange(n), n, None)
-
-
-def draw_first_level(
-    inputs: Inputs, n: int, rng: np.random.Generator, known: RootedPoints | None = None
-) -> Generator[FloatArray, FloatArray, Chains]:
-    """Simulate the n independent points of level 0; those that are `known` are not simulated again."""
-    u, f = (known.u, known.f) if known is not None else (np.empty((0, inputs.dim)), np.empty(0))
-    new = rng.standard_normal((n - len(f), inputs.dim))
-    if len(new):
-        outcomes = yield inputs.base.from_standard_normal(new)
-        u, f = np.concatenate([u, new]), np.concatenate([f, outcomes])
-    return independent_chains(u, f)._replace(n_new=len(new))
-
-
-def chain_lengths(total: int, n: int, rng: np.random.Generator) -> NDArray[np.int64]:
-    """Return the lengths (n,) of n chains with `total` points together, equal or differing by one at random."""
-    return np.asarray(total // n + (rng.permutation(n) < total % n), dtype=np.int64)
 
 
 def grow_chains(
@@ -256,27 +187,27 @@ class NextLevel(NamedTuple):
     lengths: NDArray[np.int64]
 
 
-class LevelPlanner(Protocol):
-    """The choice of the levels: a frozen dataclass of thresholds, sizes and limits, as a rule."""
-
-    def plan_next(self, chains: Chains, depth: int, n_sim: int, rng: np.random.Generator) -> NextLevel | Status:
-        """Return the level that follows on the present one, or how the descent ends with the present one."""
+Plan = Callable[[Chains, int, int, np.random.Generator], NextLevel | Status]
+"""Returns the level that follows on the present one, or how the descent ends with it, from its chains, its number and
+the simulations made for the levels after level 0."""
 
 
 def descend(
     inputs: Inputs,
-    start: Growth,
-    planner: LevelPlanner,
+    first: Chains,
+    kernel: Kernel,
+    plan_next: Plan,
     report: Callable[[Growth, NextLevel | Status], None],
     rng: np.random.Generator,
 ) -> Generator[FloatArray, FloatArray, Status]:
-    """Go from level to level until the planner ends the descent or `Interrupted` is thrown in; return how it ended.
+    """Go from level to level until the plan ends the descent or `Interrupted` is thrown in; return how it ended.
 
-    `report` is called with every level, that of the start included, as soon as it is known how the descent goes on.
+    `report` is called with every level, the first one included, as soon as it is known how the descent goes on.
     """
-    growth, depth, n_sim = start, 0, 0
+    growth = Growth(first, kernel, False, first.u[:0, 0], first.f[:0, 0])
+    depth, n_sim = 0, 0
     while True:
-        planned = Status.STOPPED if growth.interrupted else planner.plan_next(growth.chains, depth, n_sim, rng)
+        planned = Status.STOPPED if growth.interrupted else plan_next(growth.chains, depth, n_sim, rng)
         report(growth, planned)
         if isinstance(planned, Status):
             return planned
@@ -284,17 +215,8 @@ def descend(
         depth, n_sim = depth + 1, n_sim + growth.chains.n_new
 
 
-class LevelProduct(NamedTuple):
-    """Probability of the last level reached, as a product over the levels."""
-
-    p: float = 1.0
-    """Probability of the last level reached."""
-    cov: float = 0.0
-    """Its coefficient of variation."""
-
-
-def level_record(chains: Chains, threshold: float, passed: LevelProduct) -> Level:
-    """Return the record of a level: the true share of its points with f <= threshold."""
+def level_record(chains: Chains, threshold: float, before: Sequence[Level]) -> Level:
+    """Return the record of a level after others: the true share of its points with f <= threshold."""
     below = chains.used & (chains.f <= threshold)
     total = int(chains.lengths.sum())
     share = int(below.sum()) / total
@@ -302,7 +224,7 @@ def level_record(chains: Chains, threshold: float, passed: LevelProduct) -> Leve
     return Level(
         gamma=threshold,
         p=share,
-        estimate=passed.p * share,
+        estimate=multiply_levels(before)[0] * share,
         n_sim=chains.n_new,
         n_points=total,
         cov=binomial_cov(share, effective),
@@ -311,35 +233,32 @@ def level_record(chains: Chains, threshold: float, passed: LevelProduct) -> Leve
     )
 
 
-def multiply_levels(trace: Sequence[Level]) -> LevelProduct:
-    """Return the product over the levels, taken as independent of each other; 1 of none."""
+def multiply_levels(trace: Sequence[Level]) -> tuple[float, float]:
+    """Return the product over the levels, taken as independent of each other, 1 of none, and its c.o.v."""
     p, cov = 1.0, 0.0
     for level in trace:
         p, cov = p * level.p, math.sqrt((1 + cov**2) * (1 + level.cov**2) - 1)
-    return LevelProduct(p, cov)
+    return p, cov
 
 
-def subset_interval(chains: Chains, goal: Goal, trace: list[Level], cov: float) -> Interval:
-    """Return the interval of p = prod of the shares in `trace`, whose c.o.v. is `cov`, after a last level `chains`."""
-    roots = chains.where(chains.f <= goal.gamma).roots
-    if len(trace) == 1:
-        return clopper_pearson(len(roots), trace[0].n_points, goal.confidence)
-    if len(roots) == 0:
-        return _interval_without_hits(chains, goal, trace)
-    p = multiply_levels(trace).p
-    return log_normal_interval(p, cov, goal.confidence, df=max(effective_roots(roots) - 1, 1.0))
+def judge_levels(chains: Chains, goal: Goal, trace: Sequence[Level]) -> tuple[float, Interval]:
+    """Return the c.o.v. and the interval of p = prod of the shares in `trace`, after a last level `chains`.
 
-
-def _interval_without_hits(chains: Chains, goal: Goal, trace: list[Level]) -> Interval:
-    """Return the interval of p where no point of the last level fails.
-
-    The level reached is as uncertain as its descent, and its share as if each of its roots were one point.
+    Where no point of it fails, the level reached is as uncertain as its descent, and its share as if each of its roots
+    were one point.
     """
-    passed, roots = multiply_levels(trace[:-1]), chains.where(chains.used).roots
-    independent = effective_roots(roots)
-    cov = max(passed.cov, descent_cov(roots, trace[0].n_points))
-    reached = log_normal_interval(passed.p, cov, goal.confidence, df=max(independent - 1, 1.0))[1]
-    return 0.0, reached * clopper_pearson(0, max(int(independent), 1), goal.confidence)[1]
+    n, confidence = trace[0].n_points, goal.confidence
+    roots = chains.where(chains.f <= goal.gamma).roots
+    p, cov = multiply_levels(trace)
+    cov = max(cov, descent_cov(roots, n))
+    if len(trace) == 1:
+        return cov, clopper_pearson(len(roots), n, confidence)
+    if len(roots):
+        return cov, log_normal_interval(p, cov, confidence, df=max(effective_roots(roots) - 1, 1.0))
+    roots = chains.where(chains.used).roots
+    (passed, own), independent = multiply_levels(trace[:-1]), effective_roots(roots)
+    reached = log_normal_interval(passed, max(own, descent_cov(roots, n)), confidence, df=max(independent - 1, 1.0))[1]
+    return cov, (0.0, reached * clopper_pearson(0, max(int(independent), 1), confidence)[1])
 
 
 def effective_roots(roots: NDArray[np.int64]) -> float:
@@ -355,11 +274,9 @@ def effective_roots(roots: NDArray[np.int64]) -> float:
 def descent_cov(roots: NDArray[np.int64], n: int) -> float:
     """Return the c.o.v. of p-hat that the descent of the failing points shows.
 
-    With h_i failing points descending from point i of n at level 0, p-hat is proportional to the
-    mean of the h_i. Were the thresholds fixed, these would be independent, so
-    c.o.v.^2 = sum h_i^2 / (sum h_i)^2 - 1/n. Unlike the product over levels this holds the
-    correlation between levels: a lucky point at level 0 is lucky at all. `roots` (k,) has for each failing point the
-    one of level 0 that it descends from.
+    With h_i of them descending from point i of n at level 0, as `roots` (k,) says, p-hat is proportional to the mean of
+    the h_i. Were the thresholds fixed, these would be independent, so c.o.v.^2 = sum h_i^2 / (sum h_i)^2 - 1/n. Unlike
+    the product over levels this holds the correlation between levels: a lucky point at level 0 is lucky at all.
     """
     if roots.size == 0:
         return math.inf

@@ -8,6 +8,7 @@ functions.
 import math
 import random
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 from scipy.special import ndtr
@@ -31,7 +32,7 @@ def check_method(method: Stepping) -> None:
 def check_base(base: Distribution, dim: int) -> None:
     """Check that the density of a base distribution of d coordinates and its map fit 200 of its draws.
 
-    `samplers.estimate` makes this check itself; see `samplers.distributions.find_base_fault`. An AssertionError says
+    `samplers.estimate` makes this check itself. An AssertionError says
     what does not fit, with a probability below 1e-6 if all fits.
     """
     fault = find_base_fault(base, dim)
@@ -50,20 +51,15 @@ def check_form(method: Stepping) -> None:
 def check_counts(method: Stepping) -> None:
     """Check that every simulation is in n_sim and in one level of the trace, every failing point in the failures."""
     for max_sim in (None, 2500):
-        f = _Counting(half_space(2, 3.0).problem.evaluate)
-        result = estimate(FunctionProblem(f, 2), method, seed=3, max_sim=max_sim)
-        _expect_sound(method, result, f.rows)
-        failing = result.failures.total
-        _expect(failing == f.failing, method, f"{f.failing} points failed, the result has {failing}")
+        _estimate(method, half_space(2, 3.0).problem.evaluate, 2, seed=3, max_sim=max_sim)
 
 
 def check_budget(method: Stepping) -> None:
     """Check that max_sim is never exceeded, however small, by one run or by replicates together."""
     for max_sim, replicates in [(1, 1), (2, 1), (7, 1), (7, 7), (50, 1), (500, 1), (1001, 3), (1950, 1), (3000, 1)]:
-        f = _Counting(half_space(2, 3.0).problem.evaluate)
-        result = estimate(FunctionProblem(f, 2), method, seed=3, max_sim=max_sim, replicates=replicates)
-        _expect_sound(method, result, f.rows)
-        _expect(f.rows <= max_sim, method, f"max_sim={max_sim} was exceeded: {f.rows} simulations")
+        f = half_space(2, 3.0).problem.evaluate
+        result = _estimate(method, f, 2, seed=3, max_sim=max_sim, replicates=replicates)
+        _expect(result.n_sim <= max_sim, method, f"max_sim={max_sim} was exceeded: {result.n_sim} simulations")
         if result.p == 0:
             _expect(result.status == Status.NO_HITS, method, f"p = 0 calls for no_hits, got {result.status}")
 
@@ -74,28 +70,35 @@ def check_seed(method: Stepping) -> None:
     The generators are watched in a run that repeats one made before: a first run may import a library, and some draw
     while they are imported.
     """
+
+    def state() -> tuple[object, bytes]:
+        return random.getstate(), repr(np.random.get_state(legacy=False)).encode()  # noqa: NPY002 (nobody uses it)
+
     problem = two_modes().problem
     first, other = (estimate(problem, method, seed=seed, max_sim=5000) for seed in (5, 6))
-    before = _global_state()
+    before = state()
     again = estimate(problem, method, seed=5, max_sim=5000)
-    _expect(_global_state() == before, method, "it draws from a global generator; use rng alone")
+    _expect(state() == before, method, "it draws from a global generator; use rng alone")
     _expect(first == again, method, f"the same seed gave {first.p} and {again.p}")
     _expect(first.failures != other.failures, method, "another seed gave the same failing points")
 
 
 def check_no_failure(method: Stepping) -> None:
     """Check that p = 0 with a one-sided interval and a warning where nothing fails, also where f goes downhill."""
-    for dim in (1, 2, 6):
-        result = estimate(_constant(10.0, dim), method, seed=1, max_sim=5000)
-        _expect_no_failure(method, result)
-        _expect(result.interval[1] < 0.02, method, f"5000 points without failure bound p by {result.interval[1]:.2g}")
-    _expect_no_failure(method, estimate(FunctionProblem(lambda x: 30 - x[:, 0], 3), method, seed=1, max_sim=3000))
+    for dim, max_sim, slope in ((1, 5000, 0.0), (2, 5000, 0.0), (6, 5000, 0.0), (3, 3000, 1.0)):
+        result = _estimate(method, lambda x, slope=slope: 30.0 - slope * x[:, 0], dim, seed=1, max_sim=max_sim)
+        low, high = result.interval
+        wanted = f"nothing failed: expected p = 0, interval (0, more), got\n{result}"
+        _expect(result.p == low == 0 < high, method, wanted)
+        _expect(len(result.warnings) > 0, method, "nothing failed: expected a warning")
+        _expect(result.status == Status.NO_HITS, method, f"nothing failed: expected no_hits, got {result.status}")
+        _expect(slope > 0 or high < 0.02, method, f"{max_sim} points without failure bound p by {high:.2g}")
 
 
 def check_failure_everywhere(method: Stepping) -> None:
     """Check that p = 1 with an interval that reaches down a little where everything fails."""
     for dim in (1, 2):
-        result = estimate(_constant(-1.0, dim), method, seed=1, max_sim=3000)
+        result = _estimate(method, lambda x: np.full(len(x), -1.0), dim, seed=1, max_sim=3000)
         low, high = result.interval
         _expect(result.p == 1 and result.cov == 0, method, f"expected p = 1 with c.o.v. 0, got {result.p}")
         _expect(0.99 < low < 1 == high, method, f"expected an interval in [0.99, 1], got [{low}, {high}]")
@@ -104,53 +107,42 @@ def check_failure_everywhere(method: Stepping) -> None:
 
 def check_outcomes(method: Stepping) -> None:
     """Check p where f ties at gamma, which is failure, where it is infinite, and where rows have no outcome."""
-
-    def ties(x: FloatArray) -> FloatArray:
-        return np.floor(x[:, 0] + 4.5)
-
-    def infinite(x: FloatArray) -> FloatArray:
-        return np.where(x[:, 0] > 1.5, -np.inf, np.inf)
-
-    def missing(x: FloatArray) -> FloatArray:
-        return np.where(x[:, 1] > 1.5, np.nan, 10.0 - x[:, 0])
-
     for what, f, gamma, seeds in (
-        ("whole numbers", ties, 2.0, range(5)),
-        ("infinite outcomes", infinite, 0.0, (1,)),
-        ("rows without an outcome", missing, 0.0, (1,)),
+        ("whole numbers", lambda x: np.floor(x[:, 0] + 4.5), 2.0, range(5)),
+        ("infinite outcomes", lambda x: np.where(x[:, 0] > 1.5, -np.inf, np.inf), 0.0, (1,)),
+        ("rows without an outcome", lambda x: np.where(x[:, 1] > 1.5, np.nan, 10.0 - x[:, 0]), 0.0, (1,)),
     ):
         for seed in seeds:
-            result = estimate(FunctionProblem(f, 2), method, gamma, seed, max_sim=5000, on_error="failure")
+            result = _estimate(method, f, 2, gamma=gamma, seed=seed, max_sim=5000, on_error="failure")
             _expect_near(method, result, normal_cdf(-1.5), what)
 
 
 def check_dimensions(method: Stepping) -> None:
     """Check that one dimension is enough, and that with 1,500 the result is right or has a warning."""
-    result = estimate(half_space(1, 2.0).problem, method, seed=1, max_sim=5000)
-    _expect_near(method, result, normal_cdf(-2.0), "one dimension")
-    f = _Counting(half_space(1500, 2.0).problem.evaluate)
-    result = estimate(FunctionProblem(f, 1500), method, seed=1, max_sim=3000)
-    _expect_sound(method, result, f.rows)
-    holds = result.interval[0] <= normal_cdf(-2.0) <= result.interval[1]
-    _expect(holds or len(result.warnings) > 0, method, f"1,500 dimensions: missed p without a warning\n{result}")
+    p = normal_cdf(-2.0)
+    one = _estimate(method, half_space(1, 2.0).problem.evaluate, 1, seed=1, max_sim=5000)
+    _expect_near(method, one, p, "one dimension")
+    many = _estimate(method, half_space(1500, 2.0).problem.evaluate, 1500, seed=1, max_sim=3000)
+    holds = many.interval[0] <= p <= many.interval[1]
+    _expect(holds or len(many.warnings) > 0, method, f"1,500 dimensions: missed p without a warning\n{many}")
 
 
 def check_interruption(method: Stepping) -> None:
     """Check that a run that is stopped after any batch has a result with all that was simulated."""
-    reference = half_space(2, 3.0)
-    arguments = RunArguments(seed=2, max_sim=4000)
-    whole = Run(reference.problem, method, arguments)
-    batches = 0
-    while not whole.done:
-        whole.tell(reference.problem.evaluate(whole.ask()))
-        batches += 1
-    for after in sorted({math.ceil(batches * i / 12) for i in range(1, 12)} & set(range(1, batches))):
-        run = Run(reference.problem, method, arguments)
-        rows = 0
-        for _ in range(after):
+    problem, arguments = half_space(2, 3.0).problem, RunArguments(seed=2, max_sim=4000)
+
+    def take(batches: float) -> tuple[Run, int, int]:
+        """Return the run after so many batches, these and its simulations."""
+        run, n, rows = Run(problem, method, arguments), 0, 0
+        while n < batches and not run.done:
             x = run.ask()
-            rows += len(x)
-            run.tell(reference.problem.evaluate(x))
+            n, rows = n + 1, rows + len(x)
+            run.tell(problem.evaluate(x))
+        return run, n, rows
+
+    _, whole, _ = take(math.inf)
+    for after in sorted({math.ceil(whole * i / 12) for i in range(1, 12)} & set(range(1, whole))):
+        run, _, rows = take(after)
         result = run.result()
         known = not set(NOT_KNOWN.warnings) & set(result.warnings)
         _expect(known, method, f"Interrupted after batch {after}: expected an Outcome from what there is")
@@ -194,18 +186,23 @@ METHOD_CHECKS: tuple[Callable[[Stepping], None], ...] = (
 )
 
 
-class _Counting:
-    """f that counts its rows and those of them that fail."""
+def _estimate(
+    method: Stepping, f: Callable[[FloatArray], object], dim: int, gamma: float = 0.0, **options: Any
+) -> Estimate:
+    """Return an estimate whose books are those of f: its rows, and the ones that fail or have no outcome."""
+    rows = failing = 0
 
-    def __init__(self, f: Callable[[FloatArray], object]) -> None:
-        self.rows = self.failing = 0
-        self._f = f
-
-    def __call__(self, x: FloatArray) -> FloatArray:
-        values = np.asarray(self._f(x), dtype=np.float64)
-        self.rows += len(x)
-        self.failing += int(np.count_nonzero(values <= 0))
+    def counting(x: FloatArray) -> FloatArray:
+        nonlocal rows, failing
+        values = np.asarray(f(x), dtype=np.float64)
+        rows, failing = rows + len(x), failing + int(np.count_nonzero(~(values > gamma)))
         return values
+
+    result = estimate(FunctionProblem(counting, dim), method, gamma, **options)
+    _expect_sound(method, result, rows)
+    total = result.failures.total
+    _expect(total == failing, method, f"{failing} points failed, the result has {total}")
+    return result
 
 
 def _expect(holds: bool, method: Stepping, otherwise: str) -> None:
@@ -225,22 +222,5 @@ def _expect_sound(method: Stepping, result: Estimate, rows: int) -> None:
     _expect(result.p > 0 or high > 0, method, "p = 0 is never certain: expected an upper end above 0")
 
 
-def _expect_no_failure(method: Stepping, result: Estimate) -> None:
-    low, high = result.interval
-    _expect(result.p == low == 0 < high, method, f"nothing failed: expected p = 0, interval (0, more), got\n{result}")
-    _expect(len(result.failures) == 0, method, "nothing failed, but the result has failures")
-    _expect(len(result.warnings) > 0, method, "nothing failed: expected a warning")
-    _expect(result.status == Status.NO_HITS, method, f"nothing failed: expected no_hits, got {result.status}")
-
-
 def _expect_near(method: Stepping, result: Estimate, p: float, what: str) -> None:
     _expect(abs(result.p / p - 1) < 0.5, method, f"{what}: expected p near {p:.3g}, got\n{result}")
-
-
-def _constant(value: float, dim: int) -> FunctionProblem:
-    return FunctionProblem(lambda x: np.full(len(x), value), dim)
-
-
-def _global_state() -> tuple[object, bytes]:
-    state = np.random.get_state(legacy=False)  # noqa: NPY002  (to see that nobody uses it)
-    return random.getstate(), repr(state).encode()

@@ -107,19 +107,16 @@ class Methods(Mapping[str, type[Stepping]]):
 
     def __init__(self, *own: type[Stepping]) -> None:
         self._own = {method.name: method for method in own}
-
-    @property
-    def own(self) -> list[str]:
+        self.own = list(self._own)
         """The names of our own methods."""
-        return list(self._own)
 
     @cached_property
-    def _installed(self) -> dict[str, type[Stepping]]:
-        """Methods of other packages by name."""
-        loaded: dict[str, type[Stepping]] = {}
+    def _all(self) -> dict[str, type[Stepping]]:
+        """Our own and those of other packages by name."""
+        loaded = dict(self._own)
         for entry in sorted(entry_points(group=ENTRY_POINT_GROUP), key=lambda entry: entry.name):
             try:
-                if entry.name in self._own or entry.name in loaded:
+                if entry.name in loaded:
                     raise ValueError("that name is taken")
                 loaded[entry.name] = _load_method(entry)
             except Exception as error:  # an error of another package must not break this one
@@ -129,25 +126,18 @@ class Methods(Mapping[str, type[Stepping]]):
         return loaded
 
     def __getitem__(self, name: str) -> type[Stepping]:
-        return self._own[name] if name in self._own else self._installed[name]
+        return self._own[name] if name in self._own else self._all[name]
 
     def __iter__(self) -> Iterator[str]:
-        return iter([*self._own, *self._installed])
+        return iter(self._all)
 
     def __len__(self) -> int:
-        return len(self._own) + len(self._installed)
+        return len(self._all)
 
 
 METHODS = Methods(
-    Auto,
-    TwoStage,
-    Surrogate,
-    MonteCarlo,
-    ImportanceSampling,
-    CrossEntropy,
-    ImprovedCrossEntropy,
-    SubsetSimulation,
-    AdaptiveSubsetSimulation,
+    *(Auto, TwoStage, Surrogate, MonteCarlo, ImportanceSampling, CrossEntropy, ImprovedCrossEntropy),
+    *(SubsetSimulation, AdaptiveSubsetSimulation),
 )
 register_stored(*(METHODS[name] for name in METHODS.own))
 
@@ -174,14 +164,14 @@ def get_method(name: str, **settings: Any) -> Stepping:
 
 def _load_method(entry: EntryPoint) -> type[Stepping]:
     """Import the class that an entry point names."""
-    loaded: object = entry.load()
-    if not isinstance(loaded, type):
-        raise TypeError(f"expected a class, got {loaded!r}")
+    cls: Any = entry.load()
+    if not isinstance(cls, type):
+        raise TypeError(f"expected a class, got {cls!r}")
     # another package's class: the message says which it lacks
-    missing = [name for name in ("name", "stops_at_target", "steps") if not hasattr(loaded, name)]
+    missing = [name for name in ("name", "stops_at_target", "steps") if not hasattr(cls, name)]
     if missing:
-        raise TypeError(f"the class {loaded.__name__} has no {', '.join(missing)}")
-    cls = cast(type[Stepping], loaded)
-    if cls.name != entry.name:
-        raise ValueError(f"the class {cls.__name__} is named {cls.name!r}, its entry point {entry.name!r}")
-    return cls
+        raise TypeError(f"the class {cls.__name__} has no {', '.join(missing)}")
+    found = cast(type[Stepping], cls)
+    if found.name != entry.name:
+        raise ValueError(f"the class {found.__name__} is named {found.name!r}, its entry point {entry.name!r}")
+    return found

@@ -1,10 +1,8 @@
 """Method: the base class of the methods; and the coordinates that are searched, noise drawn afresh for every point.
 
-The randomness of learned drivers, or of a stack of sensors, is hundreds of coordinates of x that are standard normal
-and matter little one by one. Wide draws of all of them are nothing like noise, and no proposal describes failures in so
-many dimensions. Drawn from their own distribution they cost nothing: with Z ~ N(0, I) for the noise,
-p = E[P(f(X, Z) <= gamma | X)], and weights are those of X alone. f is then noisy for the search, and still every
-simulated x replays.
+The randomness of learned drivers is hundreds of coordinates of x that are standard normal and matter little one by one.
+No proposal describes failures in so many dimensions; drawn from their own distribution they cost nothing: with
+Z ~ N(0, I) for the noise, p = E[P(f(X, Z) <= gamma | X)], and weights are those of X alone.
 """
 
 import math
@@ -16,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from samplers.components import MixtureComponent
+from samplers.distributions import DrawnByItsMap
 from samplers.method import Goal, Stepping
 from samplers.problem import Distribution, FloatArray, Inputs, OnError
 from samplers.run import Run, RunArguments
@@ -55,16 +54,13 @@ class Method(Stepping, Protocol):
 
         Args:
             problem: Has `dim` and `base`; `evaluate` is not needed.
-            gamma: Threshold of failure.
+            gamma: As the others, see `samplers.estimate`, which gives the same result.
             seed: Same seed, same answer.
             max_sim: Simulations that are never asked for more of.
             target_cov: Coefficient of variation to stop at.
             confidence: Nominal coverage of the interval.
             replicates: Independent runs, side by side in every batch.
             on_error: What NaN among the outcomes means.
-
-        Returns:
-            The run; it gives what `estimate` with the same arguments gives.
 
         Raises:
             ValueError: If an argument is not as described in `estimate`.
@@ -96,7 +92,7 @@ def marginalise_noise(inputs: Inputs, rng: np.random.Generator) -> Inputs:
     return inputs if not noise.any() or noise.all() else cast(Inputs, NoiseMarginalisedInputs(inputs, noise, rng))
 
 
-class NoiseMarginalisedInputs:
+class NoiseMarginalisedInputs(DrawnByItsMap):
     """The coordinates that are not noise, as inputs of their own; points u (n, k) become x (n, d) with noise drawn.
 
     The same u gets the same noise again: rows of u are known by their bytes, and their noise is made anew from a
@@ -127,10 +123,6 @@ class NoiseMarginalisedInputs:
     def to_standard_normal(self, x: FloatArray) -> FloatArray:
         """Map x (n, d) to u (n, k)."""
         return self._base.to_standard_normal(x)[:, ~self._noise]
-
-    def sample(self, n: int, rng: np.random.Generator) -> FloatArray:
-        """Draw points x, shape (n, d)."""
-        return self.from_standard_normal(rng.standard_normal((n, self.dim)))
 
     def log_prob(self, x: FloatArray) -> FloatArray:
         """Return the log density of x (n, d), noise included, shape (n,)."""
@@ -189,15 +181,11 @@ _S = TypeVar("_S", bound=Simulator, covariant=True)
 class RunContext(Generic[_S]):
     """What is fixed for a run, and the simulator that counts."""
 
-    inputs: Inputs
-    """All of x."""
-    simulator: _S
-    """Of the coordinates that are searched."""
+    inputs: Inputs  # all of x
+    simulator: _S  # of the coordinates that are searched
     goal: Goal
-    budget: int
-    """Simulations that the exploration and the rounds are planned for."""
-    end: int
-    """Simulations that are never exceeded; more than `budget` where only a target c.o.v. is given."""
+    budget: int  # simulations that the exploration and the rounds are planned for
+    end: int  # simulations that are never exceeded; more than `budget` where only a target c.o.v. is given
     rng: np.random.Generator
 
     @property
@@ -219,13 +207,8 @@ class ComponentDraws(NamedTuple):
     """Draws from known components, one component after the other, and their outcomes."""
 
     components: list[MixtureComponent]
-    counts: NDArray[np.int64]
-    """Draws of each component, shape (k,); they add up to n."""
-    u: FloatArray
-    """Shape (n, d)."""
-    f: FloatArray
-    """Shape (n,)."""
-    first: int = 0
-    """Simulations that the run had spent before the first of them."""
-    x: FloatArray | None = None
-    """The points in physical space, shape (n, d), where they are kept: a fitted base takes long to map them again."""
+    counts: NDArray[np.int64]  # draws of each component, (k,); they add up to n
+    u: FloatArray  # (n, d)
+    f: FloatArray  # (n,)
+    first: int = 0  # simulations that the run had spent before the first of them
+    x: FloatArray | None = None  # in physical space, (n, d), where they are kept: a fitted base is slow to map them again

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Generator, Sequence
 from dataclasses import dataclass
-from typing import ClassVar, Literal, NamedTuple, TypeVar
+from typing import ClassVar, Literal, NamedTuple
 
 import numpy as np
 
@@ -12,7 +12,7 @@ from samplers.importance import Search, count_final_draws
 from samplers.method import Goal, Steps
 from samplers.methods.base import Method
 from samplers.methods.blocks import GaussianBlock, MixtureBlock, NormalBlock, Product, announced_blocks
-from samplers.problem import FloatArray, Inputs, check_number, check_settings, check_whole, is_number
+from samplers.problem import FloatArray, Inputs, check_settings, is_number
 from samplers.proposals import ProposalDistribution
 from samplers.sample import Status, next_level, normalise_weights
 
@@ -24,9 +24,6 @@ class Iterate(NamedTuple):
     quantile: float  # the rho-quantile of f under the proposal
     level: float  # gamma_k: the quantile, but not less than gamma
     cov: float  # of P[f <= level]
-
-
-SettingT = TypeVar("SettingT")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -79,8 +76,8 @@ class CrossEntropy(Method):
         components: Gaussians of the family "mixture" at most.
         likelihood_ratio: "joint" (equation 3) or "block" (as in the released code).
         rho: Elite fraction. (The paper has 0.01 with N_k = 5000.)
-        alpha: Step size alpha_k in (0, 1], or several: the last one holds on.
-        n_iteration: Draws per iteration, N_k, or several; at most a tenth of max_sim.
+        alpha: Step size alpha_k in (0, 1].
+        n_iteration: Draws per iteration, N_k; at most a tenth of max_sim.
         max_iterations: Iterations at most, K.
         early_end: End the search once two proposals have reached gamma.
         choice: Which iterate to keep: "cov" or "quantile", see above.
@@ -108,8 +105,8 @@ class CrossEntropy(Method):
     components: int = 3
     likelihood_ratio: Literal["joint", "block"] = "joint"
     rho: float = 0.1
-    alpha: float | tuple[float, ...] = 0.8
-    n_iteration: int | tuple[int, ...] = 1000
+    alpha: float = 0.8
+    n_iteration: int = 1000
     max_iterations: int = 20
     early_end: bool = True
     choice: Literal["cov", "quantile"] = "cov"
@@ -131,14 +128,12 @@ class CrossEntropy(Method):
             components=1,
             max_iterations=1,
             n_final=10,
+            n_iteration=10,
+            alpha=(0.0, math.nextafter(1.0, 2.0)),
             rho=(0.0, 0.5),
             base_share=(0.0, 1.0),
             wide_factor=(1.0, math.inf),
         )
-        for size in as_tuple(self.n_iteration) or [None]:
-            check_whole("CrossEntropy.n_iteration", size, 10)
-        for step in as_tuple(self.alpha) or [None]:
-            check_number("CrossEntropy.alpha", step, 0.0, math.nextafter(1.0, 2.0))
         if not (is_number(self.wide_share) and self.wide_share == 0):
             check_settings(self, wide_share=(0.0, 1.0 - self.base_share))
 
@@ -174,7 +169,7 @@ class CrossEntropy(Method):
         """Run algorithm 1, as a rule until two proposals have reached gamma."""
         iterates, gamma, base = list[Iterate](), search.goal.gamma, proposal
         while last := (
-            yield from search.draw(proposal, value_at(self.n_iteration, len(iterates)), self.max_iterations)
+            yield from search.draw(proposal, self.n_iteration, self.max_iterations)
         ):
             del search.rounds[1:-1]  # `Search.pool_rounds` takes the first and the last one
             level = next_level(last.f, self.rho, gamma)
@@ -190,24 +185,13 @@ class CrossEntropy(Method):
             if n_reached == 2 - first and (self.early_end or first):
                 search.status = Status.CONVERGED
                 return iterates
-            proposal = self._project(proposal, elite, log_ratios, value_at(self.alpha, len(iterates) - 1))
+            proposal = self._project(proposal, elite, log_ratios)
         if search.status is Status.STALLED and iterates[-1].level == gamma:
             search.status = Status.CONVERGED
         return iterates
 
-    def _project(self, proposal: Product, elite: FloatArray, log_ratios: FloatArray, alpha: float) -> Product:
+    def _project(self, proposal: Product, elite: FloatArray, log_ratios: FloatArray) -> Product:
         """Return the proposal after one step of equation 2 towards the elite points."""
         if self.likelihood_ratio == "joint":
             log_ratios = np.broadcast_to(log_ratios.sum(axis=0), log_ratios.shape)
-        return proposal.project(elite, np.stack([normalise_weights(ratios) for ratios in log_ratios]), alpha)
-
-
-def as_tuple(setting: SettingT | tuple[SettingT, ...]) -> tuple[SettingT, ...]:
-    """Return a setting that may be one value or several as several."""
-    return tuple(setting) if isinstance(setting, tuple | list) else (setting,)
-
-
-def value_at(setting: SettingT | tuple[SettingT, ...], k: int) -> SettingT:
-    """Return the value of a setting at iteration k; the last one given holds on."""
-    values = as_tuple(setting)
-    return values[min(k, len(values) - 1)]
+        return proposal.project(elite, np.stack([normalise_weights(ratios) for ratios in log_ratios]), self.alpha)

@@ -52,42 +52,41 @@ class KeptDraws:
 
     def __init__(self, gamma: float, dim: int, most: int = MOST_DRAWS, most_failing: int | None = None) -> None:
         self._gamma, self._n_missing = gamma, 0
-        room = max(MOST_FAILING_BYTES // (8 * max(dim, 1)), LEAST_FAILING) if most_failing is None else most_failing
+        room = most_failing or max(MOST_FAILING_BYTES // (8 * max(dim, 1)), LEAST_FAILING)
         self._f, self._x, self._f_failing = EvenlySpaced(most), EvenlySpaced(room, (dim,)), EvenlySpaced(room)
 
-    def add(self, x: FloatArray, f: FloatArray) -> int:
-        """Add draws x (n, d) with outcomes f (n,); return how many of them fail."""
+    def add(self, x: FloatArray, f: FloatArray) -> None:
+        """Add draws x (n, d) with outcomes f (n,)."""
         fails = f <= self._gamma
         self._f.add(f)
         self._x.add(x[fails])
         self._f_failing.add(f[fails])
         self._n_missing += int(np.isneginf(f[fails]).sum())
-        return int(fails.sum())
 
     @property
-    def no_outcome_share(self) -> float:
-        """Share of the failing draws that have no outcome."""
-        return self._n_missing / self._x.n if self._x.n else 0.0
+    def counts(self) -> tuple[int, int]:
+        """Failing draws and all draws."""
+        return self._x.n, self._f.n
 
-    def to_sample(self) -> Sample:
-        """Return the draws as a sample; where some were left out, those kept stand for them.
+    def outcome(self, goal: Goal, trace: list[Level]) -> Outcome:
+        """Return the outcome of a run that ends with them.
 
-        The weights of the failing ones add up to their share of all draws, so that p is exact; the error of p at other
-        thresholds is that of the draws kept, as the weights and their number tell.
+        Where some draws were left out of its sample, those kept stand for them. The weights of the failing ones add up
+        to their share of all draws, so that p is exact; the error of p at other thresholds is that of the draws kept,
+        as the weights and their number tell.
         """
-        n, f, x = self._f.n, self._f.values, self._x.values
+        (hits, n), f, x, failing = self.counts, self._f.values, self._x.values, self._f_failing.values
         if self._f.stride == 1 and self._x.stride == 1:
-            return Sample.of_equal_draws(f, x)
-        failing, safe, hits = self._f_failing.values, f[f > self._gamma], self._x.n
-        weights = [np.full(k, m / (n * k)) for m, k in ((hits, len(failing)), (n - hits, len(safe))) if k]
-        k = len(failing) + len(safe)
-        return Sample(
-            f=np.concatenate([failing, safe]),
-            weights=np.concatenate(weights),
-            units=np.arange(k, dtype=np.int64),
-            n_units=k,
-            x=x,
-        )
+            sample = Sample.of_equal_draws(f, x)
+        else:
+            safe = f[f > self._gamma]
+            k = len(failing) + len(safe)
+            weights = [np.full(m, of / (n * m)) for of, m in ((hits, len(failing)), (n - hits, len(safe))) if m]
+            f, units = np.concatenate([failing, safe]), np.arange(k, dtype=np.int64)
+            sample = Sample(f=f, weights=np.concatenate(weights), units=units, n_units=k, x=x)
+        missing = self._n_missing / hits if hits else 0.0
+        outcome = Outcome.of_counts(hits, n, goal.confidence, trace, missing)
+        return replace(outcome, sample=sample, draw_weights=(DrawWeights.of_equal_draws(n, 0, n),))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -126,9 +125,8 @@ class MonteCarlo(Method):
     def steps(self, inputs: Inputs, goal: Goal, rng: np.random.Generator) -> Steps:
         """Draw batches until the target or the end of the budget."""
         budget = self.n if goal.max_sim is None else goal.max_sim
-        n, hits, met, stopped = 0, 0, False, False
-        draws = KeptDraws(goal.gamma, inputs.dim)
-        trace: list[Level] = []
+        draws, trace = KeptDraws(goal.gamma, inputs.dim), list[Level]()
+        n, met = 0, False
         while n < budget and not met:
             size = min(self.batch, budget - n)
             x = inputs.base.sample(size, rng)
@@ -137,20 +135,11 @@ class MonteCarlo(Method):
             except Interrupted:
                 if n == 0:  # the caller, who has simulated before, has the outcome
                     raise
-                stopped = True
-                break
-            failing = draws.add(x, f)
-            n, hits = n + size, hits + failing
+                return replace(draws.outcome(goal, trace), status=Status.STOPPED)
+            draws.add(x, f)
+            (hits, n), share = draws.counts, float((f <= goal.gamma).mean())
             cov = binomial_cov(hits / n, n)
             met = goal.target_cov is not None and hits > 0 and cov <= goal.target_cov
-            trace.append(
-                Level(gamma=goal.gamma, p=failing / size, estimate=hits / n, n_sim=size, n_points=size, cov=cov)
-            )
+            trace.append(Level(gamma=goal.gamma, p=share, estimate=hits / n, n_sim=size, n_points=size, cov=cov))
             goal.on_level(trace[-1])
-        outcome = Outcome.of_counts(hits, n, goal.confidence, trace, draws.no_outcome_share)
-        return replace(
-            outcome,
-            sample=draws.to_sample(),
-            status=Status.STOPPED if stopped else outcome.status,
-            draw_weights=(DrawWeights.of_equal_draws(n, 0, n),),
-        )
+        return draws.outcome(goal, trace)

@@ -1,15 +1,6 @@
-"""Subset simulation (Au and Beck 2001) and adaptive subset simulation (Tian et al. 2024): levels, estimate, methods.
-
-Estimate of subset simulation: p, c.o.v., interval and weighted points from the levels of a descent.
-
-References:
-    Au and Beck, "Estimation of small failure probabilities in high dimensions by subset simulation",
-    Probabilistic Engineering Mechanics 16, 2001.
-    Lee and Whiteley, "Variance estimation in the particle filter", Biometrika 105, 2018.
-"""
+"""Subset simulation (Au and Beck 2001) and adaptive subset simulation (Tian et al. 2024)."""
 
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import ClassVar, Literal, NamedTuple, Protocol
 
@@ -17,30 +8,19 @@ import numpy as np
 
 from samplers.mcmc import (
     Chains,
-    FixedMetropolis,
     Growth,
     Kernel,
     NextLevel,
     RootedPoints,
-    ScaledKernel,
-    chain_lengths,
     descend,
-    descent_cov,
-    draw_first_level,
+    independent_chains,
+    judge_levels,
     level_record,
-    multiply_levels,
-    subset_interval,
 )
 from samplers.method import Goal, Outcome, Steps, no_outcome_share
 from samplers.methods.base import Method
-from samplers.problem import FloatArray, Inputs, check_settings
-from samplers.sample import (
-    Layer,
-    Level,
-    Sample,
-    Status,
-    next_level,
-)
+from samplers.problem import Inputs, check_settings
+from samplers.sample import Layer, Level, Sample, Status, next_level
 
 LONGEST_CHAIN = 50
 """More steps than this from a handful of seeds cost calls of f and add little."""
@@ -64,16 +44,12 @@ class SubsetMethod(Method, Protocol):
     max_levels: int
     stops_at_target: ClassVar[bool] = False
 
-    def _check_levels(self) -> None:
-        """Check the settings of the levels."""
-        check_settings(self, n=10, max_levels=1, p0=(0.0, 0.5))
-
     def _descend(
         self, inputs: Inputs, goal: Goal, rng: np.random.Generator, kernel: Kernel, known: RootedPoints | None = None
     ) -> Steps:
         """Go from level to level until the share of failures among its points is p0 or more."""
-        n_known, gamma = 0 if known is None else len(known.f), goal.gamma
-        budget = goal.budget + n_known
+        u, f = (np.empty((0, inputs.dim)), np.empty(0)) if known is None else (known.u, known.f)
+        budget, gamma = goal.budget + len(f), goal.gamma
         fitting = int(budget / (1 + (USUAL_LEVELS - 1) * (1 - self.p0)))  # seeds are not simulated again
         n = min(self.n, max(math.ceil(FEWEST_SEEDS / self.p0), fitting))
         levels, trace = list[Chains](), list[Level]()
@@ -81,18 +57,20 @@ class SubsetMethod(Method, Protocol):
         def record(growth: Growth, planned: NextLevel | Status) -> None:
             threshold = planned.threshold if isinstance(planned, NextLevel) else gamma
             levels.append(growth.chains)
-            trace.append(level_record(growth.chains, threshold, multiply_levels(trace)))
+            trace.append(level_record(growth.chains, threshold, trace))
             goal.on_level(trace[-1])
 
-        first = yield from draw_first_level(inputs, max(min(n, budget), n_known), rng, known)
-        planner = SubsetPlanner(n, self.p0, self.max_levels, gamma, goal.budget - first.n_new)
-        status = yield from descend(inputs, Growth.start(first, kernel), planner, record, rng)
-        outcome = summarise(levels[-1], goal, trace, status)
+        new = rng.standard_normal((max(min(n, budget), len(f)) - len(f), inputs.dim))
+        if len(new):
+            outcomes = yield inputs.base.from_standard_normal(new)
+            u, f = np.concatenate([u, new]), np.concatenate([f, outcomes])
+        first = independent_chains(u, f)._replace(n_new=len(new))
+        planner = SubsetPlanner(n, self.p0, self.max_levels, gamma, goal.budget - len(new))
+        status = yield from descend(inputs, first, kernel, planner.plan_next, record, rng)
         doubts = [f"max_sim leaves {budget} simulations: {n} points per level, not {self.n}."] if n < self.n / 2 else []
         if budget < n:
             doubts = [f"max_sim leaves {budget} of the {n} simulations that level 0 needs at least: plain draws only."]
-        warnings = (*doubts, *outcome.warnings)
-        return replace(outcome, warnings=warnings, sample=weighted_points(inputs, levels, trace, gamma))
+        return summarise(inputs, levels, goal, trace, status, doubts)
 
 
 class SubsetPlanner(NamedTuple):
@@ -119,8 +97,9 @@ class SubsetPlanner(NamedTuple):
         if left < n_seeds:
             return Status.BUDGET  # not one step for every chain
         longest = max(LONGEST_CHAIN, math.ceil(1 / self.p0))
-        n_points = max(min(self.n, n_seeds + left, n_seeds * longest), n_seeds)
-        return NextLevel(threshold, seeds, chain_lengths(n_points, n_seeds, rng))
+        total = max(min(self.n, n_seeds + left, n_seeds * longest), n_seeds)
+        lengths = total // n_seeds + (rng.permutation(n_seeds) < total % n_seeds)  # equal, or differing by 1 at random
+        return NextLevel(threshold, seeds, np.asarray(lengths, dtype=np.int64))
 
 
 ACCEPTANCE_RANGE = (0.15, 0.85)
@@ -131,61 +110,60 @@ LARGE_COV = 0.5
 """C.o.v. that is worth a warning; the interval then spans a factor of 2.5 to either side."""
 
 
+def summarise(
+    inputs: Inputs, levels: list[Chains], goal: Goal, trace: list[Level], status: Status, doubts: list[str]
+) -> Outcome:
+    """Return the outcome of all levels, of the last of which `trace` counts f <= gamma."""
+    hits = levels[-1].where(levels[-1].f <= goal.gamma).f
+    cov, interval = judge_levels(levels[-1], goal, trace)
+    return Outcome(
+        p=trace[-1].estimate,
+        interval=interval,
+        cov=cov,
+        status=status if len(hits) or status is Status.STOPPED else Status.NO_HITS,
+        warnings=(*doubts, *_end_warnings(len(trace) - 1, status, len(hits), cov), *_chain_warnings(trace)),
+        trace=tuple(trace),
+        no_outcome_share=no_outcome_share(hits),
+        base_draws=trace[0].n_points,
+        sample=weighted_points(inputs, levels, trace, goal.gamma),
+    )
+
+
 def weighted_points(inputs: Inputs, levels: list[Chains], trace: list[Level], gamma: float) -> Sample:
     """Return the points of all levels with their weights.
 
     A point of level j counts where it lies above the threshold that leads on to level j + 1 (below it, the
     points of level j + 1 speak), with weight P_j / N_j: the probability of its level over its points.
     """
-    kept = [c.where(c.f > record.gamma) for c, record in zip(levels[:-1], trace[:-1], strict=True)]
-    kept.append(levels[-1].where(levels[-1].used))
     reached = np.cumprod([1.0, *(record.p for record in trace[:-1])])
     weights = reached / [record.n_points for record in trace]
-    last = kept[-1]  # every point with f <= gamma is one of these
+    thresholds = [math.inf, *(record.gamma for record in trace[:-1]), -math.inf]
+    points = [chains.where(chains.used) for chains in levels]
+    layers = tuple(
+        Layer(f=of.f, weights=np.full(len(of.f), weight), units=of.roots, low=low, high=high)
+        for of, weight, high, low in zip(points, weights, thresholds, thresholds[1:], strict=False)
+    )
+    kept = [(layer, (layer.f > layer.low) | (layer.low == -math.inf)) for layer in layers]
+    last = points[-1]  # every point with f <= gamma is one of these
     return Sample(
-        f=np.concatenate([points.f for points in kept]),
-        weights=np.repeat(weights, [len(points.f) for points in kept]),
-        units=np.concatenate([points.roots for points in kept]),
+        f=np.concatenate([layer.f[above] for layer, above in kept]),
+        weights=np.concatenate([layer.weights[above] for layer, above in kept]),
+        units=np.concatenate([layer.units[above] for layer, above in kept]),
         n_units=trace[0].n_points,
         x=inputs.base.from_standard_normal(last.u[last.f <= gamma]),
-        layers=tuple(_layers(levels, trace, weights)),
-    )
-
-
-def _layers(levels: list[Chains], trace: list[Level], weights: FloatArray) -> Iterator[Layer]:
-    """Go through the levels with all their points; level j has thresholds from that of level j + 1 to its own."""
-    thresholds = [math.inf, *(record.gamma for record in trace[:-1]), -math.inf]
-    for chains, weight, high, low in zip(levels, weights, thresholds, thresholds[1:], strict=False):
-        points = chains.where(chains.used)
-        yield Layer(f=points.f, weights=np.full(len(points.f), weight), units=points.roots, low=low, high=high)
-
-
-def summarise(chains: Chains, goal: Goal, trace: list[Level], status: Status) -> Outcome:
-    """Return the outcome after a last level `chains`, of which the last of `trace` counted f <= gamma."""
-    _, hits, roots = chains.where(chains.f <= goal.gamma)
-    product = multiply_levels(trace)
-    cov = max(product.cov, descent_cov(roots, trace[0].n_points))
-    return Outcome(
-        p=product.p,
-        interval=subset_interval(chains, goal, trace, cov),
-        cov=cov,
-        status=status if len(hits) or status is Status.STOPPED else Status.NO_HITS,
-        warnings=(*_end_warnings(len(trace) - 1, status, len(hits), cov), *_chain_warnings(trace)),
-        trace=tuple(trace),
-        no_outcome_share=no_outcome_share(hits),
-        base_draws=trace[0].n_points,
+        layers=layers,
     )
 
 
 def _end_warnings(depth: int, status: Status, hits: int, cov: float) -> list[str]:
     """Return what the end of the run at level `depth` and its failures leave doubtful."""
-    found, failing = [], f"{hits} failing point{'' if hits == 1 else 's'}"
-    if status is Status.STALLED:
-        found.append(f"No progress beyond level {depth}: f is constant there, or the limit on levels was reached.")
-    if status is Status.BUDGET:
-        found.append(f"max_sim was used up at level {depth}; p rests on {failing}.")
-    if status is Status.STOPPED:
-        found.append(f"Stopped at level {depth}; p rests on {failing}.")
+    failing = f"{hits} failing point{'' if hits == 1 else 's'}"
+    about = {
+        Status.STALLED: f"No progress beyond level {depth}: f is constant there, or the limit on levels was reached.",
+        Status.BUDGET: f"max_sim was used up at level {depth}; p rests on {failing}.",
+        Status.STOPPED: f"Stopped at level {depth}; p rests on {failing}.",
+    }
+    found = [about[status]] if status in about else []
     if hits == 0:
         found.append("No failure was seen: p = 0 with a one-sided interval.")
     elif cov > LARGE_COV:
@@ -210,30 +188,25 @@ def _chain_warnings(trace: list[Level]) -> list[str]:
 
 @dataclass(frozen=True, kw_only=True)
 class SubsetSimulation(SubsetMethod):
-    """Subset simulation with the component-wise modified Metropolis algorithm.
+    """Subset simulation with the component-wise modified Metropolis algorithm; "SS" of Tian et al.
 
     P[f <= gamma] is the product of conditional probabilities P[F_j | F_(j-1)] of nested level
     sets F_j = {f <= b_j}. Level 0 is plain Monte Carlo; from level 1 on, every point inside F_j
     starts a Markov chain that stays in F_j. A move proposes a symmetric step of every component,
     keeps each with probability min(1, phi(new) / phi(old)), and is taken if it ends in F_j. Works
-    in standard normal space. "SS" of Tian et al.
+    in standard normal space.
 
     Where the paper and this implementation differ:
 
     - *Chains* move together, one step per call of f, so that f gets about p0 N rows per call.
-    - *A candidate equal to its point* (no component moved; every third or so in one dimension)
-      is not simulated again; a level then costs less than (1 - p0) N.
-    - *Ties.* Thresholds are outcomes that occurred, with their true share (`next_level`); the
-      paper books p0 for every level but the last.
-    - *c.o.v.* The larger of the paper's (equations 25 to 29, with levels taken as independent)
-      and the one from the descent of the failing points (`descent_cov`), which does not.
+    - *A candidate equal to its point* (every third or so in one dimension) is not simulated again.
+    - *Ties.* Thresholds are outcomes that occurred, with their true share; the paper books p0 for all but the last.
+    - *c.o.v.* The larger of the paper's (equations 25 to 29), which takes the levels as independent,
+      and the one from the descent of the failing points, which does not.
 
-    The script that Tian et al. released for this method does not run; where it can be read it maps
-    to normal space through marginals only.
-
-    The interval is log-normal with the t quantile of the independent paths that reach the failures
-    (`effective_roots`), or Clopper-Pearson where level 0 already answers. p-hat has a bias of order
-    1/N. A small max_sim is dealt with as in `AdaptiveSubsetSimulation`.
+    The interval is log-normal with the t quantile of the independent paths that reach the failures, or Clopper-Pearson
+    where level 0 already answers. p-hat has a bias of order 1/N. A small max_sim is dealt with as in
+    `AdaptiveSubsetSimulation`.
 
     Args:
         n: Points per level, N. (Tian et al. have 500.)
@@ -264,12 +237,12 @@ class SubsetSimulation(SubsetMethod):
 
     def __post_init__(self) -> None:
         """Check the settings."""
-        self._check_levels()
+        check_settings(self, n=10, max_levels=1, p0=(0.0, 0.5))
         check_settings(self, distribution=("uniform", "normal"), spread=(0.0, math.inf))
 
     def steps(self, inputs: Inputs, goal: Goal, rng: np.random.Generator) -> Steps:
         """Go from level to level until the share of failures among its points is p0 or more."""
-        return self._descend(inputs, goal, rng, FixedMetropolis(self.spread, distribution=self.distribution))
+        return self._descend(inputs, goal, rng, Kernel(self.distribution, self.spread))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -283,36 +256,22 @@ class AdaptiveSubsetSimulation(SubsetMethod):
 
     Where the paper, its released code and this implementation differ:
 
-    - *Proposal.* The paper speaks of conditional sampling, with standard deviations of at most 1
-      (equation 14), and prints a Metropolis ratio r = phi(new) / phi(old) per component (equations
-      19, 20); the code draws the conditional (AR-1) proposal rho u + sigma xi, rho^2 = 1 - sigma^2,
-      and has no ratio. Only one of the two is right at a time. The AR-1 proposal leaves N(0, 1)
-      invariant on its own (its own Metropolis ratio is 1 everywhere); with r on top the invariant
-      distribution would be phi^2, N(0, 1/2), and p far too small. The ratio r is exact for a symmetric step
-      u + sigma xi. So "conditional" is the code's reading and "metropolis" the printed one with the
-      step that it is right for. The default is "conditional": no component ever stays, so every
-      candidate is new. A level of 1000 points is then worth 381 independent ones against 299 in 2
-      dimensions and 385 against 372 in 100, and the spread of p-hat is 13 to 23 % smaller.
-    - *Adaptation.* Paper and code run N_a = 10 chains to their end, then adapt the scale for the
-      next 10. Ours moves all chains together, one step per call of f, and adapts after each step
-      with the same rule (equation 16), so that f gets about p0 N rows per call and a level takes
-      about 1/p0 - 1 calls. The scale is carried to the next level; paper and code start again.
-    - *sigma0.* 1 ("unit") as the code has hard-selected it; the paper's seed standard deviations
-      (equations 17, 18) are "seeds" (the code's version of them averages over the wrong axis).
-      They depend on the very points that are moved, which biases p where d is large: -12 % on a
-      hypersphere with d = 20, against +4 % with 1.
-    - *Seeds* keep their stored outcome; the code simulates them again, which costs p0 N calls
-      per level and biases p when f is noisy.
+    - *Proposal.* "conditional" is the code's, u' = rho u + sigma xi, which needs no ratio; the paper prints a ratio
+      with it, phi(new) / phi(old) per component, which makes the invariant distribution N(0, 1/2). "metropolis" is that
+      ratio with the symmetric step that it is right for; a level of it is worth 3 to 22 % fewer independent points.
+    - *Adaptation.* After each step of all chains together, by the rule of equation 16, and carried to the next level;
+      paper and code adapt after every 10 whole chains and start again at each level.
+    - *sigma0.* 1 ("unit") as in the code; "seeds" are the paper's deviations (equations 17, 18), which depend on the
+      very points that are moved: a bias of -12 % on a hypersphere with d = 20, against +4 % with 1.
+    - *Seeds* keep their outcome; the code simulates them again, p0 N calls per level and a bias where f is noisy.
     - *End.* No level is simulated once p0 N points have f <= gamma; the code runs one more.
-    - *Ties.* Thresholds are outcomes that occurred, with their true share (`next_level`); the
-      code takes an interpolated percentile and books p0 whatever the share.
-    - *c.o.v.* Au and Beck's chain correlation, chains kept apart; the code mixes the chains. The
-      released "Cov" column is the square of a c.o.v.
+    - *Ties.* Thresholds are outcomes that occurred, with their true share; the code interpolates and books p0.
+    - *c.o.v.* By Au and Beck with chains kept apart; the code mixes them, and its "Cov" is the square of a c.o.v.
 
     The c.o.v. is the larger of two: Au and Beck's, which takes the levels as independent, and the
-    one from the descent of the failing points (`descent_cov`), which does not. The interval is
-    log-normal with the t quantile of the independent paths that reach the failures
-    (`effective_roots`), or Clopper-Pearson where level 0 already answers. p-hat has a bias of order
+    one from the descent of the failing points, which does not. The interval is
+    log-normal with the t quantile of the independent paths that reach the failures,
+    or Clopper-Pearson where level 0 already answers. p-hat has a bias of order
     1/N (+1 to +4 % at N = 1000 and p = 2e-4).
 
     Where max_sim does not hold four levels of n points (3.7 n with p0 = 0.1), N is what lets them
@@ -357,8 +316,7 @@ class AdaptiveSubsetSimulation(SubsetMethod):
 
     def __post_init__(self) -> None:
         """Check the settings."""
-        self._check_levels()
-        check_settings(self, scale=(0.0, math.inf), target_acceptance=(0.0, 1.0))
+        check_settings(self, n=10, max_levels=1, p0=(0.0, 0.5), scale=(0.0, math.inf), target_acceptance=(0.0, 1.0))
         check_settings(self, proposal=("conditional", "metropolis"), sigma0=("unit", "seeds"))
 
     def steps(self, inputs: Inputs, goal: Goal, rng: np.random.Generator, known: RootedPoints | None = None) -> Steps:
@@ -366,9 +324,8 @@ class AdaptiveSubsetSimulation(SubsetMethod):
 
         Level 0 begins with base draws whose outcomes are known, at most n.
         """
-        kernel = ScaledKernel(
-            self.proposal, self.sigma0, self.scale, self.target_acceptance, deviations=np.ones(inputs.dim)
-        )
+        proposal: Literal["conditional", "normal"] = "conditional" if self.proposal == "conditional" else "normal"
+        kernel = Kernel(proposal, self.scale, self.target_acceptance, by_seeds=self.sigma0 == "seeds")
         return self._descend(inputs, goal, rng, kernel, known)
 
 
@@ -376,12 +333,12 @@ def spend_on_subset_simulation(
     inputs: Inputs, goal: Goal, levels: int, budget: int, known: RootedPoints | None, rng: np.random.Generator
 ) -> Steps:
     """Run adaptive subset simulation with the points per level that a budget or a target c.o.v. asks for."""
-    levels = max(levels, FEWEST_LEVELS)
-    n = int((budget + (0 if known is None else len(known.f))) / (1 + LEVEL_SHARE * (levels + 0.5)))
+    levels, n_known = max(levels, FEWEST_LEVELS), 0 if known is None else len(known.f)
+    n = int((budget + n_known) / (1 + LEVEL_SHARE * (levels + 0.5)))
     if goal.target_cov is not None:
         n = min(n, math.ceil(CHAIN_POINTS * (levels + 1) / goal.target_cov**2))
     n = max(n, 10)
-    known = known and known.select(np.arange(min(n, len(known.f))))
+    known = known and known.select(np.arange(min(n, n_known)))
     outcome = yield from AdaptiveSubsetSimulation(n=n).steps(inputs, replace(goal, max_sim=budget), rng, known)
     about = (
         "No proposal describes the failures: p is from adaptive subset simulation with the remaining "

@@ -63,9 +63,9 @@ def installed(tmp_path, monkeypatch):
         monkeypatch.syspath_prepend(tmp_path)
         return tmp_path
 
-    vars(METHODS).pop("_installed", None)  # as in a new process
+    vars(METHODS).pop("_all", None)  # as in a new process
     yield install
-    vars(METHODS).pop("_installed", None)
+    vars(METHODS).pop("_all", None)
     sys.modules.pop("lattice_methods", None)
 
 

@@ -41,14 +41,12 @@ from samplers.components import IsotropicNormal, MixtureComponent, draw_componen
 from samplers.mcmc import (
     Chains,
     Growth,
+    Kernel,
     NextLevel,
-    ScaledKernel,
     descend,
-    descent_cov,
     independent_chains,
+    judge_levels,
     level_record,
-    multiply_levels,
-    subset_interval,
 )
 from samplers.method import Goal, Interrupted
 from samplers.methods.base import ComponentDraws, SimulationSteps, Simulator
@@ -156,9 +154,7 @@ def descend_levels(
 
     All candidates are kept, for the regressions around the regions; there is no estimate, so no level is recorded.
     """
-    kernel = ScaledKernel(
-        "conditional", "unit", EXPLORATION.initial_scale, EXPLORATION.level_acceptance, deviations=np.ones(u.shape[1])
-    )
+    kernel = Kernel("conditional", EXPLORATION.initial_scale, EXPLORATION.level_acceptance)
     gamma = goal.gamma
     planner = ExplorationPlanner(gamma, n, most - simulator.n_sim)
     levels, thresholds = list[Growth](), list[float]()
@@ -167,8 +163,8 @@ def descend_levels(
         levels.append(growth)
         thresholds.append(planned.threshold if isinstance(planned, NextLevel) else gamma)
 
-    start = Growth.start(independent_chains(u, f), kernel)
-    status = yield from descend(simulator.inputs, start, planner, record, rng)
+    first = independent_chains(u, f)
+    status = yield from descend(simulator.inputs, first, kernel, planner.plan_next, record, rng)
     outcomes = np.concatenate([level.f_candidates for level in levels])
     simulator.n_sim += len(outcomes)
     if status is Status.STOPPED:
@@ -189,10 +185,8 @@ def _upper_end(levels: list[Chains], thresholds: list[float], goal: Goal) -> flo
     """Return the upper end of p by subset simulation."""
     trace = list[Level]()
     for chains, threshold in zip(levels, thresholds, strict=True):
-        trace.append(level_record(chains, threshold, multiply_levels(trace)))
-    roots = levels[-1].where(levels[-1].f <= goal.gamma).roots
-    cov = max(multiply_levels(trace).cov, descent_cov(roots, trace[0].n_points))
-    return subset_interval(levels[-1], goal, trace, cov)[1]
+        trace.append(level_record(chains, threshold, trace))
+    return judge_levels(levels[-1], goal, trace)[1][1]
 
 
 def choose_roots(f: FloatArray, n: int, rng: np.random.Generator) -> NDArray[np.int64]:
