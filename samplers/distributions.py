@@ -242,7 +242,7 @@ class OpenTurnsDistribution(DrawnByItsMap):
 
     def to_standard_normal(self, x: FloatArray, /) -> FloatArray:
         """Map x (n, d) to u ~ N(0, I)."""
-        if self.dim > 1:
+        if self.dim > 1 or len(x) == 0:
             return _map(self.distribution.getIsoProbabilisticTransformation(), x)
         above = np.asarray(self.distribution.computeComplementaryCDF(x))
         return np.where(above < 0.5, -ndtri(above), ndtri(np.asarray(self.distribution.computeCDF(x))))

@@ -75,19 +75,6 @@ def shell(dim: int = 20, p: float = 1e-4) -> Reference:
     return _reference(f"shell_d{dim}", lambda u: radius - np.linalg.norm(u, axis=1), dim, p)
 
 
-def unannounced_region(announced: float = 4.0, hidden: float = 3.1) -> Reference:
-    """Return two regions of failure, of which f announces only the rarer one: 3 % of p.
-
-    f = announced - u1 falls towards u1 > announced; u1 < -hidden, on the far side, where f is
-    largest, fails without a sign (f = -1). Methods that follow f downhill find the hidden region
-    by a lucky early draw or not at all, and then return P[u1 > announced] = 3.2e-5 and a
-    narrow interval that does not hold p = 9.99e-4. This problem measures how often a method misses
-    such a region and whether it warns of that. No method here is expected to cover p.
-    """
-    p = normal_cdf(-announced) + normal_cdf(-hidden)
-    return _reference("unannounced", lambda u: np.where(u[:, 0] < -hidden, -1.0, announced - u[:, 0]), 2, p)
-
-
 def _reference(name: str, f: Callable[[FloatArray], ArrayLike], dim: int, p: float) -> Reference:
     return Reference(name, FunctionProblem(f, dim), p)
 

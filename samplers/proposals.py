@@ -23,7 +23,7 @@ from scipy.special import logsumexp
 
 from samplers.components import expectation_maximisation, shrink_covariance, start_from_centres
 from samplers.distributions import Gaussian
-from samplers.problem import FloatArray, StandardNormal
+from samplers.problem import FloatArray
 
 __all__ = ["Gaussian", "Mixture", "correct_eigenvalues", "fit_proposal_mixture", "fit_shrunk_gaussian"]
 
@@ -36,21 +36,6 @@ class ProposalDistribution(Protocol):
 
     def log_prob(self, u: FloatArray, /) -> FloatArray:
         """Return the log density at u (n, d), shape (n,)."""
-
-
-@dataclass(frozen=True, eq=False)
-class TiltedNormal:
-    """N(shift, I), that is N(0, I) tilted by exp(shift' u - |shift|^2 / 2), for a shift (d,)."""
-
-    shift: FloatArray
-
-    def sample(self, n: int, rng: np.random.Generator) -> FloatArray:
-        """Draw n independent points, shape (n, d)."""
-        return self.shift + rng.standard_normal((n, len(self.shift)))
-
-    def log_prob(self, u: FloatArray, /) -> FloatArray:
-        """Return the log density at u (n, d), shape (n,)."""
-        return StandardNormal(len(self.shift)).log_prob(u - self.shift)
 
 
 @dataclass(frozen=True, eq=False)

@@ -211,4 +211,6 @@ class ComponentDraws(NamedTuple):
     u: FloatArray  # (n, d)
     f: FloatArray  # (n,)
     first: int = 0  # simulations that the run had spent before the first of them
-    x: FloatArray | None = None  # in physical space, (n, d), where they are kept: a fitted base is slow to map them again
+    x: FloatArray | None = (
+        None  # in physical space, (n, d), where they are kept: a fitted base is slow to map them again
+    )

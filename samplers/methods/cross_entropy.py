@@ -1,9 +1,9 @@
 """The cross-entropy method (O'Kelly et al. 2018, algorithm 1)."""
 
 import math
-from collections.abc import Generator, Sequence
+from collections.abc import Generator
 from dataclasses import dataclass
-from typing import ClassVar, Literal, NamedTuple
+from typing import ClassVar, Literal
 
 import numpy as np
 
@@ -15,15 +15,6 @@ from samplers.methods.blocks import GaussianBlock, MixtureBlock, NormalBlock, Pr
 from samplers.problem import FloatArray, Inputs, check_settings, is_number
 from samplers.proposals import ProposalDistribution
 from samplers.sample import Status, next_level, normalise_weights
-
-
-class Iterate(NamedTuple):
-    """One proposal of the search, with the results of its draws."""
-
-    proposal: Product
-    quantile: float  # the rho-quantile of f under the proposal
-    level: float  # gamma_k: the quantile, but not less than gamma
-    cov: float  # of P[f <= level]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -141,15 +132,17 @@ class CrossEntropy(Method):
         """Search for a proposal, then estimate with fresh draws."""
         base = self._start(inputs)
         search = Search(inputs, goal, rng, base, np.asarray if self.family == "blocks" else None)
-        iterates = yield from self._search(search, base)
-        best = min(iterates, key=self._rank, default=None)
+        proposals, quantiles = yield from self._search(search, base)
+        firsts = quantiles if self.choice == "quantile" else [level.gamma for level in search.trace]
+        ranks = [(first, level.cov) for first, level in zip(firsts, search.trace, strict=True)]
+        best = ranks.index(min(ranks)) if ranks else 0
+        reached = bool(ranks) and search.trace[best].gamma == goal.gamma
         sampler: ProposalDistribution = base
         base_share = 1.0
-        if best is not None and len(iterates) > 1:  # else the base draws fail often enough, or there is no way on
+        if len(proposals) > 1:  # else the base draws fail often enough, or there is no way on
             base_share = self.base_share
-            sampler = search.mix(best.proposal, base_share, self.wide_share, self.wide_factor)
-        doubts = [] if best is not None and best.level == goal.gamma else search.warnings()
-        limit = count_final_draws(goal, search.n_sim, self.n_final)
+            sampler = search.mix(proposals[best], base_share, self.wide_share, self.wide_factor)
+        limit, doubts = count_final_draws(goal, search.n_sim, self.n_final), [] if reached else search.warnings()
         return (yield from search.finish(sampler, base_share, limit, self.n_final, goal.target_cov, doubts))
 
     def _start(self, inputs: Inputs) -> Product:
@@ -161,34 +154,31 @@ class CrossEntropy(Method):
             return Product((MixtureBlock(gaussian, self.components),))
         return Product((GaussianBlock(gaussian) if self.family == "gaussian" else NormalBlock(gaussian),))
 
-    def _rank(self, iterate: Iterate) -> tuple[float, float]:
-        """Return the order of the iterates: the least one is sampled from."""
-        return (iterate.quantile if self.choice == "quantile" else iterate.level, iterate.cov)
-
-    def _search(self, search: Search, proposal: Product) -> Generator[FloatArray, FloatArray, Sequence[Iterate]]:
-        """Run algorithm 1, as a rule until two proposals have reached gamma."""
-        iterates, gamma, base = list[Iterate](), search.goal.gamma, proposal
-        while last := (
-            yield from search.draw(proposal, self.n_iteration, self.max_iterations)
-        ):
+    def _search(
+        self, search: Search, base: Product
+    ) -> Generator[FloatArray, FloatArray, tuple[list[Product], list[float]]]:
+        """Run algorithm 1; return the proposals drawn from and the rho-quantile of f under each."""
+        proposals, quantiles, gamma, n_reached = [base], list[float](), search.goal.gamma, 0
+        while last := (yield from search.draw(proposals[-1], self.n_iteration, self.max_iterations)):
             del search.rounds[1:-1]  # `Search.pool_rounds` takes the first and the last one
             level = next_level(last.f, self.rho, gamma)
             lowest = float(last.f.min()) if level is None else level
             elite = last.u[last.f <= lowest]
-            log_ratios = base.log_probs(elite) - proposal.log_probs(elite)
+            log_ratios = base.log_probs(elite) - proposals[-1].log_probs(elite)
             rank = int(np.ceil(self.rho * len(last.f))) - 1
+            quantiles.append(float(np.partition(last.f, rank)[rank]))
             search.record(lowest, log_ratios.sum(axis=0))
-            iterates.append(Iterate(proposal, float(np.partition(last.f, rank)[rank]), lowest, search.trace[-1].cov))
             if level is None:
-                return iterates
-            n_reached, first = sum(iterate.level == gamma for iterate in iterates), len(iterates) == 1
+                break
+            first, n_reached = len(quantiles) == 1, n_reached + (level == gamma)
             if n_reached == 2 - first and (self.early_end or first):
                 search.status = Status.CONVERGED
-                return iterates
-            proposal = self._project(proposal, elite, log_ratios)
-        if search.status is Status.STALLED and iterates[-1].level == gamma:
-            search.status = Status.CONVERGED
-        return iterates
+                break
+            proposals.append(self._project(proposals[-1], elite, log_ratios))
+        else:
+            if search.status is Status.STALLED and search.trace[-1].gamma == gamma:
+                search.status = Status.CONVERGED
+        return proposals[: len(quantiles)], quantiles
 
     def _project(self, proposal: Product, elite: FloatArray, log_ratios: FloatArray) -> Product:
         """Return the proposal after one step of equation 2 towards the elite points."""

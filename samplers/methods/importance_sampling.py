@@ -11,7 +11,7 @@ from samplers.importance import Search
 from samplers.method import Goal, Steps
 from samplers.methods.base import Method
 from samplers.problem import FloatArray, Inputs, check_settings
-from samplers.proposals import ProposalDistribution, TiltedNormal
+from samplers.proposals import Gaussian, ProposalDistribution
 from samplers.sample import Status, next_level, normalise_weights
 
 QUANTILE = 1.96
@@ -95,8 +95,8 @@ class ImportanceSampling(Method):
     def steps(self, inputs: Inputs, goal: Goal, rng: np.random.Generator) -> Steps:
         """Search for the tilt, then draw until the interval is narrow enough."""
         search = Search(inputs, goal, rng)
-        tilt = yield from self._search(search)
-        missed = unreached_share(search, tilt.shift) if tilt and search.status is not Status.STOPPED else 0.0
+        tilt = yield from self._search(search, inputs.dim)
+        missed = unreached_share(search, tilt.mean) if tilt and search.status is not Status.STOPPED else 0.0
         sampler, base_share, doubts = search.base, 1.0, search.warnings()
         if missed > MOST_UNREACHED:
             where = f"{100 * missed:.0f} % of the failing points found lie outside the tilted distribution"
@@ -115,9 +115,9 @@ class ImportanceSampling(Method):
             return outcome
         return outcome.remark_first(f"All draws were used at a c.o.v. of {outcome.cov:.3g}, above {target:.3g}.")
 
-    def _search(self, search: Search) -> Generator[FloatArray, FloatArray, TiltedNormal | None]:
+    def _search(self, search: Search, dim: int) -> Generator[FloatArray, FloatArray, Gaussian | None]:
         """Follow the level down to gamma and fit the shift there twice; None where base draws serve."""
-        tilt, gamma, reached = None, search.goal.gamma, 0
+        tilt, gamma, reached, identity = None, search.goal.gamma, 0, np.eye(dim)
         proposal: ProposalDistribution = search.base
         while last := (yield from search.draw(proposal, self.n_round, self.max_rounds)):
             level = next_level(last.f, self.rho, gamma)
@@ -127,7 +127,7 @@ class ImportanceSampling(Method):
             if level is None or (tilt is None and level == gamma):
                 search.status = Status.STALLED if level is None else Status.CONVERGED
                 return tilt
-            proposal = tilt = TiltedNormal(normalise_weights(log_weights[inside]) @ last.u[inside])
+            proposal = tilt = Gaussian(normalise_weights(log_weights[inside]) @ last.u[inside], identity)
             reached += level == gamma
             if reached == FITS_AT_GAMMA:
                 break

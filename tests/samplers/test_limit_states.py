@@ -8,7 +8,6 @@ from samplers.limit_states import (
     plateau,
     shell,
     two_modes,
-    unannounced_region,
 )
 
 
@@ -21,7 +20,6 @@ from samplers.limit_states import (
         four_branches(k=1.8),
         plateau(beta=1.5),
         shell(5, p=0.05),
-        unannounced_region(1.5, 1.2),
     ],
     ids=lambda r: r.name,
 )

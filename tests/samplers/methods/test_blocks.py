@@ -265,7 +265,7 @@ def test_joint_ratio_is_the_projection_of_equation_2(rng):
     elite = u[u.sum(axis=1) <= 0.7]
     ratios = base.log_probs(elite) - shifted.log_probs(elite)
     for ratio, right in (("joint", True), ("block", False)):
-        moved = CE(family="blocks", likelihood_ratio=ratio)._project(shifted, elite, ratios, 1.0)
+        moved = CE(family="blocks", likelihood_ratio=ratio, alpha=1.0)._project(shifted, elite, ratios)
         for block in moved.blocks:
             assert block.box[0] < block.alpha[0] < block.box[1]
             found = [stats.beta(block.alpha[0], block.beta[0]).expect(g) for g in (np.log, lambda y: np.log1p(-y))]

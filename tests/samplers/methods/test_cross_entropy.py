@@ -53,7 +53,7 @@ def test_a_step_of_the_search_uses_the_likelihood_ratio(rng):
     u = proposal.sample(200_000, rng)
     u = u[u[:, 0] > 2.0]
     log_ratios = (Gaussian.standard(2).log_prob(u) - proposal.log_prob(u))[None]
-    moved = CE()._project(Product((GaussianBlock(proposal),)), u, log_ratios, 1.0)
+    moved = CE(alpha=1.0)._project(Product((GaussianBlock(proposal),)), u, log_ratios)
     np.testing.assert_allclose(moved.blocks[0].gaussian.mean, [stats.norm.pdf(2) / stats.norm.sf(2), 0.0], atol=0.02)
 
 

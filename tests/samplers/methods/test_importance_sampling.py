@@ -19,10 +19,10 @@ def test_the_tilt_is_the_mean_of_the_failures(drive):
     """For a half-space at beta that is phi(beta) / Phi(-beta) along its normal."""
     reference = half_space(2, 3.0)
     search = Search(reference.problem, Goal(gamma=0.0), np.random.default_rng(1))
-    tilt = drive(IS(n_round=5000)._search(search), reference.problem).value
+    tilt = drive(IS(n_round=5000)._search(search, 2), reference.problem).value
     assert search.status is Status.CONVERGED
     length = stats.norm.pdf(3.0) / stats.norm.sf(3.0)
-    np.testing.assert_allclose(tilt.shift, np.full(2, length / math.sqrt(2)), atol=0.1)
+    np.testing.assert_allclose(tilt.mean, np.full(2, length / math.sqrt(2)), atol=0.1)
 
 
 @pytest.mark.parametrize(

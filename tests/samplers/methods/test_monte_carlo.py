@@ -7,6 +7,7 @@ import pytest
 
 import samplers
 from samplers.limit_states import half_space
+from samplers.method import Goal
 from samplers.methods import monte_carlo as kept_draws
 from samplers.methods.monte_carlo import KeptDraws
 
@@ -52,7 +53,8 @@ def test_thinned_draws_keep_p_and_match_failing_points_with_their_f(rng: np.rand
     draws = KeptDraws(-0.5, 2, most=100, most_failing=30)
     for first in range(0, 1000, 90):
         draws.add(x[first : first + 90], f[first : first + 90])
-    sample, fails = draws.to_sample(), f <= -0.5
+    outcome, fails = draws.outcome(Goal(gamma=-0.5), []), f <= -0.5
+    sample = outcome.sample
     failing = sample.f <= -0.5
     assert np.isclose(sample.weights[failing].sum(), fails.mean(), rtol=1e-12)
     assert np.isclose(sample.weights.sum(), 1.0, rtol=1e-12)
@@ -60,7 +62,7 @@ def test_thinned_draws_keep_p_and_match_failing_points_with_their_f(rng: np.rand
     stride = len(x[fails]) // failing.sum() + 1
     expected = x[fails][::stride]
     assert np.array_equal(sample.x, expected) and np.array_equal(sample.f[failing], f[fails][::stride])
-    assert draws.no_outcome_share == np.isneginf(f[fails]).mean()
+    assert outcome.no_outcome_share == np.isneginf(f[fails]).mean()
 
 
 def test_memory_does_not_grow_with_the_draws() -> None:
@@ -72,4 +74,5 @@ def test_memory_does_not_grow_with_the_draws() -> None:
     kept = sum(part.nbytes for rows in (draws._f, draws._x, draws._f_failing) for part in rows._parts)
     limit = 8 * kept_draws.MOST_DRAWS + 2 * kept_draws.MOST_FAILING_BYTES
     assert kept <= limit
-    assert len(draws.to_sample().f) < 2 * kept_draws.MOST_DRAWS + kept_draws.MOST_FAILING_BYTES // 8
+    kept = len(draws.outcome(Goal(gamma=0.0), []).sample.f)
+    assert kept < 2 * kept_draws.MOST_DRAWS + kept_draws.MOST_FAILING_BYTES // 8
