@@ -222,7 +222,7 @@ class CollisionRate:
             "spread": self.probability.spread,
             "site_log_sd": self.site_log_sd,
             "shares_of_variance": self.shares,
-            "frequency": {**frequency.to_dict(), "per_hour": frequency.per_hour, "per_km": frequency.per_km},
+            "frequency": {**asdict(frequency), "per_hour": frequency.per_hour, "per_km": frequency.per_km},
             "fitted_to": self.fitted_to,
         }
 

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from rare_envs.control.actions import ACTIONS
-from rare_envs.distributions.product import join_independent
+from rare_envs.distributions.fitted import join_independent
 from rare_envs.distributions.space import Distribution, ScenarioSpace
 from rare_envs.egos.needs import EgoNeeds
 from rare_envs.measures.registry import load_measure
@@ -145,4 +145,4 @@ def build_space(world: World, base: Distribution, ego_noise: int = 0) -> Scenari
             f"{world.scenario.name} has parameters of its own named {', '.join(sorted(twice))}, as weather or drivers "
             "have; rename them."
         )
-    return ScenarioSpace.of(parameters, join_independent(base, *(distribution for _, distribution in blocks)))
+    return ScenarioSpace(parameters, join_independent(base, *(distribution for _, distribution in blocks)))

@@ -264,7 +264,7 @@ def format_per_km(cells: Sequence[CalibrationCell]) -> list[str]:
 def describe_people(events: HumanEvents, frequency: EventFrequency) -> dict[str, Any]:
     """Return what the counts are compared with, for JSON."""
     return {
-        "frequency": {**frequency.to_dict(), "per_km": frequency.per_km},
+        "frequency": {**asdict(frequency), "per_km": frequency.per_km},
         "contacts": events.contacts.to_dict(),
         "contacts_per_event": count_per_event(events.contacts, frequency),
         "near_crashes": events.near_crashes.to_dict(),

@@ -23,7 +23,7 @@ import samplers
 from benchmarks import RESULTS
 from benchmarks.uncertainty.base_coverage import Repetition, compare_with_truth, summarise_repetitions
 from rare_envs.distributions.fitted import FittedDistribution
-from rare_envs.distributions.mixture import CoordinateMixture
+from rare_envs.distributions.mixture import TruncatedGaussianMixture
 from rare_envs.scenarios.base import load_base
 from rare_envs.scenarios.registry import scenario_named
 from samplers.problem import FloatArray
@@ -56,10 +56,10 @@ class RecipeWorld:
     p: float = 7e-4
     """Probability of a failure, of 4,000,000 draws: known to 2 %."""
 
-    def truth(self) -> CoordinateMixture:
+    def truth(self) -> TruncatedGaussianMixture:
         """Return the distribution of the events."""
         base = load_base(scenario_named(SCENARIO), self.base)
-        assert isinstance(base, FittedDistribution) and isinstance(base.distribution, CoordinateMixture)
+        assert isinstance(base, FittedDistribution) and isinstance(base.distribution, TruncatedGaussianMixture)
         return merge_components(base.distribution) if self.components == 1 else base.distribution
 
     def draw(self, rng: np.random.Generator) -> EventSet:
@@ -80,12 +80,12 @@ RECIPE_WORLDS = (
 )
 
 
-def merge_components(mixture: CoordinateMixture) -> CoordinateMixture:
+def merge_components(mixture: TruncatedGaussianMixture) -> TruncatedGaussianMixture:
     """Return the Gaussian with the mean and covariance of a mixture."""
     mean = mixture.weights @ mixture.means
     apart = mixture.means - mean
     covariance = np.einsum("k,kij->ij", mixture.weights, mixture.covariances + apart[:, :, None] * apart[:, None, :])
-    return CoordinateMixture(mixture.coordinates, np.ones(1), mean[None], covariance[None])
+    return TruncatedGaussianMixture(np.ones(1), mean[None], covariance[None], coordinates=mixture.coordinates)
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,7 +122,7 @@ def repeat_recipe(world: RecipeWorld, seed: int, n_refits: int | None = None) ->
     events = world.draw(np.random.default_rng([seed, world.events, world.components]))
     base = fit_base(FitRequest(SCENARIO, events, {}, "", n_refits=n_refits, seed=seed))
     result = samplers.estimate(ShortTimeToCollision(base, world.limit), seed=seed, max_sim=MAX_SIM)
-    assert isinstance(base.distribution, CoordinateMixture)
+    assert isinstance(base.distribution, TruncatedGaussianMixture)
     components = len(base.distribution.weights)
     return FittedRepetition(
         compare_with_truth(result, world.p), base.record["coordinates"], components, len(base.refits)

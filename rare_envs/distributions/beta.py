@@ -10,13 +10,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import special
 
-from rare_envs.distributions.coordinates import FloatArray
-from rare_envs.distributions.space import (
-    RELATIVE_CHANGE,
-    DistributionParameter,
-    check_values,
-    number_columns,
-)
+from rare_envs.distributions.coordinates import FloatArray, freeze_arrays, pick_fields
+from rare_envs.distributions.space import RELATIVE_CHANGE, DistributionParameter, check_values, name_columns
 
 BETA_FIELDS = ("alpha", "beta", "low", "high")
 
@@ -48,16 +43,13 @@ class BetaDistribution:
     high: FloatArray
 
     def __post_init__(self) -> None:
-        for name in BETA_FIELDS:
-            values = np.atleast_1d(np.array(getattr(self, name), dtype=np.float64))  # a field by its name
-            values.setflags(write=False)
-            object.__setattr__(self, name, values)
+        freeze_arrays(self, *BETA_FIELDS)
         shapes = {getattr(self, name).shape for name in BETA_FIELDS}  # a field by its name
         if len(shapes) != 1 or self.low.ndim != 1:
             raise ValueError(f"Expected alpha, beta, low and high of one shape (d,), got {sorted(shapes)}.")
-        if not (np.isfinite(self.alpha + self.beta).all() and (self.alpha > 0).all() and (self.beta > 0).all()):
+        if not ((self.alpha > 0).all() and (self.beta > 0).all()):
             raise ValueError(f"Expected positive alpha and beta, got {self.alpha} and {self.beta}.")
-        if not (np.isfinite(self.high - self.low).all() and (self.low < self.high).all()):
+        if not (self.low < self.high).all():
             raise ValueError(f"Expected low < high, got {self.low} and {self.high}.")
 
     @classmethod
@@ -67,18 +59,15 @@ class BetaDistribution:
         Raises:
             ValueError: If one is missing or they do not fit.
         """
-        missing = [name for name in BETA_FIELDS if name not in data]
-        if missing:
-            raise ValueError(f"Expected alpha, beta, low and high, got no {', '.join(missing)}.")
-        return cls(*(np.asarray(data[name], dtype=np.float64) for name in BETA_FIELDS))
+        return cls(*pick_fields(data, BETA_FIELDS))
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain lists under the names of the constructor's arguments, ready for JSON."""
         return {name: getattr(self, name).tolist() for name in BETA_FIELDS}
 
     def parameters(self, names: Sequence[str] = (), like: object = None) -> tuple[DistributionParameter, ...]:
-        """Return the shape parameters of each variable, alpha and beta; see `HasParameters`."""
-        columns = names or number_columns(self.dim)
+        """Return the shape parameters of each variable, alpha and beta; see `DistributionParameter`."""
+        columns = names or name_columns(self.dim)
         return tuple(
             DistributionParameter(f"{shape} of {name}", float(value), RELATIVE_CHANGE * float(value), "10 %", (j,))
             for j, name in enumerate(columns)

@@ -5,28 +5,38 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import MISSING, asdict, dataclass, field, fields, replace
+from functools import partial
 from typing import Any, TypeVar, cast
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from rare_envs.distributions.beta import BetaDistribution
 from rare_envs.distributions.coordinates import FloatArray
-from rare_envs.distributions.mixture import COMPONENT_FIELDS, BoxPoints, CoordinateMixture, TruncatedGaussianMixture
-from rare_envs.distributions.pooled import number_coordinates, pool_mixtures
-from rare_envs.distributions.space import Distribution, DistributionParameter, HasParameters
+from rare_envs.distributions.mixture import (
+    COMPONENT_FIELDS,
+    TruncatedGaussianMixture,
+    find_log_densities,
+    name_kinds,
+    pool_mixtures,
+)
+from rare_envs.distributions.product import ProductDistribution
+from rare_envs.distributions.space import Distribution, DistributionParameter
 
-FileDistribution = TruncatedGaussianMixture | CoordinateMixture | BetaDistribution
+FileDistribution = TruncatedGaussianMixture | BetaDistribution
 RecordT = TypeVar("RecordT")
+FITTED_KEYS = ("refits", "events", "family", "frequency", "checks")
+"""Keys of a base file of which each makes it a fitted one; these then need `events` and `family`."""
+BETA_SHAPES = ("alpha", "beta")
+MAX_COVERING_REFITS = 30
+"""Refits whose mixture reaches where failures under any of them lie: of 100, more take longer and reach no further."""
+COORDINATE_KEYS = ("coordinates", "order")
+"""Keys of a file that a refit may have of its own, where it has chosen other coordinates than its base."""
 
 
 def read_distribution(data: Mapping[str, Any]) -> FileDistribution:
-    """Return the distribution of the kind that the keys of a file tell: Beta, a mixture in coordinates, or plain."""
-    if "alpha" in data:
-        return BetaDistribution.from_dict(data)
-    if "coordinates" in data or data.get("order"):
-        return CoordinateMixture.from_dict(data)
-    return TruncatedGaussianMixture.from_dict(data)
+    """Return the distribution of the kind that the keys of a file tell: Beta variables or a mixture."""
+    return BetaDistribution.from_dict(data) if "alpha" in data else TruncatedGaussianMixture.from_dict(data)
 
 
 def read_record(kind: type[RecordT], what: str, data: object) -> RecordT:
@@ -131,19 +141,6 @@ class EventFrequency:
         share_variance = 0.0 if self.share_events is None else (1.0 - self.share) / (self.share * self.share_events)
         return math.sqrt(1.0 / self.count + share_variance)
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return the fields by name, ready for JSON."""
-        return asdict(self)
-
-
-FITTED_KEYS = ("refits", "events", "family", "frequency", "checks")
-"""Keys of a base file of which each makes it a fitted one; these then need `events` and `family`."""
-BETA_SHAPES = ("alpha", "beta")
-MAX_COVERING_REFITS = 30
-"""Refits whose mixture reaches where failures under any of them lie: of 100, more take longer and reach no further."""
-COORDINATE_KEYS = ("coordinates", "order")
-"""Keys of a file that a refit may have of its own, where it has chosen other coordinates than its base."""
-
 
 @dataclass(frozen=True, kw_only=True)
 class EventCounts:
@@ -181,10 +178,6 @@ class EventCounts:
         events = f"{total} event{'' if self.used == (1,) else 's'}"
         return events if self.cluster == "event" else f"{events} of {self.clusters} {self.cluster}{plural}"
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return the fields by name, ready for JSON."""
-        return {**asdict(self), "used": list(self.used)}
-
 
 @dataclass(frozen=True)
 class PredictiveCheck:
@@ -210,31 +203,6 @@ class PredictiveCheck:
         require_count("recorded of a check", self.recorded, least=0)
         if self.expected != 0:
             require_number("expected of a check", self.expected)
-
-
-class Refits(tuple[Distribution, ...]):
-    """Distributions of the same X, of which densities are computed together."""
-
-    __slots__ = ()
-
-    def log_probs(self, x: FloatArray) -> FloatArray:
-        """Return the log density of each, (n, d) -> (R, n); where points are in equal coordinates is found once."""
-        known: dict[tuple[object, ...], BoxPoints] = {}
-        out = np.empty((len(self), len(x)))
-        for row, each in zip(out, self, strict=True):
-            # A class of the user's below one of these may have another density.
-            if type(each) in (CoordinateMixture, TruncatedGaussianMixture):
-                assert isinstance(each, CoordinateMixture)
-                key = each.coordinates.key
-                if key not in known:
-                    known[key] = BoxPoints.of(each.coordinates, each.rows("x", x))
-                row[:] = each.log_prob_at(known[key])
-            else:
-                values = np.asarray(each.log_prob(x))
-                if values.shape != row.shape:
-                    raise ValueError(f"Expected log_prob of a refit of shape {row.shape}, got {values.shape}.")
-                row[:] = values
-        return out
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -273,13 +241,20 @@ class FittedDistribution:
     """Loader of other base distributions of the same scenario, by name or file."""
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "refits", Refits(self.refits))
+        object.__setattr__(self, "refits", tuple(self.refits))
         object.__setattr__(self, "checks", tuple(self.checks))
         require_text("family", self.family)
         if not isinstance(self.record, Mapping):
             raise ValueError(f"Expected provenance as an object, got {self.record!r}.")
         for i, refit in enumerate(self.refits):
-            _check_refit(i, refit, self.distribution)
+            if not isinstance(refit, Distribution):
+                raise ValueError(
+                    f"Expected refits[{i}] with the four methods of a distribution, got {type(refit).__name__}."
+                )
+            for name in ("dim", "low", "high"):
+                own, expected = (getattr(each, name, None) for each in (refit, self.distribution))
+                if own is not None and expected is not None and not np.array_equal(own, expected):
+                    raise ValueError(f"Expected refits[{i}] with {name} {expected} as its base, got {own}.")
 
     @property
     def dim(self) -> int:
@@ -297,6 +272,16 @@ class FittedDistribution:
         return cast(FloatArray, cast(Any, self.distribution).high)
 
     @property
+    def blocks(self) -> tuple[Any, ...]:
+        """Independent distributions side by side; none if it has only one."""
+        return getattr(self.distribution, "blocks", ())
+
+    @property
+    def noise(self) -> NDArray[np.bool_]:
+        """Mask of the columns that are noise, shape (d,): samplers may leave these as they are."""
+        return cast(NDArray[np.bool_], getattr(self.distribution, "noise", np.zeros(self.dim, dtype=bool)))
+
+    @property
     def clusters(self) -> int:
         """Number of independent clusters of events."""
         return self.events.clusters
@@ -308,8 +293,10 @@ class FittedDistribution:
 
     @property
     def refit_families(self) -> tuple[int, ...]:
-        """Number of the coordinates of each refit; 0 are those of `distribution`."""
-        return number_coordinates([self.distribution, *self.refits])[1:]
+        """Number of the coordinates of each refit, equal ones have the same; 0 are those of `distribution`."""
+        names = [tuple(map(name_kinds, getattr(each, "blocks", (each,)))) for each in (self.distribution, *self.refits)]
+        numbers = {name: number for number, name in enumerate(dict.fromkeys(names))}
+        return tuple(numbers[name] for name in names[1:])
 
     def sample(self, n: int, rng: np.random.Generator) -> FloatArray:
         """Draw independent points, shape (n, d)."""
@@ -327,10 +314,23 @@ class FittedDistribution:
         """Map from standard normal space, (n, d) -> (n, d)."""
         return self.distribution.from_standard_normal(u)
 
+    def refit_log_probs(self, x: FloatArray) -> FloatArray:
+        """Return the log density of each of R refits, (n, d) -> (R, n); of like mixtures at once."""
+        out, groups = np.empty((len(self.refits), len(x))), dict[object, list[int]]()
+        for i, each in enumerate(self.refits):
+            if type(each) is TruncatedGaussianMixture:  # one of the user's below it may have another density
+                key = name_kinds(each), each.coordinates.columns, len(each.weights)
+                groups.setdefault(key, []).append(i)
+            else:
+                out[i] = each.log_prob(x)
+        for rows in groups.values():
+            out[rows] = find_log_densities([cast(TruncatedGaussianMixture, self.refits[i]) for i in rows], x)
+        return out
+
     def parameters(self, names: Sequence[str] = (), like: object = None) -> tuple[DistributionParameter, ...]:
-        """Return the parameters of `distribution`, none if it offers none; see `HasParameters`."""
-        like = like.distribution if isinstance(like, FittedDistribution) else like
-        return self.distribution.parameters(names, like) if isinstance(self.distribution, HasParameters) else ()
+        """Return the parameters of `distribution`, none if it offers none; see `DistributionParameter`."""
+        own: Any = self.distribution
+        return own.parameters(names, like) if hasattr(own, "parameters") else ()
 
     def with_parameters(self, values: ArrayLike) -> Distribution:
         """Return `distribution` with other values of its parameters.
@@ -338,24 +338,23 @@ class FittedDistribution:
         Raises:
             ValueError: It has no parameters, or not so many.
         """
-        if not isinstance(self.distribution, HasParameters):
-            raise ValueError(f"A {type(self.distribution).__name__} has no parameters.")
-        return self.distribution.with_parameters(values)
+        own: Any = self.distribution
+        if not hasattr(own, "with_parameters"):
+            raise ValueError(f"A {type(own).__name__} has no parameters.")
+        return cast(Distribution, own.with_parameters(values))
 
     def ensemble(self) -> Distribution:
         """Return the refits as one mixture with equal weights: what they predict for the next event.
 
-        Mixtures of the same coordinates are cut to the box as a whole, see `pool_mixtures`.
+        Mixtures of the same coordinates are cut to the box as a whole, see `pool_mixtures`; blocks that all refits
+        share stay as they are.
 
         Raises:
             ValueError: There are no refits, or they are no mixtures.
         """
         if not self.refits:
             raise ValueError("There are no refits to make an ensemble of.")
-        mixtures = [each for each in self.refits if isinstance(each, TruncatedGaussianMixture | CoordinateMixture)]
-        if len(mixtures) < len(self.refits):
-            raise ValueError("An ensemble needs refits that are Gaussian mixtures.")
-        return pool_mixtures(mixtures)
+        return _pool(self.refits)
 
     def covering_ensemble(self) -> Distribution:
         """Return the mixture of at most 30 of the refits, evenly chosen: to simulate failures under any of them.
@@ -389,8 +388,8 @@ class FittedDistribution:
         return {
             **own,
             "family": self.family,
-            "events": self.events.to_dict(),
-            "frequency": None if self.frequency is None else self.frequency.to_dict(),
+            "events": {**asdict(self.events), "used": list(self.events.used)},
+            "frequency": None if self.frequency is None else asdict(self.frequency),
             "checks": [asdict(check) for check in self.checks],
             "provenance": dict(self.record),
             "refits": [_refit_entries(i, refit, own) for i, refit in enumerate(self.refits)],
@@ -403,8 +402,8 @@ class FittedDistribution:
         """Return the distribution that `to_dict` describes; other keys are left alone.
 
         Args:
-            data: Keys of the distribution (see `CoordinateMixture.from_dict`), and `events`, `family`, and if wanted
-                `refits`, `frequency`, `checks` and `provenance`. A refit is an object with weights, means and
+            data: Keys of the distribution (see `TruncatedGaussianMixture.from_dict`), and `events`, `family`, and if
+                wanted `refits`, `frequency`, `checks` and `provenance`. A refit is an object with weights, means and
                 covariances (alpha and beta, where the base has these), in the coordinates of the base or with
                 `coordinates` and `order` of its own.
             siblings: Loader of other base distributions of the same scenario.
@@ -417,30 +416,77 @@ class FittedDistribution:
             raise ValueError(
                 f"A file with {', '.join(k for k in FITTED_KEYS if k in data)} lacks {', '.join(missing)}."
             )
+        lists = {key: data.get(key, ()) for key in ("refits", "checks")}
+        for key, values in lists.items():
+            if not isinstance(values, list | tuple):
+                raise ValueError(f"Expected {key} as a list of objects, got {values!r}.")
         frequency = data.get("frequency")
         return cls(
             distribution=read_distribution(data),
-            refits=tuple(_read_refit(i, refit, data) for i, refit in enumerate(_read_list("refits", data))),
+            refits=tuple(_read_refit(i, refit, data) for i, refit in enumerate(lists["refits"])),
             events=read_record(EventCounts, "events", data["events"]),
             family=data["family"],
             frequency=None if frequency is None else read_record(EventFrequency, "frequency", frequency),
-            checks=tuple(read_record(PredictiveCheck, "a check", each) for each in _read_list("checks", data)),
+            checks=tuple(read_record(PredictiveCheck, "a check", each) for each in lists["checks"]),
             record=data.get("provenance", {}),
             siblings=siblings,
         )
 
 
-def _read_list(key: str, data: Mapping[str, Any]) -> Sequence[Any]:
-    values = data.get(key, ())
-    if not isinstance(values, list | tuple):
-        raise ValueError(f"Expected {key} as a list of objects, got {values!r}.")
-    return values
+def _pool(refits: Sequence[Any]) -> Distribution:
+    """Return refits as one distribution; of products, blocks that are the same in all stay as they are."""
+    if not all(isinstance(each, ProductDistribution) for each in refits):
+        return pool_mixtures(refits)
+    columns = zip(*(each.blocks for each in refits), strict=True)
+    return ProductDistribution(
+        tuple(own[0] if all(block is own[0] for block in own) else _pool(own) for own in columns)
+    )
+
+
+def join_independent(*distributions: Distribution) -> Distribution:
+    """Return independent distributions side by side as one; their own blocks, if they have some, become its blocks.
+
+    If exactly one of them is fitted to events, so is the whole: its refits have the other blocks as they are, and
+    events, frequency, checks and record are those of the fitted one. With several fitted ones it is not: their refits
+    do not belong together.
+
+    Example:
+        >>> from rare_envs.distributions import NoiseDistribution
+        >>> join_independent(NoiseDistribution(3), NoiseDistribution(2)).dim
+        5
+    """
+    if len(distributions) == 1:
+        return distributions[0]
+    fitted = [each for each in distributions if isinstance(each, FittedDistribution)]
+    blocks: list[Any] = []
+    for each in distributions:
+        plain = each.distribution if isinstance(each, FittedDistribution) else each
+        blocks += getattr(plain, "blocks", (plain,))
+    whole = ProductDistribution(tuple(blocks))
+    if len(fitted) != 1:
+        return whole
+    join_with = partial(_join_with, distributions)
+    return replace(
+        fitted[0],
+        distribution=whole,
+        refits=tuple(map(join_with, fitted[0].refits)),
+        siblings=partial(_join_sibling, distributions, fitted[0]),
+    )
+
+
+def _join_with(distributions: Sequence[Distribution], replacement: Distribution) -> Distribution:
+    """Return distributions as one with another in place of the fitted one."""
+    return join_independent(*(replacement if isinstance(each, FittedDistribution) else each for each in distributions))
+
+
+def _join_sibling(distributions: Sequence[Distribution], fitted: FittedDistribution, name: str) -> Distribution:
+    """Return distributions as one with another base distribution in place of the fitted one."""
+    return _join_with(distributions, fitted.sibling(name))
 
 
 def _read_refit(i: int, refit: object, data: Mapping[str, Any]) -> FileDistribution:
     """Return a refit, whose entries replace those of the base."""
-    wanted = BETA_SHAPES if "alpha" in data else COMPONENT_FIELDS
-    own = () if "alpha" in data else COORDINATE_KEYS
+    wanted, own = (BETA_SHAPES, ()) if "alpha" in data else (COMPONENT_FIELDS, COORDINATE_KEYS)
     if not isinstance(refit, Mapping):
         raise ValueError(f"Expected refits[{i}] as an object with {', '.join(wanted)}, got {refit!r}.")
     missing = [name for name in wanted if name not in refit]
@@ -456,17 +502,9 @@ def _read_refit(i: int, refit: object, data: Mapping[str, Any]) -> FileDistribut
         raise ValueError(f"refits[{i}]: {error}") from None
 
 
-def _check_refit(i: int, refit: object, distribution: Distribution) -> None:
-    if not isinstance(refit, Distribution):
-        raise ValueError(f"Expected refits[{i}] with the four methods of a distribution, got {type(refit).__name__}.")
-    for name in ("dim", "low", "high"):
-        own, expected = (getattr(each, name, None) for each in (refit, distribution))
-        if own is not None and expected is not None and not np.array_equal(own, expected):
-            raise ValueError(f"Expected refits[{i}] with {name} {expected} as its base, got {own}.")
-
-
 def _to_dict(distribution: Distribution) -> dict[str, Any]:
-    if not isinstance(distribution, TruncatedGaussianMixture | CoordinateMixture | BetaDistribution):
+    """Return the entries of a distribution of a kind that files hold."""
+    if not isinstance(distribution, TruncatedGaussianMixture | BetaDistribution):
         raise ValueError(f"A file holds mixtures and Beta variables, no {type(distribution).__name__}.")
     return distribution.to_dict()
 
@@ -476,14 +514,7 @@ def _refit_entries(i: int, refit: Distribution, base: Mapping[str, Any]) -> dict
     entries = _to_dict(refit)
     if ("alpha" in entries) != ("alpha" in base) or any(entries[k] != base[k] for k in ("low", "high")):
         raise ValueError(f"refits[{i}] has another box than its base, or is of another kind; a file holds one for all.")
-    if "alpha" in base:
-        return {name: entries[name] for name in BETA_SHAPES}
-    own = {name: entries[name] for name in COMPONENT_FIELDS}
-    coordinates = _coordinates_of(entries)
-    return own if coordinates == _coordinates_of(base) else own | coordinates
-
-
-def _coordinates_of(entries: Mapping[str, Any]) -> dict[str, Any]:
-    """Return kinds and order of the coordinates in the entries of a mixture; plain ones are not written."""
-    kinds = entries.get("coordinates", ["plain"] * len(entries["low"]))
-    return {"coordinates": kinds, "order": entries.get("order", [])}
+    own = {name: entries[name] for name in (BETA_SHAPES if "alpha" in base else COMPONENT_FIELDS)}
+    usual = {"coordinates": ["plain"] * len(entries["low"]), "order": []}  # as they are where not written
+    theirs, ours = ({key: each.get(key, usual[key]) for key in COORDINATE_KEYS} for each in (entries, base))
+    return own if theirs == ours else own | theirs

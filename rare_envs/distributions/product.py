@@ -1,4 +1,4 @@
-"""Base distributions made of independent blocks, and noise as one of them.
+"""Independent blocks side by side, and noise as one of them.
 
 Cross-entropy searches block by block (`samplers.CrossEntropy(family="blocks")`); it finds them in
 `ProductDistribution.blocks`.
@@ -7,20 +7,13 @@ Cross-entropy searches block by block (`samplers.CrossEntropy(family="blocks")`)
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Protocol, cast, runtime_checkable
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from rare_envs.distributions.coordinates import FloatArray
-from rare_envs.distributions.fitted import FittedDistribution
-from rare_envs.distributions.space import (
-    Distribution,
-    DistributionParameter,
-    HasParameters,
-    check_values,
-    number_columns,
-)
+from rare_envs.distributions.space import DistributionParameter, check_values, name_columns
 
 
 @dataclass(frozen=True)
@@ -47,9 +40,7 @@ class NoiseDistribution:
         """Return the same points."""
         return x
 
-    def from_standard_normal(self, u: FloatArray) -> FloatArray:
-        """Return the same points."""
-        return u
+    from_standard_normal = to_standard_normal
 
     def pull_back(self, u: FloatArray, gradients: FloatArray) -> FloatArray:
         """Return the same gradients."""
@@ -62,26 +53,6 @@ class NoiseDistribution:
     def widen(self, factor: float) -> "NoiseDistribution":
         """Return the same distribution."""
         return self
-
-
-@runtime_checkable
-class BlockDistribution(Distribution, Protocol):
-    """A distribution that announces independent blocks and noise, as cross-entropy and two-stage look for them.
-
-    Example:
-        >>> isinstance(ProductDistribution((NoiseDistribution(1),)), BlockDistribution)
-        True
-        >>> isinstance(NoiseDistribution(1), BlockDistribution)
-        False
-    """
-
-    @property
-    def blocks(self) -> Sequence[Any]:
-        """Distributions with `dim`, in the order of the columns of x."""
-
-    @property
-    def noise(self) -> NDArray[np.bool_]:
-        """Mask of the columns of x that are noise, shape (d,): samplers may leave these as they are."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,10 +72,6 @@ class ProductDistribution:
     def dim(self) -> int:
         """Number of columns d."""
         return sum(block.dim for block in self.blocks)
-
-    @cached_property
-    def _ends(self) -> NDArray[np.intp]:
-        return np.cumsum([block.dim for block in self.blocks])[:-1]
 
     @cached_property
     def noise(self) -> NDArray[np.bool_]:
@@ -129,14 +96,14 @@ class ProductDistribution:
         return np.hstack([block.from_standard_normal(part) for block, part in self._with_parts(u)])
 
     def parameters(self, names: Sequence[str] = (), like: object = None) -> tuple[DistributionParameter, ...]:
-        """Return the parameters of the blocks that have some, see `HasParameters`."""
-        names, found = names or number_columns(self.dim), list[DistributionParameter]()
-        others = getattr(like, "blocks", ())
-        others = others if len(others) == len(self.blocks) else (None,) * len(self.blocks)
+        """Return the parameters of the blocks that have some, see `DistributionParameter`."""
+        names, others = names or name_columns(self.dim), getattr(like, "blocks", ())
+        found: list[DistributionParameter] = []
         first = 0
-        for block, other in zip(self.blocks, others, strict=True):
+        for i, block in enumerate(self.blocks):
             size: int = block.dim
-            if isinstance(block, HasParameters):
+            if hasattr(block, "parameters"):
+                other = others[i] if len(others) == len(self.blocks) else None
                 own = block.parameters(names[first : first + size], other)
                 found += [each._replace(columns=tuple(first + j for j in each.columns)) for each in own]
             first += size
@@ -148,7 +115,7 @@ class ProductDistribution:
         Raises:
             ValueError: There is not one value for each parameter, or a block refuses its values.
         """
-        counts = [len(block.parameters()) if isinstance(block, HasParameters) else 0 for block in self.blocks]
+        counts = [len(block.parameters()) if hasattr(block, "parameters") else 0 for block in self.blocks]
         given = np.asarray(values, dtype=np.float64)
         check_values(given, sum(counts))
         parts = np.split(given, np.cumsum(counts)[:-1])
@@ -157,97 +124,5 @@ class ProductDistribution:
 
     def _with_parts(self, points: FloatArray) -> list[tuple[Any, FloatArray]]:
         """Return each block with its columns."""
-        return list(zip(self.blocks, self._split(points), strict=True))
-
-    def _split(self, points: FloatArray) -> list[FloatArray]:
-        return np.split(np.asarray(points), self._ends, axis=1)
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class FittedProduct(FittedDistribution):
-    """Independent blocks of which one is fitted to events: its refits, with the other blocks as they are.
-
-    `join_independent` makes it. Events, frequency, checks and record are those of the fitted block.
-
-    Example:
-        >>> from rare_envs.distributions import EventCounts, TruncatedGaussianMixture
-        >>> fit, refit = (TruncatedGaussianMixture([1.0], [[m]], [[[1.0]]], [-9.0], [9.0]) for m in (0.0, 0.3))
-        >>> fitted = FittedDistribution(
-        ...     distribution=fit, refits=(fit, refit), events=EventCounts(used=(40,), clusters=12), family="1 component"
-        ... )
-        >>> joined = join_independent(fitted, NoiseDistribution(2))
-        >>> type(joined).__name__, joined.dim, [each.dim for each in joined.refits], joined.fitted_to
-        ('FittedProduct', 3, [3, 3], '40 events of 12 scenes')
-    """
-
-    parts: tuple[Distribution, ...]
-    """The independent distributions, of which one is fitted."""
-
-    @property
-    def blocks(self) -> Sequence[Any]:
-        """Distributions with `dim`, in the order of the columns of x."""
-        return cast(BlockDistribution, self.distribution).blocks
-
-    @property
-    def noise(self) -> NDArray[np.bool_]:
-        """Which columns are noise, shape (d,): samplers may leave these as they are."""
-        return cast(BlockDistribution, self.distribution).noise
-
-    @property
-    def fitted_part(self) -> FittedDistribution:
-        """The one that is fitted."""
-        return next(each for each in self.parts if isinstance(each, FittedDistribution))
-
-    @property
-    def refit_families(self) -> tuple[int, ...]:
-        """Number of the coordinates of each refit of the fitted one."""
-        return self.fitted_part.refit_families
-
-    def ensemble(self) -> Distribution:
-        """Return the blocks with the ensemble of the fitted one in its place."""
-        return _join_with(self.parts, self.fitted_part.ensemble())
-
-    def sibling(self, name: str) -> Distribution:
-        """Return the blocks with another base distribution in place of the fitted one."""
-        return _join_with(self.parts, self.fitted_part.sibling(name))
-
-
-def join_independent(*distributions: Distribution) -> Distribution:
-    """Return independent distributions side by side as one; their own blocks, if they have some, become its blocks.
-
-    If exactly one of them is fitted to events, so is the whole, see `FittedProduct`. With several fitted ones it is
-    not: their refits do not belong together.
-
-    Example:
-        >>> join_independent(NoiseDistribution(3), NoiseDistribution(2)).dim
-        5
-    """
-    fitted = [each for each in distributions if isinstance(each, FittedDistribution)]
-    if len(distributions) == 1:
-        return distributions[0]
-    if len(fitted) != 1:
-        return _join(distributions)
-    (own,) = fitted
-    return FittedProduct(
-        distribution=_join_with(distributions, own.distribution),
-        refits=tuple(_join_with(distributions, refit) for refit in own.refits),
-        events=own.events,
-        family=own.family,
-        frequency=own.frequency,
-        checks=own.checks,
-        record=own.record,
-        parts=distributions,
-    )
-
-
-def _join_with(distributions: Sequence[Distribution], replacement: Distribution) -> Distribution:
-    """Return distributions as one with another in place of the fitted one."""
-    return join_independent(*(replacement if isinstance(each, FittedDistribution) else each for each in distributions))
-
-
-def _join(distributions: Sequence[Distribution]) -> Distribution:
-    blocks: list[Any] = []
-    for each in distributions:
-        plain = each.distribution if isinstance(each, FittedDistribution) else each
-        blocks += plain.blocks if isinstance(plain, BlockDistribution) else (plain,)
-    return ProductDistribution(tuple(blocks))
+        ends = np.cumsum([block.dim for block in self.blocks])[:-1]
+        return list(zip(self.blocks, np.split(np.asarray(points), ends, axis=1), strict=True))

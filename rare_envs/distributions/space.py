@@ -1,25 +1,23 @@
-"""Scenario spaces: parameters with names, units and ranges, and their distribution; `env.unwrapped.space` is one.
-
-A distribution may have parameters of its own, in interpretable units: what sensitivities of p are stated for. A
-mixture has weights, and for each component means, standard deviations and correlations of its coordinates; the box is
-no parameter. Such a distribution offers them by two methods: `parameters(names)` lists them, and
-`with_parameters(values)` returns the same distribution with other values of them.
-"""
+"""Scenario spaces: parameters with names, units and ranges, and their distribution; `env.unwrapped.space` is one."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from html import escape
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.optimize import linear_sum_assignment
 
-from rare_envs.distributions.coordinates import ClosingSpeed, CoordinateKind, Coordinates, FloatArray
+from rare_envs.distributions.coordinates import FloatArray
 from rare_envs.plugins import did_you_mean
+
+MOST_SHOWN = 8
+"""Parameters that `repr` names."""
+RELATIVE_CHANGE = 0.1
+"""Change of a positive parameter for which sensitivities are stated, as a share of its value."""
 
 
 @runtime_checkable
@@ -45,6 +43,43 @@ class Distribution(Protocol):
         """Map u ~ N(0, I) to points, (n, d) -> (n, d)."""
 
 
+class DistributionParameter(NamedTuple):
+    """One parameter of a distribution, in interpretable units: what sensitivities of p are stated for.
+
+    A distribution offers them by two methods: `parameters(names, like)` lists them, given names of the columns of x
+    (x1, x2, ... by default) and a distribution of the same family whose numbering of components is followed, and
+    `with_parameters(values)` returns the same distribution with other values of them. The box is no parameter.
+
+    Example:
+        >>> from rare_envs.distributions import BetaDistribution
+        >>> gap = BetaDistribution([2.0], [3.0], [1.0], [40.0])
+        >>> [(each.name, each.value, each.change) for each in gap.parameters(["gap"])]
+        [('alpha of gap', 2.0, 0.2), ('beta of gap', 3.0, 0.30000000000000004)]
+    """
+
+    name: str
+    """In words, such as "mean of log gap"."""
+    value: float
+    change: float
+    """Change for which a sensitivity is stated, in units of the value: a standard deviation for a mean, a tenth of a
+    standard deviation, of a weight or of a shape parameter, 0.1 for a correlation."""
+    change_name: str
+    """The same in words, such as "1 sd"."""
+    columns: tuple[int, ...] = ()
+    """Columns of x that it is about; none for the weight of a component, which is about all."""
+
+
+def name_columns(dim: int) -> tuple[str, ...]:
+    """Return names of columns: x1, x2, ..."""
+    return tuple(f"x{j + 1}" for j in range(dim))
+
+
+def check_values(values: FloatArray, n: int) -> None:
+    """Raise a ValueError unless there are n values."""
+    if values.shape != (n,):
+        raise ValueError(f"Expected {n} values, one for each parameter, got shape {values.shape}.")
+
+
 @dataclass(frozen=True)
 class Parameter:
     """A named scenario parameter and the physical range it is allowed.
@@ -67,22 +102,15 @@ class Parameter:
     size: int = 1
     """Columns of x that it takes: 1 for a scalar, more for a block of like values, one for each vehicle, say."""
 
-
-MOST_SHOWN = 8
-"""Parameters that `repr` names."""
+    @property
+    def range(self) -> str:
+        """The range in words, with its unit."""
+        return f"[{self.low:g}, {self.high:g}] {self.unit}".rstrip()
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class ScenarioSpace:
     """The parameters of a scenario in the order of x, and their base distribution.
-
-    Attributes:
-        names: Parameter names.
-        units: Their units.
-        low: Lower ends of the allowed ranges, one for each column of x, shape (d,).
-        high: Upper ends, shape (d,).
-        base: Distribution of x; the methods of the same name go to it.
-        sizes: Columns of x that each parameter takes; by default one each.
 
     Example:
         >>> import gymnasium as gym, rare_envs
@@ -97,40 +125,29 @@ class ScenarioSpace:
         ValueError: gap = 300 is outside its range [1, 150] m; the parameters are ego_speed [0, 45] m/s, lead_speed [0, 45] m/s, gap [1, 150] m.
     """  # noqa: E501 (the example shows a whole message)
 
-    names: tuple[str, ...]
-    units: tuple[str, ...]
-    low: FloatArray
-    high: FloatArray
+    parameters: Sequence[Parameter]
+    """In the order of x."""
     base: Distribution
-    sizes: tuple[int, ...] = ()
+    """Distribution of x; the methods of the same name go to it."""
+    names: tuple[str, ...] = field(init=False)
+    """Names of the parameters."""
+    units: tuple[str, ...] = field(init=False)
+    """Their units."""
+    sizes: tuple[int, ...] = field(init=False)
+    """Columns of x that each takes."""
+    low: FloatArray = field(init=False)
+    """Lower ends of the allowed ranges, one for each column of x, shape (d,)."""
+    high: FloatArray = field(init=False)
+    """Upper ends, shape (d,)."""
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "names", tuple(self.names))
-        object.__setattr__(self, "units", tuple(self.units))
-        object.__setattr__(self, "sizes", tuple(self.sizes) or (1,) * len(self.names))
+        object.__setattr__(self, "parameters", tuple(self.parameters))
+        for field_name, own in (("names", "name"), ("units", "unit"), ("sizes", "size")):
+            object.__setattr__(self, field_name, tuple(getattr(p, own) for p in self.parameters))  # fields by name
         for name in ("low", "high"):
-            bound = np.array(getattr(self, name), dtype=np.float64)  # a field by its name
-            bound.setflags(write=False)
-            object.__setattr__(self, name, bound)
-        fits = len(self.names) == len(self.units) == len(self.sizes)
-        if not (fits and self.low.shape == self.high.shape == (sum(self.sizes),)):
-            raise ValueError(
-                f"Expected as many names, units and bounds, got {len(self.names)} names, {len(self.units)} units, "
-                f"sizes {self.sizes}, low {self.low.shape} and high {self.high.shape}."
-            )
-
-    @classmethod
-    def of(cls, parameters: Sequence[Parameter], base: Distribution) -> ScenarioSpace:
-        """Return the space of some parameters, in the order of x, with their distribution."""
-        sizes = tuple(p.size for p in parameters)
-        return cls(
-            names=tuple(p.name for p in parameters),
-            units=tuple(p.unit for p in parameters),
-            low=np.repeat([p.low for p in parameters], sizes),
-            high=np.repeat([p.high for p in parameters], sizes),
-            base=base,
-            sizes=sizes,
-        )
+            ends = np.repeat([float(getattr(p, name)) for p in self.parameters], self.sizes)  # a field by its name
+            ends.setflags(write=False)
+            object.__setattr__(self, name, ends)
 
     @property
     def dim(self) -> int:
@@ -140,11 +157,7 @@ class ScenarioSpace:
     @property
     def column_names(self) -> tuple[str, ...]:
         """Names of the columns of x; those of a block have their number in it, such as "speed[0]"."""
-        return tuple(
-            name if size == 1 else f"{name}[{k}]"
-            for name, size in zip(self.names, self.sizes, strict=True)
-            for k in range(size)
-        )
+        return tuple(p.name if p.size == 1 else f"{p.name}[{k}]" for p in self.parameters for k in range(p.size))
 
     def sample(self, n: int, rng: np.random.Generator) -> FloatArray:
         """Draw independent scenarios from the base distribution, shape (n, d)."""
@@ -167,16 +180,12 @@ class ScenarioSpace:
         row = np.asarray(x_row, dtype=np.float64)
         if row.shape != (self.dim,):
             raise ValueError(f"Expected one scenario of shape ({self.dim},), got {row.shape}.")
-        return {name: float(part[0]) if size == 1 else part for name, size, part in self._parts(row)}
+        return {name: part if part.ndim else float(part) for name, part in self.columns(row).items()}
 
     def columns(self, x: FloatArray) -> dict[str, FloatArray]:
         """Return scenarios (n, d) as a mapping from names to columns: (n,), or (n, size) for blocks."""
-        return {name: part[:, 0] if size == 1 else part for name, size, part in self._parts(x)}
-
-    def _parts(self, x: FloatArray) -> list[tuple[str, int, FloatArray]]:
-        """Return name, size and columns of each parameter."""
-        parts = zip(self.names, self.sizes, self._slices, strict=True)
-        return [(name, size, x[..., at].copy()) for name, size, at in parts]
+        parts = ((p, x[..., at]) for p, at in zip(self.parameters, self._slices, strict=True))
+        return {p.name: np.array(part[..., 0] if p.size == 1 else part) for p, part in parts}
 
     @cached_property
     def _slices(self) -> tuple[slice, ...]:
@@ -186,10 +195,8 @@ class ScenarioSpace:
 
     def describe(self) -> str:
         """Return all valid names with their ranges, in the order of x."""
-        return ", ".join(
-            f"{name} {self._range(j)}" if size == 1 else f"{name} ({size} values) {self._range(j)}"
-            for j, (name, size) in enumerate(zip(self.names, self.sizes, strict=True))
-        )
+        values = ("" if p.size == 1 else f" ({p.size} values)" for p in self.parameters)
+        return ", ".join(f"{p.name}{many} {p.range}" for p, many in zip(self.parameters, values, strict=True))
 
     def __repr__(self) -> str:
         """Return one line; `describe` has the ranges."""
@@ -199,12 +206,10 @@ class ScenarioSpace:
 
     def _repr_html_(self) -> str:
         """Return a table of the parameters for notebooks."""
-        first = [at.start for at in self._slices]
         rows = "".join(
-            f"<tr><th>{escape(name)}</th><td>{low:g} to {high:g}</td><td>{escape(unit)}</td><td>{size}</td></tr>"
-            for name, unit, size, low, high in zip(
-                self.names, self.units, self.sizes, self.low[first], self.high[first], strict=True
-            )
+            f"<tr><th>{escape(p.name)}</th><td>{p.low:g} to {p.high:g}</td>"
+            f"<td>{escape(p.unit)}</td><td>{p.size}</td></tr>"
+            for p in self.parameters
         )
         header = "<tr><th>parameter</th><th>range</th><th>unit</th><th>values</th></tr>"
         return f"<table>{header}{rows}</table>"
@@ -229,8 +234,8 @@ class ScenarioSpace:
                 f"Expected x of shape (n, {self.dim}) or ({self.dim},), got {np.shape(x)}; "
                 f"its columns are {self.describe()}."
             )
-        for j in range(len(self.names)):
-            self._check_range(j, points[:, self._slices[j]])
+        for parameter, at in zip(self.parameters, self._slices, strict=True):
+            self._check_range(parameter, points[:, at])
         return points
 
     def scenario_x(
@@ -262,13 +267,14 @@ class ScenarioSpace:
             raise ValueError(f"Expected options as a mapping of parameter names to values, got {options!r}.")
         if "x" in options:
             return self._given_x(options, n)
-        columns = {self._index(name): self._column(name, value, n) for name, value in options.items()}
+        columns = [self._column(name, value, n) for name, value in options.items()]
         points = np.array((draw or self.base.sample)(n, rng), dtype=np.float64)
-        for j, column in columns.items():
-            points[:, self._slices[j]] = column
+        for at, column in columns:
+            points[:, at] = column
         return self.validate(points)
 
     def _given_x(self, options: Mapping[str, Any], n: int) -> FloatArray:
+        """Return the rows that options give as x, (n, d)."""
         others = sorted(str(name) for name in options if name != "x")
         if others:
             raise ValueError(f"x gives every parameter, so {', '.join(others)} cannot be given beside it.")
@@ -277,8 +283,14 @@ class ScenarioSpace:
             raise ValueError(f"Expected x with 1 or {n} rows, one per scenario, got {len(points)}.")
         return np.repeat(points, n, axis=0) if len(points) == 1 else points
 
-    def _column(self, name: str, value: Any, n: int) -> FloatArray:
-        values, j = _as_numbers(name, value), self._index(name)
+    def _column(self, name: str, value: Any, n: int) -> tuple[slice, FloatArray]:
+        """Return where a parameter stands in x, and its values in n rows, (n, size) or (1, size)."""
+        if name not in self.names:
+            raise ValueError(
+                f"Unknown scenario parameter {name!r}{did_you_mean(str(name), (*self.names, 'x'))}; "
+                f"valid are {self.describe()}, or 'x' for all of them in this order."
+            )
+        j, values = self.names.index(name), _as_numbers(name, value)
         size = self.sizes[j]
         if size == 1:
             if values.shape not in ((), (1,), (n,)):
@@ -288,31 +300,18 @@ class ScenarioSpace:
             if values.shape not in ((size,), (n, size)):
                 raise ValueError(f"Expected {name} of shape ({size},) or ({n}, {size}), got {values.shape}.")
             column = np.atleast_2d(values)
-        self._check_range(j, column)
-        return column
+        self._check_range(self.parameters[j], column)
+        return self._slices[j], column
 
-    def _index(self, name: str) -> int:
-        if name in self.names:
-            return self.names.index(name)
-        raise ValueError(
-            f"Unknown scenario parameter {name!r}{did_you_mean(str(name), (*self.names, 'x'))}; "
-            f"valid are {self.describe()}, or 'x' for all of them in this order."
-        )
-
-    def _range(self, j: int) -> str:
-        at = self._slices[j].start
-        return f"[{self.low[at]:g}, {self.high[at]:g}] {self.units[j]}".rstrip()
-
-    def _check_range(self, j: int, values: FloatArray) -> None:
-        """Check the columns of a parameter, shape (n, size)."""
-        low, high = self.low[self._slices[j]], self.high[self._slices[j]]
-        wrong = ~((values >= low) & (values <= high) & np.isfinite(values))  # True for NaN too
-        if wrong.any():
-            i, k = np.unravel_index(int(np.argmax(wrong)), wrong.shape)
+    def _check_range(self, parameter: Parameter, values: FloatArray) -> None:
+        """Raise a ValueError unless the columns of a parameter, (n, size), are finite and in its range."""
+        inside = (values >= parameter.low) & (values <= parameter.high) & np.isfinite(values)
+        if not inside.all():
+            i, k = np.argwhere(~inside)[0]
             row = f" (row {i})" if len(values) > 1 else ""
-            which = f"[{k}]" if self.sizes[j] > 1 else ""
+            which = f"[{k}]" if parameter.size > 1 else ""
             raise ValueError(
-                f"{self.names[j]}{which} = {values[i, k]:.10g}{row} is outside its range {self._range(j)}; "
+                f"{parameter.name}{which} = {values[i, k]:.10g}{row} is outside its range {parameter.range}; "
                 f"the parameters are {self.describe()}."
             )
 
@@ -326,162 +325,3 @@ def _as_numbers(name: str, value: Any) -> FloatArray:
         return raw.astype(np.float64)
     except (TypeError, ValueError):
         raise ValueError(f"{name} must be a number or an array of numbers, got {value!r}.") from None
-
-
-RELATIVE_CHANGE = 0.1
-"""Change of a positive parameter for which sensitivities are stated, as a share of its value."""
-CORRELATION_CHANGE = 0.1
-"""The same of a correlation."""
-
-
-class DistributionParameter(NamedTuple):
-    """One parameter of a distribution.
-
-    Example:
-        >>> from rare_envs.distributions import BetaDistribution
-        >>> gap = BetaDistribution([2.0], [3.0], [1.0], [40.0])
-        >>> [(each.name, each.value, each.change) for each in gap.parameters(["gap"])]
-        [('alpha of gap', 2.0, 0.2), ('beta of gap', 3.0, 0.30000000000000004)]
-    """
-
-    name: str
-    """In words, such as "mean of log gap"."""
-    value: float
-    change: float
-    """Change for which a sensitivity is stated, in units of the value: a standard deviation for a mean, a tenth of a
-    standard deviation, of a weight or of a shape parameter, 0.1 for a correlation."""
-    change_name: str
-    """The same in words, such as "1 sd"."""
-    columns: tuple[int, ...] = ()
-    """Columns of x that it is about; none for the weight of a component, which is about all."""
-
-
-@runtime_checkable
-class HasParameters(Protocol):
-    """A distribution with parameters.
-
-    Example:
-        >>> from rare_envs.distributions import BetaDistribution, NoiseDistribution
-        >>> isinstance(BetaDistribution([2.0], [2.0], [0.0], [1.0]), HasParameters)
-        True
-        >>> isinstance(NoiseDistribution(3), HasParameters)
-        False
-    """
-
-    def parameters(self, names: Sequence[str] = (), like: object = None) -> tuple[DistributionParameter, ...]:
-        """Return the parameters.
-
-        Args:
-            names: Of the columns of x, d of them; x1, x2, ... by default.
-            like: Distribution of the same family whose numbering of components is followed.
-        """
-
-    def with_parameters(self, values: ArrayLike) -> Distribution:
-        """Return the same distribution with other values of the parameters, in the order of `parameters()`."""
-
-
-class MixtureArrays(NamedTuple):
-    """Weights (K,), means (K, d) and covariances (K, d, d) of a mixture."""
-
-    weights: FloatArray
-    means: FloatArray
-    covariances: FloatArray
-
-
-def number_columns(dim: int) -> tuple[str, ...]:
-    """Return names of columns: x1, x2, ..."""
-    return tuple(f"x{j + 1}" for j in range(dim))
-
-
-def list_mixture_parameters(
-    mixture: MixtureArrays, coordinates: Coordinates, names: Sequence[str] = (), like: MixtureArrays | None = None
-) -> tuple[DistributionParameter, ...]:
-    """Return weights (of several components), means, standard deviations and correlations, component by component.
-
-    The components are numbered as those of `like`, if it has as many.
-    """
-    if like is not None and len(like.weights) == len(mixture.weights):
-        mixture = MixtureArrays(*(values[match_components(mixture, like)] for values in mixture))
-    columns = tuple(names) or coordinates.names or number_columns(coordinates.dim)
-    labels = [_name_coordinate(coordinates.kinds[j], columns[j]) for j in coordinates.columns]
-    k = len(mixture.weights)
-    found: list[DistributionParameter] = []
-    if k > 1:
-        found += [
-            DistributionParameter(f"weight of component {c + 1}", float(w), RELATIVE_CHANGE * float(w), "10 %")
-            for c, w in enumerate(mixture.weights)
-        ]
-    for c, (mean, covariance) in enumerate(zip(mixture.means, mixture.covariances, strict=True)):
-        end = f" (component {c + 1})" if k > 1 else ""
-        found += _list_component(mean, covariance, labels, coordinates.columns, end)
-    return tuple(found)
-
-
-def _name_coordinate(kind: CoordinateKind, column: str) -> str:
-    """Return a coordinate in words; "closing to" a column is its `ClosingSpeed`."""
-    if isinstance(kind, ClosingSpeed):
-        return f"closing to {column}"
-    return f"log {column}" if kind == "log" else column
-
-
-def _list_component(
-    mean: FloatArray, covariance: FloatArray, labels: Sequence[str], columns: Sequence[int], end: str
-) -> list[DistributionParameter]:
-    """Return means, standard deviations and correlations of one component."""
-    sd = np.sqrt(np.diag(covariance))
-    correlation = covariance / np.outer(sd, sd)
-    found = []
-    for label, value, deviation, column in zip(labels, mean.tolist(), sd.tolist(), columns, strict=True):
-        found.append(DistributionParameter(f"mean of {label}{end}", value, deviation, "1 sd", (column,)))
-    for label, deviation, column in zip(labels, sd.tolist(), columns, strict=True):
-        change = RELATIVE_CHANGE * deviation
-        found.append(DistributionParameter(f"sd of {label}{end}", deviation, change, "10 %", (column,)))
-    for i, j in ((later, earlier) for later in range(len(sd)) for earlier in range(later)):
-        name, pair = f"correlation of {labels[j]} and {labels[i]}{end}", (columns[j], columns[i])
-        change = CORRELATION_CHANGE
-        found.append(DistributionParameter(name, float(correlation[i, j]), change, f"{change:g}", pair))
-    return found
-
-
-def set_mixture_parameters(mixture: MixtureArrays, values: ArrayLike) -> MixtureArrays:
-    """Return the arrays of a mixture with other values of its parameters; weights are scaled to sum to 1."""
-    given = np.asarray(values, dtype=np.float64)
-    k, d = mixture.means.shape
-    own = d + d + d * (d - 1) // 2
-    n_weights = k if k > 1 else 0
-    check_values(given, n_weights + k * own)
-    weights = given[:n_weights] / given[:n_weights].sum() if n_weights else mixture.weights
-    parts = given[n_weights:].reshape(k, own)
-    covariances = np.empty((k, d, d))
-    for c, part in enumerate(parts):
-        correlation = np.eye(d)
-        below = np.tril_indices(d, -1)
-        correlation[below] = correlation[below[::-1]] = part[2 * d :]
-        covariances[c] = correlation * np.outer(part[d : 2 * d], part[d : 2 * d])
-    return MixtureArrays(weights, parts[:, :d].copy(), covariances)
-
-
-def check_values(values: FloatArray, n: int) -> None:
-    """Raise a ValueError unless there are n values."""
-    if values.shape != (n,):
-        raise ValueError(f"Expected {n} values, one for each parameter, got shape {values.shape}.")
-
-
-def match_components(mixture: MixtureArrays, like: MixtureArrays) -> list[int]:
-    """Return the components of a mixture in the numbering of another with as many.
-
-    The assignment has the least sum of squared distances of means, standard deviations and logarithms of weights, in
-    standard deviations of the other's components.
-    """
-    sd, other_sd = (np.sqrt(np.diagonal(each.covariances, axis1=1, axis2=2)) for each in (mixture, like))
-    means = ((mixture.means[:, None] - like.means) / other_sd) ** 2
-    spreads = np.log(sd[:, None] / other_sd) ** 2
-    weights = np.log(mixture.weights[:, None] / like.weights) ** 2
-    _, places = linear_sum_assignment(means.sum(axis=2) + spreads.sum(axis=2) + weights)
-    return [int(component) for component in np.argsort(places)]
-
-
-def arrays_of(distribution: object) -> MixtureArrays | None:
-    """Return the arrays of a distribution that is a mixture; None for any other."""
-    arrays = tuple(getattr(distribution, name, None) for name in MixtureArrays._fields)
-    return None if any(values is None for values in arrays) else MixtureArrays(*(np.asarray(v) for v in arrays))

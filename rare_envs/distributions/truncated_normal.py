@@ -1,13 +1,13 @@
 """One-dimensional normal mixtures cut to an interval: masses, maps to and from the standard normal, draws.
 
 Arrays hold components in rows and points in columns, (K, n). A column does not depend, bit for bit, on the others of a
-call. Masses and the map to the standard normal are in logarithms of the smaller tail. Quantiles of one normal have a
-closed form. Those of mixtures are found in plain numbers by Halley's method, and where that does not do, by a
-bracketing search on the map in logarithms.
+call. Quantiles are found in plain numbers, and where these do not do, by a bracketing search on the map in logarithms.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass, fields
+from functools import cached_property
 from typing import Any, NamedTuple, cast
 
 import numpy as np
@@ -25,8 +25,6 @@ small as the cancellation in a difference of distribution functions, 1e-12."""
 CANCELS = 0.01
 """A difference of distribution functions of less than this share of one of them is found by a series, of relative error
 1e-16."""
-ALL = 8.3
-"""From here on Phi is 1 but for rounding."""
 MIN_MASS = 1e-200
 """Least mass of an untruncated mixture in its interval, and..."""
 MIN_U = -30.0
@@ -42,11 +40,42 @@ MAX_ERROR = 1e3
 """On the quantile scale; at an end of an interval it is infinite, which a search for a root cannot interpolate."""
 
 
-class TruncatedConditional(NamedTuple):
+class Cut(NamedTuple):
+    """Normals cut to [a, b] in units of their own, with their masses in plain numbers, (K, n) or (K, 1) each."""
+
+    start: FloatArray
+    """a."""
+    end: FloatArray
+    """b."""
+    start_tail: FloatArray
+    """Phi(-|a|)."""
+    end_tail: FloatArray
+    """Phi(-|b|)."""
+    mass: FloatArray
+    """Phi(b) - Phi(a)."""
+
+    @classmethod
+    def of(cls, a: FloatArray, b: FloatArray, width: FloatArray) -> Cut:
+        """Return normals cut to [a, b]; `width` is b - a without rounding."""
+        start_tail, end_tail = ndtr(-np.abs(a)), ndtr(-np.abs(b))
+        mass = np.where(a * b > 0.0, np.abs(start_tail - end_tail), 1.0 - (start_tail + end_tail))
+        near = mass < CANCELS * start_tail
+        if near.any():
+            mass[near] = _narrow_mass(*(np.broadcast_to(each, near.shape)[near] for each in (a, width)))
+        return cls(a, b, start_tail, end_tail, mass)
+
+    def turned_round(self) -> Cut:
+        """Return the same normals mirrored at 0."""
+        return Cut(-self.end, -self.start, self.end_tail, self.start_tail, self.mass)
+
+
+@dataclass(frozen=True, eq=False)
+class TruncatedConditional:
     """One coordinate given the earlier ones: a one-dimensional mixture cut to [low, high].
 
     log_weights, which need not be normalised, and mean have shape (K, n), or (K, 1) if they are the same in all rows,
     and scale (K, 1) or (K, n); low and high are scalars or (n,). Components with is_log (K, 1) are normal in log x.
+    Masses are also those of R mixtures at once, (K, R, n) in place of (K, n).
     """
 
     log_weights: FloatArray
@@ -55,31 +84,36 @@ class TruncatedConditional(NamedTuple):
     low: Any
     high: Any
     is_log: NDArray[np.bool_] | None = None
+    known_cut: Cut | None = None
 
     def take(self, rows: NDArray[np.intp]) -> TruncatedConditional:
         """Return the distributions of some rows."""
-        return TruncatedConditional(*(_take_rows(array, rows) for array in self))
+        values = [getattr(self, each.name) for each in fields(self)]  # fields by name
+        return TruncatedConditional(*(_take_rows(value, rows) for value in values))
 
-    def log_mass(self) -> FloatArray:
-        """Return the log mass of each component in [low, high], (K, n)."""
-        a = (self.low - self.mean) / self.scale
-        width = np.broadcast_to((self.high - self.low) / self.scale, a.shape)
-        return log_interval(a, a + width, width)
+    @cached_property
+    def cut(self) -> Cut:
+        """The components cut to the interval."""
+        if self.known_cut is not None:
+            return self.known_cut
+        low, high = (_place(self.is_log, end) for end in (self.low, self.high))
+        start, end, width = ((each / self.scale) for each in (low - self.mean, high - self.mean, high - low))
+        return Cut.of(start, end, width)
+
+    @cached_property
+    def weights_and_mass(self) -> tuple[FloatArray, FloatArray]:
+        """Weights, the largest of them 1, and the mass of such a mixture in the interval, (n,)."""
+        weights = np.exp(self.log_weights - _highest(self.log_weights))
+        return weights, sum_components(weights * self.cut.mass)
 
     def log_whole_mass(self) -> FloatArray:
-        """Return the log mass of the mixture in [low, high], its weights as they are, (n,)."""
-        top = _highest(self.log_weights)
-        start, end = ((each - self.mean) / self.scale for each in (self.low, self.high))
-        mass, narrow = _plain_mass(start, end)
-        mass *= np.exp(self.log_weights - top)
-        total = sum_components(mass)
-        fits = (total >= MIN_MASS) & ~narrow.any(axis=0)
-        out = np.asarray(top + np.log(np.where(fits, total, 1.0)))
-        if not fits.all():
-            rest = np.flatnonzero(~fits)
-            conditional = self.take(rest)
-            out[rest] = log_sum(conditional.log_weights + conditional.log_mass())
-        return out
+        """Return the log mass of the mixture in [low, high], its weights as they are, (n,), or (1,) for all points."""
+        mass = self.weights_and_mass[1]
+        fits = mass >= MIN_MASS
+        found = _highest(self.log_weights) + np.log(np.where(fits, mass, 1.0))
+        if fits.all():
+            return np.asarray(found)
+        return np.where(fits, found, log_sum(self.log_weights + log_interval(self.cut.start, self.cut.end)))
 
     def to_normal(self, x: FloatArray) -> FloatArray:
         """Return Phi^-1 of the distribution function at x (n,), by the smaller tail."""
@@ -92,12 +126,13 @@ class TruncatedConditional(NamedTuple):
 
     def from_normal(self, u: FloatArray) -> FloatArray:
         """Invert `to_normal`, (n,) -> (n,)."""
-        found, fits = np.empty(len(u)), np.zeros(len(u), dtype=bool)
         if len(self.mean) == 1 and self.is_log is None:
             found, fits = self._invert_alone(u)
-        if not fits.all():
             rest = np.flatnonzero(~fits)
-            found[rest], fits[rest] = self.take(rest)._invert_by_steps(u[rest])
+            if rest.size:
+                found[rest], fits[rest] = self.take(rest)._invert_by_steps(u[rest])
+        else:
+            found, fits = self._invert_by_steps(u)
         if not fits.all():
             rest = np.flatnonzero(~fits)
             found[rest] = self.take(rest)._search(u[rest])
@@ -111,16 +146,21 @@ class TruncatedConditional(NamedTuple):
 
     def _invert_alone(self, u: FloatArray) -> tuple[FloatArray, NDArray[np.bool_]]:
         """Return the quantiles of one normal at Phi(u), (n,), and where plain numbers do for that."""
-        sign = np.where(u > 0.0, -1.0, 1.0)  # mirrored, so that they are read from the lower end
-        a, b = ((end - self.mean[0]) / self.scale[0] for end in (self.low, self.high))
-        a, b = np.where(u > 0.0, -b, a), np.where(u > 0.0, -a, b)
-        turned = np.where(a > 0.0, -1.0, 1.0)
-        start = ndtr(turned * a)
-        mass = ndtr(turned * b) - start
-        below = ndtr(-np.abs(u))
-        z = turned * ndtri(start + mass * below)
-        fits = (np.abs(mass) * below >= CANCELS * start) & (np.abs(mass) >= MIN_MASS) & (np.abs(u) < -MIN_U)
-        return self.mean[0] + sign * z * self.scale[0], fits
+        mirrored, (start, end, start_tail, end_tail, mass) = u > 0.0, (each[0] for each in self.cut)
+        turned = np.where(np.where(mirrored, -end, start) > 0.0, -1.0, 1.0)
+        tail, part = np.where(mirrored, end_tail, start_tail), mass * ndtr(-np.abs(u))
+        z = turned * ndtri(tail + turned * part)
+        fits = (part >= CANCELS * tail) & (mass >= MIN_MASS) & (np.abs(u) < -MIN_U)
+        return self.mean[0] + np.where(mirrored, -z, z) * self.scale[0], fits
+
+    def draw(self, first: FloatArray, second: FloatArray) -> FloatArray:
+        """Return draws from uniforms (n,) each, of which the first chooses a component, normal in x."""
+        shape = len(self.log_weights), len(first)
+        a, b, mean, scale = (
+            np.broadcast_to(each, shape) for each in (self.cut.start, self.cut.end, self.mean, self.scale)
+        )
+        chosen = choose(self.log_weights + log_interval(a, b), first), np.arange(len(first))
+        return np.asarray(mean[chosen] + scale[chosen] * truncated_quantile(a[chosen], b[chosen], second))
 
     def _search(self, u: FloatArray) -> FloatArray:
         """Return where `to_normal` is u (n,), by a bracketing search."""
@@ -135,9 +175,11 @@ class TruncatedConditional(NamedTuple):
         return np.asarray(elementwise.find_root(find_error, (low, high), args=(np.arange(len(u), dtype=np.float64),)).x)
 
 
-def _take_rows(array: Any, rows: NDArray[np.intp]) -> Any:
+def _take_rows(value: Any, rows: NDArray[np.intp]) -> Any:
     """Return some rows of what may be the same in all of them."""
-    return array if np.shape(array)[-1:] in ((), (1,)) else np.take(array, rows, axis=-1)
+    if isinstance(value, Cut):
+        return Cut(*(_take_rows(each, rows) for each in value))
+    return value if np.shape(value)[-1:] in ((), (1,)) else np.take(value, rows, axis=-1)
 
 
 def _place(is_log: NDArray[np.bool_] | None, x: Any, sign: Any = 1.0) -> Any:
@@ -175,32 +217,36 @@ class Tail(NamedTuple):
     @classmethod
     def of(cls, conditional: TruncatedConditional, u: FloatArray) -> tuple[Tail, NDArray[np.bool_]]:
         """Return the distribution functions to be inverted at u (n,), and which rows fit into plain numbers."""
-        is_log, mirrored = conditional.is_log, u > 0.0
+        mirrored, cut = u > 0.0, conditional.cut
         sign = np.where(mirrored, -1.0, 1.0)
-        low, high = (
-            np.where(mirrored, -conditional.high, conditional.low),
-            np.where(mirrored, -conditional.low, conditional.high),
-        )
-        mean = sign * conditional.mean
-        start = (_place(is_log, low, sign) - mean) / conditional.scale
-        turned = np.where(start > 0.0, -1.0, 1.0)
-        rate, start = turned / conditional.scale, -np.abs(start)
-        tail = cls(sign, low, high, mean, rate, start, ndtr(start), rate, turned, is_log)
-        mass = tail._rise(high, (_place(is_log, high, sign) - mean) * rate)
-        weight = np.exp(conditional.log_weights - _highest(conditional.log_weights)) * turned
-        total = sum_components(weight * mass)
+        weights, total = conditional.weights_and_mass
         fits = (total >= MIN_MASS) & (np.abs(u) < -MIN_U)
-        return tail._replace(mass=mass, weight=weight / np.where(fits, total, 1.0)), fits
+        start = np.where(mirrored, -cut.end, cut.start)
+        turned = np.where(start > 0.0, -1.0, 1.0)
+        tail = cls(
+            sign=sign,
+            low=np.where(mirrored, -conditional.high, conditional.low),
+            high=np.where(mirrored, -conditional.low, conditional.high),
+            mean=sign * conditional.mean,
+            rate=turned / conditional.scale,
+            start=-np.abs(start),
+            start_mass=np.where(mirrored, cut.end_tail, cut.start_tail),
+            mass=turned * cut.mass,
+            weight=turned * (weights / np.where(fits, total, 1.0)),
+            is_log=conditional.is_log,
+        )
+        return tail, fits
 
     def solve(self, u: FloatArray) -> tuple[FloatArray, NDArray[np.bool_]]:
         """Return where the distribution functions are Phi(-|u|), mirrored back, (n,), and which rows were found."""
         p = ndtr(np.maximum(-np.abs(u), MIN_U))
         with np.errstate(all="ignore"):  # the ends of the interval, and components without weight, give inf and nan
-            x, found = self._iterate(p, self._guess(p), FIRST_STEPS)
-            rest = np.flatnonzero(~found)
-            if rest.size:
-                few = Tail(*(_take_rows(array, rest) for array in self))
-                x[rest], found[rest] = few._iterate(p[rest], x[rest], FURTHER_STEPS)
+            x, found = self._guess(p), np.zeros(len(p), dtype=np.bool_)
+            for steps in (FIRST_STEPS, FURTHER_STEPS):
+                rest = np.flatnonzero(~found)
+                if rest.size:
+                    few = self if rest.size == len(p) else Tail(*(_take_rows(array, rest) for array in self))
+                    x[rest], found[rest] = few._iterate(p[rest], x[rest], steps)
         return self.sign * x, found
 
     def _iterate(self, p: FloatArray, x: FloatArray, steps: int) -> tuple[FloatArray, NDArray[np.bool_]]:
@@ -272,18 +318,9 @@ def _narrow_mass(a: FloatArray, width: FloatArray) -> FloatArray:
     return np.asarray(width * np.exp(-0.5 * m2) / SQRT_2PI * series)
 
 
-def _plain_mass(a: FloatArray, b: FloatArray) -> tuple[FloatArray, NDArray[np.bool_]]:
-    """Return Phi(b) - Phi(a) for a < b, and where the interval is so narrow that the difference cancels."""
-    below, turned = ndtr(-np.abs(a)), a > 0.0  # turned, so that both ends are read from the lower tail
-    narrow = (b - a) * (1.0 + np.abs(a)) < NARROW
-    if b.size and b.min() > ALL and not turned.any():
-        return 1.0 - below, narrow
-    mass = ndtr(np.where(turned, -b, b)) - below
-    return np.where(turned, -mass, mass), narrow
-
-
-def log_interval(a: FloatArray, b: FloatArray, width: FloatArray) -> FloatArray:
+def log_interval(a: FloatArray, b: FloatArray, width: FloatArray | None = None) -> FloatArray:
     """Return log(Phi(b) - Phi(a)) for a < b, accurate in both tails; `width` is b - a without rounding."""
+    width = b - a if width is None else width
     flip = a + b > 0  # mirrored, so that both ends are read from the lower tail
     lower, upper = log_ndtr(np.where(flip, -b, a)), log_ndtr(np.where(flip, -a, b))
     with np.errstate(divide="ignore"):  # an empty interval has log mass -inf
@@ -298,18 +335,15 @@ def log_interval(a: FloatArray, b: FloatArray, width: FloatArray) -> FloatArray:
     return cast(FloatArray, out)
 
 
-def truncated_quantile(a: FloatArray, b: FloatArray, log_v: FloatArray, log_1mv: FloatArray) -> FloatArray:
-    """Return the v-quantile of the standard normal cut to [a, b], from log v and log(1 - v)."""
+def truncated_quantile(a: FloatArray, b: FloatArray, v: FloatArray) -> FloatArray:
+    """Return the quantiles at v (n,), from 0 to 1, of standard normals cut to [a, b], (n,) each."""
     flip = a + b > 0
     lower, upper = log_ndtr(np.where(flip, -b, a)), log_ndtr(np.where(flip, -a, b))
-    low_part, high_part = np.where(flip, log_v, log_1mv), np.where(flip, log_1mv, log_v)
+    with np.errstate(divide="ignore"):  # v = 0 is an end of the interval
+        above, below = np.log(v), np.log1p(-v)
+    low_part, high_part = np.where(flip, above, below), np.where(flip, below, above)
     z = ndtri_exp(np.minimum(np.logaddexp(lower + low_part, upper + high_part), upper))
     return cast(FloatArray, np.clip(np.where(flip, -z, z), a, b))
-
-
-def reweight(log_weights: FloatArray, residual: FloatArray, scale: FloatArray) -> FloatArray:
-    """Return log weights after seeing a coordinate: plus its log density per component."""
-    return cast(FloatArray, log_weights - 0.5 * residual * residual - np.log(scale) - LOG_SQRT_2PI)
 
 
 def choose(score: FloatArray, v: FloatArray) -> NDArray[np.intp]:
@@ -318,14 +352,8 @@ def choose(score: FloatArray, v: FloatArray) -> NDArray[np.intp]:
     Where all scores are minus infinity, it is the last one.
     """
     total = log_sum(score)
-    probability = np.exp(score - np.where(total == -np.inf, 0.0, total))
-    threshold = v * sum_components(probability)
-    pick = np.zeros(len(v), dtype=np.intp)
-    cumulative = np.zeros(len(v))
-    for row in probability[:-1]:
-        cumulative = cumulative + row
-        pick += threshold >= cumulative
-    return pick
+    cumulative = np.cumsum(np.exp(score - np.where(total == -np.inf, 0.0, total)), axis=0)
+    return np.asarray(np.count_nonzero(v * cumulative[-1] >= cumulative[:-1], axis=0), dtype=np.intp)
 
 
 def log_sum(values: FloatArray) -> FloatArray:
@@ -343,4 +371,4 @@ def _highest(values: FloatArray) -> FloatArray:
 
 def sum_components(values: FloatArray) -> FloatArray:
     """Sum over components, (K, n) -> (n,), one after the other; of a single column NumPy would add up pairs."""
-    return np.asarray(np.add.reduce(values) if values.shape[1] > 1 else np.add.accumulate(values)[-1])
+    return np.asarray(np.add.reduce(values) if values[0].size > 1 else np.add.accumulate(values)[-1])

@@ -16,7 +16,8 @@ from highway_env.utils import class_from_path, lmap
 from numpy.typing import NDArray
 
 from rare_envs.distributions.coordinates import FloatArray
-from rare_envs.distributions.product import NoiseDistribution, join_independent
+from rare_envs.distributions.fitted import join_independent
+from rare_envs.distributions.product import NoiseDistribution
 from rare_envs.distributions.space import Parameter, ScenarioSpace
 from rare_envs.interop.layouts import (
     LAYOUTS,
@@ -331,4 +332,4 @@ def _make_space(groups: list[Group], noise: bool, base: Any) -> ScenarioSpace:
         distributions.append(NoiseDistribution(1))
     if not parameters:
         raise ValueError("Every parameter is held; expected at least one that varies.")
-    return ScenarioSpace.of(parameters, join_independent(*distributions))
+    return ScenarioSpace(parameters, join_independent(*distributions))

@@ -186,9 +186,9 @@ def load_base(scenario: Scenario, base: str | PathLike[str] | Distribution | Non
     """Return the base distribution of a scenario.
 
     A JSON file holds what the shipped ones do: names, low, high, weights, means, covariances, and if wanted units,
-    provenance, coordinates and order (see `CoordinateMixture`); or, for independent Beta variables, names, low, high,
-    alpha and beta, one for each column of x (see `BetaDistribution`). A file with refits, events, family, frequency or
-    checks gives a `FittedDistribution`, see its `from_dict`.
+    provenance, coordinates and order (see `TruncatedGaussianMixture`); or, for independent Beta variables, names, low,
+    high, alpha and beta, one for each column of x (see `BetaDistribution`). A file with refits, events, family,
+    frequency or checks gives a `FittedDistribution`, see its `from_dict`.
 
     Args:
         scenario: The scenario.

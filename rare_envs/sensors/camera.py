@@ -15,7 +15,7 @@ from torch import Tensor
 
 from rare_envs.distributions.beta import BetaDistribution
 from rare_envs.distributions.coordinates import Coordinates
-from rare_envs.distributions.mixture import CoordinateMixture
+from rare_envs.distributions.mixture import TruncatedGaussianMixture
 from rare_envs.distributions.space import Distribution, Parameter
 
 GROUND_RANGE = 2000.0
@@ -158,11 +158,11 @@ CONDITIONS = (
 """Parameters of the scenario with `weather=True`, behind its own."""
 SENSOR_NOISE = Parameter("sensor_noise", "levels", 0.0, 10.0, "standard deviation of the noise of a pixel, of 255")
 """One more, unless `noise=False`."""
-FOG_DISTRIBUTION = CoordinateMixture(
-    Coordinates(np.array([1e-5]), np.array([0.3]), ("log",)),
+FOG_DISTRIBUTION = TruncatedGaussianMixture(
     weights=np.ones(1),
     means=np.array([[math.log(1.9e-4)]]),
     covariances=np.array([[[1.2**2]]]),
+    coordinates=Coordinates(np.array([1e-5]), np.array([0.3]), ("log",)),
 )
 """Log-normal: median visibility 16 km; less than 1 km, which is fog by definition, in 1 of 100 cases."""
 SUN_DISTRIBUTION = WeatherBeta(*map(np.array, ([1.1, 1.0], [1.58, 1.0], [5.0, -180.0], [76.0, 180.0])))

@@ -71,7 +71,7 @@ class FittedBase(Distribution, Protocol):
 
     With `ensemble()`, the mixture of the refits with equal weights (a ValueError where they cannot be mixed), it lets
     `estimate` make a further run where the points of the first do not reach the refits; `covering_ensemble()` is the
-    mixture of a few of many refits that reach as far. `refits.log_probs(x)` may give the log densities of all R refits
+    mixture of a few of many refits that reach as far. `refit_log_probs(x)` may give the log densities of all R refits
     at x (k, d) at once, shape (R, k); `refit_families` the number of the family of each, 0 for that of the base.
 
     Example:
@@ -313,8 +313,9 @@ def refit_log_ratios(estimate: EstimateData, sample: Sample, refits: Sequence[Ha
         if all(a is b for a, b in zip(kept, of, strict=True)):
             return ratios
     old = log_density(base, x)
-    if hasattr(refits, "log_probs"):  # a user's sequence
-        new = np.asarray(refits.log_probs(x))
+    together: Any = base
+    if hasattr(base, "refit_log_probs") and refits is together.refits:
+        new = np.asarray(together.refit_log_probs(x))
     else:
         new = np.array([log_density(refit, x) for refit in refits], dtype=np.float64).reshape(len(refits), len(x))
     estimate.refit_ratios[:] = [(of, _subtract_log_densities(new, old, x))]

@@ -474,7 +474,7 @@ def announced_blocks(inputs: Inputs) -> Product:
     ValueError says that there are no blocks, one is not as described, or their product is not the base distribution.
     """
     announced = getattr(inputs.base, "blocks", None)  # the user's own class
-    if announced is None:
+    if not announced:
         raise ValueError(
             f'CrossEntropy: family "blocks" needs a base distribution with an attribute blocks, as Product has; '
             f'{type(inputs.base).__name__} has none. The family "gaussian" works with any.'

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rare_envs.distributions.fitted import EventFrequency, FittedDistribution, PredictiveCheck
-from rare_envs.distributions.mixture import CoordinateMixture
+from rare_envs.distributions.mixture import TruncatedGaussianMixture
 from rare_envs.distributions.space import Distribution, Parameter
 from rare_envs.scenarios.registry import scenario_named
 from samplers.problem import FloatArray
@@ -186,7 +186,7 @@ def format_base(scenario: str, content: Mapping[str, Any]) -> str:
     return json.dumps({**head, **content}, indent=1, ensure_ascii=False, allow_nan=False) + "\n"
 
 
-def mass_outside(distribution: CoordinateMixture, seed: int = 0) -> dict[str, Any]:
+def mass_outside(distribution: TruncatedGaussianMixture, seed: int = 0) -> dict[str, Any]:
     """Return the probability that the box cuts away from the mixture without its box.
 
     `any` is that some column of x is outside, with its `standard_error`; `each` is the same per column.
@@ -200,7 +200,7 @@ def mass_outside(distribution: CoordinateMixture, seed: int = 0) -> dict[str, An
     y = np.concatenate(parts)
     x = np.empty_like(y)
     for position, j in enumerate(coordinates.columns):
-        x[:, j] = coordinates.unbounded_value(j, y[:, position], x)
+        x[:, j] = coordinates.value(j, y[:, position], x)
     outside = (x < coordinates.low) | (x > coordinates.high)
     p = float(outside.any(axis=1).mean())
     return {

@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rare_envs.distributions.coordinates import ClosingSpeed, CoordinateKind, Coordinates
-from rare_envs.distributions.mixture import CoordinateMixture
+from rare_envs.distributions.mixture import TruncatedGaussianMixture
 from rare_envs.distributions.space import Parameter
 from samplers.problem import FloatArray
 from training.fit.filters import EventSet
@@ -118,7 +118,7 @@ class SystemFit:
     """A mixture fitted in one coordinate system."""
 
     system: CoordinateSystem
-    distribution: CoordinateMixture
+    distribution: TruncatedGaussianMixture
     """Of all columns of x."""
     candidates: Sequence[Candidate]
     """Numbers of components of the columns that are fitted together, with a BIC in units of x."""
@@ -155,7 +155,8 @@ def fit_system(
     if events.apart.shape[1]:
         apart, (single, *_) = _fit_in(system.coordinates(parameters[n:]), events.apart, seed, 1, None)
         components, bic_apart = append_independent(components, apart), single.bic
-    return SystemFit(system, CoordinateMixture(system.coordinates(parameters), *components), candidates, bic_apart)
+    mixture = TruncatedGaussianMixture(*components, coordinates=system.coordinates(parameters))
+    return SystemFit(system, mixture, candidates, bic_apart)
 
 
 def _fit_in(

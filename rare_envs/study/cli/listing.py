@@ -205,10 +205,10 @@ def _describe_base(scenario: Scenario, name: str) -> dict[str, Any]:
     frequency = base.frequency
     if frequency is not None:
         rates = {"per_hour": frequency.per_hour, "per_km": frequency.per_km}
-        known |= {"frequency": {**frequency.to_dict(), **rates}, "no_frequency": None}
+        known |= {"frequency": {**asdict(frequency), **rates}, "no_frequency": None}
     return known | {
         "fitted_to": base.fitted_to,
-        "events": base.events.to_dict(),
+        "events": asdict(base.events),
         "family": base.family,
         "refits": len(base.refits),
         "checks": [{key: getattr(check, key) for key in ("name", "recorded", "expected")} for check in base.checks],

@@ -1,22 +1,23 @@
 """Fitted distributions: frequency, counts in words, refits and their mixture, files that come back or are damaged."""
 
 import json
-from dataclasses import replace
+from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
 import pytest
 
 from rare_envs.distributions.beta import BetaDistribution
-from rare_envs.distributions.fitted import EventCounts, EventFrequency, FittedDistribution, PredictiveCheck, read_record
-from rare_envs.distributions.mixture import CoordinateMixture, TruncatedGaussianMixture
-from rare_envs.distributions.product import (
-    BlockDistribution,
-    FittedProduct,
-    NoiseDistribution,
-    ProductDistribution,
+from rare_envs.distributions.fitted import (
+    EventCounts,
+    EventFrequency,
+    FittedDistribution,
+    PredictiveCheck,
     join_independent,
+    read_record,
 )
+from rare_envs.distributions.mixture import TruncatedGaussianMixture
+from rare_envs.distributions.product import NoiseDistribution, ProductDistribution
 
 NAMES = ["speed", "lead_speed", "gap"]
 ORDER = ["speed", "gap", "lead_speed"]
@@ -53,7 +54,7 @@ CONTENT: dict[str, Any] = {
     "high": [45.0, 45.0, 150.0],
     "family": "2 components, closing speed / sqrt(gap), log gap",
     "events": {"used": [38, 15], "clusters": 17, "cluster": "scene"},
-    "frequency": CUT_INS.to_dict(),
+    "frequency": asdict(CUT_INS),
     "checks": [{"name": "TTC < 5 s", "recorded": 7, "expected": 15.9}],
     "provenance": {"site": "US 101", "bic": 7852.8},
     "refits": [components(seed, k) for seed, k in ((1, 1), (2, 2), (3, 3))],
@@ -66,7 +67,7 @@ def test_frequency_and_its_error_by_hand() -> None:
     assert (round(CUT_INS.per_hour, 2), round(CUT_INS.per_km, 3)) == (9.01, 0.259)
     assert CUT_INS.log_sd**2 == pytest.approx(1 / 1221 + 1 / 38 - 1 / 46, rel=1e-12)
     assert replace(CUT_INS, share_events=None).log_sd == pytest.approx(1221**-0.5, rel=1e-12)
-    assert read_record(EventFrequency, "frequency", CUT_INS.to_dict()) == CUT_INS
+    assert read_record(EventFrequency, "frequency", asdict(CUT_INS)) == CUT_INS
 
 
 @pytest.mark.parametrize(
@@ -95,16 +96,16 @@ def test_what_it_was_fitted_to() -> None:
 
 
 def test_refits_are_distributions_of_the_same_coordinates_with_components_of_their_own() -> None:
-    assert [len(refit.weights) for refit in BASE.refits if isinstance(refit, CoordinateMixture)] == [1, 2, 3]
+    assert [len(refit.weights) for refit in BASE.refits if isinstance(refit, TruncatedGaussianMixture)] == [1, 2, 3]
     x = BASE.sample(50, np.random.default_rng(0))
-    alone = CoordinateMixture.from_dict({**CONTENT, **CONTENT["refits"][2]})
+    alone = TruncatedGaussianMixture.from_dict({**CONTENT, **CONTENT["refits"][2]})
     assert (BASE.refits[2].log_prob(x) == alone.log_prob(x)).all()
 
 
 def test_the_ensemble_is_the_mean_of_the_refits() -> None:
     """Up to the mass outside the box, which is below 1e-3 for the typical points compared here."""
     ensemble = BASE.ensemble()
-    assert isinstance(ensemble, CoordinateMixture)
+    assert isinstance(ensemble, TruncatedGaussianMixture)
     assert len(ensemble.weights) == 6
     np.testing.assert_allclose(ensemble.weights[:1], [1 / 3], rtol=1e-12)
     x = ensemble.sample(2000, np.random.default_rng(0))
@@ -119,7 +120,7 @@ def test_a_covering_ensemble_has_at_most_30_refits_the_first_and_the_last_among_
     refits = tuple(TruncatedGaussianMixture([1.0], [[m]], [[[1.0]]], [-9.0], [9.0]) for m in means)
     base = FittedDistribution(distribution=refits[0], refits=refits, events=COUNTS, family="1 component")
     pool = base.covering_ensemble()
-    assert isinstance(pool, CoordinateMixture)
+    assert isinstance(pool, TruncatedGaussianMixture)
     assert len(pool.weights) == 30
     assert (pool.means.min(), pool.means.max()) == (-1.0, 1.0)
     few = replace(base, refits=refits[:3])
@@ -138,7 +139,7 @@ def test_an_ensemble_of_plain_mixtures_or_of_nothing() -> None:
     beta = BetaDistribution([2.0], [2.0], [-9.0], [9.0])
     with pytest.raises(ValueError, match="needs refits that are Gaussian mixtures"):
         replace(base, refits=(fit, beta)).ensemble()
-    logs = CoordinateMixture.from_dict({**fit.to_dict(), "low": [1.0], "high": [9.0], "coordinates": ["log"]})
+    logs = TruncatedGaussianMixture.from_dict({**fit.to_dict(), "low": [1.0], "high": [9.0], "coordinates": ["log"]})
     plain = TruncatedGaussianMixture(fit.weights, fit.means, fit.covariances, [1.0], [9.0])
     both = replace(base, distribution=logs, refits=(logs, plain)).ensemble()
     x = np.linspace(1.5, 5.0, 9)[:, None]
@@ -151,8 +152,8 @@ def test_a_refit_may_have_coordinates_of_its_own_also_in_a_file() -> None:
     content = {**CONTENT, "refits": [CONTENT["refits"][0], CONTENT["refits"][0] | plain]}
     base = FittedDistribution.from_dict(content)
     own, other = base.refits
-    assert isinstance(own, CoordinateMixture)
-    assert isinstance(other, CoordinateMixture)
+    assert isinstance(own, TruncatedGaussianMixture)
+    assert isinstance(other, TruncatedGaussianMixture)
     assert own.coordinates.kinds != other.coordinates.kinds == ("plain",) * 3
     assert other.coordinates.order == ()
     assert base.refit_families == (0, 1)
@@ -259,8 +260,7 @@ def test_densities_add_up_and_maps_go_block_by_block() -> None:
 
 def test_a_product_with_one_fitted_block_is_fitted_too() -> None:
     whole = join_independent(BASE, BETA, NoiseDistribution(2))
-    assert isinstance(whole, FittedProduct)
-    assert isinstance(whole, BlockDistribution)
+    assert isinstance(whole, FittedDistribution)
     assert (whole.dim, whole.noise.tolist()) == (6, [False] * 4 + [True] * 2)
     assert [type(block) for block in whole.blocks] == [type(BASE.distribution), BetaDistribution, NoiseDistribution]
     assert (whole.fitted_to, whole.clusters, whole.family) == (BASE.fitted_to, BASE.clusters, BASE.family)
@@ -270,7 +270,7 @@ def test_a_product_with_one_fitted_block_is_fitted_too() -> None:
 @pytest.mark.parametrize("first", [True, False])
 def test_a_refit_replaces_its_block_alone(first: bool) -> None:
     whole = join_independent(*((BASE, BETA) if first else (BETA, BASE)))
-    assert isinstance(whole, FittedProduct)
+    assert isinstance(whole, FittedDistribution)
     x = whole.sample(50, np.random.default_rng(0))
     own, rest = (x[:, :3], x[:, 3:]) if first else (x[:, 1:], x[:, :1])
     assert len(whole.refits) == 3
@@ -284,11 +284,11 @@ def test_a_product_of_a_fitted_product_and_a_sibling() -> None:
     found = FittedDistribution.from_dict(BASE.to_dict(), siblings={"i80": BASE}.__getitem__)
     inner = join_independent(found, BETA)
     outer = join_independent(inner, NoiseDistribution(1))
-    assert isinstance(outer, FittedProduct)
+    assert isinstance(outer, FittedDistribution)
     assert [block.dim for block in outer.blocks] == [3, 1, 1]
     assert [refit.dim for refit in outer.refits] == [5] * 3
     other = outer.sibling("i80")
-    assert isinstance(other, FittedProduct)
+    assert isinstance(other, FittedDistribution)
     assert (other.dim, other.fitted_to) == (5, BASE.fitted_to)
     assert join_independent(inner) is inner
     with pytest.raises(ValueError, match="A file holds mixtures and Beta variables, no ProductDistribution"):

@@ -11,7 +11,7 @@ from scipy import stats
 from scipy.special import ndtri_exp
 
 from rare_envs.distributions.coordinates import LEAST_DISTANCE, ClosingSpeed, Coordinates, as_finite, move_inside
-from rare_envs.distributions.mixture import CHUNK_ROWS, CoordinateMixture, TruncatedGaussianMixture
+from rare_envs.distributions.mixture import CHUNK, TruncatedGaussianMixture
 
 
 def random_mixture(seed: int, components: int, d: int, low: float, high: float) -> TruncatedGaussianMixture:
@@ -22,7 +22,7 @@ def random_mixture(seed: int, components: int, d: int, low: float, high: float) 
     return TruncatedGaussianMixture(rng.dirichlet(np.full(components, 3.0)), means, covariances, [low] * d, [high] * d)
 
 
-def make_cut_in(seed: int, components: int) -> CoordinateMixture:
+def make_cut_in(seed: int, components: int) -> TruncatedGaussianMixture:
     """A cut-in with two gaps; the lead's closing speed is relative to the vehicle that cuts in."""
     rng = np.random.default_rng(seed)
     scale = np.array([2.5, 0.65, 0.5, 0.8, 0.5, 0.4])
@@ -30,7 +30,7 @@ def make_cut_in(seed: int, components: int) -> CoordinateMixture:
     covariances = roots @ roots.transpose(0, 2, 1) * np.outer(scale, scale)
     means = np.array([14.0, 2.8, -0.2, 2.5, -0.1, 3.0]) + scale * rng.uniform(-1.0, 1.0, (components, 6))
     first, second = {"closing_behind": "ego", "gap": "gap"}, {"closing_behind": "cutter", "gap": "lead_gap"}
-    return CoordinateMixture.from_dict(
+    return TruncatedGaussianMixture.from_dict(
         {
             "names": ["ego", "cutter", "lead", "gap", "lead_gap", "offset"],
             "order": ["ego", "gap", "cutter", "lead_gap", "lead", "offset"],
@@ -44,7 +44,7 @@ def make_cut_in(seed: int, components: int) -> CoordinateMixture:
     )
 
 
-FOLLOWING = CoordinateMixture.from_dict(
+FOLLOWING = TruncatedGaussianMixture.from_dict(
     {
         "names": ["ego_speed", "lead_speed", "gap"],
         "order": ["ego_speed", "gap", "lead_speed"],
@@ -61,7 +61,7 @@ FOLLOWING = CoordinateMixture.from_dict(
 )
 """Like the fit to recorded pairs; the slower component is cut where a speed would be negative."""
 BOX = {"low": [8.0, 8.0, 5.0], "high": [16.0, 16.0, 40.0]}
-CUT = CoordinateMixture.from_dict({**FOLLOWING.to_dict(), **BOX})
+CUT = TruncatedGaussianMixture.from_dict({**FOLLOWING.to_dict(), **BOX})
 """The box cuts every coordinate in its bulk."""
 WIDE = random_mixture(1, 3, 2, -15.0, 15.0)
 CUT_2D = random_mixture(2, 3, 2, -1.0, 2.0)
@@ -74,14 +74,14 @@ every = pytest.mark.parametrize(
 )
 
 
-def draw(mixture: CoordinateMixture, n: int, seed: int) -> NDArray[np.float64]:
+def draw(mixture: TruncatedGaussianMixture, n: int, seed: int) -> NDArray[np.float64]:
     return mixture.sample(n, np.random.default_rng(seed))
 
 
 # --- density ----------------------------------------------------------------------------------------
 
 
-def marginal(mixture: CoordinateMixture, x: NDArray[np.float64]) -> NDArray[np.float64]:
+def marginal(mixture: TruncatedGaussianMixture, x: NDArray[np.float64]) -> NDArray[np.float64]:
     """Density of the untruncated mixture's first x.shape[1] coordinates, by SciPy."""
     k = x.shape[1]
     parts = zip(mixture.weights, mixture.means, mixture.covariances, strict=True)
@@ -106,7 +106,10 @@ def test_density_is_the_product_of_cut_conditionals(mixture: TruncatedGaussianMi
 def test_one_logarithm_is_scipys_truncated_log_normal() -> None:
     low, high = 5.0, 60.0
     row = {"weights": [1.0], "means": [[2.5]], "covariances": [[[0.49]]], "low": [low], "high": [high]}
-    own, reference = CoordinateMixture.from_dict({**row, "coordinates": ["log"]}), stats.lognorm(0.7, scale=np.exp(2.5))
+    own, reference = (
+        TruncatedGaussianMixture.from_dict({**row, "coordinates": ["log"]}),
+        stats.lognorm(0.7, scale=np.exp(2.5)),
+    )
     mass = reference.cdf(high) - reference.cdf(low)
     x = np.linspace(5.01, 59.9, 50)
     np.testing.assert_allclose(own.log_prob(x[:, None]), reference.logpdf(x) - np.log(mass), rtol=1e-12)
@@ -121,7 +124,9 @@ def truncated(mean: Any, deviation: float, low: Any, high: Any) -> Any:
 
 def test_one_component_of_closing_speeds_by_scipys_truncated_normals() -> None:
     """Independent coordinates: v, log gap and (v - v_lead) / sqrt(gap), the last within the lead's [0, 45] m/s."""
-    mixture = CoordinateMixture(FOLLOWING.coordinates, [1.0], [[12.0, 2.5, 0.2]], [np.diag([9.0, 0.25, 0.49])])
+    mixture = TruncatedGaussianMixture(
+        [1.0], [[12.0, 2.5, 0.2]], [np.diag([9.0, 0.25, 0.49])], coordinates=FOLLOWING.coordinates
+    )
     rng = np.random.default_rng(0)
     v, gap, lead = rng.uniform(0.1, 44.0, 200), rng.uniform(1.1, 149.0, 200), rng.uniform(0.1, 44.0, 200)
     y, root = (v - lead) / np.sqrt(gap), np.sqrt(gap)
@@ -132,7 +137,7 @@ def test_one_component_of_closing_speeds_by_scipys_truncated_normals() -> None:
 
 
 @every
-def test_density_is_that_of_normals_through_the_map(mixture: CoordinateMixture) -> None:
+def test_density_is_that_of_normals_through_the_map(mixture: TruncatedGaussianMixture) -> None:
     """log p(x) = log phi(u) + log |det du/dx|, with central differences of the map."""
     x = mixture.from_standard_normal(np.random.default_rng(3).standard_normal((300, mixture.dim)))
     margin = 0.005 * (mixture.high - mixture.low)  # differences over 1e-5 are rough where u runs to infinity
@@ -158,14 +163,14 @@ def check_normal(u: NDArray[np.float64]) -> None:
 
 
 @every
-def test_samples_are_standard_normal_through_the_map(mixture: CoordinateMixture) -> None:
+def test_samples_are_standard_normal_through_the_map(mixture: TruncatedGaussianMixture) -> None:
     x = draw(mixture, 20_000, 7)
     assert ((x > mixture.low) & (x < mixture.high)).all()
     check_normal(mixture.to_standard_normal(x))
 
 
 @every
-def test_round_trips_to_the_spacing_of_floats(mixture: CoordinateMixture) -> None:
+def test_round_trips_to_the_spacing_of_floats(mixture: TruncatedGaussianMixture) -> None:
     """Next to a face that cuts the bulk, floats of the size of the box are further apart in u than 1e-8."""
     rng = np.random.default_rng(8)
     u = rng.standard_normal((3000, mixture.dim))
@@ -184,7 +189,7 @@ def test_round_trips_to_the_spacing_of_floats(mixture: CoordinateMixture) -> Non
 
 
 @every
-def test_u_rises_with_its_own_column_and_faces_and_far_tails_are_finite(mixture: CoordinateMixture) -> None:
+def test_u_rises_with_its_own_column_and_faces_and_far_tails_are_finite(mixture: TruncatedGaussianMixture) -> None:
     x = draw(mixture, 300, 4)
     u = mixture.to_standard_normal(x)
     for j in range(mixture.dim):
@@ -224,7 +229,7 @@ def test_tail_of_a_tail_agrees_with_survival_functions() -> None:
 def test_an_order_of_columns_is_the_mixture_with_columns_exchanged() -> None:
     """The mixture's arrays are in the order (b, a); columns of x and u stay where they are."""
     box = Coordinates([-1.0, -1.0], [2.0, 2.0], ("plain", "plain"), names=("a", "b"), order=("b", "a"))
-    exchanged = CoordinateMixture(box, CUT_2D.weights, CUT_2D.means, CUT_2D.covariances)
+    exchanged = TruncatedGaussianMixture(CUT_2D.weights, CUT_2D.means, CUT_2D.covariances, coordinates=box)
     u = np.random.default_rng(0).standard_normal((100, 2))
     x = exchanged.from_standard_normal(u)
     assert (x[:, ::-1] == CUT_2D.from_standard_normal(u[:, ::-1])).all()
@@ -233,7 +238,7 @@ def test_an_order_of_columns_is_the_mixture_with_columns_exchanged() -> None:
 
 
 @every
-def test_rows_stand_alone_bit_for_bit(mixture: CoordinateMixture) -> None:
+def test_rows_stand_alone_bit_for_bit(mixture: TruncatedGaussianMixture) -> None:
     rng = np.random.default_rng(2)
     u = np.concatenate([rng.standard_normal((500, mixture.dim)), rng.uniform(-9, 9, (50, mixture.dim))])
     x = mixture.from_standard_normal(u)
@@ -249,10 +254,11 @@ def test_rows_stand_alone_bit_for_bit(mixture: CoordinateMixture) -> None:
 
 
 def test_draws_are_seeded_and_neither_their_number_nor_chunks_show() -> None:
-    long = draw(CUT_IN, CHUNK_ROWS + 100, 1)
+    rows = CHUNK // 3  # of 3 components
+    long = draw(CUT_IN, rows + 100, 1)
     assert (long[:50] == draw(CUT_IN, 50, 1)).all()
     assert not (long[:50] == draw(CUT_IN, 50, 2)).any()
-    assert (CUT_IN.log_prob(long)[CHUNK_ROWS - 3 :] == CUT_IN.log_prob(long[CHUNK_ROWS - 3 :])).all()
+    assert (CUT_IN.log_prob(long)[rows - 3 :] == CUT_IN.log_prob(long[rows - 3 :])).all()
     for n in (0, 1):
         x = draw(CUT_IN, n, 0)
         assert (x.shape, CUT_IN.log_prob(x).shape) == ((n, 6), (n,))
@@ -263,7 +269,7 @@ def test_draws_are_seeded_and_neither_their_number_nor_chunks_show() -> None:
 
 
 @pytest.mark.parametrize("mixture", [CUT_3D, FOLLOWING], ids=["plain", "closing"])
-def test_json_round_trip_is_exact(mixture: CoordinateMixture) -> None:
+def test_json_round_trip_is_exact(mixture: TruncatedGaussianMixture) -> None:
     copy = type(mixture).from_dict(json.loads(json.dumps(mixture.to_dict())))
     x = draw(mixture, 100, 0)
     assert copy.to_dict() == mixture.to_dict()
@@ -304,7 +310,7 @@ def test_missing_keys_and_other_dimensions_are_named() -> None:
         TruncatedGaussianMixture.from_dict({k: v for k, v in GOOD.items() if k not in ("means", "high")})
     two = Coordinates([0.0, 0.0], [1.0, 1.0], ("plain", "plain"))
     with pytest.raises(ValueError, match=r"means of shape \(2, 2\), one for each column, got \(2, 3\)"):
-        CoordinateMixture(two, FOLLOWING.weights, FOLLOWING.means, FOLLOWING.covariances)
+        TruncatedGaussianMixture(FOLLOWING.weights, FOLLOWING.means, FOLLOWING.covariances, coordinates=two)
 
 
 def test_bad_points_are_refused() -> None:
@@ -336,14 +342,14 @@ def test_dictionary_round_trip() -> None:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"coordinates": ["plain", "sqrt", "log"]}, 'Unknown coordinate \'sqrt\'; known are "plain", "log" and'),
+        ({"coordinates": ["plain", "sqrt", "log"]}, 'coordinate \'sqrt\' of lead; known are "plain", "log" and'),
         ({"coordinates": ["plain", {**CLOSING, "gap": "space"}, "log"]}, "names no column 'space'; columns are v, lea"),
         ({"coordinates": ["plain", {**CLOSING, "gap": "lead"}, "log"]}, "lead depends on lead, which must come earl"),
         ({"order": ["v", "lead", "gap"]}, "of lead depends on gap, which must come earlier in order; order is v, lead"),
         ({"order": ["v", "gap"]}, "order must have each of the columns v, lead, gap once, got v, gap"),
         ({"names": ["v", "lead"]}, "Expected 3 different names, one for each column, got v, lead"),
         ({"coordinates": ["log"]}, r"low of shape \(1,\), one for each column, got \(3,\)"),
-        ({"low": [0.0, 5.0, 0.0]}, "The gap 'gap' of the closing speed of lead needs a positive low"),
+        ({"low": [0.0, 5.0, 0.0]}, "The coordinate of lead needs a positive low of gap, got 0"),
         ({"low": [0.0, 50.0, 1.0]}, r"low must be below high, got \[50, 40\] at coordinate 1"),
     ],
 )
@@ -354,7 +360,7 @@ def test_wrong_coordinates_are_refused_in_one_line(change: dict[str, Any], messa
 
 
 def test_a_missing_end_of_the_box_is_named() -> None:
-    with pytest.raises(ValueError, match="Missing high; needed are low and high"):
+    with pytest.raises(ValueError, match="Missing high; needed are low, high"):
         Coordinates.from_dict({key: value for key, value in DRIVERS.items() if key != "high"})
 
 

@@ -11,11 +11,9 @@ import pytest
 from rare_envs.distributions import (
     BetaDistribution,
     ClosingSpeed,
-    CoordinateMixture,
     Coordinates,
     EventCounts,
     FittedDistribution,
-    HasParameters,
     NoiseDistribution,
     ProductDistribution,
     TruncatedGaussianMixture,
@@ -23,17 +21,17 @@ from rare_envs.distributions import (
 
 COVARIANCES = np.array([[[4.0, 1.2], [1.2, 1.0]], [[1.0, -0.3], [-0.3, 0.25]]])
 PLAIN = TruncatedGaussianMixture([0.3, 0.7], [[1.0, 2.0], [-1.0, 0.5]], COVARIANCES, [-9.0, -9.0], [9.0, 9.0])
-CLOSING = CoordinateMixture(
-    Coordinates(
+CLOSING = TruncatedGaussianMixture(
+    [1.0],
+    [[20.0, 3.0, 0.0]],
+    [np.array([[9.0, 0.3, 0.0], [0.3, 0.25, 0.02], [0.0, 0.02, 0.04]])],
+    coordinates=Coordinates(
         low=[0.0, 0.0, 1.0],
         high=[45.0, 45.0, 150.0],
         kinds=("plain", ClosingSpeed("speed", "gap"), "log"),
         names=("speed", "lead_speed", "gap"),
         order=("speed", "gap", "lead_speed"),
     ),
-    [1.0],
-    [[20.0, 3.0, 0.0]],
-    [np.array([[9.0, 0.3, 0.0], [0.3, 0.25, 0.02], [0.0, 0.02, 0.04]])],
 )
 BETA = BetaDistribution([2.0, 3.0], [2.5, 1.5], [0.0, 1.0], [1.0, 9.0])
 PRODUCT = ProductDistribution((BETA, NoiseDistribution(2), CLOSING))
@@ -43,7 +41,7 @@ FITTED = FittedDistribution(
 ALL = {"plain": PLAIN, "closing": CLOSING, "beta": BETA, "product": PRODUCT, "fitted": FITTED}
 
 
-def values_of(distribution: HasParameters) -> np.ndarray:
+def values_of(distribution) -> np.ndarray:
     return np.array([each.value for each in distribution.parameters()])
 
 

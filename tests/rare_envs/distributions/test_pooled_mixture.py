@@ -4,30 +4,29 @@ import numpy as np
 import pytest
 from scipy import integrate, stats
 
-from rare_envs.distributions import ClosingSpeed, CoordinateMixture, Coordinates, TruncatedGaussianMixture
-from rare_envs.distributions.fitted import Refits
-from rare_envs.distributions.pooled import PooledMixture, pool_mixtures
+from rare_envs.distributions import ClosingSpeed, Coordinates, TruncatedGaussianMixture
+from rare_envs.distributions.mixture import PooledMixture, pool_mixtures
 
 NAMES = ("speed", "lead_speed", "gap")
 BOX = {"low": [0.0, 0.0, 1.0], "high": [45.0, 45.0, 150.0], "names": NAMES}
 CLOSING = Coordinates(**BOX, kinds=("plain", ClosingSpeed("speed", "gap"), "log"), order=("speed", "gap", "lead_speed"))
 LOG_GAP = Coordinates(**BOX, kinds=("plain", "plain", "log"))
 PLAIN = Coordinates(BOX["low"], BOX["high"], ("plain",) * 3)  # a file may leave the names of plain columns out
-IN_CLOSING = CoordinateMixture(CLOSING, [1.0], [[15.0, 3.0, 0.1]], [np.diag([4.0, 0.2, 0.1])])
-IN_LOG_GAP = CoordinateMixture(
-    LOG_GAP,
+IN_CLOSING = TruncatedGaussianMixture([1.0], [[15.0, 3.0, 0.1]], [np.diag([4.0, 0.2, 0.1])], coordinates=CLOSING)
+IN_LOG_GAP = TruncatedGaussianMixture(
     [0.7, 0.3],
     [[15.0, 15.0, 3.0], [25.0, 24.0, 3.5]],
     [[[4.0, 3.0, 0.2], [3.0, 4.0, 0.1], [0.2, 0.1, 0.2]], np.diag([4.0, 9.0, 0.1])],
+    coordinates=LOG_GAP,
 )
-IN_PLAIN = CoordinateMixture(PLAIN, [1.0], [[14.0, 14.0, 30.0]], [np.diag([9.0, 9.0, 100.0])])
+IN_PLAIN = TruncatedGaussianMixture([1.0], [[14.0, 14.0, 30.0]], [np.diag([9.0, 9.0, 100.0])], coordinates=PLAIN)
 POOL = pool_mixtures([IN_CLOSING, IN_LOG_GAP, IN_LOG_GAP, IN_PLAIN])
 
 
 def test_the_density_is_the_mean_of_the_densities() -> None:
     """Another order of the columns cuts a mixture otherwise at the box, beyond which lie 1e-3 and less of these."""
     assert isinstance(POOL, PooledMixture)
-    assert POOL.weights.tolist() == [0.25, 0.5, 0.25]
+    assert POOL.shares.tolist() == [0.25, 0.5, 0.25]
     x = POOL.sample(2000, np.random.default_rng(0))
     mean = np.mean([np.exp(each.log_prob(x)) for each in (IN_CLOSING, IN_LOG_GAP, IN_LOG_GAP, IN_PLAIN)], axis=0)
     np.testing.assert_allclose(np.exp(POOL.log_prob(x)), mean, rtol=5e-3)
@@ -61,7 +60,10 @@ def test_the_map_is_that_of_the_density() -> None:
 def test_draws_follow_the_density() -> None:
     """In one dimension against the integral of the density: Kolmogorov-Smirnov at the level 1e-4."""
     plain, log = (Coordinates([1.0], [99.0], (kind,), ("gap",)) for kind in ("plain", "log"))
-    parts = CoordinateMixture(plain, [1.0], [[20.0]], [[[9.0]]]), CoordinateMixture(log, [1.0], [[3.5]], [[[0.01]]])
+    parts = (
+        TruncatedGaussianMixture([1.0], [[20.0]], [[[9.0]]], coordinates=plain),
+        TruncatedGaussianMixture([1.0], [[3.5]], [[[0.01]]], coordinates=log),
+    )
     pool = pool_mixtures(parts)
     x = pool.sample(4000, np.random.default_rng(3))[:, 0]
     grid = np.linspace(1.0, 99.0, 4001)
@@ -76,37 +78,6 @@ def test_pools_that_cannot_be_are_refused() -> None:
     with pytest.raises(ValueError, match="same box, but mixtures 0 and 1 differ"):
         pool_mixtures([IN_CLOSING, other])
     backward = Coordinates(**BOX, kinds=(ClosingSpeed("lead_speed", "gap"), "plain", "log"), order=NAMES[::-1])
-    against = CoordinateMixture(backward, [1.0], [[3.0, 15.0, 0.1]], [np.diag([0.2, 4.0, 0.1])])
+    against = TruncatedGaussianMixture([1.0], [[3.0, 15.0, 0.1]], [np.diag([0.2, 4.0, 0.1])], coordinates=backward)
     with pytest.raises(ValueError, match="No order of the columns serves the coordinates of all mixtures"):
         pool_mixtures([IN_CLOSING, against])
-    with pytest.raises(ValueError, match="columns in the same order"):
-        PooledMixture((IN_CLOSING, IN_LOG_GAP), [0.5, 0.5])
-    with pytest.raises(ValueError, match="Expected 1 weights with sum 1"):
-        PooledMixture((IN_CLOSING,), [0.5, 0.5])
-
-
-def test_densities_of_refits_are_those_of_each() -> None:
-    plain = TruncatedGaussianMixture([1.0], [[14.0, 14.0, 30.0]], [np.diag([9.0, 9.0, 99.0])], BOX["low"], BOX["high"])
-    refits = Refits([IN_CLOSING, IN_LOG_GAP, POOL, plain, IN_PLAIN, IN_CLOSING])
-    x = np.concatenate([POOL.sample(50, np.random.default_rng(2)), [[46.0, 20.0, 9.0], [20.0, 20.0, np.nan]]])
-    assert np.array_equal(refits.log_probs(x), [each.log_prob(x) for each in refits])
-    assert np.isneginf(refits.log_probs(x)[:, 50:]).all()
-    assert Refits().log_probs(x).shape == (0, 52)
-    with pytest.raises(ValueError, match=r"Expected x of shape \(n, 3\), got \(4, 2\)"):
-        refits.log_probs(np.zeros((4, 2)))
-
-
-def test_refits_of_users_have_their_own_densities() -> None:
-    class Flat(TruncatedGaussianMixture):
-        def log_prob(self, x):
-            return np.full(len(x), -1.0)
-
-    class OneNumber(TruncatedGaussianMixture):
-        def log_prob(self, x):
-            return -1.0
-
-    shape = ([1.0], [[14.0, 14.0, 30.0]], [np.diag([9.0, 9.0, 99.0])], BOX["low"], BOX["high"])
-    x = POOL.sample(4, np.random.default_rng(2))
-    assert Refits([TruncatedGaussianMixture(*shape), Flat(*shape)]).log_probs(x)[1].tolist() == [-1.0] * 4
-    with pytest.raises(ValueError, match=r"of a refit of shape \(4,\), got \(\)"):
-        Refits([OneNumber(*shape)]).log_probs(x)

@@ -1,7 +1,5 @@
 """Scenario parameters as reset options."""
 
-import dataclasses
-
 import numpy as np
 import pytest
 
@@ -13,15 +11,8 @@ NAMES = [p.name for p in scenario_named("rare_envs/CutIn-v0").parameters]
 
 
 def make_space():
-    box = scenario_named("rare_envs/CutIn-v0").parameters
-    return ScenarioSpace(
-        names=tuple(p.name for p in box),
-        units=tuple(p.unit for p in box),
-        low=np.array([p.low for p in box for _ in range(p.size)]),
-        high=np.array([p.high for p in box for _ in range(p.size)]),
-        base=load_base(scenario_named("rare_envs/CutIn-v0"), "us101-15-offsets"),
-        sizes=tuple(p.size for p in box),
-    )
+    scenario = scenario_named("rare_envs/CutIn-v0")
+    return ScenarioSpace(scenario.parameters, load_base(scenario, "us101-15-offsets"))
 
 
 def rng():
@@ -69,18 +60,5 @@ def test_bad_options_are_refused(options, message):
     assert "\n" not in str(caught.value)
 
 
-def test_space_checks_its_own_lengths():
-    base = load_base(scenario_named("car_following"), "us101-gap")
-    with pytest.raises(ValueError, match="2 names, 3 units"):
-        ScenarioSpace(("a", "b"), ("m", "m", "m"), np.zeros(3), np.ones(3), base)
-
-
-def test_repr_is_one_line_and_html_has_every_parameter_escaped():
-    space = make_space()
-    assert "\n" not in repr(space)
-    assert repr(space) == f"<ScenarioSpace of 6 parameters in 6 dimensions: {', '.join(NAMES)}>"
-    html = space._repr_html_()
-    assert all(f"<th>{name}</th>" in html for name in NAMES)
-    space = dataclasses.replace(make_space(), names=("<b>", *NAMES[1:]))
-    assert "<b>" not in space._repr_html_()
-    assert "&lt;b&gt;" in space._repr_html_()
+def test_repr_is_one_line():
+    assert repr(make_space()) == f"<ScenarioSpace of 6 parameters in 6 dimensions: {', '.join(NAMES)}>"

@@ -13,7 +13,7 @@ from scipy.stats import kstest
 import rare_envs
 from rare_envs.distributions.beta import BetaDistribution
 from rare_envs.distributions.fitted import FittedDistribution
-from rare_envs.distributions.mixture import CoordinateMixture, TruncatedGaussianMixture
+from rare_envs.distributions.mixture import TruncatedGaussianMixture
 from rare_envs.distributions.space import Distribution, ScenarioSpace
 from rare_envs.scenarios.base import Scenario, load_base
 from rare_envs.scenarios.registry import SCENARIOS, scenario_named
@@ -29,7 +29,7 @@ def rng() -> np.random.Generator:
 
 @pytest.mark.parametrize(("scenario", "base"), [(each, base) for each in SCENARIOS.values() for base in each.bases])
 def test_shipped_bases_fit_their_scenario(scenario: Scenario, base: str) -> None:
-    space = ScenarioSpace.of(scenario.parameters, load_base(scenario, base))
+    space = ScenarioSpace(scenario.parameters, load_base(scenario, base))
     assert isinstance(space.base, Distribution)
     x = space.sample(1000, rng())
     assert x.shape == (1000, scenario.size)
@@ -71,7 +71,7 @@ WITH_LOGARITHM = {"weights": [1.0], "means": [[15.0, 3.5]], "covariances": [[[4.
     ("content", "kind", "median"),
     [
         (GAUSSIAN, TruncatedGaussianMixture, [15.0, 40.0]),
-        ({**WITH_LOGARITHM, "coordinates": ["plain", "log"]}, CoordinateMixture, [15.0, np.exp(3.5)]),
+        ({**WITH_LOGARITHM, "coordinates": ["plain", "log"]}, TruncatedGaussianMixture, [15.0, np.exp(3.5)]),
         ({"alpha": [2.0, 2.0], "beta": [2.0, 2.0]}, BetaDistribution, [17.5, 80.0]),
     ],
 )
@@ -91,7 +91,7 @@ def test_a_dictionary_has_the_names_and_the_box_of_its_scenario(
 def shipped_dict(scenario: Scenario = FOLLOWING) -> dict[str, Any]:
     base = load_base(scenario)
     assert isinstance(base, FittedDistribution)
-    assert isinstance(base.distribution, TruncatedGaussianMixture | CoordinateMixture)
+    assert isinstance(base.distribution, TruncatedGaussianMixture)
     return {"names": [p.name for p in scenario.parameters], **base.distribution.to_dict()}
 
 

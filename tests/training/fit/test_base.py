@@ -8,7 +8,7 @@ from scipy.stats import norm
 
 from rare_envs.distributions.coordinates import ClosingSpeed, Coordinates
 from rare_envs.distributions.fitted import EventFrequency
-from rare_envs.distributions.mixture import CoordinateMixture, TruncatedGaussianMixture
+from rare_envs.distributions.mixture import TruncatedGaussianMixture
 from rare_envs.scenarios.base import load_base
 from rare_envs.scenarios.registry import scenario_named
 from training.fit import mixture as mixture_fit
@@ -49,7 +49,7 @@ def test_mass_outside_of_a_closing_speed():
         order=("v", "gap", "ahead"),
     )
     tight = np.diag([1e-12, 1e-12, 9.0])
-    mass = mass_outside(CoordinateMixture(closing, [1.0], [[10.0, 2.0, 0.0]], [tight]))
+    mass = mass_outside(TruncatedGaussianMixture([1.0], [[10.0, 2.0, 0.0]], [tight], coordinates=closing))
     expected = 0.1100  # Phi(-10 / (3 e)); 35 m/s faster has probability 1e-5
     assert mass["each"][1] == pytest.approx(expected, abs=4.0 * mass["standard_error"] + 1e-4)
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from sklearn.mixture import GaussianMixture
 
-from rare_envs.distributions.mixture import CoordinateMixture, TruncatedGaussianMixture
+from rare_envs.distributions.mixture import TruncatedGaussianMixture
 from rare_envs.scenarios.registry import scenario_named
 from training.fit import coordinates as module
 from training.fit import mixture as mixture_fit
@@ -108,7 +108,9 @@ COMPONENT = ([1.0], [[15.0, 2.8, 0.0]], [np.diag([9.0, 0.16, 0.04])])
 
 
 def closing_events(n, seed=0):
-    x = CoordinateMixture(CLOSING.coordinates(FOLLOWING), *COMPONENT).sample(n, np.random.default_rng(seed))
+    x = TruncatedGaussianMixture(*COMPONENT, coordinates=CLOSING.coordinates(FOLLOWING)).sample(
+        n, np.random.default_rng(seed)
+    )
     return EventSet(x, np.arange(n) // 10)
 
 

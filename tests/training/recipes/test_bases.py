@@ -1,6 +1,7 @@
 """Bases of the package: their events as the recordings have them, and files that say what they are worth."""
 
 import json
+from dataclasses import asdict
 from importlib import resources
 
 import numpy as np
@@ -52,7 +53,7 @@ def test_recorded_events(base):
         assert ((column >= p.low) & (column <= p.high)).all()
     if frequency is not None:
         assert 1.0 < frequency.per_hour < 60.0
-        assert counted.items() <= frequency.to_dict().items()
+        assert counted.items() <= asdict(frequency).items()
     if frequency is not None and "CutIn" not in base.scenario:  # the cut-ins are counted in longer recordings
         assert round(frequency.count * frequency.share) == len(events.joint)
 
