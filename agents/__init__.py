@@ -6,7 +6,6 @@ require_libraries()  # before anything that needs them
 
 from agents.files import Provenance, read_provenance
 from agents.learned.driver import LearnedDriver, LearnedEgo, read_driver, save_driver
-from agents.learned.networks import WeightDistribution
 from agents.loading import Ego, load_driver, load_ego
 from agents.saved_ego import SavedEgo
 
@@ -16,7 +15,6 @@ __all__ = [
     "LearnedEgo",
     "Provenance",
     "SavedEgo",
-    "WeightDistribution",
     "load_driver",
     "load_ego",
     "read_driver",

@@ -34,45 +34,39 @@ FIXED_STACK_SEED = 54321
 
 @dataclass(frozen=True)
 class Stack:
-    """Size of a stack's imperfections.
+    """Size of a stack's imperfections: of errors, which are normal, the standard deviation.
 
-    Errors are normal, with the correlation exp(-t / `correlation`) in time. That errors of perception are put between
-    the world and the driver is what Piazzoni et al. propose (2020, "Modeling perception errors towards robust decision
-    making in autonomous vehicles", IJCAI). The defaults are our choice, round numbers for an ordinary stack on an
-    ordinary road; none is a measurement of one stack, so give those of yours. Where a published figure is known to us
-    it stands beside the default.
+    They stand between the world and the driver as Piazzoni et al. propose (2020, "Modeling perception errors towards
+    robust decision making in autonomous vehicles", IJCAI). The defaults are our choice, round numbers for an ordinary
+    stack on an ordinary road, and no measurement; docs/egos.md has published figures.
     """
 
     across: float = 0.1
-    """Localisation across the road, standard deviation [m]. Wan et al. (2018, "Robust and precise vehicle localization
-    based on multi-sensor fusion in diverse city scenes", ICRA, abstract) report 0.05 to 0.1 m, of position."""
+    """Localisation across the road [m]."""
     heading: float = 0.002
-    """Localisation, heading [rad]; our choice."""
+    """Localisation, heading [rad]."""
     own_speed: float = 0.1
-    """Own speed [m/s]; our choice."""
+    """Own speed [m/s]."""
     position: float = 0.3
-    """Of other vehicles, along and across [m]; our choice."""
+    """Of other vehicles, along and across [m]."""
     speed: float = 0.5
-    """Of other vehicles [m/s]; our choice."""
+    """Of other vehicles [m/s]."""
     missed: float = 0.01
-    """Probability that a vehicle is not detected at a moment; our choice."""
+    """Probability that a vehicle is not detected at a moment."""
     correlation: float = 0.5
-    """Correlation time of all errors and misses [s]; our choice."""
+    """Correlation time of all errors and misses [s]: exp(-t / `correlation`)."""
     latency: float = 0.2
-    """From the observation of other vehicles to the decision [s]; our choice. Lin et al. (2018, "The architectural
-    implications of autonomous driving", ASPLOS) design for about 0.1 s; the cruise controls of five cars on sale
-    responded after 1.7 to 2.5 s (doi:10.1177/0361198120911047, abstract), lags included. A stack
-    knows its own position and speed without latency here."""
+    """From the observation of other vehicles to the decision [s]; own position and speed are known without."""
     period: float = 0.2
-    """Between two plans of the speed [s], our choice; steering follows the path at every tick."""
+    """Between two plans of the speed [s]; steering follows the path at every tick."""
     lag: float = 0.3
-    """Time constant of acceleration [s]; our choice. Autoware's planning simulator has 0.1 s, and 0.1 s of delay."""
+    """Time constant of acceleration [s]."""
     steering_lag: float = 0.1
-    """Time constant of steering [s]; our choice. Autoware's planning simulator has 0.27 s, and 0.24 s of delay."""
+    """Time constant of steering [s]."""
     jerk: float = 10.0
-    """Largest change of acceleration [m/s^3]; our choice."""
+    """Largest change of acceleration [m/s^3]."""
     steering_rate: float = 0.4
-    """Largest change of the steering angle [rad/s]; our choice."""
+    """Largest change of the steering angle [rad/s]."""
 
     def __post_init__(self) -> None:
         for each in fields(self):

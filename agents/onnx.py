@@ -10,7 +10,7 @@ import json
 import warnings
 from functools import cached_property
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
@@ -144,17 +144,6 @@ def _are_scores(shape: Any) -> bool:
 # --- export -------------------------------------------------------------------------------------------
 
 
-class ExportReport(NamedTuple):
-    """Result of an export."""
-
-    path: Path
-    """The file."""
-    difference: float
-    """Largest difference of its actions from those of the policy, on random observations."""
-    observations: int
-    """Number of observations that were compared."""
-
-
 class _Graph(nn.Module):
     """The graph: raw observations and memory to actions and memory, batch first throughout."""
 
@@ -210,8 +199,11 @@ class _Graph(nn.Module):
         return torch.minimum(torch.maximum(action, low), high)
 
 
-def export_onnx(ego: SavedEgo, path: Path, seed: int = 0) -> ExportReport:
-    """Write a policy as ONNX, if over several ticks and batch sizes of random observations it acts as the policy."""
+def export_onnx(ego: SavedEgo, path: Path, seed: int = 0) -> tuple[float, int]:
+    """Write a policy as ONNX, if over several ticks and batch sizes of random observations it acts as the policy.
+
+    Return the largest difference of actions, and the number of observations that were compared.
+    """
     try:
         import onnx
     except ImportError as error:
@@ -230,7 +222,7 @@ def export_onnx(ego: SavedEgo, path: Path, seed: int = 0) -> ExportReport:
         difference, count = compare_actions(ego, OnnxEgo(draft), np.random.default_rng(seed))
         if not difference <= ACTION_TOLERANCE:
             raise ValueError(f"The exported graph acts differently, by up to {difference:.2g}; nothing was written.")
-    return ExportReport(path, difference, count)
+    return difference, count
 
 
 def _trace(ego: SavedEgo, path: Path) -> None:

@@ -100,11 +100,7 @@ class SavedEgo:
         return WrappedPolicy(self.policy, self.statistics.normalize_obs, *(self.frames or ()))
 
     def find_missing_statistics(self, expected: Any) -> str:
-        """Return why it seems to have been trained on normalised observations, if it has no statistics; "" if not.
-
-        Args:
-            expected: Space of the environment's observations.
-        """
+        """Return why it seems to lack statistics for an environment's space of observations; "" if it does not."""
         if self.statistics is not None:
             return ""
         last = _open_observation(self.header, "_last_obs")
@@ -215,10 +211,7 @@ def _normalises(statistics: Any) -> bool:
 
 
 def describe_missing_statistics(header: Mapping[str, Any], last: Any, own: Any, expected: Any) -> str:
-    """Return why a policy without statistics seems to have been trained on normalised observations; "" if nothing does.
-
-    The last observations of its training and the space that it declares are compared with that of its environment.
-    """
+    """Return why the last observations and the own space of a policy seem normalised; "" if nothing does."""
     if _has_original_observations(header, last):
         return "its file says that it was trained behind VecNormalize"
     if not isinstance(expected, spaces.Box) or expected.dtype != np.float32 or len(expected.shape) != 1:
@@ -238,11 +231,7 @@ def describe_missing_statistics(header: Mapping[str, Any], last: Any, own: Any, 
 
 
 def _has_original_observations(header: Mapping[str, Any], last: Any) -> bool:
-    """Return whether a file keeps observations as they were before `VecNormalize`, beside the last ones.
-
-    Algorithms with a replay buffer fill that entry without `VecNormalize` too, by the observations one step earlier,
-    which are of the same scale as the last ones.
-    """
+    """Return whether a file keeps observations from before `VecNormalize`; with a replay buffer, by their scale."""
     name = "_last_original_obs"
     if header.get(name) is None or "learning_starts" not in header:
         return header.get(name) is not None

@@ -126,14 +126,10 @@ class LearnedDriver:
             features: What M vehicles in B scenarios perceive, shape (B, M, 51).
             weights: Last layers of the scenarios, shape (B, 404) as `head_weights` has them; None for the policy's own.
             innovations: Independent standard normal draws, shape (B, M, 2); None for the mean actions.
-            memory: As the last call returned it; at the start that of `begin`. Shape (B, M, 2, 2), of the noise, and
-                with lane changes (B, M, 14).
+            memory: As `begin` or the last call returned it, shape (B, M, 2, 2), with lane changes (B, M, 14).
 
         Returns:
             Accelerations [m/s^2] and yaw rates [rad/s], shape (B, M, 2), and the new memory.
-
-        Raises:
-            ValueError: If a shape is wrong, or innovations come without a memory.
         """
         self._check_shapes(features, weights, innovations, memory)
         policy, (batch, vehicles, _) = self.policy, features.shape
@@ -208,10 +204,7 @@ class LearnedDriver:
         return replace(self, policy=copy.deepcopy(self.policy).to(device))
 
     def begin(self, draws: Tensor) -> Tensor:
-        """Return the memory at the start, from independent standard normal draws (B, M, 2, 2).
-
-        The patience for lane changes is made of the second draws, which balanced noise leaves.
-        """
+        """Return the memory at the start, from independent standard normal draws (B, M, 2, 2)."""
         swings = self.colour.begin(draws)
         if self.changes is None:
             return swings

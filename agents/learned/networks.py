@@ -196,19 +196,6 @@ class WeightDistribution:
     """Normal distribution N(mean, precision^-1), and how far its mean may be moved.
 
     Cross-entropy takes it as a block as it is: `mean`, `covariance` and `radius` say what it is and how it may move.
-
-    Raises:
-        ValueError: If the mean is not finite, the precision not symmetric positive definite, or the radius negative.
-
-    Example:
-        >>> weights = WeightDistribution(np.zeros(2), np.array([[2.0, 1.0], [1.0, 2.0]]))
-        >>> weights.covariance.round(4)
-        array([[ 0.6667, -0.3333],
-               [-0.3333,  0.6667]])
-        >>> weights.sample(3, np.random.default_rng(0)).shape
-        (3, 2)
-        >>> weights.log_prob(np.zeros((1, 2))).round(4)
-        array([-1.2886])
     """
 
     mean: FloatArray

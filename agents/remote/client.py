@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import itertools
 import json
-import math
 import os
 import shutil
 import subprocess
@@ -25,15 +24,7 @@ from numpy.typing import NDArray
 from zmq.utils.monitor import recv_monitor_message
 
 from agents.remote import protocol
-from agents.remote.protocol import (
-    SECRET_VARIABLE,
-    MalformedMessage,
-    Message,
-    Socket,
-    demand,
-    derive_server_keys,
-    read_secret,
-)
+from agents.remote.protocol import SECRET_VARIABLE, MalformedMessage, Message, Socket, demand
 from rare_envs.plugins import EgoGone, NoAnswer
 from rare_envs.simulation.observation import batch_size
 
@@ -41,14 +32,12 @@ TIMEOUT, PATIENCE = 10.0, 30.0
 """Seconds to wait for an answer, and for an ego that has gone to come back."""
 _MAX_NAME, _MAX_REASON = 100, 500
 """Letters of an ego's name, and of an error's reason, that are kept."""
-_HELLO_INTERVAL = 1.0
-"""Time [s] after which a hello without an answer is sent again, and after which the user is told of the wait."""
-_RETRY_PAUSE = 0.1
-"""Time [s] between attempts to connect where they fail at once."""
+_HELLO_INTERVAL, _RETRY_PAUSE = 1.0, 0.1
+"""Time [s] after which a hello is sent again and the user told of the wait; between attempts that fail at once."""
 _PART_FACTOR, _MIN_PART_TIMEOUT = 10.0, 0.5
 """A part of a batch that was not answered gets this multiple of the longest answer so far, and at least so long [s]."""
-_EXIT_WAIT = 1.0
-"""Time [s] for a process that has closed its socket to end, so that its exit status is known."""
+_LOOK, _EXIT_WAIT = 0.1, 1.0
+"""Time [s] between looks whether a process is there, and for one that closed its socket to end."""
 _HANDSHAKE = f"the handshake failed; both sides need the same secret ({SECRET_VARIABLE}), or none"
 _BROKEN = {
     zmq.EVENT_CLOSED: "nothing listens there",
@@ -62,23 +51,13 @@ _HOPELESS = (zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL, zmq.EVENT_HANDSHAKE_FAILED_AUT
 
 
 class LinkError(Exception):
-    """A request without an answer: the server is silent, or the connection broke."""
-
-
-class NoReply(LinkError):
-    """A request that was not answered in time, or at which the ego's process ended: perhaps the request caused it."""
+    """A request without an answer: the connection broke, or there is none."""
 
 
 class RemoteError(RuntimeError):
-    """A request that was answered with an error, or twice not at all; or a connection that the server refuses.
-
-    Example:
-        >>> RemoteError("no road", "ego").code
-        'ego'
-    """
+    """A request that was answered with an error, or twice not at all; or a connection that the server refuses."""
 
     def __init__(self, reason: str, code: str = "") -> None:
-        """Make an error, of a code that docs/egos.md has; "" without one."""
         super().__init__(reason)
         self.code = code
 
@@ -95,25 +74,23 @@ class ServerLink:
     def __init__(self, address: str, secret: bytes | None = None) -> None:
         """Make a link to an address such as "tcp://127.0.0.1:5555", with a secret if its server has one."""
         self.address, self._secret = address, secret
-        # one for all links: ending a context may wait, closing a socket does not
-        self._context: zmq.Context[Socket] = zmq.Context.instance()
         self._socket: Socket | None = None
         self._monitor: Socket | None = None
 
     def open(self) -> None:
         """Connect anew; a request under way is dropped."""
         self.close()
-        self._socket = self._context.socket(zmq.DEALER)
-        self._socket.setsockopt(zmq.LINGER, 0)
-        self._socket.setsockopt(zmq.RECONNECT_IVL, 100)
-        self._socket.setsockopt(zmq.MAXMSGSIZE, protocol.MAX_BYTES)
+        # of one context for all links: ending a context may wait, closing a socket does not
+        self._socket = zmq.Context.instance().socket(zmq.DEALER)
+        for option, value in ((zmq.LINGER, 0), (zmq.RECONNECT_IVL, 100), (zmq.MAXMSGSIZE, protocol.MAX_BYTES)):
+            self._socket.setsockopt(option, value)
         self._monitor = self._socket.get_monitor_socket(sum(_BROKEN))
         self._attach(self._socket)
 
     def _attach(self, socket: Socket) -> None:
         """Connect a socket to the server."""
         if self._secret is not None:
-            socket.curve_serverkey = derive_server_keys(self._secret)[0]
+            socket.curve_serverkey = protocol.derive_server_keys(self._secret)[0]
             socket.curve_publickey, socket.curve_secretkey = zmq.curve_keypair()
         port = self.address.rpartition(":")[2]
         if self.address.startswith("tcp://") and port.isdigit() and not 0 < int(port) < 65536:
@@ -132,18 +109,18 @@ class ServerLink:
         poller.register(self._monitor, zmq.POLLIN)
         while True:
             left = deadline - time.monotonic()
-            ready = dict(poller.poll(max(0, math.ceil(1000 * self._bound_wait(left)))))
+            ready = dict(poller.poll(max(0.0, 1000 * min(left, _LOOK))))
             if self._socket in ready:
                 return protocol.open_envelope(self._socket.recv_multipart())[1]
             if ready:
                 event = zmq.Event(recv_monitor_message(self._monitor)["event"])
                 raise (RemoteError if event in _HOPELESS else LinkError)(_BROKEN[event])
             if left <= 0:
-                raise NoReply(f"no answer within {timeout:.3g} s")
+                raise NoAnswer(f"no answer within {timeout:.3g} s")
+            self._look()
 
-    def _bound_wait(self, left: float) -> float:
-        """Return how long to wait for an event before looking again [s]."""
-        return left
+    def _look(self) -> None:
+        """Raise a LinkError if what is there without a connection has ended."""
 
     def close(self) -> None:
         """Disconnect."""
@@ -154,7 +131,6 @@ class ServerLink:
         self._socket = self._monitor = None
 
     def __del__(self) -> None:
-        """Disconnect."""
         self.close()
 
 
@@ -165,11 +141,11 @@ class ProcessLink(ServerLink):
     """
 
     load_timeout: ClassVar[float] = 60.0
+    _process: subprocess.Popen[bytes] | None = None
+    _folder: str | None = None
 
     def __init__(self, spec: str, **how: Any) -> None:
         """Make a link; `open` starts the process. Arguments are those of `agents.load_ego`, which is called there."""
-        self._process: subprocess.Popen[bytes] | None = None
-        self._folder: str | None = None
         super().__init__(f"process:{spec}")
         if os.name != "posix":
             raise ValueError("Expected Linux or macOS for process:EGO, whose socket is a file; use serve-ego.")
@@ -185,22 +161,19 @@ class ProcessLink(ServerLink):
         self._process = subprocess.Popen(words, stdin=subprocess.DEVNULL, stdout=2)
 
     def request(self, content: bytes, timeout: float) -> bytes:
-        """Send a message and return its answer; see `ServerLink.request`."""
+        """Send a message and return its answer; a process that ended gave none."""
         assert self._process is not None
         try:
             return super().request(content, timeout)
-        except NoReply:
-            raise
         except LinkError as error:
             with contextlib.suppress(subprocess.TimeoutExpired):
                 self._process.wait(_EXIT_WAIT)
-            raise NoReply(f"its process ended (exit status {self._process.returncode})") from error
+            raise NoAnswer(f"its process ended (exit status {self._process.returncode})") from error
 
-    def _bound_wait(self, left: float) -> float:
-        """Look now and then whether the process ended before it connected."""
+    def _look(self) -> None:
+        """Raise a LinkError if the process ended before it connected."""
         if self._process is not None and self._process.poll() is not None:
             raise LinkError("its process ended")
-        return min(left, 0.1)
 
     def close(self) -> None:
         """End the process."""
@@ -243,40 +216,15 @@ class _Session:
 
 
 class RemoteEgo:
-    """An ego on the other side of a link.
+    """An ego on the other side of a link, with its name, spaces, and whether its answers repeat, None if it is silent.
 
-    If an answer does not come in time or the connection breaks, the link is opened again, for as long as `patience`
-    says, and the batch is sent anew from its reset: an ego that was killed and started again loses nothing. If the
-    same request then fails again, that is a fault of the ego on this batch.
-
-    Attributes:
-        name: Name of the ego.
-        observation_space: Its observations, None if it does not say.
-        action_space: Its actions, None if it does not say.
-        deterministic: Whether its answers repeat, None if it does not say.
-
-    Example:
-        >>> import agents
-        >>> with_ego = agents.load_ego("process:imitation")
-        >>> type(with_ego).__name__, with_ego.observation_space.shape
-        ('RemoteEgo', (51,))
-        >>> with_ego.predict(np.zeros((3, 51), np.float32))[0].shape
-        (3, 2)
-        >>> with_ego.close()
+    If the connection breaks, the link is opened again, for as long as `patience` says, and the batch is sent anew from
+    its reset: an ego that was killed and started again loses nothing. If the same request then fails again, that is a
+    fault of the ego on this batch, as is one that is not answered in time.
     """
 
     def __init__(self, link: ServerLink, timeout: float = TIMEOUT, patience: float = PATIENCE) -> None:
-        """Connect.
-
-        Args:
-            link: To the server.
-            timeout: Seconds to wait for an answer.
-            patience: Seconds to wait for an ego to appear, or come back.
-
-        Raises:
-            EgoGone: No server answers.
-            ValueError: The server refuses, speaks another version or another protocol.
-        """
+        """Connect, with so many seconds to wait for an answer, and for an ego to appear; EgoGone if none does."""
         self._link, self._timeout, self._patience = link, timeout, patience
         self._ids, self._numbers = itertools.count(1), itertools.count(1)
         self._epoch, self._connected, self._warm = 0, False, False
@@ -287,11 +235,10 @@ class RemoteEgo:
             hello = self._connect()
             self._spaces = hello.get("observation"), hello.get("action")
             self.observation_space, self.action_space = map(protocol.decode_space, self._spaces)
-        except (RemoteError, MalformedMessage) as error:
+        except BaseException as error:
             link.close()
-            raise ValueError(f"The ego at {link.address} refuses: {error}") from error
-        except BaseException:
-            link.close()
+            if isinstance(error, RemoteError | MalformedMessage):
+                raise ValueError(f"The ego at {link.address} refuses: {error}") from error
             raise
         self.deterministic = None if hello.get("deterministic") is None else bool(hello["deterministic"])
         self.name = _one_line(hello.get("name", "ego"), _MAX_NAME)
@@ -303,12 +250,9 @@ class RemoteEgo:
         episode_start: NDArray[np.bool_] | None = None,
         deterministic: bool = True,
     ) -> tuple[NDArray[Any], Any]:
-        """Choose an action for each row of a batch; see `agents.Ego.predict`.
+        """Choose actions, see `agents.Ego.predict`.
 
-        Raises:
-            NoAnswer: It does not answer in time, or its process dies.
-            RemoteError: The ego failed on this batch.
-            EgoGone: It is not there any more.
+        NoAnswer and RemoteError are faults of the ego on this batch, EgoGone ends everything.
         """
         session = self._find_session(batch_size(observation)) if state is None else state
         tick = {"observation": protocol.pack_observation(observation)}
@@ -327,7 +271,7 @@ class RemoteEgo:
         while self._ended and self._connected:  # batches with a memory that nobody refers to any more
             try:
                 self._request({"type": "end", "session": self._ended.pop()}, self._timeout)
-            except (LinkError, MalformedMessage, RemoteError):
+            except (LinkError, NoAnswer, MalformedMessage, RemoteError):
                 self._connected = False
         if batch in self._reusable:
             return self._reusable[batch]
@@ -345,7 +289,7 @@ class RemoteEgo:
                 self._restore(session)
                 reply = self._send_act(session, session.step, tick)
                 action = protocol.unpack_array(reply.get("action"))
-            except NoReply as error:
+            except NoAnswer as error:
                 self._connected = False
                 self._smallest_unanswered = max(self._smallest_unanswered, session.batch)
                 raise NoAnswer(f"The ego at {self._link.address}: {error}.") from error
@@ -378,8 +322,8 @@ class RemoteEgo:
     def _send_act(self, session: _Session, step: int, tick: Message) -> Message:
         """Return the answer for one tick of a session.
 
-        Parts of a batch that was not answered in time get less time, some multiple of the longest answer so far. A part
-        that would have been answered a little later does no harm: its rows are sent one by one, with the full time.
+        Parts of a batch that was not answered in time get less time. A part that would have been answered a little
+        later does no harm: its rows are sent one by one, with the full time.
         """
         timeout, sent = self._timeout, time.monotonic()
         if self._warm and 1 < session.batch < self._smallest_unanswered:
@@ -393,9 +337,8 @@ class RemoteEgo:
         number = next(self._ids)
         reply = protocol.unpack(self._link.request(protocol.pack({**message, "id": number}), timeout))
         if reply.get("type") == "error":
-            raise RemoteError(
-                _one_line(reply.get("reason", "no reason given"), _MAX_REASON), str(reply.get("code", ""))
-            )
+            reason = _one_line(reply.get("reason", "no reason given"), _MAX_REASON)
+            raise RemoteError(reason, str(reply.get("code", "")))
         demand(reply.get("id") == number, f"an answer to {reply.get('id')!r:.50}, expected one to {number}")
         return reply
 
@@ -409,17 +352,14 @@ class RemoteEgo:
             try:
                 reply = self._request(greeting, max(min(_HELLO_INTERVAL, left), self._link.load_timeout))
                 break
-            except LinkError as error:
+            except (LinkError, NoAnswer) as error:
                 reason = str(error)
             waited = time.monotonic() - began
             if waited >= self._patience:
                 raise EgoGone(f"No ego at {address} within {self._patience:g} s: {reason}.")
             if waited >= _HELLO_INTERVAL and not told:
-                told, wait = (
-                    True,
-                    f"waiting for one, {self._patience:g} s at most (?patience=SECONDS behind the address)",
-                )
-                warnings.warn(f"no ego at {address} yet: {reason}; {wait}", stacklevel=3)
+                told, most = True, f"{self._patience:g} s at most (?patience=SECONDS behind the address)"
+                warnings.warn(f"no ego at {address} yet: {reason}; waiting for one, {most}", stacklevel=3)
             time.sleep(_RETRY_PAUSE)
         speaks = reply.get("protocol")
         demand(speaks == protocol.PROTOCOL, f"it speaks protocol {speaks!r:.50}, expected {protocol.PROTOCOL}")
@@ -429,13 +369,13 @@ class RemoteEgo:
 
     def _reconnect(self) -> None:
         """Connect again, to the same ego."""
-        address = self._link.address
+        gone = f"The ego at {self._link.address} went away, and"
         try:
             hello = self._connect()
         except (RemoteError, MalformedMessage) as error:
-            raise EgoGone(f"The ego at {address} went away, and what is there now refuses: {error}") from error
+            raise EgoGone(f"{gone} what is there now refuses: {error}") from error
         if (hello.get("observation"), hello.get("action")) != self._spaces:
-            raise EgoGone(f"The ego at {address} went away, and one with other spaces is there now.")
+            raise EgoGone(f"{gone} one with other spaces is there now.")
 
     def close(self) -> None:
         """End the connection."""
@@ -451,7 +391,7 @@ def _one_line(text: Any, most: int) -> str:
 def connect(spec: str) -> RemoteEgo:
     """Connect to the ego at "tcp://host:port?timeout=10&patience=30", with the secret of RARE_ENVS_SECRET if any."""
     address, settings = parse_address(spec)
-    return RemoteEgo(ServerLink(address, read_secret()), **settings)
+    return RemoteEgo(ServerLink(address, protocol.read_secret()), **settings)
 
 
 def isolate(spec: str, algo: str | None = None, trust: bool = False, stats: str | Path | None = None) -> RemoteEgo:

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 import torch
 
-from agents import LearnedDriver, Provenance, WeightDistribution, save_driver
-from agents.learned.networks import HUMAN_NOISE, head_weights
+from agents import LearnedDriver, Provenance, save_driver
+from agents.learned.networks import HUMAN_NOISE, WeightDistribution, head_weights
 from benchmarks.driving import realism, realism_score
 from benchmarks.driving.realism import constant_velocity, format_table, load_named, measure_all
 from benchmarks.driving.realism_score import (

@@ -210,15 +210,15 @@ def export_ego_command(
         from agents.saved_ego import load_saved_ego
 
         ego = load_saved_ego(model, asked["algo"], asked["trust"], asked["stats"])
-        exported = export_onnx(ego, out)
+        difference, tried = export_onnx(ego, out)
     data = {
         "model": str(model),
         "algorithm": ego.algorithm,
         "vec_normalize": None if ego.statistics_path is None else str(ego.statistics_path),
-        "onnx": str(exported.path),
-        "largest_difference": exported.difference,
+        "onnx": str(out),
+        "largest_difference": difference,
         "tolerance": ACTION_TOLERANCE,
-        "observations_tried": exported.observations,
+        "observations_tried": tried,
     }
-    tried = f"on {exported.observations:,} random observations"
-    return Answer(data, f"Wrote {out}: its actions differ by {exported.difference:.1e} at most {tried}.")
+    found = f"its actions differ by {difference:.1e} at most on {tried:,} random observations"
+    return Answer(data, f"Wrote {out}: {found}.")

@@ -25,7 +25,7 @@ from agents.loading import EGO_SUFFIXES, EXPECTED_EGO, find_ego_kind, strip_pref
 from agents.safe_pickle import TRUST_ADVICE, TRUST_CONSEQUENCE, find_origin_risks
 from agents.saved_ego import find_statistics
 from rare_envs.egos.needs import AMBIGUOUS, TAKEN_AS_ACCELERATIONS
-from rare_envs.plugins import EgoGone, reason_of
+from rare_envs.plugins import EgoGone, NoAnswer, reason_of
 from rare_envs.scenarios.registry import find_scenario
 from rare_envs.simulation.observation import map_kinds
 from rare_envs.startup import use_one_thread
@@ -177,7 +177,7 @@ def check_protocol(spec: str) -> Iterator[Finding]:
             steps = [isinstance(message, dict) and "step" in message for message in messages]
             acts = [reply for reply, step in zip(replies, steps, strict=True) if step]
             yield compare(name, kind, next((reply for reply in acts if reply.get("type") != kind), replies[-1]))
-    except (LinkError, RemoteError, EgoGone, ValueError) as error:
+    except (LinkError, RemoteError, NoAnswer, EgoGone, ValueError) as error:
         yield Finding("protocol", "fail", reason_of(error), f"is it running at {address}? {PROTOCOL_ADVICE}")
     finally:
         link.close()

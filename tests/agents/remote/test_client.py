@@ -23,7 +23,6 @@ from agents import load_ego
 from agents.remote import protocol
 from agents.remote.client import (
     LinkError,
-    NoReply,
     RemoteEgo,
     RemoteError,
     ServerLink,
@@ -159,7 +158,7 @@ class VirtualLink:
             return self.handler.handle(b"", content)
         except Hung:
             self.waits.append(timeout)
-            raise NoReply(f"no answer within {timeout:.3g} s") from None
+            raise NoAnswer(f"no answer within {timeout:.3g} s") from None
 
     def close(self) -> None:
         pass
@@ -228,7 +227,7 @@ def test_a_broken_connection_and_silence_are_told_apart(serve: Any) -> None:
     with socket.create_server(("127.0.0.1", 0)) as listener:
         link = ServerLink(f"tcp://127.0.0.1:{listener.getsockname()[1]}")
         link.open()
-        with pytest.raises(NoReply, match=r"no answer within 0\.1 s"):
+        with pytest.raises(NoAnswer, match=r"no answer within 0\.1 s"):
             link.request(b"", 0.1)
         link.close()
     server = serve(Braking())
