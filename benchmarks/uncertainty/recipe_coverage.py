@@ -27,7 +27,7 @@ from rare_envs.distributions.mixture import TruncatedGaussianMixture
 from rare_envs.scenarios.base import load_base
 from rare_envs.scenarios.registry import scenario_named
 from samplers.problem import FloatArray
-from training.fit.base import FitRequest, fit_base
+from training.fit.base import fit_base
 from training.fit.filters import EventSet
 
 RECIPE_RESULT = RESULTS / "recipe_coverage.json"
@@ -120,7 +120,7 @@ def repeat_recipe(world: RecipeWorld, seed: int, n_refits: int | None = None) ->
         n_refits: Number of refits; None for that of the recipe.
     """
     events = world.draw(np.random.default_rng([seed, world.events, world.components]))
-    base = fit_base(FitRequest(SCENARIO, events, {}, "", n_refits=n_refits, seed=seed))
+    base = fit_base(SCENARIO, events, {}, "", n_refits=n_refits, seed=seed)
     result = samplers.estimate(ShortTimeToCollision(base, world.limit), seed=seed, max_sim=MAX_SIM)
     assert isinstance(base.distribution, TruncatedGaussianMixture)
     components = len(base.distribution.weights)

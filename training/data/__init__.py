@@ -2,12 +2,11 @@
 
 from training.data.events import car_following_events, cut_in_events, hard_brake_events
 from training.data.formats import (
-    find_tgsim_files,
-    highd_recordings,
     load_coifman_li,
     load_highd,
     load_i24_motion,
     load_ngsim,
+    load_recordings,
     load_tgsim,
 )
 from training.data.scenes import TrafficScene, load_us101_scenes, scenes_of, split_by_clock
@@ -19,13 +18,12 @@ __all__ = [
     "Trajectories",
     "car_following_events",
     "cut_in_events",
-    "find_tgsim_files",
     "hard_brake_events",
-    "highd_recordings",
     "load_coifman_li",
     "load_highd",
     "load_i24_motion",
     "load_ngsim",
+    "load_recordings",
     "load_tgsim",
     "load_us101_scenes",
     "read_trajectories",

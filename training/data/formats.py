@@ -131,9 +131,23 @@ def load_recordings(
     between: tuple[float, float] | None = None,
     gaps: Gaps = "error",
 ) -> Iterator[Trajectories]:
-    """Yield the tables of files of one of `RECORDING_KINDS`, each read when it is asked for.
+    """Yield the tables of all files of a path, each read when it is asked for.
 
-    Location, numbers of recordings (all if empty) and moments are those of the loaders, for the kinds that have them.
+    Args:
+        kind: One of "ngsim", "highd", "tgsim", "i24" and "coifman".
+        path: File or folder, as of the loader of that kind; of TGSIM also a folder with several files.
+        location: As of `load_ngsim`.
+        recordings: Numbers of highD's, such as "01"; all in the folder if empty.
+        between: As of `load_i24_motion`.
+        gaps: As of `load_ngsim`.
+
+    Raises:
+        ValueError: The kind is unknown, the path holds no such file, or a loader refuses one.
+
+    Example:
+        >>> next(load_recordings("highd", "no_such_folder"))
+        Traceback (most recent call last):
+        ValueError: There is no folder no_such_folder; expected the data folder of highD, with files XX_tracks.csv.
     """
     if kind == "highd":
         yield from (load_highd(path, name, gaps=gaps) for name in recordings or highd_recordings(path))
@@ -299,16 +313,7 @@ def _known_lengths(vehicle: FloatArray, ngsim: Path, length: float) -> FloatArra
 
 
 def highd_recordings(folder: Path | str) -> tuple[str, ...]:
-    """Return the numbers of the recordings in a folder, such as "01".
-
-    Raises:
-        ValueError: The folder holds none.
-
-    Example:
-        >>> highd_recordings("no_such_folder")
-        Traceback (most recent call last):
-        ValueError: There is no folder no_such_folder; expected the data folder of highD, with files XX_tracks.csv.
-    """
+    """Return the numbers of the recordings in a folder, such as "01"; a ValueError if it holds none."""
     if not Path(folder).is_dir():
         raise ValueError(f"There is no folder {folder}; expected the data folder of highD, with files XX_tracks.csv.")
     names = tuple(sorted(path.name.removesuffix("_tracks.csv") for path in Path(folder).glob("*_tracks.csv")))
@@ -389,16 +394,7 @@ def _highd_recording(path: Path) -> tuple[float, list[tuple[float, ...]]]:
 
 
 def find_tgsim_files(path: Path | str) -> tuple[Path, ...]:
-    """Return a file, or the files of trajectories in a folder, which may hold others, such as lines of lanes.
-
-    Raises:
-        ValueError: The folder holds none.
-
-    Example:
-        >>> find_tgsim_files("no_such_folder")
-        Traceback (most recent call last):
-        ValueError: no_such_folder has no CSV file with a column xloc_kf; is it a folder with files of TGSIM?
-    """
+    """Return a file, or those of trajectories in a folder, which may hold others; a ValueError if it holds none."""
     path, wanted = Path(path), TGSIM["x"].names
     if path.is_file():
         return (path,)

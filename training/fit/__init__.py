@@ -1,6 +1,6 @@
 """Fit: base distributions of scenarios from recorded traffic."""
 
-from training.fit.base import FitRequest, fit_base
+from training.fit.base import fit_base
 from training.fit.filters import EventSet
 
-__all__ = ["EventSet", "FitRequest", "fit_base"]
+__all__ = ["EventSet", "fit_base"]

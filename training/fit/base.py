@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from importlib.metadata import version
 from typing import Any
 
@@ -56,38 +55,29 @@ SETTINGS = {
 """What the record of a fit has of its settings, beside the seed."""
 
 
-@dataclass(frozen=True)
-class FitRequest:
-    """What a base is fitted to, and how.
-
-    Example:
-        >>> events = EventSet(np.array([[12.0, 11.0, 15.0], [14.0, 12.0, 20.0]]), clusters=np.arange(2))
-        >>> FitRequest("car_following", events, source={"site": "my road"}, command="python fit.py").seed
-        0
-    """
-
-    scenario: str
-    """Short name or environment id."""
-    events: EventSet
-    source: Mapping[str, Any]
-    """Site, data, publisher, licence and so on, for the file."""
-    command: str
-    """Command that writes the file."""
-    frequency: EventFrequency | None = None
-    """How often the events happen; None where nobody counted."""
-    system: str | None = None
-    """Name of the coordinate system, columns apart left out; None for the one that the events support best."""
-    n_refits: int | None = None
-    """Number of refits, see `refit`."""
-    seed: int = 0
-    """Seed of the fits."""
-
-
-def fit_base(request: FitRequest, report: Callable[[str], None] = lambda _: None) -> FittedDistribution:
+def fit_base(
+    scenario: str,
+    events: EventSet,
+    source: Mapping[str, Any],
+    command: str,
+    *,
+    frequency: EventFrequency | None = None,
+    system: str | None = None,
+    n_refits: int | None = None,
+    seed: int = 0,
+    report: Callable[[str], None] = lambda _: None,
+) -> FittedDistribution:
     """Return a base fitted to events: coordinates and components chosen, refits, predictive checks, and its record.
 
     Args:
-        request: What it is fitted to, and how.
+        scenario: Short name or environment id.
+        events: What it is fitted to.
+        source: Site, data, publisher, licence and so on, for the file.
+        command: Command that writes the file.
+        frequency: How often the events happen; None where nobody counted.
+        system: Name of the coordinate system, columns apart left out; None for the one that the events support best.
+        n_refits: Number of refits, see `refit`.
+        seed: Seed of the fits.
         report: Told of each fit and refit.
 
     Raises:
@@ -97,38 +87,37 @@ def fit_base(request: FitRequest, report: Callable[[str], None] = lambda _: None
         >>> rng = np.random.default_rng(0)
         >>> columns = [rng.normal(14, 3, 60), rng.normal(14, 3, 60), rng.lognormal(3, 0.4, 60)]  # m/s, m/s, m
         >>> events = EventSet(np.stack(columns, axis=1), clusters=np.arange(60))
-        >>> request = FitRequest("car_following", events, {"site": "my road"}, "fit.py", system="plain", n_refits=2)
-        >>> base = fit_base(request)
+        >>> base = fit_base("car_following", events, {"site": "my road"}, "fit.py", system="plain", n_refits=2)
         >>> base.clusters, len(base.refits)
         (60, 2)
     """
-    events, seed, scenario = request.events, request.seed, scenario_named(request.scenario)
-    parameters, systems = tuple(scenario.parameters), COORDINATE_SYSTEMS[scenario.name]
+    found = scenario_named(scenario)
+    parameters, systems = tuple(found.parameters), COORDINATE_SYSTEMS[found.name]
     names = [system.name for system in systems]
-    if request.system not in (None, *names):
-        raise ValueError(f"Unknown coordinate system {request.system!r}; known are {', '.join(names)}.")
+    if system not in (None, *names):
+        raise ValueError(f"Unknown coordinate system {system!r}; known are {', '.join(names)}.")
     own = parameters[events.joint.shape[1] :]
-    refitted = [system for system in systems if request.system in (None, system.name)]
+    refitted = [each for each in systems if system in (None, each.name)]
     selections: dict[str, Any] = {}
-    if systems_apart := [system for p in own for system in SYSTEMS_APART.get(p.name, ())]:
+    if systems_apart := [each for p in own for each in SYSTEMS_APART.get(p.name, ())]:
         alone = EventSet(events.apart, np.arange(len(events.apart)))
         fits, best, selections["selection_apart"] = compare_systems(alone, systems_apart, own, seed, report, most=1)
-        systems = tuple(system.combine(fits[best].system) for system in systems)
-        refitted = [system.combine(other) for system in refitted for other in systems_apart]
+        systems = tuple(each.combine(fits[best].system) for each in systems)
+        refitted = [each.combine(other) for each in refitted for other in systems_apart]
     fits, best, selection = compare_systems(events, systems, parameters, seed, report)
-    best = best if request.system is None else names.index(request.system)
+    best = best if system is None else names.index(system)
     chosen = fits[best]
-    refits = refit(events, refitted, parameters, seed, request.n_refits, report)
+    refits = refit(events, refitted, parameters, seed, n_refits, report)
     record = {
         "kind": "fitted to recorded events",
         **{name: selection[best][name] for name in ("coordinates", "bic", "held_out_log_prob")},
-        "source": dict(request.source),
+        "source": dict(source),
         "filters": list(events.log),
         "selection": selection,
         **selections,
         "settings": {**SETTINGS, "seed": seed},
         "mass_outside_box": mass_outside(chosen.distribution),
-        "command": request.command,
+        "command": command,
         "libraries": {name: version(name) for name in ("numpy", "scipy", "scikit-learn")},
     }
     return FittedDistribution(
@@ -136,8 +125,8 @@ def fit_base(request: FitRequest, report: Callable[[str], None] = lambda _: None
         refits=tuple(each.distribution for each in refits),
         events=events.counts,
         family=describe_family(chosen.family, refits),
-        frequency=request.frequency,
-        checks=check_predictions(scenario.name, [p.name for p in parameters], events.joint, chosen.distribution, seed),
+        frequency=frequency,
+        checks=check_predictions(found.name, [p.name for p in parameters], events.joint, chosen.distribution, seed),
         record=record,
     )
 

@@ -36,7 +36,7 @@ from training.data.events import (
 )
 from training.data.formats import load_recordings
 from training.data.table import DT, Trajectories
-from training.fit.base import FitRequest, fit_base, format_base
+from training.fit.base import fit_base, format_base
 from training.fit.filters import EVENT_DEFINITIONS, EVENT_RECIPES, filter_events, read_events
 
 COMMAND = "rare-envs fit, with --highd or another option of recordings"
@@ -130,10 +130,10 @@ def fit_own_bases(
         path, recipe = out / f"{scenario}_events.csv", EVENT_RECIPES[scenario]
         events = filter_events(read_events(path, recipe), recipe, scenario_named(scenario).parameters)
         frequency = count_events(scenario, pooled[scenario], len(events.joint), traffic)
-        request = FitRequest(scenario, events, source, COMMAND, frequency, n_refits=n_refits, seed=seed)
+        asked: dict[str, Any] = {"n_refits": n_refits, "seed": seed, "report": partial(tell, scenario)}
         tell(scenario, f"{len(events.joint):,} events; fitting")
         try:
-            base = fit_base(request, partial(tell, scenario))
+            base = fit_base(scenario, events, source, COMMAND, frequency=frequency, **asked)
         except ValueError as error:
             too_few += 1
             words = f"{path}: {error} No base of {{}} is written"

@@ -41,7 +41,7 @@ from training.data.events import (
     time_between_spans,
 )
 from training.data.table import DT, VEHICLES_FILE, read_columns
-from training.fit.base import FitRequest, fit_base, format_base
+from training.fit.base import fit_base, format_base
 from training.fit.coordinates import COORDINATE_SYSTEMS
 from training.fit.filters import (
     EVENT_RECIPES,
@@ -131,10 +131,9 @@ def fit_shipped_base(base: ShippedBase, data: Path, seed: int = 0, n_refits: int
     assert isinstance(shipped, FittedDistribution)
     events, counted = base.read(data)
     frequency = None if shipped.frequency is None else replace(shipped.frequency, **counted)
-    request = FitRequest(
-        base.scenario, events, shipped.record["source"], COMMAND, frequency, base.system, n_refits=n_refits, seed=seed
-    )
-    return format_base(base.scenario, fit_base(request).to_dict())
+    asked: dict[str, Any] = {"system": base.system, "n_refits": n_refits, "seed": seed}
+    fitted = fit_base(base.scenario, events, shipped.record["source"], COMMAND, frequency=frequency, **asked)
+    return format_base(base.scenario, fitted.to_dict())
 
 
 def _read_i24_leaders(folder: Path) -> Read:

@@ -15,7 +15,6 @@ from training.fit import mixture as mixture_fit
 from training.fit.base import (
     CHECK_DRAWS,
     DANGEROUS_STATES,
-    FitRequest,
     check_predictions,
     fit_base,
     format_base,
@@ -32,11 +31,11 @@ def quick(monkeypatch):
     monkeypatch.setattr(mixture_fit, "EM_STARTS", 1)
 
 
-def request(n=60, **changes):
+def fitted(n=60, **changes):
     rng = np.random.default_rng(0)
     x = np.column_stack([rng.normal(15.0, 3.0, (n, 2)), np.exp(rng.normal(3.0, 0.4, n))])
     events = EventSet(x, np.arange(n) // 4, cluster="scene")
-    return FitRequest("car_following", events, SOURCE, "by hand", FREQUENCY, n_refits=3, **changes)
+    return fit_base("car_following", events, SOURCE, "by hand", frequency=FREQUENCY, n_refits=3, **changes)
 
 
 def test_mass_outside_of_a_closing_speed():
@@ -55,7 +54,7 @@ def test_mass_outside_of_a_closing_speed():
 
 
 def test_a_base_carries_all_that_says_what_it_is_worth_and_so_does_its_file(quick, tmp_path):
-    base = fit_base(request())
+    base = fitted()
     assert len(base.refits) == 3
     assert (base.events.used, base.events.clusters, base.events.cluster) == ((60,), 15, "scene")
     assert base.frequency == FREQUENCY
@@ -74,9 +73,9 @@ def test_a_base_carries_all_that_says_what_it_is_worth_and_so_does_its_file(quic
         assert np.array_equal(one.log_prob(x), other.log_prob(x))
     written, read = base.to_dict(), again.to_dict()
     assert {**written, "names": read.get("names")} == {**read, "names": read.get("names")}  # a file always has them
-    assert fit_base(request(system="plain")).family.endswith("plain")
+    assert fitted(system="plain").family.endswith("plain")
     with pytest.raises(ValueError, match="Unknown coordinate system 'polar'; known are plain, log gap, closing"):
-        fit_base(request(system="polar"))
+        fitted(system="polar")
 
 
 @pytest.mark.parametrize("logarithmic", [True, False])
@@ -87,7 +86,7 @@ def test_the_coordinate_of_the_duration_is_chosen_by_the_changes(quick, logarith
     normal = rng.standard_normal(200)
     duration = np.exp(np.log(5.0) - 0.08 + 0.39 * normal) if logarithmic else 5.0 + 1.2 * normal
     events = EventSet(joint, np.arange(40), np.column_stack([rng.normal(3.2, 0.2, 200), np.clip(duration, 1.6, 11.9)]))
-    base = fit_base(FitRequest("cut_in", events, {}, "a test", n_refits=2))
+    base = fit_base("cut_in", events, {}, "a test", n_refits=2)
     word = "log duration" if logarithmic else "plain duration"
     assert base.family.endswith(f", {word}") and base.record["coordinates"].endswith(f", {word}")
     selection = base.record["selection_apart"]
