@@ -14,11 +14,9 @@ from rare_envs.control.human_driver import (
     Glances,
     HumanDriverModel,
     Percept,
-    anticipate,
     count_glance_draws,
     draw_glances,
     estimate_leads,
-    glance_duration,
     remaining_duration,
     respond,
     step_errors,
@@ -65,12 +63,6 @@ def test_gaps_to_several_leaders_leave_out_the_bodies_in_between() -> None:
     assert nearest.gap.tolist() == [[math.inf, 15.0, math.inf, math.inf]]
 
 
-def test_anticipation_takes_speeds_and_the_own_acceleration_for_constant() -> None:
-    lead, speed = anticipate(Lead(tensor(20.0)[None], tensor(4.0)[None]), tensor(10.0), tensor(-2.0), 0.5)
-    assert (lead.gap.item(), lead.closing_speed.item(), speed.item()) == (18.0, 4.0, 9.0)
-    assert anticipate(lead, tensor(0.5), tensor(-2.0), 0.5)[1].item() == 0.0
-
-
 def test_one_leader_is_answered_as_by_the_idm() -> None:
     lead = Lead(tensor(20.0, math.inf, 3.0), tensor(4.0, 0.0, 9.0))
     expected = MODEL.idm.acceleration(tensor(15.0, 10.0, 15.0), lead)
@@ -102,13 +94,6 @@ N, HORIZON = 40_000, 10.0
 def glances() -> Glances:
     generator = torch.Generator().manual_seed(0)
     return draw_glances(torch.randn(N, count_glance_draws(HORIZON), generator=generator, dtype=torch.float64))
-
-
-def test_the_quantiles_are_the_published_ones() -> None:
-    duration, share = (torch.tensor(column, dtype=torch.float64) for column in zip(*GLANCE_CDF, strict=True))
-    torch.testing.assert_close(glance_duration(share), duration)
-    halfway = (share[:-1] + share[1:]) / 2
-    torch.testing.assert_close(glance_duration(halfway), (duration[:-1] + duration[1:]) / 2)
 
 
 def test_durations_have_the_published_distribution(glances: Glances) -> None:

@@ -8,7 +8,6 @@ import torch
 from rare_envs.control.idm import IDM, lane_keeping
 from rare_envs.traffic.bodies import Lead
 from rare_envs.traffic.road import straight
-from rare_envs.traffic.state import bicycle
 from tests.rare_envs.traffic_states import F64, tensor
 
 
@@ -66,14 +65,6 @@ def test_lane_keeping_never_steers_the_wrong_way(dtype: torch.dtype) -> None:
     steering = lane_keeping(y, heading, speed, straight(1))
     exact = lane_keeping(y.double(), heading.double(), speed.double(), straight(1))
     torch.testing.assert_close(steering.double(), exact, rtol=0, atol=1e-4)
-
-
-def test_lane_keeping_returns_to_the_lane() -> None:
-    state = (tensor(0.0), tensor(1.0), tensor(0.05), tensor(20.0))
-    for _ in range(100):
-        state = bicycle(*state, tensor(0.0), lane_keeping(*state[1:], straight(1)), 0.1)
-    assert state[1].item() == pytest.approx(0.0, abs=1e-4)
-    assert state[2].item() == pytest.approx(0.0, abs=1e-4)
 
 
 def test_steering_by_hand() -> None:

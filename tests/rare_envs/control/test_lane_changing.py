@@ -131,25 +131,6 @@ def test_no_change_that_makes_the_new_follower_brake_too_hard():
         assert found[1] == safe
 
 
-def test_who_is_polite_counts_the_losses_of_others():
-    """The changing vehicle gains a little, its new follower loses more, and brakes by less than is safe."""
-    scene = (EGO, (60.0, 4.0, 0.0, 17.0), (-26.0, 0.0, 0.0, 20.0))
-    own, loss = interaction(20.0, 55.0, 3.0), interaction(20.0, 21.0, 0.0)
-    assert 0.1 < own < loss < 4.0
-    for politeness in (0.0, 0.25, 1.0):
-        incentive, safe = choice(*scene, politeness=politeness)
-        assert safe
-        assert incentive == pytest.approx(own - politeness * loss)
-
-
-def test_the_old_follower_gains():
-    """Behind the changing vehicle it keeps 15 m, then 45 m to the old lead: politeness counts the difference."""
-    scene = (EGO, NEAR_LEAD, (-20.0, 4.0, 0.0, 20.0))
-    gain = interaction(20.0, 15.0, 0.0) - interaction(20.0, 45.0, 10.0)
-    selfish, polite = choice(*scene, politeness=0.0), choice(*scene, politeness=1.0)
-    assert polite[0] - selfish[0] == pytest.approx(gain)
-
-
 def test_wrong_parameters_are_refused():
     for wrong in ({"safe_deceleration": 0.0}, {"lateral_speed": 0.0}, {"threshold": -0.1}, {"delay": -1.0}):
         with pytest.raises(ValueError, match="Expected a positive safe deceleration"):

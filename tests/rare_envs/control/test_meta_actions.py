@@ -201,17 +201,6 @@ def test_a_recording_has_a_frame_of_every_tick() -> None:
     env.close()
 
 
-def test_an_id_with_highway_envs_layout() -> None:
-    """So that a script written for HighwayEnv runs with nothing but the id changed."""
-    env = gym.make("rare_envs/CutIn-kinematics-v0")
-    same = gym.make("rare_envs/CutIn-v0", observation="kinematics", action="meta")
-    assert env.observation_space == same.observation_space
-    assert env.action_space == same.action_space
-    np.testing.assert_array_equal(env.reset(seed=3)[0], same.reset(seed=3)[0])
-    np.testing.assert_array_equal(env.step(3)[0], same.step(3)[0])
-    assert gym.make_vec("rare_envs/HardBrake-kinematics-v0", num_envs=2).reset()[0].shape == (2, 5, 5)
-
-
 def test_the_id_used_in_training_is_taken_everywhere() -> None:
     x = rare_envs.DrivingProblem("rare_envs/CutIn-v0").base.sample(4, np.random.default_rng(0))
     short = rare_envs.DrivingProblem("rare_envs/CutIn-kinematics-v0", ego=Idle())

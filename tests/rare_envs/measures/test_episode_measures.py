@@ -216,21 +216,6 @@ def test_robustness_by_hand() -> None:
 
 
 @needs_rtamt
-def test_robustness_is_what_the_signals_say() -> None:
-    """ "always" is the least over time, "eventually" the greatest, bounds are in seconds."""
-    kept: list[Trace] = []
-    recorder = TraceMeasure(lambda trace: kept.append(trace) or trace.of(ttc).amin(0), collision=None)
-    x = problem("ttc").base.sample(20, np.random.default_rng(3))
-    problem(recorder).evaluate(x)
-    gap, time = kept[-1].lead.gap.double().numpy(), kept[-1].of(ttc).double().numpy()
-    both = problem(stl("always (gap > 2 and ttc > 3)")).evaluate(x)
-    np.testing.assert_allclose(both, np.minimum(gap - 2.0, time - 3.0).min(0), rtol=1e-5)
-    late = problem(stl("eventually[1:2.5] (always[0:0.5] (gap > 10))")).evaluate(x)
-    windows = np.stack([gap[k : k + 6].min(0) - 10.0 for k in range(10, 26)])
-    np.testing.assert_allclose(late, windows.max(0), rtol=1e-5)
-
-
-@needs_rtamt
 @pytest.mark.parametrize(
     ("formula", "words"),
     [

@@ -1,6 +1,5 @@
 """Highway: its parameters, its drivers as part of x, and the agreement of environment and rollout."""
 
-import gymnasium as gym
 import numpy as np
 import pytest
 import torch
@@ -9,10 +8,7 @@ from scipy import stats
 import agents
 import rare_envs
 import samplers
-from rare_envs.measures import Moment
-from rare_envs.measures.longitudinal import TTC_MAX, lidar_ttc
 from rare_envs.scenarios.highway import START_LANES
-from rare_envs.sensors.lidar import perceive_traffic
 from rare_envs.simulation.world import drive
 from rare_envs.traffic.road import i80
 
@@ -111,14 +107,6 @@ def test_a_learned_ego_looks_and_a_driver_is_no_ego():
         rare_envs.DrivingProblem(HIGHWAY, ego=agents.load_driver("mgail"))
 
 
-def test_lidar_ttc_on_paper():
-    world = rare_envs.DrivingProblem("rare_envs/CarFollowing-v0", measure="lidar_ttc").world
-    episode = world.start(torch.tensor([[20.0, 15.0, 30.0], [15.0, 20.0, 30.0]]))
-    assert episode.f.tolist() == pytest.approx([32.5 / 5.0, TTC_MAX])
-    moment = Moment(episode.state, episode.lead, episode.road, perceive_traffic(episode.state, episode.road))
-    torch.testing.assert_close(lidar_ttc(moment), episode.f)
-
-
 def test_lidar_ttc_ends_before_the_collision():
     def f(measure):
         asleep = lambda observation: np.zeros((len(observation), 2))  # noqa: E731
@@ -127,18 +115,3 @@ def test_lidar_ttc_ends_before_the_collision():
 
     assert 0.0 < f("lidar_ttc") < 0.3
     assert f("ttc") == -1.0
-
-
-@pytest.mark.parametrize(
-    ("kwargs", "message"),
-    [
-        ({"drivers": "mgial"}, "did you mean 'mgail'"),
-        ({"drivers": 3}, "Expected drivers by name"),
-        ({"noise": "some"}, "noise True, False or 'fixed'"),
-        ({"dt": 0.2}, "dt = 0.1"),
-        ({"base": "us101"}, "neither one of okelly2018"),
-    ],
-)
-def test_wrong_arguments_are_refused(kwargs, message):
-    with pytest.raises(ValueError, match=message):
-        gym.make(HIGHWAY, **kwargs)

@@ -7,7 +7,6 @@ from pathlib import Path
 import pytest
 
 from rare_envs.scenarios.registry import (
-    HIGHWAY_ENV_LAYOUT,
     SCENARIOS,
     Registry,
     complete_id,
@@ -91,19 +90,6 @@ def test_an_id_may_name_the_module_that_registers_it(place: str) -> None:
             find_scenario(f"{place}:tests/Crests-v0")
     finally:
         del SCENARIOS["tests/Crest-v0"]
-
-
-def test_a_module_that_cannot_be_imported_is_named_with_the_id(place: str) -> None:
-    Path(f"{place}.py").write_text("1 / 0\n")
-    for name in (place, "nowhere_at_all"):
-        with pytest.raises(ValueError, match=f"Cannot import '{name}' for the environment '{name}:tests/Crest-v0'"):
-            find_scenario(f"{name}:tests/Crest-v0")
-
-
-def test_an_id_with_highway_envs_layout_stands_for_its_arguments() -> None:
-    assert split_layout("rare_envs/HardBrake-kinematics-v0") == ("rare_envs/HardBrake-v0", HIGHWAY_ENV_LAYOUT)
-    for other in ("rare_envs/CutIn-v0", "highway-fast-v0", 3, ["rare_envs/CutIn-v0"]):
-        assert split_layout(other) == (other, {})  # type: ignore[arg-type]
 
 
 def test_an_id_may_lack_its_namespace_unless_two_end_so(monkeypatch: pytest.MonkeyPatch) -> None:

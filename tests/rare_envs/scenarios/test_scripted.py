@@ -42,13 +42,6 @@ def test_the_lead_stops_after_its_braking_distance() -> None:
     assert place[-1] == place[-2]
 
 
-def test_ego_and_lead_start_at_one_speed_and_the_gap_is_between_their_bodies() -> None:
-    problem = rare_envs.DrivingProblem("rare_envs/HardBrake-v0", horizon=1.0)
-    start = next(iter(drive(problem.world, problem.driver, torch.tensor([[20.0, 30.0, 4.0]]))))
-    assert start.state.speed[0].tolist() == [20.0, 20.0]
-    assert float(start.lead.gap) == pytest.approx(30.0, abs=1e-4)
-
-
 def test_bezier_is_de_casteljau_and_level_at_both_ends() -> None:
     length, offset = 60.0, 3.5
     control = [(0.0, offset), (length / 3, offset), (2 * length / 3, 0.0), (length, 0.0)]

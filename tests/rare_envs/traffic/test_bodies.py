@@ -18,10 +18,10 @@ from rare_envs.traffic.bodies import (
     project_on_axes,
     time_to_contact,
 )
-from rare_envs.traffic.road import ReferenceLine, Road, i80, straight
+from rare_envs.traffic.road import ReferenceLine, Road, i80
 from rare_envs.traffic.state import State
 from tests.rare_envs.traffic.slow_boxes import corners, nearest, overlap
-from tests.rare_envs.traffic_states import ARC, F64, RADIUS, tensor, traffic
+from tests.rare_envs.traffic_states import ARC, F64, RADIUS, traffic
 
 
 def tensors(values: np.ndarray) -> tuple[Tensor, ...]:
@@ -129,16 +129,6 @@ def test_bodies_overlap_in_the_world_not_along_the_road() -> None:
     state = traffic((75.0, 20.0, 0.0, 0.0), (75.0, 21.9, 0.0, 0.0))
     assert overlaps(state, road).item() is True
     assert overlaps(state._replace(y=torch.tensor([[20.0, 22.1]], dtype=F64)), road).item() is False
-
-
-def test_a_vehicle_that_crosses_in_front_of_the_ego() -> None:
-    """20 m ahead and 3 m to the right, going to the right at 5 m/s: its axes are the ego's, turned by 90 degrees."""
-    far_behind = (-50.0, 0.0, 0.0, 20.0)
-    met = encounter(traffic((0.0, 0.0, 0.0, 20.0), (20.0, 3.0, math.pi / 2, 5.0), far_behind), straight(2))
-    torch.testing.assert_close(met.axes.offset[0], torch.stack((tensor(20, 3, 3, -20), tensor(-50, 0, -50, 0))))
-    torch.testing.assert_close(met.axes.reach[0], torch.stack((tensor(3.5, 3.5, 3.5, 3.5), tensor(5, 2, 5, 2))))
-    torch.testing.assert_close(met.rate[0], torch.stack((tensor(-20, 5, 5, 20), tensor(0, 0, 0, 0))))
-    torch.testing.assert_close((met.other_heading - met.heading)[0], tensor(math.pi / 2, 0.0))
 
 
 def test_vehicles_on_a_bend_meet_along_the_chord() -> None:

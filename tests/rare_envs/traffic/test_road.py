@@ -8,7 +8,6 @@ import torch
 
 from rare_envs.traffic import road as reference_line
 from rare_envs.traffic.road import ReferenceLine, Road, i80, straight
-from rare_envs.traffic.state import point_mass
 
 F64 = torch.float64
 BEND = Road((-2.0, 2.0, 5.0), ReferenceLine(25.0, (0.0, 0.002, 0.004, -0.002, 0.0)))
@@ -131,11 +130,3 @@ def test_gradients(road: Road) -> None:
     assert torch.autograd.gradcheck(road.from_world, world)
     assert torch.autograd.gradcheck(road.curvature, (x,))
     assert torch.autograd.gradcheck(road.markers, (y,))
-    speed, acceleration, rate = (
-        v.requires_grad_() for v in (spread(5, 30, 12), spread(-3, 3, 12), spread(-0.1, 0.1, 12))
-    )
-
-    def step(*state: torch.Tensor) -> tuple[torch.Tensor, ...]:
-        return point_mass(*state, 0.1, road.curvature(state[0]))
-
-    assert torch.autograd.gradcheck(step, (x, y, heading, speed, acceleration, rate))

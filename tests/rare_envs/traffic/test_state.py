@@ -33,12 +33,7 @@ def test_a_changed_or_copied_state_has_its_own_vehicles() -> None:
     copied.x.zero_()
     assert copied.vehicles[1].x.eq(0).all()
     assert state.vehicles[1].x.ne(0).all()
-
-
-def test_pickled_as_its_fields_alone() -> None:
-    """Columns are views of one table: each would bring all of it."""
-    state = State.of_vehicles(numbered(3).vehicles, torch.zeros(2, 0))
     plain = State(*(field.clone() for field in state))
-    assert len(pickle.dumps(state)) < 1.5 * len(pickle.dumps(plain))
+    assert len(pickle.dumps(state)) < 1.5 * len(pickle.dumps(plain))  # columns would each bring the table of all
     back = pickle.loads(pickle.dumps(state))
-    assert torch.equal(back.vehicles[2].speed, state.vehicles[2].speed)
+    assert torch.equal(back.vehicles[1].speed, state.vehicles[1].speed)

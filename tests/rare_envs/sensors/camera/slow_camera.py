@@ -1,14 +1,16 @@
 """A camera the slow way, pixel by pixel in plain Python and NumPy, by other formulas than the batched one.
 
-Bodies are cut face by face (a plane, then a rectangle in it); shadows are convex polygons on the ground; the road's
-coordinates come from the nearest of many points of its line; what covers a pixel's footprint is counted on many points.
-Only constants, colours above all, are taken from the package.
+Bodies are cut face by face (a plane, then a rectangle in it); shadows are convex polygons on the ground; what covers a
+pixel's footprint is counted on many points. Only the road's coordinates and constants, colours above all, are taken
+from the package.
 """
 
 import itertools
 import math
+from collections.abc import Callable
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from rare_envs.sensors import pictures as b
@@ -18,41 +20,12 @@ from rare_envs.traffic.state import VEHICLE_LENGTH, VEHICLE_WIDTH
 
 Array = NDArray[np.float64]
 Place = tuple[float, float, float]
-STEP = 0.25
-"""Between points of a curved road's line [m]; the nearest place is interpolated between them."""
 
 
-class SlowRoad:
-    """Road coordinates by search among points; the line itself is the integral of its curvature."""
-
-    def __init__(self, road: Road) -> None:
-        self.road = road
-        if road.reference_line is not None:
-            s = np.arange(0.0, 2500.0, STEP)
-            fine = np.linspace(0.0, 2500.0, 20 * len(s))
-            knots = np.arange(len(road.reference_line.curvature)) * road.reference_line.spacing
-            bend = np.interp(fine, knots, road.reference_line.curvature, right=0.0)
-            ds = fine[1] - fine[0]
-            heading = np.concatenate(([0.0], np.cumsum((bend[1:] + bend[:-1]) / 2 * ds)))
-            slopes = np.cos(heading), np.sin(heading)
-            line = [np.concatenate(([0.0], np.cumsum((w[1:] + w[:-1]) / 2 * ds))) for w in slopes]
-            self.s, self.x, self.y, self.heading = s, *(np.interp(s, fine, w) for w in (*line, heading))
-
-    def coordinates(self, x: float, y: float) -> tuple[float, float]:
-        """s and t of a point of the world."""
-        if self.road.reference_line is None:
-            return x, y
-        i = int(np.argmin((self.x - x) ** 2 + (self.y - y) ** 2))
-        cos, sin = math.cos(self.heading[i]), math.sin(self.heading[i])
-        dx, dy = x - self.x[i], y - self.y[i]
-        return self.s[i] + dx * cos + dy * sin, dy * cos - dx * sin
-
-    def world(self, s: float, t: float, heading: float) -> tuple[float, float, float]:
-        """Place and heading in the world."""
-        if self.road.reference_line is None:
-            return s, t, heading
-        x, y, turn = (float(np.interp(s, self.s, w)) for w in (self.x, self.y, self.heading))
-        return x - t * math.sin(turn), y + t * math.cos(turn), turn + heading
+def transform(way: Callable[..., tuple[torch.Tensor, ...]], *place: float) -> Place:
+    """Place and heading by `Road.to_world` or `Road.from_world`, for one place in plain numbers."""
+    x, y, heading = (float(part) for part in way(*torch.tensor(place, dtype=torch.float64)))
+    return x, y, heading
 
 
 def picture(
@@ -62,8 +35,7 @@ def picture(
 
     Fog is in 1/m, elevation and azimuth of the sun, from the world's X axis to the right, are in rad.
     """
-    slow = SlowRoad(road)
-    placed = [slow.world(*vehicle) for vehicle in vehicles]
+    placed = [transform(road.to_world, *vehicle) for vehicle in vehicles]
     x, y, heading = placed[seen_from]
     eye = np.array((x + camera.mount_ahead * math.cos(heading), y + camera.mount_ahead * math.sin(heading), 0.0))
     eye += camera.mount_right * np.array((-math.sin(heading), math.cos(heading), 0.0))
@@ -75,7 +47,7 @@ def picture(
     below = -math.sin(camera.pitch) * ahead - math.cos(camera.pitch) * up
     level = math.cos(elevation)
     sun = np.array((level * math.cos(azimuth), level * math.sin(azimuth), math.sin(elevation)))
-    scene = Scene(slow, placed, seen_from, fog, sun)
+    scene = Scene(road, placed, seen_from, fog, sun)
     half_width = math.tan(camera.field_of_view / 2)
     image = np.zeros((camera.height, camera.width, 3))
 
@@ -92,7 +64,7 @@ def picture(
 class Scene:
     """What rays meet."""
 
-    def __init__(self, road: SlowRoad, placed: list[Place], own: int, fog: float, sun: Array) -> None:
+    def __init__(self, road: Road, placed: list[Place], own: int, fog: float, sun: Array) -> None:
         self.road, self.placed, self.own, self.fog, self.sun = road, placed, own, fog, sun
         through = math.exp(-fog * b.FOG_DEPTH / sun[2])
         self.direct = b.DIRECT * through
@@ -142,15 +114,15 @@ class Scene:
             return point
 
         middle = meet(row + 0.5, column + 0.5)
-        s, t = self.road.coordinates(*middle[:2])
+        s, t, _ = transform(self.road.from_world, *middle[:2], 0.0)
         h = 1e-3
         across, along = 0.0, 0.0
         for dr, dc in ((h, 0.0), (0.0, h)):
-            far = self.road.coordinates(*meet(row + 0.5 + dr, column + 0.5 + dc)[:2])
-            near = self.road.coordinates(*meet(row + 0.5 - dr, column + 0.5 - dc)[:2])
+            far = transform(self.road.from_world, *meet(row + 0.5 + dr, column + 0.5 + dc)[:2], 0.0)
+            near = transform(self.road.from_world, *meet(row + 0.5 - dr, column + 0.5 - dc)[:2], 0.0)
             across += abs(far[1] - near[1]) / (2 * h)
             along = abs(far[0] - near[0]) / (2 * h) if dr else along
-        left, *inner, right = self.road.road.edges
+        left, *inner, right = self.road.edges
         places = t + across * (np.arange(4000) + 0.5 - 2000) / 4000
 
         def part(edge: float) -> float:

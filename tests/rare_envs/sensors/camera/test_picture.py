@@ -1,4 +1,4 @@
-"""Cameras and their pictures: rays, a slow renderer, other batches, and sensor noise against its hash."""
+"""Cameras and their pictures: rays, a slow renderer, other batches, and sensor noise."""
 
 import math
 
@@ -29,7 +29,7 @@ SHARPEST = Road((-2.0, 2.0, 6.0), ReferenceLine(50.0, (0.0, MAX_CURVATURE, MAX_C
 SCENES = [
     (straight(2), Camera(16, 44), (1.5e-4, 0.8, 2.1)),
     (straight(1), Camera(14, 36, 1.5, 0.1, 1.2), (0.02, 0.2, 2.8)),
-    (i80(), Camera(16, 44), (0.005, 0.1, -0.1)),
+    (i80(), Camera(12, 30), (0.005, 0.1, -0.1)),
     (i80(), Camera(20, 30, 1.2, -0.05, 1.6, 1.0), (1e-3, 1.2, -2.0)),
     (SHARPEST, Camera(16, 44), (1e-4, 0.5, 1.0)),
     (i80(), Camera(16, 44, pitch=0.12, mount_right=-1.1, yaw=0.6), (1e-3, 0.7, -1.0)),
@@ -37,7 +37,7 @@ SCENES = [
 ]
 
 
-@pytest.mark.parametrize("number", range(len(SCENES)))
+@pytest.mark.parametrize("number", [0, 1, 2, *(pytest.param(k, marks=pytest.mark.slow) for k in range(3, len(SCENES)))])
 def test_equal_to_the_slow_renderer_within_rounding(number: int) -> None:
     road, camera, sky = SCENES[number]
     rng = np.random.default_rng(number)
@@ -70,21 +70,6 @@ def test_pictures_do_not_depend_on_their_batch(road: Road) -> None:
     assert len({image.numpy().tobytes() for image in images}) == batch
 
 
-def test_any_heading_and_place_gives_a_picture() -> None:
-    """After a spin the road is no longer where a car on its lane would look for it."""
-    rng = np.random.default_rng(1)
-    n = 64
-    x, y = (
-        torch.from_numpy(rng.uniform(-50.0, 900.0, (n, 6))).float(),
-        torch.from_numpy(rng.uniform(-30, 30, (n, 6))).float(),
-    )
-    heading = torch.from_numpy(rng.uniform(-7.0, 7.0, (n, 6))).float()
-    state = State(x, y, heading, torch.zeros_like(x), torch.zeros(n, 0))
-    for road in (straight(1), i80(), SHARPEST):
-        images = take_picture(state, road, CameraContext.at_start(Camera(20, 40), clear_day(x)))
-        assert images.float().std() > 10.0
-
-
 def test_rays_span_the_field_of_view() -> None:
     camera = Camera(height=3, width=101, pitch=0.0, field_of_view=math.radians(60.0))
     ray = pixels(camera, torch.device("cpu")).ray.view(3, 3, 101)
@@ -112,41 +97,14 @@ def test_a_camera_by_its_size() -> None:
 
 N = 3 * 66 * 200
 """Values of a picture."""
+
+
 KEYS = (0, 1, 2**30, 1065353216, 1065353217)
-GOLDEN = 2654435761
-"""2^32 over the golden ratio, a prime."""
-WORD = 2**32
 
 
 def cameras(*keys: int, tick: int = 0, viewer: int = 0) -> CameraContext:
     context = CameraContext.at_start(Camera(), Weather(*torch.zeros(4, len(keys)), torch.tensor(keys)))
     return context._replace(tick=context.tick + tick, viewer=viewer)
-
-
-def lowbias32(x: int) -> int:
-    """Wellons' mixing function, as published."""
-    x ^= x >> 16
-    x = x * 0x7FEB352D % WORD
-    x ^= x >> 15
-    x = x * 0x846CA68B % WORD
-    return x ^ x >> 16
-
-
-def slow_noise(key: int, tick: int, viewer: int, place: int) -> float:
-    """One value of the noise: the sum of the four bytes of a hash, less its mean, over its standard deviation."""
-    bits = key
-    for number in (tick, viewer):
-        bits = lowbias32((bits + (number + 1) * GOLDEN) % WORD)
-    bits = lowbias32((bits + place * GOLDEN) % WORD)
-    return (sum(bits.to_bytes(4, "big")) - 4 * 127.5) / math.sqrt(4 * (256**2 - 1) / 12)
-
-
-@pytest.mark.parametrize(("tick", "viewer"), [(0, 0), (1, 0), (99, 5)])
-def test_equal_to_the_hash_in_plain_integers(tick: int, viewer: int) -> None:
-    found = draw_pixel_noise(cameras(*KEYS, tick=tick, viewer=viewer), N)
-    for row, key in zip(found, KEYS, strict=True):
-        for place in (0, 1, 2, 255, 600, N - 1):
-            assert row[place].item() == pytest.approx(slow_noise(key, tick, viewer, place), abs=1e-6)
 
 
 def test_noise_is_white() -> None:
