@@ -233,10 +233,8 @@ class DrivingProblem:
             x: Scenario parameters, shape (n, d).
 
         Returns:
-            Safety measures, shape (n,), NaN in rows on which it fails, and the reasons by row.
-
-        Raises:
-            Exception: A policy with a memory has failed on the batch, which may be the fault of any row.
+            Safety measures, shape (n,), NaN in rows on which it fails, and the reasons by row. An error of a policy
+            with a memory is raised: it may be the fault of any row.
         """
         failed_rows: dict[int, str] = {}
         return self._simulate(x, failed_rows), failed_rows
@@ -263,10 +261,7 @@ class DrivingProblem:
         return self._simulate_terms(x, gamma, None)
 
     def attempt_terms(self, x: NDArray[np.float64], gamma: float = 0.0) -> tuple[EpisodeTerms, dict[int, str]]:
-        """Simulate as `terms` does, and go on with the other rows when the policy fails on some, as `attempt` does.
-
-        f and terms are NaN in rows on which it fails; the reasons come by row.
-        """
+        """Simulate as `terms` does, and go on as `attempt` does; f and terms are NaN in rows on which it fails."""
         failed_rows: dict[int, str] = {}
         terms = self._simulate_terms(x, gamma, failed_rows)
         rows = list(failed_rows)
@@ -380,11 +375,7 @@ class DrivingProblem:
             yield end
 
     def _replay(self, world: World, rows: Tensor) -> Episode | None:
-        """Return the episodes of scenarios (B, d) on a GPU, recorded when there were as many before.
-
-        None where a policy has to be asked on the CPU: one that cannot decide elsewhere, or one that fails, for then it
-        is told on which rows, and how.
-        """
+        """Return the episodes of x (B, d) on a GPU; None where the CPU has to ask a policy, or to tell how it fails."""
         known = self._recorded
         driver = find_device_driver(self.driver, self.device, None if known is None else known.driver)
         if driver is None:

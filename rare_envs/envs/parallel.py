@@ -286,16 +286,7 @@ class AgentsVectorEnv(_SeveralAgents, VectorEnv[NDArray[np.float32], NDArray[Any
         rewards: Mapping[str, Reward] | None = None,
         **kwargs: Any,
     ) -> None:
-        """Make the batch.
-
-        Args:
-            env_id: The scenario's registered id.
-            scenarios: B.
-            agents: Names of the vehicles that act, as in `DrivingParallelEnv`; None for all.
-            ego: What drives the ego if it is no agent; without memory, because scenarios begin at different times.
-            rewards: Rewards of agents by name, as in `DrivingParallelEnv`.
-            **kwargs: See `rare_envs.make.set_up`.
-        """
+        """Make a batch of B scenarios; arguments as of `DrivingParallelEnv`, but an ego without memory."""
         if not isinstance(scenarios, (int, np.integer)) or isinstance(scenarios, bool) or scenarios < 1:
             raise ValueError(f"Expected one or more scenarios, got {scenarios!r}.")
         self.agents = self._set_up(env_id, agents, ego, rewards, kwargs)
@@ -312,15 +303,7 @@ class AgentsVectorEnv(_SeveralAgents, VectorEnv[NDArray[np.float32], NDArray[Any
     def reset(
         self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[NDArray[np.float32], dict[str, Any]]:
-        """Start all scenarios.
-
-        Args:
-            seed: Seeds the one generator of the batch; of a list the first.
-            options: As in `DrivingVectorEnv.reset`, for the B scenarios.
-
-        Returns:
-            Observations, shape (B A, F), and infos.
-        """
+        """Start all scenarios, by one generator (of a list of seeds, the first): observations (B A, F), and infos."""
         super().reset(seed=seed[0] if isinstance(seed, list) else seed)
         self._x = self.space.scenario_x(options, self.scenarios, self.np_random)
         self._tick[:] = 0
@@ -330,11 +313,7 @@ class AgentsVectorEnv(_SeveralAgents, VectorEnv[NDArray[np.float32], NDArray[Any
     def step(
         self, actions: NDArray[Any]
     ) -> tuple[NDArray[np.float32], NDArray[np.float64], NDArray[Any], NDArray[Any], dict[str, Any]]:
-        """Carry out one decision of each agent and replace the scenarios that ended.
-
-        Raises:
-            ValueError: If the actions have the wrong shape or are NaN.
-        """
+        """Carry out one decision of each agent and replace the scenarios that ended."""
         if self._episode is None:
             raise RuntimeError("Expected reset() before step().")
         rewards_of = {self._vehicles[agent]: self.rewards[agent] for agent in self.agents}

@@ -276,8 +276,7 @@ class World:
                 shape = (1, FIRST_DRAWS + self.clock.ticks, others, 2)
                 draws = fixed_draws(shape, FIXED_SEED, noise).expand(batch, -1, -1, -1)
             background = BackgroundState.start(self.background, weights.contiguous(), draws)
-        perception = self._perceive(state, self._place(state))
-        return self.start_from(state, perception, background, self.sensing.start_camera(weather, key))
+        return self.start_from(state, self._look(state)[1], background, self.sensing.start_camera(weather, key))
 
     def start_from(
         self,
@@ -375,24 +374,23 @@ class World:
             others, overridden = apply_overrides(episode, action, commanded, others, driver_actions, dt)
         rest = zip(*(field.unbind(1) for field in others), strict=True)
         state = State.of_vehicles((moved, *rest), old.theta)
-        place = self._place(state)
+        place, perception = self._look(state)
         hit = overlaps(state, road, "ego", place).any(dim=1) | road.off_road(state.vehicles[0].y)
         if self.measurement.collisions == "any":
             hit = hit | overlaps(state, road, "others").any(dim=1)
         episode = episode._replace(background_state=background_state, overridden=overridden)
-        return self.update(episode, state, self._perceive(state, place), hit)
+        return self.update(episode, state, perception, hit)
 
     def _least_ttc(self, measure_state: Tensor) -> Tensor | None:
         """Return the least time to collision, where that is the measure."""
         return measure_state if self.measurement.measure == "ttc" else None
 
-    def _place(self, state: State) -> WorldPose | None:
-        """Return where the vehicles are in the flat world; None in a world without lidar."""
-        return self.scenario.road.place(state.x, state.y, state.heading) if self.uses_lidar else None
-
-    def _perceive(self, state: State, place: WorldPose | None) -> Tensor | None:
-        """Return the lidar features of the vehicles; None in a world without lidar."""
-        return perceive_traffic(state, self.scenario.road, place) if self.uses_lidar else None
+    def _look(self, state: State) -> tuple[WorldPose | None, Tensor | None]:
+        """Return where the vehicles are in the flat world, and their lidar features; None in a world without lidar."""
+        if not self.uses_lidar:
+            return None, None
+        place = self.scenario.road.place(state.x, state.y, state.heading)
+        return place, perceive_traffic(state, self.scenario.road, place)
 
 
 _RULE = IDM()

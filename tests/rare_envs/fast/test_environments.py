@@ -7,7 +7,7 @@ import torch
 from gymnasium.vector import AutoresetMode
 
 import rare_envs  # noqa: F401  (registers its ids)
-from rare_envs.fast import crashes as fast_crashes
+from rare_envs.fast import rollouts
 from rare_envs.fast.choice import find_scripted_step
 from rare_envs.fast.equations import RoadNumbers
 from rare_envs.simulation.episode import EpisodeStatistics
@@ -160,7 +160,7 @@ def test_crashes_are_those_of_torch(turned, speed):
     )
     own, others = copied(nothing()), copied(old)
     stacked = (np.stack([field.numpy().T for field in state[:4]]) for state in (before, after))
-    fast_crashes.record_crashes(*stacked, over.numpy(), now.numpy(), RoadNumbers.of(ROAD), DT, own, others)
+    rollouts.record_crashes(*stacked, over.numpy(), now.numpy(), RoadNumbers.of(ROAD), DT, own, others)
     for found, wanted in ((own, expected.own), (others, expected.others)):
         assert np.array_equal(found.kind, wanted.kind.numpy())
         assert np.array_equal(found.vehicles, wanted.vehicles.numpy())
