@@ -179,7 +179,12 @@ def add_run(run: Path, corpus: Path, most: int = 20, trust: bool = False) -> tup
     if most < 1:
         raise BadInput(f"Expected at least one failure to add, got {most}.")
     study = load_finished(run)
-    chosen = _choose_likely(list_failures(study, trust), most, study.result.get("modes"))
+    failures, modes = list_failures(study, trust), study.result.get("modes")
+    first = {failure.crash: number for number, failure in reversed(list(enumerate(failures)))}
+    named = [mode.get("failure") for mode in modes if isinstance(mode, dict)] if isinstance(modes, list) else []
+    of_modes = [number for number in named if type(number) is int and 0 <= number < len(failures)]
+    order = list(dict.fromkeys([*sorted(first.values()), *of_modes, *range(len(failures))]))
+    chosen = [failures[number] for number in sorted(order[:most])]
     if not chosen:
         raise BadInput(f"The run in {str(run)!r} has no failure.")
     new = 0
@@ -191,15 +196,6 @@ def add_run(run: Path, corpus: Path, most: int = 20, trust: bool = False) -> tup
                 new += 1
             note_question(read_question(failure.question_values()))
     return chosen, new
-
-
-def _choose_likely(failures: Sequence[StoredFailure], most: int, modes: object) -> list[StoredFailure]:
-    """Return the `most` most likely failures."""
-    first = {failure.crash: number for number, failure in reversed(list(enumerate(failures)))}
-    named = [mode.get("failure") for mode in modes if isinstance(mode, dict)] if isinstance(modes, list) else []
-    of_modes = [number for number in named if type(number) is int and 0 <= number < len(failures)]
-    order = dict.fromkeys([*sorted(first.values()), *of_modes, *range(len(failures))])
-    return [failures[number] for number in sorted(list(order)[:most])]
 
 
 def join_x(failures: Sequence[StoredFailure], space: ScenarioSpace) -> NDArray[np.float64]:

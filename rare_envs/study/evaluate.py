@@ -94,7 +94,18 @@ def run(
     """
     start, study = time.perf_counter(), settle_chunk(study, executor)
     advice = "" if journal else " With --out finished simulations would have been kept."
-    evaluator = open_evaluator(study, journal, executor)
+    question, problem = study.question, study.problem
+    evaluator = Evaluator(
+        problem if study.ego_was_given else SentProblem(problem, question),
+        question.gamma,
+        cast(OnError, question.on_error),
+        journal=journal,
+        executor=executor,
+        seed=question.seed,
+        size=question.chunk or problem.tile,
+        name="The ego",
+        precision=np.float32,  # in which scenarios are simulated
+    )
     keeper = RowKeeper(study.question.gamma)
 
     def report_on(estimate: samplers.Estimate) -> Report:
@@ -134,22 +145,6 @@ def settle_chunk(study: Study, executor: Executor | None) -> Study:
     if executor is None or study.question.chunk is not None:
         return study
     return replace(study, question=replace(study.question, chunk=study.problem.chunk_size))
-
-
-def open_evaluator(study: Study, journal: Journal | None = None, executor: Executor | None = None) -> Evaluator:
-    """Return the evaluator of a study; scenarios are simulated in single precision."""
-    question, problem = study.question, study.problem
-    return Evaluator(
-        problem if study.ego_was_given else SentProblem(problem, question),
-        question.gamma,
-        cast(OnError, question.on_error),
-        journal=journal,
-        executor=executor,
-        seed=question.seed,
-        size=question.chunk or problem.tile,
-        name="The ego",
-        precision=np.float32,
-    )
 
 
 class SentProblem:

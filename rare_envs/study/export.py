@@ -190,13 +190,6 @@ def find_trajectories(drive: Drive) -> WorldTrajectories:
     return WorldTrajectories(names, time, x[rows], 0.0 - y[rows], 0.0 - heading[rows], drive.speed[rows])  # no -0.0
 
 
-def sample_line(road: Road, y: float, along: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return points, x and y [m], of a line y [m] to the right of the road's, at places along it (k,)."""
-    s = torch.from_numpy(along)
-    x, across, _ = road.to_world(s, torch.full_like(s, y), torch.zeros_like(s))
-    return x.numpy(), -across.numpy()
-
-
 ROAD_ID = 0
 
 
@@ -433,13 +426,14 @@ def _add_point(parent: ET.Element, x: float, y: float) -> None:
 
 def _add_lanelets(root: ET.Element, road: Road, extent: tuple[float, float]) -> None:
     count = 2 if road.reference_line is None else int(np.ceil((extent[1] - extent[0]) / _SPACING)) + 1
-    along = np.linspace(*extent, count)
+    along = torch.linspace(*extent, count, dtype=torch.float64)
     for lane in range(road.lanes):
         lanelet = _add(root, "lanelet", id=str(lane + 1))
         for name, edge in (("leftBound", lane), ("rightBound", lane + 1)):
             bound = _add(lanelet, name)
-            for x, y in zip(*sample_line(road, road.edges[edge], along), strict=True):
-                _add_point(bound, x, y)
+            x, right, _ = road.to_world(along, torch.full_like(along, road.edges[edge]), torch.zeros_like(along))
+            for point in zip(x.tolist(), (-right).tolist(), strict=True):
+                _add_point(bound, *point)
             _add(bound, "lineMarking", "solid" if edge in (0, road.lanes) else "dashed")
         if lane > 0:
             _add(lanelet, "adjacentLeft", ref=str(lane), drivingDir="same")

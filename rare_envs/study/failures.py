@@ -291,17 +291,8 @@ class FailureMode:
         return {"crash": self.crash, **share, "failure": self.failure, "center": dict(self.center)}
 
 
-class LabelledFailures(NamedTuple):
-    """Failing points of a run with their modes."""
-
-    rows: NDArray[np.int64]
-    """Rows of `Sample.x`, shape (k,)."""
-    kinds: NDArray[np.object_]
-    """Their kinds of crash, shape (k,)."""
-    labels: NDArray[np.object_]
-    """Their modes, shape (k,)."""
-    listed: NDArray[np.object_]
-    """Mode of each failure of the run's list; "" where none of its kind was labelled."""
+Labels = NDArray[np.object_]
+"""Words, one for each of some points."""
 
 
 def find_modes(space: ScenarioSpace, estimate: samplers.Estimate, crashes: Crashes) -> tuple[FailureMode, ...]:
@@ -309,20 +300,22 @@ def find_modes(space: ScenarioSpace, estimate: samplers.Estimate, crashes: Crash
     found = assign_modes(space, estimate, crashes)
     if found is None:
         return ()
-    sample, labels = require_sample(estimate), found.labels
-    x, weights = sample.x[found.rows], sample.weights[sample.f <= estimate.gamma][found.rows]
+    sample, (rows, kinds, labels, listed) = require_sample(estimate), found
+    x, weights = sample.x[rows], sample.weights[sample.f <= estimate.gamma][rows]
     modes = []
-    for label, share in sum_by_label(estimate, found.rows, labels).items():
-        mine, listed = labels == label, np.flatnonzero(found.listed == label)
+    for label, share in sum_by_label(estimate, rows, labels).items():
+        mine, numbers = labels == label, np.flatnonzero(listed == label)
         mean = np.average(x[mine], axis=0, weights=weights[mine] if weights[mine].sum() > 0 else None)
         center = {column.name: float(mean[j]) for j, column in enumerate(list_columns(space)) if column.shown}
-        failure, crash = int(listed[0]) if len(listed) else None, str(found.kinds[mine][0])
+        failure, crash = int(numbers[0]) if len(numbers) else None, str(kinds[mine][0])
         modes.append(FailureMode(crash=crash, share=share, failure=failure, center=center))
     return tuple(modes)
 
 
-def assign_modes(space: ScenarioSpace, estimate: samplers.Estimate, crashes: Crashes) -> LabelledFailures | None:
-    """Return at most `MAX_CLUSTERED` failing points with their modes; None where nothing failed or has a weight."""
+def assign_modes(
+    space: ScenarioSpace, estimate: samplers.Estimate, crashes: Crashes
+) -> tuple[NDArray[np.int64], Labels, Labels, Labels] | None:
+    """Return rows of `Sample.x` (k,) of failures with kinds and modes, and the modes of those listed; None without."""
     sample, listed = estimate.sample, estimate.failures
     if sample is None or not (sample.f <= estimate.gamma).any() or estimate.p <= 0:
         return None
@@ -339,10 +332,10 @@ def assign_modes(space: ScenarioSpace, estimate: samplers.Estimate, crashes: Cra
         mine, like = kinds_listed == kind, np.flatnonzero(kinds == kind)
         if len(like):
             found[mine] = labels[like[_find_nearest(u_listed[mine], u[like])]]
-    return LabelledFailures(rows, kinds, labels, found)
+    return rows, kinds, labels, found
 
 
-def _find_kinds(x: FloatArray, crashes: Crashes, failed: NDArray[np.bool_] | None = None) -> NDArray[np.object_]:
+def _find_kinds(x: FloatArray, crashes: Crashes, failed: NDArray[np.bool_] | None = None) -> Labels:
     """Return the kinds of crash of scenarios x (n, d), shape (n,); "" where that is not known, and where f failed."""
     kinds = np.array([crashes.get(digest, "") for digest in digest_scenarios(x)], dtype=object)
     if failed is not None:
@@ -350,7 +343,7 @@ def _find_kinds(x: FloatArray, crashes: Crashes, failed: NDArray[np.bool_] | Non
     return kinds
 
 
-def label_modes(u: FloatArray, kinds: NDArray[np.object_]) -> NDArray[np.object_]:
+def label_modes(u: FloatArray, kinds: Labels) -> Labels:
     """Return the mode, a word, of each of n failures u (n, k) in standard normal space with kinds of crash (n,)."""
     labels = np.empty(len(kinds), dtype=object)
     for kind in dict.fromkeys(kinds.tolist()):
@@ -469,11 +462,12 @@ def list_every_mode(space: ScenarioSpace, estimate: samplers.Estimate, crashes: 
     found = assign_modes(space, longer, crashes)
     if found is None:
         return longer
-    return _list_more(longer, found.rows, found.labels, {*found.listed, f"{NO_OUTCOME_LABEL}/0", "/0"})
+    rows, _, labels, modes = found
+    return _list_more(longer, rows, labels, {*modes, f"{NO_OUTCOME_LABEL}/0", "/0"})
 
 
 def _list_more(
-    estimate: samplers.Estimate, rows: NDArray[np.int64], labels: NDArray[np.object_], known: set[Any]
+    estimate: samplers.Estimate, rows: NDArray[np.int64], labels: Labels, known: set[Any]
 ) -> samplers.Estimate:
     """Return an estimate whose list has the most likely of the rows of `Sample.x` of each label that is not known."""
     missing = [labels == label for label in dict.fromkeys(labels.tolist()) if label not in known]

@@ -201,18 +201,15 @@ def build_problem(question: Question, ego: Any) -> DrivingProblem:
     """Return the problem of a question; what it cannot check is among its notes, without a warning."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", EgoWarning)  # the report says it
-        base = _load_ensemble(question) if question.ensemble else question.base
+        base: Any = question.base
+        if question.ensemble:
+            base = load_base(find_scenario(question.env_id), base)
+            if not isinstance(base, FittedDistribution) or not base.refits:
+                name = "the default" if question.base is None else repr(question.base)
+                raise ValueError(f"The base distribution ({name}) has no refits, so there is no ensemble of them.")
+            base = base.ensemble()
         world = {name: getattr(question, name) for name in PROBLEM_FIELDS}
         return DrivingProblem(question.env_id, ego=ego, base=base, **world)
-
-
-def _load_ensemble(question: Question) -> Distribution:
-    """Return the mixture of the refits of the base distribution."""
-    base = load_base(find_scenario(question.env_id), question.base)
-    if not isinstance(base, FittedDistribution) or not base.refits:
-        name = "the default" if question.base is None else repr(question.base)
-        raise ValueError(f"The base distribution ({name}) has no refits, so there is no ensemble of them.")
-    return base.ensemble()
 
 
 @torch.inference_mode()

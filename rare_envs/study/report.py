@@ -20,7 +20,6 @@ from rare_envs.measures.base import Measure
 from rare_envs.measures.registry import MEASURES
 from rare_envs.scenarios.registry import find_scenario
 from rare_envs.startup import __version__
-from rare_envs.study.arguments import Question
 from rare_envs.study.failures import CrashKinds
 from rare_envs.study.question import Study
 from samplers.analysis.base_error import FIT_BIAS
@@ -59,50 +58,22 @@ def compute_threshold_curve(estimate: samplers.Estimate) -> samplers.Curve | Non
 
 def find_frequency(study: Study) -> EventFrequency:
     """Return the frequency of the events whose failures a question counts, or raise a ValueError that says why not."""
-    reason = _explain_no_collisions(study.question)
-    if reason:
-        raise ValueError(f"no rate per hour or km: {reason}")
-    base = study.fitted
-    if base is None or base.frequency is None:
-        scenario = find_scenario(study.question.env_id).name
-        raise ValueError(
-            f"no rate per hour or km: the base {study.base_name!r} of {scenario} has no event frequency, "
-            f"{explain_no_frequency({} if base is None else base.record)}"
-        )
-    return base.frequency
-
-
-def _explain_no_collisions(question: Question) -> str:
-    """Return why p is no probability of a collision of the ego; empty if it is one."""
+    question, base, reason = study.question, study.fitted, ""
     measure = MEASURES.get(question.measure)
+    advised = f"counts other events than collisions (--measure {COLLISION_MEASURE} does)"
     if not (isinstance(measure, Measure) and measure.collisions_only):
-        return f"--measure {question.measure} counts other events than collisions (--measure {COLLISION_MEASURE} does)"
-    lowest = measure.collision if isinstance(measure.collision, float) else 0.0  # no number: f is graded by the crash
-    if not lowest <= question.gamma <= 0:
-        return f"--gamma {question.gamma:g} counts other events than collisions (--gamma 0 does)"
-    if question.collisions != "ego":
-        return f"--collisions {question.collisions} counts those between other vehicles too"
-    return ""
-
-
-def describe_value(
-    value: float, cov: float, sampling: Interval, base: samplers.BaseUncertainty | None
-) -> CollisionProbability:
-    """Return an expectation per event with its errors; its interval is that of the base where there is one."""
-    known = value > 0 and math.isfinite(cov)
-    if not known or base is None or not math.isfinite(base.spread):
-        interval = sampling if known else None
-        return CollisionProbability(p=value, cov=cov, upper=sampling[1], determined=known, interval=interval)
-    return CollisionProbability(
-        p=value,
-        cov=cov,
-        upper=sampling[1] if base.bound is None else base.bound,
-        interval=base.interval,
-        spread=base.spread,
-        fit_bias=FIT_BIAS,
-        quantile=refit_quantile(base.confidence, len(base.p_refits) - 1, base.clusters),
-        determined=base.bound is None,
-    )
+        reason = f"--measure {question.measure} {advised}"
+    # where it is no number, f is graded by the crash
+    elif not (measure.collision if isinstance(measure.collision, float) else 0.0) <= question.gamma <= 0:
+        reason = f"--gamma {question.gamma:g} counts other events than collisions (--gamma 0 does)"
+    elif question.collisions != "ego":
+        reason = f"--collisions {question.collisions} counts those between other vehicles too"
+    elif base is None or base.frequency is None:
+        reason = f"the base {study.base_name!r} of {find_scenario(question.env_id).name} has no event frequency, "
+        reason += explain_no_frequency({} if base is None else base.record)
+    else:
+        return base.frequency
+    raise ValueError(f"no rate per hour or km: {reason}")
 
 
 def describe_left_out(study: Study, estimate: samplers.Estimate) -> tuple[str, ...]:
@@ -312,14 +283,23 @@ class Report:
     def _rate_of(
         self, value: float, cov: float, sampling: Interval, uncertainty: samplers.BaseUncertainty | None
     ) -> CollisionRate | None:
-        """Return the rate of what has a value per event: those of two bases fitted to the same events say so."""
+        """Return the rate of what has a value per event; its interval is that of the base where there is one."""
         if self.no_rate:
             return None
+        known, spread = value > 0 and math.isfinite(cov), {}
+        ends, upper, determined = sampling if known else None, sampling[1], known
+        if known and uncertainty is not None and math.isfinite(uncertainty.spread):
+            quantile = refit_quantile(uncertainty.confidence, len(uncertainty.p_refits) - 1, uncertainty.clusters)
+            spread = {"spread": uncertainty.spread, "fit_bias": FIT_BIAS, "quantile": quantile}
+            ends, determined = uncertainty.interval, uncertainty.bound is None
+            upper = upper if uncertainty.bound is None else uncertainty.bound
         base = self.study.fitted
-        data = "" if base is None else read_source(base.record)["data"]
+        data = "" if base is None else read_source(base.record)["data"]  # rates of bases of the same events say so
         return CollisionRate(
             scenario=self.study.problem.world.scenario.name,
-            probability=describe_value(value, cov, sampling, uncertainty),
+            probability=CollisionProbability(
+                p=value, cov=cov, upper=upper, interval=ends, determined=determined, **spread
+            ),
             frequency=find_frequency(self.study),
             confidence=self.estimate.confidence,
             fitted_to=f"{base.fitted_to}, {data}" if base is not None and data else "",

@@ -328,7 +328,11 @@ def _describe_failure(report: Report, details: bool) -> Iterator[str]:
     with_outcome = np.flatnonzero(~np.isnan(failures.f))
     k = int(with_outcome[0]) if len(with_outcome) else 0
     crash, f = report.crashes[k], f"f = {failures.f[k]:.3g}" if len(with_outcome) else "the ego failed"
-    what = "" if crash is None else summarise_crash(crash, report.study.problem.world.scenario.labels)
+    what = ""
+    if crash is not None:
+        who, whom = name_parties(crash, report.study.problem.world.scenario.labels)
+        speeds = f"{crash['impact_speed']:.1f} m/s at contact, delta-v {max(crash['delta_v']):.1f} m/s"
+        what = f"{who} runs into {whom}: {speeds}, serious injury {100 * max(crash['injury_risk']):.2g} %"
     found, brackets = f"most likely of {failures.total:,} failures found", "in brackets the central 90 %"
     if details:
         yield f"{found} ({f}; {brackets} of ordinary scenarios):"
@@ -340,13 +344,6 @@ def _describe_failure(report: Report, details: bool) -> Iterator[str]:
     but = " but drivers' weights or noise" if max(space.sizes) > MAX_SHOWN else ""
     nothing = f"nothing beyond the central 90 % of ordinary scenarios{but}"
     yield f"  unusual in it: {f'{unusual} ({brackets} of ordinary scenarios)' if unusual else nothing}"
-
-
-def summarise_crash(crash: dict[str, Any], labels: tuple[str, ...]) -> str:
-    """Return who ran into whom, how fast, and the risk of injury, in words; `labels` are those of the vehicles."""
-    who = name_parties(crash, labels)
-    speeds = f"{crash['impact_speed']:.1f} m/s at contact, delta-v {max(crash['delta_v']):.1f} m/s"
-    return f"{who[0]} runs into {who[1]}: {speeds}, serious injury {100 * max(crash['injury_risk']):.2g} %"
 
 
 def _list_unusual(space: ScenarioSpace, x: FloatArray) -> str:

@@ -219,20 +219,16 @@ def finish_run(folder: Path, report: Report) -> None:
     try:
         folder.mkdir(parents=True, exist_ok=True)
         write_run(folder, report)
-        finish_study_file(folder, report.study, report.seconds)
+        begun = read_about(folder)  # stays, but for one of another question, which somebody has put there
+        if not begun or ("question" in begun and not is_same_question(begun["question"], report.study.question)):
+            begun = describe_study(report.study)
+        digests = {name: digest_file(folder / name) for name in DIGESTED if (folder / name).is_file()}
+        ended = {"finished": _now(), "seconds": report.seconds, "results": digests}
+        _write_study_file(folder, {**begun, **ended})
     except OSError as error:
         raise UnwrittenResults(
             f"Cannot write the results to {str(folder)!r}: {error.strerror or error}.", report
         ) from error
-
-
-def finish_study_file(folder: Path, study: Study, seconds: float) -> None:
-    """Note in study.json that the run is done, its wall time [s], and the digests of its files."""
-    begun = read_about(folder)
-    if not begun or ("question" in begun and not is_same_question(begun["question"], study.question)):
-        begun = describe_study(study)
-    digests = {name: digest_file(folder / name) for name in DIGESTED if (folder / name).is_file()}
-    _write_study_file(folder, {**begun, "finished": _now(), "seconds": seconds, "results": digests})
 
 
 def describe_study(study: Study) -> dict[str, Any]:

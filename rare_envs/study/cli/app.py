@@ -7,7 +7,6 @@ Exit codes: 0 done, 2 bad input (one line on standard error), 3 done with warnin
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable
 from functools import partial
 from typing import Annotated
 
@@ -15,22 +14,7 @@ import typer
 
 from rare_envs.startup import __version__
 from rare_envs.study.arguments import as_bad_input
-from rare_envs.study.cli.egos import (
-    check_ego_command,
-    export_ego_command,
-    fit_command,
-    serve_ego_command,
-    train_drivers_command,
-    train_ego_command,
-)
-from rare_envs.study.cli.estimate import compare_command, estimate_command, plan_command, resume_command, risk_command
-from rare_envs.study.cli.runs import (
-    corpus_add_command,
-    corpus_run_command,
-    export_command,
-    replay_command,
-    report_command,
-)
+from rare_envs.study.cli import egos, estimate, runs
 from rare_envs.study.cli.shell import Answer, OneLineErrors, SummarisedCommands, command, ignore_signals
 
 EXAMPLES = """
@@ -137,26 +121,11 @@ def format_examples(page: str) -> str:
     return "\n".join(("\b", "Examples:", *(f"  {line}" for line in list_examples(page))))
 
 
-COMMANDS: dict[str, Callable[..., None]] = {
-    "list": list_command,
-    "estimate": estimate_command,
-    "risk": risk_command,
-    "bases": bases_command,
-    "resume": resume_command,
-    "compare": compare_command,
-    "fit": fit_command,
-    "train-ego": train_ego_command,
-    "train-drivers": train_drivers_command,
-    "export-ego": export_ego_command,
-    "replay": replay_command,
-    "export": export_command,
-    "plan": plan_command,
-    "report": report_command,
-    "check-ego": check_ego_command,
-    "serve-ego": serve_ego_command,
-    "corpus add": corpus_add_command,
-    "corpus run": corpus_run_command,
-}
+COMMANDS = (
+    *("list", "estimate", "risk", "bases", "resume", "compare", "fit", "train-ego", "train-drivers", "export-ego"),
+    *("replay", "export", "plan", "report", "check-ego", "serve-ego", "corpus add", "corpus run"),
+)
+"""Commands in the order of the first page; the function of `corpus add` is `corpus_add_command`."""
 corpus_app = typer.Typer(
     cls=SummarisedCommands,
     help="Keep failures as regression scenarios, and try other egos in them.",
@@ -164,8 +133,10 @@ corpus_app = typer.Typer(
 )
 app.add_typer(corpus_app, name="corpus")
 app.info.epilog = format_examples("")
-for _name, _function in COMMANDS.items():
+_functions = {**vars(estimate), **vars(egos), **vars(runs), **globals()}
+for _name in COMMANDS:
     _group, _, _word = _name.rpartition(" ")
+    _function = _functions[f"{_name.replace(' ', '_').replace('-', '_')}_command"]
     (corpus_app if _group else app).command(_word, epilog=format_examples(_name))(_function)
 
 

@@ -121,34 +121,29 @@ class AtlasEntry(NamedTuple):
     """Why there are no pictures; "" if there are."""
 
 
-class AtlasSource(NamedTuple):
-    """What the atlas of a run is made from."""
-
-    problem: DrivingProblem
-    failures: Mapping[str, Any]
-    """Of failures.csv."""
-    ordinary: FloatArray
-    """Draws of the base distribution, shape (n, d)."""
-    events: FloatArray | None
-    """Recorded events, columns of x that are shown, shape (m, k); None without recordings."""
+def draw_shown(problem: DrivingProblem) -> FloatArray:
+    """Return ordinary scenarios, the columns that are shown, shape (n, k)."""
+    return draw_ordinary(problem.space)[:, [column.shown for column in list_columns(problem.space)]]
 
 
-def build_atlas(source: AtlasSource, modes: list[dict[str, Any]]) -> list[AtlasEntry]:
-    """Return the entries of the largest modes."""
-    return [_build_entry(source, number, mode) for number, mode in enumerate(modes[:MOST_MODES], 1)]
+def build_atlas(study: LoadedStudy, problem: DrivingProblem, events: FloatArray | None) -> list[AtlasEntry]:
+    """Return the entries of the largest modes; `events` (m, k) are recorded ones, if there are any."""
+    modes = list(study.result.get("modes") or [])[:MOST_MODES]
+    return [_build_entry(study, problem, events, number, mode) for number, mode in enumerate(modes, 1)]
 
 
-def _build_entry(source: AtlasSource, number: int, mode: Mapping[str, Any]) -> AtlasEntry:
+def _build_entry(
+    study: LoadedStudy, problem: DrivingProblem, events: FloatArray | None, number: int, mode: Mapping[str, Any]
+) -> AtlasEntry:
     failure = mode.get("failure")
     if failure is None:
         return AtlasEntry(mode, missing="none of its failures is in failures.csv")
-    whole = read_row(source.failures, source.problem, int(failure))
-    shown = [column.shown for column in list_columns(source.problem.space)]
-    x, events = whole[shown], source.events
-    nearest = None if events is None else find_nearest_event(x, events, source.ordinary[:, shown])
-    entry = AtlasEntry(mode, float(source.failures["f"][int(failure)]), x, nearest)
+    whole = read_row(study.failures, problem, int(failure))
+    x = whole[[column.shown for column in list_columns(problem.space)]]
+    nearest = None if events is None else find_nearest_event(x, events, draw_shown(problem))
+    entry = AtlasEntry(mode, float(study.failures["f"][int(failure)]), x, nearest)
     try:
-        drive = drive_again(source.problem, whole)
+        drive = drive_again(problem, whole)
         figures, clip = _draw_drive(drive, number), encode_clip(drive)
     except (Exception, SystemExit, EgoGone) as error:  # the ego is the user's, and need not do again what it did before
         return entry._replace(missing=f"it cannot be shown: {reason_of(error)}")
@@ -225,11 +220,9 @@ def write_html_report(
         problem = prepare(question).problem
         shown = [column.name for column in list_columns(problem.space) if column.shown]
         known = None if events is None else read_recorded_events(events, shown)
-        source = AtlasSource(problem, study.failures, draw_ordinary(problem.space), known)
         with _damage_as_bad_input(folder):
-            atlas = build_atlas(source, list(study.result.get("modes") or []))
-            drawn = _make_figures(study, source)
-            content = render_page(study, source, drawn, atlas)
+            atlas, drawn = build_atlas(study, problem, known), _make_figures(study, problem)
+            content = render_page(study, problem, drawn, atlas)
         with as_bad_input(OSError):
             replace_text(page, content)
             if figures is None:
@@ -240,7 +233,7 @@ def write_html_report(
 
 
 def render_page(
-    study: LoadedStudy, source: AtlasSource, figures: Mapping[str, FigureOfPage], atlas: Sequence[AtlasEntry]
+    study: LoadedStudy, problem: DrivingProblem, figures: Mapping[str, FigureOfPage], atlas: Sequence[AtlasEntry]
 ) -> str:
     """Return the page as text; everything that files say is escaped."""
     result, base = study.result, study.result.get("base_uncertainty")
@@ -272,8 +265,8 @@ def render_page(
         figures={name: figure.to_svg() for name, figure in figures.items()},
         passes_levels=drawings.passes_levels(result),
         atlas=atlas,
-        columns=[column for column in list_columns(source.problem.space) if column.shown],
-        usual=_keep_shown(source, np.array(find_ordinary_range(source.ordinary))),
+        columns=[column for column in list_columns(problem.space) if column.shown],
+        usual=find_ordinary_range(draw_shown(problem)),
         describe_kind=text.describe_kind,
         probability=text.format_probability,
         parties=name_parties,
@@ -302,17 +295,9 @@ def _damage_as_bad_input(folder: Path) -> Iterator[None]:
         raise BadInput(f"{RESULT} or {STUDY} in {str(folder)!r} is damaged: {one_line(error)}.") from error
 
 
-def _keep_shown(source: AtlasSource, x: FloatArray) -> FloatArray:
-    """Return the columns of x (n, d) that are shown."""
-    return x[:, [column.shown for column in list_columns(source.problem.space)]]
-
-
-def _make_figures(study: LoadedStudy, source: AtlasSource) -> dict[str, FigureOfPage]:
+def _make_figures(study: LoadedStudy, problem: DrivingProblem) -> dict[str, FigureOfPage]:
     """Return the figures of the run by name."""
-    columns, ordinary = (
-        [each for each in list_columns(source.problem.space) if each.shown],
-        _keep_shown(source, source.ordinary),
-    )
+    columns, ordinary = [column for column in list_columns(problem.space) if column.shown], draw_shown(problem)
     failing, log_weights = _read_failing(study, [column.name for column in columns])
     weighted = ~np.isnan(log_weights)
     measure = text.name_measure(str(study.question.get("measure", "")))

@@ -6,7 +6,7 @@ import html
 import io
 import math
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -117,33 +117,21 @@ def draw_weights(figure: Figure, log_weights: FloatArray, p: float, stacked: boo
     share.set_xlim(left=0)
 
 
-def draw_curve(figure: Figure, curve: Mapping[str, Any], gamma: float, measure: str) -> None:
-    """Draw p over the threshold with its simultaneous band."""
-    band = f"{100 * float(curve['confidence']):g} % band, for all thresholds together"
-    axes = _draw_band(figure, curve, "gammas", (band, "P[f ≤ threshold]"))
-    axes.axvline(gamma, color=HIT_COLOUR, linewidth=1, label="gamma")
-    axes.set_xlabel(f"threshold of f{f', {measure}' if measure else ''}")
-    axes.set_ylabel("P[f ≤ threshold]")
-    axes.legend(frameon=False, fontsize=8)
-
-
-def draw_severity(figure: Figure, severity: Mapping[str, Any]) -> None:
-    """Draw P[collision with a larger delta-v] with its band."""
-    axes = _draw_band(figure, severity["curve"], "delta_v")
-    axes.set_xlabel("delta-v [m/s]")
-    axes.set_ylabel("P[collision with a larger delta-v]")
-
-
-def _draw_band(figure: Figure, curve: Mapping[str, Any], axis: str, labels: Sequence[str] = ("", "")) -> Axes:
-    """Draw p of a curve and its band over one of its entries, p on a log scale."""
+def draw_band(
+    figure: Figure, curve: Mapping[str, Any], axis: str, words: tuple[str, str], gamma: float | None = None
+) -> None:
+    """Draw p of a curve and its simultaneous band over one of its entries, p on a log scale; words are on the axes."""
     axes = figure.subplots()
     over, p, low, high = (np.array(curve[name], dtype=float) for name in (axis, "p", "low", "high"))
     floor = p[p > 0].min(initial=1.0) / 10  # an end of 0 has no place on a log scale
-    band = (np.maximum(low, floor), np.maximum(high, floor))
-    axes.fill_between(over, *band, color=LINE_COLOUR, alpha=0.2, linewidth=0, label=labels[0])
-    axes.plot(over, np.where(p > 0, p, np.nan), color=LINE_COLOUR, label=labels[1])
-    axes.set_yscale("log")
-    return axes
+    band = f"{100 * float(curve['confidence']):g} % band, for all thresholds together"
+    ends = (np.maximum(low, floor), np.maximum(high, floor))
+    axes.fill_between(over, *ends, color=LINE_COLOUR, alpha=0.2, linewidth=0, label=band)
+    axes.plot(over, np.where(p > 0, p, np.nan), color=LINE_COLOUR, label=words[1])
+    axes.set(yscale="log", xlabel=words[0], ylabel=words[1])
+    if gamma is not None:
+        axes.axvline(gamma, color=HIT_COLOUR, linewidth=1, label="gamma")
+        axes.legend(frameon=False, fontsize=8)
 
 
 def draw_parameters(
@@ -197,10 +185,13 @@ def figures_of_result(result: Result, log_weights: FloatArray, measure: str) -> 
         )
     if isinstance(curve, dict):
         gamma = float(result["gamma"])
+        words = (f"threshold of f{f', {measure}' if measure else ''}", "P[f ≤ threshold]")
         caption = "Probability over the threshold, with its band"
-        drawn["curve"] = (caption, lambda figure: draw_curve(figure, curve, gamma, measure), PANEL_SIZE)
+        drawn["curve"] = (caption, lambda figure: draw_band(figure, curve, "gammas", words, gamma), PANEL_SIZE)
     if isinstance(severity, dict):
-        drawn["severity"] = ("Severity of the collisions", lambda figure: draw_severity(figure, severity), PANEL_SIZE)
+        over, axes = severity["curve"], ("delta-v [m/s]", "P[collision with a larger delta-v]")
+        caption = "Severity of the collisions"
+        drawn["severity"] = (caption, lambda figure: draw_band(figure, over, "delta_v", axes), PANEL_SIZE)
     return {name: FigureOfPage(name, *about) for name, about in drawn.items()}
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import threading
 from collections.abc import Callable
 from pathlib import Path
@@ -149,6 +150,7 @@ def test_a_good_ego_passes(broken: str, ego: str) -> None:
     assert {"memory", "determinism", "latency", "driving", "space"} <= set(result)
     assert exit_code(list(result.values())) == 0
     assert ("none" in result["memory"].found) == (ego == "good")
+    assert re.search(r": (under 1 s|[1-9]\d* s) for 6000 simulations", result["latency"].found)
 
 
 @pytest.mark.parametrize("ego", ["idm", "noisy:idm", "gail"])

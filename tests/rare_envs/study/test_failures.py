@@ -157,6 +157,15 @@ def test_each_failure_of_the_list_has_its_crash_and_shares_add_up(
     assert np.array_equal(np.isnan(found["delta_v_struck"]), found["crash"] == "none")
 
 
+def test_a_scenario_stands_once_in_the_list(report: Report) -> None:
+    """Chains that stay in a place repeat it."""
+    estimate = report.estimate
+    x, f, log_p0 = estimate.failures.x, estimate.failures.f, estimate.failures.log_p0
+    twice = replace(estimate, failures=estimate.failures.merge(x, f, log_p0, keep=2 * len(f)))
+    found, kinds = classify_failures(report.study.problem, twice)
+    assert np.array_equal(found.failures.x, x) and kinds.listed == report.crashes
+
+
 def test_what_cannot_be_driven_again_is_not_known_and_said() -> None:
     report = make_report(Forgetful(), 200)
     assert report.kinds.shares == {}

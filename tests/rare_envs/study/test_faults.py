@@ -319,12 +319,6 @@ def test_what_one_executor_began_another_continues(
     assert fault_rows(report) == fault_rows(whole)
 
 
-def test_with_an_executor_the_question_says_how_large_chunks_are(faulty: Path, risky: str) -> None:
-    study = prepare(ask("nan", risky, chunk=None))
-    assert evaluate.settle_chunk(study, None).question.chunk is None
-    assert evaluate.settle_chunk(study, samplers.InProcess()).question.chunk == 256
-
-
 @pytest.mark.slow
 def test_a_worker_that_cannot_load_the_ego_is_one_line(faulty: Path, risky: str) -> None:
     class Later:

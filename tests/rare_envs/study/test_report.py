@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,7 @@ import samplers
 from rare_envs.study import Question, prepare, run
 from rare_envs.study.report import N_THRESHOLDS, compute_threshold_curve
 from rare_envs.study.run_folder import read_failures
+from rare_envs.study.text import print_report
 from tests.rare_envs.study.refusals import FOLLOWING, SMALL, Cli
 
 
@@ -63,6 +65,7 @@ def test_scenarios_on_which_the_ego_fails_are_listed(cli: Cli, here: Path, risky
         assert result.exit_code == 3, result.output  # the number is doubtful
         found[on_error] = json.loads((here / "run" / "result.json").read_text())
         assert f"the ego failed twice on {found[on_error]['n_faults']} scenarios" in result.stdout
+        assert " failures found: the ego failed\n" in result.stdout and "f = nan" not in result.stdout
     with (here / "run" / "faults.csv").open(newline="") as file:
         header, *rows = csv.reader(file)
     answer = found["failure"]
@@ -83,6 +86,17 @@ def test_a_doubt_about_the_base_distribution_makes_a_report_doubtful() -> None:
     assert not report.estimate.warnings
     assert any("refits rest on under 10 effective failing points" in text for text in report.warnings)
     assert report.doubtful and report.to_dict()["doubtful"]
+
+
+def test_plain_monte_carlo_is_advised_where_it_would_find_enough(
+    risky: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """30 failures at least; beyond a million simulations nothing is advised."""
+    report = run(prepare(Question(env_id=FOLLOWING, base=risky, method="two-stage", max_sim=1000, horizon=4.0)))
+    for p, said in ((1.1e-3, "--max-sim 30000 "), (4e-5, "--max-sim 800000 "), (1e-5, ""), (0.0, "")):
+        print_report(replace(report, estimate=replace(report.estimate, p=p, cov=0.1)))
+        line = capsys.readouterr().out.partition("check: --method mc ")[2]
+        assert line.startswith(said) and bool(line) == bool(said), (p, line)
 
 
 def test_progress_reaches_the_caller(risky: str) -> None:

@@ -18,7 +18,6 @@ import samplers
 from rare_envs.study import Question, episodes, prepare, run_folder, run_into
 from rare_envs.study.episodes import EpisodeTable, digest_scenarios, name_columns
 from rare_envs.study.evaluate import resume
-from rare_envs.study.writing import finish_study_file
 from samplers.evaluate import Simulated
 from samplers.journal import Journal
 from tests.rare_envs.study.refusals import FOLLOWING
@@ -73,17 +72,6 @@ def test_a_damaged_table_and_one_that_is_too_large_for_memory_are_refused(
     (tmp_path / "episodes.parquet").write_bytes(study.episodes_path.read_bytes()[:-40])
     with pytest.raises(ValueError, match=r"episodes\.parquet"):
         rare_envs.load_study(tmp_path).episodes()
-
-
-def test_a_run_that_ends_keeps_what_its_file_held_of_the_beginning(tmp_path: Path) -> None:
-    study = prepare(Question(env_id="rare_envs/CarFollowing-v0"))
-    (tmp_path / "study.json").write_text(json.dumps({"command": "rare-envs estimate", "finished": None}))
-    finish_study_file(tmp_path, study, 2.5)
-    found = json.loads((tmp_path / "study.json").read_text())
-    assert found["command"] == "rare-envs estimate" and found["seconds"] == 2.5 and found["finished"]
-    (tmp_path / "study.json").write_text("{")
-    finish_study_file(tmp_path, study, 2.5)
-    assert json.loads((tmp_path / "study.json").read_text())["seed"] == 0
 
 
 def ask(risky: str, method: str, **more: object) -> Question:

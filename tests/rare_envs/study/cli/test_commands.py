@@ -24,7 +24,6 @@ import samplers
 import training.fit.recordings as fitting
 from rare_envs.scenarios.hard_brake import HARD_BRAKE
 from rare_envs.scenarios.registry import SCENARIOS
-from rare_envs.study import html_report
 from rare_envs.study.cli.listing import TITLES
 from rare_envs.study.cli.runs import FAILS
 from rare_envs.study.corpus import read_corpus
@@ -242,15 +241,6 @@ def test_all_failures_replay_and_another_ego_takes_them(cli: Cli, run: Path) -> 
     assert changed.exit_code == 3 and changed.stdout.count("\n") == 2
 
 
-def test_another_f_than_recorded_is_a_warning(cli: Cli, run: Path) -> None:
-    result = json.loads((run / "result.json").read_text())
-    result["question"]["horizon"] = 0.5  # as if the program had changed
-    (run / "result.json").write_text(json.dumps(result))
-    answer = cli("replay", run)
-    assert answer.exit_code == 3
-    assert "warning: the run recorded f = -1" in answer.stdout
-
-
 def test_a_failure_becomes_files_of_other_simulators(cli: Cli, run: Path) -> None:
     result = cli("export", run, "--format", "commonroad", "--out", "a.xml", "--json")
     assert result.exit_code == 0, result.output
@@ -258,21 +248,6 @@ def test_a_failure_becomes_files_of_other_simulators(cli: Cli, run: Path) -> Non
     pytest.importorskip("scenariogeneration", reason='scenariogeneration comes with "rare-envs[export]"')
     result = cli("export", run, "--failure", 1, "--format", "carla", "--out", "a.xosc")
     assert result.exit_code == 0 and result.stdout == "Wrote a.xosc and a.xodr.\n" and Path("a.xodr").exists()
-
-
-def test_options_reach_the_report_and_the_answer_names_the_files(cli: Cli, monkeypatch: pytest.MonkeyPatch) -> None:
-    asked: list[object] = []
-
-    def write(run: Path, **options: object) -> list[Path]:
-        asked.append((run, options))
-        return [Path("a.html"), Path("figures/curve.pdf")]
-
-    monkeypatch.setattr(html_report, "write_html_report", write)
-    words = ("report", "run", "--out", "a.html", "--events", "e.csv", "--figures", "pdf", "--trust")
-    assert json.loads(cli(*words, "--json").stdout) == {"report": "a.html", "figures": ["figures/curve.pdf"]}
-    options = {"trust": True, "events": Path("e.csv"), "out": Path("a.html"), "figures": "pdf"}
-    assert asked == [(Path("run"), options)]
-    assert cli(*words).stdout == "Wrote a.html and 1 figures.\n"
 
 
 def test_from_a_run_to_a_regression_test(cli: Cli, run: Path) -> None:

@@ -17,7 +17,6 @@ import numpy as np
 import pytest
 import typer
 from stable_baselines3 import DQN
-from typer.testing import CliRunner
 
 import agents
 import rare_envs
@@ -25,7 +24,7 @@ import samplers
 from rare_envs.study.arguments import ExecutorOptions
 from rare_envs.study.cli.app import EXAMPLES, app, list_examples
 from rare_envs.study.cli.estimate import ESTIMATE_FILE
-from rare_envs.study.cli.shell import GATE_CODES, Answer, command, read_count
+from rare_envs.study.cli.shell import GATE_CODES
 from rare_envs.study.run_folder import CRASH, read_failures
 from tests.rare_envs.study.refusals import FOLLOWING, SMALL, Cli, assert_refused
 
@@ -129,44 +128,11 @@ def test_a_plan_from_pilots_and_one_from_a_folder(
     assert "found no failure" in none.stderr.splitlines()[-1]  # behind the bar
 
 
-def test_a_word_of_noise_is_an_argument_of_the_problem() -> None:
-    shown = []
-
-    def show(asked: dict[str, Any]) -> Answer:
-        shown.append(asked)
-        return Answer(asked, "")
-
-    other = typer.Typer()
-    other.command()(command("noise", "seed")(show))
-    for words in ([], ["--noise", "fixed"], ["--noise", "off", "--seed", "1e1"]):
-        assert CliRunner().invoke(other, words).exit_code == 0
-    assert shown == [{"noise": True, "seed": 0}, {"noise": "fixed", "seed": 0}, {"noise": False, "seed": 10}]
-
-
-def test_counts_may_be_written_with_an_exponent() -> None:
-    for text, number in (("10000", 10_000), ("1e4", 10_000), ("2.5e3", 2500), ("-5", -5), ("1_000", 1000)):
-        assert read_count(text) == number
-    for text in ("many", "1.5", "1e-3", "inf", "nan", ""):
-        with pytest.raises(typer.BadParameter, match="expected a whole number"):
-            read_count(text)
-
-
 def test_options_name_an_executor() -> None:
     assert ExecutorOptions(workers=3, memory_limit=2.0).make() == samplers.LocalProcesses(3, memory_limit=2.0**31)
     assert ExecutorOptions(executor="local").make() == samplers.LocalProcesses()
     ray = ExecutorOptions(executor="ray", address="auto", time_limit=9.0, memory_limit=1.0)
     assert ray.make() == samplers.RayCluster("auto", time_limit=9.0, memory_limit=2.0**30)
-
-
-@pytest.mark.slow
-def test_workers_change_the_progress_line_alone(cli: Cli, here: Path, risky: str) -> None:
-    words = ["estimate", FOLLOWING, "--base", risky, "--method", "mc", "--max-sim", 400, "--gamma", 2, "--horizon", 1]
-    one = cli(*words, "--chunk", 100, "--json")
-    two = cli(*words, "--chunk", 100, "--json", "--workers", 2)
-    assert "2 workers" in two.stderr and "workers" not in one.stderr
-    first, second = json.loads(one.stdout), json.loads(two.stdout)
-    del first["seconds"], second["seconds"]
-    assert second == first and first["p"] > 0
 
 
 def commands(group: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
